@@ -23,7 +23,7 @@ import av
 
 from aqualvs.batch.cluster import DaskWorkers, FinishedTask
 from aqualvs.batch.parts import PieceResult
-from aqualvs.batch.scheduler import Season, Steps
+from aqualvs.batch.scheduler import Scheduler, Steps
 from aqualvs.batch.work import PIECE_FRAMES, DiveProbe, DiveWork
 from aqualvs.demo import bundled_dive
 from aqualvs.results.run_request import RunRequest
@@ -76,7 +76,7 @@ def look(work: DiveWork) -> tuple[DiveProbe, dict[str, Any] | None]:
         Span(kind=SpanKind.VIDEO, first=i * PIECE_FRAMES, stop=(i + 1) * PIECE_FRAMES, n_bytes=1)
         for i in range(_PIECES_A_DIVE)
     )
-    survey = DiveProbe(
+    probe = DiveProbe(
         source_key=work.name,
         result_key="",
         spans=spans,
@@ -85,14 +85,14 @@ def look(work: DiveWork) -> tuple[DiveProbe, dict[str, Any] | None]:
         n_frames=None,
         source={},
     )
-    return survey, None
+    return probe, None
 
 
-def measure(_work: DiveWork, _survey: DiveProbe, number: int) -> PieceResult:
+def measure(_work: DiveWork, _probe: DiveProbe, number: int) -> PieceResult:
     return PieceResult(number=number, n_frames=1, n_valid=1, duration_s=0.0, fault="")
 
 
-def join(_work: DiveWork, _survey: DiveProbe, results: Sequence[PieceResult]) -> dict[str, Any]:
+def join(_work: DiveWork, _probe: DiveProbe, results: Sequence[PieceResult]) -> dict[str, Any]:
     return {"fault": "", "n_frames": len(results)}
 
 
@@ -133,10 +133,10 @@ def costs_of(folder: Path, n_frames: int) -> tuple[float, float, float]:
     real, name = Steps(), f"dive{n_frames}"
     dive = make_dive(folder / f"{name}.mp4", n_frames)
     work = work_in(folder, dive, Path(str(bundled_dive() / "rig.yaml")), name)
-    seen, (survey, _) = timed(lambda: real.look(work))
-    pieces = range(len(survey.spans))
-    measured, results = timed(lambda: [real.measure(work, survey.only(i), 0) for i in pieces])
-    joined, _ = timed(lambda: real.join(work, survey, results))
+    seen, (probe, _) = timed(lambda: real.look(work))
+    pieces = range(len(probe.spans))
+    measured, results = timed(lambda: [real.measure(work, probe.only(i), 0) for i in pieces])
+    joined, _ = timed(lambda: real.join(work, probe, results))
     return seen, measured, joined
 
 
@@ -155,14 +155,14 @@ def step_costs(folder: Path) -> dict[str, float]:
 
 def simulated_s(costs: dict[str, float], n_workers: int, n_dives: int) -> float:
     workers = SimulatedWorkers(n_workers, costs.__getitem__)
-    run_season(workers, n_dives)
+    run_scheduler(workers, n_dives)
     return workers.now
 
 
-def run_season(workers: Any, n_dives: int) -> None:
+def run_scheduler(workers: Any, n_dives: int) -> None:
     nowhere = Path("nowhere")
     works = [(work_in(nowhere, nowhere, nowhere, f"dive{i}"), 1) for i in range(n_dives)]
-    Season(works, workers, Unwatched(), Steps(look, measure, join)).run(lambda: False)  # type: ignore[arg-type]
+    Scheduler(works, workers, Unwatched(), Steps(look, measure, join)).run(lambda: False)  # type: ignore[arg-type]
 
 
 def overhead_s(n_dives: int) -> float:
@@ -171,7 +171,7 @@ def overhead_s(n_dives: int) -> float:
         workers.submit("warm", os.getpid)
         workers.next_done(60.0)
         began = time.process_time()
-        run_season(workers, n_dives)
+        run_scheduler(workers, n_dives)
         return time.process_time() - began
 
 

@@ -40,7 +40,7 @@ def run(quick: bool = False) -> list[dict[str, Any]]:
     views = _views(rig, n_views=7 if quick else 14)
     start = replace(rig, dome_from_cam=SE3(rig.dome_from_cam.rotation, np.zeros(3)))
     sets = [BoardSet(name="air", views=views)]
-    options = DomeOptions(check_held_back=False)
+    options = DomeOptions(check_cross_validation=False)
     ours, seconds = _timed(lambda: dome(start, sets, options, _KNOWN), 3 if quick else _ROUNDS)
     reference, reference_seconds = _timed(lambda: _reference(start, sets, options), 1)
     apart = np.linalg.norm(ours.rig.dome_from_cam.translation - reference)

@@ -55,7 +55,7 @@ def _trials(name: str, *, rendered: bool) -> list[dict[str, Any]]:
         _row(f"{what}: follow, range rms", 1e3 * max(f.range_rms for f in follows), "mm", 30.0),
         _row(f"{what}: follow, yaw rms", degrees(max(f.yaw_rms for f in follows)), "deg", 3.0),
         _row(f"{what}: follow, frames lost", float(sum(f.n_lost for f in follows)), "", None),
-        _row(f"{what}: follow, nearest", min(f.least_clearance for f in follows), "m", None),
+        _row(f"{what}: follow, nearest", min(f.min_clearance for f in follows), "m", None),
     ]
 
 
@@ -67,7 +67,7 @@ def _dives(name: str, n: int) -> list[dict[str, Any]]:
         return float(sum(of))
 
     late = max(dive.safety.neutral_late for dive in found)
-    nearest = min(dive.safety.least_clearance for dive in found)
+    nearest = min(dive.safety.min_clearance for dive in found)
     return [
         _row(f"{name}: {n} dives, contacts", count([d.safety.contact for d in found]), "", None),
         _row(f"{name}: {n} dives, unstable", count([_unstable(d) for d in found]), "", None),

@@ -138,13 +138,13 @@ def measure(rig: Rig, dive: Path) -> tuple[Clock, list[float]]:
     controls = Controls(SetpointHolder(rig.working_range), NoRecorder())
     server = DashboardServer("127.0.0.1", 0, Access("127.0.0.1", "unused"), rig, controls)
     clock = Clock()
-    with script(_PEER) as peer, script(_WATCHER, str(server.port)) as watcher:
+    with script(_PEER) as peer, script(_WATCHER, str(server.port)) as viewer:
         outputs = [
             MavlinkOutput(f"udpout:127.0.0.1:{line_of(peer)}"),
             clock,
             Dashboard(server, controls),
         ]
-        line_of(watcher)
+        line_of(viewer)
         feed = open_feed(dive, realtime=True)
         LiveRunner(feed, FixedScanner(scanner), outputs, posture_filter=PostureFilter()).run(
             lambda: False

@@ -54,7 +54,7 @@ _MISSED, _DARK = 0.05, 0.01
 _AMBIGUOUS, _SIGMA_TOLD = 0.4, 0.02
 # A frame whose range is off by more has another target; dives with many such frames do not count.
 _WRONG_RANGE, _WRONG_SHARE = 0.05, 0.2
-_LEAST_STRANDS = 5.0
+_MIN_STRANDS = 5.0
 _MESH, _TWINE, _SOLIDITY, _LARGE_HOLE = 0.05, 0.20, 0.05, 3.0
 _TARGET_MS = 3.0
 
@@ -92,7 +92,7 @@ class Outcome:
     @property
     def counts(self) -> bool:
         """Whether mesh, twine and solidity must be right."""
-        shown = self.stretch is not None and self.stretch.n_strands >= _LEAST_STRANDS
+        shown = self.stretch is not None and self.stretch.n_strands >= _MIN_STRANDS
         return shown and self.right_target
 
 

@@ -13,11 +13,11 @@ import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.scanner import Scanner
-from aqualvs.scanning.candidates import Readings, read_returns
+from aqualvs.scanning.candidates import Candidates, find_candidates
 from aqualvs.scanning.detection import FrameDetector
-from aqualvs.scanning.labels import label_readings
-from aqualvs.scanning.laser_bands import plan_searches, searched_range
-from aqualvs.scanning.posture_estimator import FitMethod, PostureMeter
+from aqualvs.scanning.labels import label_candidates
+from aqualvs.scanning.laser_bands import plan_bands, search_range
+from aqualvs.scanning.posture_estimator import FitMethod, PostureEstimator
 from aqualvs.scanning.scan import Frame, planes_of_image
 from aqualvs.scanning.stripe import StripeOptions
 from aqualvs.scanning.surfaces import find_surfaces
@@ -96,32 +96,32 @@ def _cost() -> list[dict[str, Any]]:
     """Time to label one frame whose light is repeated so and so many times."""
     rig = example_rig()
     camera = rig.camera()
-    searches = plan_searches(rig, camera)
+    laser_bands = plan_bands(rig, camera)
     frame, _ = shoot(random_scene(np.random.default_rng([2021, 1]), "usual"), 1)
-    returns = FrameDetector(rig.size_px, searches, StripeOptions()).detect(frame)
-    readings = read_returns(returns, searches, Triangulator(rig, camera))
+    peaks = FrameDetector(rig.size_px, laser_bands, StripeOptions()).detect(frame)
+    candidates = find_candidates(peaks, laser_bands, Triangulator(rig, camera))
     rows = []
     for n in (500, 1000, 2000, 4000):
-        some = readings.where(np.arange(len(readings)) % max(len(readings) / n, 1.0) < 1.0)
-        value = _label_ms(some, searches)
+        some = candidates.where(np.arange(len(candidates)) % max(len(candidates) / n, 1.0) < 1.0)
+        value = _label_ms(some, laser_bands)
         rows.append(
             _row(f"labels, {len(some)} readings", value, "ms", _TARGET_MS, _TARGET_MS / value)
         )
     return rows
 
 
-def _label_ms(readings: Readings, searches: Any) -> float:
+def _label_ms(candidates: Candidates, laser_bands: Any) -> float:
     rig = example_rig()
-    chunks, index = readings.chunks()
-    reach = searched_range(rig.working_range)
-    surfaces = find_surfaces(chunks, index, readings.pixels, 3, reach, rig.focal_px)
+    subsegments, index = candidates.subsegments()
+    reach = search_range(rig.working_range)
+    surfaces = find_surfaces(subsegments, index, candidates.pixels, 3, reach, rig.focal_px)
     target = choose_target(surfaces, TargetKind.AUTO, rig.working_range)
     assert target is not None
-    found = PostureMeter(rig, searches, FitMethod.ROBUST).measure(readings, index, target)
+    found = PostureEstimator(rig, laser_bands, FitMethod.ROBUST).measure(candidates, index, target)
     times = []
     for _ in range(100):
         start = time.perf_counter()
-        label_readings(readings, index, surfaces, target, found, rig.working_range)
+        label_candidates(candidates, index, surfaces, target, found, rig.working_range)
         times.append(time.perf_counter() - start)
     return float(np.median(times)) * 1e3
 

@@ -76,9 +76,9 @@ def whole(dive: Dive, out: Path, *, report: bool, n_processes: int = 1) -> int:
         n_processes=n_processes,
     )
     result = run_dive(request)
-    if result.fault is not None or result.tally.n_frames != dive.n_frames:
-        raise RuntimeError(f"{dive.path}: {result.tally.n_frames} frames, {result.fault}")
-    return result.tally.n_frames
+    if result.fault is not None or result.summary.n_frames != dive.n_frames:
+        raise RuntimeError(f"{dive.path}: {result.summary.n_frames} frames, {result.fault}")
+    return result.summary.n_frames
 
 
 def best_costs(jobs: dict[str, Callable[[], object]], rounds: int) -> dict[str, Cost]:

@@ -23,11 +23,11 @@ from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.optics.camera import DomeCamera
 from aqualvs.optics.rig import Rig
 from aqualvs.scanner import Scanner
-from aqualvs.scanning.candidates import read_returns
+from aqualvs.scanning.candidates import find_candidates
 from aqualvs.scanning.detection import FrameDetector
-from aqualvs.scanning.laser_bands import SearchAxis, plan_searches
+from aqualvs.scanning.laser_bands import SearchAxis, plan_bands
 from aqualvs.scanning.posture import range_pitch_yaw
-from aqualvs.scanning.posture_estimator import FitMethod, PostureMeter
+from aqualvs.scanning.posture_estimator import FitMethod, PostureEstimator
 from aqualvs.scanning.scan import Frame
 from aqualvs.scanning.stripe import StripeOptions
 from aqualvs.scanning.surfaces import find_surfaces
@@ -63,14 +63,14 @@ def make_case(rig: Rig, scenario: str) -> Case:
     picture = Renderer(rig, threads=2).render(scene, 1.0, np.random.default_rng(0))
     frame = decoded(picture.image, rig.size_px)
     bgr = bgr_of(frame)
-    searches = plan_searches(rig, rig.camera())
+    laser_bands = plan_bands(rig, rig.camera())
     pixels = [picture.lit.pixels[picture.lit.laser == i] for i in range(len(rig.lasers))]
     return Case(
         rig,
         bgr,
         frame,
         [drawn_area(rig, pixels, i) for i in range(len(pixels))],
-        [search.axis is SearchAxis.ALONG_X for search in searches],
+        [search.axis is SearchAxis.ALONG_X for search in laser_bands],
     )
 
 
@@ -186,18 +186,23 @@ def row(name: str, value: float, unit: str, reference: float | None) -> dict[str
 def stage_rows(case: Case, name: str) -> list[dict[str, Any]]:
     """Time the scanner's stages, each on what the one before it made."""
     rig, camera = case.rig, case.rig.camera()
-    searches = plan_searches(rig, camera)
-    detector = FrameDetector(rig.size_px, searches, StripeOptions())
+    laser_bands = plan_bands(rig, camera)
+    detector = FrameDetector(rig.size_px, laser_bands, StripeOptions())
     triangulator = Triangulator(rig, camera)
-    meter = PostureMeter(rig, searches, FitMethod.ROBUST)
+    processor = PostureEstimator(rig, laser_bands, FitMethod.ROBUST)
     near, far = rig.working_range
-    returns = detector.detect(case.frame)
-    readings = read_returns(returns, searches, triangulator)
+    peaks = detector.detect(case.frame)
+    candidates = find_candidates(peaks, laser_bands, triangulator)
 
     def surfaces() -> tuple[IntArray, Any]:
-        chunks, index = readings.chunks()
+        subsegments, index = candidates.subsegments()
         found = find_surfaces(
-            chunks, index, readings.pixels, len(rig.lasers), (0.8 * near, 1.2 * far), rig.focal_px
+            subsegments,
+            index,
+            candidates.pixels,
+            len(rig.lasers),
+            (0.8 * near, 1.2 * far),
+            rig.focal_px,
         )
         return index, choose_target(found, TargetKind.AUTO, rig.working_range)
 
@@ -213,11 +218,11 @@ def stage_rows(case: Case, name: str) -> list[dict[str, Any]]:
         ),
         (
             "read",
-            lambda: read_returns(returns, searches, triangulator),
+            lambda: find_candidates(peaks, laser_bands, triangulator),
             lambda: plain_points(rig, pixels),
         ),
         ("surfaces", surfaces, None),
-        ("fit", lambda: meter.measure(readings, index, target), lambda: plain_fit(points)),
+        ("fit", lambda: processor.measure(candidates, index, target), lambda: plain_fit(points)),
     )
     return [
         row(f"{name}: {stage}", best_ms(ours), "ms", best_ms(plain) if plain else None)

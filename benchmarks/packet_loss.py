@@ -38,7 +38,7 @@ from aqualvs.demo import bundled_dive
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.rigfile import load_rig
 from aqualvs.scanner import Scanner
-from aqualvs.scanning.laser_bands import SearchAxis, plan_searches
+from aqualvs.scanning.laser_bands import SearchAxis, plan_bands
 from aqualvs.scanning.posture import Posture, Refusal
 from aqualvs.scanning.scan import Frame, ImagePlane
 from aqualvs.sources import open_source
@@ -91,7 +91,7 @@ class Part(NamedTuple):
 
 
 @dataclass
-class Tally:
+class RunSummary:
     """Postures compared with those of whole pictures."""
 
     n: int = 0
@@ -344,7 +344,7 @@ def bands_of(rig: Rig) -> list[np.ndarray]:
     """Return the pixels in which each laser is looked for, shape (height, width)."""
     width, height = rig.size_px
     found = []
-    for search in plan_searches(rig, rig.camera()):
+    for search in plan_bands(rig, rig.camera()):
         along_x = search.axis is SearchAxis.ALONG_X
         at = np.arange(width if along_x else height)
         inside = (at >= search.lowest[:, None]) & (at <= search.highest[:, None])
@@ -366,7 +366,7 @@ def report(
     share, run, n_seeds = loss
     shape = bands[0].shape
     n_exact, area, worst_leak = 0, 0.0, 0
-    concealed, intact, nearly, best = Tally(), Tally(), Tally(), Tally()
+    concealed, intact, nearly, best = RunSummary(), RunSummary(), RunSummary(), RunSummary()
     for seed in range(n_seeds):
         lost = lost_parts(parts, share, run, seed)
         for at, luma in delivered(pictures, parts, lost):

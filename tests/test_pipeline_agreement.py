@@ -43,7 +43,7 @@ def test_a_drifted_laser_gets_a_line_and_its_facts() -> None:
     summary = watched(0.4)
     assert summary.lines()[-1].startswith("laser 2 (left) is off by 0.4 deg (its stripe lies")
     assert "recalibrate" in summary.lines()[-1]
-    found = summary.facts()["laser_agreement"]
+    found = summary.to_dict()["laser_agreement"]
     assert found["state"] == "drifted"
     assert found["suspects"] == ["left"]
     assert found["angle_deg"] == pytest.approx(0.4, abs=0.02)
@@ -53,8 +53,8 @@ def test_a_drifted_laser_gets_a_line_and_its_facts() -> None:
 def test_lasers_that_agree_are_not_spoken_of() -> None:
     summary = watched(0.0)
     assert not any("laser" in line for line in summary.lines())
-    assert summary.facts()["laser_agreement"] == {"state": "agree", "n_frames": 6}
-    assert "laser_agreement" not in RunSummary().facts()
+    assert summary.to_dict()["laser_agreement"] == {"state": "agree", "n_frames": 6}
+    assert "laser_agreement" not in RunSummary().to_dict()
 
 
 @pytest.mark.parametrize("degrees", [0.0, 0.4])

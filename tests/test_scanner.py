@@ -21,7 +21,7 @@ from aqualvs.scanning.scan import Frame, Label, Scan, planes_of_image
 from aqualvs.scanning.stripe import ThresholdOptions
 from aqualvs.scanning.target import TargetKind
 from aqualvs.simulation.scenarios import bluerov2_rig, example_rig
-from scanning_cases import returns_of
+from scanning_cases import peaks_of
 from scanning_cases import strands as broken
 from windowed_cases import windowed
 
@@ -386,14 +386,14 @@ def test_an_error_that_all_strands_share_is_in_the_sigma_of_the_range(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     rig, variances = example_rig(), []
-    returns = returns_of(rig, [(plane(0.5), broken)], 0.05)
+    peaks = peaks_of(rig, [(plane(0.5), broken)], 0.05)
     for twine_px in (posture_estimator._TWINE_PX, 0.0):
         monkeypatch.setattr(posture_estimator, "_TWINE_PX", twine_px)
-        found = Scanner(rig).measure(0, 0.0, returns).posture
+        found = Scanner(rig).measure(0, 0.0, peaks).posture
         assert isinstance(found, Posture)
         variances.append(found.covariance[0, 0])
     # How far the stripes move in the picture as the target moves away.
-    near, far = (returns_of(rig, [(plane(one), everywhere)]) for one in (0.5, 0.501))
+    near, far = (peaks_of(rig, [(plane(one), everywhere)]) for one in (0.5, 0.501))
     one, other = (part[SearchAxis.ALONG_Y] for part in (near, far))
     moved = np.interp(other.line, one.line, one.position) - other.position
     px_per_m = float(np.median(np.abs(moved))) / 0.001

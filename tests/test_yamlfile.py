@@ -16,7 +16,7 @@ from aqualvs.control.plan import load_plan
 from aqualvs.design.file import load_design
 from aqualvs.errors import AqualvsError, RigError
 from aqualvs.experiments.benchmark.set import SET_FILE, load_set
-from aqualvs.nets.target_file import target_facts
+from aqualvs.nets.target_file import target_dict
 from aqualvs.optics.rigfile import load_rig
 from aqualvs.report.run_data import read_run_file
 from aqualvs.results.run_request import read_run_yaml
@@ -77,7 +77,7 @@ READERS: dict[str, Callable[[Path], object]] = {
     "board": load_board,
     "box": load_box,
     "target": load_target,
-    "net": lambda path: target_facts(str(path)),
+    "net": lambda path: target_dict(str(path)),
     "scenario": read_scenario,
     "list of dives": read_list,
 }

@@ -1,4 +1,4 @@
-"""Fit the weights with which pieces of stripes are judged (`aqualvs.scanning.stripe_pieces`).
+"""Fit the weights with which pieces of stripes are judged (`aqualvs.scanning.stripe_segments`).
 
     python tools/fit_stripe_pieces.py ../shared/samples/real-laser-lines
 
@@ -26,19 +26,37 @@ import real_lines
 from aqualvs.scanning.laser_bands import SearchAxis
 from aqualvs.scanning.laser_colour import WHITE
 from aqualvs.scanning.scan import Frame, planes_of_image
-from aqualvs.scanning.stripe_pieces import (
-    ACROSS,
-    ALONG,
-    HALO,
-    LENGTH,
-    TOP,
-    Weights,
-    general_evidence,
-    learn_lines,
-    line_log_odds,
-    own_evidence,
+from aqualvs.scanning.stripe_segments import (
+    ACROSS as ACROSS,
 )
-from aqualvs.scanning.whole_picture import find_all_pieces
+from aqualvs.scanning.stripe_segments import (
+    ALONG as ALONG,
+)
+from aqualvs.scanning.stripe_segments import (
+    HALO as HALO,
+)
+from aqualvs.scanning.stripe_segments import (
+    LENGTH as LENGTH,
+)
+from aqualvs.scanning.stripe_segments import (
+    TOP as TOP,
+)
+from aqualvs.scanning.stripe_segments import (
+    Weights as Weights,
+)
+from aqualvs.scanning.stripe_segments import (
+    general_evidence as general_evidence,
+)
+from aqualvs.scanning.stripe_segments import (
+    learn_lines as learn_lines,
+)
+from aqualvs.scanning.stripe_segments import (
+    line_log_odds as line_log_odds,
+)
+from aqualvs.scanning.stripe_segments import (
+    own_evidence as own_evidence,
+)
+from aqualvs.scanning.uncalibrated_stripes import find_all_segments as find_all_segments
 
 Array = NDArray[np.float64]
 
@@ -105,19 +123,19 @@ def samples(folder: Path, formats: list[str]) -> Iterator[Sample]:
 
 def _sample(name: str, fmt: str, given: object, nm: float, lines: Array | None) -> Sample:
     frame = given if isinstance(given, Frame) else Frame(0, 0.0, *planes_of_image(given))
-    found = find_all_pieces(frame, real_lines.options_for(nm))
-    table = np.concatenate([pieces.table for pieces in found], axis=1)
+    found = find_all_segments(frame, real_lines.options_for(nm))
+    table = np.concatenate([segments.table for segments in found], axis=1)
     is_line = np.zeros(table.shape[1])
     if lines is not None and len(is_line):
         dark = name.startswith("green15-dark")
         share, middle = [], []
-        for pieces in found:
-            line = pieces.search.line_px * (pieces.returns.line[pieces.order] + 0.5) - 0.5
-            points = np.stack([line, pieces.returns.position[pieces.order]], axis=-1)
-            if pieces.search.axis is SearchAxis.ALONG_X:
+        for segments in found:
+            line = segments.search.line_px * (segments.peaks.line[segments.order] + 0.5) - 0.5
+            points = np.stack([line, segments.peaks.position[segments.order]], axis=-1)
+            if segments.search.axis is SearchAxis.ALONG_X:
                 points = points[:, ::-1]
             near = cKDTree(lines).query(points)[0] <= (NEAR_WIDE_PX if dark else NEAR_PX)
-            first, n = pieces.start[:-1], np.diff(pieces.start)
+            first, n = segments.start[:-1], np.diff(segments.start)
             share.append(np.add.reduceat(near.astype(float), first) / n)
             middle.append(np.add.reduceat(points, first) / n[:, None])
         on, (x, y) = np.concatenate(share), np.concatenate(middle).T

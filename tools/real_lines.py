@@ -33,7 +33,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aqualvs.scanning.scan import Frame
-from aqualvs.scanning.whole_picture import WholePictureOptions, find_stripes
+from aqualvs.scanning.uncalibrated_stripes import (
+    UncalibratedStripeOptions as UncalibratedStripeOptions,
+)
+from aqualvs.scanning.uncalibrated_stripes import find_stripes as find_stripes
 from aqualvs.sources import open_source
 
 Image = NDArray[np.uint8]
@@ -49,8 +52,8 @@ RED_NM, GREEN_NM = 650.0, 532.0
 # Luma and V of B, G, R. Difference of a pair: smoothing along the line; size of the surroundings
 # and what counts there at most; least of red, luma, and luma compared with the surroundings.
 _LUMA, _V = (0.114, 0.587, 0.299), (-0.081, -0.419, 0.5)
-_BLUR_ALONG_PX, _AROUND_PX, _MOST_NOISE = 2.0, (21, 61), 8.0
-_LEAST_RED, _LEAST_LUMA, _LEAST_CLEAR = 1.0, 3.0, 4.0
+_BLUR_ALONG_PX, _AROUND_PX, _MAX_NOISE = 2.0, (21, 61), 8.0
+_MIN_RED, _MIN_LUMA, _MIN_CLEAR = 1.0, 3.0, 4.0
 # Drawing: pictures darker than this on average are brightened; space around lines, in widths;
 # width of a sheet in pixels.
 _DARK, _MARGIN, _SHEET_WIDTH = 40.0, 0.02, 1440
@@ -85,12 +88,12 @@ class Score:
     elsewhere: int
 
 
-def options_for(wavelength_nm: float) -> WholePictureOptions:
+def options_for(wavelength_nm: float) -> UncalibratedStripeOptions:
     """Return options for a colour, where this version of the package knows colours."""
-    names = {field.name for field in dataclasses.fields(WholePictureOptions)}
+    names = {field.name for field in dataclasses.fields(UncalibratedStripeOptions)}
     if "wavelength_nm" in names:
-        return WholePictureOptions(wavelength_nm=wavelength_nm)  # type: ignore[arg-type]
-    return WholePictureOptions()
+        return UncalibratedStripeOptions(wavelength_nm=wavelength_nm)  # type: ignore[arg-type]
+    return UncalibratedStripeOptions()
 
 
 def encoded(image: Image, fmt: str) -> Image | Frame:
@@ -185,11 +188,11 @@ def pair_line(off: Image, on: Image) -> Array:
     luma, red = (_high(difference @ np.array(weights, np.float32)) for weights in (_LUMA, _V))
     luma = cv2.GaussianBlur(luma, (0, 0), _BLUR_ALONG_PX, sigmaY=0.6)
     red = cv2.GaussianBlur(red, (0, 0), _BLUR_ALONG_PX)
-    around = cv2.boxFilter(np.minimum(np.abs(luma), _MOST_NOISE), -1, _AROUND_PX)
-    clear = np.where(red > -_LEAST_RED, luma / (1.5 * around + 0.5), 0.0)
+    around = cv2.boxFilter(np.minimum(np.abs(luma), _MAX_NOISE), -1, _AROUND_PX)
+    clear = np.where(red > -_MIN_RED, luma / (1.5 * around + 0.5), 0.0)
     row = clear.argmax(axis=0)
     columns = np.arange(len(row))
-    strong = (clear[row, columns] > _LEAST_CLEAR) & (luma[row, columns] > _LEAST_LUMA)
+    strong = (clear[row, columns] > _MIN_CLEAR) & (luma[row, columns] > _MIN_LUMA)
     line = np.full(len(row), np.nan)
     for x in np.flatnonzero(strong):
         beside = slice(max(0, x - 6), x + 7)

@@ -82,7 +82,7 @@ class BoardPose:
 
 
 @dataclass(frozen=True)
-class Measured:
+class FrameResult:
     """One picture in one format; errors are those of its worst frame."""
 
     picture: str
@@ -241,12 +241,12 @@ def _sigma(row: dict[str, str], what: str) -> float:
     return float(row[f"sigma_{kind}_total_{unit}"])
 
 
-def compare(picture: str, fmt: str, rows: list[dict[str, str]], board: BoardPose) -> Measured:
+def compare(picture: str, fmt: str, rows: list[dict[str, str]], board: BoardPose) -> FrameResult:
     """Return the worst of a source's frames against the board."""
     invalid = [row for row in rows if row["valid"] != "1"]
     if invalid or not rows:
         reason = invalid[0]["reason"] if rows else "no_frames"
-        return Measured(picture, fmt, reason, board.range_m)
+        return FrameResult(picture, fmt, reason, board.range_m)
     row = max(rows, key=lambda r: abs(float(r["range_m"]) - board.range_m))
     errors = (
         float(row["range_m"]) - board.range_m,
@@ -256,7 +256,7 @@ def compare(picture: str, fmt: str, rows: list[dict[str, str]], board: BoardPose
     sigmas = tuple(_sigma(row, what) for what in ("range_m", "pitch_deg", "yaw_deg"))
     flat = (board.flat_range_m, board.flat_pitch_deg, board.flat_yaw_deg)
     scores = [e / math.hypot(s, f) for e, s, f in zip(errors, sigmas, flat, strict=True)]
-    return Measured(
+    return FrameResult(
         picture,
         fmt,
         "",
@@ -287,8 +287,8 @@ def leave_one_out(
     pictures: Sequence[str] = (),
     recalibrate: bool = False,
     more: Sequence[str] = (),
-    tell: Callable[[str], None] = print,
-) -> list[Measured]:
+    echo: Callable[[str], None] = print,
+) -> list[FrameResult]:
     """Calibrate without each picture in turn and measure it; see the module.
 
     Parameters
@@ -307,7 +307,7 @@ def leave_one_out(
         Also where a rig is kept from before.
     more : sequence of str
         Further arguments of `aqualvs run`.
-    tell : callable
+    echo : callable
         Called with a line for each result.
     """
     paths = sorted(samples.glob("*.png"))
@@ -326,15 +326,17 @@ def leave_one_out(
         for fmt in formats:
             source = make_source(image, sources, fmt)
             if rig is None:
-                result = Measured(path.stem, fmt, "calibration_refused", board.range_m)
+                result = FrameResult(path.stem, fmt, "calibration_refused", board.range_m)
             else:
                 result = compare(path.stem, fmt, measure(source, rig, folder / fmt, more), board)
             results.append(result)
-            tell(line(result))
+            echo(line(result))
     return results
 
 
-def sheet(samples: Path, work: Path, results: Sequence[Measured], columns: int = 3) -> np.ndarray:
+def sheet(
+    samples: Path, work: Path, results: Sequence[FrameResult], columns: int = 3
+) -> np.ndarray:
     """Return the pictures with the points that `run` used, and what it measured."""
     tiles = []
     x0, y0, x1, y1 = _TILE
@@ -360,7 +362,7 @@ def sheet(samples: Path, work: Path, results: Sequence[Measured], columns: int =
     return made
 
 
-def line(m: Measured) -> str:
+def line(m: FrameResult) -> str:
     """Return one line of the table."""
     head = f"{m.picture:8} {m.format:6} {1e3 * m.board_range_m:6.1f} mm "
     if not m.valid:
@@ -373,7 +375,7 @@ def line(m: Measured) -> str:
     )
 
 
-def summary(results: Sequence[Measured]) -> list[str]:
+def summary(results: Sequence[FrameResult]) -> list[str]:
     """Return a Markdown table, one row for each format, as docs/real-light.md has it."""
     lines = [
         "| format | postures | range error | yaw error | pitch error | error / sigma, rms "
@@ -426,7 +428,7 @@ def main() -> int:
         pictures=[p for p in given.pictures.split(",") if p],
         recalibrate=given.recalibrate,
         more=given.run,
-        tell=lambda text: print(text, flush=True),
+        echo=lambda text: print(text, flush=True),
     )
     said = (
         "error/sigma: total sigma and 1 mm of flatness of the board, tilted over the way to where"

@@ -6,20 +6,20 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 
 from aqualvs.errors import SourceError
-from aqualvs.pipeline import run_and_tell
+from aqualvs.pipeline import run_and_print
 from aqualvs.results.run_request import RunRequest
 
 _FILES = ("dive.mp4", "rig.yaml", "truth.csv")
 
 
-def demo(out: Path, tell: Callable[[str], object], *, overwrite: bool = False) -> int:
+def demo(out: Path, echo: Callable[[str], object], *, overwrite: bool = False) -> int:
     """Run the bundled dive, print posture and error, and return the exit code.
 
     Parameters
     ----------
     out : Path
         Folder to write.
-    tell : callable
+    echo : callable
         Takes one line of text.
     overwrite : bool
         Whether to replace a run that is already there.
@@ -32,7 +32,7 @@ def demo(out: Path, tell: Callable[[str], object], *, overwrite: bool = False) -
     with importlib.resources.as_file(bundled_dive()) as folder:
         dive, rig, truth = (_present(folder / name) for name in _FILES)
         request = RunRequest(source=str(dive), rig=rig, truth=truth, out=out, overwrite=overwrite)
-        return run_and_tell(request, tell)
+        return run_and_print(request, echo)
 
 
 def bundled_dive() -> Traversable:

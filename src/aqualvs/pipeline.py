@@ -19,12 +19,12 @@ from aqualvs.scanner import Scanner, ScannerOptions
 from aqualvs.scanning.agreement import LaserAgreement
 from aqualvs.sources import FrameSource, open_source
 from aqualvs.terminal import StopSignals, progress
-from aqualvs.workers.frame_results import ScansFrames
-from aqualvs.workers.pool import CrewWork, crew_work
-from aqualvs.workers.run_frames import Replay, RunMeasuring, replay_of
+from aqualvs.workers.frame_results import FrameScanner
+from aqualvs.workers.pool import PoolJob, pool_job
+from aqualvs.workers.run_frames import DiveProcessor, Replay, replay_of
 from aqualvs.workers.water_index import WaterFollowingScanner
 
-ScannerFor = Callable[[Rig, ScannerOptions], ScansFrames]
+ScannerFor = Callable[[Rig, ScannerOptions], FrameScanner]
 """Constructor of a scanner."""
 
 
@@ -72,20 +72,20 @@ def run(request: RunRequest, *, scanner_for: ScannerFor = Scanner) -> RunResult:
     """
     with (
         open_dive(request) as dive,
-        RunMeasuring(
+        DiveProcessor(
             dive.source,
             dive.rig,
             request.frames,
             _shared_work(dive, scanner_for),
             request.n_processes,
-        ) as measuring,
+        ) as processor,
     ):
         # While other processes measure the first frames, this one gets ready to write.
         from aqualvs import run_outputs as outputs
 
         scanner, summary = dive.scanner(scanner_for), summary_for(dive)
         net = outputs.RunNet(dive.rig, request.net)
-        measuring.await_first()
+        processor.wait_for_first()
         claim = outputs.prepare(request)
         started, fault = time.perf_counter(), None
         try:
@@ -94,7 +94,7 @@ def run(request: RunRequest, *, scanner_for: ScannerFor = Scanner) -> RunResult:
                 StopSignals() as stop,
                 progress(dive.source.name, request.frames.n_frames(dive.source.n_frames)) as tick,
                 closing(
-                    measuring.blocks(writers.recorded(scanner), one_by_one=request.mcap)
+                    processor.blocks(writers.recorded(scanner), one_by_one=request.mcap)
                 ) as blocks,
             ):
                 outputs.write_all(blocks, writers, stop, tick)
@@ -115,7 +115,7 @@ def run(request: RunRequest, *, scanner_for: ScannerFor = Scanner) -> RunResult:
     return result
 
 
-def run_and_tell(request: RunRequest, tell: Callable[[str], object]) -> int:
+def run_and_print(request: RunRequest, echo: Callable[[str], object]) -> int:
     """Run a dive, print its results line by line, and return the exit code.
 
     Raises
@@ -125,7 +125,7 @@ def run_and_tell(request: RunRequest, tell: Callable[[str], object]) -> int:
     """
     result = run(request)
     for line in summary_lines(request, result):
-        tell(line)
+        echo(line)
     if result.fault is not None:
         raise result.fault
     return result.exit_code
@@ -169,7 +169,7 @@ class OpenDive(Closing):
         """True if the source is a recording."""
         return isinstance(self.source, Replay)
 
-    def scanner(self, scanner_for: ScannerFor = Scanner) -> ScansFrames:
+    def scanner(self, scanner_for: ScannerFor = Scanner) -> FrameScanner:
         """Return what measures the frames: the recording itself, or a scanner.
 
         Raises
@@ -240,10 +240,10 @@ def summary_for(dive: OpenDive) -> RunSummary:
     return RunSummary(agreement=agreement, net_check=net_check(request.target, rig))
 
 
-def _shared_work(dive: OpenDive, scanner_for: ScannerFor) -> CrewWork | None:
+def _shared_work(dive: OpenDive, scanner_for: ScannerFor) -> PoolJob | None:
     """Return how processes can share the dive; None where one process must measure all of it."""
     request = dive.request
     alone = request.overlay or request.mcap or request.index_target is not None
     if alone or dive.is_replay or scanner_for is not Scanner or request.n_processes < 2:
         return None
-    return crew_work(dive.source, request.frames, dive.rig, request.scanner)
+    return pool_job(dive.source, request.frames, dive.rig, request.scanner)

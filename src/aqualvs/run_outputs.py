@@ -39,17 +39,17 @@ from aqualvs.results.folder import (
     prepare_folder,
 )
 from aqualvs.results.net_survey import NetPass
-from aqualvs.results.run_request import RunRequest, Status, source_facts
+from aqualvs.results.run_request import RunRequest, Status, source_dict
 from aqualvs.results.summary import RunSummary, TruthComparison, compare_with_truth
 from aqualvs.scanner import Scanner, ScannerOptions
 from aqualvs.scanning.laser_bands import SearchAxis
 from aqualvs.scanning.posture import Posture
 from aqualvs.scanning.scan import Frame, Scan
-from aqualvs.scanning.stripe import Returns
+from aqualvs.scanning.stripe import StripePeaks
 from aqualvs.sources import FrameSource
 from aqualvs.sources.base import bgr_of
 from aqualvs.terminal import StopSignals, Tick
-from aqualvs.workers.frame_results import FrameResult, ScansFrames
+from aqualvs.workers.frame_results import FrameResult, FrameScanner
 from aqualvs.workers.run_frames import Replay
 from aqualvs.workers.water_index import WaterFollowingScanner
 
@@ -104,7 +104,7 @@ class RunNet:
         return [*result.lines, f"map of the net: {folder / NET_MAP_PNG}"]
 
 
-MeasuredFrame = tuple[Rig, Scan, dict[SearchAxis, Returns]]
+FrameOutput = tuple[Rig, Scan, dict[SearchAxis, StripePeaks]]
 
 
 class RunMcap(Closing):
@@ -134,21 +134,21 @@ class RunMcap(Closing):
             with writing(self._path):
                 self._recording = _recording(self._path, options)
 
-    def recorded(self, scanner: ScansFrames) -> ScansFrames:
+    def recorded(self, scanner: FrameScanner) -> FrameScanner:
         """Return a scanner that measures as this one does, and records its results."""
         return scanner if self._recording is None else _RecordedScanner(self, scanner)
 
-    def write(self, rig: Rig, scan: Scan, returns: dict[SearchAxis, Returns]) -> None:
+    def write(self, rig: Rig, scan: Scan, peaks: dict[SearchAxis, StripePeaks]) -> None:
         """Record a scan with the rig and the stripes that it was made from."""
         if self._recording is not None:
             with writing(self._path):
-                self._recording.write(self._sample(rig, scan, returns))
+                self._recording.write(self._sample(rig, scan, peaks))
 
     def lost(self, scan: Scan) -> None:
         """Record the scan of a frame that was lost."""
         self.write(self._rig, scan, {})
 
-    def _sample(self, rig: Rig, scan: Scan, returns: dict[SearchAxis, Returns]) -> "LiveSample":
+    def _sample(self, rig: Rig, scan: Scan, peaks: dict[SearchAxis, StripePeaks]) -> "LiveSample":
         from aqualvs.recording.sample import Instants, LiveSample
         from aqualvs.sources.base import Health
 
@@ -156,7 +156,7 @@ class RunMcap(Closing):
         return LiveSample(
             rig=rig,
             scan=scan,
-            returns=returns,
+            peaks=peaks,
             frame=None,
             # Times as if the dive had started with the run.
             utc_ns=self._began_ns + at_ns,
@@ -175,12 +175,12 @@ class RunMcap(Closing):
 class _RecordedScanner:
     """Scanner that measures as another one does, and records the results."""
 
-    def __init__(self, mcap: RunMcap, scanner: ScansFrames) -> None:
+    def __init__(self, mcap: RunMcap, scanner: FrameScanner) -> None:
         self._mcap, self._scanner = mcap, scanner
 
     def process(self, frame: Frame) -> Scan:
-        rig, scan, returns = _measured(self._scanner, frame)
-        self._mcap.write(rig, scan, returns)
+        rig, scan, peaks = _measured(self._scanner, frame)
+        self._mcap.write(rig, scan, peaks)
         return scan
 
 
@@ -205,7 +205,7 @@ def check_source_stays(folder: Path, source: str) -> None:
         raise OptionError(f"{path}: is what the run reads; write to another folder")
 
 
-def _measured(scanner: ScansFrames, frame: Frame) -> MeasuredFrame:
+def _measured(scanner: FrameScanner, frame: Frame) -> FrameOutput:
     """Return the scan of a frame, with its rig and stripes."""
     if isinstance(scanner, Replay):
         return scanner.measured(frame)
@@ -215,8 +215,8 @@ def _measured(scanner: ScansFrames, frame: Frame) -> MeasuredFrame:
         scanner = scanner.scanner
     if not isinstance(scanner, Scanner):
         raise TypeError(f"{type(scanner).__name__} does not tell its stripes")
-    returns = scanner.detect(frame)
-    return scanner.rig, scanner.measure(frame.index, frame.time_s, returns), returns
+    peaks = scanner.detect(frame)
+    return scanner.rig, scanner.measure(frame.index, frame.time_s, peaks), peaks
 
 
 _FPS_WITHOUT_CLOCK = 25.0
@@ -336,7 +336,7 @@ class RunWriters:
         self._outputs, self._overlay, self._bare_lens = outputs, overlay, bare_lens
         self._mcap, self._net = mcap, net
 
-    def recorded(self, scanner: ScansFrames) -> ScansFrames:
+    def recorded(self, scanner: FrameScanner) -> FrameScanner:
         """Return the scanner to measure with, which records its results if requested."""
         return self._mcap.recorded(scanner)
 
@@ -379,9 +379,9 @@ def writers(
     """Open everything that the run writes; it is completed however the run ends."""
     outputs = RunOutputs(
         request.out,
-        source=source_facts(source),
+        source=source_dict(source),
         rig=rig_to_mapping(rig),
-        options=request.facts(),
+        options=request.to_dict(),
         summary=summary,
     )
     with (

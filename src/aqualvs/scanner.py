@@ -11,24 +11,24 @@ from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.rig_covariance import PostureErrors, fitted_plane
 from aqualvs.optics.solved import completed_uncertainty
-from aqualvs.scanning.assignment import UNTESTED, AssignmentTest, Verdict, widened
-from aqualvs.scanning.candidates import Chunks, Readings, read_returns
+from aqualvs.scanning.assignment import NOT_TESTED, AssignmentTest, Verdict, inflate_for_rival
+from aqualvs.scanning.candidates import Candidates, Subsegments, find_candidates
 from aqualvs.scanning.detection import DetectorOptions, FrameDetector
-from aqualvs.scanning.labels import label_readings
-from aqualvs.scanning.laser_bands import SearchAxis, plan_searches, searched_range
+from aqualvs.scanning.labels import label_candidates
+from aqualvs.scanning.laser_bands import SearchAxis, plan_bands, search_range
 from aqualvs.scanning.patch import fitted_patch
 from aqualvs.scanning.posture import Posture, Reason, Refusal
-from aqualvs.scanning.posture_estimator import MIN_LINES, FitMethod, Measurement, PostureMeter
+from aqualvs.scanning.posture_estimator import MIN_LINES, FitMethod, Measurement, PostureEstimator
 from aqualvs.scanning.scan import Frame, Scan, ScanPoints
-from aqualvs.scanning.stripe import Returns, StripeOptions
+from aqualvs.scanning.stripe import StripeOptions, StripePeaks
 from aqualvs.scanning.surfaces import (
     MIN_LINES_PER_LASER,
     Surface,
     find_surfaces,
-    shares_light,
+    shares_peaks,
     surface_on,
 )
-from aqualvs.scanning.target import TargetKind, choose_target, read_as_wanted
+from aqualvs.scanning.target import TargetKind, as_requested_kind, choose_target
 from aqualvs.scanning.triangulate import Triangulator
 
 if TYPE_CHECKING:
@@ -78,14 +78,14 @@ class Scanner:
         self.rig = rig
         self.options = options or ScannerOptions()
         camera = camera or rig.camera()
-        self._searches = plan_searches(rig, camera)
-        self._detector = FrameDetector(rig.size_px, self._searches, self.options.detector)
+        self._laser_bands = plan_bands(rig, camera)
+        self._detector = FrameDetector(rig.size_px, self._laser_bands, self.options.detector)
         self._triangulator = Triangulator(rig, camera)
-        self._meter = PostureMeter(rig, self._searches, self.options.fit)
+        self._posture_estimator = PostureEstimator(rig, self._laser_bands, self.options.fit)
         self._paper_filter = self._make_paper_filter(camera)
         self._rig_errors = PostureErrors(rig, camera, completed_uncertainty(rig))
         self._assignment = AssignmentTest(
-            self._searches, self._triangulator, searched_range(rig.working_range)
+            self._laser_bands, self._triangulator, search_range(rig.working_range)
         )
 
     def process(self, frame: Frame) -> Scan:
@@ -108,8 +108,8 @@ class Scanner:
         """
         return self.measure(frame.index, frame.time_s, self.detect(frame))
 
-    def detect(self, frame: Frame) -> dict[SearchAxis, Returns]:
-        """Find the sub-pixel returns along the search lines, within the lasers' bands.
+    def detect(self, frame: Frame) -> dict[SearchAxis, StripePeaks]:
+        """Find the sub-pixel peaks along the search lines, within the lasers' bands.
 
         Raises
         ------
@@ -118,8 +118,8 @@ class Scanner:
         """
         return self._detector.detect(frame)
 
-    def measure(self, index: int, time_s: float, returns: dict[SearchAxis, Returns]) -> Scan:
-        """Measure the posture from the returns of one frame.
+    def measure(self, index: int, time_s: float, peaks: dict[SearchAxis, StripePeaks]) -> Scan:
+        """Measure the posture from the peaks of one frame.
 
         Parameters
         ----------
@@ -127,19 +127,19 @@ class Scanner:
             Of the frame.
         time_s : float
             Of the frame.
-        returns : dict
-            From `detect`; recorded returns give the same result as their frame.
+        peaks : dict
+            From `detect`; recorded peaks give the same result as their frame.
         """
         # Candidates: each peak as a point of every laser that could have made it.
-        readings = read_returns(returns, self._searches, self._triangulator)
-        found, points, listed = self._measured(readings)
+        candidates = find_candidates(peaks, self._laser_bands, self._triangulator)
+        found, points, listed = self._estimate(candidates)
         if self._paper_filter is not None:
-            # The paper's filter needs the laser of each return, which is known by now.
-            kept = np.zeros(len(readings), np.bool_)
+            # The paper's filter needs the laser of each peak, which is known by now.
+            kept = np.zeros(len(candidates), np.bool_)
             kept[listed] = _on_mesh(self._paper_filter, points)
-            readings = readings.where(kept)
-            found, points, _ = self._measured(readings)
-        posture = self._with_rig_covariance(found, readings)
+            candidates = candidates.where(kept)
+            found, points, _ = self._estimate(candidates)
+        posture = self._with_rig_covariance(found, candidates)
         return Scan(index, time_s, posture, points, self.rig.n_water)
 
     def _make_paper_filter(self, camera: Camera) -> "PaperFilter | None":
@@ -150,126 +150,150 @@ class Scanner:
         from aqualvs.scanning.paper.detector import PaperFilter
 
         every_pixel = not isinstance(self.options.detector, StripeOptions)
-        return PaperFilter(self.rig, camera, self._searches, options, every_pixel=every_pixel)
+        return PaperFilter(self.rig, camera, self._laser_bands, options, every_pixel=every_pixel)
 
-    def _measured(self, readings: Readings) -> tuple[Measurement, ScanPoints, IntArray]:
+    def _estimate(self, candidates: Candidates) -> tuple[Measurement, ScanPoints, IntArray]:
         """Return the posture, the labelled points, and the rows of their candidates."""
         # Planes that several lasers agree on, and the one that is the target.
-        chunks, chunk_index = readings.chunks()
+        subsegments, subsegment_index = candidates.subsegments()
         surfaces = find_surfaces(
-            chunks,
-            chunk_index,
-            readings.pixels,
+            subsegments,
+            subsegment_index,
+            candidates.pixels,
             len(self.rig.lasers),
-            searched_range(self.rig.working_range),
+            search_range(self.rig.working_range),
             self.rig.focal_px,
         )
-        surfaces = read_as_wanted(surfaces, self.options.target)
-        surfaces, target, doubtful = self._chosen(readings, chunks, chunk_index, surfaces)
-        tested = UNTESTED
+        surfaces = as_requested_kind(surfaces, self.options.target)
+        surfaces, target, doubtful = self._chosen(
+            candidates, subsegments, subsegment_index, surfaces
+        )
+        tested = NOT_TESTED
         if target is not None:
             # The same peaks, read as other lasers', may give a plane that is as good or better.
-            tested = self._assignment.test(readings, chunks, chunk_index, target)
+            tested = self._assignment.test(candidates, subsegments, subsegment_index, target)
             if tested.verdict is Verdict.RIVAL and tested.other is not None:
-                surfaces = self._with_rival(surfaces, target, tested.other, chunks)
-                surfaces, target, doubtful = self._chosen(readings, chunks, chunk_index, surfaces)
+                surfaces = self._with_rival(surfaces, target, tested.other, subsegments)
+                surfaces, target, doubtful = self._chosen(
+                    candidates, subsegments, subsegment_index, surfaces
+                )
         # The posture from the target's points outside crossing zones.
         if target is None:
-            found = _no_target(readings, surfaces, self.options.target)
+            found = _refuse_no_target(candidates, surfaces, self.options.target)
         elif doubtful is not None:
-            found = _ambiguous(readings, target.plane, doubtful.plane)
-        elif self._assignment.by_chance(readings, chunks, chunk_index, surfaces, target):
-            found = _by_chance(readings)
+            found = _refuse_ambiguous(candidates, target.plane, doubtful.plane)
+        elif self._assignment.is_by_chance(
+            candidates, subsegments, subsegment_index, surfaces, target
+        ):
+            found = _refuse_chance_plane(candidates)
         elif tested.verdict is Verdict.AMBIGUOUS and tested.other is not None:
-            found = _ambiguous(readings, target.plane, tested.other)
+            found = _refuse_ambiguous(candidates, target.plane, tested.other)
         else:
-            found = self._meter.measure(readings, chunk_index, target)
-            found = widened(found, tested)
+            found = self._posture_estimator.measure(candidates, subsegment_index, target)
+            found = inflate_for_rival(found, tested)
             # The mean plane of folds covers all of a net's light, nearer parts included.
-            other = None if found.folded else self._assignment.outweighed(chunks, surfaces, target)
+            other = (
+                None if found.folded else self._assignment.nearer_net(subsegments, surfaces, target)
+            )
             if other is not None and found.posture:
-                found = _ambiguous(readings, target.plane, other.plane)
-        points, listed = label_readings(
-            readings, chunk_index, surfaces, target, found, self.rig.working_range
+                found = _refuse_ambiguous(candidates, target.plane, other.plane)
+        points, listed = label_candidates(
+            candidates, subsegment_index, surfaces, target, found, self.rig.working_range
         )
         return found, points, listed
 
     def _chosen(
-        self, readings: Readings, chunks: Chunks, chunk_index: IntArray, surfaces: list[Surface]
+        self,
+        candidates: Candidates,
+        subsegments: Subsegments,
+        subsegment_index: IntArray,
+        surfaces: list[Surface],
     ) -> tuple[list[Surface], Surface | None, Surface | None]:
         """Return the surfaces, the target, and a surface before it that may be the net instead."""
         kind = self.options.target
         target = choose_target(surfaces, kind, self.rig.working_range)
         if target is None or kind is not TargetKind.AUTO:
             return surfaces, target, None
-        before = self._assignment.overlooked(readings, chunks, chunk_index, surfaces, target)
+        before = self._assignment.overlooked(
+            candidates, subsegments, subsegment_index, surfaces, target
+        )
         if before is None or not before.is_mesh:
             return surfaces, target, before
         surfaces = [before if one.members is before.members else one for one in surfaces]
         return surfaces, before, None
 
-    def _with_rig_covariance(self, found: Measurement, readings: Readings) -> Posture | Refusal:
+    def _with_rig_covariance(self, found: Measurement, candidates: Candidates) -> Posture | Refusal:
         """Return the posture with its covariance by the rig's uncertainty."""
         posture = found.posture
         if not isinstance(posture, Posture) or found.weights is None:
             return posture
-        m, points, weights = posture.normal_in_dome / posture.range, readings.points, found.weights
+        m, points, weights = (
+            posture.normal_in_dome / posture.range,
+            candidates.points,
+            found.weights,
+        )
         surface = fitted_plane(m, points)
         if found.patch is not None:
             # Heights over a patch are in metres; m·X is relative to the range.
             surface, weights = fitted_patch(found.patch, m, points), weights / posture.range**2
         covariance = self._rig_errors.covariance_of(
-            surface, readings.pixels, readings.laser, points, weights
+            surface, candidates.pixels, candidates.laser, points, weights
         )
         return replace(posture, rig_covariance=covariance)
 
     def _with_rival(
-        self, surfaces: list[Surface], target: Surface, other: Plane, chunks: Chunks
+        self, surfaces: list[Surface], target: Surface, other: Plane, subsegments: Subsegments
     ) -> list[Surface]:
         """Replace a surface by the rival that explains the picture better."""
-        rival = surface_on(other, chunks, len(self.rig.lasers), self.rig.focal_px)
+        rival = surface_on(other, subsegments, len(self.rig.lasers), self.rig.focal_px)
         kept = [
-            one for one in surfaces if one is not target and not shares_light(one, rival, chunks)
+            one
+            for one in surfaces
+            if one is not target and not shares_peaks(one, rival, subsegments)
         ]
-        return read_as_wanted([rival, *kept], self.options.target)
+        return as_requested_kind([rival, *kept], self.options.target)
 
 
 def _on_mesh(paper_filter: "PaperFilter", points: ScanPoints) -> BoolArray:
     laser = points.laser.astype(np.int64)
-    return paper_filter.apply(points.pixels, points.width, laser).returns_on_mesh(len(points))
+    return paper_filter.apply(points.pixels, points.width, laser).peaks_on_mesh(len(points))
 
 
-def _by_chance(readings: Readings) -> Measurement:
+def _refuse_chance_plane(candidates: Candidates) -> Measurement:
     detail = "the best plane is small, and lasers that should be seen on it are not"
-    return Measurement(Refusal(Reason.NOT_A_PLANE, detail), np.zeros(len(readings), np.bool_))
+    return Measurement(Refusal(Reason.NOT_A_PLANE, detail), np.zeros(len(candidates), np.bool_))
 
 
-def _ambiguous(readings: Readings, one: Plane, other: Plane) -> Measurement:
+def _refuse_ambiguous(candidates: Candidates, one: Plane, other: Plane) -> Measurement:
     apart = np.rad2deg(np.arccos(min(float(one.normal @ other.normal), 1.0)))
     detail = (
         f"planes at {one.offset:.3f} m and {other.offset:.3f} m, {apart:.1f} deg apart, explain "
         "the stripes about as well"
     )
-    return Measurement(Refusal(Reason.AMBIGUOUS, detail), np.zeros(len(readings), np.bool_))
+    return Measurement(Refusal(Reason.AMBIGUOUS, detail), np.zeros(len(candidates), np.bool_))
 
 
-def _no_target(readings: Readings, surfaces: list[Surface], wanted: TargetKind) -> Measurement:
-    refusal = _why_no_target(readings, surfaces, wanted)
-    return Measurement(refusal, np.zeros(len(readings), np.bool_))
+def _refuse_no_target(
+    candidates: Candidates, surfaces: list[Surface], wanted: TargetKind
+) -> Measurement:
+    refusal = _no_target_reason(candidates, surfaces, wanted)
+    return Measurement(refusal, np.zeros(len(candidates), np.bool_))
 
 
-def _why_no_target(readings: Readings, surfaces: list[Surface], wanted: TargetKind) -> Refusal:
-    returns, reading, readings_of = np.unique(
-        readings.source, return_index=True, return_counts=True
+def _no_target_reason(
+    candidates: Candidates, surfaces: list[Surface], wanted: TargetKind
+) -> Refusal:
+    peaks, candidate, candidates_of = np.unique(
+        candidates.source, return_index=True, return_counts=True
     )
-    if not len(returns):
+    if not len(peaks):
         return Refusal(Reason.NO_STRIPES, "no laser stripe in the picture")
     if surfaces:
         return Refusal(Reason.NO_TARGET, f"surfaces in view, but none of kind {wanted.value}")
-    if len(returns) < MIN_LINES:
-        return Refusal(Reason.TOO_FEW_POINTS, f"only {len(returns)} stripe points")
-    # Lasers with many returns that can belong to no other laser.
-    own = np.bincount(readings.laser[reading[readings_of == 1]])
+    if len(peaks) < MIN_LINES:
+        return Refusal(Reason.TOO_FEW_POINTS, f"only {len(peaks)} stripe points")
+    # Lasers with many peaks that can belong to no other laser.
+    own = np.bincount(candidates.laser[candidate[candidates_of == 1]])
     if np.count_nonzero(own >= MIN_LINES_PER_LASER) == 1:
         return Refusal(Reason.ONE_LASER, "stripes of one laser only")
-    return Refusal(Reason.NOT_A_PLANE, f"{len(returns)} stripe points share no plane")
+    return Refusal(Reason.NOT_A_PLANE, f"{len(peaks)} stripe points share no plane")

@@ -95,7 +95,7 @@ def progress(label: str, n_frames: int | None, unit: str = "frames") -> Iterator
         Call it with the number of frames completed since the last call.
     """
     if _HIDDEN.get() or not _may_be_terminal():
-        yield _tell_nobody
+        yield _echo_nothing
         return
 
     from aqualvs.terminal_bar import terminal_bar
@@ -114,5 +114,5 @@ def _may_be_terminal() -> bool:
         return False
 
 
-def _tell_nobody(n_done: int) -> None:
+def _echo_nothing(n_done: int) -> None:
     """Do nothing."""

@@ -48,7 +48,7 @@ LABEL_COLOURS: dict[Label, str] = {
 LASER_COLOURS = ("#E69F00", "#56B4E9", "#CC79A7", "#D55E00", "#0072B2", "#009E73", "#F0E442")
 
 
-def reason_words(reason: str) -> str:
+def reason_text(reason: str) -> str:
     """Return a refusal as text; an unknown reason is returned in readable form."""
     key, _, detail = reason.partition(":")
     words = REASON_WORDS.get(key.strip(), key.strip().replace("_", " ")) or "no reason given"

@@ -15,7 +15,7 @@ from batch_cases import DEMO, RESULTS, demo_dive, without_times
 
 distributed = pytest.importorskip("distributed")
 
-PATIENCE_S = 240
+TIMEOUT_S = 240
 DASK = [sys.executable, "-m", "dask"]
 QUIET = ["--no-dashboard"]
 
@@ -30,15 +30,15 @@ def begun(command, folder):
         finally:
             process.send_signal(signal.SIGTERM)
             try:
-                process.wait(timeout=PATIENCE_S)
+                process.wait(timeout=TIMEOUT_S)
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
 
 
 def await_worker(address, name, said):
-    deadline = time.monotonic() + PATIENCE_S
-    with distributed.Client(address, timeout=PATIENCE_S, set_as_default=False) as client:
+    deadline = time.monotonic() + TIMEOUT_S
+    with distributed.Client(address, timeout=TIMEOUT_S, set_as_default=False) as client:
         while name not in {w["name"] for w in client.scheduler_info()["workers"].values()}:
             assert time.monotonic() < deadline, said.read_text()
             time.sleep(0.05)
@@ -53,7 +53,7 @@ def scheduler(tmp_path):
     command = [*DASK, "scheduler", "--host", "127.0.0.1", "--port", "0", *QUIET]
     with contextlib.ExitStack() as stack:
         stack.enter_context(begun([*command, "--scheduler-file", str(told)], folder))
-        deadline = time.monotonic() + PATIENCE_S
+        deadline = time.monotonic() + TIMEOUT_S
         while not told.exists() or not told.read_text().endswith("}"):
             assert time.monotonic() < deadline, (folder / "said.txt").read_text()
             time.sleep(0.05)
@@ -118,14 +118,14 @@ def test_a_worker_may_go_and_another_come(scheduler, season, near, tmp_path):
     command = [sys.executable, "-m", "aqualvs", "batch", str(season), "-o", str(out)]
     command += ["--no-report", "--net", "--scheduler", address]
     with begun(command, tmp_path) as process:
-        deadline = time.monotonic() + PATIENCE_S
+        deadline = time.monotonic() + TIMEOUT_S
         while not list((out / ".batch" / "dives").glob("*/survey")):
             assert time.monotonic() < deadline
             assert process.poll() is None, (tmp_path / "said.txt").read_text()
             time.sleep(0.02)
         os.kill(first.pid, signal.SIGKILL)
         worker("two")
-        assert process.wait(timeout=PATIENCE_S) == 0, (tmp_path / "said.txt").read_text()
+        assert process.wait(timeout=TIMEOUT_S) == 0, (tmp_path / "said.txt").read_text()
     assert "2 finished" in (tmp_path / "said.txt").read_text()
     found = results(out)
     assert [name for name in near if found[name] != near[name]] == []

@@ -4,7 +4,13 @@ import threading
 
 import pytest
 
-from aqualvs.batch.dataset import SEAL, drafted, read_seal, seal, sealed
+from aqualvs.batch.dataset import (
+    MANIFEST,
+    drafted,
+    read_manifest,
+    read_valid_manifest,
+    write_manifest,
+)
 
 
 @pytest.fixture
@@ -12,31 +18,31 @@ def finished(tmp_path):
     folder = tmp_path / "piece"
     with drafted(folder) as draft:
         (draft / "rows.csv").write_bytes(b"0123456789")
-        seal(draft, "key", {"n": 3}, ["rows.csv"])
+        write_manifest(draft, "key", {"n": 3}, ["rows.csv"])
     return folder
 
 
 def test_finished_work_is_had_back(finished):
-    assert sealed(finished, "key") == {"n": 3}
+    assert read_valid_manifest(finished, "key") == {"n": 3}
 
 
 def test_another_key_makes_it_worthless(finished):
-    assert sealed(finished, "other") is None
+    assert read_valid_manifest(finished, "other") is None
 
 
 @pytest.mark.parametrize("content", [b"012345678", b"0123456780", b"01234567890"])
 def test_a_changed_file_makes_it_worthless(finished, content):
     (finished / "rows.csv").write_bytes(content)
-    assert sealed(finished, "key") is None
+    assert read_valid_manifest(finished, "key") is None
 
 
 def test_a_lost_file_or_a_torn_seal_makes_it_worthless(finished):
-    text = (finished / SEAL).read_text()
-    (finished / SEAL).write_text(text[: len(text) // 2])
-    assert sealed(finished, "key") is None
-    (finished / SEAL).write_text(text)
+    text = (finished / MANIFEST).read_text()
+    (finished / MANIFEST).write_text(text[: len(text) // 2])
+    assert read_valid_manifest(finished, "key") is None
+    (finished / MANIFEST).write_text(text)
     (finished / "rows.csv").unlink()
-    assert sealed(finished, "key") is None
+    assert read_valid_manifest(finished, "key") is None
 
 
 def test_work_that_is_broken_off_leaves_nothing(tmp_path):
@@ -56,7 +62,7 @@ def test_of_two_that_do_the_same_the_first_to_finish_wins(tmp_path):
     def work(word):
         with drafted(folder) as draft:
             (draft / "rows.csv").write_text(word)
-            seal(draft, "key", {"word": word}, ["rows.csv"])
+            write_manifest(draft, "key", {"word": word}, ["rows.csv"])
             ready.wait(60)
 
     threads = [threading.Thread(target=work, args=(word,)) for word in ("one", "two")]
@@ -64,7 +70,7 @@ def test_of_two_that_do_the_same_the_first_to_finish_wins(tmp_path):
         thread.start()
     for thread in threads:
         thread.join()
-    facts = sealed(folder, "key")
+    facts = read_valid_manifest(folder, "key")
     assert facts is not None
     assert facts["word"] == (folder / "rows.csv").read_text()
     assert [path.name for path in tmp_path.iterdir()] == ["piece"]
@@ -74,6 +80,6 @@ def test_new_work_takes_the_place_of_damaged_work(finished):
     (finished / "rows.csv").write_bytes(b"x")
     with drafted(finished) as draft:
         (draft / "rows.csv").write_bytes(b"0123456789")
-        seal(draft, "key", {"n": 4}, ["rows.csv"])
-    assert sealed(finished, "key") == {"n": 4}
-    assert read_seal(finished)["files"]["rows.csv"][0] == 10
+        write_manifest(draft, "key", {"n": 4}, ["rows.csv"])
+    assert read_valid_manifest(finished, "key") == {"n": 4}
+    assert read_manifest(finished)["files"]["rows.csv"][0] == 10

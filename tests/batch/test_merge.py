@@ -5,9 +5,9 @@ import pytest
 import yaml
 
 from aqualvs.batch.cluster import WorkersLostError
-from aqualvs.batch.dataset import holds_dive, read_seal
+from aqualvs.batch.dataset import holds_dive, read_manifest
 from aqualvs.batch.dives import DiveState
-from aqualvs.batch.scheduler import Season, look
+from aqualvs.batch.scheduler import Scheduler, look
 from aqualvs.optics.rigfile import load_rig, save_rig
 from aqualvs.pipeline import run
 from aqualvs.results.run_request import scanner_options
@@ -46,7 +46,7 @@ def serial(dive, net_file, tmp_path_factory):
 def season(works, workers=None):
     listener = Listener()
     sized = [(work, 1000) for work in works]
-    return Season(sized, workers or InlineWorkers(), listener).run(lambda: False), listener
+    return Scheduler(sized, workers or InlineWorkers(), listener).run(lambda: False), listener
 
 
 def same_files(one, other, names=RESULTS):
@@ -110,7 +110,7 @@ def test_workers_that_always_die_fail_the_dive(tmp_path, dive):
 def test_a_batch_that_was_stopped_goes_on(tmp_path, dive, net_file, serial):
     work = work_for(tmp_path, dive, **options(net_file))
     first = InlineWorkers()
-    stopped = Season([(work, 1)], first, Listener())
+    stopped = Scheduler([(work, 1)], first, Listener())
     records = stopped.run(lambda: first.done.count("measure_piece") == 2)
     assert records["dive"].state is DiveState.UNFINISHED
     kept = list(work.home.glob("pieces-*/*/done.json"))
@@ -125,7 +125,7 @@ def test_a_batch_that_was_stopped_goes_on(tmp_path, dive, net_file, serial):
 def test_a_damaged_piece_is_measured_again(tmp_path, dive, net_file, serial):
     work = work_for(tmp_path, dive, **options(net_file))
     first = InlineWorkers()
-    Season([(work, 1)], first, Listener()).run(lambda: first.done.count("measure_piece") == 3)
+    Scheduler([(work, 1)], first, Listener()).run(lambda: first.done.count("measure_piece") == 3)
     piece = next(work.home.glob("pieces-*/*"))
     rows = (piece / "posture.csv").read_bytes()
     (piece / "posture.csv").write_bytes(rows.replace(b"1", b"2", 1))
@@ -239,6 +239,6 @@ def test_a_fault_of_ours_fails_the_dive_alone(tmp_path, dive):
 def test_a_seal_tells_what_the_work_cost(tmp_path, dive):
     work = work_for(tmp_path, dive)
     season([work])
-    facts = read_seal(work.home / "joined")["facts"]
+    facts = read_manifest(work.home / "joined")["facts"]
     assert facts["cpu_s"] > 0.0
     assert facts["peak_bytes"] > 50e6

@@ -11,7 +11,7 @@ from aqualvs.batch.dataset import drop_dive, holds_dive, put_dive, write_dives
 from aqualvs.batch.dives import DiveRecord, DiveState
 from aqualvs.batch.summary_page import range_steps, range_svg, write_summary
 from aqualvs.results.folder import PostureCsv
-from aqualvs.results.points import PointsJournal, export_points
+from aqualvs.results.points import PointsStream, export_points
 from aqualvs.scanning.posture import Reason
 from shell_cases import scan
 
@@ -48,13 +48,13 @@ def dataset(tmp_path_factory):
     for k, name in enumerate(NAMES):
         run = folder / name
         run.mkdir()
-        journal = run / "points.arrows"
-        with PostureCsv(run / "posture.csv") as rows, PointsJournal(journal) as points:
+        points_stream = run / "points.arrows"
+        with PostureCsv(run / "posture.csv") as rows, PointsStream(points_stream) as points:
             for i in range(6):
                 one = scan(i, 20 + k, reason=Reason.ONE_LASER if i == 3 else None)
                 rows.write(one)
                 points.write(one)
-        export_points(journal, run / "points.parquet", run / "points.ply")
+        export_points(points_stream, run / "points.parquet", run / "points.ply")
         put_dive(folder / "dataset", name, run)
     return folder / "dataset"
 

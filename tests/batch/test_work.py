@@ -8,9 +8,9 @@ import pytest
 from pyarrow import dataset as arrow_dataset
 
 from aqualvs.batch.dives import DiveState
-from aqualvs.batch.scheduler import Season, known_net
+from aqualvs.batch.scheduler import Scheduler, known_net
 from aqualvs.batch.summary_page import write_summary
-from aqualvs.batch.work import survey
+from aqualvs.batch.work import probe
 from aqualvs.errors import OptionError
 from aqualvs.net_survey.command import NetSource, net_of_run
 from aqualvs.nets.target_file import NetRequest, net_request
@@ -30,7 +30,7 @@ def dive(tmp_path_factory):
 def season(work):
     """How the dive stands after a batch, and what was done."""
     workers, listener = InlineWorkers(), Listener()
-    records = Season([(work, 1000)], workers, listener).run(lambda: False)
+    records = Scheduler([(work, 1000)], workers, listener).run(lambda: False)
     return records[work.name], workers.done, listener.lines
 
 
@@ -63,7 +63,7 @@ def test_it_is_what_the_net_command_tells(tmp_path, told):
     assert record.state is DiveState.FINISHED
     assert record.net["n_stretches"] >= 1
     assert record.net["bar_mm"] == pytest.approx(25.0, abs=1.0)
-    assert record.net_words() in lines[0]
+    assert record.net_text() in lines[0]
     assert '<section id="net">' in (out / "report.html").read_text()
 
 
@@ -86,7 +86,7 @@ def test_it_is_in_the_data_set_and_on_the_page(told):
     assert row["net_bar_mm"] == record.net["bar_mm"]
     assert row["net_holes"] == record.net["n_holes"]
     page = write_summary(folder, [record]).read_text()
-    assert f'<a href="dives/dive/net_map.png" title="map of the net">{record.net_words()}' in page
+    assert f'<a href="dives/dive/net_map.png" title="map of the net">{record.net_text()}' in page
 
 
 def test_another_batch_takes_it_as_it_is(finished):
@@ -126,7 +126,7 @@ def test_a_batch_that_does_not_ask_still_knows_it(finished):
     record, done, _ = season(replace(finished, request=request))
     assert done == ["look"]
     assert record.net["n_stretches"] >= 1
-    key = survey(finished).key
+    key = probe(finished).key
     assert known_net(finished.home, key)["net"] == record.net
     assert known_net(finished.home, f"{key[:-1]}x") == {}
 

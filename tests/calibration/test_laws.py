@@ -18,7 +18,7 @@ from aqualvs.optics.rig import Rig, RigUncertainty
 from aqualvs.simulation.scenarios import bluerov2_rig, example_rig
 from dome_cases import AIR, INTRINSICS, WATER, board_points, guessed, rail, see
 
-QUICK = DomeOptions(check_held_back=False)
+QUICK = DomeOptions(check_cross_validation=False)
 turns = st.tuples(*[st.floats(-3.0, 3.0)] * 3).map(np.array)
 rigs = st.sampled_from([example_rig(), bluerov2_rig()])
 media = st.sampled_from([AIR, WATER])

@@ -12,7 +12,7 @@ import pytest
 from rich.console import Console
 
 from aqualvs.check.finding import Severity
-from aqualvs.check.rig import age_words, check_rig, run_check
+from aqualvs.check.rig import age_text, check_rig, run_check
 from aqualvs.errors import RigError
 from aqualvs.optics.rig import Rig, RigUncertainty
 from aqualvs.optics.rigfile import save_rig
@@ -131,7 +131,7 @@ def test_what_is_not_written_down_is_named() -> None:
     ],
 )
 def test_ages_in_words(days: float, words: str) -> None:
-    assert age_words(NOW - timedelta(days=days), NOW) == words
+    assert age_text(NOW - timedelta(days=days), NOW) == words
 
 
 def page_of(rig: Rig, folder: Path) -> list[str]:

@@ -18,7 +18,7 @@ pytest.importorskip("distributed")
 
 PROGRAM = [sys.executable, "-m", "aqualvs", "batch"]
 # The first run on a machine compiles its kernels.
-PATIENCE_S = 240
+TIMEOUT_S = 240
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +74,7 @@ def test_an_interrupted_batch_whose_workers_are_killed_gives_what_runs_give(tmp_
         said = first.stdout.readline()
         # As a terminal does it: to the workers too.
         os.killpg(first.pid, signal.SIGINT)
-        rest, errors = first.communicate(timeout=PATIENCE_S)
+        rest, errors = first.communicate(timeout=TIMEOUT_S)
     assert first.returncode == 130, errors
     assert "the same command goes on from here" in rest
     assert "Traceback" not in errors
@@ -85,7 +85,7 @@ def test_an_interrupted_batch_whose_workers_are_killed_gives_what_runs_give(tmp_
         over = threading.Event()
 
         def kill_one():
-            until = time.monotonic() + PATIENCE_S
+            until = time.monotonic() + TIMEOUT_S
             homes = out / ".batch" / "dives"
             while not over.is_set() and time.monotonic() < until:
                 if len(list(homes.glob("*/survey"))) >= 2 and (pids := workers_of(second)):
@@ -96,7 +96,7 @@ def test_an_interrupted_batch_whose_workers_are_killed_gives_what_runs_give(tmp_
 
         killer = threading.Thread(target=kill_one)
         killer.start()
-        told, errors = second.communicate(timeout=PATIENCE_S)
+        told, errors = second.communicate(timeout=TIMEOUT_S)
         over.set()
         killer.join()
     assert killed
@@ -168,5 +168,5 @@ def test_a_reader_that_has_seen_enough_is_no_fault(season, tmp_path):
         process.stdout.readline()
         process.stdout.close()
         errors = process.stderr.read()
-        process.wait(timeout=PATIENCE_S)
+        process.wait(timeout=TIMEOUT_S)
     assert errors == ""

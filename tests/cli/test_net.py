@@ -16,7 +16,7 @@ from aqualvs.nets.target_file import NetRequest
 from aqualvs.optics.rigfile import rig_to_mapping
 from aqualvs.results.folder import NET_FILES, RunOutputs
 from aqualvs.results.net_survey import NetPass, read_run
-from aqualvs.results.points import PointsJournal
+from aqualvs.results.points import PointsStream
 from aqualvs.simulation.scenarios import example_rig
 from aqualvs.simulation.scene import Net
 from net_cases import passing
@@ -178,9 +178,9 @@ def test_a_killed_run_is_completed_first(scans, tmp_path, capsys):
     folder = write_run(tmp_path / "run", scans[:FEW])
     content = yaml.safe_load((folder / "run.yaml").read_text())
     (folder / "points.parquet").unlink()
-    with PointsJournal(folder / "points.arrows") as journal:
+    with PointsStream(folder / "points.arrows") as points_stream:
         for scan in scans[:FEW]:
-            journal.write(scan)
+            points_stream.write(scan)
     (folder / "run.yaml").write_text(yaml.safe_dump(content | {"status": "running"}))
     assert main(["net", str(folder)]) == 0
     assert "points completed" in capsys.readouterr().out

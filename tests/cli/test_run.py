@@ -30,7 +30,7 @@ from shell_cases import (
 
 PROGRAM = [sys.executable, "-m", "aqualvs"]
 # The first run on a machine compiles its kernels.
-PATIENCE_S = 240
+TIMEOUT_S = 240
 
 
 @pytest.fixture
@@ -231,7 +231,7 @@ def under_way(source, rig, out, *, limit=None):
         arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=limit
     )
     try:
-        deadline = time.monotonic() + PATIENCE_S
+        deadline = time.monotonic() + TIMEOUT_S
         table = out / "posture.csv"
         while not (table.exists() and table.read_bytes().count(b"\n") > 20):
             assert process.poll() is None, process.stderr.read()
@@ -252,7 +252,7 @@ def test_a_stopped_run_is_complete(long_dive, rig, tmp_path, number, code):
     out = tmp_path / "out"
     with under_way(long_dive, rig, out) as process:
         process.send_signal(number)
-        said, complaint = process.communicate(timeout=PATIENCE_S)
+        said, complaint = process.communicate(timeout=TIMEOUT_S)
     assert process.returncode == code
     assert complaint == ""
     assert f"stopped by {number.name} after {len(rows(out))} frames" in said
@@ -310,7 +310,7 @@ def test_ctrl_c_reaches_the_processes_of_a_run_and_does_nothing_there(long_dive,
     with under_way(long_dive, rig, out) as process:
         for pid in [*children_of(process.pid), process.pid]:
             os.kill(pid, signal.SIGINT)
-        _, complaint = process.communicate(timeout=PATIENCE_S)
+        _, complaint = process.communicate(timeout=TIMEOUT_S)
     assert process.returncode == 130
     assert complaint == ""
     assert run_file(out)["status"] == "interrupted"
@@ -331,7 +331,7 @@ def test_a_full_disk_is_said_and_what_is_there_can_be_read(long_dive, rig, tmp_p
         resource.setrlimit(resource.RLIMIT_FSIZE, (4_000_000, 4_000_000))
 
     with under_way(long_dive, rig, out, limit=limit) as process:
-        _, complaint = process.communicate(timeout=PATIENCE_S)
+        _, complaint = process.communicate(timeout=TIMEOUT_S)
     assert process.returncode == 2
     assert complaint.count("\n") == 1
     assert "disk is full" in complaint

@@ -13,7 +13,7 @@ from aqualvs.control.safety import AnswerLimits, AnswerWatch, LimitReason
 from aqualvs.control.vehicle import NEUTRAL, Effort, Setpoint
 from aqualvs.errors import OptionError
 from aqualvs.follow.case import SimCase, sea, vehicle_model
-from aqualvs.follow.sensor_model import Blind, LossOfSight, SampledEye
+from aqualvs.follow.sensor_model import Blind, LossOfSight, SampledSensor
 from aqualvs.scanning.posture import Posture
 from control_cases import FRAME_S, posture_at, state_at
 
@@ -109,7 +109,7 @@ def frozen_hold(
         start_range=before,
         seed=seed,
     )
-    eye = SampledEye(
+    eye = SampledSensor(
         case.net, np.random.default_rng(seed), blind=(Blind(freeze_s, math.inf, loss),)
     )
     loop, decisions = case.loop(eye, mission), []

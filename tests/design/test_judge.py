@@ -25,7 +25,7 @@ from aqualvs.geometry.transforms import SE3
 from aqualvs.optics.camera import parameter_names
 from aqualvs.optics.lens import Lens
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Laser, Rig, rig_moved_by
-from aqualvs.scanning.laser_bands import SearchAxis, plan_searches
+from aqualvs.scanning.laser_bands import SearchAxis, plan_bands
 from aqualvs.scanning.plane_fit import SharedError, fit_robust
 from aqualvs.scanning.posture import range_pitch_yaw
 from aqualvs.scanning.triangulate import Triangulator
@@ -73,10 +73,10 @@ class Wall:
 
     def __init__(self, rig: Rig, wall_range: float) -> None:
         camera = rig.camera()
-        searches = plan_searches(rig, camera)
+        laser_bands = plan_bands(rig, camera)
         wall = Plane(np.array([0.0, 1.0, 0.0]), wall_range)
         pixels, along_x, laser, place = [], [], [], []
-        for i, (one, search) in enumerate(zip(rig.lasers, searches, strict=True)):
+        for i, (one, search) in enumerate(zip(rig.lasers, laser_bands, strict=True)):
             line, position = lit_stripe(rig, search, one.plane, wall, everywhere)
             is_row = search.axis is SearchAxis.ALONG_X
             pixels.append(np.stack([position, line] if is_row else [line, position], axis=-1))

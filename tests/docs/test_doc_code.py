@@ -20,7 +20,7 @@ from aqualvs.calibration.targets.target_files import load_board, load_box
 from aqualvs.control.plan import load_plan
 from aqualvs.live.options import load_vehicle
 from aqualvs.optics.rigfile import load_rig
-from aqualvs.pipeline import run_and_tell
+from aqualvs.pipeline import run_and_print
 from aqualvs.results.run_request import FrameWindow, RunRequest
 from doc_blocks import ROOT, Block, blocks
 
@@ -43,7 +43,7 @@ def folder(tmp_path_factory):
         mcap=True,
         report=False,
     )
-    assert run_and_tell(request, lambda _line: None) == 0
+    assert run_and_print(request, lambda _line: None) == 0
     shutil.copy(folder / "run" / "dive.mcap", folder / "dive.mcap")
     (folder / "dive.tlog").write_bytes(vehicle_log())
     return folder

@@ -23,7 +23,7 @@ from aqualvs.experiments import simulate
 from aqualvs.simulation.scenario import Scenario
 from aqualvs.simulation.scenarios import load_scenario
 from doc_blocks import PAGES, ROOT, Command, all_commands, commands
-from waiting import PATIENCE_S
+from waiting import TIMEOUT_S
 
 ELSEWHERE = {
     r"^(live|doctor) ": "needs a stream: tests/live",
@@ -126,7 +126,7 @@ def run(command: Command, folder: Path) -> None:
         capture_output=True,
         text=True,
         # The first of them compile most kernels.
-        timeout=5 * PATIENCE_S,
+        timeout=5 * TIMEOUT_S,
         env={**os.environ, "OMP_NUM_THREADS": "1"},
     )
     assert done.returncode == 0, f"{command}\n{done.stdout[-800:]}{done.stderr[-800:]}"

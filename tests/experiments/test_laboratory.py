@@ -6,7 +6,7 @@ import pytest
 from aqualvs.experiments.dome_or_not import Distances, _calibrated_without, distances, level_laser
 from aqualvs.experiments.laboratory import Laboratory, MeasuredDive, Variant, told
 from aqualvs.experiments.mesh_filter import LitTruth, judge_pixels, judge_reflections, mean_judged
-from aqualvs.scanning.paper.detector import FilteredPoints
+from aqualvs.scanning.paper.detector import FilteredPeaks
 from aqualvs.scanning.posture import Reason, Refusal
 from aqualvs.scanning.scan import Scan, ScanPoints
 from aqualvs.simulation.scenario import parse_scenario
@@ -41,7 +41,7 @@ def blobs(kept):
     pixels = (centres[:, None] + offsets).reshape(-1, 2)
     on_mesh = (np.arange(9) < np.array(kept)[:, None]).ravel()
     zeros = np.zeros(len(pixels), np.int64)
-    return FilteredPoints(zeros, zeros, pixels, np.zeros((len(pixels), 3)), on_mesh)
+    return FilteredPeaks(zeros, zeros, pixels, np.zeros((len(pixels), 3)), on_mesh)
 
 
 def test_reflections_count_as_most_of_their_pixels_do():

@@ -15,8 +15,8 @@ from aqualvs.control.missions import HoldMission
 from aqualvs.control.vehicle import Setpoint, SetpointHolder
 from aqualvs.follow.case import SimCase, vehicle_model
 from aqualvs.follow.command import FOLLOW_CSV, LoopPage
-from aqualvs.follow.loop import Eye
-from aqualvs.follow.sensor_model import RenderedEye, SampledEye
+from aqualvs.follow.loop import RangeSensor
+from aqualvs.follow.sensor_model import RenderedSensor, SampledSensor
 from aqualvs.simulation.cameras import IDEAL, simulated_camera
 from aqualvs.simulation.scenarios import example_rig
 from aqualvs.sources.base import State
@@ -24,16 +24,18 @@ from browser import open_page
 from live_cases import Collector
 
 # A vehicle takes seconds to its setpoint; a busy machine more.
-PATIENCE_S = 120.0
+TIMEOUT_S = 120.0
 HELD = Setpoint(0.6)
 
 
-def shown(eye: Eye, case: SimCase, seconds: float) -> tuple[Collector, LoopPage, SetpointHolder]:
+def shown(
+    sensor: RangeSensor, case: SimCase, seconds: float
+) -> tuple[Collector, LoopPage, SetpointHolder]:
     """Run a loop for a page that keeps what it is sent."""
     rig, collector = example_rig(), Collector()
     holder = SetpointHolder(rig.working_range)
     holder.put(HELD)
-    loop = case.loop(eye, HoldMission(HELD))
+    loop = case.loop(sensor, HoldMission(HELD))
     page = LoopPage(collector, rig, loop, holder)
     loop.on_step = page.take
 
@@ -52,9 +54,9 @@ def still_case() -> SimCase:
 
 def test_every_step_is_shown_when_the_clock_has_come_to_it() -> None:
     case = still_case()
-    eye = SampledEye(case.net, np.random.default_rng(3))
+    sensor = SampledSensor(case.net, np.random.default_rng(3))
     began = time.monotonic()
-    collector, page, _ = shown(eye, case, 1.5)
+    collector, page, _ = shown(sensor, case, 1.5)
     # The last of 38 frames is exposed then.
     assert time.monotonic() - began >= 37 / 25
     samples = collector.samples
@@ -78,8 +80,8 @@ def test_every_step_is_shown_when_the_clock_has_come_to_it() -> None:
 
 def test_rendered_pictures_come_with_their_own_points() -> None:
     case = still_case()
-    eye = RenderedEye(case.net, example_rig(), np.random.default_rng(3))
-    collector, _, _ = shown(eye, case, 0.2)
+    sensor = RenderedSensor(case.net, example_rig(), np.random.default_rng(3))
+    collector, _, _ = shown(sensor, case, 0.2)
     assert len(collector.samples) >= 3
     for sample in collector.samples:
         assert sample.frame is not None
@@ -91,9 +93,9 @@ def test_rendered_pictures_are_those_of_the_chosen_camera() -> None:
     case = still_case()
     lumas = []
     for camera in (IDEAL, simulated_camera("pal")):
-        eye = RenderedEye(case.net, example_rig(), np.random.default_rng(3), camera=camera)
-        shown(eye, case, 0.1)
-        lumas.append(np.asarray(eye.shots[0][0].luma))
+        sensor = RenderedSensor(case.net, example_rig(), np.random.default_rng(3), camera=camera)
+        shown(sensor, case, 0.1)
+        lumas.append(np.asarray(sensor.shots[0][0].luma))
     assert np.abs(lumas[0].astype(int) - lumas[1]).mean() > 5.0
 
 
@@ -113,17 +115,17 @@ def test_a_browser_shows_the_loop_and_moves_its_setpoint(tmp_path: Path) -> None
                 page.call("Page.navigate", url=address)
                 page.wait_for("document.getElementById('numbers').dataset.valid === '1'")
                 near = "Math.abs(document.getElementById('numbers').dataset.range - {}) < 0.04"
-                page.wait_for(near.format(0.6), PATIENCE_S)
+                page.wait_for(near.format(0.6), TIMEOUT_S)
                 page.wait_for(
                     "document.getElementById('parts').innerHTML.includes('holding: 0.60 m')"
                 )
                 page.evaluate("document.getElementById('set-range').value = '0.75'")
                 page.evaluate("document.getElementById('setpoint').requestSubmit()")
-                page.wait_for(near.format(0.75), PATIENCE_S)
+                page.wait_for(near.format(0.75), TIMEOUT_S)
                 page.screenshot(tmp_path / "page.png")
                 assert page.said == []
             process.send_signal(signal.SIGTERM)
-            assert process.wait(PATIENCE_S) == 0
+            assert process.wait(TIMEOUT_S) == 0
         finally:
             process.kill()
             reader.join()

@@ -51,7 +51,7 @@ def test_hold_measures_of_a_sine() -> None:
     # Whole periods: the rms of a sine is its amplitude over root 2.
     assert found.range_rms == pytest.approx(0.02 / math.sqrt(2.0), rel=0.01)
     assert found.range_worst == pytest.approx(0.02, rel=0.01)
-    assert found.least_clearance == pytest.approx(0.58, abs=1e-4)
+    assert found.min_clearance == pytest.approx(0.58, abs=1e-4)
     assert (found.n_lost, found.n_guarded) == (1, 1)
 
 

@@ -17,7 +17,7 @@ from aqualvs.follow.case import SimCase, sea, tuned_gains, vehicle_model
 from aqualvs.follow.log import NEUTRAL_WITHIN_S, LoopLog, LoopRow, write_log
 from aqualvs.follow.loop import SimulatedLoop, Timing
 from aqualvs.follow.monte_carlo import random_dive
-from aqualvs.follow.sensor_model import Blind, LossOfSight, PostureNoise, SampledEye
+from aqualvs.follow.sensor_model import Blind, LossOfSight, PostureNoise, SampledSensor
 from aqualvs.scanning.posture import Posture, Reason
 from aqualvs.simulation.net_motion import NetWall
 from aqualvs.simulation.vehicle.water_motion import WaterMotion
@@ -29,15 +29,15 @@ ROUGH = replace(CALM, water=sea(seed=3))
 
 
 def loop_of(case: SimCase, blind: tuple[Blind, ...] = ()) -> SimulatedLoop:
-    eye = SampledEye(case.net, np.random.default_rng(5), blind=blind)
-    return case.loop(eye, HoldMission(Setpoint(0.6)))
+    sensor = SampledSensor(case.net, np.random.default_rng(5), blind=blind)
+    return case.loop(sensor, HoldMission(Setpoint(0.6)))
 
 
 def test_eye_has_the_noise_that_it_claims() -> None:
     net = NetWall(curvature=-0.1)
-    eye = SampledEye(net, np.random.default_rng(1))
+    sensor = SampledSensor(net, np.random.default_rng(1))
     dome = net.station(0.7, yaw=0.1)
-    seen = [eye.look(dome, 0.0) for _ in range(2000)]
+    seen = [sensor.look(dome, 0.0) for _ in range(2000)]
     postures = [one for one in seen if isinstance(one, Posture)]
     assert len(postures) == len(seen)
     values = np.array([(one.range, one.pitch, one.yaw) for one in postures])
@@ -50,15 +50,15 @@ def test_eye_has_the_noise_that_it_claims() -> None:
 def test_eye_loses_target_and_stream_when_told_to() -> None:
     net = NetWall()
     blind = (Blind(1.0, 2.0), Blind(3.0, 4.0, LossOfSight.STREAM))
-    eye = SampledEye(net, np.random.default_rng(1), PostureNoise(), blind)
+    sensor = SampledSensor(net, np.random.default_rng(1), PostureNoise(), blind)
     near, far = net.station(0.6), net.station(1.5)
-    assert eye.look(near, 0.5)
-    lost = eye.look(near, 1.5)
+    assert sensor.look(near, 0.5)
+    lost = sensor.look(near, 1.5)
     assert not lost
     assert lost is not None
     assert lost.reason is Reason.TOO_FEW_POINTS
-    assert eye.look(near, 3.5) is None
-    away = eye.look(far, 5.0)
+    assert sensor.look(near, 3.5) is None
+    away = sensor.look(far, 5.0)
     assert not isinstance(away, Posture)
     assert away is not None
     assert away.reason is Reason.OUT_OF_RANGE

@@ -26,7 +26,7 @@ from live_cases import demo_frames, demo_rig
 from ports import free_port
 from repository import HELPERS
 from shell_cases import write_video
-from waiting import PATIENCE_S
+from waiting import TIMEOUT_S
 
 pytest.importorskip("pymavlink")
 
@@ -68,7 +68,7 @@ def clip(tmp_path_factory: pytest.TempPathFactory, pictures: list[np.ndarray]) -
         stream = container.add_stream_from_template(source.streams.video[0])
         packets = [packet for packet in source.demux(video=0) if packet.size]
         assert packets[0].is_keyframe
-        for i in range(round(PATIENCE_S * FPS)):
+        for i in range(round(TIMEOUT_S * FPS)):
             packet = av.Packet(bytes(packets[i % N_FRAMES]))
             packet.stream, packet.time_base = stream, Fraction(1, FPS)
             packet.pts = packet.dts = i
@@ -96,7 +96,7 @@ class Follow:
     told: list[str] = field(default_factory=list)
 
     def wait(self, words: str, n_before: int = 0) -> None:
-        until(lambda: any(words in line for line in self.told[n_before:]), words, PATIENCE_S)
+        until(lambda: any(words in line for line in self.told[n_before:]), words, TIMEOUT_S)
 
     def press(self) -> str:
         """Press Enter; return the answer."""
@@ -104,12 +104,12 @@ class Follow:
         n = len(self.told)
         self.process.stdin.write("\n")
         self.process.stdin.flush()
-        until(lambda: len(self.told) > n, "an answer", PATIENCE_S)
+        until(lambda: len(self.told) > n, "an answer", TIMEOUT_S)
         return self.told[n]
 
     def engage(self) -> None:
         """Press Enter until the vehicle has been heard."""
-        end = time.monotonic() + PATIENCE_S
+        end = time.monotonic() + TIMEOUT_S
         while (answer := self.press()) != "engaged":
             assert "not engaged" in answer
             assert time.monotonic() < end
@@ -168,7 +168,7 @@ def test_steers_by_a_video_until_told_to_end(clip: Path, tmp_path: Path) -> None
             again = time.monotonic()
             until(lambda: len(sticks(fake, again)) > 3, "efforts again")
             one.process.send_signal(signal.SIGTERM)
-            assert one.process.wait(PATIENCE_S) == 0
+            assert one.process.wait(TIMEOUT_S) == 0
         ended = time.monotonic()
         until(lambda: len(fake.steered()) > 3 and is_neutral(fake.steered()[-1]), "neutral")
         time.sleep(0.2)
@@ -203,7 +203,7 @@ def test_a_vehicle_file_says_who_steers(clip: Path, tmp_path: Path) -> None:
             until(
                 lambda: "set MAV_GCS_SYSID 255, or ground_station 250" in one.press(),
                 "the reason why not",
-                PATIENCE_S,
+                TIMEOUT_S,
             )
         file.write_text("aqualvs_vehicle: 1\nground_station: 250\n", encoding="utf-8")
         with follow(fake, clip, tmp_path / "obeyed", "--vehicle-file", str(file)) as one:
@@ -243,12 +243,12 @@ def test_a_picture_that_stands_still_ends_the_thrust(freezing: Path, tmp_path: P
             ) as stream:
                 try:
                     until(lambda: len(sticks(fake)) > 20, "efforts")
-                    told, _ = stream.communicate("\n", timeout=PATIENCE_S)
+                    told, _ = stream.communicate("\n", timeout=TIMEOUT_S)
                 finally:
                     stream.kill()
             n_sent = json.loads(told.splitlines()[-1])["frames"]
             one.process.send_signal(signal.SIGTERM)
-            one.process.wait(PATIENCE_S)
+            one.process.wait(TIMEOUT_S)
     finally:
         fake.stop()
     with (tmp_path / FOLLOW_CSV).open(encoding="utf-8") as file:

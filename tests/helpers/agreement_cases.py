@@ -6,7 +6,7 @@ from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.transforms import rotation_from_rotvec
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.sheet import Sheet, sheets_of
-from aqualvs.scanning.laser_bands import SearchAxis, plan_searches
+from aqualvs.scanning.laser_bands import SearchAxis, plan_bands
 from aqualvs.scanning.plane_fit import SOLID_ERROR, fit_robust
 from aqualvs.scanning.posture import Posture, Reason, Refusal, posture_from_fit
 from aqualvs.scanning.scan import Scan, ScanPoints
@@ -57,14 +57,14 @@ class Diver:
     def __init__(self, seen_by: Rig, read_by: Rig) -> None:
         self._read_by = read_by
         self._camera, self._sheets = seen_by.camera(), sheets_of(seen_by)
-        searches = plan_searches(seen_by, self._camera)
-        self.along_x = np.array([one.axis is SearchAxis.ALONG_X for one in searches], np.int64)
+        laser_bands = plan_bands(seen_by, self._camera)
+        self.along_x = np.array([one.axis is SearchAxis.ALONG_X for one in laser_bands], np.int64)
         self._triangulator = Triangulator(read_by, read_by.camera())
         self._axis = read_by.dome_from_cam.rotate([0.0, 0.0, 1.0])
 
     def scan(self, target: Target, index: int = 0, noise_px: float = 0.1) -> Scan:
         """Scan of a target; nothing but the target's stripes is seen."""
-        px, laser = self._returns(target, np.random.default_rng([3, index]), noise_px)
+        px, laser = self._peaks(target, np.random.default_rng([3, index]), noise_px)
         found = self._triangulator.triangulate(px, self.along_x[laser], laser)
         good = found.valid
         px, laser, points = px[good], laser[good], found.points_in_dome[good]
@@ -94,7 +94,7 @@ class Diver:
             posture = posture_from_fit(fit, points, self._axis)
         return Scan(index, 0.04 * index, posture, read, self._read_by.n_water)
 
-    def _returns(
+    def _peaks(
         self, target: Target, rng: np.random.Generator, noise_px: float
     ) -> tuple[FloatArray, IntArray]:
         pixels, lasers = [], []

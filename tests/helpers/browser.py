@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 from websockets.sync.client import ClientConnection, connect
 
-from waiting import PATIENCE_S
+from waiting import TIMEOUT_S
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 FLAGS = (
@@ -64,7 +64,7 @@ class Page:
         message = {"id": number, "method": method, "params": parameters}
         self._connection.send(json.dumps(message))
         while True:
-            answer = json.loads(self._connection.recv(timeout=PATIENCE_S))
+            answer = json.loads(self._connection.recv(timeout=TIMEOUT_S))
             if answer.get("id") == number:
                 if "error" in answer:
                     raise RuntimeError(answer["error"]["message"])
@@ -77,7 +77,7 @@ class Page:
             raise RuntimeError(str(found["exceptionDetails"]))
         return found["result"].get("value")
 
-    def wait_for(self, script: str, seconds: float = PATIENCE_S) -> Any:
+    def wait_for(self, script: str, seconds: float = TIMEOUT_S) -> Any:
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             # While the page loads, elements that the script looks for are missing.
@@ -123,11 +123,11 @@ def open_page(profile: Path) -> Iterator[Page]:
             yield Page(connection)
     finally:
         browser.terminate()
-        browser.wait(PATIENCE_S)
+        browser.wait(TIMEOUT_S)
 
 
 def _pages(address: str) -> list[dict[str, Any]]:
-    with urllib.request.urlopen(address, timeout=PATIENCE_S) as answer:
+    with urllib.request.urlopen(address, timeout=TIMEOUT_S) as answer:
         found = [one for one in json.load(answer) if one["type"] == "page"]
     if not found:
         raise OSError("no page yet")
@@ -135,7 +135,7 @@ def _pages(address: str) -> list[dict[str, Any]]:
 
 
 def _wait(look: Callable[[], Any]) -> Any:
-    end = time.monotonic() + PATIENCE_S
+    end = time.monotonic() + TIMEOUT_S
     while True:
         try:
             return look()

@@ -29,7 +29,7 @@ from aqualvs.scanning.scan import Scan, ScanPoints
 from aqualvs.sources.base import Health
 from fake_ardusub import PARAMETERS
 from live_cases import demo_rig
-from waiting import PATIENCE_S
+from waiting import TIMEOUT_S
 
 FRAME_S = 0.04
 HELD = Setpoint(0.6)
@@ -56,7 +56,7 @@ AT_START = {
 STEERED = ("MANUAL_CONTROL", "SET_POSITION_TARGET_LOCAL_NED")
 
 
-def until(condition: Callable[[], object], what: str, patience_s: float = PATIENCE_S) -> None:
+def until(condition: Callable[[], object], what: str, patience_s: float = TIMEOUT_S) -> None:
     end = time.monotonic() + patience_s
     while not condition():
         assert time.monotonic() < end, f"{what} did not happen"
@@ -114,8 +114,8 @@ class Fake:
 
     def stop(self) -> None:
         self.process.kill()
-        self.process.wait(PATIENCE_S)
-        self._reader.join(PATIENCE_S)
+        self.process.wait(TIMEOUT_S)
+        self._reader.join(TIMEOUT_S)
         for pipe in (self.process.stdin, self.process.stdout):
             if pipe is not None:
                 with contextlib.suppress(BrokenPipeError):
@@ -170,7 +170,7 @@ def sample(
     return LiveSample(
         rig=rig,
         scan=Scan(i, FRAME_S * i, seen, ScanPoints.none(), rig.n_water),
-        returns={},
+        peaks={},
         frame=None,
         utc_ns=0,
         instants=Instants(arrived_ns, arrived_ns, arrived_ns),
@@ -269,7 +269,7 @@ class Dive:
 
     def close(self) -> None:
         self._stop.set()
-        self._thread.join(PATIENCE_S)
+        self._thread.join(TIMEOUT_S)
         self.pilot.close()
         self.link.close()
 

@@ -15,8 +15,8 @@ from aqualvs.geometry.planes import Plane
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
 from aqualvs.optics.lens import Lens
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Laser, Rig
-from aqualvs.scanning.laser_bands import SearchAxis, StripeSearch, plan_searches
-from aqualvs.scanning.stripe import Returns
+from aqualvs.scanning.laser_bands import LaserBand, SearchAxis, plan_bands
+from aqualvs.scanning.stripe import StripePeaks
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,7 +74,7 @@ class Trouble(NamedTuple):
 class Scene(NamedTuple):
     """Returns, and the plane that they were made on."""
 
-    returns: dict[SearchAxis, Returns]
+    peaks: dict[SearchAxis, StripePeaks]
     plane: Plane
 
 
@@ -93,7 +93,7 @@ class Stage:
     def __init__(self, rig: Rig, fan: Fan, true_rig: Rig | None = None) -> None:
         self.rig, self.fan = rig, fan
         self.true_rig = true_rig or rig
-        self.searches = plan_searches(rig, rig.camera())
+        self.laser_bands = plan_bands(rig, rig.camera())
 
     def scene(self, rng: np.random.Generator, trouble: Trouble) -> Scene:
         """Make the returns of one random wall."""
@@ -110,13 +110,15 @@ class Stage:
         parts: dict[SearchAxis, list[_Part]] = {}
         state = self._states(rng, trouble)
         hide = rng.uniform(0.2, 0.8, 2) * self.rig.size_px if trouble.hidden else None
-        for k, (laser, search) in enumerate(zip(self.true_rig.lasers, self.searches, strict=True)):
+        for k, (laser, search) in enumerate(
+            zip(self.true_rig.lasers, self.laser_bands, strict=True)
+        ):
             if state[k] > 0.0:
                 part = self._stripe(rng, laser.plane, search, plane, trouble, state[k], hide)
                 parts.setdefault(search.axis, []).append(part)
-        axis = self.searches[0].axis
+        axis = self.laser_bands[0].axis
         parts.setdefault(axis, []).extend(self._clutter(rng, trouble))
-        found = {one: returns_from(some) for one, some in parts.items() if some}
+        found = {one: peaks_from(some) for one, some in parts.items() if some}
         return Scene(found, plane)
 
     def _states(self, rng: np.random.Generator, trouble: Trouble) -> FloatArray:
@@ -134,7 +136,7 @@ class Stage:
         self,
         rng: np.random.Generator,
         sheet: Plane,
-        search: StripeSearch,
+        search: LaserBand,
         plane: Plane,
         trouble: Trouble,
         state: float,
@@ -178,7 +180,7 @@ class Stage:
 
     def _clutter(self, rng: np.random.Generator, trouble: Trouble) -> Iterator[_Part]:
         """Yield edges of a chessboard (straight, parallel, in squares) and glints."""
-        search = self.searches[0]
+        search = self.laser_bands[0]
         n_lines, length = (
             len(search.lowest),
             self.rig.size_px[0 if search.axis is SearchAxis.ALONG_X else 1],
@@ -210,7 +212,7 @@ def _pieces(rng: np.random.Generator, n: int, missing: float) -> BoolArray:
     return keep
 
 
-def returns_from(parts: list[_Part]) -> Returns:
+def peaks_from(parts: list[_Part]) -> StripePeaks:
     """Return parts as what a detector gives."""
     line = np.concatenate([part.line for part in parts]).astype(np.int64)
     place = np.concatenate([part.place for part in parts])
@@ -221,7 +223,7 @@ def returns_from(parts: list[_Part]) -> Returns:
     apart = np.ones(len(line), np.bool_)
     apart[1:] = (np.diff(line) > 0) | (np.diff(place) > 4.0)
     n = int(apart.sum())
-    return Returns(line[apart], place[apart], height[apart], np.full(n, 5.0), np.ones(n))
+    return StripePeaks(line[apart], place[apart], height[apart], np.full(n, 5.0), np.ones(n))
 
 
 def miscalibrated(

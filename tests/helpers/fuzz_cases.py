@@ -917,7 +917,7 @@ def option_holder(words: tuple[str, ...]):
     return dict(commands(typer.main.get_command(cli.app)))[words]
 
 
-def failures(bench: Bench, seed: int, n_cases: int, folder: Path, tell=None) -> list[str]:
+def failures(bench: Bench, seed: int, n_cases: int, folder: Path, echo=None) -> list[str]:
     """Run cases and return what is wrong with which."""
     rng = random.Random(seed)
     n_options = n_cases // 3
@@ -940,8 +940,8 @@ def failures(bench: Bench, seed: int, n_cases: int, folder: Path, tell=None) -> 
                 shutil.rmtree(where, ignore_errors=True)
             if fault:
                 found.append(f"{case.name}: {fault}")
-                if tell is not None:
-                    tell(
+                if echo is not None:
+                    echo(
                         f"{found[-1]}   {case.arguments if not callable(case.arguments) else ''}"[
                             :600
                         ]

@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 PROGRAM = (sys.executable, "-m", "aqualvs")
-PATIENCE_S = 600.0
+TIMEOUT_S = 600.0
 TRIES = 5
 """How often a command that ended before its kill is begun again."""
 KINDS = ("run", "batch", "live", "follow")
@@ -152,9 +152,7 @@ class Kills:
 
     def _call(self, *arguments: object) -> subprocess.CompletedProcess[str]:
         words = [*PROGRAM, *map(str, arguments)]
-        return subprocess.run(
-            words, capture_output=True, text=True, timeout=PATIENCE_S, check=False
-        )
+        return subprocess.run(words, capture_output=True, text=True, timeout=TIMEOUT_S, check=False)
 
 
 def rows_below(folder: Path) -> dict[str, list[str]]:

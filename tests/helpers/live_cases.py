@@ -55,14 +55,14 @@ def demo_samples(n: int = 8) -> list[LiveSample]:
     scanner = demo_scanner()
     found = []
     for frame in demo_frames(n):
-        returns = scanner.detect(frame)
-        scan = scanner.measure(frame.index, frame.time_s, returns)
+        peaks = scanner.detect(frame)
+        scan = scanner.measure(frame.index, frame.time_s, peaks)
         at = 10**9 + 40_000_000 * frame.index
         found.append(
             LiveSample(
                 rig=scanner.rig,
                 scan=scan,
-                returns=returns,
+                peaks=peaks,
                 frame=frame,
                 utc_ns=1_790_000_000_000_000_000 + 40_000_000 * frame.index,
                 instants=Instants(at, at + 100_000, at + 1_500_000),

@@ -6,7 +6,7 @@ import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.optics.rig import Rig
-from aqualvs.scanning.laser_bands import SearchAxis, plan_searches
+from aqualvs.scanning.laser_bands import SearchAxis, plan_bands
 from aqualvs.scanning.posture import Posture
 from aqualvs.scanning.scan import Label, Scan, ScanPoints
 from aqualvs.simulation.render import Renderer
@@ -45,7 +45,7 @@ class NetCamera:
 
     def __post_init__(self) -> None:
         self._renderer = Renderer(self.rig)
-        self._searches = plan_searches(self.rig, self.rig.camera())
+        self._laser_bands = plan_bands(self.rig, self.rig.camera())
         self._rng = np.random.default_rng(11)
 
     def scan(self, scene: Scene, time_s: float, index: int) -> Scan:
@@ -97,7 +97,7 @@ class NetCamera:
         self, lit: LitPoints, lost: BoolArray, i: int, distance: float
     ) -> tuple[IntArray, FloatArray, FloatArray, IntArray]:
         """One return for every search line and kind of thing that this laser lights there."""
-        search = self._searches[i]
+        search = self._laser_bands[i]
         across = 1 if search.axis is SearchAxis.ALONG_X else 0
         pixels, points, label = [], [], []
         beside = round(0.5 * self.halo / distance * self.rig.focal_px / search.line_px)

@@ -33,7 +33,7 @@ _SEEN_BESIDE = 0.3
 _LOOKS = 3
 # Long dives: pictures, bars from one to the next, frame rate at most; share with holes, and how far
 # these are apart; things a second are as many as in a dive of so many seconds.
-_LONG, _PACE, _MOST_FPS = 240, 0.35, 25.0
+_LONG, _PACE, _MAX_FPS = 240, 0.35, 25.0
 _WITH_HOLES, _APART, _COMPANY_S = 0.85, (0.35, 0.9), 3.0
 # A frame is measured at its true range within this share; a line of light has no break where it
 # has none of so many usual steps.
@@ -150,7 +150,7 @@ def long_dive(rng: np.random.Generator, difficulty: Difficulty = "usual") -> Div
     """
     scene = random_scene(rng, difficulty)
     net = scene.nets[0]
-    speed = min(float(rng.uniform(0.2, 0.3)), _PACE * net.bar * _MOST_FPS)
+    speed = min(float(rng.uniform(0.2, 0.3)), _PACE * net.bar * _MAX_FPS)
     fps = speed / (_PACE * net.bar)
     angle = float(rng.uniform(0.0, 2.0 * np.pi))
     velocity = speed * np.array([np.cos(angle), np.sin(angle)])

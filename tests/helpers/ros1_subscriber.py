@@ -20,7 +20,7 @@ LONGEST_S = 180.0
 lock = threading.Lock()
 
 
-def tell(**values):
+def echo(**values):
     with lock:
         print(json.dumps(values), flush=True)
 
@@ -40,7 +40,7 @@ def plain(value):
 
 def listener(topic):
     def hear(message):
-        tell(topic=topic, at_ns=time.time_ns(), message=plain(message))
+        echo(topic=topic, at_ns=time.time_ns(), message=plain(message))
 
     return hear
 
@@ -56,7 +56,7 @@ def main(namespace):
     }
     for topic, kind in topics.items():
         rospy.Subscriber(topic, kind, listener(topic), tcp_nodelay=True)
-    tell(ready=True)
+    echo(ready=True)
     time.sleep(LONGEST_S)
 
 

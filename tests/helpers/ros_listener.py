@@ -16,10 +16,10 @@ import numpy as np
 from aqualvs.live.outputs.base import Output
 from aqualvs.live.outputs.ros_messages import POINT_TYPE
 from aqualvs.recording.sample import LiveSample
-from waiting import PATIENCE_S
+from waiting import TIMEOUT_S
 
 
-def until(true: Callable[[], object], seconds: float = PATIENCE_S) -> bool:
+def until(true: Callable[[], object], seconds: float = TIMEOUT_S) -> bool:
     """Wait for something to become true."""
     end = time.monotonic() + seconds
     while not true():
@@ -81,8 +81,8 @@ class Listener:
 
     def close(self) -> None:
         self._process.kill()
-        self._process.wait(PATIENCE_S)
-        self._thread.join(PATIENCE_S)
+        self._process.wait(TIMEOUT_S)
+        self._thread.join(TIMEOUT_S)
         if self._process.stdout is not None:
             self._process.stdout.close()
 
@@ -134,7 +134,7 @@ def typical_send(output: Output, sample: LiveSample, n: int) -> float:
 
 
 def send_until(
-    output: Output, sample: LiveSample, true: Callable[[], object], seconds: float = PATIENCE_S
+    output: Output, sample: LiveSample, true: Callable[[], object], seconds: float = TIMEOUT_S
 ) -> bool:
     """Send at 50 Hz until something becomes true."""
     end = time.monotonic() + seconds

@@ -8,8 +8,8 @@ import numpy as np
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig import Rig
-from aqualvs.scanning.laser_bands import SearchAxis, StripeSearch, plan_searches
-from aqualvs.scanning.stripe import Returns
+from aqualvs.scanning.laser_bands import LaserBand, SearchAxis, plan_bands
+from aqualvs.scanning.stripe import StripePeaks
 
 Lit: TypeAlias = Callable[[FloatArray], BoolArray]
 
@@ -30,7 +30,7 @@ def behind_strands(points: FloatArray) -> BoolArray:
 
 
 def lit_stripe(
-    rig: Rig, search: StripeSearch, laser: Plane, target: Plane, lit: Lit
+    rig: Rig, search: LaserBand, laser: Plane, target: Plane, lit: Lit
 ) -> tuple[IntArray, FloatArray]:
     """Search lines and exact positions of one laser's stripe on a target, where it is lit."""
     along = np.cross(laser.normal, target.normal)
@@ -54,13 +54,13 @@ def lit_stripe(
     return line[shown].astype(np.int64), place[shown]
 
 
-def returns_of(
+def peaks_of(
     rig: Rig, targets: Sequence[tuple[Plane, Lit]], noise_px: float = 0.0
-) -> dict[SearchAxis, Returns]:
+) -> dict[SearchAxis, StripePeaks]:
     """Returns of every laser on every target, each in the search direction of its laser."""
     rng = np.random.default_rng(7)
     stripes: dict[SearchAxis, list[tuple[IntArray, FloatArray]]] = {}
-    for laser, search in zip(rig.lasers, plan_searches(rig, rig.camera()), strict=True):
+    for laser, search in zip(rig.lasers, plan_bands(rig, rig.camera()), strict=True):
         for target, lit in targets:
             stripe = lit_stripe(rig, search, laser.plane, target, lit)
             stripes.setdefault(search.axis, []).append(stripe)
@@ -71,7 +71,7 @@ def returns_of(
         position = position + rng.normal(0.0, noise_px, len(line))
         order = np.lexsort((position, line))
         n = len(line)
-        found[axis] = Returns(
+        found[axis] = StripePeaks(
             line=line[order],
             position=position[order],
             height=np.full(n, 80.0),

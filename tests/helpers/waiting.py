@@ -7,13 +7,13 @@ event. What needs a limit states one that holds with four busy programs on each 
 import time
 from collections.abc import Callable
 
-PATIENCE_S = 180.0
+TIMEOUT_S = 180.0
 """So long is waited for what must happen in the end; only a test that fails waits so long."""
 
 
 def until(condition: Callable[[], object], what: str = "what was waited for") -> None:
     """Wait until a condition is true; fail where it never becomes so."""
-    end = time.monotonic() + PATIENCE_S
+    end = time.monotonic() + TIMEOUT_S
     while not condition():
         assert time.monotonic() < end, f"{what} did not happen"
         time.sleep(0.005)

@@ -27,7 +27,7 @@ from live_cases import demo_frames, demo_rig
 from ports import free_port
 from repository import HELPERS
 from stream_sender import make_clip
-from waiting import PATIENCE_S, until
+from waiting import TIMEOUT_S, until
 
 SENDER = HELPERS / "stream_sender.py"
 N_CLIP = 60
@@ -94,7 +94,7 @@ class Live:
         command = [sys.executable, str(SENDER), *map(str, clips), "--port", str(self.port)]
         for name, value in options.items():
             command += ["--" + name.replace("_", "-"), str(value)]
-        subprocess.run(command, stdout=subprocess.DEVNULL, check=True, timeout=2 * PATIENCE_S)
+        subprocess.run(command, stdout=subprocess.DEVNULL, check=True, timeout=2 * TIMEOUT_S)
 
     def valid(self, since: float = 0.0) -> list[tuple[float, dict[str, Any]]]:
         return [(at, line) for at, line in list(self.lines) if line["valid"] and at > since]
@@ -104,7 +104,7 @@ class Live:
 
     def end(self, how: signal.Signals) -> int:
         self.process.send_signal(how)
-        return self.process.wait(PATIENCE_S)
+        return self.process.wait(TIMEOUT_S)
 
 
 @contextlib.contextmanager
@@ -187,7 +187,7 @@ def replayed(recording: Path, out: Path) -> list[dict[str, str]]:
         [*command, str(recording), "-o", str(out), "--no-report"],
         capture_output=True,
         text=True,
-        timeout=4 * PATIENCE_S,
+        timeout=4 * TIMEOUT_S,
         check=False,
     )
     assert done.returncode == 0, done.stderr
@@ -311,7 +311,7 @@ def test_what_cannot_work_is_told_in_one_line(
         [*command, *arguments, "--rig", str(rig_file)],
         capture_output=True,
         text=True,
-        timeout=4 * PATIENCE_S,
+        timeout=4 * TIMEOUT_S,
         cwd=tmp_path,
         check=False,
     )

@@ -27,7 +27,7 @@ from live_cases import (
     of_size,
     renumbered,
 )
-from waiting import PATIENCE_S
+from waiting import TIMEOUT_S
 
 FRAME = demo_frames(1)[0]
 
@@ -133,11 +133,11 @@ class _Waiting:
 
     def detect(self, frame: Frame) -> object:
         self.begun.set()
-        assert self.let_go.wait(PATIENCE_S)
+        assert self.let_go.wait(TIMEOUT_S)
         return demo_scanner().detect(frame)
 
-    def measure(self, index: int, time_s: float, returns: object) -> Scan:
-        return demo_scanner().measure(index, time_s, returns)  # type: ignore[arg-type]
+    def measure(self, index: int, time_s: float, peaks: object) -> Scan:
+        return demo_scanner().measure(index, time_s, peaks)  # type: ignore[arg-type]
 
 
 def test_a_source_faster_than_the_pipeline_costs_frames_but_no_delay(
@@ -150,7 +150,7 @@ def test_a_source_faster_than_the_pipeline_costs_frames_but_no_delay(
     class Fast(ScriptedFeed):
         def __iter__(self) -> Iterator[Frame]:
             yield renumbered(FRAME, 0)
-            assert scanner.begun.wait(PATIENCE_S)
+            assert scanner.begun.wait(TIMEOUT_S)
             yield from (renumbered(FRAME, i) for i in range(1, 400))
             scanner.let_go.set()
 
@@ -223,8 +223,8 @@ class _Stumbling:
             raise ZeroDivisionError("bad luck")
         return demo_scanner().detect(frame)
 
-    def measure(self, index: int, time_s: float, returns: object) -> Scan:
-        return demo_scanner().measure(index, time_s, returns)  # type: ignore[arg-type]
+    def measure(self, index: int, time_s: float, peaks: object) -> Scan:
+        return demo_scanner().measure(index, time_s, peaks)  # type: ignore[arg-type]
 
 
 def test_a_frame_that_the_scanner_fails_on_ends_nothing() -> None:
@@ -240,7 +240,7 @@ def test_an_output_that_fails_is_told_and_disturbs_no_other(inline: bool) -> Non
         raise ConnectionRefusedError("nobody there")
 
     bad, good = Collector("bad", inline=inline, disturb=fail), Collector("good")
-    end = time.monotonic() + PATIENCE_S
+    end = time.monotonic() + TIMEOUT_S
 
     def parts() -> dict[str, PartHealth]:
         return {part.name: part for part in good.samples[-1].health.outputs}
@@ -266,7 +266,7 @@ def test_a_slow_output_gets_the_latest_and_delays_nobody(monkeypatch: pytest.Mon
 
     def slow_down(_n: int) -> None:
         begun.set()
-        assert let_go.wait(PATIENCE_S)
+        assert let_go.wait(TIMEOUT_S)
 
     def follow(n: int) -> None:
         if n == 19:
@@ -279,7 +279,7 @@ def test_a_slow_output_gets_the_latest_and_delays_nobody(monkeypatch: pytest.Mon
     class Late(ScriptedFeed):
         def __iter__(self) -> Iterator[Frame]:
             yield renumbered(FRAME, 0)
-            assert begun.wait(PATIENCE_S)
+            assert begun.wait(TIMEOUT_S)
             yield from super().__iter__()
 
     LiveRunner(
@@ -349,7 +349,7 @@ def test_the_clock_of_the_system_may_jump(monkeypatch: pytest.MonkeyPatch) -> No
     runner(steps, output, keep_every=True).run(never)
     assert len([s for s in output.samples if s.scan.posture]) == 6
     # The jumps are of years.
-    assert 0.0 <= output.samples[-1].health.delays[-1].p99_s < PATIENCE_S
+    assert 0.0 <= output.samples[-1].health.delays[-1].p99_s < TIMEOUT_S
 
 
 def test_a_closed_mailbox_gives_its_last_frame_and_then_nothing() -> None:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from aqualvs.nets.coverage import LaidView, Twine, dash_kinds, measure_solidity, sound_length
+from aqualvs.nets.coverage import RegisteredView, Twine, dash_kinds, measure_solidity, sound_length
 from aqualvs.nets.dashes import NetView, find_dashes
 from aqualvs.nets.lattice import LatticeFitter, NetLattice
 from aqualvs.nets.lit_intervals import NetSignal
@@ -58,12 +58,12 @@ def view_of(
     return find_dashes(signal)
 
 
-def laid(grown: float = 0.0, turn: float = TURN, height: float = HEIGHT) -> list[LaidView]:
+def laid(grown: float = 0.0, turn: float = TURN, height: float = HEIGHT) -> list[RegisteredView]:
     fitter, found = LatticeFitter(NET), []
     for shift in np.linspace(0.0, 0.9, 10):
         view = view_of(shift, grown, turn, height)
         fit = fitter.assign(view.dashes, np.full(2, -shift * BAR))
-        found.append(LaidView(view, fit, np.full(2, shift * BAR)))
+        found.append(RegisteredView(view, fit, np.full(2, shift * BAR)))
     return found
 
 

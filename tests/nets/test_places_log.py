@@ -46,14 +46,14 @@ def test_motion_tells_the_offset(moving):
     laid = lay_log(*moving, None, None)
     assert laid.offset.offset_s == pytest.approx(TRUE_S, abs=0.1)
     assert laid.places is not None
-    assert laid.facts()["offset_s"] == pytest.approx(TRUE_S, abs=0.1)
+    assert laid.to_dict()["offset_s"] == pytest.approx(TRUE_S, abs=0.1)
     assert "motion" in laid.words()
 
 
 def test_what_the_user_says_counts(moving):
     laid = lay_log(*moving, 3.5, None)
     assert laid.places.offset_s == 3.5
-    assert laid.facts()["offset_from"] == "given by the user"
+    assert laid.to_dict()["offset_from"] == "given by the user"
 
 
 def test_clocks_stand_in_where_motion_says_nothing(still, monkeypatch):
@@ -69,7 +69,7 @@ def test_without_motion_and_clocks_the_log_is_not_used(still, monkeypatch):
     laid = lay_log(*still, None, VIDEO)
     assert laid.places is None
     assert "is not used" in laid.words()
-    assert laid.facts() == {
+    assert laid.to_dict() == {
         "file": "vehicle.csv",
         "used": False,
         "refused": laid.offset.reason,

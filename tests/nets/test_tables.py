@@ -10,7 +10,7 @@ import pytest
 
 from aqualvs.nets.map import draw_map
 from aqualvs.nets.places import place_net
-from aqualvs.nets.tables import HOLE_COLUMNS, NET_COLUMNS, bands, net_facts, net_lines, unroll
+from aqualvs.nets.tables import HOLE_COLUMNS, NET_COLUMNS, bands, net_dict, net_lines, unroll
 from aqualvs.report.net import net_cards, net_view, read_net
 from aqualvs.report.run_page import write_report
 from aqualvs.results.folder import NET_FILES
@@ -49,7 +49,7 @@ def wall():
 @pytest.fixture(scope="module")
 def folder(wall, tmp_path_factory):
     folder = tmp_path_factory.mktemp("net")
-    facts = {"summary": net_facts(wall, 1.5, 200, 190), "log": None}
+    facts = {"summary": net_dict(wall, 1.5, 200, 190), "log": None}
     write_net_files(folder, wall, facts)
     return folder
 
@@ -242,7 +242,7 @@ def test_report_shows_the_net_of_its_folder(wall, tmp_path):
     dive = make_dive(tmp_path / "run", video=False)
     page = write_report(dive.folder).read_text(encoding="utf-8")
     assert '<section id="net">' not in page
-    write_net_files(dive.folder, wall, {"summary": net_facts(wall, 1.5, 200, 190), "log": None})
+    write_net_files(dive.folder, wall, {"summary": net_dict(wall, 1.5, 200, 190), "log": None})
     page = write_report(dive.folder).read_text(encoding="utf-8")
     assert '<section id="net">' in page
     assert '<div class="value">2 holes</div>' in page
@@ -257,7 +257,7 @@ def test_a_track_that_slipped_is_told(tmp_path):
     said = net_lines(wall, 1.0, 200)[-1]
     assert said.startswith("warning: the track and the log's depth part by 1.8 m")
     dive = make_dive(tmp_path / "run", video=False)
-    write_net_files(dive.folder, wall, {"summary": net_facts(wall, 1.0, 200, 190)})
+    write_net_files(dive.folder, wall, {"summary": net_dict(wall, 1.0, 200, 190)})
     assert "part by 1.8 m" in write_report(dive.folder).read_text(encoding="utf-8")
 
 
@@ -289,7 +289,7 @@ def test_report_copes_with_what_is_missing_or_broken(wall, tmp_path):
 
 
 def test_report_says_that_no_net_was_seen(tmp_path):
-    write_net_files(tmp_path, walled([]), {"summary": net_facts(walled([]), 0.0, 9, 0)})
+    write_net_files(tmp_path, walled([]), {"summary": net_dict(walled([]), 0.0, 9, 0)})
     net, _ = read_net(tmp_path)
     assert "No net was seen" in net_view(net)
     assert net_cards(net) == []

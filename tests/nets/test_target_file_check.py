@@ -8,7 +8,7 @@ import pytest
 from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.planes import Plane
-from aqualvs.nets.target_file import NetCheck, NetFacts, bar_of, strand_distance, target_facts
+from aqualvs.nets.target_file import NetCheck, NetFacts, bar_of, strand_distance, target_dict
 from aqualvs.report.findings import warnings_of
 from aqualvs.report.run_data import Track
 from aqualvs.scanning.paper.mesh_filter import MeshFilterOptions
@@ -99,8 +99,8 @@ def test_the_bar_comes_out_roughly(bar: float) -> None:
 def test_the_right_net_is_passed_over_in_silence() -> None:
     check = check_of(0.03, 0.03)
     assert check.sentence() == ""
-    assert check.facts()["words"] == ""
-    assert check.facts()["n_frames"] == 12
+    assert check.to_dict()["words"] == ""
+    assert check.to_dict()["n_frames"] == 12
 
 
 @pytest.mark.parametrize("factor", [2.0, 0.5])
@@ -112,7 +112,7 @@ def test_a_net_that_looks_otherwise_is_named(factor: float) -> None:
     assert f"about {1e3 * seen:.2g} mm" in sentence
     assert f"net.yaml says {30 * factor:g} mm" in sentence
     assert "\n" not in sentence
-    assert check.facts()["bar_said_mm"] == pytest.approx(30 * factor)
+    assert check.to_dict()["bar_said_mm"] == pytest.approx(30 * factor)
 
 
 def test_little_is_not_enough_to_say_anything() -> None:
@@ -121,7 +121,7 @@ def test_little_is_not_enough_to_say_anything() -> None:
     for index in range(60):
         check.add(scan_of(0.03, 0.2, index, valid=False))
     assert check.sentence() == ""
-    assert "bar_seen_mm" not in check.facts()
+    assert "bar_seen_mm" not in check.to_dict()
 
 
 def test_the_report_warns() -> None:
@@ -138,22 +138,22 @@ def test_the_report_warns() -> None:
         n_points=np.full(2, 200.0),
         n_water=np.full(2, 1.34),
     )
-    words = check_of(0.06, 0.03).facts()
+    words = check_of(0.06, 0.03).to_dict()
     told = warnings_of(track, None, {}, {"summary": {"net_check": words}}, None, [])
     assert any(text.startswith("The net looks like one with a bar length") for text in told)
-    quiet = check_of(0.03, 0.03).facts()
+    quiet = check_of(0.03, 0.03).to_dict()
     assert not warnings_of(track, None, {}, {"summary": {"net_check": quiet}}, None, [])
 
 
 def test_the_file_says_what_the_net_is(tmp_path: Path) -> None:
     path = tmp_path / "net.yaml"
     path.write_text("kind: net\nnet: {mesh: hexagon, bar_mm: 20, twine_mm: 2}\n")
-    facts = target_facts(str(path))
+    facts = target_dict(str(path))
     assert facts.net == NetFacts("hexagon", 0.02, 0.002)
     # Side and diameter of a hexagon; a reflection five times as long as the twine is thick.
     assert facts.mesh_filter == MeshFilterOptions(rd_theta=0.01, r_min=0.02, r_max=0.04)
     path.write_text("net: {bar_mm: 20, twine_mm: 8}\nmesh_filter: {r_max_mm: 50}\n")
-    facts = target_facts(str(path))
+    facts = target_dict(str(path))
     assert facts.net == NetFacts("diamond", 0.02, 0.008)
     assert facts.mesh_filter.r_max == 0.05
     assert facts.mesh_filter.rd_theta == facts.mesh_filter.r_min == pytest.approx(0.02 / 2**0.5)
@@ -174,5 +174,5 @@ def test_bad_nets_are_named(tmp_path: Path, content: str, words: str) -> None:
     path = tmp_path / "net.yaml"
     path.write_text(content)
     with pytest.raises(OptionError, match=str(path)) as caught:
-        target_facts(str(path))
+        target_dict(str(path))
     assert words in str(caught.value)

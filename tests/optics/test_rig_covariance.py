@@ -25,7 +25,7 @@ from aqualvs.scanning.laser_bands import SearchAxis
 from aqualvs.scanning.patch import Patch, fitted_patch, nearest_tangent
 from aqualvs.scanning.posture import Posture, Refusal, range_pitch_yaw
 from aqualvs.scanning.scan import Frame, planes_of_image
-from aqualvs.scanning.stripe import Returns
+from aqualvs.scanning.stripe import StripePeaks
 from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenarios import bluerov2_rig, example_rig, load_scenario
 from aqualvs.simulation.scene import SurfaceKind
@@ -46,7 +46,9 @@ def calibrated(rig: Rig) -> RigUncertainty:
 
 
 @cache
-def seen(name: str, scenario: str, time_s: float) -> tuple[dict[SearchAxis, Returns], FloatArray]:
+def seen(
+    name: str, scenario: str, time_s: float
+) -> tuple[dict[SearchAxis, StripePeaks], FloatArray]:
     """What the scanner of the true rig finds in a picture, and range, pitch and yaw in truth."""
     rig = {"example": example_rig, "bluerov2": bluerov2_rig}[name]()
     scene = load_scenario(scenario).scene_at(time_s)
@@ -58,12 +60,12 @@ def seen(name: str, scenario: str, time_s: float) -> tuple[dict[SearchAxis, Retu
         assert fit is not None
         plane = fit[0]
     image = cv2.cvtColor(picture.image, cv2.COLOR_RGB2BGR)
-    returns = Scanner(rig).detect(Frame(0, time_s, *planes_of_image(image)))
-    return returns, np.array(range_pitch_yaw(plane.normal / plane.offset))
+    peaks = Scanner(rig).detect(Frame(0, time_s, *planes_of_image(image)))
+    return peaks, np.array(range_pitch_yaw(plane.normal / plane.offset))
 
 
-def measured(rig: Rig, returns: dict[SearchAxis, Returns]) -> Posture:
-    posture = Scanner(rig).measure(0, 0.0, returns).posture
+def measured(rig: Rig, peaks: dict[SearchAxis, StripePeaks]) -> Posture:
+    posture = Scanner(rig).measure(0, 0.0, peaks).posture
     assert isinstance(posture, Posture)
     return posture
 
@@ -75,14 +77,14 @@ def three(posture: Posture) -> FloatArray:
 @pytest.mark.parametrize("rig", [example_rig(), bluerov2_rig()], ids=lambda rig: rig.name)
 def test_the_jacobian_is_that_of_the_whole_scanner(rig: Rig) -> None:
     """Every number of the rig is moved and the same returns measured again."""
-    returns, _ = seen(rig.name, "wall_yaw", 1.0)
+    peaks, _ = seen(rig.name, "wall_yaw", 1.0)
     uncertainty = calibrated(rig)
-    told = measured(with_uncertainty(rig, uncertainty), returns)
+    told = measured(with_uncertainty(rig, uncertainty), peaks)
     scale = np.sqrt(np.diag(told.rig_covariance))
     slopes = np.empty((3, len(uncertainty.names)))
     for i, (name, sigma) in enumerate(uncertainty.sigmas.items()):
         ahead, behind = (
-            three(measured(rig_moved_by(rig, [name], np.array([h])), returns))
+            three(measured(rig_moved_by(rig, [name], np.array([h])), peaks))
             for h in (sigma, -sigma)
         )
         slopes[:, i] = (ahead - behind) / 2.0

@@ -44,7 +44,7 @@ from aqualvs.sources.base import Health, PartHealth, StageDelay, State
 from aqualvs.sources.mcap_file import McapFile
 from live_cases import demo_frames, demo_rig, demo_samples
 from recorder_cases import counted, read_by_mcap, read_by_rosbags
-from waiting import PATIENCE_S, until
+from waiting import TIMEOUT_S, until
 
 EVERY = RecorderOptions(points_hz=None)
 
@@ -124,7 +124,7 @@ def test_rosbags_understands_every_message(tmp_path, samples):
         assert np.allclose(cloud["quality"], points.quality)
     for sample, message in zip(samples, found[STRIPES.name], strict=True):
         assert message.refusal == ""
-        for (axis, stripes), part in zip(sample.returns.items(), message.returns, strict=True):
+        for (axis, stripes), part in zip(sample.peaks.items(), message.peaks, strict=True):
             assert part.axis == axis.value
             assert np.array_equal(part.line, stripes.line)
             for name in ("position", "height", "width", "likelihood"):
@@ -169,24 +169,24 @@ def test_stripes_come_back_bit_for_bit(tmp_path, samples):
     for sample, frame in zip(samples, frames, strict=True):
         assert (frame.index, frame.time_s) == (sample.scan.index, sample.scan.time_s)
         assert frame.n_water == sample.scan.n_water
-        assert list(frame.returns) == list(sample.returns)
-        for axis, stripes in sample.returns.items():
+        assert list(frame.peaks) == list(sample.peaks)
+        for axis, stripes in sample.peaks.items():
             for name in stripes.__slots__:
-                assert same_bits(getattr(frame.returns[axis], name), getattr(stripes, name))
+                assert same_bits(getattr(frame.peaks[axis], name), getattr(stripes, name))
 
 
 def test_a_direction_without_stripes_stays_one(tmp_path, samples):
     sample = samples[0]
     empty = {
         axis: type(found)(*(getattr(found, name)[:0] for name in found.__slots__))
-        for axis, found in sample.returns.items()
+        for axis, found in sample.peaks.items()
     }
-    path = recorded(tmp_path / "dive.mcap", [replace(sample, returns=empty)])
+    path = recorded(tmp_path / "dive.mcap", [replace(sample, peaks=empty)])
     (frame,) = DiveRecording(path).frames(with_pictures=False)
-    assert list(frame.returns) == list(empty)
-    assert [len(found) for found in frame.returns.values()] == [0] * len(empty)
+    assert list(frame.peaks) == list(empty)
+    assert [len(found) for found in frame.peaks.values()] == [0] * len(empty)
     (message,) = decoded(path)[STRIPES.name]
-    assert [len(part.position) for part in message.returns] == [0] * len(empty)
+    assert [len(part.position) for part in message.peaks] == [0] * len(empty)
 
 
 def test_a_frame_that_was_not_measured_keeps_its_reason(tmp_path, samples):
@@ -195,10 +195,10 @@ def test_a_frame_that_was_not_measured_keeps_its_reason(tmp_path, samples):
     silent = Refusal(Reason.NO_FRAMES, "no picture for 0.2 s")
     scan = samples[1].scan
     refused = replace(
-        samples[1], scan=replace(scan, posture=refusal, points=nothing), returns={}, frame=None
+        samples[1], scan=replace(scan, posture=refusal, points=nothing), peaks={}, frame=None
     )
     quiet = replace(
-        samples[1], scan=replace(scan, posture=silent, points=nothing), returns={}, frame=None
+        samples[1], scan=replace(scan, posture=silent, points=nothing), peaks={}, frame=None
     )
     path = recorded(tmp_path / "dive.mcap", [samples[0], refused, quiet, samples[2]])
     frames = list(DiveRecording(path).frames(with_pictures=False))
@@ -335,7 +335,7 @@ class Disk:
         self.awake.set()
 
     def write(self, content):
-        self.awake.wait(2 * PATIENCE_S)
+        self.awake.wait(2 * TIMEOUT_S)
         if self.full:
             raise OSError(errno.ENOSPC, "No space left on device")
         return self._file.write(content)
@@ -422,7 +422,7 @@ def test_a_slow_disk_holds_nobody_up_and_loses_nothing(tmp_path, samples, disk):
             output.send(sample)
             longest = max(longest, time.perf_counter() - began)
     # The disk sleeps until it is woken below.
-    assert longest < PATIENCE_S
+    assert longest < TIMEOUT_S
     disk.disks[0].awake.set()
     output.close()
     assert counted(read_by_mcap(path))[STRIPES.name] == 120

@@ -18,7 +18,7 @@ from pathlib import Path
 import pytest
 
 from repository import HELPERS
-from waiting import PATIENCE_S, until
+from waiting import TIMEOUT_S, until
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="needs processes as POSIX has them")
 
@@ -104,7 +104,7 @@ def start():
 
     yield begin
     process.stdin.close()
-    process.wait(PATIENCE_S)
+    process.wait(TIMEOUT_S)
     process.stdout.close()
 
 

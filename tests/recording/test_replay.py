@@ -161,7 +161,7 @@ def test_the_water_that_the_run_followed_is_followed_again(tmp_path):
     expected = []
     for i, sample in enumerate(demo_samples(6)):
         scanner = Scanner(demo_rig().in_water(1.3333 if i < 3 else 1.345))
-        scan = scanner.measure(i, sample.scan.time_s, sample.returns)
+        scan = scanner.measure(i, sample.scan.time_s, sample.peaks)
         recording.write(replace(sample, rig=scanner.rig, scan=scan))
         expected.append((f"{scan.posture.range:.6f}", f"{scan.n_water:.6f}"))
     recording.close()
@@ -179,7 +179,7 @@ def test_frames_that_were_lost_stay_lost(demo, tmp_path):
     assert recording.n_frames == 12
     from aqualvs.workers.run_frames import _lost
 
-    lost = replace(samples[1], scan=_lost(1, 0.04, 1.3333), returns={}, frame=None)
+    lost = replace(samples[1], scan=_lost(1, 0.04, 1.3333), peaks={}, frame=None)
     kept = Recording(path, RecorderOptions())
     for sample in (samples[0], lost, samples[2]):
         kept.write(sample)
@@ -214,7 +214,7 @@ def test_the_recorded_options_hold_unless_others_are_asked_for(tmp_path):
     scanner = Scanner(demo_rig(), solid)
     recording = Recording(path, RecorderOptions(scanner=solid))
     for sample in demo_samples(4):
-        scan = scanner.measure(sample.scan.index, sample.scan.time_s, sample.returns)
+        scan = scanner.measure(sample.scan.index, sample.scan.time_s, sample.peaks)
         recording.write(replace(sample, scan=scan))
     recording.close()
     for given, target in (

@@ -49,7 +49,7 @@ def content(recording):
     return {
         frame.index: b"".join(
             getattr(found, name).tobytes()
-            for found in frame.returns.values()
+            for found in frame.peaks.values()
             for name in ("line", "position", "height", "width", "likelihood")
         )
         for frame in recording.frames(with_pictures=False)

@@ -25,7 +25,7 @@ from aqualvs.follow.case import (
 )
 from aqualvs.follow.log import effort_measures, hold_measures, step_measures
 from aqualvs.follow.monte_carlo import DiveResult, dive_and_measure, random_dive, random_dives
-from aqualvs.follow.sensor_model import SampledEye
+from aqualvs.follow.sensor_model import SampledSensor
 
 N_RUNS = int(os.environ.get("AQUALVS_LOOP_RUNS", "0"))
 # Some of any kind, and the hardest that were met: a BlueROV2 Heavy that swings its pitch up with
@@ -77,8 +77,8 @@ def test_holds_and_turns_in_calm_water(name: str) -> None:
             if now_s >= 40.0:
                 mission.setpoint = Setpoint(RANGE, math.radians(10.0))
 
-        eye = SampledEye(case.net, np.random.default_rng(seed))
-        log = case.loop(eye, mission).run(48.0, step)
+        sensor = SampledSensor(case.net, np.random.default_rng(seed))
+        log = case.loop(sensor, mission).run(48.0, step)
         hold = hold_measures(log, FROM_REST_S, 40.0)
         assert hold.range_rms <= 15e-3
         assert math.degrees(hold.yaw_rms) <= 0.3
@@ -94,7 +94,7 @@ def test_follows_a_curved_net_that_moves(name: str) -> None:
     assert follow.range_rms <= 30e-3
     assert math.degrees(follow.yaw_rms) <= 3.0
     assert follow.n_lost == 0
-    assert follow.least_clearance > 0.0
+    assert follow.min_clearance > 0.0
     along = log.column("along")
     # 0.2 m/s through the water for a minute; the current changes what that is over ground.
     assert along[-1] - along[0] > 5.0
@@ -148,4 +148,4 @@ def test_a_rendered_loop_takes_hold(name: str) -> None:
     assert follow.range_rms <= 30e-3
     assert math.degrees(follow.yaw_rms) <= 3.0
     assert follow.n_lost == 0
-    assert follow.least_clearance > 0.0
+    assert follow.min_clearance > 0.0

@@ -14,7 +14,7 @@ from aqualvs.experiments.mesh_filter import Judged as Reflections
 from aqualvs.experiments.mesh_filter import LitTruth, judge_reflections, mean_judged
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.scanner import Scanner, ScannerOptions
-from aqualvs.scanning.laser_bands import plan_searches
+from aqualvs.scanning.laser_bands import plan_bands
 from aqualvs.scanning.paper.detector import PaperFilter
 from aqualvs.scanning.paper.mesh_filter import MeshFilterOptions
 from aqualvs.scanning.scan import Frame, Label, Scan, planes_of_image
@@ -108,8 +108,8 @@ def paper_judged(samples: Path, dive: str, options: MeshFilterOptions) -> Reflec
     rig = load_truth(samples / "lab-paper" / "truth" / "rig_truth.json")
     camera = rig.camera()
     scanner = Scanner(rig, ScannerOptions(detector=ThresholdOptions(level=180)))
-    searches = plan_searches(rig, camera)
-    papers = PaperFilter(rig, camera, searches, options, every_pixel=True)
+    laser_bands = plan_bands(rig, camera)
+    papers = PaperFilter(rig, camera, laser_bands, options, every_pixel=True)
     found = []
     for frame, path in sample_frames(samples, dive):
         points = scanner.process(frame).points

@@ -17,7 +17,7 @@ import real_lines
 import real_wall as wall
 from aqualvs.calibrate import lasers
 from aqualvs.optics.rigfile import load_rig
-from aqualvs.scanning.whole_picture import find_stripes
+from aqualvs.scanning.uncalibrated_stripes import find_stripes as find_stripes
 from laser_cases import laser_error
 from repository import ROOT
 
@@ -124,7 +124,7 @@ def work(tmp_path_factory) -> Iterator[Path]:
 def left_out(samples: Path, work: Path) -> dict[str, list]:
     """Every photograph of the set by lasers of the eight others, by format."""
     results = wall.leave_one_out(
-        samples / "real-laser-on-wall", work, formats=LEFT_OUT_FORMATS, tell=lambda _: None
+        samples / "real-laser-on-wall", work, formats=LEFT_OUT_FORMATS, echo=lambda _: None
     )
     return {fmt: [m for m in results if m.format == fmt] for fmt in LEFT_OUT_FORMATS}
 
@@ -199,8 +199,8 @@ def test_nothing_is_found_without_laser(line_scores, fmt: str) -> None:
 
 @pytest.mark.samples
 @pytest.mark.parametrize(("fmt", "n_least"), [("png", 8), ("jpg80", 7), ("crf23", 4)])
-def test_red_lines_of_pairs(line_scores, fmt: str, n_least: int) -> None:
+def test_red_lines_of_pairs(line_scores, fmt: str, n_min: int) -> None:
     """What is reached of 8: at 320 x 240, compression takes what colour a thin line has left."""
     pairs = [s for s in line_scores[fmt] if s.group == "pair"]
     assert len(pairs) == 10
-    assert sum(s.found >= 0.9 for s in pairs) >= n_least
+    assert sum(s.found >= 0.9 for s in pairs) >= n_min

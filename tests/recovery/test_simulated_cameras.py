@@ -29,7 +29,7 @@ _TRUTH = ("visible_fit_range_mm", "visible_fit_pitch_deg", "visible_fit_yaw_deg"
 _FPS = {"wall_yaw": 0.75, "net_diamond": 0.75}
 
 
-class Measured(NamedTuple):
+class FrameResult(NamedTuple):
     """A dive of N frames: which have a posture, errors (N, 3) in metres and radians, sigmas."""
 
     valid: FloatArray
@@ -39,7 +39,7 @@ class Measured(NamedTuple):
 
 
 @cache
-def measured(dive: str, camera: str) -> Measured:
+def measured(dive: str, camera: str) -> FrameResult:
     rig = example_rig()
     scenario = replace(load_scenario(dive), fps=_FPS[dive])
     with TemporaryDirectory() as folder:
@@ -55,7 +55,7 @@ def measured(dive: str, camera: str) -> Measured:
     answer = [[p.range, p.pitch, p.yaw] if isinstance(p, Posture) else none for p in found]
     sigma = [np.sqrt(np.diag(p.covariance)) if isinstance(p, Posture) else none for p in found]
     valid = np.array([isinstance(p, Posture) for p in found])
-    return Measured(valid, np.array(answer) - truth, np.array(sigma), truth[:, 0])
+    return FrameResult(valid, np.array(answer) - truth, np.array(sigma), truth[:, 0])
 
 
 @pytest.mark.parametrize("camera", REAL)

@@ -28,7 +28,7 @@ from aqualvs.report.run_data import Track, lasers_of, read_track
 from aqualvs.report.run_page import write_report
 from aqualvs.scanning.posture import Reason
 from aqualvs.scanning.scan import Label
-from aqualvs.text import LABEL_COLOURS, LABEL_WORDS, REASON_WORDS, reason_words
+from aqualvs.text import LABEL_COLOURS, LABEL_WORDS, REASON_WORDS, reason_text
 from report_cases import COLUMNS, FPS, LASERS, NASTY, NASTY_LASER, Dive, make_dive, write_truth
 from shell_cases import write_video
 
@@ -282,8 +282,8 @@ def test_interrupted_run_still_gives_a_report(tmp_path: Path) -> None:
         with pa.ipc.new_stream(sink, table.schema) as writer:
             writer.write_table(table.combine_chunks(), max_chunksize=300)
         n_bytes = sink.tell()
-    with (dive.folder / "points.arrows").open("r+b") as journal:
-        journal.truncate(n_bytes - 2000)
+    with (dive.folder / "points.arrows").open("r+b") as points_stream:
+        points_stream.truncate(n_bytes - 2000)
     page = write_report(dive.folder).read_text()
     text = " ".join(visible(page).split())
     assert "run.yaml cannot be read" in text
@@ -415,8 +415,8 @@ def test_rig_tolerates_what_is_missing() -> None:
 def test_every_reason_and_label_has_words() -> None:
     assert set(REASON_WORDS) == set(Reason)
     assert set(LABEL_WORDS) == set(LABEL_COLOURS) == set(Label)
-    assert reason_words("something_new") == "something new"
-    assert reason_words("") == "no reason given"
+    assert reason_text("something_new") == "something new"
+    assert reason_text("") == "no reason given"
 
 
 @given(

@@ -18,10 +18,10 @@ from aqualvs.results.folder import PostureCsv, RunOutputs, posture_row, prepare_
 from aqualvs.results.points import (
     POINTS_SCHEMA,
     PointsExport,
-    PointsJournal,
+    PointsStream,
     export_points,
     points_batch,
-    read_journal,
+    read_points_stream,
 )
 from aqualvs.results.run_request import Status
 from aqualvs.results.summary import summary_of
@@ -134,7 +134,7 @@ class NearlyFull:
         return getattr(self.file, name)
 
 
-@pytest.mark.parametrize("kind", [PostureCsv, PointsJournal])
+@pytest.mark.parametrize("kind", [PostureCsv, PointsStream])
 def test_a_frame_that_does_not_fit_is_taken_back(tmp_path, kind):
     path = tmp_path / "file"
     writer = kind(path)
@@ -187,33 +187,33 @@ def test_points_become_columns_of_the_schema():
 
 def test_every_frame_of_the_journal_can_be_read_while_it_is_written(tmp_path):
     path = tmp_path / "points.arrows"
-    with PointsJournal(path) as journal:
+    with PointsStream(path) as points_stream:
         for i in range(4):
-            journal.write(scan(i, 10 + i))
-            assert [b.num_rows for b in read_journal(path)] == [10 + k for k in range(i + 1)]
+            points_stream.write(scan(i, 10 + i))
+            assert [b.num_rows for b in read_points_stream(path)] == [10 + k for k in range(i + 1)]
 
 
 def test_a_frame_without_points_leaves_no_trace_in_the_journal(tmp_path):
     path = tmp_path / "points.arrows"
-    with PointsJournal(path) as journal:
-        journal.write(scan(0, 0))
-        journal.write(scan(1, 5))
-    assert [b.num_rows for b in read_journal(path)] == [5]
+    with PointsStream(path) as points_stream:
+        points_stream.write(scan(0, 0))
+        points_stream.write(scan(1, 5))
+    assert [b.num_rows for b in read_points_stream(path)] == [5]
 
 
 def test_a_journal_cut_at_any_byte_gives_its_whole_frames(tmp_path):
     path = tmp_path / "points.arrows"
     ends = []
-    with PointsJournal(path) as journal:
+    with PointsStream(path) as points_stream:
         for i in range(3):
-            journal.write(scan(i, 20))
+            points_stream.write(scan(i, 20))
             ends.append(path.stat().st_size)
     data = path.read_bytes()
     cut = tmp_path / "cut.arrows"
     for size in range(0, len(data), 37):
         cut.write_bytes(data[:size])
         n_whole = sum(end <= size for end in ends)
-        batches = list(read_journal(cut))
+        batches = list(read_points_stream(cut))
         assert len(batches) == n_whole
         assert all(b["frame"][0].as_py() == i for i, b in enumerate(batches))
 
@@ -227,7 +227,7 @@ def test_a_full_disk_is_said_by_the_journal_and_by_the_rows():
     assert "disk is full" in explain(Path("out"), fault.value)
     with (
         pytest.raises(OSError, match="No space left") as fault,
-        PointsJournal(Path("/dev/full")) as w,
+        PointsStream(Path("/dev/full")) as w,
     ):
         w.write(scan(0))
     assert "disk is full" in explain(Path("out"), fault.value)
@@ -237,11 +237,11 @@ def test_export_keeps_every_point_and_colours_the_targets(tmp_path, monkeypatch)
     # Groups of two frames, the last of them incomplete.
     monkeypatch.setattr("aqualvs.results.points._ROWS_PER_GROUP", 100)
     scans = [scan(i, 60) for i in range(5)]
-    journal = tmp_path / "points.arrows"
-    with PointsJournal(journal) as writer:
+    points_stream = tmp_path / "points.arrows"
+    with PointsStream(points_stream) as writer:
         for made in scans:
             writer.write(made)
-    n_points = export_points(journal, tmp_path / "p.parquet", tmp_path / "p.ply")
+    n_points = export_points(points_stream, tmp_path / "p.parquet", tmp_path / "p.ply")
     assert n_points == 300
     file = parquet.ParquetFile(tmp_path / "p.parquet")
     assert file.num_row_groups == 3
@@ -266,16 +266,16 @@ def test_export_keeps_every_point_and_colours_the_targets(tmp_path, monkeypatch)
 
 
 def test_an_empty_journal_gives_empty_files(tmp_path):
-    journal = tmp_path / "points.arrows"
-    journal.write_bytes(b"")
-    assert export_points(journal, tmp_path / "p.parquet", tmp_path / "p.ply") == 0
+    points_stream = tmp_path / "points.arrows"
+    points_stream.write_bytes(b"")
+    assert export_points(points_stream, tmp_path / "p.parquet", tmp_path / "p.ply") == 0
     assert parquet.read_table(tmp_path / "p.parquet").schema == POINTS_SCHEMA
     assert len(read_ply(tmp_path / "p.ply")) == 0
 
 
 def test_a_failed_export_leaves_no_half_files(tmp_path, monkeypatch):
-    journal = tmp_path / "points.arrows"
-    with PointsJournal(journal) as writer:
+    points_stream = tmp_path / "points.arrows"
+    with PointsStream(points_stream) as writer:
         writer.write(scan(0))
 
     def fail(table):
@@ -283,7 +283,7 @@ def test_a_failed_export_leaves_no_half_files(tmp_path, monkeypatch):
 
     monkeypatch.setattr("aqualvs.results.points._vertices", fail)
     with pytest.raises(OSError, match="No space"):
-        export_points(journal, tmp_path / "points.parquet", tmp_path / "points.ply")
+        export_points(points_stream, tmp_path / "points.parquet", tmp_path / "points.ply")
     assert [p.name for p in tmp_path.iterdir()] == ["points.arrows"]
 
 
@@ -309,7 +309,7 @@ def test_a_finished_run_is_complete(tmp_path):
     assert content["source"] == {"name": "dive.mp4"}
     assert content["rig"] == {"name": "r"}
     assert set(content["versions"]) >= {"aqualvs", "python", "numpy", "numba", "av"}
-    assert summary_of(tmp_path / "posture.csv").facts() == content["summary"]
+    assert summary_of(tmp_path / "posture.csv").to_dict() == content["summary"]
     rows = list(csv.DictReader((tmp_path / "posture.csv").read_text().splitlines()))
     assert [row["frame"] for row in rows] == list("01234")
 

@@ -11,7 +11,7 @@ from aqualvs.errors import SourceError
 from aqualvs.results import net_survey as module
 from aqualvs.results.folder import RunOutputs
 from aqualvs.results.net_survey import check_stored, read_run
-from aqualvs.results.points import PointsJournal, export_points
+from aqualvs.results.points import PointsStream, export_points
 from aqualvs.scanning.posture import Reason
 from shell_cases import scan
 
@@ -74,9 +74,9 @@ def test_a_run_that_was_killed_is_read_from_its_journal(tmp_path):
     made = dive()
     folder = written(tmp_path / "run", made)
     (folder / "points.parquet").unlink()
-    with PointsJournal(folder / "points.arrows") as journal:
+    with PointsStream(folder / "points.arrows") as points_stream:
         for one in made:
-            journal.write(one)
+            points_stream.write(one)
     # What was cut short counts for nothing: half a row, half a batch.
     with (folder / "posture.csv").open("a") as file:
         file.write("8,0.32,1,,0.5")
@@ -117,10 +117,10 @@ def test_an_older_run_without_a_single_point_is_told_too(tmp_path):
 
 
 def test_an_older_journal_still_becomes_parquet(tmp_path):
-    journal, old = tmp_path / "points.arrows", tmp_path / "old.arrows"
-    with PointsJournal(journal) as writer:
+    points_stream, old = tmp_path / "points.arrows", tmp_path / "old.arrows"
+    with PointsStream(points_stream) as writer:
         writer.write(scan(0))
-    with pa.ipc.open_stream(journal) as stream:
+    with pa.ipc.open_stream(points_stream) as stream:
         table = stream.read_all().drop_columns(["intensity", "width_px"])
     with pa.ipc.new_stream(old, table.schema) as stream:
         stream.write_table(table)

@@ -95,7 +95,7 @@ def test_few_frames_are_kept_of_many():
 def test_the_summary_is_that_of_the_frames(tmp_path):
     scans = [scan_of(i, i in (3, 4)) for i in range(9)]
     whole, parts = of(scans), joined(scans, [4], tmp_path)
-    assert parts.facts() == whole.facts()
+    assert parts.to_dict() == whole.to_dict()
     assert parts.refused == {"one_laser": 2}
     expected = [one.posture.range if isinstance(one.posture, Posture) else np.nan for one in scans]
     np.testing.assert_array_equal(parts.ranges, expected)

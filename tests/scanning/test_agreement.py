@@ -63,7 +63,7 @@ def test_lasers_that_agree_are_left_alone(rig: Rig, target: Callable[..., Target
     verdict = verdict_on(rig, scans(rig, rig, target))
     assert verdict.state is AgreementState.AGREE
     assert verdict.sentence() == ""
-    assert verdict.facts() == {"state": "agree", "n_frames": verdict.n_frames}
+    assert verdict.to_dict() == {"state": "agree", "n_frames": verdict.n_frames}
 
 
 @pytest.mark.parametrize("laser", [0, 1, 2])

@@ -10,18 +10,18 @@ from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.scanner import Scanner, ScannerOptions
 from aqualvs.scanning import assignment
-from aqualvs.scanning.assignment import UNTESTED, Outcome, Verdict, widened
-from aqualvs.scanning.candidates import read_returns
-from aqualvs.scanning.laser_bands import SearchAxis, plan_searches
+from aqualvs.scanning.assignment import NOT_TESTED, AssignmentOutcome, Verdict, inflate_for_rival
+from aqualvs.scanning.candidates import find_candidates
+from aqualvs.scanning.laser_bands import SearchAxis, plan_bands
 from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.posture_estimator import Measurement
-from aqualvs.scanning.stripe import Returns
+from aqualvs.scanning.stripe import StripePeaks
 from aqualvs.scanning.surfaces import Surface, surface_on
 from aqualvs.scanning.target import TargetKind
 from aqualvs.scanning.triangulate import Triangulator
 from aqualvs.simulation.scenarios import example_rig
 from fan_cases import Fan, Stage, Trouble, fan_rig, miscalibrated
-from scanning_cases import everywhere, returns_of, strands
+from scanning_cases import everywhere, peaks_of, strands
 
 FAN = Fan()
 FAR_FAN = Fan(baseline=(0.2, 0.0, 0.02), aim_deg=-10.0)
@@ -32,35 +32,35 @@ STRANDS = Trouble(strands=True, missing=0.2, n_glints=40)
 WALL = Plane.from_normal((0.1, 1.0, -0.05), 0.6)
 
 
-class Tally(NamedTuple):
+class RunSummary(NamedTuple):
     """Random walls before a fan: how many are measured, and how many wrongly by over 5 %."""
 
     valid: int
     wrong: int
 
 
-def tally(fan: Fan, trouble: Trouble, own_deg: float) -> Tally:
+def summary(fan: Fan, trouble: Trouble, own_deg: float) -> RunSummary:
     rig, valid, wrong = fan_rig(fan), 0, 0
     for case in range(2):
         told = miscalibrated(rig, np.random.default_rng([5, case]), own_deg=own_deg)
         stage, scanner = Stage(told, fan, rig), Scanner(told)
         for k in range(4):
             scene = stage.scene(np.random.default_rng([9, case, k]), trouble)
-            found = scanner.measure(0, 0.0, scene.returns).posture
+            found = scanner.measure(0, 0.0, scene.peaks).posture
             if isinstance(found, Posture):
                 valid += 1
                 wrong += abs(found.range / scene.plane.offset - 1.0) > 0.05
-    return Tally(valid, wrong)
+    return RunSummary(valid, wrong)
 
 
-def untested(*_: object) -> Outcome:
-    return UNTESTED
+def untested(*_: object) -> AssignmentOutcome:
+    return NOT_TESTED
 
 
 def measured(fan: Fan, trouble: Trouble) -> Posture | Refusal:
     stage = Stage(fan_rig(fan), fan)
     scene = stage.scene_of(np.random.default_rng(3), trouble, WALL)
-    return Scanner(stage.rig).measure(0, 0.0, scene.returns).posture
+    return Scanner(stage.rig).measure(0, 0.0, scene.peaks).posture
 
 
 CASES = {
@@ -73,7 +73,7 @@ CASES = {
 
 @pytest.mark.parametrize("case", CASES)
 def test_no_stripe_of_a_fan_is_taken_for_its_neighbours(case: str) -> None:
-    found = tally(*CASES[case], own_deg=0.02)
+    found = summary(*CASES[case], own_deg=0.02)
     assert found.wrong == 0
     # Measured: all eight; one may be refused as ambiguous.
     assert found.valid >= 7
@@ -81,7 +81,7 @@ def test_no_stripe_of_a_fan_is_taken_for_its_neighbours(case: str) -> None:
 
 def test_without_the_test_of_rivals_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(assignment.AssignmentTest, "test", untested)
-    assert tally(FAR_FAN, STRANDS, own_deg=0.02).wrong >= 2
+    assert summary(FAR_FAN, STRANDS, own_deg=0.02).wrong >= 2
 
 
 def test_lines_that_might_be_their_neighbours_are_ambiguous() -> None:
@@ -99,7 +99,7 @@ def test_light_that_must_be_there_decides(monkeypatch: pytest.MonkeyPatch) -> No
     assert measured(fan, EASY)
     monkeypatch.setattr(assignment, "_DARK_LASER", 0.0)
     monkeypatch.setattr(assignment, "_FOREIGN_STRIPE", 0.0)
-    monkeypatch.setattr(assignment, "_MOST_FREEDOM", 0.0)
+    monkeypatch.setattr(assignment, "_MAX_FREEDOM", 0.0)
     assert not measured(fan, EASY)
 
 
@@ -109,7 +109,7 @@ def test_residuals_tell_a_fan_with_a_dark_end(monkeypatch: pytest.MonkeyPatch) -
     found = measured(FAN, trouble)
     assert isinstance(found, Posture)
     assert found.range == pytest.approx(WALL.offset, rel=0.01)
-    monkeypatch.setattr(assignment, "_MOST_FREEDOM", 0.0)
+    monkeypatch.setattr(assignment, "_MAX_FREEDOM", 0.0)
     assert not measured(FAN, trouble)
 
 
@@ -130,12 +130,12 @@ def posture(distance: float, yaw: float) -> Posture:
 def test_a_near_rival_widens_and_a_far_one_does_not() -> None:
     found = Measurement(posture(0.6, 0.0), np.ones(1, np.bool_))
     other = Plane.from_normal((np.tan(0.02), 1.0, 0.0), 0.606 / np.cos(0.02))
-    near = widened(found, Outcome(Verdict.NEAR, other, 0.0)).posture
+    near = inflate_for_rival(found, AssignmentOutcome(Verdict.NEAR, other, 0.0)).posture
     assert isinstance(near, Posture)
     # Even odds: half of the squared distance between the two.
     assert near.covariance[2, 2] == pytest.approx(1e-6 + 0.5 * 0.02**2)
     assert near.range == 0.6
-    assert widened(found, UNTESTED) is found
+    assert inflate_for_rival(found, NOT_TESTED) is found
 
 
 def small(points: FloatArray) -> BoolArray:
@@ -147,11 +147,11 @@ def small(points: FloatArray) -> BoolArray:
 def test_a_flank_that_one_laser_misses_is_no_wall() -> None:
     rig, flank = example_rig(), Plane.from_normal((0.0, 1.0, 0.0), 0.95)
     scanner = Scanner(rig, ScannerOptions(target=TargetKind.SOLID))
-    found = scanner.measure(0, 0.0, returns_of(rig, [(flank, small)], 0.1)).posture
+    found = scanner.measure(0, 0.0, peaks_of(rig, [(flank, small)], 0.1)).posture
     assert isinstance(found, Refusal)
     assert found.reason is Reason.NOT_A_PLANE
     assert "lasers that should be seen on it are not" in found.detail
-    assert scanner.measure(0, 0.0, returns_of(rig, [(flank, everywhere)], 0.1)).posture
+    assert scanner.measure(0, 0.0, peaks_of(rig, [(flank, everywhere)], 0.1)).posture
 
 
 def planks(points: FloatArray) -> BoolArray:
@@ -163,10 +163,10 @@ def planks(points: FloatArray) -> BoolArray:
 
 def test_a_table_with_gaps_is_solid_where_something_solid_is_asked_for() -> None:
     rig = example_rig()
-    returns = returns_of(rig, [(Plane.from_normal((0.1, 1.0, 0.0), 0.6), planks)], 0.1)
+    peaks = peaks_of(rig, [(Plane.from_normal((0.1, 1.0, 0.0), 0.6), planks)], 0.1)
     labels = {}
     for kind in (TargetKind.AUTO, TargetKind.SOLID):
-        scan = Scanner(rig, ScannerOptions(target=kind)).measure(0, 0.0, returns)
+        scan = Scanner(rig, ScannerOptions(target=kind)).measure(0, 0.0, peaks)
         assert isinstance(scan.posture, Posture), scan.posture
         assert scan.posture.range == pytest.approx(0.6 / np.hypot(0.1, 1.0), rel=2e-3)
         labels[kind] = np.bincount(scan.points.label, minlength=2)
@@ -182,7 +182,7 @@ def farther_strands(points: FloatArray) -> BoolArray:
     return strands(points) & (points[:, 0] > 0.0)
 
 
-def joined(parts: list[dict[SearchAxis, Returns]]) -> dict[SearchAxis, Returns]:
+def joined(parts: list[dict[SearchAxis, StripePeaks]]) -> dict[SearchAxis, StripePeaks]:
     """Returns of several parts of a scene, in the order that detection gives."""
     found = {}
     for axis in SearchAxis:
@@ -190,11 +190,11 @@ def joined(parts: list[dict[SearchAxis, Returns]]) -> dict[SearchAxis, Returns]:
         if mine:
             rows = [np.concatenate(column) for column in zip(*map(columns, mine), strict=True)]
             order = np.lexsort((rows[1], rows[0]))
-            found[axis] = Returns(*(row[order] for row in rows))
+            found[axis] = StripePeaks(*(row[order] for row in rows))
     return found
 
 
-def columns(part: Returns) -> tuple[FloatArray, ...]:
+def columns(part: StripePeaks) -> tuple[FloatArray, ...]:
     return part.line, part.position, part.height, part.width, part.likelihood
 
 
@@ -206,35 +206,37 @@ def test_a_net_that_lacks_a_laser_is_outweighed_by_a_nearer_one(
     first, second, third = rig.lasers
     near, far = (Plane.from_normal((0.1 * k, 1.0, 0.0), 0.5 + 0.12 * k) for k in range(2))
     parts = [
-        returns_of(replace(rig, lasers=(second, third)), [(near, nearer_strands)], 0.1),
-        returns_of(replace(rig, lasers=(first, second)), [(far, farther_strands)], 0.1),
+        peaks_of(replace(rig, lasers=(second, third)), [(near, nearer_strands)], 0.1),
+        peaks_of(replace(rig, lasers=(first, second)), [(far, farther_strands)], 0.1),
     ]
     camera = rig.camera()
-    searches, triangulator = plan_searches(rig, camera), Triangulator(rig, camera)
-    test = assignment.AssignmentTest(searches, triangulator, rig.working_range)
+    laser_bands, triangulator = plan_bands(rig, camera), Triangulator(rig, camera)
+    test = assignment.AssignmentTest(laser_bands, triangulator, rig.working_range)
 
-    def outweighed(
-        parts: list[dict[SearchAxis, Returns]], *, share: float = 1.0, mesh: bool = True
+    def nearer_net(
+        parts: list[dict[SearchAxis, StripePeaks]], *, share: float = 1.0, mesh: bool = True
     ) -> bool:
-        chunks, _ = read_returns(joined(parts), searches, triangulator).chunks()
-        target, other = (surface_on(one, chunks, len(rig.lasers), 850.0) for one in (far, near))
+        subsegments, _ = find_candidates(joined(parts), laser_bands, triangulator).subsegments()
+        target, other = (
+            surface_on(one, subsegments, len(rig.lasers), 850.0) for one in (far, near)
+        )
         target = replace(target, is_mesh=True)
-        other = replace(other, is_mesh=mesh, voice=share * target.voice)
-        assert test.outweighed(chunks, [target, other], other) is None
-        return test.outweighed(chunks, [target, other], target) is other
+        other = replace(other, is_mesh=mesh, sampling_weight=share * target.sampling_weight)
+        assert test.nearer_net(subsegments, [target, other], other) is None
+        return test.nearer_net(subsegments, [target, other], target) is other
 
-    assert outweighed(parts)
+    assert nearer_net(parts)
     # Not by less light, by something solid, or where every laser is on the net.
-    assert not outweighed(parts, share=0.9)
-    assert not outweighed(parts, mesh=False)
-    whole = returns_of(rig, [(far, strands)], 0.1)
-    assert not outweighed([parts[0], whole])
-    scanner, returns = Scanner(rig), joined(parts)
-    chunks, _ = read_returns(returns, searches, triangulator).chunks()
-    other = surface_on(near, chunks, len(rig.lasers), 850.0)
-    assert scanner.measure(0, 0.0, returns).posture
-    monkeypatch.setattr(assignment.AssignmentTest, "outweighed", lambda *_: other)
-    refused = scanner.measure(0, 0.0, returns).posture
+    assert not nearer_net(parts, share=0.9)
+    assert not nearer_net(parts, mesh=False)
+    net_mask = peaks_of(rig, [(far, strands)], 0.1)
+    assert not nearer_net([parts[0], net_mask])
+    scanner, peaks = Scanner(rig), joined(parts)
+    subsegments, _ = find_candidates(peaks, laser_bands, triangulator).subsegments()
+    other = surface_on(near, subsegments, len(rig.lasers), 850.0)
+    assert scanner.measure(0, 0.0, peaks).posture
+    monkeypatch.setattr(assignment.AssignmentTest, "nearer_net", lambda *_: other)
+    refused = scanner.measure(0, 0.0, peaks).posture
     assert isinstance(refused, Refusal)
     assert refused.reason is Reason.AMBIGUOUS
 
@@ -248,22 +250,22 @@ def slanted_strands(points: FloatArray) -> BoolArray:
 def test_a_net_before_a_wall_is_not_overlooked(monkeypatch: pytest.MonkeyPatch) -> None:
     rig = example_rig()
     net, wall = Plane.from_normal((0.1, 1.0, 0.0), 0.4), Plane.from_normal((0.0, 1.0, 0.1), 0.8)
-    behind = returns_of(rig, [(wall, everywhere)], 0.1)
+    behind = peaks_of(rig, [(wall, everywhere)], 0.1)
     camera = rig.camera()
-    searches, triangulator = plan_searches(rig, camera), Triangulator(rig, camera)
-    test = assignment.AssignmentTest(searches, triangulator, rig.working_range)
+    laser_bands, triangulator = plan_bands(rig, camera), Triangulator(rig, camera)
+    test = assignment.AssignmentTest(laser_bands, triangulator, rig.working_range)
 
     def overlooked(
-        part: dict[SearchAxis, Returns], *, mesh: bool = True, wall_is_mesh: bool = False
+        part: dict[SearchAxis, StripePeaks], *, mesh: bool = True, wall_is_mesh: bool = False
     ) -> Surface | None:
-        readings = read_returns(joined([part, behind]), searches, triangulator)
-        chunks, index = readings.chunks()
-        near, far = (surface_on(one, chunks, len(rig.lasers), 850.0) for one in (net, wall))
+        candidates = find_candidates(joined([part, behind]), laser_bands, triangulator)
+        subsegments, index = candidates.subsegments()
+        near, far = (surface_on(one, subsegments, len(rig.lasers), 850.0) for one in (net, wall))
         near, far = replace(near, is_mesh=mesh), replace(far, is_mesh=wall_is_mesh)
-        assert test.overlooked(readings, chunks, index, [far, near], near) is None
-        return test.overlooked(readings, chunks, index, [far, near], far)
+        assert test.overlooked(candidates, subsegments, index, [far, near], near) is None
+        return test.overlooked(candidates, subsegments, index, [far, near], far)
 
-    seen = returns_of(rig, [(net, slanted_strands)], 0.1)
+    seen = peaks_of(rig, [(net, slanted_strands)], 0.1)
     found = overlooked(seen)
     assert found is not None
     assert found.is_mesh
@@ -273,21 +275,20 @@ def test_a_net_before_a_wall_is_not_overlooked(monkeypatch: pytest.MonkeyPatch) 
     assert dense is not None
     assert dense.is_mesh
     # Not a plate, and not what one laser alone shows.
-    assert overlooked(returns_of(rig, [(net, everywhere)], 0.1), mesh=False) is None
+    assert overlooked(peaks_of(rig, [(net, everywhere)], 0.1), mesh=False) is None
     assert (
-        overlooked(returns_of(replace(rig, lasers=rig.lasers[:1]), [(net, slanted_strands)]))
-        is None
+        overlooked(peaks_of(replace(rig, lasers=rig.lasers[:1]), [(net, slanted_strands)])) is None
     )
     # The wall in its shadows may look broken, and has long stretches all the same.
     assert overlooked(seen, wall_is_mesh=True) is not None
-    scanner, returns = Scanner(rig), joined([seen, behind])
+    scanner, peaks = Scanner(rig), joined([seen, behind])
     monkeypatch.setattr("aqualvs.scanner.choose_target", lambda surfaces, *_: surfaces[0])
-    posture = scanner.measure(0, 0.0, returns).posture
+    posture = scanner.measure(0, 0.0, peaks).posture
     assert isinstance(posture, Posture)
     assert posture.range == pytest.approx(0.4 / np.hypot(0.1, 1.0), rel=2e-3)
     monkeypatch.setattr(
         assignment.AssignmentTest, "overlooked", lambda *_: replace(found, is_mesh=False)
     )
-    refused = scanner.measure(0, 0.0, returns).posture
+    refused = scanner.measure(0, 0.0, peaks).posture
     assert isinstance(refused, Refusal)
     assert refused.reason is Reason.AMBIGUOUS

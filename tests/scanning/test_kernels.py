@@ -8,12 +8,12 @@ from hypothesis.extra.numpy import arrays
 
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.quantile import element_at
-from aqualvs.scanning.plane_search import _guide, _middle_voice, _pick
+from aqualvs.scanning.plane_search import _guide, _median_weight, _pick
 from aqualvs.scanning.surfaces import lit_cells, number_cells
 
 # Repeated values among them, and such as leave the others in one bin.
 VALUES = st.floats(-300.0, 300.0) | st.sampled_from([0.0, 12.0, 12.5, -1e30, 1e300, np.inf, np.nan])
-VOICES = arrays(np.float64, st.integers(1, 60), elements=st.integers(1, 40).map(float))
+SAMPLING_WEIGHTS = arrays(np.float64, st.integers(1, 60), elements=st.integers(1, 40).map(float))
 
 
 @settings(deadline=None, max_examples=300)
@@ -27,25 +27,27 @@ def test_a_quantile_is_the_value_that_sorting_gives(values: FloatArray, share: f
 
 
 @settings(deadline=None, max_examples=200)
-@given(VOICES)
-def test_half_of_all_voice_is_at_most_as_loud_as_the_middle_one(voice: FloatArray) -> None:
+@given(SAMPLING_WEIGHTS)
+def test_half_of_all_voice_is_at_most_as_loud_as_the_middle_one(
+    sampling_weight: FloatArray,
+) -> None:
     # Whole numbers add up exactly in any order.
-    ordered = np.sort(voice)
-    expected = ordered[np.searchsorted(np.cumsum(ordered), 0.5 * voice.sum())]
-    assert _middle_voice(voice) == expected
+    ordered = np.sort(sampling_weight)
+    expected = ordered[np.searchsorted(np.cumsum(ordered), 0.5 * sampling_weight.sum())]
+    assert _median_weight(sampling_weight) == expected
 
 
 @settings(deadline=None, max_examples=100)
-@given(VOICES, st.lists(st.floats(0.0, 1.0, exclude_max=True), min_size=1, max_size=50))
+@given(SAMPLING_WEIGHTS, st.lists(st.floats(0.0, 1.0, exclude_max=True), min_size=1, max_size=50))
 def test_chunks_are_drawn_in_proportion_to_their_voice(
-    voice: FloatArray, draws: list[float]
+    sampling_weight: FloatArray, draws: list[float]
 ) -> None:
-    up_to = np.cumsum(voice)
-    guide = np.empty(len(voice), np.int64)
+    up_to = np.cumsum(sampling_weight)
+    guide = np.empty(len(sampling_weight), np.int64)
     _guide(up_to, guide)
     found = [_pick(up_to, guide, draw) for draw in draws]
     expected = np.searchsorted(up_to, np.array(draws) * up_to[-1], side="right")
-    np.testing.assert_array_equal(found, expected.clip(max=len(voice) - 1))
+    np.testing.assert_array_equal(found, expected.clip(max=len(sampling_weight) - 1))
 
 
 @pytest.mark.parametrize("size_px", [(720, 576), (1920, 1080)])

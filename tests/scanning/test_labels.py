@@ -7,17 +7,17 @@ import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.planes import Plane
-from aqualvs.scanning.candidates import Readings, read_returns
-from aqualvs.scanning.labels import label_readings
-from aqualvs.scanning.laser_bands import SearchAxis, plan_searches
+from aqualvs.scanning.candidates import Candidates, find_candidates
+from aqualvs.scanning.labels import label_candidates
+from aqualvs.scanning.laser_bands import SearchAxis, plan_bands
 from aqualvs.scanning.posture import Reason, Refusal
 from aqualvs.scanning.posture_estimator import Measurement
 from aqualvs.scanning.scan import Label, ScanPoints
-from aqualvs.scanning.stripe import Returns
+from aqualvs.scanning.stripe import StripePeaks
 from aqualvs.scanning.surfaces import Surface, find_surfaces
 from aqualvs.scanning.triangulate import Triangulator
 from aqualvs.simulation.scenarios import example_rig
-from scanning_cases import Lit, behind_strands, everywhere, returns_of, strands
+from scanning_cases import Lit, behind_strands, everywhere, peaks_of, strands
 
 NET = Plane.from_normal([-0.1, 1.0, 0.05], 0.45)
 NONE = Refusal(Reason.COLLINEAR)
@@ -27,8 +27,8 @@ WALL = Plane.from_normal([0.07, 1.0, 0.0], 0.8)
 
 
 class Labelled(NamedTuple):
-    returns: dict[SearchAxis, Returns]
-    readings: Readings
+    peaks: dict[SearchAxis, StripePeaks]
+    candidates: Candidates
     index: IntArray
     surfaces: list[Surface]
     points: ScanPoints
@@ -38,24 +38,24 @@ def label(targets: Sequence[tuple[Plane, Lit]], posture_to: Plane | None) -> Lab
     """Label the light on some targets; the posture rests on all that lies on one of them."""
     rig = example_rig()
     camera = rig.camera()
-    returns = returns_of(rig, targets, 0.1)
-    readings = read_returns(returns, plan_searches(rig, camera), Triangulator(rig, camera))
-    chunks, index = readings.chunks()
-    surfaces = find_surfaces(chunks, index, readings.pixels, 3, rig.working_range, 850.0)
+    peaks = peaks_of(rig, targets, 0.1)
+    candidates = find_candidates(peaks, plan_bands(rig, camera), Triangulator(rig, camera))
+    subsegments, index = candidates.subsegments()
+    surfaces = find_surfaces(subsegments, index, candidates.pixels, 3, rig.working_range, 850.0)
     target = None
-    in_posture = np.zeros(len(readings), np.bool_)
+    in_posture = np.zeros(len(candidates), np.bool_)
     if posture_to is not None:
         offsets = [abs(one.plane.offset - posture_to.offset) for one in surfaces]
         target = surfaces[int(np.argmin(offsets))]
         in_posture = target.members[index]
-    points, _ = label_readings(
-        readings, index, surfaces, target, Measurement(NONE, in_posture), RANGE
+    points, _ = label_candidates(
+        candidates, index, surfaces, target, Measurement(NONE, in_posture), RANGE
     )
-    return Labelled(returns, readings, index, surfaces, points)
+    return Labelled(peaks, candidates, index, surfaces, points)
 
 
-def all_pixels(returns: dict[SearchAxis, Returns]) -> FloatArray:
-    along_x, along_y = returns[SearchAxis.ALONG_X], returns[SearchAxis.ALONG_Y]
+def all_pixels(peaks: dict[SearchAxis, StripePeaks]) -> FloatArray:
+    along_x, along_y = peaks[SearchAxis.ALONG_X], peaks[SearchAxis.ALONG_Y]
     return np.concatenate(
         [
             np.stack([along_x.position, along_x.line], axis=-1),
@@ -78,20 +78,20 @@ def test_light_on_the_target_is_labelled_once_with_its_laser() -> None:
     assert np.all(times_seen(points)[on_target] == 1)
     off = np.abs(WALL.signed_distance(points.points_in_dome[on_target]))
     assert np.percentile(off, 99) < 0.005
-    n_returns = len(all_pixels(found.returns))
-    assert np.count_nonzero(on_target) > 0.95 * n_returns
+    n_peaks = len(all_pixels(found.peaks))
+    assert np.count_nonzero(on_target) > 0.95 * n_peaks
     assert np.all(np.diff(points.laser) >= 0)
 
 
 def test_no_return_is_lost() -> None:
     found = label([(NET, strands), (WALL, behind_strands)], NET)
     missing = 0
-    for pixel in all_pixels(found.returns):
+    for pixel in all_pixels(found.peaks):
         gap = np.abs(found.points.pixels - pixel).max(axis=1).min()
         # What another reading of the same light explains is left out: within two cells of 6 px.
         missing += gap > 12.0
     # Long segments that no laser could have made are dropped before.
-    assert missing < 0.02 * len(all_pixels(found.returns))
+    assert missing < 0.02 * len(all_pixels(found.peaks))
 
 
 def test_the_wall_behind_the_net_is_background() -> None:
@@ -122,9 +122,9 @@ def test_what_the_posture_left_out_of_its_target_is_still_on_it() -> None:
     found = label([(WALL, everywhere)], WALL)
     target = found.surfaces[0]
     on_it = target.members[found.index]
-    left_out = on_it & (found.readings.pixels[:, 1] < 200.0)
-    points, _ = label_readings(
-        found.readings,
+    left_out = on_it & (found.candidates.pixels[:, 1] < 200.0)
+    points, _ = label_candidates(
+        found.candidates,
         found.index,
         found.surfaces,
         target,
@@ -140,15 +140,15 @@ def test_what_the_posture_left_out_of_its_target_is_still_on_it() -> None:
 
 def test_short_pieces_that_nothing_explains_are_clutter_or_ambiguous() -> None:
     found = label([(NET, strands)], None)
-    points, _ = label_readings(
-        found.readings,
+    points, _ = label_candidates(
+        found.candidates,
         found.index,
         [],
         None,
-        Measurement(NONE, np.zeros(len(found.readings), np.bool_)),
+        Measurement(NONE, np.zeros(len(found.candidates), np.bool_)),
         SHORT,
     )
-    assert len(points) == len(found.readings)
+    assert len(points) == len(found.candidates)
     several = times_seen(points) > 1
     assert np.all(points.label[several] == Label.AMBIGUOUS)
     distance = np.linalg.norm(points.points_in_dome, axis=1)

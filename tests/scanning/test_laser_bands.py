@@ -10,7 +10,7 @@ from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig import Laser, Rig
 from aqualvs.optics.sheet import sheets_of
-from aqualvs.scanning.laser_bands import SLOPE_CELL, SearchAxis, StripeSearch, plan_searches
+from aqualvs.scanning.laser_bands import SLOPE_CELL, LaserBand, SearchAxis, plan_bands
 from aqualvs.simulation.lasers import default_sources
 from aqualvs.simulation.scenarios import bluerov2_rig, example_rig
 from windowed_cases import windowed
@@ -46,14 +46,14 @@ def stripe_pixels(rig: Rig, laser: Plane, target: Plane) -> FloatArray:
     return pixels[valid & near & camera.inside_image(pixels)]
 
 
-def across_and_line(search: StripeSearch, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
+def across_and_line(search: LaserBand, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Position along the search line, and the number of the line, with fractions."""
     x, y = pixels.T
     position, across = (x, y) if search.axis is SearchAxis.ALONG_X else (y, x)
     return position, (across - 0.5 * (search.line_px - 1)) / search.line_px
 
 
-def in_band(search: StripeSearch, position: FloatArray, line: FloatArray) -> BoolArray:
+def in_band(search: LaserBand, position: FloatArray, line: FloatArray) -> BoolArray:
     nearest: IntArray = np.rint(line).astype(np.int64).clip(0, len(search.lowest) - 1)
     inside: BoolArray = (position >= search.lowest[nearest]) & (position <= search.highest[nearest])
     return inside
@@ -62,10 +62,10 @@ def in_band(search: StripeSearch, position: FloatArray, line: FloatArray) -> Boo
 @pytest.mark.parametrize("make_rig", RIGS)
 def test_bands_hold_every_stripe_within_the_working_range(make_rig: Callable[[], Rig]) -> None:
     rig = make_rig()
-    searches = plan_searches(rig, rig.camera())
-    seen = np.zeros(len(searches), np.int64)
+    laser_bands = plan_bands(rig, rig.camera())
+    seen = np.zeros(len(laser_bands), np.int64)
     for target in random_targets(rig, np.random.default_rng(1)):
-        for i, search in enumerate(searches):
+        for i, search in enumerate(laser_bands):
             pixels = stripe_pixels(rig, rig.lasers[i].plane, target)
             position, line = across_and_line(search, pixels)
             # Half a pixel beyond the first and last pixel's centre is still the picture.
@@ -93,10 +93,10 @@ def bent_stripe_pixels(rig: Rig, i: int, target: Plane) -> FloatArray:
 @pytest.mark.parametrize("make_rig", RIGS)
 def test_bands_and_slopes_hold_bent_stripes(make_rig: Callable[[], Rig]) -> None:
     rig = windowed(make_rig())
-    searches = plan_searches(rig, rig.camera())
-    seen = np.zeros(len(searches), np.int64)
+    laser_bands = plan_bands(rig, rig.camera())
+    seen = np.zeros(len(laser_bands), np.int64)
     for target in random_targets(rig, np.random.default_rng(3)):
-        for i, search in enumerate(searches):
+        for i, search in enumerate(laser_bands):
             position, line = across_and_line(search, bent_stripe_pixels(rig, i, target))
             length = rig.size_px[0] if search.axis is SearchAxis.ALONG_X else rig.size_px[1]
             assert in_band(search, position.clip(0.0, length - 1.0), line).all()
@@ -114,9 +114,9 @@ def test_bands_and_slopes_hold_bent_stripes(make_rig: Callable[[], Rig]) -> None
 @pytest.mark.parametrize("make_rig", RIGS)
 def test_slope_bounds_hold_the_true_slopes(make_rig: Callable[[], Rig]) -> None:
     rig = make_rig()
-    searches = plan_searches(rig, rig.camera())
+    laser_bands = plan_bands(rig, rig.camera())
     for target in random_targets(rig, np.random.default_rng(2)):
-        for i, search in enumerate(searches):
+        for i, search in enumerate(laser_bands):
             position, line = across_and_line(
                 search, stripe_pixels(rig, rig.lasers[i].plane, target)
             )
@@ -138,7 +138,7 @@ def test_bounds_say_something(make_rig: Callable[[], Rig]) -> None:
     rig = make_rig()
     width, height = rig.size_px
     # The paper's lens, far off the centre of its dome, sees the lower sheet in nearly every pixel.
-    for search, most in zip(plan_searches(rig, rig.camera()), (0.99, 0.85, 0.85), strict=True):
+    for search, most in zip(plan_bands(rig, rig.camera()), (0.99, 0.85, 0.85), strict=True):
         assert search.visible
         lit_px = search.line_px * np.maximum(search.highest - search.lowest + 1, 0).sum()
         assert 0.02 < lit_px / (width * height) < most
@@ -148,7 +148,7 @@ def test_bounds_say_something(make_rig: Callable[[], Rig]) -> None:
 @pytest.mark.parametrize("make_rig", RIGS)
 def test_search_runs_across_the_stripe(make_rig: Callable[[], Rig]) -> None:
     rig = make_rig()
-    lower, left, _ = plan_searches(rig, rig.camera())
+    lower, left, _ = plan_bands(rig, rig.camera())
     assert lower.axis is SearchAxis.ALONG_Y
     assert left.axis is SearchAxis.ALONG_X
     width, height = rig.size_px
@@ -164,7 +164,7 @@ def test_search_runs_across_the_stripe(make_rig: Callable[[], Rig]) -> None:
 @pytest.mark.parametrize("make_rig", RIGS)
 def test_bands_stay_inside_the_picture(make_rig: Callable[[], Rig]) -> None:
     rig = make_rig()
-    for search in plan_searches(rig, rig.camera()):
+    for search in plan_bands(rig, rig.camera()):
         length = rig.size_px[0] if search.axis is SearchAxis.ALONG_X else rig.size_px[1]
         used = search.lowest <= search.highest
         assert search.lowest[used].min() >= 0
@@ -174,14 +174,14 @@ def test_bands_stay_inside_the_picture(make_rig: Callable[[], Rig]) -> None:
 def test_a_laser_behind_the_camera_is_not_visible() -> None:
     rig = example_rig()
     behind = replace(rig, lasers=(Laser("behind", Plane.from_normal((0.0, 1.0, 0.0), -0.4)),))
-    (search,) = plan_searches(behind, behind.camera())
+    (search,) = plan_bands(behind, behind.camera())
     assert not search.visible
 
 
 def test_a_narrower_working_range_gives_a_narrower_band() -> None:
     rig = example_rig()
     wide, narrow = (
-        plan_searches(replace(rig, working_range=limits), rig.camera())
+        plan_bands(replace(rig, working_range=limits), rig.camera())
         for limits in ((0.3, 1.0), (0.5, 0.6))
     )
     for a, b in zip(wide, narrow, strict=True):
@@ -194,7 +194,7 @@ def test_a_narrower_working_range_gives_a_narrower_band() -> None:
 
 def test_a_picture_that_is_no_multiple_of_a_cell() -> None:
     rig = replace(example_rig(), size_px=(717, 571))
-    for i, search in enumerate(plan_searches(rig, rig.camera())):
+    for i, search in enumerate(plan_bands(rig, rig.camera())):
         pixels = stripe_pixels(rig, rig.lasers[i].plane, Plane(np.array([0.0, 1.0, 0.0]), 0.5))
         position, line = across_and_line(search, pixels)
         length = 717 if search.axis is SearchAxis.ALONG_X else 571
@@ -205,6 +205,6 @@ def test_a_picture_that_is_no_multiple_of_a_cell() -> None:
 
 def test_without_its_dome_the_camera_has_other_bands() -> None:
     rig = example_rig()
-    with_dome = plan_searches(rig, rig.camera())
-    without = plan_searches(rig, rig.bare_camera())
+    with_dome = plan_bands(rig, rig.camera())
+    without = plan_bands(rig, rig.bare_camera())
     assert any(np.any(a.lowest != b.lowest) for a, b in zip(with_dome, without, strict=True))

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.scanning.detection import FrameDetector
-from aqualvs.scanning.laser_bands import SearchAxis, StripeSearch
+from aqualvs.scanning.laser_bands import LaserBand, SearchAxis
 from aqualvs.scanning.laser_colour import (
     LaserColour,
     channel_image,
@@ -20,7 +20,7 @@ from aqualvs.scanning.laser_colour import (
     useful_height,
 )
 from aqualvs.scanning.scan import Frame, planes_of_image
-from aqualvs.scanning.stripe import N_MEASURES, Returns, StripeOptions
+from aqualvs.scanning.stripe import N_MEASURES, StripeOptions, StripePeaks
 
 U8 = NDArray[np.uint8]
 Colour = tuple[float, float, float]
@@ -66,11 +66,11 @@ def picture(
     return np.clip(np.rint(image[..., ::-1]), 0, 255).astype(np.uint8)
 
 
-def detect(image: U8, wavelength: float = 532.0, *, min_likelihood: float = 0.0) -> Returns:
+def detect(image: U8, wavelength: float = 532.0, *, min_likelihood: float = 0.0) -> StripePeaks:
     """All returns of a picture, however likely."""
     frame = Frame(0, 0.0, *planes_of_image(image))
     free = np.zeros((-(-HEIGHT // 8), -(-WIDTH // 8)))
-    search = StripeSearch(
+    search = LaserBand(
         SearchAxis.ALONG_Y,
         1,
         np.zeros(WIDTH, np.int64),
@@ -83,7 +83,7 @@ def detect(image: U8, wavelength: float = 532.0, *, min_likelihood: float = 0.0)
     return FrameDetector((WIDTH, HEIGHT), [search], options).detect(frame)[SearchAxis.ALONG_Y]
 
 
-def likelihood_at(found: Returns, y: float) -> FloatArray:
+def likelihood_at(found: StripePeaks, y: float) -> FloatArray:
     """Likelihoods of the returns on the bar at y; there is one on nearly every search line."""
     there: FloatArray = found.likelihood[np.abs(found.position - y) < 1.5]
     assert len(there) > 0.95 * WIDTH

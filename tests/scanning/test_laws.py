@@ -13,11 +13,11 @@ from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
 from aqualvs.optics.rig import Laser, Rig
 from aqualvs.scanner import Scanner
 from aqualvs.scanning.detection import FrameDetector
-from aqualvs.scanning.laser_bands import SearchAxis, StripeSearch
+from aqualvs.scanning.laser_bands import LaserBand, SearchAxis
 from aqualvs.scanning.plane_fit import SOLID_ERROR, PlaneFit, fit_robust
 from aqualvs.scanning.posture import range_pitch_yaw
 from aqualvs.scanning.scan import Frame
-from aqualvs.scanning.stripe import Returns, StripeOptions
+from aqualvs.scanning.stripe import StripeOptions, StripePeaks
 from aqualvs.scanning.triangulate import Triangulator
 from aqualvs.simulation.scenario import dome_from_target
 from aqualvs.simulation.scenarios import bluerov2_rig, example_rig
@@ -30,11 +30,11 @@ ANGLE = st.floats(-0.7, 0.7)
 # ------------------------------------------------------------------ detector
 
 
-def detect(image: U8, axis: SearchAxis = SearchAxis.ALONG_Y) -> Returns:
+def detect(image: U8, axis: SearchAxis = SearchAxis.ALONG_Y) -> StripePeaks:
     height, width = image.shape
     length, n_lines = (height, width) if axis is SearchAxis.ALONG_Y else (width, height)
     free = np.zeros((-(-length // 8), -(-n_lines // 8)))
-    search = StripeSearch(
+    search = LaserBand(
         axis=axis,
         line_px=1,
         lowest=np.zeros(n_lines, np.int64),
@@ -63,7 +63,7 @@ def stripes(seed: int) -> U8:
 SEED = st.integers(0, 2**32 - 1)
 
 
-def assert_moved(found: Returns, expected: Returns, shift: float) -> None:
+def assert_moved(found: StripePeaks, expected: StripePeaks, shift: float) -> None:
     np.testing.assert_array_equal(found.line, expected.line)
     # Sums in another order round differently.
     np.testing.assert_allclose(found.position, expected.position + shift, rtol=0.0, atol=1e-9)

@@ -5,10 +5,16 @@ import pytest
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.planes import Plane
-from aqualvs.scanning.candidates import Chunks
-from aqualvs.scanning.net_surfaces import continues, doubted, fit_mean, joined_plane, seen_through
+from aqualvs.scanning.candidates import Subsegments
+from aqualvs.scanning.net_surfaces import (
+    fit_mean,
+    inflate_covariance,
+    is_continuation,
+    merged_plane,
+    seen_through,
+)
 from aqualvs.scanning.posture import Posture
-from aqualvs.scanning.region_growing import follow_net
+from aqualvs.scanning.region_growing import grow_region
 
 RANGE = 0.6
 M_PER_LINE = 0.7e-3
@@ -26,21 +32,21 @@ class Stripes:
         self.laser = strand // n_strands
         self.line = (strand % n_strands) * PERIOD + np.tile(np.arange(LINES), height.size)
         self.height = height.ravel()[strand]
-        self.stretch = strand
+        self.component = strand
         self.source = np.arange(len(strand))
-        self.trust = np.full(len(strand), 0.8)
+        self.confidence = np.full(len(strand), 0.8)
         x = (self.line - self.line.mean()) * M_PER_LINE
         self.points = np.stack([x, RANGE + self.height, 0.1 * self.laser], axis=-1)
 
     def followed(self, on_net: BoolArray) -> BoolArray:
         """Which strands are on the net in the end, shape of the heights."""
-        marked = on_net.ravel()[self.stretch]
-        follow_net(
+        marked = on_net.ravel()[self.component]
+        grow_region(
             self.points,
             self.line,
             self.laser,
-            self.stretch,
-            self.trust,
+            self.component,
+            self.confidence,
             self.source,
             self.height,
             RANGE,
@@ -91,7 +97,7 @@ def test_light_between_strands_that_follow_one_another_is_none_of_the_net() -> N
 def test_dim_light_is_not_followed() -> None:
     height = fold([-0.015, -0.03, -0.015])
     stripes = Stripes(height)
-    stripes.trust[stripes.height < 0.0] = 0.3
+    stripes.confidence[stripes.height < 0.0] = 0.3
     np.testing.assert_array_equal(stripes.followed(height == 0.0), height == 0.0)
 
 
@@ -107,41 +113,41 @@ def test_of_several_readings_of_one_return_the_nearest_to_the_net_is_kept() -> N
     assert not found[2, 8:11].any()
 
 
-def chunks_on(laser: IntArray, line: IntArray, points: FloatArray) -> Chunks:
+def subsegments_on(laser: IntArray, line: IntArray, points: FloatArray) -> Subsegments:
     table = np.zeros((7, len(laser)))
     table[:3] = points.T
     table[6] = 5.0
     light = np.full(len(laser), 5.0)
-    return Chunks(table, light, np.full(len(laser), 5), line, line + 4, laser)
+    return Subsegments(table, light, np.full(len(laser), 5), line, line + 4, laser)
 
 
-def two_surfaces(second: BoolArray, height: FloatArray) -> Chunks:
+def two_surfaces(second: BoolArray, height: FloatArray) -> Subsegments:
     """Chunks of three lasers, 24 each, those of the second surface at a height over the first."""
     laser = np.repeat([0, 1, 2], 24)
     line = np.tile(np.arange(24) * PERIOD, 3)
     x = (line - 400.0) * M_PER_LINE
     points = np.stack([x, RANGE + np.where(second, height, 0.0), 0.1 * laser - 0.1], axis=-1)
-    return chunks_on(laser, line, points)
+    return subsegments_on(laser, line, points)
 
 
 def test_flanks_side_by_side_are_one_net() -> None:
     second = np.tile(np.arange(24) >= 14, 3)
     height = 0.8 * (np.tile(np.arange(24), 3) - 13) * PERIOD * M_PER_LINE
-    chunks = two_surfaces(second, height)
-    assert continues(FLAT, ~second, second, chunks)
-    assert not seen_through(~second, second, chunks)
+    subsegments = two_surfaces(second, height)
+    assert is_continuation(FLAT, ~second, second, subsegments)
+    assert not seen_through(~second, second, subsegments)
 
 
 def test_a_net_that_hangs_beside_and_behind_is_another() -> None:
     second = np.tile(np.arange(24) >= 14, 3)
-    assert not continues(FLAT, ~second, second, two_surfaces(second, np.full(72, 0.15)))
+    assert not is_continuation(FLAT, ~second, second, two_surfaces(second, np.full(72, 0.15)))
 
 
 def test_what_takes_turns_is_seen_through() -> None:
     second = np.tile(np.arange(24) % 2 == 1, 3)
-    chunks = two_surfaces(second, np.full(72, 0.3))
-    assert seen_through(~second, second, chunks)
-    assert not continues(FLAT, ~second, second, chunks)
+    subsegments = two_surfaces(second, np.full(72, 0.3))
+    assert seen_through(~second, second, subsegments)
+    assert not is_continuation(FLAT, ~second, second, subsegments)
 
 
 def test_two_turns_are_not_enough_to_see_through() -> None:
@@ -152,12 +158,12 @@ def test_two_turns_are_not_enough_to_see_through() -> None:
 
 def test_the_main_piece_gives_the_plane_and_else_their_mean() -> None:
     second = np.tile(np.arange(24) >= 14, 3)
-    chunks = two_surfaces(second, np.full(72, 0.02))
+    subsegments = two_surfaces(second, np.full(72, 0.02))
     other = Plane(FLAT.normal, RANGE + 0.02)
-    assert joined_plane([FLAT, other], [~second, second], chunks) is FLAT
+    assert merged_plane([FLAT, other], [~second, second], subsegments) is FLAT
     even = np.tile(np.arange(24) % 2 == 0, 3)
-    chunks = two_surfaces(even, np.full(72, 0.02))
-    mean = joined_plane([FLAT, other], [~even, even], chunks)
+    subsegments = two_surfaces(even, np.full(72, 0.02))
+    mean = merged_plane([FLAT, other], [~even, even], subsegments)
     assert mean.offset == pytest.approx(RANGE + 0.01, abs=1e-3)
 
 
@@ -209,7 +215,7 @@ def posture(distance: float, yaw: float) -> Posture:
 
 
 def test_doubt_widens_what_the_opinions_disagree_on() -> None:
-    wider = doubted(posture(0.6, 0.0), posture(0.61, 0.1), 0.25).covariance
+    wider = inflate_covariance(posture(0.6, 0.0), posture(0.61, 0.1), 0.25).covariance
     assert wider[0, 0] == pytest.approx(1e-6 + 0.25 * 0.01**2)
     assert wider[1, 1] == pytest.approx(1e-6)
     assert wider[2, 2] == pytest.approx(1e-6 + 0.25 * 0.1**2)

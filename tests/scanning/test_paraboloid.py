@@ -10,8 +10,8 @@ from aqualvs.scanning.paraboloid import (
     Patch,
     fit_patch,
     flat_patch,
-    hints_at_curvature,
     nearest_tangent,
+    shows_curvature,
     tangent_covariance,
 )
 from aqualvs.scanning.plane_fit import SharedError
@@ -84,12 +84,12 @@ def test_curvature_is_found_with_its_sigma(bend: tuple[float, float, float]) -> 
 def test_a_plane_is_left_a_plane() -> None:
     seen = observed(patch_of(*FLAT))
     assert fit_patch(seen, BASE, SHARED) is None
-    assert not hints_at_curvature(seen, np.ones(len(seen.laser)), BASE)
+    assert not shows_curvature(seen, np.ones(len(seen.laser)), BASE)
 
 
 def test_a_bend_is_hinted_at() -> None:
     seen = observed(patch_of(0.0, 0.0, 0.0, 0.2, 0.0, 0.0))
-    assert hints_at_curvature(seen, np.ones(len(seen.laser)), BASE)
+    assert shows_curvature(seen, np.ones(len(seen.laser)), BASE)
 
 
 @pytest.mark.parametrize("bend", [(1.0, 0.0, 0.0), (-0.8, 0.1, 0.4), (0.0, 0.0, 0.0)])

@@ -5,30 +5,32 @@ import numpy as np
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.scanning.plane_search import JY, N_ROWS, WEIGHT, X, Z, search_plane
 
-N_LASERS, N_CHUNKS, N_SEEDS = 3, 63, 400
+N_LASERS, N_SUBSEGMENTS, N_SEEDS = 3, 63, 400
 
 
 def stripes() -> FloatArray:
     """A plane with a fifth of the light, two thirds of that on another one, the rest scattered."""
     rng = np.random.default_rng(5)
-    table = np.zeros((N_ROWS, N_LASERS * N_CHUNKS))
+    table = np.zeros((N_ROWS, N_LASERS * N_SUBSEGMENTS))
     table[JY], table[WEIGHT] = 1e-3, rng.uniform(3.0, 6.0, table.shape[1])
     for laser in range(N_LASERS):
-        mine = slice(laser * N_CHUNKS, (laser + 1) * N_CHUNKS)
-        along = np.linspace(-0.25, 0.25, N_CHUNKS)
-        depth = rng.uniform(0.3, 1.5, N_CHUNKS)
-        whole = rng.permutation(N_CHUNKS)[:14]
-        depth[whole] = 0.6
+        mine = slice(laser * N_SUBSEGMENTS, (laser + 1) * N_SUBSEGMENTS)
+        along = np.linspace(-0.25, 0.25, N_SUBSEGMENTS)
+        depth = rng.uniform(0.3, 1.5, N_SUBSEGMENTS)
+        net_mask = rng.permutation(N_SUBSEGMENTS)[:14]
+        depth[net_mask] = 0.6
         if laser:
-            depth[rng.permutation(N_CHUNKS)[:13]] = 0.9
-        points = np.stack([along, np.ones(N_CHUNKS), np.full(N_CHUNKS, 0.1 * (laser - 1))])
-        table[X : Z + 1, mine] = points * depth + rng.normal(0.0, 4e-4, (3, N_CHUNKS))
+            depth[rng.permutation(N_SUBSEGMENTS)[:13]] = 0.9
+        points = np.stack(
+            [along, np.ones(N_SUBSEGMENTS), np.full(N_SUBSEGMENTS, 0.1 * (laser - 1))]
+        )
+        table[X : Z + 1, mine] = points * depth + rng.normal(0.0, 4e-4, (3, N_SUBSEGMENTS))
     return table
 
 
 def test_a_plane_with_a_fifth_of_the_light_is_found_beside_a_smaller_one() -> None:
-    table, laser = stripes(), np.repeat(np.arange(N_LASERS), N_CHUNKS)
-    start = np.arange(N_LASERS + 1) * N_CHUNKS
+    table, laser = stripes(), np.repeat(np.arange(N_LASERS), N_SUBSEGMENTS)
+    start = np.arange(N_LASERS + 1) * N_SUBSEGMENTS
     found = np.empty((N_SEEDS, 4))
     for seed in range(N_SEEDS):
         assert search_plane(table, laser, start, 0.24, 1.8, seed, found[seed])

@@ -9,9 +9,9 @@ from aqualvs.scanning.posture import (
     Posture,
     Reason,
     Refusal,
-    believable,
     posture_from_fit,
     range_pitch_yaw,
+    validate,
 )
 from aqualvs.simulation.scenario import dome_from_target
 
@@ -35,7 +35,7 @@ def answer(
     working_range: tuple[float, float] = (0.3, 1.0),
 ) -> Posture | Refusal:
     fit = PlaneFit(m, covariance, np.ones(3), rms)
-    return believable(posture_from_fit(fit, POINTS, axis), working_range)
+    return validate(posture_from_fit(fit, POINTS, axis), working_range)
 
 
 @pytest.mark.parametrize(("pitch", "yaw"), [(0.0, 0.0), (12.0, -25.0), (-30.0, 7.0), (1e-6, 40.0)])

@@ -6,18 +6,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aqualvs.geometry.arrays import FloatArray, IntArray
-from aqualvs.scanning.laser_bands import SearchAxis, StripeSearch
-from aqualvs.scanning.segments import CHUNK_LINES, Segments, link_segments
-from aqualvs.scanning.stripe import Returns
+from aqualvs.scanning.laser_bands import LaserBand, SearchAxis
+from aqualvs.scanning.segments import SUBSEGMENT_LINES, Segments, link_segments
+from aqualvs.scanning.stripe import StripePeaks
 
 N_LINES, LENGTH = 400, 300
 
 
 def search_for(
     slopes: tuple[float, float] = (-1.0, 1.0), band: tuple[int, int] = (0, LENGTH - 1)
-) -> StripeSearch:
+) -> LaserBand:
     cells = np.ones((-(-LENGTH // 8), -(-N_LINES // 8)))
-    return StripeSearch(
+    return LaserBand(
         axis=SearchAxis.ALONG_Y,
         line_px=1,
         lowest=np.full(N_LINES, band[0]),
@@ -27,13 +27,13 @@ def search_for(
     )
 
 
-def returns_at(*stripes: tuple[IntArray, FloatArray]) -> Returns:
+def peaks_at(*stripes: tuple[IntArray, FloatArray]) -> StripePeaks:
     """Returns on stripes given as (line, position), in the order that detectors keep."""
     line = np.concatenate([line for line, _ in stripes])
     position = np.concatenate([position for _, position in stripes])
     order = np.lexsort((position, line))
     n = len(line)
-    return Returns(
+    return StripePeaks(
         line=line[order],
         position=position[order],
         height=np.full(n, 80.0),
@@ -53,74 +53,68 @@ def members(segments: Segments, of: IntArray) -> list[set[int]]:
 
 
 def test_a_wall_s_stripe_is_one_stretch_in_small_chunks() -> None:
-    returns = returns_at(straight(20, 219, 100.0, 0.3))
-    found = link_segments(returns, search_for())
+    peaks = peaks_at(straight(20, 219, 100.0, 0.3))
+    found = link_segments(peaks, search_for())
     np.testing.assert_array_equal(found.order, np.arange(200))
-    assert len(np.unique(found.stretch)) == 1
-    sizes = np.bincount(found.chunk)
+    assert len(np.unique(found.component)) == 1
+    sizes = np.bincount(found.subsegment)
     assert sizes.sum() == 200
-    assert sizes.max() <= CHUNK_LINES
+    assert sizes.max() <= SUBSEGMENT_LINES
     # Even pieces: no chunk of one line at the end.
-    assert sizes.min() >= CHUNK_LINES - 4
-    assert np.all(np.diff(found.chunk) >= 0)
+    assert sizes.min() >= SUBSEGMENT_LINES - 4
+    assert np.all(np.diff(found.subsegment) >= 0)
 
 
 @pytest.mark.parametrize("slope", [-0.9, 0.0, 0.9])
 def test_a_missing_line_does_not_part_a_stripe_and_a_wide_gap_does(slope: float) -> None:
     line, position = straight(10, 109, 150.0, slope)
     one_missing = line != 60
-    found = link_segments(returns_at((line[one_missing], position[one_missing])), search_for())
+    found = link_segments(peaks_at((line[one_missing], position[one_missing])), search_for())
     assert len(found.order) == 99
-    assert len(np.unique(found.stretch)) == 1
+    assert len(np.unique(found.component)) == 1
     # One segment of 99 in even pieces, not two of 50 and 49.
-    assert len(np.unique(found.chunk)) == -(-99 // CHUNK_LINES)
+    assert len(np.unique(found.subsegment)) == -(-99 // SUBSEGMENT_LINES)
     wide = (line < 55) | (line > 75)
-    found = link_segments(returns_at((line[wide], position[wide])), search_for())
-    assert members(found, found.stretch) == [set(range(45)), set(range(45, 79))]
+    found = link_segments(peaks_at((line[wide], position[wide])), search_for())
+    assert members(found, found.component) == [set(range(45)), set(range(45, 79))]
 
 
 def test_a_jump_across_the_line_parts_a_stripe() -> None:
     # A box before a wall: the stripe goes on elsewhere.
-    found = link_segments(
-        returns_at(straight(10, 69, 100.0), straight(70, 129, 160.0)), search_for()
-    )
-    assert members(found, found.stretch) == [set(range(60)), set(range(60, 120))]
-    chunk_of_last, chunk_of_first = found.chunk[59], found.chunk[60]
-    assert chunk_of_first != chunk_of_last
+    found = link_segments(peaks_at(straight(10, 69, 100.0), straight(70, 129, 160.0)), search_for())
+    assert members(found, found.component) == [set(range(60)), set(range(60, 120))]
+    subsegment_of_last, subsegment_of_first = found.subsegment[59], found.subsegment[60]
+    assert subsegment_of_first != subsegment_of_last
 
 
 def test_two_strands_that_meet_at_a_knot_are_one_stretch_but_not_one_chunk() -> None:
     # Ten lines each; the second goes on three lines after the first's end, three pixels beside.
-    found = link_segments(
-        returns_at(straight(10, 19, 100.0), straight(23, 32, 103.0)), search_for()
-    )
-    assert len(np.unique(found.stretch)) == 1
-    assert len(np.unique(found.chunk)) == 2
-    apart = link_segments(
-        returns_at(straight(10, 19, 100.0), straight(30, 39, 103.0)), search_for()
-    )
-    assert len(np.unique(apart.stretch)) == 2
+    found = link_segments(peaks_at(straight(10, 19, 100.0), straight(23, 32, 103.0)), search_for())
+    assert len(np.unique(found.component)) == 1
+    assert len(np.unique(found.subsegment)) == 2
+    apart = link_segments(peaks_at(straight(10, 19, 100.0), straight(30, 39, 103.0)), search_for())
+    assert len(np.unique(apart.component)) == 2
 
 
 def test_meeting_is_transitive() -> None:
     dashes = [straight(10 + 13 * k, 19 + 13 * k, 100.0 + 3.0 * k) for k in range(6)]
-    found = link_segments(returns_at(*dashes), search_for())
+    found = link_segments(peaks_at(*dashes), search_for())
     assert len(found.order) == 60
-    assert len(np.unique(found.stretch)) == 1
+    assert len(np.unique(found.component)) == 1
 
 
 @pytest.mark.parametrize("slope", [0.4, 0.8])
 def test_crossing_stripes_keep_their_direction(slope: float) -> None:
     a = straight(100, 199, 100.0, slope)
     b = straight(100, 199, 100.0 + 99.0 * slope + 0.7, -slope)
-    returns = returns_at(a, b)
-    found = link_segments(returns, search_for())
+    peaks = peaks_at(a, b)
+    found = link_segments(peaks, search_for())
     assert len(np.unique(found.order)) == len(found.order) == 200
-    on_a = np.abs(returns.position - (100.0 + slope * (returns.line - 100))) < 1e-9
+    on_a = np.abs(peaks.position - (100.0 + slope * (peaks.line - 100))) < 1e-9
     # Before the crossing and after it each follows its own line.
-    for chunk in np.unique(found.chunk):
-        rows = found.order[found.chunk == chunk]
-        far = np.abs(returns.line[rows] - 149.5) > 6
+    for subsegment in np.unique(found.subsegment):
+        rows = found.order[found.subsegment == subsegment]
+        far = np.abs(peaks.line[rows] - 149.5) > 6
         if far.all():
             share = on_a[rows].mean()
             assert share in {0.0, 1.0}
@@ -130,31 +124,31 @@ def test_a_long_segment_in_a_wrong_direction_is_dropped_and_a_dash_is_kept() -> 
     narrow = search_for(slopes=(-0.1, 0.1))
     right, wrong = straight(10, 89, 50.0, 0.05), straight(10, 89, 150.0, 0.9)
     dash = straight(200, 211, 150.0, 0.9)
-    returns = returns_at(right, wrong, dash)
-    found = link_segments(returns, narrow)
-    kept = returns.position[found.order]
+    peaks = peaks_at(right, wrong, dash)
+    found = link_segments(peaks, narrow)
+    kept = peaks.position[found.order]
     assert np.count_nonzero(kept < 60.0) == 80
     np.testing.assert_allclose(np.sort(kept[kept > 60.0]), dash[1])
     # Where a laser may run so, the same stripe stays.
-    assert len(link_segments(returns, search_for()).order) == len(returns)
+    assert len(link_segments(peaks, search_for()).order) == len(peaks)
 
 
 def test_a_dash_is_one_chunk() -> None:
-    found = link_segments(returns_at(straight(10, 29, 50.0)), search_for())
+    found = link_segments(peaks_at(straight(10, 29, 50.0)), search_for())
     assert len(found.order) == 20
-    assert len(np.unique(found.chunk)) == 1
+    assert len(np.unique(found.subsegment)) == 1
 
 
 def test_what_lies_outside_the_band_is_left_out() -> None:
-    returns = returns_at(straight(10, 89, 50.0), straight(10, 89, 150.0), straight(10, 89, 250.0))
-    found = link_segments(returns, search_for(band=(100, 200)))
-    np.testing.assert_array_equal(returns.position[found.order], np.full(80, 150.0))
+    peaks = peaks_at(straight(10, 89, 50.0), straight(10, 89, 150.0), straight(10, 89, 250.0))
+    found = link_segments(peaks, search_for(band=(100, 200)))
+    np.testing.assert_array_equal(peaks.position[found.order], np.full(80, 150.0))
 
 
 def test_no_returns() -> None:
-    nothing = returns_at((np.empty(0, np.int64), np.empty(0)))
+    nothing = peaks_at((np.empty(0, np.int64), np.empty(0)))
     found = link_segments(nothing, search_for())
-    assert len(found.order) == len(found.stretch) == len(found.chunk) == 0
+    assert len(found.order) == len(found.component) == len(found.subsegment) == 0
 
 
 @settings(max_examples=60, deadline=None)
@@ -167,12 +161,12 @@ def test_every_return_is_used_at_most_once_and_groups_are_unbroken(
     position = rng.uniform(0.0, LENGTH - 1.0, n)
     if smooth:
         position = 150.0 + rng.normal(0.0, 1.5, n)
-    returns = returns_at((line, position))
-    found = link_segments(returns, search_for(slopes=(-5.0, 5.0)))
+    peaks = peaks_at((line, position))
+    found = link_segments(peaks, search_for(slopes=(-5.0, 5.0)))
     assert len(np.unique(found.order)) == len(found.order)
-    assert np.all(np.diff(found.chunk) >= 0)
-    for chunk in np.unique(found.chunk):
-        rows = found.order[found.chunk == chunk]
+    assert np.all(np.diff(found.subsegment) >= 0)
+    for subsegment in np.unique(found.subsegment):
+        rows = found.order[found.subsegment == subsegment]
         # Along the segment, one return a line, in one stretch.
-        assert np.all(np.diff(returns.line[rows]) > 0)
-        assert len(np.unique(found.stretch[found.chunk == chunk])) == 1
+        assert np.all(np.diff(peaks.line[rows]) > 0)
+        assert len(np.unique(found.component[found.subsegment == subsegment])) == 1

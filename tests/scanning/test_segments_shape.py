@@ -3,20 +3,22 @@
 import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray
-from aqualvs.scanning.segments import StretchShapes, stretch_shapes
+from aqualvs.scanning.segments import ComponentShapes, component_shapes
 
 _PX = 0.7e-3  # a pixel on the target, in metres
 
 
-def shapes_of(*depths: FloatArray, width: float = 5.0, height: float = 100.0) -> StretchShapes:
+def shapes_of(*depths: FloatArray, width: float = 5.0, height: float = 100.0) -> ComponentShapes:
     """Describe stretches that run to the right and are so deep, in pixels of stripe."""
-    stretch = np.repeat(np.arange(len(depths)), [len(one) for one in depths])
+    component = np.repeat(np.arange(len(depths)), [len(one) for one in depths])
     line = np.concatenate([np.arange(len(one)) for one in depths])
     depth = np.concatenate(depths)
     n = len(line)
     points = np.stack([_PX * line, 0.5 + _PX * depth, np.zeros(n)], axis=-1)
     sensitivity = np.tile([0.0, _PX, 0.0], (n, 1))
-    return stretch_shapes(stretch, line, points, sensitivity, np.full(n, width), np.full(n, height))
+    return component_shapes(
+        component, line, points, sensitivity, np.full(n, width), np.full(n, height)
+    )
 
 
 def test_a_straight_stretch_is_straight_however_it_slants() -> None:
@@ -55,5 +57,5 @@ def test_a_bright_spot_is_round_and_a_dim_or_long_one_is_not() -> None:
 def test_nothing_has_no_shapes() -> None:
     nothing, vectors = np.empty(0), np.empty((0, 3))
     index = np.empty(0, np.int64)
-    shapes = stretch_shapes(index, index, vectors, vectors, nothing, nothing)
+    shapes = component_shapes(index, index, vectors, vectors, nothing, nothing)
     assert len(shapes.n_lines) == 0

@@ -12,15 +12,15 @@ from numpy.typing import NDArray
 from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.scanning.detection import FrameDetector
-from aqualvs.scanning.laser_bands import SearchAxis, StripeSearch, plan_searches
+from aqualvs.scanning.laser_bands import LaserBand, SearchAxis, plan_bands
 from aqualvs.scanning.scan import Frame
 from aqualvs.scanning.stripe import (
     HEIGHT,
     N_MEASURES,
     PeakFinder,
-    Returns,
     SearchImage,
     StripeOptions,
+    StripePeaks,
 )
 from aqualvs.simulation.scenarios import bluerov2_rig
 
@@ -43,7 +43,7 @@ def detector_for(
     length, n_lines = (height, width) if axis is ALONG_Y else (width, height)
     low, high = band or (0, length - 1)
     free = np.zeros((-(-length // 8), -(-n_lines // 8)))
-    search = StripeSearch(
+    search = LaserBand(
         axis=axis,
         line_px=1,
         lowest=np.full(n_lines, low),
@@ -60,7 +60,7 @@ def detect(
     axis: SearchAxis = ALONG_Y,
     band: tuple[int, int] | None = None,
     options: StripeOptions = WIDE,
-) -> Returns:
+) -> StripePeaks:
     found = detector_for(image, axis, band, options).detect(Frame(0, 0.0, image, chroma))
     return found[axis]
 
@@ -82,9 +82,9 @@ def as_image(light: FloatArray) -> U8:
     return np.clip(np.rint(light), 0, 255).astype(np.uint8)
 
 
-def assert_same(found: Returns, expected: Returns) -> None:
+def assert_same(found: StripePeaks, expected: StripePeaks) -> None:
     assert len(found) > 0
-    for field in fields(Returns):
+    for field in fields(StripePeaks):
         one, other = getattr(found, field.name), getattr(expected, field.name)
         np.testing.assert_array_equal(one, other, err_msg=field.name)
 
@@ -256,12 +256,12 @@ def test_wide_pictures_of_any_size(size: tuple[int, int], with_chroma: bool) -> 
     rig = replace(bluerov2_rig(), size_px=size)
     image = as_image(30.0 + gaussian(300.3 + 0.02 * np.arange(width), length=height))
     chroma = green_chroma(image) if with_chroma else None
-    searches = [s for s in plan_searches(rig, rig.camera()) if s.axis is ALONG_Y]
-    assert len(searches) > 0
-    detector = FrameDetector(size, searches, StripeOptions())
+    laser_bands = [s for s in plan_bands(rig, rig.camera()) if s.axis is ALONG_Y]
+    assert len(laser_bands) > 0
+    detector = FrameDetector(size, laser_bands, StripeOptions())
     found = detector.detect(Frame(0, 0.0, image, chroma))[ALONG_Y]
-    line_px = searches[0].line_px
-    assert len(found) == len(searches[0].lowest)
+    line_px = laser_bands[0].line_px
+    assert len(found) == len(laser_bands[0].lowest)
     column = found.line * line_px + 0.5 * (line_px - 1)
     np.testing.assert_allclose(found.position, 300.3 + 0.02 * column, atol=0.05)
 

@@ -45,7 +45,7 @@ def background_of(row: list[int], reach: int) -> list[int]:
     ]
 
 
-def pieces(run: list[int], base: int) -> list[tuple[int, int]]:
+def segments(run: list[int], base: int) -> list[tuple[int, int]]:
     """Part a run where a valley has less than 0.6 of the lower of two peaks above the base."""
     start, found = 0, []
     while start < len(run):
@@ -83,7 +83,7 @@ def _peaks_of_run(
     row: list[int], background: list[int], x: int, start: int, stop: int, reach: int
 ) -> list[Peak]:
     found = []
-    parts = pieces(row[start:stop], background[start])
+    parts = segments(row[start:stop], background[start])
     for k, (one, other) in enumerate(parts):
         mine = row[start + one : start + other]
         peak = start + one + mine.index(max(mine))
@@ -179,13 +179,13 @@ def test_the_background_is_the_higher_of_the_two_sliding_minima() -> None:
     row = np.full(60, 20, np.uint8)
     row[30:] = 90
     row[28:31] = [120, 150, 120]
-    whole = np.array([0]), np.array([59])
+    net_mask = np.array([0]), np.array([59])
     image = SearchImage(row[None], NO_CHROMA, NO_CHROMA, 1, False)
-    _, table = find(image, whole, 10, 6)
+    _, table = find(image, net_mask, 10, 6)
     # A stripe on the edge of a box counts from the brighter side.
     np.testing.assert_array_equal(table[HEIGHT], [60.0])
     row[40:] = 20
-    _, table = find(image, whole, 40, 6)
+    _, table = find(image, net_mask, 40, 6)
     # Within reach the box has another side, and is dark behind it: all of it stands out.
     np.testing.assert_array_equal(table[HEIGHT], [130.0])
 

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from aqualvs.scanning.detection import FrameDetector, SearchLines
-from aqualvs.scanning.laser_bands import SearchAxis, plan_searches
+from aqualvs.scanning.laser_bands import SearchAxis, plan_bands
 from aqualvs.scanning.scan import Frame
 from aqualvs.scanning.stripe import StripeOptions
 from aqualvs.simulation.scenarios import bluerov2_rig
@@ -73,10 +73,10 @@ def test_padded_rows_and_interleaved_chroma_give_the_same_returns(size: tuple[in
     for plane in planes:
         plane.flags.writeable = False
     strange_frame = Frame(0, 0.0, planes[0], planes[1:])
-    detector = FrameDetector(size, plan_searches(rig, rig.camera()), StripeOptions())
+    detector = FrameDetector(size, plan_bands(rig, rig.camera()), StripeOptions())
     expected, found = detector.detect(plain_frame), detector.detect(strange_frame)
     assert set(found) == set(expected) == set(SearchAxis)
-    for axis, returns in found.items():
-        assert len(returns) > 300
+    for axis, peaks in found.items():
+        assert len(peaks) > 300
         for name in ("line", "position", "height", "width", "likelihood"):
-            np.testing.assert_array_equal(getattr(returns, name), getattr(expected[axis], name))
+            np.testing.assert_array_equal(getattr(peaks, name), getattr(expected[axis], name))

@@ -9,14 +9,14 @@ import pytest
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig import Rig
-from aqualvs.scanning.candidates import Readings, read_returns
-from aqualvs.scanning.laser_bands import SearchAxis, plan_searches
-from aqualvs.scanning.stripe import Returns
+from aqualvs.scanning.candidates import Candidates, find_candidates
+from aqualvs.scanning.laser_bands import SearchAxis, plan_bands
+from aqualvs.scanning.stripe import StripePeaks
 from aqualvs.scanning.surfaces import Surface, find_surfaces
 from aqualvs.scanning.target import TargetKind, choose_target
 from aqualvs.scanning.triangulate import Triangulator
 from aqualvs.simulation.scenarios import bluerov2_rig, example_rig
-from scanning_cases import Lit, everywhere, returns_of, strands
+from scanning_cases import Lit, everywhere, peaks_of, strands
 
 NOISE_PX = 0.15
 
@@ -43,21 +43,21 @@ def left_half(points: FloatArray) -> BoolArray:
 
 def surfaces_of(
     rig: Rig, targets: Sequence[tuple[Plane, Lit]], noise_px: float = NOISE_PX
-) -> tuple[list[Surface], Readings, IntArray]:
+) -> tuple[list[Surface], Candidates, IntArray]:
     camera = rig.camera()
-    readings = read_returns(
-        returns_of(rig, targets, noise_px), plan_searches(rig, camera), Triangulator(rig, camera)
+    candidates = find_candidates(
+        peaks_of(rig, targets, noise_px), plan_bands(rig, camera), Triangulator(rig, camera)
     )
-    chunks, index = readings.chunks()
+    subsegments, index = candidates.subsegments()
     found = find_surfaces(
-        chunks,
+        subsegments,
         index,
-        readings.pixels,
+        candidates.pixels,
         len(rig.lasers),
         rig.working_range,
         max(rig.lens.fx, rig.lens.fy),
     )
-    return found, readings, index
+    return found, candidates, index
 
 
 def assert_near(found: Plane, expected: Plane, share: float = 0.01, deg: float = 1.5) -> None:
@@ -77,14 +77,14 @@ def binned(make_rig: Callable[[], Rig]) -> Rig:
 )
 def test_a_wall_alone(make_rig: Callable[[], Rig], target: Plane) -> None:
     rig = binned(make_rig)
-    found, readings, index = surfaces_of(rig, [(target, everywhere)])
+    found, candidates, index = surfaces_of(rig, [(target, everywhere)])
     assert len(found) >= 1
     first = found[0]
     assert_near(first.plane, target)
     assert not first.is_mesh
     assert first.plane.offset > 0.0
     on_it = first.members[index]
-    right = np.abs(target.signed_distance(readings.points)) < 0.01 * target.offset
+    right = np.abs(target.signed_distance(candidates.points)) < 0.01 * target.offset
     # Nearly all right readings belong to it, and hardly a wrong one.
     assert np.mean(on_it[right]) > 0.95
     assert np.mean(right[on_it]) > 0.97
@@ -141,8 +141,8 @@ def test_the_same_readings_give_the_same_surfaces() -> None:
 def test_one_laser_gives_no_surface() -> None:
     rig = example_rig()
     single = replace(rig, lasers=rig.lasers[:1])
-    found, readings, _ = surfaces_of(single, [(plane(0.5), everywhere)])
-    assert len(readings) > 300
+    found, candidates, _ = surfaces_of(single, [(plane(0.5), everywhere)])
+    assert len(candidates) > 300
     assert found == []
     assert choose(found, TargetKind.AUTO) is None
 
@@ -159,8 +159,8 @@ def test_nothing_gives_no_surface() -> None:
     def nowhere(points: FloatArray) -> BoolArray:
         return np.zeros(len(points), np.bool_)
 
-    found, readings, _ = surfaces_of(example_rig(), [(plane(0.5), nowhere)])
-    assert len(readings) == 0
+    found, candidates, _ = surfaces_of(example_rig(), [(plane(0.5), nowhere)])
+    assert len(candidates) == 0
     assert found == []
 
 
@@ -190,11 +190,11 @@ def test_scattered_light_gives_no_surface_worth_a_target() -> None:
     """Marine snow: returns anywhere, as many as a wall's."""
     rig = example_rig()
     rng = np.random.default_rng(5)
-    returns = {}
+    peaks = {}
     for axis in SearchAxis:
         length, n_lines = rig.size_px if axis is SearchAxis.ALONG_X else rig.size_px[::-1]
         line = np.sort(rng.integers(0, n_lines, 300))
-        returns[axis] = Returns(
+        peaks[axis] = StripePeaks(
             line=line,
             position=rng.uniform(10.0, length - 10.0, 300),
             height=np.full(300, 30.0),
@@ -202,11 +202,11 @@ def test_scattered_light_gives_no_surface_worth_a_target() -> None:
             likelihood=np.full(300, 10.0),
         )
     camera = rig.camera()
-    readings = read_returns(returns, plan_searches(rig, camera), Triangulator(rig, camera))
-    chunks, index = readings.chunks()
-    found = find_surfaces(chunks, index, readings.pixels, 3, rig.working_range, 850.0)
+    candidates = find_candidates(peaks, plan_bands(rig, camera), Triangulator(rig, camera))
+    subsegments, index = candidates.subsegments()
+    found = find_surfaces(subsegments, index, candidates.pixels, 3, rig.working_range, 850.0)
     # Chance puts some specks on a plane, never a fifth of them.
-    assert all(surface.n_lines < 0.2 * len(readings) for surface in found)
+    assert all(surface.n_lines < 0.2 * len(candidates) for surface in found)
 
 
 def choose(
@@ -215,13 +215,13 @@ def choose(
     return choose_target(found, kind, working_range)
 
 
-def surface(offset: float, support: float, is_mesh: bool, extent: float = 300.0) -> Surface:
+def surface(offset: float, inlier_weight: float, is_mesh: bool, extent: float = 300.0) -> Surface:
     return Surface(
         plane=plane(offset),
         members=np.ones(4, np.bool_),
-        n_lines=int(support),
-        support=support,
-        voice=support,
+        n_lines=int(inlier_weight),
+        inlier_weight=inlier_weight,
+        sampling_weight=inlier_weight,
         extent=extent,
         is_mesh=is_mesh,
     )
@@ -266,10 +266,10 @@ def test_which_of_several_is_the_target() -> None:
 def test_specks_on_a_plane_are_no_net_before_a_wall_of_light() -> None:
     """Caustics: a few dozen lines share a plane by chance, beside a wall's thousand."""
     wall = surface(0.6, 1200.0, False, extent=1400.0)
-    specks = replace(surface(0.45, 84.0, True, extent=350.0), voice=400.0)
+    specks = replace(surface(0.45, 84.0, True, extent=350.0), sampling_weight=400.0)
     assert choose([wall, specks], TargetKind.AUTO) is wall
     # A sparse net reaches far, and a near one has more light.
     sparse = replace(specks, extent=950.0)
-    near = replace(surface(0.45, 190.0, True, extent=350.0), voice=400.0)
+    near = replace(surface(0.45, 190.0, True, extent=350.0), sampling_weight=400.0)
     assert choose([wall, sparse], TargetKind.AUTO) is sparse
     assert choose([wall, near], TargetKind.AUTO) is near

@@ -7,7 +7,11 @@ from numpy.typing import NDArray
 
 from aqualvs.errors import OptionError
 from aqualvs.scanning.scan import Frame
-from aqualvs.scanning.whole_picture import StripePixels, WholePictureOptions, find_stripes
+from aqualvs.scanning.uncalibrated_stripes import StripePixels as StripePixels
+from aqualvs.scanning.uncalibrated_stripes import (
+    UncalibratedStripeOptions as UncalibratedStripeOptions,
+)
+from aqualvs.scanning.uncalibrated_stripes import find_stripes as find_stripes
 
 SIZE = (360, 240)
 
@@ -88,8 +92,8 @@ def test_how_likely_a_piece_must_be_laser_light_is_an_option() -> None:
     paint = [
         np.count_nonzero(np.abs(distances(find_stripes(image, options), line)) > 2.0)
         for options in (
-            WholePictureOptions(min_likelihood=0.3),
-            WholePictureOptions(min_likelihood=0.99),
+            UncalibratedStripeOptions(min_likelihood=0.3),
+            UncalibratedStripeOptions(min_likelihood=0.99),
         )
     ]
     assert paint[0] > 200
@@ -171,7 +175,7 @@ def test_how_long_a_piece_must_be_is_an_option() -> None:
     image[:, 280:] = picture()[:, 280:]
     assert len(find_stripes(image)) > 60
     # 80 px of 360.
-    assert len(find_stripes(image, WholePictureOptions(min_length_share=0.25))) == 0
+    assert len(find_stripes(image, UncalibratedStripeOptions(min_length_share=0.25))) == 0
 
 
 def test_a_bright_stripe_without_colour_is_no_laser() -> None:
@@ -201,13 +205,13 @@ def test_short_dashes_without_a_certain_line_are_left_out() -> None:
 @pytest.mark.parametrize("share", [0.0, 1.0, -0.1, float("nan")])
 def test_senseless_options_are_refused(share: float) -> None:
     with pytest.raises(OptionError, match=f"min_length_share is {share}; use 0 to 1"):
-        WholePictureOptions(min_length_share=share)
+        UncalibratedStripeOptions(min_length_share=share)
 
 
 @pytest.mark.parametrize("likelihood", [0.0, 1.0, float("nan")])
 def test_senseless_likelihoods_are_refused(likelihood: float) -> None:
     with pytest.raises(OptionError, match=f"min_likelihood is {likelihood}; use 0 to 1"):
-        WholePictureOptions(min_likelihood=likelihood)
+        UncalibratedStripeOptions(min_likelihood=likelihood)
 
 
 # Channels as OpenCV has them (blue, green, red) of which two change places.
@@ -215,7 +219,7 @@ def test_senseless_likelihoods_are_refused(likelihood: float) -> None:
 def test_a_line_of_another_wavelength(wavelength: float, channels: list[int]) -> None:
     line = (0.3, 1.0, 160.0)
     image = np.ascontiguousarray(picture(line)[..., channels])
-    off = distances(find_stripes(image, WholePictureOptions(wavelength_nm=wavelength)), line)
+    off = distances(find_stripes(image, UncalibratedStripeOptions(wavelength_nm=wavelength)), line)
     # Chroma, of half the size, makes half of what is searched, with its noise.
     assert np.sqrt(np.mean(off**2)) < 0.1
     assert len(off) > 0.6 * SIZE[0]
@@ -234,7 +238,7 @@ def test_a_thin_line_is_known_by_the_colour_beside_it() -> None:
     line, half = (0.0, 1.0, 100.3), SIZE[0] // 2
     image = np.ascontiguousarray(picture(line, width=2.0, green=110.0)[..., [0, 2, 1]])
     image[:, half:] = blurred_red(image)[:, half:]
-    found = find_stripes(image, WholePictureOptions(wavelength_nm=650.0))
+    found = find_stripes(image, UncalibratedStripeOptions(wavelength_nm=650.0))
     assert np.all(np.abs(distances(found, line)) < 1.0)
     assert np.count_nonzero(found.pixels[:, 0] > half + 8) > 0.95 * (half - 8)
 

@@ -17,7 +17,7 @@ from aqualvs.sources.opening import PacedFeed
 from aqualvs.sources.remote import CameraFeed, CameraOptions, RemoteFeed, camera_device
 from aqualvs.sources.udp import UdpFeed, read_sdp
 from shell_cases import cut_after, picture, write_video
-from waiting import PATIENCE_S, until
+from waiting import TIMEOUT_S, until
 
 SDP = """v=0
 o=- 1188340656180883 1 IN IP4 192.168.2.2
@@ -188,7 +188,7 @@ def test_a_device_that_is_no_camera_is_tried_again(tmp_path):
     until(lambda: "no connection" in feed.health().detail)
     assert feed.health().state is State.FAULT
     feed.close()
-    thread.join(PATIENCE_S)
+    thread.join(TIMEOUT_S)
     assert not thread.is_alive()
 
 
@@ -209,7 +209,7 @@ def test_a_recording_comes_at_its_own_pace_or_as_fast_as_it_is_taken(tmp_path):
         assert [f.index for f in frames] == list(range(5))
         assert [f.time_s for f in frames] == pytest.approx([i / fps for i in range(5)])
         assert feed.health().state is State.OFF
-        assert span >= 0.2 if realtime else span < PATIENCE_S
+        assert span >= 0.2 if realtime else span < TIMEOUT_S
 
 
 def test_a_paced_recording_can_be_closed_while_it_waits(tmp_path):
@@ -220,7 +220,7 @@ def test_a_paced_recording_can_be_closed_while_it_waits(tmp_path):
     # The second picture is due after 100 s.
     began = time.monotonic()
     assert list(frames) == []
-    assert time.monotonic() - began < PATIENCE_S
+    assert time.monotonic() - began < TIMEOUT_S
     assert feed.health().detail == "closed"
 
 

@@ -21,7 +21,7 @@ from aqualvs.sources import datagrams, live_frames, open_feed, remote
 from aqualvs.sources.base import State
 from aqualvs.sources.remote import RemoteFeed
 from ports import free_port
-from waiting import PATIENCE_S, until
+from waiting import TIMEOUT_S, until
 
 SD, HD = (720, 576), (1920, 1080)
 SENDER = Path(stream_sender.__file__)
@@ -33,8 +33,8 @@ END_S = 5.0
 @pytest.fixture(autouse=True)
 def patient(monkeypatch):
     """A machine that is busy is no silence, and what it does not keep up with is kept."""
-    monkeypatch.setattr(live_frames, "_SILENT_S", PATIENCE_S)
-    monkeypatch.setattr(datagrams, "_MAX_LAG_S", PATIENCE_S)
+    monkeypatch.setattr(live_frames, "_SILENT_S", TIMEOUT_S)
+    monkeypatch.setattr(datagrams, "_MAX_LAG_S", TIMEOUT_S)
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +95,7 @@ class Listener:
             self.indices.append(frame.index)
 
     def wait(self, condition):
-        end = time.monotonic() + PATIENCE_S
+        end = time.monotonic() + TIMEOUT_S
         while not condition():
             assert time.monotonic() < end, self.feed.health()
             time.sleep(0.005)
@@ -104,7 +104,7 @@ class Listener:
         """Close the feed and return how long that took."""
         began = time.monotonic()
         self.feed.close()
-        self._thread.join(PATIENCE_S)
+        self._thread.join(TIMEOUT_S)
         assert not self._thread.is_alive()
         return time.monotonic() - began
 
@@ -150,7 +150,7 @@ def go_on(process):
 def send(*clips, port, **options):
     """Send clips and return what the sender tells."""
     with sender(*clips, port=port, **options) as process:
-        text, _ = process.communicate(timeout=2 * PATIENCE_S)
+        text, _ = process.communicate(timeout=2 * TIMEOUT_S)
     return json.loads(text.splitlines()[-1])
 
 

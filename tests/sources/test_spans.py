@@ -9,7 +9,7 @@ from aqualvs.sources.h264 import unit_reader
 from aqualvs.sources.spans import (
     Span,
     SpanKind,
-    UnlikeSurveyError,
+    UnlikeProbeError,
     VideoParts,
     image_frames,
     video_spans,
@@ -123,7 +123,7 @@ def test_a_damaged_part_is_noticed_and_the_others_are_not_touched(tmp_path, dama
     damage(path, 14)
     spans = video_spans(path, 10).spans
     assert len(spans) == 4
-    with pytest.raises(UnlikeSurveyError):
+    with pytest.raises(UnlikeProbeError):
         list(VideoParts(path, SIZE).frames(spans[1]))
     for span in (spans[0], spans[2], spans[3]):
         assert len(list(VideoParts(path, SIZE).frames(span))) == 10
@@ -142,7 +142,7 @@ def test_no_damage_goes_unnoticed_that_the_whole_video_shows(tmp_path, seed):
     spans = video_spans(path, 10).spans
     try:
         list(VideoParts(path, SIZE).frames(spans[1]))
-    except UnlikeSurveyError:
+    except UnlikeProbeError:
         return
     assert_same_frames(path, spans)
 
@@ -151,13 +151,13 @@ def test_a_file_that_was_changed_since_is_noticed(tmp_path):
     path = dive(tmp_path / "dive.mp4")
     spans = video_spans(path, 10).spans
     dive(path, content=lambda i, size: grain(i + 1, size))
-    with pytest.raises(UnlikeSurveyError):
+    with pytest.raises(UnlikeProbeError):
         list(frames_of(path, spans[2:3]))
 
 
 def test_pictures_of_another_size_are_noticed(tmp_path):
     path = dive(tmp_path / "dive.mp4")
-    with pytest.raises(UnlikeSurveyError, match="another size"):
+    with pytest.raises(UnlikeProbeError, match="another size"):
         list(VideoParts(path, (64, 96)).frames(video_spans(path, 10).spans[1]))
 
 
@@ -174,7 +174,7 @@ def test_the_parts_of_a_folder_of_images_are_the_whole(tmp_path):
     for part, one in zip(parts, whole, strict=True):
         assert np.array_equal(part.luma, one.luma)
     (tmp_path / "4.png").write_bytes(b"torn")
-    with pytest.raises(UnlikeSurveyError):
+    with pytest.raises(UnlikeProbeError):
         list(image_frames(tmp_path, spans[1], 5.0))
 
 

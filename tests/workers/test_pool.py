@@ -28,8 +28,14 @@ from aqualvs.scanning.scan import Scan, ScanPoints
 from aqualvs.sources import open_source
 from aqualvs.workers import channel, pool
 from aqualvs.workers.channel import Ended, Receiver, Sender, SharedMemory
-from aqualvs.workers.frame_results import FrameResult, Meter, block_length, in_blocks, read_ahead
-from aqualvs.workers.pool import Crew, crew_work
+from aqualvs.workers.frame_results import (
+    FrameProcessor,
+    FrameResult,
+    block_length,
+    in_blocks,
+    read_ahead,
+)
+from aqualvs.workers.pool import WorkerPool, pool_job
 from batch_cases import DEMO, RESULTS, demo_dive, without_times
 from shell_cases import destroy_frame
 
@@ -44,22 +50,26 @@ def dive(tmp_path_factory):
 
 @pytest.fixture(autouse=True)
 def short_dives_are_shared(monkeypatch):
-    monkeypatch.setattr(pool, "_LEAST_FRAMES", 8)
+    monkeypatch.setattr(pool, "_MIN_FRAMES", 8)
     monkeypatch.setattr(pool, "_PART_FRAMES", GROUP)
 
 
 @pytest.fixture
-def crews(monkeypatch):
+def worker_pools(monkeypatch):
     """The crews that runs have had."""
     seen = []
-    entered = Crew.__enter__
-    monkeypatch.setattr(Crew, "__enter__", lambda crew: seen.append(crew) or entered(crew))
+    entered = WorkerPool.__enter__
+    monkeypatch.setattr(
+        WorkerPool,
+        "__enter__",
+        lambda worker_pool: seen.append(worker_pool) or entered(worker_pool),
+    )
     return seen
 
 
 def work_of(source):
     with open_source(source, fps=25 if Path(source).is_dir() else None) as opened:
-        return crew_work(opened, FrameWindow(), load_rig(RIG), ScannerOptions())
+        return pool_job(opened, FrameWindow(), load_rig(RIG), ScannerOptions())
 
 
 def results(source, out, n_processes, **more):
@@ -71,72 +81,72 @@ def results(source, out, n_processes, **more):
     return {name: without_times(out / name) for name in RESULTS}, result
 
 
-def assert_same(source, folder, crews, **more):
+def assert_same(source, folder, worker_pools, **more):
     alone, _ = results(source, folder / "alone", 1, **more)
-    assert not crews
+    assert not worker_pools
     shared, result = results(source, folder / "shared", 2, **more)
-    assert len(crews) == 1
+    assert len(worker_pools) == 1
     assert [name for name in RESULTS if alone[name] == shared[name]] == list(RESULTS)
     assert not multiprocessing.active_children()
     return result
 
 
-def test_two_processes_find_what_one_finds(tmp_path, dive, crews):
-    result = assert_same(dive, tmp_path, crews)
-    assert crews[0].is_done
+def test_two_processes_find_what_one_finds(tmp_path, dive, worker_pools):
+    result = assert_same(dive, tmp_path, worker_pools)
+    assert worker_pools[0].is_done
     assert result.summary.n_frames == N
     assert result.summary.n_valid > N - 4
 
 
-def test_so_they_do_in_a_window_that_cuts_through_parts(tmp_path, dive, crews):
-    result = assert_same(dive, tmp_path, crews, frames=FrameWindow(4, 15))
-    assert crews[0].is_done
+def test_so_they_do_in_a_window_that_cuts_through_parts(tmp_path, dive, worker_pools):
+    result = assert_same(dive, tmp_path, worker_pools, frames=FrameWindow(4, 15))
+    assert worker_pools[0].is_done
     assert result.summary.n_frames == 11
 
 
-def test_so_they_do_in_a_folder_of_images(tmp_path, dive, crews):
+def test_so_they_do_in_a_folder_of_images(tmp_path, dive, worker_pools):
     folder = tmp_path / "images"
     folder.mkdir()
     with av.open(str(dive)) as container:
         for i, picture in zip(range(2 * GROUP), container.decode(video=0), strict=False):
             cv2.imwrite(str(folder / f"{i}.png"), picture.to_ndarray(format="bgr24"))
-    assert_same(folder, tmp_path, crews, fps=12.5)
-    assert crews[0].is_done
+    assert_same(folder, tmp_path, worker_pools, fps=12.5)
+    assert worker_pools[0].is_done
 
 
-def test_from_damage_on_one_process_goes_on(tmp_path, dive, crews):
+def test_from_damage_on_one_process_goes_on(tmp_path, dive, worker_pools):
     damaged = tmp_path / "damaged.mp4"
     damaged.write_bytes(dive.read_bytes())
     destroy_frame(damaged, 15)
-    result = assert_same(damaged, tmp_path, crews)
-    assert not crews[0].is_done
-    assert 12 <= crews[0].next_frame <= 15
+    result = assert_same(damaged, tmp_path, worker_pools)
+    assert not worker_pools[0].is_done
+    assert 12 <= worker_pools[0].next_frame <= 15
     assert result.summary.refused["corrupt_frame"] >= 1
 
 
-def test_from_the_death_of_a_process_on_one_goes_on(tmp_path, dive, crews, monkeypatch):
+def test_from_the_death_of_a_process_on_one_goes_on(tmp_path, dive, worker_pools, monkeypatch):
     """Nothing is lost, and nothing is there twice."""
     whole, _ = results(dive, tmp_path / "alone", 1)
-    of_part = Crew._of_part
+    of_part = WorkerPool._of_part
 
-    def one_dies(crew, number):
+    def one_dies(worker_pool, number):
         if number == 1:
-            for hand in crew._hands:
+            for worker in worker_pool._workers:
                 with contextlib.suppress(ProcessLookupError):
-                    os.kill(hand.process.pid, signal.SIGKILL)
-        return of_part(crew, number)
+                    os.kill(worker.process.pid, signal.SIGKILL)
+        return of_part(worker_pool, number)
 
-    monkeypatch.setattr(Crew, "_of_part", one_dies)
+    monkeypatch.setattr(WorkerPool, "_of_part", one_dies)
     shared, result = results(dive, tmp_path / "shared", 2)
     assert result.summary.n_frames == N
     assert whole == shared
-    assert GROUP <= crews[0].next_frame <= N
+    assert GROUP <= worker_pools[0].next_frame <= N
 
 
 def test_what_is_given_up_leaves_no_process(dive):
     work = work_of(dive)
-    with Crew(work, 3) as crew:
-        first, *_ = next(crew.blocks())
+    with WorkerPool(work, 3) as worker_pool:
+        first, *_ = next(worker_pool.blocks())
         assert len(multiprocessing.active_children()) == 3
     assert first.scan.index == 0
     assert not multiprocessing.active_children()
@@ -147,21 +157,23 @@ def test_what_is_given_up_leaves_no_process(dive):
     [{"overlay": True}, {"mcap": True}, {"frames": FrameWindow(0, 7)}],
     ids=["pictures", "stripes", "few-frames"],
 )
-def test_what_needs_this_process_is_done_by_it(tmp_path, dive, crews, more):
+def test_what_needs_this_process_is_done_by_it(tmp_path, dive, worker_pools, more):
     if "mcap" in more:
         pytest.importorskip("foxglove")
     results(dive, tmp_path / "out", 2, **{"frames": FrameWindow(0, 9), **more})
-    assert not crews
+    assert not worker_pools
 
 
-def test_without_memory_to_share_all_goes_through_the_pipe(tmp_path, dive, crews, monkeypatch):
+def test_without_memory_to_share_all_goes_through_the_pipe(
+    tmp_path, dive, worker_pools, monkeypatch
+):
     def refused(_):
         raise OSError(errno.EMFILE, "none")
 
     monkeypatch.setattr(os, "memfd_create", refused, raising=False)
     assert SharedMemory.new() is None
-    assert_same(dive, tmp_path, crews)
-    assert crews[0].is_done
+    assert_same(dive, tmp_path, worker_pools)
+    assert worker_pools[0].is_done
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="processes are copied on Linux")
@@ -214,7 +226,7 @@ def block(dive):
     rig = load_rig(RIG)
     with open_source(dive) as source:
         frames = [frame for _, frame in zip(range(3), source, strict=False)]
-    return Meter(rig, Scanner(rig)).measure(frames)
+    return FrameProcessor(rig, Scanner(rig)).measure(frames)
 
 
 @pytest.fixture

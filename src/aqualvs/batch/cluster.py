@@ -20,12 +20,12 @@ from aqualvs.workers import start_method
 _MEMORY_BYTES = 2_000_000_000
 """A process that takes more is started again; one needs less than a third of it."""
 
-_DEATHS = 20
+_MAX_DEATHS = 20
 """A task that was under way in so many dying processes is given up by the scheduler."""
 
 # Tasks take seconds: what Dask does many times a second for shorter ones only costs time.
 _SETTINGS = {
-    "distributed.scheduler.allowed-failures": _DEATHS,
+    "distributed.scheduler.allowed-failures": _MAX_DEATHS,
     "distributed.scheduler.active-memory-manager.start": False,
     "distributed.scheduler.work-stealing-interval": "1s",
     "distributed.worker.profile.enabled": False,
@@ -35,9 +35,9 @@ _SETTINGS = {
     "distributed.admin.system-monitor.interval": "10s",
     "distributed.admin.system-monitor.gil.enabled": False,
 }
-_PATIENCE_S = 30.0
+_TIMEOUT_S = 30.0
 _COUNT_EVERY_S = 5.0
-_LONELY_S = 300.0
+_NO_WORKER_S = 300.0
 _STARTS = 3
 
 
@@ -107,7 +107,7 @@ class DaskWorkers(Closing):
         where = scheduler or self._cluster
         try:
             # Results come through this object, not through a file of the user's.
-            self._client = distributed.Client(where, timeout=_PATIENCE_S, set_as_default=False)
+            self._client = distributed.Client(where, timeout=_TIMEOUT_S, set_as_default=False)
         except (OSError, ValueError, TimeoutError) as fault:
             raise OptionError(
                 f"--scheduler {scheduler}: does not answer ({fault}); check the address, such as "
@@ -129,9 +129,9 @@ class DaskWorkers(Closing):
             n_slots = sum(self._client.nthreads().values())
             if n_slots:
                 self._seen_s = now_s
-            elif now_s > self._seen_s + _LONELY_S:
+            elif now_s > self._seen_s + _NO_WORKER_S:
                 raise WorkersGoneError(
-                    f"no worker has been there for {_LONELY_S:.0f} s; what is finished is kept, "
+                    f"no worker has been there for {_NO_WORKER_S:.0f} s; what is finished is kept, "
                     "see to the workers and run the same command again"
                 )
             self._n_slots = max(1, n_slots)
@@ -192,7 +192,7 @@ class DaskWorkers(Closing):
         """Drop what is under way, and end the processes of this machine."""
         self._client.close()
         if self._cluster is not None:
-            self._cluster.close(timeout=_PATIENCE_S)
+            self._cluster.close(timeout=_TIMEOUT_S)
 
 
 def _distributed() -> Any:

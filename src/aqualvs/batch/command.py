@@ -12,10 +12,10 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
 from aqualvs.batch.cluster import DaskWorkers
-from aqualvs.batch.dataset import clear, read_seal, write_dives
+from aqualvs.batch.dataset import clear, read_manifest, write_dives
 from aqualvs.batch.dives import Dive, DiveRecord, DiveState, find_dives, name_dives
 from aqualvs.batch.merge import JOINED
-from aqualvs.batch.scheduler import Season, known_net
+from aqualvs.batch.scheduler import Scheduler, known_net
 from aqualvs.batch.summary_page import SUMMARY_HTML, write_summary
 from aqualvs.batch.work import PIECE_FRAMES, DiveWork, size_of
 from aqualvs.closing import Closing
@@ -83,7 +83,7 @@ class BatchRequest:
     piece_frames: int = PIECE_FRAMES
 
 
-def batch(request: BatchRequest, tell: Callable[[str], object]) -> int:
+def batch(request: BatchRequest, echo: Callable[[str], object]) -> int:
     """Measure dives, report progress line by line, and write results, summary and data set.
 
     What an earlier batch in the same folder has finished, of the same dives with the same rig,
@@ -119,12 +119,12 @@ def batch(request: BatchRequest, tell: Callable[[str], object]) -> int:
         with (
             StopSignals() as stop,
             DaskWorkers(request.n_workers, request.scheduler) as workers,
-            BatchProgress(len(works), tell) as progress,
+            BatchProgress(len(works), echo) as progress,
         ):
             if request.scheduler is not None:
                 workers.check_sight(lock)
             sized = [(work, size_of(Path(work.request.source))) for work in works]
-            found = Season(sized, workers, progress).run(lambda: stop.caught is not None)
+            found = Scheduler(sized, workers, progress).run(lambda: stop.caught is not None)
         records = _all_records(request.out, found)
         with writing(request.out):
             _tidy(request.out / HOME)
@@ -133,8 +133,8 @@ def batch(request: BatchRequest, tell: Callable[[str], object]) -> int:
         for line in _summary_lines(
             request, found, stopped_by=stop.caught.name if stop.caught else ""
         ):
-            tell(line)
-        tell(f"summary: {write_summary(request.out, records)}")
+            echo(line)
+        echo(f"summary: {write_summary(request.out, records)}")
     claim.close()
     if stop.caught:
         return stop.exit_code
@@ -216,9 +216,9 @@ def _all_records(out: Path, found: Mapping[str, DiveRecord]) -> list[DiveRecord]
     """Return how all dives of the folder stand, those of earlier batches too, by name."""
     records = dict(found)
     for source, name in _known_names(out).items():
-        seal = read_seal(out / HOME / DIVES / name / JOINED)
-        if name not in records and seal is not None:
-            facts = seal["facts"] | known_net(out / HOME / DIVES / name, seal["key"])
+        manifest = read_manifest(out / HOME / DIVES / name / JOINED)
+        if name not in records and manifest is not None:
+            facts = manifest["facts"] | known_net(out / HOME / DIVES / name, manifest["key"])
             records[name] = DiveRecord.of(name, source, facts, reused=True)
     return [records[name] for name in sorted(records, key=str.casefold)]
 
@@ -247,14 +247,14 @@ class BatchProgress(Closing):
     Parameters
     ----------
     n_dives : int
-    tell : callable
+    echo : callable
         Takes one line of text.
     """
 
-    def __init__(self, n_dives: int, tell: Callable[[str], object]) -> None:
+    def __init__(self, n_dives: int, echo: Callable[[str], object]) -> None:
         self._n_dives, self._n_ended, self._n_frames = n_dives, 0, 0
         self._total = 0
-        self._tell = tell
+        self._tell = echo
         console = Console(stderr=True)
         columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn())
         self._bar = Progress(

@@ -28,13 +28,13 @@ from pyarrow import csv, parquet
 from aqualvs.results.files import read_json
 from aqualvs.results.folder import HOLES_CSV, NET_CSV, POINTS_PARQUET, POSTURE_CSV
 
-SEAL = "done.json"
+MANIFEST = "done.json"
 """Written last; says for what the content of a folder was made, and what it is."""
 
 _BLOCK = 1 << 20
 
 
-def seal(
+def write_manifest(
     folder: Path,
     key: str,
     facts: Mapping[str, Any],
@@ -62,12 +62,12 @@ def seal(
     """
     files = {name: _fingerprint((place or folder) / name) for name in names}
     content = {"key": key, "files": files, "facts": dict(facts)}
-    draft = folder / f"{SEAL}.{uuid.uuid4().hex[:8]}.part"
+    draft = folder / f"{MANIFEST}.{uuid.uuid4().hex[:8]}.part"
     draft.write_text(json.dumps(content), encoding="utf-8")
-    os.replace(draft, folder / SEAL)
+    os.replace(draft, folder / MANIFEST)
 
 
-def sealed(folder: Path, key: str, place: Path | None = None) -> dict[str, Any] | None:
+def read_valid_manifest(folder: Path, key: str, place: Path | None = None) -> dict[str, Any] | None:
     """Return the facts of finished work, None unless it is there, made for `key`, and intact.
 
     Parameters
@@ -75,11 +75,11 @@ def sealed(folder: Path, key: str, place: Path | None = None) -> dict[str, Any] 
     folder : Path
         With the seal.
     key : str
-        As in `seal`.
+        As in `write_manifest`.
     place : Path or None
         Where the files are, if not in `folder`.
     """
-    content = read_seal(folder)
+    content = read_manifest(folder)
     if content is None or content["key"] != key:
         return None
     try:
@@ -92,10 +92,10 @@ def sealed(folder: Path, key: str, place: Path | None = None) -> dict[str, Any] 
     return facts
 
 
-def read_seal(folder: Path) -> dict[str, Any] | None:
+def read_manifest(folder: Path) -> dict[str, Any] | None:
     """Return the content of a seal, None if it is missing or unreadable."""
     try:
-        content = read_json(folder / SEAL)
+        content = read_json(folder / MANIFEST)
     except (OSError, ValueError):
         return None
     whole = isinstance(content, dict) and {"key", "files", "facts"} <= set(content)
@@ -143,11 +143,11 @@ def _publish(draft: Path, folder: Path) -> None:
     try:
         os.rename(draft, folder)
     except OSError:
-        seal_ours, seal_theirs = read_seal(draft), read_seal(folder)
+        our_manifest, their_manifest = read_manifest(draft), read_manifest(folder)
         if (
-            seal_ours is not None
-            and seal_theirs is not None
-            and (sealed(folder, seal_ours["key"]) is not None)
+            our_manifest is not None
+            and their_manifest is not None
+            and (read_valid_manifest(folder, our_manifest["key"]) is not None)
         ):
             return
         clear(folder)

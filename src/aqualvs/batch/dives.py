@@ -463,11 +463,11 @@ class DiveRecord:
 
     @property
     def net(self) -> Mapping[str, Any]:
-        """Return the condition of the net as `net_facts` has it, empty if it was not evaluated."""
+        """Return the condition of the net as `net_dict` has it, empty if it was not evaluated."""
         found: Mapping[str, Any] = self.facts.get("net", {})
         return found
 
-    def net_words(self) -> str:
+    def net_text(self) -> str:
         """Return the condition of the net in a few words; empty if it was not evaluated."""
         if not self.net:
             return ""
@@ -486,7 +486,7 @@ class DiveRecord:
         if "range_median_m" in self.summary:
             said += f", range {self.summary['range_median_m']:.3f} m"
         if self.net:
-            said += f", {self.net_words()}"
+            said += f", {self.net_text()}"
         if self.words:
             said += f"; {self.state.value}: {self.words}"
         return said + (" (was finished)" if self.reused else "")

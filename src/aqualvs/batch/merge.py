@@ -10,7 +10,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from aqualvs.batch.dataset import clear, drop_net, holds_dive, put_dive, scratch, seal, sealed
+from aqualvs.batch.dataset import (
+    clear,
+    drop_net,
+    holds_dive,
+    put_dive,
+    read_valid_manifest,
+    scratch,
+    write_manifest,
+)
 from aqualvs.batch.parts import SUMMARY, PieceResult, peak_bytes, piece_folder, piece_key
 from aqualvs.batch.summary_page import range_steps
 from aqualvs.batch.work import DiveProbe, DiveWork
@@ -20,16 +28,16 @@ from aqualvs.report.run_page import write_report
 from aqualvs.results.files import writing
 from aqualvs.results.folder import (
     DIVE_MCAP,
-    JOURNAL,
     POINTS_PARQUET,
     POINTS_PLY,
+    POINTS_STREAM,
     POSTURE_BARE_CSV,
     POSTURE_CSV,
     REPORT_HTML,
     RUN_FILES,
     RUN_YAML,
 )
-from aqualvs.results.points import export_batches, read_journal
+from aqualvs.results.points import export_batches, read_points_stream
 from aqualvs.results.run_request import RunFile, Status
 from aqualvs.results.summary import RunSummary
 
@@ -60,25 +68,25 @@ class PieceLostError(Exception):
     """A finished piece is not there any more, or not intact; it must be measured again."""
 
 
-def finished_dive(work: DiveWork, survey: DiveProbe) -> dict[str, Any] | None:
+def finished_dive(work: DiveWork, probe: DiveProbe) -> dict[str, Any] | None:
     """Return the facts of a dive that an earlier batch has finished; None if it has not.
 
     Its files must be there and intact, and made from the same dive, rig, options and versions.
     """
     out = work.request.out
-    facts = sealed(work.home / JOINED, survey.key, out)
+    facts = read_valid_manifest(work.home / JOINED, probe.key, out)
     if facts is None or (work.request.report and not (out / REPORT_HTML).exists()):
         return None
     return facts if holds_dive(work.dataset, work.name) else None
 
 
-def join_dive(work: DiveWork, survey: DiveProbe, results: Sequence[PieceResult]) -> dict[str, Any]:
+def join_dive(work: DiveWork, probe: DiveProbe, results: Sequence[PieceResult]) -> dict[str, Any]:
     """Join the pieces of a dive, write its report, and drop the pieces.
 
     Parameters
     ----------
     work : DiveWork
-    survey : DiveProbe
+    probe : DiveProbe
     results : sequence of PieceResult
         Of all pieces, in order.
 
@@ -94,15 +102,15 @@ def join_dive(work: DiveWork, survey: DiveProbe, results: Sequence[PieceResult])
     AqualvsError
         If the dive's folder cannot be written.
     """
-    pieces = [piece_folder(work, survey, number) for number in range(len(survey.spans))]
+    pieces = [piece_folder(work, probe, number) for number in range(len(probe.spans))]
     for number, piece in enumerate(pieces):
-        if sealed(piece, piece_key(survey, number)) is None:
+        if read_valid_manifest(piece, piece_key(probe, number)) is None:
             raise PieceLostError(f"{piece}: is not intact")
     began_s = time.process_time()
     out, home = work.request.out, work.home
     with writing(out), scratch(home, "joining") as draft:
         _join_files(pieces, draft)
-        facts = _write_run_file(work, survey, results, pieces, draft)
+        facts = _write_run_file(work, probe, results, pieces, draft)
         if work.request.report:
             write_report(draft)
         names = _replace_run(draft, out)
@@ -113,7 +121,7 @@ def join_dive(work: DiveWork, survey: DiveProbe, results: Sequence[PieceResult])
         cpu_s = sum(result.cpu_s for result in results) + time.process_time() - began_s
         peak = max(peak_bytes(), *(result.peak_bytes for result in results))
         facts |= {"cpu_s": round(cpu_s, 2), "peak_bytes": peak}
-        seal(home / JOINED, survey.key, facts, names, out)
+        write_manifest(home / JOINED, probe.key, facts, names, out)
     for old in home.glob("pieces-*"):
         clear(old)
     return facts
@@ -121,7 +129,7 @@ def join_dive(work: DiveWork, survey: DiveProbe, results: Sequence[PieceResult])
 
 def _write_run_file(
     work: DiveWork,
-    survey: DiveProbe,
+    probe: DiveProbe,
     results: Sequence[PieceResult],
     pieces: Sequence[Path],
     folder: Path,
@@ -129,8 +137,8 @@ def _write_run_file(
     """Write `run.yaml`; returns the facts of the dive."""
     with open_dive(work.request) as dive:
         summary = joined_summary(dive, pieces)
-    fault, facts, rig = results[-1].fault, summary.facts(), rig_to_mapping(dive.rig)
-    run_file = RunFile(folder / RUN_YAML, survey.source, rig, dive.request.facts())
+    fault, facts, rig = results[-1].fault, summary.to_dict(), rig_to_mapping(dive.rig)
+    run_file = RunFile(folder / RUN_YAML, probe.source, rig, dive.request.to_dict())
     run_file.write(Status.FAILED if fault else Status.FINISHED, error=fault, summary=facts)
     return {
         "n_frames": summary.n_frames,
@@ -142,8 +150,8 @@ def _write_run_file(
         "rig": str(rig.get("name", "")),
         "rig_file": str(work.request.rig or work.request.source),
         "n_water": dive.rig.n_water,
-        "source": dict(survey.source),
-        "why_whole": survey.why_whole,
+        "source": dict(probe.source),
+        "why_whole": probe.why_whole,
         "n_pieces": len(pieces),
     }
 
@@ -155,7 +163,7 @@ def _join_files(pieces: Sequence[Path], folder: Path) -> None:
         if parts:
             _join_rows(parts, folder / name)
     export_batches(
-        (batch for piece in pieces for batch in read_journal(piece / JOURNAL)),
+        (batch for piece in pieces for batch in read_points_stream(piece / POINTS_STREAM)),
         folder / POINTS_PARQUET,
         folder / POINTS_PLY,
     )

@@ -10,23 +10,23 @@ from typing import Any
 
 import cv2
 
-from aqualvs.batch.dataset import drafted, seal, sealed
+from aqualvs.batch.dataset import drafted, read_valid_manifest, write_manifest
 from aqualvs.batch.work import DiveProbe, DiveWork, digest
 from aqualvs.errors import SourceError
 from aqualvs.pipeline import OpenDive, open_dive, summary_for
 from aqualvs.results.files import writing
-from aqualvs.results.folder import JOURNAL, POSTURE_BARE_CSV, POSTURE_CSV, PostureCsv
-from aqualvs.results.points import PointsJournal
+from aqualvs.results.folder import POINTS_STREAM, POSTURE_BARE_CSV, POSTURE_CSV, PostureCsv
+from aqualvs.results.points import PointsStream
 from aqualvs.results.run_request import FrameWindow
 from aqualvs.run_outputs import RunBareLens
 from aqualvs.scanning.scan import Frame
 from aqualvs.sources.spans import Span, SpanKind, VideoParts, image_frames
 from aqualvs.workers.frame_results import (
+    FrameProcessor,
     FrameResult,
-    Meter,
-    ScansFrames,
+    FrameScanner,
     in_blocks,
-    measured_blocks,
+    result_blocks,
 )
 from aqualvs.workers.run_frames import ready, with_losses
 
@@ -66,32 +66,32 @@ class PieceResult:
     reused: bool = False
 
 
-def piece_folder(work: DiveWork, survey: DiveProbe, number: int) -> Path:
+def piece_folder(work: DiveWork, probe: DiveProbe, number: int) -> Path:
     """Return the folder of a piece; another rig, option or version has another."""
-    span = survey.spans[number]
+    span = probe.spans[number]
     kind = f"{span.first:08d}" if span.kind is not SpanKind.WHOLE else "whole"
-    return work.home / f"pieces-{survey.key[:12]}" / kind
+    return work.home / f"pieces-{probe.key[:12]}" / kind
 
 
-def piece_key(survey: DiveProbe, number: int) -> str:
+def piece_key(probe: DiveProbe, number: int) -> str:
     """Return what a piece is made from, as a short text."""
-    span = survey.spans[number]
-    return digest({"dive": survey.key, "kind": span.kind, "first": span.first, "stop": span.stop})
+    span = probe.spans[number]
+    return digest({"dive": probe.key, "kind": span.kind, "first": span.first, "stop": span.stop})
 
 
-def measure_piece(work: DiveWork, survey: DiveProbe, number: int) -> PieceResult:
+def measure_piece(work: DiveWork, probe: DiveProbe, number: int) -> PieceResult:
     """Measure one piece of a dive, or take what an earlier batch has finished.
 
     Raises
     ------
-    UnlikeSurveyError
+    UnlikeProbeError
         If the piece does not hold what the survey promised.
     AqualvsError
         If the dive cannot be read any more, or the piece not be written.
     """
-    folder, span = piece_folder(work, survey, number), survey.spans[number]
-    key = piece_key(survey, number)
-    known = sealed(folder, key)
+    folder, span = piece_folder(work, probe, number), probe.spans[number]
+    key = piece_key(probe, number)
+    known = read_valid_manifest(folder, key)
     if known is not None:
         return PieceResult(number=number, reused=True, **known)
     began_s = time.process_time()
@@ -99,8 +99,8 @@ def measure_piece(work: DiveWork, survey: DiveProbe, number: int) -> PieceResult
     cv2.setNumThreads(1)
     with writing(folder), drafted(folder) as draft:
         with open_dive(work.request) as dive:
-            facts, names = _write_piece(dive, span, draft, _scanner(dive, survey))
-        seal(draft, key, facts, names)
+            facts, names = _write_piece(dive, span, draft, _scanner(dive, probe))
+        write_manifest(draft, key, facts, names)
     return PieceResult(
         number=number, cpu_s=time.process_time() - began_s, peak_bytes=peak_bytes(), **facts
     )
@@ -116,18 +116,18 @@ def peak_bytes() -> int:
 
 
 def _write_piece(
-    dive: OpenDive, span: Span, folder: Path, scanner: ScansFrames
+    dive: OpenDive, span: Span, folder: Path, scanner: FrameScanner
 ) -> tuple[dict[str, Any], list[str]]:
     """Write a piece into a folder; returns facts and the names of the files."""
     fault, last_s, summary = "", 0.0, summary_for(dive)
     frames = _frames(dive, span)
-    meter = Meter(dive.rig, scanner)
+    processor = FrameProcessor(dive.rig, scanner)
     with ExitStack() as files:
         posture = files.enter_context(PostureCsv(folder / POSTURE_CSV))
-        points = files.enter_context(PointsJournal(folder / JOURNAL))
+        points = files.enter_context(PointsStream(folder / POINTS_STREAM))
         bare = files.enter_context(RunBareLens(folder, dive.rig))
         try:
-            for block in _blocks(dive, span, frames, meter):
+            for block in _blocks(dive, span, frames, processor):
                 scans = [measured.scan for measured in block]
                 points.write(*scans)
                 posture.write(*scans)
@@ -138,7 +138,7 @@ def _write_piece(
         except SourceError as broken_off:
             fault = str(broken_off)
     summary.save(folder / SUMMARY)
-    names = [POSTURE_CSV, JOURNAL, SUMMARY]
+    names = [POSTURE_CSV, POINTS_STREAM, SUMMARY]
     if dive.rig.dome is not None:
         names.append(POSTURE_BARE_CSV)
     facts = {
@@ -166,28 +166,28 @@ def _video_frames(path: Path, span: Span, size_px: tuple[int, int]) -> Iterator[
 
 
 def _blocks(
-    dive: OpenDive, span: Span, frames: Iterator[Frame], meter: Meter
+    dive: OpenDive, span: Span, frames: Iterator[Frame], processor: FrameProcessor
 ) -> Iterator[list[FrameResult]]:
     """Yield the results of a piece's frames, and refusals in place of lost frames."""
     # A recording tells of lost frames itself.
     first = None if dive.is_replay else span.first
     pairs = with_losses(frames, first, dive.rig.n_water)
-    return measured_blocks(in_blocks(pairs, meter.block_length), meter)
+    return result_blocks(in_blocks(pairs, processor.block_length), processor)
 
 
 class _Kept(threading.local):
     """The scanner of the last piece, which the next one mostly needs again."""
 
     key: str = ""
-    scanner: ScansFrames | None = None
+    scanner: FrameScanner | None = None
 
 
 _KEPT = _Kept()
 
 
-def _scanner(dive: OpenDive, survey: DiveProbe) -> ScansFrames:
+def _scanner(dive: OpenDive, probe: DiveProbe) -> FrameScanner:
     if dive.is_replay or dive.request.index_target is not None:
         return dive.scanner()
-    if _KEPT.key != survey.result_key or _KEPT.scanner is None:
-        _KEPT.key, _KEPT.scanner = survey.result_key, dive.scanner()
+    if _KEPT.key != probe.result_key or _KEPT.scanner is None:
+        _KEPT.key, _KEPT.scanner = probe.result_key, dive.scanner()
     return _KEPT.scanner

@@ -13,11 +13,19 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from aqualvs.batch.cluster import FinishedTask, Workers, WorkersLostError
-from aqualvs.batch.dataset import drop_dive, holds_net, put_net, read_seal, scratch, seal, sealed
+from aqualvs.batch.dataset import (
+    drop_dive,
+    holds_net,
+    put_net,
+    read_manifest,
+    read_valid_manifest,
+    scratch,
+    write_manifest,
+)
 from aqualvs.batch.dives import DiveRecord, DiveState
 from aqualvs.batch.merge import PieceLostError, finished_dive, join_dive
 from aqualvs.batch.parts import PieceResult, measure_piece
-from aqualvs.batch.work import DiveProbe, DiveWork, content_digest, digest, survey
+from aqualvs.batch.work import DiveProbe, DiveWork, content_digest, digest, probe
 from aqualvs.errors import AqualvsError
 from aqualvs.net_survey.command import StoredDive
 from aqualvs.nets.target_file import NetRequest
@@ -25,7 +33,7 @@ from aqualvs.report.run_page import write_report
 from aqualvs.results.files import writing
 from aqualvs.results.folder import NET_FILES
 from aqualvs.results.net_survey import read_run
-from aqualvs.sources.spans import UnlikeSurveyError
+from aqualvs.sources.spans import UnlikeProbeError
 
 NET = "net"
 """Folder, below a dive's home, with the seal of its net's state."""
@@ -45,7 +53,7 @@ def with_net(work: DiveWork, key: str, facts: Mapping[str, Any]) -> dict[str, An
     Returns
     -------
     facts : dict
-        With `net`, as `net_facts` has it, where it is known, or with `net_fault`, which says why
+        With `net`, as `net_dict` has it, where it is known, or with `net_fault`, which says why
         not. The dive's own result stands in any case.
     """
     request = work.request.net
@@ -67,7 +75,7 @@ def known_net(home: Path, key: str) -> dict[str, Any]:
     key : str
         Of its result; what was told of another does not count.
     """
-    found = read_seal(home / NET)
+    found = read_manifest(home / NET)
     if found is None or not str(found["key"]).startswith(f"{key}-"):
         return {}
     return {"net": found["facts"]}
@@ -76,7 +84,7 @@ def known_net(home: Path, key: str) -> dict[str, Any]:
 def _state(work: DiveWork, key: str, request: NetRequest) -> dict[str, Any]:
     """Return the summary of a net's state: the one that is there, or a new one."""
     out, home = work.request.out, work.home / NET
-    found = sealed(home, key, out)
+    found = read_valid_manifest(home, key, out)
     if found is not None and holds_net(work.dataset, work.name):
         return found
     dive = StoredDive(out)
@@ -91,7 +99,7 @@ def _state(work: DiveWork, key: str, request: NetRequest) -> dict[str, Any]:
         if work.request.report:
             write_report(out)
         home.mkdir(parents=True, exist_ok=True)
-        seal(home, key, result.summary, NET_FILES, out)
+        write_manifest(home, key, result.summary, NET_FILES, out)
     return result.summary
 
 
@@ -104,7 +112,7 @@ def _digest(request: NetRequest) -> str:
 _AHEAD = 3
 _WAIT_S = 0.2
 # Beginnings of a dive; each costs only what is not finished.
-_MOST_BEGINNINGS = 3
+_MAX_BEGINNINGS = 3
 
 
 class BatchObserver(Protocol):
@@ -127,7 +135,7 @@ class _Dive:
     work: DiveWork
     # What the watcher was told to expect of it, and not yet that it is done.
     n_bytes: int
-    survey: DiveProbe | None = None
+    probe: DiveProbe | None = None
     results: dict[int, PieceResult] = field(default_factory=dict)
     n_beginnings: int = 0
     is_done: bool = False
@@ -152,7 +160,7 @@ def look(work: DiveWork) -> tuple[DiveProbe, dict[str, Any] | None]:
     AqualvsError
         If the dive or its rig cannot be used.
     """
-    found = survey(work)
+    found = probe(work)
     facts = finished_dive(work, found)
     return found, None if facts is None else with_net(work, found.key, facts)
 
@@ -177,7 +185,7 @@ class Steps:
     join: Callable[[DiveWork, DiveProbe, Sequence[PieceResult]], dict[str, Any]] = join
 
 
-class Season:
+class Scheduler:
     """Scheduler that measures many dives with many processes.
 
     Parameters
@@ -185,7 +193,7 @@ class Season:
     works : sequence of (DiveWork, int)
         The dives with the sizes of their sources in bytes, in the order in which they are begun.
     workers : Workers
-    watcher : BatchObserver
+    observer : BatchObserver
     steps : Steps, optional
         In place of the real ones.
     """
@@ -194,10 +202,10 @@ class Season:
         self,
         works: Sequence[tuple[DiveWork, int]],
         workers: Workers,
-        watcher: BatchObserver,
+        observer: BatchObserver,
         steps: Steps | None = None,
     ) -> None:
-        self._workers, self._watcher, self._steps = workers, watcher, steps or Steps()
+        self._workers, self._observer, self._steps = workers, observer, steps or Steps()
         self._dives = [_Dive(work, n_bytes) for work, n_bytes in works]
         self._new = deque(self._dives)
         self._ready: deque[tuple[_Task, Callable[..., Any], tuple[object, ...]]] = deque()
@@ -218,7 +226,7 @@ class Season:
             Name to how the dive stands, of all dives.
         """
         for dive in self._dives:
-            self._watcher.expect(dive.n_bytes)
+            self._observer.expect(dive.n_bytes)
         while len(self.records) < len(self._dives) and not is_stopped():
             self._hand_over()
             outcome = self._workers.next_done(_WAIT_S)
@@ -248,7 +256,7 @@ class Season:
         self._ready.append((_Task(dive, dive.n_beginnings), self._steps.look, (dive.work,)))
 
     def _measure(self, dive: _Dive, found: DiveProbe) -> None:
-        dive.survey = found
+        dive.probe = found
         for piece in range(len(found.spans)):
             task = _Task(dive, dive.n_beginnings, piece)
             self._ready.append((task, self._steps.measure, (dive.work, found.only(piece), 0)))
@@ -259,8 +267,8 @@ class Season:
             return
         if outcome.error is not None:
             self._mend(task.dive, outcome.error)
-        elif task.dive.survey is None:
-            self._surveyed(task.dive, *outcome.value)
+        elif task.dive.probe is None:
+            self._probed(task.dive, *outcome.value)
         elif task.piece is not None:
             self._measured(task.dive, task.piece, outcome.value)
         else:
@@ -271,7 +279,7 @@ class Season:
                 ),
             )
 
-    def _surveyed(self, dive: _Dive, found: DiveProbe, facts: dict[str, Any] | None) -> None:
+    def _probed(self, dive: _Dive, found: DiveProbe, facts: dict[str, Any] | None) -> None:
         self._expect(dive, found.n_bytes)
         if facts is None:
             self._measure(dive, found)
@@ -280,7 +288,7 @@ class Season:
         self._end(dive, DiveRecord.of(work.name, work.request.source, facts, reused=True))
 
     def _measured(self, dive: _Dive, piece: int, result: PieceResult) -> None:
-        found = dive.survey
+        found = dive.probe
         if found is None:
             return
         dive.results[piece] = replace(result, number=piece)
@@ -289,7 +297,7 @@ class Season:
             self._expect(dive, dive.n_bytes - n_bytes)
         else:
             dive.n_bytes -= n_bytes
-            self._watcher.measured(n_bytes, result.n_frames)
+            self._observer.measured(n_bytes, result.n_frames)
         if len(dive.results) == len(found.spans):
             results = [dive.results[i] for i in range(len(found.spans))]
             # A dive that is nearly done comes first: its pieces can go.
@@ -298,12 +306,12 @@ class Season:
 
     def _mend(self, dive: _Dive, error: BaseException) -> None:
         """Retry the tasks that may succeed, and give up the others."""
-        again = dive.n_beginnings < _MOST_BEGINNINGS
-        if isinstance(error, UnlikeSurveyError) and dive.survey is not None:
-            if not dive.survey.is_whole:
+        again = dive.n_beginnings < _MAX_BEGINNINGS
+        if isinstance(error, UnlikeProbeError) and dive.probe is not None:
+            if not dive.probe.is_whole:
                 return self._as_whole(dive, str(error))
         elif isinstance(error, PieceLostError | WorkersLostError) and again:
-            dive.survey = None
+            dive.probe = None
             return self._begin(dive)
         foreseen = isinstance(error, AqualvsError | WorkersLostError)
         words = str(error) if foreseen else f"{type(error).__name__}: {error}"
@@ -312,21 +320,21 @@ class Season:
 
     def _as_whole(self, dive: _Dive, why: str) -> None:
         """Measure a dive in one piece after its pieces turned out to be unusable."""
-        if dive.survey is None:
+        if dive.probe is None:
             return
         dive.n_beginnings += 1
         dive.results.clear()
-        self._expect(dive, dive.survey.n_bytes)
-        self._measure(dive, dive.survey.in_one_piece(why))
+        self._expect(dive, dive.probe.n_bytes)
+        self._measure(dive, dive.probe.in_one_piece(why))
 
     def _end(self, dive: _Dive, record: DiveRecord) -> None:
         dive.is_done = True
         self.records[record.name] = record
         self._expect(dive, 0)
-        self._watcher.ended(record)
+        self._observer.ended(record)
 
     def _expect(self, dive: _Dive, n_bytes: int) -> None:
-        self._watcher.expect(n_bytes - dive.n_bytes)
+        self._observer.expect(n_bytes - dive.n_bytes)
         dive.n_bytes = n_bytes
 
     @staticmethod

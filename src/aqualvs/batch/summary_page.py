@@ -72,7 +72,7 @@ SUMMARY_HTML = "summary.html"
 _HEAD = ("dive", "state", "duration", "frames", "posture", "range, m", "from – to, m", "over time")
 _NET = "net"
 _LOW_SHARE = 0.8
-_MOST_NOTES = 12
+_MAX_NOTES = 12
 # What a reader of the data set types first.
 _EXAMPLES = {
     "DuckDB": "SELECT dive, avg(range_m) FROM read_parquet('dataset/posture/**/*.parquet', "
@@ -162,9 +162,9 @@ def _cards(records: Sequence[DiveRecord]) -> list[Card]:
 def _notes(records: Sequence[DiveRecord]) -> Iterator[str]:
     """Yield the points that deserve attention, dive by dive, up to a readable number."""
     notes = [note for record in records for note in _notes_on(record)]
-    yield from notes[:_MOST_NOTES]
-    if len(notes) > _MOST_NOTES:
-        yield f"and {len(notes) - _MOST_NOTES} more, in the table and in the dives’ own reports"
+    yield from notes[:_MAX_NOTES]
+    if len(notes) > _MAX_NOTES:
+        yield f"and {len(notes) - _MAX_NOTES} more, in the table and in the dives’ own reports"
 
 
 def _notes_on(record: DiveRecord) -> Iterator[str]:
@@ -226,7 +226,7 @@ def _net(folder: Path, record: DiveRecord) -> str:
     """Return the condition of a dive's net, with a link to its map."""
     if not record.net:
         return ""
-    return _linked(folder, record, NET_MAP_PNG, record.net_words(), "map of the net")
+    return _linked(folder, record, NET_MAP_PNG, record.net_text(), "map of the net")
 
 
 def _linked(folder: Path, record: DiveRecord, file: str, words: str, title: str) -> str:

@@ -1,6 +1,6 @@
 """Work on one dive of a batch, as it is sent to the processes, and the first look at the dive.
 
-The first look (`survey`) finds whether the dive can be measured, what its source holds, and where
+The first look (`probe`) finds whether the dive can be measured, what its source holds, and where
 it is cut into pieces.
 """
 
@@ -13,13 +13,13 @@ from typing import Any
 
 import av
 
-from aqualvs.batch.dataset import seal, sealed
+from aqualvs.batch.dataset import read_valid_manifest, write_manifest
 from aqualvs.errors import OptionError
-from aqualvs.nets.target_file import target_facts
+from aqualvs.nets.target_file import target_dict
 from aqualvs.optics.rigfile import rig_to_mapping
 from aqualvs.pipeline import OpenDive, open_dive
 from aqualvs.results.files import writing
-from aqualvs.results.run_request import RunRequest, source_facts, versions
+from aqualvs.results.run_request import RunRequest, source_dict, versions
 from aqualvs.sources.images import ImageSource, images_in
 from aqualvs.sources.spans import Span, SpanKind, image_spans, video_spans
 from aqualvs.sources.video import VideoSource
@@ -63,8 +63,8 @@ def result_key(dive: OpenDive) -> str:
     """
     request = dive.request
     target_content = content_digest(request.index_target)
-    facts = request.facts() | {"rig_file": None, "index_target": target_content}
-    target = asdict(target_facts(request.target))
+    facts = request.to_dict() | {"rig_file": None, "index_target": target_content}
+    target = asdict(target_dict(request.target))
     found = {
         "format": _FORMAT,
         "rig": rig_to_mapping(dive.rig),
@@ -152,7 +152,7 @@ class DiveProbe:
         return replace(self, spans=whole, why_whole=why)
 
 
-def survey(work: DiveWork) -> DiveProbe:
+def probe(work: DiveWork) -> DiveProbe:
     """Look at a dive.
 
     Reads the whole file once, unless an earlier look is still valid, but decodes nothing.
@@ -170,7 +170,7 @@ def survey(work: DiveWork) -> DiveProbe:
             why_whole="",
             n_bytes=0,
             n_frames=dive.source.n_frames,
-            source=source_facts(dive.source),
+            source=source_dict(dive.source),
         )
         stat = _stat_key(Path(work.request.source)) | {"frames": work.piece_frames}
         content = _remembered(work, stat) or _remember(
@@ -243,12 +243,12 @@ def _stat_key(path: Path) -> dict[str, Any]:
 
 
 def _remembered(work: DiveWork, stat: Mapping[str, Any]) -> dict[str, Any] | None:
-    return sealed(work.home / _MEMORY, digest(stat))
+    return read_valid_manifest(work.home / _MEMORY, digest(stat))
 
 
 def _remember(work: DiveWork, stat: Mapping[str, Any], content: dict[str, Any]) -> dict[str, Any]:
     folder = work.home / _MEMORY
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        seal(folder, digest(stat), content, [])
+        write_manifest(folder, digest(stat), content, [])
     return content

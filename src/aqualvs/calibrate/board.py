@@ -33,7 +33,7 @@ from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL
 from aqualvs.results.files import Claim, writing
 
-Tell: TypeAlias = Callable[[str], object]
+Echo: TypeAlias = Callable[[str], object]
 
 _MM = 1e3
 # Ratio of marker to square, about that of OpenCV's own boards.
@@ -96,7 +96,7 @@ class BoardRequest:
     overwrite: bool = False
 
 
-def print_board(request: BoardRequest, tell: Tell) -> None:
+def print_board(request: BoardRequest, echo: Echo) -> None:
     """Write the PDF and the yaml of a target.
 
     Raises
@@ -121,10 +121,10 @@ def print_board(request: BoardRequest, tell: Tell) -> None:
         with writing(pdf):
             pdf.write_bytes(pdf_bytes(pages, f"aqualvs {request.kind}"))
     n = len(pages)
-    tell(f"pages: {pdf} ({n} page{'s' if n > 1 else ''}; print at 100 %, then measure the ruler)")
-    tell(f"file: {yaml}")
+    echo(f"pages: {pdf} ({n} page{'s' if n > 1 else ''}; print at 100 %, then measure the ruler)")
+    echo(f"file: {yaml}")
     for word in words:
-        tell(f"note: {word}")
+        echo(f"note: {word}")
 
 
 def _print_squares(request: BoardRequest, yaml: Path) -> tuple[list[PdfPage], list[str]]:

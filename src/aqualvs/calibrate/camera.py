@@ -10,13 +10,13 @@ from aqualvs.calibrate.common import (
     N_LASERS,
     WAVELENGTH_NM,
     Calibration,
-    Found,
+    DetectedTargets,
+    Echo,
     Nominal,
     Picture,
-    Tell,
     corner_residuals,
     corner_rows,
-    find_targets,
+    detect_targets,
     finish,
     load_nominal,
     named,
@@ -90,7 +90,7 @@ def calibrate_camera(
     """
     known = load_nominal(Path(nominal)) if isinstance(nominal, str | Path) else nominal or Nominal()
     pattern = board if isinstance(board, Board) else load_board(board)
-    found = find_targets(
+    found = detect_targets(
         pictures,
         lambda name, image: detect_board(image, pattern, name),
         named(board, "the board"),
@@ -110,7 +110,7 @@ def calibrate_camera(
     )
 
 
-def run_camera(request: CameraRequest, tell: Tell) -> None:
+def run_camera(request: CameraRequest, echo: Echo) -> None:
     """Calibrate the camera and write the rig and its report.
 
     Raises
@@ -129,16 +129,16 @@ def run_camera(request: CameraRequest, tell: Tell) -> None:
     result, found = done.solution, done.found[0]
     n_pictures = len(found.views) + len(found.missed)
     of = f" of {n_pictures}" if len(result.views) < n_pictures else ""
-    tell(
+    echo(
         f"{len(result.views)}{of} pictures, {result.n_points} corners, residual "
         f"{result.rms_px:.3f} px (rms)"
     )
     for line in (*found.remarks, *result.findings):
-        tell(line)
-    finish(done.rig, _page(done.rig, result, found, request), request.out, "camera", tell)
+        echo(line)
+    finish(done.rig, _page(done.rig, result, found, request), request.out, "camera", echo)
 
 
-def _check_size(found: Found, nominal: Nominal, source: object) -> None:
+def _check_size(found: DetectedTargets, nominal: Nominal, source: object) -> None:
     if nominal.size_px is not None and nominal.size_px != found.size_px:
         (w, h), (nw, nh) = found.size_px, nominal.size_px
         said_by = source if isinstance(source, str | Path) else "the nominal rig"
@@ -170,7 +170,7 @@ def _rig(result: CameraCalibration, nominal: Nominal) -> Rig:
 
 
 def _page(
-    rig: Rig, result: CameraCalibration, found: Found, request: CameraRequest
+    rig: Rig, result: CameraCalibration, found: DetectedTargets, request: CameraRequest
 ) -> CalibrationPage:
     sigmas = result.uncertainty.sigmas
     lens = result.lens
@@ -188,9 +188,13 @@ def _page(
             "of the picture's cells hold corners",
         ),
     ]
-    if np.isfinite(result.held_back_rms_px):
+    if np.isfinite(result.cross_validation_rms_px):
         cards.append(
-            Card("held-back views", f"{result.held_back_rms_px:.3f} px", "corners predicted, rms")
+            Card(
+                "held-back views",
+                f"{result.cross_validation_rms_px:.3f} px",
+                "corners predicted, rms",
+            )
         )
     return CalibrationPage(
         title="Calibration of the camera",

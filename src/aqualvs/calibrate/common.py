@@ -158,7 +158,7 @@ def _of_mapping(content: Mapping[str, Any], path: Path) -> Nominal:
     )
 
 
-Tell: TypeAlias = Callable[[str], object]
+Echo: TypeAlias = Callable[[str], object]
 Image: TypeAlias = NDArray[np.uint8]
 Picture: TypeAlias = str | Path | Image
 """A picture's file, or its pixels: grey, or blue, green, red."""
@@ -172,7 +172,7 @@ _NAMES_SHOWN = 3
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class DetectedTargets:
     """Targets found in a set of pictures.
 
     Attributes
@@ -251,7 +251,7 @@ class Calibration(Generic[SolutionT]):
         Remarks on the pictures and on the result, in plain words.
     solution : CameraCalibration, DomeCalibration, LaserCalibration or WaterCalibration
         Details of the solve.
-    found : tuple of Found
+    found : tuple of DetectedTargets
         Targets found, one for each set of pictures.
     """
 
@@ -261,7 +261,7 @@ class Calibration(Generic[SolutionT]):
     left_out: dict[str, str]
     notes: tuple[str, ...]
     solution: SolutionT
-    found: tuple[Found, ...]
+    found: tuple[DetectedTargets, ...]
 
     @property
     def rms_px(self) -> float:
@@ -275,12 +275,12 @@ def residuals_of(views: Iterable[ViewFit]) -> dict[str, FloatArray]:
     return {view.label: view.residuals for view in views}
 
 
-def all_missed(found: Iterable[Found]) -> dict[str, str]:
+def all_missed(found: Iterable[DetectedTargets]) -> dict[str, str]:
     """Return the pictures of several sets in which no target was found, with the reasons."""
     return {name: why for one in found for name, why in one.missed.items()}
 
 
-def find_targets(pictures: Sequence[Picture], detect: Detect, target: str) -> Found:
+def detect_targets(pictures: Sequence[Picture], detect: Detect, target: str) -> DetectedTargets:
     """Find a target in every picture.
 
     Parameters
@@ -329,7 +329,9 @@ def find_targets(pictures: Sequence[Picture], detect: Detect, target: str) -> Fo
         raise CalibrationError(
             f"{target}: found in none of {len(pictures)} pictures; {name}: {why}"
         )
-    return Found(tuple(view for _, view in found), tuple(one for one, _ in found), size_px, missed)
+    return DetectedTargets(
+        tuple(view for _, view in found), tuple(one for one, _ in found), size_px, missed
+    )
 
 
 def named(target: object, what: str) -> str:
@@ -411,7 +413,7 @@ def finish(
     page: CalibrationPage,
     out: Path,
     step: str,
-    tell: Tell,
+    echo: Echo,
     *,
     comments_of: Path | None = None,
 ) -> None:
@@ -428,15 +430,15 @@ def finish(
         out.parent.mkdir(parents=True, exist_ok=True)
     copy = save_rig(rig, out, comments_of=comments_of)
     if copy is not None:
-        tell(f"kept: {copy}")
-    tell(f"rig: {out}")
+        echo(f"kept: {copy}")
+    echo(f"rig: {out}")
     report = out.with_suffix(f".{step}.html")
     if report.exists():
         keep_dated(report)
-    tell(f"report: {write_page(page, report)}")
+    echo(f"report: {write_page(page, report)}")
 
 
-def check_same_size(rig: Rig, found: Found) -> None:
+def check_same_size(rig: Rig, found: DetectedTargets) -> None:
     """Refuse pictures of another size than the rig's.
 
     Raises

@@ -6,14 +6,14 @@ from pathlib import Path
 
 from aqualvs.calibrate.common import (
     Calibration,
-    Found,
+    DetectedTargets,
+    Echo,
     Picture,
-    Tell,
     all_missed,
     check_same_size,
     corner_residuals,
     corner_rows,
-    find_targets,
+    detect_targets,
     finish,
     medium_index,
     named,
@@ -140,7 +140,7 @@ def calibrate_dome(
     )
 
 
-def run_dome(request: DomeRequest, tell: Tell) -> None:
+def run_dome(request: DomeRequest, echo: Echo) -> None:
     """Calibrate the dome and write the rig and its report.
 
     Raises
@@ -162,8 +162,8 @@ def run_dome(request: DomeRequest, tell: Tell) -> None:
         options=_options(request),
     )
     for line in (*_summary(done), *done.solution.findings):
-        tell(line)
-    finish(done.rig, _page(rig, done, request), request.out, "dome", tell, comments_of=request.rig)
+        echo(line)
+    finish(done.rig, _page(rig, done, request), request.out, "dome", echo, comments_of=request.rig)
 
 
 def _summary(done: Calibration[DomeCalibration]) -> list[str]:
@@ -208,11 +208,11 @@ def _board_set(
     poses: str | Path | None,
     rig: Rig,
     n_medium: float,
-) -> tuple[Found, BoardSet]:
+) -> tuple[DetectedTargets, BoardSet]:
     """Return the boards found in one set of pictures, as found and as the solver takes them."""
     pattern = board if isinstance(board, Board) else load_board(board)
     rows = None if poses is None else load_poses(Path(poses))
-    found = find_targets(
+    found = detect_targets(
         pictures, lambda name, image: detect_board(image, pattern, name), named(board, "the board")
     )
     check_same_size(rig, found)
@@ -263,8 +263,8 @@ def _page(before: Rig, done: Calibration[DomeCalibration], request: DomeRequest)
         Card("residual", f"{result.rms_px:.3f} px", "rms distance of corners"),
         Card("pictures", str(len(result.views)), f"{result.n_points:,} corners"),
     ]
-    if result.held_back is not None:
-        held = result.held_back
+    if result.cross_validation is not None:
+        held = result.cross_validation
         cards.append(
             Card(
                 "held-back views",

@@ -11,12 +11,12 @@ from aqualvs.calibrate.common import (
     N_LASERS,
     WAVELENGTH_NM,
     Calibration,
-    Found,
+    DetectedTargets,
+    Echo,
     Picture,
-    Tell,
     check_same_size,
     common_wavelength,
-    find_targets,
+    detect_targets,
     finish,
     medium_index,
     named,
@@ -65,7 +65,10 @@ from aqualvs.report.calibration_material import (
     residual_map,
 )
 from aqualvs.report.html import Card
-from aqualvs.scanning.whole_picture import WholePictureOptions, find_stripes
+from aqualvs.scanning.uncalibrated_stripes import (
+    UncalibratedStripeOptions as UncalibratedStripeOptions,
+)
+from aqualvs.scanning.uncalibrated_stripes import find_stripes as find_stripes
 from aqualvs.text import laser_colour
 
 _DEG = 180.0 / math.pi
@@ -95,7 +98,7 @@ class _Target:
 
     name: str
     surfaces: TargetSurfaces
-    found: Found
+    found: DetectedTargets
     n_medium: float
 
 
@@ -206,7 +209,7 @@ def calibrate_lasers(
     )
 
 
-def run_lasers(request: LasersRequest, tell: Tell) -> None:
+def run_lasers(request: LasersRequest, echo: Echo) -> None:
     """Calibrate the lasers and write the rig and its report.
 
     Raises
@@ -230,15 +233,15 @@ def run_lasers(request: LasersRequest, tell: Tell) -> None:
         wavelength_nm=request.wavelength_nm,
     )
     for warning in done.solution.warnings:
-        tell(f"note: {warning}")
+        echo(f"note: {warning}")
     for figures, laser in zip(done.solution.lasers, done.rig.lasers, strict=True):
-        tell(_words(figures, laser))
+        echo(_words(figures, laser))
     finish(
         done.rig,
         _page(before, done, request),
         request.out,
         "lasers",
-        tell,
+        echo,
         comments_of=request.rig,
     )
 
@@ -297,12 +300,14 @@ def _target(
         name = named(box, "the box")
         surfaces = box_surfaces(markers.planes, markers.points())
         default = rig.n_water if n_nominal is None else _nearer(n_nominal, rig)
-        found = find_targets(pictures, lambda one, image: detect_markers(image, markers, one), name)
+        found = detect_targets(
+            pictures, lambda one, image: detect_markers(image, markers, one), name
+        )
         return _Target(name, surfaces, found, medium_index(medium, rig, default))
     assert board is not None
     pattern = board if isinstance(board, Board) else load_board(board)
     name = named(board, "the board")
-    found = find_targets(pictures, lambda one, image: detect_board(image, pattern, one), name)
+    found = detect_targets(pictures, lambda one, image: detect_board(image, pattern, one), name)
     n_medium = medium_index(medium, rig, rig.n_water)
     return _Target(name, board_surface(thickness=board_offset), found, n_medium)
 
@@ -313,7 +318,9 @@ def _nearer(n_nominal: float, rig: Rig) -> float:
 
 
 def _stripes(picture: Picture, name: str, wavelength_nm: float | None) -> StripePoints:
-    found = find_stripes(read_colour(picture), WholePictureOptions(wavelength_nm=wavelength_nm))
+    found = find_stripes(
+        read_colour(picture), UncalibratedStripeOptions(wavelength_nm=wavelength_nm)
+    )
     return StripePoints(name, found.pixels, found.across, found.chain, found.sigma_px)
 
 

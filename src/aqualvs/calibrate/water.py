@@ -8,11 +8,11 @@ import numpy as np
 
 from aqualvs.calibrate.common import (
     Calibration,
-    Found,
+    DetectedTargets,
+    Echo,
     Picture,
-    Tell,
     check_same_size,
-    find_targets,
+    detect_targets,
     finish,
     named,
 )
@@ -101,7 +101,7 @@ def calibrate_water(
     before = rig if isinstance(rig, Rig) else load_rig(rig, need_lasers=False)
     markers = target if isinstance(target, MarkerSet) else load_target(target)
     if isinstance(pictures, Sequence):
-        found = find_targets(
+        found = detect_targets(
             pictures,
             lambda name, image: detect_markers(image, markers, name),
             named(target, "the target"),
@@ -130,7 +130,7 @@ def calibrate_water(
     )
 
 
-def run_water(request: WaterRequest, tell: Tell) -> None:
+def run_water(request: WaterRequest, echo: Echo) -> None:
     """Calibrate the water's index and write the rig in that water, and its report.
 
     Raises
@@ -150,22 +150,22 @@ def run_water(request: WaterRequest, tell: Tell) -> None:
             options=IndexOptions.of_target(request.place_sigma_mm, request.turn_sigma_deg),
         )
     result = done.solution
-    tell(f"index {result.n:.5f} ± {result.sigma:.5f} from {len(result.readings)} pictures")
+    echo(f"index {result.n:.5f} ± {result.sigma:.5f} from {len(result.readings)} pictures")
     for line in done.notes:
-        tell(line)
+        echo(line)
     finish(
         done.rig,
         _page(done.rig, result, prior, request),
         request.out,
         "water",
-        tell,
+        echo,
         comments_of=request.rig,
     )
 
 
 def _found_in(
     source: FrameSource, markers: MarkerSet, rig: Rig, target: object
-) -> tuple[Found, list[float]]:
+) -> tuple[DetectedTargets, list[float]]:
     """Return the markers found in the frames of a source, and the times of those frames."""
     check_fits(source, rig)
     name = named(target, "the target")
@@ -185,7 +185,7 @@ def _found_in(
             f"{target if isinstance(target, str | Path) else name}: its markers are in no picture "
             f"of {source.name}; check its family and ids, and that the camera sees the target sharp"
         )
-    return Found(tuple(views), (), rig.size_px, missed), times
+    return DetectedTargets(tuple(views), (), rig.size_px, missed), times
 
 
 def _check(result: WaterCalibration) -> None:

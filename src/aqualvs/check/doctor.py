@@ -101,7 +101,7 @@ def _ardusub(
 ) -> Iterator[Finding]:
     began_s = time.monotonic()
     before = [link.n_received(kind) for kind in ("ATTITUDE", "RC_CHANNELS")]
-    told = link.read_parameters((*FOR_STICKS, *FOR_DISTANCE), patience_s=_LISTEN_S)
+    told = link.read_parameters((*FOR_STICKS, *FOR_DISTANCE), timeout_s=_LISTEN_S)
     # The ground station is to be heard, and rates are to be counted, for some seconds.
     time.sleep(max(0.0, began_s + _LISTEN_S - time.monotonic()))
     span_s = time.monotonic() - began_s
@@ -189,7 +189,7 @@ _EXTRAS = {
 """Extra, the packages it brings, what they are for."""
 
 _N_FRAMES, _FRAME_RATE = 40, 25.0
-_LEAST_FREE_GB = 2.0
+_MIN_FREE_GB = 2.0
 _STREAM_S = 8.0
 
 
@@ -253,7 +253,7 @@ def _machine() -> Iterator[Finding]:
     words = f"Python {platform.python_version()}, {platform.machine()}, {cores} cores"
     yield Finding(Severity.OK if cores > 1 else Severity.WARN, words)
     free_gb = shutil.disk_usage(Path.cwd()).free / 1e9
-    if free_gb < _LEAST_FREE_GB:
+    if free_gb < _MIN_FREE_GB:
         yield Finding(
             Severity.WARN, f"only {free_gb:.1f} GB free here; recordings need about 1 GB an hour"
         )

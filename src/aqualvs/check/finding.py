@@ -65,7 +65,7 @@ def escaped(text: str) -> str:
     return text.replace("[", r"\[")
 
 
-def count_words(n: int, word: str) -> str:
+def count_text(n: int, word: str) -> str:
     """Return a number of things: "1 fault", "2 faults"."""
     return f"{n} {word}" if n == 1 else f"{n} {word}s"
 

@@ -18,7 +18,7 @@ from aqualvs.check.finding import (
     Finding,
     Severity,
     check_errors,
-    count_words,
+    count_text,
     error_table,
     expected_errors,
     findings_table,
@@ -77,22 +77,22 @@ def check_solved(
     yield from _loose(rig, uncertainty)
 
 
-def age_words(date: datetime, now: datetime) -> str:
+def age_text(date: datetime, now: datetime) -> str:
     """Return how long ago a date is: "today", "3 days ago", "5 months ago"."""
     days = (now - date).days
     if days < 1:
         return "today"
     for length, word, most in ((1, "day", 14), (7, "week", 60), (30.44, "month", 730)):
         if days < most:
-            return f"{count_words(round(days / length), word)} ago"
-    return f"{count_words(round(days / 365.25), 'year')} ago"
+            return f"{count_text(round(days / length), word)} ago"
+    return f"{count_text(round(days / 365.25), 'year')} ago"
 
 
 def _told(name: str, step: SolvedStep, now: datetime) -> Finding:
     verb = "were" if name == "lasers" else "was"
     sentence = (
-        f"The {name} {verb} calibrated {age_words(step.date, now)} from "
-        f"{count_words(step.pictures, 'picture')} with {count_words(step.points, 'point')}, to "
+        f"The {name} {verb} calibrated {age_text(step.date, now)} from "
+        f"{count_text(step.pictures, 'picture')} with {count_text(step.points, 'point')}, to "
         f"{step.rms_px:.2g} px rms"
     )
     if step.rms_px > _LARGE_RMS_PX:
@@ -126,7 +126,7 @@ def _doubts(name: str, step: SolvedStep, now: datetime) -> Iterator[Finding]:
     if step.pictures < _FEW_PICTURES.get(name, 1):
         yield Finding(
             Severity.WARN,
-            f"The calibration of the {name} rests on {count_words(step.pictures, 'picture')}; take "
+            f"The calibration of the {name} rests on {count_text(step.pictures, 'picture')}; take "
             f"at least {_FEW_PICTURES.get(name, 1)}, at different tilts and distances.",
         )
     surfaces = step.extras.get(SURFACES)
@@ -479,8 +479,8 @@ def _check_pair(a: Laser, b: Laser) -> Finding:
 def _verdict(findings: Sequence[Finding]) -> str:
     count = {s: sum(finding.severity is s for finding in findings) for s in Severity}
     if count[Severity.BAD]:
-        faults = count_words(count[Severity.BAD], "fault")
+        faults = count_text(count[Severity.BAD], "fault")
         return f"This rig cannot measure as it is: mend {faults}."
     if count[Severity.WARN]:
-        return f"This rig is sane, with {count_words(count[Severity.WARN], 'warning')}."
+        return f"This rig is sane, with {count_text(count[Severity.WARN], 'warning')}."
     return "This rig is sane."

@@ -83,7 +83,7 @@ def batch(
         bool,
         typer.Option(
             "--net",
-            help="Tell the state of each dive's net too, as aqualvs net does; a list may name the "
+            help="Echo the state of each dive's net too, as aqualvs net does; a list may name the "
             "vehicles' logs.",
         ),
     ] = False,

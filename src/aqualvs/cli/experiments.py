@@ -32,7 +32,7 @@ def benchmark(
     from aqualvs.experiments.benchmark import set as body
 
     if list_:
-        body.tell_dives(typer.echo)
+        body.print_dives(typer.echo)
         return
     if out is None:
         raise OptionError("--out: missing; give the folder to write")
@@ -94,7 +94,7 @@ def reproduce(
     from aqualvs.experiments import command as body
 
     if list_:
-        body.tell_experiments(typer.echo)
+        body.print_experiments(typer.echo)
         return
     request = body.ReproduceRequest(names=tuple(experiments or ()), out=out)
     raise typer.Exit(body.reproduce(request, typer.echo))

@@ -87,7 +87,7 @@ def run(
     ] = None,
     index_target: IndexTarget = None,
     net: Annotated[
-        bool, typer.Option("--net", help="Tell the state of the net too, see aqualvs net.")
+        bool, typer.Option("--net", help="Echo the state of the net too, see aqualvs net.")
     ] = False,
     mcap: Annotated[
         bool, typer.Option("--mcap", help="Write dive.mcap too, for Foxglove and for replays.")
@@ -129,7 +129,7 @@ def run(
         net=NetRequest() if net else None,
         n_processes=workers or n_cores(),
     )
-    raise typer.Exit(body.run_and_tell(request, typer.echo))
+    raise typer.Exit(body.run_and_print(request, typer.echo))
 
 
 def net(
@@ -248,7 +248,7 @@ def simulate(
     from aqualvs.experiments import simulate as body
 
     if list_:
-        body.tell_scenarios(typer.echo)
+        body.print_scenarios(typer.echo)
     else:
         body.simulate(scenario, rig, out, typer.echo, camera=camera, overwrite=overwrite)
 

@@ -342,7 +342,7 @@ class QuietZone:
 
 
 # Beyond this yaw, in radians, forward motion hardly changes the range.
-_GREATEST_YAW = math.radians(60.0)
+_MAX_YAW = math.radians(60.0)
 # Time constant in seconds of a small integral's decay while thrust changes its sign.
 _FORGETS_S = 1.0
 
@@ -530,7 +530,7 @@ class RangeYawController:
     ) -> tuple[float, float]:
         """Return the forces forward and right, in newtons."""
         vehicle, ramp = self.gains.vehicle, self._range_ramp
-        psi = min(max(yaw, -_GREATEST_YAW), _GREATEST_YAW)
+        psi = min(max(yaw, -_MAX_YAW), _MAX_YAW)
         c, s = math.cos(psi), math.sin(psi)
         side = sway * c if vehicle.can_sway else 0.0
         aside = (side + vehicle.dome_forward * turn) * s

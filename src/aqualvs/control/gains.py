@@ -401,17 +401,17 @@ def gain_schedule(gains: RangeGains, damping: float) -> tuple[float, float]:
     """
     relative = damping / gains.speed
     return (
-        min(1.0 + _DAMPING_SHARE * relative, _GREATEST_SCHEDULE),
-        min(1.0 + _INTEGRAL_SHARE * relative, _GREATEST_INTEGRAL),
+        min(1.0 + _DAMPING_SHARE * relative, _MAX_SCHEDULE),
+        min(1.0 + _INTEGRAL_SHARE * relative, _MAX_INTEGRAL),
     )
 
 
 # Drag damps like the speed's gain, but its assumed value may be twice the truth. The limit allows
 # for that, and for pitch: with 3, thrust makes a BlueROV2 Heavy in 0.45 m/s pitch ever more.
-_DAMPING_SHARE, _GREATEST_SCHEDULE = 0.8, 2.2
+_DAMPING_SHARE, _MAX_SCHEDULE = 0.8, 2.2
 # Drag makes the loop stiff in position; without a greater gain, the integral takes 10 s to find the
 # force of a strong current.
-_INTEGRAL_SHARE, _GREATEST_INTEGRAL = 1.2, 6.0
+_INTEGRAL_SHARE, _MAX_INTEGRAL = 1.2, 6.0
 
 
 def _check_positive(owner: object, what: str, names: tuple[str, ...] | list[str]) -> None:

@@ -30,7 +30,7 @@ _KEY = "aqualvs_plan"
 # Least distance of a setpoint from the least range, in metres: room to swing.
 _ROOM = 0.1
 # Greatest number of depths of a survey; more are a typing error.
-_MOST_DEPTHS = 1000
+_MAX_DEPTHS = 1000
 
 Two = Annotated[list[Number], Field(min_length=2, max_length=2)]
 Speed = Annotated[float, Field(ge=-1.0, le=1.0, allow_inf_nan=False)]
@@ -225,7 +225,7 @@ def _depths(part: SurveyPart) -> tuple[float, ...]:
         )
     first, last = part.depths_m
     n = math.floor(abs(last - first) / part.step_m + 1e-9) + 1
-    if n > _MOST_DEPTHS:
+    if n > _MAX_DEPTHS:
         raise OptionError(f"survey.step_m {part.step_m:g} makes {n} legs; choose a greater one")
     step = math.copysign(part.step_m, last - first)
     depths = [first + i * step for i in range(n)]

@@ -282,7 +282,7 @@ class SafetyGate:
         if range_rate is not None and math.isfinite(range_rate):
             return -range_rate
         (first_s, first), (last_s, last) = self._seen[0], self._seen[-1]
-        if last_s - first_s < _LEAST_WINDOW_S:
+        if last_s - first_s < _MIN_WINDOW_S:
             return 0.0
         return (first - last) / (last_s - first_s)
 
@@ -312,7 +312,7 @@ _FIRM_WITHIN_M = 0.05
 _FIRM_ABOVE = 2.0 / 3.0
 # Postures this far apart give the closing speed to some cm/s in spite of their noise.
 _SPEED_WINDOW_S = 0.4
-_LEAST_WINDOW_S = 0.15
+_MIN_WINDOW_S = 0.15
 
 
 def _refused_effort(effort: Effort) -> LimitReason | None:
@@ -342,7 +342,7 @@ def _clipped(effort: Effort) -> Effort:
 _N_NOISE, _N_USUAL = 8, 50
 _ORDER = 6.0
 # Postures with less noise come from a simulation without noise: metres and radians.
-_LEAST_RANGE, _LEAST_ANGLE = 2e-5, math.radians(0.005)
+_MIN_RANGE, _MIN_ANGLE = 2e-5, math.radians(0.005)
 # The force that holds the vehicle in place is the mean thrust over so many seconds; known after so
 # many. Before that, a current that the controller has yet to find takes as much.
 _BALANCE_S, _BALANCED_S = 4.0, 10.0
@@ -355,7 +355,7 @@ _PUSHED_S = 0.5
 # Least distance of the range beyond its setpoint, in metres.
 _OFF = 0.05
 # Greatest change between two reports of a heading; a greater one is a reset compass.
-_GREATEST_TURN = math.radians(20.0)
+_MAX_TURN = math.radians(20.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -517,7 +517,7 @@ class AnswerWatch:
         if state.heading is None:
             return
         turn = math.remainder(state.heading - self._told, 2.0 * math.pi)
-        if abs(turn) < _GREATEST_TURN:
+        if abs(turn) < _MAX_TURN:
             self._heading += turn
         self._told = state.heading
 
@@ -570,8 +570,8 @@ class _Noise:
             return False
         rows = zip(*self._postures, strict=True)
         squares = [(a - 2.0 * b + c) ** 2 / _ORDER for a, b, c in rows]
-        known = self._n >= _N_USUAL and self._usual[0] > _LEAST_RANGE**2
-        known = known and min(self._usual[1:]) > _LEAST_ANGLE**2
+        known = self._n >= _N_USUAL and self._usual[0] > _MIN_RANGE**2
+        known = known and min(self._usual[1:]) > _MIN_ANGLE**2
         if known:
             shares = [one / usual for one, usual in zip(squares, self._usual, strict=True)]
             self._recent.append(sum(shares) / 3.0)

@@ -27,7 +27,7 @@ _CENTRE_US = 1500.0
 # Microseconds of a unit of x, y and r, and of z, at a pilot gain of 1.
 _LEVEL_US, _UPRIGHT_US = 0.4, 0.8
 # ArduPilot's parameters are whole microseconds within these.
-_LEAST_US, _MOST_US = 800.0, 2200.0
+_MIN_US, _MAX_US = 800.0, 2200.0
 _CHANNELS = {"throttle": 3, "yaw": 4, "forward": 5, "right": 6}
 
 
@@ -62,7 +62,7 @@ class StickChannel:
     @property
     def is_sound(self) -> bool:
         """Whether ArduSub can use it."""
-        inside = _LEAST_US <= self.least < self.trim < self.most <= _MOST_US
+        inside = _MIN_US <= self.least < self.trim < self.most <= _MAX_US
         return inside and 0.0 <= self.dead_zone < 0.5 * (self.most - self.least)
 
 

@@ -10,7 +10,7 @@ from aqualvs.geometry.arrays import FloatArray
 from aqualvs.scanning.posture import Posture, Refusal
 
 # A micrometre and a microradian: keeps the covariance of an exact measurement invertible.
-_LEAST_VARIANCE = 1e-12 * np.eye(3)
+_MIN_VARIANCE = 1e-12 * np.eye(3)
 
 
 @dataclass(frozen=True, slots=True)
@@ -259,17 +259,17 @@ class _Motion:
     ) -> _Track | None:
         """Return the track after a measurement, None if that lies beyond the gate."""
         ahead = self.forecast(track, time_s)
-        surprise = measured - ahead.state[:3]
-        of_surprise = ahead.cov[:3, :3] + cov
-        weight = np.linalg.inv(of_surprise)
-        if surprise @ weight @ surprise > self._gate:
+        standardised = measured - ahead.state[:3]
+        of_innovation = ahead.cov[:3, :3] + cov
+        weight = np.linalg.inv(of_innovation)
+        if standardised @ weight @ standardised > self._gate:
             return None
         gain = ahead.cov[:, :3] @ weight
         # Joseph's form stays positive whatever rounding does.
         keep = np.eye(6)
         keep[:, :3] -= gain
         after = keep @ ahead.cov @ keep.T + gain @ cov @ gain.T
-        state = ahead.state + gain @ surprise
+        state = ahead.state + gain @ standardised
         return _Track(time_s, state, 0.5 * (after + after.T), track.n_measurements + 1)
 
 
@@ -278,7 +278,7 @@ def _measurement(posture: Posture | Refusal) -> tuple[FloatArray, FloatArray] | 
     if not isinstance(posture, Posture):
         return None
     measured = np.array([posture.range, posture.pitch, posture.yaw])
-    cov = 0.5 * (posture.covariance + posture.covariance.T) + _LEAST_VARIANCE
+    cov = 0.5 * (posture.covariance + posture.covariance.T) + _MIN_VARIANCE
     if not (np.isfinite(measured).all() and np.isfinite(cov).all()):
         return None
     try:

@@ -262,15 +262,15 @@ _SWELL = 1.2
 # thrust of a BlueROV2 Heavy in calm water changes its sign more than 20 times a minute; with 21 mm,
 # the step of a BlueROV2 takes twice the time. The second bounds it for weak thrusters, as share of
 # their thrust times seconds: with 0.022 the step of a VideoRay-like vehicle takes twice the time.
-_CROSSING, _GREATEST_CROSSING = 0.018, 0.0175
+_CROSSING, _MAX_CROSSING = 0.018, 0.0175
 # Factor by which the autopilot's lag behind a turning rate grows in the thrusters' dead band.
 _SLUGGISH = 4.0
 # Limits of the bisection of a gain, in 1/s.
 _LEAST, _GREATEST = 0.05, 20.0
 # Greatest delays and frame intervals in seconds, and greatest current in m/s.
-_MOST_S, _MOST_CURRENT = 60.0, 10.0
+_MAX_S, _MAX_CURRENT = 60.0, 10.0
 # Packaged gains have 0.40 to 0.55; 1.5 times these gains 0.28 to 0.37, twice these 0.13 to 0.19.
-_LEAST_USABLE_MODULUS = 0.25
+_MIN_USABLE_MODULUS = 0.25
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -316,22 +316,22 @@ class TuneOptions:
         OptionError
             Naming the value.
         """
-        if not 0.0 <= self.delay <= self.greatest_delay <= _MOST_S:
+        if not 0.0 <= self.delay <= self.greatest_delay <= _MAX_S:
             raise OptionError(
                 f"tune: delay {self.delay:g} s; choose 0 to the greatest, "
-                f"{self.greatest_delay:g} s, and that up to {_MOST_S:g} s"
+                f"{self.greatest_delay:g} s, and that up to {_MAX_S:g} s"
             )
-        if not (0.0 < self.frame <= _MOST_S and min(self.mass_factor, self.drag_factor) >= 1.0):
+        if not (0.0 < self.frame <= _MAX_S and min(self.mass_factor, self.drag_factor) >= 1.0):
             raise OptionError(
                 f"tune: frame {self.frame:g} s, factors {self.mass_factor:g} and "
-                f"{self.drag_factor:g}; the first is positive, up to {_MOST_S:g} s, the others are "
+                f"{self.drag_factor:g}; the first is positive, up to {_MAX_S:g} s, the others are "
                 "at least 1"
             )
         moduli = (self.least_modulus, self.least_late_modulus, self.least_yaw_modulus)
-        if not (0.0 <= self.current <= _MOST_CURRENT and 0.0 < min(moduli) <= max(moduli) < 1.0):
+        if not (0.0 <= self.current <= _MAX_CURRENT and 0.0 < min(moduli) <= max(moduli) < 1.0):
             raise OptionError(
                 f"tune: current {self.current:g} m/s, least moduli "
-                f"{', '.join(f'{one:g}' for one in moduli)}; the first is 0 to {_MOST_CURRENT:g}, "
+                f"{', '.join(f'{one:g}' for one in moduli)}; the first is 0 to {_MAX_CURRENT:g}, "
                 "the others between 0 and 1"
             )
 
@@ -427,11 +427,11 @@ def usable_gains(source: Path | str) -> ControlGains:
     }
     for axis, loop in loops.items():
         found = margins(loop)
-        if not _enough(found, _LEAST_USABLE_MODULUS):
+        if not _enough(found, _MIN_USABLE_MODULUS):
             left = f"modulus {found.modulus:.2f}" if found.stable else "unstable"
             raise OptionError(
                 f"{source}: the {axis} loop would swing up ({left}, at least "
-                f"{_LEAST_USABLE_MODULUS:g} is needed); make gains with aqualvs tune"
+                f"{_MIN_USABLE_MODULUS:g} is needed); make gains with aqualvs tune"
             )
     return gains
 
@@ -439,7 +439,7 @@ def usable_gains(source: Path | str) -> ControlGains:
 def _range_gains(speed: float, lag: float, facts: VehicleFacts) -> RangeGains:
     crossing = _CROSSING * speed * facts.mass / facts.thrust.forward
     return RangeGains(
-        crossing_impulse=tidy(min(crossing, _GREATEST_CROSSING)),
+        crossing_impulse=tidy(min(crossing, _MAX_CROSSING)),
         swell=_SWELL,
         lag=tidy(lag),
         position=tidy(_POSITION_SHARE * speed),

@@ -28,7 +28,7 @@ _LEANS = (np.deg2rad((25.0, 0.0, 10.0)), np.deg2rad((-15.0, 0.0, -25.0)))
 _PLACES = (0.15, 0.85)
 _N_CORNERS = 11
 _HALF_BOARD = 0.8
-_N_POINTS, _LEAST_POINTS = 161, 40
+_N_POINTS, _MIN_POINTS = 161, 40
 
 
 def camera_errors(design: Design, ranges: Sequence[float]) -> dict[str, FloatArray]:
@@ -103,7 +103,7 @@ def lasers_by(believed: Rig, true: Rig) -> Rig | None:
             continue
         for points, laser in zip(lit, true.lasers, strict=True):
             points.append(_stripe_on(board, found, laser, believed, true))
-    if any(sum(map(len, points)) < _LEAST_POINTS for points in lit):
+    if any(sum(map(len, points)) < _MIN_POINTS for points in lit):
         return None
     lasers = (
         replace(laser, plane=_fitted(np.concatenate(points)), window=None)

@@ -32,7 +32,7 @@ _HALF_TILTS, _HALF_STRIPES = 6, 3
 _WIDER = 2.0
 # Number of initial choices of each kind.
 _N_STARTS = 8
-_MOST_ROUNDS = 20
+_MAX_ROUNDS = 20
 
 
 def best_angles(design: Design, *, quick: bool = False) -> Design:
@@ -66,7 +66,7 @@ def best_angles(design: Design, *, quick: bool = False) -> Design:
 def _exchange(judge: Judge, lots: Sequence[Lot], start: Sequence[int]) -> tuple[float, list[int]]:
     """Exchange every laser for its best candidate until none changes."""
     picked, least = list(start), math.inf
-    for _ in range(_MOST_ROUNDS):
+    for _ in range(_MAX_ROUNDS):
         before = list(picked)
         for i, lot in enumerate(lots):
             others = lot.take([])

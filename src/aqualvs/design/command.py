@@ -24,7 +24,7 @@ from aqualvs.design.report import (
     ERRORS_PNG,
     PICTURE_PNG,
     cause_table,
-    centring_words,
+    centring_text,
     change_table,
     draw_figures,
     error_table,
@@ -102,14 +102,14 @@ def design_and_tell(request: DesignRequest, console: Console | None = None) -> N
             _say(console, line)
         console.print()
         if request.rig is not None and request.tilt:
-            _tell_errors(console, design, "As it is: one sigma on a wall or net square ahead")
+            _errors_text(console, design, "As it is: one sigma on a wall or net square ahead")
             error, better = score(design).error, score(best).error
             _say(console, f"Tilted best, its errors are {better / error:.0%} of that.\n")
-        _tell_errors(console, best, "Expected error: one sigma on a wall or net square ahead")
+        _errors_text(console, best, "Expected error: one sigma on a wall or net square ahead")
         costs = offset_costs(best, best.rig.working_range)
         if costs:
             console.print(offset_table(costs, best.rig.working_range))
-            _say(console, centring_words(best, costs, best.rig.working_range))
+            _say(console, centring_text(best, costs, best.rig.working_range))
             console.print()
         if request.try_changes:
             console.print(change_table(changes(best)))
@@ -118,7 +118,7 @@ def design_and_tell(request: DesignRequest, console: Console | None = None) -> N
             _write(best, request.out, console)
 
 
-def _tell_errors(console: Console, design: Design, title: str) -> None:
+def _errors_text(console: Console, design: Design, title: str) -> None:
     """Print the places of the lasers, their errors, and the part of each tolerance."""
     closely = predict(design, np.geomspace(*design.rig.working_range, _N_SEEN))
     ranges = shown_ranges(design.rig.working_range)

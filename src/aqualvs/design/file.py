@@ -60,11 +60,11 @@ _MM = 1e-3
 
 _Index = Annotated[float, Field(ge=1.0, le=2.0, allow_inf_nan=False)]
 # Limits beyond which numbers are mistakes: 100 m, and the pictures of the largest cameras.
-_MOST_MM, _MOST_PX = 1e5, 32_768
-_Place = Annotated[float, Field(ge=-_MOST_MM, le=_MOST_MM, allow_inf_nan=False)]
-_Length = Annotated[float, Field(gt=0.0, le=_MOST_MM, allow_inf_nan=False)]
+_MAX_MM, _MAX_PX = 1e5, 32_768
+_Place = Annotated[float, Field(ge=-_MAX_MM, le=_MAX_MM, allow_inf_nan=False)]
+_Length = Annotated[float, Field(gt=0.0, le=_MAX_MM, allow_inf_nan=False)]
 _Triple = Annotated[list[_Place], Field(min_length=3, max_length=3)]
-_Pixels = Annotated[int, Field(gt=0, le=_MOST_PX)]
+_Pixels = Annotated[int, Field(gt=0, le=_MAX_PX)]
 _Fan = Annotated[float, Field(gt=0.0, lt=180.0, allow_inf_nan=False)]
 _Tilt = Annotated[float, Field(gt=-80.0, lt=80.0, allow_inf_nan=False)]
 
@@ -83,7 +83,7 @@ class DomeDesign(StrictPart):
     """Schema of `dome`."""
 
     inner_radius_mm: _Length
-    thickness_mm: Annotated[float, Field(ge=0.0, le=_MOST_MM, allow_inf_nan=False)]
+    thickness_mm: Annotated[float, Field(ge=0.0, le=_MAX_MM, allow_inf_nan=False)]
     n_acrylic: _Index = 1.49
 
 

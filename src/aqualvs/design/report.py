@@ -26,13 +26,13 @@ if TYPE_CHECKING:
 
 
 _STEPS_MM = (10, 20, 50, 100, 200, 250, 500, 1000, 2000)
-_MOST_ROWS = 6
+_MAX_ROWS = 6
 
 
 def shown_ranges(working_range: tuple[float, float]) -> list[float]:
     """Return round ranges, in metres, from the nearest to the farthest."""
     near, far = (value * 1e3 for value in working_range)
-    step = next((s for s in _STEPS_MM if (far - near) / s <= _MOST_ROWS - 2), far - near)
+    step = next((s for s in _STEPS_MM if (far - near) / s <= _MAX_ROWS - 2), far - near)
     first = math.floor(near / step) + 1
     inner = [step * i for i in range(first, math.ceil(far / step))]
     return [value * 1e-3 for value in (near, *inner, far)]
@@ -163,7 +163,7 @@ def offset_table(costs: Sequence[OffsetCost], ranges: Sequence[float]) -> Table:
     return table
 
 
-def centring_words(design: Design, costs: Sequence[OffsetCost], ranges: Sequence[float]) -> str:
+def centring_text(design: Design, costs: Sequence[OffsetCost], ranges: Sequence[float]) -> str:
     """Return the errors by the design's centring tolerance without a calibration of the dome."""
     off = min(costs, key=lambda one: abs(one.offset - design.centring))
     shares = _percents(off.neglected, ranges), _percents(off.calibrated, ranges)

@@ -18,7 +18,7 @@ from aqualvs.optics.sheet import sheet_in
 from aqualvs.scanning.plane_fit import MESH_ERROR, SOLID_ERROR, SharedError
 
 # Limit of a sheet square to the forward axis, which draws no stripe on a wall ahead.
-_LEAST_ACROSS = 1e-3
+_MIN_ACROSS = 1e-3
 # Assumed distance before the dome's centre of a rig's laser without a source of its own.
 _BESIDE_DOME = 0.01
 
@@ -160,7 +160,7 @@ def mount_of_laser(laser: Laser, rig: Rig, fan: float) -> Mount:
     normal = plane.normal
     side = np.array([normal[0], 0.0, normal[2]])
     length = float(np.linalg.norm(side))
-    if length < _LEAST_ACROSS:
+    if length < _MIN_ACROSS:
         raise RigError(
             f"laser {laser.name}: its plane is square to the forward axis, so it draws no stripe "
             "on a wall ahead; check its normal"

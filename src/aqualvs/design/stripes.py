@@ -196,8 +196,8 @@ def _summed(camera: Camera, line: _Lines, ranges: FloatArray, common: FloatArray
     place = _place(camera, pixels, is_row)
     # A stripe without depth (its sheet runs through the lens) has no information.
     with np.errstate(divide="ignore", invalid="ignore"):
-        voice = np.where(seen[..., None] & (per_px != 0.0), lines / per_px**2, 0.0)
-    heard = voice[..., None] * np.where(np.isfinite(points), points, 0.0)
+        line_weight = np.where(seen[..., None] & (per_px != 0.0), lines / per_px**2, 0.0)
+    weighted = line_weight[..., None] * np.where(np.isfinite(points), points, 0.0)
     by_error = _own(sensitivity, points, line, per_px, place)
     safe = [np.where(np.isfinite(a), a, 0.0) for a in (points, by_error, sensitivity.by_common)]
     middle = np.where(seen[..., None], pixels[..., _N_SUM // 2, :], np.nan)
@@ -205,9 +205,9 @@ def _summed(camera: Camera, line: _Lines, ranges: FloatArray, common: FloatArray
         lines=np.where(seen, lines.sum(axis=-1), 0.0),
         length=np.where(seen, 2.0 * half[..., 0], 0.0),
         middle=middle,
-        matrix=np.einsum("kwsi,kwsj->kwij", heard, safe[0]),
-        own=np.einsum("kwsi,kwse->kwei", heard, safe[1]),
-        common=np.einsum("kwsi,kwsg->kwgi", heard, safe[2]),
+        matrix=np.einsum("kwsi,kwsj->kwij", weighted, safe[0]),
+        own=np.einsum("kwsi,kwse->kwei", weighted, safe[1]),
+        common=np.einsum("kwsi,kwsg->kwgi", weighted, safe[2]),
         centre=centre,
         along=along,
         ends=np.where(seen[..., None], ends, np.nan),

@@ -41,7 +41,7 @@ from aqualvs.experiments.mesh_filter import (
 )
 from aqualvs.experiments.tank import wall_dive
 from aqualvs.scanner import ScannerOptions
-from aqualvs.scanning.paper.detector import FilteredPoints
+from aqualvs.scanning.paper.detector import FilteredPeaks
 from aqualvs.scanning.paper.mesh_filter import MeshFilterOptions
 from aqualvs.scanning.posture_estimator import FitMethod
 from aqualvs.scanning.stripe import StripeOptions, ThresholdOptions
@@ -172,7 +172,7 @@ _RANGES = {"0.4 m": (400, 450), "0.6 m": (600, 650), "0.8 m": (800, 850)}
 # net meets one every 25 mm: region C then holds two neighbours.
 _FILTERS_NETS = ("diamond", "square")
 # The paper names no level; nobody would take a filter that calls much else a net.
-_FILTERS_LEVELS, _LEAST_PRECISION = (140, 180, 220), 0.9
+_FILTERS_LEVELS, _MIN_PRECISION = (140, 180, 220), 0.9
 
 
 class _Set(NamedTuple):
@@ -266,7 +266,7 @@ def _run_filters(laboratory: Laboratory) -> ExperimentResult:
         notes=(
             "Reflections are groups of connected bright pixels of one laser. Each net and range "
             "has its own best set, of those whose precision is "
-            f"{_LEAST_PRECISION:g} or more: level of the threshold, rd_theta/dd/r_min/r_max. The "
+            f"{_MIN_PRECISION:g} or more: level of the threshold, rd_theta/dd/r_min/r_max. The "
             "level of section 5.2's row is the best of the same three. One centre a return is "
             "what the sub-pixel detector finds on each search line, and not the paper's way.",
         ),
@@ -289,7 +289,7 @@ def _see(laboratory: Laboratory, net: str) -> _Seen:
     return seen
 
 
-def _judged(found: Sequence[FilteredPoints], truth: Sequence[LitTruth]) -> list[Judged]:
+def _judged(found: Sequence[FilteredPeaks], truth: Sequence[LitTruth]) -> list[Judged]:
     return [judge_reflections(one, lit) for one, lit in zip(found, truth, strict=True)]
 
 
@@ -328,7 +328,7 @@ def _best(judged: Mapping[_Set, Judged]) -> tuple[_Set, Judged]:
     """Return the set that keeps most, among those that keep little else."""
 
     def worth(item: tuple[_Set, Judged]) -> float:
-        precise = not item[1].precision < _LEAST_PRECISION
+        precise = not item[1].precision < _MIN_PRECISION
         return item[1].recall if precise else -1.0
 
     return max(judged.items(), key=worth)

@@ -194,7 +194,7 @@ def left_in_words(seconds: float) -> str:
     return f"about {round(seconds / 60.0)} min left"
 
 
-Tell: TypeAlias = Callable[[str], object]
+Echo: TypeAlias = Callable[[str], object]
 Load: TypeAlias = Callable[[str], Experiment]
 
 _FAILURES = "failures"
@@ -217,15 +217,15 @@ class ReproduceRequest:
     out: Path
 
 
-def tell_experiments(tell: Tell) -> None:
+def print_experiments(echo: Echo) -> None:
     """Print the name, title and place in the paper of every experiment."""
     width = max(map(len, catalogue.MODULES))
     for name in catalogue.MODULES:
         found = catalogue.experiment(name)
-        tell(f"{name:<{width}}  {found.title} ({found.paper or 'an ablation of ours'})")
+        echo(f"{name:<{width}}  {found.title} ({found.paper or 'an ablation of ours'})")
 
 
-def reproduce(request: ReproduceRequest, tell: Tell, load: Load = catalogue.experiment) -> int:
+def reproduce(request: ReproduceRequest, echo: Echo, load: Load = catalogue.experiment) -> int:
     """Run experiments, write the page after each of them, and return the exit code.
 
     Results of other experiments that the same version left in the folder stay on the page.
@@ -233,7 +233,7 @@ def reproduce(request: ReproduceRequest, tell: Tell, load: Load = catalogue.expe
     Parameters
     ----------
     request : ReproduceRequest
-    tell : callable
+    echo : callable
         Takes one line of text.
     load : callable
         From a name to its experiment.
@@ -262,12 +262,12 @@ def reproduce(request: ReproduceRequest, tell: Tell, load: Load = catalogue.expe
         for number, name in enumerate(names, 1):
             bar.start(name)
             book.run(name, load, laboratory)
-            tell(f"[{number}/{len(names)}] {_line(book.records[name], book.seconds[name])}")
+            echo(f"[{number}/{len(names)}] {_line(book.records[name], book.seconds[name])}")
             bar.end()
             write_page(book.in_order(), book.seconds, request.out)
     claim.close()
     for line in _closing(book, names, request.out):
-        tell(line)
+        echo(line)
     return _EXIT_FAILED if any(book.records[name].failure for name in names) else 0
 
 

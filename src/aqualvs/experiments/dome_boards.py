@@ -209,7 +209,7 @@ def _run(laboratory: Laboratory) -> ExperimentResult:
 
 
 def _findings(solved: SolvedDome, before_px: float) -> tuple[ExperimentRow, ...]:
-    held = solved.dome.held_back
+    held = solved.dome.cross_validation
     worst = max(abs(solved.errors[n]) / solved.sigmas[n] for n in (*_LENS, *_TURN))
     found = (
         _vector("lens in the dome x, y, z (mm)", _PAPER_LENS, solved, _LENS, 1e3, 2),

@@ -29,8 +29,8 @@ from aqualvs.optics.rig import Rig
 from aqualvs.report.figure_style import OURS, PINK, STYLE, new_figure
 from aqualvs.report.mesh_figures import Reflections, drawn_figures
 from aqualvs.scanner import ScannerOptions
-from aqualvs.scanning.laser_bands import plan_searches
-from aqualvs.scanning.paper.detector import FilteredPoints, PaperFilter
+from aqualvs.scanning.laser_bands import plan_bands
+from aqualvs.scanning.paper.detector import FilteredPeaks, PaperFilter
 from aqualvs.scanning.paper.mesh_filter import MeshFilterOptions, laser_frame
 from aqualvs.scanning.scan import Frame, Label, Scan, ScanPoints
 from aqualvs.scanning.stripe import ThresholdOptions
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 def papers_pixels(
     laboratory: Laboratory, dive: RenderedDive, options: MeshFilterOptions, level: int | None = None
-) -> list[FilteredPoints]:
+) -> list[FilteredPeaks]:
     """Return the bright pixels of every frame, and what the paper's filter keeps of them.
 
     The paper divides its picture by hand into one area for each laser; here our own classification
@@ -64,7 +64,7 @@ def papers_pixels(
 
 def papers_centres(
     laboratory: Laboratory, dive: RenderedDive, options: MeshFilterOptions
-) -> list[FilteredPoints]:
+) -> list[FilteredPeaks]:
     """Return the pixels of every frame, on the mesh where the paper's filter keeps their return.
 
     The filter is given one point for each sub-pixel return, as the paper does not do it.
@@ -74,25 +74,25 @@ def papers_centres(
     return _pixels(scans, dive.rig, [one.on_mesh for one in centres])
 
 
-def adaptive_pixels(scans: Sequence[Scan], rig: Rig) -> list[FilteredPoints]:
+def adaptive_pixels(scans: Sequence[Scan], rig: Rig) -> list[FilteredPeaks]:
     """Return the pixels of scans, on the mesh where their return is labelled net."""
     return _pixels(scans, rig, [np.asarray(scan.points.label == Label.NET) for scan in scans])
 
 
 def filtered_points(
     scans: Sequence[Scan], rig: Rig, options: MeshFilterOptions, *, every_pixel: bool
-) -> list[FilteredPoints]:
+) -> list[FilteredPeaks]:
     """Return the points of scans, and what the paper's filter keeps of them."""
     camera = rig.camera()
-    searches = plan_searches(rig, camera)
-    papers = PaperFilter(rig, camera, searches, options, every_pixel=every_pixel)
+    laser_bands = plan_bands(rig, camera)
+    papers = PaperFilter(rig, camera, laser_bands, options, every_pixel=every_pixel)
     return [
         papers.apply(scan.points.pixels, scan.points.width, scan.points.laser.astype(np.int64))
         for scan in scans
     ]
 
 
-def _pixels(scans: Sequence[Scan], rig: Rig, kept: Sequence[BoolArray]) -> list[FilteredPoints]:
+def _pixels(scans: Sequence[Scan], rig: Rig, kept: Sequence[BoolArray]) -> list[FilteredPeaks]:
     found = filtered_points(scans, rig, MeshFilterOptions(), every_pixel=True)
     return [replace(one, on_mesh=mine[one.source]) for one, mine in zip(found, kept, strict=True)]
 
@@ -175,7 +175,7 @@ def judge_pixels(pixels: FloatArray, laser: IntArray, truth: LitTruth) -> Judged
     return Judged(right / judged if judged else np.nan, found / true if true else np.nan)
 
 
-def judge_reflections(found: FilteredPoints, truth: LitTruth) -> Judged:
+def judge_reflections(found: FilteredPeaks, truth: LitTruth) -> Judged:
     """Compare the reflections that are said to lie on the net with the true ones.
 
     A reflection is a group of pixels of one laser that touch by sides or corners, and said to lie
@@ -186,7 +186,7 @@ def judge_reflections(found: FilteredPoints, truth: LitTruth) -> Judged:
 
     Parameters
     ----------
-    found : FilteredPoints
+    found : FilteredPeaks
         All pixels of the frame, and which of them are said to lie on the net.
     truth : LitTruth
 
@@ -319,7 +319,7 @@ def _run(laboratory: Laboratory) -> ExperimentResult:
     )
 
 
-def _judge_each(found: FilteredPoints, lit: LitTruth) -> Judged:
+def _judge_each(found: FilteredPeaks, lit: LitTruth) -> Judged:
     return judge_pixels(found.pixels[found.on_mesh], found.laser[found.on_mesh], lit)
 
 
@@ -360,7 +360,7 @@ def _findings(
 
 
 def _pictures(
-    frame: Frame, scan: Scan, papers: FilteredPoints, rig: Rig
+    frame: Frame, scan: Scan, papers: FilteredPeaks, rig: Rig
 ) -> tuple[ExperimentFigure, ...]:
     laser = level_laser(rig)
     reflections = _reflections(papers, scan, rig, laser)
@@ -391,7 +391,7 @@ def _pictures(
     )
 
 
-def _reflections(papers: FilteredPoints, scan: Scan, rig: Rig, laser: int) -> Reflections:
+def _reflections(papers: FilteredPeaks, scan: Scan, rig: Rig, laser: int) -> Reflections:
     mine = papers.laser == laser
     near, far = rig.working_range
     distance = np.linalg.norm(papers.points_in_dome[mine], axis=1)
@@ -433,7 +433,7 @@ def _seen(frame: Frame) -> "Figure":
     return figure
 
 
-def _filtered(papers: FilteredPoints, scan: Scan, rig: Rig, laser: int) -> "Figure":
+def _filtered(papers: FilteredPeaks, scan: Scan, rig: Rig, laser: int) -> "Figure":
     from matplotlib import rc_context
 
     own, bright = scan.points.laser == laser, papers.laser == laser

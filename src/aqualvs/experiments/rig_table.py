@@ -20,7 +20,7 @@ from aqualvs.optics.expected_error import see_stripe
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig
 from aqualvs.optics.sheet import Sheet, sheets_of
 from aqualvs.report.figure_style import BLUE, DARK, GREY, OURS, PAPER
-from aqualvs.scanning.laser_bands import SearchAxis, plan_searches
+from aqualvs.scanning.laser_bands import SearchAxis, plan_bands
 from aqualvs.simulation.scenario import Scenario, parse_scenario
 from aqualvs.sources.base import bgr_of
 from aqualvs.text import laser_colour
@@ -101,7 +101,7 @@ def bending(rig: Rig, pixels: FloatArray) -> Bending:
 def band_shares(rig: Rig) -> list[float]:
     """Return the share of the picture in which each laser is looked for."""
     shares = []
-    for search in plan_searches(rig, rig.camera()):
+    for search in plan_bands(rig, rig.camera()):
         along = rig.size_px[1] if search.axis is SearchAxis.ALONG_Y else rig.size_px[0]
         inside = np.maximum(search.highest - search.lowest + 1, 0).sum()
         shares.append(float(inside / (along * len(search.lowest))))

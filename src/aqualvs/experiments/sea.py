@@ -24,7 +24,7 @@ from aqualvs.experiments.laboratory import Laboratory
 from aqualvs.follow.case import SimCase, Trials, sea, vehicle_model
 from aqualvs.follow.log import HoldMeasures, LoopLog, StepMeasures
 from aqualvs.follow.report import drawn_follow_figures
-from aqualvs.follow.sensor_model import RenderedEye, SampledEye
+from aqualvs.follow.sensor_model import RenderedSensor, SampledSensor
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.transforms import SE3
 from aqualvs.report.figure_style import BLUE, DARK, GREY, ORANGE, STYLE, new_figure
@@ -105,7 +105,7 @@ def _hold_rows(vehicle: str, hold: HoldMeasures, step: StepMeasures) -> tuple[Ex
 
 def _follow_rows(vehicle: str, log: LoopLog, follow: HoldMeasures) -> tuple[ExperimentRow, ...]:
     range_mm, yaw_deg = 1e3 * follow.range_rms, math.degrees(follow.yaw_rms)
-    free = follow.least_clearance > 0.0 and follow.n_lost == 0
+    free = follow.min_clearance > 0.0 and follow.n_lost == 0
     along = log.column("along")
     return (
         ExperimentRow(
@@ -177,8 +177,8 @@ class _Watched:
     """
 
     net: NetWall
-    steering: SampledEye
-    rendered: RenderedEye
+    steering: SampledSensor
+    rendered: RenderedSensor
     laboratory: Laboratory
     n_looks: int = 0
     seen: list[tuple[float, Posture | Refusal, NetPosture]] = field(default_factory=list)
@@ -195,10 +195,10 @@ class _Watched:
 
 
 def _run_sea(laboratory: Laboratory) -> ExperimentResult:
-    eye, log = _dive(laboratory)
-    time_s = np.array([t for t, _, _ in eye.seen])
-    valid = np.array([bool(posture) for _, posture, _ in eye.seen])
-    errors = _errors(eye)
+    sensor, log = _dive(laboratory)
+    time_s = np.array([t for t, _, _ in sensor.seen])
+    valid = np.array([bool(posture) for _, posture, _ in sensor.seen])
+    errors = _errors(sensor)
     found = errors[valid]
     rms = np.sqrt(np.mean(found**2, axis=0))
     share = 100.0 * float(valid.mean())
@@ -240,10 +240,10 @@ def _run_sea(laboratory: Laboratory) -> ExperimentResult:
                 name="figure_22",
                 caption="Depth, range, heading and yaw of the net over the dive, beside figure "
                 "22. Dots: measured in rendered pictures; lines: truth.",
-                figure=_drawn(eye, log, valid),
+                figure=_drawn(sensor, log, valid),
             ),
         ),
-        series=(_sea_series(eye, time_s),),
+        series=(_sea_series(sensor, time_s),),
         notes=(
             "A simulated BlueROV2 in a current of 0.15 m/s and waves of 0.1 m before a net of a "
             "cage of 20 m radius that sways and rocks. It is steered by postures with sampled "
@@ -274,20 +274,20 @@ def _dive(laboratory: Laboratory) -> tuple[_Watched, LoopLog]:
         nets=(Net(bar=0.025, twine=0.0022, fouling=0.2, seed=_SEA_SEED),),
         target="net",
     )
-    eye = _Watched(
+    sensor = _Watched(
         net,
-        SampledEye(net, np.random.default_rng([_SEA_SEED, 1])),
-        RenderedEye(net, laboratory.rig, np.random.default_rng([_SEA_SEED, 2]), scene),
+        SampledSensor(net, np.random.default_rng([_SEA_SEED, 1])),
+        RenderedSensor(net, laboratory.rig, np.random.default_rng([_SEA_SEED, 2]), scene),
         laboratory,
     )
-    loop = case.loop(eye, _Descent(Setpoint(_RANGE)))
-    return eye, loop.run(_SECONDS)
+    loop = case.loop(sensor, _Descent(Setpoint(_RANGE)))
+    return sensor, loop.run(_SECONDS)
 
 
-def _errors(eye: _Watched) -> FloatArray:
+def _errors(sensor: _Watched) -> FloatArray:
     """Return errors of range in percent, pitch and yaw in degrees; NaN where refused."""
-    rows = np.full((len(eye.seen), 3), np.nan)
-    for i, (_, posture, truth) in enumerate(eye.seen):
+    rows = np.full((len(sensor.seen), 3), np.nan)
+    for i, (_, posture, truth) in enumerate(sensor.seen):
         if isinstance(posture, Posture):
             rows[i] = (
                 100.0 * (posture.range / truth.range - 1.0),
@@ -302,21 +302,21 @@ def _correlation(log: LoopLog) -> float:
     return float(np.corrcoef(heading, log.column("yaw"))[0, 1])
 
 
-def _measured(eye: _Watched) -> FloatArray:
+def _measured(sensor: _Watched) -> FloatArray:
     """Return range (m), pitch and yaw (deg) measured, NaN where refused; shape (N, 3)."""
     return np.array(
         [
             (p.range, math.degrees(p.pitch), math.degrees(p.yaw))
             if isinstance(p, Posture)
             else (math.nan,) * 3
-            for _, p, _ in eye.seen
+            for _, p, _ in sensor.seen
         ]
     )
 
 
-def _sea_series(eye: _Watched, time_s: FloatArray) -> DataColumns:
-    measured = _measured(eye)
-    truth = [(t.range, math.degrees(t.pitch), math.degrees(t.yaw)) for _, _, t in eye.seen]
+def _sea_series(sensor: _Watched, time_s: FloatArray) -> DataColumns:
+    measured = _measured(sensor)
+    truth = [(t.range, math.degrees(t.pitch), math.degrees(t.yaw)) for _, _, t in sensor.seen]
     names = ("range_m", "pitch_deg", "yaw_deg")
     columns: dict[str, FloatArray] = {"time_s": time_s}
     for k, name in enumerate(names):
@@ -325,11 +325,11 @@ def _sea_series(eye: _Watched, time_s: FloatArray) -> DataColumns:
     return DataColumns(name="sea", columns=columns)
 
 
-def _drawn(eye: _Watched, log: LoopLog, valid: FloatArray) -> "Figure":
+def _drawn(sensor: _Watched, log: LoopLog, valid: FloatArray) -> "Figure":
     from matplotlib import rc_context
 
-    time_s, seen_s = log.column("time_s"), np.array([t for t, _, _ in eye.seen])
-    measured = _measured(eye)
+    time_s, seen_s = log.column("time_s"), np.array([t for t, _, _ in sensor.seen])
+    measured = _measured(sensor)
     with rc_context(dict(STYLE)):
         figure = new_figure(5.0)
         depth, ranges, angles = figure.subplots(3, 1, sharex=True)

@@ -28,7 +28,7 @@ def simulate(
     scenario: str | None,
     rig_file: Path | None,
     out: Path | None,
-    tell: Callable[[str], object],
+    echo: Callable[[str], object],
     *,
     camera: str,
     overwrite: bool,
@@ -43,7 +43,7 @@ def simulate(
         None takes the example rig.
     out : Path or None
         Folder to write.
-    tell : callable
+    echo : callable
         Takes one line of text.
     camera : str
         Name of the camera that takes the pictures.
@@ -61,7 +61,7 @@ def simulate(
         raise OptionError("--out: missing; give the folder to write")
     eye = simulated_camera(camera)
     if scenario == CALIBRATION:
-        _simulate_calibration(rig_file, out, tell, camera=eye, overwrite=overwrite)
+        _simulate_calibration(rig_file, out, echo, camera=eye, overwrite=overwrite)
         return
     course = load_scenario(scenario)
     rig = example_rig() if rig_file is None else load_rig(rig_file)
@@ -70,13 +70,13 @@ def simulate(
         _write_net_truth(course, out)
         dive = simulate_dive(course, rig, out, progress=lambda _done, _all: tick(1), camera=eye)
         save_rig(with_exact_numbers(rig), out / "rig.yaml")
-    tell(f"{dive.n_frames} frames: {dive.video}, truth: {dive.truth}")
-    tell(
+    echo(f"{dive.n_frames} frames: {dive.video}, truth: {dive.truth}")
+    echo(
         f"next: aqualvs run {dive.video} --rig {out / 'rig.yaml'} --truth {dive.truth} "
         f"-o {out / 'run'}"
     )
     if course.nets:
-        tell(
+        echo(
             f"then: aqualvs net {out / 'run'} --log {out / _LOG} --log-offset-s {LEAD_S:g}; "
             f"true holes: {out / _HOLES}"
         )
@@ -93,7 +93,7 @@ def _write_net_truth(course: Scenario, out: Path) -> None:
 def _simulate_calibration(
     rig_file: Path | None,
     out: Path,
-    tell: Callable[[str], object],
+    echo: Callable[[str], object],
     *,
     camera: SimulatedCamera,
     overwrite: bool,
@@ -102,10 +102,10 @@ def _simulate_calibration(
     claim = Claim("simulate", [out / name for name in _CALIBRATION_FILES], overwrite=overwrite)
     with claim, writing(out), progress(CALIBRATION, SetSize().total, "pictures") as tick:
         files = simulate_calibration(rig, out, progress=lambda _done, _all: tick(1), camera=camera)
-    tell(f"{files.n_pictures} pictures and frames in {out}, truth: {files.rig}")
-    tell("next:")
+    echo(f"{files.n_pictures} pictures and frames in {out}, truth: {files.rig}")
+    echo("next:")
     for command in calibration_commands(files, out, len(rig.lasers)):
-        tell(f"  aqualvs {shlex.join(command)}")
+        echo(f"  aqualvs {shlex.join(command)}")
 
 
 def calibration_commands(files: CalibrationFiles, out: Path, n_lasers: int) -> list[list[str]]:
@@ -135,9 +135,9 @@ def calibration_commands(files: CalibrationFiles, out: Path, n_lasers: int) -> l
     return commands
 
 
-def tell_scenarios(tell: Callable[[str], object]) -> None:
+def print_scenarios(echo: Callable[[str], object]) -> None:
     """Print the built-in scenarios, one line each."""
     scenarios = {**list_scenarios(), CALIBRATION: _ABOUT_CALIBRATION}
     width = max(map(len, scenarios))
     for name, about in scenarios.items():
-        tell(f"{name:{width}}  {about}")
+        echo(f"{name:{width}}  {about}")

@@ -18,8 +18,8 @@ from aqualvs.control.tune import tune
 from aqualvs.control.vehicle import Setpoint
 from aqualvs.errors import OptionError
 from aqualvs.follow.log import HoldMeasures, LoopLog, StepMeasures, hold_measures, step_measures
-from aqualvs.follow.loop import Eye, SimulatedLink, SimulatedLoop, Timing
-from aqualvs.follow.sensor_model import RenderedEye, SampledEye
+from aqualvs.follow.loop import RangeSensor, SimulatedLink, SimulatedLoop, Timing
+from aqualvs.follow.sensor_model import RenderedSensor, SampledSensor
 from aqualvs.simulation.net_motion import NetWall
 from aqualvs.simulation.scenarios import example_rig
 from aqualvs.simulation.vehicle.models import BLUEROV2, BLUEROV2_HEAVY, VIDEORAY, VehicleModel
@@ -65,7 +65,7 @@ class SimCase:
     limits: SafetyLimits = field(default_factory=SafetyLimits)
     seed: int = 0
 
-    def loop(self, eye: Eye, mission: Mission) -> SimulatedLoop:
+    def loop(self, sensor: RangeSensor, mission: Mission) -> SimulatedLoop:
         """Return the loop, ready to run."""
         dome = self.net.station(self.start_range, yaw=self.start_yaw)
         vehicle = SimulatedVehicle(
@@ -77,7 +77,7 @@ class SimCase:
         )
         controller = RangeYawController(self.gains)
         steering = NetPilot(mission, controller, SafetyGate(self.limits))
-        return SimulatedLoop(SimulatedLink(vehicle), self.net, eye, steering, self.timing)
+        return SimulatedLoop(SimulatedLink(vehicle), self.net, sensor, steering, self.timing)
 
 
 def vehicle_model(name: str, pilot_gain: float = 0.5) -> VehicleModel:
@@ -187,7 +187,7 @@ class Trials:
     def begin(self, seconds: float) -> LoopLog:
         """Take hold before a flat net, from rest in the current."""
         case = self._case(NetWall())
-        return case.loop(self._eye(case), HoldMission(Setpoint(RANGE))).run(seconds)
+        return case.loop(self._sensor(case), HoldMission(Setpoint(RANGE))).run(seconds)
 
     def hold_and_step(
         self, seconds: float = HOLD_END_S, step_s: float = STEP_S
@@ -200,7 +200,7 @@ class Trials:
             if now_s >= step_s:
                 mission.setpoint = Setpoint(RANGE + STEP)
 
-        log = case.loop(self._eye(case), mission).run(seconds, step)
+        log = case.loop(self._sensor(case), mission).run(seconds, step)
         answer = step_measures(
             log.column("time_s"), log.column("range"), step_s, RANGE, RANGE + STEP
         )
@@ -213,7 +213,7 @@ class Trials:
         """Go along a curved net that moves."""
         case = self._case(CURVED)
         mission = FollowMission(Setpoint(RANGE), SWAY)
-        log = case.loop(self._eye(case), mission).run(seconds, every_frame)
+        log = case.loop(self._sensor(case), mission).run(seconds, every_frame)
         return log, hold_measures(log, FROM_REST_S)
 
     def _case(self, net: NetWall) -> SimCase:
@@ -227,8 +227,8 @@ class Trials:
             seed=self.seed,
         )
 
-    def _eye(self, case: SimCase) -> Eye:
+    def _sensor(self, case: SimCase) -> RangeSensor:
         rng = np.random.default_rng([self.seed, 53])
         if self.rendered:
-            return RenderedEye(case.net, example_rig(), rng)
-        return SampledEye(case.net, rng)
+            return RenderedSensor(case.net, example_rig(), rng)
+        return SampledSensor(case.net, rng)

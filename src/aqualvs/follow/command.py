@@ -25,9 +25,9 @@ from aqualvs.control.vehicle import Setpoint, SetpointHolder, VehicleState
 from aqualvs.errors import OptionError
 from aqualvs.follow.case import SimCase, sea, tuned_gains, vehicle_model
 from aqualvs.follow.log import write_log
-from aqualvs.follow.loop import Eye, SimulatedLoop, Timing
+from aqualvs.follow.loop import RangeSensor, SimulatedLoop, Timing
 from aqualvs.follow.report import FIGURE_FILES, PAGE, RunFacts, summary_lines, write_report
-from aqualvs.follow.sensor_model import Blind, LossOfSight, RenderedEye, SampledEye
+from aqualvs.follow.sensor_model import Blind, LossOfSight, RenderedSensor, SampledSensor
 from aqualvs.live.options import serve_page
 from aqualvs.live.outputs.base import Output
 from aqualvs.live.pilot import PilotReport
@@ -101,7 +101,7 @@ class LoopPage:
         sample = LiveSample(
             rig=self._rig,
             scan=scan,
-            returns={},
+            peaks={},
             frame=frame,
             utc_ns=time.time_ns(),
             instants=Instants(now_ns, now_ns, now_ns),
@@ -116,9 +116,9 @@ class LoopPage:
 
     def _seen(self, frame_s: float, posture: Posture | Refusal) -> tuple[Frame | None, Scan]:
         """Return the picture of a step with its points, where pictures are rendered."""
-        eye = self._loop.eye
-        if isinstance(eye, RenderedEye):
-            for frame, scan in eye.shots:
+        sensor = self._loop.eye
+        if isinstance(sensor, RenderedSensor):
+            for frame, scan in sensor.shots:
                 if scan.posture is posture:
                     return frame, scan
         index = round(frame_s * self._loop.timing.fps)
@@ -126,13 +126,15 @@ class LoopPage:
 
     def _health(self, report: PilotReport) -> Health:
         link = self._loop.link
-        eye = "rendered pictures" if isinstance(self._loop.eye, RenderedEye) else "no pictures"
+        sensor = (
+            "rendered pictures" if isinstance(self._loop.eye, RenderedSensor) else "no pictures"
+        )
         vehicle = f"{report.state.mode_name}, effort forward {report.effort.forward:+.2f}"
         return Health(
             rate_hz=self._loop.timing.fps,
             valid_share=sum(self._valid) / len(self._valid),
             n_frames=report.frame + 1,
-            source=PartHealth("simulation", State.OK, eye),
+            source=PartHealth("simulation", State.OK, sensor),
             outputs=(
                 PartHealth("pilot", report.colour, report.words),
                 PartHealth(link.name, State.OK, vehicle),
@@ -144,7 +146,7 @@ _TELL_EVERY_S = 10.0
 # A plan that is over continues to hold: time to show that it does.
 _HOLDS_ON_S = 5.0
 # Least length of a run: a report needs some rows.
-_LEAST_S = 1.0
+_MIN_S = 1.0
 
 
 class RunWatch:
@@ -155,7 +157,7 @@ class RunWatch:
     loop : SimulatedLoop
     seconds : float
         Of the whole run.
-    tell : callable
+    echo : callable
         Takes one line.
     stop : StopSignals
     slow : bool
@@ -166,12 +168,12 @@ class RunWatch:
         self,
         loop: SimulatedLoop,
         seconds: float,
-        tell: Callable[[str], object],
+        echo: Callable[[str], object],
         stop: StopSignals,
         *,
         slow: bool,
     ) -> None:
-        self._loop, self._seconds, self._tell, self._stop = loop, seconds, tell, stop
+        self._loop, self._seconds, self._tell, self._stop = loop, seconds, echo, stop
         self._told_s = 0.0 if slow else math.inf
         self._over_s = math.inf
 
@@ -181,19 +183,19 @@ class RunWatch:
             self._told_s = now_s
             self._tell(f"simulated {now_s:.0f} of {self._seconds:g} s")
         if not self._loop.steering.engaged:
-            self._tell(f"at {now_s:.1f} s: {self._last_words()}; here a pilot takes over")
+            self._tell(f"at {now_s:.1f} s: {self._last_text()}; here a pilot takes over")
             return False
         if self._over_s == math.inf and self._is_over():
             self._over_s = now_s
             self._tell(f"at {now_s:.1f} s: {LimitReason.MISSION_OVER.words}")
-        stopped = self._stop.caught is not None and now_s >= _LEAST_S
+        stopped = self._stop.caught is not None and now_s >= _MIN_S
         return not stopped and now_s < self._over_s + _HOLDS_ON_S
 
     def _is_over(self) -> bool:
         rows = self._loop.log.rows
         return bool(rows) and rows[-1].stage == Stage.OVER.value
 
-    def _last_words(self) -> str:
+    def _last_text(self) -> str:
         reason = self._loop.steering.gate.latched
         return "disengaged" if reason is None else reason.words
 
@@ -310,18 +312,18 @@ class SimRequest:
         OptionError
             Naming the value.
         """
-        if not _FOLLOW_LEAST_S <= self.seconds <= _MOST_S:
+        if not _FOLLOW_LEAST_S <= self.seconds <= _MAX_S:
             raise OptionError(
                 f"--seconds {self.seconds:g}: choose at least {_FOLLOW_LEAST_S:g}, "
-                f"at most {_MOST_S:g}"
+                f"at most {_MAX_S:g}"
             )
-        if not _LEAST_FPS <= self.fps <= _MOST_FPS:
-            raise OptionError(f"--fps {self.fps:g}: choose {_LEAST_FPS:g} to {_MOST_FPS:g}")
+        if not _MIN_FPS <= self.fps <= _MAX_FPS:
+            raise OptionError(f"--fps {self.fps:g}: choose {_MIN_FPS:g} to {_MAX_FPS:g}")
         if self.camera is not None and not self.rendered:
             raise OptionError(f"--camera {self.camera}: takes rendered frames; add --rendered")
-        if self.cage_radius and not self.cage_radius >= _LEAST_RADIUS:
+        if self.cage_radius and not self.cage_radius >= _MIN_RADIUS:
             raise OptionError(
-                f"--cage-radius {self.cage_radius:g}: choose at least {_LEAST_RADIUS:g} m, or 0 "
+                f"--cage-radius {self.cage_radius:g}: choose at least {_MIN_RADIUS:g} m, or 0 "
                 "for a flat net"
             )
         if not (0.0 <= self.current <= 2.0 and 0.0 <= self.net_sway <= 1.0):
@@ -333,12 +335,12 @@ class SimRequest:
             raise OptionError(f"--freeze {self.freeze:g}: choose 0 s or later")
 
 
-_FOLLOW_LEAST_S, _LEAST_RADIUS = 1.0, 2.0
+_FOLLOW_LEAST_S, _MIN_RADIUS = 1.0, 2.0
 # A day; frame rates of the slowest and the fastest cameras.
-_MOST_S, _LEAST_FPS, _MOST_FPS = 86_400.0, 1.0, 1000.0
+_MAX_S, _MIN_FPS, _MAX_FPS = 86_400.0, 1.0, 1000.0
 
 
-def simulate_and_tell(request: SimRequest, tell: Callable[[str], object]) -> int:
+def simulate_and_tell(request: SimRequest, echo: Callable[[str], object]) -> int:
     """Run the loop, write log, figures and page, and print the summary; return 0.
 
     Raises
@@ -354,20 +356,22 @@ def simulate_and_tell(request: SimRequest, tell: Callable[[str], object]) -> int
         rng = np.random.default_rng([request.seed, 53])
         freeze_s = math.inf if request.freeze is None else request.freeze
         frozen = (Blind(freeze_s, math.inf, LossOfSight.FROZEN),)
-        eye: Eye = SampledEye(case.net, rng, blind=frozen, working_range=rig.working_range)
+        sensor: RangeSensor = SampledSensor(
+            case.net, rng, blind=frozen, working_range=rig.working_range
+        )
         if request.rendered:
             camera = simulated_camera(request.camera or "ideal")
-            eye = RenderedEye(case.net, rig, rng, camera=camera, freeze_s=freeze_s)
-        loop = case.loop(eye, mission)
+            sensor = RenderedSensor(case.net, rig, rng, camera=camera, freeze_s=freeze_s)
+        loop = case.loop(sensor, mission)
         with ExitStack() as undo:
             page = None
             if request.dashboard is not None:
                 holder = SetpointHolder(rig.working_range)
                 holder.put(setpoint)
-                served = serve_page(request.dashboard, request.token, rig, holder, None, tell)
+                served = serve_page(request.dashboard, request.token, rig, holder, None, echo)
                 page = LoopPage(served, rig, loop, holder)
                 undo.callback(page.close)
-            _run(loop, request, page, tell)
+            _run(loop, request, page, echo)
         write_log(loop.log, request.out / TRUTH_CSV)
         facts = RunFacts(
             vehicle=case.model.name,
@@ -378,8 +382,8 @@ def simulate_and_tell(request: SimRequest, tell: Callable[[str], object]) -> int
         )
         report = write_report(loop.log, facts, request.out)
     for line in summary_lines(loop.log, facts):
-        tell(line)
-    tell(f"written: {report}")
+        echo(line)
+    echo(f"written: {report}")
     return 0
 
 
@@ -408,11 +412,11 @@ def _case(request: SimRequest, limits: SafetyLimits, setpoint: Setpoint) -> SimC
 
 
 def _run(
-    loop: SimulatedLoop, request: SimRequest, page: LoopPage | None, tell: Callable[[str], object]
+    loop: SimulatedLoop, request: SimRequest, page: LoopPage | None, echo: Callable[[str], object]
 ) -> None:
     """Run with the log beside it; Ctrl-C ends it early."""
     with StopSignals() as stop, FollowLog(request.out / FOLLOW_CSV) as follow_log:
-        watch = RunWatch(loop, request.seconds, tell, stop, slow=request.rendered)
+        watch = RunWatch(loop, request.seconds, echo, stop, slow=request.rendered)
         if page is None:
             loop.on_step = follow_log.write
             loop.run(request.seconds, watch)
@@ -427,5 +431,5 @@ def _run(
             return watch(now_s)
 
         loop.on_step = show
-        tell("in real time; Ctrl-C ends it")
+        echo("in real time; Ctrl-C ends it")
         loop.run(request.seconds, every_frame)

@@ -174,7 +174,7 @@ class HoldMeasures:
         Of the true posture about the setpoint, in metres and radians.
     range_worst : float
         Greatest error of the range, in metres.
-    least_clearance : float
+    min_clearance : float
         Between hull and net, in metres; negative is contact.
     n_lost : int
         Frames without a posture.
@@ -185,7 +185,7 @@ class HoldMeasures:
     range_rms: float
     yaw_rms: float
     range_worst: float
-    least_clearance: float
+    min_clearance: float
     n_lost: int
     n_guarded: int
 
@@ -232,7 +232,7 @@ class SafetyMeasures:
 
     Attributes
     ----------
-    least_clearance : float
+    min_clearance : float
         In metres; negative is contact.
     n_blind : int
         Periods of more than 0.2 s without a valid posture.
@@ -246,7 +246,7 @@ class SafetyMeasures:
         Of the vehicle, in radians.
     """
 
-    least_clearance: float
+    min_clearance: float
     n_blind: int
     neutral_late: float
     stable: bool
@@ -256,7 +256,7 @@ class SafetyMeasures:
     @property
     def contact(self) -> bool:
         """Whether the hull touched the net."""
-        return self.least_clearance <= 0.0
+        return self.min_clearance <= 0.0
 
     @property
     def neutral_in_time(self) -> bool:
@@ -274,7 +274,7 @@ def hold_measures(log: LoopLog, start_s: float, end_s: float = math.inf) -> Hold
         range_rms=_rms(off),
         yaw_rms=_rms(turned),
         range_worst=float(np.abs(off).max()),
-        least_clearance=float(log.column("clearance")[here].min()),
+        min_clearance=float(log.column("clearance")[here].min()),
         n_lost=sum(row.refusal != "" for row in rows),
         n_guarded=sum(row.reason != "" for row in rows),
     )
@@ -328,7 +328,7 @@ def step_measures(
 def safety_measures(log: LoopLog) -> SafetyMeasures:
     """Return the safety measures of a whole run."""
     return SafetyMeasures(
-        least_clearance=float(log.column("clearance").min()),
+        min_clearance=float(log.column("clearance").min()),
         n_blind=log.n_blind,
         neutral_late=max(log.blind_thrust_s, default=0.0),
         stable=_is_stable(log),

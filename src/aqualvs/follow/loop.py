@@ -96,7 +96,7 @@ _SILENT_AFTER_S, _SILENT_EVERY_S, _DOG_LOOKS_S = 0.20, 0.10, 0.02
 OnStep: TypeAlias = Callable[[float, float, Posture | Refusal, Decision, VehicleState], object]
 
 
-class Eye(Protocol):
+class RangeSensor(Protocol):
     """Interface of a sensor that measures the net's posture from a vehicle."""
 
     def look(self, world_from_dome: SE3, time_s: float) -> Posture | Refusal | None:
@@ -145,7 +145,7 @@ class _Arrival(NamedTuple):
 class _Sight:
     """State of the stream, as the live run and the pilot's watchdog know it."""
 
-    patience_s: float
+    timeout_s: float
     coming: deque[_Arrival] = field(default_factory=deque)
     # Times of the last frame and of the last report of a silent stream.
     heard_s: float = 0.0
@@ -161,7 +161,7 @@ class _Sight:
 
     def bark_s(self, thrusts: bool) -> float:
         """Return when the watchdog stops the thrusters."""
-        return self.seen_s + self.patience_s + _DOG_LOOKS_S if thrusts else math.inf
+        return self.seen_s + self.timeout_s + _DOG_LOOKS_S if thrusts else math.inf
 
 
 class SimulatedLoop:
@@ -172,7 +172,7 @@ class SimulatedLoop:
     link : SimulatedLink
         To the vehicle.
     net : NetWall
-    eye : Eye
+    sensor : RangeSensor
     steering : NetPilot
         Engaged at the start.
     timing : Timing, optional
@@ -188,13 +188,13 @@ class SimulatedLoop:
         self,
         link: SimulatedLink,
         net: NetWall,
-        eye: Eye,
+        sensor: RangeSensor,
         steering: NetPilot,
         timing: Timing | None = None,
         posture_filter: PostureFilter | None = None,
         on_step: OnStep | None = None,
     ) -> None:
-        self.link, self.net, self.eye, self.steering = link, net, eye, steering
+        self.link, self.net, self.eye, self.steering = link, net, sensor, steering
         self.timing = timing or Timing()
         self._filter = posture_filter or PostureFilter()
         self.on_step = on_step
@@ -303,7 +303,7 @@ class SimulatedLoop:
     def _send(self, effort: Effort, now_s: float) -> None:
         """Send an effort, or neutral for one that rests on too old a posture."""
         seen_s = self._sight.seen_s
-        if now_s - seen_s > self._sight.patience_s:
+        if now_s - seen_s > self._sight.timeout_s:
             effort = NEUTRAL
         if effort == NEUTRAL and self.link.effort != NEUTRAL:
             self.log.note_neutral(seen_s, now_s)

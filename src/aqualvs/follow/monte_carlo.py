@@ -20,7 +20,7 @@ from aqualvs.follow.log import (
     safety_measures,
 )
 from aqualvs.follow.loop import Timing
-from aqualvs.follow.sensor_model import Blind, LossOfSight, PostureNoise, SampledEye
+from aqualvs.follow.sensor_model import Blind, LossOfSight, PostureNoise, SampledSensor
 from aqualvs.simulation.net_motion import NetWall
 from aqualvs.simulation.scenarios import bluerov2_rig
 from aqualvs.simulation.vehicle.models import VehicleModel
@@ -28,7 +28,7 @@ from aqualvs.simulation.vehicle.models import VehicleModel
 SECONDS = 40.0
 """Length of a random dive."""
 # Sight is not lost before the loop has started.
-_FIRST_LOSS_S, _GREATEST_LOSS_S = 6.0, 1.0
+_FIRST_LOSS_S, _MAX_LOSS_S = 6.0, 1.0
 _GIVEN_UP_S = LOST_AFTER_S + 0.5
 # Range that a careful pilot holds: in metres, and in metres more for each m/s of current.
 _ROOM, _ROOM_BY_SPEED = 0.5, 0.6
@@ -66,8 +66,8 @@ class RandomDive:
         """Dive until the end, or until a human must take over, and return the log."""
         rng = np.random.default_rng([self.seed, 43])
         noise = PostureNoise(outliers=0.005)
-        eye = SampledEye(self.case.net, rng, noise, self.blind, _WORKING_RANGE)
-        loop = self.case.loop(eye, self.mission())
+        sensor = SampledSensor(self.case.net, rng, noise, self.blind, _WORKING_RANGE)
+        loop = self.case.loop(sensor, self.mission())
         return loop.run(seconds, lambda now_s: now_s - max(loop.seen_s, 0.0) < _GIVEN_UP_S)
 
 
@@ -184,7 +184,7 @@ def _blind(rng: np.random.Generator) -> tuple[Blind, ...]:
     stretches: list[Blind] = []
     start_s = _FIRST_LOSS_S + rng.exponential(3.0)
     while start_s < SECONDS - 2.0:
-        end_s = start_s + rng.uniform(0.04, _GREATEST_LOSS_S)
+        end_s = start_s + rng.uniform(0.04, _MAX_LOSS_S)
         loss = LossOfSight.TARGET if rng.uniform() < 0.5 else LossOfSight.STREAM
         stretches.append(Blind(start_s, end_s, loss))
         start_s = end_s + 2.0 + rng.exponential(6.0)

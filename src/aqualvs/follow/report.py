@@ -40,7 +40,7 @@ _STYLE: dict[Any, Any] = {
     "legend.frameon": False,
 }
 # Least span of an axis, so that noise does not fill it: metres, degrees.
-_LEAST_DEPTH, _LEAST_RANGE, _LEAST_ANGLE = 0.2, 0.1, 6.0
+_MIN_DEPTH, _MIN_RANGE, _MIN_ANGLE = 0.2, 0.1, 6.0
 
 
 FIGURE_FILES = ("figure_22.png", "figure_23.png")
@@ -87,15 +87,15 @@ def _motion(log: LoopLog) -> "Figure":
     time_s = log.column("time_s")
     depth, ranges, angles = axes
     depth.plot(time_s, log.column("depth"), color=_BLUE, linewidth=0.9)
-    _name(depth, "depth (m)", _LEAST_DEPTH)
+    _name(depth, "depth (m)", _MIN_DEPTH)
     depth.invert_yaxis()
     ranges.plot(time_s, log.column("measured_range"), color=_BLUE, linewidth=0.9)
-    _name(ranges, "range (m)", _LEAST_RANGE)
+    _name(ranges, "range (m)", _MIN_RANGE)
     heading = np.degrees(np.unwrap(log.column("heading")))
     angles.plot(time_s, heading, color=_ORANGE, linewidth=0.9, label="heading")
     yaw = np.degrees(log.column("measured_yaw"))
     angles.plot(time_s, yaw, color=_BLUE, linewidth=0.9, label="target yaw")
-    _name(angles, "angle (deg)", _LEAST_ANGLE)
+    _name(angles, "angle (deg)", _MIN_ANGLE)
     _legend(angles)
     _finish(axes, log, time_s)
     return figure
@@ -106,10 +106,10 @@ def _control(log: LoopLog) -> "Figure":
     figure, axes = _panels(4, 8.0)
     time_s = log.column("time_s")
     _loop(axes[0], log, "range", 1.0)
-    _name(axes[0], "range (m)", _LEAST_RANGE)
+    _name(axes[0], "range (m)", _MIN_RANGE)
     _command(axes[1], time_s, log.column("forward"), "forward effort")
     _loop(axes[2], log, "yaw", 180.0 / np.pi)
-    _name(axes[2], "target yaw (deg)", _LEAST_ANGLE)
+    _name(axes[2], "target yaw (deg)", _MIN_ANGLE)
     _command(axes[3], time_s, log.column("turn"), "yaw effort")
     _legend(axes[0])
     _finish(axes, log, time_s)
@@ -199,10 +199,10 @@ class RunFacts:
     @property
     def words(self) -> str:
         """One line."""
-        eye = "rendered pictures, measured" if self.rendered else "sampled postures"
+        sensor = "rendered pictures, measured" if self.rendered else "sampled postures"
         return (
             f"{self.vehicle}, current {self.current:g} m/s, waves of {self.waves:g} m amplitude, "
-            f"{eye} at {self.fps:g} Hz"
+            f"{sensor} at {self.fps:g} Hz"
         )
 
 
@@ -223,7 +223,7 @@ def summary(log: LoopLog) -> list[tuple[str, str]]:
         ("frames at which the safety gate stepped in", f"{hold.n_guarded}"),
         (
             "nearest to the net",
-            f"{safety.least_clearance:.2f} m" + (" - CONTACT" if safety.contact else ""),
+            f"{safety.min_clearance:.2f} m" + (" - CONTACT" if safety.contact else ""),
         ),
         ("share of the time under control", f"{100.0 * steered:.0f} %"),
     ]

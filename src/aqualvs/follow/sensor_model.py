@@ -1,7 +1,7 @@
 """Models of the scanner for simulated loops: sampled postures, or the scanner on rendered pictures.
 
-`SampledEye` gives the true posture with noise and losses. `RenderedEye` renders every frame and
-measures in it by the real pipeline.
+`SampledSensor` gives the true posture with noise and losses. `RenderedSensor` renders every frame
+and measures in it by the real pipeline.
 """
 
 import math
@@ -34,7 +34,7 @@ def net_scene(seed: int = 0) -> Scene:
     return Scene(dome_from_scene=SE3.identity(), nets=(net,), target="net")
 
 
-class RenderedEye:
+class RenderedSensor:
     """Sensor that renders the camera's picture from a vehicle, and measures in it.
 
     Parameters
@@ -104,7 +104,7 @@ class RenderedEye:
 
 # Approximate number of inliers of a posture by the example rig.
 _N_POINTS = 400
-_GREATEST_ANGLE = math.radians(60.0)
+_MAX_ANGLE = math.radians(60.0)
 
 
 class LossOfSight(StrEnum):
@@ -156,7 +156,7 @@ class PostureNoise:
     outliers: float = 0.0
 
 
-class SampledEye:
+class SampledSensor:
     """Sensor that gives the true posture with noise.
 
     Parameters
@@ -210,7 +210,7 @@ class SampledEye:
         near, far = self._working_range
         if not near <= truth.range <= far:
             return Refusal(Reason.OUT_OF_RANGE, f"{truth.range:.2f} m")
-        if max(abs(truth.yaw), abs(truth.pitch)) > _GREATEST_ANGLE:
+        if max(abs(truth.yaw), abs(truth.pitch)) > _MAX_ANGLE:
             return Refusal(Reason.COLLINEAR, "the lasers leave the net")
         return self._measured(truth, (10.0 if wild else 1.0) * draws)
 

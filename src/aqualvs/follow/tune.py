@@ -145,7 +145,7 @@ class TuneRequest:
     options: TuneOptions = field(default_factory=TuneOptions)
 
 
-def tune_and_tell(request: TuneRequest, tell: Callable[[str], None]) -> None:
+def tune_and_tell(request: TuneRequest, echo: Callable[[str], None]) -> None:
     """Tune, try a step, write or print the gains.
 
     Raises
@@ -162,12 +162,12 @@ def tune_and_tell(request: TuneRequest, tell: Callable[[str], None]) -> None:
     with Claim("tune", files, overwrite=request.overwrite):
         tuned = tune(model, request.options)
         for line in report(model, tuned, request.options):
-            tell(line)
+            echo(line)
         if request.output is None:
-            tell(gains_text(tuned.gains))
+            echo(gains_text(tuned.gains))
         else:
             save_gains(tuned.gains, request.output)
-            tell(f"written to {request.output}")
+            echo(f"written to {request.output}")
 
 
 def report(model: VehicleModel, tuned: Tuned, options: TuneOptions) -> list[str]:

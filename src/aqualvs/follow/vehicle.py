@@ -152,7 +152,7 @@ class FollowRequest:
 
 
 def follow_and_tell(
-    request: FollowRequest, tell: Callable[[str], object], keys: TextIO | None = None
+    request: FollowRequest, echo: Callable[[str], object], keys: TextIO | None = None
 ) -> int:
     """Run until the source ends or the user stops it; return 0.
 
@@ -174,9 +174,9 @@ def follow_and_tell(
         warm_up(scanner)
         with contextlib.closing(MavlinkLink(request.mavlink, request.vehicle.link)) as link:
             pilot = Pilot(steering, ArduSubLink(link, request.vehicle.steering), holder)
-            runner = _runner(request, scanner, link, pilot, holder, tell)
-            tell("disengaged: Enter engages, Enter again gives the vehicle back; Ctrl-C ends")
-            listen(pilot, sys.stdin if keys is None else keys, tell)
+            runner = _runner(request, scanner, link, pilot, holder, echo)
+            echo("disengaged: Enter engages, Enter again gives the vehicle back; Ctrl-C ends")
+            listen(pilot, sys.stdin if keys is None else keys, echo)
             with StopSignals() as stop:
                 fault = runner.run(lambda: stop.caught is not None)
     if fault is not None:
@@ -190,7 +190,7 @@ def _runner(
     link: MavlinkLink,
     pilot: Pilot,
     holder: SetpointHolder,
-    tell: Callable[[str], object],
+    echo: Callable[[str], object],
 ) -> LiveRunner:
     """Make the live loop; if a part fails, the parts made before it are closed."""
     sys.setswitchinterval(SWITCH_S)
@@ -209,16 +209,16 @@ def _runner(
         undo.callback(recorder.close)
         outputs += [recorder, Console()]
         if request.record:
-            tell(f"recording: {recorder.start()}")
+            echo(f"recording: {recorder.start()}")
         if request.dashboard is not None:
-            page = serve_page(request.dashboard, request.token, scanner.rig, holder, recorder, tell)
+            page = serve_page(request.dashboard, request.token, scanner.rig, holder, recorder, echo)
             outputs.append(page)
         runner = LiveRunner(feed, FixedScanner(scanner), outputs, posture_filter=PostureFilter())
         undo.pop_all()
     return runner
 
 
-def listen(pilot: Pilot, keys: TextIO, tell: Callable[[str], object]) -> threading.Thread:
+def listen(pilot: Pilot, keys: TextIO, echo: Callable[[str], object]) -> threading.Thread:
     """Engage and disengage by lines of a terminal, in a thread of its own."""
 
     def toggle() -> None:
@@ -226,12 +226,12 @@ def listen(pilot: Pilot, keys: TextIO, tell: Callable[[str], object]) -> threadi
             try:
                 if pilot.engaged:
                     pilot.disengage()
-                    tell("disengaged")
+                    echo("disengaged")
                 else:
                     pilot.engage()
-                    tell("engaged")
+                    echo("engaged")
             except (AqualvsError, OSError) as fault:
-                tell(str(fault))
+                echo(str(fault))
 
     thread = threading.Thread(target=toggle, name="follow keys", daemon=True)
     thread.start()

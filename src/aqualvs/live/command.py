@@ -34,7 +34,7 @@ from aqualvs.sources.remote import Transport
 from aqualvs.terminal import StopSignals
 from aqualvs.workers.water_index import WaterFollowingScanner
 
-_PATIENCE_S = 3.0
+_TIMEOUT_S = 3.0
 
 
 class WaterFollower:
@@ -75,7 +75,7 @@ class WaterFollower:
         while not self._frames.empty():
             self._frames.get_nowait()
         self._frames.put(None)
-        self._thread.join(_PATIENCE_S)
+        self._thread.join(_TIMEOUT_S)
 
     def _look(self) -> None:
         while (frame := self._frames.get()) is not None:
@@ -108,7 +108,7 @@ class Console:
 
     def send(self, sample: LiveSample) -> None:
         """Tell of parts that have changed at once, and of the posture when it is time."""
-        self._tell_changes(sample)
+        self._report_changes(sample)
         now_s = time.monotonic()
         if now_s < self._next_s:
             return
@@ -125,7 +125,7 @@ class Console:
             self._stream.write("\n")
             self._stream.flush()
 
-    def _tell_changes(self, sample: LiveSample) -> None:
+    def _report_changes(self, sample: LiveSample) -> None:
         health = sample.health
         for part in (health.source, *health.lasers, *health.outputs):
             before = self._parts.get(part.name, (State.OFF, ""))[0]
@@ -256,7 +256,7 @@ class LiveRequest:
     index_target: Path | None = None
 
 
-def live_and_tell(request: LiveRequest, tell: Callable[[str], object]) -> int:
+def live_and_tell(request: LiveRequest, echo: Callable[[str], object]) -> int:
     """Run until the source ends or the user stops it, the normal end of a live run; return 0.
 
     Raises
@@ -269,12 +269,12 @@ def live_and_tell(request: LiveRequest, tell: Callable[[str], object]) -> int:
     sys.setswitchinterval(SWITCH_S)
     with ExitStack() as undo:
         undo.callback(feed.close)
-        outputs = _outputs(request, rig, tell)
+        outputs = _outputs(request, rig, echo)
         for output in outputs:
             undo.callback(output.close)
         runner = LiveRunner(
             feed,
-            _supply(request, rig),
+            _provider(request, rig),
             outputs,
             LiveOptions(keep_every=request.fast),
             PostureFilter() if request.smooth else None,
@@ -287,7 +287,7 @@ def live_and_tell(request: LiveRequest, tell: Callable[[str], object]) -> int:
     return 0
 
 
-def _outputs(request: LiveRequest, rig: Rig, tell: Callable[[str], object]) -> list[Output]:
+def _outputs(request: LiveRequest, rig: Rig, echo: Callable[[str], object]) -> list[Output]:
     """Make all outputs; those made before one that fails are closed."""
     options = recorder_options(request.scanner, video=request.record_video)
     recorder = RecorderSwitch(request.record_to, options)
@@ -295,14 +295,14 @@ def _outputs(request: LiveRequest, rig: Rig, tell: Callable[[str], object]) -> l
         outputs: list[Output] = [recorder, Console()]
         made.callback(recorder.close)
         if request.record:
-            tell(f"recording: {recorder.start()}")
+            echo(f"recording: {recorder.start()}")
         outputs += make_outputs(request.outputs)
         for output in outputs[2:]:
             made.callback(output.close)
         if request.dashboard is not None:
             holder = SetpointHolder(rig.working_range)
             outputs.append(
-                serve_page(request.dashboard, request.token, rig, holder, recorder, tell)
+                serve_page(request.dashboard, request.token, rig, holder, recorder, echo)
             )
         made.pop_all()
     return outputs
@@ -313,7 +313,7 @@ def recorder_options(scanner: ScannerOptions, *, video: bool) -> RecorderOptions
     return RecorderOptions(pictures=PictureFormat.JPEG if video else None, scanner=scanner)
 
 
-def _supply(request: LiveRequest, rig: Rig) -> ScannerSupply:
+def _provider(request: LiveRequest, rig: Rig) -> ScannerSupply:
     if request.index_target is None:
         scanner = Scanner(rig, request.scanner)
         warm_up(scanner)

@@ -359,7 +359,7 @@ def _cell_means(luma: ImagePlane) -> FloatArray:
     return np.asarray(sums.reshape(rows, columns, _CELL) @ _ONES / _CELL**2, np.float64)
 
 
-_VERDICT_EVERY_S, _PATIENCE_S = 5.0, 3.0
+_VERDICT_EVERY_S, _TIMEOUT_S = 5.0, 3.0
 
 
 class DriftWatch:
@@ -399,7 +399,7 @@ class DriftWatch:
         while not self._scans.empty():
             self._scans.get_nowait()
         self._scans.put(None)
-        self._thread.join(_PATIENCE_S)
+        self._thread.join(_TIMEOUT_S)
         self._thread = None
 
     def _watch(self, agreement: LaserAgreement) -> None:

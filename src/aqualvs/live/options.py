@@ -229,7 +229,7 @@ def serve_page(
     rig: Rig,
     holder: SetpointHolder,
     recorder: RecorderSwitch | None,
-    tell: Callable[[str], object],
+    echo: Callable[[str], object],
 ) -> Output:
     """Serve the page and print its address.
 
@@ -244,7 +244,7 @@ def serve_page(
         Where the page puts what is to be held.
     recorder : RecorderSwitch or None
         What its record button moves; None where nothing can be recorded.
-    tell : callable
+    echo : callable
         Takes one line.
 
     Raises
@@ -259,4 +259,4 @@ def serve_page(
             f"--dashboard: {fault.name} is missing; pip install 'aqualvs[dashboard]'"
         ) from fault
     host, port = host_and_port(address, DASHBOARD_PORT, "--dashboard-address")
-    return start_dashboard(host, port, token, rig, holder, recorder, tell)
+    return start_dashboard(host, port, token, rig, holder, recorder, echo)

@@ -34,7 +34,7 @@ class Watchdog:
     Parameters
     ----------
     vehicle : VehicleLink
-    patience_s : float
+    timeout_s : float
         Time that an effort may stay in force.
 
     Attributes
@@ -43,8 +43,8 @@ class Watchdog:
         How often it had to act.
     """
 
-    def __init__(self, vehicle: VehicleLink, patience_s: float) -> None:
-        self._vehicle, self._patience_s = vehicle, patience_s
+    def __init__(self, vehicle: VehicleLink, timeout_s: float) -> None:
+        self._vehicle, self._timeout_s = vehicle, timeout_s
         # Held only for calls that return at once, so that nothing can delay neutral.
         self._sending = threading.Lock()
         self._known_s = float("-inf")
@@ -69,7 +69,7 @@ class Watchdog:
             As `VehicleLink.send`.
         """
         with self._sending:
-            if time.monotonic() - known_s > self._patience_s:
+            if time.monotonic() - known_s > self._timeout_s:
                 effort = NEUTRAL
             self._known_s = known_s
             # Before sending: an effort that was sent despite an error is stopped all the same.
@@ -96,7 +96,7 @@ class Watchdog:
         """Stop the thrusters if their effort has stood for too long."""
         with self._sending:
             late_s = time.monotonic() - self._known_s
-            if not self._thrusting.is_set() or late_s <= self._patience_s:
+            if not self._thrusting.is_set() or late_s <= self._timeout_s:
                 return
             try:
                 self._vehicle.send(NEUTRAL)
@@ -208,8 +208,8 @@ class Pilot:
         self, steering: NetPilot, vehicle: VehicleLink, holder: SetpointHolder | None = None
     ) -> None:
         self._steering, self._vehicle, self._holder = steering, vehicle, holder
-        self._patience_s = steering.gate.limits.posture_age
-        self._watchdog = Watchdog(vehicle, self._patience_s)
+        self._timeout_s = steering.gate.limits.posture_age
+        self._watchdog = Watchdog(vehicle, self._timeout_s)
         # Samples come from one thread, engaging from another.
         self._stepping = threading.Lock()
         # Neutrals still to be sent; negative while engaged.
@@ -327,7 +327,7 @@ class Pilot:
         posture, arrived_s = sample.scan.posture, 1e-9 * sample.instants.arrived_ns
         if not posture:
             return posture
-        if now_s - arrived_s > self._patience_s:
+        if now_s - arrived_s > self._timeout_s:
             return Refusal(NoPosture.NO_FRAMES, f"measured {now_s - arrived_s:.2f} s late")
         self._seen_s = arrived_s
         return posture

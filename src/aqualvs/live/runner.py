@@ -33,7 +33,7 @@ from aqualvs.scanner import Scanner
 from aqualvs.scanning.laser_bands import SearchAxis
 from aqualvs.scanning.posture import Reason, Refusal
 from aqualvs.scanning.scan import Frame, Scan, ScanPoints
-from aqualvs.scanning.stripe import Returns
+from aqualvs.scanning.stripe import StripePeaks
 from aqualvs.sources.base import Feed, Health, PartHealth, State
 
 _GREY, _LIGHT, _THICK_PX, _BLUR_PX = 30, 150, 3, 1.2
@@ -73,7 +73,7 @@ def wall_frame(rig: Rig) -> Frame:
 
 # Samples that may wait for a recorder, with their pictures: 300 MB at 1920x1080.
 _QUEUE = 100
-_PATIENCE_S = 5.0
+_TIMEOUT_S = 5.0
 _log = logging.getLogger(__name__)
 
 
@@ -135,7 +135,7 @@ class OutputWorker:
             with self._changed:
                 self._closing = True
                 self._changed.notify()
-            self._thread.join(_PATIENCE_S)
+            self._thread.join(_TIMEOUT_S)
             if self._thread.is_alive():
                 _log.warning("%s: did not end in time", self.name)
         try:
@@ -237,7 +237,7 @@ class Mailbox:
 
 
 # A feed promises to end within a second of being closed.
-_READER_PATIENCE_S = 3.0
+_READER_TIMEOUT_S = 3.0
 # After an unexpected exception the feed is restarted.
 _AGAIN_S = 1.0
 
@@ -285,7 +285,7 @@ class FrameReader:
         self._closing.set()
         self._feed.close()
         self._mailbox.close()
-        self._thread.join(_READER_PATIENCE_S)
+        self._thread.join(_READER_TIMEOUT_S)
         if self._thread.is_alive():
             _log.warning("%s: did not end in time", self._feed.name)
 
@@ -381,7 +381,7 @@ class LiveRunner:
     Parameters
     ----------
     feed : Feed
-    supply : ScannerSupply
+    provider : ScannerSupply
         Closed at the end.
     outputs : sequence of Output
         Closed at the end.
@@ -394,16 +394,16 @@ class LiveRunner:
     def __init__(
         self,
         feed: Feed,
-        supply: ScannerSupply,
+        provider: ScannerSupply,
         outputs: Sequence[Output],
         options: LiveOptions | None = None,
         posture_filter: PostureFilter | None = None,
     ) -> None:
         self._options = options or LiveOptions()
-        self._supply, self._filter = supply, posture_filter
+        self._provider, self._filter = provider, posture_filter
         self._mailbox = Mailbox(keep_every=self._options.keep_every)
         self._reader = FrameReader(feed, self._mailbox)
-        self._monitor = HealthMonitor(supply.scanner.rig)
+        self._monitor = HealthMonitor(provider.scanner.rig)
         # Outputs that never wait come first: waking a thread takes longer than a datagram.
         ordered = sorted(outputs, key=lambda output: not output.inline)
         self._workers = [OutputWorker(output) for output in ordered]
@@ -429,7 +429,7 @@ class LiveRunner:
                     elif self._is_silent():
                         self._pass_on(self._silence())
         finally:
-            self._supply.close()
+            self._provider.close()
             self._monitor.close()
             for worker in self._workers:
                 worker.close()
@@ -446,8 +446,8 @@ class LiveRunner:
                 outputs=[worker.health() for worker in self._workers],
                 n_dropped=self._mailbox.n_dropped,
                 n_lost=self._reader.n_lost,
-                n_water=self._supply.scanner.rig.n_water,
-                sigma_n_water=self._supply.sigma_n_water,
+                n_water=self._provider.scanner.rig.n_water,
+                sigma_n_water=self._provider.sigma_n_water,
             )
         return self._health
 
@@ -456,19 +456,19 @@ class LiveRunner:
         taken_ns = time.monotonic_ns()
         frame = self._last = arrival.frame
         self._heard_ns = arrival.arrived_ns
-        scanner = self._supply.scanner
-        returns, scan = self._scan(scanner, frame)
+        scanner = self._provider.scanner
+        peaks, scan = self._scan(scanner, frame)
         return self._sample(
             scanner.rig,
             scan,
-            returns,
+            peaks,
             frame,
             arrival.utc_ns,
             Instants(arrival.arrived_ns, taken_ns, time.monotonic_ns()),
             scan.time_s,
         )
 
-    def _scan(self, scanner: Scanner, frame: Frame) -> tuple[dict[SearchAxis, Returns], Scan]:
+    def _scan(self, scanner: Scanner, frame: Frame) -> tuple[dict[SearchAxis, StripePeaks], Scan]:
         rig = scanner.rig
         height, width = frame.luma.shape
         if (width, height) != rig.size_px:
@@ -482,8 +482,8 @@ class LiveRunner:
             refusal = Refusal(Reason.FROZEN, f"the same picture for {still_s:.1f} s")
             return {}, Scan(frame.index, frame.time_s, refusal, ScanPoints.none(), rig.n_water)
         try:
-            returns = scanner.detect(frame)
-            return returns, scanner.measure(frame.index, frame.time_s, returns)
+            peaks = scanner.detect(frame)
+            return peaks, scanner.measure(frame.index, frame.time_s, peaks)
         except Exception as fault:
             # One bad frame must not end a dive.
             if str(fault) != self._trouble:
@@ -507,7 +507,7 @@ class LiveRunner:
         silent_s = 1e-9 * (now_ns - self._heard_ns)
         index, time_s = (-1, 0.0) if self._last is None else (self._last.index, self._last.time_s)
         refusal = Refusal(Reason.NO_FRAMES, f"no picture for {silent_s:.1f} s")
-        rig = self._supply.scanner.rig
+        rig = self._provider.scanner.rig
         scan = Scan(index, time_s, refusal, ScanPoints.none(), rig.n_water)
         instants = Instants(now_ns, now_ns, now_ns)
         return self._sample(rig, scan, {}, None, time.time_ns(), instants, time_s + silent_s)
@@ -516,7 +516,7 @@ class LiveRunner:
         self,
         rig: Rig,
         scan: Scan,
-        returns: dict[SearchAxis, Returns],
+        peaks: dict[SearchAxis, StripePeaks],
         frame: Frame | None,
         utc_ns: int,
         instants: Instants,
@@ -526,7 +526,7 @@ class LiveRunner:
         return LiveSample(
             rig=rig,
             scan=scan,
-            returns=returns,
+            peaks=peaks,
             frame=frame,
             utc_ns=utc_ns,
             instants=instants,
@@ -538,5 +538,5 @@ class LiveRunner:
         for worker in self._workers:
             worker.offer(sample)
         if sample.frame is not None:
-            self._supply.offer(sample.frame)
+            self._provider.offer(sample.frame)
         self._monitor.add(sample.scan, sample.instants, time.monotonic_ns())

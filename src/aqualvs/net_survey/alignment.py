@@ -20,17 +20,17 @@ _REACH = 3.0
 STEP = 0.1
 """Shifts that are tried are this far apart, in metres."""
 # A shift is told if so much of the chance lies so near (in prior deviations, and in metres).
-_MASS, _NEAR, _LEAST_NEAR = 0.95, 0.5, 0.3
+_MASS, _NEAR, _MIN_NEAR = 0.95, 0.5, 0.3
 _FLAT_NEAR = 0.5
 # Agreement of patterns that chance alone would show in one of so many cases does not count.
 _CHANCE = 0.01
 # Places this far apart in a pattern of growth count as independent.
 _PATTERN = 0.7
-_LEAST_STRETCHES, _LEAST_OVERLAP = 8, 0.5
+_MIN_STRETCHES, _MIN_OVERLAP = 8, 0.5
 # Stretches that follow each other by no more than this belong to one lane.
 _LANE = 3
 # All pairs of so many stretches fit into memory, and tell how alike neighbours are.
-_MOST_BESIDE = 2000
+_MAX_BESIDE = 2000
 # A hole is still there with this chance. Its diameter is then mostly found again to the first
 # factor (log), else, seen in part, to the second, by which diameters of any holes differ.
 _KEPT, _SEEN_ALIKE = 0.5, 0.7
@@ -38,7 +38,7 @@ _SIZE, _SIZES = 0.15, 0.5
 _CLIP, _MAD = 3.0, 1.4826
 # Places in a stretch that are compared, along and across.
 _SAMPLES = 5
-_MOST_SHIFTS = 40_000
+_MAX_SHIFTS = 40_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +103,7 @@ def align(
     chance /= chance.sum()
     value, spread, told = np.zeros(2), sigma.copy(), np.zeros(2, np.bool_)
     for axis in range(2):
-        near = max(_NEAR * sigma[axis], _LEAST_NEAR) if np.isfinite(sigma[axis]) else _FLAT_NEAR
+        near = max(_NEAR * sigma[axis], _MIN_NEAR) if np.isfinite(sigma[axis]) else _FLAT_NEAR
         shifts = STEP * grid.steps[axis]
         marginal = chance.sum(axis=1 - axis)
         inside = np.abs(shifts - shifts[np.argmax(marginal)]) <= near
@@ -135,7 +135,7 @@ def _grid(later: PlacedSurvey, earlier: Sequence[PlacedSurvey], frame: WallFrame
         centre, reach[0] = 0.5 * (least + most), 0.5 * (most - least)
     n = np.ceil(reach / STEP)
     depths = np.arange(-n[1], n[1] + 1)
-    n[0] = min(n[0], _MOST_SHIFTS // len(depths) // 2)
+    n[0] = min(n[0], _MAX_SHIFTS // len(depths) // 2)
     across = np.round(centre / STEP) + np.arange(-n[0], n[0] + 1)
     log_prior = -0.5 * (STEP * depths / sigma[1]) ** 2 + np.zeros((len(across), 1))
     if frame.round:
@@ -148,7 +148,7 @@ def _pattern_gain(
 ) -> FloatArray:
     """Return by how much each shift explains the growth better than none; 0 if by chance only."""
     nothing = np.zeros(grid.log_prior.shape)
-    if len(later.rows) < _LEAST_STRETCHES:
+    if len(later.rows) < _MIN_STRETCHES:
         return nothing
     raster, known = _pattern(earlier, frame)
     places = spread_over(later.outline, 1e9)
@@ -160,7 +160,7 @@ def _pattern_gain(
             told = _mean_over(known, raster.index(places + np.array([du, dd])))
             good = np.isfinite(told)
             count[i, j] = np.count_nonzero(good)
-            if count[i, j] < _LEAST_STRETCHES:
+            if count[i, j] < _MIN_STRETCHES:
                 continue
             agreement[i, j] = _correlation(mine[good], _clipped(told[good]))
             value = -count[i, j] * np.log1p(-(agreement[i, j] ** 2)) * (agreement[i, j] > 0.0)
@@ -168,7 +168,7 @@ def _pattern_gain(
                 best, best_told = value, told
     if best_told is None:
         return nothing
-    agreement[(agreement < 0.0) | (count < _LEAST_OVERLAP * count.max())] = 0.0
+    agreement[(agreement < 0.0) | (count < _MIN_OVERLAP * count.max())] = 0.0
     gain = -0.5 * count * np.log1p(-(np.minimum(agreement, 0.9999) ** 2))
     alike, rest = _independent(mine, best_told, later.outline.mean(axis=1))
     n_shifts = max(grid.log_prior.size * (STEP / _PATTERN) ** 2, 1.0)
@@ -239,7 +239,7 @@ def _independent(mine: FloatArray, told: FloatArray, middle: FloatArray) -> tupl
 
 def _beside(middle: FloatArray) -> IntArray:
     """Return pairs (2, n): stretches, and the nearest of another time, where one is near."""
-    middle = middle[:_MOST_BESIDE]
+    middle = middle[:_MAX_BESIDE]
     gap = np.abs(np.subtract.outer(np.arange(len(middle)), np.arange(len(middle))))
     distance = np.hypot(*(middle[:, None] - middle[None]).transpose(2, 0, 1))
     distance[gap <= _LANE] = np.inf
@@ -250,7 +250,7 @@ def _beside(middle: FloatArray) -> IntArray:
 
 
 def _memory(values: FloatArray, pairs: IntArray) -> float:
-    if pairs.shape[1] < _LEAST_STRETCHES:
+    if pairs.shape[1] < _MIN_STRETCHES:
         return 0.0
     return float(np.clip(_correlation(values[pairs[0]], values[pairs[1]]), 0.0, 0.95))
 

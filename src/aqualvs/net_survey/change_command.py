@@ -58,7 +58,7 @@ class NetChangeRequest:
             raise OptionError(f"--cell-m {self.cell_m:g}: must be positive; correct it")
 
 
-def net_change(request: NetChangeRequest, tell: Callable[[str], object]) -> Comparison:
+def net_change(request: NetChangeRequest, echo: Callable[[str], object]) -> Comparison:
     """Compare dives along the same net, write the changes and print them.
 
     Raises
@@ -72,17 +72,17 @@ def net_change(request: NetChangeRequest, tell: Callable[[str], object]) -> Comp
     with Claim("net-change", files, overwrite=request.overwrite):
         for folder in request.runs:
             for line in left_out(folder):
-                tell(line)
+                echo(line)
         for one in surveys:
-            tell(f"{one.folder}: {one.date} ({origins[str(one.folder)]})")
+            echo(f"{one.folder}: {one.date} ({origins[str(one.folder)]})")
         result = compare(surveys, request.cell_m)
         with writing(request.out):
             write_tables(request.out, result, (NET_CHANGE_CSV, HOLES_CHANGE_CSV))
             draw_change(result, request.out / NET_CHANGE_PNG)
             write_page(request.out / NET_CHANGE_HTML, request.out / NET_CHANGE_PNG, result, origins)
     for line in summary_lines(result):
-        tell(line)
-    tell(f"page: {request.out / NET_CHANGE_HTML}")
+        echo(line)
+    echo(f"page: {request.out / NET_CHANGE_HTML}")
     return result
 
 

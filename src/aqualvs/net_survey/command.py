@@ -8,7 +8,7 @@ from typing import Any
 from aqualvs.errors import OptionError, SourceError
 from aqualvs.nets.target_file import NetRequest
 from aqualvs.optics.rigfile import rig_from_mapping
-from aqualvs.pipeline import run_and_tell
+from aqualvs.pipeline import run_and_print
 from aqualvs.report.run_page import write_report
 from aqualvs.results.folder import (
     NET_FILES,
@@ -48,7 +48,7 @@ class NetSource:
     overwrite: bool = False
 
 
-def net(place: NetSource, request: NetRequest, tell: Callable[[str], object]) -> int:
+def net(place: NetSource, request: NetRequest, echo: Callable[[str], object]) -> int:
     """Evaluate the condition of a net, write it and print it.
 
     Returns
@@ -62,7 +62,7 @@ def net(place: NetSource, request: NetRequest, tell: Callable[[str], object]) ->
         If an input cannot be used, or a file not be written.
     """
     if (Path(place.source) / POSTURE_CSV).is_file():
-        return net_of_run(place, request, tell)
+        return net_of_run(place, request, echo)
     if place.out is None:
         raise OptionError("--out: missing; give the folder in which the dive is to be run")
     run = RunRequest(
@@ -74,10 +74,10 @@ def net(place: NetSource, request: NetRequest, tell: Callable[[str], object]) ->
         chosen=frozenset() if place.target == "auto" else frozenset({"target"}),
         net=request,
     )
-    return run_and_tell(run, tell)
+    return run_and_print(run, echo)
 
 
-def net_of_run(place: NetSource, request: NetRequest, tell: Callable[[str], object]) -> int:
+def net_of_run(place: NetSource, request: NetRequest, echo: Callable[[str], object]) -> int:
     """Find the state of a net from a run that is on disk; one that was killed is completed first.
 
     Returns
@@ -97,7 +97,7 @@ def net_of_run(place: NetSource, request: NetRequest, tell: Callable[[str], obje
             f"--rig {place.rig}: {run_folder} is a run and has its rig; leave --rig out"
         )
     if recover(run_folder):
-        tell(f"{run_folder}: points completed from the journal of a run that was killed")
+        echo(f"{run_folder}: points completed from the journal of a run that was killed")
     stored = StoredDive(run_folder)
     net = stored.net_pass(request)
     with claim_run(folder, NET_FILES, overwrite=place.overwrite):
@@ -109,13 +109,13 @@ def net_of_run(place: NetSource, request: NetRequest, tell: Callable[[str], obje
                     break
         result = net.write(folder, stored.video)
     for line in [*result.lines, f"map of the net: {folder / NET_MAP_PNG}"]:
-        tell(line)
+        echo(line)
     if stop.caught:
-        tell(f"stopped by {stop.caught.name}; {folder} tells of the frames before")
+        echo(f"stopped by {stop.caught.name}; {folder} tells of the frames before")
     if folder == run_folder and (run_folder / REPORT_HTML).exists():
         # The run's own page, brought up to date.
         with claim_run(folder, [REPORT_HTML], overwrite=True):
-            tell(f"report: {write_report(run_folder)}")
+            echo(f"report: {write_report(run_folder)}")
     return stop.exit_code
 
 

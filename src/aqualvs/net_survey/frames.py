@@ -15,12 +15,12 @@ from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.net_survey.surveys import Survey
 
 # A round net shows in how its bearing grows along the way (as in `nets.places`).
-_LEAST_TURN, _LEAST_AGREEMENT = np.deg2rad(5.0), 0.9
-_LEAST_KNOWN = 3
+_MIN_TURN, _MIN_AGREEMENT = np.deg2rad(5.0), 0.9
+_MIN_KNOWN = 3
 # Flat nets are the same side of a pen if they face the same way up to a compass's error.
 _FLAT_SPREAD, _SAME_SIDE = np.deg2rad(10.0), np.deg2rad(25.0)
 # Own error of a place within a dive, in metres: at least that of bearing and depth.
-_LEAST_SIGMA_U, _SIGMA_D = 0.05, 0.05
+_MIN_SIGMA_U, _SIGMA_D = 0.05, 0.05
 _MAD = 1.4826
 
 
@@ -132,19 +132,19 @@ def has_places(survey: Survey) -> bool:
     """Return whether depth and bearing are known for enough of a dive."""
     one = survey.stretches
     known = np.isfinite(one.depth) & np.isfinite(one.bearing) & one.usable
-    return survey.by_depth and int(np.count_nonzero(known)) >= _LEAST_KNOWN
+    return survey.by_depth and int(np.count_nonzero(known)) >= _MIN_KNOWN
 
 
 def _radius(survey: Survey) -> float | None:
     """Return metres along the net per radian of bearing; None where it shows no roundness."""
     one = survey.stretches
     known = np.flatnonzero(np.isfinite(one.bearing) & one.placed)
-    if len(known) < _LEAST_KNOWN or survey.by_bearing:
+    if len(known) < _MIN_KNOWN or survey.by_bearing:
         return None
     turn, along = np.unwrap(one.bearing[known]), one.along[known]
     turn, along = turn - turn.mean(), along - along.mean()
     spread = float(np.sqrt(turn @ turn * (along @ along)))
-    if np.std(turn) < _LEAST_TURN or abs(turn @ along) < _LEAST_AGREEMENT * spread:
+    if np.std(turn) < _MIN_TURN or abs(turn @ along) < _MIN_AGREEMENT * spread:
         return None
     return float(turn @ along) / float(turn @ turn)
 
@@ -165,8 +165,8 @@ def _untracked(surveys: Sequence[Survey]) -> bool:
 def _bearing_noise(survey: Survey, rows: IntArray, frame: WallFrame) -> float:
     """Return how far bearing and track part from one stretch to the next, in metres."""
     one = survey.stretches
-    if not frame.round or survey.by_bearing or len(rows) < _LEAST_KNOWN:
-        return _LEAST_SIGMA_U if not frame.round else max(_LEAST_SIGMA_U, np.deg2rad(1.0))
+    if not frame.round or survey.by_bearing or len(rows) < _MIN_KNOWN:
+        return _MIN_SIGMA_U if not frame.round else max(_MIN_SIGMA_U, np.deg2rad(1.0))
     off = frame.radius * np.unwrap(one.bearing[rows]) - frame.sign * one.along[rows]
     step = np.diff(off)
     return float(max(_MAD * np.median(np.abs(step - np.median(step))) / np.sqrt(2.0), 0.05))

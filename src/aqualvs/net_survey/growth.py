@@ -20,7 +20,7 @@ SIGMA_SCALE = 1.4
 COMMON = 0.5
 """Share of the variance of solidity that all stretches of a dive have in common."""
 # A date knows of a cell if stretches passed over so much of it.
-_LEAST_COVER = 0.25
+_MIN_COVER = 0.25
 FALSE_SHARE = 0.05
 """Share of false ones among the cells that are said to have changed."""
 
@@ -219,7 +219,7 @@ def _assemble(
                 shape=(n_cells * n_dates, share.shape[1]),
             )
         )
-    known = (cover >= _LEAST_COVER * np.prod(raster.size)) & (seen > 0.0)
+    known = (cover >= _MIN_COVER * np.prod(raster.size)) & (seen > 0.0)
     scale = np.where(known, 1.0 / np.where(known, seen, 1.0), 0.0).ravel()
     weights = sparse.csr_array(sparse.diags_array(scale) @ sparse.hstack(blocks).tocsr())
     values = np.concatenate([one.solidity for one in placed])

@@ -23,7 +23,7 @@ LOOKED = 0.8
 # A hole has grown beyond chance in all but one of 100.
 _GROWN = float(stats.norm.isf(0.005))
 _SIDE = 0.1
-_MOST_SQUARES = 4_000_000
+_MAX_SQUARES = 4_000_000
 _DRAWS = 256
 MISSED = 0.3
 """Share of the holes that lasers swept over and that one dive does not find
@@ -104,9 +104,9 @@ def find_sites(
     size = np.array([placed[i].survey.holes.diameter[k] for i, k in parts])
     of_run = np.array([i for i, _ in parts])
     group = _groups(place, sigma, size, of_run, frame)
-    looks = _Looks.of(placed, shifts, frame)
+    visits = _Visits.of(placed, shifts, frame)
     return [
-        _site(np.flatnonzero(group == g), parts, (place, sigma), placed, dates, looks)
+        _site(np.flatnonzero(group == g), parts, (place, sigma), placed, dates, visits)
         for g in dict.fromkeys(group)
     ]
 
@@ -188,7 +188,7 @@ def _counterparts(distance: FloatArray, group: IntArray) -> IntArray:
 
 
 @dataclass(frozen=True, slots=True)
-class _Looks:
+class _Visits:
     """Places that the lasers of each dive looked at, with their uncertainty."""
 
     raster: Raster
@@ -199,10 +199,10 @@ class _Looks:
     @classmethod
     def of(
         cls, placed: Sequence[PlacedSurvey], shifts: Sequence[SurveyShift], frame: WallFrame
-    ) -> "_Looks":
+    ) -> "_Visits":
         corners = np.concatenate([one.outline.reshape(-1, 2) for one in placed])
         low, high = corners.min(axis=0), corners.max(axis=0)
-        side = max(_SIDE, float(np.sqrt(np.prod(high - low) / _MOST_SQUARES)))
+        side = max(_SIDE, float(np.sqrt(np.prod(high - low) / _MAX_SQUARES)))
         raster = Raster.over(low, high, side, frame)
         dates = sorted({one.survey.date for one in placed})
         return cls(
@@ -236,7 +236,7 @@ def _site(
     where: tuple[FloatArray, FloatArray],
     placed: Sequence[PlacedSurvey],
     dates: Sequence[date],
-    looks: _Looks,
+    visits: _Visits,
 ) -> Site:
     place, sigma = where
     best = mine[np.argmin(sigma[mine].prod(axis=1))]
@@ -250,7 +250,7 @@ def _site(
         # A dive sees too little of a hole, never too much: of one date the largest counts.
         if not size <= sizes[visit]:
             sizes[visit], errors[visit] = size, float(np.linalg.norm(holes.sigma[numbers]))
-    looked = looks.chance(place[best], sigma[best], n_dates)
+    looked = visits.chance(place[best], sigma[best], n_dates)
     looked[np.isfinite(sizes)] = 1.0
     return Site(
         state=_state(sizes, errors, looked),

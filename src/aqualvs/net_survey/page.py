@@ -21,9 +21,9 @@ from aqualvs.net_survey.hole_sites import HoleState, Site
 from aqualvs.net_survey.tables import (
     bearing_deg,
     by_state,
-    place_words,
-    rate_words,
-    size_words,
+    place_text,
+    rate_text,
+    size_text,
     state_title,
     summary_lines,
     verdict,
@@ -42,11 +42,11 @@ if TYPE_CHECKING:
 
 _DPI = 200
 _WIDTH_IN, _PANEL_IN, _AROUND_IN, _ROW_GAP_IN = 11.0, 9.2, 1.7, 0.45
-_TALLEST_IN, _LEAST_RATIO, _MOST_ROWS = 7.0, 0.16, 6
+_TALLEST_IN, _MIN_RATIO, _MAX_ROWS = 7.0, 0.16, 6
 _WEEK = 7.0
 # From green (less) over white to brown (more); told apart by colour-blind eyes.
 _COLOURS = "BrBG_r"
-_LEAST_SCALE = 1.0
+_MIN_SCALE = 1.0
 _INK, _GREY, _SEA = "#1c2a33", "#d5dade", "#ffffff"
 _LABELLED = 24
 _MARKS: dict[HoleState, dict[str, Any]] = {
@@ -102,7 +102,7 @@ def _map(wall: OnWall) -> "Figure":
     low = raster.low[1] - 0.3 * raster.size[1]
     high = raster.low[1] + (raster.shape[1] + 0.3) * raster.size[1]
     length, tall = len(columns) * float(raster.size[0]), float(high - low)
-    n_rows = min(max(math.ceil(math.sqrt(_LEAST_RATIO * length / tall)), 1), _MOST_ROWS)
+    n_rows = min(max(math.ceil(math.sqrt(_MIN_RATIO * length / tall)), 1), _MAX_ROWS)
     per_row = math.ceil(len(columns) / n_rows)
     span = per_row * float(raster.size[0])
     height = min(_PANEL_IN * tall / span, _TALLEST_IN)
@@ -144,7 +144,7 @@ def _shades(wall: OnWall) -> "ScalarMappable":
     from matplotlib.colors import Normalize
 
     rates = [abs(100.0 * _WEEK * one.per_day.value) for one in wall.cells]
-    most = max(float(np.quantile(rates, 0.98)) if rates else 0.0, _LEAST_SCALE)
+    most = max(float(np.quantile(rates, 0.98)) if rates else 0.0, _MIN_SCALE)
     return ScalarMappable(Normalize(-most, most), _COLOURS)
 
 
@@ -240,7 +240,7 @@ def _title(wall: OnWall) -> str:
     words = f"What changed on the net from {dates[0]} to {dates[-1]}"
     if wall.growth is None:
         return words
-    return f"{words}\n{rate_words(wall.growth)}: {verdict(wall.growth)}"
+    return f"{words}\n{rate_text(wall.growth)}: {verdict(wall.growth)}"
 
 
 def _legend(figure: "Figure", wall: OnWall) -> None:
@@ -406,8 +406,8 @@ def _hole_row(one: Site, wall: OnWall) -> tuple[str, ...]:
     seen = np.flatnonzero(np.isfinite(one.sizes))
     return (
         state_title(one.state),
-        place_words(one.place, wall.frame),
-        size_words(one).replace("->", "\u2192"),
+        place_text(one.place, wall.frame),
+        size_text(one).replace("->", "\u2192"),
         dates[seen[0]].isoformat(),
         dates[seen[-1]].isoformat(),
         f"{100.0 * float(one.looked[:-1].max()):.0f} %",

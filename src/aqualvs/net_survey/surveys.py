@@ -100,7 +100,7 @@ def _source(folder: Path) -> Path:
 Row: TypeAlias = Mapping[str, str]
 
 # A row that rests on fewer strands in a frame is not to be relied on (docs/net-condition.md).
-_LEAST_STRANDS = 5.0
+_MIN_STRANDS = 5.0
 # Part of what a picture passed over in which lasers look for holes, where the files do not tell.
 _LASERS_SHARE = 0.4
 _DIVES = "dives"
@@ -292,7 +292,7 @@ def _stretches(rows: Sequence[Row], outline: FloatArray) -> Stretches:
         seen=_column(rows, "seen_m"),
         solidity=solidity,
         sigma=sigma,
-        usable=(strands >= _LEAST_STRANDS) & np.isfinite(solidity) & (sigma > 0.0),
+        usable=(strands >= _MIN_STRANDS) & np.isfinite(solidity) & (sigma > 0.0),
         placed=np.array([row["placed_by"] != "nothing" for row in rows], np.bool_),
         outline=outline,
     )

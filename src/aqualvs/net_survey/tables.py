@@ -13,7 +13,7 @@ from aqualvs.net_survey.hole_sites import LOOKED, HoleState, Site
 from aqualvs.nets.tables import Cell, write_table
 
 _WEEK = 7.0
-_MOST_LISTED = 20
+_MAX_LISTED = 20
 _ORDER = (
     HoleState.NEW,
     HoleState.GROWN,
@@ -53,7 +53,7 @@ def state_title(state: HoleState) -> str:
     return _TITLES[state]
 
 
-def place_words(place: FloatArray, frame: WallFrame) -> str:
+def place_text(place: FloatArray, frame: WallFrame) -> str:
     """Return where on the net something is."""
     if frame.round:
         return f"{place[1]:.1f} m deep, bearing {bearing_deg(place[0], frame):.0f}°"
@@ -65,7 +65,7 @@ def bearing_deg(u: float, frame: WallFrame) -> float:
     return float(np.rad2deg(u / frame.radius)) % 360.0
 
 
-def rate_words(growth: Growth) -> str:
+def rate_text(growth: Growth) -> str:
     """Return growth as percent of the net's area a week."""
     week, sigma = 100.0 * _WEEK * growth.value, 100.0 * _WEEK * growth.sigma
     return f"{week:+.1f} ± {sigma:.1f} % of the net's area a week"
@@ -84,7 +84,7 @@ def by_state(sites: Sequence[Site]) -> dict[HoleState, list[Site]]:
     return {state: some for state, some in found.items() if some}
 
 
-def size_words(site: Site) -> str:
+def size_text(site: Site) -> str:
     """Return a hole's diameter when last seen, after that before if it is still there."""
     known = np.isfinite(site.sizes)
     last = site.sizes[known][-2:] if known[-1] else site.sizes[known][-1:]
@@ -107,7 +107,7 @@ def _whole_line(result: Comparison) -> str:
         for day, one in zip(result.dates, result.whole, strict=True)
         if one
     )
-    rate = f"; {rate_words(result.rate)}: {verdict(result.rate)}" if result.rate else ""
+    rate = f"; {rate_text(result.rate)}: {verdict(result.rate)}" if result.rate else ""
     return f"solidity of all that each date's dives saw, perhaps other parts: {means}{rate}"
 
 
@@ -142,7 +142,7 @@ def _growth_line(wall: OnWall) -> str:
         return "no part of the net was seen on two dates: growth is not told"
     area = len(wall.cells) * float(np.prod(wall.history.raster.size))
     return (
-        f"fouling: {rate_words(wall.growth)}, on {area:.0f} m² seen on two dates or more: "
+        f"fouling: {rate_text(wall.growth)}, on {area:.0f} m² seen on two dates or more: "
         f"{verdict(wall.growth)}"
     )
 
@@ -163,7 +163,7 @@ def _where_lines(wall: OnWall) -> Iterator[str]:
         words = "faster" if most.excess.value > 0.0 else "slower"
         yield (
             f"  {len(apart)} cells differ from the rest of the wall; surest at "
-            f"{_where(wall, most)}, {words} by {rate_words(_size(most.excess)).lstrip('+')}"
+            f"{_where(wall, most)}, {words} by {rate_text(_size(most.excess)).lstrip('+')}"
         )
     elif n > 1:
         yield "  no cell differs from the rest of the wall beyond chance"
@@ -174,11 +174,11 @@ def _size(growth: Growth) -> Growth:
 
 
 def _extreme(wall: OnWall, cell: CellChange) -> str:
-    return f"{_where(wall, cell)}: {rate_words(cell.per_day)}"
+    return f"{_where(wall, cell)}: {rate_text(cell.per_day)}"
 
 
 def _where(wall: OnWall, cell: CellChange) -> str:
-    return place_words(wall.history.raster.middle(np.array(cell.cell)), wall.frame)
+    return place_text(wall.history.raster.middle(np.array(cell.cell)), wall.frame)
 
 
 def _mean_lines(wall: OnWall) -> Iterator[str]:
@@ -201,10 +201,10 @@ def _hole_lines(wall: OnWall) -> Iterator[str]:
         if state is HoleState.SAME:
             yield from _since(wall, sites)
             continue
-        for one in sites[:_MOST_LISTED]:
-            yield f"  {size_words(one)}: {place_words(one.place, wall.frame)}{_doubt(one)}"
-        if len(sites) > _MOST_LISTED:
-            yield f"  and {len(sites) - _MOST_LISTED} more, see holes_change.csv"
+        for one in sites[:_MAX_LISTED]:
+            yield f"  {size_text(one)}: {place_text(one.place, wall.frame)}{_doubt(one)}"
+        if len(sites) > _MAX_LISTED:
+            yield f"  and {len(sites) - _MAX_LISTED} more, see holes_change.csv"
 
 
 def _since(wall: OnWall, sites: Sequence[Site]) -> Iterator[str]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import BoolArray, FloatArray
-from aqualvs.nets.coverage import LaidView, Twine, dash_kinds, measure_solidity, measure_twine
+from aqualvs.nets.coverage import RegisteredView, Twine, dash_kinds, measure_solidity, measure_twine
 from aqualvs.nets.dashes import NetView, crossings_of, find_dashes
 from aqualvs.nets.holes import Hole, HoleMap, merge_holes
 from aqualvs.nets.lattice import (
@@ -30,10 +30,10 @@ from aqualvs.optics.rig import Rig
 from aqualvs.scanning.scan import Scan
 
 # Limit of the frames kept before the first lattice, to search them for holes once it is known.
-_MOST_WAITING = 1500
+_MAX_WAITING = 1500
 # Ends of a laser's line that are darker than the rest by this factor are beyond the laser's fan.
 _BIN_LINES, _DIM = 24, 0.25
-_LEAST_LOOKED_AT = 600
+_MIN_LOOKED_AT = 600
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -217,7 +217,7 @@ class NetCondition:
         self.stretches.append(stretch)
         if self._lattice is None:
             self._waiting[len(self.stretches) - 1] = seen
-            while sum(len(one.views) for one in self._waiting.values()) > _MOST_WAITING:
+            while sum(len(one.views) for one in self._waiting.values()) > _MAX_WAITING:
                 del self._waiting[min(self._waiting)]
         return stretch
 
@@ -279,7 +279,7 @@ class NetCondition:
             seen_length=sum(view.seen_length for view in views),
         )
 
-    def _follow(self, lattice: NetLattice, seen: _Seen) -> list[LaidView]:
+    def _follow(self, lattice: NetLattice, seen: _Seen) -> list[RegisteredView]:
         """Fit the lattice's place in every frame, update the track, and search for holes."""
         fitter, laid = LatticeFitter(lattice), []
         for i, view in enumerate(seen.views):
@@ -290,7 +290,7 @@ class NetCondition:
             if shift is None:
                 continue
             place = self._track.place
-            laid.append(LaidView(view, fitter.assign(view.dashes, shift.place), place))
+            laid.append(RegisteredView(view, fitter.assign(view.dashes, shift.place), place))
             self._map.add(lattice, view, shift.place, place, self._track.piece)
         self._map.update(lattice)
         return laid
@@ -310,7 +310,7 @@ class NetCondition:
         lit = np.add.reduceat(self._lit, edges, axis=1)
         looked = np.add.reduceat(self._looked, edges, axis=1)
         for i in range(len(lit)):
-            known = looked[i] > _LEAST_LOOKED_AT
+            known = looked[i] > _MIN_LOOKED_AT
             if not known.any():
                 continue
             share = lit[i] / np.maximum(looked[i], 1.0)

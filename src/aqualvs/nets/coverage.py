@@ -34,7 +34,7 @@ from aqualvs.nets.spectrum import Mesh
 # search lines; and the power of its height over the usual one, in grey levels, with which dashes
 # grow. From simulated dives in clear and turbid water at 0.3 to 1.0 m with known twine.
 _SEEN, _HALO, _HALO_STEPS, _BRIGHTER = 0.82, 0.43e-3, 0.44, 0.25
-_LEAST_HEIGHT = 25.0
+_MIN_HEIGHT = 25.0
 USUAL_HEIGHT = np.array(100.0)
 """Height of a dash at which `Twine.halo` holds, in grey levels."""
 # Variation of that in steps; and as a share of the strand at zero height, falling to zero at a
@@ -181,7 +181,7 @@ def measure_twine(kinds: Sequence[DashKind], known: float | None = None) -> Twin
 
 def _bright(height: FloatArray) -> FloatArray:
     """Return the ratio of the length of dashes to that of dashes of the usual height."""
-    return np.asarray((np.maximum(height, _LEAST_HEIGHT) / USUAL_HEIGHT) ** _BRIGHTER)
+    return np.asarray((np.maximum(height, _MIN_HEIGHT) / USUAL_HEIGHT) ** _BRIGHTER)
 
 
 def _fit(kinds: Sequence[DashKind]) -> tuple[FloatArray, FloatArray]:
@@ -236,19 +236,19 @@ def _model(
 
 
 # Dashes of a kind: crossing angle (sine), distance from the strand and from others (pitches).
-_LEAST_ACROSS, _ON_STRAND, _CLEAR = 0.4, 0.12, 0.2
-_LEAST_DASHES = 6
+_MIN_ACROSS, _ON_STRAND, _CLEAR = 0.4, 0.12, 0.2
+_MIN_DASHES = 6
 # Growth lengthens dashes and makes them differ. Share of all light on a kind's dashes up to which
 # they are bare, and the scale of the spread with which it falls; then the spread by noise, in grey
 # levels, and without noise. From simulated dives.
-_BARE_SHARE, _DIFFER, _LEAST_BARE = 0.45, 0.22, 0.08
+_BARE_SHARE, _DIFFER, _MIN_BARE = 0.45, 0.22, 0.08
 _NOISE, _NO_NOISE = 7.0, 0.03
 _SHORT, _LONG, _SLANTED, _USUAL_SPREAD = 0.25, 0.7, 1.5, 0.15
 _WIDTH_QUANTILE = 0.4
 # At smaller sines of the angle a strand counts as parallel to the line.
 _NEARLY_ALONG = 0.02
 # Dashes of more search lines may be lost (`segments`).
-_MOST_LINES = 20.0
+_MAX_LINES = 20.0
 _BLOCKS = 6
 # Errors of solidity for dashes that run together or are not seen, as shares: of any net, and per
 # pixel in the distance of two strands (simulated dives).
@@ -263,7 +263,7 @@ _TOO_LONG, _HEXAGON_GAP = 1.25, 2.0
 
 
 @dataclass(frozen=True, slots=True)
-class LaidView:
+class RegisteredView:
     """A frame with the place of the lattice in it.
 
     Attributes
@@ -308,20 +308,20 @@ class _Angles:
         return cls(across, slant, square)
 
 
-def _angles(lattice: NetLattice, one: LaidView) -> _Angles:
+def _angles(lattice: NetLattice, one: RegisteredView) -> _Angles:
     """Return the angles of every dash."""
     laser = one.view.dashes.laser
     normal = lattice.normals[one.fit.family]
     return _Angles.of(one.view.direction[laser], one.view.search[laser], normal)
 
 
-def dash_kinds(lattice: NetLattice, frames: Sequence[LaidView]) -> list[DashKind]:
+def dash_kinds(lattice: NetLattice, frames: Sequence[RegisteredView]) -> list[DashKind]:
     """Group whole dashes that lie clearly on one strand by laser and family."""
     rows = [_rows(lattice, one) for one in frames]
     table = np.concatenate(rows) if rows else np.empty((0, 9))
     kinds = np.unique(table[:, :2], axis=0)
     each = [table[np.all(table[:, :2] == kind, axis=1)] for kind in kinds]
-    each = [mine for mine in each if len(mine) >= _LEAST_DASHES]
+    each = [mine for mine in each if len(mine) >= _MIN_DASHES]
     # Long dashes against short ones; on slanted strands the light sheet evens them out.
     spreads = [
         np.log(_length_at(mine, _LONG) / _length_at(mine, _SHORT))
@@ -337,7 +337,7 @@ def _kind(mine: FloatArray, spread: float) -> DashKind:
     across, slant, height, step, pixel = np.median(mine[:, [2, 3, 6, 7, 8]], axis=0)
     noise = np.hypot(_NOISE / max(height, 1.0), _NO_NOISE)
     grown = np.sqrt(max(spread**2 - noise**2, 0.0))
-    share = float(max(_BARE_SHARE * np.exp(-grown / _DIFFER), _LEAST_BARE))
+    share = float(max(_BARE_SHARE * np.exp(-grown / _DIFFER), _MIN_BARE))
     return DashKind(
         laser=int(mine[0, 0]),
         family=int(mine[0, 1]),
@@ -360,12 +360,12 @@ def _length_at(mine: FloatArray, share: float) -> float:
     return float(ordered[np.searchsorted(light, share * light[-1])])
 
 
-def _rows(lattice: NetLattice, one: LaidView) -> FloatArray:
+def _rows(lattice: NetLattice, one: RegisteredView) -> FloatArray:
     """Return rows (laser, family, across, slant, length, width, height, step) of clear dashes."""
     pitch, dashes, fit = lattice.pitch, one.view.dashes, one.fit
     angles = _angles(lattice, one)
     clear = dashes.whole & (fit.off < _ON_STRAND * pitch[fit.family])
-    clear &= angles.across > _LEAST_ACROSS
+    clear &= angles.across > _MIN_ACROSS
     if lattice.mesh is Mesh.FOUR_SIDED:
         clear &= fit.clear > _CLEAR * pitch.min()
     step = one.view.step[dashes.laser]
@@ -388,7 +388,7 @@ def _rows(lattice: NetLattice, one: LaidView) -> FloatArray:
 
 
 def measure_solidity(
-    lattice: NetLattice, twine: Twine, frames: Sequence[LaidView]
+    lattice: NetLattice, twine: Twine, frames: Sequence[RegisteredView]
 ) -> tuple[float, float] | None:
     """Return the share of the sound net that strands and growth cover, and its standard deviation.
 
@@ -485,7 +485,7 @@ def _reliable(lattice: NetLattice, twine: Twine, view: NetView) -> BoolArray:
     angles = _Angles.of(line[:, None], search[:, None], lattice.normals[None])
     step = view.step[:, None]
     lines = twine.usual(angles.across, angles.slant, step, USUAL_HEIGHT) / step
-    good: BoolArray = lines < _MOST_LINES
+    good: BoolArray = lines < _MAX_LINES
     best = lines.argmin(axis=0)
     good[best, np.arange(len(best))] = True
     return good

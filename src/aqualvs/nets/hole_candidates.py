@@ -26,7 +26,7 @@ from aqualvs.nets.spectrum import Mesh
 
 # Share of strand that is always dark without a hole; share of light where the net has a hole (a
 # fish, a loose end); and limit of the evidence of the looks at one cell against a hole.
-_DARK, _FALSE_LIGHT, _MOST_SOUND = 0.03, 0.03, 4.0
+_DARK, _FALSE_LIGHT, _MAX_SOUND = 0.03, 0.03, 4.0
 # Prior number of crossings seen, for one laser and family: with few crossings, the share that is
 # missed is not known. The same for a piece of its line.
 # Where seen and missed alternate at this share, all missed ones count; where a larger share than
@@ -34,7 +34,7 @@ _DARK, _FALSE_LIGHT, _MOST_SOUND = 0.03, 0.03, 4.0
 _BEFORE, _BEFORE_HERE, _SCARCE, _TOO_MANY = 20.0, 5.0, 0.12, 0.3
 # A dark object that hides the net for a while leaves some strands visible. Share of strands seen in
 # a hole; and largest log-likelihood by which a hidden net may be likelier than a hole.
-_LIT_IN_HOLE, _LEAST_OVER_HIDDEN = 0.05, -3.0
+_LIT_IN_HOLE, _MIN_OVER_HIDDEN = 0.05, -3.0
 # Least number of frames of a hole seen by one laser alone: those in which a line sweeps over three
 # bars at the fastest speed at which the net can be tracked.
 _ALONE_FRAMES = 8
@@ -100,7 +100,7 @@ class Looks:
         number = self.sums[:, 0]
         margin = np.maximum(2.0 * self.shares - 1.0, 0.0)
         mean = self.sums[:, 3] / number
-        says = np.where(self.missed, mean, np.maximum(mean * number, -_MOST_SOUND))
+        says = np.where(self.missed, mean, np.maximum(mean * number, -_MAX_SOUND))
         return np.asarray(says * margin)
 
     def stays_dark(self, middle: FloatArray, radius: float) -> bool:
@@ -117,7 +117,7 @@ class Looks:
         hidden = max(lit / (dark + lit), _LIT_IN_HOLE)
         over_lit = lit * np.log(_LIT_IN_HOLE / hidden)
         over = over_lit + dark * np.log((1.0 - _LIT_IN_HOLE) / (1.0 - hidden))
-        if over < _LEAST_OVER_HIDDEN:
+        if over < _MIN_OVER_HIDDEN:
             return False
         laser = (self.keys[inside] >> 1) % LASERS
         balance = np.bincount(laser, np.where(missed, share, -share))
@@ -189,7 +189,7 @@ _SINGLE = 0.8
 # Large holes are rarer than small ones, by this power of the radius.
 _RARER = 2.0
 # A hole's log-likelihood over sound net, and over a single strand that is cut.
-_LEAST_SCORE, _LEAST_LEAD = 12.0, 5.0
+_MIN_SCORE, _MIN_LEAD = 12.0, 5.0
 # Uncertainty of a radius from the grid and from the places of strands, in bars.
 _ROUGH = 0.25
 
@@ -228,7 +228,7 @@ def find_discs(place: FloatArray, weight: FloatArray, bar: float) -> list[Disc]:
     """
     weight = weight.copy()
     found: list[Disc] = []
-    while weight[weight > 0.0].sum() >= _LEAST_SCORE:
+    while weight[weight > 0.0].sum() >= _MIN_SCORE:
         disc = _best(place, weight, bar)
         if disc is None:
             break
@@ -262,7 +262,7 @@ def _best(place: FloatArray, weight: FloatArray, bar: float) -> Disc | None:
     total[:, single] = -np.inf
     at, size = np.unravel_index(np.argmax(total), total.shape)
     best = float(score[at, size])
-    if best < _LEAST_SCORE or best - max(float(score[:, single].max()), 0.0) < _LEAST_LEAD:
+    if best < _MIN_SCORE or best - max(float(score[:, single].max()), 0.0) < _MIN_LEAD:
         return None
     # Discs that contain the middle of the likeliest one belong to the same hole.
     away = np.hypot(*(middles - middles[at]).T)
@@ -309,7 +309,7 @@ def _scores(
 # search lines.
 _OFF, _OFF_STEPS = 0.2, 1.5
 # Least sine of a crossing angle; at smaller ones the place of the crossing is uncertain.
-_LEAST_ACROSS = 0.3
+_MIN_ACROSS = 0.3
 # Margin at the ends of hexagon bars, as a share of a bar, within which their presence is uncertain.
 _KNOT = 0.2
 # Least share of light behind the net seen through a hole, relative to elsewhere.
@@ -415,7 +415,7 @@ def _predict(
             qx, qy = waves[f]
             rate = qx * direction[i, 0] + qy * direction[i, 1]
             size = np.sqrt(qx * qx + qy * qy)
-            if not abs(rate) > _LEAST_ACROSS * size:
+            if not abs(rate) > _MIN_ACROSS * size:
                 continue
             start = qx * (origin[i, 0] - place[0]) + qy * (origin[i, 1] - place[1])
             off = max(_OFF / abs(rate), least_off[i])

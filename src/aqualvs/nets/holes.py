@@ -31,10 +31,10 @@ from aqualvs.nets.spectrum import Mesh
 # Side of the map's cells, in bars: looks of one laser at one cell are alike.
 _CELL = 0.4
 # Limit of the share missed between strands that are seen; above it the lattice is wrong.
-_MOST_MISSED = 0.3
+_MAX_MISSED = 0.3
 # Missing strands may be a hole if this near to each other, in bars, and with this much evidence;
 # strands within the last distance determine its edge.
-_NEAR, _LEAST_NEAR, _AROUND = 1.5, 9.0, 6.5
+_NEAR, _MIN_NEAR, _AROUND = 1.5, 9.0, 6.5
 # Discs no farther apart than this are one hole, in bars.
 _TOUCH = 1.2
 # Motion of the vehicle, in bars, between the frames whose foot is kept.
@@ -172,7 +172,7 @@ class HoleMap:
         )
         self._waiting = []
         between = float(np.sum(1.0 / run[closed]))
-        if between > _MOST_MISSED * (between + np.count_nonzero(~missed)):
+        if between > _MAX_MISSED * (between + np.count_nonzero(~missed)):
             return
         says = looks_say(laser, family, here, missed, run)
         column, row = np.floor(place / (_CELL * self._bar)).astype(np.int64).T
@@ -192,7 +192,7 @@ class HoleMap:
         bar = lattice.bar
         likely = np.flatnonzero(weights > 0.0)
         near = local_sums(places[likely], weights[likely], _NEAR * bar)
-        likely = likely[near > _LEAST_NEAR]
+        likely = likely[near > _MIN_NEAR]
         found, left = [], weights.copy()
         for group in _groups(places[likely], 2.0 * _NEAR * bar):
             seeds = places[likely[group]]

@@ -29,16 +29,16 @@ from aqualvs.nets.spectrum import (
 from aqualvs.nets.spectrum_kernels import wave_sums
 
 # Number of frames for the fit of a lattice, and of those among them for the search.
-_MOST_FRAMES, _SEARCHED_FRAMES = 30, 12
+_MAX_FRAMES, _SEARCHED_FRAMES = 30, 12
 # Number of likely lattices that are refined roughly, and of the best that are refined well.
 _FOLLOWED, _COMPARED = 12, 4
 _FIRST_ROUNDS, _ROUNDS, _LAST_ROUNDS = 2, 5, 7
 # Least crossings of a usable frame.
-_LEAST_CROSSINGS = 5
+_MIN_CROSSINGS = 5
 # Least log-likelihood per frame of a lattice; less may be chance.
-_LEAST_SCORE = 0.3
+_MIN_SCORE = 0.3
 # Least lead of the best lattice over those with another bar length.
-_LEAST_LEAD, _SAME_BAR = 0.2, 0.06
+_MIN_LEAD, _SAME_BAR = 0.2, 0.06
 # The previous lattice is kept with this share of its score, turned by up to this many degrees.
 _AS_BEFORE, _TURNS = 0.6, (0.0, -4.0, 4.0)
 # Number of parts of the frames whose bars are compared, and the relative error of the search.
@@ -121,7 +121,7 @@ def find_lattice(
         best = _searched(Spectrum.of(_spread(chosen, _SEARCHED_FRAMES)))
         best = best and refine(best, spectrum, _LAST_ROUNDS)
     # A chance result of a few frames is not confirmed by all of them.
-    if best is None or best.score < _LEAST_SCORE:
+    if best is None or best.score < _MIN_SCORE:
         return None
     return _lattice(best, _sigma(best, chosen))
 
@@ -134,14 +134,14 @@ def _searched(spectrum: Spectrum) -> Hypothesis | None:
     tried[:_COMPARED] = [refine(one, spectrum, _ROUNDS) for one in tried[:_COMPARED]]
     best = max(tried, key=lambda one: one.score)
     others = [one.score for one in tried if abs(np.log(bar_of(one) / bar_of(best))) > _SAME_BAR]
-    if best.score < max([_LEAST_SCORE, *(score + _LEAST_LEAD for score in others)]):
+    if best.score < max([_MIN_SCORE, *(score + _MIN_LEAD for score in others)]):
         return None
     return best
 
 
 def _known(before: NetLattice, spectrum: Spectrum) -> Hypothesis | None:
     """Return the previous lattice, if it explains these frames nearly as well."""
-    enough = max(_LEAST_SCORE, _AS_BEFORE * before.score)
+    enough = max(_MIN_SCORE, _AS_BEFORE * before.score)
     for angle in np.deg2rad(_TURNS):
         found = refine(Hypothesis(before.mesh, before.basis @ turned(angle).T), spectrum, 3)
         if found.score >= enough:
@@ -151,8 +151,8 @@ def _known(before: NetLattice, spectrum: Spectrum) -> Hypothesis | None:
 
 def _choose(frames: Sequence[Crossings]) -> list[Crossings]:
     """Return some frames, evenly spread, of those with enough crossings."""
-    useful = [one for one in frames if len(one.place) >= _LEAST_CROSSINGS]
-    return _spread(useful, _MOST_FRAMES)
+    useful = [one for one in frames if len(one.place) >= _MIN_CROSSINGS]
+    return _spread(useful, _MAX_FRAMES)
 
 
 def _spread(frames: Sequence[Crossings], most: int) -> list[Crossings]:
@@ -193,7 +193,7 @@ _HARMONICS, _REGULAR = 3, 0.92
 # around the expected place, whatever its shape.
 _REACH, _TRIED = 0.75, 18
 # Least match: as a share of that of perfect crossings, and in deviations of random ones.
-_LEAST_SHARE, _LEAST_DEVIATIONS = 0.4, 3.0
+_MIN_SHARE, _MIN_DEVIATIONS = 0.4, 3.0
 _TRACK_LEAST_CROSSINGS = 4
 # Newton's steps to the best shift, and its regularisation in undetermined directions (1/m²).
 _TRACK_ROUNDS, _STIFF = 4, 100.0
@@ -203,7 +203,7 @@ _VELOCITY, _TOLD_VELOCITY, _ACCELERATION, _FOOT = 0.15, 0.03, 0.25, 1.5e-3
 # Velocities at which a piece of track may begin (m/s): greatest, step, standard deviation before
 # and after it is found; and the least number of frames.
 _FASTEST, _STEP, _USUAL, _FOUND = 0.45, 0.0125, 0.2, 0.04
-_LEAST_FRAMES = 4
+_MIN_FRAMES = 4
 # Velocities that differ by a whole mesh per frame look the same: the slowest one with this share of
 # the best match is taken, and then the best one within this distance of it (m/s).
 _AS_GOOD, _SAME_VELOCITY = 0.9, 0.05
@@ -324,7 +324,7 @@ class LatticeFitter:
             place = place + np.linalg.solve(information + _STIFF * np.eye(2), slope)
         match, _, information = self._about(sums, place)
         full = len(crossings.place) * float(np.sum(self._amplitude**2))
-        if match < max(_LEAST_SHARE * full, _LEAST_DEVIATIONS * np.sqrt(0.5 * full)):
+        if match < max(_MIN_SHARE * full, _MIN_DEVIATIONS * np.sqrt(0.5 * full)):
             return None
         return LatticeShift(place, information)
 
@@ -342,7 +342,7 @@ class LatticeFitter:
             Their times.
         """
         usable = [i for i, one in enumerate(crossings) if len(one.place) >= _TRACK_LEAST_CROSSINGS]
-        if len(usable) < _LEAST_FRAMES:
+        if len(usable) < _MIN_FRAMES:
             return None
         size = np.hypot(*self._waves.T)
         longest = size < 1.2 * size.min()

@@ -19,7 +19,7 @@ from aqualvs.nets.occlusion import LaserLines, hidden_lines, light_beyond
 from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.sheet import Sheet, sheets_of
-from aqualvs.scanning.laser_bands import SearchAxis, plan_searches
+from aqualvs.scanning.laser_bands import SearchAxis, plan_bands
 from aqualvs.scanning.posture import Posture
 from aqualvs.scanning.scan import Label, Scan
 
@@ -29,7 +29,7 @@ _OFF_PLANE = 0.05
 _REACH = 1.3
 _SAMPLES = 129
 # Least sine of the angle between sheet and net for a line on the net.
-_LEAST_SLOPE = 1e-3
+_MIN_SLOPE = 1e-3
 # The detector needs dark flanks: no stripe is found next to the border.
 _BORDER_PX = 16.0
 # Reach of a crossing, where two lasers' stripes disturb each other: in widths, plus pixels.
@@ -130,20 +130,20 @@ class NetReader:
     def __init__(self, rig: Rig, camera: Camera | None = None) -> None:
         self.rig = rig
         self._camera = camera or rig.camera()
-        self._searches = plan_searches(rig, self._camera)
+        self._laser_bands = plan_bands(rig, self._camera)
         self._sheets = sheets_of(rig)
         self._planes = [sheet.best_plane(self._camera, rig.working_range) for sheet in self._sheets]
         # Image axis along which each laser's search lines run.
-        self._axis = np.array([0 if s.axis is SearchAxis.ALONG_X else 1 for s in self._searches])
-        self._line_px = np.array([s.line_px for s in self._searches])
-        self.n_lines = max((len(one.lowest) for one in self._searches), default=0)
+        self._axis = np.array([0 if s.axis is SearchAxis.ALONG_X else 1 for s in self._laser_bands])
+        self._line_px = np.array([s.line_px for s in self._laser_bands])
+        self.n_lines = max((len(one.lowest) for one in self._laser_bands), default=0)
         self._lowest, self._highest = self._bands()
 
     def _bands(self) -> tuple[FloatArray, FloatArray]:
         """Return the first and last position (L, J) of a detectable stripe on each search line."""
-        lowest = np.full((len(self._searches), self.n_lines), np.inf)
+        lowest = np.full((len(self._laser_bands), self.n_lines), np.inf)
         highest = np.full(lowest.shape, -np.inf)
-        for i, search in enumerate(self._searches):
+        for i, search in enumerate(self._laser_bands):
             axis = 0 if search.axis is SearchAxis.ALONG_X else 1
             n, last = len(search.lowest), self.rig.size_px[axis] - 1
             lowest[i, :n] = np.maximum(search.lowest, _BORDER_PX)
@@ -161,7 +161,7 @@ class NetReader:
 
     def _lines(self, net: SE3) -> LaserLines:
         """Follow every laser's line across the net's plane."""
-        n, n_lines = len(self._searches), self.n_lines
+        n, n_lines = len(self._laser_bands), self.n_lines
         lines = [_line_on(plane, net) for plane in self._planes]
         origin, direction = np.stack(lines, axis=1) if n else np.empty((2, 0, 2))
         reach = _REACH * float(np.linalg.norm(net.translation))
@@ -181,7 +181,7 @@ class NetReader:
             step=np.zeros((n, n_lines)),
         )
         for i in np.flatnonzero(np.isfinite(direction[:, 0])).tolist():
-            search, axis = self._searches[i], int(self._axis[i])
+            search, axis = self._laser_bands[i], int(self._axis[i])
             _resample(
                 s,
                 (pixels[i, :, 1 - axis] + 0.5) / search.line_px - 0.5,
@@ -269,7 +269,7 @@ def _line_on(sheet: Plane, net: SE3) -> tuple[FloatArray, FloatArray]:
     across = net.rotate(sheet.normal)
     flat = across[:2]
     size = float(np.hypot(*flat))
-    if size < _LEAST_SLOPE:
+    if size < _MIN_SLOPE:
         return np.full(2, np.nan), np.full(2, np.nan)
     # A point of the net's plane X has n·(R^T (X - t)) = offset.
     offset = sheet.offset + float(across @ net.translation)

@@ -25,11 +25,11 @@ _ROW_GAP_IN, _AROUND_IN = 0.5, 1.0
 # Greatest height and least width, in inches: a net passed up or down makes a narrower picture.
 _TALLEST_IN, _NARROWEST_IN = 8.0, 6.5
 # The wall is cut into rows until a row is at least this high for its width, or up to this number.
-_LEAST_RATIO, _MOST_ROWS = 0.13, 8
+_MIN_RATIO, _MAX_ROWS = 0.13, 8
 _MARGIN = 0.09
 # Looks alike in all kinds of colour vision, from dark blue (clean) to yellow.
 _COLOURS = "cividis"
-_LEAST_SCALE, _SCALE_STEP = 0.1, 0.05
+_MIN_SCALE, _SCALE_STEP = 0.1, 0.05
 _GREY, _PATH, _HOLE = "#c4c9cd", "#ffffff", "#d55e00"
 _INK, _SEA = "#1c2a33", "#f4f7f8"
 # A bearing that changes less than this, in degrees, is given in the title.
@@ -125,7 +125,7 @@ def _extent(wall: UnrolledNet) -> tuple[FloatArray, FloatArray]:
 
 def _rows(size: FloatArray) -> int:
     """Return the number of rows that a wall is cut into, so that no row is a thin line."""
-    return min(max(math.ceil(_LEAST_RATIO * float(size[0] / size[1])), 1), _MOST_ROWS)
+    return min(max(math.ceil(_MIN_RATIO * float(size[0] / size[1])), 1), _MAX_ROWS)
 
 
 def _shades(wall: UnrolledNet) -> "ScalarMappable":
@@ -133,7 +133,7 @@ def _shades(wall: UnrolledNet) -> "ScalarMappable":
     from matplotlib.colors import Normalize
 
     known = [value for value in map(fouling_of, wall.stretches) if value is not None]
-    most = max([*known, _LEAST_SCALE])
+    most = max([*known, _MIN_SCALE])
     top = _SCALE_STEP * math.ceil(most / _SCALE_STEP - 1e-9)
     return ScalarMappable(Normalize(0.0, top), _COLOURS)
 

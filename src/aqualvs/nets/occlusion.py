@@ -19,7 +19,7 @@ _THINGS = (Label.SOLID, Label.FISH, Label.BUBBLE)
 # likelihood) that hides the net: weaker light is probably not laser light, and in a hole, where
 # there is no other light, it would prevent looks at the hole. At half the best height, this is a
 # likelihood of 0.18.
-_LEAST_QUALITY = 0.3
+_MIN_QUALITY = 0.3
 # Pieces of light are on one object if at most this many search lines are between them, and at most
 # this many pixels along these, plus as many for each line. An object with this much light is not a
 # bubble or speck.
@@ -100,7 +100,7 @@ def hidden_lines(
     hidden = np.zeros(lines.along.shape, np.bool_)
     before = (points.label == Label.CLUTTER) & (in_net[:, 2] > off)
     before |= np.isin(points.label, _THINGS) & (in_net[:, 2] > -off)
-    before &= points.quality >= _LEAST_QUALITY
+    before &= points.quality >= _MIN_QUALITY
     index = np.flatnonzero(before)
     index = index[np.lexsort((row[index], points.laser[index]))]
     laser = points.laser[index].astype(np.int64)

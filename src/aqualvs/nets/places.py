@@ -190,7 +190,7 @@ class LaidLog:
         how = self.offset.how
         return f"log {self.log.name}: its clock minus the dive's is {offset}{sigma} ({how})"
 
-    def facts(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """Return the same for `net.geojson`."""
         found: dict[str, Any] = {"file": self.log.name, "used": self.places is not None}
         if isinstance(self.offset, OffsetRefusal):
@@ -266,9 +266,9 @@ def _found(
 _PIN_S = 15.0
 # A round cage is detected by the growth of its bearing along the track: least change (standard
 # deviation), and least coefficient of correlation of the two.
-_LEAST_TURN, _LEAST_AGREEMENT = np.deg2rad(5.0), 0.9
+_MIN_TURN, _MIN_AGREEMENT = np.deg2rad(5.0), 0.9
 # Difference of height, in metres, at which track and log disagree; waves make less.
-_LEAST_SLIP = 0.5
+_MIN_SLIP = 0.5
 
 
 class PlacedBy(StrEnum):
@@ -440,7 +440,7 @@ class _Nodes:
         known = np.isfinite(off)
         spread = [np.ptp(off[known & (self.run == r)]) for r in np.unique(self.run[known])]
         most = float(max(spread, default=0.0))
-        return most if most > _LEAST_SLIP else 0.0
+        return most if most > _MIN_SLIP else 0.0
 
     def place(self, i: int, seen: ViewedPlaces) -> NetPlace:
         """Return the place of a node."""
@@ -516,7 +516,7 @@ def _along_a_cage(along: FloatArray, run: IntArray, bearing: FloatArray) -> Floa
     off_turn = np.concatenate([turn[mine] - turn[mine].mean() for mine in within])
     off_along = np.concatenate([along[mine] - along[mine].mean() for mine in within])
     spread = float(np.sqrt(off_turn @ off_turn * (off_along @ off_along)))
-    if np.std(off_turn) < _LEAST_TURN or abs(off_turn @ off_along) < _LEAST_AGREEMENT * spread:
+    if np.std(off_turn) < _MIN_TURN or abs(off_turn @ off_along) < _MIN_AGREEMENT * spread:
         return None
     radius = float(off_turn @ off_along) / float(off_turn @ off_turn)
     lag = np.array([np.mean((radius * turn - along)[mine]) for mine in within])

@@ -25,7 +25,7 @@ from scipy.ndimage import maximum_filter
 from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.nets.spectrum_kernels import (
     HIGHEST,
-    MOST_HARMONICS,
+    MAX_HARMONICS,
     REGULAR,
     SHARE_OF_REST,
     SHELL_1,
@@ -51,7 +51,7 @@ _UPWARD: FloatArray = np.arange(-2.0 * STEP, HIGHEST + STEP, STEP)
 # On the grid evenly spread crossings are this far apart, in metres: their own period is beyond its
 # end. The grid gives initial guesses only, so this number of frames is enough.
 _APART = 7.5e-3
-_MOST_ON_GRID = 12
+_MAX_ON_GRID = 12
 
 
 Swings: TypeAlias = NDArray[np.complex64]
@@ -230,7 +230,7 @@ class Spectrum:
         )
         return power / max(self.n_crossings, 1)
 
-    def polar(self, most: int = _MOST_ON_GRID) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def polar(self, most: int = _MAX_ON_GRID) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the local maximum power at sizes (K,) and directions (A,) of waves, shape (K, A).
 
         At most `most` frames are used, evenly spread.
@@ -265,7 +265,7 @@ _SHORTEST_BAR = 0.010
 # second families for each of them.
 _TRIED, _KEPT, _SECONDS = 1000, 6, 2
 # Number of frames in the search for second families.
-_MOST_OF_REST = 6
+_MAX_OF_REST = 6
 # Least distance in frequency of two waves.
 _HYPOTHESES_APART = 2.5
 # Spread of the logarithm of the ratio of the pitches of two families.
@@ -274,7 +274,7 @@ _EVEN = 0.05
 # few diamonds do so by chance: penalty within this angle.
 _AS_HONEYCOMB, _RARE = np.deg2rad(2.5), 1.0
 # Families that run more nearly alike than this have no mesh between them.
-_LEAST_ANGLE = np.deg2rad(25.0)
+_MIN_ANGLE = np.deg2rad(25.0)
 
 
 class Mesh(StrEnum):
@@ -384,7 +384,7 @@ def hypotheses(spectrum: Spectrum) -> list[Hypothesis]:
 def _family_gain(power: FloatArray, size: FloatArray, per_frame: float, share: float) -> FloatArray:
     """Return the gain (K, A) from a family's harmonics, for waves of every size and direction."""
     gain = np.zeros_like(power)
-    for h in range(1, MOST_HARMONICS + 1):
+    for h in range(1, MAX_HARMONICS + 1):
         k = np.rint((h * size - size[0]) / (size[1] - size[0])).astype(int)
         inside = (k < len(size)) & ((h == 1) | (h * size < HIGHEST))
         gain[inside] += _gain(power[k[inside]], 1.0 + per_frame * (share * REGULAR**h) ** 2)
@@ -402,10 +402,10 @@ def _four_sided(
         rest = spectrum.without(a)
         if rest.n_crossings == 0:
             continue
-        left = _family_gain(rest.polar(_MOST_OF_REST)[2], size, rest.per_frame, SHARE_OF_REST)
+        left = _family_gain(rest.polar(_MAX_OF_REST)[2], size, rest.per_frame, SHARE_OF_REST)
         between = np.abs((angle - angle[i] + 0.5 * np.pi) % np.pi - 0.5 * np.pi)
         left = left - 0.5 * (np.log(size / size[k])[:, None] / _EVEN) ** 2
-        left[:, between < _LEAST_ANGLE] = -np.inf
+        left[:, between < _MIN_ANGLE] = -np.inf
         for m, j in _best_waves(left, size, angle, _SECONDS):
             b = size[m] * np.array([np.cos(angle[j]), np.sin(angle[j])])
             found.append(Hypothesis(Mesh.FOUR_SIDED, np.array([a, b])))

@@ -279,7 +279,7 @@ def wave_sums(
 
 HIGHEST = 125.0
 """Largest frequency of waves, in periods a metre."""
-MOST_HARMONICS, REGULAR = 6, 0.92
+MAX_HARMONICS, REGULAR = 6, 0.92
 """Harmonics of a family's wave that are used; each is weaker than the one before by the factor."""
 SHELL_1 = 0.37
 """Amplitude of the waves in the first shell of a honeycomb's reciprocal lattice."""
@@ -420,7 +420,7 @@ def _comb_gain(
         return -_NOTHING_LEFT
     per_frame = place.shape[0] / (start.shape[0] - 1)
     size = np.hypot(wave[0], wave[1])
-    power = np.zeros(int(max(1.0, min(HIGHEST // size, MOST_HARMONICS))))
+    power = np.zeros(int(max(1.0, min(HIGHEST // size, MAX_HARMONICS))))
     comb_power(place, start, begin, end, expected, span_start, wave[0], wave[1], power)
     gain = 0.0
     for h in range(len(power)):

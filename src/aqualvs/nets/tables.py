@@ -26,7 +26,7 @@ from aqualvs.optics.rig import Rig
 from aqualvs.text import clock, hole_count
 
 # A stretch in which the vehicle moved less than this share of what the picture shows is no band.
-_LEAST_MOVE = 0.15
+_MIN_MOVE = 0.15
 # Bands meet in one edge where the cosine of the turn between them is above this.
 _SHARP = 0.5
 _CORNERS = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
@@ -151,7 +151,7 @@ def bands(nodes: FloatArray, half: FloatArray) -> list[FloatArray]:
     """
     moves = np.diff(nodes, axis=0)
     length = np.hypot(*moves.T)
-    still = length < _LEAST_MOVE * half.sum(axis=1)
+    still = length < _MIN_MOVE * half.sum(axis=1)
     with np.errstate(invalid="ignore", divide="ignore"):
         across = np.stack([-moves[:, 1], moves[:, 0]], axis=-1) / length[:, None]
     # From the middle to the left edge: half of what the picture measures square to the way.
@@ -349,10 +349,10 @@ def _corners(places: FloatArray) -> list[list[float]]:
     return [[round(float(x), 4) + 0.0, round(float(y), 4) + 0.0] for x, y in places]
 
 
-_MOST_LISTED = 20
+_MAX_LISTED = 20
 
 
-def net_facts(wall: UnrolledNet, area: float, n_frames: int, n_net_frames: int) -> dict[str, Any]:
+def net_dict(wall: UnrolledNet, area: float, n_frames: int, n_net_frames: int) -> dict[str, Any]:
     """Return the numbers that sum a dive up; None where not measured.
 
     Parameters
@@ -391,12 +391,12 @@ def net_lines(wall: UnrolledNet, area: float, n_frames: int) -> list[str]:
     """Return the summary in words, line by line."""
     if not wall.stretches:
         return [f"no net was seen in {n_frames} frames"]
-    facts = net_facts(wall, area, n_frames, n_frames)
+    facts = net_dict(wall, area, n_frames, n_frames)
     lines = [_mesh_line(facts), *_fouling_lines(wall, facts), *_hole_lines(wall, facts)]
-    return lines if not wall.places.slip else [*lines, f"warning: {slip_words(wall.places.slip)}"]
+    return lines if not wall.places.slip else [*lines, f"warning: {slip_text(wall.places.slip)}"]
 
 
-def slip_words(slip: float) -> str:
+def slip_text(slip: float) -> str:
     """Return what it means that track and log disagree about the height."""
     return (
         f"the track and the log's depth part by {slip:.1f} m: meshes were counted wrongly, so "
@@ -404,7 +404,7 @@ def slip_words(slip: float) -> str:
     )
 
 
-def place_words(place: NetPlace) -> str:
+def place_text(place: NetPlace) -> str:
     """Return where something is."""
     words = [] if place.placed_by == "nothing" else [f"{place.along:.2f} m along"]
     words.append(
@@ -415,7 +415,7 @@ def place_words(place: NetPlace) -> str:
     return ", ".join(words)
 
 
-def size_words(hole: Hole) -> str:
+def size_text(hole: Hole) -> str:
     """Return how large a hole is."""
     width, height = (1e3 * side for side in hole.extent)
     return f"{1e3 * hole.diameter:.0f} mm ({width:.0f} x {height:.0f} mm)"
@@ -437,7 +437,7 @@ def _fouling_lines(wall: UnrolledNet, facts: dict[str, Any]) -> list[str]:
     worst = int(np.argmax([-np.inf if value is None else value for value in fouling]))
     return [
         f"solidity {facts['solidity']:.2f}, of bare twine {clean:.2f}: "
-        f"fouling {facts['fouling']:+.2f}; most at {place_words(wall.places.middle[worst])}: "
+        f"fouling {facts['fouling']:+.2f}; most at {place_text(wall.places.middle[worst])}: "
         f"{fouling[worst]:+.2f}"
     ]
 
@@ -447,14 +447,14 @@ def _hole_lines(wall: UnrolledNet, facts: dict[str, Any]) -> list[str]:
     seen = (
         f"looked at {facts['area_m2']:.2f} m² of net over {facts['way_m']:.1f} m: {hole_count(n)}"
     )
-    order = np.argsort([-hole.diameter for hole in wall.holes], kind="stable")[:_MOST_LISTED]
+    order = np.argsort([-hole.diameter for hole in wall.holes], kind="stable")[:_MAX_LISTED]
     lines = [
-        f"  {size_words(hole)}, {hole.missing_meshes:.0f} meshes: {place_words(place)}, "
+        f"  {size_text(hole)}, {hole.missing_meshes:.0f} meshes: {place_text(place)}, "
         f"at {clock(hole.time_s)} (frame {hole.frame})"
         for hole, place in ((wall.holes[i], wall.places.holes[i]) for i in sorted(order))
     ]
-    if n > _MOST_LISTED:
-        lines.append(f"  and {n - _MOST_LISTED} smaller ones, see holes.csv")
+    if n > _MAX_LISTED:
+        lines.append(f"  and {n - _MAX_LISTED} smaller ones, see holes.csv")
     return [seen, *lines]
 
 

@@ -82,7 +82,7 @@ class NetRequest:
         twine = None if self.twine_mm is None else 1e-3 * self.twine_mm
         return NetConditionOptions(stretch=self.stretch_m, twine=twine)
 
-    def facts(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """Return the options for the files that are written."""
         return {"twine_mm": self.twine_mm, "stretch_m": self.stretch_m}
 
@@ -177,7 +177,7 @@ class TargetFacts:
     net: NetFacts | None = None
 
 
-def target_facts(text: str) -> TargetFacts:
+def target_dict(text: str) -> TargetFacts:
     """Return what a word (auto, net, solid) or the path of a target file says.
 
     Raises
@@ -302,7 +302,7 @@ class NetCheck:
             f"{self.source} says {1e3 * self.said.bar:g} mm; postures do not depend on it"
         )
 
-    def facts(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """Return the result for `run.yaml`."""
         bar = self.bar()
         found: dict[str, Any] = {"bar_said_mm": round(1e3 * self.said.bar, 2)}
@@ -319,15 +319,15 @@ def net_check(target: str, rig: Rig) -> NetCheck | None:
     Parameters
     ----------
     target : str
-        A word or the path of a target file, as `target_facts` takes it.
+        A word or the path of a target file, as `target_dict` takes it.
     rig : Rig
 
     Raises
     ------
     OptionError
-        As `target_facts`.
+        As `target_dict`.
     """
-    said = target_facts(target).net
+    said = target_dict(target).net
     if said is None:
         return None
     camera = rig.camera()

@@ -27,11 +27,11 @@ from aqualvs.optics.sheet import packed_sheets, sheet_distance, sheet_tangent, s
 # Nodes of the lattice: bilinear interpolation of r^6 over it is good to 2 % in the corners.
 _LATTICE = (33, 25)
 # Segments of stripe that represent all of it: in total, and per laser at least.
-_BINS, _LEAST_BINS = 24, 3
+_BINS, _MIN_BINS = 24, 3
 # Least number of points that are summed, where there are as many.
 _ENOUGH = 384
 # A pivot below this share of its diagonal is rounding, not information.
-_LEAST_PIVOT = 1e-12
+_MIN_PIVOT = 1e-12
 # Central differences: this share of a sigma, and no more than this in any unit.
 _STEP_SHARE, _LARGEST_STEP = 0.1, 1e-4
 
@@ -201,7 +201,7 @@ class PostureErrors:
                 points,
                 weights,
                 self._n_lasers,
-                each or max(_LEAST_BINS, -(-_BINS // max(self._n_lasers, 1))),
+                each or max(_MIN_BINS, -(-_BINS // max(self._n_lasers, 1))),
                 *self._lattice,
                 moves.sheets,
                 moves.first,
@@ -391,7 +391,7 @@ def _propagate(
     n, n_terms = jacobian.shape[1], terms.shape[1]
     factor, gain, slopes = np.empty((n_terms, n_terms)), posture.copy(), np.empty(n)
     scratch = np.empty(15)
-    if not factorise(sums.matrix, 0.0, _LEAST_PIVOT, factor):
+    if not factorise(sums.matrix, 0.0, _MIN_PIVOT, factor):
         jacobian[:] = np.nan
         covariance[:] = np.nan
         return

@@ -99,9 +99,9 @@ _ROTATION_DECIMALS = 12
 _UNIT = 1e-14
 # A source measured with a ruler lies at most this far off its laser's plane, in metres.
 _OFF_SHEET = 5e-3
-_LEAST_BEHIND = 1e-4
+_MIN_BEHIND = 1e-4
 # Cosine between the normals of sheet and window; nearer ones mean that no light could cross.
-_MOST_ACROSS = math.cos(math.radians(30.0))
+_MAX_ACROSS = math.cos(math.radians(30.0))
 
 
 def load_rig(path: str | Path, *, need_lasers: bool = True) -> Rig:
@@ -338,7 +338,7 @@ def _check_window(place: str, source_mm: list[float], sheet: Plane, window: Wind
             "light comes from a point in it: correct source_mm, or the laser's normal and offset_mm"
         )
     across = abs(float(sheet.normal @ window.face.normal))
-    if across > _MOST_ACROSS:
+    if across > _MAX_ACROSS:
         raise RigError(
             f"{place}.normal is {math.degrees(math.acos(min(across, 1.0))):.0f} degrees from the "
             "laser's normal, so its light would run along the glass; give the normal of the "
@@ -348,7 +348,7 @@ def _check_window(place: str, source_mm: list[float], sheet: Plane, window: Wind
     ahead = np.array([0.0, 1.0, 0.0]) - sheet.normal[1] * sheet.normal
     behind = -float(window.face.signed_distance(source))
     # Light that goes forward must meet the face after leaving the source.
-    if abs(behind) < _LEAST_BEHIND or behind * float(window.face.normal @ ahead) < 0.0:
+    if abs(behind) < _MIN_BEHIND or behind * float(window.face.normal @ ahead) < 0.0:
         raise RigError(
             f"{place}.source_mm is {source_mm}, which is not behind the window as a target ahead "
             "sees it; correct source_mm, or the window's offset_mm, which is that of its outer face"

@@ -404,7 +404,7 @@ string detail
 aqualvs_msgs/Returns[] returns
 """
 
-_RETURNS = """\
+_PEAKS = """\
 # Axis that the search lines run along: y (columns) or x (rows).
 string axis
 uint32[] line
@@ -494,7 +494,7 @@ STRIPES = RecordedTopic(
     2,
     "/aqualvs/stripes",
     "aqualvs_msgs/msg/Stripes",
-    _definition(_STRIPES, _HEADER, _TIME, ("aqualvs_msgs/Returns", _RETURNS)),
+    _definition(_STRIPES, _HEADER, _TIME, ("aqualvs_msgs/Returns", _PEAKS)),
 )
 POINTS = RecordedTopic(
     3,

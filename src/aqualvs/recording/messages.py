@@ -38,7 +38,7 @@ from aqualvs.scanner import ScannerOptions
 from aqualvs.scanning.laser_bands import SearchAxis
 from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.scan import Frame, ScanPoints
-from aqualvs.scanning.stripe import Returns
+from aqualvs.scanning.stripe import StripePeaks
 from aqualvs.sources.base import Health, PartHealth, State
 
 FRAME_ID = "dome"
@@ -74,14 +74,14 @@ def posture_message(sample: LiveSample, stamp_ns: int) -> bytes:
 def stripes_message(sample: LiveSample, stamp_ns: int) -> bytes:
     """Return the detected stripes, bit for bit, or the reason of a refusal."""
     scan, to = sample.scan, CdrWriter()
-    refusal = scan.posture if not sample.returns and not scan.posture else None
+    refusal = scan.posture if not sample.peaks and not scan.posture else None
     to.header(stamp_ns, FRAME_ID)
     to.numbers("q", scan.index)
     to.numbers("d", scan.time_s, scan.n_water)
     to.text("" if refusal is None else refusal.reason.value)
     to.text("" if refusal is None else refusal.detail)
-    to.numbers("I", len(sample.returns))
-    for axis, found in sample.returns.items():
+    to.numbers("I", len(sample.peaks))
+    for axis, found in sample.peaks.items():
         to.text(axis.value)
         to.array(found.line.astype(np.uint32))
         for column in (found.position, found.height, found.width, found.likelihood):
@@ -91,7 +91,7 @@ def stripes_message(sample: LiveSample, stamp_ns: int) -> bytes:
 
 def stripes_of(
     message: bytes,
-) -> tuple[int, float, float, dict[SearchAxis, Returns], Refusal | None]:
+) -> tuple[int, float, float, dict[SearchAxis, StripePeaks], Refusal | None]:
     """Return frame, time, index of the water, stripes and refusal of a message.
 
     Raises
@@ -104,15 +104,15 @@ def stripes_of(
     index = of.number("q")
     time_s, n_water = of.numbers("d", 2)
     reason, detail = of.text(), of.text()
-    returns = {}
+    peaks = {}
     for _ in range(of.number("I")):
         axis = SearchAxis(of.text())
         line = of.array("u4").astype(np.int64)
         position, height, width, likelihood = (of.array("f8") for _ in range(4))
         # Recordings of 0.1.0 hold levels here, of peaks that passed a colour gate; NaN if grey.
         likelihood = np.where(np.isnan(likelihood), 1.0, np.minimum(likelihood, 1.0))
-        returns[axis] = Returns(line, position, height, width, likelihood)
-    return index, time_s, n_water, returns, Refusal(Reason(reason), detail) if reason else None
+        peaks[axis] = StripePeaks(line, position, height, width, likelihood)
+    return index, time_s, n_water, peaks, Refusal(Reason(reason), detail) if reason else None
 
 
 def points_message(points: ScanPoints, stamp_ns: int) -> bytes:

@@ -151,7 +151,7 @@ def recording_file(path: Path, open_file: Callable[[Path], BinaryIO] | None = No
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 # Period of retries on a full disk, and of checks for a chunk that is due.
 _RETRY_S, _LOOK_S = 2.0, 0.25
-_PATIENCE_S = 4.0
+_TIMEOUT_S = 4.0
 
 
 class Recorder:
@@ -234,7 +234,7 @@ class Recorder:
                 self._hand_over()
                 self._closing = True
                 self._changed.notify()
-        self._thread.join(_PATIENCE_S)
+        self._thread.join(_TIMEOUT_S)
 
     def _hand_over(self) -> None:
         """Leave the present chunk to the thread, or drop it where too much waits already."""

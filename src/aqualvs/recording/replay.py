@@ -20,7 +20,7 @@ from aqualvs.scanner import ScannerOptions
 from aqualvs.scanning.laser_bands import SearchAxis
 from aqualvs.scanning.posture import Refusal
 from aqualvs.scanning.scan import Frame
-from aqualvs.scanning.stripe import Returns
+from aqualvs.scanning.stripe import StripePeaks
 from aqualvs.sources.mcap_file import McapFile, StoredMessage
 
 
@@ -34,7 +34,7 @@ class RecordedFrame:
         As in the `Frame`.
     n_water : float
         Index that it was measured with.
-    returns : dict
+    peaks : dict
         Stripes as detected.
     refusal : Refusal or None
         Why it was not measured at all.
@@ -45,7 +45,7 @@ class RecordedFrame:
     index: int
     time_s: float
     n_water: float
-    returns: dict[SearchAxis, Returns]
+    peaks: dict[SearchAxis, StripePeaks]
     refusal: Refusal | None
     picture: Frame | None
 
@@ -149,14 +149,14 @@ class DiveRecording:
     def _frame(self, parts: dict[str, StoredMessage]) -> RecordedFrame:
         stripes = parts[STRIPES.name]
         try:
-            index, time_s, n_water, returns, refusal = stripes_of(stripes.data)
+            index, time_s, n_water, peaks, refusal = stripes_of(stripes.data)
             picture = _picture(index, time_s, parts)
         except (ValueError, AqualvsError) as fault:
             raise SourceError(
                 f"{self.path}: a message cannot be understood ({fault}); "
                 "was it written by a later version?"
             ) from fault
-        return RecordedFrame(index, time_s, n_water, returns, refusal, picture)
+        return RecordedFrame(index, time_s, n_water, peaks, refusal, picture)
 
     def _mean_rate(self) -> float | None:
         """Return frames per second over the first few of them."""

@@ -6,7 +6,7 @@ from aqualvs.control.time_filter import FilteredPosture
 from aqualvs.optics.rig import Rig
 from aqualvs.scanning.laser_bands import SearchAxis
 from aqualvs.scanning.scan import Frame, Scan
-from aqualvs.scanning.stripe import Returns
+from aqualvs.scanning.stripe import StripePeaks
 from aqualvs.sources.base import Health
 
 
@@ -40,7 +40,7 @@ class LiveSample:
     scan : Scan
         Raw posture or refusal, and the points. Where the stream is silent there is no frame: the
         scan then has the refusal `no_frames` and the number and time of the last frame.
-    returns : dict
+    peaks : dict
         Stripes by search direction, as detected; empty where there is no frame.
     frame : Frame or None
         The picture.
@@ -55,7 +55,7 @@ class LiveSample:
 
     rig: Rig
     scan: Scan
-    returns: dict[SearchAxis, Returns]
+    peaks: dict[SearchAxis, StripePeaks]
     frame: Frame | None
     utc_ns: int
     instants: Instants

@@ -23,7 +23,7 @@ from aqualvs.scanning.scan import ImagePlane
 # Greatest width and JPEG quality, tried in this order until a picture fits its share of the page.
 _SIZES = ((960, 80), (800, 75), (640, 72), (480, 65), (360, 55), (240, 45))
 _ALL_BYTES = 340_000
-_MOST_BYTES = 130_000
+_MAX_BYTES = 130_000
 _ALL_MARKS = 6000
 _UNDER = "#10181c"
 # Size of a mark and widths of its line and of the dark edge under it, for a picture 640 wide.
@@ -47,7 +47,7 @@ def picture_view(shots: Sequence[PictureShot]) -> Raw:
 
 
 def _figure(shot: PictureShot, index: int, count: int) -> str:
-    jpeg, width, height = _embedded(shot.image, min(_MOST_BYTES, _ALL_BYTES // count))
+    jpeg, width, height = _embedded(shot.image, min(_MAX_BYTES, _ALL_BYTES // count))
     scale = width / shot.image.shape[1]
     body = [f'<image href="data:image/jpeg;base64,{jpeg}" width="{width}" height="{height}"/>']
     limit = _ALL_MARKS // count // max(len(shot.points), 1)
@@ -228,7 +228,7 @@ def _vector_chart(
         "</svg>",
         *_scale_bar(scale),
     ]
-    words = _vector_words(points, len(rows), bool(cut[rows].any()))
+    words = _vector_text(points, len(rows), bool(cut[rows].any()))
     total = (width + _LEFT + _RIGHT, height + _HEAD + _FOOT)
     chart = draw.svg(*total, body, alt=f"{title}: residual vectors. {words}", kind="map")
     return chart, words, _vector_legend(bool((~points.used).any()))
@@ -270,7 +270,7 @@ def _histogram(points: _Points, title: str) -> tuple[Raw, str]:
         _bell(dense, curve, x_axis, y_axis),
         *_histogram_axis(x_axis, y_axis),
     ]
-    words = _histogram_words(values, rms)
+    words = _histogram_text(values, rms)
     alt = f"{title}: histogram of residuals. {words}"
     return draw.svg(_SIDE, _SIDE_HEIGHT, body, alt=alt, kind="histogram"), words
 
@@ -374,7 +374,7 @@ def _scale_bar(scale: _Scale) -> Iterator[str]:
     yield draw.words_at(end + 10, y + 5, words, anchor="start", kind="strong")
 
 
-def _vector_words(points: _Points, drawn: int, cut: bool) -> str:
+def _vector_text(points: _Points, drawn: int, cut: bool) -> str:
     total, used = len(points.used), points.used_residuals
     if not total:
         return "No points."
@@ -461,7 +461,7 @@ def _histogram_axis(x_axis: draw.Axis, y_axis: draw.Axis) -> Iterator[str]:
     yield draw.words_at(middle, foot + 40, "residual in x and in y, px", kind="axis")
 
 
-def _histogram_words(values: FloatArray, rms: float) -> str:
+def _histogram_text(values: FloatArray, rms: float) -> str:
     within = 100.0 * float((np.abs(values) <= rms).mean())
     beyond = int((np.abs(values) > _REACH * rms).sum())
     said = (

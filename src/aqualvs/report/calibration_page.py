@@ -88,7 +88,7 @@ def expectation_view(rows: Sequence[ExpectationRow]) -> Raw:
     """Return what the calibration lets expect on a target: a sentence and a table."""
     head = ("target at", "σ from", "range, mm", "range, %", "pitch, °", "yaw, °")
     cells = [line for row in rows for line in _expectation_lines(row)]
-    return Raw(_expectation_words(rows) + table(head, cells, texts=2))
+    return Raw(_expectation_text(rows) + table(head, cells, texts=2))
 
 
 def laser_tables(rows: Sequence[LaserRow]) -> Raw:
@@ -237,7 +237,7 @@ def _seen(row: ExpectationRow) -> tuple[float, float, float]:
     return both if all(map(math.isfinite, both)) else parts["calibration"]
 
 
-def _expectation_words(rows: Sequence[ExpectationRow]) -> str:
+def _expectation_text(rows: Sequence[ExpectationRow]) -> str:
     known = [row for row in rows if math.isfinite(_excess(row))]
     if not known:
         return '<p class="verdict bad">What to expect on a target is not known.</p>'

@@ -22,7 +22,7 @@ from aqualvs.report.points import (
 )
 from aqualvs.report.run_data import LaserFacts, Track
 from aqualvs.scanning.scan import Label
-from aqualvs.text import LABEL_COLOURS, LABEL_WORDS, clock, laser_colour, reason_words, signed
+from aqualvs.text import LABEL_COLOURS, LABEL_WORDS, clock, laser_colour, reason_text, signed
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,21 +121,21 @@ def merged(found: list[Stretch], track: Track, columns: int) -> list[Stretch]:
     return joined
 
 
-def stretch_words(stretch: Stretch, track: Track) -> str:
+def stretch_text(stretch: Stretch, track: Track) -> str:
     """Return why a stretch has no posture, the commonest reason first."""
     rows = slice(stretch.first, stretch.last + 1)
     bad = track.reason[rows][~track.valid[rows]]
     counted = Counter(bad.tolist()).most_common(3)
     if len(counted) == 1:
-        return reason_words(track.reasons[counted[0][0]])
-    return ", ".join(f"{reason_words(track.reasons[code])} ({count})" for code, count in counted)
+        return reason_text(track.reasons[counted[0][0]])
+    return ", ".join(f"{reason_text(track.reasons[code])} ({count})" for code, count in counted)
 
 
 def reason_counts(track: Track) -> list[tuple[str, int]]:
     """Return the reasons of all refusals in words with their numbers of frames, commonest first."""
     counted: Counter[str] = Counter()
     for code, count in sorted(Counter(track.reason[~track.valid].tolist()).items()):
-        counted[reason_words(track.reasons[code])] += count
+        counted[reason_text(track.reasons[code])] += count
     return counted.most_common()
 
 
@@ -269,10 +269,10 @@ def time_unit(track: Track) -> tuple[float, str]:
     return (1.0, "s") if track.time_s[-1] < 300.0 else (1.0 / 60.0, "min")
 
 
-def posture_words(track: Track, row: int) -> str:
+def posture_text(track: Track, row: int) -> str:
     """Return the posture of a frame with its total sigma, or the refusal, in words."""
     if not track.valid[row]:
-        return f"no posture: {reason_words(track.reasons[track.reason[row]])}"
+        return f"no posture: {reason_text(track.reasons[track.reason[row]])}"
     (r, p, y), (sr, sp, sy) = track.posture[row], track.sigma_total[row]
     return signed(
         f"range {1e3 * r:.1f}{_plus_minus(1e3 * sr, 1)} mm, "
@@ -342,7 +342,7 @@ def _stretch(stretch: Any, track: Track, scale: float) -> Json:
         "from": round(start * scale, 4),
         "to": round(end * scale, 4),
         "hover": rounded([t * scale for t in hover_places(start, end, whole)], 4),
-        "words": f"{stretch_words(stretch, track)} – {count} from {clock(start)}",
+        "words": f"{stretch_text(stretch, track)} – {count} from {clock(start)}",
     }
 
 
@@ -354,7 +354,7 @@ def _plane_frame(points: PointSummary, track: Track, row: int, lasers: list[Lase
         _in_plane(mine, index, laser) | _target_line(laser, normal[0], float(distance[0]))
         for index, laser in enumerate(lasers)
     ]
-    words = f"frame {frame}, {track.time_s[row]:.2f} s: {posture_words(track, row)}"
+    words = f"frame {frame}, {track.time_s[row]:.2f} s: {posture_text(track, row)}"
     return {"words": words, "lasers": planes}
 
 

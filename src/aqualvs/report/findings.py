@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray
-from aqualvs.report.charts import stretch_end_s, stretch_words, stretches
+from aqualvs.report.charts import stretch_end_s, stretch_text, stretches
 from aqualvs.report.frames import SampleFrame
 from aqualvs.report.html import Card
 from aqualvs.report.points import PointSummary
@@ -17,7 +17,7 @@ _LONG_GAP_S = 2.0
 _FEW_POINTS = 60
 _LOOSE = 0.02
 _WATER_STEP = 5e-4
-_MOST_GAPS = 3
+_MAX_GAPS = 3
 
 
 def headline(track: Track) -> list[Card]:
@@ -29,7 +29,7 @@ def headline(track: Track) -> list[Card]:
         _posture_card("Pitch", "°", 1, track, scale=1.0, digits=2),
         _posture_card("Yaw", "°", 2, track, scale=1.0, digits=2),
         Card("Frames with a posture", f"{100 * share:.1f} %", valid),
-        Card("Duration", clock(duration_s(track)), _rate_words(track)),
+        Card("Duration", clock(duration_s(track)), _rate_text(track)),
     ]
     water = track.n_water[np.isfinite(track.n_water)]
     if len(water):
@@ -56,8 +56,8 @@ def warnings_of(
     """Return what the reader of the report should know, most important first."""
     return [
         *_status_warnings(run, track),
-        *_summary_words(run, "laser_agreement"),
-        *_summary_words(run, "net_check"),
+        *_summary_text(run, "laser_agreement"),
+        *_summary_text(run, "net_check"),
         *_gap_warnings(track),
         *_range_warnings(track, working_range),
         *_precision_warnings(track),
@@ -104,7 +104,7 @@ def _posture_card(
     return Card(name, signed(value), signed(f"median; {note}"))
 
 
-def _rate_words(track: Track) -> str:
+def _rate_text(track: Track) -> str:
     if len(track) < 2 or not duration_s(track) > 0.0:
         return f"{len(track)} frames"
     return f"{len(track)} frames, {(len(track) - 1) / duration_s(track):.3g} per second"
@@ -122,7 +122,7 @@ def _status_warnings(run: Mapping[str, Any], track: Track) -> Iterator[str]:
         yield f"Only {100 * share:.0f} % of the frames gave a posture."
 
 
-def _summary_words(run: Mapping[str, Any], name: str) -> Iterator[str]:
+def _summary_text(run: Mapping[str, Any], name: str) -> Iterator[str]:
     """Yield what a part of the run's summary has to say, as a sentence."""
     summary = run.get("summary")
     found = summary.get(name) if isinstance(summary, dict) else None
@@ -137,11 +137,11 @@ def _gap_warnings(track: Track) -> Iterator[str]:
         (end - start, start, found) for (start, end), found in spans if end - start > _LONG_GAP_S
     ]
     long.sort(key=lambda gap: -gap[0])
-    for length, start, found in long[:_MOST_GAPS]:
-        words = stretch_words(found, track)
+    for length, start, found in long[:_MAX_GAPS]:
+        words = stretch_text(found, track)
         yield f"No posture for {clock(length)} from {_moment(start)} on: {words}."
-    if len(long) > _MOST_GAPS:
-        yield f"{len(long) - _MOST_GAPS} more gaps longer than {_LONG_GAP_S:g} s."
+    if len(long) > _MAX_GAPS:
+        yield f"{len(long) - _MAX_GAPS} more gaps longer than {_LONG_GAP_S:g} s."
 
 
 def _moment(seconds: float) -> str:

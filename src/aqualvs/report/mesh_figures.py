@@ -19,13 +19,13 @@ from pyarrow import parquet
 from aqualvs.errors import OptionError, SourceError
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.planes import Plane
-from aqualvs.nets.target_file import target_facts
+from aqualvs.nets.target_file import target_dict
 from aqualvs.optics.rigfile import rig_from_mapping
 from aqualvs.report.figure_style import new_canvas
 from aqualvs.report.run_data import LaserFacts, lasers_of, read_run_file, working_range_m
 from aqualvs.results.files import Claim, writing
 from aqualvs.results.folder import POINTS_PARQUET, check_run_files
-from aqualvs.scanning.laser_bands import plan_searches
+from aqualvs.scanning.laser_bands import plan_bands
 from aqualvs.scanning.paper.detector import PaperFilter
 from aqualvs.scanning.paper.mesh_filter import (
     MeshFilterOptions,
@@ -383,7 +383,7 @@ class _Counts(NamedTuple):
 def figures(
     folder: Path,
     out: Path,
-    tell: Callable[[str], object],
+    echo: Callable[[str], object],
     *,
     frame: int | None = None,
     laser: str | None = None,
@@ -401,7 +401,7 @@ def figures(
         Of a finished run.
     out : Path
         Folder for the pictures; made if it is not there.
-    tell : callable
+    echo : callable
         Takes lines for the user.
     frame : int, optional
         The frame; by default the one that shows most of both net and other reflections.
@@ -450,9 +450,9 @@ def figures(
     with Claim("figures", files, overwrite=overwrite), writing(out):
         written = draw_figures(reflections, options, out)
     for line in _summary(reflections):
-        tell(line)
+        echo(line)
     for path in written:
-        tell(f"figure: {path}")
+        echo(f"figure: {path}")
     return written
 
 
@@ -471,7 +471,7 @@ def _paper_options(folder: Path, run: Mapping[str, Any], target: Path | None) ->
             f"{folder}: the run used --mesh-filter paper, which drops what it rejects; run once "
             "more without it (the figures apply the filter themselves)"
         )
-    return MeshFilterOptions() if target is None else target_facts(str(target)).mesh_filter
+    return MeshFilterOptions() if target is None else target_dict(str(target)).mesh_filter
 
 
 def _count(points: Path) -> _Counts:
@@ -581,7 +581,7 @@ def _pixels(table: Any, laser: int, run: Mapping[str, Any], options: MeshFilterO
     """Return every bright pixel of a run with the threshold detector."""
     rig = rig_from_mapping(run["rig"], source_name="run.yaml")
     camera = rig.camera()
-    papers = PaperFilter(rig, camera, plan_searches(rig, camera), options, every_pixel=True)
+    papers = PaperFilter(rig, camera, plan_bands(rig, camera), options, every_pixel=True)
     centres, width = _columns(table, "u_px", "v_px"), _columns(table, "width_px")[:, 0]
     found = papers.apply(centres, width, np.full(len(width), laser))
     return _Judged(found.points_in_dome, _is_net(table["label"])[found.source], found.on_mesh)

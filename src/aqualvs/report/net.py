@@ -71,9 +71,9 @@ def net_warnings(net: NetTables | None) -> list[str]:
     if not isinstance(slip, int | float) or not slip > 0.0:
         return []
     # Imported here: it brings the evaluation of nets along, which few reports have.
-    from aqualvs.nets.tables import slip_words
+    from aqualvs.nets.tables import slip_text
 
-    words = slip_words(slip)
+    words = slip_text(slip)
     return [f"Net: {words}."]
 
 

@@ -17,7 +17,7 @@ from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.optics.rig import Rig
 from aqualvs.scanning.posture import Posture, Refusal
 from aqualvs.scanning.scan import ImagePlane, ScanPoints
-from aqualvs.text import bgr, laser_colour, reason_words
+from aqualvs.text import bgr, laser_colour, reason_text
 
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 _WHITE = (255, 255, 255)
@@ -84,7 +84,7 @@ def draw_points(
 def posture_lines(posture: Posture | Refusal) -> list[str]:
     """Return what the overlay says of a posture, line by line."""
     if isinstance(posture, Refusal):
-        lines = ["no posture", reason_words(posture.reason)]
+        lines = ["no posture", reason_text(posture.reason)]
         return [*lines, posture.detail] if posture.detail else lines
     sigma = np.sqrt(np.diag(posture.total_covariance))
     pitch, yaw = np.rad2deg([posture.pitch, posture.yaw])

@@ -18,7 +18,7 @@ from pyarrow import parquet
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import borrowing_kernel
 from aqualvs.report.run_data import Track
-from aqualvs.results.points import read_journal
+from aqualvs.results.points import read_points_stream
 from aqualvs.scanning.scan import Label
 
 
@@ -229,15 +229,15 @@ def _empty(track: Track) -> PointSummary:
 
 def _batches(run_dir: Path) -> Iterator[dict[str, NDArray[Any]]]:
     """Yield batches as arrays by column, labels as numbers."""
-    path, journal = run_dir / "points.parquet", run_dir / "points.arrows"
-    if path.exists() or not journal.exists():
+    path, points_stream = run_dir / "points.parquet", run_dir / "points.arrows"
+    if path.exists() or not points_stream.exists():
         with parquet.ParquetFile(path.absolute(), pre_buffer=False) as file:
             names = [name for name in (*_NEEDED, *_OPTIONAL) if name in file.schema_arrow.names]
             # One batch at a time, on one thread, keeps memory flat however long the dive.
             batches = file.iter_batches(batch_size=_BATCH, columns=names, use_threads=False)
             yield from map(_columns, batches)
     else:
-        yield from map(_columns, read_journal(journal))
+        yield from map(_columns, read_points_stream(points_stream))
 
 
 def _columns(batch: Any) -> dict[str, NDArray[Any]]:

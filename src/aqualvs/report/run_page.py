@@ -302,7 +302,7 @@ def _captions(m: Material) -> dict[int, tuple[str, str, bool]]:
     return {
         row: (
             f"Frame {track.frame[row]}, {clock(float(track.time_s[row]))}",
-            charts.posture_words(track, row),
+            charts.posture_text(track, row),
             bool(track.valid[row]),
         )
         for row in m.picture_rows

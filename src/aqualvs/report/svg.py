@@ -26,8 +26,8 @@ BAND = "#bcdcea"
 
 _WIDTH, _HEIGHT, _LEFT, _RIGHT, _FOOT = 900.0, 300.0, 84.0, 16.0, 54.0
 _LANE = 20.0
-_MOST_LANES = 4
-_MOST_WORDS = 12
+_MAX_LANES = 4
+_MAX_WORDS = 12
 _LONGEST = 48
 _DRAWN_PER_SERIES = 800
 # A generous width of a character of the charts' text, relative to its size of 14.
@@ -139,7 +139,7 @@ def line_chart(series: Series) -> Raw:
         return Raw('<p class="note">No value is known.</p>')
     marks = [(x, words) for x, words in series.marks if math.isfinite(x)]
     x_axis = _x_axis(series, known)
-    labels, lanes = _mark_words(marks, x_axis)
+    labels, lanes = _mark_text(marks, x_axis)
     head = 10.0 + _LANE * lanes
     y_axis = _y_axis(series, known, head)
     body = [
@@ -245,16 +245,16 @@ def _mark_lines(marks: Sequence[tuple[float, str]], x_axis: Axis, y_axis: Axis) 
     ]
 
 
-def _mark_words(marks: Sequence[tuple[float, str]], x_axis: Axis) -> tuple[list[str], int]:
+def _mark_text(marks: Sequence[tuple[float, str]], x_axis: Axis) -> tuple[list[str], int]:
     """Return the words of the first marks, in lanes in which they do not touch, and the lanes."""
     ends: list[float] = []
     parts = []
-    for at, words in _inside(marks, x_axis)[:_MOST_WORDS]:
+    for at, words in _inside(marks, x_axis)[:_MAX_WORDS]:
         short = words if len(words) <= _LONGEST else words[: _LONGEST - 1] + "…"
         width, x = _CHARACTER * len(short) + 10.0, x_axis.at(at)
         start = max(min(x - 2.0, x_axis.end - width), 0.0)
         free = [i for i, end in enumerate(ends) if end <= start]
-        if not free and len(ends) == _MOST_LANES:
+        if not free and len(ends) == _MAX_LANES:
             continue
         lane = free[0] if free else len(ends)
         ends[lane : lane + 1] = [start + width]

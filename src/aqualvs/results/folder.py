@@ -25,7 +25,7 @@ from aqualvs.closing import Closing
 from aqualvs.errors import OutputError, SourceError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.results.files import AppendFile, Claim, explain, locked_folder, writing
-from aqualvs.results.points import DRAFT, PointsExport, PointsJournal, check_idle, export_points
+from aqualvs.results.points import DRAFT, PointsExport, PointsStream, check_idle, export_points
 from aqualvs.results.run_request import RunFile, Status, now, read_run_yaml, write_yaml
 from aqualvs.results.summary import RunSummary, summary_of
 from aqualvs.scanning.posture import Posture
@@ -135,7 +135,7 @@ def _numbers(posture: Posture) -> str:
 
 POSTURE_CSV = "posture.csv"
 POSTURE_BARE_CSV = "posture_bare.csv"
-JOURNAL = "points.arrows"
+POINTS_STREAM = "points.arrows"
 POINTS_PARQUET = "points.parquet"
 POINTS_PLY = "points.ply"
 RUN_YAML = "run.yaml"
@@ -153,7 +153,7 @@ RUN_FILES = (
     RUN_YAML,
     POSTURE_CSV,
     POSTURE_BARE_CSV,
-    JOURNAL,
+    POINTS_STREAM,
     POINTS_PARQUET,
     POINTS_PLY,
     POINTS_PARQUET + DRAFT,
@@ -208,7 +208,7 @@ class RunOutputs:
         self._run_file = RunFile(folder / RUN_YAML, source, rig, options)
         with contextlib.ExitStack() as stack, writing(folder):
             # First, so that only one of two runs that begin at the same moment continues.
-            self._points = stack.enter_context(_new_journal(folder))
+            self._points = stack.enter_context(_new_points_stream(folder))
             self._run_file.write(Status.RUNNING)
             self._posture = stack.enter_context(PostureCsv(folder / POSTURE_CSV))
             self._export: PointsExport | None = PointsExport(
@@ -248,12 +248,12 @@ class RunOutputs:
         try:
             self._open_files.close()
             if self._export is None:
-                _export_journal(self.folder)
+                _export_points_stream(self.folder)
             else:
                 self._export.finish()
-            (self.folder / JOURNAL).unlink()
+            (self.folder / POINTS_STREAM).unlink()
             self._run_file.write(
-                self._final(fault), error=_words(fault), summary=self.summary.facts()
+                self._final(fault), error=_words(fault), summary=self.summary.to_dict()
             )
         except OSError as full:
             refusal = OutputError(explain(self.folder, full))
@@ -266,7 +266,7 @@ class RunOutputs:
         self._points.abandon()
         self._posture.close()
         with contextlib.suppress(OSError):
-            self._run_file.write(Status.FAILED, error=str(fault), summary=self.summary.facts())
+            self._run_file.write(Status.FAILED, error=str(fault), summary=self.summary.to_dict())
 
     def _discard_export(self) -> None:
         if self._export is not None:
@@ -303,7 +303,7 @@ def prepare_folder(folder: Path, *, overwrite: bool) -> Claim:
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
         with locked_folder(folder):
-            check_idle(folder / JOURNAL)
+            check_idle(folder / POINTS_STREAM)
             claim = claim_run(folder, RUN_FILES, overwrite=overwrite)
             for path in claim.found:
                 path.unlink()
@@ -358,18 +358,18 @@ def recover(folder: Path) -> bool:
     if not (folder / POSTURE_CSV).is_file():
         raise OutputError(f"{folder}: holds no run (no {POSTURE_CSV}); give the folder of a run")
     check_run_files(folder)
-    journal = folder / JOURNAL
-    check_idle(journal)
-    if not journal.exists():
+    points_stream = folder / POINTS_STREAM
+    check_idle(points_stream)
+    if not points_stream.exists():
         return False
     with writing(folder):
-        _export_journal(folder)
-        journal.unlink()
+        _export_points_stream(folder)
+        points_stream.unlink()
         _mend_run_file(folder)
     return True
 
 
-def _new_journal(folder: Path) -> PointsJournal:
+def _new_points_stream(folder: Path) -> PointsStream:
     """Begin the journal of a run.
 
     Raises
@@ -379,15 +379,15 @@ def _new_journal(folder: Path) -> PointsJournal:
     """
     try:
         with locked_folder(folder):
-            return PointsJournal(folder / JOURNAL, exclusive=True)
+            return PointsStream(folder / POINTS_STREAM, exclusive=True)
     except FileExistsError:
         raise OutputError(
             f"{folder}: another run has just begun here; choose another folder"
         ) from None
 
 
-def _export_journal(folder: Path) -> None:
-    export_points(folder / JOURNAL, folder / POINTS_PARQUET, folder / POINTS_PLY)
+def _export_points_stream(folder: Path) -> None:
+    export_points(folder / POINTS_STREAM, folder / POINTS_PARQUET, folder / POINTS_PLY)
 
 
 def _mend_run_file(folder: Path) -> None:
@@ -405,7 +405,7 @@ def _mend_run_file(folder: Path) -> None:
         "started": content.get("started"),
         "error": _KILLED,
         "completed": now(),
-        "summary": summary_of(folder / POSTURE_CSV).facts(),
+        "summary": summary_of(folder / POSTURE_CSV).to_dict(),
     }
     write_yaml(path, head | {key: value for key, value in content.items() if key not in known})
 

@@ -29,16 +29,16 @@ from aqualvs.optics.rig import Rig
 from aqualvs.results.files import writing
 from aqualvs.results.folder import (
     HOLES_CSV,
-    JOURNAL,
     NET_CSV,
     NET_GEOJSON,
     NET_MAP_PNG,
     NET_MAP_SVG,
     POINTS_PARQUET,
+    POINTS_STREAM,
     POSTURE_CSV,
     check_run_files,
 )
-from aqualvs.results.points import LABELS, POINTS_SCHEMA, read_journal
+from aqualvs.results.points import LABELS, POINTS_SCHEMA, read_points_stream
 from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.scan import Label, Scan, ScanPoints
 
@@ -126,7 +126,7 @@ class NetPass:
             If a file cannot be written.
         """
         from aqualvs.nets.places import DivePostures, lay_log, place_net
-        from aqualvs.nets.tables import net_facts, net_lines, unroll
+        from aqualvs.nets.tables import net_dict, net_lines, unroll
 
         self._condition.finish()
         stretches, holes = self._condition.stretches, self._condition.holes
@@ -137,11 +137,11 @@ class NetPass:
         places = place_net(stretches, holes, postures, log.places if log else None)
         wall = unroll(stretches, holes, places, self._rig)
         area = self._condition.area
-        summary = net_facts(wall, area, self._n_frames, len(postures.time_s))
+        summary = net_dict(wall, area, self._n_frames, len(postures.time_s))
         facts = {
             "version": __version__,
-            "options": self._request.facts(),
-            "log": None if log is None else log.facts(),
+            "options": self._request.to_dict(),
+            "log": None if log is None else log.to_dict(),
             "summary": summary,
         }
         with writing(folder):
@@ -340,9 +340,9 @@ def _pieces(run_folder: Path) -> Iterator[tuple[int, Columns]]:
 
 
 def _batches(run_folder: Path) -> Iterator[Columns]:
-    path, journal = run_folder / POINTS_PARQUET, run_folder / JOURNAL
-    if not path.exists() and journal.exists():
-        path = journal
+    path, points_stream = run_folder / POINTS_PARQUET, run_folder / POINTS_STREAM
+    if not path.exists() and points_stream.exists():
+        path = points_stream
     try:
         for batch in _arrow_batches(path):
             missing = [name for name in POINTS_SCHEMA.names if name not in batch.schema.names]
@@ -362,8 +362,8 @@ def _batches(run_folder: Path) -> Iterator[Columns]:
 
 
 def _arrow_batches(path: Path) -> Iterator[Any]:
-    if path.name == JOURNAL:
-        yield from read_journal(path)
+    if path.name == POINTS_STREAM:
+        yield from read_points_stream(path)
         return
     with parquet.ParquetFile(path.absolute(), pre_buffer=False) as file:
         # One batch at a time, on one thread, keeps memory flat however long the dive; the empty

@@ -48,7 +48,7 @@ half of that.
 _LABEL_NAMES = pa.array(LABELS, pa.string())
 
 
-class PointsJournal:
+class PointsStream:
     """Writer of `points.arrows`, a few frames at a time as `AppendFile` does it.
 
     Parameters
@@ -153,7 +153,7 @@ def points_batch(*scans: Scan) -> Any:
     return pa.RecordBatch.from_arrays(arrays, schema=POINTS_SCHEMA)
 
 
-def read_journal(path: Path) -> Iterator[Any]:
+def read_points_stream(path: Path) -> Iterator[Any]:
     """Yield the whole record batches of a journal, up to where it was cut off."""
     with pa.OSFile(str(path), "rb") as file:
         try:
@@ -289,12 +289,12 @@ class PointsExport:
         self._n_vertices += len(vertices)
 
 
-def export_points(journal: Path, points_parquet: Path, points_ply: Path) -> int:
+def export_points(points_stream: Path, points_parquet: Path, points_ply: Path) -> int:
     """Write the points of a journal as `PointsExport` does it.
 
     Parameters
     ----------
-    journal : Path
+    points_stream : Path
         May lack its end; what follows the last whole batch is left out.
     points_parquet, points_ply : Path
 
@@ -308,7 +308,7 @@ def export_points(journal: Path, points_parquet: Path, points_ply: Path) -> int:
     OSError
         As the system says it, a full disk for example; the journal is left as it is.
     """
-    return export_batches(read_journal(journal), points_parquet, points_ply)
+    return export_batches(read_points_stream(points_stream), points_parquet, points_ply)
 
 
 def export_batches(batches: Iterator[Any], points_parquet: Path, points_ply: Path) -> int:

@@ -18,7 +18,7 @@ import yaml
 
 from aqualvs import __version__
 from aqualvs.errors import OptionError, SourceError
-from aqualvs.nets.target_file import NetRequest, target_facts
+from aqualvs.nets.target_file import NetRequest, target_dict
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.rigfile import load_rig
 from aqualvs.optics.water import seawater_index_vacuum
@@ -263,14 +263,14 @@ class RunRequest:
     target: str = "auto"
     n_processes: int = 1
 
-    def facts(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """Return the options as `run.yaml` holds them."""
         rig_file = None if self.rig is None else str(self.rig)
         found: dict[str, Any] = {"rig_file": rig_file, "no_dome": self.no_dome}
         found |= asdict(self.water)
         found |= {"first_frame": self.frames.first, "stop_frame": self.frames.stop}
         found["index_target"] = None if self.index_target is None else str(self.index_target)
-        return found | {"scanner": scanner_facts(self.scanner)}
+        return found | {"scanner": scanner_dict(self.scanner)}
 
 
 def scanner_options(target: str, detector: str, mesh_filter: str, fit: str) -> ScannerOptions:
@@ -284,7 +284,7 @@ def scanner_options(target: str, detector: str, mesh_filter: str, fit: str) -> S
     mesh_filter : {"none", "paper"}
     fit : {"robust", "pseudo_inverse"}
     """
-    facts = target_facts(target)
+    facts = target_dict(target)
     return ScannerOptions(
         target=facts.kind,
         detector=DETECTORS[detector](),
@@ -293,7 +293,7 @@ def scanner_options(target: str, detector: str, mesh_filter: str, fit: str) -> S
     )
 
 
-def scanner_facts(options: ScannerOptions) -> dict[str, Any]:
+def scanner_dict(options: ScannerOptions) -> dict[str, Any]:
     """Return the scanner's options as `run.yaml` holds them."""
     found: dict[str, Any] = asdict(options)
     found["detector"] = {"kind": detector_word(options.detector), **found["detector"]}
@@ -345,7 +345,7 @@ def check_fits(source: FrameSource, rig: Rig) -> None:
         )
 
 
-def source_facts(source: FrameSource) -> dict[str, Any]:
+def source_dict(source: FrameSource) -> dict[str, Any]:
     """Return data that identify a source without reading all of it."""
     found: dict[str, Any] = {"name": source.name}
     path = Path(source.name)

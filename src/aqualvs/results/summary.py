@@ -268,7 +268,7 @@ class RunSummary:
     def _known_ranges(self) -> list[float]:
         return [one for one in self.ranges if not math.isnan(one)]
 
-    def facts(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """Return the summary for `run.yaml`; ranges are absent where no frame is valid."""
         found: dict[str, Any] = {"n_frames": self.n_frames, "n_valid": self.n_valid}
         if self.n_frames:
@@ -280,9 +280,9 @@ class RunSummary:
         if self.refused:
             found["refused"] = dict(self.refused.most_common())
         if self.agreement is not None:
-            found["laser_agreement"] = self.agreement.verdict().facts()
+            found["laser_agreement"] = self.agreement.verdict().to_dict()
         if self.net_check is not None:
-            found["net_check"] = self.net_check.facts()
+            found["net_check"] = self.net_check.to_dict()
         return found
 
     def lines(self) -> list[str]:

@@ -30,7 +30,7 @@ from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import LASER_PARAMETERS, Rig
 from aqualvs.optics.sheet import Sheet, sheets_of
 from aqualvs.optics.solved import rig_uncertainty
-from aqualvs.scanning.laser_bands import SearchAxis, plan_searches
+from aqualvs.scanning.laser_bands import SearchAxis, plan_bands
 from aqualvs.scanning.scan import Scan, ScanPoints
 
 N_BINS = 12
@@ -139,11 +139,11 @@ def _middle(
     near = 0
     for i in rows:
         if abs(off[i] - median) < near_by:
-            light = intensity[i] * width[i]
+            brightness = intensity[i] * width[i]
             near += 1
-            total += light
-            x += light * pixels[i, 0]
-            y += light * pixels[i, 1]
+            total += brightness
+            x += brightness * pixels[i, 0]
+            y += brightness * pixels[i, 1]
     if near >= _MIN_POINTS and near >= _MIN_SHARE * rows.shape[0]:
         out[0], out[1] = x / total, y / total
 
@@ -502,7 +502,7 @@ class AgreementVerdict:
     sigma_angle: float = math.nan
     effect: float = math.nan
 
-    def facts(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """Return the verdict as written to `run.yaml`."""
         found: dict[str, Any] = {"state": self.state.value, "n_frames": self.n_frames}
         if self.suspects:
@@ -542,7 +542,7 @@ class LaserAgreement:
         self._rig = rig
         self._camera = rig.camera()
         self._known = rig_uncertainty(rig)
-        axes = [search.axis for search in plan_searches(rig, self._camera)]
+        axes = [search.axis for search in plan_bands(rig, self._camera)]
         self._along_x = np.array([axis is SearchAxis.ALONG_X for axis in axes], np.int64)
         self._middles: dict[int, FloatArray] = {}
         self._every = _EVERY

@@ -29,20 +29,20 @@ from aqualvs.scanning.assignment_kernels import (
     CELL_LINES,
     DARK,
     FREEDOM,
-    LIGHT,
+    INTENSITY_WEIGHT,
     N_FACTS,
     PER_LASER,
     SAME_ANGLE,
     SAME_RANGE,
     VARIANCE,
+    exclusive_share,
     find_rivals,
     judge_planes,
-    light_left,
     seen_of,
 )
-from aqualvs.scanning.candidates import Chunks, Readings
-from aqualvs.scanning.laser_bands import SearchAxis, StripeSearch
-from aqualvs.scanning.net_surfaces import doubted, seen_through
+from aqualvs.scanning.candidates import Candidates, Subsegments
+from aqualvs.scanning.laser_bands import LaserBand, SearchAxis
+from aqualvs.scanning.net_surfaces import inflate_covariance, seen_through
 from aqualvs.scanning.plane_search import WEIGHT, X, Z
 from aqualvs.scanning.posture import Refusal, range_pitch_yaw
 from aqualvs.scanning.posture_estimator import Measurement
@@ -54,7 +54,7 @@ from aqualvs.scanning.triangulate import Triangulator
 _DARK_LASER, _FOREIGN_STRIPE, _DECIDED = 2.6, 3.0, 3.0
 # Residuals of half stripes count as at most this many independent ones, because errors of the rig
 # are not noise. Then the limit of the evidence from residuals.
-_MOST_FREEDOM, _MOST_BY_RESIDUALS = 10.0, 12.0
+_MAX_FREEDOM, _MAX_BY_RESIDUALS = 10.0, 12.0
 # Hypotheses nearer to each other than this are covered by a larger sigma instead of a refusal.
 _NEAR_RANGE, _NEAR_ANGLE = 0.02, math.radians(2.0)
 # Number of rivals that are refined.
@@ -66,7 +66,7 @@ _N_SAMPLES = 16
 # caustics and fish are not. This share of the lasers may be faint. Found on rendered dives: planes
 # through caustics have up to 0.14 of the light, most below 0.1; nets come down to 0.15, folded ones
 # to 0.14.
-_LITTLE_LIGHT, _SHORT_WAY, _MAY_BE_FAINT = 0.12, 0.15, 0.25
+_SMALL_SHARE, _SHORT_WAY, _MAY_BE_FAINT = 0.12, 0.15, 0.25
 
 
 class Verdict(Enum):
@@ -82,7 +82,7 @@ class Verdict(Enum):
     """Another plane is as good, and far off."""
 
 
-class Outcome(NamedTuple):
+class AssignmentOutcome(NamedTuple):
     """The verdict, the other plane where there is one, and the log-odds of the better one."""
 
     verdict: Verdict
@@ -90,7 +90,7 @@ class Outcome(NamedTuple):
     log_odds: float = math.inf
 
 
-UNTESTED = Outcome(Verdict.CLEAR)
+NOT_TESTED = AssignmentOutcome(Verdict.CLEAR)
 """The outcome if there is nothing to test, or no evidence against the surface."""
 
 
@@ -99,7 +99,7 @@ class AssignmentTest:
 
     Parameters
     ----------
-    searches : sequence of StripeSearch
+    laser_bands : sequence of LaserBand
         One for each laser.
     triangulator : Triangulator
         Of the same rig.
@@ -109,19 +109,19 @@ class AssignmentTest:
 
     def __init__(
         self,
-        searches: Sequence[StripeSearch],
+        laser_bands: Sequence[LaserBand],
         triangulator: Triangulator,
         searched: tuple[float, float],
     ) -> None:
         self._searched = searched
-        self._along_x = np.array([one.axis is SearchAxis.ALONG_X for one in searches], np.bool_)
-        self._bands = _sample_bands(searches, triangulator)
+        self._along_x = np.array([one.axis is SearchAxis.ALONG_X for one in laser_bands], np.bool_)
+        self._bands = _sample_bands(laser_bands, triangulator)
 
-    def by_chance(
+    def is_by_chance(
         self,
-        readings: Readings,
-        chunks: Chunks,
-        chunk_index: IntArray,
+        candidates: Candidates,
+        subsegments: Subsegments,
+        subsegment_index: IntArray,
         surfaces: Sequence[Surface],
         target: Surface,
     ) -> bool:
@@ -129,21 +129,21 @@ class AssignmentTest:
 
         Parameters
         ----------
-        readings, chunks, chunk_index
+        candidates, subsegments, subsegment_index
             As in `test`.
         surfaces : sequence of Surface
             All that were found: light on the others does not speak against this one.
         target : Surface
             The one to judge.
         """
-        small, faint = self._evidence(readings, chunks, chunk_index, surfaces, target)
+        small, faint = self._evidence(candidates, subsegments, subsegment_index, surfaces, target)
         return small and faint > _MAY_BE_FAINT
 
     def overlooked(
         self,
-        readings: Readings,
-        chunks: Chunks,
-        chunk_index: IntArray,
+        candidates: Candidates,
+        subsegments: Subsegments,
+        subsegment_index: IntArray,
         surfaces: Sequence[Surface],
         target: Surface,
     ) -> Surface | None:
@@ -155,8 +155,8 @@ class AssignmentTest:
 
         Parameters
         ----------
-        readings, chunks, chunk_index, surfaces
-            As in `by_chance`.
+        candidates, subsegments, subsegment_index, surfaces
+            As in `is_by_chance`.
         target : Surface
             The one that was chosen.
 
@@ -170,53 +170,53 @@ class AssignmentTest:
             return None
         for one in surfaces:
             # Only broken stripes have an extent.
-            if one is target or one.extent <= 0.0 or not _is_nearer(one, target, chunks):
+            if one is target or one.extent <= 0.0 or not _is_nearer(one, target, subsegments):
                 continue
-            small, faint = self._evidence(readings, chunks, chunk_index, surfaces, one)
+            small, faint = self._evidence(candidates, subsegments, subsegment_index, surfaces, one)
             if small or faint > _MAY_BE_FAINT:
                 continue
-            is_net = one.is_mesh or seen_through(one.members, target.members, chunks)
+            is_net = one.is_mesh or seen_through(one.members, target.members, subsegments)
             return replace(one, is_mesh=is_net)
         return None
 
     def _evidence(
         self,
-        readings: Readings,
-        chunks: Chunks,
-        chunk_index: IntArray,
+        candidates: Candidates,
+        subsegments: Subsegments,
+        subsegment_index: IntArray,
         surfaces: Sequence[Surface],
         surface: Surface,
     ) -> tuple[bool, float]:
         """Return whether a surface is small, and the share of the lasers that are faint on it."""
-        others = np.zeros(len(chunks), np.bool_)
+        others = np.zeros(len(subsegments), np.bool_)
         for one in surfaces:
             if one is not surface:
                 others |= one.members
         # A plane needs two lasers: the surplus of one is no evidence for it.
-        light = light_left(
-            readings.source,
-            readings.trust,
-            chunk_index,
+        intensity_share = exclusive_share(
+            candidates.source,
+            candidates.confidence,
+            subsegment_index,
             surface.members,
             others,
-            chunks.light,
-            surface.support,
+            subsegments.intensity_weight,
+            surface.inlier_weight,
         )
-        most, faint = self._seen_of(surface, chunks)
-        small = light < _LITTLE_LIGHT or (most < _SHORT_WAY and not surface.is_mesh)
+        most, faint = self._seen_of(surface, subsegments)
+        small = intensity_share < _SMALL_SHARE or (most < _SHORT_WAY and not surface.is_mesh)
         return small, faint
 
-    def _seen_of(self, surface: Surface, chunks: Chunks) -> tuple[float, float]:
+    def _seen_of(self, surface: Surface, subsegments: Subsegments) -> tuple[float, float]:
         """Return the share of its best stripe that a surface shows, and that of faint lasers."""
         packed = np.empty(4)
         packed[:3], packed[3] = surface.plane.normal, surface.plane.offset
         seen: tuple[float, float] = seen_of(
-            packed, surface.members, chunks.n_lines, chunks.laser, self._bands
+            packed, surface.members, subsegments.n_lines, subsegments.laser, self._bands
         )
         return seen
 
-    def outweighed(
-        self, chunks: Chunks, surfaces: Sequence[Surface], target: Surface
+    def nearer_net(
+        self, subsegments: Subsegments, surfaces: Sequence[Surface], target: Surface
     ) -> Surface | None:
         """Return a nearer net with as much light as a net that lacks a laser, if there is one.
 
@@ -226,7 +226,7 @@ class AssignmentTest:
 
         Parameters
         ----------
-        chunks : Chunks
+        subsegments : Subsegments
             C of them.
         surfaces : sequence of Surface
             All that were found.
@@ -236,59 +236,65 @@ class AssignmentTest:
         if not target.is_mesh:
             return None
         for one in surfaces:
-            rivals = one is not target and one.is_mesh and one.voice >= target.voice
-            if rivals and _is_nearer(one, target, chunks):
-                _, faint = self._seen_of(target, chunks)
+            rivals = (
+                one is not target and one.is_mesh and one.sampling_weight >= target.sampling_weight
+            )
+            if rivals and _is_nearer(one, target, subsegments):
+                _, faint = self._seen_of(target, subsegments)
                 return one if faint > _MAY_BE_FAINT else None
         return None
 
     def test(
-        self, readings: Readings, chunks: Chunks, chunk_index: IntArray, surface: Surface
-    ) -> Outcome:
+        self,
+        candidates: Candidates,
+        subsegments: Subsegments,
+        subsegment_index: IntArray,
+        surface: Surface,
+    ) -> AssignmentOutcome:
         """Test a surface.
 
         Parameters
         ----------
-        readings : Readings
+        candidates : Candidates
             N of them.
-        chunks : Chunks
+        subsegments : Subsegments
             C of them.
-        chunk_index : int array, shape (N,)
-            Row of each reading's chunk.
+        subsegment_index : int array, shape (N,)
+            Row of each candidate's subsegment.
         surface : Surface
             The one to test.
         """
         n_lasers = len(self._along_x)
         if n_lasers < 2:
-            return UNTESTED
+            return NOT_TESTED
         planes = np.empty((_N_RIVALS + 1, 4))
         facts = np.empty((_N_RIVALS + 1, N_FACTS))
         planes[0, :3], planes[0, 3] = surface.plane.normal, surface.plane.offset
         n = find_rivals(
-            readings.source,
-            readings.laser,
-            readings.trust,
-            readings.points,
-            readings.sensitivity,
-            chunk_index,
+            candidates.source,
+            candidates.laser,
+            candidates.confidence,
+            candidates.points,
+            candidates.sensitivity,
+            subsegment_index,
             surface.members,
-            chunks.table,
+            subsegments.table,
             *self._searched,
             n_lasers,
             planes,
         )
         if n == 0:
-            return UNTESTED
+            return NOT_TESTED
         judge_planes(
             planes[: n + 1],
-            chunks.table,
-            chunks.n_lines,
-            chunks.first_line,
-            chunks.last_line,
-            chunks.laser,
-            readings.source,
-            readings.trust,
-            chunk_index,
+            subsegments.table,
+            subsegments.n_lines,
+            subsegments.first_line,
+            subsegments.last_line,
+            subsegments.laser,
+            candidates.source,
+            candidates.confidence,
+            subsegment_index,
             self._along_x,
             self._bands,
             facts,
@@ -296,21 +302,23 @@ class AssignmentTest:
         return _verdict(planes[: n + 1], facts[: n + 1])
 
 
-def _is_nearer(one: Surface, target: Surface, chunks: Chunks) -> bool:
+def _is_nearer(one: Surface, target: Surface, subsegments: Subsegments) -> bool:
     """Return whether most of a surface's light lies before another surface's plane."""
-    voice, plane = chunks.table[WEIGHT], target.plane
-    near = plane.normal @ chunks.table[X : Z + 1] < plane.offset
-    return bool(voice[one.members & near].sum() > 0.5 * voice[one.members].sum())
+    sampling_weight, plane = subsegments.table[WEIGHT], target.plane
+    near = plane.normal @ subsegments.table[X : Z + 1] < plane.offset
+    return bool(
+        sampling_weight[one.members & near].sum() > 0.5 * sampling_weight[one.members].sum()
+    )
 
 
-def widened(found: Measurement, outcome: Outcome) -> Measurement:
+def inflate_for_rival(found: Measurement, outcome: AssignmentOutcome) -> Measurement:
     """Return a measurement with its covariance widened by a near rival.
 
     Parameters
     ----------
     found : Measurement
         Of the surface that was tested.
-    outcome : Outcome
+    outcome : AssignmentOutcome
         Of the test.
     """
     posture, other = found.posture, outcome.other
@@ -319,10 +327,10 @@ def widened(found: Measurement, outcome: Outcome) -> Measurement:
     distance, pitch, yaw = range_pitch_yaw(other.normal / other.offset)
     rival = replace(posture, range=distance, pitch=pitch, yaw=yaw)
     share = 1.0 / (1.0 + math.exp(outcome.log_odds))
-    return replace(found, posture=doubted(posture, rival, share))
+    return replace(found, posture=inflate_covariance(posture, rival, share))
 
 
-def _verdict(planes: FloatArray, facts: FloatArray) -> Outcome:
+def _verdict(planes: FloatArray, facts: FloatArray) -> AssignmentOutcome:
     """Compare the surface, the first plane, with its rivals, and those with each other."""
     best = 0
     for k in range(1, len(planes)):
@@ -338,10 +346,10 @@ def _verdict(planes: FloatArray, facts: FloatArray) -> Outcome:
     if odds < _DECIDED:
         other = _plane(planes[second] if kept else planes[best])
         if not _alike(planes[best], planes[second], _NEAR_RANGE, _NEAR_ANGLE):
-            return Outcome(Verdict.AMBIGUOUS, other, odds)
+            return AssignmentOutcome(Verdict.AMBIGUOUS, other, odds)
         if kept:
-            return Outcome(Verdict.NEAR, other, odds)
-    return UNTESTED if kept else Outcome(Verdict.RIVAL, _plane(planes[best]), odds)
+            return AssignmentOutcome(Verdict.NEAR, other, odds)
+    return NOT_TESTED if kept else AssignmentOutcome(Verdict.RIVAL, _plane(planes[best]), odds)
 
 
 def _plane(packed: FloatArray) -> Plane:
@@ -351,13 +359,17 @@ def _plane(packed: FloatArray) -> Plane:
 def _log_odds(one: FloatArray, other: FloatArray) -> float:
     """Return the log-odds of one hypothesis against another."""
     per_laser = max(one[PER_LASER], other[PER_LASER], 1e-9)
-    light = _FOREIGN_STRIPE * (one[LIGHT] - other[LIGHT]) / per_laser
+    intensity_share = (
+        _FOREIGN_STRIPE * (one[INTENSITY_WEIGHT] - other[INTENSITY_WEIGHT]) / per_laser
+    )
     dark = _DARK_LASER * (other[DARK] - one[DARK])
-    freedom = min(one[FREEDOM], other[FREEDOM], _MOST_FREEDOM)
+    freedom = min(one[FREEDOM], other[FREEDOM], _MAX_FREEDOM)
     residuals = 0.0
     if freedom > 0.0:
         residuals = 0.5 * freedom * math.log(other[VARIANCE] / one[VARIANCE])
-    return float(light + dark + min(max(residuals, -_MOST_BY_RESIDUALS), _MOST_BY_RESIDUALS))
+    return float(
+        intensity_share + dark + min(max(residuals, -_MAX_BY_RESIDUALS), _MAX_BY_RESIDUALS)
+    )
 
 
 def _alike(
@@ -367,15 +379,15 @@ def _alike(
     return bool(abs(one[3] / other[3] - 1.0) < share and cosine > math.cos(angle))
 
 
-def _sample_bands(searches: Sequence[StripeSearch], triangulator: Triangulator) -> FloatArray:
+def _sample_bands(laser_bands: Sequence[LaserBand], triangulator: Triangulator) -> FloatArray:
     """Sample the points that each laser's band sees: (n_lasers, cells, samples, 4).
 
     A point P is kept as (P, 1) / |P|: with it (m·X - 1) / |X| changes nearly evenly across a band.
     NaN where nothing is seen.
     """
-    n_cells = max((len(one.lowest) for one in searches), default=0) // CELL_LINES + 1
-    bands = np.full((len(searches), n_cells, _N_SAMPLES, 4), np.nan)
-    for i, search in enumerate(searches):
+    n_cells = max((len(one.lowest) for one in laser_bands), default=0) // CELL_LINES + 1
+    bands = np.full((len(laser_bands), n_cells, _N_SAMPLES, 4), np.nan)
+    for i, search in enumerate(laser_bands):
         lines = np.arange(CELL_LINES // 2, len(search.lowest), CELL_LINES)
         lines = lines[search.lowest[lines] <= search.highest[lines]]
         if not len(lines):

@@ -19,7 +19,7 @@ from aqualvs.scanning.plane_search import (
     squared_gate,
 )
 
-LIGHT, PER_LASER, DARK, VARIANCE, FREEDOM = range(5)
+INTENSITY_WEIGHT, PER_LASER, DARK, VARIANCE, FREEDOM = range(5)
 """Measures of a hypothesis: light that it explains, the same for each laser, dark lasers, variance
 of half stripes (px²) and its degrees of freedom."""
 N_FACTS = 5
@@ -38,11 +38,11 @@ _HALF_STRIPE_PX = 0.1
 # the peaks must not count as dark, nor their light as foreign.
 _WIDE = 2.5
 # Least number of cells to judge a laser; with a smaller share of the typical light it is dark.
-_LEAST_CELLS, _DARK_SHARE = 3, 0.25
+_MIN_CELLS, _DARK_SHARE = 3, 0.25
 # A cell is lit if this share of the other lasers that can be there is seen there.
 _LIT_SHARE = 0.15
 # Least number of search lines of half a stripe.
-_LEAST_LINES = 8
+_MIN_LINES = 8
 # A laser is faint with this share of the best one's way through the picture.
 _FAINT = 0.4
 # Columns of sums over the peaks of one laser's stripe, read as some laser's.
@@ -53,10 +53,10 @@ _XX, _XY, _XZ, _YY, _YZ, _ZZ, _SX, _SY, _SZ, _N, _SJX, _SJY, _SJZ, _N_SUMS = ran
 def find_rivals(
     source: IntArray,
     laser: IntArray,
-    trust: FloatArray,
+    confidence: FloatArray,
     points: FloatArray,
     sensitivity: FloatArray,
-    chunk_index: IntArray,
+    subsegment_index: IntArray,
     members: BoolArray,
     table: FloatArray,
     nearest: float,
@@ -68,14 +68,14 @@ def find_rivals(
 
     Parameters
     ----------
-    source, laser, trust, points, sensitivity
-        As in `Readings`, N of them.
-    chunk_index : int array, shape (N,)
-        Row of each reading's chunk.
+    source, laser, confidence, points, sensitivity
+        As in `Candidates`, N of them.
+    subsegment_index : int array, shape (N,)
+        Row of each candidate's subsegment.
     members : bool array, shape (C,)
-        Chunks on the surface.
+        Subsegments on the surface.
     table : array, shape (7, C)
-        As in `Chunks`.
+        As in `Subsegments`.
     nearest, farthest : float
         Limits of the planes that are considered, in metres.
     n_lasers : int
@@ -85,7 +85,7 @@ def find_rivals(
     """
     sums = np.zeros((n_lasers, n_lasers, _N_SUMS))
     place = np.zeros((n_lasers, 3))
-    _sum_readings(source, laser, trust, points, sensitivity, chunk_index, members, sums)
+    _sum_candidates(source, laser, confidence, points, sensitivity, subsegment_index, members, sums)
     total, other = 0.0, 0.0
     for i in range(n_lasers):
         own = sums[i, i, _N]
@@ -110,13 +110,13 @@ def find_rivals(
 
 
 @kernel
-def _sum_readings(
+def _sum_candidates(
     source: IntArray,
     laser: IntArray,
-    trust: FloatArray,
+    confidence: FloatArray,
     points: FloatArray,
     sensitivity: FloatArray,
-    chunk_index: IntArray,
+    subsegment_index: IntArray,
     members: BoolArray,
     sums: FloatArray,
 ) -> None:
@@ -126,13 +126,13 @@ def _sum_readings(
         last = max(last, source[i])
     owner = np.full(last + 1, -1)
     for i in range(source.shape[0]):
-        if members[chunk_index[i]]:
+        if members[subsegment_index[i]]:
             owner[source[i]] = laser[i]
     for i in range(source.shape[0]):
         own = owner[source[i]]
         if own < 0:
             continue
-        w, row = trust[i], sums[own, laser[i]]
+        w, row = confidence[i], sums[own, laser[i]]
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         row[_XX] += w * x * x
         row[_XY] += w * x * y
@@ -310,8 +310,8 @@ def _refine_rivals(
     for k in range(1, n + 1):
         plane = planes[k]
         good = True
-        for stretch in (_WIDE, 1.0, 1.0, _WIDE, _WIDE):
-            good = good and refine_plane(table, plane, stretch, normal, scratch, lanes)
+        for component in (_WIDE, 1.0, 1.0, _WIDE, _WIDE):
+            good = good and refine_plane(table, plane, component, normal, scratch, lanes)
         good = good and nearest <= plane[3] <= farthest and plane[1] >= MIN_FACING
         for j in range(kept + 1):
             good = good and not _same(plane, planes[j], 1.0)
@@ -330,8 +330,8 @@ def judge_planes(
     last_line: IntArray,
     laser: IntArray,
     source: IntArray,
-    trust: FloatArray,
-    chunk_index: IntArray,
+    confidence: FloatArray,
+    subsegment_index: IntArray,
     along_x: BoolArray,
     bands: FloatArray,
     facts: FloatArray,
@@ -343,17 +343,17 @@ def judge_planes(
     planes : array, shape (P, 4)
         Normals and offsets.
     table, n_lines, first_line, last_line, laser
-        As in `Chunks`, C of them.
-    source, trust
-        As in `Readings`, N of them.
-    chunk_index : int array, shape (N,)
-        Row of each reading's chunk.
+        As in `Subsegments`, C of them.
+    source, confidence
+        As in `Candidates`, N of them.
+    subsegment_index : int array, shape (N,)
+        Row of each candidate's subsegment.
     along_x : bool array, shape (n_lasers,)
         Whether each laser's search lines run along x.
     bands : array, shape (n_lasers, cells, samples, 4)
         Points P that each laser's band sees, as (P, 1) / |P|; NaN where nothing is seen.
     facts : array, shape (P, 5)
-        Written, see `LIGHT`.
+        Written, see `INTENSITY_WEIGHT`.
     """
     n_lasers, n_cells = bands.shape[0], bands.shape[1]
     last = 0
@@ -365,18 +365,18 @@ def judge_planes(
     lit, expected = np.empty((n_lasers, n_cells), np.bool_), np.empty((n_lasers, n_cells), np.bool_)
     for k in range(planes.shape[0]):
         plane, found = planes[k], facts[k]
-        _mark_light(plane, table, first_line, last_line, laser, near, lit)
-        found[LIGHT] = _light_on(k, near, source, trust, chunk_index, seen)
+        _mark_lit_cells(plane, table, first_line, last_line, laser, near, lit)
+        found[INTENSITY_WEIGHT] = _intensity_on(k, near, source, confidence, subsegment_index, seen)
         found[VARIANCE], found[FREEDOM], n_lit = _variance(
             plane, table, n_lines, first_line, laser, near, n_lasers
         )
-        found[PER_LASER] = found[LIGHT] / max(n_lit, 1)
+        found[PER_LASER] = found[INTENSITY_WEIGHT] / max(n_lit, 1)
         _mark_expected(plane, bands, expected)
         found[DARK] = _dark_lasers(lit, expected, along_x)
 
 
 @borrowing_kernel
-def _mark_light(
+def _mark_lit_cells(
     plane: FloatArray,
     table: FloatArray,
     first_line: IntArray,
@@ -385,7 +385,7 @@ def _mark_light(
     near: FloatArray,
     lit: BoolArray,
 ) -> None:
-    """Write how near each chunk is to a plane, 0 to 1; mark the cells with light near it."""
+    """Write how near each subsegment is to a plane, 0 to 1; mark the cells with light near it."""
     lit[:] = False
     x, y, z, offset = plane[0], plane[1], plane[2], plane[3]
     for c in range(laser.shape[0]):
@@ -399,21 +399,21 @@ def _mark_light(
 
 
 @borrowing_kernel
-def _light_on(
+def _intensity_on(
     number: int,
     near: FloatArray,
     source: IntArray,
-    trust: FloatArray,
-    chunk_index: IntArray,
+    confidence: FloatArray,
+    subsegment_index: IntArray,
     seen: IntArray,
 ) -> float:
     """Sum the confidence of the peaks on a plane, each counted once, weighted by its distance."""
     total = 0.0
     for i in range(source.shape[0]):
-        share = near[chunk_index[i]]
+        share = near[subsegment_index[i]]
         if share > 0.0 and seen[source[i]] != number:
             seen[source[i]] = number
-            total += trust[i] * share
+            total += confidence[i] * share
     return total
 
 
@@ -440,7 +440,7 @@ def _variance(
                 lines += n_lines[end]
             end += 1
         middle /= max(lines, 1)
-        n_lit += lines >= _LEAST_LINES
+        n_lit += lines >= _MIN_LINES
         for half in range(2):
             total, lines = 0.0, 0
             for c in range(begin, end):
@@ -449,7 +449,7 @@ def _variance(
                     per_px = x * table[JX, c] + y * table[JY, c] + z * table[JZ, c]
                     total += n_lines[c] * residual / per_px
                     lines += n_lines[c]
-            if lines >= _LEAST_LINES:
+            if lines >= _MIN_LINES:
                 square += (total / lines) ** 2
                 n += 1
         begin = end
@@ -478,46 +478,46 @@ def _mark_expected(plane: FloatArray, bands: FloatArray, expected: BoolArray) ->
 
 
 @kernel
-def light_left(
+def exclusive_share(
     source: IntArray,
-    trust: FloatArray,
-    chunk_index: IntArray,
+    confidence: FloatArray,
+    subsegment_index: IntArray,
     members: BoolArray,
     others: BoolArray,
-    chunk_light: FloatArray,
-    support: float,
+    subsegment_light: FloatArray,
+    inlier_weight: float,
 ) -> float:
     """Return the share of the light on a surface, without light on other surfaces.
 
     Parameters
     ----------
-    source, trust
-        As in `Readings`, N of them.
-    chunk_index : int array, shape (N,)
-        Row of each reading's chunk.
+    source, confidence
+        As in `Candidates`, N of them.
+    subsegment_index : int array, shape (N,)
+        Row of each candidate's subsegment.
     members, others : bool array, shape (C,)
-        Chunks on the surface, and on other surfaces.
-    chunk_light : array, shape (C,)
-        Of each chunk.
-    support : float
+        Subsegments on the surface, and on other surfaces.
+    subsegment_light : array, shape (C,)
+        Of each subsegment.
+    inlier_weight : float
         The part of the surface's light that counts.
     """
     last = 0
     for i in range(source.shape[0]):
         last = max(last, source[i])
-    light, owner = np.zeros(last + 1), np.zeros(last + 1, np.int64)
+    intensity_weight, owner = np.zeros(last + 1), np.zeros(last + 1, np.int64)
     for i in range(source.shape[0]):
-        c, r = chunk_index[i], source[i]
-        light[r] = trust[i]
+        c, r = subsegment_index[i], source[i]
+        intensity_weight[r] = confidence[i]
         owner[r] = max(owner[r], 2 if members[c] else int(others[c]))
     total, on = 0.0, 0.0
     for r in range(last + 1):
-        total += light[r] if owner[r] != 1 else 0.0
-        on += light[r] if owner[r] == 2 else 0.0
+        total += intensity_weight[r] if owner[r] != 1 else 0.0
+        on += intensity_weight[r] if owner[r] == 2 else 0.0
     of_members = 0.0
     for c in range(members.shape[0]):
-        of_members += chunk_light[c] if members[c] else 0.0
-    return on / max(total, 1e-12) * (support / of_members)
+        of_members += subsegment_light[c] if members[c] else 0.0
+    return on / max(total, 1e-12) * (inlier_weight / of_members)
 
 
 @kernel
@@ -535,9 +535,9 @@ def seen_of(
     plane : array, shape (4,)
         Normal and offset.
     members : bool array, shape (C,)
-        Chunks on the surface.
+        Subsegments on the surface.
     n_lines, laser
-        As in `Chunks`.
+        As in `Subsegments`.
     bands
         As in `judge_planes`.
     """
@@ -550,7 +550,7 @@ def seen_of(
     most, asked, faint = 0.0, 0, 0
     for i in range(n_lasers):
         cells = np.count_nonzero(expected[i])
-        way[i] = way[i] / (CELL_LINES * cells) if cells >= _LEAST_CELLS else np.nan
+        way[i] = way[i] / (CELL_LINES * cells) if cells >= _MIN_CELLS else np.nan
         if way[i] > most:
             most = way[i]
     for i in range(n_lasers):
@@ -581,7 +581,7 @@ def _dark_lasers(lit: BoolArray, expected: BoolArray, along_x: BoolArray) -> flo
             seen += lit[i, cell]
             of_others += there
             by_others += shown
-        if asked < _LEAST_CELLS:
+        if asked < _MIN_CELLS:
             continue
         typical = _DARK_SHARE * by_others / of_others
         share = seen / asked

@@ -1,9 +1,9 @@
 """Candidates: every stripe peak, triangulated as a point of each laser that could have made it.
 
-`read_returns` links each laser's peaks (`Returns`) to segments and triangulates them; the result,
-`Readings`, holds the candidate correspondences of peaks and lasers. `Chunks` summarises them by
-subsegments, the units that agree with a surface or do not; `Readings.observations` averages any
-groups of them, weighted by intensity.
+`find_candidates` links each laser's peaks (`StripePeaks`) to segments and triangulates them; the
+result, `Candidates`, holds the candidate correspondences of peaks and lasers. `Subsegments`
+summarises them by subsegments, the units that agree with a surface or do not;
+`Candidates.observations` averages any groups of them, weighted by intensity.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,33 +14,33 @@ import numpy as np
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import ZERO, borrowing_kernel, inline_borrowing_kernel, kernel
 from aqualvs.geometry.quantile import element_at
-from aqualvs.scanning.laser_bands import SearchAxis, StripeSearch
+from aqualvs.scanning.laser_bands import LaserBand, SearchAxis
 from aqualvs.scanning.segments import (
-    StretchShapes,
-    describe_stretches,
+    ComponentShapes,
+    component_shapes,
+    describe_components,
     is_curved,
     run_end,
-    segment_returns,
-    stretch_shapes,
+    segment_peaks,
 )
-from aqualvs.scanning.stripe import Returns
+from aqualvs.scanning.stripe import StripePeaks
 from aqualvs.scanning.triangulate import Triangulator
 
-SOURCE, LASER, LINE, STRETCH, CHUNK, ALONG_X = range(6)
-"""Rows of a table of readings' whole numbers, the last 1 where the search runs along x."""
+SOURCE, LASER, LINE, COMPONENT, SUBSEGMENT, ALONG_X = range(6)
+"""Rows of a table of candidates' whole numbers, the last 1 where the search runs along x."""
 N_NUMBERS = 6
-HEIGHT, WIDTH, SIGMA_PX, TRUST = range(4)
-"""Rows of a table of readings' measures."""
+HEIGHT, WIDTH, SIGMA_PX, CONFIDENCE = range(4)
+"""Rows of a table of candidates' measures."""
 N_MEASURES = 4
 
-# Position noise of a return: a floor (texture, compression), and the effect of grey-level noise on
+# Position noise of a peak: a floor (texture, compression), and the effect of grey-level noise on
 # the two flanks of a stripe of given width and height.
 _FLOOR_PX = 0.1
 _FLANK_NOISE = 1.35  # 0.45 (geometry of two flanks) times 3 grey levels
 
 
 @kernel
-def read_laser(
+def append_candidates(
     line: IntArray,
     position: FloatArray,
     height: FloatArray,
@@ -64,15 +64,15 @@ def read_laser(
     Parameters
     ----------
     line, position, height, width, likelihood
-        As in `Returns`, of the laser's search direction.
+        As in `StripePeaks`, of the laser's search direction.
     lowest, highest, slope_low, slope_high, line_px
-        As in the laser's `StripeSearch`.
+        As in the laser's `LaserBand`.
     laser : int
         Its index.
     along_x : int
         1 where its search lines run along x.
     best_height : float
-        Of the frame's best returns.
+        Of the frame's best peaks.
     begin : int
         Number of candidates of other lasers.
     numbers : int array, shape (6, N), measures : array, shape (4, N)
@@ -81,13 +81,13 @@ def read_laser(
         Written.
     """
     found = np.empty((3, line.shape[0]), np.int64)
-    n = segment_returns(line, position, lowest, highest, slope_low, slope_high, found)
-    # Stretches and chunks of different lasers must have different numbers.
-    first_stretch, first_chunk = 0, 0
+    n = segment_peaks(line, position, lowest, highest, slope_low, slope_high, found)
+    # Components and subsegments of different lasers must have different numbers.
+    first_component, first_subsegment = 0, 0
     for i in range(begin):
-        first_stretch = max(first_stretch, numbers[STRETCH, i] + 1)
+        first_component = max(first_component, numbers[COMPONENT, i] + 1)
     if begin > 0:
-        first_chunk = numbers[CHUNK, begin - 1] + 1
+        first_subsegment = numbers[SUBSEGMENT, begin - 1] + 1
     across, along = (1, 0) if along_x else (0, 1)
     height_share = 1.0 / best_height
     for k in range(n):
@@ -96,92 +96,94 @@ def read_laser(
         numbers[SOURCE, i] = 2 * r + along_x
         numbers[LASER, i] = laser
         numbers[LINE, i] = line[r]
-        numbers[STRETCH, i] = first_stretch + found[1, k]
-        numbers[CHUNK, i] = first_chunk + found[2, k]
+        numbers[COMPONENT, i] = first_component + found[1, k]
+        numbers[SUBSEGMENT, i] = first_subsegment + found[2, k]
         numbers[ALONG_X, i] = along_x
         measures[HEIGHT, i] = height[r]
         measures[WIDTH, i] = width[r]
         flank = _FLANK_NOISE * width[r] / height[r]
         measures[SIGMA_PX, i] = np.sqrt(_FLOOR_PX * _FLOOR_PX + flank * flank)
-        measures[TRUST, i] = np.sqrt(min(height[r] * height_share, 1.0) * likelihood[r])
+        measures[CONFIDENCE, i] = np.sqrt(min(height[r] * height_share, 1.0) * likelihood[r])
         # The middle of a search line that is several pixels wide.
         pixels[i, across] = (line[r] + 0.5) * line_px - 0.5
         pixels[i, along] = position[r]
     return begin + n
 
 
-# Position noise of a chunk's centroid beyond that: a floor that neighbouring returns share, and a
-# share of the spread, because a strand's light may be cut off on one side by a knot or the border.
-_CHUNK_FLOOR_PX = 0.08
+# Position noise of a subsegment's centroid beyond that: a floor that neighbouring peaks share, and
+# a share of the spread, because a strand's light may be cut off on one side by a knot or the
+# border.
+_SUBSEGMENT_FLOOR_PX = 0.08
 _SPREAD_SHARE = 0.12
-# Limit of a stretch's sampling weight (`voice`) in the search for surfaces: this many times the
+# Limit of a component's sampling weight in the search for surfaces: this many times the
 # typical one, but at least that of this many search lines.
-_LOUDEST_SHARE = 2.0
-_LOUD_ENOUGH = 16.0
-# Factor on the sampling weight of a curved stretch: a fish has tangent planes, but is not a plane.
-_CURVED_VOICE = 0.2
-# Shorter stretches are specks, and are left out of the typical weight.
+_WEIGHT_LIMIT_SHARE = 2.0
+_MIN_WEIGHT_LIMIT = 16.0
+# Factor on the sampling weight of a curved component: a fish has tangent planes, but is not a
+# plane.
+_CURVED_WEIGHT = 0.2
+# Shorter components are specks, and are left out of the typical weight.
 _SPECK_LINES = 3.0
 
 
 @borrowing_kernel
-def count_chunks(chunk: IntArray) -> int:
-    """Count chunks whose numbers ascend."""
+def count_subsegments(subsegment: IntArray) -> int:
+    """Count subsegments whose numbers ascend."""
     n = 0
-    for i in range(chunk.shape[0]):
-        n += i == 0 or chunk[i] != chunk[i - 1]
+    for i in range(subsegment.shape[0]):
+        n += i == 0 or subsegment[i] != subsegment[i - 1]
     return n
 
 
 @kernel
-def chunk_readings(
-    chunk: IntArray,
+def summarise_subsegments(
+    subsegment: IntArray,
     line: IntArray,
     laser: IntArray,
-    stretch: IntArray,
-    trust: FloatArray,
+    component: IntArray,
+    confidence: FloatArray,
     height: FloatArray,
     width: FloatArray,
     points: FloatArray,
     sensitivity: FloatArray,
     index: IntArray,
     table: FloatArray,
-    light: FloatArray,
+    intensity_weight: FloatArray,
     facts: IntArray,
 ) -> FloatArray:
-    """Summarise N candidates in C chunks, whose numbers ascend.
+    """Summarise N candidates in C subsegments, whose numbers ascend.
 
     Parameters
     ----------
-    chunk, line, laser, stretch, trust, height, width, points, sensitivity
-        As in `Readings`.
+    subsegment, line, laser, component, confidence, height, width, points, sensitivity
+        As in `Candidates`.
     index : int array, shape (N,)
-        Written: row of each reading's chunk.
+        Written: row of each candidate's subsegment.
     table : array, shape (7, C), light : array, shape (C,)
-        Written, as in `Chunks`.
+        Written, as in `Subsegments`.
     facts : int array, shape (4, C)
         Written: (n_lines, first_line, last_line, laser).
 
     Returns
     -------
     array, shape (6, S)
-        The stretches as described by `describe_stretches`.
+        The components as described by `describe_components`.
     """
     begin = ZERO
-    for c in range(light.shape[0]):
-        end = run_end(chunk, begin)
+    for c in range(intensity_weight.shape[0]):
+        end = run_end(subsegment, begin)
         for i in range(begin, end):
             index[i] = c
         facts[0, c], facts[1, c], facts[2, c] = end - begin, line[begin], line[end - 1]
         facts[3, c] = laser[begin]
         total = 0.0
         for i in range(begin, end):
-            total += trust[i]
-        light[c] = total
+            total += confidence[i]
+        intensity_weight[c] = total
         _write_centroid(height, width, points, sensitivity, begin, end, table, c)
         begin = end
-    shapes = describe_stretches(stretch, line, points, sensitivity, width, height)
-    _write_voices(facts[0], stretch, light, shapes, table[6])
+    shapes = describe_components(component, line, points, sensitivity, width, height)
+    _write_sampling_weights(facts[0], component, intensity_weight, shapes, table[6])
     return shapes
 
 
@@ -196,37 +198,41 @@ def _write_centroid(
     table: FloatArray,
     c: int,
 ) -> None:
-    """Write the mean point and sensitivity of a chunk, weighted by the light in each return."""
+    """Write the mean point and sensitivity of a subsegment, weighted by the light in each peak."""
     total, x, y, z, jx, jy, jz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(begin, end):
-        light = height[i] * width[i]
-        total += light
-        x += light * points[i, 0]
-        y += light * points[i, 1]
-        z += light * points[i, 2]
-        jx += light * sensitivity[i, 0]
-        jy += light * sensitivity[i, 1]
-        jz += light * sensitivity[i, 2]
+        intensity_weight = height[i] * width[i]
+        total += intensity_weight
+        x += intensity_weight * points[i, 0]
+        y += intensity_weight * points[i, 1]
+        z += intensity_weight * points[i, 2]
+        jx += intensity_weight * sensitivity[i, 0]
+        jy += intensity_weight * sensitivity[i, 1]
+        jz += intensity_weight * sensitivity[i, 2]
     share = 1.0 / total
     table[0, c], table[1, c], table[2, c] = share * x, share * y, share * z
     table[3, c], table[4, c], table[5, c] = share * jx, share * jy, share * jz
 
 
 @kernel
-def _write_voices(
-    n_lines: IntArray, stretch: IntArray, light: FloatArray, table: FloatArray, voice: FloatArray
+def _write_sampling_weights(
+    n_lines: IntArray,
+    component: IntArray,
+    intensity_weight: FloatArray,
+    table: FloatArray,
+    sampling_weight: FloatArray,
 ) -> None:
-    """Write the sampling weight of each chunk: its light, reduced in long or curved stretches."""
-    shapes = StretchShapes(table[0], table[1], table[2], table[3], table[4], table[5])
+    """Write each subsegment's sampling weight: its light, less in long or curved components."""
+    shapes = ComponentShapes(table[0], table[1], table[2], table[3], table[4], table[5])
     strands = shapes.n_lines[shapes.n_lines >= _SPECK_LINES]
     typical = np.median(strands) if strands.shape[0] else 0.0
-    loudest = max(_LOUDEST_SHARE * typical, _LOUD_ENOUGH)
+    most_lines = max(_WEIGHT_LIMIT_SHARE * typical, _MIN_WEIGHT_LIMIT)
     begin = 0
     for c in range(n_lines.shape[0]):
-        s = stretch[begin]
-        voice[c] = light[c] * min(1.0, loudest / shapes.n_lines[s])
+        s = component[begin]
+        sampling_weight[c] = intensity_weight[c] * min(1.0, most_lines / shapes.n_lines[s])
         if is_curved(shapes, s):
-            voice[c] *= _CURVED_VOICE
+            sampling_weight[c] *= _CURVED_WEIGHT
         begin += n_lines[c]
 
 
@@ -254,14 +260,14 @@ def summarise(
         c = index[i]
         if c < 0:
             continue
-        light = height[i] * width[i]
-        total[c] += light
+        intensity_weight = height[i] * width[i]
+        total[c] += intensity_weight
         for k in range(3):
-            centroid[c, k] += light * points[i, k]
-            mean_sensitivity[c, k] += light * sensitivity[i, k]
+            centroid[c, k] += intensity_weight * points[i, k]
+            mean_sensitivity[c, k] += intensity_weight * sensitivity[i, k]
         # Error of a weighted mean of independent positions.
-        group_sigma_px[c] += (light * sigma_px[i]) ** 2
-        group_line[c] += light * line[i]
+        group_sigma_px[c] += (intensity_weight * sigma_px[i]) ** 2
+        group_line[c] += intensity_weight * line[i]
         group_laser[c] = laser[i]
     middle = np.empty(n)
     for c in range(n):
@@ -286,54 +292,54 @@ def summarise(
             per_px += normal[k] * mean_sensitivity[c, k]
         scatter = spread[c] / (total[c] * per_px * per_px)
         variance = group_sigma_px[c] + _SPREAD_SHARE**2 * scatter
-        group_sigma_px[c] = np.sqrt(variance + _CHUNK_FLOOR_PX**2)
+        group_sigma_px[c] = np.sqrt(variance + _SUBSEGMENT_FLOOR_PX**2)
 
 
 @dataclass(frozen=True, slots=True)
-class Chunks:
-    """Subsegments of stripes (chunks), C of them, ordered by laser.
+class Subsegments:
+    """Subsegments of stripes, C of them, ordered by laser.
 
     Attributes
     ----------
     table : array, shape (7, C)
         Rows as `plane_search` names them: centroid in `dome` (m), mean derivative of the points by
-        the stripe's position (m/px), and sampling weight (voice): its light, but a long stretch
+        the stripe's position (m/px), and sampling weight: its light, but a long component
         weighs no more than a few strands, because it may follow one strand off the sheet's middle.
-    light : array, shape (C,)
+    intensity_weight : array, shape (C,)
         Search lines in it, each weighted by the confidence that its peak is laser light.
     n_lines : int array, shape (C,)
         Search lines in it.
     first_line, last_line : int array, shape (C,)
-        Its extent in search lines; separates lit from dark stretches.
+        Its extent in search lines; separates lit from dark intervals.
     laser : int array, shape (C,)
         Index of the laser; ascending.
     """
 
     table: FloatArray
-    light: FloatArray
+    intensity_weight: FloatArray
     n_lines: IntArray
     first_line: IntArray
     last_line: IntArray
     laser: IntArray
 
     def __len__(self) -> int:
-        """Return the number of chunks."""
+        """Return the number of subsegments."""
         return len(self.laser)
 
 
-# The best returns of a frame are those from this quantile on.
+# The best peaks of a frame are those from this quantile on.
 _BEST_SHARE = 0.95
 _AXES = (SearchAxis.ALONG_X, SearchAxis.ALONG_Y)
 _NOTHING = np.empty(0)
-_NO_RETURNS = Returns(np.empty(0, np.int64), _NOTHING, _NOTHING, _NOTHING, _NOTHING)
+_NO_PEAKS = StripePeaks(np.empty(0, np.int64), _NOTHING, _NOTHING, _NOTHING, _NOTHING)
 
 FORWARD: FloatArray = np.array([0.0, 1.0, 0.0])
 """The vehicle's forward axis in `dome`: the normal of a target that is square to it."""
 
 
 @dataclass(frozen=True, slots=True)
-class Readings:
-    """Triangulated candidates (readings), N of them, ordered by laser, segment and chunk.
+class Candidates:
+    """Triangulated candidates, N of them, ordered by laser, segment and subsegment.
 
     Attributes
     ----------
@@ -343,15 +349,16 @@ class Readings:
         Index of the laser that the peak is read as.
     line : int array, shape (N,)
         Search line.
-    stretch, chunk : int array, shape (N,)
-        Numbers of the stretch (linked segments) and the chunk; those of the chunks ascend.
+    component, subsegment : int array, shape (N,)
+        Numbers of the component (connected segments) and the subsegment; those of the subsegments
+        ascend.
     pixels : array, shape (N, 2)
         In `image`.
     height, width : array, shape (N,)
-        Of the return: grey levels, pixels.
+        Of the peak: grey levels, pixels.
     sigma_px : array, shape (N,)
         Standard deviation of the position along the search line.
-    trust : array, shape (N,)
+    confidence : array, shape (N,)
         Confidence that the peak is laser light, from its height as a share of the frame's best and
         its likelihood; 0 to 1.
     points : array, shape (N, 3)
@@ -363,62 +370,62 @@ class Readings:
     source: IntArray
     laser: IntArray
     line: IntArray
-    stretch: IntArray
-    chunk: IntArray
+    component: IntArray
+    subsegment: IntArray
     pixels: FloatArray
     height: FloatArray
     width: FloatArray
     sigma_px: FloatArray
-    trust: FloatArray
+    confidence: FloatArray
     points: FloatArray
     sensitivity: FloatArray
     # Cached: used by the search for surfaces and by the labels.
-    _shapes: StretchShapes | None = field(default=None, init=False, repr=False, compare=False)
+    _shapes: ComponentShapes | None = field(default=None, init=False, repr=False, compare=False)
 
     def __len__(self) -> int:
         """Return the number of candidates."""
         return len(self.source)
 
-    def where(self, mask: BoolArray) -> "Readings":
+    def where(self, mask: BoolArray) -> "Candidates":
         """Return the candidates that a mask of shape (N,) selects."""
-        return Readings(*(getattr(self, item.name)[mask] for item in fields(self) if item.init))
+        return Candidates(*(getattr(self, item.name)[mask] for item in fields(self) if item.init))
 
-    def chunks(self) -> tuple[Chunks, IntArray]:
-        """Summarise the chunks by their centroids.
+    def subsegments(self) -> tuple[Subsegments, IntArray]:
+        """Summarise the subsegments by their centroids.
 
         Returns
         -------
-        Chunks
+        Subsegments
             C of them, ordered by laser.
         index : int array, shape (N,)
-            Row of each reading's chunk.
+            Row of each candidate's subsegment.
         """
-        n = count_chunks(self.chunk)
+        n = count_subsegments(self.subsegment)
         index, facts = np.empty(len(self), np.int64), np.empty((4, n), np.int64)
-        table, light = np.empty((7, n)), np.empty(n)
-        shapes = chunk_readings(
-            self.chunk,
+        table, intensity_weight = np.empty((7, n)), np.empty(n)
+        shapes = summarise_subsegments(
+            self.subsegment,
             self.line,
             self.laser,
-            self.stretch,
-            self.trust,
+            self.component,
+            self.confidence,
             self.height,
             self.width,
             self.points,
             self.sensitivity,
             index,
             table,
-            light,
+            intensity_weight,
             facts,
         )
-        object.__setattr__(self, "_shapes", StretchShapes(*shapes))
-        return Chunks(table, light, *facts), index
+        object.__setattr__(self, "_shapes", ComponentShapes(*shapes))
+        return Subsegments(table, intensity_weight, *facts), index
 
-    def shapes(self) -> StretchShapes:
-        """Describe the shape of every stretch."""
+    def shapes(self) -> ComponentShapes:
+        """Describe the shape of every component."""
         if self._shapes is None:
-            found = stretch_shapes(
-                self.stretch, self.line, self.points, self.sensitivity, self.width, self.height
+            found = component_shapes(
+                self.component, self.line, self.points, self.sensitivity, self.width, self.height
             )
             object.__setattr__(self, "_shapes", found)
             return found
@@ -433,7 +440,7 @@ class Readings:
         Parameters
         ----------
         index : int array, shape (N,)
-            Group of each reading, 0 to n - 1, or -1 to leave it out; no group is empty.
+            Group of each candidate, 0 to n - 1, or -1 to leave it out; no group is empty.
         n : int
             Number of groups.
         normal : array, shape (3,)
@@ -488,36 +495,36 @@ class Observations:
     laser: IntArray
 
 
-def read_returns(
-    returns: Mapping[SearchAxis, Returns],
-    searches: Sequence[StripeSearch],
+def find_candidates(
+    peaks: Mapping[SearchAxis, StripePeaks],
+    laser_bands: Sequence[LaserBand],
     triangulator: Triangulator,
-) -> Readings:
+) -> Candidates:
     """Link each laser's peaks to segments and triangulate them.
 
     Parameters
     ----------
-    returns : mapping of SearchAxis to Returns
+    peaks : mapping of SearchAxis to StripePeaks
         As `FrameDetector.detect` gives them.
-    searches : sequence of StripeSearch
+    laser_bands : sequence of LaserBand
         One for each laser.
     triangulator : Triangulator
         Of the same rig.
 
     Returns
     -------
-    Readings
+    Candidates
         Only those whose ray meets the laser's sheet in front of the camera.
     """
-    along_x, along_y = (returns.get(axis, _NO_RETURNS) for axis in _AXES)
-    by_search = [along_x if one.axis is SearchAxis.ALONG_X else along_y for one in searches]
+    along_x, along_y = (peaks.get(axis, _NO_PEAKS) for axis in _AXES)
+    by_search = [along_x if one.axis is SearchAxis.ALONG_X else along_y for one in laser_bands]
     capacity = sum(map(len, by_search))
     numbers, measures = np.empty((N_NUMBERS, capacity), np.int64), np.empty((N_MEASURES, capacity))
     pixels = np.empty((capacity, 2))
     best_height = element_at(np.concatenate((along_x.height, along_y.height)), _BEST_SHARE)
     n = 0
-    for i, (search, found) in enumerate(zip(searches, by_search, strict=True)):
-        n = read_laser(
+    for i, (search, found) in enumerate(zip(laser_bands, by_search, strict=True)):
+        n = append_candidates(
             found.line,
             found.position,
             found.height,
@@ -537,24 +544,24 @@ def read_returns(
             pixels,
         )
     points, sensitivity, valid = np.empty((n, 3)), np.empty((n, 3)), np.empty(n, np.bool_)
-    source, laser, line, stretch, chunk, along = numbers[:, :n]
-    height, width, sigma_px, trust = measures[:, :n]
+    source, laser, line, component, subsegment, along = numbers[:, :n]
+    height, width, sigma_px, confidence = measures[:, :n]
     pixels = pixels[:n]
     all_valid = triangulator.triangulate_into(
-        pixels, along, laser, chunk, points, sensitivity, valid
+        pixels, along, laser, subsegment, points, sensitivity, valid
     )
-    readings = Readings(
+    candidates = Candidates(
         source,
         laser,
         line,
-        stretch,
-        chunk,
+        component,
+        subsegment,
         pixels,
         height,
         width,
         sigma_px,
-        trust,
+        confidence,
         points,
         sensitivity,
     )
-    return readings if all_valid else readings.where(valid)
+    return candidates if all_valid else candidates.where(valid)

@@ -13,7 +13,7 @@ import numpy as np
 from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.compiled import inline_kernel, kernel
 from aqualvs.geometry.quantile import element_at
-from aqualvs.scanning.laser_bands import SearchAxis, StripeSearch
+from aqualvs.scanning.laser_bands import LaserBand, SearchAxis
 from aqualvs.scanning.laser_colour import (
     HIGHEST_USEFUL,
     Paint,
@@ -31,9 +31,9 @@ from aqualvs.scanning.stripe import (
     N_MEASURES,
     POSITION,
     PeakFinder,
-    Returns,
     SearchImage,
     StripeOptions,
+    StripePeaks,
     ThresholdOptions,
     U8Array,
 )
@@ -139,7 +139,7 @@ DETECTORS: dict[str, type[DetectorOptions]] = {
 
 # One search line of this many is sampled first. Low peaks are used up to this many times the number
 # that the lasers can make.
-_SAMPLE_EVERY, _MOST_PEAKS = 48, 2.0
+_SAMPLE_EVERY, _MAX_PEAKS = 48, 2.0
 # Quantile of the height of a frame's bright peaks.
 _BRIGHT_QUANTILE = 0.9
 _CACHE_LINE = 8  # numbers of 64 bits
@@ -160,7 +160,7 @@ class FrameDetector:
     ----------
     size_px : (int, int)
         Image width and height.
-    searches : sequence of StripeSearch
+    laser_bands : sequence of LaserBand
         One for each laser.
     options : StripeOptions or ThresholdOptions
         Kind of detector, and its options.
@@ -169,12 +169,12 @@ class FrameDetector:
     def __init__(
         self,
         size_px: tuple[int, int],
-        searches: Sequence[StripeSearch],
+        laser_bands: Sequence[LaserBand],
         options: DetectorOptions,
     ) -> None:
         self._size_px = size_px
         self._options = options
-        seen = [search for search in searches if search.visible]
+        seen = [search for search in laser_bands if search.visible]
         self._colours = sorted({one.colour for one in seen}, key=lambda colour: colour.name)
         # Each laser shows about once on a search line.
         self._n_possible = float(sum(np.count_nonzero(one.lowest <= one.highest) for one in seen))
@@ -222,8 +222,8 @@ class FrameDetector:
             np.array([colour.value for colour in self._colours]),
         )
 
-    def detect(self, frame: Frame) -> dict[SearchAxis, Returns]:
-        """Find the returns of every search direction.
+    def detect(self, frame: Frame) -> dict[SearchAxis, StripePeaks]:
+        """Find the peaks of every search direction.
 
         Parameters
         ----------
@@ -255,7 +255,7 @@ class FrameDetector:
             for axis, detector in self._threshold.items()
         }
 
-    def _find_stripes(self, frame: Frame, options: StripeOptions) -> dict[SearchAxis, Returns]:
+    def _find_stripes(self, frame: Frame, options: StripeOptions) -> dict[SearchAxis, StripePeaks]:
         luma = self._brightest(frame)
         chroma = frame.chroma or (_NO_CHROMA, _NO_CHROMA)
         u, v = (_plain(plane, out) for plane, out in zip(chroma, self._chroma, strict=True))
@@ -271,14 +271,14 @@ class FrameDetector:
             likelihood = np.ones(len(line))
         else:
             likelihood = self._likelihood(table, paint, self._n_possible)
-        rows = select_returns(
+        rows = select_peaks(
             line, table, likelihood, ends, options.min_likelihood, options.min_share
         )
         line, likelihood = line[rows], likelihood[rows]
         position, height, width = table[:3].take(rows, axis=1)
         bounds = np.searchsorted(rows, ends)
         return {
-            axis: Returns(
+            axis: StripePeaks(
                 line[start:end],
                 position[start:end],
                 height[start:end],
@@ -323,7 +323,7 @@ class FrameDetector:
         Above that height there are not many more peaks than the lasers can make.
         """
         n_possible = self._n_possible / _SAMPLE_EVERY
-        most = _MOST_PEAKS * n_possible
+        most = _MAX_PEAKS * n_possible
         heights = np.sort(sample[HEIGHT])
         n = len(heights)
         crowded = round(min(float(heights[n - 1 - int(most)]), HIGHEST_USEFUL)) if n > most else 0
@@ -351,7 +351,7 @@ class FrameDetector:
 
 
 @kernel
-def select_returns(
+def select_peaks(
     line: IntArray,
     table: FloatArray,
     likelihood: FloatArray,
@@ -392,8 +392,8 @@ def _plain(plane: U8Array, copy: U8Array) -> U8Array:
     return copy
 
 
-def _band(searches: Sequence[StripeSearch]) -> tuple[IntArray, IntArray]:
+def _band(laser_bands: Sequence[LaserBand]) -> tuple[IntArray, IntArray]:
     """Return the first and the last position (n_lines,) of any of the lasers."""
-    lowest: IntArray = np.min([search.lowest for search in searches], axis=0)
-    highest: IntArray = np.max([search.highest for search in searches], axis=0)
+    lowest: IntArray = np.min([search.lowest for search in laser_bands], axis=0)
+    highest: IntArray = np.max([search.highest for search in laser_bands], axis=0)
     return lowest, highest

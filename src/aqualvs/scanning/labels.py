@@ -1,6 +1,6 @@
 """Labels of stripe points: the kind of object that each was found on.
 
-`label_readings` labels light on the other surfaces first, then light on the target (on a net also
+`label_candidates` labels light on the other surfaces first, then light on the target (on a net also
 nearby light that the search left out). What lies on no surface is labelled by the shape of its
 segment.
 """
@@ -14,20 +14,20 @@ from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import borrowing_kernel, kernel
 from aqualvs.geometry.planes import Plane
 from aqualvs.geometry.quantile import element_at
-from aqualvs.scanning.candidates import Readings
+from aqualvs.scanning.candidates import Candidates
 from aqualvs.scanning.patch import height_over, packed_plane
 from aqualvs.scanning.posture import Posture
 from aqualvs.scanning.posture_estimator import Measurement
-from aqualvs.scanning.region_growing import recruit
+from aqualvs.scanning.region_growing import recruit_candidates
 from aqualvs.scanning.scan import Label, ScanPoints
-from aqualvs.scanning.segments import StretchShapes, is_bent, is_round, is_straight
+from aqualvs.scanning.segments import ComponentShapes, is_bent, is_round, is_straight
 from aqualvs.scanning.surfaces import Surface, lit_cells, number_cells
 
-# Position error of the best returns: quality 1.
+# Position error of the best peaks: quality 1.
 _BEST_SIGMA_PX = 0.1
-# A surface is a fish if this share of its light lies in bent stretches.
+# A surface is a fish if this share of its light lies in bent components.
 _MOSTLY = 0.5
-# Quantile of the height of a frame's bright returns.
+# Quantile of the height of a frame's bright peaks.
 _BRIGHT_SHARE = 0.9
 # Compiled code takes numbers more easily than members of an enumeration.
 _NET, _SOLID, _FISH = np.uint8(Label.NET), np.uint8(Label.SOLID), np.uint8(Label.FISH)
@@ -40,10 +40,10 @@ _OUT_OF_RANGE = np.uint8(Label.OUT_OF_RANGE)
 def label_other(
     members: BoolArray,
     is_mesh: bool,
-    chunk_index: IntArray,
-    stretch: IntArray,
+    subsegment_index: IntArray,
+    component: IntArray,
     points: FloatArray,
-    shapes: StretchShapes,
+    shapes: ComponentShapes,
     target: FloatArray,
     explained: BoolArray,
     label: NDArray[np.uint8],
@@ -53,11 +53,11 @@ def label_other(
     Parameters
     ----------
     members : bool array, shape (C,)
-        Chunks on the surface.
+        Subsegments on the surface.
     is_mesh : bool
         As in `Surface`.
-    chunk_index, stretch : int array, shape (N,), points : array, shape (N, 3), shapes
-        Of the readings.
+    subsegment_index, component : int array, shape (N,), points : array, shape (N, 3), shapes
+        Of the candidates.
     target : array, shape (16,)
         The target as `Patch.packed` gives it; empty where there is none.
     explained : bool array, shape (N,), label : uint8 array, shape (N,)
@@ -67,10 +67,10 @@ def label_other(
     # Distances nearest to the target on either side: they decide if half of them lie behind it.
     nearest_before, nearest_behind = -np.inf, np.inf
     for i in range(points.shape[0]):
-        if not members[chunk_index[i]]:
+        if not members[subsegment_index[i]]:
             continue
         n += 1
-        n_bent += is_bent(shapes, stretch[i])
+        n_bent += is_bent(shapes, component[i])
         if target.shape[0]:
             behind = height_over(target, points[i, 0], points[i, 1], points[i, 2])
             if behind > 0.0:
@@ -85,7 +85,7 @@ def label_other(
     if not is_behind:
         kind = _NET if is_mesh else _FISH if n_bent > _MOSTLY * n else _SOLID
     for i in range(points.shape[0]):
-        if members[chunk_index[i]]:
+        if members[subsegment_index[i]]:
             label[i] = kind
             explained[i] = True
 
@@ -94,13 +94,13 @@ def label_other(
 def label_target(
     members: BoolArray,
     is_mesh: bool,
-    chunk_index: IntArray,
+    subsegment_index: IntArray,
     source: IntArray,
     points: FloatArray,
     sensitivity: FloatArray,
     target: FloatArray,
-    rests_on: BoolArray,
-    whole: BoolArray,
+    inliers: BoolArray,
+    net_mask: BoolArray,
     explained: BoolArray,
     label: NDArray[np.uint8],
 ) -> None:
@@ -109,34 +109,43 @@ def label_target(
     Parameters
     ----------
     members : bool array, shape (C,)
-        Chunks on the target.
+        Subsegments on the target.
     is_mesh : bool
         As in `Surface`.
-    chunk_index, source : int array, shape (N,), points, sensitivity : array, shape (N, 3)
-        Of the readings.
+    subsegment_index, source : int array, shape (N,), points, sensitivity : array, shape (N, 3)
+        Of the candidates.
     target : array, shape (16,)
         As `Patch.packed` gives it.
-    rests_on, whole : bool array, shape (N,)
+    inliers, net_mask : bool array, shape (N,)
         As in `Measurement`; the second empty where there is none.
     explained : bool array, shape (N,)
-        Readings on other surfaces; completed in place.
+        Candidates on other surfaces; completed in place.
     label : uint8 array, shape (N,)
         Completed in place.
     """
     n = source.shape[0]
     on_target = np.empty(n, np.bool_)
     for i in range(n):
-        on_target[i] = members[chunk_index[i]]
+        on_target[i] = members[subsegment_index[i]]
     if is_mesh:
-        taken = _of_same_return(source, explained, explained)
-        n_chunks = members.shape[0]
-        recruit(points, sensitivity, chunk_index, n_chunks, target, explained, taken, on_target)
+        taken = _of_same_peak(source, explained, explained)
+        n_subsegments = members.shape[0]
+        recruit_candidates(
+            points,
+            sensitivity,
+            subsegment_index,
+            n_subsegments,
+            target,
+            explained,
+            taken,
+            on_target,
+        )
     for i in range(n):
-        on_target[i] |= rests_on[i]
-    if whole.shape[0]:
-        elsewhere = _of_same_return(source, explained, on_target)
+        on_target[i] |= inliers[i]
+    if net_mask.shape[0]:
+        elsewhere = _of_same_peak(source, explained, on_target)
         for i in range(n):
-            on_target[i] |= whole[i] and not elsewhere[i]
+            on_target[i] |= net_mask[i] and not elsewhere[i]
     for i in range(n):
         if on_target[i]:
             label[i] = _NET if is_mesh else _SOLID
@@ -144,8 +153,8 @@ def label_target(
 
 
 @kernel
-def _of_same_return(source: IntArray, one: BoolArray, other: BoolArray) -> BoolArray:
-    """Mark every reading of the returns that have a reading marked in one of two ways."""
+def _of_same_peak(source: IntArray, one: BoolArray, other: BoolArray) -> BoolArray:
+    """Mark every candidate of the peaks that have a candidate marked in one of two ways."""
     known = np.zeros(_n_sources(source), np.bool_)
     for i in range(source.shape[0]):
         if one[i] or other[i]:
@@ -167,11 +176,11 @@ def _n_sources(source: IntArray) -> int:
 @kernel
 def label_loose(
     source: IntArray,
-    stretch: IntArray,
+    component: IntArray,
     pixels: FloatArray,
     points: FloatArray,
     height: FloatArray,
-    shapes: StretchShapes,
+    shapes: ComponentShapes,
     target: FloatArray,
     working_range: tuple[float, float],
     explained: BoolArray,
@@ -182,31 +191,31 @@ def label_loose(
 
     Parameters
     ----------
-    source, stretch, pixels, points, height, shapes
-        Of N readings.
+    source, component, pixels, points, height, shapes
+        Of N candidates.
     target : array, shape (16,)
         As `Patch.packed` gives it; empty where there is none.
     working_range : (float, float)
         Distances from the dome's centre beyond which clutter is out of range, in metres.
     explained : bool array, shape (N,)
-        Readings on surfaces. Others of the same light are not listed.
+        Candidates on surfaces. Others of the same light are not listed.
     label : uint8 array, shape (N,)
         Completed in place, for what is listed.
     rows : int array, shape (N,)
         Written.
     """
     n = _list_kept(source, pixels, explained, rows)
-    readings_of = np.zeros(_n_sources(source), np.int64)
+    candidates_of = np.zeros(_n_sources(source), np.int64)
     for k in range(n):
-        readings_of[source[rows[k]]] += 1
+        candidates_of[source[rows[k]]] += 1
     bright = np.nan
     for k in range(n):
         i = rows[k]
         if explained[i]:
             continue
-        s = stretch[i]
+        s = component[i]
         label[i] = _AMBIGUOUS
-        if readings_of[source[i]] == 1:
+        if candidates_of[source[i]] == 1:
             label[i] = _kind_of(points, i, is_straight(shapes, s), target, working_range)
         if is_round(shapes, s, 0.0) and bright != bright:
             bright = element_at(height, _BRIGHT_SHARE)
@@ -219,7 +228,7 @@ def label_loose(
 
 @kernel
 def _list_kept(source: IntArray, pixels: FloatArray, explained: BoolArray, rows: IntArray) -> int:
-    """List the explained readings, and those whose light no surface explains."""
+    """List the explained candidates, and those whose light no surface explains."""
     cell = np.empty(source.shape[0], np.int64)
     n_cells, n_columns = number_cells(pixels, cell)
     lit = lit_cells(cell, explained, n_cells, n_columns)
@@ -268,7 +277,7 @@ def copy_points(
     out_label: NDArray[np.uint8],
     out_used: BoolArray,
 ) -> None:
-    """Write some readings as `ScanPoints` has them.
+    """Write some candidates as `ScanPoints` has them.
 
     `out_measures`, shape (4, len(rows)), gets sigma, intensity, width and quality.
     """
@@ -289,9 +298,9 @@ def copy_points(
 _NOTHING, _NOWHERE = np.empty(0), np.empty(0, np.bool_)
 
 
-def label_readings(
-    readings: Readings,
-    chunk_index: IntArray,
+def label_candidates(
+    candidates: Candidates,
+    subsegment_index: IntArray,
     surfaces: Sequence[Surface],
     target: Surface | None,
     found: Measurement,
@@ -301,10 +310,10 @@ def label_readings(
 
     Parameters
     ----------
-    readings : Readings
+    candidates : Candidates
         N of them.
-    chunk_index : int array, shape (N,)
-        Row of each reading's chunk in the surfaces' `members`.
+    subsegment_index : int array, shape (N,)
+        Row of each candidate's subsegment in the surfaces' `members`.
     surfaces : sequence of Surface
         All that were found.
     target : Surface or None
@@ -321,9 +330,9 @@ def label_readings(
         explains is labelled by its shape, or as ambiguous if the shape is not distinctive and
         several lasers could have made it.
     listed : int array, shape (P,)
-        Row of each point's reading.
+        Row of each point's candidate.
     """
-    n, shapes = len(readings), readings.shapes()
+    n, shapes = len(candidates), candidates.shapes()
     label, explained = np.empty(n, np.uint8), np.zeros(n, np.bool_)
     facing = _facing(target, found)
     for surface in surfaces:
@@ -331,9 +340,9 @@ def label_readings(
             label_other(
                 surface.members,
                 surface.is_mesh,
-                chunk_index,
-                readings.stretch,
-                readings.points,
+                subsegment_index,
+                candidates.component,
+                candidates.points,
                 shapes,
                 facing,
                 explained,
@@ -343,23 +352,23 @@ def label_readings(
         label_target(
             target.members,
             target.is_mesh,
-            chunk_index,
-            readings.source,
-            readings.points,
-            readings.sensitivity,
+            subsegment_index,
+            candidates.source,
+            candidates.points,
+            candidates.sensitivity,
             facing,
-            found.rests_on,
-            _NOWHERE if found.whole is None else found.whole,
+            found.inliers,
+            _NOWHERE if found.net_mask is None else found.net_mask,
             explained,
             label,
         )
     rows = np.empty(n, np.int64)
     n_listed = label_loose(
-        readings.source,
-        readings.stretch,
-        readings.pixels,
-        readings.points,
-        readings.height,
+        candidates.source,
+        candidates.component,
+        candidates.pixels,
+        candidates.points,
+        candidates.height,
         shapes,
         facing,
         working_range,
@@ -368,7 +377,7 @@ def label_readings(
         rows,
     )
     listed = rows[:n_listed]
-    return _scan_points(readings, label, found.rests_on, listed), listed
+    return _scan_points(candidates, label, found.inliers, listed), listed
 
 
 def _facing(target: Surface | None, found: Measurement) -> FloatArray:
@@ -384,7 +393,7 @@ def _facing(target: Surface | None, found: Measurement) -> FloatArray:
 
 
 def _scan_points(
-    readings: Readings, label: NDArray[np.uint8], used: BoolArray, rows: IntArray
+    candidates: Candidates, label: NDArray[np.uint8], used: BoolArray, rows: IntArray
 ) -> ScanPoints:
     n = len(rows)
     measures = np.empty((4, n))
@@ -402,13 +411,13 @@ def _scan_points(
     )
     copy_points(
         rows,
-        readings.laser,
-        readings.pixels,
-        readings.points,
-        readings.sensitivity,
-        readings.sigma_px,
-        readings.height,
-        readings.width,
+        candidates.laser,
+        candidates.pixels,
+        candidates.points,
+        candidates.sensitivity,
+        candidates.sigma_px,
+        candidates.height,
+        candidates.width,
         label,
         used,
         found.laser,

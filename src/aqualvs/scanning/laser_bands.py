@@ -39,7 +39,7 @@ class SearchAxis(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class StripeSearch:
+class LaserBand:
     """The search band of one laser in the image.
 
     Attributes
@@ -72,7 +72,7 @@ class StripeSearch:
         return bool(np.any(self.lowest <= self.highest))
 
 
-def searched_range(working_range: tuple[float, float]) -> tuple[float, float]:
+def search_range(working_range: tuple[float, float]) -> tuple[float, float]:
     """Return the working range widened, so that a target beyond it is detected and reported."""
     near, far = working_range
     return 0.8 * near, 1.2 * far
@@ -83,7 +83,7 @@ def pixels_per_line(size_px: tuple[int, int]) -> int:
     return 2 if size_px[0] >= _PIXELS_PER_LINE_FROM else 1
 
 
-def plan_searches(rig: Rig, camera: Camera) -> tuple[StripeSearch, ...]:
+def plan_bands(rig: Rig, camera: Camera) -> tuple[LaserBand, ...]:
     """Compute the search band of each of the rig's lasers.
 
     Parameters
@@ -95,18 +95,18 @@ def plan_searches(rig: Rig, camera: Camera) -> tuple[StripeSearch, ...]:
 
     Returns
     -------
-    tuple of StripeSearch
+    tuple of LaserBand
         In the order of `rig.lasers`.
     """
     return tuple(
-        _plan_search(sheet, LaserColour.of(laser.wavelength_nm), rig.working_range, camera)
+        _plan_band(sheet, LaserColour.of(laser.wavelength_nm), rig.working_range, camera)
         for sheet, laser in zip(sheets_of(rig), rig.lasers, strict=True)
     )
 
 
-def _plan_search(
+def _plan_band(
     sheet: Sheet, colour: LaserColour, working_range: tuple[float, float], camera: Camera
-) -> StripeSearch:
+) -> LaserBand:
     points, in_band = _points_on_grid(sheet, working_range, camera, (SLOPE_CELL, SLOPE_CELL))
     rise, run = _stripe_directions(points)
     axis = _search_axis(rise[0], run[0], in_band)
@@ -121,7 +121,7 @@ def _plan_search(
     rise, run = _stripe_directions(points)
     length, n_pixels = camera.size_px if along_x else camera.size_px[::-1]
     lowest, highest = _band_limits(in_band, n_pixels // line_px, length)
-    return StripeSearch(axis, line_px, lowest, highest, *_slope_bounds(rise, run), colour)
+    return LaserBand(axis, line_px, lowest, highest, *_slope_bounds(rise, run), colour)
 
 
 def _points_on_grid(
@@ -136,7 +136,7 @@ def _points_on_grid(
     y = np.arange(0, height + steps[1], steps[1], dtype=np.float64)
     points, valid = sheet.intersect(camera.rays(np.stack(np.meshgrid(x, y), axis=-1)))
     distance = np.linalg.norm(points, axis=-1)
-    near, far = searched_range(working_range)
+    near, far = search_range(working_range)
     # A plane at range d has no point nearer than d, so the near bound is exact.
     with np.errstate(invalid="ignore"):
         in_band = valid & (distance >= near) & (distance <= far * _OFF_AXIS_STRETCH)

@@ -34,15 +34,15 @@ _RED_OF_V, _BLUE_OF_U = 1.596 / 1.164, 2.018 / 1.164
 # paint, in standard deviations and in levels; least cosine of its angle to the wavelength's
 # direction; least share of the largest step for their height; least number of such peaks; and the
 # largest and the smallest scatter of half of them, as shares of their mean step.
-_MIN_HEIGHT, _CLEAR_SIGMAS, _CLEAR_LEVELS, _LEAST_COSINE = 12.0, 3.0, 3.0, 0.2
-_BEST_SHARE, _MIN_LEARNED, _MOST_SCATTER, _LEAST_SCATTER = 0.6, 16, 0.4, 0.22
+_MIN_HEIGHT, _CLEAR_SIGMAS, _CLEAR_LEVELS, _MIN_COSINE = 12.0, 3.0, 3.0, 0.2
+_BEST_SHARE, _MIN_LEARNED, _MAX_SCATTER, _MIN_SCATTER = 0.6, 16, 0.4, 0.22
 # Number of peaks that is enough to learn from.
 _ENOUGH = 2500
 # Paint: least height of the peaks near one colour, and least ratio of their number to what the
 # lasers can make; its least spread, as chroma for each level, and its largest spread across the
 # tint of its light; and the distances from its middle, in standard deviations, of other things and
 # of lines.
-_TALL, _CROWD, _LEAST_SPREAD, _MOST_ACROSS = 20.0, 1.5, 0.02, 0.045
+_TALL, _CROWD, _MIN_SPREAD, _MAX_ACROSS = 20.0, 1.5, 0.02, 0.045
 _OF_CROWD, _CLEAR_OF_PAINT, _MAD_TO_SIGMA = 2.5, 4.0, 1.4826
 # Chroma levels for each grey level of height: the expected value of a line where none is clear
 # enough to learn from, the least and the most that is accepted of a learned one, and the spread of
@@ -57,7 +57,7 @@ _TINT_SHARE, _PAINT_SHARE = 0.5, 0.5
 # The learned ratio is the one that this share of the best stripes exceeds.
 _LEARNED_QUANTILE = 0.35
 # Least chroma noise after rounding and subsampling, in levels.
-_LEAST_SIGMA = 0.7
+_MIN_SIGMA = 0.7
 # Width of the bins of height, and number of refinements of the shares of lines in them.
 _KINDS_PER_OCTAVE, _N_KINDS, _ROUNDS = 2.0, 16, 3
 _KIND_OF_HEIGHT = np.minimum(_KINDS_PER_OCTAVE * np.log2(np.arange(256).clip(1)), _N_KINDS - 1)
@@ -201,7 +201,7 @@ def learn_paint(table: FloatArray, n_possible: float) -> Paint | None:
     """
     *paint, across_tint, n_near = _learn_paint(table, _CROWD * n_possible)
     # The share of the light's tint in paint varies; other differences are a mixture with lines.
-    return Paint(*paint) if across_tint < _MOST_ACROSS and n_near > _CROWD * n_possible else None
+    return Paint(*paint) if across_tint < _MAX_ACROSS and n_near > _CROWD * n_possible else None
 
 
 def learn_colour(table: FloatArray, colour: LaserColour, paint: Paint | None) -> LineColour | None:
@@ -290,7 +290,7 @@ def _noise(table: FloatArray) -> float:
     A low quantile: beside other stripes and edges the flanks differ by more than noise.
     """
     noise = element_at(np.abs(table[IMBALANCE]), 0.25) / _QUARTER_OF_NORMAL
-    return max(noise / math.sqrt(2.0), _LEAST_SIGMA)
+    return max(noise / math.sqrt(2.0), _MIN_SIGMA)
 
 
 @inline_kernel
@@ -346,19 +346,17 @@ def _middle(of_u: FloatArray, of_v: FloatArray) -> tuple[float, float, bool]:
     """Return the median of steps, and whether at least half of them are near it."""
     u, v = element_at(of_u, 0.5), element_at(of_v, 0.5)
     squared = element_at((of_u - u) ** 2 + (of_v - v) ** 2, 0.5)
-    return u, v, squared <= _MOST_SCATTER**2 * (u**2 + v**2)
+    return u, v, squared <= _MAX_SCATTER**2 * (u**2 + v**2)
 
 
 @kernel
-def _learn_paint(
-    table: FloatArray, n_least: float
-) -> tuple[float, float, float, float, float, int]:
+def _learn_paint(table: FloatArray, n_min: float) -> tuple[float, float, float, float, float, int]:
     """Return the fields of a `Paint`, its spread across the flanks' tint, and the number near it.
 
-    The number is zero if at most `n_least` peaks are tall.
+    The number is zero if at most `n_min` peaks are tall.
     """
     tall = np.flatnonzero(table[HEIGHT] >= _TALL)
-    if tall.shape[0] <= n_least:
+    if tall.shape[0] <= n_min:
         return 0.0, 0.0, 0.0, 0.0, 0.0, 0
     height = table[HEIGHT][tall]
     of_u, of_v = table[STEP_U][tall] / height, table[STEP_V][tall] / height
@@ -370,14 +368,14 @@ def _learn_paint(
         u, v = element_at(some_u, 0.5), element_at(some_v, 0.5)
         seen_u = _MAD_TO_SIGMA * element_at(np.abs(some_u - u), 0.5)
         seen_v = _MAD_TO_SIGMA * element_at(np.abs(some_v - v), 0.5)
-        spread_u = math.sqrt(max(seen_u**2 - noise**2, _LEAST_SPREAD**2))
-        spread_v = math.sqrt(max(seen_v**2 - noise**2, _LEAST_SPREAD**2))
+        spread_u = math.sqrt(max(seen_u**2 - noise**2, _MIN_SPREAD**2))
+        spread_v = math.sqrt(max(seen_v**2 - noise**2, _MIN_SPREAD**2))
         var_u, var_v = spread_u**2 + noise**2, spread_v**2 + noise**2
         near = (of_u - u) ** 2 / var_u + (of_v - v) ** 2 / var_v < _OF_CROWD**2
     tint_u, tint_v = element_at(table[TINT_U][tall], 0.5), element_at(table[TINT_V][tall], 0.5)
     size = math.hypot(tint_u, tint_v)
     across = math.hypot(spread_u, spread_v)
-    if size > _LEAST_SPREAD:
+    if size > _MIN_SPREAD:
         across = math.hypot(tint_v * spread_u, tint_u * spread_v) / size
     return u, v, spread_u, spread_v, across, int(np.count_nonzero(near))
 
@@ -412,8 +410,8 @@ def _learn_beside_paint(
     line_u, line_v = line_u / size, line_v / size
     off_along = np.abs(line_u * of_u + line_v * of_v - size)
     off_across = np.abs(line_v * of_u - line_u * of_v)
-    along = max(_MAD_TO_SIGMA * element_at(off_along, 0.5) / size, _LEAST_SCATTER)
-    across = max(_MAD_TO_SIGMA * element_at(off_across, 0.5) / size, _LEAST_SCATTER)
+    along = max(_MAD_TO_SIGMA * element_at(off_along, 0.5) / size, _MIN_SCATTER)
+    across = max(_MAD_TO_SIGMA * element_at(off_across, 0.5) / size, _MIN_SCATTER)
     return line_u, line_v, max(size, RATIO_LEAST), sigma, along, across
 
 
@@ -421,7 +419,7 @@ def _learn_beside_paint(
 def _is_near(step_u: float, step_v: float, u: float, v: float) -> bool:
     """Return whether a chroma step is within the widest angle of a direction."""
     along = u * step_u + v * step_v
-    return along > 0.0 and along**2 > _LEAST_COSINE**2 * (step_u**2 + step_v**2)
+    return along > 0.0 and along**2 > _MIN_COSINE**2 * (step_u**2 + step_v**2)
 
 
 @inline_kernel
@@ -511,7 +509,7 @@ def _weigh(
             beyond_u, beyond_v = _beyond_paint(table, i, left, _TINT_SHARE, _PAINT_SHARE * line)
             off_paint = (beyond_u**2 + beyond_v**2) / (sigma**2 + (_RATIO_OF_PAINT * height) ** 2)
         log_odds = 0.5 * (off_paint - off_line**2 / var_along - across**2 / var_across)
-        if size > _CLEAR_SIGMAS * sigma and along < _LEAST_COSINE * left * size:
+        if size > _CLEAR_SIGMAS * sigma and along < _MIN_COSINE * left * size:
             # Light of another colour.
             log_odds = -_MAX_LOG_ODDS
         odds[i] = math.exp(min(max(log_odds, -_MAX_LOG_ODDS), _MAX_LOG_ODDS))

@@ -3,9 +3,9 @@
 `describe_pattern` classifies the stripes on a surface by their lit lengths and gaps. A net is the
 only surface through which another one is seen: along a stripe, light on it alternates with light
 behind it (`seen_through`). The flanks of a fold, which are found as planes of their own, lie side
-by side, and the one begins where the other ends (`continues`); `joined_plane` gives their plane.
-For a net that is mostly folds `fit_mean` fits the mean plane, and `doubted` widens the covariance
-of a posture that disagrees with it.
+by side, and the one begins where the other ends (`is_continuation`); `merged_plane` gives their
+plane. For a net that is mostly folds `fit_mean` fits the mean plane, and `inflate_covariance`
+widens the covariance of a posture that disagrees with it.
 """
 
 from collections.abc import Sequence
@@ -18,15 +18,15 @@ from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import kernel
 from aqualvs.geometry.linear_algebra import invert_symmetric, solve_symmetric
 from aqualvs.geometry.planes import Plane
-from aqualvs.scanning.candidates import Chunks
+from aqualvs.scanning.candidates import Subsegments
 from aqualvs.scanning.plane_fit import PlaneFit, normal_equations
 from aqualvs.scanning.plane_search import WEIGHT, X, Z
 from aqualvs.scanning.posture import Posture
 
 # Transitions along the stripes, as a share of those in random order: with fewer, surfaces are side
 # by side; with more, one is seen through the other, if there are enough transitions.
-_MOST_TURNS = 0.5
-_LEAST_TURNS = 0.6
+_MAX_TURNS = 0.5
+_MIN_TURNS = 0.6
 _ENOUGH_TURNS = 8
 # The steepest flank of a fold, and what noise adds to the step from one piece to the next, as a
 # share of the range.
@@ -38,7 +38,9 @@ _MOST = 0.5
 _MAIN_SHARE = 0.5
 
 
-def continues(plane: Plane, first: BoolArray, second: BoolArray, chunks: Chunks) -> bool:
+def is_continuation(
+    plane: Plane, first: BoolArray, second: BoolArray, subsegments: Subsegments
+) -> bool:
     """Return whether one surface continues, side by side, as another one.
 
     Parameters
@@ -46,31 +48,31 @@ def continues(plane: Plane, first: BoolArray, second: BoolArray, chunks: Chunks)
     plane : Plane
         Of the first.
     first, second : bool array, shape (C,)
-        Chunks on them.
-    chunks : Chunks
+        Subsegments on them.
+    subsegments : Subsegments
         C of them.
     """
     packed = np.append(plane.normal, plane.offset)
     turns, at_random, met = _turns(
-        chunks.table, chunks.laser, chunks.first_line, first, second, packed
+        subsegments.table, subsegments.laser, subsegments.first_line, first, second, packed
     )
-    return bool(0 < turns <= max(_MOST_TURNS * at_random, 1.0) and met >= _MOST * turns)
+    return bool(0 < turns <= max(_MAX_TURNS * at_random, 1.0) and met >= _MOST * turns)
 
 
-def seen_through(first: BoolArray, second: BoolArray, chunks: Chunks) -> bool:
+def seen_through(first: BoolArray, second: BoolArray, subsegments: Subsegments) -> bool:
     """Return whether one surface is seen through the gaps of another.
 
     Parameters
     ----------
     first, second : bool array, shape (C,)
-        Chunks on them.
-    chunks : Chunks
+        Subsegments on them.
+    subsegments : Subsegments
         C of them.
     """
     turns, at_random, _ = _turns(
-        chunks.table, chunks.laser, chunks.first_line, first, second, np.zeros(4)
+        subsegments.table, subsegments.laser, subsegments.first_line, first, second, np.zeros(4)
     )
-    return bool(turns >= _ENOUGH_TURNS and turns >= _LEAST_TURNS * at_random)
+    return bool(turns >= _ENOUGH_TURNS and turns >= _MIN_TURNS * at_random)
 
 
 @kernel
@@ -106,7 +108,7 @@ def _turns(
 
 @kernel
 def _meet(table: FloatArray, a: int, b: int, plane: FloatArray) -> bool:
-    """Return whether the step from one chunk to another is one that a fold makes."""
+    """Return whether the step from one subsegment to another is one that a fold makes."""
     square = 0.0
     step = 0.0
     for k in range(3):
@@ -117,7 +119,9 @@ def _meet(table: FloatArray, a: int, b: int, plane: FloatArray) -> bool:
     return bool(abs(step) <= _STEEPEST * beside + _LOOSE_SHARE * plane[3])
 
 
-def joined_plane(planes: Sequence[Plane], members: Sequence[BoolArray], chunks: Chunks) -> Plane:
+def merged_plane(
+    planes: Sequence[Plane], members: Sequence[BoolArray], subsegments: Subsegments
+) -> Plane:
     """Return the plane of a net in several pieces: that of the main one, else the mean.
 
     Parameters
@@ -125,17 +129,17 @@ def joined_plane(planes: Sequence[Plane], members: Sequence[BoolArray], chunks: 
     planes : sequence of Plane
         Of the pieces.
     members : sequence of bool array, shape (C,)
-        Chunks on them.
-    chunks : Chunks
+        Subsegments on them.
+    subsegments : Subsegments
         C of them.
     """
-    voice = np.array([chunks.table[WEIGHT] @ mine for mine in members])
-    main = int(np.argmax(voice))
-    if voice[main] > _MAIN_SHARE * voice.sum():
+    sampling_weight = np.array([subsegments.table[WEIGHT] @ mine for mine in members])
+    main = int(np.argmax(sampling_weight))
+    if sampling_weight[main] > _MAIN_SHARE * sampling_weight.sum():
         return planes[main]
     mine = np.logical_or.reduce(members)
-    weight = np.sqrt(chunks.table[WEIGHT, mine])
-    points = chunks.table[X : Z + 1, mine].T
+    weight = np.sqrt(subsegments.table[WEIGHT, mine])
+    points = subsegments.table[X : Z + 1, mine].T
     m = np.linalg.lstsq(weight[:, None] * points, weight)[0]
     length = float(np.linalg.norm(m))
     return Plane(m / length, 1.0 / length)
@@ -203,7 +207,7 @@ def _distances(points: FloatArray, m: FloatArray, off: FloatArray) -> None:
         off[i] = m[0] * points[i, 0] + m[1] * points[i, 1] + m[2] * points[i, 2] - 1.0
 
 
-def doubted(posture: Posture, other: Posture, share: float) -> Posture:
+def inflate_covariance(posture: Posture, other: Posture, share: float) -> Posture:
     """Return a posture with its covariance inflated by its difference from another one.
 
     Parameters
@@ -237,45 +241,45 @@ def _apart(posture: Posture, other: Posture) -> FloatArray:
     )
 
 
-# Duty of a mesh at most: a typical lit stretch over the sum of it and a typical gap. The gaps of a
+# Duty of a mesh at most: a typical lit interval over the sum of it and a typical gap. The gaps of a
 # net are longer than the lit strands; a wall behind a net is lit between short shadows.
 _MESH_DUTY = 0.6
 # Below this duty the gaps are real, not specks: a dense net, or a wall in a net's shadows.
 _GAPPY_DUTY = 0.9
-# Lit stretches with fewer dark search lines between them are one.
+# Lit intervals with fewer dark search lines between them are one.
 _MIN_GAP_LINES = 3
-_MIN_STRETCHES = 3
-# This many short stretches on all lasers, and none longer, are a net of which little is seen.
-_FEW_STRETCHES = 5
-LONGEST_STRETCH = 0.03
+_MIN_INTERVALS = 3
+# This many short intervals on all lasers, and none longer, are a net of which little is seen.
+_FEW_INTERVALS = 5
+LONGEST_INTERVAL = 0.03
 """The light on one strand is typically shorter than this, in metres."""
-# A stripe with this share of its light in stretches so much longer lies on something solid that is
+# A stripe with this share of its light in intervals so much longer lies on something solid that is
 # partly hidden or broken by its texture; growth and strands along a laser make few of them.
 _UNBROKEN_SHARE, _UNBROKEN_LENGTHS = 0.4, 2.0
-# A chunk whose sampling weight is a smaller share of its light lies in a curved stretch.
-_CURVED_VOICE = 0.21
+# A subsegment whose sampling weight is a smaller share of its light lies in a curved component.
+_CURVED_WEIGHT = 0.21
 # Share of the lines at each end of a stripe that may be stragglers.
 _STRAGGLERS = 0.1
 
 
-class Pattern(NamedTuple):
-    """Pattern of lit stretches and gaps of the stripes on a surface.
+class StripePattern(NamedTuple):
+    """Pattern of lit intervals and gaps of the stripes on a surface.
 
     Attributes
     ----------
     is_mesh : bool
-        As on a net: two lasers (or the only one asked) show short lit stretches between longer
+        As on a net: two lasers (or the only one asked) show short lit intervals between longer
         gaps. One laser may run along a strand and look unbroken even on a net. Where little is
-        seen, a few short stretches and nothing longer are enough.
+        seen, a few short intervals and nothing longer are enough.
     is_gappy : bool
-        As on a dense net, or as on a wall in the shadows of a net: short stretches at any gaps.
+        As on a dense net, or as on a wall in the shadows of a net: short intervals at any gaps.
     is_unbroken : bool
         As on something solid, if need be with gaps: on two lasers (or the only one asked) much
-        of the light is in stretches longer than those on strands.
+        of the light is in intervals longer than those on strands.
     extent : float
         Search lines over which the gappy stripes reach, summed over the lasers.
     on_strands : array, shape (n_lasers,)
-        Light in stretches as short as those on a strand, and not curved.
+        Light in intervals as short as those on a strand, and not curved.
     """
 
     is_mesh: bool
@@ -286,13 +290,13 @@ class Pattern(NamedTuple):
 
 
 def describe_pattern(
-    chunks: Chunks, members: BoolArray, n_lasers: int, min_lines: int, focal_px: float
-) -> Pattern:
+    subsegments: Subsegments, members: BoolArray, n_lasers: int, min_lines: int, focal_px: float
+) -> StripePattern:
     """Describe the stripes on a surface.
 
     Parameters
     ----------
-    chunks : Chunks
+    subsegments : Subsegments
         C of them.
     members : bool array, shape (C,)
         Those on the surface.
@@ -305,28 +309,28 @@ def describe_pattern(
 
     Returns
     -------
-    Pattern
+    StripePattern
     """
     on_strands = np.zeros(n_lasers)
     is_mesh, is_gappy, is_unbroken, extent = _describe(
-        chunks.table,
-        chunks.light,
-        chunks.n_lines,
-        chunks.first_line,
-        chunks.last_line,
-        chunks.laser,
+        subsegments.table,
+        subsegments.intensity_weight,
+        subsegments.n_lines,
+        subsegments.first_line,
+        subsegments.last_line,
+        subsegments.laser,
         members,
         min_lines,
         focal_px,
         on_strands,
     )
-    return Pattern(is_mesh, is_gappy, is_unbroken, extent, on_strands)
+    return StripePattern(is_mesh, is_gappy, is_unbroken, extent, on_strands)
 
 
 @kernel
 def _describe(
     table: FloatArray,
-    light: FloatArray,
+    intensity_weight: FloatArray,
     n_lines: IntArray,
     first_line: IntArray,
     last_line: IntArray,
@@ -336,8 +340,8 @@ def _describe(
     focal_px: float,
     on_strands: FloatArray,
 ) -> tuple[bool, bool, bool, float]:
-    """Write the light on strands; returns the rest of a `Pattern`."""
-    asked, broken, gappy, long, unbroken, n_stretches = 0, 0, 0, 0, 0, 0
+    """Write the light on strands; returns the rest of a `StripePattern`."""
+    asked, broken, gappy, long, unbroken, n_intervals = 0, 0, 0, 0, 0, 0
     total = 0.0
     for index in range(on_strands.shape[0]):
         order, n_mine = _in_order(first_line, n_lines, laser, members, index)
@@ -345,17 +349,17 @@ def _describe(
             continue
         asked += 1
         n, duty, length, extent, on_strands[index], share = _describe_stripe(
-            table, light, n_lines, first_line, last_line, order, focal_px
+            table, intensity_weight, n_lines, first_line, last_line, order, focal_px
         )
-        n_stretches += n
+        n_intervals += n
         unbroken += share >= _UNBROKEN_SHARE
-        is_short = length < LONGEST_STRETCH
+        is_short = length < LONGEST_INTERVAL
         long += not is_short
-        is_gappy = n >= _MIN_STRETCHES and is_short and duty < _GAPPY_DUTY
+        is_gappy = n >= _MIN_INTERVALS and is_short and duty < _GAPPY_DUTY
         gappy += is_gappy
         broken += is_gappy and duty < _MESH_DUTY
         total += extent if is_gappy else 0.0
-    few = not long and gappy == broken and n_stretches >= _FEW_STRETCHES
+    few = not long and gappy == broken and n_intervals >= _FEW_INTERVALS
     enough = min(2, asked)
     return broken >= enough or few, gappy >= enough or few, unbroken >= enough, total
 
@@ -364,12 +368,12 @@ def _describe(
 def _in_order(
     first_line: IntArray, n_lines: IntArray, laser: IntArray, members: BoolArray, index: int
 ) -> tuple[IntArray, int]:
-    """Return a laser's chunks on a surface in their order along the stripe, and their lines."""
+    """Return a laser's subsegments on a surface, in order along the stripe, and their lines."""
     order, n, total = np.empty(members.shape[0], np.int64), 0, 0
     for c in range(members.shape[0]):
         if not members[c] or laser[c] != index:
             continue
-        # Chunks come almost in order.
+        # Subsegments come almost in order.
         at = n
         while at > 0 and first_line[order[at - 1]] > first_line[c]:
             order[at] = order[at - 1]
@@ -383,21 +387,21 @@ def _in_order(
 @kernel
 def _describe_stripe(
     table: FloatArray,
-    light: FloatArray,
+    intensity_weight: FloatArray,
     n_lines: IntArray,
     first_line: IntArray,
     last_line: IntArray,
     order: IntArray,
     focal_px: float,
 ) -> tuple[int, float, float, float, float, float]:
-    """Return number, duty, typical length (m), extent and light on strands of a laser's stretches.
+    """Return number, duty, typical length (m), extent and light on strands of a laser's intervals.
 
-    The last value is the share of the lit search lines in stretches much longer than a strand's
+    The last value is the share of the lit search lines in intervals much longer than a strand's
     light. Medians are used, so that parts hidden by a fish or a box do not count.
     """
     n = order.shape[0]
     lit, dark, distance, bright = np.empty(n), np.empty(n), np.empty(n), np.zeros(n)
-    n_stretches = 0
+    n_intervals = 0
     begin = first_line[order[0]]
     end = last_line[order[0]] + 1
     for k in range(n):
@@ -405,29 +409,29 @@ def _describe_stripe(
         distance[k] = np.sqrt(table[0, c] ** 2 + table[1, c] ** 2 + table[2, c] ** 2)
         gap = first_line[c] - end
         if gap >= _MIN_GAP_LINES:
-            lit[n_stretches] = end - begin
-            dark[n_stretches] = gap
-            n_stretches += 1
+            lit[n_intervals] = end - begin
+            dark[n_intervals] = gap
+            n_intervals += 1
             begin = first_line[c]
         end = max(end, last_line[c] + 1)
-        if table[WEIGHT, c] > _CURVED_VOICE * light[c]:
-            bright[n_stretches] += light[c]
+        if table[WEIGHT, c] > _CURVED_WEIGHT * intensity_weight[c]:
+            bright[n_intervals] += intensity_weight[c]
     extent = _extent(n_lines, first_line, last_line, order)
-    gap = np.median(dark[:n_stretches]) if n_stretches else 0.0
-    lit[n_stretches] = end - begin
-    n_stretches += 1
-    stretch = np.median(lit[:n_stretches])
+    gap = np.median(dark[:n_intervals]) if n_intervals else 0.0
+    lit[n_intervals] = end - begin
+    n_intervals += 1
+    component = np.median(lit[:n_intervals])
     m_per_line = np.median(distance) / focal_px
     on_strands, all_lines, unbroken = 0.0, 0.0, 0.0
-    for k in range(n_stretches):
+    for k in range(n_intervals):
         all_lines += lit[k]
-        if lit[k] * m_per_line < LONGEST_STRETCH:
+        if lit[k] * m_per_line < LONGEST_INTERVAL:
             on_strands += bright[k]
-        elif lit[k] * m_per_line > _UNBROKEN_LENGTHS * LONGEST_STRETCH:
+        elif lit[k] * m_per_line > _UNBROKEN_LENGTHS * LONGEST_INTERVAL:
             unbroken += lit[k]
     share = float(unbroken / all_lines)
-    duty = float(stretch / (stretch + gap))
-    return n_stretches, duty, float(stretch * m_per_line), extent, on_strands, share
+    duty = float(component / (component + gap))
+    return n_intervals, duty, float(component * m_per_line), extent, on_strands, share
 
 
 @kernel

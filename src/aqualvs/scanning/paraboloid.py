@@ -50,12 +50,12 @@ _REWEIGHTS = 6
 # Largest curvature: a net does not bend with a radius below half a metre.
 _STRONGEST = 2.0
 # Curvature is fitted when it gains this share of the light or of the scatter ...
-_MORE_LIGHT = 1.10
+_MORE_INTENSITY = 1.10
 _LESS_SCATTER = 0.6
 # ... and the curvature is significant.
 _SIGNIFICANT = 6.0
 # A pivot below this share of its diagonal is rounding, not information.
-_LEAST_PIVOT = 1e-13
+_MIN_PIVOT = 1e-13
 
 
 @kernel
@@ -68,7 +68,7 @@ def fit_over(
     gates: float,
     shift_px: float,
     tilt_px: float,
-    least_bend: float,
+    min_bend: float,
     inside: BoolArray,
     patch: FloatArray,
     covariance: FloatArray,
@@ -84,7 +84,7 @@ def fit_over(
         The fit begins with observations within this many gates of the base; 0: with `inside`.
     shift_px, tilt_px : float
         Errors that each laser's stripe shares, as standard deviations.
-    least_bend : float
+    min_bend : float
         Share of the range by which the net must bend where it is seen.
     inside : bool array, shape (M,)
         Initial observations, unless `gates` selects them; then those of the grown fit.
@@ -121,7 +121,7 @@ def fit_over(
     for i in range(n):
         pull[i] = weights[i] * per_px[i] / (sigma[i] * sigma[i])
     add_shared(terms, pull, line, laser, shift_px, tilt_px, inverse, covariance)
-    enough = least_bend * patch[OFFSET]
+    enough = min_bend * patch[OFFSET]
     asked = _asked_for(terms, height, inside, coefficients, covariance, n_on_plane, enough, rms)
     return True, asked, rms
 
@@ -134,7 +134,7 @@ def _asked_for(
     coefficients: FloatArray,
     covariance: FloatArray,
     n_on_plane: int,
-    least_bend: float,
+    min_bend: float,
     rms: float,
 ) -> bool:
     """Return whether the residual of the base plane asks for curvature."""
@@ -148,7 +148,7 @@ def _asked_for(
             least, most = min(least, bend), max(most, bend)
             square += height[i] * height[i]
             n_inside += 1
-    if most - least < least_bend:
+    if most - least < min_bend:
         return False
     sigmas = 0.0
     for k in range(3, N):
@@ -156,11 +156,11 @@ def _asked_for(
     if sigmas < _SIGNIFICANT:
         return False
     less = rms < _LESS_SCATTER * np.sqrt(square / n_inside)
-    return bool(n_inside >= _MORE_LIGHT * n_on_plane or less)
+    return bool(n_inside >= _MORE_INTENSITY * n_on_plane or less)
 
 
 @kernel
-def hinted_curvature(
+def curvature_hint(
     points: FloatArray,
     sensitivity: FloatArray,
     sigma_px: FloatArray,
@@ -239,7 +239,7 @@ def _solve(
             right[j] += part * height[i]
             for k in range(j + 1):
                 factor[j, k] += part * terms[i, k]
-    if not factorise(factor, 0.0, _LEAST_PIVOT, factor):
+    if not factorise(factor, 0.0, _MIN_PIVOT, factor):
         return False
     solve_factorised(factor, right, coefficients)
     return True
@@ -406,18 +406,18 @@ def add_shared(
 
 __all__ = (
     "FLAT",
-    "LEAST_BEND",
+    "MIN_BEND",
     "Patch",
     "PatchFit",
     "fit_patch",
     "flat_patch",
-    "hints_at_curvature",
     "nearest_tangent",
     "refit_at_nearest",
+    "shows_curvature",
     "tangent_covariance",
 )
 
-LEAST_BEND = 0.003
+MIN_BEND = 0.003
 """Least bend of a curved net where it is seen, as a share of the range."""
 
 _WIDE_GATE = 3.0
@@ -426,7 +426,7 @@ _HINT = 2.0
 _LOOSENED = 1.5
 
 
-def hints_at_curvature(seen: Observations, weights: FloatArray, plane: Plane) -> bool:
+def shows_curvature(seen: Observations, weights: FloatArray, plane: Plane) -> bool:
     """Return whether the residuals of a plane fit look bent: a cheap test before a patch fit.
 
     Parameters
@@ -439,24 +439,24 @@ def hints_at_curvature(seen: Observations, weights: FloatArray, plane: Plane) ->
         The fit.
     """
     flat = packed_plane(plane)
-    hint = hinted_curvature(seen.points, seen.sensitivity, seen.sigma_px, weights, flat)
+    hint = curvature_hint(seen.points, seen.sensitivity, seen.sigma_px, weights, flat)
     return bool(hint > _HINT)
 
 
 def fit_patch(
-    seen: Observations, plane: Plane, shared: SharedError, least_bend: float = LEAST_BEND
+    seen: Observations, plane: Plane, shared: SharedError, min_bend: float = MIN_BEND
 ) -> PatchFit | None:
     """Fit a patch to M observations, if they are not fitted as well by a plane.
 
     Parameters
     ----------
     seen : Observations
-        Of strands on the target and of any others that may lie on it, wrong readings included.
+        Of strands on the target and of any others that may lie on it, wrong candidates included.
     plane : Plane
         As the search found it.
     shared : SharedError
         Errors that each laser's stripe shares.
-    least_bend : float
+    min_bend : float
         Share of the range by which the net must bend where it is seen.
 
     Returns
@@ -465,8 +465,8 @@ def fit_patch(
         None where a plane is as good, or the curvature is not determined.
     """
     # Few strands of a coarse net are on the plane, and the others not far from it.
-    first = _fit_over(seen, plane, shared, 1.0, least_bend)
-    first = first or _fit_over(seen, plane, shared, _WIDE_GATE, least_bend)
+    first = _fit_over(seen, plane, shared, 1.0, min_bend)
+    first = first or _fit_over(seen, plane, shared, _WIDE_GATE, min_bend)
     return first.fit if first is not None and first.asked_for else None
 
 
@@ -509,7 +509,7 @@ def _fit_over(
     plane: Plane,
     shared: SharedError,
     start: BoolArray | float,
-    least_bend: float = LEAST_BEND,
+    min_bend: float = MIN_BEND,
 ) -> _Attempt | None:
     """Fit a patch over a plane, grown from given observations or from those within some gates."""
     n = len(seen.line)
@@ -524,7 +524,7 @@ def _fit_over(
         start if isinstance(start, float) else 0.0,
         shared.shift_px,
         shared.tilt_px,
-        least_bend,
+        min_bend,
         inside,
         patch,
         covariance,

@@ -21,7 +21,7 @@ SIGMA_CURVATURE, SIGMA_TWIST = 2.0, 0.5
 
 # Newton steps of the search for the nearest point, which must go downhill.
 _FOOT_STEPS = 12
-_LEAST_CURVED = 0.05
+_MIN_CURVED = 0.05
 
 
 @borrowing_kernel
@@ -77,7 +77,7 @@ def write_tangent(patch: FloatArray, m: FloatArray) -> bool:
         uu, vv = 1.0 + slope_u * slope_u + reach * p, 1.0 + slope_v * slope_v + reach * r
         uv = slope_u * slope_v + reach * q
         determinant = uu * vv - uv * uv
-        if determinant <= _LEAST_CURVED or uu <= _LEAST_CURVED:
+        if determinant <= _MIN_CURVED or uu <= _MIN_CURVED:
             return False
         u -= (vv * by_u - uv * by_v) / determinant
         v -= (uu * by_v - uv * by_u) / determinant

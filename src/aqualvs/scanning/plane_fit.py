@@ -99,8 +99,8 @@ def fit_robust(
     ----------
     points, sensitivity : array, shape (N, 3)
         Points in `dome` (m) and their derivatives by the stripe's position (m/px). Errors of
-        different points should be independent: take centroids of chunks rather than single
-        returns, which share the errors of their neighbours.
+        different points should be independent: take centroids of subsegments rather than single
+        peaks, which share the errors of their neighbours.
     sigma_px : array, shape (N,)
         Least standard deviation of the stripe's position; greater scatter is recognised.
     laser : int array, shape (N,)

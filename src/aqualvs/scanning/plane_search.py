@@ -1,13 +1,14 @@
 """Search for one plane among subsegments: a deterministic, locally optimised RANSAC.
 
 Samples are taken among neighbours (after NAPSAC, Myatt et al. 2002, doi:10.5244/C.16.44):
-subsegments (chunks) next to each other on a stripe more likely share a surface than distant ones,
-and those with a larger sampling weight (`voice`) more likely lie on any surface than specks.
+subsegments next to each other on a stripe more likely share a surface than distant ones,
+and those with a larger sampling weight more likely lie on any surface than specks.
 Hypotheses are scored by MSAC (Torr & Zisserman 2000, doi:10.1006/cviu.1999.0832), and the promising
 ones are refined.
 
-Chunks come as a table, one column a chunk and one row a quantity, so that scoring a hypothesis
-runs along memory and is vectorised; the scores are then summed chunk by chunk, in a fixed order.
+Subsegments come as a table, one column a subsegment and one row a quantity, so that scoring a
+hypothesis runs along memory and is vectorised; the scores are then summed subsegment by subsegment,
+in a fixed order.
 """
 
 import numpy as np
@@ -23,36 +24,36 @@ from aqualvs.geometry.linear_algebra import solve_symmetric
 from aqualvs.geometry.quantile import sum_of
 
 X, Y, Z, JX, JY, JZ, WEIGHT = range(7)
-"""Rows of the table: centroid (m), sensitivity (m/px), voice (search lines)."""
+"""Rows of the table: centroid (m), sensitivity (m/px), sampling weight (search lines)."""
 N_ROWS = 7
 
 _MAX_HYPOTHESES = 6000
 # Trials for a plane, times the square of its share of the sampling weight; beyond the second number
 # in total, only this part of them.
 _TRIALS, _MANY, _SOME = 45.0, 2500.0, 0.55
-# Limit of the chunks scored in total: a frame full of noise must not delay a live run.
+# Limit of the subsegments scored in total: a frame full of noise must not delay a live run.
 _MAX_WORK = 10_000_000
-# Chunks scored between checks whether the rest can change the result.
+# Subsegments scored between checks whether the rest can change the result.
 _STEP = 32
-# A neighbour for sampling lies at most this many chunks away in the same laser's list.
+# A neighbour for sampling lies at most this many subsegments away in the same laser's list.
 _NEIGHBOURHOOD = 8
-# Chunks with a smaller share of the typical sampling weight are not sampled.
-_SOFTEST_SHARE = 0.5
+# Subsegments with a smaller share of the typical sampling weight are not sampled.
+_LIGHTEST_SHARE = 0.5
 MIN_FACING = float(np.cos(np.deg2rad(55.0)))
 """Limit of a normal's deviation from the forward axis: others are no target ahead."""
-# Distance of a chunk from a plane: this share of the range, and this shift of the stripe.
+# Distance of a subsegment from a plane: this share of the range, and this shift of the stripe.
 _GATE_RANGE_SHARE = 0.003
 _GATE_PX = 1.0
 # Gate of a hypothesis before it is refined, and how near the best one it must come for that.
 _WIDE_GATE = 3.0
 _WORTH_REFINING = 0.8
 # Largest weight of the best laser relative to the second: a plane needs two lasers.
-MOST_TO_SECOND = 3.0
+MAX_TO_SECOND = 3.0
 
 
 @inline_kernel
 def squared_gate(per_px: float, offset: float) -> float:
-    """Return the square of the largest distance (m) at which a chunk belongs to a plane."""
+    """Return the square of the largest distance (m) at which a subsegment belongs to a plane."""
     by_range = _GATE_RANGE_SHARE * offset
     by_pixel = _GATE_PX * per_px
     return by_range * by_range + by_pixel * by_pixel
@@ -63,15 +64,15 @@ def _score(
     table: FloatArray,
     laser_start: IntArray,
     plane: FloatArray,
-    stretch: float,
-    voice_after: FloatArray,
+    gate_scale: float,
+    weight_after: FloatArray,
     enough: float,
     lanes: FloatArray,
 ) -> float:
-    """Return the MSAC score of a plane (normal, offset) with a gate `stretch` times as wide.
+    """Return the MSAC score of a plane (normal, offset) with a gate `gate_scale` times as wide.
 
-    The score is 0 if a partial sum shows that it cannot exceed `enough`. `voice_after` holds the
-    sampling weight of each chunk and all after it; `lanes` is overwritten.
+    The score is 0 if a partial sum shows that it cannot exceed `enough`. `weight_after` holds the
+    sampling weight of each subsegment and all after it; `lanes` is overwritten.
     """
     first = 0.0
     second = 0.0
@@ -81,28 +82,33 @@ def _score(
         at, end = laser_start[i_laser], laser_start[i_laser + 1]
         while at < end:
             stop = min(at + _STEP, end)
-            value += _near(table, at, stop, plane, stretch * stretch, lanes)
-            if total + value + voice_after[stop] <= enough:
+            value += _near(table, at, stop, plane, gate_scale * gate_scale, lanes)
+            if total + value + weight_after[stop] <= enough:
                 return 0.0
             at = stop
         total += value
         second = max(second, min(first, value))
         first = max(first, value)
-    return min(total, total - first + MOST_TO_SECOND * second)
+    return min(total, total - first + MAX_TO_SECOND * second)
 
 
 @inline_borrowing_kernel
 def _near(
-    table: FloatArray, at: int, stop: int, plane: FloatArray, stretch_2: float, lanes: FloatArray
+    table: FloatArray,
+    at: int,
+    stop: int,
+    plane: FloatArray,
+    squared_gate_scale: float,
+    lanes: FloatArray,
 ) -> float:
-    """Sum the sampling weights of some chunks, scaled by their closeness to a plane."""
+    """Sum the sampling weights of some subsegments, scaled by their closeness to a plane."""
     x, y, z, weight = table[X], table[Y], table[Z], table[WEIGHT]
     jx, jy, jz = table[JX], table[JY], table[JZ]
     nx, ny, nz, offset = plane[0], plane[1], plane[2], plane[3]
     for k in range(at, stop):
         residual = nx * x[k] + ny * y[k] + nz * z[k] - offset
         gate = squared_gate(nx * jx[k] + ny * jy[k] + nz * jz[k], offset)
-        near = 1.0 - residual * residual / (stretch_2 * gate)
+        near = 1.0 - residual * residual / (squared_gate_scale * gate)
         lanes[k - at] = weight[k] * max(near, 0.0)
     value = 0.0
     for k in range(stop - at):
@@ -114,12 +120,12 @@ def _near(
 def refine_plane(
     table: FloatArray,
     plane: FloatArray,
-    stretch: float,
+    gate_scale: float,
     normal: FloatArray,
     scratch: FloatArray,
     lanes: FloatArray,
 ) -> bool:
-    """Refit the plane X·m = 1 (paper, Eq. 24) to the chunks in the widened gate, in place."""
+    """Refit the plane X·m = 1 (paper, Eq. 24) to the subsegments in the widened gate, in place."""
     x, y, z, weight = table[X], table[Y], table[Z], table[WEIGHT]
     jx, jy, jz = table[JX], table[JY], table[JZ]
     nx, ny, nz, offset = plane[0], plane[1], plane[2], plane[3]
@@ -127,7 +133,7 @@ def refine_plane(
     for k in range(n):
         residual = nx * x[k] + ny * y[k] + nz * z[k] - offset
         gate = squared_gate(nx * jx[k] + ny * jy[k] + nz * jz[k], offset)
-        lanes[k] = weight[k] / gate if residual * residual < stretch * stretch * gate else 0.0
+        lanes[k] = weight[k] / gate if residual * residual < gate_scale * gate_scale * gate else 0.0
     xx = yy = zz = xy = yz = zx = sx = sy = sz = 0.0
     for k in range(n):
         w = lanes[k]
@@ -159,7 +165,7 @@ def refine_plane(
 
 @inline_kernel
 def _plane_through(table: FloatArray, i: int, j: int, k: int, plane: FloatArray) -> bool:
-    """Write the plane through three chunks, normal outward; return False if they are collinear."""
+    """Write the plane through three subsegments, normal outward; return False if collinear."""
     ax, ay, az = table[X, i], table[Y, i], table[Z, i]
     ux, uy, uz = table[X, j] - ax, table[Y, j] - ay, table[Z, j] - az
     vx, vy, vz = table[X, k] - ax, table[Y, k] - ay, table[Z, k] - az
@@ -182,44 +188,44 @@ def _next_random(state: np.uint64) -> tuple[np.uint64, float]:
 
 
 @inline_borrowing_kernel
-def _pick(voice_up_to: FloatArray, guide: IntArray, draw: float) -> int:
-    """Draw a chunk with a probability proportional to its sampling weight."""
-    wanted = draw * voice_up_to[voice_up_to.shape[0] - 1]
+def _pick(cumulative_weight: FloatArray, guide: IntArray, draw: float) -> int:
+    """Draw a subsegment with a probability proportional to its sampling weight."""
+    wanted = draw * cumulative_weight[cumulative_weight.shape[0] - 1]
     at = guide[int(draw * guide.shape[0])]
-    while at > 0 and voice_up_to[at - 1] > wanted:
+    while at > 0 and cumulative_weight[at - 1] > wanted:
         at -= 1
-    while voice_up_to[at] <= wanted and at < voice_up_to.shape[0] - 1:
+    while cumulative_weight[at] <= wanted and at < cumulative_weight.shape[0] - 1:
         at += 1
     return int(at)
 
 
 @borrowing_kernel
-def _guide(voice_up_to: FloatArray, guide: IntArray) -> None:
-    """Write the start of the search in `_pick`, for draws in as many steps as there are chunks."""
+def _guide(cumulative_weight: FloatArray, guide: IntArray) -> None:
+    """Write the start of the search in `_pick`, for as many draws as there are subsegments."""
     n = guide.shape[0]
-    step = voice_up_to[n - 1] / n
+    step = cumulative_weight[n - 1] / n
     at = 0
     for k in range(n):
-        while at < n - 1 and voice_up_to[at] <= k * step:
+        while at < n - 1 and cumulative_weight[at] <= k * step:
             at += 1
         guide[k] = at
 
 
 @kernel
-def _middle_voice(voice: FloatArray) -> float:
+def _median_weight(sampling_weight: FloatArray) -> float:
     """Return the weighted median of the sampling weights."""
-    values = voice.copy()
-    wanted, below = 0.5 * sum_of(voice), 0.0
+    values = sampling_weight.copy()
+    wanted, below = 0.5 * sum_of(sampling_weight), 0.0
     low, high = 0, values.shape[0]
     while high - low > 1:
         pivot = values[(low + high) // 2]
         # Partition: smaller weights to the front, larger ones to the end.
         first, last, k = low, high, low
-        softer, same = 0.0, 0.0
+        lighter, same = 0.0, 0.0
         while k < last:
             one = values[k]
             if one < pivot:
-                softer += one
+                lighter += one
                 values[k], values[first] = values[first], one
                 first += 1
                 k += 1
@@ -229,23 +235,23 @@ def _middle_voice(voice: FloatArray) -> float:
             else:
                 same += one
                 k += 1
-        if below + softer >= wanted:
+        if below + lighter >= wanted:
             high = first
-        elif below + softer + same >= wanted:
+        elif below + lighter + same >= wanted:
             return float(pivot)
         else:
-            below += softer + same
+            below += lighter + same
             low = last
     return float(values[min(low, values.shape[0] - 1)])
 
 
 @kernel
-def _loud(voice: FloatArray) -> IntArray:
-    """Return the chunks to sample: those not much below the weighted median.
+def _heavy(sampling_weight: FloatArray) -> IntArray:
+    """Return the subsegments to sample: those not much below the weighted median.
 
     Where glare makes thousands of specks, most neighbours on a stripe would be specks.
     """
-    return np.flatnonzero(voice >= _SOFTEST_SHARE * _middle_voice(voice))
+    return np.flatnonzero(sampling_weight >= _LIGHTEST_SHARE * _median_weight(sampling_weight))
 
 
 @kernel
@@ -258,20 +264,20 @@ def search_plane(
     seed: int,
     best_plane: FloatArray,
 ) -> bool:
-    """Find the plane that chunks of at least two lasers agree on best.
+    """Find the plane that subsegments of at least two lasers agree on best.
 
     Parameters
     ----------
     table : array, shape (7, C)
-        Chunks, ordered by laser.
+        Subsegments, ordered by laser.
     laser : int array, shape (C,)
-        Index of each chunk's laser.
+        Index of each subsegment's laser.
     laser_start : int array, shape (n_lasers + 1,)
-        First chunk of each laser, and C.
+        First subsegment of each laser, and C.
     nearest, farthest : float
         Limits of the hypotheses, in metres.
     seed : int
-        The same seed and chunks give the same plane.
+        The same seed and subsegments give the same plane.
     best_plane : array, shape (4,)
         Written: unit normal, pointing outward, and offset.
     """
@@ -280,31 +286,31 @@ def search_plane(
     plane, normal, scratch = np.empty(4), np.empty((3, 3)), np.empty((5, 3))
     best = 0.0
     best_rough = 0.0
-    loud = _loud(table[WEIGHT])
-    n_loud = loud.shape[0]
-    voice_up_to = table[WEIGHT][loud]
-    for k in range(1, n_loud):
-        voice_up_to[k] += voice_up_to[k - 1]
-    guide = np.empty(n_loud, np.int64)
-    _guide(voice_up_to, guide)
-    voice_after = np.zeros(n + 1)
+    heavy = _heavy(table[WEIGHT])
+    n_heavy = heavy.shape[0]
+    cumulative_weight = table[WEIGHT][heavy]
+    for k in range(1, n_heavy):
+        cumulative_weight[k] += cumulative_weight[k - 1]
+    guide = np.empty(n_heavy, np.int64)
+    _guide(cumulative_weight, guide)
+    weight_after = np.zeros(n + 1)
     for c in range(n - 1, -1, -1):
-        voice_after[c] = voice_after[c + 1] + table[WEIGHT, c]
+        weight_after[c] = weight_after[c + 1] + table[WEIGHT, c]
     lanes = np.empty(max(n, _STEP))
-    total = voice_after[0]
+    total = weight_after[0]
     most = min(_MAX_HYPOTHESES, _MAX_WORK // n)
     needed = most
     trial = 0
     while trial < needed:
         trial += 1
         state, draw = _next_random(state)
-        at = _pick(voice_up_to, guide, draw)
+        at = _pick(cumulative_weight, guide, draw)
         state, draw = _next_random(state)
         beside = at + 1 + int(draw * _NEIGHBOURHOOD)
         state, draw = _next_random(state)
-        if beside >= n_loud or laser[loud[at]] != laser[loud[beside]]:
+        if beside >= n_heavy or laser[heavy[at]] != laser[heavy[beside]]:
             continue
-        i, j, k = loud[at], loud[beside], loud[_pick(voice_up_to, guide, draw)]
+        i, j, k = heavy[at], heavy[beside], heavy[_pick(cumulative_weight, guide, draw)]
         if laser[k] == laser[i]:
             continue
         if not _plane_through(table, i, j, k, plane):
@@ -313,14 +319,14 @@ def search_plane(
             continue
         # A plane through neighbours is rough: scored with a wide gate, refined with narrower ones.
         score = _score(
-            table, laser_start, plane, _WIDE_GATE, voice_after, _WORTH_REFINING * best_rough, lanes
+            table, laser_start, plane, _WIDE_GATE, weight_after, _WORTH_REFINING * best_rough, lanes
         )
         if score <= _WORTH_REFINING * best_rough:
             continue
         best_rough = max(best_rough, score)
-        for stretch in (_WIDE_GATE, 0.5 * (1.0 + _WIDE_GATE), 1.0):
-            refine_plane(table, plane, stretch, normal, scratch, lanes)
-        score = _score(table, laser_start, plane, 1.0, voice_after, best, lanes)
+        for gate_scale in (_WIDE_GATE, 0.5 * (1.0 + _WIDE_GATE), 1.0):
+            refine_plane(table, plane, gate_scale, normal, scratch, lanes)
+        score = _score(table, laser_start, plane, 1.0, weight_after, best, lanes)
         if score <= best:
             continue
         best = score

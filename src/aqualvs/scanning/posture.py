@@ -85,7 +85,7 @@ class Posture:
     n_points : int
         Number of inliers of the fit.
     rms : float
-        Root mean square distance of their chunks from the plane, in metres; from the curved
+        Root mean square distance of their subsegments from the plane, in metres; from the curved
         surface where there is one.
     curvature, sigma_curvature : (float, float) or None
         Of a curved net along the horizontal and along the vertical, in 1/m, and their standard
@@ -132,7 +132,7 @@ def posture_from_fit(fit: PlaneFit, points: FloatArray, camera_axis_in_dome: Flo
     camera_axis_in_dome : array, shape (3,)
         Unit vector along which the camera looks.
     """
-    n_points, nearest = rested_on(points, np.ones(len(points)))
+    n_points, nearest = count_inliers(points, np.ones(len(points)))
     return posture_of(fit, nearest, n_points, camera_axis_in_dome)
 
 
@@ -156,7 +156,7 @@ def posture_of(
     )
 
 
-def believable(
+def validate(
     posture: Posture, working_range: tuple[float, float], max_rms_share: float = MAX_RMS_SHARE
 ) -> Posture | Refusal:
     """Return the posture if a pilot may rely on it, else a refusal.
@@ -221,7 +221,7 @@ def _carry_over(
 
 
 @borrowing_kernel
-def rested_on(points: FloatArray, weights: FloatArray) -> tuple[int, float]:
+def count_inliers(points: FloatArray, weights: FloatArray) -> tuple[int, float]:
     """Return the number of points (N, 3) with a weight, and the least distance from the origin."""
     n, square = 0, np.inf
     for i in range(points.shape[0]):

@@ -1,8 +1,8 @@
 """The posture to one surface: its inliers, the fit to them, and the checks of the result.
 
-`PostureMeter.measure` selects the pieces of stripe on the surface, fits a plane or a paraboloid to
-them, follows a net where it leaves the surface, and replaces or widens the posture where a net is
-mostly folds.
+`PostureEstimator.measure` selects the pieces of stripe on the surface, fits a plane or a paraboloid
+to them, follows a net where it leaves the surface, and replaces or widens the posture where a net
+is mostly folds.
 """
 
 import math
@@ -18,10 +18,10 @@ from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel,
 from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.sheet import COLUMNS, START, WINDOWED, sheet_distance, sheets_of
-from aqualvs.scanning.candidates import Observations, Readings
-from aqualvs.scanning.laser_bands import StripeSearch
-from aqualvs.scanning.net_surfaces import disagreement, doubted, fit_mean
-from aqualvs.scanning.paraboloid import LEAST_BEND, fit_patch, hints_at_curvature, refit_at_nearest
+from aqualvs.scanning.candidates import Candidates, Observations
+from aqualvs.scanning.laser_bands import LaserBand
+from aqualvs.scanning.net_surfaces import disagreement, fit_mean, inflate_covariance
+from aqualvs.scanning.paraboloid import MIN_BEND, fit_patch, refit_at_nearest, shows_curvature
 from aqualvs.scanning.patch import (
     Patch,
     heights_over,
@@ -38,8 +38,8 @@ from aqualvs.scanning.plane_fit import (
     fit_pseudo_inverse,
     fit_robust,
 )
-from aqualvs.scanning.posture import MAX_RMS_SHARE, Posture, Reason, Refusal, believable, posture_of
-from aqualvs.scanning.region_growing import SOME, follow_net, much_beside
+from aqualvs.scanning.posture import MAX_RMS_SHARE, Posture, Reason, Refusal, posture_of, validate
+from aqualvs.scanning.region_growing import SOME, grow_region, has_much_beside
 from aqualvs.scanning.surfaces import Surface
 
 # Reach of a crossing: this many full widths of the stripes, and this many pixels more.
@@ -48,11 +48,11 @@ _CROSSING_PX = 2.0
 
 
 @kernel
-def select_pieces(
+def select_units(
     points: FloatArray,
     laser: IntArray,
     width: FloatArray,
-    piece: IntArray,
+    unit: IntArray,
     min_lines: int,
     on_target: BoolArray,
     planes: FloatArray,
@@ -67,13 +67,13 @@ def select_pieces(
     Parameters
     ----------
     points, laser, width
-        Of N readings.
-    piece : int array, shape (N,)
-        Number of each candidate's piece: its stretch or its chunk.
+        Of N candidates.
+    unit : int array, shape (N,)
+        Number of each candidate's piece: its component or its subsegment.
     min_lines : int
         Shorter pieces are left out.
     on_target : bool array, shape (N,)
-        Readings on the target.
+        Candidates on the target.
     planes : array, shape (n_lasers, 4)
         The lasers' sheets, normal and offset.
     bent : array, shape (n_lasers, COLUMNS), or None
@@ -85,38 +85,38 @@ def select_pieces(
 
     Returns
     -------
-    n_groups, n_readings : int
+    n_groups, n_candidates : int
         Number of groups, and of candidates in them.
     """
-    number = _pieces_on(piece, min_lines, on_target)
-    mean_width = _mean_widths(laser, width, piece, number, planes.shape[0])
+    number = _units_on(unit, min_lines, on_target)
+    mean_width = _mean_widths(laser, width, unit, number, planes.shape[0])
     n_groups = 0
-    n_readings = 0
-    for i in range(piece.shape[0]):
+    n_candidates = 0
+    for i in range(unit.shape[0]):
         group[i] = -1
-        p = piece[i]
+        p = unit[i]
         if number[p] == -1 or in_crossing(points, i, laser[i], planes, bent, mean_width, focal_px):
             continue
         if number[p] == -2:
             number[p] = n_groups
             n_groups += 1
         group[i] = number[p]
-        n_readings += 1
-    return n_groups, n_readings
+        n_candidates += 1
+    return n_groups, n_candidates
 
 
 @kernel
-def _pieces_on(piece: IntArray, min_lines: int, on_target: BoolArray) -> IntArray:
+def _units_on(unit: IntArray, min_lines: int, on_target: BoolArray) -> IntArray:
     """Return -2 for each piece on the target that is long enough, -1 for others."""
-    n_pieces = 0
-    for i in range(piece.shape[0]):
-        n_pieces = max(n_pieces, piece[i] + 1)
-    number, lines = np.full(n_pieces, -1), np.zeros(n_pieces, np.int64)
-    for i in range(piece.shape[0]):
-        lines[piece[i]] += 1
+    n_planes = 0
+    for i in range(unit.shape[0]):
+        n_planes = max(n_planes, unit[i] + 1)
+    number, lines = np.full(n_planes, -1), np.zeros(n_planes, np.int64)
+    for i in range(unit.shape[0]):
+        lines[unit[i]] += 1
         if on_target[i]:
-            number[piece[i]] = -2
-    for p in range(n_pieces):
+            number[unit[i]] = -2
+    for p in range(n_planes):
         if lines[p] < min_lines:
             number[p] = -1
     return number
@@ -124,12 +124,12 @@ def _pieces_on(piece: IntArray, min_lines: int, on_target: BoolArray) -> IntArra
 
 @kernel
 def _mean_widths(
-    laser: IntArray, width: FloatArray, piece: IntArray, number: IntArray, n_lasers: int
+    laser: IntArray, width: FloatArray, unit: IntArray, number: IntArray, n_lasers: int
 ) -> FloatArray:
     """Return each laser's mean stripe width; single widths are inflated by the crossing itself."""
     total, count = np.zeros(n_lasers), np.zeros(n_lasers)
-    for i in range(piece.shape[0]):
-        if number[piece[i]] != -1:
+    for i in range(unit.shape[0]):
+        if number[unit[i]] != -1:
             total[laser[i]] += width[i]
             count[laser[i]] += 1.0
     for index in range(n_lasers):
@@ -173,27 +173,27 @@ def places_along(line: FloatArray, laser: IntArray, n_lines: IntArray, along: Fl
 
 
 @kernel
-def mark_rested_on(
+def mark_inliers(
     group: IntArray,
     laser: IntArray,
     weights: FloatArray,
     of_all: bool,
     points: FloatArray,
-    rests_on: BoolArray,
+    inliers: BoolArray,
 ) -> tuple[int, float, int]:
     """Mark the inliers of a fit.
 
     Parameters
     ----------
     group : int array, shape (N,)
-        From `select_pieces`.
+        From `select_units`.
     laser : int array, shape (M,), weights : array, shape (M,)
         Of the observations.
     of_all : bool
         Whether observations without weight are counted in `second`.
     points : array, shape (N, 3)
-        Of the readings.
-    rests_on : bool array, shape (N,)
+        Of the candidates.
+    inliers : bool array, shape (N,)
         Written.
 
     Returns
@@ -207,21 +207,21 @@ def mark_rested_on(
     """
     n, square = 0, np.inf
     for i in range(group.shape[0]):
-        rests_on[i] = group[i] >= 0 and weights[group[i]] > 0.0
-        if rests_on[i]:
+        inliers[i] = group[i] >= 0 and weights[group[i]] > 0.0
+        if inliers[i]:
             n += 1
             x, y, z = points[i, 0], points[i, 1], points[i, 2]
             square = min(square, x * x + y * y + z * z)
     n_lasers = 0
     for k in range(laser.shape[0]):
         n_lasers = max(n_lasers, laser[k] + 1)
-    pieces = np.zeros(n_lasers, np.int64)
+    observations = np.zeros(n_lasers, np.int64)
     for k in range(laser.shape[0]):
-        pieces[laser[k]] += of_all or weights[k] > 0.0
+        observations[laser[k]] += of_all or weights[k] > 0.0
     best, second = 0, 0
     for index in range(n_lasers):
-        second = max(second, min(best, pieces[index]))
-        best = max(best, pieces[index])
+        second = max(second, min(best, observations[index]))
+        best = max(best, observations[index])
     return n, np.sqrt(square), second
 
 
@@ -235,16 +235,16 @@ def distances_off(points: FloatArray, normal: FloatArray, offset: float, off: Fl
 
 @kernel
 def mark_beside(
-    source: IntArray, whole: BoolArray, off: FloatArray, most: float, beside: BoolArray
+    source: IntArray, net_mask: BoolArray, off: FloatArray, most: float, beside: BoolArray
 ) -> None:
     """Mark the candidates of a net, and those near its plane whose light the net does not explain.
 
     Parameters
     ----------
     source : int array, shape (N,)
-        Number of each reading's return.
-    whole : bool array, shape (N,)
-        Readings of the net.
+        Number of each candidate's peak.
+    net_mask : bool array, shape (N,)
+        Candidates of the net.
     off : array, shape (N,)
         From `distances_off`.
     most : float
@@ -257,24 +257,24 @@ def mark_beside(
         last = max(last, source[i])
     explained = np.zeros(last + 1, np.bool_)
     for i in range(source.shape[0]):
-        if whole[i]:
+        if net_mask[i]:
             explained[source[i]] = True
     for i in range(source.shape[0]):
-        beside[i] = whole[i] or (off[i] < most and not explained[source[i]])
+        beside[i] = net_mask[i] or (off[i] < most and not explained[source[i]])
 
 
 @kernel
-def light_share_near(
-    group: IntArray, trust: FloatArray, points: FloatArray, patch: FloatArray, near: float
+def intensity_share_near(
+    group: IntArray, confidence: FloatArray, points: FloatArray, patch: FloatArray, near: float
 ) -> float:
     """Return the share of the light in pieces nearer to a patch than `near`, in metres.
 
     Parameters
     ----------
     group : int array, shape (N,)
-        From `select_pieces`.
-    trust : array, shape (N,)
-        Of the readings.
+        From `select_units`.
+    confidence : array, shape (N,)
+        Of the candidates.
     points : array, shape (M, 3)
         Of the pieces.
     patch : array, shape (16,)
@@ -285,13 +285,13 @@ def light_share_near(
     total, on = 0.0, 0.0
     for i in range(group.shape[0]):
         if group[i] >= 0:
-            total += trust[i]
-            on += trust[i] if abs(height[group[i]]) < near else 0.0
+            total += confidence[i]
+            on += confidence[i] if abs(height[group[i]]) < near else 0.0
     return on / max(total, 1e-12)
 
 
 @kernel
-def weigh_readings(
+def weigh_candidates(
     group: IntArray,
     m: FloatArray,
     sensitivity: FloatArray,
@@ -305,7 +305,7 @@ def weigh_readings(
     Parameters
     ----------
     group : int array, shape (N,)
-        From `select_pieces`.
+        From `select_units`.
     m : array, shape (3,)
         Of the plane.
     sensitivity, sigma_px, fit_weights : array, shape (M, 3), (M,), (M,)
@@ -339,7 +339,7 @@ _FEW_STRANDS, _STRONG_BEND = 36, 0.02
 # the greater share, the mean plane inflates the covariance.
 _MAIN_SHARE, _WHOLE_SHARE = 0.4, 0.9
 # Fewer strands do not show that a net is folded.
-_LEAST_FOLDED = 12
+_MIN_FOLDED = 12
 # Largest scatter of strands about the mean plane of a folded net, as a share of the range.
 _FOLDED_RMS_SHARE = 0.04
 _NEAR_SHARE = 0.005
@@ -347,19 +347,19 @@ _NEAR_SHARE = 0.005
 # of which fewer strands than the second share lie on the surface, and less light than the third, is
 # mostly folds. Flat nets in strong sun and those with growth come down to 0.36 of the strands, and
 # to 0.31 of the light; folded ones reach 0.46 and 0.62.
-_BESIDE_SHARE, _FOLDED_STRANDS, _FOLDED_LIGHT = 0.06, 0.5, 0.47
+_BESIDE_SHARE, _FOLDED_STRANDS, _FOLDED_INTENSITY = 0.06, 0.5, 0.47
 # Square of the distance between two postures, over the covariance of the one: its expected value if
 # only chance parts them, and what chance exceeds once in 1000 times (chi-squared, 3 values).
 _EXPECTED, _CONTRADICTS = 3.0, 16.27
 # The light about a mean plane is selected at most this many times more.
-_MOST_SELECTIONS = 5
+_MAX_SELECTIONS = 5
 # A strand's light is brightest on the twine's front, and blur takes away the light on its edges:
 # its centroid lies before the mean of the surface it lights. On rendered nets of twelve kinds, in
 # clear and turbid water, all strands alike were 0.05 to 0.18 px off, to the near side; how far
 # depends on twine, growth and water, so that it is an error and no correction.
 _TWINE_PX = 0.11
 # Independent pieces of stripe that the second best laser must show.
-_MIN_PIECES = 3
+_MIN_OBSERVATIONS = 3
 
 
 class FitMethod(StrEnum):
@@ -379,11 +379,11 @@ class Measurement:
     ----------
     posture : Posture or Refusal
         The result.
-    rests_on : bool array, shape (N,)
+    inliers : bool array, shape (N,)
         Inliers: candidates in the posture; none where it is refused.
     patch : Patch or None
         The curved surface, where a plane does not describe the net.
-    whole : bool array, shape (N,), or None
+    net_mask : bool array, shape (N,), or None
         Mask of the net: candidates on it, also where its folds leave the surface; None if the
         target is no net.
     weights : array, shape (N,), or None
@@ -393,156 +393,171 @@ class Measurement:
     """
 
     posture: Posture | Refusal
-    rests_on: BoolArray
+    inliers: BoolArray
     patch: Patch | None = None
-    whole: BoolArray | None = None
+    net_mask: BoolArray | None = None
     weights: FloatArray | None = None
     folded: bool = False
 
 
-class PostureMeter:
+class PostureEstimator:
     """Estimator of postures to surfaces with one rig.
 
     Parameters
     ----------
     rig : Rig
         Lasers, working range and camera axis.
-    searches : sequence of StripeSearch
+    laser_bands : sequence of LaserBand
         One for each laser.
     fit : FitMethod
         Method of the plane fit.
     """
 
-    def __init__(self, rig: Rig, searches: Sequence[StripeSearch], fit: FitMethod) -> None:
+    def __init__(self, rig: Rig, laser_bands: Sequence[LaserBand], fit: FitMethod) -> None:
         self._fit_method = fit
-        self._n_lines = np.array([len(search.lowest) for search in searches])
+        self._n_lines = np.array([len(search.lowest) for search in laser_bands])
         self._working_range = rig.working_range
         sheets = np.array([one.packed() for one in sheets_of(rig)]).reshape(-1, COLUMNS)
         self._planes = np.ascontiguousarray(sheets[:, START : START + 4])
         # A kernel that is given None is compiled without the code for bent sheets.
         self._bent = sheets if sheets[:, WINDOWED].any() else None
         self._focal_px = rig.focal_px
-        self._line_px = max((search.line_px for search in searches), default=1)
+        self._line_px = max((search.line_px for search in laser_bands), default=1)
         self._axis_in_dome = rig.dome_from_cam.rotate([0.0, 0.0, 1.0])
 
-    def measure(self, readings: Readings, chunk_index: IntArray, target: Surface) -> Measurement:
+    def measure(
+        self, candidates: Candidates, subsegment_index: IntArray, target: Surface
+    ) -> Measurement:
         """Measure the posture to a surface.
 
         Parameters
         ----------
-        readings : Readings
+        candidates : Candidates
             N of them.
-        chunk_index : int array, shape (N,)
-            Row of each reading's chunk in the surface's `members`.
+        subsegment_index : int array, shape (N,)
+            Row of each candidate's subsegment in the surface's `members`.
         target : Surface
             Surface that the posture is measured to.
         """
-        # On a net a stretch is one strand, whose light has one centre; on a wall a chunk is long
-        # enough for independent errors.
+        # On a net a component is one strand, whose light has one centre; on a wall a subsegment is
+        # long enough for independent errors.
         mesh = target.is_mesh
-        piece, min_lines = (readings.stretch, _SHORTEST_STRAND) if mesh else (readings.chunk, 1)
-        on_target = target.members[chunk_index]
-        seen = self._observe(readings, piece, min_lines, on_target, target.plane.normal)
-        if seen.n_readings < MIN_LINES:
-            detail = f"only {seen.n_readings} stripe points outside crossings"
-            return _nothing(readings, Refusal(Reason.TOO_FEW_POINTS, detail))
-        fit = self._fit(readings, seen, target)
+        unit, min_lines = (
+            (candidates.component, _SHORTEST_STRAND) if mesh else (candidates.subsegment, 1)
+        )
+        on_target = target.members[subsegment_index]
+        seen = self._observe(candidates, unit, min_lines, on_target, target.plane.normal)
+        if seen.n_candidates < MIN_LINES:
+            detail = f"only {seen.n_candidates} stripe points outside crossings"
+            return _refused(candidates, Refusal(Reason.TOO_FEW_POINTS, detail))
+        fit = self._fit(candidates, seen, target)
         if fit is None:
-            return _nothing(readings, Refusal(Reason.COLLINEAR, "the points do not fix a plane"))
-        flat = self._measured(readings, seen, fit, on_twine=mesh)
+            return _refused(candidates, Refusal(Reason.COLLINEAR, "the points do not fix a plane"))
+        flat = self._posture_of_fit(candidates, seen, fit, on_twine=mesh)
         found = flat
         if mesh and self._fit_method is FitMethod.ROBUST:
             if flat is not None:
-                found = self._measure_net(readings, seen, fit, flat, target)
+                found = self._measure_net(candidates, seen, fit, flat, target)
             else:
-                found = self._measure_folds(readings, seen, fit)
+                found = self._measure_folds(candidates, seen, fit)
         if found is None:
             detail = "all lasers but one show too little of the target"
-            return _nothing(readings, Refusal(Reason.ONE_LASER, detail))
-        return self._believed(readings, found)
+            return _refused(candidates, Refusal(Reason.ONE_LASER, detail))
+        return self._validated(candidates, found)
 
-    def _believed(self, readings: Readings, found: Measurement) -> Measurement:
+    def _validated(self, candidates: Candidates, found: Measurement) -> Measurement:
         """Return the measurement if a pilot may rely on it, else a refusal."""
         if isinstance(found.posture, Refusal):
             return found
         max_rms_share = _FOLDED_RMS_SHARE if found.folded else MAX_RMS_SHARE
-        posture = believable(found.posture, self._working_range, max_rms_share)
+        posture = validate(found.posture, self._working_range, max_rms_share)
         if isinstance(posture, Refusal):
-            return Measurement(posture, np.zeros(len(readings), np.bool_), whole=found.whole)
+            return Measurement(
+                posture, np.zeros(len(candidates), np.bool_), net_mask=found.net_mask
+            )
         return found
 
     def _measure_net(
-        self, readings: Readings, seen: "_Seen", fit: PlaneFit, flat: Measurement, target: Surface
+        self,
+        candidates: Candidates,
+        seen: "_Observed",
+        fit: PlaneFit,
+        flat: Measurement,
+        target: Surface,
     ) -> Measurement:
         """Measure the posture to a net, which may bend or fold, and find its visible part."""
         plane = _plane_of(fit)
-        off = np.empty(len(readings))
-        distances_off(readings.points, plane.normal, plane.offset, off)
+        off = np.empty(len(candidates))
+        distances_off(candidates.points, plane.normal, plane.offset, off)
         # With few strands only a strong bend is accepted.
-        few = len(seen.pieces.laser) < _FEW_STRANDS and much_beside(off, SOME)
-        bends = target.n_pieces > 1 or much_beside(off)
-        bends = bends or hints_at_curvature(seen.pieces, fit.weights, plane)
-        least = LEAST_BEND if bends else few * _STRONG_BEND
-        curved = None if least == 0.0 else self._measure_curved(readings, plane, off, least)
+        few = len(seen.observations.laser) < _FEW_STRANDS and has_much_beside(off, SOME)
+        bends = target.n_planes > 1 or has_much_beside(off)
+        bends = bends or shows_curvature(seen.observations, fit.weights, plane)
+        least = MIN_BEND if bends else few * _STRONG_BEND
+        curved = None if least == 0.0 else self._measure_curved(candidates, plane, off, least)
         best = flat if curved is None else curved
-        if curved is not None and not self._tells(readings, curved):
+        if curved is not None and not self._is_observable(candidates, curved):
             # The net bends, but its posture at the nearest point is not observable.
-            best = _doubted(flat, curved, 1.0)
+            best = _inflate_covariance(flat, curved, 1.0)
         patch = packed_plane(plane) if best.patch is None else best.patch.packed()
-        whole = self._followed(readings, best.rests_on, plane, patch)
-        folded = self._folded(readings, whole, off, plane, patch, best)
+        net_mask = self._grow_net_mask(candidates, best.inliers, plane, patch)
+        folded = self._mean_plane_of_folds(candidates, net_mask, off, plane, patch, best)
         if folded is None or not folded.folded:
             is_curved = best is curved
-            best = self._weighed(readings, whole, plane, patch, folded or best, is_curved)
+            best = self._or_mean_plane(
+                candidates, net_mask, plane, patch, folded or best, is_curved
+            )
         else:
             best = folded
-        return replace(best, whole=whole)
+        return replace(best, net_mask=net_mask)
 
     def _measure_folds(
-        self, readings: Readings, seen: "_Seen", fit: PlaneFit
+        self, candidates: Candidates, seen: "_Observed", fit: PlaneFit
     ) -> Measurement | None:
         """Measure the posture to the mean plane of a net of which one laser alone fits a plane.
 
         Such a plane may stand anywhere: its mean plane counts if every laser confirms it.
         """
         plane = _plane_of(fit)
-        off = np.empty(len(readings))
-        distances_off(readings.points, plane.normal, plane.offset, off)
-        rests_on = (seen.group >= 0) & (fit.weights[seen.group] > 0.0)
-        whole = self._followed(readings, rests_on, plane, packed_plane(plane))
-        folded = self._folded(readings, whole, off, plane, packed_plane(plane), None)
+        off = np.empty(len(candidates))
+        distances_off(candidates.points, plane.normal, plane.offset, off)
+        inliers = (seen.group >= 0) & (fit.weights[seen.group] > 0.0)
+        net_mask = self._grow_net_mask(candidates, inliers, plane, packed_plane(plane))
+        folded = self._mean_plane_of_folds(
+            candidates, net_mask, off, plane, packed_plane(plane), None
+        )
         if folded is None:
             return None
         for index in range(len(self._planes)):
-            mine = folded.rests_on & (readings.laser == index)
-            if len(np.unique(readings.stretch[mine])) < _MIN_PIECES:
+            mine = folded.inliers & (candidates.laser == index)
+            if len(np.unique(candidates.component[mine])) < _MIN_OBSERVATIONS:
                 return None
-        return replace(folded, whole=whole)
+        return replace(folded, net_mask=net_mask)
 
-    def _followed(
-        self, readings: Readings, rests_on: BoolArray, plane: Plane, patch: FloatArray
+    def _grow_net_mask(
+        self, candidates: Candidates, inliers: BoolArray, plane: Plane, patch: FloatArray
     ) -> BoolArray:
         """Mark the visible part of a net, also where its folds leave the surface."""
-        whole, height = rests_on.copy(), np.empty(len(readings))
-        heights_over(readings.points, patch, height)
-        follow_net(
-            readings.points,
-            readings.line,
-            readings.laser,
-            readings.stretch,
-            readings.trust,
-            readings.source,
+        net_mask, height = inliers.copy(), np.empty(len(candidates))
+        heights_over(candidates.points, patch, height)
+        grow_region(
+            candidates.points,
+            candidates.line,
+            candidates.laser,
+            candidates.component,
+            candidates.confidence,
+            candidates.source,
             height,
             plane.offset,
             plane.offset * self._line_px / self._focal_px,
-            whole,
+            net_mask,
         )
-        return whole
+        return net_mask
 
-    def _folded(
+    def _mean_plane_of_folds(
         self,
-        readings: Readings,
-        whole: BoolArray,
+        candidates: Candidates,
+        net_mask: BoolArray,
         off: FloatArray,
         plane: Plane,
         patch: FloatArray,
@@ -554,114 +569,128 @@ class PostureMeter:
         mean plane of all that light contradicts it. `best` is the posture to the surface, if any:
         where it is the main part of the net it is returned, widened as far as the two disagree.
         """
-        seen = self._beside(readings, whole, off, plane)
-        if len(seen.pieces.laser) < _LEAST_FOLDED:
+        seen = self._beside(candidates, net_mask, off, plane)
+        if len(seen.observations.laser) < _MIN_FOLDED:
             return None
         near = _NEAR_SHARE * plane.offset
-        strands = share_near(seen.pieces.points, patch, near)
+        strands = share_near(seen.observations.points, patch, near)
         few = strands < _FOLDED_STRANDS
         if strands >= _WHOLE_SHARE or (best is None and not few):
             return None
-        light = light_share_near(seen.group, readings.trust, seen.pieces.points, patch, near)
+        intensity_share = intensity_share_near(
+            seen.group, candidates.confidence, seen.observations.points, patch, near
+        )
         if not few:
-            return best and self._widened(best, seen, plane, light)
-        mean = self._settled(readings, whole, seen, self._mean(readings, seen, plane))
-        if mean is None or best is None or light < _FOLDED_LIGHT:
+            return best and self._widened(best, seen, plane, intensity_share)
+        mean = self._settled(candidates, net_mask, seen, self._mean_plane(candidates, seen, plane))
+        if mean is None or best is None or intensity_share < _FOLDED_INTENSITY:
             return mean
         one, other = best.posture, mean.posture
         if not (one and other):
             return None
         contradicts = disagreement(one, other) > _CONTRADICTS
-        return mean if contradicts else _disputed(best, other, light)
+        return mean if contradicts else _disputed(best, other, intensity_share)
 
-    def _widened(self, best: Measurement, seen: "_Seen", plane: Plane, light: float) -> Measurement:
-        """Widen a posture by the mean plane of the light near it; `light` is its own share."""
-        fit = fit_mean(seen.pieces.points, plane)
+    def _widened(
+        self, best: Measurement, seen: "_Observed", plane: Plane, intensity_share: float
+    ) -> Measurement:
+        """Widen a posture by the mean plane of the light near it; `intensity_share` is its own."""
+        fit = fit_mean(seen.observations.points, plane)
         if fit is None:
             return best
-        return _disputed(best, posture_of(fit, 0.0, 0, self._axis_in_dome), light)
+        return _disputed(best, posture_of(fit, 0.0, 0, self._axis_in_dome), intensity_share)
 
     def _beside(
-        self, readings: Readings, whole: BoolArray, off: FloatArray, plane: Plane
-    ) -> "_Seen":
+        self, candidates: Candidates, net_mask: BoolArray, off: FloatArray, plane: Plane
+    ) -> "_Observed":
         """Average the pieces of stripe of a net, and those near a plane that may be the net's."""
-        beside = np.empty(len(readings), np.bool_)
-        mark_beside(readings.source, whole, off, _BESIDE_SHARE, beside)
-        return self._observe(readings, readings.stretch, _SHORTEST_STRAND, beside, plane.normal)
+        beside = np.empty(len(candidates), np.bool_)
+        mark_beside(candidates.source, net_mask, off, _BESIDE_SHARE, beside)
+        return self._observe(
+            candidates, candidates.component, _SHORTEST_STRAND, beside, plane.normal
+        )
 
     def _settled(
-        self, readings: Readings, whole: BoolArray, seen: "_Seen", mean: Measurement | None
+        self,
+        candidates: Candidates,
+        net_mask: BoolArray,
+        seen: "_Observed",
+        mean: Measurement | None,
     ) -> Measurement | None:
         """Measure a mean plane again from the light about it.
 
         The light near one flank is more of that side than of the other: the selection is repeated
         about the mean plane until it holds the same pieces.
         """
-        off = np.empty(len(readings))
-        for _ in range(_MOST_SELECTIONS):
+        off = np.empty(len(candidates))
+        for _ in range(_MAX_SELECTIONS):
             if mean is None or not isinstance(mean.posture, Posture):
                 break
             plane = Plane(mean.posture.normal_in_dome, mean.posture.range)
-            distances_off(readings.points, plane.normal, plane.offset, off)
-            other = self._beside(readings, whole, off, plane)
+            distances_off(candidates.points, plane.normal, plane.offset, off)
+            other = self._beside(candidates, net_mask, off, plane)
             if np.array_equal(other.group >= 0, seen.group >= 0):
                 break
-            seen, mean = other, self._mean(readings, other, plane)
+            seen, mean = other, self._mean_plane(candidates, other, plane)
         return mean
 
-    def _mean(self, readings: Readings, seen: "_Seen", plane: Plane) -> Measurement | None:
+    def _mean_plane(
+        self, candidates: Candidates, seen: "_Observed", plane: Plane
+    ) -> Measurement | None:
         """Measure the posture to the mean plane of a folded net."""
-        fit = fit_mean(seen.pieces.points, plane)
-        found = None if fit is None else self._measured(readings, seen, fit, of_all=True)
+        fit = fit_mean(seen.observations.points, plane)
+        found = None if fit is None else self._posture_of_fit(candidates, seen, fit, of_all=True)
         return None if found is None else replace(found, folded=True)
 
-    def _weighed(
+    def _or_mean_plane(
         self,
-        readings: Readings,
-        whole: BoolArray,
+        candidates: Candidates,
+        net_mask: BoolArray,
         plane: Plane,
         patch: FloatArray,
         best: Measurement,
         is_curved: bool,
     ) -> Measurement:
         """Return the measurement, widened or replaced by the mean plane if the net is folds."""
-        seen = self._observe(readings, readings.stretch, _SHORTEST_STRAND, whole, plane.normal)
-        if len(seen.pieces.laser) < _LEAST_FOLDED:
+        seen = self._observe(
+            candidates, candidates.component, _SHORTEST_STRAND, net_mask, plane.normal
+        )
+        if len(seen.observations.laser) < _MIN_FOLDED:
             return best
-        share = share_near(seen.pieces.points, patch, _NEAR_SHARE * plane.offset)
+        share = share_near(seen.observations.points, patch, _NEAR_SHARE * plane.offset)
         if share >= _MAIN_SHARE and (share >= _WHOLE_SHARE or is_curved):
             return best
-        mean = self._mean(readings, seen, plane)
+        mean = self._mean_plane(candidates, seen, plane)
         if mean is None:
             return best
-        return mean if share < _MAIN_SHARE else _doubted(best, mean, 1.0 - share)
+        return mean if share < _MAIN_SHARE else _inflate_covariance(best, mean, 1.0 - share)
 
-    def _tells(self, readings: Readings, curved: Measurement) -> bool:
+    def _is_observable(self, candidates: Candidates, curved: Measurement) -> bool:
         """Return whether the posture to a curved net may be relied on."""
         posture = curved.posture
         return (
             isinstance(posture, Posture)
-            and bool(believable(posture, self._working_range))
+            and bool(validate(posture, self._working_range))
             and nearest_in_view(
-                posture.normal_in_dome / posture.range, readings.points[curved.rests_on]
+                posture.normal_in_dome / posture.range, candidates.points[curved.inliers]
             )
         )
 
     def _measure_curved(
-        self, readings: Readings, plane: Plane, off: FloatArray, least_bend: float
+        self, candidates: Candidates, plane: Plane, off: FloatArray, min_bend: float
     ) -> Measurement | None:
         """Measure the posture to a curved net; None where a plane is as good."""
         near = off < _DEEPEST_BEND
-        seen = self._observe(readings, readings.stretch, _SHORTEST_STRAND, near, plane.normal)
-        if not len(seen.pieces.laser):
+        seen = self._observe(candidates, candidates.component, _SHORTEST_STRAND, near, plane.normal)
+        if not len(seen.observations.laser):
             return None
-        fit = fit_patch(seen.pieces, plane, MESH_ERROR, least_bend)
-        fit = fit and refit_at_nearest(fit, seen.pieces, MESH_ERROR)
+        fit = fit_patch(seen.observations, plane, MESH_ERROR, min_bend)
+        fit = fit and refit_at_nearest(fit, seen.observations, MESH_ERROR)
         m = None if fit is None else nearest_tangent(fit.patch)
         if fit is None or m is None:
             return None
         tangent = PlaneFit(m, tangent_covariance(fit, m), fit.weights, fit.rms)
-        found = self._measured(readings, seen, tangent, on_twine=True)
+        found = self._posture_of_fit(candidates, seen, tangent, on_twine=True)
         if found is None or isinstance(found.posture, Refusal):
             return None
         along = fit.patch.coefficients[[3, 5]].tolist()
@@ -671,19 +700,19 @@ class PostureMeter:
 
     def _observe(
         self,
-        readings: Readings,
-        piece: IntArray,
+        candidates: Candidates,
+        unit: IntArray,
         min_lines: int,
         on_target: BoolArray,
         normal: FloatArray,
-    ) -> "_Seen":
+    ) -> "_Observed":
         """Average the pieces of stripe on a target, those in crossings left out."""
-        group = np.empty(len(readings), np.int64)
-        n_groups, n_readings = select_pieces(
-            readings.points,
-            readings.laser,
-            readings.width,
-            piece,
+        group = np.empty(len(candidates), np.int64)
+        n_groups, n_candidates = select_units(
+            candidates.points,
+            candidates.laser,
+            candidates.width,
+            unit,
             min_lines,
             on_target,
             self._planes,
@@ -691,30 +720,30 @@ class PostureMeter:
             self._focal_px,
             group,
         )
-        return _Seen(group, n_readings, readings.observations(group, n_groups, normal))
+        return _Observed(group, n_candidates, candidates.observations(group, n_groups, normal))
 
-    def _fit(self, readings: Readings, seen: "_Seen", target: Surface) -> PlaneFit | None:
-        pieces = seen.pieces
-        along = np.empty(len(pieces.line))
-        places_along(pieces.line, pieces.laser, self._n_lines, along)
+    def _fit(self, candidates: Candidates, seen: "_Observed", target: Surface) -> PlaneFit | None:
+        observations = seen.observations
+        along = np.empty(len(observations.line))
+        places_along(observations.line, observations.laser, self._n_lines, along)
         robust = fit_robust(
-            pieces.points,
-            pieces.sensitivity,
-            pieces.sigma_px,
-            pieces.laser,
+            observations.points,
+            observations.sensitivity,
+            observations.sigma_px,
+            observations.laser,
             along,
             target.plane.normal / target.plane.offset,
             MESH_ERROR if target.is_mesh else SOLID_ERROR,
         )
         if robust is None or self._fit_method is FitMethod.ROBUST:
             return robust
-        points = readings.points[seen.group >= 0]
-        return fit_pseudo_inverse(points, len(pieces.laser), robust.covariance)
+        points = candidates.points[seen.group >= 0]
+        return fit_pseudo_inverse(points, len(observations.laser), robust.covariance)
 
-    def _measured(
+    def _posture_of_fit(
         self,
-        readings: Readings,
-        seen: "_Seen",
+        candidates: Candidates,
+        seen: "_Observed",
         fit: PlaneFit,
         *,
         of_all: bool = False,
@@ -726,31 +755,37 @@ class PostureMeter:
         With `of_all`, pieces that the fit has rejected count too. With `on_twine`, the range has
         the error that the light on all strands shares.
         """
-        rests_on = np.empty(len(readings), np.bool_)
-        laser = seen.pieces.laser
-        n_points, nearest, second = mark_rested_on(
-            seen.group, laser, fit.weights, of_all, readings.points, rests_on
+        inliers = np.empty(len(candidates), np.bool_)
+        laser = seen.observations.laser
+        n_points, nearest, second = mark_inliers(
+            seen.group, laser, fit.weights, of_all, candidates.points, inliers
         )
-        if second < _MIN_PIECES:
+        if second < _MIN_OBSERVATIONS:
             return None
-        weights, pieces = np.empty(len(readings)), seen.pieces
+        weights, observations = np.empty(len(candidates)), seen.observations
         # The mean plane of folds and the pseudo-inverse do not use the errors.
         alike = of_all or self._fit_method is FitMethod.PSEUDO_INVERSE
-        weigh_readings(
-            seen.group, fit.m, pieces.sensitivity, pieces.sigma_px, fit.weights, alike, weights
+        weigh_candidates(
+            seen.group,
+            fit.m,
+            observations.sensitivity,
+            observations.sigma_px,
+            fit.weights,
+            alike,
+            weights,
         )
         posture = posture_of(fit, nearest, n_points, self._axis_in_dome)
         if on_twine:
-            _add_twine_error(posture, fit, pieces.sensitivity)
-        return Measurement(posture, rests_on, weights=weights)
+            _add_twine_error(posture, fit, observations.sensitivity)
+        return Measurement(posture, inliers, weights=weights)
 
 
-class _Seen(NamedTuple):
+class _Observed(NamedTuple):
     """Pieces of stripe on a surface; each candidate's piece (-1: none), number of candidates."""
 
     group: IntArray
-    n_readings: int
-    pieces: Observations
+    n_candidates: int
+    observations: Observations
 
 
 def _plane_of(fit: PlaneFit) -> Plane:
@@ -764,7 +799,7 @@ def _add_twine_error(posture: Posture, fit: PlaneFit, sensitivity: FloatArray) -
     posture.covariance[0, 0] += (_TWINE_PX * share * posture.range) ** 2
 
 
-def _disputed(found: Measurement, other: Posture, light: float) -> Measurement:
+def _disputed(found: Measurement, other: Posture, intensity_share: float) -> Measurement:
     """Widen a posture by another one's difference that the other's scatter does not explain."""
     if isinstance(found.posture, Refusal):
         return found
@@ -772,14 +807,16 @@ def _disputed(found: Measurement, other: Posture, light: float) -> Measurement:
     if apart <= _EXPECTED:
         return found
     excess = 1.0 - _EXPECTED / apart
-    return replace(found, posture=doubted(found.posture, other, (1.0 - light) * excess))
+    return replace(
+        found, posture=inflate_covariance(found.posture, other, (1.0 - intensity_share) * excess)
+    )
 
 
-def _doubted(found: Measurement, other: Measurement, share: float) -> Measurement:
+def _inflate_covariance(found: Measurement, other: Measurement, share: float) -> Measurement:
     """Inflate a posture's covariance by its difference from another one with a share of light."""
     one, two = found.posture, other.posture
-    return replace(found, posture=doubted(one, two, share)) if one and two else found
+    return replace(found, posture=inflate_covariance(one, two, share)) if one and two else found
 
 
-def _nothing(readings: Readings, refusal: Refusal) -> Measurement:
-    return Measurement(refusal, np.zeros(len(readings), np.bool_))
+def _refused(candidates: Candidates, refusal: Refusal) -> Measurement:
+    return Measurement(refusal, np.zeros(len(candidates), np.bool_))

@@ -1,10 +1,11 @@
 """Region growing: light of the target that the search for planes left out.
 
 A plane is sought with a narrow gate, among whole pieces of stripe, so that nothing foreign enters
-the posture. To label points the gate may be wider (`recruit`): a strand's light is off the plane by
-the strand's thickness, a net bulges, and where stripes cross two lasers share the light.
+the posture. To label points the gate may be wider (`recruit_candidates`): a strand's light is off
+the plane by the strand's thickness, a net bulges, and where stripes cross two lasers share the
+light.
 
-`follow_net` follows a net along each stripe, from strand to strand. Where a net folds, its light
+`grow_region` follows a net along each stripe, from strand to strand. Where a net folds, its light
 leaves the plane gradually: the next strand is about as far away as the last one, within the
 steepness of a flank. Candidates of other lasers' light, bubbles and light seen through the net have
 no such neighbours, or are farther off than the right candidate of the same light.
@@ -14,7 +15,7 @@ import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import kernel
-from aqualvs.scanning.net_surfaces import LONGEST_STRETCH
+from aqualvs.scanning.net_surfaces import LONGEST_INTERVAL
 
 # Largest distance of light on the target: a share of the range, and pixels.
 _NEAR_SHARE = 0.010
@@ -27,7 +28,7 @@ MUCH, SOME = 0.85, 0.5
 """Light beside a plane over light on it."""
 
 
-def much_beside(off: FloatArray, much: float = MUCH) -> bool:
+def has_much_beside(off: FloatArray, much: float = MUCH) -> bool:
     """Return whether enough light lies just off a plane for the net to bend away from it.
 
     Where stripes cross, wrong candidates lie there as well.
@@ -35,7 +36,7 @@ def much_beside(off: FloatArray, much: float = MUCH) -> bool:
     Parameters
     ----------
     off : array, shape (N,)
-        Distances of the readings from the plane, as shares of the range.
+        Distances of the candidates from the plane, as shares of the range.
     much : float
         Light beside the plane over light on it.
     """
@@ -44,11 +45,11 @@ def much_beside(off: FloatArray, much: float = MUCH) -> bool:
 
 
 @kernel
-def recruit(
+def recruit_candidates(
     points: FloatArray,
     sensitivity: FloatArray,
-    chunk_index: IntArray,
-    n_chunks: int,
+    subsegment_index: IntArray,
+    n_subsegments: int,
     patch: FloatArray,
     other: BoolArray,
     taken: BoolArray,
@@ -59,21 +60,21 @@ def recruit(
     Parameters
     ----------
     points, sensitivity : array, shape (N, 3)
-        Of the readings, in `dome`: metres, and m/px.
-    chunk_index : int array, shape (N,)
-        Chunk of each reading, below `n_chunks`.
+        Of the candidates, in `dome`: metres, and m/px.
+    subsegment_index : int array, shape (N,)
+        Subsegment of each candidate, below `n_subsegments`.
     patch : array, shape (16,)
         The target as `Patch.packed` gives it.
     other : bool array, shape (N,)
-        Readings that another surface explains.
+        Candidates that another surface explains.
     taken : bool array, shape (N,)
-        Readings of light that another surface explains by some reading.
+        Candidates of light that another surface explains by some candidate.
     on_target : bool array, shape (N,)
-        Readings on the target; completed in place.
+        Candidates on the target; completed in place.
     """
     n = points.shape[0]
     near = np.zeros(n, np.bool_)
-    n_near, n_all = np.zeros(n_chunks), np.zeros(n_chunks)
+    n_near, n_all = np.zeros(n_subsegments), np.zeros(n_subsegments)
     by_range = _NEAR_SHARE * patch[3]
     for i in range(n):
         off = -patch[3]
@@ -89,17 +90,17 @@ def recruit(
         off -= 0.5 * (patch[13] * u * u + patch[15] * v * v) + patch[14] * u * v
         by_pixel = _NEAR_PX * per_px
         near[i] = off * off < by_range * by_range + by_pixel * by_pixel
-        n_all[chunk_index[i]] += 1.0
-        n_near[chunk_index[i]] += near[i]
+        n_all[subsegment_index[i]] += 1.0
+        n_near[subsegment_index[i]] += near[i]
     for i in range(n):
-        c = chunk_index[i]
+        c = subsegment_index[i]
         if near[i] and n_near[c] >= _MOST * n_all[c] and (other[i] or not taken[i]):
             on_target[i] = True
 
 
-# Rows of the table of stretches: search lines, means of height, line and confidence, shares of
+# Rows of the table of components: search lines, means of height, line and confidence, shares of
 # light on the net and of light that is on it by another candidate, laser, length in metres.
-LINES, HEIGHT, LINE, TRUST, ON_NET, TAKEN, LASER, SIZE, _N_FACTS = range(9)
+LINES, HEIGHT, LINE, CONFIDENCE, ON_NET, TAKEN, LASER, SIZE, _N_FACTS = range(9)
 
 # The steepest flank that is followed, and the noise of a step, as a share of the range.
 _STEEPEST = 1.2
@@ -107,15 +108,15 @@ _LOOSE_SHARE = 0.006
 # A single strand is accepted within this share of the range; farther off only as part of a flank.
 _LONELY_SHARE = 0.015
 # Least number of strands of a fold beyond that share, of all lasers.
-_LEAST_STRANDS = 6
+_MIN_STRANDS = 6
 # Largest distance to the next strand: a share of the range, and in usual distances.
 _FARTHEST_SHARE, _FARTHEST_GAP = 0.15, 2.5
 # A net strays from its plane by at most this share of the range.
 _DEEPEST_SHARE = 0.2
-# Number of preceding stretches that are compared, so that the cost does not grow with clutter.
+# Number of preceding components that are compared, so that the cost does not grow with clutter.
 _LOOK_BACK = 16
 # A strand continues one of this many last strands on the net.
-_MOST_TRIED = 2
+_MAX_TRIED = 2
 # Least lines of a strand, less is a speck; and its least brightness as a share of the net's light.
 _SPECK_LINES = 3
 _DIMMEST = 0.6
@@ -125,12 +126,12 @@ _FOLD_GAP = 1.7
 
 
 @kernel
-def follow_net(
+def grow_region(
     points: FloatArray,
     line: IntArray,
     laser: IntArray,
-    stretch: IntArray,
-    trust: FloatArray,
+    component: IntArray,
+    confidence: FloatArray,
     source: IntArray,
     height: FloatArray,
     distance: float,
@@ -142,40 +143,40 @@ def follow_net(
     Parameters
     ----------
     points : array, shape (N, 3)
-        Of the readings, in `dome`, metres.
-    line, laser, stretch : int array, shape (N,)
-        As in `Readings`.
-    trust : array, shape (N,)
-        As in `Readings`.
+        Of the candidates, in `dome`, metres.
+    line, laser, component : int array, shape (N,)
+        As in `Candidates`.
+    confidence : array, shape (N,)
+        As in `Candidates`.
     source : int array, shape (N,)
-        Number of the return that is read.
+        Number of the peak that is read.
     height : array, shape (N,)
-        By how much the readings lie behind the net's surface, in metres.
+        By how much the candidates lie behind the net's surface, in metres.
     distance : float
         Range, in metres.
     m_per_line : float
         Width of a search line at that distance, in metres.
     on_net : bool array, shape (N,)
-        Readings on the net; completed in place.
+        Candidates on the net; completed in place.
     """
-    n_stretches = 0
+    n_components = 0
     n_sources = 0
-    for i in range(stretch.shape[0]):
-        n_stretches = max(n_stretches, stretch[i] + 1)
+    for i in range(component.shape[0]):
+        n_components = max(n_components, component[i] + 1)
         n_sources = max(n_sources, source[i] + 1)
     taken = np.zeros(n_sources, np.bool_)
-    for i in range(stretch.shape[0]):
+    for i in range(component.shape[0]):
         taken[source[i]] |= on_net[i]
-    facts = np.zeros((_N_FACTS, n_stretches))
-    _describe(points, line, laser, stretch, trust, source, height, on_net, taken, facts)
+    facts = np.zeros((_N_FACTS, n_components))
+    _describe(points, line, laser, component, confidence, source, height, on_net, taken, facts)
     order, dimmest = _listed(facts, distance)
     usual = _drop_between(order, facts)
     farthest = min(_FARTHEST_SHARE * distance, _FARTHEST_GAP * usual * m_per_line)
-    cost = np.full(n_stretches, np.inf)
+    cost = np.full(n_components, np.inf)
     for way in (1, -1):
         _sweep(order, way, facts, distance, m_per_line, farthest, dimmest, cost)
     _drop_few(facts[HEIGHT], _LONELY_SHARE * distance, cost)
-    _settle(stretch, source, cost, taken, on_net)
+    _settle(component, source, cost, taken, on_net)
 
 
 @kernel
@@ -183,33 +184,33 @@ def _describe(
     points: FloatArray,
     line: IntArray,
     laser: IntArray,
-    stretch: IntArray,
-    trust: FloatArray,
+    component: IntArray,
+    confidence: FloatArray,
     source: IntArray,
     height: FloatArray,
     on_net: BoolArray,
     taken: BoolArray,
     facts: FloatArray,
 ) -> None:
-    """Write the table of the stretches of light."""
-    n_stretches = facts.shape[1]
-    first, last = np.full(n_stretches, -1), np.full(n_stretches, -1)
-    for i in range(stretch.shape[0]):
-        s = stretch[i]
+    """Write the table of the components of light."""
+    n_components = facts.shape[1]
+    first, last = np.full(n_components, -1), np.full(n_components, -1)
+    for i in range(component.shape[0]):
+        s = component[i]
         facts[LINES, s] += 1.0
         facts[HEIGHT, s] += height[i]
         facts[LINE, s] += line[i]
-        facts[TRUST, s] += trust[i]
+        facts[CONFIDENCE, s] += confidence[i]
         facts[ON_NET, s] += on_net[i]
         facts[TAKEN, s] += taken[source[i]] and not on_net[i]
         facts[LASER, s] = laser[i]
         if first[s] < 0:
             first[s] = i
         last[s] = i
-    for s in range(n_stretches):
+    for s in range(n_components):
         if facts[LINES, s] == 0.0:
             continue
-        for k in (HEIGHT, LINE, TRUST, ON_NET, TAKEN):
+        for k in (HEIGHT, LINE, CONFIDENCE, ON_NET, TAKEN):
             facts[k, s] /= facts[LINES, s]
         for k in range(3):
             facts[SIZE, s] += (points[first[s], k] - points[last[s], k]) ** 2
@@ -218,7 +219,7 @@ def _describe(
 
 @kernel
 def _listed(facts: FloatArray, distance: float) -> tuple[IntArray, float]:
-    """Return seeds and candidates in their order along the stripes, and the least trust."""
+    """Return seeds and candidates in their order along the stripes, and the lowest confidence."""
     n = facts.shape[1]
     key = np.full(n, np.inf)
     total = 0.0
@@ -228,9 +229,9 @@ def _listed(facts: FloatArray, distance: float) -> tuple[IntArray, float]:
             continue
         seed = facts[ON_NET, s] >= 0.5
         if seed:
-            total += facts[TRUST, s]
+            total += facts[CONFIDENCE, s]
             n_seeds += 1
-        short = facts[SIZE, s] < LONGEST_STRETCH
+        short = facts[SIZE, s] < LONGEST_INTERVAL
         near = abs(facts[HEIGHT, s]) < _DEEPEST_SHARE * distance
         loose = facts[TAKEN, s] < 0.5 and facts[ON_NET, s] == 0.0
         if seed or (short and near and loose):
@@ -241,11 +242,11 @@ def _listed(facts: FloatArray, distance: float) -> tuple[IntArray, float]:
 
 @kernel
 def _drop_few(height: FloatArray, lonely: float, cost: FloatArray) -> None:
-    """Remove stretches that leave the surface, where they are too few to be a fold."""
+    """Remove components that leave the surface, where they are too few to be a fold."""
     n_far = 0
     for s in range(cost.shape[0]):
         n_far += cost[s] < np.inf and abs(height[s]) >= lonely
-    if n_far < _LEAST_STRANDS:
+    if n_far < _MIN_STRANDS:
         for s in range(cost.shape[0]):
             if abs(height[s]) >= lonely:
                 cost[s] = np.inf
@@ -253,7 +254,7 @@ def _drop_few(height: FloatArray, lonely: float, cost: FloatArray) -> None:
 
 @kernel
 def _drop_between(order: IntArray, facts: FloatArray) -> float:
-    """Remove stretches between regularly spaced strands on the plane.
+    """Remove components between regularly spaced strands on the plane.
 
     Return the usual distance of the strands in search lines; infinite where there are none.
     """
@@ -285,7 +286,7 @@ def _drop_between(order: IntArray, facts: FloatArray) -> float:
         one = abs(facts[LINE, s] - (before[at] if after[at] != after[at] else after[at]))
         wide = both > _FOLD_GAP * usual if both == both else one > 0.5 * _FOLD_GAP * usual
         if not wide:
-            facts[TRUST, s] = 0.0
+            facts[CONFIDENCE, s] = 0.0
     return usual
 
 
@@ -305,16 +306,16 @@ def _sweep(
     The cost of a strand is that of the most expensive step of the path to it.
     """
     n = order.shape[0]
-    n_stretches = cost.shape[0]
-    reached, parent = np.full(n_stretches, np.inf), np.full(n_stretches, -1)
-    has_next = np.zeros(n_stretches, np.bool_)
+    n_components = cost.shape[0]
+    reached, parent = np.full(n_components, np.inf), np.full(n_components, -1)
+    has_next = np.zeros(n_components, np.bool_)
     loose = _LOOSE_SHARE * distance
     for at in range(n):
         s = order[at] if way > 0 else order[n - 1 - at]
         if facts[ON_NET, s] > 0.0:
             reached[s] = 0.0
             continue
-        if facts[TRUST, s] < dimmest:
+        if facts[CONFIDENCE, s] < dimmest:
             continue
         tried = 0
         for back in range(at - 1, max(at - 1 - _LOOK_BACK, -1), -1):
@@ -325,7 +326,7 @@ def _sweep(
                 continue
             # Along the stripe only: the position across it follows from the height.
             beside = abs(facts[LINE, s] - facts[LINE, p]) * m_per_line
-            if beside > farthest or tried == _MOST_TRIED:
+            if beside > farthest or tried == _MAX_TRIED:
                 break
             tried += 1
             step = abs(facts[HEIGHT, s] - facts[HEIGHT, p])
@@ -346,13 +347,13 @@ def _sweep(
 
 @kernel
 def _settle(
-    stretch: IntArray, source: IntArray, cost: FloatArray, taken: BoolArray, on_net: BoolArray
+    component: IntArray, source: IntArray, cost: FloatArray, taken: BoolArray, on_net: BoolArray
 ) -> None:
     """Mark the candidates of the strands reached; only the cheapest of each peak."""
     best = np.full(taken.shape[0], np.inf)
-    for i in range(stretch.shape[0]):
-        best[source[i]] = min(best[source[i]], cost[stretch[i]])
-    for i in range(stretch.shape[0]):
-        mine = cost[stretch[i]]
+    for i in range(component.shape[0]):
+        best[source[i]] = min(best[source[i]], cost[component[i]])
+    for i in range(component.shape[0]):
+        mine = cost[component[i]]
         if mine < np.inf and mine <= best[source[i]] and not taken[source[i]]:
             on_net[i] = True

@@ -3,10 +3,10 @@
 A stripe on a wall makes segments of hundreds of peaks, a strand of a net one of a few. A long
 segment that runs in a direction in which its laser's stripe cannot run belongs to another laser;
 the direction of a short one carries no information, because it follows the strand, not the stripe.
-Segments that continue where another ends, or meet there, form a connected component (a "stretch"):
+Segments that continue where another ends, or meet there, form a connected component:
 one strand with its knots.
 
-`StretchShapes` describes single components: straight, bent smoothly, or as high as they are wide.
+`ComponentShapes` describes single components: straight, bent smoothly, or as high as they are wide.
 The flank of a fish bends the stripe in one smooth sweep; a face of a box keeps it straight, and its
 edge breaks it; a bubble is a spot.
 """
@@ -20,30 +20,30 @@ import numpy as np
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import ZERO, borrowing_kernel, inline_borrowing_kernel, kernel
 from aqualvs.geometry.linear_algebra import solve_symmetric
-from aqualvs.scanning.laser_bands import SLOPE_CELL, StripeSearch
-from aqualvs.scanning.stripe import Returns
+from aqualvs.scanning.laser_bands import SLOPE_CELL, LaserBand
+from aqualvs.scanning.stripe import StripePeaks
 
 # Least height of a bend over its chord, beyond errors of the lens.
-_LEAST_SAGITTA_PX = 1.0
+_MIN_SAGITTA_PX = 1.0
 # Largest residual of a smooth bend: a floor, and a share of its height. A corner leaves more.
 _ROUGH_PX = 0.3
 _ROUGH_SHARE = 0.05
 # A bend of this height lies beyond the gate for planes.
 _CURVED_PX = 2.0
 # Shorter pieces are as short as the light on a strand and have no distinctive shape.
-_LEAST_LINES = 16
+_MIN_LINES = 16
 # A spot is as long as it is wide within these factors, and no larger than that.
 _ROUND_FROM, _ROUND_TO = 0.5, 2.6
 _SPOT_LINES = 4
 _LARGEST_SPOT = 0.012
 # And it glints: its brightness as a share of that of the frame's bright peaks.
 _GLINT_SHARE = 0.75
-# What is summed over a stretch: powers 0 to 4 of the place, its moments, and squares.
+# What is summed over a component: powers 0 to 4 of the place, its moments, and squares.
 _MOMENTS, _SQUARES, _N_SUMS = 5, 8, 9
 
 
-class StretchShapes(NamedTuple):
-    """Shapes of stretches (connected segments), one row for each stretch number.
+class ComponentShapes(NamedTuple):
+    """Shapes of components (connected segments), one row for each component number.
 
     Attributes
     ----------
@@ -57,9 +57,9 @@ class StretchShapes(NamedTuple):
     size : array, shape (S,)
         Chord in metres.
     thickness : array, shape (S,)
-        Mean width of its returns in search lines.
+        Mean width of its peaks in search lines.
     height : array, shape (S,)
-        Mean height of its returns in grey levels.
+        Mean height of its peaks in grey levels.
     """
 
     n_lines: FloatArray
@@ -70,50 +70,50 @@ class StretchShapes(NamedTuple):
     height: FloatArray
 
     def bent(self) -> BoolArray:
-        """Mark the stretches that are bent smoothly, as the flank of a fish."""
+        """Mark the components that are bent smoothly, as the flank of a fish."""
         return self._those(is_bent)
 
     def curved(self) -> BoolArray:
-        """Mark the stretches that are not straight for any reason, so not on a plane."""
+        """Mark the components that are not straight for any reason, so not on a plane."""
         return self._those(is_curved)
 
     def straight(self) -> BoolArray:
-        """Mark the stretches that are long and straight, as on a plane."""
+        """Mark the components that are long and straight, as on a plane."""
         return self._those(is_straight)
 
     def round(self, bright: float) -> BoolArray:
-        """Mark the stretches that are spots of at least nearly the height `bright`."""
+        """Mark the components that are spots of at least nearly the height `bright`."""
         return self._those(lambda shapes, s: is_round(shapes, s, bright))
 
-    def _those(self, asked: Callable[["StretchShapes", int], bool]) -> BoolArray:
+    def _those(self, asked: Callable[["ComponentShapes", int], bool]) -> BoolArray:
         return np.array([asked(self, s) for s in range(len(self.n_lines))], np.bool_)
 
 
 @inline_borrowing_kernel
-def is_bent(shapes: StretchShapes, s: int) -> bool:
-    """Return whether stretch s is bent smoothly, as the flank of a fish."""
+def is_bent(shapes: ComponentShapes, s: int) -> bool:
+    """Return whether component s is bent smoothly, as the flank of a fish."""
     sagitta_px = shapes.sagitta_px[s]
     smooth = shapes.rough_px[s] < _ROUGH_PX + _ROUGH_SHARE * sagitta_px
-    bent = sagitta_px > _LEAST_SAGITTA_PX and smooth
-    return bool(shapes.n_lines[s] >= _LEAST_LINES and bent)
+    bent = sagitta_px > _MIN_SAGITTA_PX and smooth
+    return bool(shapes.n_lines[s] >= _MIN_LINES and bent)
 
 
 @inline_borrowing_kernel
-def is_curved(shapes: StretchShapes, s: int) -> bool:
-    """Return whether stretch s is not straight for any reason, so not on a plane."""
-    return bool(shapes.n_lines[s] >= _LEAST_LINES and shapes.sagitta_px[s] > _CURVED_PX)
+def is_curved(shapes: ComponentShapes, s: int) -> bool:
+    """Return whether component s is not straight for any reason, so not on a plane."""
+    return bool(shapes.n_lines[s] >= _MIN_LINES and shapes.sagitta_px[s] > _CURVED_PX)
 
 
 @inline_borrowing_kernel
-def is_straight(shapes: StretchShapes, s: int) -> bool:
-    """Return whether stretch s is long and straight, as on a plane."""
-    is_long = shapes.n_lines[s] >= 2 * _LEAST_LINES
-    return bool(is_long and shapes.sagitta_px[s] <= _LEAST_SAGITTA_PX)
+def is_straight(shapes: ComponentShapes, s: int) -> bool:
+    """Return whether component s is long and straight, as on a plane."""
+    is_long = shapes.n_lines[s] >= 2 * _MIN_LINES
+    return bool(is_long and shapes.sagitta_px[s] <= _MIN_SAGITTA_PX)
 
 
 @inline_borrowing_kernel
-def is_round(shapes: StretchShapes, s: int, bright: float) -> bool:
-    """Return whether stretch s is a spot of at least nearly the height `bright`."""
+def is_round(shapes: ComponentShapes, s: int, bright: float) -> bool:
+    """Return whether component s is a spot of at least nearly the height `bright`."""
     n_lines = shapes.n_lines[s]
     ratio = n_lines / max(shapes.thickness[s], 1.0)
     spot = _ROUND_FROM <= ratio <= _ROUND_TO and n_lines >= _SPOT_LINES
@@ -121,46 +121,48 @@ def is_round(shapes: StretchShapes, s: int, bright: float) -> bool:
     return bool(spot and small and shapes.height[s] >= _GLINT_SHARE * bright)
 
 
-def stretch_shapes(
-    stretch: IntArray,
+def component_shapes(
+    component: IntArray,
     line: IntArray,
     points: FloatArray,
     sensitivity: FloatArray,
     width: FloatArray,
     height: FloatArray,
-) -> StretchShapes:
-    """Describe the stretches of N candidates.
+) -> ComponentShapes:
+    """Describe the components of N candidates.
 
     Parameters
     ----------
-    stretch, line, points, sensitivity, width, height
-        As in `Readings`.
+    component, line, points, sensitivity, width, height
+        As in `Candidates`.
 
     Returns
     -------
-    StretchShapes
-        S rows, one more than the highest stretch number.
+    ComponentShapes
+        S rows, one more than the highest component number.
     """
-    return StretchShapes(*describe_stretches(stretch, line, points, sensitivity, width, height))
+    return ComponentShapes(
+        *describe_components(component, line, points, sensitivity, width, height)
+    )
 
 
 @kernel
-def describe_stretches(
-    stretch: IntArray,
+def describe_components(
+    component: IntArray,
     line: IntArray,
     points: FloatArray,
     sensitivity: FloatArray,
     width: FloatArray,
     height: FloatArray,
 ) -> FloatArray:
-    """Return the fields of `StretchShapes` as a table, shape (6, S)."""
+    """Return the fields of `ComponentShapes` as a table, shape (6, S)."""
     n = 0
-    for i in range(stretch.shape[0]):
-        n = max(n, stretch[i] + 1)
+    for i in range(component.shape[0]):
+        n = max(n, component[i] + 1)
     table = np.zeros((6, n))
-    shapes = StretchShapes(table[0], table[1], table[2], table[3], table[4], table[5])
+    shapes = ComponentShapes(table[0], table[1], table[2], table[3], table[4], table[5])
     first, last = np.full(n, -1), np.full(n, -1)
-    _measure_stretches(stretch, line, width, height, shapes, first, last)
+    _measure_components(component, line, width, height, shapes, first, last)
     chord = np.empty((n, 3))
     for s in range(n):
         if shapes.n_lines[s] == 0.0:
@@ -172,7 +174,7 @@ def describe_stretches(
             chord[s, k] = points[last[s], k] - points[first[s], k]
             square += chord[s, k] * chord[s, k]
         shapes.size[s] = np.sqrt(square)
-    _fit_parabolas(stretch, points, sensitivity, first, chord, shapes)
+    _fit_parabolas(component, points, sensitivity, first, chord, shapes)
     return table
 
 
@@ -186,19 +188,19 @@ def run_end(numbers: IntArray, begin: int) -> int:
 
 
 @borrowing_kernel
-def _measure_stretches(
-    stretch: IntArray,
+def _measure_components(
+    component: IntArray,
     line: IntArray,
     width: FloatArray,
     height: FloatArray,
-    shapes: StretchShapes,
+    shapes: ComponentShapes,
     first: IntArray,
     last: IntArray,
 ) -> None:
-    """Sum lines, widths and heights, and find the readings at the ends."""
+    """Sum lines, widths and heights, and find the candidates at the ends."""
     begin = ZERO
-    while begin < stretch.shape[0]:
-        s, end = stretch[begin], run_end(stretch, begin)
+    while begin < component.shape[0]:
+        s, end = component[begin], run_end(component, begin)
         widths, heights = 0.0, 0.0
         low, high = begin, begin
         for i in range(begin, end):
@@ -218,20 +220,20 @@ def _measure_stretches(
 
 @kernel
 def _fit_parabolas(
-    stretch: IntArray,
+    component: IntArray,
     points: FloatArray,
     sensitivity: FloatArray,
     first: IntArray,
     chord: FloatArray,
-    shapes: StretchShapes,
+    shapes: ComponentShapes,
 ) -> None:
-    """Fit a parabola over the chord of each stretch that is long enough to have a shape."""
+    """Fit a parabola over the chord of each component that is long enough to have a shape."""
     n = shapes.n_lines.shape[0]
     sums = np.zeros((n, _N_SUMS))
     begin = ZERO
-    while begin < stretch.shape[0]:
-        s, end = stretch[begin], run_end(stretch, begin)
-        if shapes.n_lines[s] >= _LEAST_LINES and shapes.size[s] > 0.0:
+    while begin < component.shape[0]:
+        s, end = component[begin], run_end(component, begin)
+        if shapes.n_lines[s] >= _MIN_LINES and shapes.size[s] > 0.0:
             _add_powers(
                 points, sensitivity, begin, end, first[s], chord[s], shapes.size[s], sums[s]
             )
@@ -302,15 +304,15 @@ def _add_powers(
 # Beyond any position on a search line.
 _ANYWHERE = 1 << 40
 
-CHUNK_LINES = 16
-"""A long segment is cut into chunks of at most this many returns."""
+SUBSEGMENT_LINES = 16
+"""A long segment is cut into subsegments of at most this many peaks."""
 
 # A gap of one search line does not end a segment: H.264 and specks make such gaps.
 _MAX_LINE_STEP = 2
 _LINK_GATE_PX = 2.0
 # Segments shorter than this follow the strand; longer ones must follow the stripe.
 _LONG_SEGMENT = 24
-# A segment that begins this near to another one's end belongs to the same stretch.
+# A segment that begins this near to another one's end belongs to the same component.
 _JOIN_LINES = 4
 _JOIN_PX = 4.0
 # Tolerance of a segment's direction beyond the bounds for a plane target; covers curvature.
@@ -319,60 +321,60 @@ _SLOPE_MARGIN = 0.15
 
 @dataclass(frozen=True, slots=True)
 class Segments:
-    """Peaks of one laser's search, grouped by segment, stretch and chunk.
+    """Peaks of one laser's search, grouped by segment, component and subsegment.
 
     Attributes
     ----------
     order : int array, shape (N,)
-        Indices into the `Returns`, segment by segment, along each segment.
-    stretch : int array, shape (N,)
-        Number of the stretch (connected segments) of each peak, in the order of `order`.
-    chunk : int array, shape (N,)
-        Number of the chunk (subsegment), likewise; a segment's chunks are consecutive. A short
-        segment, such as the light on one strand of a net, is one chunk.
+        Indices into the `StripePeaks`, segment by segment, along each segment.
+    component : int array, shape (N,)
+        Number of the component (connected segments) of each peak, in the order of `order`.
+    subsegment : int array, shape (N,)
+        Number of the subsegment, likewise; a segment's subsegments are consecutive. A short
+        segment, such as the light on one strand of a net, is one subsegment.
     """
 
     order: IntArray
-    stretch: IntArray
-    chunk: IntArray
+    component: IntArray
+    subsegment: IntArray
 
 
-def link_segments(returns: Returns, search: StripeSearch) -> Segments:
-    """Group the returns inside a laser's band; segments of another laser's direction are dropped.
+def link_segments(peaks: StripePeaks, search: LaserBand) -> Segments:
+    """Group the peaks inside a laser's band; segments of another laser's direction are dropped.
 
     Parameters
     ----------
-    returns : Returns
+    peaks : StripePeaks
         Of the search direction of `search`.
-    search : StripeSearch
+    search : LaserBand
         Band and slopes of the laser.
 
     Returns
     -------
     Segments
     """
-    numbers = np.empty((3, len(returns)), np.int64)
-    n = segment_returns(
-        returns.line,
-        returns.position,
+    numbers = np.empty((3, len(peaks)), np.int64)
+    n = segment_peaks(
+        peaks.line,
+        peaks.position,
         search.lowest,
         search.highest,
         search.slope_low,
         search.slope_high,
         numbers,
     )
-    order, stretch, chunk = numbers[:, :n]
-    return Segments(order, stretch, chunk)
+    order, component, subsegment = numbers[:, :n]
+    return Segments(order, component, subsegment)
 
 
 @kernel
 def in_a_row(line: IntArray, position: FloatArray) -> BoolArray:
-    """Mark the returns (N,) of segments of at least `CHUNK_LINES`, of any direction.
+    """Mark the peaks (N,) of segments of at least `SUBSEGMENT_LINES`, of any direction.
 
     Parameters
     ----------
     line, position
-        As in `Returns`.
+        As in `StripePeaks`.
     """
     n = line.shape[0]
     n_lines = line[n - 1] + 1 if n else 0
@@ -382,12 +384,12 @@ def in_a_row(line: IntArray, position: FloatArray) -> BoolArray:
     _link(line, position, lowest, highest, segment_of, first, last, count)
     long = np.empty(n, np.bool_)
     for i in range(n):
-        long[i] = count[segment_of[i]] >= CHUNK_LINES
+        long[i] = count[segment_of[i]] >= SUBSEGMENT_LINES
     return long
 
 
 @kernel
-def segment_returns(
+def segment_peaks(
     line: IntArray,
     position: FloatArray,
     lowest: IntArray,
@@ -396,7 +398,7 @@ def segment_returns(
     slope_high: FloatArray,
     numbers: IntArray,
 ) -> int:
-    """Write (order, stretch, chunk) as in `Segments`, shape (3, N); return the number kept."""
+    """Write the rows of `Segments`, shape (3, N); return the number kept."""
     n = line.shape[0]
     segment_of = np.empty(n, np.int64)
     # First and last return of each segment, and their number.
@@ -405,12 +407,12 @@ def segment_returns(
     start = _sort(segment_of, count[:n_segments], numbers)
     n_kept = _drop_foreign(line, position, slope_low, slope_high, start, first, last, numbers)
     root = _join(line, position, first[:n_kept], last[:n_kept])
-    order, stretch = numbers[0], numbers[1]
+    order, component = numbers[0], numbers[1]
     n = 0
     for s in range(n_kept):
         mine = root[s]
         while True:
-            stretch[n] = mine
+            component[n] = mine
             n += 1
             if order[n - 1] == last[s]:
                 break
@@ -445,7 +447,7 @@ def _link(
     last: IntArray,
     count: IntArray,
 ) -> int:
-    """Give each return the segment that it continues, or a new one; -1 outside the band."""
+    """Give each peak the segment that it continues, or a new one; -1 outside the band."""
     n = line.shape[0]
     # Active segments: number and last line; last position, slope and the largest change of it by
     # the next return; and the predicted position on this search line.
@@ -480,7 +482,7 @@ def _link(
             track[1, best] += track[2, best] * (seen - track[1, best])
             count[s] += 1
             track[2, best] = max(1.0 / count[s], 0.15)
-        # A segment has one return on a search line.
+        # A segment has one peak on a search line.
         alive[1, best], track[0, best], due[best] = x, place, np.inf
         segment_of[i], last[s] = s, i
     return n_segments
@@ -488,7 +490,7 @@ def _link(
 
 @kernel
 def _sort(segment_of: IntArray, count: IntArray, numbers: IntArray) -> IntArray:
-    """Sort the returns by segment into the first row of `numbers`; return the segments' starts."""
+    """Sort the peaks by segment into the first row of `numbers`; return the segments' starts."""
     n_segments = count.shape[0]
     start, fill = np.empty(n_segments + 1, np.int64), np.empty(n_segments, np.int64)
     start[0] = 0
@@ -514,23 +516,23 @@ def _drop_foreign(
     last: IntArray,
     numbers: IntArray,
 ) -> int:
-    """Keep the segments whose direction is possible, and count them; number their chunks."""
-    order, chunk = numbers[0], numbers[2]
-    n, n_chunks, n_kept = 0, 0, 0
+    """Keep the segments whose direction is possible, and count them; number their subsegments."""
+    order, subsegment = numbers[0], numbers[2]
+    n, n_subsegments, n_kept = 0, 0, 0
     for s in range(start.shape[0] - 1):
         begin, size = start[s], start[s + 1] - start[s]
         if size >= _LONG_SEGMENT:
             members = order[begin : begin + size]
             if not _direction_possible(line, position, members, slope_low, slope_high):
                 continue
-            n_pieces = (size + CHUNK_LINES - 1) // CHUNK_LINES
+            n_planes = (size + SUBSEGMENT_LINES - 1) // SUBSEGMENT_LINES
             for k in range(size):
-                chunk[n + k] = n_chunks + k * n_pieces // size
-            n_chunks += n_pieces
+                subsegment[n + k] = n_subsegments + k * n_planes // size
+            n_subsegments += n_planes
         else:
             for k in range(size):
-                chunk[n + k] = n_chunks
-            n_chunks += 1
+                subsegment[n + k] = n_subsegments
+            n_subsegments += 1
         if n < begin:
             for k in range(size):
                 order[n + k] = order[begin + k]
@@ -575,7 +577,7 @@ def _direction_possible(
 def _join(line: IntArray, position: FloatArray, first: IntArray, last: IntArray) -> IntArray:
     """Assign each connected component of segments whose ends meet the number of its first segment.
 
-    `first` and `last` are the returns at the segments' ends; segments are ordered by the first.
+    `first` and `last` are the peaks at the segments' ends; segments are ordered by the first.
     """
     n = first.shape[0]
     root = np.arange(n)

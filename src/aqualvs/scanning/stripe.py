@@ -21,7 +21,7 @@ U8Array: TypeAlias = NDArray[np.uint8]
 
 # Limit of the doubled contrast threshold.
 _MAX_CONTRAST = 120
-# A valley below this many tenths of the lower of two peaks separates two returns.
+# A valley below this many tenths of the lower of two peaks separates two peaks.
 _VALLEY_TENTHS = 6
 # Marks of pixels, bytes of 0 or 1, are read eight at a time.
 _WORD = 8
@@ -47,16 +47,16 @@ class StripeOptions:
     Attributes
     ----------
     min_contrast : int
-        Smallest height of a return above its background, in grey levels; raised where hardly any
+        Smallest height of a peak above its background, in grey levels; raised where hardly any
         return of that height is laser light.
     reach_share : float
         Reach of the search for the background on each side, as a share of the image width; must
         exceed the width of the widest stripe.
     min_likelihood : float
-        Least likelihood, 0 to 1, that the colour of a return is laser light. Only used where the
+        Least likelihood, 0 to 1, that the colour of a peak is laser light. Only used where the
         source has colour.
     min_share : float
-        Returns lower than this share of the frame's bright returns (their 90 % quantile) are kept
+        Peaks lower than this share of the frame's bright peaks (their 90 % quantile) are kept
         only where many follow one another, as on a distant wall or of a weak laser; others are
         noise, or the glow beside a strand.
     max_returns : int
@@ -93,7 +93,7 @@ class ThresholdOptions:
     max_returns, max_pixels : int
         Runs of bright pixels, and bright pixels, allowed per frame and search direction. Where
         there are more, the lowest higher level is used at which there are not; if even white is
-        too much, the frame has no returns.
+        too much, the frame has no peaks.
     """
 
     level: int = 140
@@ -107,8 +107,8 @@ class ThresholdOptions:
 
 
 @dataclass(frozen=True, slots=True)
-class Returns:
-    """Stripe peaks (returns) of one search direction, ordered by search line, then by position.
+class StripePeaks:
+    """Stripe peaks of one search direction, ordered by search line, then by position.
 
     Attributes
     ----------
@@ -131,7 +131,7 @@ class Returns:
     likelihood: FloatArray
 
     def __len__(self) -> int:
-        """Return the number of returns."""
+        """Return the number of peaks."""
         return len(self.line)
 
 
@@ -157,7 +157,7 @@ class SearchImage(NamedTuple):
     along_x: bool
 
 
-class _Scratch(NamedTuple):
+class _Workspace(NamedTuple):
     """Buffers of one search line: pixels with margins, sliding minima, marks above background."""
 
     padded: U8Array
@@ -198,7 +198,7 @@ class PeakFinder:
         # There is room for a gap and a mark after the last pixel.
         background, above = np.zeros((2, (length + _VECTOR) // _WORD * _WORD + 3 * _WORD), np.uint8)
         words = above.view(np.uint64)
-        self._scratch = _Scratch(padded, minima, spare, background, above, words)
+        self._scratch = _Workspace(padded, minima, spare, background, above, words)
 
     def find(
         self,
@@ -251,7 +251,7 @@ def _find_peaks(
     every: int,
     reach_px: int,
     directions: FloatArray,
-    scratch: _Scratch,
+    scratch: _Workspace,
     line: IntArray,
     table: FloatArray,
 ) -> int:
@@ -281,7 +281,7 @@ def _find_peaks(
 
 @inline_borrowing_kernel
 def _mark_above(
-    row: U8Array, first: int, end: int, min_contrast: int, reach_px: int, scratch: _Scratch
+    row: U8Array, first: int, end: int, min_contrast: int, reach_px: int, scratch: _Workspace
 ) -> None:
     """Mark the pixels [first, end) that stand above the background; index 0 is `first`."""
     n = end - first
@@ -367,7 +367,7 @@ def _measure_run(
     x: int,
     first: int,
     run: tuple[int, int],
-    scratch: _Scratch,
+    scratch: _Workspace,
     reach_px: int,
     directions: FloatArray,
     line: IntArray,

@@ -19,13 +19,18 @@ from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel, kernel
 from aqualvs.geometry.planes import Plane
 from aqualvs.geometry.quantile import sum_of
-from aqualvs.scanning.candidates import Chunks
-from aqualvs.scanning.net_surfaces import continues, describe_pattern, joined_plane, seen_through
+from aqualvs.scanning.candidates import Subsegments
+from aqualvs.scanning.net_surfaces import (
+    describe_pattern,
+    is_continuation,
+    merged_plane,
+    seen_through,
+)
 from aqualvs.scanning.plane_search import (
     JX,
     JY,
     JZ,
-    MOST_TO_SECOND,
+    MAX_TO_SECOND,
     N_ROWS,
     WEIGHT,
     X,
@@ -53,7 +58,7 @@ def _cell(coordinate: float) -> int:
 
 @kernel
 def number_cells(pixels: FloatArray, cell: IntArray) -> tuple[int, int]:
-    """Write the number of the cell in which each of N readings lies.
+    """Write the number of the cell in which each of N candidates lies.
 
     Parameters
     ----------
@@ -77,7 +82,7 @@ def number_cells(pixels: FloatArray, cell: IntArray) -> tuple[int, int]:
 
 
 @inline_borrowing_kernel
-def light_up(middle: int, n_columns: int, lit: U8Array) -> None:
+def mark_cells(middle: int, n_columns: int, lit: U8Array) -> None:
     """Mark a cell and those around it, as far as they lie in `lit`, with nonzero values."""
     if lit[middle] == _MIDDLE:
         return
@@ -96,37 +101,37 @@ def lit_cells(cell: IntArray, explained: BoolArray, n_cells: int, n_columns: int
     cell, n_cells, n_columns
         From `number_cells`.
     explained : bool array, shape (N,)
-        Readings that lie on a surface.
+        Candidates that lie on a surface.
     """
     lit = np.zeros(n_cells, np.uint8)
     for i in range(cell.shape[0]):
         if explained[i]:
-            light_up(cell[i], n_columns, lit)
+            mark_cells(cell[i], n_columns, lit)
     return lit
 
 
-MOST_SURFACES = 5
+MAX_SURFACES = 5
 """Largest number of surfaces in a frame."""
 MIN_LINES_PER_LASER = 8
 """Least number of search lines with which a laser supports a surface."""
 WORTH_SHARE = 0.08
 """Least support of a surface, as a share of the best one's; less is left-over light."""
-LINES, SUPPORT, VOICE = range(3)
+LINES, INLIER_WEIGHT, SAMPLING_WEIGHT = range(3)
 """Sums over a surface: search lines on it, light, and sampling weight."""
 
-_MIN_CHUNKS = 6
+_MIN_SUBSEGMENTS = 6
 _MIN_LINES = 30
-# Planes through noise hold up to a hundredth of the light in the frame, all readings counted.
-_LEAST_SHARE = 0.03
+# Planes through noise hold up to a hundredth of the light in the frame, all candidates counted.
+_MIN_SHARE = 0.03
 
 
 @kernel
 def search_surfaces(
     table: FloatArray,
-    light: FloatArray,
+    intensity_weight: FloatArray,
     n_lines: IntArray,
     laser: IntArray,
-    chunk_index: IntArray,
+    subsegment_index: IntArray,
     pixels: FloatArray,
     n_lasers: int,
     nearest: float,
@@ -139,12 +144,12 @@ def search_surfaces(
 
     Parameters
     ----------
-    table, light, n_lines, laser
-        As in `Chunks`, C of them.
-    chunk_index : int array, shape (N,)
-        Row of each reading's chunk.
+    table, intensity_weight, n_lines, laser
+        As in `Subsegments`, C of them.
+    subsegment_index : int array, shape (N,)
+        Row of each candidate's subsegment.
     pixels : array, shape (N, 2)
-        Each reading's place in the image.
+        Each candidate's place in the image.
     n_lasers : int
         Lasers of the rig.
     nearest, farthest : float
@@ -152,7 +157,7 @@ def search_surfaces(
     planes : array, shape (5, 4)
         Written: normals and offsets.
     members : bool array, shape (5, C)
-        Written: chunks on each; False at first.
+        Written: subsegments on each; False at first.
     sums : array, shape (5, 3)
         Written: search lines, light and sampling weight of each. Light and weight of the best laser
         count up to three times those of the second.
@@ -162,28 +167,28 @@ def search_surfaces(
     n_cells, n_columns = 0, 0
     enough = float(_MIN_LINES)
     by_laser = np.empty((3, n_lasers))
-    for found in range(MOST_SURFACES):
+    for found in range(MAX_SURFACES):
         rows = np.flatnonzero(free)
-        if sum_of(n_lines[rows]) < enough or rows.shape[0] < _MIN_CHUNKS:
+        if sum_of(n_lines[rows]) < enough or rows.shape[0] < _MIN_SUBSEGMENTS:
             return found
         if not _find_plane(table, laser, rows, n_lasers, nearest, farthest, found, planes[found]):
             return found
         by_laser[:] = 0.0
         mine = members[found]
-        n = _collect(table, rows, planes[found], n_lines, light, laser, mine, by_laser)
+        n = _collect(table, rows, planes[found], n_lines, intensity_weight, laser, mine, by_laser)
         supporting = np.count_nonzero(by_laser[LINES] >= MIN_LINES_PER_LASER)
         sums[found, LINES] = sum_of(by_laser[LINES])
-        if n < _MIN_CHUNKS or supporting < 2 or sums[found, LINES] < _MIN_LINES:
+        if n < _MIN_SUBSEGMENTS or supporting < 2 or sums[found, LINES] < _MIN_LINES:
             return found
-        if sum_of(by_laser[SUPPORT]) < _LEAST_SHARE * sum_of(light):
+        if sum_of(by_laser[INLIER_WEIGHT]) < _MIN_SHARE * sum_of(intensity_weight):
             return found
-        sums[found, SUPPORT] = on_two(by_laser[SUPPORT])
-        sums[found, VOICE] = on_two(by_laser[VOICE])
+        sums[found, INLIER_WEIGHT] = on_two(by_laser[INLIER_WEIGHT])
+        sums[found, SAMPLING_WEIGHT] = on_two(by_laser[SAMPLING_WEIGHT])
         enough = max(enough, WORTH_SHARE * sums[found, LINES])
         if n_cells == 0:
             n_cells, n_columns = number_cells(pixels, cell)
-        _claim_light(chunk_index, cell, n_cells, n_columns, mine, free)
-    return MOST_SURFACES
+        _claim_peaks(subsegment_index, cell, n_cells, n_columns, mine, free)
+    return MAX_SURFACES
 
 
 @kernel
@@ -197,7 +202,7 @@ def _find_plane(
     seed: int,
     plane: FloatArray,
 ) -> bool:
-    """Search the chunks of some rows for a plane."""
+    """Search the subsegments of some rows for a plane."""
     n = rows.shape[0]
     some, its_laser = np.empty((N_ROWS, n)), np.empty(n, np.int64)
     start = np.zeros(n_lasers + 1, np.int64)
@@ -218,12 +223,12 @@ def _collect(
     rows: IntArray,
     plane: FloatArray,
     n_lines: IntArray,
-    light: FloatArray,
+    intensity_weight: FloatArray,
     laser: IntArray,
     members: BoolArray,
     by_laser: FloatArray,
 ) -> int:
-    """Mark the chunks on the plane; return their number, and each laser's lines, light, weight."""
+    """Mark the subsegments on the plane; return their number, and sums for each laser."""
     n = 0
     nx, ny, nz, offset = plane[0], plane[1], plane[2], plane[3]
     for k in range(rows.shape[0]):
@@ -233,8 +238,8 @@ def _collect(
         if residual * residual < squared_gate(per_px, offset):
             members[c] = True
             by_laser[LINES, laser[c]] += n_lines[c]
-            by_laser[SUPPORT, laser[c]] += light[c]
-            by_laser[VOICE, laser[c]] += table[WEIGHT, c]
+            by_laser[INLIER_WEIGHT, laser[c]] += intensity_weight[c]
+            by_laser[SAMPLING_WEIGHT, laser[c]] += table[WEIGHT, c]
             n += 1
     return n
 
@@ -243,19 +248,19 @@ def _collect(
 def collect_surface(
     table: FloatArray,
     n_lines: IntArray,
-    light: FloatArray,
+    intensity_weight: FloatArray,
     laser: IntArray,
     n_lasers: int,
     plane: FloatArray,
     members: BoolArray,
     sums: FloatArray,
 ) -> None:
-    """Mark the chunks on a plane; write the sums of its surface as `search_surfaces` does.
+    """Mark the subsegments on a plane; write the sums of its surface as `search_surfaces` does.
 
     Parameters
     ----------
-    table, n_lines, light, laser
-        As in `Chunks`, C of them.
+    table, n_lines, intensity_weight, laser
+        As in `Subsegments`, C of them.
     n_lasers : int
         Lasers of the rig.
     plane : array, shape (4,)
@@ -267,10 +272,10 @@ def collect_surface(
     """
     by_laser = np.zeros((3, n_lasers))
     rows = np.arange(laser.shape[0])
-    _collect(table, rows, plane, n_lines, light, laser, members, by_laser)
+    _collect(table, rows, plane, n_lines, intensity_weight, laser, members, by_laser)
     sums[LINES] = sum_of(by_laser[LINES])
-    sums[SUPPORT] = on_two(by_laser[SUPPORT])
-    sums[VOICE] = on_two(by_laser[VOICE])
+    sums[INLIER_WEIGHT] = on_two(by_laser[INLIER_WEIGHT])
+    sums[SAMPLING_WEIGHT] = on_two(by_laser[SAMPLING_WEIGHT])
 
 
 @borrowing_kernel
@@ -281,26 +286,26 @@ def on_two(weight: FloatArray) -> float:
         total += weight[i]
         second = max(second, min(first, weight[i]))
         first = max(first, weight[i])
-    return min(total, total - first + MOST_TO_SECOND * second)
+    return min(total, total - first + MAX_TO_SECOND * second)
 
 
 @kernel
-def _claim_light(
-    chunk_index: IntArray,
+def _claim_peaks(
+    subsegment_index: IntArray,
     cell: IntArray,
     n_cells: int,
     n_columns: int,
     members: BoolArray,
     free: BoolArray,
 ) -> None:
-    """Remove the members, and every other candidate of the same light, from the free chunks."""
+    """Remove the members, and all other candidates of that light, from the free subsegments."""
     lit = np.zeros(n_cells, np.uint8)
-    for i in range(chunk_index.shape[0]):
-        if members[chunk_index[i]]:
-            light_up(cell[i], n_columns, lit)
+    for i in range(subsegment_index.shape[0]):
+        if members[subsegment_index[i]]:
+            mark_cells(cell[i], n_columns, lit)
     claimed = np.zeros(free.shape[0], np.int64)
-    for i in range(chunk_index.shape[0]):
-        claimed[chunk_index[i]] += 1 if lit[cell[i]] else -1
+    for i in range(subsegment_index.shape[0]):
+        claimed[subsegment_index[i]] += 1 if lit[cell[i]] else -1
     for c in range(free.shape[0]):
         if members[c] or claimed[c] > 0:
             free[c] = False
@@ -311,11 +316,11 @@ __all__ = (
     "WORTH_SHARE",
     "Surface",
     "find_surfaces",
-    "shares_light",
+    "shares_peaks",
     "surface_on",
 )
 
-# Least share of a net's light on strands; that of a fish lies in long or bent stretches.
+# Least share of a net's light on strands; that of a fish lies in long or bent components.
 _STRANDS_SHARE = 0.4
 # A wall's shadows reach nearly as far as the net that casts them.
 _EXTENT_SHARE = 0.6
@@ -325,21 +330,21 @@ _SHARED = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Surface:
-    """A plane that chunks of at least two lasers agree on.
+    """A plane that subsegments of at least two lasers agree on.
 
     Attributes
     ----------
     plane : Plane
         In `dome`, offset > 0.
     members : bool array, shape (C,)
-        Chunks on it.
+        Subsegments on it.
     n_lines : int
         Search lines on it.
-    support : float
+    inlier_weight : float
         Inlier weight: light on it, that of the best laser up to three times the second's, because
         a plane needs two lasers.
-    voice : float
-        Sampling weight: the same, but a long stretch counts as a few strands.
+    sampling_weight : float
+        Sampling weight: the same, but a long component counts as a few strands.
     extent : float
         Search lines over which its broken stripes reach, summed over the lasers, stragglers left
         out.
@@ -348,8 +353,8 @@ class Surface:
     is_gappy : bool
         Whether they are broken at least, as on a dense net or in a net's shadows.
     is_unbroken : bool
-        Whether much of the light is in long stretches all the same, as on a table with gaps.
-    n_pieces : int
+        Whether much of the light is in long components all the same, as on a table with gaps.
+    n_planes : int
         Planes that were joined, because a folded or bent net goes on from one to the next. `plane`
         is then that of the largest, or their mean where none of them has half of the light.
     """
@@ -357,18 +362,18 @@ class Surface:
     plane: Plane
     members: BoolArray
     n_lines: int
-    support: float
-    voice: float
+    inlier_weight: float
+    sampling_weight: float
     extent: float
     is_mesh: bool
     is_gappy: bool = False
     is_unbroken: bool = False
-    n_pieces: int = 1
+    n_planes: int = 1
 
 
 def find_surfaces(
-    chunks: Chunks,
-    chunk_index: IntArray,
+    subsegments: Subsegments,
+    subsegment_index: IntArray,
     pixels: FloatArray,
     n_lasers: int,
     working_range: tuple[float, float],
@@ -378,12 +383,12 @@ def find_surfaces(
 
     Parameters
     ----------
-    chunks : Chunks
+    subsegments : Subsegments
         Of all candidates.
-    chunk_index : int array, shape (N,)
-        Row of each reading's chunk.
+    subsegment_index : int array, shape (N,)
+        Row of each candidate's subsegment.
     pixels : array, shape (N, 2)
-        Each reading's place in the image.
+        Each candidate's place in the image.
     n_lasers : int
         Lasers of the rig.
     working_range : (float, float)
@@ -394,16 +399,16 @@ def find_surfaces(
     Returns
     -------
     list of Surface
-        Deterministic: the same chunks give the same surfaces.
+        Deterministic: the same subsegments give the same surfaces.
     """
-    planes, sums = np.empty((MOST_SURFACES, 4)), np.empty((MOST_SURFACES, 3))
-    members = np.zeros((MOST_SURFACES, len(chunks)), np.bool_)
+    planes, sums = np.empty((MAX_SURFACES, 4)), np.empty((MAX_SURFACES, 3))
+    members = np.zeros((MAX_SURFACES, len(subsegments)), np.bool_)
     n = search_surfaces(
-        chunks.table,
-        chunks.light,
-        chunks.n_lines,
-        chunks.laser,
-        chunk_index,
+        subsegments.table,
+        subsegments.intensity_weight,
+        subsegments.n_lines,
+        subsegments.laser,
+        subsegment_index,
         pixels,
         n_lasers,
         *working_range,
@@ -412,60 +417,67 @@ def find_surfaces(
         sums,
     )
     surfaces = [
-        _describe(chunks, planes[i], members[i], sums[i], n_lasers, focal_px) for i in range(n)
+        _describe(subsegments, planes[i], members[i], sums[i], n_lasers, focal_px) for i in range(n)
     ]
     if n < 2:
         return surfaces
-    told = [
-        replace(one, is_mesh=True) if _is_dense_net(one, surfaces, chunks) else one
+    classified = [
+        replace(one, is_mesh=True) if _is_dense_net(one, surfaces, subsegments) else one
         for one in surfaces
     ]
-    return _join_pieces(told, chunks)
+    return _merge_coplanar(classified, subsegments)
 
 
-def surface_on(plane: Plane, chunks: Chunks, n_lasers: int, focal_px: float) -> Surface:
-    """Return the surface of all chunks on a plane, even if other surfaces explain their light.
+def surface_on(plane: Plane, subsegments: Subsegments, n_lasers: int, focal_px: float) -> Surface:
+    """Return the surface of all subsegments on a plane, even if other surfaces explain their light.
 
     Parameters
     ----------
     plane : Plane
         In `dome`, offset > 0.
-    chunks, n_lasers, focal_px
+    subsegments, n_lasers, focal_px
         As in `find_surfaces`.
     """
-    packed, members = np.append(plane.normal, plane.offset), np.zeros(len(chunks), np.bool_)
+    packed, members = np.append(plane.normal, plane.offset), np.zeros(len(subsegments), np.bool_)
     sums = np.empty(3)
     collect_surface(
-        chunks.table, chunks.n_lines, chunks.light, chunks.laser, n_lasers, packed, members, sums
+        subsegments.table,
+        subsegments.n_lines,
+        subsegments.intensity_weight,
+        subsegments.laser,
+        n_lasers,
+        packed,
+        members,
+        sums,
     )
-    return _describe(chunks, packed, members, sums, n_lasers, focal_px)
+    return _describe(subsegments, packed, members, sums, n_lasers, focal_px)
 
 
-def shares_light(one: Surface, other: Surface, chunks: Chunks) -> bool:
-    """Return whether half of a surface's chunks are on another one as well."""
-    shared = chunks.n_lines[one.members & other.members].sum()
-    return bool(shared > _SHARED * chunks.n_lines[one.members].sum())
+def shares_peaks(one: Surface, other: Surface, subsegments: Subsegments) -> bool:
+    """Return whether half of a surface's subsegments are on another one as well."""
+    shared = subsegments.n_lines[one.members & other.members].sum()
+    return bool(shared > _SHARED * subsegments.n_lines[one.members].sum())
 
 
 def _describe(
-    chunks: Chunks,
+    subsegments: Subsegments,
     plane: FloatArray,
     members: BoolArray,
     sums: FloatArray,
     n_lasers: int,
     focal_px: float,
 ) -> Surface:
-    """Make a surface from a plane and its chunks."""
-    lines, support, voice = sums.tolist()
-    pattern = describe_pattern(chunks, members, n_lasers, MIN_LINES_PER_LASER, focal_px)
+    """Make a surface from a plane and its subsegments."""
+    lines, inlier_weight, sampling_weight = sums.tolist()
+    pattern = describe_pattern(subsegments, members, n_lasers, MIN_LINES_PER_LASER, focal_px)
     # Strands near the vehicle are long in search lines, and still short.
-    on_strands = max(voice, on_two(pattern.on_strands)) > _STRANDS_SHARE * support
+    on_strands = max(sampling_weight, on_two(pattern.on_strands)) > _STRANDS_SHARE * inlier_weight
     return Surface(
         plane=Plane(plane[:3], float(plane[3])),
         members=members,
         n_lines=int(lines),
-        support=support,
-        voice=voice,
+        inlier_weight=inlier_weight,
+        sampling_weight=sampling_weight,
         extent=pattern.extent,
         is_mesh=pattern.is_mesh and on_strands,
         is_gappy=pattern.is_gappy and on_strands,
@@ -473,52 +485,54 @@ def _describe(
     )
 
 
-def _join_pieces(surfaces: list[Surface], chunks: Chunks) -> list[Surface]:
+def _merge_coplanar(surfaces: list[Surface], subsegments: Subsegments) -> list[Surface]:
     """Join planes that are pieces of one net; the others stay as they are."""
     rest, done = list(surfaces), []
     while rest:
         net = rest.pop(0)
-        pieces = [net]
+        parts = [net]
         while net.is_mesh:
             more = [
                 one
                 for one in rest
                 if one.is_mesh
-                and any(continues(p.plane, p.members, one.members, chunks) for p in pieces)
+                and any(
+                    is_continuation(p.plane, p.members, one.members, subsegments) for p in parts
+                )
             ]
             if not more:
                 break
-            pieces += more
-            rest = [one for one in rest if all(one is not piece for piece in more)]
-        done.append(_joined(pieces, chunks) if len(pieces) > 1 else net)
+            parts += more
+            rest = [one for one in rest if all(one is not part for part in more)]
+        done.append(_merged(parts, subsegments) if len(parts) > 1 else net)
     return done
 
 
-def _joined(pieces: list[Surface], chunks: Chunks) -> Surface:
-    members = [piece.members for piece in pieces]
+def _merged(parts: list[Surface], subsegments: Subsegments) -> Surface:
+    members = [part.members for part in parts]
     return Surface(
-        plane=joined_plane([piece.plane for piece in pieces], members, chunks),
+        plane=merged_plane([part.plane for part in parts], members, subsegments),
         members=np.logical_or.reduce(members),
-        n_lines=sum(piece.n_lines for piece in pieces),
-        support=sum(piece.support for piece in pieces),
-        voice=sum(piece.voice for piece in pieces),
-        extent=max(piece.extent for piece in pieces),
+        n_lines=sum(part.n_lines for part in parts),
+        inlier_weight=sum(part.inlier_weight for part in parts),
+        sampling_weight=sum(part.sampling_weight for part in parts),
+        extent=max(part.extent for part in parts),
         is_mesh=True,
         is_gappy=True,
-        n_pieces=len(pieces),
+        n_planes=len(parts),
     )
 
 
-def _is_dense_net(surface: Surface, surfaces: list[Surface], chunks: Chunks) -> bool:
+def _is_dense_net(surface: Surface, surfaces: list[Surface], subsegments: Subsegments) -> bool:
     """Return whether another surface, broken by shadows, is seen through the gaps of this one.
 
     A net that is near may fill most of the stripes; it then has more light than what it shadows.
     """
     return not surface.is_mesh and any(
         other.is_gappy
-        and (surface.is_gappy or surface.support > other.support)
+        and (surface.is_gappy or surface.inlier_weight > other.inlier_weight)
         and other.plane.offset > surface.plane.offset
         and other.extent >= _EXTENT_SHARE * surface.extent
-        and seen_through(surface.members, other.members, chunks)
+        and seen_through(surface.members, other.members, subsegments)
         for other in surfaces
     )

@@ -12,7 +12,7 @@ _LINES_SHARE, _REACH_SHARE = 0.1, 0.5
 # A mesh reaches far with this share of the widest mesh's extent.
 _EXTENT_SHARE = 0.75
 # And it is well supported with this share of the best one's support.
-_SUPPORT_SHARE = 0.35
+_INLIER_SHARE = 0.35
 
 
 class TargetKind(StrEnum):
@@ -26,7 +26,7 @@ class TargetKind(StrEnum):
     """Only a surface with unbroken stripes, or with long stretches between gaps."""
 
 
-def read_as_wanted(surfaces: list[Surface], kind: TargetKind) -> list[Surface]:
+def as_requested_kind(surfaces: list[Surface], kind: TargetKind) -> list[Surface]:
     """Return the surfaces, classified as solid where possible if a solid target is wanted.
 
     A table with gaps, or a wall whose texture breaks the stripes, may look like a net.
@@ -55,7 +55,7 @@ def choose_target(
         return only if fits else None
     near, far = working_range
     surfaces = [one for one in surfaces if near <= one.plane.offset <= far] or surfaces
-    most = max((surface.voice for surface in surfaces), default=0.0)
+    most = max((surface.sampling_weight for surface in surfaces), default=0.0)
     lines = max((surface.n_lines for surface in surfaces), default=0)
     # Unbroken stripes have no extent; their number of search lines serves as one.
     reach = max((max(surface.extent, surface.n_lines) for surface in surfaces), default=0.0)
@@ -63,11 +63,11 @@ def choose_target(
         one
         for one in surfaces
         if one.is_mesh
-        and one.voice >= WORTH_SHARE * most
+        and one.sampling_weight >= WORTH_SHARE * most
         and (one.n_lines >= _LINES_SHARE * lines or one.extent >= _REACH_SHARE * reach)
     ]
     solids = [one for one in surfaces if not one.is_mesh]
-    solid = max(solids, key=lambda surface: surface.support, default=None)
+    solid = max(solids, key=lambda surface: surface.inlier_weight, default=None)
     net = _nearest_far_reaching(meshes)
     if kind is TargetKind.NET:
         return net
@@ -76,13 +76,13 @@ def choose_target(
 
 def _nearest_far_reaching(meshes: Sequence[Surface]) -> Surface | None:
     farthest = max((surface.extent for surface in meshes), default=0.0)
-    # What has long stretches as well may be a wall in a net's shadows: no measure of a net's light.
+    # What has long intervals as well may be a wall in a net's shadows: no measure of a net's light.
     broken = [surface for surface in meshes if not surface.is_unbroken] or meshes
-    most = max((surface.voice for surface in broken), default=0.0)
+    most = max((surface.sampling_weight for surface in broken), default=0.0)
     wide = [
         one
         for one in meshes
-        if one.extent >= _EXTENT_SHARE * farthest and one.voice >= _SUPPORT_SHARE * most
+        if one.extent >= _EXTENT_SHARE * farthest and one.sampling_weight >= _INLIER_SHARE * most
     ]
-    best = max(meshes, key=lambda surface: surface.voice, default=None)
+    best = max(meshes, key=lambda surface: surface.sampling_weight, default=None)
     return min(wide, key=lambda surface: surface.plane.offset, default=best)

@@ -100,10 +100,10 @@ _KNOT = 0.45
 _GROWTH_ALBEDO = (0.42, 0.46, 0.26)
 # Least step along a ray towards a folded net, and number of bisections of the last step.
 _STEP = 1e-3
-_MOST_STEPS = 200
+_MAX_STEPS = 200
 _HALVINGS = 16
 # Greatest number of layers of a folded net along a ray.
-_MOST_LAYERS = 5
+_MAX_LAYERS = 5
 
 
 class Strand(NamedTuple):
@@ -207,7 +207,7 @@ def _next_crossing(
     # The height over the net limits the distance to it along the ray from below.
     share = 1.0 / (1.5 + steepest)
     side = _behind(o, d, t, nets, i, folds)
-    for _ in range(_MOST_STEPS):
+    for _ in range(_MAX_STEPS):
         if t >= end:
             break
         step = max(share * abs(side), _STEP)
@@ -339,7 +339,7 @@ def meet_net(
     """Return the first strand of net i that a ray meets."""
     found = Strand(np.inf, (0.0, 0.0, 0.0), 0.0, 0.0, 0.0)
     t = 0.0
-    for _ in range(_MOST_LAYERS):
+    for _ in range(_MAX_LAYERS):
         t = _next_crossing(o, d, nets, i, folds, t)
         if not t < 1e6:
             break

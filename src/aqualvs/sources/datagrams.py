@@ -1,7 +1,7 @@
 """UDP datagrams: addresses, a receiver with its own thread, and detection of their content.
 
-`Datagrams` takes datagrams from the system as they arrive. `Inbox` hands out those of one kind (RTP
-with H.264, MPEG-TS, bare H.264) until the content shows another kind.
+`Datagrams` takes datagrams from the system as they arrive. `DatagramQueue` hands out those of one
+kind (RTP with H.264, MPEG-TS, bare H.264) until the content shows another kind.
 """
 
 import errno
@@ -250,7 +250,7 @@ def transport_content(datagram: bytes) -> bytes | None:
     return datagram if whole and set(datagram[::PACKET_BYTES]) == {SYNC} else None
 
 
-class Inbox:
+class DatagramQueue:
     """Queue of datagrams of one kind, until another kind arrives.
 
     Parameters

@@ -22,7 +22,7 @@ from av.video.stream import VideoStream
 from aqualvs.scanning.scan import Frame
 from aqualvs.sources.base import PartHealth, State, planes_of
 from aqualvs.sources.h264 import FrameNumbers
-from aqualvs.sources.video import Ledger
+from aqualvs.sources.video import FrameCounter
 
 _DISAGREE_S = 5.0
 """Greatest difference of stream and arrival times for one sender: buffers hold no more."""
@@ -243,10 +243,10 @@ class Reception:
             return State.FAULT, self._trouble
         if self._heard is None:
             return State.FAULT, f"waiting for the stream for {now - self._began:.0f} s"
-        if now - self._heard > self._patience():
+        if now - self._heard > self._timeout():
             return State.FAULT, f"silent for {now - self._heard:.1f} s; waiting for its return"
         since = self._began if self._last_frame is None else self._last_frame
-        if now - since > self._patience():
+        if now - since > self._timeout():
             why = "damaged or lost packets, no sound picture" if self._n_held else "no key frame"
             return State.FAULT, f"{self._content}: {why} for {now - since:.1f} s"
         return self._running()
@@ -261,7 +261,7 @@ class Reception:
         share = 100 * n_lost / (n_lost + len(self._frames))
         return State.WARN, f"{words}, {share:.1f} % lost".strip()
 
-    def _patience(self) -> float:
+    def _timeout(self) -> float:
         """Return the silence that is no fault: longer for a stream of few frames."""
         if len(self._frames) < 2:
             return max(_SILENT_S, 2.0 if self._last_frame is None else 0.0)
@@ -374,7 +374,7 @@ class LiveFrames:
 
     def __init__(self, reception: Reception) -> None:
         self._reception = reception
-        self._ledger = Ledger(counts_packets=True)
+        self._frame_counter = FrameCounter(counts_packets=True)
         self._clock = StreamClock(1.0)
         self._decoder: LiveDecoder | None = None
         self._spacing = _Spacing()
@@ -397,14 +397,14 @@ class LiveFrames:
             As for `LiveDecoder`.
         """
         self._decoder = LiveDecoder(codec, hears_losses=hears_losses)
-        self._ledger.restart()
+        self._frame_counter.restart()
         self._lossy = False
         self._clock.set_tick(tick)
 
     def restart(self) -> None:
         """Continue with a sender that has started anew, on the same decoder."""
         self.lose()
-        self._ledger.restart()
+        self._frame_counter.restart()
         self._lossy = False
 
     def lose(self) -> None:
@@ -420,7 +420,7 @@ class LiveFrames:
         ----------
         packet : Packet
         """
-        self._ledger.expect(packet)
+        self._frame_counter.expect(packet)
         self._hold()
 
     def feed(self, packet: "Packet[VideoStream]") -> Iterator[Frame]:
@@ -437,7 +437,7 @@ class LiveFrames:
         """
         if self._decoder is None or packet.size == 0:
             return
-        self._ledger.expect(packet)
+        self._frame_counter.expect(packet)
         arrival = time.monotonic()
         pictures = self._decoder.decode(packet)
         if self._decoder.is_waiting:
@@ -462,7 +462,7 @@ class LiveFrames:
 
     def _number(self, picture: VideoFrame, at: float) -> int:
         """Return the picture's number; after a loss, the time gives the number of missing ones."""
-        number = self._ledger.number(picture.pts)
+        number = self._frame_counter.number(picture.pts)
         if self._first is None:
             self._first = number  # Earlier ones are not lost: reception began later.
         index = number - self._first
@@ -474,7 +474,7 @@ class LiveFrames:
                 self._spacing.learn(passed)
             return index
         missing = max(0, self._spacing.count(passed) - step)
-        self._ledger.skip(missing)
+        self._frame_counter.skip(missing)
         return index + missing
 
 

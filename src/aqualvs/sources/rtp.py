@@ -110,7 +110,7 @@ class RtpOrder:
 
     def __init__(self, *, depth: int = 32, patience: float = 0.02) -> None:
         self._depth = depth
-        self._patience = patience
+        self._timeout = patience
         self._sender: int | None = None
         self._next = 0
         self._kept: dict[int, RtpPacket] = {}
@@ -150,7 +150,7 @@ class RtpOrder:
     @property
     def wait(self) -> float | None:
         """Seconds after which to call `overdue` if nothing comes; None if nothing is missing."""
-        return self._patience if self._kept else None
+        return self._timeout if self._kept else None
 
     def overdue(self, arrival: float) -> list[Ordered]:
         """Return the packets that have waited too long for a missing one.
@@ -164,7 +164,7 @@ class RtpOrder:
 
     def _due(self, arrival: float) -> list[Ordered]:
         ready = self._run(after_loss=False)
-        late = arrival - self._missing_since >= self._patience
+        late = arrival - self._missing_since >= self._timeout
         while self._kept and (late or len(self._kept) > self._depth):
             self._next = min(self._kept, key=self._distance)
             ready += self._run(after_loss=True)

@@ -34,7 +34,7 @@ _INTRA_ONLY = frozenset({"mjpeg", "prores", "dnxhd", "rawvideo", "huffyuv", "ffv
 # Tolerance in the time of the last picture before the end that the container states; the serial
 # reader allows more.
 _EARLY_FRAMES, _EARLY_SHARE = 2.0, 0.01
-_PATIENCE_S = 10.0
+_TIMEOUT_S = 10.0
 
 
 class SpanKind(StrEnum):
@@ -94,13 +94,13 @@ class VideoSpans:
     n_bytes: int
 
 
-def video_spans(path: Path, n_least: int) -> VideoSpans:
+def video_spans(path: Path, n_min: int) -> VideoSpans:
     """Read a video's packets, without decoding them, and find where it may be cut.
 
     Parameters
     ----------
     path : Path
-    n_least : int
+    n_min : int
         Frames that a part has at least, but for the last.
 
     Raises
@@ -108,7 +108,7 @@ def video_spans(path: Path, n_least: int) -> VideoSpans:
     av.error.FFmpegError, OSError
         As FFmpeg says it, if the file cannot be opened.
     """
-    with av.open(str(path), timeout=_PATIENCE_S) as container:
+    with av.open(str(path), timeout=_TIMEOUT_S) as container:
         stream = container.streams.video[0]
         packets = _Packets(stream)
         try:
@@ -117,21 +117,21 @@ def video_spans(path: Path, n_least: int) -> VideoSpans:
         except av.error.FFmpegError as fault:
             packets.doubt(f"the file breaks off ({fault.strerror})")
         why = packets.why_whole() or _broken_promise(stream, packets)
-        spans = () if why else packets.spans(n_least)
+        spans = () if why else packets.spans(n_min)
         return VideoSpans(spans, why, packets.checksum, packets.n_bytes)
 
 
-def image_spans(sizes: Sequence[int], n_least: int) -> tuple[Span, ...]:
+def image_spans(sizes: Sequence[int], n_min: int) -> tuple[Span, ...]:
     """Cut a folder of images into parts.
 
     Parameters
     ----------
     sizes : sequence of int
         Of the files, in bytes, in their order.
-    n_least : int
+    n_min : int
         Images that a part has, but for the last.
     """
-    edges = [*range(0, len(sizes), n_least), len(sizes)]
+    edges = [*range(0, len(sizes), n_min), len(sizes)]
     return tuple(
         Span(kind=SpanKind.IMAGES, first=first, stop=stop, n_bytes=sum(sizes[first:stop]))
         for first, stop in itertools.pairwise(edges)
@@ -205,9 +205,9 @@ class _Packets:
             return "pictures that share a time"
         return "" if self._cuts[:1] == [0] else "no key frame at the beginning"
 
-    def spans(self, n_least: int) -> tuple[Span, ...]:
+    def spans(self, n_min: int) -> tuple[Span, ...]:
         """Return the spans, each of which begins at a picture that needs none before it."""
-        starts = _far_enough(self._sound_cuts(), n_least)
+        starts = _far_enough(self._sound_cuts(), n_min)
         edges = [*starts, len(self._pts)]
         origin = min(self._pts)
         return tuple(
@@ -256,11 +256,11 @@ class _Packets:
         return found.is_refresh and (found.has_all_parameter_sets or not self._sets_in_band)
 
 
-def _far_enough(cuts: Sequence[int], n_least: int) -> list[int]:
+def _far_enough(cuts: Sequence[int], n_min: int) -> list[int]:
     """Return the first cut and those that leave enough frames since the one before."""
     chosen = [cuts[0]]
     for cut in cuts:
-        if cut - chosen[-1] >= n_least:
+        if cut - chosen[-1] >= n_min:
             chosen.append(cut)
     return chosen
 
@@ -274,8 +274,8 @@ def _broken_promise(stream: VideoStream, packets: _Packets) -> str:
     promised_s, rate = promised_duration(stream), stream.average_rate
     if promised_s is None or not rate:
         return ""
-    patience_s = max(_EARLY_FRAMES / float(rate), _EARLY_SHARE * promised_s)
-    return "" if packets.latest_s() + patience_s >= promised_s else "ends before its promise"
+    timeout_s = max(_EARLY_FRAMES / float(rate), _EARLY_SHARE * promised_s)
+    return "" if packets.latest_s() + timeout_s >= promised_s else "ends before its promise"
 
 
 def promised_duration(stream: VideoStream) -> float | None:
@@ -292,7 +292,7 @@ def promised_duration(stream: VideoStream) -> float | None:
 _SEEK_BEFORE_S = (0, 2, 20, 1_000_000)
 
 
-class UnlikeSurveyError(Exception):
+class UnlikeProbeError(Exception):
     """Difference between a span and its description; the dive must be measured in one piece."""
 
 
@@ -320,7 +320,7 @@ class VideoParts(Closing):
 
         Raises
         ------
-        UnlikeSurveyError
+        UnlikeProbeError
             If any picture is damaged or missing: the whole video decides what becomes of those
             that follow.
         """
@@ -329,20 +329,20 @@ class VideoParts(Closing):
             stream = self._stream(span)
             for picture in _pictures(stream, span):
                 if picture.is_corrupt or picture.pts is None or picture.pts <= latest:
-                    raise UnlikeSurveyError(f"picture {index} is damaged")
+                    raise UnlikeProbeError(f"picture {index} is damaged")
                 if (picture.width, picture.height) != self._size_px:
-                    raise UnlikeSurveyError(f"picture {index} has another size")
+                    raise UnlikeProbeError(f"picture {index} has another size")
                 latest = picture.pts
                 ticks = picture.pts - span.origin_pts
                 luma, chroma = planes_of(picture)
                 yield Frame(index, float(ticks * (stream.time_base or 0)), luma, chroma)
                 index += 1
         except (av.error.FFmpegError, OSError) as fault:
-            raise UnlikeSurveyError(
+            raise UnlikeProbeError(
                 f"picture {index} or a later one is damaged ({fault})"
             ) from fault
         if index != span.stop:
-            raise UnlikeSurveyError(f"{index - span.first} pictures of {span.stop - span.first}")
+            raise UnlikeProbeError(f"{index - span.first} pictures of {span.stop - span.first}")
 
     def close(self) -> None:
         """Close the file; frames already delivered stay valid."""
@@ -355,7 +355,7 @@ class VideoParts(Closing):
             # Some containers cannot seek to the start.
             self.close()
         if self._container is None:
-            self._container = av.open(str(self._path), timeout=_PATIENCE_S)
+            self._container = av.open(str(self._path), timeout=_TIMEOUT_S)
             _prepare(self._container.streams.video[0])
         return self._container.streams.video[0]
 
@@ -365,7 +365,7 @@ def image_frames(folder: Path, span: Span, fps: float) -> Iterator[Frame]:
 
     Raises
     ------
-    UnlikeSurveyError
+    UnlikeProbeError
         If an image cannot be read, or there are others than there were.
     """
     try:
@@ -373,13 +373,13 @@ def image_frames(folder: Path, span: Span, fps: float) -> Iterator[Frame]:
         index = span.first
         for frame in source:
             if frame.index + span.first != index:
-                raise UnlikeSurveyError(f"image {index} cannot be read")
+                raise UnlikeProbeError(f"image {index} cannot be read")
             yield Frame(index, index / fps, frame.luma, frame.chroma)
             index += 1
     except SourceError as fault:
-        raise UnlikeSurveyError(str(fault)) from fault
+        raise UnlikeProbeError(str(fault)) from fault
     if index != span.stop:
-        raise UnlikeSurveyError(f"{index - span.first} images of {span.stop - span.first}")
+        raise UnlikeProbeError(f"{index - span.first} images of {span.stop - span.first}")
 
 
 def _prepare(stream: VideoStream) -> None:
@@ -396,7 +396,7 @@ def _pictures(stream: VideoStream, span: Span) -> Iterator[VideoFrame]:
         checksums.append(packet_checksum(packet))
         yield from packet.decode()
     if joint_checksum(checksums) != span.checksum:
-        raise UnlikeSurveyError("the file has changed since it was looked through")
+        raise UnlikeProbeError("the file has changed since it was looked through")
     yield from stream.codec_context.decode(None)
 
 
@@ -418,4 +418,4 @@ def _packets_from(stream: VideoStream, span: Span) -> "Iterator[Packet[VideoStre
                 return itertools.chain([packet], packets)
             if packet.is_keyframe and (packet.pts is None or packet.pts > span.start_pts):
                 break
-    raise UnlikeSurveyError(f"picture {span.first} is not found")
+    raise UnlikeProbeError(f"picture {span.first} is not found")

@@ -30,8 +30,8 @@ from aqualvs.sources.datagrams import (
     RTP,
     TS,
     WAIT_S,
+    DatagramQueue,
     Datagrams,
-    Inbox,
     UdpAddress,
     kind_of,
     transport_content,
@@ -151,32 +151,32 @@ class RtpReader:
         self._parameter_sets = parameter_sets
         self._payload_type = payload_type
 
-    def frames(self, inbox: Inbox) -> Iterator[Frame]:
+    def frames(self, datagram_queue: DatagramQueue) -> Iterator[Frame]:
         """Yield frames until the feed ends or another kind comes.
 
         Parameters
         ----------
-        inbox : Inbox
+        datagram_queue : DatagramQueue
         """
         order, pictures = RtpOrder(), H264Depacketizer()
         self._frames.connect(
             decoder_of("h264", self._parameter_sets), 1 / TICKS_HZ, hears_losses=True
         )
-        while not inbox.is_closed:
-            datagram = inbox.get(order.wait or WAIT_S)
+        while not datagram_queue.is_closed:
+            datagram = datagram_queue.get(order.wait or WAIT_S)
             if datagram is None:
                 due = order.overdue(time.monotonic())
-            elif inbox.is_late(datagram):
+            elif datagram_queue.is_late(datagram):
                 self._frames.lose()
                 continue
             else:
                 packet = parse_rtp(datagram.content)
-                if inbox.is_foreign(datagram, fits=packet is not None):
+                if datagram_queue.is_foreign(datagram, fits=packet is not None):
                     return
                 if packet is None or not self._is_video(packet):
                     continue
                 due = order.push(packet, datagram.arrival)
-                self._tell(inbox.reception, pictures)
+                self._tell(datagram_queue.reception, pictures)
             for ordered in due:
                 for picture in pictures.push(ordered):
                     yield from decoded(self._frames, picture)
@@ -204,25 +204,25 @@ class TransportReader:
     def __init__(self, frames: LiveFrames) -> None:
         self._frames = frames
 
-    def frames(self, inbox: Inbox) -> Iterator[Frame]:
+    def frames(self, datagram_queue: DatagramQueue) -> Iterator[Frame]:
         """Yield frames until the feed ends or another kind comes.
 
         Parameters
         ----------
-        inbox : Inbox
+        datagram_queue : DatagramQueue
         """
         stream, codec = TransportStream(), None
-        while not inbox.is_closed:
-            datagram = inbox.get()
+        while not datagram_queue.is_closed:
+            datagram = datagram_queue.get()
             if datagram is None:
                 continue
-            if inbox.is_late(datagram):
+            if datagram_queue.is_late(datagram):
                 self._frames.lose()
                 continue
             content = transport_content(datagram.content)
-            if inbox.is_foreign(datagram, fits=content is not None):
+            if datagram_queue.is_foreign(datagram, fits=content is not None):
                 return
-            inbox.reception.hear(TS)
+            datagram_queue.reception.hear(TS)
             for picture in stream.push(content or b""):
                 if codec != stream.codec:
                     codec = stream.codec or ""
@@ -242,26 +242,26 @@ class BareReader:
     def __init__(self, frames: LiveFrames) -> None:
         self._frames = frames
 
-    def frames(self, inbox: Inbox) -> Iterator[Frame]:
+    def frames(self, datagram_queue: DatagramQueue) -> Iterator[Frame]:
         """Yield frames until the feed ends or another kind comes.
 
         Parameters
         ----------
-        inbox : Inbox
+        datagram_queue : DatagramQueue
         """
         codec = decoder_of("h264")
         self._frames.connect(codec, 1e-6, hears_losses=False)
-        while not inbox.is_closed:
-            datagram = inbox.get()
+        while not datagram_queue.is_closed:
+            datagram = datagram_queue.get()
             if datagram is None:
                 continue
-            if inbox.is_late(datagram):
+            if datagram_queue.is_late(datagram):
                 self._frames.lose()
                 continue
             other = kind_of(datagram.content) in (RTP, TS)
-            if inbox.is_foreign(datagram, fits=not other):
+            if datagram_queue.is_foreign(datagram, fits=not other):
                 return
-            inbox.reception.hear(BARE)
+            datagram_queue.reception.hear(BARE)
             for unit in codec.parse(datagram.content):
                 unit.pts, unit.time_base = int(1e6 * datagram.arrival), Fraction(1, 1_000_000)
                 yield from self._frames.feed(unit)
@@ -396,13 +396,13 @@ class UdpFeed:
 
     def _receive(self, datagrams: Datagrams) -> Iterator[Frame]:
         """Yield frames of any kind of content, which may change."""
-        readers: dict[str, Callable[[Inbox], Iterator[Frame]]] = {
+        readers: dict[str, Callable[[DatagramQueue], Iterator[Frame]]] = {
             RTP: RtpReader(self._frames, self._parameter_sets, self._payload_type).frames,
             TS: TransportReader(self._frames).frames,
             BARE: BareReader(self._frames).frames,
         }
-        inbox = Inbox(datagrams, self._closed, self._reception)
+        datagram_queue = DatagramQueue(datagrams, self._closed, self._reception)
         while not self._closed.is_set():
-            kind = inbox.peek_kind()
+            kind = datagram_queue.peek_kind()
             if kind is not None:
-                yield from readers[kind](inbox)
+                yield from readers[kind](datagram_queue)

@@ -1,6 +1,7 @@
 """Frames from a video file or stream, decoded by FFmpeg through PyAV.
 
-`Ledger` numbers the pictures by their packets, so that lost pictures leave a gap in the index.
+`FrameCounter` numbers the pictures by their packets, so that lost pictures leave a gap in the
+index.
 """
 
 import heapq
@@ -20,7 +21,7 @@ from aqualvs.sources.base import planes_of
 from aqualvs.sources.spans import promised_duration
 
 
-class Ledger:
+class FrameCounter:
     """Numbers of pictures by the packets that announced them; lost ones leave a gap.
 
     Parameters
@@ -152,7 +153,9 @@ class VideoSource(Closing):
         self._damage_is_partial = self._container.format.name in _LOSSY_CONTAINERS
         self._promised_s = promised_duration(self._stream)
         self.n_frames = self._stream.frames or self._estimated_frames()
-        self._ledger = Ledger(counts_packets=self._stream.codec_context.name not in _HIDDEN_PACKETS)
+        self._frame_counter = FrameCounter(
+            counts_packets=self._stream.codec_context.name not in _HIDDEN_PACKETS
+        )
 
     def __iter__(self) -> Iterator[Frame]:
         """Yield the sound frames; lost ones leave a gap in the index.
@@ -165,7 +168,7 @@ class VideoSource(Closing):
         """
         n_delivered, last = 0, None
         for picture in self._pictures():
-            index = self._ledger.number(picture.pts)
+            index = self._frame_counter.number(picture.pts)
             if picture.is_corrupt:
                 continue
             last = self._frame(picture, index)
@@ -176,7 +179,7 @@ class VideoSource(Closing):
     def _pictures(self) -> Iterator[VideoFrame]:
         """Decode all undamaged pictures, in order of presentation."""
         for packet in self._packets():
-            self._ledger.expect(packet)
+            self._frame_counter.expect(packet)
             if packet.is_corrupt and not self._damage_is_partial:
                 continue
             try:
@@ -209,16 +212,18 @@ class VideoSource(Closing):
         """Return seconds since the start of the stream, by its own clock where it has one."""
         if picture.pts is None or self._stream.time_base is None:
             return index / (self.fps or 1.0)
-        return float((picture.pts - (self._ledger.first_pts or 0)) * self._stream.time_base)
+        return float((picture.pts - (self._frame_counter.first_pts or 0)) * self._stream.time_base)
 
     def _check_complete(self, n_delivered: int, last: Frame | None) -> None:
         """Raise if the file ended before its promise, or if its last frames are lost."""
         index, time_s = (-1, 0.0) if last is None else (last.index, last.time_s)
         exact = self._stream.frames
-        cut = self._ledger.n_packets < exact if exact else self._ends_early(time_s)
-        if not cut and index + 1 == self._ledger.n_known:
+        cut = self._frame_counter.n_packets < exact if exact else self._ends_early(time_s)
+        if not cut and index + 1 == self._frame_counter.n_known:
             return
-        promised = f"{exact}" if exact else f"about {max(self.n_frames or 0, self._ledger.n_known)}"
+        promised = (
+            f"{exact}" if exact else f"about {max(self.n_frames or 0, self._frame_counter.n_known)}"
+        )
         raise SourceError(
             f"{self.name}: only {n_delivered} of {promised} frames could be decoded, the last at "
             f"{time_s:.2f} s; the file is cut short or damaged, copy it again from the recorder"

@@ -21,7 +21,7 @@ SMOOTHING_S = 0.4
 25 Hz leaves a rate of 0.1 degrees a second; a vehicle's own motion is slower than this window."""
 _TREND_S = 5.0
 """Slower changes are left out: the net's own bearing along a cage, drift of a compass."""
-_LEAST_COVER = 0.5
+_MIN_COVER = 0.5
 """Share of the window that must hold values."""
 _CLIP_SIGMAS = 4.0
 _CLIP_RATE = math.radians(5.0)
@@ -108,7 +108,7 @@ def _slopes(values: FloatArray, valid: BoolArray) -> tuple[FloatArray, BoolArray
     stx = _convolve(centred, -window * lag)
     spread = s0 * s2 - s1**2
     whole = window.sum()
-    known = (s0 >= _LEAST_COVER * whole) & (spread >= _LEAST_COVER**2 * whole * window @ lag**2)
+    known = (s0 >= _MIN_COVER * whole) & (spread >= _MIN_COVER**2 * whole * window @ lag**2)
     slope = (s0 * stx - s1 * sx) / np.where(known, spread, 1.0)
     return np.where(known, slope, 0.0), known
 

@@ -31,14 +31,14 @@ from aqualvs.vehicle_logs.motion import (
 )
 from aqualvs.vehicle_logs.vehicle_log import Signal, VehicleLog
 
-_LEAST_OVERLAP_S = 30.0
+_MIN_OVERLAP_S = 30.0
 _LONGEST_S = 24 * 3600.0
 _LOBE_S = 1.0
 """Offsets within this of the best one belong to the same peak and are no rivals."""
 _N_RIVALS = 30
 _BLOCK_S = 3.0
 """Longer than a motion lasts, so that blocks are independent."""
-_LEAST_MARGIN = 2.5
+_MIN_MARGIN = 2.5
 """Least number of standard deviations by which the best offset must exceed all others."""
 _START_SIGMAS = 4.0
 _ITERATIONS = 8
@@ -192,12 +192,12 @@ def _clear_peak(
     channels: tuple[Channel, ...], scores: OffsetScores, where: str
 ) -> float | OffsetRefusal:
     """Return the offset on the grid that is clearly the best."""
-    enough = scores.overlap_s >= _LEAST_OVERLAP_S
+    enough = scores.overlap_s >= _MIN_OVERLAP_S
     if not enough.any():
         longest = float(scores.overlap_s.max(initial=0.0))
         return OffsetRefusal(
             f"dive and log share at most {longest:.0f} s with valid posture{where}, and "
-            f"{_LEAST_OVERLAP_S:.0f} s are needed; give the offset yourself"
+            f"{_MIN_OVERLAP_S:.0f} s are needed; give the offset yourself"
         )
     peaks = _peaks(scores, enough)
     if not peaks:
@@ -206,7 +206,7 @@ def _clear_peak(
         )
     best, rivals = peaks[0], peaks[1:]
     margin, rival = _margin(channels, best, rivals)
-    if margin >= _LEAST_MARGIN:
+    if margin >= _MIN_MARGIN:
         return best
     if rival is None:
         return OffsetRefusal(

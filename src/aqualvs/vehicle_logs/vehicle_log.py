@@ -297,7 +297,7 @@ def _at(signal: Signal | None, times: FloatArray) -> tuple[FloatArray, BoolArray
 
 
 # A vertical normal has no bearing.
-_LEAST_HORIZONTAL = 0.05
+_MIN_HORIZONTAL = 0.05
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -399,7 +399,7 @@ class VehiclePlaces:
         north, east, down = normal_in_ned.T
         horizontal = np.hypot(north, east)
         seen = posture_valid & state.heading_valid
-        bearing_valid = seen & (horizontal > _LEAST_HORIZONTAL)
+        bearing_valid = seen & (horizontal > _MIN_HORIZONTAL)
         lean_valid = seen & ~level & (pitch is not None)
         return Places(
             time_s=times,

@@ -28,7 +28,7 @@ class Ended(Enum):
     """Message that a part has ended, and its outcome."""
 
     WHOLE = auto()
-    UNLIKE_SURVEY = auto()
+    UNLIKE_PROBE = auto()
     """It does not hold what it should; what was sent before is sound."""
 
 

@@ -1,6 +1,6 @@
 """Results of frames, a few frames at a time: measurement with and without the dome, in blocks.
 
-- `Meter`: measures blocks of consecutive frames.
+- `FrameProcessor`: measures blocks of consecutive frames.
 - `BareLensComparison`: the posture from the same stripe points, triangulated as if by a bare lens:
   the error of ignoring the dome.
 - `in_blocks`, `read_ahead`: blocks of frames, and a thread that reads them ahead.
@@ -21,9 +21,9 @@ from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import borrowing_kernel
 from aqualvs.optics.rig import Rig
 from aqualvs.scanner import Scanner
-from aqualvs.scanning.laser_bands import plan_searches
+from aqualvs.scanning.laser_bands import plan_bands
 from aqualvs.scanning.plane_fit import SOLID_ERROR, PlaneFit, fit_robust, plane_of_all
-from aqualvs.scanning.posture import Posture, Reason, Refusal, posture_of, rested_on
+from aqualvs.scanning.posture import Posture, Reason, Refusal, count_inliers, posture_of
 from aqualvs.scanning.scan import Frame, Scan
 from aqualvs.scanning.triangulate import Triangulator
 
@@ -48,7 +48,7 @@ class BareLensComparison:
         camera = rig.bare_camera()
         self._triangulator = Triangulator(rig, camera)
         self._along_x = np.array(
-            [search.axis.value == "x" for search in plan_searches(rig, rig.camera())], np.int64
+            [search.axis.value == "x" for search in plan_bands(rig, rig.camera())], np.int64
         )
         self._axis_in_dome = rig.dome_from_cam.rotate([0.0, 0.0, 1.0])
 
@@ -77,7 +77,7 @@ class BareLensComparison:
         fit = self._fit(found, sensitivity, laser)
         if fit is None:
             return Refusal(Reason.COLLINEAR, "the points do not fix a plane")
-        n_points, nearest = rested_on(found, fit.weights)
+        n_points, nearest = count_inliers(found, fit.weights)
         return posture_of(fit, nearest, n_points, self._axis_in_dome)
 
     @staticmethod
@@ -112,9 +112,9 @@ def _pick(
 
 T = TypeVar("T")
 
-_MOST_FRAMES = 8
-_MOST_BYTES = 32 << 20
-_PATIENCE_S = 0.1
+_MAX_FRAMES = 8
+_MAX_BYTES = 32 << 20
+_TIMEOUT_S = 0.1
 
 
 def block_length(size_px: tuple[int, int]) -> int:
@@ -124,7 +124,7 @@ def block_length(size_px: tuple[int, int]) -> int:
     the decoder displaces all code from the caches; more than eight gain nothing.
     """
     n_bytes = 3 * size_px[0] * size_px[1] // 2
-    return max(1, min(_MOST_FRAMES, _MOST_BYTES // n_bytes))
+    return max(1, min(_MAX_FRAMES, _MAX_BYTES // n_bytes))
 
 
 def in_blocks(
@@ -166,7 +166,7 @@ def read_ahead(items: Iterator[T]) -> Iterator[T]:
     def put(item: T | _End) -> None:
         while not given_up.is_set():
             with contextlib.suppress(queue.Full):
-                return fetched.put(item, timeout=_PATIENCE_S)
+                return fetched.put(item, timeout=_TIMEOUT_S)
         return None
 
     def fetch() -> None:
@@ -198,7 +198,7 @@ class _End:
         self.fault = fault
 
 
-class ScansFrames(Protocol):
+class FrameScanner(Protocol):
     """Interface of a scanner for a run."""
 
     def process(self, frame: Frame) -> Scan:
@@ -226,13 +226,13 @@ class FrameResult:
     is_lost: bool = False
 
 
-class Meter:
+class FrameProcessor:
     """Measurement of frames, with the dome and without.
 
     Parameters
     ----------
     rig : Rig
-    scanner : ScansFrames
+    scanner : FrameScanner
         For the same rig.
 
     Attributes
@@ -241,7 +241,7 @@ class Meter:
         How many frames it is best given at a time.
     """
 
-    def __init__(self, rig: Rig, scanner: ScansFrames) -> None:
+    def __init__(self, rig: Rig, scanner: FrameScanner) -> None:
         self._scanner = scanner
         self.block_length = block_length(rig.size_px) if isinstance(scanner, Scanner) else 1
         self._bare_lens = BareLensComparison(rig) if rig.dome is not None else None
@@ -266,15 +266,15 @@ class Meter:
             return [scanner.process(frame) for frame in frames]
         # Step by step for all frames: code that has just run is still in the caches, from which
         # decoding and the other step would displace it.
-        returns = [scanner.detect(frame) for frame in frames]
+        peaks = [scanner.detect(frame) for frame in frames]
         return [
             scanner.measure(frame.index, frame.time_s, found)
-            for frame, found in zip(frames, returns, strict=True)
+            for frame, found in zip(frames, peaks, strict=True)
         ]
 
 
-def measured_blocks(
-    blocks: Iterator[list[tuple[list[Scan], Frame]]], meter: Meter
+def result_blocks(
+    blocks: Iterator[list[tuple[list[Scan], Frame]]], processor: FrameProcessor
 ) -> Iterator[list[FrameResult]]:
     """Yield the results of frames, and scans of lost ones, in the order of the dive.
 
@@ -282,7 +282,7 @@ def measured_blocks(
     ----------
     blocks : iterator of list
         Of frames with the scans of the lost ones right before, see `with_losses`.
-    meter : Meter
+    processor : FrameProcessor
 
     Yields
     ------
@@ -293,10 +293,10 @@ def measured_blocks(
         (before, _), *others = block
         if before:
             # Before any result of the block's own frames is recorded.
-            yield [meter.lost(scan) for scan in before]
-        first, *more = meter.measure([frame for _, frame in block])
+            yield [processor.lost(scan) for scan in before]
+        first, *more = processor.measure([frame for _, frame in block])
         found = [first]
         for (lost, _), measured in zip(others, more, strict=True):
-            found += [meter.lost(scan) for scan in lost]
+            found += [processor.lost(scan) for scan in lost]
             found.append(measured)
         yield found

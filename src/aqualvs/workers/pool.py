@@ -1,7 +1,7 @@
 """A pool of processes that measure parts of a dive; results are yielded in the order of the dive.
 
-`crew_work` decides whether and how processes can share a run; `Crew` begins them and collects their
-results; `serve` is the loop of each process.
+`pool_job` decides whether and how processes can share a run; `WorkerPool` begins them and collects
+their results; `serve` is the loop of each process.
 """
 
 import contextlib
@@ -29,14 +29,14 @@ from aqualvs.sources.images import images_in
 from aqualvs.sources.spans import (
     Span,
     SpanKind,
-    UnlikeSurveyError,
+    UnlikeProbeError,
     VideoParts,
     image_frames,
     image_spans,
     video_spans,
 )
 from aqualvs.workers.channel import Ended, Message, Receiver, Sender, SharedMemory
-from aqualvs.workers.frame_results import FrameResult, Meter, in_blocks
+from aqualvs.workers.frame_results import FrameProcessor, FrameResult, in_blocks
 from aqualvs.workers.start_method import context, deaf_to_interrupts, interrupts_blocked
 
 
@@ -57,7 +57,7 @@ class SpanPart:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class CrewWork:
+class PoolJob:
     """Work of a pool: the dive, its parts, and what measures it.
 
     Attributes
@@ -80,7 +80,7 @@ class CrewWork:
 
 
 def serve(
-    work: CrewWork,
+    work: PoolJob,
     pipe: Connection,
     memory: SharedMemory | None,
     others: Sequence[Connection],
@@ -98,18 +98,20 @@ def serve(
     cv2.setNumThreads(1)
     sender = Sender(pipe, memory)
     try:
-        meter = Meter(work.rig, Scanner(work.rig, work.options))
+        processor = FrameProcessor(work.rig, Scanner(work.rig, work.options))
         with VideoParts(work.path, work.rig.size_px) as video:
             while True:
                 part = work.parts[sender.next_part()]
-                for message in _messages(part, _frames(work, part, video), meter):
+                for message in _messages(part, _frames(work, part, video), processor):
                     sender.send(message)
     except (EOFError, ConnectionError):
         # The other end is closed; buffered data are discarded.
         os._exit(1)
 
 
-def _messages(part: SpanPart, frames: Iterator[Frame], meter: Meter) -> Iterator[Message]:
+def _messages(
+    part: SpanPart, frames: Iterator[Frame], processor: FrameProcessor
+) -> Iterator[Message]:
     wanted = itertools.islice(
         frames,
         part.first - part.span.first,
@@ -117,33 +119,33 @@ def _messages(part: SpanPart, frames: Iterator[Frame], meter: Meter) -> Iterator
         None if part.stop == part.span.stop else part.stop - part.span.first,
     )
     try:
-        for block in in_blocks(wanted, meter.block_length, UnlikeSurveyError):
-            yield meter.measure(block)
-    except UnlikeSurveyError:
-        yield Ended.UNLIKE_SURVEY
+        for block in in_blocks(wanted, processor.block_length, UnlikeProbeError):
+            yield processor.measure(block)
+    except UnlikeProbeError:
+        yield Ended.UNLIKE_PROBE
     else:
         yield Ended.WHOLE
 
 
-def _frames(work: CrewWork, part: SpanPart, video: VideoParts) -> Iterator[Frame]:
+def _frames(work: PoolJob, part: SpanPart, video: VideoParts) -> Iterator[Frame]:
     if part.span.kind is SpanKind.VIDEO:
         return video.frames(part.span)
     return image_frames(work.path, part.span, work.fps)
 
 
-_LEAST_FRAMES = 100
+_MIN_FRAMES = 100
 """Least number of frames to share: fewer are measured before more processes are ready."""
 
 _PART_FRAMES = 32
 """Least number of frames in a part, because the first frames of each cost more."""
 
 
-def crew_work(
+def pool_job(
     source: FrameSource,
     window: FrameWindow,
     rig: Rig,
     options: ScannerOptions,
-) -> CrewWork | None:
+) -> PoolJob | None:
     """Return how a dive can be shared, or None where it cannot, or is too short.
 
     Reads a video once without decoding it: 25 ms for 1000 frames of standard definition.
@@ -161,10 +163,10 @@ def crew_work(
         for span in _spans(source)
         if (first := max(span.first, window.first)) < (stop := _earlier(span.stop, window.stop))
     )
-    if len(parts) < 2 or parts[-1].stop - parts[0].first < _LEAST_FRAMES:
+    if len(parts) < 2 or parts[-1].stop - parts[0].first < _MIN_FRAMES:
         return None
     fps = source.fps or 1.0
-    return CrewWork(path=Path(source.name), parts=parts, rig=rig, options=options, fps=fps)
+    return PoolJob(path=Path(source.name), parts=parts, rig=rig, options=options, fps=fps)
 
 
 def _spans(source: FrameSource) -> tuple[Span, ...]:
@@ -184,14 +186,14 @@ def _earlier(stop: int, wanted: int | None) -> int:
     return stop if wanted is None else min(stop, wanted)
 
 
-_MOST_WAITING = 100
+_MAX_WAITING = 100
 """Blocks for each process that may wait for earlier parts; beyond it, only those are read."""
 
-_PATIENCE_S = 2.0
+_TIMEOUT_S = 2.0
 
 
 @dataclass(slots=True)
-class _Hand:
+class _Worker:
     """A process, and the number of the part that it works on; -1 if there is none left for it."""
 
     process: BaseProcess
@@ -200,12 +202,12 @@ class _Hand:
     number: int = -1
 
 
-class Crew(Closing):
+class WorkerPool(Closing):
     """Pool of processes that measure the parts of a dive; a context manager that ends them.
 
     Parameters
     ----------
-    work : CrewWork
+    work : PoolJob
     n_processes : int
         There are no more than parts.
 
@@ -217,12 +219,12 @@ class Crew(Closing):
         Whether all has come.
     """
 
-    def __init__(self, work: CrewWork, n_processes: int) -> None:
+    def __init__(self, work: PoolJob, n_processes: int) -> None:
         self._work = work
         self.next_frame = work.parts[0].first
         self.is_done = False
         self._n_given = 0
-        self._hands: list[_Hand] = []
+        self._workers: list[_Worker] = []
         self._found: defaultdict[int, deque[Message]] = defaultdict(deque)
         self._n_processes = min(n_processes, len(work.parts))
 
@@ -237,7 +239,7 @@ class Crew(Closing):
                 for block in self._of_part(number):
                     yield block
                     self.next_frame += len(block)
-        except (_UnlikeSurveyError, EOFError, OSError):
+        except (_UnlikeProbeError, EOFError, OSError):
             return
         self.is_done = self.next_frame == self._work.parts[-1].stop
 
@@ -247,8 +249,8 @@ class Crew(Closing):
             while not found:
                 self._take_in(number)
             message = found.popleft()
-            if message is Ended.UNLIKE_SURVEY:
-                raise _UnlikeSurveyError
+            if message is Ended.UNLIKE_PROBE:
+                raise _UnlikeProbeError
             if message is Ended.WHOLE:
                 break
             yield message
@@ -256,61 +258,61 @@ class Crew(Closing):
 
     def _take_in(self, number: int) -> None:
         """Wait for messages about a part, and take in others unless too many wait."""
-        crowded = sum(map(len, self._found.values())) > _MOST_WAITING * len(self._hands)
-        hands = {
-            hand.pipe: hand
-            for hand in self._hands
-            if hand.number == number or (hand.number >= 0 and not crowded)
+        crowded = sum(map(len, self._found.values())) > _MAX_WAITING * len(self._workers)
+        workers = {
+            worker.pipe: worker
+            for worker in self._workers
+            if worker.number == number or (worker.number >= 0 and not crowded)
         }
-        for pipe in wait(list(hands)):
-            hand = hands[cast("Connection", pipe)]
-            message = hand.receiver.receive()
-            self._found[hand.number].append(message)
+        for pipe in wait(list(workers)):
+            worker = workers[cast("Connection", pipe)]
+            message = worker.receiver.receive()
+            self._found[worker.number].append(message)
             if isinstance(message, Ended):
-                self._give(hand)
+                self._give(worker)
 
-    def _give(self, hand: _Hand) -> None:
+    def _give(self, worker: _Worker) -> None:
         """Give a process its next part, if there is one."""
-        hand.number = self._n_given if self._n_given < len(self._work.parts) else -1
-        if hand.number >= 0:
+        worker.number = self._n_given if self._n_given < len(self._work.parts) else -1
+        if worker.number >= 0:
             self._n_given += 1
-            hand.receiver.give_part(hand.number)
+            worker.receiver.give_part(worker.number)
 
     def __enter__(self) -> Self:
         """Start the processes."""
         for _ in range(self._n_processes):
-            hand = self._start()
-            self._hands.append(hand)
-            self._give(hand)
+            worker = self._start()
+            self._workers.append(worker)
+            self._give(worker)
         return self
 
-    def _start(self) -> _Hand:
+    def _start(self) -> _Worker:
         how, memory = context(), SharedMemory.new()
         mine, theirs = how.Pipe()
         is_copy = how.get_start_method() == "fork"
         # Copies of this process inherit these; a pipe is closed when no process has it open.
-        mines = [*(hand.pipe for hand in self._hands), mine] if is_copy else []
+        mines = [*(worker.pipe for worker in self._workers), mine] if is_copy else []
         process = how.Process(target=serve, args=(self._work, theirs, memory, mines), daemon=True)
         with interrupts_blocked() if is_copy else deaf_to_interrupts():
             process.start()
         theirs.close()
         if memory is not None:
             memory.seal()
-        return _Hand(process, mine, Receiver(mine, memory))
+        return _Worker(process, mine, Receiver(mine, memory))
 
     def close(self) -> None:
         """End the processes."""
-        for hand in self._hands:
+        for worker in self._workers:
             with contextlib.suppress(OSError):
-                hand.pipe.close()
-            hand.process.terminate()
-        for hand in self._hands:
-            hand.process.join(_PATIENCE_S)
-            if hand.process.is_alive():
-                hand.process.kill()
-                hand.process.join()
-            hand.process.close()
+                worker.pipe.close()
+            worker.process.terminate()
+        for worker in self._workers:
+            worker.process.join(_TIMEOUT_S)
+            if worker.process.is_alive():
+                worker.process.kill()
+                worker.process.join()
+            worker.process.close()
 
 
-class _UnlikeSurveyError(Exception):
+class _UnlikeProbeError(Exception):
     pass

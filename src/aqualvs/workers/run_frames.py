@@ -22,17 +22,17 @@ from aqualvs.scanner import Scanner, ScannerOptions
 from aqualvs.scanning.laser_bands import SearchAxis
 from aqualvs.scanning.posture import Reason, Refusal
 from aqualvs.scanning.scan import Frame, ImagePlane, Scan, ScanPoints
-from aqualvs.scanning.stripe import Returns
+from aqualvs.scanning.stripe import StripePeaks
 from aqualvs.sources import FrameSource, ImageSource, VideoSource
 from aqualvs.workers.frame_results import (
+    FrameProcessor,
     FrameResult,
-    Meter,
-    ScansFrames,
+    FrameScanner,
     in_blocks,
-    measured_blocks,
     read_ahead,
+    result_blocks,
 )
-from aqualvs.workers.pool import Crew, CrewWork
+from aqualvs.workers.pool import PoolJob, WorkerPool
 
 if TYPE_CHECKING:
     from aqualvs.recording import DiveRecording, RecordedFrame
@@ -117,7 +117,7 @@ class Replay(Closing):
         """Return the scan of a frame of this source."""
         return self.measured(frame)[1]
 
-    def measured(self, frame: Frame) -> tuple[Rig, Scan, dict[SearchAxis, Returns]]:
+    def measured(self, frame: Frame) -> tuple[Rig, Scan, dict[SearchAxis, StripePeaks]]:
         """Return the scan of a frame of this source, with its rig and stripes."""
         recorded = frame.recorded if isinstance(frame, ReplayedFrame) else None
         if recorded is None:
@@ -127,8 +127,8 @@ class Replay(Closing):
             scan = Scan(frame.index, frame.time_s, recorded.refusal, nothing, recorded.n_water)
             return self.rig, scan, {}
         scanner = self._scanner_in(recorded.n_water)
-        returns = scanner.detect(frame) if self._detects else recorded.returns
-        return scanner.rig, scanner.measure(frame.index, frame.time_s, returns), returns
+        peaks = scanner.detect(frame) if self._detects else recorded.peaks
+        return scanner.rig, scanner.measure(frame.index, frame.time_s, peaks), peaks
 
     def _scanner_in(self, n_water: float) -> Scanner:
         """Return the scanner for the water of a frame, as the dive's run knew it."""
@@ -227,7 +227,7 @@ def _lost(index: int, time_s: float, n_water: float) -> Scan:
     return Scan(index, time_s, Refusal(Reason.CORRUPT_FRAME), ScanPoints.none(), n_water)
 
 
-class RunMeasuring(Closing):
+class DiveProcessor(Closing):
     """Measurement of a dive's frames; a context manager, within which processes are at work.
 
     Parameters
@@ -237,7 +237,7 @@ class RunMeasuring(Closing):
     rig : Rig
     window : FrameWindow
         Of the frames to measure.
-    work : CrewWork or None
+    work : PoolJob or None
         How processes may share the dive; None has this process measure it.
     n_processes : int
     """
@@ -247,24 +247,24 @@ class RunMeasuring(Closing):
         source: FrameSource,
         rig: Rig,
         window: FrameWindow,
-        work: CrewWork | None,
+        work: PoolJob | None,
         n_processes: int,
     ) -> None:
         self._source, self._rig, self._window = source, rig, window
-        self._crew = None if work is None else Crew(work, n_processes)
+        self._pool = None if work is None else WorkerPool(work, n_processes)
         self._head: list[FrameResult] | None = None
         self._shared: Iterator[list[FrameResult]] = iter(())
         self._frames: Iterator[Frame] = iter(())
         self._stack = ExitStack()
 
     def blocks(
-        self, scanner: ScansFrames, *, one_by_one: bool
+        self, scanner: FrameScanner, *, one_by_one: bool
     ) -> Generator[list[FrameResult], None, None]:
         """Yield the results, in the order of the dive; to be closed before the source is.
 
         Parameters
         ----------
-        scanner : ScansFrames
+        scanner : FrameScanner
             For what this process measures.
         one_by_one : bool
             Whether nothing may be measured before what was found in the frame before is yielded.
@@ -274,23 +274,23 @@ class RunMeasuring(Closing):
         SourceError
             From the source, at the end of what it has.
         """
-        if self._head is not None and self._crew is not None:
+        if self._head is not None and self._pool is not None:
             yield self._head
             yield from self._shared
-            if self._crew.is_done:
+            if self._pool.is_done:
                 return
             # The effect of damage depends on the whole video; earlier results stay valid.
-            self._window = replace(self._window, first=self._crew.next_frame)
+            self._window = replace(self._window, first=self._pool.next_frame)
             self._frames = window_of(self._source, self._window)
         # A recording contains its lost frames; frames that it lacks were skipped on purpose.
         first = None if isinstance(self._source, Replay) else self._window.first
         pairs = with_losses(self._frames, first, self._rig.n_water)
         ahead = _is_at_hand(self._source) and not one_by_one
-        meter = Meter(self._rig, scanner)
-        frames = in_blocks(pairs, meter.block_length if ahead else 1)
-        yield from measured_blocks(read_ahead(frames) if ahead else frames, meter)
+        processor = FrameProcessor(self._rig, scanner)
+        frames = in_blocks(pairs, processor.block_length if ahead else 1)
+        yield from result_blocks(read_ahead(frames) if ahead else frames, processor)
 
-    def await_first(self) -> None:
+    def wait_for_first(self) -> None:
         """Wait for the first frame; to be called before `blocks`.
 
         Raises
@@ -305,8 +305,8 @@ class RunMeasuring(Closing):
 
     def __enter__(self) -> Self:
         """Start the processes."""
-        if self._crew is not None:
-            self._shared = self._stack.enter_context(self._crew).blocks()
+        if self._pool is not None:
+            self._shared = self._stack.enter_context(self._pool).blocks()
         return self
 
     def close(self) -> None:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 _FIRST_FRAMES, _EVERY_S = 5, 0.4
 # Smaller changes of the index change the range by less than 0.003 % and need no new scanner.
 _WORTH = 2e-4
-_LEAST_SIGMA_TO_FOLLOW = 4e-3
+_MIN_SIGMA_TO_FOLLOW = 4e-3
 # Accuracy of a user's measurement of the plate's place; only the index is tracked.
 _PLACE_MM, _TURN_DEG = 0.2, 0.1
 
@@ -112,7 +112,7 @@ class WaterFollowingScanner:
         if not reading:
             return
         self._last, self._n_read = reading, self._n_read + 1
-        trusted = reading.sigma < _LEAST_SIGMA_TO_FOLLOW
+        trusted = reading.sigma < _MIN_SIGMA_TO_FOLLOW
         if trusted and abs(reading.n - self.scanner.rig.n_water) > _WORTH:
             self.scanner = Scanner(self._rig.in_water(max(reading.n, 1.0)), self._options)
 

@@ -80,7 +80,7 @@ def test_reports_what_a_user_wants_to_know() -> None:
     found = camera(_shots(), SIZE)
     # Two coordinates of 0.1 px, less what 8 + 14 x 6 numbers take up of 2 x 1000.
     assert found.rms_px == pytest.approx(0.1 * np.sqrt(2.0), rel=0.07)
-    assert found.held_back_rms_px == pytest.approx(0.1 * np.sqrt(2.0), rel=0.2)
+    assert found.cross_validation_rms_px == pytest.approx(0.1 * np.sqrt(2.0), rel=0.2)
     assert found.coverage.shape == COVERAGE_CELLS
     assert found.coverage.sum() == found.n_points
     assert len(found.views) == 14

@@ -8,7 +8,7 @@ import pytest
 
 from aqualvs.calibration.dome.calibrate import dome
 from aqualvs.calibration.dome.problem import BoardSet, DomeOptions
-from aqualvs.calibration.solver.result import DomeCalibration, HeldBack
+from aqualvs.calibration.solver.result import CrossValidation, DomeCalibration
 from aqualvs.calibration.targets.targets import View
 from aqualvs.errors import CalibrationError
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec, rotvec_from_rotation
@@ -29,7 +29,7 @@ from dome_cases import (
 )
 
 PAPER = example_rig()
-QUICK = DomeOptions(check_held_back=False)
+QUICK = DomeOptions(check_cross_validation=False)
 
 
 def _solve(
@@ -210,35 +210,35 @@ def test_tolerances_stay_what_pictures_cannot_tell() -> None:
 
 def test_says_that_the_dome_is_needed() -> None:
     found = _solve([_rail("exact").as_set()], options=DomeOptions())
-    assert found.held_back is not None
-    assert found.held_back.n_views == len(found.views)
-    assert found.held_back.n_dome_better == len(found.views)
+    assert found.cross_validation is not None
+    assert found.cross_validation.n_views == len(found.views)
+    assert found.cross_validation.n_dome_better == len(found.views)
     # Poses from half of the corners: predictions are some noisier than 0.1 px each way.
-    assert found.held_back.dome_rms_px < 0.2
-    assert found.held_back.bare_rms_px > 2.0 * found.held_back.dome_rms_px
+    assert found.cross_validation.dome_rms_px < 0.2
+    assert found.cross_validation.bare_rms_px > 2.0 * found.cross_validation.dome_rms_px
     assert any("the dome model is needed" in line for line in found.findings)
 
 
-def _held_back(dome_px: Sequence[float], bare_px: Sequence[float]) -> HeldBack:
+def _cross_validation(dome_px: Sequence[float], bare_px: Sequence[float]) -> CrossValidation:
     counts = np.full(len(dome_px), 40)
-    return HeldBack(np.array(dome_px), np.array(bare_px), counts)
+    return CrossValidation(np.array(dome_px), np.array(bare_px), counts)
 
 
 def test_the_dome_is_compared_view_by_view() -> None:
     """An advantage in every view tells, where views differ more than the models do."""
     dome_px = np.array([0.12, 0.2, 0.31, 0.25, 0.36, 0.17, 0.22, 0.3, 0.27])
-    better = _held_back(dome_px, dome_px * np.linspace(1.08, 1.22, 9))
+    better = _cross_validation(dome_px, dome_px * np.linspace(1.08, 1.22, 9))
     assert better.n_points == 360
     assert better.bare_rms_px / better.dome_rms_px == pytest.approx(1.15, abs=0.02)
     assert better.dome_is_better
     # As much better over all corners, by one view alone.
     one = dome_px.copy()
     one[4] *= 1.7
-    by_one = _held_back(dome_px, one)
+    by_one = _cross_validation(dome_px, one)
     assert by_one.bare_rms_px > better.bare_rms_px
     assert not by_one.dome_is_better
-    assert not _held_back(dome_px, dome_px * np.linspace(0.82, 1.0, 9)).dome_is_better
-    assert not _held_back([0.1, 0.1], [0.2, 0.21]).dome_is_better
+    assert not _cross_validation(dome_px, dome_px * np.linspace(0.82, 1.0, 9)).dome_is_better
+    assert not _cross_validation([0.1, 0.1], [0.2, 0.21]).dome_is_better
 
 
 def test_says_that_pictures_show_no_dome() -> None:

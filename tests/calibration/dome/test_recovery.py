@@ -33,7 +33,7 @@ from dome_cases import (
     rail,
 )
 
-QUICK = DomeOptions(check_held_back=False)
+QUICK = DomeOptions(check_cross_validation=False)
 SIGMA_WATER = 5e-4
 
 
@@ -197,5 +197,5 @@ def test_dome_of_the_sample(
     assert max(map(abs, errors.values())) < 3.0
     assert not found.left_out
     assert found.rms_px < 0.1
-    assert found.held_back is not None
-    assert found.held_back.dome_is_better
+    assert found.cross_validation is not None
+    assert found.cross_validation.dome_is_better

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from aqualvs.calibration.lasers.calibrate import LaserOptions, calibrate_lasers
-from aqualvs.calibration.lasers.covariance import CameraDoubt
+from aqualvs.calibration.lasers.covariance import CameraCovariance
 from aqualvs.calibration.lasers.views import LaserView
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.optics.rig import LASER_PARAMETERS, Rig, RigUncertainty, rig_moved_by, tangent_basis
@@ -126,11 +126,11 @@ def test_bias_of_stripes_does_not_average_out() -> None:
 
 def test_doubt_knows_its_medium() -> None:
     given = RigUncertainty(("fx", "n_water", "k1"), np.diag([1.0, 1e-6, 0.0]))
-    water = CameraDoubt.of(RIG, given, None, 0.5)
+    water = CameraCovariance.of(RIG, given, None, 0.5)
     assert water.names == ("fx",)
     assert water.sigma_medium == pytest.approx(1e-3)
     assert water.medium_is_water
-    air = CameraDoubt.of(RIG, given, 1.0003, 2e-5)
+    air = CameraCovariance.of(RIG, given, 1.0003, 2e-5)
     assert air.sigma_medium == pytest.approx(2e-5)
     assert not air.medium_is_water
     np.testing.assert_allclose(air.covariance, np.diag([1.0, 4e-10]))

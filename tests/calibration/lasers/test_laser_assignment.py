@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from aqualvs.calibration.lasers.candidates import lines_on_patch
-from aqualvs.calibration.lasers.laser_assignment import LaserSplit, split_lasers
+from aqualvs.calibration.lasers.laser_assignment import LaserAssignment, assign_lasers
 from aqualvs.calibration.lasers.stripes_on_planes import (
     PooledStripes,
     StripePoints,
@@ -51,7 +51,7 @@ def with_junk(view: LaserView, n: int, seed: int) -> LaserView:
     return replace(view, stripes=stripes)
 
 
-def matched(split: LaserSplit, rig: Rig = RIG) -> list[int]:
+def matched(split: LaserAssignment, rig: Rig = RIG) -> list[int]:
     """Which of the split's planes is nearest to each laser of the rig."""
     errors = [[laser_error(p, laser.plane)[0] for p in split.planes] for laser in rig.lasers]
     return [int(np.argmin(row)) for row in errors]
@@ -63,7 +63,7 @@ def test_lasers_fall_apart(target: str, n_lasers: int | None) -> None:
     surfaces = box() if target == "box" else board_surface()
     views = (box_views if target == "box" else board_views)(RIG, noise=NOISE)
     stripes = placed(views, surfaces)
-    split = split_lasers(stripes, LENS, n_lasers=n_lasers)
+    split = assign_lasers(stripes, LENS, n_lasers=n_lasers)
     assert len(split.planes) == 3
     order = matched(split)
     assert sorted(order) == [0, 1, 2]
@@ -81,7 +81,7 @@ def test_lasers_fall_apart(target: str, n_lasers: int | None) -> None:
 
 def test_scattered_points_do_not_mislead() -> None:
     views = [with_junk(v, 300, i) for i, v in enumerate(box_views(RIG, noise=NOISE))]
-    split = split_lasers(placed(views, box()), LENS)
+    split = assign_lasers(placed(views, box()), LENS)
     assert sorted(matched(split)) == [0, 1, 2]
     assert len(split.planes) == 3
 
@@ -94,7 +94,7 @@ def test_a_pencil_of_fifteen_near_parallel_lasers() -> None:
         lasers.append(Laser(f"laser_{i + 1}", Plane.from_normal(normal, float(normal @ emitter))))
     rig = replace(RIG, lasers=tuple(lasers))
     views = board_views(rig, noise=NOISE)
-    split = split_lasers(placed(views, board_surface(), rig), LENS, n_lasers=15)
+    split = assign_lasers(placed(views, board_surface(), rig), LENS, n_lasers=15)
     assert len(split.planes) == 15
     assert sorted(matched(split, rig)) == list(range(15))
 
@@ -102,7 +102,7 @@ def test_a_pencil_of_fifteen_near_parallel_lasers() -> None:
 def test_a_surface_is_never_taken_for_a_laser() -> None:
     """Many stripes on one plane all lie in it; that is no plane of light."""
     views = box_views(RIG, noise=NOISE)
-    split = split_lasers(placed(views, box()), LENS, n_lasers=5)
+    split = assign_lasers(placed(views, box()), LENS, n_lasers=5)
     assert len(split.planes) == 3
 
 
@@ -114,20 +114,20 @@ def test_stripes_on_one_surface_alone_stay_unmatched() -> None:
         chain = view.stripes.chain
         keep = (chain < 2 * n) | (first & (chain == 2 * n + 2))
         kept.append(replace(view, stripes=view.stripes.where(keep)))
-    split = split_lasers(placed(kept, box()), LENS, n_lasers=3)
+    split = assign_lasers(placed(kept, box()), LENS, n_lasers=3)
     assert len(split.planes) == 2
     assert [line.patch for line in split.unmatched] == [2]
 
 
 def test_a_further_laser_is_counted() -> None:
-    split = split_lasers(placed(box_views(RIG, noise=NOISE), box()), LENS, n_lasers=2)
+    split = assign_lasers(placed(box_views(RIG, noise=NOISE), box()), LENS, n_lasers=2)
     assert len(split.planes) == 3
 
 
 def test_crossing_stripes_leave_a_gap() -> None:
     views = box_views(RIG, noise=NOISE)
     stripes = placed(views, box())
-    split = split_lasers(stripes, LENS)
+    split = assign_lasers(stripes, LENS)
     lone = split.laser < 0
     normals = np.array([p.normal for p in split.planes])
     offsets = np.array([p.offset for p in split.planes])

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from aqualvs.calibration.lasers.laser_assignment import LaserSplit, split_lasers
+from aqualvs.calibration.lasers.laser_assignment import LaserAssignment, assign_lasers
 from aqualvs.calibration.lasers.stripes_on_planes import board_surface
 from aqualvs.calibration.lasers.views import pooled
 from laser_cases import laser_error
@@ -13,12 +13,12 @@ CLUTTER = Clutter(edges=0.2, glints=4.0, behind=0.11, gaps=0.3)
 NOISE_PX = (0.05, 0.1, 0.3)
 
 
-def split(made: Scene, n_lasers: int | None) -> LaserSplit:
+def split(made: Scene, n_lasers: int | None) -> LaserAssignment:
     stripes = pooled(made.views, board_surface())
-    return split_lasers(stripes, made.rig.dome_from_cam.translation, n_lasers=n_lasers)
+    return assign_lasers(stripes, made.rig.dome_from_cam.translation, n_lasers=n_lasers)
 
 
-def n_right(found: LaserSplit, made: Scene) -> int:
+def n_right(found: LaserAssignment, made: Scene) -> int:
     """How many lasers of the scene are among the planes."""
     right = 0
     for laser in made.rig.lasers:

@@ -6,9 +6,9 @@ import numpy as np
 
 from aqualvs.calibration.lasers.laser_assignment import (
     JudgedPlane,
-    LaserSplit,
+    LaserAssignment,
     PlaneVerdict,
-    split_lasers,
+    assign_lasers,
 )
 from aqualvs.calibration.lasers.stripes_on_planes import board_surface, place_stripes
 from aqualvs.calibration.lasers.views import pooled
@@ -19,9 +19,9 @@ RAIL = [(0.02, 0.01, 0.0)] * 6
 QUIET = Clutter()
 
 
-def split(made: Scene, n_lasers: int | None = None) -> LaserSplit:
+def split(made: Scene, n_lasers: int | None = None) -> LaserAssignment:
     stripes = pooled(made.views, board_surface())
-    return split_lasers(stripes, made.rig.dome_from_cam.translation, n_lasers=n_lasers)
+    return assign_lasers(stripes, made.rig.dome_from_cam.translation, n_lasers=n_lasers)
 
 
 def only(planes: tuple[JudgedPlane, ...]) -> JudgedPlane:

@@ -22,7 +22,7 @@ from aqualvs.optics.rig import (
     rig_moved_by,
     tangent_basis,
 )
-from aqualvs.scanning.whole_picture import find_stripes
+from aqualvs.scanning.uncalibrated_stripes import find_stripes as find_stripes
 from aqualvs.simulation.scenarios import example_rig
 from laser_cases import (
     Noise,

@@ -8,7 +8,7 @@ import pytest
 from aqualvs.calibration.dome.checks import solved_by_offset
 from aqualvs.calibration.dome.problem import DomeOptions, dome_problem
 from aqualvs.calibration.solver.bundle import PRIORS, Bundle, BundleState, TargetView, moved_target
-from aqualvs.calibration.solver.covariance import considered, observability
+from aqualvs.calibration.solver.covariance import consider_covariance, observability
 from aqualvs.calibration.solver.least_squares import solve
 from aqualvs.calibration.solver.priors import (
     KnownDistance,
@@ -120,7 +120,7 @@ def test_held_numbers_pass_their_errors_on() -> None:
     bundle = problem.bundle
     # All noise at its nominal size, so that both solves weigh alike.
     found = solve(bundle, bundle.start, reject=False)
-    names, covariance = considered(bundle, found, problem.held)
+    names, covariance = consider_covariance(bundle, found, problem.held)
     shift = 0.2 * np.sqrt(INTRINSICS.of(["cx"])[0, 0])
     held = names.index("cx") - len(names)
     gain = covariance[:, held] / INTRINSICS.of(["cx"])[0, 0]

@@ -10,11 +10,11 @@ from aqualvs.calibration.solver.bundle import moved_target
 from aqualvs.calibration.targets.targets import View
 from aqualvs.calibration.water_index.estimator import (
     N_WATER,
+    CusumTest,
     IndexEstimator,
-    StepTest,
     calibrate_water,
 )
-from aqualvs.calibration.water_index.filter import MOST_POINTS, FrameCorners
+from aqualvs.calibration.water_index.filter import MAX_POINTS, FrameCorners
 from aqualvs.calibration.water_index.state import IndexOptions, IndexPrior, IndexReading
 from aqualvs.errors import CalibrationError, OptionError
 from aqualvs.geometry.arrays import FloatArray
@@ -238,7 +238,7 @@ def test_a_slow_change_of_temperature_rings_no_alarm() -> None:
 
 def test_surprises_by_chance_ring_no_alarm_and_small_changes_do() -> None:
     rng = np.random.default_rng(10)
-    test = StepTest()
+    test = CusumTest()
     assert not any(test.add(u) for u in rng.normal(size=200_000).tolist())
     assert test.inflation < 1.3
     began = [test.add(u) for u in rng.normal(1.0, 1.0, 100).tolist()]
@@ -250,7 +250,7 @@ def test_surprises_by_chance_ring_no_alarm_and_small_changes_do() -> None:
 
 def test_surprises_that_repeat_themselves_inflate_the_noise() -> None:
     rng = np.random.default_rng(11)
-    test, last, n_alarms = StepTest(), 0.0, 0
+    test, last, n_alarms = CusumTest(), 0.0, 0
     for _ in range(5000):
         last = 0.8 * last + 0.6 * float(rng.normal())
         n_alarms += test.add(last / test.inflation) > 0
@@ -366,10 +366,10 @@ def test_corners_that_are_always_off_and_a_plate_elsewhere_are_named() -> None:
 
 
 def test_a_frame_takes_each_corner_once_and_not_too_many() -> None:
-    n = 3 * MOST_POINTS
+    n = 3 * MAX_POINTS
     view = View("many", np.arange(n), np.ones((n, 3)), np.ones((n, 2)))
     frame = FrameCorners.of(0.0, view, ())
-    assert len(frame.ids) == MOST_POINTS
+    assert len(frame.ids) == MAX_POINTS
     assert max(frame.ids) == n - 1
     known = (5, 6, 7, *range(100, 161))
     assert FrameCorners.of(0.0, view, known).ids == known

@@ -33,7 +33,7 @@ from aqualvs.recording.sample import LiveSample
 from aqualvs.results.folder import POSTURE_COLUMNS, posture_row
 from browser import open_page
 from live_cases import demo_rig, demo_samples, of_size
-from waiting import PATIENCE_S, until
+from waiting import TIMEOUT_S, until
 
 TOKEN = "let me steer"
 
@@ -53,7 +53,7 @@ class Button:
         self.on = False
         self.pressed.append(False)
 
-    def facts(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         return {"on": self.on, "words": "dive.mcap" if self.on else ""}
 
 
@@ -82,7 +82,7 @@ class Bench:
 
     def shown(self, connection: ClientConnection, sample: LiveSample | None = None) -> Any:
         """Send a sample until a page is told the state, which the server may let in later."""
-        end = time.monotonic() + PATIENCE_S
+        end = time.monotonic() + TIMEOUT_S
         while time.monotonic() < end:
             self.dashboard.send(sample or demo_samples(1)[0])
             with contextlib.suppress(TimeoutError):
@@ -100,9 +100,9 @@ def bench() -> Iterator[Bench]:
     dashboard.close()
 
 
-def state_of(connection: ClientConnection, patience_s: float) -> dict[str, Any]:
+def state_of(connection: ClientConnection, timeout_s: float) -> dict[str, Any]:
     while True:
-        message = connection.recv(timeout=patience_s)
+        message = connection.recv(timeout=timeout_s)
         if isinstance(message, str) and (found := json.loads(message))["kind"] == "state":
             return dict(found)
 
@@ -160,12 +160,12 @@ def test_without_a_token_this_machine_may_watch_but_not_command(
     bench: Bench, caplog: pytest.LogCaptureFixture
 ) -> None:
     with bench.connect() as connection:
-        assert json.loads(connection.recv(timeout=PATIENCE_S))["may_command"] is False
+        assert json.loads(connection.recv(timeout=TIMEOUT_S))["may_command"] is False
         assert bench.shown(connection)["posture"]["valid"] == "1"
         connection.send(json.dumps({"kind": "record", "on": True}))
         answer = ""
         while "refused" not in answer:
-            message = connection.recv(timeout=PATIENCE_S)
+            message = connection.recv(timeout=TIMEOUT_S)
             answer = message if isinstance(message, str) else ""
     assert bench.button.pressed == []
     assert "record refused" in caplog.text
@@ -180,12 +180,12 @@ def test_elsewhere_nothing_is_shown_without_the_token() -> None:
             with connect(f"ws://127.0.0.1:{server.port}/live") as connection:
                 connection.send(json.dumps({"kind": "hello", "token": token}))
                 with pytest.raises(ConnectionClosed) as closed:
-                    connection.recv(timeout=PATIENCE_S)
+                    connection.recv(timeout=TIMEOUT_S)
                 assert closed.value.rcvd is not None
                 assert closed.value.rcvd.reason == why
         with connect(f"ws://127.0.0.1:{server.port}/live") as connection:
             connection.send(json.dumps({"kind": "hello", "token": TOKEN}))
-            assert json.loads(connection.recv(timeout=PATIENCE_S))["may_command"] is True
+            assert json.loads(connection.recv(timeout=TIMEOUT_S))["may_command"] is True
     finally:
         server.close()
 
@@ -206,7 +206,7 @@ def test_foreign_pages_are_refused(bench: Bench, headers: dict[str, str]) -> Non
 
 def receive_until_closed(connection: ClientConnection) -> None:
     while True:
-        connection.recv(timeout=PATIENCE_S)
+        connection.recv(timeout=TIMEOUT_S)
 
 
 @pytest.mark.parametrize(
@@ -226,8 +226,8 @@ def test_malformed_messages_end_the_connection_and_nothing_else(
     bench: Bench, message: str | bytes
 ) -> None:
     with bench.connect(TOKEN) as bad, bench.connect(TOKEN) as good:
-        bad.recv(timeout=PATIENCE_S)
-        good.recv(timeout=PATIENCE_S)
+        bad.recv(timeout=TIMEOUT_S)
+        good.recv(timeout=TIMEOUT_S)
         bad.send(message)
         with pytest.raises(ConnectionClosed):
             receive_until_closed(bad)
@@ -238,10 +238,10 @@ def test_malformed_messages_end_the_connection_and_nothing_else(
 
 def test_oversized_messages_end_the_connection(bench: Bench) -> None:
     with bench.connect(TOKEN) as connection:
-        connection.recv(timeout=PATIENCE_S)
+        connection.recv(timeout=TIMEOUT_S)
         connection.send("x" * (MAX_MESSAGE_BYTES + 1))
         with pytest.raises(ConnectionClosed) as closed:
-            connection.recv(timeout=PATIENCE_S)
+            connection.recv(timeout=TIMEOUT_S)
         assert closed.value.rcvd is not None
         assert closed.value.rcvd.code == 1009
 
@@ -249,53 +249,53 @@ def test_oversized_messages_end_the_connection(bench: Bench) -> None:
 def test_who_says_nothing_is_not_let_in(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("aqualvs.live.dashboard.server._HELLO_S", 0.2)
     with connect(f"ws://{bench.address}/live") as connection, pytest.raises(ConnectionClosed):
-        connection.recv(timeout=PATIENCE_S)
+        connection.recv(timeout=TIMEOUT_S)
 
 
 def test_a_setpoint_that_cannot_be_held_is_refused(bench: Bench) -> None:
     with bench.connect(TOKEN) as connection:
-        connection.recv(timeout=PATIENCE_S)
+        connection.recv(timeout=TIMEOUT_S)
         connection.send(json.dumps({"kind": "setpoint", "range_m": 5.0}))
-        answer = json.loads(connection.recv(timeout=PATIENCE_S))
+        answer = json.loads(connection.recv(timeout=TIMEOUT_S))
         assert answer["kind"] == "refused"
         assert "5 m" in answer["why"]
         connection.send(json.dumps({"kind": "setpoint", "range_m": 0.6, "yaw_deg": 80.0}))
-        assert "80" in json.loads(connection.recv(timeout=PATIENCE_S))["why"]
+        assert "80" in json.loads(connection.recv(timeout=TIMEOUT_S))["why"]
     assert bench.controls.setpoint.setpoint is None
 
 
 def test_a_page_that_goes_leaves_nothing_behind(bench: Bench) -> None:
-    for _ in range(3 * Hub.MAX_WATCHERS):
+    for _ in range(3 * Hub.MAX_VIEWERS):
         with bench.connect() as connection:
-            connection.recv(timeout=PATIENCE_S)
+            connection.recv(timeout=TIMEOUT_S)
             # As a browser that crashes: without saying good-bye.
             connection.socket.close()
         bench.play(3)
-    until(lambda: bench.play(1) or not bench.server.hub.n_watchers, "an empty server")
+    until(lambda: bench.play(1) or not bench.server.hub.n_viewers, "an empty server")
 
 
 def test_too_many_pages_are_refused(bench: Bench) -> None:
     with contextlib.ExitStack() as open_:
-        for _ in range(Hub.MAX_WATCHERS):
-            open_.enter_context(bench.connect()).recv(timeout=PATIENCE_S)
+        for _ in range(Hub.MAX_VIEWERS):
+            open_.enter_context(bench.connect()).recv(timeout=TIMEOUT_S)
         late = open_.enter_context(bench.connect())
         with pytest.raises(ConnectionClosed):
-            late.recv(timeout=PATIENCE_S)
+            late.recv(timeout=TIMEOUT_S)
 
 
 def test_a_slow_page_gets_the_latest_and_few_pictures() -> None:
     async def scene() -> tuple[list[str | None], list[bytes | None]]:
-        watcher = PageClient(may_command=False)
+        viewer = PageClient(may_command=False)
         for i in range(10):
-            watcher.put(f"{i}", bytes([i]))
-        got = [await watcher.next()]
-        watcher.put("10", bytes([10]))
-        got.append(await watcher.next())
+            viewer.put(f"{i}", bytes([i]))
+        got = [await viewer.next()]
+        viewer.put("10", bytes([10]))
+        got.append(await viewer.next())
         # Two pictures are on their way: none more until one has been shown.
-        watcher.put("11", bytes([11]))
-        got.append(await watcher.next())
-        watcher.shown()
-        got.append(await watcher.next())
+        viewer.put("11", bytes([11]))
+        got.append(await viewer.next())
+        viewer.shown()
+        got.append(await viewer.next())
         return [state for state, _ in got], [picture for _, picture in got]
 
     states, pictures = asyncio.run(scene())
@@ -344,12 +344,12 @@ def test_what_is_no_number_becomes_null(bench: Bench) -> None:
     silent = demo_samples(1)[0]
     silent = replace(silent, health=replace(silent.health, quality=float("nan")))
     with bench.connect() as connection:
-        connection.recv(timeout=PATIENCE_S)
+        connection.recv(timeout=TIMEOUT_S)
         assert bench.shown(connection, silent)["health"]["quality"] is None
 
 
 def raw(bench: Bench) -> socket.socket:
-    return socket.create_connection(("127.0.0.1", bench.server.port), timeout=PATIENCE_S)
+    return socket.create_connection(("127.0.0.1", bench.server.port), timeout=TIMEOUT_S)
 
 
 def first_line(wire: socket.socket, *lines: str) -> str:
@@ -410,13 +410,13 @@ def test_idle_connections_of_strangers_leave_room_for_the_pilot(bench: Bench) ->
         with raw(bench) as wire:
             assert first_line(wire, "GET / HTTP/1.1", "Host: boat").endswith("200 OK")
         with bench.connect(TOKEN) as page:
-            assert json.loads(page.recv(timeout=PATIENCE_S))["may_command"] is True
+            assert json.loads(page.recv(timeout=TIMEOUT_S))["may_command"] is True
 
 
 def test_one_address_holds_few_connections_without_a_greeting(bench: Bench) -> None:
     with contextlib.ExitStack() as open_:
         page = open_.enter_context(bench.connect(TOKEN))
-        page.recv(timeout=PATIENCE_S)
+        page.recv(timeout=TIMEOUT_S)
         first = open_.enter_context(raw(bench))
         for _ in range(ConnectionLimits.PER_ADDRESS):
             open_.enter_context(raw(bench))
@@ -433,7 +433,7 @@ def test_who_never_asks_is_disconnected(monkeypatch: pytest.MonkeyPatch) -> None
     controls = Controls(SetpointHolder(rig.working_range), Button())
     server = DashboardServer("127.0.0.1", 0, Access("127.0.0.1", TOKEN), rig, controls)
     try:
-        with socket.create_connection(("127.0.0.1", server.port), timeout=PATIENCE_S) as wire:
+        with socket.create_connection(("127.0.0.1", server.port), timeout=TIMEOUT_S) as wire:
             wire.sendall(b"GET / HTTP/1.1\r\nHost: 127")
             with contextlib.suppress(ConnectionResetError):
                 assert wire.recv(1) == b""
@@ -451,10 +451,10 @@ def test_wrong_tokens_cost_time_over_all_connections(
         guessing = [open_.enter_context(bench.connect(f"guess {i}")) for i in range(n_guesses)]
         # The pilot's own token waits for its turn at most.
         with bench.connect(TOKEN) as page:
-            assert json.loads(page.recv(timeout=PATIENCE_S))["may_command"] is True
+            assert json.loads(page.recv(timeout=TIMEOUT_S))["may_command"] is True
         for connection in guessing:
             with pytest.raises(ConnectionClosed):
-                connection.recv(timeout=PATIENCE_S)
+                connection.recv(timeout=TIMEOUT_S)
     assert time.monotonic() - begin >= n_guesses * 0.3
 
 
@@ -480,11 +480,11 @@ def test_addresses_without_wrong_tokens_are_asked_first() -> None:
 
 def test_a_page_with_the_token_takes_the_place_of_one_without(bench: Bench) -> None:
     with contextlib.ExitStack() as open_:
-        pages = [open_.enter_context(bench.connect()) for _ in range(Hub.MAX_WATCHERS)]
+        pages = [open_.enter_context(bench.connect()) for _ in range(Hub.MAX_VIEWERS)]
         for page in pages:
-            page.recv(timeout=PATIENCE_S)
+            page.recv(timeout=TIMEOUT_S)
         pilot = open_.enter_context(bench.connect(TOKEN))
-        assert json.loads(pilot.recv(timeout=PATIENCE_S))["may_command"] is True
+        assert json.loads(pilot.recv(timeout=TIMEOUT_S))["may_command"] is True
         with pytest.raises(ConnectionClosed) as closed:
             receive_until_closed(pages[0])
         assert closed.value.rcvd is not None

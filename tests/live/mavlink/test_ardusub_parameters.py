@@ -39,7 +39,7 @@ def test_leaves_out_what_it_does_not_have_and_still_reads_the_rest(fake: Fake) -
 def test_gives_up_after_its_patience() -> None:
     with contextlib.closing(MavlinkLink("udpout:127.0.0.1:9")) as link:
         began = time.monotonic()
-        assert link.read_parameters(["RC4_DZ"], patience_s=0.2) == {}
+        assert link.read_parameters(["RC4_DZ"], timeout_s=0.2) == {}
         assert time.monotonic() - began >= 0.2
 
 

@@ -29,8 +29,8 @@ from fake_ardusub_cases import (
     AT_START,
     FRAME_S,
     MARGIN_S,
-    PATIENCE_S,
     STEERED,
+    TIMEOUT_S,
     WITHIN_S,
     Dive,
     Fake,
@@ -303,7 +303,7 @@ def test_killed_process_leaves_the_vehicle_to_its_own_fail_safe(fake: Fake) -> N
     script = KILLED.format(helpers=str(HELPERS), url=fake.url)
     process = subprocess.Popen([sys.executable, "-c", script])
     try:
-        until(lambda: pushing(fake), "an effort", PATIENCE_S)
+        until(lambda: pushing(fake), "an effort", TIMEOUT_S)
         n = len(fake.events)
     finally:
         process.send_signal(signal.SIGKILL)
@@ -344,7 +344,7 @@ def test_signs(fake: Fake, command: Command) -> None:
 
 
 def steer_until(vehicle: ArduSubLink, effort: Effort, done: Callable[[], bool]) -> None:
-    end = time.monotonic() + PATIENCE_S
+    end = time.monotonic() + TIMEOUT_S
     while not done():
         assert time.monotonic() < end, f"{effort} moves nothing"
         vehicle.send(effort)

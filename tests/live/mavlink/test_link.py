@@ -27,7 +27,7 @@ from aqualvs.sources.base import State
 from live_cases import first_sample
 from ports import free_port
 from repository import HELPERS
-from waiting import PATIENCE_S, until
+from waiting import TIMEOUT_S, until
 
 pytest.importorskip("pymavlink")
 
@@ -52,7 +52,7 @@ class Peer:
         self._lines: queue.Queue[dict[str, Any]] = queue.Queue()
         self._reader = threading.Thread(target=self._read)
         self._reader.start()
-        self.port = int(self._lines.get(timeout=PATIENCE_S)["port"])
+        self.port = int(self._lines.get(timeout=TIMEOUT_S)["port"])
 
     def _read(self) -> None:
         assert self.process.stdout is not None
@@ -62,7 +62,7 @@ class Peer:
 
     def wait_for(self, kind: str, **fields: object) -> dict[str, Any]:
         """Return the next message of a kind with such fields."""
-        end = time.monotonic() + PATIENCE_S
+        end = time.monotonic() + TIMEOUT_S
         while (left := end - time.monotonic()) > 0:
             with contextlib.suppress(queue.Empty):
                 found = self._lines.get(timeout=left)
@@ -87,8 +87,8 @@ class Peer:
     def stop(self) -> None:
         if self.process.poll() is None:
             self.process.kill()
-        self.process.wait(PATIENCE_S)
-        self._reader.join(PATIENCE_S)
+        self.process.wait(TIMEOUT_S)
+        self._reader.join(TIMEOUT_S)
         if self.process.stdout is not None:
             self.process.stdout.close()
 
@@ -209,7 +209,7 @@ def test_heartbeats_go_out_without_frames_and_messages_come_in(lab: Lab) -> None
     found = output.link.latest("ATTITUDE", system=1, component=1)
     assert found is not None
     assert found.message.yaw == pytest.approx(0.3)
-    assert found.age_s < PATIENCE_S
+    assert found.age_s < TIMEOUT_S
     assert output.link.latest("ATTITUDE", system=2) is None
 
 
@@ -321,7 +321,7 @@ def test_a_peer_that_takes_nothing_holds_nobody_up(lab: Lab, tmp_path: Path, kin
     becomes(output, State.OK, "ArduSub")
     os.kill(peer.process.pid, signal.SIGSTOP)
     took: list[float] = []
-    end = time.monotonic() + PATIENCE_S
+    end = time.monotonic() + TIMEOUT_S
     while output.health().n_dropped < 50:
         start = time.perf_counter()
         output.send(first_sample())
@@ -343,7 +343,7 @@ def test_a_connection_that_takes_nothing_for_long_is_made_anew(
     output = lab.output(f"tcp:127.0.0.1:{peer.port}")
     becomes(output, State.OK, "ArduSub")
     os.kill(peer.process.pid, signal.SIGSTOP)
-    end = time.monotonic() + PATIENCE_S
+    end = time.monotonic() + TIMEOUT_S
     while "takes nothing any more" not in (found := output.health()).detail:
         # At full speed, to fill the buffers of both systems.
         output.send(first_sample())

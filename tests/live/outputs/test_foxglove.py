@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from repository import HELPERS
-from waiting import PATIENCE_S, until
+from waiting import TIMEOUT_S, until
 
 _PATHS = os.pathsep.join([str(HELPERS), os.environ.get("PYTHONPATH", "")])
 TOPICS = ("posture", "points", "picture", "health", "rig", "scene", "transforms")
@@ -32,7 +32,7 @@ def client(port, n_postures):
     counts, times = dict.fromkeys(TOPICS, 0), []
     with connect(url, subprotocols=["foxglove.sdk.v1"], max_size=None) as server:
         while len(channels) < len(TOPICS):
-            told = json.loads(server.recv(PATIENCE_S))
+            told = json.loads(server.recv(TIMEOUT_S))
             for one in told.get("channels", ()) if told["op"] == "advertise" else ():
                 channels[one["id"]] = one
                 if one["encoding"] == "cdr":
@@ -41,7 +41,7 @@ def client(port, n_postures):
         server.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
         print("ready", flush=True)
         while counts["posture"] < n_postures:
-            told = server.recv(PATIENCE_S)
+            told = server.recv(TIMEOUT_S)
             if isinstance(told, str) or told[0] != 1:
                 continue
             number, at_ns = struct.unpack_from("<IQ", told, 1)
@@ -107,7 +107,7 @@ def watch():
     yield start
     for process in processes:
         process.kill()
-        process.wait(PATIENCE_S)
+        process.wait(TIMEOUT_S)
         process.stdout.close()
 
 
@@ -125,7 +125,7 @@ def is_watched(output, n):
 
 
 def answer(process):
-    text, _ = process.communicate(timeout=PATIENCE_S)
+    text, _ = process.communicate(timeout=TIMEOUT_S)
     return json.loads(text)
 
 
@@ -180,7 +180,7 @@ def test_a_refusal_is_shown_too(output, watch, samples):
     scan = replace(samples[0].scan, posture=silent, points=ScanPoints.none())
     viewer = watch(output.port, 1)
     until(lambda: is_watched(output, 1), "a viewer of every topic")
-    output.send(replace(samples[0], scan=scan, returns={}, frame=None))
+    output.send(replace(samples[0], scan=scan, peaks={}, frame=None))
     told = answer(viewer)
     assert not told["found"]["posture"]["valid"]
     assert told["found"]["posture"]["reason"] == "no_frames"

@@ -29,7 +29,7 @@ from ports import free_port
 from processes import children_of
 from repository import HELPERS
 from ros_listener import (
-    PATIENCE_S,
+    TIMEOUT_S,
     Listener,
     expected_points,
     n_threads,
@@ -53,7 +53,7 @@ def ros_is_installed() -> bool:
     if shutil.which("roscore") is None:
         return False
     imports = "import rospy, sensor_msgs.msg, geometry_msgs.msg, diagnostic_msgs.msg"
-    return subprocess.run([PYTHON, "-c", imports], timeout=PATIENCE_S, check=False).returncode == 0
+    return subprocess.run([PYTHON, "-c", imports], timeout=TIMEOUT_S, check=False).returncode == 0
 
 
 # Where everything must be tested, absence is a failure.
@@ -110,7 +110,7 @@ class Roscore:
             for pid in family:
                 with contextlib.suppress(ProcessLookupError):
                     os.kill(pid, signal.SIGKILL)
-            self._process.wait(PATIENCE_S)
+            self._process.wait(TIMEOUT_S)
         self._process = None
 
 
@@ -316,7 +316,7 @@ def test_something_else_answers_for_roscore(publish: Publish, port: int) -> None
     thread.start()
     output = publish()
     assert until(lambda: "no roscore at" in output.health().detail)
-    thread.join(PATIENCE_S)
+    thread.join(TIMEOUT_S)
     deaf.close()
 
 

@@ -29,7 +29,7 @@ from aqualvs.sources.base import Health, State
 from live_cases import first_sample
 from ports import free_port
 from repository import ROOT
-from waiting import PATIENCE_S, until
+from waiting import TIMEOUT_S, until
 
 PAGE = ROOT / "docs" / "json.md"
 
@@ -59,7 +59,7 @@ def decoded(sample: LiveSample) -> dict[str, Any]:
 def receiver() -> Iterator[socket.socket]:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as made:
         made.bind(("127.0.0.1", 0))
-        made.settimeout(PATIENCE_S)
+        made.settimeout(TIMEOUT_S)
         yield made
 
 
@@ -152,7 +152,7 @@ def test_every_receiver_gets_every_sample(receiver: socket.socket) -> None:
             other.bind(("::1", 0))
         except OSError:
             pytest.skip("no IPv6 here")
-        other.settimeout(PATIENCE_S)
+        other.settimeout(TIMEOUT_S)
         both = (address_of(receiver), f"[::1]:{other.getsockname()[1]}")
         with contextlib.closing(UdpJsonOutput(both)) as output:
             output.send(first_sample())
@@ -164,7 +164,7 @@ def test_every_receiver_gets_every_sample(receiver: socket.socket) -> None:
 def test_broadcast_is_allowed() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
         listener.bind(("", 0))
-        listener.settimeout(PATIENCE_S)
+        listener.settimeout(TIMEOUT_S)
         address = f"127.255.255.255:{listener.getsockname()[1]}"
         with contextlib.closing(UdpJsonOutput(address)) as output:
             output.send(first_sample())
@@ -178,7 +178,7 @@ def test_names_are_looked_up_without_waiting(
 
     def slow(host: str, *args: Any, flags: int = 0, **more: Any) -> Any:
         if flags != socket.AI_NUMERICHOST:
-            assert answered.wait(PATIENCE_S)
+            assert answered.wait(TIMEOUT_S)
             host = "127.0.0.1"
         return lookup(host, *args, flags=flags, **more)
 
@@ -217,7 +217,7 @@ def test_a_receiver_that_goes_and_returns(receiver: socket.socket) -> None:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as back:
             host, _, port = address.partition(":")
             back.bind((host, int(port)))
-            back.settimeout(PATIENCE_S)
+            back.settimeout(TIMEOUT_S)
             output.send(first_sample())
             # The first datagram after its return arrives: the old refusal costs none.
             assert back.recv(65535) == json_line(first_sample())
@@ -301,7 +301,7 @@ def test_the_documented_receiver_works(tmp_path: Path) -> None:
             until(lambda: output.send(first_sample()) or printed.read_text().endswith("\n"))
     finally:
         process.kill()
-        process.wait(PATIENCE_S)
+        process.wait(TIMEOUT_S)
     assert set(printed.read_text().split()) == {str(round(measured().range, 6))}
 
 

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from aqualvs.errors import OptionError
 from aqualvs.scanning.detection import FrameDetector
-from aqualvs.scanning.laser_bands import SearchAxis, StripeSearch
-from aqualvs.scanning.paper.detector import ThresholdDetector, pixels_of_returns
+from aqualvs.scanning.laser_bands import LaserBand, SearchAxis
+from aqualvs.scanning.paper.detector import ThresholdDetector, pixels_of_peaks
 from aqualvs.scanning.scan import Frame
-from aqualvs.scanning.stripe import Returns, ThresholdOptions
+from aqualvs.scanning.stripe import StripePeaks, ThresholdOptions
 
 U8 = NDArray[np.uint8]
 
@@ -28,7 +28,7 @@ def full_detector(
     length, n_lines = (height, width) if axis is SearchAxis.ALONG_Y else (width, height)
     low, high = band or (0, length - 1)
     free = np.zeros((-(-length // 8), -(-n_lines // 8)))
-    search = StripeSearch(
+    search = LaserBand(
         axis=axis,
         line_px=1,
         lowest=np.full(n_lines, low),
@@ -39,7 +39,7 @@ def full_detector(
     return FrameDetector((width, height), [search], options)
 
 
-def detect(image: U8, level: int = 140, band: tuple[int, int] | None = None) -> Returns:
+def detect(image: U8, level: int = 140, band: tuple[int, int] | None = None) -> StripePeaks:
     detector = full_detector(image.shape, ThresholdOptions(level=level), band)
     return detector.detect(Frame(0, 0.0, image))[SearchAxis.ALONG_Y]
 
@@ -70,7 +70,7 @@ def lit_pixels(lines: U8, low: int, high: int, options: ThresholdOptions) -> U8:
     bounds = np.full(n_lines, low), np.full(n_lines, high)
     detector = ThresholdDetector(SearchAxis.ALONG_X, (length, n_lines), *bounds, options)
     found = detector.detect(lines)
-    source, place = pixels_of_returns(found.position, found.width)
+    source, place = pixels_of_peaks(found.position, found.width)
     seen = np.zeros(lines.shape, np.uint8)
     np.add.at(seen, (found.line[source], place.astype(np.int64)), 1)
     for line, position, height, width in zip(
@@ -114,7 +114,7 @@ def test_a_white_picture_has_no_returns() -> None:
 
 
 def test_a_sub_pixel_return_has_the_pixels_above_half_its_height() -> None:
-    source, place = pixels_of_returns(np.array([20.4, 10.5, 7.0]), np.array([4.0, 0.5, 1.9]))
+    source, place = pixels_of_peaks(np.array([20.4, 10.5, 7.0]), np.array([4.0, 0.5, 1.9]))
     np.testing.assert_array_equal(source, [0, 0, 0, 0, 1, 2])
     np.testing.assert_array_equal(place, [19, 20, 21, 22, 10, 7])
 

@@ -8,8 +8,8 @@ import pytest
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.optics.rig import Rig
 from aqualvs.scanner import Scanner, ScannerOptions
-from aqualvs.scanning.laser_bands import plan_searches
-from aqualvs.scanning.paper.detector import FilteredPoints, PaperFilter
+from aqualvs.scanning.laser_bands import plan_bands
+from aqualvs.scanning.paper.detector import FilteredPeaks, PaperFilter
 from aqualvs.scanning.paper.mesh_filter import MeshFilterOptions, mesh_filter_dense
 from aqualvs.scanning.scan import Frame
 from aqualvs.scanning.stripe import ThresholdOptions
@@ -51,12 +51,12 @@ def kept_by_reference(rig: Rig, luma: FloatArray) -> BoolArray:
     return kept
 
 
-def filtered(rig: Rig, luma: FloatArray, *, every_pixel: bool) -> tuple[FilteredPoints, int]:
+def filtered(rig: Rig, luma: FloatArray, *, every_pixel: bool) -> tuple[FilteredPeaks, int]:
     camera = rig.camera()
     scanner = Scanner(rig, replace(LEVEL_ONLY, mesh_filter=None))
     points = scanner.process(Frame(0, 0.0, luma)).points
-    searches = plan_searches(rig, camera)
-    papers = PaperFilter(rig, camera, searches, MeshFilterOptions(), every_pixel=every_pixel)
+    laser_bands = plan_bands(rig, camera)
+    papers = PaperFilter(rig, camera, laser_bands, MeshFilterOptions(), every_pixel=every_pixel)
     laser = points.laser.astype(np.int64)
     return papers.apply(points.pixels, points.width, laser), len(points)
 
@@ -79,7 +79,7 @@ def test_a_return_is_kept_if_most_of_its_pixels_are(rig: Rig, picture: FloatArra
     found, n = filtered(rig, picture, every_pixel=True)
     share = np.bincount(found.source, found.on_mesh) / np.bincount(found.source)
     assert len(share) == n
-    np.testing.assert_array_equal(found.returns_on_mesh(n), share > 0.5)
+    np.testing.assert_array_equal(found.peaks_on_mesh(n), share > 0.5)
     scan = Scanner(rig, LEVEL_ONLY).process(Frame(0, 0.0, picture))
     assert len(scan.points) == np.count_nonzero(share > 0.5) > 30
     assert (scan.points.width == 3.0).all()

@@ -25,8 +25,8 @@ from aqualvs.calibration.dome.cross_validation import predicted
 from aqualvs.calibration.solver.bundle import CORNER_SIGMA_PX, CORNERS, Bundle, BundleState
 from aqualvs.calibration.solver.covariance import (
     ViewCovariance,
+    implausible_distance,
     shared_covariance,
-    unbelievable_distance,
 )
 from aqualvs.calibration.solver.least_squares import Solution, solve
 from aqualvs.calibration.solver.result import ViewFit, rms_px, view_fit
@@ -103,7 +103,7 @@ def check_camera_solution(
     _check_determined(solution, covariance)
     poses = solution.state.poses
     away = [np.linalg.norm(p.apply(v.middle)) for p, v in zip(poses, views, strict=True)]
-    fault = unbelievable_distance(np.array(away), [view.name for view in views])
+    fault = implausible_distance(np.array(away), [view.name for view in views])
     if fault is not None:
         raise CalibrationError(fault)
 
@@ -163,7 +163,7 @@ def pixel_grid(size_px: tuple[int, int]) -> FloatArray:
 _BAD_VIEW, _BAD_NOISE_PX = 5.0, 0.3
 _MOSTLY_WRONG, _BAD_SHARE = 0.6, 1.0 / 3.0
 # One view out of this number is held back; least number of views and of corners in one for that.
-_HELD_BACK_EVERY, _MIN_HELD_BACK, _CAMERA_MIN_POINTS = 4, 8, 12
+_FOLDS, _MIN_VIEWS_TO_VALIDATE, _CAMERA_MIN_POINTS = 4, 8, 12
 _MANY_OUTLIERS = 0.05
 _WEAK_PIXEL_PX = 1.0
 _THIN_COVERAGE = 0.6
@@ -194,7 +194,7 @@ class CameraCalibration:
         Typical standard deviation of a corner's coordinate.
     coverage : int array, shape (6, 8)
         Number of corners in each cell of the picture.
-    held_back_rms_px : float
+    cross_validation_rms_px : float
         Root mean square error of a model from three views in four for the corners of the
         fourth; NaN where there are too few views.
     bend_height : float
@@ -213,7 +213,7 @@ class CameraCalibration:
     left_out: dict[str, str]
     noise_px: float
     coverage: IntArray
-    held_back_rms_px: float
+    cross_validation_rms_px: float
     bend_height: float
     findings: tuple[str, ...]
     n_iterations: int
@@ -362,18 +362,18 @@ def _result(
         left_out=left_out,
         noise_px=CORNER_SIGMA_PX * solution.scales[CORNERS],
         coverage=coverage(seen, rig.size_px),
-        held_back_rms_px=_held_back(bundle, solution),
+        cross_validation_rms_px=_cross_validation(bundle, solution),
         bend_height=0.0,
         findings=(),
         n_iterations=solution.n_iterations,
     )
 
 
-def _held_back(bundle: Bundle, solution: Solution[BundleState]) -> float:
+def _cross_validation(bundle: Bundle, solution: Solution[BundleState]) -> float:
     n = len(bundle.views)
     believed = [bundle.views[i].view.where(solution.inliers[i]) for i in range(n)]
-    held = [i for i in range(1, n, _HELD_BACK_EVERY) if len(believed[i]) >= _CAMERA_MIN_POINTS]
-    if n < _MIN_HELD_BACK or not held:
+    held = [i for i in range(1, n, _FOLDS) if len(believed[i]) >= _CAMERA_MIN_POINTS]
+    if n < _MIN_VIEWS_TO_VALIDATE or not held:
         return float("nan")
     rest = [i for i in range(n) if i not in held]
     try:
@@ -394,9 +394,9 @@ def _findings(result: CameraCalibration) -> list[str]:
         f"distortion: {n} coefficients of the {lens.model} model",
     ]
     lines += _shared_errors(result)
-    if np.isfinite(result.held_back_rms_px):
+    if np.isfinite(result.cross_validation_rms_px):
         lines.append(
-            f"corners of views held back are predicted to {result.held_back_rms_px:.3f} px"
+            f"corners of views held back are predicted to {result.cross_validation_rms_px:.3f} px"
         )
     lines += [f"left out, {name}: {why}" for name, why in result.left_out.items()]
     for fit in result.views:

@@ -21,7 +21,7 @@ from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel, kernel
 from aqualvs.geometry.linear_algebra import factorise, solve_factorised
 
-LEAST_PIVOT = 1e-12
+MIN_PIVOT = 1e-12
 """Ratio of a pivot of the normal matrix to its diagonal below which there is no information."""
 
 _SQRT_HALF = math.sqrt(0.5)
@@ -135,7 +135,7 @@ def _fit(
             return 0.0, 1.0
         if max(abs(best[0] - window[_X]), abs(best[1] - window[_Y])) < _RECENTRE_PX:
             break
-    if not best[6] > 0.0 or not factorise(matrices[0], 0.0, LEAST_PIVOT, matrices[2]):
+    if not best[6] > 0.0 or not factorise(matrices[0], 0.0, MIN_PIVOT, matrices[2]):
         return 0.0, 1.0
     variance = rss / (count - _N)
     spread = 0.0
@@ -177,7 +177,7 @@ def _descend(
     rss, count = _sums(image, window, best, matrices[0], gradient, vectors[5])
     damping = 1e-3
     for _ in range(_MAX_ITERATIONS):
-        if count < 2 * _N or not factorise(matrices[0], damping, LEAST_PIVOT, matrices[2]):
+        if count < 2 * _N or not factorise(matrices[0], damping, MIN_PIVOT, matrices[2]):
             return np.inf, 0
         solve_factorised(matrices[2], gradient, step)
         _advance(best, step, tried)

@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from aqualvs.calibration.detection.saddle_corners import LEAST_PIVOT, GreyImage, blurred_edge
+from aqualvs.calibration.detection.saddle_corners import MIN_PIVOT, GreyImage, blurred_edge
 from aqualvs.calibration.targets.targets import aruco_dictionary
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel, kernel
@@ -36,7 +36,7 @@ U8Array = NDArray[np.uint8]
 N_UNKNOWNS = 22
 BLUR, GAMMA, LEVEL, CONTRAST = 14, 15, 16, 17
 # Ratio of the ink's tone to the contrast below which ink is taken as black.
-_LEAST_DARKNESS = 0.02
+_MIN_DARKNESS = 0.02
 
 
 @inline_borrowing_kernel
@@ -126,7 +126,7 @@ def _tone(h: float, gamma: float, darkness: float) -> tuple[float, float, float,
     """
     if h <= 0.0 or h >= 1.0:
         return h, 1.0, 0.0, 0.0
-    r = max(darkness, _LEAST_DARKNESS)
+    r = max(darkness, _MIN_DARKNESS)
     log_low, log_high = math.log(r), math.log(1.0 + r)
     low, high = math.exp(gamma * log_low), math.exp(gamma * log_high)
     light = low + h * (high - low)
@@ -135,7 +135,7 @@ def _tone(h: float, gamma: float, darkness: float) -> tuple[float, float, float,
     scale = grey / (gamma * light)
     by_gamma = low * log_low + h * (high * log_high - low * log_low)
     by_r = gamma * (low / r * (1.0 - h) + high / (1.0 + r) * h)
-    tone_by_r = scale * by_r - 1.0 if darkness > _LEAST_DARKNESS else 0.0
+    tone_by_r = scale * by_r - 1.0 if darkness > _MIN_DARKNESS else 0.0
     by_log_gamma = scale * by_gamma * gamma - grey * log_light / gamma
     return grey - r, scale * (high - low), by_log_gamma, tone_by_r
 
@@ -347,7 +347,7 @@ def descend(
     ) + _add_prior(prior, unknowns, normal, gradient)
     damping = 1e-3
     for _ in range(n_steps):
-        if not factorise(normal, damping, LEAST_PIVOT, lower):
+        if not factorise(normal, damping, MIN_PIVOT, lower):
             return False
         solve_factorised(lower, gradient, step)
         _shorten(step, unknowns)
@@ -376,7 +376,7 @@ def descend(
         residuals[:, :] = new_residuals
         if np.max(np.abs(step[:6])) < _SETTLED_PX and abs(step[BLUR]) < _SETTLED_LOG_BLUR:
             break
-    if not factorise(normal, 0.0, LEAST_PIVOT, lower):
+    if not factorise(normal, 0.0, MIN_PIVOT, lower):
         return False
     covariance[:, :] = inverse_of(lower)
     return True
@@ -421,7 +421,7 @@ _STEPS = 4
 _POLLUTED_SCALES = 4.5
 _POLLUTED_SHARE = 0.08
 # Noise of rounding to whole grey levels.
-_LEAST_NOISE = 0.3
+_MIN_NOISE = 0.3
 _MIN_CONTRAST = 8.0
 _MAX_RESIDUAL_SHARE = 0.06
 _MIN_CLEAN_SHARE = 0.4
@@ -525,7 +525,7 @@ def _fit(
     rms = float(np.sqrt(np.mean(np.square(residuals[clean & seen]))))
     if rms > _MAX_RESIDUAL_SHARE * unknowns[CONTRAST] + 1.0:
         return None
-    return _corners(unknowns, covariance * max(rms, _LEAST_NOISE) ** 2, quad, side)
+    return _corners(unknowns, covariance * max(rms, _MIN_NOISE) ** 2, quad, side)
 
 
 def _window(image: GreyImage, quad: FloatArray, reach: float) -> tuple[FloatArray, tuple[int, int]]:
@@ -581,7 +581,7 @@ def _weigh(residuals: FloatArray, contrast: float, robust: bool) -> tuple[FloatA
     The surroundings of polluted pixels are left out as well: the faint flank of a stripe biases.
     """
     size = np.abs(residuals)
-    noise = max(1.4826 * float(np.nanmedian(size)), _LEAST_NOISE)
+    noise = max(1.4826 * float(np.nanmedian(size)), _MIN_NOISE)
     size = np.nan_to_num(size)
     limit = max(_POLLUTED_SCALES * noise, _POLLUTED_SHARE * contrast)
     if robust:

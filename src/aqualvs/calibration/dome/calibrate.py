@@ -12,10 +12,10 @@ from dataclasses import replace
 import numpy as np
 
 from aqualvs.calibration.dome.checks import (
+    check_initial_guess,
     check_media,
     check_shared_errors,
     check_solution,
-    check_start,
     contradicted_distances,
     distance_blocks,
     noise_px,
@@ -31,16 +31,16 @@ from aqualvs.calibration.dome.problem import (
     PoseKind,
     check_sets,
     dome_problem,
-    start_rigs,
-    with_leaning_as_found,
+    initial_rigs,
+    with_board_tilt_as_found,
 )
 from aqualvs.calibration.solver.bundle import CORNER_SIGMA_PX, BundleState
-from aqualvs.calibration.solver.covariance import Observability, considered, observability
+from aqualvs.calibration.solver.covariance import Observability, consider_covariance, observability
 from aqualvs.calibration.solver.least_squares import Solution, solve
 from aqualvs.calibration.solver.priors import rig_difference
 from aqualvs.calibration.solver.result import (
+    CrossValidation,
     DomeCalibration,
-    HeldBack,
     SolvedMedium,
     ViewFit,
     view_fit,
@@ -81,7 +81,7 @@ def findings(
     lines += _entangled(result)
     lines += _media(problem, result)
     lines += _against_priors(problem, solution)
-    lines += _held_back(result.held_back)
+    lines += _cross_validation(result.cross_validation)
     lines += [f"left out, {label}: {why}" for label, why in result.left_out.items()]
     return lines
 
@@ -206,7 +206,7 @@ def _against_priors(problem: DomeProblem, solution: Solution[BundleState]) -> li
     ]
 
 
-def _held_back(held: HeldBack | None) -> list[str]:
+def _cross_validation(held: CrossValidation | None) -> list[str]:
     if held is None:
         return []
     told = (
@@ -264,16 +264,16 @@ def dome(
     problem, solution = _solved(rig, sets, known, options)
     problem, solution = _without_bad_views(problem, solution)
     problem, solution = _without_wrong_distances(problem, solution, sets)
-    problem, solution = with_leaning_as_found(problem, solution, options.tilt_sigma)
-    names, covariance = considered(problem.bundle, solution, problem.held)
+    problem, solution = with_board_tilt_as_found(problem, solution, options.tilt_sigma)
+    names, covariance = consider_covariance(problem.bundle, solution, problem.held)
     n_solved = len(solution.covariance)
     doubts = check_shared_errors(problem, solution, covariance[:n_solved, :n_solved])
     doubts += check_media(problem, solution, sets)
     covariance[:n_solved, :n_solved] += _of_rail(problem, solution, options)
     result = _result(problem, solution, sets, names, covariance)
     check_solution(problem, solution, result.uncertainty)
-    if options.check_held_back:
-        result = replace(result, held_back=compare_with_bare_lens(problem, solution))
+    if options.check_cross_validation:
+        result = replace(result, cross_validation=compare_with_bare_lens(problem, solution))
     words = findings(problem, solution, result)
     return replace(result, findings=(*doubts, *words))
 
@@ -284,13 +284,13 @@ def _solved(
     """Solve from the rig's lens position, or else from the dome's centre."""
     best: tuple[DomeProblem, Solution[BundleState]] | None = None
     trouble: list[CalibrationError | RigError] = []
-    for start in start_rigs(rig):
+    for start in initial_rigs(rig):
         try:
             problem = dome_problem(start, sets, known, options)
         except CalibrationError as error:
             trouble.append(error)
             continue
-        check_start(problem)
+        check_initial_guess(problem)
         try:
             solution = solve(problem.bundle, problem.bundle.start)
         except (CalibrationError, RigError) as error:
@@ -391,7 +391,7 @@ def _result(
         left_out=problem.left_out,
         noise_px=noise_px(solution),
         rotation_is_solved=problem.rotation_is_solved,
-        held_back=None,
+        cross_validation=None,
         findings=(),
         n_iterations=solution.n_iterations,
     )

@@ -17,9 +17,9 @@ from aqualvs.calibration.dome.problem import LENS, BoardSet, DomeProblem, PoseKi
 from aqualvs.calibration.solver.bundle import CORNER_SIGMA_PX, CORNERS, PRIORS, Bundle, BundleState
 from aqualvs.calibration.solver.covariance import (
     all_alike,
+    implausible_distance,
     length_ratio,
     scale_fault,
-    unbelievable_distance,
 )
 from aqualvs.calibration.solver.initial_pose import start_pose
 from aqualvs.calibration.solver.least_squares import (
@@ -365,7 +365,7 @@ _POSE_RULES = (
 )
 
 
-def check_start(problem: DomeProblem) -> None:
+def check_initial_guess(problem: DomeProblem) -> None:
     """Refuse boards at impossible distances, or grossly different from the given ones.
 
     Raises
@@ -376,7 +376,7 @@ def check_start(problem: DomeProblem) -> None:
     _check_seen(problem)
     views = problem.bundle.views
     away = [float(np.linalg.norm(v.dome_from_target.apply(v.view.middle))) for v in views]
-    _refuse_if(unbelievable_distance(np.array(away), [shot.label for shot in problem.shots]))
+    _refuse_if(implausible_distance(np.array(away), [shot.label for shot in problem.shots]))
     exact = any(view.fixed for view in views)
     if not exact and all_alike(
         np.array([view.dome_from_target.rotation[:, 2] for view in views]), np.array(away)

@@ -9,7 +9,7 @@ from aqualvs.calibration.dome.problem import LENS, ROTATION, DomeProblem
 from aqualvs.calibration.solver.bundle import Bundle, BundleState, TargetView
 from aqualvs.calibration.solver.initial_pose import start_pose, target_pose
 from aqualvs.calibration.solver.least_squares import Solution, solve
-from aqualvs.calibration.solver.result import HeldBack, rms_px
+from aqualvs.calibration.solver.result import CrossValidation, rms_px
 from aqualvs.calibration.targets.targets import View
 from aqualvs.errors import CalibrationError
 from aqualvs.geometry.arrays import FloatArray
@@ -23,7 +23,7 @@ _MIN_POINTS = 12
 
 def compare_with_bare_lens(
     problem: DomeProblem, solution: Solution[BundleState]
-) -> HeldBack | None:
+) -> CrossValidation | None:
     """Solve both models from three views in four and predict the fourth; four times.
 
     The pose of a view held back is found from half of its corners; the other half is predicted.
@@ -31,7 +31,7 @@ def compare_with_bare_lens(
 
     Returns
     -------
-    HeldBack or None
+    CrossValidation or None
         None if there are too few views.
     """
     n = len(problem.shots)
@@ -57,7 +57,7 @@ def compare_with_bare_lens(
     return _compared(pairs)
 
 
-def _compared(pairs: Sequence[tuple[FloatArray, FloatArray]]) -> HeldBack | None:
+def _compared(pairs: Sequence[tuple[FloatArray, FloatArray]]) -> CrossValidation | None:
     """Compare residuals (N, 2) of the same corners, view by view."""
     rows = []
     for dome, bare in pairs:
@@ -67,7 +67,7 @@ def _compared(pairs: Sequence[tuple[FloatArray, FloatArray]]) -> HeldBack | None
     if not rows:
         return None
     dome_px, bare_px, counts = np.array(rows).T
-    return HeldBack(dome_px, bare_px, counts.astype(np.int64))
+    return CrossValidation(dome_px, bare_px, counts.astype(np.int64))
 
 
 def _dome_state(

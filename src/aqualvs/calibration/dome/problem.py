@@ -5,7 +5,7 @@ The input is sets of views of boards, each set in one medium, and options (`Boar
 
 Prior of the boards' tilt: most boards of a rail stand square, some lean by a degree or more. How
 closely the good ones agree is not known beforehand. It is estimated by maximum likelihood, over a
-ladder of scales (`with_leaning_as_found`).
+ladder of scales (`with_board_tilt_as_found`).
 """
 
 from collections.abc import Iterator, Sequence
@@ -16,7 +16,7 @@ from typing import Protocol
 import numpy as np
 
 from aqualvs.calibration.solver.bundle import Bundle, BundleState, PoseTerm, TargetView
-from aqualvs.calibration.solver.covariance import unbelievable_distance
+from aqualvs.calibration.solver.covariance import implausible_distance
 from aqualvs.calibration.solver.initial_pose import (
     StartPose,
     square_rotation,
@@ -119,7 +119,7 @@ class DomeOptions:
     refine_intrinsics : bool
         Whether intrinsics are solved too, with the camera's calibration as their prior. If not,
         they are held, and their uncertainty is propagated to the result.
-    check_held_back : bool
+    check_cross_validation : bool
         Whether to compare the dome with a bare lens on views held back.
     """
 
@@ -130,7 +130,7 @@ class DomeOptions:
     distance_offset_sigma: float = 2e-4
     tilt_sigma: float = field(default=float(np.deg2rad(0.2)))
     refine_intrinsics: bool = True
-    check_held_back: bool = True
+    check_cross_validation: bool = True
 
     def __post_init__(self) -> None:
         if self.distance_sigma <= 0.0 or self.tilt_sigma <= 0.0:
@@ -264,12 +264,12 @@ class DomeProblem:
             views[i] = replace(views[i], known=known)
         return replace(self, bundle=replace(self.bundle, views=tuple(views)))
 
-    def with_lean_sigma(self, sigma: float) -> "DomeProblem":
+    def with_board_tilt_prior(self, sigma: float) -> "DomeProblem":
         """Return the problem with another prior scale of the boards' tilt."""
         views = []
         for view in self.bundle.views:
             known = tuple(
-                replace(term, lean_sigma=sigma) if isinstance(term, SquareBoard) else term
+                replace(term, board_tilt_sigma=sigma) if isinstance(term, SquareBoard) else term
                 for term in view.known
             )
             views.append(replace(view, known=known))
@@ -285,7 +285,7 @@ def shots_of(sets: Sequence[BoardSet]) -> list[Shot]:
     ]
 
 
-def start_rigs(rig: Rig) -> Iterator[Rig]:
+def initial_rigs(rig: Rig) -> Iterator[Rig]:
     """Yield the rig, then the same with its lens at the dome's centre, where solves converge.
 
     A stated lens position far to the wrong side may leave no pose of a board to start from.
@@ -370,7 +370,7 @@ def _why_none(rig: Rig, sets: Sequence[BoardSet]) -> str | None:
         if not isinstance(start, str):
             middle = start.dome_from_target.apply(shot.view.middle)
             found[shot.label] = float(np.linalg.norm(middle - rig.dome_from_cam.translation))
-    return unbelievable_distance(np.array([*found.values()]), [*found]) if found else None
+    return implausible_distance(np.array([*found.values()]), [*found]) if found else None
 
 
 def _start(camera: Camera, shot: Shot) -> StartPose | str:
@@ -412,7 +412,7 @@ _STEP = 0.5
 _EVIDENCE = 3.0
 
 
-def with_leaning_as_found(
+def with_board_tilt_as_found(
     problem: DomeProblem, solution: Solution[BundleState], sigma: float
 ) -> tuple[DomeProblem, Solution[BundleState]]:
     """Solve with a finer scale of the boards' tilt as long as they agree that closely.
@@ -430,7 +430,7 @@ def with_leaning_as_found(
         Unchanged if boards do not agree better, or nothing is known of their poses.
     """
     while sigma * _STEP >= _FINEST * (1.0 - 1e-9):
-        finer = problem.with_lean_sigma(sigma * _STEP)
+        finer = problem.with_board_tilt_prior(sigma * _STEP)
         trial = solve(finer.bundle, solution.state)
         gain = _misfit(solution, sigma) - _misfit(trial, sigma * _STEP)
         if not (trial.converged and gain > _EVIDENCE):

@@ -18,12 +18,16 @@ from aqualvs.calibration.lasers.checks import (
     check_size,
     far_apart,
     like,
-    loose_words,
+    loose_text,
     match_to_rig,
     named,
 )
-from aqualvs.calibration.lasers.covariance import CameraDoubt, joint_uncertainty
-from aqualvs.calibration.lasers.laser_assignment import BENT_TOLERANCE_PX, LaserSplit, split_lasers
+from aqualvs.calibration.lasers.covariance import CameraCovariance, joint_uncertainty
+from aqualvs.calibration.lasers.laser_assignment import (
+    BENT_TOLERANCE_PX,
+    LaserAssignment,
+    assign_lasers,
+)
 from aqualvs.calibration.lasers.report import (
     LaserCalibration,
     LaserFigures,
@@ -123,20 +127,22 @@ def calibrate_lasers(
         If refinement is requested and nothing is uncertain.
     """
     options = options or LaserOptions()
-    doubt = _doubt(rig, options, uncertainty or RigUncertainty.none())
+    camera_covariance = _camera_covariance(rig, options, uncertainty or RigUncertainty.none())
     check_size(views)
     seen_rig = rig if options.n_medium is None else rig.in_water(options.n_medium)
     placed, left_out = place_views(seen_rig.camera(), views, surfaces)
     check_poses(placed)
     check_distances(placed, rig)
     lasers, laser_of, warnings = _sorted_stripes(rig, placed, surfaces, options)
-    start = InitialGuess(seen_rig, surfaces, tuple(placed), doubt if options.refine else None)
+    start = InitialGuess(
+        seen_rig, surfaces, tuple(placed), camera_covariance if options.refine else None
+    )
     solved, words = solve_lasers(start, lasers, laser_of, options.loose)
-    result = _result_rig(rig, solved, lasers, start.doubt)
+    result = _result_rig(rig, solved, lasers, start.camera_covariance)
     joint = joint_uncertainty(
         solved.solution,
         solved.problem,
-        doubt,
+        camera_covariance,
         result.lasers,
         refined=options.refine,
         stripe_bias_px=options.stripe_bias_px,
@@ -154,14 +160,18 @@ def calibrate_lasers(
     )
 
 
-def _doubt(rig: Rig, options: LaserOptions, uncertainty: RigUncertainty) -> CameraDoubt:
-    doubt = CameraDoubt.of(rig, uncertainty, options.n_medium, options.sigma_n_medium)
-    if options.refine and not doubt.n_columns:
+def _camera_covariance(
+    rig: Rig, options: LaserOptions, uncertainty: RigUncertainty
+) -> CameraCovariance:
+    camera_covariance = CameraCovariance.of(
+        rig, uncertainty, options.n_medium, options.sigma_n_medium
+    )
+    if options.refine and not camera_covariance.n_columns:
         raise OptionError(
             "refinement is asked for, but the rig says of none of its camera's numbers how well "
             "it is known; calibrate the camera and dome first, or leave refinement out"
         )
-    return doubt
+    return camera_covariance
 
 
 def _sorted_stripes(
@@ -189,13 +199,13 @@ def _sorted_stripes(
 
 def _split(
     rig: Rig, views: Sequence[PlacedView], surfaces: TargetSurfaces, options: LaserOptions
-) -> tuple[LaserSplit, list[str]]:
+) -> tuple[LaserAssignment, list[str]]:
     """Split the stripes, with a larger tolerance if a tilted board may have split lasers."""
     expected = options.n_lasers or len(rig.lasers) or None
     stripes, lens = pooled(views, surfaces), rig.dome_from_cam.translation
 
-    def split_within(tolerance: float) -> LaserSplit:
-        return split_lasers(stripes, lens, n_lasers=expected, tolerance_px=tolerance)
+    def split_within(tolerance: float) -> LaserAssignment:
+        return assign_lasers(stripes, lens, n_lasers=expected, tolerance_px=tolerance)
 
     split = split_within(tolerance_px(rig.lasers))
     if len(surfaces.planes) == 1 and (split.torn or len(split.planes) < (expected or 1)):
@@ -209,13 +219,16 @@ def _split(
 
 
 def _result_rig(
-    rig: Rig, solved: SolvedLasers, lasers: Sequence[Laser], doubt: CameraDoubt | None
+    rig: Rig,
+    solved: SolvedLasers,
+    lasers: Sequence[Laser],
+    camera_covariance: CameraCovariance | None,
 ) -> Rig:
     state = solved.state
     found = tuple(sheet.laser(laser) for laser, sheet in zip(lasers, state.sheets, strict=True))
-    if doubt is None:
+    if camera_covariance is None:
         return replace(rig, lasers=found)
-    n_water = float(state.bundle.media[0]) if doubt.medium_is_water else rig.n_water
+    n_water = float(state.bundle.media[0]) if camera_covariance.medium_is_water else rig.n_water
     return replace(state.bundle.rig, lasers=found, n_water=n_water)
 
 
@@ -241,7 +254,7 @@ def _warnings(
         if figures.rms_px > _BAD_STRIPES_PX
     ]
     if solved.problem.slack is not None:
-        words.append(loose_words(solved))
+        words.append(loose_text(solved))
     if not solved.solution.converged:
         words.append("the solve did not settle; look at the residuals before using this rig")
     return words
@@ -249,12 +262,12 @@ def _warnings(
 
 # Place of each laser's stripe by the board's pose, to distinguish the lasers.
 _NEAR_PX = 8.0
-_FEWEST_POINTS = 20
+_MIN_POINTS = 20
 _N_FITS = 10
 
 
 @dataclass(frozen=True, slots=True)
-class HeldOutView:
+class LeaveOneOutView:
     """One picture, measured by lasers that were calibrated from the others.
 
     Attributes
@@ -285,7 +298,7 @@ def leave_one_out(
     *,
     options: LaserOptions | None = None,
     uncertainty: RigUncertainty | None = None,
-) -> list[HeldOutView]:
+) -> list[LeaveOneOutView]:
     """Calibrate without each picture in turn, and measure that picture's board with the lasers.
 
     Parameters
@@ -295,7 +308,7 @@ def leave_one_out(
 
     Returns
     -------
-    list of HeldOutView
+    list of LeaveOneOutView
         One for each picture.
 
     Raises
@@ -317,13 +330,13 @@ def leave_one_out(
 
 def _measured(
     calibration: LaserCalibration, view: LaserView, surfaces: TargetSurfaces, options: LaserOptions
-) -> HeldOutView:
+) -> LeaveOneOutView:
     rig = calibration.rig
     seen_rig = rig if options.n_medium is None else rig.in_water(options.n_medium)
     placed = place_views(seen_rig.camera(), [view], surfaces)[0][0]
     planes = [figures.laser.plane for figures in calibration.lasers]
     points, laser = _triangulated(seen_rig, placed, pooled([placed], surfaces), planes)
-    if len(points) < _FEWEST_POINTS or len(np.unique(laser)) < 2:
+    if len(points) < _MIN_POINTS or len(np.unique(laser)) < 2:
         raise CalibrationError(
             f"{view.view.name}: {len(points)} points on {len(np.unique(laser))} stripes; a plane "
             "needs two stripes"
@@ -331,7 +344,7 @@ def _measured(
     by_lasers = fitted(points)
     by_board = surfaces.placed(0, placed.dome_from_target).facing_origin()
     ours, theirs = posture(by_lasers), posture(by_board)
-    return HeldOutView(
+    return LeaveOneOutView(
         name=view.view.name,
         n_lasers=len(np.unique(laser)),
         by_lasers=by_lasers,

@@ -168,19 +168,19 @@ _N_PLANE_FITS = 5
 # Largest tangent of the angle between a point's stripe and the plane's, in the image.
 _ALIGNED_WITH_PLANE = 0.35
 # Number of pairs beyond which they are sampled; number of planes tried at a time.
-_MOST_PLANES, _AT_ONCE = 6000, 500
+_MAX_PLANES, _AT_ONCE = 6000, 500
 # Prior of the rate of accidents, for when few are seen: spread of the lines in pixels, and its
 # weight as a number of observed planes. Then the shift in pixels, the number of shifts and the
 # number of pairs in the random test of how often lines meet by accident.
 _SPREAD_PX, _PRIOR_WEIGHT = 1000.0, 20.0
-_MOVED_PX, _N_MOVES, _MOST_MOVED = 250.0, 8, 1000
+_MOVED_PX, _N_MOVES, _MAX_MOVED = 250.0, 8, 1000
 # A line nearer than this share of the tolerance is no better evidence: poses are not more accurate.
 _NEAREST = 0.1
 # Accidents of a line are counted on lines of its surface of at least this share of its length.
 _AS_LONG = 0.5
 # Rounds of removing the lines of found planes from the accidents.
 _N_ROUNDS = 3
-_MOST_TRIALS = 60
+_MAX_TRIALS = 60
 
 
 @dataclass(frozen=True, slots=True)
@@ -274,9 +274,9 @@ class _Hypotheses:
         normals, offsets = _planes_of_pairs(table, pairs)
         meet = _pairs_meet(table, pairs, normals, offsets, tolerance_px)
         kept = np.flatnonzero(meet)
-        share = min(1.0, _MOST_PLANES / max(len(kept), 1))
+        share = min(1.0, _MAX_PLANES / max(len(kept), 1))
         if share < 1.0:
-            kept = np.sort(np.random.default_rng(0).choice(kept, _MOST_PLANES, replace=False))
+            kept = np.sort(np.random.default_rng(0).choice(kept, _MAX_PLANES, replace=False))
         pairs, normals, offsets = pairs[kept], normals[kept], offsets[kept]
         worst = np.empty((len(kept), len(table.patch)))
         for first in range(0, len(kept), _AT_ONCE):
@@ -374,7 +374,7 @@ def _collected(
     free = np.ones(len(lines), np.bool_)
     alive = np.ones(len(planes.pairs), np.bool_)
     nearness = _nearness(planes.worst, tolerance_px)
-    for _ in range(_MOST_TRIALS):
+    for _ in range(_MAX_TRIALS):
         alive &= np.all(free[planes.pairs], axis=1)
         alarms = _log_false_alarms(table, np.where(free, nearness, np.inf), accidents)
         alarms[~alive] = np.inf
@@ -492,7 +492,7 @@ def _meeting_rate(table: LineTable, pairs: IntArray, tolerance_px: float) -> flo
     if not len(pairs):
         return 0.0
     rng = np.random.default_rng(1)
-    some = pairs[rng.permutation(len(pairs))[:_MOST_MOVED]]
+    some = pairs[rng.permutation(len(pairs))[:_MAX_MOVED]]
     met = 0
     for _ in range(_N_MOVES):
         moves = rng.uniform(-_MOVED_PX, _MOVED_PX, len(some))[:, None, None]

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from aqualvs.calibration.lasers.laser_assignment import JudgedPlane, LaserSplit, PlaneVerdict
+from aqualvs.calibration.lasers.laser_assignment import JudgedPlane, LaserAssignment, PlaneVerdict
 from aqualvs.calibration.lasers.report import SolvedLasers
 from aqualvs.calibration.lasers.stripes_on_planes import TargetSurfaces
 from aqualvs.calibration.lasers.views import LaserView, PlacedView
@@ -109,7 +109,7 @@ _NEARER, _FARTHER = 0.2, 5.0
 # Ratio of the corners' residuals with stripes to those without from which they contradict each
 # other; ratio of the stripes' residuals from a plane to those from lines from which they do.
 _CORNERS_CONTRADICT, _STRIPES_CONTRADICT = 1.5, 3.0
-_FEWEST_BINS = 5
+_MIN_BINS = 5
 # Larger than any error of detection, in pixels.
 _IMPOSSIBLE_PX = 2.0
 # Share of the weakest laser's points in a picture from which a further stripe is reported.
@@ -176,7 +176,7 @@ def check_distances(views: Sequence[PlacedView], rig: Rig) -> None:
 
 
 def check_count(
-    split: LaserSplit,
+    split: LaserAssignment,
     expected: int | None,
     rig: Rig,
     views: Sequence[PlacedView],
@@ -268,7 +268,7 @@ def _stripes_misfit(solved: SolvedLasers) -> float:
     for i, group in enumerate(solved.problem.groups):
         residuals, _ = solved.stripe_residuals_px(i)
         seen = np.isfinite(residuals)
-        if np.count_nonzero(seen) < _FEWEST_BINS:
+        if np.count_nonzero(seen) < _MIN_BINS:
             continue
         weights = 1.0 / group.sigma_px[seen]
         along = group.pixels[seen] - group.pixels[seen].mean(axis=0)
@@ -281,7 +281,7 @@ def _stripes_misfit(solved: SolvedLasers) -> float:
     return float(np.sqrt(from_plane / max(from_line, 1e-12)))
 
 
-def loose_words(solved: SolvedLasers) -> str:
+def loose_text(solved: SolvedLasers) -> str:
     """Return the warning that a board is assumed to lie unevenly on its surface."""
     slack = solved.state.slack
     tilt = np.rad2deg(np.sqrt(np.mean(np.sum(slack[:, :2] ** 2, axis=1))))
@@ -305,7 +305,7 @@ def _alone_px(solved: SolvedLasers) -> float:
 
 
 def _too_few(
-    split: LaserSplit,
+    split: LaserAssignment,
     expected: int | None,
     rig: Rig,
     views: Sequence[PlacedView],

@@ -1,6 +1,6 @@
 """Joint covariance of camera, medium and lasers after a calibration of the lasers.
 
-The camera's numbers come from another calibration, with their own uncertainty (`CameraDoubt`).
+The camera's numbers come from another calibration, with their own uncertainty (`CameraCovariance`).
 Either they are held, and their uncertainty is propagated to the planes to first order (a "consider"
 covariance, Schmidt 1966, doi:10.1016/B978-1-4831-6716-9.50011-4), or they are refined with that
 uncertainty as their prior. In both cases planes and camera remain correlated, and the result holds
@@ -22,7 +22,7 @@ from aqualvs.optics.rig import LASER_PARAMETERS, Laser, Rig, RigUncertainty
 
 
 @dataclass(frozen=True, slots=True)
-class CameraDoubt:
+class CameraCovariance:
     """Uncertain numbers of the camera, and uncertainty of the medium's index.
 
     Attributes
@@ -45,7 +45,7 @@ class CameraDoubt:
     @classmethod
     def of(
         cls, rig: Rig, given: RigUncertainty, n_medium: float | None, sigma_medium: float
-    ) -> "CameraDoubt":
+    ) -> "CameraCovariance":
         """Return the uncertain numbers.
 
         Parameters
@@ -117,7 +117,7 @@ class JointResult:
 def joint_uncertainty(
     solution: Solution[LaserState],
     problem: LaserProblem,
-    doubt: CameraDoubt,
+    camera_covariance: CameraCovariance,
     lasers: Sequence[Laser],
     *,
     refined: bool,
@@ -131,7 +131,7 @@ def joint_uncertainty(
         Of `problem`.
     problem : LaserProblem
         With free uncertain numbers if `refined`, else held ones.
-    doubt : CameraDoubt
+    camera_covariance : CameraCovariance
         Numbers that were uncertain before.
     lasers : sequence of Laser
         In the problem's order.
@@ -142,16 +142,16 @@ def joint_uncertainty(
         surface, across the stripe.
     """
     correlation = _correlation(solution, problem)
-    information = _data_information(solution, problem, doubt, correlation)
-    covariance = _all_covariance(information, problem, doubt, stripe_bias_px, refined)
+    information = _data_information(solution, problem, camera_covariance, correlation)
+    covariance = _all_covariance(information, problem, camera_covariance, stripe_bias_px, refined)
     # Poses, slack and bias are marginalised.
-    n, mine = doubt.n_columns, np.arange(N_LASER * problem.n_lasers)
+    n, mine = camera_covariance.n_columns, np.arange(N_LASER * problem.n_lasers)
     mine += problem.laser_columns(0)[0] + n - problem.bundle.n_shared
     kept = np.concatenate([np.arange(n), mine])
-    joint = _with_given(covariance[np.ix_(kept, kept)], doubt)
+    joint = _with_given(covariance[np.ix_(kept, kept)], camera_covariance)
     names = [f"{laser.name}:{name}" for laser in lasers for name in LASER_PARAMETERS]
     return JointResult(
-        RigUncertainty((*doubt.given.names, *names), joint),
+        RigUncertainty((*camera_covariance.given.names, *names), joint),
         covariance[np.ix_(mine, mine)],
         correlation,
     )
@@ -160,21 +160,21 @@ def joint_uncertainty(
 def _all_covariance(
     information: FloatArray,
     problem: LaserProblem,
-    doubt: CameraDoubt,
+    camera_covariance: CameraCovariance,
     stripe_bias_px: float,
     refined: bool,
 ) -> FloatArray:
     """Return the covariance of all numbers from the information of the data alone."""
-    n, n_bias = doubt.n_columns, problem.n_lasers * len(problem.surfaces.planes)
+    n, n_bias = camera_covariance.n_columns, problem.n_lasers * len(problem.surfaces.planes)
     bias = np.arange(len(information) - n_bias, len(information))
     bias_prior = np.diag(np.full(n_bias, stripe_bias_px**2))
     if refined:
         informed = information.copy()
-        informed[:n, :n] += inverse(doubt.covariance)
-        return _considered(informed, bias, bias_prior)
+        informed[:n, :n] += inverse(camera_covariance.covariance)
+        return _consider_covariance(informed, bias, bias_prior)
     prior = np.zeros((n + n_bias, n + n_bias))
-    prior[:n, :n], prior[n:, n:] = doubt.covariance, bias_prior
-    return _considered(information, np.concatenate([np.arange(n), bias]), prior)
+    prior[:n, :n], prior[n:, n:] = camera_covariance.covariance, bias_prior
+    return _consider_covariance(information, np.concatenate([np.arange(n), bias]), prior)
 
 
 def _correlation(solution: Solution[LaserState], problem: LaserProblem) -> tuple[float, ...]:
@@ -200,15 +200,15 @@ def _correlation(solution: Solution[LaserState], problem: LaserProblem) -> tuple
 def _data_information(
     solution: Solution[LaserState],
     problem: LaserProblem,
-    doubt: CameraDoubt,
+    camera_covariance: CameraCovariance,
     correlation: Sequence[float],
 ) -> FloatArray:
     """Return the information of stripes, corners, slack: uncertain numbers first, biases last."""
     bundle = replace(
         problem.bundle,
-        free=doubt.names,
+        free=camera_covariance.names,
         priors=RigUncertainty.none(),
-        media_sigma=np.array([doubt.sigma_medium]),
+        media_sigma=np.array([camera_covariance.sigma_medium]),
     )
     full = replace(problem, bundle=bundle)
     blocks = full.blocks(solution.state)
@@ -243,7 +243,7 @@ def _with_bias(block: Block, group: StripeGroup, columns: IntArray) -> Block:
     )
 
 
-def _considered(information: FloatArray, held: IntArray, prior: FloatArray) -> FloatArray:
+def _consider_covariance(information: FloatArray, held: IntArray, prior: FloatArray) -> FloatArray:
     """Return the covariance of all numbers if some were held at values of covariance `prior`."""
     solved = np.setdiff1d(np.arange(len(information)), held)
     noise = inverse(information[np.ix_(solved, solved)])
@@ -256,16 +256,16 @@ def _considered(information: FloatArray, held: IntArray, prior: FloatArray) -> F
     return covariance
 
 
-def _with_given(covariance: FloatArray, doubt: CameraDoubt) -> FloatArray:
+def _with_given(covariance: FloatArray, camera_covariance: CameraCovariance) -> FloatArray:
     """Return the covariance of all given numbers and the lasers.
 
     Numbers outside the solve follow those in it by their prior correlation.
     """
-    n, n_given = doubt.n_columns, len(doubt.given.names)
-    crossed = doubt.with_given()
-    follow = crossed.T @ _pseudo_inverse(doubt.covariance)
+    n, n_given = camera_covariance.n_columns, len(camera_covariance.given.names)
+    crossed = camera_covariance.with_given()
+    follow = crossed.T @ _pseudo_inverse(camera_covariance.covariance)
     joint = np.empty((n_given + len(covariance) - n,) * 2)
-    rest = doubt.given.covariance - follow @ crossed
+    rest = camera_covariance.given.covariance - follow @ crossed
     joint[:n_given, :n_given] = rest + follow @ covariance[:n, :n] @ follow.T
     joint[:n_given, n_given:] = follow @ covariance[:n, n:]
     joint[n_given:, :n_given] = joint[:n_given, n_given:].T

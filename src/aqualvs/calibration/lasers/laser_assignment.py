@@ -3,7 +3,7 @@
 The points lie on known surfaces. On each surface a laser plane draws a straight line; lines on
 different surfaces together determine planes and number of lasers (`candidates`). Each candidate
 plane is judged by its evidence and against the better planes: laser, no laser, or undecided
-(`judged`). `split_lasers` then assigns every point to the plane it lies in.
+(`judged`). `assign_lasers` then assigns every point to the plane it lies in.
 """
 
 from collections.abc import Sequence
@@ -27,7 +27,7 @@ from aqualvs.geometry.planes import Plane
 # False discovery rate of planes that are accepted as lasers (Benjamini & Hochberg 1995,
 # doi:10.1111/j.2517-6161.1995.tb02031.x); least number of points of a laser.
 _FALSE_SHARE = 1e-3
-_LEAST_POINTS = 40
+_MIN_POINTS = 40
 # Distance from another laser's stripe, in pixels, within which light is its halo; on other
 # surfaces, where that laser is not seen, it may be the same laser on a board that is not flat.
 _HALO_PX, _TORN_PX = 6.0, 15.0
@@ -41,10 +41,10 @@ _LITTLE, _ALIKE = 0.15, 0.8
 _FIXED_PX = 1.5
 # The stripe of a plane nearer to the lens, in metres, stays in one place of the picture: it is a
 # scratch or an overlaid text.
-_LEAST_BASELINE = 2e-3
+_MIN_BASELINE = 2e-3
 # Ratio of a plane's residual to the best laser's from which its light lies on something else;
 # errors of the poses make a tenth of a pixel for every stripe.
-_POORER, _LEAST_RESIDUAL_PX = 5.0, 0.1
+_POORER, _MIN_RESIDUAL_PX = 5.0, 0.1
 
 
 class PlaneVerdict(Enum):
@@ -111,7 +111,7 @@ def judged(
         candidate = candidates[i]
         members = _members(lines, candidate)
         fault = _fault(pooled, candidate, members, seen)
-        if abs(float(candidate.plane.signed_distance(lens_in_dome))) < _LEAST_BASELINE:
+        if abs(float(candidate.plane.signed_distance(lens_in_dome))) < _MIN_BASELINE:
             fault = PlaneVerdict.OTHER, "it stays in one place of the picture, near or far"
         if fault is None and i >= n_sure:
             fault = PlaneVerdict.WEAK, "too few stripes lie in it to tell it from an accident"
@@ -150,7 +150,7 @@ def _fault(
     seen: Sequence[JudgedPlane],
 ) -> tuple[PlaneVerdict, str] | None:
     """Return the reason against a plane as a laser of its own, or None."""
-    if len(members) < _LEAST_POINTS:
+    if len(members) < _MIN_POINTS:
         return PlaneVerdict.OTHER, f"it has {len(members)} points only"
     if _is_fixed(pooled, members):
         return PlaneVerdict.DOUBTFUL, (
@@ -167,7 +167,7 @@ def _fault(
         (other.candidate.residual_px for other in seen if other.verdict is PlaneVerdict.LASER),
         default=np.inf,
     )
-    if candidate.residual_px > _POORER * max(best, _LEAST_RESIDUAL_PX):
+    if candidate.residual_px > _POORER * max(best, _MIN_RESIDUAL_PX):
         return PlaneVerdict.DOUBTFUL, (
             f"its stripes miss a plane by {candidate.residual_px:.1f} px, those of another laser "
             f"by {best:.1f} px; they may lie on something else than the target"
@@ -250,7 +250,7 @@ BENT_TOLERANCE_PX = 10.0
 _CROSSING_PX = 9.0
 _N_FITS = 5
 # Least share of its chains that a straight stripe holds; with less it is a chord of a curve.
-_LEAST_OF_CHAIN = 0.25
+_MIN_OF_CHAIN = 0.25
 # Difference of log false alarms from which a plane is clearly worse.
 _CLEARLY_WORSE = 3.0
 # Greatest expected number of accidents of a plane that is needed for the given number of lasers,
@@ -262,7 +262,7 @@ _HARDLY_AN_ACCIDENT = float(np.log(0.05))
 
 
 @dataclass(frozen=True, slots=True)
-class LaserSplit:
+class LaserAssignment:
     """Points sorted by laser.
 
     Attributes
@@ -305,13 +305,13 @@ class LaserSplit:
         return any(plane.verdict is PlaneVerdict.TORN for plane in self.spare)
 
 
-def split_lasers(
+def assign_lasers(
     pooled: PooledStripes,
     lens_in_dome: FloatArray,
     *,
     n_lasers: int | None = None,
     tolerance_px: float = TOLERANCE_PX,
-) -> LaserSplit:
+) -> LaserAssignment:
     """Assign stripe points to the laser planes that they lie in.
 
     Parameters
@@ -327,7 +327,7 @@ def split_lasers(
 
     Returns
     -------
-    LaserSplit
+    LaserAssignment
         All planes with clear evidence, even more than `n_lasers`. If there are fewer, also the best
         undecided ones, if they are clearly better than the other undecided ones.
     """
@@ -346,7 +346,7 @@ def split_lasers(
     planes = _refined(pooled, [plane.candidate.plane for plane in taken], tolerance_px)
     laser = assigned(pooled, planes, tolerance_px)
     spare = tuple(plane for plane in found if plane not in taken)
-    return LaserSplit(tuple(planes), laser, _unmatched(lines, laser), spare)
+    return LaserAssignment(tuple(planes), laser, _unmatched(lines, laser), spare)
 
 
 def _may_be_laser(plane: JudgedPlane, lines: Sequence[StripeLine], longest: int) -> bool:
@@ -374,7 +374,7 @@ def _all_lines(pooled: PooledStripes) -> list[StripeLine]:
         lines += [
             line
             for line in lines_on_patch(pooled, members, patch)
-            if _share_of_chains(pooled, line, n_of_chain) >= _LEAST_OF_CHAIN
+            if _share_of_chains(pooled, line, n_of_chain) >= _MIN_OF_CHAIN
         ]
     return lines
 
@@ -402,7 +402,7 @@ def _refined(pooled: PooledStripes, planes: list[Plane], tolerance_px: float) ->
         laser = assigned(pooled, planes, tolerance_px)
         planes = [
             fitted_plane(pooled.placed, np.flatnonzero(laser == i), plane)
-            if np.count_nonzero(laser == i) >= _LEAST_POINTS
+            if np.count_nonzero(laser == i) >= _MIN_POINTS
             else plane
             for i, plane in enumerate(planes)
         ]
@@ -439,6 +439,6 @@ def _unmatched(lines: Sequence[StripeLine], laser: IntArray) -> tuple[StripeLine
     free = [
         line
         for line in lines
-        if len(line.members) >= _LEAST_POINTS and np.mean(laser[line.members] >= 0) < 0.2
+        if len(line.members) >= _MIN_POINTS and np.mean(laser[line.members] >= 0) < 0.2
     ]
     return tuple(sorted(free, key=lambda line: -len(line.members)))

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from aqualvs.calibration.lasers.checks import contradicts, like, typical_corner_error_px
-from aqualvs.calibration.lasers.covariance import CameraDoubt
+from aqualvs.calibration.lasers.covariance import CameraCovariance
 from aqualvs.calibration.lasers.laser_assignment import BENT_TOLERANCE_PX, TOLERANCE_PX, assigned
 from aqualvs.calibration.lasers.problem import N_SLACK, LaserProblem, LaserState, Slack
 from aqualvs.calibration.lasers.report import SolvedLasers
@@ -146,7 +146,7 @@ def _fit(solved: SolvedLasers, i_laser: int) -> _Fit:
 # Tilt and offset of a board of paper or foam that is fixed to a wall by hand.
 _LOOSE = Slack(float(np.deg2rad(1.0)), 2e-3)
 # Least number of a laser's points in a view.
-_FEWEST_POINTS = 5
+_MIN_POINTS = 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,7 +160,7 @@ class InitialGuess:
     surfaces : TargetSurfaces
         Of the target.
     views : tuple of PlacedView
-    doubt : CameraDoubt or None
+    camera_covariance : CameraCovariance or None
         Numbers that are refined too; None if the camera is held.
     slack : Slack or None
         Uncertainty of a board's pose on its surface; None if it is the surface.
@@ -171,7 +171,7 @@ class InitialGuess:
     rig: Rig
     surfaces: TargetSurfaces
     views: tuple[PlacedView, ...]
-    doubt: CameraDoubt | None
+    camera_covariance: CameraCovariance | None
     slack: Slack | None = None
     shared_error_px: float = 0.0
 
@@ -182,13 +182,15 @@ class InitialGuess:
 
     def bundle(self) -> Bundle:
         """Return the bundle of the corners alone."""
-        doubt = self.doubt
+        camera_covariance = self.camera_covariance
         return Bundle(
             views=tuple(TargetView(v.view, 0, v.dome_from_target) for v in self.views),
-            free=() if doubt is None else doubt.names,
+            free=() if camera_covariance is None else camera_covariance.names,
             start=self.state(),
-            priors=RigUncertainty.none() if doubt is None else doubt.given,
-            media_sigma=np.array([0.0 if doubt is None else doubt.sigma_medium]),
+            priors=RigUncertainty.none() if camera_covariance is None else camera_covariance.given,
+            media_sigma=np.array(
+                [0.0 if camera_covariance is None else camera_covariance.sigma_medium]
+            ),
         )
 
     def state(self) -> BundleState:
@@ -257,7 +259,7 @@ def _sorted_again(
     planes = [sheet.plane for sheet in state.sheets]
     sorted_anew = assigned(pooled(views, start.surfaces), planes, tolerance)
     counts = np.bincount(sorted_anew[sorted_anew >= 0], minlength=len(planes))
-    if counts.min() < _FEWEST_POINTS:
+    if counts.min() < _MIN_POINTS:
         return start, laser_of
     return replace(start, views=views), sorted_anew
 
@@ -271,7 +273,7 @@ def _solve_from(
         planes = start.planes(view)
         for i_laser, sheet in enumerate(sheets):
             members = np.flatnonzero(mine == i_laser)
-            if len(members) >= _FEWEST_POINTS:
+            if len(members) >= _MIN_POINTS:
                 stripes = view.stripes.at(view.placed.index[members])
                 group = binned(i_view, i_laser, stripes, view.placed.surface[members])
                 group = with_shared_error(group, start.shared_error_px)
@@ -279,11 +281,11 @@ def _solve_from(
     problem = LaserProblem(start.bundle(), start.surfaces, tuple(groups), len(sheets), start.slack)
     slack = np.zeros((len(start.views), N_SLACK))
     state = LaserState(start.state(), sheets, slack)
-    solution = solve(problem, state, remedy=lambda i: free_words(problem, names, start.views, i))
+    solution = solve(problem, state, remedy=lambda i: free_text(problem, names, start.views, i))
     return SolvedLasers(problem, solution, start.views)
 
 
-def free_words(
+def free_text(
     problem: LaserProblem, names: Sequence[str], views: Sequence[PlacedView], parameter: int
 ) -> str:
     """Return the remedy for a parameter that the pictures do not determine.

@@ -323,7 +323,7 @@ BIN_PX = 12.0
 # A gap of more pixels than this along a stripe ends a bin.
 _GAP_PX = 10.0
 # Greatest lag of the autocorrelation, in bins, and least number of pairs at each lag.
-_MAX_LAG, _LEAST_PAIRS = 12, 20
+_MAX_LAG, _MIN_PAIRS = 12, 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -507,7 +507,7 @@ def correlation_factor(sequences: Sequence[FloatArray]) -> float:
         return 1.0
     factor = 1.0
     for lag in range(1, _MAX_LAG + 1):
-        if pairs[lag] < _LEAST_PAIRS or products[lag] <= 0.0:
+        if pairs[lag] < _MIN_PAIRS or products[lag] <= 0.0:
             break
         factor += 2.0 * (products[lag] / pairs[lag]) / (products[0] / pairs[0])
     return factor

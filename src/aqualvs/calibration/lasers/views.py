@@ -113,7 +113,7 @@ def pose_difference(a: SE3, b: SE3, middle: FloatArray) -> tuple[float, float]:
     return angle, float(np.linalg.norm(a.apply(middle) - b.apply(middle)))
 
 
-_FEWEST_CORNERS = 4
+_MIN_CORNERS = 4
 # Neighbouring points of a stripe are nearly redundant.
 _ENOUGH_POINTS = 2000
 
@@ -205,7 +205,7 @@ def place_views(
 
 def _placed_view(camera: Camera, laser_view: LaserView, surfaces: TargetSurfaces) -> PlacedView:
     view = laser_view.view
-    if len(view) < _FEWEST_CORNERS:
+    if len(view) < _MIN_CORNERS:
         raise CalibrationError(
             f"{view.name}: {len(view)} corners of the target found; show more of it, with better "
             "light, or check the family and sizes in its file"

@@ -9,8 +9,9 @@ Zeger 1986, doi:10.1093/biomet/73.1.13), with the bias correction CR2 for views 
 parameters badly; it is shrunk towards a multiple of the corners' (Ledoit & Wolf 2004,
 doi:10.1016/S0047-259X(03)00096-4).
 
-Held parameters (`considered`): the errors of numbers that were held, though they are not known
-exactly, pass into the numbers that were solved for, through the derivatives of both. This is the
+Held parameters (`consider_covariance`): the errors of numbers that were held, though they are not
+known exactly, pass into the numbers that were solved for, through the derivatives of both. This is
+the
 "consider" covariance (Schmidt 1966, doi:10.1016/B978-1-4831-6716-9.50011-4).
 
 Observability (`observability`): combinations of numbers that the data determined, and those that
@@ -99,7 +100,7 @@ def scale_fault(ratio: float, tolerance: float) -> str | None:
     )
 
 
-def unbelievable_distance(distances: FloatArray, labels: Sequence[str]) -> str | None:
+def implausible_distance(distances: FloatArray, labels: Sequence[str]) -> str | None:
     """Return the fault of boards at unlikely distances (metres)."""
     median = float(np.median(distances))
     label = labels[int(np.argsort(distances)[len(distances) // 2])]
@@ -208,7 +209,7 @@ def _marginal(information: FloatArray, columns: IntArray) -> FloatArray:
     return marginal
 
 
-def considered(
+def consider_covariance(
     bundle: Bundle, solution: Solution[BundleState], held: RigUncertainty
 ) -> tuple[tuple[str, ...], FloatArray]:
     """Return the joint covariance of solved and held numbers.
@@ -267,7 +268,7 @@ def _cross_information(
 # compared with there.
 _ALONE = 0.999
 # Student's distribution has a variance from three views on; fewer count as this number.
-_FEWEST_VIEWS = 3.0
+_MIN_VIEWS = 3.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -404,7 +405,7 @@ def _spread(own: Sequence[FloatArray], scores: Sequence[FloatArray]) -> tuple[Fl
     # Few views determine their own scatter badly: a ratio to it has Student's distribution, whose
     # variance is larger. The noise of corners is known from many, and is present in any case.
     shares = np.einsum("sk,nst,tk->nk", vectors, np.array(own), vectors)
-    effective = np.maximum(np.sum(shares, axis=0) ** 2 / np.sum(shares**2, axis=0), _FEWEST_VIEWS)
+    effective = np.maximum(np.sum(shares, axis=0) ** 2 / np.sum(shares**2, axis=0), _MIN_VIEWS)
     students = effective / (effective - 2.0)
     values = 1.0 + students * np.maximum(values - 1.0, 0.0)
     return (vectors * values) @ vectors.T, inflation

@@ -176,7 +176,7 @@ _TINY = 1e-6
 # Weight of the group's noise in that of a block, as a number of values.
 _GROUP_FREEDOM = 10.0
 # Least number of degrees of freedom for an estimate of the noise.
-_LEAST_FREEDOM = 0.5
+_MIN_FREEDOM = 0.5
 
 
 def start_scales(blocks: Sequence[Block]) -> list[float]:
@@ -230,7 +230,7 @@ def group_scales(
     typical = {}
     for group in {b.group for b in blocks if b.scaled}:
         mine = [i for i, b in enumerate(blocks) if b.scaled and b.group == group]
-        useful = [i for i in mine if freedom[i] > _LEAST_FREEDOM]
+        useful = [i for i in mine if freedom[i] > _MIN_FREEDOM]
         if not useful:
             typical[group] = scales[mine[0]]
             continue
@@ -270,7 +270,7 @@ def _largest_scale(block: Block, freedom: float) -> float:
     Many outliers would raise the scale that accepts them; the limit prevents that.
     """
     values = block.values(block.seen)
-    if freedom <= _LEAST_FREEDOM or not values:
+    if freedom <= _MIN_FREEDOM or not values:
         return float("inf")
     return _DOUBT * _median_scale([block]) * float(np.sqrt(values / freedom))
 

@@ -53,14 +53,14 @@ class SquareBoard:
     ----------
     square : array, shape (3, 3)
         `dome_from_target` rotation of a board without tilt.
-    lean_sigma, roll_sigma : float
+    board_tilt_sigma, roll_sigma : float
         Standard deviations of well set up boards, in radians about each axis; boards far beyond
         count little (Cauchy), so that the square majority decides. Tilt (about x and z) and roll
         (about y) are judged separately: a rail keeps the roll of all.
     """
 
     square: FloatArray
-    lean_sigma: float
+    board_tilt_sigma: float
     roll_sigma: float
 
     def blocks(self, dome_from_target: SE3, centre: FloatArray, columns: IntArray) -> list[Block]:
@@ -79,7 +79,7 @@ class SquareBoard:
                 False,
             )
             for group, axes, sigma in (
-                (TILTS, [0, 2], self.lean_sigma),
+                (TILTS, [0, 2], self.board_tilt_sigma),
                 (ROLLS, [1], self.roll_sigma),
             )
         ]

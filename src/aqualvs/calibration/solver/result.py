@@ -13,7 +13,7 @@ from aqualvs.geometry.transforms import SE3
 from aqualvs.optics.rig import Rig, RigUncertainty
 
 # Least number of views in a comparison, and its probability of a false positive.
-_FEWEST_COMPARED, _CHANCE = 3, 0.01
+_MIN_COMPARED, _CHANCE = 3, 0.01
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +61,7 @@ class SolvedMedium:
 
 
 @dataclass(frozen=True, slots=True)
-class HeldBack:
+class CrossValidation:
     """Cross-validation of dome and bare lens: prediction of the same unused corners.
 
     Attributes
@@ -109,7 +109,7 @@ class HeldBack:
         Student's test of the views' log ratios: errors that both models share cancel in a view, and
         corners of one view are not independent. NaN with fewer than three views.
         """
-        if self.n_views < _FEWEST_COMPARED:
+        if self.n_views < _MIN_COMPARED:
             return float("nan")
         ratios = np.log(self.bare_px / self.dome_px)
         return float(ttest_1samp(ratios, 0.0, alternative="greater").pvalue)
@@ -139,7 +139,7 @@ class DomeCalibration:
         Typical standard deviation of a corner's coordinate.
     rotation_is_solved : bool
         Whether boards determined the camera's rotation; if not, it is that of the given rig.
-    held_back : HeldBack or None
+    cross_validation : CrossValidation or None
         None if not requested, or if there are too few views.
     findings : tuple of str
         In plain words: what the data determined, and what not.
@@ -153,7 +153,7 @@ class DomeCalibration:
     left_out: dict[str, str]
     noise_px: float
     rotation_is_solved: bool
-    held_back: HeldBack | None
+    cross_validation: CrossValidation | None
     findings: tuple[str, ...]
     n_iterations: int
 

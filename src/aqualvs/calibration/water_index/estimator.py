@@ -4,7 +4,7 @@ Section 2.2 of the paper solves for the index alone. Here the uncertainty of the
 of the camera's numbers counts too; see `water_index.filter`.
 
 A jump of the index is detected by a two-sided cumulative sum over the normalised innovations of the
-frames (`StepTest`; Page 1954, Continuous inspection schemes, Biometrika 41, 100,
+frames (`CusumTest`; Page 1954, Continuous inspection schemes, Biometrika 41, 100,
 doi:10.1093/biomet/41.1-2.100).
 
 `calibrate_water` applies the estimator to a set of pictures, as `aqualvs calibrate water` reports
@@ -56,7 +56,7 @@ _MEMORY = 100
 
 
 @dataclass(slots=True)
-class StepTest:
+class CusumTest:
     """Two-sided cumulative sum (CUSUM) test of the innovations of frames.
 
     Attributes
@@ -72,7 +72,7 @@ class StepTest:
     _block: list[float] = field(default_factory=list)
     _n_blocks: int = 0
 
-    def add(self, surprise: float) -> int:
+    def add(self, standardised: float) -> int:
         """Add the innovation of a frame, in standard deviations.
 
         Returns
@@ -82,7 +82,7 @@ class StepTest:
             alarm; else 0.
         """
         for side, sign in enumerate((1.0, -1.0)):
-            bounded = min(max(sign * surprise, -_LARGEST), _LARGEST)
+            bounded = min(max(sign * standardised, -_LARGEST), _LARGEST)
             total = max(self._sums[side] + bounded - _ALLOWANCE, 0.0)
             self._sums[side] = total
             self._lengths[side] = self._lengths[side] + 1 if total > 0.0 else 0
@@ -90,7 +90,7 @@ class StepTest:
                 began = self._lengths[side]
                 self.forget()
                 return began
-        self._spread(surprise)
+        self._spread(standardised)
         return 0
 
     @property
@@ -102,8 +102,8 @@ class StepTest:
         """Reset the sums, as after a jump; keep the inflation."""
         self._sums, self._lengths, self._block = [0.0, 0.0], [0, 0], []
 
-    def _spread(self, surprise: float) -> None:
-        self._block.append(surprise)
+    def _spread(self, standardised: float) -> None:
+        self._block.append(standardised)
         if len(self._block) < _BLOCK:
             return
         self._n_blocks += 1
@@ -116,7 +116,7 @@ class StepTest:
 
 
 # Noise of a corner before any residuals, least estimate from a first frame, and least of all.
-_NOMINAL_NOISE, _FIRST_NOISE, _LEAST_NOISE = 0.1, 0.03, 0.005
+_NOMINAL_NOISE, _FIRST_NOISE, _MIN_NOISE = 0.1, 0.03, 0.005
 _NOISE_MEMORY = 100
 _FIRST_ROUNDS = 4
 # A frame with a larger innovation waits for the next ones before it is used.
@@ -169,7 +169,7 @@ class IndexEstimator:
     _last_time: float = -math.inf
     _since_prior: float = 0.0
     _sigma_frame: float = math.inf
-    _test: StepTest = field(default_factory=StepTest, repr=False)
+    _test: CusumTest = field(default_factory=CusumTest, repr=False)
     _recent: deque[tuple[IndexState, Innovation]] = field(
         default_factory=lambda: deque(maxlen=_KEPT), repr=False
     )
@@ -269,7 +269,7 @@ class IndexEstimator:
             update = believe(self._model, state, seen.frame, noise)
             noise = max(update.noise, _FIRST_NOISE)
         self._last_time, self._noise = frame.time, noise
-        return self._believe(name, seen, update, state.n)
+        return self._accept(name, seen, update, state.n)
 
     def _next(self, name: str, last: IndexState, frame: FrameCorners) -> IndexReading:
         state = self._until(last, frame)
@@ -282,23 +282,23 @@ class IndexEstimator:
         if not seen.fits:
             return self._reading(frame.time, name, _not_there(seen))
         self._recent.append((last, seen))
-        surprise = seen.shift / seen.sigma
-        began = self._test.add(surprise)
+        standardised = seen.shift / seen.sigma
+        began = self._test.add(standardised)
         if began:
             return self._jump(name, min(began, len(self._recent)))
-        if abs(surprise) > _WAIT:
+        if abs(standardised) > _WAIT:
             n = state.n + seen.shift
             waits = f"alone it gives an index of {n:.4f}; the next frames will tell"
             return self._reading(frame.time, name, waits, n_frame=n)
         update = believe(self._model, state, seen.frame, noise)
-        return self._believe(name, seen, update, state.n)
+        return self._accept(name, seen, update, state.n)
 
-    def _believe(self, name: str, seen: Innovation, update: Update, n: float) -> IndexReading:
+    def _accept(self, name: str, seen: Innovation, update: Update, n: float) -> IndexReading:
         self._state = update.state
         self._n_frames += 1
         share = max(1.0 / self._n_frames, 1.0 / _NOISE_MEMORY)
         square = self._noise**2 + share * (update.noise**2 - self._noise**2)
-        self._noise = max(math.sqrt(square), _FIRST_NOISE if self._n_frames < 2 else _LEAST_NOISE)
+        self._noise = max(math.sqrt(square), _FIRST_NOISE if self._n_frames < 2 else _MIN_NOISE)
         self._sigma_frame = seen.sigma_frame
         return self._reading(seen.frame.time, name, n_frame=n + seen.shift, update=update)
 
@@ -308,9 +308,9 @@ class IndexEstimator:
         since = since[_onset(np.array([s.shift / s.sigma for _, s in since])) :]
         self._recent.clear()
         try:
-            state, update = self._believe_again(since)
+            state, update = self._accept_again(since)
         except RigError:
-            state, update = self._believe_again(since[-1:])
+            state, update = self._accept_again(since[-1:])
         self._state, self._since_prior = state, WIDE**2
         size, sigma = state.step
         slope = self._model.slope_uncertainty(state, since[-1][1].frame)
@@ -322,7 +322,7 @@ class IndexEstimator:
             self._moved = self._moved or not step.by_medium
         return self._reading(self._last_time, name, n_frame=state.n, update=update, step=step)
 
-    def _believe_again(
+    def _accept_again(
         self, since: Sequence[tuple[IndexState, Innovation]]
     ) -> tuple[IndexState, Update]:
         before, seen = since[0]
@@ -392,14 +392,14 @@ class IndexEstimator:
         )
 
 
-def _onset(surprises: FloatArray) -> int:
+def _onset(standardised: FloatArray) -> int:
     """Return the first of a run's frames (K,) after the jump.
 
     By truncated least squares of a change of the mean from zero.
     """
-    after = float(np.median(surprises[-_TELLING:]))
-    without = np.minimum(surprises**2, _GROSS)
-    with_jump = np.minimum((surprises - after) ** 2, _GROSS)
+    after = float(np.median(standardised[-_TELLING:]))
+    without = np.minimum(standardised**2, _GROSS)
+    with_jump = np.minimum((standardised - after) ** 2, _GROSS)
     costs = np.concatenate([[0.0], np.cumsum(without - with_jump)[:-1]])
     return int(np.argmin(costs))
 

@@ -36,7 +36,7 @@ from aqualvs.optics.rig import Rig, RigUncertainty, rig_moved_by
 MIN_POINTS = 4
 """Least number of corners of a frame: with fewer, an outlier cannot be recognised."""
 
-MOST_POINTS = 64
+MAX_POINTS = 64
 """Greatest number of corners: more cost time and add little."""
 
 
@@ -63,14 +63,14 @@ class FrameCorners:
 
     @classmethod
     def of(cls, time: float, view: View, known: tuple[int, ...] = ()) -> "FrameCorners":
-        """Return the finite corners of a view, at most `MOST_POINTS` together with known ones."""
+        """Return the finite corners of a view, at most `MAX_POINTS` together with known ones."""
         finite = np.all(np.isfinite(view.pixels), axis=1) & np.all(np.isfinite(view.points), axis=1)
         _, first = np.unique(view.ids, return_index=True)
         once = np.zeros(len(view), np.bool_)
         once[first] = True
         old = once & finite & np.isin(view.ids, known)
         new = np.flatnonzero(once & finite & ~old)
-        room = min(len(new), max(MOST_POINTS - len(known), 0))
+        room = min(len(new), max(MAX_POINTS - len(known), 0))
         keep = np.flatnonzero(old).tolist()
         if room:
             keep += new[np.linspace(0, len(new) - 1, room).astype(int)].tolist()

@@ -26,7 +26,7 @@ from aqualvs.experiments.benchmark.set import (
     read_system,
 )
 from aqualvs.geometry.arrays import BoolArray, FloatArray
-from aqualvs.nets.target_file import target_facts
+from aqualvs.nets.target_file import target_dict
 from aqualvs.pipeline import run
 from aqualvs.results.files import Claim, writing
 from aqualvs.results.folder import POSTURE_BARE_CSV
@@ -448,7 +448,7 @@ BARE_LENS = "bare-lens"
 
 
 def run_own(
-    benchmark: BenchmarkSet, folder: Path, tell: Callable[[str], object], *, overwrite: bool
+    benchmark: BenchmarkSet, folder: Path, echo: Callable[[str], object], *, overwrite: bool
 ) -> list[str]:
     """Measure every dive of a set with every system of `OWN_SYSTEMS`.
 
@@ -457,7 +457,7 @@ def run_own(
     benchmark : BenchmarkSet
     folder : Path
         A run goes to SYSTEM/DIVE in it.
-    tell : callable
+    echo : callable
         Takes one line of text.
     overwrite : bool
         Whether to replace runs that are there.
@@ -482,7 +482,7 @@ def run_own(
                     overwrite,
                 )
             )
-        tell(f"{system.name}: {len(benchmark.dives)} dives measured into {folder / system.name}")
+        echo(f"{system.name}: {len(benchmark.dives)} dives measured into {folder / system.name}")
     bare = folder / BARE_LENS
     files = [bare / f"{dive.name}.csv" for dive in benchmark.dives]
     with Claim("score", files, overwrite=overwrite), writing(bare):
@@ -498,7 +498,7 @@ def _request(system: OwnSystem, source: Path, out: Path, overwrite: bool) -> Run
     target, mesh_filter = "auto", "none"
     if system.mesh_filter == "paper":
         told = str(source / TARGET_FILE)
-        if target_facts(told).kind is not TargetKind.SOLID:
+        if target_dict(told).kind is not TargetKind.SOLID:
             target, mesh_filter = told, system.mesh_filter
     return RunRequest(
         source=str(source / "dive.mp4"),
@@ -514,7 +514,7 @@ def _request(system: OwnSystem, source: Path, out: Path, overwrite: bool) -> Run
 def score_and_tell(
     results: Sequence[str],
     truth: Path,
-    tell: Callable[[str], object],
+    echo: Callable[[str], object],
     *,
     own: Path | None,
     out: Path | None,
@@ -529,7 +529,7 @@ def score_and_tell(
         NAME=PATH or paths, as `read_system` takes them.
     truth : Path
         Folder of the set.
-    tell : callable
+    echo : callable
         Takes one line of text.
     own : Path or None
         Folder in which to run what comes with aqualvs first, to be scored too.
@@ -555,7 +555,7 @@ def score_and_tell(
         arguments = list(results)
         systems = [read_system(argument, benchmark) for argument in arguments]
         if own is not None:
-            mine = run_own(benchmark, own, tell, overwrite=overwrite)
+            mine = run_own(benchmark, own, echo, overwrite=overwrite)
             systems += [read_system(argument, benchmark) for argument in mine]
         names = [system.name for system in systems]
         twice = next((name for name in names if names.count(name) > 1), None)
@@ -563,13 +563,13 @@ def score_and_tell(
             raise OptionError(f"{twice}: two systems of this name; give NAME=PATH")
         scores = score_systems(benchmark, systems)
         for line in lines(scores, dives=dives):
-            tell(line)
+            echo(line)
         for system in systems:
             if system.missing:
-                tell(
+                echo(
                     f"{system.name}: no file for {', '.join(system.missing)}: counted as no answer"
                 )
         if out is not None:
             with writing(out):
                 written = write_scores(scores, out)
-            tell(f"scores: {', '.join(map(str, written))}")
+            echo(f"scores: {', '.join(map(str, written))}")

@@ -299,7 +299,7 @@ _README_MD = "README.md"
 def make_set(
     out: Path,
     names: Sequence[str],
-    tell: Callable[[str], object],
+    echo: Callable[[str], object],
     *,
     n_frames: int | None,
     overwrite: bool,
@@ -312,7 +312,7 @@ def make_set(
         Folder to write.
     names : sequence of str
         Levels or dives; none for all.
-    tell : callable
+    echo : callable
         Takes one line of text.
     n_frames : int or None
         Frames of every dive; None for all.
@@ -340,9 +340,9 @@ def make_set(
         (out / _README_MD).write_text(README, encoding="utf-8")
         content = yaml.safe_dump(set_facts(dives), sort_keys=False, width=100)
         (out / SET_FILE).write_text(content, encoding="utf-8")
-    tell(f"{len(dives)} dives, {total} frames: {out}")
-    tell(f"what is in it, and what to write: {out / _README_MD}")
-    tell(f"next: aqualvs score mine=RESULTS --truth {out}")
+    echo(f"{len(dives)} dives, {total} frames: {out}")
+    echo(f"what is in it, and what to write: {out / _README_MD}")
+    echo(f"next: aqualvs score mine=RESULTS --truth {out}")
 
 
 def chosen_dives(names: Sequence[str], n_frames: int | None) -> list[BenchmarkDive]:
@@ -402,11 +402,11 @@ def set_facts(dives: Sequence[BenchmarkDive]) -> dict[str, Any]:
     }
 
 
-def tell_dives(tell: Callable[[str], object]) -> None:
+def print_dives(echo: Callable[[str], object]) -> None:
     """Print the levels and their dives, one line each."""
     for level, about in LEVELS.items():
         names = (dive.name for dive in benchmark_dives() if dive.level == level)
-        tell(f"{level:8} {about}: {', '.join(names)}")
+        echo(f"{level:8} {about}: {', '.join(names)}")
 
 
 _ANSWER = ("pitch_deg", "yaw_deg")

@@ -87,7 +87,7 @@ class RecordButton(Protocol):
     def stop(self) -> None:
         """End it; does nothing where there is none."""
 
-    def facts(self) -> Mapping[str, Any]:
+    def to_dict(self) -> Mapping[str, Any]:
         """Return `on` (bool) and `words` (a file's name, or why it does not work)."""
 
 
@@ -101,7 +101,7 @@ class NoRecorder:
     def stop(self) -> None:
         """Do nothing."""
 
-    def facts(self) -> Mapping[str, Any]:
+    def to_dict(self) -> Mapping[str, Any]:
         """Return that nothing is recorded."""
         return {"on": False, "words": ""}
 
@@ -137,7 +137,7 @@ class Controls:
             self.recorder.stop()
 
 
-_LEAST_TOKEN = 8
+_MIN_TOKEN = 8
 _HOST = re.compile(r"(?:\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9_.-]+)(?::([0-9]{1,5}))?", re.ASCII)
 _SCHEME = re.compile(r"[a-z][a-z0-9+.-]*://", re.ASCII)
 _MAX_PORT = 65535
@@ -231,9 +231,9 @@ def make_access(host: str, token: str | None) -> Access:
 
 def token_fault(token: str | None) -> str:
     """Return the fault of a token that a user chose; "" if there is none."""
-    if token is None or len(token) >= _LEAST_TOKEN:
+    if token is None or len(token) >= _MIN_TOKEN:
         return ""
-    return f"--token: {len(token)} characters; choose at least {_LEAST_TOKEN}, or leave it out"
+    return f"--token: {len(token)} characters; choose at least {_MIN_TOKEN}, or leave it out"
 
 
 Peer = tuple[str, int]

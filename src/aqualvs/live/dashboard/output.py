@@ -75,20 +75,20 @@ class Dashboard:
     def send(self, sample: LiveSample) -> None:
         """Send a sample, and at intervals its picture behind the number of its frame."""
         now_s = time.monotonic()
-        if not self._server.hub.n_watchers or now_s - self._state_s < 0.5 * _STATE_EVERY_S:
+        if not self._server.hub.n_viewers or now_s - self._state_s < 0.5 * _STATE_EVERY_S:
             return
         self._state_s = now_s
         picture = None
         if sample.frame is not None and now_s - self._picture_s > _PICTURE_EVERY_S:
             self._picture_s = now_s
             picture = sample.frame.index.to_bytes(4, "big") + page_picture(sample.frame)
-        recording = self._controls.recorder.facts()
+        recording = self._controls.recorder.to_dict()
         setpoint = self._controls.setpoint.setpoint
         self._server.publish(page_state(sample, setpoint, recording), picture)
 
     def health(self) -> PartHealth:
         """Return how many pages are open."""
-        n = self._server.hub.n_watchers
+        n = self._server.hub.n_viewers
         return PartHealth(self.name, State.OK, f"{n} page{'' if n == 1 else 's'} open")
 
     def close(self) -> None:
@@ -115,7 +115,7 @@ class SwitchButton:
         """End it."""
         self._switch.stop()
 
-    def facts(self) -> Mapping[str, Any]:
+    def to_dict(self) -> Mapping[str, Any]:
         """Return whether a recording is on, and its file or its fault."""
         path, health = self._switch.path, self._switch.health()
         words = health.detail if health.state is State.FAULT else path.name if path else ""
@@ -129,7 +129,7 @@ def start_dashboard(
     rig: Rig,
     holder: SetpointHolder,
     recorder: RecorderSwitch | None,
-    tell: Callable[[str], object],
+    echo: Callable[[str], object],
 ) -> Dashboard:
     """Serve the page and print its address; without a recorder, its button refuses.
 
@@ -145,5 +145,5 @@ def start_dashboard(
     controls = Controls(holder, NoRecorder() if recorder is None else SwitchButton(recorder))
     server = DashboardServer(host, port, access, rig, controls)
     shown = f"[{host}]" if ":" in host else host
-    tell(f"dashboard: http://{shown}:{server.port}/#token={access.token}")
+    echo(f"dashboard: http://{shown}:{server.port}/#token={access.token}")
     return Dashboard(server, controls)

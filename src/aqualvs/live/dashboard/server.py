@@ -208,41 +208,41 @@ class PageClient:
 
 
 class Hub:
-    """All pages; used from the server's event loop alone, but for `n_watchers`."""
+    """All pages; used from the server's event loop alone, but for `n_viewers`."""
 
-    MAX_WATCHERS = 8
+    MAX_VIEWERS = 8
 
     def __init__(self) -> None:
         # In the order of their arrival.
-        self._watchers: dict[PageClient, None] = {}
+        self._viewers: dict[PageClient, None] = {}
 
     @property
-    def n_watchers(self) -> int:
+    def n_viewers(self) -> int:
         """Pages that are open."""
-        return len(self._watchers)
+        return len(self._viewers)
 
-    def join(self, watcher: PageClient) -> bool:
+    def join(self, viewer: PageClient) -> bool:
         """Add a page; False if there are too many.
 
         A page that may command takes the place of the oldest one that may not.
         """
-        if len(self._watchers) >= self.MAX_WATCHERS:
-            oldest = next((one for one in self._watchers if not one.may_command), None)
-            if oldest is None or not watcher.may_command:
+        if len(self._viewers) >= self.MAX_VIEWERS:
+            oldest = next((one for one in self._viewers if not one.may_command), None)
+            if oldest is None or not viewer.may_command:
                 return False
             self.leave(oldest)
             oldest.gone.set()
-        self._watchers[watcher] = None
+        self._viewers[viewer] = None
         return True
 
-    def leave(self, watcher: PageClient) -> None:
+    def leave(self, viewer: PageClient) -> None:
         """Remove a page."""
-        self._watchers.pop(watcher, None)
+        self._viewers.pop(viewer, None)
 
     def publish(self, state: str, picture: bytes | None) -> None:
         """Hand out the latest state, and picture if there is a new one."""
-        for watcher in self._watchers:
-            watcher.put(state, picture)
+        for viewer in self._viewers:
+            viewer.put(state, picture)
 
 
 _ASSETS = {
@@ -359,9 +359,9 @@ class DashboardServer:
             return
         await socket.accept()
         try:
-            watcher = await self._welcome(socket, peer)
-            if watcher is not None:
-                await self._attend(socket, watcher, peer)
+            viewer = await self._welcome(socket, peer)
+            if viewer is not None:
+                await self._attend(socket, viewer, peer)
         except (WebSocketDisconnect, RuntimeError, OSError):
             # The page has closed, which is normal.
             return
@@ -375,14 +375,14 @@ class DashboardServer:
             return None
         token = hello.token if isinstance(hello, Hello) else ""
         known = bool(token) and await self._is_right(socket, token)
-        watcher = PageClient(may_command=known)
-        why = self._why_not(token, watcher)
+        viewer = PageClient(may_command=known)
+        why = self._why_not(token, viewer)
         if why:
             await _refuse(socket, peer, why)
             return None
         self._limits.welcome(_end(socket))
         await socket.send_text(rig_state(self._rig, may_command=known))
-        return watcher
+        return viewer
 
     async def _is_right(self, socket: WebSocket, token: str) -> bool:
         """Return whether a token is right, when its turn has come; a page that goes loses it."""
@@ -395,37 +395,37 @@ class DashboardServer:
         asking.cancel()
         raise WebSocketDisconnect
 
-    def _why_not(self, token: str, watcher: PageClient) -> str:
+    def _why_not(self, token: str, viewer: PageClient) -> str:
         """Let a page in, or return why not."""
-        if token and not watcher.may_command:
+        if token and not viewer.may_command:
             return "wrong token"
         if not self._access.may_watch(token):
             return "no token"
-        return "" if self.hub.join(watcher) else "too many pages are open"
+        return "" if self.hub.join(viewer) else "too many pages are open"
 
-    async def _attend(self, socket: WebSocket, watcher: PageClient, peer: str) -> None:
+    async def _attend(self, socket: WebSocket, viewer: PageClient, peer: str) -> None:
         """Send news and receive messages until the page closes."""
         beside = [
-            asyncio.create_task(_send_news(socket, watcher)),
-            asyncio.create_task(_make_room(socket, watcher, peer)),
+            asyncio.create_task(_send_news(socket, viewer)),
+            asyncio.create_task(_make_room(socket, viewer, peer)),
         ]
         try:
             while True:
-                await self._hear(socket, watcher, peer, await socket.receive_text())
+                await self._hear(socket, viewer, peer, await socket.receive_text())
         except (ValidationError, KeyError):
             await _refuse(socket, peer, "message not understood")
         finally:
-            self.hub.leave(watcher)
+            self.hub.leave(viewer)
             for task in beside:
                 task.cancel()
 
-    async def _hear(self, socket: WebSocket, watcher: PageClient, peer: str, text: str) -> None:
+    async def _hear(self, socket: WebSocket, viewer: PageClient, peer: str, text: str) -> None:
         message = parse_message(text)
         if isinstance(message, PictureShown):
-            watcher.shown()
+            viewer.shown()
         elif isinstance(message, Hello):
             return
-        elif not watcher.may_command:
+        elif not viewer.may_command:
             _log.warning("dashboard: %s: %s refused: no token", peer, message.kind)
             await socket.send_json({"kind": "refused", "why": "open the page with its token"})
         else:
@@ -436,17 +436,17 @@ class DashboardServer:
                 await socket.send_json({"kind": "refused", "why": str(fault)})
 
 
-async def _send_news(socket: WebSocket, watcher: PageClient) -> None:
+async def _send_news(socket: WebSocket, viewer: PageClient) -> None:
     while True:
-        state, picture = await watcher.next()
+        state, picture = await viewer.next()
         if state is not None:
             await socket.send_text(state)
         if picture is not None:
             await socket.send_bytes(picture)
 
 
-async def _make_room(socket: WebSocket, watcher: PageClient, peer: str) -> None:
-    await watcher.gone.wait()
+async def _make_room(socket: WebSocket, viewer: PageClient, peer: str) -> None:
+    await viewer.gone.wait()
     await _refuse(socket, peer, "a page with the token took this place")
 
 

@@ -54,7 +54,7 @@ FRESH_S = 1.0
 _INVALID = 32767
 # ArduSub turns full deflection at a pilot gain of 1 into 400 us about 1500 us (joystick.cpp).
 _CENTRE_US, _FULL_US = 1500, 400
-_LEAST_US, _MOST_US = 800, 2200
+_MIN_US, _MAX_US = 800, 2200
 _YAW, _FORWARD, _LATERAL, _VERTICAL = "chan4_raw", "chan5_raw", "chan6_raw", "chan3_raw"
 _KEPT = 200
 
@@ -115,7 +115,7 @@ class PilotSticks:
     def _beyond(self, told: Any, channel: str, ours: list[int]) -> bool:
         """Return whether a channel is outside of the range that our own sticks explain."""
         pulse_us = getattr(told, channel)
-        if not _LEAST_US <= pulse_us <= _MOST_US:
+        if not _MIN_US <= pulse_us <= _MAX_US:
             return False
         swing = (pulse_us - _CENTRE_US) / _FULL_US
         least, most = min((0, *ours)) / FULL, max((0, *ours)) / FULL

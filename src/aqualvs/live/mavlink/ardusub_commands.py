@@ -18,19 +18,19 @@ from aqualvs.live.mavlink.link import MavlinkLink
 
 # Length of the window of sticks and responses, and their least number: six messages of three
 # channels, or as many of the attitude.
-_WINDOW_S, _LEAST_PAIRS = 6.0, 18
+_WINDOW_S, _MIN_PAIRS = 6.0, 18
 # Least sum of the squares of all sticks: six at a tenth are enough for channels.
 _LEAST_SQUARES = 6 * 0.1**2
 # The least pilot gain is 0.1, 40 us for a full stick; half of the messages may hold the pilot's
 # own sticks, so that a quarter of that still counts as a response.
-_LEAST_SLOPE_US = 10.0
+_MIN_SLOPE_US = 10.0
 # Sticks may alternate faster than channels are reported; the channels then move all the same.
 _STILL_US = 3.0
 # Smaller sticks may lie within the dead zone of the channel. A vehicle that turns by less for a
 # full stick does not respond to it.
-_TURNING_STICK, _LEAST_TURN = 0.5, math.radians(2.0)
+_TURNING_STICK, _MIN_TURN = 0.5, math.radians(2.0)
 _LONGEST_STICK_S = 0.3
-_CENTRE_US, _LEAST_US, _MOST_US = 1500, 800, 2200
+_CENTRE_US, _MIN_US, _MAX_US = 1500, 800, 2200
 _AXES = (("chan5_raw", "x"), ("chan6_raw", "y"), ("chan4_raw", "r"))
 
 
@@ -67,11 +67,11 @@ class StickResponse:
         self._take(now_s, stick[1])
         channels = [pair for pairs in self._channels.values() for pair in pairs.since(now_s)]
         still = all(pairs.swing <= _STILL_US for pairs in self._channels.values())
-        if still and _slope(channels) < _LEAST_SLOPE_US:
+        if still and _slope(channels) < _MIN_SLOPE_US:
             return "RC_CHANNELS does not follow our sticks: the vehicle does not obey them"
         if channels or now_s - self._began_s < 0.5 * _WINDOW_S:
             return ""
-        if _slope(self._turns.since(now_s)) < _LEAST_TURN:
+        if _slope(self._turns.since(now_s)) < _MIN_TURN:
             return "the vehicle does not turn as our yaw stick says"
         return "RC_CHANNELS is not told: whether our sticks are obeyed is not seen"
 
@@ -82,7 +82,7 @@ class StickResponse:
             for channel, axis in _AXES:
                 share, pulse_us = getattr(sticks, axis) / FULL, getattr(told, channel)
                 # 0 and 65535 mean an unused channel.
-                off_us = pulse_us - _CENTRE_US if _LEAST_US < pulse_us < _MOST_US else 0
+                off_us = pulse_us - _CENTRE_US if _MIN_US < pulse_us < _MAX_US else 0
                 self._channels[channel].add(now_s, share, float(off_us))
         told = self._new("ATTITUDE")
         turn = sticks.r / FULL
@@ -127,7 +127,7 @@ class _Pairs:
 def _slope(pairs: list[tuple[float, float]]) -> float:
     """Return the answer to a full stick by least squares; infinite where too little is known."""
     squares = sum(share * share for share, _ in pairs)
-    if len(pairs) < _LEAST_PAIRS or squares < _LEAST_SQUARES:
+    if len(pairs) < _MIN_PAIRS or squares < _LEAST_SQUARES:
         return math.inf
     return sum(share * answer for share, answer in pairs) / squares
 

@@ -40,7 +40,7 @@ _MAX_SENDERS = 64
 # Datagrams received before sending is checked again.
 _READ_AT_ONCE = 64
 # Greatest delay of a message by data in the serial driver's buffer; beyond it, it is dropped.
-_PATIENCE_S, _URGENT_PATIENCE_S = 0.02, 0.1
+_TIMEOUT_S, _URGENT_TIMEOUT_S = 0.02, 0.1
 _ARDUPILOT, _NO_AUTOPILOT = 3, 8
 _AUTOPILOT_COMPONENT = 1
 # ArduPilot queues 20 requests at most (GCS_Param.cpp), and a lost datagram loses some.
@@ -165,7 +165,7 @@ class MavlinkLink:
         self._fault = "not open yet"
         self._n_unsent = 0
         self._receiving = threading.Lock()
-        self._inbox: dict[str, dict[tuple[int, int, Peer], Received]] = {}
+        self._queue: dict[str, dict[tuple[int, int, Peer], Received]] = {}
         self._parameters: dict[str, float] = {}
         self._n_received: Counter[str] = Counter()
         self._closing = threading.Event()
@@ -203,9 +203,9 @@ class MavlinkLink:
         struct.error
             If a field does not fit into its type.
         """
-        patience_s = _URGENT_PATIENCE_S if urgent else _PATIENCE_S
+        timeout_s = _URGENT_TIMEOUT_S if urgent else _TIMEOUT_S
         with self._sending:
-            sent = self._send(messages, patience_s, to_vehicle=to_vehicle)
+            sent = self._send(messages, timeout_s, to_vehicle=to_vehicle)
             self._n_unsent += not sent
         return sent
 
@@ -236,7 +236,7 @@ class MavlinkLink:
     def every(self, kind: str) -> list[Received]:
         """Return the last message of a kind of each sender."""
         with self._receiving:
-            return list(self._inbox.get(kind, {}).values())
+            return list(self._queue.get(kind, {}).values())
 
     @property
     def conflict(self) -> str:
@@ -248,14 +248,14 @@ class MavlinkLink:
         """Other address that speaks as the vehicle; empty if there is none."""
         return self._peers.rival
 
-    def read_parameters(self, names: Iterable[str], *, patience_s: float = 3.0) -> dict[str, float]:
+    def read_parameters(self, names: Iterable[str], *, timeout_s: float = 3.0) -> dict[str, float]:
         """Ask the autopilot for parameters and wait for the answers.
 
         Parameters
         ----------
         names : iterable of str
             As ArduPilot calls them, such as `RC4_DZ`.
-        patience_s : float
+        timeout_s : float
             How long to ask and wait, in seconds.
 
         Returns
@@ -268,7 +268,7 @@ class MavlinkLink:
         with self._receiving:
             for name in wanted:
                 self._parameters.pop(name, None)
-        end_s = time.monotonic() + patience_s
+        end_s = time.monotonic() + timeout_s
         missing = wanted
         while missing and time.monotonic() < end_s and not self._closing.is_set():
             asked = missing[:_ASKED_AT_ONCE]
@@ -351,14 +351,14 @@ class MavlinkLink:
         return [beat for beat in beats if beat.message.autopilot != _NO_AUTOPILOT]
 
     def _send(
-        self, messages: tuple[Any, ...], patience_s: float, *, to_vehicle: bool = False
+        self, messages: tuple[Any, ...], timeout_s: float, *, to_vehicle: bool = False
     ) -> bool:
         port = self._port
         if port is None or self._broken is not None:
             return False
         try:
             vehicle = self._peers.vehicle if port.many else ()
-            if port.lag_s > patience_s or (to_vehicle and vehicle is None):
+            if port.lag_s > timeout_s or (to_vehicle and vehicle is None):
                 return False
             if self._signer is not None:
                 self._signer.advance()
@@ -410,7 +410,7 @@ class MavlinkLink:
             if now_s >= beat_s:
                 beat_s = now_s + HEARTBEAT_EVERY_S
                 with self._sending:
-                    self._send((self._heartbeat,), _URGENT_PATIENCE_S)
+                    self._send((self._heartbeat,), _URGENT_TIMEOUT_S)
             events = selectors.EVENT_READ | (selectors.EVENT_WRITE if port.unsent else 0)
             selector.modify(port, events)
             for _, ready in selector.select(min(_LOOK_EVERY_S, max(0.0, beat_s - now_s))):
@@ -460,7 +460,7 @@ class MavlinkLink:
         kind, received_ns = message.get_type(), time.monotonic_ns()
         sender = (message.get_srcSystem(), message.get_srcComponent())
         with self._receiving:
-            latest = self._inbox.setdefault(kind, {})
+            latest = self._queue.setdefault(kind, {})
             latest.pop((*sender, peer), None)
             latest[*sender, peer] = Received(message, received_ns, *sender)
             if len(latest) > _MAX_SENDERS:

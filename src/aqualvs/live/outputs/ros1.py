@@ -30,7 +30,7 @@ DEFAULT_MASTER = "http://localhost:11311"
 _ASK_EVERY_S = 2.0
 _FIRST_WAIT_S, _LONGEST_WAIT_S = 0.5, 8.0
 _MASTER_S = 2.0
-_PATIENCE_S = 3.0
+_TIMEOUT_S = 3.0
 # No packet is ever sent there; the system is only asked for the route.
 _FAR_AWAY = "198.51.100.1"
 _TROUBLE = (OSError, xmlrpc.client.Error, http.client.HTTPException, ValueError)
@@ -100,7 +100,7 @@ class Ros1Node:
     def close(self) -> None:
         """Say good-bye to roscore and subscribers, within some seconds; once is enough."""
         self._stop.set()
-        self._keeper.join(_PATIENCE_S)
+        self._keeper.join(_TIMEOUT_S)
         self._server.close()
         self.links.close()
 
@@ -210,7 +210,7 @@ class _Server(socketserver.ThreadingMixIn, xmlrpc.server.SimpleXMLRPCServer):
 
     def close(self) -> None:
         self.shutdown()
-        self._thread.join(_PATIENCE_S)
+        self._thread.join(_TIMEOUT_S)
         self.server_close()
 
 

@@ -212,7 +212,7 @@ _MAX_LINKS = 64
 _MAX_HEADER = 65_536
 _HANDSHAKE_S = 5.0
 _LOOK_EVERY_S = 0.5
-_PATIENCE_S = 2.0
+_TIMEOUT_S = 2.0
 _ANY = "*"
 _log = logging.getLogger(__name__)
 
@@ -321,7 +321,7 @@ class Ros1Links:
         """Close all connections and the port."""
         self._closing = True
         self._rouse()
-        self._thread.join(_PATIENCE_S)
+        self._thread.join(_TIMEOUT_S)
 
     def _rouse(self) -> None:
         # If the pipe is full, the thread will wake anyway.

@@ -1,11 +1,11 @@
 """The paper's stripe detection (section 3.1), and its mesh filter behind either detector.
 
 For comparison: every pixel above one threshold is detected. Bright pixels that follow one another
-on a search line are one return; its position and width determine them exactly, and
-`pixels_of_returns` gives them back one by one.
+on a search line are one peak; its position and width determine them exactly, and
+`pixels_of_peaks` gives them back one by one.
 
 The paper treats every bright pixel as a point of its own, so that its regions count the lit cells
-of whole reflections. `PaperFilter` passes returns of the threshold detector to the mesh filter in
+of whole reflections. `PaperFilter` passes peaks of the threshold detector to the mesh filter in
 that form; those of the sub-pixel detector are one point each, their centre.
 """
 
@@ -19,9 +19,9 @@ from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.sheet import sheets_of
-from aqualvs.scanning.laser_bands import SearchAxis, StripeSearch
+from aqualvs.scanning.laser_bands import LaserBand, SearchAxis
 from aqualvs.scanning.paper.mesh_filter import MeshFilterOptions, mesh_filter
-from aqualvs.scanning.stripe import Returns, ThresholdOptions
+from aqualvs.scanning.stripe import StripePeaks, ThresholdOptions
 from aqualvs.scanning.triangulate import Triangulator
 
 _LEVELS = 256
@@ -57,7 +57,7 @@ class ThresholdDetector:
         # Zero outside the band; the zeros of one more column end the runs of every line.
         self._lines: NDArray[np.uint8] = np.zeros((len(lowest), length + 1), np.uint8)
 
-    def detect(self, lines: NDArray[np.uint8]) -> Returns:
+    def detect(self, lines: NDArray[np.uint8]) -> StripePeaks:
         """Find the runs of bright pixels of one frame; colour is ignored.
 
         Parameters
@@ -78,7 +78,7 @@ class ThresholdDetector:
             first, end = _runs(flat, self._raised_level(flat))
         line, start = np.divmod(first, self._lines.shape[1])
         width = end - first
-        return Returns(
+        return StripePeaks(
             line=line,
             position=start + 0.5 * (width - 1),
             height=_brightest(flat, first, end),
@@ -97,21 +97,21 @@ class ThresholdDetector:
         return int(np.argmax(fits)) if fits.any() else _LEVELS
 
 
-def pixels_of_returns(position: FloatArray, width: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Return the pixels of returns, along their search lines.
+def pixels_of_peaks(position: FloatArray, width: FloatArray) -> tuple[IntArray, FloatArray]:
+    """Return the pixels of peaks, along their search lines.
 
-    A return of the threshold detector gives its bright pixels, each once; a sub-pixel one those
+    A peak of the threshold detector gives its bright pixels, each once; a sub-pixel one those
     above half its height, at least one.
 
     Parameters
     ----------
     position, width : array, shape (N,)
-        As in `Returns`.
+        As in `StripePeaks`.
 
     Returns
     -------
     source : int array, shape (M,)
-        Row of the return that each pixel belongs to, ascending.
+        Row of the peak that each pixel belongs to, ascending.
     place : array, shape (M,)
         Whole position of each pixel.
     """
@@ -148,13 +148,13 @@ def _brightest(flat: NDArray[np.uint8], first: IntArray, end: IntArray) -> Float
 
 
 @dataclass(frozen=True, slots=True)
-class FilteredPoints:
-    """Points of N returns as the paper's filter takes them, M of them, and its answer.
+class FilteredPeaks:
+    """Points of N peaks as the paper's filter takes them, M of them, and its answer.
 
     Attributes
     ----------
     source : int array, shape (M,)
-        Row of the return that each point belongs to, ascending.
+        Row of the peak that each point belongs to, ascending.
     laser : int array, shape (M,)
         Index of its laser.
     pixels : array, shape (M, 2)
@@ -171,15 +171,15 @@ class FilteredPoints:
     points_in_dome: FloatArray
     on_mesh: BoolArray
 
-    def returns_on_mesh(self, n: int) -> BoolArray:
-        """Return which of the N returns have more than half of their points on the mesh."""
+    def peaks_on_mesh(self, n: int) -> BoolArray:
+        """Return which of the N peaks have more than half of their points on the mesh."""
         n_points = np.bincount(self.source, minlength=n)
         n_on_mesh = np.bincount(self.source[self.on_mesh], minlength=n)
         return np.asarray(2 * n_on_mesh > n_points)
 
 
 class PaperFilter:
-    """The paper's filter, applied to returns of known lasers.
+    """The paper's filter, applied to peaks of known lasers.
 
     Parameters
     ----------
@@ -187,19 +187,19 @@ class PaperFilter:
         Lasers and working range.
     camera : Camera
         Of the rig.
-    searches : sequence of StripeSearch
+    laser_bands : sequence of LaserBand
         One for each laser.
     options : MeshFilterOptions
         Of the filter.
     every_pixel : bool
-        Whether every pixel of a return is a point, or its centre alone.
+        Whether every pixel of a peak is a point, or its centre alone.
     """
 
     def __init__(
         self,
         rig: Rig,
         camera: Camera,
-        searches: Sequence[StripeSearch],
+        laser_bands: Sequence[LaserBand],
         options: MeshFilterOptions,
         *,
         every_pixel: bool,
@@ -208,19 +208,19 @@ class PaperFilter:
         self._working_range = rig.working_range
         self._triangulator = Triangulator(rig, camera)
         self._planes = [one.best_plane(camera, rig.working_range) for one in sheets_of(rig)]
-        self._along_x = np.array([one.axis is SearchAxis.ALONG_X for one in searches], np.int64)
+        self._along_x = np.array([one.axis is SearchAxis.ALONG_X for one in laser_bands], np.int64)
 
-    def apply(self, pixels: FloatArray, width: FloatArray, laser: IntArray) -> FilteredPoints:
-        """Triangulate the returns, and filter the points of each laser.
+    def apply(self, pixels: FloatArray, width: FloatArray, laser: IntArray) -> FilteredPeaks:
+        """Triangulate the peaks, and filter the points of each laser.
 
         Parameters
         ----------
         pixels : array, shape (N, 2)
-            Centres of the returns in `image`.
+            Centres of the peaks in `image`.
         width : array, shape (N,)
-            As in `Returns`.
+            As in `StripePeaks`.
         laser : int array, shape (N,)
-            Index of the laser that made each return. The paper divides its picture by hand into
+            Index of the laser that made each peak. The paper divides its picture by hand into
             one area for each laser.
         """
         source, each = self._places(pixels, width, laser)
@@ -234,18 +234,18 @@ class PaperFilter:
             on_mesh[mine] = mesh_filter(
                 points[mine], plane, self._options, working_range=self._working_range
             )
-        return FilteredPoints(source, laser, each, points, on_mesh)
+        return FilteredPeaks(source, laser, each, points, on_mesh)
 
     def _places(
         self, pixels: FloatArray, width: FloatArray, laser: IntArray
     ) -> tuple[IntArray, FloatArray]:
-        """Return the row of the return and the place in `image` of each point, (M,) and (M, 2)."""
+        """Return the row of the peak and the place in `image` of each point, (M,) and (M, 2)."""
         rows = np.arange(len(pixels))
         if not self._every_pixel:
             return rows, np.ascontiguousarray(pixels, np.float64)
         # Column of the coordinate that runs along the search line.
         along = 1 - self._along_x[laser]
-        source, place = pixels_of_returns(pixels[rows, along], width)
+        source, place = pixels_of_peaks(pixels[rows, along], width)
         each = np.ascontiguousarray(pixels[source], np.float64)
         each[np.arange(len(each)), along[source]] = place
         return source, each

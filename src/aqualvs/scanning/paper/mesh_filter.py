@@ -30,11 +30,11 @@ class Limits(NamedTuple):
     ----------
     a, b, c : int
         Greatest squared distance, in cells, of the cells of the regions A, B and C.
-    least_in_a, most_in_a : int
+    min_in_a, max_in_a : int
         Lit cells in A.
-    most_in_ab : int
+    max_in_ab : int
         Lit cells in A and B together.
-    least_in_c, most_in_c : int
+    min_in_c, max_in_c : int
         Lit cells in C.
     reach : int
         Side of the blocks of the hash, in cells; not below the radius of C.
@@ -43,11 +43,11 @@ class Limits(NamedTuple):
     a: int
     b: int
     c: int
-    least_in_a: int
-    most_in_a: int
-    most_in_ab: int
-    least_in_c: int
-    most_in_c: int
+    min_in_a: int
+    max_in_a: int
+    max_in_ab: int
+    min_in_c: int
+    max_in_c: int
     reach: int
 
 
@@ -192,13 +192,13 @@ def _belongs(blocks: _Blocks, place: int, near: IntArray, n_near: int, limits: L
             in_ab += distance <= limits.b
             in_abc += distance <= limits.c
         # Counts only grow: a cell amid a wall or a fish needs no further counting.
-        if in_abc > limits.most_in_ab + limits.most_in_c:
+        if in_abc > limits.max_in_ab + limits.max_in_c:
             return False
     in_c = in_abc - in_ab
     return (
-        limits.least_in_a <= in_a <= limits.most_in_a
-        and in_ab <= limits.most_in_ab
-        and limits.least_in_c <= in_c <= limits.most_in_c
+        limits.min_in_a <= in_a <= limits.max_in_a
+        and in_ab <= limits.max_in_ab
+        and limits.min_in_c <= in_c <= limits.max_in_c
     )
 
 
@@ -469,11 +469,11 @@ def _limits(options: MeshFilterOptions) -> Limits:
         a=a,
         b=b,
         c=c,
-        least_in_a=math.ceil(dg / 2),
-        most_in_a=dg,
-        most_in_ab=dg,
-        least_in_c=math.ceil(3 * dg / 2),
-        most_in_c=2 * dg,
+        min_in_a=math.ceil(dg / 2),
+        max_in_a=dg,
+        max_in_ab=dg,
+        min_in_c=math.ceil(3 * dg / 2),
+        max_in_c=2 * dg,
         reach=options.padding,
     )
 

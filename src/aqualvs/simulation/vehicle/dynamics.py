@@ -250,9 +250,9 @@ _FULL_TURN, _FULL_CLIMB = 13, 14
 # Thrust curve in one row.
 _FORWARD, _REVERSE, _DEAD, _AUTOPILOT_LINEAR = range(4)
 # Limits of the integrators (ATC_RAT_*_IMAX), of the heading's error and of the depth's.
-_MOST_ROLL_PITCH, _MOST_YAW, _MOST_DOWN = 0.444, 0.222, 0.8
-_MOST_TURN_ERROR = float(np.deg2rad(30.0))
-_MOST_DEPTH_ERROR = 0.5
+_MAX_ROLL_PITCH, _MAX_YAW, _MAX_DOWN = 0.444, 0.222, 0.8
+_MAX_TURN_ERROR = float(np.deg2rad(30.0))
+_MAX_DEPTH_ERROR = 0.5
 
 
 class PackedAutopilot(NamedTuple):
@@ -346,7 +346,7 @@ def _hold_heading(
         m[HEADING] = heading
     else:
         m[HEADING] += m[TURN_RATE] * h
-    error = _clip(_wrapped(m[HEADING] - heading), _MOST_TURN_ERROR)
+    error = _clip(_wrapped(m[HEADING] - heading), _MAX_TURN_ERROR)
     m[HEADING] = heading + error
     return float(m[TURN_RATE] + g[_ANGLE] * error)
 
@@ -358,12 +358,12 @@ def _hold_depth(
     """Return the motor input for down."""
     asked = g[_FULL_CLIMB] * effort[2]
     m[DESCENT] += _clip(asked - m[DESCENT], g[_ACCELERATION] * h)
-    error = _clip(m[DEPTH] + m[DESCENT] * h - depth, _MOST_DEPTH_ERROR)
+    error = _clip(m[DEPTH] + m[DESCENT] * h - depth, _MAX_DEPTH_ERROR)
     m[DEPTH] = depth + error
     lack = m[DESCENT] + g[_DEPTH] * error - descent
     out = g[_CLIMB] * lack + m[INTEGRAL + 3]
     if abs(out) < 1.0 or out * lack < 0.0:
-        m[INTEGRAL + 3] = _clip(m[INTEGRAL + 3] + g[_CLIMB_I] * lack * h, _MOST_DOWN)
+        m[INTEGRAL + 3] = _clip(m[INTEGRAL + 3] + g[_CLIMB_I] * lack * h, _MAX_DOWN)
     return float(out)
 
 
@@ -409,11 +409,9 @@ def steer(
     roll, pitch, heading = euler_of(r)
     turn = _hold_heading(effort, heading, h, memory, g)
     # Rates about body axes that change the heading at constant roll and pitch.
-    _rate_loop(ROLL, -g[_ANGLE] * roll + turn * r[2][0], y[10], _MOST_ROLL_PITCH, h, memory, pilot)
-    _rate_loop(
-        PITCH, -g[_ANGLE] * pitch + turn * r[2][1], y[11], _MOST_ROLL_PITCH, h, memory, pilot
-    )
-    _rate_loop(YAW, turn * r[2][2], y[12], _MOST_YAW, h, memory, pilot)
+    _rate_loop(ROLL, -g[_ANGLE] * roll + turn * r[2][0], y[10], _MAX_ROLL_PITCH, h, memory, pilot)
+    _rate_loop(PITCH, -g[_ANGLE] * pitch + turn * r[2][1], y[11], _MAX_ROLL_PITCH, h, memory, pilot)
+    _rate_loop(YAW, turn * r[2][2], y[12], _MAX_YAW, h, memory, pilot)
     descent = to_world(r, (y[7], y[8], y[9]))[2]
     pilot.inputs[DOWN] = _hold_depth(effort, y[2], descent, h, memory, g)
     pilot.inputs[FORWARD] = effort[0]

@@ -146,15 +146,15 @@ class StickInput:
         dead = int(self.yaw_dead_zone * self.gain)
         if abs(beyond) <= dead:
             return 0.0
-        travel = (_MOST_US - trim if beyond > 0 else trim - _LEAST_US) - dead
+        travel = (_MAX_US - trim if beyond > 0 else trim - _MIN_US) - dead
         return math.copysign(int(4500 * (abs(beyond) - dead) / travel) / 4500, beyond)
 
     def _climb(self, z: int) -> float:
         """Return the share of the rate of climb (`get_pilot_desired_climb_rate`)."""
         # The throttle is a range of 1000 from RC3_MIN + RC3_DZ on.
-        low = _LEAST_US + _THROTTLE_DEAD_US
-        control = int(1000 * max(_pulse(0.8 * self.gain, z - 500) - low, 0) / (_MOST_US - low))
-        middle = int(1000 * (0.5 * (_LEAST_US + _MOST_US) - low) / (_MOST_US - low))
+        low = _MIN_US + _THROTTLE_DEAD_US
+        control = int(1000 * max(_pulse(0.8 * self.gain, z - 500) - low, 0) / (_MAX_US - low))
+        middle = int(1000 * (0.5 * (_MIN_US + _MAX_US) - low) / (_MAX_US - low))
         dead = self.throttle_dead_zone * self.gain
         if control < middle - dead:
             return max((control - middle + dead) / (middle - dead), -1.0)
@@ -163,17 +163,17 @@ class StickInput:
         return 0.0
 
 
-_LEAST_US, _MOST_US, _THROTTLE_DEAD_US = 1100, 1900, 30
+_MIN_US, _MAX_US, _THROTTLE_DEAD_US = 1100, 1900, 30
 
 
 def _pulse(unit_us: float, units: int) -> int:
     """Return the pulse of a stick in microseconds, cut to whole ones (`set_override`)."""
-    return min(max(int(1500 + unit_us * units), _LEAST_US), _MOST_US)
+    return min(max(int(1500 + unit_us * units), _MIN_US), _MAX_US)
 
 
 def _thrust_input(pulse: int, trim: int) -> float:
     """Return the share of the way from the trim to the end (`norm_input`)."""
-    return (pulse - trim) / (_MOST_US - trim if pulse > trim else trim - _LEAST_US)
+    return (pulse - trim) / (_MAX_US - trim if pulse > trim else trim - _MIN_US)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

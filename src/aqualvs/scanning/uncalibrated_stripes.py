@@ -8,23 +8,35 @@ import numpy as np
 
 from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.scanning.laser_bands import SLOPE_CELL, SearchAxis, StripeSearch, pixels_per_line
+from aqualvs.scanning.laser_bands import SLOPE_CELL, LaserBand, SearchAxis, pixels_per_line
 from aqualvs.scanning.laser_colour import LaserColour
 from aqualvs.scanning.scan import Frame, ImagePlane, planes_of_image
-from aqualvs.scanning.stripe import Returns
-from aqualvs.scanning.stripe_pieces import (
-    LENGTH,
-    SMOOTHING,
-    Pieces,
-    continued,
-    extended,
-    find_pieces,
-    line_log_odds,
+from aqualvs.scanning.stripe import StripePeaks
+from aqualvs.scanning.stripe_segments import (
+    LENGTH as LENGTH,
+)
+from aqualvs.scanning.stripe_segments import (
+    SMOOTHING as SMOOTHING,
+)
+from aqualvs.scanning.stripe_segments import (
+    StripeSegments as StripeSegments,
+)
+from aqualvs.scanning.stripe_segments import (
+    continued as continued,
+)
+from aqualvs.scanning.stripe_segments import (
+    extended as extended,
+)
+from aqualvs.scanning.stripe_segments import (
+    find_segments as find_segments,
+)
+from aqualvs.scanning.stripe_segments import (
+    line_log_odds as line_log_odds,
 )
 
 # A stripe at less than 45 degrees to a search line is left to the other axis.
 _STEEPEST = 1.0
-# Slopes are computed from this many returns on either side.
+# Slopes are computed from this many peaks on either side.
 _SLOPE_REACH = 6
 # A chain shorter than this many of its own widths is a blob: the beam's own dot, a glint, a mark.
 _MIN_LENGTH_IN_WIDTHS = 2.5
@@ -33,7 +45,7 @@ _MIN_LENGTH_IN_WIDTHS = 2.5
 _MAX_WIDTH, _LONGEST_DOT = 1.8, 1.5
 # Noise of the centre of a stripe by speckle, as a share of its width; the least noise is that of 8
 # bits and a Bayer pattern.
-_SIGMA_IN_WIDTHS, _LEAST_SIGMA_PX = 0.01, 0.05
+_SIGMA_IN_WIDTHS, _MIN_SIGMA_PX = 0.01, 0.05
 # Where one side is lighter than the other, beyond the stripe or on its slopes, paint shifts the
 # centre by about this many widths, relative to the height of the stripe.
 _FLANK_AT, _FLANK_PULL = 1.3, 0.2
@@ -44,7 +56,7 @@ _MAP_LENGTH = 30000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class WholePictureOptions:
+class UncalibratedStripeOptions:
     """Options of `find_stripes`.
 
     Attributes
@@ -103,7 +115,7 @@ class StripePixels:
 
 
 def find_stripes(
-    image: ImagePlane | Frame, options: WholePictureOptions | None = None
+    image: ImagePlane | Frame, options: UncalibratedStripeOptions | None = None
 ) -> StripePixels:
     """Find the lines of lasers: thin, long, of the lasers' colour, and similar to each other.
 
@@ -111,7 +123,7 @@ def find_stripes(
     ----------
     image : uint8 array, shape (height, width) or (height, width, 3), or Frame
         Grey, or BGR as OpenCV reads it. In a grey picture every thin bright line counts.
-    options : WholePictureOptions, optional
+    options : UncalibratedStripeOptions, optional
 
     Returns
     -------
@@ -119,74 +131,74 @@ def find_stripes(
         Each piece of a stripe is searched along the axis that crosses it nearer to a right angle.
         Empty if no piece is certain.
     """
-    options = options or WholePictureOptions()
+    options = options or UncalibratedStripeOptions()
     frame = image if isinstance(image, Frame) else Frame(0, 0.0, *planes_of_image(image))
     width = frame.luma.shape[1]
-    found = find_all_pieces(frame, options)
-    table = np.concatenate([pieces.table for pieces in found], axis=1)
+    found = find_all_segments(frame, options)
+    table = np.concatenate([segments.table for segments in found], axis=1)
     log_odds = line_log_odds(table, width, has_colour=frame.chroma is not None)
     least = math.log(options.min_likelihood / (1.0 - options.min_likelihood))
     keep = continued(table, log_odds, least, width)
     keep &= table[LENGTH] >= options.min_length_share * width
     parts, first = [], 0
-    for pieces in found:
-        n = len(pieces.start) - 1
-        for chain in extended(pieces, keep[first : first + n]):
-            parts.append(_piece(pieces.search, pieces.returns, chain))
+    for segments in found:
+        n = len(segments.start) - 1
+        for chain in extended(segments, keep[first : first + n]):
+            parts.append(_piece(segments.search, segments.peaks, chain))
         first += n
-    stripes = _joined([piece for piece in parts if _is_long(piece)])
+    stripes = _joined([segment for segment in parts if _is_long(segment)])
     return replace(stripes, sigma_px=_sigma_px(frame.luma, stripes))
 
 
-def find_all_pieces(frame: Frame, options: WholePictureOptions) -> list[Pieces]:
+def find_all_segments(frame: Frame, options: UncalibratedStripeOptions) -> list[StripeSegments]:
     """Find pieces of stripes along both search directions, lines of lasers and others.
 
     Parameters
     ----------
     frame : Frame
-    options : WholePictureOptions
+    options : UncalibratedStripeOptions
         The wavelength says in which channel lines are brightest.
     """
     size_px = frame.luma.shape[1], frame.luma.shape[0]
     colour = LaserColour.of(options.wavelength_nm)
-    return [find_pieces(frame, _whole_search(size_px, axis, colour)) for axis in SearchAxis]
+    return [find_segments(frame, _whole_band(size_px, axis, colour)) for axis in SearchAxis]
 
 
-def _whole_search(size_px: tuple[int, int], axis: SearchAxis, colour: LaserColour) -> StripeSearch:
+def _whole_band(size_px: tuple[int, int], axis: SearchAxis, colour: LaserColour) -> LaserBand:
     line_px = pixels_per_line(size_px)
     n_pixels, length = size_px if axis is SearchAxis.ALONG_Y else size_px[::-1]
     n_lines = n_pixels // line_px
     slopes = np.full((-(-length // SLOPE_CELL), -(-n_lines // SLOPE_CELL)), _STEEPEST * line_px)
     lowest, highest = np.zeros(n_lines, np.int64), np.full(n_lines, length - 1)
-    return StripeSearch(axis, line_px, lowest, highest, -slopes, slopes, colour)
+    return LaserBand(axis, line_px, lowest, highest, -slopes, slopes, colour)
 
 
-def _piece(search: StripeSearch, returns: Returns, chain: IntArray) -> StripePixels:
+def _piece(search: LaserBand, peaks: StripePeaks, chain: IntArray) -> StripePixels:
     axis = search.axis
-    line = search.line_px * (returns.line[chain].astype(np.float64) + 0.5) - 0.5
-    slope = _slopes(line, returns.position[chain])
-    width = returns.width[chain]
+    line = search.line_px * (peaks.line[chain].astype(np.float64) + 0.5) - 0.5
+    slope = _slopes(line, peaks.position[chain])
+    width = peaks.width[chain]
     # At just 45 degrees one of the axes must have it.
     steep_enough = np.abs(slope) <= _STEEPEST * (1.0 if axis is SearchAxis.ALONG_Y else 0.999999)
     keep = steep_enough & ~_in_dot(width / search.line_px)
     chain, line, slope = chain[keep], line[keep], slope[keep]
     along_x = axis is SearchAxis.ALONG_X
     cosine = 1.0 / np.hypot(1.0, slope)
-    pixels = np.stack([line, returns.position[chain]], axis=-1)
+    pixels = np.stack([line, peaks.position[chain]], axis=-1)
     across = np.stack([-slope * cosine, cosine], axis=-1)
-    width = _unsmoothed(returns.width[chain], slope * search.line_px) * cosine
+    width = _unsmoothed(peaks.width[chain], slope * search.line_px) * cosine
     return StripePixels(
         pixels[:, ::-1] if along_x else pixels,
         across[:, ::-1] if along_x else across,
         np.zeros(len(chain), np.int64),
-        returns.height[chain],
+        peaks.height[chain],
         width,
         np.zeros(len(chain)),
     )
 
 
 def _in_dot(width: FloatArray) -> BoolArray:
-    """Mark the returns (N,) of a chain that lie on a dot; widths are in search lines."""
+    """Mark the peaks (N,) of a chain that lie on a dot; widths are in search lines."""
     wide = width > _MAX_WIDTH * np.median(width)
     bounds = np.flatnonzero(np.diff(wide, prepend=False, append=False))
     for first, end in bounds.reshape(-1, 2):
@@ -213,7 +225,7 @@ def _sigma_px(luma: ImagePlane, stripes: StripePixels) -> FloatArray:
 
     pull = np.hypot(_FLANK_PULL * lopsided(_FLANK_AT), _SLOPE_PULL * lopsided(_SLOPE_AT))
     in_widths = np.hypot(_SIGMA_IN_WIDTHS, pull)
-    return np.hypot(_LEAST_SIGMA_PX, in_widths * stripes.width)
+    return np.hypot(_MIN_SIGMA_PX, in_widths * stripes.width)
 
 
 def _bilinear(luma: ImagePlane, pixels: FloatArray) -> FloatArray:
@@ -245,11 +257,11 @@ def _slopes(line: FloatArray, position: FloatArray) -> FloatArray:
     return slope
 
 
-def _is_long(piece: StripePixels) -> bool:
-    if len(piece) < 3:
+def _is_long(segment: StripePixels) -> bool:
+    if len(segment) < 3:
         return False
-    length = float(np.hypot(*(piece.pixels[-1] - piece.pixels[0])))
-    return length >= _MIN_LENGTH_IN_WIDTHS * float(np.median(piece.width))
+    length = float(np.hypot(*(segment.pixels[-1] - segment.pixels[0])))
+    return length >= _MIN_LENGTH_IN_WIDTHS * float(np.median(segment.width))
 
 
 def _joined(parts: list[StripePixels]) -> StripePixels:

@@ -21,7 +21,7 @@ from scipy.sparse.csgraph import connected_components
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import kernel
-from aqualvs.scanning.laser_bands import SearchAxis, StripeSearch
+from aqualvs.scanning.laser_bands import LaserBand, SearchAxis
 from aqualvs.scanning.laser_colour import (
     RATIO_EXPECTED,
     RATIO_LEAST,
@@ -33,7 +33,7 @@ from aqualvs.scanning.laser_colour import (
 from aqualvs.scanning.scan import Frame, ImagePlane
 from aqualvs.scanning.segments import link_segments
 from aqualvs.scanning.stripe import HEIGHT as PEAK_HEIGHT
-from aqualvs.scanning.stripe import N_MEASURES, POSITION, PeakFinder, Returns, SearchImage
+from aqualvs.scanning.stripe import N_MEASURES, POSITION, PeakFinder, SearchImage, StripePeaks
 from aqualvs.scanning.stripe import WIDTH as PEAK_WIDTH
 
 Rows = NDArray[np.float32]
@@ -47,12 +47,12 @@ _N_MEASURES = 12
 # lines, so that noise of one pixel does not break a faint line. Number of peaks per search line.
 _MIN_CONTRAST, SMOOTHING, _PEAKS_PER_LINE = 3, 1.0, 120
 # Reach of the search for the background: a share of the picture's width, or this many pixels.
-_REACH_SHARE, _LEAST_REACH = 0.045, 8
+_REACH_SHARE, _MIN_REACH = 0.045, 8
 # Ends of a piece: distance to the next return in search lines and in pixels; bend within three
-# returns in pixels and as a share of the width. Least number of returns.
+# peaks in pixels and as a share of the width. Least number of peaks.
 _MAX_LINE_STEP, _MAX_STEP_PX = 2, 4.0
-_KINK_PX, _KINK_IN_WIDTHS, MIN_RETURNS = 1.0, 0.25, 5
-# Where the median height of MIN_RETURNS changes by this factor, another thing begins: noise and the
+_KINK_PX, _KINK_IN_WIDTHS, MIN_PEAKS = 1.0, 0.25, 5
+# Where the median height of MIN_PEAKS changes by this factor, another thing begins: noise and the
 # ringing of a codec continue many a line.
 _HEIGHT_STEP = 3.0
 # Light and chroma of a stripe are summed up to its flanks, this many pixels beyond half height.
@@ -61,11 +61,11 @@ _FLANK_PX = 2
 _HALO_PX = 6
 # Ratios of chroma to light, and differences in height of the flanks for each level, are clipped to
 # these bounds. Every red line of the photographs has at least the expected halo, however coded.
-_MOST_RATIO, _LEAST_RATIO, _MOST_ACROSS, _MOST_ONE_SIDED = 1.0, -0.5, 0.6, 3.0
+_MAX_RATIO, _MIN_RATIO, _MAX_ACROSS, _MAX_ONE_SIDED = 1.0, -0.5, 0.6, 3.0
 _HALO_EXPECTED = 0.3
 # More chroma for each level than this is coloured paint, or the halo of another thing; and the
 # logarithm of that excess is clipped.
-_PAINTED_RATIO, _MOST_EXCESS = 1.5, 3.0
+_PAINTED_RATIO, _MAX_EXCESS = 1.5, 3.0
 # Noise of chroma, in levels.
 _CHROMA_NOISE = 2.0
 # Pieces of more than these log odds, by the general statistics of lines, and of this share of the
@@ -76,14 +76,14 @@ _CERTAIN, _CERTAIN_SHARE = 2.4, 0.08
 _CERTAIN_IF_LONG, _LONG_SHARE = 1.0, 0.2
 # Spread of the colour of a picture's lines: chroma for each level, and as a share of theirs.
 _ACROSS_SPREAD, _SHARE_SPREAD = 0.08, 0.3
-_MOST_OWN = 9.0
+_MAX_OWN = 9.0
 # Bonus in log odds of a piece that continues a line straight on: largest gap as a share of the
 # picture's width; largest deviation from its direction in pixels, and as a share of the gap.
-_HELP, _MOST_GAP, _OFF_PX, _OFF_SHARE = 2.0, 0.1, 1.5, 0.05
-# Extension of a line at its end: most returns; largest distance in pixels from the extrapolation by
-# its slope over this many returns; least height as a share of the line's; and limit of the search
+_HELP, _MAX_GAP, _OFF_PX, _OFF_SHARE = 2.0, 0.1, 1.5, 0.05
+# Extension of a line at its end: most peaks; largest distance in pixels from the extrapolation by
+# its slope over this many peaks; least height as a share of the line's; and limit of the search
 # lines missed.
-_MOST_FOLLOWING, _FOLLOW_PX, _SLOPE_RETURNS, _LEAST_HEIGHT_SHARE, _MOST_MISSED = 8, 1.2, 6, 0.3, 4
+_MAX_FOLLOWING, _FOLLOW_PX, _SLOPE_PEAKS, _MIN_HEIGHT_SHARE, _MAX_MISSED = 8, 1.2, 6, 0.3, 4
 
 
 class Weights(NamedTuple):
@@ -118,25 +118,25 @@ WEIGHTS = Weights(
 """Fitted by tools/fit_stripe_pieces.py."""
 
 
-class Pieces(NamedTuple):
+class StripeSegments(NamedTuple):
     """Pieces of stripes, P of them, along one search direction.
 
     Attributes
     ----------
-    search : StripeSearch
+    search : LaserBand
         Of the whole picture.
-    returns : Returns
+    peaks : StripePeaks
         All peaks of the search direction.
     order : int array, shape (N,)
-        Indices into the returns, piece by piece, along each piece.
+        Indices into the peaks, piece by piece, along each piece.
     start : int array, shape (P + 1,)
         Where each piece begins in `order`, and N.
     table : array, shape (12, P)
         Measures of the pieces, rows as named above.
     """
 
-    search: StripeSearch
-    returns: Returns
+    search: LaserBand
+    peaks: StripePeaks
     order: IntArray
     start: IntArray
     table: FloatArray
@@ -147,25 +147,25 @@ class PictureRows(NamedTuple):
 
     Attributes
     ----------
-    light : float32 array, shape (n_lines, length)
+    intensity_weight : float32 array, shape (n_lines, length)
         Grey levels of the channel in which the laser is brightest.
     along, across : float32 array, shape (n_lines, length)
         Chroma along the direction of the laser's colour and at right angles to it; of shape (0, 0)
         for a grey picture.
     """
 
-    light: Rows
+    intensity_weight: Rows
     along: Rows
     across: Rows
 
 
-def picture_rows(frame: Frame, search: StripeSearch, colour: LaserColour) -> PictureRows:
+def picture_rows(frame: Frame, search: LaserBand, colour: LaserColour) -> PictureRows:
     """Return a picture as the rows of a search, light smoothed along the stripes.
 
     Parameters
     ----------
     frame : Frame
-    search : StripeSearch
+    search : LaserBand
         Of the whole picture.
     colour : LaserColour
     """
@@ -185,7 +185,7 @@ def picture_rows(frame: Frame, search: StripeSearch, colour: LaserColour) -> Pic
     return PictureRows(light, *(_rows(full_size(one, frame), search) for one in off))
 
 
-def _rows(image: ImagePlane | Rows, search: StripeSearch) -> Rows:
+def _rows(image: ImagePlane | Rows, search: LaserBand) -> Rows:
     lines = image.T if search.axis is SearchAxis.ALONG_Y else image
     step = search.line_px
     n = len(lines) // step
@@ -195,37 +195,37 @@ def _rows(image: ImagePlane | Rows, search: StripeSearch) -> Rows:
     return np.ascontiguousarray(rows)
 
 
-def find_pieces(frame: Frame, search: StripeSearch) -> Pieces:
+def find_segments(frame: Frame, search: LaserBand) -> StripeSegments:
     """Find and measure all pieces, of whatever colour, along one search direction.
 
     Parameters
     ----------
     frame : Frame
-    search : StripeSearch
+    search : LaserBand
         Of the whole picture, with the colour of the laser.
     """
     rows = picture_rows(frame, search, search.colour)
-    returns = _peaks(rows.light, search, frame.luma.shape[1])
-    order, start = _smooth_chains(returns, search)
+    peaks = _peaks(rows.intensity_weight, search, frame.luma.shape[1])
+    order, start = _smooth_chains(peaks, search)
     table = np.empty((_N_MEASURES, len(start) - 1))
     _measure(
         *rows,
-        returns.line,
-        returns.position,
-        returns.height,
-        returns.width,
+        peaks.line,
+        peaks.position,
+        peaks.height,
+        peaks.width,
         order,
         start,
         search.line_px,
         search.axis is SearchAxis.ALONG_X,
         table,
     )
-    return Pieces(search, returns, order, start, table)
+    return StripeSegments(search, peaks, order, start, table)
 
 
-def _peaks(light: Rows, search: StripeSearch, width_px: int) -> Returns:
+def _peaks(light: Rows, search: LaserBand, width_px: int) -> StripePeaks:
     n_lines, length = light.shape
-    reach_px = max(_LEAST_REACH, round(_REACH_SHARE * width_px))
+    reach_px = max(_MIN_REACH, round(_REACH_SHARE * width_px))
     directions = np.array([search.colour.value])
     finder = PeakFinder(length, search.lowest, search.highest, reach_px, directions)
     grey = np.empty((0, 0), np.uint8)
@@ -239,32 +239,32 @@ def _peaks(light: Rows, search: StripeSearch, width_px: int) -> Returns:
     margin = np.ceil(0.5 * width) + _FLANK_PX + 2.0
     inside = (position >= margin) & (position < length - 1 - margin)
     position, height, width = (column[inside] for column in (position, height, width))
-    return Returns(line[inside], position, height, width, np.ones(len(position)))
+    return StripePeaks(line[inside], position, height, width, np.ones(len(position)))
 
 
-def _smooth_chains(returns: Returns, search: StripeSearch) -> tuple[IntArray, IntArray]:
-    """Return chains of returns without gaps, kinks and steps: order, and where each begins."""
-    segments = link_segments(returns, search)
+def _smooth_chains(peaks: StripePeaks, search: LaserBand) -> tuple[IntArray, IntArray]:
+    """Return chains of peaks without gaps, kinks and steps: order, and where each begins."""
+    segments = link_segments(peaks, search)
     order = segments.order
     if len(order) == 0:
         return order, np.zeros(1, np.int64)
-    line, position, width = returns.line[order], returns.position[order], returns.width[order]
+    line, position, width = peaks.line[order], peaks.position[order], peaks.width[order]
     step = np.diff(line)
-    ends = (np.diff(segments.stretch) != 0) | (step <= 0) | (step > _MAX_LINE_STEP)
+    ends = (np.diff(segments.component) != 0) | (step <= 0) | (step > _MAX_LINE_STEP)
     ends |= np.abs(np.diff(position)) > _MAX_STEP_PX
     bend = np.abs(position[2:] - 2.0 * position[1:-1] + position[:-2])
     kinks = np.flatnonzero(bend > np.maximum(_KINK_PX, _KINK_IN_WIDTHS * width[1:-1])) + 1
     ends[kinks - 1] = ends[kinks] = True
-    ends[_height_steps(returns.height[order], ends)] = True
+    ends[_height_steps(peaks.height[order], ends)] = True
     start = np.concatenate([[0], np.flatnonzero(ends) + 1, [len(order)]])
-    long = np.diff(start) >= MIN_RETURNS
+    long = np.diff(start) >= MIN_PEAKS
     order = order[np.repeat(long, np.diff(start))]
     return order, np.concatenate([[0], np.cumsum(np.diff(start)[long])])
 
 
 def _height_steps(height: FloatArray, ends: BoolArray) -> IntArray:
-    """Return after which returns (of N) the height changes for good, but not beside an end."""
-    n, half = len(height), MIN_RETURNS
+    """Return after which peaks (of N) the height changes for good, but not beside an end."""
+    n, half = len(height), MIN_PEAKS
     if n < 2 * half:
         return np.zeros(0, np.int64)
     median = np.median(np.lib.stride_tricks.sliding_window_view(np.log(height), half), axis=1)
@@ -376,13 +376,13 @@ def general_evidence(table: FloatArray, width_px: int, *, has_colour: bool) -> F
             height**2,
             length * height,
             width,
-            np.minimum(table[ONE_SIDED], _MOST_ONE_SIDED),
+            np.minimum(table[ONE_SIDED], _MAX_ONE_SIDED),
             np.clip(halo, 0.0, _HALO_EXPECTED),
-            np.clip(halo, _LEAST_RATIO, 0.0),
-            np.clip(along, _LEAST_RATIO, 0.0),
+            np.clip(halo, _MIN_RATIO, 0.0),
+            np.clip(along, _MIN_RATIO, 0.0),
             np.log1p(levels / _CHROMA_NOISE),
-            np.clip(np.log(np.maximum(most, 1e-3) / _PAINTED_RATIO), 0.0, _MOST_EXCESS),
-            np.minimum(np.abs(across), _MOST_ACROSS),
+            np.clip(np.log(np.maximum(most, 1e-3) / _PAINTED_RATIO), 0.0, _MAX_EXCESS),
+            np.minimum(np.abs(across), _MAX_ACROSS),
         ],
         axis=-1,
     )
@@ -390,7 +390,7 @@ def general_evidence(table: FloatArray, width_px: int, *, has_colour: bool) -> F
 
 def _believed(table: FloatArray, row: int, in_white: float) -> FloatArray:
     """Return chroma for each level (P,) of a row; a white core says nothing."""
-    ratio = np.minimum(table[row], _MOST_RATIO)
+    ratio = np.minimum(table[row], _MAX_RATIO)
     believed: FloatArray = np.where(table[TOP] >= WHITE, np.maximum(ratio, in_white), ratio)
     return believed
 
@@ -459,10 +459,10 @@ def own_evidence(
     off_across = np.zeros(table.shape[1])
     if has_colour:
         spread = _ACROSS_SPREAD + _SHARE_SPREAD * np.hypot(lines.along, lines.across)
-        off_across = np.clip(table[ACROSS] - lines.across, -_MOST_ACROSS, _MOST_ACROSS) / spread
+        off_across = np.clip(table[ACROSS] - lines.across, -_MAX_ACROSS, _MAX_ACROSS) / spread
     off_width = np.log(table[WIDTH]) - lines.log_width
     higher = np.maximum(np.log(table[HEIGHT]) - lines.log_height, 0.0)
-    own = np.minimum(np.stack([off_across**2, off_width**2, higher], axis=-1), _MOST_OWN)
+    own = np.minimum(np.stack([off_across**2, off_width**2, higher], axis=-1), _MAX_OWN)
     return np.concatenate([general, own], axis=1)
 
 
@@ -545,28 +545,30 @@ def continued(table: FloatArray, log_odds: FloatArray, least: float, width_px: i
     return keep
 
 
-def extended(pieces: Pieces, keep: BoolArray) -> list[IntArray]:
-    """Return the chains of returns of kept pieces, each with the returns that follow at its ends.
+def extended(segments: StripeSegments, keep: BoolArray) -> list[IntArray]:
+    """Return the chains of peaks of kept pieces, each with the peaks that follow at its ends.
 
-    A piece ends at a kink or a gap; a few returns beyond may still belong to the line.
+    A piece ends at a kink or a gap; a few peaks beyond may still belong to the line.
 
     Parameters
     ----------
-    pieces : Pieces
+    segments : StripeSegments
     keep : bool array, shape (P,)
         Which pieces are lines.
     """
-    returns = pieces.returns
-    first_of = np.searchsorted(returns.line, np.arange(len(pieces.search.lowest) + 1))
-    chains = [pieces.order[pieces.start[k] : pieces.start[k + 1]] for k in np.flatnonzero(keep)]
-    used = np.zeros(len(returns), bool)
+    peaks = segments.peaks
+    first_of = np.searchsorted(peaks.line, np.arange(len(segments.search.lowest) + 1))
+    chains = [
+        segments.order[segments.start[k] : segments.start[k + 1]] for k in np.flatnonzero(keep)
+    ]
+    used = np.zeros(len(peaks), bool)
     for chain in chains:
         used[chain] = True
     longer = []
     for chain in chains:
-        after = _following(chain, 1, returns.line, returns.position, returns.height, first_of, used)
+        after = _following(chain, 1, peaks.line, peaks.position, peaks.height, first_of, used)
         before = _following(
-            chain[::-1], -1, returns.line, returns.position, returns.height, first_of, used
+            chain[::-1], -1, peaks.line, peaks.position, peaks.height, first_of, used
         )
         longer.append(np.concatenate([before[::-1], chain, after]))
     return longer
@@ -582,14 +584,14 @@ def _following(
     first_of: IntArray,
     used: BoolArray,
 ) -> IntArray:
-    """Return and mark the returns that follow the last one of a chain, one a search line."""
+    """Return and mark the peaks that follow the last one of a chain, one a search line."""
     n = chain.shape[0]
-    last, back = chain[n - 1], chain[max(n - 1 - _SLOPE_RETURNS, 0)]
+    last, back = chain[n - 1], chain[max(n - 1 - _SLOPE_PEAKS, 0)]
     slope = (position[last] - position[back]) / max(abs(line[last] - line[back]), 1)
-    least = _LEAST_HEIGHT_SHARE * np.median(height[chain])
-    found = np.empty(_MOST_FOLLOWING, np.int64)
+    least = _MIN_HEIGHT_SHARE * np.median(height[chain])
+    found = np.empty(_MAX_FOLLOWING, np.int64)
     n_found, x, place, gap = 0, line[last], position[last], 0
-    while n_found < _MOST_FOLLOWING and gap < _MOST_MISSED:
+    while n_found < _MAX_FOLLOWING and gap < _MAX_MISSED:
         x += step
         if x < 0 or x >= first_of.shape[0] - 1:
             break
@@ -616,17 +618,17 @@ def _ends(table: FloatArray) -> FloatArray:
     return ends
 
 
-def _goes_on(piece: FloatArray, others: FloatArray, width_px: int) -> BoolArray:
+def _goes_on(segment: FloatArray, others: FloatArray, width_px: int) -> BoolArray:
     """Mark which other pieces (N, 2, 2) lie on the straight continuation of a piece (2, 2)."""
-    way = piece[1] - piece[0]
+    way = segment[1] - segment[0]
     length = float(np.hypot(*way))
     way = way / max(length, 1e-9)
-    middle = piece.mean(axis=0)
+    middle = segment.mean(axis=0)
     off = others - middle
     along, across = off @ way, off @ np.array([-way[1], way[0]])
     # The gap is at most the length of the piece, because of the uncertainty of its direction.
     gap = np.abs(along).min(axis=1) - 0.5 * length
-    reach = min(length, _MOST_GAP * width_px)
+    reach = min(length, _MAX_GAP * width_px)
     allowed = _OFF_PX + _OFF_SHARE * np.maximum(gap, 0.0)
     goes_on: BoolArray = np.abs(across).max(axis=1) <= allowed
     goes_on &= (gap > -0.5 * length) & (gap <= reach)
