@@ -36,7 +36,7 @@ def test_simulation_writes_log_figures_and_page(tmp_path: Path) -> None:
     # Frames at 25 Hz, the last two still on their way.
     assert 70 <= len(rows) <= 76
     page = (request.out / "follow.html").read_text(encoding="utf-8")
-    assert "figure_22.png" in page
+    assert page.count("data:image/png;base64,") == 2
     assert "range error, rms" in page
     assert "reversals of the effort a minute" in page
     assert any("rms" in line and "mm" in line for line in told)

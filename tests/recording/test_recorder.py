@@ -124,7 +124,7 @@ def test_rosbags_understands_every_message(tmp_path, samples):
         assert np.allclose(cloud["quality"], points.quality)
     for sample, message in zip(samples, found[STRIPES.name], strict=True):
         assert message.refusal == ""
-        for (axis, stripes), part in zip(sample.peaks.items(), message.peaks, strict=True):
+        for (axis, stripes), part in zip(sample.peaks.items(), message.returns, strict=True):
             assert part.axis == axis.value
             assert np.array_equal(part.line, stripes.line)
             for name in ("position", "height", "width", "likelihood"):
@@ -186,7 +186,7 @@ def test_a_direction_without_stripes_stays_one(tmp_path, samples):
     assert list(frame.peaks) == list(empty)
     assert [len(found) for found in frame.peaks.values()] == [0] * len(empty)
     (message,) = decoded(path)[STRIPES.name]
-    assert [len(part.position) for part in message.peaks] == [0] * len(empty)
+    assert [len(part.position) for part in message.returns] == [0] * len(empty)
 
 
 def test_a_frame_that_was_not_measured_keeps_its_reason(tmp_path, samples):

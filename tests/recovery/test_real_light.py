@@ -198,7 +198,7 @@ def test_nothing_is_found_without_laser(line_scores, fmt: str) -> None:
 
 
 @pytest.mark.samples
-@pytest.mark.parametrize(("fmt", "n_least"), [("png", 8), ("jpg80", 7), ("crf23", 4)])
+@pytest.mark.parametrize(("fmt", "n_min"), [("png", 8), ("jpg80", 7), ("crf23", 4)])
 def test_red_lines_of_pairs(line_scores, fmt: str, n_min: int) -> None:
     """What is reached of 8: at 320 x 240, compression takes what colour a thin line has left."""
     pairs = [s for s in line_scores[fmt] if s.group == "pair"]

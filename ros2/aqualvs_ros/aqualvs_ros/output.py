@@ -5,7 +5,7 @@ import importlib
 from typing import Any
 
 from aqualvs.live.outputs.ros2_messages import TYPE_NAMES, Ros2Types, to_ros2
-from aqualvs.live.outputs.ros_messages import MessageMaker, RosOptions, Topic
+from aqualvs.live.outputs.ros_messages import MessageMaker, PublishedTopic, RosOptions
 from aqualvs.recording.sample import LiveSample
 from aqualvs.sources.base import PartHealth, State
 
@@ -46,10 +46,10 @@ class RclpyOutput:
         self._publishers = {
             topic: node.create_publisher(
                 self._types.classes[TYPE_NAMES[topic]],
-                "/diagnostics" if topic is Topic.DIAGNOSTICS else f"~/{topic}",
-                _quality(reliable or topic is Topic.DIAGNOSTICS),
+                "/diagnostics" if topic is PublishedTopic.DIAGNOSTICS else f"~/{topic}",
+                _quality(reliable or topic is PublishedTopic.DIAGNOSTICS),
             )
-            for topic in Topic
+            for topic in PublishedTopic
         }
         self._n_topics = 0
 
@@ -85,7 +85,7 @@ def installed_types() -> Ros2Types:
     for name in {*_PARTS, *TYPE_NAMES.values()}:
         package, _, short = name.split("/")
         classes[name] = getattr(importlib.import_module(f"{package}.msg"), short)
-    fields = classes[TYPE_NAMES[Topic.RANGE]].get_fields_and_field_types()
+    fields = classes[TYPE_NAMES[PublishedTopic.RANGE]].get_fields_and_field_types()
     return Ros2Types(
         classes=classes,
         range_has_variance="variance" in fields,
