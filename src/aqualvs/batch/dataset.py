@@ -281,11 +281,6 @@ def write_dives(dataset: Path, rows: Iterable[Mapping[str, Any]]) -> None:
         parquet.write_table(table, draft, compression="zstd")
 
 
-def posture_table(posture_csv: Path) -> Any:
-    """Return `posture.csv` as a table; numbers that a frame has not are null."""
-    return _table(posture_csv, null_words=False)
-
-
 def _table(path: Path, *, null_words: bool) -> Any:
     """Return a CSV file as a table; numbers that are not there are null, and words if wanted."""
     with path.open(encoding="utf-8") as file:

@@ -90,11 +90,6 @@ class NetLattice:
         """Unit vectors across each family's strands, shape (F, 2)."""
         return self.waves * self.pitch[:, None]
 
-    @property
-    def strand_angles(self) -> FloatArray:
-        """Direction of each family's strands, counter-clockwise from right, 0 to pi."""
-        return np.mod(np.arctan2(self.waves[:, 1], self.waves[:, 0]) + 0.5 * np.pi, np.pi)
-
     def crossings_per_metre(self, direction: FloatArray) -> float:
         """Return the crossings per metre of a line of unit direction (2,) with strands."""
         return float(np.abs(self.waves @ direction) @ self.density)

@@ -209,11 +209,6 @@ class MavlinkLink:
             self._n_unsent += not sent
         return sent
 
-    @property
-    def n_unsent(self) -> int:
-        """Calls of `send` that found no connection or no room."""
-        return self._n_unsent
-
     def latest(
         self, kind: str, *, system: int | None = None, component: int | None = None
     ) -> Received | None:
