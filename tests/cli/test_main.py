@@ -168,6 +168,12 @@ def test_pipes_and_devices_are_refused(make, tmp_path, capsys):
         assert said.count("\n") == 1
 
 
+@pytest.mark.parametrize("rate_hz", ["0", "nan", "99999999999"])
+def test_gains_are_made_for_a_frame_rate_that_cameras_have(rate_hz, capsys):
+    assert main(["tune", "bluerov2", "--rate-hz", rate_hz]) == 2
+    assert capsys.readouterr().err.startswith("aqualvs: error: --rate-hz ")
+
+
 def test_faults_of_the_system_are_one_line(monkeypatch, capsys):
     def fail(**_):
         raise PermissionError(13, "Permission denied", "/somewhere/dive.mp4")

@@ -33,8 +33,8 @@ def tune(
     from aqualvs.errors import OptionError
     from aqualvs.follow import tune as body
 
-    if not rate_hz > 0.0:
-        raise OptionError(f"--rate-hz {rate_hz:g}: must be positive")
+    if not 1.0 <= rate_hz <= 1000.0:
+        raise OptionError(f"--rate-hz {rate_hz:g}: give 1 to 1000 frames a second")
     options = TuneOptions(
         delay=1e-3 * delay_ms,
         greatest_delay=1e-3 * greatest_delay_ms,

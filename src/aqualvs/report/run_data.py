@@ -99,7 +99,7 @@ def read_run_file(run_dir: Path) -> tuple[dict[str, Any], str]:
 
 
 def read_track(path: Path) -> Track:
-    """Read a `posture.csv`; rows cut short by an interruption are left out.
+    """Read a `posture.csv`; rows that are damaged or cut short are left out.
 
     Raises
     ------
@@ -108,6 +108,9 @@ def read_track(path: Path) -> Track:
     """
     columns, texts = _read_columns(path, _NUMBERS, ("valid", "reason"))
     order = np.argsort(columns["frame"], kind="stable")
+    order = order[np.isfinite(columns["frame"] + columns["time_s"])[order]]
+    if not len(order):
+        raise SourceError(f"{path}: no row has a frame and its time; run the dive again")
     posture = np.stack([columns[name] for name in POSTURE], axis=-1)[order]
     sigma = np.stack([columns[f"sigma_{name}"] for name in POSTURE], axis=-1)[order]
     total = np.stack([columns[name] for name in _TOTALS], axis=-1)[order]

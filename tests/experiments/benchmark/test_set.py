@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 
 from aqualvs.errors import AqualvsError, SourceError
-from aqualvs.experiments.benchmark.set import BenchmarkSet, DiveTruth, load_set, read_system
+from aqualvs.experiments.benchmark.set import (
+    BenchmarkSet,
+    DiveTruth,
+    load_set,
+    read_dive,
+    read_system,
+)
 
 
 def truth(name, n=3):
@@ -120,3 +126,12 @@ def test_a_folder_without_a_set_is_refused(content, words, tmp_path):
         write(tmp_path / "benchmark.yaml", content)
     with pytest.raises(SourceError, match=words):
         load_set(tmp_path)
+
+
+def test_a_truth_with_a_frame_twice_is_refused(tmp_path):
+    row = "1,0.5,1,2,300\n"
+    path = write(tmp_path / "truth.csv", "frame,range_m,pitch_deg,yaw_deg,n_visible\n" + row)
+    assert len(read_dive(path, "a", "near").frames) == 1
+    path.write_text(path.read_text() + row)
+    with pytest.raises(SourceError, match="a frame is there twice"):
+        read_dive(path, "a", "near")

@@ -364,7 +364,15 @@ class IndexOptions:
         """Return the options for a target with given uncertainties of its place on the vehicle.
 
         An index counts as observable if it separates fresh water from sea water.
+
+        Raises
+        ------
+        OptionError
+            If one of them is negative or no number.
         """
+        for name, value in (("place-sigma-mm", place_sigma_mm), ("turn-sigma-deg", turn_sigma_deg)):
+            if not (math.isfinite(value) and value >= 0.0):
+                raise OptionError(f"--{name} {value:g}: give a number that is not negative")
         return cls(
             sigma_place=place_sigma_mm / 1e3,
             sigma_turn=math.radians(turn_sigma_deg),

@@ -234,6 +234,8 @@ def read_dive(path: Path, name: str, level: str) -> DiveTruth:
     table = np.array(cells, dtype=np.float64)
     if not np.isfinite(table[:, [0, 4]]).all():
         raise SourceError(f"{path}: a row lacks its frame or n_visible; make the set again")
+    if len(np.unique(table[:, 0])) < len(table):
+        raise SourceError(f"{path}: a frame is there twice; make the set again")
     return DiveTruth(
         name, level, table[:, 0].astype(np.int64), table[:, 1:4], table[:, 4].astype(np.int64)
     )
