@@ -236,7 +236,7 @@ class Scanner:
         if found.patch is not None:
             # Heights over a patch are in metres; m·X is relative to the range.
             surface, weights = fitted_patch(found.patch, m, points), weights / posture.range**2
-        covariance = self._rig_errors.covariance_of(
+        _, covariance = self._rig_errors.propagate(
             surface, candidates.pixels, candidates.laser, points, weights
         )
         return replace(posture, rig_covariance=covariance)

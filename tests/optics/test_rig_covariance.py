@@ -151,7 +151,7 @@ def test_windows_and_the_water_in_front_of_them_count() -> None:
     laser, ones = np.repeat([0, 1], 50), np.ones(100)
     m = np.array([0.0, 1.0 / 0.6, 0.0])
     plane = fitted_plane(m, points)
-    found = errors.jacobian(plane, pixels, laser, points, ones, 50)
+    found, _ = errors.propagate(plane, pixels, laser, points, ones, 50)
     for i, name in enumerate(errors.names):
         h = sigmas[name]
         read = []
@@ -191,7 +191,7 @@ def test_a_curved_net_answers_with_its_own_coefficients() -> None:
         rig, rig.camera(), RigUncertainty(tuple(names), 1e-6 * np.outer(step, step))
     )
     surface = fitted_patch(patch, m, at)
-    covariance = errors.covariance_of(surface, where, own, at, np.full(len(at), 1e8))
+    _, covariance = errors.propagate(surface, where, own, at, np.full(len(at), 1e8))
     # 1 mm in range, and nothing in the angles; the points lie up to 30 mm off the patch.
     np.testing.assert_allclose(np.sqrt(covariance[0, 0]), 1e-3, rtol=0.01)
     assert np.sqrt(np.diag(covariance))[1:].max() < np.deg2rad(0.02)

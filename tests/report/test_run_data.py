@@ -18,5 +18,5 @@ def test_a_row_without_frame_or_time_is_left_out(tmp_path):
     path.write_text("".join(lines))
     assert len(read_track(path)) == len(whole) - 2
     path.write_text(lines[0] + lines[4])
-    with pytest.raises(SourceError, match="no row has a frame and its time"):
+    with pytest.raises(SourceError, match="holds no frame"):
         read_track(path)

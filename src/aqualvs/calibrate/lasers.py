@@ -197,10 +197,7 @@ def calibrate_lasers(
         rig=solved if names is None else _with_names(solved, names),
         uncertainty=result.uncertainty,
         residuals_px={one.name: one.corner_residuals_px for one in result.views},
-        left_out={
-            **seen.found.missed,
-            **{name: why for name, _, why in (one.partition(": ") for one in result.left_out)},
-        },
+        left_out={**seen.found.missed, **result.left_out},
         notes=(*seen.found.notes, *result.warnings),
         solution=result,
         found=(seen.found,),
@@ -429,7 +426,11 @@ def _page(before: Rig, done: LasersResult, request: LasersRequest) -> Calibratio
                 "rms residual, the worst laser",
             ),
         ),
-        warnings=(*result.warnings, *result.left_out, *found.remarks),
+        warnings=(
+            *result.warnings,
+            *(f"{name}: {why}" for name, why in result.left_out.items()),
+            *found.remarks,
+        ),
         words=tuple(
             _words(figures, laser) for figures, laser in zip(result.lasers, rig.lasers, strict=True)
         ),

@@ -272,10 +272,9 @@ class WallView:
         sigma, points = self._sigma(), self._points()
         good = np.isfinite(sigma) & (sigma > 0.0) & np.isfinite(points).all(axis=-1)
         wall = fitted_plane(np.array([0.0, 1.0 / self.wall_range, 0.0]), points[good])
-        slope = errors.jacobian(
+        _, covariance = errors.propagate(
             wall, pixels[good], laser[good], points[good], sigma[good] ** -2.0, N_POINTS
         )
-        covariance: FloatArray = slope @ errors.covariance @ slope.T
         return covariance
 
     def _points(self) -> FloatArray:

@@ -145,15 +145,16 @@ class PostureErrors:
         self._camera_steps = [(own.index(name), steps[name]) for name in self.names if name in own]
         self._lattice = self._derivatives_on_lattice()
 
-    def covariance_of(
+    def propagate(
         self,
         surface: FittedSurface,
         pixels: FloatArray,
         laser: IntArray,
         points: FloatArray,
         weights: FloatArray,
-    ) -> FloatArray:
-        """Return the covariance (3, 3) of (range, pitch, yaw) by the rig, in m and rad.
+        each: int | None = None,
+    ) -> tuple[FloatArray, FloatArray]:
+        """Propagate the uncertainty of the rig to (range, pitch, yaw), in m and rad.
 
         Parameters
         ----------
@@ -162,35 +163,16 @@ class PostureErrors:
         pixels, laser, points, weights : array, shape (N, 2), (N,), (N, 3), (N,)
             Points that it was fitted to, ordered along the stripes; weights are 1 over the variance
             of the residual, or 0.
+        each : int, optional
+            Largest number of short segments that represent the stripes of a laser.
+
+        Returns
+        -------
+        jacobian : array, shape (3, P)
+            Derivatives by the rig's parameters.
+        covariance : array, shape (3, 3)
+            Both are NaN where the points do not determine the surface.
         """
-        return self._propagated(surface, pixels, laser, points, weights, None)[1]
-
-    def jacobian(
-        self,
-        surface: FittedSurface,
-        pixels: FloatArray,
-        laser: IntArray,
-        points: FloatArray,
-        weights: FloatArray,
-        each: int | None = None,
-    ) -> FloatArray:
-        """Return the derivatives (3, P) of range, pitch and yaw by the rig's parameters.
-
-        Parameters as in `covariance_of`; `each` is the largest number of short segments that
-        represent the stripes of a laser. NaN where the points do not determine the surface.
-        """
-        return self._propagated(surface, pixels, laser, points, weights, each)[0]
-
-    def _propagated(
-        self,
-        surface: FittedSurface,
-        pixels: FloatArray,
-        laser: IntArray,
-        points: FloatArray,
-        weights: FloatArray,
-        each: int | None,
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return derivatives (3, P) and covariance (3, 3)."""
         n, moves = len(self.names), self._moves
         jacobian, covariance = np.empty((3, n)), np.zeros((3, 3))
         if n:
@@ -370,7 +352,7 @@ def _propagate(
     terms, prior, normal, bend, posture
         As in `FittedSurface`.
     pixels, laser, points, weights
-        As in `PostureErrors.covariance_of`.
+        As in `PostureErrors.propagate`.
     n_lasers, each : int
         Number of lasers, and the largest number of short segments for each.
     table, scale

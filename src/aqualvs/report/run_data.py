@@ -108,9 +108,6 @@ def read_track(path: Path) -> Track:
     """
     columns, texts = _read_columns(path, _NUMBERS, ("valid", "reason"))
     order = np.argsort(columns["frame"], kind="stable")
-    order = order[np.isfinite(columns["frame"] + columns["time_s"])[order]]
-    if not len(order):
-        raise SourceError(f"{path}: no row has a frame and its time; run the dive again")
     posture = np.stack([columns[name] for name in POSTURE], axis=-1)[order]
     sigma = np.stack([columns[f"sigma_{name}"] for name in POSTURE], axis=-1)[order]
     total = np.stack([columns[name] for name in _TOTALS], axis=-1)[order]
@@ -214,10 +211,13 @@ class _Words(NamedTuple):
 def _read_columns(
     path: Path, numbers: tuple[str, ...], texts: tuple[str, ...]
 ) -> tuple[dict[str, FloatArray], dict[str, _Words]]:
-    """Read the named columns of a CSV; a missing column becomes NaN or "None"."""
+    """Read the named columns of a CSV, of the rows that have a frame and its time.
+
+    A missing column becomes NaN or "None".
+    """
     table = _read_table(path, numbers, texts)
     # With NumPy: filtering an Arrow table imports all of its functions first.
-    whole = np.isfinite(_numbers(table["frame"]))
+    whole = np.isfinite(_numbers(table["frame"])) & np.isfinite(_numbers(table["time_s"]))
     if not whole.any():
         raise NoFrameError(
             f"{path}: holds no frame; there is nothing to report, run the dive again"

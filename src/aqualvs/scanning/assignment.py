@@ -136,8 +136,8 @@ class AssignmentTest:
         target : Surface
             The one to judge.
         """
-        small, faint = self._evidence(candidates, subsegments, subsegment_index, surfaces, target)
-        return small and faint > _MAY_BE_FAINT
+        small = self._is_small(candidates, subsegments, subsegment_index, surfaces, target)
+        return small and self._is_faint(target, subsegments)
 
     def overlooked(
         self,
@@ -172,22 +172,22 @@ class AssignmentTest:
             # Only broken stripes have an extent.
             if one is target or one.extent <= 0.0 or not _is_nearer(one, target, subsegments):
                 continue
-            small, faint = self._evidence(candidates, subsegments, subsegment_index, surfaces, one)
-            if small or faint > _MAY_BE_FAINT:
+            small = self._is_small(candidates, subsegments, subsegment_index, surfaces, one)
+            if small or self._is_faint(one, subsegments):
                 continue
             is_net = one.is_mesh or seen_through(one.members, target.members, subsegments)
             return replace(one, is_mesh=is_net)
         return None
 
-    def _evidence(
+    def _is_small(
         self,
         candidates: Candidates,
         subsegments: Subsegments,
         subsegment_index: IntArray,
         surfaces: Sequence[Surface],
         surface: Surface,
-    ) -> tuple[bool, float]:
-        """Return whether a surface is small, and the share of the lasers that are faint on it."""
+    ) -> bool:
+        """Return whether a surface has little light of its own, or, if no mesh, short stripes."""
         others = np.zeros(len(subsegments), np.bool_)
         for one in surfaces:
             if one is not surface:
@@ -202,9 +202,13 @@ class AssignmentTest:
             subsegments.intensity_weight,
             surface.inlier_weight,
         )
-        most, faint = self._seen_of(surface, subsegments)
-        small = intensity_share < _SMALL_SHARE or (most < _SHORT_WAY and not surface.is_mesh)
-        return small, faint
+        if intensity_share < _SMALL_SHARE or surface.is_mesh:
+            return intensity_share < _SMALL_SHARE
+        return self._seen_of(surface, subsegments)[0] < _SHORT_WAY
+
+    def _is_faint(self, surface: Surface, subsegments: Subsegments) -> bool:
+        """Return whether a laser that should be seen on a surface is faint there, or missing."""
+        return self._seen_of(surface, subsegments)[1] > _MAY_BE_FAINT
 
     def _seen_of(self, surface: Surface, subsegments: Subsegments) -> tuple[float, float]:
         """Return the share of its best stripe that a surface shows, and that of faint lasers."""
@@ -240,8 +244,7 @@ class AssignmentTest:
                 one is not target and one.is_mesh and one.sampling_weight >= target.sampling_weight
             )
             if rivals and _is_nearer(one, target, subsegments):
-                _, faint = self._seen_of(target, subsegments)
-                return one if faint > _MAY_BE_FAINT else None
+                return one if self._is_faint(target, subsegments) else None
         return None
 
     def test(

@@ -73,7 +73,7 @@ def test_lasers_come_out_of_a_box() -> None:
     check(result, RIG)
     assert [f.laser.name for f in result.lasers] == ["lower", "left", "right"]
     assert result.warnings == ()
-    assert result.left_out == ()
+    assert result.left_out == {}
     for figures in result.lasers:
         assert figures.sheet == "plane"
         assert len(figures.surfaces) >= 2
@@ -251,7 +251,7 @@ def test_views_without_markers_are_left_out_with_the_reason() -> None:
     views = [box_seen()[0], *corners_only([box_seen()[1]], lambda v: v.view.ids < 0), box_seen()[2]]
     result = calibrate_lasers(RIG, views, box())
     assert len(result.views) == 2
-    assert result.left_out[0].startswith("view_1.png: 0 corners of the target found")
+    assert result.left_out["view_1.png"].startswith("0 corners of the target found")
 
 
 def test_no_markers_at_all() -> None:
@@ -270,7 +270,7 @@ def test_markers_on_one_plane_only() -> None:
     with pytest.raises(CalibrationError, match=r"markers are seen on plane 'forward' only"):
         calibrate_lasers(RIG, views, box())
     mixed = [views[0], *box_seen()[1:]]
-    assert "'forward' only" in calibrate_lasers(RIG, mixed, box()).left_out[0]
+    assert "'forward' only" in calibrate_lasers(RIG, mixed, box()).left_out["view_0.png"]
 
 
 def test_a_laser_on_one_plane_only() -> None:

@@ -154,7 +154,7 @@ def calibrate_lasers(
         uncertainty=joint.uncertainty,
         lasers=tuple(figures),
         views=tuple(pictures),
-        left_out=tuple(left_out),
+        left_out=left_out,
         warnings=(*warnings, *_warnings(solved, figures, pictures)),
         refined=options.refine,
     )

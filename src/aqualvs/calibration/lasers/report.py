@@ -119,8 +119,8 @@ class LaserCalibration:
         In the order of `rig.lasers`.
     views : tuple of ViewFigures
         Pictures that were used.
-    left_out : tuple of str
-        Reasons why others were not, in words.
+    left_out : dict
+        Names of the others, with the reason.
     warnings : tuple of str
         Warnings for the user, in words.
     refined : bool
@@ -131,7 +131,7 @@ class LaserCalibration:
     uncertainty: RigUncertainty
     lasers: tuple[LaserFigures, ...]
     views: tuple[ViewFigures, ...]
-    left_out: tuple[str, ...]
+    left_out: dict[str, str]
     warnings: tuple[str, ...]
     refined: bool
 

@@ -167,7 +167,7 @@ class PlacedView:
 
 def place_views(
     camera: Camera, views: Sequence[LaserView], surfaces: TargetSurfaces
-) -> tuple[list[PlacedView], list[str]]:
+) -> tuple[list[PlacedView], dict[str, str]]:
     """Find the pose of every picture, and its stripes on the surfaces.
 
     Parameters
@@ -182,23 +182,27 @@ def place_views(
     Returns
     -------
     placed : list of PlacedView
-    left_out : list of str
-        Reasons why others could not be used, in words, the picture's name first.
+    left_out : dict
+        Names of the pictures that could not be used, with the reason.
 
     Raises
     ------
     CalibrationError
         If no picture can be used.
     """
-    found, left_out = [], []
+    found: list[PlacedView] = []
+    left_out: dict[str, str] = {}
     for view in views:
+        name = view.view.name
         try:
             found.append(_placed_view(camera, view, surfaces))
         except CalibrationError as fault:
-            left_out.append(str(fault))
+            left_out[name] = str(fault).removeprefix(f"{name}: ")
     if not found:
         few = f" (and {len(left_out) - 1} others likewise)" if len(left_out) > 1 else ""
-        reason = left_out[0] if left_out else "no pictures were given"
+        reason = next(
+            (f"{name}: {why}" for name, why in left_out.items()), "no pictures were given"
+        )
         raise CalibrationError(f"no picture can be used: {reason}{few}")
     return found, left_out
 

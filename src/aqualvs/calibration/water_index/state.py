@@ -355,9 +355,7 @@ class IndexOptions:
 
     def __post_init__(self) -> None:
         for name in self.__slots__:
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value >= 0.0):
-                raise OptionError(f"{name} is {value:g}; give a number that is not negative")
+            _check_not_negative(name, getattr(self, name))
 
     @classmethod
     def of_target(cls, place_sigma_mm: float, turn_sigma_deg: float) -> Self:
@@ -370,9 +368,8 @@ class IndexOptions:
         OptionError
             If one of them is negative or no number.
         """
-        for name, value in (("place-sigma-mm", place_sigma_mm), ("turn-sigma-deg", turn_sigma_deg)):
-            if not (math.isfinite(value) and value >= 0.0):
-                raise OptionError(f"--{name} {value:g}: give a number that is not negative")
+        _check_not_negative("--place-sigma-mm", place_sigma_mm)
+        _check_not_negative("--turn-sigma-deg", turn_sigma_deg)
         return cls(
             sigma_place=place_sigma_mm / 1e3,
             sigma_turn=math.radians(turn_sigma_deg),
@@ -383,6 +380,11 @@ class IndexOptions:
     def pose_sigmas(self) -> FloatArray:
         """Standard deviations of turn and shift of the target, shape (6,)."""
         return np.array([self.sigma_turn] * 3 + [self.sigma_place] * 3)
+
+
+def _check_not_negative(name: str, value: float) -> None:
+    if not (math.isfinite(value) and value >= 0.0):
+        raise OptionError(f"{name} is {value:g}; give a number that is not negative")
 
 
 @dataclass(frozen=True, slots=True)
