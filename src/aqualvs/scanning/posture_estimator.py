@@ -18,7 +18,7 @@ from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel,
 from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.sheet import COLUMNS, START, WINDOWED, sheet_distance, sheets_of
-from aqualvs.scanning.candidates import Candidates, Observations
+from aqualvs.scanning.candidates import Candidates, Observations, Subsegments
 from aqualvs.scanning.laser_bands import LaserBand
 from aqualvs.scanning.net_surfaces import disagreement, fit_mean, inflate_covariance
 from aqualvs.scanning.paraboloid import MIN_BEND, fit_patch, refit_at_nearest, shows_curvature
@@ -426,7 +426,7 @@ class PostureEstimator:
         self._axis_in_dome = rig.dome_from_cam.rotate([0.0, 0.0, 1.0])
 
     def measure(
-        self, candidates: Candidates, subsegment_index: IntArray, target: Surface
+        self, candidates: Candidates, subsegments: Subsegments, target: Surface
     ) -> Measurement:
         """Measure the posture to a surface.
 
@@ -434,8 +434,8 @@ class PostureEstimator:
         ----------
         candidates : Candidates
             N of them.
-        subsegment_index : int array, shape (N,)
-            Row of each candidate's subsegment in the surface's `members`.
+        subsegments : Subsegments
+            Those of the candidates.
         target : Surface
             Surface that the posture is measured to.
         """
@@ -445,7 +445,7 @@ class PostureEstimator:
         unit, min_lines = (
             (candidates.component, _SHORTEST_STRAND) if mesh else (candidates.subsegment, 1)
         )
-        on_target = target.members[subsegment_index]
+        on_target = target.members[subsegments.of_candidate]
         seen = self._observe(candidates, unit, min_lines, on_target, target.plane.normal)
         if seen.n_candidates < MIN_LINES:
             detail = f"only {seen.n_candidates} stripe points outside crossings"
