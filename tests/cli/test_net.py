@@ -62,20 +62,6 @@ def run_folder(scans, tmp_path):
     return write_run(tmp_path / "run", scans[:FEW])
 
 
-@pytest.fixture
-def refused(capfd):
-    """Run the command line; it must refuse in one line with exit code 2."""
-
-    def check(*arguments):
-        assert main([str(a) for a in arguments]) == 2
-        said = capfd.readouterr()
-        assert said.err.count("\n") == 1
-        assert said.err.startswith("aqualvs: error: ")
-        return said.err
-
-    return check
-
-
 def rows(path):
     return list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
 
