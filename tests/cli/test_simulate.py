@@ -27,6 +27,9 @@ def test_the_list_names_every_scenario(capsys):
         (["missing.yaml", "-o", "x"], "missing.yaml"),
         (["wall", "-o", "x", "--rig", "missing-rig.yaml"], "missing-rig.yaml"),
         (["wall", "-o", "x", "--camera", "gopro"], "--camera gopro"),
+        (["wall", "-o", "x", "--shutter", "roll:20"], "such as rolling:20:8"),
+        (["wall", "-o", "x", "--shutter", "rolling:90:8"], "lower the scenario's fps"),
+        (["calibration", "-o", "x", "--shutter", "rolling:20"], "boards stand still"),
     ],
 )
 def test_bad_input_gives_one_line(arguments, words, capsys, tmp_path, monkeypatch):

@@ -75,11 +75,11 @@ def scene(water=_CLEAR, *, target="wall", **more):
 
 
 def n_visible(renderer, seen):
-    return len(render_with_visible(renderer, seen, 0.0, np.random.default_rng(1))[1])
+    return len(render_with_visible(renderer, lambda _: seen, 0.0, np.random.default_rng(1))[1])
 
 
 def test_on_a_clear_wall_a_stripe_has_one_point_in_every_pixel_along_it(renderer):
-    visible = render_with_visible(renderer, scene(), 0.0, np.random.default_rng(1))[1]
+    visible = render_with_visible(renderer, lambda _: scene(), 0.0, np.random.default_rng(1))[1]
     width, height = renderer.rig.size_px
     # The level stripe crosses every column, the upright one every row; the third runs across.
     level, upright, diagonal = np.bincount(visible.laser)

@@ -159,6 +159,7 @@ def _rig(result: CameraCalibration, nominal: Nominal) -> Rig:
         n_water=nominal.n_water,
         lasers=(),
         working_range=nominal.working_range,
+        shutter=nominal.shutter,
     )
     step = SolvedStep(
         pictures=len(result.views), points=result.n_points, rms_px=result.rms_px, extras={}

@@ -24,6 +24,7 @@ from aqualvs.optics.camera import Dome
 from aqualvs.optics.rig import Laser, Rig, RigUncertainty
 from aqualvs.optics.rigfile import keep_dated, load_rig, save_rig
 from aqualvs.optics.rigschema import LaserWavelength
+from aqualvs.optics.shutter import AT_ONCE, Shutter
 from aqualvs.report.calibration_material import ResidualMap, ViewRow, missed_rows, residual_map
 from aqualvs.report.calibration_page import CalibrationPage, write_page
 from aqualvs.results.files import writing
@@ -60,6 +61,8 @@ class Nominal:
         Of the lasers; None if unknown, or if they differ.
     working_range : (float, float)
         Metres.
+    shutter : Shutter
+        Of the camera.
     """
 
     name: str = "rig"
@@ -70,6 +73,7 @@ class Nominal:
     n_lasers: int | None = None
     wavelength_nm: float | None = None
     working_range: tuple[float, float] = (0.25, 1.3)
+    shutter: Shutter = AT_ONCE
 
 
 class _Part(BaseModel):
@@ -132,6 +136,7 @@ def _of_rig_file(path: Path) -> Nominal:
         n_lasers=len(rig.lasers) or None,
         wavelength_nm=common_wavelength(rig.lasers),
         working_range=rig.working_range,
+        shutter=rig.shutter,
     )
 
 

@@ -20,7 +20,7 @@ from pathlib import Path
 from rich.console import Console
 
 from aqualvs import __version__
-from aqualvs.check.finding import Finding, Severity, findings_table
+from aqualvs.check.finding import Finding, Severity, findings_table, shutter_finding
 from aqualvs.control.vehicle import Mode, VehicleState
 from aqualvs.demo import bundled_dive
 from aqualvs.errors import AqualvsError
@@ -317,6 +317,9 @@ def _rig_file(path: Path) -> Iterator[Finding]:
     rig = load_rig(path)
     size = "x".join(map(str, rig.size_px))
     yield Finding(Severity.OK, f"rig {rig.name!r}: {size} px, lasers: {len(rig.lasers)}")
+    shutter = shutter_finding(rig)
+    if shutter is not None:
+        yield shutter
 
 
 def _stream(where: str, rig_file: Path | None) -> Iterator[Finding]:

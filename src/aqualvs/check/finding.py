@@ -19,9 +19,11 @@ from aqualvs.optics.expected_error import (
     SIGMA_PX,
     USUAL_RANGES,
     ExpectedError,
+    WallView,
     expected_posture_errors,
 )
 from aqualvs.optics.rig import Rig, RigUncertainty
+from aqualvs.optics.shutter import ShutterKind
 
 
 class Severity(StrEnum):
@@ -185,3 +187,50 @@ def _shown_units(sigmas: FloatArray) -> tuple[float, float, float]:
 
 def _shown(value: float) -> str:
     return "-" if math.isnan(value) else f"{value:.3g}"
+
+
+# A small vehicle near a net in waves; what a shutter costs is stated at these rates.
+_SPEED, _TURN = 0.2, math.radians(15.0)
+
+
+def shutter_finding(rig: Rig) -> Finding | None:
+    """Return what a rig's shutter means for a vehicle that moves; None if it states none."""
+    shutter = rig.shutter
+    if shutter.instant:
+        return None
+    rates = f"At {_SPEED:g} m/s and {math.degrees(_TURN):.0f} degrees/s"
+    blur = ""
+    if shutter.exposure > 0.0:
+        pixels = rig.focal_px * _TURN * shutter.exposure
+        blur = f"an exposure of {1e3 * shutter.exposure:g} ms blurs over {pixels:.1f} px"
+    if shutter.kind is ShutterKind.GLOBAL:
+        return Finding(Severity.OK, f"The shutter exposes all rows at once. {rates} {blur}.")
+    blur = f"; {blur}" if blur else ""
+    apart = 1e3 * shutter.readout
+    if shutter.kind is ShutterKind.INTERLACED:
+        return Finding(
+            Severity.WARN,
+            f"The video is interlaced, its fields {apart:g} ms apart. {rates} the target moves by "
+            f"{_SPEED * apart:.1f} mm and {math.degrees(_TURN) * shutter.readout:.2f} degrees "
+            f"({rig.focal_px * _TURN * shutter.readout:.1f} px) between them, and stripes are "
+            f"combed by that{blur}. No sigma counts it: move slowly.",
+        )
+    return Finding(
+        Severity.WARN,
+        f"The shutter rolls, {apart:g} ms from the first row to the last. {rates} "
+        f"{_rolling_error(rig)}{blur}. No sigma counts it: move slowly.",
+    )
+
+
+def _rolling_error(rig: Rig) -> str:
+    """Return the largest errors on a wall in the middle of the working range, as words."""
+    wall = WallView.ahead(rig, math.sqrt(math.prod(rig.working_range)))
+    by_rates = wall.by_rates(lambda rows: rig.shutter.row_times(rows, rig.size_px[1]))
+    if not np.isfinite(by_rates).all():
+        apart = math.degrees(_TURN) * rig.shutter.readout
+        return f"its rows see a target {apart:.2f} degrees apart"
+    away, pitch, yaw = np.abs(by_rates) @ [_SPEED, _TURN, _TURN]
+    return (
+        f"a wall at {1e3 * wall.wall_range:.0f} mm is read up to {1e3 * away:.1f} mm and "
+        f"{math.degrees(max(pitch, yaw)):.2f} degrees off"
+    )

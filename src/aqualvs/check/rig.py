@@ -24,6 +24,7 @@ from aqualvs.check.finding import (
     findings_table,
     index_sigma,
     sensitivity_table,
+    shutter_finding,
 )
 from aqualvs.errors import RigError
 from aqualvs.geometry.planes import Rays
@@ -299,6 +300,7 @@ def check_rig(rig: Rig, now: datetime | None = None) -> list[Finding]:
         If what calibrations have noted down in the rig cannot be understood.
     """
     camera, uncertainty = rig.camera(), rig_uncertainty(rig)
+    shutter = shutter_finding(rig)
     return [
         *_check_lens(rig),
         *_check_view(rig, camera),
@@ -306,6 +308,7 @@ def check_rig(rig: Rig, now: datetime | None = None) -> list[Finding]:
         _check_index(rig),
         *_check_lasers(rig, camera),
         *(_check_pair(a, b) for a, b in itertools.combinations(rig.lasers, 2)),
+        *([] if shutter is None else [shutter]),
         *check_solved(rig, solved_steps(rig), uncertainty, now or datetime.now(UTC)),
         *check_errors(expected_errors(rig, completed_uncertainty(rig))),
     ]

@@ -241,6 +241,15 @@ def simulate(
     camera: Annotated[
         str, typer.Option(help="Camera that takes the pictures: ideal, webcam, action or pal.")
     ] = "ideal",
+    shutter: Annotated[
+        str | None,
+        typer.Option(
+            metavar="KIND:MS",
+            help="How the camera exposes a picture, in milliseconds: rolling:READOUT:EXPOSURE, "
+            "interlaced:EXPOSURE or global:EXPOSURE; the rig's if left out.",
+            show_default=False,
+        ),
+    ] = None,
     overwrite: Overwrite = False,
     list_: Annotated[bool, typer.Option("--list", help="List the scenarios and exit.")] = False,
 ) -> None:
@@ -250,7 +259,9 @@ def simulate(
     if list_:
         body.print_scenarios(typer.echo)
     else:
-        body.simulate(scenario, rig, out, typer.echo, camera=camera, overwrite=overwrite)
+        body.simulate(
+            scenario, rig, out, typer.echo, camera=camera, shutter=shutter, overwrite=overwrite
+        )
 
 
 def demo(

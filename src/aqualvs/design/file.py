@@ -26,8 +26,9 @@ from aqualvs.geometry.transforms import SE3
 from aqualvs.optics.camera import Dome
 from aqualvs.optics.lens import Lens, LensModel
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig
-from aqualvs.optics.rigfile import load_rig
-from aqualvs.optics.rigschema import NotNegative, Number, Positive, StrictPart
+from aqualvs.optics.rigfile import load_rig, shutter_from_part
+from aqualvs.optics.rigschema import NotNegative, Number, Positive, ShutterPart, StrictPart
+from aqualvs.optics.shutter import AT_ONCE, Shutter
 from aqualvs.optics.water import seawater_index_vacuum
 from aqualvs.scanning.plane_fit import SharedError
 from aqualvs.yamlfile import parse_yaml, read_yaml
@@ -77,6 +78,7 @@ class CameraDesign(StrictPart):
     fov_deg: Annotated[float, Field(gt=0.0, lt=220.0, allow_inf_nan=False)] | None = None
     model: Literal["opencv", "fisheye"] = "opencv"
     rig: str | None = None
+    shutter: ShutterPart | None = None
 
 
 class DomeDesign(StrictPart):
@@ -265,7 +267,7 @@ def _design(file: DesignFile, folder: Path) -> Design:
             f"working_range_mm is {file.working_range_mm}; write the nearest range first, then a "
             "larger one"
         )
-    lens, size_px = _lens(file.camera, folder)
+    lens, size_px, shutter = _camera(file.camera, folder)
     position = np.array(file.lens.position_mm) * _MM
     dome = file.dome
     rig = Rig(
@@ -280,6 +282,7 @@ def _design(file: DesignFile, folder: Path) -> Design:
         n_water=_water_index(file.water),
         lasers=(),
         working_range=(near, far),
+        shutter=shutter,
     )
     rig.camera()
     return Design(
@@ -297,7 +300,8 @@ def _design(file: DesignFile, folder: Path) -> Design:
     )
 
 
-def _lens(camera: CameraDesign, folder: Path) -> tuple[Lens, tuple[int, int]]:
+def _camera(camera: CameraDesign, folder: Path) -> tuple[Lens, tuple[int, int], Shutter]:
+    given = AT_ONCE if camera.shutter is None else shutter_from_part(camera.shutter)
     if camera.rig is not None:
         if camera.width_px or camera.height_px or camera.fov_deg:
             raise OptionError(
@@ -305,7 +309,7 @@ def _lens(camera: CameraDesign, folder: Path) -> tuple[Lens, tuple[int, int]]:
                 "height_px and fov_deg"
             )
         rig = load_rig(folder / camera.rig, need_lasers=False)
-        return rig.lens, rig.size_px
+        return rig.lens, rig.size_px, rig.shutter if camera.shutter is None else given
     width, height, fov_deg = camera.width_px, camera.height_px, camera.fov_deg
     if width is None or height is None or fov_deg is None:
         raise OptionError(
@@ -321,7 +325,8 @@ def _lens(camera: CameraDesign, folder: Path) -> tuple[Lens, tuple[int, int]]:
     focal = 0.5 * width / (half if fisheye else math.tan(half))
     middle = (width - 1) / 2.0, (height - 1) / 2.0
     model = LensModel(camera.model)
-    return Lens(model=model, fx=focal, fy=focal, cx=middle[0], cy=middle[1]), (width, height)
+    lens = Lens(model=model, fx=focal, fy=focal, cx=middle[0], cy=middle[1])
+    return lens, (width, height), given
 
 
 def _water_index(water: WaterDesign) -> float:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from rich.table import Table
 
-from aqualvs.check.finding import escaped
+from aqualvs.check.finding import escaped, shutter_finding
 from aqualvs.design.calibrated import INDEX_ERROR, OffsetCost, camera_errors
 from aqualvs.design.changes import Change
 from aqualvs.design.judge import PredictedErrors, predict, together
@@ -39,7 +39,7 @@ def shown_ranges(working_range: tuple[float, float]) -> list[float]:
 
 
 def summary(design: Design) -> list[str]:
-    """Return the design in two or three lines."""
+    """Return the design in two or three lines; the third is on a shutter that is stated."""
     rig = design.rig
     width, height = rig.size_px
     fov = 2.0 * math.degrees(math.atan(0.5 * width / rig.lens.fx))
@@ -51,11 +51,13 @@ def summary(design: Design) -> list[str]:
     else:
         radius, thickness = rig.dome.inner_radius * 1e3, rig.dome.thickness * 1e3
         housing = f"dome {radius:g} mm + {thickness:g} mm"
+    shutter = shutter_finding(rig)
     return [
         f"{rig.name}: {width}x{height} px, {fov:.0f} degrees across in air, {housing}, lens at "
         f"({x:g}, {y:g}, {z:g}) mm, water n = {rig.n_water:.4f}",
         f"net: bars of {design.net.bar * 1e3:g} mm, twine {design.net.twine * 1e3:g} mm: "
         f"{design.net.lit_share:.0%} of a stripe falls on it",
+        *([] if shutter is None else [shutter.sentence]),
     ]
 
 

@@ -57,7 +57,7 @@ def visible_points(laboratory: Laboratory, dive: RenderedDive) -> FloatArray:
         counts = []
         for i, t in enumerate(scenario.times()):
             rng = np.random.default_rng([scenario.seed, i])
-            counts.append(len(render_with_visible(renderer, scenario.scene_at(t), t, rng)[1]))
+            counts.append(len(render_with_visible(renderer, scenario.scene_at, t, rng)[1]))
             laboratory.rendered(i + 1, scenario.n_frames)
         path.write_text("".join(f"{count}\n" for count in counts), encoding="utf-8")
     return np.loadtxt(path, ndmin=1)

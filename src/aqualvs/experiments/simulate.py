@@ -2,15 +2,23 @@
 
 import shlex
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
-from aqualvs.errors import OptionError
+from aqualvs.errors import OptionError, RigError
 from aqualvs.optics.rigfile import load_rig, save_rig
+from aqualvs.optics.shutter import Shutter, ShutterKind
 from aqualvs.optics.solved import with_exact_numbers
 from aqualvs.results.files import Claim, writing
 from aqualvs.simulation.calibration_set import CalibrationFiles, SetSize, simulate_calibration
 from aqualvs.simulation.cameras import SimulatedCamera, simulated_camera
-from aqualvs.simulation.dive import LEAD_S, simulate_dive, write_hole_truth, write_vehicle_log
+from aqualvs.simulation.dive import (
+    LEAD_S,
+    check_shutter,
+    simulate_dive,
+    write_hole_truth,
+    write_vehicle_log,
+)
 from aqualvs.simulation.scenario import Scenario
 from aqualvs.simulation.scenarios import example_rig, list_scenarios, load_scenario
 from aqualvs.terminal import progress
@@ -31,6 +39,7 @@ def simulate(
     echo: Callable[[str], object],
     *,
     camera: str,
+    shutter: str | None = None,
     overwrite: bool,
 ) -> None:
     """Render a scenario into a folder and print how to run it.
@@ -47,6 +56,8 @@ def simulate(
         Takes one line of text.
     camera : str
         Name of the camera that takes the pictures.
+    shutter : str or None
+        As `shutter_from_words` reads it; None takes the rig's.
     overwrite : bool
         Whether what is already there may be replaced.
 
@@ -61,10 +72,18 @@ def simulate(
         raise OptionError("--out: missing; give the folder to write")
     eye = simulated_camera(camera)
     if scenario == CALIBRATION:
+        if shutter is not None:
+            raise OptionError(
+                "--shutter: boards stand still, so it would show nothing; leave it out, or choose "
+                "a dive"
+            )
         _simulate_calibration(rig_file, out, echo, camera=eye, overwrite=overwrite)
         return
     course = load_scenario(scenario)
     rig = example_rig() if rig_file is None else load_rig(rig_file)
+    if shutter is not None:
+        rig = replace(rig, shutter=shutter_from_words(shutter, course.fps))
+    check_shutter(rig.shutter, course)
     claim = Claim("simulate", [out / name for name in _FILES], overwrite=overwrite)
     with claim, writing(out), progress(scenario, course.n_frames) as tick:
         _write_net_truth(course, out)
@@ -80,6 +99,43 @@ def simulate(
             f"then: aqualvs net {out / 'run'} --log {out / _LOG} --log-offset-s {LEAD_S:g}; "
             f"true holes: {out / _HOLES}"
         )
+
+
+def shutter_from_words(words: str, fps: float) -> Shutter:
+    """Return the shutter that the option `--shutter` names.
+
+    Parameters
+    ----------
+    words : str
+        `global`, `rolling:READOUT_MS` or `interlaced`, each with `:EXPOSURE_MS` at its end where
+        that is not 0.
+    fps : float
+        Frames a second; the fields of an interlaced picture are half a frame apart.
+
+    Raises
+    ------
+    OptionError
+        If they name no shutter.
+    """
+    kind, *numbers = words.split(":")
+    try:
+        milliseconds = [float(number) for number in numbers]
+        readout = 0.0
+        if kind == ShutterKind.ROLLING:
+            readout = 1e-3 * milliseconds.pop(0)
+        elif kind == ShutterKind.INTERLACED:
+            readout = 0.5 / fps
+        exposure = 1e-3 * milliseconds.pop(0) if milliseconds else 0.0
+        if milliseconds:
+            raise ValueError
+        return Shutter(kind=ShutterKind(kind), readout=readout, exposure=exposure)
+    except (ValueError, IndexError):
+        raise OptionError(
+            f"--shutter: {words!r} is none; write rolling:READOUT_MS:EXPOSURE_MS, "
+            "interlaced:EXPOSURE_MS or global:EXPOSURE_MS, such as rolling:20:8"
+        ) from None
+    except RigError as fault:
+        raise OptionError(f"--shutter: {words}: {fault}") from None
 
 
 def _write_net_truth(course: Scenario, out: Path) -> None:

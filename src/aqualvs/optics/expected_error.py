@@ -7,7 +7,7 @@ to point and from frame to frame; calibration errors are the same in all frames 
 averaging does not reduce them.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -256,11 +256,35 @@ class WallView:
         if not self.determined:
             return np.full((3, 3), np.nan)
         points, _ = self._weighed(self._points())
-        # Range, pitch and yaw by m = (x, y, z) at (0, 1/range, 0).
-        far = self.wall_range
-        by_m = np.array([[0.0, -(far**2), 0.0], [0.0, 0.0, far], [far, 0.0, 0.0]])
+        by_m = self._by_m()
         covariance: FloatArray = by_m @ np.linalg.inv(points.T @ points) @ by_m.T
         return covariance
+
+    def by_rates(self, row_times: Callable[[FloatArray], FloatArray]) -> FloatArray:
+        """Return the error (3, 3) of range, pitch and yaw by their rates; NaN where none.
+
+        All points are read as if they had been taken at the picture's middle.
+
+        Parameters
+        ----------
+        row_times : callable
+            From rows to the times of their exposure, in seconds from the picture's middle.
+        """
+        if not self.determined:
+            return np.full((3, 3), np.nan)
+        rows = np.concatenate([stripe.pixels[:, 1] for stripe in self.stripes if stripe.visible])
+        # At its time t a point lies on the plane m + t * rate, so m is off by what explains
+        # t * rate·X, of which the wall's rate is one column for each part of m.
+        points = self._points()
+        moved, _ = self._weighed(points * row_times(rows)[:, None])
+        by_rate = np.linalg.lstsq(self._weighed(points)[0], moved)[0]
+        errors: FloatArray = self._by_m() @ by_rate @ np.linalg.inv(self._by_m())
+        return errors
+
+    def _by_m(self) -> FloatArray:
+        """Return the change of range, pitch and yaw by m = (x, y, z) at (0, 1/range, 0)."""
+        far = self.wall_range
+        return np.array([[0.0, -(far**2), 0.0], [0.0, 0.0, far], [far, 0.0, 0.0]])
 
     def calibration(self, errors: PostureErrors) -> FloatArray:
         """Return the covariance (3, 3) by a rig's uncertainty; NaN where there is no posture."""

@@ -24,6 +24,7 @@ from aqualvs.optics.camera import (
 )
 from aqualvs.optics.dome import Dome
 from aqualvs.optics.lens import Lens
+from aqualvs.optics.shutter import AT_ONCE, Shutter
 
 DOME_FROM_CAM_NOMINAL: FloatArray = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 """Rotation of a camera mounted without error; columns are x, y and z of `cam` in `dome`.
@@ -100,6 +101,8 @@ class Rig:
     solved_from : mapping
         Records of calibrations (`aqualvs.optics.solved`); kept and written back, not interpreted
         here.
+    shutter : Shutter
+        When each row of a picture is exposed.
     """
 
     name: str
@@ -112,6 +115,7 @@ class Rig:
     lasers: tuple[Laser, ...]
     working_range: tuple[float, float]
     solved_from: Mapping[str, Any] = field(default_factory=dict)
+    shutter: Shutter = AT_ONCE
 
     def camera(self) -> Camera:
         """Return the camera as it looks into the outer medium."""

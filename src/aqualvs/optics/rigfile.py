@@ -23,7 +23,15 @@ from aqualvs.geometry.transforms import SE3, rotation_from_rotvec, rotvec_from_r
 from aqualvs.optics.camera import Dome
 from aqualvs.optics.lens import Lens, LensModel
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Laser, Rig, Window
-from aqualvs.optics.rigschema import VERSION, LaserPart, RigFile, WaterPart, parse_rig
+from aqualvs.optics.rigschema import (
+    VERSION,
+    LaserPart,
+    RigFile,
+    ShutterPart,
+    WaterPart,
+    parse_rig,
+)
+from aqualvs.optics.shutter import AT_ONCE, Shutter, ShutterKind
 from aqualvs.optics.solved import rig_uncertainty
 from aqualvs.optics.water import GREEN_NM, seawater_index_vacuum
 from aqualvs.yamlfile import carry_comments, parse_yaml, read_text, read_yaml, rig_text
@@ -93,7 +101,7 @@ def _uncopied(path: Path, fault: OSError) -> OutputError:
 
 __all__ = ["check_rig_place", "load_rig", "rig_from_mapping", "rig_to_mapping", "save_rig"]
 
-_MM = 1e3
+_MILLI = 1e3
 _ROTATION_DECIMALS = 12
 # Normals this close to unit length are kept as they are, so that loading and saving settle.
 _UNIT = 1e-14
@@ -211,8 +219,8 @@ def rig_to_mapping(rig: Rig) -> dict[str, Any]:
     }
     if rig.dome is not None:
         content["dome"] = {
-            "inner_radius_mm": _to_mm(rig.dome.inner_radius),
-            "thickness_mm": _to_mm(rig.dome.thickness),
+            "inner_radius_mm": _to_milli(rig.dome.inner_radius),
+            "thickness_mm": _to_milli(rig.dome.thickness),
             "n_acrylic": float(rig.dome.n_acrylic),
         }
     content["n_air"] = float(rig.n_air)
@@ -269,16 +277,36 @@ def _rig(file: RigFile) -> Rig:
             cy=camera.cy_px,
             distortion=_distortion(file),
         ),
-        dome_from_cam=SE3(turn @ DOME_FROM_CAM_NOMINAL, np.array(camera.position_mm) / _MM),
+        dome_from_cam=SE3(turn @ DOME_FROM_CAM_NOMINAL, np.array(camera.position_mm) / _MILLI),
         dome=None
         if dome is None
-        else Dome(dome.inner_radius_mm / _MM, dome.thickness_mm / _MM, dome.n_acrylic),
+        else Dome(dome.inner_radius_mm / _MILLI, dome.thickness_mm / _MILLI, dome.n_acrylic),
         n_air=file.n_air,
         n_water=_water_index(file.water, file.n_air),
         lasers=tuple(_laser(f"lasers[{i}]", part) for i, part in enumerate(file.lasers)),
-        working_range=(file.working_range_mm[0] / _MM, file.working_range_mm[1] / _MM),
+        working_range=(file.working_range_mm[0] / _MILLI, file.working_range_mm[1] / _MILLI),
         solved_from=dict(file.solved_from),
+        shutter=shutter_from_part(camera.shutter),
     )
+
+
+def shutter_from_part(part: ShutterPart) -> Shutter:
+    """Return the shutter that a file's `camera.shutter` describes.
+
+    Raises
+    ------
+    RigError
+        If its values contradict each other.
+    """
+    try:
+        return Shutter(
+            kind=ShutterKind(part.kind),
+            readout=part.readout_ms / _MILLI,
+            exposure=part.exposure_ms / _MILLI,
+            first_field=part.first_field,
+        )
+    except RigError as fault:
+        raise RigError(f"camera.shutter.{fault}") from None
 
 
 def _distortion(file: RigFile) -> tuple[float, ...]:
@@ -323,7 +351,7 @@ def _laser(place: str, part: LaserPart) -> Laser:
         return Laser(part.name, plane, wavelength_nm=part.wavelength_nm)
     place, face = f"{place}.window", part.window
     window = Window(
-        _plane(place, face.normal, face.offset_mm), np.array(face.source_mm, np.float64) / _MM
+        _plane(place, face.normal, face.offset_mm), np.array(face.source_mm, np.float64) / _MILLI
     )
     _check_window(place, face.source_mm, plane, window)
     return Laser(part.name, plane, window, part.wavelength_nm)
@@ -334,8 +362,9 @@ def _check_window(place: str, source_mm: list[float], sheet: Plane, window: Wind
     off = float(sheet.signed_distance(window.source))
     if abs(off) > _OFF_SHEET:
         raise RigError(
-            f"{place}.source_mm is {source_mm}, {abs(off) * _MM:.1f} mm off the laser's plane; the "
-            "light comes from a point in it: correct source_mm, or the laser's normal and offset_mm"
+            f"{place}.source_mm is {source_mm}, {abs(off) * _MILLI:.1f} mm off the laser's plane; "
+            "the light comes from a point in it: correct source_mm, or the laser's normal and "
+            "offset_mm"
         )
     across = abs(float(sheet.normal @ window.face.normal))
     if across > _MAX_ACROSS:
@@ -366,7 +395,7 @@ def _plane(place: str, normal: Sequence[float], offset_mm: float) -> Plane:
         )
     if abs(length - 1.0) > _UNIT:
         vector = vector / length
-    return Plane(vector, offset_mm / _MM)
+    return Plane(vector, offset_mm / _MILLI)
 
 
 def _check_whole(file: RigFile, need_lasers: bool) -> None:
@@ -400,7 +429,7 @@ def _check_whole(file: RigFile, need_lasers: bool) -> None:
 def _camera_mapping(rig: Rig) -> dict[str, Any]:
     lens, pose = rig.lens, rig.dome_from_cam
     turn = np.rad2deg(rotvec_from_rotation(pose.rotation @ DOME_FROM_CAM_NOMINAL.T))
-    return {
+    content: dict[str, Any] = {
         "model": LensModel(lens.model).value,
         "fx_px": float(lens.fx),
         "fy_px": float(lens.fy),
@@ -411,6 +440,21 @@ def _camera_mapping(rig: Rig) -> dict[str, Any]:
         # Adding zero turns -0.0 into 0.0.
         "rotation_deg": [round(float(value), _ROTATION_DECIMALS) + 0.0 for value in turn],
     }
+    if rig.shutter != AT_ONCE:
+        content["shutter"] = _shutter_mapping(rig.shutter)
+    return content
+
+
+def _shutter_mapping(shutter: Shutter) -> dict[str, Any]:
+    """Return the keys of a shutter, without those that say nothing about its kind."""
+    content: dict[str, Any] = {"kind": shutter.kind.value}
+    if shutter.readout > 0.0:
+        content["readout_ms"] = _to_milli(shutter.readout)
+    if shutter.exposure > 0.0:
+        content["exposure_ms"] = _to_milli(shutter.exposure)
+    if shutter.kind is ShutterKind.INTERLACED:
+        content["first_field"] = shutter.first_field
+    return content
 
 
 def _laser_mapping(laser: Laser) -> dict[str, Any]:
@@ -426,27 +470,27 @@ def _laser_mapping(laser: Laser) -> dict[str, Any]:
 def _plane_mapping(plane: Plane) -> dict[str, Any]:
     return {
         "normal": [float(value) for value in plane.normal],
-        "offset_mm": _to_mm(plane.offset),
+        "offset_mm": _to_milli(plane.offset),
     }
 
 
 def _all_to_mm(values: FloatArray | Sequence[float]) -> list[float]:
-    return [_to_mm(float(value)) for value in values]
+    return [_to_milli(float(value)) for value in values]
 
 
-def _to_mm(metres: float) -> float:
-    """Return millimetres with the fewest digits that load as the same number of metres.
+def _to_milli(value_in_si: float) -> float:
+    """Return milli-units with the fewest digits that load as the same number of metres or seconds.
 
-    A few numbers of metres are not a thousandth of any float; they come back off by one unit in the
+    A few numbers are not a thousandth of any float; they come back off by one unit in the
     last place.
     """
-    value = float(metres) * _MM
+    value = float(value_in_si) * _MILLI
     for digits in (15, 16, 17):
         short = float(f"{value:.{digits}g}")
-        if short / _MM == metres:
+        if short / _MILLI == value_in_si:
             return short
     neighbours = (math.nextafter(value, -math.inf), math.nextafter(value, math.inf))
-    return next((near for near in neighbours if near / _MM == metres), value)
+    return next((near for near in neighbours if near / _MILLI == value_in_si), value)
 
 
 def _plain(value: object, place: str) -> Any:

@@ -44,6 +44,15 @@ class ImagePart(StrictPart):
     height_px: Pixels
 
 
+class ShutterPart(StrictPart):
+    """`shutter` of the camera; all at once if left out."""
+
+    kind: Literal["global", "rolling", "interlaced"] = "global"
+    readout_ms: NotNegative = 0.0
+    exposure_ms: NotNegative = 0.0
+    first_field: Literal["top", "bottom"] = "top"
+
+
 class CameraPart(StrictPart):
     """`camera`: intrinsics, calibrated in air without the dome, and place in the dome."""
 
@@ -55,6 +64,7 @@ class CameraPart(StrictPart):
     distortion: list[Number] = []
     position_mm: Triple
     rotation_deg: Triple = [0.0, 0.0, 0.0]
+    shutter: ShutterPart = ShutterPart()
 
 
 class DomePart(StrictPart):
@@ -257,6 +267,9 @@ _EXAMPLES: dict[str, str] = {
     "distortion": "distortion: [-0.126, 0.083, 0.0006, -0.0004]",
     "position_mm": "position_mm: [0.0, 0.0, 0.0]",
     "rotation_deg": "rotation_deg: [0.0, 0.0, 0.0]",
+    "shutter": "shutter: {kind: rolling, readout_ms: 20, exposure_ms: 8}",
+    "readout_ms": "readout_ms: 20",
+    "exposure_ms": "exposure_ms: 8",
     "dome": "dome: {inner_radius_mm: 44.25, thickness_mm: 5.75, n_acrylic: 1.49}",
     "inner_radius_mm": "inner_radius_mm: 44.25",
     "thickness_mm": "thickness_mm: 5.75",
@@ -280,6 +293,7 @@ _EXAMPLES: dict[str, str] = {
 _PARTS: dict[str, type[BaseModel]] = {
     "image": ImagePart,
     "camera": CameraPart,
+    "shutter": ShutterPart,
     "dome": DomePart,
     "water": WaterPart,
     "lasers": LaserPart,

@@ -28,7 +28,7 @@ from aqualvs.optics.rig import Rig
 from aqualvs.optics.rigfile import rig_to_mapping, save_rig
 from aqualvs.optics.solved import with_exact_numbers
 from aqualvs.simulation.cameras import expose, spread
-from aqualvs.simulation.render import Renderer
+from aqualvs.simulation.render import Renderer, SceneAt
 from aqualvs.simulation.scenario import Scenario, parse_scenario
 from aqualvs.simulation.scenarios import example_rig
 from aqualvs.simulation.scene import Scene, SurfaceKind
@@ -429,20 +429,27 @@ def render_benchmark_dive(
         table = csv.writer(file)
         table.writerow(TRUTH_COLUMNS)
         for i, t in enumerate(scenario.times()):
-            scene = scenario.scene_at(t)
             rng = np.random.default_rng([scenario.seed, i])
-            image, lit = render_with_visible(renderer, scene, t, rng)
+            image, lit = render_with_visible(renderer, scenario.scene_at, t, rng)
             video.write(image)
-            table.writerow([i, f"{t:.4f}", *truth_cells(scene, lit)])
+            table.writerow([i, f"{t:.4f}", *truth_cells(scenario.scene_at(t), lit)])
             tick(1)
 
 
 def render_with_visible(
-    renderer: Renderer, scene: Scene, t: float, rng: np.random.Generator
+    renderer: Renderer, scene_at: SceneAt, t: float, rng: np.random.Generator
 ) -> tuple[NDArray[np.uint8], LitPoints]:
-    """Return the picture of a scene and its visible stripe points on the target."""
+    """Return the picture of a scene and its visible stripe points on the target.
+
+    The rig's shutter takes the picture; the points are those of its middle, visible to a camera
+    that exposes all rows at once.
+    """
+    scene = scene_at(t)
     radiance = renderer.radiance(scene, t)
-    image = expose(spread(radiance, scene.water, scene.sensor), scene.sensor, rng)
+    if renderer.rig.shutter.instant:
+        image = expose(spread(radiance, scene.water, scene.sensor), scene.sensor, rng)
+    else:
+        image = renderer.take(scene_at, t, rng).image
     lit = renderer.lit_points(scene, t)
     label = _LABELS[scene.target]
     if not np.any(lit.label == label):

@@ -13,10 +13,11 @@ from typing import TextIO
 
 import numpy as np
 
-from aqualvs.errors import OutputError
+from aqualvs.errors import OptionError, OutputError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.transforms import SE3
 from aqualvs.optics.rig import Rig
+from aqualvs.optics.shutter import Shutter, ShutterKind
 from aqualvs.simulation.cameras import IDEAL, SimulatedCamera
 from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenario import Scenario
@@ -150,15 +151,16 @@ def simulate_dive(
 ) -> DiveFiles:
     """Render a scenario with a rig and write `dive.mp4`, `truth.csv` and, if asked, lit points.
 
-    The same scenario, rig and seed give the same pictures. If it is interrupted, the frames
-    written so far and their truth can be read.
+    The same scenario, rig and seed give the same pictures, taken as the rig's shutter does. The
+    truth is that of each picture's middle, at the frame's time; so are lit points. If it is
+    interrupted, the frames written so far and their truth can be read.
 
     Parameters
     ----------
     scenario : Scenario
         Scenario to render.
     rig : Rig
-        Camera, dome, water and lasers.
+        Camera with its shutter, dome, water and lasers.
     out_dir : Path
         Made if it is missing; files of an earlier dive in it are overwritten.
     progress : callable, optional
@@ -178,8 +180,9 @@ def simulate_dive(
     OutputError
         If the folder or a file cannot be written.
     RigError, OptionError
-        If rig, scenario or options make no sense.
+        If rig, scenario or options make no sense, or a picture takes longer than a frame.
     """
+    check_shutter(rig.shutter, scenario)
     _make_folder(out_dir)
     video, truth = out_dir / "dive.mp4", out_dir / "truth.csv"
     renderer = Renderer(rig, threads=threads or os.cpu_count() or 1, camera=camera)
@@ -192,7 +195,8 @@ def simulate_dive(
         table.writerow(TRUTH_COLUMNS)
         for i, t in enumerate(scenario.times()):
             scene = scenario.scene_at(t)
-            picture = renderer.render(scene, t, np.random.default_rng([scenario.seed, i]))
+            rng = np.random.default_rng([scenario.seed, i])
+            picture = renderer.take(scenario.scene_at, t, rng)
             writer.write(picture.image)
             table.writerow(truth_row(i, t, scene, rig, picture.lit))
             if i in point_frames:
@@ -200,6 +204,26 @@ def simulate_dive(
             if progress is not None:
                 progress(i + 1, scenario.n_frames)
     return DiveFiles(video, truth, tuple(points), scenario.n_frames)
+
+
+def check_shutter(shutter: Shutter, scenario: Scenario) -> None:
+    """Refuse a shutter that takes longer for a picture than a scenario's frames are apart.
+
+    Raises
+    ------
+    OptionError
+        If it does.
+    """
+    # Two fields make a frame, and the second is as far from the next frame's first.
+    needed = shutter.readout * (2.0 if shutter.kind is ShutterKind.INTERLACED else 1.0)
+    needed = max(needed, shutter.exposure)
+    # NTSC's fields are stated to a few digits.
+    if needed > (1.0 + 1e-3) / scenario.fps:
+        raise OptionError(
+            f"the {shutter.kind.value} shutter takes {1e3 * needed:g} ms for a picture, but at "
+            f"{scenario.fps:g} frames a second there are {1e3 / scenario.fps:g} ms; lower the "
+            "scenario's fps, or give a faster shutter"
+        )
 
 
 def _make_folder(folder: Path) -> None:

@@ -9,11 +9,12 @@ Marine snow is added after that: particles that drift before the camera and ligh
 sheet meets them (`add_snow`).
 """
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,7 @@ from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel
 from aqualvs.geometry.linear_algebra import Vec, combine, row3, unit
 from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import Rig
+from aqualvs.optics.shutter import ShutterKind
 from aqualvs.simulation.cameras import IDEAL, CornerRays, SimulatedCamera, corner_rays
 from aqualvs.simulation.lasers import LaserSource, Sheets, default_sources, light_on_points
 from aqualvs.simulation.scene import Scene
@@ -176,6 +178,16 @@ def _tiles_of(
 
 _ZERO = (0.0, 0.0, 0.0)
 
+SceneAt: TypeAlias = Callable[[float], Scene]
+"""From a time in seconds to the scene at that time, such as `Scenario.scene_at`."""
+
+# Rows of a rolling picture that are rendered at one instant lie within this time; stripes that
+# move by 300 px a second are off by 0.04 px at most, to and fro.
+_BAND_S = 0.25e-3
+# Instants of an exposure are this near to each other: 0.6 px at the same speed, less than the
+# width of a stripe.
+_INSTANT_S = 2e-3
+
 
 @dataclass(frozen=True, slots=True)
 class RenderedFrame:
@@ -231,11 +243,73 @@ class Renderer:
     def render(
         self, scene: Scene, t: float = 0.0, rng: np.random.Generator | None = None
     ) -> RenderedFrame:
-        """Return the picture at time `t` and its truth; without `rng` it has no noise."""
+        """Return the picture at time `t` and its truth; without `rng` it has no noise.
+
+        The whole picture is taken at one instant, whatever the rig's shutter; see `take`.
+        """
         surfaces, sheets = self._pack(scene, t)
         light = self._radiance(scene, t, surfaces, sheets)
         image = self.camera.picture(light, scene.water, scene.sensor, t, rng)
         return RenderedFrame(image, find_lit_points(self.rig, surfaces, sheets))
+
+    def take(
+        self, scene_at: SceneAt, t: float = 0.0, rng: np.random.Generator | None = None
+    ) -> RenderedFrame:
+        """Return the picture with its middle at time `t`, as the rig's shutter takes it.
+
+        Truth and marine snow are those of the middle. Each field of an interlaced picture has its
+        own blur and noise, as if the other one did not exist.
+
+        Parameters
+        ----------
+        scene_at : callable
+            Scene at any time from the first row to the last.
+        t : float
+            In seconds.
+        rng : Generator, optional
+            Without it the picture has no noise.
+        """
+        scene, shutter = scene_at(t), self.rig.shutter
+        if shutter.instant:
+            return self.render(scene, t, rng)
+        if shutter.kind is ShutterKind.INTERLACED:
+            half = 0.5 * shutter.readout
+            fields = [self._developed(scene_at, at, rng) for at in (t - half, t + half)]
+            image = fields[1]
+            image[shutter.first_row :: 2] = fields[0][shutter.first_row :: 2]
+        else:
+            image = self._developed(scene_at, t, rng)
+        return RenderedFrame(image, self.lit_points(scene, t))
+
+    def _developed(
+        self, scene_at: SceneAt, t: float, rng: np.random.Generator | None
+    ) -> NDArray[np.uint8]:
+        """Return the picture of rows that are exposed around time `t`."""
+        scene = scene_at(t)
+        light = self._exposed(scene_at, t)
+        add_snow(light, self.rig.camera(), self.camera.light(scene), t, self._pack(scene, t)[1])
+        return self.camera.picture(light, scene.water, scene.sensor, t, rng)
+
+    def _exposed(self, scene_at: SceneAt, t: float) -> NDArray[np.float32]:
+        """Return the mean light of every row over its exposure, without marine snow."""
+        width, height = self.rig.size_px
+        shutter = self.rig.shutter
+        n_bands = 1
+        if shutter.kind is ShutterKind.ROLLING:
+            n_bands = min(math.ceil(shutter.readout / _BAND_S), height)
+        n_instants = max(math.ceil(shutter.exposure / _INSTANT_S), 1)
+        instants = ((np.arange(n_instants) + 0.5) / n_instants - 0.5) * shutter.exposure
+        out = np.zeros((height, width, 3), dtype=np.float32)
+        now = np.zeros_like(out)
+        for low, high in pairwise(np.linspace(0, height, n_bands + 1).astype(int).tolist()):
+            middle = t
+            if shutter.kind is ShutterKind.ROLLING:
+                middle += float(shutter.row_times(0.5 * (low + high - 1), height))
+            for at in (middle + instants).tolist():
+                scene = scene_at(at)
+                self._trace(now, (low, high), scene, at, *self._pack(scene, at), self._corners)
+                out[low:high] += now[low:high] / np.float32(n_instants)
+        return out
 
     def radiance(
         self, scene: Scene, t: float = 0.0, where: BoolArray | None = None
@@ -278,22 +352,33 @@ class Renderer:
         where: BoolArray | None = None,
     ) -> NDArray[np.float32]:
         width, height = self.rig.size_px
-        camera = self.rig.camera()
         out = np.zeros((height, width, 3), dtype=np.float32)
-        members = tile_members(camera, self.rig.size_px, surfaces)
+        rays = self._corners if where is None else self._corners.only(where)
+        self._trace(out, (0, height), scene, t, surfaces, sheets, rays)
+        add_snow(out, self.rig.camera(), self.camera.light(scene), t, sheets)
+        return out
+
+    def _trace(
+        self,
+        out: NDArray[np.float32],
+        rows: tuple[int, int],
+        scene: Scene,
+        t: float,
+        surfaces: Surfaces,
+        sheets: Sheets,
+        rays: CornerRays,
+    ) -> None:
+        """Write the light of some rows, from the first to before the last, into a picture."""
+        members = tile_members(self.rig.camera(), self.rig.size_px, surfaces)
         everything = np.arange(len(surfaces.ellipsoids), dtype=np.int64)
-        light, rays = pack_light(self.camera.light(scene), t), self._corners
-        if where is not None:
-            rays = rays.only(where)
+        light = pack_light(self.camera.light(scene), t)
 
         def render_band(band: tuple[int, int]) -> None:
             _render(band, rays, self.samples, surfaces, members, everything, sheets, light, out)
 
-        edges = np.linspace(0, height, self.threads + 1).astype(int).tolist()
+        edges = np.linspace(*rows, self.threads + 1).astype(int).tolist()
         with ThreadPoolExecutor(self.threads) as pool:
             list(pool.map(render_band, pairwise(edges)))
-        add_snow(out, camera, self.camera.light(scene), t, sheets)
-        return out
 
 
 @inline_borrowing_kernel

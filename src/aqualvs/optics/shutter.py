@@ -1,0 +1,119 @@
+"""The shutter of a camera: when each row of a picture is exposed.
+
+Times count from the picture's middle: half-way between the exposures of the first and the last row,
+or of the two fields.
+"""
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from aqualvs.errors import RigError
+from aqualvs.geometry.arrays import FloatArray
+
+LONGEST_S = 0.5
+"""Longest readout and exposure of a video camera, in seconds; larger numbers are in other units."""
+
+Field: TypeAlias = Literal["top", "bottom"]
+
+
+class ShutterKind(StrEnum):
+    """Order in which rows are exposed."""
+
+    GLOBAL = "global"
+    """All rows at once."""
+    ROLLING = "rolling"
+    """One row after the other, from the top."""
+    INTERLACED = "interlaced"
+    """Every other row at once, then the rows between them."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Shutter:
+    """Exposure of a picture, in seconds.
+
+    Attributes
+    ----------
+    kind : ShutterKind
+    readout : float
+        From the first row to the last (rolling), or from the first field to the second
+        (interlaced); 0 for a global shutter.
+    exposure : float
+        Time that each row gathers light; 0 where it is not stated.
+    first_field : {"top", "bottom"}
+        Field that an interlaced camera exposes first: "top" holds rows 0, 2, 4 and so on.
+
+    Raises
+    ------
+    RigError
+        If the values contradict each other; the message names keys of the rig file.
+    """
+
+    kind: ShutterKind = ShutterKind.GLOBAL
+    readout: float = 0.0
+    exposure: float = 0.0
+    first_field: Field = "top"
+
+    def __post_init__(self) -> None:
+        for key, value in (("readout_ms", self.readout), ("exposure_ms", self.exposure)):
+            if not 0.0 <= value <= LONGEST_S:
+                raise RigError(
+                    f"{key} is {1e3 * value:g}; write milliseconds, 0 to {1e3 * LONGEST_S:g}"
+                )
+        if self.kind is ShutterKind.GLOBAL and self.readout > 0.0:
+            raise RigError(
+                f"readout_ms is {1e3 * self.readout:g}, but a global shutter exposes all rows at "
+                "once; leave it out, or write kind: rolling"
+            )
+        if self.kind is not ShutterKind.GLOBAL and self.readout == 0.0:
+            what = (
+                "from the first row to the last, such as 20"
+                if self.kind is ShutterKind.ROLLING
+                else "from the first field to the second: 20 for PAL, 16.683 for NTSC"
+            )
+            raise RigError(f"readout_ms is missing or 0; write the milliseconds {what}")
+        if self.kind is not ShutterKind.INTERLACED and self.first_field != "top":
+            raise RigError(
+                f"first_field is for interlaced cameras, but kind is {self.kind.value}; leave it "
+                "out, or write kind: interlaced"
+            )
+        # A sensor starts its next field when it has read out the last one.
+        if self.kind is ShutterKind.INTERLACED and self.exposure > self.readout:
+            raise RigError(
+                f"exposure_ms is {1e3 * self.exposure:g}, longer than the {1e3 * self.readout:g} "
+                "ms from field to field; write how long one field is exposed"
+            )
+
+    @property
+    def instant(self) -> bool:
+        """Whether the whole picture is taken at one instant, as far as it is known."""
+        return self.readout == 0.0 and self.exposure == 0.0
+
+    @property
+    def first_row(self) -> int:
+        """First row of the field that is exposed first."""
+        return 0 if self.first_field == "top" else 1
+
+    def row_times(self, rows: ArrayLike, height: int) -> FloatArray:
+        """Return the middles of the exposures of rows, in seconds from the picture's middle.
+
+        Parameters
+        ----------
+        rows : array-like
+            Rows of the picture, the centre of the top one being 0.
+        height : int
+            Of the picture, in pixels.
+        """
+        rows = np.asarray(rows, np.float64)
+        if self.kind is ShutterKind.INTERLACED:
+            early = np.rint(rows) % 2.0 == self.first_row
+            return np.where(early, -0.5, 0.5) * self.readout
+        share: FloatArray = (rows + 0.5) / height - 0.5
+        return share * self.readout
+
+
+AT_ONCE = Shutter()
+"""Shutter of a rig file that states none."""
