@@ -112,7 +112,7 @@ def test_distance_is_where_the_plane_meets_the_axis() -> None:
 
 
 def test_considered_numbers_pass_their_errors_on() -> None:
-    """The gain of the consider covariance is what a shift of a considered number does to a solve."""
+    """The gain of the covariance is what a shift of a considered number does to a solve."""
     rig, rng = example_rig(), np.random.default_rng(5)
     shoot = rail(rig, AIR, "exact", rng, noise_px=0.05)
     options = DomeOptions(refine_intrinsics=False)
