@@ -23,6 +23,7 @@ from aqualvs.cli.command import CheckedCommand
 from aqualvs.cli.design import design
 from aqualvs.cli.experiments import benchmark, reproduce, score
 from aqualvs.cli.follow import follow, tune
+from aqualvs.cli.formats import export, import_file, schema
 from aqualvs.cli.live import doctor, live
 from aqualvs.cli.run import check, demo, figures, net, net_change, report, run, simulate
 from aqualvs.errors import AqualvsError
@@ -178,6 +179,21 @@ _command(
     help="Print a calibration target, true to scale, with its yaml: OUT.pdf and OUT.yaml.",
     epilog="Example: aqualvs board charuco --paper a3 -o board",
 )(board)
+_command(
+    "import",
+    help="Make a rig file of the calibration that another program made: ROS, OpenCV, Kalibr, "
+    "mrcal, COLMAP, Refractive COLMAP.",
+    epilog="Example: aqualvs import camera_info.yaml --as camera -o rig.yaml",
+)(import_file)
+_command(
+    help="Write a rig's camera as a calibration file of another program.",
+    epilog="Example: aqualvs export rig.yaml --to colmap-underwater -o cameras.txt",
+)(export)
+_command(
+    help="Print the JSON Schema of rig files, with which editors complete and check them; put it "
+    "in a file with > rig.schema.json.",
+    epilog="Example: aqualvs schema",
+)(schema)
 _command(
     help="Say in words whether a rig is sane and what it can measure.",
     epilog="Example: aqualvs check rig.yaml --against last",
