@@ -242,6 +242,15 @@ def test_one_of_several_cameras_is_chosen_by_name(tmp_path):
         read_camera(path, camera="cam7")
 
 
+@pytest.mark.parametrize(
+    ("written", "read"), [("15021204", "15021204"), ("''", "file"), ("front", "front")]
+)
+def test_a_camera_may_be_named_by_its_serial_number(tmp_path, written, read):
+    path = tmp_path / "file.yaml"
+    path.write_text(ROS.replace("camera_name: example", f"camera_name: {written}"))
+    assert rig_of_camera(read_camera(path), str(path)).name == read
+
+
 def test_a_file_storage_without_its_model_is_read_as_told(tmp_path):
     path = tmp_path / "camera.yml"
     path.write_text(OPENCV.replace("fisheye_model: 0\n", ""))

@@ -66,6 +66,12 @@ class Entries:
             raise RigError(f"{self.place}{key} is {shown(value)}; write a word")
         return value.strip()
 
+    def name(self, key: str, default: str) -> str:
+        """Return the name at a key, which may be a serial number; the default if there is none."""
+        value = self.content.get(key)
+        named = isinstance(value, str | int) and not isinstance(value, bool)
+        return (str(value).strip() if named else "") or default
+
     def number(self, *keys: str) -> float:
         """Return the number at the first of some keys that there is."""
         key = self.first(keys)

@@ -52,7 +52,7 @@ def read_ros(text: str, source: str) -> ForeignCamera:
             f"{' or '.join(map(str, _ROS_MODELS[model]))}"
         )
     return ForeignCamera(
-        name=entries.word("camera_name") if entries.has("camera_name") else Path(source).stem,
+        name=entries.name("camera_name", Path(source).stem),
         size_px=(entries.whole("image_width", "width"), entries.whole("image_height", "height")),
         lens=opencv_lens(
             entries.core("camera_matrix", "k", "K"), distortion, fisheye=model == _FISHEYE
@@ -170,7 +170,7 @@ def read_opencv(text: str, source: str, *, model: str | None = None) -> ForeignC
         )
     else:
         fisheye = model == "fisheye"
-    name = entries.word("camera_name") if entries.has("camera_name") else Path(source).stem
+    name = entries.name("camera_name", Path(source).stem)
     lens = opencv_lens(core, distortion, fisheye=fisheye)
     return ForeignCamera(name=name, size_px=size_px, lens=lens)
 
