@@ -11,7 +11,7 @@ from aqualvs.simulation.scenarios import example_rig
 
 
 def request(**given):
-    nothing = dict.fromkeys((field.name for field in fields(DomeRequest)))
+    nothing = dict.fromkeys(field.name for field in fields(DomeRequest))
     return DomeRequest(**nothing | given)
 
 
