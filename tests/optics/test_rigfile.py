@@ -606,4 +606,4 @@ def test_the_documentation_names_every_key() -> None:
     table = page.split("## Keys")[1].split("## In Python")[0]
     # `fy_px` and its like stand behind their part's first key; `n` is `water.n`.
     named = {cell.rsplit(".", 1)[-1] for cell in re.findall(r"`([a-z_.\[\]]+)`", table)}
-    assert keys - named == {"image", "camera", "water", "lasers"}
+    assert keys - named == {"image", "camera", "lasers"}
