@@ -18,7 +18,7 @@ from aqualvs.design.changes import Change
 from aqualvs.design.judge import PredictedErrors, predict, together
 from aqualvs.design.settings import Design, Mount
 from aqualvs.geometry.arrays import BoolArray, FloatArray
-from aqualvs.report.figure_style import new_canvas
+from aqualvs.report.figure_style import BLUE, DARK, GREY, ORANGE, STYLE, new_canvas
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -250,16 +250,6 @@ def _table(title: str, first: str = "", right: bool = False) -> Table:
 ERRORS_PNG, PICTURE_PNG = "errors.png", "picture.png"
 
 _DPI = 160
-_BLUE, _ORANGE, _DARK, _GREY = "#1f4fc8", "#d55e00", "#23272e", "#8a8f98"
-_STYLE: dict[Any, Any] = {
-    "font.size": 9.0,
-    "axes.linewidth": 0.7,
-    "axes.grid": True,
-    "grid.color": "#e4e6ea",
-    "grid.linewidth": 0.6,
-    "legend.fontsize": 8.0,
-    "legend.frameon": False,
-}
 # Errors by the camera's tolerances change little with range.
 _N_RANGES, _N_CAMERA, _N_ALONG = 60, 5, 40
 
@@ -282,7 +272,7 @@ def draw_figures(design: Design, out: Path) -> list[Path]:
     from matplotlib import rc_context
 
     written = []
-    with rc_context(_STYLE):
+    with rc_context(STYLE):
         for name, draw in ((ERRORS_PNG, _errors), (PICTURE_PNG, _picture)):
             draw(design).savefig(out / name, dpi=_DPI)
             written.append(out / name)
@@ -300,9 +290,9 @@ def _errors(design: Design) -> "Figure":
     figure = new_canvas(7.2, 2.9)
     panels = figure.subplots(1, 3, sharex=True)
     kinds = (
-        ("net, one frame", told.net, _ORANGE, "-"),
-        ("wall, one frame", told.wall, _BLUE, "-"),
-        ("tolerances", systematic, _DARK, "--"),
+        ("net, one frame", told.net, ORANGE, "-"),
+        ("wall, one frame", told.wall, BLUE, "-"),
+        ("tolerances", systematic, DARK, "--"),
     )
     percent, degrees = 100.0 / ranges, np.full_like(ranges, 180.0 / np.pi)
     goal = 100.0 * design.goals.range_share, np.degrees(design.goals.angle)
@@ -312,13 +302,12 @@ def _errors(design: Design) -> "Figure":
     ):
         for name, sigma, colour, style in kinds:
             axes.plot(ranges * 1e3, sigma[:, i] * unit, style, color=colour, label=name)
-        axes.axhline(wanted, color=_GREY, linewidth=0.8, linestyle=":", label="goal")
+        axes.axhline(wanted, color=GREY, linewidth=0.8, linestyle=":", label="goal")
         axes.set_yscale("log")
         axes.set_title(f"one sigma of {title}", fontsize=9.0)
         axes.set_xlabel("range (mm)")
         axes.yaxis.set_major_formatter(_plain())
         axes.grid(True, which="both")
-        axes.spines[["top", "right"]].set_visible(False)
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4)
     return figure
@@ -386,6 +375,6 @@ def _label_lasers(axes: "Axes", design: Design, ranges: FloatArray) -> None:
             ha="center",
             va="center",
             fontsize=8.0,
-            color=_DARK,
-            bbox={"boxstyle": "round,pad=0.2", "facecolor": "white", "edgecolor": _GREY, "lw": 0.5},
+            color=DARK,
+            bbox={"boxstyle": "round,pad=0.2", "facecolor": "white", "edgecolor": GREY, "lw": 0.5},
         )

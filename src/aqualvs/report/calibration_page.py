@@ -165,7 +165,7 @@ def _bar(view: ViewRow, usual: float, wrong: bool) -> Raw:
     if usual > 0.0:
         x = _BAR / _BAR_REACH
         dashed = ' stroke-width="1.2" stroke-dasharray="3 2"'
-        body.append(draw.line(x, 0.0, x, _BAR_HEIGHT, colour="#1c2a33", more=dashed))
+        body.append(draw.line(x, 0.0, x, _BAR_HEIGHT, colour="var(--ink)", more=dashed))
     return draw.svg(_BAR, _BAR_HEIGHT, body, alt=f"{view.rms_px:.3f} px", kind="bar")
 
 
