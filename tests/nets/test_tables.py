@@ -312,7 +312,7 @@ def test_the_map_shows_a_hole_beyond_the_stretches(tmp_path):
 
 
 def test_a_hole_is_found_again_in_the_picture_of_its_look(wall, folder, tmp_path):
-    first, second = rows(folder / "holes.csv")
+    first, _ = rows(folder / "holes.csv")
     # The vehicle looks square to the net at the hole, half a metre away.
     camera = example_rig().camera()
     (u, v), _ = camera.project(np.array([0.0, 0.5, 0.0]))
