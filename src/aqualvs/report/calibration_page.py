@@ -161,7 +161,7 @@ def _bar(view: ViewRow, usual: float, wrong: bool) -> Raw:
     body = [draw.box(0.0, 2.0, length, _BAR_HEIGHT - 4.0, fill=colour, stroke="none")]
     if view.rms_px > reach:
         gap = ' stroke-width="3"'
-        body.append(draw.line(_BAR - 16, _BAR_HEIGHT, _BAR - 10, 0, colour="#fff", more=gap))
+        body.append(draw.line(_BAR - 16, _BAR_HEIGHT, _BAR - 10, 0, colour=draw.PAPER, more=gap))
     if usual > 0.0:
         x = _BAR / _BAR_REACH
         dashed = ' stroke-width="1.2" stroke-dasharray="3 2"'

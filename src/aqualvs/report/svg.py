@@ -18,9 +18,8 @@ from aqualvs.report.html import Raw
 from aqualvs.text import signed
 
 # Those of the page, light or dark (`colours.css`); outliers as in pictures.
-ACCENT, QUIET, EDGE, GRID, BAND = (
-    f"var(--{x})" for x in ("accent", "quiet", "quiet", "line", "band")
-)
+ACCENT, QUIET, EDGE = "var(--accent)", "var(--quiet)", "var(--quiet)"
+GRID, BAND, PAPER = "var(--line)", "var(--band)", "var(--paper)"
 OUTLIER = "#D55E00"
 
 _WIDTH, _HEIGHT, _LEFT, _RIGHT, _FOOT = 900.0, 300.0, 84.0, 16.0, 54.0
