@@ -20,6 +20,7 @@ from aqualvs.check.finding import (
     check_errors,
     count_text,
     error_table,
+    error_words,
     expected_errors,
     findings_table,
     index_sigma,
@@ -275,13 +276,17 @@ def run_check(path: Path, console: Console | None = None) -> int:
     except RigError as error:
         raise RigError(f"{path}: {error}") from None
     console.print(f"{path}: rig '{rig.name}'", style="bold", markup=False, highlight=False)
-    console.print(findings_table(findings))
     errors = expected_errors(rig, completed_uncertainty(rig))
+    bad = any(finding.severity is Severity.BAD for finding in findings)
+    words = [_verdict(findings), *error_words(errors)]
+    for line in words:
+        console.print(line, style="bold red" if bad else "bold", highlight=False, soft_wrap=True)
+    # What needs a hand first; else in the order in which light passes the rig.
+    order = (Severity.BAD, Severity.WARN, Severity.OK)
+    console.print(findings_table(sorted(findings, key=lambda one: order.index(one.severity))))
     if errors:
         console.print(sensitivity_table(rig, errors))
         console.print(error_table(errors))
-    bad = any(finding.severity is Severity.BAD for finding in findings)
-    console.print(_verdict(findings), style="bold red" if bad else "bold", highlight=False)
     return EXIT_BAD if bad else EXIT_SANE
 
 
