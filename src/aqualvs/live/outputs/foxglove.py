@@ -15,11 +15,12 @@ import numpy as np
 
 from aqualvs.errors import OptionError, OutputError
 from aqualvs.geometry.arrays import FloatArray
+from aqualvs.geometry.planes import upright_axes
 from aqualvs.geometry.transforms import rotvec_from_rotation
 from aqualvs.optics.rig import Laser, Rig
 from aqualvs.recording import messages
 from aqualvs.recording.encoding import HEALTH, PICTURE, POINTS, POSTURE, RIG, RecordedTopic, jpeg_of
-from aqualvs.recording.messages import FRAME_ID, RecordClock
+from aqualvs.recording.messages import FRAME_ID, RateLimit, RecordClock
 from aqualvs.recording.sample import LiveSample
 from aqualvs.scanner import ScannerOptions
 from aqualvs.scanning.posture import Posture
@@ -128,10 +129,7 @@ def _plate(posture: Posture) -> "CubePrimitive":
 
     side = _SIDE_SHARE * posture.range
     foot = posture.range * posture.normal_in_dome
-    across = np.cross(posture.normal_in_dome, (0.0, 0.0, 1.0))
-    across /= max(float(np.linalg.norm(across)), 1e-9)
-    up = np.cross(across, posture.normal_in_dome)
-    axes = np.stack([across, posture.normal_in_dome, up], axis=1)
+    axes = upright_axes(posture.normal_in_dome)
     return CubePrimitive(
         pose=_pose(axes, foot), size=Vector3(x=side, y=1e-3, z=side), color=Color(**_rgba(_BLUE))
     )
@@ -268,8 +266,8 @@ class FoxgloveOutput:
         self._channels = {topic: _channel(foxglove, topic, context) for topic in shown}
         self._transforms = foxglove.channels.FrameTransformsChannel(_TRANSFORMS, context=context)
         self._scene = foxglove.channels.SceneUpdateChannel(_SCENE, context=context)
-        self._picture_due, self._points_due = _Rate(picture_hz), _Rate(points_hz)
-        self._seldom_due = _Rate(_SELDOM_HZ)
+        self._picture_due, self._points_due = RateLimit(picture_hz), RateLimit(points_hz)
+        self._seldom_due = RateLimit(_SELDOM_HZ)
         try:
             self._server = foxglove.start_server(
                 name="aqualvs",
@@ -344,7 +342,7 @@ class FoxgloveOutput:
         topic: RecordedTopic,
         at_ns: int,
         content: Callable[[], bytes],
-        due: "_Rate | None" = None,
+        due: RateLimit | None = None,
     ) -> None:
         """Send a message if its topic has viewers and it is due."""
         channel = self._channels[topic]
@@ -384,22 +382,6 @@ class _Viewers:
             left = self._watched.pop(client.id, 1) - 1
             if left > 0:
                 self._watched[client.id] = left
-
-
-class _Rate:
-    """Rate limit of a message."""
-
-    def __init__(self, hz: float) -> None:
-        # A tenth of a period early rather than a whole frame late.
-        self._every_ns = round(0.9e9 / hz) if hz else None
-        self._from_ns = 0
-
-    def at(self, stamp_ns: int) -> bool:
-        """Return whether the message is due; if so, start the next period."""
-        if self._every_ns is None or stamp_ns < self._from_ns:
-            return False
-        self._from_ns = stamp_ns + self._every_ns
-        return True
 
 
 def _sdk() -> Any:
