@@ -245,7 +245,8 @@ def test_nothing_is_made_that_nobody_watches(output, samples, monkeypatch):
 
 
 def test_lines_and_plate_lie_where_the_points_are(samples):
-    from aqualvs.live.outputs.foxglove import laser_lines, quaternion
+    from aqualvs.geometry.transforms import quaternion_from_rotation
+    from aqualvs.live.outputs.foxglove import laser_lines
 
     sample = samples[0]
     posture = sample.scan.posture
@@ -256,7 +257,7 @@ def test_lines_and_plate_lie_where_the_points_are(samples):
         # On the target, to what a single point at its edge is off.
         assert np.allclose(ends @ posture.normal_in_dome, posture.range, atol=0.03)
     turn = sample.rig.dome_from_cam.rotation
-    x, y, z, w = quaternion(turn)
+    x, y, z, w = quaternion_from_rotation(turn)
     again = np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
@@ -265,7 +266,7 @@ def test_lines_and_plate_lie_where_the_points_are(samples):
         ]
     )
     assert np.allclose(again, turn, atol=1e-12)
-    assert quaternion(np.eye(3)) == (0.0, 0.0, 0.0, 1.0)
+    assert quaternion_from_rotation(np.eye(3)) == (0.0, 0.0, 0.0, 1.0)
 
 
 @pytest.fixture(scope="module")

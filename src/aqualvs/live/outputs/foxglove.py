@@ -5,7 +5,6 @@ shows both. In addition there are coordinate frames and a scene for the 3D panel
 laser lines beside the points. Messages that nobody watches are not made.
 """
 
-import math
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -16,7 +15,7 @@ import numpy as np
 from aqualvs.errors import OptionError, OutputError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.planes import upright_axes
-from aqualvs.geometry.transforms import rotvec_from_rotation
+from aqualvs.geometry.transforms import quaternion_from_rotation
 from aqualvs.optics.rig import Laser, Rig
 from aqualvs.recording import messages
 from aqualvs.recording.encoding import HEALTH, PICTURE, POINTS, POSTURE, RIG, RecordedTopic, jpeg_of
@@ -115,14 +114,6 @@ def laser_lines(
     return found
 
 
-def quaternion(rotation: FloatArray) -> tuple[float, float, float, float]:
-    """Return a rotation matrix as x, y, z, w."""
-    turn = rotvec_from_rotation(rotation)
-    angle = float(np.linalg.norm(turn))
-    x, y, z = turn * (0.5 * np.sinc(angle / (2.0 * math.pi)))
-    return float(x), float(y), float(z), math.cos(0.5 * angle)
-
-
 def _plate(posture: Posture) -> "CubePrimitive":
     """Return the target as a thin square about the foot of the perpendicular."""
     from foxglove.messages import Color, CubePrimitive, Vector3
@@ -191,7 +182,7 @@ def _vector(values: FloatArray) -> "Vector3":
 def _turn(rotation: FloatArray) -> "Quaternion":
     from foxglove.messages import Quaternion
 
-    x, y, z, w = quaternion(rotation)
+    x, y, z, w = quaternion_from_rotation(rotation)
     return Quaternion(x=x, y=y, z=z, w=w)
 
 
