@@ -34,6 +34,7 @@ import aqualvs
 from aqualvs.cli import main as cli
 from aqualvs.cli.main import main
 from aqualvs.errors import SourceError
+from complaints import complaints
 from repository import ROOT
 
 CPU_S = 20
@@ -152,7 +153,7 @@ def _judged(case: Case, status: int, n_bytes: int, err: str) -> str:
     if os.WIFSIGNALED(status):
         return f"killed by {signal.Signals(os.WTERMSIG(status)).name}"
     code = os.WEXITSTATUS(status)
-    lines = [line for line in err.splitlines() if line.strip()]
+    lines = [line for line in complaints(err) if line.strip()]
     if "Traceback" in err or "Exception ignored" in err or code == 70:
         return f"traceback: {lines[-1] if lines else ''}"
     if n_bytes > MEMORY_BYTES:

@@ -267,7 +267,7 @@ def _page(before: Rig, done: Calibration[DomeCalibration], request: DomeRequest)
         held = result.cross_validation
         cards.append(
             Card(
-                "held-back views",
+                "held-out views",
                 f"{held.dome_rms_px:.2f} px",
                 f"a bare lens: {held.bare_rms_px:.2f} px",
             )

@@ -16,13 +16,13 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from aqualvs.control.gains_file import load_settings
-from aqualvs.control.vehicle import SetpointHolder
+from aqualvs.control.vehicle import SetpointHolder, VehicleState
 from aqualvs.errors import OptionError
 from aqualvs.live.mavlink.ardusub import ArduSubOptions
 from aqualvs.live.mavlink.ardusub_commands import Command
 from aqualvs.live.mavlink.link import LinkOptions
 from aqualvs.live.mavlink.peers import load_key
-from aqualvs.live.outputs.base import Output
+from aqualvs.live.outputs.base import HearsVehicle, Output
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.rigschema import Positive, StrictPart
 from aqualvs.recording import RecorderSwitch
@@ -234,6 +234,13 @@ def _rerun(where: str) -> Output:
     return RerunOutput(where)
 
 
+def vehicle_reader(outputs: Sequence[Output]) -> Callable[[], VehicleState | None]:
+    """Return what reads depth and heading from the first output that an autopilot answers."""
+    return next(
+        (one.vehicle_state for one in outputs if isinstance(one, HearsVehicle)), lambda: None
+    )
+
+
 def serve_page(
     address: str,
     token: str | None,
@@ -241,6 +248,7 @@ def serve_page(
     holder: SetpointHolder,
     recorder: RecorderSwitch | None,
     echo: Callable[[str], object],
+    vehicle: Callable[[], VehicleState | None] = lambda: None,
 ) -> Output:
     """Serve the page and print its address.
 
@@ -257,6 +265,8 @@ def serve_page(
         What its record button moves; None where nothing can be recorded.
     echo : callable
         Takes one line.
+    vehicle : callable, optional
+        Returns what the autopilot tells of depth and heading.
 
     Raises
     ------
@@ -270,4 +280,4 @@ def serve_page(
             f"--dashboard: {fault.name} is missing; pip install 'aqualvs[dashboard]'"
         ) from fault
     host, port = host_and_port(address, DASHBOARD_PORT, "--dashboard-address")
-    return start_dashboard(host, port, token, rig, holder, recorder, echo)
+    return start_dashboard(host, port, token, rig, holder, recorder, echo, vehicle)
