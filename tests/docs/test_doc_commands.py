@@ -34,6 +34,7 @@ ELSEWHERE = {
     r"^simulate net_holes": "takes minutes: tests/cli/test_net.py",
     r"^net out/sim/run --log out/sim/vehicle.csv": "of the same dive",
     r"--log vehicle.tlog": "a real log: tests/vehicle_logs/test_mavlink_frames.py",
+    r"^run .* --rerun ": "needs rerun-sdk: tests/test_pipeline.py",
     r"^run dives/dive_": "a recording's name differs: tests/live",
     r"^import ": "files of other programs: tests/cli/test_formats.py",
     r"^calibrate ": "file names of the user's own: the tour runs all four steps",

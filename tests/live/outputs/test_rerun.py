@@ -99,10 +99,17 @@ def test_no_place(logs, where):
         rerun.RerunOutput(where)
 
 
-def test_file_that_cannot_be_written(logs, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        (PermissionError(13, "Permission denied"), "Permission denied"),
+        (ValueError("embedded null byte"), "embedded null byte"),
+    ],
+)
+def test_file_that_cannot_be_written(logs, tmp_path, monkeypatch, fault, words):
     def refuse(self, path):
-        raise PermissionError(13, "Permission denied")
+        raise fault
 
     monkeypatch.setattr(Log, "save", refuse)
-    with pytest.raises(OutputError, match=r"cannot be written \(Permission denied\)"):
+    with pytest.raises(OutputError, match=rf"cannot be written \({words}\)"):
         rerun.RerunOutput(str(tmp_path / "dive.rrd"))

@@ -129,8 +129,9 @@ def _file_log(path: Path) -> RerunLog:
     log = RerunLog()
     try:
         log.save(path)
-    except OSError as fault:
+    except (OSError, ValueError) as fault:
+        words = fault.strerror if isinstance(fault, OSError) else fault
         raise OutputError(
-            f"--rerun {path}: cannot be written ({fault.strerror}); choose another place"
+            f"--rerun {path}: cannot be written ({words}); choose another place"
         ) from fault
     return log
