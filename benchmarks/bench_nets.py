@@ -112,16 +112,18 @@ def _cost() -> list[dict[str, Any]]:
 
 def _label_ms(candidates: Candidates, laser_bands: Any) -> float:
     rig = example_rig()
-    subsegments, index = candidates.subsegments()
+    subsegments = candidates.subsegments()
     reach = search_range(rig.working_range)
-    surfaces = find_surfaces(subsegments, index, candidates.pixels, 3, reach, rig.focal_px)
+    surfaces = find_surfaces(subsegments, candidates.pixels, 3, reach, rig.focal_px)
     target = choose_target(surfaces, TargetKind.AUTO, rig.working_range)
     assert target is not None
-    found = PostureEstimator(rig, laser_bands, FitMethod.ROBUST).measure(candidates, index, target)
+    found = PostureEstimator(rig, laser_bands, FitMethod.ROBUST).measure(
+        candidates, subsegments, target
+    )
     times = []
     for _ in range(100):
         start = time.perf_counter()
-        label_candidates(candidates, index, surfaces, target, found, rig.working_range)
+        label_candidates(candidates, subsegments, surfaces, target, found, rig.working_range)
         times.append(time.perf_counter() - start)
     return float(np.median(times)) * 1e3
 

@@ -19,11 +19,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.optics.camera import DomeCamera
 from aqualvs.optics.rig import Rig
 from aqualvs.scanner import Scanner
-from aqualvs.scanning.candidates import find_candidates
+from aqualvs.scanning.candidates import Subsegments, find_candidates
 from aqualvs.scanning.detection import FrameDetector
 from aqualvs.scanning.laser_bands import SearchAxis, plan_bands
 from aqualvs.scanning.posture import range_pitch_yaw
@@ -194,19 +194,18 @@ def stage_rows(case: Case, name: str) -> list[dict[str, Any]]:
     peaks = detector.detect(case.frame)
     candidates = find_candidates(peaks, laser_bands, triangulator)
 
-    def surfaces() -> tuple[IntArray, Any]:
-        subsegments, index = candidates.subsegments()
+    def surfaces() -> tuple[Subsegments, Any]:
+        subsegments = candidates.subsegments()
         found = find_surfaces(
             subsegments,
-            index,
             candidates.pixels,
             len(rig.lasers),
             (0.8 * near, 1.2 * far),
             rig.focal_px,
         )
-        return index, choose_target(found, TargetKind.AUTO, rig.working_range)
+        return subsegments, choose_target(found, TargetKind.AUTO, rig.working_range)
 
-    index, target = surfaces()
+    subsegments, target = surfaces()
     assert target is not None
     pixels = plain_detect(case.bgr, case.areas, case.along_x)
     points = plain_points(rig, pixels)
@@ -222,7 +221,11 @@ def stage_rows(case: Case, name: str) -> list[dict[str, Any]]:
             lambda: plain_points(rig, pixels),
         ),
         ("surfaces", surfaces, None),
-        ("fit", lambda: processor.measure(candidates, index, target), lambda: plain_fit(points)),
+        (
+            "fit",
+            lambda: processor.measure(candidates, subsegments, target),
+            lambda: plain_fit(points),
+        ),
     )
     return [
         row(f"{name}: {stage}", best_ms(ours), "ms", best_ms(plain) if plain else None)

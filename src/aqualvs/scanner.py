@@ -155,41 +155,34 @@ class Scanner:
     def _estimate(self, candidates: Candidates) -> tuple[Measurement, ScanPoints, IntArray]:
         """Return the posture, the labelled points, and the rows of their candidates."""
         # Planes that several lasers agree on, and the one that is the target.
-        subsegments, subsegment_index = candidates.subsegments()
+        subsegments = candidates.subsegments()
         surfaces = find_surfaces(
             subsegments,
-            subsegment_index,
             candidates.pixels,
             len(self.rig.lasers),
             search_range(self.rig.working_range),
             self.rig.focal_px,
         )
         surfaces = as_requested_kind(surfaces, self.options.target)
-        surfaces, target, doubtful = self._chosen(
-            candidates, subsegments, subsegment_index, surfaces
-        )
+        surfaces, target, doubtful = self._chosen(candidates, subsegments, surfaces)
         tested = NOT_TESTED
         if target is not None:
             # The same peaks, read as other lasers', may give a plane that is as good or better.
-            tested = self._assignment.test(candidates, subsegments, subsegment_index, target)
+            tested = self._assignment.test(candidates, subsegments, target)
             if tested.verdict is Verdict.RIVAL and tested.other is not None:
                 surfaces = self._with_rival(surfaces, target, tested.other, subsegments)
-                surfaces, target, doubtful = self._chosen(
-                    candidates, subsegments, subsegment_index, surfaces
-                )
+                surfaces, target, doubtful = self._chosen(candidates, subsegments, surfaces)
         # The posture from the target's points outside crossing zones.
         if target is None:
             found = _refuse_no_target(candidates, surfaces, self.options.target)
         elif doubtful is not None:
             found = _refuse_ambiguous(candidates, target.plane, doubtful.plane)
-        elif self._assignment.is_by_chance(
-            candidates, subsegments, subsegment_index, surfaces, target
-        ):
+        elif self._assignment.is_by_chance(candidates, subsegments, surfaces, target):
             found = _refuse_chance_plane(candidates)
         elif tested.verdict is Verdict.AMBIGUOUS and tested.other is not None:
             found = _refuse_ambiguous(candidates, target.plane, tested.other)
         else:
-            found = self._posture_estimator.measure(candidates, subsegment_index, target)
+            found = self._posture_estimator.measure(candidates, subsegments, target)
             found = inflate_for_rival(found, tested)
             # The mean plane of folds covers all of a net's light, nearer parts included.
             other = (
@@ -198,7 +191,7 @@ class Scanner:
             if other is not None and found.posture:
                 found = _refuse_ambiguous(candidates, target.plane, other.plane)
         points, listed = label_candidates(
-            candidates, subsegment_index, surfaces, target, found, self.rig.working_range
+            candidates, subsegments, surfaces, target, found, self.rig.working_range
         )
         return found, points, listed
 
@@ -206,7 +199,6 @@ class Scanner:
         self,
         candidates: Candidates,
         subsegments: Subsegments,
-        subsegment_index: IntArray,
         surfaces: list[Surface],
     ) -> tuple[list[Surface], Surface | None, Surface | None]:
         """Return the surfaces, the target, and a surface before it that may be the net instead."""
@@ -214,9 +206,7 @@ class Scanner:
         target = choose_target(surfaces, kind, self.rig.working_range)
         if target is None or kind is not TargetKind.AUTO:
             return surfaces, target, None
-        before = self._assignment.overlooked(
-            candidates, subsegments, subsegment_index, surfaces, target
-        )
+        before = self._assignment.overlooked(candidates, subsegments, surfaces, target)
         if before is None or not before.is_mesh:
             return surfaces, target, before
         surfaces = [before if one.members is before.members else one for one in surfaces]

@@ -33,20 +33,6 @@ def season(tmp_path_factory):
     return folder
 
 
-@pytest.fixture
-def refused(capfd):
-    """Run the command line; it must refuse in one line with exit code 2."""
-
-    def check(*arguments):
-        assert main(["batch", *(str(a) for a in arguments)]) == 2
-        said = capfd.readouterr()
-        assert said.err.count("\n") == 1
-        assert "Traceback" not in said.err
-        return said.err
-
-    return check
-
-
 def command(season, out):
     rig = ["--rig", str(season / "rig.yaml")]
     return [*PROGRAM, str(season), "-o", str(out), *rig, "--workers", "2", "--no-report"]
@@ -123,16 +109,16 @@ def test_an_interrupted_batch_whose_workers_are_killed_gives_what_runs_give(tmp_
 
 def test_bad_input_is_refused_in_one_line(tmp_path, season, refused):
     out = tmp_path / "out"
-    assert "no such file" in refused(tmp_path / "none.mp4", "-o", out)
+    assert "no such file" in refused("batch", tmp_path / "none.mp4", "-o", out)
     lonely = tmp_path / "lonely.mp4"
     lonely.touch()
-    assert "has no rig" in refused(lonely, "-o", out)
+    assert "has no rig" in refused("batch", lonely, "-o", out)
     both = ("--workers", "2", "--scheduler", "tcp://127.0.0.1:1")
-    assert "--workers" in refused(season, "-o", out, *both)
-    assert "give at least 1" in refused(season, "-o", out, "--workers", "0")
+    assert "--workers" in refused("batch", season, "-o", out, *both)
+    assert "give at least 1" in refused("batch", season, "-o", out, "--workers", "0")
     (tmp_path / "file").touch()
     rig = ("--rig", season / "rig.yaml")
-    assert "choose another folder" in refused(season, "-o", tmp_path / "file", *rig)
+    assert "choose another folder" in refused("batch", season, "-o", tmp_path / "file", *rig)
 
 
 def test_help_shows_an_example(capsys):
@@ -156,8 +142,8 @@ def test_the_nets_of_a_season_and_what_changed(tmp_path, capfd):
 
 
 def test_what_is_said_about_nets_without_net_is_refused(season, refused, tmp_path):
-    assert "add --net" in refused(season, "-o", tmp_path / "out", "--twine-mm", "2")
-    said = refused(season, "-o", tmp_path / "out", "--net", "--stretch-m", "-1")
+    assert "add --net" in refused("batch", season, "-o", tmp_path / "out", "--twine-mm", "2")
+    said = refused("batch", season, "-o", tmp_path / "out", "--net", "--stretch-m", "-1")
     assert "--stretch-m -1: must be positive" in said
     assert not (tmp_path / "out").exists()
 

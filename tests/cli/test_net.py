@@ -19,7 +19,6 @@ from aqualvs.results.net_survey import NetPass, read_run
 from aqualvs.results.points import PointsStream
 from aqualvs.simulation.scenarios import example_rig
 from aqualvs.simulation.scene import Net
-from complaints import complaints
 from net_cases import passing
 from shell_cases import rig_file, write_video
 
@@ -61,20 +60,6 @@ def scans():
 def run_folder(scans, tmp_path):
     """The first second and a half of it: enough for what is no matter of the net."""
     return write_run(tmp_path / "run", scans[:FEW])
-
-
-@pytest.fixture
-def refused(capfd):
-    """Run the command line; it must refuse in one line with exit code 2."""
-
-    def check(*arguments):
-        assert main([str(a) for a in arguments]) == 2
-        said = complaints(capfd.readouterr().err)
-        assert len(said) == 1
-        assert said[0].startswith("aqualvs: error: ")
-        return said[0]
-
-    return check
 
 
 def rows(path):

@@ -23,20 +23,6 @@ NEW = (0.74, 0.0, 0.06)
 HEADING_DEG, DEPTH_M, DISTANCE, YAW_DEG = 80.0, 7.0, 0.5, 5.0
 
 
-@pytest.fixture
-def refused(capfd):
-    """Run the command line; it must refuse in one line with exit code 2."""
-
-    def check(*arguments):
-        assert main(["net-change", *map(str, arguments)]) == 2
-        said = capfd.readouterr()
-        assert said.err.count("\n") == 1
-        assert said.err.startswith("aqualvs: error: ")
-        return said.err
-
-    return check
-
-
 def rows(path):
     return list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
 
@@ -173,26 +159,28 @@ def test_faults_in_one_line_and_files_of_others_stay(cage, tmp_path, refused):
     run.mkdir()
     (run / "posture.csv").write_text("frame\n")
     (empty / "dives").mkdir(parents=True)
-    assert f"run: aqualvs net {run} --log" in refused(a, run, "-o", out)
-    assert "of which no dive has the state of its net" in refused(a, empty, "-o", out)
-    assert "no run is there" in refused(a, tmp_path / "nowhere", "-o", out)
-    assert "add --date" in refused(a, b, "-o", out)
-    assert "once for every RUN" in refused(a, b, "--date", "2026-05-01", "-o", out)
-    assert "--date May: is no date" in refused(a, b, "--date", "May", "--date", "auto", "-o", out)
-    assert "one run is no comparison" in refused(a, "-o", out)
-    assert "is named twice" in refused(a, a, "-o", out)
+    assert f"run: aqualvs net {run} --log" in refused("net-change", a, run, "-o", out)
+    assert "of which no dive has the state of its net" in refused("net-change", a, empty, "-o", out)
+    assert "no run is there" in refused("net-change", a, tmp_path / "nowhere", "-o", out)
+    assert "add --date" in refused("net-change", a, b, "-o", out)
+    assert "once for every RUN" in refused("net-change", a, b, "--date", "2026-05-01", "-o", out)
+    assert "--date May: is no date" in refused(
+        "net-change", a, b, "--date", "May", "--date", "auto", "-o", out
+    )
+    assert "one run is no comparison" in refused("net-change", a, "-o", out)
+    assert "is named twice" in refused("net-change", a, a, "-o", out)
     both = ["--date", "2026-05-01", "--date", "2026-05-01"]
-    assert "name runs of another date too" in refused(a, b, *both, "-o", out)
-    assert "--cell-m 0" in refused(a, b, "--cell-m", "0", "-o", out)
+    assert "name runs of another date too" in refused("net-change", a, b, *both, "-o", out)
+    assert "--cell-m 0" in refused("net-change", a, b, "--cell-m", "0", "-o", out)
     assert not out.exists()
     other = ["--date", "2026-05-01", "--date", "2026-05-22"]
     (b / "net.geojson").write_text("{}")
-    assert f"aqualvs net {b} --overwrite" in refused(a, b, *other, "-o", out)
+    assert f"aqualvs net {b} --overwrite" in refused("net-change", a, b, *other, "-o", out)
     write(dive(cage, 1, depths=(3.0,)), tmp_path / "one")
     (b / "net.geojson").write_bytes((tmp_path / "one" / "net.geojson").read_bytes())
-    assert "do not belong together" in refused(a, b, *other, "-o", out)
+    assert "do not belong together" in refused("net-change", a, b, *other, "-o", out)
     out.mkdir()
     (out / "net_change.csv").write_text("precious")
     written(cage, b, 21)
-    assert "did not write it" in refused(a, b, *other, "-o", out, "--overwrite")
+    assert "did not write it" in refused("net-change", a, b, *other, "-o", out, "--overwrite")
     assert (out / "net_change.csv").read_text() == "precious"

@@ -45,20 +45,6 @@ def dive(tmp_path_factory):
     return write_video(tmp_path_factory.mktemp("dive") / "dive.mp4", 5)
 
 
-@pytest.fixture
-def refused(capfd):
-    """Run the command line; it must refuse in one line with exit code 2."""
-
-    def check(*arguments):
-        assert main([str(a) for a in arguments]) == 2
-        said = complaints(capfd.readouterr().err)
-        assert len(said) == 1
-        assert said[0].startswith("aqualvs: error: ")
-        return said[0]
-
-    return check
-
-
 def rows(folder):
     return list(csv.DictReader((folder / "posture.csv").read_text().splitlines()))
 

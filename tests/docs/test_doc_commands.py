@@ -36,6 +36,7 @@ ELSEWHERE = {
     r"^simulate net_holes": "takes minutes: tests/cli/test_net.py",
     r"^net out/sim/run --log out/sim/vehicle.csv": "of the same dive",
     r"--log vehicle.tlog": "a real log: tests/vehicle_logs/test_mavlink_frames.py",
+    r"^import ": "files of other programs: tests/cli/test_formats.py",
     r"^calibrate ": "file names of the user's own: the tour runs all four steps",
     r"^board box|^board plate": "tests/calibration/targets/test_targets.py",
     r"^(benchmark|score) ": "takes minutes: tests/cli/test_score.py",
@@ -86,7 +87,18 @@ def test_a_wrong_option_is_not_understood():
         understood(["run", "dive.mp4", "--no-such-option", "-o", "out"])
 
 
-AGAIN = {"board", "demo", "design", "figures", "follow", "run", "score", "simulate", "tune"}
+AGAIN = {
+    "board",
+    "demo",
+    "design",
+    "export",
+    "figures",
+    "follow",
+    "run",
+    "score",
+    "simulate",
+    "tune",
+}
 
 
 def few_frames(name: str) -> Scenario:

@@ -216,7 +216,7 @@ def test_a_net_that_lacks_a_laser_is_outweighed_by_a_nearer_one(
     def nearer_net(
         parts: list[dict[SearchAxis, StripePeaks]], *, share: float = 1.0, mesh: bool = True
     ) -> bool:
-        subsegments, _ = find_candidates(joined(parts), laser_bands, triangulator).subsegments()
+        subsegments = find_candidates(joined(parts), laser_bands, triangulator).subsegments()
         target, other = (
             surface_on(one, subsegments, len(rig.lasers), 850.0) for one in (far, near)
         )
@@ -232,7 +232,7 @@ def test_a_net_that_lacks_a_laser_is_outweighed_by_a_nearer_one(
     net_mask = peaks_of(rig, [(far, strands)], 0.1)
     assert not nearer_net([parts[0], net_mask])
     scanner, peaks = Scanner(rig), joined(parts)
-    subsegments, _ = find_candidates(peaks, laser_bands, triangulator).subsegments()
+    subsegments = find_candidates(peaks, laser_bands, triangulator).subsegments()
     other = surface_on(near, subsegments, len(rig.lasers), 850.0)
     assert scanner.measure(0, 0.0, peaks).posture
     monkeypatch.setattr(assignment.AssignmentTest, "nearer_net", lambda *_: other)
@@ -259,11 +259,11 @@ def test_a_net_before_a_wall_is_not_overlooked(monkeypatch: pytest.MonkeyPatch) 
         part: dict[SearchAxis, StripePeaks], *, mesh: bool = True, wall_is_mesh: bool = False
     ) -> Surface | None:
         candidates = find_candidates(joined([part, behind]), laser_bands, triangulator)
-        subsegments, index = candidates.subsegments()
+        subsegments = candidates.subsegments()
         near, far = (surface_on(one, subsegments, len(rig.lasers), 850.0) for one in (net, wall))
         near, far = replace(near, is_mesh=mesh), replace(far, is_mesh=wall_is_mesh)
-        assert test.overlooked(candidates, subsegments, index, [far, near], near) is None
-        return test.overlooked(candidates, subsegments, index, [far, near], far)
+        assert test.overlooked(candidates, subsegments, [far, near], near) is None
+        return test.overlooked(candidates, subsegments, [far, near], far)
 
     seen = peaks_of(rig, [(net, slanted_strands)], 0.1)
     found = overlooked(seen)
@@ -292,3 +292,21 @@ def test_a_net_before_a_wall_is_not_overlooked(monkeypatch: pytest.MonkeyPatch) 
     refused = scanner.measure(0, 0.0, peaks).posture
     assert isinstance(refused, Refusal)
     assert refused.reason is Reason.AMBIGUOUS
+
+
+def fish(points: FloatArray) -> BoolArray:
+    """Light on a flank of 24 by 8 cm, where two of the stripes cross at 0.75 m."""
+    lit: BoolArray = (abs(points[:, 0] - 0.069) < 0.12) & (abs(points[:, 2] - 0.121) < 0.04)
+    return lit
+
+
+def test_a_fish_before_a_wall_out_of_range_is_no_wall() -> None:
+    """Not even a large one: the wall has more light, and a laser passes the fish."""
+    rig = example_rig()
+    flank, wall = (Plane.from_normal((0.0, 1.0, 0.0), d) for d in (0.75, 1.25))
+    two = peaks_of(replace(rig, lasers=rig.lasers[:2]), [(flank, fish)], 0.1)
+    scanner = Scanner(rig)
+    assert scanner.measure(0, 0.0, two).posture
+    found = scanner.measure(0, 0.0, joined([two, peaks_of(rig, [(wall, everywhere)], 0.1)])).posture
+    assert isinstance(found, Refusal)
+    assert found.reason is Reason.NOT_A_PLANE

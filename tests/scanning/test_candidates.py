@@ -107,7 +107,8 @@ def test_sigma_grows_with_width_over_height() -> None:
 def test_chunks_are_centroids_and_their_errors_shrink() -> None:
     rig = example_rig()
     candidates = read(rig, peaks_of(rig, [(WALL, strands)], noise_px=0.1))
-    subsegments, index = candidates.subsegments()
+    subsegments = candidates.subsegments()
+    index = subsegments.of_candidate
     assert index.shape == (len(candidates),)
     assert np.all(np.diff(index) >= 0)
     n = int(index[-1]) + 1
@@ -146,7 +147,8 @@ def test_nothing_in_nothing_out() -> None:
     }
     candidates = read(rig, nothing)
     assert len(candidates) == 0
-    subsegments, index = candidates.subsegments()
+    subsegments = candidates.subsegments()
+    index = subsegments.of_candidate
     assert len(subsegments) == len(index) == 0
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.planes import Plane
-from aqualvs.scanning.candidates import Candidates, find_candidates
+from aqualvs.scanning.candidates import Candidates, Subsegments, find_candidates
 from aqualvs.scanning.labels import label_candidates
 from aqualvs.scanning.laser_bands import SearchAxis, plan_bands
 from aqualvs.scanning.posture import Reason, Refusal
@@ -29,7 +29,7 @@ WALL = Plane.from_normal([0.07, 1.0, 0.0], 0.8)
 class Labelled(NamedTuple):
     peaks: dict[SearchAxis, StripePeaks]
     candidates: Candidates
-    index: IntArray
+    subsegments: Subsegments
     surfaces: list[Surface]
     points: ScanPoints
 
@@ -40,18 +40,18 @@ def label(targets: Sequence[tuple[Plane, Lit]], posture_to: Plane | None) -> Lab
     camera = rig.camera()
     peaks = peaks_of(rig, targets, 0.1)
     candidates = find_candidates(peaks, plan_bands(rig, camera), Triangulator(rig, camera))
-    subsegments, index = candidates.subsegments()
-    surfaces = find_surfaces(subsegments, index, candidates.pixels, 3, rig.working_range, 850.0)
+    subsegments = candidates.subsegments()
+    surfaces = find_surfaces(subsegments, candidates.pixels, 3, rig.working_range, 850.0)
     target = None
     in_posture = np.zeros(len(candidates), np.bool_)
     if posture_to is not None:
         offsets = [abs(one.plane.offset - posture_to.offset) for one in surfaces]
         target = surfaces[int(np.argmin(offsets))]
-        in_posture = target.members[index]
+        in_posture = target.members[subsegments.of_candidate]
     points, _ = label_candidates(
-        candidates, index, surfaces, target, Measurement(NONE, in_posture), RANGE
+        candidates, subsegments, surfaces, target, Measurement(NONE, in_posture), RANGE
     )
-    return Labelled(peaks, candidates, index, surfaces, points)
+    return Labelled(peaks, candidates, subsegments, surfaces, points)
 
 
 def all_pixels(peaks: dict[SearchAxis, StripePeaks]) -> FloatArray:
@@ -121,11 +121,11 @@ def test_without_a_target_nothing_is_used() -> None:
 def test_what_the_posture_left_out_of_its_target_is_still_on_it() -> None:
     found = label([(WALL, everywhere)], WALL)
     target = found.surfaces[0]
-    on_it = target.members[found.index]
+    on_it = target.members[found.subsegments.of_candidate]
     left_out = on_it & (found.candidates.pixels[:, 1] < 200.0)
     points, _ = label_candidates(
         found.candidates,
-        found.index,
+        found.subsegments,
         found.surfaces,
         target,
         Measurement(NONE, on_it & ~left_out),
@@ -142,7 +142,7 @@ def test_short_pieces_that_nothing_explains_are_clutter_or_ambiguous() -> None:
     found = label([(NET, strands)], None)
     points, _ = label_candidates(
         found.candidates,
-        found.index,
+        found.subsegments,
         [],
         None,
         Measurement(NONE, np.zeros(len(found.candidates), np.bool_)),

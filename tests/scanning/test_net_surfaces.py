@@ -117,8 +117,8 @@ def subsegments_on(laser: IntArray, line: IntArray, points: FloatArray) -> Subse
     table = np.zeros((7, len(laser)))
     table[:3] = points.T
     table[6] = 5.0
-    light = np.full(len(laser), 5.0)
-    return Subsegments(table, light, np.full(len(laser), 5), line, line + 4, laser)
+    n, light = len(laser), np.full(len(laser), 5.0)
+    return Subsegments(np.arange(n), table, light, np.full(n, 5), line, line + 4, laser)
 
 
 def two_surfaces(second: BoolArray, height: FloatArray) -> Subsegments:

@@ -48,16 +48,15 @@ def surfaces_of(
     candidates = find_candidates(
         peaks_of(rig, targets, noise_px), plan_bands(rig, camera), Triangulator(rig, camera)
     )
-    subsegments, index = candidates.subsegments()
+    subsegments = candidates.subsegments()
     found = find_surfaces(
         subsegments,
-        index,
         candidates.pixels,
         len(rig.lasers),
         rig.working_range,
         max(rig.lens.fx, rig.lens.fy),
     )
-    return found, candidates, index
+    return found, candidates, subsegments.of_candidate
 
 
 def assert_near(found: Plane, expected: Plane, share: float = 0.01, deg: float = 1.5) -> None:
@@ -203,8 +202,8 @@ def test_scattered_light_gives_no_surface_worth_a_target() -> None:
         )
     camera = rig.camera()
     candidates = find_candidates(peaks, plan_bands(rig, camera), Triangulator(rig, camera))
-    subsegments, index = candidates.subsegments()
-    found = find_surfaces(subsegments, index, candidates.pixels, 3, rig.working_range, 850.0)
+    subsegments = candidates.subsegments()
+    found = find_surfaces(subsegments, candidates.pixels, 3, rig.working_range, 850.0)
     # Chance puts some specks on a plane, never a fifth of them.
     assert all(surface.n_lines < 0.2 * len(candidates) for surface in found)
 

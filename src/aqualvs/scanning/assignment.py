@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from aqualvs.geometry.arrays import FloatArray, IntArray
+from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.scanning.assignment_kernels import (
     CELL_LINES,
@@ -121,7 +121,6 @@ class AssignmentTest:
         self,
         candidates: Candidates,
         subsegments: Subsegments,
-        subsegment_index: IntArray,
         surfaces: Sequence[Surface],
         target: Surface,
     ) -> bool:
@@ -129,21 +128,24 @@ class AssignmentTest:
 
         Parameters
         ----------
-        candidates, subsegments, subsegment_index
+        candidates, subsegments
             As in `test`.
         surfaces : sequence of Surface
             All that were found: light on the others does not speak against this one.
         target : Surface
             The one to judge.
         """
-        small = self._is_small(candidates, subsegments, subsegment_index, surfaces, target)
+        # A fish before a wall that is out of range: the wall is no target, and the fish is none.
+        outweighed = not target.is_mesh and any(
+            one.inlier_weight > target.inlier_weight for one in surfaces
+        )
+        small = outweighed or self._is_small(candidates, subsegments, surfaces, target)
         return small and self._is_faint(target, subsegments)
 
     def overlooked(
         self,
         candidates: Candidates,
         subsegments: Subsegments,
-        subsegment_index: IntArray,
         surfaces: Sequence[Surface],
         target: Surface,
     ) -> Surface | None:
@@ -155,7 +157,7 @@ class AssignmentTest:
 
         Parameters
         ----------
-        candidates, subsegments, subsegment_index, surfaces
+        candidates, subsegments, surfaces
             As in `is_by_chance`.
         target : Surface
             The one that was chosen.
@@ -172,7 +174,7 @@ class AssignmentTest:
             # Only broken stripes have an extent.
             if one is target or one.extent <= 0.0 or not _is_nearer(one, target, subsegments):
                 continue
-            small = self._is_small(candidates, subsegments, subsegment_index, surfaces, one)
+            small = self._is_small(candidates, subsegments, surfaces, one)
             if small or self._is_faint(one, subsegments):
                 continue
             is_net = one.is_mesh or seen_through(one.members, target.members, subsegments)
@@ -183,7 +185,6 @@ class AssignmentTest:
         self,
         candidates: Candidates,
         subsegments: Subsegments,
-        subsegment_index: IntArray,
         surfaces: Sequence[Surface],
         surface: Surface,
     ) -> bool:
@@ -196,7 +197,7 @@ class AssignmentTest:
         intensity_share = exclusive_share(
             candidates.source,
             candidates.confidence,
-            subsegment_index,
+            subsegments.of_candidate,
             surface.members,
             others,
             subsegments.intensity_weight,
@@ -251,7 +252,6 @@ class AssignmentTest:
         self,
         candidates: Candidates,
         subsegments: Subsegments,
-        subsegment_index: IntArray,
         surface: Surface,
     ) -> AssignmentOutcome:
         """Test a surface.
@@ -262,8 +262,6 @@ class AssignmentTest:
             N of them.
         subsegments : Subsegments
             C of them.
-        subsegment_index : int array, shape (N,)
-            Row of each candidate's subsegment.
         surface : Surface
             The one to test.
         """
@@ -279,7 +277,7 @@ class AssignmentTest:
             candidates.confidence,
             candidates.points,
             candidates.sensitivity,
-            subsegment_index,
+            subsegments.of_candidate,
             surface.members,
             subsegments.table,
             *self._searched,
@@ -297,7 +295,7 @@ class AssignmentTest:
             subsegments.laser,
             candidates.source,
             candidates.confidence,
-            subsegment_index,
+            subsegments.of_candidate,
             self._along_x,
             self._bands,
             facts,

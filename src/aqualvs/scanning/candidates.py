@@ -301,6 +301,8 @@ class Subsegments:
 
     Attributes
     ----------
+    of_candidate : int array, shape (N,)
+        Row of the subsegment that each candidate belongs to; ascending.
     table : array, shape (7, C)
         Rows as `plane_search` names them: centroid in `dome` (m), mean derivative of the points by
         the stripe's position (m/px), and sampling weight: its light, but a long component
@@ -315,6 +317,7 @@ class Subsegments:
         Index of the laser; ascending.
     """
 
+    of_candidate: IntArray
     table: FloatArray
     intensity_weight: FloatArray
     n_lines: IntArray
@@ -390,18 +393,10 @@ class Candidates:
         """Return the candidates that a mask of shape (N,) selects."""
         return Candidates(*(getattr(self, item.name)[mask] for item in fields(self) if item.init))
 
-    def subsegments(self) -> tuple[Subsegments, IntArray]:
-        """Summarise the subsegments by their centroids.
-
-        Returns
-        -------
-        Subsegments
-            C of them, ordered by laser.
-        index : int array, shape (N,)
-            Row of each candidate's subsegment.
-        """
+    def subsegments(self) -> Subsegments:
+        """Summarise the subsegments by their centroids."""
         n = count_subsegments(self.subsegment)
-        index, facts = np.empty(len(self), np.int64), np.empty((4, n), np.int64)
+        of_candidate, facts = np.empty(len(self), np.int64), np.empty((4, n), np.int64)
         table, intensity_weight = np.empty((7, n)), np.empty(n)
         shapes = summarise_subsegments(
             self.subsegment,
@@ -413,13 +408,13 @@ class Candidates:
             self.width,
             self.points,
             self.sensitivity,
-            index,
+            of_candidate,
             table,
             intensity_weight,
             facts,
         )
         object.__setattr__(self, "_shapes", ComponentShapes(*shapes))
-        return Subsegments(table, intensity_weight, *facts), index
+        return Subsegments(of_candidate, table, intensity_weight, *facts)
 
     def shapes(self) -> ComponentShapes:
         """Describe the shape of every component."""

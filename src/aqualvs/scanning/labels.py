@@ -14,7 +14,7 @@ from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import borrowing_kernel, kernel
 from aqualvs.geometry.planes import Plane
 from aqualvs.geometry.quantile import element_at
-from aqualvs.scanning.candidates import Candidates
+from aqualvs.scanning.candidates import Candidates, Subsegments
 from aqualvs.scanning.patch import height_over, packed_plane
 from aqualvs.scanning.posture import Posture
 from aqualvs.scanning.posture_estimator import Measurement
@@ -300,7 +300,7 @@ _NOTHING, _NOWHERE = np.empty(0), np.empty(0, np.bool_)
 
 def label_candidates(
     candidates: Candidates,
-    subsegment_index: IntArray,
+    subsegments: Subsegments,
     surfaces: Sequence[Surface],
     target: Surface | None,
     found: Measurement,
@@ -312,8 +312,8 @@ def label_candidates(
     ----------
     candidates : Candidates
         N of them.
-    subsegment_index : int array, shape (N,)
-        Row of each candidate's subsegment in the surfaces' `members`.
+    subsegments : Subsegments
+        Those of the candidates.
     surfaces : sequence of Surface
         All that were found.
     target : Surface or None
@@ -340,7 +340,7 @@ def label_candidates(
             label_other(
                 surface.members,
                 surface.is_mesh,
-                subsegment_index,
+                subsegments.of_candidate,
                 candidates.component,
                 candidates.points,
                 shapes,
@@ -352,7 +352,7 @@ def label_candidates(
         label_target(
             target.members,
             target.is_mesh,
-            subsegment_index,
+            subsegments.of_candidate,
             candidates.source,
             candidates.points,
             candidates.sensitivity,

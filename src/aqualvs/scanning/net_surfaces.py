@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import kernel
+from aqualvs.geometry.compiled import borrowing_kernel, kernel
 from aqualvs.geometry.linear_algebra import invert_symmetric, solve_symmetric
 from aqualvs.geometry.planes import Plane
 from aqualvs.scanning.candidates import Subsegments
@@ -451,3 +451,41 @@ def _extent(n_lines: IntArray, first_line: IntArray, last_line: IntArray, order:
             end = last_line[c]
         seen += n_lines[c]
     return float(end - begin + 1)
+
+
+@borrowing_kernel
+def distances_off(points: FloatArray, normal: FloatArray, offset: float, off: FloatArray) -> None:
+    """Write the distances of points (N, 3) from a plane, as shares of its own."""
+    nx, ny, nz = normal[0] / offset, normal[1] / offset, normal[2] / offset
+    for i in range(points.shape[0]):
+        off[i] = abs(nx * points[i, 0] + ny * points[i, 1] + nz * points[i, 2] - 1.0)
+
+
+@kernel
+def mark_beside(
+    source: IntArray, net_mask: BoolArray, off: FloatArray, most: float, beside: BoolArray
+) -> None:
+    """Mark the candidates of a net, and those near its plane whose light the net does not explain.
+
+    Parameters
+    ----------
+    source : int array, shape (N,)
+        Number of each candidate's peak.
+    net_mask : bool array, shape (N,)
+        Candidates of the net.
+    off : array, shape (N,)
+        From `distances_off`.
+    most : float
+        Largest distance that is near.
+    beside : bool array, shape (N,)
+        Written.
+    """
+    last = 0
+    for i in range(source.shape[0]):
+        last = max(last, source[i])
+    explained = np.zeros(last + 1, np.bool_)
+    for i in range(source.shape[0]):
+        if net_mask[i]:
+            explained[source[i]] = True
+    for i in range(source.shape[0]):
+        beside[i] = net_mask[i] or (off[i] < most and not explained[source[i]])

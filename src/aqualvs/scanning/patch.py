@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from aqualvs.geometry.arrays import FloatArray
+from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel, kernel
 from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig_covariance import FittedSurface, posture_by_plane
@@ -289,3 +289,30 @@ def fitted_patch(patch: Patch, m: FloatArray, points: FloatArray) -> FittedSurfa
     bend = p * np.outer(right, right) + q * (across + across.T) + r * np.outer(up, up)
     normal = patch.base.normal - b * right - c * up
     return FittedSurface(terms, CURVATURE_PRIOR, normal, -bend, by_plane @ by_terms)
+
+
+@kernel
+def intensity_share_near(
+    group: IntArray, confidence: FloatArray, points: FloatArray, patch: FloatArray, near: float
+) -> float:
+    """Return the share of the light in pieces nearer to a patch than `near`, in metres.
+
+    Parameters
+    ----------
+    group : int array, shape (N,)
+        From `select_units`.
+    confidence : array, shape (N,)
+        Of the candidates.
+    points : array, shape (M, 3)
+        Of the pieces.
+    patch : array, shape (16,)
+        As `Patch.packed` gives it.
+    """
+    height = np.empty(points.shape[0])
+    heights_over(points, patch, height)
+    total, on = 0.0, 0.0
+    for i in range(group.shape[0]):
+        if group[i] >= 0:
+            total += confidence[i]
+            on += confidence[i] if abs(height[group[i]]) < near else 0.0
+    return on / max(total, 1e-12)

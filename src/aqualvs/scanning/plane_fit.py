@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from aqualvs.geometry.arrays import FloatArray, IntArray
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import kernel
 from aqualvs.geometry.linear_algebra import invert_symmetric, solve_symmetric
 
@@ -289,3 +289,93 @@ def _weighted_rms(sigma: FloatArray, z: FloatArray, weights: FloatArray, m: Floa
         weight += weights[i]
     length = np.sqrt(m[0] * m[0] + m[1] * m[1] + m[2] * m[2])
     return float(np.sqrt(total / weight) / length)
+
+
+@kernel
+def mark_inliers(
+    group: IntArray,
+    laser: IntArray,
+    weights: FloatArray,
+    of_all: bool,
+    points: FloatArray,
+    inliers: BoolArray,
+) -> tuple[int, float, int]:
+    """Mark the inliers of a fit.
+
+    Parameters
+    ----------
+    group : int array, shape (N,)
+        From `select_units`.
+    laser : int array, shape (M,), weights : array, shape (M,)
+        Of the observations.
+    of_all : bool
+        Whether observations without weight are counted in `second`.
+    points : array, shape (N, 3)
+        Of the candidates.
+    inliers : bool array, shape (N,)
+        Written.
+
+    Returns
+    -------
+    n_points : int
+        Number of inliers.
+    nearest : float
+        Distance of the nearest of them from the origin.
+    second : int
+        Number of observations of the second best laser.
+    """
+    n, square = 0, np.inf
+    for i in range(group.shape[0]):
+        inliers[i] = group[i] >= 0 and weights[group[i]] > 0.0
+        if inliers[i]:
+            n += 1
+            x, y, z = points[i, 0], points[i, 1], points[i, 2]
+            square = min(square, x * x + y * y + z * z)
+    n_lasers = 0
+    for k in range(laser.shape[0]):
+        n_lasers = max(n_lasers, laser[k] + 1)
+    observations = np.zeros(n_lasers, np.int64)
+    for k in range(laser.shape[0]):
+        observations[laser[k]] += of_all or weights[k] > 0.0
+    best, second = 0, 0
+    for index in range(n_lasers):
+        second = max(second, min(best, observations[index]))
+        best = max(best, observations[index])
+    return n, np.sqrt(square), second
+
+
+@kernel
+def weigh_candidates(
+    group: IntArray,
+    m: FloatArray,
+    sensitivity: FloatArray,
+    sigma_px: FloatArray,
+    fit_weights: FloatArray,
+    alike: bool,
+    weights: FloatArray,
+) -> None:
+    """Write the weight of each candidate in a fit of m·X = 1: an equal share of its piece's.
+
+    Parameters
+    ----------
+    group : int array, shape (N,)
+        From `select_units`.
+    m : array, shape (3,)
+        Of the plane.
+    sensitivity, sigma_px, fit_weights : array, shape (M, 3), (M,), (M,)
+        Of the observations.
+    alike : bool
+        Whether the fit gave all observations equal weights, regardless of their errors.
+    weights : array, shape (N,)
+        Written: 1 over the variance of m·X; 0 for outliers.
+    """
+    count, weight = np.zeros(sigma_px.shape[0]), np.empty(sigma_px.shape[0])
+    for i in range(group.shape[0]):
+        if group[i] >= 0:
+            count[group[i]] += 1.0
+    for c in range(sigma_px.shape[0]):
+        per_px = m[0] * sensitivity[c, 0] + m[1] * sensitivity[c, 1] + m[2] * sensitivity[c, 2]
+        sigma = 1.0 if alike else abs(per_px) * sigma_px[c] + 1e-12
+        weight[c] = fit_weights[c] / (sigma * sigma * count[c])
+    for i in range(group.shape[0]):
+        weights[i] = weight[group[i]] if group[i] >= 0 else 0.0

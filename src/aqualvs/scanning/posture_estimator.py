@@ -18,13 +18,20 @@ from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel,
 from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.sheet import COLUMNS, START, WINDOWED, sheet_distance, sheets_of
-from aqualvs.scanning.candidates import Candidates, Observations
+from aqualvs.scanning.candidates import Candidates, Observations, Subsegments
 from aqualvs.scanning.laser_bands import LaserBand
-from aqualvs.scanning.net_surfaces import disagreement, fit_mean, inflate_covariance
+from aqualvs.scanning.net_surfaces import (
+    disagreement,
+    distances_off,
+    fit_mean,
+    inflate_covariance,
+    mark_beside,
+)
 from aqualvs.scanning.paraboloid import MIN_BEND, fit_patch, refit_at_nearest, shows_curvature
 from aqualvs.scanning.patch import (
     Patch,
     heights_over,
+    intensity_share_near,
     nearest_in_view,
     nearest_tangent,
     packed_plane,
@@ -37,6 +44,8 @@ from aqualvs.scanning.plane_fit import (
     PlaneFit,
     fit_pseudo_inverse,
     fit_robust,
+    mark_inliers,
+    weigh_candidates,
 )
 from aqualvs.scanning.posture import MAX_RMS_SHARE, Posture, Reason, Refusal, posture_of, validate
 from aqualvs.scanning.region_growing import SOME, grow_region, has_much_beside
@@ -172,161 +181,6 @@ def places_along(line: FloatArray, laser: IntArray, n_lines: IntArray, along: Fl
         along[k] = 2.0 * line[k] / n_lines[laser[k]] - 1.0
 
 
-@kernel
-def mark_inliers(
-    group: IntArray,
-    laser: IntArray,
-    weights: FloatArray,
-    of_all: bool,
-    points: FloatArray,
-    inliers: BoolArray,
-) -> tuple[int, float, int]:
-    """Mark the inliers of a fit.
-
-    Parameters
-    ----------
-    group : int array, shape (N,)
-        From `select_units`.
-    laser : int array, shape (M,), weights : array, shape (M,)
-        Of the observations.
-    of_all : bool
-        Whether observations without weight are counted in `second`.
-    points : array, shape (N, 3)
-        Of the candidates.
-    inliers : bool array, shape (N,)
-        Written.
-
-    Returns
-    -------
-    n_points : int
-        Number of inliers.
-    nearest : float
-        Distance of the nearest of them from the origin.
-    second : int
-        Number of observations of the second best laser.
-    """
-    n, square = 0, np.inf
-    for i in range(group.shape[0]):
-        inliers[i] = group[i] >= 0 and weights[group[i]] > 0.0
-        if inliers[i]:
-            n += 1
-            x, y, z = points[i, 0], points[i, 1], points[i, 2]
-            square = min(square, x * x + y * y + z * z)
-    n_lasers = 0
-    for k in range(laser.shape[0]):
-        n_lasers = max(n_lasers, laser[k] + 1)
-    observations = np.zeros(n_lasers, np.int64)
-    for k in range(laser.shape[0]):
-        observations[laser[k]] += of_all or weights[k] > 0.0
-    best, second = 0, 0
-    for index in range(n_lasers):
-        second = max(second, min(best, observations[index]))
-        best = max(best, observations[index])
-    return n, np.sqrt(square), second
-
-
-@borrowing_kernel
-def distances_off(points: FloatArray, normal: FloatArray, offset: float, off: FloatArray) -> None:
-    """Write the distances of points (N, 3) from a plane, as shares of its own."""
-    nx, ny, nz = normal[0] / offset, normal[1] / offset, normal[2] / offset
-    for i in range(points.shape[0]):
-        off[i] = abs(nx * points[i, 0] + ny * points[i, 1] + nz * points[i, 2] - 1.0)
-
-
-@kernel
-def mark_beside(
-    source: IntArray, net_mask: BoolArray, off: FloatArray, most: float, beside: BoolArray
-) -> None:
-    """Mark the candidates of a net, and those near its plane whose light the net does not explain.
-
-    Parameters
-    ----------
-    source : int array, shape (N,)
-        Number of each candidate's peak.
-    net_mask : bool array, shape (N,)
-        Candidates of the net.
-    off : array, shape (N,)
-        From `distances_off`.
-    most : float
-        Largest distance that is near.
-    beside : bool array, shape (N,)
-        Written.
-    """
-    last = 0
-    for i in range(source.shape[0]):
-        last = max(last, source[i])
-    explained = np.zeros(last + 1, np.bool_)
-    for i in range(source.shape[0]):
-        if net_mask[i]:
-            explained[source[i]] = True
-    for i in range(source.shape[0]):
-        beside[i] = net_mask[i] or (off[i] < most and not explained[source[i]])
-
-
-@kernel
-def intensity_share_near(
-    group: IntArray, confidence: FloatArray, points: FloatArray, patch: FloatArray, near: float
-) -> float:
-    """Return the share of the light in pieces nearer to a patch than `near`, in metres.
-
-    Parameters
-    ----------
-    group : int array, shape (N,)
-        From `select_units`.
-    confidence : array, shape (N,)
-        Of the candidates.
-    points : array, shape (M, 3)
-        Of the pieces.
-    patch : array, shape (16,)
-        As `Patch.packed` gives it.
-    """
-    height = np.empty(points.shape[0])
-    heights_over(points, patch, height)
-    total, on = 0.0, 0.0
-    for i in range(group.shape[0]):
-        if group[i] >= 0:
-            total += confidence[i]
-            on += confidence[i] if abs(height[group[i]]) < near else 0.0
-    return on / max(total, 1e-12)
-
-
-@kernel
-def weigh_candidates(
-    group: IntArray,
-    m: FloatArray,
-    sensitivity: FloatArray,
-    sigma_px: FloatArray,
-    fit_weights: FloatArray,
-    alike: bool,
-    weights: FloatArray,
-) -> None:
-    """Write the weight of each candidate in a fit of m·X = 1: an equal share of its piece's.
-
-    Parameters
-    ----------
-    group : int array, shape (N,)
-        From `select_units`.
-    m : array, shape (3,)
-        Of the plane.
-    sensitivity, sigma_px, fit_weights : array, shape (M, 3), (M,), (M,)
-        Of the observations.
-    alike : bool
-        Whether the fit gave all observations equal weights, regardless of their errors.
-    weights : array, shape (N,)
-        Written: 1 over the variance of m·X; 0 for outliers.
-    """
-    count, weight = np.zeros(sigma_px.shape[0]), np.empty(sigma_px.shape[0])
-    for i in range(group.shape[0]):
-        if group[i] >= 0:
-            count[group[i]] += 1.0
-    for c in range(sigma_px.shape[0]):
-        per_px = m[0] * sensitivity[c, 0] + m[1] * sensitivity[c, 1] + m[2] * sensitivity[c, 2]
-        sigma = 1.0 if alike else abs(per_px) * sigma_px[c] + 1e-12
-        weight[c] = fit_weights[c] / (sigma * sigma * count[c])
-    for i in range(group.shape[0]):
-        weights[i] = weight[group[i]] if group[i] >= 0 else 0.0
-
-
 MIN_LINES = 30
 """Least number of stripe points of a posture."""
 
@@ -426,7 +280,7 @@ class PostureEstimator:
         self._axis_in_dome = rig.dome_from_cam.rotate([0.0, 0.0, 1.0])
 
     def measure(
-        self, candidates: Candidates, subsegment_index: IntArray, target: Surface
+        self, candidates: Candidates, subsegments: Subsegments, target: Surface
     ) -> Measurement:
         """Measure the posture to a surface.
 
@@ -434,8 +288,8 @@ class PostureEstimator:
         ----------
         candidates : Candidates
             N of them.
-        subsegment_index : int array, shape (N,)
-            Row of each candidate's subsegment in the surface's `members`.
+        subsegments : Subsegments
+            Those of the candidates.
         target : Surface
             Surface that the posture is measured to.
         """
@@ -445,7 +299,7 @@ class PostureEstimator:
         unit, min_lines = (
             (candidates.component, _SHORTEST_STRAND) if mesh else (candidates.subsegment, 1)
         )
-        on_target = target.members[subsegment_index]
+        on_target = target.members[subsegments.of_candidate]
         seen = self._observe(candidates, unit, min_lines, on_target, target.plane.normal)
         if seen.n_candidates < MIN_LINES:
             detail = f"only {seen.n_candidates} stripe points outside crossings"

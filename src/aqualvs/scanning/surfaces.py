@@ -373,7 +373,6 @@ class Surface:
 
 def find_surfaces(
     subsegments: Subsegments,
-    subsegment_index: IntArray,
     pixels: FloatArray,
     n_lasers: int,
     working_range: tuple[float, float],
@@ -385,8 +384,6 @@ def find_surfaces(
     ----------
     subsegments : Subsegments
         Of all candidates.
-    subsegment_index : int array, shape (N,)
-        Row of each candidate's subsegment.
     pixels : array, shape (N, 2)
         Each candidate's place in the image.
     n_lasers : int
@@ -408,7 +405,7 @@ def find_surfaces(
         subsegments.intensity_weight,
         subsegments.n_lines,
         subsegments.laser,
-        subsegment_index,
+        subsegments.of_candidate,
         pixels,
         n_lasers,
         *working_range,
