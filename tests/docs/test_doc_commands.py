@@ -113,10 +113,7 @@ def world(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(simulate, "load_scenario", few_frames)
         for command in {arguments_of(c): c for page in IN_ORDER for c in commands(page)}.values():
-            if command.arguments[0] in AS_A_PROCESS:
-                run(command, folder)
-            else:
-                run_here(command, folder)
+            run(command, folder)
     named = {path for page in IN_ORDER for path in files_named(page)}
     assert [path for path in sorted(named) if not (folder / path).exists()] == []
     shutil.copy(folder / "out/cal/rig.yaml", folder / "rig.yaml")
@@ -161,6 +158,11 @@ def repeatable(command: Command, folder: Path) -> list[str]:
 
 
 def run(command: Command, folder: Path) -> None:
+    alone = command.arguments[0] in AS_A_PROCESS
+    (run_as_process if alone else run_here)(command, folder)
+
+
+def run_as_process(command: Command, folder: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-m", "aqualvs", *repeatable(command, folder)],
         cwd=folder,
@@ -213,7 +215,7 @@ def test_the_first_pages_run_as_they_stand(world):
 
 def test_the_other_pages_commands_run(world):
     for command in others():
-        run_here(command, world)
+        run(command, world)
 
 
 def test_what_is_said_to_run_elsewhere_is_still_named():
