@@ -646,6 +646,7 @@ class Bench:
         self.run, self.rig, self.dive, self.small = run, rig, dive, small_pictures
         self._make_foreign()
         self._make_settings()
+        self._make_calibrations()
         self._load_all()
 
     def _make_settings(self) -> None:
@@ -709,6 +710,28 @@ class Bench:
             ]
             path = self.run / name
             add(Format(name, path.read_bytes(), calls, binary=True, optional=True, inside=self.run))
+
+    def _make_calibrations(self) -> None:
+        """Add calibrations of other programs, as `aqualvs export` writes them, and a target."""
+        from aqualvs.calibration_files import EXPORTS, camera_of_rig, camera_text
+        from aqualvs.calibration_formats import CalibrationFormat
+        from aqualvs.optics.rigfile import load_rig
+
+        camera = camera_of_rig(load_rig(self.rig))
+        texts = {f"{to}.txt": camera_text(camera, to) for to in EXPORTS}
+        texts["opencv.xml"] = camera_text(camera, "opencv", suffix=".xml")
+        texts["opencv.json"] = camera_text(camera, "opencv", suffix=".json")
+        texts[f"{CalibrationFormat.KALIBR_TARGET}.txt"] = (
+            "target_type: 'checkerboard'\ntargetCols: 6\ntargetRows: 7\n"
+            "rowSpacingMeters: 0.06\ncolSpacingMeters: 0.06\n"
+        )
+        calls = [
+            lambda p: ["import", p, "-o", "out.yaml"],
+            lambda p: ["import", p, "-o", "out.yaml", "--image", "720x576", "--model", "opencv"],
+            lambda p: ["check", p],
+        ]
+        for name, text in texts.items():
+            self.formats.append(Format(name, text.encode(), calls))
 
     def _load_all(self) -> None:
         """Load every module and the compiled functions, so that no copy has to."""

@@ -23,6 +23,7 @@ from aqualvs.cli.command import CheckedCommand, CommandGroups
 from aqualvs.cli.design import design
 from aqualvs.cli.experiments import benchmark, reproduce, score
 from aqualvs.cli.follow import follow, tune
+from aqualvs.cli.formats import export, import_file, schema
 from aqualvs.cli.live import doctor, live
 from aqualvs.cli.run import check, demo, figures, net, net_change, report, run, simulate
 from aqualvs.errors import AqualvsError
@@ -166,11 +167,26 @@ _calibrate(
     help="Print a calibration target, true to scale, with its yaml: OUT.pdf and OUT.yaml.",
     epilog="Example: aqualvs board charuco --paper a3 -o board",
 )(board)
+_calibrate(
+    "import",
+    help="Make a rig file of the calibration that another program made: ROS, OpenCV, Kalibr, "
+    "mrcal, COLMAP, Refractive COLMAP.",
+    epilog="Example: aqualvs import camera_info.yaml --as camera -o rig.yaml",
+)(import_file)
+_calibrate(
+    help="Write a rig's camera as a calibration file of another program.",
+    epilog="Example: aqualvs export rig.yaml --to colmap-underwater -o cameras.txt",
+)(export)
 app.add_typer(calibrate, rich_help_panel="Calibrate")
 _calibrate(
     help="Say in words whether a rig is sane and what it can measure.",
     epilog="Example: aqualvs check rig.yaml --against last",
 )(check)
+_calibrate(
+    help="Print the JSON Schema of rig files, with which editors complete and check them; put it "
+    "in a file with > rig.schema.json.",
+    epilog="Example: aqualvs schema",
+)(schema)
 _live(
     help="Say whether this machine is ready, the stream arrives and the autopilot answers.",
     epilog="Example: aqualvs doctor udp://0.0.0.0:5600 --rig rig.yaml",

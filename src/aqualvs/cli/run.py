@@ -99,6 +99,10 @@ def run(
     mcap: Annotated[
         bool, typer.Option("--mcap", help="Write dive.mcap too, for Foxglove and for replays.")
     ] = False,
+    rerun: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.rrd", help="Write a file of Rerun too.", show_default=False),
+    ] = None,
     workers: Annotated[
         int | None,
         typer.Option(
@@ -130,6 +134,7 @@ def run(
         target=target,
         chosen=given(context, ("target", "detector", "mesh_filter", "fit")),
         mcap=mcap,
+        rerun=rerun,
         overlay=overlay,
         report=report,
         truth=truth,

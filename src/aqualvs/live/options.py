@@ -139,6 +139,8 @@ class OutputRequest:
     ros2, ros1 : bool
     foxglove : str or None
         Address HOST:PORT to listen on.
+    rerun : str or None
+        As `RerunOutput` takes it.
     """
 
     mavlink: tuple[str, ...] = ()
@@ -147,6 +149,7 @@ class OutputRequest:
     ros2: bool = False
     ros1: bool = False
     foxglove: str | None = None
+    rerun: str | None = None
 
 
 def make_outputs(request: OutputRequest) -> list[Output]:
@@ -169,6 +172,8 @@ def make_outputs(request: OutputRequest) -> list[Output]:
         makers.append(_ros1)
     if request.foxglove is not None:
         makers.append(partial(_foxglove, request.foxglove))
+    if request.rerun is not None:
+        makers.append(partial(_rerun, request.rerun))
     with ExitStack() as made:
         outputs = []
         for make in makers:
@@ -221,6 +226,12 @@ def _foxglove(address: str) -> Output:
 
     host, port = host_and_port(address, FOXGLOVE_PORT, "--foxglove-address")
     return FoxgloveOutput(host, port)
+
+
+def _rerun(where: str) -> Output:
+    from aqualvs.live.outputs.rerun import RerunOutput
+
+    return RerunOutput(where)
 
 
 def vehicle_reader(outputs: Sequence[Output]) -> Callable[[], VehicleState | None]:

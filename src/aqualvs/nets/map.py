@@ -31,7 +31,7 @@ _MARGIN = 0.09
 _COLOURS = "cividis"
 _MIN_SCALE, _SCALE_STEP = 0.1, 0.05
 _GREY, _PATH, _HOLE = "#c4c9cd", "#ffffff", "#d55e00"
-_INK, _SEA = "#1c2a33", "#f4f7f8"
+_INK, _SEA = "#14222c", "#f4f7f8"
 # A bearing that changes less than this, in degrees, is given in the title.
 _ONE_BEARING = 4.0
 # The vehicle's track is drawn thinner if there are more stretches than this.

@@ -314,7 +314,7 @@ def _data(m: Material) -> dict[str, Any]:
         data["error"] = charts.error_chart(m.track, m.truth)
     if m.points is not None:
         data["planes"] = charts.plane_charts(m.points, m.track, m.sample_rows, m.lasers)
-        data["cloud"] = charts.cloud_chart(m.points, len(m.lasers), dome_radius_mm(m.rig))
+        data["cloud"] = charts.cloud_chart(m.points, m.track, len(m.lasers), dome_radius_mm(m.rig))
         data["quality"] = charts.quality_charts(m.points, m.track, len(m.lasers))
     if m.bare is not None:
         data["bare"] = charts.bare_chart(m.track, m.bare, m.truth)
@@ -408,10 +408,10 @@ def _plane_view(lasers: list[LaserFacts], has_points: bool) -> str:
 
 def _cloud_view(points: PointSummary | None, planes_known: bool) -> str:
     """Return the place of the cloud, or why there is none."""
-    if points is None or not len(points.cloud_in_dome):
+    if points is None or not len(points.cloud_in_target):
         return '<p class="note">The run left no points on the target.</p>'
     total = int(points.on_target.sum())
-    shown = len(points.cloud_in_dome)
+    shown = len(points.cloud_in_target)
     amount = f"All {total:,}" if shown == total else f"A random {shown:,} of {total:,}"
     buttons = ""
     if planes_known:
@@ -420,8 +420,11 @@ def _cloud_view(points: PointSummary | None, planes_known: bool) -> str:
             '<button type="button" data-cloud="frame">the frame chosen above</button></div>'
         )
     return (
-        f'<p class="lead">{amount} target points, as seen from the vehicle (x right, y forward, z '
-        "up; the dome is the small black hemisphere). Drag to turn, scroll or pinch to zoom.</p>\n"
+        f'<p class="lead">{amount} target points. The whole dive is shown in the target’s frame: '
+        "right and up of the point nearest to the dome, and beyond the fitted plane, so that the "
+        "points of all frames lie on each other; the line is where the dome was. A frame is shown "
+        "as the vehicle saw it, with the dome as a hemisphere. Drag to turn, scroll or pinch to "
+        "zoom.</p>\n"
         f'{buttons}<div class="chart screen" id="chart-cloud"></div>'
         '<img class="paper" id="cloud-paper" alt="the same view, for paper">'
     )
