@@ -36,7 +36,7 @@ ELSEWHERE = {
     r"^simulate net_holes": "takes minutes: tests/cli/test_net.py",
     r"^net out/sim/run --log out/sim/vehicle.csv": "of the same dive",
     r"--log vehicle.tlog": "a real log: tests/vehicle_logs/test_mavlink_frames.py",
-    r"^run .* --rerun ": "needs rerun-sdk: tests/test_pipeline.py",
+    r"--rerun ": "needs an extra that is not in dev: tests/test_pipeline.py",
     r"^import ": "files of other programs: tests/cli/test_formats.py",
     r"^calibrate ": "file names of the user's own: the tour runs all four steps",
     r"^board box|^board plate": "tests/calibration/targets/test_targets.py",
