@@ -5,6 +5,7 @@ import os
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 from repository import ROOT
 
@@ -13,6 +14,9 @@ LONG = ("recovery", "cli", "docs")
 
 # As the command line does it, and before any test imports NumPy.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# On a busy machine an example, or the making of one, may take seconds.
+settings.register_profile("aqualvs", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("aqualvs")
 # Imports and thousands of tests leave nothing to free: searching them is a third of collecting.
 gc.disable()
 

@@ -5,6 +5,7 @@ import json
 import signal
 import threading
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -26,6 +27,7 @@ from aqualvs.results.summary import compare_with_truth
 from aqualvs.scanner import ScannerOptions
 from aqualvs.sources import open_source
 from aqualvs.terminal import StopSignals
+from rerun_stand_in import replace_sdk
 from shell_cases import (
     LumaScanner,
     all_key_frames,
@@ -231,6 +233,7 @@ def test_memory_stays_flat(request_for, tmp_path, monkeypatch):
         ({"water": Water(salinity=35.0)}, OptionError, "--temperature-c: missing"),
         ({"water": Water(temperature_c=10.0)}, OptionError, "--salinity: missing"),
         ({"fps": 5.0}, OptionError, "own clock"),
+        ({"rerun": Path("dive.mcap")}, OptionError, "--rerun dive.mcap: give a file that ends in"),
     ],
 )
 def test_bad_input_is_refused_before_anything_is_written(request_for, dive, change, kind, words):
@@ -239,6 +242,27 @@ def test_bad_input_is_refused_before_anything_is_written(request_for, dive, chan
         run(request, scanner_for=LumaScanner())
     assert "\n" not in str(fault.value)
     assert not request.out.exists()
+
+
+def test_a_file_of_rerun_has_every_frame(request_for, dive, tmp_path, monkeypatch):
+    streams = replace_sdk(monkeypatch)
+    request = request_for(dive, rerun=tmp_path / "out" / "dive.rrd")
+    run(request, scanner_for=LumaScanner())
+    (stream,) = streams
+    assert (stream.place, stream.closed) == (request.rerun, 1)
+    ranges = stream.at("posture/range_m", "Scalars")
+    assert [when["frame"] for when, _ in ranges] == list(range(8))
+    assert stream.at("target/vehicle/camera/picture", "EncodedImage")
+    before = (request.out / "posture.csv").read_bytes()
+    with pytest.raises(OutputError, match=r"dive.rrd: exists; .* --overwrite"):
+        run(replace(request, out=tmp_path / "other"), scanner_for=LumaScanner())
+    run(replace(request, overwrite=True), scanner_for=LumaScanner())
+    assert (request.out / "posture.csv").read_bytes() == before
+    # What somebody else has put there stays.
+    request.rerun.write_bytes(b"mine")
+    with pytest.raises(OutputError, match="has changed since"):
+        run(replace(request, overwrite=True), scanner_for=LumaScanner())
+    assert request.rerun.read_bytes() == b"mine"
 
 
 def test_pictures_of_another_size_are_refused(request_for, tmp_path):

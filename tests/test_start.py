@@ -5,9 +5,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+from rich.progress import Progress
+
 from aqualvs.cli.command import importing
 from aqualvs.demo import bundled_dive
-from aqualvs.terminal import progress
+from aqualvs.terminal import FIRST_RUN, hidden_progress, progress
+from aqualvs.terminal_bar import Rate
 
 # SciPy's linear algebra is missing here, because compiling a kernel for the first time imports it.
 NOT_FOR_A_RUN = {
@@ -38,10 +42,13 @@ def test_a_run_imports_only_what_it_needs(tmp_path: Path) -> None:
     assert not NOT_FOR_A_RUN & set(modules)
 
 
-def test_progress_is_shown_on_terminals_only(monkeypatch, capsys) -> None:
+def test_progress_is_a_bar_on_terminals_and_one_line_elsewhere(monkeypatch, capsys) -> None:
     monkeypatch.delenv("FORCE_COLOR", raising=False)
     monkeypatch.delenv("TTY_COMPATIBLE", raising=False)
     with progress("dive", 2) as tick:
+        tick(2)
+    assert capsys.readouterr().err == f"aqualvs: dive: 2 frames ({FIRST_RUN})\n"
+    with hidden_progress(), progress("dive", 2) as tick:
         tick(2)
     assert capsys.readouterr().err == ""
     monkeypatch.setenv("TTY_COMPATIBLE", "1")
@@ -49,6 +56,25 @@ def test_progress_is_shown_on_terminals_only(monkeypatch, capsys) -> None:
     with progress("dive", 2) as tick:
         tick(2)
     assert "dive" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("n_done", "seconds", "rate"),
+    [
+        (0, 5.0, ""),
+        (1, 40.0, "0.025 frames/s"),
+        (12, 5.0, "2.4 frames/s"),
+        (700, 2.0, "350 frames/s"),
+    ],
+)
+def test_no_rate_reads_0(n_done: int, seconds: int, rate: str) -> None:
+    """Also of one frame, which Rich knows no rate of, and of less than one a second."""
+    now = 0.0
+    bar = Progress(get_time=lambda: now, disable=True)
+    task = bar.add_task("dive", total=1000)
+    now = float(seconds)
+    bar.update(task, advance=n_done)
+    assert Rate("frames").render(bar.tasks[0]).plain == rate
 
 
 def test_garbage_is_looked_for_again_after_importing() -> None:

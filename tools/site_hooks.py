@@ -5,12 +5,22 @@ that lets the search work on pages opened as files comes with the site.
 """
 
 import re
+import tomllib
+from pathlib import Path
 from typing import Any
 
 from latex2mathml.converter import convert
 
 _BLOCK = re.compile(r"^```math\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+_PROJECT = Path(__file__).parents[1] / "pyproject.toml"
 _SHIM = "https://unpkg.com/iframe-worker/shim"
+
+
+def on_config(config: Any) -> Any:
+    """Name the version that the site describes at the bottom of its pages."""
+    project = tomllib.loads(_PROJECT.read_text(encoding="utf-8"))["project"]
+    config["copyright"] = f"{project['name']} {project['version']}"
+    return config
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:

@@ -12,6 +12,8 @@ setup(
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
         (f"share/{NAME}/launch", ["launch/aqualvs.launch.py"]),
+        (f"share/{NAME}/config", ["config/aqualvs.yaml"]),
+        (f"share/{NAME}/rviz", ["rviz/aqualvs.rviz"]),
     ],
     install_requires=["setuptools"],
     zip_safe=True,

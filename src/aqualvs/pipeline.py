@@ -243,7 +243,8 @@ def summary_for(dive: OpenDive) -> RunSummary:
 def _shared_work(dive: OpenDive, scanner_for: ScannerFor) -> PoolJob | None:
     """Return how processes can share the dive; None where one process must measure all of it."""
     request = dive.request
-    alone = request.overlay or request.mcap or request.index_target is not None
+    shows_pictures = request.overlay or request.rerun is not None
+    alone = shows_pictures or request.mcap or request.index_target is not None
     if alone or dive.is_replay or scanner_for is not Scanner or request.n_processes < 2:
         return None
     return pool_job(dive.source, request.frames, dive.rig, request.scanner)

@@ -5,6 +5,7 @@
 - `RunBareLens`: `posture_bare.csv`, the posture without the dome model.
 - `RunOverlay`: `overlay.mp4`, the video of what the scanner detected.
 - `RunMcap`: `dive.mcap`, the recording, on request.
+- `RunRerun`: a file of Rerun, on request.
 - `RunNet`: the state of the net, on request.
 """
 
@@ -12,7 +13,7 @@ import statistics
 import time
 from array import array
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -20,7 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from aqualvs.closing import Closing
-from aqualvs.errors import OptionError
+from aqualvs.errors import OptionError, OutputError
 from aqualvs.nets.target_file import NetRequest
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.rigfile import rig_to_mapping
@@ -48,6 +49,7 @@ from aqualvs.scanning.scan import Frame, Scan
 from aqualvs.scanning.stripe import StripePeaks
 from aqualvs.sources import FrameSource
 from aqualvs.sources.base import bgr_of
+from aqualvs.special_files import refuse_special
 from aqualvs.terminal import StopSignals, Tick
 from aqualvs.workers.frame_results import FrameResult, FrameScanner
 from aqualvs.workers.run_frames import Replay
@@ -55,6 +57,7 @@ from aqualvs.workers.water_index import WaterFollowingScanner
 
 if TYPE_CHECKING:
     from aqualvs.recording import Recording
+    from aqualvs.recording.rerun_log import RerunLog
     from aqualvs.recording.sample import LiveSample
 
 
@@ -142,28 +145,11 @@ class RunMcap(Closing):
         """Record a scan with the rig and the stripes that it was made from."""
         if self._recording is not None:
             with writing(self._path):
-                self._recording.write(self._sample(rig, scan, peaks))
+                self._recording.write(_sample(self._began_ns, rig, scan, peaks))
 
     def lost(self, scan: Scan) -> None:
         """Record the scan of a frame that was lost."""
         self.write(self._rig, scan, {})
-
-    def _sample(self, rig: Rig, scan: Scan, peaks: dict[SearchAxis, StripePeaks]) -> "LiveSample":
-        from aqualvs.recording.sample import Instants, LiveSample
-        from aqualvs.sources.base import Health
-
-        at_ns = round(1e9 * scan.time_s)
-        return LiveSample(
-            rig=rig,
-            scan=scan,
-            peaks=peaks,
-            frame=None,
-            # Times as if the dive had started with the run.
-            utc_ns=self._began_ns + at_ns,
-            instants=Instants(at_ns, at_ns, at_ns),
-            filtered=None,
-            health=Health(),
-        )
 
     def close(self) -> None:
         """Close the file; readable in any case."""
@@ -182,6 +168,67 @@ class _RecordedScanner:
         rig, scan, peaks = _measured(self._scanner, frame)
         self._mcap.write(rig, scan, peaks)
         return scan
+
+
+def _sample(
+    began_ns: int,
+    rig: Rig,
+    scan: Scan,
+    peaks: dict[SearchAxis, StripePeaks],
+    frame: Frame | None = None,
+) -> "LiveSample":
+    """Return the sample of a frame, with times as if the dive had started with the run."""
+    from aqualvs.recording.sample import Instants, LiveSample
+    from aqualvs.sources.base import Health
+
+    at_ns = round(1e9 * scan.time_s)
+    return LiveSample(
+        rig=rig,
+        scan=scan,
+        peaks=peaks,
+        frame=frame,
+        utc_ns=began_ns + at_ns,
+        instants=Instants(at_ns, at_ns, at_ns),
+        filtered=None,
+        health=Health(),
+    )
+
+
+class RunRerun(Closing):
+    """Writer of a file of Rerun during a run, or of nothing; a context manager.
+
+    Parameters
+    ----------
+    path : Path or None
+    rig : Rig
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written.
+    OptionError
+        If rerun-sdk is not installed.
+    """
+
+    def __init__(self, path: Path | None, rig: Rig) -> None:
+        self._rig = rig
+        self._log: RerunLog | None = None
+        if path is not None:
+            from aqualvs.recording import rerun_log
+
+            self._log = rerun_log.RerunLog()
+            with writing(path):
+                self._log.save(path)
+
+    def write(self, frame: Frame | None, scan: Scan) -> None:
+        """Log the result of a frame."""
+        if self._log is not None:
+            self._log.write(_sample(0, self._rig, scan, {}, frame))
+
+    def close(self) -> None:
+        """Finish the file."""
+        if self._log is not None:
+            self._log.close()
 
 
 def _recording(path: Path, options: ScannerOptions) -> "Recording":
@@ -322,6 +369,7 @@ class RunWriters:
     overlay : RunOverlay
     bare_lens : RunBareLens
     mcap : RunMcap
+    rerun : RunRerun
     net : RunNet
     """
 
@@ -331,10 +379,11 @@ class RunWriters:
         overlay: RunOverlay,
         bare_lens: RunBareLens,
         mcap: RunMcap,
+        rerun: RunRerun,
         net: RunNet,
     ) -> None:
         self._outputs, self._overlay, self._bare_lens = outputs, overlay, bare_lens
-        self._mcap, self._net = mcap, net
+        self._mcap, self._rerun, self._net = mcap, rerun, net
 
     def recorded(self, scanner: FrameScanner) -> FrameScanner:
         """Return the scanner to measure with, which records its results if requested."""
@@ -346,6 +395,7 @@ class RunWriters:
         self._bare_lens.write(*found)
         for measured in found:
             self._overlay.write(measured.frame, measured.scan)
+            self._rerun.write(measured.frame, measured.scan)
             if measured.is_lost:
                 self._mcap.lost(measured.scan)
             else:
@@ -360,16 +410,32 @@ class RunWriters:
         return self._bare_lens.lines()
 
 
-def prepare(request: RunRequest) -> Claim:
-    """Make sure that the run can be written; returns the claim to be closed at its end.
+def prepare(request: RunRequest) -> ExitStack:
+    """Make sure that the run can be written; returns the claims to be closed at its end.
 
     Raises
     ------
     OutputError
         If it cannot, or its folder holds another that may not be replaced.
+    OptionError
+        If a file of Rerun is requested but cannot be.
     """
     check_source_stays(request.out, request.source)
-    return prepare_folder(request.out, overwrite=request.overwrite)
+    with ExitStack() as claims:
+        if request.rerun is not None:
+            claims.callback(_claim_rerun(request.rerun, overwrite=request.overwrite).close)
+        claims.callback(prepare_folder(request.out, overwrite=request.overwrite).close)
+        return claims.pop_all()
+
+
+def _claim_rerun(path: Path, *, overwrite: bool) -> Claim:
+    from aqualvs.recording.rerun_log import RRD, rerun_sdk
+
+    if path.suffix != RRD:
+        raise OptionError(f"--rerun {path}: give a file that ends in {RRD}")
+    rerun_sdk()
+    refuse_special(path, OutputError, f"give a file that ends in {RRD}")
+    return Claim("run", [path], overwrite=overwrite)
 
 
 @contextmanager
@@ -389,8 +455,9 @@ def writers(
         RunOverlay(request.out, rig, source, wanted=request.overlay) as overlay,
         RunBareLens(request.out, rig) as bare_lens,
         RunMcap(request.out, rig, request.scanner, wanted=request.mcap) as mcap,
+        RunRerun(request.rerun, rig) as rerun,
     ):
-        yield RunWriters(outputs, overlay, bare_lens, mcap, net)
+        yield RunWriters(outputs, overlay, bare_lens, mcap, rerun, net)
 
 
 def write_all(

@@ -1,4 +1,4 @@
-"""The terminal during a run: a progress bar on standard error, and an orderly stop.
+"""The terminal during a run: progress on standard error, and an orderly stop.
 
 Ctrl-C and SIGTERM end the run after the current frame (`StopSignals`).
 """
@@ -61,6 +61,9 @@ class StopSignals(Closing):
 
 Tick: TypeAlias = Callable[[int], None]
 
+FIRST_RUN = "the first run on a machine compiles for a minute or two"
+"""Said until the first frame is done; compiled code is kept for the next run."""
+
 _HIDDEN: ContextVar[bool] = ContextVar("hidden", default=False)
 # Variables that declare any output a terminal (https://force-color.org).
 _CLAIMS = ("TTY_COMPATIBLE", "FORCE_COLOR")
@@ -78,7 +81,9 @@ def hidden_progress() -> Iterator[None]:
 
 @contextlib.contextmanager
 def progress(label: str, n_frames: int | None, unit: str = "frames") -> Iterator[Tick]:
-    """Show a progress bar, unless standard error is not a terminal or bars are hidden.
+    """Show a progress bar; print one line instead where standard error is no terminal.
+
+    Inside `hidden_progress`, show nothing.
 
     Parameters
     ----------
@@ -94,13 +99,18 @@ def progress(label: str, n_frames: int | None, unit: str = "frames") -> Iterator
     tick : callable
         Call it with the number of frames completed since the last call.
     """
-    if _HIDDEN.get() or not _may_be_terminal():
+    if _HIDDEN.get():
+        yield _echo_nothing
+        return
+    if not _may_be_terminal():
+        count = unit if n_frames is None else f"{n_frames} {unit}"
+        print(f"aqualvs: {label}: {count} ({FIRST_RUN})", file=sys.stderr, flush=True)
         yield _echo_nothing
         return
 
     from aqualvs.terminal_bar import terminal_bar
 
-    with terminal_bar(label, n_frames, unit) as tick:
+    with terminal_bar(label, n_frames, unit, hint=FIRST_RUN) as tick:
         yield tick
 
 

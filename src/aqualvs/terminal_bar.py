@@ -15,11 +15,8 @@ from rich.progress import (
 )
 from rich.text import Text
 
-# Until the first frame is done; compiled code is kept for the next run.
-_FIRST_RUN = "(the first run on a machine compiles for a minute or two)"
 
-
-class _Rate(ProgressColumn):
+class Rate(ProgressColumn):
     """Frames, or whatever is counted, per second."""
 
     def __init__(self, unit: str) -> None:
@@ -29,17 +26,28 @@ class _Rate(ProgressColumn):
     def render(self, task: Task) -> Text:
         """Return the rate as text."""
         speed = task.finished_speed or task.speed
-        return Text("" if speed is None else f"{speed:.0f} {self._unit}/s")
+        if not speed and task.completed and task.elapsed:
+            # Rich forgets what is older than half a minute.
+            speed = task.completed / task.elapsed
+        return Text(f"{_rounded(speed)} {self._unit}/s" if speed else "")
+
+
+def _rounded(speed: float) -> str:
+    """Return a rate with two significant digits at least."""
+    return f"{speed:.0f}" if speed >= 10.0 else f"{speed:#.2g}"
 
 
 @contextlib.contextmanager
-def terminal_bar(label: str, n_frames: int | None, unit: str) -> Iterator[Callable[[int], None]]:
+def terminal_bar(
+    label: str, n_frames: int | None, unit: str, *, hint: str
+) -> Iterator[Callable[[int], None]]:
     """Show a bar on standard error; nothing where Rich does not take that for a terminal.
 
-    Parameters and what it yields are those of `aqualvs.terminal.progress`.
+    Parameters and what it yields are those of `aqualvs.terminal.progress`. The hint is shown until
+    the first frame is done.
     """
     console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), _Rate(unit))
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), Rate(unit))
     bar = Progress(
         *columns,
         TimeRemainingColumn(),
@@ -48,7 +56,7 @@ def terminal_bar(label: str, n_frames: int | None, unit: str) -> Iterator[Callab
         disable=not console.is_terminal,
     )
     with bar:
-        task = bar.add_task(f"{label} {_FIRST_RUN}", total=n_frames)
+        task = bar.add_task(f"{label} ({hint})", total=n_frames)
 
         def tick(n_done: int) -> None:
             bar.update(task, advance=n_done, description=label)

@@ -231,6 +231,9 @@ def test_command_on_a_sane_rig(tmp_path: Path) -> None:
     assert "pixel noise" in page
     assert "How well the set of intrinsics is known is not written down" in " ".join(page.split())
     assert "This rig is sane" in page
+    # The verdict first, then what needs a hand, then what is well.
+    assert page.index("This rig is sane") < page.index(" ok ")
+    assert page.rfind(" warn ") < page.index(" ok ")
 
 
 def test_command_on_a_bad_rig(tmp_path: Path) -> None:

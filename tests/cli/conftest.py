@@ -5,6 +5,7 @@ from collections.abc import Callable
 import pytest
 
 from aqualvs.cli.main import main
+from complaints import complaints
 
 
 @pytest.fixture
@@ -13,10 +14,9 @@ def refused(capfd: pytest.CaptureFixture[str]) -> Callable[..., str]:
 
     def check(*arguments: object) -> str:
         assert main([str(one) for one in arguments]) == 2
-        said = capfd.readouterr()
-        assert said.err.count("\n") == 1
-        assert said.err.startswith("aqualvs: error: ")
-        assert "Traceback" not in said.err
-        return said.err
+        said = complaints(capfd.readouterr().err)
+        assert len(said) == 1
+        assert said[0].startswith("aqualvs: error: ")
+        return said[0]
 
     return check

@@ -1,5 +1,6 @@
 """`aqualvs design`: from options to tables, a rig that works, and pictures."""
 
+import re
 from dataclasses import replace
 
 import cv2
@@ -135,3 +136,23 @@ def test_faults_of_the_user_become_one_line(arguments, words, capsys):
     complaint = capsys.readouterr().err
     assert words in complaint
     assert complaint.count("\n") == 1
+
+
+def test_the_page_says_the_verdict_first_and_all_that_was_printed(folder):
+    page = (folder / "design.html").read_text(encoding="utf-8")
+    words = re.sub(r"<style>.*?</style>|<[^>]+>", " ", page, flags=re.DOTALL)
+    words = " ".join(words.split())
+    assert words.index("its goals of 0.5 % and 0.5 degrees") < words.index("Expected error")
+    assert words.count("Tolerances at") >= 1
+    # Pictures travel with the page, and it asks nobody for anything.
+    assert page.count('src="data:image/png;base64,') == 2
+    assert "http" not in words
+    assert page.count("<section") == page.count("</section>")
+
+
+def test_a_design_that_misses_its_goals_is_told_so(tmp_path, capsys):
+    content = {**yaml.safe_load(EXAMPLE), "goals": {"range_percent": 0.001, "angle_deg": 0.5}}
+    (tmp_path / "design.yaml").write_text(yaml.safe_dump(content))
+    assert main(["design", str(tmp_path / "design.yaml"), "--no-changes", "--no-tilt"]) == 0
+    first = capsys.readouterr().out.splitlines()[0]
+    assert first.startswith("No: misses its goals of 0.001 % and 0.5 degrees")

@@ -1,5 +1,6 @@
 """The command line as a whole: help, version, and how fast it is there."""
 
+import contextlib
 import os
 import re
 import signal
@@ -52,6 +53,33 @@ def test_help_without_a_command_names_them_all(capsys):
     assert main([]) == 0
     said = capsys.readouterr().out
     assert all(command in said for command in COMMANDS)
+
+
+def test_every_command_is_in_a_group(capsys):
+    assert main(["--help"]) == 0
+    said = capsys.readouterr().out
+    titles = [line for line in said.splitlines() if re.fullmatch(r"[A-Z][a-z ]+:", line)]
+    groups = ["Measure", "Calibrate", "Live and control", "Nets", "Simulate", "Reference"]
+    assert titles == ["Options:", *(f"{group}:" for group in groups)]
+    assert "..." not in said.partition("Measure:")[2]
+    assert said.index("  calibrate ") < said.index("Live and control:")
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish", "powershell"])
+def test_a_shell_can_complete(shell, monkeypatch, capsys):
+    monkeypatch.setenv("_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION", "1")
+    with contextlib.suppress(SystemExit):
+        main(["--show-completion", shell])
+    assert f"complete_{shell}" in capsys.readouterr().out
+
+
+def test_a_command_is_completed(monkeypatch, capsys):
+    monkeypatch.setenv("_AQUALVS_COMPLETE", "complete_bash")
+    monkeypatch.setenv("COMP_WORDS", "aqualvs run dive.mp4 --detector ")
+    monkeypatch.setenv("COMP_CWORD", "4")
+    with contextlib.suppress(SystemExit):
+        main([])
+    assert capsys.readouterr().out.split() == ["ridge", "threshold"]
 
 
 def test_the_version(capsys):

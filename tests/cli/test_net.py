@@ -218,7 +218,7 @@ def test_faults_are_told_in_one_line(dive, run_folder, tmp_path, refused):
     video, rig = dive
     out = tmp_path / "out"
     assert "--rig" in refused("net", video, "-o", out)
-    assert "--out" in refused("net", video, "--rig", rig)
+    assert "--out: missing" in refused("net", "udp://127.0.0.1:5600", "--rig", rig)
     assert "nowhere" in refused("net", tmp_path / "nowhere", "--rig", rig, "-o", out)
     assert "leave --rig out" in refused("net", run_folder, "--rig", rig)
     missing = tmp_path / "missing.csv"

@@ -1,15 +1,22 @@
 """`aqualvs simulate`, and what it writes through `aqualvs run`."""
 
 import re
+import signal
+import subprocess
+import sys
 
 import av
 import pytest
 
+from aqualvs.calibration.targets.target_files import load_board
 from aqualvs.cli.main import main
 from aqualvs.experiments.simulate import CALIBRATION
+from aqualvs.simulation.calibration_set import SetSize
 from aqualvs.simulation.cameras import list_cameras
 from aqualvs.simulation.scenarios import list_scenarios
+from aqualvs.sources import open_source
 from shell_cases import rig_file
+from waiting import TIMEOUT_S, until
 
 
 def test_the_list_names_every_scenario(capsys):
@@ -91,3 +98,42 @@ def test_a_real_camera_s_dive_is_another_picture_of_the_same_truth(tmp_path):
         with av.open(str(folder / "dive.mp4")) as container:
             codecs.append(container.streams.video[0].codec_context.name)
     assert codecs == ["h264", "mjpeg"]
+
+
+def interrupted(begun, *arguments):
+    """Send SIGINT once the simulation has come so far, and return what it says on its output."""
+    command = [sys.executable, "-m", "aqualvs", "simulate", *map(str, arguments)]
+    pipe = subprocess.PIPE
+    process = subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True)
+    # Once it tells of its progress, signals are caught.
+    assert "frames" in process.stderr.readline() or begun is not None
+    if begun is not None:
+        until(begun.exists, f"{begun}")
+    process.send_signal(signal.SIGINT)
+    said, errors = process.communicate(timeout=TIMEOUT_S)
+    assert process.returncode == 128 + signal.SIGINT, errors
+    assert errors == ""
+    return said
+
+
+def test_ctrl_c_leaves_a_dive_that_can_be_measured(tmp_path):
+    said = interrupted(None, "wall", "-o", tmp_path)
+    n_done, n_all = map(
+        int, re.search(r"stopped by SIGINT after (\d+) of (\d+) frames", said).groups()
+    )
+    assert 0 < n_done < n_all
+    n_rows = len((tmp_path / "truth.csv").read_text().splitlines()) - 1
+    with open_source(tmp_path / "dive.mp4") as source:
+        assert sum(1 for _ in source) == n_rows == n_done
+    command = next(line for line in said.splitlines() if line.startswith("next: aqualvs "))
+    assert main([*command.removeprefix("next: aqualvs ").split(), "--no-report"]) == 0
+
+
+def test_ctrl_c_leaves_whole_folders_of_calibration_pictures(tmp_path):
+    said = interrupted(tmp_path / "dome_air", "calibration", "-o", tmp_path)
+    complete = re.search(r"stopped by SIGINT after \d+ of 43 pictures; complete in .*: (.*)", said)
+    assert "camera_air" in complete[1].split(", ")
+    assert "dive" not in complete[1].split(", ")
+    assert len(list((tmp_path / "camera_air").glob("*.png"))) == SetSize().camera
+    load_board(tmp_path / "camera_air" / "board.yaml")
+    assert (tmp_path / "nominal.yaml").is_file()

@@ -305,3 +305,12 @@ def test_swell_filter_passes_its_period_alone() -> None:
     assert gain(1.0) < 0.1
     still = SwellFilter(5.0, 0.15)
     assert still.update(0.0, 1.0) == 0.0
+
+
+def test_a_ramp_may_fall_more_slowly_than_it_rises() -> None:
+    ramp = Ramp(0.5, 4.0, falling=0.1)
+    for goal, speed in ((1.0, 0.5), (0.0, -0.1)):
+        for _ in range(25):
+            ramp.step(goal, 0.04)
+        assert ramp.rate == pytest.approx(speed)
+        ramp.start(goal)

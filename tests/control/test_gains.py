@@ -197,3 +197,17 @@ def test_default_gains_are_whole(content: dict[str, object]) -> None:
     assert isinstance(load_gains("videoray"), ControlGains)
     assert load_gains("videoray").vehicle.can_sway is False
     assert load_gains("bluerov2").vehicle.can_sway is True
+
+
+@pytest.mark.parametrize("drag", [Drag(4.0, 18.0), Drag(0.0, 18.0), Drag(4.0, 0.0), Drag(0.0, 0.0)])
+def test_coasting_speed_is_that_of_the_way(drag: Drag) -> None:
+    speed, way, step = drag.coasting_speed(0.3, 5.0, 17.0), 0.0, 1e-3
+    for _ in range(5000):
+        speed -= 0.5 * step * drag.force(speed) / 17.0
+        way += step * speed
+        speed -= 0.5 * step * drag.force(speed) / 17.0
+    assert way == pytest.approx(0.3, rel=1e-3)
+
+
+def test_a_greater_drag_than_any_vehicles_gives_a_finite_speed() -> None:
+    assert math.isfinite(Drag(0.0, 1e9).coasting_speed(0.3, 5.0, 1.0))

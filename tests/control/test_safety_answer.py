@@ -96,10 +96,27 @@ def test_a_yaw_that_does_not_follow_the_heading() -> None:
     assert answering == [{None}, {None, LimitReason.NO_ANSWER}]
 
 
+@pytest.mark.parametrize(("turned_deg_s", "receding_m_s"), [(5.3, 0.0), (10.0, 0.02)])
+def test_a_way_along_a_curved_net_is_an_answer(turned_deg_s: float, receding_m_s: float) -> None:
+    """At 0.8 m/s with the current, well held; or faster, as the range shows that it is live."""
+    rng, watch = np.random.default_rng(6), AnswerWatch(GAINS.vehicle)
+    for k in range(100):
+        now_s = FRAME_S * k
+        state = state_at(now_s, heading=math.radians(turned_deg_s) * now_s)
+        assert watch.see(now_s, noisy(rng, 0.6 + receding_m_s * now_s), state) is None
+        watch.done(now_s, HELD)
+
+
 def frozen_hold(
-    name: str, loss: LossOfSight, *, before: float = 0.6, seed: int = 1
+    name: str,
+    loss: LossOfSight,
+    *,
+    before: float = 0.6,
+    since_s: float = 0.3,
+    noticed_s: float = math.inf,
+    seed: int = 1,
 ) -> tuple[float, float, list[Decision]]:
-    """Hold 0.6 m in calm water; sight freezes at 14 s, just before of which the setpoint came."""
+    """Hold 0.6 m in calm water; sight freezes at 14 s, some time after the setpoint came."""
     freeze_s, mission = 14.0, HoldMission(Setpoint(before))
     model = vehicle_model(name)
     case = SimCase(
@@ -109,9 +126,11 @@ def frozen_hold(
         start_range=before,
         seed=seed,
     )
-    eye = SampledSensor(
-        case.net, np.random.default_rng(seed), blind=(Blind(freeze_s, math.inf, loss),)
+    blind = (
+        Blind(freeze_s, freeze_s + noticed_s, loss),
+        Blind(freeze_s + noticed_s, math.inf, LossOfSight.TARGET),
     )
+    eye = SampledSensor(case.net, np.random.default_rng(seed), blind=blind)
     loop, decisions = case.loop(eye, mission), []
 
     def keep(now_s: float, *step: object) -> None:
@@ -120,7 +139,7 @@ def frozen_hold(
             decisions.append((now_s, step[2]))
 
     def step(now_s: float) -> None:
-        if now_s >= freeze_s - 0.3:
+        if now_s >= freeze_s - since_s:
             mission.setpoint = Setpoint(0.6)
 
     loop.on_step = keep
@@ -140,10 +159,22 @@ def test_a_frozen_posture_stops_the_vehicle_in_time(name: str, before: float) ->
     assert decisions[-1].reason is LimitReason.FROZEN
 
 
+@pytest.mark.parametrize(("name", "least"), [("bluerov2", 0.3), ("bluerov2-heavy", 0.43)])
+def test_a_vehicle_that_approaches_a_frozen_net_coasts_to_rest_before_it(
+    name: str, least: float
+) -> None:
+    """The picture is noticed after 0.4 s; what coasts far approaches slowly."""
+    for since_s in (0.9, 1.8):
+        _, nearest, _ = frozen_hold(
+            name, LossOfSight.STUCK, before=0.75, since_s=since_s, noticed_s=0.4
+        )
+        assert nearest >= least
+
+
 def test_a_vehicle_that_moves_unseen_is_given_back() -> None:
     """The picture stands still, yet has noise: efforts alone tell."""
     neutral_s, _, decisions = frozen_hold("bluerov2", LossOfSight.STUCK, before=0.75)
-    assert neutral_s <= 2.5
+    assert neutral_s <= 3.5
     assert decisions[-1].reason is LimitReason.NO_ANSWER
     assert not decisions[-1].engaged
     assert LimitReason.NO_ANSWER.takes_over

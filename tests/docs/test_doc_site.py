@@ -27,7 +27,7 @@ def test_the_site_builds_and_links_hold(tmp_path):
     done = build(tmp_path / "site")
     assert done.returncode == 0, done.stderr
     page = (tmp_path / "site" / "index.html").read_text(encoding="utf-8")
-    assert "aqualvs" in page
+    assert f"aqualvs {aqualvs.__version__}" in page
     formulas = (tmp_path / "site" / "mathematics.html").read_text(encoding="utf-8")
     assert "<mfrac>" in formulas
     assert "```" not in formulas
@@ -47,6 +47,7 @@ def test_a_dead_link_is_found(tmp_path):
     (docs / "index.md").write_text("[gone](gone.md)\n", encoding="utf-8")
     config = (ROOT / "mkdocs.yml").read_text(encoding="utf-8").split("nav:\n")[0]
     shutil.copytree(ROOT / "tools", tmp_path / "tools")
+    shutil.copy(ROOT / "pyproject.toml", tmp_path)
     (tmp_path / "mkdocs.yml").write_text(config, encoding="utf-8")
     done = build(tmp_path / "site", tmp_path / "mkdocs.yml")
     assert done.returncode != 0

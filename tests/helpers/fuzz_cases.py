@@ -34,6 +34,7 @@ import aqualvs
 from aqualvs.cli import main as cli
 from aqualvs.cli.main import main
 from aqualvs.errors import SourceError
+from complaints import complaints
 from repository import ROOT
 
 CPU_S = 20
@@ -152,7 +153,7 @@ def _judged(case: Case, status: int, n_bytes: int, err: str) -> str:
     if os.WIFSIGNALED(status):
         return f"killed by {signal.Signals(os.WTERMSIG(status)).name}"
     code = os.WEXITSTATUS(status)
-    lines = [line for line in err.splitlines() if line.strip()]
+    lines = [line for line in complaints(err) if line.strip()]
     if "Traceback" in err or "Exception ignored" in err or code == 70:
         return f"traceback: {lines[-1] if lines else ''}"
     if n_bytes > MEMORY_BYTES:
@@ -645,6 +646,7 @@ class Bench:
         self.run, self.rig, self.dive, self.small = run, rig, dive, small_pictures
         self._make_foreign()
         self._make_settings()
+        self._make_calibrations()
         self._load_all()
 
     def _make_settings(self) -> None:
@@ -708,6 +710,28 @@ class Bench:
             ]
             path = self.run / name
             add(Format(name, path.read_bytes(), calls, binary=True, optional=True, inside=self.run))
+
+    def _make_calibrations(self) -> None:
+        """Add calibrations of other programs, as `aqualvs export` writes them, and a target."""
+        from aqualvs.calibration_files import EXPORTS, camera_of_rig, camera_text
+        from aqualvs.calibration_formats import CalibrationFormat
+        from aqualvs.optics.rigfile import load_rig
+
+        camera = camera_of_rig(load_rig(self.rig))
+        texts = {f"{to}.txt": camera_text(camera, to) for to in EXPORTS}
+        texts["opencv.xml"] = camera_text(camera, "opencv", suffix=".xml")
+        texts["opencv.json"] = camera_text(camera, "opencv", suffix=".json")
+        texts[f"{CalibrationFormat.KALIBR_TARGET}.txt"] = (
+            "target_type: 'checkerboard'\ntargetCols: 6\ntargetRows: 7\n"
+            "rowSpacingMeters: 0.06\ncolSpacingMeters: 0.06\n"
+        )
+        calls = [
+            lambda p: ["import", p, "-o", "out.yaml"],
+            lambda p: ["import", p, "-o", "out.yaml", "--image", "720x576", "--model", "opencv"],
+            lambda p: ["check", p],
+        ]
+        for name, text in texts.items():
+            self.formats.append(Format(name, text.encode(), calls))
 
     def _load_all(self) -> None:
         """Load every module and the compiled functions, so that no copy has to."""

@@ -33,8 +33,9 @@ def log(n=N, heading=1.0, turn=0.0):
 
 
 def walled(stretches, holes=(), vehicle=None):
-    places = place_net(stretches, holes, postures(len(stretches) * STRETCH_S), vehicle)
-    return unroll(stretches, holes, places, example_rig())
+    dive = postures(len(stretches) * STRETCH_S)
+    places = place_net(stretches, holes, dive, vehicle)
+    return unroll(stretches, holes, places, example_rig(), dive)
 
 
 @pytest.fixture(scope="module")
@@ -293,3 +294,41 @@ def test_report_says_that_no_net_was_seen(tmp_path):
     net, _ = read_net(tmp_path)
     assert "No net was seen" in net_view(net)
     assert net_cards(net) == []
+
+
+def test_the_map_shows_a_hole_beyond_the_stretches(tmp_path):
+    """A wall of half a metre with a hole a metre to its right, which is drawn whole."""
+    beyond = walled([stretch(0, (STEP, 0.0))], [hole(1.0, (1.5, 0.0), size=0.3)])
+    draw_map(beyond, [tmp_path / "map.svg"])
+    assert "<!-- 1: 270 mm -->" in (tmp_path / "map.svg").read_text()
+    draw_map(beyond, [tmp_path / "map.png"])
+    picture = cv2.imread(str(tmp_path / "map.png")).astype(int)
+    rim = np.abs(picture - [0x00, 0x5E, 0xD5]).max(axis=2) < 6
+    # Both sides of the ring, larger than the one in the legend.
+    _, _, stats, _ = cv2.connectedComponentsWithStats(rim.astype(np.uint8))
+    width, height = stats[1:, cv2.CC_STAT_WIDTH], stats[1:, cv2.CC_STAT_HEIGHT]
+    assert width.max() > 100
+    assert height[width.argmax()] / width.max() == pytest.approx(0.8, abs=0.1)
+
+
+def test_a_hole_is_found_again_in_the_picture_of_its_look(wall, folder, tmp_path):
+    first, _ = rows(folder / "holes.csv")
+    # The vehicle looks square to the net at the hole, half a metre away.
+    camera = example_rig().camera()
+    (u, v), _ = camera.project(np.array([0.0, 0.5, 0.0]))
+    assert [float(first["u_px"]), float(first["v_px"])] == pytest.approx([u, v], abs=0.1)
+    (rim, _), _ = camera.project(np.array([0.5 * 0.108, 0.5, 0.0]))
+    assert float(first["diameter_px"]) == pytest.approx(2.0 * (rim - u), rel=0.02)
+    assert first["picture_frame"] == first["frame"] == "150"
+    unseen = walled([stretch(0, (STEP, 0.0))], [hole(1.0, (0.9, 0.0), from_foot=(0.9, 0.0))])
+    write_net_files(tmp_path, unseen, {})
+    assert rows(tmp_path / "holes.csv")[0]["u_px"] == ""
+
+
+def test_report_shows_each_hole_and_the_way_back(wall, tmp_path):
+    dive = make_dive(tmp_path / "run", n=300)
+    write_net_files(dive.folder, wall, {})
+    page = write_report(dive.folder).read_text(encoding="utf-8")
+    assert page.count('alt="Hole 1 with its surroundings"') == 1
+    way = "depth 4.90 m, heading 57°, 1.20 m along the net, 6.0 s in the video"
+    assert f"<b>Hole 1: 108 ± 12 mm</b><br>{way}" in page

@@ -1,5 +1,6 @@
 """The rig file: what is read, what is refused and in which words, and that nothing drifts."""
 
+import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -25,9 +26,12 @@ from aqualvs.optics.rigschema import (
     RigFile,
     WaterPart,
     WindowPart,
+    rig_json_schema,
 )
 from aqualvs.optics.sheet import sheets_of
 from aqualvs.optics.water import seawater_index_vacuum
+from aqualvs.yamlfile import parse_yaml
+from json_schema import is_valid
 from repository import ROOT
 
 HAND_WRITTEN = """\
@@ -156,80 +160,151 @@ def test_lasers_may_be_missing_only_before_their_calibration() -> None:
     assert "lasers is empty" in fault(hand_written(lasers=[]))
 
 
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"aqualvs_rig": ...}, ("aqualvs_rig is missing", "aqualvs_rig: 1")),
-        ({"aqualvs_rig": 2}, ("aqualvs_rig is 2", "version 1")),
-        ({"aqualvs_rig": "1"}, ("aqualvs_rig is '1'",)),
-        ({"aqualvs_rig": True}, ("aqualvs_rig is True",)),
-        ({"camera__fx_px": ...}, ("camera.fx_px is missing", "fx_px: 817.5")),
-        ({"image__width": 720}, ("image.width is not a key", "'width_px'")),
-        ({"image__width": 720, "image__width_px": ...}, ("image.width is not a key", "'width_px'")),
-        ({"lasers__1__ofset_mm": 1.0}, ("lasers[1].ofset_mm is not a key", "'offset_mm'")),
-        ({"fps": 25}, ("fps is not a key", "allowed here: aqualvs_rig, name")),
-        ({"camera__fx_px": "817.5"}, ("camera.fx_px is '817.5'", "plain number")),
-        ({"camera__fx_px": True}, ("camera.fx_px is True", "plain number")),
-        ({"camera__fx_px": -817.5}, ("camera.fx_px is -817.5", "greater than 0")),
-        ({"camera__fx_px": None}, ("camera.fx_px is empty", "plain number")),
-        ({"camera__cx_px": float("nan")}, ("camera.cx_px is nan", "finite")),
-        (
-            {"camera__distortion": [0.1, float("inf"), 0, 0]},
-            ("camera.distortion[1] is inf", "finite"),
-        ),
-        (
-            {"camera__distortion": [0.1, 0.2, 0.3]},
-            ("camera.distortion has 3 values", "0, 4, 5 or 8"),
-        ),
-        (
-            {"camera__model": "fisheye", "camera__distortion": [0.1] * 5},
-            ("camera.distortion has 5 values", "fisheye", "0 or 4"),
-        ),
-        ({"camera__model": "pinhole"}, ("camera.model is 'pinhole'", "'opencv' or 'fisheye'")),
-        ({"camera__position_mm": [1.0, 2.0]}, ("camera.position_mm", "3 values")),
-        ({"camera__position_mm": [0, 44.25, 0]}, ("camera.position_mm", "44.2 mm", "44.25 mm")),
-        ({"camera": [1, 2]}, ("camera is [1, 2]", "keys and values")),
-        ({"image__width_px": 720.5}, ("image.width_px is 720.5", "whole number")),
-        ({"image__height_px": 0}, ("image.height_px is 0", "greater than 0")),
-        ({"dome__thickness_mm": -1}, ("dome.thickness_mm is -1", "at least 0")),
-        ({"dome__inner_radius_mm": 0}, ("dome.inner_radius_mm is 0", "greater than 0")),
-        ({"dome__n_acrylic": 0.9}, ("dome.n_acrylic is 0.9", "at least 1")),
-        ({"n_air": 1333}, ("n_air is 1333", "at most 2")),
-        ({"water__n": 2.1}, ("water.n is 2.1", "at most 2")),
-        ({"water": ...}, ("water is missing", "water: {n: 1.3333}")),
-        ({"water": {}}, ("water has no index", "temperature_c and salinity_permille")),
-        ({"water": {"temperature_c": 15}}, ("water has no index", "salinity_permille")),
-        ({"water__temperature_c": 15}, ("water gives n and", "keep either")),
-        (
-            {"water": {"temperature_c": 90, "salinity_permille": 0}},
-            ("water: water temperature 90", "0 to 30"),
-        ),
-        ({"lasers": {"name": "a"}}, ("lasers is {'name': 'a'}", "square brackets")),
-        ({"lasers__1__normal": [0, 0, 0]}, ("lasers[1].normal is [0", "no direction")),
-        ({"lasers__0__normal": [1, float("nan"), 0]}, ("lasers[0].normal[1] is nan", "finite")),
-        ({"lasers__0__offset_mm": ...}, ("lasers[0].offset_mm is missing", "offset_mm: -140")),
-        ({"lasers__1__name": "horizontal"}, ("lasers[1].name is 'horizontal'", "lasers[0]")),
-        ({"lasers__1__name": ""}, ("lasers[1].name is ''", "name")),
-        (
-            {"lasers__1__wavelength_nm": 5320},
-            ("lasers[1].wavelength_nm is 5320;", "in nanometres, 380 to 780, for example 532"),
-        ),
-        ({"lasers__0__wavelength_nm": 0.532}, ("lasers[0].wavelength_nm is 0.532;", "nanometres")),
-        ({"lasers__0__wavelength_nm": float("nan")}, ("lasers[0].wavelength_nm is nan", "nanom")),
-        ({"lasers__0__wavelength_nm": "red"}, ("lasers[0].wavelength_nm is 'red'", "nanometres")),
-        ({"lasers__0__wave_nm": 532}, ("lasers[0].wave_nm is not a key", "'wavelength_nm'")),
-        ({"working_range_mm": [1300, 250]}, ("working_range_mm is [1300, 250]", "nearest")),
-        ({"working_range_mm": [0, 250]}, ("working_range_mm[0] is 0", "greater than 0")),
-        ({"working_range_mm": [250, 500, 800]}, ("working_range_mm", "2 values")),
-        ({"solved_from": "boards"}, ("solved_from is 'boards'", "keys and values")),
-    ],
-)
+WINDOW = {"normal": [0.0, 1.0, 0.0], "offset_mm": 40.0, "source_mm": [0.0, 0.0, -152.0]}
+
+FAULTS: list[tuple[dict[str, Any], tuple[str, ...]]] = [
+    ({"aqualvs_rig": ...}, ("aqualvs_rig is missing", "aqualvs_rig: 1")),
+    ({"aqualvs_rig": 2}, ("aqualvs_rig is 2", "version 1")),
+    ({"aqualvs_rig": "1"}, ("aqualvs_rig is '1'",)),
+    ({"aqualvs_rig": True}, ("aqualvs_rig is True",)),
+    ({"camera__fx_px": ...}, ("camera.fx_px is missing", "fx_px: 817.5")),
+    ({"image__width": 720}, ("image.width is not a key", "'width_px'")),
+    ({"image__width": 720, "image__width_px": ...}, ("image.width is not a key", "'width_px'")),
+    ({"lasers__1__ofset_mm": 1.0}, ("lasers[1].ofset_mm is not a key", "'offset_mm'")),
+    ({"fps": 25}, ("fps is not a key", "allowed here: aqualvs_rig, name")),
+    ({"camera__fx_px": "817.5"}, ("camera.fx_px is '817.5'", "plain number")),
+    ({"camera__fx_px": True}, ("camera.fx_px is True", "plain number")),
+    ({"camera__fx_px": -817.5}, ("camera.fx_px is -817.5", "greater than 0")),
+    ({"camera__fx_px": 1e300}, ("camera.fx_px is 1e+300", "at most 1e+07")),
+    ({"camera__fx_px": None}, ("camera.fx_px is empty", "plain number")),
+    ({"camera__cx_px": float("nan")}, ("camera.cx_px is nan", "finite")),
+    (
+        {"camera__distortion": [0.1, float("inf"), 0, 0]},
+        ("camera.distortion[1] is inf", "finite"),
+    ),
+    (
+        {"camera__distortion": [0.1, 0.2, 0.3]},
+        ("camera.distortion has 3 values", "0, 4, 5 or 8"),
+    ),
+    (
+        {"camera__model": "fisheye", "camera__distortion": [0.1] * 5},
+        ("camera.distortion has 5 values", "fisheye", "0 or 4"),
+    ),
+    ({"camera__model": "pinhole"}, ("camera.model is 'pinhole'", "'opencv' or 'fisheye'")),
+    ({"camera__position_mm": [1.0, 2.0]}, ("camera.position_mm", "3 values")),
+    ({"camera__position_mm": [0, 44.25, 0]}, ("camera.position_mm", "44.2 mm", "44.25 mm")),
+    ({"camera": [1, 2]}, ("camera is [1, 2]", "keys and values")),
+    ({"image__width_px": 720.5}, ("image.width_px is 720.5", "whole number")),
+    ({"image__height_px": 0}, ("image.height_px is 0", "greater than 0")),
+    ({"dome__thickness_mm": -1}, ("dome.thickness_mm is -1", "at least 0")),
+    ({"dome__inner_radius_mm": 0}, ("dome.inner_radius_mm is 0", "greater than 0")),
+    ({"dome__n_acrylic": 0.9}, ("dome.n_acrylic is 0.9", "at least 1")),
+    ({"n_air": 1333}, ("n_air is 1333", "at most 2")),
+    ({"water__n": 2.1}, ("water.n is 2.1", "at most 2")),
+    ({"water": ...}, ("water is missing", "water: {n: 1.3333}")),
+    (
+        {"water": ..., "dome": ..., "lasers__0__window": WINDOW},
+        ("water is missing", "water: {n: 1.3333}"),
+    ),
+    ({"camera__position_mm": ...}, ("camera.position_mm is missing", "position_mm: [0.0, 0.0")),
+    ({"camera__position_mm": None}, ("camera.position_mm is missing",)),
+    ({"water": {}}, ("water has no index", "temperature_c and salinity_permille")),
+    ({"water": {"temperature_c": 15}}, ("water has no index", "salinity_permille")),
+    ({"water__temperature_c": 15}, ("water gives n and", "keep either")),
+    (
+        {"water": {"temperature_c": 90, "salinity_permille": 0}},
+        ("water: water temperature 90", "0 to 30"),
+    ),
+    ({"lasers": {"name": "a"}}, ("lasers is {'name': 'a'}", "square brackets")),
+    ({"lasers__1__normal": [0, 0, 0]}, ("lasers[1].normal is [0", "no direction")),
+    ({"lasers__0__normal": [1, float("nan"), 0]}, ("lasers[0].normal[1] is nan", "finite")),
+    ({"lasers__0__offset_mm": ...}, ("lasers[0].offset_mm is missing", "offset_mm: -140")),
+    ({"lasers__1__name": "horizontal"}, ("lasers[1].name is 'horizontal'", "lasers[0]")),
+    ({"lasers__1__name": ""}, ("lasers[1].name is ''", "name")),
+    (
+        {"lasers__1__wavelength_nm": 5320},
+        ("lasers[1].wavelength_nm is 5320;", "in nanometres, 380 to 780, for example 532"),
+    ),
+    ({"lasers__0__wavelength_nm": 0.532}, ("lasers[0].wavelength_nm is 0.532;", "nanometres")),
+    ({"lasers__0__wavelength_nm": float("nan")}, ("lasers[0].wavelength_nm is nan", "nanom")),
+    ({"lasers__0__wavelength_nm": "red"}, ("lasers[0].wavelength_nm is 'red'", "nanometres")),
+    ({"lasers__0__wave_nm": 532}, ("lasers[0].wave_nm is not a key", "'wavelength_nm'")),
+    ({"working_range_mm": [1300, 250]}, ("working_range_mm is [1300, 250]", "nearest")),
+    ({"working_range_mm": [0, 250]}, ("working_range_mm[0] is 0", "greater than 0")),
+    ({"working_range_mm": [250, 500, 800]}, ("working_range_mm", "2 values")),
+    ({"solved_from": "boards"}, ("solved_from is 'boards'", "keys and values")),
+]
+
+# Of the rig as a whole, or of what a number means: only the reader checks them.
+BEYOND_SCHEMA: list[dict[str, Any]] = [
+    {"camera__position_mm": [0, 44.25, 0]},
+    {"water": {"temperature_c": 90, "salinity_permille": 0}},
+    {"lasers__1__normal": [0, 0, 0]},
+    {"lasers__1__name": "horizontal"},
+    {"working_range_mm": [1300, 250]},
+]
+
+
+@pytest.mark.parametrize(("changes", "words"), FAULTS)
 def test_fault_names_place_value_and_remedy(
     changes: dict[str, Any], words: tuple[str, ...]
 ) -> None:
     message = fault(hand_written(**changes))
     for word in words:
         assert word in message
+
+
+@pytest.mark.parametrize("changes", [changes for changes, _ in FAULTS])
+def test_the_json_schema_refuses_what_the_reader_refuses(changes: dict[str, Any]) -> None:
+    assert is_valid(hand_written(**changes), rig_json_schema()) is (changes in BEYOND_SCHEMA)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"camera__model": "fisheye", "camera__distortion": [0.1, 0.0, 0.0, 0.0]},
+        {"camera__distortion": ...},
+        {"water": {"temperature_c": 15, "salinity_permille": 38, "wavelength_nm": 520}},
+        {"dome": ..., "water": ..., "camera__position_mm": ...},
+        {"dome": None, "water": None, "camera__position_mm": None},
+        {"dome": ..., "lasers__0__window": WINDOW},
+        {"lasers__0__wavelength_nm": 650},
+    ],
+)
+def test_the_json_schema_takes_what_the_reader_takes(changes: dict[str, Any]) -> None:
+    content = hand_written(**changes)
+    rig = rig_from_mapping(content, source_name="x")
+    assert is_valid(content, rig_json_schema())
+    assert is_valid(rig_to_mapping(rig), rig_json_schema())
+
+
+def test_the_json_schema_takes_the_rigs_that_come_with_the_package() -> None:
+    rigs = [*(ROOT / "src/aqualvs/data").rglob("rig*.yaml"), *(ROOT / "tests").rglob("rig*.yaml")]
+    assert rigs
+    for path in rigs:
+        assert is_valid(parse_yaml(path.read_text(), str(path), RigError), rig_json_schema()), path
+
+
+def test_the_published_json_schema_is_that_of_the_reader() -> None:
+    published = json.loads((ROOT / "docs/rig.schema.json").read_text())
+    assert published == rig_json_schema(), "run: aqualvs schema > docs/rig.schema.json"
+
+
+def test_every_key_of_the_json_schema_says_what_it_is() -> None:
+    schema = rig_json_schema()
+    for part in (schema, *schema["$defs"].values()):
+        for key, value in part["properties"].items():
+            assert "description" in value or "$ref" in value or key == "window", key
+
+
+def test_a_bare_lens_in_air_needs_neither_water_nor_position() -> None:
+    rig = rig_from_mapping(
+        hand_written(dome=..., water=..., camera__position_mm=...), source_name="x"
+    )
+    assert rig.n_water == rig.n_air
+    np.testing.assert_array_equal(rig.dome_from_cam.translation, np.zeros(3))
+    assert same(rig, rig_from_mapping(rig_to_mapping(rig), source_name="y"), rotation_atol=1e-13)
 
 
 @pytest.mark.parametrize("content", [None, [], "rig", 3])
@@ -531,4 +606,4 @@ def test_the_documentation_names_every_key() -> None:
     table = page.split("## Keys")[1].split("## In Python")[0]
     # `fy_px` and its like stand behind their part's first key; `n` is `water.n`.
     named = {cell.rsplit(".", 1)[-1] for cell in re.findall(r"`([a-z_.\[\]]+)`", table)}
-    assert keys - named == {"image", "camera", "water", "lasers"}
+    assert keys - named == {"image", "camera", "lasers"}

@@ -212,7 +212,7 @@ def test_long_series_stay_small_and_keep_their_peak() -> None:
     assert np.ptp(places) > 100.0
 
 
-def vectors(html: str, colour: str = "#0b5c7d") -> FloatArray:
+def vectors(html: str, colour: str = "var(--accent)") -> FloatArray:
     """Return start and vector of every point drawn, in the chart's unit, shape (N, 4)."""
     inner = drawing(html, "map")
     found = []

@@ -72,7 +72,7 @@ def share_of(path: Path, rgb: tuple[int, int, int]) -> float:
     return float(np.mean(np.abs(image - rgb).max(axis=2) < 12))
 
 
-PINK, BLUE = (240, 111, 174), (31, 79, 200)
+PINK, BLUE = (240, 111, 174), (11, 92, 125)
 
 
 def test_the_frame_and_laser_that_show_most_are_drawn(tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from pyarrow import parquet
 
 from aqualvs.errors import OutputError, SourceError
+from aqualvs.report import html
 from aqualvs.report.charts import breaks, merged, stretches, thin
 from aqualvs.report.frames import choose_pictures, choose_samples, decode_frames
 from aqualvs.report.html import embedded_json
@@ -73,7 +74,15 @@ class Tags(HTMLParser):
 def test_page_asks_no_network_and_forbids_it(page: str) -> None:
     tags = Tags(page)
     assert not {"link", "iframe", "object", "embed", "base"} & set(tags.names)
-    places = [value or "" for name, value in tags.attributes if name in ("src", "href", "srcset")]
+    named = [value or "" for name, value in tags.attributes if name in ("src", "href", "srcset")]
+    # The contents lead to places of the page itself.
+    contents = [place for place in named if place.startswith("#")]
+    ids = [value for name, value in tags.attributes if name == "id"]
+    assert set(contents) == {
+        "#" + i for i in ("posture", "planes", "cloud", "pictures", "quality", "rig")
+    }
+    assert {place[1:] for place in contents} <= set(ids)
+    places = [place for place in named if not place.startswith("#")]
     assert len(places) == 6
     assert all(place.startswith("data:image/jpeg;base64,") for place in places)
     policies = [value or "" for name, value in tags.attributes if name == "content"]
@@ -147,6 +156,31 @@ def test_laser_plane_view_is_the_papers_frame(dive: Dive, page: str) -> None:
         if label == Label.NET:
             # Coordinates are rounded to 0.1 mm.
             assert a * x + b * y == pytest.approx(c, abs=0.15)
+
+
+def test_cloud_of_the_dive_lies_in_the_target(dive: Dive, page: str) -> None:
+    """Exact points lie in the plane, wherever the vehicle was; the dome was before it."""
+    cloud = data_of(page)["cloud"]
+    beyond = np.concatenate([laser["y"] for laser in cloud["lasers"]])
+    assert len(beyond) > 1000
+    assert np.abs(beyond).max() == 0.0
+    valid = [i for i in range(40) if i not in dive.refused]
+    ranges = 1e3 * dive.range_m[valid]
+    assert cloud["dome_mm"] == pytest.approx([ranges.min(), ranges.max()], abs=0.51)
+    # Right and up of the foot: points keep their distance from it.
+    track = read_track(dive.folder / "posture.csv")
+    summary, _ = summarize_points(dive.folder, track, [0])
+    assert summary is not None
+    mine = summary.samples[0]
+    off = np.linalg.norm(mine.points_in_dome[mine.used], axis=1) ** 2 - track.posture[0, 0] ** 2
+    planar = (summary.cloud_in_target[:, [0, 2]] ** 2).sum(axis=1)
+    assert np.abs(planar[:, None] - off).min(axis=0).max() < 1e-4
+
+
+def test_report_of_the_demo_size_stays_small(page: str) -> None:
+    """The chart library is packed: it was most of a report."""
+    assert len(html.packed("plotly-gl3d.min.js")) < 800_000
+    assert html.asset("plotly-gl3d.min.js")[:1000] not in page
 
 
 def test_residuals_of_exact_points_vanish(dive: Dive) -> None:

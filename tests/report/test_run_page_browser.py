@@ -46,6 +46,8 @@ HARMLESS = re.compile(r"GL Driver Message|willReadFrequently")
 PROBE = """
 <script>
 const found = document.documentElement.dataset;
+const probe = () => {
+if (!found.ready) { setTimeout(probe, 50); return; }
 found.fits = document.documentElement.scrollWidth <= window.innerWidth;
 const words = document.getElementById("plane-words");
 document.getElementById("plane-slider").value = 0;
@@ -70,6 +72,8 @@ drag.dispatchEvent(new MouseEvent("mousemove", at));
 setTimeout(() => {
   found.hover = [...chart.querySelectorAll(".hoverlayer text")].map((t) => t.textContent).join("|");
 }, 1500);
+};
+probe();
 </script>
 """
 

@@ -24,7 +24,7 @@ TESTS = ROOT / "tests"
 PRECIOUS = "somebody's own\n"
 
 QUICK: dict[str, tuple[list[str], list[str]]] = {
-    "design": (["-o", "."], ["rig.yaml", "errors.png", "picture.png"]),
+    "design": (["-o", "."], ["rig.yaml", "errors.png", "picture.png", "design.html"]),
     "board": (["charuco", "-o", "rig"], ["rig.yaml", "rig.pdf"]),
     "tune": (["bluerov2", "-o", "rig.yaml"], ["rig.yaml"]),
     "simulate": (["wall", "-o", "."], ["rig.yaml", "dive.mp4", "truth.csv"]),

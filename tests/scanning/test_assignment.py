@@ -292,3 +292,21 @@ def test_a_net_before_a_wall_is_not_overlooked(monkeypatch: pytest.MonkeyPatch) 
     refused = scanner.measure(0, 0.0, peaks).posture
     assert isinstance(refused, Refusal)
     assert refused.reason is Reason.AMBIGUOUS
+
+
+def fish(points: FloatArray) -> BoolArray:
+    """Light on a flank of 24 by 8 cm, where two of the stripes cross at 0.75 m."""
+    lit: BoolArray = (abs(points[:, 0] - 0.069) < 0.12) & (abs(points[:, 2] - 0.121) < 0.04)
+    return lit
+
+
+def test_a_fish_before_a_wall_out_of_range_is_no_wall() -> None:
+    """Not even a large one: the wall has more light, and a laser passes the fish."""
+    rig = example_rig()
+    flank, wall = (Plane.from_normal((0.0, 1.0, 0.0), d) for d in (0.75, 1.25))
+    two = peaks_of(replace(rig, lasers=rig.lasers[:2]), [(flank, fish)], 0.1)
+    scanner = Scanner(rig)
+    assert scanner.measure(0, 0.0, two).posture
+    found = scanner.measure(0, 0.0, joined([two, peaks_of(rig, [(wall, everywhere)], 0.1)])).posture
+    assert isinstance(found, Refusal)
+    assert found.reason is Reason.NOT_A_PLANE

@@ -1,4 +1,4 @@
-"""An output of a live run that publishes by rclpy."""
+"""Outputs of a live run that publish by rclpy: what is measured, and coordinate frames."""
 
 import array
 import importlib
@@ -7,7 +7,10 @@ from typing import Any
 from aqualvs.live.outputs.ros2_messages import TYPE_NAMES, Ros2Types, to_ros2
 from aqualvs.live.outputs.ros_messages import MessageMaker, PublishedTopic, RosOptions
 from aqualvs.recording.sample import LiveSample
+from aqualvs.scanning.posture import Posture
 from aqualvs.sources.base import PartHealth, State
+from aqualvs_ros.frames import FrameNames, fixed_transforms, target_transform, tf_message
+from aqualvs_ros.pictures import StampOf, stamped
 
 _DEPTH = 5
 _PARTS = (
@@ -17,6 +20,10 @@ _PARTS = (
     "geometry_msgs/msg/Quaternion",
     "geometry_msgs/msg/Pose",
     "geometry_msgs/msg/PoseWithCovariance",
+    "geometry_msgs/msg/Vector3",
+    "geometry_msgs/msg/Transform",
+    "geometry_msgs/msg/TransformStamped",
+    "tf2_msgs/msg/TFMessage",
     "sensor_msgs/msg/PointField",
     "diagnostic_msgs/msg/DiagnosticStatus",
     "diagnostic_msgs/msg/KeyValue",
@@ -32,13 +39,19 @@ class RclpyOutput:
         Topics are private to it, `diagnostics` is not.
     options : RosOptions, optional
         Defaults if left out; `namespace` is not used, the node has one.
+    stamp_of : callable, optional
+        Takes the number of a frame, gives the time in the header of its picture, or None. The time
+        of arrival counts if left out.
     """
 
     name = "ros2"
     inline = False
     keeps_all = False
 
-    def __init__(self, node: Any, options: RosOptions | None = None) -> None:
+    def __init__(
+        self, node: Any, options: RosOptions | None = None, stamp_of: StampOf | None = None
+    ) -> None:
+        self._stamp_of = stamp_of
         self._maker = MessageMaker(options or RosOptions())
         self._types = installed_types()
         self._node, self._closed = node, False
@@ -47,7 +60,7 @@ class RclpyOutput:
             topic: node.create_publisher(
                 self._types.classes[TYPE_NAMES[topic]],
                 "/diagnostics" if topic is PublishedTopic.DIAGNOSTICS else f"~/{topic}",
-                _quality(reliable or topic is PublishedTopic.DIAGNOSTICS),
+                quality(reliable or topic is PublishedTopic.DIAGNOSTICS),
             )
             for topic in PublishedTopic
         }
@@ -57,7 +70,7 @@ class RclpyOutput:
         """Publish what a sample has to say, on the topics that somebody listens to."""
         if self._closed:
             return
-        publishers = self._publishers
+        sample, publishers = stamped(sample, self._stamp_of), self._publishers
         wanted = {topic for topic, one in publishers.items() if one.get_subscription_count()}
         for topic, message in self._maker.messages(sample, wanted):
             publishers[topic].publish(to_ros2(self._types, message))
@@ -79,6 +92,56 @@ class RclpyOutput:
                 self._node.destroy_publisher(publisher)
 
 
+class FramesOutput:
+    """Broadcasts the fixed frames once, for late comers too, and the target's with each posture.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+    names : FrameNames
+    stamp_of : callable, optional
+        As for `RclpyOutput`.
+    """
+
+    name = "tf"
+    inline = False
+    keeps_all = False
+
+    def __init__(self, node: Any, names: FrameNames, stamp_of: StampOf | None = None) -> None:
+        self._node, self._names, self._stamp_of = node, names, stamp_of
+        self._types = installed_types()
+        kind = self._types.classes["tf2_msgs/msg/TFMessage"]
+        stays = quality(reliable=True, depth=1, stays=True)
+        self._fixed = node.create_publisher(kind, "/tf_static", stays)
+        self._moving = node.create_publisher(kind, "/tf", quality(reliable=True, depth=100))
+        self._told = self._closed = False
+
+    def send(self, sample: LiveSample) -> None:
+        """Broadcast where the target is, and the fixed frames before it."""
+        if self._closed:
+            return
+        sample = stamped(sample, self._stamp_of)
+        posture, at_ns = sample.scan.posture, sample.utc_ns
+        if not self._told:
+            self._told = True
+            fixed = fixed_transforms(sample.rig, self._names)
+            self._fixed.publish(tf_message(self._types, at_ns, fixed))
+        if isinstance(posture, Posture):
+            target = target_transform(posture, self._names)
+            self._moving.publish(tf_message(self._types, at_ns, [target]))
+
+    def health(self) -> PartHealth:
+        """Return that it works."""
+        return PartHealth(self.name, State.OFF if self._closed else State.OK)
+
+    def close(self) -> None:
+        """Give the publishers back to the node."""
+        if not self._closed:
+            self._closed = True
+            self._node.destroy_publisher(self._fixed)
+            self._node.destroy_publisher(self._moving)
+
+
 def installed_types() -> Ros2Types:
     """Return the message classes of the ROS 2 that is installed."""
     classes = {}
@@ -95,8 +158,10 @@ def installed_types() -> Ros2Types:
     )
 
 
-def _quality(reliable: bool) -> Any:
-    from rclpy.qos import QoSProfile, ReliabilityPolicy
+def quality(reliable: bool, depth: int = _DEPTH, stays: bool = False) -> Any:
+    """Return a quality of service; with `stays`, those who come late get the last messages."""
+    from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
     wish = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
-    return QoSProfile(depth=_DEPTH, reliability=wish)
+    more = {"durability": DurabilityPolicy.TRANSIENT_LOCAL} if stays else {}
+    return QoSProfile(depth=depth, reliability=wish, **more)

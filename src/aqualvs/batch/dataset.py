@@ -167,7 +167,7 @@ def _fingerprint(path: Path) -> list[int]:
 DIVES_PARQUET = "dives.parquet"
 
 _COUNTS = (
-    *("frame", "n_points", "first_frame", "last_frame", "n_frames"),
+    *("frame", "n_points", "first_frame", "last_frame", "n_frames", "picture_frame"),
     *("stretch", "piece", "hole", "n_looks"),
 )
 # Of columns in CSV files; all others hold numbers.

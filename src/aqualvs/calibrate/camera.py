@@ -192,7 +192,7 @@ def _page(
     if np.isfinite(result.cross_validation_rms_px):
         cards.append(
             Card(
-                "held-back views",
+                "held-out views",
                 f"{result.cross_validation_rms_px:.3f} px",
                 "corners predicted, rms",
             )

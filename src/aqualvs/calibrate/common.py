@@ -18,6 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from aqualvs.calibration.solver.result import ViewFit
 from aqualvs.calibration.targets.targets import View
+from aqualvs.calibration_formats import refuse_foreign
 from aqualvs.errors import CalibrationError, OptionError, RigError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.optics.camera import Dome
@@ -31,7 +32,7 @@ from aqualvs.results.files import writing
 from aqualvs.results.run_request import checked_index
 from aqualvs.sources.images import read_image
 from aqualvs.terminal import progress
-from aqualvs.yamlfile import read_yaml
+from aqualvs.yamlfile import parse_yaml, read_text
 
 WATER_N = 1.3340
 """Default index: fresh water of 15 °C in green light."""
@@ -113,7 +114,11 @@ def load_nominal(path: Path) -> Nominal:
     RigError
         One line that names the file, the place in it, the value and the remedy.
     """
-    content = read_yaml(path, "a nominal rig or a rig file", RigError)
+    what = "a nominal rig or a rig file"
+    text = read_text(path, what, RigError)
+    if "aqualvs_rig" not in text:
+        refuse_foreign(text, path, what, RigError)
+    content = parse_yaml(text, str(path), RigError)
     if not isinstance(content, Mapping):
         raise RigError(f"{path}: is not a nominal rig; write keys such as 'dome: ...'")
     return _of_rig_file(path) if "aqualvs_rig" in content else _of_mapping(content, path)

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from aqualvs.calibrate.common import (
+    WATER_N,
     Calibration,
     DetectedTargets,
     Echo,
@@ -48,6 +49,9 @@ from aqualvs.report.calibration_material import (
     parameter_rows,
 )
 from aqualvs.report.html import Card
+
+# Difference of indices below which a medium is the air inside.
+_AIR = 1e-3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -189,6 +193,9 @@ def _with_dome(rig: Rig, request: DomeRequest) -> Rig:
     old = shell or Dome(1.0, 1.0, 1.49)
     radius = old.inner_radius if given[0] is None else given[0] / 1e3
     thickness = old.thickness if given[1] is None else given[1] / 1e3
+    if shell is None and abs(rig.n_water - rig.n_air) < _AIR:
+        # A camera that was bare in air goes into the water with its dome.
+        rig = rig.in_water(WATER_N)
     return replace(rig, dome=Dome(radius, thickness, given[2] or old.n_acrylic))
 
 
@@ -220,7 +227,7 @@ def _board_set(
     if rows is not None and poses is not None:
         given, notes = match_poses(rows, [view.name for view in found.views], Path(poses))
         found = replace(found, pose_notes=notes)
-    in_air = abs(n_medium - rig.n_air) < 1e-3
+    in_air = abs(n_medium - rig.n_air) < _AIR
     board_set = BoardSet(
         name="air" if in_air else "water",
         views=found.views,
@@ -267,7 +274,7 @@ def _page(before: Rig, done: Calibration[DomeCalibration], request: DomeRequest)
         held = result.cross_validation
         cards.append(
             Card(
-                "held-back views",
+                "held-out views",
                 f"{held.dome_rms_px:.2f} px",
                 f"a bare lens: {held.bare_rms_px:.2f} px",
             )

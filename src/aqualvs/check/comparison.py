@@ -316,15 +316,15 @@ def run_compare(new: Path, old: Path, console: Console | None = None) -> int:
     difference = rig_difference(new_rig, old_rig, new_uncertainty, old_uncertainty)
     console = console or Console()
     console.print(f"{new} against {old}", style="bold", markup=False, highlight=False)
-    console.print(_table(new_rig, old_rig, difference))
-    known = {new: bool(new_uncertainty.names), old: bool(old_uncertainty.names)}
-    for sentence in (*_limits(known), *_mismatches(new_rig, old_rig)):
-        console.print(sentence, markup=False, highlight=False)
     parts = compared_parts(new_rig, old_rig, difference)
     console.print(verdict(parts), style="bold", markup=False, highlight=False)
     if not all(part.is_same for part in parts):
         for sentence in consequence(new_rig, old_rig):
             console.print(sentence, markup=False, highlight=False)
+    console.print(_table(new_rig, old_rig, difference))
+    known = {new: bool(new_uncertainty.names), old: bool(old_uncertainty.names)}
+    for sentence in (*_limits(known), *_mismatches(new_rig, old_rig)):
+        console.print(sentence, markup=False, highlight=False)
     return 0
 
 

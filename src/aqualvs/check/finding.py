@@ -162,6 +162,19 @@ def error_table(errors: Sequence[ExpectedError]) -> Table:
     return table
 
 
+def error_words(errors: Sequence[ExpectedError]) -> Iterator[str]:
+    """Say in one line what the rig measures at the middle one of the ranges."""
+    if not errors or not errors[len(errors) // 2].valid:
+        return
+    middle = errors[len(errors) // 2]
+    range_mm, pitch, yaw = _shown_units(middle.sigma)
+    share = 1e-3 * range_mm / middle.wall_range
+    yield (
+        f"At {middle.wall_range * 1e3:.0f} mm expect errors of {range_mm:.2g} mm ({share:.2%}) in "
+        f"range, {pitch:.2g} degrees in pitch and {yaw:.2g} in yaw (one sigma)."
+    )
+
+
 def index_sigma(rig: Rig) -> float:
     """Return the sigma of the water's index from a known target, infinite if not observable.
 

@@ -20,6 +20,7 @@ from aqualvs.check.finding import (
     check_errors,
     count_text,
     error_table,
+    error_words,
     expected_errors,
     findings_table,
     index_sigma,
@@ -53,6 +54,8 @@ _FEW_PICTURES = {"camera": 5, "dome": 2}
 # Beyond these a calibration has not found what it was for.
 _LENS_M, _TURN, _FOCAL_SHARE, _INDEX = 2e-3, math.radians(0.5), 0.005, 2e-3
 _TILT, _OFFSET_M = math.radians(0.25), 2e-3
+# Difference of indices below which the medium outside is air.
+_AIR = 1e-3
 
 
 def check_solved(
@@ -274,13 +277,17 @@ def run_check(path: Path, console: Console | None = None) -> int:
     except RigError as error:
         raise RigError(f"{path}: {error}") from None
     console.print(f"{path}: rig '{rig.name}'", style="bold", markup=False, highlight=False)
-    console.print(findings_table(findings))
     errors = expected_errors(rig, completed_uncertainty(rig))
+    bad = any(finding.severity is Severity.BAD for finding in findings)
+    words = [_verdict(findings), *error_words(errors)]
+    for line in words:
+        console.print(line, style="bold red" if bad else "bold", highlight=False, soft_wrap=True)
+    # What needs a hand first; else in the order in which light passes the rig.
+    order = (Severity.BAD, Severity.WARN, Severity.OK)
+    console.print(findings_table(sorted(findings, key=lambda one: order.index(one.severity))))
     if errors:
         console.print(sensitivity_table(rig, errors))
         console.print(error_table(errors))
-    bad = any(finding.severity is Severity.BAD for finding in findings)
-    console.print(_verdict(findings), style="bold red" if bad else "bold", highlight=False)
     return EXIT_BAD if bad else EXIT_SANE
 
 
@@ -316,7 +323,9 @@ def check_rig(rig: Rig, now: datetime | None = None) -> list[Finding]:
 
 def _check_lens(rig: Rig) -> Iterator[Finding]:
     distance = float(np.linalg.norm(rig.dome_from_cam.translation))
-    if rig.dome is None:
+    if rig.dome is None and _in_air(rig):
+        yield Finding(Severity.OK, "There is no dome and no water: rays start at the lens, in air.")
+    elif rig.dome is None:
         yield Finding(Severity.WARN, "There is no dome: rays start at the lens, in the water.")
     else:
         gap = rig.dome.inner_radius - distance
@@ -374,17 +383,25 @@ def _check_view(rig: Rig, camera: Camera) -> Iterator[Finding]:
         )
     else:
         yield Finding(
-            Severity.OK, f"The field of view in the water is {across:.0f} by {down:.0f} degrees."
+            Severity.OK,
+            f"The field of view in {'air' if _in_air(rig) else 'the water'} is {across:.0f} by "
+            f"{down:.0f} degrees.",
         )
+
+
+def _in_air(rig: Rig) -> bool:
+    """Return whether the medium outside is the air inside."""
+    return abs(rig.n_water - rig.n_air) < _AIR
 
 
 def _check_water(rig: Rig) -> Finding:
     n = rig.n_water
     if 1.32 <= n <= 1.36:
         return Finding(Severity.OK, f"The water's index {n:.4f} is that of {_water_name(n)}.")
-    if abs(n - rig.n_air) < 1e-3:
+    if _in_air(rig):
         return Finding(
-            Severity.WARN, f"The water's index {n:.4f} is that of air: this rig is for the bench."
+            Severity.OK if rig.dome is None else Severity.WARN,
+            f"The water's index {n:.4f} is that of air: this rig is for the bench.",
         )
     return Finding(
         Severity.BAD,

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
-from typer.core import TyperCommand
+from typer.core import TyperCommand, TyperGroup
 
 from aqualvs.errors import OptionError
 from aqualvs.special_files import refuse_special
@@ -38,9 +38,6 @@ def importing() -> Iterator[None]:
 MAX_WORKERS = 1024
 """Processes on one machine; more are a slip of the finger that would fill its memory."""
 
-OutFolder = Annotated[
-    Path, typer.Option("--out", "-o", help="Folder to write.", show_default=False)
-]
 Overwrite = Annotated[
     bool, typer.Option("--overwrite", help="Replace what this command wrote there before.")
 ]
@@ -115,6 +112,8 @@ def given(context: typer.Context, names: Sequence[str]) -> frozenset[str]:
 
 
 _MAX_INTEGER = 2**31 - 1
+# Characters; sentences in `--help` are wrapped, not cut.
+_MAX_SUMMARY = 200
 
 
 class CheckedCommand(TyperCommand):
@@ -136,6 +135,30 @@ class CheckedCommand(TyperCommand):
             for value in _plain(ctx.params.get(parameter.name)):
                 _check(value, _name(parameter))
         return super().invoke(ctx)
+
+
+class CommandGroups(TyperGroup):
+    """A program whose help lists its commands by group, each with the first sentence of its help.
+
+    A command's group is its `rich_help_panel`; groups are listed as their first commands are. Typer
+    itself draws groups by Rich only, which takes as long to import as all the rest of `--help`.
+    """
+
+    def format_commands(self, _ctx: Any, formatter: Any) -> None:
+        """Write a section for every group, and one for commands without a group."""
+        groups: dict[str, list[tuple[str, str]]] = {}
+        for name, command in self.commands.items():
+            if not command.hidden:
+                summary = command.get_short_help_str(limit=_MAX_SUMMARY)
+                group = getattr(command, "rich_help_panel", None)
+                groups.setdefault(group if isinstance(group, str) else "Commands", []).append(
+                    (name, summary)
+                )
+        # One column for all groups.
+        widest = max(len(name) for name in self.commands)
+        for title, rows in groups.items():
+            with formatter.section(title):
+                formatter.write_dl([(f"{name:{widest}}", summary) for name, summary in rows])
 
 
 def _plain(value: Any) -> Iterator[Any]:

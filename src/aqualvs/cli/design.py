@@ -26,7 +26,10 @@ def design(
     out: Annotated[
         Path | None,
         typer.Option(
-            "--out", "-o", help="Folder for rig.yaml, errors.png, picture.png.", show_default=False
+            "--out",
+            "-o",
+            help="Folder for rig.yaml, design.html and its pictures.",
+            show_default=False,
         ),
     ] = None,
     image: Annotated[

@@ -40,6 +40,14 @@ def live(
     foxglove_address: Annotated[
         str, typer.Option(metavar="HOST:PORT", help="Where to serve Foxglove.")
     ] = "127.0.0.1:8765",
+    rerun: Annotated[
+        str | None,
+        typer.Option(
+            metavar="viewer|HOST:PORT|FILE.rrd",
+            help="Show in Rerun: open a viewer, use one that is open, or write a file.",
+            show_default=False,
+        ),
+    ] = None,
     dashboard: Annotated[
         bool, typer.Option("--dashboard", help="Serve the pilot's page at http://127.0.0.1:8100.")
     ] = False,
@@ -108,6 +116,7 @@ def live(
             ros2=ros2,
             ros1=ros1,
             foxglove=foxglove_address if foxglove else None,
+            rerun=rerun,
         ),
         dashboard=dashboard_address if dashboard else None,
         token=token,

@@ -11,7 +11,7 @@ import functools
 import gc
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Annotated, Any, TextIO
 
 import typer
@@ -19,10 +19,11 @@ import typer
 from aqualvs import __version__
 from aqualvs.cli.batch import batch
 from aqualvs.cli.calibrate import board, calibrate
-from aqualvs.cli.command import CheckedCommand
+from aqualvs.cli.command import CheckedCommand, CommandGroups
 from aqualvs.cli.design import design
 from aqualvs.cli.experiments import benchmark, reproduce, score
 from aqualvs.cli.follow import follow, tune
+from aqualvs.cli.formats import export, import_file, schema
 from aqualvs.cli.live import doctor, live
 from aqualvs.cli.run import check, demo, figures, net, net_change, report, run, simulate
 from aqualvs.errors import AqualvsError
@@ -120,101 +121,123 @@ os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
 
 app = typer.Typer(
     name="aqualvs",
+    cls=CommandGroups,
     help="Underwater laser vision: range, pitch and yaw to a net or wall.",
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
-    add_completion=False,
 )
 
-_command = functools.partial(app.command, cls=CheckedCommand)
+
+def _group(title: str) -> Callable[..., Any]:
+    """Return what registers a command in a group of `--help`."""
+    return functools.partial(app.command, cls=CheckedCommand, rich_help_panel=title)
 
 
-_command(
+_measure, _calibrate, _live = _group("Measure"), _group("Calibrate"), _group("Live and control")
+_nets, _simulate, _reference = _group("Nets"), _group("Simulate"), _group("Reference")
+
+_measure(
     help="Run the bundled dive and compare it with its truth.",
     epilog="Example: aqualvs demo -o out/demo",
 )(demo)
-_command(
+_measure(
     help="Measure a dive: range, pitch and yaw for every frame, all points, and a report. "
     "SOURCE is a video, a folder of images, an address (rtsp://, udp://, http://), or a recording "
-    "(dive.mcap), which brings its own rig and options.",
+    "(dive.mcap), which brings its own rig and options. Without -o, results go to NAME_run beside "
+    "it.",
     epilog="Example: aqualvs run dive.mp4 --rig rig.yaml -o out/dive",
 )(run)
-_command(
+_measure(
+    help="Measure many dives, on this machine or on many, each as aqualvs run does it; writes a "
+    "summary and one Parquet data set. Run it again to go on after an interruption: what is "
+    "finished is kept. Exit code 1 if a dive could not be finished.",
+    epilog="Example: aqualvs batch season/2026 --rig rig.yaml -o out/2026",
+)(batch)
+_measure(
+    help="Write the report of a run again. After a run that was killed, its points are completed "
+    "first.",
+    epilog="Example: aqualvs report out/dive --truth truth.csv",
+)(report)
+_measure(
+    help="Draw a run's reflections in a laser's plane, with what the filters take for net: "
+    "pictures after figures 13 and 14 of the paper, and the filter's binary image.",
+    epilog="Example: aqualvs figures out/dive -o out/figures",
+)(figures)
+_calibrate(
+    help="Print a calibration target, true to scale, with its yaml: OUT.pdf and OUT.yaml.",
+    epilog="Example: aqualvs board charuco --paper a3 -o board",
+)(board)
+_calibrate(
+    "import",
+    help="Make a rig file of the calibration that another program made: ROS, OpenCV, Kalibr, "
+    "mrcal, COLMAP, Refractive COLMAP.",
+    epilog="Example: aqualvs import camera_info.yaml --as camera -o rig.yaml",
+)(import_file)
+_calibrate(
+    help="Write a rig's camera as a calibration file of another program.",
+    epilog="Example: aqualvs export rig.yaml --to colmap-underwater -o cameras.txt",
+)(export)
+app.add_typer(calibrate, rich_help_panel="Calibrate")
+_calibrate(
+    help="Say in words whether a rig is sane and what it can measure.",
+    epilog="Example: aqualvs check rig.yaml --against last",
+)(check)
+_calibrate(
+    help="Print the JSON Schema of rig files, with which editors complete and check them; put it "
+    "in a file with > rig.schema.json.",
+    epilog="Example: aqualvs schema",
+)(schema)
+_live(
+    help="Say whether this machine is ready, the stream arrives and the autopilot answers.",
+    epilog="Example: aqualvs doctor udp://0.0.0.0:5600 --rig rig.yaml",
+)(doctor)
+_live(
     help="Measure live: a stream, a camera or a file in real time, to pilot, autopilot, ROS, "
     "Foxglove and recording. Ctrl-C ends it.",
     epilog="Example: aqualvs live udp://0.0.0.0:5600 --rig rig.yaml --dashboard "
     "--mavlink udpout:192.168.2.2:14550",
 )(live)
-_command(
-    help="Tell the state of a net: meshes, twine, fouling, holes, and a map. SOURCE is a dive "
-    "(video or images, which is run into DIR first) or the folder of a run.",
+_live(
+    help="Hold a distance to a net, or follow it: in simulation, or with a vehicle.",
+    epilog="Example: aqualvs follow --sim -o out/follow",
+)(follow)
+_live(
+    help="Make gains for a vehicle model, and say what margins they leave.",
+    epilog="Example: aqualvs tune bluerov2_heavy -o gains.yaml",
+)(tune)
+_nets(
+    help="Report the condition of a net: meshes, twine, fouling, holes, and a map. SOURCE is a "
+    "dive (video or images, which is run first) or the folder of a run.",
     epilog="Example: aqualvs net out/dive --log vehicle.tlog",
 )(net)
-_command(
+_nets(
     "net-change",
     help="Compare a net between dates: how fouling grew and where, which holes are new, grown, "
     "gone, or were not passed. RUN is the folder of a run with the state of its net, or of a "
     "batch.",
     epilog="Example: aqualvs net-change out/2026-05-01 out/2026-05-22 -o out/change",
 )(net_change)
-_command(
-    help="Measure many dives, on this machine or on many, each as aqualvs run does it; writes a "
-    "summary and one Parquet data set. Run it again to go on after an interruption: what is "
-    "finished is kept. Exit code 1 if a dive could not be finished.",
-    epilog="Example: aqualvs batch season/2026 --rig rig.yaml -o out/2026",
-)(batch)
-_command(
-    help="Write the report of a run again. After a run that was killed, its points are completed "
-    "first.",
-    epilog="Example: aqualvs report out/dive --truth truth.csv",
-)(report)
-_command(
-    help="Draw a run's reflections in a laser's plane, with what the filters take for net: "
-    "pictures after figures 13 and 14 of the paper, and the filter's binary image.",
-    epilog="Example: aqualvs figures out/dive -o out/figures",
-)(figures)
-app.add_typer(calibrate)
-_command(
-    help="Print a calibration target, true to scale, with its yaml: OUT.pdf and OUT.yaml.",
-    epilog="Example: aqualvs board charuco --paper a3 -o board",
-)(board)
-_command(
-    help="Say in words whether a rig is sane and what it can measure.",
-    epilog="Example: aqualvs check rig.yaml --against last",
-)(check)
-_command(
+_simulate(
+    help="Render a dive with known truth: dive.mp4, truth.csv and rig.yaml. "
+    "SCENARIO is a name from --list or a YAML file.",
+    epilog="Example: aqualvs simulate net_diamond --camera webcam -o out/net",
+)(simulate)
+_simulate(
     help="Predict what a camera, a dome and lasers would measure, and tilt the lasers best. "
     "DESIGN is a file; options take the place of what it says, or of the example's numbers.",
     epilog="Example: aqualvs design --image 1920x1080 --fov-deg 69 --dome-mm 51:6 "
     "--baseline-mm 150 --lasers 3 --range-mm 300:1200 -o out/design",
 )(design)
-_command(
-    help="Render a dive with known truth: dive.mp4, truth.csv and rig.yaml. "
-    "SCENARIO is a name from --list or a YAML file.",
-    epilog="Example: aqualvs simulate net_diamond --camera webcam -o out/net",
-)(simulate)
-_command(
-    help="Hold a distance to a net, or follow it: in simulation, or with a vehicle.",
-    epilog="Example: aqualvs follow --sim -o out/follow",
-)(follow)
-_command(
-    help="Make gains for a vehicle model, and say what margins they leave.",
-    epilog="Example: aqualvs tune bluerov2_heavy -o gains.yaml",
-)(tune)
-_command(
-    help="Say whether this machine is ready, the stream arrives and the autopilot answers.",
-    epilog="Example: aqualvs doctor udp://0.0.0.0:5600 --rig rig.yaml",
-)(doctor)
-_command(
+_reference(
     help="Repeat the paper's experiments in a simulated tank, each beside what the paper prints: "
     "figures, tables and one page, reproduce.html. Without a name, all of them.",
     epilog="Example: aqualvs reproduce distance angles -o out/reproduce",
 )(reproduce)
-_command(
+_reference(
     help="Render the public benchmark set: dives by difficulty, each with its truth and its rig.",
     epilog="Example: aqualvs benchmark sun fouled -o bench",
 )(benchmark)
-_command(
+_reference(
     help="Score what systems answered on a benchmark set, side by side: plain CSV in, scores out.",
     epilog="Example: aqualvs score mine=out/mine --truth bench --own out/own -o scores",
 )(score)

@@ -15,7 +15,6 @@ from aqualvs.cli.command import (
     Fit,
     IndexTarget,
     MeshFilter,
-    OutFolder,
     Overwrite,
     Refraction,
     Salinity,
@@ -60,7 +59,15 @@ def net_change(
 def run(
     context: typer.Context,
     source: Annotated[str, typer.Argument(help="Video, folder of images, address, or recording.")],
-    out: OutFolder,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            "-o",
+            help="Folder to write; NAME_run beside the dive if left out.",
+            show_default=False,
+        ),
+    ] = None,
     rig: Annotated[
         Path | None,
         typer.Option("--rig", help="Rig file; a recording has its own.", show_default=False),
@@ -92,6 +99,10 @@ def run(
     mcap: Annotated[
         bool, typer.Option("--mcap", help="Write dive.mcap too, for Foxglove and for replays.")
     ] = False,
+    rerun: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.rrd", help="Write a file of Rerun too.", show_default=False),
+    ] = None,
     workers: Annotated[
         int | None,
         typer.Option(
@@ -107,12 +118,13 @@ def run(
         from aqualvs import pipeline as body
         from aqualvs.nets.target_file import NetRequest
         from aqualvs.results.run_request import FrameWindow, RunRequest, Water, scanner_options
+        from aqualvs.sources.opening import folder_beside
         from aqualvs.workers.start_method import n_cores
 
     request = RunRequest(
         source=source,
         rig=rig,
-        out=out,
+        out=out or folder_beside(source),
         overwrite=overwrite,
         water=Water(n_water=water_n, temperature_c=temperature_c, salinity=salinity),
         no_dome=not dome,
@@ -122,6 +134,7 @@ def run(
         target=target,
         chosen=given(context, ("target", "detector", "mesh_filter", "fit")),
         mcap=mcap,
+        rerun=rerun,
         overlay=overlay,
         report=report,
         truth=truth,
@@ -139,7 +152,7 @@ def net(
         typer.Option(
             "--out",
             "-o",
-            help="Folder to write; of a run its own if left out.",
+            help="Folder to write; if left out a run's own, or NAME_run beside a dive.",
             show_default=False,
         ),
     ] = None,
@@ -174,7 +187,7 @@ def net(
     stretch_m: Annotated[float, typer.Option(help="Length of a stretch of net.")] = 0.5,
     overwrite: Overwrite = False,
 ) -> None:
-    """Tell the state of a net."""
+    """Report the condition of a net."""
     from aqualvs.net_survey import command as body
     from aqualvs.nets.target_file import NetRequest
 
@@ -185,7 +198,15 @@ def net(
 
 def figures(
     folder: Annotated[Path, typer.Argument(help="Folder of the run.")],
-    out: OutFolder,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            "-o",
+            help="Folder to write; figures in the run's folder if left out.",
+            show_default=False,
+        ),
+    ] = None,
     frame: Annotated[
         int | None,
         typer.Option(help="Frame; the one that shows most if left out.", show_default=False),
@@ -207,7 +228,13 @@ def figures(
     from aqualvs.report import mesh_figures as body
 
     body.figures(
-        folder, out, typer.echo, frame=frame, laser=laser, target=target, overwrite=overwrite
+        folder,
+        out or folder / "figures",
+        typer.echo,
+        frame=frame,
+        laser=laser,
+        target=target,
+        overwrite=overwrite,
     )
 
 
@@ -259,9 +286,10 @@ def simulate(
     if list_:
         body.print_scenarios(typer.echo)
     else:
-        body.simulate(
+        code = body.simulate(
             scenario, rig, out, typer.echo, camera=camera, shutter=shutter, overwrite=overwrite
         )
+        raise typer.Exit(code)
 
 
 def demo(

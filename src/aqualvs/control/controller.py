@@ -276,6 +276,8 @@ class Ramp:
         Greatest, per second and per second squared.
     lag : float
         Time constant in seconds with which a measurement follows, at best.
+    falling : float
+        Greatest speed towards lower values, where that is less.
 
     Attributes
     ----------
@@ -285,8 +287,11 @@ class Ramp:
         Where a measurement is to be by now, and its speed.
     """
 
-    def __init__(self, speed: float, acceleration: float, lag: float = 0.0) -> None:
-        self._speed, self._most, self._lag = speed, acceleration, lag
+    def __init__(
+        self, speed: float, acceleration: float, lag: float = 0.0, falling: float = math.inf
+    ) -> None:
+        self._rising, self._falling = speed, min(speed, falling)
+        self._most, self._lag = acceleration, lag
         self.start(0.0)
 
     def start(self, value: float) -> None:
@@ -303,7 +308,8 @@ class Ramp:
         most = self._most * dt
         # Speed at which one more step and then braking end on the goal.
         brake = math.sqrt(0.25 * most * most + 2.0 * self._most * abs(left)) - 0.5 * most
-        wanted = math.copysign(min(self._speed, max(brake, 0.0), abs(left) / dt), left)
+        speed = self._rising if left > 0.0 else self._falling
+        wanted = math.copysign(min(speed, max(brake, 0.0), abs(left) / dt), left)
         before = self.rate
         self.rate = min(max(wanted, before - most), before + most)
         self.value += self.rate * dt
@@ -390,7 +396,9 @@ class RangeYawController:
             )
         )
         near, turn = gains.range, gains.yaw
-        self._range_ramp = Ramp(near.ramp_speed, near.ramp_acceleration, near.lag)
+        self._range_ramp = Ramp(
+            near.ramp_speed, near.ramp_acceleration, near.lag, near.approach_speed
+        )
         self._yaw_ramp = Ramp(turn.ramp_rate, turn.ramp_acceleration, turn.lag)
         self._swell = SwellFilter(near.swell_period, near.swell_damping)
         self._swing_gain = near.speed * near.swell

@@ -198,10 +198,21 @@ class Drag:
         """Return the force that a change of a speed takes, in newtons for m/s."""
         return self.linear + 2.0 * self.quadratic * abs(speed)
 
+    def coasting_speed(self, way: float, seconds: float, mass: float) -> float:
+        """Return the speed from which a mass in kg coasts so many metres in a time."""
+        share, rate = self.quadratic / mass, self.linear / mass
+        grown = math.expm1(min(share * way, _MAX_EXPONENT)) / share if share else way
+        slowed = -math.expm1(-rate * seconds) / rate if rate else seconds
+        return grown / slowed
+
     def speed(self, force: float) -> float:
         """Return the speed that a force keeps, in m/s."""
         root = math.sqrt(self.linear**2 + 4.0 * self.quadratic * abs(force))
         return 0.0 if force == 0.0 else 2.0 * force / (self.linear + root)
+
+
+# Keeps exponentials finite.
+_MAX_EXPONENT = 50.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -268,6 +279,9 @@ class RangeGains:
         Asked for towards and away from the target, in m/s.
     ramp_speed, ramp_acceleration : float
         With which a new setpoint is approached, in m/s and m/s².
+    approach_speed : float
+        In place of `ramp_speed` towards the target, where that is faster, in m/s: for vehicles
+        that coast far when the picture stands still and thrust ends.
     jerk : float
         Greatest change of the acceleration asked for, per second. What it holds back comes late:
         with 8 the pitch of a BlueROV2 Heavy, which thrust below its centre moves, swings up.
@@ -290,6 +304,7 @@ class RangeGains:
     lag: float
     greatest_speed: float = 0.25
     ramp_speed: float = 0.15
+    approach_speed: float = 0.15
     ramp_acceleration: float = 0.12
     jerk: float = 30.0
     crossing_impulse: float = 0.0175

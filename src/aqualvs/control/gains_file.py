@@ -178,6 +178,7 @@ class RangePart(StrictPart):
     swell_damping: Positive = 0.15
     greatest_speed_m_s: Positive = 0.25
     ramp_speed_m_s: Positive = 0.15
+    approach_speed_m_s: Positive = 0.15
     ramp_acceleration_m_s2: Positive = 0.12
     jerk_m_s3: Positive = 30.0
     crossing_impulse_s: NotNegative = 0.0175
@@ -304,6 +305,7 @@ def _range(part: RangePart) -> RangeGains:
         swell_damping=part.swell_damping,
         greatest_speed=part.greatest_speed_m_s,
         ramp_speed=part.ramp_speed_m_s,
+        approach_speed=part.approach_speed_m_s,
         ramp_acceleration=part.ramp_acceleration_m_s2,
         jerk=part.jerk_m_s3,
         crossing_impulse=part.crossing_impulse_s,
@@ -341,6 +343,7 @@ def _content(gains: ControlGains) -> GainsFile:
             swell_damping=near.swell_damping,
             greatest_speed_m_s=near.greatest_speed,
             ramp_speed_m_s=near.ramp_speed,
+            approach_speed_m_s=near.approach_speed,
             ramp_acceleration_m_s2=near.ramp_acceleration,
             jerk_m_s3=near.jerk,
             crossing_impulse_s=near.crossing_impulse,

@@ -378,16 +378,16 @@ class AnswerLimits:
         answer to. Standing still is 0.6 % of the range and 0.6 degrees: waters that take so much
         from the efforts move the vehicle by more.
     turned : float
-        Turn of the heading within `window_s` that a yaw which stands still must answer to, in
-        radians. An even way along a curved net turns the heading, too: at 0.3 m/s and a radius of
-        8 m by 4 degrees.
+        Turn of the heading within `window_s` that a posture which stands still must answer to, in
+        radians. An even way along a curved net turns the heading, too: at 0.8 m/s, the current's
+        speed included, and a radius of 8 m by 10 degrees.
     """
 
     repeats_s: float = 0.2
     quiet: float = 0.1
     window_s: float = 1.7
     promised: float = 0.45
-    turned: float = math.radians(8.0)
+    turned: float = math.radians(12.0)
 
     def __post_init__(self) -> None:
         """Refuse limits that cannot work.
@@ -539,8 +539,7 @@ class AnswerWatch:
         lately = [m for m in self._moments if m.time_s >= begin.time_s]
         if _swing([m.yaw for m in lately]) > _STILL_YAW:
             return False
-        still = _swing([m.range for m in lately]) < _STILL_RANGE * last.range
-        return (promises and still) or turned >= self.limits.turned
+        return _swing([m.range for m in lately]) < _STILL_RANGE * last.range
 
 
 def _swing(values: list[float]) -> float:

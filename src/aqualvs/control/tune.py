@@ -263,6 +263,10 @@ _SWELL = 1.2
 # the step of a BlueROV2 takes twice the time. The second bounds it for weak thrusters, as share of
 # their thrust times seconds: with 0.022 the step of a VideoRay-like vehicle takes twice the time.
 _CROSSING, _MAX_CROSSING = 0.018, 0.0175
+# Speed of a new setpoint, in m/s. Towards the target it is less for a vehicle that would coast
+# farther than so many metres in so many seconds, where the picture has stood still for that long
+# until it is noticed and thrust ends.
+_RAMP_SPEED, _COAST, _COAST_S, _UNSEEN_S = 0.15, 0.3, 5.0, 0.6
 # Factor by which the autopilot's lag behind a turning rate grows in the thrusters' dead band.
 _SLUGGISH = 4.0
 # Limits of the bisection of a gain, in 1/s.
@@ -438,7 +442,12 @@ def usable_gains(source: Path | str) -> ControlGains:
 
 def _range_gains(speed: float, lag: float, facts: VehicleFacts) -> RangeGains:
     crossing = _CROSSING * speed * facts.mass / facts.thrust.forward
+    # While it sees nothing of its motion the loop pushes as from rest.
+    unseen = 1.0 + speed * _UNSEEN_S
+    coasting = facts.forward_drag.coasting_speed(_COAST, _COAST_S, facts.mass)
     return RangeGains(
+        ramp_speed=_RAMP_SPEED,
+        approach_speed=tidy(min(coasting / unseen, _RAMP_SPEED)),
         crossing_impulse=tidy(min(crossing, _MAX_CROSSING)),
         swell=_SWELL,
         lag=tidy(lag),

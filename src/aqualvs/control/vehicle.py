@@ -37,13 +37,15 @@ class SetpointHolder:
     ----------
     working_range : (float, float)
         A range outside of it cannot be measured, so it cannot be held, in metres.
+    followed : bool, optional
+        Whether a controller follows it; else it is only what a pilot steers by.
     """
 
     MAX_YAW = math.radians(45.0)
     """Beyond this the lasers leave the target, in radians."""
 
-    def __init__(self, working_range: tuple[float, float]) -> None:
-        self.working_range = working_range
+    def __init__(self, working_range: tuple[float, float], *, followed: bool = True) -> None:
+        self.working_range, self.followed = working_range, followed
         self._lock = threading.Lock()
         self._setpoint: Setpoint | None = None
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
+from rich.table import Table
 
 from aqualvs.design.calibrated import camera_errors, offset_costs
 from aqualvs.design.changes import best_angles, changes
@@ -21,6 +22,7 @@ from aqualvs.design.file import (
 )
 from aqualvs.design.judge import predict, score, together
 from aqualvs.design.report import (
+    DESIGN_HTML,
     ERRORS_PNG,
     PICTURE_PNG,
     cause_table,
@@ -33,6 +35,8 @@ from aqualvs.design.report import (
     offset_table,
     shown_ranges,
     summary,
+    verdict,
+    write_page,
 )
 from aqualvs.design.settings import Design
 from aqualvs.errors import OptionError
@@ -89,50 +93,68 @@ def design_and_tell(request: DesignRequest, console: Console | None = None) -> N
     AqualvsError
         If a file or an option cannot be used, or the folder cannot be written.
     """
-    console = console or Console()
+    told = _Telling(console or Console())
     design = _asked_for(request)
-    names = () if request.out is None else (RIG_YAML, ERRORS_PNG, PICTURE_PNG)
+    names = () if request.out is None else (RIG_YAML, ERRORS_PNG, PICTURE_PNG, DESIGN_HTML)
     files = [(request.out or Path()) / name for name in names]
     with Claim("design", files, overwrite=request.overwrite):
         if request.turn:
             turned = [replace(m, free_stripe=m.free_stripe or m.free_tilt) for m in design.mounts]
             design = design.with_mounts(turned)
         best = best_angles(design) if request.tilt else design
-        for line in summary(best):
-            _say(console, line)
-        console.print()
+        first, fine = verdict(best)
+        told.console.print(first, style="bold", markup=False, highlight=False, soft_wrap=True)
+        told(*summary(best))
         if request.rig is not None and request.tilt:
-            _errors_text(console, design, "As it is: one sigma on a wall or net square ahead")
+            _tell_errors(told, design, "As it is: one sigma on a wall or net square ahead")
             error, better = score(design).error, score(best).error
-            _say(console, f"Tilted best, its errors are {better / error:.0%} of that.\n")
-        _errors_text(console, best, "Expected error: one sigma on a wall or net square ahead")
+            told(f"Tilted best, its errors are {better / error:.0%} of that.")
+        _tell_errors(told, best, "Expected error: one sigma on a wall or net square ahead")
         costs = offset_costs(best, best.rig.working_range)
         if costs:
-            console.print(offset_table(costs, best.rig.working_range))
-            _say(console, centring_text(best, costs, best.rig.working_range))
-            console.print()
+            words = centring_text(best, costs, best.rig.working_range)
+            told(offset_table(costs, best.rig.working_range), words)
         if request.try_changes:
-            console.print(change_table(changes(best)))
-            console.print()
+            told(change_table(changes(best)))
         if request.out is not None:
-            _write(best, request.out, console)
+            with writing(request.out):
+                save_rig(designed_rig(best), request.out / RIG_YAML)
+                pictures = draw_figures(best, request.out)
+                page = request.out / DESIGN_HTML
+                write_page(page, best.rig.name, first, told.parts, pictures, fine=fine)
+            for path in (request.out / RIG_YAML, *pictures, page):
+                told.say(f"written: {path}")
 
 
-def _errors_text(console: Console, design: Design, title: str) -> None:
-    """Print the places of the lasers, their errors, and the part of each tolerance."""
+@dataclass(slots=True)
+class _Telling:
+    """Printer of a design's parts, which the page repeats."""
+
+    console: Console
+    parts: list[str | Table] = field(default_factory=list)
+
+    def __call__(self, *parts: str | Table) -> None:
+        """Print parts that belong together."""
+        for part in parts:
+            self.console.print(part) if isinstance(part, Table) else self.say(part)
+        self.console.print()
+        self.parts += parts
+
+    def say(self, sentence: str) -> None:
+        """Print a line that is not for the page."""
+        self.console.print(sentence, markup=False, highlight=False, soft_wrap=True)
+
+
+def _tell_errors(told: _Telling, design: Design, title: str) -> None:
+    """Tell the places of the lasers, their errors, and the part of each tolerance."""
     closely = predict(design, np.geomspace(*design.rig.working_range, _N_SEEN))
     ranges = shown_ranges(design.rig.working_range)
-    told = predict(design, ranges)
-    causes = {**camera_errors(design, ranges), **told.systematic}
-    console.print(lasers_table(design, closely))
-    for line in findings(design, closely):
-        _say(console, line)
-    console.print()
-    console.print(error_table(told, together(causes), title))
-    console.print()
-    middle = int(np.argmin(np.abs(told.ranges - math.sqrt(math.prod(design.rig.working_range)))))
-    console.print(cause_table(causes, middle, ranges[middle]))
-    console.print()
+    found = predict(design, ranges)
+    causes = {**camera_errors(design, ranges), **found.systematic}
+    told(lasers_table(design, closely), *findings(design, closely))
+    told(error_table(found, together(causes), title))
+    middle = int(np.argmin(np.abs(found.ranges - math.sqrt(math.prod(design.rig.working_range)))))
+    told(cause_table(causes, middle, ranges[middle]))
 
 
 def _asked_for(request: DesignRequest) -> Design:
@@ -147,18 +169,6 @@ def _asked_for(request: DesignRequest) -> Design:
         return load_design(request.design, request.given)
     content = merged_content(example_content(), request.given)
     return design_from(content, name="design", folder=Path())
-
-
-def _write(design: Design, out: Path, console: Console) -> None:
-    with writing(out):
-        save_rig(designed_rig(design), out / RIG_YAML)
-        pictures = draw_figures(design, out)
-    for path in (out / RIG_YAML, *pictures):
-        _say(console, f"written: {path}")
-
-
-def _say(console: Console, sentence: str) -> None:
-    console.print(sentence, markup=False, highlight=False, soft_wrap=True)
 
 
 def designed_rig(design: Design) -> Rig:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich.table import Table
+from rich.text import Text
 
 from aqualvs.check.finding import escaped, shutter_finding
 from aqualvs.design.calibrated import INDEX_ERROR, OffsetCost, camera_errors
@@ -18,7 +19,9 @@ from aqualvs.design.changes import Change
 from aqualvs.design.judge import PredictedErrors, predict, together
 from aqualvs.design.settings import Design, Mount
 from aqualvs.geometry.arrays import BoolArray, FloatArray
-from aqualvs.report.figure_style import new_canvas
+from aqualvs.report import html
+from aqualvs.report.figure_style import BLUE, DARK, GREY, ORANGE, STYLE, new_canvas
+from aqualvs.results.files import replace_text
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -59,6 +62,30 @@ def summary(design: Design) -> list[str]:
         f"{design.net.lit_share:.0%} of a stripe falls on it",
         *([] if shutter is None else [shutter.sentence]),
     ]
+
+
+def verdict(design: Design) -> tuple[str, bool]:
+    """Return in one line whether a design meets its goals, and whether it does.
+
+    Of a single frame on the net, noise and tolerances together, at the worst range.
+    """
+    ranges = shown_ranges(design.rig.working_range)
+    told, goals = predict(design, ranges), design.goals
+    near, far = (f"{1e3 * wall:.0f}" for wall in design.rig.working_range)
+    if not told.valid.all():
+        return f"No: between {near} and {far} mm there are ranges without a posture.", False
+    systematic = np.hypot(told.systematic_total, together(camera_errors(design, ranges)))
+    sigma = np.hypot(told.net, systematic)
+    share, angle = sigma[:, 0] / ranges, sigma[:, 1:].max(axis=1)
+    worst, tilted = int(share.argmax()), int(angle.argmax())
+    fine = bool(share[worst] <= goals.range_share and angle[tilted] <= goals.angle)
+    return (
+        f"{'Yes: meets' if fine else 'No: misses'} its goals of {100.0 * goals.range_share:g} % "
+        f"and {math.degrees(goals.angle):g} degrees from {near} to {far} mm. At worst one sigma is "
+        f"{100.0 * share[worst]:.2g} % of range at {1e3 * ranges[worst]:.0f} mm and "
+        f"{math.degrees(angle[tilted]):.2g} degrees at {1e3 * ranges[tilted]:.0f} mm "
+        "(a net, one frame, noise and tolerances)."
+    ), fine
 
 
 def lasers_table(design: Design, told: PredictedErrors) -> Table:
@@ -249,19 +276,9 @@ def _table(title: str, first: str = "", right: bool = False) -> Table:
     return table
 
 
-ERRORS_PNG, PICTURE_PNG = "errors.png", "picture.png"
+ERRORS_PNG, PICTURE_PNG, DESIGN_HTML = "errors.png", "picture.png", "design.html"
 
 _DPI = 160
-_BLUE, _ORANGE, _DARK, _GREY = "#1f4fc8", "#d55e00", "#23272e", "#8a8f98"
-_STYLE: dict[Any, Any] = {
-    "font.size": 9.0,
-    "axes.linewidth": 0.7,
-    "axes.grid": True,
-    "grid.color": "#e4e6ea",
-    "grid.linewidth": 0.6,
-    "legend.fontsize": 8.0,
-    "legend.frameon": False,
-}
 # Errors by the camera's tolerances change little with range.
 _N_RANGES, _N_CAMERA, _N_ALONG = 60, 5, 40
 
@@ -284,11 +301,82 @@ def draw_figures(design: Design, out: Path) -> list[Path]:
     from matplotlib import rc_context
 
     written = []
-    with rc_context(_STYLE):
+    with rc_context(STYLE):
         for name, draw in ((ERRORS_PNG, _errors), (PICTURE_PNG, _picture)):
             draw(design).savefig(out / name, dpi=_DPI)
             written.append(out / name)
     return written
+
+
+_FIGURES = {
+    ERRORS_PNG: "Predicted errors over range: noise of one frame, tolerances, and the goals",
+    PICTURE_PNG: "The camera’s picture with all stripes, coloured by range",
+}
+
+
+def write_page(
+    path: Path,
+    name: str,
+    first: str,
+    parts: Sequence[str | Table],
+    pictures: Sequence[Path],
+    *,
+    fine: bool,
+) -> None:
+    """Write a design's page: the verdict, the figures, and what the terminal shows.
+
+    Parameters
+    ----------
+    path : Path
+    name : str
+        Of the rig.
+    first : str
+        The verdict.
+    parts : sequence of str or Table
+        Sentences belong to the table before them.
+    pictures : sequence of Path
+        Of `draw_figures`.
+    fine : bool
+        Whether the goals are met.
+
+    Raises
+    ------
+    OSError
+        As the system says it.
+    """
+    figures = "".join(
+        f'<figure><img src="{html.data_url(one.read_bytes(), "png")}" alt="{_FIGURES[one.name]}">'
+        f"<figcaption>{_FIGURES[one.name]}.</figcaption></figure>"
+        for one in pictures
+    )
+    sections, number = [f'<section id="figures"><h2>Figures</h2>{figures}</section>'], 0
+    lead = []
+    for part in parts:
+        if isinstance(part, Table):
+            number += 1
+            title = html.text(part.title or "")
+            sections.append(
+                f'<section id="table-{number}"><h2>{title}</h2>{_as_html(part)}</section>'
+            )
+        elif number:
+            sections[-1] = sections[-1].replace("</section>", f"<p>{html.text(part)}</p></section>")
+        else:
+            lead.append(f'<p class="lead">{html.text(part)}</p>')
+    texts = {"title": name, "subtitle": "predicted before it is built", "verdict": first}
+    made = {"lead": "".join(lead), "tables": "\n".join(sections), "kind": "" if fine else " warn"}
+    replace_text(path, html.page("design.html", texts, made))
+
+
+def _as_html(table: Table) -> str:
+    """Return a table of the terminal as one of a page."""
+
+    def plain(cell: Any) -> str:
+        return Text.from_markup(str(cell)).plain.replace("\n", " ").strip()
+
+    head = [plain(column.header) for column in table.columns]
+    cells = [[plain(cell) for cell in column.cells] for column in table.columns]
+    right = [i for i, column in enumerate(table.columns) if i and column.justify == "right"]
+    return html.table(head, zip(*cells, strict=True), texts=min(right))
 
 
 def _errors(design: Design) -> "Figure":
@@ -302,9 +390,9 @@ def _errors(design: Design) -> "Figure":
     figure = new_canvas(7.2, 2.9)
     panels = figure.subplots(1, 3, sharex=True)
     kinds = (
-        ("net, one frame", told.net, _ORANGE, "-"),
-        ("wall, one frame", told.wall, _BLUE, "-"),
-        ("tolerances", systematic, _DARK, "--"),
+        ("net, one frame", told.net, ORANGE, "-"),
+        ("wall, one frame", told.wall, BLUE, "-"),
+        ("tolerances", systematic, DARK, "--"),
     )
     percent, degrees = 100.0 / ranges, np.full_like(ranges, 180.0 / np.pi)
     goal = 100.0 * design.goals.range_share, np.degrees(design.goals.angle)
@@ -314,13 +402,12 @@ def _errors(design: Design) -> "Figure":
     ):
         for name, sigma, colour, style in kinds:
             axes.plot(ranges * 1e3, sigma[:, i] * unit, style, color=colour, label=name)
-        axes.axhline(wanted, color=_GREY, linewidth=0.8, linestyle=":", label="goal")
+        axes.axhline(wanted, color=GREY, linewidth=0.8, linestyle=":", label="goal")
         axes.set_yscale("log")
         axes.set_title(f"one sigma of {title}", fontsize=9.0)
         axes.set_xlabel("range (mm)")
         axes.yaxis.set_major_formatter(_plain())
         axes.grid(True, which="both")
-        axes.spines[["top", "right"]].set_visible(False)
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4)
     return figure
@@ -388,6 +475,6 @@ def _label_lasers(axes: "Axes", design: Design, ranges: FloatArray) -> None:
             ha="center",
             va="center",
             fontsize=8.0,
-            color=_DARK,
-            bbox={"boxstyle": "round,pad=0.2", "facecolor": "white", "edgecolor": _GREY, "lw": 0.5},
+            color=DARK,
+            bbox={"boxstyle": "round,pad=0.2", "facecolor": "white", "edgecolor": GREY, "lw": 0.5},
         )

@@ -233,7 +233,7 @@ def _findings(solved: SolvedDome, before_px: float) -> tuple[ExperimentRow, ...]
     return (
         *found,
         ExperimentRow(
-            what="corners of boards held back: with the dome, and best without it (px)",
+            what="corners of boards held out: with the dome, and best without it (px)",
             paper="",
             ours=f"{held.dome_rms_px:.3f} and {held.bare_rms_px:.3f}",
         ),

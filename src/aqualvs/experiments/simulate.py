@@ -1,8 +1,9 @@
 """`aqualvs simulate`: a dive with known truth, or pictures for a calibration."""
 
+import itertools
 import shlex
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Collection
+from dataclasses import astuple, replace
 from pathlib import Path
 
 from aqualvs.errors import OptionError, RigError
@@ -21,7 +22,7 @@ from aqualvs.simulation.dive import (
 )
 from aqualvs.simulation.scenario import Scenario
 from aqualvs.simulation.scenarios import example_rig, list_scenarios, load_scenario
-from aqualvs.terminal import progress
+from aqualvs.terminal import StopSignals, Tick, progress
 
 CALIBRATION = "calibration"
 """What is given in a scenario's place to render pictures for a calibration."""
@@ -29,7 +30,9 @@ CALIBRATION = "calibration"
 _ABOUT_CALIBRATION = "no dive: pictures for all four steps of a calibration, with the truth"
 _LOG, _HOLES = "vehicle.csv", "truth_holes.csv"
 _FILES = ("dive.mp4", "truth.csv", "rig.yaml", _LOG, _HOLES)
-_CALIBRATION_FILES = ("camera_air", "dome_air", "box", "index", "dive", "truth", "nominal.yaml")
+# In the order in which they are rendered.
+_FOLDERS = ("camera_air", "dome_air", "box", "index", "dive")
+_CALIBRATION_FILES = (*_FOLDERS, "truth", "nominal.yaml")
 
 
 def simulate(
@@ -41,8 +44,10 @@ def simulate(
     camera: str,
     shutter: str | None = None,
     overwrite: bool,
-) -> None:
+) -> int:
     """Render a scenario into a folder and print how to run it.
+
+    SIGINT and SIGTERM end it after the frame under way; what was rendered can be used.
 
     Parameters
     ----------
@@ -61,6 +66,11 @@ def simulate(
     overwrite : bool
         Whether what is already there may be replaced.
 
+    Returns
+    -------
+    exit_code : int
+        0, or 128 + signal if it was stopped.
+
     Raises
     ------
     AqualvsError
@@ -77,28 +87,55 @@ def simulate(
                 "--shutter: boards stand still, so it would show nothing; leave it out, or choose "
                 "a dive"
             )
-        _simulate_calibration(rig_file, out, echo, camera=eye, overwrite=overwrite)
-        return
+        return _simulate_calibration(rig_file, out, echo, camera=eye, overwrite=overwrite)
     course = load_scenario(scenario)
     rig = example_rig() if rig_file is None else load_rig(rig_file)
     if shutter is not None:
         rig = replace(rig, shutter=shutter_from_words(shutter, course.fps))
     check_shutter(rig.shutter, course)
     claim = Claim("simulate", [out / name for name in _FILES], overwrite=overwrite)
-    with claim, writing(out), progress(scenario, course.n_frames) as tick:
+    video, truth = out / "dive.mp4", out / "truth.csv"
+    with claim, writing(out), StopSignals() as stop, progress(scenario, course.n_frames) as tick:
         _write_net_truth(course, out)
-        dive = simulate_dive(course, rig, out, progress=lambda _done, _all: tick(1), camera=eye)
+        out.mkdir(parents=True, exist_ok=True)
         save_rig(with_exact_numbers(rig), out / "rig.yaml")
-    echo(f"{dive.n_frames} frames: {dive.video}, truth: {dive.truth}")
-    echo(
-        f"next: aqualvs run {dive.video} --rig {out / 'rig.yaml'} --truth {dive.truth} "
-        f"-o {out / 'run'}"
-    )
+        stopped = None
+        try:
+            simulate_dive(course, rig, out, progress=_stopping(stop, tick), camera=eye)
+        except _StoppedError as early:
+            stopped = early
+    echo(f"{stopped or f'{course.n_frames} frames'}: {video}, truth: {truth}")
+    echo(f"next: aqualvs run {video} --rig {out / 'rig.yaml'} --truth {truth} -o {out / 'run'}")
     if course.nets:
         echo(
             f"then: aqualvs net {out / 'run'} --log {out / _LOG} --log-offset-s {LEAD_S:g}; "
             f"true holes: {out / _HOLES}"
         )
+    return stop.exit_code if stopped else 0
+
+
+class _StoppedError(Exception):
+    """A signal asked to stop, and everything up to here is written."""
+
+    def __init__(self, signal: str, n_done: int, n_all: int, unit: str) -> None:
+        super().__init__(f"stopped by {signal} after {n_done} of {n_all} {unit}")
+        self.n_done = n_done
+
+
+def _stopping(
+    stop: StopSignals, tick: Tick, *, unit: str = "frames", not_at: Collection[int] = ()
+) -> Callable[[int, int], None]:
+    """Return a callback of renderers that shows progress, and ends them when a signal was caught.
+
+    It raises `_StoppedError`, but not after the last picture, nor after those in `not_at`.
+    """
+
+    def after(n_done: int, n_all: int) -> None:
+        tick(1)
+        if stop.caught and n_done < n_all and n_done not in not_at:
+            raise _StoppedError(stop.caught.name, n_done, n_all, unit)
+
+    return after
 
 
 def shutter_from_words(words: str, fps: float) -> Shutter:
@@ -153,15 +190,30 @@ def _simulate_calibration(
     *,
     camera: SimulatedCamera,
     overwrite: bool,
-) -> None:
+) -> int:
     rig = example_rig() if rig_file is None else load_rig(rig_file)
     claim = Claim("simulate", [out / name for name in _CALIBRATION_FILES], overwrite=overwrite)
-    with claim, writing(out), progress(CALIBRATION, SetSize().total, "pictures") as tick:
-        files = simulate_calibration(rig, out, progress=lambda _done, _all: tick(1), camera=camera)
+    size = SetSize()
+    # A folder is complete with what is written after its last picture.
+    ends = dict(zip(_FOLDERS, itertools.accumulate(astuple(size)), strict=True))
+    with (
+        claim,
+        writing(out),
+        StopSignals() as stop,
+        progress(CALIBRATION, size.total, "pictures") as tick,
+    ):
+        after = _stopping(stop, tick, unit="pictures", not_at=ends.values())
+        try:
+            files = simulate_calibration(rig, out, size=size, progress=after, camera=camera)
+        except _StoppedError as early:
+            complete = [name for name, end in ends.items() if end < early.n_done]
+            echo(f"{early}; complete in {out}: {', '.join(complete) or 'nothing'}")
+            return stop.exit_code
     echo(f"{files.n_pictures} pictures and frames in {out}, truth: {files.rig}")
     echo("next:")
     for command in calibration_commands(files, out, len(rig.lasers)):
         echo(f"  aqualvs {shlex.join(command)}")
+    return 0
 
 
 def calibration_commands(files: CalibrationFiles, out: Path, n_lasers: int) -> list[list[str]]:

@@ -368,7 +368,9 @@ def simulate_and_tell(request: SimRequest, echo: Callable[[str], object]) -> int
             if request.dashboard is not None:
                 holder = SetpointHolder(rig.working_range)
                 holder.put(setpoint)
-                served = serve_page(request.dashboard, request.token, rig, holder, None, echo)
+                served = serve_page(
+                    request.dashboard, request.token, rig, holder, None, echo, loop.link.state
+                )
                 page = LoopPage(served, rig, loop, holder)
                 undo.callback(page.close)
             _run(loop, request, page, echo)

@@ -10,14 +10,14 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from aqualvs.follow.log import JUMP, LoopLog, effort_measures, hold_measures, safety_measures
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.report import html
-from aqualvs.report.figure_style import new_canvas
+from aqualvs.report.figure_style import BLUE, DARK, GREY, ORANGE, STYLE, new_canvas
 from aqualvs.results.files import replace_text, writing
 
 if TYPE_CHECKING:
@@ -26,19 +26,7 @@ if TYPE_CHECKING:
 
 
 _DPI = 160
-_BLUE, _ORANGE, _DARK, _GREY = "#1f4fc8", "#d55e00", "#23272e", "#8a8f98"
 _LOST, _GUARDED = "#f3c9bd", "#f6e3a8"
-_STYLE: dict[Any, Any] = {
-    "font.size": 9.0,
-    "axes.linewidth": 0.7,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "grid.color": "#e4e6ea",
-    "grid.linewidth": 0.6,
-    "legend.fontsize": 8.0,
-    "legend.frameon": False,
-}
 # Least span of an axis, so that noise does not fill it: metres, degrees.
 _MIN_DEPTH, _MIN_RANGE, _MIN_ANGLE = 0.2, 0.1, 6.0
 
@@ -77,7 +65,7 @@ def drawn_follow_figures(log: LoopLog) -> "dict[str, Figure]":
     """Return the same pictures by name, not yet written."""
     from matplotlib import rc_context
 
-    with rc_context(_STYLE):
+    with rc_context(STYLE):
         return {"figure_22": _motion(log), "figure_23": _control(log)}
 
 
@@ -86,15 +74,15 @@ def _motion(log: LoopLog) -> "Figure":
     figure, axes = _panels(3, 6.4)
     time_s = log.column("time_s")
     depth, ranges, angles = axes
-    depth.plot(time_s, log.column("depth"), color=_BLUE, linewidth=0.9)
+    depth.plot(time_s, log.column("depth"), color=BLUE, linewidth=0.9)
     _name(depth, "depth (m)", _MIN_DEPTH)
     depth.invert_yaxis()
-    ranges.plot(time_s, log.column("measured_range"), color=_BLUE, linewidth=0.9)
+    ranges.plot(time_s, log.column("measured_range"), color=BLUE, linewidth=0.9)
     _name(ranges, "range (m)", _MIN_RANGE)
     heading = np.degrees(np.unwrap(log.column("heading")))
-    angles.plot(time_s, heading, color=_ORANGE, linewidth=0.9, label="heading")
+    angles.plot(time_s, heading, color=ORANGE, linewidth=0.9, label="heading")
     yaw = np.degrees(log.column("measured_yaw"))
-    angles.plot(time_s, yaw, color=_BLUE, linewidth=0.9, label="target yaw")
+    angles.plot(time_s, yaw, color=BLUE, linewidth=0.9, label="target yaw")
     _name(angles, "angle (deg)", _MIN_ANGLE)
     _legend(angles)
     _finish(axes, log, time_s)
@@ -119,15 +107,15 @@ def _control(log: LoopLog) -> "Figure":
 def _loop(axes: "Axes", log: LoopLog, name: str, unit: float) -> None:
     time_s = log.column("time_s")
     measured = unit * log.column(f"measured_{name}")
-    axes.plot(time_s, measured, color=_BLUE, linewidth=0.8, alpha=0.55, label="measured")
-    axes.plot(time_s, unit * log.column(name), color=_DARK, linewidth=1.0, label="true")
+    axes.plot(time_s, measured, color=BLUE, linewidth=0.8, alpha=0.55, label="measured")
+    axes.plot(time_s, unit * log.column(name), color=DARK, linewidth=1.0, label="true")
     wanted = unit * log.column(f"wanted_{name}")
-    axes.plot(time_s, wanted, color=_ORANGE, linewidth=1.2, linestyle="--", label="setpoint")
+    axes.plot(time_s, wanted, color=ORANGE, linewidth=1.2, linestyle="--", label="setpoint")
 
 
 def _command(axes: "Axes", time_s: FloatArray, effort: FloatArray, name: str) -> None:
-    axes.axhline(0.0, color=_GREY, linewidth=0.6)
-    axes.plot(time_s, effort, color=_DARK, linewidth=0.7)
+    axes.axhline(0.0, color=GREY, linewidth=0.6)
+    axes.plot(time_s, effort, color=DARK, linewidth=0.7)
     most = max(0.2, 1.15 * float(np.abs(effort).max()))
     axes.set_ylim(-most, most)
     axes.set_ylabel(name)

@@ -211,8 +211,8 @@ def _runner(
         if request.record:
             echo(f"recording: {recorder.start()}")
         if request.dashboard is not None:
-            page = serve_page(request.dashboard, request.token, scanner.rig, holder, recorder, echo)
-            outputs.append(page)
+            page = (request.dashboard, request.token, scanner.rig, holder, recorder, echo)
+            outputs.append(serve_page(*page, lambda: pilot.latest.state if pilot.latest else None))
         runner = LiveRunner(feed, FixedScanner(scanner), outputs, posture_filter=PostureFilter())
         undo.pop_all()
     return runner

@@ -89,3 +89,19 @@ class Plane:
         if self.offset < 0.0:
             return Plane(-self.normal, -self.offset)
         return self
+
+
+def upright_axes(normal: FloatArray) -> FloatArray:
+    """Return axes on a plane in `dome`, the columns of a rotation (3, 3).
+
+    They are horizontal to the right, along the normal, and up the plane.
+
+    Parameters
+    ----------
+    normal : array, shape (3,)
+        Unit normal that points away from the vehicle; not vertical.
+    """
+    right = np.cross(normal, (0.0, 0.0, 1.0))
+    right /= max(float(np.linalg.norm(right)), 1e-9)
+    axes: FloatArray = np.stack([right, normal, np.cross(right, normal)], axis=1)
+    return axes

@@ -1,5 +1,6 @@
 """Rotations and rigid transforms, frozen and batched."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -79,6 +80,14 @@ def rotvec_from_rotation(rotations: ArrayLike) -> FloatArray:
     factor = np.where(small, 2.0 + sin_half**2 / 3.0, angle / np.where(small, 1.0, sin_half))
     rotvec: FloatArray = factor[..., None] * q[..., 1:]
     return rotvec
+
+
+def quaternion_from_rotation(rotation: FloatArray) -> tuple[float, float, float, float]:
+    """Return a rotation matrix (3, 3) as a unit quaternion x, y, z, w."""
+    turn = rotvec_from_rotation(rotation)
+    angle = float(np.linalg.norm(turn))
+    x, y, z = turn * (0.5 * np.sinc(angle / (2.0 * math.pi)))
+    return float(x), float(y), float(z), math.cos(0.5 * angle)
 
 
 @dataclass(frozen=True, slots=True)

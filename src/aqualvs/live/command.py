@@ -18,7 +18,7 @@ from typing import TextIO
 from aqualvs.control.time_filter import PostureFilter
 from aqualvs.control.vehicle import SetpointHolder
 from aqualvs.errors import OptionError
-from aqualvs.live.options import OutputRequest, make_outputs, serve_page
+from aqualvs.live.options import OutputRequest, make_outputs, serve_page, vehicle_reader
 from aqualvs.live.outputs.base import Output
 from aqualvs.live.runner import FixedScanner, LiveOptions, LiveRunner, ScannerSupply, warm_up
 from aqualvs.optics.rig import Rig
@@ -300,10 +300,9 @@ def _outputs(request: LiveRequest, rig: Rig, echo: Callable[[str], object]) -> l
         for output in outputs[2:]:
             made.callback(output.close)
         if request.dashboard is not None:
-            holder = SetpointHolder(rig.working_range)
-            outputs.append(
-                serve_page(request.dashboard, request.token, rig, holder, recorder, echo)
-            )
+            holder = SetpointHolder(rig.working_range, followed=False)
+            page = (request.dashboard, request.token, rig, holder, recorder, echo)
+            outputs.append(serve_page(*page, vehicle_reader(outputs)))
         made.pop_all()
     return outputs
 

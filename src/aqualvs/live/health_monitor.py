@@ -11,7 +11,7 @@ import queue
 import threading
 import time
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import NamedTuple
 
@@ -33,8 +33,9 @@ _CELL, _EVERY = 8, 4
 _ONES = np.ones(_CELL, np.float32)
 # Laser stripes fill at least a hundredth of a picture.
 _QUANTILE = 0.99
-# Number of stored changes of a live picture, and the least number for their quantile.
-_N_KEPT, _N_KNOWN = 250, 25
+# Number of stored changes of a live picture, and the least number for their quantile: a vehicle in
+# swell has turned round by then, so that its slowest moments are known.
+_N_KEPT, _N_KNOWN = 250, 50
 _USUAL = 0.05
 # A stream that returns after this time counts as a new one, in seconds.
 _GAP_S = 2.0
@@ -45,11 +46,8 @@ _REDUCED_PX, _PATCH = 360, 16
 _STRONG, _PATCH_QUANTILE = 0.15, 0.8
 # Keeps patches without edges at rest, in squared grey levels per pixel.
 _FLAT = 1e-3
-# The motion before a stop is that over this time before it, in spans. Where its trend foretells
-# less than this share of it, the vehicle may have turned round.
-_BEFORE = (1.15, 2.2)
+# Number of motions before a stop that give their median.
 _N_BEFORE = 3
-_FORETOLD = 0.3
 _EPS_S = 1e-6
 
 
@@ -74,9 +72,11 @@ class FrozenOptions:
         Motion within `span_s`, in pixels of a picture that is reduced to a width of about 360,
         from which on a sudden stop is one of the picture and not of the vehicle.
     stop : float
-        The picture has stopped where its motion is less than this share of that before.
+        The picture has stopped where its motion stays below this share of the motion before.
     stopped_s : float
-        For so long, in seconds: a vehicle that turns round stops for a moment.
+        For so long, in seconds. A vehicle that turns round stops for a moment: at constant
+        acceleration its motion, `stopped_s` / 2 from the turning point, is a third of the median
+        over the `span_s` before.
     confirmed_s : float
         Within this time, in seconds, the changes of a stopped picture must fall below the limits
         above, or it counts as live again.
@@ -87,7 +87,7 @@ class FrozenOptions:
     least: float = 0.1
     share: float = 0.65
     motion: float = 0.15
-    stop: float = 0.2
+    stop: float = 0.25
     stopped_s: float = 0.16
     confirmed_s: float = 2.0
 
@@ -132,19 +132,6 @@ class _Kept(NamedTuple):
     patches: _Patches
 
 
-class _Trend(NamedTuple):
-    """Motion over some time: its median, and a line through it."""
-
-    pace: float
-    middle_s: float
-    level: float
-    slope: float
-
-    def at(self, time_s: float) -> float:
-        """Return what the line foretells."""
-        return self.level + self.slope * (time_s - self.middle_s)
-
-
 class FrozenPicture:
     """Detector of frozen pictures: compares each with one a quarter of a second older.
 
@@ -155,8 +142,8 @@ class FrozenPicture:
 
     At low bit rates the encoder takes a second and more to improve a still. The *motion* tells
     earlier: the 80 % quantile of the displacements of patches across their edges. What an encoder
-    improves moves no edge. A vehicle slows down little by little; a picture whose motion ends at
-    once has stopped itself.
+    improves moves no edge. A vehicle slows down little by little, and one that turns round moves
+    again soon; a picture whose motion ends at once, and does not return, has stopped itself.
 
     Parameters
     ----------
@@ -205,8 +192,7 @@ class FrozenPicture:
 
     def _go_on(self) -> None:
         """Take the picture for a live one."""
-        self._since_s = self._moved_s = self._stopped_s = self._doubted_s = math.nan
-        self._pace, self._rests = math.nan, False
+        self._since_s = self._moved_s = self._doubted_s = self._pace = math.nan
 
     def _continues(self, time_s: float, shape: tuple[int, int]) -> bool:
         last = self._kept[-1]
@@ -223,8 +209,6 @@ class FrozenPicture:
             displacements = np.abs(_displacements(before.patches, reduced))
             self.motion = _upper(displacements, _PATCH_QUANTILE)
             self._motions.append((time_s, self.motion))
-        while self._motions and time_s - self._motions[0][0] > 2.0 * _BEFORE[1] * self._span_s:
-            self._motions.popleft()
 
     def _limit(self) -> float:
         """Return the change below which a picture stands still."""
@@ -237,17 +221,15 @@ class FrozenPicture:
     def _has_stopped(self, time_s: float) -> bool:
         """Return whether a motion has ended at once."""
         options = self.options
-        if not self._rests:
-            self._trend = _trend(self._motions, time_s, self._span_s)
-            self._pace = self._trend.pace
-        self._rests = self._pace >= options.motion and self.motion < options.stop * self._pace
-        # A vehicle that slows down comes to rest as its motion before it foretells.
-        if not (self._rests and abs(self._trend.at(time_s)) > _FORETOLD * self._pace):
-            self._stopped_s = math.nan
+        stop_s = time_s - options.stopped_s - _EPS_S
+        while self._motions and self._motions[0][0] < stop_s - options.span_s:
+            self._motions.popleft()
+        before = [motion for at_s, motion in self._motions if at_s < stop_s]
+        if len(before) < _N_BEFORE:
             return False
-        if math.isnan(self._stopped_s):
-            self._stopped_s = time_s
-        return time_s - self._stopped_s >= options.stopped_s - _EPS_S
+        self._pace = float(np.median(before))
+        lately = max(motion for at_s, motion in self._motions if at_s >= stop_s)
+        return self._pace >= options.motion and lately < options.stop * self._pace
 
     def _judge(self, time_s: float) -> None:
         if math.isnan(self.change):
@@ -257,7 +239,6 @@ class FrozenPicture:
             self._doubt(time_s, still=still)
         elif still | self._has_stopped(time_s):
             self._since_s = self._kept[0].time_s
-            self._stopped_s = math.nan
             self._doubted_s = math.nan if still else time_s
         else:
             self._usual.append(self.change)
@@ -275,19 +256,6 @@ class FrozenPicture:
         moves = time_s - self._moved_s > self.options.span_s
         if moves or time_s - self._doubted_s > self.options.confirmed_s:
             self._go_on()
-
-
-def _trend(motions: Iterable[tuple[float, float]], time_s: float, span_s: float) -> _Trend:
-    """Return how fast the picture moved before the comparison of a time reaches back to it."""
-    first, last = (time_s - many * span_s for many in reversed(_BEFORE))
-    before = np.array([one for one in motions if first <= one[0] <= last])
-    if len(before) < _N_BEFORE:
-        return _Trend(math.nan, time_s, math.nan, math.nan)
-    times, values = before.T
-    middle_s = float(times.mean())
-    away = times - middle_s
-    slope = float(away @ values / (away @ away))
-    return _Trend(float(np.median(values)), middle_s, float(values.mean()), slope)
 
 
 def _upper(values: FloatArray | NDArray[np.float32], quantile: float) -> float:

@@ -16,13 +16,13 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from aqualvs.control.gains_file import load_settings
-from aqualvs.control.vehicle import SetpointHolder
+from aqualvs.control.vehicle import SetpointHolder, VehicleState
 from aqualvs.errors import OptionError
 from aqualvs.live.mavlink.ardusub import ArduSubOptions
 from aqualvs.live.mavlink.ardusub_commands import Command
 from aqualvs.live.mavlink.link import LinkOptions
 from aqualvs.live.mavlink.peers import load_key
-from aqualvs.live.outputs.base import Output
+from aqualvs.live.outputs.base import HearsVehicle, Output
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.rigschema import Positive, StrictPart
 from aqualvs.recording import RecorderSwitch
@@ -139,6 +139,8 @@ class OutputRequest:
     ros2, ros1 : bool
     foxglove : str or None
         Address HOST:PORT to listen on.
+    rerun : str or None
+        As `RerunOutput` takes it.
     """
 
     mavlink: tuple[str, ...] = ()
@@ -147,6 +149,7 @@ class OutputRequest:
     ros2: bool = False
     ros1: bool = False
     foxglove: str | None = None
+    rerun: str | None = None
 
 
 def make_outputs(request: OutputRequest) -> list[Output]:
@@ -169,6 +172,8 @@ def make_outputs(request: OutputRequest) -> list[Output]:
         makers.append(_ros1)
     if request.foxglove is not None:
         makers.append(partial(_foxglove, request.foxglove))
+    if request.rerun is not None:
+        makers.append(partial(_rerun, request.rerun))
     with ExitStack() as made:
         outputs = []
         for make in makers:
@@ -223,6 +228,19 @@ def _foxglove(address: str) -> Output:
     return FoxgloveOutput(host, port)
 
 
+def _rerun(where: str) -> Output:
+    from aqualvs.live.outputs.rerun import RerunOutput
+
+    return RerunOutput(where)
+
+
+def vehicle_reader(outputs: Sequence[Output]) -> Callable[[], VehicleState | None]:
+    """Return what reads depth and heading from the first output that an autopilot answers."""
+    return next(
+        (one.vehicle_state for one in outputs if isinstance(one, HearsVehicle)), lambda: None
+    )
+
+
 def serve_page(
     address: str,
     token: str | None,
@@ -230,6 +248,7 @@ def serve_page(
     holder: SetpointHolder,
     recorder: RecorderSwitch | None,
     echo: Callable[[str], object],
+    vehicle: Callable[[], VehicleState | None] = lambda: None,
 ) -> Output:
     """Serve the page and print its address.
 
@@ -246,6 +265,8 @@ def serve_page(
         What its record button moves; None where nothing can be recorded.
     echo : callable
         Takes one line.
+    vehicle : callable, optional
+        Returns what the autopilot tells of depth and heading.
 
     Raises
     ------
@@ -259,4 +280,4 @@ def serve_page(
             f"--dashboard: {fault.name} is missing; pip install 'aqualvs[dashboard]'"
         ) from fault
     host, port = host_and_port(address, DASHBOARD_PORT, "--dashboard-address")
-    return start_dashboard(host, port, token, rig, holder, recorder, echo)
+    return start_dashboard(host, port, token, rig, holder, recorder, echo, vehicle)

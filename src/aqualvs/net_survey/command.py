@@ -21,6 +21,7 @@ from aqualvs.results.folder import (
 )
 from aqualvs.results.net_survey import NetPass, check_stored, read_run
 from aqualvs.results.run_request import RunRequest, read_run_yaml, scanner_options
+from aqualvs.sources.opening import folder_beside
 from aqualvs.terminal import StopSignals, progress
 
 
@@ -33,8 +34,8 @@ class NetSource:
     source : str
         Folder of a run, or a dive as `open_source` takes it.
     rig, out : Path or None
-        Needed for a dive (a recording brings its rig). A run has its own rig, and its own folder is
-        the default.
+        A dive needs a rig (a recording brings its own); its default folder is beside it. A run has
+        its own rig, and its own folder is the default.
     target : str
         As `aqualvs run` takes it; for a dive.
     overwrite : bool
@@ -63,12 +64,10 @@ def net(place: NetSource, request: NetRequest, echo: Callable[[str], object]) ->
     """
     if (Path(place.source) / POSTURE_CSV).is_file():
         return net_of_run(place, request, echo)
-    if place.out is None:
-        raise OptionError("--out: missing; give the folder in which the dive is to be run")
     run = RunRequest(
         source=place.source,
         rig=place.rig,
-        out=place.out,
+        out=place.out or folder_beside(place.source),
         overwrite=place.overwrite,
         scanner=scanner_options(place.target, "ridge", "none", "robust"),
         chosen=frozenset() if place.target == "auto" else frozenset({"target"}),

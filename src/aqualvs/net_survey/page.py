@@ -29,6 +29,7 @@ from aqualvs.net_survey.tables import (
     verdict,
 )
 from aqualvs.report import html
+from aqualvs.report.figure_style import DARK, PALE, STYLE
 from aqualvs.report.html import Card
 from aqualvs.results.files import replace_text
 from aqualvs.results.run_request import now
@@ -47,7 +48,7 @@ _WEEK = 7.0
 # From green (less) over white to brown (more); told apart by colour-blind eyes.
 _COLOURS = "BrBG_r"
 _MIN_SCALE = 1.0
-_INK, _GREY, _SEA = "#1c2a33", "#d5dade", "#ffffff"
+_GREY, _SEA = "#d5dade", "#ffffff"
 _LABELLED = 24
 _MARKS: dict[HoleState, dict[str, Any]] = {
     HoleState.NEW: {"marker": "o", "markerfacecolor": "#d7191c", "markersize": 10},
@@ -67,16 +68,7 @@ _NAMES = {
     HoleState.FIRST_LOOK: "not looked at before",
     HoleState.NOT_PASSED: "not looked at now",
 }
-_STYLE: dict[Any, Any] = {
-    "font.size": 9.0,
-    "axes.edgecolor": "#8796a0",
-    "axes.linewidth": 0.7,
-    "text.color": _INK,
-    "axes.labelcolor": _INK,
-    "xtick.color": _INK,
-    "ytick.color": _INK,
-    "hatch.linewidth": 0.5,
-}
+_STYLE: dict[Any, Any] = {**STYLE, "axes.grid": False, "hatch.linewidth": 0.5}
 
 
 def draw_change(result: Comparison, path: Path) -> None:
@@ -170,7 +162,7 @@ def _cells(axes: "Axes", wall: OnWall, columns: IntArray, shades: "ScalarMappabl
             axes.add_patch(Rectangle(corner, width, height, linewidth=0.4, **style))
             if one is not None and one.changed:
                 middle = (corner[0] + 0.5 * width, corner[1] + 0.5 * height)
-                axes.plot(*middle, ".", color=_INK, markersize=2.2)
+                axes.plot(*middle, ".", color=DARK, markersize=2.2)
 
 
 def _sites(axes: "Axes", wall: OnWall, columns: IntArray) -> None:
@@ -184,7 +176,7 @@ def _sites(axes: "Axes", wall: OnWall, columns: IntArray) -> None:
             x,
             site.place[1],
             linestyle="",
-            markeredgecolor=_INK,
+            markeredgecolor=DARK,
             markeredgewidth=0.9,
             **_MARKS[site.state],
         )
@@ -217,8 +209,6 @@ def _axis(axes: "Axes", wall: OnWall, columns: IntArray, *, last: bool) -> None:
     raster, frame = wall.history.raster, wall.frame
     axes.set_ylabel("depth, m")
     axes.set_aspect("equal")
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
     if frame.round:
         start = float(columns[0] * raster.size[0])
         low, high = axes.get_xlim()
@@ -250,14 +240,14 @@ def _legend(figure: "Figure", wall: OnWall) -> None:
     states = {one.state for one in wall.sites}
     shown: dict[str, Line2D | Patch] = {
         _NAMES[state]: Line2D(
-            [], [], linestyle="", markeredgecolor=_INK, markeredgewidth=0.9, **style
+            [], [], linestyle="", markeredgecolor=DARK, markeredgewidth=0.9, **style
         )
         for state, style in _MARKS.items()
         if state in states
     }
     if any(one.changed for one in wall.cells):
         shown["changed beyond chance"] = Line2D(
-            [], [], linestyle="", marker=".", color=_INK, markersize=4
+            [], [], linestyle="", marker=".", color=DARK, markersize=4
         )
     known = wall.history.known.sum(axis=1)
     if np.any(known == 1):
@@ -284,13 +274,13 @@ def _dates(result: Comparison) -> "Figure":
         [100.0 * one.value for _, one in known],
         [100.0 * one.sigma for _, one in known],
         fmt="o-",
-        color=_INK,
+        color=DARK,
         capsize=4.0,
     )
     axes.set_xticks(days, [day.isoformat() for day, _ in known])
     axes.margins(x=0.12)
     axes.set_ylabel("solidity of all that was seen, %")
-    axes.grid(color="#dfe5e8", linewidth=0.6)
+    axes.grid(color=PALE, linewidth=0.6)
     figure.suptitle(
         "Whole dives: places on the net are not compared",
         x=0.01,

@@ -8,6 +8,7 @@ estimated from the dive itself.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import TypeAlias
 
 import numpy as np
 
@@ -45,6 +46,9 @@ _ROW = 1 << 24
 # Squares of a side's 24th part measure the area of discs that overlap.
 _SQUARES = 24
 
+# Frame, time, and place on the map.
+Foot: TypeAlias = tuple[int, float, FloatArray]
+
 
 @dataclass(frozen=True, slots=True)
 class Hole:
@@ -71,6 +75,8 @@ class Hole:
         from the dome's centre), in metres.
     n_looks : int
         Looks through it.
+    feet : sequence of (int, float, array of shape (2,))
+        Frame, time, and place of the vehicle's foot in frames from different places around it.
     """
 
     piece: int
@@ -83,6 +89,7 @@ class Hole:
     time_s: float
     from_foot: FloatArray
     n_looks: int
+    feet: Sequence[Foot] = ()
 
 
 @dataclass(slots=True)
@@ -101,7 +108,7 @@ class HoleMap:
     _looks: Looks = field(default_factory=Looks)
     _meshes: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
     _waiting: list[tuple[Strands, FloatArray, float, int]] = field(default_factory=list)
-    _feet: dict[tuple[int, int], tuple[int, float, FloatArray]] = field(default_factory=dict)
+    _feet: dict[tuple[int, int], Foot] = field(default_factory=dict)
     _last: FloatArray | None = None
     _settled_meshes: int = 0
     _mesh: float = 0.0
@@ -234,6 +241,7 @@ class HoleMap:
             time_s=nearest[1],
             from_foot=middle - nearest[2],
             n_looks=int(np.count_nonzero(inside & (weights > 0.0))),
+            feet=tuple(self._feet.values()),
         )
 
     def _settle(self) -> None:

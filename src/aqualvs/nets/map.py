@@ -31,7 +31,7 @@ _MARGIN = 0.09
 _COLOURS = "cividis"
 _MIN_SCALE, _SCALE_STEP = 0.1, 0.05
 _GREY, _PATH, _HOLE = "#c4c9cd", "#ffffff", "#d55e00"
-_INK, _SEA = "#1c2a33", "#f4f7f8"
+_INK, _SEA = "#14222c", "#f4f7f8"
 # A bearing that changes less than this, in degrees, is given in the title.
 _ONE_BEARING = 4.0
 # The vehicle's track is drawn thinner if there are more stretches than this.
@@ -114,8 +114,13 @@ def _figure(wall: UnrolledNet) -> "Figure":
 
 
 def _extent(wall: UnrolledNet) -> tuple[FloatArray, FloatArray]:
-    """Return the corners of the drawing, with a margin."""
-    corners = np.concatenate([*wall.outlines, *wall.path])
+    """Return the corners of the drawing, holes included, with a margin."""
+    holes = [
+        middle + 0.5 * np.array(_drawn_size(wall, hole.extent)) * sign
+        for hole, middle in zip(wall.holes, wall.holes_xy, strict=True)
+        for sign in (-1.0, 1.0)
+    ]
+    corners = np.concatenate([*wall.outlines, *wall.path, np.reshape(holes, (-1, 2))])
     low, high = corners.min(axis=0), corners.max(axis=0)
     margin = _MARGIN * (high - low)
     if not wall.by_bearing:
@@ -187,7 +192,7 @@ def _label_axes(axes: "Axes", wall: UnrolledNet, *, last: bool) -> None:
 
 
 def _label_holes(axes: "Axes", wall: UnrolledNet) -> None:
-    """Write the holes' sizes beside the band that they lie in, by turns above and below it."""
+    """Write number and size of each hole beside its band, by turns above and below it."""
     begins = np.array([one.begin_s for one in wall.stretches])
     for i, (hole, middle) in enumerate(zip(wall.holes, wall.holes_xy, strict=True)):
         sign = 1.0 if i % 2 == 0 else -1.0
@@ -195,7 +200,7 @@ def _label_holes(axes: "Axes", wall: UnrolledNet) -> None:
         rim = sign * 0.5 * _drawn_size(wall, hole.extent)[1]
         edge = sign * _to_the_edge(band, middle, sign)
         axes.annotate(
-            f"{1e3 * hole.diameter:.0f} mm",
+            f"{i + 1}: {1e3 * hole.diameter:.0f} mm",
             (middle[0], middle[1] + rim),
             xytext=(middle[0], middle[1] + (edge if abs(edge) > abs(rim) else rim) + sign * 0.01),
             ha="center",
@@ -287,7 +292,7 @@ def _legend(figure: "Figure", wall: UnrolledNet) -> None:
     )
     shown: dict[str, Line2D | Patch] = {"vehicle’s way": path, "its start": start}
     if wall.holes:
-        shown["hole, to scale"] = Line2D(
+        shown["hole with its number, to scale"] = Line2D(
             [], [], linestyle="", marker="o", markersize=9, color="white", markeredgecolor=_HOLE
         )
     if any(fouling_of(one) is None for one in wall.stretches):

@@ -21,7 +21,8 @@ import numpy as np
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.nets.condition import NetStretch
 from aqualvs.nets.holes import Hole
-from aqualvs.nets.places import NetPlace, NetPlaces, PlacedBy
+from aqualvs.nets.lit_intervals import net_from_dome
+from aqualvs.nets.places import DivePostures, NetPlace, NetPlaces, PlacedBy
 from aqualvs.optics.rig import Rig
 from aqualvs.text import clock, hole_count
 
@@ -54,6 +55,9 @@ class UnrolledNet:
         Of the vehicle's foot on the net: one line for every piece in which the track holds.
     holes_xy : array, shape (H, 2)
         Middles of the holes.
+    holes_px : array, shape (H, 4)
+        Frame whose picture has them nearest to its centre, column and row of their middles in it,
+        and diameter in pixels; NaN where no picture shows any of a hole.
     """
 
     stretches: Sequence[NetStretch]
@@ -64,10 +68,15 @@ class UnrolledNet:
     outlines: list[FloatArray]
     path: list[FloatArray]
     holes_xy: FloatArray
+    holes_px: FloatArray
 
 
 def unroll(
-    stretches: Sequence[NetStretch], holes: Sequence[Hole], places: NetPlaces, rig: Rig
+    stretches: Sequence[NetStretch],
+    holes: Sequence[Hole],
+    places: NetPlaces,
+    rig: Rig,
+    postures: DivePostures,
 ) -> UnrolledNet:
     """Project stretches and holes to the plane of the unrolled net.
 
@@ -79,6 +88,8 @@ def unroll(
         Theirs.
     rig : Rig
         Whose picture tells how much of the net is seen at a time.
+    postures : DivePostures
+        Of the same dive.
     """
     nodes = [*places.begin[:1], *places.end]
     by_bearing = all(one.placed_by is PlacedBy.NOTHING for one in nodes) and any(
@@ -105,7 +116,32 @@ def unroll(
         outlines=bands(at_nodes, half),
         path=_path(at_nodes, stretches),
         holes_xy=np.stack([holes_x, y[len(nodes) :]], axis=-1),
+        holes_px=_pixels(holes, postures, rig),
     )
+
+
+def _pixels(holes: Sequence[Hole], postures: DivePostures, rig: Rig) -> FloatArray:
+    """Return where the holes are in the dive's pictures (`UnrolledNet.holes_px`)."""
+    found, normals, camera = np.full((len(holes), 4), np.nan), postures.normals(), rig.camera()
+    size = np.array(rig.size_px)
+    for i, hole in enumerate(holes):
+        feet = [(hole.frame, hole.time_s, hole.place - hole.from_foot), *hole.feet]
+        points = np.empty((len(feet), 2, 3))
+        for k, (_, time_s, foot) in enumerate(feet):
+            at = min(int(np.searchsorted(postures.time_s, time_s)), len(normals) - 1)
+            middle = [*(hole.place - foot), 0.0]
+            rim = np.add(middle, [0.5 * hole.diameter, 0.0, 0.0])
+            dome_from_net = net_from_dome(normals[at], float(postures.range[at])).inverse()
+            points[k] = dome_from_net.apply(np.stack([middle, rim]))
+        pixels, seen = camera.project(points)
+        off = np.where(seen.all(axis=1), np.hypot(*(pixels[:, 0] - 0.5 * size).T), np.inf)
+        best = int(np.argmin(off))
+        diameter = 2.0 * float(np.hypot(*(pixels[best, 1] - pixels[best, 0])))
+        # Up to its rim a hole may lie beyond the picture.
+        beyond = np.abs(pixels[best, 0] - 0.5 * size) - 0.5 * size
+        if np.isfinite(off[best]) and np.all(beyond < 0.5 * diameter):
+            found[i] = [feet[best][0], *pixels[best, 0], diameter]
+    return found
 
 
 def _heights(places: Sequence[NetPlace], by_depth: bool) -> FloatArray:
@@ -187,13 +223,13 @@ NET_COLUMNS = (
 )
 """Columns of `net.csv`, one row for every stretch; empty where not measured or not known."""
 HOLE_COLUMNS = (
-    *("hole", "piece", "right_m", "up_m", *_PLACE),
+    *("hole", "piece", "right_m", "up_m", *_PLACE, "heading_deg"),
     *("width_mm", "height_mm", "diameter_mm", "sigma_diameter_mm", "missing_meshes"),
-    *("frame", "time_s", "n_looks"),
+    *("frame", "time_s", "n_looks", "picture_frame", "u_px", "v_px", "diameter_px"),
 )
 """Columns of `holes.csv`, one row for every hole."""
 
-_DIGITS = {"s": 3, "m": 3, "deg": 1, "mm": 2}
+_DIGITS = {"s": 3, "m": 3, "deg": 1, "mm": 2, "px": 1}
 _SHARE_DIGITS = 4
 
 
@@ -208,7 +244,7 @@ def stretch_rows(wall: UnrolledNet) -> list[dict[str, Cell]]:
 def hole_rows(wall: UnrolledNet) -> list[dict[str, Cell]]:
     """Return the rows of `holes.csv`."""
     return [
-        _rounded(_hole(i, hole, place))
+        _rounded(_hole(i, hole, place, wall.holes_px[i]))
         for i, (hole, place) in enumerate(zip(wall.holes, wall.places.holes, strict=True))
     ]
 
@@ -292,13 +328,20 @@ def _stretch(i: int, one: NetStretch, place: NetPlace) -> dict[str, Cell]:
     return dict(zip(NET_COLUMNS, cells, strict=True))
 
 
-def _hole(i: int, hole: Hole, place: NetPlace) -> dict[str, Cell]:
+def _hole(i: int, hole: Hole, place: NetPlace, pixels: FloatArray) -> dict[str, Cell]:
     mm = 1e3
     cells: tuple[Cell, ...] = (
-        *(i + 1, hole.piece, *map(float, hole.place), *_place_cells(place)),
+        *(
+            i + 1,
+            hole.piece,
+            *map(float, hole.place),
+            *_place_cells(place),
+            _degrees(place.heading),
+        ),
         *(mm * hole.extent[0], mm * hole.extent[1]),
         *(mm * hole.diameter, mm * hole.sigma_diameter, hole.missing_meshes),
         *(hole.frame, hole.time_s, hole.n_looks),
+        *((int(pixels[0]), *map(float, pixels[1:])) if np.isfinite(pixels[0]) else (None,) * 4),
     )
     return dict(zip(HOLE_COLUMNS, cells, strict=True))
 
@@ -449,9 +492,9 @@ def _hole_lines(wall: UnrolledNet, facts: dict[str, Any]) -> list[str]:
     )
     order = np.argsort([-hole.diameter for hole in wall.holes], kind="stable")[:_MAX_LISTED]
     lines = [
-        f"  {size_text(hole)}, {hole.missing_meshes:.0f} meshes: {place_text(place)}, "
+        f"  {i + 1}: {size_text(hole)}, {hole.missing_meshes:.0f} meshes: {place_text(place)}, "
         f"at {clock(hole.time_s)} (frame {hole.frame})"
-        for hole, place in ((wall.holes[i], wall.places.holes[i]) for i in sorted(order))
+        for i, hole, place in ((i, wall.holes[i], wall.places.holes[i]) for i in sorted(order))
     ]
     if n > _MAX_LISTED:
         lines.append(f"  and {n - _MAX_LISTED} smaller ones, see holes.csv")

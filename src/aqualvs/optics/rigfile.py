@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from aqualvs.calibration_formats import refuse_foreign
 from aqualvs.errors import AqualvsError, OptionError, OutputError, RigError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.planes import Plane
@@ -24,17 +25,18 @@ from aqualvs.optics.camera import Dome
 from aqualvs.optics.lens import Lens, LensModel
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Laser, Rig, Window
 from aqualvs.optics.rigschema import (
+    COEFFICIENT_COUNTS,
     VERSION,
     LaserPart,
     RigFile,
     ShutterPart,
-    WaterPart,
+    missing_text,
     parse_rig,
 )
 from aqualvs.optics.shutter import AT_ONCE, Shutter, ShutterKind
 from aqualvs.optics.solved import rig_uncertainty
 from aqualvs.optics.water import GREEN_NM, seawater_index_vacuum
-from aqualvs.yamlfile import carry_comments, parse_yaml, read_text, read_yaml, rig_text
+from aqualvs.yamlfile import carry_comments, parse_yaml, read_text, rig_text
 
 _STAMP = re.compile(r"\.(\d{4}-\d\d-\d\dT\d{6})(?:-(\d+))?")
 
@@ -127,7 +129,10 @@ def load_rig(path: str | Path, *, need_lasers: bool = True) -> Rig:
     RigError
         One line that names the file, the place in it, the value and the remedy.
     """
-    content = read_yaml(Path(path), "a rig file", RigError)
+    text = read_text(Path(path), "a rig file", RigError)
+    if "aqualvs_rig" not in text:
+        refuse_foreign(text, Path(path), "a rig file", RigError)
+    content = parse_yaml(text, str(path), RigError)
     return rig_from_mapping(content, source_name=str(path), need_lasers=need_lasers)
 
 
@@ -277,12 +282,12 @@ def _rig(file: RigFile) -> Rig:
             cy=camera.cy_px,
             distortion=_distortion(file),
         ),
-        dome_from_cam=SE3(turn @ DOME_FROM_CAM_NOMINAL, np.array(camera.position_mm) / _MILLI),
+        dome_from_cam=SE3(turn @ DOME_FROM_CAM_NOMINAL, np.array(_position_mm(file)) / _MILLI),
         dome=None
         if dome is None
         else Dome(dome.inner_radius_mm / _MILLI, dome.thickness_mm / _MILLI, dome.n_acrylic),
         n_air=file.n_air,
-        n_water=_water_index(file.water, file.n_air),
+        n_water=_water_index(file),
         lasers=tuple(_laser(f"lasers[{i}]", part) for i, part in enumerate(file.lasers)),
         working_range=(file.working_range_mm[0] / _MILLI, file.working_range_mm[1] / _MILLI),
         solved_from=dict(file.solved_from),
@@ -311,7 +316,7 @@ def shutter_from_part(part: ShutterPart) -> Shutter:
 
 def _distortion(file: RigFile) -> tuple[float, ...]:
     values, model = file.camera.distortion, file.camera.model
-    allowed = {"opencv": (0, 4, 5, 8), "fisheye": (0, 4)}[model]
+    allowed = COEFFICIENT_COUNTS[model]
     if len(values) not in allowed:
         raise RigError(
             f"camera.distortion has {len(values)} values; the {model} model takes "
@@ -320,8 +325,26 @@ def _distortion(file: RigFile) -> tuple[float, ...]:
     return tuple(float(value) for value in values)
 
 
-def _water_index(water: WaterPart, n_air: float) -> float:
-    """Return the water's index relative to vacuum, as given or from Quan & Fry (1995)."""
+def _position_mm(file: RigFile) -> list[float]:
+    """Return the lens's place; a bare lens is the origin of the frame unless it is said."""
+    position = file.camera.position_mm
+    if position is not None:
+        return position
+    if file.dome is not None:
+        raise RigError(missing_text("camera.position_mm"))
+    return [0.0, 0.0, 0.0]
+
+
+def _water_index(file: RigFile) -> float:
+    """Return the index outside relative to vacuum: given, from Quan & Fry (1995), or that of air.
+
+    Where nothing refracts it is of no consequence and need not be said.
+    """
+    water, n_air = file.water, file.n_air
+    if water is None:
+        if file.dome is not None or any(laser.window is not None for laser in file.lasers):
+            raise RigError(missing_text("water"))
+        return n_air
     measured = (water.temperature_c, water.salinity_permille, water.wavelength_nm)
     if water.n is not None:
         if any(value is not None for value in measured):
@@ -405,10 +428,11 @@ def _check_whole(file: RigFile, need_lasers: bool) -> None:
             f"working_range_mm is [{near:g}, {far:g}]; write the nearest range first, then a "
             "larger one"
         )
-    distance = math.hypot(*file.camera.position_mm)
+    position = _position_mm(file)
+    distance = math.hypot(*position)
     if file.dome is not None and distance >= file.dome.inner_radius_mm:
         raise RigError(
-            f"camera.position_mm is {file.camera.position_mm}, {distance:.1f} mm from the dome's "
+            f"camera.position_mm is {position}, {distance:.1f} mm from the dome's "
             f"centre and outside its inner radius of {file.dome.inner_radius_mm:g} mm; give the "
             "lens's place relative to the centre of the sphere"
         )

@@ -20,6 +20,8 @@ VERSION = 1
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+FocalLength = Annotated[float, Field(gt=0.0, le=1e7, allow_inf_nan=False)]
+"""In pixels; a lens of 10 m before pixels of 1 micrometre has the greatest."""
 Index = Annotated[float, Field(ge=1.0, le=2.0, allow_inf_nan=False)]
 Pixels = Annotated[int, Field(gt=0)]
 Triple = Annotated[list[Number], Field(min_length=3, max_length=3)]
@@ -37,84 +39,186 @@ class StrictPart(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
 
+def _said(text: str) -> Any:
+    """Return the description of a key, for editors that complete rig files."""
+    return Field(description=text)
+
+
 class ImagePart(StrictPart):
     """`image`: size of the pictures."""
 
-    width_px: Pixels
-    height_px: Pixels
+    width_px: Annotated[Pixels, _said("Width of the pictures the camera was calibrated at.")]
+    height_px: Annotated[Pixels, _said("Height of the pictures the camera was calibrated at.")]
+
+
+COEFFICIENT_COUNTS = {"opencv": (0, 4, 5, 8), "fisheye": (0, 4)}
+"""Numbers of distortion coefficients that a model takes."""
+
+
+def _camera_conditions(schema: dict[str, Any]) -> None:
+    """Add to the JSON Schema how many distortion coefficients each model takes."""
+    schema["allOf"] = [
+        {
+            # A model that is left out is opencv.
+            "if": {
+                "properties": {"model": {"const": model}},
+                **({} if model == "opencv" else {"required": ["model"]}),
+            },
+            "then": {
+                "properties": {
+                    "distortion": {"anyOf": [{"minItems": n, "maxItems": n} for n in counts]}
+                }
+            },
+        }
+        for model, counts in COEFFICIENT_COUNTS.items()
+    ]
 
 
 class ShutterPart(StrictPart):
     """`shutter` of the camera; all at once if left out."""
 
-    kind: Literal["global", "rolling", "interlaced"] = "global"
-    readout_ms: NotNegative = 0.0
-    exposure_ms: NotNegative = 0.0
-    first_field: Literal["top", "bottom"] = "top"
+    kind: Annotated[
+        Literal["global", "rolling", "interlaced"], _said("Order in which rows are exposed.")
+    ] = "global"
+    readout_ms: Annotated[
+        NotNegative, _said("From the first row to the last, or from the first field to the second.")
+    ] = 0.0
+    exposure_ms: Annotated[NotNegative, _said("Time that a row gathers light; 0 if unknown.")] = 0.0
+    first_field: Annotated[
+        Literal["top", "bottom"], _said("Of interlaced video; top holds rows 0, 2, 4.")
+    ] = "top"
 
 
 class CameraPart(StrictPart):
     """`camera`: intrinsics, calibrated in air without the dome, and place in the dome."""
 
-    model: Literal["opencv", "fisheye"] = "opencv"
-    fx_px: Positive
-    fy_px: Positive
-    cx_px: Number
-    cy_px: Number
-    distortion: list[Number] = []
-    position_mm: Triple
-    rotation_deg: Triple = [0.0, 0.0, 0.0]
-    shutter: ShutterPart = ShutterPart()
+    model_config = ConfigDict(json_schema_extra=_camera_conditions)
+
+    model: Annotated[
+        Literal["opencv", "fisheye"], _said("As cv2.projectPoints, or as cv2.fisheye.")
+    ] = "opencv"
+    fx_px: Annotated[FocalLength, _said("Focal length along x, in air without the dome.")]
+    fy_px: Annotated[FocalLength, _said("Focal length along y, in air without the dome.")]
+    cx_px: Annotated[Number, _said("Image centre; the centre of the top-left pixel is (0, 0).")]
+    cy_px: Annotated[Number, _said("Image centre; the centre of the top-left pixel is (0, 0).")]
+    distortion: Annotated[
+        list[Number],
+        _said("opencv: none, or k1 k2 p1 p2 [k3 [k4 k5 k6]]; fisheye: none, or k1 k2 k3 k4."),
+    ] = []
+    position_mm: Annotated[
+        Triple | None,
+        _said("Projection centre of the lens in the frame `dome`; needed behind a dome."),
+    ] = None
+    rotation_deg: Annotated[
+        Triple, _said("Rotation vector in `dome`, applied after the nominal mounting.")
+    ] = [0.0, 0.0, 0.0]
+    shutter: Annotated[ShutterPart, _said("When rows are exposed; all at once if left out.")] = (
+        ShutterPart()
+    )
 
 
 class DomePart(StrictPart):
     """`dome`: two concentric spheres and the material between them."""
 
-    inner_radius_mm: Positive
-    thickness_mm: NotNegative
-    n_acrylic: Index
+    inner_radius_mm: Annotated[Positive, _said("Inner radius.")]
+    thickness_mm: Annotated[NotNegative, _said("Thickness of the wall.")]
+    n_acrylic: Annotated[Index, _said("Refractive index of the wall.")]
 
 
 class WaterPart(StrictPart):
     """`water`: its index, or the temperature and salinity that determine it."""
 
-    n: Index | None = None
-    temperature_c: Number | None = None
-    salinity_permille: Number | None = None
-    wavelength_nm: Number | None = None
+    model_config = ConfigDict(
+        json_schema_extra={
+            "oneOf": [
+                {
+                    "required": ["n"],
+                    "properties": {
+                        "temperature_c": {"type": "null"},
+                        "salinity_permille": {"type": "null"},
+                        "wavelength_nm": {"type": "null"},
+                    },
+                },
+                {
+                    "required": ["temperature_c", "salinity_permille"],
+                    "properties": {"n": {"type": "null"}},
+                },
+            ]
+        }
+    )
+
+    n: Annotated[Index | None, _said("Index outside, relative to vacuum.")] = None
+    temperature_c: Annotated[Number | None, _said("0 to 30; in place of n.")] = None
+    salinity_permille: Annotated[Number | None, _said("0 to 40; in place of n.")] = None
+    wavelength_nm: Annotated[Number | None, _said("Of the light, for the index; 532.")] = None
 
 
 class WindowPart(StrictPart):
     """`window` of a laser: its outer face in `dome`, and the light source."""
 
-    normal: Triple
-    offset_mm: Number
-    source_mm: Triple
+    normal: Annotated[Triple, _said("Normal of the window's outer face.")]
+    offset_mm: Annotated[Number, _said("Of the outer face, along the unit normal.")]
+    source_mm: Annotated[Triple, _said("Point that the light fans out from.")]
 
 
 class LaserPart(StrictPart):
     """One of `lasers`: a plane in `dome`; `offset_mm` belongs to the unit normal."""
 
-    name: Name
-    normal: Triple
-    offset_mm: Number
-    wavelength_nm: LaserWavelength | None = None
+    name: Annotated[Name, _said("A name of its own.")]
+    normal: Annotated[Triple, _said("Normal of the laser's plane in `dome`, of any length.")]
+    offset_mm: Annotated[Number, _said("Distance from the dome's centre along the unit normal.")]
+    wavelength_nm: Annotated[
+        LaserWavelength | None, _said("Of this laser's light; green if it is left out.")
+    ] = None
     window: WindowPart | None = None
+
+
+def _dome_conditions(schema: dict[str, Any]) -> None:
+    """Add to the JSON Schema what must be known where light is refracted."""
+    given = {"not": {"type": "null"}}
+    window = {"required": ["window"], "properties": {"window": given}}
+    dome = {"required": ["dome"], "properties": {"dome": given}}
+    lasers = {"required": ["lasers"], "properties": {"lasers": {"contains": window}}}
+    water = {"required": ["water"], "properties": {"water": given}}
+    lens = {"required": ["position_mm"], "properties": {"position_mm": given}}
+    schema["allOf"] = [
+        {"if": {"anyOf": [dome, lasers]}, "then": water},
+        {"if": dome, "then": {"properties": {"camera": lens}}},
+    ]
 
 
 class RigFile(StrictPart):
     """A whole rig file."""
 
-    aqualvs_rig: int
-    name: Name = "rig"
+    model_config = ConfigDict(json_schema_extra=_dome_conditions)
+
+    aqualvs_rig: Annotated[
+        int, Field(description="Version of the format.", json_schema_extra={"const": VERSION})
+    ]
+    name: Annotated[Name, _said("How reports call the rig.")] = "rig"
     image: ImagePart
     camera: CameraPart
-    dome: DomePart | None = None
-    n_air: Index = 1.0003
-    water: WaterPart
-    lasers: list[LaserPart] = []
-    working_range_mm: Pair = [250.0, 1300.0]
-    solved_from: dict[str, Any] = {}
+    dome: Annotated[DomePart | None, _said("Leave it out for a bare lens.")] = None
+    n_air: Annotated[Index, _said("Index inside the dome, relative to vacuum.")] = 1.0003
+    water: Annotated[
+        WaterPart | None, _said("What is outside; needed behind a dome, else air.")
+    ] = None
+    lasers: Annotated[list[LaserPart], _said("One to measure points, two for a posture.")] = []
+    working_range_mm: Annotated[
+        Pair, _said("Nearest and farthest target at which stripes are believed.")
+    ] = [250.0, 1300.0]
+    solved_from: Annotated[dict[str, Any], _said("What calibrations note down; kept.")] = {}
+
+
+def rig_json_schema() -> dict[str, Any]:
+    """Return the JSON Schema of the rig file (draft 2020-12), made of the reader's own model.
+
+    It holds what can be said of keys one by one; that a lens is inside its dome, or that names of
+    lasers differ, only the reader checks.
+    """
+    schema = RigFile.model_json_schema()
+    title = "Rig file of aqualvs"
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema, "title": title}
 
 
 def parse_rig(content: object, source_name: str) -> RigFile:
@@ -214,11 +318,15 @@ class SchemaWords:
         if kind == "extra_forbidden":
             return f"{place} is not a key of {self.file}; {self._closest(fault['loc'], model)}"
         if kind == "missing":
-            return f"{place} is missing; add it, for example '{self._example(fault['loc'])}'"
+            return self.missing(place, fault["loc"])
         shown = f"{place} is {_shown(fault['input'])}"
         if kind == "literal_error":
             return f"{shown}; write {fault['ctx']['expected']}"
         return f"{shown}; {self._remedy(fault)}"
+
+    def missing(self, place: str, loc: tuple[int | str, ...]) -> str:
+        """Return the sentence on a key that must be there."""
+        return f"{place} is missing; add it, for example '{self._example(loc)}'"
 
     def _remedy(self, fault: ErrorDetails) -> str:
         kind, place = fault["type"], fault["loc"]
@@ -308,3 +416,8 @@ _WORDS = SchemaWords(
     first_line="aqualvs_rig: 1",
     a_list="a list in square brackets",
 )
+
+
+def missing_text(place: str) -> str:
+    """Return the sentence on a key of a rig file that must be there, such as "camera.fx_px"."""
+    return _WORDS.missing(place, tuple(place.split(".")))

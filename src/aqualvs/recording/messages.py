@@ -406,6 +406,28 @@ class RecordClock:
         return self.last_ns
 
 
+class RateLimit:
+    """Rate limit of a message.
+
+    Parameters
+    ----------
+    hz : float
+        0 for none at all.
+    """
+
+    def __init__(self, hz: float) -> None:
+        # A tenth of a period early rather than a whole frame late.
+        self._every_ns = round(0.9e9 / hz) if hz else None
+        self._from_ns = -math.inf
+
+    def at(self, stamp_ns: int) -> bool:
+        """Return whether the message is due; if so, start the next period."""
+        if self._every_ns is None or stamp_ns < self._from_ns:
+            return False
+        self._from_ns = stamp_ns + self._every_ns
+        return True
+
+
 def _is_silence(sample: LiveSample) -> bool:
     """Return whether a sample reports a silent stream instead of a frame."""
     posture = sample.scan.posture

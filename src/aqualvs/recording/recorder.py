@@ -346,12 +346,18 @@ class RecorderSwitch:
         self._lock = threading.Lock()
         self._recorder: Recorder | None = None
         self._last: PartHealth | None = None
+        self._began_s = time.monotonic()
 
     @property
     def path(self) -> Path | None:
         """File that is being written, None where none is."""
         recorder = self._recorder
         return None if recorder is None else recorder.path
+
+    @property
+    def seconds(self) -> float:
+        """Since the last recording was begun."""
+        return time.monotonic() - self._began_s
 
     def start(self, path: Path | None = None) -> Path:
         """Begin to record, if that is not yet so.
@@ -374,6 +380,7 @@ class RecorderSwitch:
         with self._lock:
             if self._recorder is None:
                 self._recorder = Recorder(path or self._free_path(), self._options)
+                self._began_s = time.monotonic()
             return self._recorder.path
 
     def stop(self) -> Path | None:

@@ -309,7 +309,7 @@ def _thinned(points: _Points, limit: int) -> IntArray:
 def _frame(size_px: tuple[int, int], scale: _Scale) -> Iterator[str]:
     """Yield the picture's edge with round pixels beside it."""
     width, height = (scale.per_px * side for side in size_px)
-    yield draw.box(_LEFT, _HEAD, width, height, fill="#fff", stroke=draw.EDGE)
+    yield draw.box(_LEFT, _HEAD, width, height, fill=draw.PAPER, stroke=draw.EDGE)
     half = 0.5 * scale.per_px
     x_axis = draw.Axis(0.0, float(size_px[0]), _LEFT + half, _LEFT + half + width)
     y_axis = draw.Axis(0.0, float(size_px[1]), _HEAD + half, _HEAD + half + height)
@@ -422,7 +422,7 @@ def _cell_counts(points: _Points) -> IntArray:
 
 def _cell(x: float, y: float, dx: float, dy: float, count: int, most: int) -> Iterator[str]:
     if not count:
-        yield draw.box(x, y, dx, dy, fill="#fff", stroke="#b9c5cc")
+        yield draw.box(x, y, dx, dy, fill=draw.PAPER, stroke=draw.EDGE)
         yield draw.line(x, y + dy, x + dx, y, colour="#b08968")
         yield draw.line(x, y + dy / 2, x + dx / 2, y, colour="#b08968")
         yield draw.line(x + dx / 2, y + dy, x + dx, y + dy / 2, colour="#b08968")
@@ -430,7 +430,7 @@ def _cell(x: float, y: float, dx: float, dy: float, count: int, most: int) -> It
     # The root keeps thinly covered cells apart from each other.
     deep = math.sqrt(count / most)
     red, green, blue = (_PALE + deep * (_DEEP - _PALE)).round().astype(int)
-    yield draw.box(x, y, dx, dy, fill=f"#{red:02x}{green:02x}{blue:02x}", stroke="#fff")
+    yield draw.box(x, y, dx, dy, fill=f"#{red:02x}{green:02x}{blue:02x}", stroke=draw.PAPER)
     shown = f"{count}" if count < 10_000 else f"{count / 1000:.0f}k"
     # Where black and white words contrast equally.
     kind = "on-deep" if deep > 0.74 else "on-pale"
@@ -443,7 +443,7 @@ def _bars(
     lefts, tops = x_axis.place(edges), y_axis.place(counts.astype(np.float64))
     width = float(lefts[1] - lefts[0])
     for left, top in zip(lefts[:-1].tolist(), tops.tolist(), strict=True):
-        yield draw.box(left, top, width, y_axis.start - top, fill=draw.BAND, stroke="#fff")
+        yield draw.box(left, top, width, y_axis.start - top, fill=draw.BAND, stroke=draw.PAPER)
 
 
 def _bell(x: FloatArray, y: FloatArray, x_axis: draw.Axis, y_axis: draw.Axis) -> str:

@@ -161,11 +161,11 @@ def _bar(view: ViewRow, usual: float, wrong: bool) -> Raw:
     body = [draw.box(0.0, 2.0, length, _BAR_HEIGHT - 4.0, fill=colour, stroke="none")]
     if view.rms_px > reach:
         gap = ' stroke-width="3"'
-        body.append(draw.line(_BAR - 16, _BAR_HEIGHT, _BAR - 10, 0, colour="#fff", more=gap))
+        body.append(draw.line(_BAR - 16, _BAR_HEIGHT, _BAR - 10, 0, colour=draw.PAPER, more=gap))
     if usual > 0.0:
         x = _BAR / _BAR_REACH
         dashed = ' stroke-width="1.2" stroke-dasharray="3 2"'
-        body.append(draw.line(x, 0.0, x, _BAR_HEIGHT, colour="#1c2a33", more=dashed))
+        body.append(draw.line(x, 0.0, x, _BAR_HEIGHT, colour="var(--ink)", more=dashed))
     return draw.svg(_BAR, _BAR_HEIGHT, body, alt=f"{view.rms_px:.3f} px", kind="bar")
 
 

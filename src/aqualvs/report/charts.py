@@ -154,7 +154,7 @@ def hover_places(start: float, end: float, whole: float) -> Iterator[float]:
 
 _PER_LINE = 2000
 _COLUMNS = 1000
-_PER_LASER = 500
+_PER_LASER = 300
 _QUANTITIES = (
     ("range", "mm", 1e3, 2, 4.0),
     ("pitch", "°", 1.0, 3, 0.5),
@@ -206,18 +206,23 @@ def plane_charts(
     frames = [_plane_frame(points, track, row, lasers) for row in rows]
     return {
         "frames": frames,
-        "axes": [_plane_axes(frames, index) for index in range(len(lasers))],
+        "axes": _plane_axes(frames),
         "known": [laser.known for laser in lasers],
         "basis": [_basis(laser) for laser in lasers],
     }
 
 
-def cloud_chart(points: PointSummary, n_lasers: int, dome_radius_mm: float) -> Json:
-    """Return the random target points of the dive by laser, in millimetres in `dome`."""
-    xyz = 1e3 * points.cloud_in_dome
+def cloud_chart(points: PointSummary, track: Track, n_lasers: int, dome_radius_mm: float) -> Json:
+    """Return the random target points of the dive by laser, in millimetres in the target's frame.
+
+    With the least and the greatest range, between which the dome was.
+    """
+    xyz = 1e3 * points.cloud_in_target
     mine = [xyz[points.cloud_laser == index] for index in range(n_lasers)]
+    ranges = 1e3 * track.posture[track.valid, 0]
     return {
-        "lasers": [{axis: rounded(part[:, i], 1) for i, axis in enumerate("xyz")} for part in mine],
+        "lasers": [{axis: rounded(part[:, i], 0) for i, axis in enumerate("xyz")} for part in mine],
+        "dome_mm": rounded([ranges.min(), ranges.max()], 0) if len(ranges) else None,
         "dome_radius_mm": None if np.isnan(dome_radius_mm) else dome_radius_mm,
     }
 
@@ -383,11 +388,12 @@ def _target_line(laser: LaserFacts, normal: FloatArray, distance: float) -> Json
     return {"line": rounded(line, 5)}
 
 
-def _plane_axes(frames: list[Json], index: int) -> Json:
-    """Return limits that hold nearly all points of every sample frame, a little wider."""
+def _plane_axes(frames: list[Json]) -> Json:
+    """Return limits that hold nearly all points of every laser and sample frame, a little wider."""
     limits = {}
+    drawn = [laser for frame in frames for laser in frame["lasers"]]
     for axis in "xy":
-        values = [v for frame in frames for v in frame["lasers"][index][axis] if v is not None]
+        values = [v for laser in drawn for v in laser[axis] if v is not None]
         low, high = np.percentile(values, [2, 98]) if values else (0.0, 1000.0)
         pad = 0.06 * (high - low) + 5.0
         limits[axis] = rounded([low - pad, high + pad], 1)

@@ -20,22 +20,29 @@ def new_canvas(width_in: float, height_in: float) -> "Figure":
     return figure
 
 
-BLUE, ORANGE, GREEN, PURPLE = "#1f4fc8", "#d55e00", "#1a8f5a", "#8a4fbf"
-DARK, GREY, PALE, PINK = "#23272e", "#8a8f98", "#d9dce1", "#f06fae"
+BLUE, ORANGE, GREEN, PURPLE = "#0b5c7d", "#d55e00", "#1a8f5a", "#8a4fbf"
+DARK, GREY, PALE, PINK = "#14222c", "#8796a0", "#dfe5e8", "#f06fae"
+"""Blue is the accent of all pages, and dark their ink (`colours.css`)."""
 OURS, PAPER, TRUTH = BLUE, ORANGE, DARK
 """The same three everywhere: what we measure, the paper's way, and the truth."""
 
 WIDTH_IN: Mapping[str, float] = {"column": 3.5, "page": 7.2}
 
-STYLE: Mapping[Any, Any] = {
+# Its keys are a type of their own in some versions of Matplotlib.
+STYLE: dict[Any, Any] = {
     "font.size": 8.5,
+    "text.color": DARK,
     "axes.titlesize": 9.0,
+    "axes.edgecolor": GREY,
+    "axes.labelcolor": DARK,
     "axes.linewidth": 0.7,
+    "xtick.color": DARK,
+    "ytick.color": DARK,
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.grid": True,
     "axes.axisbelow": True,
-    "grid.color": "#e4e6ea",
+    "grid.color": PALE,
     "grid.linewidth": 0.6,
     "legend.fontsize": 7.5,
     "legend.frameon": False,

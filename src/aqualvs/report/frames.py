@@ -3,7 +3,7 @@
 import base64
 import contextlib
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -21,10 +21,13 @@ from aqualvs.report.run_data import Track
 from aqualvs.scanning.posture import Reason
 from aqualvs.scanning.scan import ImagePlane
 from aqualvs.sources.images import IMAGE_SUFFIXES, images_in, read_image
+from aqualvs.text import bgr
 
 N_PICTURES = 6
 N_SAMPLES = 24
 _WIDTH_PX = 800
+# Pictures of holes: least side and size on the page in pixels, and hole diameters across.
+_CROP_PX, _CROP_SHOWN_PX, _CROP_DIAMETERS = 160, 320, 2.5
 _DECODERS = 2
 # What a file raises that is no video, has no picture, or breaks off.
 _BROKEN = (av.error.FFmpegError, OSError, IndexError, StopIteration)
@@ -36,6 +39,7 @@ _JPEG = (
     cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444,
 )
 _SATURATED = 250
+_HOLE_COLOUR = bgr("#ffb347")
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +57,7 @@ class SampleFrame:
 
     jpeg_base64: str
     size_px: tuple[int, int]
-    saturated: float
+    saturated: float = float("nan")
 
 
 def choose_pictures(track: Track, source: Path | None = None) -> list[int]:
@@ -122,9 +126,40 @@ def make_picture(image: ImagePlane, points: FramePoints | None) -> SampleFrame:
     if points is not None:
         pixels = (points.pixels + 0.5) * scale - 0.5
         small = draw_points(small, points.laser, pixels, points.used)
-    _, jpeg = cv2.imencode(".jpg", small, _JPEG)
+    return replace(_embedded(small), saturated=saturated_share(image, points))
+
+
+def make_crop(image: ImagePlane, middle: tuple[float, float], diameter: float) -> SampleFrame:
+    """Cut the surroundings of a place out of a picture, with a ring around the place.
+
+    Parameters
+    ----------
+    image : uint8 array, shape (height, width, 3)
+        BGR.
+    middle : (float, float)
+        Column and row.
+    diameter : float
+        Of the ring, in pixels.
+    """
+    height, width = map(int, image.shape[:2])
+    side = min(round(max(_CROP_DIAMETERS * diameter, _CROP_PX)), width, height)
+    left, top = (
+        min(max(round(at - 0.5 * side), 0), most - side)
+        for at, most in zip(middle, (width, height), strict=True)
+    )
+    crop = image[top : top + side, left : left + side]
+    scale = _CROP_SHOWN_PX / side
+    shown = cv2.resize(crop, (_CROP_SHOWN_PX, _CROP_SHOWN_PX), interpolation=cv2.INTER_AREA)
+    centre = (round(scale * (middle[0] - left)), round(scale * (middle[1] - top)))
+    radius = round(0.5 * scale * diameter)
+    cv2.circle(shown, centre, radius, _HOLE_COLOUR, 2, cv2.LINE_AA)
+    return _embedded(np.asarray(shown, np.uint8))
+
+
+def _embedded(image: ImagePlane) -> SampleFrame:
+    _, jpeg = cv2.imencode(".jpg", image, _JPEG)
     text = base64.b64encode(jpeg.tobytes()).decode("ascii")
-    return SampleFrame(text, (small.shape[1], small.shape[0]), saturated_share(image, points))
+    return SampleFrame(text, (image.shape[1], image.shape[0]))
 
 
 def saturated_share(image: ImagePlane, points: FramePoints | None) -> float:

@@ -3,7 +3,9 @@
 Every page is a template that extends `base.html`. All text from files is escaped here.
 """
 
+import gzip
 import json
+import re
 from base64 import b64encode
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -27,12 +29,33 @@ def _templates() -> "Environment":
         loader=FunctionLoader(asset), autoescape=True, undefined=StrictUndefined, trim_blocks=True
     )
     templates.globals["asset"] = lambda name: Raw(asset(name))
+    templates.globals["packed"] = packed
+    templates.globals["contents"] = contents
     return templates
 
 
 def asset(name: str) -> str:
     """Return the text of a file that comes with the package."""
     return files("aqualvs.report").joinpath("assets", name).read_text(encoding="utf-8")
+
+
+@cache
+def packed(name: str) -> str:
+    """Return a file that comes with the package as base64 of gzip, for a page to unpack."""
+    return b64encode(gzip.compress(asset(name).encode(), mtime=0)).decode("ascii")
+
+
+_SECTION = re.compile(r'<section\b[^>]*\bid="([^"]+)"[^>]*>\s*<h2>(.*?)</h2>', re.DOTALL)
+_FEWEST = 3
+
+
+def contents(body: str) -> "Raw":
+    """Return links to the sections of a page; nothing where there are few, or it has its own."""
+    found = _SECTION.findall(body)
+    if len(found) < _FEWEST or any(name == "contents" for name, _ in found):
+        return Raw("")
+    items = "".join(f'<li><a href="#{name}">{title}</a></li>' for name, title in found)
+    return Raw(f'<nav aria-label="Contents"><ul class="contents">{items}</ul></nav>')
 
 
 def page(template: str, texts: Mapping[str, str], parts: Mapping[str, str]) -> str:

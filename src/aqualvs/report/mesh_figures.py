@@ -21,7 +21,7 @@ from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.nets.target_file import target_dict
 from aqualvs.optics.rigfile import rig_from_mapping
-from aqualvs.report.figure_style import new_canvas
+from aqualvs.report.figure_style import BLUE, DARK, GREY, PINK, STYLE, new_canvas
 from aqualvs.report.run_data import LaserFacts, lasers_of, read_run_file, working_range_m
 from aqualvs.results.files import Claim, writing
 from aqualvs.results.folder import POINTS_PARQUET, check_run_files
@@ -42,16 +42,10 @@ if TYPE_CHECKING:
 
 
 _DPI = 220
-_PINK, _BLUE, _DARK, _GREY, _ZONE = "#f06fae", "#1f4fc8", "#23272e", "#8a8f98", "#e8f3ea"
+_ZONE = "#e8f3ea"
 # Width and height of a detail, in mm.
 _DETAIL = (150.0, 75.0)
 _RINGS = {"A": "#d55e00", "B": "#009e73", "C": "#7b3fb5"}
-_STYLE: dict[Any, Any] = {
-    "font.size": 8.0,
-    "axes.titlesize": 8.5,
-    "axes.linewidth": 0.7,
-    "legend.fontsize": 7.5,
-}
 # Stragglers beyond these quantiles do not set the scale of a picture.
 _STRAGGLERS = 0.005
 _NAMES = ("adaptive filter", "paper's filter")
@@ -132,7 +126,7 @@ def drawn_figures(reflections: Reflections, options: MeshFilterOptions) -> "dict
     """Return the same pictures by name, not yet written."""
     from matplotlib import rc_context
 
-    with rc_context(_STYLE):
+    with rc_context(STYLE):
         return {
             "figure_13": _all_reflections(reflections, options),
             "figure_14": _filtered(reflections, options),
@@ -158,9 +152,9 @@ def _all_reflections(r: Reflections, _: MeshFilterOptions) -> "Figure":
     figure = new_canvas(min(tall * (width + spare) / height + 1.0, 5.6), tall + 0.8)
     axes = figure.add_subplot()
     _zone(axes, r)
-    _dots(axes, xy[r.usable], 2.5, _BLUE, f"{r.noun} in it ({int(r.usable.sum())})")
+    _dots(axes, xy[r.usable], 2.5, BLUE, f"{r.noun} in it ({int(r.usable.sum())})")
     if not r.usable.all():
-        _dots(axes, xy[~r.usable], 2.5, _GREY, f"others ({int((~r.usable).sum())})")
+        _dots(axes, xy[~r.usable], 2.5, GREY, f"others ({int((~r.usable).sum())})")
     _plane_axes(axes, low, high)
     axes.set_title(f"{r.noun.capitalize()} of laser “{r.laser}” in its plane, frame {r.frame}")
     axes.legend(loc="lower left", markerscale=3.0, frameon=False)
@@ -182,15 +176,15 @@ def _filtered(r: Reflections, options: MeshFilterOptions) -> "Figure":
     for column, (name, net) in enumerate(zip(_NAMES, (r.adaptive, r.paper), strict=True)):
         kept = 1e3 * r.in_laser[net & r.usable]
         axes = grid[0, column]
-        _dots(axes, xy, 3.0, _PINK, f"all ({len(xy)})")
-        _dots(axes, kept, 3.0, _BLUE, f"net ({len(kept)})")
+        _dots(axes, xy, 3.0, PINK, f"all ({len(xy)})")
+        _dots(axes, kept, 3.0, BLUE, f"net ({len(kept)})")
         _plane_axes(axes, low, high)
         axes.add_patch(_box(*view))
         axes.set_title(f"({'ab'[column]}) {name}")
         axes.legend(loc="upper right", markerscale=2.5, ncols=2, frameon=False)
         detail = grid[1, column]
-        _dots(detail, xy, 7.0, _PINK)
-        _dots(detail, kept, 7.0, _BLUE)
+        _dots(detail, xy, 7.0, PINK)
+        _dots(detail, kept, 7.0, BLUE)
         _plane_axes(detail, *view)
         detail.set_title(f"({'cd'[column]}) {name}, detail")
     figure.suptitle(
@@ -214,7 +208,7 @@ def _binary_image(r: Reflections, options: MeshFilterOptions) -> "Figure":
     dd = 1e3 * options.dd
     cells = np.unique(image.cells, axis=0)
     centres = corner + dd * (cells + 0.5)
-    left.scatter(centres[:, 0], centres[:, 1], s=1.2, marker="s", color=_DARK, linewidths=0)
+    left.scatter(centres[:, 0], centres[:, 1], s=1.2, marker="s", color=DARK, linewidths=0)
     _plane_axes(left, *_square(*_span(centres, 0.06)))
     columns, rows = image.lit.shape
     left.set_title(f"(a) Im: {columns} x {rows} cells of {dd:.3g} mm, {len(cells)} lit")
@@ -243,7 +237,7 @@ def _cells(
         lit.T,
         origin="lower",
         extent=extent,
-        cmap=ListedColormap(["white", _DARK]),
+        cmap=ListedColormap(["white", DARK]),
         vmin=0,
         vmax=1,
         interpolation="nearest",
@@ -349,7 +343,7 @@ def _box(low: FloatArray, high: FloatArray) -> Any:
 
     width, height = (high - low).tolist()
     return Rectangle(
-        (float(low[0]), float(low[1])), width, height, fill=False, edgecolor=_DARK, linewidth=0.8
+        (float(low[0]), float(low[1])), width, height, fill=False, edgecolor=DARK, linewidth=0.8
     )
 
 

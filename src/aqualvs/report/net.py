@@ -2,11 +2,14 @@
 
 import base64
 import csv
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, TypeAlias
 
+from aqualvs.report.frames import SampleFrame
 from aqualvs.report.html import Card, Raw, table, text
 from aqualvs.results.files import read_json
 from aqualvs.results.folder import HOLES_CSV, NET_CSV, NET_GEOJSON, NET_MAP_PNG
@@ -95,15 +98,55 @@ def net_cards(net: NetTables | None) -> list[Card]:
     return [Card("Net", value, "; ".join(words) or "solidity not measured")]
 
 
-def net_view(net: NetTables | None) -> str:
-    """Return the section on the net; nothing without one."""
+@dataclass(frozen=True, slots=True)
+class HolePicture:
+    """Where a hole is to be cut out of the dive's pictures.
+
+    Attributes
+    ----------
+    number : str
+        As `holes.csv` has it.
+    frame : int
+    middle : (float, float)
+        Column and row in that frame's picture.
+    diameter : float
+        In pixels.
+    """
+
+    number: str
+    frame: int
+    middle: tuple[float, float]
+    diameter: float
+
+
+def hole_pictures(net: NetTables) -> list[HolePicture]:
+    """Return what shows the largest holes, of those whose nearest look has them in its picture."""
+    by_size = sorted(net.holes, key=lambda row: _number(row, "diameter_mm") or 0.0, reverse=True)
+    found = []
+    for row in by_size[:_LONG_TABLE]:
+        values = [_number(row, name) for name in ("picture_frame", "u_px", "v_px", "diameter_px")]
+        frame, u, v, diameter = (math.nan if value is None else value for value in values)
+        if math.isfinite(frame + u + v + diameter):
+            found.append(HolePicture(row["hole"], int(frame), (u, v), diameter))
+    return found
+
+
+def net_view(net: NetTables | None, crops: Mapping[str, SampleFrame] = MappingProxyType({})) -> str:
+    """Return the section on the net; nothing without one.
+
+    Parameters
+    ----------
+    net : NetTables or None
+    crops : mapping
+        Number of a hole to its picture.
+    """
     if net is None:
         return ""
     head = '<section id="net"><h2>Net</h2>\n'
     if not net.stretches:
         return f'{head}<p class="note">No net was seen.</p></section>'
     return "\n".join(
-        [head + _lead(net), _map(net), _holes(net), _stretches(net), _log(net), "</section>"]
+        [head + _lead(net), _map(net), _holes(net, crops), _stretches(net), _log(net), "</section>"]
     )
 
 
@@ -132,10 +175,13 @@ def _map(net: NetTables) -> str:
     )
 
 
-def _holes(net: NetTables) -> str:
+def _holes(net: NetTables, crops: Mapping[str, SampleFrame]) -> str:
     if not net.holes:
         return "<h3>Holes</h3><p>None was found.</p>"
-    names = ("hole", "diameter, mm", "width × height, mm", "meshes", *_PLACE_HEAD, "time", "frame")
+    names = (
+        *("hole", "diameter, mm", "width × height, mm", "meshes", *_PLACE_HEAD),
+        *("heading, °", "time", "frame"),
+    )
     rows = [
         (
             _cell(row, "hole"),
@@ -143,12 +189,34 @@ def _holes(net: NetTables) -> str:
             f"{_cell(row, 'width_mm', 0)} × {_cell(row, 'height_mm', 0)}",
             _cell(row, "missing_meshes", 0),
             *_place(row),
+            _cell(row, "heading_deg", 0),
             _time(row, "time_s"),
             _cell(row, "frame"),
         )
         for row in net.holes
     ]
-    return f"<h3>Holes</h3>{_folded(table(names, rows), len(rows), 'holes')}"
+    shown = "\n".join(_crop(row, crops[row["hole"]]) for row in net.holes if row["hole"] in crops)
+    pictures = f'<div class="crops">{shown}</div>' if shown else ""
+    return f"<h3>Holes</h3>{pictures}{_folded(table(names, rows), len(rows), 'holes')}"
+
+
+def _crop(row: Row, picture: SampleFrame) -> str:
+    """Return the picture of a hole and the way back to it."""
+    name, (width, height) = f"Hole {text(row['hole'])}", picture.size_px
+    size = f"{_cell(row, 'diameter_mm', 0)} ± {_cell(row, 'sigma_diameter_mm', 0)} mm"
+    values = (
+        ("depth {} m", _cell(row, "depth_m", 2)),
+        ("heading {}°", _cell(row, "heading_deg", 0)),
+        ("{} m along the net", _cell(row, "along_m", 2)),
+        ("{} in the video", _time(row, "time_s")),
+        ("shown in frame {}", _cell(row, "picture_frame")),
+    )
+    way = ", ".join(words.format(value) for words, value in values if value != _NONE)
+    return (
+        f'<figure><img src="data:image/jpeg;base64,{picture.jpeg_base64}" width="{width}" '
+        f'height="{height}" alt="{name} with its surroundings">'
+        f"<figcaption><b>{name}: {size}</b><br>{way}</figcaption></figure>"
+    )
 
 
 _PLACE_HEAD = ("along, m", "depth, m", "bearing, °")

@@ -139,8 +139,10 @@ class PointSummary:
         Sum of squared distances of target points from the frame's plane, and their number.
     quality, residual : int array, shape (MAX_LASERS, bins)
         Histograms of the target points over `QUALITY_EDGES` and `RESIDUAL_EDGES_MM`.
-    cloud_in_dome, cloud_laser : array, shape (K, 3) and (K,)
-        Random target points of the dive, at most 15,000, the same ones every time.
+    cloud_in_target, cloud_laser : array, shape (K, 3) and (K,)
+        Random target points of the dive, at most 15,000, the same ones every time: right of the
+        foot of the perpendicular from the dome's centre, beyond the target plane, and up, in
+        metres. Those of all frames lie on each other, wherever the vehicle was.
     samples : dict
         Frame number to the points of that frame.
     """
@@ -151,7 +153,7 @@ class PointSummary:
     labels: IntArray = field(default_factory=lambda: _counts(len(Label)))
     quality: IntArray = field(default_factory=lambda: _counts(len(QUALITY_EDGES) - 1))
     residual: IntArray = field(default_factory=lambda: _counts(len(RESIDUAL_EDGES_MM) - 1))
-    cloud_in_dome: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    cloud_in_target: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     cloud_laser: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     samples: dict[int, FramePoints] = field(default_factory=dict)
 
@@ -308,7 +310,10 @@ def _add(
         quality = batch["quality"][target].astype(np.float64)
         _count(summary.quality, QUALITY_EDGES, laser[target], quality)
     _keep_samples(summary, batch, frame, laser, label, xyz, sample_frames)
-    return _grow_cloud(summary, xyz, laser, target, keys, rng)
+    # Points of a frame without a posture have no place in the target's frame.
+    of_frames = planes[np.searchsorted(track.frame, frame[target])]
+    known = np.isfinite(of_frames[:, 3])
+    return _grow_cloud(summary, xyz, laser, target[known], of_frames[known], keys, rng)
 
 
 def _keep_samples(
@@ -367,6 +372,7 @@ def _grow_cloud(
     xyz: list[FloatArray],
     laser: IntArray,
     target: IntArray,
+    planes: FloatArray,
     keys: FloatArray,
     rng: np.random.Generator,
 ) -> FloatArray:
@@ -375,13 +381,24 @@ def _grow_cloud(
     if len(keys) == _CLOUD:
         # Of many points only the few whose key is small enough are looked at again.
         small = np.flatnonzero(drawn < keys.max())
-        drawn, target = drawn[small], target[small]
+        drawn, target, planes = drawn[small], target[small], planes[small]
     keys = np.concatenate([keys, drawn])
-    points = np.stack([axis[target] for axis in xyz], axis=-1)
-    points = np.concatenate([summary.cloud_in_dome, points])
+    points = _in_target(np.stack([axis[target] for axis in xyz], axis=-1), planes)
+    points = np.concatenate([summary.cloud_in_target, points])
     laser = np.concatenate([summary.cloud_laser, laser[target]])
     if len(keys) > _CLOUD:
         kept = np.argpartition(keys, _CLOUD)[:_CLOUD]
         keys, points, laser = keys[kept], points[kept], laser[kept]
-    summary.cloud_in_dome, summary.cloud_laser = points, laser
+    summary.cloud_in_target, summary.cloud_laser = points, laser
     return keys
+
+
+def _in_target(points: FloatArray, planes: FloatArray) -> FloatArray:
+    """Return points in `dome` (N, 3) as those of `PointSummary.cloud_in_target`."""
+    n, distance = planes[:, :3], planes[:, 3]
+    up = np.array([0.0, 0.0, 1.0]) - n[:, 2:] * n
+    up /= np.linalg.norm(up, axis=1, keepdims=True)
+    axes = np.stack([np.cross(n, up), n, up], axis=1)
+    found = np.einsum("nij,nj->ni", axes, points)
+    found[:, 1] -= distance
+    return np.asarray(found)

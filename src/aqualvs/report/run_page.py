@@ -22,9 +22,18 @@ from aqualvs.report.frames import (
     choose_pictures,
     choose_samples,
     decode_frames,
+    make_crop,
     make_picture,
 )
-from aqualvs.report.net import NetTables, net_cards, net_view, net_warnings, read_net
+from aqualvs.report.net import (
+    HolePicture,
+    NetTables,
+    hole_pictures,
+    net_cards,
+    net_view,
+    net_warnings,
+    read_net,
+)
 from aqualvs.report.points import MAX_LASERS, PointSummary, summarize_points
 from aqualvs.report.run_data import (
     LaserFacts,
@@ -68,6 +77,8 @@ class Material:
         Why pictures are missing; "" where none is.
     net : NetTables or None
         The state of the net, where it was evaluated.
+    crops : dict
+        Number of a hole to its picture.
     warnings : list of str
     """
 
@@ -83,6 +94,7 @@ class Material:
     pictures: dict[int, SampleFrame]
     no_pictures: str
     net: NetTables | None
+    crops: dict[str, SampleFrame]
     warnings: list[str]
 
     @property
@@ -111,15 +123,23 @@ def gather(run_dir: Path, truth: Path | None) -> Material:
     picture_rows = choose_pictures(track, None if isinstance(source, str) else source)
     sample_rows = choose_samples(track, picture_rows)
     frames = track.frame[sample_rows].tolist()
+    net, no_net = read_net(run_dir)
+    holes = _rows_of_holes(net, track)
     with ThreadPoolExecutor(1) as beside:
         # FFmpeg works on the pictures while this thread counts points.
-        images = beside.submit(_decoded, source, track, picture_rows)
+        wanted = sorted({*picture_rows, *holes.values()})
+        images = beside.submit(_decoded, source, track, wanted)
         points, no_points = summarize_points(run_dir, track, frames)
-        pictures, no_pictures = _pictures(source, images, track, points)
+        decoded, no_pictures = _decoded_or_why(source, images)
+    samples = {} if points is None else points.samples
+    pictures = {
+        row: make_picture(decoded[row], samples.get(int(track.frame[row])))
+        for row in picture_rows
+        if row in decoded
+    }
     rig = mapping(run, "rig")
     lasers = _lasers(rig, points)
     names = [laser.name for laser in lasers]
-    net, no_net = read_net(run_dir)
     bare, no_bare = read_bare(run_dir, track)
     told = warnings_of(track, points, pictures, run, working_range_m(rig), names)
     return Material(
@@ -135,6 +155,11 @@ def gather(run_dir: Path, truth: Path | None) -> Material:
         pictures=pictures,
         no_pictures=no_pictures,
         net=net,
+        crops={
+            place.number: make_crop(decoded[row], place.middle, place.diameter)
+            for place, row in holes.items()
+            if row in decoded
+        },
         warnings=[
             text
             for text in (
@@ -193,12 +218,16 @@ def _decoded(source: Path | str, track: Track, rows: list[int]) -> dict[int, Ima
     return {} if isinstance(source, str) else decode_frames(source, track, rows)
 
 
-def _pictures(
-    source: Path | str,
-    decoded: "Future[dict[int, ImagePlane]]",
-    track: Track,
-    points: PointSummary | None,
-) -> tuple[dict[int, SampleFrame], str]:
+def _rows_of_holes(net: NetTables | None, track: Track) -> dict[HolePicture, int]:
+    """Return the row of the track with the nearest look at each hole that is to be shown."""
+    rows = {int(frame): row for row, frame in enumerate(track.frame)}
+    places = [] if net is None else hole_pictures(net)
+    return {place: rows[place.frame] for place in places if place.frame in rows}
+
+
+def _decoded_or_why(
+    source: Path | str, decoded: "Future[dict[int, ImagePlane]]"
+) -> tuple[dict[int, ImagePlane], str]:
     if isinstance(source, str):
         return {}, source
     try:
@@ -207,12 +236,7 @@ def _pictures(
         return {}, f"{fault}: sample frames come without pictures."
     if not images:
         return {}, f"{source} cannot be decoded again: sample frames come without pictures."
-    samples = {} if points is None else points.samples
-    pictures = {
-        row: make_picture(image, samples.get(int(track.frame[row])))
-        for row, image in images.items()
-    }
-    return pictures, ""
+    return images, ""
 
 
 def write_report(run_dir: Path, *, truth: Path | None = None, out: Path | None = None) -> Path:
@@ -269,7 +293,7 @@ def _parts(m: Material) -> dict[str, str]:
         "cards": html.cards([*headline(m.track), *net_cards(m.net)]),
         "warnings": html.notice(m.warnings),
         "truth": _truth_view(m.track, m.truth),
-        "net": net_view(m.net),
+        "net": net_view(m.net, m.crops),
         "planes": _plane_view(m.lasers, m.points is not None),
         "cloud": _cloud_view(m.points, planes_known),
         "pictures": _picture_view(_captions(m), m.pictures, m.no_pictures, m.names),
@@ -290,7 +314,7 @@ def _data(m: Material) -> dict[str, Any]:
         data["error"] = charts.error_chart(m.track, m.truth)
     if m.points is not None:
         data["planes"] = charts.plane_charts(m.points, m.track, m.sample_rows, m.lasers)
-        data["cloud"] = charts.cloud_chart(m.points, len(m.lasers), dome_radius_mm(m.rig))
+        data["cloud"] = charts.cloud_chart(m.points, m.track, len(m.lasers), dome_radius_mm(m.rig))
         data["quality"] = charts.quality_charts(m.points, m.track, len(m.lasers))
     if m.bare is not None:
         data["bare"] = charts.bare_chart(m.track, m.bare, m.truth)
@@ -384,10 +408,10 @@ def _plane_view(lasers: list[LaserFacts], has_points: bool) -> str:
 
 def _cloud_view(points: PointSummary | None, planes_known: bool) -> str:
     """Return the place of the cloud, or why there is none."""
-    if points is None or not len(points.cloud_in_dome):
+    if points is None or not len(points.cloud_in_target):
         return '<p class="note">The run left no points on the target.</p>'
     total = int(points.on_target.sum())
-    shown = len(points.cloud_in_dome)
+    shown = len(points.cloud_in_target)
     amount = f"All {total:,}" if shown == total else f"A random {shown:,} of {total:,}"
     buttons = ""
     if planes_known:
@@ -396,8 +420,11 @@ def _cloud_view(points: PointSummary | None, planes_known: bool) -> str:
             '<button type="button" data-cloud="frame">the frame chosen above</button></div>'
         )
     return (
-        f'<p class="lead">{amount} target points, as seen from the vehicle (x right, y forward, z '
-        "up; the dome is the small black hemisphere). Drag to turn, scroll or pinch to zoom.</p>\n"
+        f'<p class="lead">{amount} target points. The whole dive is shown in the target’s frame: '
+        "right and up of the point nearest to the dome, and beyond the fitted plane, so that the "
+        "points of all frames lie on each other; the line is where the dome was. A frame is shown "
+        "as the vehicle saw it, with the dome as a hemisphere. Drag to turn, scroll or pinch to "
+        "zoom.</p>\n"
         f'{buttons}<div class="chart screen" id="chart-cloud"></div>'
         '<img class="paper" id="cloud-paper" alt="the same view, for paper">'
     )

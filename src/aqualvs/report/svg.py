@@ -17,12 +17,10 @@ from aqualvs.report.charts import breaks, thin
 from aqualvs.report.html import Raw
 from aqualvs.text import signed
 
-ACCENT = "#0b5c7d"
+# Those of the page, light or dark (`colours.css`); outliers as in pictures.
+ACCENT, QUIET, EDGE = "var(--accent)", "var(--quiet)", "var(--quiet)"
+GRID, BAND, PAPER = "var(--line)", "var(--band)", "var(--paper)"
 OUTLIER = "#D55E00"
-QUIET = "#55656f"
-EDGE = "#8a9aa4"
-GRID = "#e3e9ec"
-BAND = "#bcdcea"
 
 _WIDTH, _HEIGHT, _LEFT, _RIGHT, _FOOT = 900.0, 300.0, 84.0, 16.0, 54.0
 _LANE = 20.0

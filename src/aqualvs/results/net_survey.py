@@ -135,7 +135,7 @@ class NetPass:
         if self._log is not None:
             log = lay_log(self._log, postures, self._request.log_offset_s, video)
         places = place_net(stretches, holes, postures, log.places if log else None)
-        wall = unroll(stretches, holes, places, self._rig)
+        wall = unroll(stretches, holes, places, self._rig, postures)
         area = self._condition.area
         summary = net_dict(wall, area, self._n_frames, len(postures.time_s))
         facts = {

@@ -229,6 +229,8 @@ class RunRequest:
         None: all of them.
     mcap : bool
         Whether to write `dive.mcap`.
+    rerun : Path or None
+        File of Rerun to write, if any.
     overlay, report : bool
         Whether to write `overlay.mp4` and `report.html`.
     truth : Path or None
@@ -255,6 +257,7 @@ class RunRequest:
     scanner: ScannerOptions = field(default_factory=ScannerOptions)
     chosen: frozenset[str] | None = None
     mcap: bool = False
+    rerun: Path | None = None
     overlay: bool = False
     report: bool = True
     truth: Path | None = None

@@ -135,7 +135,11 @@ class AssignmentTest:
         target : Surface
             The one to judge.
         """
-        small = self._is_small(candidates, subsegments, surfaces, target)
+        # A fish before a wall that is out of range: the wall is no target, and the fish is none.
+        outweighed = not target.is_mesh and any(
+            one.inlier_weight > target.inlier_weight for one in surfaces
+        )
+        small = outweighed or self._is_small(candidates, subsegments, surfaces, target)
         return small and self._is_faint(target, subsegments)
 
     def overlooked(

@@ -211,14 +211,15 @@ def _check(rig: Rig, size: SetSize) -> None:
 
 
 def _simulate(job: _Job) -> CalibrationFiles:
+    # First, so that a set that is interrupted has them.
+    nominal, rig = job.out / "nominal.yaml", job.folder("truth") / "rig.yaml"
+    targets.write_yaml(nominal, _nominal_mapping(job.rig))
+    save_rig(with_exact_numbers(job.rig), rig)
     camera, board = _camera_air(job)
     dome, rail_board, poses = _dome_air(job)
     box, box_file = _box(job)
     index, target = _index(job)
     dive, dive_truth = _dive(job)
-    nominal, rig = job.out / "nominal.yaml", job.folder("truth") / "rig.yaml"
-    targets.write_yaml(nominal, _nominal_mapping(job.rig))
-    save_rig(with_exact_numbers(job.rig), rig)
     return CalibrationFiles(
         nominal=nominal,
         camera=camera,

@@ -291,6 +291,22 @@ def _described(path: Path) -> Feed:
     return RemoteFeed(str(path), opener, content=f"RTP {video.codec}")
 
 
+def folder_beside(where: str) -> Path:
+    """Return where the results of a source go by default: a folder beside it, `NAME_run`.
+
+    Raises
+    ------
+    OptionError
+        If the source is an address.
+    """
+    if is_address(where):
+        raise OptionError(f"--out: missing; give the folder to write for {where}")
+    path = _split_topic(where, None)[0]
+    if path.name in ("", ".."):
+        path = path.resolve()
+    return path.with_name(f"{path.name if path.is_dir() else path.stem}_run")
+
+
 def _split_topic(where: str | Path, topic: str | None) -> tuple[Path, str | None]:
     """Return path and topic of `PATH#TOPIC`; a path that exists is taken as it is."""
     path, mark, name = str(where).rpartition("#")

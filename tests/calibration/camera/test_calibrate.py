@@ -88,7 +88,7 @@ def test_reports_what_a_user_wants_to_know() -> None:
     text = "\n".join(found.findings)
     assert "focal lengths: 81" in text
     assert "4 coefficients of the opencv model" in text
-    assert "held back" in text
+    assert "held out" in text
 
 
 @pytest.mark.parametrize("distortion", [(), FOUR, (*FOUR, 0.25)])

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from aqualvs.calibration.lasers.problem import (
-    N_SLACK,
+    N_BOARD_POSE,
+    BoardPosePrior,
     LaserProblem,
     LaserState,
-    Slack,
     distances_of,
 )
 from aqualvs.calibration.lasers.stripes_on_planes import (
@@ -49,9 +49,9 @@ def made(
             mine = np.flatnonzero(view.stripes.chain // n == i_laser)
             group = binned(i, i_laser, view.stripes.at(mine), view.stripes.chain[mine] % n)
             groups.append(with_gain(group, camera, planes, sheet))
-    slack = Slack(0.01, 0.002) if loose else None
-    problem = LaserProblem(bundle, surfaces, tuple(groups), len(sheets), slack)
-    return problem, LaserState(state, sheets, np.zeros((2, N_SLACK)))
+    prior = BoardPosePrior(0.01, 0.002) if loose else None
+    problem = LaserProblem(bundle, surfaces, tuple(groups), len(sheets), prior)
+    return problem, LaserState(state, sheets, np.zeros((2, N_BOARD_POSE)))
 
 
 @pytest.mark.parametrize(
@@ -68,7 +68,7 @@ def test_jacobians_are_derivatives(target: str, bent: bool, medium: float, loose
     problem, state = made(rig, target=target, free=FREE, medium=medium, loose=loose)
     if loose:
         tilted = np.array([[0.02, -0.01, 0.003], [-0.015, 0.02, -0.002]])
-        state = replace(state, slack=tilted)
+        state = replace(state, board_poses=tilted)
     blocks = problem.blocks(state)
     # Different units need different steps: index and radians move pixels more than focal lengths.
     size = np.full(problem.n_parameters, 1e-6)

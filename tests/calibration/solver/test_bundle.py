@@ -111,8 +111,8 @@ def test_distance_is_where_the_plane_meets_the_axis() -> None:
     assert on_axis[2] == pytest.approx(0.0, abs=1e-15)
 
 
-def test_held_numbers_pass_their_errors_on() -> None:
-    """The gain of the consider covariance is what a shift of a held number does to a solve."""
+def test_considered_numbers_pass_their_errors_on() -> None:
+    """The gain of the covariance is what a shift of a considered number does to a solve."""
     rig, rng = example_rig(), np.random.default_rng(5)
     shoot = rail(rig, AIR, "exact", rng, noise_px=0.05)
     options = DomeOptions(refine_intrinsics=False)
@@ -120,7 +120,7 @@ def test_held_numbers_pass_their_errors_on() -> None:
     bundle = problem.bundle
     # All noise at its nominal size, so that both solves weigh alike.
     found = solve(bundle, bundle.start, reject=False)
-    names, covariance = consider_covariance(bundle, found, problem.held)
+    names, covariance = consider_covariance(bundle, found, problem.considered)
     shift = 0.2 * np.sqrt(INTRINSICS.of(["cx"])[0, 0])
     held = names.index("cx") - len(names)
     gain = covariance[:, held] / INTRINSICS.of(["cx"])[0, 0]
@@ -173,8 +173,8 @@ def test_observability_tells_data_from_priors() -> None:
     assert list(best.main) == ["fy"]
     assert worst.gain < 1e-3
     assert list(worst.main) == ["fx"]
-    assert worst in seen.untold()
-    assert best not in seen.untold()
+    assert worst in seen.unobservable()
+    assert best not in seen.unobservable()
 
 
 def test_views_behind_each_other_in_one_medium_only() -> None:

@@ -6,7 +6,7 @@ import json
 import socket
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
-from aqualvs.control.vehicle import Setpoint, SetpointHolder
+from aqualvs.control.vehicle import Setpoint, SetpointHolder, VehicleState
 from aqualvs.errors import OptionError
 from aqualvs.live.dashboard.access import (
     MAX_MESSAGE_BYTES,
@@ -26,12 +26,15 @@ from aqualvs.live.dashboard.access import (
     make_access,
     token_fault,
 )
-from aqualvs.live.dashboard.output import Dashboard, page_picture
+from aqualvs.live.dashboard.output import Dashboard, SwitchButton, page_picture
 from aqualvs.live.dashboard.server import DashboardServer, Hub, PageClient
 from aqualvs.live.options import host_and_port
+from aqualvs.recording import RecorderSwitch
 from aqualvs.recording.sample import LiveSample
 from aqualvs.results.folder import POSTURE_COLUMNS, posture_row
-from browser import open_page
+from aqualvs.scanning.posture import Posture, Reason, Refusal
+from aqualvs.sources.base import PartHealth, State
+from browser import Page, open_page
 from live_cases import demo_rig, demo_samples, of_size
 from waiting import TIMEOUT_S, until
 
@@ -93,9 +96,10 @@ class Bench:
 @pytest.fixture
 def bench() -> Iterator[Bench]:
     rig, button = demo_rig(), Button()
-    controls = Controls(SetpointHolder(rig.working_range), button)
+    controls = Controls(SetpointHolder(rig.working_range, followed=False), button)
     server = DashboardServer("127.0.0.1", 0, Access("127.0.0.1", TOKEN), rig, controls)
-    dashboard = Dashboard(server, controls)
+    place = VehicleState(depth=4.87, heading=1.0)
+    dashboard = Dashboard(server, controls, lambda: place)
     yield Bench(server, dashboard, controls, button)
     dashboard.close()
 
@@ -107,20 +111,31 @@ def state_of(connection: ClientConnection, timeout_s: float) -> dict[str, Any]:
             return dict(found)
 
 
-def test_in_a_browser_it_shows_what_posture_csv_says_and_takes_commands(
-    bench: Bench, tmp_path: Path
-) -> None:
-    stop = threading.Event()
-    sample = demo_samples(4)[3]
+@contextlib.contextmanager
+def playing(bench: Bench) -> Iterator[Callable[[LiveSample], None]]:
+    """Send a sample over and over; yields what changes it."""
+    stop, current = threading.Event(), [demo_samples(1)[0]]
 
     def play() -> None:
-        # Only one frame, so that what is on the screen can be compared.
         while not stop.wait(0.05):
-            bench.dashboard.send(sample)
+            bench.dashboard.send(current[0])
 
     player = threading.Thread(target=play)
     player.start()
     try:
+        yield lambda sample: current.__setitem__(0, sample)
+    finally:
+        stop.set()
+        player.join()
+
+
+def test_in_a_browser_it_shows_what_posture_csv_says_and_takes_commands(
+    bench: Bench, tmp_path: Path
+) -> None:
+    sample = demo_samples(4)[3]
+    # Only one frame, so that what is on the screen can be compared.
+    with playing(bench) as show:
+        show(sample)
         with open_page(tmp_path / "profile") as page:
             page.size(1280, 800)
             page.call("Page.navigate", url=f"http://{bench.address}/#token={TOKEN}")
@@ -145,15 +160,75 @@ def test_in_a_browser_it_shows_what_posture_csv_says_and_takes_commands(
                 "document.getElementById('video').getContext('2d')"
                 ".getImageData(300, 200, 1, 1).data[1] > 0"
             )
-            assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+            assert_guided(page, row)
+            for width in (1280, 390):
+                page.size(width, 768)
+                page.wait_for("document.documentElement.scrollWidth <= innerWidth")
+            page.size(1366, 768)
+            # All that a pilot needs fits a small laptop's screen.
+            page.wait_for("document.documentElement.scrollHeight <= innerHeight")
             page.screenshot(tmp_path / "page.png")
             assert (tmp_path / "page.png").stat().st_size > 30_000
             assert page.said == []
-    finally:
-        stop.set()
-        player.join()
     assert bench.button.pressed == [True]
     assert bench.controls.setpoint.setpoint == Setpoint(0.55, 0.0)
+
+
+def assert_guided(page: Page, row: dict[str, str]) -> None:
+    """The page says how far to go and to turn from a setpoint of 0.55 m, and where the vehicle is.
+
+    A net whose far normal points to the right is squared by a turn to the right.
+    """
+
+    def text(name: str) -> str:
+        return str(page.evaluate(f"document.getElementById('{name}').textContent"))
+
+    off, turn = float(row["range_m"]) - 0.55, float(row["yaw_deg"])
+    assert (off > 0.1, turn > 10.0) == (True, True)
+    assert text("error-range") == f"▲ {off:.2f} m too far"
+    assert (text("turn"), text("error-yaw")) == (f"{turn:.0f}° ▶", "turn right")
+    assert (text("depth"), text("heading")) == ("4.87", "057")
+    # Nothing follows this setpoint: it is an aim.
+    assert text("set-name") == "Aim at"
+    assert text("set-words").startswith("Aim: 0.55 m")
+    assert "Hold" not in str(page.evaluate("document.body.innerText"))
+
+
+def test_a_browser_warns_of_a_near_net_and_greys_lasers_without_pictures(
+    bench: Bench, tmp_path: Path
+) -> None:
+    sample = demo_samples(1)[0]
+    posture = sample.scan.posture
+    assert isinstance(posture, Posture)
+    lasers = (PartHealth("lower", State.OK),)
+    seen = replace(sample, health=replace(sample.health, lasers=lasers))
+    near = replace(seen, scan=replace(seen.scan, posture=replace(posture, nearest=0.33)))
+    refusal = Refusal(Reason.NO_FRAMES, "no picture for 2 s")
+    blind = replace(near, scan=replace(seen.scan, posture=refusal), frame=None)
+    chip = "document.querySelector('#parts li:nth-child(2)').dataset.state === '{}'"
+    with open_page(tmp_path / "profile") as page, playing(bench) as show:
+        show(near)
+        page.call("Page.navigate", url=f"http://{bench.address}/")
+        page.wait_for("document.getElementById('box-range').dataset.level === 'bad'")
+        page.wait_for(chip.format("ok"))
+        parts = page.evaluate("document.getElementById('parts').innerText")
+        assert "laser lower" in str(parts)
+        show(blind)
+        page.wait_for(chip.format("off"))
+
+
+def test_time_and_room_of_a_recording_are_told(tmp_path: Path) -> None:
+    switch = RecorderSwitch(tmp_path)
+    button = SwitchButton(switch)
+    assert button.to_dict() == {"on": False, "words": ""}
+    button.start()
+    told = button.to_dict()
+    button.stop()
+    assert told["on"]
+    assert str(told["words"]).endswith(".mcap")
+    assert 0.0 <= float(told["seconds"]) < TIMEOUT_S
+    assert int(told["free_bytes"]) > 0
+    assert button.to_dict()["on"] is False
 
 
 def test_without_a_token_this_machine_may_watch_but_not_command(

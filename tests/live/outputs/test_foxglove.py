@@ -245,7 +245,8 @@ def test_nothing_is_made_that_nobody_watches(output, samples, monkeypatch):
 
 
 def test_lines_and_plate_lie_where_the_points_are(samples):
-    from aqualvs.live.outputs.foxglove import laser_lines, quaternion
+    from aqualvs.geometry.transforms import quaternion_from_rotation
+    from aqualvs.live.outputs.foxglove import laser_lines
 
     sample = samples[0]
     posture = sample.scan.posture
@@ -256,7 +257,7 @@ def test_lines_and_plate_lie_where_the_points_are(samples):
         # On the target, to what a single point at its edge is off.
         assert np.allclose(ends @ posture.normal_in_dome, posture.range, atol=0.03)
     turn = sample.rig.dome_from_cam.rotation
-    x, y, z, w = quaternion(turn)
+    x, y, z, w = quaternion_from_rotation(turn)
     again = np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
@@ -265,23 +266,86 @@ def test_lines_and_plate_lie_where_the_points_are(samples):
         ]
     )
     assert np.allclose(again, turn, atol=1e-12)
-    assert quaternion(np.eye(3)) == (0.0, 0.0, 0.0, 1.0)
+    assert quaternion_from_rotation(np.eye(3)) == (0.0, 0.0, 0.0, 1.0)
 
 
-def test_the_layout_names_topics_and_fields_that_exist():
+@pytest.fixture(scope="module")
+def layout():
     from aqualvs.live.outputs.foxglove import LAYOUT
-    from aqualvs.recording.encoding import TOPICS
 
-    layout = json.loads(LAYOUT.read_text())
+    return json.loads(LAYOUT.read_text())
+
+
+def test_the_layout_is_in_the_words_of_the_panels(layout):
+    """The SDK's classes of panels are the published schema; the file is as the app exports it."""
+    from foxglove import layouts
+
     panels = set(re.findall(r'"(\w+!\w+)"', json.dumps(layout["layout"])))
     assert panels == set(layout["configById"])
-    known = {topic.name: topic.definition for topic in TOPICS}
-    paths = re.findall(r'"(/aqualvs/\w+)((?:\.\w+|\[:\])*)"', LAYOUT.read_text())
-    assert len(paths) > 10
-    for topic, path in paths:
-        assert topic in known or topic == "/aqualvs/scene"
-        for name in re.findall(r"\.(\w+)", path):
-            assert re.search(rf"\b{name}\n", known[topic])
+    classes = {
+        "Plot": layouts.PlotPanel,
+        "3D": layouts.ThreeDeePanel,
+        "Image": layouts.ImagePanel,
+        "StateTransitions": layouts.StateTransitionsPanel,
+        "RawMessages": layouts.RawMessagesPanel,
+    }
+    series = {"Plot": layouts.PlotSeries, "StateTransitions": layouts.StateTransitionsSeries}
+    for name, config in layout["configById"].items():
+        kind = name.partition("!")[0]
+        panel = classes[kind]()._to_dict()
+        # What the app exports calls this one panel otherwise.
+        assert panel["panelType"].replace("ThreeDee", "3D") == kind
+        assert not set(config) - set(panel["config"]._to_dict()), name
+        for one in config.get("paths", ()):
+            assert not set(one) - set(series[kind](value="/a.b")._to_dict()), name
+    scene = layout["configById"]["3D!scene"]
+    cloud, entities = scene["topics"]["/aqualvs/points"], scene["topics"]["/aqualvs/scene"]
+    point_keys = layouts.BaseRendererPointCloudTopicSettings()._to_dict()
+    for given, known in (
+        (cloud, point_keys),
+        (entities, layouts.BaseRendererSceneUpdateTopicSettings()._to_dict()),
+        (scene["layers"]["grid"], layouts.BaseRendererGridLayerSettings()._to_dict()),
+        (scene["cameraState"], layouts.ThreeDeeCameraState()._to_dict()),
+        (layout["configById"]["Image!picture"]["imageMode"], layouts.ImageModeConfig()._to_dict()),
+    ):
+        assert not set(given) - set(known)
+
+
+def test_what_the_layout_names_is_in_a_recording(layout, samples, tmp_path):
+    from rosbags.rosbag2 import Reader
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    from aqualvs.recording import PictureFormat, RecorderOptions, Recording
+    from aqualvs.sources.base import StageDelay
+
+    health = replace(samples[0].health, delays=(StageDelay("scan", 0.001, 0.002),))
+    path = tmp_path / "dive.mcap"
+    recording = Recording(path, RecorderOptions(pictures=PictureFormat.JPEG))
+    for sample in samples:
+        recording.write(replace(sample, health=health))
+    recording.close()
+    store, found = get_typestore(Stores.EMPTY), {}
+    with Reader(path) as reader:
+        for one in reader.connections:
+            store.register(get_types_from_msg(one.msgdef.data, one.msgtype))
+        for one, _, data in reader.messages():
+            found[one.topic] = store.deserialize_cdr(data, one.msgtype)
+    # Coordinate frames and the scene are sent live only.
+    live_only = {"/aqualvs/scene"}
+    named = re.findall(r'"(/aqualvs/[\w/]+)((?:\.\w+|\[:\])*)"', json.dumps(layout))
+    assert len(named) > 10
+    for topic, place in named:
+        if topic not in live_only:
+            values = [found[topic]]
+            for step in re.findall(r"\w+|\[:\]", place):
+                values = (
+                    [one for several in values for one in several]
+                    if step == "[:]"
+                    else [getattr(value, step) for value in values]
+                )
+            assert values, (topic, place)
+    cloud = layout["configById"]["3D!scene"]["topics"]["/aqualvs/points"]
+    assert cloud["colorField"] in [field.name for field in found["/aqualvs/points"].fields]
 
 
 if __name__ == "__main__":

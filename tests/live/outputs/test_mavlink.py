@@ -3,6 +3,7 @@
 import contextlib
 import math
 import os
+import re
 import socket
 import sys
 from collections.abc import Iterator
@@ -38,6 +39,7 @@ from aqualvs.recording.sample import LiveSample
 from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.scan import ScanPoints
 from live_cases import first_sample
+from repository import ROOT
 
 pytest.importorskip("pymavlink")
 
@@ -98,13 +100,14 @@ def bench() -> Iterator[Bench]:
 
 
 def test_a_posture_becomes_messages(bench: Bench) -> None:
-    distance, values = bench.send(first_sample())
-    posture = measured()
+    # The rig of the bundled dive is exact: its part is put in by hand.
+    rig_part = np.diag([1e-6, 2e-6, 3e-6])
+    posture = replace(measured(), rig_covariance=rig_part)
+    distance, values = bench.send(with_posture(posture))
     assert distance.current_distance == round(100 * posture.range)
     assert distance.time_boot_ms == first_sample().instants.arrived_ns // 1_000_000
     assert distance.signal_quality > 50
     assert tuple(values) == NAMES
-    assert posture.rig_covariance.any()
     sigmas = np.sqrt(np.diag(posture.total_covariance))
     expected = {
         "aq_valid": 1.0,
@@ -155,6 +158,18 @@ def test_names_fit_and_differ() -> None:
     names = NAMES + FILTERED_NAMES
     assert all(0 < len(name.encode("ascii")) <= 10 for name in names)
     assert len(set(names)) == len(names)
+
+
+def test_stations_find_what_the_recipe_names() -> None:
+    """Cockpit's variables have system, component and name in their path."""
+    options = LinkOptions()
+    named = re.findall(
+        r"/mavlink/(\d+)/(\d+)/NAMED_VALUE_FLOAT/(\w+)", (ROOT / "docs/mavlink.md").read_text()
+    )
+    assert {name for _, _, name in named} == {"aq_range", "aq_yaw", "aq_s_range", "aq_valid"}
+    assert {name for _, _, name in named} <= set(NAMES)
+    ids = {(int(system), int(component)) for system, component, _ in named}
+    assert ids == {(options.system, options.component)}
 
 
 def test_the_clock_wraps(bench: Bench) -> None:

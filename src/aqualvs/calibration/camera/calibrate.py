@@ -162,7 +162,7 @@ def pixel_grid(size_px: tuple[int, int]) -> FloatArray:
 # A view is bad if it is this many times noisier than the typical one, and noisier than this.
 _BAD_VIEW, _BAD_NOISE_PX = 5.0, 0.3
 _MOSTLY_WRONG, _BAD_SHARE = 0.6, 1.0 / 3.0
-# One view out of this number is held back; least number of views and of corners in one for that.
+# One view out of this number is held out; least number of views and of corners in one for that.
 _FOLDS, _MIN_VIEWS_TO_VALIDATE, _CAMERA_MIN_POINTS = 4, 8, 12
 _MANY_OUTLIERS = 0.05
 _WEAK_PIXEL_PX = 1.0
@@ -372,13 +372,15 @@ def _result(
 def _cross_validation(bundle: Bundle, solution: Solution[BundleState]) -> float:
     n = len(bundle.views)
     believed = [bundle.views[i].view.where(solution.inliers[i]) for i in range(n)]
-    held = [i for i in range(1, n, _FOLDS) if len(believed[i]) >= _CAMERA_MIN_POINTS]
-    if n < _MIN_VIEWS_TO_VALIDATE or not held:
+    held_out = [i for i in range(1, n, _FOLDS) if len(believed[i]) >= _CAMERA_MIN_POINTS]
+    if n < _MIN_VIEWS_TO_VALIDATE or not held_out:
         return float("nan")
-    rest = [i for i in range(n) if i not in held]
+    rest = [i for i in range(n) if i not in held_out]
     try:
         state = solve(_part(bundle, rest), _state(solution.state, rest)).state
-        errors = np.concatenate(predicted(state, [0] * len(held), [believed[i] for i in held]))
+        errors = np.concatenate(
+            predicted(state, [0] * len(held_out), [believed[i] for i in held_out])
+        )
         return rms_px(errors[np.isfinite(errors).all(axis=1)])
     except CalibrationError:
         return float("nan")
@@ -396,7 +398,7 @@ def _findings(result: CameraCalibration) -> list[str]:
     lines += _shared_errors(result)
     if np.isfinite(result.cross_validation_rms_px):
         lines.append(
-            f"corners of views held back are predicted to {result.cross_validation_rms_px:.3f} px"
+            f"corners of views held out are predicted to {result.cross_validation_rms_px:.3f} px"
         )
     lines += [f"left out, {name}: {why}" for name, why in result.left_out.items()]
     for fit in result.views:

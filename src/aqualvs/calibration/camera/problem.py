@@ -316,9 +316,9 @@ def gain_of_coefficients(bundle: Bundle, solution: Solution[BundleState], n: int
     size = np.sqrt(np.diag(information)[new])
     values, vectors = np.linalg.eigh(left / np.outer(size, size))
     # Combinations whose effect others have already are known to rounding only.
-    told = values > _REDUNDANT
-    along = (vectors.T @ (slope / size))[told]
-    return float(np.sum(along**2 / values[told]))
+    known = values > _REDUNDANT
+    along = (vectors.T @ (slope / size))[known]
+    return float(np.sum(along**2 / values[known]))
 
 
 def _distorts(bundle: Bundle, solution: Solution[BundleState]) -> bool:

@@ -75,7 +75,7 @@ def findings(
     """Return one sentence for each finding."""
     bundle, uncertainty = problem.bundle, result.uncertainty
     seen = observability(bundle, solution, uncertainty, _DOME)
-    lines = [_lens(result), _rotation(problem, result), *_dome(result, seen), *_untold(seen)]
+    lines = [_lens(result), _rotation(problem, result), *_dome(result, seen), *_unobservable(seen)]
     lens = observability(bundle, solution, uncertainty, result.rig.lens.parameter_names)
     lines += _intrinsics(problem, result, lens)
     lines += _entangled(result)
@@ -89,35 +89,35 @@ def findings(
 def _lens(result: DomeCalibration) -> str:
     sigmas = result.uncertainty.sigmas
     position = 1e3 * result.rig.dome_from_cam.translation
-    told = ", ".join(
+    coordinates = ", ".join(
         f"{axis} {value:.3f} ± {1e3 * sigmas[name]:.4f}"
         for axis, value, name in zip("xyz", position, LENS, strict=True)
     )
-    return f"lens position: {told} mm"
+    return f"lens position: {coordinates} mm"
 
 
 def _rotation(problem: DomeProblem, result: DomeCalibration) -> str:
     if not result.rotation_is_solved:
         return (
             "camera rotation: taken from the rig; boards at unknown poses say nothing about it, "
-            "and the lens position is told in axes turned by it"
+            "and the lens position is given in axes turned by it"
         )
     sigma = np.rad2deg([result.uncertainty.sigmas[name] for name in ROTATION])
-    told = ", ".join(f"{axis} {value:.4f}" for axis, value in zip("xyz", sigma, strict=True))
+    sigmas = ", ".join(f"{axis} {value:.4f}" for axis, value in zip("xyz", sigma, strict=True))
     exact = any(shot.kind is PoseKind.EXACT for shot in problem.shots)
     source = "boards at known poses" if exact else "most boards standing square to the dome"
-    return f"camera rotation: from {source}; uncertain by {told} deg about the dome's axes"
+    return f"camera rotation: from {source}; uncertain by {sigmas} deg about the dome's axes"
 
 
 def _dome(result: DomeCalibration, seen: Observability) -> list[str]:
     lines = []
     nothing = seen.undetermined(_DOME, _NOTHING)
     some = [n for n in seen.undetermined(_DOME, _SOMETHING) if n not in nothing]
-    told = [n for n in _DOME if n in seen.shrinkage and n not in nothing and n not in some]
+    rest = [n for n in _DOME if n in seen.shrinkage and n not in nothing and n not in some]
     for names, what in (
         (nothing, "not determined by the pictures, taken as given"),
         (some, "hardly determined by the pictures, mostly taken as given"),
-        (told, "determined by the pictures"),
+        (rest, "determined by the pictures"),
     ):
         if names:
             listed = ", ".join(f"{_WORDS[name]} (± {_size(name, result)})" for name in names)
@@ -143,7 +143,7 @@ def _intrinsics(problem: DomeProblem, result: DomeCalibration, seen: Observabili
             f"intrinsics: refined within what the camera's calibration says of them; their "
             f"uncertainty is {100.0 * share:.0f} % of what it was, that of fx {focal:.2f} px"
         ]
-    if problem.held.names:
+    if problem.considered.names:
         return ["intrinsics: held as they were; their uncertainty is passed on to the result"]
     return [
         "intrinsics: taken as exact, as the rig does not say how well they are known; "
@@ -151,15 +151,15 @@ def _intrinsics(problem: DomeProblem, result: DomeCalibration, seen: Observabili
     ]
 
 
-def _untold(seen: Observability) -> list[str]:
+def _unobservable(seen: Observability) -> list[str]:
     """Name the combinations that the pictures do not determine."""
-    untold = seen.untold()
-    if not untold:
+    unobservable = seen.unobservable()
+    if not unobservable:
         return []
-    told = "; ".join(" with ".join(_WORDS.get(n, n) for n in d.main) for d in untold)
+    names = "; ".join(" with ".join(_WORDS.get(n, n) for n in d.main) for d in unobservable)
     return [
         f"of the {len(seen.directions)} combinations of the dome's numbers the pictures tell "
-        f"{len(seen.directions) - len(untold)}; they tell nothing of: {told}"
+        f"{len(seen.directions) - len(unobservable)}; they tell nothing of: {names}"
     ]
 
 
@@ -206,17 +206,17 @@ def _against_priors(problem: DomeProblem, solution: Solution[BundleState]) -> li
     ]
 
 
-def _cross_validation(held: CrossValidation | None) -> list[str]:
-    if held is None:
+def _cross_validation(found: CrossValidation | None) -> list[str]:
+    if found is None:
         return []
-    told = (
-        f"{held.n_points} corners of {held.n_views} views, each held back once, are predicted to "
-        f"{held.dome_rms_px:.3f} px with the dome, to {held.bare_rms_px:.3f} px with a bare lens; "
-        f"the dome is better in {held.n_dome_better} of the views"
+    text = (
+        f"{found.n_points} corners of {found.n_views} views, each held out once, are predicted to "
+        f"{found.dome_rms_px:.3f} px with the dome, to {found.bare_rms_px:.3f} px with a bare "
+        f"lens; the dome is better in {found.n_dome_better} of the views"
     )
-    if held.dome_is_better:
-        return [f"{told}: the dome model is needed"]
-    return [f"{told}: the pictures do not show that there is a dome"]
+    if found.dome_is_better:
+        return [f"{text}: the dome model is needed"]
+    return [f"{text}: the pictures do not show that there is a dome"]
 
 
 # A solve with smaller residuals has found the minimum; one with larger ones may be in another.
@@ -265,7 +265,7 @@ def dome(
     problem, solution = _without_bad_views(problem, solution)
     problem, solution = _without_wrong_distances(problem, solution, sets)
     problem, solution = with_board_tilt_as_found(problem, solution, options.tilt_sigma)
-    names, covariance = consider_covariance(problem.bundle, solution, problem.held)
+    names, covariance = consider_covariance(problem.bundle, solution, problem.considered)
     n_solved = len(solution.covariance)
     doubts = check_shared_errors(problem, solution, covariance[:n_solved, :n_solved])
     doubts += check_media(problem, solution, sets)
@@ -328,9 +328,9 @@ def _without_wrong_distances(
 ) -> tuple[DomeProblem, Solution[BundleState]]:
     """Drop given distances that the pictures contradict, if they are few."""
     wrong = _wrong_distances(problem, solution)
-    if wrong and problem.held.names:
-        # Errors of held numbers bias all distances; distances must not be rejected for that.
-        free = problem.with_held_free()
+    if wrong and problem.considered.names:
+        # Errors of considered numbers bias all distances; distances must not be rejected for that.
+        free = problem.with_considered_free()
         wrong = _wrong_distances(free, solve(free.bundle, solution.state))
     if not wrong:
         return problem, solution
@@ -376,8 +376,8 @@ def _result(
     covariance: FloatArray,
 ) -> DomeCalibration:
     bundle, state = problem.bundle, solution.state
-    n_free, n_held = len(bundle.free), len(problem.held.names)
-    columns = [*range(n_free), *range(len(covariance) - n_held, len(covariance))]
+    n_free, n_considered = len(bundle.free), len(problem.considered.names)
+    columns = [*range(n_free), *range(len(covariance) - n_considered, len(covariance))]
     rig = state.rig.in_water(bundle.start.rig.n_water)
     if len(bundle.free_media) == 1:
         # The one medium that was solved for is the water that the rig will be used in.

@@ -80,9 +80,9 @@ def check_media(
     for medium, one in enumerate(sets):
         if _suspicion(problem, solution, medium, one) is _Suspicion.NONE:
             continue
-        # Errors of held numbers and of a rail's zero bias the solution; they must not be attributed
-        # to the medium.
-        bare = problem.with_held_free().without_distances(problem.measured_views)
+        # Errors of considered numbers and of a rail's zero bias the solution; they must not be
+        # attributed to the medium.
+        bare = problem.with_considered_free().without_distances(problem.measured_views)
         own = solve(bare.bundle, solution.state)
         suspicion = _suspicion(bare, own, medium, one)
         if suspicion is _Suspicion.OTHER:
@@ -267,7 +267,7 @@ def check_shared_errors(
     solution : Solution
         Of it.
     covariance : array, shape (P, P)
-        Of the solved numbers, with the uncertainty of held ones propagated.
+        Of the solved numbers, with the uncertainty of considered ones propagated.
 
     Returns
     -------
@@ -288,21 +288,21 @@ def check_shared_errors(
     if max(offset.sigmas, scale.sigmas) < _CHECK_SURE:
         return []
     if offset.sigmas >= scale.sigmas:
-        told = (
+        text = (
             f"all given distances are {1e3 * offset.value:+.2f} ± {1e3 * offset.sigma:.2f} mm off "
             "together; they count from the dome's centre along its y axis, not from its front or "
             "from the lens"
         )
         fatal = abs(offset.value) > _MAX_OFFSET
     else:
-        told = (
+        text = (
             f"all given distances are {100.0 * scale.value:+.2f} ± {100.0 * scale.sigma:.2f} % off "
             "together, measured in the board's squares; measure the squares, and check the medium"
         )
         fatal = abs(scale.value) > _MAX_SCALE
     if fatal:
-        raise CalibrationError(told)
-    return [told]
+        raise CalibrationError(text)
+    return [text]
 
 
 def distance_blocks(problem: DomeProblem, solution: Solution[BundleState]) -> dict[int, Block]:
@@ -461,7 +461,7 @@ def check_solution(
     solution : Solution
         Of it.
     uncertainty : RigUncertainty
-        Of the solved numbers, with the uncertainty of held ones propagated.
+        Of the solved numbers, with the uncertainty of considered ones propagated.
 
     Raises
     ------

@@ -26,7 +26,7 @@ def compare_with_bare_lens(
 ) -> CrossValidation | None:
     """Solve both models from three views in four and predict the fourth; four times.
 
-    The pose of a view held back is found from half of its corners; the other half is predicted.
+    The pose of a view held out is found from half of its corners; the other half is predicted.
     Outliers of the whole solve and corners that either model cannot see are left out for both.
 
     Returns
@@ -44,10 +44,10 @@ def compare_with_bare_lens(
         return None
     pairs: list[tuple[FloatArray, FloatArray]] = []
     for part in range(_PARTS):
-        held = usable[part::_PARTS]
-        rest = [i for i in range(n) if i not in held]
-        media = [problem.shots[i].i_set for i in held]
-        views = [believed[i] for i in held]
+        held_out = usable[part::_PARTS]
+        rest = [i for i in range(n) if i not in held_out]
+        media = [problem.shots[i].i_set for i in held_out]
+        views = [believed[i] for i in held_out]
         try:
             with_dome = predicted(_dome_state(problem, solution, rest), media, views)
             bare = predicted(_bare_state(problem, solution, rest), media, views)

@@ -120,7 +120,7 @@ class DomeOptions:
         Whether intrinsics are solved too, with the camera's calibration as their prior. If not,
         they are held, and their uncertainty is propagated to the result.
     check_cross_validation : bool
-        Whether to compare the dome with a bare lens on views held back.
+        Whether to compare the dome with a bare lens on views held out.
     """
 
     inner_radius_sigma: float = 1e-4
@@ -201,7 +201,7 @@ class DomeProblem:
     bundle : Bundle
     shots : tuple of Shot
         One for each of the bundle's views.
-    held : RigUncertainty
+    considered : RigUncertainty
         Uncertainty of numbers that are not solved for.
     left_out : dict
         Labels of views that could not be used, with the reason.
@@ -209,7 +209,7 @@ class DomeProblem:
 
     bundle: Bundle
     shots: tuple[Shot, ...]
-    held: RigUncertainty
+    considered: RigUncertainty
     left_out: dict[str, str]
 
     @property
@@ -247,14 +247,14 @@ class DomeProblem:
             shots=tuple(self.shots[i] for i in keep),
         )
 
-    def with_held_free(self) -> "DomeProblem":
-        """Return the problem with the held numbers solved for, with priors."""
+    def with_considered_free(self) -> "DomeProblem":
+        """Return the problem with the considered numbers solved for, with priors."""
         bundle = replace(
             self.bundle,
-            free=(*self.bundle.free, *self.held.names),
-            priors=combined(self.bundle.priors, self.held),
+            free=(*self.bundle.free, *self.considered.names),
+            priors=combined(self.bundle.priors, self.considered),
         )
-        return replace(self, bundle=bundle, held=RigUncertainty.none())
+        return replace(self, bundle=bundle, considered=RigUncertainty.none())
 
     def without_distances(self, wrong: Sequence[int]) -> "DomeProblem":
         """Return the problem without some of the given distances."""
@@ -320,7 +320,7 @@ def dome_problem(
     if boards and not exact:
         rig, poses = turned_square(rig, poses, square, boards, options.tilt_sigma)
     solves_rotation = bool(boards) or exact
-    priors, held = _priors(rig, known, options, solves_rotation)
+    priors, considered = _priors(rig, known, options, solves_rotation)
     rotation = tuple(name for name in ROTATION if solves_rotation or name in priors.names)
     free = (*LENS, *rotation, *(name for name in priors.names if name not in ROTATION))
     views = tuple(
@@ -336,7 +336,7 @@ def dome_problem(
     media = np.array([one.n_medium for one in sets], np.float64)
     sigma = np.array([one.sigma_medium for one in sets], np.float64)
     bundle = Bundle(views, free, BundleState(rig, media, tuple(poses)), priors, sigma)
-    return DomeProblem(bundle, tuple(shots), held, left_out)
+    return DomeProblem(bundle, tuple(shots), considered, left_out)
 
 
 def _started(rig: Rig, sets: Sequence[BoardSet]) -> tuple[list[Shot], list[SE3], dict[str, str]]:
@@ -391,7 +391,7 @@ def _known(shot: Shot, square: FloatArray, options: DomeOptions) -> tuple[PoseTe
 def _priors(
     rig: Rig, known: RigUncertainty, options: DomeOptions, solves_rotation: bool
 ) -> tuple[RigUncertainty, RigUncertainty]:
-    """Return the prior uncertainty of solved numbers, and the uncertainty of held ones."""
+    """Return the prior uncertainty of solved numbers, and the uncertainty of considered ones."""
     intrinsics = [n for n in rig.lens.parameter_names if known.sigmas.get(n, 0.0) > 0.0]
     rotation = [n for n in ROTATION if known.sigmas.get(n, 0.0) > 0.0 and not solves_rotation]
     tolerances = {
@@ -401,8 +401,8 @@ def _priors(
     }
     dome = RigUncertainty.independent({n: s for n, s in tolerances.items() if s > 0.0})
     moving = known.only(rotation + (intrinsics if options.refine_intrinsics else []))
-    held = known.only([] if options.refine_intrinsics else intrinsics)
-    return combined(dome, moving), held
+    considered = known.only([] if options.refine_intrinsics else intrinsics)
+    return combined(dome, moving), considered
 
 
 # Boards are not set up better than this: 0.9 mm a metre.

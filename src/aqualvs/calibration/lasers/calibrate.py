@@ -253,7 +253,7 @@ def _warnings(
         for figures in lasers
         if figures.rms_px > _BAD_STRIPES_PX
     ]
-    if solved.problem.slack is not None:
+    if solved.problem.board_pose_prior is not None:
         words.append(loose_text(solved))
     if not solved.solution.converged:
         words.append("the solve did not settle; look at the residuals before using this rig")

@@ -283,9 +283,9 @@ def _stripes_misfit(solved: SolvedLasers) -> float:
 
 def loose_text(solved: SolvedLasers) -> str:
     """Return the warning that a board is assumed to lie unevenly on its surface."""
-    slack = solved.state.slack
-    tilt = np.rad2deg(np.sqrt(np.mean(np.sum(slack[:, :2] ** 2, axis=1))))
-    offset = np.sqrt(np.mean(slack[:, 2] ** 2)) * 1e3
+    board_pose = solved.state.board_poses
+    tilt = np.rad2deg(np.sqrt(np.mean(np.sum(board_pose[:, :2] ** 2, axis=1))))
+    offset = np.sqrt(np.mean(board_pose[:, 2] ** 2)) * 1e3
     return (
         "the board is taken to lie unevenly on the surface that the stripes are on, or to bend, "
         f"because stripes and corners contradict each other; by {tilt:.1f} deg and {offset:.1f} mm "
@@ -327,10 +327,10 @@ def _too_few(
         wanted = "on two planes of the box"
     if split.possible:
         lonely += f"; undecided: {_planes(split.possible, views, surfaces)}"
-    told = "give --lasers N, how many there are, or " if split.possible and not expected else ""
+    count = "give --lasers N, how many there are, or " if split.possible and not expected else ""
     return (
         f"{seen} of the lasers can be solved{which}: each must be seen {wanted}{lonely}; "
-        f"{told}{_remedy(surfaces)}"
+        f"{count}{_remedy(surfaces)}"
     )
 
 

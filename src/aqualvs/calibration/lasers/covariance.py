@@ -144,7 +144,7 @@ def joint_uncertainty(
     correlation = _correlation(solution, problem)
     information = _data_information(solution, problem, camera_covariance, correlation)
     covariance = _all_covariance(information, problem, camera_covariance, stripe_bias_px, refined)
-    # Poses, slack and bias are marginalised.
+    # Poses, board poses and bias are marginalised.
     n, mine = camera_covariance.n_columns, np.arange(N_LASER * problem.n_lasers)
     mine += problem.laser_columns(0)[0] + n - problem.bundle.n_shared
     kept = np.concatenate([np.arange(n), mine])
@@ -178,7 +178,7 @@ def _all_covariance(
 
 
 def _correlation(solution: Solution[LaserState], problem: LaserProblem) -> tuple[float, ...]:
-    if problem.slack is not None:
+    if problem.board_pose_prior is not None:
         # The noise of stripes then includes the errors that bins share.
         return (1.0,) * problem.n_lasers
     sequences: list[list[FloatArray]] = [[] for _ in range(problem.n_lasers)]
@@ -203,7 +203,7 @@ def _data_information(
     camera_covariance: CameraCovariance,
     correlation: Sequence[float],
 ) -> FloatArray:
-    """Return the information of stripes, corners, slack: uncertain numbers first, biases last."""
+    """Return the information of all data: uncertain numbers first, biases last."""
     bundle = replace(
         problem.bundle,
         free=camera_covariance.names,
@@ -213,11 +213,11 @@ def _data_information(
     full = replace(problem, bundle=bundle)
     blocks = full.blocks(solution.state)
     n_data = len(problem.groups) + len(bundle.views)
-    n_slack = 0 if problem.slack is None else len(bundle.views)
+    n_board_pose = 0 if problem.board_pose_prior is None else len(bundle.views)
 
     def of_interest(n_blocks: int) -> list[int]:
         # The priors of the camera, different in the two problems, are in between.
-        return [*range(n_data), *range(n_blocks - n_slack, n_blocks)]
+        return [*range(n_data), *range(n_blocks - n_board_pose, n_blocks)]
 
     then = of_interest(len(solution.blocks))
     scales = [solution.block_scales[i] for i in then]
@@ -243,16 +243,18 @@ def _with_bias(block: Block, group: StripeGroup, columns: IntArray) -> Block:
     )
 
 
-def _consider_covariance(information: FloatArray, held: IntArray, prior: FloatArray) -> FloatArray:
+def _consider_covariance(
+    information: FloatArray, considered: IntArray, prior: FloatArray
+) -> FloatArray:
     """Return the covariance of all numbers if some were held at values of covariance `prior`."""
-    solved = np.setdiff1d(np.arange(len(information)), held)
+    solved = np.setdiff1d(np.arange(len(information)), considered)
     noise = inverse(information[np.ix_(solved, solved)])
-    by_held = -noise @ information[np.ix_(solved, held)]
+    by_considered = -noise @ information[np.ix_(solved, considered)]
     covariance = np.empty_like(information)
-    covariance[np.ix_(held, held)] = prior
-    covariance[np.ix_(solved, held)] = by_held @ prior
-    covariance[np.ix_(held, solved)] = (by_held @ prior).T
-    covariance[np.ix_(solved, solved)] = noise + by_held @ prior @ by_held.T
+    covariance[np.ix_(considered, considered)] = prior
+    covariance[np.ix_(solved, considered)] = by_considered @ prior
+    covariance[np.ix_(considered, solved)] = (by_considered @ prior).T
+    covariance[np.ix_(solved, solved)] = noise + by_considered @ prior @ by_considered.T
     return covariance
 
 

@@ -27,8 +27,8 @@ from aqualvs.optics.rig import LASER_PARAMETERS, tangent_basis
 from aqualvs.optics.sheet import Sheet
 
 N_LASER = len(LASER_PARAMETERS)
-N_SLACK = 3
-SLACK = "slack"
+N_BOARD_POSE = 3
+BOARD_POSES = "board poses"
 """Group of the priors on a board's pose on its surface."""
 
 
@@ -38,7 +38,7 @@ def stripes_group(i_laser: int) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Slack:
+class BoardPosePrior:
     """Standard deviations of a board's pose on the surface of the stripes.
 
     Attributes
@@ -54,7 +54,7 @@ class Slack:
 
     @property
     def sigmas(self) -> FloatArray:
-        """Standard deviations of a view's slack, shape (3,)."""
+        """Standard deviations of a board's pose, shape (3,)."""
         return np.array([self.tilt, self.tilt, self.offset])
 
 
@@ -68,14 +68,14 @@ class LaserState:
         Camera, medium and poses.
     sheets : tuple of Sheet
         Sheet of every laser.
-    slack : array, shape (V, 3)
+    board_poses : array, shape (V, 3)
         Difference between the surface of the stripes and the target's own in every view: two
         tilts about the target's middle (radians), and an offset away from the camera (metres).
     """
 
     bundle: BundleState
     sheets: tuple[Sheet, ...]
-    slack: FloatArray
+    board_poses: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,8 +93,8 @@ class _Distances:
 class LaserProblem:
     """The joint problem of `calibrate lasers`, see `least_squares.solve`.
 
-    Columns: those of `bundle`, then `LASER_PARAMETERS` of every laser, then, with slack, three for
-    every view.
+    Columns: those of `bundle`, then `LASER_PARAMETERS` of every laser, then, with a
+    prior on the boards' poses, three for every view.
 
     Attributes
     ----------
@@ -105,7 +105,7 @@ class LaserProblem:
     groups : tuple of StripeGroup
         Stripes; their residuals come before the corners'.
     n_lasers : int
-    slack : Slack or None
+    board_pose_prior : BoardPosePrior or None
         Uncertainty of the target's pose on the surface; None if the target is the surface.
     """
 
@@ -113,28 +113,28 @@ class LaserProblem:
     surfaces: TargetSurfaces
     groups: tuple[StripeGroup, ...]
     n_lasers: int
-    slack: Slack | None = None
+    board_pose_prior: BoardPosePrior | None = None
 
     @property
     def n_parameters(self) -> int:
         """Length of a step."""
-        n_slack = 0 if self.slack is None else N_SLACK * len(self.bundle.views)
-        return self.bundle.n_parameters + N_LASER * self.n_lasers + n_slack
+        n_board_pose = 0 if self.board_pose_prior is None else N_BOARD_POSE * len(self.bundle.views)
+        return self.bundle.n_parameters + N_LASER * self.n_lasers + n_board_pose
 
     def laser_columns(self, i_laser: int) -> IntArray:
         """Return the columns of a laser."""
         first = self.bundle.n_parameters + N_LASER * i_laser
         return np.arange(first, first + N_LASER)
 
-    def slack_columns(self, i_view: int) -> IntArray:
-        """Return the columns of a view's slack; none without slack."""
-        if self.slack is None:
+    def board_pose_columns(self, i_view: int) -> IntArray:
+        """Return the columns of a view's board pose; none without a prior."""
+        if self.board_pose_prior is None:
             return np.zeros(0, np.int64)
-        first = self.bundle.n_parameters + N_LASER * self.n_lasers + N_SLACK * i_view
-        return np.arange(first, first + N_SLACK)
+        first = self.bundle.n_parameters + N_LASER * self.n_lasers + N_BOARD_POSE * i_view
+        return np.arange(first, first + N_BOARD_POSE)
 
     def blocks(self, state: LaserState) -> list[Block]:
-        """Return the residuals of all stripes, then those of the bundle, then of slack."""
+        """Return the residuals of all stripes, then those of the bundle, then the board poses'."""
         camera = state.bundle.camera(0)
         seen = self._seen(state, camera)
         lit = self._lit(state, [points for points, _ in seen])
@@ -143,18 +143,18 @@ class LaserProblem:
             for group, (_, moves), distances in zip(self.groups, seen, lit, strict=True)
         ]
         blocks += self.bundle.blocks(state.bundle)
-        if self.slack is not None:
-            sigma = self.slack.sigmas
+        if self.board_pose_prior is not None:
+            sigma = self.board_pose_prior.sigmas
             blocks += [
                 Block(
-                    SLACK,
-                    self.slack_columns(i),
+                    BOARD_POSES,
+                    self.board_pose_columns(i),
                     (row / sigma)[None],
                     np.diag(1.0 / sigma)[None],
                     RobustLoss.SQUARE,
                     scaled=False,
                 )
-                for i, row in enumerate(state.slack)
+                for i, row in enumerate(state.board_poses)
             ]
         return blocks
 
@@ -168,19 +168,19 @@ class LaserProblem:
             moves[:N_LASER] = step[self.laser_columns(i)]
             moved = replace(sheet, n_air=bundle.rig.n_air, n_water=float(bundle.media[0]))
             sheets.append(moved.moved_by(moves))
-        slack = state.slack
-        if self.slack is not None:
-            slack = slack + step[-slack.size :].reshape(slack.shape)
-        return LaserState(bundle, tuple(sheets), slack)
+        board_pose = state.board_poses
+        if self.board_pose_prior is not None:
+            board_pose = board_pose + step[-board_pose.size :].reshape(board_pose.shape)
+        return LaserState(bundle, tuple(sheets), board_pose)
 
     def surface_planes(self, state: LaserState, i_view: int) -> list[Plane]:
         """Return the surfaces of the stripes in a view, in `dome`."""
-        pose, slack = state.bundle.poses[i_view], state.slack[i_view]
+        pose, board_pose = state.bundle.poses[i_view], state.board_poses[i_view]
         planes = [self.surfaces.placed(i, pose) for i in range(len(self.surfaces.planes))]
-        if self.slack is None:
+        if self.board_pose_prior is None:
             return planes
         middle = pose.apply(self.bundle.views[i_view].view.points.mean(axis=0))
-        return [_slackened(plane, self._tangents(pose), middle, slack) for plane in planes]
+        return [_displaced(plane, self._tangents(pose), middle, board_pose) for plane in planes]
 
     def _tangents(self, pose: SE3) -> FloatArray:
         """Return the axes (2, 3) of the tilts in `dome`, fixed to the target."""
@@ -239,7 +239,7 @@ class LaserProblem:
         columns = [
             np.arange(bundle.n_shared),
             bundle.pose_columns(group.view),
-            self.slack_columns(group.view),
+            self.board_pose_columns(group.view),
             self.laser_columns(group.laser),
         ]
         unit = group.gain * group.sigma_px
@@ -248,8 +248,8 @@ class LaserProblem:
             np.concatenate(columns),
             (lit.distance / unit)[:, None],
             (slopes / unit[:, None])[:, None, :],
-            # With slack, residuals do not determine the noise of stripes.
-            scaled=self.slack is None,
+            # With free board poses, residuals do not determine the noise of stripes.
+            scaled=self.board_pose_prior is None,
         )
 
     def _moves(
@@ -259,8 +259,8 @@ class LaserProblem:
         bundle, view = self.bundle, self.bundle.views[i_view]
         n_free, n_shared = len(bundle.free), bundle.n_shared
         n_pose = 0 if view.fixed else 6
-        n_slack = len(self.slack_columns(i_view))
-        right = np.zeros((len(points), 3, n_shared + n_pose + n_slack))
+        n_board_pose = len(self.board_pose_columns(i_view))
+        right = np.zeros((len(points), 3, n_shared + n_pose + n_board_pose))
         if n_shared:
             _, _, by_point, by_number = camera.project_with_parameter_jacobian(points)
             names = parameter_names(camera)
@@ -274,9 +274,9 @@ class LaserProblem:
             middle = pose.apply(view.view.points.mean(axis=0))
             by_pose = point_by_pose(points, middle)
             right[:, 2, n_shared : n_shared + n_pose] = np.einsum("ni,nic->nc", normals, by_pose)
-        if n_slack:
+        if n_board_pose:
             offsets = points - pose.apply(view.view.points.mean(axis=0))
-            right[:, 2, -N_SLACK:-1] = -offsets @ self._tangents(pose).T
+            right[:, 2, -N_BOARD_POSE:-1] = -offsets @ self._tangents(pose).T
             right[:, 2, -1] = 1.0
         return solve_on_surface(by_point, normals, right)
 
@@ -287,14 +287,16 @@ def _rows(groups: Sequence[StripeGroup]) -> list[slice]:
     return [slice(a, b) for a, b in pairwise(ends)]
 
 
-def _slackened(plane: Plane, tangents: FloatArray, middle: FloatArray, slack: FloatArray) -> Plane:
+def _displaced(
+    plane: Plane, tangents: FloatArray, middle: FloatArray, board_pose: FloatArray
+) -> Plane:
     """Return the plane tilted about the foot of `middle`, and moved along its normal.
 
-    The normal is not normalised, so that slack enters linearly.
+    The normal is not normalised, so that the board's pose enters linearly.
     """
     foot = middle - float(plane.signed_distance(middle)) * plane.normal
-    normal = plane.normal + slack[:2] @ tangents
-    return Plane(normal, float(normal @ foot) + float(slack[2]))
+    normal = plane.normal + board_pose[:2] @ tangents
+    return Plane(normal, float(normal @ foot) + float(board_pose[2]))
 
 
 def distances_of(problem: LaserProblem, state: LaserState, group: StripeGroup) -> FloatArray:

@@ -14,7 +14,12 @@ import numpy as np
 from aqualvs.calibration.lasers.checks import contradicts, like, typical_corner_error_px
 from aqualvs.calibration.lasers.covariance import CameraCovariance
 from aqualvs.calibration.lasers.laser_assignment import BENT_TOLERANCE_PX, TOLERANCE_PX, assigned
-from aqualvs.calibration.lasers.problem import N_SLACK, LaserProblem, LaserState, Slack
+from aqualvs.calibration.lasers.problem import (
+    N_BOARD_POSE,
+    BoardPosePrior,
+    LaserProblem,
+    LaserState,
+)
 from aqualvs.calibration.lasers.report import SolvedLasers
 from aqualvs.calibration.lasers.stripes_on_planes import (
     TargetSurfaces,
@@ -144,7 +149,7 @@ def _fit(solved: SolvedLasers, i_laser: int) -> _Fit:
 
 
 # Tilt and offset of a board of paper or foam that is fixed to a wall by hand.
-_LOOSE = Slack(float(np.deg2rad(1.0)), 2e-3)
+_LOOSE = BoardPosePrior(float(np.deg2rad(1.0)), 2e-3)
 # Least number of a laser's points in a view.
 _MIN_POINTS = 5
 
@@ -162,7 +167,7 @@ class InitialGuess:
     views : tuple of PlacedView
     camera_covariance : CameraCovariance or None
         Numbers that are refined too; None if the camera is held.
-    slack : Slack or None
+    board_pose_prior : BoardPosePrior or None
         Uncertainty of a board's pose on its surface; None if it is the surface.
     shared_error_px : float
         Error that shifts or turns a whole stripe in its picture.
@@ -172,7 +177,7 @@ class InitialGuess:
     surfaces: TargetSurfaces
     views: tuple[PlacedView, ...]
     camera_covariance: CameraCovariance | None
-    slack: Slack | None = None
+    board_pose_prior: BoardPosePrior | None = None
     shared_error_px: float = 0.0
 
     def planes(self, view: PlacedView) -> list[Plane]:
@@ -230,7 +235,7 @@ def solve_lasers(
     first = _solve_from(start, start_sheets(start.rig, lasers, bent=False), laser_of, names)
     if len(start.surfaces.planes) == 1 and (contradicts(first) if loose is None else loose):
         error = typical_corner_error_px(start.views)
-        again = replace(start, slack=_LOOSE, shared_error_px=error)
+        again = replace(start, board_pose_prior=_LOOSE, shared_error_px=error)
     else:
         again, laser_of = _sorted_again(start, first, laser_of, tolerance_px(lasers))
     flat = _solve_from(again, first.state.sheets, laser_of, names)
@@ -278,9 +283,11 @@ def _solve_from(
                 group = binned(i_view, i_laser, stripes, view.placed.surface[members])
                 group = with_shared_error(group, start.shared_error_px)
                 groups.append(with_gain(group, camera, planes, sheet))
-    problem = LaserProblem(start.bundle(), start.surfaces, tuple(groups), len(sheets), start.slack)
-    slack = np.zeros((len(start.views), N_SLACK))
-    state = LaserState(start.state(), sheets, slack)
+    problem = LaserProblem(
+        start.bundle(), start.surfaces, tuple(groups), len(sheets), start.board_pose_prior
+    )
+    board_pose = np.zeros((len(start.views), N_BOARD_POSE))
+    state = LaserState(start.state(), sheets, board_pose)
     solution = solve(problem, state, remedy=lambda i: free_text(problem, names, start.views, i))
     return SolvedLasers(problem, solution, start.views)
 

@@ -9,10 +9,9 @@ Zeger 1986, doi:10.1093/biomet/73.1.13), with the bias correction CR2 for views 
 parameters badly; it is shrunk towards a multiple of the corners' (Ledoit & Wolf 2004,
 doi:10.1016/S0047-259X(03)00096-4).
 
-Held parameters (`consider_covariance`): the errors of numbers that were held, though they are not
+Considered parameters (`consider_covariance`): errors of numbers that were held fixed, though not
 known exactly, pass into the numbers that were solved for, through the derivatives of both. This is
-the
-"consider" covariance (Schmidt 1966, doi:10.1016/B978-1-4831-6716-9.50011-4).
+the "consider" covariance (Schmidt 1966, doi:10.1016/B978-1-4831-6716-9.50011-4).
 
 Observability (`observability`): combinations of numbers that the data determined, and those that
 rest on their priors. Degenerate sets of views, such as boards that are all alike or distances in a
@@ -150,7 +149,7 @@ class Observability:
     shrinkage: dict[str, float]
     directions: tuple[Direction, ...]
 
-    def untold(self, limit: float = 0.1) -> list[Direction]:
+    def unobservable(self, limit: float = 0.1) -> list[Direction]:
         """Return the combinations with far less information from the data than from the priors."""
         return [direction for direction in self.directions if direction.gain < limit]
 
@@ -175,7 +174,7 @@ def observability(
     solution : Solution
         Of it.
     uncertainty : RigUncertainty
-        After the solve, with the uncertainty of held numbers propagated.
+        After the solve, with the uncertainty of considered numbers propagated.
     names : sequence of str
         Numbers to judge, with priors independent of those of others; those without a prior are
         skipped.
@@ -210,9 +209,9 @@ def _marginal(information: FloatArray, columns: IntArray) -> FloatArray:
 
 
 def consider_covariance(
-    bundle: Bundle, solution: Solution[BundleState], held: RigUncertainty
+    bundle: Bundle, solution: Solution[BundleState], considered: RigUncertainty
 ) -> tuple[tuple[str, ...], FloatArray]:
-    """Return the joint covariance of solved and held numbers.
+    """Return the joint covariance of solved and considered numbers.
 
     Parameters
     ----------
@@ -220,35 +219,35 @@ def consider_covariance(
         The problem.
     solution : Solution
         Of it.
-    held : RigUncertainty
+    considered : RigUncertainty
         Of numbers that the bundle does not solve for.
 
     Returns
     -------
     names : tuple of str
-        `bundle.free`, then those of `held`.
+        `bundle.free`, then those of `considered`.
     covariance : array, shape (P + H, P + H)
-        In the bundle's columns, then those of `held`.
+        In the bundle's columns, then those of `considered`.
     """
-    if not held.names:
+    if not considered.names:
         return bundle.free, solution.covariance.copy()
-    cross = _cross_information(bundle, solution, held.names)
+    cross = _cross_information(bundle, solution, considered.names)
     gain = -solution.covariance @ cross
-    passed_on = gain @ held.covariance
+    passed_on = gain @ considered.covariance
     joint = np.block(
         [
             [solution.covariance + passed_on @ gain.T, passed_on],
-            [passed_on.T, held.covariance],
+            [passed_on.T, considered.covariance],
         ]
     )
-    return (*bundle.free, *held.names), joint
+    return (*bundle.free, *considered.names), joint
 
 
 def _cross_information(
-    bundle: Bundle, solution: Solution[BundleState], held: tuple[str, ...]
+    bundle: Bundle, solution: Solution[BundleState], considered: tuple[str, ...]
 ) -> FloatArray:
-    """Return the cross information of the data on solved and held numbers, shape (P, H)."""
-    wider = replace(bundle, free=(*bundle.free, *held))
+    """Return the cross information of the data on solved and considered numbers, shape (P, H)."""
+    wider = replace(bundle, free=(*bundle.free, *considered))
     kept = [i for i, b in enumerate(solution.blocks) if b.group != PRIORS]
     # Priors stand at the end, so both problems begin with the same blocks.
     blocks = wider.blocks(solution.state)[: len(kept)]
@@ -258,7 +257,7 @@ def _cross_information(
         [solution.inliers[i] for i in kept],
         [solution.block_scales[i] for i in kept],
     ).information
-    n, m = len(bundle.free), len(held)
+    n, m = len(bundle.free), len(considered)
     solved = np.r_[0:n, n + m : wider.n_parameters]
     cross: FloatArray = information[np.ix_(solved, np.arange(n, n + m))]
     return cross

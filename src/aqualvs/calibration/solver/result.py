@@ -67,7 +67,7 @@ class CrossValidation:
     Attributes
     ----------
     dome_px, bare_px : array, shape (V,)
-        For every view held back, the root mean square distance of its predicted corners with the
+        For every view held out, the root mean square distance of its predicted corners with the
         dome, and with a bare lens of free pose.
     n_by_view : int array, shape (V,)
         Numbers of corners that both predicted.
@@ -79,7 +79,7 @@ class CrossValidation:
 
     @property
     def n_views(self) -> int:
-        """Number of views held back."""
+        """Number of views held out."""
         return len(self.n_by_view)
 
     @property
@@ -129,7 +129,7 @@ class DomeCalibration:
     rig : Rig
         With lens, rotation, dome and intrinsics as solved; everything else unchanged.
     uncertainty : RigUncertainty
-        Joint covariance of all solved and held numbers, scaled by the residuals.
+        Joint covariance of all solved and considered numbers, scaled by the residuals.
     media : tuple of SolvedMedium
         One for each set.
     views : tuple of ViewFit

@@ -23,6 +23,7 @@ from aqualvs.calibration.targets.targets import (
     aruco_dictionary,
     dictionary_id,
 )
+from aqualvs.calibration_formats import refuse_foreign
 from aqualvs.errors import CalibrationError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.planes import Plane
@@ -43,7 +44,9 @@ def read_mapping(path: Path, what: str) -> dict[Any, Any]:
     CalibrationError
         One line, if the file cannot be read or does not hold keys and values.
     """
-    text = _FREE_TEXT.sub(_quoted, read_text(path, what, CalibrationError))
+    raw = read_text(path, what, CalibrationError)
+    refuse_foreign(raw, path, what, CalibrationError)
+    text = _FREE_TEXT.sub(_quoted, raw)
     content = parse_yaml(text, str(path), CalibrationError)
     if not isinstance(content, dict):
         raise CalibrationError(f"{path}: holds no keys; give the path of {what}")

@@ -88,7 +88,10 @@ class RecordButton(Protocol):
         """End it; does nothing where there is none."""
 
     def to_dict(self) -> Mapping[str, Any]:
-        """Return `on` (bool) and `words` (a file's name, or why it does not work)."""
+        """Return `on` (bool) and `words` (a file's name, or why it does not work).
+
+        Also, as far as known, `seconds` of the recording, `free_bytes` of the disk and `left_s`.
+        """
 
 
 class NoRecorder:

@@ -4,14 +4,18 @@ The camera's picture is reduced for the page (`page_picture`), so that it is sma
 make.
 """
 
+import contextlib
+import math
+import shutil
 import time
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
-from aqualvs.control.vehicle import SetpointHolder
+from aqualvs.control.vehicle import SetpointHolder, VehicleState
 from aqualvs.errors import OptionError
 from aqualvs.live.dashboard.access import Controls, NoRecorder, make_access, token_fault
 from aqualvs.live.dashboard.server import DashboardServer, page_state
@@ -62,14 +66,21 @@ class Dashboard:
     server : DashboardServer
         Owned from here on.
     controls : Controls
+    vehicle : callable or None
+        Returns what the autopilot tells of depth and heading.
     """
 
     name = "dashboard"
     inline = False
     keeps_all = False
 
-    def __init__(self, server: DashboardServer, controls: Controls) -> None:
-        self._server, self._controls = server, controls
+    def __init__(
+        self,
+        server: DashboardServer,
+        controls: Controls,
+        vehicle: Callable[[], VehicleState | None] = lambda: None,
+    ) -> None:
+        self._server, self._controls, self._vehicle = server, controls, vehicle
         self._state_s = self._picture_s = 0.0
 
     def send(self, sample: LiveSample) -> None:
@@ -84,7 +95,7 @@ class Dashboard:
             picture = sample.frame.index.to_bytes(4, "big") + page_picture(sample.frame)
         recording = self._controls.recorder.to_dict()
         setpoint = self._controls.setpoint.setpoint
-        self._server.publish(page_state(sample, setpoint, recording), picture)
+        self._server.publish(page_state(sample, setpoint, recording, self._vehicle()), picture)
 
     def health(self) -> PartHealth:
         """Return how many pages are open."""
@@ -94,6 +105,10 @@ class Dashboard:
     def close(self) -> None:
         """End the server."""
         self._server.close()
+
+
+# Between looks at the size of the recording and at the disk.
+_DISK_EVERY_S = 1.0
 
 
 class SwitchButton:
@@ -106,6 +121,9 @@ class SwitchButton:
 
     def __init__(self, switch: RecorderSwitch) -> None:
         self._switch = switch
+        self._path: Path | None = None
+        self._asked_s = -math.inf
+        self._found: dict[str, Any] = {}
 
     def start(self) -> None:
         """Begin a recording."""
@@ -116,10 +134,22 @@ class SwitchButton:
         self._switch.stop()
 
     def to_dict(self) -> Mapping[str, Any]:
-        """Return whether a recording is on, and its file or its fault."""
-        path, health = self._switch.path, self._switch.health()
+        """Return whether a recording is on, its file or its fault, its time and the disk's room."""
+        now_s, path = time.monotonic(), self._switch.path
+        if path is self._path and now_s - self._asked_s < _DISK_EVERY_S:
+            return self._found
+        self._path, self._asked_s = path, now_s
+        health = self._switch.health()
         words = health.detail if health.state is State.FAULT else path.name if path else ""
-        return {"on": path is not None, "words": words}
+        self._found = {"on": path is not None, "words": words}
+        if path is not None:
+            # A disk that has been taken away is the recorder's fault to tell.
+            with contextlib.suppress(OSError):
+                free, seconds = shutil.disk_usage(path.parent).free, self._switch.seconds
+                rate = path.stat().st_size / seconds if seconds > _DISK_EVERY_S else 0.0
+                left_s = free / rate if rate else None
+                self._found |= {"seconds": seconds, "free_bytes": free, "left_s": left_s}
+        return self._found
 
 
 def start_dashboard(
@@ -130,6 +160,7 @@ def start_dashboard(
     holder: SetpointHolder,
     recorder: RecorderSwitch | None,
     echo: Callable[[str], object],
+    vehicle: Callable[[], VehicleState | None] = lambda: None,
 ) -> Dashboard:
     """Serve the page and print its address; without a recorder, its button refuses.
 
@@ -146,4 +177,4 @@ def start_dashboard(
     server = DashboardServer(host, port, access, rig, controls)
     shown = f"[{host}]" if ":" in host else host
     echo(f"dashboard: http://{shown}:{server.port}/#token={access.token}")
-    return Dashboard(server, controls)
+    return Dashboard(server, controls, vehicle)

@@ -28,7 +28,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from aqualvs import __version__
 from aqualvs.control.time_filter import FilteredPosture
-from aqualvs.control.vehicle import Setpoint
+from aqualvs.control.vehicle import Setpoint, VehicleState
 from aqualvs.errors import AqualvsError, OptionError
 from aqualvs.live.dashboard.access import (
     MAX_MESSAGE_BYTES,
@@ -53,7 +53,12 @@ from aqualvs.text import laser_colour
 _MAX_POINTS = 360
 
 
-def page_state(sample: LiveSample, setpoint: Setpoint | None, recording: Mapping[str, Any]) -> str:
+def page_state(
+    sample: LiveSample,
+    setpoint: Setpoint | None,
+    recording: Mapping[str, Any],
+    vehicle: VehicleState | None = None,
+) -> str:
     """Return the message for the page about one sample.
 
     Its `posture` holds the cells of the frame's row in `posture.csv`, as they are written there.
@@ -71,13 +76,14 @@ def page_state(sample: LiveSample, setpoint: Setpoint | None, recording: Mapping
         if setpoint is None
         else {"range_m": setpoint.range, "yaw_deg": math.degrees(setpoint.yaw)},
         "recording": recording,
+        "vehicle": _vehicle(vehicle),
         "health": _health(sample.health),
         "points": _points(sample.scan.points),
     }
     return json.dumps(_without_nan(found), separators=(",", ":"))
 
 
-def rig_state(rig: Rig, *, may_command: bool) -> str:
+def rig_state(rig: Rig, *, may_command: bool, holds: bool) -> str:
     """Return the first message of a connection: the data that do not change."""
     near, far = rig.working_range
     found = {
@@ -89,6 +95,7 @@ def rig_state(rig: Rig, *, may_command: bool) -> str:
         ],
         "working_range_m": [near, far],
         "may_command": may_command,
+        "holds": holds,
     }
     return json.dumps(found, separators=(",", ":"))
 
@@ -109,6 +116,13 @@ def _points(points: ScanPoints) -> dict[str, Any]:
         "used": points.used[some].astype(int).tolist(),
         "net": (points.label[some] == Label.NET).astype(int).tolist(),
     }
+
+
+def _vehicle(state: VehicleState | None) -> dict[str, float | None] | None:
+    if state is None or (state.depth is None and state.heading is None):
+        return None
+    heading = None if state.heading is None else math.degrees(state.heading) % 360.0
+    return {"depth_m": state.depth, "heading_deg": heading}
 
 
 def _filtered(filtered: FilteredPosture | None) -> dict[str, float] | None:
@@ -245,13 +259,16 @@ class Hub:
             viewer.put(state, picture)
 
 
+_OWN, _JS, _CSS = "aqualvs.live.dashboard", "text/javascript", "text/css"
+# Name to file, type, and package: the colours are those of the reports.
 _ASSETS = {
-    "": ("dashboard.html", "text/html; charset=utf-8"),
-    "dashboard.css": ("dashboard.css", "text/css; charset=utf-8"),
-    "dashboard.js": ("dashboard.js", "text/javascript; charset=utf-8"),
-    "views.js": ("views.js", "text/javascript; charset=utf-8"),
-    "uPlot.iife.min.js": ("uPlot.iife.min.js", "text/javascript; charset=utf-8"),
-    "uPlot.min.css": ("uPlot.min.css", "text/css; charset=utf-8"),
+    "": ("dashboard.html", "text/html", _OWN),
+    "colours.css": ("colours.css", _CSS, "aqualvs.report"),
+    "dashboard.css": ("dashboard.css", _CSS, _OWN),
+    "dashboard.js": ("dashboard.js", _JS, _OWN),
+    "views.js": ("views.js", _JS, _OWN),
+    "uPlot.iife.min.js": ("uPlot.iife.min.js", _JS, _OWN),
+    "uPlot.min.css": ("uPlot.min.css", _CSS, _OWN),
 }
 _HEADERS = {
     "Content-Security-Policy": "default-src 'self'; img-src 'self' blob: data:; "
@@ -381,7 +398,9 @@ class DashboardServer:
             await _refuse(socket, peer, why)
             return None
         self._limits.welcome(_end(socket))
-        await socket.send_text(rig_state(self._rig, may_command=known))
+        await socket.send_text(
+            rig_state(self._rig, may_command=known, holds=self._controls.setpoint.followed)
+        )
         return viewer
 
     async def _is_right(self, socket: WebSocket, token: str) -> bool:
@@ -498,8 +517,10 @@ async def _asset(request: Request) -> Response:
     found = _ASSETS.get(request.path_params["name"])
     if found is None:
         return PlainTextResponse("no such page\n", 404, headers=_HEADERS)
-    folder = importlib.resources.files("aqualvs.live.dashboard") / "assets"
-    return Response((folder / found[0]).read_bytes(), media_type=found[1], headers=_HEADERS)
+    folder = importlib.resources.files(found[2]) / "assets"
+    return Response(
+        (folder / found[0]).read_bytes(), media_type=f"{found[1]}; charset=utf-8", headers=_HEADERS
+    )
 
 
 def _listening(host: str, port: int) -> socket.socket:

@@ -188,7 +188,6 @@ _AUTOPILOT = 1
 _SENDER = MAV_COMP_ID_ONBOARD_COMPUTER
 _ARDUPILOT, _SUBMARINE, _GROUND_STATION = 3, 12, 6
 _ARMED = 128
-_FRESH_S = 1.0
 # Two and a half of ArduSub's heartbeats.
 _BEATS_WITHIN_S = 2.5
 # Sticks used within this time may still be in force when the link is closed.
@@ -200,6 +199,15 @@ _KEEPS_DEPTH: Final = {
     Command.GUIDED: ("GUIDED",),
 }
 _log = logging.getLogger(__name__)
+
+
+def attitude_of(link: MavlinkLink) -> tuple[float | None, float | None, float | None]:
+    """Return an autopilot's roll, pitch and heading (in [0, 2 pi)), in radians; None if unknown."""
+    found = link.latest("ATTITUDE", system=link.system, component=_AUTOPILOT)
+    if found is None or found.age_s > FRESH_S:
+        return None, None, None
+    told = found.message
+    return told.roll, told.pitch, told.yaw % (2.0 * math.pi)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -304,7 +312,7 @@ class ArduSubLink:
             own=(station, _SENDER),
             dead_band=self.options.stick_dead_band,
         )
-        self._depth = DepthChoice(self.link, _FRESH_S)
+        self._depth = DepthChoice(self.link, FRESH_S)
         self._response = StickResponse(self.link)
         self._watch = ParameterWatch(self.link, FOR_STICKS)
         # The autopilot takes ten requests at once.
@@ -326,7 +334,7 @@ class ArduSubLink:
         self._advise(parameters)
         mode, mode_name = self._mode(beat, parameters)
         self._shape(beat)
-        roll, pitch, heading = self._attitude()
+        roll, pitch, heading = attitude_of(self.link)
         return VehicleState(
             heard_s=self._heard_s(beat),
             armed=bool(beat.message.base_mode & _ARMED),
@@ -477,11 +485,3 @@ class ArduSubLink:
         if attitude is not None and beat.age_s < _BEATS_WITHIN_S:
             heard_ns = max(heard_ns, attitude.received_ns)
         return 1e-9 * heard_ns
-
-    def _attitude(self) -> tuple[float | None, float | None, float | None]:
-        """Return roll, pitch and heading (in [0, 2 pi)), in radians."""
-        found = self.link.latest("ATTITUDE", system=self.link.system, component=_AUTOPILOT)
-        if found is None or found.age_s > _FRESH_S:
-            return None, None, None
-        told = found.message
-        return told.roll, told.pitch, told.yaw % (2.0 * math.pi)

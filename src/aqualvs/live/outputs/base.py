@@ -1,7 +1,8 @@
 """Interface of all outputs of a live run."""
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
+from aqualvs.control.vehicle import VehicleState
 from aqualvs.recording.sample import LiveSample
 from aqualvs.sources.base import PartHealth
 
@@ -50,3 +51,11 @@ class Output(Protocol):
 
     def close(self) -> None:
         """Say good-bye and free everything; further calls do nothing."""
+
+
+@runtime_checkable
+class HearsVehicle(Protocol):
+    """Interface of an output that an autopilot answers."""
+
+    def vehicle_state(self) -> VehicleState:
+        """Return what the autopilot tells; returns at once."""

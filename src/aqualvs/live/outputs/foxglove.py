@@ -5,7 +5,6 @@ shows both. In addition there are coordinate frames and a scene for the 3D panel
 laser lines beside the points. Messages that nobody watches are not made.
 """
 
-import math
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -15,11 +14,12 @@ import numpy as np
 
 from aqualvs.errors import OptionError, OutputError
 from aqualvs.geometry.arrays import FloatArray
-from aqualvs.geometry.transforms import rotvec_from_rotation
+from aqualvs.geometry.planes import upright_axes
+from aqualvs.geometry.transforms import quaternion_from_rotation
 from aqualvs.optics.rig import Laser, Rig
 from aqualvs.recording import messages
 from aqualvs.recording.encoding import HEALTH, PICTURE, POINTS, POSTURE, RIG, RecordedTopic, jpeg_of
-from aqualvs.recording.messages import FRAME_ID, RecordClock
+from aqualvs.recording.messages import FRAME_ID, RateLimit, RecordClock
 from aqualvs.recording.sample import LiveSample
 from aqualvs.scanner import ScannerOptions
 from aqualvs.scanning.posture import Posture
@@ -114,24 +114,13 @@ def laser_lines(
     return found
 
 
-def quaternion(rotation: FloatArray) -> tuple[float, float, float, float]:
-    """Return a rotation matrix as x, y, z, w."""
-    turn = rotvec_from_rotation(rotation)
-    angle = float(np.linalg.norm(turn))
-    x, y, z = turn * (0.5 * np.sinc(angle / (2.0 * math.pi)))
-    return float(x), float(y), float(z), math.cos(0.5 * angle)
-
-
 def _plate(posture: Posture) -> "CubePrimitive":
     """Return the target as a thin square about the foot of the perpendicular."""
     from foxglove.messages import Color, CubePrimitive, Vector3
 
     side = _SIDE_SHARE * posture.range
     foot = posture.range * posture.normal_in_dome
-    across = np.cross(posture.normal_in_dome, (0.0, 0.0, 1.0))
-    across /= max(float(np.linalg.norm(across)), 1e-9)
-    up = np.cross(across, posture.normal_in_dome)
-    axes = np.stack([across, posture.normal_in_dome, up], axis=1)
+    axes = upright_axes(posture.normal_in_dome)
     return CubePrimitive(
         pose=_pose(axes, foot), size=Vector3(x=side, y=1e-3, z=side), color=Color(**_rgba(_BLUE))
     )
@@ -193,7 +182,7 @@ def _vector(values: FloatArray) -> "Vector3":
 def _turn(rotation: FloatArray) -> "Quaternion":
     from foxglove.messages import Quaternion
 
-    x, y, z, w = quaternion(rotation)
+    x, y, z, w = quaternion_from_rotation(rotation)
     return Quaternion(x=x, y=y, z=z, w=w)
 
 
@@ -268,8 +257,8 @@ class FoxgloveOutput:
         self._channels = {topic: _channel(foxglove, topic, context) for topic in shown}
         self._transforms = foxglove.channels.FrameTransformsChannel(_TRANSFORMS, context=context)
         self._scene = foxglove.channels.SceneUpdateChannel(_SCENE, context=context)
-        self._picture_due, self._points_due = _Rate(picture_hz), _Rate(points_hz)
-        self._seldom_due = _Rate(_SELDOM_HZ)
+        self._picture_due, self._points_due = RateLimit(picture_hz), RateLimit(points_hz)
+        self._seldom_due = RateLimit(_SELDOM_HZ)
         try:
             self._server = foxglove.start_server(
                 name="aqualvs",
@@ -344,7 +333,7 @@ class FoxgloveOutput:
         topic: RecordedTopic,
         at_ns: int,
         content: Callable[[], bytes],
-        due: "_Rate | None" = None,
+        due: RateLimit | None = None,
     ) -> None:
         """Send a message if its topic has viewers and it is due."""
         channel = self._channels[topic]
@@ -384,22 +373,6 @@ class _Viewers:
             left = self._watched.pop(client.id, 1) - 1
             if left > 0:
                 self._watched[client.id] = left
-
-
-class _Rate:
-    """Rate limit of a message."""
-
-    def __init__(self, hz: float) -> None:
-        # A tenth of a period early rather than a whole frame late.
-        self._every_ns = round(0.9e9 / hz) if hz else None
-        self._from_ns = 0
-
-    def at(self, stamp_ns: int) -> bool:
-        """Return whether the message is due; if so, start the next period."""
-        if self._every_ns is None or stamp_ns < self._from_ns:
-            return False
-        self._from_ns = stamp_ns + self._every_ns
-        return True
 
 
 def _sdk() -> Any:

@@ -4,6 +4,8 @@ import math
 from typing import Any
 
 from aqualvs.control.time_filter import FilteredPosture
+from aqualvs.control.vehicle import VehicleState
+from aqualvs.live.mavlink.ardusub import FRESH_S, DepthChoice, attitude_of
 from aqualvs.live.mavlink.link import LinkOptions, MavlinkLink
 from aqualvs.recording.sample import LiveSample
 from aqualvs.scanning.posture import Posture, Refusal
@@ -65,6 +67,7 @@ class MavlinkOutput:
         self.link = MavlinkLink(link, options) if isinstance(link, str) else link
         self.name = f"mavlink {self.link.url}"
         self._n_dropped = 0
+        self._depth = DepthChoice(self.link, FRESH_S)
         self._distance = _distance_message(self.link.dialect)
         self._values = _value_messages(self.link.dialect, NAMES)
         self._filtered_values = _value_messages(self.link.dialect, FILTERED_NAMES)
@@ -89,6 +92,10 @@ class MavlinkOutput:
         """Return how the link is, and how many samples did not go out as a whole."""
         found = self.link.health()
         return PartHealth(self.name, found.state, found.detail, self._n_dropped)
+
+    def vehicle_state(self) -> VehicleState:
+        """Return depth and heading as far as the autopilot tells them."""
+        return VehicleState(depth=self._depth.read(), heading=attitude_of(self.link)[2])
 
     def close(self) -> None:
         """Close the link if it was made here; further calls do nothing."""

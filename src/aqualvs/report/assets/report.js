@@ -3,7 +3,14 @@
    through `plain`, because Plotly reads a few tags in labels. */
 (function () {
   const data = JSON.parse(document.getElementById("report-data").textContent);
-  const INK = "#1c2a33", GRID = "#e6ebee", BLUE = "#0072B2", BLACK = "#111111";
+  /* The colours of the page, light or dark; those of lasers and labels are the data's. */
+  const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+  const faded = (hex, share) => hex + Math.round(255 * share).toString(16).padStart(2, "0");
+  let INK, GRID, EDGE, PAPER, MEASURED;
+  function pickColours() {
+    [INK, GRID, EDGE, PAPER, MEASURED] =
+      ["--ink", "--line", "--quiet", "--paper", "--accent"].map(css);
+  }
   const PAPER_WIDTH = 690;
   const CONFIG = { displaylogo: false, responsive: true };
   const FLAT = { ...CONFIG, modeBarButtons: [["toImage", "zoom2d", "pan2d", "resetScale2d"]] };
@@ -16,14 +23,14 @@
   const box = (id) => document.getElementById(id);
   const axis = (title, more) => Object.assign(
     { title: { text: title, standoff: 8, font: { size: 13 } }, gridcolor: GRID, zeroline: false, automargin: true,
-      linecolor: "#b8c4ca", ticks: "outside", tickcolor: "#b8c4ca" }, more);
+      linecolor: EDGE, ticks: "outside", tickcolor: EDGE }, more);
   const layout = (more) => Object.assign({
     font: { family: "system-ui, -apple-system, Segoe UI, Roboto, Arial, sans-serif",
             size: 13, color: INK },
-    paper_bgcolor: "#fff", plot_bgcolor: "#fff",
+    paper_bgcolor: PAPER, plot_bgcolor: PAPER,
     margin: { l: 64, r: 14, t: 26, b: 46 },
     legend: { orientation: "h", x: 0, y: 1.01, yanchor: "bottom" },
-    hoverlabel: { bgcolor: "#fff", bordercolor: "#a9bdc7", font: { color: INK } },
+    hoverlabel: { bgcolor: PAPER, bordercolor: EDGE, font: { color: INK } },
   }, more);
 
   function draw(id, traces, shape, config) {
@@ -89,28 +96,28 @@
       const top = 1 - i * 0.345;
       shape[i ? `yaxis${i + 1}` : "yaxis"] = axis(`${strip.name}, ${strip.unit}`,
         { domain: [Math.max(0, top - 0.31), top], range: strip.axis, zeroline: strip.error,
-          zerolinecolor: "#8b9aa3", hoverformat: i ? ".2f" : ".1f" });
+          zerolinecolor: EDGE, hoverformat: i ? ".2f" : ".1f" });
       if (chart.stretches.length)
         traces.push({ ...shading(chart.stretches, strip.axis), yaxis: y, type: "scatter",
           mode: "lines", fill: "toself", fillcolor: "rgba(90,100,106,0.17)", line: { width: 0 },
           hoverinfo: "skip", name: "no posture", showlegend: i === 0, legendrank: 2000 });
       for (const [key, ink, name] of [["total", 0.13, "±σ, frame and rig"], ["sigma", 0.22, "±σ, frame alone"]])
         traces.push({ ...band(strip, strip[key]), yaxis: y, type: "scatter", mode: "lines", fill: "toself",
-          fillcolor: `rgba(0,114,178,${ink})`, line: { width: 0 }, hoverinfo: "skip",
+          fillcolor: faded(MEASURED, ink), line: { width: 0 }, hoverinfo: "skip",
           name, showlegend: i === 0, legendgroup: `band-${key}` });
       if (strip.truth)
         traces.push({ ...lifted(strip.truth, ["x", "y"]), yaxis: y, type: "scatter", mode: "lines",
-          line: { color: BLACK, width: 1.3, dash: "dash" }, name: "truth", showlegend: i === 0,
+          line: { color: INK, width: 1.3, dash: "dash" }, name: "truth", showlegend: i === 0,
           hovertemplate: `%{y} ${strip.unit}<extra>true ${strip.name}</extra>` });
       const line = lifted(strip, ["x", "y", "sigma", "total", "frame"]);
       const told = (s) => (s === null || s === undefined ? "?" : s.toFixed(i ? 2 : 1));
       traces.push({ x: line.x, y: line.y, yaxis: y, type: "scatter", mode: "lines",
-        line: { color: BLUE, width: strip.x.length > 1000 ? 0.9 : 1.6 }, name: chart.measured, showlegend: i === 0,
+        line: { color: MEASURED, width: strip.x.length > 1000 ? 0.9 : 1.6 }, name: chart.measured, showlegend: i === 0,
         customdata: line.total.map((s, k) => [told(s), told(line.sigma[k]), line.frame[k]]),
         hovertemplate: `%{y} ± %{customdata[0]} ${strip.unit}, its noise ± %{customdata[1]} (frame %{customdata[2]})` +
           `<extra>${strip.name}</extra>` });
       traces.push({ ...single(strip), yaxis: y, type: "scatter", mode: "markers", hoverinfo: "skip",
-        marker: { color: BLUE, size: 3.5 }, showlegend: false });
+        marker: { color: MEASURED, size: 3.5 }, showlegend: false });
     });
     const hints = { x: [], y: [], text: [] }, middle = mean(chart.strips[0].axis);
     for (const gap of chart.stretches)
@@ -143,14 +150,13 @@
     slider.addEventListener("input", () => go(Number(slider.value)));
     box("plane-back").addEventListener("click", () => go(chosen - 1));
     box("plane-next").addEventListener("click", () => go(chosen + 1));
-    plane(chart);
   }
   function plane(chart) {
     const frame = chart.frames[chosen];
     box("plane-words").textContent = frame.words;
     frame.lasers.forEach((points, index) => {
       if (!chart.known[index]) return;
-      const laser = data.lasers[index], limits = chart.axes[index], traces = [];
+      const laser = data.lasers[index], limits = chart.axes, traces = [];
       data.labels.forEach((label, code) => {
         const mine = points.label.flatMap((value, i) => (value === code ? [i] : []));
         traces.push({ x: mine.map((i) => points.x[i]), y: mine.map((i) => points.y[i]),
@@ -161,7 +167,7 @@
       if (points.line && Math.abs(points.line[1]) > 1e-3) {
         const [a, b, c] = points.line;
         traces.unshift({ x: limits.x, y: limits.x.map((x) => (c - a * x) / b), type: "scatter",
-          mode: "lines", line: { color: BLACK, width: 1, dash: "dot" }, hoverinfo: "skip",
+          mode: "lines", line: { color: INK, width: 1, dash: "dot" }, hoverinfo: "skip",
           showlegend: false });
       }
       const shape = layout({ height: 330, margin: { l: 58, r: 10, t: 34, b: 44 },
@@ -203,7 +209,14 @@
       x.push(r * Math.cos(a)); y.push(0); z.push(r * Math.sin(a));
     }
     return { x, y, z, type: "scatter3d", mode: "lines", name: "dome", hoverinfo: "name",
-             line: { color: BLACK, width: 2 } };
+             line: { color: INK, width: 2 } };
+  }
+  /* In the target's frame the dome is before the plane's origin, at one range after the other. */
+  function domePlaces() {
+    const ranges = data.cloud.dome_mm || [];
+    return { x: ranges.map(() => 0), y: ranges.map((r) => -r), z: ranges.map(() => 0), type: "scatter3d",
+             mode: "lines+markers", name: "dome, nearest to farthest", hovertemplate: "range %{customdata} mm",
+             customdata: ranges, marker: { size: 4, color: INK }, line: { color: INK, width: 4 } };
   }
   function cloud(mode) {
     if (!data.cloud || !box("chart-cloud")) return;
@@ -213,16 +226,18 @@
       ...(mode === "frame" ? framePoints(index) : data.cloud.lasers[index]),
       type: "scatter3d", mode: "markers", name: plain(laser.name),
       marker: { size: mode === "frame" ? 2.6 : 1.7, color: laser.colour },
-      hovertemplate: "right %{x:.0f}<br>forward %{y:.0f}<br>up %{z:.0f} mm",
+      hovertemplate: `right %{x:.0f}<br>${mode === "frame" ? "forward" : "beyond the plane"} %{y:.0f}<br>up %{z:.0f} mm`,
     }));
-    traces.push(dome());
-    const of3 = (title) => ({ title: { text: title }, gridcolor: "#d3dbdf", zeroline: false,
-                              backgroundcolor: "#fff", showspikes: false, nticks: 6 });
+    traces.push(mode === "frame" ? dome() : domePlaces());
+    const of3 = (title) => ({ title: { text: title }, gridcolor: GRID, color: INK, zeroline: false,
+                              backgroundcolor: PAPER, showspikes: false, nticks: 6 });
     const shape = layout({ height: 500, margin: { l: 0, r: 0, t: 30, b: 0 },
       legend: { orientation: "h", x: 0, y: 1.0, yanchor: "bottom", itemsizing: "constant" },
-      uirevision: "keep the view",
-      scene: { aspectmode: "data", xaxis: of3("right, mm"), yaxis: of3("forward, mm"),
-               zaxis: of3("up, mm"), camera: { eye: { x: -1.6, y: -1.5, z: 0.95 }, center: { x: 0.1, y: 0.05, z: -0.22 } } } });
+      uirevision: mode,
+      scene: { aspectmode: "data", xaxis: of3("right, mm"), yaxis: of3(mode === "frame" ? "forward, mm" : "beyond the plane, mm"),
+               zaxis: of3("up, mm"), camera: mode === "frame"
+                 ? { eye: { x: -1.6, y: -1.5, z: 0.95 }, center: { x: 0.1, y: 0.05, z: -0.22 } }
+                 : { eye: { x: -0.7, y: -1.7, z: 0.7 }, center: { x: 0, y: 0.1, z: -0.1 } } } });
     if (place.data) Plotly.react(place, traces, shape, SOLID);
     else {
       draw("chart-cloud", traces, shape, SOLID);
@@ -263,7 +278,7 @@
     const shape = (title) => Object.assign(
       layout({ height: 300, hovermode: "x unified", showlegend: false }),
       { xaxis: axis(`time, ${chart.time_unit}`), yaxis: axis(title, { rangemode: "tozero" }) });
-    const spread = [["rms", "rms residual", BLUE], ["sigma", "σ of the range", BLACK]];
+    const spread = [["rms", "rms residual", MEASURED], ["sigma", "σ of the range", INK]];
     draw("chart-counts", counts, shape("target points"), SMALL);
     draw("chart-rms", spread.map(([key, name, color]) => ({ ...lifted(chart[key], ["x", "y"]),
       type: "scatter", mode: "lines", line: { color, width: 1.4 }, name })),
@@ -275,8 +290,8 @@
   function bare() {
     const chart = data.bare;
     if (!chart) return;
-    const styles = [["truth", "truth", BLACK, "dash"], ["bare", "without the dome's refraction", "#D55E00", "solid"],
-                    ["dome", "with it", BLUE, "solid"]];
+    const styles = [["truth", "truth", INK, "dash"], ["bare", "without the dome's refraction", "#D55E00", "solid"],
+                    ["dome", "with it", MEASURED, "solid"]];
     const traces = styles.filter(([key]) => chart[key]).map(([key, name, color, dash]) => ({
       ...lifted(chart[key], ["x", "y"]), type: "scatter", mode: "lines", name,
       line: { color, dash, width: 1.6 } }));
@@ -300,16 +315,47 @@
       Plotly.relayout(place, { width: null, autosize: true,
                                ...(place.id === "chart-posture" ? { height: 640 } : {}) });
   }
-  window.addEventListener("beforeprint", paper);
-  window.addEventListener("afterprint", screen);
+  const dark = matchMedia("(prefers-color-scheme: dark)");
+  window.addEventListener("beforeprint", () => {
+    document.documentElement.dataset.theme = "light";
+    if (dark.matches) drawAll();
+    paper();
+  });
+  window.addEventListener("afterprint", () => {
+    delete document.documentElement.dataset.theme;
+    if (dark.matches) drawAll();
+    screen();
+  });
+  dark.addEventListener("change", () => drawAll());
 
   for (const button of document.querySelectorAll("[data-cloud]"))
     button.addEventListener("click", () => cloud(button.dataset.cloud));
-  strips("chart-posture", data.posture, 640);
-  strips("chart-error", data.error, 520);
-  planes();
-  quality();
-  bare();
-  cloud("dive");
-  document.documentElement.dataset.ready = "true";
+  function drawAll() {
+    pickColours();
+    strips("chart-posture", data.posture, 640);
+    strips("chart-error", data.error, 520);
+    if (data.planes && data.planes.frames.length) plane(data.planes);
+    quality();
+    bare();
+    cloud(cloudMode);
+  }
+  /* The library is a third as large when packed. */
+  async function unpack() {
+    const bytes = Uint8Array.from(atob(box("chart-library").textContent), (c) => c.charCodeAt(0));
+    const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
+    const script = document.createElement("script");
+    script.textContent = await new Response(stream).text();
+    document.head.append(script);
+  }
+  unpack().then(() => {
+    planes();
+    drawAll();
+    document.documentElement.dataset.ready = "true";
+  }).catch((fault) => {
+    const words = document.createElement("p");
+    words.className = "warn";
+    words.textContent = `The charts could not be drawn (${fault.message}); a newer browser may.`;
+    document.querySelector("main").prepend(words);
+    throw fault;
+  });
 })();

@@ -3,12 +3,16 @@
 
 const $ = (id) => document.getElementById(id);
 const strips = {
-  range: new Strip($("strip-range"), "Range", "m", 0.05),
-  yaw: new Strip($("strip-yaw"), "Yaw", "°", 4),
-  pitch: new Strip($("strip-pitch"), "Pitch", "°", 4),
+  range: new Strip($("strip-range"), "Range", "m", 0.05, false),
+  yaw: new Strip($("strip-yaw"), "Yaw", "°", 4, false),
+  pitch: new Strip($("strip-pitch"), "Pitch", "°", 4, true),
 };
 // After so long without news the numbers are old, whatever the last message said.
 const STALE_MS = 600;
+// The nearest point in multiples of the least range of the rig: red, and amber.
+const TOO_NEAR = 1.2, NEAR = 1.5;
+// What is no error to a pilot, in metres and degrees.
+const ON_RANGE = 0.02, ON_YAW = 2;
 let rig = null;
 let state = null;
 let socket = null;
@@ -63,10 +67,11 @@ function greet(message) {
   const names = rig.lasers.map((laser) => {
     const name = document.createElement("b");
     name.textContent = laser.name;
-    name.style.color = laser.colour;
+    name.style.borderColor = laser.colour;
     return name;
   });
   $("plane-names").replaceChildren(...names);
+  $("set-name").textContent = rig.holds ? "Hold" : "Aim at";
   const [near, far] = rig.working_range_m;
   Object.assign($("set-range"), { min: near, max: far, placeholder: `${near}–${far}` });
   for (const element of document.querySelectorAll("#commands button, #commands input")) element.disabled = !rig.may_command;
@@ -98,6 +103,7 @@ async function show(data) {
     const picture = await createImageBitmap(new Blob([new Uint8Array(data, 4)], { type: "image/jpeg" }));
     const canvas = $("video");
     if (canvas.width !== picture.width || canvas.height !== picture.height) Object.assign(canvas, { width: picture.width, height: picture.height });
+    delete $("picture").dataset.empty;
     canvas.getContext("2d").drawImage(picture, 0, 0);
     picture.close();
     if (rig && pointsOf.has(frame)) drawPoints(canvas, pointsOf.get(frame), rig);
@@ -111,7 +117,7 @@ function draw() {
   if (state && rig && (dirty || stale)) {
     dirty = false;
     numbers(stale);
-    health();
+    health(stale);
     commands();
     drawTop($("top"), state, rig);
     drawPlane($("plane"), state, rig);
@@ -128,7 +134,7 @@ function numbers(stale) {
   Object.assign(box.dataset, { frame: posture.frame, range: posture.range_m, yaw: posture.yaw_deg, pitch: posture.pitch_deg, sigma: posture.sigma_range_total_m });
   const put = (id, text, digits, sign) => {
     const value = Number(text);
-    $(id).textContent = valid ? (sign && value >= 0 ? "+" : "") + value.toFixed(digits) : "–";
+    $(id).textContent = valid ? sign ? signed(value) : value.toFixed(digits) : "–";
   };
   put("range", posture.range_m, 3, false);
   put("yaw", posture.yaw_deg, 1, true);
@@ -138,6 +144,7 @@ function numbers(stale) {
   $("sigma-pitch").textContent = valid ? `± ${Number(posture.sigma_pitch_total_deg).toFixed(2)}°` : "";
   const words = stale ? "no news from the system" : state.detail || posture.reason;
   $("reason").textContent = valid ? "" : `No posture: ${words}`;
+  guide(valid, stale);
   const dead = stale || posture.reason === "no_frames" || posture.reason === "frozen";
   document.body.dataset.dead = dead ? "1" : "0";
   $("veil").hidden = !dead;
@@ -148,19 +155,54 @@ function numbers(stale) {
   $("smooth").textContent = smooth ? `Filtered: ${smooth.range_m.toFixed(3)} m, yaw ${smooth.yaw_deg.toFixed(1)}°, pitch ${smooth.pitch_deg.toFixed(1)}°` : "";
 }
 
-function health() {
+/** What to do: how far to go and to turn, from the setpoint or else to stand square. */
+function guide(valid, stale) {
+  const { posture, setpoint, vehicle } = state;
+  const nearest = Number(posture.nearest_m) / rig.working_range_m[0];
+  const level = nearest < TOO_NEAR ? "bad" : nearest < NEAR ? "warn" : "ok";
+  const off = setpoint && Number(posture.range_m) - setpoint.range_m;
+  const way = Math.abs(off) < ON_RANGE ? "✓ on range" : `${off > 0 ? "▲" : "▼"} ${Math.abs(off).toFixed(2)} m too ${off > 0 ? "far" : "near"}`;
+  $("error-range").textContent = !valid ? "" : level !== "ok" ? "Too near: go back" : setpoint ? way : "";
+  const aim = setpoint ? setpoint.yaw_deg : 0;
+  const turn = Number(posture.yaw_deg) - aim;
+  const there = Math.abs(turn) < ON_YAW;
+  const degrees = `${Math.abs(turn).toFixed(Math.abs(turn) < 10 ? 1 : 0)}°`;
+  $("turn").textContent = !valid ? "–" : there ? "✓" : turn > 0 ? `${degrees} ▶` : `◀ ${degrees}`;
+  $("error-yaw").textContent = !valid ? "" : there ? (aim ? "on yaw" : "square to the target") : `turn ${turn > 0 ? "right" : "left"}`;
+  $("aim-yaw").textContent = !valid ? "" : aim ? `for a yaw of ${signed(aim)}°` : there ? "" : "to stand square";
+  $("box-range").dataset.level = valid ? level : "";
+  $("box-turn").dataset.level = valid && there ? "ok" : "";
+  $("vehicle").hidden = !vehicle;
+  if (!vehicle) return;
+  const known = (value, digits) => (stale || value === null ? "–" : value.toFixed(digits));
+  $("depth").textContent = known(vehicle.depth_m, 2);
+  $("heading").textContent = known(vehicle.heading_deg, 0).replace(/^\d+$/, (digits) => digits.padStart(3, "0"));
+}
+
+const signed = (value) => (value < 0 ? "−" : "+") + Math.abs(value).toFixed(1);
+
+function health(stale) {
   const found = state.health;
-  const items = [found.source, ...found.lasers, ...found.outputs].map((part) => {
+  // Without pictures nobody knows how the lasers are; without news, how anything is.
+  const blind = document.body.dataset.dead === "1";
+  const chip = (part, name, unknown) => {
     const item = document.createElement("li");
-    item.dataset.state = part.state;
-    item.title = `${part.name}: ${part.state}. ${part.detail}`;
-    const words = part.state === "ok" || !part.detail ? "" : `: ${part.detail}`;
-    item.textContent = `${part.name}${words}`;
+    item.dataset.state = unknown ? "off" : part.state;
+    item.title = unknown ? `${name}: not known now` : `${name}: ${part.state}. ${part.detail}`;
+    const words = unknown || part.state === "ok" || !part.detail ? "" : `: ${part.detail}`;
+    item.textContent = `${name}${words}`;
     return item;
-  });
+  };
+  const laser = (part) => (/laser/i.test(part.name) ? part.name : `laser ${part.name}`);
+  const items = [
+    chip(found.source, found.source.name, stale),
+    ...found.lasers.map((part) => chip(part, laser(part), blind)),
+    ...found.outputs.map((part) => chip(part, part.name, stale)),
+  ];
   $("parts").replaceChildren(...items);
   const total = found.delays_ms.total;
-  const delay = total ? `, delay ${total[0].toFixed(1)} ms (99 %: ${total[1].toFixed(1)})` : "";
+  const delay = total ? `, ${total[0].toFixed(1)} ms` : "";
+  $("rates").title = total ? `delay: ${total[0].toFixed(1)} ms, 99 % below ${total[1].toFixed(1)} ms` : "";
   $("rates").textContent = `${found.rate_hz.toFixed(0)} Hz${delay}, ${found.n_dropped} skipped, ${found.n_lost} lost`;
 }
 
@@ -168,9 +210,16 @@ function commands() {
   const { recording, setpoint } = state;
   $("record").setAttribute("aria-pressed", String(Boolean(recording.on)));
   $("record").textContent = recording.on ? "Stop recording" : "Record";
-  $("record-words").textContent = recording.words || "";
-  $("set-words").textContent = setpoint ? `Setpoint ${setpoint.range_m.toFixed(2)} m, ${setpoint.yaw_deg.toFixed(1)}°` : "No setpoint";
+  const disk = recording.free_bytes === undefined ? "" : `, disk: ${size(recording.free_bytes)} free${recording.left_s === null ? "" : `, for ${lasting(recording.left_s)}`}`;
+  const since = recording.seconds === undefined ? "" : `${clock(recording.seconds)} – `;
+  $("record-words").textContent = `${since}${recording.words || ""}${disk}`;
+  const verb = rig.holds ? "Holding" : "Aim:";
+  $("set-words").textContent = setpoint ? `${verb} ${setpoint.range_m.toFixed(2)} m, ${setpoint.yaw_deg.toFixed(1)}°` : rig.holds ? "No setpoint" : "No aim";
 }
+
+const clock = (s) => `${Math.floor(s / 60)}:${String(Math.floor(s % 60)).padStart(2, "0")}`;
+const size = (bytes) => (bytes < 1e9 ? `${(bytes / 1e6).toFixed(0)} MB` : `${(bytes / 1e9).toFixed(bytes < 1e10 ? 1 : 0)} GB`);
+const lasting = (s) => (s < 5400 ? `${Math.floor(s / 60)} min` : `${Math.floor(s / 3600)} h`);
 
 $("record").onclick = () => {
   $("answer").textContent = "";
@@ -188,12 +237,14 @@ $("ask").onsubmit = (event) => {
   $("ask").hidden = true;
   connect();
 };
-$("theme").onclick = () => {
-  const dark = document.documentElement.dataset.theme !== "dark";
+function theme(dark) {
   document.documentElement.dataset.theme = dark ? "dark" : "light";
   $("theme").textContent = dark ? "Light" : "Dark";
+  Object.values(strips).forEach((strip) => strip.redraw());
   dirty = true;
-};
+}
+$("theme").onclick = () => theme(document.documentElement.dataset.theme !== "dark");
+theme(matchMedia("(prefers-color-scheme: dark)").matches);
 
 connect();
 draw();

@@ -17,24 +17,29 @@ function drawPoints(canvas, points, rig) {
   context.globalAlpha = 1;
 }
 
-/** A canvas with metres to pixels: `right` and `ahead` as on a chart. */
+/** A canvas with metres to pixels: `right` and `ahead` as on a chart; as sharp as the screen. */
 function sheet(canvas, rightSpan, aheadSpan) {
   const context = canvas.getContext("2d");
-  context.clearRect(0, 0, canvas.width, canvas.height);
-  const margin = 26;
-  const scale = Math.min((canvas.width - 16) / (2 * rightSpan), (canvas.height - 2 * margin) / aheadSpan);
+  const [width, height] = [canvas.clientWidth, canvas.clientHeight];
+  const fine = window.devicePixelRatio || 1;
+  const [across, down] = [Math.round(width * fine), Math.round(height * fine)];
+  if (canvas.width !== across || canvas.height !== down) Object.assign(canvas, { width: across, height: down });
+  context.setTransform(fine, 0, 0, fine, 0, 0);
+  context.clearRect(0, 0, width, height);
+  const margin = 16;
+  const scale = Math.min((width - 16) / (2 * rightSpan), (height - 2 * margin) / aheadSpan);
   return {
     context,
     scale,
-    at: (right, ahead) => [canvas.width / 2 + scale * right, canvas.height - margin - scale * ahead],
+    at: (right, ahead) => [width / 2 + scale * right, height - margin - scale * ahead],
   };
 }
 
 function ranges(view, near, far, span) {
   const { context } = view;
   context.strokeStyle = ink("--line");
-  context.fillStyle = ink("--soft");
-  context.font = "15px system-ui, sans-serif";
+  context.fillStyle = ink("--quiet");
+  context.font = "13px system-ui, sans-serif";
   for (const range of [near, far]) {
     const [, y] = view.at(0, range);
     context.setLineDash([5, 5]);
@@ -64,10 +69,10 @@ function drawTop(canvas, state, rig) {
   if (state.posture.valid === "1") {
     // From above: the target's normal is turned by yaw; its foot is at the range along it, in the
     // horizontal plane through the dome.
-    targetLine(view, +state.posture.range_m / Math.cos(radians(+state.posture.pitch_deg)), +state.posture.yaw_deg, ink("--good"), []);
+    targetLine(view, +state.posture.range_m / Math.cos(radians(+state.posture.pitch_deg)), +state.posture.yaw_deg, ink("--accent"), []);
   }
   if (state.setpoint) {
-    targetLine(view, state.setpoint.range_m, state.setpoint.yaw_deg, ink("--accent"), [8, 6]);
+    targetLine(view, state.setpoint.range_m, state.setpoint.yaw_deg, ink("--ink"), [8, 6]);
   }
 }
 
@@ -126,11 +131,12 @@ const radians = (degrees) => (degrees * Math.PI) / 180;
 
 /** One strip chart of the last minute: value, band of one sigma, setpoint. */
 class Strip {
-  constructor(element, name, unit, least) {
+  constructor(element, name, unit, least, last) {
     this.element = element;
     this.least = least;
     this.data = [[], [], [], [], []];
     this.plot = null;
+    this.last = last;
     this.name = `${name}, ${unit}`;
   }
 
@@ -146,9 +152,14 @@ class Strip {
   draw() {
     if (!this.data[0].length) return;
     const { clientWidth, clientHeight } = this.element;
-    if (this.plot === null) this.plot = this.make(clientWidth, Math.max(92, clientHeight));
-    if (Math.abs(this.plot.width - clientWidth) > 1) this.plot.setSize({ width: clientWidth, height: this.plot.height });
+    if (this.plot === null) this.plot = this.make(clientWidth, clientHeight);
+    if (Math.abs(this.plot.width - clientWidth) > 1) this.plot.setSize({ width: clientWidth, height: clientHeight });
     this.plot.setData(this.data);
+  }
+
+  /** Draw anew, in the colours of now. */
+  redraw() {
+    if (this.plot !== null) this.plot.redraw(false, true);
   }
 
   make(width, height) {
@@ -156,23 +167,23 @@ class Strip {
     const last = () => this.data[0][this.data[0].length - 1];
     return new uPlot(
       {
-        width, height, cursor: { show: false },
+        width, height, cursor: { show: false }, padding: [8, 14, 2, 0],
         scales: {
           x: { time: false, range: () => [last() - 60, last()] },
           y: { range: (_, low, high) => this.limits(low, high) },
         },
         axes: [
-          { ...axis, size: 24, splits: () => [60, 50, 40, 30, 20, 10, 0].map((age) => last() - age), values: (_, ticks) => ticks.map((t) => `${Math.round(t - last())} s`) },
-          { ...axis, size: 58, label: this.name, labelSize: 18 },
+          { ...axis, size: this.last ? 24 : 4, splits: () => [60, 50, 40, 30, 20, 10, 0].map((age) => last() - age), values: (_, ticks) => ticks.map((t) => (this.last ? `${Math.round(t - last())} s` : "")) },
+          { ...axis, size: 44, space: 13, label: this.name, labelSize: 20 },
         ],
         series: [
           {},
-          { stroke: () => ink("--good"), width: 3, points: { show: false } },
+          { stroke: () => ink("--accent"), width: 2.5, points: { show: false } },
           { stroke: "transparent", points: { show: false } },
           { stroke: "transparent", points: { show: false } },
-          { stroke: () => ink("--accent"), width: 2, dash: [8, 6], points: { show: false } },
+          { stroke: () => ink("--ink"), width: 1.5, dash: [8, 6], points: { show: false } },
         ],
-        bands: [{ series: [3, 2], fill: () => `${ink("--good")}40` }],
+        bands: [{ series: [3, 2], fill: () => `${ink("--accent")}40` }],
       },
       this.data,
       this.element,

@@ -1,0 +1,18 @@
+"""Calibration files of other programs, read into rigs and written from them.
+
+ROS, OpenCV, Kalibr, mrcal, COLMAP and Refractive COLMAP; docs/formats.md has the conventions. One
+module for each program; imports `optics` and `calibration.targets`.
+"""
+
+from aqualvs.calibration_files.camera import ForeignCamera, camera_of_rig, rig_of_camera
+from aqualvs.calibration_files.files import EXPORTS, camera_text, read_board, read_camera
+
+__all__ = [
+    "EXPORTS",
+    "ForeignCamera",
+    "camera_of_rig",
+    "camera_text",
+    "read_board",
+    "read_camera",
+    "rig_of_camera",
+]

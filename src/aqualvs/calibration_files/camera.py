@@ -1,0 +1,163 @@
+"""A camera as other programs describe it, and the rig that it makes."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from aqualvs.errors import AqualvsError, RigError
+from aqualvs.geometry.arrays import FloatArray
+from aqualvs.geometry.transforms import SE3
+from aqualvs.optics.dome import Dome
+from aqualvs.optics.lens import Lens, LensModel
+from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig
+from aqualvs.optics.rigfile import rig_from_mapping, rig_to_mapping
+
+_N_AIR = 1.0003
+_WORKING_RANGE_M = (0.25, 1.3)
+_N_OPENCV = 8
+
+
+@dataclass(frozen=True, slots=True)
+class DomePort:
+    """A dome and the media inside and outside of it, in the frame of the camera.
+
+    Attributes
+    ----------
+    centre : array, shape (3,)
+        Centre of the dome in `cam`, in metres.
+    dome : Dome
+    n_air, n_water : float
+        Refractive indices.
+    """
+
+    centre: FloatArray
+    dome: Dome
+    n_air: float
+    n_water: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ForeignCamera:
+    """What the file of another program says of one camera.
+
+    Attributes
+    ----------
+    name : str
+    size_px : (int, int) or None
+        Image width and height; None where the file does not say it.
+    lens : Lens
+        The centre of the top-left pixel is (0, 0).
+    port : DomePort or None
+        None for a camera without a dome.
+    """
+
+    name: str
+    size_px: tuple[int, int] | None
+    lens: Lens
+    port: DomePort | None = None
+
+
+def opencv_lens(core: Sequence[float], distortion: Sequence[float], *, fisheye: bool) -> Lens:
+    """Return the lens of OpenCV's coefficients, if aqualvs has all of them.
+
+    Parameters
+    ----------
+    core : sequence of float
+        fx, fy, cx, cy.
+    distortion : sequence of float
+        In OpenCV's order. Zeros beyond k6, of a thin prism or a tilt, are dropped.
+    fisheye : bool
+        Whether they are those of `cv2.fisheye`.
+
+    Raises
+    ------
+    RigError
+        If there are others, or a value is impossible.
+    """
+    values = tuple(map(float, distortion))
+    if not fisheye and len(values) in (12, 14):
+        if any(values[_N_OPENCV:]):
+            raise RigError(
+                "has thin prism or tilt coefficients (s1 to s4, tx, ty), which the lens of aqualvs "
+                "lacks; calibrate with k1 k2 p1 p2 k3 k4 k5 k6 at most"
+            )
+        values = values[:_N_OPENCV]
+    fx, fy, cx, cy = core
+    model = LensModel.FISHEYE if fisheye else LensModel.OPENCV
+    return Lens(model=model, fx=fx, fy=fy, cx=cx, cy=cy, distortion=values)
+
+
+def padded(lens: Lens, n: int) -> tuple[float, ...]:
+    """Return n distortion coefficients of a lens, zeros for those that it lacks.
+
+    Raises
+    ------
+    RigError
+        If one that is not zero would be lost.
+    """
+    values = (*lens.distortion, *(0.0,) * n)
+    if any(values[n:]):
+        names = ", ".join(lens.parameter_names[4 + n :])
+        raise RigError(f"the lens has {names}, which this format lacks; choose another format")
+    return values[:n]
+
+
+def rig_of_camera(
+    camera: ForeignCamera, source: str, *, solved_from: dict[str, Any] | None = None
+) -> Rig:
+    """Return the rig of a camera, without lasers: behind its dome, or bare in air.
+
+    The camera looks along the dome's y axis: other programs do not know a frame of the vehicle.
+
+    Parameters
+    ----------
+    camera : ForeignCamera
+        With the size of its pictures.
+    source : str
+        Name of the file in messages.
+    solved_from : dict, optional
+        As `Rig.solved_from`.
+
+    Raises
+    ------
+    RigError
+        If such a rig is impossible.
+    """
+    if camera.size_px is None:
+        raise RigError(
+            f"{source}: does not say the size of the pictures; add --image, such as "
+            "--image 1920x1080"
+        )
+    port, turn = camera.port, DOME_FROM_CAM_NOMINAL
+    lens_in_dome = np.zeros(3) if port is None else -(turn @ port.centre) + 0.0
+    rig = Rig(
+        name=camera.name,
+        size_px=camera.size_px,
+        lens=camera.lens,
+        dome_from_cam=SE3(turn.copy(), lens_in_dome),
+        dome=None if port is None else port.dome,
+        n_air=_N_AIR if port is None else port.n_air,
+        n_water=_N_AIR if port is None else port.n_water,
+        lasers=(),
+        working_range=_WORKING_RANGE_M,
+        solved_from=solved_from or {},
+    )
+    try:
+        # The conditions on rig files hold for this one, too.
+        return rig_from_mapping(rig_to_mapping(rig), source_name=source, need_lasers=False)
+    except AqualvsError:
+        raise
+    except (ArithmeticError, ValueError):
+        raise RigError(f"{source}: holds numbers that are no camera's; correct them") from None
+
+
+def camera_of_rig(rig: Rig) -> ForeignCamera:
+    """Return the camera of a rig, with its dome, as seen from the camera."""
+    port = None
+    if rig.dome is not None:
+        pose = rig.dome_from_cam
+        centre = -(pose.rotation.T @ pose.translation) + 0.0
+        port = DomePort(centre, rig.dome, rig.n_air, rig.n_water)
+    return ForeignCamera(name=rig.name, size_px=rig.size_px, lens=rig.lens, port=port)

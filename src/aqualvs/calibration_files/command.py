@@ -1,0 +1,146 @@
+"""`aqualvs import` and `aqualvs export`: calibrations of other programs into rigs, and back."""
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TypeAlias
+
+from aqualvs.calibration.targets.target_files import save_board
+from aqualvs.calibration_files.camera import ForeignCamera, camera_of_rig, rig_of_camera
+from aqualvs.calibration_files.files import camera_text, format_of, read_board, read_camera
+from aqualvs.calibration_formats import FORMAT_TEXTS, CalibrationFormat
+from aqualvs.errors import OptionError, RigError
+from aqualvs.optics.rig import Rig
+from aqualvs.optics.rigfile import check_rig_place, load_rig, save_rig
+from aqualvs.optics.solved import assumptions, rig_uncertainty
+from aqualvs.results.files import Claim, replace_text, writing
+
+Echo: TypeAlias = Callable[[str], object]
+
+IMPORTED = "imported"
+"""Key of `Rig.solved_from`: the file that the camera was taken from."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ImportRequest:
+    """Request of `aqualvs import`, see its `--help`."""
+
+    source: Path
+    out: Path
+    what: str | None = None
+    camera: str | None = None
+    model: str | None = None
+    image: str | None = None
+    overwrite: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ExportRequest:
+    """Request of `aqualvs export`, see its `--help`."""
+
+    rig: Path
+    to: str
+    out: Path
+    overwrite: bool = False
+
+
+def run_import(request: ImportRequest, echo: Echo) -> None:
+    """Write the rig or the board of a calibration file.
+
+    Raises
+    ------
+    AqualvsError
+        If the file cannot be read, holds what aqualvs lacks, or the output cannot be written.
+    """
+    found, _ = format_of(request.source)
+    what = request.what or ("board" if found is CalibrationFormat.KALIBR_TARGET else "rig")
+    if what == "board":
+        board = read_board(request.source)
+        with Claim("import", [request.out], overwrite=request.overwrite):
+            save_board(board, request.out, note=f"imported from {request.source.name}")
+        echo(f"board: {request.out} ({board.describe()})")
+        return
+    check_rig_place(request.out)
+    camera = read_camera(request.source, camera=request.camera, model=request.model)
+    camera = _of_size(camera, request)
+    dropped = what == "camera" and camera.port is not None
+    if dropped:
+        camera = replace(camera, port=None)
+    note = {"file": request.source.name, "format": str(found), "camera": camera.name}
+    rig = rig_of_camera(camera, str(request.source), solved_from={IMPORTED: note})
+    copy = save_rig(rig, request.out)
+    kept = "" if copy is None else f"; the one before is {copy}"
+    echo(f"rig: {request.out} (from {FORMAT_TEXTS[found]}){kept}")
+    for line in _remarks(rig, dropped=dropped):
+        echo(line)
+
+
+def _of_size(camera: ForeignCamera, request: ImportRequest) -> ForeignCamera:
+    """Return the camera with the size of its pictures, which a file may leave out."""
+    if request.image is None:
+        return camera
+    match = re.fullmatch(r"(\d{1,6})x(\d{1,6})", request.image)
+    if match is None:
+        raise OptionError(f"--image {request.image!r}: write width x height, such as 1920x1080")
+    size_px = (int(match[1]), int(match[2]))
+    if camera.size_px is not None and camera.size_px != size_px:
+        raise OptionError(
+            f"--image {request.image}: {request.source} says "
+            f"{'x'.join(map(str, camera.size_px))}; leave --image out"
+        )
+    return replace(camera, size_px=size_px)
+
+
+def _remarks(rig: Rig, *, dropped: bool) -> list[str]:
+    lens = rig.lens
+    lines = [
+        f"camera: {lens.model}, {len(lens.distortion)} distortion coefficients, "
+        f"{rig.size_px[0]}x{rig.size_px[1]} px, fx {lens.fx:.2f} px"
+    ]
+    if dropped:
+        lines.append("left out: the dome; --as rig takes it too")
+    elif rig.dome is None:
+        lines.append("no dome: the lens is bare, in air; 'aqualvs calibrate dome' adds a dome")
+    else:
+        lines.append(
+            f"dome: inner radius {rig.dome.inner_radius * 1e3:g} mm; the camera counts as looking "
+            "along the dome's y axis"
+        )
+    words = "; ".join(f"{one.words} ({one.what})" for one in assumptions(rig))
+    lines.append(f"uncertainty: the file has none; one sigma that is assumed: {words}")
+    lines.append("next: lasers, by 'aqualvs calibrate lasers' or by hand (docs/rig.md)")
+    return lines
+
+
+def run_export(request: ExportRequest, echo: Echo) -> None:
+    """Write the camera of a rig in the format of another program.
+
+    Raises
+    ------
+    AqualvsError
+        If the rig cannot be read, the format cannot hold it, or the file cannot be written.
+    """
+    rig = load_rig(request.rig, need_lasers=False)
+    try:
+        text = camera_text(camera_of_rig(rig), request.to, suffix=request.out.suffix)
+    except RigError as fault:
+        raise RigError(f"{request.rig}: {fault}") from None
+    with (
+        Claim("export", [request.out], overwrite=request.overwrite),
+        writing(request.out),
+    ):
+        replace_text(request.out, text)
+    echo(f"{request.to}: {request.out}")
+    left_out = _left_out(rig, request.to)
+    if left_out:
+        echo(f"left out, as the format lacks it: {', '.join(left_out)}")
+
+
+def _left_out(rig: Rig, to: str) -> list[str]:
+    refractive = to == "colmap-underwater"
+    names = ["the dome (the intrinsics are those in air)"] if rig.dome and not refractive else []
+    names += [f"{len(rig.lasers)} laser{'s' if len(rig.lasers) > 1 else ''}"] if rig.lasers else []
+    names += ["the camera's rotation in the dome"] if rig.dome and refractive else []
+    names += ["the covariance"] if rig_uncertainty(rig).names else []
+    return names
