@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 
 import pytest
 
@@ -9,6 +10,7 @@ from aqualvs.calibration.targets.target_files import load_board
 from aqualvs.cli.main import main
 from aqualvs.optics.rigfile import load_rig, save_rig
 from aqualvs.optics.rigschema import rig_json_schema
+from aqualvs.optics.shutter import Shutter, ShutterKind
 from aqualvs.optics.solved import assumptions, with_exact_numbers
 from repository import ROOT
 
@@ -141,10 +143,11 @@ def test_a_bare_camera_in_air_is_no_fault_of_a_rig(here, capsys):
     assert "in the water" not in out
 
 
-def test_the_covariance_that_is_left_out_is_named(here, capsys):
-    save_rig(with_exact_numbers(load_rig(DEMO_RIG)), "rig.yaml")
+def test_the_covariance_and_the_shutter_that_are_left_out_are_named(here, capsys):
+    rolling = Shutter(kind=ShutterKind.ROLLING, readout=0.02)
+    save_rig(replace(with_exact_numbers(load_rig(DEMO_RIG)), shutter=rolling), "rig.yaml")
     out = said(capsys, "export", "rig.yaml", "--to", "colmap-underwater", "-o", "cameras.txt")
-    assert "the covariance" in out
+    assert "the shutter, the covariance" in out
 
 
 def test_the_schema_is_printed(capsys):

@@ -13,6 +13,7 @@ from aqualvs.calibration_formats import FORMAT_TEXTS, CalibrationFormat
 from aqualvs.errors import OptionError, RigError
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.rigfile import check_rig_place, load_rig, save_rig
+from aqualvs.optics.shutter import AT_ONCE
 from aqualvs.optics.solved import assumptions, rig_uncertainty
 from aqualvs.results.files import Claim, replace_text, writing
 
@@ -142,5 +143,6 @@ def _left_out(rig: Rig, to: str) -> list[str]:
     names = ["the dome (the intrinsics are those in air)"] if rig.dome and not refractive else []
     names += [f"{len(rig.lasers)} laser{'s' if len(rig.lasers) > 1 else ''}"] if rig.lasers else []
     names += ["the camera's rotation in the dome"] if rig.dome and refractive else []
+    names += ["the shutter"] if rig.shutter != AT_ONCE else []
     names += ["the covariance"] if rig_uncertainty(rig).names else []
     return names
