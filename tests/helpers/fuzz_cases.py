@@ -74,6 +74,10 @@ class Case:
     whole: bool = False
     """Whether the program is started anew; else a copy of this process, which has loaded all."""
 
+    def begins(self, command: str) -> bool:
+        """Return whether it runs a command."""
+        return not callable(self.arguments) and str(self.arguments[0]) == command
+
 
 def fault_of(case: Case, folder: Path) -> str:
     """Run a case in a process of its own; return what is wrong, "" if nothing is."""
@@ -952,8 +956,9 @@ def failures(bench: Bench, seed: int, n_cases: int, folder: Path, echo=None) -> 
     )
     for cases in streams:
         for i, case in enumerate(cases):
-            # One in each few goes the whole way, through a process that begins with nothing.
-            if i % _WHOLE_EVERY == _WHOLE_EVERY - 1:
+            # One in each few goes the whole way, through a process that begins with nothing. So do
+            # batches: in a copy, the server that makes their workers is another process's child.
+            if i % _WHOLE_EVERY == _WHOLE_EVERY - 1 or case.begins("batch"):
                 case = replace(case, whole=not callable(case.arguments))
             where = folder / "here"
             fault = fault_of(case, where)

@@ -56,11 +56,13 @@ ELSEWHERE = {
     "net-change": "cli/test_net_change.py::test_faults_in_one_line_and_files_of_others_stay",
     "figures": "report/test_mesh_figures.py::test_pictures_of_others_stay",
     "score": "cli/test_score.py::test_scores_of_others_stay",
+    "import": "cli/test_formats.py::test_files_of_others_are_never_overwritten",
+    "export": "cli/test_formats.py::test_files_of_others_are_never_overwritten",
     "live": "recording/test_recorder.py::test_a_name_that_is_taken_or_impossible_is_refused",
 }
 """Commands that must read something before: the test with what they need."""
 
-NO_FILES = {"check", "doctor"}
+NO_FILES = {"check", "doctor", "schema"}
 
 
 def all_commands() -> dict[str, Any]:

@@ -30,7 +30,7 @@ def _templates() -> "Environment":
     )
     templates.globals["asset"] = lambda name: Raw(asset(name))
     templates.globals["packed"] = packed
-    templates.globals["contents"] = contents
+    templates.globals["contents_of"] = contents_of
     return templates
 
 
@@ -49,7 +49,7 @@ _SECTION = re.compile(r'<section\b[^>]*\bid="([^"]+)"[^>]*>\s*<h2>(.*?)</h2>', r
 _FEWEST = 3
 
 
-def contents(body: str) -> "Raw":
+def contents_of(body: str) -> "Raw":
     """Return links to the sections of a page; nothing where there are few, or it has its own."""
     found = _SECTION.findall(body)
     if len(found) < _FEWEST or any(name == "contents" for name, _ in found):
