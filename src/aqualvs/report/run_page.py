@@ -352,7 +352,7 @@ def _subtitle(run: Mapping[str, Any]) -> str:
 
 def _posture_lead(track: Track, truth: FloatArray | None) -> str:
     """Return the line above the posture's charts."""
-    words = "Bands: one and two standard deviations."
+    words = "Bands: one standard deviation, by the frame alone and with the rig."
     if not track.valid.all():
         words += " Grey: no posture; point at it for the reason."
     if truth is not None:
@@ -381,7 +381,7 @@ def _truth_view(track: Track, truth: FloatArray | None) -> str:
     return (
         heading
         + html.table(("", "rms", "greatest"), rows)
-        + '<p class="note">Bands: one and two standard deviations as the run states them.</p>\n'
+        + '<p class="note">Bands: one standard deviation, as the run states it.</p>\n'
         '<div class="chart" id="chart-error"></div>'
     )
 
