@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aqualvs.design.judge import predict
+from aqualvs.design.judge import predict, score
 from aqualvs.design.settings import (
     Design,
     Mount,
@@ -34,7 +34,12 @@ from scanning_cases import everywhere, lit_stripe
 
 WIDE = math.radians(160.0)
 NO_NOISE = SharedError(0.0, 0.0)
-POINT_ONLY = Noise(point=0.1, strand=0.1, wall=NO_NOISE, net=NO_NOISE)
+POINT_ONLY = Noise(point=0.1, strand=0.1, wall=NO_NOISE, net=NO_NOISE, twine=0.0)
+
+
+NO_TOLERANCES = Tolerances(
+    lens=0.0, rotation=0.0, focal=0.0, dome=0.0, n_water=0.0, laser_angle=0.0, laser_offset=0.0
+)
 
 
 def as_design(rig: Rig, **changes) -> Design:
@@ -169,6 +174,32 @@ def test_a_pair_of_lasers_has_a_closed_form():
         expected = wall_range**2 * 0.1 / (700.0 * 0.1 * math.sqrt(2.0 * n))
         # Points far from the axis weigh as those on it: exact, but for the ends found.
         assert told.wall[0, 0] == pytest.approx(expected, rel=1e-5)
+
+
+def test_the_shift_of_all_strands_moves_the_range_whatever_the_number_of_lasers():
+    """Each pair of lasers as far from the lens tells the same wrong range: range² e / (f B)."""
+    twine_only = replace(POINT_ONLY, point=1e-9, strand=1e-9, twine=0.11)
+    two = pair(0.1, noise=twine_only)
+    beside = tuple(
+        Mount(name=name, position=(x, 0.0, 0.0), stripe=math.pi / 2, tilt=0.0, fan=WIDE)
+        for name, x in (("left", -0.1), ("right", 0.1))
+    )
+    for design in (two, two.with_mounts([*two.mounts, *beside])):
+        told = predict(design, [0.4, 0.7])
+        expected = np.array([0.4, 0.7]) ** 2 * 0.11 / (700.0 * 0.1)
+        np.testing.assert_allclose(told.net[:, 0], expected, rtol=1e-5)
+        # To the angles it is the same on all sides, and a wall has no twine.
+        assert np.all(told.net[:, 1:] < 1e-6)
+        assert np.all(told.wall < 1e-8)
+
+
+def test_the_scores_error_counts_the_shift_of_all_strands():
+    design = pair(0.1, tolerances=NO_TOLERANCES)
+    wider = replace(design, noise=replace(design.noise, twine=0.11))
+    squares = score(wider).error ** 2 - score(design).error ** 2
+    # On the net alone, and in the range alone: one of two targets, one of three errors.
+    shift = design.ranges**2 * 0.11 / (700.0 * 0.1) / (design.ranges * design.goals.range_share)
+    assert squares == pytest.approx(np.mean(shift**2) / 6.0, rel=1e-3)
 
 
 @settings(max_examples=25)

@@ -272,7 +272,10 @@ def _centred(design: Design) -> Design | None:
 
 
 def _averaged(design: Design) -> Design:
-    """Average four frames with stripes at different places of the target: all noise halves."""
+    """Average four frames with stripes at different places of the target: all noise halves.
+
+    But for the shift of all strands, which follows from twine and water, not from the place.
+    """
     noise = design.noise
     wall, net = (
         SharedError(0.5 * one.shift_px, 0.5 * one.tilt_px) for one in (noise.wall, noise.net)

@@ -140,6 +140,7 @@ class NoisePart(StrictPart):
     wall_tilt_px: NotNegative = Noise().wall.tilt_px
     net_shift_px: NotNegative = Noise().net.shift_px
     net_tilt_px: NotNegative = Noise().net.tilt_px
+    twine_px: NotNegative = Noise().twine
 
 
 class TolerancesPart(StrictPart):
@@ -379,6 +380,7 @@ def _noise(part: NoisePart) -> Noise:
         strand=part.strand_px,
         wall=SharedError(part.wall_shift_px, part.wall_tilt_px),
         net=SharedError(part.net_shift_px, part.net_tilt_px),
+        twine=part.twine_px,
     )
 
 

@@ -144,7 +144,21 @@ def wall_sums(stripes: Stripes, noise: Noise) -> Sums:
 
 def net_sums(stripes: Stripes, design: Design) -> Sums:
     """Return the sums of all stripes on the design's net."""
-    return net_parts(stripes, design).total()
+    sums = net_parts(stripes, design).total()
+    twine = outer(twine_pulls(stripes, design).sum(axis=0)[..., None, :])
+    return Sums(sums.matrix, sums.scatter + twine)
+
+
+def twine_pulls(stripes: Stripes, design: Design) -> FloatArray:
+    """Return the pull (K, W, 3) of each stripe by the shift that all strands of the net share.
+
+    Light on twine appears nearer than the net on every stripe; which way that is in the picture
+    depends on the side of the lens that the laser is on.
+    """
+    shift = stripes.own[..., 0, :]
+    nearer = np.sign(shift[..., 1:2]) * net_share(stripes, design)[..., None]
+    pulls: FloatArray = design.noise.twine * nearer * shift
+    return pulls
 
 
 def _parts(stripes: Stripes, share: FloatArray, point: float, shared: tuple[float, float]) -> Sums:
@@ -315,7 +329,11 @@ class Judge:
         share = net_share(stripes, design)[..., None, None]
         wall, net = wall_parts(stripes, design.noise), net_parts(stripes, design)
         on_wall = wall.matrix, wall.scatter + scatter, stripes.common
-        on_net = net.matrix, net.scatter + share**2 * scatter, share * stripes.common
+        # What all strands share adds up over the stripes, as the water's index does.
+        pulls = np.concatenate(
+            [share * stripes.common, twine_pulls(stripes, design)[..., None, :]], axis=-2
+        )
+        on_net = net.matrix, net.scatter + share**2 * scatter, pulls
         return Lot(stripes, (on_wall, on_net))
 
     def judge(self, lot: Lot, others: Lot) -> tuple[FloatArray, FloatArray]:

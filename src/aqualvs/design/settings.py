@@ -15,7 +15,7 @@ from aqualvs.geometry.planes import Plane
 from aqualvs.optics.camera import Camera, parameter_names
 from aqualvs.optics.rig import Laser, Rig
 from aqualvs.optics.sheet import sheet_in
-from aqualvs.scanning.plane_fit import MESH_ERROR, SOLID_ERROR, SharedError
+from aqualvs.scanning.plane_fit import MESH_ERROR, SOLID_ERROR, TWINE_ERROR_PX, SharedError
 
 # Limit of a sheet square to the forward axis, which draws no stripe on a wall ahead.
 _MIN_ACROSS = 1e-3
@@ -217,12 +217,15 @@ class Noise:
         Of the light on one strand of a net.
     wall, net : SharedError
         Of the errors that a whole stripe shares.
+    twine : float
+        Of the shift that all strands of a net share, towards the near side or the far one.
     """
 
     point: float = 0.3
     strand: float = 0.15
     wall: SharedError = SOLID_ERROR
     net: SharedError = MESH_ERROR
+    twine: float = TWINE_ERROR_PX
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -41,6 +41,7 @@ from aqualvs.scanning.patch import (
 from aqualvs.scanning.plane_fit import (
     MESH_ERROR,
     SOLID_ERROR,
+    TWINE_ERROR_PX,
     PlaneFit,
     fit_pseudo_inverse,
     fit_robust,
@@ -207,11 +208,6 @@ _BESIDE_SHARE, _FOLDED_STRANDS, _FOLDED_INTENSITY = 0.06, 0.5, 0.47
 _EXPECTED, _CONTRADICTS = 3.0, 16.27
 # The light about a mean plane is selected at most this many times more.
 _MAX_SELECTIONS = 5
-# A strand's light is brightest on the twine's front, and blur takes away the light on its edges:
-# its centroid lies before the mean of the surface it lights. On rendered nets of twelve kinds, in
-# clear and turbid water, all strands alike were 0.05 to 0.18 px off, to the near side; how far
-# depends on twine, growth and water, so that it is an error and no correction.
-_TWINE_PX = 0.11
 # Independent pieces of stripe that the second best laser must show.
 _MIN_OBSERVATIONS = 3
 
@@ -650,7 +646,7 @@ def _plane_of(fit: PlaneFit) -> Plane:
 def _add_twine_error(posture: Posture, fit: PlaneFit, sensitivity: FloatArray) -> None:
     """Widen the range of a posture, in place, by the error that the light on all strands shares."""
     share = float(np.abs(sensitivity @ fit.m) @ fit.weights / fit.weights.sum())
-    posture.covariance[0, 0] += (_TWINE_PX * share * posture.range) ** 2
+    posture.covariance[0, 0] += (TWINE_ERROR_PX * share * posture.range) ** 2
 
 
 def _disputed(found: Measurement, other: Posture, intensity_share: float) -> Measurement:
