@@ -293,6 +293,20 @@ def test_a_mission_that_is_over_holds_until_the_pilot_takes_over(mission: Missio
     assert not touched.engaged
 
 
+def test_a_vehicle_that_tips_is_told_of_and_held_on() -> None:
+    """Without thrust the water would carry it onto the net."""
+    taken = []
+    for pitch in (0.0, -math.radians(50.0)):
+        loop = Loop(HoldMission(HOLD), current=(0.2, 0.0))
+        loop.engage()
+        loop.go(5.0)
+        taken.append(loop.go(5.0, state=state_at(0.0, pitch=pitch)))
+    level, tipped = taken
+    assert [one.effort for one in tipped] == [one.effort for one in level]
+    assert {(one.reason, one.engaged) for one in level} == {(None, True)}
+    assert {(one.reason, one.engaged) for one in tipped} == {(LimitReason.TIPPING, True)}
+
+
 def test_the_pilots_stick_takes_over_at_once_and_for_good() -> None:
     loop = Loop(HoldMission(HOLD), distance=0.8)
     loop.engage()

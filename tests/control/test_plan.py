@@ -45,13 +45,14 @@ def test_values_reach_their_places(tmp_path: Path) -> None:
     content = {
         **SURVEY,
         "yaw_deg": 10,
-        "safety": {"least_range_m": 0.4, "retreat_effort": 0.3},
+        "safety": {"least_range_m": 0.4, "retreat_effort": 0.3, "tilt_deg": 30},
         "loss": {"give_up_s": 30},
     }
     plan = load_plan(written(tmp_path, content))
     assert plan.setpoint.yaw == pytest.approx(math.radians(10.0))
     assert plan.limits.least_range == 0.4
     assert plan.limits.retreat_effort == 0.3
+    assert plan.limits.tilt == pytest.approx(math.radians(30.0))
     mission = plan.mission()
     assert isinstance(mission, SurveyMission)
     assert mission._options.depths == (2.0, 3.0, 4.0, 5.0)

@@ -230,6 +230,40 @@ def test_whatever_comes_the_gate_never_adds_approach(
         assert sent.forward == min(max(effort.forward, -1.0), 1.0)
 
 
+@pytest.mark.parametrize("doubt", [LimitReason.FROZEN, LimitReason.NO_ANSWER])
+def test_a_doubt_brakes_for_a_moment_then_stops(doubt: LimitReason) -> None:
+    gate, sent = engaged(), []
+    for k in range(6):
+        now = 100.0 + 0.04 * k
+        # Later doubts change nothing, nor does one that passes if it gives the vehicle back.
+        late = doubt if k == 0 or not doubt.takes_over else None
+        found = gate.check(
+            now, 0.0, posture_at(), state_at(now), ASKED, doubt=late, brake=0.9 - 0.1 * k
+        )
+        assert found[1] is doubt
+        sent.append(found[0])
+    back = Effort(forward=-0.9)
+    assert sent == [back] * 3 + [NEUTRAL] * 3
+    assert gate.latched is (doubt if doubt.takes_over else None)
+    # A pilot, and a vehicle that is not ours, come first.
+    gate = engaged()
+    moved = state_at(100.0, pilot_moves=True)
+    found = gate.check(100.0, 0.0, posture_at(), moved, ASKED, doubt=doubt, brake=0.3)
+    assert found == (NEUTRAL, LimitReason.PILOT_STICKS)
+
+
+def test_a_tilted_vehicle_is_not_engaged() -> None:
+    gate, limit = SafetyGate(), SafetyLimits().tilt
+    for axis in ("roll", "pitch"):
+        for sign in (-1.0, 1.0):
+            tilted = state_at(5.0, **{axis: sign * (limit + 0.01)})
+            assert gate.engage(5.0, tilted) is LimitReason.TIPPING
+            assert gate.engage(5.0, state_at(5.0, **{axis: sign * (limit - 0.01)})) is None
+    # A vehicle that does not tell its attitude can be engaged, and is not stopped.
+    assert gate.engage(5.0, state_at(5.0)) is None
+    assert gate.check(5.0, 0.0, posture_at(), tilted, ASKED) == (ASKED, None)
+
+
 def test_every_reason_has_words() -> None:
     for reason in LimitReason:
         assert reason.words

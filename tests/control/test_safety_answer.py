@@ -14,7 +14,8 @@ from aqualvs.control.vehicle import NEUTRAL, Effort, Setpoint
 from aqualvs.errors import OptionError
 from aqualvs.follow.case import SimCase, sea, vehicle_model
 from aqualvs.follow.sensor_model import Blind, LossOfSight, SampledSensor
-from aqualvs.scanning.posture import Posture
+from aqualvs.geometry.transforms import SE3
+from aqualvs.scanning.posture import Posture, Reason, Refusal
 from control_cases import FRAME_S, posture_at, state_at
 
 GAINS = load_gains("bluerov2")
@@ -107,6 +108,16 @@ def test_a_way_along_a_curved_net_is_an_answer(turned_deg_s: float, receding_m_s
         watch.done(now_s, HELD)
 
 
+class NoticingSensor(SampledSensor):
+    """One whose frozen picture is known for one from some time on, as the live run does."""
+
+    noticed_s = math.inf
+
+    def look(self, world_from_dome: SE3, time_s: float) -> Posture | Refusal | None:
+        seen = super().look(world_from_dome, time_s)
+        return Refusal(Reason.FROZEN) if time_s >= self.noticed_s else seen
+
+
 def frozen_hold(
     name: str,
     loss: LossOfSight,
@@ -126,11 +137,9 @@ def frozen_hold(
         start_range=before,
         seed=seed,
     )
-    blind = (
-        Blind(freeze_s, freeze_s + noticed_s, loss),
-        Blind(freeze_s + noticed_s, math.inf, LossOfSight.TARGET),
-    )
-    eye = SampledSensor(case.net, np.random.default_rng(seed), blind=blind)
+    blind = (Blind(freeze_s, math.inf, loss),)
+    eye = NoticingSensor(case.net, np.random.default_rng(seed), blind=blind)
+    eye.noticed_s = freeze_s + noticed_s
     loop, decisions = case.loop(eye, mission), []
 
     def keep(now_s: float, *step: object) -> None:
@@ -159,16 +168,22 @@ def test_a_frozen_posture_stops_the_vehicle_in_time(name: str, before: float) ->
     assert decisions[-1].reason is LimitReason.FROZEN
 
 
-@pytest.mark.parametrize(("name", "least"), [("bluerov2", 0.3), ("bluerov2-heavy", 0.43)])
-def test_a_vehicle_that_approaches_a_frozen_net_coasts_to_rest_before_it(
-    name: str, least: float
-) -> None:
-    """The picture is noticed after 0.4 s; what coasts far approaches slowly."""
+@pytest.mark.parametrize("name", ["bluerov2", "bluerov2-heavy"])
+@pytest.mark.parametrize("noticed_s", [0.24, 0.4, 0.5])
+def test_a_vehicle_that_approaches_a_frozen_net_is_braked(name: str, noticed_s: float) -> None:
+    """In the midst of a step it coasts 0.3 m; as much effort astern as stops it prevents that."""
     for since_s in (0.9, 1.8):
-        _, nearest, _ = frozen_hold(
-            name, LossOfSight.STUCK, before=0.75, since_s=since_s, noticed_s=0.4
+        _, nearest, decisions = frozen_hold(
+            name, LossOfSight.STUCK, before=0.75, since_s=since_s, noticed_s=noticed_s
         )
-        assert nearest >= least
+        assert nearest >= 0.45
+        # Not thrown back either.
+        assert nearest <= 0.75
+        doubted = [one for one in decisions if one.reason is LimitReason.FROZEN]
+        pushes = [one.effort for one in doubted if one.effort != NEUTRAL]
+        assert len(pushes) <= 3
+        assert all(-1.0 <= one.forward < 0.0 and one.right == one.yaw == 0.0 for one in pushes)
+        assert doubted[-1].effort == NEUTRAL
 
 
 def test_a_vehicle_that_moves_unseen_is_given_back() -> None:

@@ -146,11 +146,14 @@ class NetPilot:
             asked or NEUTRAL,
             range_rate=None if filtered is None else filtered.range_rate,
             doubt=self._doubt,
+            brake=0.0 if self._doubt is None else self._watch.brake(self._doubt),
         )
         wanted = None if guidance.setpoint is None else guidance.setpoint.range
         self._watch.done(now_s, effort, wanted)
         self._settle(asked, effort, reason)
         reason = self._end(guidance) or reason or _mission_says(guidance)
+        if reason is None and self.gate.tips(state):
+            reason = LimitReason.TIPPING
         return Decision(effort, reason, guidance, self.engaged)
 
     def _end(self, guidance: Guidance) -> LimitReason | None:

@@ -72,6 +72,7 @@ class SafetyPart(StrictPart):
     stopping_time_s: Positive = 0.7
     retreat_effort: Positive = 0.25
     brake_effort: Positive = 0.5
+    tilt_deg: Positive = 45.0
 
 
 class PlanFile(StrictPart):
@@ -188,6 +189,7 @@ def _limits(part: SafetyPart) -> SafetyLimits:
         stopping_time=part.stopping_time_s,
         retreat_effort=part.retreat_effort,
         brake_effort=part.brake_effort,
+        tilt=math.radians(part.tilt_deg),
     )
 
 

@@ -41,6 +41,7 @@ class LimitReason(StrEnum):
     TOO_FAST = "too_fast"
     NO_SETPOINT = "no_setpoint"
     MISSION_OVER = "mission_over"
+    TIPPING = "tipping"
     GAVE_UP = "gave_up"
 
     @property
@@ -75,6 +76,7 @@ _WORDS = {
     LimitReason.TOO_FAST: "closing in too fast; braking",
     LimitReason.NO_SETPOINT: "no range is set to hold",
     LimitReason.MISSION_OVER: "the plan is done; holding until the pilot takes over",
+    LimitReason.TIPPING: "the vehicle tips over; take the sticks while the target is in sight",
     LimitReason.GAVE_UP: "the target was lost for too long; stopped until engaged again",
 }
 _TAKES_OVER = frozenset(
@@ -128,6 +130,8 @@ class SafetyLimits:
     brake_effort : float
         With which it brakes what closes in by two thirds or more faster than allowed; likewise.
         Below it is less in proportion: braking is not to throw the vehicle out of sight.
+    tilt : float
+        Angle in radians by which roll or pitch may be off level; beyond, the pilot is warned.
     """
 
     posture_age: float = 0.15
@@ -137,6 +141,7 @@ class SafetyLimits:
     stopping_time: float = 0.7
     retreat_effort: float = 0.25
     brake_effort: float = 0.5
+    tilt: float = math.radians(45.0)
 
     def __post_init__(self) -> None:
         """Refuse limits that cannot work.
@@ -181,6 +186,9 @@ class SafetyGate:
         self.latched: LimitReason | None = LimitReason.NOT_ENGAGED
         self._last_s = -math.inf
         self._seen: deque[tuple[float, float]] = deque(maxlen=32)
+        # The doubt in force, since when, and the effort that brakes.
+        self._doubt: LimitReason | None = None
+        self._doubt_s, self._brake = -math.inf, 0.0
 
     def engage(self, now_s: float, state: VehicleState) -> LimitReason | None:
         """Let efforts pass from now on, as the pilot wants it; return why not, None if so."""
@@ -188,8 +196,15 @@ class SafetyGate:
         if refused is None and state.rival:
             # At the start it is unknown which of them is the vehicle; later, the newcomer is not.
             refused = LimitReason.CONFLICT
+        if refused is None and self.tips(state):
+            refused = LimitReason.TIPPING
         self.latched = LimitReason.NOT_ENGAGED if refused else None
+        self._doubt = None
         return refused
+
+    def tips(self, state: VehicleState) -> bool:
+        """Return whether the vehicle reports that it is tilted beyond the limit."""
+        return max(abs(state.roll or 0.0), abs(state.pitch or 0.0)) > self.limits.tilt
 
     def stop(self, reason: LimitReason = LimitReason.NOT_ENGAGED) -> None:
         """Let nothing pass until `engage`."""
@@ -205,6 +220,7 @@ class SafetyGate:
         *,
         range_rate: float | None = None,
         doubt: LimitReason | None = None,
+        brake: float = 0.0,
     ) -> tuple[Effort, LimitReason | None]:
         """Return the effort that may be sent, and the reason if it differs from the request.
 
@@ -224,8 +240,12 @@ class SafetyGate:
             In m/s, where a filter knows it; else it follows from postures in a row.
         doubt : LimitReason, optional
             Why the posture is not to be trusted, where something has noticed.
+        brake : float
+            Effort astern, 0 or more, for `BRAKE_S` from the first of a row of doubts on.
         """
-        refused = self._clock_refuses(now_s) or self._vehicle_stops(now_s, state, doubt)
+        refused = self._clock_refuses(now_s) or self._vehicle_stops(now_s, state)
+        if refused is None and self._doubts(now_s, doubt, brake) is not None:
+            return self._effort_in_doubt(now_s), self._doubt
         refused = refused or self._sight_refuses(posture_age_s, posture) or _refused_effort(effort)
         if refused is not None or posture is None:
             return NEUTRAL, refused or LimitReason.NO_POSTURE
@@ -243,15 +263,27 @@ class SafetyGate:
             return LimitReason.CLOCK
         return None
 
-    def _vehicle_stops(
-        self, now_s: float, state: VehicleState, doubt: LimitReason | None
-    ) -> LimitReason | None:
-        """Return why the vehicle may not be steered; most reasons last until engaged again."""
+    def _vehicle_stops(self, now_s: float, state: VehicleState) -> LimitReason | None:
+        """Return why the vehicle may not be steered, until engaged again."""
         if self.latched is None:
             self.latched = self._vehicle_refuses(now_s, state)
-        if self.latched is None and doubt is not None and doubt.takes_over:
-            self.latched = doubt
-        return self.latched or doubt
+        return self.latched
+
+    def _doubts(self, now_s: float, doubt: LimitReason | None, brake: float) -> LimitReason | None:
+        """Return the doubt in force; one that gives the vehicle back stays while it brakes."""
+        stays = self._doubt is not None and self._doubt.takes_over
+        if doubt is not self._doubt and not stays:
+            self._doubt, self._doubt_s = doubt, now_s
+            self._brake = min(max(brake, 0.0), 1.0)
+        return self._doubt
+
+    def _effort_in_doubt(self, now_s: float) -> Effort:
+        """Return the brake while it lasts, then neutral."""
+        if self._brake > 0.0 and now_s - self._doubt_s < BRAKE_S - _TICK_S:
+            return Effort(forward=-self._brake)
+        if self._doubt is not None and self._doubt.takes_over:
+            self.latched = self._doubt
+        return NEUTRAL
 
     def _vehicle_refuses(self, now_s: float, state: VehicleState) -> LimitReason | None:
         # A heartbeat from the future is by another clock, and useless.
@@ -306,6 +338,10 @@ class SafetyGate:
         return _clipped(effort), None
 
 
+BRAKE_S = 0.12
+"""Time in seconds for which a vehicle whose picture stands still is braked: with the time until
+that is noticed less than 0.5 s, and within the pilot's 0.2 s after the last posture."""
+_TICK_S = 1e-3
 # The dome's centre is some 30 mm behind the hull's front, and pictures end at 0.3 m: the retreat
 # reaches its full effort before that.
 _FIRM_WITHIN_M = 0.05
@@ -354,6 +390,9 @@ _STILL_RANGE, _STILL_YAW, _N_MEANS = 0.006, math.radians(0.6), 6
 _PUSHED_S = 0.5
 # Least distance of the range beyond its setpoint, in metres.
 _OFF = 0.05
+# A picture that stands still is noticed within so many seconds: older postures are live. Slower
+# vehicles, in m/s, are not braked: noise of postures shows as much.
+_TRUSTED_S, _SLOW = 0.6, 0.03
 # Greatest change between two reports of a heading; a greater one is a reset compass.
 _MAX_TURN = math.radians(20.0)
 
@@ -380,14 +419,14 @@ class AnswerLimits:
     turned : float
         Turn of the heading within `window_s` that a posture which stands still must answer to, in
         radians. An even way along a curved net turns the heading, too: at 0.8 m/s, the current's
-        speed included, and a radius of 8 m by 10 degrees.
+        speed included, and a radius of 8 m by 7.5 degrees.
     """
 
     repeats_s: float = 0.2
     quiet: float = 0.1
-    window_s: float = 1.7
-    promised: float = 0.45
-    turned: float = math.radians(12.0)
+    window_s: float = 1.3
+    promised: float = 0.15
+    turned: float = math.radians(9.5)
 
     def __post_init__(self) -> None:
         """Refuse limits that cannot work.
@@ -485,6 +524,30 @@ class AnswerWatch:
         while now_s - self._moments[0].time_s > self.limits.window_s + _SLOPE_S:
             self._moments.popleft()
         return LimitReason.NO_ANSWER if self._is_unanswered() else None
+
+    def brake(self, doubt: LimitReason) -> float:
+        """Return the effort astern that stops the vehicle within `BRAKE_S`; 0 if it is slow.
+
+        Its speed is that of the last trusted postures and what the efforts since have added.
+
+        Parameters
+        ----------
+        doubt : LimitReason
+            Of the last posture.
+        """
+        blind_s = _TRUSTED_S if doubt is LimitReason.FROZEN else self.limits.window_s
+        before = [m for m in self._moments if self._now_s - m.time_s >= blind_s]
+        if len(before) < 2:
+            return 0.0
+        last = before[-1]
+        first = next(m for m in before if last.time_s - m.time_s <= _SLOPE_S)
+        if first is last:
+            return 0.0
+        speed = (first.range - last.range) / (last.time_s - first.time_s)
+        speed += self._speed - last.speed
+        thrust = self._vehicle.thrust
+        force = self._vehicle.mass * speed / BRAKE_S
+        return thrust.effort(force / thrust.backward) if speed > _SLOW else 0.0
 
     def _repeats(self, now_s: float, posture: Posture) -> bool:
         """Return whether the posture has been the same to the bit while an effort was in force."""

@@ -9,6 +9,7 @@ import numpy as np
 
 from aqualvs.control.gains import ControlGains
 from aqualvs.control.missions import FollowMission, HoldMission, Mission
+from aqualvs.control.safety import LimitReason
 from aqualvs.control.vehicle import Setpoint
 from aqualvs.follow.case import SimCase, sea
 from aqualvs.follow.log import (
@@ -63,12 +64,20 @@ class RandomDive:
         return HoldMission(self.setpoint)
 
     def run(self, seconds: float = SECONDS) -> LoopLog:
-        """Dive until the end, or until a human must take over, and return the log."""
+        """Dive until the end, or until a human has had time to take over, and return the log."""
         rng = np.random.default_rng([self.seed, 43])
         noise = PostureNoise(outliers=0.005)
         sensor = SampledSensor(self.case.net, rng, noise, self.blind, _WORKING_RANGE)
         loop = self.case.loop(sensor, self.mission())
-        return loop.run(seconds, lambda now_s: now_s - max(loop.seen_s, 0.0) < _GIVEN_UP_S)
+        told_s = math.inf
+
+        def goes_on(now_s: float) -> bool:
+            nonlocal told_s
+            if loop.log.rows and loop.log.rows[-1].reason == LimitReason.TIPPING.value:
+                told_s = min(told_s, now_s)
+            return now_s - min(max(loop.seen_s, 0.0), told_s) < _GIVEN_UP_S
+
+        return loop.run(seconds, goes_on)
 
 
 @dataclass(frozen=True, slots=True)
