@@ -330,5 +330,5 @@ def test_report_shows_each_hole_and_the_way_back(wall, tmp_path):
     write_net_files(dive.folder, wall, {})
     page = write_report(dive.folder).read_text(encoding="utf-8")
     assert page.count('alt="Hole 1 with its surroundings"') == 1
-    way = "depth 4.90 m, heading 57°, 1.20 m along the net, 6.0 s in the video"
+    way = "depth 4.90 m, heading 57°, 1.20 m along the net, nearest at 6.0 s"
     assert f"<b>Hole 1: 108 ± 12 mm</b><br>{way}" in page

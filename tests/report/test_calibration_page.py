@@ -198,7 +198,7 @@ def test_parts_that_are_empty_leave_no_heading() -> None:
     assert "<h2>" not in html
     assert "<h3>" not in html
     assert "<table" not in html
-    assert "Nothing to warn of" in html
+    assert "No warnings" in html
     assert "<h1>Camera</h1>" in html
 
 

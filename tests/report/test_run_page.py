@@ -219,7 +219,7 @@ def test_bare_lens_is_compared(tmp_path: Path) -> None:
     (dive.folder / "posture_bare.csv").write_text("\n".join(lines) + "\n")
     page = write_report(dive.folder, truth=write_truth(dive, 0.0)).read_text()
     words = " ".join(visible(page).split())
-    assert "range without, relative to with −20.00 % −20.00 % −20.00 %" in words
+    assert "range without the dome, relative to with it −20.00 % −20.00 % −20.00 %" in words
     worst = 200.0 * dive.range_m[frames].max()
     assert f"without it {200.0 * np.sqrt((dive.range_m[frames] ** 2).mean()):.2f} mm" in words
     assert f"{worst:.2f} mm" in words
@@ -415,7 +415,7 @@ def test_warnings_say_what_is_wrong(tmp_path: Path) -> None:
 
 def test_a_sound_run_has_no_warning(tmp_path: Path) -> None:
     dive = make_dive(tmp_path / "run")
-    assert "Nothing to warn of." in visible(write_report(dive.folder).read_text())
+    assert "No warnings." in visible(write_report(dive.folder).read_text())
 
 
 def test_saturated_stripes_are_noticed(tmp_path: Path) -> None:
@@ -579,9 +579,10 @@ def test_a_report_that_cannot_be_written_leaves_the_old_one(
 
 def test_a_page_escapes_its_texts_and_misses_none() -> None:
     texts = {"title": "<b>&", "subtitle": '"<i>"'}
-    html = filled_page("follow.html", texts, {"facts": "<table></table>", "figures": ""})
+    parts = {"cards": "", "warnings": "", "facts": "<table></table>"}
+    html = filled_page("follow.html", texts, {**parts, "figures": ""})
     assert "<title>&lt;b&gt;&amp; – aqualvs follow</title>" in html
     assert '<p class="sub">&#34;&lt;i&gt;&#34;</p>' in html
     assert "<table></table>" in html
     with pytest.raises(UndefinedError, match="figures"):
-        filled_page("follow.html", texts, {"facts": ""})
+        filled_page("follow.html", texts, parts)

@@ -121,7 +121,7 @@ def _page(folder: Path, records: Sequence[DiveRecord]) -> str:
         "title": folder.resolve().name,
         "subtitle": _rigs(records),
         "lead": lead,
-        "footer": f"Written {now()} by aqualvs {__version__}.",
+        "footer": f"Written {html.moment(now())} by aqualvs {__version__}.",
     }
     parts = {
         "cards": html.cards(_cards(records)),

@@ -183,11 +183,6 @@ def _page(
             f"± {max(sigmas['fx'], sigmas['fy']):.2f} px",
         ),
         Card("pictures", str(len(result.views)), f"{result.n_points:,} corners"),
-        Card(
-            "coverage",
-            f"{np.mean(result.coverage > 0):.0%}",
-            "of the picture's cells hold corners",
-        ),
     ]
     if np.isfinite(result.cross_validation_rms_px):
         cards.append(

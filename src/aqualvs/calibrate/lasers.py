@@ -368,7 +368,7 @@ def _words(figures: LaserFigures, laser: Laser) -> str:
     return (
         f"laser '{laser.name}': normal ± {_DEG * figures.sigma_normal:.3f} deg, offset "
         f"{1e3 * laser.plane.offset:.2f} ± {1e3 * figures.sigma_offset:.2f} mm, residual "
-        f"{figures.rms_px:.2f} px, {figures.n_points} points on {', '.join(figures.surfaces)}"
+        f"{figures.rms_px:.2f} px, {figures.n_points} points; seen on {', '.join(figures.surfaces)}"
     )
 
 

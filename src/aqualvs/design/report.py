@@ -5,6 +5,7 @@ figure is drawn, and only its Agg canvas: no display is needed.
 """
 
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -175,7 +176,7 @@ def offset_table(costs: Sequence[OffsetCost], ranges: Sequence[float]) -> Table:
         f"in calibration too\n{near}",
         f"\n{far}",
         f"n +{INDEX_ERROR:g}\n{far}",
-        "n told to\n+-",
+        "n known\nto +-",
     ):
         table.add_column(name, justify="right")
     for cost in costs:
@@ -216,7 +217,10 @@ def _percent(share: float) -> str:
 
 def change_table(found: Sequence[Change]) -> Table:
     """Return the table of changes and their effects, the most helpful first."""
-    table = _table("Changes, lasers tilted anew: errors grow by so many per cent", first="\nchange")
+    table = _table(
+        "Change of the errors in per cent by a change of the rig, lasers tilted anew",
+        first="\nchange",
+    )
     for name in ("\nall", "noise\nrange", "\nangle", "tolerances\nrange", "\nangle"):
         table.add_column(name, justify="right")
     for one in found:
@@ -367,14 +371,25 @@ def write_page(
     replace_text(path, html.page("design.html", texts, made))
 
 
+_LEADING_MINUS = re.compile(r"^-(?=\d)")
+
+
 def _as_html(table: Table) -> str:
     """Return a table of the terminal as one of a page."""
 
     def plain(cell: Any) -> str:
         return Text.from_markup(str(cell)).plain.replace("\n", " ").strip()
 
-    head = [plain(column.header) for column in table.columns]
-    cells = [[plain(cell) for cell in column.cells] for column in table.columns]
+    head, group = [], ""
+    for column in table.columns:
+        first, _, second = str(column.header).rpartition("\n")
+        # A column of numbers without a heading of its own shares that of the one before it.
+        group = first if first or column.justify != "right" else group
+        unit = ", " if group and second in ("mm", "%", "deg") else " "
+        head.append(plain(f"{group}{unit}{second}").replace(", deg", ", °"))
+    cells = [
+        [_LEADING_MINUS.sub("−", plain(cell)) for cell in column.cells] for column in table.columns
+    ]
     right = [i for i, column in enumerate(table.columns) if i and column.justify == "right"]
     return html.table(head, zip(*cells, strict=True), texts=min(right))
 

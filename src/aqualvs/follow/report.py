@@ -95,10 +95,10 @@ def _control(log: LoopLog) -> "Figure":
     time_s = log.column("time_s")
     _loop(axes[0], log, "range", 1.0)
     _name(axes[0], "range (m)", _MIN_RANGE)
-    _command(axes[1], time_s, log.column("forward"), "forward effort")
+    _command(axes[1], time_s, log.column("forward"), "forward effort (1 is full)")
     _loop(axes[2], log, "yaw", 180.0 / np.pi)
     _name(axes[2], "target yaw (deg)", _MIN_ANGLE)
-    _command(axes[3], time_s, log.column("turn"), "yaw effort")
+    _command(axes[3], time_s, log.column("turn"), "yaw effort (1 is full)")
     _legend(axes[0])
     _finish(axes, log, time_s)
     return figure
@@ -197,20 +197,20 @@ class RunFacts:
 def summary(log: LoopLog) -> list[tuple[str, str]]:
     """Return the results of a run, as names and values."""
     rows = log.rows
-    start_s = SETTLED_S if rows[-1].time_s > 2.0 * SETTLED_S else 0.5 * rows[-1].time_s
+    start_s = _settled_s(log)
     hold, safety = hold_measures(log, start_s), safety_measures(log)
     steered = sum(row.engaged for row in rows) / len(rows)
     figures = [
         (
             f"range error, rms from {start_s:.0f} s on",
-            f"{1e3 * hold.range_rms:.1f} mm (worst {1e3 * hold.range_worst:.0f} mm)",
+            f"{1e3 * hold.range_rms:.1f} mm (max {1e3 * hold.range_worst:.0f} mm)",
         ),
         ("yaw error, rms", f"{math.degrees(hold.yaw_rms):.2f} deg"),
         *_efforts(log, start_s),
         ("frames without a posture", f"{hold.n_lost}"),
         ("frames at which the safety gate stepped in", f"{hold.n_guarded}"),
         (
-            "nearest to the net",
+            "least distance from hull to net",
             f"{safety.min_clearance:.2f} m" + (" - CONTACT" if safety.contact else ""),
         ),
         ("share of the time under control", f"{100.0 * steered:.0f} %"),
@@ -221,6 +221,33 @@ def summary(log: LoopLog) -> list[tuple[str, str]]:
     if math.isfinite(safety.lost_s):
         figures.append(("LOST", f"the net, for good, at {safety.lost_s:.1f} s"))
     return figures
+
+
+def _settled_s(log: LoopLog) -> float:
+    end_s = log.rows[-1].time_s
+    return SETTLED_S if end_s > 2.0 * SETTLED_S else 0.5 * end_s
+
+
+def _headline(log: LoopLog) -> tuple[list[html.Card], list[str]]:
+    """Return the cards and the warnings of the page."""
+    start_s = _settled_s(log)
+    hold, safety = hold_measures(log, start_s), safety_measures(log)
+    since = f"rms from {start_s:.0f} s on"
+    cards = [
+        html.Card(
+            "Range error",
+            f"{1e3 * hold.range_rms:.1f} mm",
+            f"{since}; max {1e3 * hold.range_worst:.0f} mm",
+        ),
+        html.Card("Yaw error", f"{math.degrees(hold.yaw_rms):.2f}°", since),
+        html.Card("Hull to net", f"{safety.min_clearance:.2f} m", "least distance of the run"),
+    ]
+    warnings = []
+    if safety.contact:
+        warnings.append("The vehicle touched the net.")
+    if math.isfinite(safety.lost_s):
+        warnings.append(f"The net was lost for good at {safety.lost_s:.1f} s.")
+    return cards, warnings
 
 
 def _efforts(log: LoopLog, start_s: float) -> list[tuple[str, str]]:
@@ -266,11 +293,17 @@ def _page(log: LoopLog, facts: RunFacts, figures: Sequence[Path]) -> str:
         f"<figcaption>{escape(_CAPTIONS[figure.name])}</figcaption></figure>"
         for figure in figures
     )
-    parts = {"facts": html.fact_table(summary(log)), "figures": shown}
+    cards, warnings = _headline(log)
+    parts = {
+        "cards": html.cards(cards),
+        "warnings": html.notice(warnings),
+        "facts": html.fact_table(summary(log)),
+        "figures": shown,
+    }
     return html.page("follow.html", texts, parts)
 
 
 _CAPTIONS = {
     "figure_22.png": "Depth, range, heading and target yaw over time.",
-    "figure_23.png": "The controllers on range and yaw: setpoint, measured, true, and the command.",
+    "figure_23.png": "Range and yaw control: setpoint, measurement, truth and effort.",
 }

@@ -318,7 +318,7 @@ def write_page(path: Path, picture: Path, result: Comparison, origins: Mapping[s
     texts = {
         "title": f"The net from {first} to {last}",
         "subtitle": f"{len(result.surveys)} dives on {len(result.dates)} dates",
-        "footer": f"Written {now()} by aqualvs {__version__}.",
+        "footer": f"Written {html.moment(now())} by aqualvs {__version__}.",
     }
     parts = {
         "cards": html.cards(_cards(result)),

@@ -290,7 +290,7 @@ def _legend(figure: "Figure", wall: UnrolledNet) -> None:
     start = Line2D(
         [], [], linestyle="", marker=">", color=_PATH, markeredgecolor=_INK, markersize=8
     )
-    shown: dict[str, Line2D | Patch] = {"vehicle’s way": path, "its start": start}
+    shown: dict[str, Line2D | Patch] = {"vehicle’s track": path, "its start": start}
     if wall.holes:
         shown["hole with its number, to scale"] = Line2D(
             [], [], linestyle="", marker="o", markersize=9, color="white", markeredgecolor=_HOLE

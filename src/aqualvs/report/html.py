@@ -109,6 +109,11 @@ def data_url(data: bytes, kind: str) -> str:
     return f"data:image/{kind};base64,{b64encode(data).decode('ascii')}"
 
 
+def moment(value: object) -> str:
+    """Return a time stamp such as `2026-05-04T09:30:00+00:00` for readers."""
+    return str(value).replace("T", " ").replace("+00:00", " UTC")
+
+
 def text(value: object) -> str:
     """Return something from a file as HTML text."""
     return escape(str(value))
@@ -156,7 +161,7 @@ def cards(items: Iterable[Card]) -> str:
 def notice(warnings: Sequence[str]) -> str:
     """Return the box of warnings, or the all-clear."""
     if not warnings:
-        return '<div class="notice"><p>Nothing to warn of.</p></div>'
+        return '<div class="notice"><p>No warnings.</p></div>'
     items = "".join(f"<li>{escape(text)}</li>" for text in warnings)
     return f'<div class="notice warn"><p><b>Please note</b></p><ul>{items}</ul></div>'
 

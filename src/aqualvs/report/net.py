@@ -171,7 +171,7 @@ def _map(net: NetTables) -> str:
         return '<p class="note">net_map.png is missing.</p>'
     return (
         f'<figure><img class="wide" src="data:image/png;base64,{net.map_base64}" '
-        'alt="Map of the net wall: fouling, holes and the vehicle’s way"></figure>'
+        'alt="Map of the net wall: fouling, holes and the vehicle’s track"></figure>'
     )
 
 
@@ -180,7 +180,7 @@ def _holes(net: NetTables, crops: Mapping[str, SampleFrame]) -> str:
         return "<h3>Holes</h3><p>None was found.</p>"
     names = (
         *("hole", "diameter, mm", "width × height, mm", "meshes", *_PLACE_HEAD),
-        *("heading, °", "time", "frame"),
+        *("heading, °", "nearest at", "in frame"),
     )
     rows = [
         (
@@ -208,7 +208,7 @@ def _crop(row: Row, picture: SampleFrame) -> str:
         ("depth {} m", _cell(row, "depth_m", 2)),
         ("heading {}°", _cell(row, "heading_deg", 0)),
         ("{} m along the net", _cell(row, "along_m", 2)),
-        ("{} in the video", _time(row, "time_s")),
+        ("nearest at {}", _time(row, "time_s")),
         ("shown in frame {}", _cell(row, "picture_frame")),
     )
     way = ", ".join(words.format(value) for words, value in values if value != _NONE)

@@ -376,11 +376,12 @@ def _truth_view(track: Track, truth: FloatArray | None) -> str:
     ]
     relative = np.abs(track.posture[:, 0] / truth[:, 0] - 1.0)
     relative = 100.0 * relative[np.isfinite(relative)]
-    rows.append(("range, %", f"{np.sqrt((relative**2).mean()):.3f}", f"{relative.max():.3f}"))
+    share = f"{np.sqrt((relative**2).mean()):.3f}", f"{relative.max():.3f}"
+    rows.insert(1, ("range, %", *share))
     heading = f"<h3>Error against truth, {count} frames</h3>"
     return (
         heading
-        + html.table(("", "rms", "greatest"), rows)
+        + html.table(("", "rms", "max"), rows)
         + '<p class="note">Bands: one standard deviation, as the run states it.</p>\n'
         '<div class="chart" id="chart-error"></div>'
     )
@@ -420,11 +421,10 @@ def _cloud_view(points: PointSummary | None, planes_known: bool) -> str:
             '<button type="button" data-cloud="frame">the frame chosen above</button></div>'
         )
     return (
-        f'<p class="lead">{amount} target points. The whole dive is shown in the target’s frame: '
-        "right and up of the point nearest to the dome, and beyond the fitted plane, so that the "
-        "points of all frames lie on each other; the line is where the dome was. A frame is shown "
-        "as the vehicle saw it, with the dome as a hemisphere. Drag to turn, scroll or pinch to "
-        "zoom.</p>\n"
+        f'<p class="lead">{amount} points on the target. The whole dive is drawn relative to the '
+        "target, so that all frames coincide: the origin is the point of the target plane nearest "
+        "to the dome, and the black line spans the positions of the dome. A single frame is drawn "
+        "relative to the dome (the hemisphere). Drag to turn, scroll or pinch to zoom.</p>\n"
         f'{buttons}<div class="chart screen" id="chart-cloud"></div>'
         '<img class="paper" id="cloud-paper" alt="the same view, for paper">'
     )
@@ -478,10 +478,7 @@ def _quality_view(track: Track, points: PointSummary | None, names: list[str]) -
         for name, title, known in places
         if known
     )
-    return (
-        f'<div class="grid two tables">{reasons}{lasers}</div>\n'
-        f'{html.laser_legend(names)}<div class="grid two">{shown}</div>'
-    )
+    return f'{reasons}{lasers}\n{html.laser_legend(names)}<div class="grid two">{shown}</div>'
 
 
 def _bare_view(track: Track, bare: FloatArray | None, truth: FloatArray | None) -> str:
@@ -495,9 +492,12 @@ def _bare_view(track: Track, bare: FloatArray | None, truth: FloatArray | None) 
         return f'<section id="bare"><h2>With and without the dome</h2>{words}</section>'
     low, middle, high = percent.min(), np.median(percent), percent.max()
     rows = [
-        ("range without, relative to with", *(signed(f"{v:+.2f} %") for v in (low, middle, high)))
+        (
+            "range without the dome, relative to with it",
+            *(signed(f"{v:+.2f} %") for v in (low, middle, high)),
+        )
     ]
-    text = html.table(("", "least", "median", "greatest"), rows)
+    text = html.table(("", "min", "median", "max"), rows)
     if truth is not None:
         text += _both_errors(track.posture, bare, truth)
     return (
@@ -571,7 +571,7 @@ def _both_errors(dome: FloatArray, bare: FloatArray, truth: FloatArray) -> str:
         rms, worst, count = errors_against(truth, posture)
         if count:
             rows.append((name, f"{1e3 * rms[0]:.2f} mm", f"{1e3 * worst[0]:.2f} mm", f"{count}"))
-    return html.table(("range error against truth", "rms", "greatest", "frames"), rows)
+    return html.table(("range error against truth", "rms", "max", "frames"), rows)
 
 
 def _laser_row(index: int, laser: LaserFacts) -> tuple[str, ...]:
@@ -584,6 +584,6 @@ def _laser_row(index: int, laser: LaserFacts) -> tuple[str, ...]:
 
 def _footer(run: Mapping[str, Any], track: Track) -> str:
     """Return when the run took place and what made the page."""
-    when = " to ".join(str(run[key]) for key in ("started", "ended") if run.get(key))
+    when = " to ".join(html.moment(run[key]) for key in ("started", "ended") if run.get(key))
     said = f"Run from {when}. " if when else ""
     return f"{said}{len(track):,} frames over {clock(float(np.ptp(track.time_s)))}."

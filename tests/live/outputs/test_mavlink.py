@@ -247,6 +247,8 @@ def test_quality_leaves_one_to_the_invalid(qualities: list[float], expected: int
             SerialAddress("/dev/serial/by-id/usb-3D_Robotics_PX4_FMU-if00", 115200),
         ),
         ("COM3,57600", SerialAddress("COM3", 57600)),
+        ("COM12", SerialAddress("COM12", 115200)),
+        ("serial:COM3:57600", SerialAddress("COM3", 57600)),
     ],
 )
 def test_addresses_as_pilots_write_them(url: str, expected: object) -> None:
@@ -285,7 +287,6 @@ def test_no_port_ever_waits(kind: NetKind) -> None:
             assert opened.read() == (b"", ())
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="no serial ports there")
 def test_a_speed_that_the_system_does_not_know_is_refused() -> None:
     with pytest.raises(OptionError, match=r"123456 baud.*115200"):
         check_address(SerialAddress("/dev/ttyACM0", 123456))

@@ -158,8 +158,8 @@ def _unobservable(seen: Observability) -> list[str]:
         return []
     names = "; ".join(" with ".join(_WORDS.get(n, n) for n in d.main) for d in unobservable)
     return [
-        f"of the {len(seen.directions)} combinations of the dome's numbers the pictures tell "
-        f"{len(seen.directions) - len(unobservable)}; they tell nothing of: {names}"
+        f"the pictures determine {len(seen.directions) - len(unobservable)} of the "
+        f"{len(seen.directions)} combinations of the dome's parameters; not determined: {names}"
     ]
 
 

@@ -1,7 +1,6 @@
 """Addresses and ports of MAVLink peers: UDP, TCP and serial lines, all non-blocking.
 
-Addresses have the forms that pymavlink and ground stations use (`parse_address`). The serial port
-uses system calls of POSIX only.
+Addresses have the forms that pymavlink and ground stations use (`parse_address`).
 """
 
 import errno
@@ -19,7 +18,7 @@ from aqualvs.live.mavlink.peers import Peer
 DEFAULT_BAUD = 115_200
 _FORMS = (
     "write udpout:HOST:PORT, udpin:HOST:PORT, udpbcast:HOST:PORT, tcp:HOST:PORT "
-    "or /dev/ttyACM0,115200"
+    "or a serial port: serial:/dev/ttyACM0:115200, on Windows serial:COM3:115200"
 )
 _NET_KINDS: dict[str, "NetKind"] = {
     "udpout": "udpout",
@@ -85,7 +84,8 @@ def parse_address(url: str) -> Address:
         pymavlink), `udpbcast:HOST:PORT`, `tcp:HOST:PORT`; two slashes after the colon are allowed,
         and `udpclient`, `udpserver` and `tcpclient`, as BlueOS calls them.
         An empty host to listen at means every address of this computer.
-        `/dev/ttyACM0`, `/dev/ttyACM0,57600`, `serial:/dev/ttyACM0:57600`; 115200 baud if left out.
+        `/dev/ttyACM0`, `/dev/ttyACM0,57600`, `serial:/dev/ttyACM0:57600`, `COM3`, `COM3,57600`,
+        `serial:COM3:57600`; 115200 baud if left out.
 
     Raises
     ------
@@ -245,18 +245,13 @@ def check_address(address: Address) -> None:
     Raises
     ------
     OptionError
-        For a serial port where there are none, or at a speed that it does not know.
+        For a serial port without pyserial, or at a speed that it does not know.
     """
     if not isinstance(address, SerialAddress):
         return
-    try:
-        from aqualvs.live.mavlink.serial import speed_of
-    except ImportError as fault:
-        raise OptionError(
-            f"MAVLink connection {address.device}: serial ports need Linux or macOS; let MAVProxy "
-            "or BlueOS forward it, and use udpin:"
-        ) from fault
-    speed_of(address)
+    from aqualvs.live.mavlink.serial import check_speed
+
+    check_speed(address)
 
 
 def _open_udp(address: NetAddress, *, passive: bool) -> tuple[socket.socket, tuple[object, ...]]:

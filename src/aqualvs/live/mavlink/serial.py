@@ -1,38 +1,48 @@
-"""A serial port by the system's own calls; POSIX only."""
+"""A serial port by pyserial: Linux, macOS and Windows."""
 
-import fcntl
+import contextlib
 import os
-import struct
-import termios
+import select
+import socket
+import threading
 
 from aqualvs.errors import OptionError
 from aqualvs.live.mavlink.ports import SerialAddress, StreamPort
 
 _CHUNK = 4096
 _BITS_PER_BYTE = 10
-_COMMON = (9600, 38400, 57600, 115200, 230400, 460800, 921600, 1500000)
+# How long the reader waits for a byte before it looks whether the port was closed.
+_READ_S = 0.1
+# On Windows, a write that the driver does not take at once is given up after this time.
+_WRITE_S = 0.1
 
 
-def speed_of(address: SerialAddress) -> int:
-    """Return the system's code of a speed.
+def check_speed(address: SerialAddress) -> None:
+    """Raise if pyserial is missing, or there is no such speed.
 
     Raises
     ------
     OptionError
-        If it knows no such speed.
     """
-    code: int | None = getattr(termios, f"B{address.baud}", None)
-    if not code:
-        known = ", ".join(str(baud) for baud in _COMMON if hasattr(termios, f"B{baud}"))
+    try:
+        from serial import Serial
+    except ImportError as fault:
+        raise OptionError(
+            f"MAVLink connection {address.device}: serial ports need pyserial: "
+            "pip install 'aqualvs[mavlink]'"
+        ) from fault
+    if address.baud not in Serial.BAUDRATES:
+        known = ", ".join(str(baud) for baud in Serial.BAUDRATES if baud >= 9600)
         raise OptionError(
             f"MAVLink connection {address.device}: speed {address.baud} baud is unknown here; "
             f"use one of {known}"
         )
-    return code
 
 
 class SerialPort(StreamPort):
     """A serial port with eight bits, no parity, one stop bit and no flow control.
+
+    A thread reads, because Windows cannot wait for serial ports and sockets together.
 
     Parameters
     ----------
@@ -46,52 +56,70 @@ class SerialPort(StreamPort):
 
     def __init__(self, address: SerialAddress) -> None:
         super().__init__()
+        # Only those who have a serial line need it.
+        from serial import Serial
+
         self._bytes_per_s = address.baud / _BITS_PER_BYTE
-        self._number = os.open(address.device, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+        write_s = 0.0 if os.name == "posix" else _WRITE_S
         try:
-            _make_raw(self._number, speed_of(address))
-        except termios.error as fault:
-            os.close(self._number)
-            raise OSError(fault.args[0], "this is no serial port") from fault
+            self._serial = Serial(
+                address.device, address.baud, timeout=_READ_S, write_timeout=write_s
+            )
+        except Exception as fault:
+            raise _as_os_error(fault) from fault
+        self._received, self._incoming = socket.socketpair()
+        self._received.setblocking(False)
+        self._closing = False
+        self._reader = threading.Thread(
+            target=self._pour, name=f"serial {address.device}", daemon=True
+        )
+        self._reader.start()
 
     @property
     def lag_s(self) -> float:
         """How long the driver is going to send what it holds already."""
-        answer = fcntl.ioctl(self._number, termios.TIOCOUTQ, b"\0\0\0\0")
-        return float(struct.unpack("i", answer)[0]) / self._bytes_per_s
+        return float(self._serial.out_waiting) / self._bytes_per_s
 
     def fileno(self) -> int:
         """Return the number to wait on."""
-        return self._number
+        return self._received.fileno()
 
     def close(self) -> None:
         """Free the port at once; what waits is lost."""
-        if self._number < 0:
+        if self._closing:
             return
-        number, self._number = self._number, -1
-        try:
-            # Without this, closing waits until the driver has sent what it holds.
-            termios.tcflush(number, termios.TCOFLUSH)
-        except termios.error:
-            pass
-        finally:
-            os.close(number)
+        self._closing = True
+        # The reader may wait for room.
+        self._received.close()
+        with contextlib.suppress(OSError):
+            self._serial.cancel_read()
+        self._reader.join()
+        # Without this, closing waits until the driver has sent what it holds. Of a device that has
+        # gone, pyserial also passes on errors of the system that are no OSError.
+        with contextlib.suppress(Exception):
+            self._serial.reset_output_buffer()
+        self._serial.close()
+
+    def _pour(self) -> None:
+        """Pass on what comes until the port is closed or gone."""
+        with self._incoming, contextlib.suppress(OSError):
+            while not self._closing:
+                size = min(_CHUNK, max(1, self._serial.in_waiting))
+                self._incoming.sendall(self._serial.read(size))
 
     def _take(self) -> bytes:
-        return os.read(self._number, _CHUNK)
+        return self._received.recv(_CHUNK)
 
     def _give(self, data: bytes) -> int:
-        return os.write(self._number, data)
+        # pyserial tries again and again while there is no room.
+        if os.name == "posix" and not select.select((), (self._serial,), (), 0)[1]:
+            raise BlockingIOError
+        return self._serial.write(data) or 0
 
 
-def _make_raw(number: int, speed: int) -> None:
-    """Pass bytes through as they are."""
-    state = termios.tcgetattr(number)
-    state[0] = termios.IGNBRK
-    state[1] = 0
-    state[2] = termios.CS8 | termios.CREAD | termios.CLOCAL
-    state[3] = 0
-    state[4] = state[5] = speed
-    # With a minimum of 1 an idle port says "not now"; an empty read then means that it has gone.
-    state[6][termios.VMIN], state[6][termios.VTIME] = 1, 0
-    termios.tcsetattr(number, termios.TCSANOW, state)
+def _as_os_error(fault: Exception) -> OSError:
+    """Return why a port cannot be opened; pyserial's own text names the device three times."""
+    number = fault.args[0] if fault.args and isinstance(fault.args[0], int) else None
+    if number is None:
+        return OSError(0, "this is no serial port")
+    return OSError(number, os.strerror(number))

@@ -101,7 +101,7 @@
         traces.push({ ...shading(chart.stretches, strip.axis), yaxis: y, type: "scatter",
           mode: "lines", fill: "toself", fillcolor: "rgba(90,100,106,0.17)", line: { width: 0 },
           hoverinfo: "skip", name: "no posture", showlegend: i === 0, legendrank: 2000 });
-      for (const [key, ink, name] of [["total", 0.13, "±σ, frame and rig"], ["sigma", 0.22, "±σ, frame alone"]])
+      for (const [key, ink, name] of [["total", 0.2, "±σ, frame and rig"], ["sigma", 0.3, "±σ, frame alone"]])
         traces.push({ ...band(strip, strip[key]), yaxis: y, type: "scatter", mode: "lines", fill: "toself",
           fillcolor: faded(MEASURED, ink), line: { width: 0 }, hoverinfo: "skip",
           name, showlegend: i === 0, legendgroup: `band-${key}` });
@@ -229,6 +229,8 @@
       hovertemplate: `right %{x:.0f}<br>${mode === "frame" ? "forward" : "beyond the plane"} %{y:.0f}<br>up %{z:.0f} mm`,
     }));
     traces.push(mode === "frame" ? dome() : domePlaces());
+    // A narrow page shows less beside the middle.
+    const far = place.clientWidth < 600 ? 1.5 : 1.1;
     const of3 = (title) => ({ title: { text: title }, gridcolor: GRID, color: INK, zeroline: false,
                               backgroundcolor: PAPER, showspikes: false, nticks: 6 });
     const shape = layout({ height: 500, margin: { l: 0, r: 0, t: 30, b: 0 },
@@ -237,7 +239,7 @@
       scene: { aspectmode: "data", xaxis: of3("right, mm"), yaxis: of3(mode === "frame" ? "forward, mm" : "beyond the plane, mm"),
                zaxis: of3("up, mm"), camera: mode === "frame"
                  ? { eye: { x: -1.6, y: -1.5, z: 0.95 }, center: { x: 0.1, y: 0.05, z: -0.22 } }
-                 : { eye: { x: -0.7, y: -1.7, z: 0.7 }, center: { x: 0, y: 0.1, z: -0.1 } } } });
+                 : { eye: { x: -0.95 * far, y: -1.75 * far, z: 0.8 * far }, center: { x: 0, y: 0, z: -0.12 } } } });
     if (place.data) Plotly.react(place, traces, shape, SOLID);
     else {
       draw("chart-cloud", traces, shape, SOLID);

@@ -55,7 +55,7 @@ function link(kind, words) {
 
 function hear(message) {
   if (message.kind === "rig") greet(message);
-  else if (message.kind === "refused") $("answer").textContent = message.why;
+  else if (message.kind === "refused") answer(message.why);
   else if (message.kind === "state") take(message);
 }
 
@@ -75,7 +75,13 @@ function greet(message) {
   const [near, far] = rig.working_range_m;
   Object.assign($("set-range"), { min: near, max: far, placeholder: `${near}–${far}` });
   for (const element of document.querySelectorAll("#commands button, #commands input")) element.disabled = !rig.may_command;
-  $("answer").textContent = rig.may_command ? "" : "Open the page with its token to command.";
+  answer(rig.may_command ? "" : "To record and to set an aim, open the page with its token.", true);
+}
+
+/** What became of a command; in red, unless it is a note. */
+function answer(words, note = false) {
+  $("answer").textContent = words;
+  $("answer").classList.toggle("note", note);
 }
 
 function take(message) {
@@ -162,7 +168,7 @@ function guide(valid, stale) {
   const level = nearest < TOO_NEAR ? "bad" : nearest < NEAR ? "warn" : "ok";
   const off = setpoint && Number(posture.range_m) - setpoint.range_m;
   const way = Math.abs(off) < ON_RANGE ? "✓ on range" : `${off > 0 ? "▲" : "▼"} ${Math.abs(off).toFixed(2)} m too ${off > 0 ? "far" : "near"}`;
-  $("error-range").textContent = !valid ? "" : level !== "ok" ? "Too near: go back" : setpoint ? way : "";
+  $("error-range").textContent = !valid ? "" : level === "bad" ? "Too near: go back" : level === "warn" ? "Near: no closer" : setpoint ? way : "";
   const aim = setpoint ? setpoint.yaw_deg : 0;
   const turn = Number(posture.yaw_deg) - aim;
   const there = Math.abs(turn) < ON_YAW;
@@ -201,9 +207,9 @@ function health(stale) {
   ];
   $("parts").replaceChildren(...items);
   const total = found.delays_ms.total;
-  const delay = total ? `, ${total[0].toFixed(1)} ms` : "";
+  const delay = total ? `, delay ${total[0].toFixed(0)} ms` : "";
   $("rates").title = total ? `delay: ${total[0].toFixed(1)} ms, 99 % below ${total[1].toFixed(1)} ms` : "";
-  $("rates").textContent = `${found.rate_hz.toFixed(0)} Hz${delay}, ${found.n_dropped} skipped, ${found.n_lost} lost`;
+  $("rates").textContent = `${found.rate_hz.toFixed(0)} frames/s${delay}, ${found.n_dropped} skipped, ${found.n_lost} lost`;
 }
 
 function commands() {
@@ -222,12 +228,12 @@ const size = (bytes) => (bytes < 1e9 ? `${(bytes / 1e6).toFixed(0)} MB` : `${(by
 const lasting = (s) => (s < 5400 ? `${Math.floor(s / 60)} min` : `${Math.floor(s / 3600)} h`);
 
 $("record").onclick = () => {
-  $("answer").textContent = "";
+  answer("");
   say({ kind: "record", on: $("record").getAttribute("aria-pressed") !== "true" });
 };
 $("setpoint").onsubmit = (event) => {
   event.preventDefault();
-  $("answer").textContent = "";
+  answer("");
   say({ kind: "setpoint", range_m: Number($("set-range").value), yaw_deg: Number($("set-yaw").value) });
 };
 $("set-clear").onclick = () => say({ kind: "setpoint", range_m: null });
