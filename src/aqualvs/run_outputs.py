@@ -329,7 +329,7 @@ class RunBareLens(Closing):
         self._path = folder / POSTURE_BARE_CSV
         self._ratios = array("d")
         self._file: PostureCsv | None = None
-        if rig.dome is not None:
+        if rig.housing is not None:
             with writing(self._path):
                 self._file = PostureCsv(self._path)
 

@@ -6,6 +6,7 @@ import pytest
 
 from aqualvs.calibrate.common import load_nominal
 from aqualvs.errors import RigError
+from aqualvs.optics.dome import Dome
 from aqualvs.optics.rigfile import save_rig
 from aqualvs.simulation.scenarios import example_rig
 
@@ -21,9 +22,9 @@ def test_a_nominal_file(tmp_path):
     assert nominal.wavelength_nm == 650.0
     assert (nominal.name, nominal.size_px, nominal.n_lasers) == ("blue", (720, 576), 3)
     assert nominal.n_air == 1.0002
-    assert nominal.dome is not None
-    assert nominal.dome.inner_radius == pytest.approx(0.04425, rel=1e-12)
-    assert nominal.dome.n_acrylic == 1.48
+    assert isinstance(nominal.housing, Dome)
+    assert nominal.housing.inner_radius == pytest.approx(0.04425, rel=1e-12)
+    assert nominal.housing.n_acrylic == 1.48
 
 
 def test_a_rig_file_serves_too(tmp_path):
@@ -31,7 +32,7 @@ def test_a_rig_file_serves_too(tmp_path):
     save_rig(rig, tmp_path / "rig.yaml")
     nominal = load_nominal(tmp_path / "rig.yaml")
     assert nominal.size_px == rig.size_px
-    assert nominal.dome == rig.dome
+    assert nominal.housing == rig.dome
     assert nominal.n_lasers == len(rig.lasers)
     assert nominal.n_water == rig.n_water
     assert nominal.wavelength_nm is None

@@ -17,7 +17,7 @@ def request(**given):
 
 @pytest.mark.parametrize(("n_water", "n_expected"), [(1.0003, WATER_N), (1.3412, 1.3412)])
 def test_a_camera_that_was_bare_in_air_goes_into_the_water_with_its_dome(n_water, n_expected):
-    bare = replace(example_rig().in_water(n_water), dome=None)
+    bare = replace(example_rig().in_water(n_water), housing=None)
     rig = _with_dome(bare, request(inner_radius_mm=44.25, thickness_mm=5.75))
     assert rig.dome == Dome(0.04425, 0.00575, 1.49)
     assert rig.n_water == n_expected

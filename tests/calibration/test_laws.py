@@ -100,7 +100,7 @@ def test_a_larger_world_gives_a_larger_rig(factor: float) -> None:
     views = tuple(View(v.name, v.ids, factor * v.points, v.pixels) for v in shoot.views)
     shell = rig.dome
     grown = replace(
-        rig, dome=Dome(factor * shell.inner_radius, factor * shell.thickness, shell.n_acrylic)
+        rig, housing=Dome(factor * shell.inner_radius, factor * shell.thickness, shell.n_acrylic)
     )
     wider = replace(QUICK, inner_radius_sigma=factor * 1e-4, thickness_sigma=factor * 1e-4)
     small = dome(guessed(rig, rotation_known=True), [shoot.as_set()], QUICK, INTRINSICS)

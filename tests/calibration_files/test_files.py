@@ -140,7 +140,7 @@ def test_readers_of_python_read_the_yaml_and_the_literal(tmp_path):
 
 def test_refractive_colmap_needs_a_dome():
     with pytest.raises(RigError, match="has no dome"):
-        camera_text(camera_of_rig(replace(RIG, dome=None)), "colmap-underwater")
+        camera_text(camera_of_rig(replace(RIG, housing=None)), "colmap-underwater")
 
 
 # What is refused. ---------------------------------------------------------------------------------

@@ -63,7 +63,7 @@ def test_equal_rigs_are_equal(tmp_path: Path) -> None:
 
 def test_the_consequence_is_what_the_old_rig_reads(tmp_path: Path) -> None:
     """A bare camera and parallel sheets at offset b: the range is in proportion to b."""
-    rig = replace(example_rig(), dome=None)
+    rig = replace(example_rig(), housing=None)
     lengths = np.array(
         [*rig.dome_from_cam.translation, *(laser.plane.offset for laser in rig.lasers)]
     )
@@ -100,7 +100,7 @@ def test_what_is_significant_may_not_matter(tmp_path: Path) -> None:
     ("new", "words"),
     [
         (bluerov2_rig(), "The pictures are 1920x1080 px and were 720x576 px"),
-        (replace(example_rig(), dome=None), "Only the old rig has a dome."),
+        (replace(example_rig(), housing=None), "Only the old rig has a dome."),
         (
             replace(example_rig(), lens=replace(example_rig().lens, distortion=())),
             "The lens models differ",

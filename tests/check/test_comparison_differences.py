@@ -9,7 +9,7 @@ from aqualvs.check.comparison import rig_difference
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig import Rig, RigUncertainty, rig_moved_by, rig_parameter_names
-from aqualvs.simulation.scenarios import example_rig
+from aqualvs.simulation.scenarios import example_rig, flat_port_rig
 
 NONE = RigUncertainty.none()
 RIG = example_rig()
@@ -35,6 +35,15 @@ def test_the_change_is_the_step_that_was_made() -> None:
     np.testing.assert_array_equal(found.covariance, 0.0)
     assert found.sigmas(NAMES) is None
     assert found.has_moved(NAMES) is None
+
+
+def test_the_change_of_a_flat_port_is_the_step_that_was_made() -> None:
+    rig = flat_port_rig()
+    names = rig_parameter_names(rig)
+    step = np.linspace(-1.0, 1.0, len(names)) * 1e-3
+    found = rig_difference(rig_moved_by(rig, names, step), rig, NONE, NONE)
+    order = [found.names.index(name) for name in names]
+    np.testing.assert_allclose(found.change[order], step, rtol=1e-9, atol=3e-13)
 
 
 def test_the_same_rig_has_not_changed() -> None:
@@ -114,7 +123,7 @@ def test_sigmas_turn_with_the_basis_of_the_new_plane() -> None:
 
 
 def test_what_the_rigs_do_not_share_is_left_out() -> None:
-    other = replace(RIG, dome=None, size_px=(640, 480), lasers=RIG.lasers[1:])
+    other = replace(RIG, housing=None, size_px=(640, 480), lasers=RIG.lasers[1:])
     found = rig_difference(other, RIG, NONE, NONE)
     assert "fx" not in found.names
     assert "inner_radius" not in found.names

@@ -20,11 +20,12 @@ from aqualvs.optics.expected_error import (
     point_per_pixel,
     see_stripe,
 )
-from aqualvs.optics.lens import Lens
+from aqualvs.optics.flat_port import FlatPort
+from aqualvs.optics.lens import Lens, LensModel
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Laser, Rig, RigUncertainty, Window
 from aqualvs.optics.rigfile import save_rig
 from aqualvs.optics.sheet import Sheet, sheets_of
-from aqualvs.simulation.scenarios import bluerov2_rig, example_rig
+from aqualvs.simulation.scenarios import bluerov2_rig, example_rig, flat_port_rig
 
 
 def pinhole(*lasers: Laser) -> Rig:
@@ -34,7 +35,7 @@ def pinhole(*lasers: Laser) -> Rig:
         size_px=(641, 481),
         lens=Lens(fx=800.0, fy=800.0, cx=320.0, cy=240.0),
         dome_from_cam=SE3(DOME_FROM_CAM_NOMINAL, np.zeros(3)),
-        dome=None,
+        housing=None,
         n_air=1.0,
         n_water=1.3333,
         lasers=lasers,
@@ -67,6 +68,20 @@ def test_example_rigs_are_sane(rig: Rig) -> None:
     findings = check_rig(rig)
     assert sentences(findings, Severity.BAD) == ""
     assert "The lens lies" in sentences(findings, Severity.OK)
+
+
+def test_a_flat_port_is_described() -> None:
+    findings = check_rig(flat_port_rig())
+    assert sentences(findings, Severity.BAD) == ""
+    said = sentences(findings, Severity.OK)
+    assert "a flat port, 12 mm ahead, 5 mm thick and tilted by 0.7 degrees" in said
+    assert "A flat port shows the water's index" in said
+    steep = replace(
+        flat_port_rig(),
+        housing=FlatPort(0.012, 0.005, 1.49, 0.7),
+        lens=Lens(model=LensModel.FISHEYE, fx=560.0, fy=560.0, cx=959.5, cy=539.5),
+    )
+    assert "light misses the flat port" in sentences(check_rig(steep), Severity.WARN)
 
 
 def test_field_of_view_of_a_pinhole() -> None:
@@ -129,7 +144,7 @@ def test_index_is_seen_by_a_decentred_lens_only() -> None:
     assert all(a > b for a, b in itertools.pairwise(at))
     centred = replace(rig, dome_from_cam=SE3(rig.dome_from_cam.rotation, np.zeros(3)))
     assert index_sigma(centred) > 0.1
-    assert index_sigma(replace(rig, dome=None)) == np.inf
+    assert index_sigma(replace(rig, housing=None)) == np.inf
 
 
 def test_index_sigma_is_that_of_a_monte_carlo() -> None:

@@ -31,7 +31,7 @@ def folder(tmp_path_factory):
     save_board(replace(board, dictionary="DICT_5X5_100"), path / "other.yaml")
     rig = replace(example_rig(), size_px=SIZE, lasers=(), solved_from={})
     save_rig(rig, path / "rig.yaml")
-    save_rig(replace(rig, dome=None), path / "bare.yaml")
+    save_rig(replace(rig, housing=None), path / "bare.yaml")
     (path / "box.yaml").write_text(
         "frame: G\nplanes:\n  wall: {normal: [0, 1, 0], d: 700}\nfamily: DICT_APRILTAG_36h11\n"
         "markers:\n- {id: 0, plane: wall, size_mm: 48, corners: [[0, 700, 48], [48, 700, 48], "

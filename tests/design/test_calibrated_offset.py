@@ -55,4 +55,4 @@ def test_the_designs_own_offset_and_its_centring_are_among_them(design):
     assert 0.3e-3 in offsets
     assert round(own, 5) in offsets
     assert max(offsets) < design.rig.dome.inner_radius
-    assert offset_costs(replace(design, rig=replace(design.rig, dome=None)), RANGES) == ()
+    assert offset_costs(replace(design, rig=replace(design.rig, housing=None)), RANGES) == ()

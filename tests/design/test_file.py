@@ -10,7 +10,8 @@ import yaml
 
 from aqualvs.design.file import EXAMPLE, design_from, design_of_rig, load_design
 from aqualvs.design.settings import Tolerances
-from aqualvs.errors import AqualvsError
+from aqualvs.errors import AqualvsError, OptionError
+from aqualvs.optics.flat_port import FlatPort
 from aqualvs.optics.rigfile import save_rig
 from aqualvs.simulation.scenarios import example_rig
 
@@ -74,6 +75,14 @@ def test_fisheyes_and_bare_lenses():
     wide = read(camera={"width_px": 1000, "height_px": 800, "fov_deg": 160, "model": "fisheye"})
     assert wide.rig.lens.fx == pytest.approx(500.0 / math.radians(80.0))
     assert read(dome=None).rig.dome is None
+
+
+def test_flat_ports():
+    flat = {"distance_mm": 12, "thickness_mm": 5, "n_port": 1.5, "tilt_deg": [1, 0]}
+    rig = read(dome=None, flat=flat).rig
+    assert rig.housing == FlatPort(0.012, 0.005, 1.5, math.radians(1.0))
+    with pytest.raises(OptionError, match="dome and flat are both given"):
+        read(flat=flat)
 
 
 def test_a_rig_that_exists_is_a_design_with_its_own_lasers():

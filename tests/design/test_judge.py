@@ -55,7 +55,7 @@ def pinhole(width: int = 1000, focal: float = 700.0, **changes) -> Rig:
         size_px=(width, width),
         lens=Lens(fx=focal, fy=focal, cx=middle, cy=middle),
         dome_from_cam=SE3(DOME_FROM_CAM_NOMINAL, np.zeros(3)),
-        dome=None,
+        housing=None,
         n_air=1.0,
         n_water=1.0,
         lasers=(),
@@ -160,7 +160,7 @@ def test_tolerances_are_what_moved_rigs_read():
 
 
 def test_the_water_does_not_matter_to_a_bare_lens():
-    told = predict(as_design(replace(example_rig(), dome=None)), [0.5])
+    told = predict(as_design(replace(example_rig(), housing=None)), [0.5])
     np.testing.assert_array_equal(told.systematic["water index"], 0.0)
 
 

@@ -69,7 +69,7 @@ def test_rays_from_the_centre_do_not_bend():
 
 def test_bare_lens_has_no_rays_through_a_dome():
     with pytest.raises(RigError, match="no dome"):
-        bending(replace(RIG, dome=None), PIXELS)
+        bending(replace(RIG, housing=None), PIXELS)
 
 
 def test_bands_take_more_of_the_picture_the_longer_the_range():

@@ -49,7 +49,7 @@ def fan_rig(fan: Fan, working_range: tuple[float, float] = (0.3, 1.0)) -> Rig:
         size_px=(2208, 1242),
         lens=Lens(fx=1407.86, fy=1407.12, cx=1083.25, cy=623.67, distortion=(0.0, 0.0, 0.0, 0.0)),
         dome_from_cam=SE3(DOME_FROM_CAM_NOMINAL, np.zeros(3)),
-        dome=None,
+        housing=None,
         n_air=1.0003,
         n_water=1.0003,
         lasers=tuple(lasers),

@@ -6,7 +6,7 @@ import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
-from aqualvs.optics.camera import BareCamera, DomeCamera
+from aqualvs.optics.camera import BareCamera, DomeCamera, FlatCamera, FlatPort
 from aqualvs.optics.dome import Dome
 from aqualvs.optics.lens import Lens, LensModel
 
@@ -60,6 +60,28 @@ def dome_camera(
         lens=lens,
         dome_from_cam=pose(lens_mm, rotvec),
         dome=dome,
+        n_air=n_air,
+        n_water=n_water,
+    )
+
+
+PORT = FlatPort(0.031, 0.006, 1.49, 0.02, -0.03)
+
+
+def flat_camera(
+    port: FlatPort = PORT,
+    *,
+    lens_mm: tuple[float, float, float] = (3.1, 41.8, 3.0),
+    lens: Lens = PAPER_LENS,
+    n_air: float = 1.0003,
+    n_water: float = 1.3333,
+    rotvec: tuple[float, float, float] = (0.04, 0.029, 0.016),
+) -> FlatCamera:
+    return FlatCamera(
+        size_px=SIZE_PX,
+        lens=lens,
+        dome_from_cam=pose(lens_mm, rotvec),
+        port=port,
         n_air=n_air,
         n_water=n_water,
     )

@@ -127,7 +127,7 @@ def test_both_errors_add_as_variances() -> None:
 
 def test_one_metre_of_offset_is_worth_what_geometry_says() -> None:
     """All sheets and the lens scaled alike scale the range: an error of scale is an error of 1."""
-    rig = replace(example_rig(), dome=None)
+    rig = replace(example_rig(), housing=None)
     names = ["lens_x", "lens_y", "lens_z", *(f"{laser.name}:offset" for laser in rig.lasers)]
     lengths = [*rig.dome_from_cam.translation, *(laser.plane.offset for laser in rig.lasers)]
     error = 1e-3 * np.array(lengths)

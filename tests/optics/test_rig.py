@@ -31,7 +31,7 @@ def test_rig_gives_its_cameras() -> None:
     rig = example_rig()
     assert isinstance(rig.camera(), DomeCamera)
     assert isinstance(rig.bare_camera(), BareCamera)
-    bare = Rig(**{name: getattr(rig, name) for name in Rig.__slots__} | {"dome": None})
+    bare = Rig(**{name: getattr(rig, name) for name in Rig.__slots__} | {"housing": None})
     assert isinstance(bare.camera(), BareCamera)
 
 

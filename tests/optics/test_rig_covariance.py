@@ -167,7 +167,7 @@ def test_windows_and_the_water_in_front_of_them_count() -> None:
 
 def test_a_curved_net_answers_with_its_own_coefficients() -> None:
     """All points pushed outward by a number that stands for a shift of the camera."""
-    rig = replace(example_rig(), dome=None)
+    rig = replace(example_rig(), housing=None)
     base = Plane(np.array([0.0, 1.0, 0.0]), 0.6)
     patch = Patch(
         base,
@@ -222,6 +222,6 @@ def test_what_was_calibrated_keeps_its_own_uncertainty() -> None:
 
 
 def test_a_bare_rig_in_air_has_neither_dome_nor_water() -> None:
-    rig = replace(example_rig(), dome=None, n_water=1.0003)
+    rig = replace(example_rig(), housing=None, n_water=1.0003)
     names = {name for name in completed_uncertainty(rig).names if ":" not in name}
     assert names == {"fx", "fy", "cx", "cy", "k1"}

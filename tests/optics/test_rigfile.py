@@ -1,6 +1,8 @@
 """The rig file: what is read, what is refused and in which words, and that nothing drifts."""
 
+import copy
 import json
+import math
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +16,9 @@ from hypothesis import strategies as st
 
 from aqualvs.errors import OutputError, RigError
 from aqualvs.geometry import SE3, Plane, rotation_from_rotvec
+from aqualvs.optics.camera import FlatCamera
 from aqualvs.optics.dome import Dome
+from aqualvs.optics.flat_port import FlatPort
 from aqualvs.optics.lens import Lens, LensModel
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Laser, Rig
 from aqualvs.optics.rigfile import load_rig, rig_from_mapping, rig_to_mapping, save_rig
@@ -65,7 +69,7 @@ def hand_written(**changes: Any) -> dict[str, Any]:
         if value is ...:
             del part[key]
         else:
-            part[key] = value
+            part[key] = copy.deepcopy(value)
     return content
 
 
@@ -75,8 +79,8 @@ def same(one: Rig, other: Rig, *, rotation_atol: float = 0.0) -> bool:
     return (
         np.allclose(turn, other_turn, rtol=0.0, atol=rotation_atol)
         and np.array_equal(one.dome_from_cam.translation, other.dome_from_cam.translation)
-        and (one.name, one.size_px, one.lens, one.dome)
-        == (other.name, other.size_px, other.lens, other.dome)
+        and (one.name, one.size_px, one.lens, one.housing)
+        == (other.name, other.size_px, other.lens, other.housing)
         and (one.n_air, one.n_water, one.working_range)
         == (other.n_air, other.n_water, other.working_range)
         and [laser.name for laser in one.lasers] == [laser.name for laser in other.lasers]
@@ -153,6 +157,28 @@ def test_bare_lens_and_fisheye() -> None:
     assert same(rig, rig_from_mapping(rig_to_mapping(rig), source_name="y"))
 
 
+@pytest.mark.parametrize("housing", [..., "flat"])
+def test_a_flat_port(housing: object) -> None:
+    changes = FLAT if housing is ... else FLAT | {"housing": housing}
+    rig = rig_from_mapping(hand_written(**changes), source_name="x")
+    tilt = math.radians(0.4), math.radians(-0.2)
+    assert rig.housing == FlatPort(0.012, 0.005, 1.49, *tilt)
+    assert (rig.dome, rig.flat_port) == (None, rig.housing)
+    assert isinstance(rig.camera(), FlatCamera)
+    np.testing.assert_array_equal(rig.dome_from_cam.translation, np.zeros(3))
+    assert rig_to_mapping(rig)["housing"] == "flat"
+    again = rig_from_mapping(rig_to_mapping(rig), source_name="y")
+    assert again.housing == rig.housing
+
+
+def test_the_housing_may_be_named() -> None:
+    named = rig_from_mapping(hand_written(housing="dome"), source_name="x")
+    assert same(named, rig_from_mapping(hand_written(), source_name="x"))
+    assert "housing" not in rig_to_mapping(named)
+    bare = rig_from_mapping(hand_written(dome=..., housing="none"), source_name="x")
+    assert bare.housing is None
+
+
 def test_lasers_may_be_missing_only_before_their_calibration() -> None:
     content = hand_written(lasers=...)
     assert rig_from_mapping(content, source_name="x", need_lasers=False).lasers == ()
@@ -161,6 +187,12 @@ def test_lasers_may_be_missing_only_before_their_calibration() -> None:
 
 
 WINDOW = {"normal": [0.0, 1.0, 0.0], "offset_mm": 40.0, "source_mm": [0.0, 0.0, -152.0]}
+
+FLAT: dict[str, Any] = {
+    "dome": ...,
+    "camera__position_mm": ...,
+    "flat": {"distance_mm": 12.0, "thickness_mm": 5.0, "n_port": 1.49, "tilt_deg": [0.4, -0.2]},
+}
 
 FAULTS: list[tuple[dict[str, Any], tuple[str, ...]]] = [
     ({"aqualvs_rig": ...}, ("aqualvs_rig is missing", "aqualvs_rig: 1")),
@@ -199,6 +231,20 @@ FAULTS: list[tuple[dict[str, Any], tuple[str, ...]]] = [
     ({"dome__thickness_mm": -1}, ("dome.thickness_mm is -1", "at least 0")),
     ({"dome__inner_radius_mm": 0}, ("dome.inner_radius_mm is 0", "greater than 0")),
     ({"dome__n_acrylic": 0.9}, ("dome.n_acrylic is 0.9", "at least 1")),
+    ({"flat": FLAT["flat"]}, ("dome and flat: both are given", "leave one out")),
+    ({"housing": "flat"}, ("housing is 'flat' but 'dome' is given", "agree")),
+    ({"housing": "none"}, ("housing is 'none' but 'dome' is given", "agree")),
+    ({"housing": "dome", "dome": ...}, ("housing is 'dome' but neither",)),
+    ({"housing": "window"}, ("housing is 'window'", "'dome', 'flat' or 'none'")),
+    ({**FLAT, "housing": "dome"}, ("housing is 'dome' but 'flat' is given", "agree")),
+    ({**FLAT, "flat__distance_mm": 0}, ("flat.distance_mm is 0", "greater than 0")),
+    ({**FLAT, "flat__distance_mm": ...}, ("flat.distance_mm is missing", "distance_mm: 12")),
+    ({**FLAT, "flat__thickness_mm": -1}, ("flat.thickness_mm is -1", "at least 0")),
+    ({**FLAT, "flat__n_port": 0.9}, ("flat.n_port is 0.9", "at least 1")),
+    ({**FLAT, "flat__n_glass": 1.5}, ("flat.n_glass is not a key", "allowed here: distance_mm")),
+    ({**FLAT, "flat__tilt_deg": [1.0]}, ("flat.tilt_deg", "2 values")),
+    ({**FLAT, "flat__tilt_deg": [0, 60]}, ("flat.tilt_deg[1] is 60", "at most 45")),
+    ({**FLAT, "water": ...}, ("water is missing", "water: {n: 1.3333}")),
     ({"n_air": 1333}, ("n_air is 1333", "at most 2")),
     ({"water__n": 2.1}, ("water.n is 2.1", "at most 2")),
     ({"water": ...}, ("water is missing", "water: {n: 1.3333}")),
@@ -270,6 +316,10 @@ def test_the_json_schema_refuses_what_the_reader_refuses(changes: dict[str, Any]
         {"dome": None, "water": None, "camera__position_mm": None},
         {"dome": ..., "lasers__0__window": WINDOW},
         {"lasers__0__wavelength_nm": 650},
+        FLAT,
+        FLAT | {"housing": "flat"},
+        {"housing": "dome"},
+        {"housing": "none", "dome": ...},
     ],
 )
 def test_the_json_schema_takes_what_the_reader_takes(changes: dict[str, Any]) -> None:
@@ -423,7 +473,7 @@ def test_a_solved_rig_comes_back(seed: int) -> None:
         size_px=(1920, 1080),
         lens=Lens(fx=rng.uniform(500, 2000), fy=1e3 + rng.normal(), cx=957.3, cy=543.1),
         dome_from_cam=SE3(rotation, rng.normal(size=3) * 0.01),
-        dome=Dome(0.051, 0.006, 1.49),
+        housing=Dome(0.051, 0.006, 1.49),
         n_air=1.0003,
         n_water=1.333 + rng.normal() * 1e-3,
         lasers=lasers,
@@ -498,9 +548,13 @@ def test_the_example_of_the_documentation(tmp_path: Path) -> None:
     assert rig.working_range == (0.3, 1.0)
 
 
-def test_the_documentations_example_of_a_window() -> None:
+def test_the_documentations_examples_of_windows() -> None:
     page = (ROOT / "docs" / "rig.md").read_text(encoding="utf-8")
-    lasers = yaml.safe_load(page.split("```yaml\n")[2].split("```")[0])
+    flat = yaml.safe_load(page.split("```yaml\n")[2].split("```")[0])
+    port = rig_from_mapping(hand_written(dome=...) | flat, source_name="x").flat_port
+    assert port is not None
+    assert port.distance == 0.012
+    lasers = yaml.safe_load(page.split("```yaml\n")[3].split("```")[0])
     rig = rig_from_mapping(hand_written() | lasers, source_name="x")
     window = rig.lasers[0].window
     assert window is not None

@@ -68,7 +68,7 @@ def test_the_truth_and_what_is_known_beforehand_are_those_of_the_rig(made):
     assert rig_to_mapping(load_rig(files.rig)) == rig_to_mapping(with_exact_numbers(rig))
     nominal = load_nominal(files.nominal)
     assert (nominal.name, nominal.size_px, nominal.n_lasers) == ("example", (360, 288), 3)
-    assert nominal.dome == rig.dome
+    assert nominal.housing == rig.dome
 
 
 def test_boards_before_the_bare_camera_are_at_their_true_poses(made):

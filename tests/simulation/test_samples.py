@@ -37,7 +37,7 @@ def _rig(folder):
             distortion=tuple(camera["dist"]),
         ),
         dome_from_cam=SE3(turn @ _NOMINAL, np.array(truth["lens_mm"]) / 1e3),
-        dome=Dome(dome["inner_mm"] / 1e3, dome["thickness_mm"] / 1e3, dome["n_acrylic"]),
+        housing=Dome(dome["inner_mm"] / 1e3, dome["thickness_mm"] / 1e3, dome["n_acrylic"]),
         n_air=truth["n_air"],
         n_water=truth["n_water"],
         lasers=tuple(

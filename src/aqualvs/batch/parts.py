@@ -139,7 +139,7 @@ def _write_piece(
             fault = str(broken_off)
     summary.save(folder / SUMMARY)
     names = [POSTURE_CSV, POINTS_STREAM, SUMMARY]
-    if dive.rig.dome is not None:
+    if dive.rig.housing is not None:
         names.append(POSTURE_BARE_CSV)
     facts = {
         "n_frames": summary.n_frames,

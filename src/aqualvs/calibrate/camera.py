@@ -154,7 +154,7 @@ def _rig(result: CameraCalibration, nominal: Nominal) -> Rig:
         size_px=result.size_px,
         lens=result.lens,
         dome_from_cam=SE3(DOME_FROM_CAM_NOMINAL.copy(), np.zeros(3)),
-        dome=nominal.dome,
+        housing=nominal.housing,
         n_air=nominal.n_air,
         n_water=nominal.n_water,
         lasers=(),

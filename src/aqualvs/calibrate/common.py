@@ -21,7 +21,7 @@ from aqualvs.calibration.targets.targets import View
 from aqualvs.calibration_formats import refuse_foreign
 from aqualvs.errors import CalibrationError, OptionError, RigError
 from aqualvs.geometry.arrays import FloatArray
-from aqualvs.optics.camera import Dome
+from aqualvs.optics.camera import Dome, Housing
 from aqualvs.optics.rig import Laser, Rig, RigUncertainty
 from aqualvs.optics.rigfile import keep_dated, load_rig, save_rig
 from aqualvs.optics.rigschema import LaserWavelength
@@ -55,7 +55,7 @@ class Nominal:
     name : str
     size_px : (int, int) or None
         Image width and height.
-    dome : Dome or None
+    housing : Dome, FlatPort or None
     n_air, n_water : float
     n_lasers : int or None
     wavelength_nm : float or None
@@ -68,7 +68,7 @@ class Nominal:
 
     name: str = "rig"
     size_px: tuple[int, int] | None = None
-    dome: Dome | None = None
+    housing: Housing | None = None
     n_air: float = 1.0003
     n_water: float = WATER_N
     n_lasers: int | None = None
@@ -135,7 +135,7 @@ def _of_rig_file(path: Path) -> Nominal:
     return Nominal(
         name=rig.name,
         size_px=rig.size_px,
-        dome=rig.dome,
+        housing=rig.housing,
         n_air=rig.n_air,
         n_water=rig.n_water,
         n_lasers=len(rig.lasers) or None,
@@ -159,7 +159,7 @@ def _of_mapping(content: Mapping[str, Any], path: Path) -> Nominal:
     return Nominal(
         name=file.name,
         size_px=None if file.image is None else (file.image.width, file.image.height),
-        dome=None
+        housing=None
         if part is None
         else Dome(part.inner_radius_mm / 1e3, part.thickness_mm / 1e3, part.n_acrylic),
         n_air=file.n_air,

@@ -196,7 +196,7 @@ def _with_dome(rig: Rig, request: DomeRequest) -> Rig:
     if shell is None and abs(rig.n_water - rig.n_air) < _AIR:
         # A camera that was bare in air goes into the water with its dome.
         rig = rig.in_water(WATER_N)
-    return replace(rig, dome=Dome(radius, thickness, given[2] or old.n_acrylic))
+    return replace(rig, housing=Dome(radius, thickness, given[2] or old.n_acrylic))
 
 
 def _options(request: DomeRequest) -> DomeOptions:

@@ -137,7 +137,7 @@ def rig_of_camera(
         size_px=camera.size_px,
         lens=camera.lens,
         dome_from_cam=SE3(turn.copy(), lens_in_dome),
-        dome=None if port is None else port.dome,
+        housing=None if port is None else port.dome,
         n_air=_N_AIR if port is None else port.n_air,
         n_water=_N_AIR if port is None else port.n_water,
         lasers=(),

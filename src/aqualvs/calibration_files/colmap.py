@@ -149,7 +149,10 @@ def colmap_text(camera: ForeignCamera, *, refractive: bool) -> str:
         If there is no dome to write.
     """
     if refractive and camera.port is None:
-        raise RigError("the rig has no dome, which Refractive COLMAP needs; write it with colmap")
+        raise RigError(
+            "the rig has no dome, the only housing written for Refractive COLMAP; write it with "
+            "colmap"
+        )
     lens, (width, height) = camera.lens, camera.size_px or (0, 0)
     n = len(lens.distortion)
     if lens.model is LensModel.FISHEYE:

@@ -141,6 +141,7 @@ def run_export(request: ExportRequest, echo: Echo) -> None:
 def _left_out(rig: Rig, to: str) -> list[str]:
     refractive = to == "colmap-underwater"
     names = ["the dome (the intrinsics are those in air)"] if rig.dome and not refractive else []
+    names += ["the flat port (the intrinsics are those in air)"] if rig.flat_port else []
     names += [f"{len(rig.lasers)} laser{'s' if len(rig.lasers) > 1 else ''}"] if rig.lasers else []
     names += ["the camera's rotation in the dome"] if rig.dome and refractive else []
     names += ["the shutter"] if rig.shutter != AT_ONCE else []

@@ -21,7 +21,7 @@ from aqualvs.errors import RigError
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.geometry.transforms import rotvec_from_rotation
-from aqualvs.optics.camera import DOME_PARAMETERS, POSE_PARAMETERS
+from aqualvs.optics.camera import POSE_PARAMETERS
 from aqualvs.optics.expected_error import WallView
 from aqualvs.optics.rig import (
     LASER_PARAMETERS,
@@ -140,20 +140,19 @@ def _camera_changes(new: Rig, old: Rig) -> dict[str, float]:
     rotvec[np.abs(rotvec) < _ROUNDING] = 0.0
     values = [*shift, *rotvec]
     changes = dict(zip(POSE_PARAMETERS, map(float, values), strict=True))
-    if new.dome is not None and old.dome is not None:
-        pairs = (
-            new.dome.inner_radius - old.dome.inner_radius,
-            new.dome.thickness - old.dome.thickness,
-            new.n_air - old.n_air,
-            new.dome.n_acrylic - old.dome.n_acrylic,
-            new.n_water - old.n_water,
-        )
-        changes |= dict(zip(DOME_PARAMETERS, pairs, strict=True))
+    if new.housing is not None and type(new.housing) is type(old.housing):
+        ours, theirs = _port_numbers(new), _port_numbers(old)
+        changes |= {name: ours[name] - theirs[name] for name in new.housing.parameter_names}
     if same_lens_model(new, old):
         numbers = zip(_intrinsics(new), _intrinsics(old), strict=True)
         differences = (ours - theirs for ours, theirs in numbers)
         changes |= dict(zip(old.lens.parameter_names, differences, strict=True))
     return changes
+
+
+def _port_numbers(rig: Rig) -> dict[str, float]:
+    own = {} if rig.housing is None else rig.housing.numbers()
+    return {**own, "n_air": rig.n_air, "n_water": rig.n_water}
 
 
 def same_lens_model(new: Rig, old: Rig) -> bool:
@@ -218,6 +217,8 @@ _WALL_M = 0.6
 # Changes that matter to a dive: about 0.1 % of range or 0.1 degrees.
 _LENS_M, _TURN, _FOCAL_SHARE, _CENTRE_PX = 5e-4, math.radians(0.1), 0.002, 2.0
 _SHELL_M, _ACRYLIC, _INDEX = 2e-4, 5e-3, 1e-3
+# Of a flat port. It bends a ray by about a quarter of it.
+_PORT_TILT = math.radians(0.2)
 _TILT, _SHIFT_M = math.radians(0.05), 3e-4
 # A laser whose plane is as near as this to one of another name is likely the same.
 _ALIKE_TILT, _ALIKE_SHIFT_M = math.radians(1.0), 5e-3
@@ -335,6 +336,8 @@ def compared_parts(new: Rig, old: Rig, difference: RigDifference) -> list[Compar
         parts.append(_intrinsics_part(new, old, difference))
     if new.dome is not None and old.dome is not None:
         parts += [_shell_part(difference), _water_part(difference)]
+    if new.flat_port is not None and old.flat_port is not None:
+        parts += [_flat_part(difference), _water_part(difference)]
     return parts + [_laser_part(new, a, b, difference) for a, b in _shared_lasers(new, old)]
 
 
@@ -407,6 +410,16 @@ def _shell_part(difference: RigDifference) -> ComparedPart:
     did += f" and {index:+.2g} in index"
     matters = max(abs(radius), abs(thickness)) > _SHELL_M or abs(index) > _ACRYLIC
     return _part(difference, "the dome", names, did, matters)
+
+
+def _flat_part(difference: RigDifference) -> ComparedPart:
+    names = ("port_distance", "thickness", "n_port", "port_tilt_x", "port_tilt_y")
+    distance, thickness, index, *tilts = (difference.of(name) for name in names)
+    tilt = math.hypot(*tilts)
+    did = f"changed by {distance * 1e3:+.2g} mm in distance, {thickness * 1e3:+.2g} mm in thickness"
+    did += f", {index:+.2g} in index and {math.degrees(tilt):.2g} degrees in tilt"
+    matters = max(abs(distance), abs(thickness)) > _SHELL_M or abs(index) > _ACRYLIC
+    return _part(difference, "the flat port", names, did, matters or tilt > _PORT_TILT)
 
 
 def _water_part(difference: RigDifference) -> ComparedPart:
@@ -494,8 +507,12 @@ def _mismatches(new: Rig, old: Rig) -> Iterator[str]:
         )
     elif not same_lens_model(new, old):
         yield "The lens models differ, so the intrinsics cannot be compared number by number."
-    if (new.dome is None) != (old.dome is None):
-        yield f"Only the {'old' if new.dome is None else 'new'} rig has a dome."
+    for what, ours, theirs in (
+        ("dome", new.dome, old.dome),
+        ("flat port", new.flat_port, old.flat_port),
+    ):
+        if (ours is None) != (theirs is None):
+            yield f"Only the {'old' if ours is None else 'new'} rig has a {what}."
     yield from _laser_mismatches(new, old)
 
 
@@ -585,13 +602,8 @@ def _value(rig: Rig, name: str) -> float:
     values: dict[str, float | FloatArray] = {
         **dict(zip(POSE_PARAMETERS[:3], rig.dome_from_cam.translation.tolist(), strict=True)),
         **dict.fromkeys(POSE_PARAMETERS[3:], math.nan),
-        "n_air": rig.n_air,
-        "n_water": rig.n_water,
+        **_port_numbers(rig),
     }
-    if rig.dome is not None:
-        dome = rig.dome
-        values |= {"inner_radius": dome.inner_radius, "thickness": dome.thickness}
-        values["n_acrylic"] = dome.n_acrylic
     lens = rig.lens
     intrinsics = (lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion)
     values |= dict(zip(lens.parameter_names, intrinsics, strict=True))

@@ -181,7 +181,7 @@ def index_sigma(rig: Rig) -> float:
     The target is a plate of 10 by 6 corners, 180 by 100 mm, held 0.4 m ahead at a known place,
     each corner found to 0.1 px: what an index target on the vehicle gives in one picture.
     """
-    if rig.dome is None:
+    if rig.housing is None:
         return np.inf
     x, z = np.meshgrid(np.linspace(-0.09, 0.09, 10), np.linspace(-0.05, 0.05, 6))
     corners = np.stack([x, np.full_like(x, 0.4), z], axis=-1).reshape(-1, 3)

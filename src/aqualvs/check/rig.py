@@ -322,8 +322,15 @@ def check_rig(rig: Rig, now: datetime | None = None) -> list[Finding]:
 
 
 def _check_lens(rig: Rig) -> Iterator[Finding]:
-    distance = float(np.linalg.norm(rig.dome_from_cam.translation))
-    if rig.dome is None and _in_air(rig):
+    distance, port = float(np.linalg.norm(rig.dome_from_cam.translation)), rig.flat_port
+    if port is not None:
+        tilt = math.degrees(math.acos(math.cos(port.tilt_x) * math.cos(port.tilt_y)))
+        yield Finding(
+            Severity.OK,
+            f"The lens looks through a flat port, {port.distance * 1e3:g} mm ahead, "
+            f"{port.thickness * 1e3:g} mm thick and tilted by {tilt:.1f} degrees.",
+        )
+    elif rig.dome is None and _in_air(rig):
         yield Finding(Severity.OK, "There is no dome and no water: rays start at the lens, in air.")
     elif rig.dome is None:
         yield Finding(Severity.WARN, "There is no dome: rays start at the lens, in the water.")
@@ -378,8 +385,9 @@ def _check_view(rig: Rig, camera: Camera) -> Iterator[Finding]:
     if math.isnan(across) or math.isnan(down) or blind > 0.0:
         yield Finding(
             Severity.WARN,
-            f"{blind:.0%} of the picture sees no water: the lens model ends or the dome reflects "
-            "there; check camera.distortion and the dome.",
+            f"{blind:.0%} of the picture sees no water: the lens model ends or "
+            + ("light misses the flat port " if rig.flat_port else "the dome reflects ")
+            + f"there; check camera.distortion and the {'port' if rig.flat_port else 'dome'}.",
         )
     else:
         yield Finding(
@@ -400,7 +408,7 @@ def _check_water(rig: Rig) -> Finding:
         return Finding(Severity.OK, f"The water's index {n:.4f} is that of {_water_name(n)}.")
     if _in_air(rig):
         return Finding(
-            Severity.OK if rig.dome is None else Severity.WARN,
+            Severity.OK if rig.housing is None else Severity.WARN,
             f"The water's index {n:.4f} is that of air: this rig is for the bench.",
         )
     return Finding(
@@ -419,6 +427,12 @@ def _water_name(n: float) -> str:
 
 def _check_index(rig: Rig) -> Finding:
     sigma = index_sigma(rig)
+    if rig.flat_port is not None:
+        return Finding(
+            Severity.OK,
+            f"A flat port shows the water's index: one picture of a known target gives it to "
+            f"{sigma:.1g}.",
+        )
     if sigma < 5e-4:
         return Finding(
             Severity.OK,

@@ -75,6 +75,10 @@ def _steps(rig: Rig, tolerances: Tolerances) -> dict[str, list[Mapping[str, floa
     }
     if rig.dome is not None:
         steps["dome"] = [{"inner_radius": dome}, {"thickness": dome}]
+    if rig.flat_port is not None:
+        # The place of the lens is that of the whole camera; the port's is what tolerances change.
+        tilts = [{"port_tilt_x": turn}, {"port_tilt_y": turn}]
+        steps["flat port"] = [{"port_distance": lens}, {"thickness": dome}, *tilts]
     return steps
 
 

@@ -23,11 +23,11 @@ from aqualvs.design.settings import (
 )
 from aqualvs.errors import OptionError, RigError
 from aqualvs.geometry.transforms import SE3
-from aqualvs.optics.camera import Dome
+from aqualvs.optics.camera import Dome, FlatPort, Housing
 from aqualvs.optics.lens import Lens, LensModel
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig
 from aqualvs.optics.rigfile import load_rig, shutter_from_part
-from aqualvs.optics.rigschema import NotNegative, Number, Positive, ShutterPart, StrictPart
+from aqualvs.optics.rigschema import NotNegative, Number, Positive, ShutterPart, StrictPart, Tilt
 from aqualvs.optics.shutter import AT_ONCE, Shutter
 from aqualvs.optics.water import seawater_index_vacuum
 from aqualvs.scanning.plane_fit import SharedError
@@ -43,6 +43,7 @@ aqualvs_design: 1
 name: rov
 camera: {width_px: 1920, height_px: 1080, fov_deg: 69}  # across, in air; or {rig: calibrated.yaml}
 dome: {inner_radius_mm: 51, thickness_mm: 6, n_acrylic: 1.49}  # leave out for a bare lens
+# or, in place of dome: flat: {distance_mm: 12, thickness_mm: 5, n_port: 1.49}
 lens: {position_mm: [0, 6, 0], centring_mm: 1}
 water: {temperature_c: 12, salinity_permille: 35}  # or {n: 1.3400}
 lasers: {count: 3, baseline_mm: 150, back_mm: 0, fan_deg: 68}
@@ -87,6 +88,15 @@ class DomeDesign(StrictPart):
     inner_radius_mm: _Length
     thickness_mm: Annotated[float, Field(ge=0.0, le=_MAX_MM, allow_inf_nan=False)]
     n_acrylic: _Index = 1.49
+
+
+class FlatDesign(StrictPart):
+    """Schema of `flat`."""
+
+    distance_mm: _Length
+    thickness_mm: Annotated[float, Field(ge=0.0, le=_MAX_MM, allow_inf_nan=False)]
+    n_port: _Index = 1.49
+    tilt_deg: Annotated[list[Tilt], Field(min_length=2, max_length=2)] = Field(default=[0.0, 0.0])
 
 
 class LensDesign(StrictPart):
@@ -169,6 +179,7 @@ class DesignFile(StrictPart):
     name: str = "design"
     camera: CameraDesign
     dome: DomeDesign | None = None
+    flat: FlatDesign | None = None
     lens: LensDesign = LensDesign()
     water: WaterDesign = WaterDesign(n=1.3345)
     lasers: LasersDesign | None = None
@@ -270,15 +281,12 @@ def _design(file: DesignFile, folder: Path) -> Design:
         )
     lens, size_px, shutter = _camera(file.camera, folder)
     position = np.array(file.lens.position_mm) * _MM
-    dome = file.dome
     rig = Rig(
         name=file.name,
         size_px=size_px,
         lens=lens,
         dome_from_cam=SE3(DOME_FROM_CAM_NOMINAL, position),
-        dome=None
-        if dome is None
-        else Dome(dome.inner_radius_mm * _MM, dome.thickness_mm * _MM, dome.n_acrylic),
+        housing=_housing(file),
         n_air=_N_AIR,
         n_water=_water_index(file.water),
         lasers=(),
@@ -299,6 +307,18 @@ def _design(file: DesignFile, folder: Path) -> Design:
         ),
         avoid_crossings=file.avoid_crossings,
     )
+
+
+def _housing(file: DesignFile) -> Housing | None:
+    dome, flat = file.dome, file.flat
+    if dome is not None and flat is not None:
+        raise OptionError("dome and flat are both given; leave one out")
+    if dome is not None:
+        return Dome(dome.inner_radius_mm * _MM, dome.thickness_mm * _MM, dome.n_acrylic)
+    if flat is None:
+        return None
+    tilt = [math.radians(value) for value in flat.tilt_deg]
+    return FlatPort(flat.distance_mm * _MM, flat.thickness_mm * _MM, flat.n_port, *tilt)
 
 
 def _camera(camera: CameraDesign, folder: Path) -> tuple[Lens, tuple[int, int], Shutter]:

@@ -50,7 +50,10 @@ def summary(design: Design) -> list[str]:
     if rig.lens.model == "fisheye":
         fov = math.degrees(width / rig.lens.fx)
     x, y, z = (value * 1e3 for value in rig.dome_from_cam.translation.tolist())
-    if rig.dome is None:
+    if rig.flat_port is not None:
+        port = rig.flat_port
+        housing = f"flat port {port.distance * 1e3:g} mm ahead, {port.thickness * 1e3:g} mm thick"
+    elif rig.dome is None:
         housing = "bare lens"
     else:
         radius, thickness = rig.dome.inner_radius * 1e3, rig.dome.thickness * 1e3

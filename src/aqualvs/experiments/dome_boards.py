@@ -107,7 +107,7 @@ def solve_from_pictures(laboratory: Laboratory) -> SolvedDome:
         size_px=truth.size_px,
         lens=lens.lens,
         dome_from_cam=SE3(DOME_FROM_CAM_NOMINAL.copy(), np.zeros(3)),
-        dome=truth.dome,
+        housing=truth.dome,
         n_air=truth.n_air,
         n_water=truth.n_water,
         lasers=(),

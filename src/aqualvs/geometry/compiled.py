@@ -6,11 +6,12 @@ arrays lie in memory, and on which of its callers a kernel was compiled for: a d
 several machines, or by several processes, would not equal the same dive measured by one.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, TypeVar, cast
 
 import numba
 import numpy as np
+from numba.extending import overload
 
 # What `kernel_loading` uses of Numba is private: no other version than those tested is trusted.
 _LOADS_LIGHTLY = numba.__version__.startswith("0.68.")
@@ -48,8 +49,30 @@ def inline_borrowing_kernel(function: F) -> F:
     return _compiled(function, forceinline=True, _nrt=False)
 
 
+def chosen_by_class(kernels: Mapping[type, Callable[..., Any]]) -> Callable[..., Any]:
+    """Return a function for kernels to call that stands for one of several inline kernels.
+
+    The class of the first argument, a named tuple, chooses among them when the caller is compiled:
+    nothing is decided, and nothing of the others is compiled, at run time.
+    """
+
+    def stand_in(*arguments: Any) -> Any:
+        raise TypeError(f"only kernels can call what is chosen by class, not {arguments!r}")
+
+    def choose(*arguments: Any) -> Any:
+        chosen: Any = kernels.get(getattr(arguments[0], "instance_class", type(None)))
+        return None if chosen is None else chosen.py_func
+
+    overload(stand_in, strict=False, jit_options={**_OPTIONS, "forceinline": True})(choose)
+    stand_in._stands_for = tuple(kernels.values())  # type: ignore[attr-defined]
+    return stand_in
+
+
+_OPTIONS = {"error_model": "numpy", "nogil": True, "fastmath": False}
+
+
 def _compiled(function: F, **options: object) -> F:
-    options = {"error_model": "numpy", "nogil": True, "fastmath": False, **options}
+    options = {**_OPTIONS, **options}
     compiled = numba.njit(cache=True, **options)(function)
     _depend_on_callees(compiled, function, repr(sorted(options.items())))
     if _LOADS_LIGHTLY:
@@ -67,8 +90,8 @@ def _depend_on_callees(compiled: Any, function: Callable[..., Any], options: str
     own = _cache_file(compiled)
     if own is None:
         return
-    files = (_cache_file(value) for value in function.__globals__.values())
-    stamps = {stamp for file in files if file is not None for stamp in file._source_stamp}
+    files = (file for value in function.__globals__.values() for file in _cache_files(value))
+    stamps = {stamp for file in files for stamp in file._source_stamp}
     own._source_stamp = tuple(sorted(stamps | {own._source_stamp, options}, key=repr))
     own._load_index = _forgiving(own._load_index)
 
@@ -87,6 +110,14 @@ def _forgiving(load_index: Callable[[], Any]) -> Callable[[], Any]:
             return {}
 
     return load
+
+
+def _cache_files(value: Any) -> Iterator[Any]:
+    """Yield Numba's records of the caches of all compiled functions that a global stands for."""
+    for compiled in getattr(value, "_stands_for", (value,)):
+        file = _cache_file(compiled)
+        if file is not None:
+            yield file
 
 
 def _cache_file(compiled: Any) -> Any:

@@ -380,7 +380,7 @@ class DriftWatch:
 
 
 def _agreement_of(rig: Rig) -> LaserAgreement | None:
-    if rig.dome is None or len(rig.lasers) < 2:
+    if rig.housing is None or len(rig.lasers) < 2:
         return None
     try:
         return LaserAgreement(rig)

@@ -1,7 +1,8 @@
 """Refraction, the camera behind a dome, water, and the rig file."""
 
-from aqualvs.optics.camera import BareCamera, Camera, DomeCamera, parameter_names
+from aqualvs.optics.camera import BareCamera, Camera, DomeCamera, FlatCamera, parameter_names
 from aqualvs.optics.dome import Dome
+from aqualvs.optics.flat_port import FlatPort
 from aqualvs.optics.lens import Lens, LensModel
 from aqualvs.optics.refraction import refract
 from aqualvs.optics.water import seawater_index, seawater_index_vacuum
@@ -11,6 +12,8 @@ __all__ = [
     "Camera",
     "Dome",
     "DomeCamera",
+    "FlatCamera",
+    "FlatPort",
     "Lens",
     "LensModel",
     "parameter_names",

@@ -1,8 +1,8 @@
 """The camera: pixels to rays in the outer medium, points to pixels, and every derivative.
 
-`BareCamera` and `DomeCamera` share one set of numbers: `parameter_names` gives their order in every
-parameter Jacobian, `moved_by` adds a small step to them, and `camera_params` checks them and packs
-them for kernels. For kernels of other modules `trace_pixel(camera.params, u, v)` and
+The cameras share one set of numbers: `parameter_names` gives their order in every parameter
+Jacobian, `moved_by` adds a small step to them, and `camera_params` checks them and packs them for
+kernels. For kernels of other modules `trace_pixel(camera.params, u, v)` and
 `project_point(camera.params, x, y, z)` are scalar compiled functions to call inside a `@kernel`.
 """
 
@@ -18,14 +18,19 @@ from aqualvs.geometry.arrays import BoolArray, FloatArray, as_vectors
 from aqualvs.geometry.planes import Rays
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
 from aqualvs.optics.camera_kernels import (
+    CameraParams,
     project_all,
     project_jacobian_all,
     project_point,
     rays_all,
     rays_jacobian_all,
+    trace_pixel,
 )
-from aqualvs.optics.dome import CameraParams, Dome, check_index, trace_pixel
+from aqualvs.optics.dome import DOME_PARAMETERS, Dome
+from aqualvs.optics.flat_port import FLAT_PARAMETERS, FlatPort
 from aqualvs.optics.lens import Lens
+from aqualvs.optics.port_kernels import BareParams
+from aqualvs.optics.refraction import as_triple, check_index
 
 POSE_PARAMETERS = ("lens_x", "lens_y", "lens_z", "rotation_x", "rotation_y", "rotation_z")
 """First columns of every parameter Jacobian.
@@ -33,8 +38,8 @@ POSE_PARAMETERS = ("lens_x", "lens_y", "lens_z", "rotation_x", "rotation_y", "ro
 The lens position L in `dome` (metres), and a rotation vector w (radians) in `dome` that is applied
 after the camera's rotation: `dome_from_cam.rotation = Rodrigues(w) @ rotation`, taken at w = 0.
 """
-DOME_PARAMETERS = ("inner_radius", "thickness", "n_air", "n_acrylic", "n_water")
-"""Columns that follow for a camera behind a dome; `inner_radius` moves the outer sphere along."""
+Housing = Dome | FlatPort
+"""What keeps the water from a camera, and refracts what it sees."""
 
 
 class HasParameters(Protocol):
@@ -52,11 +57,11 @@ class HasParameters(Protocol):
 def parameter_names(camera: HasParameters) -> tuple[str, ...]:
     """Return the names of a camera's parameters, in the order of every parameter Jacobian.
 
-    `POSE_PARAMETERS`, then `DOME_PARAMETERS` if there is a dome, then the intrinsics: fx, fy, cx,
-    cy and as many distortion coefficients as the lens has, in OpenCV's order.
+    `POSE_PARAMETERS`, then `DOME_PARAMETERS` behind a dome or `FLAT_PARAMETERS` behind a flat port,
+    then the intrinsics: fx, fy, cx, cy and as many distortion coefficients as the lens has, in
+    OpenCV's order.
     """
-    dome = DOME_PARAMETERS if camera.params.has_dome else ()
-    return POSE_PARAMETERS + dome + camera.lens.parameter_names
+    return POSE_PARAMETERS + camera.params.port.names + camera.lens.parameter_names
 
 
 def named_step(camera: HasParameters, step: ArrayLike) -> dict[str, float]:
@@ -91,7 +96,7 @@ def camera_params(
     size_px: tuple[int, int],
     lens: Lens,
     dome_from_cam: SE3,
-    dome: Dome | None,
+    housing: Housing | None,
     n_air: float,
     n_water: float,
 ) -> CameraParams:
@@ -107,38 +112,13 @@ def camera_params(
     check_index("camera", "n_air", n_air)
     check_index("camera", "n_water", n_water)
     rotation, centre = _checked_pose(dome_from_cam)
-    decentring = float(np.linalg.norm(centre))
-    if dome is not None and decentring >= dome.inner_radius:
-        raise RigError(
-            f"lens at {np.round(centre * 1e3, 3).tolist()} mm is {decentring * 1e3:.3f} mm from "
-            f"the dome's centre but the inner radius is {dome.inner_radius * 1e3:.3f} mm; move "
-            "the lens inside or correct the radius"
-        )
-    axis = centre / decentring if decentring > 0.0 else np.array([0.0, 0.0, 1.0])
-    shell = dome or Dome(1.0, 0.0, 1.0)
     return CameraParams(
         lens=lens.params,
-        has_dome=dome is not None,
-        rotation=_nine(rotation),
-        centre=_three(centre),
-        inner_radius=float(shell.inner_radius),
-        outer_radius=float(shell.outer_radius),
-        n_air=float(n_air),
-        n_acrylic=float(shell.n_acrylic),
-        n_water=float(n_water),
-        decentring=decentring,
-        axis=_three(axis),
+        rotation=(*as_triple(rotation[0]), *as_triple(rotation[1]), *as_triple(rotation[2])),
+        port=BareParams(as_triple(centre))
+        if housing is None
+        else housing.params(dome_from_cam, n_air, n_water),
     )
-
-
-def _three(v: FloatArray) -> tuple[float, float, float]:
-    return float(v[0]), float(v[1]), float(v[2])
-
-
-def _nine(
-    m: FloatArray,
-) -> tuple[float, float, float, float, float, float, float, float, float]:
-    return (*_three(m[0]), *_three(m[1]), *_three(m[2]))
 
 
 def _check_size(size_px: tuple[int, int]) -> None:
@@ -167,12 +147,16 @@ def _checked_pose(pose: SE3) -> tuple[FloatArray, FloatArray]:
 
 __all__ = [
     "DOME_PARAMETERS",
+    "FLAT_PARAMETERS",
     "POSE_PARAMETERS",
     "BareCamera",
     "Camera",
     "CameraParams",
     "Dome",
     "DomeCamera",
+    "FlatCamera",
+    "FlatPort",
+    "Housing",
     "parameter_names",
     "project_point",
     "trace_pixel",
@@ -269,8 +253,8 @@ class _CompiledCamera:
         Returns
         -------
         Rays
-            In `dome`, batch shape (...). Origins lie on the outer surface of the dome (metres), or
-            at the lens of a bare camera; directions are unit, in the outer medium, away from the
+            In `dome`, batch shape (...). Origins lie on the outer surface of the housing (metres),
+            or at the lens of a bare camera; directions are unit, in the outer medium, away from the
             camera. Not valid, and NaN, where the lens model ends or light is totally reflected.
         """
         p = as_vectors(pixels, 2, "pixels")
@@ -333,7 +317,7 @@ class _CompiledCamera:
         pixels : array, shape (..., 2)
             In `image`, possibly outside the picture (see `inside_image`); NaN where not valid.
         valid : bool array, shape (...)
-            False for points inside the dome, points that no ray reaches, and directions in which
+            False for points inside the housing, points that no ray reaches, and directions in which
             the lens model does not hold.
         """
         p = as_vectors(points_in_dome, 3, "points_in_dome")
@@ -397,6 +381,7 @@ class _CompiledCamera:
             valid.reshape(-1),
             by_point.reshape(-1, 2, 3),
             by_parameter,
+            len(POSE_PARAMETERS) + len(self.params.port.names),
         )
         return pixels, valid, by_point
 
@@ -434,7 +419,7 @@ class BareCamera(_CompiledCamera):
             size_px=self.size_px,
             lens=self.lens,
             dome_from_cam=self.dome_from_cam,
-            dome=None,
+            housing=None,
             n_air=1.0,
             n_water=1.0,
         )
@@ -483,7 +468,7 @@ class DomeCamera(_CompiledCamera):
             size_px=self.size_px,
             lens=self.lens,
             dome_from_cam=self.dome_from_cam,
-            dome=self.dome,
+            housing=self.dome,
             n_air=self.n_air,
             n_water=self.n_water,
         )
@@ -496,11 +481,58 @@ class DomeCamera(_CompiledCamera):
             size_px=self.size_px,
             lens=moved_lens(self.lens, values),
             dome_from_cam=moved_pose(self.dome_from_cam, values),
-            dome=Dome(
-                self.dome.inner_radius + values["inner_radius"],
-                self.dome.thickness + values["thickness"],
-                self.dome.n_acrylic + values["n_acrylic"],
-            ),
+            dome=self.dome.moved_by(values),
+            n_air=self.n_air + values["n_air"],
+            n_water=self.n_water + values["n_water"],
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlatCamera(_CompiledCamera):
+    """A camera behind a flat port, which is fixed to it.
+
+    Attributes
+    ----------
+    size_px : (int, int)
+        Image width and height.
+    lens : Lens
+        Intrinsics, calibrated in air without the port.
+    dome_from_cam : SE3
+        Camera pose in `dome`; the translation is the lens position L in metres.
+    port : FlatPort
+        Place and material.
+    n_air, n_water : float
+        Refractive indices (vacuum = 1) inside and outside the port.
+
+    Raises
+    ------
+    RigError
+        If an index or the size is not valid, or the pose is not one finite rigid transform.
+    """
+
+    port: FlatPort
+    n_air: float
+    n_water: float
+
+    def __post_init__(self) -> None:
+        params = camera_params(
+            size_px=self.size_px,
+            lens=self.lens,
+            dome_from_cam=self.dome_from_cam,
+            housing=self.port,
+            n_air=self.n_air,
+            n_water=self.n_water,
+        )
+        object.__setattr__(self, "params", params)
+
+    def moved_by(self, step: ArrayLike) -> "FlatCamera":
+        """Return the camera with `step` (P,) added to its parameters, see `parameter_names`."""
+        values = named_step(self, step)
+        return FlatCamera(
+            size_px=self.size_px,
+            lens=moved_lens(self.lens, values),
+            dome_from_cam=moved_pose(self.dome_from_cam, values),
+            port=self.port.moved_by(values),
             n_air=self.n_air + values["n_air"],
             n_water=self.n_water + values["n_water"],
         )

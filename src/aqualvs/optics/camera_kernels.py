@@ -1,33 +1,18 @@
 """Batch kernels of the camera: pixels to rays, points to pixels, and the Jacobians of both.
 
 Every kernel writes into arrays that it is given, and NaN wherever it writes False into `valid`. The
-block layout of the scratch array is that of `aqualvs.optics.lens`.
+block layout of the scratch array is that of `aqualvs.optics.lens`; what refracts is a camera's
+`port`, see `aqualvs.optics.port_kernels`.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.geometry.compiled import inline_kernel, kernel
-from aqualvs.optics.dome import (
-    ROUNDS,
-    CameraParams,
-    across_axis,
-    back_derivative,
-    cam_from_dome,
-    cross,
-    direction_to_point,
-    dome_from_cam,
-    dot,
-    is_outside,
-    paraxial_start,
-    perpendicular,
-    polar_angle,
-    solve_guarded,
-    surfaces_at,
-    three_steps,
-    trace_direction,
-    trace_tangent,
-)
+from aqualvs.optics.dome import DomeParams
+from aqualvs.optics.flat_port import FlatParams
 from aqualvs.optics.lens import (
     BLOCK,
     DX,
@@ -40,14 +25,103 @@ from aqualvs.optics.lens import (
     write_intrinsics_jacobian,
 )
 from aqualvs.optics.lens_kernels import (
+    LensParams,
     Vector,
     fisheye_pixel,
     fisheye_pixel_jacobian,
+    lens_direction,
     lens_direction_jacobian,
     lens_pixel,
     opencv_pixel,
     opencv_pixel_jacobian,
 )
+from aqualvs.optics.port_kernels import (
+    CX,
+    CY,
+    CZ,
+    GUX,
+    GUY,
+    GUZ,
+    GVX,
+    GVY,
+    GVZ,
+    JU,
+    JV,
+    N_POINT_ROWS,
+    N_ROWS,
+    OK,
+    PX,
+    PY,
+    PZ,
+    BareParams,
+    U,
+    V,
+    aim,
+    aim_block,
+    gradients_block,
+    trace_port,
+    trace_port_tangent,
+    turn_gradients_block,
+)
+
+
+class CameraParams(NamedTuple):
+    """A camera as kernels take it; `camera.params` makes it.
+
+    Attributes
+    ----------
+    lens : LensParams
+        Intrinsics.
+    rotation : tuple of 9 float
+        `dome_from_cam`, row by row.
+    port : BareParams, DomeParams or FlatParams
+        What stands between the lens and the outer medium, and the lens position.
+    """
+
+    lens: LensParams
+    rotation: tuple[float, float, float, float, float, float, float, float, float]
+    port: BareParams | DomeParams | FlatParams
+
+
+@inline_kernel
+def dome_from_cam(camera: CameraParams, x: float, y: float, z: float) -> Vector:
+    """Rotate a direction from `cam` to `dome`."""
+    r = camera.rotation
+    return (
+        r[0] * x + r[1] * y + r[2] * z,
+        r[3] * x + r[4] * y + r[5] * z,
+        r[6] * x + r[7] * y + r[8] * z,
+    )
+
+
+@inline_kernel
+def cam_from_dome(camera: CameraParams, x: float, y: float, z: float) -> Vector:
+    """Rotate a direction from `dome` to `cam`."""
+    r = camera.rotation
+    return (
+        r[0] * x + r[3] * y + r[6] * z,
+        r[1] * x + r[4] * y + r[7] * z,
+        r[2] * x + r[5] * y + r[8] * z,
+    )
+
+
+@inline_kernel
+def trace_pixel(
+    camera: CameraParams, u: float, v: float
+) -> tuple[bool, float, float, float, float, float, float]:
+    """Trace the pixel (u, v) into the outer medium; callable from other kernels.
+
+    Returns
+    -------
+    valid, ox, oy, oz, dx, dy, dz
+        Origin (metres) and unit direction in `dome`, as in `Rays`. Where `valid` is False the
+        numbers are meaningless.
+    """
+    seen, cx, cy, cz = lens_direction(camera.lens, u, v)
+    dx, dy, dz = dome_from_cam(camera, cx, cy, cz)
+    passed, ox, oy, oz, dx, dy, dz = trace_port(camera.port, dx, dy, dz)
+    return seen and passed, ox, oy, oz, dx, dy, dz
+
 
 # Rows of the scratch array after those of the lens: the origin of the ray.
 OX, OY, OZ = ((N_LENS_ROWS + i_row) * BLOCK for i_row in range(3))
@@ -58,7 +132,7 @@ N_RAY_ROWS = N_LENS_ROWS + 3
 def trace_block(camera: CameraParams, w: FloatArray) -> None:
     """Turn unit directions in `dome` into rays in the outer medium, all lanes of a block."""
     for j in range(BLOCK):
-        passed, ox, oy, oz, dx, dy, dz = trace_direction(camera, w[DX + j], w[DY + j], w[DZ + j])
+        passed, ox, oy, oz, dx, dy, dz = trace_port(camera.port, w[DX + j], w[DY + j], w[DZ + j])
         w[OX + j], w[OY + j], w[OZ + j] = ox, oy, oz
         w[DX + j], w[DY + j], w[DZ + j] = dx, dy, dz
         w[LENS_OK + j] = w[LENS_OK + j] if passed else -1.0
@@ -66,12 +140,10 @@ def trace_block(camera: CameraParams, w: FloatArray) -> None:
 
 @inline_kernel
 def rotate_block(camera: CameraParams, w: FloatArray) -> None:
-    """Rotate directions from `cam` to `dome` and start them at the lens, all lanes of a block."""
-    cx, cy, cz = camera.centre
+    """Rotate directions from `cam` to `dome`, all lanes of a block."""
     for j in range(BLOCK):
         x, y, z = dome_from_cam(camera, w[DX + j], w[DY + j], w[DZ + j])
         w[DX + j], w[DY + j], w[DZ + j] = x, y, z
-        w[OX + j], w[OY + j], w[OZ + j] = cx, cy, cz
 
 
 @inline_kernel
@@ -110,8 +182,7 @@ def rays_all(
         load_pixels(camera.lens, pixels, start, count, w)
         directions_block(camera.lens, count, w)
         rotate_block(camera, w)
-        if camera.has_dome:
-            trace_block(camera, w)
+        trace_block(camera, w)
         store_rays(start, count, w, origins, directions, valid)
 
 
@@ -123,7 +194,7 @@ def trace_all(
     directions: FloatArray,
     valid: BoolArray,
 ) -> None:
-    """Write rays of unit directions (N, 3) at the lens, in `dome`: the dome alone."""
+    """Write rays of unit directions (N, 3) at the lens, in `dome`: the port alone."""
     w = np.zeros(N_RAY_ROWS * BLOCK)
     for start in range(0, directions_at_lens.shape[0], BLOCK):
         count = min(BLOCK, directions_at_lens.shape[0] - start)
@@ -155,19 +226,10 @@ def rays_jacobian_all(
         for k in range(2):
             d_dot = d_u if k == 0 else d_v
             d_dot = dome_from_cam(camera, d_dot[0], d_dot[1], d_dot[2])
-            o_dot = (0.0, 0.0, 0.0)
-            if camera.has_dome:
-                o_dot, d_dot = trace_tangent(camera, d, d_dot)
+            o_dot, d_dot = trace_port_tangent(camera.port, d, d_dot)
             for j in range(3):
                 origin_jacobian[i, j, k] = o_dot[j]
                 direction_jacobian[i, j, k] = d_dot[j]
-
-
-# Rows of the scratch array: the point, which becomes the direction at the lens, then the pixel;
-# its polar coordinates (distance inverted); the unit vector across the axis; the solution; a
-# sign, positive where valid.
-PX, PY, PZ, FAR, COS_T, SIN_T, EX, EY, EZ, COS_A, SIN_A, OK = (i_row * BLOCK for i_row in range(12))
-N_POINT_ROWS = 12
 
 
 @inline_kernel
@@ -176,11 +238,7 @@ def project_point(camera: CameraParams, x: float, y: float, z: float) -> tuple[b
 
     Where `valid` is False the numbers are meaningless.
     """
-    if camera.has_dome:
-        reached, dx, dy, dz = direction_to_point(camera, x, y, z)
-    else:
-        c = camera.centre
-        reached, dx, dy, dz = True, x - c[0], y - c[1], z - c[2]
+    reached, dx, dy, dz = aim(camera.port, x, y, z)
     x, y, z = cam_from_dome(camera, dx, dy, dz)
     seen, u, v = lens_pixel(camera.lens, x, y, z)
     return reached and seen, u, v
@@ -193,67 +251,6 @@ def load_points(points: FloatArray, start: int, count: int, w: FloatArray) -> No
         w[PX + j] = points[start + j, 0]
         w[PY + j] = points[start + j, 1]
         w[PZ + j] = points[start + j, 2]
-
-
-@inline_kernel
-def bare_block(camera: CameraParams, w: FloatArray) -> None:
-    """Turn points into directions from the lens, all lanes of a block."""
-    cx, cy, cz = camera.centre
-    for j in range(BLOCK):
-        w[PX + j], w[PY + j], w[PZ + j] = w[PX + j] - cx, w[PY + j] - cy, w[PZ + j] - cz
-        w[OK + j] = 1.0
-
-
-@inline_kernel
-def polar_block(camera: CameraParams, w: FloatArray) -> None:
-    """Turn points into polar coordinates and the start of the search, all lanes of a block."""
-    n_l = camera.n_air * camera.decentring
-    for j in range(BLOCK):
-        far, cos_t, sin_t, e = polar_angle(camera, w[PX + j], w[PY + j], w[PZ + j])
-        w[FAR + j], w[COS_T + j], w[SIN_T + j] = far, cos_t, sin_t
-        w[EX + j], w[EY + j], w[EZ + j] = e
-        w[OK + j] = 0.0 if is_outside(camera, far) else -1.0
-        s = surfaces_at(camera, far)
-        w[COS_A + j], w[SIN_A + j] = paraxial_start(s, n_l, cos_t, sin_t)
-
-
-@inline_kernel
-def solve_block(camera: CameraParams, count: int, w: FloatArray) -> None:
-    """Solve for the ray's angle at the lens, all lanes of a block; set the signs of validity.
-
-    Lanes that no round of steps solves are searched one by one.
-    """
-    n_l = camera.n_air * camera.decentring
-    n_open = count
-    for _ in range(ROUNDS):
-        if n_open == 0:
-            return
-        for j in range(BLOCK):
-            s = surfaces_at(camera, w[FAR + j])
-            c, k, solved = three_steps(
-                s, n_l, w[COS_T + j], w[SIN_T + j], w[COS_A + j], w[SIN_A + j]
-            )
-            w[COS_A + j], w[SIN_A + j] = c, k
-            w[OK + j] = 1.0 if solved & (w[OK + j] >= 0.0) else w[OK + j]
-        n_open = 0
-        for j in range(count):
-            n_open += w[OK + j] == 0.0
-    for j in range(count):
-        if w[OK + j] == 0.0:
-            s = surfaces_at(camera, w[FAR + j])
-            found, w[COS_A + j], w[SIN_A + j] = solve_guarded(s, n_l, w[COS_T + j], w[SIN_T + j])
-            w[OK + j] = 1.0 if found else -1.0
-
-
-@inline_kernel
-def aim_block(camera: CameraParams, w: FloatArray) -> None:
-    """Turn solved angles into directions at the lens, in `dome`, all lanes of a block."""
-    ax, ay, az = camera.axis
-    for j in range(BLOCK):
-        c, k = w[COS_A + j], w[SIN_A + j]
-        w[PX + j] = c * ax + k * w[EX + j]
-        w[PY + j] = c * ay + k * w[EY + j]
-        w[PZ + j] = c * az + k * w[EZ + j]
 
 
 @inline_kernel
@@ -283,33 +280,13 @@ def project_all(
     for start in range(0, points.shape[0], BLOCK):
         count = min(BLOCK, points.shape[0] - start)
         load_points(points, start, count, w)
-        if camera.has_dome:
-            polar_block(camera, w)
-            solve_block(camera, count, w)
-            aim_block(camera, w)
-        else:
-            bare_block(camera, w)
+        aim_block(camera.port, count, w)
         see_block(camera, count, w)
         for j in range(count):
             ok = w[OK + j] > 0.0
             valid[start + j] = ok
             pixels[start + j, 0] = w[PX + j] if ok else np.nan
             pixels[start + j, 1] = w[PY + j] if ok else np.nan
-
-
-# Columns of the parameter Jacobian before the intrinsics: lens position 3, rotation 3, and these
-# of the dome.
-N_POSE = 6
-N_DOME = 5
-# Rows of the scratch array after those of the projection: direction in `cam`, pixel, gradients of
-# u and v by the direction in `dome`, then for u and for v the gradients by point, pose and dome.
-CX, CY, CZ, U, V, GUX, GUY, GUZ, GVX, GVY, GVZ = (
-    (N_POINT_ROWS + i_row) * BLOCK for i_row in range(11)
-)
-N_GRADIENT = 3 + N_POSE + N_DOME
-JU = (N_POINT_ROWS + 11) * BLOCK
-JV = JU + N_GRADIENT * BLOCK
-N_ROWS = N_POINT_ROWS + 11 + 2 * N_GRADIENT
 
 
 @inline_kernel
@@ -344,68 +321,15 @@ def see_jacobian_block(camera: CameraParams, count: int, w: FloatArray) -> None:
 
 
 @inline_kernel
-def dome_gradients_block(camera: CameraParams, w: FloatArray) -> None:
-    """Write the gradients of u and v by point, lens position and dome, all lanes of a block."""
-    spare = perpendicular(camera.axis)
-    for j in range(BLOCK):
-        back = back_derivative(
-            camera,
-            surfaces_at(camera, w[FAR + j]),
-            (w[FAR + j], w[COS_T + j], w[SIN_T + j]),
-            across_axis(camera.axis, (w[EX + j], w[EY + j], w[EZ + j]), spare),
-            (w[COS_A + j], w[SIN_A + j]),
-        )
-        for g, row in (
-            ((w[GUX + j], w[GUY + j], w[GUZ + j]), JU),
-            ((w[GVX + j], w[GVY + j], w[GVZ + j]), JV),
-        ):
-            g_u, g_m = dot(g, back.turn), dot(g, back.normal)
-            by_point, by_lens = g_m * back.across_point, g_m * back.across_lens
-            for k in range(3):
-                w[row + k * BLOCK + j] = g_u * back.along_point[k] + by_point * back.normal[k]
-                w[row + (3 + k) * BLOCK + j] = (
-                    g_u * back.along_lens * back.turn[k] + by_lens * back.normal[k]
-                )
-            w[row + 9 * BLOCK + j] = g_u * back.by_inner
-            w[row + 10 * BLOCK + j] = g_u * back.by_thickness
-            w[row + 11 * BLOCK + j] = g_u * back.by_n_air
-            w[row + 12 * BLOCK + j] = g_u * back.by_n_acrylic
-            w[row + 13 * BLOCK + j] = g_u * back.by_n_water
-
-
-@inline_kernel
-def bare_gradients_block(w: FloatArray) -> None:
-    """Write the gradients of u and v by point and lens position, all lanes of a block."""
-    for row, g in ((JU, GUX), (JV, GVX)):
-        for k in range(3):
-            for j in range(BLOCK):
-                w[row + k * BLOCK + j] = w[g + k * BLOCK + j]
-                w[row + (3 + k) * BLOCK + j] = -w[g + k * BLOCK + j]
-
-
-@inline_kernel
-def turn_gradients_block(w: FloatArray) -> None:
-    """Write the gradients of u and v by the camera's rotation, all lanes of a block.
-
-    exp(w) R seen from `cam` turns the direction d by -w: g . (d x w) = w . (g x d).
-    """
-    for row, g in ((JU, GUX), (JV, GVX)):
-        for j in range(BLOCK):
-            x, y, z = cross(
-                (w[g + j], w[g + BLOCK + j], w[g + 2 * BLOCK + j]),
-                (w[PX + j], w[PY + j], w[PZ + j]),
-            )
-            w[row + 6 * BLOCK + j] = x
-            w[row + 7 * BLOCK + j] = y
-            w[row + 8 * BLOCK + j] = z
-
-
-@inline_kernel
 def store_parameters(
-    camera: CameraParams, start: int, count: int, w: FloatArray, jacobian: FloatArray
+    camera: CameraParams,
+    n_before: int,
+    start: int,
+    count: int,
+    w: FloatArray,
+    jacobian: FloatArray,
 ) -> None:
     """Write `count` parameter Jacobians from the scratch `w` to the rows from `start`."""
-    n_before = N_POSE + N_DOME if camera.has_dome else N_POSE
     for j in range(count):
         if w[OK + j] < 0.0:
             jacobian[start + j] = np.nan
@@ -426,26 +350,20 @@ def project_jacobian_all(
     valid: BoolArray,
     point_jacobian: FloatArray,
     parameter_jacobian: FloatArray,
+    n_before: int,
 ) -> None:
     """Write pixels (N, 2) of points (N, 3), derivatives by the point and, if asked, the parameters.
 
-    `parameter_jacobian` has shape (N, 2, P) in the order of `camera.parameter_names`, or
-    (0, 2, P) to leave it out.
+    `parameter_jacobian` has shape (N, 2, P) in the order of `camera.parameter_names`, of which
+    `n_before` stand before the intrinsics, or (0, 2, P) to leave it out.
     """
     w = np.zeros(N_ROWS * BLOCK)
     for start in range(0, points.shape[0], BLOCK):
         count = min(BLOCK, points.shape[0] - start)
         load_points(points, start, count, w)
-        if camera.has_dome:
-            polar_block(camera, w)
-            solve_block(camera, count, w)
-            aim_block(camera, w)
-            see_jacobian_block(camera, count, w)
-            dome_gradients_block(camera, w)
-        else:
-            bare_block(camera, w)
-            see_jacobian_block(camera, count, w)
-            bare_gradients_block(w)
+        aim_block(camera.port, count, w)
+        see_jacobian_block(camera, count, w)
+        gradients_block(camera.port, w)
         for j in range(count):
             ok = w[OK + j] > 0.0
             valid[start + j] = ok
@@ -455,5 +373,5 @@ def project_jacobian_all(
                 point_jacobian[start + j, 0, k] = w[JU + k * BLOCK + j] if ok else np.nan
                 point_jacobian[start + j, 1, k] = w[JV + k * BLOCK + j] if ok else np.nan
         if parameter_jacobian.shape[0] > 0:
-            turn_gradients_block(w)
-            store_parameters(camera, start, count, w, parameter_jacobian)
+            turn_gradients_block(camera.port, w)
+            store_parameters(camera, n_before, start, count, w, parameter_jacobian)

@@ -1,6 +1,6 @@
 """Refraction by the dome: two concentric spheres with acrylic or glass between them.
 
-Unprojection (`trace_pixel`) follows a pixel's ray from the lens into the outer medium. Projection
+Unprojection (`trace_direction`) follows a ray from the lens into the outer medium. Projection
 (`direction_to_point`) finds the direction at the lens whose ray meets a point in the outer medium.
 
 In concentric spheres n * rho * sin(incidence) is constant along a ray (Bouguer; Born and Wolf,
@@ -29,26 +29,28 @@ decentring.
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
+
 from aqualvs.errors import RigError
 from aqualvs.geometry.compiled import inline_kernel, kernel
-from aqualvs.optics.lens_kernels import LensParams, Vector, lens_direction
-from aqualvs.optics.refraction import leave_sphere, leave_sphere_tangent
+from aqualvs.geometry.transforms import SE3
+from aqualvs.optics.lens_kernels import Vector
+from aqualvs.optics.refraction import as_triple, check_index, leave_sphere, leave_sphere_tangent
+
+DOME_PARAMETERS = ("inner_radius", "thickness", "n_air", "n_acrylic", "n_water")
+"""Parameters of a camera behind a dome, after those of its pose; `inner_radius` moves the outer
+sphere along."""
 
 
-class CameraParams(NamedTuple):
-    """A camera as kernels take it; `camera.params` makes it.
+class DomeParams(NamedTuple):
+    """A dome as kernels take it; `Dome.params` makes it.
 
     Attributes
     ----------
-    lens : LensParams
-        Intrinsics.
-    has_dome : bool
-        False for a bare lens; the fields of the dome then hold harmless values.
-    rotation : tuple of 9 float
-        `dome_from_cam`, row by row.
     centre : tuple of 3 float
         The lens position L in `dome`, metres.
     inner_radius, outer_radius : float
@@ -61,9 +63,6 @@ class CameraParams(NamedTuple):
         L/|L| in `dome`; any unit vector when L is zero.
     """
 
-    lens: LensParams
-    has_dome: bool
-    rotation: tuple[float, float, float, float, float, float, float, float, float]
     centre: Vector
     inner_radius: float
     outer_radius: float
@@ -73,32 +72,15 @@ class CameraParams(NamedTuple):
     decentring: float
     axis: Vector
 
-
-@inline_kernel
-def dome_from_cam(camera: CameraParams, x: float, y: float, z: float) -> Vector:
-    """Rotate a direction from `cam` to `dome`."""
-    r = camera.rotation
-    return (
-        r[0] * x + r[1] * y + r[2] * z,
-        r[3] * x + r[4] * y + r[5] * z,
-        r[6] * x + r[7] * y + r[8] * z,
-    )
-
-
-@inline_kernel
-def cam_from_dome(camera: CameraParams, x: float, y: float, z: float) -> Vector:
-    """Rotate a direction from `dome` to `cam`."""
-    r = camera.rotation
-    return (
-        r[0] * x + r[3] * y + r[6] * z,
-        r[1] * x + r[4] * y + r[7] * z,
-        r[2] * x + r[5] * y + r[8] * z,
-    )
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return DOME_PARAMETERS
 
 
 @inline_kernel
 def trace_direction(
-    camera: CameraParams, dx: float, dy: float, dz: float
+    port: DomeParams, dx: float, dy: float, dz: float
 ) -> tuple[bool, float, float, float, float, float, float]:
     """Trace a unit direction in `dome` from the lens through both surfaces of the dome.
 
@@ -109,64 +91,43 @@ def trace_direction(
         medium, both in `dome`.
     """
     inner, px, py, pz, dx, dy, dz = leave_sphere(
-        camera.centre[0],
-        camera.centre[1],
-        camera.centre[2],
+        port.centre[0],
+        port.centre[1],
+        port.centre[2],
         dx,
         dy,
         dz,
-        camera.inner_radius,
-        camera.n_air / camera.n_acrylic,
+        port.inner_radius,
+        port.n_air / port.n_acrylic,
     )
     outer, px, py, pz, dx, dy, dz = leave_sphere(
-        px, py, pz, dx, dy, dz, camera.outer_radius, camera.n_acrylic / camera.n_water
+        px, py, pz, dx, dy, dz, port.outer_radius, port.n_acrylic / port.n_water
     )
     return (inner >= 0.0) & (outer >= 0.0), px, py, pz, dx, dy, dz
 
 
 @inline_kernel
-def trace_pixel(
-    camera: CameraParams, u: float, v: float
-) -> tuple[bool, float, float, float, float, float, float]:
-    """Trace the pixel (u, v) into the outer medium; callable from other kernels.
-
-    Returns
-    -------
-    valid, ox, oy, oz, dx, dy, dz
-        Origin (metres) and unit direction in `dome`, as in `Rays`. Where `valid` is False the
-        numbers are meaningless.
-    """
-    seen, cx, cy, cz = lens_direction(camera.lens, u, v)
-    dx, dy, dz = dome_from_cam(camera, cx, cy, cz)
-    if not camera.has_dome:
-        ox, oy, oz = camera.centre
-        return seen, ox, oy, oz, dx, dy, dz
-    passed, ox, oy, oz, dx, dy, dz = trace_direction(camera, dx, dy, dz)
-    return seen and passed, ox, oy, oz, dx, dy, dz
-
-
-@inline_kernel
 def trace_tangent(
-    camera: CameraParams,
+    port: DomeParams,
     direction: Vector,
     direction_dot: Vector,
 ) -> tuple[Vector, Vector]:
     """Return the derivative of `trace_direction`'s origin and direction along direction_dot."""
     still = (0.0, 0.0, 0.0)
-    ratio = camera.n_air / camera.n_acrylic
-    c = camera.centre
+    ratio = port.n_air / port.n_acrylic
+    c = port.centre
     d = direction
     _, px, py, pz, ex, ey, ez = leave_sphere(
-        c[0], c[1], c[2], d[0], d[1], d[2], camera.inner_radius, ratio
+        c[0], c[1], c[2], d[0], d[1], d[2], port.inner_radius, ratio
     )
-    p_dot, e_dot = leave_sphere_tangent(c, d, still, direction_dot, camera.inner_radius, ratio)
+    p_dot, e_dot = leave_sphere_tangent(c, d, still, direction_dot, port.inner_radius, ratio)
     return leave_sphere_tangent(
         (px, py, pz),
         (ex, ey, ez),
         p_dot,
         e_dot,
-        camera.outer_radius,
-        camera.n_acrylic / camera.n_water,
+        port.outer_radius,
+        port.n_acrylic / port.n_water,
     )
 
 
@@ -193,14 +154,14 @@ class AngleSines(NamedTuple):
 
 
 @inline_kernel
-def surfaces_at(camera: CameraParams, inverse_rho: float) -> AngleSines:
+def surfaces_at(port: DomeParams, inverse_rho: float) -> AngleSines:
     """Return the sines per unit of b for a point at distance 1 / inverse_rho from the centre."""
     return AngleSines(
-        1.0 / (camera.n_air * camera.inner_radius),
-        1.0 / (camera.n_acrylic * camera.inner_radius),
-        1.0 / (camera.n_acrylic * camera.outer_radius),
-        1.0 / (camera.n_water * camera.outer_radius),
-        inverse_rho / camera.n_water,
+        1.0 / (port.n_air * port.inner_radius),
+        1.0 / (port.n_acrylic * port.inner_radius),
+        1.0 / (port.n_acrylic * port.outer_radius),
+        1.0 / (port.n_water * port.outer_radius),
+        inverse_rho / port.n_water,
     )
 
 
@@ -347,13 +308,13 @@ def solve_alpha(
 
 @inline_kernel
 def polar_angle(
-    camera: CameraParams, x: float, y: float, z: float
+    port: DomeParams, x: float, y: float, z: float
 ) -> tuple[float, float, float, Vector]:
     """Return (1/rho, cos, sin, e) of a point: cos a + sin e is its direction, a the lens axis.
 
     e is a unit vector, or zero for a point exactly on the axis.
     """
-    a = camera.axis
+    a = port.axis
     inverse = 1.0 / math.sqrt(x * x + y * y + z * z)
     x, y, z = x * inverse, y * inverse, z * inverse
     cosine = x * a[0] + y * a[1] + z * a[2]
@@ -364,26 +325,26 @@ def polar_angle(
 
 
 @inline_kernel
-def is_outside(camera: CameraParams, inverse_rho: float) -> bool:
+def is_outside(port: DomeParams, inverse_rho: float) -> bool:
     """Return whether a point at distance 1 / inverse_rho lies in the outer medium."""
-    return (inverse_rho > 0.0) & (inverse_rho * camera.outer_radius <= 1.0 + SURFACE_SLACK)
+    return (inverse_rho > 0.0) & (inverse_rho * port.outer_radius <= 1.0 + SURFACE_SLACK)
 
 
 @inline_kernel
 def direction_to_point(
-    camera: CameraParams, x: float, y: float, z: float
+    port: DomeParams, x: float, y: float, z: float
 ) -> tuple[bool, float, float, float]:
     """Return (valid, dx, dy, dz): the unit direction at the lens whose ray meets the point.
 
     Both in `dome`. Not valid for a point inside the dome or one that no ray reaches.
     """
-    inverse_rho, cos_target, sin_target, e = polar_angle(camera, x, y, z)
-    s = surfaces_at(camera, inverse_rho)
-    n_l = camera.n_air * camera.decentring
+    inverse_rho, cos_target, sin_target, e = polar_angle(port, x, y, z)
+    s = surfaces_at(port, inverse_rho)
+    n_l = port.n_air * port.decentring
     found, c, k = solve_alpha(s, n_l, cos_target, sin_target)
-    a = camera.axis
+    a = port.axis
     return (
-        found and is_outside(camera, inverse_rho),
+        found and is_outside(port, inverse_rho),
         c * a[0] + k * e[0],
         c * a[1] + k * e[1],
         c * a[2] + k * e[2],
@@ -476,7 +437,7 @@ def across_axis(axis: Vector, e: Vector, spare: Vector) -> Vector:
 
 @inline_kernel
 def back_derivative(
-    camera: CameraParams,
+    port: DomeParams,
     s: AngleSines,
     target: tuple[float, float, float],
     e: Vector,
@@ -486,7 +447,7 @@ def back_derivative(
 
     Parameters
     ----------
-    camera : CameraParams
+    port : DomeParams
     s : AngleSines
         Of the point.
     target : (float, float, float)
@@ -497,7 +458,7 @@ def back_derivative(
         (cos alpha, sin alpha).
     """
     (inverse_rho, cos_t, sin_t), (c, k) = target, solution
-    n_l = camera.n_air * camera.decentring
+    n_l = port.n_air * port.decentring
     b = n_l * k
     _, sin_d_per_b, slope, scale = deflection(s, b)
     slope = slope / scale
@@ -507,20 +468,20 @@ def back_derivative(
     t1, t2 = b * s.q1 / cosine_of(s.q1, b), b * s.q2 / cosine_of(s.q2, b)
     t3, t4 = b * s.q3 / cosine_of(s.q3, b), b * s.q4 / cosine_of(s.q4, b)
     t5 = b * s.q5 / cosine_of(s.q5, b)
-    by_outer = (t4 - t3) / camera.outer_radius * inverse
-    axis = camera.axis
+    by_outer = (t4 - t3) / port.outer_radius * inverse
+    axis = port.axis
     return BackDerivative(
         turn=blend(-k, axis, c, e),
         normal=cross(axis, e),
         along_point=blend((-sin_t - t5 * cos_t) * by_rho, axis, (cos_t - t5 * sin_t) * by_rho, e),
         across_point=ratio * inverse_rho,
-        along_lens=camera.n_air * slope * inverse,
-        across_lens=camera.n_air * sin_d_per_b * ratio,
-        by_inner=(t2 - t1) / camera.inner_radius * inverse + by_outer,
+        along_lens=port.n_air * slope * inverse,
+        across_lens=port.n_air * sin_d_per_b * ratio,
+        by_inner=(t2 - t1) / port.inner_radius * inverse + by_outer,
         by_thickness=by_outer,
-        by_n_air=(t3 - t2 + t5 - t4) / camera.n_air * inverse,
-        by_n_acrylic=(t2 - t3) / camera.n_acrylic * inverse,
-        by_n_water=(t4 - t5) / camera.n_water * inverse,
+        by_n_air=(t3 - t2 + t5 - t4) / port.n_air * inverse,
+        by_n_acrylic=(t2 - t3) / port.n_acrylic * inverse,
+        by_n_water=(t4 - t5) / port.n_water * inverse,
     )
 
 
@@ -564,11 +525,47 @@ class Dome:
         """Radius of the outer sphere in metres."""
         return self.inner_radius + self.thickness
 
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Names of the parameters of a camera behind it, see `DOME_PARAMETERS`."""
+        return DOME_PARAMETERS
 
-def check_index(owner: str, name: str, value: float) -> None:
-    """Raise RigError unless `value` can be a refractive index relative to vacuum."""
-    if not 1.0 <= value <= 3.0:
-        raise RigError(
-            f"{owner} has {name} = {value:g}; a refractive index relative to vacuum lies "
-            "between 1 and 3"
+    def numbers(self) -> dict[str, float]:
+        """Return the sizes and the index by the names of their parameters."""
+        return {
+            "inner_radius": self.inner_radius,
+            "thickness": self.thickness,
+            "n_acrylic": self.n_acrylic,
+        }
+
+    def moved_by(self, step: Mapping[str, float]) -> "Dome":
+        """Return the dome with steps added to the parameters that are named."""
+        return Dome(**{name: value + step.get(name, 0.0) for name, value in self.numbers().items()})
+
+    def params(self, dome_from_cam: SE3, n_air: float, n_water: float) -> DomeParams:
+        """Return the dome around a camera as kernels take it.
+
+        Raises
+        ------
+        RigError
+            If the lens lies outside the inner sphere.
+        """
+        centre = np.asarray(dome_from_cam.translation, dtype=np.float64)
+        decentring = float(np.linalg.norm(centre))
+        if decentring >= self.inner_radius:
+            raise RigError(
+                f"lens at {np.round(centre * 1e3, 3).tolist()} mm is {decentring * 1e3:.3f} mm "
+                f"from the dome's centre but the inner radius is {self.inner_radius * 1e3:.3f} mm; "
+                "move the lens inside or correct the radius"
+            )
+        axis = centre / decentring if decentring > 0.0 else np.array([0.0, 0.0, 1.0])
+        return DomeParams(
+            centre=as_triple(centre),
+            inner_radius=float(self.inner_radius),
+            outer_radius=float(self.outer_radius),
+            n_air=float(n_air),
+            n_acrylic=float(self.n_acrylic),
+            n_water=float(n_water),
+            decentring=decentring,
+            axis=as_triple(axis),
         )

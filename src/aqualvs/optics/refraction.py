@@ -5,8 +5,23 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
+from aqualvs.errors import RigError
 from aqualvs.geometry.arrays import BoolArray, FloatArray, as_vectors
 from aqualvs.geometry.compiled import inline_kernel, kernel
+
+
+def check_index(owner: str, name: str, value: float) -> None:
+    """Raise RigError unless `value` can be a refractive index relative to vacuum."""
+    if not 1.0 <= value <= 3.0:
+        raise RigError(
+            f"{owner} has {name} = {value:g}; a refractive index relative to vacuum lies "
+            "between 1 and 3"
+        )
+
+
+def as_triple(vector: FloatArray) -> tuple[float, float, float]:
+    """Return a vector (3,) as kernels take it."""
+    return float(vector[0]), float(vector[1]), float(vector[2])
 
 
 @inline_kernel
@@ -100,6 +115,80 @@ def leave_sphere_tangent(
             ratio * d_dot[0] - k_dot * qx - k * qx_dot,
             ratio * d_dot[1] - k_dot * qy - k * qy_dot,
             ratio * d_dot[2] - k_dot * qz - k * qz_dot,
+        ),
+    )
+
+
+@inline_kernel
+def leave_plane(
+    p: tuple[float, float, float],
+    d: tuple[float, float, float],
+    normal: tuple[float, float, float],
+    height: float,
+    ratio: float,
+) -> tuple[float, tuple[float, float, float], tuple[float, float, float]]:
+    """Carry a ray from `height` behind a plane to it and refract it there.
+
+    Parameters
+    ----------
+    p, d : vector
+        Start and unit direction.
+    normal : vector
+        Of the plane, away from the start.
+    height : float
+        Distance of the plane from the start along the normal.
+    ratio : float
+        n before / n behind the plane.
+
+    Returns
+    -------
+    radicand, q, e
+        Point on the plane and unit direction behind it. A radicand that is not positive means
+        total reflection, or a direction that does not meet the plane; both are then meaningless.
+    """
+    cos_in = d[0] * normal[0] + d[1] * normal[1] + d[2] * normal[2]
+    step = height / cos_in
+    k, radicand = snell_weight(cos_in, ratio)
+    return (
+        radicand if cos_in > 0.0 else -1.0,
+        (p[0] + step * d[0], p[1] + step * d[1], p[2] + step * d[2]),
+        (
+            ratio * d[0] - k * normal[0],
+            ratio * d[1] - k * normal[1],
+            ratio * d[2] - k * normal[2],
+        ),
+    )
+
+
+@inline_kernel
+def leave_plane_tangent(
+    d: tuple[float, float, float],
+    p_dot: tuple[float, float, float],
+    d_dot: tuple[float, float, float],
+    normal: tuple[float, float, float],
+    height: float,
+    ratio: float,
+) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    """Return the derivative of `leave_plane`'s point and direction along (p_dot, d_dot).
+
+    `p_dot` lies in a plane parallel to it: the height does not change.
+    """
+    cos_in = d[0] * normal[0] + d[1] * normal[1] + d[2] * normal[2]
+    cos_dot = d_dot[0] * normal[0] + d_dot[1] * normal[1] + d_dot[2] * normal[2]
+    step = height / cos_in
+    step_dot = -step * cos_dot / cos_in
+    cos_out = math.sqrt(1.0 - ratio * ratio * (1.0 - cos_in * cos_in))
+    k_dot = ratio * cos_dot * (1.0 - ratio * cos_in / cos_out)
+    return (
+        (
+            p_dot[0] + step_dot * d[0] + step * d_dot[0],
+            p_dot[1] + step_dot * d[1] + step * d_dot[1],
+            p_dot[2] + step_dot * d[2] + step * d_dot[2],
+        ),
+        (
+            ratio * d_dot[0] - k_dot * normal[0],
+            ratio * d_dot[1] - k_dot * normal[1],
+            ratio * d_dot[2] - k_dot * normal[2],
         ),
     )
 

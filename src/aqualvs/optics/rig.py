@@ -19,10 +19,13 @@ from aqualvs.optics.camera import (
     BareCamera,
     Camera,
     DomeCamera,
+    FlatCamera,
+    Housing,
     moved_lens,
     moved_pose,
 )
 from aqualvs.optics.dome import Dome
+from aqualvs.optics.flat_port import FlatPort
 from aqualvs.optics.lens import Lens
 from aqualvs.optics.shutter import AT_ONCE, Shutter
 
@@ -87,13 +90,13 @@ class Rig:
     size_px : (int, int)
         Image width and height.
     lens : Lens
-        Intrinsics, calibrated in air without the dome.
+        Intrinsics, calibrated in air without the housing.
     dome_from_cam : SE3
         Camera pose in `dome`; the translation is the lens position L.
-    dome : Dome or None
+    housing : Dome, FlatPort or None
         None for a bare lens in the outer medium.
     n_air, n_water : float
-        Refractive indices (vacuum = 1) inside and outside the dome.
+        Refractive indices (vacuum = 1) inside and outside the housing.
     lasers : tuple of Laser
         In the order in which `points.parquet` numbers them.
     working_range : (float, float)
@@ -109,7 +112,7 @@ class Rig:
     size_px: tuple[int, int]
     lens: Lens
     dome_from_cam: SE3
-    dome: Dome | None
+    housing: Housing | None
     n_air: float
     n_water: float
     lasers: tuple[Laser, ...]
@@ -119,20 +122,39 @@ class Rig:
 
     def camera(self) -> Camera:
         """Return the camera as it looks into the outer medium."""
-        if self.dome is None:
+        if self.housing is None:
             return self.bare_camera()
+        if isinstance(self.housing, FlatPort):
+            return FlatCamera(
+                size_px=self.size_px,
+                lens=self.lens,
+                dome_from_cam=self.dome_from_cam,
+                port=self.housing,
+                n_air=self.n_air,
+                n_water=self.n_water,
+            )
         return DomeCamera(
             size_px=self.size_px,
             lens=self.lens,
             dome_from_cam=self.dome_from_cam,
-            dome=self.dome,
+            dome=self.housing,
             n_air=self.n_air,
             n_water=self.n_water,
         )
 
     def bare_camera(self) -> BareCamera:
-        """Return the same camera without the dome, which ignores refraction."""
+        """Return the same camera without the housing, which ignores refraction."""
         return BareCamera(size_px=self.size_px, lens=self.lens, dome_from_cam=self.dome_from_cam)
+
+    @property
+    def dome(self) -> Dome | None:
+        """The housing if it is a dome."""
+        return self.housing if isinstance(self.housing, Dome) else None
+
+    @property
+    def flat_port(self) -> FlatPort | None:
+        """The housing if it is a flat port."""
+        return self.housing if isinstance(self.housing, FlatPort) else None
 
     @property
     def focal_px(self) -> float:
@@ -277,10 +299,11 @@ def laser_parameter_names(laser: Laser) -> tuple[str, ...]:
 def rig_parameter_names(rig: Rig) -> tuple[str, ...]:
     """Return the names of all numbers of a rig that a `RigUncertainty` may hold.
 
-    The dome's are included whether or not the rig has one: the same rig may be used without it.
+    A bare lens has those of a dome: the same rig may be used without it.
     """
     lasers = (name for laser in rig.lasers for name in laser_parameter_names(laser))
-    return (*POSE_PARAMETERS, *DOME_PARAMETERS, *rig.lens.parameter_names, *lasers)
+    port = DOME_PARAMETERS if rig.housing is None else rig.housing.parameter_names
+    return (*POSE_PARAMETERS, *port, *rig.lens.parameter_names, *lasers)
 
 
 def rig_moved_by(rig: Rig, names: Sequence[str], step: FloatArray) -> Rig:
@@ -294,21 +317,13 @@ def rig_moved_by(rig: Rig, names: Sequence[str], step: FloatArray) -> Rig:
     values = dict(zip(names, np.asarray(step, np.float64).tolist(), strict=True))
     pose = {name: values.get(name, 0.0) for name in POSE_PARAMETERS}
     lens = {name: values.get(name, 0.0) for name in rig.lens.parameter_names}
-    shell = {name: values.get(name, 0.0) for name in DOME_PARAMETERS}
-    dome = rig.dome
-    if dome is not None:
-        dome = Dome(
-            dome.inner_radius + shell["inner_radius"],
-            dome.thickness + shell["thickness"],
-            dome.n_acrylic + shell["n_acrylic"],
-        )
     return replace(
         rig,
         dome_from_cam=moved_pose(rig.dome_from_cam, pose),
         lens=moved_lens(rig.lens, lens),
-        dome=dome,
-        n_air=rig.n_air + shell["n_air"],
-        n_water=rig.n_water + shell["n_water"],
+        housing=None if rig.housing is None else rig.housing.moved_by(values),
+        n_air=rig.n_air + values.get("n_air", 0.0),
+        n_water=rig.n_water + values.get("n_water", 0.0),
         lasers=tuple(_moved_laser(laser, values) for laser in rig.lasers),
     )
 

@@ -21,7 +21,7 @@ from aqualvs.errors import AqualvsError, OptionError, OutputError, RigError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec, rotvec_from_rotation
-from aqualvs.optics.camera import Dome
+from aqualvs.optics.camera import Dome, FlatPort, Housing
 from aqualvs.optics.lens import Lens, LensModel
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Laser, Rig, Window
 from aqualvs.optics.rigschema import (
@@ -228,6 +228,16 @@ def rig_to_mapping(rig: Rig) -> dict[str, Any]:
             "thickness_mm": _to_milli(rig.dome.thickness),
             "n_acrylic": float(rig.dome.n_acrylic),
         }
+    if rig.flat_port is not None:
+        port = rig.flat_port
+        tilt = np.rad2deg([port.tilt_x, port.tilt_y])
+        content["housing"] = "flat"
+        content["flat"] = {
+            "distance_mm": _to_milli(port.distance),
+            "thickness_mm": _to_milli(port.thickness),
+            "n_port": float(port.n_port),
+            "tilt_deg": [round(float(value), _ROTATION_DECIMALS) + 0.0 for value in tilt],
+        }
     content["n_air"] = float(rig.n_air)
     content["water"] = {"n": float(rig.n_water)}
     content["lasers"] = [_laser_mapping(laser) for laser in rig.lasers]
@@ -270,7 +280,6 @@ def rig_from_mapping(
 def _rig(file: RigFile) -> Rig:
     camera = file.camera
     turn = rotation_from_rotvec(np.deg2rad(camera.rotation_deg))
-    dome = file.dome
     return Rig(
         name=file.name,
         size_px=(file.image.width_px, file.image.height_px),
@@ -283,9 +292,7 @@ def _rig(file: RigFile) -> Rig:
             distortion=_distortion(file),
         ),
         dome_from_cam=SE3(turn @ DOME_FROM_CAM_NOMINAL, np.array(_position_mm(file)) / _MILLI),
-        dome=None
-        if dome is None
-        else Dome(dome.inner_radius_mm / _MILLI, dome.thickness_mm / _MILLI, dome.n_acrylic),
+        housing=_housing(file),
         n_air=file.n_air,
         n_water=_water_index(file),
         lasers=tuple(_laser(f"lasers[{i}]", part) for i, part in enumerate(file.lasers)),
@@ -293,6 +300,22 @@ def _rig(file: RigFile) -> Rig:
         solved_from=dict(file.solved_from),
         shutter=shutter_from_part(camera.shutter),
     )
+
+
+def _housing(file: RigFile) -> Housing | None:
+    dome, flat = file.dome, file.flat
+    if dome is not None and flat is not None:
+        raise RigError("dome and flat: both are given; leave one out, a camera has one housing")
+    kind = "dome" if dome is not None else "flat" if flat is not None else "none"
+    if file.housing not in (None, kind):
+        said = "neither 'dome' nor 'flat' is given" if kind == "none" else f"'{kind}' is given"
+        raise RigError(f"housing is {file.housing!r} but {said}; make them agree")
+    if dome is not None:
+        return Dome(dome.inner_radius_mm / _MILLI, dome.thickness_mm / _MILLI, dome.n_acrylic)
+    if flat is None:
+        return None
+    tilt = [math.radians(value) for value in flat.tilt_deg]
+    return FlatPort(flat.distance_mm / _MILLI, flat.thickness_mm / _MILLI, flat.n_port, *tilt)
 
 
 def shutter_from_part(part: ShutterPart) -> Shutter:
@@ -342,7 +365,8 @@ def _water_index(file: RigFile) -> float:
     """
     water, n_air = file.water, file.n_air
     if water is None:
-        if file.dome is not None or any(laser.window is not None for laser in file.lasers):
+        housed = file.dome is not None or file.flat is not None
+        if housed or any(laser.window is not None for laser in file.lasers):
             raise RigError(missing_text("water"))
         return n_air
     measured = (water.temperature_c, water.salinity_permille, water.wavelength_nm)

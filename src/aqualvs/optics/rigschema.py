@@ -24,6 +24,7 @@ FocalLength = Annotated[float, Field(gt=0.0, le=1e7, allow_inf_nan=False)]
 """In pixels; a lens of 10 m before pixels of 1 micrometre has the greatest."""
 Index = Annotated[float, Field(ge=1.0, le=2.0, allow_inf_nan=False)]
 Pixels = Annotated[int, Field(gt=0)]
+Tilt = Annotated[float, Field(ge=-45.0, le=45.0, allow_inf_nan=False)]
 Triple = Annotated[list[Number], Field(min_length=3, max_length=3)]
 Pair = Annotated[list[Positive], Field(min_length=2, max_length=2)]
 Name = Annotated[str, Field(min_length=1)]
@@ -125,6 +126,19 @@ class DomePart(StrictPart):
     n_acrylic: Annotated[Index, _said("Refractive index of the wall.")]
 
 
+class FlatPart(StrictPart):
+    """`flat`: a plane window, fixed to the camera."""
+
+    distance_mm: Annotated[Positive, _said("From the lens's projection centre to the inner face.")]
+    thickness_mm: Annotated[NotNegative, _said("Thickness of the window.")]
+    n_port: Annotated[Index, _said("Refractive index of the window.")]
+    tilt_deg: Annotated[
+        list[Tilt],
+        Field(min_length=2, max_length=2),
+        _said("Of its normal from the optical axis, about the camera's x and y axes."),
+    ] = [0.0, 0.0]
+
+
 class WaterPart(StrictPart):
     """`water`: its index, or the temperature and salinity that determine it."""
 
@@ -178,12 +192,22 @@ def _dome_conditions(schema: dict[str, Any]) -> None:
     given = {"not": {"type": "null"}}
     window = {"required": ["window"], "properties": {"window": given}}
     dome = {"required": ["dome"], "properties": {"dome": given}}
+    flat = {"required": ["flat"], "properties": {"flat": given}}
+    sections = (("dome", dome), ("flat", flat))
     lasers = {"required": ["lasers"], "properties": {"lasers": {"contains": window}}}
     water = {"required": ["water"], "properties": {"water": given}}
     lens = {"required": ["position_mm"], "properties": {"position_mm": given}}
     schema["allOf"] = [
-        {"if": {"anyOf": [dome, lasers]}, "then": water},
+        {"if": {"anyOf": [dome, flat, lasers]}, "then": water},
         {"if": dome, "then": {"properties": {"camera": lens}}},
+        {"not": {"allOf": [dome, flat]}},
+        *(
+            {
+                "if": {"required": ["housing"], "properties": {"housing": {"const": kind}}},
+                "then": {"allOf": [one if own == kind else {"not": one} for own, one in sections]},
+            }
+            for kind in ("dome", "flat", "none")
+        ),
     ]
 
 
@@ -198,10 +222,15 @@ class RigFile(StrictPart):
     name: Annotated[Name, _said("How reports call the rig.")] = "rig"
     image: ImagePart
     camera: CameraPart
-    dome: Annotated[DomePart | None, _said("Leave it out for a bare lens.")] = None
-    n_air: Annotated[Index, _said("Index inside the dome, relative to vacuum.")] = 1.0003
+    housing: Annotated[
+        Literal["dome", "flat", "none"] | None,
+        _said("Follows from the sections `dome` and `flat`, and must agree with them."),
+    ] = None
+    dome: Annotated[DomePart | None, _said("Leave it out without a dome.")] = None
+    flat: Annotated[FlatPart | None, _said("Leave it out without a flat port.")] = None
+    n_air: Annotated[Index, _said("Index inside the housing, relative to vacuum.")] = 1.0003
     water: Annotated[
-        WaterPart | None, _said("What is outside; needed behind a dome, else air.")
+        WaterPart | None, _said("What is outside; needed behind a housing, else air.")
     ] = None
     lasers: Annotated[list[LaserPart], _said("One to measure points, two for a posture.")] = []
     working_range_mm: Annotated[
@@ -379,6 +408,11 @@ _EXAMPLES: dict[str, str] = {
     "readout_ms": "readout_ms: 20",
     "exposure_ms": "exposure_ms: 8",
     "dome": "dome: {inner_radius_mm: 44.25, thickness_mm: 5.75, n_acrylic: 1.49}",
+    "housing": "housing: flat",
+    "flat": "flat: {distance_mm: 12.0, thickness_mm: 5.0, n_port: 1.49}",
+    "distance_mm": "distance_mm: 12.0",
+    "n_port": "n_port: 1.49",
+    "tilt_deg": "tilt_deg: [0.0, 0.0]",
     "inner_radius_mm": "inner_radius_mm: 44.25",
     "thickness_mm": "thickness_mm: 5.75",
     "n_acrylic": "n_acrylic: 1.49",
@@ -403,6 +437,7 @@ _PARTS: dict[str, type[BaseModel]] = {
     "camera": CameraPart,
     "shutter": ShutterPart,
     "dome": DomePart,
+    "flat": FlatPart,
     "water": WaterPart,
     "lasers": LaserPart,
     "window": WindowPart,

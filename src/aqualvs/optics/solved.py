@@ -65,10 +65,14 @@ _UNCERTAINTY = "uncertainty"
 _PLACE = f"solved_from.{_UNCERTAINTY}"
 _KEYS = ("parameters", "sigma", "correlation")
 _DEG = 180.0 / math.pi
-_MM = ("lens_x", "lens_y", "lens_z", "inner_radius", "thickness", "offset", "window_offset")
+_MM = (
+    *("lens_x", "lens_y", "lens_z", "inner_radius", "thickness", "port_distance"),
+    *("offset", "window_offset"),
+)
 _UNIT_OF = {
     **dict.fromkeys((*_MM, "source_1", "source_2"), ("mm", 1e3)),
     **dict.fromkeys(("rotation_x", "rotation_y", "rotation_z"), ("deg", _DEG)),
+    **dict.fromkeys(("port_tilt_x", "port_tilt_y"), ("deg", _DEG)),
     **dict.fromkeys(("tilt_1", "tilt_2", "window_tilt_1", "window_tilt_2"), ("deg", _DEG)),
     **dict.fromkeys(("fx", "fy", "cx", "cy"), ("px", 1.0)),
 }
@@ -326,9 +330,12 @@ CENTRE_SHARE = 0.002
 DISTORTION_K1 = 0.005
 """Of the first distortion coefficient, where the rig has any."""
 LENS_M = 1e-3
-"""Of the lens's place in the dome, along each axis: measured with a caliper."""
+"""Of the lens's place in the dome along each axis, or its distance from a flat port: measured with
+a caliper."""
 RADIUS_M, THICKNESS_M, N_ACRYLIC = 1e-4, 1e-4, 3e-3
 """Of the dome: the tolerances of the part that `calibrate dome` assumes as well."""
+PORT_TILT = math.radians(0.5)
+"""Of a flat port from square to the optical axis, about each axis: a camera mounted by hand."""
 N_WATER = 3e-3
 """Of the water's index: between fresh and sea water, with which `calibrate dome` starts as well."""
 LASER_TILT, LASER_OFFSET_M = math.radians(0.2), 1e-3
@@ -336,6 +343,7 @@ LASER_TILT, LASER_OFFSET_M = math.radians(0.2), 1e-3
 
 _LENS = ("lens_x", "lens_y", "lens_z")
 _SHELL = ("inner_radius", "thickness", "n_acrylic")
+_FLAT = ("port_distance", "thickness", "n_port", "port_tilt_x", "port_tilt_y")
 # An index outside that is the one inside is air, which is known.
 _AIR = 1e-3
 
@@ -364,7 +372,7 @@ def assumptions(rig: Rig) -> tuple[Assumption, ...]:
     A group of numbers (intrinsics, place of the lens, dome, water, each laser) of which
     `solved_from.uncertainty` names one was calibrated; the others of the group were held fixed and
     count as exact. The origin and the axes of the frame `dome` are exact by definition where
-    nothing physical fixes them: the camera's rotation, and a bare lens's place.
+    nothing physical fixes them: the camera's rotation, and the place of a lens without a dome.
 
     Raises
     ------
@@ -415,7 +423,15 @@ def _defaults(rig: Rig) -> Iterator[Assumption]:
             f"{RADIUS_M * 1e3:g} mm in radius and thickness, {N_ACRYLIC:g} in index",
             RigUncertainty.independent(sizes),
         )
-    bends = rig.dome is not None or any(laser.window is not None for laser in rig.lasers)
+    if rig.flat_port is not None:
+        tolerances = (LENS_M, THICKNESS_M, N_ACRYLIC, PORT_TILT, PORT_TILT)
+        yield Assumption(
+            "flat port",
+            f"{LENS_M * 1e3:g} mm in distance, {THICKNESS_M * 1e3:g} mm in thickness, "
+            f"{N_ACRYLIC:g} in index, {math.degrees(PORT_TILT):g} degrees in tilt",
+            RigUncertainty.independent(dict(zip(_FLAT, tolerances, strict=True))),
+        )
+    bends = rig.housing is not None or any(laser.window is not None for laser in rig.lasers)
     if bends and abs(rig.n_water - rig.n_air) > _AIR:
         yield Assumption(
             "water's index", f"{N_WATER:g}", RigUncertainty.independent({"n_water": N_WATER})

@@ -11,6 +11,7 @@ text of its file and its exact numbers; the scanner's options as JSON.
 
 import json
 import struct
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
 from typing import Any, cast
@@ -22,7 +23,7 @@ from numpy.typing import NDArray
 from aqualvs.errors import RigError
 from aqualvs.geometry.planes import Plane
 from aqualvs.geometry.transforms import SE3
-from aqualvs.optics.dome import Dome
+from aqualvs.optics.camera import Dome, FlatPort, Housing
 from aqualvs.optics.rig import Laser, Rig, Window
 from aqualvs.optics.rigfile import rig_from_mapping, rig_to_mapping
 from aqualvs.scanner import ScannerOptions
@@ -107,7 +108,7 @@ def rig_yaml(rig: Rig) -> str:
 
 def rig_exact(rig: Rig) -> str:
     """Return the exact values of the numbers that a rig file rounds, as JSON."""
-    pose, dome = rig.dome_from_cam, rig.dome
+    pose, dome, port = rig.dome_from_cam, rig.dome, rig.flat_port
     found = {
         "rotation": pose.rotation.tolist(),
         "translation": pose.translation.tolist(),
@@ -117,6 +118,8 @@ def rig_exact(rig: Rig) -> str:
         "lasers": [_laser_numbers(laser) for laser in rig.lasers],
         "working_range": list(rig.working_range),
     }
+    if port is not None:
+        found["flat"] = list(port.numbers().values())
     return json.dumps(found)
 
 
@@ -143,7 +146,7 @@ def rig_from_record(text: str, exact: str, source_name: str) -> Rig:
     return replace(
         rig,
         dome_from_cam=SE3(np.array(numbers["rotation"]), np.array(numbers["translation"])),
-        dome=None if numbers["dome"] is None else Dome(*numbers["dome"]),
+        housing=_housing(numbers),
         n_air=numbers["n_air"],
         n_water=numbers["n_water"],
         lasers=tuple(
@@ -152,6 +155,12 @@ def rig_from_record(text: str, exact: str, source_name: str) -> Rig:
         ),
         working_range=tuple(numbers["working_range"]),
     )
+
+
+def _housing(numbers: Mapping[str, Any]) -> Housing | None:
+    if "flat" in numbers:
+        return FlatPort(*numbers["flat"])
+    return None if numbers["dome"] is None else Dome(*numbers["dome"])
 
 
 def options_text(options: ScannerOptions) -> str:

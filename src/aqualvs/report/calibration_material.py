@@ -277,7 +277,11 @@ _NAMES = {
     "rotation_y": ("camera rotation y", "°", _DEG, 3),
     "rotation_z": ("camera rotation z", "°", _DEG, 3),
     "inner_radius": ("dome inner radius", "mm", 1e3, 3),
-    "thickness": ("dome thickness", "mm", 1e3, 3),
+    "thickness": ("thickness of the housing", "mm", 1e3, 3),
+    "port_distance": ("distance of the port", "mm", 1e3, 3),
+    "port_tilt_x": ("tilt of the port about x", "°", _DEG, 3),
+    "port_tilt_y": ("tilt of the port about y", "°", _DEG, 3),
+    "n_port": ("index of the port", "", 1.0, 4),
     "n_air": ("index of the air inside", "", 1.0, 5),
     "n_acrylic": ("index of the dome", "", 1.0, 4),
     "n_water": ("index of the water", "", 1.0, 5),
@@ -347,11 +351,7 @@ def camera_numbers(rig: Rig) -> dict[str, float]:
         numbers[f"lens_{axis}"] = float(place)
         numbers[f"rotation_{axis}"] = float(angle)
     numbers["n_air"], numbers["n_water"] = rig.n_air, rig.n_water
-    if rig.dome is not None:
-        numbers["inner_radius"] = rig.dome.inner_radius
-        numbers["thickness"] = rig.dome.thickness
-        numbers["n_acrylic"] = rig.dome.n_acrylic
-    return numbers
+    return numbers if rig.housing is None else numbers | rig.housing.numbers()
 
 
 def residual_map(

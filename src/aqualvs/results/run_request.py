@@ -329,7 +329,7 @@ def in_water(rig: Rig, water: Water, *, no_dome: bool) -> Rig:
         If the water makes no sense.
     """
     rig = water.applied_to(rig)
-    return replace(rig, dome=None) if no_dome else rig
+    return replace(rig, housing=None) if no_dome else rig
 
 
 def check_fits(source: FrameSource, rig: Rig) -> None:

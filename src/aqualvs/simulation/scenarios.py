@@ -5,10 +5,13 @@ statistics over conditions rather than over one dive.
 
 The rigs are in round numbers. `example_rig` resembles the rig of the paper: a lens strongly off the
 dome's centre and three lasers, one nearly level below, one nearly upright on the left, one diagonal
-on the right. `bluerov2_rig` resembles a BlueROV2: a wide camera near the centre of a 4-inch dome.
+on the right. `bluerov2_rig` resembles a BlueROV2: a wide camera near the centre of a 4-inch dome;
+`flat_port_rig` has its camera and lasers behind a flat port.
 """
 
+import math
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal, TypeAlias, get_args
@@ -19,7 +22,7 @@ from aqualvs.errors import OptionError
 from aqualvs.geometry.linear_algebra import Vec
 from aqualvs.geometry.planes import Plane
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
-from aqualvs.optics.camera import Dome
+from aqualvs.optics.camera import Dome, FlatPort
 from aqualvs.optics.lens import Lens
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Laser, Rig
 from aqualvs.simulation.scenario import (
@@ -44,7 +47,7 @@ def example_rig() -> Rig:
             fx=817.0, fy=878.0, cx=369.0, cy=282.0, distortion=(-0.126, 0.083, 0.0006, -0.0004)
         ),
         dome_from_cam=_pose((2.3, 1.7, 0.9), (3.0, 41.5, 3.0)),
-        dome=Dome(inner_radius=44.25e-3, thickness=5.75e-3, n_acrylic=1.49),
+        housing=Dome(inner_radius=44.25e-3, thickness=5.75e-3, n_acrylic=1.49),
         n_air=1.0003,
         n_water=_N_FRESH_WATER,
         lasers=(
@@ -65,7 +68,7 @@ def bluerov2_rig() -> Rig:
             fx=1390.0, fy=1390.0, cx=957.0, cy=543.0, distortion=(-0.11, 0.05, 0.0003, -0.0002)
         ),
         dome_from_cam=_pose((0.6, -0.4, 0.2), (0.8, 5.8, -0.6)),
-        dome=Dome(inner_radius=51.0e-3, thickness=6.0e-3, n_acrylic=1.49),
+        housing=Dome(inner_radius=51.0e-3, thickness=6.0e-3, n_acrylic=1.49),
         n_air=1.0003,
         n_water=_N_FRESH_WATER,
         lasers=(
@@ -74,6 +77,17 @@ def bluerov2_rig() -> Rig:
             Laser("right", Plane.from_normal((0.730, 0.170, 0.662), 0.110)),
         ),
         working_range=(0.3, 1.2),
+    )
+
+
+def flat_port_rig() -> Rig:
+    """Return the camera and lasers of `bluerov2_rig` behind a flat port, its lens the origin."""
+    rig = bluerov2_rig()
+    return replace(
+        rig,
+        name="flat port",
+        dome_from_cam=SE3(rig.dome_from_cam.rotation, np.zeros(3)),
+        housing=FlatPort(0.012, 0.005, 1.49, math.radians(0.6), math.radians(-0.4)),
     )
 
 

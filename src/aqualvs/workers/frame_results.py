@@ -33,7 +33,7 @@ _MIN_POINTS = 6
 
 
 class BareLensComparison:
-    """Measurement of a scan's posture with the rig's camera out of its dome.
+    """Measurement of a scan's posture with the rig's camera out of its housing.
 
     Detection, classification and the choice of the target are taken over from the scan, so that
     the difference is that of the ray model alone (paper, section 5.4).
@@ -41,7 +41,7 @@ class BareLensComparison:
     Parameters
     ----------
     rig : Rig
-        A rig with a dome.
+        A rig with a housing.
     """
 
     def __init__(self, rig: Rig) -> None:
@@ -244,7 +244,7 @@ class FrameProcessor:
     def __init__(self, rig: Rig, scanner: FrameScanner) -> None:
         self._scanner = scanner
         self.block_length = block_length(rig.size_px) if isinstance(scanner, Scanner) else 1
-        self._bare_lens = BareLensComparison(rig) if rig.dome is not None else None
+        self._bare_lens = BareLensComparison(rig) if rig.housing is not None else None
 
     def measure(self, frames: Sequence[Frame]) -> list[FrameResult]:
         """Measure frames, in their order."""

@@ -390,7 +390,7 @@ def test_refuses_too_little() -> None:
 def test_refuses_a_rig_without_a_dome() -> None:
     shoot = _rail("unknown")
     with pytest.raises(CalibrationError, match="rig example has no dome"):
-        dome(replace(PAPER, dome=None), [shoot.as_set()], QUICK, INTRINSICS)
+        dome(replace(PAPER, housing=None), [shoot.as_set()], QUICK, INTRINSICS)
 
 
 def test_refuses_another_board() -> None:

@@ -111,7 +111,7 @@ def truth(paper: Path) -> Rig:
             distortion=tuple(lens["dist"][:4]),
         ),
         dome_from_cam=SE3(turn @ DOME_FROM_CAM_NOMINAL, 1e-3 * np.array(content["lens_mm"])),
-        dome=Dome(1e-3 * shell["inner_mm"], 1e-3 * shell["thickness_mm"], shell["n_acrylic"]),
+        housing=Dome(1e-3 * shell["inner_mm"], 1e-3 * shell["thickness_mm"], shell["n_acrylic"]),
         n_air=content["n_air"],
         n_water=content["n_water"],
         lasers=(),

@@ -378,7 +378,7 @@ def test_swapped_units(factor: float) -> None:
 
 def test_a_target_ten_times_too_large_lies_too_far_away() -> None:
     """A bare lens cannot tell a target's size; its distance gives it away."""
-    rig = replace(RIG, dome=None, working_range=(0.3, 0.6))
+    rig = replace(RIG, housing=None, working_range=(0.3, 0.6))
     views = simulated(rig, [dome_from_board(i) for i in range(4)], board_corners(), board_surface())
     views = [replace(v, view=replace(v.view, points=v.view.points * 10.0)) for v in views]
     with pytest.raises(CalibrationError, match=r"stripes lie .* mm away"):

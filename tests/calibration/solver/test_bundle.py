@@ -45,7 +45,9 @@ def _bundle(rig: Rig, seed: int = 1, n_views: int = 4, noise_px: float = 0.0) ->
     return Bundle(tuple(targets), free, state, priors, media_sigma)
 
 
-@pytest.mark.parametrize("rig", [example_rig(), bluerov2_rig(), replace(example_rig(), dome=None)])
+@pytest.mark.parametrize(
+    "rig", [example_rig(), bluerov2_rig(), replace(example_rig(), housing=None)]
+)
 def test_derivatives_are_those_of_central_differences(rig: Rig) -> None:
     bundle = _bundle(rig)
     # Away from where priors and measured poses have no residual.

@@ -402,8 +402,8 @@ def test_sets_from_which_nothing_can_be_solved() -> None:
     few = vehicle.sees(1.34).where(np.arange(24) < 2)
     with pytest.raises(CalibrationError, match=r"none of 2 pictures.*2 corners"):
         calibrate_water(RIG, [few, few])
-    with pytest.raises(CalibrationError, match="has no dome"):
-        calibrate_water(replace(RIG, dome=None), [vehicle.sees(1.34)])
+    with pytest.raises(CalibrationError, match="has no housing"):
+        calibrate_water(replace(RIG, housing=None), [vehicle.sees(1.34)])
     with pytest.raises(CalibrationError, match="no picture"):
         vehicle.estimator().residuals(few)
 

@@ -415,7 +415,7 @@ def _bundle(lens: Lens, size_px: tuple[int, int], views: Sequence[View]) -> Bund
         size_px=size_px,
         lens=lens,
         dome_from_cam=SE3.identity(),
-        dome=None,
+        housing=None,
         n_air=1.0,
         n_water=1.0,
         lasers=(),

@@ -83,12 +83,12 @@ def _bare_state(
 ) -> BundleState:
     """Solve a bare lens with free pose from the same pictures."""
     bundle = problem.bundle
-    rig = replace(solution.state.rig, dome=None)
+    rig = replace(solution.state.rig, housing=None)
     views = [_bare_view(rig.camera(), bundle.views[i], solution.state, i) for i in rest]
     intrinsics = tuple(name for name in bundle.free if name in rig.lens.parameter_names)
     # With unknown poses the place is arbitrary.
     free = (LENS + ROTATION if problem.rotation_is_solved else ()) + intrinsics
-    start_rig = replace(bundle.start.rig, dome=None)
+    start_rig = replace(bundle.start.rig, housing=None)
     start = BundleState(start_rig, solution.state.media, tuple(v.dome_from_target for v in views))
     bare = Bundle(
         tuple(views),

@@ -64,10 +64,10 @@ class CameraCovariance:
         sigmas = given.sigmas
         known = set(parameter_names(rig.camera())) - {"n_water"}
         names = tuple(n for n in given.names if n in known and sigmas[n] > 0.0)
-        is_water = n_medium is None and rig.dome is not None
+        is_water = n_medium is None and rig.housing is not None
         if is_water:
             sigma_medium = sigmas.get("n_water", 0.0)
-        return cls(names, sigma_medium if rig.dome is not None else 0.0, is_water, given)
+        return cls(names, sigma_medium if rig.housing is not None else 0.0, is_water, given)
 
     @property
     def n_columns(self) -> int:

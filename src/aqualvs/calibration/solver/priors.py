@@ -166,12 +166,8 @@ def rig_numbers(rig: Rig) -> dict[str, float]:
     position = rig.dome_from_cam.translation.tolist()
     numbers.update(zip(("lens_x", "lens_y", "lens_z"), position, strict=True))
     numbers.update(dict.fromkeys(_ROTATION, 0.0), n_air=rig.n_air, n_water=rig.n_water)
-    if rig.dome is not None:
-        numbers.update(
-            inner_radius=rig.dome.inner_radius,
-            thickness=rig.dome.thickness,
-            n_acrylic=rig.dome.n_acrylic,
-        )
+    if rig.housing is not None:
+        numbers.update(rig.housing.numbers())
     return numbers
 
 

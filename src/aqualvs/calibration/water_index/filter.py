@@ -146,10 +146,10 @@ class IndexModel:
     _cache: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        if self.rig.dome is None:
+        if self.rig.housing is None:
             raise CalibrationError(
-                f"rig {self.rig.name} has no dome: a bare lens looks the same in every medium, so "
-                "its index cannot be found; add the dome to the rig"
+                f"rig {self.rig.name} has no housing: a bare lens looks the same in every medium, "
+                "so its index cannot be found; add the dome or the flat port to the rig"
             )
         sigmas = self.uncertainty.sigmas
         names = parameter_names(self.rig.camera())

@@ -1,0 +1,368 @@
+"""What refracts between a camera and the outer medium: nothing, a dome or a flat port.
+
+A port is a named tuple of numbers (`BareParams`, `DomeParams`, `FlatParams`) and six functions on
+it, one for each name that `chosen_by_class` defines here; kernels are compiled for the class of
+port that they are called with. Functions of blocks work on a scratch array whose rows are named
+here, `BLOCK` lanes long.
+"""
+
+import math
+from typing import NamedTuple
+
+from aqualvs.geometry.arrays import FloatArray
+from aqualvs.geometry.compiled import chosen_by_class, inline_kernel
+from aqualvs.optics.dome import (
+    ROUNDS,
+    DomeParams,
+    across_axis,
+    back_derivative,
+    blend,
+    cross,
+    direction_to_point,
+    dot,
+    is_outside,
+    paraxial_start,
+    perpendicular,
+    polar_angle,
+    solve_guarded,
+    surfaces_at,
+    three_steps,
+    trace_direction,
+    trace_tangent,
+)
+from aqualvs.optics.flat_port import (
+    FLAT_PARAMETERS,
+    FlatParams,
+    flat_derivative,
+    height_and_reach,
+    is_in_front,
+    tangent_guarded,
+    tangent_start,
+    three_tangent_steps,
+    trace_flat,
+    trace_flat_tangent,
+)
+from aqualvs.optics.lens import BLOCK
+from aqualvs.optics.lens_kernels import Vector
+
+
+class BareParams(NamedTuple):
+    """A lens in the outer medium itself, as kernels take it.
+
+    Attributes
+    ----------
+    centre : tuple of 3 float
+        The lens position L in `dome`, metres.
+    """
+
+    centre: Vector
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return ()
+
+
+@inline_kernel
+def _trace_bare(
+    port: BareParams, dx: float, dy: float, dz: float
+) -> tuple[bool, float, float, float, float, float, float]:
+    ox, oy, oz = port.centre
+    return True, ox, oy, oz, dx, dy, dz
+
+
+@inline_kernel
+def _trace_bare_tangent(
+    _port: BareParams, _direction: Vector, direction_dot: Vector
+) -> tuple[Vector, Vector]:
+    return (0.0, 0.0, 0.0), direction_dot
+
+
+trace_port = chosen_by_class(
+    {BareParams: _trace_bare, DomeParams: trace_direction, FlatParams: trace_flat}
+)
+"""`trace_port(port, dx, dy, dz)`: a unit direction at the lens as the ray in the outer medium, see
+`trace_direction`."""
+trace_port_tangent = chosen_by_class(
+    {BareParams: _trace_bare_tangent, DomeParams: trace_tangent, FlatParams: trace_flat_tangent}
+)
+"""`trace_port_tangent(port, direction, direction_dot)`: its derivative."""
+
+
+# Rows of the scratch array: the point, which becomes the direction at the lens, then the pixel;
+# its polar coordinates (distance inverted), or, of a flat port, its height above the outer face
+# and its distance from the axis; the unit vector across the axis; the solution; a sign, positive
+# where valid.
+PX, PY, PZ, FAR, COS_T, SIN_T, EX, EY, EZ, COS_A, SIN_A, OK = (i_row * BLOCK for i_row in range(12))
+N_POINT_ROWS = 12
+
+
+@inline_kernel
+def _aim_bare(port: BareParams, x: float, y: float, z: float) -> tuple[bool, float, float, float]:
+    c = port.centre
+    return True, x - c[0], y - c[1], z - c[2]
+
+
+@inline_kernel
+def _aim_flat(port: FlatParams, x: float, y: float, z: float) -> tuple[bool, float, float, float]:
+    height, rho, e = height_and_reach(port, x, y, z)
+    t, solved = three_tangent_steps(port, height, rho, tangent_start(port, height, rho))
+    if not solved:
+        solved, t = tangent_guarded(port, height, rho)
+    m = port.normal
+    return (
+        solved and is_in_front(port, height),
+        m[0] + t * e[0],
+        m[1] + t * e[1],
+        m[2] + t * e[2],
+    )
+
+
+aim = chosen_by_class(
+    {BareParams: _aim_bare, DomeParams: direction_to_point, FlatParams: _aim_flat}
+)
+"""`aim(port, x, y, z)`: (valid, dx, dy, dz), a direction at the lens, of any length, whose ray
+meets the point."""
+
+
+@inline_kernel
+def aim_bare_block(port: BareParams, _count: int, w: FloatArray) -> None:
+    """Turn points into directions from the lens, all lanes of a block."""
+    cx, cy, cz = port.centre
+    for j in range(BLOCK):
+        w[PX + j], w[PY + j], w[PZ + j] = w[PX + j] - cx, w[PY + j] - cy, w[PZ + j] - cz
+        w[OK + j] = 1.0
+
+
+@inline_kernel
+def polar_block(port: DomeParams, w: FloatArray) -> None:
+    """Turn points into polar coordinates and the start of the search, all lanes of a block."""
+    n_l = port.n_air * port.decentring
+    for j in range(BLOCK):
+        far, cos_t, sin_t, e = polar_angle(port, w[PX + j], w[PY + j], w[PZ + j])
+        w[FAR + j], w[COS_T + j], w[SIN_T + j] = far, cos_t, sin_t
+        w[EX + j], w[EY + j], w[EZ + j] = e
+        w[OK + j] = 0.0 if is_outside(port, far) else -1.0
+        s = surfaces_at(port, far)
+        w[COS_A + j], w[SIN_A + j] = paraxial_start(s, n_l, cos_t, sin_t)
+
+
+@inline_kernel
+def solve_block(port: DomeParams, count: int, w: FloatArray) -> None:
+    """Solve for the ray's angle at the lens, all lanes of a block; set the signs of validity.
+
+    Lanes that no round of steps solves are searched one by one.
+    """
+    n_l = port.n_air * port.decentring
+    n_open = count
+    for _ in range(ROUNDS):
+        if n_open == 0:
+            return
+        for j in range(BLOCK):
+            s = surfaces_at(port, w[FAR + j])
+            c, k, solved = three_steps(
+                s, n_l, w[COS_T + j], w[SIN_T + j], w[COS_A + j], w[SIN_A + j]
+            )
+            w[COS_A + j], w[SIN_A + j] = c, k
+            w[OK + j] = 1.0 if solved & (w[OK + j] >= 0.0) else w[OK + j]
+        n_open = 0
+        for j in range(count):
+            n_open += w[OK + j] == 0.0
+    for j in range(count):
+        if w[OK + j] == 0.0:
+            s = surfaces_at(port, w[FAR + j])
+            found, w[COS_A + j], w[SIN_A + j] = solve_guarded(s, n_l, w[COS_T + j], w[SIN_T + j])
+            w[OK + j] = 1.0 if found else -1.0
+
+
+@inline_kernel
+def turn_block(port: DomeParams, w: FloatArray) -> None:
+    """Turn solved angles into directions at the lens, in `dome`, all lanes of a block."""
+    ax, ay, az = port.axis
+    for j in range(BLOCK):
+        c, k = w[COS_A + j], w[SIN_A + j]
+        w[PX + j] = c * ax + k * w[EX + j]
+        w[PY + j] = c * ay + k * w[EY + j]
+        w[PZ + j] = c * az + k * w[EZ + j]
+
+
+@inline_kernel
+def aim_dome_block(port: DomeParams, count: int, w: FloatArray) -> None:
+    """Turn points into directions at the lens, in `dome`, all lanes of a block."""
+    polar_block(port, w)
+    solve_block(port, count, w)
+    turn_block(port, w)
+
+
+@inline_kernel
+def aim_flat_block(port: FlatParams, count: int, w: FloatArray) -> None:
+    """Turn points into directions at the lens, in `dome`, all lanes of a block."""
+    for j in range(BLOCK):
+        height, rho, e = height_and_reach(port, w[PX + j], w[PY + j], w[PZ + j])
+        w[FAR + j], w[SIN_T + j] = height, rho
+        w[EX + j], w[EY + j], w[EZ + j] = e
+        t, solved = three_tangent_steps(port, height, rho, tangent_start(port, height, rho))
+        w[SIN_A + j] = t
+        in_front = is_in_front(port, height)
+        w[OK + j] = (1.0 if solved else 0.0) if in_front else -1.0
+    for j in range(count):
+        if w[OK + j] == 0.0:
+            found, w[SIN_A + j] = tangent_guarded(port, w[FAR + j], w[SIN_T + j])
+            w[OK + j] = 1.0 if found else -1.0
+    mx, my, mz = port.normal
+    for j in range(BLOCK):
+        t = w[SIN_A + j]
+        c = 1.0 / math.sqrt(1.0 + t * t)
+        s = t * c
+        w[COS_A + j], w[SIN_A + j] = c, s
+        w[PX + j] = c * mx + s * w[EX + j]
+        w[PY + j] = c * my + s * w[EY + j]
+        w[PZ + j] = c * mz + s * w[EZ + j]
+
+
+aim_block = chosen_by_class(
+    {BareParams: aim_bare_block, DomeParams: aim_dome_block, FlatParams: aim_flat_block}
+)
+"""`aim_block(port, count, w)`: `aim` for all lanes of a block."""
+
+
+# Columns of the parameter Jacobian before the intrinsics: lens position 3, rotation 3, and those of
+# the port, seven at most.
+N_POSE = 6
+N_PORT = len(FLAT_PARAMETERS)
+# Rows of the scratch array after those of the projection: direction in `cam`, pixel, gradients of
+# u and v by the direction in `dome`, then for u and for v the gradients by point, pose and port.
+CX, CY, CZ, U, V, GUX, GUY, GUZ, GVX, GVY, GVZ = (
+    (N_POINT_ROWS + i_row) * BLOCK for i_row in range(11)
+)
+N_GRADIENT = 3 + N_POSE + N_PORT
+JU = (N_POINT_ROWS + 11) * BLOCK
+JV = JU + N_GRADIENT * BLOCK
+N_ROWS = N_POINT_ROWS + 11 + 2 * N_GRADIENT
+
+
+@inline_kernel
+def dome_gradients_block(port: DomeParams, w: FloatArray) -> None:
+    """Write the gradients of u and v by point, lens position and dome, all lanes of a block."""
+    spare = perpendicular(port.axis)
+    for j in range(BLOCK):
+        back = back_derivative(
+            port,
+            surfaces_at(port, w[FAR + j]),
+            (w[FAR + j], w[COS_T + j], w[SIN_T + j]),
+            across_axis(port.axis, (w[EX + j], w[EY + j], w[EZ + j]), spare),
+            (w[COS_A + j], w[SIN_A + j]),
+        )
+        for g, row in (
+            ((w[GUX + j], w[GUY + j], w[GUZ + j]), JU),
+            ((w[GVX + j], w[GVY + j], w[GVZ + j]), JV),
+        ):
+            g_u, g_m = dot(g, back.turn), dot(g, back.normal)
+            by_point, by_lens = g_m * back.across_point, g_m * back.across_lens
+            for k in range(3):
+                w[row + k * BLOCK + j] = g_u * back.along_point[k] + by_point * back.normal[k]
+                w[row + (3 + k) * BLOCK + j] = (
+                    g_u * back.along_lens * back.turn[k] + by_lens * back.normal[k]
+                )
+            w[row + 9 * BLOCK + j] = g_u * back.by_inner
+            w[row + 10 * BLOCK + j] = g_u * back.by_thickness
+            w[row + 11 * BLOCK + j] = g_u * back.by_n_air
+            w[row + 12 * BLOCK + j] = g_u * back.by_n_acrylic
+            w[row + 13 * BLOCK + j] = g_u * back.by_n_water
+
+
+@inline_kernel
+def bare_gradients_block(_port: BareParams, w: FloatArray) -> None:
+    """Write the gradients of u and v by point and lens position, all lanes of a block."""
+    for row, g in ((JU, GUX), (JV, GVX)):
+        for k in range(3):
+            for j in range(BLOCK):
+                w[row + k * BLOCK + j] = w[g + k * BLOCK + j]
+                w[row + (3 + k) * BLOCK + j] = -w[g + k * BLOCK + j]
+
+
+@inline_kernel
+def flat_gradients_block(port: FlatParams, w: FloatArray) -> None:
+    """Write the gradients of u and v by point, pose and port, all lanes of a block.
+
+    The port goes with the camera: moving both by a step is moving the point by its opposite, and
+    turning them by a small w turns the point p, seen from the lens, by -w: w . (gradient x p). A
+    turn of the normal alone turns direction and point together, and the point back.
+    """
+    m = port.normal
+    spare = perpendicular(m)
+    for j in range(BLOCK):
+        e = across_axis(m, (w[EX + j], w[EY + j], w[EZ + j]), spare)
+        back = flat_derivative(port, w[FAR + j], e, (w[COS_A + j], w[SIN_A + j]))
+        across = cross(m, e)
+        d = (w[PX + j], w[PY + j], w[PZ + j])
+        p = blend(w[FAR + j] + port.distance + port.thickness, m, w[SIN_T + j], e)
+        for g, row in (
+            ((w[GUX + j], w[GUY + j], w[GUZ + j]), JU),
+            ((w[GVX + j], w[GVY + j], w[GVZ + j]), JV),
+        ):
+            g_u = dot(g, back.turn)
+            by_reach, by_across = g_u * back.by_reach, dot(g, across) * back.across_point
+            by_height = -by_reach * back.water_tangent
+            by_point = (
+                by_reach * e[0] + by_height * m[0] + by_across * across[0],
+                by_reach * e[1] + by_height * m[1] + by_across * across[1],
+                by_reach * e[2] + by_height * m[2] + by_across * across[2],
+            )
+            by_turn = cross(by_point, p)
+            by_normal = blend(1.0, cross(d, g), 1.0, by_turn)
+            x, y, z = by_point
+            w[row + j], w[row + BLOCK + j], w[row + 2 * BLOCK + j] = x, y, z
+            w[row + 3 * BLOCK + j], w[row + 4 * BLOCK + j], w[row + 5 * BLOCK + j] = -x, -y, -z
+            x, y, z = by_turn
+            w[row + 6 * BLOCK + j], w[row + 7 * BLOCK + j], w[row + 8 * BLOCK + j] = x, y, z
+            w[row + 9 * BLOCK + j] = g_u * back.by_distance
+            w[row + 10 * BLOCK + j] = g_u * back.by_thickness
+            w[row + 11 * BLOCK + j] = g_u * back.by_n_air
+            w[row + 12 * BLOCK + j] = g_u * back.by_n_port
+            w[row + 13 * BLOCK + j] = g_u * back.by_n_water
+            w[row + 14 * BLOCK + j] = dot(by_normal, port.turn_x)
+            w[row + 15 * BLOCK + j] = dot(by_normal, port.turn_y)
+
+
+gradients_block = chosen_by_class(
+    {
+        BareParams: bare_gradients_block,
+        DomeParams: dome_gradients_block,
+        FlatParams: flat_gradients_block,
+    }
+)
+"""`gradients_block(port, w)`: the gradients of u and v by the point, and by the parameters but for
+the rotation, all lanes of a block."""
+
+
+@inline_kernel
+def _turn_gradients_block(_port: BareParams | DomeParams, w: FloatArray) -> None:
+    """Write the gradients of u and v by the camera's rotation, all lanes of a block.
+
+    exp(w) R seen from `cam` turns the direction d by -w: g . (d x w) = w . (g x d).
+    """
+    for row, g in ((JU, GUX), (JV, GVX)):
+        for j in range(BLOCK):
+            x, y, z = cross(
+                (w[g + j], w[g + BLOCK + j], w[g + 2 * BLOCK + j]),
+                (w[PX + j], w[PY + j], w[PZ + j]),
+            )
+            w[row + 6 * BLOCK + j] = x
+            w[row + 7 * BLOCK + j] = y
+            w[row + 8 * BLOCK + j] = z
+
+
+@inline_kernel
+def _turned_with_port(_port: FlatParams, _w: FloatArray) -> None:
+    """Leave the gradients by the rotation as `flat_gradients_block` wrote them."""
+
+
+turn_gradients_block = chosen_by_class(
+    {
+        BareParams: _turn_gradients_block,
+        DomeParams: _turn_gradients_block,
+        FlatParams: _turned_with_port,
+    }
+)
+"""`turn_gradients_block(port, w)`: the gradients by the camera's rotation, all lanes of a block."""
