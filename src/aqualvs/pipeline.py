@@ -18,6 +18,7 @@ from aqualvs.results.summary import RunSummary, TruthComparison, read_truth
 from aqualvs.scanner import Scanner, ScannerOptions
 from aqualvs.scanning.agreement import LaserAgreement
 from aqualvs.sources import FrameSource, open_source
+from aqualvs.sources.fields import source_of_frames
 from aqualvs.terminal import StopSignals, progress
 from aqualvs.workers.frame_results import FrameScanner
 from aqualvs.workers.pool import PoolJob, pool_job
@@ -212,7 +213,8 @@ def open_dive(request: RunRequest) -> OpenDive:
     if replay:
         dive = OpenDive(replay, rig, replace(request, scanner=replay.options))
     else:
-        dive = OpenDive(open_source(request.source, fps=request.fps), rig, request)
+        pictures = open_source(request.source, fps=request.fps)
+        dive = OpenDive(source_of_frames(pictures, rig.shutter), rig, request)
     try:
         check_fits(dive.source, rig)
     except BaseException:

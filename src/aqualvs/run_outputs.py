@@ -300,7 +300,10 @@ class RunOverlay(Closing):
         if self._writer is None:
             return
         width, height = self._rig.size_px
-        image = np.zeros((height, width, 3), np.uint8) if frame is None else bgr_of(frame)
+        image = np.zeros((height, width, 3), np.uint8)
+        if frame is not None:
+            shown = bgr_of(frame)
+            image[: len(shown)] = shown
         with writing(self._path):
             self._writer.write(draw_overlay(image, scan.points, scan.posture, self._rig))
 
@@ -331,7 +334,7 @@ class RunBareLens(Closing):
         self._file: PostureCsv | None = None
         if rig.housing is not None:
             with writing(self._path):
-                self._file = PostureCsv(self._path)
+                self._file = PostureCsv(self._path, rig.shutter)
 
     def write(self, *found: FrameResult) -> None:
         """Append the rows of frames."""
@@ -449,6 +452,7 @@ def writers(
         rig=rig_to_mapping(rig),
         options=request.to_dict(),
         summary=summary,
+        shutter=rig.shutter,
     )
     with (
         outputs,

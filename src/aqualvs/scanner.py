@@ -10,12 +10,13 @@ from aqualvs.geometry.planes import Plane
 from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.rig_covariance import PostureErrors, fitted_plane
+from aqualvs.optics.shutter import Field
 from aqualvs.optics.solved import completed_uncertainty
 from aqualvs.scanning.assignment import NOT_TESTED, AssignmentTest, Verdict, inflate_for_rival
 from aqualvs.scanning.candidates import Candidates, Subsegments, find_candidates
 from aqualvs.scanning.detection import DetectorOptions, FrameDetector
 from aqualvs.scanning.labels import label_candidates
-from aqualvs.scanning.laser_bands import SearchAxis, plan_bands, search_range
+from aqualvs.scanning.laser_bands import LaserBand, SearchAxis, plan_bands, search_range
 from aqualvs.scanning.patch import fitted_patch
 from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.posture_estimator import MIN_LINES, FitMethod, Measurement, PostureEstimator
@@ -59,8 +60,20 @@ class ScannerOptions:
     fit: FitMethod = FitMethod.ROBUST
 
 
+@dataclass(frozen=True, slots=True)
+class _View:
+    """Search for stripes in whole pictures, or in one field of them."""
+
+    laser_bands: tuple[LaserBand, ...]
+    detector: FrameDetector
+    assignment: AssignmentTest
+
+
 class Scanner:
     """The scanner of one rig: frames in, postures out, each from its frame alone.
+
+    Frames of an interlaced camera are fields (`Shutter.field_of`); their points are in pixels of
+    the whole picture, whose camera model holds.
 
     Parameters
     ----------
@@ -78,15 +91,13 @@ class Scanner:
         self.rig = rig
         self.options = options or ScannerOptions()
         camera = camera or rig.camera()
-        self._laser_bands = plan_bands(rig, camera)
-        self._detector = FrameDetector(rig.size_px, self._laser_bands, self.options.detector)
         self._triangulator = Triangulator(rig, camera)
-        self._posture_estimator = PostureEstimator(rig, self._laser_bands, self.options.fit)
-        self._paper_filter = self._make_paper_filter(camera)
+        fields = {rig.shutter.field_of(index) for index in range(2)}
+        self._views = {field: self._make_view(camera, field) for field in fields}
+        laser_bands = self._view(0).laser_bands
+        self._posture_estimator = PostureEstimator(rig, laser_bands, self.options.fit)
+        self._paper_filter = self._make_paper_filter(camera, laser_bands)
         self._rig_errors = PostureErrors(rig, camera, completed_uncertainty(rig))
-        self._assignment = AssignmentTest(
-            self._laser_bands, self._triangulator, search_range(rig.working_range)
-        )
 
     def process(self, frame: Frame) -> Scan:
         """Measure the posture in one frame.
@@ -94,7 +105,7 @@ class Scanner:
         Parameters
         ----------
         frame : Frame
-            Of the rig's image size.
+            Of the rig's image size, or the field that its index says.
 
         Returns
         -------
@@ -104,7 +115,7 @@ class Scanner:
         Raises
         ------
         ValueError
-            If the frame has another size than the rig's image.
+            If the frame has another size than the rig's image, or is another field.
         """
         return self.measure(frame.index, frame.time_s, self.detect(frame))
 
@@ -114,9 +125,14 @@ class Scanner:
         Raises
         ------
         ValueError
-            If the frame has another size than the rig's image.
+            If the frame has another size than the rig's image, or is another field.
         """
-        return self._detector.detect(frame)
+        if frame.field != self.rig.shutter.field_of(frame.index):
+            raise ValueError(
+                f"frame {frame.index} is {frame.field or 'a whole picture'} but expected "
+                f"{self.rig.shutter.field_of(frame.index) or 'a whole picture'}"
+            )
+        return self._view(frame.index).detector.detect(frame)
 
     def measure(self, index: int, time_s: float, peaks: dict[SearchAxis, StripePeaks]) -> Scan:
         """Measure the posture from the peaks of one frame.
@@ -131,18 +147,33 @@ class Scanner:
             From `detect`; recorded peaks give the same result as their frame.
         """
         # Candidates: each peak as a point of every laser that could have made it.
-        candidates = find_candidates(peaks, self._laser_bands, self._triangulator)
-        found, points, listed = self._estimate(candidates)
+        view = self._view(index)
+        candidates = find_candidates(peaks, view.laser_bands, self._triangulator)
+        found, points, listed = self._estimate(candidates, view.assignment)
         if self._paper_filter is not None:
             # The paper's filter needs the laser of each peak, which is known by now.
             kept = np.zeros(len(candidates), np.bool_)
             kept[listed] = _on_mesh(self._paper_filter, points)
             candidates = candidates.where(kept)
-            found, points, _ = self._estimate(candidates)
+            found, points, _ = self._estimate(candidates, view.assignment)
         posture = self._with_rig_covariance(found, candidates)
         return Scan(index, time_s, posture, points, self.rig.n_water)
 
-    def _make_paper_filter(self, camera: Camera) -> "PaperFilter | None":
+    def _make_view(self, camera: Camera, field: Field | None) -> _View:
+        laser_bands = plan_bands(self.rig, camera, field)
+        limits = search_range(self.rig.working_range)
+        return _View(
+            laser_bands,
+            FrameDetector(self.rig.size_px, laser_bands, self.options.detector, field),
+            AssignmentTest(laser_bands, self._triangulator, limits),
+        )
+
+    def _view(self, index: int) -> _View:
+        return self._views[self.rig.shutter.field_of(index)]
+
+    def _make_paper_filter(
+        self, camera: Camera, laser_bands: tuple[LaserBand, ...]
+    ) -> "PaperFilter | None":
         options = self.options.mesh_filter
         if options is None:
             return None
@@ -150,9 +181,11 @@ class Scanner:
         from aqualvs.scanning.paper.detector import PaperFilter
 
         every_pixel = not isinstance(self.options.detector, StripeOptions)
-        return PaperFilter(self.rig, camera, self._laser_bands, options, every_pixel=every_pixel)
+        return PaperFilter(self.rig, camera, laser_bands, options, every_pixel=every_pixel)
 
-    def _estimate(self, candidates: Candidates) -> tuple[Measurement, ScanPoints, IntArray]:
+    def _estimate(
+        self, candidates: Candidates, assignment: AssignmentTest
+    ) -> tuple[Measurement, ScanPoints, IntArray]:
         """Return the posture, the labelled points, and the rows of their candidates."""
         # Planes that several lasers agree on, and the one that is the target.
         subsegments = candidates.subsegments()
@@ -164,20 +197,22 @@ class Scanner:
             self.rig.focal_px,
         )
         surfaces = as_requested_kind(surfaces, self.options.target)
-        surfaces, target, doubtful = self._chosen(candidates, subsegments, surfaces)
+        surfaces, target, doubtful = self._chosen(candidates, subsegments, surfaces, assignment)
         tested = NOT_TESTED
         if target is not None:
             # The same peaks, read as other lasers', may give a plane that is as good or better.
-            tested = self._assignment.test(candidates, subsegments, target)
+            tested = assignment.test(candidates, subsegments, target)
             if tested.verdict is Verdict.RIVAL and tested.other is not None:
                 surfaces = self._with_rival(surfaces, target, tested.other, subsegments)
-                surfaces, target, doubtful = self._chosen(candidates, subsegments, surfaces)
+                surfaces, target, doubtful = self._chosen(
+                    candidates, subsegments, surfaces, assignment
+                )
         # The posture from the target's points outside crossing zones.
         if target is None:
             found = _refuse_no_target(candidates, surfaces, self.options.target)
         elif doubtful is not None:
             found = _refuse_ambiguous(candidates, target.plane, doubtful.plane)
-        elif self._assignment.is_by_chance(candidates, subsegments, surfaces, target):
+        elif assignment.is_by_chance(candidates, subsegments, surfaces, target):
             found = _refuse_chance_plane(candidates)
         elif tested.verdict is Verdict.AMBIGUOUS and tested.other is not None:
             found = _refuse_ambiguous(candidates, target.plane, tested.other)
@@ -185,9 +220,7 @@ class Scanner:
             found = self._posture_estimator.measure(candidates, subsegments, target)
             found = inflate_for_rival(found, tested)
             # The mean plane of folds covers all of a net's light, nearer parts included.
-            other = (
-                None if found.folded else self._assignment.nearer_net(subsegments, surfaces, target)
-            )
+            other = None if found.folded else assignment.nearer_net(subsegments, surfaces, target)
             if other is not None and found.posture:
                 found = _refuse_ambiguous(candidates, target.plane, other.plane)
         points, listed = label_candidates(
@@ -200,13 +233,14 @@ class Scanner:
         candidates: Candidates,
         subsegments: Subsegments,
         surfaces: list[Surface],
+        assignment: AssignmentTest,
     ) -> tuple[list[Surface], Surface | None, Surface | None]:
         """Return the surfaces, the target, and a surface before it that may be the net instead."""
         kind = self.options.target
         target = choose_target(surfaces, kind, self.rig.working_range)
         if target is None or kind is not TargetKind.AUTO:
             return surfaces, target, None
-        before = self._assignment.overlooked(candidates, subsegments, surfaces, target)
+        before = assignment.overlooked(candidates, subsegments, surfaces, target)
         if before is None or not before.is_mesh:
             return surfaces, target, before
         surfaces = [before if one.members is before.members else one for one in surfaces]

@@ -20,6 +20,7 @@ from aqualvs.results.points import PointsStream
 from aqualvs.results.run_request import FrameWindow
 from aqualvs.run_outputs import RunBareLens
 from aqualvs.scanning.scan import Frame
+from aqualvs.sources.fields import frames_in, frames_of
 from aqualvs.sources.spans import Span, SpanKind, VideoParts, image_frames
 from aqualvs.workers.frame_results import (
     FrameProcessor,
@@ -123,7 +124,7 @@ def _write_piece(
     frames = _frames(dive, span)
     processor = FrameProcessor(dive.rig, scanner)
     with ExitStack() as files:
-        posture = files.enter_context(PostureCsv(folder / POSTURE_CSV))
+        posture = files.enter_context(PostureCsv(folder / POSTURE_CSV, dive.rig.shutter))
         points = files.enter_context(PointsStream(folder / POINTS_STREAM))
         bare = files.enter_context(RunBareLens(folder, dive.rig))
         try:
@@ -152,11 +153,11 @@ def _write_piece(
 
 def _frames(dive: OpenDive, span: Span) -> Iterator[Frame]:
     """Return the frames of a piece; the first of them has been decoded."""
-    path = Path(dive.request.source)
+    path, shutter = Path(dive.request.source), dive.rig.shutter
     if span.kind is SpanKind.VIDEO:
-        return _video_frames(path, span, dive.rig.size_px)
+        return frames_of(_video_frames(path, span, dive.rig.size_px), shutter)
     if span.kind is SpanKind.IMAGES:
-        return image_frames(path, span, dive.request.fps or 1.0)
+        return frames_of(image_frames(path, span, dive.request.fps or 1.0), shutter)
     return ready(iter(dive.source), dive.source, FrameWindow())
 
 
@@ -170,7 +171,7 @@ def _blocks(
 ) -> Iterator[list[FrameResult]]:
     """Yield the results of a piece's frames, and refusals in place of lost frames."""
     # A recording tells of lost frames itself.
-    first = None if dive.is_replay else span.first
+    first = None if dive.is_replay else frames_in(span, dive.rig.shutter)[0]
     pairs = with_losses(frames, first, dive.rig.n_water)
     return result_blocks(in_blocks(pairs, processor.block_length), processor)
 

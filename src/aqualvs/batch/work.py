@@ -20,6 +20,7 @@ from aqualvs.optics.rigfile import rig_to_mapping
 from aqualvs.pipeline import OpenDive, open_dive
 from aqualvs.results.files import writing
 from aqualvs.results.run_request import RunRequest, source_dict, versions
+from aqualvs.sources.fields import source_of_pictures
 from aqualvs.sources.images import ImageSource, images_in
 from aqualvs.sources.spans import Span, SpanKind, image_spans, video_spans
 from aqualvs.sources.video import VideoSource
@@ -187,8 +188,8 @@ def probe(work: DiveWork) -> DiveProbe:
 
 def _content(dive: OpenDive, piece_frames: int) -> dict[str, Any]:
     """Return what is found in the source itself, ready for JSON."""
-    path = Path(dive.request.source)
-    if isinstance(dive.source, VideoSource):
+    path, pictures = Path(dive.request.source), source_of_pictures(dive.source)
+    if isinstance(pictures, VideoSource):
         try:
             video = video_spans(path, piece_frames)
         except (av.error.FFmpegError, OSError) as fault:
@@ -199,7 +200,7 @@ def _content(dive: OpenDive, piece_frames: int) -> dict[str, Any]:
             "why_whole": video.why_whole,
             "n_bytes": video.n_bytes,
         }
-    if isinstance(dive.source, ImageSource) and path.is_dir():
+    if isinstance(pictures, ImageSource) and path.is_dir():
         return _images(path, piece_frames)
     return _uncut(path, "recordings and bags are not cut")
 

@@ -43,6 +43,7 @@ from aqualvs.scanner import Scanner
 from aqualvs.scanning.scan import Frame
 from aqualvs.sources import open_source
 from aqualvs.sources.base import State
+from aqualvs.sources.fields import frames_of
 
 _HEARTBEAT_S, _LISTEN_S = 6.0, 3.0
 # Between heartbeats the attitude tells that the vehicle is there; channels show the pilot's sticks.
@@ -376,6 +377,7 @@ def _fit(rig: Rig, frames: list[Frame]) -> Finding:
             "calibrate in this one",
         )
     scanner = Scanner(rig)
+    frames = list(frames_of(frames, rig.shutter))
     n_valid = sum(bool(scanner.process(frame).posture) for frame in frames)
     words = f"posture in {n_valid} of {len(frames)} frames with the rig {rig.name!r}"
     if not n_valid:

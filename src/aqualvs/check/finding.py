@@ -222,11 +222,11 @@ def shutter_finding(rig: Rig) -> Finding | None:
     apart = 1e3 * shutter.readout
     if shutter.kind is ShutterKind.INTERLACED:
         return Finding(
-            Severity.WARN,
+            Severity.OK,
             f"The video is interlaced, its fields {apart:g} ms apart. {rates} the target moves by "
             f"{_SPEED * apart:.1f} mm and {math.degrees(_TURN) * shutter.readout:.2f} degrees "
-            f"({rig.focal_px * _TURN * shutter.readout:.1f} px) between them, and stripes are "
-            f"combed by that{blur}. No sigma counts it: move slowly.",
+            f"({rig.focal_px * _TURN * shutter.readout:.1f} px) between them{blur}. Each field is "
+            "measured by itself: twice as many postures, each of half the rows.",
         )
     return Finding(
         Severity.WARN,

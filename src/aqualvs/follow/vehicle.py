@@ -37,6 +37,7 @@ from aqualvs.results.run_request import Water, prepared_rig
 from aqualvs.scanner import Scanner, ScannerOptions
 from aqualvs.scanning.posture import Posture, Refusal
 from aqualvs.sources.base import PartHealth, State
+from aqualvs.sources.fields import feed_of_frames
 from aqualvs.terminal import StopSignals
 
 _Step: TypeAlias = tuple[PilotReport, float, Posture | Refusal]
@@ -196,7 +197,8 @@ def _runner(
     sys.setswitchinterval(SWITCH_S)
     with ExitStack() as undo:
         undo.callback(pilot.close)
-        feed = request.feed.opened(request.source, realtime=True)
+        pictures = request.feed.opened(request.source, realtime=True)
+        feed = feed_of_frames(pictures, scanner.rig.shutter)
         undo.callback(feed.close)
         # The pilot first: other outputs must not delay an effort.
         outputs: list[Output] = [pilot, MavlinkOutput(link)]

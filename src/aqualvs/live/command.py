@@ -29,6 +29,7 @@ from aqualvs.scanner import Scanner, ScannerOptions
 from aqualvs.scanning.posture import Posture
 from aqualvs.scanning.scan import Frame
 from aqualvs.sources.base import Feed, PartHealth, State
+from aqualvs.sources.fields import feed_of_frames
 from aqualvs.sources.opening import open_feed
 from aqualvs.sources.remote import Transport
 from aqualvs.terminal import StopSignals
@@ -265,7 +266,8 @@ def live_and_tell(request: LiveRequest, echo: Callable[[str], object]) -> int:
         If an input cannot be used, or the source can never work.
     """
     rig = prepared_rig(request.rig, request.water, no_dome=False)
-    feed = request.feed.opened(request.source, realtime=not request.fast)
+    pictures = request.feed.opened(request.source, realtime=not request.fast)
+    feed = feed_of_frames(pictures, rig.shutter)
     sys.setswitchinterval(SWITCH_S)
     with ExitStack() as undo:
         undo.callback(feed.close)

@@ -28,6 +28,7 @@ from aqualvs.live.outputs.base import Output
 from aqualvs.optics.expected_error import see_stripe
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.sheet import sheets_of
+from aqualvs.optics.shutter import Field
 from aqualvs.recording.sample import Instants, LiveSample
 from aqualvs.scanner import Scanner
 from aqualvs.scanning.laser_bands import SearchAxis
@@ -35,6 +36,7 @@ from aqualvs.scanning.posture import Reason, Refusal
 from aqualvs.scanning.scan import Frame, Scan, ScanPoints
 from aqualvs.scanning.stripe import StripePeaks
 from aqualvs.sources.base import Feed, Health, PartHealth, State
+from aqualvs.sources.fields import frames_of, size_of_frames
 
 _GREY, _LIGHT, _THICK_PX, _BLUR_PX = 30, 150, 3, 1.2
 _ROUNDS = 2
@@ -48,9 +50,10 @@ def warm_up(scanner: Scanner) -> Scan:
     scan : Scan
         Of a wall in the middle of the working range, square to the vehicle.
     """
-    frame = wall_frame(scanner.rig)
+    picture = wall_frame(scanner.rig)
     for _ in range(_ROUNDS):
-        scan = scanner.process(frame)
+        for frame in frames_of([picture], scanner.rig.shutter):
+            scan = scanner.process(frame)
     return scan
 
 
@@ -183,7 +186,7 @@ class Arrival:
 
 
 class Mailbox:
-    """Room for one frame: the latest.
+    """Room for one picture: the latest, or both its fields.
 
     Parameters
     ----------
@@ -200,7 +203,7 @@ class Mailbox:
         self.n_dropped = 0
         self._keep_every = keep_every
         self._changed = threading.Condition()
-        self._waiting: Arrival | None = None
+        self._waiting: deque[Arrival] = deque()
         self._closed = False
 
     def put(self, frame: Frame) -> None:
@@ -208,18 +211,20 @@ class Mailbox:
         arrival = Arrival(frame, time.monotonic_ns(), time.time_ns())
         with self._changed:
             if self._keep_every:
-                self._changed.wait_for(lambda: self._waiting is None or self._closed)
+                self._changed.wait_for(lambda: not self._waiting or self._closed)
             if self._closed:
                 return
-            self.n_dropped += self._waiting is not None
-            self._waiting = arrival
+            while self._waiting and not _are_one_picture(self._waiting[0].frame, frame):
+                self._waiting.popleft()
+                self.n_dropped += 1
+            self._waiting.append(arrival)
             self._changed.notify_all()
 
     def take(self, timeout_s: float) -> Arrival | None:
         """Take the frame that is there, or wait for one; None if there is none in time."""
         with self._changed:
-            self._changed.wait_for(lambda: self._waiting is not None or self._closed, timeout_s)
-            arrival, self._waiting = self._waiting, None
+            self._changed.wait_for(lambda: self._waiting or self._closed, timeout_s)
+            arrival = self._waiting.popleft() if self._waiting else None
             self._changed.notify_all()
         return arrival
 
@@ -233,7 +238,12 @@ class Mailbox:
     def exhausted(self) -> bool:
         """Whether no frame waits and none will come."""
         with self._changed:
-            return self._closed and self._waiting is None
+            return self._closed and not self._waiting
+
+
+def _are_one_picture(first: Frame, second: Frame) -> bool:
+    """Return whether two frames are the fields of one picture, which come at the same moment."""
+    return second.field is not None and first.index // 2 == second.index // 2
 
 
 # A feed promises to end within a second of being closed.
@@ -407,8 +417,7 @@ class LiveRunner:
         # Outputs that never wait come first: waking a thread takes longer than a datagram.
         ordered = sorted(outputs, key=lambda output: not output.inline)
         self._workers = [OutputWorker(output) for output in ordered]
-        frozen = self._options.frozen
-        self._frozen = None if frozen is None else FrozenPicture(frozen)
+        self._frozen: dict[Field | None, FrozenPicture] = {}
         self._last: Frame | None = None
         self._heard_ns = self._told_ns = 0
         self._trouble = ""
@@ -458,26 +467,32 @@ class LiveRunner:
         self._heard_ns = arrival.arrived_ns
         scanner = self._provider.scanner
         peaks, scan = self._scan(scanner, frame)
+        shutter, age_ns = scanner.rig.shutter, 0
+        if frame.field == shutter.first_field:
+            # It waited for the second field, with which it came.
+            age_ns = round(1e9 * shutter.readout)
         return self._sample(
             scanner.rig,
             scan,
             peaks,
             frame,
-            arrival.utc_ns,
-            Instants(arrival.arrived_ns, taken_ns, time.monotonic_ns()),
+            arrival.utc_ns - age_ns,
+            Instants(arrival.arrived_ns - age_ns, taken_ns, time.monotonic_ns()),
             scan.time_s,
         )
 
     def _scan(self, scanner: Scanner, frame: Frame) -> tuple[dict[SearchAxis, StripePeaks], Scan]:
         rig = scanner.rig
         height, width = frame.luma.shape
-        if (width, height) != rig.size_px:
-            need = "x".join(map(str, rig.size_px))
+        wanted = size_of_frames(rig)
+        if (width, height) != wanted:
+            need = "x".join(map(str, wanted))
+            what = "picture" if frame.field is None else "field"
             refusal = Refusal(
-                Reason.WRONG_SIZE, f"picture of {width}x{height} px, but the rig has {need} px"
+                Reason.WRONG_SIZE, f"{what} of {width}x{height} px, but the rig has {need} px"
             )
             return {}, Scan(frame.index, frame.time_s, refusal, ScanPoints.none(), rig.n_water)
-        still_s = self._frozen.update(frame.time_s, frame.luma) if self._frozen else 0.0
+        still_s = self._still_s(frame)
         if still_s > 0.0:
             refusal = Refusal(Reason.FROZEN, f"the same picture for {still_s:.1f} s")
             return {}, Scan(frame.index, frame.time_s, refusal, ScanPoints.none(), rig.n_water)
@@ -491,6 +506,13 @@ class LiveRunner:
                 self._trouble = str(fault)
             refusal = Refusal(Reason.CORRUPT_FRAME, f"could not be measured: {fault}")
             return {}, Scan(frame.index, frame.time_s, refusal, ScanPoints.none(), rig.n_water)
+
+    def _still_s(self, frame: Frame) -> float:
+        """Return how long the picture has been the same; fields are compared with their like."""
+        if self._options.frozen is None:
+            return 0.0
+        frozen = self._frozen.setdefault(frame.field, FrozenPicture(self._options.frozen))
+        return frozen.update(frame.time_s, frame.luma)
 
     def _is_silent(self) -> bool:
         now_ns = time.monotonic_ns()

@@ -130,12 +130,17 @@ class NetReader:
     def __init__(self, rig: Rig, camera: Camera | None = None) -> None:
         self.rig = rig
         self._camera = camera or rig.camera()
-        self._laser_bands = plan_bands(rig, self._camera)
+        self._laser_bands = plan_bands(rig, self._camera, rig.shutter.field_of(0))
         self._sheets = sheets_of(rig)
         self._planes = [sheet.best_plane(self._camera, rig.working_range) for sheet in self._sheets]
         # Image axis along which each laser's search lines run.
         self._axis = np.array([0 if s.axis is SearchAxis.ALONG_X else 1 for s in self._laser_bands])
         self._line_px = np.array([s.line_px for s in self._laser_bands])
+        # Lines of the two fields of an interlaced camera differ by this alone.
+        self._shift_px = {
+            field: np.array([s.shift_px for s in plan_bands(rig, self._camera, field)])
+            for field in {rig.shutter.field_of(index) for index in range(2)}
+        }
         self.n_lines = max((len(one.lowest) for one in self._laser_bands), default=0)
         self._lowest, self._highest = self._bands()
 
@@ -157,9 +162,10 @@ class NetReader:
             return None
         target = Plane(posture.normal_in_dome, posture.range)
         net = net_from_dome(target.normal, target.offset)
-        return self._signal(scan, posture, net, self._lines(net))
+        shift_px = self._shift_px[self.rig.shutter.field_of(scan.index)]
+        return self._signal(scan, posture, net, self._lines(net, shift_px), shift_px)
 
-    def _lines(self, net: SE3) -> LaserLines:
+    def _lines(self, net: SE3, shift_px: FloatArray) -> LaserLines:
         """Follow every laser's line across the net's plane."""
         n, n_lines = len(self._laser_bands), self.n_lines
         lines = [_line_on(plane, net) for plane in self._planes]
@@ -184,7 +190,7 @@ class NetReader:
             search, axis = self._laser_bands[i], int(self._axis[i])
             _resample(
                 s,
-                (pixels[i, :, 1 - axis] + 0.5) / search.line_px - 0.5,
+                (pixels[i, :, 1 - axis] + 0.5 - shift_px[i]) / search.line_px - 0.5,
                 pixels[i, :, axis],
                 valid[i],
                 len(search.lowest),
@@ -194,14 +200,17 @@ class NetReader:
             )
         return found
 
-    def _signal(self, scan: Scan, posture: Posture, net: SE3, lines: LaserLines) -> NetSignal:
+    def _signal(
+        self, scan: Scan, posture: Posture, net: SE3, lines: LaserLines, shift_px: FloatArray
+    ) -> NetSignal:
         points, distance = scan.points, posture.range
         in_net = net.apply(points.points_in_dome)
         laser = points.laser.astype(np.int64)
         every = np.arange(len(points))
         position = points.pixels[every, self._axis[laser]]
         row = points.pixels[every, 1 - self._axis[laser]]
-        row = np.rint((row + 0.5) / self._line_px[laser] - 0.5).astype(np.int64)
+        row = (row + 0.5 - shift_px[laser]) / self._line_px[laser] - 0.5
+        row = np.rint(row).astype(np.int64)
         off = _OFF_PLANE * distance
         on_net = (np.abs(in_net[:, 2]) < off) & (points.label == Label.NET)
         height, width = (np.zeros(lines.along.shape) for _ in range(2))
@@ -227,7 +236,7 @@ class NetReader:
             distance,
             lines.origin,
             lines.direction,
-            self._search_directions(net, lines, seen),
+            self._search_directions(net, lines, seen, shift_px),
             posture.slant_range / self.rig.focal_px,
             lines.along,
             lines.step,
@@ -237,7 +246,9 @@ class NetReader:
             light_beyond(points, in_net, sources, lines, off),
         )
 
-    def _search_directions(self, net: SE3, lines: LaserLines, seen: BoolArray) -> FloatArray:
+    def _search_directions(
+        self, net: SE3, lines: LaserLines, seen: BoolArray, shift_px: FloatArray
+    ) -> FloatArray:
         """Return unit vectors in `net` along the search lines in the middle of what is seen."""
         middle = np.tile(0.5 * (np.array(self.rig.size_px) - 1.0), (len(seen), 1))
         for i, axis in enumerate(self._axis):
@@ -245,7 +256,7 @@ class NetReader:
             if len(j):
                 half_way = j[len(j) // 2]
                 middle[i, axis] = lines.position[i, half_way]
-                middle[i, 1 - axis] = (half_way + 0.5) * self._line_px[i] - 0.5
+                middle[i, 1 - axis] = (half_way + 0.5) * self._line_px[i] - 0.5 + shift_px[i]
         step = _AHEAD_PX * np.eye(2)[self._axis]
         rays = self._camera.rays(np.stack([middle - step, middle + step]))
         origins, ahead = net.apply(rays.origins), net.rotate(rays.directions)

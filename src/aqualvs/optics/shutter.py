@@ -4,6 +4,7 @@ Times count from the picture's middle: half-way between the exposures of the fir
 or of the two fields.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Literal, TypeAlias
@@ -18,6 +19,8 @@ LONGEST_S = 0.5
 """Longest readout and exposure of a video camera, in seconds; larger numbers are in other units."""
 
 Field: TypeAlias = Literal["top", "bottom"]
+FIRST_ROW: Mapping[Field, int] = {"top": 0, "bottom": 1}
+"""Row of the picture that a field begins with; every other one follows."""
 
 
 class ShutterKind(StrEnum):
@@ -95,7 +98,22 @@ class Shutter:
     @property
     def first_row(self) -> int:
         """First row of the field that is exposed first."""
-        return 0 if self.first_field == "top" else 1
+        return FIRST_ROW[self.first_field]
+
+    def field_of(self, index: int) -> Field | None:
+        """Return the field that a frame holds; None where frames are whole pictures.
+
+        Every picture of an interlaced camera makes two frames: 2 n is the first field of picture n,
+        2 n + 1 its second.
+
+        Parameters
+        ----------
+        index : int
+            Of the frame.
+        """
+        if self.kind is not ShutterKind.INTERLACED:
+            return None
+        return "top" if (index + self.first_row) % 2 == 0 else "bottom"
 
     def row_times(self, rows: ArrayLike, height: int) -> FloatArray:
         """Return the middles of the exposures of rows, in seconds from the picture's middle.

@@ -59,7 +59,9 @@ def jpeg_of(frame: Frame, quality: int) -> bytes:
     quality : int
         1 to 100.
     """
-    image = np.ascontiguousarray(frame.luma) if frame.chroma is None else bgr_of(frame)
+    image = bgr_of(frame)
+    if frame.chroma is None:
+        image = np.ascontiguousarray(image[..., 0])
     return _encoded(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
 
 

@@ -14,6 +14,7 @@ from av.container import InputContainer
 from av.video.frame import VideoFrame
 
 from aqualvs.geometry.arrays import IntArray
+from aqualvs.optics.shutter import FIRST_ROW
 from aqualvs.report.charts import stretches
 from aqualvs.report.overlay import draw_points
 from aqualvs.report.points import FramePoints
@@ -206,10 +207,10 @@ def _farthest(rows: IntArray, chosen: list[int]) -> int:
 def _from_images(files: list[Path], track: Track, rows: list[int]) -> dict[int, ImagePlane]:
     pictures = {}
     for row in rows:
-        frame = int(track.frame[row])
-        image = read_image(files[frame], cv2.IMREAD_COLOR) if frame < len(files) else None
+        number, _ = _picture_of(track, row)
+        image = read_image(files[number], cv2.IMREAD_COLOR) if number < len(files) else None
         if image is not None:
-            pictures[row] = image
+            pictures[row] = _shown(image, track, row)
     return pictures
 
 
@@ -225,12 +226,29 @@ def _from_video(source: Path, track: Track, rows: list[int]) -> dict[int, ImageP
         stream.codec_context.thread_count = 1
         start = next(container.decode(stream)).time or 0.0
         for row in rows:
-            wanted = start + float(track.time_s[row])
+            wanted = start + _picture_of(track, row)[1]
             _seek(container, wanted)
             found = _frame_at(container, wanted - half)
             if found is not None and abs((found.time or 0.0) - wanted) <= 2.0 * half:
-                pictures[row] = np.asarray(found.to_ndarray(format="bgr24"), dtype=np.uint8)
+                image = np.asarray(found.to_ndarray(format="bgr24"), dtype=np.uint8)
+                pictures[row] = _shown(image, track, row)
     return pictures
+
+
+def _picture_of(track: Track, row: int) -> tuple[int, float]:
+    """Return number and time of the picture that a frame is, or is a field of."""
+    frame, time_s = int(track.frame[row]), float(track.time_s[row])
+    if track.first_field is None:
+        return frame, time_s
+    return frame // 2, time_s - frame % 2 * _step_s(track)
+
+
+def _shown(image: ImagePlane, track: Track, row: int) -> ImagePlane:
+    """Return a picture, or the rows of the frame's field, each twice."""
+    if track.first_field is None:
+        return image
+    first = (FIRST_ROW[track.first_field] + int(track.frame[row])) % 2
+    return np.repeat(image[first::2], 2, axis=0)[: len(image)]
 
 
 def _rows_at_key_frames(source: Path, track: Track, rows: list[int]) -> list[int]:

@@ -18,6 +18,7 @@ from aqualvs.errors import RigError, SourceError
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.optics.rigfile import rig_from_mapping
 from aqualvs.optics.sheet import sheets_of
+from aqualvs.optics.shutter import FIRST_ROW, Field
 from aqualvs.results.folder import POSTURE_BARE_CSV
 from aqualvs.results.run_request import read_run_yaml
 from aqualvs.results.summary import read_truth as truth_by_frame
@@ -67,6 +68,8 @@ class Track:
         By noise and rig together; that of the noise in runs of older versions.
     n_points, n_water : array, shape (N,)
         NaN where the file has none.
+    first_field : {"top", "bottom"} or None
+        Field of even frames of an interlaced camera; None where frames are whole pictures.
     """
 
     frame: IntArray
@@ -79,6 +82,7 @@ class Track:
     sigma_total: FloatArray
     n_points: FloatArray
     n_water: FloatArray
+    first_field: Field | None = None
 
     def __len__(self) -> int:
         """Return the number of frames."""
@@ -106,7 +110,7 @@ def read_track(path: Path) -> Track:
     SourceError
         If the file is missing, holds no frame, or holds something that is no number.
     """
-    columns, texts = _read_columns(path, _NUMBERS, ("valid", "reason"))
+    columns, texts = _read_columns(path, _NUMBERS, ("valid", "reason", "field"))
     order = np.argsort(columns["frame"], kind="stable")
     posture = np.stack([columns[name] for name in POSTURE], axis=-1)[order]
     sigma = np.stack([columns[f"sigma_{name}"] for name in POSTURE], axis=-1)[order]
@@ -126,7 +130,17 @@ def read_track(path: Path) -> Track:
         sigma_total=np.where(valid[:, None], total, np.nan),
         n_points=columns["n_points"][order],
         n_water=columns["n_water"][order],
+        first_field=_first_field(columns["frame"], texts["field"]),
     )
+
+
+def _first_field(frame: FloatArray, field: "_Words") -> Field | None:
+    """Return the field of even frames, as the first even row names it."""
+    for row in np.flatnonzero(frame % 2 == 0)[:1].tolist():
+        for name in FIRST_ROW:
+            if field.names[field.codes[row]] == name:
+                return name
+    return None
 
 
 def read_truth(path: Path, track: Track) -> FloatArray:

@@ -24,6 +24,7 @@ import numpy as np
 from aqualvs.closing import Closing
 from aqualvs.errors import OutputError, SourceError
 from aqualvs.geometry.arrays import FloatArray
+from aqualvs.optics.shutter import AT_ONCE, Shutter
 from aqualvs.results.files import AppendFile, Claim, explain, locked_folder, writing
 from aqualvs.results.points import DRAFT, PointsExport, PointsStream, check_idle, export_points
 from aqualvs.results.run_request import RunFile, Status, now, read_run_yaml, write_yaml
@@ -71,6 +72,8 @@ class PostureCsv(Closing):
     ----------
     path : Path
         Created, or overwritten.
+    shutter : Shutter
+        Of the camera; of an interlaced one, each row ends with the field, "top" or "bottom".
 
     Raises
     ------
@@ -78,21 +81,26 @@ class PostureCsv(Closing):
         From the constructor and from `write`, as the system says it.
     """
 
-    def __init__(self, path: Path) -> None:
-        self._file = AppendFile(path)
+    def __init__(self, path: Path, shutter: Shutter = AT_ONCE) -> None:
+        self._file, self._shutter = AppendFile(path), shutter
+        columns = POSTURE_COLUMNS if shutter.field_of(0) is None else (*POSTURE_COLUMNS, "field")
         try:
-            self._append(",".join(POSTURE_COLUMNS) + "\n")
+            self._append(",".join(columns) + "\n")
         except OSError:
             self.close()
             raise
 
     def write(self, *scans: Scan) -> None:
         """Append the rows of frames, all or none."""
-        self._append("".join(map(posture_row, scans)))
+        self._append("".join(map(self._row, scans)))
 
     def close(self) -> None:
         """Close the file; further calls do nothing."""
         self._file.close()
+
+    def _row(self, scan: Scan) -> str:
+        field = self._shutter.field_of(scan.index)
+        return posture_row(scan) if field is None else f"{posture_row(scan)[:-1]},{field}\n"
 
     def _append(self, row: str) -> None:
         self._file.append(row.encode("ascii"))
@@ -179,6 +187,8 @@ class RunOutputs:
         For `run.yaml`.
     summary : RunSummary, optional
         To which the frames are added; its monitors are those of the run.
+    shutter : Shutter
+        Of the camera.
 
     Attributes
     ----------
@@ -201,6 +211,7 @@ class RunOutputs:
         rig: Mapping[str, Any],
         options: Mapping[str, Any],
         summary: RunSummary | None = None,
+        shutter: Shutter = AT_ONCE,
     ) -> None:
         self.folder = folder
         self.status = Status.FINISHED
@@ -210,7 +221,7 @@ class RunOutputs:
             # First, so that only one of two runs that begin at the same moment continues.
             self._points = stack.enter_context(_new_points_stream(folder))
             self._run_file.write(Status.RUNNING)
-            self._posture = stack.enter_context(PostureCsv(folder / POSTURE_CSV))
+            self._posture = stack.enter_context(PostureCsv(folder / POSTURE_CSV, shutter))
             self._export: PointsExport | None = PointsExport(
                 folder / POINTS_PARQUET, folder / POINTS_PLY
             )

@@ -82,6 +82,12 @@ def compare_with_truth(posture_csv: Path, truth_csv: Path) -> TruthComparison:
     SourceError
         If a file cannot be read, lacks a column, or no frame is in both.
     """
+    in_fields, of_fields = (_has_fields(path) for path in (posture_csv, truth_csv))
+    if of_fields and not in_fields:
+        raise SourceError(
+            f"{truth_csv}: of the fields of an interlaced camera, but the run took whole pictures; "
+            "set camera.shutter in the rig file to kind: interlaced"
+        )
     measured = read_truth(posture_csv)
     truth = read_truth(truth_csv)
     common = sorted(measured.keys() & truth.keys())
@@ -133,6 +139,10 @@ def read_truth(path: Path) -> dict[int, tuple[float, float, float]]:
         if all(map(math.isfinite, [frame, *values])):
             found[int(frame)] = (values[0] * scale, values[1], values[2])
     return found
+
+
+def _has_fields(path: Path) -> bool:
+    return any("field" in row for row in _rows(path)[:1])
 
 
 def _frames(path: Path) -> set[int]:

@@ -394,7 +394,8 @@ def _sample_bands(laser_bands: Sequence[LaserBand], triangulator: Triangulator) 
         if not len(lines):
             continue
         places = np.linspace(search.lowest[lines], search.highest[lines], _N_SAMPLES, axis=1)
-        across = np.broadcast_to((lines + 0.5)[:, None] * search.line_px - 0.5, places.shape)
+        middle = (lines + 0.5)[:, None] * search.line_px - 0.5 + search.shift_px
+        across = np.broadcast_to(middle, places.shape)
         along_x = search.axis is SearchAxis.ALONG_X
         pixels = np.stack([places, across] if along_x else [across, places], axis=-1)
         n = places.size

@@ -53,6 +53,7 @@ def append_candidates(
     laser: int,
     along_x: int,
     line_px: int,
+    shift_px: float,
     best_height: float,
     begin: int,
     numbers: IntArray,
@@ -65,7 +66,7 @@ def append_candidates(
     ----------
     line, position, height, width, likelihood
         As in `StripePeaks`, of the laser's search direction.
-    lowest, highest, slope_low, slope_high, line_px
+    lowest, highest, slope_low, slope_high, line_px, shift_px
         As in the laser's `LaserBand`.
     laser : int
         Its index.
@@ -105,7 +106,7 @@ def append_candidates(
         measures[SIGMA_PX, i] = np.sqrt(_FLOOR_PX * _FLOOR_PX + flank * flank)
         measures[CONFIDENCE, i] = np.sqrt(min(height[r] * height_share, 1.0) * likelihood[r])
         # The middle of a search line that is several pixels wide.
-        pixels[i, across] = (line[r] + 0.5) * line_px - 0.5
+        pixels[i, across] = (line[r] + 0.5) * line_px - 0.5 + shift_px
         pixels[i, along] = position[r]
     return begin + n
 
@@ -532,6 +533,7 @@ def find_candidates(
             i,
             found is along_x,
             search.line_px,
+            search.shift_px,
             best_height,
             n,
             numbers,

@@ -5,6 +5,7 @@ peaks in them within the lasers' bands.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import cv2
@@ -13,6 +14,7 @@ import numpy as np
 from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.compiled import inline_kernel, kernel
 from aqualvs.geometry.quantile import element_at
+from aqualvs.optics.shutter import FIRST_ROW, Field
 from aqualvs.scanning.laser_bands import LaserBand, SearchAxis
 from aqualvs.scanning.laser_colour import (
     HIGHEST_USEFUL,
@@ -164,6 +166,9 @@ class FrameDetector:
         One for each laser.
     options : StripeOptions or ThresholdOptions
         Kind of detector, and its options.
+    field : {"top", "bottom"} or None
+        Field that the frames hold: rows of the bands' pictures, and of peaks, that they have not.
+        An odd last row of the picture belongs to none. None for whole pictures.
     """
 
     def __init__(
@@ -171,19 +176,26 @@ class FrameDetector:
         size_px: tuple[int, int],
         laser_bands: Sequence[LaserBand],
         options: DetectorOptions,
+        field: Field | None = None,
     ) -> None:
-        self._size_px = size_px
+        width, height = size_px
+        self._field = field
+        self._size_px = size_px if field is None else (width, height // 2)
         self._options = options
         seen = [search for search in laser_bands if search.visible]
         self._colours = sorted({one.colour for one in seen}, key=lambda colour: colour.name)
         # Each laser shows about once on a search line.
         self._n_possible = float(sum(np.count_nonzero(one.lowest <= one.highest) for one in seen))
-        self._line_px = max((one.line_px for one in seen), default=1)
-        self._bands = {
-            axis: _band([one for one in seen if one.axis is axis])
-            for axis in SearchAxis
-            if any(one.axis is axis for one in seen)
+        by_axis = {axis: [one for one in seen if one.axis is axis] for axis in SearchAxis}
+        self._bands = {axis: _band(ones) for axis, ones in by_axis.items() if ones}
+        # A search line along x of a field is one of its rows.
+        self._line_px = {
+            axis: 1 if field and axis is SearchAxis.ALONG_X else by_axis[axis][0].line_px
+            for axis in self._bands
         }
+        if field and SearchAxis.ALONG_Y in self._bands:
+            lowest, highest = self._bands[SearchAxis.ALONG_Y]
+            self._bands[SearchAxis.ALONG_Y] = lowest // 2, highest // 2
         self._finders: Mapping[SearchAxis, PeakFinder] = (
             {axis: self._finder(axis, options) for axis in self._bands}
             if isinstance(options, StripeOptions)
@@ -197,8 +209,11 @@ class FrameDetector:
         self._threshold = (
             {} if isinstance(options, StripeOptions) else self._threshold_detectors(options)
         )
-        width, height = size_px
-        self._lines = {axis: SearchLines(size_px, axis, self._line_px) for axis in self._bands}
+        width, height = self._size_px
+        self._lines = {
+            axis: SearchLines(self._size_px, axis, line_px)
+            for axis, line_px in self._line_px.items()
+        }
         self._luma = np.empty((height, width), np.uint8)
         self._chroma = np.empty((2, -(-height // 2), -(-width // 2)), np.uint8)
 
@@ -215,10 +230,12 @@ class FrameDetector:
 
     def _finder(self, axis: SearchAxis, options: StripeOptions) -> PeakFinder:
         width, height = self._size_px
+        along_x = axis is SearchAxis.ALONG_X
+        reach = options.reach_share * (width if along_x or not self._field else 0.5 * width)
         return PeakFinder(
-            width if axis is SearchAxis.ALONG_X else height,
+            width if along_x else height,
             *self._bands[axis],
-            max(8, round(options.reach_share * width)),
+            max(8, round(reach)),
             np.array([colour.value for colour in self._colours]),
         )
 
@@ -248,19 +265,23 @@ class FrameDetector:
         if not self._bands:
             return {}
         if isinstance(self._options, StripeOptions):
-            return self._find_stripes(frame, self._options)
-        np.copyto(self._luma, frame.luma)
-        return {
-            axis: detector.detect(self._lines[axis].of(self._luma))
-            for axis, detector in self._threshold.items()
-        }
+            found = self._find_stripes(frame, self._options)
+        else:
+            np.copyto(self._luma, frame.luma)
+            found = {
+                axis: detector.detect(self._lines[axis].of(self._luma))
+                for axis, detector in self._threshold.items()
+            }
+        if self._field and SearchAxis.ALONG_Y in found:
+            found[SearchAxis.ALONG_Y] = _in_picture(found[SearchAxis.ALONG_Y], self._field)
+        return found
 
     def _find_stripes(self, frame: Frame, options: StripeOptions) -> dict[SearchAxis, StripePeaks]:
         luma = self._brightest(frame)
         chroma = frame.chroma or (_NO_CHROMA, _NO_CHROMA)
         u, v = (_plain(plane, out) for plane, out in zip(chroma, self._chroma, strict=True))
         images = {
-            axis: SearchImage(lines.of(luma), u, v, self._line_px, axis is SearchAxis.ALONG_X)
+            axis: SearchImage(lines.of(luma), u, v, self._line_px[axis], axis is SearchAxis.ALONG_X)
             for axis, lines in self._lines.items()
         }
         # A sample of the search lines gives the least useful height of peaks.
@@ -382,6 +403,12 @@ def select_peaks(
         for i in range(rows.shape[0]):
             keep[rows[i]] = long[i] or table[HEIGHT, rows[i]] >= bright
     return np.flatnonzero(keep)
+
+
+def _in_picture(peaks: StripePeaks, field: Field) -> StripePeaks:
+    """Return peaks of columns of a field with positions and widths in pixels of the picture."""
+    position = 2.0 * peaks.position + FIRST_ROW[field]
+    return replace(peaks, position=position, width=2.0 * peaks.width)
 
 
 def _plain(plane: U8Array, copy: U8Array) -> U8Array:

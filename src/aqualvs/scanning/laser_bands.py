@@ -14,6 +14,7 @@ from aqualvs.geometry.transforms import rotation_from_rotvec
 from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.sheet import Sheet, sheets_of
+from aqualvs.optics.shutter import FIRST_ROW, Field
 from aqualvs.scanning.laser_colour import LaserColour
 
 SLOPE_CELL = 8
@@ -47,7 +48,8 @@ class LaserBand:
     axis : SearchAxis
         Direction of the search lines.
     line_px : int
-        Pixels across one search line, 1 or 2: the mean of so many rows or columns of pixels.
+        Pixels across one search line, 1 or 2: the mean of so many rows or columns of pixels, or one
+        row of every two in a field.
     lowest, highest : int array, shape (n_lines,)
         First and last position of the band on each search line; lowest > highest where the laser
         cannot be seen.
@@ -56,6 +58,9 @@ class LaserBand:
         cell of 8 positions by 8 lines.
     colour : LaserColour
         Of the laser's light.
+    shift_px : float
+        Of the lines from the middle of the pixels that each stands for; 0 but for the rows of a
+        field.
     """
 
     axis: SearchAxis
@@ -65,6 +70,7 @@ class LaserBand:
     slope_low: FloatArray
     slope_high: FloatArray
     colour: LaserColour = LaserColour.GREEN
+    shift_px: float = 0.0
 
     @property
     def visible(self) -> bool:
@@ -83,7 +89,7 @@ def pixels_per_line(size_px: tuple[int, int]) -> int:
     return 2 if size_px[0] >= _PIXELS_PER_LINE_FROM else 1
 
 
-def plan_bands(rig: Rig, camera: Camera) -> tuple[LaserBand, ...]:
+def plan_bands(rig: Rig, camera: Camera, field: Field | None = None) -> tuple[LaserBand, ...]:
     """Compute the search band of each of the rig's lasers.
 
     Parameters
@@ -92,6 +98,8 @@ def plan_bands(rig: Rig, camera: Camera) -> tuple[LaserBand, ...]:
         Lasers and working range.
     camera : Camera
         The camera that will see them; with or without its dome.
+    field : {"top", "bottom"} or None
+        Field whose rows are the search lines along x; None for whole pictures.
 
     Returns
     -------
@@ -99,19 +107,25 @@ def plan_bands(rig: Rig, camera: Camera) -> tuple[LaserBand, ...]:
         In the order of `rig.lasers`.
     """
     return tuple(
-        _plan_band(sheet, LaserColour.of(laser.wavelength_nm), rig.working_range, camera)
+        _plan_band(sheet, LaserColour.of(laser.wavelength_nm), rig.working_range, camera, field)
         for sheet, laser in zip(sheets_of(rig), rig.lasers, strict=True)
     )
 
 
 def _plan_band(
-    sheet: Sheet, colour: LaserColour, working_range: tuple[float, float], camera: Camera
+    sheet: Sheet,
+    colour: LaserColour,
+    working_range: tuple[float, float],
+    camera: Camera,
+    field: Field | None,
 ) -> LaserBand:
     points, in_band = _points_on_grid(sheet, working_range, camera, (SLOPE_CELL, SLOPE_CELL))
     rise, run = _stripe_directions(points)
     axis = _search_axis(rise[0], run[0], in_band)
-    line_px = pixels_per_line(camera.size_px)
     along_x = axis is SearchAxis.ALONG_X
+    line_px, shift_px = pixels_per_line(camera.size_px), 0.0
+    if along_x and field is not None:
+        line_px, shift_px = 2, FIRST_ROW[field] - 0.5
     wide = SLOPE_CELL * line_px
     steps = (SLOPE_CELL, wide) if along_x else (wide, SLOPE_CELL)
     points, in_band = _points_on_grid(sheet, working_range, camera, steps)
@@ -121,7 +135,7 @@ def _plan_band(
     rise, run = _stripe_directions(points)
     length, n_pixels = camera.size_px if along_x else camera.size_px[::-1]
     lowest, highest = _band_limits(in_band, n_pixels // line_px, length)
-    return LaserBand(axis, line_px, lowest, highest, *_slope_bounds(rise, run), colour)
+    return LaserBand(axis, line_px, lowest, highest, *_slope_bounds(rise, run), colour, shift_px)
 
 
 def _points_on_grid(

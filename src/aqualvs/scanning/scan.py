@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray
+from aqualvs.optics.shutter import Field
 from aqualvs.scanning.posture import Posture, Refusal
 
 ImagePlane: TypeAlias = NDArray[np.uint8]
@@ -20,7 +21,7 @@ _UV_OF_BGR = np.array([[0.4392, -0.2910, -0.1482, 128.0], [-0.0714, -0.3678, 0.4
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """One picture as decoders deliver it: full-size luma, half-size chroma.
+    """One picture as decoders deliver it, or one field of it: full-size luma, half-size chroma.
 
     Attributes
     ----------
@@ -32,12 +33,19 @@ class Frame:
         Rows may be padded in memory (any strides with unit step along x).
     chroma : (uint8 array, uint8 array) or None
         U and V planes, shape (ceil(height/2), ceil(width/2)); None for a grey source.
+    field : {"top", "bottom"} or None
+        Field that the rows are, every other one of the picture's; None for a whole picture.
+    is_interlaced : bool
+        Whether the stream says that a whole picture is two fields. Its rows of chroma alternate
+        between them then, as those of luma do.
     """
 
     index: int
     time_s: float
     luma: ImagePlane
     chroma: tuple[ImagePlane, ImagePlane] | None = None
+    field: Field | None = None
+    is_interlaced: bool = False
 
 
 def planes_of_image(image: ImagePlane) -> Planes:

@@ -152,8 +152,9 @@ def simulate_dive(
     """Render a scenario with a rig and write `dive.mp4`, `truth.csv` and, if asked, lit points.
 
     The same scenario, rig and seed give the same pictures, taken as the rig's shutter does. The
-    truth is that of each picture's middle, at the frame's time; so are lit points. If it is
-    interrupted, the frames written so far and their truth can be read.
+    truth is that of each picture's middle, at the frame's time; so are lit points. Of an interlaced
+    camera each field is a frame, the first at its picture's time, and has a truth of its own. If it
+    is interrupted, the frames written so far and their truth can be read.
 
     Parameters
     ----------
@@ -189,21 +190,40 @@ def simulate_dive(
     points: list[Path] = []
     with (
         _open_table(truth) as file,
-        VideoWriter(video, rig.size_px, scenario.fps, recording or camera.recording) as writer,
+        VideoWriter(
+            video,
+            rig.size_px,
+            scenario.fps,
+            recording or camera.recording,
+            first_field=rig.shutter.field_of(0),
+        ) as writer,
     ):
         table = csv.writer(file)
-        table.writerow(TRUTH_COLUMNS)
+        is_interlaced = rig.shutter.kind is ShutterKind.INTERLACED
+        table.writerow((*TRUTH_COLUMNS, "field") if is_interlaced else TRUTH_COLUMNS)
         for i, t in enumerate(scenario.times()):
-            scene = scenario.scene_at(t)
             rng = np.random.default_rng([scenario.seed, i])
-            picture = renderer.take(scenario.scene_at, t, rng)
+            # The middle between two fields is after the first.
+            middle = t + 0.5 * rig.shutter.readout if is_interlaced else t
+            picture = renderer.take(scenario.scene_at, middle, rng)
             writer.write(picture.image)
-            table.writerow(truth_row(i, t, scene, rig, picture.lit))
-            if i in point_frames:
-                points.append(_write_points(out_dir / f"points_{i:04d}.npz", picture.lit))
+            for frame, at in _frames_of(i, t, rig.shutter):
+                scene = scenario.scene_at(at)
+                lit = renderer.lit_points(scene, at) if is_interlaced else picture.lit
+                row = truth_row(frame, at, scene, rig, lit)
+                table.writerow([*row, rig.shutter.field_of(frame)] if is_interlaced else row)
+                if frame in point_frames:
+                    points.append(_write_points(out_dir / f"points_{frame:04d}.npz", lit))
             if progress is not None:
                 progress(i + 1, scenario.n_frames)
     return DiveFiles(video, truth, tuple(points), scenario.n_frames)
+
+
+def _frames_of(picture: int, t: float, shutter: Shutter) -> list[tuple[int, float]]:
+    """Return number and time of the frames that a picture makes."""
+    if shutter.kind is not ShutterKind.INTERLACED:
+        return [(picture, t)]
+    return [(2 * picture, t), (2 * picture + 1, t + shutter.readout)]
 
 
 def check_shutter(shutter: Shutter, scenario: Scenario) -> None:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from aqualvs.closing import Closing
 from aqualvs.errors import OptionError, OutputError
+from aqualvs.optics.shutter import Field
 
 Codec: TypeAlias = Literal["h264", "lossless", "mjpeg"]
 
@@ -76,6 +77,10 @@ class VideoWriter(Closing):
         Frames a second.
     recording : Compression
         Compression of the frames.
+    first_field : {"top", "bottom"} or None
+        Field that comes first in interlaced pictures: "h264" codes them as such, with chroma of
+        each field by itself, as capture devices do; the other codecs know no fields. None for
+        whole pictures.
 
     Raises
     ------
@@ -86,11 +91,17 @@ class VideoWriter(Closing):
     """
 
     def __init__(
-        self, path: Path, size_px: tuple[int, int], fps: float, recording: Compression | None = None
+        self,
+        path: Path,
+        size_px: tuple[int, int],
+        fps: float,
+        recording: Compression | None = None,
+        *,
+        first_field: Field | None = None,
     ) -> None:
         self._recording = Compression() if recording is None else recording
-        _check(size_px, fps, self._recording.codec)
-        self._path, self._n_frames = path, 0
+        _check(size_px, fps, self._recording.codec, first_field)
+        self._path, self._n_frames, self._first_field = path, 0, first_field
         codec = _CODECS.get(self._recording.codec) or _lossy_codec()
         try:
             self._container = av.open(str(path), "w")
@@ -113,6 +124,9 @@ class VideoWriter(Closing):
             stream.options = {"crf": str(recording.crf), "preset": "veryfast"}
         else:
             stream.bit_rate = recording.bit_rate or _FALLBACK_BIT_RATE
+        if self._first_field is not None and codec == "libx264":
+            order = "tff=1" if self._first_field == "top" else "bff=1"
+            stream.options = {**stream.options, "flags": "+ilme+ildct", "x264-params": order}
 
     def write(self, image: NDArray[np.uint8]) -> None:
         """Append one frame, uint8 RGB of shape (height, width, 3).
@@ -125,8 +139,7 @@ class VideoWriter(Closing):
         if self._recording.codec == "mjpeg":
             self._mux([self._jpeg_packet(image)])
         else:
-            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")
-            self._encode(frame)
+            self._encode(self._picture(np.ascontiguousarray(image)))
         self._n_frames += 1
 
     def close(self) -> None:
@@ -136,6 +149,20 @@ class VideoWriter(Closing):
                 self._encode(None)
         finally:
             self._container.close()
+
+    def _picture(self, image: NDArray[np.uint8]) -> av.VideoFrame:
+        if self._first_field is None or self._stream.pix_fmt != "yuv420p":
+            return av.VideoFrame.from_ndarray(image, format="rgb24")
+        # The conversion takes pictures for progressive, and would mix the colours of the fields.
+        height, width = image.shape[:2]
+        whole = np.empty((height * 3 // 2, width), np.uint8)
+        for first in range(2):
+            rows = np.ascontiguousarray(image[first::2])
+            field = av.VideoFrame.from_ndarray(rows, "rgb24").reformat(format="yuv420p")
+            planes = _planes(np.asarray(field.to_ndarray(), np.uint8), height // 2)
+            for plane, part in zip(_planes(whole, height), planes, strict=True):
+                plane[first::2] = part
+        return av.VideoFrame.from_ndarray(whole, format="yuv420p")
 
     def _jpeg_packet(self, image: NDArray[np.uint8]) -> "av.Packet[Any]":
         """Return a frame as a JPEG with the standard tables, as from USB cameras."""
@@ -169,6 +196,13 @@ def _add_stream(container: OutputContainer, codec: str, fps: float) -> VideoStre
     return cast(VideoStream, container.add_stream(codec, rate=rate))
 
 
+def _planes(stacked: NDArray[np.uint8], height: int) -> tuple[NDArray[np.uint8], ...]:
+    """Return views on Y, U and V of a 4:2:0 picture with its planes one after the other."""
+    width = stacked.shape[1]
+    chroma = stacked[height:].reshape(2, height // 2, width // 2)
+    return stacked[:height], chroma[0], chroma[1]
+
+
 def _lossy_codec() -> str:
     for name in _LOSSY:
         if name in av.codecs_available:
@@ -193,7 +227,12 @@ def jpeg(image: NDArray[np.uint8], quality: int) -> bytes:
     return data.tobytes()
 
 
-def _check(size_px: tuple[int, int], fps: float, codec: Codec) -> None:
+def _check(size_px: tuple[int, int], fps: float, codec: Codec, first_field: Field | None) -> None:
+    if codec == "h264" and first_field is not None and size_px[1] % 4:
+        raise OptionError(
+            f"size is {size_px[0]}x{size_px[1]} px; fields of interlaced 4:2:0 video have even "
+            "heights: choose a height that 4 divides, or lossless"
+        )
     if codec == "h264" and any(side % 2 for side in size_px):
         raise OptionError(
             f"size is {size_px[0]}x{size_px[1]} px; 4:2:0 video needs even sides, or choose "

@@ -120,8 +120,14 @@ def bgr_of(frame: Frame) -> ImagePlane:
     Returns
     -------
     image : uint8 array, shape (height, width, 3)
-        A new array; grey where the frame has no chroma.
+        A new array; grey where the frame has no chroma. A field has each of its rows twice, so that
+        pixels of the picture lie where they do in the picture.
     """
+    image = _bgr_of(frame)
+    return image if frame.field is None else np.repeat(image, 2, axis=0)
+
+
+def _bgr_of(frame: Frame) -> ImagePlane:
     if frame.chroma is None:
         return cast(ImagePlane, cv2.cvtColor(frame.luma, cv2.COLOR_GRAY2BGR))
     height, width = frame.luma.shape
@@ -189,6 +195,20 @@ def _as_420(picture: VideoFrame) -> VideoFrame:
     """Convert to 8-bit 4:2:0 in the same range, so that luma keeps its values."""
     full = picture.format.name.startswith("yuvj") or picture.color_range == _FULL_RANGE
     return picture.reformat(format="yuvj420p" if full else "yuv420p")
+
+
+def frame_of(index: int, time_s: float, picture: VideoFrame) -> Frame:
+    """Return the frame that a decoded picture makes.
+
+    Parameters
+    ----------
+    index : int
+    time_s : float
+    picture : VideoFrame
+        As `planes_of` takes it.
+    """
+    luma, chroma = planes_of(picture)
+    return Frame(index, time_s, luma, chroma, is_interlaced=bool(picture.interlaced_frame))
 
 
 def packet_with(data: bytes) -> "Packet[VideoStream]":

@@ -20,7 +20,7 @@ from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
 
 from aqualvs.scanning.scan import Frame
-from aqualvs.sources.base import PartHealth, State, planes_of
+from aqualvs.sources.base import PartHealth, State, frame_of
 from aqualvs.sources.h264 import FrameNumbers
 from aqualvs.sources.video import FrameCounter
 
@@ -456,9 +456,8 @@ class LiveFrames:
         n_lost = index - self._last_index - 1
         self._last_index, self._last_time = index, at
         self._lossy, self._n_held = False, 0
-        luma, chroma = planes_of(picture)
         self._reception.deliver((picture.width, picture.height), n_lost)
-        return Frame(index, at, luma, chroma)
+        return frame_of(index, at, picture)
 
     def _number(self, picture: VideoFrame, at: float) -> int:
         """Return the picture's number; after a loss, the time gives the number of missing ones."""

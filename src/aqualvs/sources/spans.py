@@ -25,7 +25,7 @@ from av.video.stream import VideoStream
 from aqualvs.closing import Closing
 from aqualvs.errors import SourceError
 from aqualvs.scanning.scan import Frame
-from aqualvs.sources.base import planes_of
+from aqualvs.sources.base import frame_of
 from aqualvs.sources.h264 import UnitReader, unit_reader
 from aqualvs.sources.images import ImageSource, images_in
 
@@ -334,8 +334,7 @@ class VideoParts(Closing):
                     raise UnlikeProbeError(f"picture {index} has another size")
                 latest = picture.pts
                 ticks = picture.pts - span.origin_pts
-                luma, chroma = planes_of(picture)
-                yield Frame(index, float(ticks * (stream.time_base or 0)), luma, chroma)
+                yield frame_of(index, float(ticks * (stream.time_base or 0)), picture)
                 index += 1
         except (av.error.FFmpegError, OSError) as fault:
             raise UnlikeProbeError(

@@ -17,7 +17,7 @@ from av.video.stream import VideoStream
 from aqualvs.closing import Closing
 from aqualvs.errors import SourceError
 from aqualvs.scanning.scan import Frame
-from aqualvs.sources.base import planes_of
+from aqualvs.sources.base import frame_of
 from aqualvs.sources.spans import promised_duration
 
 
@@ -205,8 +205,7 @@ class VideoSource(Closing):
                 f"{self.name}: the picture size changes from {self.size_px[0]}x{self.size_px[1]} "
                 f"to {picture.width}x{picture.height} px at frame {index}; cut the video there"
             )
-        luma, chroma = planes_of(picture)
-        return Frame(index, self._time_of(picture, index), luma, chroma)
+        return frame_of(index, self._time_of(picture, index), picture)
 
     def _time_of(self, picture: VideoFrame, index: int) -> float:
         """Return seconds since the start of the stream, by its own clock where it has one."""

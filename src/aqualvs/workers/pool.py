@@ -21,10 +21,12 @@ import cv2
 
 from aqualvs.closing import Closing
 from aqualvs.optics.rig import Rig
+from aqualvs.optics.shutter import Shutter
 from aqualvs.results.run_request import FrameWindow
 from aqualvs.scanner import Scanner, ScannerOptions
 from aqualvs.scanning.scan import Frame
 from aqualvs.sources import FrameSource, ImageSource, VideoSource
+from aqualvs.sources.fields import frames_in, frames_of, source_of_pictures
 from aqualvs.sources.images import images_in
 from aqualvs.sources.spans import (
     Span,
@@ -48,7 +50,8 @@ class SpanPart:
     ----------
     span : Span
     first, stop : int
-        Frames `first` to `stop` - 1, which lie in the span.
+        Frames `first` to `stop` - 1, which lie in the span; numbers of fields if the camera is
+        interlaced, while spans count pictures.
     """
 
     span: Span
@@ -102,7 +105,8 @@ def serve(
         with VideoParts(work.path, work.rig.size_px) as video:
             while True:
                 part = work.parts[sender.next_part()]
-                for message in _messages(part, _frames(work, part, video), processor):
+                frames = frames_of(_pictures(work, part, video), work.rig.shutter)
+                for message in _messages(part, work.rig.shutter, frames, processor):
                     sender.send(message)
     except (EOFError, ConnectionError):
         # The other end is closed; buffered data are discarded.
@@ -110,13 +114,14 @@ def serve(
 
 
 def _messages(
-    part: SpanPart, frames: Iterator[Frame], processor: FrameProcessor
+    part: SpanPart, shutter: Shutter, frames: Iterator[Frame], processor: FrameProcessor
 ) -> Iterator[Message]:
+    first, stop = frames_in(part.span, shutter)
     wanted = itertools.islice(
         frames,
-        part.first - part.span.first,
+        part.first - first,
         # To its end, where the reader compares the span with its description.
-        None if part.stop == part.span.stop else part.stop - part.span.first,
+        None if part.stop == stop else part.stop - first,
     )
     try:
         for block in in_blocks(wanted, processor.block_length, UnlikeProbeError):
@@ -127,7 +132,7 @@ def _messages(
         yield Ended.WHOLE
 
 
-def _frames(work: PoolJob, part: SpanPart, video: VideoParts) -> Iterator[Frame]:
+def _pictures(work: PoolJob, part: SpanPart, video: VideoParts) -> Iterator[Frame]:
     if part.span.kind is SpanKind.VIDEO:
         return video.frames(part.span)
     return image_frames(work.path, part.span, work.fps)
@@ -158,14 +163,16 @@ def pool_job(
     rig : Rig
     options : ScannerOptions
     """
+    pictures = source_of_pictures(source)
+    spans = [(span, *frames_in(span, rig.shutter)) for span in _spans(pictures)]
     parts = tuple(
-        SpanPart(span, first, stop)
-        for span in _spans(source)
-        if (first := max(span.first, window.first)) < (stop := _earlier(span.stop, window.stop))
+        SpanPart(span, max(first, window.first), _earlier(stop, window.stop))
+        for span, first, stop in spans
+        if max(first, window.first) < _earlier(stop, window.stop)
     )
     if len(parts) < 2 or parts[-1].stop - parts[0].first < _MIN_FRAMES:
         return None
-    fps = source.fps or 1.0
+    fps = pictures.fps or 1.0
     return PoolJob(path=Path(source.name), parts=parts, rig=rig, options=options, fps=fps)
 
 

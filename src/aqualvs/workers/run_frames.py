@@ -24,6 +24,7 @@ from aqualvs.scanning.posture import Reason, Refusal
 from aqualvs.scanning.scan import Frame, ImagePlane, Scan, ScanPoints
 from aqualvs.scanning.stripe import StripePeaks
 from aqualvs.sources import FrameSource, ImageSource, VideoSource
+from aqualvs.sources.fields import field_of, source_of_pictures
 from aqualvs.workers.frame_results import (
     FrameProcessor,
     FrameResult,
@@ -102,11 +103,19 @@ class Replay(Closing):
             At the end, if parts of the recording were torn.
         """
         for recorded in self._recording.frames(with_pictures=self._pictures):
-            picture = recorded.picture
-            luma, chroma = (
-                (self._black, None) if picture is None else (picture.luma, picture.chroma)
+            frame = recorded.picture or Frame(recorded.index, recorded.time_s, self._black)
+            field = self.rig.shutter.field_of(recorded.index)
+            # A picture for viewers has each row of a field twice.
+            if field is not None and len(frame.luma) == self.size_px[1]:
+                frame = field_of(frame, field)
+            yield ReplayedFrame(
+                recorded.index,
+                recorded.time_s,
+                frame.luma,
+                frame.chroma,
+                field=field,
+                recorded=recorded,
             )
-            yield ReplayedFrame(recorded.index, recorded.time_s, luma, chroma, recorded)
         if self._recording.n_torn:
             raise SourceError(
                 f"{self.name}: {self._recording.n_torn} of its parts are damaged, as by a loss of "
@@ -316,4 +325,5 @@ class DiveProcessor(Closing):
 
 def _is_at_hand(source: FrameSource) -> bool:
     """Return whether frames come as fast as they are asked for."""
-    return isinstance(source, VideoSource | ImageSource) and Path(source.name).exists()
+    pictures = source_of_pictures(source)
+    return isinstance(pictures, VideoSource | ImageSource) and Path(source.name).exists()

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from aqualvs.errors import OptionError
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.solved import rig_uncertainty
 from aqualvs.results.run_request import Water
@@ -50,6 +51,8 @@ class WaterFollowingScanner:
     ------
     CalibrationError
         If the target's file cannot be used.
+    OptionError
+        If the camera is interlaced.
     """
 
     def __init__(self, rig: Rig, options: ScannerOptions, target: Path, water: Water) -> None:
@@ -58,6 +61,11 @@ class WaterFollowingScanner:
         from aqualvs.calibration.water_index.state import IndexOptions
 
         self._rig, self._options, self._target = rig, options, target
+        if rig.shutter.field_of(0) is not None:
+            raise OptionError(
+                "--index-target: markers are not looked for in fields of an interlaced camera; "
+                "leave it out, and give --water-n or --temperature-c and --salinity"
+            )
         self.scanner = Scanner(rig, options)
         self._markers = load_target(target)
         self._estimator = IndexEstimator(

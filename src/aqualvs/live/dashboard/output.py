@@ -31,6 +31,8 @@ _MAX_WIDTH, _QUALITY = 960, 70
 def page_picture(frame: Frame) -> bytes:
     """Return the frame as a JPEG of at most 960 px width."""
     height, width = frame.luma.shape
+    # Rows of a field are two rows apart.
+    height = height if frame.field is None else 2 * height
     scale = min(1.0, _MAX_WIDTH / width)
     # Even numbers: the colour planes have half the size.
     size = (2 * round(scale * width / 2), 2 * round(scale * height / 2))

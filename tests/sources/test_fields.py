@@ -1,0 +1,101 @@
+"""An interlaced picture is taken apart into its rows, exactly."""
+
+import av
+import numpy as np
+import pytest
+
+from aqualvs.optics.shutter import AT_ONCE, Shutter, ShutterKind
+from aqualvs.scanning.scan import Frame
+from aqualvs.sources import open_source
+from aqualvs.sources.base import bgr_of
+from aqualvs.sources.fields import FieldSource, field_of, frames_of
+from field_cases import FIELDS, woven_dive
+
+_BOTTOM = Shutter(kind=ShutterKind.INTERLACED, readout=0.02, first_field="bottom")
+
+
+def picture(height=8, *, is_interlaced=False, index=3):
+    rng = np.random.default_rng(1)
+    luma = rng.integers(0, 256, (height, 6), np.uint8)
+    u, v = rng.integers(0, 256, (2, -(-height // 2), 3), np.uint8)
+    return Frame(index, 0.12, luma, (u, v), is_interlaced=is_interlaced)
+
+
+@pytest.mark.parametrize(("field", "first"), [("top", 0), ("bottom", 1)])
+def test_a_field_is_every_other_row(field, first):
+    whole = picture(is_interlaced=True)
+    found = field_of(whole, field)
+    assert np.shares_memory(found.luma, whole.luma)
+    assert np.array_equal(found.luma, whole.luma[first::2])
+    for plane, mine in zip(whole.chroma, found.chroma, strict=True):
+        assert np.array_equal(mine, plane[first::2])
+    assert found.field == field
+
+
+def test_chroma_of_a_picture_coded_as_progressive_is_of_both_fields():
+    whole = picture()
+    for field in ("top", "bottom"):
+        for plane, mine in zip(whole.chroma, field_of(whole, field).chroma, strict=True):
+            mean = 0.5 * (plane[::2].astype(float) + plane[1::2])
+            assert np.abs(mine - mean).max() <= 0.5
+
+
+@pytest.mark.parametrize("is_interlaced", [True, False])
+@pytest.mark.parametrize("height", [5, 6, 7, 9, 10])
+def test_fields_of_any_height_are_alike_and_an_odd_last_row_is_left_out(height, is_interlaced):
+    whole = picture(height, is_interlaced=is_interlaced)
+    for first, field in enumerate(("top", "bottom")):
+        found = field_of(whole, field)
+        assert np.array_equal(found.luma, whole.luma[first : height // 2 * 2 : 2])
+        assert {plane.shape for plane in found.chroma} == {((height // 2 + 1) // 2, 3)}
+
+
+def test_fields_are_frames_with_numbers_and_times_of_their_own():
+    one, other = frames_of([picture(index=3)], _BOTTOM)
+    assert (one.index, one.time_s, one.field) == (6, 0.12, "bottom")
+    assert (other.index, other.time_s, other.field) == (7, pytest.approx(0.14), "top")
+    assert [_BOTTOM.field_of(i) for i in (6, 7)] == [one.field, other.field]
+
+
+def test_pictures_of_other_cameras_stay_as_they_are():
+    whole = picture()
+    assert next(frames_of([whole], AT_ONCE)) is whole
+
+
+def test_a_field_is_shown_with_its_rows_where_they_lie():
+    grey = Frame(0, 0.0, picture().luma)
+    shown = bgr_of(field_of(grey, "bottom"))[..., 0]
+    assert np.array_equal(shown[1::2], grey.luma[1::2])
+    assert np.array_equal(shown[::2], shown[1::2])
+
+
+@pytest.mark.parametrize("first", ["top", "bottom"])
+def test_fields_of_a_coded_video_are_the_pictures_that_it_was_woven_from(tmp_path, first):
+    shutter = Shutter(kind=ShutterKind.INTERLACED, readout=0.04, first_field=first)
+    video = woven_dive(tmp_path / "dive.mp4", 3, shutter=shutter)
+    with FieldSource(open_source(video), shutter) as source:
+        assert (source.n_frames, source.fps, source.size_px) == (6, 25.0, (720, 576))
+        fields = list(source)
+    assert [frame.time_s for frame in fields] == pytest.approx([0.04 * i for i in range(6)])
+    from batch_cases import DEMO
+
+    with av.open(str(DEMO / "dive.mp4")) as dive:
+        for frame, whole in zip(fields, dive.decode(video=0), strict=False):
+            row = 0 if frame.field == "top" else 1
+            stacked = whole.to_ndarray()
+            luma, chroma = stacked[:576], stacked[576:].reshape(2, 288, 360)
+            # By H.264 alone; rows of the other field, 40 ms away, differ by far more.
+            assert np.abs(frame.luma.astype(int) - luma[row::2]).mean() < 1.5
+            for mine, plane in zip(frame.chroma, chroma, strict=True):
+                assert np.abs(mine.astype(int) - plane[row::2]).mean() < 1.0
+
+
+def test_the_stream_says_that_it_is_interlaced(tmp_path):
+    for coded in (True, False):
+        with open_source(woven_dive(tmp_path / "dive.mp4", 2, coded=coded)) as source:
+            assert {frame.is_interlaced for frame in source} == {coded}
+
+
+def test_the_fields_of_a_lost_picture_are_lost():
+    frames = list(frames_of([picture(index=0), picture(index=2)], FIELDS))
+    assert [frame.index for frame in frames] == [0, 1, 4, 5]
