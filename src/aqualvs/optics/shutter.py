@@ -97,6 +97,16 @@ class Shutter:
         """First row of the field that is exposed first."""
         return 0 if self.first_field == "top" else 1
 
+    @property
+    def middle_to_end(self) -> float:
+        """Time from the middle of a rolling picture to the end of its last exposure, in seconds.
+
+        0 for others: a picture that is taken at once is taken when it comes.
+        """
+        if self.kind is not ShutterKind.ROLLING:
+            return 0.0
+        return 0.5 * (self.readout + self.exposure)
+
     def row_times(self, rows: ArrayLike, height: int) -> FloatArray:
         """Return the middles of the exposures of rows, in seconds from the picture's middle.
 
