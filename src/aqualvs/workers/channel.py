@@ -36,7 +36,7 @@ Message: TypeAlias = list[FrameResult] | Ended
 
 _COLUMNS = {field.name: getattr(ScanPoints.none(), field.name) for field in fields(ScanPoints)}
 _BYTES = [column.itemsize * math.prod(column.shape[1:]) for column in _COLUMNS.values()]
-_ARRAYS = ("covariance", "normal_in_dome", "rig_covariance", "by_rates")
+_ARRAYS = ("covariance", "normal_in_dome", "rig_covariance")
 _NUMBERS = tuple(field.name for field in fields(Posture) if field.name not in _ARRAYS)
 # Size of a cache line: no two columns share one.
 _ALIGNED = 64
@@ -95,8 +95,7 @@ def _plain(answer: Posture | Refusal | None) -> Any:
     if not isinstance(answer, Posture):
         return answer
     numbers = [getattr(answer, name) for name in _NUMBERS]
-    arrays = [getattr(answer, name) for name in _ARRAYS]
-    return numbers, [None if array is None else array.tolist() for array in arrays]
+    return numbers, [getattr(answer, name).tolist() for name in _ARRAYS]
 
 
 def _answer(plain: Any) -> Any:
@@ -104,8 +103,7 @@ def _answer(plain: Any) -> Any:
         return plain
     numbers, arrays = plain
     values: dict[str, Any] = dict(zip(_NUMBERS, numbers, strict=True))
-    arrays = [None if array is None else np.array(array) for array in arrays]
-    values |= zip(_ARRAYS, arrays, strict=True)
+    values |= zip(_ARRAYS, map(np.array, arrays), strict=True)
     return Posture(**values)
 
 
