@@ -12,6 +12,7 @@
 import statistics
 import time
 from array import array
+from collections import deque
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
@@ -133,23 +134,28 @@ class RunMcap(Closing):
         self._path, self._rig = folder / DIVE_MCAP, rig
         self._began_ns = time.time_ns()
         self._recording: Recording | None = None
+        # A rolling shutter's scans are written a few frames after their stripes are measured.
+        self._waiting: deque[tuple[Rig, dict[SearchAxis, StripePeaks]]] = deque()
         if wanted:
             with writing(self._path):
                 self._recording = _recording(self._path, options)
 
     def recorded(self, scanner: FrameScanner) -> FrameScanner:
-        """Return a scanner that measures as this one does, and records its results."""
-        return scanner if self._recording is None else _RecordedScanner(self, scanner)
+        """Return a scanner that measures as this one does, and keeps the stripes for `write`."""
+        if self._recording is None:
+            return scanner
+        return _RecordedScanner(scanner, self._waiting)
 
-    def write(self, rig: Rig, scan: Scan, peaks: dict[SearchAxis, StripePeaks]) -> None:
-        """Record a scan with the rig and the stripes that it was made from."""
-        if self._recording is not None:
-            with writing(self._path):
-                self._recording.write(_sample(self._began_ns, rig, scan, peaks))
+    def write(self, scan: Scan, *, is_lost: bool) -> None:
+        """Record the next scan, with the rig and the stripes that it was made from.
 
-    def lost(self, scan: Scan) -> None:
-        """Record the scan of a frame that was lost."""
-        self.write(self._rig, scan, {})
+        A frame that was lost has none.
+        """
+        if self._recording is None:
+            return
+        rig, peaks = (self._rig, {}) if is_lost else self._waiting.popleft()
+        with writing(self._path):
+            self._recording.write(_sample(self._began_ns, rig, scan, peaks))
 
     def close(self) -> None:
         """Close the file; readable in any case."""
@@ -159,14 +165,18 @@ class RunMcap(Closing):
 
 
 class _RecordedScanner:
-    """Scanner that measures as another one does, and records the results."""
+    """Scanner that measures as another one does, and keeps the stripes of its scans."""
 
-    def __init__(self, mcap: RunMcap, scanner: FrameScanner) -> None:
-        self._mcap, self._scanner = mcap, scanner
+    def __init__(
+        self,
+        scanner: FrameScanner,
+        stripes: deque[tuple[Rig, dict[SearchAxis, StripePeaks]]],
+    ) -> None:
+        self._scanner, self._stripes = scanner, stripes
 
     def process(self, frame: Frame) -> Scan:
         rig, scan, peaks = _measured(self._scanner, frame)
-        self._mcap.write(rig, scan, peaks)
+        self._stripes.append((rig, peaks))
         return scan
 
 
@@ -399,9 +409,8 @@ class RunWriters:
         for measured in found:
             self._overlay.write(measured.frame, measured.scan)
             self._rerun.write(measured.frame, measured.scan)
-            if measured.is_lost:
-                self._mcap.lost(measured.scan)
-            else:
+            self._mcap.write(measured.scan, is_lost=measured.is_lost)
+            if not measured.is_lost:
                 self._net.add(measured.scan)
 
     def interrupt(self) -> None:

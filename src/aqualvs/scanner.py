@@ -5,21 +5,22 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from aqualvs.geometry.arrays import BoolArray, IntArray
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import Rig
-from aqualvs.optics.rig_covariance import PostureErrors, fitted_plane
-from aqualvs.optics.shutter import Field
+from aqualvs.optics.rig_covariance import FittedSurface, PostureErrors, fitted_plane
+from aqualvs.optics.shutter import Field, ShutterKind
 from aqualvs.optics.solved import completed_uncertainty
 from aqualvs.scanning.assignment import NOT_TESTED, AssignmentTest, Verdict, inflate_for_rival
 from aqualvs.scanning.candidates import Candidates, Subsegments, find_candidates
 from aqualvs.scanning.detection import DetectorOptions, FrameDetector
 from aqualvs.scanning.labels import label_candidates
 from aqualvs.scanning.laser_bands import LaserBand, SearchAxis, plan_bands, search_range
-from aqualvs.scanning.patch import fitted_patch
+from aqualvs.scanning.patch import Patch, fitted_patch
 from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.posture_estimator import MIN_LINES, FitMethod, Measurement, PostureEstimator
+from aqualvs.scanning.row_motion import RowMotion
 from aqualvs.scanning.scan import Frame, Scan, ScanPoints
 from aqualvs.scanning.stripe import StripeOptions, StripePeaks
 from aqualvs.scanning.surfaces import (
@@ -97,6 +98,8 @@ class Scanner:
         laser_bands = self._view(0).laser_bands
         self._posture_estimator = PostureEstimator(rig, laser_bands, self.options.fit)
         self._paper_filter = self._make_paper_filter(camera, laser_bands)
+        rolls = rig.shutter.kind is ShutterKind.ROLLING
+        self._row_motion = RowMotion(rig) if rolls else None
         self._rig_errors = PostureErrors(rig, camera, completed_uncertainty(rig))
 
     def process(self, frame: Frame) -> Scan:
@@ -217,7 +220,7 @@ class Scanner:
         elif tested.verdict is Verdict.AMBIGUOUS and tested.other is not None:
             found = _refuse_ambiguous(candidates, target.plane, tested.other)
         else:
-            found = self._posture_estimator.measure(candidates, subsegments, target)
+            found = self._measured(candidates, subsegments, target)
             found = inflate_for_rival(found, tested)
             # The mean plane of folds covers all of a net's light, nearer parts included.
             other = None if found.folded else assignment.nearer_net(subsegments, surfaces, target)
@@ -246,22 +249,31 @@ class Scanner:
         surfaces = [before if one.members is before.members else one for one in surfaces]
         return surfaces, before, None
 
+    def _measured(
+        self, candidates: Candidates, subsegments: Subsegments, target: Surface
+    ) -> Measurement:
+        """Return the posture to the target, as the rows of the picture show it."""
+        if self._row_motion is None:
+            return self._posture_estimator.measure(candidates, subsegments, target)
+        on_target = target.members[subsegments.of_candidate]
+        still, rates = self._row_motion.stilled(candidates, on_target, target.plane)
+        found = self._posture_estimator.measure(still, subsegments, target)
+        posture = found.posture
+        if not isinstance(posture, Posture) or found.weights is None:
+            return found
+        surface, weights = _fitted(posture, found.patch, still.points, found.weights)
+        return replace(
+            found, posture=self._row_motion.as_exposed(posture, surface, still, weights, rates)
+        )
+
     def _with_rig_covariance(self, found: Measurement, candidates: Candidates) -> Posture | Refusal:
         """Return the posture with its covariance by the rig's uncertainty."""
         posture = found.posture
         if not isinstance(posture, Posture) or found.weights is None:
             return posture
-        m, points, weights = (
-            posture.normal_in_dome / posture.range,
-            candidates.points,
-            found.weights,
-        )
-        surface = fitted_plane(m, points)
-        if found.patch is not None:
-            # Heights over a patch are in metres; m·X is relative to the range.
-            surface, weights = fitted_patch(found.patch, m, points), weights / posture.range**2
+        surface, weights = _fitted(posture, found.patch, candidates.points, found.weights)
         _, covariance = self._rig_errors.propagate(
-            surface, candidates.pixels, candidates.laser, points, weights
+            surface, candidates.pixels, candidates.laser, candidates.points, weights
         )
         return replace(posture, rig_covariance=covariance)
 
@@ -276,6 +288,17 @@ class Scanner:
             if one is not target and not shares_peaks(one, rival, subsegments)
         ]
         return as_requested_kind([rival, *kept], self.options.target)
+
+
+def _fitted(
+    posture: Posture, patch: Patch | None, points: FloatArray, weights: FloatArray
+) -> tuple[FittedSurface, FloatArray]:
+    """Return the surface of a posture as fitted to points, and their weights for its residuals."""
+    m = posture.normal_in_dome / posture.range
+    if patch is None:
+        return fitted_plane(m, points), weights
+    # Heights over a patch are in metres; m·X is relative to the range.
+    return fitted_patch(patch, m, points), weights / posture.range**2
 
 
 def _on_mesh(paper_filter: "PaperFilter", points: ScanPoints) -> BoolArray:

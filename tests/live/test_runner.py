@@ -5,6 +5,7 @@ import math
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -13,7 +14,10 @@ from aqualvs.errors import SourceError
 from aqualvs.live import runner as live_runner
 from aqualvs.live.health_monitor import FrozenOptions
 from aqualvs.live.runner import Arrival, FixedScanner, LiveOptions, LiveRunner, Mailbox
-from aqualvs.scanning.posture import Reason, Refusal
+from aqualvs.optics.shutter import Shutter, ShutterKind
+from aqualvs.scanner import Scanner
+from aqualvs.scanning.posture import Posture, Reason, Refusal
+from aqualvs.scanning.row_motion import RowMotion
 from aqualvs.scanning.scan import Frame, Scan
 from aqualvs.sources.base import PartHealth, State
 from live_cases import (
@@ -121,6 +125,23 @@ def test_every_frame_of_a_file_gives_what_the_scanner_alone_gives() -> None:
         assert sample.scan.posture.range == expected.range
         assert sample.instants.arrived_ns <= sample.instants.taken_ns <= sample.instants.scanned_ns
     assert output.closed
+
+
+def test_a_rolling_shutter_is_corrected_by_frames_of_the_past() -> None:
+    shutter = Shutter(kind=ShutterKind.ROLLING, readout=0.02, exposure=0.008)
+    scanner = Scanner(replace(demo_rig(), shutter=shutter))
+    output = Collector()
+    runner(list(demo_frames()), output, keep_every=True, scanner=scanner).run(never)
+    seen = [scanner.process(frame) for frame in demo_frames()]
+    motion = RowMotion(scanner.rig)
+    for i, sample in enumerate(output.samples):
+        expected = motion.correct(seen[i], seen[max(i - 2, 0) : i]).posture
+        assert isinstance(sample.scan.posture, Posture)
+        assert isinstance(expected, Posture)
+        assert (sample.scan.posture.numbers == expected.numbers).all()
+        # Half of readout and exposure.
+        assert sample.instants.arrived_ns - sample.posture_ns == 14_000_000
+    assert len(output.samples) == 8
 
 
 class _Waiting:

@@ -26,6 +26,7 @@ from aqualvs.workers.frame_results import (
     FrameProcessor,
     FrameResult,
     FrameScanner,
+    corrected_rows,
     in_blocks,
     result_blocks,
 )
@@ -173,7 +174,9 @@ def _blocks(
     # A recording tells of lost frames itself.
     first = None if dive.is_replay else frames_in(span, dive.rig.shutter)[0]
     pairs = with_losses(frames, first, dive.rig.n_water)
-    return result_blocks(in_blocks(pairs, processor.block_length), processor)
+    return corrected_rows(
+        result_blocks(in_blocks(pairs, processor.block_length), processor), dive.rig
+    )
 
 
 class _Kept(threading.local):

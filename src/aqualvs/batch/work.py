@@ -17,6 +17,7 @@ from aqualvs.batch.dataset import read_valid_manifest, write_manifest
 from aqualvs.errors import OptionError
 from aqualvs.nets.target_file import target_dict
 from aqualvs.optics.rigfile import rig_to_mapping
+from aqualvs.optics.shutter import ShutterKind
 from aqualvs.pipeline import OpenDive, open_dive
 from aqualvs.results.files import writing
 from aqualvs.results.run_request import RunRequest, source_dict, versions
@@ -28,7 +29,7 @@ from aqualvs.sources.video import VideoSource
 PIECE_FRAMES = 1500
 """Frames that a piece has at least: a minute of video, seconds of work."""
 
-_FORMAT = 2
+_FORMAT = 3
 """Of what pieces hold; another one makes old pieces worthless."""
 
 
@@ -173,6 +174,7 @@ def probe(work: DiveWork) -> DiveProbe:
             n_frames=dive.source.n_frames,
             source=source_dict(dive.source),
         )
+        rolls = dive.rig.shutter.kind is ShutterKind.ROLLING
         stat = _stat_key(Path(work.request.source)) | {"frames": work.piece_frames}
         content = _remembered(work, stat) or _remember(
             work, stat, _content(dive, work.piece_frames)
@@ -181,8 +183,11 @@ def probe(work: DiveWork) -> DiveProbe:
     found = replace(
         found, source_key=content["source_key"], spans=spans, n_bytes=content["n_bytes"]
     )
-    why = "" if work.request.index_target is None else "the water is followed from frame to frame"
-    why = why or content["why_whole"]
+    why = content["why_whole"]
+    if work.request.index_target is not None:
+        why = "the water is followed from frame to frame"
+    elif rolls:
+        why = "its rolling shutter is corrected from frame to frame"
     return found.in_one_piece(why) if why or not spans else found
 
 

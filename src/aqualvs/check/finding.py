@@ -229,9 +229,9 @@ def shutter_finding(rig: Rig) -> Finding | None:
             "measured by itself: twice as many postures, each of half the rows.",
         )
     return Finding(
-        Severity.WARN,
+        Severity.OK,
         f"The shutter rolls, {apart:g} ms from the first row to the last. {rates} "
-        f"{_rolling_error(rig)}{blur}. No sigma counts it: move slowly.",
+        f"{_rolling_error(rig)}{blur}. The frames beside it correct that.",
     )
 
 
@@ -244,6 +244,6 @@ def _rolling_error(rig: Rig) -> str:
         return f"its rows see a target {apart:.2f} degrees apart"
     away, pitch, yaw = np.abs(by_rates) @ [_SPEED, _TURN, _TURN]
     return (
-        f"a wall at {1e3 * wall.wall_range:.0f} mm is read up to {1e3 * away:.1f} mm and "
+        f"one frame reads a wall at {1e3 * wall.wall_range:.0f} mm up to {1e3 * away:.1f} mm and "
         f"{math.degrees(max(pitch, yaw)):.2f} degrees off"
     )

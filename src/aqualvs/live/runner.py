@@ -28,11 +28,12 @@ from aqualvs.live.outputs.base import Output
 from aqualvs.optics.expected_error import see_stripe
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.sheet import sheets_of
-from aqualvs.optics.shutter import Field
+from aqualvs.optics.shutter import Field, ShutterKind
 from aqualvs.recording.sample import Instants, LiveSample
 from aqualvs.scanner import Scanner
 from aqualvs.scanning.laser_bands import SearchAxis
 from aqualvs.scanning.posture import Reason, Refusal
+from aqualvs.scanning.row_motion import REACH, RowMotion
 from aqualvs.scanning.scan import Frame, Scan, ScanPoints
 from aqualvs.scanning.stripe import StripePeaks
 from aqualvs.sources.base import Feed, Health, PartHealth, State
@@ -418,6 +419,10 @@ class LiveRunner:
         ordered = sorted(outputs, key=lambda output: not output.inline)
         self._workers = [OutputWorker(output) for output in ordered]
         self._frozen: dict[Field | None, FrozenPicture] = {}
+        rig = provider.scanner.rig
+        rolls = rig.shutter.kind is ShutterKind.ROLLING
+        self._row_motion = RowMotion(rig) if rolls else None
+        self._before: deque[Scan] = deque(maxlen=REACH)
         self._last: Frame | None = None
         self._heard_ns = self._told_ns = 0
         self._trouble = ""
@@ -498,7 +503,7 @@ class LiveRunner:
             return {}, Scan(frame.index, frame.time_s, refusal, ScanPoints.none(), rig.n_water)
         try:
             peaks = scanner.detect(frame)
-            return peaks, scanner.measure(frame.index, frame.time_s, peaks)
+            return peaks, self._at_middle(scanner.measure(frame.index, frame.time_s, peaks))
         except Exception as fault:
             # One bad frame must not end a dive.
             if str(fault) != self._trouble:
@@ -513,6 +518,14 @@ class LiveRunner:
             return 0.0
         frozen = self._frozen.setdefault(frame.field, FrozenPicture(self._options.frozen))
         return frozen.update(frame.time_s, frame.luma)
+
+    def _at_middle(self, scan: Scan) -> Scan:
+        """Return a scan as it is at its picture's middle, by those before it."""
+        if self._row_motion is None:
+            return scan
+        before = list(self._before)
+        self._before.append(scan)
+        return self._row_motion.correct(scan, before)
 
     def _is_silent(self) -> bool:
         now_ns = time.monotonic_ns()

@@ -115,6 +115,16 @@ class Shutter:
             return None
         return "top" if (index + self.first_row) % 2 == 0 else "bottom"
 
+    @property
+    def middle_to_end(self) -> float:
+        """Time from the middle of a rolling picture to the end of its last exposure, in seconds.
+
+        0 for others: a picture that is taken at once is taken when it comes.
+        """
+        if self.kind is not ShutterKind.ROLLING:
+            return 0.0
+        return 0.5 * (self.readout + self.exposure)
+
     def row_times(self, rows: ArrayLike, height: int) -> FloatArray:
         """Return the middles of the exposures of rows, in seconds from the picture's middle.
 

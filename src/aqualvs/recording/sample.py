@@ -61,3 +61,12 @@ class LiveSample:
     instants: Instants
     filtered: FilteredPosture | None
     health: Health
+
+    @property
+    def posture_ns(self) -> int:
+        """Time of the posture by `time.monotonic_ns`: that of the picture's middle.
+
+        As if the picture had come at the end of its last row: delays of camera and network are not
+        known here.
+        """
+        return self.instants.arrived_ns - round(1e9 * self.rig.shutter.middle_to_end)

@@ -91,6 +91,10 @@ class Posture:
         Of a curved net along the horizontal and along the vertical, in 1/m, and their standard
         deviations; positive where the net recedes beside the point nearest to the vehicle. Range,
         pitch and yaw are then those of the tangent plane at that point. None for a plane.
+    by_rates : array, shape (3, 3), or None
+        Error of (range, pitch, yaw) by their rates, in seconds, m and rad, where the rows of a
+        rolling shutter show the target at different times; `row_motion` corrects it. None where it
+        has been corrected, and where all rows are exposed at once.
     """
 
     range: float
@@ -105,10 +109,16 @@ class Posture:
     curvature: tuple[float, float] | None = None
     sigma_curvature: tuple[float, float] | None = None
     rig_covariance: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
+    by_rates: FloatArray | None = None
 
     def __bool__(self) -> Literal[True]:
         """Return True: a posture is an answer."""
         return True
+
+    @property
+    def numbers(self) -> FloatArray:
+        """Range, pitch and yaw (3,), in m and rad."""
+        return np.array([self.range, self.pitch, self.yaw])
 
     @property
     def total_covariance(self) -> FloatArray:

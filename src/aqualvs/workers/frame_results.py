@@ -3,14 +3,16 @@
 - `FrameProcessor`: measures blocks of consecutive frames.
 - `BareLensComparison`: the posture from the same stripe points, triangulated as if by a bare lens:
   the error of ignoring the dome.
+- `corrected_rows`: the correction of a rolling shutter, by the frames beside each.
 - `in_blocks`, `read_ahead`: blocks of frames, and a thread that reads them ahead.
 """
 
 import contextlib
 import queue
 import threading
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import closing
+from dataclasses import dataclass, replace
 from typing import Protocol, TypeVar
 
 import numpy as np
@@ -20,10 +22,12 @@ from aqualvs.errors import AqualvsError
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import borrowing_kernel
 from aqualvs.optics.rig import Rig
+from aqualvs.optics.shutter import ShutterKind
 from aqualvs.scanner import Scanner
 from aqualvs.scanning.laser_bands import plan_bands
 from aqualvs.scanning.plane_fit import SOLID_ERROR, PlaneFit, fit_robust, plane_of_all
 from aqualvs.scanning.posture import Posture, Reason, Refusal, count_inliers, posture_of
+from aqualvs.scanning.row_motion import REACH, RowMotion
 from aqualvs.scanning.scan import Frame, Scan
 from aqualvs.scanning.triangulate import Triangulator
 
@@ -273,9 +277,58 @@ class FrameProcessor:
         ]
 
 
+def corrected_rows(
+    blocks: Generator[list[FrameResult], None, None], rig: Rig
+) -> Generator[list[FrameResult], None, None]:
+    """Yield results as they are at the middles of the pictures of a rolling shutter.
+
+    Those of other shutters are yielded as they are. Those of a rolling one come a few frames after
+    they were measured, when the frames after them are known; none is lost where their source breaks
+    off.
+
+    Parameters
+    ----------
+    blocks : generator of list
+        Results as measured, in the order of the dive; closed at the end.
+    rig : Rig
+    """
+    with closing(blocks):
+        if rig.shutter.kind is not ShutterKind.ROLLING:
+            yield from blocks
+            return
+        motion, measured, n_done = RowMotion(rig), list[FrameResult](), 0
+        block: list[FrameResult] | None = []
+        broken_off = None
+        while block is not None:
+            try:
+                block = next(blocks, None)
+            except AqualvsError as fault:
+                block, broken_off = None, fault
+            measured += block or []
+            stop = max(n_done, len(measured) - (0 if block is None else REACH))
+            if stop > n_done:
+                yield [_corrected(motion, measured, i) for i in range(n_done, stop)]
+            n_done = min(stop, REACH)
+            del measured[: stop - n_done]
+        if broken_off is not None:
+            raise broken_off
+
+
+def _corrected(motion: RowMotion, measured: Sequence[FrameResult], i: int) -> FrameResult:
+    """Return a result as it is at its picture's middle, by those beside it."""
+    one = measured[i]
+    beside = [*measured[max(i - REACH, 0) : i], *measured[i + 1 : i + 1 + REACH]]
+    scan = motion.correct(one.scan, [other.scan for other in beside])
+    seen, found, bare = one.scan.posture, scan.posture, one.bare
+    if isinstance(seen, Posture) and isinstance(found, Posture) and isinstance(bare, Posture):
+        # The same motion, seen by a camera without its dome.
+        bare = motion.moved(bare, found.numbers - seen.numbers)
+    return replace(one, scan=scan, bare=bare)
+
+
 def result_blocks(
     blocks: Iterator[list[tuple[list[Scan], Frame]]], processor: FrameProcessor
-) -> Iterator[list[FrameResult]]:
+) -> Generator[list[FrameResult], None, None]:
     """Yield the results of frames, and scans of lost ones, in the order of the dive.
 
     Parameters

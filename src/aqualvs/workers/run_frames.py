@@ -29,6 +29,7 @@ from aqualvs.workers.frame_results import (
     FrameProcessor,
     FrameResult,
     FrameScanner,
+    corrected_rows,
     in_blocks,
     read_ahead,
     result_blocks,
@@ -271,6 +272,8 @@ class DiveProcessor(Closing):
     ) -> Generator[list[FrameResult], None, None]:
         """Yield the results, in the order of the dive; to be closed before the source is.
 
+        Those of a rolling shutter are corrected.
+
         Parameters
         ----------
         scanner : FrameScanner
@@ -283,6 +286,11 @@ class DiveProcessor(Closing):
         SourceError
             From the source, at the end of what it has.
         """
+        return corrected_rows(self._measured(scanner, one_by_one=one_by_one), self._rig)
+
+    def _measured(
+        self, scanner: FrameScanner, *, one_by_one: bool
+    ) -> Generator[list[FrameResult], None, None]:
         if self._head is not None and self._pool is not None:
             yield self._head
             yield from self._shared

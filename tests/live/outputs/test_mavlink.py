@@ -35,6 +35,7 @@ from aqualvs.live.outputs.mavlink import (
     signal_quality,
     variance_cm2,
 )
+from aqualvs.optics.shutter import Shutter, ShutterKind
 from aqualvs.recording.sample import LiveSample
 from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.scan import ScanPoints
@@ -106,6 +107,10 @@ def test_a_posture_becomes_messages(bench: Bench) -> None:
     distance, values = bench.send(with_posture(posture))
     assert distance.current_distance == round(100 * posture.range)
     assert distance.time_boot_ms == first_sample().instants.arrived_ns // 1_000_000
+    rolling = Shutter(kind=ShutterKind.ROLLING, readout=0.02, exposure=0.008)
+    rig = replace(first_sample().rig, shutter=rolling)
+    late, _ = bench.send(replace(with_posture(posture), rig=rig))
+    assert late.time_boot_ms == (first_sample().instants.arrived_ns - 14_000_000) // 1_000_000
     assert distance.signal_quality > 50
     assert tuple(values) == NAMES
     sigmas = np.sqrt(np.diag(posture.total_covariance))

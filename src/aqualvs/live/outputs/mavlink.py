@@ -75,7 +75,7 @@ class MavlinkOutput:
 
     def send(self, sample: LiveSample) -> None:
         """Send one sample without waiting; drop messages that cannot be sent."""
-        time_boot_ms = boot_ms(sample.instants.arrived_ns)
+        time_boot_ms = boot_ms(sample.posture_ns)
         _fill_distance(self._distance, time_boot_ms, sample)
         numbers = _numbers(sample.scan.posture, sample.scan.n_water)
         messages = _fill(self._values, time_boot_ms, numbers)

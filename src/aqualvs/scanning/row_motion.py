@@ -1,0 +1,233 @@
+"""Correction of postures for the motion from row to row of a rolling shutter.
+
+Every stripe point is seen at the time of its row, so that a posture is off by its `by_rates` times
+the rates of range, pitch and yaw. The rates come from the frames beside it, with the frames' own
+errors by them: in frame j, at time t from the frame that is corrected,
+
+    measured_j = posture + t rates + t²/2 acceleration + by_rates_j (rates + t acceleration) + e_j.
+
+Frames beside it never smooth a posture: it is moved by its `by_rates` times the rates, no more.
+
+The points of one frame alone tell the rates too, but worse: they bend and twist a plane. That is
+enough to take the motion out of the scatter, before surfaces are fitted and sigmas are found.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from aqualvs.geometry.arrays import BoolArray, FloatArray
+from aqualvs.geometry.planes import Plane
+from aqualvs.optics.rig import Rig
+from aqualvs.optics.rig_covariance import FittedSurface, posture_by_plane
+from aqualvs.scanning.candidates import Candidates
+from aqualvs.scanning.posture import Posture
+from aqualvs.scanning.scan import Scan
+
+REACH = 2
+"""Frames to each side that tell the rates of a frame."""
+
+# Frames further away tell little of the rates now.
+_REACH_S = 0.25
+# Standard deviations of a small vehicle's motion near a net, before anything is measured: of the
+# rates of range, pitch and yaw (m/s, rad/s), and of their changes (m/s², rad/s²).
+_RATES = np.array([0.3, np.deg2rad(20.0), np.deg2rad(20.0)])
+_ACCELERATIONS = np.array([0.5, np.deg2rad(40.0), np.deg2rad(40.0)])
+# A frame whose squared Mahalanobis distance is larger (once in 1000 times by chance, 3 values)
+# shows another surface, or is wrong.
+_GATE = 16.27
+# Of the fit of the rates to one frame, as in `plane_fit`.
+_TUKEY, _ITERATIONS = 4.685, 4
+# Points share the errors of their stripe: all together they count as this many. A rate of which one
+# frame tells little, such as that of the range, so stays near zero.
+_INDEPENDENT = 30.0
+
+
+class RowMotion:
+    """Motion from row to row in the pictures of one rig with a rolling shutter.
+
+    Parameters
+    ----------
+    rig : Rig
+    """
+
+    def __init__(self, rig: Rig) -> None:
+        self._shutter, self._height = rig.shutter, rig.size_px[1]
+        self._axis_in_dome = rig.dome_from_cam.rotate([0.0, 0.0, 1.0])
+
+    def stilled(
+        self, candidates: Candidates, on_target: BoolArray, plane: Plane
+    ) -> tuple[Candidates, FloatArray]:
+        """Return candidates without the motion that one frame shows, and its rates (3,).
+
+        Parameters
+        ----------
+        candidates : Candidates
+            N of them.
+        on_target : bool array, shape (N,)
+            Candidates on the target.
+        plane : Plane
+            Of the target, roughly.
+        """
+        times, m = self._times(candidates.pixels), plane.normal / plane.offset
+        sigma = np.abs(candidates.sensitivity @ m) * candidates.sigma_px + 1e-12
+        m, m_rate = _fit_rates(candidates.points[on_target], sigma[on_target], times[on_target], m)
+        still = candidates.points - times[:, None] * _velocity(m, m_rate, candidates.points)
+        return replace(candidates, points=still), _by_m(m) @ m_rate
+
+    def as_exposed(
+        self,
+        posture: Posture,
+        surface: FittedSurface,
+        candidates: Candidates,
+        weights: FloatArray,
+        rates: FloatArray,
+    ) -> Posture:
+        """Return the posture to `stilled` candidates as that to the candidates themselves.
+
+        It has `by_rates`, and the noise of `rates` is no longer in it.
+
+        Parameters
+        ----------
+        posture : Posture
+        surface : FittedSurface
+            Surface of the posture.
+        candidates : Candidates
+            N of them, to which it was fitted.
+        weights : array, shape (N,)
+            1 over the variance of the residual, or 0.
+        rates : array, shape (3,)
+            From `stilled`.
+        """
+        m = posture.normal_in_dome / posture.range
+        terms = surface.terms * weights[:, None]
+        matrix = terms.T @ surface.terms + np.diag(surface.prior)
+        # At its time t a point lies on the plane m + t rate, and so off m by -t rate·X.
+        moved = terms.T @ (candidates.points * self._times(candidates.pixels)[:, None])
+        scale = float(np.linalg.norm(surface.normal) / np.linalg.norm(m))
+        by_m_rate = -scale * surface.posture @ np.linalg.solve(matrix, moved)
+        by_rates: FloatArray = by_m_rate @ np.linalg.inv(_by_m(m))
+        return replace(self.moved(posture, by_rates @ rates), by_rates=by_rates)
+
+    def correct(self, scan: Scan, beside: Sequence[Scan]) -> Scan:
+        """Return a scan with posture and points as they are at the picture's middle.
+
+        Points move as the target does if it turns about the dome's centre: how it slides along
+        itself, or rolls, no posture tells. Their pixels stay as seen.
+
+        Parameters
+        ----------
+        scan : Scan
+            As the scanner measured it; without a posture it is returned as it is.
+        beside : sequence of Scan
+            Scans just before and after, as measured; in a live run, those before alone.
+        """
+        posture = scan.posture
+        if not isinstance(posture, Posture) or posture.by_rates is None:
+            return scan
+        rates, covariance = _rates(scan, posture, posture.by_rates, beside)
+        corrected = replace(
+            self.moved(posture, -posture.by_rates @ rates),
+            covariance=posture.covariance + posture.by_rates @ covariance @ posture.by_rates.T,
+        )
+        points, seen = scan.points, scan.points.points_in_dome
+        m = posture.normal_in_dome / posture.range
+        m_rate: FloatArray = np.linalg.inv(_by_m(m)) @ rates
+        velocity = _velocity(m, m_rate, seen)
+        moved = seen - self._times(points.pixels)[:, None] * velocity
+        if points.used.any():
+            nearest = float(np.linalg.norm(moved[points.used], axis=1).min())
+            corrected = replace(corrected, nearest=nearest)
+        return replace(scan, posture=corrected, points=replace(points, points_in_dome=moved))
+
+    def moved(self, posture: Posture, by: FloatArray) -> Posture:
+        """Return a posture with a change (3,) of range, pitch and yaw, in m and rad."""
+        distance, pitch, yaw = (posture.numbers + by).tolist()
+        normal = np.array([np.tan(yaw), 1.0, np.tan(pitch)])
+        normal /= np.linalg.norm(normal)
+        approach = float(normal @ self._axis_in_dome)
+        return replace(
+            posture,
+            range=distance,
+            pitch=pitch,
+            yaw=yaw,
+            normal_in_dome=normal,
+            slant_range=distance / approach if approach > 0.0 else float("inf"),
+            by_rates=None,
+        )
+
+    def _times(self, pixels: FloatArray) -> FloatArray:
+        return self._shutter.row_times(pixels[:, 1], self._height)
+
+
+def _fit_rates(
+    points: FloatArray, sigma: FloatArray, times: FloatArray, m: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the plane m·X = 1 at time 0 and the rate of m, from points (N, 3) at their times.
+
+    Parameters
+    ----------
+    points, sigma, times : array, shape (N, 3), (N,), (N,)
+        In `dome` (m); standard deviations of m·X; seconds.
+    m : array, shape (3,)
+        A first m.
+    """
+    terms = np.hstack([points, points * times[:, None]])
+    prior, both = np.zeros((6, 6)), np.concatenate([m, np.zeros(3)])
+    scaled = _by_m(m) / _RATES[:, None]
+    prior[3:, 3:] = scaled.T @ scaled
+    for _ in range(_ITERATIONS):
+        z = (terms @ both - 1.0) / sigma
+        scale = max(1.4826 * float(np.median(np.abs(z))), 0.1)
+        weights = (np.maximum(1.0 - (z / (_TUKEY * scale)) ** 2, 0.0) / (sigma * scale)) ** 2
+        weighted = terms.T * (weights * min(_INDEPENDENT / len(points), 1.0))
+        both = np.linalg.solve(weighted @ terms + prior, weighted.sum(axis=1))
+    return both[:3], both[3:]
+
+
+def _rates(
+    scan: Scan, posture: Posture, by_rates: FloatArray, beside: Sequence[Scan]
+) -> tuple[FloatArray, FloatArray]:
+    """Return the rates (3,) of range, pitch and yaw at a scan, and their covariance (3, 3)."""
+    # Unknowns: posture, rates, accelerations, relative to the scan's own measurement.
+    matrix, right = np.zeros((9, 9)), np.zeros(9)
+    prior = np.concatenate([_RATES, _ACCELERATIONS]) ** -2.0
+    matrix[range(3, 9), range(3, 9)] = prior
+    for one in (scan, *beside):
+        found, t = one.posture, one.time_s - scan.time_s
+        if not isinstance(found, Posture) or found.by_rates is None or abs(t) > _REACH_S:
+            continue
+        off = found.numbers - posture.numbers
+        by = np.hstack([np.eye(3), t * np.eye(3) + found.by_rates])
+        by = np.hstack([by, 0.5 * t**2 * np.eye(3) + t * found.by_rates])
+        # Of the difference between the two, in which their common error is not.
+        by_motion = by[:, 3:].copy()
+        by_motion[:, :3] -= by_rates
+        expected = found.covariance + posture.covariance + (by_motion / prior) @ by_motion.T
+        if one is not scan and off @ np.linalg.solve(expected, off) > _GATE:
+            continue
+        weighed = by.T @ np.linalg.inv(found.covariance)
+        matrix += weighed @ by
+        right += weighed @ off
+    covariance = np.asarray(np.linalg.inv(matrix), np.float64)
+    return (covariance @ right)[3:6], covariance[3:6, 3:6]
+
+
+def _velocity(m: FloatArray, m_rate: FloatArray, points: FloatArray) -> FloatArray:
+    """Return the velocities (N, 3) of points (N, 3) that turn and move with the plane m·X = 1."""
+    distance = float(1.0 / np.linalg.norm(m))
+    normal = m * distance
+    along = float(normal @ m_rate)
+    turned = distance * (m_rate - along * normal)
+    velocity: FloatArray = np.outer(points @ normal, turned) - np.outer(
+        points @ turned + along * distance**2, normal
+    )
+    return velocity
+
+
+def _by_m(m: FloatArray) -> FloatArray:
+    """Return the derivatives (3, 3) of range, pitch and yaw by m."""
+    by_m = np.empty((3, 3))
+    posture_by_plane(m, by_m)
+    return by_m

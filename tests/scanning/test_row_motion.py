@@ -1,0 +1,120 @@
+"""Postures of a rolling shutter are those of the picture's middle."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from aqualvs.optics.shutter import AT_ONCE, Shutter, ShutterKind
+from aqualvs.scanner import Scanner
+from aqualvs.scanning.posture import Posture, Reason, Refusal
+from aqualvs.scanning.row_motion import RowMotion
+from aqualvs.scanning.scan import Frame, Scan, ScanPoints, planes_of_image
+from aqualvs.simulation.render import Renderer
+from aqualvs.simulation.scenario import dome_from_target
+from aqualvs.simulation.scenarios import example_rig
+from aqualvs.simulation.scene import Scene, Wall
+
+START = np.array([0.57, np.deg2rad(2.0), np.deg2rad(-3.0)])
+RATES = np.array([0.25, np.deg2rad(18.0), np.deg2rad(-15.0)])
+STEP_S = 0.04
+N = 5
+
+
+def rig_with(shutter):
+    """The example rig at half its resolution, for speed."""
+    rig = example_rig()
+    lens = replace(rig.lens, fx=408.5, fy=439.0, cx=184.25, cy=140.75)
+    return replace(rig, size_px=(360, 288), lens=lens, shutter=shutter)
+
+
+ROLLING = rig_with(Shutter(kind=ShutterKind.ROLLING, readout=0.02))
+
+
+def truth(i):
+    return START + RATES * STEP_S * (i - 2)
+
+
+def scene_at(t):
+    pose = dome_from_target(*(truth(0) + RATES * t))
+    return Scene(dome_from_scene=pose, walls=(Wall(),), target="wall")
+
+
+@pytest.fixture(scope="module")
+def scans():
+    """Consecutive pictures of a wall before a vehicle that turns and backs off."""
+    eye, scanner = Renderer(ROLLING), Scanner(ROLLING)
+    found = []
+    for i in range(N):
+        t = STEP_S * i
+        image = eye.take(scene_at, t, np.random.default_rng(i)).image
+        frame = Frame(i, t, *planes_of_image(np.ascontiguousarray(image[:, :, ::-1])))
+        found.append(scanner.process(frame))
+    return found
+
+
+def error(scan, i):
+    """Error of a posture: range in permille, angles in degrees."""
+    return (scan.posture.numbers - truth(i)) / [1e-3 * truth(i)[0], *2 * [np.pi / 180.0]]
+
+
+def off_plane(scan):
+    """Distances of the points of the posture from the true wall at the picture's middle."""
+    normal = scene_at(scan.time_s).dome_from_scene.rotation[:, 1]
+    used = scan.points.points_in_dome[scan.points.used]
+    return used @ normal - truth(scan.index)[0]
+
+
+def test_a_posture_is_that_of_the_pictures_middle(scans):
+    assert abs(error(scans[2], 2)[1]) > 0.5
+    found = RowMotion(ROLLING).correct(scans[2], [*scans[:2], *scans[3:]])
+    assert np.all(np.abs(error(found, 2)) < [1.0, 0.15, 0.15])
+    sigma = np.sqrt(np.diag(found.posture.covariance))
+    assert np.all(np.abs(found.posture.numbers - truth(2)) < 3.0 * sigma)
+    assert found.posture.by_rates is None
+
+
+@pytest.mark.parametrize("beside", [[0, 1], [3, 4], [3]])
+def test_frames_of_one_side_are_enough(scans, beside):
+    found = RowMotion(ROLLING).correct(scans[2], [scans[i] for i in beside])
+    assert np.all(np.abs(error(found, 2)) < [1.0, 0.2, 0.15])
+
+
+def test_a_frame_alone_stays_and_says_how_far_it_may_be_off(scans):
+    far = replace(scans[4], time_s=9.0)
+    lost = Scan(3, 0.12, Refusal(Reason.CORRUPT_FRAME), ScanPoints.none(), 1.33)
+    found = RowMotion(ROLLING).correct(scans[2], [lost, far])
+    sigma = np.sqrt(np.diag(found.posture.covariance))
+    # Nearly all of it is pitch by the change of range.
+    assert sigma[1] > 10.0 * np.sqrt(scans[2].posture.covariance[1, 1])
+    assert np.all(np.abs(found.posture.numbers - truth(2)) < 3.0 * sigma)
+    assert RowMotion(ROLLING).correct(lost, scans) is lost
+
+
+def test_a_frame_that_shows_another_surface_tells_nothing(scans):
+    wrong = replace(scans[1], posture=replace(scans[1].posture, range=scans[1].posture.range + 0.3))
+    motion = RowMotion(ROLLING)
+    expected = motion.correct(scans[2], [scans[3]]).posture
+    found = motion.correct(scans[2], [wrong, scans[3]]).posture
+    assert np.array_equal(found.numbers, expected.numbers)
+
+
+def test_points_move_to_where_they_are_at_the_middle(scans):
+    found = RowMotion(ROLLING).correct(scans[2], [scans[1], scans[3]])
+    assert np.std(off_plane(found)) < 0.75 * np.std(off_plane(scans[2]))
+    assert abs(off_plane(found).mean()) < 0.3e-3
+    assert np.array_equal(found.points.pixels, scans[2].points.pixels)
+    nearest = np.linalg.norm(found.points.points_in_dome[found.points.used], axis=1).min()
+    assert found.posture.nearest == nearest
+
+
+def test_motion_is_no_scatter(scans):
+    """Sigma is about that of a picture taken at once: the wall's warp is not in it."""
+    rig = rig_with(AT_ONCE)
+    image = Renderer(rig).render(scene_at(2 * STEP_S), 0.0, np.random.default_rng(2)).image
+    frame = Frame(0, 0.0, *planes_of_image(np.ascontiguousarray(image[:, :, ::-1])))
+    still = Scanner(rig).process(frame).posture
+    assert isinstance(still, Posture)
+    assert still.by_rates is None
+    ratio = np.diag(scans[2].posture.covariance) / np.diag(still.covariance)
+    assert np.all(ratio < 1.5**2)
