@@ -387,8 +387,8 @@ def test_an_error_that_all_strands_share_is_in_the_sigma_of_the_range(
 ) -> None:
     rig, variances = example_rig(), []
     peaks = peaks_of(rig, [(plane(0.5), broken)], 0.05)
-    for twine_px in (posture_estimator._TWINE_PX, 0.0):
-        monkeypatch.setattr(posture_estimator, "_TWINE_PX", twine_px)
+    for twine_px in (posture_estimator.TWINE_ERROR_PX, 0.0):
+        monkeypatch.setattr(posture_estimator, "TWINE_ERROR_PX", twine_px)
         found = Scanner(rig).measure(0, 0.0, peaks).posture
         assert isinstance(found, Posture)
         variances.append(found.covariance[0, 0])

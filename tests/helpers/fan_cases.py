@@ -223,7 +223,9 @@ def peaks_from(parts: list[_Part]) -> StripePeaks:
     apart = np.ones(len(line), np.bool_)
     apart[1:] = (np.diff(line) > 0) | (np.diff(place) > 4.0)
     n = int(apart.sum())
-    return StripePeaks(line[apart], place[apart], height[apart], np.full(n, 5.0), np.ones(n))
+    return StripePeaks(
+        line[apart], place[apart], height[apart], np.full(n, 5.0), np.ones(n), np.zeros(n)
+    )
 
 
 def miscalibrated(

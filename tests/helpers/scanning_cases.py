@@ -77,5 +77,6 @@ def peaks_of(
             height=np.full(n, 80.0),
             width=np.full(n, 5.0),
             likelihood=np.ones(n),
+            pull=np.zeros(n),
         )
     return found

@@ -7,6 +7,7 @@ import statistics
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 from pyarrow import parquet
@@ -17,6 +18,7 @@ from aqualvs.optics.rigfile import load_rig, save_rig
 from aqualvs.pipeline import run
 from aqualvs.recording import DiveRecording, PictureFormat, Recorder, RecorderOptions, Recording
 from aqualvs.recording.encoding import TOPICS
+from aqualvs.recording.messages import stripes_message, stripes_of
 from aqualvs.results.run_request import FrameWindow, RunRequest, Water
 from aqualvs.scanner import Scanner, ScannerOptions
 from aqualvs.scanning.stripe import ThresholdOptions
@@ -82,6 +84,22 @@ def test_a_recorded_run_replays_bit_for_bit(whole, tmp_path):
     assert said["options"]["rig_file"] is None
     first = yaml.safe_load((whole / "run.yaml").read_text())
     assert said["rig"] == first["rig"]
+
+
+def test_stripes_of_recordings_before_pulls_were_measured_have_none():
+    (sample,) = demo_samples(1)
+    message = stripes_message(sample, 0)
+    *_, peaks, _ = stripes_of(message)
+    pulls = {axis: found.pull for axis, found in sample.peaks.items()}
+    assert len(peaks) == 2
+    for axis, found in peaks.items():
+        np.testing.assert_array_equal(found.pull, pulls[axis])
+        assert np.count_nonzero(found.pull) > 0.5 * len(found)
+    # Their number, aligned to 8 bytes, and the numbers.
+    *_, old, _ = stripes_of(message[: -8 * (1 + sum(map(len, peaks.values())))])
+    for axis, found in old.items():
+        np.testing.assert_array_equal(found.position, peaks[axis].position)
+        np.testing.assert_array_equal(found.pull, np.zeros(len(found)))
 
 
 def test_the_same_rig_from_its_file_gives_the_same(whole, demo, tmp_path):

@@ -14,8 +14,11 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+import yaml
 
+from aqualvs.cli.main import main
 from aqualvs.geometry.arrays import FloatArray
+from aqualvs.optics.rigfile import save_rig
 from aqualvs.scanner import Scanner
 from aqualvs.scanning.posture import Posture
 from aqualvs.simulation.cameras import simulated_camera
@@ -71,3 +74,45 @@ def test_a_real_camera_measures_as_the_ideal_one(dive: str, camera: str) -> None
     assert share.max() < 5e-3
     # Rms of nine values: at a true 1.3 it is below 1.9 in 98 of 100 cases.
     assert np.sqrt(np.mean((real.error / real.sigma) ** 2)) < 1.9
+
+
+def _rows(path: Path) -> list[dict[str, str]]:
+    return list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
+
+
+@pytest.mark.parametrize(
+    ("camera", "dive", "wavelength_nm"), [("pal", "net_diamond", 640.0), ("webcam", "wall", 655.0)]
+)
+def test_red_lasers_through_the_commands(
+    camera: str, dive: str, wavelength_nm: float, tmp_path: Path
+) -> None:
+    rig, scenario = example_rig(), tmp_path / "scenario.yaml"
+    red = tuple(replace(laser, wavelength_nm=wavelength_nm) for laser in rig.lasers)
+    save_rig(replace(rig, lasers=red), tmp_path / "rig.yaml")
+    save_rig(rig, tmp_path / "green.yaml")
+    motion = {"range_mm": [350, 550], "yaw_deg": [-8, 6], "slide_x_mm": [0, 90]}
+    target = {"net": {"twine_mm": 2.2}} if dive.startswith("net") else {"walls": [{}]}
+    content = {"duration_s": 1.0, "fps": 4.0, "motion": motion, **target}
+    scenario.write_text(yaml.safe_dump(content), encoding="utf-8")
+    made = tmp_path / "dive"
+    rendering = ["--camera", camera, "--rig", str(tmp_path / "rig.yaml"), "-o", str(made)]
+    assert main(["simulate", str(scenario), *rendering]) == 0
+
+    def postures(rig_file: str) -> list[dict[str, str]]:
+        out = tmp_path / Path(rig_file).stem
+        arguments = ["--rig", str(tmp_path / rig_file), "-o", str(out), "--no-report"]
+        assert main(["run", str(made / "dive.mp4"), *arguments]) == 0
+        return _rows(out / "posture.csv")
+
+    found, truth = postures("rig.yaml"), _rows(made / "truth.csv")
+    assert len(found) == len(truth) == 4
+    for row, true in zip(found, truth, strict=True):
+        assert row["valid"] == "1", row["reason"]
+        expected = float(true[_TRUTH[0]]) * 1e-3
+        error = float(row["range_m"]) - expected
+        # Half of what is searched is chroma, of half the resolution.
+        assert abs(error) < 2e-3 * expected
+        assert abs(error) < 4.0 * float(row["sigma_range_m"])
+        assert abs(float(row["yaw_deg"]) - float(true[_TRUTH[2]])) < 0.5
+    # A rig that says green looks for other light.
+    assert sum(row["valid"] == "1" for row in postures("green.yaml")) <= 1

@@ -195,7 +195,7 @@ def joined(parts: list[dict[SearchAxis, StripePeaks]]) -> dict[SearchAxis, Strip
 
 
 def columns(part: StripePeaks) -> tuple[FloatArray, ...]:
-    return part.line, part.position, part.height, part.width, part.likelihood
+    return part.line, part.position, part.height, part.width, part.likelihood, part.pull
 
 
 def test_a_net_that_lacks_a_laser_is_outweighed_by_a_nearer_one(

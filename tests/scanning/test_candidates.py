@@ -51,7 +51,7 @@ def test_a_return_lies_in_the_middle_of_a_search_line_two_pixels_wide() -> None:
     assert {search.line_px for search in laser_bands} == {2}
     line = np.arange(200, 240)
     plain = {
-        axis: StripePeaks(line, np.full(40, 640.25), *(np.full(40, 50.0) for _ in range(3)))
+        axis: StripePeaks(line, np.full(40, 640.25), *(np.full(40, 50.0) for _ in range(4)))
         for axis in SearchAxis
     }
     candidates = read(rig, plain)
@@ -93,7 +93,12 @@ def test_sigma_grows_with_width_over_height() -> None:
     plain = peaks_of(rig, [(WALL, everywhere)])
     faint = {
         axis: StripePeaks(
-            found.line, found.position, found.height / 4.0, found.width, found.likelihood
+            found.line,
+            found.position,
+            found.height / 4.0,
+            found.width,
+            found.likelihood,
+            found.pull,
         )
         for axis, found in plain.items()
     }
@@ -142,7 +147,7 @@ def test_observations_are_weighed_by_light() -> None:
 def test_nothing_in_nothing_out() -> None:
     rig = example_rig()
     nothing = {
-        axis: StripePeaks(np.empty(0, np.int64), *(np.empty(0) for _ in range(4)))
+        axis: StripePeaks(np.empty(0, np.int64), *(np.empty(0) for _ in range(5)))
         for axis in SearchAxis
     }
     candidates = read(rig, nothing)

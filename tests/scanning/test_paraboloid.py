@@ -47,6 +47,7 @@ def observed(patch: Patch, noise_px: float = 0.1, n: int = 40, wrong: int = 0) -
         points=points,
         sensitivity=np.tile(_PX * normal, (m, 1)),
         sigma_px=np.full(m, 0.1),
+        pull=np.zeros(m),
         line=line,
         laser=laser,
     )

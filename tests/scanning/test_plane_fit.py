@@ -123,6 +123,32 @@ def test_outliers_of_any_size_do_not_pull_but_the_pseudo_inverse_follows_them() 
     assert plain.rms > 10.0 * found.rms
 
 
+def test_an_error_that_all_stripes_share_counts_as_what_it_moves_the_plane_by() -> None:
+    points, per_px, laser = stripes(TILTED)
+    common = np.where(laser == 1, -0.1, 0.2) + 0.05 * np.tile(ALONG, 3)
+
+    def fitted(at: FloatArray, common: FloatArray | None) -> PlaneFit:
+        found = fit_robust(
+            at,
+            per_px,
+            np.full(len(at), 0.2),
+            laser,
+            np.tile(ALONG, 3),
+            start=TILTED,
+            shared=INDEPENDENT,
+            common=common,
+        )
+        assert found is not None
+        return found
+
+    plain, widened = fitted(points, None), fitted(points, common)
+    moved = fitted(points + 1e-3 * common[:, None] * per_px, None).m - plain.m
+    added = widened.covariance - plain.covariance
+    # A thousandth of the error, so that no point is an outlier; it scales.
+    np.testing.assert_allclose(added, 1e6 * np.outer(moved, moved), rtol=0.01, atol=1e-9)
+    np.testing.assert_array_equal(widened.m, plain.m)
+
+
 @pytest.mark.parametrize("m", [SQUARE, TILTED])
 @pytest.mark.parametrize("shared", [INDEPENDENT, SOLID_ERROR, MESH_ERROR])
 @pytest.mark.parametrize("sigma_px", [0.1, 0.4])

@@ -39,6 +39,7 @@ def peaks_at(*stripes: tuple[IntArray, FloatArray]) -> StripePeaks:
         height=np.full(n, 80.0),
         width=np.full(n, 5.0),
         likelihood=np.full(n, 20.0),
+        pull=np.zeros(n),
     )
 
 

@@ -107,6 +107,25 @@ def test_centre_width_and_height_of_a_clean_stripe(sigma: float) -> None:
     np.testing.assert_array_equal(found.likelihood, 1.0)
 
 
+@pytest.mark.parametrize("slope", [-0.3, 0.0, 0.3])
+@pytest.mark.parametrize("sigma", [2.5, 4.0])
+def test_the_pull_is_what_a_ramp_below_a_stripe_moves_its_centre_by(
+    sigma: float, slope: float
+) -> None:
+    ramp = 100.0 + slope * (np.arange(200.0)[:, None] - 100.0)
+    found = detect(as_image(ramp + gaussian(CENTRES, sigma=sigma)))
+    moved = found.position - CENTRES
+    # First order in slope * width / height, up to 0.02 here; the Gaussian reaches the flanks.
+    expected = 0.269 * (FWHM * sigma) ** 2 * slope / 120.0
+    assert found.pull.mean() == pytest.approx(expected, abs=0.15 * abs(expected) + 4e-3)
+    assert abs((moved - found.pull).mean()) < 0.25 * abs(expected) + 3e-3
+
+
+def test_a_brighter_stripe_beside_a_peak_is_no_pull() -> None:
+    light = gaussian(np.full(20, 100.0)) + gaussian(np.full(20, 112.0), height=150.0)
+    np.testing.assert_array_equal(detect(as_image(30.0 + light)).pull, 0.0)
+
+
 @pytest.mark.parametrize("slope", [-0.4, 0.4])
 def test_a_sloping_background_pulls_by_hundredths(slope: float) -> None:
     background = 60.0 + slope * (np.arange(200)[:, None] - 100.0)

@@ -199,6 +199,7 @@ def test_scattered_light_gives_no_surface_worth_a_target() -> None:
             height=np.full(300, 30.0),
             width=np.full(300, 4.0),
             likelihood=np.full(300, 10.0),
+            pull=np.zeros(300),
         )
     camera = rig.camera()
     candidates = find_candidates(peaks, plan_bands(rig, camera), Triangulator(rig, camera))

@@ -301,6 +301,11 @@ class CdrReader:
         found = np.frombuffer(self._take(n * dtype.itemsize), dtype)
         return found.astype(np.dtype(kind))
 
+    @property
+    def at_end(self) -> bool:
+        """Whether nothing is left to take."""
+        return self._at >= len(self._content)
+
     def blob(self) -> bytes:
         """Take a sequence of bytes."""
         return self._take(self.number("I"))
@@ -413,6 +418,8 @@ float64 n_water
 string refusal
 string detail
 aqualvs_msgs/Returns[] returns
+# Pull of each peak by an uneven background in pixels: those of the first entry, then the next.
+float64[] pull
 """
 
 _PEAKS = """\

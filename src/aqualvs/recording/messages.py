@@ -6,7 +6,7 @@ everywhere outside the library. Numbers that do not exist are NaN.
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -86,6 +86,8 @@ def stripes_message(sample: LiveSample, stamp_ns: int) -> bytes:
         to.array(found.line.astype(np.uint32))
         for column in (found.position, found.height, found.width, found.likelihood):
             to.array(column)
+    # Behind all that older recordings hold, so that both are read alike.
+    to.array(np.concatenate([np.empty(0), *(found.pull for found in sample.peaks.values())]))
     return to.finish()
 
 
@@ -111,7 +113,14 @@ def stripes_of(
         position, height, width, likelihood = (of.array("f8") for _ in range(4))
         # Recordings of 0.1.0 hold levels here, of peaks that passed a colour gate; NaN if grey.
         likelihood = np.where(np.isnan(likelihood), 1.0, np.minimum(likelihood, 1.0))
-        peaks[axis] = StripePeaks(line, position, height, width, likelihood)
+        peaks[axis] = StripePeaks(line, position, height, width, likelihood, np.zeros(len(line)))
+    if not of.at_end:
+        ends = np.cumsum([len(found) for found in peaks.values()])
+        pulls = np.split(of.array("f8"), ends[:-1])
+        peaks = {
+            axis: replace(found, pull=pull)
+            for (axis, found), pull in zip(peaks.items(), pulls, strict=False)
+        }
     return index, time_s, n_water, peaks, Refusal(Reason(reason), detail) if reason else None
 
 

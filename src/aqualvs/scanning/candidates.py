@@ -7,7 +7,7 @@ summarises them by subsegments, the units that agree with a surface or do not;
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
@@ -29,9 +29,9 @@ from aqualvs.scanning.triangulate import Triangulator
 SOURCE, LASER, LINE, COMPONENT, SUBSEGMENT, ALONG_X = range(6)
 """Rows of a table of candidates' whole numbers, the last 1 where the search runs along x."""
 N_NUMBERS = 6
-HEIGHT, WIDTH, SIGMA_PX, CONFIDENCE = range(4)
+HEIGHT, WIDTH, SIGMA_PX, CONFIDENCE, PULL = range(5)
 """Rows of a table of candidates' measures."""
-N_MEASURES = 4
+N_MEASURES = 5
 
 # Position noise of a peak: a floor (texture, compression), and the effect of grey-level noise on
 # the two flanks of a stripe of given width and height.
@@ -46,6 +46,7 @@ def append_candidates(
     height: FloatArray,
     width: FloatArray,
     likelihood: FloatArray,
+    pull: FloatArray,
     lowest: IntArray,
     highest: IntArray,
     slope_low: FloatArray,
@@ -64,7 +65,7 @@ def append_candidates(
 
     Parameters
     ----------
-    line, position, height, width, likelihood
+    line, position, height, width, likelihood, pull
         As in `StripePeaks`, of the laser's search direction.
     lowest, highest, slope_low, slope_high, line_px, shift_px
         As in the laser's `LaserBand`.
@@ -76,7 +77,7 @@ def append_candidates(
         Of the frame's best peaks.
     begin : int
         Number of candidates of other lasers.
-    numbers : int array, shape (6, N), measures : array, shape (4, N)
+    numbers : int array, shape (6, N), measures : array, shape (5, N)
         Written, see `SOURCE` and `HEIGHT`.
     pixels : array, shape (N, 2)
         Written.
@@ -104,6 +105,7 @@ def append_candidates(
         measures[WIDTH, i] = width[r]
         flank = _FLANK_NOISE * width[r] / height[r]
         measures[SIGMA_PX, i] = np.sqrt(_FLOOR_PX * _FLOOR_PX + flank * flank)
+        measures[PULL, i] = pull[r]
         measures[CONFIDENCE, i] = np.sqrt(min(height[r] * height_share, 1.0) * likelihood[r])
         # The middle of a search line that is several pixels wide.
         pixels[i, across] = (line[r] + 0.5) * line_px - 0.5 + shift_px
@@ -247,14 +249,16 @@ def summarise(
     points: FloatArray,
     sensitivity: FloatArray,
     sigma_px: FloatArray,
+    pull: FloatArray,
     normal: FloatArray,
     centroid: FloatArray,
     mean_sensitivity: FloatArray,
     group_sigma_px: FloatArray,
+    group_pull: FloatArray,
     group_line: FloatArray,
     group_laser: IntArray,
 ) -> None:
-    """Write the centroids, mean sensitivities, position errors and lasers of groups."""
+    """Write the centroids, mean sensitivities, position errors, pulls and lasers of groups."""
     n = group_sigma_px.shape[0]
     total, spread = np.zeros(n), np.zeros(n)
     for i in range(index.shape[0]):
@@ -268,6 +272,7 @@ def summarise(
             mean_sensitivity[c, k] += intensity_weight * sensitivity[i, k]
         # Error of a weighted mean of independent positions.
         group_sigma_px[c] += (intensity_weight * sigma_px[i]) ** 2
+        group_pull[c] += intensity_weight * pull[i]
         group_line[c] += intensity_weight * line[i]
         group_laser[c] = laser[i]
     middle = np.empty(n)
@@ -279,6 +284,7 @@ def summarise(
             mean_sensitivity[c, k] *= share
             middle[c] += normal[k] * centroid[c, k]
         group_sigma_px[c] *= share * share
+        group_pull[c] *= share
         group_line[c] *= share
     for i in range(index.shape[0]):
         c = index[i]
@@ -335,7 +341,7 @@ class Subsegments:
 _BEST_SHARE = 0.95
 _AXES = (SearchAxis.ALONG_X, SearchAxis.ALONG_Y)
 _NOTHING = np.empty(0)
-_NO_PEAKS = StripePeaks(np.empty(0, np.int64), _NOTHING, _NOTHING, _NOTHING, _NOTHING)
+_NO_PEAKS = StripePeaks(np.empty(0, np.int64), _NOTHING, _NOTHING, _NOTHING, _NOTHING, _NOTHING)
 
 FORWARD: FloatArray = np.array([0.0, 1.0, 0.0])
 """The vehicle's forward axis in `dome`: the normal of a target that is square to it."""
@@ -365,6 +371,8 @@ class Candidates:
     confidence : array, shape (N,)
         Confidence that the peak is laser light, from its height as a share of the frame's best and
         its likelihood; 0 to 1.
+    pull : array, shape (N,)
+        Shift of the position by an uneven background, in pixels, as in `StripePeaks`.
     points : array, shape (N, 3)
         In `dome`, metres.
     sensitivity : array, shape (N, 3)
@@ -381,6 +389,7 @@ class Candidates:
     width: FloatArray
     sigma_px: FloatArray
     confidence: FloatArray
+    pull: FloatArray
     points: FloatArray
     sensitivity: FloatArray
     # Cached: used by the search for surfaces and by the labels.
@@ -393,6 +402,10 @@ class Candidates:
     def where(self, mask: BoolArray) -> "Candidates":
         """Return the candidates that a mask of shape (N,) selects."""
         return Candidates(*(getattr(self, item.name)[mask] for item in fields(self) if item.init))
+
+    def without_pull(self) -> "Candidates":
+        """Return the candidates with their points moved back by `pull`."""
+        return replace(self, points=self.points - self.pull[:, None] * self.sensitivity)
 
     def subsegments(self) -> Subsegments:
         """Summarise the subsegments by their centroids."""
@@ -446,6 +459,7 @@ class Candidates:
             points=np.zeros((n, 3)),
             sensitivity=np.zeros((n, 3)),
             sigma_px=np.zeros(n),
+            pull=np.zeros(n),
             line=np.zeros(n),
             laser=np.empty(n, np.int64),
         )
@@ -458,10 +472,12 @@ class Candidates:
             self.points,
             self.sensitivity,
             self.sigma_px,
+            self.pull,
             normal,
             seen.points,
             seen.sensitivity,
             seen.sigma_px,
+            seen.pull,
             seen.line,
             seen.laser,
         )
@@ -478,6 +494,8 @@ class Observations:
         Centroid in `dome` (m) and its derivative by the stripe's position (m/px).
     sigma_px : array, shape (M,)
         Standard deviation of that position.
+    pull : array, shape (M,)
+        Mean shift of that position by an uneven background, in pixels.
     line : array, shape (M,)
         Mean search line.
     laser : int array, shape (M,)
@@ -487,6 +505,7 @@ class Observations:
     points: FloatArray
     sensitivity: FloatArray
     sigma_px: FloatArray
+    pull: FloatArray
     line: FloatArray
     laser: IntArray
 
@@ -526,6 +545,7 @@ def find_candidates(
             found.height,
             found.width,
             found.likelihood,
+            found.pull,
             search.lowest,
             search.highest,
             search.slope_low,
@@ -542,7 +562,7 @@ def find_candidates(
         )
     points, sensitivity, valid = np.empty((n, 3)), np.empty((n, 3)), np.empty(n, np.bool_)
     source, laser, line, component, subsegment, along = numbers[:, :n]
-    height, width, sigma_px, confidence = measures[:, :n]
+    height, width, sigma_px, confidence, pull = measures[:, :n]
     pixels = pixels[:n]
     all_valid = triangulator.triangulate_into(
         pixels, along, laser, subsegment, points, sensitivity, valid
@@ -558,6 +578,7 @@ def find_candidates(
         width,
         sigma_px,
         confidence,
+        pull,
         points,
         sensitivity,
     )

@@ -32,6 +32,7 @@ from aqualvs.scanning.stripe import (
     HEIGHT,
     N_MEASURES,
     POSITION,
+    PULL,
     PeakFinder,
     SearchImage,
     StripeOptions,
@@ -297,6 +298,7 @@ class FrameDetector:
         )
         line, likelihood = line[rows], likelihood[rows]
         position, height, width = table[:3].take(rows, axis=1)
+        pull = table[PULL].take(rows)
         bounds = np.searchsorted(rows, ends)
         return {
             axis: StripePeaks(
@@ -305,6 +307,7 @@ class FrameDetector:
                 height[start:end],
                 width[start:end],
                 likelihood[start:end],
+                pull[start:end],
             )
             for axis, start, end in zip(images, bounds[:-1], bounds[1:], strict=True)
         }
@@ -386,7 +389,7 @@ def select_peaks(
     ----------
     line : int array, shape (N,)
         Search line of each peak, direction after direction.
-    table : array, shape (9, N)
+    table : array, shape (10, N)
         Measures of the peaks.
     likelihood : array, shape (N,)
         Of each peak.

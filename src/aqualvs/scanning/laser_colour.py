@@ -189,7 +189,7 @@ def learn_paint(table: FloatArray, n_possible: float) -> Paint | None:
 
     Parameters
     ----------
-    table : array, shape (9, N)
+    table : array, shape (10, N)
         Measures of a sample of peaks, rows as `stripe` names them.
     n_possible : float
         Peaks that the lasers can make in the sample.
@@ -209,7 +209,7 @@ def learn_colour(table: FloatArray, colour: LaserColour, paint: Paint | None) ->
 
     Parameters
     ----------
-    table : array, shape (9, N)
+    table : array, shape (10, N)
         Measures of peaks, rows as `stripe` names them.
     colour : LaserColour
     paint : Paint or None
@@ -246,7 +246,7 @@ def laser_likelihood(
 
     Parameters
     ----------
-    table : array, shape (9, N)
+    table : array, shape (10, N)
         Measures of all peaks of one frame, rows as `stripe` names them.
     line : LineColour
         From `learn_colour` or `expected_colour`.

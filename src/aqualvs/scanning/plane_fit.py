@@ -95,6 +95,7 @@ def fit_robust(
     along: FloatArray,
     start: FloatArray,
     shared: SharedError,
+    common: FloatArray | None = None,
 ) -> PlaneFit | None:
     """Fit m·X = 1 by iteratively re-weighted least squares with Tukey's biweight.
 
@@ -117,18 +118,22 @@ def fit_robust(
         A first m, such as RANSAC gives.
     shared : SharedError
         Error that each laser's stripe shares.
+    common : array, shape (N,), optional
+        Error that all stripes share: one standard deviation of it at each point, in pixels, with
+        its sign. None if left out.
 
     Returns
     -------
     PlaneFit or None
         None where the points do not determine a plane. The covariance follows from the actual
-        residuals (Huber 1981, section 7.6), widened by the error that each laser's stripe shares.
+        residuals (Huber 1981, section 7.6), widened by the errors that stripes share.
     """
     m = np.array(start, dtype=np.float64)
     covariance = np.empty((3, 3))
     weights = np.empty(len(points))
     modes = shared.shift_px, shared.tilt_px
-    rms = _fit(points, sensitivity, sigma_px, laser, along, modes, m, covariance, weights)
+    common = np.zeros(len(points)) if common is None else common
+    rms = _fit(points, sensitivity, sigma_px, laser, along, common, modes, m, covariance, weights)
     if not math.isfinite(rms):
         return None
     return PlaneFit(m, covariance, weights, rms)
@@ -186,6 +191,7 @@ def _fit(
     sigma_px: FloatArray,
     laser: IntArray,
     along: FloatArray,
+    common: FloatArray,
     modes: tuple[float, float],
     m: FloatArray,
     covariance: FloatArray,
@@ -218,7 +224,7 @@ def _fit(
         return np.nan
     covariance *= factor
     _add_shared_error(
-        points, sensitivity, sigma, weights, laser, along, modes, m, inverse, covariance
+        points, sensitivity, sigma, weights, laser, along, common, modes, m, inverse, covariance
     )
     if not np.isfinite(covariance).all():
         return np.nan
@@ -256,16 +262,17 @@ def _add_shared_error(
     weights: FloatArray,
     laser: IntArray,
     along: FloatArray,
+    common: FloatArray,
     modes: tuple[float, float],
     m: FloatArray,
     inverse: FloatArray,
     covariance: FloatArray,
 ) -> None:
-    """Widen by one shift and one tilt for each laser, each of its own."""
+    """Widen by one shift and one tilt for each laser, each of its own, and by the common error."""
     n_lasers = 0
     for i in range(laser.shape[0]):
         n_lasers = max(n_lasers, laser[i] + 1)
-    pull = np.zeros((n_lasers, 2, 3))
+    pull, together = np.zeros((n_lasers, 2, 3)), np.zeros(3)
     shift = np.empty(3)
     for i in range(points.shape[0]):
         per_px = m[0] * sensitivity[i, 0] + m[1] * sensitivity[i, 1] + m[2] * sensitivity[i, 2]
@@ -273,6 +280,7 @@ def _add_shared_error(
         for k in range(3):
             pull[laser[i], 0, k] += w * points[i, k]
             pull[laser[i], 1, k] += w * points[i, k] * along[i]
+            together[k] += w * points[i, k] * common[i]
     for index in range(n_lasers):
         for mode in range(2):
             for j in range(3):
@@ -283,6 +291,13 @@ def _add_shared_error(
             for j in range(3):
                 for k in range(3):
                     covariance[j, k] += shift[j] * shift[k]
+    for j in range(3):
+        shift[j] = 0.0
+        for k in range(3):
+            shift[j] += inverse[j, k] * together[k]
+    for j in range(3):
+        for k in range(3):
+            covariance[j, k] += shift[j] * shift[k]
 
 
 @kernel

@@ -292,6 +292,8 @@ class PostureEstimator:
         # On a net a component is one strand, whose light has one centre; on a wall a subsegment is
         # long enough for independent errors.
         mesh = target.is_mesh
+        # The light on a strand has no flanks of its own.
+        candidates = candidates if mesh else candidates.without_pull()
         unit, min_lines = (
             (candidates.component, _SHORTEST_STRAND) if mesh else (candidates.subsegment, 1)
         )
@@ -584,6 +586,8 @@ class PostureEstimator:
             along,
             target.plane.normal / target.plane.offset,
             MESH_ERROR if target.is_mesh else SOLID_ERROR,
+            # Glow begins at the stripe, so that it may pull twice as much as a ramp.
+            None if target.is_mesh else observations.pull,
         )
         if robust is None or self._fit_method is FitMethod.ROBUST:
             return robust

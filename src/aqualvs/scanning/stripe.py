@@ -33,11 +33,15 @@ _VECTOR = 128
 # Luma of flanks that are dark; black is 16.
 _DARK = 36.0
 _THIRD = 1.0 / 3.0
-# Flanks that differ by more than this share of a peak's height are not both background.
-_OTHER_STRIPE = 0.25
-POSITION, HEIGHT, WIDTH, TOP, STEP_U, STEP_V, IMBALANCE, TINT_U, TINT_V = range(9)
+# Flanks that differ by more than this share of a peak's height are not both background; they are
+# read this many pixels beyond the peak's width.
+_OTHER_STRIPE, _FLANK_PX = 0.25, 4
+# Shift of the centroid above half height of a Gaussian of width w on a ramp, over w² times the
+# ramp's slope over the Gaussian's height: (1 / 12) / (0.810 - 1 / 2), the area above half height.
+_PULL_OF_RAMP = 0.269
+POSITION, HEIGHT, WIDTH, TOP, STEP_U, STEP_V, IMBALANCE, TINT_U, TINT_V, PULL = range(10)
 """Rows of a table of peaks."""
-N_MEASURES = 9
+N_MEASURES = 10
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -122,6 +126,9 @@ class StripePeaks:
         Full width at half height along the line, in pixels.
     likelihood : array, shape (N,)
         Likelihood that the peak is laser light, by its colour: 0 to 1; 1 for a grey source.
+    pull : array, shape (N,)
+        Shift of `position` by a background that is brighter on one side, taken for a ramp between
+        the flanks; in pixels. 0 where it is not measured.
     """
 
     line: IntArray
@@ -129,6 +136,7 @@ class StripePeaks:
     height: FloatArray
     width: FloatArray
     likelihood: FloatArray
+    pull: FloatArray
 
     def __len__(self) -> int:
         """Return the number of peaks."""
@@ -221,7 +229,7 @@ class PeakFinder:
             Use one search line of this many.
         line : int array, shape (N,)
             Written: search line of each peak; ascending.
-        table : array, shape (9, N)
+        table : array, shape (10, N)
             Written: measures of each peak, rows as named above.
         """
         while True:
@@ -400,6 +408,7 @@ def _measure_run(
         table[POSITION, n] = _centroid(row, a, b, level)
         table[HEIGHT, n] = 2 * np.int64(row[peak]) - level
         table[WIDTH, n], table[TOP, n] = width, row[peak]
+        table[PULL, n] = _pull(row, peak, width, table[HEIGHT, n])
         if image.u.shape[0] > 0:
             _measure_chroma(image, x, peak, width, directions, table[:, n])
         n += 1
@@ -472,6 +481,17 @@ def _centroid(row: U8Array, a: int, b: int, level: np.int64) -> float:
 
 
 @inline_borrowing_kernel
+def _pull(row: U8Array, peak: int, width: float, height: float) -> float:
+    """Return the shift of the centroid by the difference between the flanks, were it a ramp."""
+    flank = int(width) + _FLANK_PX
+    before, after = max(peak - flank, 0), min(peak + flank, row.shape[0] - 1)
+    difference = np.int64(row[after]) - np.int64(row[before])
+    if abs(difference) > _OTHER_STRIPE * height:
+        return 0.0
+    return float(_PULL_OF_RAMP * width * width * difference / ((after - before) * height))
+
+
+@inline_borrowing_kernel
 def _measure_chroma(
     image: SearchImage,
     x: int,
@@ -486,7 +506,7 @@ def _measure_chroma(
     a saturated core is white.
     """
     row, chroma_line = image.lines[x], (x * image.line_px) >> 1
-    edge, flank = int(0.5 * width) + 1, int(width) + 4
+    edge, flank = int(0.5 * width) + 1, int(width) + _FLANK_PX
     before, after = max(peak - flank, 0), min(peak + flank, row.shape[0] - 1)
     u_before, v_before = _chroma(image, chroma_line, before)
     u_after, v_after = _chroma(image, chroma_line, after)

@@ -239,7 +239,8 @@ def _peaks(light: Rows, search: LaserBand, width_px: int) -> StripePeaks:
     margin = np.ceil(0.5 * width) + _FLANK_PX + 2.0
     inside = (position >= margin) & (position < length - 1 - margin)
     position, height, width = (column[inside] for column in (position, height, width))
-    return StripePeaks(line[inside], position, height, width, np.ones(len(position)))
+    likelihood, pull = np.ones(len(position)), np.zeros(len(position))
+    return StripePeaks(line[inside], position, height, width, likelihood, pull)
 
 
 def _smooth_chains(peaks: StripePeaks, search: LaserBand) -> tuple[IntArray, IntArray]:

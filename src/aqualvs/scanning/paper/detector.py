@@ -84,6 +84,7 @@ class ThresholdDetector:
             height=_brightest(flat, first, end),
             width=width.astype(np.float64),
             likelihood=np.ones(len(first)),
+            pull=np.zeros(len(first)),
         )
 
     def _raised_level(self, flat: NDArray[np.uint8]) -> int:
