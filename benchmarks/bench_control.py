@@ -8,13 +8,31 @@ References are what the loop must reach.
 
 import math
 import os
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from aqualvs.follow.case import RANGE, STEP, STEP_S, Trials, tuned_gains, vehicle_model
-from aqualvs.follow.log import step_measures
+from aqualvs.control.gains_file import load_gains
+from aqualvs.control.missions import HoldMission
+from aqualvs.control.vehicle import Setpoint
+from aqualvs.follow.case import (
+    FROM_REST_S,
+    HOLD_END_S,
+    RANGE,
+    STEP,
+    STEP_S,
+    SimCase,
+    Trials,
+    sea,
+    tuned_gains,
+    vehicle_model,
+)
+from aqualvs.follow.log import LoopLog, effort_measures, hold_measures, step_measures
 from aqualvs.follow.monte_carlo import DiveResult, random_dives
+from aqualvs.follow.sensor_model import SampledSensor
+from aqualvs.simulation.vehicle.models import VehicleModel
+from aqualvs.simulation.vehicle.water_motion import WaterMotion
 
 _VEHICLES = ("bluerov2", "bluerov2-heavy")
 _DIVES = {"bluerov2": 200, "bluerov2-heavy": 200, "videoray": 100}
@@ -26,6 +44,7 @@ def run() -> list[dict[str, Any]]:
     rows = [row for name in _VEHICLES for row in _trials(name, rendered=False)]
     if "AQUALVS_LOOP_RENDERED" in os.environ:
         rows += [row for name in _VEHICLES for row in _trials(name, rendered=True)]
+    rows += [row for name in _DIVES for row in _holds(name)]
     for name, n in _DIVES.items():
         rows += _dives(name, n)
     return rows
@@ -57,6 +76,30 @@ def _trials(name: str, *, rendered: bool) -> list[dict[str, Any]]:
         _row(f"{what}: follow, frames lost", float(sum(f.n_lost for f in follows)), "", None),
         _row(f"{what}: follow, nearest", min(f.min_clearance for f in follows), "m", None),
     ]
+
+
+def _holds(name: str) -> list[dict[str, Any]]:
+    """Return the worst of all seeds in a current from each side, and in still water."""
+    model = vehicle_model(name)
+    waters = {f"current to {to} deg": sea(current_to=math.radians(to)) for to in (0, 45, 90, 180)}
+    rows = []
+    for what, water in {**waters, "still water": sea(current=0.0, waves=0.0)}.items():
+        logs = [_held(model, replace(water, seed=seed)) for seed in _SEEDS]
+        holds = [hold_measures(log, FROM_REST_S) for log in logs]
+        turns = max(effort_measures(log, "forward", FROM_REST_S).reversals for log in logs)
+        named = f"{name}: hold, {what}"
+        rows += [
+            _row(f"{named}, range rms", 1e3 * max(h.range_rms for h in holds), "mm", 15.0),
+            _row(f"{named}, yaw rms", math.degrees(max(h.yaw_rms for h in holds)), "deg", 1.5),
+            _row(f"{named}, reversals", turns, "1/min", 20.0),
+        ]
+    return rows
+
+
+def _held(model: VehicleModel, water: WaterMotion) -> LoopLog:
+    case = SimCase(model=model, gains=load_gains(model.name), water=water, seed=water.seed)
+    sensor = SampledSensor(case.net, np.random.default_rng([water.seed, 53]))
+    return case.loop(sensor, HoldMission(Setpoint(RANGE))).run(HOLD_END_S)
 
 
 def _dives(name: str, n: int) -> list[dict[str, Any]]:

@@ -243,3 +243,11 @@ def test_an_older_or_broken_run_is_told_in_one_line(run_folder, tmp_path, refuse
     parquet.write_table(table.drop_columns(["intensity", "width_px"]), path)
     assert "run the dive again" in refused("net", run_folder, "-o", out)
     assert not out.exists()
+
+
+@pytest.mark.parametrize("make", [os.mkfifo, lambda at: at.symlink_to(at), lambda _: None])
+def test_a_run_without_its_postures_is_told_by_name(make, run_folder, refused):
+    path = run_folder / "posture.csv"
+    path.unlink()
+    make(path)
+    assert f"{run_folder}: holds no run (no posture.csv)" in refused("net", run_folder)

@@ -391,8 +391,8 @@ _PUSHED_S = 0.5
 # Least distance of the range beyond its setpoint, in metres.
 _OFF = 0.05
 # A picture that stands still is noticed within so many seconds: older postures are live. Slower
-# vehicles, in m/s, are not braked: noise of postures shows as much.
-_TRUSTED_S, _SLOW = 0.6, 0.03
+# vehicles, in m/s, coast by little and are not braked: a hold in swell swings at 0.03.
+_TRUSTED_S, _SLOW = 0.6, 0.05
 # Greatest change between two reports of a heading; a greater one is a reset compass.
 _MAX_TURN = math.radians(20.0)
 

@@ -62,7 +62,8 @@ def net(place: NetSource, request: NetRequest, echo: Callable[[str], object]) ->
     AqualvsError
         If an input cannot be used, or a file not be written.
     """
-    if (Path(place.source) / POSTURE_CSV).is_file():
+    # A run without its postures is refused by its name; as a dive it would lack a rig.
+    if any((Path(place.source) / name).is_file() for name in (POSTURE_CSV, RUN_YAML)):
         return net_of_run(place, request, echo)
     run = RunRequest(
         source=place.source,
