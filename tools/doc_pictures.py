@@ -43,6 +43,9 @@ def make(folder: Path) -> None:
     _still(run / "figures" / "figure_14.png", DOCS / "mesh-filters.webp")
     _still(folder / "design" / "errors.png", DOCS / "design-errors.webp")
     for page, name in ((run / "report.html", "report"), (folder / "follow/follow.html", "follow")):
+        # The folder has another name on every machine.
+        text = page.read_text(encoding="utf-8").replace(str(folder.resolve()), "/dives")
+        page.write_text(text, encoding="utf-8")
         shot = folder / f"{name}.png"
         _shoot(page, shot)
         _still(shot, DOCS / f"{name}.webp")

@@ -3,6 +3,7 @@
 import contextlib
 import io
 import re
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -10,9 +11,10 @@ from rich.console import Console
 
 from aqualvs.check import doctor
 from aqualvs.check import doctor as doctor_autopilot
-from aqualvs.check.doctor import DoctorRequest, run_doctor
+from aqualvs.check.doctor import _EXTRAS, DoctorRequest, run_doctor
 from aqualvs.errors import AqualvsError
 from ports import free_port
+from repository import ROOT
 
 DEMO = Path(doctor.__file__).parents[1] / "data" / "demo"
 
@@ -58,6 +60,19 @@ def test_a_rig_is_read_also_where_nothing_is_to_fit_it(tmp_path: Path) -> None:
 
 
 def test_a_package_that_is_missing_names_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor, "_installed", lambda name: name != "cyclonedds")
+    monkeypatch.setattr(doctor, "_installed", lambda _name: False)
     text = told(DoctorRequest())
-    assert "pip install 'aqualvs[dds]'" in text
+    for extra in _EXTRAS:
+        assert f"pip install 'aqualvs[{extra}]'" in text
+
+
+def test_every_extra_of_users_is_listed_with_its_packages() -> None:
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"][
+        "optional-dependencies"
+    ]
+    expected = {
+        name: {one.partition(">")[0] for one in packages}
+        for name, packages in extras.items()
+        if name not in ("live", "docs", "dev")
+    }
+    assert {name: set(packages) for name, (packages, _) in _EXTRAS.items()} == expected

@@ -181,11 +181,13 @@ def _channels(rate_hz: float) -> Finding:
 
 
 _EXTRAS = {
-    "mavlink": (("pymavlink",), "MAVLink, .tlog and .BIN logs"),
-    "dds": (("cyclonedds",), "ROS 2 without ROS"),
-    "foxglove": (("foxglove-sdk",), "Foxglove live"),
     "dashboard": (("starlette", "uvicorn", "websockets"), "the pilot's page"),
-    "bags": (("rosbags",), "ROS bags as source"),
+    "mavlink": (("pymavlink", "pyserial"), "MAVLink, .tlog and .BIN logs"),
+    "bags": (("mcap", "rosbags"), "ROS bags as source"),
+    "foxglove": (("foxglove-sdk",), "Foxglove live"),
+    "rerun": (("rerun-sdk",), "--rerun"),
+    "dds": (("cyclonedds",), "ROS 2 without ROS"),
+    "batch": (("distributed",), "aqualvs batch"),
 }
 """Extra, the packages it brings, what they are for."""
 

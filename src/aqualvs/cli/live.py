@@ -65,6 +65,15 @@ def live(
             show_default=False,
         ),
     ] = None,
+    embed_from: Annotated[
+        list[str] | None,
+        typer.Option(
+            envvar="AQUALVS_EMBED_FROM",
+            metavar="ORIGIN",
+            help="Let pages of this origin show the page, such as http://blueos.local; repeatable.",
+            show_default=False,
+        ),
+    ] = None,
     record: Annotated[bool, typer.Option("--record", help="Record from the start.")] = False,
     record_to: Annotated[Path, typer.Option(help="Folder of recordings.")] = Path("dives"),
     record_video: Annotated[
@@ -120,6 +129,7 @@ def live(
         ),
         dashboard=dashboard_address if dashboard else None,
         token=token,
+        embed_from=tuple(embed_from or ()),
         record=record,
         record_to=record_to,
         record_video=record_video,

@@ -226,6 +226,8 @@ class LiveRequest:
         Address HOST:PORT of the pilot's page.
     token : str or None
         Its password.
+    embed_from : tuple of str
+        Origins of pages that may show it.
     record : bool
         Whether to record from the start; the page's button begins and ends recordings, too.
     record_to : Path
@@ -247,6 +249,7 @@ class LiveRequest:
     outputs: OutputRequest = field(default_factory=OutputRequest)
     dashboard: str | None = None
     token: str | None = None
+    embed_from: tuple[str, ...] = ()
     record: bool = False
     record_to: Path = Path("dives")
     record_video: bool = False
@@ -304,7 +307,7 @@ def _outputs(request: LiveRequest, rig: Rig, echo: Callable[[str], object]) -> l
         if request.dashboard is not None:
             holder = SetpointHolder(rig.working_range, followed=False)
             page = (request.dashboard, request.token, rig, holder, recorder, echo)
-            outputs.append(serve_page(*page, vehicle_reader(outputs)))
+            outputs.append(serve_page(*page, vehicle_reader(outputs), request.embed_from))
         made.pop_all()
     return outputs
 

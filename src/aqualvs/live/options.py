@@ -249,6 +249,7 @@ def serve_page(
     recorder: RecorderSwitch | None,
     echo: Callable[[str], object],
     vehicle: Callable[[], VehicleState | None] = lambda: None,
+    embedders: Sequence[str] = (),
 ) -> Output:
     """Serve the page and print its address.
 
@@ -267,11 +268,14 @@ def serve_page(
         Takes one line.
     vehicle : callable, optional
         Returns what the autopilot tells of depth and heading.
+    embedders : sequence of str, optional
+        Origins, such as `http://blueos.local`, whose pages may show this one; none if left out.
 
     Raises
     ------
     OptionError
-        If a part is not installed, the token is too short, or the address cannot be used.
+        If a part is not installed, the token is too short, an embedder is no origin, or the address
+        cannot be used.
     """
     try:
         from aqualvs.live.dashboard.output import start_dashboard
@@ -280,4 +284,4 @@ def serve_page(
             f"--dashboard: {fault.name} is missing; pip install 'aqualvs[dashboard]'"
         ) from fault
     host, port = host_and_port(address, DASHBOARD_PORT, "--dashboard-address")
-    return start_dashboard(host, port, token, rig, holder, recorder, echo, vehicle)
+    return start_dashboard(host, port, token, rig, holder, recorder, echo, vehicle, embedders)

@@ -6,6 +6,7 @@ import json
 import socket
 import threading
 import time
+import urllib.request
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -565,3 +566,32 @@ def test_a_page_with_the_token_takes_the_place_of_one_without(bench: Bench) -> N
         assert closed.value.rcvd is not None
         assert closed.value.rcvd.reason == "a page with the token took this place"
         assert bench.shown(pages[1])["posture"]["valid"] == "1"
+
+
+@pytest.mark.parametrize(
+    ("embedders", "ancestors"),
+    [
+        ((), "'none'"),
+        (("http://blueos.local", "http://[::1]:81"), "http://blueos.local http://[::1]:81"),
+    ],
+)
+def test_only_named_origins_may_show_the_page(embedders: tuple[str, ...], ancestors: str) -> None:
+    rig = demo_rig()
+    controls = Controls(SetpointHolder(rig.working_range, followed=False), Button())
+    access = make_access("127.0.0.1", TOKEN, embedders)
+    server = DashboardServer("127.0.0.1", 0, access, rig, controls)
+    try:
+        with urllib.request.urlopen(f"http://127.0.0.1:{server.port}/") as answer:
+            policy = answer.headers["Content-Security-Policy"]
+    finally:
+        server.close()
+    assert policy.endswith(f"frame-ancestors {ancestors}")
+
+
+@pytest.mark.parametrize(
+    "origin", ["*", "http://*", "blueos.local", "http://a.b/page", "http://a; script-src *", "null"]
+)
+def test_what_is_no_origin_may_not_show_the_page(origin: str) -> None:
+    with pytest.raises(OptionError, match="--embed-from") as caught:
+        make_access("127.0.0.1", TOKEN, [origin])
+    assert "\n" not in str(caught.value)

@@ -157,10 +157,13 @@ class Access:
         Address that the page is served at.
     token : str
         The password.
+    embedders : tuple of str
+        Origins whose pages may show this one inside themselves; none if empty.
     """
 
     host: str
     token: str
+    embedders: tuple[str, ...] = ()
 
     @property
     def is_local(self) -> bool:
@@ -227,9 +230,22 @@ def _is_origin(text: str) -> bool:
     return text == "null" or (scheme is not None and _is_host(text[scheme.end() :]))
 
 
-def make_access(host: str, token: str | None) -> Access:
-    """Return the rules for an address; without a token a new one is made."""
-    return Access(host, token if token else secrets.token_urlsafe(12))
+def make_access(host: str, token: str | None, embedders: Sequence[str] = ()) -> Access:
+    """Return the rules for an address; without a token a new one is made.
+
+    Raises
+    ------
+    OptionError
+        If an embedder is no origin of web pages.
+    """
+    for origin in embedders:
+        # Anything else, such as a wildcard, would let strangers lay a page over the buttons.
+        if not (origin.startswith(("http://", "https://")) and _is_origin(origin)):
+            raise OptionError(
+                f"--embed-from {origin}: not understood; write the address of the page without a "
+                "path, such as http://blueos.local"
+            )
+    return Access(host, token if token else secrets.token_urlsafe(12), tuple(embedders))
 
 
 def token_fault(token: str | None) -> str:

@@ -8,7 +8,7 @@ import contextlib
 import math
 import shutil
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -163,18 +163,19 @@ def start_dashboard(
     recorder: RecorderSwitch | None,
     echo: Callable[[str], object],
     vehicle: Callable[[], VehicleState | None] = lambda: None,
+    embedders: Sequence[str] = (),
 ) -> Dashboard:
     """Serve the page and print its address; without a recorder, its button refuses.
 
     Raises
     ------
     OptionError
-        If the token is too short, or the address cannot be listened to.
+        If the token is too short, an embedder is no origin, or the address cannot be listened to.
     """
     fault = token_fault(token)
     if fault:
         raise OptionError(fault)
-    access = make_access(host, token)
+    access = make_access(host, token, embedders)
     controls = Controls(holder, NoRecorder() if recorder is None else SwitchButton(recorder))
     server = DashboardServer(host, port, access, rig, controls)
     shown = f"[{host}]" if ":" in host else host

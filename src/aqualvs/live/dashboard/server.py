@@ -271,8 +271,6 @@ _ASSETS = {
     "uPlot.min.css": ("uPlot.min.css", _CSS, _OWN),
 }
 _HEADERS = {
-    "Content-Security-Policy": "default-src 'self'; img-src 'self' blob: data:; "
-    "frame-ancestors 'none'",
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
     "Cache-Control": "no-cache",
@@ -311,6 +309,7 @@ class DashboardServer:
     def __init__(self, host: str, port: int, access: Access, rig: Rig, controls: Controls) -> None:
         self.hub = Hub()
         self._access, self._rig, self._controls = access, rig, controls
+        self._policy = _policy(access)
         self._limits, self._gate = ConnectionLimits(), TokenGate(access)
         self._socket = _listening(host, port)
         self.port: int = self._socket.getsockname()[1]
@@ -362,10 +361,18 @@ class DashboardServer:
         return Starlette(
             routes=[
                 Route("/register_service", _blueos, methods=["GET"]),
-                Route("/{name:path}", _asset, methods=["GET"]),
+                Route("/{name:path}", self._asset, methods=["GET"]),
                 WebSocketRoute("/live", self._talk),
             ]
         )
+
+    async def _asset(self, request: Request) -> Response:
+        found = _ASSETS.get(request.path_params["name"])
+        if found is None:
+            return PlainTextResponse("no such page\n", 404, headers=_HEADERS)
+        content = (importlib.resources.files(found[2]) / "assets" / found[0]).read_bytes()
+        headers = {**_HEADERS, "Content-Security-Policy": self._policy}
+        return Response(content, media_type=f"{found[1]}; charset=utf-8", headers=headers)
 
     async def _talk(self, socket: WebSocket) -> None:
         peer = socket.client.host if socket.client else "unknown"
@@ -455,6 +462,12 @@ class DashboardServer:
                 await socket.send_json({"kind": "refused", "why": str(fault)})
 
 
+def _policy(access: Access) -> str:
+    """Return what the page may load, and who may show it inside a page of theirs."""
+    embedders = " ".join(access.embedders) or "'none'"
+    return f"default-src 'self'; img-src 'self' blob: data:; frame-ancestors {embedders}"
+
+
 async def _send_news(socket: WebSocket, viewer: PageClient) -> None:
     while True:
         state, picture = await viewer.next()
@@ -510,16 +523,6 @@ async def _blueos(_request: Request) -> Response:
             "api": "",
         },
         headers=_HEADERS,
-    )
-
-
-async def _asset(request: Request) -> Response:
-    found = _ASSETS.get(request.path_params["name"])
-    if found is None:
-        return PlainTextResponse("no such page\n", 404, headers=_HEADERS)
-    folder = importlib.resources.files(found[2]) / "assets"
-    return Response(
-        (folder / found[0]).read_bytes(), media_type=f"{found[1]}; charset=utf-8", headers=_HEADERS
     )
 
 

@@ -174,7 +174,7 @@ class Strip {
         },
         axes: [
           { ...axis, size: this.last ? 24 : 4, splits: () => [60, 50, 40, 30, 20, 10, 0].map((age) => last() - age), values: (_, ticks) => ticks.map((t) => (this.last ? `${Math.round(t - last())} s` : "")) },
-          { ...axis, size: 48, space: 13, label: this.name, labelSize: 22 },
+          { ...axis, size: 58, space: 13, label: this.name, labelSize: 22 },
         ],
         series: [
           {},
