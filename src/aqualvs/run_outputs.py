@@ -325,7 +325,7 @@ class RunOverlay(Closing):
 
 
 class RunBareLens(Closing):
-    """Writer of `posture_bare.csv` during a run; of nothing for a rig without a dome.
+    """Writer of `posture_bare.csv` during a run; of nothing for a rig without a housing.
 
     Parameters
     ----------
@@ -340,6 +340,7 @@ class RunBareLens(Closing):
 
     def __init__(self, folder: Path, rig: Rig) -> None:
         self._path = folder / POSTURE_BARE_CSV
+        self._housing = "dome" if rig.flat_port is None else "flat port"
         self._ratios = array("d")
         self._file: PostureCsv | None = None
         if rig.housing is not None:
@@ -361,11 +362,11 @@ class RunBareLens(Closing):
             self._file.write(*rows)
 
     def lines(self) -> list[str]:
-        """Return the effect of the dome model as lines of text."""
+        """Return the effect of the housing's model as lines of text."""
         if not self._ratios:
             return []
         percent = 100.0 * (statistics.median(self._ratios) - 1.0)
-        return [f"without the dome model the range would read {percent:+.1f} % (median)"]
+        return [f"without the {self._housing} model the range would read {percent:+.1f} % (median)"]
 
     def close(self) -> None:
         """Close the file."""

@@ -15,11 +15,12 @@ from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.scan import Frame, planes_of_image
 from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenario import dome_from_target
-from aqualvs.simulation.scenarios import bluerov2_rig, example_rig, load_scenario
+from aqualvs.simulation.scenarios import bluerov2_rig, example_rig, flat_port_rig, load_scenario
 from aqualvs.simulation.scene import Scene, SurfaceKind, Wall, WaterOptics
 from aqualvs.simulation.truth import visible_fit
 
-SMALL, WIDE = "example", "bluerov2"
+SMALL, WIDE, FLAT = "example", "bluerov2", "flat port"
+RIGS = {SMALL: example_rig, WIDE: bluerov2_rig, FLAT: flat_port_rig}
 WALLS = [("wall", 0.2), ("wall_yaw", 1.0), ("wall_pitch", 3.0)]
 NETS = [
     *[("net_diamond", t) for t in (0.5, 2.0, 3.5)],
@@ -39,7 +40,7 @@ class Shot(NamedTuple):
 
 @cache
 def equipment(rig_name: str) -> tuple[Renderer, Scanner]:
-    rig: Rig = example_rig() if rig_name == SMALL else bluerov2_rig()
+    rig: Rig = RIGS[rig_name]()
     return Renderer(rig, threads=2), Scanner(rig)
 
 
@@ -108,9 +109,10 @@ def test_a_net(name: str, t: float) -> None:
     assert abs(shot.posture.range - shot.posture.nearest) < 0.2 * shot.posture.range
 
 
+@pytest.mark.parametrize("rig_name", [WIDE, FLAT])
 @pytest.mark.parametrize(("name", "t"), [("wall_yaw", 1.5), ("net_diamond", 1.0)])
-def test_a_wide_picture(name: str, t: float) -> None:
-    share, pitch, yaw = errors(shoot(name, t, WIDE))
+def test_a_wide_picture(name: str, t: float, rig_name: str) -> None:
+    share, pitch, yaw = errors(shoot(name, t, rig_name))
     assert abs(share) < (0.001 if name == "wall_yaw" else 0.01)
     assert np.hypot(pitch, yaw) < (0.2 if name == "wall_yaw" else 1.5)
 

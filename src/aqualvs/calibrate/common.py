@@ -21,7 +21,7 @@ from aqualvs.calibration.targets.targets import View
 from aqualvs.calibration_formats import refuse_foreign
 from aqualvs.errors import CalibrationError, OptionError, RigError
 from aqualvs.geometry.arrays import FloatArray
-from aqualvs.optics.camera import Dome, Housing
+from aqualvs.optics.camera import Dome, FlatPort, Housing
 from aqualvs.optics.rig import Laser, Rig, RigUncertainty
 from aqualvs.optics.rigfile import keep_dated, load_rig, save_rig
 from aqualvs.optics.rigschema import LaserWavelength
@@ -92,6 +92,12 @@ class _Dome(_Part):
     n_acrylic: _Index = 1.49
 
 
+class _Flat(_Part):
+    distance_mm: _Positive
+    thickness_mm: Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+    n_port: _Index = 1.49
+
+
 class _Lasers(_Part):
     count: _Count
     wavelength_nm: LaserWavelength | None = None
@@ -101,6 +107,7 @@ class _File(_Part):
     name: str = "rig"
     image: _Image | None = None
     dome: _Dome | None = None
+    flat: _Flat | None = None
     n_air: _Index = 1.0003
     lasers: _Lasers | None = None
     fps: _Positive | None = None
@@ -155,17 +162,25 @@ def _of_mapping(content: Mapping[str, Any], path: Path) -> Nominal:
             f"{path}: {place} is {fault['input']!r}: {fault['msg'].lower()}; a nominal rig has "
             f"{', '.join(_File.model_fields)}"
         ) from None
-    part = file.dome
     return Nominal(
         name=file.name,
         size_px=None if file.image is None else (file.image.width, file.image.height),
-        housing=None
-        if part is None
-        else Dome(part.inner_radius_mm / 1e3, part.thickness_mm / 1e3, part.n_acrylic),
+        housing=_housing(file, path),
         n_air=file.n_air,
         n_lasers=None if file.lasers is None else file.lasers.count,
         wavelength_nm=None if file.lasers is None else file.lasers.wavelength_nm,
     )
+
+
+def _housing(file: _File, path: Path) -> Housing | None:
+    dome, flat = file.dome, file.flat
+    if dome is not None and flat is not None:
+        raise RigError(f"{path}: dome and flat: both are given; leave one out")
+    if dome is not None:
+        return Dome(dome.inner_radius_mm / 1e3, dome.thickness_mm / 1e3, dome.n_acrylic)
+    if flat is None:
+        return None
+    return FlatPort(flat.distance_mm / 1e3, flat.thickness_mm / 1e3, flat.n_port)
 
 
 Echo: TypeAlias = Callable[[str], object]

@@ -1,6 +1,6 @@
-"""`aqualvs calibrate dome`: position of the lens in the dome and rotation of the camera."""
+"""`aqualvs calibrate dome`: place of the lens in its dome or behind its flat port."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -28,7 +28,7 @@ from aqualvs.calibration.targets.pose_files import BoardPose, load_poses, match_
 from aqualvs.calibration.targets.target_files import load_board
 from aqualvs.calibration.targets.targets import Board
 from aqualvs.errors import OptionError
-from aqualvs.optics.camera import DOME_PARAMETERS, POSE_PARAMETERS, Dome
+from aqualvs.optics.camera import POSE_PARAMETERS, Dome, FlatPort, parameter_names
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.rigfile import check_rig_place, load_rig
 from aqualvs.optics.solved import (
@@ -70,6 +70,7 @@ class DomeRequest:
     inner_radius_mm: float | None
     thickness_mm: float | None
     n_acrylic: float | None
+    port_distance_mm: float | None
     radius_tolerance_mm: float
     thickness_tolerance_mm: float
     acrylic_tolerance: float
@@ -91,6 +92,8 @@ def calibrate_dome(
 ) -> Calibration[DomeCalibration]:
     """Solve the lens's position in the dome and the camera's rotation, from boards outside it.
 
+    Of a flat port its distance and its tilt are solved, from boards in water at unknown poses.
+
     Parameters
     ----------
     pictures : sequence of str, Path or array
@@ -98,15 +101,15 @@ def calibrate_dome(
     board : Board, str or Path
         The board or its file.
     rig : Rig, str or Path
-        Rig with intrinsics and a nominal dome, or its file.
+        Rig with intrinsics and a nominal dome or flat port, or its file.
     poses : str or Path, optional
         File of what is known of the boards' poses: distances, or full poses.
     medium : str or float
-        Outside of the dome: "air", "water" (the rig's), or an index.
+        Outside of the housing: "air", "water" (the rig's), or an index.
     water_pictures, water_board, water_poses : optional
         Further pictures, taken in the rig's water; their board, if it is another one; their poses.
     options : DomeOptions, optional
-        Tolerances of the dome and of the distances.
+        Tolerances of the housing and of the distances.
 
     Returns
     -------
@@ -153,7 +156,7 @@ def run_dome(request: DomeRequest, echo: Echo) -> None:
         As `calibrate_dome`, or if an output cannot be written.
     """
     check_rig_place(request.out)
-    rig = _with_dome(load_rig(request.rig, need_lasers=False), request)
+    rig = _with_housing(load_rig(request.rig, need_lasers=False), request)
     done = calibrate_dome(
         picture_paths(request.images),
         request.board,
@@ -182,21 +185,33 @@ def _summary(done: Calibration[DomeCalibration]) -> list[str]:
     ]
 
 
-def _with_dome(rig: Rig, request: DomeRequest) -> Rig:
-    given = (request.inner_radius_mm, request.thickness_mm, request.n_acrylic)
-    shell = rig.dome
-    if shell is None and (given[0] is None or given[1] is None):
+def _with_housing(rig: Rig, request: DomeRequest) -> Rig:
+    """Return the rig with the sizes that options give; they may add a dome or a flat port."""
+    radius, distance = request.inner_radius_mm, request.port_distance_mm
+    if radius is not None and (distance is not None or rig.flat_port is not None):
+        raise OptionError("--inner-radius-mm: of a dome, but the housing is a flat port")
+    if distance is not None and rig.dome is not None:
+        raise OptionError("--port-distance-mm: of a flat port, but the housing is a dome")
+    first, thickness = radius if distance is None else distance, request.thickness_mm
+    if rig.housing is None and (first is None or thickness is None):
         raise OptionError(
-            f"{request.rig}: has no dome; give --inner-radius-mm and --thickness-mm, or write "
-            "'dome: {inner_radius_mm: ..., thickness_mm: ..., n_acrylic: 1.49}' in it"
+            f"{request.rig}: has no dome; give --inner-radius-mm (of a flat port "
+            "--port-distance-mm) and --thickness-mm, or write 'dome: {inner_radius_mm: ..., "
+            "thickness_mm: ..., n_acrylic: 1.49}' in it"
         )
-    old = shell or Dome(1.0, 1.0, 1.49)
-    radius = old.inner_radius if given[0] is None else given[0] / 1e3
-    thickness = old.thickness if given[1] is None else given[1] / 1e3
-    if shell is None and abs(rig.n_water - rig.n_air) < _AIR:
-        # A camera that was bare in air goes into the water with its dome.
-        rig = rig.in_water(WATER_N)
-    return replace(rig, housing=Dome(radius, thickness, given[2] or old.n_acrylic))
+    old = rig.housing
+    if old is None:
+        old = Dome(1.0, 1.0, 1.49) if distance is None else FlatPort(1.0, 1.0, 1.49)
+        if abs(rig.n_water - rig.n_air) < _AIR:
+            # A camera that was bare in air goes into the water with its housing.
+            rig = rig.in_water(WATER_N)
+    size, _, index = list(old.numbers())[:3]
+    given = zip((size, "thickness", index), (first, thickness, request.n_acrylic), strict=True)
+    wanted = {name: value for name, value in given if value is not None}
+    now = old.numbers()
+    for name, value in wanted.items():
+        now[name] = value if name == index else value / 1e3
+    return replace(rig, housing=type(old)(*now.values()))
 
 
 def _options(request: DomeRequest) -> DomeOptions:
@@ -241,7 +256,7 @@ def _board_set(
 def _noted(rig: Rig, result: DomeCalibration) -> Rig:
     uncertainty = merged(rig_uncertainty(rig), result.uncertainty)
     names = set(rig_uncertainty(rig).names)
-    solved = set(POSE_PARAMETERS) | set(DOME_PARAMETERS)
+    solved = set(parameter_names(rig.camera())) - set(rig.lens.parameter_names)
     assumed = [
         file_parameter_name(name) for name in result.uncertainty.names if name not in names | solved
     ]
@@ -260,13 +275,8 @@ def _noted(rig: Rig, result: DomeCalibration) -> Rig:
 def _page(before: Rig, done: Calibration[DomeCalibration], request: DomeRequest) -> CalibrationPage:
     rig, result = done.rig, done.solution
     sigmas = result.uncertainty.sigmas
-    lens = rig.dome_from_cam.translation
     cards = [
-        Card(
-            "lens",
-            f"{1e3 * lens[0]:.2f}, {1e3 * lens[1]:.2f}, {1e3 * lens[2]:.2f} mm",
-            f"± {1e3 * max(sigmas.get(f'lens_{axis}', 0.0) for axis in 'xyz'):.2f} mm",
-        ),
+        _place_card(rig, sigmas),
         Card("residual", f"{result.rms_px:.3f} px", "rms distance of corners"),
         Card("pictures", str(len(result.views)), f"{result.n_points:,} corners"),
     ]
@@ -279,9 +289,10 @@ def _page(before: Rig, done: Calibration[DomeCalibration], request: DomeRequest)
                 f"a bare lens: {held.bare_rms_px:.2f} px",
             )
         )
-    dome_names = [name for name in DOME_PARAMETERS if name in sigmas]
+    port_names = [name for name in rig.camera().params.port.names if name in sigmas]
+    what = "dome" if rig.flat_port is None else "flat port"
     return CalibrationPage(
-        title="Calibration of the dome",
+        title=f"Calibration of the {what}",
         subtitle=f"Rig “{rig.name}”",
         cards=tuple(cards),
         warnings=(
@@ -293,7 +304,7 @@ def _page(before: Rig, done: Calibration[DomeCalibration], request: DomeRequest)
         parameters=parameter_rows(
             rig,
             result.uncertainty,
-            [*POSE_PARAMETERS, *dome_names, *rig.lens.parameter_names],
+            [*POSE_PARAMETERS, *port_names, *rig.lens.parameter_names],
             before,
         ),
         residual_maps=(corner_residuals(result.views, rig.size_px),),
@@ -303,4 +314,19 @@ def _page(before: Rig, done: Calibration[DomeCalibration], request: DomeRequest)
             ("board", str(request.board)),
             ("poses", str(request.poses or "unknown")),
         ),
+    )
+
+
+def _place_card(rig: Rig, sigmas: Mapping[str, float]) -> Card:
+    if rig.flat_port is not None:
+        return Card(
+            "flat port",
+            f"{1e3 * rig.flat_port.distance:.2f} mm from the lens",
+            f"± {1e3 * sigmas['port_distance']:.2f} mm",
+        )
+    lens = rig.dome_from_cam.translation
+    return Card(
+        "lens",
+        f"{1e3 * lens[0]:.2f}, {1e3 * lens[1]:.2f}, {1e3 * lens[2]:.2f} mm",
+        f"± {1e3 * max(sigmas.get(f'lens_{axis}', 0.0) for axis in 'xyz'):.2f} mm",
     )

@@ -85,7 +85,8 @@ def camera(
 @calibrate.command(
     cls=CheckedCommand,
     help="Place of the lens in the dome, from a board outside it, in air, in water, or both. "
-    "With poses (distance only, or full) the camera's rotation is found too.",
+    "With poses (distance only, or full) the camera's rotation is found too. Of a flat port: its "
+    "distance and tilt, from a board in water, without poses.",
     epilog="Example: aqualvs calibrate dome rail/*.png --board board.yaml --poses poses.csv "
     "--rig rig.yaml -o rig.yaml",
 )
@@ -117,10 +118,17 @@ def dome(
         float | None, typer.Option(help="Inner radius of the dome.", show_default=False)
     ] = None,
     thickness_mm: Annotated[
-        float | None, typer.Option(help="Thickness of the dome.", show_default=False)
+        float | None, typer.Option(help="Thickness of the housing.", show_default=False)
     ] = None,
     n_acrylic: Annotated[
-        float | None, typer.Option(help="Index of the dome's material.", show_default=False)
+        float | None, typer.Option(help="Index of the housing's material.", show_default=False)
+    ] = None,
+    port_distance_mm: Annotated[
+        float | None,
+        typer.Option(
+            help="Distance of a flat port from the lens, in place of a dome: an initial guess.",
+            show_default=False,
+        ),
     ] = None,
     radius_tolerance_mm: Annotated[
         float, typer.Option(help="How well the radius is known (one sigma).")
@@ -159,6 +167,7 @@ def dome(
             inner_radius_mm=inner_radius_mm,
             thickness_mm=thickness_mm,
             n_acrylic=n_acrylic,
+            port_distance_mm=port_distance_mm,
             radius_tolerance_mm=radius_tolerance_mm,
             thickness_tolerance_mm=thickness_tolerance_mm,
             acrylic_tolerance=acrylic_tolerance,

@@ -67,7 +67,8 @@ Salinity = Annotated[
     float | None, typer.Option(help="Salinity in per mille, for its index.", show_default=False)
 ]
 Refraction = Annotated[
-    bool, typer.Option("--dome/--no-dome", help="Refract at the dome, or ignore it.")
+    bool,
+    typer.Option("--dome/--no-dome", help="Refract at the dome or the flat port, or ignore it."),
 ]
 IndexTarget = Annotated[
     Path | None,

@@ -461,6 +461,7 @@ def _dome(files: CalibrationFiles, rig: Path) -> None:
             water_board=None,
             water_poses=None,
             inner_radius_mm=None,
+            port_distance_mm=None,
             thickness_mm=None,
             n_acrylic=None,
             radius_tolerance_mm=0.1,

@@ -365,6 +365,11 @@ def working_range_m(rig: Mapping[str, Any]) -> tuple[float, float] | None:
     return (near, far) if np.isfinite(near) and np.isfinite(far) else None
 
 
+def housing_name(rig: Mapping[str, Any]) -> str:
+    """Return the name of the camera's housing."""
+    return "flat port" if isinstance(rig.get("flat"), dict) else "dome"
+
+
 def dome_radius_mm(rig: Mapping[str, Any]) -> float:
     """Return the dome's outer radius in millimetres, NaN where the rig has no dome."""
     dome = rig.get("dome")

@@ -40,6 +40,7 @@ from aqualvs.report.run_data import (
     Track,
     dome_radius_mm,
     facts,
+    housing_name,
     lasers_of,
     read_bare,
     read_run_file,
@@ -298,7 +299,7 @@ def _parts(m: Material) -> dict[str, str]:
         "cloud": _cloud_view(m.points, planes_known),
         "pictures": _picture_view(_captions(m), m.pictures, m.no_pictures, m.names),
         "quality": _quality_view(m.track, m.points, m.names),
-        "bare": _bare_view(m.track, m.bare, m.truth),
+        "bare": _bare_view(m.track, m.bare, m.truth, housing_name(m.rig)),
         "rig": _rig_view(m.run, m.lasers),
         "data": html.embedded_json(_data(m)),
     }
@@ -481,15 +482,17 @@ def _quality_view(track: Track, points: PointSummary | None, names: list[str]) -
     return f'{reasons}{lasers}\n{html.laser_legend(names)}<div class="grid two">{shown}</div>'
 
 
-def _bare_view(track: Track, bare: FloatArray | None, truth: FloatArray | None) -> str:
-    """Return the section on what ignoring the dome would cost; nothing without the comparison."""
+def _bare_view(
+    track: Track, bare: FloatArray | None, truth: FloatArray | None, housing: str
+) -> str:
+    """Return the section on what ignoring the housing costs; nothing without the comparison."""
     if bare is None:
         return ""
     percent = 100.0 * (bare[:, 0] / track.posture[:, 0] - 1.0)
     percent = percent[np.isfinite(percent)]
     if not len(percent):
         words = '<p class="note">No frame has a posture both ways.</p>'
-        return f'<section id="bare"><h2>With and without the dome</h2>{words}</section>'
+        return f'<section id="bare"><h2>With and without the {housing}</h2>{words}</section>'
     low, middle, high = percent.min(), np.median(percent), percent.max()
     rows = [
         (
@@ -499,10 +502,11 @@ def _bare_view(track: Track, bare: FloatArray | None, truth: FloatArray | None) 
     ]
     text = html.table(("", "min", "median", "max"), rows)
     if truth is not None:
-        text += _both_errors(track.posture, bare, truth)
+        text += _both_errors(track.posture, bare, truth, housing)
     return (
-        '<section id="bare"><h2>With and without the dome</h2>\n<p class="lead">The same stripe '
-        "pixels, read once through the dome’s refraction and once as if the camera looked "
+        f'<section id="bare"><h2>With and without the {housing}</h2>\n<p class="lead">The same '
+        f"stripe pixels, read once through the {housing}’s refraction and once as if the camera "
+        "looked "
         f"straight into the water ({len(percent)} frames).</p>\n"
         f'<div class="chart" id="chart-bare"></div>\n{text}\n</section>'
     )
@@ -565,9 +569,9 @@ def _laser_counts(points: PointSummary, names: list[str]) -> str:
     return html.table(head, rows)
 
 
-def _both_errors(dome: FloatArray, bare: FloatArray, truth: FloatArray) -> str:
+def _both_errors(housed: FloatArray, bare: FloatArray, truth: FloatArray, housing: str) -> str:
     rows = []
-    for name, posture in (("with the dome", dome), ("without it", bare)):
+    for name, posture in ((f"with the {housing}", housed), ("without it", bare)):
         rms, worst, count = errors_against(truth, posture)
         if count:
             rows.append((name, f"{1e3 * rms[0]:.2f} mm", f"{1e3 * worst[0]:.2f} mm", f"{count}"))

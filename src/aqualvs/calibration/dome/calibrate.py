@@ -3,9 +3,11 @@
 Boards are seen through the dome at poses that are known, known by their distance only (the paper's
 rail), or unknown; in air, in water, or both in one solve. Tolerances of the dome and the covariance
 of the intrinsics are priors, so that a number that the pictures do not determine keeps the
-uncertainty it had. `findings` says in plain words what the pictures determined.
+uncertainty it had. `findings` says in plain words what the pictures determined. Of a flat port the
+same solve finds its distance from the lens and its tilt.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -32,12 +34,13 @@ from aqualvs.calibration.dome.problem import (
     check_sets,
     dome_problem,
     initial_rigs,
+    place_names,
     with_board_tilt_as_found,
 )
 from aqualvs.calibration.solver.bundle import CORNER_SIGMA_PX, BundleState
 from aqualvs.calibration.solver.covariance import Observability, consider_covariance, observability
 from aqualvs.calibration.solver.least_squares import Solution, solve
-from aqualvs.calibration.solver.priors import rig_difference
+from aqualvs.calibration.solver.priors import rig_difference, rig_numbers
 from aqualvs.calibration.solver.result import (
     CrossValidation,
     DomeCalibration,
@@ -50,11 +53,15 @@ from aqualvs.geometry.arrays import FloatArray
 from aqualvs.optics.rig import Rig, RigUncertainty
 from aqualvs.optics.solved import rig_uncertainty
 
-_DOME = ("inner_radius", "thickness", "n_acrylic")
+_SIZES = ("inner_radius", "thickness", "n_acrylic", "n_port")
 _WORDS = {
     "inner_radius": "inner radius",
     "thickness": "thickness",
     "n_acrylic": "acrylic index",
+    "n_port": "index of the port",
+    "port_distance": "distance of the port",
+    "port_tilt_x": "tilt of the port about x",
+    "port_tilt_y": "tilt of the port about y",
     "lens_x": "lens x",
     "lens_y": "lens y",
     "lens_z": "lens z",
@@ -74,14 +81,18 @@ def findings(
 ) -> list[str]:
     """Return one sentence for each finding."""
     bundle, uncertainty = problem.bundle, result.uncertainty
-    seen = observability(bundle, solution, uncertainty, _DOME)
-    lines = [_lens(result), _rotation(problem, result), *_dome(result, seen), *_unobservable(seen)]
+    housing = result.rig.housing
+    names = () if housing is None else tuple(n for n in _SIZES if n in housing.numbers())
+    seen = observability(bundle, solution, uncertainty, names)
+    place = _lens(result) if result.rig.flat_port is None else _port(result)
+    lines = [place, _rotation(problem, result), *_dome(names, result, seen), *_unobservable(seen)]
     lens = observability(bundle, solution, uncertainty, result.rig.lens.parameter_names)
     lines += _intrinsics(problem, result, lens)
     lines += _entangled(result)
     lines += _media(problem, result)
     lines += _against_priors(problem, solution)
-    lines += _cross_validation(result.cross_validation)
+    what = "dome" if result.rig.flat_port is None else "port"
+    lines += _cross_validation(result.cross_validation, what)
     lines += [f"left out, {label}: {why}" for label, why in result.left_out.items()]
     return lines
 
@@ -96,11 +107,27 @@ def _lens(result: DomeCalibration) -> str:
     return f"lens position: {coordinates} mm"
 
 
+def _port(result: DomeCalibration) -> str:
+    sigmas, numbers = result.uncertainty.sigmas, rig_numbers(result.rig)
+    x, y = (
+        f"{math.degrees(numbers[name]):.3f} ± {math.degrees(sigmas[name]):.4f}"
+        for name in ("port_tilt_x", "port_tilt_y")
+    )
+    return (
+        f"flat port: {1e3 * numbers['port_distance']:.3f} ± {1e3 * sigmas['port_distance']:.4f} mm "
+        f"from the lens, tilted by {x} deg about the camera's x axis and {y} deg about y"
+    )
+
+
 def _rotation(problem: DomeProblem, result: DomeCalibration) -> str:
     if not result.rotation_is_solved:
         return (
-            "camera rotation: taken from the rig; boards at unknown poses say nothing about it, "
-            "and the lens position is given in axes turned by it"
+            "camera rotation: taken from the rig; boards at unknown poses say nothing about it"
+            + (
+                ", and the lens position is given in axes turned by it"
+                if result.rig.flat_port is None
+                else ""
+            )
         )
     sigma = np.rad2deg([result.uncertainty.sigmas[name] for name in ROTATION])
     sigmas = ", ".join(f"{axis} {value:.4f}" for axis, value in zip("xyz", sigma, strict=True))
@@ -109,20 +136,20 @@ def _rotation(problem: DomeProblem, result: DomeCalibration) -> str:
     return f"camera rotation: from {source}; uncertain by {sigmas} deg about the dome's axes"
 
 
-def _dome(result: DomeCalibration, seen: Observability) -> list[str]:
+def _dome(names: Sequence[str], result: DomeCalibration, seen: Observability) -> list[str]:
     lines = []
-    nothing = seen.undetermined(_DOME, _NOTHING)
-    some = [n for n in seen.undetermined(_DOME, _SOMETHING) if n not in nothing]
-    rest = [n for n in _DOME if n in seen.shrinkage and n not in nothing and n not in some]
-    for names, what in (
+    nothing = seen.undetermined(names, _NOTHING)
+    some = [n for n in seen.undetermined(names, _SOMETHING) if n not in nothing]
+    rest = [n for n in names if n in seen.shrinkage and n not in nothing and n not in some]
+    for group, what in (
         (nothing, "not determined by the pictures, taken as given"),
         (some, "hardly determined by the pictures, mostly taken as given"),
         (rest, "determined by the pictures"),
     ):
-        if names:
-            listed = ", ".join(f"{_WORDS[name]} (± {_size(name, result)})" for name in names)
+        if group:
+            listed = ", ".join(f"{_WORDS[name]} (± {_size(name, result)})" for name in group)
             lines.append(f"{listed}: {what}")
-    exact = [_WORDS[name] for name in _DOME if name not in seen.shrinkage]
+    exact = [_WORDS[name] for name in names if name not in seen.shrinkage]
     if exact:
         lines.append(f"{', '.join(exact)}: taken as exact")
     return lines
@@ -130,7 +157,7 @@ def _dome(result: DomeCalibration, seen: Observability) -> list[str]:
 
 def _size(name: str, result: DomeCalibration) -> str:
     sigma = result.uncertainty.sigmas[name]
-    return f"{sigma:.4f}" if name == "n_acrylic" else f"{1e3 * sigma:.3f} mm"
+    return f"{sigma:.4f}" if name.startswith("n_") else f"{1e3 * sigma:.3f} mm"
 
 
 def _intrinsics(problem: DomeProblem, result: DomeCalibration, seen: Observability) -> list[str]:
@@ -159,7 +186,7 @@ def _unobservable(seen: Observability) -> list[str]:
     names = "; ".join(" with ".join(_WORDS.get(n, n) for n in d.main) for d in unobservable)
     return [
         f"the pictures determine {len(seen.directions) - len(unobservable)} of the "
-        f"{len(seen.directions)} combinations of the dome's parameters; not determined: {names}"
+        f"{len(seen.directions)} combinations of the housing's parameters; not determined: {names}"
     ]
 
 
@@ -169,10 +196,10 @@ def _entangled(result: DomeCalibration) -> list[str]:
     sigma = np.sqrt(np.diag(uncertainty.covariance))
     with np.errstate(divide="ignore", invalid="ignore"):
         correlation = uncertainty.covariance / np.outer(sigma, sigma)
-    worst, pair = _CORRELATED, None
+    worst, pair, place = _CORRELATED, None, place_names(result.rig)
     for i, name in enumerate(uncertainty.names):
         for j, other in enumerate(uncertainty.names):
-            if name in LENS and other not in LENS and abs(correlation[i, j]) > worst:
+            if name in place and other not in place and abs(correlation[i, j]) > worst:
                 worst, pair = abs(float(correlation[i, j])), (name, other)
     if pair is None:
         return []
@@ -206,17 +233,17 @@ def _against_priors(problem: DomeProblem, solution: Solution[BundleState]) -> li
     ]
 
 
-def _cross_validation(found: CrossValidation | None) -> list[str]:
+def _cross_validation(found: CrossValidation | None, what: str) -> list[str]:
     if found is None:
         return []
     text = (
         f"{found.n_points} corners of {found.n_views} views, each held out once, are predicted to "
-        f"{found.dome_rms_px:.3f} px with the dome, to {found.bare_rms_px:.3f} px with a bare "
-        f"lens; the dome is better in {found.n_dome_better} of the views"
+        f"{found.dome_rms_px:.3f} px with the {what}, to {found.bare_rms_px:.3f} px with a bare "
+        f"lens; the {what} is better in {found.n_dome_better} of the views"
     )
     if found.dome_is_better:
-        return [f"{text}: the dome model is needed"]
-    return [f"{text}: the pictures do not show that there is a dome"]
+        return [f"{text}: the {what} model is needed"]
+    return [f"{text}: the pictures do not show that there is a housing"]
 
 
 # A solve with smaller residuals has found the minimum; one with larger ones may be in another.
@@ -239,8 +266,8 @@ def dome(
     Parameters
     ----------
     rig : Rig
-        Intrinsics from `calibrate camera`, the dome's nominal sizes, and any lens position inside
-        it. Without known poses its rotation is kept.
+        Intrinsics from `calibrate camera`, the housing's nominal sizes, and any lens position
+        inside a dome. Without known poses its rotation is kept.
     sets : sequence of BoardSet
         One for each medium.
     options : DomeOptions, optional

@@ -13,7 +13,7 @@ from enum import Enum, auto
 
 import numpy as np
 
-from aqualvs.calibration.dome.problem import LENS, BoardSet, DomeProblem, PoseKind
+from aqualvs.calibration.dome.problem import BoardSet, DomeProblem, PoseKind, place_names
 from aqualvs.calibration.solver.bundle import CORNER_SIGMA_PX, CORNERS, PRIORS, Bundle, BundleState
 from aqualvs.calibration.solver.covariance import (
     all_alike,
@@ -474,7 +474,7 @@ def check_solution(
         raise CalibrationError(
             f"no lens position explains the pictures: corners are {noise:.2g} px off (0.1 px is "
             "usual); check the board's file against the print, the camera's calibration, the "
-            "dome's sizes and the medium"
+            f"{'port' if solution.state.rig.flat_port else 'dome'}'s sizes and the medium"
         )
     if not solution.converged:
         raise CalibrationError(
@@ -488,13 +488,21 @@ def _check_lens(
     problem: DomeProblem, solution: Solution[BundleState], uncertainty: RigUncertainty
 ) -> None:
     rig = solution.state.rig
+    if rig.flat_port is not None:
+        sigma = uncertainty.sigmas["port_distance"]
+        if sigma > _MAX_LENS_SIGMA:
+            raise CalibrationError(
+                f"the pictures do not tell how far the port is from the lens: {1e3 * sigma:.1f} mm "
+                "uncertain; show more views in water, some near, with corners all over the picture"
+            )
+        return
     lens = rig.dome_from_cam.translation
     if rig.dome is not None and np.linalg.norm(lens) > _AT_THE_WALL * rig.dome.inner_radius:
         raise CalibrationError(
             f"the lens ends at the dome's wall, at {np.round(1e3 * lens, 1).tolist()} mm; check "
             "the dome's inner radius, the board's square_mm, the given distances and the medium"
         )
-    values, vectors = np.linalg.eigh(uncertainty.of(LENS))
+    values, vectors = np.linalg.eigh(uncertainty.of(place_names(rig)))
     sigma, axis = float(np.sqrt(values[-1])), vectors[:, -1] * np.sign(vectors[:, -1].sum())
     if sigma > _MAX_LENS_SIGMA:
         raise CalibrationError(

@@ -1,5 +1,8 @@
 """The least-squares problem of `calibrate dome`: its input, free and known numbers, initial guess.
 
+A flat port is solved in the same way. It belongs to the camera, so that boards say where it is
+before the lens, and nothing about where the camera is: their poses are unknown.
+
 The input is sets of views of boards, each set in one medium, and options (`BoardSet`,
 `DomeOptions`).
 
@@ -34,6 +37,8 @@ from aqualvs.optics.rig import Rig, RigUncertainty, combined
 
 _MIN_VIEWS = 3
 _MIN_POINTS = 60
+# Indices on both sides of a port that differ by less tell nothing of its place.
+_BENDING = 0.01
 
 
 class GivenPose(Protocol):
@@ -105,9 +110,9 @@ class DomeOptions:
     Attributes
     ----------
     inner_radius_sigma, thickness_sigma : float
-        Standard deviations of the dome's sizes; 0 takes one as exact.
+        Standard deviations of the housing's sizes; 0 takes one as exact. A flat port has no radius.
     n_acrylic_sigma : float
-        Standard deviation of the dome's index.
+        Standard deviation of the index of the dome or the flat port.
     distance_sigma : float
         Standard deviation of given distances, independent of each other.
     distance_offset_sigma : float
@@ -141,18 +146,20 @@ class DomeOptions:
 
 
 def check_sets(rig: Rig, sets: Sequence[BoardSet]) -> None:
-    """Refuse a rig without a dome, and sets with too little in them.
+    """Refuse a rig without a housing, and sets with too little in them.
 
     Raises
     ------
     CalibrationError
         With what is given and what is needed.
     """
-    if rig.dome is None:
+    if rig.housing is None:
         raise CalibrationError(
             f"rig {rig.name} has no dome; write its inner_radius_mm, thickness_mm and n_acrylic "
-            "into the rig file"
+            "into the rig file, or those of a flat port"
         )
+    if rig.flat_port is not None:
+        _check_flat(rig, sets)
     views = [view for one in sets for view in one.views]
     exact = any(
         kind_of(one.given(i)) is PoseKind.EXACT for one in sets for i in range(len(one.views))
@@ -171,8 +178,29 @@ def check_sets(rig: Rig, sets: Sequence[BoardSet]) -> None:
         )
 
 
+def _check_flat(rig: Rig, sets: Sequence[BoardSet]) -> None:
+    if any(given is not None for one in sets for given in one.poses):
+        raise CalibrationError(
+            f"rig {rig.name} has a flat port, whose place does not depend on the boards' poses; "
+            "leave the poses out"
+        )
+    if all(abs(one.n_medium - rig.n_air) < _BENDING for one in sets):
+        raise CalibrationError(
+            "all pictures were taken in air, where a flat port looks the same at any distance; "
+            "take some with the port in water"
+        )
+
+
 LENS = ("lens_x", "lens_y", "lens_z")
+PORT = ("port_distance", "port_tilt_x", "port_tilt_y")
 ROTATION = ("rotation_x", "rotation_y", "rotation_z")
+
+
+def place_names(rig: Rig) -> tuple[str, ...]:
+    """Return the names of the numbers that say where lens and housing are to each other."""
+    return LENS if rig.flat_port is None else PORT
+
+
 # For every lens position, poses of the right board are nearer than this.
 _MAX_MISFIT_PX = 30.0
 
@@ -291,6 +319,8 @@ def initial_rigs(rig: Rig) -> Iterator[Rig]:
     A stated lens position far to the wrong side may leave no pose of a board to start from.
     """
     yield rig
+    if rig.flat_port is not None:
+        return
     yield replace(rig, dome_from_cam=SE3(rig.dome_from_cam.rotation, np.zeros(3)))
 
 
@@ -302,7 +332,7 @@ def dome_problem(
     Parameters
     ----------
     rig : Rig
-        Initial guess; its lens lies inside the dome.
+        Initial guess; its lens lies inside the dome, or behind the flat port.
     sets : sequence of BoardSet
     known : RigUncertainty
         Of the rig beforehand: intrinsics from the camera's calibration.
@@ -322,7 +352,7 @@ def dome_problem(
     solves_rotation = bool(boards) or exact
     priors, considered = _priors(rig, known, options, solves_rotation)
     rotation = tuple(name for name in ROTATION if solves_rotation or name in priors.names)
-    free = (*LENS, *rotation, *(name for name in priors.names if name not in ROTATION))
+    free = (*place_names(rig), *rotation, *(name for name in priors.names if name not in ROTATION))
     views = tuple(
         TargetView(
             shot.view,
@@ -394,11 +424,12 @@ def _priors(
     """Return the prior uncertainty of solved numbers, and the uncertainty of considered ones."""
     intrinsics = [n for n in rig.lens.parameter_names if known.sigmas.get(n, 0.0) > 0.0]
     rotation = [n for n in ROTATION if known.sigmas.get(n, 0.0) > 0.0 and not solves_rotation]
-    tolerances = {
-        "inner_radius": options.inner_radius_sigma,
-        "thickness": options.thickness_sigma,
-        "n_acrylic": options.n_acrylic_sigma,
-    }
+    tolerances = {"thickness": options.thickness_sigma}
+    if rig.flat_port is not None:
+        tolerances |= {"n_port": options.n_acrylic_sigma}
+    else:
+        tolerances = {"inner_radius": options.inner_radius_sigma, **tolerances}
+        tolerances |= {"n_acrylic": options.n_acrylic_sigma}
     dome = RigUncertainty.independent({n: s for n, s in tolerances.items() if s > 0.0})
     moving = known.only(rotation + (intrinsics if options.refine_intrinsics else []))
     considered = known.only([] if options.refine_intrinsics else intrinsics)

@@ -292,7 +292,7 @@
   function bare() {
     const chart = data.bare;
     if (!chart) return;
-    const styles = [["truth", "truth", INK, "dash"], ["bare", "without the dome's refraction", "#D55E00", "solid"],
+    const styles = [["truth", "truth", INK, "dash"], ["bare", "without refraction", "#D55E00", "solid"],
                     ["dome", "with it", MEASURED, "solid"]];
     const traces = styles.filter(([key]) => chart[key]).map(([key, name, color, dash]) => ({
       ...lifted(chart[key], ["x", "y"]), type: "scatter", mode: "lines", name,
