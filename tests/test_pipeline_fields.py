@@ -4,6 +4,7 @@ import csv
 import multiprocessing
 from collections import Counter
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ import pytest
 from aqualvs.batch.scheduler import Scheduler
 from aqualvs.errors import OptionError, SourceError
 from aqualvs.optics.rigfile import load_rig
-from aqualvs.pipeline import run
+from aqualvs.pipeline import run, summary_lines
 from aqualvs.report.run_data import read_track
 from aqualvs.results.folder import POSTURE_COLUMNS
 from aqualvs.results.run_request import FrameWindow, RunRequest
@@ -182,6 +183,21 @@ def test_the_truth_of_fields_is_not_compared_with_whole_pictures(tmp_path, dive)
     out = measured(dive, DEMO / "rig.yaml", tmp_path / "run", frames=FrameWindow(0, 2))
     with pytest.raises(SourceError, match=r"set camera\.shutter in the rig file"):
         compare_with_truth(out / "posture.csv", truth)
+
+
+def test_a_run_with_the_wrong_shutter_says_so(tmp_path, dive, rig):
+    few = {"frames": FrameWindow(0, 2), "report": False}
+    for source, of, said in (
+        (dive, DEMO / "rig.yaml", "warning: the video is interlaced (the stream says so)"),
+        (DEMO / "dive.mp4", rig, "warning: the rig says that the video is interlaced"),
+        (dive, rig, None),
+        (DEMO / "dive.mp4", DEMO / "rig.yaml", None),
+    ):
+        out = tmp_path / f"{Path(source).parent.name}-{Path(of).parent.name}"
+        request = RunRequest(source=str(source), rig=of, out=out, **few)
+        told = [line for line in summary_lines(request, run(request)) if "warning" in line]
+        assert bool(told) == (said is not None)
+        assert not told or told[0].startswith(said)
 
 
 def test_markers_are_not_looked_for_in_fields(tmp_path, dive, rig):

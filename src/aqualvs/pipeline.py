@@ -17,8 +17,9 @@ from aqualvs.results.run_request import RunRequest, check_fits, prepared_rig
 from aqualvs.results.summary import RunSummary, TruthComparison, read_truth
 from aqualvs.scanner import Scanner, ScannerOptions
 from aqualvs.scanning.agreement import LaserAgreement
-from aqualvs.sources import FrameSource, open_source
-from aqualvs.sources.fields import source_of_frames
+from aqualvs.sources import FrameSource, VideoSource, open_source
+from aqualvs.sources.fields import FieldEvidence, source_of_frames, source_of_pictures
+from aqualvs.sources.video import sampled_pictures
 from aqualvs.terminal import StopSignals, progress
 from aqualvs.workers.frame_results import FrameScanner
 from aqualvs.workers.pool import PoolJob, pool_job
@@ -106,7 +107,12 @@ def run(request: RunRequest, *, scanner_for: ScannerFor = Scanner) -> RunResult:
         exit_code=stop.exit_code,
         stopped_by=stop.caught.name if stop.caught else "",
         summary=summary,
-        lines=[*water, *writers.dome_lines(), *net.write(request.out, request.source)],
+        lines=[
+            *_shutter_lines(dive),
+            *water,
+            *writers.dome_lines(),
+            *net.write(request.out, request.source),
+        ],
         elapsed_s=time.perf_counter() - started,
         report=outputs.report(request),
         comparison=outputs.comparison(request),
@@ -242,6 +248,16 @@ def summary_for(dive: OpenDive) -> RunSummary:
         except RigError as error:
             raise RigError(f"{request.rig or request.source}: {error}") from None
     return RunSummary(agreement=agreement, net_check=net_check(request.target, rig))
+
+
+def _shutter_lines(dive: OpenDive) -> list[str]:
+    """Return a warning if a video file is interlaced and the rig is not, or the reverse."""
+    path, pictures = Path(dive.request.source), source_of_pictures(dive.source)
+    if not isinstance(pictures, VideoSource) or not path.is_file():
+        return []
+    evidence = FieldEvidence.of(*sampled_pictures(path))
+    wrong = evidence.contradiction(dive.rig.shutter, pictures.fps)
+    return [f"warning: {wrong}"] if wrong else []
 
 
 def _shared_work(dive: OpenDive, scanner_for: ScannerFor) -> PoolJob | None:

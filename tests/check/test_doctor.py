@@ -13,6 +13,7 @@ from aqualvs.check import doctor
 from aqualvs.check import doctor as doctor_autopilot
 from aqualvs.check.doctor import _EXTRAS, DoctorRequest, run_doctor
 from aqualvs.errors import AqualvsError
+from field_cases import interlaced_rig, woven_dive
 from ports import free_port
 from repository import ROOT
 
@@ -40,6 +41,20 @@ def test_a_source_that_fits_the_rig(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "720x576 px" in text
     # A busy machine does not keep up with a recording that comes at its own pace.
     assert re.search(r" \d+ lost", text)
+
+
+def test_fields_that_the_rig_says_nothing_of_are_told(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(doctor, "_STREAM_S", 2.0)
+    dive, rig = woven_dive(tmp_path / "dive.mp4", 12), interlaced_rig(tmp_path / "rig.yaml")
+    wrong = "camera.shutter: {kind: interlaced, readout_ms: 40}"
+    assert wrong in told(DoctorRequest(source=str(dive), rig=DEMO / "rig.yaml"))
+    assert wrong in told(DoctorRequest(source=str(dive)))
+    text = told(DoctorRequest(source=str(dive), rig=rig))
+    assert wrong not in text
+    assert re.search(r"posture in \d+ of \d*[02468] frames with the rig", text)
+    assert "take camera.shutter out" in told(DoctorRequest(source=str(DEMO / "dive.mp4"), rig=rig))
 
 
 def test_silence_is_not_ready_and_the_remedy_is_told(monkeypatch: pytest.MonkeyPatch) -> None:

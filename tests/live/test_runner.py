@@ -20,6 +20,8 @@ from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.row_motion import RowMotion
 from aqualvs.scanning.scan import Frame, Scan
 from aqualvs.sources.base import PartHealth, State
+from aqualvs.sources.fields import FieldFeed, frames_of
+from field_cases import FIELDS
 from live_cases import (
     Collector,
     ScriptedFeed,
@@ -384,3 +386,68 @@ def test_a_closed_mailbox_gives_its_last_frame_and_then_nothing() -> None:
     assert arrival.frame is FRAME
     assert box.exhausted
     assert box.take(0.0) is None
+
+
+def woven_pictures(n: int) -> list[Frame]:
+    """Pictures of two fields each, 40 ms apart, from two frames of the dive each."""
+    frames = demo_frames(2 * n)
+    pictures = []
+    for early, late in zip(frames[::2], frames[1::2], strict=True):
+        luma = early.luma.copy()
+        luma[1::2] = late.luma[1::2]
+        chroma = []
+        for one, other in zip(early.chroma or (), late.chroma or (), strict=True):
+            chroma.append(one.copy())
+            chroma[-1][1::2] = other[1::2]
+        index, chroma_planes = early.index // 2, (chroma[0], chroma[1])
+        pictures.append(Frame(index, early.time_s, luma, chroma_planes, is_interlaced=True))
+    return pictures
+
+
+def test_both_fields_of_a_picture_are_measured_with_their_own_times() -> None:
+    scanner = Scanner(replace(demo_rig(), shutter=FIELDS))
+    steps: list[Step] = list(woven_pictures(4))
+    feed, output = FieldFeed(ScriptedFeed(steps), FIELDS), Collector()
+    options = LiveOptions(keep_every=True)
+    assert LiveRunner(feed, FixedScanner(scanner), [output], options).run(never) is None
+    assert [sample.scan.index for sample in output.samples] == list(range(8))
+    assert sum(bool(sample.scan.posture) for sample in output.samples) >= 7
+    for sample, frame in zip(output.samples, demo_frames(8), strict=True):
+        assert sample.frame is not None
+        assert sample.frame.field == ("top" if frame.index % 2 == 0 else "bottom")
+        assert sample.scan.time_s == pytest.approx(frame.time_s)
+    for first, second in zip(output.samples[::2], output.samples[1::2], strict=True):
+        # Both come with the second; the autopilot is told when each was exposed.
+        apart = second.instants.arrived_ns - first.instants.arrived_ns
+        assert 0.04e9 <= apart < 0.04e9 + 1e9 * TIMEOUT_S
+        assert second.utc_ns - first.utc_ns >= 0.04e9 - 1
+
+
+def test_a_mailbox_has_room_for_both_fields_of_the_latest_picture() -> None:
+    box, fields = Mailbox(), list(frames_of(woven_pictures(3), FIELDS))
+    for frame in fields[:4]:
+        box.put(frame)
+    assert box.n_dropped == 2
+    taken = [box.take(1.0), box.take(1.0)]
+    assert [one.frame.index for one in taken if one] == [2, 3]
+    box.put(fields[2])
+    box.put(fields[4])
+    assert box.n_dropped == 3
+    found = box.take(1.0)
+    assert found is not None
+    assert found.frame.index == 4
+
+
+def _again(picture: Frame, index: int) -> Frame:
+    return replace(picture, index=index, time_s=0.08 * index)
+
+
+def test_a_still_interlaced_picture_is_noticed_though_its_fields_differ() -> None:
+    pictures = woven_pictures(12)
+    steps: list[Step] = [*pictures, *(_again(pictures[-1], i) for i in range(12, 32))]
+    feed, output = FieldFeed(ScriptedFeed(steps), FIELDS), Collector()
+    scanner = FixedScanner(Scanner(replace(demo_rig(), shutter=FIELDS)))
+    LiveRunner(feed, scanner, [output], LiveOptions(keep_every=True)).run(never)
+    found = reasons(output)
+    assert Reason.FROZEN not in found[:24]
+    assert set(found[-10:]) == {Reason.FROZEN}

@@ -1,5 +1,8 @@
 """An interlaced picture is taken apart into its rows, exactly."""
 
+import itertools
+from dataclasses import replace
+
 import av
 import numpy as np
 import pytest
@@ -8,7 +11,15 @@ from aqualvs.optics.shutter import AT_ONCE, Shutter, ShutterKind
 from aqualvs.scanning.scan import Frame
 from aqualvs.sources import open_source
 from aqualvs.sources.base import bgr_of
-from aqualvs.sources.fields import FieldSource, field_of, frames_of
+from aqualvs.sources.fields import (
+    FieldEvidence,
+    FieldSource,
+    combed_share,
+    field_of,
+    frames_of,
+)
+from aqualvs.sources.video import sampled_pictures
+from batch_cases import DEMO
 from field_cases import FIELDS, woven_dive
 
 _BOTTOM = Shutter(kind=ShutterKind.INTERLACED, readout=0.02, first_field="bottom")
@@ -77,8 +88,6 @@ def test_fields_of_a_coded_video_are_the_pictures_that_it_was_woven_from(tmp_pat
         assert (source.n_frames, source.fps, source.size_px) == (6, 25.0, (720, 576))
         fields = list(source)
     assert [frame.time_s for frame in fields] == pytest.approx([0.04 * i for i in range(6)])
-    from batch_cases import DEMO
-
     with av.open(str(DEMO / "dive.mp4")) as dive:
         for frame, whole in zip(fields, dive.decode(video=0), strict=False):
             row = 0 if frame.field == "top" else 1
@@ -99,3 +108,62 @@ def test_the_stream_says_that_it_is_interlaced(tmp_path):
 def test_the_fields_of_a_lost_picture_are_lost():
     frames = list(frames_of([picture(index=0), picture(index=2)], FIELDS))
     assert [frame.index for frame in frames] == [0, 1, 4, 5]
+
+
+def evidence(video):
+    return FieldEvidence.of(*sampled_pictures(video))
+
+
+@pytest.mark.parametrize("coded", [True, False], ids=["marked", "combed"])
+def test_fields_are_recognised_by_the_stream_and_by_the_comb(tmp_path, coded):
+    found = evidence(woven_dive(tmp_path / "dive.mp4", 6, shutter=_BOTTOM, coded=coded))
+    assert (found.is_marked, found.first_field) == ((True, "bottom") if coded else (False, None))
+    assert found.combed > 0.005
+    order = ", first_field: bottom" if coded else ""
+    remedy = f"camera.shutter: {{kind: interlaced, readout_ms: 40{order}}}"
+    for whole in (AT_ONCE, Shutter(kind=ShutterKind.ROLLING, readout=0.02)):
+        assert remedy in found.contradiction(whole, 12.5)
+    assert found.contradiction(_BOTTOM, 12.5) == ""
+    other = found.contradiction(FIELDS, 12.5)
+    assert ("camera.shutter.first_field: bottom" in other) == coded
+
+
+def test_whole_pictures_are_recognised_where_something_moves():
+    found = evidence(DEMO / "dive.mp4")
+    assert found.combed < 1e-5 < 0.01 < found.woven
+    assert found.contradiction(AT_ONCE, 25.0) == ""
+    assert "take camera.shutter out" in found.contradiction(FIELDS, 25.0)
+
+
+def test_what_stands_still_tells_nothing_against_a_rig():
+    with open_source(DEMO / "dive.mp4") as source:
+        still = 3 * [next(iter(source))]
+    for shutter in (AT_ONCE, FIELDS):
+        assert FieldEvidence.of([still]).contradiction(shutter, 25.0) == ""
+    assert FieldEvidence.of([]).contradiction(FIELDS, None) == ""
+
+
+def test_a_progressive_picture_in_an_interlaced_stream_is_whole():
+    with open_source(DEMO / "dive.mp4") as source:
+        marked = [replace(one, is_interlaced=True) for one in itertools.islice(source, 3)]
+    found = FieldEvidence.of([marked])
+    assert found.is_marked
+    assert found.contradiction(AT_ONCE, 25.0) == ""
+
+
+def test_thin_lines_and_noise_are_no_comb():
+    rng = np.random.default_rng(2)
+    noisy = np.clip(rng.normal(90.0, 6.0, (240, 320)), 0, 255).astype(np.uint8)
+    assert combed_share(noisy) < 1e-5
+    lined = noisy.copy()
+    lined[::8] = 220
+    assert combed_share(lined) < 1e-5
+    combs = noisy.copy()
+    combs[::2, 100:104] = 220
+    assert 3 / 320 < combed_share(combs) < 9 / 320
+
+
+def test_a_damaged_video_gives_the_signs_that_it_has(tmp_path):
+    broken = tmp_path / "dive.mp4"
+    broken.write_bytes((DEMO / "dive.mp4").read_bytes()[:200_000])
+    assert evidence(broken) == FieldEvidence(is_marked=False, combed=0.0, woven=0.0)

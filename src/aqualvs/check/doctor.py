@@ -39,11 +39,14 @@ from aqualvs.live.mavlink.link import MavlinkLink
 from aqualvs.live.options import VehicleSetup
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.rigfile import load_rig
+from aqualvs.optics.shutter import AT_ONCE, Shutter
 from aqualvs.scanner import Scanner
 from aqualvs.scanning.scan import Frame
 from aqualvs.sources import open_source
 from aqualvs.sources.base import State
-from aqualvs.sources.fields import frames_of
+from aqualvs.sources.fields import FieldEvidence, frames_of
+from aqualvs.sources.opening import is_address
+from aqualvs.sources.video import sampled_pictures
 
 _HEARTBEAT_S, _LISTEN_S = 6.0, 3.0
 # Between heartbeats the attitude tells that the vehicle is there; channels show the pilot's sticks.
@@ -345,6 +348,22 @@ def _stream(where: str, rig_file: Path | None) -> Iterator[Finding]:
     )
     if rig is not None:
         yield _fit(rig, frames)
+    yield from _fields(where, AT_ONCE if rig is None else rig.shutter, frames)
+
+
+def _fields(where: str, shutter: Shutter, frames: list[Frame]) -> Iterator[Finding]:
+    """Say whether the pictures are interlaced, if the rig does not say so too, or the reverse."""
+    successive = [
+        list(pair) for pair in itertools.pairwise(frames) if pair[1].index == pair[0].index + 1
+    ]
+    groups, first_field = successive, None
+    if not is_address(where) and Path(where).is_file():
+        groups, first_field = sampled_pictures(Path(where))
+    span_s = frames[-1].time_s - frames[0].time_s
+    fps = (frames[-1].index - frames[0].index) / span_s if span_s > 0.0 else None
+    wrong = FieldEvidence.of(groups, first_field).contradiction(shutter, fps)
+    if wrong:
+        yield Finding(Severity.WARN, f"{where}: {wrong}")
 
 
 def _received(where: str) -> tuple[list[Frame], float, str]:

@@ -4,7 +4,9 @@
 index.
 """
 
+import contextlib
 import heapq
+import itertools
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -16,6 +18,7 @@ from av.video.stream import VideoStream
 
 from aqualvs.closing import Closing
 from aqualvs.errors import SourceError
+from aqualvs.optics.shutter import Field
 from aqualvs.scanning.scan import Frame
 from aqualvs.sources.base import frame_of
 from aqualvs.sources.spans import promised_duration
@@ -252,6 +255,42 @@ class VideoSource(Closing):
     def close(self) -> None:
         """Close the file; frames already delivered stay valid."""
         self._container.close()
+
+
+# Pictures that are looked at for fields: so many in a row, at so many places of a file.
+_GROUP, _PLACES = 3, 3
+_TOP_FIRST, _BOTTOM_FIRST = (2, 5), (3, 4)
+"""AVFieldOrder of FFmpeg: by the field that is shown first, whichever is coded first."""
+
+
+def sampled_pictures(path: Path) -> tuple[list[list[Frame]], Field | None]:
+    """Return a few pictures in a row from some places of a video, and which field comes first.
+
+    Parameters
+    ----------
+    path : Path
+
+    Returns
+    -------
+    groups : list of list of Frame
+        Without numbers and times; none from where the file is damaged.
+    first_field : {"top", "bottom"} or None
+        As the stream states it.
+    """
+    groups: list[list[Frame]] = []
+    first_field: Field | None = None
+    with contextlib.suppress(av.error.FFmpegError, OSError), av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        stream.codec_context.thread_count = 1
+        for place in range(_PLACES):
+            if place:
+                container.seek(place * (container.duration or 0) // _PLACES)
+            pictures = itertools.islice(container.decode(stream), _GROUP)
+            groups.append([frame_of(0, 0.0, one) for one in pictures if not one.is_corrupt])
+        order = stream.codec_context.field_order
+        if order in _TOP_FIRST + _BOTTOM_FIRST:
+            first_field = "top" if order in _TOP_FIRST else "bottom"
+    return groups, first_field
 
 
 def _open(where: str) -> InputContainer:
