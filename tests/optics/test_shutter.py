@@ -27,7 +27,9 @@ def test_rows_are_exposed_in_their_order_about_the_middle():
     assert not AT_ONCE.row_times(rows, 576).any()
 
 
-@pytest.mark.parametrize("shutter", [_ROLLING, _FIELDS, Shutter(exposure=0.0083)])
+@pytest.mark.parametrize(
+    "shutter", [_ROLLING, replace(_ROLLING, readout=-0.03), _FIELDS, Shutter(exposure=0.0083)]
+)
 def test_a_shutter_is_saved_and_loaded_to_the_bit(tmp_path, shutter):
     rig = replace(example_rig(), shutter=shutter)
     save_rig(rig, tmp_path / "rig.yaml")
@@ -48,8 +50,8 @@ def test_a_rig_file_without_a_shutter_is_written_without_one():
         ({"kind": "rolling"}, "shutter.readout_ms is missing or 0; write the milliseconds"),
         ({"kind": "interlaced"}, "20 for PAL"),
         ({"readout_ms": 20}, "leave it out, or write kind: rolling"),
-        ({"kind": "rolling", "readout_ms": 20000}, "is 20000; write milliseconds, 0 to 500"),
-        ({"kind": "rolling", "readout_ms": -20}, "readout_ms is -20; it must be at least 0"),
+        ({"kind": "rolling", "readout_ms": 20000}, "20000; write milliseconds, -500 to 500"),
+        ({"kind": "interlaced", "readout_ms": -20}, "is -20; write milliseconds, 0 to 500"),
         ({"kind": "rolling", "readout_ms": 20, "first_field": "bottom"}, "kind: interlaced"),
         ({"kind": "interlaced", "readout_ms": 20, "exposure_ms": 21}, "from field to field"),
         ("rolling", "for example 'shutter: {kind: rolling, readout_ms: 20, exposure_ms: 8}'"),

@@ -219,7 +219,7 @@ def shutter_finding(rig: Rig) -> Finding | None:
     if shutter.kind is ShutterKind.GLOBAL:
         return Finding(Severity.OK, f"The shutter exposes all rows at once. {rates} {blur}.")
     blur = f"; {blur}" if blur else ""
-    apart = 1e3 * shutter.readout
+    apart = 1e3 * abs(shutter.readout)
     if shutter.kind is ShutterKind.INTERLACED:
         return Finding(
             Severity.OK,
@@ -228,9 +228,10 @@ def shutter_finding(rig: Rig) -> Finding | None:
             f"({rig.focal_px * _TURN * shutter.readout:.1f} px) between them{blur}. Each field is "
             "measured by itself: twice as many postures, each of half the rows.",
         )
+    order = "first row to the last" if shutter.readout > 0.0 else "last row to the first"
     return Finding(
         Severity.OK,
-        f"The shutter rolls, {apart:g} ms from the first row to the last. {rates} "
+        f"The shutter rolls, {apart:g} ms from the {order}. {rates} "
         f"{_rolling_error(rig)}{blur}. The frames beside it correct that.",
     )
 
@@ -240,7 +241,7 @@ def _rolling_error(rig: Rig) -> str:
     wall = WallView.ahead(rig, math.sqrt(math.prod(rig.working_range)))
     by_rates = wall.by_rates(lambda rows: rig.shutter.row_times(rows, rig.size_px[1]))
     if not np.isfinite(by_rates).all():
-        apart = math.degrees(_TURN) * rig.shutter.readout
+        apart = math.degrees(_TURN) * abs(rig.shutter.readout)
         return f"its rows see a target {apart:.2f} degrees apart"
     away, pitch, yaw = np.abs(by_rates) @ [_SPEED, _TURN, _TURN]
     return (

@@ -9,7 +9,7 @@ from aqualvs.cli.command import Celsius, CheckedCommand, Overwrite, Salinity
 
 calibrate = typer.Typer(
     name="calibrate",
-    help="Make a rig file from pictures: camera, dome, lasers, water, in this order.",
+    help="Make a rig file from pictures: camera, dome, lasers, water, in this order; shutter last.",
     no_args_is_help=True,
     rich_markup_mode=None,
 )
@@ -283,6 +283,29 @@ def water(
             place_sigma_mm=place_sigma_mm,
             turn_sigma_deg=turn_sigma_deg,
         ),
+        typer.echo,
+    )
+
+
+@calibrate.command(
+    cls=CheckedCommand,
+    help="Readout of a rolling shutter, from a dive of 20 s in which the vehicle swings before a "
+    "wall.",
+    epilog="Example: aqualvs calibrate shutter dive.mp4 --rig rig.yaml -o rig.yaml",
+)
+def shutter(
+    source: Annotated[str, typer.Argument(help="Video, or a folder of pictures.")],
+    rig: RigIn,
+    out: RigOut,
+    fps: Annotated[
+        float | None, typer.Option(help="Frame rate of pictures.", show_default=False)
+    ] = None,
+) -> None:
+    """Calibrate the shutter."""
+    from aqualvs.calibrate import shutter as body
+
+    body.run_shutter(
+        body.ShutterRequest(source=source, rig=rig, out=out, fps=fps),
         typer.echo,
     )
 

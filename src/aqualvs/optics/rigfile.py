@@ -496,7 +496,7 @@ def _camera_mapping(rig: Rig) -> dict[str, Any]:
 def _shutter_mapping(shutter: Shutter) -> dict[str, Any]:
     """Return the keys of a shutter, without those that say nothing about its kind."""
     content: dict[str, Any] = {"kind": shutter.kind.value}
-    if shutter.readout > 0.0:
+    if shutter.readout != 0.0:
         content["readout_ms"] = _to_milli(shutter.readout)
     if shutter.exposure > 0.0:
         content["exposure_ms"] = _to_milli(shutter.exposure)

@@ -82,7 +82,11 @@ class ShutterPart(StrictPart):
         Literal["global", "rolling", "interlaced"], _said("Order in which rows are exposed.")
     ] = "global"
     readout_ms: Annotated[
-        NotNegative, _said("From the first row to the last, or from the first field to the second.")
+        Number,
+        _said(
+            "From the first row to the last, negative if the last comes first, or from the first "
+            "field to the second."
+        ),
     ] = 0.0
     exposure_ms: Annotated[NotNegative, _said("Time that a row gathers light; 0 if unknown.")] = 0.0
     first_field: Annotated[

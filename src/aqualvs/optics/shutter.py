@@ -29,7 +29,7 @@ class ShutterKind(StrEnum):
     GLOBAL = "global"
     """All rows at once."""
     ROLLING = "rolling"
-    """One row after the other, from the top."""
+    """One row after the other."""
     INTERLACED = "interlaced"
     """Every other row at once, then the rows between them."""
 
@@ -42,8 +42,9 @@ class Shutter:
     ----------
     kind : ShutterKind
     readout : float
-        From the first row to the last (rolling), or from the first field to the second
-        (interlaced); 0 for a global shutter.
+        From the first row to the last (rolling; negative if the last comes first, as in a picture
+        that is turned upside down), or from the first field to the second (interlaced); 0 for a
+        global shutter.
     exposure : float
         Time that each row gathers light; 0 where it is not stated.
     first_field : {"top", "bottom"}
@@ -61,10 +62,15 @@ class Shutter:
     first_field: Field = "top"
 
     def __post_init__(self) -> None:
-        for key, value in (("readout_ms", self.readout), ("exposure_ms", self.exposure)):
-            if not 0.0 <= value <= LONGEST_S:
+        lowest = -LONGEST_S if self.kind is ShutterKind.ROLLING else 0.0
+        for key, value, least in (
+            ("readout_ms", self.readout, lowest),
+            ("exposure_ms", self.exposure, 0.0),
+        ):
+            if not least <= value <= LONGEST_S:
                 raise RigError(
-                    f"{key} is {1e3 * value:g}; write milliseconds, 0 to {1e3 * LONGEST_S:g}"
+                    f"{key} is {1e3 * value:g}; write milliseconds, {1e3 * least:g} to "
+                    f"{1e3 * LONGEST_S:g}"
                 )
         if self.kind is ShutterKind.GLOBAL and self.readout > 0.0:
             raise RigError(
@@ -123,7 +129,7 @@ class Shutter:
         """
         if self.kind is not ShutterKind.ROLLING:
             return 0.0
-        return 0.5 * (self.readout + self.exposure)
+        return 0.5 * (abs(self.readout) + self.exposure)
 
     def row_times(self, rows: ArrayLike, height: int) -> FloatArray:
         """Return the middles of the exposures of rows, in seconds from the picture's middle.

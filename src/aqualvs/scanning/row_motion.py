@@ -126,7 +126,7 @@ class RowMotion:
         posture = scan.posture
         if not isinstance(posture, Posture) or posture.by_rates is None:
             return scan
-        rates, covariance = _rates(scan, posture, posture.by_rates, beside)
+        rates, covariance = rates_beside(scan, beside)
         corrected = replace(
             self.moved(posture, -posture.by_rates @ rates),
             covariance=posture.covariance + posture.by_rates @ covariance @ posture.by_rates.T,
@@ -186,10 +186,19 @@ def _fit_rates(
     return both[:3], both[3:]
 
 
-def _rates(
-    scan: Scan, posture: Posture, by_rates: FloatArray, beside: Sequence[Scan]
-) -> tuple[FloatArray, FloatArray]:
-    """Return the rates (3,) of range, pitch and yaw at a scan, and their covariance (3, 3)."""
+def rates_beside(scan: Scan, beside: Sequence[Scan]) -> tuple[FloatArray, FloatArray]:
+    """Return the rates (3,) of range, pitch and yaw at a scan, and their covariance (3, 3).
+
+    Parameters
+    ----------
+    scan : Scan
+        As the scanner measured it, with a posture.
+    beside : sequence of Scan
+        As in `RowMotion.correct`.
+    """
+    posture = scan.posture
+    if not isinstance(posture, Posture) or posture.by_rates is None:
+        raise ValueError(f"frame {scan.index}: no posture as its rows were exposed")
     # Unknowns: posture, rates, accelerations, relative to the scan's own measurement.
     matrix, right = np.zeros((9, 9)), np.zeros(9)
     prior = np.concatenate([_RATES, _ACCELERATIONS]) ** -2.0
@@ -203,7 +212,7 @@ def _rates(
         by = np.hstack([by, 0.5 * t**2 * np.eye(3) + t * found.by_rates])
         # Of the difference between the two, in which their common error is not.
         by_motion = by[:, 3:].copy()
-        by_motion[:, :3] -= by_rates
+        by_motion[:, :3] -= posture.by_rates
         expected = found.covariance + posture.covariance + (by_motion / prior) @ by_motion.T
         if one is not scan and off @ np.linalg.solve(expected, off) > _GATE:
             continue

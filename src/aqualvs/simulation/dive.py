@@ -235,7 +235,7 @@ def check_shutter(shutter: Shutter, scenario: Scenario) -> None:
         If it does.
     """
     # Two fields make a frame, and the second is as far from the next frame's first.
-    needed = shutter.readout * (2.0 if shutter.kind is ShutterKind.INTERLACED else 1.0)
+    needed = abs(shutter.readout) * (2.0 if shutter.kind is ShutterKind.INTERLACED else 1.0)
     needed = max(needed, shutter.exposure)
     # NTSC's fields are stated to a few digits.
     if needed > (1.0 + 1e-3) / scenario.fps:

@@ -296,7 +296,7 @@ class Renderer:
         shutter = self.rig.shutter
         n_bands = 1
         if shutter.kind is ShutterKind.ROLLING:
-            n_bands = min(math.ceil(shutter.readout / _BAND_S), height)
+            n_bands = min(math.ceil(abs(shutter.readout) / _BAND_S), height)
         n_instants = max(math.ceil(shutter.exposure / _INSTANT_S), 1)
         instants = ((np.arange(n_instants) + 0.5) / n_instants - 0.5) * shutter.exposure
         out = np.zeros((height, width, 3), dtype=np.float32)

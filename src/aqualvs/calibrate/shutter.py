@@ -1,0 +1,257 @@
+"""`aqualvs calibrate shutter`: the readout of a rolling shutter, from a dive before a flat target.
+
+Points that are read as if all rows had been exposed at once lie on no plane while the vehicle
+turns: a pitch that changes bends it, a yaw that changes twists it, in proportion to the readout.
+The rates come from the frames beside each, as in a run. What does not change with them, such as
+errors of the rig, is fitted beside the readout.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from aqualvs.calibrate.common import Echo, finish
+from aqualvs.errors import CalibrationError, RigError
+from aqualvs.geometry.arrays import FloatArray
+from aqualvs.optics.rig import Rig
+from aqualvs.optics.rig_covariance import posture_by_plane
+from aqualvs.optics.rigfile import check_rig_place, load_rig
+from aqualvs.optics.shutter import Shutter, ShutterKind
+from aqualvs.report.calibration_material import CalibrationPage, Series, expectations, facts
+from aqualvs.report.html import Card
+from aqualvs.results.run_request import check_fits
+from aqualvs.scanner import Scanner
+from aqualvs.scanning.posture import Posture
+from aqualvs.scanning.row_motion import REACH, rates_beside
+from aqualvs.scanning.scan import Scan, ScanPoints
+from aqualvs.sources import FrameSource, open_source
+from aqualvs.terminal import progress
+
+# Errors by the rates are proportional to the readout: any will do to find them.
+_NOMINAL = 0.02
+# The rates are corrected by the readout, which converges by a factor of ten or more a round.
+_ROUNDS = 6
+# Parts of the dive whose disagreement gives sigma, and the least frames in all.
+_N_PARTS, _MIN_FRAMES = 10, 50
+# A sigma beyond this, in seconds, is no result: 5 % of a usual readout.
+_MAX_SIGMA = 1e-3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ShutterRequest:
+    """Request of `aqualvs calibrate shutter`, see its `--help`."""
+
+    source: str
+    rig: Path
+    out: Path
+    fps: float | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ShutterCalibration:
+    """Readout of a shutter, as a dive shows it.
+
+    Attributes
+    ----------
+    readout, sigma : float
+        As in `Shutter`, and its standard deviation, in seconds.
+    n_frames : int
+        Frames with a posture.
+    times, parts : array, shape (N,)
+        Middles of the parts of the dive, and the readout of each, in seconds.
+    """
+
+    readout: float
+    sigma: float
+    n_frames: int
+    times: FloatArray
+    parts: FloatArray
+
+    @property
+    def rolls(self) -> bool:
+        """Whether the readout is not zero by chance."""
+        return abs(self.readout) > 3.0 * self.sigma
+
+
+class _Warp(NamedTuple):
+    """What one frame tells: b = matrix @ (static - readout * rates), in units of its own noise."""
+
+    scan: Scan
+    matrix: FloatArray
+    right: FloatArray
+
+
+def calibrate_shutter(source: FrameSource, rig: Rig) -> ShutterCalibration:
+    """Estimate the readout of a rolling shutter.
+
+    Parameters
+    ----------
+    source : FrameSource
+        A dive in which the vehicle turns before a flat target.
+    rig : Rig
+        With lasers; its own readout is not used.
+
+    Raises
+    ------
+    CalibrationError
+        If the dive shows too few postures, or too little motion.
+    SourceError
+        If the pictures do not fit the rig, or cannot be read.
+    """
+    check_fits(source, rig)
+    nominal = Shutter(kind=ShutterKind.ROLLING, readout=_NOMINAL)
+    scanner = Scanner(replace(rig, shutter=nominal))
+    scans: list[Scan] = []
+    warps: list[tuple[int, _Warp]] = []
+    with progress(f"measuring {source.name}", source.n_frames) as tick:
+        for frame in source:
+            scan = scanner.process(frame)
+            warp = _warp(scan, rig.size_px[1])
+            if warp is not None:
+                warps.append((len(scans), warp))
+            # The points of a whole dive would not fit into memory.
+            scans.append(replace(scan, points=ScanPoints.none()))
+            tick(1)
+    if len(warps) < _MIN_FRAMES:
+        raise CalibrationError(
+            f"{source.name}: a posture in {len(warps)} frames only; give a dive of 20 s before a "
+            f"wall, at least {_MIN_FRAMES} frames"
+        )
+    found = _solve(scans, warps)
+    if not found.sigma <= _MAX_SIGMA:
+        raise CalibrationError(
+            f"{source.name}: the readout is not observable, its sigma is {1e3 * found.sigma:.2g} "
+            "ms; swing the vehicle in pitch and yaw before a wall, 10 degrees and more to each "
+            "side, for 20 s"
+        )
+    return found
+
+
+def run_shutter(request: ShutterRequest, echo: Echo) -> None:
+    """Calibrate the shutter and write the rig with it, and its report.
+
+    Raises
+    ------
+    AqualvsError
+        As `calibrate_shutter`, or if the rig cannot be used or an output not be written.
+    """
+    check_rig_place(request.out)
+    rig = load_rig(request.rig)
+    if rig.shutter.kind is ShutterKind.INTERLACED:
+        raise RigError(
+            f"{request.rig}: camera.shutter.kind is interlaced, whose fields are as far apart as "
+            "the video's standard says; leave the shutter out to calibrate a rolling one"
+        )
+    with open_source(request.source, fps=request.fps) as source:
+        found = calibrate_shutter(source, rig)
+    shutter = Shutter(exposure=rig.shutter.exposure)
+    sentence = "All rows are exposed at once, as far as this dive shows."
+    if found.rolls:
+        shutter = replace(shutter, kind=ShutterKind.ROLLING, readout=round(found.readout, 5))
+        order = "first row to the last" if found.readout > 0.0 else "last row to the first"
+        sentence = f"The shutter rolls from the {order}."
+    echo(f"readout {_text(found)} from {found.n_frames} frames")
+    echo(sentence)
+    note = {
+        "date": datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
+        "frames": found.n_frames,
+        "readout_ms": round(1e3 * found.readout, 3),
+        "sigma_ms": round(1e3 * found.sigma, 3),
+    }
+    solved = replace(rig, shutter=shutter, solved_from={**rig.solved_from, "shutter": note})
+    page = CalibrationPage(
+        title="Calibration of the shutter",
+        subtitle=f"Rig “{rig.name}”, {request.source}",
+        cards=(Card("readout", _text(found), f"{found.n_frames} frames"),),
+        words=(sentence,),
+        expectations=expectations(solved),
+        series=(
+            Series(
+                title="Readout of parts of the dive",
+                x_label="time, s",
+                y_label="readout, ms",
+                x=found.times,
+                y=1e3 * found.parts,
+                level=("all", 1e3 * found.readout),
+            ),
+        ),
+        facts=facts(("rig before", str(request.rig))),
+    )
+    finish(solved, page, request.out, "shutter", echo, comments_of=request.rig)
+
+
+def _text(found: ShutterCalibration) -> str:
+    return f"{1e3 * found.readout:.2f} ± {1e3 * found.sigma:.2f} ms"
+
+
+def _warp(scan: Scan, height: int) -> _Warp | None:
+    """Return how the points of a posture are bent by rates that last from row to row."""
+    posture, points = scan.posture, scan.points
+    if not isinstance(posture, Posture) or posture.by_rates is None or not points.used.any():
+        return None
+    seen = points.points_in_dome[points.used]
+    m = posture.normal_in_dome / posture.range
+    by_m = np.empty((3, 3))
+    posture_by_plane(m, by_m)
+    sigma = points.sigma[points.used] * np.linalg.norm(m)
+    shares = (points.pixels[points.used, 1] + 0.5) / height - 0.5
+    # Residuals of m·X, and their derivatives by the rates, for a readout of one second.
+    both = np.column_stack([seen @ m - 1.0, (seen * shares[:, None]) @ np.linalg.inv(by_m)])
+    both, seen = both / sigma[:, None], seen / sigma[:, None]
+    # What a plane explains tells nothing.
+    both -= seen @ np.linalg.lstsq(seen, both)[0]
+    noise = 1.4826 * float(np.median(np.abs(both[:, 0])))
+    if not noise > 0.0:
+        return None
+    sums = both.T @ both / noise**2
+    return _Warp(scan, sums[1:, 1:], sums[1:, 0])
+
+
+def _solve(scans: Sequence[Scan], warps: Sequence[tuple[int, _Warp]]) -> ShutterCalibration:
+    """Return the readout that explains the warps, and its sigma by the parts of the dive."""
+    readout, share = 0.0, np.arange(len(warps)) * _N_PARTS // len(warps)
+    for _ in range(_ROUNDS):
+        # Of readout and static part.
+        equations = list(_equations(scans, warps, readout))
+        matrices = np.array([matrix for matrix, _ in equations])
+        rights = np.array([right for _, right in equations])
+        inverse = np.linalg.pinv(matrices.sum(axis=0))
+        solved = inverse @ rights.sum(axis=0)
+        readout = float(np.clip(solved[0], -1.0, 1.0))
+    pulls = rights - matrices @ solved
+    sums = np.array([pulls[share == part].sum(axis=0) for part in range(_N_PARTS)])
+    covariance = inverse @ (sums.T @ sums) @ inverse * _N_PARTS / (_N_PARTS - 1)
+    times = np.array([warp.scan.time_s for _, warp in warps])
+    steps = [sums[part][0] / matrices[share == part].sum(axis=0)[0, 0] for part in range(_N_PARTS)]
+    return ShutterCalibration(
+        readout=readout,
+        # Without motion the noise of the rates is taken for some, and chance may agree with it.
+        sigma=float(np.sqrt(max(covariance[0, 0], inverse[0, 0]))),
+        n_frames=len(warps),
+        times=np.array([times[share == part].mean() for part in range(_N_PARTS)]),
+        parts=readout + np.array(steps),
+    )
+
+
+def _equations(
+    scans: Sequence[Scan], warps: Sequence[tuple[int, _Warp]], readout: float
+) -> Iterator[tuple[FloatArray, FloatArray]]:
+    """Yield the normal equations (4, 4) and (4,) of each frame, with rates for a readout."""
+    scaled = [_with_readout(scan, readout) for scan in scans]
+    for i, warp in warps:
+        beside = [*scaled[max(i - REACH, 0) : i], *scaled[i + 1 : i + 1 + REACH]]
+        rates, _ = rates_beside(scaled[i], beside)
+        terms = np.column_stack([-rates, np.eye(3)])
+        yield terms.T @ warp.matrix @ terms, terms.T @ warp.right
+
+
+def _with_readout(scan: Scan, readout: float) -> Scan:
+    posture = scan.posture
+    if not isinstance(posture, Posture) or posture.by_rates is None:
+        return scan
+    by_rates = posture.by_rates * (readout / _NOMINAL)
+    return replace(scan, posture=replace(posture, by_rates=by_rates))
