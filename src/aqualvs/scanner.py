@@ -219,6 +219,10 @@ class Scanner:
             found = _refuse_chance_plane(candidates)
         elif tested.verdict is Verdict.AMBIGUOUS and tested.other is not None:
             found = _refuse_ambiguous(candidates, target.plane, tested.other)
+        elif self.options.target is TargetKind.AUTO and self._assignment.may_hide_net(
+            candidates, subsegments, surfaces, target
+        ):
+            found = _refuse_hidden_net(candidates, target.plane)
         else:
             found = self._measured(candidates, subsegments, target)
             found = inflate_for_rival(found, tested)
@@ -309,6 +313,14 @@ def _on_mesh(paper_filter: "PaperFilter", points: ScanPoints) -> BoolArray:
 def _refuse_chance_plane(candidates: Candidates) -> Measurement:
     detail = "the best plane is small, and lasers that should be seen on it are not"
     return Measurement(Refusal(Reason.NOT_A_PLANE, detail), np.zeros(len(candidates), np.bool_))
+
+
+def _refuse_hidden_net(candidates: Candidates, plane: Plane) -> Measurement:
+    detail = (
+        f"much light before the surface at {plane.offset:.3f} m shares no plane, such as that on a "
+        "net in folds"
+    )
+    return Measurement(Refusal(Reason.AMBIGUOUS, detail), np.zeros(len(candidates), np.bool_))
 
 
 def _refuse_ambiguous(candidates: Candidates, one: Plane, other: Plane) -> Measurement:

@@ -127,6 +127,20 @@ def test_a_net_that_is_all_folds_is_measured_by_all_of_its_light(
     assert np.abs(error / np.sqrt(np.diag(posture.covariance))).max() < 3.0
 
 
+@pytest.mark.parametrize(
+    ("direction", "height", "width", "bar", "behind"),
+    [(0.6, 0.035, 0.05, 0.03, 0.3), (2.0, 0.045, 0.07, 0.03, 0.3), (0.3, 0.05, 0.08, 0.035, 0.3)],
+)
+def test_a_wall_is_no_target_where_a_net_before_it_makes_no_plane(
+    direction: float, height: float, width: float, bar: float, behind: float
+) -> None:
+    fold = Fold(direction=direction, place=0.03, height=-height, width=width, period=2.0 * width)
+    thin = replace(NET, bar=bar, twine=0.05 * bar, folds=(fold,))
+    posture = shoot(thin, walls=(Wall(depth=behind),)).scan.posture
+    # Measured to the wall, 0.2 or 0.3 m farther, without a look at the loose light before it.
+    assert not posture or abs(posture.range / 0.6 - 1.0) < 0.06
+
+
 def test_a_slack_net() -> None:
     wave = Fold(direction=0.5, place=0.1, height=0.008, width=0.15, period=0.3)
     shot = shoot(replace(NET, folds=(wave,)))

@@ -520,6 +520,62 @@ def exclusive_share(
     return on / max(total, 1e-12) * (inlier_weight / of_members)
 
 
+# Light is on a plane within the first of these shares of its distance, before it from the second
+# on; pieces of stripe this long are those of walls and fish, not the light on strands.
+_ON_PLANE, _BEFORE, _LONG_PIECE = 0.02, 0.03, 24.0
+
+
+@kernel
+def loose_share_before(
+    source: IntArray,
+    confidence: FloatArray,
+    points: FloatArray,
+    n_lines: FloatArray,
+    subsegment_index: IntArray,
+    members: BoolArray,
+    explained: BoolArray,
+    plane: FloatArray,
+    nearest: float,
+) -> float:
+    """Return the light in short pieces before a surface that none explains, over its own light.
+
+    Parameters
+    ----------
+    source, confidence, points
+        As in `Candidates`, N of them.
+    n_lines : array, shape (N,)
+        Search lines of each candidate's component.
+    subsegment_index : int array, shape (N,)
+        Row of each candidate's subsegment.
+    members, explained : bool array, shape (C,)
+        Subsegments on the surface, and on any surface.
+    plane : array, shape (4,)
+        Normal and offset of the surface.
+    nearest : float
+        Least distance along the forward axis, in metres.
+    """
+    last = 0
+    for i in range(source.shape[0]):
+        last = max(last, source[i])
+    intensity_weight = np.zeros(last + 1)
+    own, bound, before = np.zeros((3, last + 1), np.bool_)
+    for i in range(source.shape[0]):
+        c, r = subsegment_index[i], source[i]
+        off = -plane[3]
+        for k in range(3):
+            off += plane[k] * points[i, k]
+        intensity_weight[r] = confidence[i]
+        own[r] |= members[c]
+        # However it is read: one peak has a candidate for each laser.
+        bound[r] |= explained[c] or n_lines[i] >= _LONG_PIECE or abs(off) < _ON_PLANE * plane[3]
+        before[r] |= off < -_BEFORE * plane[3] and points[i, 1] > nearest
+    of_surface, loose = 0.0, 0.0
+    for r in range(last + 1):
+        of_surface += intensity_weight[r] if own[r] else 0.0
+        loose += intensity_weight[r] if before[r] and not bound[r] else 0.0
+    return loose / max(of_surface, 1e-12)
+
+
 @kernel
 def seen_of(
     plane: FloatArray,
