@@ -1,7 +1,7 @@
 """Build the wheel, install it in an empty environment, and try it there.
 
-Runs the demo, and tests of the parts below for a limited time, part by part. The tests lie in a copy
-of the repository without `src`, so that whatever the wheel lacks is missing.
+Runs the demo, and tests of the parts below for a limited time, part by part. The tests lie in a
+copy of the repository without `src`, so that whatever the wheel lacks is missing.
 
     python tools/wheel_tests.py [--minutes 20] [--folder out/wheel]
 """
