@@ -19,12 +19,15 @@ from aqualvs.calibration_files import (
     read_camera,
     rig_of_camera,
 )
+from aqualvs.calibration_files.command import ExportRequest, run_export
 from aqualvs.calibration_formats import CalibrationFormat, recognised
 from aqualvs.errors import AqualvsError, CalibrationError, RigError
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
+from aqualvs.optics.flat_port import FlatPort
 from aqualvs.optics.lens import Lens, LensModel
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL
-from aqualvs.optics.rigfile import load_rig
+from aqualvs.optics.rigfile import load_rig, save_rig
+from aqualvs.simulation.scenarios import flat_port_rig
 from repository import ROOT
 
 RIG = load_rig(ROOT / "src/aqualvs/data/demo/rig.yaml")
@@ -138,9 +141,20 @@ def test_readers_of_python_read_the_yaml_and_the_literal(tmp_path):
     assert mrcal["intrinsics"][4:] == [*tiny.lens.distortion]
 
 
-def test_refractive_colmap_needs_a_dome():
+@pytest.mark.parametrize("housing", [None, FlatPort(0.012, 0.005, 1.49)], ids=["bare", "flat"])
+def test_refractive_colmap_needs_a_dome(housing):
     with pytest.raises(RigError, match="has no dome"):
-        camera_text(camera_of_rig(replace(RIG, housing=None)), "colmap-underwater")
+        camera_text(camera_of_rig(replace(RIG, housing=housing)), "colmap-underwater")
+
+
+def test_a_flat_port_is_left_out_by_name(tmp_path):
+    save_rig(flat_port_rig(), tmp_path / "rig.yaml")
+    said = []
+    run_export(
+        ExportRequest(rig=tmp_path / "rig.yaml", to="opencv", out=tmp_path / "camera.yml"),
+        said.append,
+    )
+    assert "the flat port (the intrinsics are those in air)" in said[-1]
 
 
 # What is refused. ---------------------------------------------------------------------------------

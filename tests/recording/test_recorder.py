@@ -37,9 +37,13 @@ from aqualvs.recording.encoding import (
     TOPICS,
     CdrReader,
     CdrWriter,
+    rig_exact,
+    rig_from_record,
+    rig_yaml,
 )
 from aqualvs.scanning.posture import Reason, Refusal
 from aqualvs.scanning.scan import ScanPoints
+from aqualvs.simulation.scenarios import flat_port_rig
 from aqualvs.sources.base import Health, PartHealth, StageDelay, State
 from aqualvs.sources.mcap_file import McapFile
 from live_cases import demo_frames, demo_rig, demo_samples
@@ -525,3 +529,10 @@ def test_cdr_is_that_of_rosbags():
             of.number("d")
     with pytest.raises(ValueError, match="CDR"):
         CdrReader(b"\x00\x00\x00\x00")
+
+
+@pytest.mark.parametrize("rig", [flat_port_rig(), replace(flat_port_rig(), housing=None)])
+def test_a_recorded_rig_comes_back_to_the_last_bit_whatever_its_housing(rig):
+    exact = replace(rig, housing=rig.housing and rig.housing.moved_by({"port_tilt_x": 1e-15}))
+    back = rig_from_record(rig_yaml(exact), rig_exact(exact), "dive.mcap")
+    assert back.housing == exact.housing

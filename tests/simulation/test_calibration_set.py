@@ -12,6 +12,8 @@ from aqualvs.calibration.targets.pose_files import load_poses
 from aqualvs.calibration.targets.target_files import load_board, load_box, load_target
 from aqualvs.calibration.targets.targets import View
 from aqualvs.errors import OptionError, OutputError
+from aqualvs.geometry.transforms import SE3
+from aqualvs.optics.flat_port import FlatPort
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL
 from aqualvs.optics.rigfile import load_rig, rig_to_mapping
 from aqualvs.optics.solved import with_exact_numbers
@@ -30,6 +32,25 @@ def made(tmp_path_factory):
         small_rig(), out, size=SIZE, seed=5, progress=lambda *tick: ticks.append(tick)
     )
     return files, ticks
+
+
+def test_boards_before_a_flat_port_are_in_water_at_their_true_poses(tmp_path):
+    rig = replace(
+        small_rig(),
+        housing=FlatPort(0.012, 0.005, 1.49, 0.01, -0.01),
+        dome_from_cam=SE3(small_rig().dome_from_cam.rotation, np.zeros(3)),
+    )
+    size = SetSize(camera=1, dome=2, box=1, index=1, dive=0)
+    files = simulate_calibration(rig, tmp_path, size=size)
+    assert files.dome == tmp_path / "port_water"
+    assert files.poses is None
+    port = load_nominal(files.nominal).housing
+    assert port == replace(rig.flat_port, tilt_x=0.0, tilt_y=0.0)
+    board = load_board(files.rail_board)
+    for name, pose in true_poses(files, "port_water").items():
+        view = detect_board(picture(files.dome / name), board, name)
+        assert isinstance(view, View), view
+        check_close(view.pixels, *rig.camera().project(pose.apply(view.points)))
 
 
 def picture(path):
@@ -136,7 +157,7 @@ def test_the_same_seed_gives_the_same_pictures(made, tmp_path):
     assert again.dive is None
 
 
-@pytest.mark.parametrize("change", [{"dome": None}, {"lasers": ()}])
+@pytest.mark.parametrize("change", [{"housing": None}, {"lasers": ()}])
 def test_a_rig_that_cannot_be_calibrated_wholly_is_refused(change, tmp_path):
     with pytest.raises(OptionError, match=next(iter(change))):
         simulate_calibration(replace(small_rig(), **change), tmp_path / "out")

@@ -114,6 +114,7 @@ def solve_from_pictures(laboratory: Laboratory) -> SolvedDome:
         working_range=truth.working_range,
     )
     views = board_views(files.dome, files.rail_board, _SEED + 2)
+    assert files.poses is not None
     rows = read_with_errors(load_poses(files.poses))
     given, _ = match_poses(rows, [view.name for view in views], files.poses)
     sets = [BoardSet(name="air", views=views, poses=given, n_medium=truth.n_air)]

@@ -11,7 +11,12 @@ from aqualvs.optics.rigfile import load_rig, save_rig
 from aqualvs.optics.shutter import Shutter, ShutterKind
 from aqualvs.optics.solved import with_exact_numbers
 from aqualvs.results.files import Claim, writing
-from aqualvs.simulation.calibration_set import CalibrationFiles, SetSize, simulate_calibration
+from aqualvs.simulation.calibration_set import (
+    CalibrationFiles,
+    SetSize,
+    port_folder,
+    simulate_calibration,
+)
 from aqualvs.simulation.cameras import SimulatedCamera, simulated_camera
 from aqualvs.simulation.dive import (
     LEAD_S,
@@ -30,9 +35,6 @@ CALIBRATION = "calibration"
 _ABOUT_CALIBRATION = "no dive: pictures for all four steps of a calibration, with the truth"
 _LOG, _HOLES = "vehicle.csv", "truth_holes.csv"
 _FILES = ("dive.mp4", "truth.csv", "rig.yaml", _LOG, _HOLES)
-# In the order in which they are rendered.
-_FOLDERS = ("camera_air", "dome_air", "box", "index", "dive")
-_CALIBRATION_FILES = (*_FOLDERS, "truth", "nominal.yaml")
 
 
 def simulate(
@@ -192,10 +194,13 @@ def _simulate_calibration(
     overwrite: bool,
 ) -> int:
     rig = example_rig() if rig_file is None else load_rig(rig_file)
-    claim = Claim("simulate", [out / name for name in _CALIBRATION_FILES], overwrite=overwrite)
+    # In the order in which they are rendered.
+    folders = ("camera_air", port_folder(rig), "box", "index", "dive")
+    files_of_set = [out / name for name in (*folders, "truth", "nominal.yaml")]
+    claim = Claim("simulate", files_of_set, overwrite=overwrite)
     size = SetSize()
     # A folder is complete with what is written after its last picture.
-    ends = dict(zip(_FOLDERS, itertools.accumulate(astuple(size)), strict=True))
+    ends = dict(zip(folders, itertools.accumulate(astuple(size)), strict=True))
     with (
         claim,
         writing(out),
@@ -231,7 +236,8 @@ def calibration_commands(files: CalibrationFiles, out: Path, n_lasers: int) -> l
     rig = str(out / "rig.yaml")
     update = ["--rig", rig, "-o", rig]
     camera = [str(files.camera), f"--board={files.board}", f"--nominal={files.nominal}", "-o", rig]
-    dome = [str(files.dome), f"--board={files.rail_board}", f"--poses={files.poses}", *update]
+    poses = ["--medium=water"] if files.poses is None else [f"--poses={files.poses}"]
+    dome = [str(files.dome), f"--board={files.rail_board}", *poses, *update]
     lasers = [str(files.box), f"--box={files.box_file}", f"--lasers={n_lasers}", *update]
     water = [str(files.index), f"--target={files.target}", *update]
     steps = {"camera": camera, "dome": dome, "lasers": lasers, "water": water}

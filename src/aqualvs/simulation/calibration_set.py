@@ -2,7 +2,7 @@
 
 import csv
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,7 @@ from aqualvs.simulation.video import jpeg
 _LASER_POWER = 8.0
 _ROOM = RoomLight(level=0.72)
 _DIM = RoomLight(level=0.32)
+_POOL = RoomLight(level=0.6, tint=(0.75, 1.0, 0.95), veil=(0.012, 0.035, 0.028))
 _WATER = RoomLight(level=0.30, tint=(0.75, 1.0, 0.95), veil=(0.012, 0.035, 0.028))
 # A square of the rail's board in the farthest picture, in pixels, and its farthest place.
 _FAR_SQUARE_PX, _FARTHEST = 19.0, 1.2
@@ -74,7 +75,8 @@ class CalibrationFiles:
     camera, dome, box, index : Path
         Folders of pictures.
     board, rail_board, poses, box_file, target : Path
-        Files of their targets: two `board.yaml`, `poses.csv`, `box.yaml`, `target.yaml`.
+        Files of their targets: two `board.yaml`, `poses.csv`, `box.yaml`, `target.yaml`. No
+        `poses.csv` (None) for a flat port.
     dive, dive_truth : Path or None
         Video of a wall and its truth.
     rig : Path
@@ -90,7 +92,7 @@ class CalibrationFiles:
     index: Path
     board: Path
     rail_board: Path
-    poses: Path
+    poses: Path | None
     box_file: Path
     target: Path
     dive: Path | None
@@ -160,7 +162,8 @@ def simulate_calibration(
     """Render pictures for all steps of a calibration, and the files that go with them.
 
     `camera_air/` shows a board without the dome, `dome_air/` a larger one through the dome in air
-    (`poses.csv` knows distances only, and half of the boards are not quite square), `box/` an open
+    (`poses.csv` knows distances only, and half of the boards are not quite square), or
+    `port_water/` one in water before a flat port, at unknown poses; `box/` is an open
     box of markers in air with all lasers on, the vehicle's pose unknown, and `index/clip_0/` a
     plate that is fixed on the vehicle, in the rig's water. `dive/` is a wall to measure afterwards.
     `truth/` holds what a user would not have: the rig, and the poses of boards (dome_from_board)
@@ -169,7 +172,7 @@ def simulate_calibration(
     Parameters
     ----------
     rig : Rig
-        The truth; with a dome and at least one laser.
+        The truth; with a housing and at least one laser.
     out : Path
         Made if it is missing; files of an earlier set in it are overwritten.
     size : SetSize, optional
@@ -184,7 +187,7 @@ def simulate_calibration(
     Raises
     ------
     OptionError
-        If the rig has no dome or no lasers, or there are too few pictures.
+        If the rig has no housing or no lasers, or there are too few pictures.
     OutputError
         If the folder or a file cannot be written.
     """
@@ -200,11 +203,11 @@ def simulate_calibration(
 
 
 def _check(rig: Rig, size: SetSize) -> None:
-    if rig.dome is None or not rig.lasers:
-        missing = "dome" if rig.dome is None else "lasers"
+    if rig.housing is None or not rig.lasers:
+        missing = "housing" if rig.housing is None else "lasers"
         raise OptionError(
             f"rig {rig.name} has no {missing}; pictures for a whole calibration need a rig with "
-            "dome and lasers"
+            "housing and lasers"
         )
     if min(size.camera, size.dome, size.box, size.index) < 1 or size.dive < 0:
         raise OptionError(f"{size}: every kind needs one picture at least")
@@ -216,7 +219,7 @@ def _simulate(job: _Job) -> CalibrationFiles:
     targets.write_yaml(nominal, _nominal_mapping(job.rig))
     save_rig(with_exact_numbers(job.rig), rig)
     camera, board = _camera_air(job)
-    dome, rail_board, poses = _dome_air(job)
+    dome, rail_board, poses = (_dome_air if job.rig.flat_port is None else _port_water)(job)
     box, box_file = _box(job)
     index, target = _index(job)
     dive, dive_truth = _dive(job)
@@ -252,8 +255,32 @@ def _camera_air(job: _Job) -> tuple[Path, Path]:
     return folder, folder / "board.yaml"
 
 
+def port_folder(rig: Rig) -> str:
+    """Return the name of the folder of boards before the housing."""
+    return "dome_air" if rig.flat_port is None else "port_water"
+
+
+def _port_water(job: _Job) -> tuple[Path, Path, None]:
+    rig, rng, folder = job.rig, job.rng(1), job.folder(port_folder(job.rig))
+    board, lens = targets.hand_board(rig.size_px[0]), rig.lens
+    # Water magnifies what a flat port shows.
+    longer = replace(lens, fx=rig.n_water * lens.fx, fy=rig.n_water * lens.fy)
+    boards = replace(rig, lens=longer, housing=None)
+    poses = views.board_across(boards, targets.squares_size(board), job.size.dome, rng)
+    behind = targets.ground(
+        rig.dome_from_cam @ SE3(np.eye(3), np.array([0.0, 0.0, 2.2])), shift=150
+    )
+    scenes = [
+        PanelScene(panels=[targets.board_panel(board, pose), behind], light=_POOL) for pose in poses
+    ]
+    names = job.shoot(PanelRenderer(rig.camera(), eye=job.camera), scenes, folder, rng)
+    _write_poses(job.folder("truth") / "port_water_poses.csv", names, poses)
+    targets.write_yaml(folder / "board.yaml", targets.board_mapping(board))
+    return folder, folder / "board.yaml", None
+
+
 def _dome_air(job: _Job) -> tuple[Path, Path, Path]:
-    rig, rng, folder = job.rig.in_water(job.rig.n_air), job.rng(1), job.folder("dome_air")
+    rig, rng, folder = job.rig.in_water(job.rig.n_air), job.rng(1), job.folder(port_folder(job.rig))
     board = targets.rail_board()
     near = _NEAREST if rig.dome is None else rig.dome.inner_radius + rig.dome.thickness + _NEAREST
     far = max(1.5 * near, min(_FARTHEST, board.square * rig.focal_px / _FAR_SQUARE_PX))
@@ -336,6 +363,12 @@ def _nominal_mapping(rig: Rig) -> dict[str, Any]:
             "inner_radius_mm": targets.to_mm(rig.dome.inner_radius),
             "thickness_mm": targets.to_mm(rig.dome.thickness),
             "n_acrylic": float(rig.dome.n_acrylic),
+        }
+    if rig.flat_port is not None:
+        content["flat"] = {
+            "distance_mm": targets.to_mm(rig.flat_port.distance),
+            "thickness_mm": targets.to_mm(rig.flat_port.thickness),
+            "n_port": float(rig.flat_port.n_port),
         }
     return {**content, "n_air": float(rig.n_air), "lasers": {"count": len(rig.lasers)}}
 

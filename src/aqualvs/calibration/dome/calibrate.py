@@ -243,7 +243,7 @@ def _cross_validation(found: CrossValidation | None, what: str) -> list[str]:
     )
     if found.dome_is_better:
         return [f"{text}: the {what} model is needed"]
-    return [f"{text}: the pictures do not show that there is a housing"]
+    return [f"{text}: the pictures do not show that there is a {what}"]
 
 
 # A solve with smaller residuals has found the minimum; one with larger ones may be in another.

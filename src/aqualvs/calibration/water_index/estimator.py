@@ -138,7 +138,7 @@ class IndexEstimator:
     Attributes
     ----------
     rig : Rig
-        Behind a dome.
+        Behind a housing.
     uncertainty : RigUncertainty
         Of the rig.
     options : IndexOptions
@@ -151,7 +151,7 @@ class IndexEstimator:
     Raises
     ------
     CalibrationError
-        If the rig has no dome.
+        If the rig has no housing.
     """
 
     rig: Rig
@@ -384,7 +384,9 @@ class IndexEstimator:
             contradicted=self._contradicted,
             since_prior=self._since_prior,
             sigma_frame=sigma_frame,
-            decentring=float(np.linalg.norm(self.rig.dome_from_cam.translation)),
+            decentring=None
+            if self.rig.flat_port is not None
+            else float(np.linalg.norm(self.rig.dome_from_cam.translation)),
             n_lost=self._n_lost,
             moved=self._moved,
             n_camera=len(self._model.camera_names),
@@ -473,7 +475,7 @@ def calibrate_water(
     Parameters
     ----------
     rig : Rig
-        Behind a dome; its own index is the initial guess without a prior.
+        Behind a housing; its own index is the initial guess without a prior.
     views : sequence of View
         Points of the target in `dome`, metres.
     times : sequence of float, optional
@@ -492,7 +494,7 @@ def calibrate_water(
     Raises
     ------
     CalibrationError
-        If the rig has no dome or no picture can be used.
+        If the rig has no housing or no picture can be used.
     """
     known = RigUncertainty.none() if uncertainty is None else uncertainty
     estimator = IndexEstimator(rig, uncertainty=known, options=options, prior=prior)

@@ -118,7 +118,7 @@ class IndexModel:
     Attributes
     ----------
     rig : Rig
-        Behind a dome; its own `n_water` plays no part.
+        Behind a housing; its own `n_water` plays no part.
     uncertainty : RigUncertainty
         Of the camera's numbers.
     pose_sigmas : array, shape (6,)
@@ -133,7 +133,7 @@ class IndexModel:
     Raises
     ------
     CalibrationError
-        If the rig has no dome.
+        If the rig has no housing.
     """
 
     rig: Rig

@@ -493,8 +493,8 @@ class Knowledge:
         Variance of the index added by drift and steps since the prior was given.
     sigma_frame : float
         Noise of the index from one frame.
-    decentring : float
-        Distance of the lens from the dome's centre, metres.
+    decentring : float or None
+        Distance of the lens from the dome's centre, metres; None behind a flat port.
     n_lost : int
         Number of frames since the target was last at its place.
     moved : bool
@@ -511,7 +511,7 @@ class Knowledge:
     contradicted: bool
     since_prior: float
     sigma_frame: float
-    decentring: float
+    decentring: float | None
     n_lost: int
     moved: bool
     n_camera: int
@@ -544,10 +544,12 @@ class Knowledge:
         if self.observable or self.own is None or self.moved or self.n_lost >= _LOST_FRAMES:
             return ""
         if self.sigma_frame > self.options.largest_sigma:
+            lens = "the target is small, "
+            if self.decentring is not None:
+                lens = f"the lens is {self.decentring * 1e3:.1f} mm from the dome's centre, "
             return (
-                f"unobservable: the lens is {self.decentring * 1e3:.1f} mm from the dome's centre, "
-                "so the picture of the target hardly moves with the index; give temperature and "
-                "salinity"
+                f"unobservable: {lens}so the picture of the target hardly moves with the index; "
+                "give temperature and salinity"
             )
         if self.prior is not None and not self.contradicted:
             return (
