@@ -86,7 +86,7 @@ def run(request: RunRequest, *, scanner_for: ScannerFor = Scanner) -> RunResult:
         from aqualvs import run_outputs as outputs
 
         scanner, summary = dive.scanner(scanner_for), summary_for(dive)
-        net = outputs.RunNet(dive.rig, request.net)
+        net, warnings = outputs.RunNet(dive.rig, request.net), _shutter_lines(dive)
         processor.wait_for_first()
         claim = outputs.prepare(request)
         started, fault = time.perf_counter(), None
@@ -108,7 +108,7 @@ def run(request: RunRequest, *, scanner_for: ScannerFor = Scanner) -> RunResult:
         stopped_by=stop.caught.name if stop.caught else "",
         summary=summary,
         lines=[
-            *_shutter_lines(dive),
+            *warnings,
             *water,
             *writers.dome_lines(),
             *net.write(request.out, request.source),

@@ -1,5 +1,6 @@
 """`aqualvs simulate`, and what it writes through `aqualvs run`."""
 
+import csv
 import re
 import signal
 import subprocess
@@ -11,6 +12,8 @@ import pytest
 from aqualvs.calibration.targets.target_files import load_board
 from aqualvs.cli.main import main
 from aqualvs.experiments.simulate import CALIBRATION
+from aqualvs.optics.rigfile import load_rig
+from aqualvs.optics.shutter import AT_ONCE
 from aqualvs.simulation.calibration_set import SetSize
 from aqualvs.simulation.cameras import list_cameras
 from aqualvs.simulation.scenarios import list_scenarios
@@ -35,7 +38,7 @@ def test_the_list_names_every_scenario(capsys):
         (["wall", "-o", "x", "--rig", "missing-rig.yaml"], "missing-rig.yaml"),
         (["wall", "-o", "x", "--camera", "gopro"], "--camera gopro"),
         (["wall", "-o", "x", "--shutter", "roll:20"], "such as rolling:20:8"),
-        (["wall", "-o", "x", "--shutter", "rolling:90:8"], "lower the scenario's fps"),
+        (["wall", "-o", "x", "--shutter", "rolling:90:8"], "lower fps"),
         (["calibration", "-o", "x", "--shutter", "rolling:20"], "boards stand still"),
     ],
 )
@@ -137,3 +140,28 @@ def test_ctrl_c_leaves_whole_folders_of_calibration_pictures(tmp_path):
     assert len(list((tmp_path / "camera_air").glob("*.png"))) == SetSize().camera
     load_board(tmp_path / "camera_air" / "board.yaml")
     assert (tmp_path / "nominal.yaml").is_file()
+
+
+def test_a_scenario_may_state_the_shutter(tmp_path, capsys):
+    small = rig_file(tmp_path)
+    dive = tmp_path / "dive.yaml"
+    dive.write_text("duration_s: 0.08\nfps: 25\nwalls: [{}]\nshutter: interlaced\n")
+    out = tmp_path / "out"
+    assert main(["simulate", str(dive), "--rig", str(small), "-o", str(out)]) == 0
+    shutter = load_rig(out / "rig.yaml").shutter
+    assert (shutter.kind.value, shutter.readout) == ("interlaced", 0.02)
+    with (out / "truth.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    found = [(row["frame"], float(row["time_s"]), row["field"]) for row in rows]
+    fields = [("0", 0.0, "top"), ("1", 0.02, "bottom"), ("2", 0.04, "top"), ("3", 0.06, "bottom")]
+    assert found == fields
+    with open_source(out / "dive.mp4") as source:
+        assert {frame.is_interlaced for frame in source} == {True}
+    # The option counts before the file, and a fault in the file is the file's.
+    out = tmp_path / "other"
+    arguments = ["simulate", str(dive), "--rig", str(small), "-o", str(out)]
+    assert main([*arguments, "--shutter", "global"]) == 0
+    assert load_rig(out / "rig.yaml").shutter == AT_ONCE
+    dive.write_text("walls: [{}]\nshutter: comb\n")
+    assert main([*arguments, "--overwrite"]) == 2
+    assert f"scenario {dive}: shutter: 'comb' is none" in capsys.readouterr().err

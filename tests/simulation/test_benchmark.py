@@ -1,10 +1,14 @@
 """The benchmark set: its definition, and which stripe points count as visible."""
 
+import csv
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import yaml
 
+from aqualvs.experiments.benchmark import set as benchmark_set
+from aqualvs.optics.shutter import Shutter, ShutterKind
 from aqualvs.simulation.benchmark import (
     BENCHMARK_NAME,
     LEVELS,
@@ -13,12 +17,14 @@ from aqualvs.simulation.benchmark import (
     benchmark_checksum,
     benchmark_dives,
     benchmark_rig,
+    render_benchmark_dive,
     render_with_visible,
     truth_cells,
 )
 from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenario import dome_from_target
 from aqualvs.simulation.scene import Net, Scene, Wall, WaterOptics
+from aqualvs.sources import open_source
 
 DIVES = {dive.name: dive for dive in benchmark_dives()}
 _CLEAR = WaterOptics()
@@ -140,3 +146,37 @@ def test_pixels_that_are_asked_for_are_traced_as_in_the_whole_picture(renderer):
     part = renderer.radiance(scene(), 0.0, where)
     np.testing.assert_array_equal(part[where], whole[where])
     assert (part[100:140, 10:90] == 0.0).all()
+
+
+def test_a_set_with_fields_has_a_truth_for_each(renderer, tmp_path):
+    shutter = Shutter(kind=ShutterKind.INTERLACED, readout=0.02)
+    fields = Renderer(replace(renderer.rig, shutter=shutter))
+    dive = next(one for one in benchmark_dives() if one.name == "clear_wall").shortened(2)
+    render_benchmark_dive(dive, fields, tmp_path, tick=lambda _: None)
+    with (tmp_path / "truth.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    starts = list(dive.scenario.times())
+    assert [row["frame"] for row in rows] == ["0", "1", "2", "3"]
+    times = [at for start in starts for at in (start, start + 0.02)]
+    assert [float(row["time_s"]) for row in rows] == pytest.approx(times, abs=1e-4)
+    for row, at in zip(rows, times, strict=True):
+        plane = dive.scenario.scene_at(at).target_plane()
+        assert float(row["plane_range_m"]) == pytest.approx(plane.offset, abs=1e-6)
+    with open_source(tmp_path / "dive.mp4") as source:
+        assert [frame.is_interlaced for frame in source] == [True, True]
+
+
+def test_a_set_with_a_shutter_stands_for_itself(tmp_path, monkeypatch):
+    shutters = []
+
+    def rendered(_, renderer, folder, **__):
+        folder.mkdir(parents=True)
+        shutters.append(renderer.rig.shutter)
+
+    monkeypatch.setattr(benchmark_set, "render_benchmark_dive", rendered)
+    benchmark_set.make_set(
+        tmp_path, [], lambda _: None, n_frames=None, shutter="rolling:20:8", overwrite=False
+    )
+    content = yaml.safe_load((tmp_path / "benchmark.yaml").read_text())
+    assert (content["whole"], content["shutter"]) == (False, "rolling:20:8")
+    assert {(one.kind, one.readout) for one in shutters} == {(ShutterKind.ROLLING, 0.02)}

@@ -167,3 +167,25 @@ def test_a_damaged_video_gives_the_signs_that_it_has(tmp_path):
     broken = tmp_path / "dive.mp4"
     broken.write_bytes((DEMO / "dive.mp4").read_bytes()[:200_000])
     assert evidence(broken) == FieldEvidence(is_marked=False, combed=0.0, woven=0.0)
+
+
+def test_chroma_at_full_height_is_reduced_field_by_field(tmp_path):
+    """4:2:2, as capture devices deliver it, becomes 4:2:0 without mixing the fields."""
+    rows = np.where(np.arange(96) % 2, 170, 90).astype(np.uint8)
+    planes = [np.full((96, 64), 100, np.uint8), *2 * [np.repeat(rows[:, None], 32, axis=1)]]
+    video = tmp_path / "dive.mkv"
+    with av.open(str(video), "w") as container:
+        stream = container.add_stream("libx264", rate=25)
+        stream.width, stream.height, stream.pix_fmt = 64, 96, "yuv422p"
+        stream.options = {"flags": "+ilme+ildct", "x264-params": "tff=1", "qp": "0"}
+        coded = av.VideoFrame(64, 96, "yuv422p")
+        for plane, values in zip(coded.planes, planes, strict=True):
+            padded = np.zeros((plane.height, plane.line_size), np.uint8)
+            padded[:, : values.shape[1]] = values
+            plane.update(padded.tobytes())
+        container.mux(stream.encode(coded))
+        container.mux(stream.encode(None))
+    with open_source(video) as source:
+        whole = next(iter(source))
+    for field, level in (("top", 90), ("bottom", 170)):
+        assert {int(v) for plane in field_of(whole, field).chroma for v in plane.flat} == {level}

@@ -24,6 +24,15 @@ def benchmark(
         int | None,
         typer.Option(help="Frames of every dive, for a quick look.", show_default=False),
     ] = None,
+    shutter: Annotated[
+        str | None,
+        typer.Option(
+            metavar="KIND[:MS]",
+            help="rolling:READOUT:EXPOSURE, interlaced:EXPOSURE or global:EXPOSURE; all rows at "
+            "once if left out.",
+            show_default=False,
+        ),
+    ] = None,
     overwrite: Overwrite = False,
     list_: Annotated[bool, typer.Option("--list", help="List levels and dives and exit.")] = False,
 ) -> None:
@@ -36,7 +45,9 @@ def benchmark(
         return
     if out is None:
         raise OptionError("--out: missing; give the folder to write")
-    body.make_set(out, names or [], typer.echo, n_frames=frames, overwrite=overwrite)
+    body.make_set(
+        out, names or [], typer.echo, n_frames=frames, shutter=shutter, overwrite=overwrite
+    )
 
 
 def score(

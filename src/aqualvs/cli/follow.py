@@ -141,6 +141,14 @@ def follow(
             show_default=False,
         ),
     ] = None,
+    shutter: Annotated[
+        str | None,
+        typer.Option(
+            metavar="KIND[:MS]",
+            help="Sim, rendered: rolling:READOUT:EXPOSURE, interlaced:EXPOSURE, global:EXPOSURE.",
+            show_default=False,
+        ),
+    ] = None,
     fps: Annotated[float, typer.Option(help="Sim: frames a second.")] = 25.0,
     seed: Annotated[int, typer.Option(min=0, help="Sim: of waves and noise.")] = 0,
     freeze: Annotated[
@@ -172,6 +180,7 @@ def follow(
             fps=fps,
             rendered=rendered,
             camera=camera,
+            shutter=shutter,
             seed=seed,
             freeze=freeze,
             dashboard=dashboard_address if dashboard else None,

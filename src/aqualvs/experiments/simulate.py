@@ -6,9 +6,8 @@ from collections.abc import Callable, Collection
 from dataclasses import astuple, replace
 from pathlib import Path
 
-from aqualvs.errors import OptionError, RigError
+from aqualvs.errors import OptionError
 from aqualvs.optics.rigfile import load_rig, save_rig
-from aqualvs.optics.shutter import Shutter, ShutterKind
 from aqualvs.optics.solved import with_exact_numbers
 from aqualvs.results.files import Claim, writing
 from aqualvs.simulation.calibration_set import (
@@ -21,6 +20,7 @@ from aqualvs.simulation.cameras import SimulatedCamera, simulated_camera
 from aqualvs.simulation.dive import (
     LEAD_S,
     check_shutter,
+    shutter_from_words,
     simulate_dive,
     write_hole_truth,
     write_vehicle_log,
@@ -64,7 +64,7 @@ def simulate(
     camera : str
         Name of the camera that takes the pictures.
     shutter : str or None
-        As `shutter_from_words` reads it; None takes the rig's.
+        As `shutter_from_words` reads it; None takes the scenario's, or else the rig's.
     overwrite : bool
         Whether what is already there may be replaced.
 
@@ -94,7 +94,10 @@ def simulate(
     rig = example_rig() if rig_file is None else load_rig(rig_file)
     if shutter is not None:
         rig = replace(rig, shutter=shutter_from_words(shutter, course.fps))
-    check_shutter(rig.shutter, course)
+    elif course.shutter is not None:
+        place = f"scenario {scenario}: shutter"
+        rig = replace(rig, shutter=shutter_from_words(course.shutter, course.fps, place))
+    check_shutter(rig.shutter, course.fps)
     claim = Claim("simulate", [out / name for name in _FILES], overwrite=overwrite)
     video, truth = out / "dive.mp4", out / "truth.csv"
     with claim, writing(out), StopSignals() as stop, progress(scenario, course.n_frames) as tick:
@@ -138,43 +141,6 @@ def _stopping(
             raise _StoppedError(stop.caught.name, n_done, n_all, unit)
 
     return after
-
-
-def shutter_from_words(words: str, fps: float) -> Shutter:
-    """Return the shutter that the option `--shutter` names.
-
-    Parameters
-    ----------
-    words : str
-        `global`, `rolling:READOUT_MS` or `interlaced`, each with `:EXPOSURE_MS` at its end where
-        that is not 0.
-    fps : float
-        Frames a second; the fields of an interlaced picture are half a frame apart.
-
-    Raises
-    ------
-    OptionError
-        If they name no shutter.
-    """
-    kind, *numbers = words.split(":")
-    try:
-        milliseconds = [float(number) for number in numbers]
-        readout = 0.0
-        if kind == ShutterKind.ROLLING:
-            readout = 1e-3 * milliseconds.pop(0)
-        elif kind == ShutterKind.INTERLACED:
-            readout = 0.5 / fps
-        exposure = 1e-3 * milliseconds.pop(0) if milliseconds else 0.0
-        if milliseconds:
-            raise ValueError
-        return Shutter(kind=ShutterKind(kind), readout=readout, exposure=exposure)
-    except (ValueError, IndexError):
-        raise OptionError(
-            f"--shutter: {words!r} is none; write rolling:READOUT_MS:EXPOSURE_MS, "
-            "interlaced:EXPOSURE_MS or global:EXPOSURE_MS, such as rolling:20:8"
-        ) from None
-    except RigError as fault:
-        raise OptionError(f"--shutter: {words}: {fault}") from None
 
 
 def _write_net_truth(course: Scenario, out: Path) -> None:

@@ -9,7 +9,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -32,11 +32,13 @@ from aqualvs.live.options import serve_page
 from aqualvs.live.outputs.base import Output
 from aqualvs.live.pilot import PilotReport
 from aqualvs.optics.rig import Rig
+from aqualvs.optics.shutter import Shutter
 from aqualvs.recording.sample import Instants, LiveSample
 from aqualvs.results.files import Claim
 from aqualvs.scanning.posture import Posture, Refusal
 from aqualvs.scanning.scan import Frame, Scan, ScanPoints
 from aqualvs.simulation.cameras import simulated_camera
+from aqualvs.simulation.dive import check_shutter, shutter_from_words
 from aqualvs.simulation.net_motion import NetWall
 from aqualvs.simulation.scenarios import example_rig
 from aqualvs.sources.base import Health, PartHealth, State
@@ -273,6 +275,8 @@ class SimRequest:
         Render every frame and measure in it, instead of sampling the scanner's noise.
     camera : str or None
         Simulated camera that takes the rendered frames; the ideal one if left out.
+    shutter : str or None
+        Of that camera, as `shutter_from_words` reads it; all rows at once if left out.
     seed : int
     freeze : float or None
         When the picture begins to stand still, in seconds; never if left out.
@@ -298,6 +302,7 @@ class SimRequest:
     fps: float = 25.0
     rendered: bool = False
     camera: str | None = None
+    shutter: str | None = None
     seed: int = 0
     freeze: float | None = None
     dashboard: str | None = None
@@ -321,6 +326,10 @@ class SimRequest:
             raise OptionError(f"--fps {self.fps:g}: choose {_MIN_FPS:g} to {_MAX_FPS:g}")
         if self.camera is not None and not self.rendered:
             raise OptionError(f"--camera {self.camera}: takes rendered frames; add --rendered")
+        if self.shutter is not None:
+            if not self.rendered:
+                raise OptionError(f"--shutter {self.shutter}: of rendered frames; add --rendered")
+            check_shutter(shutter_from_words(self.shutter, self.fps), self.fps)
         if self.cage_radius and not self.cage_radius >= _MIN_RADIUS:
             raise OptionError(
                 f"--cage-radius {self.cage_radius:g}: choose at least {_MIN_RADIUS:g} m, or 0 "
@@ -349,8 +358,10 @@ def simulate_and_tell(request: SimRequest, echo: Callable[[str], object]) -> int
         If an input cannot be used, or the folder cannot be written.
     """
     rig = example_rig()
+    if request.shutter is not None:
+        rig = replace(rig, shutter=shutter_from_words(request.shutter, request.fps))
     mission, limits, setpoint = request.aim.mission(rig.working_range)
-    case = _case(request, limits, setpoint)
+    case = _case(request, limits, setpoint, rig.shutter)
     files = [request.out / name for name in (FOLLOW_CSV, TRUTH_CSV, PAGE, *FIGURE_FILES)]
     with Claim("follow", files, overwrite=request.overwrite):
         rng = np.random.default_rng([request.seed, 53])
@@ -380,7 +391,7 @@ def simulate_and_tell(request: SimRequest, echo: Callable[[str], object]) -> int
             current=request.current,
             waves=request.waves,
             rendered=request.rendered,
-            fps=request.fps,
+            fps=case.timing.fps,
         )
         report = write_report(loop.log, facts, request.out)
     for line in summary_lines(loop.log, facts):
@@ -389,7 +400,12 @@ def simulate_and_tell(request: SimRequest, echo: Callable[[str], object]) -> int
     return 0
 
 
-def _case(request: SimRequest, limits: SafetyLimits, setpoint: Setpoint) -> SimCase:
+def _case(
+    request: SimRequest, limits: SafetyLimits, setpoint: Setpoint, shutter: Shutter
+) -> SimCase:
+    timing = Timing(fps=request.fps)
+    if shutter.field_of(0) is not None:
+        timing = Timing(fps=2.0 * request.fps, field=shutter.readout)
     model = vehicle_model(request.vehicle, request.pilot_gain)
     return SimCase(
         model=model,
@@ -407,7 +423,7 @@ def _case(request: SimRequest, limits: SafetyLimits, setpoint: Setpoint) -> SimC
         ),
         start_range=setpoint.range,
         start_yaw=setpoint.yaw,
-        timing=Timing(fps=request.fps),
+        timing=timing,
         limits=limits,
         seed=request.seed,
     )

@@ -113,10 +113,14 @@ class Timing:
         Frames a second.
     delay : float
         From the exposure to the measured posture, in seconds.
+    field : float
+        Time that every other frame, from the first on, waits for the next besides, in seconds: as
+        the first field of an interlaced picture does for the second.
     """
 
     fps: float = 25.0
     delay: float = 0.06
+    field: float = 0.0
 
     def __post_init__(self) -> None:
         """Refuse impossible values.
@@ -126,7 +130,7 @@ class Timing:
         OptionError
             If there are no frames, or they come before their time.
         """
-        if not (self.fps > 0.0 and self.delay >= 0.0):
+        if not (self.fps > 0.0 and self.delay >= 0.0 and self.field >= 0.0):
             raise OptionError(
                 f"simulated loop: {self.fps:g} frames a second, delay {self.delay:g} s; the first "
                 "is positive, the second 0 or more"
@@ -268,7 +272,12 @@ class SimulatedLoop:
         """Take a frame, and write down how things stand."""
         posture = self.eye.look(self.link.vehicle.dome_pose, now_s)
         if posture is not None:
-            self._sight.coming.append(_Arrival(now_s + self.timing.delay, now_s, posture))
+            coming = self._sight.coming
+            wait_s = 0.0 if len(self.log.rows) % 2 else self.timing.field
+            at_s = now_s + self.timing.delay + wait_s
+            # The fields of a picture arrive at one moment, but for rounding.
+            at_s = max(at_s, coming[-1].at_s) if coming else at_s
+            coming.append(_Arrival(at_s, now_s, posture))
         self.log.rows.append(self._row(now_s, posture))
 
     def _arrive(self, arrival: _Arrival) -> None:

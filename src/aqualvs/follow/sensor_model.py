@@ -13,9 +13,10 @@ from enum import StrEnum
 import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray
-from aqualvs.geometry.transforms import SE3
+from aqualvs.geometry.transforms import SE3, rotation_from_rotvec, rotvec_from_rotation
 from aqualvs.live.health_monitor import FrozenPicture
 from aqualvs.optics.rig import Rig
+from aqualvs.optics.shutter import FIRST_ROW, Field
 from aqualvs.scanner import Scanner, ScannerOptions
 from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.scan import Frame, Planes, Scan, planes_of_image
@@ -36,6 +37,10 @@ def net_scene(seed: int = 0) -> Scene:
 
 class RenderedSensor:
     """Sensor that renders the camera's picture from a vehicle, and measures in it.
+
+    A picture is what the rig's shutter saw until it was read out: rows show where the vehicle was
+    when they were exposed, between its poses at this frame and at the one before. Frames of an
+    interlaced camera are its fields, one by one.
 
     Parameters
     ----------
@@ -77,29 +82,52 @@ class RenderedSensor:
         self._renderer = Renderer(rig, samples=samples, camera=camera)
         self._scanner = Scanner(rig, options)
         self._n_frames = 0
-        self._freeze_s, self._frozen = freeze_s, FrozenPicture()
-        self._planes: Planes | None = None
+        self._freeze_s = freeze_s
+        self._frozen: dict[Field | None, FrozenPicture] = {}
+        self._planes: dict[Field | None, Planes] = {}
+        self._poses: deque[tuple[float, SE3]] = deque(maxlen=2)
         self.shots: deque[tuple[Frame, Scan]] = deque(maxlen=_N_KEPT)
 
     def look(self, world_from_dome: SE3, time_s: float) -> Posture | Refusal:
-        """Return the result for the frame exposed now; None for a lost frame."""
-        if self._planes is None or time_s < self._freeze_s:
-            self._planes = self._rendered(world_from_dome, time_s)
-        frame = Frame(self._n_frames, time_s, *self._planes)
+        """Return the result for the frame whose exposure ends now; None for a lost frame."""
+        self._poses.append((time_s, world_from_dome))
+        field = self._scanner.rig.shutter.field_of(self._n_frames)
+        if field not in self._planes or time_s < self._freeze_s:
+            self._planes[field] = self._rendered(time_s, field)
+        frame = Frame(self._n_frames, time_s, *self._planes[field], field=field)
         self._n_frames += 1
         # As the live run does.
-        still_s = self._frozen.update(time_s, frame.luma)
+        still_s = self._frozen.setdefault(field, FrozenPicture()).update(time_s, frame.luma)
         if still_s > 0.0:
             return Refusal(Reason.FROZEN, f"the same picture for {still_s:.1f} s")
         scan = self._scanner.process(frame)
         self.shots.append((frame, scan))
         return scan.posture
 
-    def _rendered(self, world_from_dome: SE3, time_s: float) -> Planes:
-        scene = self._net.scene_at(world_from_dome, time_s, self._scene)
-        image = self._renderer.render(scene, time_s, self._rng).image
+    def _rendered(self, time_s: float, field: Field | None) -> Planes:
+        shutter = self._scanner.rig.shutter
+        middle_s = time_s - 0.5 * shutter.exposure
+        if field is not None:
+            image = self._renderer.exposed_at(self._scene_at, middle_s, self._rng)
+            image = image[FIRST_ROW[field] :: 2][: len(image) // 2]
+        else:
+            middle_s -= 0.5 * shutter.readout
+            image = self._renderer.take(self._scene_at, middle_s, self._rng).image
         # OpenCV's order of colours.
         return planes_of_image(np.ascontiguousarray(image[:, :, ::-1]))
+
+    def _scene_at(self, time_s: float) -> Scene:
+        return self._net.scene_at(self._pose_at(time_s), time_s, self._scene)
+
+    def _pose_at(self, time_s: float) -> SE3:
+        """Return the vehicle's pose between the last two frames."""
+        (early_s, early), (late_s, late) = self._poses[0], self._poses[-1]
+        if time_s >= late_s or late_s == early_s:
+            return late
+        share = (time_s - early_s) / (late_s - early_s)
+        turn = rotation_from_rotvec(share * rotvec_from_rotation(early.rotation.T @ late.rotation))
+        way = late.translation - early.translation
+        return SE3(early.rotation @ turn, early.translation + share * way)
 
 
 # Approximate number of inliers of a posture by the example rig.

@@ -26,8 +26,10 @@ from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.rigfile import rig_to_mapping, save_rig
+from aqualvs.optics.shutter import ShutterKind
 from aqualvs.optics.solved import with_exact_numbers
 from aqualvs.simulation.cameras import expose, spread
+from aqualvs.simulation.dive import frames_of_picture
 from aqualvs.simulation.render import Renderer, SceneAt
 from aqualvs.simulation.scenario import Scenario, parse_scenario
 from aqualvs.simulation.scenarios import example_rig
@@ -408,7 +410,7 @@ def render_benchmark_dive(
     dive : BenchmarkDive
         Dive to render.
     renderer : Renderer
-        For `benchmark_rig()`.
+        For `benchmark_rig()`, with any shutter; of an interlaced one each field is a frame.
     folder : Path
         Files of the same names in it are replaced.
     tick : callable
@@ -424,15 +426,30 @@ def render_benchmark_dive(
     scenario = dive.scenario
     with (
         (folder / "truth.csv").open("w", newline="", encoding="utf-8") as file,
-        VideoWriter(folder / "dive.mp4", renderer.rig.size_px, scenario.fps) as video,
+        VideoWriter(
+            folder / "dive.mp4",
+            renderer.rig.size_px,
+            scenario.fps,
+            first_field=renderer.rig.shutter.field_of(0),
+        ) as video,
     ):
         table = csv.writer(file)
         table.writerow(TRUTH_COLUMNS)
+        shutter = renderer.rig.shutter
         for i, t in enumerate(scenario.times()):
             rng = np.random.default_rng([scenario.seed, i])
-            image, lit = render_with_visible(renderer, scenario.scene_at, t, rng)
+            if shutter.kind is not ShutterKind.INTERLACED:
+                image, lit = render_with_visible(renderer, scenario.scene_at, t, rng)
+                frames = [(i, t, lit)]
+            else:
+                image = renderer.take(scenario.scene_at, t + 0.5 * shutter.readout, rng).image
+                frames = [
+                    (frame, at, visible_lit(renderer, scenario.scene_at(at), at))
+                    for frame, at in frames_of_picture(i, t, shutter)
+                ]
             video.write(image)
-            table.writerow([i, f"{t:.4f}", *truth_cells(scenario.scene_at(t), lit)])
+            for frame, at, lit in frames:
+                table.writerow([frame, f"{at:.4f}", *truth_cells(scenario.scene_at(at), lit)])
             tick(1)
 
 
@@ -450,12 +467,23 @@ def render_with_visible(
         image = expose(spread(radiance, scene.water, scene.sensor), scene.sensor, rng)
     else:
         image = renderer.take(scene_at, t, rng).image
+    return image, visible_lit(renderer, scene, t, radiance)
+
+
+def visible_lit(
+    renderer: Renderer, scene: Scene, t: float, radiance: NDArray[np.float32] | None = None
+) -> LitPoints:
+    """Return the visible stripe points on the target of a scene at time `t`.
+
+    `radiance` is that of the scene, if it is known.
+    """
     lit = renderer.lit_points(scene, t)
     label = _LABELS[scene.target]
     if not np.any(lit.label == label):
-        return image, _part(lit, np.empty(0, np.int64))
-    contrast = stripe_contrast(renderer, scene, t, radiance, lit)
-    return image, _part(lit, visible_points(lit, label, contrast))
+        return _part(lit, np.empty(0, np.int64))
+    seen = renderer.radiance(scene, t) if radiance is None else radiance
+    contrast = stripe_contrast(renderer, scene, t, seen, lit)
+    return _part(lit, visible_points(lit, label, contrast))
 
 
 def truth_cells(scene: Scene, visible: LitPoints) -> list[Cell]:

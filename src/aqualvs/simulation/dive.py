@@ -13,7 +13,7 @@ from typing import TextIO
 
 import numpy as np
 
-from aqualvs.errors import OptionError, OutputError
+from aqualvs.errors import OptionError, OutputError, RigError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.transforms import SE3
 from aqualvs.optics.rig import Rig
@@ -183,7 +183,7 @@ def simulate_dive(
     RigError, OptionError
         If rig, scenario or options make no sense, or a picture takes longer than a frame.
     """
-    check_shutter(rig.shutter, scenario)
+    check_shutter(rig.shutter, scenario.fps)
     _make_folder(out_dir)
     video, truth = out_dir / "dive.mp4", out_dir / "truth.csv"
     renderer = Renderer(rig, threads=threads or os.cpu_count() or 1, camera=camera)
@@ -207,7 +207,7 @@ def simulate_dive(
             middle = t + 0.5 * rig.shutter.readout if is_interlaced else t
             picture = renderer.take(scenario.scene_at, middle, rng)
             writer.write(picture.image)
-            for frame, at in _frames_of(i, t, rig.shutter):
+            for frame, at in frames_of_picture(i, t, rig.shutter):
                 scene = scenario.scene_at(at)
                 lit = renderer.lit_points(scene, at) if is_interlaced else picture.lit
                 row = truth_row(frame, at, scene, rig, lit)
@@ -219,15 +219,54 @@ def simulate_dive(
     return DiveFiles(video, truth, tuple(points), scenario.n_frames)
 
 
-def _frames_of(picture: int, t: float, shutter: Shutter) -> list[tuple[int, float]]:
+def frames_of_picture(picture: int, t: float, shutter: Shutter) -> list[tuple[int, float]]:
     """Return number and time of the frames that a picture makes."""
     if shutter.kind is not ShutterKind.INTERLACED:
         return [(picture, t)]
     return [(2 * picture, t), (2 * picture + 1, t + shutter.readout)]
 
 
-def check_shutter(shutter: Shutter, scenario: Scenario) -> None:
-    """Refuse a shutter that takes longer for a picture than a scenario's frames are apart.
+def shutter_from_words(words: str, fps: float, place: str = "--shutter") -> Shutter:
+    """Return the shutter that words name, of the option `--shutter` or of a scenario.
+
+    Parameters
+    ----------
+    words : str
+        `global`, `rolling:READOUT_MS` or `interlaced`, each with `:EXPOSURE_MS` at its end where
+        that is not 0.
+    fps : float
+        Pictures a second; the fields of an interlaced one are half a picture apart.
+    place : str
+        Where the words come from, for the error.
+
+    Raises
+    ------
+    OptionError
+        If they name no shutter.
+    """
+    kind, *numbers = words.split(":")
+    try:
+        milliseconds = [float(number) for number in numbers]
+        readout = 0.0
+        if kind == ShutterKind.ROLLING:
+            readout = 1e-3 * milliseconds.pop(0)
+        elif kind == ShutterKind.INTERLACED:
+            readout = 0.5 / fps
+        exposure = 1e-3 * milliseconds.pop(0) if milliseconds else 0.0
+        if milliseconds:
+            raise ValueError
+        return Shutter(kind=ShutterKind(kind), readout=readout, exposure=exposure)
+    except (ValueError, IndexError):
+        raise OptionError(
+            f"{place}: {words!r} is none; write rolling:READOUT_MS:EXPOSURE_MS, "
+            "interlaced:EXPOSURE_MS or global:EXPOSURE_MS, such as rolling:20:8"
+        ) from None
+    except RigError as fault:
+        raise OptionError(f"{place}: {words}: {fault}") from None
+
+
+def check_shutter(shutter: Shutter, fps: float) -> None:
+    """Refuse a shutter that takes longer for a picture than pictures are apart.
 
     Raises
     ------
@@ -238,11 +277,11 @@ def check_shutter(shutter: Shutter, scenario: Scenario) -> None:
     needed = abs(shutter.readout) * (2.0 if shutter.kind is ShutterKind.INTERLACED else 1.0)
     needed = max(needed, shutter.exposure)
     # NTSC's fields are stated to a few digits.
-    if needed > (1.0 + 1e-3) / scenario.fps:
+    if needed > (1.0 + 1e-3) / fps:
         raise OptionError(
             f"the {shutter.kind.value} shutter takes {1e3 * needed:g} ms for a picture, but at "
-            f"{scenario.fps:g} frames a second there are {1e3 / scenario.fps:g} ms; lower the "
-            "scenario's fps, or give a faster shutter"
+            f"{fps:g} frames a second there are {1e3 / fps:g} ms; lower "
+            "fps, or give a faster shutter"
         )
 
 

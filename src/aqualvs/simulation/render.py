@@ -274,17 +274,20 @@ class Renderer:
             return self.render(scene, t, rng)
         if shutter.kind is ShutterKind.INTERLACED:
             half = 0.5 * shutter.readout
-            fields = [self._developed(scene_at, at, rng) for at in (t - half, t + half)]
+            fields = [self.exposed_at(scene_at, at, rng) for at in (t - half, t + half)]
             image = fields[1]
             image[shutter.first_row :: 2] = fields[0][shutter.first_row :: 2]
         else:
-            image = self._developed(scene_at, t, rng)
+            image = self.exposed_at(scene_at, t, rng)
         return RenderedFrame(image, self.lit_points(scene, t))
 
-    def _developed(
-        self, scene_at: SceneAt, t: float, rng: np.random.Generator | None
+    def exposed_at(
+        self, scene_at: SceneAt, t: float, rng: np.random.Generator | None = None
     ) -> NDArray[np.uint8]:
-        """Return the picture of rows that are exposed around time `t`."""
+        """Return a picture exposed around time `t`: of an interlaced camera, all rows at once.
+
+        Of a field only its own rows count. See `take` for the arguments.
+        """
         scene = scene_at(t)
         light = self._exposed(scene_at, t)
         add_snow(light, self.rig.camera(), self.camera.light(scene), t, self._pack(scene, t)[1])

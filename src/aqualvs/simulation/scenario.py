@@ -221,6 +221,8 @@ class Scenario:
         Frames a second.
     seed : int
         Seed of noise and everything else that is random.
+    shutter : str or None
+        Of the camera, in the words of `--shutter`; None leaves the rig's.
     trajectory : Trajectory
         Posture of the vehicle over time.
     target : {"net", "wall", "none"}
@@ -243,6 +245,7 @@ class Scenario:
     water: WaterOptics = field(default_factory=WaterOptics)
     sensor: CameraSensor = field(default_factory=CameraSensor)
     lasers_on: bool = True
+    shutter: str | None = None
 
     @property
     def n_frames(self) -> int:
@@ -391,6 +394,7 @@ class ScenarioFile(_Strict):
     water: WaterFile = WaterFile()
     sensor: SensorFile = SensorFile()
     lasers_on: bool = True
+    shutter: str | None = None
 
     def scenario(self, name: str) -> Scenario:
         """Return the scenario that the file describes, in SI units."""
@@ -412,6 +416,7 @@ class ScenarioFile(_Strict):
             water=_water(self.water),
             sensor=CameraSensor(**self.sensor.model_dump()),
             lasers_on=self.lasers_on,
+            shutter=self.shutter,
         )
 
 

@@ -195,13 +195,15 @@ _MOVING_SHARE, _STILL_WHOLE = 2e-3, 0.02
 
 def combed_share(luma: ImagePlane) -> float:
     """Return the share of pixels whose rows alternate as those of two fields of what moves."""
-    # Along the rows, against the noise of uncompressed pictures.
-    rows = cv2.blur(luma, (_COMBED_COLUMNS, 1)).astype(np.int16)
+    # Along the rows, against the noise of uncompressed pictures; what is left of detail there does
+    # without most of the columns.
+    blurred = cv2.blur(luma, (_COMBED_COLUMNS, 1))[:, _COMBED_COLUMNS // 2 :: _COMBED_COLUMNS]
+    rows = blurred.astype(np.int16)
     bend = 2 * rows[1:-1] - rows[:-2] - rows[2:]
     bend[1::2] *= -1
     column = np.ones((_COMBED_ROWS, 1), np.uint8)
     n = sum(np.count_nonzero(cv2.erode(one, column) > 2 * _COMBED_LEVELS) for one in (bend, -bend))
-    return n / luma.size
+    return float(n / rows.size)
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,7 @@ import csv
 import math
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,7 @@ from aqualvs.simulation.benchmark import (
     benchmark_rig,
     render_benchmark_dive,
 )
+from aqualvs.simulation.dive import shutter_from_words
 from aqualvs.simulation.render import Renderer
 from aqualvs.special_files import refuse_special
 from aqualvs.terminal import progress
@@ -296,6 +297,7 @@ def _read_yaml(path: Path) -> dict[str, Any]:
 
 
 _README_MD = "README.md"
+_PICTURES_A_SECOND = 25.0
 
 
 def make_set(
@@ -304,6 +306,7 @@ def make_set(
     echo: Callable[[str], object],
     *,
     n_frames: int | None,
+    shutter: str | None = None,
     overwrite: bool,
 ) -> None:
     """Render dives of the set, with truth and a README, into a folder.
@@ -318,6 +321,10 @@ def make_set(
         Takes one line of text.
     n_frames : int or None
         Frames of every dive; None for all.
+    shutter : str or None
+        Of the camera, as `shutter_from_words` reads it for 25 pictures a second, which the set's
+        few are some of; None exposes all rows at once. A set with a shutter is a part: its scores
+        stand for themselves.
     overwrite : bool
         Whether a set that is there may be replaced.
 
@@ -331,7 +338,10 @@ def make_set(
     dives = chosen_dives(names, n_frames)
     files = [out / name for name in (SET_FILE, _README_MD, *(dive.name for dive in dives))]
     claim = Claim("benchmark", files, overwrite=overwrite)
-    renderer = Renderer(benchmark_rig(), threads=os.cpu_count() or 1)
+    rig = benchmark_rig()
+    if shutter is not None:
+        rig = replace(rig, shutter=shutter_from_words(shutter, _PICTURES_A_SECOND))
+    renderer = Renderer(rig, threads=os.cpu_count() or 1)
     total = sum(dive.scenario.n_frames for dive in dives)
     with claim, writing(out), progress(BENCHMARK_NAME, total) as tick:
         # Written last: a set that was interrupted is none.
@@ -340,7 +350,10 @@ def make_set(
             render_benchmark_dive(dive, renderer, out / dive.name, tick=tick)
             (out / dive.name / TARGET_FILE).write_text(target_text(dive), encoding="utf-8")
         (out / _README_MD).write_text(README, encoding="utf-8")
-        content = yaml.safe_dump(set_facts(dives), sort_keys=False, width=100)
+        facts = set_facts(dives)
+        if shutter is not None:
+            facts |= {"whole": False, "shutter": shutter}
+        content = yaml.safe_dump(facts, sort_keys=False, width=100)
         (out / SET_FILE).write_text(content, encoding="utf-8")
     echo(f"{len(dives)} dives, {total} frames: {out}")
     echo(f"what is in it, and what to write: {out / _README_MD}")
