@@ -38,7 +38,7 @@ def test_boards_before_a_flat_port_are_in_water_at_their_true_poses(tmp_path):
     rig = replace(
         small_rig(),
         housing=FlatPort(0.012, 0.005, 1.49, 0.01, -0.01),
-        dome_from_cam=SE3(small_rig().dome_from_cam.rotation, np.zeros(3)),
+        dome_from_cam=SE3(DOME_FROM_CAM_NOMINAL, np.zeros(3)),
     )
     size = SetSize(camera=1, dome=2, box=1, index=1, dive=0)
     files = simulate_calibration(rig, tmp_path, size=size)
@@ -162,6 +162,12 @@ def test_a_rig_that_cannot_be_calibrated_wholly_is_refused(change, tmp_path):
     with pytest.raises(OptionError, match=next(iter(change))):
         simulate_calibration(replace(small_rig(), **change), tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_a_flat_port_and_a_turned_camera_are_refused(tmp_path):
+    rig = replace(small_rig(), housing=FlatPort(0.012, 0.005, 1.49))
+    with pytest.raises(OptionError, match=r"leave camera.position_mm and camera.rotation_deg"):
+        simulate_calibration(rig, tmp_path / "out")
 
 
 def test_too_few_pictures_are_refused(tmp_path):

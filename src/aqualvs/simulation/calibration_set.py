@@ -187,7 +187,8 @@ def simulate_calibration(
     Raises
     ------
     OptionError
-        If the rig has no housing or no lasers, or there are too few pictures.
+        If the rig has no housing or no lasers, a camera behind a flat port that is not in the
+        frame's origin and straight ahead, or there are too few pictures.
     OutputError
         If the folder or a file cannot be written.
     """
@@ -208,6 +209,15 @@ def _check(rig: Rig, size: SetSize) -> None:
         raise OptionError(
             f"rig {rig.name} has no {missing}; pictures for a whole calibration need a rig with "
             "housing and lasers"
+        )
+    pose = rig.dome_from_cam
+    if rig.flat_port is not None and not (
+        np.allclose(pose.rotation, DOME_FROM_CAM_NOMINAL, rtol=0.0, atol=1e-9)
+        and not pose.translation.any()
+    ):
+        raise OptionError(
+            f"rig {rig.name}: behind a flat port no picture tells where the camera is on the "
+            "vehicle; leave camera.position_mm and camera.rotation_deg at zero"
         )
     if min(size.camera, size.dome, size.box, size.index) < 1 or size.dive < 0:
         raise OptionError(f"{size}: every kind needs one picture at least")
