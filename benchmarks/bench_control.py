@@ -15,6 +15,7 @@ import numpy as np
 
 from aqualvs.control.gains_file import load_gains
 from aqualvs.control.missions import HoldMission
+from aqualvs.control.safety import SafetyLimits
 from aqualvs.control.vehicle import Setpoint
 from aqualvs.follow.case import (
     FROM_REST_S,
@@ -115,7 +116,7 @@ def _dives(name: str, n: int) -> list[dict[str, Any]]:
         _row(f"{name}: {n} dives, contacts", count([d.safety.contact for d in found]), "", None),
         _row(f"{name}: {n} dives, unstable", count([_unstable(d) for d in found]), "", None),
         _row(f"{name}: {n} dives, sight lost", count([_lost(d) for d in found]), "", None),
-        _row(f"{name}: {n} dives, tipped over", count([_tipped(d) for d in found]), "", None),
+        _row(f"{name}: {n} dives, warned of tipping", count([_warned(d) for d in found]), "", None),
         _row(f"{name}: {n} dives, nearest", nearest, "m", None),
         _row(f"{name}: {n} dives, neutral after", late, "s", 0.2),
     ]
@@ -125,8 +126,8 @@ def _unstable(dive: DiveResult) -> bool:
     return not dive.safety.stable
 
 
-def _tipped(dive: DiveResult) -> bool:
-    return dive.safety.greatest_tilt > math.radians(60.0)
+def _warned(dive: DiveResult) -> bool:
+    return dive.safety.greatest_tilt > SafetyLimits().tilt
 
 
 def _lost(dive: DiveResult) -> bool:

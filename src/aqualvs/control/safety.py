@@ -393,6 +393,9 @@ _OFF = 0.05
 # A picture that stands still is noticed within so many seconds: older postures are live. Slower
 # vehicles, in m/s, coast by little and are not braked: a hold in swell swings at 0.03.
 _TRUSTED_S, _SLOW = 0.6, 0.05
+# Water that passes at this speed and grows faster by so much, in m/s, takes efforts that promise a
+# way: the more the greater the drag.
+_WATER, _WATER_CHANGE = 0.4, 0.024
 # Greatest change between two reports of a heading; a greater one is a reset compass.
 _MAX_TURN = math.radians(20.0)
 
@@ -414,19 +417,19 @@ class AnswerLimits:
         Efforts and motion are compared over this time, in seconds.
     promised : float
         Way towards the target by the efforts, in metres, that a posture which stands still must
-        answer to. Standing still is 0.6 % of the range and 0.6 degrees: waters that take so much
-        from the efforts move the vehicle by more.
+        answer to, in water that does not change. Standing still is 0.6 % of the range and 0.6
+        degrees.
     turned : float
         Turn of the heading within `window_s` that a posture which stands still must answer to, in
         radians. An even way along a curved net turns the heading, too: at 0.8 m/s, the current's
-        speed included, and a radius of 8 m by 7.5 degrees.
+        speed included, and a radius of 8 m by 10 degrees.
     """
 
     repeats_s: float = 0.2
     quiet: float = 0.1
-    window_s: float = 1.3
-    promised: float = 0.15
-    turned: float = math.radians(9.5)
+    window_s: float = 1.7
+    promised: float = 0.11
+    turned: float = math.radians(12.0)
 
     def __post_init__(self) -> None:
         """Refuse limits that cannot work.
@@ -475,6 +478,8 @@ class AnswerWatch:
     def __init__(self, vehicle: VehicleFacts, limits: AnswerLimits | None = None) -> None:
         self.limits = limits or AnswerLimits()
         self._vehicle = vehicle
+        change = vehicle.forward_drag.slope(_WATER) * _WATER_CHANGE / vehicle.mass
+        self._promised = self.limits.promised + 0.5 * change * self.limits.window_s**2
         self._noise = _Noise(self.limits.quiet)
         self.reset()
 
@@ -544,7 +549,8 @@ class AnswerWatch:
         if first is last:
             return 0.0
         speed = (first.range - last.range) / (last.time_s - first.time_s)
-        speed += self._speed - last.speed
+        kept = math.exp(-self._damping() * (self._now_s - last.time_s))
+        speed = kept * (speed - last.speed) + self._speed
         thrust = self._vehicle.thrust
         force = self._vehicle.mass * speed / BRAKE_S
         return thrust.effort(force / thrust.backward) if speed > _SLOW else 0.0
@@ -565,7 +571,8 @@ class AnswerWatch:
         if not 0.0 < step < _SLOPE_S:
             self._moments.clear()
             self._told = math.nan
-            step = 0.0
+            # It has drifted: other efforts may be needed to hold it.
+            step = self._thrust_s = 0.0
         # Sideways thrust balances the drag of a way along the target; it predicts no approach.
         forward, _ = self._vehicle.thrust.forces(self._effort.forward, self._effort.right)
         push = forward * math.cos(yaw) / self._vehicle.mass
@@ -576,13 +583,22 @@ class AnswerWatch:
             share = step / (step + min(self._thrust_s, _BALANCE_S))
             self._balance += share * (push - self._balance)
         self._way += step * self._speed
-        self._speed += step * (push - self._balance)
+        kept = math.exp(-self._damping() * step)
+        self._speed = kept * self._speed + step * (push - self._balance)
         if state.heading is None:
             return
         turn = math.remainder(state.heading - self._told, 2.0 * math.pi)
         if abs(turn) < _MAX_TURN:
             self._heading += turn
         self._told = state.heading
+
+    def _damping(self) -> float:
+        """Return the rate, per second, at which drag takes away a speed.
+
+        The balance is the drag of the water that passes.
+        """
+        drag, mass = self._vehicle.forward_drag, self._vehicle.mass
+        return drag.slope(drag.speed(mass * self._balance)) / mass
 
     def _is_unanswered(self) -> bool:
         first, last = self._moments[0], self._moments[-1]
@@ -591,12 +607,14 @@ class AnswerWatch:
             return False
         span = last.time_s - begin.time_s
         before = (first.range - begin.range) / (begin.time_s - first.time_s)
-        promised = last.way - begin.way + (before - begin.speed) * span
+        damping = self._damping()
+        coasting = -math.expm1(-damping * span) / damping if damping else span
+        promised = last.way - begin.way + (before - begin.speed) * coasting
         turned = abs(last.heading - begin.heading)
         pushed = last.time_s - self._backed_s > _PUSHED_S and self._thrust_s > _BALANCED_S
         # Near its setpoint the vehicle's thrust balances the changing current.
         pushed = pushed and last.range - self._wanted > _OFF
-        promises = promised > self.limits.promised and pushed
+        promises = promised > self._promised and pushed
         if not promises and turned < self.limits.turned:
             return False
         lately = [m for m in self._moments if m.time_s >= begin.time_s]
