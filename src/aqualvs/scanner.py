@@ -219,7 +219,7 @@ class Scanner:
             found = _refuse_chance_plane(candidates)
         elif tested.verdict is Verdict.AMBIGUOUS and tested.other is not None:
             found = _refuse_ambiguous(candidates, target.plane, tested.other)
-        elif self.options.target is TargetKind.AUTO and self._assignment.may_hide_net(
+        elif self.options.target is TargetKind.AUTO and assignment.may_hide_net(
             candidates, subsegments, surfaces, target
         ):
             found = _refuse_hidden_net(candidates, target.plane)
