@@ -69,6 +69,19 @@ def test_options_take_the_place_of_the_files_values(tmp_path, capsys):
     assert "Laser 'lower' is in the picture at" in said
 
 
+def test_a_flat_port_takes_the_place_of_the_dome(tmp_path, capsys):
+    options = ["--flat-mm", "12:5", "--no-changes", "--no-tilt"]
+    assert main(["design", *options, "-o", str(tmp_path)]) == 0
+    said = capsys.readouterr().out
+    assert "flat port 12 mm ahead, 5 mm thick, lens at (0, 0, 0) mm" in said
+    rig = load_rig(tmp_path / "rig.yaml")
+    assert rig.dome is None
+    assert rig.flat_port is not None
+    assert rig.flat_port.distance == pytest.approx(0.012)
+    assert main(["design", *options, "--dome-mm", "51:6"]) == 2
+    assert "dome and flat are both given" in capsys.readouterr().err
+
+
 def test_the_rig_it_writes_is_sane_and_measures_as_predicted(folder, capsys):
     assert main(["check", str(folder / "rig.yaml")]) == 0
     assert "This rig is sane" in capsys.readouterr().out

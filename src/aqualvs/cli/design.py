@@ -45,6 +45,14 @@ def design(
             metavar="RADIUS:THICKNESS", help="Inner radius and thickness.", show_default=False
         ),
     ] = None,
+    flat_mm: Annotated[
+        str | None,
+        typer.Option(
+            metavar="DISTANCE:THICKNESS",
+            help="A flat port in the dome's place: ahead of the lens.",
+            show_default=False,
+        ),
+    ] = None,
     lens_mm: Annotated[
         str | None,
         typer.Option(
@@ -86,6 +94,7 @@ def design(
             "fov_deg": fov_deg,
         },
         "dome": _numbers(dome_mm, ":", ("inner_radius_mm", "thickness_mm"), "--dome-mm"),
+        "flat": _numbers(flat_mm, ":", ("distance_mm", "thickness_mm"), "--flat-mm"),
         "lens": _listed(lens_mm, ",", "position_mm", 3, "--lens-mm"),
         "lasers": {
             "count": lasers,

@@ -220,8 +220,18 @@ def example_content() -> dict[str, Any]:
 
 
 def merged_content(content: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the content of a file with some values replaced; `given` maps part to its keys."""
+    """Return the content of a file with some values replaced; `given` maps part to its keys.
+
+    A flat port replaces the dome, and the place of the lens in it; a dome replaces a flat port.
+    """
     merged = dict(content)
+    if "flat" in given and "dome" not in given and "dome" in merged:
+        del merged["dome"]
+        merged["lens"] = {
+            key: v for key, v in merged.get("lens", {}).items() if key != "position_mm"
+        }
+    elif "dome" in given and "flat" not in given:
+        merged.pop("flat", None)
     for part, values in given.items():
         if part == "lasers" and "mounts" in merged:
             raise OptionError("the file has mounts one by one; change them there, not by options")
