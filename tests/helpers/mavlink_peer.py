@@ -8,10 +8,8 @@ import contextlib
 import json
 import math
 import os
-import pty
 import threading
 import time
-import tty
 
 from pymavlink import mavutil
 
@@ -22,6 +20,10 @@ class PtyPeer(mavutil.mavfile):  # type: ignore[misc]
     """The far end of a serial line."""
 
     def __init__(self, link: str, **ids: int) -> None:
+        # Windows has neither; the peer's other addresses work there.
+        import pty
+        import tty
+
         self.far, self.near = pty.openpty()
         tty.setraw(self.near)
         os.set_blocking(self.far, False)

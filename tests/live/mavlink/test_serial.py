@@ -5,7 +5,6 @@ import os
 import select
 import sys
 import threading
-import tty
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -15,7 +14,8 @@ from aqualvs.errors import OptionError
 from aqualvs.live.mavlink.ports import check_address, open_port, parse_address
 from waiting import TIMEOUT_S, until
 
-pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="no pseudo terminals")
+# Windows has no pseudo terminals.
+tty = pytest.importorskip("tty")
 
 
 @pytest.fixture
