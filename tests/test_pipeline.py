@@ -167,6 +167,15 @@ def test_a_signal_stops_after_the_current_frame(request_for, dive, number):
     assert signal.getsignal(number) is before
 
 
+@pytest.fixture
+def interruptible():
+    """SIGINT interrupts Python, as usual; what a script starts in the background ignores it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("interruptible")
 def test_the_second_signal_is_not_caught():
     with StopSignals() as stop:
         signal.raise_signal(signal.SIGINT)

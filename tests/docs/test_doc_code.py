@@ -115,6 +115,8 @@ def test_yaml_is_what_it_is_shown_for(block: Block, tmp_path):
     else:
         text = next(b.text for b in YAML if b.page == "rig.md")
         whole = {} if "aqualvs_rig" in shown else yaml.safe_load(text)
+        if "flat" in shown:
+            del whole["dome"]
         for key, value in shown.items():
             # Some keys of a section stand for what the rest of it has in the first block.
             whole[key] = whole.get(key, {}) | value if isinstance(value, dict) else value

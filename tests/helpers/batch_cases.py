@@ -15,7 +15,7 @@ from aqualvs.results.run_request import RunRequest
 DEMO = Path(str(bundled_dive()))
 """A net with a hole among fish and bubbles, and its rig."""
 
-_TIMES = re.compile(rb"20\d\d-\d\d-\d\dT[0-9:+]+")
+_TIMES = re.compile(rb"20\d\d-\d\d-\d\d[T ][0-9:+]+")
 RESULTS = ("posture.csv", "posture_bare.csv", "points.parquet", "points.ply", "run.yaml")
 
 

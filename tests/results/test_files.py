@@ -41,6 +41,7 @@ QUICK: dict[str, tuple[list[str], list[str]]] = {
         ["DIVE", "--box", "b.yaml", "--rig", "r.yaml", "-o", "rig.yaml"],
         ["rig.yaml"],
     ),
+    "calibrate shutter": (["DIVE", "--rig", "r.yaml", "-o", "rig.yaml"], ["rig.yaml"]),
     "calibrate water": (
         ["DIVE", "--target", "t.yaml", "--rig", "r.yaml", "-o", "rig.yaml"],
         ["rig.yaml"],
