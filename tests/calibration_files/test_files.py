@@ -2,6 +2,7 @@
 
 import ast
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -21,6 +22,7 @@ from aqualvs.calibration_files import (
 )
 from aqualvs.calibration_files.command import ExportRequest, run_export
 from aqualvs.calibration_formats import CalibrationFormat, recognised
+from aqualvs.demo import bundled_dive
 from aqualvs.errors import AqualvsError, CalibrationError, RigError
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
 from aqualvs.optics.flat_port import FlatPort
@@ -30,7 +32,8 @@ from aqualvs.optics.rigfile import load_rig, save_rig
 from aqualvs.simulation.scenarios import flat_port_rig
 from repository import ROOT
 
-RIG = load_rig(ROOT / "src/aqualvs/data/demo/rig.yaml")
+DEMO = Path(str(bundled_dive()))
+RIG = load_rig(DEMO / "rig.yaml")
 FOUR = (-0.126, 0.0827, 0.0006, -0.0004)
 LENSES = {
     n: Lens(fx=817.123456789, fy=878.1, cx=368.9, cy=281.7, distortion=values)
@@ -339,7 +342,7 @@ def test_foreign_files_are_recognised_and_the_command_is_named(tmp_path, known):
 
 def test_files_of_aqualvs_are_not_taken_for_others():
     ours = [
-        *ROOT.glob("src/aqualvs/data/**/*.yaml"),
+        *DEMO.parent.glob("**/*.yaml"),
         *ROOT.glob("tests/data/**/*.yaml"),
         *ROOT.glob("docs/*.md"),
     ]
@@ -355,4 +358,4 @@ def test_what_is_no_calibration_is_told_what_there_is(tmp_path):
     with pytest.raises(RigError, match="no calibration that is known; give a camera_info"):
         read_camera(path)
     with pytest.raises(RigError, match="is a rig file already"):
-        read_camera(ROOT / "src/aqualvs/data/demo/rig.yaml")
+        read_camera(DEMO / "rig.yaml")

@@ -3,18 +3,19 @@
 import json
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
 from aqualvs.calibration.targets.target_files import load_board
 from aqualvs.cli.main import main
+from aqualvs.demo import bundled_dive
 from aqualvs.optics.rigfile import load_rig, save_rig
 from aqualvs.optics.rigschema import rig_json_schema
 from aqualvs.optics.shutter import Shutter, ShutterKind
 from aqualvs.optics.solved import assumptions, with_exact_numbers
-from repository import ROOT
 
-DEMO_RIG = ROOT / "src/aqualvs/data/demo/rig.yaml"
+DEMO_RIG = Path(str(bundled_dive())) / "rig.yaml"
 FILES = {
     "ros": "camera_info.yaml",
     "opencv": "camera.xml",

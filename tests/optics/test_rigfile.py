@@ -14,6 +14,7 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from aqualvs.demo import bundled_dive
 from aqualvs.errors import OutputError, RigError
 from aqualvs.geometry import SE3, Plane, rotation_from_rotvec
 from aqualvs.optics.camera import FlatCamera
@@ -330,7 +331,8 @@ def test_the_json_schema_takes_what_the_reader_takes(changes: dict[str, Any]) ->
 
 
 def test_the_json_schema_takes_the_rigs_that_come_with_the_package() -> None:
-    rigs = [*(ROOT / "src/aqualvs/data").rglob("rig*.yaml"), *(ROOT / "tests").rglob("rig*.yaml")]
+    data = Path(str(bundled_dive())).parent
+    rigs = [*data.rglob("rig*.yaml"), *(ROOT / "tests").rglob("rig*.yaml")]
     assert rigs
     for path in rigs:
         assert is_valid(parse_yaml(path.read_text(), str(path), RigError), rig_json_schema()), path
