@@ -296,11 +296,11 @@ def _parts(m: Material) -> dict[str, str]:
         "truth": _truth_view(m.track, m.truth),
         "net": net_view(m.net, m.crops),
         "planes": _plane_view(m.lasers, m.points is not None),
-        "cloud": _cloud_view(m.points, planes_known),
+        "cloud": _cloud_view(m.points, planes_known, _origin(m.rig)),
         "pictures": _picture_view(_captions(m), m.pictures, m.no_pictures, m.names),
         "quality": _quality_view(m.track, m.points, m.names),
         "bare": _bare_view(m.track, m.bare, m.truth, housing_name(m.rig)),
-        "rig": _rig_view(m.run, m.lasers),
+        "rig": _rig_view(m.run, m.lasers, _origin(m.rig)),
         "data": html.embedded_json(_data(m)),
     }
 
@@ -398,7 +398,7 @@ def _plane_view(lasers: list[LaserFacts], has_points: bool) -> str:
     places = "\n".join(f'<div class="chart" id="chart-plane-{index}"></div>' for index in known)
     return (
         '<p class="lead">Each laser’s points in its own plane, seen from the side to which its '
-        "normal points: y leads forward, away from the dome. The dotted line is the target plane "
+        "normal points: y leads forward, away from the camera. The dotted line is the target plane "
         "of the posture.</p>\n"
         '<div class="controls"><button type="button" id="plane-back" aria-label="previous frame">'
         '‹</button><input type="range" id="plane-slider" min="0" max="0" step="1" '
@@ -408,7 +408,12 @@ def _plane_view(lasers: list[LaserFacts], has_points: bool) -> str:
     )
 
 
-def _cloud_view(points: PointSummary | None, planes_known: bool) -> str:
+def _origin(rig: Mapping[str, Any]) -> str:
+    """Return what the origin of the rig's frame is, roughly: the lens, or the dome round it."""
+    return "dome" if isinstance(rig.get("dome"), dict) else "lens"
+
+
+def _cloud_view(points: PointSummary | None, planes_known: bool, origin: str) -> str:
     """Return the place of the cloud, or why there is none."""
     if points is None or not len(points.cloud_in_target):
         return '<p class="note">The run left no points on the target.</p>'
@@ -424,8 +429,9 @@ def _cloud_view(points: PointSummary | None, planes_known: bool) -> str:
     return (
         f'<p class="lead">{amount} points on the target. The whole dive is drawn relative to the '
         "target, so that all frames coincide: the origin is the point of the target plane nearest "
-        "to the dome, and the black line spans the positions of the dome. A single frame is drawn "
-        "relative to the dome (the hemisphere). Drag to turn, scroll or pinch to zoom.</p>\n"
+        f"to the {origin}, and the black line spans the positions of the {origin}. A single frame "
+        f"is drawn relative to the {origin} (the hemisphere). Drag to turn, scroll or pinch to "
+        "zoom.</p>\n"
         f'{buttons}<div class="chart screen" id="chart-cloud"></div>'
         '<img class="paper" id="cloud-paper" alt="the same view, for paper">'
     )
@@ -512,9 +518,10 @@ def _bare_view(
     )
 
 
-def _rig_view(run: Mapping[str, Any], lasers: list[LaserFacts]) -> str:
+def _rig_view(run: Mapping[str, Any], lasers: list[LaserFacts], origin: str) -> str:
     """Return lasers, rig, options and versions as tables."""
-    head = ("laser", "normal x", "normal y", "normal z", "offset from the dome's centre, mm")
+    centre = "dome's centre" if origin == "dome" else "origin"
+    head = ("laser", "normal x", "normal y", "normal z", f"offset from the {centre}, mm")
     rows = [_laser_row(i, laser) for i, laser in enumerate(lasers)]
     lasers_table = html.table(head, rows) if rows else ""
     blocks = []

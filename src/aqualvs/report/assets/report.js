@@ -194,6 +194,7 @@
     });
     return out;
   }
+  const origin = () => (data.cloud.dome_radius_mm ? "dome" : "lens");
   function dome() {
     const r = data.cloud.dome_radius_mm || 30, x = [], y = [], z = [];
     for (let turn = 0; turn < 4; turn++) {
@@ -208,14 +209,14 @@
       const a = (i / 24) * Math.PI;
       x.push(r * Math.cos(a)); y.push(0); z.push(r * Math.sin(a));
     }
-    return { x, y, z, type: "scatter3d", mode: "lines", name: "dome", hoverinfo: "name",
+    return { x, y, z, type: "scatter3d", mode: "lines", name: origin(), hoverinfo: "name",
              line: { color: INK, width: 2 } };
   }
   /* In the target's frame the dome is before the plane's origin, at one range after the other. */
   function domePlaces() {
     const ranges = data.cloud.dome_mm || [];
     return { x: ranges.map(() => 0), y: ranges.map((r) => -r), z: ranges.map(() => 0), type: "scatter3d",
-             mode: "lines+markers", name: "dome, nearest to farthest", hovertemplate: "range %{customdata} mm",
+             mode: "lines+markers", name: `${origin()}, nearest to farthest`, hovertemplate: "range %{customdata} mm",
              customdata: ranges, marker: { size: 4, color: INK }, line: { color: INK, width: 4 } };
   }
   function cloud(mode) {
