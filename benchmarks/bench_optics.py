@@ -12,7 +12,7 @@ import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
-from aqualvs.optics.camera import BareCamera, DomeCamera, parameter_names
+from aqualvs.optics.camera import BareCamera, HousedCamera, parameter_names
 from aqualvs.optics.camera_kernels import trace_all
 from aqualvs.optics.dome import Dome
 from aqualvs.optics.lens import Lens
@@ -23,11 +23,11 @@ LENS = Lens(
 )
 NOMINAL = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 POSE = SE3(rotation_from_rotvec([0.04, 0.029, 0.016]) @ NOMINAL, np.array([3.1, 41.8, 3.0]) * 1e-3)
-CAMERA = DomeCamera(
+CAMERA = HousedCamera(
     size_px=SIZE_PX,
     lens=LENS,
     dome_from_cam=POSE,
-    dome=Dome(0.04425, 0.00575, 1.49),
+    housing=Dome(0.04425, 0.00575, 1.49),
     n_air=1.0003,
     n_water=1.3333,
 )

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray
-from aqualvs.optics.camera import DomeCamera
+from aqualvs.optics.camera import HousedCamera
 from aqualvs.optics.rig import Rig
 from aqualvs.scanner import Scanner
 from aqualvs.scanning.candidates import Subsegments, find_candidates
@@ -129,8 +129,8 @@ def plain_detect(bgr: U8, areas: list[BoolArray], along_x: list[bool]) -> list[F
 def plain_points(rig: Rig, pixels: list[FloatArray]) -> FloatArray:
     """Points (N, 3) on the laser planes, through the dome."""
     camera = rig.camera()
-    assert isinstance(camera, DomeCamera)
-    lens, dome = camera.lens, camera.dome
+    assert isinstance(camera, HousedCamera)
+    lens, dome = camera.lens, camera.housing
     matrix = np.array([[lens.fx, 0.0, lens.cx], [0.0, lens.fy, lens.cy], [0.0, 0.0, 1.0]])
     points = []
     for laser, at in zip(rig.lasers, pixels, strict=True):

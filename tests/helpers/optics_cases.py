@@ -6,7 +6,7 @@ import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
-from aqualvs.optics.camera import BareCamera, DomeCamera, FlatCamera, FlatPort
+from aqualvs.optics.camera import BareCamera, FlatPort, HousedCamera
 from aqualvs.optics.dome import Dome
 from aqualvs.optics.lens import Lens, LensModel
 
@@ -54,12 +54,12 @@ def dome_camera(
     n_air: float = 1.0003,
     n_water: float = 1.3333,
     rotvec: tuple[float, float, float] = (0.04, 0.029, 0.016),
-) -> DomeCamera:
-    return DomeCamera(
+) -> HousedCamera:
+    return HousedCamera(
         size_px=SIZE_PX,
         lens=lens,
         dome_from_cam=pose(lens_mm, rotvec),
-        dome=dome,
+        housing=dome,
         n_air=n_air,
         n_water=n_water,
     )
@@ -76,12 +76,12 @@ def flat_camera(
     n_air: float = 1.0003,
     n_water: float = 1.3333,
     rotvec: tuple[float, float, float] = (0.04, 0.029, 0.016),
-) -> FlatCamera:
-    return FlatCamera(
+) -> HousedCamera:
+    return HousedCamera(
         size_px=SIZE_PX,
         lens=lens,
         dome_from_cam=pose(lens_mm, rotvec),
-        port=port,
+        housing=port,
         n_air=n_air,
         n_water=n_water,
     )

@@ -13,7 +13,7 @@ from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
 from aqualvs.optics.camera import (
     BareCamera,
     Camera,
-    DomeCamera,
+    HousedCamera,
     parameter_names,
     project_point,
     trace_pixel,
@@ -89,11 +89,11 @@ def test_projects_the_independent_samples(samples: Path) -> None:
     truth = json.loads((samples / "lab-paper/truth/rig_truth.json").read_text())
     c, d = truth["camera"], truth["dome"]
     rotation = rotation_from_rotvec(truth["camera_rotvec"]) @ NOMINAL
-    camera = DomeCamera(
+    camera = HousedCamera(
         size_px=(c["width"], c["height"]),
         lens=Lens(fx=c["fx"], fy=c["fy"], cx=c["cx"], cy=c["cy"], distortion=tuple(c["dist"])),
         dome_from_cam=SE3(rotation, np.array(truth["lens_mm"]) * 1e-3),
-        dome=Dome(d["inner_mm"] * 1e-3, d["thickness_mm"] * 1e-3, d["n_acrylic"]),
+        housing=Dome(d["inner_mm"] * 1e-3, d["thickness_mm"] * 1e-3, d["n_acrylic"]),
         n_air=truth["n_air"],
         n_water=truth["n_water"],
     )
@@ -257,7 +257,7 @@ def test_total_reflection_is_invalid() -> None:
     bouguer = 1.45 * np.linalg.norm(
         np.cross(camera.dome_from_cam.translation, lens_to_inner), axis=-1
     )
-    np.testing.assert_array_equal(rays.valid, bouguer <= 1.0 * camera.dome.outer_radius)
+    np.testing.assert_array_equal(rays.valid, bouguer <= 1.0 * camera.housing.outer_radius)
     assert np.isnan(rays.directions[~rays.valid]).all()
     points = rays.points_at(np.full(rays.valid.shape, 0.3))
     found, valid = camera.project(points)
@@ -294,12 +294,12 @@ def test_impossible_cameras_are_refused(change: dict[str, object], words: str) -
         "size_px": SIZE_PX,
         "lens": PAPER_LENS,
         "dome_from_cam": pose((0.0, 5.0, 0.0)),
-        "dome": PAPER_DOME,
+        "housing": PAPER_DOME,
         "n_air": 1.0003,
         "n_water": 1.3333,
     }
     with pytest.raises(RigError, match=words):
-        DomeCamera(**(good | change))  # type: ignore[arg-type]
+        HousedCamera(**(good | change))  # type: ignore[arg-type]
 
 
 def test_moved_by_follows_the_documented_order() -> None:
@@ -312,7 +312,7 @@ def test_moved_by_follows_the_documented_order() -> None:
     np.testing.assert_allclose(moved.dome_from_cam.translation, [0.0011, 0.0022, 0.0033])
     turn = moved.dome_from_cam.rotation @ camera.dome_from_cam.rotation.T
     np.testing.assert_allclose(turn, rotation_from_rotvec([4e-4, 5e-4, 6e-4]), atol=1e-15)
-    assert moved.dome == Dome(0.04425 + 7e-4, 0.00575 + 8e-4, 1.49 + 10e-4)
+    assert moved.housing == Dome(0.04425 + 7e-4, 0.00575 + 8e-4, 1.49 + 10e-4)
     assert (moved.n_air, moved.n_water) == (1.0003 + 9e-4, 1.3333 + 11e-4)
     assert moved.lens.distortion[-1] == pytest.approx(0.01 + 20e-4)
     assert parameter_names(bare_camera()) == names[:6] + names[11:]

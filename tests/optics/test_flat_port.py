@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aqualvs.errors import RigError
-from aqualvs.optics.camera import FlatCamera
+from aqualvs.optics.camera import HousedCamera
 from aqualvs.optics.flat_port import FlatPort
 from aqualvs.optics.refraction import refract
 from optics_cases import FISHEYE_LENS, PAPER_LENS, bare_camera, flat_camera, image_grid
@@ -34,17 +34,17 @@ CAMERAS = st.builds(
 )
 
 
-def normal_of(camera: FlatCamera) -> np.ndarray:
+def normal_of(camera: HousedCamera) -> np.ndarray:
     """The port's normal in `dome`, by two rotations of the optical axis."""
-    x, y = camera.port.tilt_x, camera.port.tilt_y
+    x, y = camera.housing.tilt_x, camera.housing.tilt_y
     about_y = np.array([[math.cos(y), 0, math.sin(y)], [0, 1, 0], [-math.sin(y), 0, math.cos(y)]])
     about_x = np.array([[1, 0, 0], [0, math.cos(x), -math.sin(x)], [0, math.sin(x), math.cos(x)]])
     return camera.dome_from_cam.rotate(about_x @ about_y @ np.array([0.0, 0.0, 1.0]))
 
 
-def traced(camera: FlatCamera) -> tuple[np.ndarray, np.ndarray]:
+def traced(camera: HousedCamera) -> tuple[np.ndarray, np.ndarray]:
     """Origins and directions of the rays, by intersection with planes and by `refract`."""
-    normal, port, lens = normal_of(camera), camera.port, camera.dome_from_cam.translation
+    normal, port, lens = normal_of(camera), camera.housing, camera.dome_from_cam.translation
     in_air = camera.dome_from_cam.rotate(camera.lens.directions(PIXELS)[0])
     inner = lens + (port.distance / (in_air @ normal))[:, None] * in_air
     in_wall, valid = refract(in_air, -normal, n_in=camera.n_air, n_out=port.n_port)
@@ -57,7 +57,7 @@ def traced(camera: FlatCamera) -> tuple[np.ndarray, np.ndarray]:
 
 @settings(max_examples=30, deadline=None, derandomize=True)
 @given(CAMERAS)
-def test_snell_holds_at_both_faces(camera: FlatCamera) -> None:
+def test_snell_holds_at_both_faces(camera: HousedCamera) -> None:
     rays = camera.rays(PIXELS)
     origins, directions = traced(camera)
     assert rays.valid.all()
@@ -67,7 +67,7 @@ def test_snell_holds_at_both_faces(camera: FlatCamera) -> None:
 
 @settings(max_examples=30, deadline=None, derandomize=True)
 @given(CAMERAS, st.floats(0.0, 20.0))
-def test_projection_inverts_the_trace(camera: FlatCamera, distance: float) -> None:
+def test_projection_inverts_the_trace(camera: HousedCamera, distance: float) -> None:
     rays = camera.rays(PIXELS)
     found, valid = camera.project(rays.points_at(np.full(len(PIXELS), distance)))
     assert valid.all()
@@ -77,7 +77,7 @@ def test_projection_inverts_the_trace(camera: FlatCamera, distance: float) -> No
 
 @settings(max_examples=30, deadline=None, derandomize=True)
 @given(CAMERAS)
-def test_all_rays_meet_the_axis(camera: FlatCamera) -> None:
+def test_all_rays_meet_the_axis(camera: HousedCamera) -> None:
     """Behind a flat port a camera is axial (Agrawal et al. 2012)."""
     rays = camera.rays(PIXELS)
     across = np.cross(rays.directions, normal_of(camera))
@@ -87,7 +87,7 @@ def test_all_rays_meet_the_axis(camera: FlatCamera) -> None:
 
 def test_the_optical_path_is_stationary() -> None:
     camera = flat_camera()
-    rays, normal, port = camera.rays(PIXELS), normal_of(camera), camera.port
+    rays, normal, port = camera.rays(PIXELS), normal_of(camera), camera.housing
     lens = camera.dome_from_cam.translation
     target = rays.origins + 0.4 * rays.directions
     in_air = camera.dome_from_cam.rotate(camera.lens.directions(PIXELS)[0])

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
-from aqualvs.optics.camera import DomeCamera
+from aqualvs.optics.camera import HousedCamera
 from aqualvs.optics.dome import Dome
 from aqualvs.optics.refraction import refract
 from optics_cases import (
@@ -38,7 +38,7 @@ def make_camera(
     rotvec: tuple[float, float, float],
     n: tuple[float, float, float],
     relative_thickness: float,
-) -> DomeCamera:
+) -> HousedCamera:
     """A camera with its lens at `share` of the inner radius along `direction`."""
     inner = 0.044
     length = np.linalg.norm(direction)
@@ -54,14 +54,14 @@ def make_camera(
     )
 
 
-def path_of(camera: DomeCamera) -> dict[str, np.ndarray]:
+def path_of(camera: HousedCamera) -> dict[str, np.ndarray]:
     """Corners and directions of the traced rays, those inside from the quadratic formula."""
     rays = camera.rays(PIXELS)
     assert rays.valid.all()
     lens = camera.dome_from_cam.translation
     in_air = camera.dome_from_cam.rotate(camera.lens.directions(PIXELS)[0])
     half_b = in_air @ lens
-    c = lens @ lens - camera.dome.inner_radius**2
+    c = lens @ lens - camera.housing.inner_radius**2
     inner = lens + (np.sqrt(half_b**2 - c) - half_b)[:, None] * in_air
     in_wall = rays.origins - inner
     return {
@@ -81,9 +81,9 @@ def angle_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(CAMERAS)
-def test_snell_holds_at_both_surfaces(camera: DomeCamera) -> None:
+def test_snell_holds_at_both_surfaces(camera: HousedCamera) -> None:
     p = path_of(camera)
-    n_wall = camera.dome.n_acrylic
+    n_wall = camera.housing.n_acrylic
     incidence = angle_between(p["in_air"], p["inner"])
     refracted = np.arcsin(camera.n_air / n_wall * np.sin(incidence))
     # A rounding of the corners, 1e-17 m over 0.2 mm of wall at least.
@@ -96,7 +96,7 @@ def test_snell_holds_at_both_surfaces(camera: DomeCamera) -> None:
 
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(CAMERAS)
-def test_a_ray_stays_in_the_plane_of_lens_and_centre(camera: DomeCamera) -> None:
+def test_a_ray_stays_in_the_plane_of_lens_and_centre(camera: HousedCamera) -> None:
     p = path_of(camera)
     normal = np.cross(p["lens"], p["in_air"])
     length = np.linalg.norm(normal, axis=-1)
@@ -110,7 +110,7 @@ def test_a_ray_stays_in_the_plane_of_lens_and_centre(camera: DomeCamera) -> None
 
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(CAMERAS)
-def test_bouguers_invariant_is_one_number_along_a_ray(camera: DomeCamera) -> None:
+def test_bouguers_invariant_is_one_number_along_a_ray(camera: HousedCamera) -> None:
     p = path_of(camera)
     at_lens = camera.n_air * np.cross(p["lens"], p["in_air"])
     in_water = camera.n_water * np.cross(p["outer"], p["in_water"])
@@ -132,7 +132,7 @@ def test_the_optical_path_is_stationary(lens_mm: tuple[float, float, float]) -> 
         outer = p["outer"] @ rotation_from_rotvec(turn_outer).T
         return (
             camera.n_air * np.linalg.norm(inner - p["lens"], axis=-1)
-            + camera.dome.n_acrylic * np.linalg.norm(outer - inner, axis=-1)
+            + camera.housing.n_acrylic * np.linalg.norm(outer - inner, axis=-1)
             + camera.n_water * np.linalg.norm(target - outer, axis=-1)
         )
 
@@ -183,18 +183,18 @@ def test_an_infinitely_thin_dome_is_one_surface(n_acrylic: float) -> None:
 
 @settings(max_examples=40, deadline=None, derandomize=True)
 @given(CAMERAS)
-def test_light_sent_back_arrives_at_the_lens(camera: DomeCamera) -> None:
+def test_light_sent_back_arrives_at_the_lens(camera: HousedCamera) -> None:
     p = path_of(camera)
-    outer_normal = p["outer"] / camera.dome.outer_radius
+    outer_normal = p["outer"] / camera.housing.outer_radius
     in_wall, valid = refract(
-        -p["in_water"], outer_normal, n_in=camera.n_water, n_out=camera.dome.n_acrylic
+        -p["in_water"], outer_normal, n_in=camera.n_water, n_out=camera.housing.n_acrylic
     )
     assert valid.all()
     half_b = np.sum(p["outer"] * in_wall, axis=-1)
-    c = camera.dome.outer_radius**2 - camera.dome.inner_radius**2
+    c = camera.housing.outer_radius**2 - camera.housing.inner_radius**2
     inner = p["outer"] - (half_b + np.sqrt(half_b**2 - c))[:, None] * in_wall
     normal = inner / np.linalg.norm(inner, axis=-1, keepdims=True)
-    in_air, valid = refract(in_wall, normal, n_in=camera.dome.n_acrylic, n_out=camera.n_air)
+    in_air, valid = refract(in_wall, normal, n_in=camera.housing.n_acrylic, n_out=camera.n_air)
     assert valid.all()
     # Roundings grow where the way back meets the inner surface at up to 70 degrees.
     np.testing.assert_allclose(in_air, -p["in_air"], rtol=0.0, atol=1e-13)
@@ -204,7 +204,7 @@ def test_light_sent_back_arrives_at_the_lens(camera: DomeCamera) -> None:
 
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(CAMERAS, st.floats(0.0, 20.0))
-def test_projection_inverts_the_trace(camera: DomeCamera, distance: float) -> None:
+def test_projection_inverts_the_trace(camera: HousedCamera, distance: float) -> None:
     rays = camera.rays(PIXELS)
     assert rays.valid.all()
     found, valid = camera.project(rays.points_at(np.full(len(PIXELS), distance)))
@@ -216,14 +216,14 @@ def test_projection_inverts_the_trace(camera: DomeCamera, distance: float) -> No
 @settings(max_examples=30, deadline=None, derandomize=True)
 @given(CAMERAS, st.tuples(COORDINATE, COORDINATE, COORDINATE))
 def test_turning_everything_about_the_centre_changes_no_pixel(
-    camera: DomeCamera, rotvec: tuple[float, float, float]
+    camera: HousedCamera, rotvec: tuple[float, float, float]
 ) -> None:
     turn = SE3.from_rotvec(rotvec, np.zeros(3))
-    turned = DomeCamera(
+    turned = HousedCamera(
         size_px=SIZE_PX,
         lens=camera.lens,
         dome_from_cam=turn @ camera.dome_from_cam,
-        dome=camera.dome,
+        housing=camera.housing,
         n_air=camera.n_air,
         n_water=camera.n_water,
     )

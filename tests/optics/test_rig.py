@@ -11,7 +11,7 @@ import pytest
 import rig_from_sample_truth
 from aqualvs.errors import RigError
 from aqualvs.geometry import rotvec_from_rotation
-from aqualvs.optics.camera import BareCamera, DomeCamera
+from aqualvs.optics.camera import BareCamera, Dome, HousedCamera
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig
 from aqualvs.optics.rigfile import load_rig
 from aqualvs.simulation.scenarios import example_rig
@@ -29,7 +29,9 @@ def test_nominal_mounting_is_a_rotation_that_nobody_can_change() -> None:
 
 def test_rig_gives_its_cameras() -> None:
     rig = example_rig()
-    assert isinstance(rig.camera(), DomeCamera)
+    camera = rig.camera()
+    assert isinstance(camera, HousedCamera)
+    assert isinstance(camera.housing, Dome)
     assert isinstance(rig.bare_camera(), BareCamera)
     bare = Rig(**{name: getattr(rig, name) for name in Rig.__slots__} | {"housing": None})
     assert isinstance(bare.camera(), BareCamera)

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from aqualvs.demo import bundled_dive
 from aqualvs.errors import OutputError, RigError
 from aqualvs.geometry import SE3, Plane, rotation_from_rotvec
-from aqualvs.optics.camera import FlatCamera
+from aqualvs.optics.camera import HousedCamera
 from aqualvs.optics.dome import Dome
 from aqualvs.optics.flat_port import FlatPort
 from aqualvs.optics.lens import Lens, LensModel
@@ -165,7 +165,9 @@ def test_a_flat_port(housing: object) -> None:
     tilt = math.radians(0.4), math.radians(-0.2)
     assert rig.housing == FlatPort(0.012, 0.005, 1.49, *tilt)
     assert (rig.dome, rig.flat_port) == (None, rig.housing)
-    assert isinstance(rig.camera(), FlatCamera)
+    camera = rig.camera()
+    assert isinstance(camera, HousedCamera)
+    assert isinstance(camera.housing, FlatPort)
     np.testing.assert_array_equal(rig.dome_from_cam.translation, np.zeros(3))
     assert rig_to_mapping(rig)["housing"] == "flat"
     again = rig_from_mapping(rig_to_mapping(rig), source_name="y")

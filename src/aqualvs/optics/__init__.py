@@ -1,6 +1,6 @@
 """Refraction, the camera behind a dome, water, and the rig file."""
 
-from aqualvs.optics.camera import BareCamera, Camera, DomeCamera, FlatCamera, parameter_names
+from aqualvs.optics.camera import BareCamera, Camera, HousedCamera, parameter_names
 from aqualvs.optics.dome import Dome
 from aqualvs.optics.flat_port import FlatPort
 from aqualvs.optics.lens import Lens, LensModel
@@ -11,9 +11,8 @@ __all__ = [
     "BareCamera",
     "Camera",
     "Dome",
-    "DomeCamera",
-    "FlatCamera",
     "FlatPort",
+    "HousedCamera",
     "Lens",
     "LensModel",
     "parameter_names",

@@ -105,8 +105,8 @@ def camera_params(
     Raises
     ------
     RigError
-        If the lens lies outside the inner sphere, an index or the size is not valid, or the pose is
-        not one finite rigid transform.
+        If the lens lies outside the inner sphere of a dome, an index or the size is not valid, or
+        the pose is not one finite rigid transform.
     """
     _check_size(size_px)
     check_index("camera", "n_air", n_air)
@@ -153,9 +153,8 @@ __all__ = [
     "Camera",
     "CameraParams",
     "Dome",
-    "DomeCamera",
-    "FlatCamera",
     "FlatPort",
+    "HousedCamera",
     "Housing",
     "parameter_names",
     "project_point",
@@ -231,7 +230,7 @@ class _CompiledCamera:
     size_px : (int, int)
         Image width and height.
     lens : Lens
-        Intrinsics, calibrated in air without the dome.
+        Intrinsics, calibrated in air without the housing.
     dome_from_cam : SE3
         Camera pose in `dome`; the translation is the lens position L in metres.
     """
@@ -436,30 +435,30 @@ class BareCamera(_CompiledCamera):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class DomeCamera(_CompiledCamera):
-    """A camera behind a dome.
+class HousedCamera(_CompiledCamera):
+    """A camera behind a dome or a flat port.
 
     Attributes
     ----------
     size_px : (int, int)
         Image width and height.
     lens : Lens
-        Intrinsics, calibrated in air without the dome.
+        Intrinsics, calibrated in air without the housing.
     dome_from_cam : SE3
         Camera pose in `dome`; the translation is the lens position L in metres.
-    dome : Dome
-        Radii and material.
+    housing : Dome or FlatPort
+        Sizes and material; a flat port is fixed to the camera.
     n_air, n_water : float
-        Refractive indices (vacuum = 1) inside and outside the dome.
+        Refractive indices (vacuum = 1) inside and outside the housing.
 
     Raises
     ------
     RigError
-        If the lens lies outside the inner sphere, an index or the size is not valid, or the pose is
-        not one finite rigid transform.
+        If the lens lies outside the inner sphere of a dome, an index or the size is not valid, or
+        the pose is not one finite rigid transform.
     """
 
-    dome: Dome
+    housing: Housing
     n_air: float
     n_water: float
 
@@ -468,71 +467,20 @@ class DomeCamera(_CompiledCamera):
             size_px=self.size_px,
             lens=self.lens,
             dome_from_cam=self.dome_from_cam,
-            housing=self.dome,
+            housing=self.housing,
             n_air=self.n_air,
             n_water=self.n_water,
         )
         object.__setattr__(self, "params", params)
 
-    def moved_by(self, step: ArrayLike) -> "DomeCamera":
+    def moved_by(self, step: ArrayLike) -> "HousedCamera":
         """Return the camera with `step` (P,) added to its parameters, see `parameter_names`."""
         values = named_step(self, step)
-        return DomeCamera(
+        return HousedCamera(
             size_px=self.size_px,
             lens=moved_lens(self.lens, values),
             dome_from_cam=moved_pose(self.dome_from_cam, values),
-            dome=self.dome.moved_by(values),
-            n_air=self.n_air + values["n_air"],
-            n_water=self.n_water + values["n_water"],
-        )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FlatCamera(_CompiledCamera):
-    """A camera behind a flat port, which is fixed to it.
-
-    Attributes
-    ----------
-    size_px : (int, int)
-        Image width and height.
-    lens : Lens
-        Intrinsics, calibrated in air without the port.
-    dome_from_cam : SE3
-        Camera pose in `dome`; the translation is the lens position L in metres.
-    port : FlatPort
-        Place and material.
-    n_air, n_water : float
-        Refractive indices (vacuum = 1) inside and outside the port.
-
-    Raises
-    ------
-    RigError
-        If an index or the size is not valid, or the pose is not one finite rigid transform.
-    """
-
-    port: FlatPort
-    n_air: float
-    n_water: float
-
-    def __post_init__(self) -> None:
-        params = camera_params(
-            size_px=self.size_px,
-            lens=self.lens,
-            dome_from_cam=self.dome_from_cam,
-            housing=self.port,
-            n_air=self.n_air,
-            n_water=self.n_water,
-        )
-        object.__setattr__(self, "params", params)
-
-    def moved_by(self, step: ArrayLike) -> "FlatCamera":
-        """Return the camera with `step` (P,) added to its parameters, see `parameter_names`."""
-        values = named_step(self, step)
-        return FlatCamera(
-            size_px=self.size_px,
-            lens=moved_lens(self.lens, values),
-            dome_from_cam=moved_pose(self.dome_from_cam, values),
-            port=self.port.moved_by(values),
+            housing=self.housing.moved_by(values),
             n_air=self.n_air + values["n_air"],
             n_water=self.n_water + values["n_water"],
         )

@@ -18,8 +18,7 @@ from aqualvs.optics.camera import (
     POSE_PARAMETERS,
     BareCamera,
     Camera,
-    DomeCamera,
-    FlatCamera,
+    HousedCamera,
     Housing,
     moved_lens,
     moved_pose,
@@ -124,20 +123,11 @@ class Rig:
         """Return the camera as it looks into the outer medium."""
         if self.housing is None:
             return self.bare_camera()
-        if isinstance(self.housing, FlatPort):
-            return FlatCamera(
-                size_px=self.size_px,
-                lens=self.lens,
-                dome_from_cam=self.dome_from_cam,
-                port=self.housing,
-                n_air=self.n_air,
-                n_water=self.n_water,
-            )
-        return DomeCamera(
+        return HousedCamera(
             size_px=self.size_px,
             lens=self.lens,
             dome_from_cam=self.dome_from_cam,
-            dome=self.housing,
+            housing=self.housing,
             n_air=self.n_air,
             n_water=self.n_water,
         )
