@@ -23,13 +23,15 @@ LENS = Lens(
 )
 NOMINAL = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 POSE = SE3(rotation_from_rotvec([0.04, 0.029, 0.016]) @ NOMINAL, np.array([3.1, 41.8, 3.0]) * 1e-3)
+DOME = Dome(0.04425, 0.00575, 1.49)
+N_AIR, N_WATER = 1.0003, 1.3333
 CAMERA = HousedCamera(
     size_px=SIZE_PX,
     lens=LENS,
     dome_from_cam=POSE,
-    housing=Dome(0.04425, 0.00575, 1.49),
-    n_air=1.0003,
-    n_water=1.3333,
+    housing=DOME,
+    n_air=N_AIR,
+    n_water=N_WATER,
 )
 BARE = BareCamera(size_px=SIZE_PX, lens=LENS, dome_from_cam=POSE)
 DISTANCE = 0.6
@@ -66,11 +68,10 @@ def numpy_undistort(xd: FloatArray, yd: FloatArray) -> tuple[FloatArray, FloatAr
 
 def numpy_trace(directions: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Snell's law in vector form at both spheres."""
-    dome = CAMERA.dome
     p, d = POSE.translation, directions
     for radius, ratio in (
-        (dome.inner_radius, CAMERA.n_air / dome.n_acrylic),
-        (dome.outer_radius, dome.n_acrylic / CAMERA.n_water),
+        (DOME.inner_radius, N_AIR / DOME.n_acrylic),
+        (DOME.outer_radius, DOME.n_acrylic / N_WATER),
     ):
         along = np.sum(p * d, axis=-1, keepdims=True)
         reach = np.sqrt(along**2 + radius**2 - np.sum(p * p, axis=-1, keepdims=True))
@@ -89,7 +90,6 @@ def numpy_rays(pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def numpy_project(points: FloatArray) -> FloatArray:
     """Bouguer's invariant with arc sines, five Newton steps from the straight line."""
-    dome, n_air, n_water = CAMERA.dome, CAMERA.n_air, CAMERA.n_water
     length = np.linalg.norm(POSE.translation)
     axis = POSE.translation / length
     rho = np.linalg.norm(points, axis=-1)
@@ -99,19 +99,19 @@ def numpy_project(points: FloatArray) -> FloatArray:
     target = np.arctan2(sine, cosine)
     alpha = np.arctan2(rho * sine, rho * cosine - length)
     surfaces = (
-        (-1.0, n_air * dome.inner_radius),
-        (1.0, dome.n_acrylic * dome.inner_radius),
-        (-1.0, dome.n_acrylic * dome.outer_radius),
-        (1.0, n_water * dome.outer_radius),
-        (-1.0, n_water * rho),
+        (-1.0, N_AIR * DOME.inner_radius),
+        (1.0, DOME.n_acrylic * DOME.inner_radius),
+        (-1.0, DOME.n_acrylic * DOME.outer_radius),
+        (1.0, N_WATER * DOME.outer_radius),
+        (-1.0, N_WATER * rho),
     )
     for _ in range(5):
-        b = n_air * length * np.sin(alpha)
+        b = N_AIR * length * np.sin(alpha)
         theta, slope = alpha, 1.0
         for sign, n_rho in surfaces:
             s = b / n_rho
             theta = theta + sign * np.arcsin(s)
-            slope = slope + sign * n_air * length * np.cos(alpha) / (n_rho * np.sqrt(1.0 - s * s))
+            slope = slope + sign * N_AIR * length * np.cos(alpha) / (n_rho * np.sqrt(1.0 - s * s))
         alpha = alpha + (target - theta) / slope
     d = np.cos(alpha)[:, None] * axis + (np.sin(alpha) / sine)[:, None] * across
     d = d @ POSE.rotation
