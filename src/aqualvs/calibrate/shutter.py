@@ -141,7 +141,7 @@ def run_shutter(request: ShutterRequest, echo: Echo) -> None:
     """
     check_rig_place(request.out)
     rig = load_rig(request.rig)
-    if rig.shutter.kind is ShutterKind.INTERLACED:
+    if rig.shutter.is_interlaced:
         raise RigError(
             f"{request.rig}: camera.shutter.kind is interlaced, whose fields are as far apart as "
             "the video's standard says; leave the shutter out to calibrate a rolling one"
