@@ -15,6 +15,7 @@ REASON_WORDS: dict[str, str] = {
     Reason.NOT_A_PLANE: "stripes share no plane",
     Reason.AMBIGUOUS: "stripes fit two planes",
     Reason.NO_TARGET: "no target of the kind asked for",
+    Reason.BLURRED: "blurred by motion",
     Reason.OUT_OF_RANGE: "target outside the working range",
     Reason.CORRUPT_FRAME: "frame could not be decoded",
     Reason.WRONG_SIZE: "picture of another size",

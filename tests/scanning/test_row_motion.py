@@ -88,7 +88,30 @@ def test_a_frame_alone_stays_and_says_how_far_it_may_be_off(scans):
     # Nearly all of it is pitch by the change of range.
     assert sigma[1] > 10.0 * np.sqrt(scans[2].posture.covariance[1, 1])
     assert np.all(np.abs(found.posture.numbers - truth(2)) < 3.0 * sigma)
-    assert RowMotion(ROLLING).correct(lost, scans) is lost
+    assert RowMotion(ROLLING).correct(lost, scans).posture is lost.posture
+
+
+@pytest.mark.parametrize(
+    ("exposure", "reason", "expected"),
+    [
+        (0.15, Reason.NOT_A_PLANE, Reason.BLURRED),
+        (0.15, Reason.OUT_OF_RANGE, Reason.OUT_OF_RANGE),
+        (0.04, Reason.NOT_A_PLANE, Reason.NOT_A_PLANE),
+    ],
+)
+def test_a_refusal_names_the_blur_that_explains_it(scans, exposure, reason, expected):
+    rig = rig_with(Shutter(exposure=exposure))
+    refused = replace(scans[2], posture=Refusal(reason, "no plane"))
+    found = RowMotion(rig).correct(refused, [scans[1], scans[3]]).posture
+    # 23 degrees/s.
+    assert found.reason is expected
+    assert found.detail == (
+        "turned by 3.5 deg in 150 ms of exposure: no plane"
+        if expected is Reason.BLURRED
+        else "no plane"
+    )
+    alone = RowMotion(rig).correct(refused, [scans[1]]).posture
+    assert alone.reason is reason
 
 
 def test_a_frame_that_shows_another_surface_tells_nothing(scans):

@@ -174,8 +174,7 @@ def probe(work: DiveWork) -> DiveProbe:
             n_frames=dive.source.n_frames,
             source=source_dict(dive.source),
         )
-        # A rolling shutter is corrected by the frames beside each.
-        margin = REACH if dive.rig.shutter.rolls else 0
+        margin = REACH if dive.rig.shutter.needs_neighbours else 0
         stat = _stat_key(Path(work.request.source))
         stat |= {"frames": work.piece_frames, "margin": margin}
         content = _remembered(work, stat) or _remember(

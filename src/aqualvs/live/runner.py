@@ -420,7 +420,7 @@ class LiveRunner:
         self._workers = [OutputWorker(output) for output in ordered]
         self._frozen: dict[Field | None, FrozenPicture] = {}
         rig = provider.scanner.rig
-        self._row_motion = RowMotion(rig) if rig.shutter.rolls else None
+        self._row_motion = RowMotion(rig) if rig.shutter.needs_neighbours else None
         self._before: deque[Scan] = deque(maxlen=REACH)
         self._last: Frame | None = None
         self._heard_ns = self._told_ns = 0

@@ -107,6 +107,11 @@ class Shutter:
         return self.kind is ShutterKind.ROLLING
 
     @property
+    def needs_neighbours(self) -> bool:
+        """Whether the frames beside one tell what its motion did to it: rows that roll, blur."""
+        return self.rolls or self.exposure > 0.0
+
+    @property
     def is_interlaced(self) -> bool:
         """Whether each picture holds two fields, which are frames of their own."""
         return self.kind is ShutterKind.INTERLACED

@@ -38,6 +38,8 @@ class Reason(StrEnum):
     """The stripes fit two planes about as well, read as different lasers'."""
     NO_TARGET = "no_target"
     """Surfaces, but none of the kind that was asked for."""
+    BLURRED = "blurred"
+    """Stripes that share no plane, or too few: the vehicle turned too far during the exposure."""
     OUT_OF_RANGE = "out_of_range"
     """A plane, but outside the working range."""
     CORRUPT_FRAME = "corrupt_frame"

@@ -279,11 +279,11 @@ class FrameProcessor:
 def corrected_rows(
     blocks: Generator[list[FrameResult], None, None], rig: Rig
 ) -> Generator[list[FrameResult], None, None]:
-    """Yield results as they are at the middles of the pictures of a rolling shutter.
+    """Yield results as they are at the middles of the pictures of a rolling shutter, blur named.
 
-    Those of other shutters are yielded as they are. Those of a rolling one come a few frames after
-    they were measured, when the frames after them are known; none is lost where their source breaks
-    off.
+    Those of shutters that need no neighbours are yielded as they are. Others come a few frames
+    after they were measured, when the frames after them are known; none is lost where their source
+    breaks off.
 
     Parameters
     ----------
@@ -292,7 +292,7 @@ def corrected_rows(
     rig : Rig
     """
     with closing(blocks):
-        if not rig.shutter.rolls:
+        if not rig.shutter.needs_neighbours:
             yield from blocks
             return
         motion, measured, n_done = RowMotion(rig), list[FrameResult](), 0
@@ -322,6 +322,8 @@ def _corrected(motion: RowMotion, measured: Sequence[FrameResult], i: int) -> Fr
     if isinstance(seen, Posture) and isinstance(found, Posture) and isinstance(bare, Posture):
         # The same motion, seen by a camera without its dome.
         bare = motion.moved(bare, found.numbers - seen.numbers)
+    elif bare is not None and isinstance(found, Refusal):
+        bare = found
     return replace(one, scan=scan, bare=bare)
 
 
