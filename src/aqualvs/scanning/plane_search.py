@@ -246,16 +246,12 @@ def _median_weight(sampling_weight: FloatArray) -> float:
 
 
 @kernel
-def _heavy(sampling_weight: FloatArray, laser: IntArray) -> IntArray:
+def _heavy(sampling_weight: FloatArray) -> IntArray:
     """Return the subsegments to sample: those not much below the weighted median.
 
-    Where glare makes thousands of specks, most neighbours on a stripe would be specks. A sample
-    needs two lasers: all are sampled where one laser has all the heavy ones.
+    Where glare makes thousands of specks, most neighbours on a stripe would be specks.
     """
-    heavy = np.flatnonzero(sampling_weight >= _LIGHTEST_SHARE * _median_weight(sampling_weight))
-    if laser[heavy[0]] == laser[heavy[-1]]:
-        return np.arange(laser.shape[0])
-    return heavy
+    return np.flatnonzero(sampling_weight >= _LIGHTEST_SHARE * _median_weight(sampling_weight))
 
 
 @kernel
@@ -281,7 +277,8 @@ def search_plane(
     nearest, farthest : float
         Limits of the hypotheses, in metres.
     seed : int
-        The same seed and subsegments give the same plane.
+        The same seed and subsegments give the same plane; 0 for the first plane of a frame, which
+        is searched in all light if the heavy light is one laser's.
     best_plane : array, shape (4,)
         Written: unit normal, pointing outward, and offset.
     """
@@ -290,7 +287,10 @@ def search_plane(
     plane, normal, scratch = np.empty(4), np.empty((3, 3)), np.empty((5, 3))
     best = 0.0
     best_rough = 0.0
-    heavy = _heavy(table[WEIGHT], laser)
+    heavy = _heavy(table[WEIGHT])
+    if seed == 0 and laser[heavy[0]] == laser[heavy[-1]]:
+        # A sample needs two lasers. Later, such light is what a surface has left over.
+        heavy = np.arange(n)
     n_heavy = heavy.shape[0]
     cumulative_weight = table[WEIGHT][heavy]
     for k in range(1, n_heavy):
