@@ -21,9 +21,8 @@ from typing import Any
 
 import av
 
-from aqualvs.batch.cluster import DaskWorkers, FinishedTask
 from aqualvs.batch.parts import PieceResult
-from aqualvs.batch.scheduler import Scheduler, Steps
+from aqualvs.batch.scheduler import DaskWorkers, FinishedTask, Scheduler, Steps
 from aqualvs.batch.work import PIECE_FRAMES, DiveProbe, DiveWork
 from aqualvs.demo import bundled_dive
 from aqualvs.results.run_request import RunRequest

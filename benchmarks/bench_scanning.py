@@ -30,8 +30,7 @@ from aqualvs.scanning.posture import range_pitch_yaw
 from aqualvs.scanning.posture_estimator import FitMethod, PostureEstimator
 from aqualvs.scanning.scan import Frame
 from aqualvs.scanning.stripe import StripeOptions
-from aqualvs.scanning.surfaces import find_surfaces
-from aqualvs.scanning.target import TargetKind, choose_target
+from aqualvs.scanning.surfaces import TargetKind, choose_target, find_surfaces
 from aqualvs.scanning.triangulate import Triangulator
 from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenarios import bluerov2_rig, example_rig, load_scenario

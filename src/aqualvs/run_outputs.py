@@ -53,8 +53,7 @@ from aqualvs.sources.base import bgr_of
 from aqualvs.special_files import refuse_special
 from aqualvs.terminal import StopSignals, Tick
 from aqualvs.workers.frame_results import FrameResult, FrameScanner
-from aqualvs.workers.run_frames import Replay
-from aqualvs.workers.water_index import WaterFollowingScanner
+from aqualvs.workers.run_frames import Replay, WaterFollowingScanner
 
 if TYPE_CHECKING:
     from aqualvs.recording import Recording

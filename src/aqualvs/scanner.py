@@ -26,11 +26,13 @@ from aqualvs.scanning.stripe import StripeOptions, StripePeaks
 from aqualvs.scanning.surfaces import (
     MIN_LINES_PER_LASER,
     Surface,
+    TargetKind,
+    as_requested_kind,
+    choose_target,
     find_surfaces,
     shares_peaks,
     surface_on,
 )
-from aqualvs.scanning.target import TargetKind, as_requested_kind, choose_target
 from aqualvs.scanning.triangulate import Triangulator
 
 if TYPE_CHECKING:

@@ -16,8 +16,7 @@ from aqualvs.scanning.laser_bands import SearchAxis, plan_bands
 from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.posture_estimator import Measurement
 from aqualvs.scanning.stripe import StripePeaks
-from aqualvs.scanning.surfaces import Surface, surface_on
-from aqualvs.scanning.target import TargetKind
+from aqualvs.scanning.surfaces import Surface, TargetKind, surface_on
 from aqualvs.scanning.triangulate import Triangulator
 from aqualvs.simulation.scenarios import example_rig
 from fan_cases import Fan, Stage, Trouble, fan_rig, miscalibrated

@@ -11,11 +11,10 @@ from typing import Self
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
-from aqualvs.batch.cluster import DaskWorkers
 from aqualvs.batch.dataset import clear, read_manifest, write_dives
 from aqualvs.batch.dives import Dive, DiveRecord, DiveState, find_dives, name_dives
-from aqualvs.batch.merge import JOINED
-from aqualvs.batch.scheduler import Scheduler, known_net
+from aqualvs.batch.parts import JOINED
+from aqualvs.batch.scheduler import DaskWorkers, Scheduler, known_net
 from aqualvs.batch.summary_page import SUMMARY_HTML, write_summary
 from aqualvs.batch.work import PIECE_FRAMES, DiveWork, size_of
 from aqualvs.closing import Closing

@@ -15,8 +15,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from aqualvs.calibration_files.camera import DomePort, ForeignCamera, opencv_lens, padded
-from aqualvs.calibration_files.entries import number, shown, whole
+from aqualvs.calibration_files.camera import (
+    DomePort,
+    ForeignCamera,
+    number,
+    opencv_lens,
+    padded,
+    shown,
+    whole,
+)
 from aqualvs.calibration_files.kalibr import one_of
 from aqualvs.errors import RigError
 from aqualvs.optics.dome import Dome

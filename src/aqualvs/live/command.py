@@ -33,7 +33,7 @@ from aqualvs.sources.fields import FrameFeed
 from aqualvs.sources.opening import open_feed
 from aqualvs.sources.remote import Transport
 from aqualvs.terminal import StopSignals
-from aqualvs.workers.water_index import WaterFollowingScanner
+from aqualvs.workers.run_frames import WaterFollowingScanner
 
 _TIMEOUT_S = 3.0
 

@@ -15,9 +15,8 @@ import numpy as np
 
 from aqualvs import __version__
 from aqualvs.geometry.arrays import FloatArray, IntArray
-from aqualvs.net_survey.comparison import Comparison, OnWall
+from aqualvs.net_survey.comparison import Comparison, HoleState, OnWall, Site
 from aqualvs.net_survey.growth import Growth
-from aqualvs.net_survey.hole_sites import HoleState, Site
 from aqualvs.net_survey.tables import (
     bearing_deg,
     by_state,

@@ -6,10 +6,9 @@ from pathlib import Path
 import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray
-from aqualvs.net_survey.comparison import Comparison, OnWall
+from aqualvs.net_survey.comparison import LOOKED, Comparison, HoleState, OnWall, Site
 from aqualvs.net_survey.frames import WallFrame
 from aqualvs.net_survey.growth import CellChange, Growth
-from aqualvs.net_survey.hole_sites import LOOKED, HoleState, Site
 from aqualvs.nets.tables import Cell, write_table
 
 _WEEK = 7.0

@@ -39,7 +39,7 @@ from aqualvs.optics.sheet import sheets_of
 from aqualvs.scanning.paper.mesh_filter import MeshFilterOptions
 from aqualvs.scanning.posture import Posture
 from aqualvs.scanning.scan import Label, Scan
-from aqualvs.scanning.target import TargetKind
+from aqualvs.scanning.surfaces import TargetKind
 from aqualvs.yamlfile import read_yaml
 
 if TYPE_CHECKING:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.compiled import inline_kernel, kernel
-from aqualvs.geometry.quantile import element_at, sum_of
+from aqualvs.geometry.linear_algebra import element_at, sum_of
 from aqualvs.scanning.scan import Frame, ImagePlane
 from aqualvs.scanning.stripe import HEIGHT, IMBALANCE, STEP_U, STEP_V, TINT_U, TINT_V, TOP, WIDTH
 

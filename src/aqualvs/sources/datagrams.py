@@ -17,8 +17,7 @@ from urllib.parse import urlsplit
 
 from aqualvs.errors import SourceError
 from aqualvs.sources.live_frames import Reception
-from aqualvs.sources.rtp import parse_rtp
-from aqualvs.sources.transport_stream import PACKET_BYTES, SYNC
+from aqualvs.sources.rtp import PACKET_BYTES, SYNC, parse_rtp
 
 _BUFFER_BYTES = 4 << 20
 """Size of the receive buffer; the system may grant less. A key frame comes in one burst."""

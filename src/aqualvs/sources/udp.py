@@ -45,9 +45,9 @@ from aqualvs.sources.rtp import (
     H264Depacketizer,
     RtpOrder,
     RtpPacket,
+    TransportStream,
     parse_rtp,
 )
-from aqualvs.sources.transport_stream import TransportStream
 from aqualvs.special_files import refuse_special
 
 _MAX_BYTES = 64 << 10

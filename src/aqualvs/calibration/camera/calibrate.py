@@ -21,7 +21,7 @@ from aqualvs.calibration.camera.problem import (
     fitted_camera,
     with_supported_coefficients,
 )
-from aqualvs.calibration.dome.cross_validation import predicted
+from aqualvs.calibration.dome.problem import predicted
 from aqualvs.calibration.solver.bundle import CORNER_SIGMA_PX, CORNERS, Bundle, BundleState
 from aqualvs.calibration.solver.covariance import (
     ViewCovariance,

@@ -23,7 +23,6 @@ from aqualvs.calibration.dome.checks import (
     noise_px,
     solved_by_offset,
 )
-from aqualvs.calibration.dome.cross_validation import compare_with_bare_lens
 from aqualvs.calibration.dome.problem import (
     LENS,
     ROTATION,
@@ -32,15 +31,20 @@ from aqualvs.calibration.dome.problem import (
     DomeProblem,
     PoseKind,
     check_sets,
+    compare_with_bare_lens,
     dome_problem,
     initial_rigs,
     place_names,
     with_board_tilt_as_found,
 )
-from aqualvs.calibration.solver.bundle import CORNER_SIGMA_PX, BundleState
+from aqualvs.calibration.solver.bundle import (
+    CORNER_SIGMA_PX,
+    BundleState,
+    rig_difference,
+    rig_numbers,
+)
 from aqualvs.calibration.solver.covariance import Observability, consider_covariance, observability
 from aqualvs.calibration.solver.least_squares import Solution, solve
-from aqualvs.calibration.solver.priors import rig_difference, rig_numbers
 from aqualvs.calibration.solver.result import (
     CrossValidation,
     DomeCalibration,

@@ -14,7 +14,15 @@ from enum import Enum, auto
 import numpy as np
 
 from aqualvs.calibration.dome.problem import BoardSet, DomeProblem, PoseKind, place_names
-from aqualvs.calibration.solver.bundle import CORNER_SIGMA_PX, CORNERS, PRIORS, Bundle, BundleState
+from aqualvs.calibration.solver.bundle import (
+    CORNER_SIGMA_PX,
+    CORNERS,
+    DISTANCES,
+    PRIORS,
+    Bundle,
+    BundleState,
+    plane_distance,
+)
 from aqualvs.calibration.solver.covariance import (
     all_alike,
     implausible_distance,
@@ -30,7 +38,6 @@ from aqualvs.calibration.solver.least_squares import (
     normal_equations,
     solve,
 )
-from aqualvs.calibration.solver.priors import DISTANCES, plane_distance
 from aqualvs.errors import CalibrationError, RigError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.optics.rig import RigUncertainty

@@ -12,29 +12,27 @@ import numpy as np
 
 from aqualvs.calibration.lasers.candidates import plane_residuals_px
 from aqualvs.calibration.lasers.checks import (
+    LaserCalibration,
+    LaserFigures,
+    SolvedLasers,
+    ViewFigures,
     check_count,
     check_distances,
     check_poses,
     check_size,
     far_apart,
+    laser_figures,
     like,
     loose_text,
     match_to_rig,
     named,
+    view_figures,
 )
 from aqualvs.calibration.lasers.covariance import CameraCovariance, joint_uncertainty
 from aqualvs.calibration.lasers.laser_assignment import (
     BENT_TOLERANCE_PX,
     LaserAssignment,
     assign_lasers,
-)
-from aqualvs.calibration.lasers.report import (
-    LaserCalibration,
-    LaserFigures,
-    SolvedLasers,
-    ViewFigures,
-    laser_figures,
-    view_figures,
 )
 from aqualvs.calibration.lasers.solve import InitialGuess, paper_planes, solve_lasers, tolerance_px
 from aqualvs.calibration.lasers.stripes_on_planes import PooledStripes, TargetSurfaces

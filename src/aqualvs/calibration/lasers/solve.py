@@ -11,7 +11,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from aqualvs.calibration.lasers.checks import contradicts, like, typical_corner_error_px
+from aqualvs.calibration.lasers.checks import (
+    SolvedLasers,
+    contradicts,
+    like,
+    typical_corner_error_px,
+)
 from aqualvs.calibration.lasers.covariance import CameraCovariance
 from aqualvs.calibration.lasers.laser_assignment import BENT_TOLERANCE_PX, TOLERANCE_PX, assigned
 from aqualvs.calibration.lasers.problem import (
@@ -20,7 +25,6 @@ from aqualvs.calibration.lasers.problem import (
     LaserProblem,
     LaserState,
 )
-from aqualvs.calibration.lasers.report import SolvedLasers
 from aqualvs.calibration.lasers.stripes_on_planes import (
     TargetSurfaces,
     binned,

@@ -23,9 +23,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from aqualvs.calibration.solver.bundle import Bundle, BundleState
+from aqualvs.calibration.solver.bundle import PRIORS, Bundle, BundleState
 from aqualvs.calibration.solver.least_squares import Block, Solution, inverse, normal_equations
-from aqualvs.calibration.solver.priors import PRIORS
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.optics.rig import RigUncertainty
 
