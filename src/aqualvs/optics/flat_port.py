@@ -324,11 +324,6 @@ class FlatPort:
                     f"within {math.degrees(MAX_TILT):g} degrees of the optical axis"
                 )
 
-    @property
-    def parameter_names(self) -> tuple[str, ...]:
-        """Names of the parameters of a camera behind it, see `FLAT_PARAMETERS`."""
-        return FLAT_PARAMETERS
-
     def numbers(self) -> dict[str, float]:
         """Return sizes, index and tilts by the names of their parameters."""
         return {
