@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from aqualvs.calibration.lasers.calibrate import (
-    LaserCalibration,
     LaserOptions,
     calibrate_lasers,
     fitted,
@@ -16,6 +15,7 @@ from aqualvs.calibration.lasers.calibrate import (
     posture,
 )
 from aqualvs.calibration.lasers.checks import match_to_rig, named
+from aqualvs.calibration.lasers.report import LaserCalibration
 from aqualvs.calibration.lasers.solve import InitialGuess, paper_plane, solve_lasers
 from aqualvs.calibration.lasers.stripes_on_planes import board_surface
 from aqualvs.calibration.lasers.views import LaserView, place_views
