@@ -275,9 +275,6 @@ def _measured(scanner: FrameScanner, frame: Frame) -> FrameOutput:
     return scanner.rig, scanner.measure(frame.index, frame.time_s, peaks), peaks
 
 
-_FPS_WITHOUT_CLOCK = 25.0
-
-
 class RunOverlay(Closing):
     """Writer of `overlay.mp4` during a run, or of nothing; a context manager.
 
@@ -300,8 +297,9 @@ class RunOverlay(Closing):
         self._path = folder / OVERLAY_MP4
         self._rig = rig
         self._writer: OverlayWriter | None = None
+        fps_without_clock = 25.0
         if wanted:
-            fps = source.fps or _FPS_WITHOUT_CLOCK
+            fps = source.fps or fps_without_clock
             self._writer = OverlayWriter(self._path, source.size_px, fps)
 
     def write(self, frame: Frame | None, scan: Scan) -> None:

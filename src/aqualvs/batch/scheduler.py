@@ -43,9 +43,6 @@ from aqualvs.results.run_request import versions
 from aqualvs.sources.spans import UnlikeProbeError
 from aqualvs.workers import start_method
 
-_MEMORY_BYTES = 2_000_000_000
-"""A process that takes more is started again; one needs less than a third of it."""
-
 _MAX_DEATHS = 20
 """A task that was under way in so many dying processes is given up by the scheduler."""
 
@@ -62,9 +59,6 @@ _SETTINGS = {
     "distributed.admin.system-monitor.gil.enabled": False,
 }
 _TIMEOUT_S = 30.0
-_COUNT_EVERY_S = 5.0
-_NO_WORKER_S = 300.0
-_STARTS = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,18 +144,20 @@ class DaskWorkers(Closing):
             If there has been no worker for minutes.
         """
         now_s = time.monotonic()
+        count_every_s = 5.0
+        no_worker_s = 300.0
         if now_s >= self._count_again_s:
             # Machines may join a scheduler while a batch goes on; asking takes its time.
             n_slots = sum(self._client.nthreads().values())
             if n_slots:
                 self._seen_s = now_s
-            elif now_s > self._seen_s + _NO_WORKER_S:
+            elif now_s > self._seen_s + no_worker_s:
                 raise WorkersGoneError(
-                    f"no worker has been there for {_NO_WORKER_S:.0f} s; what is finished is kept, "
+                    f"no worker has been there for {no_worker_s:.0f} s; what is finished is kept, "
                     "see to the workers and run the same command again"
                 )
             self._n_slots = max(1, n_slots)
-            self._count_again_s = now_s + _COUNT_EVERY_S
+            self._count_again_s = now_s + count_every_s
         return self._n_slots
 
     def submit(self, token: object, function: Callable[..., Any], *arguments: object) -> None:
@@ -243,15 +239,18 @@ def _local_cluster(distributed: Any, n_workers: int | None) -> Any:
         settings["distributed.worker.multiprocessing-method"] = "forkserver"
         # It would import whatever it can find, to have it in the server, which is there already.
         distributed.utils._forkserver_preload_set = True
+    # A process that takes more is started again; one needs less than a third of it.
+    memory_bytes = 2_000_000_000
+    starts = 3
     # What Dask says of dying processes helps nobody: the task is done by another.
     with dask.config.set(settings), start_method.deaf_to_interrupts():
-        for _ in range(_STARTS):
+        for _ in range(starts):
             try:
                 return distributed.LocalCluster(
                     n_workers=n_workers,
                     threads_per_worker=1,
                     processes=True,
-                    memory_limit=min(_MEMORY_BYTES, MEMORY_LIMIT // n_workers),
+                    memory_limit=min(memory_bytes, MEMORY_LIMIT // n_workers),
                     # Any free port, for this machine alone; Dask's own may be taken.
                     dashboard_address="127.0.0.1:0",
                     silence_logs=logging.CRITICAL,
@@ -345,8 +344,6 @@ def _digest(request: NetRequest) -> str:
 # Tasks handed over for each that can be under way, so that no process waits for the next.
 _AHEAD = 3
 _WAIT_S = 0.2
-# Beginnings of a dive; each costs only what is not finished.
-_MAX_BEGINNINGS = 3
 
 
 class BatchObserver(Protocol):
@@ -540,7 +537,9 @@ class Scheduler:
 
     def _mend(self, dive: _Dive, error: BaseException) -> None:
         """Retry the tasks that may succeed, and give up the others."""
-        again = dive.n_beginnings < _MAX_BEGINNINGS
+        # Beginnings of a dive; each costs only what is not finished.
+        max_beginnings = 3
+        again = dive.n_beginnings < max_beginnings
         if isinstance(error, UnlikeProbeError) and dive.probe is not None:
             if not dive.probe.is_whole:
                 return self._as_whole(dive, str(error))

@@ -20,10 +20,6 @@ from aqualvs.optics.lens import Lens, LensModel
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig
 from aqualvs.optics.rigfile import rig_from_mapping, rig_to_mapping
 
-_N_AIR = 1.0003
-_WORKING_RANGE_M = (0.25, 1.3)
-_N_OPENCV = 8
-
 
 @dataclass(frozen=True, slots=True)
 class Port:
@@ -83,13 +79,14 @@ def opencv_lens(core: Sequence[float], distortion: Sequence[float], *, fisheye: 
         If there are others, or a value is impossible.
     """
     values = tuple(map(float, distortion))
+    n_opencv = 8
     if not fisheye and len(values) in (12, 14):
-        if any(values[_N_OPENCV:]):
+        if any(values[n_opencv:]):
             raise RigError(
                 "has thin prism or tilt coefficients (s1 to s4, tx, ty), which the lens of aqualvs "
                 "lacks; calibrate with k1 k2 p1 p2 k3 k4 k5 k6 at most"
             )
-        values = values[:_N_OPENCV]
+        values = values[:n_opencv]
     fx, fy, cx, cy = core
     model = LensModel.FISHEYE if fisheye else LensModel.OPENCV
     return Lens(model=model, fx=fx, fy=fy, cx=cx, cy=cy, distortion=values)
@@ -138,16 +135,18 @@ def rig_of_camera(
         )
     port, turn = camera.port, DOME_FROM_CAM_NOMINAL
     lens_in_dome = np.zeros(3) if port is None else -(turn @ port.centre) + 0.0
+    n_air = 1.0003
+    working_range_m = (0.25, 1.3)
     rig = Rig(
         name=camera.name,
         size_px=camera.size_px,
         lens=camera.lens,
         dome_from_cam=SE3(turn.copy(), lens_in_dome),
         housing=None if port is None else port.housing,
-        n_air=_N_AIR if port is None else port.n_air,
-        n_water=_N_AIR if port is None else port.n_water,
+        n_air=n_air if port is None else port.n_air,
+        n_water=n_air if port is None else port.n_water,
         lasers=(),
-        working_range=_WORKING_RANGE_M,
+        working_range=working_range_m,
         solved_from=solved_from or {},
     )
     try:

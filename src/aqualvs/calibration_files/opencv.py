@@ -140,7 +140,6 @@ _DISTORTION = (
     "D",
 )
 _SIZES = ("image_size", "imageSize", "cameraResolution", "resolution")
-_XML_DEPTH = 3
 
 
 def read_opencv(text: str, source: str, *, model: str | None = None) -> ForeignCamera:
@@ -195,7 +194,8 @@ def _xml(text: str) -> dict[str, Any]:
         root = ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError, LookupError) as fault:
         raise RigError(f"is not XML: {fault}; mend it") from None
-    return {node.tag: _xml_value(node, _XML_DEPTH) for node in root}
+    xml_depth = 3
+    return {node.tag: _xml_value(node, xml_depth) for node in root}
 
 
 def _xml_value(node: ElementTree.Element, depth: int) -> Any:

@@ -82,10 +82,6 @@ def row3(values: FloatArray, i: int, j: int) -> Vec:
     return values[i, j], values[i, j + 1], values[i, j + 2]
 
 
-# Relative to the product of the diagonal: a smaller determinant is rounding, not information.
-_SINGULAR = 1e-13
-
-
 @inline_kernel
 def invert_symmetric(matrix: FloatArray, inverse: FloatArray) -> bool:
     """Invert a positive definite 3 x 3 matrix by its cofactors; only its lower half is read.
@@ -96,7 +92,9 @@ def invert_symmetric(matrix: FloatArray, inverse: FloatArray) -> bool:
     d, e, f = matrix[1, 1], matrix[2, 1], matrix[2, 2]
     c00, c01, c02 = d * f - e * e, c * e - b * f, b * e - c * d
     determinant = a * c00 + b * c01 + c * c02
-    if not determinant > _SINGULAR * a * d * f:
+    # Relative to the product of the diagonal: a smaller determinant is rounding, not information.
+    singular = 1e-13
+    if not determinant > singular * a * d * f:
         return False
     inverse[0, 0] = c00 / determinant
     inverse[0, 1] = inverse[1, 0] = c01 / determinant

@@ -42,8 +42,6 @@ from aqualvs.net_survey.surveys import Survey
 _GATE = float(stats.chi2.isf(1e-3, 2))
 # The middle of what lasers saw of a hole is off the hole's by this share of its diameter.
 _MIDDLE = 0.25
-# Parts of one hole are no farther apart than a strand or two, in metres.
-_GAP = 0.03
 # Lasers looked at a place if they did so with this chance, given how well places are known.
 LOOKED = 0.8
 # A hole has grown beyond chance in all but one of 100.
@@ -166,7 +164,9 @@ def _groups(
 def _touching(place: FloatArray, size: FloatArray, of_run: IntArray, frame: WallFrame) -> BoolArray:
     """Mark the pairs of holes of one dive that touch."""
     off = np.hypot(*wrapped(place[:, None] - place[None], frame).transpose(2, 0, 1))
-    near = off <= 0.5 * (size[:, None] + size[None]) + _GAP
+    # Parts of one hole are no farther apart than a strand or two, in metres.
+    gap = 0.03
+    near = off <= 0.5 * (size[:, None] + size[None]) + gap
     return np.asarray(near & (of_run[:, None] == of_run[None]))
 
 
@@ -303,10 +303,6 @@ def _state(sizes: FloatArray, errors: FloatArray, looked: FloatArray) -> HoleSta
     if abs(change) <= _GROWN * np.hypot(errors[-1], errors[before[-1]]):
         return HoleState.SAME
     return HoleState.GROWN if change > 0.0 else HoleState.SMALLER
-
-
-# Dives along nets whose bars differ by so much, as a share, are hardly of one net.
-_OTHER_NET = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -470,7 +466,9 @@ def _warnings(surveys: Sequence[Survey]) -> list[str]:
     found = []
     bars = [one.facts.get("summary", {}).get("bar_mm") for one in surveys]
     known = [bar for bar in bars if isinstance(bar, int | float)]
-    if known and max(known) > (1.0 + _OTHER_NET) * min(known):
+    # Dives along nets whose bars differ by so much, as a share, are hardly of one net.
+    other_net = 0.1
+    if known and max(known) > (1.0 + other_net) * min(known):
         found.append(
             f"meshes differ, from {min(known):.1f} to {max(known):.1f} mm bar: is it the same net?"
         )

@@ -194,10 +194,6 @@ def _holes(survey: Survey, frame: WallFrame) -> FloatArray:
     return np.stack([u, holes.depth], axis=-1)
 
 
-# Places in a stretch along and across, so that none of the raster is left out between them.
-_DENSE, _LEAST, _MOST = 1.5, 4, 48
-
-
 @dataclass(frozen=True, slots=True)
 class Raster:
     """Squares on the wall.
@@ -267,7 +263,9 @@ def spread_over(outline: FloatArray, side: float, share: float = 1.0) -> FloatAr
     if not len(outline):
         return np.empty((0, 1, 2))
     edge = np.linalg.norm(outline - np.roll(outline, 1, axis=1), axis=-1).max(initial=side)
-    n = int(np.clip(np.ceil(_DENSE * edge / side), _LEAST, _MOST))
+    # Places in a stretch along and across, so that none of the raster is left out between them.
+    dense, least, most = 1.5, 4, 48
+    n = int(np.clip(np.ceil(dense * edge / side), least, most))
     at = (np.arange(n) + 0.5) / n
     s, t = (one.ravel() for one in np.meshgrid(at, 0.5 + share * (at - 0.5)))
     weights = np.stack([(1 - s) * (1 - t), s * (1 - t), s * t, (1 - s) * t], axis=-1)
@@ -301,15 +299,9 @@ STEP = 0.1
 # A shift is told if so much of the chance lies so near (in prior deviations, and in metres).
 _MASS, _NEAR, _MIN_NEAR = 0.95, 0.5, 0.3
 _FLAT_NEAR = 0.5
-# Agreement of patterns that chance alone would show in one of so many cases does not count.
-_CHANCE = 0.01
 # Places this far apart in a pattern of growth count as independent.
 _PATTERN = 0.7
 _MIN_STRETCHES, _MIN_OVERLAP = 8, 0.5
-# Stretches that follow each other by no more than this belong to one lane.
-_LANE = 3
-# All pairs of so many stretches fit into memory, and tell how alike neighbours are.
-_MAX_BESIDE = 2000
 # A hole is still there with this chance. Its diameter is then mostly found again to the first
 # factor (log), else, seen in part, to the second, by which diameters of any holes differ.
 _KEPT, _SEEN_ALIKE = 0.5, 0.7
@@ -451,7 +443,9 @@ def _pattern_gain(
     gain = -0.5 * count * np.log1p(-(np.minimum(agreement, 0.9999) ** 2))
     alike, rest = _independent(mine, best_told, later.outline.mean(axis=1))
     n_shifts = max(grid.log_prior.size * (STEP / _PATTERN) ** 2, 1.0)
-    if alike * gain.max() < np.log(n_shifts / _CHANCE):
+    # Agreement of patterns that chance alone would show in one of so many cases does not count.
+    chance = 0.01
+    if alike * gain.max() < np.log(n_shifts / chance):
         return nothing
     return np.asarray(rest * gain)
 
@@ -518,10 +512,14 @@ def _independent(mine: FloatArray, told: FloatArray, middle: FloatArray) -> tupl
 
 def _beside(middle: FloatArray) -> IntArray:
     """Return pairs (2, n): stretches, and the nearest of another time, where one is near."""
-    middle = middle[:_MAX_BESIDE]
+    # All pairs of so many stretches fit into memory, and tell how alike neighbours are.
+    max_beside = 2000
+    middle = middle[:max_beside]
     gap = np.abs(np.subtract.outer(np.arange(len(middle)), np.arange(len(middle))))
     distance = np.hypot(*(middle[:, None] - middle[None]).transpose(2, 0, 1))
-    distance[gap <= _LANE] = np.inf
+    # Stretches that follow each other by no more than this belong to one lane.
+    lane = 3
+    distance[gap <= lane] = np.inf
     nearest = np.argmin(distance, axis=1)
     rows = np.arange(len(middle))
     near = distance[rows, nearest] < 2.0 * _PATTERN

@@ -40,21 +40,11 @@ USUAL_HEIGHT = np.array(100.0)
 # Variation of that in steps; and as a share of the strand at zero height, falling to zero at a
 # height from which strands are seen in full.
 _SIGMA_HALO, _SIGMA_FAINT, _FAINT = 0.07, 0.12, 90.0
-# The silhouette of twisted twine is on average narrower than its diameter.
-_SILHOUETTE = 0.95
 # Width of a strand at half height less its silhouette, in pixels; and the exponent p (same dives).
 _STRAND_MORE, _CORNER = 0.95, 2.5
 # Priors: silhouette of a strand and lit width of the sheet in metres, the sheet's width at half
 # height over its lit one; and their spreads as logarithms.
 _USUAL, _SPREAD = np.log([2.2e-3, 2.8e-3, 0.95]), np.array([1.5, 0.2, 0.1])
-# Errors of a kind's length and width: relative, relative for one dash, and in search lines.
-_LENGTH_ERROR, _WIDTH_ERROR, _DASH_ERROR, _ERROR_PX = 0.06, 0.115, 0.2, 0.2
-# Error of bare twine's length for the spread of all lengths: growth may be taken for twine.
-_SPREAD_ERROR = 0.15
-# Error of the model, which grows with the slant of the strand.
-_SLANT_ERROR = 0.7
-# Relative uncertainty of the length that slant adds to a dash.
-_SLANT_TOLD = 0.1
 # True errors over those of the fit, which overestimates them with single kinds.
 _TRUE_ERROR = 0.7
 _ROUNDS = 40
@@ -137,7 +127,9 @@ class Twine:
         """Return the part of `usual` that is not twine, in metres, and its standard deviation."""
         usual = self.usual(across, slant, step, height)
         straight = _bright(height) * self._lit(step) / across
-        sigma = np.hypot(self.sigma_halo / across, _SLANT_TOLD * (usual - straight))
+        # Relative uncertainty of the length that slant adds to a dash.
+        slant_told = 0.1
+        sigma = np.hypot(self.sigma_halo / across, slant_told * (usual - straight))
         return usual - self.body / across, np.asarray(sigma)
 
     def _lit(self, step: FloatArray) -> FloatArray:
@@ -160,8 +152,10 @@ def measure_twine(kinds: Sequence[DashKind], known: float | None = None) -> Twin
     at, covariance = _fit(kinds)
     strand, sheet, _ = np.exp(at)
     sigma_strand = _TRUE_ERROR * float(strand * np.sqrt(covariance[0, 0]))
+    # The silhouette of twisted twine is on average narrower than its diameter.
+    silhouette = 0.95
     if known is not None:
-        body = _SILHOUETTE * known
+        body = silhouette * known
         halo = _SEEN * float(strand) + _HALO - body
         return Twine(known, 0.0, body, float(sheet), halo, _SEEN * sigma_strand)
     step, height = np.median([[k.step, k.height] for k in kinds], axis=0)
@@ -170,8 +164,8 @@ def measure_twine(kinds: Sequence[DashKind], known: float | None = None) -> Twin
     sigma = math.hypot(sigma_strand, of_halo)
     body = float(strand)
     return Twine(
-        thickness=body / _SILHOUETTE,
-        sigma=sigma / _SILHOUETTE,
+        thickness=body / silhouette,
+        sigma=sigma / silhouette,
         body=body,
         sheet=float(sheet),
         halo=_HALO - (1.0 - _SEEN) * body,
@@ -195,11 +189,17 @@ def _fit(kinds: Sequence[DashKind]) -> tuple[FloatArray, FloatArray]:
     ).T
     blur = _HALO + _HALO_STEPS * step, _STRAND_MORE * pixel
     seen = np.log(np.r_[length / _bright(height), width])
-    grown = _SPREAD_ERROR * np.array([k.spread for k in kinds])
-    of_length = np.hypot(np.hypot(_LENGTH_ERROR, grown), _ERROR_PX * step / length)
-    error = np.r_[of_length, np.full(len(kinds), _WIDTH_ERROR)]
-    error = np.hypot(error, np.tile(_DASH_ERROR / np.sqrt(count), 2))
-    error *= np.tile(1.0 + _SLANT_ERROR * slant, 2)
+    # Error of bare twine's length for the spread of all lengths: growth may be taken for twine.
+    spread_error = 0.15
+    grown = spread_error * np.array([k.spread for k in kinds])
+    # Errors of a kind's length and width: relative, relative for one dash, and in search lines.
+    length_error, width_error, dash_error, error_px = 0.06, 0.115, 0.2, 0.2
+    of_length = np.hypot(np.hypot(length_error, grown), error_px * step / length)
+    error = np.r_[of_length, np.full(len(kinds), width_error)]
+    error = np.hypot(error, np.tile(dash_error / np.sqrt(count), 2))
+    # Error of the model, which grows with the slant of the strand.
+    slant_error = 0.7
+    error *= np.tile(1.0 + slant_error * slant, 2)
     prior = np.diag(_SPREAD**-2)
     at, normal = _USUAL.copy(), prior
     at[0] = np.log(np.clip(np.min(length * across) - _HALO, 3e-4, 2e-2))
@@ -245,8 +245,6 @@ _BARE_SHARE, _DIFFER, _MIN_BARE = 0.45, 0.22, 0.08
 _NOISE, _NO_NOISE = 7.0, 0.03
 _SHORT, _LONG, _SLANTED, _USUAL_SPREAD = 0.25, 0.7, 1.5, 0.15
 _WIDTH_QUANTILE = 0.4
-# At smaller sines of the angle a strand counts as parallel to the line.
-_NEARLY_ALONG = 0.02
 # Dashes of more search lines may be lost (`segments`).
 _MAX_LINES = 20.0
 _BLOCKS = 6
@@ -255,11 +253,6 @@ _BLOCKS = 6
 _SHARE_ERROR, _UNRESOLVED = 0.04, 1.5
 # And as a share of the area that growth adds: it stands out of the net, and is lit and seen askew.
 _GROWTH_ERROR = 0.25
-# Distance along the net beyond which growth is independent, in metres.
-_ALIKE = 0.02
-# A dark piece this much longer than the lattice allows is no opening; openings of hexagons are two
-# bars long.
-_TOO_LONG, _HEXAGON_GAP = 1.25, 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -302,8 +295,10 @@ class _Angles:
     @classmethod
     def of(cls, line: FloatArray, search: FloatArray, normal: FloatArray) -> "_Angles":
         beside = np.stack([-line[..., 1], line[..., 0]], axis=-1)
-        across = np.maximum(np.abs(np.sum(line * normal, axis=-1)), _NEARLY_ALONG)
-        square = np.maximum(np.abs(np.sum(search * beside, axis=-1)), _NEARLY_ALONG)
+        # At smaller sines of the angle a strand counts as parallel to the line.
+        nearly_along = 0.02
+        across = np.maximum(np.abs(np.sum(line * normal, axis=-1)), nearly_along)
+        square = np.maximum(np.abs(np.sum(search * beside, axis=-1)), nearly_along)
         slant = np.abs(np.sum(search * normal, axis=-1)) / (across * square)
         return cls(across, slant, square)
 
@@ -435,10 +430,12 @@ def _spread_of_mean(rows: FloatArray) -> float:
     Dashes near to one another show the same growth, even in different frames.
     """
     variance, weight = 0.0, 0.0
+    # Distance along the net beyond which growth is independent, in metres.
+    alike = 0.02
     for family in np.unique(rows[:, 0]):
         mine = rows[rows[:, 0] == family, 1:]
         total, mean = float(mine[:, 0].sum()), float(mine[:, 0].mean())
-        independent = len(np.unique(np.floor(mine[:, 1:] / _ALIKE), axis=0))
+        independent = len(np.unique(np.floor(mine[:, 1:] / alike), axis=0))
         if mean > 0.0:
             variance += (total * float(mine[:, 0].std()) / mean) ** 2 / independent
             weight += total
@@ -455,9 +452,12 @@ def crossing_rates(lattice: NetLattice, view: NetView) -> FloatArray:
 def long_gaps(lattice: NetLattice, view: NetView) -> BoolArray:
     """Mark the gaps of a frame that are longer than the lattice allows."""
     longest = 1.0 / crossing_rates(lattice, view).max(axis=1)
+    # A dark piece this much longer than the lattice allows is no opening; openings of hexagons are
+    # two bars long.
+    too_long, hexagon_gap = 1.25, 2.0
     if lattice.mesh is Mesh.SIX_SIDED:
-        longest = np.full(len(view.step), _HEXAGON_GAP * lattice.bar)
-    return np.asarray(view.gaps.length > _TOO_LONG * longest[view.gaps.laser])
+        longest = np.full(len(view.step), hexagon_gap * lattice.bar)
+    return np.asarray(view.gaps.length > too_long * longest[view.gaps.laser])
 
 
 def sound_length(lattice: NetLattice, view: NetView) -> FloatArray:

@@ -32,12 +32,6 @@ _DARK, _FALSE_LIGHT, _MAX_SOUND = 0.03, 0.03, 4.0
 # Where seen and missed alternate at this share, all missed ones count; where a larger share than
 # the last one is missed, missing strands give no evidence.
 _BEFORE, _BEFORE_HERE, _SCARCE, _TOO_MANY = 20.0, 5.0, 0.12, 0.3
-# A dark object that hides the net for a while leaves some strands visible. Share of strands seen in
-# a hole; and largest log-likelihood by which a hidden net may be likelier than a hole.
-_LIT_IN_HOLE, _MIN_OVER_HIDDEN = 0.05, -3.0
-# Least number of frames of a hole seen by one laser alone: those in which a line sweeps over three
-# bars at the fastest speed at which the net can be tracked.
-_ALONE_FRAMES = 8
 
 HERE = 0.1
 """Length of a piece of a laser's line, in ranges."""
@@ -114,17 +108,24 @@ class Looks:
         dark, lit = float(share[missed].sum()), float(share[~missed].sum())
         if dark == 0.0:
             return False
-        hidden = max(lit / (dark + lit), _LIT_IN_HOLE)
-        over_lit = lit * np.log(_LIT_IN_HOLE / hidden)
-        over = over_lit + dark * np.log((1.0 - _LIT_IN_HOLE) / (1.0 - hidden))
-        if over < _MIN_OVER_HIDDEN:
+        # A dark object that hides the net for a while leaves some strands visible. Share of strands
+        # seen in a hole; and largest log-likelihood by which a hidden net may be likelier than a
+        # hole.
+        lit_in_hole, min_over_hidden = 0.05, -3.0
+        hidden = max(lit / (dark + lit), lit_in_hole)
+        over_lit = lit * np.log(lit_in_hole / hidden)
+        over = over_lit + dark * np.log((1.0 - lit_in_hole) / (1.0 - hidden))
+        if over < min_over_hidden:
             return False
         laser = (self.keys[inside] >> 1) % LASERS
         balance = np.bincount(laser, np.where(missed, share, -share))
         telling = np.flatnonzero(balance > 0.0)
         frames = self.frames[inside][missed & np.isin(laser, telling)]
         span = int(np.ptp(frames)) + 1 if len(frames) else 0
-        return len(telling) > 1 or span >= _ALONE_FRAMES
+        # Least number of frames of a hole seen by one laser alone: those in which a line sweeps
+        # over three bars at the fastest speed at which the net can be tracked.
+        alone_frames = 8
+        return len(telling) > 1 or span >= alone_frames
 
 
 def looks_say(
@@ -186,8 +187,6 @@ _STEP, _BESIDE, _COARSE_SCORE = 0.4, 2.4, 6.0
 _RADII: FloatArray = np.arange(0.5, 6.01, 0.25)
 # Discs up to this radius are single strands that are cut, larger ones holes.
 _SINGLE = 0.8
-# Large holes are rarer than small ones, by this power of the radius.
-_RARER = 2.0
 # A hole's log-likelihood over sound net, and over a single strand that is cut.
 _MIN_SCORE, _MIN_LEAD = 12.0, 5.0
 # Uncertainty of a radius from the grid and from the places of strands, in bars.
@@ -257,7 +256,9 @@ def _best(place: FloatArray, weight: FloatArray, bar: float) -> Disc | None:
         return None
     middles = _middles(place, weight, _STEP * bar, bar)
     score = _scores(place, weight, middles, radii)
-    total = score - _RARER * np.log(_RADII)
+    # Large holes are rarer than small ones, by this power of the radius.
+    rarer = 2.0
+    total = score - rarer * np.log(_RADII)
     single = _RADII <= _SINGLE
     total[:, single] = -np.inf
     at, size = np.unravel_index(np.argmax(total), total.shape)
@@ -308,12 +309,6 @@ def _scores(
 # Tolerance of a strand's predicted place, as a share of its pitch; at least this many steps of the
 # search lines.
 _OFF, _OFF_STEPS = 0.2, 1.5
-# Least sine of a crossing angle; at smaller ones the place of the crossing is uncertain.
-_MIN_ACROSS = 0.3
-# Margin at the ends of hexagon bars, as a share of a bar, within which their presence is uncertain.
-_KNOT = 0.2
-# Least share of light behind the net seen through a hole, relative to elsewhere.
-_LET_THROUGH = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -358,8 +353,10 @@ def predicted_strands(lattice: NetLattice, view: NetView, place: FloatArray) -> 
         Place of the lattice in `net` (`Shift.place`), in metres.
     """
     gaps = view.gaps
+    # Least share of light behind the net seen through a hole, relative to elsewhere.
+    let_through = 0.5
     # A hole lets light through; a dark piece without light behind it is hidden by something.
-    open_ = gaps.beyond >= _LET_THROUGH * view.beyond[gaps.laser]
+    open_ = gaps.beyond >= let_through * view.beyond[gaps.laser]
     turns = np.abs(lattice.waves).sum(axis=0) @ np.ones(2)
     most = int(np.sum(turns * (view.span[:, 1] - view.span[:, 0]) + len(lattice.waves) + 1.0))
     row, gap = np.empty((most, 3)), np.empty((most, 3), np.int64)
@@ -409,13 +406,15 @@ def _predict(
 ) -> int:
     """Write (place, along) and (laser, family, gap or -1) of every crossing; return the number."""
     n = 0
+    # Least sine of a crossing angle; at smaller ones the place of the crossing is uncertain.
+    min_across = 0.3
     for m in range(len(span)):
         i = span_laser[m]
         for f in range(len(waves)):
             qx, qy = waves[f]
             rate = qx * direction[i, 0] + qy * direction[i, 1]
             size = np.sqrt(qx * qx + qy * qy)
-            if not abs(rate) > _MIN_ACROSS * size:
+            if not abs(rate) > min_across * size:
                 continue
             start = qx * (origin[i, 0] - place[0]) + qy * (origin[i, 1] - place[1])
             off = max(_OFF / abs(rate), least_off[i])
@@ -468,4 +467,7 @@ def _on_bar(x: float, y: float, basis: FloatArray, bar: float) -> bool:
                 second, third = d, second
             elif d < third:
                 third = d
-    return bool(second - first < 0.05 * bar and third - second > _KNOT * bar)
+    # Margin at the ends of hexagon bars, as a share of a bar, within which their presence is
+    # uncertain.
+    knot = 0.2
+    return bool(second - first < 0.05 * bar and third - second > knot * bar)

@@ -33,14 +33,8 @@ _MAX_FRAMES, _SEARCHED_FRAMES = 30, 12
 # Number of likely lattices that are refined roughly, and of the best that are refined well.
 _FOLLOWED, _COMPARED = 12, 4
 _FIRST_ROUNDS, _ROUNDS, _LAST_ROUNDS = 2, 5, 7
-# Least crossings of a usable frame.
-_MIN_CROSSINGS = 5
 # Least log-likelihood per frame of a lattice; less may be chance.
 _MIN_SCORE = 0.3
-# Least lead of the best lattice over those with another bar length.
-_MIN_LEAD, _SAME_BAR = 0.2, 0.06
-# The previous lattice is kept with this share of its score, turned by up to this many degrees.
-_AS_BEFORE, _TURNS = 0.6, (0.0, -4.0, 4.0)
 # Number of parts of the frames whose bars are compared, and the relative error of the search.
 _BLOCKS, _SEARCH_ERROR = 4, 0.005
 
@@ -128,16 +122,20 @@ def _searched(spectrum: Spectrum) -> Hypothesis | None:
     tried.sort(key=lambda one: -one.score)
     tried[:_COMPARED] = [refine(one, spectrum, _ROUNDS) for one in tried[:_COMPARED]]
     best = max(tried, key=lambda one: one.score)
-    others = [one.score for one in tried if abs(np.log(bar_of(one) / bar_of(best))) > _SAME_BAR]
-    if best.score < max([_MIN_SCORE, *(score + _MIN_LEAD for score in others)]):
+    # Least lead of the best lattice over those with another bar length.
+    min_lead, same_bar = 0.2, 0.06
+    others = [one.score for one in tried if abs(np.log(bar_of(one) / bar_of(best))) > same_bar]
+    if best.score < max([_MIN_SCORE, *(score + min_lead for score in others)]):
         return None
     return best
 
 
 def _known(before: NetLattice, spectrum: Spectrum) -> Hypothesis | None:
     """Return the previous lattice, if it explains these frames nearly as well."""
-    enough = max(_MIN_SCORE, _AS_BEFORE * before.score)
-    for angle in np.deg2rad(_TURNS):
+    # The previous lattice is kept with this share of its score, turned by up to this many degrees.
+    as_before, turns = 0.6, (0.0, -4.0, 4.0)
+    enough = max(_MIN_SCORE, as_before * before.score)
+    for angle in np.deg2rad(turns):
         found = refine(Hypothesis(before.mesh, before.basis @ turned(angle).T), spectrum, 3)
         if found.score >= enough:
             return refine(found, spectrum, 5)
@@ -146,7 +144,9 @@ def _known(before: NetLattice, spectrum: Spectrum) -> Hypothesis | None:
 
 def _choose(frames: Sequence[Crossings]) -> list[Crossings]:
     """Return some frames, evenly spread, of those with enough crossings."""
-    useful = [one for one in frames if len(one.place) >= _MIN_CROSSINGS]
+    # Least crossings of a usable frame.
+    min_crossings = 5
+    useful = [one for one in frames if len(one.place) >= min_crossings]
     return _spread(useful, _MAX_FRAMES)
 
 
@@ -182,16 +182,9 @@ def _lattice(best: Hypothesis, sigma_bar: float) -> NetLattice:
     )
 
 
-# Harmonics of each family's wave; irregular spacing reduces each amplitude to this share.
-_HARMONICS, _REGULAR = 3, 0.92
-# Shifts by up to this many cells to each side are tried, in this many steps: they cover the cell
-# around the expected place, whatever its shape.
-_REACH, _TRIED = 0.75, 18
 # Least match: as a share of that of perfect crossings, and in deviations of random ones.
 _MIN_SHARE, _MIN_DEVIATIONS = 0.4, 3.0
 _TRACK_LEAST_CROSSINGS = 4
-# Newton's steps to the best shift, and its regularisation in undetermined directions (1/m²).
-_TRACK_ROUNDS, _STIFF = 4, 100.0
 # Standard deviations: velocity at first and with another sensor (m/s), acceleration (m/s²), and the
 # foot of the perpendicular on the net in one frame (m), by noise of the posture.
 _VELOCITY, _TOLD_VELOCITY, _ACCELERATION, _FOOT = 0.15, 0.03, 0.25, 1.5e-3
@@ -199,11 +192,6 @@ _VELOCITY, _TOLD_VELOCITY, _ACCELERATION, _FOOT = 0.15, 0.03, 0.25, 1.5e-3
 # and after it is found; and the least number of frames.
 _FASTEST, _STEP, _USUAL, _FOUND = 0.45, 0.0125, 0.2, 0.04
 _MIN_FRAMES = 4
-# Velocities that differ by a whole mesh per frame look the same: the slowest one with this share of
-# the best match is taken, and then the best one within this distance of it (m/s).
-_AS_GOOD, _SAME_VELOCITY = 0.9, 0.05
-# Standard deviation of the place at such a start, in metres.
-_PLACE = 2e-3
 # A new piece of track begins where the standard deviation of the place exceeds this, in metres;
 # after this many seconds the velocity is discarded as well.
 _LOST, _FORGOTTEN = 0.05, 3.0
@@ -284,7 +272,10 @@ class LatticeFitter:
     def __init__(self, lattice: NetLattice) -> None:
         self.lattice = lattice
         self._waves, self._amplitude, step = _pattern(lattice)
-        share = np.arange(-_TRIED, _TRIED + 1) * (_REACH / _TRIED)
+        # Shifts by up to this many cells to each side are tried, in this many steps: they cover the
+        # cell around the expected place, whatever its shape.
+        reach, tried = 0.75, 18
+        share = np.arange(-tried, tried + 1) * (reach / tried)
         self._away = np.stack(np.meshgrid(share, share), axis=-1).reshape(-1, 2) @ step
         self._swings = np.exp(-2j * np.pi * (self._away @ self._waves.T))
 
@@ -314,9 +305,12 @@ class LatticeFitter:
         prior = np.sum((self._away @ precision) * self._away, axis=1)
         score = 2.0 * (self._swings @ here).real - 0.5 * prior
         place = expected + self._away[np.argmax(score)]
-        for _ in range(_TRACK_ROUNDS):
+        # Newton's steps to the best shift, and its regularisation in undetermined directions
+        # (1/m²).
+        track_rounds, stiff = 4, 100.0
+        for _ in range(track_rounds):
             _, slope, information = self._about(sums, place)
-            place = place + np.linalg.solve(information + _STIFF * np.eye(2), slope)
+            place = place + np.linalg.solve(information + stiff * np.eye(2), slope)
         match, _, information = self._about(sums, place)
         full = len(crossings.place) * float(np.sum(self._amplitude**2))
         if match < max(_MIN_SHARE * full, _MIN_DEVIATIONS * np.sqrt(0.5 * full)):
@@ -350,8 +344,11 @@ class LatticeFitter:
             total += sums * np.exp(2j * np.pi * rate * (times_s[i] - times_s[0]))
         speed = np.hypot(*velocity.T)
         score = 2.0 * np.abs(total).sum(axis=1) - speed**2 / (2.0 * _USUAL**2)
-        slowest = np.argmin(np.where(score >= _AS_GOOD * score.max(), speed, np.inf))
-        near = np.hypot(*(velocity - velocity[slowest]).T) < _SAME_VELOCITY
+        # Velocities that differ by a whole mesh per frame look the same: the slowest one with this
+        # share of the best match is taken, and then the best one within this distance of it (m/s).
+        as_good, same_velocity = 0.9, 0.05
+        slowest = np.argmin(np.where(score >= as_good * score.max(), speed, np.inf))
+        near = np.hypot(*(velocity - velocity[slowest]).T) < same_velocity
         best = int(np.argmax(np.where(near, score, -np.inf)))
         match = (self._swings[:, longest] @ total[best]).real
         return TrackStart(self._away[np.argmax(match)], velocity[best])
@@ -412,10 +409,12 @@ def _pattern(lattice: NetLattice) -> tuple[FloatArray, FloatArray, FloatArray]:
     """
     basis = lattice.basis
     step = _inverse(basis).T
+    # Harmonics of each family's wave; irregular spacing reduces each amplitude to this share.
+    harmonics, regular = 3, 0.92
     if lattice.mesh is Mesh.FOUR_SIDED:
-        number = np.arange(1.0, _HARMONICS + 1.0)
+        number = np.arange(1.0, harmonics + 1.0)
         waves = np.concatenate([number[:, None] * basis[0], number[:, None] * basis[1]])
-        return waves, 0.5 * np.tile(_REGULAR**number, 2), step
+        return waves, 0.5 * np.tile(regular**number, 2), step
     # The shells of the reciprocal lattice; one of each wave and its mirror.
     first = np.array([[1.0, 0.0], [0.0, 1.0], [1.0, -1.0]])
     second = np.array([[1.0, 1.0], [2.0, -1.0], [1.0, -2.0]])
@@ -424,7 +423,7 @@ def _pattern(lattice: NetLattice) -> tuple[FloatArray, FloatArray, FloatArray]:
     ways = np.array([step[0], step[1], step[0] + step[1]])
     bars = np.stack([-ways[:, 1], ways[:, 0]], axis=1) / np.sqrt(3.0)
     each = np.cos(np.pi * waves @ ways.T) * np.sinc(waves @ bars.T)
-    return waves, _REGULAR * each.mean(axis=1), step
+    return waves, regular * each.mean(axis=1), step
 
 
 def _inverse(matrix: FloatArray) -> FloatArray:
@@ -539,10 +538,12 @@ class NetTrack:
         start: TrackStart | None,
     ) -> LatticeShift | None:
         """Begin a piece of track, from the predicted state if the last piece ended recently."""
+        # Standard deviation of the place at such a start, in metres.
+        place = 2e-3
         if start is None:
             shift = fitter.shift(crossings)
         else:
-            shift = fitter.shift(crossings, start.place, np.eye(2) / _PLACE**2)
+            shift = fitter.shift(crossings, start.place, np.eye(2) / place**2)
         if shift is None:
             return None
         covariance = _at_first()

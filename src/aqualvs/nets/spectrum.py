@@ -264,8 +264,6 @@ _SHORTEST_BAR = 0.010
 # Number of waves, and of the best ones that are not neighbours and are followed up; number of
 # second families for each of them.
 _TRIED, _KEPT, _SECONDS = 1000, 6, 2
-# Number of frames in the search for second families.
-_MAX_OF_REST = 6
 # Least distance in frequency of two waves.
 _HYPOTHESES_APART = 2.5
 # Spread of the logarithm of the ratio of the pitches of two families.
@@ -273,8 +271,6 @@ _EVEN = 0.05
 # The strongest waves of a honeycomb look like a diamond whose families lie sixty degrees apart, and
 # few diamonds do so by chance: penalty within this angle.
 _AS_HONEYCOMB, _RARE = np.deg2rad(2.5), 1.0
-# Families that run more nearly alike than this have no mesh between them.
-_MIN_ANGLE = np.deg2rad(25.0)
 
 
 class Mesh(StrEnum):
@@ -397,15 +393,19 @@ def _four_sided(
     """Return pairs of families: likely waves of the stronger one, and the best in the remainder."""
     gain = _family_gain(power, size, spectrum.per_frame, 0.5)
     found = []
+    # Number of frames in the search for second families.
+    max_of_rest = 6
+    # Families that run more nearly alike than this have no mesh between them.
+    min_angle = np.deg2rad(25.0)
     for k, i in _best_waves(gain, size, angle, _KEPT):
         a = size[k] * np.array([np.cos(angle[i]), np.sin(angle[i])])
         rest = spectrum.without(a)
         if rest.n_crossings == 0:
             continue
-        left = _family_gain(rest.polar(_MAX_OF_REST)[2], size, rest.per_frame, SHARE_OF_REST)
+        left = _family_gain(rest.polar(max_of_rest)[2], size, rest.per_frame, SHARE_OF_REST)
         between = np.abs((angle - angle[i] + 0.5 * np.pi) % np.pi - 0.5 * np.pi)
         left = left - 0.5 * (np.log(size / size[k])[:, None] / _EVEN) ** 2
-        left[:, between < _MIN_ANGLE] = -np.inf
+        left[:, between < min_angle] = -np.inf
         for m, j in _best_waves(left, size, angle, _SECONDS):
             b = size[m] * np.array([np.cos(angle[j]), np.sin(angle[j])])
             found.append(Hypothesis(Mesh.FOUR_SIDED, np.array([a, b])))

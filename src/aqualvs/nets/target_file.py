@@ -123,8 +123,6 @@ _DISTANCES = {
     "square": (math.sqrt(0.5), math.sqrt(2.0)),
     "hexagon": (1.0, 2.0),
 }
-# Reflection over twine, as for the paper's net (section 5.2).
-_REFLECTION = 5.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,8 +151,10 @@ class NetFacts:
         """Return the lengths of `MeshFilterOptions` that follow from the net, in metres."""
         least, greatest = (self.bar * share for share in _DISTANCES[self.mesh])
         lengths = {"r_min": least, "r_max": greatest}
+        # Reflection over twine, as for the paper's net (section 5.2).
+        reflection = 5.0
         if self.twine is not None:
-            lengths["rd_theta"] = min(_REFLECTION * self.twine, least)
+            lengths["rd_theta"] = min(reflection * self.twine, least)
         return lengths
 
 
@@ -252,12 +252,6 @@ _ENOUGH_FRAMES = 5
 # of a stripe, and of stripes of a frame.
 _GAP = 3e-3
 _MIN_POINTS, _MIN_STRANDS, _MIN_LASERS = 3, 4, 2
-# Gaps wider than this many usual distances are holes, or objects before the net.
-_HOLE = 2.5
-# Strands that meet at a knot count once and dim ones are missed: found on random simulated nets.
-_MISSED = 1.2
-# On those nets the bar of single frames is estimated at 0.67 to 1.45 of its true length.
-_TOO_SHORT, _TOO_LONG = 0.62, 1.6
 
 
 @dataclass(slots=True)
@@ -295,7 +289,9 @@ class NetCheck:
     def sentence(self) -> str:
         """Return the contradiction to the file in one line, "" if there is none."""
         bar = self.bar()
-        if bar is None or _TOO_SHORT <= bar / self.said.bar <= _TOO_LONG:
+        # On those nets the bar of single frames is estimated at 0.67 to 1.45 of its true length.
+        too_short, too_long = 0.62, 1.6
+        if bar is None or too_short <= bar / self.said.bar <= too_long:
             return ""
         return (
             f"the net looks like one with a bar length of about {1e3 * bar:.2g} mm, where "
@@ -361,7 +357,10 @@ def bar_of(scan: Scan, planes: Sequence[Plane], said: NetFacts) -> float | None:
             densities.append(1.0 / distance)
     if len(densities) < _MIN_LASERS:
         return None
-    return float(said.crossings_per_bar / (_MISSED * np.mean(densities)))
+    # Strands that meet at a knot count once and dim ones are missed: found on random simulated
+    # nets.
+    missed = 1.2
+    return float(said.crossings_per_bar / (missed * np.mean(densities)))
 
 
 def strand_distance(along: FloatArray) -> float | None:
@@ -381,4 +380,6 @@ def strand_distance(along: FloatArray) -> float | None:
     if np.count_nonzero(strand) < _MIN_STRANDS:
         return None
     apart = np.diff(0.5 * (along[first] + along[last])[strand])
-    return float(np.mean(apart[apart <= _HOLE * np.median(apart)]))
+    # Gaps wider than this many usual distances are holes, or objects before the net.
+    hole = 2.5
+    return float(np.mean(apart[apart <= hole * np.median(apart)]))

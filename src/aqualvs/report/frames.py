@@ -26,7 +26,6 @@ from aqualvs.text import bgr
 
 N_PICTURES = 6
 N_SAMPLES = 24
-_WIDTH_PX = 800
 # Pictures of holes: least side and size on the page in pixels, and hole diameters across.
 _CROP_PX, _CROP_SHOWN_PX, _CROP_DIAMETERS = 160, 320, 2.5
 _DECODERS = 2
@@ -39,7 +38,6 @@ _JPEG = (
     cv2.IMWRITE_JPEG_SAMPLING_FACTOR,
     cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444,
 )
-_SATURATED = 250
 _HOLE_COLOUR = bgr("#ffb347")
 
 
@@ -118,7 +116,8 @@ def decode_frames(source: Path, track: Track, rows: list[int]) -> dict[int, Imag
 
 def make_picture(image: ImagePlane, points: FramePoints | None) -> SampleFrame:
     """Draw the points of a frame into its picture and compress it for the page."""
-    scale = min(1.0, _WIDTH_PX / image.shape[1])
+    width_px = 800
+    scale = min(1.0, width_px / image.shape[1])
     small = image
     if scale < 1.0:
         small = np.asarray(
@@ -173,7 +172,8 @@ def saturated_share(image: ImagePlane, points: FramePoints | None) -> float:
     if not inside.any():
         return float("nan")
     brightest = image[rows[inside], columns[inside]].max(axis=-1)
-    return float((brightest >= _SATURATED).mean())
+    saturated = 250
+    return float((brightest >= saturated).mean())
 
 
 def _refused_rows(track: Track) -> list[int]:

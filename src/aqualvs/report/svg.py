@@ -24,10 +24,6 @@ OUTLIER = "#D55E00"
 
 _WIDTH, _HEIGHT, _LEFT, _RIGHT, _FOOT = 900.0, 300.0, 84.0, 16.0, 54.0
 _LANE = 20.0
-_MAX_LANES = 4
-_MAX_WORDS = 12
-_LONGEST = 48
-_DRAWN_PER_SERIES = 800
 # A generous width of a character of the charts' text, relative to its size of 14.
 _CHARACTER = 7.6
 _DASHED = ' stroke-width="1.6" stroke-dasharray="7 5"'
@@ -195,7 +191,8 @@ def _scales(x_axis: Axis, y_axis: Axis, series: Series) -> list[str]:
 
 def _curve(series: Series, known: BoolArray, x_axis: Axis, y_axis: Axis) -> list[str]:
     """Return band and line, broken where values are missing."""
-    rows = thin(np.where(known, series.y, np.nan), _DRAWN_PER_SERIES)
+    drawn_per_series = 800
+    rows = thin(np.where(known, series.y, np.nan), drawn_per_series)
     x, y = x_axis.place(series.x[rows]), y_axis.place(series.y[rows])
     pieces = np.split(np.arange(len(rows)), np.array(breaks(rows, ~known), dtype=np.int64) + 1)
     parts = []
@@ -247,12 +244,15 @@ def _mark_text(marks: Sequence[tuple[float, str]], x_axis: Axis) -> tuple[list[s
     """Return the words of the first marks, in lanes in which they do not touch, and the lanes."""
     ends: list[float] = []
     parts = []
-    for at, words in _inside(marks, x_axis)[:_MAX_WORDS]:
-        short = words if len(words) <= _LONGEST else words[: _LONGEST - 1] + "…"
+    max_lanes = 4
+    max_words = 12
+    longest = 48
+    for at, words in _inside(marks, x_axis)[:max_words]:
+        short = words if len(words) <= longest else words[: longest - 1] + "…"
         width, x = _CHARACTER * len(short) + 10.0, x_axis.at(at)
         start = max(min(x - 2.0, x_axis.end - width), 0.0)
         free = [i for i, end in enumerate(ends) if end <= start]
-        if not free and len(ends) == _MAX_LANES:
+        if not free and len(ends) == max_lanes:
             continue
         lane = free[0] if free else len(ends)
         ends[lane : lane + 1] = [start + width]

@@ -30,19 +30,11 @@ SAME_RANGE, SAME_ANGLE = 0.004, math.radians(0.4)
 
 # Least light that a rival must explain, as a share of the surface's.
 _RIVAL_SHARE = 0.5
-# Number of lasers whose stripes start rivals.
-_N_SEEDS = 4
-# The noise (px) that half a stripe has at least.
-_HALF_STRIPE_PX = 0.1
 # Light within this many gates of a plane is on it: lasers whose calibration is less accurate than
 # the peaks must not count as dark, nor their light as foreign.
 _WIDE = 2.5
 # Least number of cells to judge a laser; with a smaller share of the typical light it is dark.
 _MIN_CELLS, _DARK_SHARE = 3, 0.25
-# A cell is lit if this share of the other lasers that can be there is seen there.
-_LIT_SHARE = 0.15
-# Least number of search lines of half a stripe.
-_MIN_LINES = 8
 # A laser is faint with this share of the best one's way through the picture.
 _FAINT = 0.4
 # Columns of sums over the peaks of one laser's stripe, read as some laser's.
@@ -153,7 +145,9 @@ def _sum_candidates(
 def _choose_seeds(sums: FloatArray, place: FloatArray) -> IntArray:
     """Choose lasers whose stripes are bright and far from each other."""
     n_lasers = place.shape[0]
-    seeds, n = np.empty(min(_N_SEEDS, n_lasers), np.int64), 0
+    # Number of lasers whose stripes start rivals.
+    n_seeds = 4
+    seeds, n = np.empty(min(n_seeds, n_lasers), np.int64), 0
     while n < seeds.shape[0]:
         best, most = -1, 0.0
         for i in range(n_lasers):
@@ -431,6 +425,8 @@ def _variance(
     x, y, z, offset = plane[0], plane[1], plane[2], plane[3]
     square, n, n_lit = 0.0, 0, 0
     begin = 0
+    # Least number of search lines of half a stripe.
+    min_lines = 8
     for i in range(n_lasers):
         end = begin
         middle, lines = 0.0, 0
@@ -440,7 +436,7 @@ def _variance(
                 lines += n_lines[end]
             end += 1
         middle /= max(lines, 1)
-        n_lit += lines >= _MIN_LINES
+        n_lit += lines >= min_lines
         for half in range(2):
             total, lines = 0.0, 0
             for c in range(begin, end):
@@ -449,14 +445,16 @@ def _variance(
                     per_px = x * table[JX, c] + y * table[JY, c] + z * table[JZ, c]
                     total += n_lines[c] * residual / per_px
                     lines += n_lines[c]
-            if lines >= _MIN_LINES:
+            if lines >= min_lines:
                 square += (total / lines) ** 2
                 n += 1
         begin = end
     freedom = n - 3.0
     if freedom <= 0.0:
         return 1.0, 0.0, n_lit
-    return square / freedom + _HALF_STRIPE_PX * _HALF_STRIPE_PX, freedom, n_lit
+    # The noise (px) that half a stripe has at least.
+    half_stripe_px = 0.1
+    return square / freedom + half_stripe_px * half_stripe_px, freedom, n_lit
 
 
 @borrowing_kernel
@@ -621,6 +619,8 @@ def _dark_lasers(lit: BoolArray, expected: BoolArray, along_x: BoolArray) -> flo
     """Count the lasers that show nothing where others do; a dim one counts in part."""
     n_lasers, n_cells = lit.shape
     dark = 0.0
+    # A cell is lit if this share of the other lasers that can be there is seen there.
+    lit_share = 0.15
     for i in range(n_lasers):
         asked, seen, of_others, by_others = 0, 0, 0.0, 0.0
         for cell in range(n_cells):
@@ -631,7 +631,7 @@ def _dark_lasers(lit: BoolArray, expected: BoolArray, along_x: BoolArray) -> flo
                 if k != i and along_x[k] == along_x[i] and expected[k, cell]:
                     there += 1
                     shown += lit[k, cell]
-            if shown < 1 or shown < _LIT_SHARE * there:
+            if shown < 1 or shown < lit_share * there:
                 continue
             asked += 1
             seen += lit[i, cell]

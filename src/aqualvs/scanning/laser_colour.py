@@ -24,10 +24,6 @@ from aqualvs.geometry.linear_algebra import element_at, sum_of
 from aqualvs.scanning.scan import Frame, ImagePlane
 from aqualvs.scanning.stripe import HEIGHT, IMBALANCE, STEP_U, STEP_V, TINT_U, TINT_V, TOP, WIDTH
 
-# Wavelengths (nm) that separate blue, green and red lines.
-_BLUE_TO_GREEN_NM, _GREEN_TO_RED_NM = 490.0, 580.0
-# R and B by V and U, in the scale of limited-range luma (BT.601).
-_RED_OF_V, _BLUE_OF_U = 1.596 / 1.164, 2.018 / 1.164
 # The thresholds of learning were tuned on the rendered sample and benchmark dives, the photographs
 # of the sample folders and dives of the simulated cameras.
 # Stripes to learn from: least height of the peaks in grey levels; least chroma step beyond that of
@@ -36,8 +32,6 @@ _RED_OF_V, _BLUE_OF_U = 1.596 / 1.164, 2.018 / 1.164
 # largest and the smallest scatter of half of them, as shares of their mean step.
 _MIN_HEIGHT, _CLEAR_SIGMAS, _CLEAR_LEVELS, _MIN_COSINE = 12.0, 3.0, 3.0, 0.2
 _BEST_SHARE, _MIN_LEARNED, _MAX_SCATTER, _MIN_SCATTER = 0.6, 16, 0.4, 0.22
-# Number of peaks that is enough to learn from.
-_ENOUGH = 2500
 # Paint: least height of the peaks near one colour, and least ratio of their number to what the
 # lasers can make; its least spread, as chroma for each level, and its largest spread across the
 # tint of its light; and the distances from its middle, in standard deviations, of other things and
@@ -54,31 +48,18 @@ _RATIO_SPREAD, _ACROSS_SPREAD = 0.35, 0.5
 # Paint shows up to this share of the tint of its flanks, and at most the second share of the chroma
 # of a line, however green the scene is.
 _TINT_SHARE, _PAINT_SHARE = 0.5, 0.5
-# The learned ratio is the one that this share of the best stripes exceeds.
-_LEARNED_QUANTILE = 0.35
-# Least chroma noise after rounding and subsampling, in levels.
-_MIN_SIGMA = 0.7
 # Width of the bins of height, and number of refinements of the shares of lines in them.
 _KINDS_PER_OCTAVE, _N_KINDS, _ROUNDS = 2.0, 16, 3
 _KIND_OF_HEIGHT = np.minimum(_KINDS_PER_OCTAVE * np.log2(np.arange(256).clip(1)), _N_KINDS - 1)
 _KIND_OF_HEIGHT = _KIND_OF_HEIGHT.astype(np.int64)
-# Heights at which so few of a sample's peaks, or at most this share, are clearly lines are skipped.
-_FEW_LINES, _USEFUL_SHARE, _CLEARLY = 4, 0.05, 0.8
 # The colour of a core this bright, in limited-range luma, is ignored: every light is white there.
 WHITE = 225.0
-# Luma from which on a channel may be clipped; full scale; and the share of its chroma that a line
-# shows there: measured on rendered stripes, at the middle or an edge.
-_CLIPPED, _FULL, _LEFT_AT_FULL = 185.0, 235.0, 0.33
-# A quarter of a normal distribution lies within this many standard deviations.
-_QUARTER_OF_NORMAL = 0.3186
 # The largest of three normal numbers is this many standard deviations above their mean; up to this
 # many levels of noise the lines' own differences are larger.
 _LARGEST_OF_THREE, _QUIET = 0.85, 1.4
 # Limit of the log-likelihood ratio.
 _MAX_LOG_ODDS = 12.0
 
-# Spreads of 0: unknown.
-_NO_PAINT = (0.0, 0.0, 0.0, 0.0)
 
 HIGHEST_USEFUL = 32
 """Height in grey levels from which on peaks are always used."""
@@ -100,9 +81,11 @@ class LaserColour(Enum):
         """Return the colour of a wavelength in nanometres; green if it is None."""
         if wavelength_nm is None:
             return cls.GREEN
-        if wavelength_nm < _BLUE_TO_GREEN_NM:
+        # Wavelengths (nm) that separate blue, green and red lines.
+        blue_to_green_nm, green_to_red_nm = 490.0, 580.0
+        if wavelength_nm < blue_to_green_nm:
             return cls.BLUE
-        return cls.GREEN if wavelength_nm < _GREEN_TO_RED_NM else cls.RED
+        return cls.GREEN if wavelength_nm < green_to_red_nm else cls.RED
 
 
 def channel_image(frame: Frame, colour: LaserColour) -> ImagePlane:
@@ -123,8 +106,10 @@ def channel_image(frame: Frame, colour: LaserColour) -> ImagePlane:
     """
     if colour is LaserColour.GREEN or frame.chroma is None:
         return frame.luma
+    # R and B by V and U, in the scale of limited-range luma (BT.601).
+    red_of_v, blue_of_u = 1.596 / 1.164, 2.018 / 1.164
     chroma, weight = (
-        (frame.chroma[1], _RED_OF_V) if colour is LaserColour.RED else (frame.chroma[0], _BLUE_OF_U)
+        (frame.chroma[1], red_of_v) if colour is LaserColour.RED else (frame.chroma[0], blue_of_u)
     )
     mixed = frame.luma + weight * (full_size(chroma.astype(np.float32), frame) - 128.0)
     image: ImagePlane = np.clip(np.rint(mixed), 0, 255).astype(np.uint8)
@@ -220,8 +205,10 @@ def learn_colour(table: FloatArray, colour: LaserColour, paint: Paint | None) ->
     LineColour or None
         None where too few peaks are clearly of the laser's colour.
     """
+    # Number of peaks that is enough to learn from.
+    enough = 2500
     if paint is None:
-        every = 1 + table.shape[1] // _ENOUGH
+        every = 1 + table.shape[1] // enough
         found = LineColour(*_learn(table[:, ::every], *colour.value))
     else:
         found = LineColour(*_learn_beside_paint(table, *colour.value, *paint), paint)
@@ -262,7 +249,9 @@ def laser_likelihood(
         0 to 1; 0.5 where colour gives no evidence.
     """
     likelihood = np.empty(table.shape[1])
-    paint = line.paint or _NO_PAINT
+    # Spreads of 0: unknown.
+    no_paint = (0.0, 0.0, 0.0, 0.0)
+    paint = line.paint or no_paint
     _weigh(table, *line[:6], *paint, widest_white_px, n_possible, likelihood)
     return likelihood
 
@@ -289,8 +278,12 @@ def _noise(table: FloatArray) -> float:
 
     A low quantile: beside other stripes and edges the flanks differ by more than noise.
     """
-    noise = element_at(np.abs(table[IMBALANCE]), 0.25) / _QUARTER_OF_NORMAL
-    return max(noise / math.sqrt(2.0), _MIN_SIGMA)
+    # A quarter of a normal distribution lies within this many standard deviations.
+    quarter_of_normal = 0.3186
+    noise = element_at(np.abs(table[IMBALANCE]), 0.25) / quarter_of_normal
+    # Least chroma noise after rounding and subsampling, in levels.
+    min_sigma = 0.7
+    return max(noise / math.sqrt(2.0), min_sigma)
 
 
 @inline_kernel
@@ -315,6 +308,8 @@ def _beyond_paint(
 def _learn(table: FloatArray, u: float, v: float) -> tuple[float, float, float, float]:
     """Return direction, ratio and noise of the frame's best stripes; a ratio of 0 if unknown."""
     sigma = _noise(table)
+    # The learned ratio is the one that this share of the best stripes exceeds.
+    learned_quantile = 0.35
     # Steps that differ from any paint are the most certain; a line as green as the water is not.
     for tint_share in (1.0, _TINT_SHARE):
         best = _best_stripes(table, u, v, sigma, tint_share)
@@ -325,7 +320,7 @@ def _learn(table: FloatArray, u: float, v: float) -> tuple[float, float, float, 
         if is_one_colour:
             size = math.hypot(line_u, line_v)
             line_u, line_v = line_u / size, line_v / size
-            ratio = element_at(line_u * of_u + line_v * of_v, _LEARNED_QUANTILE)
+            ratio = element_at(line_u * of_u + line_v * of_v, learned_quantile)
             return line_u, line_v, max(ratio, RATIO_LEAST), sigma
     return u, v, 0.0, sigma
 
@@ -425,7 +420,10 @@ def _is_near(step_u: float, step_v: float, u: float, v: float) -> bool:
 @inline_kernel
 def _colour_left(top: float) -> float:
     """Return the share of its chroma that an overexposed line of this luma shows."""
-    return 1.0 - (1.0 - _LEFT_AT_FULL) * min(max((top - _CLIPPED) / (_FULL - _CLIPPED), 0.0), 1.0)
+    # Luma from which on a channel may be clipped; full scale; and the share of its chroma that a
+    # line shows there: measured on rendered stripes, at the middle or an edge.
+    clipped, full, left_at_full = 185.0, 235.0, 0.33
+    return 1.0 - (1.0 - left_at_full) * min(max((top - clipped) / (full - clipped), 0.0), 1.0)
 
 
 @kernel
@@ -449,13 +447,16 @@ def _best_stripes(
 @kernel
 def _useful_height(height: FloatArray, likelihood: FloatArray) -> float:
     lines, peaks = np.zeros(_N_KINDS), np.zeros(_N_KINDS)
+    # Heights at which so few of a sample's peaks, or at most this share, are clearly lines are
+    # skipped.
+    few_lines, useful_share, clearly = 4, 0.05, 0.8
     for i in range(height.shape[0]):
         kind = _kind_of(height[i])
         peaks[kind] += 1.0
-        lines[kind] += likelihood[i] > _CLEARLY
+        lines[kind] += likelihood[i] > clearly
     n_useless = 0
     while n_useless < _N_KINDS and (
-        lines[n_useless] < _FEW_LINES or lines[n_useless] <= _USEFUL_SHARE * peaks[n_useless]
+        lines[n_useless] < few_lines or lines[n_useless] <= useful_share * peaks[n_useless]
     ):
         n_useless += 1
     return float(min(math.ceil(2.0 ** (n_useless / _KINDS_PER_OCTAVE)), HIGHEST_USEFUL))

@@ -372,9 +372,6 @@ _CODECS = {0x01: "mpeg1video", 0x02: "mpeg2video", 0x10: "mpeg4", 0x1B: "h264", 
 _RESTART_TICKS = 10 * TICKS_HZ
 """A step in time beyond this is a restarted sender."""
 
-_MAX_BYTES = 16 << 20
-"""No picture is larger; larger data have lost their end."""
-
 
 class TransportStream:
     """Demultiplexer of the first video of an MPEG-TS, from packets of 188 bytes.
@@ -488,10 +485,12 @@ class TransportStream:
             self._ends_by_filling = False
             self._after_loss = True
         self._ended_early = False
+        # No picture is larger; larger data have lost their end.
+        max_bytes = 16 << 20
         if self._parts is not None and (
-            (filled and self._ends_by_filling) or self._n_bytes > _MAX_BYTES
+            (filled and self._ends_by_filling) or self._n_bytes > max_bytes
         ):
-            done += self._close(is_whole=self._n_bytes <= _MAX_BYTES)
+            done += self._close(is_whole=self._n_bytes <= max_bytes)
             self._ended_early = True
         return done
 

@@ -289,9 +289,6 @@ def promised_duration(stream: VideoStream) -> float | None:
     return 3600 * hours + 60 * minutes + seconds
 
 
-_SEEK_BEFORE_S = (0, 2, 20, 1_000_000)
-
-
 class UnlikeProbeError(Exception):
     """Difference between a span and its description; the dive must be measured in one piece."""
 
@@ -407,7 +404,8 @@ def _packets_from(stream: VideoStream, span: Span) -> "Iterator[Packet[VideoStre
     container = cast("InputContainer", stream.container)
     if not span.first:
         return (packet for packet in container.demux(stream) if packet.size)
-    for before_s in _SEEK_BEFORE_S:
+    seek_before_s = (0, 2, 20, 1_000_000)
+    for before_s in seek_before_s:
         # Some containers seek by the order of the file, where a picture may come before its time.
         ticks = before_s / (stream.time_base or 1)
         container.seek(max(span.origin_pts, round(span.start_pts - ticks)), stream=stream)

@@ -67,8 +67,6 @@ _COLUMNS = {field.name: getattr(ScanPoints.none(), field.name) for field in fiel
 _BYTES = [column.itemsize * math.prod(column.shape[1:]) for column in _COLUMNS.values()]
 _ARRAYS = ("covariance", "normal_in_dome", "rig_covariance")
 _NUMBERS = tuple(field.name for field in fields(Posture) if field.name not in _ARRAYS)
-# Size of a cache line: no two columns share one.
-_ALIGNED = 64
 
 
 def room_for(message: Message) -> int:
@@ -145,10 +143,12 @@ def _columns(memory: NDArray[np.uint8], n_points: int) -> Iterator[NDArray[Any]]
 def _places(n_points: int) -> list[tuple[int, int]]:
     """Return where the bytes of each column begin and end."""
     places, first = [], 0
+    # Size of a cache line: no two columns share one.
+    aligned = 64
     for n_bytes in _BYTES:
         stop = first + n_points * n_bytes
         places.append((first, stop))
-        first = -(-stop // _ALIGNED) * _ALIGNED
+        first = -(-stop // aligned) * aligned
     return places
 
 
@@ -426,12 +426,6 @@ def _earlier(stop: int, wanted: int | None) -> int:
     return stop if wanted is None else min(stop, wanted)
 
 
-_MAX_WAITING = 100
-"""Blocks for each process that may wait for earlier parts; beyond it, only those are read."""
-
-_TIMEOUT_S = 2.0
-
-
 @dataclass(slots=True)
 class _Worker:
     """A process, and the number of the part that it works on; -1 if there is none left for it."""
@@ -498,7 +492,9 @@ class WorkerPool(Closing):
 
     def _take_in(self, number: int) -> None:
         """Wait for messages about a part, and take in others unless too many wait."""
-        crowded = sum(map(len, self._found.values())) > _MAX_WAITING * len(self._workers)
+        # Blocks for each process that may wait for earlier parts; beyond it, only those are read.
+        max_waiting = 100
+        crowded = sum(map(len, self._found.values())) > max_waiting * len(self._workers)
         workers = {
             worker.pipe: worker
             for worker in self._workers
@@ -546,8 +542,9 @@ class WorkerPool(Closing):
             with contextlib.suppress(OSError):
                 worker.pipe.close()
             worker.process.terminate()
+        timeout_s = 2.0
         for worker in self._workers:
-            worker.process.join(_TIMEOUT_S)
+            worker.process.join(timeout_s)
             if worker.process.is_alive():
                 worker.process.kill()
                 worker.process.join()

@@ -342,11 +342,6 @@ def _is_at_hand(source: FrameSource) -> bool:
 
 # Reading the target's markers takes longer than measuring a frame; the index hardly changes.
 _FIRST_FRAMES, _EVERY_S = 5, 0.4
-# Smaller changes of the index change the range by less than 0.003 % and need no new scanner.
-_WORTH = 2e-4
-_MIN_SIGMA_TO_FOLLOW = 4e-3
-# Accuracy of a user's measurement of the plate's place; only the index is tracked.
-_PLACE_MM, _TURN_DEG = 0.2, 0.1
 
 
 class WaterFollowingScanner:
@@ -388,11 +383,13 @@ class WaterFollowingScanner:
             )
         self.scanner = Scanner(rig, options)
         self._markers = load_target(target)
+        # Accuracy of a user's measurement of the plate's place; only the index is tracked.
+        place_mm, turn_deg = 0.2, 0.1
         self._estimator = IndexEstimator(
             rig,
             uncertainty=rig_uncertainty(rig),
             prior=_prior(water, rig),
-            options=IndexOptions.of_target(_PLACE_MM, _TURN_DEG),
+            options=IndexOptions.of_target(place_mm, turn_deg),
         )
         self._next_s = -np.inf
         self._n_read = 0
@@ -440,8 +437,12 @@ class WaterFollowingScanner:
         if not reading:
             return
         self._last, self._n_read = reading, self._n_read + 1
-        trusted = reading.sigma < _MIN_SIGMA_TO_FOLLOW
-        if trusted and abs(reading.n - self.scanner.rig.n_water) > _WORTH:
+        # Smaller changes of the index change the range by less than 0.003 % and need no new
+        # scanner.
+        worth = 2e-4
+        min_sigma_to_follow = 4e-3
+        trusted = reading.sigma < min_sigma_to_follow
+        if trusted and abs(reading.n - self.scanner.rig.n_water) > worth:
             self.scanner = Scanner(self._rig.in_water(max(reading.n, 1.0)), self._options)
 
 

@@ -26,17 +26,17 @@ MIN_PIVOT = 1e-12
 
 _SQRT_HALF = math.sqrt(0.5)
 _DENSITY_AT_ZERO = 1.0 / math.sqrt(2.0 * math.pi)
-# Beyond this many standard deviations of the blur an edge has its full height.
-_REACH = 4.0
 
 
 @inline_borrowing_kernel
 def blurred_edge(distance: float, blur: float) -> tuple[float, float]:
     """Return the height of a Gaussian edge, 0 to 1, and its derivative by `distance`."""
     t = distance / blur
-    if t > _REACH:
+    # Beyond this many standard deviations of the blur an edge has its full height.
+    reach = 4.0
+    if t > reach:
         return 1.0, 0.0
-    if t < -_REACH:
+    if t < -reach:
         return 0.0, 0.0
     return 0.5 + 0.5 * math.erf(_SQRT_HALF * t), _DENSITY_AT_ZERO * math.exp(-0.5 * t * t) / blur
 
@@ -53,16 +53,12 @@ _RECENTRE_PX = 0.6
 _RADIUS_LIMIT_PX = 8.0
 _RADIUS_SHARE = 0.47
 _MIN_RADIUS_PX = 2.4
-# Sine of the angle between the edges below which they no longer cross in a point.
-_MIN_SINE = 0.25
 # Initial guess of the blur, as a share of the square.
 _BLUR_SHARE = 0.06
 _MAX_STEP_PX = 2.0
 _MAX_STEP_ANGLE = 0.2
 _MAX_STEP_LOG_BLUR = 0.5
 _BLUR_PX = (0.25, 6.0)
-# Bits of a marker affect its border up to this many standard deviations of the blur.
-_BITS_REACH = 2.0
 
 
 # The constants of one window, in this order, as kernels take them.
@@ -107,7 +103,9 @@ def _start(axes: FloatArray, pixel: FloatArray, window: FloatArray, unknowns: Fl
     area = axes[0, 0] * axes[1, 1] - axes[0, 1] * axes[1, 0]
     side_1 = math.hypot(axes[0, 0], axes[1, 0])
     side_2 = math.hypot(axes[0, 1], axes[1, 1])
-    if not abs(area) > _MIN_SINE * side_1 * side_2:
+    # Sine of the angle between the edges below which they no longer cross in a point.
+    min_sine = 0.25
+    if not abs(area) > min_sine * side_1 * side_2:
         return False
     window[_REACH_1], window[_REACH_2] = abs(area) / side_2, abs(area) / side_1
     # The edge along the board's y separates its x: its normal points to +x, the other's to +y.
@@ -289,8 +287,10 @@ def _among_bits(d_1: float, d_2: float, blur: float, window: FloatArray) -> bool
     """Return whether a pixel belongs to, or is blurred with, a marker's bits (not modelled)."""
     if window[_SIGN] * d_1 * d_2 <= 0.0:
         return False
-    u = (abs(d_1) + _BITS_REACH * blur) / window[_REACH_1]
-    v = (abs(d_2) + _BITS_REACH * blur) / window[_REACH_2]
+    # Bits of a marker affect its border up to this many standard deviations of the blur.
+    bits_reach = 2.0
+    u = (abs(d_1) + bits_reach * blur) / window[_REACH_1]
+    v = (abs(d_2) + bits_reach * blur) / window[_REACH_2]
     return bool(min(u, v) > window[_BITS_FROM])
 
 
@@ -326,12 +326,6 @@ def _lightness(
 
 GreyImage = NDArray[np.uint8]
 """A grey picture, shape (height, width)."""
-
-# Limits of an accepted fit: residual as a share of the contrast, turn of either edge, and
-# uncertainty of the crossing.
-_MAX_RESIDUAL_SHARE = 0.15
-_MAX_TURN = np.deg2rad(12.0)
-_MAX_SIGMA_PX = 0.3
 
 
 @dataclass(frozen=True, slots=True)
@@ -406,6 +400,11 @@ def refine_saddles(
     sigma, residual_share, turn, blur = quality.T
     side = np.sqrt(np.min(np.sum(np.square(axes), axis=1), axis=-1, initial=np.inf))
     wander = np.linalg.norm(pixels - starts, axis=1)
-    valid = (sigma > 0.0) & (sigma < _MAX_SIGMA_PX) & (wander <= max_wander * side)
-    valid &= (residual_share < _MAX_RESIDUAL_SHARE) & (turn < _MAX_TURN)
+    # Limits of an accepted fit: residual as a share of the contrast, turn of either edge, and
+    # uncertainty of the crossing.
+    max_residual_share = 0.15
+    max_turn = np.deg2rad(12.0)
+    max_sigma_px = 0.3
+    valid = (sigma > 0.0) & (sigma < max_sigma_px) & (wander <= max_wander * side)
+    valid &= (residual_share < max_residual_share) & (turn < max_turn)
     return SaddleFit(np.where(valid[:, None], pixels, starts), sigma, blur, valid)

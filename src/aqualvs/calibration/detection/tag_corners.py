@@ -35,8 +35,6 @@ U8Array = NDArray[np.uint8]
 # of the level 18-19 and of the contrast 20-21 along q.
 N_UNKNOWNS = 22
 BLUR, GAMMA, LEVEL, CONTRAST = 14, 15, 16, 17
-# Ratio of the ink's tone to the contrast below which ink is taken as black.
-_MIN_DARKNESS = 0.02
 
 
 @inline_borrowing_kernel
@@ -126,7 +124,9 @@ def _tone(h: float, gamma: float, darkness: float) -> tuple[float, float, float,
     """
     if h <= 0.0 or h >= 1.0:
         return h, 1.0, 0.0, 0.0
-    r = max(darkness, _MIN_DARKNESS)
+    # Ratio of the ink's tone to the contrast below which ink is taken as black.
+    min_darkness = 0.02
+    r = max(darkness, min_darkness)
     log_low, log_high = math.log(r), math.log(1.0 + r)
     low, high = math.exp(gamma * log_low), math.exp(gamma * log_high)
     light = low + h * (high - low)
@@ -135,7 +135,7 @@ def _tone(h: float, gamma: float, darkness: float) -> tuple[float, float, float,
     scale = grey / (gamma * light)
     by_gamma = low * log_low + h * (high * log_high - low * log_low)
     by_r = gamma * (low / r * (1.0 - h) + high / (1.0 + r) * h)
-    tone_by_r = scale * by_r - 1.0 if darkness > _MIN_DARKNESS else 0.0
+    tone_by_r = scale * by_r - 1.0 if darkness > min_darkness else 0.0
     by_log_gamma = scale * by_gamma * gamma - grey * log_light / gamma
     return grey - r, scale * (high - low), by_log_gamma, tone_by_r
 
@@ -417,9 +417,6 @@ _SLOPE_SHARE = 0.3
 _N_ROBUST_ROUNDS = 3
 _N_CLEAN_ROUNDS = 2
 _STEPS = 4
-# Pixels this many noise scales off, or this share of the contrast, show something else.
-_POLLUTED_SCALES = 4.5
-_POLLUTED_SHARE = 0.08
 # Noise of rounding to whole grey levels.
 _MIN_NOISE = 0.3
 _MIN_CONTRAST = 8.0
@@ -583,7 +580,10 @@ def _weigh(residuals: FloatArray, contrast: float, robust: bool) -> tuple[FloatA
     size = np.abs(residuals)
     noise = max(1.4826 * float(np.nanmedian(size)), _MIN_NOISE)
     size = np.nan_to_num(size)
-    limit = max(_POLLUTED_SCALES * noise, _POLLUTED_SHARE * contrast)
+    # Pixels this many noise scales off, or this share of the contrast, show something else.
+    polluted_scales = 4.5
+    polluted_share = 0.08
+    limit = max(polluted_scales * noise, polluted_share * contrast)
     if robust:
         return np.square(1.0 / (1.0 + np.square(size / limit))), noise
     polluted = (size > limit).astype(np.uint8)

@@ -250,13 +250,9 @@ def _cross_validation(found: CrossValidation | None, what: str) -> list[str]:
     return [f"{text}: the pictures do not show that there is a {what}"]
 
 
-# A solve with smaller residuals has found the minimum; one with larger ones may be in another.
-_GOOD_NOISE_PX = 0.5
 # A view is bad if it is this many times noisier than the typical one, and noisier than this.
 _BAD_VIEW, _BAD_NOISE_PX = 5.0, 0.5
 _BAD_SHARE = 1.0 / 3.0
-# A given distance with an error of this many sigmas is a mistake.
-_WRONG_DISTANCE = 5.0
 
 
 def dome(
@@ -315,6 +311,8 @@ def _solved(
     """Solve from the rig's lens position, or else from the dome's centre."""
     best: tuple[DomeProblem, Solution[BundleState]] | None = None
     trouble: list[CalibrationError | RigError] = []
+    # A solve with smaller residuals has found the minimum; one with larger ones may be in another.
+    good_noise_px = 0.5
     for start in initial_rigs(rig):
         try:
             problem = dome_problem(start, sets, known, options)
@@ -329,7 +327,7 @@ def _solved(
             continue
         if best is None or noise_px(solution) < noise_px(best[1]):
             best = problem, solution
-        if solution.converged and noise_px(solution) < _GOOD_NOISE_PX:
+        if solution.converged and noise_px(solution) < good_noise_px:
             break
     if best is None:
         raise trouble[0]
@@ -380,7 +378,9 @@ def _without_wrong_distances(
 
 def _wrong_distances(problem: DomeProblem, solution: Solution[BundleState]) -> list[int]:
     off = distance_blocks(problem, solution)
-    return [i for i, block in off.items() if block.lengths[0] > _WRONG_DISTANCE]
+    # A given distance with an error of this many sigmas is a mistake.
+    wrong_distance = 5.0
+    return [i for i, block in off.items() if block.lengths[0] > wrong_distance]
 
 
 def _again(

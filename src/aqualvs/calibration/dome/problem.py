@@ -47,11 +47,6 @@ from aqualvs.geometry.transforms import SE3
 from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import Rig, RigUncertainty, combined
 
-_MIN_VIEWS = 3
-_MIN_POINTS = 60
-# Indices on both sides of a port that differ by less tell nothing of its place.
-_BENDING = 0.01
-
 
 class GivenPose(Protocol):
     """Measurements of a board's pose: the whole pose, its distance, or nothing."""
@@ -176,16 +171,18 @@ def check_sets(rig: Rig, sets: Sequence[BoardSet]) -> None:
     exact = any(
         kind_of(one.given(i)) is PoseKind.EXACT for one in sets for i in range(len(one.views))
     )
-    needed = 1 if exact else _MIN_VIEWS
+    min_views = 3
+    needed = 1 if exact else min_views
     if len(views) < needed:
         raise CalibrationError(
             f"{len(views)} pictures show the board; the dome needs {needed} at least, and 10 to 15 "
             "at distances all over the working range to be good"
         )
     points = sum(len(view) for view in views)
-    if points < _MIN_POINTS:
+    min_points = 60
+    if points < min_points:
         raise CalibrationError(
-            f"{points} board corners in {len(views)} pictures; the dome needs {_MIN_POINTS} at "
+            f"{points} board corners in {len(views)} pictures; the dome needs {min_points} at "
             "least; show more of the board, or more often"
         )
 
@@ -196,7 +193,9 @@ def _check_flat(rig: Rig, sets: Sequence[BoardSet]) -> None:
             f"rig {rig.name} has a flat port, whose place does not depend on the boards' poses; "
             "leave the poses out"
         )
-    if all(abs(one.n_medium - rig.n_air) < _BENDING for one in sets):
+    # Indices on both sides of a port that differ by less tell nothing of its place.
+    bending = 0.01
+    if all(abs(one.n_medium - rig.n_air) < bending for one in sets):
         raise CalibrationError(
             "all pictures were taken in air, where a flat port looks the same at any distance; "
             "take some with the port in water"
@@ -211,10 +210,6 @@ ROTATION = ("rotation_x", "rotation_y", "rotation_z")
 def place_names(rig: Rig) -> tuple[str, ...]:
     """Return the names of the numbers that say where lens and housing are to each other."""
     return LENS if rig.flat_port is None else PORT
-
-
-# For every lens position, poses of the right board are nearer than this.
-_MAX_MISFIT_PX = 30.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -395,7 +390,9 @@ def _started(rig: Rig, sets: Sequence[BoardSet]) -> tuple[list[Shot], list[SE3],
         misfits.append(start.median_px)
     if not shots:
         raise CalibrationError(_why_none(rig, sets) or next(iter(left_out.values())))
-    if np.median(misfits) > _MAX_MISFIT_PX:
+    # For every lens position, poses of the right board are nearer than this.
+    max_misfit_px = 30.0
+    if np.median(misfits) > max_misfit_px:
         raise CalibrationError(
             f"no pose of the board explains the pictures: corners are {np.median(misfits):.0f} px "
             "off; check the board's file against the print, and the camera's calibration"
@@ -451,8 +448,6 @@ def _priors(
 # Boards are not set up better than this: 0.9 mm a metre.
 _FINEST = float(np.deg2rad(0.05))
 _STEP = 0.5
-# A finer scale must raise the log likelihood by this much: odds of 20 to 1.
-_EVIDENCE = 3.0
 
 
 def with_board_tilt_as_found(
@@ -472,11 +467,13 @@ def with_board_tilt_as_found(
     problem, solution
         Unchanged if boards do not agree better, or nothing is known of their poses.
     """
+    # A finer scale must raise the log likelihood by this much: odds of 20 to 1.
+    evidence = 3.0
     while sigma * _STEP >= _FINEST * (1.0 - 1e-9):
         finer = problem.with_board_tilt_prior(sigma * _STEP)
         trial = solve(finer.bundle, solution.state)
         gain = _misfit(solution, sigma) - _misfit(trial, sigma * _STEP)
-        if not (trial.converged and gain > _EVIDENCE):
+        if not (trial.converged and gain > evidence):
             break
         problem, solution, sigma = finer, trial, sigma * _STEP
     return problem, solution
@@ -489,12 +486,6 @@ def _misfit(solution: Solution[BundleState], sigma: float) -> float:
         return 0.0
     squares = np.sum(np.square(leaning), axis=1)
     return float(1.5 * np.sum(np.log1p(squares)) + 2.0 * len(leaning) * np.log(sigma))
-
-
-# Number of folds, and least number of views; with fewer all are needed for the solve.
-_PARTS, _MIN_SPLIT_VIEWS = 4, 8
-# Half a view must still determine a pose.
-_MIN_SPLIT_POINTS = 12
 
 
 def compare_with_bare_lens(
@@ -515,12 +506,16 @@ def compare_with_bare_lens(
         shot.view.where(inliers)
         for shot, inliers in zip(problem.shots, solution.inliers[:n], strict=True)
     ]
-    usable = [i for i in range(n) if len(believed[i]) >= _MIN_SPLIT_POINTS]
-    if len(usable) < _MIN_SPLIT_VIEWS:
+    # Half a view must still determine a pose.
+    min_split_points = 12
+    usable = [i for i in range(n) if len(believed[i]) >= min_split_points]
+    # Number of folds, and least number of views; with fewer all are needed for the solve.
+    parts, min_split_views = 4, 8
+    if len(usable) < min_split_views:
         return None
     pairs: list[tuple[FloatArray, FloatArray]] = []
-    for part in range(_PARTS):
-        held_out = usable[part::_PARTS]
+    for part in range(parts):
+        held_out = usable[part::parts]
         rest = [i for i in range(n) if i not in held_out]
         media = [problem.shots[i].i_set for i in held_out]
         views = [believed[i] for i in held_out]

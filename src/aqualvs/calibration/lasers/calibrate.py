@@ -46,8 +46,6 @@ from aqualvs.optics.rig import Laser, Rig, RigUncertainty
 _BAD_CORNERS_PX = 0.5
 # The same of stripes; paint and speckle leave a tenth to a third of a pixel.
 _BAD_STRIPES_PX = 0.7
-# A metre away this is 7 mm: too much to call a laser calibrated.
-_UNCERTAIN_NORMAL = np.deg2rad(0.4)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -239,11 +237,13 @@ def _warnings(
         for view in views
         if view.rms_corners_px > _BAD_CORNERS_PX
     ]
+    # A metre away this is 7 mm: too much to call a laser calibrated.
+    uncertain_normal = np.deg2rad(0.4)
     words += [
         f"laser '{figures.laser.name}' is known to {np.rad2deg(figures.sigma_normal):.2f} deg "
         "only; add pictures in which its stripe lies on planes further apart"
         for figures in lasers
-        if figures.sigma_normal > _UNCERTAIN_NORMAL
+        if figures.sigma_normal > uncertain_normal
     ]
     words += [
         f"stripes of laser '{figures.laser.name}' miss by {figures.rms_px:.2f} px (rms); check "

@@ -18,10 +18,6 @@ from aqualvs.calibration.lasers.stripes_on_planes import PlacedStripes, PooledSt
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.planes import Plane
 
-# Points this near to a line, in pixels across their stripe, belong to it.
-_TOLERANCE_PX = 2.0
-# Points this near are removed with it: the halo of a stripe is no second stripe.
-_HALO_PX = 6.0
 # Largest tangent of the angle between a point's stripe and the line, in the image.
 _ALIGNED = 0.35
 _MIN_POINTS = 12
@@ -72,22 +68,26 @@ def lines_on_patch(pooled: PooledStripes, members: IntArray, patch: int) -> list
     # Most pairs are of two stripes; their directions are not that of the line through both points.
     good = _runs_along(across[i], along[i], guessed) & _runs_along(across[j], along[j], guessed)
     guessed, offsets = guessed[good], offsets[good]
-    votes = _near(points[some], across[some], along[some], guessed, offsets, _TOLERANCE_PX)
+    # Points this near to a line, in pixels across their stripe, belong to it.
+    tolerance_px = 2.0
+    votes = _near(points[some], across[some], along[some], guessed, offsets, tolerance_px)
     counts = np.count_nonzero(votes, axis=0)
     lines: list[StripeLine] = []
     free = np.ones(len(members), np.bool_)
+    # Points this near are removed with it: the halo of a stripe is no second stripe.
+    halo_px = 6.0
     while len(lines) < _MAX_LINES and len(guessed):
         best = int(np.argmax(counts))
         m, c = guessed[best], float(offsets[best])
         for _ in range(_N_FITS):
-            near = free & _near(points, across, along, m[None], c, _TOLERANCE_PX)[:, 0]
+            near = free & _near(points, across, along, m[None], c, tolerance_px)[:, 0]
             if np.count_nonzero(near) < _MIN_POINTS:
                 return lines
             m, c = _fitted(points[near], across[near], normal, m)
-        near = free & _near(points, across, along, m[None], c, _TOLERANCE_PX)[:, 0]
+        near = free & _near(points, across, along, m[None], c, tolerance_px)[:, 0]
         if _length_px(points[near], along[near]) >= _MIN_LENGTH_PX:
             lines.append(StripeLine(patch, members[near]))
-        taken = free & (near | _near(points, across, along, m[None], c, _HALO_PX)[:, 0])
+        taken = free & (near | _near(points, across, along, m[None], c, halo_px)[:, 0])
         free &= ~taken
         counts -= np.count_nonzero(votes[taken[some]], axis=0)
     return lines
@@ -165,10 +165,6 @@ def _length_px(points: FloatArray, along: FloatArray) -> float:
 # Limits within which two surfaces are the same: sine between normals, distance in metres.
 _SAME_NORMAL, _SAME_OFFSET = 0.05, 0.02
 _N_PLANE_FITS = 5
-# Largest tangent of the angle between a point's stripe and the plane's, in the image.
-_ALIGNED_WITH_PLANE = 0.35
-# Number of pairs beyond which they are sampled; number of planes tried at a time.
-_MAX_PLANES, _AT_ONCE = 6000, 500
 # Prior of the rate of accidents, for when few are seen: spread of the lines in pixels, and its
 # weight as a number of observed planes. Then the shift in pixels, the number of shifts and the
 # number of pairs in the random test of how often lines meet by accident.
@@ -274,13 +270,15 @@ class _Hypotheses:
         normals, offsets = _planes_of_pairs(table, pairs)
         meet = _pairs_meet(table, pairs, normals, offsets, tolerance_px)
         kept = np.flatnonzero(meet)
-        share = min(1.0, _MAX_PLANES / max(len(kept), 1))
+        # Number of pairs beyond which they are sampled; number of planes tried at a time.
+        max_planes, at_once = 6000, 500
+        share = min(1.0, max_planes / max(len(kept), 1))
         if share < 1.0:
-            kept = np.sort(np.random.default_rng(0).choice(kept, _MAX_PLANES, replace=False))
+            kept = np.sort(np.random.default_rng(0).choice(kept, max_planes, replace=False))
         pairs, normals, offsets = pairs[kept], normals[kept], offsets[kept]
         worst = np.empty((len(kept), len(table.patch)))
-        for first in range(0, len(kept), _AT_ONCE):
-            some = slice(first, first + _AT_ONCE)
+        for first in range(0, len(kept), at_once):
+            some = slice(first, first + at_once)
             worst[some] = table.worst_px(normals[some], offsets[some])
         return cls(pairs, worst, normals, offsets, n_expected, share)
 
@@ -548,7 +546,9 @@ def plane_residuals_px(placed: PlacedStripes, planes: Sequence[Plane]) -> FloatA
     offsets = np.array([p.offset for p in planes])
     gain = np.abs(placed.by_across @ normals.T)
     slant = np.abs(placed.by_along @ normals.T)
+    # Largest tangent of the angle between a point's stripe and the plane's, in the image.
+    aligned_with_plane = 0.35
     with np.errstate(divide="ignore", invalid="ignore"):
         residuals: FloatArray = (placed.points_in_dome @ normals.T - offsets) / gain
-        residuals[~(slant <= _ALIGNED_WITH_PLANE * gain)] = np.inf
+        residuals[~(slant <= aligned_with_plane * gain)] = np.inf
     return residuals

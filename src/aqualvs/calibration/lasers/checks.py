@@ -268,12 +268,6 @@ def _view_figures(solved: SolvedLasers, i_view: int, view: PlacedView) -> ViewFi
     )
 
 
-# Scales of the distance between planes: lasers are remounted within half a radian and 0.1 m.
-_FAR_ANGLE, _FAR_OFFSET = 0.5, 0.1
-# Cosine between a sheet's normal and an axis of `dome` from which stripes are level or upright.
-_ALONG_AXIS = 0.9
-
-
 def match_to_rig(rig: Rig, planes: Sequence[Plane]) -> list[int | None]:
     """Return the index of the nearest plane for every laser of the rig, each plane used once.
 
@@ -330,9 +324,11 @@ _WORDS = ("horizontal", "vertical", "diagonal")
 
 
 def _word(plane: Plane) -> str:
-    if abs(plane.normal[2]) > _ALONG_AXIS:
+    # Cosine between a sheet's normal and an axis of `dome` from which stripes are level or upright.
+    along_axis = 0.9
+    if abs(plane.normal[2]) > along_axis:
         return _WORDS[0]
-    return _WORDS[1] if abs(plane.normal[0]) > _ALONG_AXIS else _WORDS[2]
+    return _WORDS[1] if abs(plane.normal[0]) > along_axis else _WORDS[2]
 
 
 def _place(plane: Plane) -> float:
@@ -347,22 +343,16 @@ def _apart(a: Plane, b: Plane) -> float:
     b = like(b, a)
     sine = float(np.linalg.norm(np.cross(a.normal, b.normal)))
     cosine = float(a.normal @ b.normal)
-    angle = float(np.arctan2(sine, cosine)) / _FAR_ANGLE
-    return float(np.hypot(angle, (a.offset - b.offset) / _FAR_OFFSET))
+    # Scales of the distance between planes: lasers are remounted within half a radian and 0.1 m.
+    far_angle, far_offset = 0.5, 0.1
+    angle = float(np.arctan2(sine, cosine)) / far_angle
+    return float(np.hypot(angle, (a.offset - b.offset) / far_offset))
 
 
-# Sizes of targets, in metres, beyond which their lengths must be in another unit.
-_SMALLEST, _LARGEST = 0.02, 10.0
-# Multiple of the working range beyond which stripes are refused.
-_NEARER, _FARTHER = 0.2, 5.0
 # Ratio of the corners' residuals with stripes to those without from which they contradict each
 # other; ratio of the stripes' residuals from a plane to those from lines from which they do.
 _CORNERS_CONTRADICT, _STRIPES_CONTRADICT = 1.5, 3.0
 _MIN_BINS = 5
-# Larger than any error of detection, in pixels.
-_IMPOSSIBLE_PX = 2.0
-# Share of the weakest laser's points in a picture from which a further stripe is reported.
-_AS_STRONG = 0.5
 
 
 def check_size(views: Sequence[LaserView]) -> None:
@@ -378,7 +368,9 @@ def check_size(views: Sequence[LaserView]) -> None:
         return
     everything = np.concatenate(points)
     size = float(np.max(everything.max(axis=0) - everything.min(axis=0)))
-    if not _SMALLEST <= size <= _LARGEST:
+    # Sizes of targets, in metres, beyond which their lengths must be in another unit.
+    smallest, largest = 0.02, 10.0
+    if not smallest <= size <= largest:
         raise CalibrationError(
             f"the target's points span {size * 1e3:.4g} mm; lengths in its file are millimetres: "
             "check them against the print"
@@ -394,7 +386,9 @@ def check_poses(views: Sequence[PlacedView]) -> None:
         If so.
     """
     misses = float(np.median([view.rms_px for view in views]))
-    if misses > _IMPOSSIBLE_PX:
+    # Larger than any error of detection, in pixels.
+    impossible_px = 2.0
+    if misses > impossible_px:
         raise CalibrationError(
             f"corners miss by {misses:.1f} px (rms, median of {len(views)} pictures); the rig, the "
             "medium (air or water?) or the target's file is wrong"
@@ -417,7 +411,9 @@ def check_distances(views: Sequence[PlacedView], rig: Rig) -> None:
     points = np.concatenate([view.placed.points_in_dome for view in views])
     distance = float(np.median(np.linalg.norm(points, axis=1)))
     near, far = rig.working_range
-    if not _NEARER * near <= distance <= _FARTHER * far:
+    # Multiple of the working range beyond which stripes are refused.
+    nearer, farther = 0.2, 5.0
+    if not nearer * near <= distance <= farther * far:
         raise CalibrationError(
             f"stripes lie {distance * 1e3:.4g} mm away, but the rig works from {near * 1e3:.4g} "
             f"to {far * 1e3:.4g} mm; check the units of the target's file and of the rig"
@@ -462,11 +458,13 @@ def check_count(
     ]
     taken = [line for plane in split.spare for line in plane.members.tolist()]
     counts = np.bincount(split.laser[split.laser >= 0], minlength=found)
+    # Share of the weakest laser's points in a picture from which a further stripe is reported.
+    as_strong = 0.5
     unmatched = [
         line
         for line in split.unmatched
         # The lasers' counts are over all pictures, a line is in one.
-        if len(line.members) >= _AS_STRONG * counts.min() / len(views)
+        if len(line.members) >= as_strong * counts.min() / len(views)
         and not np.isin(line.members, taken).any()
     ]
     if unmatched:

@@ -28,23 +28,8 @@ from aqualvs.geometry.planes import Plane
 # doi:10.1111/j.2517-6161.1995.tb02031.x); least number of points of a laser.
 _FALSE_SHARE = 1e-3
 _MIN_POINTS = 40
-# Distance from another laser's stripe, in pixels, within which light is its halo; on other
-# surfaces, where that laser is not seen, it may be the same laser on a board that is not flat.
-_HALO_PX, _TORN_PX = 6.0, 15.0
 # Share of points or surfaces that must agree.
 _MOST = 0.8
-# Largest overlap, as a share of their length, of two stripes of one laser that continues from the
-# target to a surface behind or before it; stripes of two lasers overlap for most of their length.
-# Least cosine between such stripes.
-_LITTLE, _ALIKE = 0.15, 0.8
-# A stripe that stays in one place of the target to within this, in pixels, may be printed there.
-_FIXED_PX = 1.5
-# The stripe of a plane nearer to the lens, in metres, stays in one place of the picture: it is a
-# scratch or an overlaid text.
-_MIN_BASELINE = 2e-3
-# Ratio of a plane's residual to the best laser's from which its light lies on something else;
-# errors of the poses make a tenth of a pixel for every stripe.
-_POORER, _MIN_RESIDUAL_PX = 5.0, 0.1
 
 
 class PlaneVerdict(Enum):
@@ -107,11 +92,14 @@ def judged(
     alarms = np.array([c.log_false_alarms for c in candidates])
     n_sure = _n_sure(alarms)
     seen: list[JudgedPlane] = []
+    # The stripe of a plane nearer to the lens, in metres, stays in one place of the picture: it is
+    # a scratch or an overlaid text.
+    min_baseline = 2e-3
     for i in _by_target(pooled, lines, candidates):
         candidate = candidates[i]
         members = _members(lines, candidate)
         fault = _fault(pooled, candidate, members, seen)
-        if abs(float(candidate.plane.signed_distance(lens_in_dome))) < _MIN_BASELINE:
+        if abs(float(candidate.plane.signed_distance(lens_in_dome))) < min_baseline:
             fault = PlaneVerdict.OTHER, "it stays in one place of the picture, near or far"
         if fault is None and i >= n_sure:
             fault = PlaneVerdict.WEAK, "too few stripes lie in it to tell it from an accident"
@@ -167,7 +155,10 @@ def _fault(
         (other.candidate.residual_px for other in seen if other.verdict is PlaneVerdict.LASER),
         default=np.inf,
     )
-    if candidate.residual_px > _POORER * max(best, _MIN_RESIDUAL_PX):
+    # Ratio of a plane's residual to the best laser's from which its light lies on something else;
+    # errors of the poses make a tenth of a pixel for every stripe.
+    poorer, min_residual_px = 5.0, 0.1
+    if candidate.residual_px > poorer * max(best, min_residual_px):
         return PlaneVerdict.DOUBTFUL, (
             f"its stripes miss a plane by {candidate.residual_px:.1f} px, those of another laser "
             f"by {best:.1f} px; they may lie on something else than the target"
@@ -185,9 +176,12 @@ def _same_light(
     shared = mine & set(other.patches)
     away = plane_residuals_px(pooled.placed, [other.candidate.plane])[members, 0]
     distance = float(np.median(np.abs(away)))
-    if distance <= _HALO_PX and shared:
+    # Distance from another laser's stripe, in pixels, within which light is its halo; on other
+    # surfaces, where that laser is not seen, it may be the same laser on a board that is not flat.
+    halo_px, torn_px = 6.0, 15.0
+    if distance <= halo_px and shared:
         return PlaneVerdict.OTHER, "it is the halo of another stripe"
-    if distance <= _TORN_PX and len(shared) <= (1.0 - _MOST) * len(mine):
+    if distance <= torn_px and len(shared) <= (1.0 - _MOST) * len(mine):
         return PlaneVerdict.TORN, (
             f"it is {distance:.0f} px away from a laser that is seen in other pictures"
         )
@@ -206,11 +200,15 @@ def _goes_on(pooled: PooledStripes, members: IntArray, others: IntArray, patch: 
     mine = points[members[pooled.patch[members] == patch]]
     theirs = points[others[pooled.patch[others] == patch]]
     middle, direction = theirs.mean(axis=0), _direction(theirs)
-    if abs(float(direction @ _direction(mine))) < _ALIKE:
+    # Largest overlap, as a share of their length, of two stripes of one laser that continues from
+    # the target to a surface behind or before it; stripes of two lasers overlap for most of their
+    # length. Least cosine between such stripes.
+    little, alike = 0.15, 0.8
+    if abs(float(direction @ _direction(mine))) < alike:
         return False
     first, last = np.quantile((theirs - middle) @ direction, [0.02, 0.98])
     way = (mine - middle) @ direction
-    return float(np.mean((way >= first) & (way <= last))) <= _LITTLE
+    return float(np.mean((way >= first) & (way <= last))) <= little
 
 
 def _direction(points: FloatArray) -> FloatArray:
@@ -239,7 +237,10 @@ def _is_fixed(pooled: PooledStripes, members: IntArray) -> bool:
         sizes = [float(np.median(size[pooled.view[mine] == v])) for v in views]
         rms = [np.sqrt(np.mean(d**2)) / px for d, px in zip(by_view, sizes, strict=True)]
         worst = max(worst, float(np.sqrt(np.mean(np.square(rms)))))
-    return several and worst <= _FIXED_PX
+    # A stripe that stays in one place of the target to within this, in pixels, may be printed
+    # there.
+    fixed_px = 1.5
+    return several and worst <= fixed_px
 
 
 TOLERANCE_PX = 3.0
@@ -249,10 +250,6 @@ BENT_TOLERANCE_PX = 10.0
 # Distance from the stripe of a second laser within which its light biases a point's centre.
 _CROSSING_PX = 9.0
 _N_FITS = 5
-# Least share of its chains that a straight stripe holds; with less it is a chord of a curve.
-_MIN_OF_CHAIN = 0.25
-# Difference of log false alarms from which a plane is clearly worse.
-_CLEARLY_WORSE = 3.0
 # Greatest expected number of accidents of a plane that is needed for the given number of lasers,
 # and greatest length of a stripe in no plane as a multiple of its own: tuned on 24 simulated scenes
 # of one picture of a box with glints. Greatest expected number of accidents of an undecided plane.
@@ -363,18 +360,22 @@ def _may_be_laser(plane: JudgedPlane, lines: Sequence[StripeLine], longest: int)
 def _as_good(plane: JudgedPlane, other: JudgedPlane) -> bool:
     """Return whether a plane's evidence is nearly as good as that of a better one."""
     worse = plane.candidate.log_false_alarms - other.candidate.log_false_alarms
-    return plane.verdict is other.verdict and worse < _CLEARLY_WORSE
+    # Difference of log false alarms from which a plane is clearly worse.
+    clearly_worse = 3.0
+    return plane.verdict is other.verdict and worse < clearly_worse
 
 
 def _all_lines(pooled: PooledStripes) -> list[StripeLine]:
     lines = []
     n_of_chain = _counts_on_patch(pooled)
+    # Least share of its chains that a straight stripe holds; with less it is a chord of a curve.
+    min_of_chain = 0.25
     for patch in range(len(pooled.patch_planes)):
         members = np.flatnonzero(pooled.patch == patch)
         lines += [
             line
             for line in lines_on_patch(pooled, members, patch)
-            if _share_of_chains(pooled, line, n_of_chain) >= _MIN_OF_CHAIN
+            if _share_of_chains(pooled, line, n_of_chain) >= min_of_chain
         ]
     return lines
 

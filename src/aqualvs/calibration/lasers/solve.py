@@ -41,10 +41,6 @@ from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig import Laser, Rig, RigUncertainty
 from aqualvs.optics.sheet import Sheet, sheet_in
 
-# Difference of the Bayesian information criterion that is strong evidence (Kass & Raftery 1995,
-# doi:10.1080/01621459.1995.10476572).
-_STRONG = 6.0
-
 
 @dataclass(frozen=True, slots=True)
 class _Fit:
@@ -130,9 +126,12 @@ def _choice(flat: _Fit, bent: _Fit) -> tuple[bool, str]:
     n = min(flat.n_effective, bent.n_effective)
     evidence = 2.0 * n * float(np.log(max(flat.rms_px, 1e-9) / max(bent.rms_px, 1e-9)))
     residuals = f"residuals {bent.rms_px:.3f} px if bent at the window, {flat.rms_px:.3f} px if not"
-    if evidence > _STRONG:
+    # Difference of the Bayesian information criterion that is strong evidence (Kass & Raftery 1995,
+    # doi:10.1080/01621459.1995.10476572).
+    strong = 6.0
+    if evidence > strong:
         return True, f"bent at its window: {residuals}"
-    if evidence < -_STRONG:
+    if evidence < -strong:
         return False, f"plane, its window left out: {residuals}"
     return True, f"bent at its window as the rig says, though stripes cannot tell: {residuals}"
 

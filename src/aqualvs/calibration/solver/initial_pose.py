@@ -38,13 +38,6 @@ _START_ERROR_PX = 8.0
 _FEW_INLIERS = 0.7
 # A second pose with residuals less than this many times larger may be the true one.
 _RIVAL = 1.5
-# Closed solutions this many times worse than the best are not worth refining.
-_HOPELESS = 5.0
-# Number of observations at the nominal noise that are added to a view's own residuals in the noise
-# estimate: the eight residuals of a single marker leave two degrees of freedom.
-_PRIOR_FREEDOM = 8.0
-# Rays further than this from their mean (cosine) are not used in the initial guess.
-_SIDEWAYS = 0.15
 
 
 @dataclass(frozen=True, slots=True)
@@ -230,7 +223,9 @@ def _pinhole(view: View, rays: Rays) -> _Pinhole:
     side /= np.linalg.norm(side)
     pose = SE3(np.stack([side, np.cross(forward, side), forward], axis=1), centre)
     in_pinhole = directions @ pose.rotation
-    ahead = in_pinhole[:, 2] > _SIDEWAYS
+    # Rays further than this from their mean (cosine) are not used in the initial guess.
+    sideways = 0.15
+    ahead = in_pinhole[:, 2] > sideways
     normalised = in_pinhole[ahead, :2] / in_pinhole[ahead, 2:]
     return _Pinhole(pose, view.points[rays.valid][ahead], np.ascontiguousarray(normalised))
 
@@ -261,8 +256,10 @@ def _closed_form(pinhole: _Pinhole, points: FloatArray, method: int) -> Iterator
         )
     except cv2.error:  # it asserts where points are degenerate
         return
+    # Closed solutions this many times worse than the best are not worth refining.
+    hopeless = 5.0
     for rotvec, translation, error in zip(rotvecs, translations, np.ravel(errors), strict=True):
-        if error > _HOPELESS * np.min(errors):
+        if error > hopeless * np.min(errors):
             continue
         if np.all(np.isfinite(rotvec)) and np.all(np.isfinite(translation)):
             yield pinhole.pose(rotvec, translation)
@@ -291,7 +288,10 @@ def _start_despite_outliers(camera: Camera, view: View, rays: Rays) -> SE3 | Non
 def _result(best: Solution[SE3], rival: Solution[SE3] | None, sigma_px: float) -> TargetPose:
     scale = best.scales[_CORNERS]
     freedom = 2.0 * _believed(best) - 6.0
-    tempered = (freedom * scale**2 + _PRIOR_FREEDOM) / (freedom + _PRIOR_FREEDOM)
+    # Number of observations at the nominal noise that are added to a view's own residuals in the
+    # noise estimate: the eight residuals of a single marker leave two degrees of freedom.
+    prior_freedom = 8.0
+    tempered = (freedom * scale**2 + prior_freedom) / (freedom + prior_freedom)
     rms = _rms_px(best, sigma_px)
     ambiguous = rival is not None and _rms_px(rival, sigma_px) < _RIVAL * rms + 0.1 * sigma_px
     return TargetPose(

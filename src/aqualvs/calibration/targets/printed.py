@@ -378,7 +378,6 @@ _EDGE_MM = 8.0
 _STRIP_MM = 14.0
 """Strip below the print for ruler and caption."""
 _RULER_MM = 100.0
-_TEXT_MM = 3.2
 _HAIR_MM = 0.2
 
 
@@ -484,9 +483,10 @@ def sheet(paper: Paper, rectangles: FloatArray, size: tuple[float, float], words
     placed = rectangles + np.array([left, top, 0.0, 0.0])
     ruler_y = height - _EDGE_MM - 8.0
     scale = "the line above measures exactly 100 mm: print at 100 %, without fitting to the page"
+    text_mm = 3.2
     texts = (
-        Text(_EDGE_MM, height - _EDGE_MM - 4.2, _TEXT_MM, words),
-        Text(_EDGE_MM, height - _EDGE_MM, _TEXT_MM, scale),
+        Text(_EDGE_MM, height - _EDGE_MM - 4.2, text_mm, words),
+        Text(_EDGE_MM, height - _EDGE_MM, text_mm, scale),
     )
     return PdfPage(width, height, np.concatenate([placed, ruler(_EDGE_MM, ruler_y)]), texts)
 

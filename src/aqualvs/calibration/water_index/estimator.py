@@ -44,16 +44,6 @@ from aqualvs.errors import CalibrationError, RigError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.optics.rig import Rig, RigUncertainty
 
-# Change to be detected: one standard deviation of a frame.
-_ALLOWANCE = 0.5
-# Independent normal innovations give a false alarm every exp(2 * 0.5 * 21) frames: years at 25 fps.
-_LIMIT = 20.0
-# Limit of a single frame, so that one wrong picture raises no alarm; four in a row do.
-_LARGEST = 7.0
-# Compression repeats its errors over a group of pictures: frames are correlated that long.
-_BLOCK = 12
-_MEMORY = 100
-
 
 @dataclass(slots=True)
 class CusumTest:
@@ -81,12 +71,19 @@ class CusumTest:
             Number of frames since the start of the change, this one included, if it raises the
             alarm; else 0.
         """
+        # Change to be detected: one standard deviation of a frame.
+        allowance = 0.5
+        # Independent normal innovations give a false alarm every exp(2 * 0.5 * 21) frames: years at
+        # 25 fps.
+        limit = 20.0
+        # Limit of a single frame, so that one wrong picture raises no alarm; four in a row do.
+        largest = 7.0
         for side, sign in enumerate((1.0, -1.0)):
-            bounded = min(max(sign * standardised, -_LARGEST), _LARGEST)
-            total = max(self._sums[side] + bounded - _ALLOWANCE, 0.0)
+            bounded = min(max(sign * standardised, -largest), largest)
+            total = max(self._sums[side] + bounded - allowance, 0.0)
             self._sums[side] = total
             self._lengths[side] = self._lengths[side] + 1 if total > 0.0 else 0
-            if total > _LIMIT:
+            if total > limit:
                 began = self._lengths[side]
                 self.forget()
                 return began
@@ -104,11 +101,14 @@ class CusumTest:
 
     def _spread(self, standardised: float) -> None:
         self._block.append(standardised)
-        if len(self._block) < _BLOCK:
+        # Compression repeats its errors over a group of pictures: frames are correlated that long.
+        block = 12
+        memory = 100
+        if len(self._block) < block:
             return
         self._n_blocks += 1
-        square = min(float(np.sum(self._block)) ** 2 / _BLOCK, 9.0)
-        share = 1.0 / min(self._n_blocks + 8, _MEMORY)
+        square = min(float(np.sum(self._block)) ** 2 / block, 9.0)
+        share = 1.0 / min(self._n_blocks + 8, memory)
         # Innovations are in units of the inflated noise: a spread above 1 raises the inflation.
         squared = self.inflation**2 * (1.0 + share * (square - 1.0))
         self.inflation = float(np.sqrt(min(max(squared, 1.0), 100.0)))
@@ -124,8 +124,6 @@ _WAIT = 4.0
 # Number of frames that can be taken back after a step.
 _KEPT = 50
 _MISFIT = 2.0
-# Number of last frames of a run that determine the size of a jump, and largest cost of a frame.
-_TELLING, _GROSS = 5, 16.0
 
 
 @dataclass(slots=True)
@@ -399,9 +397,11 @@ def _onset(standardised: FloatArray) -> int:
 
     By truncated least squares of a change of the mean from zero.
     """
-    after = float(np.median(standardised[-_TELLING:]))
-    without = np.minimum(standardised**2, _GROSS)
-    with_jump = np.minimum((standardised - after) ** 2, _GROSS)
+    # Number of last frames of a run that determine the size of a jump, and largest cost of a frame.
+    telling, gross = 5, 16.0
+    after = float(np.median(standardised[-telling:]))
+    without = np.minimum(standardised**2, gross)
+    with_jump = np.minimum((standardised - after) ** 2, gross)
     costs = np.concatenate([[0.0], np.cumsum(without - with_jump)[:-1]])
     return int(np.argmin(costs))
 
