@@ -93,24 +93,38 @@ def _compiled(function: F, **options: object) -> F:
     _depend_on_callees(compiled, function, repr(sorted(options.items())))
     if _LOADS_LIGHTLY:
         load_lightly(compiled)
-    compiled.compile = _one_at_a_time(compiled.compile, function.__code__.co_filename)
+    _one_at_a_time(compiled, function.__code__.co_filename)
     return cast(F, compiled)
 
 
-def _one_at_a_time(compile_for: Callable[..., Any], file: str) -> Callable[..., Any]:
+def _one_at_a_time(compiled: Any, file: str) -> None:
     """Have processes that want the same kernel wait for the one that compiles it.
 
     On a machine that has compiled nothing, the processes of a run or a batch want the same kernels
-    at the same moment; whoever waited loads the machine code from disk.
+    at the same moment; whoever waited loads the machine code from disk. What is there already is
+    loaded without waiting.
     """
+    compile_for, load = compiled.compile, compiled._cache.load_overload
+    under_way: list[ExitStack] = []
 
     def compile_alone(signature: Any) -> Any:
         # A kernel's callees are compiled meanwhile. The order of locks is that of calls: kernels,
         # threads included, cannot wait for each other.
-        with _THREADS, _lock_of(file):
-            return compile_for(signature)
+        with _THREADS, ExitStack() as locks:
+            under_way.append(locks)
+            try:
+                return compile_for(signature)
+            finally:
+                under_way.pop()
 
-    return compile_alone
+    def load_or_wait(signature: Any, target: Any) -> Any:
+        found = load(signature, target)
+        if found is None and under_way:
+            under_way[-1].enter_context(_lock_of(file))
+            found = load(signature, target)
+        return found
+
+    compiled.compile, compiled._cache.load_overload = compile_alone, load_or_wait
 
 
 @contextmanager
