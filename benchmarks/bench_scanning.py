@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.optics.camera import HousedCamera
+from aqualvs.optics.dome import Dome
 from aqualvs.optics.rig import Rig
 from aqualvs.scanner import Scanner
 from aqualvs.scanning.candidates import Subsegments, find_candidates
@@ -130,6 +131,7 @@ def plain_points(rig: Rig, pixels: list[FloatArray]) -> FloatArray:
     camera = rig.camera()
     assert isinstance(camera, HousedCamera)
     lens, dome = camera.lens, camera.housing
+    assert isinstance(dome, Dome)
     matrix = np.array([[lens.fx, 0.0, lens.cx], [0.0, lens.fy, lens.cy], [0.0, 0.0, 1.0]])
     points = []
     for laser, at in zip(rig.lasers, pixels, strict=True):
@@ -155,7 +157,8 @@ def plain_points(rig: Rig, pixels: list[FloatArray]) -> FloatArray:
 
 
 def plain_fit(points: FloatArray) -> tuple[float, float, float]:
-    return range_pitch_yaw(np.linalg.lstsq(points, np.ones(len(points)))[0])
+    m = np.linalg.lstsq(points, np.ones(len(points)))[0]
+    return range_pitch_yaw(m.astype(np.float64, copy=False))
 
 
 def plain_scan(case: Case) -> tuple[float, float, float]:

@@ -15,7 +15,7 @@ from aqualvs.optics.rigfile import load_rig
 from aqualvs.pipeline import run, summary_lines
 from aqualvs.report.run_data import read_track
 from aqualvs.results.folder import POSTURE_COLUMNS
-from aqualvs.results.run_request import FrameWindow, RunRequest
+from aqualvs.results.run_request import FrameWindow, RunRequest, read_run_yaml
 from aqualvs.results.summary import compare_with_truth, read_truth
 from aqualvs.scanning.posture import Posture
 from aqualvs.workers import pool
@@ -198,6 +198,8 @@ def test_a_run_with_the_wrong_shutter_says_so(tmp_path, dive, rig):
         told = [line for line in summary_lines(request, run(request)) if "warning" in line]
         assert bool(told) == (said is not None)
         assert not told or told[0].startswith(said)
+        warnings = read_run_yaml(out)["summary"].get("warnings", [])
+        assert [f"warning: {one}" for one in warnings] == told
 
 
 def test_markers_are_not_looked_for_in_fields(tmp_path, dive, rig):

@@ -85,7 +85,7 @@ def run(request: RunRequest, *, scanner_for: ScannerFor = Scanner) -> RunResult:
         from aqualvs import run_outputs as outputs
 
         scanner, summary = dive.scanner(scanner_for), summary_for(dive)
-        net, warnings = outputs.RunNet(dive.rig, request.net), _shutter_lines(dive)
+        net = outputs.RunNet(dive.rig, request.net)
         processor.wait_for_first()
         claim = outputs.prepare(request)
         started, fault = time.perf_counter(), None
@@ -107,7 +107,6 @@ def run(request: RunRequest, *, scanner_for: ScannerFor = Scanner) -> RunResult:
         stopped_by=stop.caught.name if stop.caught else "",
         summary=summary,
         lines=[
-            *warnings,
             *water,
             *writers.dome_lines(),
             *net.write(request.out, request.source),
@@ -246,17 +245,21 @@ def summary_for(dive: OpenDive) -> RunSummary:
             agreement = LaserAgreement(rig)
         except RigError as error:
             raise RigError(f"{request.rig or request.source}: {error}") from None
-    return RunSummary(agreement=agreement, net_check=net_check(request.target, rig))
+    return RunSummary(
+        agreement=agreement,
+        net_check=net_check(request.target, rig),
+        warnings=_shutter_warnings(dive),
+    )
 
 
-def _shutter_lines(dive: OpenDive) -> list[str]:
+def _shutter_warnings(dive: OpenDive) -> list[str]:
     """Return a warning if a video file is interlaced and the rig is not, or the reverse."""
     path, pictures = Path(dive.request.source), source_of_pictures(dive.source)
     if not isinstance(pictures, VideoSource) or not path.is_file():
         return []
     evidence = FieldEvidence.of(*sampled_pictures(path))
     wrong = evidence.contradiction(dive.rig.shutter, pictures.fps)
-    return [f"warning: {wrong}"] if wrong else []
+    return [wrong] if wrong else []
 
 
 def _shared_work(dive: OpenDive, scanner_for: ScannerFor) -> PoolJob | None:

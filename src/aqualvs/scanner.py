@@ -10,7 +10,7 @@ from aqualvs.geometry.planes import Plane
 from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.rig_covariance import FittedSurface, PostureErrors, fitted_plane
-from aqualvs.optics.shutter import Field, ShutterKind
+from aqualvs.optics.shutter import Field
 from aqualvs.scanning.assignment import NOT_TESTED, AssignmentTest, Verdict, inflate_for_rival
 from aqualvs.scanning.candidates import Candidates, Subsegments, find_candidates
 from aqualvs.scanning.detection import DetectorOptions, FrameDetector
@@ -102,8 +102,7 @@ class Scanner:
         laser_bands = self._view(0).laser_bands
         self._posture_estimator = PostureEstimator(rig, laser_bands, self.options.fit)
         self._paper_filter = self._make_paper_filter(camera, laser_bands)
-        rolls = rig.shutter.kind is ShutterKind.ROLLING
-        self._row_motion = RowMotion(rig) if rolls else None
+        self._row_motion = RowMotion(rig) if rig.shutter.rolls else None
         self._rig_errors = PostureErrors(rig, camera, completed_uncertainty(rig))
 
     def process(self, frame: Frame) -> Scan:

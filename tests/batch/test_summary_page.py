@@ -41,6 +41,13 @@ def record(name="april", state=DiveState.FINISHED, words="", **more):
     )
 
 
+def test_warnings_of_a_run_are_those_of_the_batch(tmp_path):
+    told = DiveRecord.of("april", "a.mp4", facts(warnings=["no <good> rig"]), reused=False)
+    assert told.line().endswith("; warning: no <good> rig")
+    write_summary(tmp_path, [told])
+    assert "april: no &lt;good&gt; rig" in (tmp_path / "summary.html").read_text()
+
+
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
     """Two dives: six frames each, of which one is refused."""

@@ -69,6 +69,7 @@ def test_the_readout_is_found_and_written(tmp_path, pictures):
     assert abs(note["readout_ms"] - 25.0) < min(3.0 * note["sigma_ms"], 2.0)
     assert re.match(r"readout \d+\.\d+ ± \d\.\d+ ms from \d+ frames", told[0])
     assert "first row to the last" in told[1]
+    assert "exposure is not observable" in told[2]
     assert (tmp_path / "rig.shutter.html").stat().st_size > 1000
 
 

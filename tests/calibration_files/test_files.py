@@ -106,6 +106,14 @@ def test_a_second_time_there_and_back_changes_nothing(tmp_path):
         assert camera_text(camera_of_rig(replace(rig, name=RIG.name)), to) == text
 
 
+def test_the_flat_port_comes_back_from_refractive_colmap(tmp_path):
+    rig = replace(flat_port_rig(), housing=FlatPort(0.012, 0.005, 1.49, 0.3, -0.2))
+    path = written(tmp_path, rig, "colmap-underwater", "cameras.txt")
+    back = rig_of_camera(read_camera(path), str(path))
+    assert back.flat_port.numbers() == pytest.approx(rig.flat_port.numbers(), abs=1e-12)
+    assert (back.n_air, back.n_water) == (rig.n_air, rig.n_water)
+
+
 def test_the_dome_comes_back_from_refractive_colmap(tmp_path):
     turn = rotation_from_rotvec(np.radians([2.0, -1.5, 0.7])) @ DOME_FROM_CAM_NOMINAL
     rig = replace(RIG, dome_from_cam=SE3(turn, np.array([3.1, 41.9, 3.0]) * 1e-3))
@@ -144,10 +152,9 @@ def test_readers_of_python_read_the_yaml_and_the_literal(tmp_path):
     assert mrcal["intrinsics"][4:] == [*tiny.lens.distortion]
 
 
-@pytest.mark.parametrize("housing", [None, FlatPort(0.012, 0.005, 1.49)], ids=["bare", "flat"])
-def test_refractive_colmap_needs_a_dome(housing):
-    with pytest.raises(RigError, match="has no dome"):
-        camera_text(camera_of_rig(replace(RIG, housing=housing)), "colmap-underwater")
+def test_refractive_colmap_needs_a_housing():
+    with pytest.raises(RigError, match="has no housing"):
+        camera_text(camera_of_rig(replace(RIG, housing=None)), "colmap-underwater")
 
 
 def test_a_flat_port_is_left_out_by_name(tmp_path):
@@ -208,7 +215,9 @@ REFUSED = [
     (COLMAP, " OPENCV ", " THIN_PRISM_FISHEYE ", ("'THIN_PRISM_FISHEYE'", "FULL_OPENCV")),
     (COLMAP, " OPENCV ", " FULL_OPENCV ", ("8 values; write 12: fx, fy, cx, cy, k1",)),
     (COLMAP, "1 OPENCV", "1 PINHOLE 1 1 1 1 1 1\n2 OPENCV", ("cameras 1, 2", "--camera 1")),
-    (DOME, "DOMEPORT", "FLATPORT", ("'FLATPORT'", "DOMEPORT")),
+    (DOME, "DOMEPORT", "CUBEPORT", ("'CUBEPORT'", "DOMEPORT and FLATPORT")),
+    (DOME, "DOMEPORT", "FLATPORT", ("has the length 0.04", "unit vector")),
+    (DOME, f"DOMEPORT {PORT}", "FLATPORT 0 0 -1 0.01 0.005 1 1.49 1.33", ("tilted by -180",)),
     (DOME, PORT, "0 0 0 0.05", ("4 values; write 8: Cx, Cy, Cz, int_radius",)),
     (DOME, PORT, "0 0 -0.06 0.05 0.005 1 1.49 1.33", ("outside its inner radius",)),
     (DOME, PORT, "0 0 0 0.05 0.005 1 1.49 13.3", ("water.n",)),

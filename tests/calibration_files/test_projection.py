@@ -318,6 +318,7 @@ def test_colmap_projects_by_its_formulas(tmp_path, model):
 # Refractive COLMAP. -------------------------------------------------------------------------------
 
 PORT = (-0.0036, 0.0014, -0.0415, 0.04425, 0.00575, 1.0003, 1.49, 1.3333)
+FLAT = (0.06, -0.08, math.sqrt(0.99), 0.012, 0.005, 1.0003, 1.49, 1.3333)
 
 
 def sphere(origin, direction, centre, radius):
@@ -348,16 +349,32 @@ def through_the_dome(direction, depth, port):
     return sphere(at, direction, np.zeros(3), depth)
 
 
-@pytest.mark.parametrize("token", ["", "REFRAC "])
-def test_refractive_colmap_projects_by_its_formulas(tmp_path, token):
+def through_the_plane(direction, depth, port):
+    """Return the point as `through_the_dome` does; FlatPort::CamFromImg and CamFromImgPoint."""
+    normal, (distance, thickness, na, ng, nw) = np.array(port[:3]), port[3:]
+    at = direction * distance / (direction @ normal)
+    direction = snell(direction, normal, na, ng)
+    at = at + direction * thickness / (direction @ normal)
+    return sphere(at, snell(direction, normal, ng, nw), np.zeros(3), depth)
+
+
+@pytest.mark.parametrize(
+    ("word", "through", "values"),
+    [
+        ("DOMEPORT", through_the_dome, PORT),
+        ("REFRAC DOMEPORT", through_the_dome, PORT),
+        ("FLATPORT", through_the_plane, FLAT),
+    ],
+)
+def test_refractive_colmap_projects_by_its_formulas(tmp_path, word, through, values):
     core = (*CORE[:2], CX + 0.5, CY + 0.5)
-    port = f" {token}DOMEPORT {' '.join(map(str, PORT))}"
+    port = f" {word} {' '.join(map(str, values))}"
     rig = imported(tmp_path, cameras_txt("OPENCV", core, FOUR, port), "cameras.txt")
     cloud, pixels = [], []
     for direction in points():
         depth = float(np.linalg.norm(direction)) + 0.2
         unit = direction / np.linalg.norm(direction)
-        cloud.append(through_the_dome(unit, depth, PORT))
+        cloud.append(through(unit, depth, values))
         pixels.append(colmap_pixel(direction, core, colmap_opencv, FOUR))
     found, valid = rig.camera().project(rig.dome_from_cam.apply(np.array(cloud)))
     assert valid.all()

@@ -70,7 +70,7 @@ def test_out_and_in_again(here, capsys, to):
 def test_as_camera_leaves_the_dome_out_and_says_so(here, capsys):
     said(capsys, "export", DEMO_RIG, "--to", "colmap-underwater", "-o", "cameras.txt")
     out = said(capsys, "import", "cameras.txt", "--as", "camera", "-o", "rig.yaml")
-    assert "left out: the dome" in out
+    assert "left out: the housing" in out
     assert load_rig("rig.yaml", need_lasers=False).dome is None
 
 

@@ -14,13 +14,13 @@ from aqualvs.errors import SourceError
 from aqualvs.live import runner as live_runner
 from aqualvs.live.health_monitor import FrozenOptions
 from aqualvs.live.runner import Arrival, FixedScanner, LiveOptions, LiveRunner, Mailbox
-from aqualvs.optics.shutter import Shutter, ShutterKind
+from aqualvs.optics.shutter import AT_ONCE, Shutter, ShutterKind
 from aqualvs.scanner import Scanner
 from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.row_motion import RowMotion
 from aqualvs.scanning.scan import Frame, Scan
 from aqualvs.sources.base import PartHealth, State
-from aqualvs.sources.fields import FieldFeed, frames_of
+from aqualvs.sources.fields import FrameFeed, frames_of
 from field_cases import FIELDS
 from live_cases import (
     Collector,
@@ -407,7 +407,7 @@ def woven_pictures(n: int) -> list[Frame]:
 def test_both_fields_of_a_picture_are_measured_with_their_own_times() -> None:
     scanner = Scanner(replace(demo_rig(), shutter=FIELDS))
     steps: list[Step] = list(woven_pictures(4))
-    feed, output = FieldFeed(ScriptedFeed(steps), FIELDS), Collector()
+    feed, output = FrameFeed(ScriptedFeed(steps), FIELDS), Collector()
     options = LiveOptions(keep_every=True)
     assert LiveRunner(feed, FixedScanner(scanner), [output], options).run(never) is None
     assert [sample.scan.index for sample in output.samples] == list(range(8))
@@ -421,6 +421,16 @@ def test_both_fields_of_a_picture_are_measured_with_their_own_times() -> None:
         apart = second.instants.arrived_ns - first.instants.arrived_ns
         assert 0.04e9 <= apart < 0.04e9 + 1e9 * TIMEOUT_S
         assert second.utc_ns - first.utc_ns >= 0.04e9 - 1
+
+
+def test_the_health_of_a_source_names_fields_that_the_rig_does_not_know() -> None:
+    pictures = [replace(one, index=i, time_s=0.4 * i) for i, one in enumerate(woven_pictures(4))]
+    for shutter, state in ((AT_ONCE, State.WARN), (FIELDS, State.OK)):
+        feed = FrameFeed(ScriptedFeed(list(pictures)), shutter)
+        assert feed.health().state is State.OK
+        assert len(list(feed)) == (len(pictures) if state is State.WARN else 2 * len(pictures))
+        assert feed.health().state is state
+        assert ("camera.shutter" in feed.health().detail) == (state is State.WARN)
 
 
 def test_a_mailbox_has_room_for_both_fields_of_the_latest_picture() -> None:
@@ -445,7 +455,7 @@ def _again(picture: Frame, index: int) -> Frame:
 def test_a_still_interlaced_picture_is_noticed_though_its_fields_differ() -> None:
     pictures = woven_pictures(12)
     steps: list[Step] = [*pictures, *(_again(pictures[-1], i) for i in range(12, 32))]
-    feed, output = FieldFeed(ScriptedFeed(steps), FIELDS), Collector()
+    feed, output = FrameFeed(ScriptedFeed(steps), FIELDS), Collector()
     scanner = FixedScanner(Scanner(replace(demo_rig(), shutter=FIELDS)))
     LiveRunner(feed, scanner, [output], LiveOptions(keep_every=True)).run(never)
     found = reasons(output)

@@ -16,6 +16,7 @@ import pytest
 import real_lines
 import real_wall as wall
 from aqualvs.calibrate import lasers
+from aqualvs.calibration.detection.detection import detect_board
 from aqualvs.optics.rigfile import load_rig
 from aqualvs.scanning.uncalibrated_stripes import find_stripes as find_stripes
 from laser_cases import laser_error
@@ -115,7 +116,7 @@ def work(tmp_path_factory) -> Iterator[Path]:
     Each is among the others eight times; what is found in it is the same each time.
     """
     with pytest.MonkeyPatch.context() as patch:
-        for function in (lasers.detect_board, lasers.find_stripes):
+        for function in (detect_board, find_stripes):
             patch.setattr(lasers, function.__name__, once_for_each_picture(function))
         yield tmp_path_factory.mktemp("real")
 

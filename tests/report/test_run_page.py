@@ -408,7 +408,7 @@ def test_warnings_say_what_is_wrong(tmp_path: Path) -> None:
         "outside the rig's working range of 300–650 mm",
         "Laser “third” gave only 0.0 % of the target points.",
         "The water's index moved by 0.0050",
-        "the disk was <i>slow</i>",
+        "The disk was <i>slow</i>.",
     ):
         assert words in text
 

@@ -36,3 +36,14 @@ def test_a_plane_with_a_fifth_of_the_light_is_found_beside_a_smaller_one() -> No
         assert search_plane(table, laser, start, 0.24, 1.8, seed, found[seed])
     missed = np.abs(found[:, 3] - 0.6) > 0.01
     assert not missed.any()
+
+
+def test_a_plane_is_found_whose_heavy_light_is_all_of_one_laser() -> None:
+    n_each, table = 20, np.zeros((N_ROWS, 60))
+    laser, start = np.repeat(np.arange(N_LASERS), n_each), np.arange(N_LASERS + 1) * n_each
+    along = np.tile(np.linspace(-0.25, 0.25, n_each), N_LASERS)
+    table[X : Z + 1] = 0.5 * np.stack([along, np.ones(60), 0.1 * (laser - 1.0)])
+    table[JY], table[WEIGHT] = 1e-3, np.where(laser == 0, 15.0, 2.5)
+    found = np.empty(4)
+    assert search_plane(table, laser, start, 0.24, 1.8, 0, found)
+    np.testing.assert_allclose(found, [0.0, 1.0, 0.0, 0.5], atol=1e-9)

@@ -14,6 +14,7 @@ from aqualvs.sources.base import bgr_of
 from aqualvs.sources.fields import (
     FieldEvidence,
     FieldSource,
+    FieldWatch,
     combed_share,
     field_of,
     frames_of,
@@ -149,6 +150,38 @@ def test_a_progressive_picture_in_an_interlaced_stream_is_whole():
     found = FieldEvidence.of([marked])
     assert found.is_marked
     assert found.contradiction(AT_ONCE, 25.0) == ""
+
+
+def watched(pictures, shutter, every=25):
+    """Warn after a stream that goes to and fro over some pictures, and say how long it took."""
+    watch = FieldWatch(shutter)
+    to_and_fro = itertools.islice(itertools.cycle([*pictures, *pictures[-2:0:-1]]), 12 * every)
+    for i, one in enumerate(to_and_fro):
+        watch.look(replace(one, index=i, time_s=i / every))
+    return watch.warning
+
+
+def test_a_stream_of_fields_is_noticed_and_named_with_its_remedy(tmp_path):
+    with open_source(woven_dive(tmp_path / "dive.mp4", 4, coded=False)) as source:
+        fields = list(source)
+    said = "camera.shutter: {kind: interlaced, readout_ms: 20}"
+    assert said in watched(fields, AT_ONCE)
+    assert "readout_ms: 16.667" in watched(fields, AT_ONCE, 30)
+    assert watched(fields, FIELDS) == ""
+
+
+def test_a_still_stream_is_interlaced_if_it_says_so():
+    with open_source(DEMO / "dive.mp4") as source:
+        still = next(iter(source))
+    assert watched([still], AT_ONCE) == ""
+    assert "the stream says so" in watched([replace(still, is_interlaced=True)], AT_ONCE)
+
+
+def test_a_stream_of_whole_pictures_under_a_rig_of_fields_is_noticed():
+    with open_source(DEMO / "dive.mp4") as source:
+        whole = [replace(one, is_interlaced=True) for one in itertools.islice(source, 4)]
+    assert watched(whole, AT_ONCE) == ""
+    assert "take camera.shutter out" in watched(whole, FIELDS)
 
 
 def test_thin_lines_and_noise_are_no_comb():

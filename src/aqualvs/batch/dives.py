@@ -462,6 +462,11 @@ class DiveRecord:
         return found
 
     @property
+    def warnings(self) -> list[str]:
+        """Return what is wrong with source or rig, as `run` warns of it."""
+        return list(self.summary.get("warnings", []))
+
+    @property
     def net(self) -> Mapping[str, Any]:
         """Return the condition of the net as `net_dict` has it, empty if it was not evaluated."""
         found: Mapping[str, Any] = self.facts.get("net", {})
@@ -489,6 +494,7 @@ class DiveRecord:
             said += f", {self.net_text()}"
         if self.words:
             said += f"; {self.state.value}: {self.words}"
+        said += "".join(f"; warning: {words}" for words in self.warnings)
         return said + (" (was finished)" if self.reused else "")
 
     def row(self) -> dict[str, Any]:

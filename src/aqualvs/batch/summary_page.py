@@ -172,6 +172,7 @@ def _notes_on(record: DiveRecord) -> Iterator[str]:
         words = (record.summary.get(key) or {}).get("words")
         if words:
             yield f"{record.name}: {words}"
+    yield from (f"{record.name}: {words}" for words in record.warnings)
     if record.net.get("n_holes"):
         n, largest = record.net["n_holes"], record.net["largest_hole_mm"]
         found = "1 hole" if n == 1 else f"{n} holes, the largest"

@@ -17,7 +17,6 @@ from aqualvs.batch.dataset import read_valid_manifest, write_manifest
 from aqualvs.errors import OptionError
 from aqualvs.nets.target_file import target_dict
 from aqualvs.optics.rigfile import rig_to_mapping
-from aqualvs.optics.shutter import ShutterKind
 from aqualvs.pipeline import OpenDive, open_dive
 from aqualvs.results.files import writing
 from aqualvs.results.run_request import RunRequest, source_dict, versions
@@ -174,7 +173,7 @@ def probe(work: DiveWork) -> DiveProbe:
             n_frames=dive.source.n_frames,
             source=source_dict(dive.source),
         )
-        rolls = dive.rig.shutter.kind is ShutterKind.ROLLING
+        rolls = dive.rig.shutter.rolls
         stat = _stat_key(Path(work.request.source)) | {"frames": work.piece_frames}
         content = _remembered(work, stat) or _remember(
             work, stat, _content(dive, work.piece_frames)

@@ -39,6 +39,9 @@ _ROUNDS = 6
 _N_PARTS, _MIN_FRAMES = 10, 50
 # A sigma beyond this, in seconds, is no result: 5 % of a usual readout.
 _MAX_SIGMA = 1e-3
+# The lasers move with the camera: a stripe moves by the change of range and tilt alone, 50 px/s and
+# less, and its width changes more by distance and brightness than by blur.
+_EXPOSURE = "The exposure is not observable from stripes: what the rig file says of it stays."
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -141,7 +144,7 @@ def run_shutter(request: ShutterRequest, echo: Echo) -> None:
     """
     check_rig_place(request.out)
     rig = load_rig(request.rig)
-    if rig.shutter.kind is ShutterKind.INTERLACED:
+    if rig.shutter.is_interlaced:
         raise RigError(
             f"{request.rig}: camera.shutter.kind is interlaced, whose fields are as far apart as "
             "the video's standard says; leave the shutter out to calibrate a rolling one"
@@ -156,6 +159,7 @@ def run_shutter(request: ShutterRequest, echo: Echo) -> None:
         sentence = f"The shutter rolls from the {order}."
     echo(f"readout {_text(found)} from {found.n_frames} frames")
     echo(sentence)
+    echo(_EXPOSURE)
     note = {
         "date": datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
         "frames": found.n_frames,
@@ -167,7 +171,7 @@ def run_shutter(request: ShutterRequest, echo: Echo) -> None:
         title="Calibration of the shutter",
         subtitle=f"Rig “{rig.name}”, {request.source}",
         cards=(Card("readout", _text(found), f"{found.n_frames} frames"),),
-        words=(sentence,),
+        words=(sentence, _EXPOSURE),
         expectations=expectations(solved),
         series=(
             Series(

@@ -6,7 +6,7 @@ Keys and values are read strictly; every fault names its place (`Entries`).
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -15,28 +15,29 @@ from aqualvs.errors import AqualvsError, RigError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.transforms import SE3
 from aqualvs.optics.dome import Dome
+from aqualvs.optics.flat_port import FlatPort
 from aqualvs.optics.lens import Lens, LensModel
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig
 from aqualvs.optics.rigfile import rig_from_mapping, rig_to_mapping
 
 
 @dataclass(frozen=True, slots=True)
-class DomePort:
-    """A dome and the media inside and outside of it, in the frame of the camera.
+class Port:
+    """A housing and the media inside and outside of it, in the frame of the camera.
 
     Attributes
     ----------
-    centre : array, shape (3,)
-        Centre of the dome in `cam`, in metres.
-    dome : Dome
+    housing : Dome or FlatPort
     n_air, n_water : float
         Refractive indices.
+    centre : array, shape (3,)
+        Centre of the dome in `cam`, in metres; zero for a flat port, whose origin is the lens.
     """
 
-    centre: FloatArray
-    dome: Dome
+    housing: Dome | FlatPort
     n_air: float
     n_water: float
+    centre: FloatArray = field(default_factory=lambda: np.zeros(3))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,14 +51,14 @@ class ForeignCamera:
         Image width and height; None where the file does not say it.
     lens : Lens
         The centre of the top-left pixel is (0, 0).
-    port : DomePort or None
-        None for a camera without a dome.
+    port : Port or None
+        None for a camera without a housing.
     """
 
     name: str
     size_px: tuple[int, int] | None
     lens: Lens
-    port: DomePort | None = None
+    port: Port | None = None
 
 
 def opencv_lens(core: Sequence[float], distortion: Sequence[float], *, fisheye: bool) -> Lens:
@@ -109,7 +110,7 @@ def padded(lens: Lens, n: int) -> tuple[float, ...]:
 def rig_of_camera(
     camera: ForeignCamera, source: str, *, solved_from: dict[str, Any] | None = None
 ) -> Rig:
-    """Return the rig of a camera, without lasers: behind its dome, or bare in air.
+    """Return the rig of a camera, without lasers: behind its housing, or bare in air.
 
     The camera looks along the dome's y axis: other programs do not know a frame of the vehicle.
 
@@ -141,7 +142,7 @@ def rig_of_camera(
         size_px=camera.size_px,
         lens=camera.lens,
         dome_from_cam=SE3(turn.copy(), lens_in_dome),
-        housing=None if port is None else port.dome,
+        housing=None if port is None else port.housing,
         n_air=n_air if port is None else port.n_air,
         n_water=n_air if port is None else port.n_water,
         lasers=(),
@@ -158,12 +159,13 @@ def rig_of_camera(
 
 
 def camera_of_rig(rig: Rig) -> ForeignCamera:
-    """Return the camera of a rig, with its dome, as seen from the camera."""
+    """Return the camera of a rig, with its housing, as seen from the camera."""
     port = None
-    if rig.dome is not None:
+    if rig.housing is not None:
+        port = Port(rig.housing, rig.n_air, rig.n_water)
+    if port is not None and rig.dome is not None:
         pose = rig.dome_from_cam
-        centre = -(pose.rotation.T @ pose.translation) + 0.0
-        port = DomePort(centre, rig.dome, rig.n_air, rig.n_water)
+        port = replace(port, centre=-(pose.rotation.T @ pose.translation) + 0.0)
     return ForeignCamera(name=rig.name, size_px=rig.size_px, lens=rig.lens, port=port)
 
 

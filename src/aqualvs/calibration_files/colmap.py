@@ -4,11 +4,14 @@ A line is `CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]` (COLMAP, "Output Format"); the
 parameters is that of src/colmap/sensor/models.h. The centre of the top-left pixel is (0.5, 0.5).
 
 Refractive COLMAP (colmap_underwater, arXiv:2403.08640) appends `DOMEPORT Cx Cy Cz int_radius
-int_thick na ng nw` (src/colmap/sensor/models_refrac.h, WriteCamerasText in reconstruction.cc): the
-dome's centre in `cam`, inner radius and thickness, all in metres, and the indices of air, wall and
-water. A later port writes the word REFRAC before; it is read as well.
+int_thick na ng nw` or `FLATPORT Nx Ny Nz int_dist int_thick na ng nw`
+(src/colmap/sensor/models_refrac.h, WriteCamerasText in reconstruction.cc): the dome's centre or the
+port's unit normal in `cam`, inner radius or distance of the inner face from the lens, and
+thickness, all in metres, and the indices of air, wall and water. A later port writes the word
+REFRAC before; it is read as well.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -16,8 +19,8 @@ from typing import NamedTuple
 import numpy as np
 
 from aqualvs.calibration_files.camera import (
-    DomePort,
     ForeignCamera,
+    Port,
     number,
     opencv_lens,
     padded,
@@ -27,6 +30,7 @@ from aqualvs.calibration_files.camera import (
 from aqualvs.calibration_files.kalibr import one_of
 from aqualvs.errors import RigError
 from aqualvs.optics.dome import Dome
+from aqualvs.optics.flat_port import FlatPort
 from aqualvs.optics.lens import Lens, LensModel
 
 # Pixel centres are at halves.
@@ -42,8 +46,14 @@ _MODELS = {
 }
 _FISHEYE = "OPENCV_FISHEYE"
 _ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-_DOME, _TOKEN = "DOMEPORT", "REFRAC"
-_PORT = ("Cx", "Cy", "Cz", "int_radius", "int_thick", "na", "ng", "nw")
+_TOKEN = "REFRAC"
+_DOME, _FLAT = "DOMEPORT", "FLATPORT"
+_PORTS = {
+    _DOME: ("Cx", "Cy", "Cz", "int_radius", "int_thick", "na", "ng", "nw"),
+    _FLAT: ("Nx", "Ny", "Nz", "int_dist", "int_thick", "na", "ng", "nw"),
+}
+# Of a normal that is written with few digits.
+_NOT_UNIT = 1e-3
 
 
 class _Row(NamedTuple):
@@ -121,18 +131,24 @@ def _lens(row: _Row, place: str) -> Lens:
     return opencv_lens(core, known[:n], fisheye=False)
 
 
-def _port(words: Sequence[str], place: str) -> DomePort:
-    if words[0] != _DOME:
+def _port(words: Sequence[str], place: str) -> Port:
+    model = words[0]
+    if model not in _PORTS:
         raise RigError(
-            f"{place} is behind {shown(words[0])}; of refractive models aqualvs knows {_DOME}"
+            f"{place} is behind {shown(model)}; of refractive models aqualvs knows "
+            f"{' and '.join(_PORTS)}"
         )
-    values = _named(words[1:], _PORT, f"{place}: {_DOME}")
-    return DomePort(
-        centre=np.array([values["Cx"], values["Cy"], values["Cz"]]),
-        dome=Dome(values["int_radius"], values["int_thick"], values["ng"]),
-        n_air=values["na"],
-        n_water=values["nw"],
-    )
+    values = _named(words[1:], _PORTS[model], f"{place}: {model}")
+    x, y, z, size, thickness, n_air, n_port, n_water = values.values()
+    if model == _DOME:
+        return Port(Dome(size, thickness, n_port), n_air, n_water, np.array([x, y, z]))
+    length = math.hypot(x, y, z)
+    if not abs(length - 1.0) <= _NOT_UNIT:
+        raise RigError(
+            f"{place}: {model}: the normal Nx Ny Nz has the length {length:g}; write a unit vector"
+        )
+    tilts = math.atan2(-y, z), math.asin(x / length)
+    return Port(FlatPort(size, thickness, n_port, *tilts), n_air, n_water)
 
 
 def _named(words: Sequence[str], names: Sequence[str], place: str) -> Mapping[str, float]:
@@ -148,17 +164,16 @@ def colmap_text(camera: ForeignCamera, *, refractive: bool) -> str:
     ----------
     camera : ForeignCamera
     refractive : bool
-        Whether to write the dome, for Refractive COLMAP.
+        Whether to write the housing, for Refractive COLMAP.
 
     Raises
     ------
     RigError
-        If there is no dome to write.
+        If there is no housing to write.
     """
     if refractive and camera.port is None:
         raise RigError(
-            "the rig has no dome, the only housing written for Refractive COLMAP; write it with "
-            "colmap"
+            "the rig has no housing, which Refractive COLMAP is for; write it with colmap"
         )
     lens, (width, height) = camera.lens, camera.size_px or (0, 0)
     n = len(lens.distortion)
@@ -175,16 +190,20 @@ def colmap_text(camera: ForeignCamera, *, refractive: bool) -> str:
     line = f"1 {model} {width} {height} {' '.join(params)}"
     if not refractive or camera.port is None:
         return f"{head}#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n{line}\n"
-    port = camera.port
-    sizes = (port.dome.inner_radius, port.dome.thickness)
-    indices = (port.n_air, port.dome.n_acrylic, port.n_water)
-    values = [repr(float(one)) for one in (*port.centre, *sizes, *indices)]
+    port, housing = camera.port, camera.port.housing
+    if isinstance(housing, Dome):
+        of_housing = (*port.centre, housing.inner_radius, housing.thickness)
+        refraction, n_port = _DOME, housing.n_acrylic
+    else:
+        of_housing = (*housing.normal_in_cam, housing.distance, housing.thickness)
+        refraction, n_port = _FLAT, housing.n_port
+    values = [repr(float(one)) for one in (*of_housing, port.n_air, n_port, port.n_water)]
     return (
         f"{head}#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[] OPTIONAL[REFRAC_MODEL "
         "REFRAC_PARAMS[]]\n"
         "# For colmap feature_extractor:\n"
         f"#   --ImageReader.camera_model {model} --ImageReader.camera_params {','.join(params)}\n"
-        f"#   --ImageReader.camera_refrac_model {_DOME} "
+        f"#   --ImageReader.camera_refrac_model {refraction} "
         f"--ImageReader.camera_refrac_params {','.join(values)}\n"
-        f"{line} {_DOME} {' '.join(values)}\n"
+        f"{line} {refraction} {' '.join(values)}\n"
     )

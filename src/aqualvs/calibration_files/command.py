@@ -236,9 +236,14 @@ def _remarks(rig: Rig, *, dropped: bool) -> list[str]:
         f"{rig.size_px[0]}x{rig.size_px[1]} px, fx {lens.fx:.2f} px"
     ]
     if dropped:
-        lines.append("left out: the dome; --as rig takes it too")
+        lines.append("left out: the housing; --as rig takes it too")
+    elif rig.flat_port is not None:
+        lines.append(
+            f"flat port: {rig.flat_port.distance * 1e3:g} mm from the lens; the camera counts as "
+            "looking along the vehicle's y axis"
+        )
     elif rig.dome is None:
-        lines.append("no dome: the lens is bare, in air; 'aqualvs calibrate dome' adds a dome")
+        lines.append("no housing: the lens is bare, in air; 'aqualvs calibrate dome' adds a dome")
     else:
         lines.append(
             f"dome: inner radius {rig.dome.inner_radius * 1e3:g} mm; the camera counts as looking "
@@ -276,10 +281,13 @@ def run_export(request: ExportRequest, echo: Echo) -> None:
 
 def _left_out(rig: Rig, to: str) -> list[str]:
     refractive = to == "colmap-underwater"
-    names = ["the dome (the intrinsics are those in air)"] if rig.dome and not refractive else []
-    names += ["the flat port (the intrinsics are those in air)"] if rig.flat_port else []
+    housing = "dome" if rig.dome else "flat port" if rig.flat_port else ""
+    names = []
+    if housing and not refractive:
+        names.append(f"the {housing} (the intrinsics are those in air)")
     names += [f"{len(rig.lasers)} laser{'s' if len(rig.lasers) > 1 else ''}"] if rig.lasers else []
-    names += ["the camera's rotation in the dome"] if rig.dome and refractive else []
+    if housing and refractive:
+        names.append("the camera's rotation" + (" in the dome" if rig.dome else " and place"))
     names += ["the shutter"] if rig.shutter != AT_ONCE else []
     names += ["the covariance"] if rig_uncertainty(rig).names else []
     return names

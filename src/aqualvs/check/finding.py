@@ -218,7 +218,7 @@ def shutter_finding(rig: Rig) -> Finding | None:
         return Finding(Severity.OK, f"The shutter exposes all rows at once. {rates} {blur}.")
     blur = f"; {blur}" if blur else ""
     apart = 1e3 * abs(shutter.readout)
-    if shutter.kind is ShutterKind.INTERLACED:
+    if shutter.is_interlaced:
         return Finding(
             Severity.OK,
             f"The video is interlaced, its fields {apart:g} ms apart. {rates} the target moves by "

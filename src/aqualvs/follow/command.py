@@ -404,7 +404,7 @@ def _case(
     request: SimRequest, limits: SafetyLimits, setpoint: Setpoint, shutter: Shutter
 ) -> SimCase:
     timing = Timing(fps=request.fps)
-    if shutter.field_of(0) is not None:
+    if shutter.is_interlaced:
         timing = Timing(fps=2.0 * request.fps, field=shutter.readout)
     model = vehicle_model(request.vehicle, request.pilot_gain)
     return SimCase(

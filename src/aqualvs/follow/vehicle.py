@@ -37,7 +37,7 @@ from aqualvs.results.run_request import Water, prepared_rig
 from aqualvs.scanner import Scanner, ScannerOptions
 from aqualvs.scanning.posture import Posture, Refusal
 from aqualvs.sources.base import PartHealth, State
-from aqualvs.sources.fields import feed_of_frames
+from aqualvs.sources.fields import FrameFeed
 from aqualvs.terminal import StopSignals
 
 _Step: TypeAlias = tuple[PilotReport, float, Posture | Refusal]
@@ -198,7 +198,7 @@ def _runner(
     with ExitStack() as undo:
         undo.callback(pilot.close)
         pictures = request.feed.opened(request.source, realtime=True)
-        feed = feed_of_frames(pictures, scanner.rig.shutter)
+        feed = FrameFeed(pictures, scanner.rig.shutter)
         undo.callback(feed.close)
         # The pilot first: other outputs must not delay an effort.
         outputs: list[Output] = [pilot, MavlinkOutput(link)]

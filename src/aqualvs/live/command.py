@@ -29,7 +29,7 @@ from aqualvs.scanner import Scanner, ScannerOptions
 from aqualvs.scanning.posture import Posture
 from aqualvs.scanning.scan import Frame
 from aqualvs.sources.base import Feed, PartHealth, State
-from aqualvs.sources.fields import feed_of_frames
+from aqualvs.sources.fields import FrameFeed
 from aqualvs.sources.opening import open_feed
 from aqualvs.sources.remote import Transport
 from aqualvs.terminal import StopSignals
@@ -270,7 +270,7 @@ def live_and_tell(request: LiveRequest, echo: Callable[[str], object]) -> int:
     """
     rig = prepared_rig(request.rig, request.water, no_dome=False)
     pictures = request.feed.opened(request.source, realtime=not request.fast)
-    feed = feed_of_frames(pictures, rig.shutter)
+    feed = FrameFeed(pictures, rig.shutter)
     sys.setswitchinterval(SWITCH_S)
     with ExitStack() as undo:
         undo.callback(feed.close)

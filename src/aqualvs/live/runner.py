@@ -28,7 +28,7 @@ from aqualvs.live.outputs.base import Output
 from aqualvs.optics.expected_error import see_stripe
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.sheet import sheets_of
-from aqualvs.optics.shutter import Field, ShutterKind
+from aqualvs.optics.shutter import Field
 from aqualvs.recording.sample import Instants, LiveSample
 from aqualvs.scanner import Scanner
 from aqualvs.scanning.laser_bands import SearchAxis
@@ -420,8 +420,7 @@ class LiveRunner:
         self._workers = [OutputWorker(output) for output in ordered]
         self._frozen: dict[Field | None, FrozenPicture] = {}
         rig = provider.scanner.rig
-        rolls = rig.shutter.kind is ShutterKind.ROLLING
-        self._row_motion = RowMotion(rig) if rolls else None
+        self._row_motion = RowMotion(rig) if rig.shutter.rolls else None
         self._before: deque[Scan] = deque(maxlen=REACH)
         self._last: Frame | None = None
         self._heard_ns = self._told_ns = 0

@@ -523,11 +523,6 @@ class Dome:
         """Radius of the outer sphere in metres."""
         return self.inner_radius + self.thickness
 
-    @property
-    def parameter_names(self) -> tuple[str, ...]:
-        """Names of the parameters of a camera behind it, see `DOME_PARAMETERS`."""
-        return DOME_PARAMETERS
-
     def numbers(self) -> dict[str, float]:
         """Return the sizes and the index by the names of their parameters."""
         return {

@@ -324,11 +324,6 @@ class FlatPort:
                     f"within {math.degrees(MAX_TILT):g} degrees of the optical axis"
                 )
 
-    @property
-    def parameter_names(self) -> tuple[str, ...]:
-        """Names of the parameters of a camera behind it, see `FLAT_PARAMETERS`."""
-        return FLAT_PARAMETERS
-
     def numbers(self) -> dict[str, float]:
         """Return sizes, index and tilts by the names of their parameters."""
         return {
@@ -343,14 +338,23 @@ class FlatPort:
         """Return the port with steps added to the parameters that are named."""
         return FlatPort(*(value + step.get(name, 0.0) for name, value in self.numbers().items()))
 
+    @property
+    def normal_in_cam(self) -> Vector:
+        """Unit normal in `cam`, away from the camera."""
+        across = math.cos(self.tilt_y)
+        return (
+            math.sin(self.tilt_y),
+            -math.sin(self.tilt_x) * across,
+            math.cos(self.tilt_x) * across,
+        )
+
     def params(self, dome_from_cam: SE3, n_air: float, n_water: float) -> FlatParams:
         """Return the port in front of a camera as kernels take it."""
         sin_x, cos_x = math.sin(self.tilt_x), math.cos(self.tilt_x)
-        sin_y, cos_y = math.sin(self.tilt_y), math.cos(self.tilt_y)
         rotation = np.asarray(dome_from_cam.rotation, dtype=np.float64)
         return FlatParams(
             centre=as_triple(dome_from_cam.translation),
-            normal=as_triple(rotation @ np.array([sin_y, -sin_x * cos_y, cos_x * cos_y])),
+            normal=as_triple(rotation @ np.array(self.normal_in_cam)),
             turn_x=as_triple(rotation[:, 0]),
             turn_y=as_triple(rotation @ np.array([0.0, cos_x, sin_x])),
             distance=float(self.distance),

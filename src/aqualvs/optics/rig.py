@@ -292,7 +292,7 @@ def rig_parameter_names(rig: Rig) -> tuple[str, ...]:
     A bare lens has those of a dome: the same rig may be used without it.
     """
     lasers = (name for laser in rig.lasers for name in laser_parameter_names(laser))
-    port = DOME_PARAMETERS if rig.housing is None else rig.housing.parameter_names
+    port = DOME_PARAMETERS if rig.housing is None else rig.camera().params.port.names
     return (*POSE_PARAMETERS, *port, *rig.lens.parameter_names, *lasers)
 
 

@@ -500,7 +500,7 @@ def _shutter_mapping(shutter: Shutter) -> dict[str, Any]:
         content["readout_ms"] = _to_milli(shutter.readout)
     if shutter.exposure > 0.0:
         content["exposure_ms"] = _to_milli(shutter.exposure)
-    if shutter.kind is ShutterKind.INTERLACED:
+    if shutter.is_interlaced:
         content["first_field"] = shutter.first_field
     return content
 

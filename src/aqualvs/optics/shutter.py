@@ -62,7 +62,7 @@ class Shutter:
     first_field: Field = "top"
 
     def __post_init__(self) -> None:
-        lowest = -LONGEST_S if self.kind is ShutterKind.ROLLING else 0.0
+        lowest = -LONGEST_S if self.rolls else 0.0
         for key, value, least in (
             ("readout_ms", self.readout, lowest),
             ("exposure_ms", self.exposure, 0.0),
@@ -80,17 +80,17 @@ class Shutter:
         if self.kind is not ShutterKind.GLOBAL and self.readout == 0.0:
             what = (
                 "from the first row to the last, such as 20"
-                if self.kind is ShutterKind.ROLLING
+                if self.rolls
                 else "from the first field to the second: 20 for PAL, 16.683 for NTSC"
             )
             raise RigError(f"readout_ms is missing or 0; write the milliseconds {what}")
-        if self.kind is not ShutterKind.INTERLACED and self.first_field != "top":
+        if not self.is_interlaced and self.first_field != "top":
             raise RigError(
                 f"first_field is for interlaced cameras, but kind is {self.kind.value}; leave it "
                 "out, or write kind: interlaced"
             )
         # A sensor starts its next field when it has read out the last one.
-        if self.kind is ShutterKind.INTERLACED and self.exposure > self.readout:
+        if self.is_interlaced and self.exposure > self.readout:
             raise RigError(
                 f"exposure_ms is {1e3 * self.exposure:g}, longer than the {1e3 * self.readout:g} "
                 "ms from field to field; write how long one field is exposed"
@@ -100,6 +100,16 @@ class Shutter:
     def instant(self) -> bool:
         """Whether the whole picture is taken at one instant, as far as it is known."""
         return self.readout == 0.0 and self.exposure == 0.0
+
+    @property
+    def rolls(self) -> bool:
+        """Whether one row is exposed after the other."""
+        return self.kind is ShutterKind.ROLLING
+
+    @property
+    def is_interlaced(self) -> bool:
+        """Whether each picture holds two fields, which are frames of their own."""
+        return self.kind is ShutterKind.INTERLACED
 
     @property
     def first_row(self) -> int:
@@ -117,7 +127,7 @@ class Shutter:
         index : int
             Of the frame.
         """
-        if self.kind is not ShutterKind.INTERLACED:
+        if not self.is_interlaced:
             return None
         return "top" if (index + self.first_row) % 2 == 0 else "bottom"
 
@@ -127,7 +137,7 @@ class Shutter:
 
         0 for others: a picture that is taken at once is taken when it comes.
         """
-        if self.kind is not ShutterKind.ROLLING:
+        if not self.rolls:
             return 0.0
         return 0.5 * (abs(self.readout) + self.exposure)
 
@@ -142,7 +152,7 @@ class Shutter:
             Of the picture, in pixels.
         """
         rows = np.asarray(rows, np.float64)
-        if self.kind is ShutterKind.INTERLACED:
+        if self.is_interlaced:
             early = np.rint(rows) % 2.0 == self.first_row
             return np.where(early, -0.5, 0.5) * self.readout
         share: FloatArray = (rows + 0.5) / height - 0.5

@@ -208,4 +208,4 @@ def _own_warnings(run: Mapping[str, Any]) -> Iterator[str]:
     for place in (run, summary if isinstance(summary, dict) else {}):
         found = place.get("warnings")
         if isinstance(found, list):
-            yield from (str(text) for text in found)
+            yield from (f"{text[:1].upper()}{text[1:]}." for text in map(str, found))

@@ -364,8 +364,9 @@ def working_range_m(rig: Mapping[str, Any]) -> tuple[float, float] | None:
 
 
 def housing_name(rig: Mapping[str, Any]) -> str:
-    """Return the name of the camera's housing."""
-    return "flat port" if isinstance(rig.get("flat"), dict) else "dome"
+    """Return the name of the camera's housing; "housing" where it is not known."""
+    names = {"dome": "dome", "flat": "flat port"}
+    return next((name for key, name in names.items() if isinstance(rig.get(key), dict)), "housing")
 
 
 def dome_radius_mm(rig: Mapping[str, Any]) -> float:

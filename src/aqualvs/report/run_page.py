@@ -290,17 +290,20 @@ def _texts(m: Material) -> dict[str, str]:
 def _parts(m: Material) -> dict[str, str]:
     """Return the parts of the page, in its order, and the numbers that its script draws."""
     planes_known = any(laser.known for laser in m.lasers)
+    housing = housing_name(m.rig)
+    # Of the rig's frame, roughly: the lens lies within its dome.
+    origin = "dome" if housing == "dome" else "lens"
     return {
         "cards": html.cards([*headline(m.track), *net_cards(m.net)]),
         "warnings": html.notice(m.warnings),
         "truth": _truth_view(m.track, m.truth),
         "net": net_view(m.net, m.crops),
         "planes": _plane_view(m.lasers, m.points is not None),
-        "cloud": _cloud_view(m.points, planes_known, _origin(m.rig)),
+        "cloud": _cloud_view(m.points, planes_known, origin),
         "pictures": _picture_view(_captions(m), m.pictures, m.no_pictures, m.names),
         "quality": _quality_view(m.track, m.points, m.names),
-        "bare": _bare_view(m.track, m.bare, m.truth, housing_name(m.rig)),
-        "rig": _rig_view(m.run, m.lasers, _origin(m.rig)),
+        "bare": _bare_view(m.track, m.bare, m.truth, housing),
+        "rig": _rig_view(m.run, m.lasers, origin),
         "data": html.embedded_json(_data(m)),
     }
 
@@ -406,11 +409,6 @@ def _plane_view(lasers: list[LaserFacts], has_points: bool) -> str:
         f'›</button></div>\n<p id="plane-words"></p>\n{_label_legend()}\n'
         f'<div class="grid" id="plane-grid">{places}</div>'
     )
-
-
-def _origin(rig: Mapping[str, Any]) -> str:
-    """Return what the origin of the rig's frame is, roughly: the lens, or the dome round it."""
-    return "dome" if isinstance(rig.get("dome"), dict) else "lens"
 
 
 def _cloud_view(points: PointSummary | None, planes_known: bool, origin: str) -> str:

@@ -83,7 +83,7 @@ class PostureCsv(Closing):
 
     def __init__(self, path: Path, shutter: Shutter = AT_ONCE) -> None:
         self._file, self._shutter = AppendFile(path), shutter
-        columns = POSTURE_COLUMNS if shutter.field_of(0) is None else (*POSTURE_COLUMNS, "field")
+        columns = (*POSTURE_COLUMNS, "field") if shutter.is_interlaced else POSTURE_COLUMNS
         try:
             self._append(",".join(columns) + "\n")
         except OSError:

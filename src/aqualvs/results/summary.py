@@ -201,12 +201,15 @@ class RunSummary:
         Monitor of the lasers, if they are monitored.
     net_check : NetCheck or None
         Comparison of the net with the target file's, if the file describes one.
+    warnings : list of str
+        Of the source and the rig, before anything is measured.
     """
 
     refused: Counter[str] = field(default_factory=Counter)
     ranges: "array[float]" = field(default_factory=lambda: array("d"))
     agreement: LaserAgreement | None = None
     net_check: NetCheck | None = None
+    warnings: list[str] = field(default_factory=list)
 
     @property
     def n_frames(self) -> int:
@@ -293,6 +296,8 @@ class RunSummary:
             found["laser_agreement"] = self.agreement.verdict().to_dict()
         if self.net_check is not None:
             found["net_check"] = self.net_check.to_dict()
+        if self.warnings:
+            found["warnings"] = list(self.warnings)
         return found
 
     def lines(self) -> list[str]:
@@ -309,7 +314,8 @@ class RunSummary:
             text.append(f"no posture: {', '.join(counts)}")
         sentence = "" if self.agreement is None else self.agreement.verdict().sentence()
         about_net = "" if self.net_check is None else self.net_check.sentence()
-        return [*text, *(words for words in (sentence, about_net) if words)]
+        text += [words for words in (sentence, about_net) if words]
+        return text + [f"warning: {words}" for words in self.warnings]
 
 
 def summary_of(posture_csv: Path) -> RunSummary:

@@ -245,12 +245,16 @@ def _median_weight(sampling_weight: FloatArray) -> float:
 
 
 @kernel
-def _heavy(sampling_weight: FloatArray) -> IntArray:
+def _heavy(sampling_weight: FloatArray, laser: IntArray) -> IntArray:
     """Return the subsegments to sample: those not much below the weighted median.
 
-    Where glare makes thousands of specks, most neighbours on a stripe would be specks.
+    Where glare makes thousands of specks, most neighbours on a stripe would be specks. A sample
+    needs two lasers: all are sampled where one laser has all the heavy ones.
     """
-    return np.flatnonzero(sampling_weight >= _LIGHTEST_SHARE * _median_weight(sampling_weight))
+    heavy = np.flatnonzero(sampling_weight >= _LIGHTEST_SHARE * _median_weight(sampling_weight))
+    if laser[heavy[0]] == laser[heavy[-1]]:
+        return np.arange(laser.shape[0])
+    return heavy
 
 
 @kernel
@@ -285,7 +289,7 @@ def search_plane(
     plane, normal, scratch = np.empty(4), np.empty((3, 3)), np.empty((5, 3))
     best = 0.0
     best_rough = 0.0
-    heavy = _heavy(table[WEIGHT])
+    heavy = _heavy(table[WEIGHT], laser)
     n_heavy = heavy.shape[0]
     cumulative_weight = table[WEIGHT][heavy]
     for k in range(1, n_heavy):

@@ -26,7 +26,6 @@ from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.rigfile import rig_to_mapping, save_rig
-from aqualvs.optics.shutter import ShutterKind
 from aqualvs.optics.solved import with_exact_numbers
 from aqualvs.simulation.cameras import expose, spread
 from aqualvs.simulation.dive import frames_of_picture
@@ -436,7 +435,7 @@ def render_benchmark_dive(
         shutter = renderer.rig.shutter
         for i, t in enumerate(scenario.times()):
             rng = np.random.default_rng([scenario.seed, i])
-            if shutter.kind is not ShutterKind.INTERLACED:
+            if not shutter.is_interlaced:
                 image, lit = render_with_visible(renderer, scenario.scene_at, t, rng)
                 frames = [(i, t, lit)]
             else:

@@ -199,7 +199,7 @@ def simulate_dive(
         ) as writer,
     ):
         table = csv.writer(file)
-        is_interlaced = rig.shutter.kind is ShutterKind.INTERLACED
+        is_interlaced = rig.shutter.is_interlaced
         table.writerow((*TRUTH_COLUMNS, "field") if is_interlaced else TRUTH_COLUMNS)
         for i, t in enumerate(scenario.times()):
             rng = np.random.default_rng([scenario.seed, i])
@@ -221,7 +221,7 @@ def simulate_dive(
 
 def frames_of_picture(picture: int, t: float, shutter: Shutter) -> list[tuple[int, float]]:
     """Return number and time of the frames that a picture makes."""
-    if shutter.kind is not ShutterKind.INTERLACED:
+    if not shutter.is_interlaced:
         return [(picture, t)]
     return [(2 * picture, t), (2 * picture + 1, t + shutter.readout)]
 
@@ -274,7 +274,7 @@ def check_shutter(shutter: Shutter, fps: float) -> None:
         If it does.
     """
     # Two fields make a frame, and the second is as far from the next frame's first.
-    needed = abs(shutter.readout) * (2.0 if shutter.kind is ShutterKind.INTERLACED else 1.0)
+    needed = abs(shutter.readout) * (2.0 if shutter.is_interlaced else 1.0)
     needed = max(needed, shutter.exposure)
     # NTSC's fields are stated to a few digits.
     if needed > (1.0 + 1e-3) / fps:

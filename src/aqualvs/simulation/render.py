@@ -24,7 +24,6 @@ from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel
 from aqualvs.geometry.linear_algebra import Vec, combine, row3, unit
 from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import Rig
-from aqualvs.optics.shutter import ShutterKind
 from aqualvs.simulation.cameras import IDEAL, CornerRays, SimulatedCamera, corner_rays
 from aqualvs.simulation.lasers import LaserSource, Sheets, default_sources, light_on_points
 from aqualvs.simulation.scene import Scene
@@ -263,7 +262,7 @@ class Renderer:
         scene, shutter = scene_at(t), self.rig.shutter
         if shutter.instant:
             return self.render(scene, t, rng)
-        if shutter.kind is ShutterKind.INTERLACED:
+        if shutter.is_interlaced:
             half = 0.5 * shutter.readout
             fields = [self.exposed_at(scene_at, at, rng) for at in (t - half, t + half)]
             image = fields[1]
@@ -292,7 +291,7 @@ class Renderer:
         # Rows of a rolling picture that are rendered at one instant lie within this time; stripes
         # that move by 300 px a second are off by 0.04 px at most, to and fro.
         band_s = 0.25e-3
-        if shutter.kind is ShutterKind.ROLLING:
+        if shutter.rolls:
             n_bands = min(math.ceil(abs(shutter.readout) / band_s), height)
         # Instants of an exposure are this near to each other: 0.6 px at the same speed, less than
         # the width of a stripe.
@@ -303,7 +302,7 @@ class Renderer:
         now = np.zeros_like(out)
         for low, high in pairwise(np.linspace(0, height, n_bands + 1).astype(int).tolist()):
             middle = t
-            if shutter.kind is ShutterKind.ROLLING:
+            if shutter.rolls:
                 middle += float(shutter.row_times(0.5 * (low + high - 1), height))
             for at in (middle + instants).tolist():
                 scene = scene_at(at)

@@ -3,7 +3,8 @@
 No filter makes whole pictures of fields: the rows of a field are those of its picture, and the
 scanner takes them as every other row of the camera (`Scanner`). Frames are numbered as
 `Shutter.field_of` says. The odd last row of a picture, which one field has and the other has not,
-is left out. `FieldEvidence` tells from pictures whether they are interlaced.
+is left out. `FieldEvidence` tells from pictures whether they are interlaced, `FieldWatch` from
+those of a stream as they come.
 """
 
 import dataclasses
@@ -16,9 +17,9 @@ import numpy as np
 
 from aqualvs.closing import Closing
 from aqualvs.optics.rig import Rig
-from aqualvs.optics.shutter import FIRST_ROW, Field, Shutter, ShutterKind
+from aqualvs.optics.shutter import FIRST_ROW, Field, Shutter
 from aqualvs.scanning.scan import Frame, ImagePlane
-from aqualvs.sources.base import Feed, FrameSource, PartHealth
+from aqualvs.sources.base import Feed, FrameSource, PartHealth, State
 from aqualvs.sources.spans import Span
 
 
@@ -32,7 +33,7 @@ def frames_of(pictures: Iterable[Frame], shutter: Shutter) -> Iterator[Frame]:
         Of the camera. The first field has the time of its picture, the second follows after
         `readout`.
     """
-    if shutter.kind is not ShutterKind.INTERLACED:
+    if not shutter.is_interlaced:
         yield from pictures
         return
     for picture in pictures:
@@ -89,12 +90,12 @@ def _halved(plane: ImagePlane, n_rows: int) -> ImagePlane:
 def size_of_frames(rig: Rig) -> tuple[int, int]:
     """Return width and height of a rig's frames: half the height if it is interlaced."""
     width, height = rig.size_px
-    return (width, height) if rig.shutter.field_of(0) is None else (width, height // 2)
+    return (width, height // 2) if rig.shutter.is_interlaced else (width, height)
 
 
 def frames_in(span: Span, shutter: Shutter) -> tuple[int, int]:
     """Return the first frame of consecutive pictures, and the first after them."""
-    n = 1 if shutter.kind is not ShutterKind.INTERLACED else 2
+    n = 2 if shutter.is_interlaced else 1
     return n * span.first, n * span.stop
 
 
@@ -135,18 +136,21 @@ class FieldSource(Closing):
         self.pictures.__exit__(None, None, None)
 
 
-class FieldFeed:
-    """Feed of the fields of another feed's pictures; satisfies `Feed`.
+class FrameFeed:
+    """Feed of a camera's frames: another feed's pictures, or their fields; satisfies `Feed`.
+
+    Its health warns where the pictures contradict the rig's shutter.
 
     Parameters
     ----------
     pictures : Feed
     shutter : Shutter
-        Interlaced.
+        Of the rig.
     """
 
     def __init__(self, pictures: Feed, shutter: Shutter) -> None:
         self._pictures, self._shutter = pictures, shutter
+        self._watch = FieldWatch(shutter)
 
     @property
     def name(self) -> str:
@@ -154,12 +158,18 @@ class FieldFeed:
         return self._pictures.name
 
     def __iter__(self) -> Iterator[Frame]:
-        """Yield the fields, both of a picture as soon as it comes."""
-        return frames_of(self._pictures, self._shutter)
+        """Yield the frames, both fields of a picture as soon as it comes."""
+        for picture in self._pictures:
+            yield from frames_of([picture], self._shutter)
+            # The frame is on its way: looking at it delays nothing.
+            self._watch.look(picture)
 
     def health(self) -> PartHealth:
-        """Return how the feed of the pictures is."""
-        return self._pictures.health()
+        """Return how the feed of the pictures is, with what contradicts the rig's shutter."""
+        found, wrong = self._pictures.health(), self._watch.warning
+        if not wrong or found.state is not State.OK:
+            return found
+        return dataclasses.replace(found, state=State.WARN, detail=wrong)
 
     def close(self) -> None:
         """End the iteration."""
@@ -168,14 +178,7 @@ class FieldFeed:
 
 def source_of_frames(pictures: FrameSource, shutter: Shutter) -> FrameSource:
     """Return the source of a camera's frames: fields where it is interlaced."""
-    is_interlaced = shutter.kind is ShutterKind.INTERLACED
-    return FieldSource(pictures, shutter) if is_interlaced else pictures
-
-
-def feed_of_frames(pictures: Feed, shutter: Shutter) -> Feed:
-    """Return the feed of a camera's frames: fields where it is interlaced."""
-    is_interlaced = shutter.kind is ShutterKind.INTERLACED
-    return FieldFeed(pictures, shutter) if is_interlaced else pictures
+    return FieldSource(pictures, shutter) if shutter.is_interlaced else pictures
 
 
 def source_of_pictures(frames: FrameSource) -> FrameSource:
@@ -247,7 +250,12 @@ class FieldEvidence:
     @property
     def are_whole(self) -> bool:
         """Whether something moves, and is not combed, whatever the stream says."""
-        return self.woven > _MOVING_SHARE and self.combed < _STILL_WHOLE * self.woven
+        return self.shows_motion and self.combed < _STILL_WHOLE * self.woven
+
+    @property
+    def shows_motion(self) -> bool:
+        """Whether fields would be combed."""
+        return self.woven > _MOVING_SHARE
 
     @property
     def are_fields(self) -> bool:
@@ -264,7 +272,7 @@ class FieldEvidence:
         fps : float or None
             Pictures a second.
         """
-        if shutter.kind is not ShutterKind.INTERLACED:
+        if not shutter.is_interlaced:
             if not self.are_fields:
                 return ""
             sign = "the stream says so" if self.is_marked else "rows of what moves are combed"
@@ -287,3 +295,58 @@ class FieldEvidence:
                 f"{self.first_field} in the rig file if the postures go to and fro"
             )
         return ""
+
+
+# A stream is looked at so often until so many pairs of pictures have shown motion: 2 ms each of
+# 720x576 px, 9 ms of 1920x1080.
+_LOOK_EVERY_S, _ENOUGH_PAIRS = 0.5, 10
+
+
+class FieldWatch:
+    """Watch of a stream's pictures for what contradicts the rig's shutter.
+
+    Parameters
+    ----------
+    shutter : Shutter
+        Of the rig.
+
+    Attributes
+    ----------
+    warning : str
+        As from `FieldEvidence.contradiction`; empty if nothing is wrong.
+    """
+
+    def __init__(self, shutter: Shutter) -> None:
+        self.warning = ""
+        self._shutter = shutter
+        self._first: Frame | None = None
+        self._last: Frame | None = None
+        self._next_s = 0.0
+        self._pairs: list[FieldEvidence] = []
+
+    def look(self, picture: Frame) -> None:
+        """Look at the next picture, if it is time."""
+        before, self._last = self._last, picture
+        if before is None or self._first is None:
+            self._first, self._next_s = picture, picture.time_s + _LOOK_EVERY_S
+            return
+        if len(self._pairs) >= _ENOUGH_PAIRS or picture.time_s < self._next_s:
+            return
+        if picture.index != before.index + 1 or picture.luma.shape != before.luma.shape:
+            return
+        self._next_s = picture.time_s + _LOOK_EVERY_S
+        found = FieldEvidence.of([(before, picture)])
+        if found.shows_motion:
+            self._pairs.append(found)
+        elif self._pairs or not found.is_marked:
+            return
+        pairs = self._pairs or [found]
+        mean = FieldEvidence(
+            is_marked=any(one.is_marked for one in pairs),
+            combed=float(np.mean([one.combed for one in pairs])),
+            woven=float(np.mean([one.woven for one in pairs])),
+        )
+        # Standards have whole and half numbers of pictures a second, or nearly so.
+        span_s = picture.time_s - self._first.time_s
+        fps = round(2.0 * (picture.index - self._first.index) / span_s) / 2.0
+        self.warning = mean.contradiction(self._shutter, fps)

@@ -22,7 +22,6 @@ from aqualvs.errors import AqualvsError
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import borrowing_kernel
 from aqualvs.optics.rig import Rig
-from aqualvs.optics.shutter import ShutterKind
 from aqualvs.scanner import Scanner
 from aqualvs.scanning.laser_bands import plan_bands
 from aqualvs.scanning.plane_fit import SOLID_ERROR, PlaneFit, fit_robust, plane_of_all
@@ -293,7 +292,7 @@ def corrected_rows(
     rig : Rig
     """
     with closing(blocks):
-        if rig.shutter.kind is not ShutterKind.ROLLING:
+        if not rig.shutter.rolls:
             yield from blocks
             return
         motion, measured, n_done = RowMotion(rig), list[FrameResult](), 0

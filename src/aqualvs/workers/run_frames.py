@@ -376,7 +376,7 @@ class WaterFollowingScanner:
         from aqualvs.calibration.water_index.state import IndexOptions
 
         self._rig, self._options, self._target = rig, options, target
-        if rig.shutter.field_of(0) is not None:
+        if rig.shutter.is_interlaced:
             raise OptionError(
                 "--index-target: markers are not looked for in fields of an interlaced camera; "
                 "leave it out, and give --water-n or --temperature-c and --salinity"
