@@ -22,7 +22,7 @@ from aqualvs.optics.rigfile import rig_from_mapping, rig_to_mapping
 
 
 @dataclass(frozen=True, slots=True)
-class Port:
+class ForeignHousing:
     """A housing and the media inside and outside of it, in the frame of the camera.
 
     Attributes
@@ -51,14 +51,14 @@ class ForeignCamera:
         Image width and height; None where the file does not say it.
     lens : Lens
         The centre of the top-left pixel is (0, 0).
-    port : Port or None
+    port : ForeignHousing or None
         None for a camera without a housing.
     """
 
     name: str
     size_px: tuple[int, int] | None
     lens: Lens
-    port: Port | None = None
+    port: ForeignHousing | None = None
 
 
 def opencv_lens(core: Sequence[float], distortion: Sequence[float], *, fisheye: bool) -> Lens:
@@ -162,7 +162,7 @@ def camera_of_rig(rig: Rig) -> ForeignCamera:
     """Return the camera of a rig, with its housing, as seen from the camera."""
     port = None
     if rig.housing is not None:
-        port = Port(rig.housing, rig.n_air, rig.n_water)
+        port = ForeignHousing(rig.housing, rig.n_air, rig.n_water)
     if port is not None and rig.dome is not None:
         pose = rig.dome_from_cam
         port = replace(port, centre=-(pose.rotation.T @ pose.translation) + 0.0)

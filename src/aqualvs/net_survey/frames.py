@@ -13,6 +13,7 @@ single shift stands out, none is applied, and the places keep the uncertainty of
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -293,23 +294,37 @@ def wrapped(off: FloatArray, frame: WallFrame) -> FloatArray:
 
 # What compass and depth sensor are off by between dives, one standard deviation.
 PRIOR_BEARING, PRIOR_DEPTH = np.deg2rad(5.0), 0.5
-_REACH = 3.0
+
+
+class _AlignmentOptions(NamedTuple):
+    """Alignment of a dive with earlier ones: shifts that are tried, and evidence for one."""
+
+    reach: float = 3.0
+    # A shift is told if so much of the chance lies so near (in prior deviations, and in metres).
+    mass: float = 0.95
+    near: float = 0.5
+    min_near: float = 0.3
+    flat_near: float = 0.5
+    # Places this far apart in a pattern of growth count as independent.
+    pattern: float = 0.7
+    min_stretches: int = 8
+    min_overlap: float = 0.5
+    # A hole is still there with this chance. Its diameter is then mostly found again to the first
+    # factor (log), else, seen in part, to the second, by which diameters of any holes differ.
+    kept: float = 0.5
+    seen_alike: float = 0.7
+    size: float = 0.15
+    sizes: float = 0.5
+    clip: float = 3.0
+    max_shifts: int = 40_000
+
+
+_ALIGNMENT = _AlignmentOptions()
+
 STEP = 0.1
 """Shifts that are tried are this far apart, in metres."""
-# A shift is told if so much of the chance lies so near (in prior deviations, and in metres).
-_MASS, _NEAR, _MIN_NEAR = 0.95, 0.5, 0.3
-_FLAT_NEAR = 0.5
-# Places this far apart in a pattern of growth count as independent.
-_PATTERN = 0.7
-_MIN_STRETCHES, _MIN_OVERLAP = 8, 0.5
-# A hole is still there with this chance. Its diameter is then mostly found again to the first
-# factor (log), else, seen in part, to the second, by which diameters of any holes differ.
-_KEPT, _SEEN_ALIKE = 0.5, 0.7
-_SIZE, _SIZES = 0.15, 0.5
-_CLIP = 3.0
 # Places in a stretch that are compared, along and across.
 _SAMPLES = 5
-_MAX_SHIFTS = 40_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -374,12 +389,16 @@ def align(
     chance /= chance.sum()
     value, spread, told = np.zeros(2), sigma.copy(), np.zeros(2, np.bool_)
     for axis in range(2):
-        near = max(_NEAR * sigma[axis], _MIN_NEAR) if np.isfinite(sigma[axis]) else _FLAT_NEAR
+        near = (
+            max(_ALIGNMENT.near * sigma[axis], _ALIGNMENT.min_near)
+            if np.isfinite(sigma[axis])
+            else _ALIGNMENT.flat_near
+        )
         shifts = STEP * grid.steps[axis]
         marginal = chance.sum(axis=1 - axis)
         inside = np.abs(shifts - shifts[np.argmax(marginal)]) <= near
         mass = float(marginal[inside].sum())
-        if mass < _MASS:
+        if mass < _ALIGNMENT.mass:
             continue
         told[axis] = True
         value[axis] = marginal[inside] @ shifts[inside] / mass
@@ -397,7 +416,7 @@ def shifted(one: PlacedSurvey, shift: SurveyShift) -> PlacedSurvey:
 
 def _grid(later: PlacedSurvey, earlier: Sequence[PlacedSurvey], frame: WallFrame) -> ShiftGrid:
     sigma = prior_sigma(frame)
-    reach = np.minimum(_REACH * sigma, 0.5 * frame.period)
+    reach = np.minimum(_ALIGNMENT.reach * sigma, 0.5 * frame.period)
     centre = 0.0
     if not frame.round:
         known = np.concatenate([one.outline.reshape(-1, 2) for one in earlier])[:, 0]
@@ -406,7 +425,7 @@ def _grid(later: PlacedSurvey, earlier: Sequence[PlacedSurvey], frame: WallFrame
         centre, reach[0] = 0.5 * (least + most), 0.5 * (most - least)
     n = np.ceil(reach / STEP)
     depths = np.arange(-n[1], n[1] + 1)
-    n[0] = min(n[0], _MAX_SHIFTS // len(depths) // 2)
+    n[0] = min(n[0], _ALIGNMENT.max_shifts // len(depths) // 2)
     across = np.round(centre / STEP) + np.arange(-n[0], n[0] + 1)
     log_prior = -0.5 * (STEP * depths / sigma[1]) ** 2 + np.zeros((len(across), 1))
     if frame.round:
@@ -419,7 +438,7 @@ def _pattern_gain(
 ) -> FloatArray:
     """Return by how much each shift explains the growth better than none; 0 if by chance only."""
     nothing = np.zeros(grid.log_prior.shape)
-    if len(later.rows) < _MIN_STRETCHES:
+    if len(later.rows) < _ALIGNMENT.min_stretches:
         return nothing
     raster, known = _pattern(earlier, frame)
     places = spread_over(later.outline, 1e9)
@@ -431,7 +450,7 @@ def _pattern_gain(
             told = _mean_over(known, raster.index(places + np.array([du, dd])))
             good = np.isfinite(told)
             count[i, j] = np.count_nonzero(good)
-            if count[i, j] < _MIN_STRETCHES:
+            if count[i, j] < _ALIGNMENT.min_stretches:
                 continue
             agreement[i, j] = _correlation(mine[good], _clipped(told[good]))
             value = -count[i, j] * np.log1p(-(agreement[i, j] ** 2)) * (agreement[i, j] > 0.0)
@@ -439,10 +458,10 @@ def _pattern_gain(
                 best, best_told = value, told
     if best_told is None:
         return nothing
-    agreement[(agreement < 0.0) | (count < _MIN_OVERLAP * count.max())] = 0.0
+    agreement[(agreement < 0.0) | (count < _ALIGNMENT.min_overlap * count.max())] = 0.0
     gain = -0.5 * count * np.log1p(-(np.minimum(agreement, 0.9999) ** 2))
     alike, rest = _independent(mine, best_told, later.outline.mean(axis=1))
-    n_shifts = max(grid.log_prior.size * (STEP / _PATTERN) ** 2, 1.0)
+    n_shifts = max(grid.log_prior.size * (STEP / _ALIGNMENT.pattern) ** 2, 1.0)
     # Agreement of patterns that chance alone would show in one of so many cases does not count.
     chance = 0.01
     if alike * gain.max() < np.log(n_shifts / chance):
@@ -482,7 +501,7 @@ def _clipped(values: FloatArray) -> FloatArray:
     """Return values with outliers drawn in."""
     middle = np.median(values)
     spread = max(_MAD * float(np.median(np.abs(values - middle))), 1e-6)
-    return np.clip(values, middle - _CLIP * spread, middle + _CLIP * spread)
+    return np.clip(values, middle - _ALIGNMENT.clip * spread, middle + _ALIGNMENT.clip * spread)
 
 
 def _correlation(a: FloatArray, b: FloatArray) -> float:
@@ -522,12 +541,12 @@ def _beside(middle: FloatArray) -> IntArray:
     distance[gap <= lane] = np.inf
     nearest = np.argmin(distance, axis=1)
     rows = np.arange(len(middle))
-    near = distance[rows, nearest] < 2.0 * _PATTERN
+    near = distance[rows, nearest] < 2.0 * _ALIGNMENT.pattern
     return np.stack([rows[near], nearest[near]])
 
 
 def _memory(values: FloatArray, pairs: IntArray) -> float:
-    if pairs.shape[1] < _MIN_STRETCHES:
+    if pairs.shape[1] < _ALIGNMENT.min_stretches:
         return 0.0
     return float(np.clip(_correlation(values[pairs[0]], values[pairs[1]]), 0.0, 0.95))
 
@@ -554,12 +573,16 @@ def _holes_gain(
             variance = sigma**2 + later.sigma**2 + middle**2 + STEP**2 / 4.0
             peak = _size_gain(diameter, other) / (2.0 * np.pi * np.sqrt(np.prod(variance)))
             density += peak * np.exp(-0.5 * (off**2 / variance).sum(axis=-1))
-        gain += np.log((1.0 - _KEPT) + _KEPT * density * area / len(known))
+        gain += np.log((1.0 - _ALIGNMENT.kept) + _ALIGNMENT.kept * density * area / len(known))
     return gain
 
 
 def _size_gain(one: float, other: float) -> float:
     """Return how much more likely two diameters are those of one hole than of any two."""
     off = float(np.log(one / other))
-    again = _SIZES / _SIZE * np.exp(-0.5 * off**2 * (_SIZE**-2 - _SIZES**-2))
-    return _SEEN_ALIKE * float(again) + 1.0 - _SEEN_ALIKE
+    again = (
+        _ALIGNMENT.sizes
+        / _ALIGNMENT.size
+        * np.exp(-0.5 * off**2 * (_ALIGNMENT.size**-2 - _ALIGNMENT.sizes**-2))
+    )
+    return _ALIGNMENT.seen_alike * float(again) + 1.0 - _ALIGNMENT.seen_alike

@@ -14,6 +14,7 @@ its edge was not seen (`find_discs`).
 """
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,14 +25,27 @@ from aqualvs.nets.dashes import NetView
 from aqualvs.nets.lattice import NetLattice
 from aqualvs.nets.spectrum import Mesh
 
-# Share of strand that is always dark without a hole; share of light where the net has a hole (a
-# fish, a loose end); and limit of the evidence of the looks at one cell against a hole.
-_DARK, _FALSE_LIGHT, _MAX_SOUND = 0.03, 0.03, 4.0
-# Prior number of crossings seen, for one laser and family: with few crossings, the share that is
-# missed is not known. The same for a piece of its line.
-# Where seen and missed alternate at this share, all missed ones count; where a larger share than
-# the last one is missed, missing strands give no evidence.
-_BEFORE, _BEFORE_HERE, _SCARCE, _TOO_MANY = 20.0, 5.0, 0.12, 0.3
+
+class _EvidenceOptions(NamedTuple):
+    """Evidence of the looks at a place of the net, for and against a hole."""
+
+    # Share of strand that is always dark without a hole; share of light where the net has a hole (a
+    # fish, a loose end); and limit of the evidence of the looks at one cell against a hole.
+    dark: float = 0.03
+    false_light: float = 0.03
+    max_sound: float = 4.0
+    # Prior number of crossings seen, for one laser and family: with few crossings, the share that
+    # is missed is not known. The same for a piece of its line. Where seen and missed alternate at
+    # this share, all missed ones count; where a larger share than the last one is missed, missing
+    # strands give no evidence.
+    before: float = 20.0
+    before_here: float = 5.0
+    scarce: float = 0.12
+    too_many: float = 0.3
+
+
+_EVIDENCE = _EvidenceOptions()
+
 
 HERE = 0.1
 """Length of a piece of a laser's line, in ranges."""
@@ -94,7 +108,7 @@ class Looks:
         number = self.sums[:, 0]
         margin = np.maximum(2.0 * self.shares - 1.0, 0.0)
         mean = self.sums[:, 3] / number
-        says = np.where(self.missed, mean, np.maximum(mean * number, -_MAX_SOUND))
+        says = np.where(self.missed, mean, np.maximum(mean * number, -_EVIDENCE.max_sound))
         return np.asarray(says * margin)
 
     def stays_dark(self, middle: FloatArray, radius: float) -> bool:
@@ -141,8 +155,8 @@ def looks_say(
         Number of the piece of the laser's line.
     """
     share = np.maximum(_missed_share(laser, family, missed, run), _missed_here(laser, here, missed))
-    dark = np.where(share < _TOO_MANY, -np.log(_DARK + share), 0.0)
-    return np.asarray(np.where(missed, dark, np.log(_FALSE_LIGHT / (1.0 - share))))
+    dark = np.where(share < _EVIDENCE.too_many, -np.log(_EVIDENCE.dark + share), 0.0)
+    return np.asarray(np.where(missed, dark, np.log(_EVIDENCE.false_light / (1.0 - share))))
 
 
 def _missed_share(
@@ -155,7 +169,7 @@ def _missed_share(
     kind = laser * (int(family.max(initial=0)) + 1) + family
     seen = np.bincount(kind[~missed], minlength=int(kind.max(initial=0)) + 1)
     single = np.bincount(kind[missed & (run == 1)], minlength=len(seen))
-    share = (single + _DARK * _BEFORE) / (seen + single + _BEFORE)
+    share = (single + _EVIDENCE.dark * _EVIDENCE.before) / (seen + single + _EVIDENCE.before)
     return np.asarray(share[kind])
 
 
@@ -170,27 +184,41 @@ def _missed_here(laser: IntArray, here: FloatArray, missed: BoolArray) -> FloatA
     again = kind[order][1:] == kind[order][:-1]
     turned = again & (missed[order][1:] != missed[order][:-1])
     n = int(kind.max(initial=0)) + 1
-    pairs = np.bincount(kind[order][1:], again, minlength=n) + _BEFORE_HERE
-    turns = np.bincount(kind[order][1:], turned, minlength=n) + 2.0 * _DARK * _BEFORE_HERE
+    pairs = np.bincount(kind[order][1:], again, minlength=n) + _EVIDENCE.before_here
+    turns = (
+        np.bincount(kind[order][1:], turned, minlength=n)
+        + 2.0 * _EVIDENCE.dark * _EVIDENCE.before_here
+    )
     # Of two in random order, 2 p (1 - p) differ.
     share = 0.5 - np.sqrt(np.maximum(0.25 - 0.5 * turns / pairs, 0.0))
     every = np.bincount(kind, missed, minlength=n) / np.bincount(kind, minlength=n)
-    return np.asarray(np.where(share > _SCARCE, np.maximum(share, every), share)[kind])
+    return np.asarray(np.where(share > _EVIDENCE.scarce, np.maximum(share, every), share)[kind])
 
 
 RIM = 0.8
 """Margin around a disc within which evidence belongs to it, in bars."""
 
-# Grid of the discs, in bars: step of the middles, their margin beyond missing strands, and the
-# radii. Least score of a hole on the grid with double the step.
-_STEP, _BESIDE, _COARSE_SCORE = 0.4, 2.4, 6.0
+
+class _DiscOptions(NamedTuple):
+    """Search for discs that hold no strand."""
+
+    # Grid of the discs, in bars: step of the middles, their margin beyond missing strands, and the
+    # radii. Least score of a hole on the grid with double the step.
+    step: float = 0.4
+    beside: float = 2.4
+    coarse_score: float = 6.0
+    # Discs up to this radius are single strands that are cut, larger ones holes.
+    single: float = 0.8
+    # A hole's log-likelihood over sound net, and over a single strand that is cut.
+    min_score: float = 12.0
+    min_lead: float = 5.0
+    # Uncertainty of a radius from the grid and from the places of strands, in bars.
+    rough: float = 0.25
+
+
+_DISCS = _DiscOptions()
+
 _RADII: FloatArray = np.arange(0.5, 6.01, 0.25)
-# Discs up to this radius are single strands that are cut, larger ones holes.
-_SINGLE = 0.8
-# A hole's log-likelihood over sound net, and over a single strand that is cut.
-_MIN_SCORE, _MIN_LEAD = 12.0, 5.0
-# Uncertainty of a radius from the grid and from the places of strands, in bars.
-_ROUGH = 0.25
 
 
 @dataclass(frozen=True, slots=True)
@@ -227,7 +255,7 @@ def find_discs(place: FloatArray, weight: FloatArray, bar: float) -> list[Disc]:
     """
     weight = weight.copy()
     found: list[Disc] = []
-    while weight[weight > 0.0].sum() >= _MIN_SCORE:
+    while weight[weight > 0.0].sum() >= _DISCS.min_score:
         disc = _best(place, weight, bar)
         if disc is None:
             break
@@ -251,19 +279,19 @@ def local_sums(place: FloatArray, weight: FloatArray, radius: float) -> FloatArr
 
 def _best(place: FloatArray, weight: FloatArray, bar: float) -> Disc | None:
     radii = _RADII * bar
-    rough = _scores(place, weight, _middles(place, weight, 2.0 * _STEP * bar, bar), radii)
-    if rough.max() < _COARSE_SCORE:
+    rough = _scores(place, weight, _middles(place, weight, 2.0 * _DISCS.step * bar, bar), radii)
+    if rough.max() < _DISCS.coarse_score:
         return None
-    middles = _middles(place, weight, _STEP * bar, bar)
+    middles = _middles(place, weight, _DISCS.step * bar, bar)
     score = _scores(place, weight, middles, radii)
     # Large holes are rarer than small ones, by this power of the radius.
     rarer = 2.0
     total = score - rarer * np.log(_RADII)
-    single = _RADII <= _SINGLE
+    single = _DISCS.single >= _RADII
     total[:, single] = -np.inf
     at, size = np.unravel_index(np.argmax(total), total.shape)
     best = float(score[at, size])
-    if best < _MIN_SCORE or best - max(float(score[:, single].max()), 0.0) < _MIN_LEAD:
+    if best < _DISCS.min_score or best - max(float(score[:, single].max()), 0.0) < _DISCS.min_lead:
         return None
     # Discs that contain the middle of the likeliest one belong to the same hole.
     away = np.hypot(*(middles - middles[at]).T)
@@ -274,14 +302,14 @@ def _best(place: FloatArray, weight: FloatArray, bar: float) -> Disc | None:
     return Disc(
         middle=share.sum(axis=1) @ middles,
         radius=radius,
-        sigma=float(np.sqrt(spread + (_ROUGH * bar) ** 2)),
+        sigma=float(np.sqrt(spread + (_DISCS.rough * bar) ** 2)),
         score=best,
     )
 
 
 def _middles(place: FloatArray, weight: FloatArray, step: float, bar: float) -> FloatArray:
     """Return a grid around the places where strands are missing, shape (C, 2)."""
-    missing, beside = place[weight > 0.0], _BESIDE * bar
+    missing, beside = place[weight > 0.0], _DISCS.beside * bar
     low, high = missing.min(axis=0) - beside, missing.max(axis=0) + beside
     sides = [np.arange(a, b, step) for a, b in zip(low, high, strict=True)]
     return np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1).reshape(-1, 2)

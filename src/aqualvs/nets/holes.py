@@ -8,7 +8,7 @@ estimated from the dive itself.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -29,11 +29,21 @@ from aqualvs.nets.hole_candidates import (
 from aqualvs.nets.lattice import NetLattice
 from aqualvs.nets.spectrum import Mesh
 
-# Missing strands may be a hole if this near to each other, in bars, and with this much evidence;
-# strands within the last distance determine its edge.
-_NEAR, _MIN_NEAR, _AROUND = 1.5, 9.0, 6.5
-# Cells farther from the vehicle than this are settled, in metres.
-_SETTLED = 2.0
+
+class _HoleOptions(NamedTuple):
+    """Missing strands that are one hole."""
+
+    # Missing strands may be a hole if this near to each other, in bars, and with this much
+    # evidence; strands within the last distance determine its edge.
+    near: float = 1.5
+    min_near: float = 9.0
+    around: float = 6.5
+    # Cells farther from the vehicle than this are settled, in metres.
+    settled: float = 2.0
+
+
+_HOLE = _HoleOptions()
+
 _ROW = 1 << 24
 
 # Frame, time, and place on the map.
@@ -188,20 +198,23 @@ class HoleMap:
         """Return whether a hole lies in the part of the map that is not settled."""
         if self._last is None:
             return False
-        return bool(np.abs(hole.place - self._last).max() < _SETTLED)
+        return bool(np.abs(hole.place - self._last).max() < _HOLE.settled)
 
     def _find(self, lattice: NetLattice) -> list[Hole]:
         places, weights = self._looks.places, self._looks.weights()
         bar = lattice.bar
         likely = np.flatnonzero(weights > 0.0)
-        near = local_sums(places[likely], weights[likely], _NEAR * bar)
-        likely = likely[near > _MIN_NEAR]
+        near = local_sums(places[likely], weights[likely], _HOLE.near * bar)
+        likely = likely[near > _HOLE.min_near]
         found, left = [], weights.copy()
         # Discs no farther apart than this are one hole, in bars.
         touch = 1.2
-        for group in _groups(places[likely], 2.0 * _NEAR * bar):
+        for group in _groups(places[likely], 2.0 * _HOLE.near * bar):
             seeds = places[likely[group]]
-            low, high = seeds.min(axis=0) - _AROUND * bar, seeds.max(axis=0) + _AROUND * bar
+            low, high = (
+                seeds.min(axis=0) - _HOLE.around * bar,
+                seeds.max(axis=0) + _HOLE.around * bar,
+            )
             around = np.all((places > low) & (places < high), axis=1)
             discs = find_discs(places[around], left[around], bar)
             # Only a part of a hole of another group may lie in these surroundings.
@@ -246,17 +259,17 @@ class HoleMap:
         """Drop cells far behind the vehicle."""
         if self._last is None or not len(self._looks.keys):
             return
-        close = np.abs(self._looks.places - self._last).max(axis=1) < _SETTLED
+        close = np.abs(self._looks.places - self._last).max(axis=1) < _HOLE.settled
         self._looks = self._looks.kept(close)
         row = np.floor_divide(self._meshes + _ROW // 2, _ROW)
         at = np.stack([self._meshes - row * _ROW, row], axis=1) * self._mesh
-        close = np.abs(at - self._last).max(axis=1) < _SETTLED
+        close = np.abs(at - self._last).max(axis=1) < _HOLE.settled
         self._settled_meshes += int(np.count_nonzero(~close))
         self._meshes = self._meshes[close]
         self._feet = {
             key: one
             for key, one in self._feet.items()
-            if np.abs(one[2] - self._last).max() < _SETTLED
+            if np.abs(one[2] - self._last).max() < _HOLE.settled
         }
 
 

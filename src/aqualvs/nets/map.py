@@ -6,7 +6,7 @@ Drawn without a display; Matplotlib is loaded only when a map is drawn.
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -19,16 +19,26 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-# The wall is cut into rows until a row is at least this high for its width, or up to this number.
-_MIN_RATIO, _MAX_ROWS = 0.13, 8
-_MARGIN = 0.09
+class _MapLayout(NamedTuple):
+    """Layout of the map, in inches and shares."""
+
+    # The wall is cut into rows until a row is at least this high for its width, or up to this
+    # number.
+    min_ratio: float = 0.13
+    max_rows: int = 8
+    margin: float = 0.09
+    min_scale: float = 0.1
+    scale_step: float = 0.05
+    # Bearings that are written above a row.
+    bearings: int = 7
+
+
+_LAYOUT = _MapLayout()
+
 # Looks alike in all kinds of colour vision, from dark blue (clean) to yellow.
 _COLOURS = "cividis"
-_MIN_SCALE, _SCALE_STEP = 0.1, 0.05
 _GREY, _PATH, _HOLE = "#c4c9cd", "#ffffff", "#d55e00"
 _INK, _SEA = "#14222c", "#f4f7f8"
-# Bearings that are written above a row.
-_BEARINGS = 7
 # Its keys are a type of their own in some versions of Matplotlib.
 _STYLE: dict[Any, Any] = {
     "font.size": 9.0,
@@ -118,7 +128,7 @@ def _extent(wall: UnrolledNet) -> tuple[FloatArray, FloatArray]:
     ]
     corners = np.concatenate([*wall.outlines, *wall.path, np.reshape(holes, (-1, 2))])
     low, high = corners.min(axis=0), corners.max(axis=0)
-    margin = _MARGIN * (high - low)
+    margin = _LAYOUT.margin * (high - low)
     if not wall.by_bearing:
         margin[:] = margin.min()
     return low - margin, high + margin
@@ -126,7 +136,7 @@ def _extent(wall: UnrolledNet) -> tuple[FloatArray, FloatArray]:
 
 def _rows(size: FloatArray) -> int:
     """Return the number of rows that a wall is cut into, so that no row is a thin line."""
-    return min(max(math.ceil(_MIN_RATIO * float(size[0] / size[1])), 1), _MAX_ROWS)
+    return min(max(math.ceil(_LAYOUT.min_ratio * float(size[0] / size[1])), 1), _LAYOUT.max_rows)
 
 
 def _shades(wall: UnrolledNet) -> "ScalarMappable":
@@ -134,8 +144,8 @@ def _shades(wall: UnrolledNet) -> "ScalarMappable":
     from matplotlib.colors import Normalize
 
     known = [value for value in map(fouling_of, wall.stretches) if value is not None]
-    most = max([*known, _MIN_SCALE])
-    top = _SCALE_STEP * math.ceil(most / _SCALE_STEP - 1e-9)
+    most = max([*known, _LAYOUT.min_scale])
+    top = _LAYOUT.scale_step * math.ceil(most / _LAYOUT.scale_step - 1e-9)
     return ScalarMappable(Normalize(0.0, top), _COLOURS)
 
 
@@ -232,7 +242,9 @@ def _mark_bearings(axes: "Axes", wall: UnrolledNet, *, name: bool) -> None:
     inside = np.flatnonzero((along >= low) & (along <= high))
     if np.any(np.diff(along) <= 0.0) or not len(inside):
         return
-    chosen = inside[np.unique(np.linspace(0, len(inside) - 1, _BEARINGS).round().astype(int))]
+    chosen = inside[
+        np.unique(np.linspace(0, len(inside) - 1, _LAYOUT.bearings).round().astype(int))
+    ]
     top = axes.secondary_xaxis("top")
     top.set_xticks(along[chosen], [f"{bearing[i]:.0f}°" for i in chosen])
     if name:

@@ -6,6 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
+from typing import NamedTuple
 
 import av
 import cv2
@@ -26,8 +27,19 @@ from aqualvs.text import bgr
 
 N_PICTURES = 6
 N_SAMPLES = 24
-# Pictures of holes: least side and size on the page in pixels, and hole diameters across.
-_CROP_PX, _CROP_SHOWN_PX, _CROP_DIAMETERS = 160, 320, 2.5
+
+
+class _CropLayout(NamedTuple):
+    """Crops of frames, in pixels."""
+
+    # Pictures of holes: least side and size on the page in pixels, and hole diameters across.
+    px: int = 160
+    shown_px: int = 320
+    diameters: float = 2.5
+
+
+_CROP = _CropLayout()
+
 _DECODERS = 2
 # What a file raises that is no video, has no picture, or breaks off.
 _BROKEN = (av.error.FFmpegError, OSError, IndexError, StopIteration)
@@ -142,14 +154,14 @@ def make_crop(image: ImagePlane, middle: tuple[float, float], diameter: float) -
         Of the ring, in pixels.
     """
     height, width = map(int, image.shape[:2])
-    side = min(round(max(_CROP_DIAMETERS * diameter, _CROP_PX)), width, height)
+    side = min(round(max(_CROP.diameters * diameter, _CROP.px)), width, height)
     left, top = (
         min(max(round(at - 0.5 * side), 0), most - side)
         for at, most in zip(middle, (width, height), strict=True)
     )
     crop = image[top : top + side, left : left + side]
-    scale = _CROP_SHOWN_PX / side
-    shown = cv2.resize(crop, (_CROP_SHOWN_PX, _CROP_SHOWN_PX), interpolation=cv2.INTER_AREA)
+    scale = _CROP.shown_px / side
+    shown = cv2.resize(crop, (_CROP.shown_px, _CROP.shown_px), interpolation=cv2.INTER_AREA)
     centre = (round(scale * (middle[0] - left)), round(scale * (middle[1] - top)))
     radius = round(0.5 * scale * diameter)
     cv2.circle(shown, centre, radius, _HOLE_COLOUR, 2, cv2.LINE_AA)

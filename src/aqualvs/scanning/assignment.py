@@ -50,18 +50,30 @@ from aqualvs.scanning.posture_estimator import Measurement
 from aqualvs.scanning.surfaces import Surface
 from aqualvs.scanning.triangulate import Triangulator
 
-# Log-odds of a laser that shows nothing though it should (7 %), and of a false stripe as good as
-# the others (5 %); odds of 20 to 1 decide.
-_DARK_LASER, _FOREIGN_STRIPE, _DECIDED = 2.6, 3.0, 3.0
-# Residuals of half stripes count as at most this many independent ones, because errors of the rig
-# are not noise. Then the limit of the evidence from residuals.
-_MAX_FREEDOM, _MAX_BY_RESIDUALS = 10.0, 12.0
-# A surface with less than this share of the light that no other explains, or a solid one whose
-# stripes are nowhere seen over this share of their way through the picture, must be seen evenly:
-# caustics and fish are not. This share of the lasers may be faint. Found on rendered dives: planes
-# through caustics have up to 0.14 of the light, most below 0.1; nets come down to 0.15, folded ones
-# to 0.14.
-_SMALL_SHARE, _SHORT_WAY, _MAY_BE_FAINT = 0.12, 0.15, 0.25
+
+class _AssignmentOptions(NamedTuple):
+    """Evidence for and against an assignment."""
+
+    # Log-odds of a laser that shows nothing though it should (7 %), and of a false stripe as good
+    # as the others (5 %); odds of 20 to 1 decide.
+    dark_laser: float = 2.6
+    foreign_stripe: float = 3.0
+    decided: float = 3.0
+    # Residuals of half stripes count as at most this many independent ones, because errors of the
+    # rig are not noise. Then the limit of the evidence from residuals.
+    max_freedom: float = 10.0
+    max_by_residuals: float = 12.0
+    # A surface with less than this share of the light that no other explains, or a solid one whose
+    # stripes are nowhere seen over this share of their way through the picture, must be seen
+    # evenly: caustics and fish are not. This share of the lasers may be faint. Found on rendered
+    # dives: planes through caustics have up to 0.14 of the light, most below 0.1; nets come down to
+    # 0.15, folded ones to 0.14.
+    small_share: float = 0.12
+    short_way: float = 0.15
+    may_be_faint: float = 0.25
+
+
+_ODDS = _AssignmentOptions()
 
 
 class Verdict(Enum):
@@ -235,13 +247,13 @@ class AssignmentTest:
             subsegments.intensity_weight,
             surface.inlier_weight,
         )
-        if intensity_share < _SMALL_SHARE or surface.is_mesh:
-            return intensity_share < _SMALL_SHARE
-        return self._seen_of(surface, subsegments)[0] < _SHORT_WAY
+        if intensity_share < _ODDS.small_share or surface.is_mesh:
+            return intensity_share < _ODDS.small_share
+        return self._seen_of(surface, subsegments)[0] < _ODDS.short_way
 
     def _is_faint(self, surface: Surface, subsegments: Subsegments) -> bool:
         """Return whether a laser that should be seen on a surface is faint there, or missing."""
-        return self._seen_of(surface, subsegments)[1] > _MAY_BE_FAINT
+        return self._seen_of(surface, subsegments)[1] > _ODDS.may_be_faint
 
     def _seen_of(self, surface: Surface, subsegments: Subsegments) -> tuple[float, float]:
         """Return the share of its best stripe that a surface shows, and that of faint lasers."""
@@ -380,7 +392,7 @@ def _verdict(planes: FloatArray, facts: FloatArray) -> AssignmentOutcome:
     kept = _alike(planes[best], planes[0])
     # Hypotheses nearer to each other than this are covered by a larger sigma instead of a refusal.
     near_range, near_angle = 0.02, math.radians(2.0)
-    if odds < _DECIDED:
+    if odds < _ODDS.decided:
         other = _plane(planes[second] if kept else planes[best])
         if not _alike(planes[best], planes[second], near_range, near_angle):
             return AssignmentOutcome(Verdict.AMBIGUOUS, other, odds)
@@ -397,15 +409,17 @@ def _log_odds(one: FloatArray, other: FloatArray) -> float:
     """Return the log-odds of one hypothesis against another."""
     per_laser = max(one[PER_LASER], other[PER_LASER], 1e-9)
     intensity_share = (
-        _FOREIGN_STRIPE * (one[INTENSITY_WEIGHT] - other[INTENSITY_WEIGHT]) / per_laser
+        _ODDS.foreign_stripe * (one[INTENSITY_WEIGHT] - other[INTENSITY_WEIGHT]) / per_laser
     )
-    dark = _DARK_LASER * (other[DARK] - one[DARK])
-    freedom = min(one[FREEDOM], other[FREEDOM], _MAX_FREEDOM)
+    dark = _ODDS.dark_laser * (other[DARK] - one[DARK])
+    freedom = min(one[FREEDOM], other[FREEDOM], _ODDS.max_freedom)
     residuals = 0.0
     if freedom > 0.0:
         residuals = 0.5 * freedom * math.log(other[VARIANCE] / one[VARIANCE])
     return float(
-        intensity_share + dark + min(max(residuals, -_MAX_BY_RESIDUALS), _MAX_BY_RESIDUALS)
+        intensity_share
+        + dark
+        + min(max(residuals, -_ODDS.max_by_residuals), _ODDS.max_by_residuals)
     )
 
 

@@ -1,6 +1,7 @@
 """Compiled kernels of `AssignmentTest`: rivals of a plane, and the evidence for each of them."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,15 +29,29 @@ CELL_LINES = 16
 SAME_RANGE, SAME_ANGLE = 0.004, math.radians(0.4)
 """Largest difference of equal hypotheses (share of the range, radians)."""
 
-# Least light that a rival must explain, as a share of the surface's.
-_RIVAL_SHARE = 0.5
-# Light within this many gates of a plane is on it: lasers whose calibration is less accurate than
-# the peaks must not count as dark, nor their light as foreign.
-_WIDE = 2.5
-# Least number of cells to judge a laser; with a smaller share of the typical light it is dark.
-_MIN_CELLS, _DARK_SHARE = 3, 0.25
-# A laser is faint with this share of the best one's way through the picture.
-_FAINT = 0.4
+
+class _EvidenceOptions(NamedTuple):
+    """Light of the lasers on a plane, and what counts as dark or faint."""
+
+    # Least light that a rival must explain, as a share of the surface's.
+    rival_share: float = 0.5
+    # Light within this many gates of a plane is on it: lasers whose calibration is less accurate
+    # than the peaks must not count as dark, nor their light as foreign.
+    wide: float = 2.5
+    # Least number of cells to judge a laser; with a smaller share of the typical light it is dark.
+    min_cells: int = 3
+    dark_share: float = 0.25
+    # A laser is faint with this share of the best one's way through the picture.
+    faint: float = 0.4
+    # Light is on a plane within the first of these shares of its distance, before it from the
+    # second on; pieces of stripe this long are those of walls and fish, not the light on strands.
+    on_plane: float = 0.02
+    before: float = 0.03
+    long_piece: float = 24.0
+
+
+_EVIDENCE = _EvidenceOptions()
+
 # Columns of sums over the peaks of one laser's stripe, read as some laser's.
 _XX, _XY, _XZ, _YY, _YZ, _ZZ, _SX, _SY, _SZ, _N, _SJX, _SJY, _SJZ, _N_SUMS = range(14)
 
@@ -90,7 +105,7 @@ def find_rivals(
         if own > 0.0:
             for k in range(3):
                 place[i, k] = sums[i, i, _SX + k] / own
-    if other < _RIVAL_SHARE * total:
+    if other < _EVIDENCE.rival_share * total:
         return 0
     seeds = _choose_seeds(sums, place)
     score = np.zeros(planes.shape[0])
@@ -189,16 +204,16 @@ def _try_pair(
             if a == b or (a == i and b == k):
                 continue
             first, second = sums[i, a], sums[k, b]
-            if first[_N] < _RIVAL_SHARE * sums[i, i, _N]:
+            if first[_N] < _EVIDENCE.rival_share * sums[i, i, _N]:
                 continue
-            if second[_N] < _RIVAL_SHARE * sums[k, k, _N]:
+            if second[_N] < _EVIDENCE.rival_share * sums[k, k, _N]:
                 continue
             if not _fit_two(first, second, normal, scratch, right, m, plane):
                 continue
             if plane[3] < nearest or plane[3] > farthest or plane[1] < MIN_FACING:
                 continue
             value = _explained(sums, plane)
-            if value >= _RIVAL_SHARE * total:
+            if value >= _EVIDENCE.rival_share * total:
                 n = _keep_best(plane, value, planes, score, n)
     return n
 
@@ -253,7 +268,7 @@ def _explained(sums: FloatArray, plane: FloatArray) -> float:
             square += y * (y * row[_YY] + 2.0 * z * row[_YZ]) + z * z * row[_ZZ]
             square += -2.0 * d * (x * row[_SX] + y * row[_SY] + z * row[_SZ]) + n * d * d
             per_px = (x * row[_SJX] + y * row[_SJY] + z * row[_SJZ]) / n
-            gate = _WIDE * _WIDE * squared_gate(per_px, d)
+            gate = _EVIDENCE.wide * _EVIDENCE.wide * squared_gate(per_px, d)
             best = max(best, n * (1.0 - square / (n * gate)))
         total += best
     return total
@@ -300,11 +315,11 @@ def _refine_rivals(
     normal, scratch, lanes = np.empty((3, 3)), np.empty((5, 3)), np.empty(table.shape[1])
     kept = 0
     for _ in range(2):
-        refine_plane(table, planes[0], _WIDE, normal, scratch, lanes)
+        refine_plane(table, planes[0], _EVIDENCE.wide, normal, scratch, lanes)
     for k in range(1, n + 1):
         plane = planes[k]
         good = True
-        for component in (_WIDE, 1.0, 1.0, _WIDE, _WIDE):
+        for component in (_EVIDENCE.wide, 1.0, 1.0, _EVIDENCE.wide, _EVIDENCE.wide):
             good = good and refine_plane(table, plane, component, normal, scratch, lanes)
         good = good and nearest <= plane[3] <= farthest and plane[1] >= MIN_FACING
         for j in range(kept + 1):
@@ -385,7 +400,7 @@ def _mark_lit_cells(
     for c in range(laser.shape[0]):
         residual = x * table[X, c] + y * table[Y, c] + z * table[Z, c] - offset
         per_px = x * table[JX, c] + y * table[JY, c] + z * table[JZ, c]
-        gate = _WIDE * _WIDE * squared_gate(per_px, offset)
+        gate = _EVIDENCE.wide * _EVIDENCE.wide * squared_gate(per_px, offset)
         near[c] = max(1.0 - residual * residual / gate, 0.0)
         if near[c] > 0.0:
             for cell in range(first_line[c] // CELL_LINES, last_line[c] // CELL_LINES + 1):
@@ -518,11 +533,6 @@ def exclusive_share(
     return on / max(total, 1e-12) * (inlier_weight / of_members)
 
 
-# Light is on a plane within the first of these shares of its distance, before it from the second
-# on; pieces of stripe this long are those of walls and fish, not the light on strands.
-_ON_PLANE, _BEFORE, _LONG_PIECE = 0.02, 0.03, 24.0
-
-
 @kernel
 def loose_share_before(
     source: IntArray,
@@ -565,8 +575,12 @@ def loose_share_before(
         intensity_weight[r] = confidence[i]
         own[r] |= members[c]
         # However it is read: one peak has a candidate for each laser.
-        bound[r] |= explained[c] or n_lines[i] >= _LONG_PIECE or abs(off) < _ON_PLANE * plane[3]
-        before[r] |= off < -_BEFORE * plane[3] and points[i, 1] > nearest
+        bound[r] |= (
+            explained[c]
+            or n_lines[i] >= _EVIDENCE.long_piece
+            or abs(off) < _EVIDENCE.on_plane * plane[3]
+        )
+        before[r] |= off < -_EVIDENCE.before * plane[3] and points[i, 1] > nearest
     of_surface, loose = 0.0, 0.0
     for r in range(last + 1):
         of_surface += intensity_weight[r] if own[r] else 0.0
@@ -604,13 +618,13 @@ def seen_of(
     most, asked, faint = 0.0, 0, 0
     for i in range(n_lasers):
         cells = np.count_nonzero(expected[i])
-        way[i] = way[i] / (CELL_LINES * cells) if cells >= _MIN_CELLS else np.nan
+        way[i] = way[i] / (CELL_LINES * cells) if cells >= _EVIDENCE.min_cells else np.nan
         if way[i] > most:
             most = way[i]
     for i in range(n_lasers):
         if way[i] == way[i]:
             asked += 1
-            faint += way[i] < _FAINT * most
+            faint += way[i] < _EVIDENCE.faint * most
     return most, faint / max(asked, 1)
 
 
@@ -637,9 +651,9 @@ def _dark_lasers(lit: BoolArray, expected: BoolArray, along_x: BoolArray) -> flo
             seen += lit[i, cell]
             of_others += there
             by_others += shown
-        if asked < _MIN_CELLS:
+        if asked < _EVIDENCE.min_cells:
             continue
-        typical = _DARK_SHARE * by_others / of_others
+        typical = _EVIDENCE.dark_share * by_others / of_others
         share = seen / asked
         if share < typical:
             dark += 1.0 - share / typical

@@ -51,19 +51,36 @@ _MAX_LINE_STEP, _MAX_STEP_PX = 2, 4.0
 _KINK_PX, _KINK_IN_WIDTHS, MIN_PEAKS = 1.0, 0.25, 5
 # Light and chroma of a stripe are summed up to its flanks, this many pixels beyond half height.
 _FLANK_PX = 2
-# Ratios of chroma to light, and differences in height of the flanks for each level, are clipped to
-# these bounds. Every red line of the photographs has at least the expected halo, however coded.
-_MAX_RATIO, _MIN_RATIO, _MAX_ACROSS, _MAX_ONE_SIDED = 1.0, -0.5, 0.6, 3.0
-_HALO_EXPECTED = 0.3
-# Pieces of more than these log odds, by the general statistics of lines, and of this share of the
-# picture's width are certain; without laser, long pieces of its colour are rare. Pieces with less
-# chroma for each level than any camera's lines, on themselves or beside them, are not certain: a
-# highlight on steel, for example.
-_CERTAIN, _CERTAIN_SHARE = 2.4, 0.08
-_CERTAIN_IF_LONG, _LONG_SHARE = 1.0, 0.2
-# Bonus in log odds of a piece that continues a line straight on: largest gap as a share of the
-# picture's width; largest deviation from its direction in pixels, and as a share of the gap.
-_HELP, _MAX_GAP, _OFF_PX, _OFF_SHARE = 2.0, 0.1, 1.5, 0.05
+
+
+class _EvidenceOptions(NamedTuple):
+    """Evidence that pieces of a picture are laser light, where no rig is known."""
+
+    # Ratios of chroma to light, and differences in height of the flanks for each level, are clipped
+    # to these bounds. Every red line of the photographs has at least the expected halo, however
+    # coded.
+    max_ratio: float = 1.0
+    min_ratio: float = -0.5
+    max_across: float = 0.6
+    max_one_sided: float = 3.0
+    halo_expected: float = 0.3
+    # Pieces of more than these log odds, by the general statistics of lines, and of this share of
+    # the picture's width are certain; without laser, long pieces of its colour are rare. Pieces
+    # with less chroma for each level than any camera's lines, on themselves or beside them, are not
+    # certain: a highlight on steel, for example.
+    certain: float = 2.4
+    certain_share: float = 0.08
+    certain_if_long: float = 1.0
+    long_share: float = 0.2
+    # Bonus in log odds of a piece that continues a line straight on: largest gap as a share of the
+    # picture's width; largest deviation from its direction in pixels, and as a share of the gap.
+    help: float = 2.0
+    max_gap: float = 0.1
+    off_px: float = 1.5
+    off_share: float = 0.05
+
+
+_EVIDENCE = _EvidenceOptions()
 
 
 class Weights(NamedTuple):
@@ -351,10 +368,13 @@ def general_evidence(table: FloatArray, width_px: int, *, has_colour: bool) -> F
     height = np.log(np.maximum(table[HEIGHT], _MIN_CONTRAST) / 20.0)
     width = np.log(200.0 * table[WIDTH] / width_px + 0.1)
     n = table.shape[1]
-    along, halo = np.full(n, RATIO_EXPECTED), np.full(n, _HALO_EXPECTED)
+    along, halo = np.full(n, RATIO_EXPECTED), np.full(n, _EVIDENCE.halo_expected)
     most, across = halo, np.zeros(n)
     if has_colour:
-        along, halo = _believed(table, ALONG, RATIO_LEAST), _believed(table, HALO, _HALO_EXPECTED)
+        along, halo = (
+            _believed(table, ALONG, RATIO_LEAST),
+            _believed(table, HALO, _EVIDENCE.halo_expected),
+        )
         most, across = np.maximum(table[ALONG], table[HALO]), table[ACROSS]
     levels = np.maximum(np.maximum(along, halo), 0.0) * table[HEIGHT]
     # More chroma for each level than this is coloured paint, or the halo of another thing; and the
@@ -371,13 +391,13 @@ def general_evidence(table: FloatArray, width_px: int, *, has_colour: bool) -> F
             height**2,
             length * height,
             width,
-            np.minimum(table[ONE_SIDED], _MAX_ONE_SIDED),
-            np.clip(halo, 0.0, _HALO_EXPECTED),
-            np.clip(halo, _MIN_RATIO, 0.0),
-            np.clip(along, _MIN_RATIO, 0.0),
+            np.minimum(table[ONE_SIDED], _EVIDENCE.max_one_sided),
+            np.clip(halo, 0.0, _EVIDENCE.halo_expected),
+            np.clip(halo, _EVIDENCE.min_ratio, 0.0),
+            np.clip(along, _EVIDENCE.min_ratio, 0.0),
             np.log1p(levels / chroma_noise),
             np.clip(np.log(np.maximum(most, 1e-3) / painted_ratio), 0.0, max_excess),
-            np.minimum(np.abs(across), _MAX_ACROSS),
+            np.minimum(np.abs(across), _EVIDENCE.max_across),
         ],
         axis=-1,
     )
@@ -385,7 +405,7 @@ def general_evidence(table: FloatArray, width_px: int, *, has_colour: bool) -> F
 
 def _believed(table: FloatArray, row: int, in_white: float) -> FloatArray:
     """Return chroma for each level (P,) of a row; a white core says nothing."""
-    ratio = np.minimum(table[row], _MAX_RATIO)
+    ratio = np.minimum(table[row], _EVIDENCE.max_ratio)
     believed: FloatArray = np.where(table[TOP] >= WHITE, np.maximum(ratio, in_white), ratio)
     return believed
 
@@ -421,14 +441,14 @@ def learn_lines(
         None where no piece is certain.
     """
     share = table[LENGTH] / width_px
-    is_certain = (log_odds > _CERTAIN) & (share >= _CERTAIN_SHARE)
-    is_certain |= (log_odds > _CERTAIN_IF_LONG) & (share >= _LONG_SHARE)
+    is_certain = (log_odds > _EVIDENCE.certain) & (share >= _EVIDENCE.certain_share)
+    is_certain |= (log_odds > _EVIDENCE.certain_if_long) & (share >= _EVIDENCE.long_share)
     if has_colour:
         is_certain &= np.minimum(table[ALONG], table[HALO]) >= RATIO_LEAST
     certain = np.flatnonzero(is_certain)
     if len(certain) == 0:
         return None
-    weight = table[LENGTH, certain] * np.clip(log_odds[certain] - _CERTAIN + 0.5, 0.5, 3.0)
+    weight = table[LENGTH, certain] * np.clip(log_odds[certain] - _EVIDENCE.certain + 0.5, 0.5, 3.0)
 
     def median(values: FloatArray) -> float:
         by_size = np.argsort(values)
@@ -457,7 +477,10 @@ def own_evidence(
     max_own = 9.0
     if has_colour:
         spread = across_spread + share_spread * np.hypot(lines.along, lines.across)
-        off_across = np.clip(table[ACROSS] - lines.across, -_MAX_ACROSS, _MAX_ACROSS) / spread
+        off_across = (
+            np.clip(table[ACROSS] - lines.across, -_EVIDENCE.max_across, _EVIDENCE.max_across)
+            / spread
+        )
     off_width = np.log(table[WIDTH]) - lines.log_width
     higher = np.maximum(np.log(table[HEIGHT]) - lines.log_height, 0.0)
     own = np.minimum(np.stack([off_across**2, off_width**2, higher], axis=-1), max_own)
@@ -530,7 +553,7 @@ def continued(table: FloatArray, log_odds: FloatArray, least: float, width_px: i
     bool array, shape (P,)
     """
     keep: BoolArray = log_odds >= least
-    waiting = np.flatnonzero(~keep & (log_odds >= least - _HELP))
+    waiting = np.flatnonzero(~keep & (log_odds >= least - _EVIDENCE.help))
     new = np.flatnonzero(keep)
     ends = _ends(table)
     while len(new) and len(waiting):
@@ -630,8 +653,8 @@ def _goes_on(segment: FloatArray, others: FloatArray, width_px: int) -> BoolArra
     along, across = off @ way, off @ np.array([-way[1], way[0]])
     # The gap is at most the length of the piece, because of the uncertainty of its direction.
     gap = np.abs(along).min(axis=1) - 0.5 * length
-    reach = min(length, _MAX_GAP * width_px)
-    allowed = _OFF_PX + _OFF_SHARE * np.maximum(gap, 0.0)
+    reach = min(length, _EVIDENCE.max_gap * width_px)
+    allowed = _EVIDENCE.off_px + _EVIDENCE.off_share * np.maximum(gap, 0.0)
     goes_on: BoolArray = np.abs(across).max(axis=1) <= allowed
     goes_on &= (gap > -0.5 * length) & (gap <= reach)
     return goes_on

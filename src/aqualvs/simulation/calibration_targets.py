@@ -6,7 +6,7 @@ a box of markers, and of a plate in the view.
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import yaml
@@ -149,10 +149,21 @@ def _centred(turn: FloatArray, middle: FloatArray, size: Size) -> SE3:
 
 
 FAMILY = "DICT_APRILTAG_36h11"
-# Pictures narrower than this get larger prints, whose markers can still be read.
-_NARROW_PX = 600
-_WALL_CELL, _PLATE_CELL = 2e-3, 1e-3
-_ALBEDO, _MOTTLE = 0.55, 0.16
+
+
+class _PrintOptions(NamedTuple):
+    """Printed targets of rendered pictures: sizes of cells in metres, and their look."""
+
+    # Pictures narrower than this get larger prints, whose markers can still be read.
+    narrow_px: int = 600
+    wall_cell: float = 2e-3
+    plate_cell: float = 1e-3
+    albedo: float = 0.55
+    mottle: float = 0.16
+
+
+_PRINTS = _PrintOptions()
+
 
 _CORNER_ORDER = (
     "as OpenCV reports: top-left, top-right, bottom-right, bottom-left of the upright marker"
@@ -192,7 +203,7 @@ class Marked:
 def hand_board(width_px: int) -> CharucoPrint:
     """Return the board that is held before the bare camera."""
     return CharucoPrint(
-        squares=(11, 8) if width_px >= _NARROW_PX else (7, 5),
+        squares=(11, 8) if width_px >= _PRINTS.narrow_px else (7, 5),
         square=24e-3,
         marker=18e-3,
         border=12e-3,
@@ -238,11 +249,11 @@ def ground(dome_from_ground: SE3, *, cell: float = 6e-3, shift: int = 0) -> Pane
 
 def marker_box(width_px: int) -> list[Marked]:
     """Return the walls of an open box, 400 x 380 x 700 mm inside, in `box`."""
-    side = 24 if width_px >= _NARROW_PX else 32
+    side = 24 if width_px >= _PRINTS.narrow_px else 32
     # Inside of the box: width, depth, height in cells of its walls.
     wide, deep, high = 200, 350, 190
-    half_wide, half_high = 0.5 * wide * _WALL_CELL, 0.5 * high * _WALL_CELL
-    depth = deep * _WALL_CELL
+    half_wide, half_high = 0.5 * wide * _PRINTS.wall_cell, 0.5 * high * _PRINTS.wall_cell
+    depth = deep * _PRINTS.wall_cell
     x, y, z = np.eye(3)
     # Name, cells across and down, top-left corner, directions across and down as seen from inside.
     walls = (
@@ -256,8 +267,10 @@ def marker_box(width_px: int) -> list[Marked]:
         places = grid_corners(*(_places(n, side) for n in cells))
         pose = SE3(np.column_stack([across, down, np.cross(across, down)]), np.array(corner))
         prints = _prints(first, places, side, side // 6)
-        albedo = mottled(cells[::-1], _ALBEDO, _MOTTLE, scale=0.8, shift=97 * k)
-        marked.append(Marked(name, Panel(pose, marker_texture(albedo, _WALL_CELL, prints)), prints))
+        albedo = mottled(cells[::-1], _PRINTS.albedo, _PRINTS.mottle, scale=0.8, shift=97 * k)
+        marked.append(
+            Marked(name, Panel(pose, marker_texture(albedo, _PRINTS.wall_cell, prints)), prints)
+        )
         first += len(places)
     return marked
 
@@ -277,7 +290,7 @@ def marker_plate() -> Marked:
     first_on_plate = 300
     prints = _prints(first_on_plate, places, side, 0)
     paper = np.full((2 * side + 3 * gap, 3 * side + 4 * gap), PAPER)
-    panel = Panel(SE3.identity(), marker_texture(paper, _PLATE_CELL, prints))
+    panel = Panel(SE3.identity(), marker_texture(paper, _PRINTS.plate_cell, prints))
     return Marked("plate", panel, prints)
 
 

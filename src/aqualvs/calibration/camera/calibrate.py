@@ -9,6 +9,7 @@ corners or uncertain intrinsics.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -160,11 +161,27 @@ def pixel_grid(size_px: tuple[int, int]) -> FloatArray:
     return np.stack([u.ravel(), v.ravel()], axis=-1)
 
 
-# One view out of this number is held out; least number of views and of corners in one for that.
-_FOLDS, _MIN_VIEWS_TO_VALIDATE, _CAMERA_MIN_POINTS = 4, 8, 12
-_MANY_OUTLIERS = 0.05
-_WEAK_PIXEL_PX = 1.0
-_THIN_COVERAGE = 0.6
+class _ValidationOptions(NamedTuple):
+    """Cross-validation over the views."""
+
+    # One view out of this number is held out; least number of views and of corners in one for that.
+    folds: int = 4
+    min_views: int = 8
+    min_points: int = 12
+
+
+_VALIDATION = _ValidationOptions()
+
+
+class _FindingLimits(NamedTuple):
+    """Limits from which on a finding is reported."""
+
+    many_outliers: float = 0.05
+    weak_pixel_px: float = 1.0
+    thin_coverage: float = 0.6
+
+
+_LIMITS = _FindingLimits()
 
 
 @dataclass(frozen=True, slots=True)
@@ -369,8 +386,10 @@ def _result(
 def _cross_validation(bundle: Bundle, solution: Solution[BundleState]) -> float:
     n = len(bundle.views)
     believed = [bundle.views[i].view.where(solution.inliers[i]) for i in range(n)]
-    held_out = [i for i in range(1, n, _FOLDS) if len(believed[i]) >= _CAMERA_MIN_POINTS]
-    if n < _MIN_VIEWS_TO_VALIDATE or not held_out:
+    held_out = [
+        i for i in range(1, n, _VALIDATION.folds) if len(believed[i]) >= _VALIDATION.min_points
+    ]
+    if n < _VALIDATION.min_views or not held_out:
         return float("nan")
     rest = [i for i in range(n) if i not in held_out]
     try:
@@ -400,7 +419,7 @@ def _findings(result: CameraCalibration) -> list[str]:
     lines += [f"left out, {name}: {why}" for name, why in result.left_out.items()]
     for fit in result.views:
         wrong = int(np.count_nonzero(~fit.inliers))
-        if wrong > _MANY_OUTLIERS * len(fit.view):
+        if wrong > _LIMITS.many_outliers * len(fit.view):
             lines.append(f"{fit.label}: {wrong} of its {len(fit.view)} corners do not fit")
     return lines + _weak_places(result)
 
@@ -438,7 +457,7 @@ def _shared_errors(result: CameraCalibration) -> list[str]:
 def _weak_places(result: CameraCalibration) -> list[str]:
     lines = []
     covered = float(np.mean(result.coverage > 0))
-    if covered < _THIN_COVERAGE:
+    if covered < _LIMITS.thin_coverage:
         lines.append(
             f"corners were seen in {100.0 * covered:.0f} % of the picture; show the board in all "
             "parts of it"
@@ -448,7 +467,7 @@ def _weak_places(result: CameraCalibration) -> list[str]:
     if not np.isfinite(sigma).all():
         lines.append("the distortion model does not reach all corners of the picture")
     worst = int(np.argmax(np.nan_to_num(sigma)))
-    if np.nan_to_num(sigma)[worst] > _WEAK_PIXEL_PX:
+    if np.nan_to_num(sigma)[worst] > _LIMITS.weak_pixel_px:
         u, v = grid[worst]
         lines.append(
             f"at pixel ({u:.0f}, {v:.0f}) the intrinsics are uncertain by {sigma[worst]:.1f} px; "

@@ -10,6 +10,7 @@ same solve finds its distance from the lens and its tilt.
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -73,11 +74,20 @@ _WORDS = {
     "rotation_y": "rotation about y",
     "rotation_z": "rotation about z",
 }
-# Ratios of sigma to the prior's sigma: from the first on nothing was learnt, below the second
-# something.
-_NOTHING, _SOMETHING = 0.9, 0.5
-_CORRELATED = 0.95
-_FAR_FROM_PRIOR = 3.5
+
+
+class _FindingLimits(NamedTuple):
+    """Limits from which on a finding is reported."""
+
+    # Ratios of sigma to the prior's sigma: from the first on nothing was learnt, below the second
+    # something.
+    nothing: float = 0.9
+    something: float = 0.5
+    correlated: float = 0.95
+    far_from_prior: float = 3.5
+
+
+_LIMITS = _FindingLimits()
 
 
 def findings(
@@ -142,8 +152,8 @@ def _rotation(problem: DomeProblem, result: DomeCalibration) -> str:
 
 def _dome(names: Sequence[str], result: DomeCalibration, seen: Observability) -> list[str]:
     lines = []
-    nothing = seen.undetermined(names, _NOTHING)
-    some = [n for n in seen.undetermined(names, _SOMETHING) if n not in nothing]
+    nothing = seen.undetermined(names, _LIMITS.nothing)
+    some = [n for n in seen.undetermined(names, _LIMITS.something) if n not in nothing]
     rest = [n for n in names if n in seen.shrinkage and n not in nothing and n not in some]
     for group, what in (
         (nothing, "not determined by the pictures, taken as given"),
@@ -200,7 +210,7 @@ def _entangled(result: DomeCalibration) -> list[str]:
     sigma = np.sqrt(np.diag(uncertainty.covariance))
     with np.errstate(divide="ignore", invalid="ignore"):
         correlation = uncertainty.covariance / np.outer(sigma, sigma)
-    worst, pair, place = _CORRELATED, None, place_names(result.rig)
+    worst, pair, place = _LIMITS.correlated, None, place_names(result.rig)
     for i, name in enumerate(uncertainty.names):
         for j, other in enumerate(uncertainty.names):
             if name in place and other not in place and abs(correlation[i, j]) > worst:
@@ -233,7 +243,7 @@ def _against_priors(problem: DomeProblem, solution: Solution[BundleState]) -> li
         f"{_WORDS.get(name, name)}: moved by {abs(value):.1f} sigma of what was known of it; check "
         "that figure"
         for name, value in off.items()
-        if abs(value) > _FAR_FROM_PRIOR
+        if abs(value) > _LIMITS.far_from_prior
     ]
 
 
@@ -250,9 +260,16 @@ def _cross_validation(found: CrossValidation | None, what: str) -> list[str]:
     return [f"{text}: the pictures do not show that there is a {what}"]
 
 
-# A view is bad if it is this many times noisier than the typical one, and noisier than this.
-_BAD_VIEW, _BAD_NOISE_PX = 5.0, 0.5
-_BAD_SHARE = 1.0 / 3.0
+class _BadViews(NamedTuple):
+    """Views that are left out, and how many may be."""
+
+    # A view is bad if it is this many times noisier than the typical one, and noisier than this.
+    times_typical: float = 5.0
+    noise_px: float = 0.5
+    max_share: float = 1.0 / 3.0
+
+
+_BAD = _BadViews()
 
 
 def dome(
@@ -342,12 +359,12 @@ def _without_bad_views(
     noise = CORNER_SIGMA_PX * np.array(solution.block_scales[:n])
     typical = noise_px(solution)
     bad = {}
-    for i in np.flatnonzero((noise > _BAD_VIEW * typical) & (noise > _BAD_NOISE_PX)):
+    for i in np.flatnonzero((noise > _BAD.times_typical * typical) & (noise > _BAD.noise_px)):
         bad[int(i)] = (
             f"its corners are {noise[i]:.2g} px off, those of other views {typical:.2g} px; wrong "
             "pose, bent board or blurred picture?"
         )
-    if not bad or len(bad) > _BAD_SHARE * n:
+    if not bad or len(bad) > _BAD.max_share * n:
         return problem, solution
     return _again(problem.without(bad), solution, [i for i in range(n) if i not in bad])
 
@@ -363,7 +380,7 @@ def _without_wrong_distances(
         wrong = _wrong_distances(free, solve(free.bundle, solution.state))
     if not wrong:
         return problem, solution
-    if len(wrong) > _BAD_SHARE * len(problem.measured_views):
+    if len(wrong) > _BAD.max_share * len(problem.measured_views):
         raise contradicted_distances(problem, solution, sets)
     reasons = {
         f"distance of {problem.shots[i].label}": (

@@ -10,6 +10,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum, auto
+from typing import NamedTuple
 
 import numpy as np
 
@@ -42,13 +43,22 @@ from aqualvs.errors import CalibrationError, RigError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.optics.rig import RigUncertainty
 
-# An index this many sigmas from the stated one contradicts it.
-_SURE = 5.0
+
+class _MediumOptions(NamedTuple):
+    """Test whether the boards were in the medium that is stated."""
+
+    # An index this many sigmas from the stated one contradicts it.
+    sure: float = 5.0
+    # Between air and water.
+    halfway: float = 1.15
+    air: float = 1.0003
+    water: float = 1.3335
+
+
+_MEDIUM = _MediumOptions()
+
 MAX_NOISE_PX = 1.0
 """Corners noisier than this indicate an error other than noise."""
-# Between air and water.
-_HALFWAY = 1.15
-_AIR, _WATER = 1.0003, 1.3335
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,13 +126,13 @@ def in_other_medium(problem: DomeProblem, medium: int) -> Solution[BundleState] 
 
 def other_medium(n: float) -> float:
     """Return the index of water for air, and of air for water."""
-    return _WATER if n < _HALFWAY else _AIR
+    return _MEDIUM.water if n < _MEDIUM.halfway else _MEDIUM.air
 
 
 def wrong_medium(one: BoardSet, index: float) -> CalibrationError:
     """Return the message on pictures that were taken in another medium than stated."""
-    crossed = (index < _HALFWAY) != (one.n_medium < _HALFWAY)
-    taken = "in air" if index < _HALFWAY else "in water"
+    crossed = (index < _MEDIUM.halfway) != (one.n_medium < _MEDIUM.halfway)
+    taken = "in air" if index < _MEDIUM.halfway else "in water"
     remedy = (
         f"were they taken {taken}?"
         if crossed
@@ -157,7 +167,7 @@ def _suspicion(
     vague = 0.03
     if near.sigma > vague or noise_px(solution) > MAX_NOISE_PX:
         return _Suspicion.OTHER
-    far = abs(near.n - one.n_medium) > _SURE * near.sigma
+    far = abs(near.n - one.n_medium) > _MEDIUM.sure * near.sigma
     return _Suspicion.NEARBY if far else _Suspicion.NONE
 
 
@@ -194,10 +204,10 @@ def _weighed_against_best(
     column = int(free.medium_columns(medium)[0])
     n, sigma = float(best.state.media[medium]), float(np.sqrt(best.covariance[column, column]))
     off = abs(n - one.n_medium)
-    sure = off > _SURE * float(np.hypot(sigma, one.sigma_medium))
+    sure = off > _MEDIUM.sure * float(np.hypot(sigma, one.sigma_medium))
     # Differences that are refused, and that are reported.
     wrong, worth_saying = 0.02, 0.003
-    if not sure or off < worth_saying or _gain(solution, best) < 0.5 * _SURE**2:
+    if not sure or off < worth_saying or _gain(solution, best) < 0.5 * _MEDIUM.sure**2:
         return []
     if off > wrong:
         raise wrong_medium(one, n)
@@ -216,9 +226,9 @@ def _weighed_against_other(
         return []
     gain = _gain(solution, rival)
     n = other_medium(one.n_medium)
-    if gain > 0.5 * _SURE**2:
+    if gain > 0.5 * _MEDIUM.sure**2:
         raise wrong_medium(one, n)
-    if gain > -0.5 * _SURE**2:
+    if gain > -0.5 * _MEDIUM.sure**2:
         return [
             f"{one.name}: the pictures do not tell n = {one.n_medium:.4f} from {n:.4f}; the lens "
             "position rests on the medium being the stated one"

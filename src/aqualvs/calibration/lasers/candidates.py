@@ -10,6 +10,7 @@ come from the pictures themselves. The number of points does not count.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import gammaln
@@ -18,12 +19,21 @@ from aqualvs.calibration.lasers.stripes_on_planes import PlacedStripes, PooledSt
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.planes import Plane
 
-# Largest tangent of the angle between a point's stripe and the line, in the image.
-_ALIGNED = 0.35
-_MIN_POINTS = 12
-_MIN_LENGTH_PX = 20.0
-_MAX_LINES = 40
-_N_GUESSES, _N_SAMPLED, _N_FITS = 800, 600, 3
+
+class _LineOptions(NamedTuple):
+    """Search for straight stripes on a surface of the target."""
+
+    # Largest tangent of the angle between a point's stripe and the line, in the image.
+    aligned: float = 0.35
+    min_points: int = 12
+    min_length_px: float = 20.0
+    max_lines: int = 40
+    n_guesses: int = 800
+    n_sampled: int = 600
+    n_fits: int = 3
+
+
+_LINES = _LineOptions()
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +72,7 @@ def lines_on_patch(pooled: PooledStripes, members: IntArray, patch: int) -> list
     placed, normal = pooled.placed, pooled.patch_planes[patch].normal
     points, across = placed.points_in_dome[members], placed.by_across[members]
     along = placed.by_along[members]
-    some = slice(None, None, -(-len(members) // _N_SAMPLED) or 1)
+    some = slice(None, None, -(-len(members) // _LINES.n_sampled) or 1)
     i, j = _pairs(pooled.chain[members], patch)
     guessed, offsets = _guesses(points, normal, i, j)
     # Most pairs are of two stripes; their directions are not that of the line through both points.
@@ -76,16 +86,16 @@ def lines_on_patch(pooled: PooledStripes, members: IntArray, patch: int) -> list
     free = np.ones(len(members), np.bool_)
     # Points this near are removed with it: the halo of a stripe is no second stripe.
     halo_px = 6.0
-    while len(lines) < _MAX_LINES and len(guessed):
+    while len(lines) < _LINES.max_lines and len(guessed):
         best = int(np.argmax(counts))
         m, c = guessed[best], float(offsets[best])
-        for _ in range(_N_FITS):
+        for _ in range(_LINES.n_fits):
             near = free & _near(points, across, along, m[None], c, tolerance_px)[:, 0]
-            if np.count_nonzero(near) < _MIN_POINTS:
+            if np.count_nonzero(near) < _LINES.min_points:
                 return lines
             m, c = _fitted(points[near], across[near], normal, m)
         near = free & _near(points, across, along, m[None], c, tolerance_px)[:, 0]
-        if _length_px(points[near], along[near]) >= _MIN_LENGTH_PX:
+        if _length_px(points[near], along[near]) >= _LINES.min_length_px:
             lines.append(StripeLine(patch, members[near]))
         taken = free & (near | _near(points, across, along, m[None], c, halo_px)[:, 0])
         free &= ~taken
@@ -99,8 +109,8 @@ def _pairs(chain: IntArray, seed: int) -> tuple[IntArray, IntArray]:
     if n < 2:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     rng = np.random.default_rng(seed)
-    i, j = rng.integers(0, n, (2, _N_GUESSES))
-    half = slice(0, _N_GUESSES // 2)
+    i, j = rng.integers(0, n, (2, _LINES.n_guesses))
+    half = slice(0, _LINES.n_guesses // 2)
     order = np.argsort(chain, kind="stable")
     first = np.searchsorted(chain[order], chain[i[half]], "left")
     last = np.searchsorted(chain[order], chain[i[half]], "right")
@@ -121,7 +131,7 @@ def _guesses(
 def _runs_along(across: FloatArray, along: FloatArray, m: FloatArray) -> BoolArray:
     """Return the mask of points (N) whose stripe runs along their line (N)."""
     gain = np.abs(np.einsum("ni,ni->n", across, m))
-    aligned: BoolArray = np.abs(np.einsum("ni,ni->n", along, m)) <= _ALIGNED * gain
+    aligned: BoolArray = np.abs(np.einsum("ni,ni->n", along, m)) <= _LINES.aligned * gain
     return aligned
 
 
@@ -136,7 +146,7 @@ def _near(
     """Return the mask (N, H) of points that are near lines and run along them."""
     gain = np.abs(across @ m.T)
     near: BoolArray = np.abs(points @ m.T - c) <= tolerance_px * gain
-    near &= np.abs(along @ m.T) <= _ALIGNED * gain
+    near &= np.abs(along @ m.T) <= _LINES.aligned * gain
     return near
 
 
@@ -165,18 +175,30 @@ def _length_px(points: FloatArray, along: FloatArray) -> float:
 # Limits within which two surfaces are the same: sine between normals, distance in metres.
 _SAME_NORMAL, _SAME_OFFSET = 0.05, 0.02
 _N_PLANE_FITS = 5
-# Prior of the rate of accidents, for when few are seen: spread of the lines in pixels, and its
-# weight as a number of observed planes. Then the shift in pixels, the number of shifts and the
-# number of pairs in the random test of how often lines meet by accident.
-_SPREAD_PX, _PRIOR_WEIGHT = 1000.0, 20.0
-_MOVED_PX, _N_MOVES, _MAX_MOVED = 250.0, 8, 1000
-# A line nearer than this share of the tolerance is no better evidence: poses are not more accurate.
-_NEAREST = 0.1
-# Accidents of a line are counted on lines of its surface of at least this share of its length.
-_AS_LONG = 0.5
-# Rounds of removing the lines of found planes from the accidents.
-_N_ROUNDS = 3
-_MAX_TRIALS = 60
+
+
+class _AccidentOptions(NamedTuple):
+    """Test of how often lines meet in a plane by accident."""
+
+    # Prior of the rate of accidents, for when few are seen: spread of the lines in pixels, and its
+    # weight as a number of observed planes. Then the shift in pixels, the number of shifts and the
+    # number of pairs in the random test of how often lines meet by accident.
+    spread_px: float = 1000.0
+    prior_weight: float = 20.0
+    moved_px: float = 250.0
+    n_moves: int = 8
+    max_moved: int = 1000
+    # A line nearer than this share of the tolerance is no better evidence: poses are not more
+    # accurate.
+    nearest: float = 0.1
+    # Accidents of a line are counted on lines of its surface of at least this share of its length.
+    as_long: float = 0.5
+    # Rounds of removing the lines of found planes from the accidents.
+    n_rounds: int = 3
+    max_trials: int = 60
+
+
+_ACCIDENTS = _AccidentOptions()
 
 
 @dataclass(frozen=True, slots=True)
@@ -324,7 +346,7 @@ def find_candidates(
     if not len(planes.pairs):
         return found
     accidental = np.zeros(len(planes.pairs), np.bool_)
-    for _ in range(_N_ROUNDS):
+    for _ in range(_ACCIDENTS.n_rounds):
         accidents = _accidents(table, planes, accidental, tolerance_px)
         found = _collected(pooled, lines, table, planes, accidents, tolerance_px)
         accidental = _accidental(len(lines), planes.pairs, found)
@@ -349,9 +371,11 @@ def _accidents(
     met = np.count_nonzero(planes.worst[accidental] <= tolerance_px, axis=0)
     # A pair's own lines are met by construction.
     met = met - np.bincount(planes.pairs[accidental].ravel(), minlength=len(table.patch))
-    prior = min(1.0, 2.0 * tolerance_px / _SPREAD_PX)
-    own_rate = (np.maximum(met, 0) + _PRIOR_WEIGHT * prior) / (n + _PRIOR_WEIGHT)
-    as_long = table.length[None] >= _AS_LONG * table.length[:, None]
+    prior = min(1.0, 2.0 * tolerance_px / _ACCIDENTS.spread_px)
+    own_rate = (np.maximum(met, 0) + _ACCIDENTS.prior_weight * prior) / (
+        n + _ACCIDENTS.prior_weight
+    )
+    as_long = table.length[None] >= _ACCIDENTS.as_long * table.length[:, None]
     rivals = (table.patch[:, None] == table.patch[None]) & as_long
     rate = np.minimum(rivals @ own_rate, 1.0)
     # One of the pairs that meet is the plane's own; the rate is the same for lines elsewhere.
@@ -372,7 +396,7 @@ def _collected(
     free = np.ones(len(lines), np.bool_)
     alive = np.ones(len(planes.pairs), np.bool_)
     nearness = _nearness(planes.worst, tolerance_px)
-    for _ in range(_MAX_TRIALS):
+    for _ in range(_ACCIDENTS.max_trials):
         alive &= np.all(free[planes.pairs], axis=1)
         alarms = _log_false_alarms(table, np.where(free, nearness, np.inf), accidents)
         alarms[~alive] = np.inf
@@ -395,7 +419,7 @@ def _collected(
 
 def _nearness(worst: FloatArray, tolerance_px: float) -> FloatArray:
     """Return distances (H, L) as a share of the tolerance; infinite beyond it."""
-    near: FloatArray = np.maximum(worst / tolerance_px, _NEAREST)
+    near: FloatArray = np.maximum(worst / tolerance_px, _ACCIDENTS.nearest)
     near[near > 1.0] = np.inf
     return near
 
@@ -417,7 +441,7 @@ def _log_false_alarms(table: LineTable, nearness: FloatArray, accidents: _Accide
     choices = gammaln(n + 1) - gammaln(k + 1) - gammaln(n - k + 1)
     alarms: FloatArray = np.log(accidents.n_planes) + choices + np.log(further).sum(axis=1)
     meeting = np.where(np.isfinite(nearness), nearness, 0.0).max(axis=1)
-    return alarms + np.where(k == 0, np.log(np.maximum(meeting, _NEAREST)), 0.0)
+    return alarms + np.where(k == 0, np.log(np.maximum(meeting, _ACCIDENTS.nearest)), 0.0)
 
 
 def _fitted_candidate(
@@ -490,10 +514,10 @@ def _meeting_rate(table: LineTable, pairs: IntArray, tolerance_px: float) -> flo
     if not len(pairs):
         return 0.0
     rng = np.random.default_rng(1)
-    some = pairs[rng.permutation(len(pairs))[:_MAX_MOVED]]
+    some = pairs[rng.permutation(len(pairs))[: _ACCIDENTS.max_moved]]
     met = 0
-    for _ in range(_N_MOVES):
-        moves = rng.uniform(-_MOVED_PX, _MOVED_PX, len(some))[:, None, None]
+    for _ in range(_ACCIDENTS.n_moves):
+        moves = rng.uniform(-_ACCIDENTS.moved_px, _ACCIDENTS.moved_px, len(some))[:, None, None]
         points = table.points[some].copy()
         points[:, 1] += moves * table.by_across[some[:, 1]]
         moved = replace(
@@ -505,7 +529,7 @@ def _meeting_rate(table: LineTable, pairs: IntArray, tolerance_px: float) -> flo
         met += int(
             np.count_nonzero(_pairs_meet(moved, own, *_planes_of_pairs(moved, own), tolerance_px))
         )
-    return (met + 1.0) / (_N_MOVES * len(some) + 1.0)
+    return (met + 1.0) / (_ACCIDENTS.n_moves * len(some) + 1.0)
 
 
 def _same_surfaces(planes: Sequence[Plane]) -> BoolArray:

@@ -9,6 +9,7 @@ plane is judged by its evidence and against the better planes: laser, no laser, 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,12 +25,22 @@ from aqualvs.calibration.lasers.stripes_on_planes import PlacedStripes, PooledSt
 from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.planes import Plane
 
-# False discovery rate of planes that are accepted as lasers (Benjamini & Hochberg 1995,
-# doi:10.1111/j.2517-6161.1995.tb02031.x); least number of points of a laser.
-_FALSE_SHARE = 1e-3
-_MIN_POINTS = 40
-# Share of points or surfaces that must agree.
-_MOST = 0.8
+
+class _AssignmentOptions(NamedTuple):
+    """Evidence that a plane is a laser's, and limits of its stripes in pixels."""
+
+    # False discovery rate of planes that are accepted as lasers (Benjamini & Hochberg 1995,
+    # doi:10.1111/j.2517-6161.1995.tb02031.x); least number of points of a laser.
+    false_share: float = 1e-3
+    min_points: int = 40
+    # Share of points or surfaces that must agree.
+    most: float = 0.8
+    # Distance from the stripe of a second laser within which its light biases a point's centre.
+    crossing_px: float = 9.0
+    n_fits: int = 5
+
+
+_SURE = _AssignmentOptions()
 
 
 class PlaneVerdict(Enum):
@@ -112,7 +123,7 @@ def judged(
 
 def _n_sure(log_alarms: FloatArray) -> int:
     """Return the number of best planes within the allowed false discovery rate."""
-    allowed = _FALSE_SHARE * np.arange(1, len(log_alarms) + 1)
+    allowed = _SURE.false_share * np.arange(1, len(log_alarms) + 1)
     good = np.flatnonzero(np.exp(np.sort(log_alarms)) <= allowed)
     return int(good[-1]) + 1 if len(good) else 0
 
@@ -126,7 +137,7 @@ def _by_target(
 ) -> list[int]:
     """Return the order of judging: planes with light on the target before those beside it."""
     beside = [
-        float(np.mean(pooled.on_target[_members(lines, c)])) < 1.0 - _MOST for c in candidates
+        float(np.mean(pooled.on_target[_members(lines, c)])) < 1.0 - _SURE.most for c in candidates
     ]
     return sorted(range(len(candidates)), key=lambda i: (beside[i], i))
 
@@ -138,7 +149,7 @@ def _fault(
     seen: Sequence[JudgedPlane],
 ) -> tuple[PlaneVerdict, str] | None:
     """Return the reason against a plane as a laser of its own, or None."""
-    if len(members) < _MIN_POINTS:
+    if len(members) < _SURE.min_points:
         return PlaneVerdict.OTHER, f"it has {len(members)} points only"
     if _is_fixed(pooled, members):
         return PlaneVerdict.DOUBTFUL, (
@@ -181,12 +192,12 @@ def _same_light(
     halo_px, torn_px = 6.0, 15.0
     if distance <= halo_px and shared:
         return PlaneVerdict.OTHER, "it is the halo of another stripe"
-    if distance <= torn_px and len(shared) <= (1.0 - _MOST) * len(mine):
+    if distance <= torn_px and len(shared) <= (1.0 - _SURE.most) * len(mine):
         return PlaneVerdict.TORN, (
             f"it is {distance:.0f} px away from a laser that is seen in other pictures"
         )
     goes_on = sum(_goes_on(pooled, members, other.members, patch) for patch in shared)
-    if len(shared) >= 2 and goes_on >= _MOST * len(mine):
+    if len(shared) >= 2 and goes_on >= _SURE.most * len(mine):
         return (
             PlaneVerdict.OTHER,
             "it begins where another stripe ends, as that laser's light does on ",
@@ -247,9 +258,6 @@ TOLERANCE_PX = 3.0
 """Greatest distance of a stripe from its plane; errors of poses add to the noise of stripes."""
 BENT_TOLERANCE_PX = 10.0
 """The same for light that may be refracted at a window, so that no plane fits well."""
-# Distance from the stripe of a second laser within which its light biases a point's centre.
-_CROSSING_PX = 9.0
-_N_FITS = 5
 # Greatest expected number of accidents of a plane that is needed for the given number of lasers,
 # and greatest length of a stripe in no plane as a multiple of its own: tuned on 24 simulated scenes
 # of one picture of a box with glints. Greatest expected number of accidents of an undecided plane.
@@ -399,11 +407,11 @@ def _share_of_chains(pooled: PooledStripes, line: StripeLine, n_of_chain: IntArr
 
 def _refined(pooled: PooledStripes, planes: list[Plane], tolerance_px: float) -> list[Plane]:
     """Fit planes to all points near them and near no other."""
-    for _ in range(_N_FITS):
+    for _ in range(_SURE.n_fits):
         laser = assigned(pooled, planes, tolerance_px)
         planes = [
             fitted_plane(pooled.placed, np.flatnonzero(laser == i), plane)
-            if np.count_nonzero(laser == i) >= _MIN_POINTS
+            if np.count_nonzero(laser == i) >= _SURE.min_points
             else plane
             for i, plane in enumerate(planes)
         ]
@@ -420,7 +428,7 @@ def assigned(
     residuals = np.abs(plane_residuals_px(pooled.placed, planes))
     nearest = np.argmin(residuals, axis=1)
     clear = residuals[np.arange(n), nearest] <= tolerance_px
-    clear &= np.count_nonzero(_crossed_px(pooled.placed, planes) <= _CROSSING_PX, axis=1) <= 1
+    clear &= np.count_nonzero(_crossed_px(pooled.placed, planes) <= _SURE.crossing_px, axis=1) <= 1
     laser: IntArray = np.where(clear, nearest, -1)
     return laser
 
@@ -440,6 +448,6 @@ def _unmatched(lines: Sequence[StripeLine], laser: IntArray) -> tuple[StripeLine
     free = [
         line
         for line in lines
-        if len(line.members) >= _MIN_POINTS and np.mean(laser[line.members] >= 0) < 0.2
+        if len(line.members) >= _SURE.min_points and np.mean(laser[line.members] >= 0) < 0.2
     ]
     return tuple(sorted(free, key=lambda line: -len(line.members)))

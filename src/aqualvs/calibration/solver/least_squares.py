@@ -12,7 +12,7 @@ import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from scipy.stats import chi2
@@ -310,10 +310,23 @@ __all__ = [
     "solve",
 ]
 
-_DAMPING_START, _DAMPING_LEAST, _DAMPING_LIMIT, _FREE = 1e-4, 1e-12, 1e10, 1e-3
-# Convergence: steps shorter than this, in sigmas, or a relative decrease of the cost below
-# rounding. The noise can be estimated before that.
-_SMALL_STEP, _SMALL_FALL, _NEAR = 2e-2, 1e-10, 0.5
+
+class _DescentOptions(NamedTuple):
+    """Damping of the steps (Levenberg-Marquardt), and convergence."""
+
+    damping_start: float = 1e-4
+    damping_least: float = 1e-12
+    damping_limit: float = 1e10
+    free: float = 1e-3
+    # Convergence: steps shorter than this, in sigmas, or a relative decrease of the cost below
+    # rounding. The noise can be estimated before that.
+    small_step: float = 2e-2
+    small_fall: float = 1e-10
+    near: float = 0.5
+
+
+_DESCENT = _DescentOptions()
+
 
 State = TypeVar("State")
 
@@ -428,13 +441,13 @@ def solve(
 
 
 def _solved(run: "_Run[State]") -> Solution[State]:
-    run.descend(_NEAR)
+    run.descend(_DESCENT.near)
     max_rounds = 20
     for _ in range(max_rounds):
         if not run.rescale():
             break
-        run.descend(_NEAR)
-    run.descend(_SMALL_STEP)
+        run.descend(_DESCENT.near)
+    run.descend(_DESCENT.small_step)
     return run.solution()
 
 
@@ -483,7 +496,7 @@ class _Run(Generic[State]):
     inliers: list[BoolArray] = field(default_factory=list)
     scales: list[float] = field(default_factory=list)
     typical: dict[str, float] = field(default_factory=dict)
-    damping: float = _DAMPING_START
+    damping: float = _DESCENT.damping_start
     converged: bool = False
     n_iterations: int = 0
 
@@ -507,9 +520,9 @@ class _Run(Generic[State]):
             equations = self._equations()
             there, step = self._lower(equations, here)
             in_sigmas = float(np.sqrt(step @ equations.information @ step))
-            little = here - there <= _SMALL_FALL * here and in_sigmas < 1.0
+            little = here - there <= _DESCENT.small_fall * here and in_sigmas < 1.0
             # A damped step is always short: it is no sign of convergence.
-            free = self.damping <= _FREE
+            free = self.damping <= _DESCENT.free
             self.converged = free and (in_sigmas < small_step or little)
             here = there
 
@@ -546,18 +559,18 @@ class _Run(Generic[State]):
     def _lower(self, equations: NormalEquations, here: float) -> tuple[float, FloatArray]:
         """Take the longest step that lowers the cost; return the cost there and the step."""
         diagonal = np.diag(equations.information)
-        while self.damping < _DAMPING_LIMIT:
+        while self.damping < _DESCENT.damping_limit:
             self.n_iterations += 1
             damped = equations.information + np.diag(self.damping * diagonal)
             step = _solve(damped, -equations.gradient)
             trial = self._try(step)
             if trial is not None and trial[2] <= here:
                 self.state, self.blocks, there = trial
-                self.damping = max(self.damping * 0.1, _DAMPING_LEAST)
+                self.damping = max(self.damping * 0.1, _DESCENT.damping_least)
                 return there, step
             self.damping *= 10.0
         # No decrease beyond rounding: the remaining gradient means nothing.
-        self.damping = _DAMPING_START
+        self.damping = _DESCENT.damping_start
         return here, np.zeros(self.problem.n_parameters)
 
     def _try(self, step: FloatArray) -> tuple[State, tuple[Block, ...], float] | None:
