@@ -27,6 +27,8 @@ from aqualvs.errors import AqualvsError
 _SLOW = frozenset(
     {"bench_batch", "bench_control", "bench_live", "bench_net_condition", "bench_nets"}
 )
+# Dives that tests make as well.
+sys.path.append(str(Path(__file__).parents[1] / "tests" / "helpers"))
 # Columns, where the output is no terminal that says how wide it is.
 _WIDTH = 120
 # Ratios of the same code wander by so much from run to run.

@@ -21,9 +21,8 @@ from typing import Any
 
 import av
 
-from aqualvs.batch.cluster import DaskWorkers, FinishedTask
 from aqualvs.batch.parts import PieceResult
-from aqualvs.batch.scheduler import Scheduler, Steps
+from aqualvs.batch.scheduler import DaskWorkers, FinishedTask, Scheduler, Steps
 from aqualvs.batch.work import PIECE_FRAMES, DiveProbe, DiveWork
 from aqualvs.demo import bundled_dive
 from aqualvs.results.run_request import RunRequest
@@ -108,7 +107,7 @@ def work_in(folder: Path, source: Path, rig: Path, name: str = "dive") -> DiveWo
 
 def make_dive(path: Path, n_frames: int) -> Path:
     """The bundled dive to and fro, with a key frame every two seconds."""
-    with av.open(str(bundled_dive() / "dive.mp4")) as old:  # type: ignore[arg-type]
+    with av.open(str(bundled_dive() / "dive.mp4")) as old:
         pictures = list(old.decode(video=0))
     order = [*pictures, *pictures[::-1]][:n_frames]
     with av.open(str(path), "w") as new:
@@ -162,7 +161,7 @@ def simulated_s(costs: dict[str, float], n_workers: int, n_dives: int) -> float:
 def run_scheduler(workers: Any, n_dives: int) -> None:
     nowhere = Path("nowhere")
     works = [(work_in(nowhere, nowhere, nowhere, f"dive{i}"), 1) for i in range(n_dives)]
-    Scheduler(works, workers, Unwatched(), Steps(look, measure, join)).run(lambda: False)  # type: ignore[arg-type]
+    Scheduler(works, workers, Unwatched(), Steps(look, measure, join)).run(lambda: False)
 
 
 def overhead_s(n_dives: int) -> float:

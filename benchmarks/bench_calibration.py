@@ -17,8 +17,7 @@ from scipy.optimize import least_squares
 
 from aqualvs.calibration.dome.calibrate import dome
 from aqualvs.calibration.dome.problem import BoardSet, DomeOptions, DomeProblem, dome_problem
-from aqualvs.calibration.solver.bundle import BundleState
-from aqualvs.calibration.solver.priors import PRIORS
+from aqualvs.calibration.solver.bundle import PRIORS, BundleState
 from aqualvs.calibration.targets.targets import View
 from aqualvs.errors import RigError
 from aqualvs.geometry.arrays import FloatArray

@@ -25,6 +25,7 @@ from aqualvs.live.command import SWITCH_S
 from aqualvs.live.dashboard.access import Access, Controls, NoRecorder
 from aqualvs.live.dashboard.output import Dashboard
 from aqualvs.live.dashboard.server import DashboardServer
+from aqualvs.live.outputs.base import Output
 from aqualvs.live.outputs.mavlink import MavlinkOutput
 from aqualvs.live.runner import FixedScanner, LiveRunner, warm_up
 from aqualvs.optics.rig import Rig
@@ -139,7 +140,7 @@ def measure(rig: Rig, dive: Path) -> tuple[Clock, list[float]]:
     server = DashboardServer("127.0.0.1", 0, Access("127.0.0.1", "unused"), rig, controls)
     clock = Clock()
     with script(_PEER) as peer, script(_WATCHER, str(server.port)) as viewer:
-        outputs = [
+        outputs: list[Output] = [
             MavlinkOutput(f"udpout:127.0.0.1:{line_of(peer)}"),
             clock,
             Dashboard(server, controls),

@@ -13,17 +13,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from tests.helpers.net_cases import NetCamera
-from tests.helpers.net_dives import (
-    Dive,
-    long_dive,
-    passed_holes,
-    random_dive,
-    scans_of,
-    shown_holes,
-    true_solidity,
-)
-from tests.helpers.quick_pictures import quick_scans
 
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.nets.condition import NetCondition, NetStretch
@@ -32,6 +21,17 @@ from aqualvs.optics.rig import Rig
 from aqualvs.scanning.scan import Scan
 from aqualvs.simulation.scenarios import Difficulty, bluerov2_rig, example_rig
 from aqualvs.simulation.scene import Net
+from net_cases import NetCamera
+from net_dives import (
+    Dive,
+    long_dive,
+    passed_holes,
+    random_dive,
+    scans_of,
+    shown_holes,
+    true_solidity,
+)
+from quick_pictures import quick_scans
 
 SERIES = 2031
 # Of rendered dives: difficulty; whether there is a hole, a compressed video, another rig.

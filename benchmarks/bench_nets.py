@@ -20,8 +20,7 @@ from aqualvs.scanning.laser_bands import plan_bands, search_range
 from aqualvs.scanning.posture_estimator import FitMethod, PostureEstimator
 from aqualvs.scanning.scan import Frame, planes_of_image
 from aqualvs.scanning.stripe import StripeOptions
-from aqualvs.scanning.surfaces import find_surfaces
-from aqualvs.scanning.target import TargetKind, choose_target
+from aqualvs.scanning.surfaces import TargetKind, choose_target, find_surfaces
 from aqualvs.scanning.triangulate import Triangulator
 from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenarios import Difficulty, example_rig, random_scene

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.optics.camera import HousedCamera
+from aqualvs.optics.dome import Dome
 from aqualvs.optics.rig import Rig
 from aqualvs.scanner import Scanner
 from aqualvs.scanning.candidates import Subsegments, find_candidates
@@ -30,8 +31,7 @@ from aqualvs.scanning.posture import range_pitch_yaw
 from aqualvs.scanning.posture_estimator import FitMethod, PostureEstimator
 from aqualvs.scanning.scan import Frame
 from aqualvs.scanning.stripe import StripeOptions
-from aqualvs.scanning.surfaces import find_surfaces
-from aqualvs.scanning.target import TargetKind, choose_target
+from aqualvs.scanning.surfaces import TargetKind, choose_target, find_surfaces
 from aqualvs.scanning.triangulate import Triangulator
 from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenarios import bluerov2_rig, example_rig, load_scenario
@@ -131,6 +131,7 @@ def plain_points(rig: Rig, pixels: list[FloatArray]) -> FloatArray:
     camera = rig.camera()
     assert isinstance(camera, HousedCamera)
     lens, dome = camera.lens, camera.housing
+    assert isinstance(dome, Dome)
     matrix = np.array([[lens.fx, 0.0, lens.cx], [0.0, lens.fy, lens.cy], [0.0, 0.0, 1.0]])
     points = []
     for laser, at in zip(rig.lasers, pixels, strict=True):
@@ -156,7 +157,8 @@ def plain_points(rig: Rig, pixels: list[FloatArray]) -> FloatArray:
 
 
 def plain_fit(points: FloatArray) -> tuple[float, float, float]:
-    return range_pitch_yaw(np.linalg.lstsq(points, np.ones(len(points)))[0])
+    m = np.linalg.lstsq(points, np.ones(len(points)))[0]
+    return range_pitch_yaw(m.astype(np.float64, copy=False))
 
 
 def plain_scan(case: Case) -> tuple[float, float, float]:

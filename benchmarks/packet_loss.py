@@ -220,7 +220,7 @@ def decode(codec: Any, units: list[bytes], i: int) -> VideoFrame | None:
 def writable(picture: VideoFrame) -> list[ImagePlane]:
     """Return the planes of a picture, in the memory from which the decoder predicts."""
     return [
-        np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)[: plane.height, : plane.width]
+        np.asarray(memoryview(plane)).reshape(-1, plane.line_size)[: plane.height, : plane.width]
         for plane in picture.planes
     ]
 
@@ -284,7 +284,7 @@ def with_damage(
 
 def grown(mask: np.ndarray) -> np.ndarray:
     size = 2 * NEAR_PX + 1
-    return cv2.dilate(mask.astype(np.uint8), np.ones((size, size), np.uint8))
+    return np.asarray(cv2.dilate(mask.astype(np.uint8), np.ones((size, size), np.uint8)))
 
 
 def intact_posture(scanner: Scanner, frame: Frame, damage: np.ndarray) -> Posture | Refusal:

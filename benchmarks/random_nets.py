@@ -20,7 +20,7 @@ import numpy as np
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.scanner import Scanner
 from aqualvs.scanning.posture import Posture
-from aqualvs.scanning.scan import Frame, planes_of_image
+from aqualvs.scanning.scan import Frame, ImagePlane, planes_of_image
 from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenarios import Difficulty, example_rig, random_scene
 from aqualvs.simulation.scene import SurfaceKind
@@ -34,7 +34,7 @@ _WRONG_SHARE = 0.05
 class Shot(NamedTuple):
     """A picture of a random scene and the plane of its net (n, d); NaN where little is seen."""
 
-    index: int
+    number: int
     frame: Frame
     plane: FloatArray
 
@@ -55,10 +55,14 @@ def shots(n: int, first: int, folder: Path | None) -> Iterator[Shot]:
         yield Shot(index, Frame(0, 0.0, luma, (u, v)), plane)
 
 
-def _render(renderer: Renderer, index: int) -> tuple[FloatArray, ...]:
+def _render(
+    renderer: Renderer, index: int
+) -> tuple[ImagePlane, ImagePlane, ImagePlane, FloatArray]:
     scene = random_scene(np.random.default_rng([2023, index]), DIFFICULTIES[index % 3])
     picture = renderer.render(scene, 0.0, np.random.default_rng([7, index]))
-    luma, chroma = planes_of_image(cv2.cvtColor(picture.image, cv2.COLOR_RGB2BGR))
+    bgr = cv2.cvtColor(picture.image, cv2.COLOR_RGB2BGR).astype(np.uint8, copy=False)
+    luma, chroma = planes_of_image(bgr)
+    assert chroma is not None
     seen = visible_fit(picture.lit, SurfaceKind.NET)
     plane = np.full(4, np.nan) if seen is None else np.append(seen[0].normal, seen[0].offset)
     return luma, *chroma, plane
@@ -89,9 +93,9 @@ def main() -> None:
         n_seen += 1
         posture = scanner.process(shot.frame).posture
         if isinstance(posture, Posture):
-            found.append([shot.index, *_errors(posture, shot.plane)])
+            found.append([shot.number, *_errors(posture, shot.plane)])
         else:
-            refused.append(f"{shot.index} {posture.reason}")
+            refused.append(f"{shot.number} {posture.reason}")
     table = np.array(found)
     wrong = table[np.abs(table[:, 1]) > _WRONG_SHARE, 0].astype(int).tolist()
     print(f"{n_seen} nets seen, {len(table)} valid ({100 * len(table) / n_seen:.1f} %)")

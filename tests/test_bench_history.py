@@ -1,5 +1,6 @@
 """The history of benchmarks: what is kept, what is compared, what is said."""
 
+import importlib
 import json
 import subprocess
 import sys
@@ -132,7 +133,7 @@ def benchmarks(monkeypatch: pytest.MonkeyPatch) -> dict[str, ModuleType]:
     """Stand-ins for the benchmarks, by name; those added here are what is run."""
     made: dict[str, ModuleType] = {}
     monkeypatch.setattr(command, "names", lambda words, **_: [n for n in made if words])
-    monkeypatch.setattr(command.importlib, "import_module", lambda n: made[n.split(".")[1]])
+    monkeypatch.setattr(importlib, "import_module", lambda n: made[n.split(".")[1]])
     return made
 
 

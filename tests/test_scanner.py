@@ -15,11 +15,12 @@ from aqualvs.scanner import Scanner, ScannerOptions
 from aqualvs.scanning import posture_estimator
 from aqualvs.scanning.laser_bands import SearchAxis
 from aqualvs.scanning.paper.mesh_filter import MeshFilterOptions
+from aqualvs.scanning.plane_fit import TWINE_ERROR_PX
 from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.posture_estimator import FitMethod
 from aqualvs.scanning.scan import Frame, Label, Scan, planes_of_image
 from aqualvs.scanning.stripe import ThresholdOptions
-from aqualvs.scanning.target import TargetKind
+from aqualvs.scanning.surfaces import TargetKind
 from aqualvs.simulation.scenarios import bluerov2_rig, example_rig
 from scanning_cases import peaks_of
 from scanning_cases import strands as broken
@@ -387,7 +388,7 @@ def test_an_error_that_all_strands_share_is_in_the_sigma_of_the_range(
 ) -> None:
     rig, variances = example_rig(), []
     peaks = peaks_of(rig, [(plane(0.5), broken)], 0.05)
-    for twine_px in (posture_estimator.TWINE_ERROR_PX, 0.0):
+    for twine_px in (TWINE_ERROR_PX, 0.0):
         monkeypatch.setattr(posture_estimator, "TWINE_ERROR_PX", twine_px)
         found = Scanner(rig).measure(0, 0.0, peaks).posture
         assert isinstance(found, Posture)

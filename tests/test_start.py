@@ -10,8 +10,7 @@ from rich.progress import Progress
 
 from aqualvs.cli.command import importing
 from aqualvs.demo import bundled_dive
-from aqualvs.terminal import FIRST_RUN, hidden_progress, progress
-from aqualvs.terminal_bar import Rate
+from aqualvs.terminal import FIRST_RUN, hidden_progress, progress, rate_text
 
 # SciPy's linear algebra is missing here, because compiling a kernel for the first time imports it.
 NOT_FOR_A_RUN = {
@@ -74,7 +73,7 @@ def test_no_rate_reads_0(n_done: int, seconds: int, rate: str) -> None:
     task = bar.add_task("dive", total=1000)
     now = float(seconds)
     bar.update(task, advance=n_done)
-    assert Rate("frames").render(bar.tasks[0]).plain == rate
+    assert rate_text(bar.tasks[0], "frames") == rate
 
 
 def test_garbage_is_looked_for_again_after_importing() -> None:

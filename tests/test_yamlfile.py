@@ -15,7 +15,7 @@ from aqualvs.control.gains_file import load_gains
 from aqualvs.control.plan import load_plan
 from aqualvs.design.file import load_design
 from aqualvs.errors import AqualvsError, RigError
-from aqualvs.experiments.benchmark.set import SET_FILE, load_set
+from aqualvs.experiments.benchmark_set import SET_FILE, load_set
 from aqualvs.nets.target_file import target_dict
 from aqualvs.optics.rigfile import load_rig
 from aqualvs.report.run_data import read_run_file

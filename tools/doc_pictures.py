@@ -29,8 +29,8 @@ def make(folder: Path) -> None:
     """Make all pictures from what the commands write into a folder."""
     # Pages show the names of their sources.
     dive, rig = Path("dive.mp4"), Path("rig.yaml")
-    for name in (dive, rig):
-        shutil.copy(str(bundled_dive() / str(name)), folder)
+    for given in (dive, rig):
+        shutil.copy(str(bundled_dive() / str(given)), folder)
     run = folder / "run"
     _command("run", dive, "--rig", rig, "--overlay", "--net", "-o", run)
     _command("figures", run)

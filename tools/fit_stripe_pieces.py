@@ -17,7 +17,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -103,12 +102,13 @@ def samples(folder: Path, formats: list[str]) -> Iterator[Sample]:
     paths = [*sorted(folder.glob("*/*")), *sorted(WALL.glob("*.jpg"))]
     for path in (p for p in paths if p.suffix in (".png", ".jpg")):
         name = f"{path.parent.name}/{path.name}"
-        image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+        image = real_lines.read_image(path)
         if path.parent == WALL:
             image = np.ascontiguousarray(image[:, :WITHOUT_LINE_PX])
         lines = None
         if "-b-" in name:
-            row = real_lines.pair_line(cv2.imread(str(path).replace("-b-", "-a-")), image)
+            off = real_lines.read_image(Path(str(path).replace("-b-", "-a-")))
+            row = real_lines.pair_line(off, image)
             column = np.flatnonzero(np.isfinite(row))
             lines = np.stack([column, row[column]], axis=-1)
         elif name in traced:
@@ -121,7 +121,9 @@ def samples(folder: Path, formats: list[str]) -> Iterator[Sample]:
                 yield _sample(name, fmt, given, nm, lines)
 
 
-def _sample(name: str, fmt: str, given: object, nm: float, lines: Array | None) -> Sample:
+def _sample(
+    name: str, fmt: str, given: real_lines.Image | Frame, nm: float, lines: Array | None
+) -> Sample:
     frame = given if isinstance(given, Frame) else Frame(0, 0.0, *planes_of_image(given))
     found = find_all_segments(frame, real_lines.options_for(nm))
     table = np.concatenate([segments.table for segments in found], axis=1)
@@ -134,7 +136,8 @@ def _sample(name: str, fmt: str, given: object, nm: float, lines: Array | None) 
             points = np.stack([line, segments.peaks.position[segments.order]], axis=-1)
             if segments.search.axis is SearchAxis.ALONG_X:
                 points = points[:, ::-1]
-            near = cKDTree(lines).query(points)[0] <= (NEAR_WIDE_PX if dark else NEAR_PX)
+            distance = np.asarray(cKDTree(lines).query(points)[0])
+            near = distance <= (NEAR_WIDE_PX if dark else NEAR_PX)
             first, n = segments.start[:-1], np.diff(segments.start)
             share.append(np.add.reduceat(near.astype(float), first) / n)
             middle.append(np.add.reduceat(points, first) / n[:, None])
@@ -160,7 +163,7 @@ def logistic(evidence: Array, is_line: Array, weight: Array) -> Array:
         found += np.clip(np.linalg.solve(curved, slope), -2.0, 2.0)
     found = found / spread
     found[0] -= (found * mean)[1:].sum()
-    return found
+    return np.asarray(found)
 
 
 def _rows(sample: Sample, evidence: Callable[[Array], Array]) -> tuple[Array, Array, Array]:
@@ -211,7 +214,9 @@ def is_first_half(name: str) -> bool:
 
 def report(weights: Weights, folder: Path, formats: list[str], *, first_half: bool) -> None:
     """Print what weights find in the pictures of one half."""
-    line_log_odds.__kwdefaults__["weights"] = weights
+    defaults = line_log_odds.__kwdefaults__
+    assert defaults is not None
+    defaults["weights"] = weights
     scores = [
         score
         for shot in real_lines.shots(folder, formats, lambda n: is_first_half(n) == first_half)

@@ -92,8 +92,15 @@ def options_for(wavelength_nm: float) -> UncalibratedStripeOptions:
     """Return options for a colour, where this version of the package knows colours."""
     names = {field.name for field in dataclasses.fields(UncalibratedStripeOptions)}
     if "wavelength_nm" in names:
-        return UncalibratedStripeOptions(wavelength_nm=wavelength_nm)  # type: ignore[arg-type]
+        return UncalibratedStripeOptions(wavelength_nm=wavelength_nm)
     return UncalibratedStripeOptions()
+
+
+def read_image(path: Path) -> Image:
+    """Return a picture (height, width, 3) as BGR."""
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    assert image is not None, path
+    return np.asarray(image, np.uint8)
 
 
 def encoded(image: Image, fmt: str) -> Image | Frame:
@@ -102,7 +109,9 @@ def encoded(image: Image, fmt: str) -> Image | Frame:
         return image
     if fmt.startswith("jpg"):
         quality = [cv2.IMWRITE_JPEG_QUALITY, int(fmt.removeprefix("jpg"))]
-        return cv2.imdecode(cv2.imencode(".jpg", image, quality)[1], cv2.IMREAD_COLOR)
+        read = cv2.imdecode(cv2.imencode(".jpg", image, quality)[1], cv2.IMREAD_COLOR)
+        assert read is not None
+        return np.asarray(read, np.uint8)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "picture.mp4"
         _write_video(image, path, int(fmt.removeprefix("crf")))
@@ -155,7 +164,7 @@ def near(
     clear[at[:, 1], at[:, 0]] = 0
     distance = cv2.distanceTransform(clear, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     at = np.clip(np.rint(points * scale), 0, np.array(size[::-1]) * scale - 1).astype(int)
-    return distance[at[:, 1], at[:, 0]] <= distance_px * scale
+    return np.asarray(distance[at[:, 1], at[:, 0]] <= distance_px * scale)
 
 
 def score_lines(
@@ -204,11 +213,11 @@ def pair_line(off: Image, on: Image) -> Array:
     return line
 
 
-def _high(difference: Array) -> Array:
+def _high(difference: NDArray[np.floating]) -> NDArray[np.floating]:
     """Return a difference (height, width) without what is wider than a line."""
     padded = np.pad(difference, ((15, 15), (0, 0)), mode="edge")
     windows = np.lib.stride_tricks.sliding_window_view(padded, 31, axis=0)
-    return difference - np.median(windows, axis=-1)
+    return np.asarray(difference - np.median(windows, axis=-1))
 
 
 def score_pair(name: str, fmt: str, found: Array, line: Array) -> Score:
@@ -243,12 +252,12 @@ def shots(
         name = f"{path.parent.name}/{path.name}"
         if not wanted(name):
             continue
-        image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+        image = read_image(path)
         red = path.parent.name.startswith("red")
         is_on = name in traced or "-b-" in path.name
         line = None
         if "-b-" in path.name:
-            off = cv2.imread(str(path).replace("-b-", "-a-"), cv2.IMREAD_COLOR)
+            off = read_image(Path(str(path).replace("-b-", "-a-")))
             line = pair_line(off, image)
         for fmt in formats:
             given = encoded(image, fmt)

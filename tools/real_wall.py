@@ -117,7 +117,7 @@ def rig_text(crop: tuple[int, int, int, int] = (0, 0, *SIZE_PX)) -> str:
 
 def intrinsics(crop: tuple[int, int, int, int] = (0, 0, *SIZE_PX)) -> np.ndarray:
     """Return the camera matrix (3, 3) of pictures cropped to x, y, width, height."""
-    return K - np.array([[0.0, 0.0, crop[0]], [0.0, 0.0, crop[1]], [0.0, 0.0, 0.0]])
+    return np.asarray(K - np.array([[0.0, 0.0, crop[0]], [0.0, 0.0, crop[1]], [0.0, 0.0, 0.0]]))
 
 
 def board_text() -> str:
@@ -217,7 +217,7 @@ def calibrate(
     (folder / "board.yaml").write_text(board_text())
     made = folder / "rig.yaml"
     made.unlink(missing_ok=True)
-    arguments = ["calibrate", "lasers", *others, "--board", folder / "board.yaml"]
+    arguments: list[str | Path] = ["calibrate", "lasers", *others, "--board", folder / "board.yaml"]
     arguments += ["--rig", folder / "rig0.yaml", "-o", made, "--medium", "air"]
     arguments += [] if n_lasers is None else ["--lasers", str(n_lasers)]
     return made if call(arguments, folder / "calibrate.txt") == 0 else None
@@ -226,7 +226,8 @@ def calibrate(
 def measure(source: Path, rig: Path, out: Path, more: Sequence[str] = ()) -> list[dict[str, str]]:
     """Run a source; return the rows of its `posture.csv`."""
     shutil.rmtree(out, ignore_errors=True)
-    arguments = ["run", source, "--rig", rig, "-o", out, "--no-report", "--workers", "1", *more]
+    arguments: list[str | Path] = ["run", source, "--rig", rig, "-o", out]
+    arguments += ["--no-report", "--workers", "1", *more]
     code = call(arguments, out.with_suffix(".txt"))
     table = out / "posture.csv"
     if not table.exists():
@@ -257,19 +258,21 @@ def compare(picture: str, fmt: str, rows: list[dict[str, str]], board: BoardPose
     flat = (board.flat_range_m, board.flat_pitch_deg, board.flat_yaw_deg)
     scores = [e / math.hypot(s, f) for e, s, f in zip(errors, sigmas, flat, strict=True)]
     return FrameResult(
-        picture,
-        fmt,
-        "",
-        board.range_m,
-        1e3 * errors[0],
-        errors[1],
-        errors[2],
-        int(row["n_points"]),
-        1e3 * sigmas[0],
-        sigmas[1],
-        sigmas[2],
-        *scores,
-        errors[0] / math.hypot(sigmas[0], FLATNESS_M),
+        picture=picture,
+        format=fmt,
+        reason="",
+        board_range_m=board.range_m,
+        range_error_mm=1e3 * errors[0],
+        pitch_error_deg=errors[1],
+        yaw_error_deg=errors[2],
+        n_points=int(row["n_points"]),
+        sigma_range_mm=1e3 * sigmas[0],
+        sigma_pitch_deg=sigmas[1],
+        sigma_yaw_deg=sigmas[2],
+        range_score=scores[0],
+        pitch_score=scores[1],
+        yaw_score=scores[2],
+        range_score_at_board=errors[0] / math.hypot(sigmas[0], FLATNESS_M),
     )
 
 
@@ -316,6 +319,7 @@ def leave_one_out(
         if pictures and path.stem not in pictures:
             continue
         image = cv2.imread(str(path))
+        assert image is not None, path
         folder = work / mode_name(n_lasers) / path.stem
         rig: Path | None = folder / "rig.yaml"
         if recalibrate or not (folder / "rig.yaml").exists():
@@ -341,7 +345,9 @@ def sheet(
     tiles = []
     x0, y0, x1, y1 = _TILE
     for m in results:
-        image = cv2.imread(str(samples / f"{m.picture}.png"))[y0:y1, x0:x1]
+        whole = cv2.imread(str(samples / f"{m.picture}.png"))
+        assert whole is not None
+        image = whole[y0:y1, x0:x1]
         scale = _TILE_PX / image.shape[1]
         tile = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
         table = work / m.picture / m.format / "points.parquet"

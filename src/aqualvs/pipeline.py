@@ -23,8 +23,7 @@ from aqualvs.sources.video import sampled_pictures
 from aqualvs.terminal import StopSignals, progress
 from aqualvs.workers.frame_results import FrameScanner
 from aqualvs.workers.pool import PoolJob, pool_job
-from aqualvs.workers.run_frames import DiveProcessor, Replay, replay_of
-from aqualvs.workers.water_index import WaterFollowingScanner
+from aqualvs.workers.run_frames import DiveProcessor, Replay, WaterFollowingScanner, replay_of
 
 ScannerFor = Callable[[Rig, ScannerOptions], FrameScanner]
 """Constructor of a scanner."""

@@ -53,8 +53,7 @@ from aqualvs.sources.base import bgr_of
 from aqualvs.special_files import refuse_special
 from aqualvs.terminal import StopSignals, Tick
 from aqualvs.workers.frame_results import FrameResult, FrameScanner
-from aqualvs.workers.run_frames import Replay
-from aqualvs.workers.water_index import WaterFollowingScanner
+from aqualvs.workers.run_frames import Replay, WaterFollowingScanner
 
 if TYPE_CHECKING:
     from aqualvs.recording import Recording
@@ -276,9 +275,6 @@ def _measured(scanner: FrameScanner, frame: Frame) -> FrameOutput:
     return scanner.rig, scanner.measure(frame.index, frame.time_s, peaks), peaks
 
 
-_FPS_WITHOUT_CLOCK = 25.0
-
-
 class RunOverlay(Closing):
     """Writer of `overlay.mp4` during a run, or of nothing; a context manager.
 
@@ -301,8 +297,9 @@ class RunOverlay(Closing):
         self._path = folder / OVERLAY_MP4
         self._rig = rig
         self._writer: OverlayWriter | None = None
+        fps_without_clock = 25.0
         if wanted:
-            fps = source.fps or _FPS_WITHOUT_CLOCK
+            fps = source.fps or fps_without_clock
             self._writer = OverlayWriter(self._path, source.size_px, fps)
 
     def write(self, frame: Frame | None, scan: Scan) -> None:

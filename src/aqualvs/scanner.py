@@ -11,7 +11,6 @@ from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.rig_covariance import FittedSurface, PostureErrors, fitted_plane
 from aqualvs.optics.shutter import Field
-from aqualvs.optics.solved import completed_uncertainty
 from aqualvs.scanning.assignment import NOT_TESTED, AssignmentTest, Verdict, inflate_for_rival
 from aqualvs.scanning.candidates import Candidates, Subsegments, find_candidates
 from aqualvs.scanning.detection import DetectorOptions, FrameDetector
@@ -26,11 +25,13 @@ from aqualvs.scanning.stripe import StripeOptions, StripePeaks
 from aqualvs.scanning.surfaces import (
     MIN_LINES_PER_LASER,
     Surface,
+    TargetKind,
+    as_requested_kind,
+    choose_target,
     find_surfaces,
     shares_peaks,
     surface_on,
 )
-from aqualvs.scanning.target import TargetKind, as_requested_kind, choose_target
 from aqualvs.scanning.triangulate import Triangulator
 
 if TYPE_CHECKING:
@@ -91,6 +92,9 @@ class Scanner:
     ) -> None:
         self.rig = rig
         self.options = options or ScannerOptions()
+        # The rig's own record of its uncertainty; no frame needs it.
+        from aqualvs.optics.solved import completed_uncertainty
+
         camera = camera or rig.camera()
         self._triangulator = Triangulator(rig, camera)
         fields = {rig.shutter.field_of(index) for index in range(2)}

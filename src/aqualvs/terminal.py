@@ -11,9 +11,12 @@ import threading
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
 from types import FrameType
-from typing import Any, Self, TypeAlias
+from typing import TYPE_CHECKING, Any, Self, TypeAlias
 
 from aqualvs.closing import Closing
+
+if TYPE_CHECKING:
+    from rich.progress import Task
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -108,9 +111,7 @@ def progress(label: str, n_frames: int | None, unit: str = "frames") -> Iterator
         yield _echo_nothing
         return
 
-    from aqualvs.terminal_bar import terminal_bar
-
-    with terminal_bar(label, n_frames, unit, hint=FIRST_RUN) as tick:
+    with _bar(label, n_frames, unit) as tick:
         yield tick
 
 
@@ -126,3 +127,39 @@ def _may_be_terminal() -> bool:
 
 def _echo_nothing(n_done: int) -> None:
     """Do nothing."""
+
+
+@contextlib.contextmanager
+def _bar(label: str, n_frames: int | None, unit: str) -> Iterator[Tick]:
+    """Show a bar; nothing where Rich does not take standard error for a terminal."""
+    from rich import console, progress
+
+    stderr = console.Console(stderr=True)
+    with progress.Progress(
+        progress.TextColumn("{task.description}"),
+        progress.BarColumn(),
+        progress.MofNCompleteColumn(),
+        progress.TextColumn("{task.fields[rate]}", markup=False),
+        progress.TimeRemainingColumn(),
+        console=stderr,
+        transient=True,
+        disable=not stderr.is_terminal,
+    ) as bar:
+        task = bar.add_task(f"{label} ({FIRST_RUN})", total=n_frames, rate="")
+
+        def tick(n_done: int) -> None:
+            bar.update(task, advance=n_done, description=label)
+            bar.update(task, rate=rate_text(bar.tasks[0], unit))
+
+        yield tick
+
+
+def rate_text(task: "Task", unit: str) -> str:
+    """Return frames, or whatever is counted, per second, with two significant digits at least."""
+    speed = task.finished_speed or task.speed
+    if not speed and task.completed and task.elapsed:
+        # Rich forgets what is older than half a minute.
+        speed = task.completed / task.elapsed
+    if not speed:
+        return ""
+    return f"{speed:.0f} {unit}/s" if speed >= 10.0 else f"{speed:#.2g} {unit}/s"

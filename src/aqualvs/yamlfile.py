@@ -19,8 +19,6 @@ from aqualvs.errors import AqualvsError, OutputError
 from aqualvs.special_files import refuse_special
 
 _HEADER = "# A rig of aqualvs: lengths in mm, angles in degrees, frame 'dome' (docs/rig.md).\n"
-# Lists stay on one line, regardless of their digits.
-_WIDTH = 1000
 
 
 def write_text(path: Path, text: str) -> None:
@@ -63,12 +61,14 @@ def _block(key: str, value: object) -> str:
     # YAML wraps a lone scalar in braces unless told to use the block style; records of calibrations
     # read better in block style.
     flow = None if isinstance(value, list | dict) and key != "solved_from" else False
+    # Lists stay on one line, regardless of their digits.
+    width = 1000
     text: str = yaml.dump(
         {key: value},
         Dumper=TidyDumper,
         sort_keys=False,
         allow_unicode=True,
-        width=_WIDTH,
+        width=width,
         default_flow_style=flow,
     )
     return text
@@ -403,8 +403,6 @@ _COMMENT = re.compile("#[^\n\r\x85\u2028\u2029]*")
 # A comment on the line that opens a block of text belongs to the token of the text.
 _BLOCK_HEAD = re.compile("[|>][-+0-9]*[ \t]+(#[^\n\r\x85\u2028\u2029]*)")
 
-# Comments of texts beyond these are not placed: rigs have up to 50,000 characters.
-_MAX_CHARACTERS, _MAX_COMMENTS = 500_000, 1000
 
 _Place: TypeAlias = tuple[object, ...]
 """Keys from the top; an item of a list by its `name`, or its number."""
@@ -429,7 +427,9 @@ def carry_comments(old: str, new: str) -> str:
     old, new : str
         YAML texts; an `old` that is not YAML has no comments.
     """
-    if "#" not in old or len(old) > _MAX_CHARACTERS:
+    # Comments of texts beyond these are not placed: rigs have up to 50,000 characters.
+    max_characters, max_comments = 500_000, 1000
+    if "#" not in old or len(old) > max_characters:
         return new
     try:
         before = parse_yaml(old, "", AqualvsError)
@@ -439,7 +439,7 @@ def carry_comments(old: str, new: str) -> str:
     comments = [one for one in _comments(old) if one.text not in known]
     if not comments or not isinstance(before, dict):
         return new
-    if len(comments) <= _MAX_COMMENTS:
+    if len(comments) <= max_comments:
         carried = _carried(old, new, comments)
         if _content(new) == _content(carried) and _holds(carried, comments):
             return carried

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 import yaml
 
-from aqualvs.batch.cluster import WorkersLostError
 from aqualvs.batch.dataset import holds_dive, read_manifest
 from aqualvs.batch.dives import DiveState
-from aqualvs.batch.scheduler import Scheduler, look
+from aqualvs.batch.scheduler import Scheduler, WorkersLostError, look
 from aqualvs.optics.rigfile import load_rig, save_rig
 from aqualvs.pipeline import run
 from aqualvs.results.run_request import scanner_options

@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from aqualvs.cli.main import main
-from aqualvs.experiments.benchmark.score import BARE_LENS, OWN_SYSTEMS
+from aqualvs.experiments.benchmark_score import BARE_LENS, OWN_SYSTEMS
 from aqualvs.simulation.benchmark import LEVELS
 
 

@@ -22,7 +22,8 @@ from aqualvs.live.options import load_vehicle
 from aqualvs.optics.rigfile import load_rig
 from aqualvs.pipeline import run_and_print
 from aqualvs.results.run_request import FrameWindow, RunRequest
-from doc_blocks import ROOT, Block, blocks
+from doc_blocks import Block, blocks
+from repository import ROOT
 
 PYTHON = blocks("python")
 YAML = blocks("yaml")

@@ -15,6 +15,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 import typer
@@ -23,8 +24,9 @@ from aqualvs.cli.main import app, main
 from aqualvs.experiments import simulate
 from aqualvs.simulation.scenario import Scenario
 from aqualvs.simulation.scenarios import load_scenario
-from doc_blocks import PAGES, ROOT, Command, all_commands, commands
+from doc_blocks import PAGES, Command, all_commands, commands
 from ports import free_port
+from repository import ROOT
 from waiting import TIMEOUT_S
 
 ELSEWHERE = {
@@ -66,7 +68,7 @@ def understood(arguments: list[str]) -> None:
 def examples() -> list[Command]:
     """The example in the help of every command."""
     found = []
-    group = typer.main.get_command(app)
+    group: Any = typer.main.get_command(app)
     pairs = [(name, one) for name, one in group.commands.items()]
     for name, one in list(pairs):
         pairs += [(f"{name} {k}", v) for k, v in getattr(one, "commands", {}).items()]

@@ -8,7 +8,7 @@ import sys
 import pytest
 
 import aqualvs
-from doc_blocks import ROOT
+from repository import ROOT
 
 pytest.importorskip("material", reason="the site needs the dev extra")
 

@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from doc_blocks import ROOT
+from repository import ROOT
 
 NOTEBOOK = ROOT / "examples" / "tour.ipynb"
 CELLS = json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"]

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from aqualvs.calibration.lasers.report import LaserFigures
+from aqualvs.calibration.lasers.checks import LaserFigures
 from aqualvs.calibration.targets.pose_files import BoardPose
 from aqualvs.calibration.targets.targets import View
 from aqualvs.errors import CalibrationError, RigError

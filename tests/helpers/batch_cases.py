@@ -7,7 +7,7 @@ from pathlib import Path
 
 import av
 
-from aqualvs.batch.cluster import FinishedTask
+from aqualvs.batch.scheduler import FinishedTask
 from aqualvs.batch.work import DiveWork
 from aqualvs.demo import bundled_dive
 from aqualvs.results.run_request import RunRequest

@@ -118,8 +118,8 @@ def fly(
         if noise is not None:
             near += 1e-3 * noise.standard_normal()
             turned += math.radians(0.2) * noise.standard_normal()
-        known = plant.rates() if rates else (None, None)
-        effort = controller.update(plant.time, near, turned, *known, setpoint, sway)
+        closing, turning = plant.rates() if rates else (None, None)
+        effort = controller.update(plant.time, near, turned, closing, turning, setpoint, sway)
         times.append(plant.time)
         ranges.append(plant.distance)
         yaws.append(plant.yaw)

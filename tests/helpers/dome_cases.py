@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from aqualvs.calibration.dome.problem import BoardSet, DomeOptions
-from aqualvs.calibration.solver.priors import rig_difference
+from aqualvs.calibration.solver.bundle import rig_difference
 from aqualvs.calibration.solver.result import DomeCalibration
 from aqualvs.calibration.targets.targets import View
 from aqualvs.geometry.arrays import FloatArray

@@ -10,6 +10,7 @@ import math
 import os
 import threading
 import time
+from typing import Any
 
 from pymavlink import mavutil
 
@@ -62,7 +63,7 @@ def say(**what: object) -> None:
     print(json.dumps(what), flush=True)
 
 
-def heard(link: mavutil.mavfile, message: mavlink.MAVLink_message) -> None:
+def heard(link: mavutil.mavfile, message: Any) -> None:
     fields = {
         key: None if isinstance(value, float) and math.isnan(value) else value
         for key, value in message.to_dict().items()

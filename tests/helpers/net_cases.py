@@ -73,7 +73,7 @@ class NetCamera:
         on_net = scene.dome_from_scene.inverse().apply(lit.points_in_dome)[:, [0, 2]]
         column, row = np.floor(on_net / _PIECE).astype(np.int64).T
         chance = np.modf(np.abs(np.sin(column * 12.9898 + row * 78.233)) * 43758.5453)[0]
-        return (chance < self.dark) & (lit.label == TrueLabel.NET)
+        return np.asarray((chance < self.dark) & (lit.label == TrueLabel.NET))
 
     def _points(self, lit: LitPoints, lost: BoolArray, distance: float) -> ScanPoints:
         parts = [self._of_laser(lit, lost, i, distance) for i in range(len(self.rig.lasers))]

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-from tests.helpers.net_dives import Dive, frame_of
 
 from aqualvs.geometry.arrays import BoolArray
 from aqualvs.optics.rig import Rig
@@ -16,6 +15,7 @@ from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scene import Scene
 from aqualvs.simulation.surfaces import pack_surfaces
 from aqualvs.simulation.truth import cast, light_sheets
+from net_dives import Dive, frame_of
 
 # Every third pixel away from the lasers' light, which reaches so far to each side: on surfaces in
 # metres, and in the picture in pixels; and the share of a fan's power that counts.

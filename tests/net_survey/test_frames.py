@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from aqualvs.net_survey.comparison import compare
+from aqualvs.net_survey.comparison import HoleState, compare
 from aqualvs.net_survey.frames import Raster, WallFrame, common_frame, spread_over
-from aqualvs.net_survey.hole_sites import HoleState
 from aqualvs.net_survey.surveys import named_date
 from net_change_cases import RADIUS, Cage, dive
 

@@ -5,11 +5,9 @@ from datetime import date
 import numpy as np
 import pytest
 
-from aqualvs.net_survey.alignment import SurveyShift
-from aqualvs.net_survey.comparison import compare
-from aqualvs.net_survey.frames import WallFrame, place_survey
+from aqualvs.net_survey.comparison import HoleState, compare
+from aqualvs.net_survey.frames import SurveyShift, WallFrame, place_survey
 from aqualvs.net_survey.growth import Growth, common_cells, history
-from aqualvs.net_survey.hole_sites import HoleState
 from aqualvs.net_survey.tables import summary_lines
 from net_change_cases import RADIUS, Cage, dive
 

@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from aqualvs.net_survey.alignment import SurveyShift
-from aqualvs.net_survey.frames import WallFrame, place_survey
-from aqualvs.net_survey.hole_sites import HoleState, find_sites
+from aqualvs.net_survey.comparison import HoleState, find_sites
+from aqualvs.net_survey.frames import SurveyShift, WallFrame, place_survey
 from aqualvs.net_survey.surveys import Holes
 from net_change_cases import RADIUS, Cage, dive
 

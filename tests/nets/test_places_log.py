@@ -8,7 +8,8 @@ import pytest
 
 from aqualvs.errors import OptionError, SourceError
 from aqualvs.nets import places as net_log
-from aqualvs.nets.places import lay_log, open_log
+from aqualvs.nets.places import DivePostures, lay_log, open_log
+from aqualvs.vehicle_logs.vehicle_log import VehicleLog
 from net_app_cases import postures, vehicle_log
 
 DURATION = 60.0
@@ -27,7 +28,7 @@ def turn(t):
 
 
 @pytest.fixture
-def moving():
+def moving() -> tuple[VehicleLog, DivePostures]:
     """A dive whose yaw shows the turning that its log has `TRUE_S` later on its own clock."""
     log = vehicle_log(
         DURATION, depth=lambda t: 5.0 + 0 * t, heading=lambda t: BEARING + turn(t - TRUE_S)
@@ -36,14 +37,15 @@ def moving():
 
 
 @pytest.fixture
-def still():
+def still() -> tuple[VehicleLog, DivePostures]:
     """A dive that shows no motion, whose log knows the time of day."""
     log = vehicle_log(DURATION, depth=lambda t: 5.0 + 0 * t, heading=lambda t: BEARING + 0 * t)
     return replace(log, start_utc_s=1000.0, start_utc_sigma_s=0.5), postures(DURATION)
 
 
 def test_motion_tells_the_offset(moving):
-    laid = lay_log(*moving, None, None)
+    log, dive = moving
+    laid = lay_log(log, dive, None, None)
     assert laid.offset.offset_s == pytest.approx(TRUE_S, abs=0.1)
     assert laid.places is not None
     assert laid.to_dict()["offset_s"] == pytest.approx(TRUE_S, abs=0.1)
@@ -51,14 +53,16 @@ def test_motion_tells_the_offset(moving):
 
 
 def test_what_the_user_says_counts(moving):
-    laid = lay_log(*moving, 3.5, None)
+    log, dive = moving
+    laid = lay_log(log, dive, 3.5, None)
     assert laid.places.offset_s == 3.5
     assert laid.to_dict()["offset_from"] == "given by the user"
 
 
 def test_clocks_stand_in_where_motion_says_nothing(still, monkeypatch):
     monkeypatch.setattr(net_log, "dive_start_utc", lambda _: 1002.0)
-    laid = lay_log(*still, None, VIDEO)
+    log, dive = still
+    laid = lay_log(log, dive, None, VIDEO)
     assert laid.places.offset_s == pytest.approx(2.0)
     assert laid.offset.sigma_s > 1.0
     assert "clocks" in laid.words()
@@ -66,7 +70,8 @@ def test_clocks_stand_in_where_motion_says_nothing(still, monkeypatch):
 
 def test_without_motion_and_clocks_the_log_is_not_used(still, monkeypatch):
     monkeypatch.setattr(net_log, "dive_start_utc", lambda _: None)
-    laid = lay_log(*still, None, VIDEO)
+    log, dive = still
+    laid = lay_log(log, dive, None, VIDEO)
     assert laid.places is None
     assert "is not used" in laid.words()
     assert laid.to_dict() == {
@@ -77,7 +82,8 @@ def test_without_motion_and_clocks_the_log_is_not_used(still, monkeypatch):
 
 
 def test_a_log_that_covers_none_of_the_dive_is_not_used(moving):
-    laid = lay_log(*moving, 500.0, None)
+    log, dive = moving
+    laid = lay_log(log, dive, 500.0, None)
     assert laid.places is None
     assert "none of the dive" in laid.words()
 

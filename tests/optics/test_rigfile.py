@@ -569,13 +569,22 @@ def test_the_documentations_examples_of_windows() -> None:
     )
 
 
-WINDOW = {"normal": [0.28, 0.96, 0.0], "offset_mm": 30.0, "source_mm": [-140.0, 20.0, 5.0]}
-BEHIND_WINDOW = {"name": "left", "normal": [1.0, 0.0, 0.0], "offset_mm": -140.0, "window": WINDOW}
+OBLIQUE_WINDOW: dict[str, Any] = {
+    "normal": [0.28, 0.96, 0.0],
+    "offset_mm": 30.0,
+    "source_mm": [-140.0, 20.0, 5.0],
+}
+BEHIND_WINDOW = {
+    "name": "left",
+    "normal": [1.0, 0.0, 0.0],
+    "offset_mm": -140.0,
+    "window": OBLIQUE_WINDOW,
+}
 
 
 def behind_window(**changes: Any) -> dict[str, Any]:
     """Return the file above with a laser behind a window, some of whose keys are changed."""
-    window = {key: value for key, value in (WINDOW | changes).items() if value is not ...}
+    window = {key: value for key, value in (OBLIQUE_WINDOW | changes).items() if value is not ...}
     return hand_written(lasers=[BEHIND_WINDOW | {"window": window}])
 
 
@@ -613,7 +622,7 @@ def test_a_wavelength_is_kept_and_none_is_needed(tmp_path: Path) -> None:
 
 def test_a_windows_normal_may_have_any_length_and_way_round() -> None:
     for scale in (3.0, -2.0):
-        normal = [scale * value for value in WINDOW["normal"]]
+        normal = [scale * value for value in OBLIQUE_WINDOW["normal"]]
         content = behind_window(normal=normal, offset_mm=np.sign(scale) * 30.0)
         window = rig_from_mapping(content, source_name="x").lasers[0].window
         assert window is not None

@@ -7,6 +7,7 @@ import re
 import threading
 import time
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -362,7 +363,7 @@ def disk():
         disks.append(Disk(path))
         return disks[0]
 
-    open_file.disks = disks
+    open_file.disks = disks  # type: ignore[attr-defined]
     return open_file
 
 
@@ -515,7 +516,7 @@ def test_cdr_is_that_of_rosbags():
         to.array(np.array([3, 4, 5], "u2"))
         to.numbers("d", 0.25, 4.0)
         content = to.finish()
-        found = store.deserialize_cdr(content, "x/msg/T")
+        found: Any = store.deserialize_cdr(content, "x/msg/T")
         assert (found.a, list(found.b), found.c, found.d, found.e) == (7, b, 9, d, -5)
         assert (list(found.f), list(found.g)) == ([3, 4, 5], [0.25, 4.0])
         assert bytes(store.serialize_cdr(found, "x/msg/T")) == content

@@ -22,7 +22,7 @@ from aqualvs.recording.messages import stripes_message, stripes_of
 from aqualvs.results.run_request import FrameWindow, RunRequest, Water
 from aqualvs.scanner import Scanner, ScannerOptions
 from aqualvs.scanning.stripe import ThresholdOptions
-from aqualvs.scanning.target import TargetKind
+from aqualvs.scanning.surfaces import TargetKind
 from live_cases import demo_rig, demo_samples
 from repository import ROOT
 

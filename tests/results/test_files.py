@@ -68,8 +68,9 @@ NO_FILES = {"check", "doctor", "schema"}
 
 def all_commands() -> dict[str, Any]:
     """Return every command of the command line by its words."""
-    found = {}
-    for name, command in typer.main.get_command(app).commands.items():
+    found: dict[str, Any] = {}
+    group: Any = typer.main.get_command(app)
+    for name, command in group.commands.items():
         inner = getattr(command, "commands", None)
         found |= (
             {name: command}

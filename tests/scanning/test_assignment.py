@@ -16,8 +16,7 @@ from aqualvs.scanning.laser_bands import SearchAxis, plan_bands
 from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.posture_estimator import Measurement
 from aqualvs.scanning.stripe import StripePeaks
-from aqualvs.scanning.surfaces import Surface, surface_on
-from aqualvs.scanning.target import TargetKind
+from aqualvs.scanning.surfaces import Surface, TargetKind, surface_on
 from aqualvs.scanning.triangulate import Triangulator
 from aqualvs.simulation.scenarios import example_rig
 from fan_cases import Fan, Stage, Trouble, fan_rig, miscalibrated
@@ -97,9 +96,8 @@ def test_light_that_must_be_there_decides(monkeypatch: pytest.MonkeyPatch) -> No
     """Without the count of dark lasers and of foreign light, only residuals are left."""
     fan = Fan(n_lines=5, spacing_deg=2.0)
     assert measured(fan, EASY)
-    monkeypatch.setattr(assignment, "_DARK_LASER", 0.0)
-    monkeypatch.setattr(assignment, "_FOREIGN_STRIPE", 0.0)
-    monkeypatch.setattr(assignment, "_MAX_FREEDOM", 0.0)
+    odds = assignment._ODDS._replace(dark_laser=0.0, foreign_stripe=0.0, max_freedom=0.0)
+    monkeypatch.setattr(assignment, "_ODDS", odds)
     assert not measured(fan, EASY)
 
 
@@ -109,7 +107,7 @@ def test_residuals_tell_a_fan_with_a_dark_end(monkeypatch: pytest.MonkeyPatch) -
     found = measured(FAN, trouble)
     assert isinstance(found, Posture)
     assert found.range == pytest.approx(WALL.offset, rel=0.01)
-    monkeypatch.setattr(assignment, "_MAX_FREEDOM", 0.0)
+    monkeypatch.setattr(assignment, "_ODDS", assignment._ODDS._replace(max_freedom=0.0))
     assert not measured(FAN, trouble)
 
 

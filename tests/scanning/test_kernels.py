@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from aqualvs.geometry.arrays import FloatArray
-from aqualvs.geometry.quantile import element_at
+from aqualvs.geometry.linear_algebra import element_at
 from aqualvs.scanning.plane_search import _guide, _median_weight, _pick
 from aqualvs.scanning.surfaces import lit_cells, number_cells
 

@@ -12,8 +12,7 @@ from aqualvs.optics.rig import Rig
 from aqualvs.scanning.candidates import Candidates, find_candidates
 from aqualvs.scanning.laser_bands import SearchAxis, plan_bands
 from aqualvs.scanning.stripe import StripePeaks
-from aqualvs.scanning.surfaces import Surface, find_surfaces
-from aqualvs.scanning.target import TargetKind, choose_target
+from aqualvs.scanning.surfaces import Surface, TargetKind, choose_target, find_surfaces
 from aqualvs.scanning.triangulate import Triangulator
 from aqualvs.simulation.scenarios import bluerov2_rig, example_rig
 from scanning_cases import Lit, everywhere, peaks_of, strands

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import yaml
 
-from aqualvs.experiments.benchmark import set as benchmark_set
+from aqualvs.experiments import benchmark_set
 from aqualvs.optics.shutter import Shutter, ShutterKind
 from aqualvs.simulation.benchmark import (
     BENCHMARK_NAME,

@@ -9,7 +9,7 @@ from aqualvs.errors import RigError
 from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig import Laser
 from aqualvs.simulation import render as render_module
-from aqualvs.simulation.cameras import expose, spread
+from aqualvs.simulation.cameras import corner_rays, expose, spread
 from aqualvs.simulation.lasers import default_sources, light_on_points, pack_sheets
 from aqualvs.simulation.render import Renderer, TileMembers, tile_members
 from aqualvs.simulation.scenario import dome_from_target
@@ -189,7 +189,7 @@ def test_culling_changes_nothing(renderer, monkeypatch):
 
 def test_rays_between_corners_are_the_cameras_rays():
     rig = example_rig()
-    corners = render_module.corner_rays(rig.camera())
+    corners = corner_rays(rig.camera())
     rng = np.random.default_rng(4)
     pixels = rng.integers(0, [720, 576], (500, 2))
     i, j = pixels.T

@@ -14,7 +14,7 @@ import pyarrow as pa
 import pytest
 
 from aqualvs.errors import OptionError, SourceError
-from aqualvs.sources import bags, message_source, open_feed, open_source
+from aqualvs.sources import bags, image_messages, open_feed, open_source
 from aqualvs.sources.image_messages import ImageMessage, planes_of_message, protobuf_fields
 from aqualvs.sources.mcap_file import decompressed
 from shell_cases import luma_level, picture
@@ -502,7 +502,7 @@ def test_empty_messages_of_ros_2_are_left_out(tmp_path):
 
 
 def test_messages_without_any_picture_are_given_up(tmp_path, monkeypatch):
-    monkeypatch.setattr(message_source, "_MAX_UNREADABLE", 30)
+    monkeypatch.setattr(image_messages, "_MAX_UNREADABLE", 30)
     name, *rest, messages = compressed_image(12)
     damaged = write_mcap(tmp_path / "gap.mcap", [(name, *rest, [*messages, *[b""] * 60])])
     with open_source(damaged) as source, pytest.raises(SourceError, match="31 messages in a row"):

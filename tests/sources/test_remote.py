@@ -11,6 +11,7 @@ import time
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -124,7 +125,7 @@ def listening(feed):
 @contextmanager
 def udp_listener():
     """Listen on a free port."""
-    feed = open_feed("udp://127.0.0.1:0")
+    feed: Any = open_feed("udp://127.0.0.1:0")
     with listening(feed) as listener:
         listener.wait(lambda: feed.port)
         yield listener

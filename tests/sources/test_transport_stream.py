@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aqualvs.sources.datagrams import BARE, RTP, TS, kind_of
-from aqualvs.sources.transport_stream import PACKET_BYTES, TransportStream
+from aqualvs.sources.rtp import PACKET_BYTES, TransportStream
 from shell_cases import grain
 
 N_PICTURES = 24

@@ -78,7 +78,8 @@ def test_grey_video_has_no_chroma(tmp_path):
 @pytest.mark.parametrize("kind", ["yuv420p", "yuvj420p", "nv12"])
 @pytest.mark.parametrize("size", [(96, 64), (97, 65)])
 def test_planes_are_views_on_the_decoder_s_memory(kind, size):
-    frame = VideoFrame(*size, kind)
+    width, height = size
+    frame = VideoFrame(width, height, kind)
     rng = np.random.default_rng(3)
     content = []
     for plane in frame.planes:

@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from aqualvs.batch.merge import join_dive
-from aqualvs.batch.parts import measure_piece
+from aqualvs.batch.parts import join_dive, measure_piece
 from aqualvs.batch.work import probe
 from aqualvs.errors import SourceError
 from aqualvs.optics.rigfile import load_rig, save_rig

@@ -26,8 +26,7 @@ from aqualvs.scanner import Scanner, ScannerOptions
 from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.scan import Scan, ScanPoints
 from aqualvs.sources import open_source
-from aqualvs.workers import channel, pool
-from aqualvs.workers.channel import Ended, Receiver, Sender, SharedMemory
+from aqualvs.workers import pool
 from aqualvs.workers.frame_results import (
     FrameProcessor,
     FrameResult,
@@ -35,7 +34,7 @@ from aqualvs.workers.frame_results import (
     in_blocks,
     read_ahead,
 )
-from aqualvs.workers.pool import WorkerPool, pool_job
+from aqualvs.workers.pool import Ended, Receiver, Sender, SharedMemory, WorkerPool, pool_job
 from batch_cases import DEMO, RESULTS, demo_dive, without_times
 from complaints import complaints
 from shell_cases import destroy_frame
@@ -274,7 +273,7 @@ def test_messages_arrive_as_they_were(block, ends):
 
 def test_so_do_those_that_are_too_large_for_their_place(block, ends, monkeypatch):
     sender, receiver, thread = ends
-    monkeypatch.setattr(channel, "_SLOT_BYTES", 4096)
+    monkeypatch.setattr(pool, "_SLOT_BYTES", 4096)
     sent = thread.submit(sender.send, block)
     assert_like(block, receiver.receive())
     sent.result(timeout=60)
@@ -328,7 +327,7 @@ def test_reading_ahead_ends_with_its_reader():
     assert [next(reader) for _ in range(3)] == [0, 1, 2]
     time.sleep(0.05)
     assert len(fetched) <= 6
-    reader.close()
+    reader.close()  # type: ignore[attr-defined]
     assert threading.active_count() == n_before
 
 

@@ -11,11 +11,10 @@ from typing import Self
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
-from aqualvs.batch.cluster import DaskWorkers
 from aqualvs.batch.dataset import clear, read_manifest, write_dives
 from aqualvs.batch.dives import Dive, DiveRecord, DiveState, find_dives, name_dives
-from aqualvs.batch.merge import JOINED
-from aqualvs.batch.scheduler import Scheduler, known_net
+from aqualvs.batch.parts import JOINED
+from aqualvs.batch.scheduler import DaskWorkers, Scheduler, known_net
 from aqualvs.batch.summary_page import SUMMARY_HTML, write_summary
 from aqualvs.batch.work import PIECE_FRAMES, DiveWork, size_of
 from aqualvs.closing import Closing
@@ -30,7 +29,6 @@ DIVES, DATASET, HOME = "dives", "dataset", ".batch"
 """Folders of a batch: results by dive, the data set, and what is under way."""
 
 _NAMES, _LOCK = "names.json", "lock"
-_EXIT_INCOMPLETE = 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -139,7 +137,8 @@ def batch(request: BatchRequest, echo: Callable[[str], object]) -> int:
     if stop.caught:
         return stop.exit_code
     unfinished = [r for r in found.values() if r.state is not DiveState.FINISHED]
-    return _EXIT_INCOMPLETE if unfinished else 0
+    exit_incomplete = 1
+    return exit_incomplete if unfinished else 0
 
 
 def _check(request: BatchRequest) -> None:
@@ -237,10 +236,6 @@ def _summary_lines(
     return [*lines, f"data set: {request.out / DATASET}"]
 
 
-# Pieces take seconds, so that the last half minute says little of the speed.
-_SPEED_OVER_S = 600.0
-
-
 class BatchProgress(Closing):
     """Progress of a batch: a bar on a terminal, and a line for each dive; a context manager.
 
@@ -257,6 +252,8 @@ class BatchProgress(Closing):
         self._tell = echo
         console = Console(stderr=True)
         columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn())
+        # Pieces take seconds, so that the last half minute says little of the speed.
+        speed_over_s = 600.0
         self._bar = Progress(
             *columns,
             TextColumn("time left"),
@@ -264,7 +261,7 @@ class BatchProgress(Closing):
             console=console,
             transient=True,
             disable=not console.is_terminal,
-            speed_estimate_period=_SPEED_OVER_S,
+            speed_estimate_period=speed_over_s,
         )
         self._task = self._bar.add_task(self._words(), total=None)
 

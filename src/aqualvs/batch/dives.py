@@ -33,7 +33,6 @@ from aqualvs.text import hole_count
 from aqualvs.yamlfile import parse_yaml, read_text
 
 _LONGEST = 80
-_DEEPEST = 4
 
 
 def name_dives(sources: Sequence[tuple[Path, str]], known: Mapping[str, str]) -> list[str]:
@@ -88,7 +87,8 @@ def _own(paths: Sequence[Path], taken: Collection[str]) -> list[str]:
     """Return names after the files; those that clash all get more of their path."""
     used, names = set(taken), dict.fromkeys(paths, "")
     waiting = list(names)
-    for depth in range(1, _DEEPEST + 1):
+    deepest = 4
+    for depth in range(1, deepest + 1):
         called = {path: _called(path, depth) for path in waiting}
         counted = [_folded(name) for name in called.values()]
         for path, name in called.items():
@@ -97,7 +97,7 @@ def _own(paths: Sequence[Path], taken: Collection[str]) -> list[str]:
         used |= {_folded(name) for name in names.values() if name}
         waiting = [path for path in waiting if not names[path]]
     for path in waiting:
-        names[path] = _numbered(_called(path, _DEEPEST), used)
+        names[path] = _numbered(_called(path, deepest), used)
         used.add(_folded(names[path]))
     return [names[path] for path in paths]
 

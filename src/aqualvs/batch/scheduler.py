@@ -1,18 +1,24 @@
-"""Scheduler of a batch: hands the next task to the processes, and takes care of its outcome.
+"""Scheduler of a batch: worker processes, their next tasks, and the outcome of each.
+
+Processes are on this machine, or those of a Dask scheduler (dask.distributed). Dask sends tasks to
+processes, restarts a process that died, and gives its task to another. It is imported here and
+nowhere else.
 
 A dive is surveyed, measured piece by piece, and merged; failed tasks are tried again or given up.
 Where the condition of the net is wanted, it is evaluated from the finished run and kept until
 something that it depends on changes.
 """
 
+import logging
 import os
+import queue
+import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
 
-from aqualvs.batch.cluster import FinishedTask, Workers, WorkersLostError
 from aqualvs.batch.dataset import (
     drop_dive,
     holds_net,
@@ -23,17 +29,244 @@ from aqualvs.batch.dataset import (
     write_manifest,
 )
 from aqualvs.batch.dives import DiveRecord, DiveState
-from aqualvs.batch.merge import PieceLostError, finished_dive, join_dive
-from aqualvs.batch.parts import PieceResult, measure_piece
+from aqualvs.batch.parts import PieceLostError, PieceResult, finished_dive, join_dive, measure_piece
 from aqualvs.batch.work import DiveProbe, DiveWork, content_digest, digest, probe
-from aqualvs.errors import AqualvsError
+from aqualvs.closing import Closing
+from aqualvs.errors import AqualvsError, OptionError
 from aqualvs.net_survey.command import StoredDive
 from aqualvs.nets.target_file import NetRequest
 from aqualvs.report.run_page import write_report
 from aqualvs.results.files import writing
 from aqualvs.results.folder import NET_FILES
 from aqualvs.results.net_survey import read_run
+from aqualvs.results.run_request import versions
 from aqualvs.sources.spans import UnlikeProbeError
+from aqualvs.workers import start_method
+
+_MAX_DEATHS = 20
+"""A task that was under way in so many dying processes is given up by the scheduler."""
+
+# Tasks take seconds: what Dask does many times a second for shorter ones only costs time.
+_SETTINGS = {
+    "distributed.scheduler.allowed-failures": _MAX_DEATHS,
+    "distributed.scheduler.active-memory-manager.start": False,
+    "distributed.scheduler.work-stealing-interval": "1s",
+    "distributed.worker.profile.enabled": False,
+    "distributed.worker.memory.monitor-interval": "500ms",
+    "distributed.admin.tick.interval": "1s",
+    "distributed.admin.tick.cycle": "2s",
+    "distributed.admin.system-monitor.interval": "10s",
+    "distributed.admin.system-monitor.gil.enabled": False,
+}
+_TIMEOUT_S = 30.0
+
+
+@dataclass(frozen=True, slots=True)
+class FinishedTask:
+    """A task that has ended.
+
+    Attributes
+    ----------
+    token : object
+        As it was submitted.
+    value : object
+        What it returned; None after an error.
+    error : Exception or None
+        What it raised.
+    """
+
+    token: Any
+    value: Any = None
+    error: BaseException | None = None
+
+
+class WorkersLostError(Exception):
+    """The processes that worked on a task died, again and again."""
+
+
+class WorkersGoneError(AqualvsError):
+    """There is no worker left, and none has come for minutes."""
+
+
+class Workers(Protocol):
+    """Pool of processes that take tasks."""
+
+    @property
+    def n_slots(self) -> int:
+        """Tasks that can be under way at a time."""
+
+    def submit(self, token: object, function: Callable[..., Any], *arguments: object) -> None:
+        """Have a task done."""
+
+    def next_done(self, timeout_s: float) -> FinishedTask | None:
+        """Return a task that has ended; None if none does within the time."""
+
+
+class DaskWorkers(Closing):
+    """Workers of a Dask scheduler; a context manager.
+
+    Parameters
+    ----------
+    n_workers : int or None
+        Processes on this machine, each with one thread; None for one per core.
+    scheduler : str or None
+        Address of a scheduler whose workers are used instead.
+
+    Raises
+    ------
+    OptionError
+        If `distributed` is missing, or the scheduler does not answer.
+    """
+
+    def __init__(self, n_workers: int | None = None, scheduler: str | None = None) -> None:
+        distributed = _distributed()
+        self._killed: type[BaseException] = distributed.KilledWorker
+        self._n_slots, self._count_again_s, self._seen_s = 1, 0.0, time.monotonic()
+        self._ended: queue.SimpleQueue[tuple[object, Any]] = queue.SimpleQueue()
+        self._cluster = None if scheduler else _local_cluster(distributed, n_workers)
+        where = scheduler or self._cluster
+        try:
+            # Results come through this object, not through a file of the user's.
+            self._client = distributed.Client(where, timeout=_TIMEOUT_S, set_as_default=False)
+        except (OSError, ValueError, TimeoutError) as fault:
+            raise OptionError(
+                f"--scheduler {scheduler}: does not answer ({fault}); check the address, such as "
+                "tcp://192.168.1.10:8786"
+            ) from fault
+
+    @property
+    def n_slots(self) -> int:
+        """Tasks that can be under way at a time, at least one.
+
+        Raises
+        ------
+        WorkersGoneError
+            If there has been no worker for minutes.
+        """
+        now_s = time.monotonic()
+        count_every_s = 5.0
+        no_worker_s = 300.0
+        if now_s >= self._count_again_s:
+            # Machines may join a scheduler while a batch goes on; asking takes its time.
+            n_slots = sum(self._client.nthreads().values())
+            if n_slots:
+                self._seen_s = now_s
+            elif now_s > self._seen_s + no_worker_s:
+                raise WorkersGoneError(
+                    f"no worker has been there for {no_worker_s:.0f} s; what is finished is kept, "
+                    "see to the workers and run the same command again"
+                )
+            self._n_slots = max(1, n_slots)
+            self._count_again_s = now_s + count_every_s
+        return self._n_slots
+
+    def submit(self, token: object, function: Callable[..., Any], *arguments: object) -> None:
+        """Have a task done; the same task twice is done twice."""
+        future = self._client.submit(function, *arguments, pure=False)
+        future.add_done_callback(lambda ended: self._ended.put((token, ended)))
+
+    def next_done(self, timeout_s: float) -> FinishedTask | None:
+        """Return a task that has ended; None if none does within the time."""
+        try:
+            token, future = self._ended.get(timeout=timeout_s)
+        except queue.Empty:
+            return None
+        if future.status == "finished":
+            return FinishedTask(token, value=future.result())
+        error = future.exception() if future.status == "error" else None
+        if error is None or isinstance(error, self._killed):
+            error = WorkersLostError("the processes that worked on it died, again and again")
+        return FinishedTask(token, error=error)
+
+    def check_sight(self, path: Path) -> None:
+        """Raise unless every worker sees a file and has the same versions as this process.
+
+        Raises
+        ------
+        OptionError
+            If one does not.
+        """
+        mine, option = versions(), f"--scheduler {self._client.scheduler.address}"
+        try:
+            found: Mapping[str, Any] = self._client.run(_sight, str(path))
+        except Exception as fault:  # Dask words what workers raise in an exception of its own
+            raise OptionError(
+                f"{option}: a worker cannot take part ({fault}); install aqualvs[batch] of this "
+                "version on its machine"
+            ) from fault
+        if not found:
+            raise OptionError(f"{option}: has no workers yet; start some with 'dask worker'")
+        for worker, (sees, theirs) in found.items():
+            if not sees:
+                raise OptionError(
+                    f"{option}: worker {worker} does not see {path.parent}; "
+                    "dives and results must lie where all machines find them under one path"
+                )
+            other = [name for name in mine if theirs.get(name) != mine[name]]
+            if other:
+                name = other[0]
+                raise OptionError(
+                    f"{option}: worker {worker} has {name} {theirs.get(name)}, this process has "
+                    f"{mine[name]}; install the same versions"
+                )
+
+    def close(self) -> None:
+        """Drop what is under way, and end the processes of this machine."""
+        self._client.close()
+        if self._cluster is not None:
+            self._cluster.close(timeout=_TIMEOUT_S)
+
+
+def _distributed() -> Any:
+    try:
+        import distributed
+    except ImportError as fault:
+        raise OptionError(
+            "aqualvs batch needs distributed; install it with pip install 'aqualvs[batch]'"
+        ) from fault
+    return distributed
+
+
+def _local_cluster(distributed: Any, n_workers: int | None) -> Any:
+    import dask
+    from dask.system import CPU_COUNT
+    from distributed.system import MEMORY_LIMIT
+
+    n_workers = n_workers or CPU_COUNT
+    settings = dict(_SETTINGS)
+    if start_method.has_server():
+        start_method.prepare(start_method.FOR_BATCHES)
+        settings["distributed.worker.multiprocessing-method"] = "forkserver"
+        # It would import whatever it can find, to have it in the server, which is there already.
+        distributed.utils._forkserver_preload_set = True
+    # A process that takes more is started again; one needs less than a third of it.
+    memory_bytes = 2_000_000_000
+    starts = 3
+    # What Dask says of dying processes helps nobody: the task is done by another.
+    with dask.config.set(settings), start_method.deaf_to_interrupts():
+        for _ in range(starts):
+            try:
+                return distributed.LocalCluster(
+                    n_workers=n_workers,
+                    threads_per_worker=1,
+                    processes=True,
+                    memory_limit=min(memory_bytes, MEMORY_LIMIT // n_workers),
+                    # Any free port, for this machine alone; Dask's own may be taken.
+                    dashboard_address="127.0.0.1:0",
+                    silence_logs=logging.CRITICAL,
+                )
+            except RuntimeError as fault:
+                # A process died before it was there; on a busy machine that may happen once.
+                trouble = fault
+        raise OptionError(
+            f"--workers {n_workers}: the processes do not start ({trouble}); "
+            "take fewer, and see whether there is memory left"
+        ) from trouble
+
+
+def _sight(path: str) -> tuple[bool, dict[str, str]]:
+    return Path(path).exists(), versions()
+
 
 NET = "net"
 """Folder, below a dive's home, with the seal of its net's state."""
@@ -111,8 +344,6 @@ def _digest(request: NetRequest) -> str:
 # Tasks handed over for each that can be under way, so that no process waits for the next.
 _AHEAD = 3
 _WAIT_S = 0.2
-# Beginnings of a dive; each costs only what is not finished.
-_MAX_BEGINNINGS = 3
 
 
 class BatchObserver(Protocol):
@@ -306,7 +537,9 @@ class Scheduler:
 
     def _mend(self, dive: _Dive, error: BaseException) -> None:
         """Retry the tasks that may succeed, and give up the others."""
-        again = dive.n_beginnings < _MAX_BEGINNINGS
+        # Beginnings of a dive; each costs only what is not finished.
+        max_beginnings = 3
+        again = dive.n_beginnings < max_beginnings
         if isinstance(error, UnlikeProbeError) and dive.probe is not None:
             if not dive.probe.is_whole:
                 return self._as_whole(dive, str(error))

@@ -21,10 +21,6 @@ from aqualvs.results.folder import NET_MAP_PNG, REPORT_HTML
 from aqualvs.results.run_request import now
 from aqualvs.text import clock
 
-_STEPS = 120
-_WIDTH, _HEIGHT = 180, 34
-_EDGE = 2.0
-
 
 def range_steps(ranges: ArrayLike) -> list[float | None]:
     """Return the median range in at most 120 equal parts of a dive, in metres; None without any.
@@ -34,7 +30,8 @@ def range_steps(ranges: ArrayLike) -> list[float | None]:
     ranges : array, shape (N,)
         Metres, NaN without a posture.
     """
-    parts = np.array_split(np.asarray(ranges, np.float64), _STEPS)
+    steps = 120
+    parts = np.array_split(np.asarray(ranges, np.float64), steps)
     known = [part[np.isfinite(part)] for part in parts if len(part)]
     return [round(float(np.median(part)), 4) if len(part) else None for part in known]
 
@@ -51,18 +48,20 @@ def range_svg(steps: Sequence[float | None], low: float, high: float) -> str:
     """
     if not steps or not high > low:
         return ""
-    across = (_WIDTH - 2 * _EDGE) / len(steps)
+    width, height = 180, 34
+    edge = 2.0
+    across = (width - 2 * edge) / len(steps)
     path, pen_is_down = "", False
     for i, step in enumerate(steps):
         if step is None:
             pen_is_down = False
             continue
         share = min(max((step - low) / (high - low), 0.0), 1.0)
-        x, y = _EDGE + across * i, _HEIGHT - _EDGE - share * (_HEIGHT - 2 * _EDGE)
+        x, y = edge + across * i, height - edge - share * (height - 2 * edge)
         path += f"{'L' if pen_is_down else 'M'}{x:.1f} {y:.1f}H{x + across:.1f}"
         pen_is_down = True
     return (
-        f'<svg class="range" viewBox="0 0 {_WIDTH} {_HEIGHT}" width="{_WIDTH}" height="{_HEIGHT}" '
+        f'<svg class="range" viewBox="0 0 {width} {height}" width="{width}" height="{height}" '
         f'role="img" aria-label="range over the dive"><path d="{path}"/></svg>'
     )
 
@@ -71,8 +70,6 @@ SUMMARY_HTML = "summary.html"
 
 _HEAD = ("dive", "state", "duration", "frames", "posture", "range, m", "from – to, m", "over time")
 _NET = "net"
-_LOW_SHARE = 0.8
-_MAX_NOTES = 12
 # What a reader of the data set types first.
 _EXAMPLES = {
     "DuckDB": "SELECT dive, avg(range_m) FROM read_parquet('dataset/posture/**/*.parquet', "
@@ -162,9 +159,10 @@ def _cards(records: Sequence[DiveRecord]) -> list[Card]:
 def _notes(records: Sequence[DiveRecord]) -> Iterator[str]:
     """Yield the points that deserve attention, dive by dive, up to a readable number."""
     notes = [note for record in records for note in _notes_on(record)]
-    yield from notes[:_MAX_NOTES]
-    if len(notes) > _MAX_NOTES:
-        yield f"and {len(notes) - _MAX_NOTES} more, in the table and in the dives’ own reports"
+    max_notes = 12
+    yield from notes[:max_notes]
+    if len(notes) > max_notes:
+        yield f"and {len(notes) - max_notes} more, in the table and in the dives’ own reports"
 
 
 def _notes_on(record: DiveRecord) -> Iterator[str]:
@@ -205,7 +203,8 @@ def _cells(folder: Path, record: DiveRecord, low: float, high: float) -> list[st
     if not record.facts:
         return [*head, *[""] * (len(_HEAD) - len(head))]
     summary, share = record.summary, record.summary.get("valid_share", 0.0)
-    low_class = ' class="low"' if share < _LOW_SHARE else ""
+    low_share = 0.8
+    low_class = ' class="low"' if share < low_share else ""
     ends = [summary.get(key) for key in _ENDS]
     return [
         *head,

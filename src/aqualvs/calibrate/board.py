@@ -36,8 +36,6 @@ from aqualvs.results.files import Claim, writing
 Echo: TypeAlias = Callable[[str], object]
 
 _MM = 1e3
-# Ratio of marker to square, about that of OpenCV's own boards.
-_MARKER_SHARE = 0.75
 # A light border that keeps the outer squares readable on any background, as a share of a square.
 _BORDER_SHARE = 0.25
 _PLATE_GAP_SHARE = 0.25
@@ -148,7 +146,9 @@ def _board(request: BoardRequest) -> Board:
             kind=BoardKind.CHESSBOARD, squares=squares, square=square / _MM, border=border / _MM
         )
     n_markers = squares[0] * squares[1] // 2
-    marker = _MARKER_SHARE * square if request.marker_mm is None else request.marker_mm
+    # Ratio of marker to square, about that of OpenCV's own boards.
+    marker_share = 0.75
+    marker = marker_share * square if request.marker_mm is None else request.marker_mm
     return Board(
         kind=BoardKind.CHARUCO,
         squares=squares,

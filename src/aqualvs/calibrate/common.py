@@ -190,11 +190,6 @@ Picture: TypeAlias = str | Path | Image
 Detect: TypeAlias = Callable[[str, Image], View | str]
 """Finder of a target in a named grey picture; returns a clause if there is none."""
 
-# Greatest useful number of threads on small pictures.
-_THREADS = 4
-# Names of pictures that a note lists.
-_NAMES_SHOWN = 3
-
 
 @dataclass(frozen=True, slots=True)
 class DetectedTargets:
@@ -249,8 +244,10 @@ class DetectedTargets:
 
 
 def _listed(names: Sequence[str]) -> str:
-    more = len(names) - _NAMES_SHOWN
-    return ", ".join(names[:_NAMES_SHOWN]) + (f" and {more} more" if more > 0 else "")
+    # Names of pictures that a note lists.
+    names_shown = 3
+    more = len(names) - names_shown
+    return ", ".join(names[:names_shown]) + (f" and {more} more" if more > 0 else "")
 
 
 SolutionT = TypeVar("SolutionT")
@@ -322,9 +319,11 @@ def detect_targets(pictures: Sequence[Picture], detect: Detect, target: str) -> 
     CalibrationError
         If the target is in none of the pictures, or they differ in size.
     """
+    # Greatest useful number of threads on small pictures.
+    threads = 4
     with (
         progress(f"looking for {target}", len(pictures), unit="pictures") as tick,
-        ThreadPoolExecutor(_THREADS) as pool,
+        ThreadPoolExecutor(threads) as pool,
     ):
 
         def look(name: str, picture: Picture) -> tuple[View | str, tuple[int, int]]:

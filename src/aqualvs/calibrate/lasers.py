@@ -25,7 +25,7 @@ from aqualvs.calibrate.common import (
 from aqualvs.calibration.detection.detection import detect_board, detect_markers
 from aqualvs.calibration.lasers.calibrate import LaserOptions
 from aqualvs.calibration.lasers.calibrate import calibrate_lasers as solve_lasers
-from aqualvs.calibration.lasers.report import LaserCalibration, LaserFigures
+from aqualvs.calibration.lasers.checks import LaserCalibration, LaserFigures
 from aqualvs.calibration.lasers.stripes_on_planes import (
     StripePoints,
     TargetSurfaces,

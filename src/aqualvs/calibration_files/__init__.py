@@ -5,7 +5,7 @@ module for each program; imports `optics` and `calibration.targets`.
 """
 
 from aqualvs.calibration_files.camera import ForeignCamera, camera_of_rig, rig_of_camera
-from aqualvs.calibration_files.files import EXPORTS, camera_text, read_board, read_camera
+from aqualvs.calibration_files.command import EXPORTS, camera_text, read_board, read_camera
 
 __all__ = [
     "EXPORTS",

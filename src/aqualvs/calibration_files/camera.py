@@ -1,6 +1,11 @@
-"""A camera as other programs describe it, and the rig that it makes."""
+"""A camera as other programs describe it, the rig that it makes, and the values of their files.
 
-from collections.abc import Sequence
+Keys and values are read strictly; every fault names its place (`Entries`).
+"""
+
+import math
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -15,13 +20,9 @@ from aqualvs.optics.lens import Lens, LensModel
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig
 from aqualvs.optics.rigfile import rig_from_mapping, rig_to_mapping
 
-_N_AIR = 1.0003
-_WORKING_RANGE_M = (0.25, 1.3)
-_N_OPENCV = 8
-
 
 @dataclass(frozen=True, slots=True)
-class Port:
+class ForeignHousing:
     """A housing and the media inside and outside of it, in the frame of the camera.
 
     Attributes
@@ -50,14 +51,14 @@ class ForeignCamera:
         Image width and height; None where the file does not say it.
     lens : Lens
         The centre of the top-left pixel is (0, 0).
-    port : Port or None
+    port : ForeignHousing or None
         None for a camera without a housing.
     """
 
     name: str
     size_px: tuple[int, int] | None
     lens: Lens
-    port: Port | None = None
+    port: ForeignHousing | None = None
 
 
 def opencv_lens(core: Sequence[float], distortion: Sequence[float], *, fisheye: bool) -> Lens:
@@ -78,13 +79,14 @@ def opencv_lens(core: Sequence[float], distortion: Sequence[float], *, fisheye: 
         If there are others, or a value is impossible.
     """
     values = tuple(map(float, distortion))
+    n_opencv = 8
     if not fisheye and len(values) in (12, 14):
-        if any(values[_N_OPENCV:]):
+        if any(values[n_opencv:]):
             raise RigError(
                 "has thin prism or tilt coefficients (s1 to s4, tx, ty), which the lens of aqualvs "
                 "lacks; calibrate with k1 k2 p1 p2 k3 k4 k5 k6 at most"
             )
-        values = values[:_N_OPENCV]
+        values = values[:n_opencv]
     fx, fy, cx, cy = core
     model = LensModel.FISHEYE if fisheye else LensModel.OPENCV
     return Lens(model=model, fx=fx, fy=fy, cx=cx, cy=cy, distortion=values)
@@ -133,16 +135,18 @@ def rig_of_camera(
         )
     port, turn = camera.port, DOME_FROM_CAM_NOMINAL
     lens_in_dome = np.zeros(3) if port is None else -(turn @ port.centre) + 0.0
+    n_air = 1.0003
+    working_range_m = (0.25, 1.3)
     rig = Rig(
         name=camera.name,
         size_px=camera.size_px,
         lens=camera.lens,
         dome_from_cam=SE3(turn.copy(), lens_in_dome),
         housing=None if port is None else port.housing,
-        n_air=_N_AIR if port is None else port.n_air,
-        n_water=_N_AIR if port is None else port.n_water,
+        n_air=n_air if port is None else port.n_air,
+        n_water=n_air if port is None else port.n_water,
         lasers=(),
-        working_range=_WORKING_RANGE_M,
+        working_range=working_range_m,
         solved_from=solved_from or {},
     )
     try:
@@ -158,8 +162,182 @@ def camera_of_rig(rig: Rig) -> ForeignCamera:
     """Return the camera of a rig, with its housing, as seen from the camera."""
     port = None
     if rig.housing is not None:
-        port = Port(rig.housing, rig.n_air, rig.n_water)
+        port = ForeignHousing(rig.housing, rig.n_air, rig.n_water)
     if port is not None and rig.dome is not None:
         pose = rig.dome_from_cam
         port = replace(port, centre=-(pose.rotation.T @ pose.translation) + 0.0)
     return ForeignCamera(name=rig.name, size_px=rig.size_px, lens=rig.lens, port=port)
+
+
+# YAML of C++ programs has numbers such as 1e-05, which YAML 1.1 reads as text; XML has text only.
+_NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
+_LONGEST_NUMBER = 40
+_LARGEST = 1e9
+
+
+@dataclass(frozen=True, slots=True)
+class Entries:
+    """A mapping of a file.
+
+    Attributes
+    ----------
+    content : mapping
+    place : str
+        Where it is in the file, such as "cam0."; empty at the top.
+    """
+
+    content: Mapping[Any, Any]
+    place: str = ""
+
+    def first(self, keys: Sequence[str]) -> str:
+        """Return the first of some keys that there is.
+
+        Raises
+        ------
+        RigError
+            If there is none.
+        """
+        for key in keys:
+            if self.content.get(key) is not None:
+                return key
+        raise RigError(f"{self.place}{keys[0]} is missing; add it")
+
+    def has(self, *keys: str) -> bool:
+        """Return whether any of some keys has a value."""
+        return any(self.content.get(key) is not None for key in keys)
+
+    def part(self, key: str) -> "Entries":
+        """Return the mapping at a key.
+
+        Raises
+        ------
+        RigError
+            If there is none.
+        """
+        value = self.content.get(key)
+        if not isinstance(value, Mapping):
+            raise RigError(f"{self.place}{key} is {shown(value)}; write keys and values")
+        return Entries(value, f"{self.place}{key}.")
+
+    def word(self, *keys: str) -> str:
+        """Return the text at the first of some keys that there is."""
+        key = self.first(keys)
+        value = self.content[key]
+        if not isinstance(value, str):
+            raise RigError(f"{self.place}{key} is {shown(value)}; write a word")
+        return value.strip()
+
+    def name(self, key: str, default: str) -> str:
+        """Return the name at a key, which may be a serial number; the default if there is none."""
+        value = self.content.get(key)
+        named = isinstance(value, str | int) and not isinstance(value, bool)
+        return (str(value).strip() if named else "") or default
+
+    def number(self, *keys: str) -> float:
+        """Return the number at the first of some keys that there is."""
+        key = self.first(keys)
+        return number(self.content[key], self.place + key)
+
+    def whole(self, *keys: str) -> int:
+        """Return the whole number at the first of some keys that there is."""
+        key = self.first(keys)
+        return whole(self.number(key), self.place + key)
+
+    def numbers(self, *keys: str) -> list[float]:
+        """Return the numbers of a list, matrix or vector at the first of some keys that there is.
+
+        Raises
+        ------
+        RigError
+            If it holds anything else, or not as many numbers as it says.
+        """
+        key = self.first(keys)
+        value, place = self.content[key], self.place + key
+        n_stated = None
+        if isinstance(value, Mapping):
+            matrix = Entries(value, f"{place}.")
+            if matrix.has("rows", "cols"):
+                n_stated = matrix.whole("rows") * matrix.whole("cols")
+            value, place = value.get("data"), f"{place}.data"
+        if isinstance(value, str):
+            value = value.split()
+        if not isinstance(value, list | tuple):
+            raise RigError(f"{place} is {shown(value)}; write a list of numbers")
+        flat: list[Any] = []
+        for one in value:
+            flat += one if isinstance(one, list | tuple) else [one]
+        if n_stated not in (None, len(flat)):
+            raise RigError(f"{place} has {len(flat)} values, but rows times cols is {n_stated}")
+        return [number(one, f"{place}[{i}]") for i, one in enumerate(flat)]
+
+    def listed(self, n: int, *keys: str) -> list[float]:
+        """Return the numbers at the first of some keys that there is, which must be n.
+
+        Raises
+        ------
+        RigError
+            If it holds anything else.
+        """
+        values = self.numbers(*keys)
+        if len(values) != n:
+            key = self.place + self.first(keys)
+            raise RigError(f"{key} has {len(values)} values; write {n}")
+        return values
+
+    def size(self, *keys: str) -> tuple[int, int]:
+        """Return the width and height in a list at the first of some keys that there is."""
+        key = self.place + self.first(keys)
+        width, height = self.listed(2, *keys)
+        return whole(width, key), whole(height, key)
+
+    def core(self, *keys: str) -> tuple[float, float, float, float]:
+        """Return fx, fy, cx, cy of the camera matrix at the first of some keys that there is.
+
+        Raises
+        ------
+        RigError
+            If it is no camera matrix, or has skew.
+        """
+        key = self.place + self.first(keys)
+        fx, skew, cx, zero, fy, cy, *last = self.listed(9, *keys)
+        if skew != 0.0:
+            raise RigError(f"{key} has a skew of {skew:g}, which the lens of aqualvs lacks")
+        if (zero, *last) != (0.0, 0.0, 0.0, 1.0):
+            raise RigError(f"{key} is no camera matrix; write [fx, 0, cx, 0, fy, cy, 0, 0, 1]")
+        return fx, fy, cx, cy
+
+
+def number(value: object, place: str) -> float:
+    """Return a value as a finite number.
+
+    Raises
+    ------
+    RigError
+        If it is none.
+    """
+    if isinstance(value, str) and len(value) < _LONGEST_NUMBER and _NUMBER.fullmatch(value.strip()):
+        value = float(value)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise RigError(f"{place} is {shown(value)}; write a finite number")
+    return float(value)
+
+
+def whole(value: float, place: str) -> int:
+    """Return a number as a whole one.
+
+    Raises
+    ------
+    RigError
+        If it is none, or larger than any size of a picture.
+    """
+    if value != math.floor(value) or not 0 <= value <= _LARGEST:
+        raise RigError(f"{place} is {value:g}; write a whole number of 0 or more")
+    return int(value)
+
+
+def shown(value: object) -> str:
+    """Return a value in a few characters."""
+    if isinstance(value, Mapping):
+        return "a mapping"
+    text = "empty" if value is None else repr(value)[:200]
+    return text if len(text) <= 60 else text[:57] + "..."

@@ -18,8 +18,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from aqualvs.calibration_files.camera import ForeignCamera, Port, opencv_lens, padded
-from aqualvs.calibration_files.entries import number, shown, whole
+from aqualvs.calibration_files.camera import (
+    ForeignCamera,
+    ForeignHousing,
+    number,
+    opencv_lens,
+    padded,
+    shown,
+    whole,
+)
 from aqualvs.calibration_files.kalibr import one_of
 from aqualvs.errors import RigError
 from aqualvs.optics.dome import Dome
@@ -124,7 +131,7 @@ def _lens(row: _Row, place: str) -> Lens:
     return opencv_lens(core, known[:n], fisheye=False)
 
 
-def _port(words: Sequence[str], place: str) -> Port:
+def _port(words: Sequence[str], place: str) -> ForeignHousing:
     model = words[0]
     if model not in _PORTS:
         raise RigError(
@@ -134,14 +141,14 @@ def _port(words: Sequence[str], place: str) -> Port:
     values = _named(words[1:], _PORTS[model], f"{place}: {model}")
     x, y, z, size, thickness, n_air, n_port, n_water = values.values()
     if model == _DOME:
-        return Port(Dome(size, thickness, n_port), n_air, n_water, np.array([x, y, z]))
+        return ForeignHousing(Dome(size, thickness, n_port), n_air, n_water, np.array([x, y, z]))
     length = math.hypot(x, y, z)
     if not abs(length - 1.0) <= _NOT_UNIT:
         raise RigError(
             f"{place}: {model}: the normal Nx Ny Nz has the length {length:g}; write a unit vector"
         )
     tilts = math.atan2(-y, z), math.asin(x / length)
-    return Port(FlatPort(size, thickness, n_port, *tilts), n_air, n_water)
+    return ForeignHousing(FlatPort(size, thickness, n_port, *tilts), n_air, n_water)
 
 
 def _named(words: Sequence[str], names: Sequence[str], place: str) -> Mapping[str, float]:

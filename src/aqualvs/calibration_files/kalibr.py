@@ -6,8 +6,7 @@ The keys are those of Kalibr's wiki, "Yaml formats" and "Calibration targets". P
 from collections.abc import Mapping
 
 from aqualvs.calibration.targets.targets import Board, BoardKind
-from aqualvs.calibration_files.camera import ForeignCamera, opencv_lens, padded
-from aqualvs.calibration_files.entries import Entries, shown
+from aqualvs.calibration_files.camera import Entries, ForeignCamera, opencv_lens, padded, shown
 from aqualvs.calibration_files.opencv import plain_name, yaml_text
 from aqualvs.errors import CalibrationError, RigError
 from aqualvs.optics.lens import LensModel

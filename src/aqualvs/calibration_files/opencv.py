@@ -1,10 +1,15 @@
-"""Camera files of ROS (`camera_info.yaml`) and of OpenCV (FileStorage).
+"""Camera files in OpenCV's model: ROS (`camera_info.yaml`), OpenCV (FileStorage), mrcal.
 
-Both hold OpenCV's camera matrix and distortion coefficients. The names of ROS's distortion models
-are those of sensor_msgs/distortion_models.hpp: plumb_bob, rational_polynomial, equidistant.
+Those of ROS and OpenCV hold OpenCV's camera matrix and distortion coefficients. The names of ROS's
+distortion models are those of sensor_msgs/distortion_models.hpp: plumb_bob, rational_polynomial,
+equidistant. A `.cameramodel` of mrcal is a Python literal; its models LENSMODEL_PINHOLE and
+LENSMODEL_OPENCV4, 5, 8 and 12 are OpenCV's (mrcal, "Lens models"); the centre of the top-left pixel
+is (0, 0).
 """
 
+import ast
 import re
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -14,8 +19,7 @@ import cv2
 import numpy as np
 import yaml
 
-from aqualvs.calibration_files.camera import ForeignCamera, opencv_lens, padded
-from aqualvs.calibration_files.entries import Entries, shown
+from aqualvs.calibration_files.camera import Entries, ForeignCamera, opencv_lens, padded, shown
 from aqualvs.errors import RigError
 from aqualvs.optics.lens import Lens, LensModel
 from aqualvs.yamlfile import TidyDumper, parse_yaml
@@ -136,7 +140,6 @@ _DISTORTION = (
     "D",
 )
 _SIZES = ("image_size", "imageSize", "cameraResolution", "resolution")
-_XML_DEPTH = 3
 
 
 def read_opencv(text: str, source: str, *, model: str | None = None) -> ForeignCamera:
@@ -191,7 +194,8 @@ def _xml(text: str) -> dict[str, Any]:
         root = ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError, LookupError) as fault:
         raise RigError(f"is not XML: {fault}; mend it") from None
-    return {node.tag: _xml_value(node, _XML_DEPTH) for node in root}
+    xml_depth = 3
+    return {node.tag: _xml_value(node, xml_depth) for node in root}
 
 
 def _xml_value(node: ElementTree.Element, depth: int) -> Any:
@@ -215,3 +219,70 @@ def opencv_text(camera: ForeignCamera, suffix: str) -> str:
     storage.write("distortion_coefficients", np.array([padded(camera.lens, n)]))
     text: str = storage.releaseAndGetString()
     return text
+
+
+_COUNTS = {
+    "LENSMODEL_PINHOLE": 0,
+    "LENSMODEL_OPENCV4": 4,
+    "LENSMODEL_OPENCV5": 5,
+    "LENSMODEL_OPENCV8": 8,
+    "LENSMODEL_OPENCV12": 12,
+}
+
+
+def read_mrcal(text: str, source: str) -> ForeignCamera:
+    """Return the camera of a `.cameramodel`.
+
+    Raises
+    ------
+    RigError
+        One line without the file's name.
+    """
+    try:
+        with warnings.catch_warnings():
+            # Of odd literals the parser warns on standard error.
+            warnings.simplefilter("ignore")
+            content = ast.literal_eval(text.strip())
+    except (ValueError, SyntaxError, TypeError, MemoryError, RecursionError):
+        raise RigError("is no Python literal, as a cameramodel is; mend it") from None
+    if not isinstance(content, Mapping):
+        raise RigError("holds no keys and values; give the whole file")
+    entries = Entries(content)
+    model = entries.word("lensmodel", "lens_model")
+    if model not in _COUNTS:
+        raise RigError(
+            f"lensmodel is {shown(model)}, which aqualvs lacks; fit another with "
+            "'mrcal-convert-lensmodel LENSMODEL_OPENCV8'"
+        )
+    core = entries.listed(4 + _COUNTS[model], "intrinsics")
+    return ForeignCamera(
+        name=Path(source).stem,
+        size_px=entries.size("imagersize"),
+        lens=opencv_lens(core[:4], core[4:], fisheye=False),
+    )
+
+
+def mrcal_text(camera: ForeignCamera) -> str:
+    """Return the `.cameramodel` of a camera.
+
+    Raises
+    ------
+    RigError
+        If mrcal lacks the camera's model.
+    """
+    lens = camera.lens
+    if lens.model is LensModel.FISHEYE:
+        raise RigError("the lens is a fisheye, whose model mrcal lacks; choose another format")
+    n = len(lens.distortion)
+    name = f"LENSMODEL_OPENCV{n}" if n else "LENSMODEL_PINHOLE"
+    values = [float(one) for one in (lens.fx, lens.fy, lens.cx, lens.cy, *padded(lens, n))]
+    return (
+        "{\n"
+        f"    'lensmodel':  '{name}',\n\n"
+        "    # intrinsics are fx,fy,cx,cy,distortion0,distortion1,....\n"
+        f"    'intrinsics': {values},\n\n"
+        "    # extrinsics are rt_fromref\n"
+        "    'extrinsics': [ 0, 0, 0, 0, 0, 0 ],\n\n"
+        f"    'imagersize': {[*(camera.size_px or (0, 0))]}\n"
+        "}\n"
+    )

@@ -38,8 +38,6 @@ from aqualvs.optics.solved import file_parameter_name, rig_uncertainty, solved_s
 SIGNIFICANT = 5.0
 """Sigmas from which on a change is no chance."""
 
-# No combination of numbers is believed to be known better than this share of their variances.
-_NOT_BETTER = 1e-4
 # Rotations (rad) come back from files with this much rounding, and then some.
 _ROUNDING = 1e-12
 
@@ -89,7 +87,10 @@ class RigDifference:
         scaled, size = change[known] / size[known], size[known]
         correlation = covariance[np.ix_(known, known)] / np.outer(size, size)
         values, vectors = np.linalg.eigh(correlation)
-        return float(np.linalg.norm(scaled @ vectors / np.sqrt(np.maximum(values, _NOT_BETTER))))
+        # No combination of numbers is believed to be known better than this share of their
+        # variances.
+        not_better = 1e-4
+        return float(np.linalg.norm(scaled @ vectors / np.sqrt(np.maximum(values, not_better))))
 
     def has_moved(self, names: Sequence[str]) -> bool | None:
         """Return whether some numbers have moved by more than chance, None where unknown.
@@ -220,8 +221,6 @@ _SHELL_M, _ACRYLIC, _INDEX = 2e-4, 5e-3, 1e-3
 # Of a flat port. It bends a ray by about a quarter of it.
 _PORT_TILT = math.radians(0.2)
 _TILT, _SHIFT_M = math.radians(0.05), 3e-4
-# A laser whose plane is as near as this to one of another name is likely the same.
-_ALIKE_TILT, _ALIKE_SHIFT_M = math.radians(1.0), 5e-3
 
 _SCALES = {"mm": 1e3, "deg": math.degrees(1.0)}
 
@@ -538,7 +537,9 @@ def _laser_mismatches(new: Rig, old: Rig) -> Iterator[str]:
 def _alike(one: Laser, other: Laser) -> bool:
     cosine = float(one.plane.normal @ other.plane.normal)
     shift = one.plane.offset - math.copysign(1.0, cosine) * other.plane.offset
-    return abs(cosine) > math.cos(_ALIKE_TILT) and abs(shift) < _ALIKE_SHIFT_M
+    # A laser whose plane is as near as this to one of another name is likely the same.
+    alike_tilt, alike_shift_m = math.radians(1.0), 5e-3
+    return abs(cosine) > math.cos(alike_tilt) and abs(shift) < alike_shift_m
 
 
 def _table(new: Rig, old: Rig, difference: RigDifference) -> Table:

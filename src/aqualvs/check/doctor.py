@@ -195,7 +195,6 @@ _EXTRAS = {
 """Extra, the packages it brings, what they are for."""
 
 _N_FRAMES, _FRAME_RATE = 40, 25.0
-_MIN_FREE_GB = 2.0
 _STREAM_S = 8.0
 
 
@@ -259,7 +258,8 @@ def _machine() -> Iterator[Finding]:
     words = f"Python {platform.python_version()}, {platform.machine()}, {cores} cores"
     yield Finding(Severity.OK if cores > 1 else Severity.WARN, words)
     free_gb = shutil.disk_usage(Path.cwd()).free / 1e9
-    if free_gb < _MIN_FREE_GB:
+    min_free_gb = 2.0
+    if free_gb < min_free_gb:
         yield Finding(
             Severity.WARN, f"only {free_gb:.1f} GB free here; recordings need about 1 GB an hour"
         )

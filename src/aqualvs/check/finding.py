@@ -72,11 +72,6 @@ def count_text(n: int, word: str) -> str:
     return f"{n} {word}" if n == 1 else f"{n} {word}s"
 
 
-_INDEX_STEP = 1e-4
-# Systematic errors that a user should know of before the dive.
-_LARGE_SHARE, _LARGE_ANGLE_DEG = 0.005, 0.5
-
-
 def expected_errors(rig: Rig, uncertainty: RigUncertainty) -> tuple[ExpectedError, ...]:
     """Return what to expect at the usual ranges that lie in the working range, if any do."""
     if len(rig.lasers) < 2:
@@ -119,10 +114,12 @@ def _calibration_finding(expected: ExpectedError, place: str) -> Finding:
         f"{place} the uncertainty of the rig leaves a systematic error of {range_mm:.2g} mm "
         f"({share:.2%}) in range, {pitch:.2g} degrees in pitch and {yaw:.2g} in yaw (one sigma)"
     )
-    if share > _LARGE_SHARE or max(pitch, yaw) > _LARGE_ANGLE_DEG:
+    # Systematic errors that a user should know of before the dive.
+    large_share, large_angle_deg = 0.005, 0.5
+    if share > large_share or max(pitch, yaw) > large_angle_deg:
         return Finding(
             Severity.WARN,
-            f"{sentence}, more than {_LARGE_SHARE:.1%} or {_LARGE_ANGLE_DEG} degrees; calibrate "
+            f"{sentence}, more than {large_share:.1%} or {large_angle_deg} degrees; calibrate "
             "what is only assumed, or again with more pictures, nearer and farther ones.",
         )
     return Finding(Severity.OK, f"{sentence}.")
@@ -185,9 +182,10 @@ def index_sigma(rig: Rig) -> float:
         return np.inf
     x, z = np.meshgrid(np.linspace(-0.09, 0.09, 10), np.linspace(-0.05, 0.05, 6))
     corners = np.stack([x, np.full_like(x, 0.4), z], axis=-1).reshape(-1, 3)
-    more, seen_more = rig.in_water(rig.n_water + _INDEX_STEP).camera().project(corners)
+    index_step = 1e-4
+    more, seen_more = rig.in_water(rig.n_water + index_step).camera().project(corners)
     here, seen = rig.camera().project(corners)
-    slope = (more - here)[seen & seen_more] / _INDEX_STEP
+    slope = (more - here)[seen & seen_more] / index_step
     information = float(np.sum(slope**2)) / SIGMA_PX**2
     return 1.0 / np.sqrt(information) if information > 0.0 else np.inf
 

@@ -254,8 +254,6 @@ def _angle(rays: Rays, first: int, second: int) -> float:
 
 EXIT_SANE, EXIT_BAD = 0, 2
 
-_N_RANGES = 43
-
 
 def run_check(path: Path, console: Console | None = None) -> int:
     """Check a rig file, print what was found, and return the exit code.
@@ -465,7 +463,8 @@ def _check_lasers(rig: Rig, camera: Camera) -> Iterator[Finding]:
 
 def _check_laser(rig: Rig, camera: Camera, laser: Laser) -> Finding:
     near, far = rig.working_range
-    walls = np.geomspace(near, far, _N_RANGES)
+    n_ranges = 43
+    walls = np.geomspace(near, far, n_ranges)
     sheet = sheet_in(laser, rig.n_air, rig.n_water)
     views = [see_stripe(camera, sheet, float(wall)) for wall in walls]
     seen = np.array([view.visible for view in views])
@@ -475,7 +474,7 @@ def _check_laser(rig: Rig, camera: Camera, laser: Laser) -> Finding:
             f"Laser '{laser.name}' never crosses the picture between {near * 1e3:.0f} and "
             f"{far * 1e3:.0f} mm; check the sign of its offset_mm and its normal.",
         )
-    picked = [i for i in (0, _N_RANGES // 2, _N_RANGES - 1) if seen[i]] or [int(np.argmax(seen))]
+    picked = [i for i in (0, n_ranges // 2, n_ranges - 1) if seen[i]] or [int(np.argmax(seen))]
     places = ", ".join(_place(float(walls[i]), views[i]) for i in picked)
     if seen.all():
         return Finding(Severity.OK, f"Laser '{laser.name}' crosses the picture {places}.")

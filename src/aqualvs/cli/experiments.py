@@ -38,7 +38,7 @@ def benchmark(
 ) -> None:
     """Render the benchmark set."""
     from aqualvs.errors import OptionError
-    from aqualvs.experiments.benchmark import set as body
+    from aqualvs.experiments import benchmark_set as body
 
     if list_:
         body.print_dives(typer.echo)
@@ -80,7 +80,7 @@ def score(
     overwrite: Overwrite = False,
 ) -> None:
     """Score systems."""
-    from aqualvs.experiments.benchmark import score as body
+    from aqualvs.experiments import benchmark_score as body
 
     body.score_and_tell(
         results or [], truth, typer.echo, own=own, out=out, dives=dives, overwrite=overwrite

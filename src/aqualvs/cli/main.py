@@ -18,12 +18,11 @@ import typer
 
 from aqualvs import __version__
 from aqualvs.cli.batch import batch
-from aqualvs.cli.calibrate import board, calibrate
+from aqualvs.cli.calibrate import board, calibrate, export, import_file, schema
 from aqualvs.cli.command import CheckedCommand, CommandGroups
 from aqualvs.cli.design import design
 from aqualvs.cli.experiments import benchmark, reproduce, score
 from aqualvs.cli.follow import follow, tune
-from aqualvs.cli.formats import export, import_file, schema
 from aqualvs.cli.live import doctor, live
 from aqualvs.cli.run import check, demo, figures, net, net_change, report, run, simulate
 from aqualvs.errors import AqualvsError

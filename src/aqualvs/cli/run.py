@@ -48,7 +48,7 @@ def net_change(
     overwrite: Overwrite = False,
 ) -> None:
     """Compare a net between dates."""
-    from aqualvs.net_survey import change_command as body
+    from aqualvs.net_survey import command as body
 
     request = body.NetChangeRequest(
         runs=tuple(runs), out=out, dates=tuple(date or ()), cell_m=cell_m, overwrite=overwrite

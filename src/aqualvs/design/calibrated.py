@@ -172,7 +172,6 @@ def _fitted(points: FloatArray) -> Plane:
 INDEX_ERROR = 0.005
 """Approximate difference of the indices of sea water and fresh water."""
 
-_USUAL = (0.0, 0.5e-3, 1e-3, 2e-3, 5e-3, 10e-3, 20e-3, 40e-3)
 # Greatest offset of a lens, as a share of the inner radius.
 _ROOM = 0.9
 
@@ -224,7 +223,8 @@ def offset_costs(design: Design, ranges: Sequence[float]) -> tuple[OffsetCost, .
     if dome is None:
         return ()
     own = float(np.linalg.norm(design.rig.dome_from_cam.translation))
-    offsets = {round(value, 5) for value in (*_USUAL, own, design.centring)}
+    usual = (0.0, 0.5e-3, 1e-3, 2e-3, 5e-3, 10e-3, 20e-3, 40e-3)
+    offsets = {round(value, 5) for value in (*usual, own, design.centring)}
     rig = design.nominal_rig()
     room = _ROOM * dome.inner_radius
     return tuple(_cost(rig, offset, ranges) for offset in sorted(offsets) if offset <= room)

@@ -28,8 +28,6 @@ _DEG = math.pi / 180.0
 _TILT_STEPS = (2.5 * _DEG, 0.5 * _DEG, 0.1 * _DEG)
 _STRIPE_STEPS = (15.0 * _DEG, 5.0 * _DEG, 1.0 * _DEG)
 _HALF_TILTS, _HALF_STRIPES = 6, 3
-# Factor on the width of the first grid if the stripe's direction is free, too.
-_WIDER = 2.0
 # Number of initial choices of each kind.
 _N_STARTS = 8
 _MAX_ROUNDS = 20
@@ -87,9 +85,11 @@ def _candidates(mount: Mount, i_grid: int, halfway: float) -> list[Mount]:
         return [mount]
     tilts, stripes = [mount.tilt], [mount.stripe]
     first = i_grid == 0
+    # Factor on the width of the first grid if the stripe's direction is free, too.
+    wider = 2.0
     if mount.free_tilt:
         low, high = TILT_LIMITS
-        step = _TILT_STEPS[0] * (_WIDER if mount.free_stripe else 1.0)
+        step = _TILT_STEPS[0] * (wider if mount.free_stripe else 1.0)
         whole = np.arange(low, high + 1e-9, step).tolist()
         tilts = whole if first else _around(mount.tilt, _TILT_STEPS[i_grid], _HALF_TILTS)
     if mount.free_stripe:
@@ -124,10 +124,6 @@ def _starts(lots: Sequence[Sequence[Mount]]) -> list[list[int]]:
         [int(share * len(lot)) for share, lot in zip(start, lots, strict=True)]
         for start in alike + mixed
     ]
-
-
-# Least distance between lasers, in metres.
-_ROOM = 0.03
 
 
 @dataclass(frozen=True, slots=True)
@@ -247,9 +243,11 @@ def _new_mount(design: Design, place: tuple[float, float, float]) -> Mount:
 
 def _free_places(design: Design) -> Iterator[tuple[float, float, float]]:
     places = [mount.position for mount in design.mounts]
+    # Least distance between lasers, in metres.
+    room = 0.03
     for x, y, z in places:
         across = (-x, y, -z)
-        if all(math.dist(across, other) > _ROOM for other in places):
+        if all(math.dist(across, other) > room for other in places):
             yield across
 
 

@@ -46,9 +46,6 @@ from aqualvs.results.files import Claim, writing
 
 RIG_YAML = "rig.yaml"
 
-# Number of ranges at which stripes are checked to be in the picture.
-_N_SEEN = 181
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DesignRequest:
@@ -147,7 +144,9 @@ class _Telling:
 
 def _tell_errors(told: _Telling, design: Design, title: str) -> None:
     """Tell the places of the lasers, their errors, and the part of each tolerance."""
-    closely = predict(design, np.geomspace(*design.rig.working_range, _N_SEEN))
+    # Number of ranges at which stripes are checked to be in the picture.
+    n_seen = 181
+    closely = predict(design, np.geomspace(*design.rig.working_range, n_seen))
     ranges = shown_ranges(design.rig.working_range)
     found = predict(design, ranges)
     causes = {**camera_errors(design, ranges), **found.systematic}

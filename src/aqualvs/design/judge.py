@@ -255,10 +255,6 @@ def _sigmas(covariance: FloatArray) -> FloatArray:
 # Margin of a stripe to the border, as a share of the picture's height, so that it stays in view on
 # oblique targets; and its least length.
 _MARGIN_SHARE, _LENGTH_SHARE = 0.05, 0.3
-# Penalty of a stripe out of the picture, in goals; greatest penalty of crossings.
-_OUT_COST, _CROSSING_SHARE = 20.0, 0.3
-# Square error of no posture, in goals squared.
-_NO_POSTURE = 1e4
 
 
 @dataclass(frozen=True, slots=True)
@@ -346,8 +342,10 @@ class Judge:
             _add_squares(*candidates, matrix, scatter, common, self._ranges, wanted, squares)
         error = np.sqrt(squares.mean(axis=-1) / len(lot.parts))
         short = self._shortfall(lot.stripes) + self._shortfall(others.stripes).sum()
-        total = error * (1.0 + _CROSSING_SHARE * self._crossings(lot.stripes, others.stripes))
-        return error, total + _OUT_COST * short / (1 + len(others))
+        # Penalty of a stripe out of the picture, in goals; greatest penalty of crossings.
+        out_cost, crossing_share = 20.0, 0.3
+        total = error * (1.0 + crossing_share * self._crossings(lot.stripes, others.stripes))
+        return error, total + out_cost * short / (1 + len(others))
 
     def _shortfall(self, stripes: Stripes) -> FloatArray:
         """Return the missing share (K,) of each stripe's least length, mean over the ranges."""
@@ -389,6 +387,8 @@ def _add_squares(
     """Add the mean square error in goals of every candidate and range to `squares` (K, W)."""
     whole, inverse, middle = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     scale = np.empty(3)
+    # Square error of no posture, in goals squared.
+    no_posture = 1e4
     for k in range(matrix.shape[0]):
         for w in range(matrix.shape[1]):
             for i in range(3):
@@ -401,7 +401,7 @@ def _add_squares(
                         middle[i, j] += (common[k, w, g, i] + rest_common[w, g, i]) * (
                             common[k, w, g, j] + rest_common[w, g, j]
                         )
-            square = _NO_POSTURE
+            square = no_posture
             if invert_symmetric(whole, inverse):
                 # Derivatives of yaw, range and pitch by m, each in units of its goal.
                 scale[0], scale[1] = ranges[w] / wanted[2], ranges[w] / wanted[0]
@@ -412,4 +412,4 @@ def _add_squares(
                         for j in range(3):
                             variance = inverse[axis, i] * middle[i, j] * inverse[j, axis]
                             square += scale[axis] ** 2 * variance / 3.0
-            squares[k, w] += min(square, _NO_POSTURE) if square >= 0.0 else _NO_POSTURE
+            squares[k, w] += min(square, no_posture) if square >= 0.0 else no_posture

@@ -29,14 +29,12 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-_STEPS_MM = (10, 20, 50, 100, 200, 250, 500, 1000, 2000)
-_MAX_ROWS = 6
-
-
 def shown_ranges(working_range: tuple[float, float]) -> list[float]:
     """Return round ranges, in metres, from the nearest to the farthest."""
     near, far = (value * 1e3 for value in working_range)
-    step = next((s for s in _STEPS_MM if (far - near) / s <= _MAX_ROWS - 2), far - near)
+    steps_mm = (10, 20, 50, 100, 200, 250, 500, 1000, 2000)
+    max_rows = 6
+    step = next((s for s in steps_mm if (far - near) / s <= max_rows - 2), far - near)
     first = math.floor(near / step) + 1
     inner = [step * i for i in range(first, math.ceil(far / step))]
     return [value * 1e-3 for value in (near, *inner, far)]
@@ -285,7 +283,6 @@ def _table(title: str, first: str = "", right: bool = False) -> Table:
 
 ERRORS_PNG, PICTURE_PNG, DESIGN_HTML = "errors.png", "picture.png", "design.html"
 
-_DPI = 160
 # Errors by the camera's tolerances change little with range.
 _N_RANGES, _N_CAMERA, _N_ALONG = 60, 5, 40
 
@@ -308,9 +305,10 @@ def draw_figures(design: Design, out: Path) -> list[Path]:
     from matplotlib import rc_context
 
     written = []
+    dpi = 160
     with rc_context(STYLE):
         for name, draw in ((ERRORS_PNG, _errors), (PICTURE_PNG, _picture)):
-            draw(design).savefig(out / name, dpi=_DPI)
+            draw(design).savefig(out / name, dpi=dpi)
             written.append(out / name)
     return written
 

@@ -17,11 +17,6 @@ from aqualvs.optics.rig import Laser, Rig
 from aqualvs.optics.sheet import sheet_in
 from aqualvs.scanning.plane_fit import MESH_ERROR, SOLID_ERROR, TWINE_ERROR_PX, SharedError
 
-# Limit of a sheet square to the forward axis, which draws no stripe on a wall ahead.
-_MIN_ACROSS = 1e-3
-# Assumed distance before the dome's centre of a rig's laser without a source of its own.
-_BESIDE_DOME = 0.01
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Mount:
@@ -160,16 +155,20 @@ def mount_of_laser(laser: Laser, rig: Rig, fan: float) -> Mount:
     normal = plane.normal
     side = np.array([normal[0], 0.0, normal[2]])
     length = float(np.linalg.norm(side))
-    if length < _MIN_ACROSS:
+    # Limit of a sheet square to the forward axis, which draws no stripe on a wall ahead.
+    min_across = 1e-3
+    if length < min_across:
         raise RigError(
             f"laser {laser.name}: its plane is square to the forward axis, so it draws no stripe "
             "on a wall ahead; check its normal"
         )
     side /= length
+    # Assumed distance before the dome's centre of a rig's laser without a source of its own.
+    beside_dome = 0.01
     # Beside the dome: the plane's point at this height ahead that is nearest to the axis.
     if laser.window is None:
-        position = side * (plane.offset - normal[1] * _BESIDE_DOME) / length
-        position[1] = _BESIDE_DOME
+        position = side * (plane.offset - normal[1] * beside_dome) / length
+        position[1] = beside_dome
     else:
         source = np.array(sheet.source)
         position = source - float(plane.signed_distance(source)) * normal

@@ -23,10 +23,6 @@ The laser's tilts turn the sheet's normal towards the stripe and towards the bea
 
 # Numbers of points in the search for the ends of a stripe, and in the sums over it (Gauss).
 _N_SEARCH, _N_PASSES, _N_SUM = 33, 2, 24
-# Limit of the fan to either side of the beam: beyond, it meets no wall nearby.
-_WIDEST = np.deg2rad(80.0)
-# As in the scanner: wider pictures are read in lines of two pixels.
-_PIXELS_PER_LINE_FROM = 1280
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,12 +113,16 @@ class _Lines:
 
 def line_pixels(camera: Camera) -> int:
     """Return the width of the scanner's search lines in pixels."""
-    return 2 if camera.size_px[0] >= _PIXELS_PER_LINE_FROM else 1
+    # As in the scanner: wider pictures are read in lines of two pixels.
+    pixels_per_line_from = 1280
+    return 2 if camera.size_px[0] >= pixels_per_line_from else 1
 
 
 def _reach(mount: Mount) -> tuple[float, float]:
     low, high = mount.swing - 0.5 * mount.fan, mount.swing + 0.5 * mount.fan
-    return float(np.tan(max(low, -_WIDEST))), float(np.tan(min(high, _WIDEST)))
+    # Limit of the fan to either side of the beam: beyond, it meets no wall nearby.
+    widest = np.deg2rad(80.0)
+    return float(np.tan(max(low, -widest))), float(np.tan(min(high, widest)))
 
 
 def _visible_ends(

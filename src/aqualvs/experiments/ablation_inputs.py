@@ -42,18 +42,16 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-_CRFS = (20, 26, 32, 38)
-_DEFAULT = 20
-
-
 def _run_video(laboratory: Laboratory) -> ExperimentResult:
     # The clear net of the growth experiment, whose H.264 at the default quality is there already.
     course = scene("clear")
     raw = laboratory.dive(course, recording=Compression(codec="lossless"))
     variants = [_variant(laboratory, raw, "uncompressed")]
-    for crf in _CRFS:
+    crfs = (20, 26, 32, 38)
+    default = 20
+    for crf in crfs:
         dive = laboratory.dive(course, recording=Compression(crf=crf))
-        variants.append(_variant(laboratory, dive, f"H.264 crf {crf}", ours=crf == _DEFAULT))
+        variants.append(_variant(laboratory, dive, f"H.264 crf {crf}", ours=crf == default))
     first, last = variants[1], variants[-1]
     return ExperimentResult(
         sentence=f"Against uncompressed pictures H.264 of good quality changes the range error "
@@ -90,9 +88,6 @@ VIDEO = Experiment(
 
 _TILTS_DEG = (-20.0, 12.0, 25.0)
 """Of the windows of the three lasers, against square to the beam, across the sheet."""
-
-_BEFORE_SOURCE = 0.02
-_GRID_PX = 24
 
 
 def before_wall() -> Scenario:
@@ -158,7 +153,8 @@ def _behind_windows(rig: Rig) -> Rig:
 def _behind_window(laser: Laser, source: LaserSource, tilt: float) -> Laser:
     normal = source.direction + np.tan(tilt) * laser.plane.normal
     normal /= np.linalg.norm(normal)
-    face = Plane(normal, float(normal @ source.position) + _BEFORE_SOURCE)
+    before_source = 0.02
+    face = Plane(normal, float(normal @ source.position) + before_source)
     return replace(laser, window=Window(face, source.position))
 
 
@@ -175,7 +171,8 @@ def _off_plane_mm(rig: Rig) -> list[float]:
     """Return for each laser how far what the camera sees of its sheet leaves its best plane."""
     camera, (near, far) = rig.camera(), rig.working_range
     width, height = rig.size_px
-    x, y = np.meshgrid(np.arange(0.0, width, _GRID_PX), np.arange(0.0, height, _GRID_PX))
+    grid_px = 24
+    x, y = np.meshgrid(np.arange(0.0, width, grid_px), np.arange(0.0, height, grid_px))
     rays = camera.rays(np.stack([x, y], axis=-1))
     found = []
     for sheet in sheets_of(rig):

@@ -60,10 +60,6 @@ TYPICAL_S: Mapping[str, float] = {
 }
 """Seconds, to guess what is left; only their ratios matter once some are done."""
 
-_UNKNOWN_S = 25.0
-# As if so many typical seconds had gone by before: the first, short experiments say little.
-_TRUST_S = 20.0
-
 
 class TimeLeft:
     """Guess of the time that is left, from what the experiments so far took.
@@ -77,7 +73,8 @@ class TimeLeft:
     """
 
     def __init__(self, names: Sequence[str], now: Callable[[], float] = time.monotonic) -> None:
-        self._to_come = {name: TYPICAL_S.get(name, _UNKNOWN_S) for name in names}
+        unknown_s = 25.0
+        self._to_come = {name: TYPICAL_S.get(name, unknown_s) for name in names}
         self._now = now
         self._running = 0.0
         self._done = 0.0
@@ -107,7 +104,9 @@ class TimeLeft:
 
     def _pace(self) -> float:
         """Return seconds per typical second."""
-        return (_TRUST_S + self._began - self._started) / (_TRUST_S + self._done)
+        # As if so many typical seconds had gone by before: the first, short experiments say little.
+        trust_s = 20.0
+        return (trust_s + self._began - self._started) / (trust_s + self._done)
 
     def _ahead(self) -> float:
         """Return typical seconds ahead; one that takes too long is held at nine tenths."""
@@ -198,7 +197,6 @@ Echo: TypeAlias = Callable[[str], object]
 Load: TypeAlias = Callable[[str], Experiment]
 
 _FAILURES = "failures"
-_EXIT_FAILED = 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -268,7 +266,8 @@ def reproduce(request: ReproduceRequest, echo: Echo, load: Load = catalogue.expe
     claim.close()
     for line in _closing(book, names, request.out):
         echo(line)
-    return _EXIT_FAILED if any(book.records[name].failure for name in names) else 0
+    exit_failed = 1
+    return exit_failed if any(book.records[name].failure for name in names) else 0
 
 
 class _Book:

@@ -13,7 +13,7 @@ from aqualvs.calibration.camera.calibrate import CameraCalibration, camera
 from aqualvs.calibration.detection.detection import detect_board
 from aqualvs.calibration.dome.calibrate import dome
 from aqualvs.calibration.dome.problem import BoardSet, DomeOptions, dome_problem
-from aqualvs.calibration.solver.priors import rig_difference, rig_numbers
+from aqualvs.calibration.solver.bundle import rig_difference, rig_numbers
 from aqualvs.calibration.solver.result import DomeCalibration, rms_px
 from aqualvs.calibration.targets.pose_files import BoardPose, load_poses, match_poses, picture_paths
 from aqualvs.calibration.targets.target_files import load_board

@@ -34,8 +34,6 @@ PICKS = ("left", "central", "right")
 _FRAMES = 2
 _PAPER_FACTOR, _PAPER_PERCENT = 5, 5.3
 _BAR_FACTOR, _BAR_PERCENT = 40.0, 0.5
-# As far as a box or a board stands when lasers are calibrated, in metres.
-_CALIBRATED_TO = 0.65
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,7 +187,9 @@ def _calibrated_without(rays: Rays, true: FloatArray) -> Plane:
 
     The rays are cut off at the wall's true distance; the plane goes through these ends.
     """
-    near = true <= _CALIBRATED_TO
+    # As far as a box or a board stands when lasers are calibrated, in metres.
+    calibrated_to = 0.65
+    near = true <= calibrated_to
     origins, directions = rays.origins[near], rays.directions[near]
     way = (true[near, None] - origins[..., 1]) / directions[..., 1]
     ends = (origins + way[..., None] * directions).reshape(-1, 3)

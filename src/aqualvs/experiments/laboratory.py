@@ -269,7 +269,6 @@ def _digest(facts: Mapping[str, Any] | list[Any]) -> str:
 
 
 QUANTITIES = ("range (%)", "pitch (degrees)", "yaw (degrees)")
-_LEAST = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -339,14 +338,15 @@ def drawn(variants: Sequence[Variant]) -> "Figure":
     names = [one.name for one in variants]
     rms = np.array([one.rms for one in variants])
     valid = np.array([one.valid_percent for one in variants])
+    least = 1e-3
     with rc_context(dict(STYLE)):
         figure = new_figure(0.9 + 0.3 * len(variants))
         panels = figure.subplots(1, 4, sharey=True)
         for k, axes in enumerate(panels[:3]):
             _bars(axes, variants, rms[:, k], QUANTITIES[k])
             axes.set_xscale("log")
-            low = np.nanmin(np.where(rms > 0.0, rms, np.nan)) if np.isfinite(rms).any() else _LEAST
-            axes.set_xlim(0.5 * max(low, _LEAST), 4.0 * max(np.nanmax(rms), 2.0 * _LEAST))
+            low = np.nanmin(np.where(rms > 0.0, rms, np.nan)) if np.isfinite(rms).any() else least
+            axes.set_xlim(0.5 * max(low, least), 4.0 * max(np.nanmax(rms), 2.0 * least))
         _bars(panels[3], variants, valid, "valid frames (%)")
         panels[3].set_xlim(0.0, 125.0)
         panels[0].set_yticks(range(len(names)), names)

@@ -10,8 +10,7 @@ import numpy as np
 from aqualvs.calibrate.common import read_colour, read_grey
 from aqualvs.calibration.detection.detection import detect_markers
 from aqualvs.calibration.lasers.calibrate import LaserOptions, calibrate_lasers
-from aqualvs.calibration.lasers.checks import like
-from aqualvs.calibration.lasers.report import LaserCalibration, LaserFigures
+from aqualvs.calibration.lasers.checks import LaserCalibration, LaserFigures, like
 from aqualvs.calibration.lasers.stripes_on_planes import StripePoints, box_surfaces
 from aqualvs.calibration.lasers.views import LaserView
 from aqualvs.calibration.targets.pose_files import picture_paths

@@ -55,8 +55,6 @@ _FORMATS: Mapping[str, Mapping[str, str | None]] = {
     "svg": {"Date": None, "Creator": None},
 }
 _MADE_BY = "made_by.txt"
-# What rounding differs by from run to run stays hidden.
-_DIGITS = 7
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -245,8 +243,10 @@ def _plain(column: Column) -> list[Any]:
 
 def _cell(value: str | int | float) -> str:
     """Return a value as text; nothing where there is no number."""
+    # What rounding differs by from run to run stays hidden.
+    digits = 7
     if isinstance(value, float):
-        return f"{value:.{_DIGITS}g}" if math.isfinite(value) else ""
+        return f"{value:.{digits}g}" if math.isfinite(value) else ""
     return str(value)
 
 
@@ -260,7 +260,6 @@ PAGE = "reproduce.html"
 FRAME = "a frame"
 """Among the times: what the scanner takes for one frame (median); no experiment has this name."""
 
-_PAPERS_FPS = 25
 
 _DASH = "–"
 # A drawing with more marks than this weighs more than its picture, and opens slower.
@@ -332,9 +331,10 @@ def _cards(records: Sequence[Record], seconds: Mapping[str, float]) -> Iterator[
     yield Card("bars met", f"{sum(map(bool, bars))} of {len(bars)}", "what we hold ourselves to")
     yield Card("experiments", f"{done} of {len(records)}", "done; each can be run alone")
     yield Card("time", duration(took), f"on {os.cpu_count() or 1} cores")
+    papers_fps = 25
     if FRAME in seconds:
         rate = 1.0 / seconds[FRAME]
-        yield Card("speed", f"{rate:.0f} fps", f"scanning, median frame; the paper: {_PAPERS_FPS}")
+        yield Card("speed", f"{rate:.0f} fps", f"scanning, median frame; the paper: {papers_fps}")
 
 
 def _notice(records: Sequence[Record]) -> str:

@@ -31,9 +31,6 @@ if TYPE_CHECKING:
 
 
 _FAR = 1.0
-_DRAWN_MM = 135.0
-# Walls whose stripes are drawn, metres.
-_WALLS = (0.3, 0.52, 1.0)
 # Rays of the drawing: rows of the picture, as shares of its height.
 _ROWS = (0.0, 0.2, 0.45, 0.7, 1.0)
 
@@ -208,9 +205,11 @@ def _draw(figure: "Figure", laboratory: Laboratory, traced: Bending) -> None:
 
 def _draw_stripes(axes: "Axes", rig: Rig, sheet: Sheet, i: int) -> None:
     """Draw where a laser's stripe lies on walls square ahead, the middle of them full."""
-    for far in _WALLS:
+    # Walls whose stripes are drawn, metres.
+    walls = (0.3, 0.52, 1.0)
+    for far in walls:
         pixels = see_stripe(rig.camera(), sheet, far).pixels
-        full = far == _WALLS[1]
+        full = far == walls[1]
         axes.plot(
             *pixels.T,
             "-" if full else "--",
@@ -233,12 +232,13 @@ def _draw_section(axes: "Axes", rig: Rig, traced: Bending) -> None:
         alpha=0.45,
         linewidth=0.0,
     )
+    drawn_mm = 135.0
     for i in range(len(traced.inner)):
         start, bend, leave = 1e3 * traced.lens, 1e3 * traced.inner[i], 1e3 * traced.outer[i]
-        reach = (_DRAWN_MM - start[1]) / traced.straight[i, 1]
+        reach = (drawn_mm - start[1]) / traced.straight[i, 1]
         on = start + reach * traced.straight[i]
         axes.plot([bend[1], on[1]], [bend[2], on[2]], ":", color=PAPER, linewidth=1.0)
-        reach = (_DRAWN_MM - leave[1]) / traced.water[i, 1]
+        reach = (drawn_mm - leave[1]) / traced.water[i, 1]
         end = leave + reach * traced.water[i]
         way = np.array([start, bend, leave, end])
         axes.plot(way[:, 1], way[:, 2], color=OURS)
@@ -256,7 +256,7 @@ def _draw_section(axes: "Axes", rig: Rig, traced: Bending) -> None:
     axes.text(4, -7, "centre S'", color=DARK, fontsize=7.5)
     axes.text(16, -62, "acrylic", color=GREY, fontsize=7.5)
     axes.text(88, -66, "water", color=BLUE, fontsize=7.5)
-    axes.set(aspect="equal", xlim=(-6, _DRAWN_MM), ylim=(-72, 72))
+    axes.set(aspect="equal", xlim=(-6, drawn_mm), ylim=(-72, 72))
     axes.set(xlabel="y, forward (mm)", ylabel="z, up (mm)")
 
 

@@ -1,7 +1,8 @@
-"""Small linear algebra for compiled kernels, where calling LAPACK costs more than the solution.
+"""Small linear algebra, quantiles and sums for compiled kernels.
 
-Three-vectors are tuples, so that they stay in registers. Symmetric 3 x 3 systems are solved by
-cofactors, positive definite systems of a few unknowns by their Cholesky factor.
+For small systems, calling LAPACK costs more than the solution. Three-vectors are tuples, so that
+they stay in registers. Symmetric 3 x 3 systems are solved by cofactors, positive definite systems
+of a few unknowns by their Cholesky factor.
 """
 
 import math
@@ -9,7 +10,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from aqualvs.geometry.arrays import FloatArray
+from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.compiled import (
     borrowing_kernel,
     inline_borrowing_kernel,
@@ -81,10 +82,6 @@ def row3(values: FloatArray, i: int, j: int) -> Vec:
     return values[i, j], values[i, j + 1], values[i, j + 2]
 
 
-# Relative to the product of the diagonal: a smaller determinant is rounding, not information.
-_SINGULAR = 1e-13
-
-
 @inline_kernel
 def invert_symmetric(matrix: FloatArray, inverse: FloatArray) -> bool:
     """Invert a positive definite 3 x 3 matrix by its cofactors; only its lower half is read.
@@ -95,7 +92,9 @@ def invert_symmetric(matrix: FloatArray, inverse: FloatArray) -> bool:
     d, e, f = matrix[1, 1], matrix[2, 1], matrix[2, 2]
     c00, c01, c02 = d * f - e * e, c * e - b * f, b * e - c * d
     determinant = a * c00 + b * c01 + c * c02
-    if not determinant > _SINGULAR * a * d * f:
+    # Relative to the product of the diagonal: a smaller determinant is rounding, not information.
+    singular = 1e-13
+    if not determinant > singular * a * d * f:
         return False
     inverse[0, 0] = c00 / determinant
     inverse[0, 1] = inverse[1, 0] = c01 / determinant
@@ -166,3 +165,53 @@ def inverse_of(factor: FloatArray) -> FloatArray:
     for k in range(len(factor)):
         solve_factorised(factor, inverse[k], inverse[k])
     return inverse
+
+
+_N_BINS = 256
+
+
+@kernel
+def element_at(values: FloatArray, share: float) -> float:
+    """Return the element below which a share of the values lie; 0 if there are no values.
+
+    NaN counts as highest. The values are counted in bins, and only one bin is sorted; a partition
+    takes longer, because its branches cannot be predicted.
+    """
+    n = values.shape[0]
+    if n == 0:
+        return 0.0
+    low, high = np.inf, -np.inf
+    for i in range(n):
+        low = values[i] if values[i] < low else low
+        high = values[i] if values[i] > high else high
+    per_level = _N_BINS / (high - low) if low < high else 0.0
+    count, rank = np.zeros(_N_BINS + 1, np.int64), int(share * (n - 1))
+    for i in range(n):
+        count[_bin_of(values[i], low, per_level)] += 1
+    # The bin that holds the element, and the number of values in lower bins.
+    which, below = 0, 0
+    while below + count[which] <= rank:
+        below += count[which]
+        which += 1
+    found, n_found = np.empty(count[which]), 0
+    for i in range(n):
+        if _bin_of(values[i], low, per_level) == which:
+            found[n_found] = values[i]
+            n_found += 1
+    # Sorted by indices, as elsewhere: each kind of sort takes long to compile.
+    return float(found[np.argsort(found)[rank - below]])
+
+
+@inline_kernel
+def sum_of(values: FloatArray | IntArray) -> float:
+    """Return the sum of values; takes less time to compile than `numpy.sum`."""
+    found = 0.0
+    for i in range(values.shape[0]):
+        found += values[i]
+    return found
+
+
+@inline_borrowing_kernel
+def _bin_of(value: float, low: float, per_level: float) -> int:
+    place = (value - low) * per_level
+    return int(place) if place < _N_BINS else _N_BINS

@@ -1,15 +1,27 @@
-"""`aqualvs net`: the condition of a net, from a dive or from a run of it."""
+"""`aqualvs net`: condition of a net, from a dive or a run; `aqualvs net-change`: between dates."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from aqualvs.errors import OptionError, SourceError
+from aqualvs.net_survey.surveys import (
+    Survey,
+    check_surveys,
+    date_of_run,
+    find_runs,
+    given_dates,
+    left_out,
+    read_survey,
+)
 from aqualvs.nets.target_file import NetRequest
 from aqualvs.optics.rigfile import rig_from_mapping
 from aqualvs.pipeline import run_and_print
 from aqualvs.report.run_page import write_report
+from aqualvs.results.files import Claim, writing
 from aqualvs.results.folder import (
     NET_FILES,
     NET_MAP_PNG,
@@ -23,6 +35,9 @@ from aqualvs.results.net_survey import NetPass, check_stored, read_run
 from aqualvs.results.run_request import RunRequest, read_run_yaml, scanner_options
 from aqualvs.sources.opening import folder_beside
 from aqualvs.terminal import StopSignals, progress
+
+if TYPE_CHECKING:
+    from aqualvs.net_survey.comparison import Comparison
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -168,3 +183,85 @@ def _run_file(run_folder: Path) -> dict[str, Any]:
     if not isinstance(content.get("rig"), dict):
         raise SourceError(f"{run_folder / RUN_YAML}: holds no rig; run the dive again")
     return content
+
+
+NET_CHANGE_CSV, HOLES_CHANGE_CSV = "net_change.csv", "holes_change.csv"
+NET_CHANGE_PNG, NET_CHANGE_HTML = "net_change.png", "net_change.html"
+NET_CHANGE_FILES = (NET_CHANGE_CSV, HOLES_CHANGE_CSV, NET_CHANGE_PNG, NET_CHANGE_HTML)
+"""What is written."""
+
+_GIVEN = "the user"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NetChangeRequest:
+    """Request for `aqualvs net-change`.
+
+    Attributes
+    ----------
+    runs : tuple of Path
+        Folders of runs, or of batches.
+    out : Path
+        Folder to write.
+    dates : tuple of str
+        None, or one for each of `runs`.
+    cell_m : float
+        Side of the map's cells.
+    overwrite : bool
+    """
+
+    runs: tuple[Path, ...]
+    out: Path
+    dates: tuple[str, ...] = ()
+    cell_m: float = 1.0
+    overwrite: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuse values that cannot be."""
+        if not 0.0 < self.cell_m < np.inf:
+            raise OptionError(f"--cell-m {self.cell_m:g}: must be positive; correct it")
+
+
+def net_change(request: NetChangeRequest, echo: Callable[[str], object]) -> "Comparison":
+    """Compare dives along the same net, write the changes and print them.
+
+    Raises
+    ------
+    AqualvsError
+        If a run cannot be read or a file not be written, or there is nothing to compare.
+    """
+    # `aqualvs net` and the processes of a batch need neither SciPy nor charts.
+    from aqualvs.net_survey.comparison import compare
+    from aqualvs.net_survey.page import draw_change, write_page
+    from aqualvs.net_survey.tables import summary_lines, write_tables
+
+    surveys, origins = _surveys(request)
+    check_surveys(surveys)
+    files = [request.out / name for name in NET_CHANGE_FILES]
+    with Claim("net-change", files, overwrite=request.overwrite):
+        for folder in request.runs:
+            for line in left_out(folder):
+                echo(line)
+        for one in surveys:
+            echo(f"{one.folder}: {one.date} ({origins[str(one.folder)]})")
+        result = compare(surveys, request.cell_m)
+        with writing(request.out):
+            write_tables(request.out, result, (NET_CHANGE_CSV, HOLES_CHANGE_CSV))
+            draw_change(result, request.out / NET_CHANGE_PNG)
+            write_page(request.out / NET_CHANGE_HTML, request.out / NET_CHANGE_PNG, result, origins)
+    for line in summary_lines(result):
+        echo(line)
+    echo(f"page: {request.out / NET_CHANGE_HTML}")
+    return result
+
+
+def _surveys(request: NetChangeRequest) -> tuple[list[Survey], dict[str, str]]:
+    """Return the dives, and the source of each date."""
+    given = given_dates(request.dates, len(request.runs))
+    surveys, origins = [], {}
+    for folder, day in zip(request.runs, given, strict=True):
+        for run in find_runs(folder):
+            found, origin = (day, _GIVEN) if day is not None else date_of_run(run)
+            surveys.append(read_survey(run, found))
+            origins[str(run)] = origin
+    return surveys, origins

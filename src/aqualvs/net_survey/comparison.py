@@ -1,18 +1,29 @@
-"""Comparison of dives along the same net: from the files of the runs to the changes."""
+"""Comparison of dives along the same net: from the files of the runs to the changes.
+
+Hole sites are holes that stay, are new, are gone, or were not passed again (`find_sites`).
+"""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import date
+from enum import StrEnum
 
 import numpy as np
+from scipy import optimize, sparse, stats
 
-from aqualvs.net_survey.alignment import SurveyShift, align, shifted
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.net_survey.frames import (
     PlacedSurvey,
+    Raster,
+    SurveyShift,
     WallFrame,
+    align,
     common_frame,
     has_places,
+    looked_at,
     place_survey,
+    shifted,
+    wrapped,
 )
 from aqualvs.net_survey.growth import (
     COMMON,
@@ -25,11 +36,273 @@ from aqualvs.net_survey.growth import (
     history,
     wall_growth,
 )
-from aqualvs.net_survey.hole_sites import Site, find_sites
 from aqualvs.net_survey.surveys import Survey
 
-# Dives along nets whose bars differ by so much, as a share, are hardly of one net.
-_OTHER_NET = 0.1
+# Two holes are one if their places differ by no more than chance makes in all but one of 1000.
+_GATE = float(stats.chi2.isf(1e-3, 2))
+# The middle of what lasers saw of a hole is off the hole's by this share of its diameter.
+_MIDDLE = 0.25
+# Lasers looked at a place if they did so with this chance, given how well places are known.
+LOOKED = 0.8
+# A hole has grown beyond chance in all but one of 100.
+_GROWN = float(stats.norm.isf(0.005))
+_SIDE = 0.1
+_MAX_SQUARES = 4_000_000
+_DRAWS = 256
+MISSED = 0.3
+"""Share of the holes that lasers swept over and that one dive does not find
+(docs/net-condition.md: 15 of 21 were found)."""
+
+
+class HoleState(StrEnum):
+    """Change of a hole between dates; the value is that of `state` in `holes_change.csv`."""
+
+    NEW = "new"
+    """Seen on the last date, and not when an earlier dive looked there."""
+    GROWN = "grown"
+    SMALLER = "smaller"
+    SAME = "same"
+    GONE = "gone"
+    """Not seen when a dive of the last date looked there: mended, or missed."""
+    FIRST_LOOK = "not looked at before"
+    """Seen on the last date; no earlier dive looked there."""
+    NOT_PASSED = "not looked at now"
+    """Seen on an earlier date; no dive of the last date looked there."""
+
+
+@dataclass(frozen=True, slots=True)
+class Site:
+    """A place on the net with a hole on one date or more.
+
+    Attributes
+    ----------
+    state : HoleState
+    place, sigma : array, shape (2,)
+        u and d in metres.
+    sizes, sigma_sizes : array, shape (V,)
+        Diameter on each date in metres; NaN where it was not seen.
+    looked : array, shape (V,)
+        Chance that lasers looked there on each date.
+    numbers : list of str
+        Run and number in its `holes.csv`.
+    """
+
+    state: HoleState
+    place: FloatArray
+    sigma: FloatArray
+    sizes: FloatArray
+    sigma_sizes: FloatArray
+    looked: FloatArray
+    numbers: list[str]
+
+    @property
+    def missed(self) -> float:
+        """Chance that a hole there escaped all looks on the dates on which it was not seen.
+
+        For a new hole those of the earlier dates, for one that is gone those of the last.
+        """
+        unseen = self.looked[~np.isfinite(self.sizes)]
+        if self.state is HoleState.GONE:
+            unseen = self.looked[-1:]
+        return float(MISSED ** np.count_nonzero(unseen >= LOOKED))
+
+
+def find_sites(
+    placed: Sequence[PlacedSurvey], shifts: Sequence[SurveyShift], frame: WallFrame
+) -> list[Site]:
+    """Bring holes of dives, already shifted, together.
+
+    Parameters
+    ----------
+    placed : sequence
+    shifts : sequence
+        What each shift leaves open is in its sigma.
+    frame : WallFrame
+    """
+    dates = sorted({one.survey.date for one in placed})
+    parts = [(i, k) for i, one in enumerate(placed) for k in _known(one)]
+    if not parts:
+        return []
+    place = np.array([placed[i].holes[k] for i, k in parts])
+    sigma = np.array([np.hypot(placed[i].sigma, shifts[i].sigma) for i, _ in parts])
+    size = np.array([placed[i].survey.holes.diameter[k] for i, k in parts])
+    of_run = np.array([i for i, _ in parts])
+    group = _groups(place, sigma, size, of_run, frame)
+    visits = _Visits.of(placed, shifts, frame)
+    return [
+        _site(np.flatnonzero(group == g), parts, (place, sigma), placed, dates, visits)
+        for g in dict.fromkeys(group)
+    ]
+
+
+def _known(one: PlacedSurvey) -> IntArray:
+    return np.flatnonzero(np.isfinite(one.holes).all(axis=1))
+
+
+def _groups(
+    place: FloatArray, sigma: FloatArray, size: FloatArray, of_run: IntArray, frame: WallFrame
+) -> IntArray:
+    """Return numbers of groups (n,), dive after dive, of holes that are one.
+
+    Of two dives each hole has one counterpart, at most: those of all pairs within the uncertainty
+    that together lie nearest. Parts that touch in one dive are one hole, unless another dive told
+    them apart as well.
+    """
+    group = np.full(len(place), -1, np.int64)
+    for run in np.unique(of_run):
+        mine, known = np.flatnonzero(of_run == run), np.flatnonzero(group >= 0)
+        distance, inside = _distances(mine, known, (place, sigma, size), frame)
+        found = _counterparts(distance, group[known])
+        for k, hole in enumerate(mine):
+            if found[k] < 0 and inside[k].any():
+                # A piece of a hole that another dive saw whole.
+                found[k] = group[known[np.argmin(np.where(inside[k], distance[k], np.inf))]]
+            group[hole] = found[k] if found[k] >= 0 else group.max() + 1
+    return _joined(group, _touching(place, size, of_run, frame), of_run)
+
+
+def _touching(place: FloatArray, size: FloatArray, of_run: IntArray, frame: WallFrame) -> BoolArray:
+    """Mark the pairs of holes of one dive that touch."""
+    off = np.hypot(*wrapped(place[:, None] - place[None], frame).transpose(2, 0, 1))
+    # Parts of one hole are no farther apart than a strand or two, in metres.
+    gap = 0.03
+    near = off <= 0.5 * (size[:, None] + size[None]) + gap
+    return np.asarray(near & (of_run[:, None] == of_run[None]))
+
+
+def _joined(group: IntArray, touching: BoolArray, of_run: IntArray) -> IntArray:
+    """Join groups whose holes touch in the one dive that saw both."""
+    n = int(group.max()) + 1
+    seen = np.zeros((n, int(of_run.max()) + 1), np.bool_)
+    seen[group, of_run] = True
+    join = np.zeros((n, n), np.bool_)
+    for i, k in np.argwhere(touching):
+        join[group[i], group[k]] |= np.count_nonzero(seen[group[i]] & seen[group[k]]) == 1
+    _, number = sparse.csgraph.connected_components(
+        sparse.csr_array(join.astype(np.float64)), directed=False
+    )
+    return np.asarray(number[group], np.int64)
+
+
+def _distances(
+    mine: IntArray,
+    known: IntArray,
+    holes: tuple[FloatArray, FloatArray, FloatArray],
+    frame: WallFrame,
+) -> tuple[FloatArray, BoolArray]:
+    """Return squares of distances by uncertainty (n, m), and what lies inside known holes."""
+    place, sigma, size = holes
+    off = wrapped(place[mine][:, None] - place[known][None], frame)
+    middle = _MIDDLE * np.maximum(size[mine][:, None], size[known][None])
+    variance = sigma[mine][:, None] ** 2 + sigma[known][None] ** 2 + middle[..., None] ** 2
+    inside = np.hypot(off[..., 0], off[..., 1]) <= 0.5 * size[known][None]
+    return np.asarray((off**2 / variance).sum(axis=-1)), np.asarray(inside)
+
+
+def _counterparts(distance: FloatArray, group: IntArray) -> IntArray:
+    """Return the group that each hole belongs to, no group twice; -1 where to none."""
+    found = np.full(len(distance), -1, np.int64)
+    numbers = np.unique(group)
+    if not len(numbers):
+        return found
+    nearest = np.stack([distance[:, group == g].min(axis=1) for g in numbers], axis=1)
+    cost = np.where(nearest < _GATE, nearest, 2.0 * _GATE)
+    for k, g in zip(*optimize.linear_sum_assignment(cost), strict=True):
+        if nearest[k, g] < _GATE:
+            found[k] = numbers[g]
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class _Visits:
+    """Places that the lasers of each dive looked at, with their uncertainty."""
+
+    raster: Raster
+    seen: list[BoolArray]
+    sigma: list[FloatArray]
+    visit: list[int]
+
+    @classmethod
+    def of(
+        cls, placed: Sequence[PlacedSurvey], shifts: Sequence[SurveyShift], frame: WallFrame
+    ) -> "_Visits":
+        corners = np.concatenate([one.outline.reshape(-1, 2) for one in placed])
+        low, high = corners.min(axis=0), corners.max(axis=0)
+        side = max(_SIDE, float(np.sqrt(np.prod(high - low) / _MAX_SQUARES)))
+        raster = Raster.over(low, high, side, frame)
+        dates = sorted({one.survey.date for one in placed})
+        return cls(
+            raster,
+            [looked_at(one, raster) for one in placed],
+            [np.hypot(a.sigma, b.sigma) for a, b in zip(placed, shifts, strict=True)],
+            [dates.index(one.survey.date) for one in placed],
+        )
+
+    def chance(self, place: FloatArray, sigma: FloatArray, n_dates: int) -> FloatArray:
+        """Return with what chance (V,) a place was looked at on each date."""
+        found = np.zeros(n_dates)
+        for seen, own, visit in zip(self.seen, self.sigma, self.visit, strict=True):
+            at = place + _normal() * np.hypot(sigma, own)
+            index = self.raster.index(at)
+            share = float(np.mean(np.where(index >= 0, seen[index], False)))
+            found[visit] = max(found[visit], share)
+        return found
+
+
+def _normal() -> FloatArray:
+    """Return places (n, 2) spread like a normal distribution, always the same ones."""
+    n = int(np.sqrt(_DRAWS))
+    at = stats.norm.ppf((np.arange(n) + 0.5) / n)
+    return np.stack(np.meshgrid(at, at), axis=-1).reshape(-1, 2)
+
+
+def _site(
+    mine: IntArray,
+    parts: Sequence[tuple[int, int]],
+    where: tuple[FloatArray, FloatArray],
+    placed: Sequence[PlacedSurvey],
+    dates: Sequence[date],
+    visits: _Visits,
+) -> Site:
+    place, sigma = where
+    best = mine[np.argmin(sigma[mine].prod(axis=1))]
+    n_dates = len(dates)
+    sizes, errors = np.full(n_dates, np.nan), np.full(n_dates, np.nan)
+    for i in {parts[k][0] for k in mine}:
+        holes, visit = placed[i].survey.holes, dates.index(placed[i].survey.date)
+        numbers = [parts[k][1] for k in mine if parts[k][0] == i]
+        # Parts of one hole that a dive saw apart add up by area.
+        size = float(np.linalg.norm(holes.diameter[numbers]))
+        # A dive sees too little of a hole, never too much: of one date the largest counts.
+        if not size <= sizes[visit]:
+            sizes[visit], errors[visit] = size, float(np.linalg.norm(holes.sigma[numbers]))
+    looked = visits.chance(place[best], sigma[best], n_dates)
+    looked[np.isfinite(sizes)] = 1.0
+    return Site(
+        state=_state(sizes, errors, looked),
+        place=place[best],
+        sigma=sigma[best],
+        sizes=sizes,
+        sigma_sizes=errors,
+        looked=looked,
+        numbers=[
+            f"{placed[parts[k][0]].survey.name}:{placed[parts[k][0]].survey.holes.number[parts[k][1]]}"
+            for k in mine
+        ],
+    )
+
+
+def _state(sizes: FloatArray, errors: FloatArray, looked: FloatArray) -> HoleState:
+    seen = np.isfinite(sizes)
+    before = np.flatnonzero(seen[:-1])
+    if not seen[-1]:
+        return HoleState.GONE if looked[-1] >= LOOKED else HoleState.NOT_PASSED
+    if not len(before):
+        return HoleState.NEW if (looked[:-1] >= LOOKED).any() else HoleState.FIRST_LOOK
+    change = sizes[-1] - sizes[before[-1]]
+    if abs(change) <= _GROWN * np.hypot(errors[-1], errors[before[-1]]):
+        return HoleState.SAME
+    return HoleState.GROWN if change > 0.0 else HoleState.SMALLER
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,7 +466,9 @@ def _warnings(surveys: Sequence[Survey]) -> list[str]:
     found = []
     bars = [one.facts.get("summary", {}).get("bar_mm") for one in surveys]
     known = [bar for bar in bars if isinstance(bar, int | float)]
-    if known and max(known) > (1.0 + _OTHER_NET) * min(known):
+    # Dives along nets whose bars differ by so much, as a share, are hardly of one net.
+    other_net = 0.1
+    if known and max(known) > (1.0 + other_net) * min(known):
         found.append(
             f"meshes differ, from {min(known):.1f} to {max(known):.1f} mm bar: is it the same net?"
         )

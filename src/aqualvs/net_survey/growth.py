@@ -12,8 +12,7 @@ import numpy as np
 from scipy import sparse, stats
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.net_survey.alignment import SurveyShift
-from aqualvs.net_survey.frames import PlacedSurvey, Raster, WallFrame, spread_over
+from aqualvs.net_survey.frames import PlacedSurvey, Raster, SurveyShift, WallFrame, spread_over
 
 SIGMA_SCALE = 1.4
 """By which sigmas of solidity are too small (docs/net-condition.md)."""

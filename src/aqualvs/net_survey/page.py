@@ -15,9 +15,8 @@ import numpy as np
 
 from aqualvs import __version__
 from aqualvs.geometry.arrays import FloatArray, IntArray
-from aqualvs.net_survey.comparison import Comparison, OnWall
+from aqualvs.net_survey.comparison import Comparison, HoleState, OnWall, Site
 from aqualvs.net_survey.growth import Growth
-from aqualvs.net_survey.hole_sites import HoleState, Site
 from aqualvs.net_survey.tables import (
     bearing_deg,
     by_state,
@@ -41,9 +40,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-_DPI = 200
-_WIDTH_IN, _PANEL_IN, _AROUND_IN, _ROW_GAP_IN = 11.0, 9.2, 1.7, 0.45
-_TALLEST_IN, _MIN_RATIO, _MAX_ROWS = 7.0, 0.16, 6
 _WEEK = 7.0
 # From green (less) over white to brown (more); told apart by colour-blind eyes.
 _COLOURS = "BrBG_r"
@@ -81,9 +77,10 @@ def draw_change(result: Comparison, path: Path) -> None:
     """
     import matplotlib as mpl
 
+    dpi = 200
     with mpl.rc_context(_STYLE):
         figure = _dates(result) if result.wall is None else _map(result.wall)
-        figure.savefig(path, dpi=_DPI)
+        figure.savefig(path, dpi=dpi)
 
 
 def _map(wall: OnWall) -> "Figure":
@@ -94,11 +91,13 @@ def _map(wall: OnWall) -> "Figure":
     low = raster.low[1] - 0.3 * raster.size[1]
     high = raster.low[1] + (raster.shape[1] + 0.3) * raster.size[1]
     length, tall = len(columns) * float(raster.size[0]), float(high - low)
-    n_rows = min(max(math.ceil(math.sqrt(_MIN_RATIO * length / tall)), 1), _MAX_ROWS)
+    tallest_in, min_ratio, max_rows = 7.0, 0.16, 6
+    n_rows = min(max(math.ceil(math.sqrt(min_ratio * length / tall)), 1), max_rows)
     per_row = math.ceil(len(columns) / n_rows)
     span = per_row * float(raster.size[0])
-    height = min(_PANEL_IN * tall / span, _TALLEST_IN)
-    size = (_WIDTH_IN, n_rows * (height + _ROW_GAP_IN) + _AROUND_IN)
+    width_in, panel_in, around_in, row_gap_in = 11.0, 9.2, 1.7, 0.45
+    height = min(panel_in * tall / span, tallest_in)
+    size = (width_in, n_rows * (height + row_gap_in) + around_in)
     figure = Figure(figsize=size, facecolor="white", layout="constrained")
     axes = figure.subplots(n_rows, 1, squeeze=False)[:, 0]
     shades = _shades(wall)
@@ -292,7 +291,6 @@ def _dates(result: Comparison) -> "Figure":
 
 
 _NONE = "–"
-_LONG = 30
 _MINUS = re.compile(r"(?<![\w-])-(?=\d)")
 
 
@@ -386,7 +384,8 @@ def _holes(result: Comparison) -> str:
         "looked at now",
     )
     table = html.table(head, rows, texts=2)
-    if len(rows) <= _LONG:
+    long = 30
+    if len(rows) <= long:
         return table
     return f"<details><summary>All {len(rows)} holes</summary>{table}</details>"
 

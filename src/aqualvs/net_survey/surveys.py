@@ -99,8 +99,6 @@ def _source(folder: Path) -> Path:
 
 Row: TypeAlias = Mapping[str, str]
 
-# A row that rests on fewer strands in a frame is not to be relied on (docs/net-condition.md).
-_MIN_STRANDS = 5.0
 # Part of what a picture passed over in which lasers look for holes, where the files do not tell.
 _LASERS_SHARE = 0.4
 _DIVES = "dives"
@@ -284,6 +282,8 @@ def check_surveys(surveys: Sequence[Survey]) -> None:
 def _stretches(rows: Sequence[Row], outline: FloatArray) -> Stretches:
     strands = _column(rows, "n_strands")
     solidity, sigma = _column(rows, "solidity"), _column(rows, "sigma_solidity")
+    # A row that rests on fewer strands in a frame is not to be relied on (docs/net-condition.md).
+    min_strands = 5.0
     return Stretches(
         begin_s=_column(rows, "begin_s"),
         along=_column(rows, "along_m"),
@@ -292,7 +292,7 @@ def _stretches(rows: Sequence[Row], outline: FloatArray) -> Stretches:
         seen=_column(rows, "seen_m"),
         solidity=solidity,
         sigma=sigma,
-        usable=(strands >= _MIN_STRANDS) & np.isfinite(solidity) & (sigma > 0.0),
+        usable=(strands >= min_strands) & np.isfinite(solidity) & (sigma > 0.0),
         placed=np.array([row["placed_by"] != "nothing" for row in rows], np.bool_),
         outline=outline,
     )

@@ -6,14 +6,12 @@ from pathlib import Path
 import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray
-from aqualvs.net_survey.comparison import Comparison, OnWall
+from aqualvs.net_survey.comparison import LOOKED, Comparison, HoleState, OnWall, Site
 from aqualvs.net_survey.frames import WallFrame
 from aqualvs.net_survey.growth import CellChange, Growth
-from aqualvs.net_survey.hole_sites import LOOKED, HoleState, Site
 from aqualvs.nets.tables import Cell, write_table
 
 _WEEK = 7.0
-_MAX_LISTED = 20
 _ORDER = (
     HoleState.NEW,
     HoleState.GROWN,
@@ -32,8 +30,6 @@ _TITLES = {
     HoleState.SMALLER: "smaller, mended in part or seen in part",
     HoleState.SAME: "the same",
 }
-# Beyond this many standard deviations a change is called one.
-_TOLD = 2.0
 
 
 def summary_lines(result: Comparison) -> list[str]:
@@ -73,7 +69,9 @@ def rate_text(growth: Growth) -> str:
 
 def verdict(growth: Growth) -> str:
     """Return whether a growth is beyond its uncertainty."""
-    if abs(growth.z) < _TOLD:
+    # Beyond this many standard deviations a change is called one.
+    told = 2.0
+    if abs(growth.z) < told:
         return "no change beyond the uncertainty"
     return "fouling has grown" if growth.value > 0.0 else "fouling has become less"
 
@@ -196,15 +194,16 @@ def _hole_lines(wall: OnWall) -> Iterator[str]:
     if not wall.sites:
         yield "holes: none on any date"
         return
+    max_listed = 20
     for state, sites in by_state(wall.sites).items():
         yield f"holes {_TITLES[state]}: {len(sites)}"
         if state is HoleState.SAME:
             yield from _since(wall, sites)
             continue
-        for one in sites[:_MAX_LISTED]:
+        for one in sites[:max_listed]:
             yield f"  {size_text(one)}: {place_text(one.place, wall.frame)}{_doubt(one)}"
-        if len(sites) > _MAX_LISTED:
-            yield f"  and {len(sites) - _MAX_LISTED} more, see holes_change.csv"
+        if len(sites) > max_listed:
+            yield f"  and {len(sites) - max_listed} more, see holes_change.csv"
 
 
 def _since(wall: OnWall, sites: Sequence[Site]) -> Iterator[str]:

@@ -29,12 +29,6 @@ from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import Rig
 from aqualvs.scanning.scan import Scan
 
-# Limit of the frames kept before the first lattice, to search them for holes once it is known.
-_MAX_WAITING = 1500
-# Ends of a laser's line that are darker than the rest by this factor are beyond the laser's fan.
-_BIN_LINES, _DIM = 24, 0.25
-_MIN_LOOKED_AT = 600
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NetConditionOptions:
@@ -215,9 +209,12 @@ class NetCondition:
             self._lattice = lattice
         stretch = self._evaluate(seen, lattice)
         self.stretches.append(stretch)
+        # Limit of the frames kept before the first lattice, to search them for holes once it is
+        # known.
+        max_waiting = 1500
         if self._lattice is None:
             self._waiting[len(self.stretches) - 1] = seen
-            while sum(len(one.views) for one in self._waiting.values()) > _MAX_WAITING:
+            while sum(len(one.views) for one in self._waiting.values()) > max_waiting:
                 del self._waiting[min(self._waiting)]
         return stretch
 
@@ -306,18 +303,22 @@ class NetCondition:
     def _usable(self) -> BoolArray:
         """Return the search lines (L, J) that each laser's fan reaches, from the dive so far."""
         usable = np.ones(self._lit.shape, np.bool_)
-        edges = np.arange(0, self._lit.shape[1], _BIN_LINES)
+        # Ends of a laser's line that are darker than the rest by this factor are beyond the laser's
+        # fan.
+        bin_lines, dim = 24, 0.25
+        min_looked_at = 600
+        edges = np.arange(0, self._lit.shape[1], bin_lines)
         lit = np.add.reduceat(self._lit, edges, axis=1)
         looked = np.add.reduceat(self._looked, edges, axis=1)
         for i in range(len(lit)):
-            known = looked[i] > _MIN_LOOKED_AT
+            known = looked[i] > min_looked_at
             if not known.any():
                 continue
             share = lit[i] / np.maximum(looked[i], 1.0)
-            bright = known & (share > _DIM * np.median(share[known]))
+            bright = known & (share > dim * np.median(share[known]))
             bright |= ~known
             inside = np.flatnonzero(bright)
             if len(inside):
                 usable[i, : edges[inside[0]]] = False
-                usable[i, edges[inside[-1]] + _BIN_LINES :] = False
+                usable[i, edges[inside[-1]] + bin_lines :] = False
         return usable

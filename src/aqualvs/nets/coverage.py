@@ -22,6 +22,7 @@ by blur; the amount was measured in simulation, and the uncertainty covers its v
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -30,34 +31,39 @@ from aqualvs.nets.dashes import NetView
 from aqualvs.nets.lattice import Fit, NetLattice
 from aqualvs.nets.spectrum import Mesh
 
-# Lit width of a strand: a share of its silhouette, plus a length in metres and one in steps of the
-# search lines; and the power of its height over the usual one, in grey levels, with which dashes
-# grow. From simulated dives in clear and turbid water at 0.3 to 1.0 m with known twine.
-_SEEN, _HALO, _HALO_STEPS, _BRIGHTER = 0.82, 0.43e-3, 0.44, 0.25
-_MIN_HEIGHT = 25.0
+
+class _TwineOptions(NamedTuple):
+    """Lit width of a strand and its error."""
+
+    # Lit width of a strand: a share of its silhouette, plus a length in metres and one in steps of
+    # the search lines; and the power of its height over the usual one, in grey levels, with which
+    # dashes grow. From simulated dives in clear and turbid water at 0.3 to 1.0 m with known twine.
+    seen: float = 0.82
+    halo: float = 0.43e-3
+    halo_steps: float = 0.44
+    brighter: float = 0.25
+    min_height: float = 25.0
+    # Variation of that in steps; and as a share of the strand at zero height, falling to zero at a
+    # height from which strands are seen in full.
+    sigma_halo: float = 0.07
+    sigma_faint: float = 0.12
+    faint: float = 90.0
+    # Width of a strand at half height less its silhouette, in pixels; and the exponent p (same
+    # dives).
+    strand_more: float = 0.95
+    corner: float = 2.5
+    # True errors over those of the fit, which overestimates them with single kinds.
+    true_error: float = 0.7
+    rounds: int = 40
+
+
+_TWINE = _TwineOptions()
+
 USUAL_HEIGHT = np.array(100.0)
 """Height of a dash at which `Twine.halo` holds, in grey levels."""
-# Variation of that in steps; and as a share of the strand at zero height, falling to zero at a
-# height from which strands are seen in full.
-_SIGMA_HALO, _SIGMA_FAINT, _FAINT = 0.07, 0.12, 90.0
-# The silhouette of twisted twine is on average narrower than its diameter.
-_SILHOUETTE = 0.95
-# Width of a strand at half height less its silhouette, in pixels; and the exponent p (same dives).
-_STRAND_MORE, _CORNER = 0.95, 2.5
 # Priors: silhouette of a strand and lit width of the sheet in metres, the sheet's width at half
 # height over its lit one; and their spreads as logarithms.
 _USUAL, _SPREAD = np.log([2.2e-3, 2.8e-3, 0.95]), np.array([1.5, 0.2, 0.1])
-# Errors of a kind's length and width: relative, relative for one dash, and in search lines.
-_LENGTH_ERROR, _WIDTH_ERROR, _DASH_ERROR, _ERROR_PX = 0.06, 0.115, 0.2, 0.2
-# Error of bare twine's length for the spread of all lengths: growth may be taken for twine.
-_SPREAD_ERROR = 0.15
-# Error of the model, which grows with the slant of the strand.
-_SLANT_ERROR = 0.7
-# Relative uncertainty of the length that slant adds to a dash.
-_SLANT_TOLD = 0.1
-# True errors over those of the fit, which overestimates them with single kinds.
-_TRUE_ERROR = 0.7
-_ROUNDS = 40
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,12 +143,14 @@ class Twine:
         """Return the part of `usual` that is not twine, in metres, and its standard deviation."""
         usual = self.usual(across, slant, step, height)
         straight = _bright(height) * self._lit(step) / across
-        sigma = np.hypot(self.sigma_halo / across, _SLANT_TOLD * (usual - straight))
+        # Relative uncertainty of the length that slant adds to a dash.
+        slant_told = 0.1
+        sigma = np.hypot(self.sigma_halo / across, slant_told * (usual - straight))
         return usual - self.body / across, np.asarray(sigma)
 
     def _lit(self, step: FloatArray) -> FloatArray:
         """Return the lit width at the usual height, in metres."""
-        return np.asarray(self.body + self.halo + _HALO_STEPS * step)
+        return np.asarray(self.body + self.halo + _TWINE.halo_steps * step)
 
 
 def measure_twine(kinds: Sequence[DashKind], known: float | None = None) -> Twine | None:
@@ -159,29 +167,34 @@ def measure_twine(kinds: Sequence[DashKind], known: float | None = None) -> Twin
         return None
     at, covariance = _fit(kinds)
     strand, sheet, _ = np.exp(at)
-    sigma_strand = _TRUE_ERROR * float(strand * np.sqrt(covariance[0, 0]))
+    sigma_strand = _TWINE.true_error * float(strand * np.sqrt(covariance[0, 0]))
+    # The silhouette of twisted twine is on average narrower than its diameter.
+    silhouette = 0.95
     if known is not None:
-        body = _SILHOUETTE * known
-        halo = _SEEN * float(strand) + _HALO - body
-        return Twine(known, 0.0, body, float(sheet), halo, _SEEN * sigma_strand)
+        body = silhouette * known
+        halo = _TWINE.seen * float(strand) + _TWINE.halo - body
+        return Twine(known, 0.0, body, float(sheet), halo, _TWINE.seen * sigma_strand)
     step, height = np.median([[k.step, k.height] for k in kinds], axis=0)
-    faint = max(1.0 - float(height) / _FAINT, 0.0)
-    of_halo = math.hypot(_SIGMA_HALO * float(step), _SIGMA_FAINT * faint * float(strand)) / _SEEN
+    faint = max(1.0 - float(height) / _TWINE.faint, 0.0)
+    of_halo = (
+        math.hypot(_TWINE.sigma_halo * float(step), _TWINE.sigma_faint * faint * float(strand))
+        / _TWINE.seen
+    )
     sigma = math.hypot(sigma_strand, of_halo)
     body = float(strand)
     return Twine(
-        thickness=body / _SILHOUETTE,
-        sigma=sigma / _SILHOUETTE,
+        thickness=body / silhouette,
+        sigma=sigma / silhouette,
         body=body,
         sheet=float(sheet),
-        halo=_HALO - (1.0 - _SEEN) * body,
-        sigma_halo=_SEEN * sigma,
+        halo=_TWINE.halo - (1.0 - _TWINE.seen) * body,
+        sigma_halo=_TWINE.seen * sigma,
     )
 
 
 def _bright(height: FloatArray) -> FloatArray:
     """Return the ratio of the length of dashes to that of dashes of the usual height."""
-    return np.asarray((np.maximum(height, _MIN_HEIGHT) / USUAL_HEIGHT) ** _BRIGHTER)
+    return np.asarray((np.maximum(height, _TWINE.min_height) / USUAL_HEIGHT) ** _TWINE.brighter)
 
 
 def _fit(kinds: Sequence[DashKind]) -> tuple[FloatArray, FloatArray]:
@@ -193,17 +206,23 @@ def _fit(kinds: Sequence[DashKind]) -> tuple[FloatArray, FloatArray]:
         [[k.across, k.slant, k.length, k.width, k.step, k.pixel, k.height, k.count] for k in kinds],
         np.float64,
     ).T
-    blur = _HALO + _HALO_STEPS * step, _STRAND_MORE * pixel
+    blur = _TWINE.halo + _TWINE.halo_steps * step, _TWINE.strand_more * pixel
     seen = np.log(np.r_[length / _bright(height), width])
-    grown = _SPREAD_ERROR * np.array([k.spread for k in kinds])
-    of_length = np.hypot(np.hypot(_LENGTH_ERROR, grown), _ERROR_PX * step / length)
-    error = np.r_[of_length, np.full(len(kinds), _WIDTH_ERROR)]
-    error = np.hypot(error, np.tile(_DASH_ERROR / np.sqrt(count), 2))
-    error *= np.tile(1.0 + _SLANT_ERROR * slant, 2)
+    # Error of bare twine's length for the spread of all lengths: growth may be taken for twine.
+    spread_error = 0.15
+    grown = spread_error * np.array([k.spread for k in kinds])
+    # Errors of a kind's length and width: relative, relative for one dash, and in search lines.
+    length_error, width_error, dash_error, error_px = 0.06, 0.115, 0.2, 0.2
+    of_length = np.hypot(np.hypot(length_error, grown), error_px * step / length)
+    error = np.r_[of_length, np.full(len(kinds), width_error)]
+    error = np.hypot(error, np.tile(dash_error / np.sqrt(count), 2))
+    # Error of the model, which grows with the slant of the strand.
+    slant_error = 0.7
+    error *= np.tile(1.0 + slant_error * slant, 2)
     prior = np.diag(_SPREAD**-2)
     at, normal = _USUAL.copy(), prior
-    at[0] = np.log(np.clip(np.min(length * across) - _HALO, 3e-4, 2e-2))
-    for _ in range(_ROUNDS):
+    at[0] = np.log(np.clip(np.min(length * across) - _TWINE.halo, 3e-4, 2e-2))
+    for _ in range(_TWINE.rounds):
         expected, slope = _model(at, across, slant, *blur)
         off = (seen - expected) / error
         jacobian = slope / error[:, None]
@@ -221,45 +240,62 @@ def _model(
 ) -> tuple[FloatArray, FloatArray]:
     """Return logarithms (2K,) of lengths, then widths, and their derivatives (2K, 3) by `at`."""
     strand, sheet, ratio = np.exp(at)
-    lit = _SEEN * strand + halo
+    lit = _TWINE.seen * strand + halo
     one, other = (lit / across) ** 2, (sheet * slant) ** 2
     by_strand = one / (one + other)
     wide = strand + more
-    full, clipped = (ratio * sheet) ** -_CORNER, (slant * across / wide) ** _CORNER
+    full, clipped = (ratio * sheet) ** -_TWINE.corner, (slant * across / wide) ** _TWINE.corner
     by_clip = clipped / (full + clipped)
     slope = np.zeros((2, len(across), 3))
-    slope[0, :, 0], slope[0, :, 1] = by_strand * _SEEN * strand / lit, 1.0 - by_strand
+    slope[0, :, 0], slope[0, :, 1] = by_strand * _TWINE.seen * strand / lit, 1.0 - by_strand
     slope[1, :, 0] = by_clip * strand / wide
     slope[1, :, 1] = slope[1, :, 2] = 1.0 - by_clip
-    expected = np.r_[0.5 * np.log(one + other), -np.log(full + clipped) / _CORNER]
+    expected = np.r_[0.5 * np.log(one + other), -np.log(full + clipped) / _TWINE.corner]
     return expected, slope.reshape(-1, 3)
 
 
-# Dashes of a kind: crossing angle (sine), distance from the strand and from others (pitches).
-_MIN_ACROSS, _ON_STRAND, _CLEAR = 0.4, 0.12, 0.2
-_MIN_DASHES = 6
-# Growth lengthens dashes and makes them differ. Share of all light on a kind's dashes up to which
-# they are bare, and the scale of the spread with which it falls; then the spread by noise, in grey
-# levels, and without noise. From simulated dives.
-_BARE_SHARE, _DIFFER, _MIN_BARE = 0.45, 0.22, 0.08
-_NOISE, _NO_NOISE = 7.0, 0.03
-_SHORT, _LONG, _SLANTED, _USUAL_SPREAD = 0.25, 0.7, 1.5, 0.15
-_WIDTH_QUANTILE = 0.4
-# At smaller sines of the angle a strand counts as parallel to the line.
-_NEARLY_ALONG = 0.02
-# Dashes of more search lines may be lost (`segments`).
-_MAX_LINES = 20.0
-_BLOCKS = 6
-# Errors of solidity for dashes that run together or are not seen, as shares: of any net, and per
-# pixel in the distance of two strands (simulated dives).
-_SHARE_ERROR, _UNRESOLVED = 0.04, 1.5
-# And as a share of the area that growth adds: it stands out of the net, and is lit and seen askew.
-_GROWTH_ERROR = 0.25
-# Distance along the net beyond which growth is independent, in metres.
-_ALIKE = 0.02
-# A dark piece this much longer than the lattice allows is no opening; openings of hexagons are two
-# bars long.
-_TOO_LONG, _HEXAGON_GAP = 1.25, 2.0
+class _KindOptions(NamedTuple):
+    """Choice of the dashes that are compared."""
+
+    # Dashes of a kind: crossing angle (sine), distance from the strand and from others (pitches).
+    min_across: float = 0.4
+    on_strand: float = 0.12
+    clear: float = 0.2
+    min_dashes: int = 6
+    # Growth lengthens dashes and makes them differ. Share of all light on a kind's dashes up to
+    # which they are bare, and the scale of the spread with which it falls; then the spread by
+    # noise, in grey levels, and without noise. From simulated dives.
+    bare_share: float = 0.45
+    differ: float = 0.22
+    min_bare: float = 0.08
+    noise: float = 7.0
+    no_noise: float = 0.03
+    short: float = 0.25
+    long: float = 0.7
+    slanted: float = 1.5
+    usual_spread: float = 0.15
+    width_quantile: float = 0.4
+    # Dashes of more search lines may be lost (`segments`).
+    max_lines: float = 20.0
+    blocks: int = 6
+
+
+_KIND = _KindOptions()
+
+
+class _SolidityErrors(NamedTuple):
+    """Errors of solidity, as shares."""
+
+    # Errors of solidity for dashes that run together or are not seen, as shares: of any net, and
+    # per pixel in the distance of two strands (simulated dives).
+    share: float = 0.04
+    unresolved: float = 1.5
+    # And as a share of the area that growth adds: it stands out of the net, and is lit and seen
+    # askew.
+    growth: float = 0.25
+
+
+_ERRORS = _SolidityErrors()
 
 
 @dataclass(frozen=True, slots=True)
@@ -302,8 +338,10 @@ class _Angles:
     @classmethod
     def of(cls, line: FloatArray, search: FloatArray, normal: FloatArray) -> "_Angles":
         beside = np.stack([-line[..., 1], line[..., 0]], axis=-1)
-        across = np.maximum(np.abs(np.sum(line * normal, axis=-1)), _NEARLY_ALONG)
-        square = np.maximum(np.abs(np.sum(search * beside, axis=-1)), _NEARLY_ALONG)
+        # At smaller sines of the angle a strand counts as parallel to the line.
+        nearly_along = 0.02
+        across = np.maximum(np.abs(np.sum(line * normal, axis=-1)), nearly_along)
+        square = np.maximum(np.abs(np.sum(search * beside, axis=-1)), nearly_along)
         slant = np.abs(np.sum(search * normal, axis=-1)) / (across * square)
         return cls(across, slant, square)
 
@@ -321,30 +359,30 @@ def dash_kinds(lattice: NetLattice, frames: Sequence[RegisteredView]) -> list[Da
     table = np.concatenate(rows) if rows else np.empty((0, 9))
     kinds = np.unique(table[:, :2], axis=0)
     each = [table[np.all(table[:, :2] == kind, axis=1)] for kind in kinds]
-    each = [mine for mine in each if len(mine) >= _MIN_DASHES]
+    each = [mine for mine in each if len(mine) >= _KIND.min_dashes]
     # Long dashes against short ones; on slanted strands the light sheet evens them out.
     spreads = [
-        np.log(_length_at(mine, _LONG) / _length_at(mine, _SHORT))
+        np.log(_length_at(mine, _KIND.long) / _length_at(mine, _KIND.short))
         for mine in each
-        if np.median(mine[:, 3]) < _SLANTED
+        if np.median(mine[:, 3]) < _KIND.slanted
     ]
-    spread = float(np.median(spreads)) if spreads else _USUAL_SPREAD
+    spread = float(np.median(spreads)) if spreads else _KIND.usual_spread
     return [_kind(mine, spread) for mine in each]
 
 
 def _kind(mine: FloatArray, spread: float) -> DashKind:
     """Average dashes, given as rows of `_rows`."""
     across, slant, height, step, pixel = np.median(mine[:, [2, 3, 6, 7, 8]], axis=0)
-    noise = np.hypot(_NOISE / max(height, 1.0), _NO_NOISE)
+    noise = np.hypot(_KIND.noise / max(height, 1.0), _KIND.no_noise)
     grown = np.sqrt(max(spread**2 - noise**2, 0.0))
-    share = float(max(_BARE_SHARE * np.exp(-grown / _DIFFER), _MIN_BARE))
+    share = float(max(_KIND.bare_share * np.exp(-grown / _KIND.differ), _KIND.min_bare))
     return DashKind(
         laser=int(mine[0, 0]),
         family=int(mine[0, 1]),
         across=float(across),
         slant=float(slant),
         length=_length_at(mine, share),
-        width=float(np.quantile(mine[:, 5], _WIDTH_QUANTILE)),
+        width=float(np.quantile(mine[:, 5], _KIND.width_quantile)),
         height=float(height),
         step=float(step),
         pixel=float(pixel),
@@ -364,10 +402,10 @@ def _rows(lattice: NetLattice, one: RegisteredView) -> FloatArray:
     """Return rows (laser, family, across, slant, length, width, height, step) of clear dashes."""
     pitch, dashes, fit = lattice.pitch, one.view.dashes, one.fit
     angles = _angles(lattice, one)
-    clear = dashes.whole & (fit.off < _ON_STRAND * pitch[fit.family])
-    clear &= angles.across > _MIN_ACROSS
+    clear = dashes.whole & (fit.off < _KIND.on_strand * pitch[fit.family])
+    clear &= angles.across > _KIND.min_across
     if lattice.mesh is Mesh.FOUR_SIDED:
-        clear &= fit.clear > _CLEAR * pitch.min()
+        clear &= fit.clear > _KIND.clear * pitch.min()
     step = one.view.step[dashes.laser]
     # A search line is a whole number of pixels wide; its step gives their size on the net more
     # accurately than the range does.
@@ -418,13 +456,15 @@ def measure_solidity(
     if not np.all(np.any(counts & (seen.sum(axis=0) > 0.0)[:, None], axis=0)):
         return None
     solidity = _family_sum(body, seen, counts)
-    blocks = np.array_split(np.arange(len(frames)), min(_BLOCKS, len(frames)))
+    blocks = np.array_split(np.arange(len(frames)), min(_KIND.blocks, len(frames)))
     parts = [_family_sum(body[b], seen[b], counts) for b in blocks]
     chance = float(np.std(parts, ddof=1) / np.sqrt(len(parts))) if len(parts) > 1 else 0.1
-    unresolved = _UNRESOLVED * frames[len(frames) // 2].view.pixel / float(lattice.pitch.min())
-    shares = [_spread_of_mean(np.concatenate(rows)), _SHARE_ERROR, unresolved]
+    unresolved = (
+        _ERRORS.unresolved * frames[len(frames) // 2].view.pixel / float(lattice.pitch.min())
+    )
+    shares = [_spread_of_mean(np.concatenate(rows)), _ERRORS.share, unresolved]
     bare = float(np.sum(twine.body * lattice.density / lattice.pitch))
-    grown = _GROWTH_ERROR * max(solidity - bare, 0.0)
+    grown = _ERRORS.growth * max(solidity - bare, 0.0)
     sigmas = [chance, _family_sum(error, seen, counts), grown, *(solidity * one for one in shares)]
     return float(np.clip(solidity, 0.0, 1.0)), float(np.linalg.norm(sigmas))
 
@@ -435,10 +475,12 @@ def _spread_of_mean(rows: FloatArray) -> float:
     Dashes near to one another show the same growth, even in different frames.
     """
     variance, weight = 0.0, 0.0
+    # Distance along the net beyond which growth is independent, in metres.
+    alike = 0.02
     for family in np.unique(rows[:, 0]):
         mine = rows[rows[:, 0] == family, 1:]
         total, mean = float(mine[:, 0].sum()), float(mine[:, 0].mean())
-        independent = len(np.unique(np.floor(mine[:, 1:] / _ALIKE), axis=0))
+        independent = len(np.unique(np.floor(mine[:, 1:] / alike), axis=0))
         if mean > 0.0:
             variance += (total * float(mine[:, 0].std()) / mean) ** 2 / independent
             weight += total
@@ -455,9 +497,12 @@ def crossing_rates(lattice: NetLattice, view: NetView) -> FloatArray:
 def long_gaps(lattice: NetLattice, view: NetView) -> BoolArray:
     """Mark the gaps of a frame that are longer than the lattice allows."""
     longest = 1.0 / crossing_rates(lattice, view).max(axis=1)
+    # A dark piece this much longer than the lattice allows is no opening; openings of hexagons are
+    # two bars long.
+    too_long, hexagon_gap = 1.25, 2.0
     if lattice.mesh is Mesh.SIX_SIDED:
-        longest = np.full(len(view.step), _HEXAGON_GAP * lattice.bar)
-    return np.asarray(view.gaps.length > _TOO_LONG * longest[view.gaps.laser])
+        longest = np.full(len(view.step), hexagon_gap * lattice.bar)
+    return np.asarray(view.gaps.length > too_long * longest[view.gaps.laser])
 
 
 def sound_length(lattice: NetLattice, view: NetView) -> FloatArray:
@@ -485,7 +530,7 @@ def _reliable(lattice: NetLattice, twine: Twine, view: NetView) -> BoolArray:
     angles = _Angles.of(line[:, None], search[:, None], lattice.normals[None])
     step = view.step[:, None]
     lines = twine.usual(angles.across, angles.slant, step, USUAL_HEIGHT) / step
-    good: BoolArray = lines < _MAX_LINES
+    good: BoolArray = lines < _KIND.max_lines
     best = lines.argmin(axis=0)
     good[best, np.arange(len(best))] = True
     return good

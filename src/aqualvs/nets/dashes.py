@@ -224,11 +224,6 @@ def _descends(along: FloatArray) -> bool:
     return bool(last < first)
 
 
-# Dark pieces this many times longer than this quantile may be holes, and are left out of the search
-# for a lattice.
-_HOLE, _MOST = 2.5, 0.8
-
-
 @dataclass(frozen=True, slots=True)
 class Dashes:
     """Lit pieces of the lasers' lines in one frame, N of them.
@@ -401,7 +396,10 @@ def crossings_of(view: NetView) -> Crossings:
     """Return crossings for the lattice search, without cut-off dashes and likely holes."""
     gaps, dashes = view.gaps, view.dashes
     inner = gaps.length[gaps.closed.all(axis=1)]
-    longest = _HOLE * float(np.quantile(inner, _MOST)) if len(inner) else np.inf
+    # Dark pieces this many times longer than this quantile may be holes, and are left out of the
+    # search for a lattice.
+    hole, most = 2.5, 0.8
+    longest = hole * float(np.quantile(inner, most)) if len(inner) else np.inf
     long = gaps.length > longest
     laser, ends = _without(view.span_laser, view.span, gaps.laser[long], gaps.ends[long])
     seen = np.zeros(len(view.direction))

@@ -14,6 +14,7 @@ its edge was not seen (`find_discs`).
 """
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,20 +25,27 @@ from aqualvs.nets.dashes import NetView
 from aqualvs.nets.lattice import NetLattice
 from aqualvs.nets.spectrum import Mesh
 
-# Share of strand that is always dark without a hole; share of light where the net has a hole (a
-# fish, a loose end); and limit of the evidence of the looks at one cell against a hole.
-_DARK, _FALSE_LIGHT, _MAX_SOUND = 0.03, 0.03, 4.0
-# Prior number of crossings seen, for one laser and family: with few crossings, the share that is
-# missed is not known. The same for a piece of its line.
-# Where seen and missed alternate at this share, all missed ones count; where a larger share than
-# the last one is missed, missing strands give no evidence.
-_BEFORE, _BEFORE_HERE, _SCARCE, _TOO_MANY = 20.0, 5.0, 0.12, 0.3
-# A dark object that hides the net for a while leaves some strands visible. Share of strands seen in
-# a hole; and largest log-likelihood by which a hidden net may be likelier than a hole.
-_LIT_IN_HOLE, _MIN_OVER_HIDDEN = 0.05, -3.0
-# Least number of frames of a hole seen by one laser alone: those in which a line sweeps over three
-# bars at the fastest speed at which the net can be tracked.
-_ALONE_FRAMES = 8
+
+class _EvidenceOptions(NamedTuple):
+    """Evidence of the looks at a place of the net, for and against a hole."""
+
+    # Share of strand that is always dark without a hole; share of light where the net has a hole (a
+    # fish, a loose end); and limit of the evidence of the looks at one cell against a hole.
+    dark: float = 0.03
+    false_light: float = 0.03
+    max_sound: float = 4.0
+    # Prior number of crossings seen, for one laser and family: with few crossings, the share that
+    # is missed is not known. The same for a piece of its line. Where seen and missed alternate at
+    # this share, all missed ones count; where a larger share than the last one is missed, missing
+    # strands give no evidence.
+    before: float = 20.0
+    before_here: float = 5.0
+    scarce: float = 0.12
+    too_many: float = 0.3
+
+
+_EVIDENCE = _EvidenceOptions()
+
 
 HERE = 0.1
 """Length of a piece of a laser's line, in ranges."""
@@ -100,7 +108,7 @@ class Looks:
         number = self.sums[:, 0]
         margin = np.maximum(2.0 * self.shares - 1.0, 0.0)
         mean = self.sums[:, 3] / number
-        says = np.where(self.missed, mean, np.maximum(mean * number, -_MAX_SOUND))
+        says = np.where(self.missed, mean, np.maximum(mean * number, -_EVIDENCE.max_sound))
         return np.asarray(says * margin)
 
     def stays_dark(self, middle: FloatArray, radius: float) -> bool:
@@ -114,17 +122,24 @@ class Looks:
         dark, lit = float(share[missed].sum()), float(share[~missed].sum())
         if dark == 0.0:
             return False
-        hidden = max(lit / (dark + lit), _LIT_IN_HOLE)
-        over_lit = lit * np.log(_LIT_IN_HOLE / hidden)
-        over = over_lit + dark * np.log((1.0 - _LIT_IN_HOLE) / (1.0 - hidden))
-        if over < _MIN_OVER_HIDDEN:
+        # A dark object that hides the net for a while leaves some strands visible. Share of strands
+        # seen in a hole; and largest log-likelihood by which a hidden net may be likelier than a
+        # hole.
+        lit_in_hole, min_over_hidden = 0.05, -3.0
+        hidden = max(lit / (dark + lit), lit_in_hole)
+        over_lit = lit * np.log(lit_in_hole / hidden)
+        over = over_lit + dark * np.log((1.0 - lit_in_hole) / (1.0 - hidden))
+        if over < min_over_hidden:
             return False
         laser = (self.keys[inside] >> 1) % LASERS
         balance = np.bincount(laser, np.where(missed, share, -share))
         telling = np.flatnonzero(balance > 0.0)
         frames = self.frames[inside][missed & np.isin(laser, telling)]
         span = int(np.ptp(frames)) + 1 if len(frames) else 0
-        return len(telling) > 1 or span >= _ALONE_FRAMES
+        # Least number of frames of a hole seen by one laser alone: those in which a line sweeps
+        # over three bars at the fastest speed at which the net can be tracked.
+        alone_frames = 8
+        return len(telling) > 1 or span >= alone_frames
 
 
 def looks_say(
@@ -140,8 +155,8 @@ def looks_say(
         Number of the piece of the laser's line.
     """
     share = np.maximum(_missed_share(laser, family, missed, run), _missed_here(laser, here, missed))
-    dark = np.where(share < _TOO_MANY, -np.log(_DARK + share), 0.0)
-    return np.asarray(np.where(missed, dark, np.log(_FALSE_LIGHT / (1.0 - share))))
+    dark = np.where(share < _EVIDENCE.too_many, -np.log(_EVIDENCE.dark + share), 0.0)
+    return np.asarray(np.where(missed, dark, np.log(_EVIDENCE.false_light / (1.0 - share))))
 
 
 def _missed_share(
@@ -154,7 +169,7 @@ def _missed_share(
     kind = laser * (int(family.max(initial=0)) + 1) + family
     seen = np.bincount(kind[~missed], minlength=int(kind.max(initial=0)) + 1)
     single = np.bincount(kind[missed & (run == 1)], minlength=len(seen))
-    share = (single + _DARK * _BEFORE) / (seen + single + _BEFORE)
+    share = (single + _EVIDENCE.dark * _EVIDENCE.before) / (seen + single + _EVIDENCE.before)
     return np.asarray(share[kind])
 
 
@@ -169,29 +184,41 @@ def _missed_here(laser: IntArray, here: FloatArray, missed: BoolArray) -> FloatA
     again = kind[order][1:] == kind[order][:-1]
     turned = again & (missed[order][1:] != missed[order][:-1])
     n = int(kind.max(initial=0)) + 1
-    pairs = np.bincount(kind[order][1:], again, minlength=n) + _BEFORE_HERE
-    turns = np.bincount(kind[order][1:], turned, minlength=n) + 2.0 * _DARK * _BEFORE_HERE
+    pairs = np.bincount(kind[order][1:], again, minlength=n) + _EVIDENCE.before_here
+    turns = (
+        np.bincount(kind[order][1:], turned, minlength=n)
+        + 2.0 * _EVIDENCE.dark * _EVIDENCE.before_here
+    )
     # Of two in random order, 2 p (1 - p) differ.
     share = 0.5 - np.sqrt(np.maximum(0.25 - 0.5 * turns / pairs, 0.0))
     every = np.bincount(kind, missed, minlength=n) / np.bincount(kind, minlength=n)
-    return np.asarray(np.where(share > _SCARCE, np.maximum(share, every), share)[kind])
+    return np.asarray(np.where(share > _EVIDENCE.scarce, np.maximum(share, every), share)[kind])
 
 
 RIM = 0.8
 """Margin around a disc within which evidence belongs to it, in bars."""
 
-# Grid of the discs, in bars: step of the middles, their margin beyond missing strands, and the
-# radii. Least score of a hole on the grid with double the step.
-_STEP, _BESIDE, _COARSE_SCORE = 0.4, 2.4, 6.0
+
+class _DiscOptions(NamedTuple):
+    """Search for discs that hold no strand."""
+
+    # Grid of the discs, in bars: step of the middles, their margin beyond missing strands, and the
+    # radii. Least score of a hole on the grid with double the step.
+    step: float = 0.4
+    beside: float = 2.4
+    coarse_score: float = 6.0
+    # Discs up to this radius are single strands that are cut, larger ones holes.
+    single: float = 0.8
+    # A hole's log-likelihood over sound net, and over a single strand that is cut.
+    min_score: float = 12.0
+    min_lead: float = 5.0
+    # Uncertainty of a radius from the grid and from the places of strands, in bars.
+    rough: float = 0.25
+
+
+_DISCS = _DiscOptions()
+
 _RADII: FloatArray = np.arange(0.5, 6.01, 0.25)
-# Discs up to this radius are single strands that are cut, larger ones holes.
-_SINGLE = 0.8
-# Large holes are rarer than small ones, by this power of the radius.
-_RARER = 2.0
-# A hole's log-likelihood over sound net, and over a single strand that is cut.
-_MIN_SCORE, _MIN_LEAD = 12.0, 5.0
-# Uncertainty of a radius from the grid and from the places of strands, in bars.
-_ROUGH = 0.25
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,7 +255,7 @@ def find_discs(place: FloatArray, weight: FloatArray, bar: float) -> list[Disc]:
     """
     weight = weight.copy()
     found: list[Disc] = []
-    while weight[weight > 0.0].sum() >= _MIN_SCORE:
+    while weight[weight > 0.0].sum() >= _DISCS.min_score:
         disc = _best(place, weight, bar)
         if disc is None:
             break
@@ -252,17 +279,19 @@ def local_sums(place: FloatArray, weight: FloatArray, radius: float) -> FloatArr
 
 def _best(place: FloatArray, weight: FloatArray, bar: float) -> Disc | None:
     radii = _RADII * bar
-    rough = _scores(place, weight, _middles(place, weight, 2.0 * _STEP * bar, bar), radii)
-    if rough.max() < _COARSE_SCORE:
+    rough = _scores(place, weight, _middles(place, weight, 2.0 * _DISCS.step * bar, bar), radii)
+    if rough.max() < _DISCS.coarse_score:
         return None
-    middles = _middles(place, weight, _STEP * bar, bar)
+    middles = _middles(place, weight, _DISCS.step * bar, bar)
     score = _scores(place, weight, middles, radii)
-    total = score - _RARER * np.log(_RADII)
-    single = _RADII <= _SINGLE
+    # Large holes are rarer than small ones, by this power of the radius.
+    rarer = 2.0
+    total = score - rarer * np.log(_RADII)
+    single = _DISCS.single >= _RADII
     total[:, single] = -np.inf
     at, size = np.unravel_index(np.argmax(total), total.shape)
     best = float(score[at, size])
-    if best < _MIN_SCORE or best - max(float(score[:, single].max()), 0.0) < _MIN_LEAD:
+    if best < _DISCS.min_score or best - max(float(score[:, single].max()), 0.0) < _DISCS.min_lead:
         return None
     # Discs that contain the middle of the likeliest one belong to the same hole.
     away = np.hypot(*(middles - middles[at]).T)
@@ -273,14 +302,14 @@ def _best(place: FloatArray, weight: FloatArray, bar: float) -> Disc | None:
     return Disc(
         middle=share.sum(axis=1) @ middles,
         radius=radius,
-        sigma=float(np.sqrt(spread + (_ROUGH * bar) ** 2)),
+        sigma=float(np.sqrt(spread + (_DISCS.rough * bar) ** 2)),
         score=best,
     )
 
 
 def _middles(place: FloatArray, weight: FloatArray, step: float, bar: float) -> FloatArray:
     """Return a grid around the places where strands are missing, shape (C, 2)."""
-    missing, beside = place[weight > 0.0], _BESIDE * bar
+    missing, beside = place[weight > 0.0], _DISCS.beside * bar
     low, high = missing.min(axis=0) - beside, missing.max(axis=0) + beside
     sides = [np.arange(a, b, step) for a, b in zip(low, high, strict=True)]
     return np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -308,12 +337,6 @@ def _scores(
 # Tolerance of a strand's predicted place, as a share of its pitch; at least this many steps of the
 # search lines.
 _OFF, _OFF_STEPS = 0.2, 1.5
-# Least sine of a crossing angle; at smaller ones the place of the crossing is uncertain.
-_MIN_ACROSS = 0.3
-# Margin at the ends of hexagon bars, as a share of a bar, within which their presence is uncertain.
-_KNOT = 0.2
-# Least share of light behind the net seen through a hole, relative to elsewhere.
-_LET_THROUGH = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -358,8 +381,10 @@ def predicted_strands(lattice: NetLattice, view: NetView, place: FloatArray) -> 
         Place of the lattice in `net` (`Shift.place`), in metres.
     """
     gaps = view.gaps
+    # Least share of light behind the net seen through a hole, relative to elsewhere.
+    let_through = 0.5
     # A hole lets light through; a dark piece without light behind it is hidden by something.
-    open_ = gaps.beyond >= _LET_THROUGH * view.beyond[gaps.laser]
+    open_ = gaps.beyond >= let_through * view.beyond[gaps.laser]
     turns = np.abs(lattice.waves).sum(axis=0) @ np.ones(2)
     most = int(np.sum(turns * (view.span[:, 1] - view.span[:, 0]) + len(lattice.waves) + 1.0))
     row, gap = np.empty((most, 3)), np.empty((most, 3), np.int64)
@@ -409,13 +434,15 @@ def _predict(
 ) -> int:
     """Write (place, along) and (laser, family, gap or -1) of every crossing; return the number."""
     n = 0
+    # Least sine of a crossing angle; at smaller ones the place of the crossing is uncertain.
+    min_across = 0.3
     for m in range(len(span)):
         i = span_laser[m]
         for f in range(len(waves)):
             qx, qy = waves[f]
             rate = qx * direction[i, 0] + qy * direction[i, 1]
             size = np.sqrt(qx * qx + qy * qy)
-            if not abs(rate) > _MIN_ACROSS * size:
+            if not abs(rate) > min_across * size:
                 continue
             start = qx * (origin[i, 0] - place[0]) + qy * (origin[i, 1] - place[1])
             off = max(_OFF / abs(rate), least_off[i])
@@ -468,4 +495,7 @@ def _on_bar(x: float, y: float, basis: FloatArray, bar: float) -> bool:
                 second, third = d, second
             elif d < third:
                 third = d
-    return bool(second - first < 0.05 * bar and third - second > _KNOT * bar)
+    # Margin at the ends of hexagon bars, as a share of a bar, within which their presence is
+    # uncertain.
+    knot = 0.2
+    return bool(second - first < 0.05 * bar and third - second > knot * bar)

@@ -8,7 +8,7 @@ estimated from the dive itself.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -29,22 +29,22 @@ from aqualvs.nets.hole_candidates import (
 from aqualvs.nets.lattice import NetLattice
 from aqualvs.nets.spectrum import Mesh
 
-# Side of the map's cells, in bars: looks of one laser at one cell are alike.
-_CELL = 0.4
-# Limit of the share missed between strands that are seen; above it the lattice is wrong.
-_MAX_MISSED = 0.3
-# Missing strands may be a hole if this near to each other, in bars, and with this much evidence;
-# strands within the last distance determine its edge.
-_NEAR, _MIN_NEAR, _AROUND = 1.5, 9.0, 6.5
-# Discs no farther apart than this are one hole, in bars.
-_TOUCH = 1.2
-# Motion of the vehicle, in bars, between the frames whose foot is kept.
-_LOOK = 0.2
-# Cells farther from the vehicle than this are settled, in metres.
-_SETTLED = 2.0
+
+class _HoleOptions(NamedTuple):
+    """Missing strands that are one hole."""
+
+    # Missing strands may be a hole if this near to each other, in bars, and with this much
+    # evidence; strands within the last distance determine its edge.
+    near: float = 1.5
+    min_near: float = 9.0
+    around: float = 6.5
+    # Cells farther from the vehicle than this are settled, in metres.
+    settled: float = 2.0
+
+
+_HOLE = _HoleOptions()
+
 _ROW = 1 << 24
-# Squares of a side's 24th part measure the area of discs that overlap.
-_SQUARES = 24
 
 # Frame, time, and place on the map.
 Foot: TypeAlias = tuple[int, float, FloatArray]
@@ -145,7 +145,9 @@ class HoleMap:
         self._last = place.copy()
         strands = predicted_strands(lattice, view, knot)
         self._waiting.append((strands, place.copy(), HERE * view.range, view.index))
-        column, row = np.floor(place / (_LOOK * self._bar)).astype(int)
+        # Motion of the vehicle, in bars, between the frames whose foot is kept.
+        look = 0.2
+        column, row = np.floor(place / (look * self._bar)).astype(int)
         self._feet.setdefault((int(column), int(row)), (view.index, view.time_s, place.copy()))
 
     def update(self, lattice: NetLattice) -> None:
@@ -179,10 +181,14 @@ class HoleMap:
         )
         self._waiting = []
         between = float(np.sum(1.0 / run[closed]))
-        if between > _MAX_MISSED * (between + np.count_nonzero(~missed)):
+        # Limit of the share missed between strands that are seen; above it the lattice is wrong.
+        max_missed = 0.3
+        if between > max_missed * (between + np.count_nonzero(~missed)):
             return
         says = looks_say(laser, family, here, missed, run)
-        column, row = np.floor(place / (_CELL * self._bar)).astype(np.int64).T
+        # Side of the map's cells, in bars: looks of one laser at one cell are alike.
+        cell = 0.4
+        column, row = np.floor(place / (cell * self._bar)).astype(np.int64).T
         keys = ((column + _ROW * row) * LASERS + laser) * 2 + missed
         self._looks = self._looks.added(keys, np.c_[np.ones(len(keys)), place, says], frame)
         column, row = np.floor(place / self._mesh).astype(np.int64).T
@@ -192,18 +198,23 @@ class HoleMap:
         """Return whether a hole lies in the part of the map that is not settled."""
         if self._last is None:
             return False
-        return bool(np.abs(hole.place - self._last).max() < _SETTLED)
+        return bool(np.abs(hole.place - self._last).max() < _HOLE.settled)
 
     def _find(self, lattice: NetLattice) -> list[Hole]:
         places, weights = self._looks.places, self._looks.weights()
         bar = lattice.bar
         likely = np.flatnonzero(weights > 0.0)
-        near = local_sums(places[likely], weights[likely], _NEAR * bar)
-        likely = likely[near > _MIN_NEAR]
+        near = local_sums(places[likely], weights[likely], _HOLE.near * bar)
+        likely = likely[near > _HOLE.min_near]
         found, left = [], weights.copy()
-        for group in _groups(places[likely], 2.0 * _NEAR * bar):
+        # Discs no farther apart than this are one hole, in bars.
+        touch = 1.2
+        for group in _groups(places[likely], 2.0 * _HOLE.near * bar):
             seeds = places[likely[group]]
-            low, high = seeds.min(axis=0) - _AROUND * bar, seeds.max(axis=0) + _AROUND * bar
+            low, high = (
+                seeds.min(axis=0) - _HOLE.around * bar,
+                seeds.max(axis=0) + _HOLE.around * bar,
+            )
             around = np.all((places > low) & (places < high), axis=1)
             discs = find_discs(places[around], left[around], bar)
             # Only a part of a hole of another group may lie in these surroundings.
@@ -214,7 +225,7 @@ class HoleMap:
             discs = [disc for disc in discs if self._looks.stays_dark(disc.middle, disc.radius)]
             found += [
                 self._hole(lattice, some, places[around], weights[around])
-                for some in _touching(discs, _TOUCH * bar)
+                for some in _touching(discs, touch * bar)
             ]
         return found
 
@@ -248,17 +259,17 @@ class HoleMap:
         """Drop cells far behind the vehicle."""
         if self._last is None or not len(self._looks.keys):
             return
-        close = np.abs(self._looks.places - self._last).max(axis=1) < _SETTLED
+        close = np.abs(self._looks.places - self._last).max(axis=1) < _HOLE.settled
         self._looks = self._looks.kept(close)
         row = np.floor_divide(self._meshes + _ROW // 2, _ROW)
         at = np.stack([self._meshes - row * _ROW, row], axis=1) * self._mesh
-        close = np.abs(at - self._last).max(axis=1) < _SETTLED
+        close = np.abs(at - self._last).max(axis=1) < _HOLE.settled
         self._settled_meshes += int(np.count_nonzero(~close))
         self._meshes = self._meshes[close]
         self._feet = {
             key: one
             for key, one in self._feet.items()
-            if np.abs(one[2] - self._last).max() < _SETTLED
+            if np.abs(one[2] - self._last).max() < _HOLE.settled
         }
 
 
@@ -317,7 +328,9 @@ def _outline(discs: Sequence[Disc]) -> tuple[FloatArray, tuple[float, float], fl
     size = high - low
     if len(discs) == 1:
         return middles[0], (float(size[0]), float(size[1])), float(np.pi * radii[0] ** 2)
-    share = (np.arange(_SQUARES) + 0.5) / _SQUARES
+    # Squares of a side's 24th part measure the area of discs that overlap.
+    squares = 24
+    share = (np.arange(squares) + 0.5) / squares
     at = low + np.stack(np.meshgrid(share, share), axis=-1).reshape(-1, 2) * size
     inside = np.any(np.hypot(*(at[:, None] - middles).transpose(2, 0, 1)) < radii, axis=1)
     area = float(np.mean(inside) * size[0] * size[1])

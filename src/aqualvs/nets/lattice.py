@@ -9,6 +9,7 @@ better than half a mesh: pass the vehicle's velocity where another sensor measur
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,21 +29,27 @@ from aqualvs.nets.spectrum import (
 )
 from aqualvs.nets.spectrum_kernels import wave_sums
 
-# Number of frames for the fit of a lattice, and of those among them for the search.
-_MAX_FRAMES, _SEARCHED_FRAMES = 30, 12
-# Number of likely lattices that are refined roughly, and of the best that are refined well.
-_FOLLOWED, _COMPARED = 12, 4
-_FIRST_ROUNDS, _ROUNDS, _LAST_ROUNDS = 2, 5, 7
-# Least crossings of a usable frame.
-_MIN_CROSSINGS = 5
-# Least log-likelihood per frame of a lattice; less may be chance.
-_MIN_SCORE = 0.3
-# Least lead of the best lattice over those with another bar length.
-_MIN_LEAD, _SAME_BAR = 0.2, 0.06
-# The previous lattice is kept with this share of its score, turned by up to this many degrees.
-_AS_BEFORE, _TURNS = 0.6, (0.0, -4.0, 4.0)
-# Number of parts of the frames whose bars are compared, and the relative error of the search.
-_BLOCKS, _SEARCH_ERROR = 4, 0.005
+
+class _FitOptions(NamedTuple):
+    """Search for a lattice in some frames, and its fit."""
+
+    # Number of frames for the fit of a lattice, and of those among them for the search.
+    max_frames: int = 30
+    searched_frames: int = 12
+    # Number of likely lattices that are refined roughly, and of the best that are refined well.
+    followed: int = 12
+    compared: int = 4
+    first_rounds: int = 2
+    rounds: int = 5
+    last_rounds: int = 7
+    # Least log-likelihood per frame of a lattice; less may be chance.
+    min_score: float = 0.3
+    # Number of parts of the frames whose bars are compared, and the relative error of the search.
+    blocks: int = 4
+    search_error: float = 0.005
+
+
+_FIT = _FitOptions()
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,10 +120,10 @@ def find_lattice(
     spectrum = Spectrum.of(chosen)
     best = _known(before, spectrum) if before is not None else None
     if best is None:
-        best = _searched(Spectrum.of(_spread(chosen, _SEARCHED_FRAMES)))
-        best = best and refine(best, spectrum, _LAST_ROUNDS)
+        best = _searched(Spectrum.of(_spread(chosen, _FIT.searched_frames)))
+        best = best and refine(best, spectrum, _FIT.last_rounds)
     # A chance result of a few frames is not confirmed by all of them.
-    if best is None or best.score < _MIN_SCORE:
+    if best is None or best.score < _FIT.min_score:
         return None
     return _lattice(best, _sigma(best, chosen))
 
@@ -124,20 +131,24 @@ def find_lattice(
 def _searched(spectrum: Spectrum) -> Hypothesis | None:
     rough = [one.scored(score(spectrum, one)) for one in hypotheses(spectrum)]
     rough.sort(key=lambda one: -one.score)
-    tried = [refine(one, spectrum, _FIRST_ROUNDS) for one in rough[:_FOLLOWED]]
+    tried = [refine(one, spectrum, _FIT.first_rounds) for one in rough[: _FIT.followed]]
     tried.sort(key=lambda one: -one.score)
-    tried[:_COMPARED] = [refine(one, spectrum, _ROUNDS) for one in tried[:_COMPARED]]
+    tried[: _FIT.compared] = [refine(one, spectrum, _FIT.rounds) for one in tried[: _FIT.compared]]
     best = max(tried, key=lambda one: one.score)
-    others = [one.score for one in tried if abs(np.log(bar_of(one) / bar_of(best))) > _SAME_BAR]
-    if best.score < max([_MIN_SCORE, *(score + _MIN_LEAD for score in others)]):
+    # Least lead of the best lattice over those with another bar length.
+    min_lead, same_bar = 0.2, 0.06
+    others = [one.score for one in tried if abs(np.log(bar_of(one) / bar_of(best))) > same_bar]
+    if best.score < max([_FIT.min_score, *(score + min_lead for score in others)]):
         return None
     return best
 
 
 def _known(before: NetLattice, spectrum: Spectrum) -> Hypothesis | None:
     """Return the previous lattice, if it explains these frames nearly as well."""
-    enough = max(_MIN_SCORE, _AS_BEFORE * before.score)
-    for angle in np.deg2rad(_TURNS):
+    # The previous lattice is kept with this share of its score, turned by up to this many degrees.
+    as_before, turns = 0.6, (0.0, -4.0, 4.0)
+    enough = max(_FIT.min_score, as_before * before.score)
+    for angle in np.deg2rad(turns):
         found = refine(Hypothesis(before.mesh, before.basis @ turned(angle).T), spectrum, 3)
         if found.score >= enough:
             return refine(found, spectrum, 5)
@@ -146,8 +157,10 @@ def _known(before: NetLattice, spectrum: Spectrum) -> Hypothesis | None:
 
 def _choose(frames: Sequence[Crossings]) -> list[Crossings]:
     """Return some frames, evenly spread, of those with enough crossings."""
-    useful = [one for one in frames if len(one.place) >= _MIN_CROSSINGS]
-    return _spread(useful, _MAX_FRAMES)
+    # Least crossings of a usable frame.
+    min_crossings = 5
+    useful = [one for one in frames if len(one.place) >= min_crossings]
+    return _spread(useful, _FIT.max_frames)
 
 
 def _spread(frames: Sequence[Crossings], most: int) -> list[Crossings]:
@@ -161,14 +174,14 @@ def _spread(frames: Sequence[Crossings], most: int) -> list[Crossings]:
 def _sigma(best: Hypothesis, frames: Sequence[Crossings]) -> float:
     """Return the standard deviation of the bar, from the differences of parts of the frames."""
     size = bar_of(best)
-    blocks = [b for b in np.array_split(np.arange(len(frames)), _BLOCKS) if len(b)]
+    blocks = [b for b in np.array_split(np.arange(len(frames)), _FIT.blocks) if len(b)]
     if len(blocks) < 2:
         return 0.02 * size
     bars = []
     for block in blocks:
         spectrum = Spectrum.of([frames[i] for i in block])
         bars.append(bar_of(refine(best, spectrum, 3)))
-    return float(np.hypot(np.std(bars, ddof=1) / np.sqrt(len(bars)), _SEARCH_ERROR * size))
+    return float(np.hypot(np.std(bars, ddof=1) / np.sqrt(len(bars)), _FIT.search_error * size))
 
 
 def _lattice(best: Hypothesis, sigma_bar: float) -> NetLattice:
@@ -182,31 +195,34 @@ def _lattice(best: Hypothesis, sigma_bar: float) -> NetLattice:
     )
 
 
-# Harmonics of each family's wave; irregular spacing reduces each amplitude to this share.
-_HARMONICS, _REGULAR = 3, 0.92
-# Shifts by up to this many cells to each side are tried, in this many steps: they cover the cell
-# around the expected place, whatever its shape.
-_REACH, _TRIED = 0.75, 18
-# Least match: as a share of that of perfect crossings, and in deviations of random ones.
-_MIN_SHARE, _MIN_DEVIATIONS = 0.4, 3.0
-_TRACK_LEAST_CROSSINGS = 4
-# Newton's steps to the best shift, and its regularisation in undetermined directions (1/m²).
-_TRACK_ROUNDS, _STIFF = 4, 100.0
-# Standard deviations: velocity at first and with another sensor (m/s), acceleration (m/s²), and the
-# foot of the perpendicular on the net in one frame (m), by noise of the posture.
-_VELOCITY, _TOLD_VELOCITY, _ACCELERATION, _FOOT = 0.15, 0.03, 0.25, 1.5e-3
-# Velocities at which a piece of track may begin (m/s): greatest, step, standard deviation before
-# and after it is found; and the least number of frames.
-_FASTEST, _STEP, _USUAL, _FOUND = 0.45, 0.0125, 0.2, 0.04
-_MIN_FRAMES = 4
-# Velocities that differ by a whole mesh per frame look the same: the slowest one with this share of
-# the best match is taken, and then the best one within this distance of it (m/s).
-_AS_GOOD, _SAME_VELOCITY = 0.9, 0.05
-# Standard deviation of the place at such a start, in metres.
-_PLACE = 2e-3
-# A new piece of track begins where the standard deviation of the place exceeds this, in metres;
-# after this many seconds the velocity is discarded as well.
-_LOST, _FORGOTTEN = 0.05, 3.0
+class _TrackOptions(NamedTuple):
+    """Place of the lattice from frame to frame."""
+
+    # Least match: as a share of that of perfect crossings, and in deviations of random ones.
+    min_share: float = 0.4
+    min_deviations: float = 3.0
+    min_crossings: int = 4
+    # Standard deviations: velocity at first and with another sensor (m/s), acceleration (m/s²), and
+    # the foot of the perpendicular on the net in one frame (m), by noise of the posture.
+    velocity: float = 0.15
+    told_velocity: float = 0.03
+    acceleration: float = 0.25
+    foot: float = 1.5e-3
+    # Velocities at which a piece of track may begin (m/s): greatest, step, standard deviation
+    # before and after it is found; and the least number of frames.
+    fastest: float = 0.45
+    step: float = 0.0125
+    usual: float = 0.2
+    found: float = 0.04
+    min_frames: int = 4
+    # A new piece of track begins where the standard deviation of the place exceeds this, in metres;
+    # after this many seconds the velocity is discarded as well.
+    lost: float = 0.05
+    forgotten: float = 3.0
+
+
+_TRACK = _TrackOptions()
+
 
 START_FRAMES, START_S = 8, 0.5
 """Number of frames for the start of a track, and the seconds within which they lie."""
@@ -284,7 +300,10 @@ class LatticeFitter:
     def __init__(self, lattice: NetLattice) -> None:
         self.lattice = lattice
         self._waves, self._amplitude, step = _pattern(lattice)
-        share = np.arange(-_TRIED, _TRIED + 1) * (_REACH / _TRIED)
+        # Shifts by up to this many cells to each side are tried, in this many steps: they cover the
+        # cell around the expected place, whatever its shape.
+        reach, tried = 0.75, 18
+        share = np.arange(-tried, tried + 1) * (reach / tried)
         self._away = np.stack(np.meshgrid(share, share), axis=-1).reshape(-1, 2) @ step
         self._swings = np.exp(-2j * np.pi * (self._away @ self._waves.T))
 
@@ -305,7 +324,7 @@ class LatticeFitter:
         precision : array, shape (2, 2), optional
             Inverse of the covariance of the expected place.
         """
-        if len(crossings.place) < _TRACK_LEAST_CROSSINGS:
+        if len(crossings.place) < _TRACK.min_crossings:
             return None
         expected = np.zeros(2) if expected is None else expected
         precision = np.zeros((2, 2)) if precision is None else precision
@@ -314,12 +333,15 @@ class LatticeFitter:
         prior = np.sum((self._away @ precision) * self._away, axis=1)
         score = 2.0 * (self._swings @ here).real - 0.5 * prior
         place = expected + self._away[np.argmax(score)]
-        for _ in range(_TRACK_ROUNDS):
+        # Newton's steps to the best shift, and its regularisation in undetermined directions
+        # (1/m²).
+        track_rounds, stiff = 4, 100.0
+        for _ in range(track_rounds):
             _, slope, information = self._about(sums, place)
-            place = place + np.linalg.solve(information + _STIFF * np.eye(2), slope)
+            place = place + np.linalg.solve(information + stiff * np.eye(2), slope)
         match, _, information = self._about(sums, place)
         full = len(crossings.place) * float(np.sum(self._amplitude**2))
-        if match < max(_MIN_SHARE * full, _MIN_DEVIATIONS * np.sqrt(0.5 * full)):
+        if match < max(_TRACK.min_share * full, _TRACK.min_deviations * np.sqrt(0.5 * full)):
             return None
         return LatticeShift(place, information)
 
@@ -336,12 +358,15 @@ class LatticeFitter:
         times_s : array, shape (n,)
             Their times.
         """
-        usable = [i for i, one in enumerate(crossings) if len(one.place) >= _TRACK_LEAST_CROSSINGS]
-        if len(usable) < _MIN_FRAMES:
+        usable = [i for i, one in enumerate(crossings) if len(one.place) >= _TRACK.min_crossings]
+        if len(usable) < _TRACK.min_frames:
             return None
         size = np.hypot(*self._waves.T)
         longest = size < 1.2 * size.min()
-        waves, share = self._waves[longest], np.arange(-_FASTEST, _FASTEST + _STEP, _STEP)
+        waves, share = (
+            self._waves[longest],
+            np.arange(-_TRACK.fastest, _TRACK.fastest + _TRACK.step, _TRACK.step),
+        )
         velocity = np.stack(np.meshgrid(share, share), axis=-1).reshape(-1, 2)
         rate = velocity @ waves.T
         total = np.zeros(rate.shape, np.complex128)
@@ -349,9 +374,12 @@ class LatticeFitter:
             sums = self._amplitude[longest] * _sums(crossings[i], waves)
             total += sums * np.exp(2j * np.pi * rate * (times_s[i] - times_s[0]))
         speed = np.hypot(*velocity.T)
-        score = 2.0 * np.abs(total).sum(axis=1) - speed**2 / (2.0 * _USUAL**2)
-        slowest = np.argmin(np.where(score >= _AS_GOOD * score.max(), speed, np.inf))
-        near = np.hypot(*(velocity - velocity[slowest]).T) < _SAME_VELOCITY
+        score = 2.0 * np.abs(total).sum(axis=1) - speed**2 / (2.0 * _TRACK.usual**2)
+        # Velocities that differ by a whole mesh per frame look the same: the slowest one with this
+        # share of the best match is taken, and then the best one within this distance of it (m/s).
+        as_good, same_velocity = 0.9, 0.05
+        slowest = np.argmin(np.where(score >= as_good * score.max(), speed, np.inf))
+        near = np.hypot(*(velocity - velocity[slowest]).T) < same_velocity
         best = int(np.argmax(np.where(near, score, -np.inf)))
         match = (self._swings[:, longest] @ total[best]).real
         return TrackStart(self._away[np.argmax(match)], velocity[best])
@@ -412,10 +440,12 @@ def _pattern(lattice: NetLattice) -> tuple[FloatArray, FloatArray, FloatArray]:
     """
     basis = lattice.basis
     step = _inverse(basis).T
+    # Harmonics of each family's wave; irregular spacing reduces each amplitude to this share.
+    harmonics, regular = 3, 0.92
     if lattice.mesh is Mesh.FOUR_SIDED:
-        number = np.arange(1.0, _HARMONICS + 1.0)
+        number = np.arange(1.0, harmonics + 1.0)
         waves = np.concatenate([number[:, None] * basis[0], number[:, None] * basis[1]])
-        return waves, 0.5 * np.tile(_REGULAR**number, 2), step
+        return waves, 0.5 * np.tile(regular**number, 2), step
     # The shells of the reciprocal lattice; one of each wave and its mirror.
     first = np.array([[1.0, 0.0], [0.0, 1.0], [1.0, -1.0]])
     second = np.array([[1.0, 1.0], [2.0, -1.0], [1.0, -2.0]])
@@ -424,7 +454,7 @@ def _pattern(lattice: NetLattice) -> tuple[FloatArray, FloatArray, FloatArray]:
     ways = np.array([step[0], step[1], step[0] + step[1]])
     bars = np.stack([-ways[:, 1], ways[:, 0]], axis=1) / np.sqrt(3.0)
     each = np.cos(np.pi * waves @ ways.T) * np.sinc(waves @ bars.T)
-    return waves, _REGULAR * each.mean(axis=1), step
+    return waves, regular * each.mean(axis=1), step
 
 
 def _inverse(matrix: FloatArray) -> FloatArray:
@@ -433,7 +463,7 @@ def _inverse(matrix: FloatArray) -> FloatArray:
 
 def _at_first() -> FloatArray:
     """Return the covariance of place and velocity where a piece of track begins."""
-    return np.diag([_FOOT**2, _FOOT**2, _VELOCITY**2, _VELOCITY**2])
+    return np.diag([_TRACK.foot**2, _TRACK.foot**2, _TRACK.velocity**2, _TRACK.velocity**2])
 
 
 @dataclass(slots=True)
@@ -472,7 +502,7 @@ class NetTrack:
 
     def begins(self, time_s: float) -> bool:
         """Return whether place and velocity are unknown at a time."""
-        return self._origin is None or time_s - self._time_s > _FORGOTTEN
+        return self._origin is None or time_s - self._time_s > _TRACK.forgotten
 
     def step(
         self,
@@ -498,7 +528,7 @@ class NetTrack:
             Place and velocity common to this frame and the next, where the track begins.
         """
         state, covariance = self._ahead(time_s, velocity)
-        if self._origin is None or covariance[:2, :2].trace() > _LOST**2:
+        if self._origin is None or covariance[:2, :2].trace() > _TRACK.lost**2:
             return self._begin(fitter, crossings, time_s, state, start)
         if self._lattice is not fitter.lattice:
             shift = fitter.shift(crossings)
@@ -507,11 +537,13 @@ class NetTrack:
                 self._lattice, self._origin = fitter.lattice, state[:2] + shift.place
                 self._take(state, covariance, time_s)
             return shift
-        precision = _inverse(covariance[:2, :2] + _FOOT**2 * np.eye(2))
+        precision = _inverse(covariance[:2, :2] + _TRACK.foot**2 * np.eye(2))
         shift = fitter.shift(crossings, self._origin - state[:2], precision)
         if shift is not None:
             told = np.zeros((4, 4))
-            told[:2, :2] = shift.information @ _inverse(np.eye(2) + _FOOT**2 * shift.information)
+            told[:2, :2] = shift.information @ _inverse(
+                np.eye(2) + _TRACK.foot**2 * shift.information
+            )
             covariance = _inverse(_inverse(covariance) + told)
             miss = np.r_[self._origin - shift.place - state[:2], 0.0, 0.0]
             self._take(state + covariance @ told @ miss, covariance, time_s)
@@ -524,10 +556,10 @@ class NetTrack:
         if velocity is not None:
             state[2:] = velocity
             covariance[2:, :2] = covariance[:2, 2:] = 0.0
-            covariance[2:, 2:] = _TOLD_VELOCITY**2 * np.eye(2)
+            covariance[2:, 2:] = _TRACK.told_velocity**2 * np.eye(2)
         move = np.eye(4)
         move[:2, 2:] = dt * np.eye(2)
-        noise = np.outer([0.5 * dt**2, dt], [0.5 * dt**2, dt]) * _ACCELERATION**2
+        noise = np.outer([0.5 * dt**2, dt], [0.5 * dt**2, dt]) * _TRACK.acceleration**2
         return move @ state, move @ covariance @ move.T + np.kron(noise, np.eye(2))
 
     def _begin(
@@ -539,10 +571,12 @@ class NetTrack:
         start: TrackStart | None,
     ) -> LatticeShift | None:
         """Begin a piece of track, from the predicted state if the last piece ended recently."""
+        # Standard deviation of the place at such a start, in metres.
+        place = 2e-3
         if start is None:
             shift = fitter.shift(crossings)
         else:
-            shift = fitter.shift(crossings, start.place, np.eye(2) / _PLACE**2)
+            shift = fitter.shift(crossings, start.place, np.eye(2) / place**2)
         if shift is None:
             return None
         covariance = _at_first()
@@ -550,7 +584,7 @@ class NetTrack:
             state = np.r_[self.place, 0.0, 0.0]
             if start is not None:
                 state[2:] = start.velocity
-                covariance[2:, 2:] = _FOUND**2 * np.eye(2)
+                covariance[2:, 2:] = _TRACK.found**2 * np.eye(2)
         self.piece += self._origin is not None
         self._lattice, self._origin = fitter.lattice, state[:2] + shift.place
         self._take(state, covariance, time_s)

@@ -23,21 +23,9 @@ from aqualvs.scanning.laser_bands import SearchAxis, plan_bands
 from aqualvs.scanning.posture import Posture
 from aqualvs.scanning.scan import Label, Scan
 
-# Largest distance of light on the net from its plane, as a share of the range.
-_OFF_PLANE = 0.05
 # A line across the net is followed this far to each side, in ranges.
 _REACH = 1.3
 _SAMPLES = 129
-# Least sine of the angle between sheet and net for a line on the net.
-_MIN_SLOPE = 1e-3
-# The detector needs dark flanks: no stripe is found next to the border.
-_BORDER_PX = 16.0
-# Reach of a crossing, where two lasers' stripes disturb each other: in widths, plus pixels.
-_CROSSING_WIDTHS, _CROSSING_PX = 1.5, 4.0
-# Distance in the picture of the places that determine directions on the net.
-_AHEAD_PX = 30.0
-# Width of a stripe where none was measured, in pixels.
-_USUAL_WIDTH_PX = 5.0
 
 
 class LineState(IntEnum):
@@ -148,11 +136,13 @@ class NetReader:
         """Return the first and last position (L, J) of a detectable stripe on each search line."""
         lowest = np.full((len(self._laser_bands), self.n_lines), np.inf)
         highest = np.full(lowest.shape, -np.inf)
+        # The detector needs dark flanks: no stripe is found next to the border.
+        border_px = 16.0
         for i, search in enumerate(self._laser_bands):
             axis = 0 if search.axis is SearchAxis.ALONG_X else 1
             n, last = len(search.lowest), self.rig.size_px[axis] - 1
-            lowest[i, :n] = np.maximum(search.lowest, _BORDER_PX)
-            highest[i, :n] = np.minimum(search.highest, last - _BORDER_PX)
+            lowest[i, :n] = np.maximum(search.lowest, border_px)
+            highest[i, :n] = np.minimum(search.highest, last - border_px)
         return lowest, highest
 
     def read(self, scan: Scan) -> NetSignal | None:
@@ -211,7 +201,9 @@ class NetReader:
         row = points.pixels[every, 1 - self._axis[laser]]
         row = (row + 0.5 - shift_px[laser]) / self._line_px[laser] - 0.5
         row = np.rint(row).astype(np.int64)
-        off = _OFF_PLANE * distance
+        # Largest distance of light on the net from its plane, as a share of the range.
+        off_plane = 0.05
+        off = off_plane * distance
         on_net = (np.abs(in_net[:, 2]) < off) & (points.label == Label.NET)
         height, width = (np.zeros(lines.along.shape) for _ in range(2))
         px = np.sqrt(np.sum(points.points_in_dome**2, axis=1)) / self.rig.focal_px
@@ -257,7 +249,9 @@ class NetReader:
                 half_way = j[len(j) // 2]
                 middle[i, axis] = lines.position[i, half_way]
                 middle[i, 1 - axis] = (half_way + 0.5) * self._line_px[i] - 0.5 + shift_px[i]
-        step = _AHEAD_PX * np.eye(2)[self._axis]
+        # Distance in the picture of the places that determine directions on the net.
+        ahead_px = 30.0
+        step = ahead_px * np.eye(2)[self._axis]
         rays = self._camera.rays(np.stack([middle - step, middle + step]))
         origins, ahead = net.apply(rays.origins), net.rotate(rays.directions)
         on_net = origins[..., :2] - origins[..., 2:] / ahead[..., 2:] * ahead[..., :2]
@@ -268,8 +262,12 @@ class NetReader:
     def _near_crossings(self, lines: LaserLines, width: FloatArray, distance: float) -> BoolArray:
         """Mark the places near another laser's line."""
         px = distance / self.rig.focal_px
-        wide = np.array([_typical(row, _USUAL_WIDTH_PX * px) for row in width])
-        margin = _CROSSING_WIDTHS * np.maximum(wide[:, None], wide) + _CROSSING_PX * px
+        # Width of a stripe where none was measured, in pixels.
+        usual_width_px = 5.0
+        wide = np.array([_typical(row, usual_width_px * px) for row in width])
+        # Reach of a crossing, where two lasers' stripes disturb each other: in widths, plus pixels.
+        crossing_widths, crossing_px = 1.5, 4.0
+        margin = crossing_widths * np.maximum(wide[:, None], wide) + crossing_px * px
         near = np.zeros(lines.along.shape, np.bool_)
         _mark_crossings(lines.origin, lines.direction, lines.along, margin, near)
         return near
@@ -280,7 +278,9 @@ def _line_on(sheet: Plane, net: SE3) -> tuple[FloatArray, FloatArray]:
     across = net.rotate(sheet.normal)
     flat = across[:2]
     size = float(np.hypot(*flat))
-    if size < _MIN_SLOPE:
+    # Least sine of the angle between sheet and net for a line on the net.
+    min_slope = 1e-3
+    if size < min_slope:
         return np.full(2, np.nan), np.full(2, np.nan)
     # A point of the net's plane X has n·(R^T (X - t)) = offset.
     offset = sheet.offset + float(across @ net.translation)

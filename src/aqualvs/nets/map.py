@@ -6,7 +6,7 @@ Drawn without a display; Matplotlib is loaded only when a map is drawn.
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -19,27 +19,26 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-_DPI = 160
-_WIDTH_IN, _PANEL_IN = 11.0, 9.0
-_ROW_GAP_IN, _AROUND_IN = 0.5, 1.0
-# Greatest height and least width, in inches: a net passed up or down makes a narrower picture.
-_TALLEST_IN, _NARROWEST_IN = 8.0, 6.5
-# The wall is cut into rows until a row is at least this high for its width, or up to this number.
-_MIN_RATIO, _MAX_ROWS = 0.13, 8
-_MARGIN = 0.09
+class _MapLayout(NamedTuple):
+    """Layout of the map, in inches and shares."""
+
+    # The wall is cut into rows until a row is at least this high for its width, or up to this
+    # number.
+    min_ratio: float = 0.13
+    max_rows: int = 8
+    margin: float = 0.09
+    min_scale: float = 0.1
+    scale_step: float = 0.05
+    # Bearings that are written above a row.
+    bearings: int = 7
+
+
+_LAYOUT = _MapLayout()
+
 # Looks alike in all kinds of colour vision, from dark blue (clean) to yellow.
 _COLOURS = "cividis"
-_MIN_SCALE, _SCALE_STEP = 0.1, 0.05
 _GREY, _PATH, _HOLE = "#c4c9cd", "#ffffff", "#d55e00"
 _INK, _SEA = "#14222c", "#f4f7f8"
-# A bearing that changes less than this, in degrees, is given in the title.
-_ONE_BEARING = 4.0
-# The vehicle's track is drawn thinner if there are more stretches than this.
-_MANY, _THIN, _THICK = 40, 0.6, 1.2
-# Height of the scale of colours on a small map.
-_BAR_IN = 2.4
-# Bearings that are written above a row.
-_BEARINGS = 7
 # Its keys are a type of their own in some versions of Matplotlib.
 _STYLE: dict[Any, Any] = {
     "font.size": 9.0,
@@ -71,28 +70,33 @@ def draw_map(wall: UnrolledNet, paths: Sequence[Path]) -> None:
     """
     import matplotlib as mpl
 
+    dpi = 160
     with mpl.rc_context(_STYLE):
         figure = _figure(wall)
         for path in paths:
             # A date would make equal maps differ.
             dated = {".svg": "Date", ".pdf": "CreationDate"}.get(path.suffix.lower())
-            figure.savefig(path, dpi=_DPI, metadata={dated: None} if dated else None)
+            figure.savefig(path, dpi=dpi, metadata={dated: None} if dated else None)
 
 
 def _figure(wall: UnrolledNet) -> "Figure":
     from matplotlib.figure import Figure
 
+    width_in, panel_in = 11.0, 9.0
     if not wall.outlines:
-        figure = Figure(figsize=(_WIDTH_IN, 2.0), facecolor="white")
+        figure = Figure(figsize=(width_in, 2.0), facecolor="white")
         figure.text(0.5, 0.5, "no net was seen", ha="center", va="center")
         return figure
     low, high = _extent(wall)
     n_rows = 1 if wall.by_bearing else _rows(high - low)
     length = (high[0] - low[0]) / n_rows
     ratio = 0.35 if wall.by_bearing else float((high[1] - low[1]) / length)
-    height = min(_PANEL_IN * ratio, _TALLEST_IN)
-    width = max(height / ratio + _WIDTH_IN - _PANEL_IN, _NARROWEST_IN)
-    size = (width, n_rows * (height + _ROW_GAP_IN) + _AROUND_IN)
+    # Greatest height and least width, in inches: a net passed up or down makes a narrower picture.
+    tallest_in, narrowest_in = 8.0, 6.5
+    height = min(panel_in * ratio, tallest_in)
+    width = max(height / ratio + width_in - panel_in, narrowest_in)
+    row_gap_in, around_in = 0.5, 1.0
+    size = (width, n_rows * (height + row_gap_in) + around_in)
     figure = Figure(figsize=size, facecolor="white", layout="constrained")
     axes = figure.subplots(n_rows, 1, squeeze=False)[:, 0]
     shades = _shades(wall)
@@ -106,8 +110,10 @@ def _figure(wall: UnrolledNet) -> "Figure":
     _scale_bar(axes[0], wall, length)
     figure.suptitle(_title(wall), x=0.01, ha="left", fontsize=12, fontweight="bold")
     _legend(figure, wall)
+    # Height of the scale of colours on a small map.
+    bar_in = 2.4
     if any(fouling_of(one) is not None for one in wall.stretches):
-        share = min(1.0, _BAR_IN / size[1] + 0.25)
+        share = min(1.0, bar_in / size[1] + 0.25)
         bar = figure.colorbar(shades, ax=list(axes), shrink=share, pad=0.015)
         bar.set_label("fouling: solidity\nbeyond the bare twine")
     return figure
@@ -122,7 +128,7 @@ def _extent(wall: UnrolledNet) -> tuple[FloatArray, FloatArray]:
     ]
     corners = np.concatenate([*wall.outlines, *wall.path, np.reshape(holes, (-1, 2))])
     low, high = corners.min(axis=0), corners.max(axis=0)
-    margin = _MARGIN * (high - low)
+    margin = _LAYOUT.margin * (high - low)
     if not wall.by_bearing:
         margin[:] = margin.min()
     return low - margin, high + margin
@@ -130,7 +136,7 @@ def _extent(wall: UnrolledNet) -> tuple[FloatArray, FloatArray]:
 
 def _rows(size: FloatArray) -> int:
     """Return the number of rows that a wall is cut into, so that no row is a thin line."""
-    return min(max(math.ceil(_MIN_RATIO * float(size[0] / size[1])), 1), _MAX_ROWS)
+    return min(max(math.ceil(_LAYOUT.min_ratio * float(size[0] / size[1])), 1), _LAYOUT.max_rows)
 
 
 def _shades(wall: UnrolledNet) -> "ScalarMappable":
@@ -138,8 +144,8 @@ def _shades(wall: UnrolledNet) -> "ScalarMappable":
     from matplotlib.colors import Normalize
 
     known = [value for value in map(fouling_of, wall.stretches) if value is not None]
-    most = max([*known, _MIN_SCALE])
-    top = _SCALE_STEP * math.ceil(most / _SCALE_STEP - 1e-9)
+    most = max([*known, _LAYOUT.min_scale])
+    top = _LAYOUT.scale_step * math.ceil(most / _LAYOUT.scale_step - 1e-9)
     return ScalarMappable(Normalize(0.0, top), _COLOURS)
 
 
@@ -156,7 +162,9 @@ def _draw(axes: "Axes", wall: UnrolledNet, shades: "ScalarMappable") -> None:
         axes.add_patch(
             Polygon(outline, facecolor=colour, edgecolor="white", linewidth=0.6, hatch=hatch)
         )
-    width = _THIN if len(wall.stretches) > _MANY else _THICK
+    # The vehicle's track is drawn thinner if there are more stretches than this.
+    many, thin, thick = 40, 0.6, 1.2
+    width = thin if len(wall.stretches) > many else thick
     for line in wall.path:
         axes.plot(*line.T, color=_INK, linewidth=2.0 * width, alpha=0.55, solid_capstyle="round")
         axes.plot(*line.T, color=_PATH, linewidth=width, marker="o", markersize=2.0 * width)
@@ -234,7 +242,9 @@ def _mark_bearings(axes: "Axes", wall: UnrolledNet, *, name: bool) -> None:
     inside = np.flatnonzero((along >= low) & (along <= high))
     if np.any(np.diff(along) <= 0.0) or not len(inside):
         return
-    chosen = inside[np.unique(np.linspace(0, len(inside) - 1, _BEARINGS).round().astype(int))]
+    chosen = inside[
+        np.unique(np.linspace(0, len(inside) - 1, _LAYOUT.bearings).round().astype(int))
+    ]
     top = axes.secondary_xaxis("top")
     top.set_xticks(along[chosen], [f"{bearing[i]:.0f}°" for i in chosen])
     if name:
@@ -248,7 +258,9 @@ def _single_bearing(wall: UnrolledNet) -> float | None:
     if not known:
         return None
     turned = np.rad2deg(np.unwrap(known))
-    return float(np.mean(turned)) % 360.0 if np.ptp(turned) < _ONE_BEARING else None
+    # A bearing that changes less than this, in degrees, is given in the title.
+    one_bearing = 4.0
+    return float(np.mean(turned)) % 360.0 if np.ptp(turned) < one_bearing else None
 
 
 def _scale_bar(axes: "Axes", wall: UnrolledNet, length: float) -> None:

@@ -15,11 +15,6 @@ from aqualvs.scanning.scan import Label, ScanPoints
 # Labels of objects, at the net's plane or before it; clutter at the plane may be part of the net.
 # Ambiguous points are left out: they may be wrong.
 _THINGS = (Label.SOLID, Label.FISH, Label.BUBBLE)
-# Least quality of light (the root of its height, as a share of the frame's best, and its
-# likelihood) that hides the net: weaker light is probably not laser light, and in a hole, where
-# there is no other light, it would prevent looks at the hole. At half the best height, this is a
-# likelihood of 0.18.
-_MIN_QUALITY = 0.3
 # Pieces of light are on one object if at most this many search lines are between them, and at most
 # this many pixels along these, plus as many for each line. An object with this much light is not a
 # bubble or speck.
@@ -28,12 +23,8 @@ _BETWEEN_LINES, _BETWEEN_PX, _SLOPE_PX, _LARGE_LINES = 8, 3.0, 1.0, 40
 _BESIDE_PX, _BESIDE = 8.0, 0.3
 # The same for a large object, projected on the net: share of its light's length.
 _HALF_WIDE = 0.5
-# A shadow is longer than the light on its object.
-_SHADOW_SHARE, _SHADOW = 0.2, 5e-3
 # Number of places along the light on a large object that represent it.
 _FEW = 12
-# Search lines to each side of light beyond the net that it represents.
-_SPREAD_LINES = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +91,12 @@ def hidden_lines(
     hidden = np.zeros(lines.along.shape, np.bool_)
     before = (points.label == Label.CLUTTER) & (in_net[:, 2] > off)
     before |= np.isin(points.label, _THINGS) & (in_net[:, 2] > -off)
-    before &= points.quality >= _MIN_QUALITY
+    # Least quality of light (the root of its height, as a share of the frame's best, and its
+    # likelihood) that hides the net: weaker light is probably not laser light, and in a hole, where
+    # there is no other light, it would prevent looks at the hole. At half the best height, this is
+    # a likelihood of 0.18.
+    min_quality = 0.3
+    before &= points.quality >= min_quality
     index = np.flatnonzero(before)
     index = index[np.lexsort((row[index], points.laser[index]))]
     laser = points.laser[index].astype(np.int64)
@@ -303,7 +299,9 @@ def _hide_in_shadow(
         x, y = _cast(in_net[k], source)
         s = (x - origin[0]) * direction[0] + (y - origin[1]) * direction[1]
         low, high = min(low, s), max(high, s)
-    margin = _SHADOW_SHARE * (high - low) + _SHADOW
+    # A shadow is longer than the light on its object.
+    shadow_share, shadow = 0.2, 5e-3
+    margin = shadow_share * (high - low) + shadow
     for j in range(len(along)):
         if low - margin < along[j] < high + margin:
             hidden[j] = True
@@ -319,6 +317,8 @@ def _mark_beyond(
     along: FloatArray,
     beyond: BoolArray,
 ) -> None:
+    # Search lines to each side of light beyond the net that it represents.
+    spread_lines = 2
     for i in range(along.shape[0]):
         known = np.flatnonzero(np.isfinite(along[i]))
         if len(known) < 2:
@@ -336,6 +336,6 @@ def _mark_beyond(
             if at == 0 or at == len(known):
                 continue
             # Farther objects cover fewer search lines than the place where their light crossed.
-            for j in range(known[at] - _SPREAD_LINES, known[at] + _SPREAD_LINES + 1):
+            for j in range(known[at] - spread_lines, known[at] + spread_lines + 1):
                 if 0 <= j < along.shape[1]:
                     beyond[i, j] = True

@@ -33,9 +33,6 @@ from aqualvs.vehicle_logs import (
     read_vehicle_log,
 )
 
-# Values at a moment are averaged over this many seconds before and after it.
-_MOMENT_S = 0.5
-
 
 @dataclass(frozen=True, slots=True)
 class DivePostures:
@@ -126,9 +123,9 @@ class ViewedPlaces:
     def _at(self, values: FloatArray, begin_s: float, end_s: float | None) -> FloatArray:
         """Return the known values between two times, or around the first."""
         last = begin_s if end_s is None else end_s
-        found = values[
-            slice(*np.searchsorted(self.time_s, (begin_s - _MOMENT_S, last + _MOMENT_S)))
-        ]
+        # Values at a moment are averaged over this many seconds before and after it.
+        moment_s = 0.5
+        found = values[slice(*np.searchsorted(self.time_s, (begin_s - moment_s, last + moment_s)))]
         return np.asarray(found[np.isfinite(found)])
 
 
@@ -145,9 +142,6 @@ def _direction(angles: FloatArray) -> float:
 
 def _or_none(value: float) -> float | None:
     return value if np.isfinite(value) else None
-
-
-_DIGITS = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,9 +189,10 @@ class LaidLog:
         found: dict[str, Any] = {"file": self.log.name, "used": self.places is not None}
         if isinstance(self.offset, OffsetRefusal):
             return found | {"refused": self.offset.reason}
+        digits = 3
         return found | {
-            "offset_s": round(self.offset.offset_s, _DIGITS),
-            "sigma_offset_s": round(self.offset.sigma_s, _DIGITS),
+            "offset_s": round(self.offset.offset_s, digits),
+            "sigma_offset_s": round(self.offset.sigma_s, digits),
             "offset_from": self.offset.how,
         }
 
@@ -259,16 +254,6 @@ def _found(
     start = clocks if isinstance(clocks, TimeOffset) else None
     motion = find_time_offset(log, postures.track(), start=start)
     return motion if isinstance(motion, TimeOffset) or start is None else start
-
-
-# Time before and after over which depth is averaged to correct the track's height, in seconds: it
-# averages out waves and the sensor's noise, and the track hardly drifts in it.
-_PIN_S = 15.0
-# A round cage is detected by the growth of its bearing along the track: least change (standard
-# deviation), and least coefficient of correlation of the two.
-_MIN_TURN, _MIN_AGREEMENT = np.deg2rad(5.0), 0.9
-# Difference of height, in metres, at which track and log disagree; waves make less.
-_MIN_SLIP = 0.5
 
 
 class PlacedBy(StrEnum):
@@ -440,7 +425,9 @@ class _Nodes:
         known = np.isfinite(off)
         spread = [np.ptp(off[known & (self.run == r)]) for r in np.unique(self.run[known])]
         most = float(max(spread, default=0.0))
-        return most if most > _MIN_SLIP else 0.0
+        # Difference of height, in metres, at which track and log disagree; waves make less.
+        min_slip = 0.5
+        return most if most > min_slip else 0.0
 
     def place(self, i: int, seen: ViewedPlaces) -> NetPlace:
         """Return the place of a node."""
@@ -516,7 +503,10 @@ def _along_a_cage(along: FloatArray, run: IntArray, bearing: FloatArray) -> Floa
     off_turn = np.concatenate([turn[mine] - turn[mine].mean() for mine in within])
     off_along = np.concatenate([along[mine] - along[mine].mean() for mine in within])
     spread = float(np.sqrt(off_turn @ off_turn * (off_along @ off_along)))
-    if np.std(off_turn) < _MIN_TURN or abs(off_turn @ off_along) < _MIN_AGREEMENT * spread:
+    # A round cage is detected by the growth of its bearing along the track: least change (standard
+    # deviation), and least coefficient of correlation of the two.
+    min_turn, min_agreement = np.deg2rad(5.0), 0.9
+    if np.std(off_turn) < min_turn or abs(off_turn @ off_along) < min_agreement * spread:
         return None
     radius = float(off_turn @ off_along) / float(off_turn @ off_turn)
     lag = np.array([np.mean((radius * turn - along)[mine]) for mine in within])
@@ -528,8 +518,11 @@ def _along_a_cage(along: FloatArray, run: IntArray, bearing: FloatArray) -> Floa
 def _pinned(time_s: FloatArray, up: FloatArray, run: IntArray, depth: FloatArray) -> FloatArray:
     """Return depths that follow the track in the short term, and the log in the long term."""
     found = np.full(len(time_s), np.nan)
+    # Time before and after over which depth is averaged to correct the track's height, in seconds:
+    # it averages out waves and the sensor's noise, and the track hardly drifts in it.
+    pin_s = 15.0
     for i in range(len(time_s)):
-        near = (run == run[i]) & (np.abs(time_s - time_s[i]) <= _PIN_S) & np.isfinite(depth)
+        near = (run == run[i]) & (np.abs(time_s - time_s[i]) <= pin_s) & np.isfinite(depth)
         if near.any():
             found[i] = float(np.mean(depth[near] + up[near])) - up[i]
     return found

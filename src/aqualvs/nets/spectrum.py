@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from itertools import pairwise
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -259,22 +259,27 @@ def _swings(place: FloatArray, first: float, n: int) -> Swings:
     return np.asarray(both.reshape(len(place), -1)[:, :n])
 
 
-# Least length of bars in the search for lattices, in metres.
-_SHORTEST_BAR = 0.010
-# Number of waves, and of the best ones that are not neighbours and are followed up; number of
-# second families for each of them.
-_TRIED, _KEPT, _SECONDS = 1000, 6, 2
-# Number of frames in the search for second families.
-_MAX_OF_REST = 6
-# Least distance in frequency of two waves.
-_HYPOTHESES_APART = 2.5
-# Spread of the logarithm of the ratio of the pitches of two families.
-_EVEN = 0.05
+class _SearchOptions(NamedTuple):
+    """Search for lattices in the spectrum of the crossings."""
+
+    # Least length of bars in the search for lattices, in metres.
+    shortest_bar: float = 0.010
+    # Number of waves, and of the best ones that are not neighbours and are followed up; number of
+    # second families for each of them.
+    tried: int = 1000
+    kept: int = 6
+    seconds: int = 2
+    # Least distance in frequency of two waves.
+    apart: float = 2.5
+    # Spread of the logarithm of the ratio of the pitches of two families.
+    even: float = 0.05
+
+
+_SEARCH = _SearchOptions()
+
 # The strongest waves of a honeycomb look like a diamond whose families lie sixty degrees apart, and
 # few diamonds do so by chance: penalty within this angle.
 _AS_HONEYCOMB, _RARE = np.deg2rad(2.5), 1.0
-# Families that run more nearly alike than this have no mesh between them.
-_MIN_ANGLE = np.deg2rad(25.0)
 
 
 class Mesh(StrEnum):
@@ -369,7 +374,7 @@ def _uneven(hypothesis: Hypothesis) -> float:
     a, b = np.hypot(*first), np.hypot(*second)
     angle = np.arccos(min(abs(first @ second) / (a * b), 1.0))
     rare = _RARE * np.exp(-0.5 * ((angle - np.pi / 3.0) / _AS_HONEYCOMB) ** 2)
-    return float(0.5 * (np.log(a / b) / _EVEN) ** 2 + rare)
+    return float(0.5 * (np.log(a / b) / _SEARCH.even) ** 2 + rare)
 
 
 def hypotheses(spectrum: Spectrum) -> list[Hypothesis]:
@@ -397,16 +402,20 @@ def _four_sided(
     """Return pairs of families: likely waves of the stronger one, and the best in the remainder."""
     gain = _family_gain(power, size, spectrum.per_frame, 0.5)
     found = []
-    for k, i in _best_waves(gain, size, angle, _KEPT):
+    # Number of frames in the search for second families.
+    max_of_rest = 6
+    # Families that run more nearly alike than this have no mesh between them.
+    min_angle = np.deg2rad(25.0)
+    for k, i in _best_waves(gain, size, angle, _SEARCH.kept):
         a = size[k] * np.array([np.cos(angle[i]), np.sin(angle[i])])
         rest = spectrum.without(a)
         if rest.n_crossings == 0:
             continue
-        left = _family_gain(rest.polar(_MAX_OF_REST)[2], size, rest.per_frame, SHARE_OF_REST)
+        left = _family_gain(rest.polar(max_of_rest)[2], size, rest.per_frame, SHARE_OF_REST)
         between = np.abs((angle - angle[i] + 0.5 * np.pi) % np.pi - 0.5 * np.pi)
-        left = left - 0.5 * (np.log(size / size[k])[:, None] / _EVEN) ** 2
-        left[:, between < _MIN_ANGLE] = -np.inf
-        for m, j in _best_waves(left, size, angle, _SECONDS):
+        left = left - 0.5 * (np.log(size / size[k])[:, None] / _SEARCH.even) ** 2
+        left[:, between < min_angle] = -np.inf
+        for m, j in _best_waves(left, size, angle, _SEARCH.seconds):
             b = size[m] * np.array([np.cos(angle[j]), np.sin(angle[j])])
             found.append(Hypothesis(Mesh.FOUR_SIDED, np.array([a, b])))
     return found
@@ -417,14 +426,14 @@ def _best_waves(
 ) -> list[tuple[int, int]]:
     """Return the rows and columns of the best waves that are not neighbours, best first."""
     gain = np.where(
-        ((size > 1.0 / LARGEST_PITCH) & (size < 1.0 / _SHORTEST_BAR))[:, None], gain, -np.inf
+        ((size > 1.0 / LARGEST_PITCH) & (size < 1.0 / _SEARCH.shortest_bar))[:, None], gain, -np.inf
     )
-    order = np.argsort(gain, axis=None)[::-1][:_TRIED]
+    order = np.argsort(gain, axis=None)[::-1][: _SEARCH.tried]
     found: list[tuple[int, int]] = []
     waves: list[FloatArray] = []
     for k, i in zip(*np.unravel_index(order, gain.shape), strict=True):
         wave = size[k] * np.array([np.cos(angle[i]), np.sin(angle[i])])
-        if all(_distance(wave, other) > _HYPOTHESES_APART for other in waves):
+        if all(_distance(wave, other) > _SEARCH.apart for other in waves):
             found.append((int(k), int(i)))
             waves.append(wave)
         if len(found) == n:
@@ -438,7 +447,9 @@ def _six_sided(
     bars = _family_gain(power, size, spectrum.per_frame, 1.0 / 3.0)
     shell = _gain(power, 1.0 + spectrum.per_frame * SHELL_1**2)
     # The first shell's waves are 1 / (1.5 bar) long.
-    rows = np.flatnonzero((size > 1.0 / LARGEST_PITCH) & (size < 1.0 / (1.5 * _SHORTEST_BAR)))
+    rows = np.flatnonzero(
+        (size > 1.0 / LARGEST_PITCH) & (size < 1.0 / (1.5 * _SEARCH.shortest_bar))
+    )
     double = np.rint((2.0 * size[rows] - size[0]) / (size[1] - size[0])).astype(int)
     longer = np.rint((np.sqrt(3.0) * size[rows] - size[0]) / (size[1] - size[0])).astype(int)
     inside = double < len(size)
@@ -451,7 +462,7 @@ def _six_sided(
         beside = (at + sixth) % N_ANGLES
         near = longer < len(size)
         total[near] += bars[longer[near]][:, beside]
-    order = np.argsort(total, axis=None)[::-1][:_TRIED]
+    order = np.argsort(total, axis=None)[::-1][: _SEARCH.tried]
     found = []
     for k, i in zip(*np.unravel_index(order, total.shape), strict=True):
         a = size[rows[k]] * np.array([np.cos(angle[i]), np.sin(angle[i])])
@@ -463,9 +474,9 @@ def _spread_out(ordered: list[Hypothesis]) -> list[Hypothesis]:
     """Return the best of each group of neighbours."""
     kept: list[Hypothesis] = []
     for one in ordered:
-        if len(kept) == _KEPT:
+        if len(kept) == _SEARCH.kept:
             break
-        if all(_apart(one, other) > _HYPOTHESES_APART for other in kept):
+        if all(_apart(one, other) > _SEARCH.apart for other in kept):
             kept.append(one)
     return kept
 

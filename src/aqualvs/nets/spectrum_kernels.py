@@ -16,8 +16,6 @@ from aqualvs.geometry.compiled import inline_kernel, kernel
 # Largest distance of a crossing of the wave's family from a crest, in periods.
 _ON_CREST = 0.12
 _TURN = 2.0 * np.pi
-# Difference of lengths that count as equal, in metres, and half a span's phase that counts as zero.
-_SAME, _SHORT = 1e-10, 1e-6
 
 
 @kernel
@@ -85,10 +83,13 @@ def _add_spans(
     n = real.shape[0]
     c, s, turn_c, turn_s, ch, sh = 1.0, 0.0, 1.0, 0.0, 1.0, 0.0
     middle_x, middle_y, step_x, step_y, half_x, half_y = 0.0, 0.0, np.inf, 0.0, np.inf, 0.0
+    # Difference of lengths that count as equal, in metres, and half a span's phase that counts as
+    # zero.
+    same, short = 1e-10, 1e-6
     for i in range(from_, to):
         x, y = 0.5 * (begin[i, 0] + end[i, 0]), 0.5 * (begin[i, 1] + end[i, 1])
         u, v = 0.5 * (end[i, 0] - begin[i, 0]), 0.5 * (end[i, 1] - begin[i, 1])
-        if abs(x - middle_x - step_x) + abs(y - middle_y - step_y) < _SAME:
+        if abs(x - middle_x - step_x) + abs(y - middle_y - step_y) < same:
             c, s = c * turn_c - s * turn_s, s * turn_c + c * turn_s
         else:
             angle = _TURN * (qx * x + qy * y)
@@ -97,14 +98,14 @@ def _add_spans(
             turn_c, turn_s = c * before_c + s * before_s, s * before_c - c * before_s
             step_x, step_y = x - middle_x, y - middle_y
         middle_x, middle_y = x, y
-        if abs(u - half_x) + abs(v - half_y) > _SAME:
+        if abs(u - half_x) + abs(v - half_y) > same:
             half_x, half_y = u, v
             half = _TURN * (qx * u + qy * v)
             ch, sh = np.cos(half), np.sin(half)
             xh, yh = 1.0, 0.0
             for h in range(n):
                 xh, yh = xh * ch - yh * sh, xh * sh + yh * ch
-                share[h] = yh / ((h + 1) * half) if abs(half) > _SHORT else 1.0
+                share[h] = yh / ((h + 1) * half) if abs(half) > short else 1.0
         a, b = 1.0, 0.0
         for h in range(n):
             a, b = a * c - b * s, a * s + b * c
@@ -285,16 +286,10 @@ SHELL_1 = 0.37
 """Amplitude of the waves in the first shell of a honeycomb's reciprocal lattice."""
 SHARE_OF_REST = 0.8
 """Share of the other family in the crossings that are not on a family's crests."""
-# Gain if no crossings are left.
-_NOTHING_LEFT = 5.0
 # The double of a first shell's wave may be strong or weak, depending on how the lines cut the net:
 # its gain is its likelihood, less this. Where a frame has few crossings, about as many as this,
 # strong waves are not expected, and the deduction is smaller.
 _FREEDOM, _FEW_CROSSINGS = 0.7, 15.0
-# Crossings seen over crossings that a lattice must have, less those that merge: spread of its
-# logarithm among lasers, variance of a frame's count of one, and spread of the mean towards fewer
-# (missing strands) and towards more.
-_SEEN_SPREAD, _COUNT_NOISE, _FEW_SEEN, _MANY_SEEN = 0.2, 0.3, 0.2, 0.12
 
 
 @inline_kernel
@@ -416,8 +411,10 @@ def _comb_gain(
     share: float,
 ) -> float:
     """Return the gain from a family's harmonics that holds a share of the crossings."""
+    # Gain if no crossings are left.
+    nothing_left = 5.0
     if place.shape[0] == 0:
-        return -_NOTHING_LEFT
+        return -nothing_left
     per_frame = place.shape[0] / (start.shape[0] - 1)
     size = np.hypot(wave[0], wave[1])
     power = np.zeros(int(max(1.0, min(HIGHEST // size, MAX_HARMONICS))))
@@ -457,12 +454,16 @@ def miscount(
             rate += abs(lines[i, 0] * wave[0] + lines[i, 1] * wave[1])
         expected[laser[i]] += rate * density * lines[i, 2]
     weight, mean, square = 0.0, 0.0, 0.0
+    # Crossings seen over crossings that a lattice must have, less those that merge: spread of its
+    # logarithm among lasers, variance of a frame's count of one, and spread of the mean towards
+    # fewer (missing strands) and towards more.
+    seen_spread, count_noise, few_seen, many_seen = 0.2, 0.3, 0.2, 0.12
     for k in range(len(seen)):
         if expected[k] > 0.0:
             count = max(float(seen[k]), 0.5)
             off = np.log(count / (expected[k] * max(1.0 - lit, 0.1)))
-            one = 1.0 / (_SEEN_SPREAD**2 + _COUNT_NOISE * n_frames / count)
+            one = 1.0 / (seen_spread**2 + count_noise * n_frames / count)
             weight, mean, square = weight + one, mean + one * off, square + one * off**2
     mean /= weight
-    spread = _FEW_SEEN if mean < 0.0 else _MANY_SEEN
+    spread = few_seen if mean < 0.0 else many_seen
     return float(0.5 * (square - weight * mean**2) + mean**2 / (2.0 * spread**2))

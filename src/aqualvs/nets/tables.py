@@ -26,8 +26,6 @@ from aqualvs.nets.places import DivePostures, NetPlace, NetPlaces, PlacedBy
 from aqualvs.optics.rig import Rig
 from aqualvs.text import clock, hole_count
 
-# A stretch in which the vehicle moved less than this share of what the picture shows is no band.
-_MIN_MOVE = 0.15
 # Bands meet in one edge where the cosine of the turn between them is above this.
 _SHARP = 0.5
 _CORNERS = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
@@ -187,7 +185,10 @@ def bands(nodes: FloatArray, half: FloatArray) -> list[FloatArray]:
     """
     moves = np.diff(nodes, axis=0)
     length = np.hypot(*moves.T)
-    still = length < _MIN_MOVE * half.sum(axis=1)
+    # A stretch in which the vehicle moved less than this share of what the picture shows is no
+    # band.
+    min_move = 0.15
+    still = length < min_move * half.sum(axis=1)
     with np.errstate(invalid="ignore", divide="ignore"):
         across = np.stack([-moves[:, 1], moves[:, 0]], axis=-1) / length[:, None]
     # From the middle to the left edge: half of what the picture measures square to the way.
@@ -230,7 +231,6 @@ HOLE_COLUMNS = (
 """Columns of `holes.csv`, one row for every hole."""
 
 _DIGITS = {"s": 3, "m": 3, "deg": 1, "mm": 2, "px": 1}
-_SHARE_DIGITS = 4
 
 
 def stretch_rows(wall: UnrolledNet) -> list[dict[str, Cell]]:
@@ -364,8 +364,9 @@ def _round(name: str, cell: Cell) -> Cell:
         return str(cell)
     if cell is None or isinstance(cell, int):
         return cell
+    share_digits = 4
     # Adding zero turns a negative zero into a plain one.
-    return round(float(cell), _DIGITS.get(name.rsplit("_", 1)[-1], _SHARE_DIGITS)) + 0.0
+    return round(float(cell), _DIGITS.get(name.rsplit("_", 1)[-1], share_digits)) + 0.0
 
 
 def _polygons(wall: UnrolledNet) -> Iterator[dict[str, Any]]:
@@ -390,9 +391,6 @@ def _feature(kind: str, row: Mapping[str, Cell], geometry: Mapping[str, Any]) ->
 
 def _corners(places: FloatArray) -> list[list[float]]:
     return [[round(float(x), 4) + 0.0, round(float(y), 4) + 0.0] for x, y in places]
-
-
-_MAX_LISTED = 20
 
 
 def net_dict(wall: UnrolledNet, area: float, n_frames: int, n_net_frames: int) -> dict[str, Any]:
@@ -490,14 +488,15 @@ def _hole_lines(wall: UnrolledNet, facts: dict[str, Any]) -> list[str]:
     seen = (
         f"looked at {facts['area_m2']:.2f} m² of net over {facts['way_m']:.1f} m: {hole_count(n)}"
     )
-    order = np.argsort([-hole.diameter for hole in wall.holes], kind="stable")[:_MAX_LISTED]
+    max_listed = 20
+    order = np.argsort([-hole.diameter for hole in wall.holes], kind="stable")[:max_listed]
     lines = [
         f"  {i + 1}: {size_text(hole)}, {hole.missing_meshes:.0f} meshes: {place_text(place)}, "
         f"at {clock(hole.time_s)} (frame {hole.frame})"
         for i, hole, place in ((i, wall.holes[i], wall.places.holes[i]) for i in sorted(order))
     ]
-    if n > _MAX_LISTED:
-        lines.append(f"  and {n - _MAX_LISTED} smaller ones, see holes.csv")
+    if n > max_listed:
+        lines.append(f"  and {n - max_listed} smaller ones, see holes.csv")
     return [seen, *lines]
 
 

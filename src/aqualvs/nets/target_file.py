@@ -24,10 +24,10 @@ pi / (2 L) (Crofton); L is 2 / bar for square and diamond meshes and 2 / (sqrt(3
 
 import math
 from array import array
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -36,14 +36,14 @@ from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.sheet import sheets_of
-from aqualvs.scanning.paper.mesh_filter import MeshFilterOptions
 from aqualvs.scanning.posture import Posture
 from aqualvs.scanning.scan import Label, Scan
-from aqualvs.scanning.target import TargetKind
+from aqualvs.scanning.surfaces import TargetKind
 from aqualvs.yamlfile import read_yaml
 
 if TYPE_CHECKING:
     from aqualvs.nets.condition import NetConditionOptions
+    from aqualvs.scanning.paper.mesh_filter import MeshFilterOptions
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -123,8 +123,6 @@ _DISTANCES = {
     "square": (math.sqrt(0.5), math.sqrt(2.0)),
     "hexagon": (1.0, 2.0),
 }
-# Reflection over twine, as for the paper's net (section 5.2).
-_REFLECTION = 5.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,8 +151,10 @@ class NetFacts:
         """Return the lengths of `MeshFilterOptions` that follow from the net, in metres."""
         least, greatest = (self.bar * share for share in _DISTANCES[self.mesh])
         lengths = {"r_min": least, "r_max": greatest}
+        # Reflection over twine, as for the paper's net (section 5.2).
+        reflection = 5.0
         if self.twine is not None:
-            lengths["rd_theta"] = min(_REFLECTION * self.twine, least)
+            lengths["rd_theta"] = min(reflection * self.twine, least)
         return lengths
 
 
@@ -166,15 +166,23 @@ class TargetFacts:
     ----------
     kind : TargetKind
         What the posture is measured to.
-    mesh_filter : MeshFilterOptions
-        Parameters of the paper's mesh filter.
+    filter_lengths : mapping
+        Parameters of the paper's mesh filter in metres, those that differ from the defaults.
     net : NetFacts or None
         What the net is said to be, where the file says it.
     """
 
     kind: TargetKind = TargetKind.AUTO
-    mesh_filter: MeshFilterOptions = field(default_factory=MeshFilterOptions)
+    filter_lengths: Mapping[str, float] = field(default_factory=dict)
     net: NetFacts | None = None
+
+    @property
+    def mesh_filter(self) -> "MeshFilterOptions":
+        """Parameters of the paper's mesh filter."""
+        # Few runs use the filter, and all read what the target is.
+        from aqualvs.scanning.paper.mesh_filter import MeshFilterOptions
+
+        return MeshFilterOptions(**self.filter_lengths)
 
 
 def target_dict(text: str) -> TargetFacts:
@@ -198,8 +206,14 @@ def target_dict(text: str) -> TargetFacts:
     if kind not in set(TargetKind):
         raise OptionError(f"{path}: kind is {kind!r}; use one of {_KINDS}")
     net = _net(path, content["net"]) if "net" in content else None
-    filtering = _mesh_filter(path, content.get("mesh_filter") or {}, net)
-    return TargetFacts(TargetKind(kind), filtering, net)
+    facts = TargetFacts(
+        TargetKind(kind), _filter_lengths(path, content.get("mesh_filter") or {}, net), net
+    )
+    try:
+        _ = facts.mesh_filter
+    except OptionError as fault:
+        raise OptionError(f"{path}: {fault}") from fault
+    return facts
 
 
 def _net(path: Path, content: Any) -> NetFacts:
@@ -221,7 +235,7 @@ def _metres(path: Path, place: str, value: Any) -> float:
     return 1e-3 * float(value)
 
 
-def _mesh_filter(path: Path, content: Any, net: NetFacts | None) -> MeshFilterOptions:
+def _filter_lengths(path: Path, content: Any, net: NetFacts | None) -> dict[str, float]:
     if not isinstance(content, dict):
         raise OptionError(f"{path}: mesh_filter holds no keys; give {', '.join(_LENGTHS)}")
     _refuse_unknown(path, "mesh_filter.", content, _LENGTHS)
@@ -231,10 +245,7 @@ def _mesh_filter(path: Path, content: Any, net: NetFacts | None) -> MeshFilterOp
         if not number or not math.isfinite(value):
             raise OptionError(f"{path}: mesh_filter.{name} is {value!r}; give millimetres")
         lengths[name.removesuffix("_mm")] = 1e-3 * value
-    try:
-        return MeshFilterOptions(**lengths)
-    except OptionError as fault:
-        raise OptionError(f"{path}: {fault}") from fault
+    return lengths
 
 
 def _refuse_unknown(
@@ -245,19 +256,21 @@ def _refuse_unknown(
             raise OptionError(f"{path}: unknown key {place}{name}; known are {', '.join(known)}")
 
 
-# A frame now and then is enough, and costs the run nothing.
-_EVERY = 5
-_ENOUGH_FRAMES = 5
-# Largest gap in the light of one strand, in metres; least number of points of a strand, of strands
-# of a stripe, and of stripes of a frame.
-_GAP = 3e-3
-_MIN_POINTS, _MIN_STRANDS, _MIN_LASERS = 3, 4, 2
-# Gaps wider than this many usual distances are holes, or objects before the net.
-_HOLE = 2.5
-# Strands that meet at a knot count once and dim ones are missed: found on random simulated nets.
-_MISSED = 1.2
-# On those nets the bar of single frames is estimated at 0.67 to 1.45 of its true length.
-_TOO_SHORT, _TOO_LONG = 0.62, 1.6
+class _CheckOptions(NamedTuple):
+    """Check of the net's stated bar against the stripes."""
+
+    # A frame now and then is enough, and costs the run nothing.
+    every: int = 5
+    enough_frames: int = 5
+    # Largest gap in the light of one strand, in metres; least number of points of a strand, of
+    # strands of a stripe, and of stripes of a frame.
+    gap: float = 3e-3
+    min_points: int = 3
+    min_strands: int = 4
+    min_lasers: int = 2
+
+
+_CHECK = _CheckOptions()
 
 
 @dataclass(slots=True)
@@ -283,19 +296,21 @@ class NetCheck:
 
     def add(self, scan: Scan) -> None:
         """Evaluate a frame, if it is sampled (by its number in the dive) and shows a net."""
-        if scan.index % _EVERY == 0:
+        if scan.index % _CHECK.every == 0:
             bar = bar_of(scan, self.planes, self.said)
             if bar is not None:
                 self.bars.append(bar)
 
     def bar(self) -> float | None:
         """Return the estimated bar over the dive, in metres; None where too little was seen."""
-        return float(np.median(self.bars)) if len(self.bars) >= _ENOUGH_FRAMES else None
+        return float(np.median(self.bars)) if len(self.bars) >= _CHECK.enough_frames else None
 
     def sentence(self) -> str:
         """Return the contradiction to the file in one line, "" if there is none."""
         bar = self.bar()
-        if bar is None or _TOO_SHORT <= bar / self.said.bar <= _TOO_LONG:
+        # On those nets the bar of single frames is estimated at 0.67 to 1.45 of its true length.
+        too_short, too_long = 0.62, 1.6
+        if bar is None or too_short <= bar / self.said.bar <= too_long:
             return ""
         return (
             f"the net looks like one with a bar length of about {1e3 * bar:.2g} mm, where "
@@ -359,9 +374,12 @@ def bar_of(scan: Scan, planes: Sequence[Plane], said: NetFacts) -> float | None:
         distance = strand_distance(scan.points.points_in_dome[mine] @ along)
         if distance is not None:
             densities.append(1.0 / distance)
-    if len(densities) < _MIN_LASERS:
+    if len(densities) < _CHECK.min_lasers:
         return None
-    return float(said.crossings_per_bar / (_MISSED * np.mean(densities)))
+    # Strands that meet at a knot count once and dim ones are missed: found on random simulated
+    # nets.
+    missed = 1.2
+    return float(said.crossings_per_bar / (missed * np.mean(densities)))
 
 
 def strand_distance(along: FloatArray) -> float | None:
@@ -372,13 +390,15 @@ def strand_distance(along: FloatArray) -> float | None:
     along : array, shape (N,)
         Places of points on the net along the stripe, in metres, in any order.
     """
-    if len(along) < _MIN_STRANDS * _MIN_POINTS:
+    if len(along) < _CHECK.min_strands * _CHECK.min_points:
         return None
     along = np.sort(along)
-    gaps = np.flatnonzero(np.diff(along) > _GAP)
+    gaps = np.flatnonzero(np.diff(along) > _CHECK.gap)
     first, last = np.append(0, gaps + 1), np.append(gaps, len(along) - 1)
-    strand = last - first + 1 >= _MIN_POINTS
-    if np.count_nonzero(strand) < _MIN_STRANDS:
+    strand = last - first + 1 >= _CHECK.min_points
+    if np.count_nonzero(strand) < _CHECK.min_strands:
         return None
     apart = np.diff(0.5 * (along[first] + along[last])[strand])
-    return float(np.mean(apart[apart <= _HOLE * np.median(apart)]))
+    # Gaps wider than this many usual distances are holes, or objects before the net.
+    hole = 2.5
+    return float(np.mean(apart[apart <= hole * np.median(apart)]))

@@ -139,8 +139,6 @@ ROUNDS = 3
 # Points this much (relative) inside the outer surface are still on it: rounding, not geometry.
 SURFACE_SLACK = 1e-9
 _TINY = 1e-300
-# Parts of each branch of theta(alpha) that the slow search looks at for a crossing.
-_SLICES = 32
 
 
 class AngleSines(NamedTuple):
@@ -264,10 +262,12 @@ def solve_guarded(
     target = math.atan2(sin_target, cos_target)
     sine = min(1.0 / max(n_l * steepest(s), _TINY), 1.0)
     bound = math.asin(sine)
+    # Parts of each branch of theta(alpha) that the slow search looks at for a crossing.
+    slices = 32
     for start in (0.0, math.pi - bound):
-        for i in range(_SLICES):
-            low = start + bound * i / _SLICES
-            high = start + bound * (i + 1) / _SLICES
+        for i in range(slices):
+            low = start + bound * i / slices
+            high = start + bound * (i + 1) / slices
             below = _theta(s, n_l, low) <= target
             if below == (_theta(s, n_l, high) < target):
                 continue
@@ -349,11 +349,6 @@ def direction_to_point(
         c * a[1] + k * e[1],
         c * a[2] + k * e[2],
     )
-
-
-# Sine of the polar angle below which sin alpha / sin theta is taken as its limit: the limit is off
-# by the square of this, the quotient by a rounding over it.
-_ON_AXIS = 1e-5
 
 
 class BackDerivative(NamedTuple):
@@ -464,7 +459,10 @@ def back_derivative(
     slope = slope / scale
     inverse = 1.0 / (1.0 + n_l * c * slope)
     by_rho = inverse * inverse_rho
-    ratio = k / max(sin_t, _ON_AXIS) if sin_t > _ON_AXIS else inverse
+    # Sine of the polar angle below which sin alpha / sin theta is taken as its limit: the limit is
+    # off by the square of this, the quotient by a rounding over it.
+    on_axis = 1e-5
+    ratio = k / max(sin_t, on_axis) if sin_t > on_axis else inverse
     t1, t2 = b * s.q1 / cosine_of(s.q1, b), b * s.q2 / cosine_of(s.q2, b)
     t3, t4 = b * s.q3 / cosine_of(s.q3, b), b * s.q4 / cosine_of(s.q4, b)
     t5 = b * s.q5 / cosine_of(s.q5, b)

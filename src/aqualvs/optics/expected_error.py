@@ -19,14 +19,6 @@ from aqualvs.optics.rig import Rig, RigUncertainty
 from aqualvs.optics.rig_covariance import PostureErrors, fitted_plane
 from aqualvs.optics.sheet import Sheet, sheets_of
 
-# Stripes are followed this far to both sides of the wall's nearest point, in even angular steps.
-_HALF_ANGLE = np.deg2rad(75.0)
-_N_SAMPLES = 1501
-# A sheet whose intersection with the wall is this ill-defined is parallel to it.
-_PARALLEL = 1e-6
-# Newton steps on the wall from a bent sheet's tangent plane, which is centimetres off at most.
-_N_STEPS = 5
-
 
 @dataclass(frozen=True, slots=True)
 class StripeView:
@@ -88,7 +80,9 @@ def _stripe_on_wall(sheet: Sheet, wall_range: float) -> FloatArray:
     if sheet.is_plane or not len(line):
         return line
     line = _line_on_wall(sheet.tangent_plane(line[len(line) // 2]), wall_range)
-    for _ in range(_N_STEPS):
+    # Newton steps on the wall from a bent sheet's tangent plane, which is centimetres off at most.
+    n_steps = 5
+    for _ in range(n_steps):
         gradient = sheet.gradient(line) * [1.0, 0.0, 1.0]
         steepness = np.sum(gradient**2, axis=-1)
         line = line - (sheet.signed_distance(line) / steepness)[:, None] * gradient
@@ -98,12 +92,18 @@ def _stripe_on_wall(sheet: Sheet, wall_range: float) -> FloatArray:
 def _line_on_wall(plane: Plane, wall_range: float) -> FloatArray:
     across = np.array([plane.normal[0], 0.0, plane.normal[2]])
     length = float(np.linalg.norm(across))
-    if length < _PARALLEL:
+    # A sheet whose intersection with the wall is this ill-defined is parallel to it.
+    parallel = 1e-6
+    if length < parallel:
         return np.empty((0, 3))
     across /= length
     foot = across * (plane.offset - plane.normal[1] * wall_range) / length
     along = np.array([-across[2], 0.0, across[0]])
-    reach = wall_range * np.tan(np.linspace(-_HALF_ANGLE, _HALF_ANGLE, _N_SAMPLES))
+    # Stripes are followed this far to both sides of the wall's nearest point, in even angular
+    # steps.
+    half_angle = np.deg2rad(75.0)
+    n_samples = 1501
+    reach = wall_range * np.tan(np.linspace(-half_angle, half_angle, n_samples))
     line: FloatArray = foot + np.array([0.0, wall_range, 0.0]) + reach[:, None] * along
     return line
 

@@ -51,8 +51,6 @@ FLAT_PARAMETERS = (
 MAX_TILT = math.radians(45.0)
 """Of a port's normal about each axis; beyond, most of a picture sees the housing's wall."""
 
-# Halley's next error is about the cube of its step.
-_STEP_SOLVED = 1e-6
 # Points this much (relative) inside the outer face are still on it: rounding, not geometry.
 _SURFACE_SLACK = 1e-9
 _TINY = 1e-300
@@ -197,7 +195,9 @@ def tangent_step(port: FlatParams, height: float, rho: float, t: float) -> tuple
     # Halley: off / (slope - off * second derivative / (2 slope)), that derivative -3 t curve.
     step = off * slope / (slope * slope + 1.5 * t * curve * off)
     t -= step
-    solved = abs(step) < _STEP_SOLVED * (1.0 + t * t)
+    # Halley's next error is about the cube of its step.
+    step_solved = 1e-6
+    solved = abs(step) < step_solved * (1.0 + t * t)
     return t, solved & (t >= 0.0) & (min(square_g, square_w) > 1e-20)
 
 

@@ -50,8 +50,6 @@ class LensParams(NamedTuple):
 
 
 _STEPS_AT_MOST = 60
-# A Newton step below this leaves an error of its square.
-_STEP_SOLVED = 1e-9
 
 
 @inline_kernel
@@ -75,6 +73,8 @@ def fisheye_undistort(lens: LensParams, radius: float) -> tuple[bool, float, flo
     if not radius * radius < lens.limit_distorted:
         return False, 0.0, 1.0
     theta = min(radius, 0.5 * high)
+    # A Newton step below this leaves an error of its square.
+    step_solved = 1e-9
     for _ in range(_STEPS_AT_MOST):
         value, slope = fisheye_distort(lens, theta)
         error = radius - value
@@ -85,7 +85,7 @@ def fisheye_undistort(lens: LensParams, radius: float) -> tuple[bool, float, flo
         following = theta + error / slope
         if not low <= following <= high:
             following = 0.5 * (low + high)
-        done = abs(following - theta) <= _STEP_SOLVED
+        done = abs(following - theta) <= step_solved
         theta = following
         if done:
             break
@@ -123,8 +123,6 @@ _HALVINGS_AT_MOST = 40
 # Residual, in distorted coordinates near 1, at which a guarded solution counts: some roundings.
 _RESIDUAL_SOLVED = 1e-14
 _SPOKES = 32
-# The distorted radius between two spokes may exceed that on both, by tangential terms.
-_BETWEEN_SPOKES = 1.02
 
 
 @inline_kernel
@@ -279,7 +277,9 @@ def opencv_limits(lens: LensParams) -> tuple[float, float]:
         phi, radius = 2.0 * math.pi * i_spoke / _SPOKES, math.sqrt(limit)
         xd, yd, _, _, _ = opencv_distort(lens, radius * math.cos(phi), radius * math.sin(phi))
         widest = max(widest, xd * xd + yd * yd)
-    return limit, _BETWEEN_SPOKES * widest
+    # The distorted radius between two spokes may exceed that on both, by tangential terms.
+    between_spokes = 1.02
+    return limit, between_spokes * widest
 
 
 @inline_kernel

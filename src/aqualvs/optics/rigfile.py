@@ -105,11 +105,6 @@ __all__ = ["check_rig_place", "load_rig", "rig_from_mapping", "rig_to_mapping", 
 
 _MILLI = 1e3
 _ROTATION_DECIMALS = 12
-# Normals this close to unit length are kept as they are, so that loading and saving settle.
-_UNIT = 1e-14
-# A source measured with a ruler lies at most this far off its laser's plane, in metres.
-_OFF_SHEET = 5e-3
-_MIN_BEHIND = 1e-4
 # Cosine between the normals of sheet and window; nearer ones mean that no light could cross.
 _MAX_ACROSS = math.cos(math.radians(30.0))
 
@@ -407,7 +402,10 @@ def _laser(place: str, part: LaserPart) -> Laser:
 def _check_window(place: str, source_mm: list[float], sheet: Plane, window: Window) -> None:
     """Refuse a source off its sheet or not behind the window, and a window without any light."""
     off = float(sheet.signed_distance(window.source))
-    if abs(off) > _OFF_SHEET:
+    # A source measured with a ruler lies at most this far off its laser's plane, in metres.
+    off_sheet = 5e-3
+    min_behind = 1e-4
+    if abs(off) > off_sheet:
         raise RigError(
             f"{place}.source_mm is {source_mm}, {abs(off) * _MILLI:.1f} mm off the laser's plane; "
             "the light comes from a point in it: correct source_mm, or the laser's normal and "
@@ -424,7 +422,7 @@ def _check_window(place: str, source_mm: list[float], sheet: Plane, window: Wind
     ahead = np.array([0.0, 1.0, 0.0]) - sheet.normal[1] * sheet.normal
     behind = -float(window.face.signed_distance(source))
     # Light that goes forward must meet the face after leaving the source.
-    if abs(behind) < _MIN_BEHIND or behind * float(window.face.normal @ ahead) < 0.0:
+    if abs(behind) < min_behind or behind * float(window.face.normal @ ahead) < 0.0:
         raise RigError(
             f"{place}.source_mm is {source_mm}, which is not behind the window as a target ahead "
             "sees it; correct source_mm, or the window's offset_mm, which is that of its outer face"
@@ -440,7 +438,9 @@ def _plane(place: str, normal: Sequence[float], offset_mm: float) -> Plane:
             f"{place}.normal is {list(normal)}, which has no direction; give the normal of the "
             f"{'window' if place.endswith('window') else 'laser'}'s plane"
         )
-    if abs(length - 1.0) > _UNIT:
+    # Normals this close to unit length are kept as they are, so that loading and saving settle.
+    unit = 1e-14
+    if abs(length - 1.0) > unit:
         vector = vector / length
     return Plane(vector, offset_mm / _MILLI)
 

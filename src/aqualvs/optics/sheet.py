@@ -50,15 +50,6 @@ NORMAL, OFFSET, FACE, SOURCE, DEPTH, RATIO, SLANT, WINDOWED = 4, 7, 8, 11, 14, 1
 """n, d, w (from the source to the water), S, s, k, n·w, and 1 where there is a window."""
 COLUMNS = 18
 
-_MAX_STEPS = 60
-# Newton's next error is about the square of its step.
-_LAST_STEP = 1e-9
-# Along a ray: sheets bend with radii of metres, so the error after such a step (m) is below 1e-12.
-_LAST_STEP_ALONG = 1e-6
-_MAX_STEPS_ALONG = 20
-# Start of the search where the plane near the sheet gives no usable place on the ray.
-_FARTHEST_START = 10.0
-
 
 @inline_borrowing_kernel
 def _steepness(s: float, h: float, k: float, rho: float) -> float:
@@ -68,12 +59,15 @@ def _steepness(s: float, h: float, k: float, rho: float) -> float:
     if b < 0.0:
         # No ray in air is flatter than the one that grazes in the water.
         m = min(m, (1.0 - 1e-12) / math.sqrt(-b * rho + 1e-300))
-    for _ in range(_MAX_STEPS):
+    max_steps = 60
+    # Newton's next error is about the square of its step.
+    last_step = 1e-9
+    for _ in range(max_steps):
         d2 = 1.0 + b * m * m * rho
         d = math.sqrt(d2)
         step = (s * m + h * k * m / d - 1.0) / (s + h * k / (d2 * d))
         m -= step
-        if not abs(step) > _LAST_STEP * m:
+        if not abs(step) > last_step * m:
             break
     return m
 
@@ -204,13 +198,19 @@ def meet_sheet(
     `near` is an initial guess of the distance, which is NaN where Newton's method finds no
     intersection ahead.
     """
-    t = near if 0.0 < near < _FARTHEST_START else 1.0
+    # Start of the search where the plane near the sheet gives no usable place on the ray.
+    farthest_start = 10.0
+    t = near if 0.0 < near < farthest_start else 1.0
     gx, gy, gz = 0.0, 0.0, 0.0
-    for _ in range(_MAX_STEPS_ALONG):
+    # Along a ray: sheets bend with radii of metres, so the error after such a step (m) is below
+    # 1e-12.
+    last_step_along = 1e-6
+    max_steps_along = 20
+    for _ in range(max_steps_along):
         f, gx, gy, gz = sheet_tangent(row, ox + t * dx, oy + t * dy, oz + t * dz)
         step = f / (gx * dx + gy * dy + gz * dz)
         t -= step
-        if not abs(step) > _LAST_STEP_ALONG:
+        if not abs(step) > last_step_along:
             break
     x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
     above = (
@@ -219,7 +219,7 @@ def meet_sheet(
         + row[FACE + 2] * (z - row[SOURCE + 2])
         - row[DEPTH]
     )
-    if not (abs(step) <= _LAST_STEP_ALONG and t > 0.0 and above > 0.0):
+    if not (abs(step) <= last_step_along and t > 0.0 and above > 0.0):
         return math.nan, gx, gy, gz
     return t, gx, gy, gz
 
@@ -278,8 +278,6 @@ Only the ratio of the indices matters: the derivative by `n_air` is that by `n_w
 
 # Distance beyond the window at which the tangent plane represents the sheet, in metres.
 _USUAL_REACH = 0.6
-# Rays to each side on which a plane is fitted to a sheet.
-_GRID = (33, 25)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -403,9 +401,9 @@ class Sheet:
         if self.window is None:
             return self.plane
         width, height = camera.size_px
-        x, y = np.meshgrid(
-            np.linspace(0, width - 1, _GRID[0]), np.linspace(0, height - 1, _GRID[1])
-        )
+        # Rays to each side on which a plane is fitted to a sheet.
+        grid = (33, 25)
+        x, y = np.meshgrid(np.linspace(0, width - 1, grid[0]), np.linspace(0, height - 1, grid[1]))
         points, valid = self.intersect(camera.rays(np.stack([x, y], axis=-1)))
         points = points[valid]
         distance = np.linalg.norm(points, axis=-1)

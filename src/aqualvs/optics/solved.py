@@ -80,8 +80,6 @@ _UNIT_OF = {
 # cancel, comes back within this share.
 _DIGITS = (5, 7, 9, 11, 13, 15)
 _LOST_SHARE = 1e-3
-# Rounding in a file written by hand or by others; what is more negative is no covariance.
-_NOT_NEGATIVE = -1e-6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -292,7 +290,9 @@ def _correlation(rows: object, n: int) -> FloatArray:
     correlation = np.eye(n)
     for i, row in enumerate(rows, start=1):
         correlation[i, :i] = correlation[:i, i] = _numbers(row, i, f"{place}[{i - 1}]")
-    if n and not np.linalg.eigvalsh(correlation)[0] >= _NOT_NEGATIVE:
+    # Rounding in a file written by hand or by others; what is more negative is no covariance.
+    not_negative = -1e-6
+    if n and not np.linalg.eigvalsh(correlation)[0] >= not_negative:
         raise RigError(f"{place} is not that of any numbers; restore it, or calibrate again")
     return correlation
 
@@ -344,8 +344,6 @@ LASER_TILT, LASER_OFFSET_M = math.radians(0.2), 1e-3
 _LENS = ("lens_x", "lens_y", "lens_z")
 _SHELL = ("inner_radius", "thickness", "n_acrylic")
 _FLAT = ("port_distance", "thickness", "n_port", "port_tilt_x", "port_tilt_y")
-# An index outside that is the one inside is air, which is known.
-_AIR = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -432,7 +430,9 @@ def _defaults(rig: Rig) -> Iterator[Assumption]:
             RigUncertainty.independent(dict(zip(_FLAT, tolerances, strict=True))),
         )
     bends = rig.housing is not None or any(laser.window is not None for laser in rig.lasers)
-    if bends and abs(rig.n_water - rig.n_air) > _AIR:
+    # An index outside that is the one inside is air, which is known.
+    air = 1e-3
+    if bends and abs(rig.n_water - rig.n_air) > air:
         yield Assumption(
             "water's index", f"{N_WATER:g}", RigUncertainty.independent({"n_water": N_WATER})
         )

@@ -18,8 +18,23 @@ N_AIR = 1.0003
 GREEN_NM = 532.0
 """Wavelength of a frequency-doubled Nd:YAG laser in vacuum, nanometres."""
 
-_N0, _N1, _N2, _N3, _N4 = 1.31405, 1.779e-4, -1.05e-6, 1.6e-8, -2.02e-6
-_N5, _N6, _N7, _N8, _N9 = 15.868, 0.01155, -0.00423, -4382.0, 1.1455e6
+
+class _QuanFry(NamedTuple):
+    """Coefficients of the formula of Quan and Fry (1995)."""
+
+    n0: float = 1.31405
+    n1: float = 1.779e-4
+    n2: float = -1.05e-06
+    n3: float = 1.6e-8
+    n4: float = -2.02e-06
+    n5: float = 15.868
+    n6: float = 0.01155
+    n7: float = -0.00423
+    n8: float = -4382.0
+    n9: float = 1.1455e6
+
+
+_FORMULA = _QuanFry()
 
 
 class IndexSlopes(NamedTuple):
@@ -64,10 +79,11 @@ def seawater_index(
     """
     t, s, w = _checked(temperature_c, salinity_permille, wavelength_nm)
     index: FloatArray = np.asarray(
-        _N0
-        + (_N1 + (_N2 + _N3 * t) * t) * s
-        + _N4 * t * t
-        + (_N5 + _N6 * s + _N7 * t + (_N8 + _N9 / w) / w) / w
+        _FORMULA.n0
+        + (_FORMULA.n1 + (_FORMULA.n2 + _FORMULA.n3 * t) * t) * s
+        + _FORMULA.n4 * t * t
+        + (_FORMULA.n5 + _FORMULA.n6 * s + _FORMULA.n7 * t + (_FORMULA.n8 + _FORMULA.n9 / w) / w)
+        / w
     )
     return index
 
@@ -92,8 +108,10 @@ def seawater_index_slopes(
     """Return how `seawater_index` changes with temperature and salinity; parameters as there."""
     t, s, w = _checked(temperature_c, salinity_permille, wavelength_nm)
     return IndexSlopes(
-        np.asarray((_N2 + 2.0 * _N3 * t) * s + 2.0 * _N4 * t + _N7 / w),
-        np.asarray(_N1 + (_N2 + _N3 * t) * t + _N6 / w),
+        np.asarray(
+            (_FORMULA.n2 + 2.0 * _FORMULA.n3 * t) * s + 2.0 * _FORMULA.n4 * t + _FORMULA.n7 / w
+        ),
+        np.asarray(_FORMULA.n1 + (_FORMULA.n2 + _FORMULA.n3 * t) * t + _FORMULA.n6 / w),
     )
 
 

@@ -44,7 +44,6 @@ from aqualvs.sources.base import Health, PartHealth, State
 FRAME_ID = "dome"
 _NAN = math.nan
 _STATES = {State.OFF: 0, State.OK: 1, State.WARN: 2, State.FAULT: 3}
-_FLOAT32, _UINT8 = 7, 2
 _FLOATS = ("x", "y", "z", "quality")
 _BYTES = ("intensity", "laser", "label", "used")
 _POINT = np.dtype([*((name, "<f4") for name in _FLOATS), *((name, "u1") for name in _BYTES)])
@@ -134,11 +133,12 @@ def points_message(points: ScanPoints, stamp_ns: int) -> bytes:
     to = CdrWriter()
     to.header(stamp_ns, FRAME_ID)
     to.numbers("I", 1, len(points), len(_FLOATS) + len(_BYTES))
+    float32, uint8 = 7, 2
     for i, name in enumerate(_FLOATS + _BYTES):
         is_float = i < len(_FLOATS)
         to.text(name)
         to.numbers("I", 4 * i if is_float else 3 * len(_FLOATS) + i)
-        to.numbers("B", _FLOAT32 if is_float else _UINT8)
+        to.numbers("B", float32 if is_float else uint8)
         to.numbers("I", 1)
     to.numbers("?", False)
     to.numbers("I", _POINT.itemsize, cloud.nbytes)
@@ -269,12 +269,6 @@ def _put_part(to: CdrWriter, kind: str, part: PartHealth) -> None:
     to.numbers("q", part.n_dropped)
 
 
-_HEALTH_EVERY_NS = 1_000_000_000
-# The rig is recorded again after a second, then at intervals that double up to a minute, and at the
-# end: so no damage, not even of the first part, loses the rig.
-_RIG_AGAIN_NS, _RIG_EVERY_NS = 1_000_000_000, 60_000_000_000
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RecorderOptions:
     """Options of a recording: its contents, and how often it is written.
@@ -341,18 +335,22 @@ class SampleEncoder:
         yield POSTURE, posture_message(sample, stamp_ns)
         if self._points_due(sample, stamp_ns):
             yield POINTS, points_message(sample.scan.points, stamp_ns)
+        health_every_ns = 1_000_000_000
         if stamp_ns >= self._health_from_ns:
-            self._health_from_ns = stamp_ns + _HEALTH_EVERY_NS
+            self._health_from_ns = stamp_ns + health_every_ns
             yield HEALTH, health_message(sample.health, stamp_ns)
 
     def rig_messages(self, rig: Rig, stamp_ns: int) -> Iterator[tuple[RecordedTopic, bytes]]:
         """Yield the rig if it is not the one before, or due again; its water is in every frame."""
+        # The rig is recorded again after a second, then at intervals that double up to a minute,
+        # and at the end: so no damage, not even of the first part, loses the rig.
+        rig_again_ns, rig_every_ns = 1_000_000_000, 60_000_000_000
         if self._is_new(rig):
             self._rig, self._exact = rig, rig_exact(rig)
             self._rig_texts = rig_texts(rig, self._options.scanner)
-            self._rig_wait_ns = _RIG_AGAIN_NS
+            self._rig_wait_ns = rig_again_ns
         elif stamp_ns >= self._rig_from_ns:
-            self._rig_wait_ns = min(2 * self._rig_wait_ns, _RIG_EVERY_NS)
+            self._rig_wait_ns = min(2 * self._rig_wait_ns, rig_every_ns)
         else:
             return
         self._rig_from_ns = stamp_ns + self._rig_wait_ns

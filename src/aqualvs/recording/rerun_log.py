@@ -42,7 +42,6 @@ RRD = ".rrd"
 _TARGET, _VEHICLE, _CAMERA = "target", "target/vehicle", "target/vehicle/camera"
 _PLANE, _PICTURE, _REFUSALS = "target/plane", "target/vehicle/camera/picture", "refusals"
 _SERIES = ("posture/range_m", "posture/pitch_deg", "posture/yaw_deg")
-_JPEG_QUALITY = 75
 # Side of the square that represents the target, as a share of its range.
 _SIDE_SHARE = 1.0
 _BLUE, _PALE, _AMBER = (51, 153, 255, 90), (51, 153, 255, 255), (240, 228, 66, 255)
@@ -117,8 +116,9 @@ class RerunLog(Closing):
         stamp_ns = sample.instants.arrived_ns
         if self._points_due.at(stamp_ns):
             self._log_points(scan.points)
+        jpeg_quality = 75
         if sample.frame is not None and self._picture_due.at(stamp_ns):
-            jpeg = jpeg_of(sample.frame, _JPEG_QUALITY)
+            jpeg = jpeg_of(sample.frame, jpeg_quality)
             picture = self._rr.EncodedImage(contents=jpeg, media_type="image/jpeg")
             self._stream.log(_PICTURE, picture)
             marks = self._rr.Points2D(scan.points.pixels, class_ids=scan.points.label, radii=-1.5)

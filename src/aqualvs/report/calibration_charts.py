@@ -10,6 +10,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from html import escape
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -22,9 +23,18 @@ from aqualvs.scanning.scan import ImagePlane
 
 # Greatest width and JPEG quality, tried in this order until a picture fits its share of the page.
 _SIZES = ((960, 80), (800, 75), (640, 72), (480, 65), (360, 55), (240, 45))
-_ALL_BYTES = 340_000
-_MAX_BYTES = 130_000
-_ALL_MARKS = 6000
+
+
+class _FigureLimits(NamedTuple):
+    """Size of a page: bytes of its pictures, and marks on them."""
+
+    all_bytes: int = 340_000
+    max_bytes: int = 130_000
+    all_marks: int = 6000
+
+
+_LIMITS = _FigureLimits()
+
 _UNDER = "#10181c"
 # Size of a mark and widths of its line and of the dark edge under it, for a picture 640 wide.
 _SHAPES: dict[MarkKind, tuple[float, float, float]] = {
@@ -47,10 +57,10 @@ def picture_view(shots: Sequence[PictureShot]) -> Raw:
 
 
 def _figure(shot: PictureShot, index: int, count: int) -> str:
-    jpeg, width, height = _embedded(shot.image, min(_MAX_BYTES, _ALL_BYTES // count))
+    jpeg, width, height = _embedded(shot.image, min(_LIMITS.max_bytes, _LIMITS.all_bytes // count))
     scale = width / shot.image.shape[1]
     body = [f'<image href="data:image/jpeg;base64,{jpeg}" width="{width}" height="{height}"/>']
-    limit = _ALL_MARKS // count // max(len(shot.points), 1)
+    limit = _LIMITS.all_marks // count // max(len(shot.points), 1)
     for layer, overlay in enumerate(shot.points):
         name = f"marks-{index}-{layer}"
         body.append(_marks(overlay, name, scale, width / 640.0, limit))
@@ -138,13 +148,36 @@ def _key(overlay: Overlay) -> str:
 
 N_VECTORS = 3000
 
-_WIDTH, _LEFT, _HEAD, _RIGHT, _FOOT = 760.0, 50.0, 30.0, 8.0, 28.0
-# Lengths of vectors as a share of the picture's width: typical ones, and where long ones are cut.
-_TYPICAL, _LONGEST = 0.03, 0.09
-_COLUMNS = 10
-_SIDE, _SIDE_HEIGHT = 400.0, 240.0
-_BINS = 32
-_REACH = 4.0
+
+class _VectorLayout(NamedTuple):
+    """Layout of a map of residuals, in units of its view box."""
+
+    width: float = 760.0
+    left: float = 50.0
+    head: float = 30.0
+    right: float = 8.0
+    foot: float = 28.0
+    # Lengths of vectors as a share of the picture's width: typical ones, and where long ones are
+    # cut.
+    typical: float = 0.03
+    longest: float = 0.09
+
+
+_VECTORS = _VectorLayout()
+
+
+class _SideLayout(NamedTuple):
+    """Layout of the charts beside the map: coverage and histogram."""
+
+    columns: int = 10
+    width: float = 400.0
+    height: float = 240.0
+    bins: int = 32
+    reach: float = 4.0
+
+
+_BESIDE = _SideLayout()
+
 _PALE, _DEEP = np.array([222.0, 238.0, 245.0]), np.array([11.0, 92.0, 125.0])
 _GAUSS_WITHIN_ONE = math.erf(math.sqrt(0.5))
 
@@ -174,7 +207,7 @@ class _Scale:
 
     def places(self, pixels: FloatArray) -> FloatArray:
         """Return where pixels lie; the centre of the first is half a pixel inside the frame."""
-        return np.array([_LEFT, _HEAD]) + (pixels + 0.5) * self.per_px
+        return np.array([_VECTORS.left, _VECTORS.head]) + (pixels + 0.5) * self.per_px
 
     def vectors(self, residuals: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Return vectors in the chart and which had to be cut."""
@@ -218,7 +251,7 @@ def _vector_chart(
     vectors, cut = scale.vectors(points.residuals)
     starts = scale.places(points.pixels)
     # An inner picture of the frame's size cuts what would run over the numbers beside it.
-    frame = f"{_LEFT:g} {_HEAD:g} {draw.num(width)} {draw.num(height)}"
+    frame = f"{_VECTORS.left:g} {_VECTORS.head:g} {draw.num(width)} {draw.num(height)}"
     x, y, w, h = frame.split()
     body = [
         *_frame(points.size_px, scale),
@@ -229,7 +262,7 @@ def _vector_chart(
         *_scale_bar(scale),
     ]
     words = _vector_text(points, len(rows), bool(cut[rows].any()))
-    total = (width + _LEFT + _RIGHT, height + _HEAD + _FOOT)
+    total = (width + _VECTORS.left + _VECTORS.right, height + _VECTORS.head + _VECTORS.foot)
     chart = draw.svg(*total, body, alt=f"{title}: residual vectors. {words}", kind="map")
     return chart, words, _vector_legend(bool((~points.used).any()))
 
@@ -239,7 +272,7 @@ def _coverage_chart(points: _Points, title: str) -> tuple[Raw, str]:
     counts = _cell_counts(points)
     covered = 100.0 * float((counts > 0).mean())
     width, height = points.size_px
-    size = _SIDE - 2.0
+    size = _BESIDE.width - 2.0
     tall = size * height / width
     dx, dy = size / counts.shape[1], tall / counts.shape[0]
     body: list[str] = []
@@ -249,7 +282,7 @@ def _coverage_chart(points: _Points, title: str) -> tuple[Raw, str]:
     words = f"Coverage: {covered:.0f} % of the picture’s cells hold points, as many as they say"
     words += "." if counts.all() else "; hatched cells hold none."
     alt = f"{title}: coverage of the picture, {covered:.0f} % of its cells hold points"
-    return draw.svg(_SIDE, tall + 2.0, body, alt=alt, kind="coverage"), words
+    return draw.svg(_BESIDE.width, tall + 2.0, body, alt=alt, kind="coverage"), words
 
 
 def _histogram(points: _Points, title: str) -> tuple[Raw, str]:
@@ -258,13 +291,13 @@ def _histogram(points: _Points, title: str) -> tuple[Raw, str]:
     rms = _rms(values)
     if not len(values) or not rms > 0.0:
         return Raw(""), "No residuals to count."
-    reach = _REACH * rms
-    counts, edges = np.histogram(values, _BINS, range=(-reach, reach))
+    reach = _BESIDE.reach * rms
+    counts, edges = np.histogram(values, _BESIDE.bins, range=(-reach, reach))
     dense = np.linspace(-reach, reach, 97)
-    bell = len(values) * (2.0 * _REACH / _BINS) / math.sqrt(2.0 * math.pi)
+    bell = len(values) * (2.0 * _BESIDE.reach / _BESIDE.bins) / math.sqrt(2.0 * math.pi)
     curve = bell * np.exp(-0.5 * (dense / rms) ** 2)
-    x_axis = draw.Axis(-reach, reach, 10.0, _SIDE - 10.0)
-    y_axis = draw.Axis(0.0, 1.06 * max(float(counts.max()), bell), _SIDE_HEIGHT - 46.0, 8.0)
+    x_axis = draw.Axis(-reach, reach, 10.0, _BESIDE.width - 10.0)
+    y_axis = draw.Axis(0.0, 1.06 * max(float(counts.max()), bell), _BESIDE.height - 46.0, 8.0)
     body = [
         *_bars(counts, edges, x_axis, y_axis),
         _bell(dense, curve, x_axis, y_axis),
@@ -272,7 +305,7 @@ def _histogram(points: _Points, title: str) -> tuple[Raw, str]:
     ]
     words = _histogram_text(values, rms)
     alt = f"{title}: histogram of residuals. {words}"
-    return draw.svg(_SIDE, _SIDE_HEIGHT, body, alt=alt, kind="histogram"), words
+    return draw.svg(_BESIDE.width, _BESIDE.height, body, alt=alt, kind="histogram"), words
 
 
 def _finite(found: ResidualMap) -> _Points:
@@ -289,13 +322,13 @@ def _finite(found: ResidualMap) -> _Points:
 def _scale_of(points: _Points) -> _Scale:
     """Return the scale at which nine of ten used residuals are at most of typical length."""
     width = points.size_px[0]
-    per_px = (_WIDTH - _LEFT - _RIGHT) / width
+    per_px = (_VECTORS.width - _VECTORS.left - _VECTORS.right) / width
     residuals = points.used_residuals if points.used.any() else points.residuals
     lengths = np.hypot(residuals[:, 0], residuals[:, 1])
     typical = float(np.quantile(lengths, 0.9)) if len(lengths) else 0.0
     # Without any residual every magnification is as good; one pixel then fills the typical length.
-    least = _TYPICAL * width / (typical if typical > 1e-9 else 1.0)
-    return _Scale(per_px, draw.round_step(least / 2.0), _LONGEST * width * per_px)
+    least = _VECTORS.typical * width / (typical if typical > 1e-9 else 1.0)
+    return _Scale(per_px, draw.round_step(least / 2.0), _VECTORS.longest * width * per_px)
 
 
 def _thinned(points: _Points, limit: int) -> IntArray:
@@ -309,19 +342,19 @@ def _thinned(points: _Points, limit: int) -> IntArray:
 def _frame(size_px: tuple[int, int], scale: _Scale) -> Iterator[str]:
     """Yield the picture's edge with round pixels beside it."""
     width, height = (scale.per_px * side for side in size_px)
-    yield draw.box(_LEFT, _HEAD, width, height, fill=draw.PAPER, stroke=draw.EDGE)
+    yield draw.box(_VECTORS.left, _VECTORS.head, width, height, fill=draw.PAPER, stroke=draw.EDGE)
     half = 0.5 * scale.per_px
-    x_axis = draw.Axis(0.0, float(size_px[0]), _LEFT + half, _LEFT + half + width)
-    y_axis = draw.Axis(0.0, float(size_px[1]), _HEAD + half, _HEAD + half + height)
-    foot = _HEAD + height
+    x_axis = draw.Axis(0.0, float(size_px[0]), _VECTORS.left + half, _VECTORS.left + half + width)
+    y_axis = draw.Axis(0.0, float(size_px[1]), _VECTORS.head + half, _VECTORS.head + half + height)
+    foot = _VECTORS.head + height
     for x, words in x_axis.ticks(7):
-        if x < _LEFT + width - 14.0:
+        if x < _VECTORS.left + width - 14.0:
             yield draw.line(x, foot, x, foot + 5) + draw.words_at(x, foot + 20, words)
-    yield draw.words_at(_LEFT + width, foot + 20, "px", anchor="end")
+    yield draw.words_at(_VECTORS.left + width, foot + 20, "px", anchor="end")
     for y, words in y_axis.ticks(6):
         if y < foot:
-            yield draw.line(_LEFT - 5, y, _LEFT, y)
-            yield draw.words_at(_LEFT - 9, y + 5, words, anchor="end")
+            yield draw.line(_VECTORS.left - 5, y, _VECTORS.left, y)
+            yield draw.words_at(_VECTORS.left - 9, y + 5, words, anchor="end")
 
 
 def _view_groups(
@@ -366,9 +399,9 @@ def _scale_bar(scale: _Scale) -> Iterator[str]:
     """Yield a bar of a round residual with its length and the magnification in words."""
     per_residual = scale.magnified * scale.per_px
     residual = draw.round_step(45.0 / per_residual)
-    y, end = 14.0, _LEFT + residual * per_residual
-    yield draw.line(_LEFT, y, end, y, colour=draw.ACCENT, more=' stroke-width="2"')
-    for x in (_LEFT, end):
+    y, end = 14.0, _VECTORS.left + residual * per_residual
+    yield draw.line(_VECTORS.left, y, end, y, colour=draw.ACCENT, more=' stroke-width="2"')
+    for x in (_VECTORS.left, end):
         yield draw.line(x, y - 5, x, y + 5, colour=draw.ACCENT, more=' stroke-width="2"')
     words = f"{residual:g} px; residuals are drawn {scale.magnified:,g} times as long as they are"
     yield draw.words_at(end + 10, y + 5, words, anchor="start", kind="strong")
@@ -412,10 +445,10 @@ def _vector_legend(outliers: bool) -> Raw:
 def _cell_counts(points: _Points) -> IntArray:
     """Return the used points in each cell; cells are about square, ten to a row."""
     width, height = points.size_px
-    rows = max(1, round(_COLUMNS * height / width))
+    rows = max(1, round(_BESIDE.columns * height / width))
     pixels = points.pixels[points.used] + 0.5
     counts, _, _ = np.histogram2d(
-        pixels[:, 1], pixels[:, 0], bins=(rows, _COLUMNS), range=((0, height), (0, width))
+        pixels[:, 1], pixels[:, 0], bins=(rows, _BESIDE.columns), range=((0, height), (0, width))
     )
     return counts.astype(np.int64)
 
@@ -463,7 +496,7 @@ def _histogram_axis(x_axis: draw.Axis, y_axis: draw.Axis) -> Iterator[str]:
 
 def _histogram_text(values: FloatArray, rms: float) -> str:
     within = 100.0 * float((np.abs(values) <= rms).mean())
-    beyond = int((np.abs(values) > _REACH * rms).sum())
+    beyond = int((np.abs(values) > _BESIDE.reach * rms).sum())
     said = (
         f"Bars: residuals, x and y apart. Line: the Gaussian of their rms, {rms:.3f} px. "
         f"{within:.0f} % lie within one rms (Gaussian: {100 * _GAUSS_WITHIN_ONE:.0f} %)"

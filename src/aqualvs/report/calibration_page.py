@@ -33,10 +33,7 @@ from aqualvs.text import signed
 DASH = "–"
 LIMIT_PERCENT, LIMIT_DEG = 0.5, 0.5
 
-_MOVED_SIGMAS = 3.0
 _HIGH_RMS = 2.5
-_ROWS_PER_COLUMN = 18
-_BAR, _BAR_HEIGHT, _BAR_REACH = 180.0, 14.0, 4.0
 
 
 def number(value: float | None, digits: int, *, plus: bool = False) -> str:
@@ -52,7 +49,8 @@ def view_table(views: Sequence[ViewRow]) -> Raw:
     """Return the views with a bar for the rms of each; in two columns if they are many."""
     usual = _usual_rms(views)
     remarks = any(view.remark or not view.used for view in views)
-    halves = 2 if len(views) > _ROWS_PER_COLUMN else 1
+    rows_per_column = 18
+    halves = 2 if len(views) > rows_per_column else 1
     length = -(-len(views) // halves)
     parts = [
         _view_part(views[start : start + length], usual, remarks)
@@ -155,18 +153,19 @@ def _bar(view: ViewRow, usual: float, wrong: bool) -> Raw:
     """Return the rms as a bar; one that would be too long is cut open at its end."""
     if not math.isfinite(view.rms_px):
         return Raw("")
-    reach = _BAR_REACH * usual if usual > 0.0 else max(view.rms_px, 1e-9)
-    length = _BAR * min(view.rms_px / reach, 1.0)
+    bar, bar_height, bar_reach = 180.0, 14.0, 4.0
+    reach = bar_reach * usual if usual > 0.0 else max(view.rms_px, 1e-9)
+    length = bar * min(view.rms_px / reach, 1.0)
     colour = draw.OUTLIER if wrong else draw.ACCENT
-    body = [draw.box(0.0, 2.0, length, _BAR_HEIGHT - 4.0, fill=colour, stroke="none")]
+    body = [draw.box(0.0, 2.0, length, bar_height - 4.0, fill=colour, stroke="none")]
     if view.rms_px > reach:
         gap = ' stroke-width="3"'
-        body.append(draw.line(_BAR - 16, _BAR_HEIGHT, _BAR - 10, 0, colour=draw.PAPER, more=gap))
+        body.append(draw.line(bar - 16, bar_height, bar - 10, 0, colour=draw.PAPER, more=gap))
     if usual > 0.0:
-        x = _BAR / _BAR_REACH
+        x = bar / bar_reach
         dashed = ' stroke-width="1.2" stroke-dasharray="3 2"'
-        body.append(draw.line(x, 0.0, x, _BAR_HEIGHT, colour="var(--ink)", more=dashed))
-    return draw.svg(_BAR, _BAR_HEIGHT, body, alt=f"{view.rms_px:.3f} px", kind="bar")
+        body.append(draw.line(x, 0.0, x, bar_height, colour="var(--ink)", more=dashed))
+    return draw.svg(bar, bar_height, body, alt=f"{view.rms_px:.3f} px", kind="bar")
 
 
 def _sigma_text(row: ParameterRow) -> str:
@@ -186,10 +185,11 @@ def _change_cells(row: ParameterRow) -> list[str]:
     sigmas = math.nan
     if row.sigma is not None and row.sigma > 0.0:
         sigmas = change / row.sigma
+    moved_sigmas = 3.0
     return [
         number(row.before, row.digits),
         number(change, row.digits, plus=True),
-        _marked(number(sigmas, 1, plus=True), abs(sigmas) > _MOVED_SIGMAS),
+        _marked(number(sigmas, 1, plus=True), abs(sigmas) > moved_sigmas),
     ]
 
 
@@ -273,9 +273,6 @@ __all__ = [
     "page_html",
     "write_page",
 ]
-
-# Vectors of all maps together; with them and the pictures' share a page stays below 1 MB.
-_ALL_VECTORS = 7500
 
 
 def write_page(page: CalibrationPage, path: Path) -> Path:
@@ -361,7 +358,9 @@ def _series(page: CalibrationPage) -> str:
 
 def _residuals(page: CalibrationPage) -> str:
     names = [view.name for view in page.views]
-    share = min(N_VECTORS, _ALL_VECTORS // len(page.residual_maps))
+    # Vectors of all maps together; with them and the pictures' share a page stays below 1 MB.
+    all_vectors = 7500
+    share = min(N_VECTORS, all_vectors // len(page.residual_maps))
     return "\n".join(
         f'<div class="whole"><h3>{escape(found.title)}</h3>'
         f"{residual_view(found, names, n_vectors=share)}</div>"

@@ -153,8 +153,6 @@ def hover_places(start: float, end: float, whole: float) -> Iterator[float]:
 
 
 _PER_LINE = 2000
-_COLUMNS = 1000
-_PER_LASER = 300
 _QUANTITIES = (
     ("range", "mm", 1e3, 2, 4.0),
     ("pitch", "°", 1.0, 3, 0.5),
@@ -171,7 +169,8 @@ Json = dict[str, Any]
 def posture_chart(track: Track, truth: FloatArray | None) -> Json:
     """Return range, pitch and yaw over time with their sigma, truth and the gaps."""
     scale, unit = time_unit(track)
-    found = merged(stretches(track), track, _COLUMNS)
+    columns = 1000
+    found = merged(stretches(track), track, columns)
     return {
         "time_unit": unit,
         "measured": "measured",
@@ -368,7 +367,8 @@ def _in_plane(points: FramePoints | None, index: int, laser: LaserFacts) -> Json
     if points is None or not laser.known:
         return {"x": [], "y": [], "label": [], "used": []}
     mine = np.flatnonzero(points.laser == index)
-    mine = mine[:: max(1, -(-len(mine) // _PER_LASER))]
+    per_laser = 300
+    mine = mine[:: max(1, -(-len(mine) // per_laser))]
     origin, e_x, e_y = laser.frame()
     local = points.points_in_dome[mine] - origin
     return {

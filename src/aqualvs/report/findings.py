@@ -13,11 +13,7 @@ from aqualvs.report.points import PointSummary
 from aqualvs.report.run_data import Track
 from aqualvs.text import clock, signed
 
-_LONG_GAP_S = 2.0
-_FEW_POINTS = 60
 _LOOSE = 0.02
-_WATER_STEP = 5e-4
-_MAX_GAPS = 3
 
 
 def headline(track: Track) -> list[Card]:
@@ -133,15 +129,17 @@ def _summary_text(run: Mapping[str, Any], name: str) -> Iterator[str]:
 
 def _gap_warnings(track: Track) -> Iterator[str]:
     spans = [(stretch_end_s(found, track), found) for found in stretches(track)]
+    long_gap_s = 2.0
     long = [
-        (end - start, start, found) for (start, end), found in spans if end - start > _LONG_GAP_S
+        (end - start, start, found) for (start, end), found in spans if end - start > long_gap_s
     ]
     long.sort(key=lambda gap: -gap[0])
-    for length, start, found in long[:_MAX_GAPS]:
+    max_gaps = 3
+    for length, start, found in long[:max_gaps]:
         words = stretch_text(found, track)
         yield f"No posture for {clock(length)} from {_moment(start)} on: {words}."
-    if len(long) > _MAX_GAPS:
-        yield f"{len(long) - _MAX_GAPS} more gaps longer than {_LONG_GAP_S:g} s."
+    if len(long) > max_gaps:
+        yield f"{len(long) - max_gaps} more gaps longer than {long_gap_s:g} s."
 
 
 def _moment(seconds: float) -> str:
@@ -167,7 +165,8 @@ def _precision_warnings(track: Track) -> Iterator[str]:
     if loose > 0.05:
         yield f"{100 * loose:.0f} % of the ranges are looser than {100 * _LOOSE:g} % (1 σ)."
     n_points = track.n_points[track.valid & np.isfinite(track.n_points)]
-    if len(n_points) and np.median(n_points) < _FEW_POINTS:
+    few_points = 60
+    if len(n_points) and np.median(n_points) < few_points:
         yield (
             f"Few points on the target: {np.median(n_points):.0f} in a typical frame. "
             "Check focus, exposure and the lasers."
@@ -195,7 +194,8 @@ def _picture_warnings(pictures: Mapping[int, SampleFrame]) -> Iterator[str]:
 
 def _water_warnings(track: Track) -> Iterator[str]:
     water = track.n_water[np.isfinite(track.n_water)]
-    if len(water) and np.ptp(water) > _WATER_STEP:
+    water_step = 5e-4
+    if len(water) and np.ptp(water) > water_step:
         yield (
             f"The water's index moved by {np.ptp(water):.4f} during the dive: a change of "
             "medium, a leak, or a target that moved."

@@ -6,6 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
+from typing import NamedTuple
 
 import av
 import cv2
@@ -26,9 +27,19 @@ from aqualvs.text import bgr
 
 N_PICTURES = 6
 N_SAMPLES = 24
-_WIDTH_PX = 800
-# Pictures of holes: least side and size on the page in pixels, and hole diameters across.
-_CROP_PX, _CROP_SHOWN_PX, _CROP_DIAMETERS = 160, 320, 2.5
+
+
+class _CropLayout(NamedTuple):
+    """Crops of frames, in pixels."""
+
+    # Pictures of holes: least side and size on the page in pixels, and hole diameters across.
+    px: int = 160
+    shown_px: int = 320
+    diameters: float = 2.5
+
+
+_CROP = _CropLayout()
+
 _DECODERS = 2
 # What a file raises that is no video, has no picture, or breaks off.
 _BROKEN = (av.error.FFmpegError, OSError, IndexError, StopIteration)
@@ -39,7 +50,6 @@ _JPEG = (
     cv2.IMWRITE_JPEG_SAMPLING_FACTOR,
     cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444,
 )
-_SATURATED = 250
 _HOLE_COLOUR = bgr("#ffb347")
 
 
@@ -118,7 +128,8 @@ def decode_frames(source: Path, track: Track, rows: list[int]) -> dict[int, Imag
 
 def make_picture(image: ImagePlane, points: FramePoints | None) -> SampleFrame:
     """Draw the points of a frame into its picture and compress it for the page."""
-    scale = min(1.0, _WIDTH_PX / image.shape[1])
+    width_px = 800
+    scale = min(1.0, width_px / image.shape[1])
     small = image
     if scale < 1.0:
         small = np.asarray(
@@ -143,14 +154,14 @@ def make_crop(image: ImagePlane, middle: tuple[float, float], diameter: float) -
         Of the ring, in pixels.
     """
     height, width = map(int, image.shape[:2])
-    side = min(round(max(_CROP_DIAMETERS * diameter, _CROP_PX)), width, height)
+    side = min(round(max(_CROP.diameters * diameter, _CROP.px)), width, height)
     left, top = (
         min(max(round(at - 0.5 * side), 0), most - side)
         for at, most in zip(middle, (width, height), strict=True)
     )
     crop = image[top : top + side, left : left + side]
-    scale = _CROP_SHOWN_PX / side
-    shown = cv2.resize(crop, (_CROP_SHOWN_PX, _CROP_SHOWN_PX), interpolation=cv2.INTER_AREA)
+    scale = _CROP.shown_px / side
+    shown = cv2.resize(crop, (_CROP.shown_px, _CROP.shown_px), interpolation=cv2.INTER_AREA)
     centre = (round(scale * (middle[0] - left)), round(scale * (middle[1] - top)))
     radius = round(0.5 * scale * diameter)
     cv2.circle(shown, centre, radius, _HOLE_COLOUR, 2, cv2.LINE_AA)
@@ -173,7 +184,8 @@ def saturated_share(image: ImagePlane, points: FramePoints | None) -> float:
     if not inside.any():
         return float("nan")
     brightest = image[rows[inside], columns[inside]].max(axis=-1)
-    return float((brightest >= _SATURATED).mean())
+    saturated = 250
+    return float((brightest >= saturated).mean())
 
 
 def _refused_rows(track: Track) -> list[int]:

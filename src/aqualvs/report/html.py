@@ -46,13 +46,13 @@ def packed(name: str) -> str:
 
 
 _SECTION = re.compile(r'<section\b[^>]*\bid="([^"]+)"[^>]*>\s*<h2>(.*?)</h2>', re.DOTALL)
-_FEWEST = 3
 
 
 def contents_of(body: str) -> "Raw":
     """Return links to the sections of a page; nothing where there are few, or it has its own."""
     found = _SECTION.findall(body)
-    if len(found) < _FEWEST or any(name == "contents" for name, _ in found):
+    fewest = 3
+    if len(found) < fewest or any(name == "contents" for name, _ in found):
         return Raw("")
     items = "".join(f'<li><a href="#{name}">{title}</a></li>' for name, title in found)
     return Raw(f'<nav aria-label="Contents"><ul class="contents">{items}</ul></nav>')

@@ -41,7 +41,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-_DPI = 220
 _ZONE = "#e8f3ea"
 # Width and height of a detail, in mm.
 _DETAIL = (150.0, 75.0)
@@ -115,9 +114,10 @@ def draw_figures(reflections: Reflections, options: MeshFilterOptions, out: Path
         If a picture cannot be written.
     """
     written = []
+    dpi = 220
     for name, figure in drawn_figures(reflections, options).items():
         path = out / f"{name}.png"
-        figure.savefig(path, dpi=_DPI)
+        figure.savefig(path, dpi=dpi)
         written.append(path)
     return written
 

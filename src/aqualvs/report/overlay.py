@@ -20,11 +20,8 @@ from aqualvs.scanning.scan import ImagePlane, ScanPoints
 from aqualvs.text import bgr, laser_colour, reason_text
 
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
-_WHITE = (255, 255, 255)
 _AMBER = bgr("#F0E442")
 _DOT = tuple((y, x) for y in (-1, 0, 1) for x in (-1, 0, 1))
-_CROSS = ((-2, -2), (-1, -1), (1, 1), (2, 2), (-2, 2), (-1, 1), (1, -1), (2, -2))
-_FAINT = 0.45
 
 
 def draw_overlay(
@@ -73,10 +70,12 @@ def draw_points(
     drawn = np.array(image, dtype=np.uint8)
     scale = _mark_scale(drawn)
     finite = np.isfinite(pixels).all(axis=1)
+    cross = ((-2, -2), (-1, -1), (1, 1), (2, 2), (-2, 2), (-1, 1), (1, -1), (2, -2))
+    faint = 0.45
     for index in np.unique(laser):
         colour = np.array(bgr(laser_colour(int(index))), dtype=np.float64)
         mine = finite & (laser == index)
-        _stamp(drawn, pixels[mine & ~used], _grown(_CROSS, scale), colour, _FAINT)
+        _stamp(drawn, pixels[mine & ~used], _grown(cross, scale), colour, faint)
         _stamp(drawn, pixels[mine & used], _grown(_DOT, scale), colour, 1.0)
     return drawn
 
@@ -103,8 +102,9 @@ def draw_caption(image: ImagePlane, lines: list[str], *, warn: bool = False) -> 
     width = max(_text_width(line, size) for line in lines) + round(24 * size)
     ground = image[: step * len(lines) + round(16 * size), :width]
     ground[:] = ground // 4
+    white = (255, 255, 255)
     for row, line in enumerate(lines):
-        _put(image, line, (round(12 * size), (row + 1) * step), size, _AMBER if warn else _WHITE)
+        _put(image, line, (round(12 * size), (row + 1) * step), size, _AMBER if warn else white)
 
 
 def draw_legend(image: ImagePlane, names: list[str]) -> None:

@@ -93,7 +93,6 @@ def add_points(
 
 
 _BATCH = 1 << 16
-_CLOUD = 15_000
 _LABEL_OF_NAME = {label.name.lower(): int(label) for label in Label}
 _NEEDED = ("frame", "laser", "u_px", "v_px", "x_m", "y_m", "z_m", "label", "used")
 _OPTIONAL = ("quality",)
@@ -378,7 +377,8 @@ def _grow_cloud(
 ) -> FloatArray:
     """Keep the points with the smallest of all random keys: a uniform sample of any stream."""
     drawn = rng.random(len(target))
-    if len(keys) == _CLOUD:
+    cloud = 15_000
+    if len(keys) == cloud:
         # Of many points only the few whose key is small enough are looked at again.
         small = np.flatnonzero(drawn < keys.max())
         drawn, target, planes = drawn[small], target[small], planes[small]
@@ -386,8 +386,8 @@ def _grow_cloud(
     points = _in_target(np.stack([axis[target] for axis in xyz], axis=-1), planes)
     points = np.concatenate([summary.cloud_in_target, points])
     laser = np.concatenate([summary.cloud_laser, laser[target]])
-    if len(keys) > _CLOUD:
-        kept = np.argpartition(keys, _CLOUD)[:_CLOUD]
+    if len(keys) > cloud:
+        kept = np.argpartition(keys, cloud)[:cloud]
         keys, points, laser = keys[kept], points[kept], laser[kept]
     summary.cloud_in_target, summary.cloud_laser = points, laser
     return keys

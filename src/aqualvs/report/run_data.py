@@ -286,10 +286,6 @@ def _numbers(column: Any) -> FloatArray:
     return np.where(np.isfinite(values), values, np.nan)
 
 
-# Lasers whose plane is square to the forward axis have no projection of it to use as y.
-_SQUARE = 1e-6
-
-
 @dataclass(frozen=True, slots=True)
 class LaserFacts:
     """A laser as the report needs it.
@@ -319,7 +315,9 @@ class LaserFacts:
     def known(self) -> bool:
         """True if the plane is known and has a frame of its own."""
         forward_part = 1.0 - self.normal[1] ** 2
-        return bool(np.isfinite(self.offset) and forward_part > _SQUARE)
+        # Lasers whose plane is square to the forward axis have no projection of it to use as y.
+        square = 1e-6
+        return bool(np.isfinite(self.offset) and forward_part > square)
 
     def frame(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return origin, e_x and e_y of the laser's frame in `dome` (paper, Eq. 37-40).

@@ -8,6 +8,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from html import escape
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,14 +23,22 @@ ACCENT, QUIET, EDGE = "var(--accent)", "var(--quiet)", "var(--quiet)"
 GRID, BAND, PAPER = "var(--line)", "var(--band)", "var(--paper)"
 OUTLIER = "#D55E00"
 
-_WIDTH, _HEIGHT, _LEFT, _RIGHT, _FOOT = 900.0, 300.0, 84.0, 16.0, 54.0
-_LANE = 20.0
-_MAX_LANES = 4
-_MAX_WORDS = 12
-_LONGEST = 48
-_DRAWN_PER_SERIES = 800
-# A generous width of a character of the charts' text, relative to its size of 14.
-_CHARACTER = 7.6
+
+class _ChartLayout(NamedTuple):
+    """Layout of a chart, in units of its view box."""
+
+    width: float = 900.0
+    height: float = 300.0
+    left: float = 84.0
+    right: float = 16.0
+    foot: float = 54.0
+    lane: float = 20.0
+    # A generous width of a character of the charts' text, relative to its size of 14.
+    character: float = 7.6
+
+
+_CHART = _ChartLayout()
+
 _DASHED = ' stroke-width="1.6" stroke-dasharray="7 5"'
 
 
@@ -138,7 +147,7 @@ def line_chart(series: Series) -> Raw:
     marks = [(x, words) for x, words in series.marks if math.isfinite(x)]
     x_axis = _x_axis(series, known)
     labels, lanes = _mark_text(marks, x_axis)
-    head = 10.0 + _LANE * lanes
+    head = 10.0 + _CHART.lane * lanes
     y_axis = _y_axis(series, known, head)
     body = [
         *_scales(x_axis, y_axis, series),
@@ -148,14 +157,14 @@ def line_chart(series: Series) -> Raw:
         *labels,
     ]
     alt = f"{series.title}: {series.y_label} over {series.x_label}"
-    chart = svg(_WIDTH, y_axis.start + _FOOT, body, alt=alt, kind="line-chart")
+    chart = svg(_CHART.width, y_axis.start + _CHART.foot, body, alt=alt, kind="line-chart")
     return Raw(chart + _legend(series, marks))
 
 
 def _x_axis(series: Series, known: BoolArray) -> Axis:
     low, high = float(series.x[known].min()), float(series.x[known].max())
     wider = 0.5 if low == high else 0.0
-    return Axis(low - wider, high + wider, _LEFT, _WIDTH - _RIGHT)
+    return Axis(low - wider, high + wider, _CHART.left, _CHART.width - _CHART.right)
 
 
 def _y_axis(series: Series, known: BoolArray, head: float) -> Axis:
@@ -170,7 +179,7 @@ def _y_axis(series: Series, known: BoolArray, head: float) -> Axis:
         spread = series.sigma[known & np.isfinite(series.sigma)]
         pad = max(pad, 1.3 * float(np.median(spread)) if len(spread) else 0.0)
     pad = max(pad, 1e-9 + 1e-6 * max(abs(low), abs(high)))
-    return Axis(low - pad, high + pad, head + _HEIGHT - _FOOT, head)
+    return Axis(low - pad, high + pad, head + _CHART.height - _CHART.foot, head)
 
 
 def _scales(x_axis: Axis, y_axis: Axis, series: Series) -> list[str]:
@@ -195,7 +204,8 @@ def _scales(x_axis: Axis, y_axis: Axis, series: Series) -> list[str]:
 
 def _curve(series: Series, known: BoolArray, x_axis: Axis, y_axis: Axis) -> list[str]:
     """Return band and line, broken where values are missing."""
-    rows = thin(np.where(known, series.y, np.nan), _DRAWN_PER_SERIES)
+    drawn_per_series = 800
+    rows = thin(np.where(known, series.y, np.nan), drawn_per_series)
     x, y = x_axis.place(series.x[rows]), y_axis.place(series.y[rows])
     pieces = np.split(np.arange(len(rows)), np.array(breaks(rows, ~known), dtype=np.int64) + 1)
     parts = []
@@ -247,16 +257,21 @@ def _mark_text(marks: Sequence[tuple[float, str]], x_axis: Axis) -> tuple[list[s
     """Return the words of the first marks, in lanes in which they do not touch, and the lanes."""
     ends: list[float] = []
     parts = []
-    for at, words in _inside(marks, x_axis)[:_MAX_WORDS]:
-        short = words if len(words) <= _LONGEST else words[: _LONGEST - 1] + "…"
-        width, x = _CHARACTER * len(short) + 10.0, x_axis.at(at)
+    max_lanes = 4
+    max_words = 12
+    longest = 48
+    for at, words in _inside(marks, x_axis)[:max_words]:
+        short = words if len(words) <= longest else words[: longest - 1] + "…"
+        width, x = _CHART.character * len(short) + 10.0, x_axis.at(at)
         start = max(min(x - 2.0, x_axis.end - width), 0.0)
         free = [i for i, end in enumerate(ends) if end <= start]
-        if not free and len(ends) == _MAX_LANES:
+        if not free and len(ends) == max_lanes:
             continue
         lane = free[0] if free else len(ends)
         ends[lane : lane + 1] = [start + width]
-        parts.append(words_at(start, 16.0 + _LANE * lane, short, anchor="start", kind="mark-words"))
+        parts.append(
+            words_at(start, 16.0 + _CHART.lane * lane, short, anchor="start", kind="mark-words")
+        )
     return parts, len(ends)
 
 

@@ -181,8 +181,6 @@ RECORD = ".aqualvs.json"
 """File of a folder that records which command wrote its files."""
 
 _WRITER, _MARK = "writer", "mark"
-# A video has gigabytes: its beginning and end, with the size, identify it.
-_ENDS = 1 << 16
 
 
 class Claim(Closing):
@@ -284,14 +282,16 @@ def _note(folder: Path, entries: Mapping[str, dict[str, Any] | None]) -> None:
 
 def _mark(path: Path) -> list[int] | None:
     """Return size and checksum of a file's two ends; None for a folder or an unreadable file."""
+    # A video has gigabytes: its beginning and end, with the size, identify it.
+    ends = 1 << 16
     try:
         if not path.is_file():
             return None
         with path.open("rb") as file:
             size = file.seek(0, os.SEEK_END)
             file.seek(0)
-            checksum = zlib.crc32(file.read(_ENDS))
-            file.seek(max(0, size - _ENDS))
-            return [size, zlib.crc32(file.read(_ENDS), checksum)]
+            checksum = zlib.crc32(file.read(ends))
+            file.seek(max(0, size - ends))
+            return [size, zlib.crc32(file.read(ends), checksum)]
     except OSError:
         return None

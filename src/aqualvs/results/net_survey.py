@@ -47,10 +47,6 @@ if TYPE_CHECKING:
     from aqualvs.nets.tables import UnrolledNet
 
 
-# Least share of net among the inliers for the posture to be that of a net.
-_NET_SHARE = 0.5
-
-
 @dataclass(frozen=True, slots=True)
 class NetResult:
     """Result of a net's evaluation, as written to its files.
@@ -178,7 +174,9 @@ def write_net_files(folder: Path, wall: "UnrolledNet", facts: dict[str, Any]) ->
 
 def _is_net(scan: Scan) -> bool:
     labels = scan.points.label[scan.points.used]
-    return bool(np.count_nonzero(labels == Label.NET) > _NET_SHARE * len(labels))
+    # Least share of net among the inliers for the posture to be that of a net.
+    net_share = 0.5
+    return bool(np.count_nonzero(labels == Label.NET) > net_share * len(labels))
 
 
 _BATCH = 1 << 15

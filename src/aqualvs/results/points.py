@@ -180,7 +180,6 @@ DRAFT = ".part"
 """Suffix of the names of unfinished files."""
 
 _ROWS_PER_GROUP = 1 << 17
-_N_LASERS = 128
 # Dictionary encoding for names only: to look for repetitions in numbers takes longer than to write
 # them, and compression shortens them anyway. For measured numbers, BYTE_STREAM_SPLIT puts similar
 # bytes (signs, exponents) side by side: the file is a sixth smaller, and the fast compression level
@@ -353,7 +352,8 @@ def _ply_header(n_vertices: int) -> bytes:
 
 def _laser_rgb() -> NDArray[np.uint8]:
     """Return red, green, blue of every laser that an int8 can number, shape (128, 3)."""
-    return np.array([bgr(laser_colour(i))[::-1] for i in range(_N_LASERS)], np.uint8)
+    n_lasers = 128
+    return np.array([bgr(laser_colour(i))[::-1] for i in range(n_lasers)], np.uint8)
 
 
 _LASER_RGB = _laser_rgb()

@@ -130,10 +130,6 @@ def now() -> str:
     return datetime.now(UTC).astimezone().isoformat(timespec="seconds")
 
 
-_INDEX_LIMITS = (1.0, 1.5)
-"""Air is 1.0003, the densest brine about 1.39."""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Water:
     """Medium as stated by the user; all None leaves the rig's own index.
@@ -370,7 +366,9 @@ def checked_index(n: float, option: str) -> float:
     OptionError
         If it is that of no medium one dives in.
     """
-    low, high = _INDEX_LIMITS
+    # Air is 1.0003, the densest brine about 1.39.
+    index_limits = (1.0, 1.5)
+    low, high = index_limits
     if not low <= n <= high:
         raise OptionError(f"{option} {n:g}: no water; give a value from {low} to {high}")
     return n

@@ -50,28 +50,30 @@ from aqualvs.scanning.posture_estimator import Measurement
 from aqualvs.scanning.surfaces import Surface
 from aqualvs.scanning.triangulate import Triangulator
 
-# Log-odds of a laser that shows nothing though it should (7 %), and of a false stripe as good as
-# the others (5 %); odds of 20 to 1 decide.
-_DARK_LASER, _FOREIGN_STRIPE, _DECIDED = 2.6, 3.0, 3.0
-# Residuals of half stripes count as at most this many independent ones, because errors of the rig
-# are not noise. Then the limit of the evidence from residuals.
-_MAX_FREEDOM, _MAX_BY_RESIDUALS = 10.0, 12.0
-# Hypotheses nearer to each other than this are covered by a larger sigma instead of a refusal.
-_NEAR_RANGE, _NEAR_ANGLE = 0.02, math.radians(2.0)
-# Number of rivals that are refined.
-_N_RIVALS = 6
-# Samples across a laser's band, in which its stripe on a plane is looked up.
-_N_SAMPLES = 16
-# A surface with less than this share of the light that no other explains, or a solid one whose
-# stripes are nowhere seen over this share of their way through the picture, must be seen evenly:
-# caustics and fish are not. This share of the lasers may be faint. Found on rendered dives: planes
-# through caustics have up to 0.14 of the light, most below 0.1; nets come down to 0.15, folded ones
-# to 0.14.
-_SMALL_SHARE, _SHORT_WAY, _MAY_BE_FAINT = 0.12, 0.15, 0.25
-# With more loose light before it, over its own, something solid may be seen through a net that
-# makes no plane. On 270 rendered walls, with snow and caustics, this share is 0.05 in 95 of 100
-# pictures and 0.23 at most; walls that were taken for the folded net before them have 0.39 to 0.68.
-_MAX_LOOSE_SHARE = 0.3
+
+class _AssignmentOptions(NamedTuple):
+    """Evidence for and against an assignment."""
+
+    # Log-odds of a laser that shows nothing though it should (7 %), and of a false stripe as good
+    # as the others (5 %); odds of 20 to 1 decide.
+    dark_laser: float = 2.6
+    foreign_stripe: float = 3.0
+    decided: float = 3.0
+    # Residuals of half stripes count as at most this many independent ones, because errors of the
+    # rig are not noise. Then the limit of the evidence from residuals.
+    max_freedom: float = 10.0
+    max_by_residuals: float = 12.0
+    # A surface with less than this share of the light that no other explains, or a solid one whose
+    # stripes are nowhere seen over this share of their way through the picture, must be seen
+    # evenly: caustics and fish are not. This share of the lasers may be faint. Found on rendered
+    # dives: planes through caustics have up to 0.14 of the light, most below 0.1; nets come down to
+    # 0.15, folded ones to 0.14.
+    small_share: float = 0.12
+    short_way: float = 0.15
+    may_be_faint: float = 0.25
+
+
+_ODDS = _AssignmentOptions()
 
 
 class Verdict(Enum):
@@ -216,7 +218,12 @@ class AssignmentTest:
             np.append(target.plane.normal, target.plane.offset),
             self._searched[0],
         )
-        return bool(share > _MAX_LOOSE_SHARE)
+        # With more loose light before it, over its own, something solid may be seen through a net
+        # that makes no plane. On 270 rendered walls, with snow and caustics, this share is 0.05 in
+        # 95 of 100 pictures and 0.23 at most; walls that were taken for the folded net before them
+        # have 0.39 to 0.68.
+        max_loose_share = 0.3
+        return bool(share > max_loose_share)
 
     def _is_small(
         self,
@@ -240,13 +247,13 @@ class AssignmentTest:
             subsegments.intensity_weight,
             surface.inlier_weight,
         )
-        if intensity_share < _SMALL_SHARE or surface.is_mesh:
-            return intensity_share < _SMALL_SHARE
-        return self._seen_of(surface, subsegments)[0] < _SHORT_WAY
+        if intensity_share < _ODDS.small_share or surface.is_mesh:
+            return intensity_share < _ODDS.small_share
+        return self._seen_of(surface, subsegments)[0] < _ODDS.short_way
 
     def _is_faint(self, surface: Surface, subsegments: Subsegments) -> bool:
         """Return whether a laser that should be seen on a surface is faint there, or missing."""
-        return self._seen_of(surface, subsegments)[1] > _MAY_BE_FAINT
+        return self._seen_of(surface, subsegments)[1] > _ODDS.may_be_faint
 
     def _seen_of(self, surface: Surface, subsegments: Subsegments) -> tuple[float, float]:
         """Return the share of its best stripe that a surface shows, and that of faint lasers."""
@@ -305,8 +312,10 @@ class AssignmentTest:
         n_lasers = len(self._along_x)
         if n_lasers < 2:
             return NOT_TESTED
-        planes = np.empty((_N_RIVALS + 1, 4))
-        facts = np.empty((_N_RIVALS + 1, N_FACTS))
+        # Number of rivals that are refined.
+        n_rivals = 6
+        planes = np.empty((n_rivals + 1, 4))
+        facts = np.empty((n_rivals + 1, N_FACTS))
         planes[0, :3], planes[0, 3] = surface.plane.normal, surface.plane.offset
         n = find_rivals(
             candidates.source,
@@ -381,9 +390,11 @@ def _verdict(planes: FloatArray, facts: FloatArray) -> AssignmentOutcome:
         if one < odds:
             second, odds = k, one
     kept = _alike(planes[best], planes[0])
-    if odds < _DECIDED:
+    # Hypotheses nearer to each other than this are covered by a larger sigma instead of a refusal.
+    near_range, near_angle = 0.02, math.radians(2.0)
+    if odds < _ODDS.decided:
         other = _plane(planes[second] if kept else planes[best])
-        if not _alike(planes[best], planes[second], _NEAR_RANGE, _NEAR_ANGLE):
+        if not _alike(planes[best], planes[second], near_range, near_angle):
             return AssignmentOutcome(Verdict.AMBIGUOUS, other, odds)
         if kept:
             return AssignmentOutcome(Verdict.NEAR, other, odds)
@@ -398,15 +409,17 @@ def _log_odds(one: FloatArray, other: FloatArray) -> float:
     """Return the log-odds of one hypothesis against another."""
     per_laser = max(one[PER_LASER], other[PER_LASER], 1e-9)
     intensity_share = (
-        _FOREIGN_STRIPE * (one[INTENSITY_WEIGHT] - other[INTENSITY_WEIGHT]) / per_laser
+        _ODDS.foreign_stripe * (one[INTENSITY_WEIGHT] - other[INTENSITY_WEIGHT]) / per_laser
     )
-    dark = _DARK_LASER * (other[DARK] - one[DARK])
-    freedom = min(one[FREEDOM], other[FREEDOM], _MAX_FREEDOM)
+    dark = _ODDS.dark_laser * (other[DARK] - one[DARK])
+    freedom = min(one[FREEDOM], other[FREEDOM], _ODDS.max_freedom)
     residuals = 0.0
     if freedom > 0.0:
         residuals = 0.5 * freedom * math.log(other[VARIANCE] / one[VARIANCE])
     return float(
-        intensity_share + dark + min(max(residuals, -_MAX_BY_RESIDUALS), _MAX_BY_RESIDUALS)
+        intensity_share
+        + dark
+        + min(max(residuals, -_ODDS.max_by_residuals), _ODDS.max_by_residuals)
     )
 
 
@@ -424,13 +437,15 @@ def _sample_bands(laser_bands: Sequence[LaserBand], triangulator: Triangulator) 
     NaN where nothing is seen.
     """
     n_cells = max((len(one.lowest) for one in laser_bands), default=0) // CELL_LINES + 1
-    bands = np.full((len(laser_bands), n_cells, _N_SAMPLES, 4), np.nan)
+    # Samples across a laser's band, in which its stripe on a plane is looked up.
+    n_samples = 16
+    bands = np.full((len(laser_bands), n_cells, n_samples, 4), np.nan)
     for i, search in enumerate(laser_bands):
         lines = np.arange(CELL_LINES // 2, len(search.lowest), CELL_LINES)
         lines = lines[search.lowest[lines] <= search.highest[lines]]
         if not len(lines):
             continue
-        places = np.linspace(search.lowest[lines], search.highest[lines], _N_SAMPLES, axis=1)
+        places = np.linspace(search.lowest[lines], search.highest[lines], n_samples, axis=1)
         middle = (lines + 0.5)[:, None] * search.line_px - 0.5 + search.shift_px
         across = np.broadcast_to(middle, places.shape)
         along_x = search.axis is SearchAxis.ALONG_X

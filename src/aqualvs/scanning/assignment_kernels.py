@@ -1,6 +1,7 @@
 """Compiled kernels of `AssignmentTest`: rivals of a plane, and the evidence for each of them."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,23 +29,29 @@ CELL_LINES = 16
 SAME_RANGE, SAME_ANGLE = 0.004, math.radians(0.4)
 """Largest difference of equal hypotheses (share of the range, radians)."""
 
-# Least light that a rival must explain, as a share of the surface's.
-_RIVAL_SHARE = 0.5
-# Number of lasers whose stripes start rivals.
-_N_SEEDS = 4
-# The noise (px) that half a stripe has at least.
-_HALF_STRIPE_PX = 0.1
-# Light within this many gates of a plane is on it: lasers whose calibration is less accurate than
-# the peaks must not count as dark, nor their light as foreign.
-_WIDE = 2.5
-# Least number of cells to judge a laser; with a smaller share of the typical light it is dark.
-_MIN_CELLS, _DARK_SHARE = 3, 0.25
-# A cell is lit if this share of the other lasers that can be there is seen there.
-_LIT_SHARE = 0.15
-# Least number of search lines of half a stripe.
-_MIN_LINES = 8
-# A laser is faint with this share of the best one's way through the picture.
-_FAINT = 0.4
+
+class _EvidenceOptions(NamedTuple):
+    """Light of the lasers on a plane, and what counts as dark or faint."""
+
+    # Least light that a rival must explain, as a share of the surface's.
+    rival_share: float = 0.5
+    # Light within this many gates of a plane is on it: lasers whose calibration is less accurate
+    # than the peaks must not count as dark, nor their light as foreign.
+    wide: float = 2.5
+    # Least number of cells to judge a laser; with a smaller share of the typical light it is dark.
+    min_cells: int = 3
+    dark_share: float = 0.25
+    # A laser is faint with this share of the best one's way through the picture.
+    faint: float = 0.4
+    # Light is on a plane within the first of these shares of its distance, before it from the
+    # second on; pieces of stripe this long are those of walls and fish, not the light on strands.
+    on_plane: float = 0.02
+    before: float = 0.03
+    long_piece: float = 24.0
+
+
+_EVIDENCE = _EvidenceOptions()
+
 # Columns of sums over the peaks of one laser's stripe, read as some laser's.
 _XX, _XY, _XZ, _YY, _YZ, _ZZ, _SX, _SY, _SZ, _N, _SJX, _SJY, _SJZ, _N_SUMS = range(14)
 
@@ -98,7 +105,7 @@ def find_rivals(
         if own > 0.0:
             for k in range(3):
                 place[i, k] = sums[i, i, _SX + k] / own
-    if other < _RIVAL_SHARE * total:
+    if other < _EVIDENCE.rival_share * total:
         return 0
     seeds = _choose_seeds(sums, place)
     score = np.zeros(planes.shape[0])
@@ -153,7 +160,9 @@ def _sum_candidates(
 def _choose_seeds(sums: FloatArray, place: FloatArray) -> IntArray:
     """Choose lasers whose stripes are bright and far from each other."""
     n_lasers = place.shape[0]
-    seeds, n = np.empty(min(_N_SEEDS, n_lasers), np.int64), 0
+    # Number of lasers whose stripes start rivals.
+    n_seeds = 4
+    seeds, n = np.empty(min(n_seeds, n_lasers), np.int64), 0
     while n < seeds.shape[0]:
         best, most = -1, 0.0
         for i in range(n_lasers):
@@ -195,16 +204,16 @@ def _try_pair(
             if a == b or (a == i and b == k):
                 continue
             first, second = sums[i, a], sums[k, b]
-            if first[_N] < _RIVAL_SHARE * sums[i, i, _N]:
+            if first[_N] < _EVIDENCE.rival_share * sums[i, i, _N]:
                 continue
-            if second[_N] < _RIVAL_SHARE * sums[k, k, _N]:
+            if second[_N] < _EVIDENCE.rival_share * sums[k, k, _N]:
                 continue
             if not _fit_two(first, second, normal, scratch, right, m, plane):
                 continue
             if plane[3] < nearest or plane[3] > farthest or plane[1] < MIN_FACING:
                 continue
             value = _explained(sums, plane)
-            if value >= _RIVAL_SHARE * total:
+            if value >= _EVIDENCE.rival_share * total:
                 n = _keep_best(plane, value, planes, score, n)
     return n
 
@@ -259,7 +268,7 @@ def _explained(sums: FloatArray, plane: FloatArray) -> float:
             square += y * (y * row[_YY] + 2.0 * z * row[_YZ]) + z * z * row[_ZZ]
             square += -2.0 * d * (x * row[_SX] + y * row[_SY] + z * row[_SZ]) + n * d * d
             per_px = (x * row[_SJX] + y * row[_SJY] + z * row[_SJZ]) / n
-            gate = _WIDE * _WIDE * squared_gate(per_px, d)
+            gate = _EVIDENCE.wide * _EVIDENCE.wide * squared_gate(per_px, d)
             best = max(best, n * (1.0 - square / (n * gate)))
         total += best
     return total
@@ -306,11 +315,11 @@ def _refine_rivals(
     normal, scratch, lanes = np.empty((3, 3)), np.empty((5, 3)), np.empty(table.shape[1])
     kept = 0
     for _ in range(2):
-        refine_plane(table, planes[0], _WIDE, normal, scratch, lanes)
+        refine_plane(table, planes[0], _EVIDENCE.wide, normal, scratch, lanes)
     for k in range(1, n + 1):
         plane = planes[k]
         good = True
-        for component in (_WIDE, 1.0, 1.0, _WIDE, _WIDE):
+        for component in (_EVIDENCE.wide, 1.0, 1.0, _EVIDENCE.wide, _EVIDENCE.wide):
             good = good and refine_plane(table, plane, component, normal, scratch, lanes)
         good = good and nearest <= plane[3] <= farthest and plane[1] >= MIN_FACING
         for j in range(kept + 1):
@@ -391,7 +400,7 @@ def _mark_lit_cells(
     for c in range(laser.shape[0]):
         residual = x * table[X, c] + y * table[Y, c] + z * table[Z, c] - offset
         per_px = x * table[JX, c] + y * table[JY, c] + z * table[JZ, c]
-        gate = _WIDE * _WIDE * squared_gate(per_px, offset)
+        gate = _EVIDENCE.wide * _EVIDENCE.wide * squared_gate(per_px, offset)
         near[c] = max(1.0 - residual * residual / gate, 0.0)
         if near[c] > 0.0:
             for cell in range(first_line[c] // CELL_LINES, last_line[c] // CELL_LINES + 1):
@@ -431,6 +440,8 @@ def _variance(
     x, y, z, offset = plane[0], plane[1], plane[2], plane[3]
     square, n, n_lit = 0.0, 0, 0
     begin = 0
+    # Least number of search lines of half a stripe.
+    min_lines = 8
     for i in range(n_lasers):
         end = begin
         middle, lines = 0.0, 0
@@ -440,7 +451,7 @@ def _variance(
                 lines += n_lines[end]
             end += 1
         middle /= max(lines, 1)
-        n_lit += lines >= _MIN_LINES
+        n_lit += lines >= min_lines
         for half in range(2):
             total, lines = 0.0, 0
             for c in range(begin, end):
@@ -449,14 +460,16 @@ def _variance(
                     per_px = x * table[JX, c] + y * table[JY, c] + z * table[JZ, c]
                     total += n_lines[c] * residual / per_px
                     lines += n_lines[c]
-            if lines >= _MIN_LINES:
+            if lines >= min_lines:
                 square += (total / lines) ** 2
                 n += 1
         begin = end
     freedom = n - 3.0
     if freedom <= 0.0:
         return 1.0, 0.0, n_lit
-    return square / freedom + _HALF_STRIPE_PX * _HALF_STRIPE_PX, freedom, n_lit
+    # The noise (px) that half a stripe has at least.
+    half_stripe_px = 0.1
+    return square / freedom + half_stripe_px * half_stripe_px, freedom, n_lit
 
 
 @borrowing_kernel
@@ -520,11 +533,6 @@ def exclusive_share(
     return on / max(total, 1e-12) * (inlier_weight / of_members)
 
 
-# Light is on a plane within the first of these shares of its distance, before it from the second
-# on; pieces of stripe this long are those of walls and fish, not the light on strands.
-_ON_PLANE, _BEFORE, _LONG_PIECE = 0.02, 0.03, 24.0
-
-
 @kernel
 def loose_share_before(
     source: IntArray,
@@ -567,8 +575,12 @@ def loose_share_before(
         intensity_weight[r] = confidence[i]
         own[r] |= members[c]
         # However it is read: one peak has a candidate for each laser.
-        bound[r] |= explained[c] or n_lines[i] >= _LONG_PIECE or abs(off) < _ON_PLANE * plane[3]
-        before[r] |= off < -_BEFORE * plane[3] and points[i, 1] > nearest
+        bound[r] |= (
+            explained[c]
+            or n_lines[i] >= _EVIDENCE.long_piece
+            or abs(off) < _EVIDENCE.on_plane * plane[3]
+        )
+        before[r] |= off < -_EVIDENCE.before * plane[3] and points[i, 1] > nearest
     of_surface, loose = 0.0, 0.0
     for r in range(last + 1):
         of_surface += intensity_weight[r] if own[r] else 0.0
@@ -606,13 +618,13 @@ def seen_of(
     most, asked, faint = 0.0, 0, 0
     for i in range(n_lasers):
         cells = np.count_nonzero(expected[i])
-        way[i] = way[i] / (CELL_LINES * cells) if cells >= _MIN_CELLS else np.nan
+        way[i] = way[i] / (CELL_LINES * cells) if cells >= _EVIDENCE.min_cells else np.nan
         if way[i] > most:
             most = way[i]
     for i in range(n_lasers):
         if way[i] == way[i]:
             asked += 1
-            faint += way[i] < _FAINT * most
+            faint += way[i] < _EVIDENCE.faint * most
     return most, faint / max(asked, 1)
 
 
@@ -621,6 +633,8 @@ def _dark_lasers(lit: BoolArray, expected: BoolArray, along_x: BoolArray) -> flo
     """Count the lasers that show nothing where others do; a dim one counts in part."""
     n_lasers, n_cells = lit.shape
     dark = 0.0
+    # A cell is lit if this share of the other lasers that can be there is seen there.
+    lit_share = 0.15
     for i in range(n_lasers):
         asked, seen, of_others, by_others = 0, 0, 0.0, 0.0
         for cell in range(n_cells):
@@ -631,15 +645,15 @@ def _dark_lasers(lit: BoolArray, expected: BoolArray, along_x: BoolArray) -> flo
                 if k != i and along_x[k] == along_x[i] and expected[k, cell]:
                     there += 1
                     shown += lit[k, cell]
-            if shown < 1 or shown < _LIT_SHARE * there:
+            if shown < 1 or shown < lit_share * there:
                 continue
             asked += 1
             seen += lit[i, cell]
             of_others += there
             by_others += shown
-        if asked < _MIN_CELLS:
+        if asked < _EVIDENCE.min_cells:
             continue
-        typical = _DARK_SHARE * by_others / of_others
+        typical = _EVIDENCE.dark_share * by_others / of_others
         share = seen / asked
         if share < typical:
             dark += 1.0 - share / typical

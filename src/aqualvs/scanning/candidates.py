@@ -13,7 +13,7 @@ import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import ZERO, borrowing_kernel, inline_borrowing_kernel, kernel
-from aqualvs.geometry.quantile import element_at
+from aqualvs.geometry.linear_algebra import element_at
 from aqualvs.scanning.laser_bands import LaserBand, SearchAxis
 from aqualvs.scanning.segments import (
     ComponentShapes,

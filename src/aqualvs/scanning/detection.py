@@ -13,7 +13,7 @@ import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.compiled import inline_kernel, kernel
-from aqualvs.geometry.quantile import element_at
+from aqualvs.geometry.linear_algebra import element_at
 from aqualvs.optics.shutter import FIRST_ROW, Field
 from aqualvs.scanning.laser_bands import LaserBand, SearchAxis
 from aqualvs.scanning.laser_colour import (

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import borrowing_kernel, kernel
+from aqualvs.geometry.linear_algebra import element_at
 from aqualvs.geometry.planes import Plane
-from aqualvs.geometry.quantile import element_at
 from aqualvs.scanning.candidates import Candidates, Subsegments
 from aqualvs.scanning.patch import height_over, packed_plane
 from aqualvs.scanning.posture import Posture

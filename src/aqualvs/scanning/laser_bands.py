@@ -20,15 +20,6 @@ from aqualvs.scanning.laser_colour import LaserColour
 SLOPE_CELL = 8
 """Positions, and search lines, per cell of the slope tables and of the grid bands come from."""
 
-# Factor on the far range: off the axis, points of a target there are farther by up to this much.
-_OFF_AXIS_STRETCH = 1.5
-# Largest angle of a target from square to the vehicle; it bounds the stripe's direction.
-_MAX_TARGET_TILT = np.deg2rad(45.0)
-# Wider pictures have finer pixels than stripes need; lines are binned to about this many.
-_PIXELS_PER_LINE_FROM = 1280
-# Slopes beyond this count as parallel to the search line.
-_STEEPEST = 5.0
-
 
 class SearchAxis(Enum):
     """Image axis of the search lines: across the usual direction of a stripe."""
@@ -86,7 +77,9 @@ def search_range(working_range: tuple[float, float]) -> tuple[float, float]:
 
 def pixels_per_line(size_px: tuple[int, int]) -> int:
     """Return how many rows or columns of pixels make a search line: 2 in wide pictures, or 1."""
-    return 2 if size_px[0] >= _PIXELS_PER_LINE_FROM else 1
+    # Wider pictures have finer pixels than stripes need; lines are binned to about this many.
+    pixels_per_line_from = 1280
+    return 2 if size_px[0] >= pixels_per_line_from else 1
 
 
 def plan_bands(rig: Rig, camera: Camera, field: Field | None = None) -> tuple[LaserBand, ...]:
@@ -151,9 +144,12 @@ def _points_on_grid(
     points, valid = sheet.intersect(camera.rays(np.stack(np.meshgrid(x, y), axis=-1)))
     distance = np.linalg.norm(points, axis=-1)
     near, far = search_range(working_range)
+    # Factor on the far range: off the axis, points of a target there are farther by up to this
+    # much.
+    off_axis_stretch = 1.5
     # A plane at range d has no point nearer than d, so the near bound is exact.
     with np.errstate(invalid="ignore"):
-        in_band = valid & (distance >= near) & (distance <= far * _OFF_AXIS_STRETCH)
+        in_band = valid & (distance >= near) & (distance <= far * off_axis_stretch)
     return points, in_band
 
 
@@ -163,9 +159,11 @@ def _stripe_directions(points: FloatArray) -> tuple[FloatArray, FloatArray]:
     The stripe of a target n·X = d is the contour line of n·X over the image; square first.
     """
     tilts = [np.zeros(3)]
+    # Largest angle of a target from square to the vehicle; it bounds the stripe's direction.
+    max_target_tilt = np.deg2rad(45.0)
     for sign in (-1.0, 1.0):
-        tilts += [np.array([sign * _MAX_TARGET_TILT, 0.0, 0.0])]
-        tilts += [np.array([0.0, 0.0, sign * _MAX_TARGET_TILT])]
+        tilts += [np.array([sign * max_target_tilt, 0.0, 0.0])]
+        tilts += [np.array([0.0, 0.0, sign * max_target_tilt])]
     normals = np.stack([rotation_from_rotvec(tilt) @ np.array([0.0, 1.0, 0.0]) for tilt in tilts])
     with np.errstate(invalid="ignore"):
         height = np.einsum("nk,vuk->nvu", normals, points)
@@ -186,8 +184,10 @@ def _slope_bounds(rise: FloatArray, run: FloatArray) -> tuple[FloatArray, FloatA
     known = np.isfinite(slopes).any(axis=0)
     low = np.min(np.where(np.isfinite(slopes), slopes, np.inf), axis=0)
     high = np.max(np.where(np.isfinite(slopes), slopes, -np.inf), axis=0)
-    low = np.where(known, np.clip(low, -_STEEPEST, _STEEPEST), -_STEEPEST)
-    high = np.where(known, np.clip(high, -_STEEPEST, _STEEPEST), _STEEPEST)
+    # Slopes beyond this count as parallel to the search line.
+    steepest = 5.0
+    low = np.where(known, np.clip(low, -steepest, steepest), -steepest)
+    high = np.where(known, np.clip(high, -steepest, steepest), steepest)
     return np.ascontiguousarray(low), np.ascontiguousarray(high)
 
 

@@ -20,30 +20,53 @@ from numpy.typing import NDArray
 
 from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.compiled import inline_kernel, kernel
-from aqualvs.geometry.quantile import element_at, sum_of
+from aqualvs.geometry.linear_algebra import element_at, sum_of
 from aqualvs.scanning.scan import Frame, ImagePlane
 from aqualvs.scanning.stripe import HEIGHT, IMBALANCE, STEP_U, STEP_V, TINT_U, TINT_V, TOP, WIDTH
 
-# Wavelengths (nm) that separate blue, green and red lines.
-_BLUE_TO_GREEN_NM, _GREEN_TO_RED_NM = 490.0, 580.0
-# R and B by V and U, in the scale of limited-range luma (BT.601).
-_RED_OF_V, _BLUE_OF_U = 1.596 / 1.164, 2.018 / 1.164
-# The thresholds of learning were tuned on the rendered sample and benchmark dives, the photographs
-# of the sample folders and dives of the simulated cameras.
-# Stripes to learn from: least height of the peaks in grey levels; least chroma step beyond that of
-# paint, in standard deviations and in levels; least cosine of its angle to the wavelength's
-# direction; least share of the largest step for their height; least number of such peaks; and the
-# largest and the smallest scatter of half of them, as shares of their mean step.
-_MIN_HEIGHT, _CLEAR_SIGMAS, _CLEAR_LEVELS, _MIN_COSINE = 12.0, 3.0, 3.0, 0.2
-_BEST_SHARE, _MIN_LEARNED, _MAX_SCATTER, _MIN_SCATTER = 0.6, 16, 0.4, 0.22
-# Number of peaks that is enough to learn from.
-_ENOUGH = 2500
-# Paint: least height of the peaks near one colour, and least ratio of their number to what the
-# lasers can make; its least spread, as chroma for each level, and its largest spread across the
-# tint of its light; and the distances from its middle, in standard deviations, of other things and
-# of lines.
-_TALL, _CROWD, _MIN_SPREAD, _MAX_ACROSS = 20.0, 1.5, 0.02, 0.045
-_OF_CROWD, _CLEAR_OF_PAINT, _MAD_TO_SIGMA = 2.5, 4.0, 1.4826
+
+class _LearnOptions(NamedTuple):
+    """Stripes to learn the colour of the lines from.
+
+    Tuned on the rendered sample and benchmark dives, the photographs of the sample folders and
+    dives of the simulated cameras.
+    """
+
+    # Least height of the peaks in grey levels; least chroma step beyond that of paint, in standard
+    # deviations and in levels; least cosine of its angle to the wavelength's direction; least share
+    # of the largest step for their height; least number of such peaks; and the largest and the
+    # smallest scatter of half of them, as shares of their mean step.
+    min_height: float = 12.0
+    clear_sigmas: float = 3.0
+    clear_levels: float = 3.0
+    min_cosine: float = 0.2
+    best_share: float = 0.6
+    min_learned: int = 16
+    max_scatter: float = 0.4
+    min_scatter: float = 0.22
+
+
+_LEARN = _LearnOptions()
+
+
+class _PaintOptions(NamedTuple):
+    """Paint: things that have the colour of the lines."""
+
+    # Paint: least height of the peaks near one colour, and least ratio of their number to what the
+    # lasers can make; its least spread, as chroma for each level, and its largest spread across the
+    # tint of its light; and the distances from its middle, in standard deviations, of other things
+    # and of lines.
+    tall: float = 20.0
+    crowd: float = 1.5
+    min_spread: float = 0.02
+    max_across: float = 0.045
+    of_crowd: float = 2.5
+    clear_of_paint: float = 4.0
+    mad_to_sigma: float = 1.4826
+
+
+_PAINT = _PaintOptions()
+
 # Chroma levels for each grey level of height: the expected value of a line where none is clear
 # enough to learn from, the least and the most that is accepted of a learned one, and the spread of
 # paint and glare about zero. Lines of nine cameras show 0.15 to 0.7.
@@ -54,31 +77,18 @@ _RATIO_SPREAD, _ACROSS_SPREAD = 0.35, 0.5
 # Paint shows up to this share of the tint of its flanks, and at most the second share of the chroma
 # of a line, however green the scene is.
 _TINT_SHARE, _PAINT_SHARE = 0.5, 0.5
-# The learned ratio is the one that this share of the best stripes exceeds.
-_LEARNED_QUANTILE = 0.35
-# Least chroma noise after rounding and subsampling, in levels.
-_MIN_SIGMA = 0.7
 # Width of the bins of height, and number of refinements of the shares of lines in them.
 _KINDS_PER_OCTAVE, _N_KINDS, _ROUNDS = 2.0, 16, 3
 _KIND_OF_HEIGHT = np.minimum(_KINDS_PER_OCTAVE * np.log2(np.arange(256).clip(1)), _N_KINDS - 1)
 _KIND_OF_HEIGHT = _KIND_OF_HEIGHT.astype(np.int64)
-# Heights at which so few of a sample's peaks, or at most this share, are clearly lines are skipped.
-_FEW_LINES, _USEFUL_SHARE, _CLEARLY = 4, 0.05, 0.8
 # The colour of a core this bright, in limited-range luma, is ignored: every light is white there.
 WHITE = 225.0
-# Luma from which on a channel may be clipped; full scale; and the share of its chroma that a line
-# shows there: measured on rendered stripes, at the middle or an edge.
-_CLIPPED, _FULL, _LEFT_AT_FULL = 185.0, 235.0, 0.33
-# A quarter of a normal distribution lies within this many standard deviations.
-_QUARTER_OF_NORMAL = 0.3186
 # The largest of three normal numbers is this many standard deviations above their mean; up to this
 # many levels of noise the lines' own differences are larger.
 _LARGEST_OF_THREE, _QUIET = 0.85, 1.4
 # Limit of the log-likelihood ratio.
 _MAX_LOG_ODDS = 12.0
 
-# Spreads of 0: unknown.
-_NO_PAINT = (0.0, 0.0, 0.0, 0.0)
 
 HIGHEST_USEFUL = 32
 """Height in grey levels from which on peaks are always used."""
@@ -100,9 +110,11 @@ class LaserColour(Enum):
         """Return the colour of a wavelength in nanometres; green if it is None."""
         if wavelength_nm is None:
             return cls.GREEN
-        if wavelength_nm < _BLUE_TO_GREEN_NM:
+        # Wavelengths (nm) that separate blue, green and red lines.
+        blue_to_green_nm, green_to_red_nm = 490.0, 580.0
+        if wavelength_nm < blue_to_green_nm:
             return cls.BLUE
-        return cls.GREEN if wavelength_nm < _GREEN_TO_RED_NM else cls.RED
+        return cls.GREEN if wavelength_nm < green_to_red_nm else cls.RED
 
 
 def channel_image(frame: Frame, colour: LaserColour) -> ImagePlane:
@@ -123,8 +135,10 @@ def channel_image(frame: Frame, colour: LaserColour) -> ImagePlane:
     """
     if colour is LaserColour.GREEN or frame.chroma is None:
         return frame.luma
+    # R and B by V and U, in the scale of limited-range luma (BT.601).
+    red_of_v, blue_of_u = 1.596 / 1.164, 2.018 / 1.164
     chroma, weight = (
-        (frame.chroma[1], _RED_OF_V) if colour is LaserColour.RED else (frame.chroma[0], _BLUE_OF_U)
+        (frame.chroma[1], red_of_v) if colour is LaserColour.RED else (frame.chroma[0], blue_of_u)
     )
     mixed = frame.luma + weight * (full_size(chroma.astype(np.float32), frame) - 128.0)
     image: ImagePlane = np.clip(np.rint(mixed), 0, 255).astype(np.uint8)
@@ -199,9 +213,13 @@ def learn_paint(table: FloatArray, n_possible: float) -> Paint | None:
     Paint or None
         None where there are few tall peaks, or they are not of one colour.
     """
-    *paint, across_tint, n_near = _learn_paint(table, _CROWD * n_possible)
+    *paint, across_tint, n_near = _learn_paint(table, _PAINT.crowd * n_possible)
     # The share of the light's tint in paint varies; other differences are a mixture with lines.
-    return Paint(*paint) if across_tint < _MAX_ACROSS and n_near > _CROWD * n_possible else None
+    return (
+        Paint(*paint)
+        if across_tint < _PAINT.max_across and n_near > _PAINT.crowd * n_possible
+        else None
+    )
 
 
 def learn_colour(table: FloatArray, colour: LaserColour, paint: Paint | None) -> LineColour | None:
@@ -220,8 +238,10 @@ def learn_colour(table: FloatArray, colour: LaserColour, paint: Paint | None) ->
     LineColour or None
         None where too few peaks are clearly of the laser's colour.
     """
+    # Number of peaks that is enough to learn from.
+    enough = 2500
     if paint is None:
-        every = 1 + table.shape[1] // _ENOUGH
+        every = 1 + table.shape[1] // enough
         found = LineColour(*_learn(table[:, ::every], *colour.value))
     else:
         found = LineColour(*_learn_beside_paint(table, *colour.value, *paint), paint)
@@ -262,7 +282,9 @@ def laser_likelihood(
         0 to 1; 0.5 where colour gives no evidence.
     """
     likelihood = np.empty(table.shape[1])
-    paint = line.paint or _NO_PAINT
+    # Spreads of 0: unknown.
+    no_paint = (0.0, 0.0, 0.0, 0.0)
+    paint = line.paint or no_paint
     _weigh(table, *line[:6], *paint, widest_white_px, n_possible, likelihood)
     return likelihood
 
@@ -289,8 +311,12 @@ def _noise(table: FloatArray) -> float:
 
     A low quantile: beside other stripes and edges the flanks differ by more than noise.
     """
-    noise = element_at(np.abs(table[IMBALANCE]), 0.25) / _QUARTER_OF_NORMAL
-    return max(noise / math.sqrt(2.0), _MIN_SIGMA)
+    # A quarter of a normal distribution lies within this many standard deviations.
+    quarter_of_normal = 0.3186
+    noise = element_at(np.abs(table[IMBALANCE]), 0.25) / quarter_of_normal
+    # Least chroma noise after rounding and subsampling, in levels.
+    min_sigma = 0.7
+    return max(noise / math.sqrt(2.0), min_sigma)
 
 
 @inline_kernel
@@ -315,17 +341,19 @@ def _beyond_paint(
 def _learn(table: FloatArray, u: float, v: float) -> tuple[float, float, float, float]:
     """Return direction, ratio and noise of the frame's best stripes; a ratio of 0 if unknown."""
     sigma = _noise(table)
+    # The learned ratio is the one that this share of the best stripes exceeds.
+    learned_quantile = 0.35
     # Steps that differ from any paint are the most certain; a line as green as the water is not.
     for tint_share in (1.0, _TINT_SHARE):
         best = _best_stripes(table, u, v, sigma, tint_share)
-        if best.shape[0] < _MIN_LEARNED:
+        if best.shape[0] < _LEARN.min_learned:
             continue
         of_u, of_v = _shown(table, best)
         line_u, line_v, is_one_colour = _middle(of_u, of_v)
         if is_one_colour:
             size = math.hypot(line_u, line_v)
             line_u, line_v = line_u / size, line_v / size
-            ratio = element_at(line_u * of_u + line_v * of_v, _LEARNED_QUANTILE)
+            ratio = element_at(line_u * of_u + line_v * of_v, learned_quantile)
             return line_u, line_v, max(ratio, RATIO_LEAST), sigma
     return u, v, 0.0, sigma
 
@@ -346,7 +374,7 @@ def _middle(of_u: FloatArray, of_v: FloatArray) -> tuple[float, float, bool]:
     """Return the median of steps, and whether at least half of them are near it."""
     u, v = element_at(of_u, 0.5), element_at(of_v, 0.5)
     squared = element_at((of_u - u) ** 2 + (of_v - v) ** 2, 0.5)
-    return u, v, squared <= _MAX_SCATTER**2 * (u**2 + v**2)
+    return u, v, squared <= _LEARN.max_scatter**2 * (u**2 + v**2)
 
 
 @kernel
@@ -355,7 +383,7 @@ def _learn_paint(table: FloatArray, n_min: float) -> tuple[float, float, float, 
 
     The number is zero if at most `n_min` peaks are tall.
     """
-    tall = np.flatnonzero(table[HEIGHT] >= _TALL)
+    tall = np.flatnonzero(table[HEIGHT] >= _PAINT.tall)
     if tall.shape[0] <= n_min:
         return 0.0, 0.0, 0.0, 0.0, 0.0, 0
     height = table[HEIGHT][tall]
@@ -366,16 +394,16 @@ def _learn_paint(table: FloatArray, n_min: float) -> tuple[float, float, float, 
     for _ in range(_ROUNDS):
         some_u, some_v = of_u[near], of_v[near]
         u, v = element_at(some_u, 0.5), element_at(some_v, 0.5)
-        seen_u = _MAD_TO_SIGMA * element_at(np.abs(some_u - u), 0.5)
-        seen_v = _MAD_TO_SIGMA * element_at(np.abs(some_v - v), 0.5)
-        spread_u = math.sqrt(max(seen_u**2 - noise**2, _MIN_SPREAD**2))
-        spread_v = math.sqrt(max(seen_v**2 - noise**2, _MIN_SPREAD**2))
+        seen_u = _PAINT.mad_to_sigma * element_at(np.abs(some_u - u), 0.5)
+        seen_v = _PAINT.mad_to_sigma * element_at(np.abs(some_v - v), 0.5)
+        spread_u = math.sqrt(max(seen_u**2 - noise**2, _PAINT.min_spread**2))
+        spread_v = math.sqrt(max(seen_v**2 - noise**2, _PAINT.min_spread**2))
         var_u, var_v = spread_u**2 + noise**2, spread_v**2 + noise**2
-        near = (of_u - u) ** 2 / var_u + (of_v - v) ** 2 / var_v < _OF_CROWD**2
+        near = (of_u - u) ** 2 / var_u + (of_v - v) ** 2 / var_v < _PAINT.of_crowd**2
     tint_u, tint_v = element_at(table[TINT_U][tall], 0.5), element_at(table[TINT_V][tall], 0.5)
     size = math.hypot(tint_u, tint_v)
     across = math.hypot(spread_u, spread_v)
-    if size > _MIN_SPREAD:
+    if size > _PAINT.min_spread:
         across = math.hypot(tint_v * spread_u, tint_u * spread_v) / size
     return u, v, spread_u, spread_v, across, int(np.count_nonzero(near))
 
@@ -395,12 +423,12 @@ def _learn_beside_paint(
     is_clear = np.zeros(table.shape[1], np.bool_)
     for i in range(table.shape[1]):
         height, step_u, step_v = table[HEIGHT, i], table[STEP_U, i], table[STEP_V, i]
-        if height >= _TALL and _is_near(step_u, step_v, u, v):
+        if height >= _PAINT.tall and _is_near(step_u, step_v, u, v):
             off_u, off_v = step_u - paint_u * height, step_v - paint_v * height
             var_u, var_v = (spread_u * height) ** 2 + sigma**2, (spread_v * height) ** 2 + sigma**2
-            is_clear[i] = off_u**2 / var_u + off_v**2 / var_v > _CLEAR_OF_PAINT**2
+            is_clear[i] = off_u**2 / var_u + off_v**2 / var_v > _PAINT.clear_of_paint**2
     best = np.flatnonzero(is_clear)
-    if best.shape[0] < _MIN_LEARNED:
+    if best.shape[0] < _LEARN.min_learned:
         return u, v, 0.0, sigma, 1.0, 1.0
     of_u, of_v = _shown(table, best)
     line_u, line_v, is_one_colour = _middle(of_u, of_v)
@@ -410,8 +438,8 @@ def _learn_beside_paint(
     line_u, line_v = line_u / size, line_v / size
     off_along = np.abs(line_u * of_u + line_v * of_v - size)
     off_across = np.abs(line_v * of_u - line_u * of_v)
-    along = max(_MAD_TO_SIGMA * element_at(off_along, 0.5) / size, _MIN_SCATTER)
-    across = max(_MAD_TO_SIGMA * element_at(off_across, 0.5) / size, _MIN_SCATTER)
+    along = max(_PAINT.mad_to_sigma * element_at(off_along, 0.5) / size, _LEARN.min_scatter)
+    across = max(_PAINT.mad_to_sigma * element_at(off_across, 0.5) / size, _LEARN.min_scatter)
     return line_u, line_v, max(size, RATIO_LEAST), sigma, along, across
 
 
@@ -419,13 +447,16 @@ def _learn_beside_paint(
 def _is_near(step_u: float, step_v: float, u: float, v: float) -> bool:
     """Return whether a chroma step is within the widest angle of a direction."""
     along = u * step_u + v * step_v
-    return along > 0.0 and along**2 > _MIN_COSINE**2 * (step_u**2 + step_v**2)
+    return along > 0.0 and along**2 > _LEARN.min_cosine**2 * (step_u**2 + step_v**2)
 
 
 @inline_kernel
 def _colour_left(top: float) -> float:
     """Return the share of its chroma that an overexposed line of this luma shows."""
-    return 1.0 - (1.0 - _LEFT_AT_FULL) * min(max((top - _CLIPPED) / (_FULL - _CLIPPED), 0.0), 1.0)
+    # Luma from which on a channel may be clipped; full scale; and the share of its chroma that a
+    # line shows there: measured on rendered stripes, at the middle or an edge.
+    clipped, full, left_at_full = 185.0, 235.0, 0.33
+    return 1.0 - (1.0 - left_at_full) * min(max((top - clipped) / (full - clipped), 0.0), 1.0)
 
 
 @kernel
@@ -436,26 +467,29 @@ def _best_stripes(
 
     The highest peaks are not taken instead, because they may be white paper.
     """
-    share, least = np.zeros(table.shape[1]), max(_CLEAR_SIGMAS * sigma, _CLEAR_LEVELS)
+    share, least = np.zeros(table.shape[1]), max(_LEARN.clear_sigmas * sigma, _LEARN.clear_levels)
     for i in range(table.shape[1]):
         height = table[HEIGHT, i]
-        if height >= _MIN_HEIGHT and _is_near(table[STEP_U, i], table[STEP_V, i], u, v):
+        if height >= _LEARN.min_height and _is_near(table[STEP_U, i], table[STEP_V, i], u, v):
             beyond_u, beyond_v = _beyond_paint(table, i, 1.0, tint_share, np.inf)
             size = math.sqrt(beyond_u**2 + beyond_v**2)
             share[i] = size / (height * _colour_left(table[TOP, i])) if size > least else 0.0
-    return np.flatnonzero(share > _BEST_SHARE * element_at(share[share > 0.0], 0.95))
+    return np.flatnonzero(share > _LEARN.best_share * element_at(share[share > 0.0], 0.95))
 
 
 @kernel
 def _useful_height(height: FloatArray, likelihood: FloatArray) -> float:
     lines, peaks = np.zeros(_N_KINDS), np.zeros(_N_KINDS)
+    # Heights at which so few of a sample's peaks, or at most this share, are clearly lines are
+    # skipped.
+    few_lines, useful_share, clearly = 4, 0.05, 0.8
     for i in range(height.shape[0]):
         kind = _kind_of(height[i])
         peaks[kind] += 1.0
-        lines[kind] += likelihood[i] > _CLEARLY
+        lines[kind] += likelihood[i] > clearly
     n_useless = 0
     while n_useless < _N_KINDS and (
-        lines[n_useless] < _FEW_LINES or lines[n_useless] <= _USEFUL_SHARE * peaks[n_useless]
+        lines[n_useless] < few_lines or lines[n_useless] <= useful_share * peaks[n_useless]
     ):
         n_useless += 1
     return float(min(math.ceil(2.0 ** (n_useless / _KINDS_PER_OCTAVE)), HIGHEST_USEFUL))
@@ -509,7 +543,7 @@ def _weigh(
             beyond_u, beyond_v = _beyond_paint(table, i, left, _TINT_SHARE, _PAINT_SHARE * line)
             off_paint = (beyond_u**2 + beyond_v**2) / (sigma**2 + (_RATIO_OF_PAINT * height) ** 2)
         log_odds = 0.5 * (off_paint - off_line**2 / var_along - across**2 / var_across)
-        if size > _CLEAR_SIGMAS * sigma and along < _MIN_COSINE * left * size:
+        if size > _LEARN.clear_sigmas * sigma and along < _LEARN.min_cosine * left * size:
             # Light of another colour.
             log_odds = -_MAX_LOG_ODDS
         odds[i] = math.exp(min(max(log_odds, -_MAX_LOG_ODDS), _MAX_LOG_ODDS))

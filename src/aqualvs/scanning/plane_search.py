@@ -20,8 +20,7 @@ from aqualvs.geometry.compiled import (
     inline_kernel,
     kernel,
 )
-from aqualvs.geometry.linear_algebra import solve_symmetric
-from aqualvs.geometry.quantile import sum_of
+from aqualvs.geometry.linear_algebra import solve_symmetric, sum_of
 
 X, Y, Z, JX, JY, JZ, WEIGHT = range(7)
 """Rows of the table: centroid (m), sensitivity (m/px), sampling weight (search lines)."""

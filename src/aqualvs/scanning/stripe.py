@@ -19,10 +19,6 @@ from aqualvs.geometry.compiled import ZERO, borrowing_kernel, inline_borrowing_k
 
 U8Array: TypeAlias = NDArray[np.uint8]
 
-# Limit of the doubled contrast threshold.
-_MAX_CONTRAST = 120
-# A valley below this many tenths of the lower of two peaks separates two peaks.
-_VALLEY_TENTHS = 6
 # Marks of pixels, bytes of 0 or 1, are read eight at a time.
 _WORD = 8
 _NOTHING, _MARKED, _UNMARKED = np.uint64(0), np.uint64(1), np.uint64(0)
@@ -232,6 +228,8 @@ class PeakFinder:
         table : array, shape (10, N)
             Written: measures of each peak, rows as named above.
         """
+        # Limit of the doubled contrast threshold.
+        max_contrast = 120
         while True:
             n = _find_peaks(
                 image,
@@ -245,7 +243,7 @@ class PeakFinder:
                 line,
                 table,
             )
-            if n < len(line) or min_contrast > _MAX_CONTRAST:
+            if n < len(line) or min_contrast > max_contrast:
                 return n
             min_contrast *= 2
 
@@ -437,7 +435,9 @@ def _next_peak(row: U8Array, start: int, end: int, base: np.int64) -> tuple[int,
 
 @inline_borrowing_kernel
 def _separates(valley: np.int64, lower_peak: np.int64, base: np.int64) -> bool:
-    return bool(10 * (valley - base) < _VALLEY_TENTHS * (lower_peak - base))
+    # A valley below this many tenths of the lower of two peaks separates two peaks.
+    valley_tenths = 6
+    return bool(10 * (valley - base) < valley_tenths * (lower_peak - base))
 
 
 @inline_borrowing_kernel

@@ -41,49 +41,46 @@ Rows = NDArray[np.float32]
 LENGTH, HEIGHT, WIDTH, TOP, ONE_SIDED, ALONG, ACROSS, HALO = range(8)
 FIRST_X, FIRST_Y, LAST_X, LAST_Y = range(8, 12)
 """Rows of a table of pieces: lengths and places in pixels, heights in grey levels."""
-_N_MEASURES = 12
 
 # Least height of peaks in grey levels, in a picture smoothed along the stripes by this many search
 # lines, so that noise of one pixel does not break a faint line. Number of peaks per search line.
 _MIN_CONTRAST, SMOOTHING, _PEAKS_PER_LINE = 3, 1.0, 120
-# Reach of the search for the background: a share of the picture's width, or this many pixels.
-_REACH_SHARE, _MIN_REACH = 0.045, 8
 # Ends of a piece: distance to the next return in search lines and in pixels; bend within three
 # peaks in pixels and as a share of the width. Least number of peaks.
 _MAX_LINE_STEP, _MAX_STEP_PX = 2, 4.0
 _KINK_PX, _KINK_IN_WIDTHS, MIN_PEAKS = 1.0, 0.25, 5
-# Where the median height of MIN_PEAKS changes by this factor, another thing begins: noise and the
-# ringing of a codec continue many a line.
-_HEIGHT_STEP = 3.0
 # Light and chroma of a stripe are summed up to its flanks, this many pixels beyond half height.
 _FLANK_PX = 2
-# The halo is summed up to so many pixels beyond them: codecs keep chroma in blocks of 16 pixels.
-_HALO_PX = 6
-# Ratios of chroma to light, and differences in height of the flanks for each level, are clipped to
-# these bounds. Every red line of the photographs has at least the expected halo, however coded.
-_MAX_RATIO, _MIN_RATIO, _MAX_ACROSS, _MAX_ONE_SIDED = 1.0, -0.5, 0.6, 3.0
-_HALO_EXPECTED = 0.3
-# More chroma for each level than this is coloured paint, or the halo of another thing; and the
-# logarithm of that excess is clipped.
-_PAINTED_RATIO, _MAX_EXCESS = 1.5, 3.0
-# Noise of chroma, in levels.
-_CHROMA_NOISE = 2.0
-# Pieces of more than these log odds, by the general statistics of lines, and of this share of the
-# picture's width are certain; without laser, long pieces of its colour are rare. Pieces with less
-# chroma for each level than any camera's lines, on themselves or beside them, are not certain: a
-# highlight on steel, for example.
-_CERTAIN, _CERTAIN_SHARE = 2.4, 0.08
-_CERTAIN_IF_LONG, _LONG_SHARE = 1.0, 0.2
-# Spread of the colour of a picture's lines: chroma for each level, and as a share of theirs.
-_ACROSS_SPREAD, _SHARE_SPREAD = 0.08, 0.3
-_MAX_OWN = 9.0
-# Bonus in log odds of a piece that continues a line straight on: largest gap as a share of the
-# picture's width; largest deviation from its direction in pixels, and as a share of the gap.
-_HELP, _MAX_GAP, _OFF_PX, _OFF_SHARE = 2.0, 0.1, 1.5, 0.05
-# Extension of a line at its end: most peaks; largest distance in pixels from the extrapolation by
-# its slope over this many peaks; least height as a share of the line's; and limit of the search
-# lines missed.
-_MAX_FOLLOWING, _FOLLOW_PX, _SLOPE_PEAKS, _MIN_HEIGHT_SHARE, _MAX_MISSED = 8, 1.2, 6, 0.3, 4
+
+
+class _EvidenceOptions(NamedTuple):
+    """Evidence that pieces of a picture are laser light, where no rig is known."""
+
+    # Ratios of chroma to light, and differences in height of the flanks for each level, are clipped
+    # to these bounds. Every red line of the photographs has at least the expected halo, however
+    # coded.
+    max_ratio: float = 1.0
+    min_ratio: float = -0.5
+    max_across: float = 0.6
+    max_one_sided: float = 3.0
+    halo_expected: float = 0.3
+    # Pieces of more than these log odds, by the general statistics of lines, and of this share of
+    # the picture's width are certain; without laser, long pieces of its colour are rare. Pieces
+    # with less chroma for each level than any camera's lines, on themselves or beside them, are not
+    # certain: a highlight on steel, for example.
+    certain: float = 2.4
+    certain_share: float = 0.08
+    certain_if_long: float = 1.0
+    long_share: float = 0.2
+    # Bonus in log odds of a piece that continues a line straight on: largest gap as a share of the
+    # picture's width; largest deviation from its direction in pixels, and as a share of the gap.
+    help: float = 2.0
+    max_gap: float = 0.1
+    off_px: float = 1.5
+    off_share: float = 0.05
+
+
+_EVIDENCE = _EvidenceOptions()
 
 
 class Weights(NamedTuple):
@@ -207,7 +204,8 @@ def find_segments(frame: Frame, search: LaserBand) -> StripeSegments:
     rows = picture_rows(frame, search, search.colour)
     peaks = _peaks(rows.intensity_weight, search, frame.luma.shape[1])
     order, start = _smooth_chains(peaks, search)
-    table = np.empty((_N_MEASURES, len(start) - 1))
+    n_measures = 12
+    table = np.empty((n_measures, len(start) - 1))
     _measure(
         *rows,
         peaks.line,
@@ -225,7 +223,9 @@ def find_segments(frame: Frame, search: LaserBand) -> StripeSegments:
 
 def _peaks(light: Rows, search: LaserBand, width_px: int) -> StripePeaks:
     n_lines, length = light.shape
-    reach_px = max(_MIN_REACH, round(_REACH_SHARE * width_px))
+    # Reach of the search for the background: a share of the picture's width, or this many pixels.
+    reach_share, min_reach = 0.045, 8
+    reach_px = max(min_reach, round(reach_share * width_px))
     directions = np.array([search.colour.value])
     finder = PeakFinder(length, search.lowest, search.highest, reach_px, directions)
     grey = np.empty((0, 0), np.uint8)
@@ -275,7 +275,10 @@ def _height_steps(height: FloatArray, ends: BoolArray) -> IntArray:
     change[half - 1 : n - half][chain[: n - 2 * half + 1] != chain[2 * half - 1 :]] = 0.0
     # One end for each step: where the medians differ most.
     largest = np.lib.stride_tricks.sliding_window_view(np.pad(change, half), 2 * half + 1).max(1)
-    return np.flatnonzero((change > math.log(_HEIGHT_STEP)) & (change >= largest))
+    # Where the median height of MIN_PEAKS changes by this factor, another thing begins: noise and
+    # the ringing of a codec continue many a line.
+    height_step = 3.0
+    return np.flatnonzero((change > math.log(height_step)) & (change >= largest))
 
 
 @kernel
@@ -295,6 +298,9 @@ def _measure(
 ) -> None:
     """Write the measures of all pieces."""
     has_colour = along.shape[0] > 0
+    # The halo is summed up to so many pixels beyond them: codecs keep chroma in blocks of 16
+    # pixels.
+    halo_px = 6
     for k in range(start.shape[0] - 1):
         members = order[start[k] : start[k + 1]]
         n = members.shape[0]
@@ -312,7 +318,7 @@ def _measure(
                 total += _sum_above_flanks(light[x], low, high)
                 total_along += _sum_above_flanks(along[x], low, high)
                 total_across += _sum_above_flanks(across[x], low, high)
-                low, high = max(low - _HALO_PX, 1), min(high + _HALO_PX, light.shape[1] - 2)
+                low, high = max(low - halo_px, 1), min(high + halo_px, light.shape[1] - 2)
                 halo += _sum_above_flanks(along[x], low, high)
         total = max(total, 1.0)
         first, last = members[0], members[n - 1]
@@ -362,12 +368,20 @@ def general_evidence(table: FloatArray, width_px: int, *, has_colour: bool) -> F
     height = np.log(np.maximum(table[HEIGHT], _MIN_CONTRAST) / 20.0)
     width = np.log(200.0 * table[WIDTH] / width_px + 0.1)
     n = table.shape[1]
-    along, halo = np.full(n, RATIO_EXPECTED), np.full(n, _HALO_EXPECTED)
+    along, halo = np.full(n, RATIO_EXPECTED), np.full(n, _EVIDENCE.halo_expected)
     most, across = halo, np.zeros(n)
     if has_colour:
-        along, halo = _believed(table, ALONG, RATIO_LEAST), _believed(table, HALO, _HALO_EXPECTED)
+        along, halo = (
+            _believed(table, ALONG, RATIO_LEAST),
+            _believed(table, HALO, _EVIDENCE.halo_expected),
+        )
         most, across = np.maximum(table[ALONG], table[HALO]), table[ACROSS]
     levels = np.maximum(np.maximum(along, halo), 0.0) * table[HEIGHT]
+    # More chroma for each level than this is coloured paint, or the halo of another thing; and the
+    # logarithm of that excess is clipped.
+    painted_ratio, max_excess = 1.5, 3.0
+    # Noise of chroma, in levels.
+    chroma_noise = 2.0
     return np.stack(
         [
             np.ones(n),
@@ -377,13 +391,13 @@ def general_evidence(table: FloatArray, width_px: int, *, has_colour: bool) -> F
             height**2,
             length * height,
             width,
-            np.minimum(table[ONE_SIDED], _MAX_ONE_SIDED),
-            np.clip(halo, 0.0, _HALO_EXPECTED),
-            np.clip(halo, _MIN_RATIO, 0.0),
-            np.clip(along, _MIN_RATIO, 0.0),
-            np.log1p(levels / _CHROMA_NOISE),
-            np.clip(np.log(np.maximum(most, 1e-3) / _PAINTED_RATIO), 0.0, _MAX_EXCESS),
-            np.minimum(np.abs(across), _MAX_ACROSS),
+            np.minimum(table[ONE_SIDED], _EVIDENCE.max_one_sided),
+            np.clip(halo, 0.0, _EVIDENCE.halo_expected),
+            np.clip(halo, _EVIDENCE.min_ratio, 0.0),
+            np.clip(along, _EVIDENCE.min_ratio, 0.0),
+            np.log1p(levels / chroma_noise),
+            np.clip(np.log(np.maximum(most, 1e-3) / painted_ratio), 0.0, max_excess),
+            np.minimum(np.abs(across), _EVIDENCE.max_across),
         ],
         axis=-1,
     )
@@ -391,7 +405,7 @@ def general_evidence(table: FloatArray, width_px: int, *, has_colour: bool) -> F
 
 def _believed(table: FloatArray, row: int, in_white: float) -> FloatArray:
     """Return chroma for each level (P,) of a row; a white core says nothing."""
-    ratio = np.minimum(table[row], _MAX_RATIO)
+    ratio = np.minimum(table[row], _EVIDENCE.max_ratio)
     believed: FloatArray = np.where(table[TOP] >= WHITE, np.maximum(ratio, in_white), ratio)
     return believed
 
@@ -427,14 +441,14 @@ def learn_lines(
         None where no piece is certain.
     """
     share = table[LENGTH] / width_px
-    is_certain = (log_odds > _CERTAIN) & (share >= _CERTAIN_SHARE)
-    is_certain |= (log_odds > _CERTAIN_IF_LONG) & (share >= _LONG_SHARE)
+    is_certain = (log_odds > _EVIDENCE.certain) & (share >= _EVIDENCE.certain_share)
+    is_certain |= (log_odds > _EVIDENCE.certain_if_long) & (share >= _EVIDENCE.long_share)
     if has_colour:
         is_certain &= np.minimum(table[ALONG], table[HALO]) >= RATIO_LEAST
     certain = np.flatnonzero(is_certain)
     if len(certain) == 0:
         return None
-    weight = table[LENGTH, certain] * np.clip(log_odds[certain] - _CERTAIN + 0.5, 0.5, 3.0)
+    weight = table[LENGTH, certain] * np.clip(log_odds[certain] - _EVIDENCE.certain + 0.5, 0.5, 3.0)
 
     def median(values: FloatArray) -> float:
         by_size = np.argsort(values)
@@ -458,12 +472,18 @@ def own_evidence(
     """
     general = general_evidence(table, width_px, has_colour=has_colour)
     off_across = np.zeros(table.shape[1])
+    # Spread of the colour of a picture's lines: chroma for each level, and as a share of theirs.
+    across_spread, share_spread = 0.08, 0.3
+    max_own = 9.0
     if has_colour:
-        spread = _ACROSS_SPREAD + _SHARE_SPREAD * np.hypot(lines.along, lines.across)
-        off_across = np.clip(table[ACROSS] - lines.across, -_MAX_ACROSS, _MAX_ACROSS) / spread
+        spread = across_spread + share_spread * np.hypot(lines.along, lines.across)
+        off_across = (
+            np.clip(table[ACROSS] - lines.across, -_EVIDENCE.max_across, _EVIDENCE.max_across)
+            / spread
+        )
     off_width = np.log(table[WIDTH]) - lines.log_width
     higher = np.maximum(np.log(table[HEIGHT]) - lines.log_height, 0.0)
-    own = np.minimum(np.stack([off_across**2, off_width**2, higher], axis=-1), _MAX_OWN)
+    own = np.minimum(np.stack([off_across**2, off_width**2, higher], axis=-1), max_own)
     return np.concatenate([general, own], axis=1)
 
 
@@ -533,7 +553,7 @@ def continued(table: FloatArray, log_odds: FloatArray, least: float, width_px: i
     bool array, shape (P,)
     """
     keep: BoolArray = log_odds >= least
-    waiting = np.flatnonzero(~keep & (log_odds >= least - _HELP))
+    waiting = np.flatnonzero(~keep & (log_odds >= least - _EVIDENCE.help))
     new = np.flatnonzero(keep)
     ends = _ends(table)
     while len(new) and len(waiting):
@@ -587,17 +607,21 @@ def _following(
 ) -> IntArray:
     """Return and mark the peaks that follow the last one of a chain, one a search line."""
     n = chain.shape[0]
-    last, back = chain[n - 1], chain[max(n - 1 - _SLOPE_PEAKS, 0)]
+    # Extension of a line at its end: most peaks; largest distance in pixels from the extrapolation
+    # by its slope over this many peaks; least height as a share of the line's; and limit of the
+    # search lines missed.
+    max_following, follow_px, slope_peaks, min_height_share, max_missed = 8, 1.2, 6, 0.3, 4
+    last, back = chain[n - 1], chain[max(n - 1 - slope_peaks, 0)]
     slope = (position[last] - position[back]) / max(abs(line[last] - line[back]), 1)
-    least = _MIN_HEIGHT_SHARE * np.median(height[chain])
-    found = np.empty(_MAX_FOLLOWING, np.int64)
+    least = min_height_share * np.median(height[chain])
+    found = np.empty(max_following, np.int64)
     n_found, x, place, gap = 0, line[last], position[last], 0
-    while n_found < _MAX_FOLLOWING and gap < _MAX_MISSED:
+    while n_found < max_following and gap < max_missed:
         x += step
         if x < 0 or x >= first_of.shape[0] - 1:
             break
         gap += 1
-        best, best_miss = -1, _FOLLOW_PX
+        best, best_miss = -1, follow_px
         for i in range(first_of[x], first_of[x + 1]):
             miss = abs(position[i] - (place + slope * gap))
             if miss < best_miss and height[i] >= least:
@@ -629,8 +653,8 @@ def _goes_on(segment: FloatArray, others: FloatArray, width_px: int) -> BoolArra
     along, across = off @ way, off @ np.array([-way[1], way[0]])
     # The gap is at most the length of the piece, because of the uncertainty of its direction.
     gap = np.abs(along).min(axis=1) - 0.5 * length
-    reach = min(length, _MAX_GAP * width_px)
-    allowed = _OFF_PX + _OFF_SHARE * np.maximum(gap, 0.0)
+    reach = min(length, _EVIDENCE.max_gap * width_px)
+    allowed = _EVIDENCE.off_px + _EVIDENCE.off_share * np.maximum(gap, 0.0)
     goes_on: BoolArray = np.abs(across).max(axis=1) <= allowed
     goes_on &= (gap > -0.5 * length) & (gap <= reach)
     return goes_on

@@ -36,20 +36,6 @@ from aqualvs.scanning.stripe_segments import (
 
 # A stripe at less than 45 degrees to a search line is left to the other axis.
 _STEEPEST = 1.0
-# Slopes are computed from this many peaks on either side.
-_SLOPE_REACH = 6
-# A chain shorter than this many of its own widths is a blob: the beam's own dot, a glint, a mark.
-_MIN_LENGTH_IN_WIDTHS = 2.5
-# Returns wider than this many median widths of their chain are a dot on the stripe, unless they go
-# on for longer than this many of their own widths: then a pale surface saturates the camera.
-_MAX_WIDTH, _LONGEST_DOT = 1.8, 1.5
-# Noise of the centre of a stripe by speckle, as a share of its width; the least noise is that of 8
-# bits and a Bayer pattern.
-_SIGMA_IN_WIDTHS, _MIN_SIGMA_PX = 0.01, 0.05
-# Where one side is lighter than the other, beyond the stripe or on its slopes, paint shifts the
-# centre by about this many widths, relative to the height of the stripe.
-_FLANK_AT, _FLANK_PULL = 1.3, 0.2
-_SLOPE_AT, _SLOPE_PULL = 0.5, 0.35
 # Full width at half height of a normal distribution, in standard deviations.
 _WIDTH_OF_SIGMA = 2.355
 _MAP_LENGTH = 30000
@@ -199,10 +185,13 @@ def _piece(search: LaserBand, peaks: StripePeaks, chain: IntArray) -> StripePixe
 
 def _in_dot(width: FloatArray) -> BoolArray:
     """Mark the peaks (N,) of a chain that lie on a dot; widths are in search lines."""
-    wide = width > _MAX_WIDTH * np.median(width)
+    # Returns wider than this many median widths of their chain are a dot on the stripe, unless they
+    # go on for longer than this many of their own widths: then a pale surface saturates the camera.
+    max_width, longest_dot = 1.8, 1.5
+    wide = width > max_width * np.median(width)
     bounds = np.flatnonzero(np.diff(wide, prepend=False, append=False))
     for first, end in bounds.reshape(-1, 2):
-        if end - first > _LONGEST_DOT * np.median(width[first:end]):
+        if end - first > longest_dot * np.median(width[first:end]):
             wide[first:end] = False
     return wide
 
@@ -223,9 +212,16 @@ def _sigma_px(luma: ImagePlane, stripes: StripePixels) -> FloatArray:
         share: FloatArray = (sides[1] - sides[0]) / stripes.height
         return share
 
-    pull = np.hypot(_FLANK_PULL * lopsided(_FLANK_AT), _SLOPE_PULL * lopsided(_SLOPE_AT))
-    in_widths = np.hypot(_SIGMA_IN_WIDTHS, pull)
-    return np.hypot(_MIN_SIGMA_PX, in_widths * stripes.width)
+    # Where one side is lighter than the other, beyond the stripe or on its slopes, paint shifts the
+    # centre by about this many widths, relative to the height of the stripe.
+    flank_at, flank_pull = 1.3, 0.2
+    slope_at, slope_pull = 0.5, 0.35
+    pull = np.hypot(flank_pull * lopsided(flank_at), slope_pull * lopsided(slope_at))
+    # Noise of the centre of a stripe by speckle, as a share of its width; the least noise is that
+    # of 8 bits and a Bayer pattern.
+    sigma_in_widths, min_sigma_px = 0.01, 0.05
+    in_widths = np.hypot(sigma_in_widths, pull)
+    return np.hypot(min_sigma_px, in_widths * stripes.width)
 
 
 def _bilinear(luma: ImagePlane, pixels: FloatArray) -> FloatArray:
@@ -242,8 +238,10 @@ def _bilinear(luma: ImagePlane, pixels: FloatArray) -> FloatArray:
 def _slopes(line: FloatArray, position: FloatArray) -> FloatArray:
     """Return d position / d line (N,), by a straight fit to the neighbours along the chain."""
     index = np.arange(len(line))
-    first = np.maximum(index - _SLOPE_REACH, 0)
-    last = np.minimum(index + _SLOPE_REACH + 1, len(line))
+    # Slopes are computed from this many peaks on either side.
+    slope_reach = 6
+    first = np.maximum(index - slope_reach, 0)
+    last = np.minimum(index + slope_reach + 1, len(line))
     x, y = line - line.mean(), position - position.mean()
 
     def window(values: FloatArray) -> FloatArray:
@@ -261,7 +259,10 @@ def _is_long(segment: StripePixels) -> bool:
     if len(segment) < 3:
         return False
     length = float(np.hypot(*(segment.pixels[-1] - segment.pixels[0])))
-    return length >= _MIN_LENGTH_IN_WIDTHS * float(np.median(segment.width))
+    # A chain shorter than this many of its own widths is a blob: the beam's own dot, a glint, a
+    # mark.
+    min_length_in_widths = 2.5
+    return length >= min_length_in_widths * float(np.median(segment.width))
 
 
 def _joined(parts: list[StripePixels]) -> StripePixels:

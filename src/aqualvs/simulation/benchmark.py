@@ -158,8 +158,6 @@ BENCHMARK_NAME = "aqualvs-bench-1"
 N_FRAMES = 20
 """Frames of every dive."""
 
-_DURATION_S = 5.0
-_WORKING_RANGE = (0.25, 1.35)
 
 LEVELS: Mapping[str, str] = MappingProxyType(
     {
@@ -325,7 +323,8 @@ class BenchmarkDive:
 
 def benchmark_rig() -> Rig:
     """Return the rig of all dives: the example rig with a working range of 0.25 to 1.35 m."""
-    return replace(example_rig(), name=BENCHMARK_NAME, working_range=_WORKING_RANGE)
+    working_range = (0.25, 1.35)
+    return replace(example_rig(), name=BENCHMARK_NAME, working_range=working_range)
 
 
 def benchmark_dives() -> tuple[BenchmarkDive, ...]:
@@ -354,11 +353,12 @@ def benchmark_checksum() -> str:
 def _definitions() -> list[tuple[str, str, dict[str, Any]]]:
     """Return name, level and scenario mapping of every dive, seeds included."""
     found: list[tuple[str, str, dict[str, Any]]] = []
+    duration_s = 5.0
     for level, courses in _OVER.items():
         for course, over in courses.items():
             content = _laid_over(_TARGETS.get(course, {}), over)
             content["motion"] = content.get("motion", _COURSES.get(course, {}))
-            timing = {"duration_s": _DURATION_S, "fps": N_FRAMES / _DURATION_S}
+            timing = {"duration_s": duration_s, "fps": N_FRAMES / duration_s}
             seed = 1000 + len(found)
             found.append((f"{level}_{course}", level, {**timing, "seed": seed, **content}))
     return found
@@ -393,8 +393,6 @@ always hold the latter: the axes of a net's twine, without folds. All are empty 
 """
 
 _LABELS = {"net": SurfaceKind.NET, "wall": SurfaceKind.WALL, "none": SurfaceKind.NONE}
-# Least number of points of a visible laser line.
-_POINTS_OF_A_LINE = 5
 
 Cell: TypeAlias = int | float | str
 
@@ -487,7 +485,9 @@ def visible_lit(
 
 def truth_cells(scene: Scene, visible: LitPoints) -> list[Cell]:
     """Return the cells of one frame after frame and time, in the order of `TRUTH_COLUMNS`."""
-    n_lasers = int(np.sum(np.bincount(visible.laser) >= _POINTS_OF_A_LINE)) if len(visible) else 0
+    # Least number of points of a visible laser line.
+    points_of_a_line = 5
+    n_lasers = int(np.sum(np.bincount(visible.laser) >= points_of_a_line)) if len(visible) else 0
     counts: list[Cell] = [len(visible), n_lasers]
     if scene.target == "none":
         return ["", "", "", *counts, "", "", "", ""]

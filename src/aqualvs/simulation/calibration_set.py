@@ -23,19 +23,14 @@ from aqualvs.simulation.panels import PanelRenderer, PanelScene, RoomLight, pane
 from aqualvs.simulation.scenario import Scenario, parse_scenario
 from aqualvs.simulation.video import jpeg
 
-_LASER_POWER = 8.0
 _ROOM = RoomLight(level=0.72)
 _DIM = RoomLight(level=0.32)
 _POOL = RoomLight(level=0.6, tint=(0.75, 1.0, 0.95), veil=(0.012, 0.035, 0.028))
 _WATER = RoomLight(level=0.30, tint=(0.75, 1.0, 0.95), veil=(0.012, 0.035, 0.028))
-# A square of the rail's board in the farthest picture, in pixels, and its farthest place.
-_FAR_SQUARE_PX, _FARTHEST = 19.0, 1.2
 # The nearest board stands this far before the dome.
 _NEAREST = 0.15
 _PLATE_FAR = 0.35
 _FPS = 25.0
-# A person needs this long from one picture to the next; drifts go on meanwhile.
-_BETWEEN_STILLS_S = 4.0
 
 _MATRIX = tuple(f"T{row}{column}" for row in range(3) for column in range(4))
 
@@ -136,8 +131,10 @@ class _Job:
         quality = self.camera.still_quality
         suffix = ".png" if quality is None else ".jpg"
         names = [name.format(i) + suffix for i in range(len(scenes))]
+        # A person needs this long from one picture to the next; drifts go on meanwhile.
+        between_stills_s = 4.0
         for scene, file in zip(scenes, names, strict=True):
-            image = renderer.render(scene, rng, _BETWEEN_STILLS_S * self.done)
+            image = renderer.render(scene, rng, between_stills_s * self.done)
             _write_picture(folder / file, image, quality)
             # Pictures of an earlier set by another camera.
             (folder / file).with_suffix(".png" if quality else ".jpg").unlink(missing_ok=True)
@@ -146,7 +143,8 @@ class _Job:
 
     def with_lasers(self, rig: Rig) -> PanelRenderer:
         """Return the renderer of panels for a rig with all lasers on."""
-        sheets = panel_sheets(rig, power=_LASER_POWER, filters=self.camera.filters)
+        laser_power = 8.0
+        sheets = panel_sheets(rig, power=laser_power, filters=self.camera.filters)
         return PanelRenderer(rig.camera(), sheets, eye=self.camera)
 
 
@@ -293,7 +291,9 @@ def _dome_air(job: _Job) -> tuple[Path, Path, Path]:
     rig, rng, folder = job.rig.in_water(job.rig.n_air), job.rng(1), job.folder(port_folder(job.rig))
     board = targets.rail_board()
     near = _NEAREST if rig.dome is None else rig.dome.inner_radius + rig.dome.thickness + _NEAREST
-    far = max(1.5 * near, min(_FARTHEST, board.square * rig.focal_px / _FAR_SQUARE_PX))
+    # A square of the rail's board in the farthest picture, in pixels, and its farthest place.
+    far_square_px, farthest = 19.0, 1.2
+    far = max(1.5 * near, min(farthest, board.square * rig.focal_px / far_square_px))
     distances = np.linspace(near, far, job.size.dome)
     poses, measured = views.board_on_rail(targets.squares_size(board), distances, rng)
     behind = targets.ground(SE3(DOME_FROM_CAM_NOMINAL, np.array([0.0, 2.2, 0.0])), shift=150)

@@ -6,7 +6,7 @@ a box of markers, and of a plate in the view.
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import yaml
@@ -35,10 +35,6 @@ _PLACES = (
     *((0.50, 0.50), (0.25, 0.28), (0.75, 0.30), (0.27, 0.72), (0.74, 0.72), (0.50, 0.25)),
     *((0.48, 0.78), (0.18, 0.50), (0.82, 0.52), (0.38, 0.40), (0.62, 0.60), (0.60, 0.38)),
 )
-# Widths of the board as shares of the picture's, in turn.
-_SHARES = (0.78, 0.52, 0.60, 0.48, 0.66, 0.56, 0.50, 0.62)
-# Turn and tilt of the vehicle in the box, in degrees: to the left, upward, clockwise.
-_LOOKS = ((0.0, -3.0, 1.0), (12.0, -9.0, -2.0), (-10.0, -10.0, 2.0), (-3.0, -13.0, -1.0))
 # Middles of the quarters for a plate, slightly off those of the picture.
 _QUARTERS = ((0.24, 0.75), (0.76, 0.75), (0.24, 0.25), (0.76, 0.25))
 _GOLDEN = np.pi * (3.0 - np.sqrt(5.0))
@@ -59,9 +55,11 @@ def board_across(rig: Rig, size: Size, count: int, rng: np.random.Generator) -> 
         Random number generator.
     """
     poses = []
+    # Widths of the board as shares of the picture's, in turn.
+    shares = (0.78, 0.52, 0.60, 0.48, 0.66, 0.56, 0.50, 0.62)
     for k in range(count):
         place = np.array(_PLACES[k % len(_PLACES)]) + rng.uniform(-0.03, 0.03, 2)
-        far = size[0] * rig.lens.fx / (_SHARES[k % len(_SHARES)] * rig.size_px[0])
+        far = size[0] * rig.lens.fx / (shares[k % len(shares)] * rig.size_px[0])
         ahead = rig.bare_camera().rays(place * rig.size_px - 0.5).directions
         ahead = rig.dome_from_cam.inverse().rotate(ahead)
         tilt = np.deg2rad(rng.uniform(20.0, 38.0) if k % 6 else 4.0)
@@ -110,8 +108,10 @@ def board_on_rail(
 def vehicle_in_box(count: int, rng: np.random.Generator) -> list[SE3]:
     """Return `box_from_dome` of a vehicle before the open mouth, looking to all sides in turn."""
     poses = []
+    # Turn and tilt of the vehicle in the box, in degrees: to the left, upward, clockwise.
+    looks = ((0.0, -3.0, 1.0), (12.0, -9.0, -2.0), (-10.0, -10.0, 2.0), (-3.0, -13.0, -1.0))
     for k in range(count):
-        left, up, roll = np.deg2rad(np.array(_LOOKS[k % len(_LOOKS)]) + rng.uniform(-1, 1, 3))
+        left, up, roll = np.deg2rad(np.array(looks[k % len(looks)]) + rng.uniform(-1, 1, 3))
         turn = rotation_from_rotvec([0.0, 0.0, left]) @ rotation_from_rotvec([up, 0.0, 0.0])
         place = np.array([0.0, -0.005, 0.03]) + rng.uniform(-0.012, 0.012, 3)
         poses.append(SE3(turn @ rotation_from_rotvec([0.0, roll, 0.0]), place))
@@ -149,13 +149,21 @@ def _centred(turn: FloatArray, middle: FloatArray, size: Size) -> SE3:
 
 
 FAMILY = "DICT_APRILTAG_36h11"
-_FIRST_ON_PLATE = 300
-# Pictures narrower than this get larger prints, whose markers can still be read.
-_NARROW_PX = 600
-_WALL_CELL, _PLATE_CELL = 2e-3, 1e-3
-_ALBEDO, _MOTTLE = 0.55, 0.16
-# Inside of the box: width, depth, height in cells of its walls.
-_WIDE, _DEEP, _HIGH = 200, 350, 190
+
+
+class _PrintOptions(NamedTuple):
+    """Printed targets of rendered pictures: sizes of cells in metres, and their look."""
+
+    # Pictures narrower than this get larger prints, whose markers can still be read.
+    narrow_px: int = 600
+    wall_cell: float = 2e-3
+    plate_cell: float = 1e-3
+    albedo: float = 0.55
+    mottle: float = 0.16
+
+
+_PRINTS = _PrintOptions()
+
 
 _CORNER_ORDER = (
     "as OpenCV reports: top-left, top-right, bottom-right, bottom-left of the upright marker"
@@ -195,7 +203,7 @@ class Marked:
 def hand_board(width_px: int) -> CharucoPrint:
     """Return the board that is held before the bare camera."""
     return CharucoPrint(
-        squares=(11, 8) if width_px >= _NARROW_PX else (7, 5),
+        squares=(11, 8) if width_px >= _PRINTS.narrow_px else (7, 5),
         square=24e-3,
         marker=18e-3,
         border=12e-3,
@@ -241,24 +249,28 @@ def ground(dome_from_ground: SE3, *, cell: float = 6e-3, shift: int = 0) -> Pane
 
 def marker_box(width_px: int) -> list[Marked]:
     """Return the walls of an open box, 400 x 380 x 700 mm inside, in `box`."""
-    side = 24 if width_px >= _NARROW_PX else 32
-    half_wide, half_high = 0.5 * _WIDE * _WALL_CELL, 0.5 * _HIGH * _WALL_CELL
-    depth = _DEEP * _WALL_CELL
+    side = 24 if width_px >= _PRINTS.narrow_px else 32
+    # Inside of the box: width, depth, height in cells of its walls.
+    wide, deep, high = 200, 350, 190
+    half_wide, half_high = 0.5 * wide * _PRINTS.wall_cell, 0.5 * high * _PRINTS.wall_cell
+    depth = deep * _PRINTS.wall_cell
     x, y, z = np.eye(3)
     # Name, cells across and down, top-left corner, directions across and down as seen from inside.
     walls = (
-        ("forward", (_WIDE, _HIGH), (-half_wide, depth, half_high), x, -z),
-        ("left", (_DEEP, _HIGH), (-half_wide, 0.0, half_high), y, -z),
-        ("right", (_DEEP, _HIGH), (half_wide, depth, half_high), -y, -z),
-        ("down", (_WIDE, _DEEP), (-half_wide, depth, -half_high), x, -y),
+        ("forward", (wide, high), (-half_wide, depth, half_high), x, -z),
+        ("left", (deep, high), (-half_wide, 0.0, half_high), y, -z),
+        ("right", (deep, high), (half_wide, depth, half_high), -y, -z),
+        ("down", (wide, deep), (-half_wide, depth, -half_high), x, -y),
     )
     marked, first = [], 0
     for k, (name, cells, corner, across, down) in enumerate(walls):
         places = grid_corners(*(_places(n, side) for n in cells))
         pose = SE3(np.column_stack([across, down, np.cross(across, down)]), np.array(corner))
         prints = _prints(first, places, side, side // 6)
-        albedo = mottled(cells[::-1], _ALBEDO, _MOTTLE, scale=0.8, shift=97 * k)
-        marked.append(Marked(name, Panel(pose, marker_texture(albedo, _WALL_CELL, prints)), prints))
+        albedo = mottled(cells[::-1], _PRINTS.albedo, _PRINTS.mottle, scale=0.8, shift=97 * k)
+        marked.append(
+            Marked(name, Panel(pose, marker_texture(albedo, _PRINTS.wall_cell, prints)), prints)
+        )
         first += len(places)
     return marked
 
@@ -275,9 +287,10 @@ def marker_plate() -> Marked:
     """Return a plate of six markers, in a frame of its own."""
     side, gap = 24, 6
     places = grid_corners(*(gap + (side + gap) * np.arange(n) for n in (3, 2)))
-    prints = _prints(_FIRST_ON_PLATE, places, side, 0)
+    first_on_plate = 300
+    prints = _prints(first_on_plate, places, side, 0)
     paper = np.full((2 * side + 3 * gap, 3 * side + 4 * gap), PAPER)
-    panel = Panel(SE3.identity(), marker_texture(paper, _PLATE_CELL, prints))
+    panel = Panel(SE3.identity(), marker_texture(paper, _PRINTS.plate_cell, prints))
     return Marked("plate", panel, prints)
 
 

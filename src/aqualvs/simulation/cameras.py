@@ -26,9 +26,6 @@ from aqualvs.simulation.lasers import COLOUR_BALANCED, LUMA, ColourFilters
 from aqualvs.simulation.scene import CameraSensor, Scene, Vector, WaterOptics
 from aqualvs.simulation.video import Compression
 
-# Reduction of the picture on which the wide halo, which has no detail, is computed.
-_SHRINK = 4
-
 
 def spread(
     radiance: NDArray[np.float32], water: WaterOptics, sensor: CameraSensor
@@ -43,10 +40,12 @@ def spread(
     if water.forward_scatter <= 0.0:
         return sharp
     height, width = radiance.shape[:2]
+    # Reduction of the picture on which the wide halo, which has no detail, is computed.
+    shrink = 4
     small = cv2.resize(
-        radiance, (-(-width // _SHRINK), -(-height // _SHRINK)), interpolation=cv2.INTER_AREA
+        radiance, (-(-width // shrink), -(-height // shrink)), interpolation=cv2.INTER_AREA
     )
-    small = cv2.GaussianBlur(small, (0, 0), water.halo_px / _SHRINK)
+    small = cv2.GaussianBlur(small, (0, 0), water.halo_px / shrink)
     halo = cv2.resize(small, (width, height), interpolation=cv2.INTER_LINEAR)
     return np.asarray(
         cv2.addWeighted(sharp, 1.0 - water.forward_scatter, halo, water.forward_scatter, 0.0)

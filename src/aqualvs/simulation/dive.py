@@ -36,7 +36,6 @@ Log time = dive time + `LEAD_S`."""
 LOG_COLUMNS = ("time_s", "depth_m", "heading_deg", "roll_deg", "pitch_deg")
 HOLE_COLUMNS = ("right_m", "up_m", "diameter_mm", "depth_m", "bearing_deg", "time_s")
 
-_RATE_HZ = 10.0
 _SIGMA_DEPTH, _SIGMA_ANGLE = 0.005, float(np.deg2rad(0.2))
 
 
@@ -72,10 +71,11 @@ def write_vehicle_log(scenario: Scenario, path: Path) -> None:
         Error of the system.
     """
     rng = np.random.default_rng([scenario.seed, 23])
+    rate_hz = 10.0
     with path.open("w", newline="", encoding="ascii") as file:
         table = csv.writer(file)
         table.writerow(LOG_COLUMNS)
-        for log_s in np.arange(0.0, scenario.duration + 2.0 * LEAD_S, 1.0 / _RATE_HZ):
+        for log_s in np.arange(0.0, scenario.duration + 2.0 * LEAD_S, 1.0 / rate_hz):
             pose = scenario.trajectory.pose_at(log_s - LEAD_S, scenario.duration)
             depth = NET_DEPTH - pose.inverse().translation[2] + _SIGMA_DEPTH * rng.normal()
             angles = np.array(vehicle_attitude(pose)) + _SIGMA_ANGLE * rng.normal(size=3)

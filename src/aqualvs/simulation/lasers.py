@@ -128,8 +128,6 @@ N_FAN = 3001
 # The fan's edge rolls off over this angle.
 _EDGE = np.deg2rad(0.8)
 _ON_PLANE = 1e-6
-# Greatest ratio of the light's way to the straight line.
-_BENT_WAY = 1.1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -323,10 +321,12 @@ def sheet_coordinates(p: Vec, sheets: Sheets, i: int) -> tuple[float, float, flo
     rel = minus(p, row3(table, i, SOURCE))
     off, distance = dot(rel, row3(table, i, NORMAL)), 0.0
     bent = sheets.optics[i, WINDOWED] != 0.0
+    # Greatest ratio of the light's way to the straight line.
+    bent_way = 1.1
     if bent:
         reach = np.sqrt(dot(rel, rel))
         wide = CUT * (table[i, SIGMA] + table[i, DIVERGENCE] * reach)
-        wide += sheets.stray[i, 0] + _BENT_WAY * sheets.stray[i, 1] * reach
+        wide += sheets.stray[i, 0] + bent_way * sheets.stray[i, 1] * reach
         start = row3(sheets.optics, i, START)
         # Few points are near a sheet: a dot product rejects the others faster than Snell's law.
         if abs(dot(p, start) - sheets.optics[i, START + 3]) > wide:

@@ -102,8 +102,6 @@ _GROWTH_ALBEDO = (0.42, 0.46, 0.26)
 _STEP = 1e-3
 _MAX_STEPS = 200
 _HALVINGS = 16
-# Greatest number of layers of a folded net along a ray.
-_MAX_LAYERS = 5
 
 
 class Strand(NamedTuple):
@@ -339,7 +337,9 @@ def meet_net(
     """Return the first strand of net i that a ray meets."""
     found = Strand(np.inf, (0.0, 0.0, 0.0), 0.0, 0.0, 0.0)
     t = 0.0
-    for _ in range(_MAX_LAYERS):
+    # Greatest number of layers of a folded net along a ray.
+    max_layers = 5
+    for _ in range(max_layers):
         t = _next_crossing(o, d, nets, i, folds, t)
         if not t < 1e6:
             break

@@ -37,12 +37,9 @@ from aqualvs.simulation.lasers import (
 from aqualvs.simulation.scene import CameraSensor, Vector, WaterOptics
 from aqualvs.simulation.textures import Texture
 
-_ZERO = (0.0, 0.0, 0.0)
 # Columns of the panel table.
 _ORIGIN, _RIGHT, _DOWN, _INTO = 0, 3, 6, 9
 COLUMNS = 12
-# A laser's light that ends within this share of its way from a panel has met it there.
-_AT_END = 1e-6
 
 
 class PanelTables(NamedTuple):
@@ -152,8 +149,9 @@ def _between(corners: FloatArray, row: int, column: int, x: float, y: float) -> 
     """Return the bilinear value between the corners of a pixel."""
     a, b = row3(corners[row], column, 0), row3(corners[row], column + 1, 0)
     c, e = row3(corners[row + 1], column, 0), row3(corners[row + 1], column + 1, 0)
-    top = combine(a, 1.0 - x, b, x, _ZERO, 0.0)
-    return combine(top, 1.0 - y, combine(c, 1.0 - x, e, x, _ZERO, 0.0), y, _ZERO, 0.0)
+    zero = (0.0, 0.0, 0.0)
+    top = combine(a, 1.0 - x, b, x, zero, 0.0)
+    return combine(top, 1.0 - y, combine(c, 1.0 - x, e, x, zero, 0.0), y, zero, 0.0)
 
 
 @inline_borrowing_kernel
@@ -254,10 +252,12 @@ def _laser_light(p: Vec, normal: Vec, own: int, panels: PanelTables, sheets: She
 @inline_borrowing_kernel
 def _is_shadowed(p: Vec, way: Vec, own: int, panels: PanelTables) -> bool:
     """Return whether a panel stands on the straight way from a point to a source."""
+    # A laser's light that ends within this share of its way from a panel has met it there.
+    at_end = 1e-6
     for i in range(panels.frames.shape[0]):
         if i != own:
             t = _meet(p, way, panels, i)
-            if _AT_END < t < 1.0 - _AT_END and _covers(along(p, way, t), panels, i):
+            if at_end < t < 1.0 - at_end and _covers(along(p, way, t), panels, i):
                 return True
     return False
 

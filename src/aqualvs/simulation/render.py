@@ -105,10 +105,6 @@ def _splat(
 
 # Side of a tile, in pixels.
 TILE = 32
-# Margin of the outline of a sphere, which is sampled at points of a box around it.
-_MARGIN_PX = 4.0
-# Distance, in metres, beyond which a body that cannot be projected is out of sight.
-_NEAR = 0.2
 
 
 class TileMembers(NamedTuple):
@@ -164,28 +160,23 @@ def _tiles_of(
     grid = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
     pixels, valid = camera.project(centre + radius * grid)
     marked = np.ones((rows, columns), dtype=np.bool_)
-    if not valid.any() and np.linalg.norm(centre) > radius + _NEAR:
+    # Distance, in metres, beyond which a body that cannot be projected is out of sight.
+    near = 0.2
+    if not valid.any() and np.linalg.norm(centre) > radius + near:
         return ~marked
     if not valid.all():
         return marked
-    low, high = pixels.min(axis=0) - _MARGIN_PX, pixels.max(axis=0) + _MARGIN_PX
+    # Margin of the outline of a sphere, which is sampled at points of a box around it.
+    margin_px = 4.0
+    low, high = pixels.min(axis=0) - margin_px, pixels.max(axis=0) + margin_px
     x, y = np.arange(columns) * TILE, np.arange(rows) * TILE
     marked &= ((x + TILE > low[0]) & (x < high[0]))[None, :]
     marked &= ((y + TILE > low[1]) & (y < high[1]))[:, None]
     return marked
 
 
-_ZERO = (0.0, 0.0, 0.0)
-
 SceneAt: TypeAlias = Callable[[float], Scene]
 """From a time in seconds to the scene at that time, such as `Scenario.scene_at`."""
-
-# Rows of a rolling picture that are rendered at one instant lie within this time; stripes that
-# move by 300 px a second are off by 0.04 px at most, to and fro.
-_BAND_S = 0.25e-3
-# Instants of an exposure are this near to each other: 0.6 px at the same speed, less than the
-# width of a stripe.
-_INSTANT_S = 2e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -297,9 +288,15 @@ class Renderer:
         width, height = self.rig.size_px
         shutter = self.rig.shutter
         n_bands = 1
+        # Rows of a rolling picture that are rendered at one instant lie within this time; stripes
+        # that move by 300 px a second are off by 0.04 px at most, to and fro.
+        band_s = 0.25e-3
         if shutter.rolls:
-            n_bands = min(math.ceil(abs(shutter.readout) / _BAND_S), height)
-        n_instants = max(math.ceil(shutter.exposure / _INSTANT_S), 1)
+            n_bands = min(math.ceil(abs(shutter.readout) / band_s), height)
+        # Instants of an exposure are this near to each other: 0.6 px at the same speed, less than
+        # the width of a stripe.
+        instant_s = 2e-3
+        n_instants = max(math.ceil(shutter.exposure / instant_s), 1)
         instants = ((np.arange(n_instants) + 0.5) / n_instants - 0.5) * shutter.exposure
         out = np.zeros((height, width, 3), dtype=np.float32)
         now = np.zeros_like(out)
@@ -386,18 +383,19 @@ class Renderer:
 @inline_borrowing_kernel
 def _between(corners: FloatArray, row: int, column: int, x: float, y: float) -> Vec:
     """Return the bilinear value between the corners of a pixel, x and y in 0..1."""
+    zero = (0.0, 0.0, 0.0)
     top = combine(
-        row3(corners[row], column, 0), 1.0 - x, row3(corners[row], column + 1, 0), x, _ZERO, 0.0
+        row3(corners[row], column, 0), 1.0 - x, row3(corners[row], column + 1, 0), x, zero, 0.0
     )
     low = combine(
         row3(corners[row + 1], column, 0),
         1.0 - x,
         row3(corners[row + 1], column + 1, 0),
         x,
-        _ZERO,
+        zero,
         0.0,
     )
-    return combine(top, 1.0 - y, low, y, _ZERO, 0.0)
+    return combine(top, 1.0 - y, low, y, zero, 0.0)
 
 
 @inline_borrowing_kernel

@@ -96,9 +96,6 @@ def _bubble(rng: np.random.Generator, duration: float, behind: float) -> Bubble:
     return Bubble(position=place, velocity=drift, radius=radius)
 
 
-_STEEPEST = np.deg2rad(85.0)
-
-
 def dome_from_target(
     distance: float, pitch: float, yaw: float, slide: tuple[float, float] = (0.0, 0.0)
 ) -> SE3:
@@ -126,7 +123,8 @@ def dome_from_target(
     """
     if not distance > 0.0:
         raise OptionError(f"range is {1e3 * distance:g} mm; it must be positive")
-    if max(abs(pitch), abs(yaw)) >= _STEEPEST:
+    steepest = np.deg2rad(85.0)
+    if max(abs(pitch), abs(yaw)) >= steepest:
         raise OptionError(
             f"pitch {np.rad2deg(pitch):g} and yaw {np.rad2deg(yaw):g} deg: the target would be "
             "seen edge on; keep both below 85 deg"

@@ -22,7 +22,6 @@ _CENTRE, _ROWS, _PART = 0, 3, 15
 _HALF, _BOX_ALBEDO = 12, 15
 
 _BODY, _TAIL, _EYE = 0.0, 1.0, 2.0
-_FAR = 1e3
 
 NONE, NET, WALL, FISH, BUBBLE, SOLID = range(6)
 
@@ -153,7 +152,8 @@ def meet_wall(o: Vec, d: Vec, walls: FloatArray, i: int) -> float:
     """Return the distance to a wall; infinite behind the ray's origin."""
     normal = row3(walls, i, _NORMAL)
     t = dot(minus(row3(walls, i, _ORIGIN), o), normal) / dot(d, normal)
-    return t if 0.0 < t < _FAR else np.inf
+    far = 1e3
+    return t if 0.0 < t < far else np.inf
 
 
 @inline_borrowing_kernel

@@ -27,12 +27,6 @@ from aqualvs.simulation.lasers import (
 from aqualvs.simulation.scene import Scene, SurfaceKind, Target
 from aqualvs.simulation.surfaces import Surfaces, first_hit, meet_bubbles
 
-# A point is seen if the camera's ray to it ends no farther than this before it. The twine's
-# grooves and growth, which depend slightly on the ray's direction, stay within this distance.
-_SEEN_WITHIN = 5e-4
-# Fraction of the fan's power below which a stripe has faded out.
-_FAN_FLOOR = 0.5
-
 
 @dataclass(frozen=True, slots=True)
 class LitPoints:
@@ -86,7 +80,10 @@ def find_lit_points(rig: Rig, surfaces: Surfaces, sheets: Sheets) -> LitPoints:
     rays = camera.rays(pixels[seen])
     reach = cast(rays.origins, rays.directions, surfaces).solid
     distance = np.linalg.norm(points[seen] - rays.origins, axis=-1)
-    seen[seen] = rays.valid & (reach > distance - _SEEN_WITHIN)
+    # A point is seen if the camera's ray to it ends no farther than this before it. The twine's
+    # grooves and growth, which depend slightly on the ray's direction, stay within this distance.
+    seen_within = 5e-4
+    seen[seen] = rays.valid & (reach > distance - seen_within)
     return LitPoints(points[seen], pixels[seen], laser[seen], label[seen].astype(np.int32))
 
 
@@ -96,7 +93,9 @@ def _lit_by(
     """Return points and labels lit by sheet i; a bubble and what is behind it may both be lit."""
     origins, directions, way = fan_rays(rig, sheets, i)
     reach, kind, bubble = cast(origins, directions, surfaces)
-    strong = (sheets.fan[i] > _FAN_FLOOR) & np.isfinite(way)
+    # Fraction of the fan's power below which a stripe has faded out.
+    fan_floor = 0.5
+    strong = (sheets.fan[i] > fan_floor) & np.isfinite(way)
     solid, clear = strong & np.isfinite(reach), strong & (bubble < reach)
     points = np.concatenate(
         [

@@ -21,20 +21,18 @@ from typing import IO, Any, BinaryIO, TypeAlias, cast
 
 from aqualvs.errors import OptionError, SourceError
 from aqualvs.sources.image_messages import (
+    MAX_BYTES,
     ImageMessage,
+    ImageTopic,
+    Logged,
+    MessageSource,
+    choose_topic,
     image_of_json,
     image_of_protobuf,
     image_of_ros,
     kind_of_schema,
 )
 from aqualvs.sources.mcap_file import HEAD_BYTES, MAX_RECORD_BYTES, Op, decompressed
-from aqualvs.sources.message_source import (
-    MAX_BYTES,
-    ImageTopic,
-    Logged,
-    MessageSource,
-    choose_topic,
-)
 from aqualvs.special_files import refuse_special
 
 # Disk space to keep free where bags compressed as whole files are unpacked.

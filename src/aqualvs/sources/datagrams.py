@@ -17,17 +17,7 @@ from urllib.parse import urlsplit
 
 from aqualvs.errors import SourceError
 from aqualvs.sources.live_frames import Reception
-from aqualvs.sources.rtp import parse_rtp
-from aqualvs.sources.transport_stream import PACKET_BYTES, SYNC
-
-_BUFFER_BYTES = 4 << 20
-"""Size of the receive buffer; the system may grant less. A key frame comes in one burst."""
-
-_LOOK_S = 0.2
-"""Period in which the receiver checks whether to end."""
-
-_MAX_WAITING = 20_000
-"""Datagrams kept for a late reader; further ones are lost, and counted as such."""
+from aqualvs.sources.rtp import PACKET_BYTES, SYNC, parse_rtp
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,7 +131,11 @@ class Datagrams:
         self._socket.close()
 
     def _receive(self) -> None:
-        self._socket.settimeout(_LOOK_S)
+        # Period in which the receiver checks whether to end.
+        look_s = 0.2
+        self._socket.settimeout(look_s)
+        # Datagrams kept for a late reader; further ones are lost, and counted as such.
+        max_waiting = 20_000
         while not self._closed.is_set():
             try:
                 content = self._socket.recv(65536)
@@ -150,7 +144,7 @@ class Datagrams:
             except OSError:  # Such as an ICMP error that Windows reports here.
                 time.sleep(0.01)
                 continue
-            if self._waiting.qsize() < _MAX_WAITING:
+            if self._waiting.qsize() < max_waiting:
                 self._waiting.put(Datagram(content, time.monotonic()))
 
 
@@ -176,8 +170,10 @@ def _listen(address: UdpAddress) -> socket.socket:
     host = ip_address(address.host) if address.host else None
     family = socket.AF_INET6 if isinstance(host, IPv6Address) else socket.AF_INET
     made = socket.socket(family, socket.SOCK_DGRAM)
+    # Size of the receive buffer; the system may grant less. A key frame comes in one burst.
+    buffer_bytes = 4 << 20
     try:
-        made.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
+        made.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, buffer_bytes)
         if host is not None and host.is_multicast:
             made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             made.bind(("", address.port))
@@ -202,7 +198,6 @@ def _join(made: socket.socket, group: str, *, is_v6: bool) -> None:
 RTP, TS, BARE = "RTP H.264", "MPEG-TS", "bare H.264"
 """Kinds of content, as health reports name them."""
 
-_TS_IN_RTP = 33
 
 WAIT_S = 0.2
 """Longest wait for datagrams, so that an end is noticed."""
@@ -241,9 +236,10 @@ def transport_content(datagram: bytes) -> bytes | None:
     ----------
     datagram : bytes
     """
+    ts_in_rtp = 33
     if datagram[:1] != bytes([SYNC]):
         packet = parse_rtp(datagram)
-        if packet is None or packet.payload_type != _TS_IN_RTP:
+        if packet is None or packet.payload_type != ts_in_rtp:
             return None
         datagram = packet.payload
     whole = len(datagram) % PACKET_BYTES == 0

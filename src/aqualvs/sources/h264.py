@@ -105,8 +105,6 @@ SLICE, IDR, SEI, SPS, PPS, DELIMITER = 1, 5, 6, 7, 8, 9
 START_CODE = b"\x00\x00\x00\x01"
 
 _START = re.compile(b"\x00\x00\x01")
-_HEAD = 64
-"""Bytes of a unit that hold all fields read here; a long scaling list is left unread."""
 
 _CHROMA_PROFILES = frozenset({100, 110, 122, 244, 44, 83, 86, 118, 128, 138, 139, 134, 135})
 
@@ -123,7 +121,9 @@ def nal_units(data: bytes) -> list[bytes]:
     units : list of bytes
         At most 64 bytes of each, without start code.
     """
-    return [data[m.end() : m.end() + _HEAD] for m in _START.finditer(data)]
+    # Bytes of a unit that hold all fields read here; a long scaling list is left unread.
+    head = 64
+    return [data[m.end() : m.end() + head] for m in _START.finditer(data)]
 
 
 class FrameNumbers:

@@ -24,9 +24,6 @@ from aqualvs.sources.base import PartHealth, State, frame_of
 from aqualvs.sources.h264 import FrameNumbers
 from aqualvs.sources.video import FrameCounter
 
-_DISAGREE_S = 5.0
-"""Greatest difference of stream and arrival times for one sender: buffers hold no more."""
-
 
 class Unwrapper:
     """Unwrapped counter: continues a counter of fixed width past its overflow.
@@ -110,7 +107,9 @@ class StreamClock:
         passed = 0.0 if self._last_arrival is None else max(0.0, arrival - self._last_arrival)
         expected = self._last + passed
         time = self._from_ticks(ticks, expected)
-        if time < self._last or abs(time - expected) > _DISAGREE_S:
+        # Greatest difference of stream and arrival times for one sender: buffers hold no more.
+        disagree_s = 5.0
+        if time < self._last or abs(time - expected) > disagree_s:
             self._anchor, self._anchor_ticks = expected, ticks
             time = expected
         self._last, self._last_arrival = time, arrival
@@ -123,9 +122,6 @@ class StreamClock:
             self._anchor, self._anchor_ticks = expected, ticks
         return self._anchor + (ticks - self._anchor_ticks) * self._tick
 
-
-_WINDOW_S = 5.0
-"""Rates and losses are reported for this time."""
 
 _SILENT_S = 0.5
 """Longer silence is a fault."""
@@ -231,9 +227,11 @@ class Reception:
             return PartHealth(self.name, state, words, self._n_lost + self._n_held)
 
     def _forget(self, now: float) -> None:
-        while self._frames and self._frames[0] < now - _WINDOW_S:
+        # Rates and losses are reported for this time.
+        window_s = 5.0
+        while self._frames and self._frames[0] < now - window_s:
             self._frames.popleft()
-        while self._losses and self._losses[0][0] < now - _WINDOW_S:
+        while self._losses and self._losses[0][0] < now - window_s:
             self._losses.popleft()
 
     def _state(self, now: float) -> tuple[State, str]:

@@ -24,9 +24,6 @@ from aqualvs.sources.live_frames import LiveFrames, Reception
 VideoPacket: TypeAlias = "Packet[VideoStream]"
 Opener: TypeAlias = Callable[[], InputContainer]
 
-_MAX_WAITING = 250
-"""Packets kept for a late decoder; beyond it the connection is given up."""
-
 
 class Connection:
     """Connection opened in the background, and the packets of its first video.
@@ -78,11 +75,13 @@ class Connection:
         if not container.streams.video:
             self.reason = "holds no video"
             return
+        # Packets kept for a late decoder; beyond it the connection is given up.
+        max_waiting = 250
         try:
             for packet in container.demux(container.streams.video[0]):
                 if self._abandoned.is_set():
                     return
-                if self._packets.qsize() > _MAX_WAITING:
+                if self._packets.qsize() > max_waiting:
                     self.reason = "this machine does not keep up"
                     return
                 self._packets.put(packet)
@@ -105,8 +104,6 @@ Transport: TypeAlias = Literal["tcp", "udp"]
 _OPEN_S, _SILENT_S = 5.0, 2.0
 """Time to connect and find the first key frame; silence after which a connection is dead."""
 
-_RETRY_S = (0.1, 0.2, 0.5)
-"""Pauses before retries, the last one repeated: the vehicle may return at any time."""
 
 _PROBE = {"fpsprobesize": "0", "analyzeduration": "1000000"}
 """The rate is not probed, so that the first pictures need not wait for it. FFmpeg's
@@ -171,7 +168,9 @@ class RemoteFeed:
         if self._closed.is_set():
             return
         self._reception.complain(f"no connection ({connection.reason}); trying again")
-        self._closed.wait(_RETRY_S[min(n_failed, len(_RETRY_S) - 1)])
+        # Pauses before retries, the last one repeated: the vehicle may return at any time.
+        retry_s = (0.1, 0.2, 0.5)
+        self._closed.wait(retry_s[min(n_failed, len(retry_s) - 1)])
 
 
 def remote_feed(address: str, *, transport: Transport = "tcp") -> RemoteFeed:

@@ -13,7 +13,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 import av
 import numpy as np
@@ -26,8 +26,10 @@ from aqualvs.closing import Closing
 from aqualvs.errors import SourceError
 from aqualvs.scanning.scan import Frame
 from aqualvs.sources.base import frame_of
-from aqualvs.sources.h264 import UnitReader, unit_reader
 from aqualvs.sources.images import ImageSource, images_in
+
+if TYPE_CHECKING:
+    from aqualvs.sources.h264 import UnitReader
 
 # Codecs without prediction between pictures.
 _INTRA_ONLY = frozenset({"mjpeg", "prores", "dnxhd", "rawvideo", "huffyuv", "ffvhuff", "utvideo"})
@@ -262,7 +264,9 @@ class _Packets:
             if earliest[cut] == pts[cut] and (cut == 0 or latest[cut - 1] < pts[cut])
         ]
 
-    def _reader(self) -> UnitReader | None:
+    def _reader(self) -> "UnitReader | None":
+        from aqualvs.sources.h264 import unit_reader
+
         context = self._stream.codec_context
         try:
             return unit_reader(context.name, context.extradata or b"")
@@ -310,9 +314,6 @@ def promised_duration(stream: VideoStream) -> float | None:
         return None
     hours, minutes, seconds = (float(part) for part in clock)
     return 3600 * hours + 60 * minutes + seconds
-
-
-_SEEK_BEFORE_S = (0, 2, 20, 1_000_000)
 
 
 class UnlikeProbeError(Exception):
@@ -430,7 +431,8 @@ def _packets_from(stream: VideoStream, span: Span) -> "Iterator[Packet[VideoStre
     container = cast("InputContainer", stream.container)
     if not span.first:
         return (packet for packet in container.demux(stream) if packet.size)
-    for before_s in _SEEK_BEFORE_S:
+    seek_before_s = (0, 2, 20, 1_000_000)
+    for before_s in seek_before_s:
         # Some containers seek by the order of the file, where a picture may come before its time.
         ticks = before_s / (stream.time_base or 1)
         container.seek(max(span.origin_pts, round(span.start_pts - ticks)), stream=stream)

@@ -45,12 +45,10 @@ from aqualvs.sources.rtp import (
     H264Depacketizer,
     RtpOrder,
     RtpPacket,
+    TransportStream,
     parse_rtp,
 )
-from aqualvs.sources.transport_stream import TransportStream
 from aqualvs.special_files import refuse_special
-
-_MAX_BYTES = 64 << 10
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,8 +85,9 @@ def read_sdp(path: Path) -> SdpVideo:
         If the file cannot be read or announces no video over RTP and UDP.
     """
     refuse_special(path)
+    max_bytes = 64 << 10
     try:
-        text = path.read_bytes()[:_MAX_BYTES].decode("utf-8", "replace")
+        text = path.read_bytes()[:max_bytes].decode("utf-8", "replace")
     except OSError as fault:
         raise SourceError(f"{path}: cannot be read ({fault.strerror})") from fault
     session, *media = re.split(r"^(?=m=)", text, flags=re.MULTILINE)
@@ -316,10 +315,6 @@ def packet_of(data: bytes, ticks: int) -> "Packet[VideoStream]":
     return packet
 
 
-_RETRY_S = 0.5
-"""Pause between two attempts to listen."""
-
-
 class UdpFeed:
     """Feed from a UDP port, whatever kind of stream arrives; satisfies `Feed`.
 
@@ -365,10 +360,12 @@ class UdpFeed:
 
     def __iter__(self) -> Iterator[Frame]:
         """Yield frames until closed; waits for a sender."""
+        # Pause between two attempts to listen.
+        retry_s = 0.5
         while not self._closed.is_set():
             datagrams = self._listen(self._address)
             if datagrams is None:
-                self._closed.wait(_RETRY_S)
+                self._closed.wait(retry_s)
                 continue
             self._datagrams = datagrams
             with closing(datagrams):

@@ -105,9 +105,6 @@ class FrameCounter:
         self._pending.clear()
 
 
-_STALL_S = 10.0
-"""A stream that sends nothing for this time has ended."""
-
 _HIDDEN_PACKETS = frozenset({"vp8"})
 """Codecs whose packets need not show a picture, so that packets cannot be counted as frames."""
 
@@ -295,14 +292,16 @@ def sampled_pictures(path: Path) -> tuple[list[list[Frame]], Field | None]:
 
 def _open(where: str) -> InputContainer:
     """Open a container, or say in one line why not."""
+    # A stream that sends nothing for this time has ended.
+    stall_s = 10.0
     try:
-        return av.open(where, timeout=_STALL_S)
+        return av.open(where, timeout=stall_s)
     except FileNotFoundError as fault:
         raise SourceError(f"{where}: no such file; check the path") from fault
     except (av.error.InvalidDataError, av.error.EOFError) as fault:
         raise SourceError(_not_a_video(where)) from fault
     except av.error.ExitError as fault:
-        raise SourceError(f"{where}: nothing came in {_STALL_S:g} s; is the sender on?") from fault
+        raise SourceError(f"{where}: nothing came in {stall_s:g} s; is the sender on?") from fault
     except (av.error.FFmpegError, OSError) as fault:
         raise SourceError(f"{where}: cannot be opened ({fault.strerror})") from fault
 

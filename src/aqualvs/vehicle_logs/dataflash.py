@@ -30,8 +30,6 @@ from aqualvs.vehicle_logs.tlog import SUB_MODES, Candidate, choose_depth
 from aqualvs.vehicle_logs.vehicle_log import Interpolation, Signal, VehicleLog, bearing_of, wrap
 
 HEAD = b"\xa3\x95"
-_FMT = 0x80
-_FMT_LENGTH = 89
 _TYPES = {
     "b": ("i1", 1.0),
     "B": ("u1", 1.0),
@@ -56,8 +54,6 @@ _TYPES = {
     "a": ("S64", 0.0),
 }
 """Format characters: type, and the factor on numbers (0 for what is no number)."""
-_BOGUS_TIME_S = 10.0
-_NEIGHBOURS = 9
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,7 +133,9 @@ def _scan(
     data: bytes, names: frozenset[str], places: dict[str, list[int]], formats: dict[str, Format]
 ) -> tuple[int, list[tuple[int, int]]]:
     """Walk over the records; note the places and formats of the wanted ones."""
-    lengths: dict[int, int] = {_FMT: _FMT_LENGTH}
+    fmt = 0x80
+    fmt_length = 89
+    lengths: dict[int, int] = {fmt: fmt_length}
     lists: dict[int, list[int]] = {}
     skipped: list[tuple[int, int]] = []
     at, size, n_records, last = 0, len(data), 0, 0
@@ -159,14 +157,14 @@ def _scan(
         if at + length > size:
             break
         n_records += 1
-        if kind == _FMT:
+        if kind == fmt:
             number, described = _format(data, at)
             if described.dtype is not None:
                 lengths[number] = described.length
                 if described.name in names:
                     formats[described.name] = described
                     lists[number] = places[described.name]
-            elif described.length > 3 and number != _FMT:
+            elif described.length > 3 and number != fmt:
                 lengths[number] = described.length
         elif kind in lists:
             lists[kind].append(at)
@@ -269,22 +267,14 @@ def _seconds(table: Mapping[str, FloatArray]) -> FloatArray | None:
 
 def _believable(times: FloatArray) -> BoolArray:
     """Return which times are near those of their neighbours in the file."""
-    usual = ndimage.median_filter(times, min(_NEIGHBOURS, len(times)), mode="nearest")
-    near: BoolArray = np.isfinite(times) & (np.abs(times - usual) <= _BOGUS_TIME_S)
+    neighbours = 9
+    usual = ndimage.median_filter(times, min(neighbours, len(times)), mode="nearest")
+    bogus_time_s = 10.0
+    near: BoolArray = np.isfinite(times) & (np.abs(times - usual) <= bogus_time_s)
     return near if len(times) > 2 else np.isfinite(times)
 
 
 _WANTED = ("ATT", "CTUN", "POS", "XKF1", "NKF1", "BARO", "GPS", "RTC", "MODE", "ARM", "EV")
-_GPS_EPOCH_S = 315964800.0
-_LEAP_S = 18.0
-_WEEK_S = 604800.0
-_GPS_FIX = 3
-_UTC_SIGMA_S = 1.0
-"""A vehicle's clock is set once, to about the second."""
-_ARMED_EVENT, _DISARMED_EVENT = 10, 11
-_DEEPEST_M = 12000.0
-_LARGEST_DEG = 720.0
-"""Records have no checksum: damaged ones may hold any number."""
 
 _Tables = Mapping[str, Mapping[str, FloatArray]]
 
@@ -349,6 +339,8 @@ def _log(path: Path, records: Records, kind: str, unit: str) -> VehicleLog:
         "armed": armed_from,
         "start_utc_s": utc_from,
     }
+    # A vehicle's clock is set once, to about the second.
+    utc_sigma_s = 1.0
     return VehicleLog(
         name=str(path),
         kind=kind,
@@ -360,7 +352,7 @@ def _log(path: Path, records: Records, kind: str, unit: str) -> VehicleLog:
         armed=armed,
         modes=_modes(tables, begin),
         start_utc_s=utc,
-        start_utc_sigma_s=None if utc is None else _UTC_SIGMA_S,
+        start_utc_sigma_s=None if utc is None else utc_sigma_s,
         sources={name: where for name, where in sources.items() if where},
         notes=tuple(n for n in (*_damage(records, unit), stuck) if n),
     )
@@ -401,7 +393,8 @@ def _signal(
     if table is None or column not in table:
         return None
     values = scale * table[column]
-    values = np.where(np.abs(values) <= _DEEPEST_M, values, np.nan)
+    deepest_m = 12000.0
+    values = np.where(np.abs(values) <= deepest_m, values, np.nan)
     return Signal.from_samples(table["time_s"] - begin, values)
 
 
@@ -411,7 +404,9 @@ def _angle(
     table = tables.get("ATT")
     if table is None or column not in table:
         return None
-    angle = np.deg2rad(np.where(np.abs(table[column]) <= _LARGEST_DEG, table[column], np.nan))
+    # Records have no checksum: damaged ones may hold any number.
+    largest_deg = 720.0
+    angle = np.deg2rad(np.where(np.abs(table[column]) <= largest_deg, table[column], np.nan))
     angle = bearing_of(angle) if interpolation is Interpolation.BEARING else wrap(angle)
     return Signal.from_samples(table["time_s"] - begin, angle, interpolation)
 
@@ -458,15 +453,16 @@ def _velocity(tables: _Tables, begin: float) -> tuple[Signal | None, str]:
 def _armed(tables: _Tables, begin: float) -> tuple[Signal | None, str]:
     """Return the arming; it is logged at changes only, so a signal without gaps is made of it."""
     table = tables.get("ARM")
+    armed_event, disarmed_event = 10, 11
     if table is not None and "ArmState" in table:
         times, state, where = table["time_s"], table["ArmState"], "ARM.ArmState"
     else:
         table = tables.get("EV")
         if table is None or "Id" not in table:
             return None, ""
-        told = (table["Id"] == _ARMED_EVENT) | (table["Id"] == _DISARMED_EVENT)
+        told = (table["Id"] == armed_event) | (table["Id"] == disarmed_event)
         times, where = table["time_s"][told], "EV.Id"
-        state = (table["Id"][told] == _ARMED_EVENT).astype(float)
+        state = (table["Id"][told] == armed_event).astype(float)
     signal = Signal.from_samples(times - begin, (state > 0.0).astype(float), Interpolation.HELD)
     if signal is None:
         return None, ""
@@ -497,10 +493,14 @@ def _modes(tables: _Tables, begin: float) -> tuple[tuple[float, str], ...]:
 
 def _start_utc(tables: _Tables, begin: float) -> tuple[float | None, str]:
     gps = tables.get("GPS")
+    gps_epoch_s = 315964800.0
+    leap_s = 18.0
+    week_s = 604800.0
+    gps_fix = 3
     if gps is not None and {"GWk", "GMS", "Status"} <= set(gps):
-        fixed = (gps["Status"] >= _GPS_FIX) & (gps["GWk"] > 0)
+        fixed = (gps["Status"] >= gps_fix) & (gps["GWk"] > 0)
         if fixed.any():
-            utc = _GPS_EPOCH_S + _WEEK_S * gps["GWk"] + gps["GMS"] * 1e-3 - _LEAP_S
+            utc = gps_epoch_s + week_s * gps["GWk"] + gps["GMS"] * 1e-3 - leap_s
             return float(np.median((utc - gps["time_s"])[fixed])) + begin, "GPS.GWk, GMS"
     rtc = tables.get("RTC")
     if rtc is not None and "Epoch" in rtc:

@@ -17,12 +17,8 @@ from aqualvs.geometry.arrays import BoolArray, IntArray
 MAGIC_1, MAGIC_2 = 0xFE, 0xFD
 _STAMP = 8
 _HEADER = {MAGIC_1: 6, MAGIC_2: 10}
-_SIGNATURE = 13
-_SIGNED = 0x01
 _CHECKSUM = 2
 _SHORTEST = _STAMP + 6 + _CHECKSUM
-_LATEST = 0x0E
-"""Second byte of the microseconds since 1970 in the year 2100; the first is 0."""
 _RECORD = re.compile(rb"\x00[\x00-\x0e].{6}[\xfd\xfe]", re.DOTALL)
 
 
@@ -205,14 +201,18 @@ def _scan(
 def _record_end(data: bytes, start: int) -> int | None:
     """Return where the record that starts here ends; None if none starts here."""
     magic = data[start + _STAMP]
-    if (magic != MAGIC_2 and magic != MAGIC_1) or data[start] or data[start + 1] > _LATEST:
+    # Second byte of the microseconds since 1970 in the year 2100; the first is 0.
+    latest = 0x0E
+    if (magic != MAGIC_2 and magic != MAGIC_1) or data[start] or data[start + 1] > latest:
         return None
     if magic == MAGIC_1:
         return start + _STAMP + 6 + _CHECKSUM + data[start + 9]
     flags = data[start + 10]
-    if flags > _SIGNED:
+    signed = 0x01
+    if flags > signed:
         return None
-    return start + _STAMP + 10 + _CHECKSUM + data[start + 9] + flags * _SIGNATURE
+    signature = 13
+    return start + _STAMP + 10 + _CHECKSUM + data[start + 9] + flags * signature
 
 
 def _next_record(data: bytes, start: int) -> int | None:

@@ -21,14 +21,6 @@ SMOOTHING_S = 0.4
 25 Hz leaves a rate of 0.1 degrees a second; a vehicle's own motion is slower than this window."""
 _TREND_S = 5.0
 """Slower changes are left out: the net's own bearing along a cage, drift of a compass."""
-_MIN_COVER = 0.5
-"""Share of the window that must hold values."""
-_CLIP_SIGMAS = 4.0
-_CLIP_RATE = math.radians(5.0)
-"""Rates beyond both are clipped to the larger one, so that no single false reading decides."""
-_HAMPEL_SAMPLES = 11
-_HAMPEL_SIGMAS = 5.0
-_HAMPEL_ANGLE = math.radians(2.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +54,10 @@ def rates_of(angle: Signal, start_s: float, end_s: float) -> Rates:
     values, valid = unwrapped.at(times)
     rate, known = _slopes(np.where(valid, values, 0.0), valid)
     rate = rate - _smooth(np.where(known, rate, 0.0), known)
-    limit = max(_CLIP_SIGMAS * robust_sigma(rate[known]), _CLIP_RATE)
+    clip_sigmas = 4.0
+    # Rates beyond both are clipped to the larger one, so that no single false reading decides.
+    clip_rate = math.radians(5.0)
+    limit = max(clip_sigmas * robust_sigma(rate[known]), clip_rate)
     return Rates(float(times[0]), np.where(known, np.clip(rate, -limit, limit), 0.0), known)
 
 
@@ -78,11 +73,14 @@ def without_outliers(angle: ArrayLike, valid: ArrayLike) -> BoolArray:
     """
     values, kept = np.asarray(angle, float), np.array(valid, bool)
     kept &= np.isfinite(values)
-    if np.count_nonzero(kept) < _HAMPEL_SAMPLES:
+    hampel_samples = 11
+    if np.count_nonzero(kept) < hampel_samples:
         return kept
     chosen = values[kept]
-    off = np.abs(chosen - ndimage.median_filter(chosen, _HAMPEL_SAMPLES, mode="nearest"))
-    limit = max(_HAMPEL_SIGMAS * 1.4826 * float(np.median(off)), _HAMPEL_ANGLE)
+    off = np.abs(chosen - ndimage.median_filter(chosen, hampel_samples, mode="nearest"))
+    hampel_sigmas = 5.0
+    hampel_angle = math.radians(2.0)
+    limit = max(hampel_sigmas * 1.4826 * float(np.median(off)), hampel_angle)
     kept[kept] = off <= limit
     return kept
 
@@ -108,7 +106,9 @@ def _slopes(values: FloatArray, valid: BoolArray) -> tuple[FloatArray, BoolArray
     stx = _convolve(centred, -window * lag)
     spread = s0 * s2 - s1**2
     whole = window.sum()
-    known = (s0 >= _MIN_COVER * whole) & (spread >= _MIN_COVER**2 * whole * window @ lag**2)
+    # Share of the window that must hold values.
+    min_cover = 0.5
+    known = (s0 >= min_cover * whole) & (spread >= min_cover**2 * whole * window @ lag**2)
     slope = (s0 * stx - s1 * sx) / np.where(known, spread, 1.0)
     return np.where(known, slope, 0.0), known
 

@@ -34,10 +34,6 @@ _COLUMNS = TIME_COLUMNS + VALUE_COLUMNS
 _STEMS = {name.rsplit("_", 1)[0]: name for name in VALUE_COLUMNS} | {"yaw": "heading_deg"}
 _UNITS = frozenset({"", "m", "cm", "mm", "ft", "deg", "rad", "degrees", "radians", "cdeg"})
 _LARGEST = {"depth_m": 12000.0, "heading_deg": 720.0, "roll_deg": 360.0, "pitch_deg": 180.0}
-# Greatest height above the surface, from waves and the sensor's zero.
-_ABOVE_SURFACE_M = -2.0
-# Clocks set by the network are more accurate than this.
-_UTC_SIGMA_S = 2.0
 
 
 def read_csv_log(path: Path) -> VehicleLog:
@@ -185,7 +181,9 @@ def _check_times(time_s: FloatArray, lines: list[int], path: Path) -> None:
 
 def _check_depths(depth_m: FloatArray, lines: list[int], path: Path) -> None:
     known = depth_m[np.isfinite(depth_m)]
-    if len(known) and np.median(known) < _ABOVE_SURFACE_M:
+    # Greatest height above the surface, from waves and the sensor's zero.
+    above_surface_m = -2.0
+    if len(known) and np.median(known) < above_surface_m:
         i = int(np.nanargmin(depth_m))
         raise SourceError(
             f"{path}: line {lines[i]}: depth_m is {depth_m[i]:g}, above the surface; write depths "
@@ -208,6 +206,8 @@ def _log(
         turned = bearing_of(turned) if interpolation is Interpolation.BEARING else wrap(turned)
         return Signal.from_samples(time_s, turned, interpolation)
 
+    # Clocks set by the network are more accurate than this.
+    utc_sigma_s = 2.0
     return VehicleLog(
         name=str(path),
         kind="csv",
@@ -216,13 +216,12 @@ def _log(
         roll=angle("roll_deg", Interpolation.ANGLE),
         pitch=angle("pitch_deg", Interpolation.ANGLE),
         start_utc_s=start_utc_s,
-        start_utc_sigma_s=None if start_utc_s is None else _UTC_SIGMA_S,
+        start_utc_sigma_s=None if start_utc_s is None else utc_sigma_s,
         sources={n.rsplit("_", 1)[0]: f"column {n}" for n in VALUE_COLUMNS if n in table},
         notes=notes,
     )
 
 
-_HEAD_BYTES = 65536
 _OTHERS = {
     b"ULog": "is a PX4 log (ULog); convert it to CSV with columns time_s, depth_m, heading_deg",
     b"\x89MCAP": "is an MCAP recording; export its MAVLink messages as .tlog",
@@ -283,9 +282,10 @@ def _reader(head: bytes, path: Path) -> Callable[[Path], VehicleLog]:
 
 
 def _head(path: Path) -> bytes:
+    head_bytes = 65536
     try:
         with path.open("rb") as file:
-            return file.read(_HEAD_BYTES)
+            return file.read(head_bytes)
     except FileNotFoundError:
         raise SourceError(f"{path}: no such file; give the path of the vehicle's log") from None
     except IsADirectoryError:

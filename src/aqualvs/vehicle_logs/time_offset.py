@@ -31,20 +31,9 @@ from aqualvs.vehicle_logs.motion import (
 )
 from aqualvs.vehicle_logs.vehicle_log import Signal, VehicleLog
 
-_MIN_OVERLAP_S = 30.0
-_LONGEST_S = 24 * 3600.0
 _LOBE_S = 1.0
 """Offsets within this of the best one belong to the same peak and are no rivals."""
-_N_RIVALS = 30
-_BLOCK_S = 3.0
-"""Longer than a motion lasts, so that blocks are independent."""
-_MIN_MARGIN = 2.5
-"""Least number of standard deviations by which the best offset must exceed all others."""
 _START_SIGMAS = 4.0
-_ITERATIONS = 8
-_HUBER = 1.5
-_CONVERGED_S = 1e-5
-_PROBE_S = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,8 +165,9 @@ def _channels(log: VehicleLog, track: PostureTrack) -> tuple[Channel, ...] | Off
         return OffsetRefusal("the dive has no valid posture; give the offset yourself")
     dive = min(a.time_s[0] for a in tracks), max(a.time_s[-1] for a in tracks)
     span = min(a.time_s[0] for _, _, a in logged), max(a.time_s[-1] for _, _, a in logged)
+    longest_s = 24 * 3600.0
     for what, (begin, end) in (("the dive", dive), (log.name, span)):
-        if end - begin > _LONGEST_S:
+        if end - begin > longest_s:
             return OffsetRefusal(
                 f"{what} covers {(end - begin) / 3600.0:.0f} hours; cut it, or check that its "
                 "times are seconds"
@@ -192,12 +182,13 @@ def _clear_peak(
     channels: tuple[Channel, ...], scores: OffsetScores, where: str
 ) -> float | OffsetRefusal:
     """Return the offset on the grid that is clearly the best."""
-    enough = scores.overlap_s >= _MIN_OVERLAP_S
+    min_overlap_s = 30.0
+    enough = scores.overlap_s >= min_overlap_s
     if not enough.any():
         longest = float(scores.overlap_s.max(initial=0.0))
         return OffsetRefusal(
             f"dive and log share at most {longest:.0f} s with valid posture{where}, and "
-            f"{_MIN_OVERLAP_S:.0f} s are needed; give the offset yourself"
+            f"{min_overlap_s:.0f} s are needed; give the offset yourself"
         )
     peaks = _peaks(scores, enough)
     if not peaks:
@@ -206,7 +197,9 @@ def _clear_peak(
         )
     best, rivals = peaks[0], peaks[1:]
     margin, rival = _margin(channels, best, rivals)
-    if margin >= _MIN_MARGIN:
+    # Least number of standard deviations by which the best offset must exceed all others.
+    min_margin = 2.5
+    if margin >= min_margin:
         return best
     if rival is None:
         return OffsetRefusal(
@@ -232,7 +225,8 @@ def _peaks(scores: OffsetScores, allowed: BoolArray) -> list[float]:
 
     tops, _ = find_peaks(np.pad(height, 1), height=1e-9, distance=round(_LOBE_S / STEP_S))
     ranked = tops[np.argsort(height[tops - 1])[::-1]] - 1
-    return [float(scores.offset_s[i]) for i in ranked[: _N_RIVALS + 1]]
+    n_rivals = 30
+    return [float(scores.offset_s[i]) for i in ranked[: n_rivals + 1]]
 
 
 def _margin(
@@ -272,17 +266,21 @@ def _vote(others: list[FloatArray], chosen: list[FloatArray], scales: list[float
 
 def _blocks(values: FloatArray) -> FloatArray:
     """Return the sums over blocks."""
-    return np.add.reduceat(values, np.arange(0, len(values), round(_BLOCK_S / STEP_S)))
+    # Longer than a motion lasts, so that blocks are independent.
+    block_s = 3.0
+    return np.add.reduceat(values, np.arange(0, len(values), round(block_s / STEP_S)))
 
 
 def _refine(channels: tuple[Channel, ...], start_s: float) -> TimeOffset:
     """Return the offset that fits best by weighted least squares, with its sandwich sigma."""
     offset = start_s
-    for _ in range(_ITERATIONS):
+    iterations = 8
+    converged_s = 1e-5
+    for _ in range(iterations):
         pull, stiffness = _normal_equation(channels, offset, _weights(channels, offset))
         step = float(np.clip(pull.sum() / stiffness.sum(), -_LOBE_S / 4, _LOBE_S / 4))
         offset += step
-        if abs(step) < _CONVERGED_S:
+        if abs(step) < converged_s:
             break
     matches = [match_at(channel, offset) for channel in channels]
     best = max(match.correlation for match in matches)
@@ -293,11 +291,12 @@ def _refine(channels: tuple[Channel, ...], start_s: float) -> TimeOffset:
 def _weights(channels: tuple[Channel, ...], offset_s: float) -> list[FloatArray]:
     """Return Huber's weights of every channel's samples, over the residuals' variance."""
     weights = []
+    huber = 1.5
     for channel in channels:
         match = match_at(channel, offset_s)
         scale = _scale(match)
         size = np.abs(match.residual) / scale
-        weights.append(1.0 / np.maximum(size / _HUBER, 1.0) / scale**2)
+        weights.append(1.0 / np.maximum(size / huber, 1.0) / scale**2)
     return weights
 
 
@@ -329,9 +328,10 @@ def _sigma(channels: tuple[Channel, ...], offset_s: float) -> float:
     pull, stiffness = _normal_equation(channels, offset_s, weights)
     shares = _blocks(stiffness) / stiffness.sum()
     sums = _blocks(pull) / np.maximum(1.0 - shares, 0.1)
-    later, _ = _normal_equation(channels, offset_s + _PROBE_S, weights)
-    earlier, _ = _normal_equation(channels, offset_s - _PROBE_S, weights)
-    fall = float(earlier.sum() - later.sum()) / (2.0 * _PROBE_S)
+    probe_s = 0.1
+    later, _ = _normal_equation(channels, offset_s + probe_s, weights)
+    earlier, _ = _normal_equation(channels, offset_s - probe_s, weights)
+    fall = float(earlier.sum() - later.sum()) / (2.0 * probe_s)
     slope = fall if fall > 0.0 else float(stiffness.sum())
     return math.sqrt(float(sums @ sums)) / slope
 

@@ -26,9 +26,6 @@ from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.vehicle_logs.mavlink_frames import SelectedMessages, Table, read_frames
 from aqualvs.vehicle_logs.vehicle_log import Interpolation, Signal, VehicleLog, bearing_of
 
-_STUCK_SHARE = 0.1
-_DIVED_M = 0.5
-
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
@@ -61,10 +58,12 @@ def choose_depth(
     """
     dived = 0.0 if pressure_depth is None else _span(pressure_depth)
     note = None
+    stuck_share = 0.1
+    dived_m = 0.5
     for candidate in candidates:
         if candidate.depth is None:
             continue
-        if dived > _DIVED_M and _span(candidate.depth) < _STUCK_SHARE * dived:
+        if dived > dived_m and _span(candidate.depth) < stuck_share * dived:
             note = note or (
                 f"{candidate.label} stands still while the pressure changes by {dived:.1f} m of "
                 "water; not used"
@@ -80,12 +79,6 @@ def _span(depth: Signal) -> float:
 
 
 _BOOT = "time_boot_ms"
-_REBOOT_S = 2.0
-_BLOCK_S = 30.0
-"""In this time, a tether delays at least one message by almost nothing."""
-_CLOCK_STEP_S = 1.0
-_UTC_SIGMA_S = 2.0
-"""Clocks set by the network are more accurate than this."""
 _FIRST_BELIEVED = datetime.datetime(1990, 1, 1, tzinfo=datetime.UTC).timestamp()
 
 
@@ -139,7 +132,8 @@ def telemetry_clock(tables: Mapping[str, Table]) -> TelemetryClock:
         return _with_utc(table, received - received[0], none.astype(np.int64), none, ())
     table = max(timed, key=lambda t: len(t.at))
     boot, received = table.payload[_BOOT] / 1e3, table.received_us / 1e6
-    firsts = np.concatenate([[0], 1 + np.flatnonzero(np.diff(boot) < -_REBOOT_S)])
+    reboot_s = 2.0
+    firsts = np.concatenate([[0], 1 + np.flatnonzero(np.diff(boot) < -reboot_s)])
     starts = [-float(boot[0])]
     for before, first, end in zip(firsts, firsts[1:], [*firsts[2:], len(boot)], strict=False):
         # The fastest messages to either side tell how much time passed in between.
@@ -159,13 +153,18 @@ def _with_utc(
 ) -> TelemetryClock:
     """Place log time 0 in UTC by the messages that were received with the least delay."""
     behind = table.received_us / 1e6 - log_s
-    firsts = np.flatnonzero(np.diff(np.floor(log_s / _BLOCK_S), prepend=-np.inf))
+    # In this time, a tether delays at least one message by almost nothing.
+    block_s = 30.0
+    firsts = np.flatnonzero(np.diff(np.floor(log_s / block_s), prepend=-np.inf))
     least = np.minimum.reduceat(behind, firsts)
-    start, sigma = float(np.median(least)), _UTC_SIGMA_S
+    # Clocks set by the network are more accurate than this.
+    utc_sigma_s = 2.0
+    start, sigma = float(np.median(least)), utc_sigma_s
     if start < _FIRST_BELIEVED:
         return TelemetryClock(table.at, log_s, boot_at, boot_s, None, None, notes)
     steps = np.diff(least)
-    large = np.flatnonzero(np.abs(steps) > _CLOCK_STEP_S)
+    clock_step_s = 1.0
+    large = np.flatnonzero(np.abs(steps) > clock_step_s)
     if len(large):
         sigma = max(sigma, float(np.ptp(least)))
         when = log_s[firsts[large[0] + 1]]
@@ -177,9 +176,6 @@ def _with_utc(
     return TelemetryClock(table.at, log_s, boot_at, boot_s, start, sigma, notes)
 
 
-_NO_AUTOPILOT = 8
-_GROUND_STATION = 6
-_ARDUPILOT, _SUBMARINE = 3, 12
 _ARMED = 128
 SUB_MODES = {
     0: "STABILIZE",
@@ -195,8 +191,6 @@ SUB_MODES = {
     21: "SURFTRAK",
 }
 """ArduSub's flight modes (ArduSub/mode.h)."""
-_METRES_PER_HPA = 100.0 / (1025.0 * 9.80665)
-_UNKNOWN_HEADING = 65535
 
 _Tables = Mapping[str, Table]
 _Found = tuple[Signal | None, str]
@@ -250,9 +244,11 @@ def _autopilot(frames: SelectedMessages, path: Path) -> tuple[int, str | None]:
     """Return whose messages to read, and a note where several vehicles speak."""
     beats = frames.tables.get("HEARTBEAT")
     speakers: set[int] = set()
+    no_autopilot = 8
+    ground_station = 6
     if beats is not None:
         kind, autopilot = beats.payload["type"], beats.payload["autopilot"]
-        speakers = set(beats.source[(kind != _GROUND_STATION) & (autopilot != _NO_AUTOPILOT)])
+        speakers = set(beats.source[(kind != ground_station) & (autopilot != no_autopilot)])
     telling = [t.source for name, t in frames.tables.items() if name not in ("HEARTBEAT",)]
     said = np.concatenate(telling) if telling else np.zeros(0, np.int64)
     if not speakers:
@@ -311,7 +307,8 @@ def _depth(tables: _Tables, clock: TelemetryClock) -> tuple[Candidate | None, st
             ("AHRS2", "altitude", -1.0),
         )
     ]
-    pressure = _signal(tables, clock, "SCALED_PRESSURE2", "press_abs", _METRES_PER_HPA)
+    metres_per_hpa = 100.0 / (1025.0 * 9.80665)
+    pressure = _signal(tables, clock, "SCALED_PRESSURE2", "press_abs", metres_per_hpa)
     return choose_depth(candidates, pressure)
 
 
@@ -320,9 +317,10 @@ def _heading(tables: _Tables, clock: TelemetryClock) -> _Found:
     if heading is not None:
         return heading, "ATTITUDE.yaw"
     table = tables.get("GLOBAL_POSITION_INT")
+    unknown_heading = 65535
     if table is not None:
         known = dict(tables)
-        known["GLOBAL_POSITION_INT"] = table[table.payload["hdg"] != _UNKNOWN_HEADING]
+        known["GLOBAL_POSITION_INT"] = table[table.payload["hdg"] != unknown_heading]
         scale = float(np.deg2rad(0.01))
         heading = _signal(known, clock, "GLOBAL_POSITION_INT", "hdg", scale, Interpolation.BEARING)
         if heading is not None:
@@ -354,7 +352,8 @@ def _armed_and_modes(
     armed = (beat["base_mode"] & _ARMED > 0).astype(float)
     number = beat["custom_mode"].astype(np.int64)
     changed = np.flatnonzero(np.diff(number, prepend=-1))
-    is_sub = (beat["autopilot"] == _ARDUPILOT) & (beat["type"] == _SUBMARINE)
+    ardupilot, submarine = 3, 12
+    is_sub = (beat["autopilot"] == ardupilot) & (beat["type"] == submarine)
     modes = tuple((float(times[i]), _mode_name(int(number[i]), bool(is_sub[i]))) for i in changed)
     return Signal.from_samples(times, armed, Interpolation.HELD), modes
 

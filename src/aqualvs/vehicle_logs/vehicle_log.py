@@ -20,10 +20,6 @@ from aqualvs.geometry.arrays import BoolArray, FloatArray
 IndexArray: TypeAlias = NDArray[np.intp]
 
 _TURN = 2.0 * math.pi
-_GAP_STEPS = 4.0
-"""A step this many times the usual one is a gap: single messages get lost all the time."""
-_SHORTEST_GAP_S = 0.5
-"""Within half a second a vehicle under water hardly changes what it does, so no step is a gap."""
 
 
 class Interpolation(StrEnum):
@@ -148,7 +144,11 @@ def usual_gap(time_s: FloatArray) -> float:
     """Return the longest step between increasing times that is not a gap, in seconds."""
     steps = np.diff(time_s)
     usual = float(np.median(steps)) if len(steps) else 0.0
-    return max(_GAP_STEPS * usual, _SHORTEST_GAP_S)
+    # A step this many times the usual one is a gap: single messages get lost all the time.
+    gap_steps = 4.0
+    # Within half a second a vehicle under water hardly changes what it does, so no step is a gap.
+    shortest_gap_s = 0.5
+    return max(gap_steps * usual, shortest_gap_s)
 
 
 def wrap(angle: FloatArray) -> FloatArray:
@@ -296,10 +296,6 @@ def _at(signal: Signal | None, times: FloatArray) -> tuple[FloatArray, BoolArray
     return signal.at(times)
 
 
-# A vertical normal has no bearing.
-_MIN_HORIZONTAL = 0.05
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Places:
     """Vehicle and net in `world` at some dive times; NaN where not valid.
@@ -399,7 +395,9 @@ class VehiclePlaces:
         north, east, down = normal_in_ned.T
         horizontal = np.hypot(north, east)
         seen = posture_valid & state.heading_valid
-        bearing_valid = seen & (horizontal > _MIN_HORIZONTAL)
+        # A vertical normal has no bearing.
+        min_horizontal = 0.05
+        bearing_valid = seen & (horizontal > min_horizontal)
         lean_valid = seen & ~level & (pitch is not None)
         return Places(
             time_s=times,

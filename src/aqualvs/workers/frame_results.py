@@ -115,10 +115,6 @@ def _pick(
 
 T = TypeVar("T")
 
-_MAX_FRAMES = 8
-_MAX_BYTES = 32 << 20
-_TIMEOUT_S = 0.1
-
 
 def block_length(size_px: tuple[int, int]) -> int:
     """Return how many frames make a block: a few, and less than 32 MB.
@@ -127,7 +123,9 @@ def block_length(size_px: tuple[int, int]) -> int:
     the decoder displaces all code from the caches; more than eight gain nothing.
     """
     n_bytes = 3 * size_px[0] * size_px[1] // 2
-    return max(1, min(_MAX_FRAMES, _MAX_BYTES // n_bytes))
+    max_frames = 8
+    max_bytes = 32 << 20
+    return max(1, min(max_frames, max_bytes // n_bytes))
 
 
 def in_blocks(
@@ -166,10 +164,12 @@ def read_ahead(items: Iterator[T]) -> Iterator[T]:
     fetched: queue.Queue[T | _End] = queue.Queue(1)
     given_up = threading.Event()
 
+    timeout_s = 0.1
+
     def put(item: T | _End) -> None:
         while not given_up.is_set():
             with contextlib.suppress(queue.Full):
-                return fetched.put(item, timeout=_TIMEOUT_S)
+                return fetched.put(item, timeout=timeout_s)
         return None
 
     def fetch() -> None:

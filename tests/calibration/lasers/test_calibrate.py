@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 
 from aqualvs.calibration.lasers.calibrate import (
-    LaserCalibration,
     LaserOptions,
     calibrate_lasers,
     fitted,
     leave_one_out,
     posture,
 )
-from aqualvs.calibration.lasers.checks import match_to_rig, named
+from aqualvs.calibration.lasers.checks import LaserCalibration, match_to_rig, named
 from aqualvs.calibration.lasers.solve import InitialGuess, paper_plane, solve_lasers
 from aqualvs.calibration.lasers.stripes_on_planes import board_surface
 from aqualvs.calibration.lasers.views import LaserView, place_views

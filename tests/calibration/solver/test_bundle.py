@@ -7,15 +7,19 @@ import pytest
 
 from aqualvs.calibration.dome.checks import solved_by_offset
 from aqualvs.calibration.dome.problem import DomeOptions, dome_problem
-from aqualvs.calibration.solver.bundle import PRIORS, Bundle, BundleState, TargetView, moved_target
-from aqualvs.calibration.solver.covariance import consider_covariance, observability
-from aqualvs.calibration.solver.least_squares import solve
-from aqualvs.calibration.solver.priors import (
+from aqualvs.calibration.solver.bundle import (
+    PRIORS,
+    Bundle,
+    BundleState,
     KnownDistance,
     SquareBoard,
+    TargetView,
+    moved_target,
     plane_distance,
     rig_difference,
 )
+from aqualvs.calibration.solver.covariance import consider_covariance, observability
+from aqualvs.calibration.solver.least_squares import solve
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig, RigUncertainty, rig_moved_by
 from aqualvs.simulation.scenarios import bluerov2_rig, example_rig

@@ -30,7 +30,6 @@ from fake_ardusub_cases import (
     FRAME_S,
     MARGIN_S,
     STEERED,
-    TIMEOUT_S,
     WITHIN_S,
     Dive,
     Fake,
@@ -43,6 +42,7 @@ from fake_ardusub_cases import (
     until,
     within,
 )
+from waiting import TIMEOUT_S
 
 LAPSE_S = 0.5
 MakeDive = Callable[..., Dive]

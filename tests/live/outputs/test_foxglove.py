@@ -12,6 +12,7 @@ import struct
 import subprocess
 import sys
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -324,7 +325,8 @@ def test_what_the_layout_names_is_in_a_recording(layout, samples, tmp_path):
     for sample in samples:
         recording.write(replace(sample, health=health))
     recording.close()
-    store, found = get_typestore(Stores.EMPTY), {}
+    store = get_typestore(Stores.EMPTY)
+    found: dict[str, Any] = {}
     with Reader(path) as reader:
         for one in reader.connections:
             store.register(get_types_from_msg(one.msgdef.data, one.msgtype))

@@ -99,7 +99,7 @@ def test_jacobian_by_finite_differences(distance: float, pitch: float, yaw: floa
 
 
 def test_covariance_by_monte_carlo() -> None:
-    mean = np.array([0.8, 0.25, -0.4])
+    mean = (0.8, 0.25, -0.4)
     sigma = np.array([0.004, 0.01, 0.015])
     correlation = np.array([[1.0, 0.3, -0.5], [0.3, 1.0, 0.2], [-0.5, 0.2, 1.0]])
     covariance = correlation * np.outer(sigma, sigma)

@@ -9,6 +9,7 @@ corners or uncertain intrinsics.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,7 +22,7 @@ from aqualvs.calibration.camera.problem import (
     fitted_camera,
     with_supported_coefficients,
 )
-from aqualvs.calibration.dome.cross_validation import predicted
+from aqualvs.calibration.dome.problem import predicted
 from aqualvs.calibration.solver.bundle import CORNER_SIGMA_PX, CORNERS, Bundle, BundleState
 from aqualvs.calibration.solver.covariance import (
     ViewCovariance,
@@ -38,14 +39,6 @@ from aqualvs.optics.rig import RigUncertainty
 
 COVERAGE_CELLS = (6, 8)
 """Rows and columns of the coverage grid."""
-_MIN_VIEWS = 3
-_MIN_POINTS = 60
-# Corners noisier than this indicate an error other than noise.
-_MAX_NOISE_PX = 1.0
-# Focal lengths (share) and image centre (share of the width) known worse than this are of no use.
-_MAX_FOCAL_SIGMA, _MAX_CENTRE_SIGMA = 0.01, 0.02
-# Angle between boards below which they count as parallel.
-_PARALLEL = np.deg2rad(5.0)
 
 
 def check_camera_views(views: Sequence[View], size_px: tuple[int, int]) -> None:
@@ -56,15 +49,17 @@ def check_camera_views(views: Sequence[View], size_px: tuple[int, int]) -> None:
     CalibrationError
         With what is given and what is needed.
     """
-    if len(views) < _MIN_VIEWS:
+    min_views = 3
+    if len(views) < min_views:
         raise CalibrationError(
-            f"{len(views)} pictures show the board; the camera needs {_MIN_VIEWS} at least, and "
+            f"{len(views)} pictures show the board; the camera needs {min_views} at least, and "
             "15 to 20 from different sides to be good"
         )
     points = sum(len(view) for view in views)
-    if points < _MIN_POINTS:
+    min_points = 60
+    if points < min_points:
         raise CalibrationError(
-            f"{points} board corners in {len(views)} pictures; the camera needs {_MIN_POINTS} at "
+            f"{points} board corners in {len(views)} pictures; the camera needs {min_points} at "
             "least; show more of the board, or more often"
         )
     for view in views:
@@ -94,7 +89,9 @@ def check_camera_solution(
         With the likely cause and the remedy.
     """
     noise = CORNER_SIGMA_PX * solution.scales[CORNERS]
-    if noise > _MAX_NOISE_PX:
+    # Corners noisier than this indicate an error other than noise.
+    max_noise_px = 1.0
+    if noise > max_noise_px:
         raise CalibrationError(
             f"no camera explains the views: corners are {noise:.2g} px off (0.1 px is usual); "
             "check squares_x, squares_y and the dictionary against the print, that the board is "
@@ -115,19 +112,24 @@ def _check_determined(solution: Solution[BundleState], covariance: FloatArray) -
     centre = float(sigma[2:].max()) / rig.size_px[0]
     normals = np.array([pose.rotation[:, 2] for pose in solution.state.poses])
     lean = float(np.arccos(np.clip(np.abs(normals @ normals.T), 0.0, 1.0).min()))
+    # Angle between boards below which they count as parallel.
+    parallel = np.deg2rad(5.0)
     remedy = (
         f"all boards are parallel within {np.rad2deg(lean):.1f} deg: tilt the board by 20 to 40 "
         "degrees, to different sides"
-        if lean < _PARALLEL
+        if lean < parallel
         else "take more views, with the board tilted by 20 to 40 degrees to different sides, near, "
         "and in all parts of the picture"
     )
-    if not focal < _MAX_FOCAL_SIGMA:
+    # Focal lengths (share) and image centre (share of the width) known worse than this are of no
+    # use.
+    max_focal_sigma, max_centre_sigma = 0.01, 0.02
+    if not focal < max_focal_sigma:
         raise CalibrationError(
             f"the views do not determine the focal length ({100.0 * focal:.2g} % uncertain); "
             f"{remedy}"
         )
-    if not centre < _MAX_CENTRE_SIGMA:
+    if not centre < max_centre_sigma:
         raise CalibrationError(
             f"the views do not determine the image centre ({float(sigma[2:].max()):.2g} px "
             f"uncertain); {remedy}"
@@ -159,18 +161,27 @@ def pixel_grid(size_px: tuple[int, int]) -> FloatArray:
     return np.stack([u.ravel(), v.ravel()], axis=-1)
 
 
-# A view is bad if it is this many times noisier than the typical one, and noisier than this.
-_BAD_VIEW, _BAD_NOISE_PX = 5.0, 0.3
-_MOSTLY_WRONG, _BAD_SHARE = 0.6, 1.0 / 3.0
-# One view out of this number is held out; least number of views and of corners in one for that.
-_FOLDS, _MIN_VIEWS_TO_VALIDATE, _CAMERA_MIN_POINTS = 4, 8, 12
-_MANY_OUTLIERS = 0.05
-_WEAK_PIXEL_PX = 1.0
-_THIN_COVERAGE = 0.6
-# Ratio of the variance by views to that by corners that is reported: sigmas 1.5 times as large.
-_SHARED_ERRORS = 2.25
-# Relative uncertainty of the focal length that is reported: ranges have the same error.
-_WEAK_FOCAL = 0.005
+class _ValidationOptions(NamedTuple):
+    """Cross-validation over the views."""
+
+    # One view out of this number is held out; least number of views and of corners in one for that.
+    folds: int = 4
+    min_views: int = 8
+    min_points: int = 12
+
+
+_VALIDATION = _ValidationOptions()
+
+
+class _FindingLimits(NamedTuple):
+    """Limits from which on a finding is reported."""
+
+    many_outliers: float = 0.05
+    weak_pixel_px: float = 1.0
+    thin_coverage: float = 0.6
+
+
+_LIMITS = _FindingLimits()
 
 
 @dataclass(frozen=True, slots=True)
@@ -302,14 +313,17 @@ def _without_bad_views(
     """Leave out views that fit much worse than the others, and solve again."""
     typical = CORNER_SIGMA_PX * solution.scales[CORNERS]
     bad: dict[int, str] = {}
+    # A view is bad if it is this many times noisier than the typical one, and noisier than this.
+    bad_view, bad_noise_px = 5.0, 0.3
+    mostly_wrong, bad_share = 0.6, 1.0 / 3.0
     for i, target in enumerate(bundle.views):
         noise = CORNER_SIGMA_PX * solution.block_scales[i]
         share = float(np.mean(solution.inliers[i]))
-        if noise > max(_BAD_VIEW * typical, _BAD_NOISE_PX):
+        if noise > max(bad_view * typical, bad_noise_px):
             bad[i] = f"its corners are {noise:.2g} px off, those of other views {typical:.2g} px"
-        elif share < _MOSTLY_WRONG:
+        elif share < mostly_wrong:
             bad[i] = f"only {100.0 * share:.0f} % of its {len(target.view)} corners fit"
-    if not bad or len(bad) > _BAD_SHARE * len(bundle.views):
+    if not bad or len(bad) > bad_share * len(bundle.views):
         return bundle, solution, {}
     keep = [i for i in range(len(bundle.views)) if i not in bad]
     part = _part(bundle, keep)
@@ -372,8 +386,10 @@ def _result(
 def _cross_validation(bundle: Bundle, solution: Solution[BundleState]) -> float:
     n = len(bundle.views)
     believed = [bundle.views[i].view.where(solution.inliers[i]) for i in range(n)]
-    held_out = [i for i in range(1, n, _FOLDS) if len(believed[i]) >= _CAMERA_MIN_POINTS]
-    if n < _MIN_VIEWS_TO_VALIDATE or not held_out:
+    held_out = [
+        i for i in range(1, n, _VALIDATION.folds) if len(believed[i]) >= _VALIDATION.min_points
+    ]
+    if n < _VALIDATION.min_views or not held_out:
         return float("nan")
     rest = [i for i in range(n) if i not in held_out]
     try:
@@ -403,7 +419,7 @@ def _findings(result: CameraCalibration) -> list[str]:
     lines += [f"left out, {name}: {why}" for name, why in result.left_out.items()]
     for fit in result.views:
         wrong = int(np.count_nonzero(~fit.inliers))
-        if wrong > _MANY_OUTLIERS * len(fit.view):
+        if wrong > _LIMITS.many_outliers * len(fit.view):
             lines.append(f"{fit.label}: {wrong} of its {len(fit.view)} corners do not fit")
     return lines + _weak_places(result)
 
@@ -416,7 +432,9 @@ def _shared_errors(result: CameraCalibration) -> list[str]:
             "lowest corner, the same in all views; this bend is solved for. Glue the board to "
             "something stiff before the next step"
         )
-    if result.inflation > _SHARED_ERRORS:
+    # Ratio of the variance by views to that by corners that is reported: sigmas 1.5 times as large.
+    shared_errors = 2.25
+    if result.inflation > shared_errors:
         lines.append(
             "views disagree more than their corners' noise explains: the uncertainties are "
             f"{np.sqrt(result.inflation):.1f} times larger than independent corners would make "
@@ -425,7 +443,9 @@ def _shared_errors(result: CameraCalibration) -> list[str]:
         )
     sigmas, lens = result.uncertainty.sigmas, result.lens
     focal = max(sigmas["fx"] / lens.fx, sigmas["fy"] / lens.fy)
-    if focal > _WEAK_FOCAL:
+    # Relative uncertainty of the focal length that is reported: ranges have the same error.
+    weak_focal = 0.005
+    if focal > weak_focal:
         lines.append(
             f"the focal length is uncertain by {100.0 * focal:.2g} %: take more views, with a "
             "stiff board, tilted by 20 to 40 degrees to different sides, near, and in all parts of "
@@ -437,7 +457,7 @@ def _shared_errors(result: CameraCalibration) -> list[str]:
 def _weak_places(result: CameraCalibration) -> list[str]:
     lines = []
     covered = float(np.mean(result.coverage > 0))
-    if covered < _THIN_COVERAGE:
+    if covered < _LIMITS.thin_coverage:
         lines.append(
             f"corners were seen in {100.0 * covered:.0f} % of the picture; show the board in all "
             "parts of it"
@@ -447,7 +467,7 @@ def _weak_places(result: CameraCalibration) -> list[str]:
     if not np.isfinite(sigma).all():
         lines.append("the distortion model does not reach all corners of the picture")
     worst = int(np.argmax(np.nan_to_num(sigma)))
-    if np.nan_to_num(sigma)[worst] > _WEAK_PIXEL_PX:
+    if np.nan_to_num(sigma)[worst] > _LIMITS.weak_pixel_px:
         u, v = grid[worst]
         lines.append(
             f"at pixel ({u:.0f}, {v:.0f}) the intrinsics are uncertain by {sigma[worst]:.1f} px; "

@@ -42,10 +42,6 @@ BEND_DEGREES = (2, 3)
 """Degrees of a bend's polynomial, each with the terms of those before it."""
 # Exponents of x and y in each term, by degree.
 _TERMS = {2: ((2, 0), (1, 1), (0, 2)), 3: ((3, 0), (2, 1), (1, 2), (0, 3))}
-# Probability that a flat board is taken for bent.
-_CHANCE = 1e-3
-# Views needed beyond the number of terms to estimate their scatter.
-_SPARE_VIEWS = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,7 +190,9 @@ def bend_is_significant(
     """
     bend = BoardBend.flat([target.view for target in bundle.views], degree)
     n, n_terms = len(bundle.views), len(bend.exponents) - n_solved
-    if n < n_terms + _SPARE_VIEWS:
+    # Views needed beyond the number of terms to estimate their scatter.
+    spare_views = 3
+    if n < n_terms + spare_views:
         return False
     problem = _BentBundle(bundle, bend)
     blocks = problem.blocks(_BentState(solution.state, bend.coefficients))
@@ -203,7 +201,9 @@ def bend_is_significant(
     terms, covariance = found.step[-n_terms:], found.by_views[-n_terms:, -n_terms:]
     size = np.sqrt(np.diag(covariance))
     squares = terms / size @ np.linalg.solve(covariance / np.outer(size, size), terms / size)
-    threshold = f_distribution.isf(_CHANCE, n_terms, n - n_terms)
+    # Probability that a flat board is taken for bent.
+    chance = 1e-3
+    threshold = f_distribution.isf(chance, n_terms, n - n_terms)
     return bool(squares / n_terms > threshold)
 
 
@@ -241,10 +241,6 @@ def fit_bend(flat: Bundle, start: BundleState, degree: int) -> BentFit | None:
 # Fields of view, in radians across the picture, that a lens is tried with where OpenCV finds none.
 _FIELDS = tuple(np.deg2rad([30.0, 50.0, 70.0, 95.0]))
 _FISHEYE_FIELDS = tuple(np.deg2rad([60.0, 100.0, 140.0, 180.0]))
-# An initial guess that leaves less than this needs no alternative.
-_GOOD_NOISE_PX = 1.0
-# Share of a coefficient's effect that no other has, below which it adds nothing.
-_REDUNDANT = 1e-7
 # Numbers of coefficients, each with those before it; fisheye lenses have all four or none.
 _STEPS = {LensModel.OPENCV: (4, 5, 8), LensModel.FISHEYE: (4,)}
 
@@ -315,8 +311,10 @@ def gain_of_coefficients(bundle: Bundle, solution: Solution[BundleState], n: int
     slope = gradient[new] - by_old @ gradient[old]
     size = np.sqrt(np.diag(information)[new])
     values, vectors = np.linalg.eigh(left / np.outer(size, size))
+    # Share of a coefficient's effect that no other has, below which it adds nothing.
+    redundant = 1e-7
     # Combinations whose effect others have already are known to rounding only.
-    known = values > _REDUNDANT
+    known = values > redundant
     along = (vectors.T @ (slope / size))[known]
     return float(np.sum(along**2 / values[known]))
 
@@ -349,6 +347,8 @@ def _first_fit(
     views: Sequence[View], size_px: tuple[int, int], model: LensModel, n_coefficients: int
 ) -> tuple[Bundle, Solution[BundleState]]:
     best: tuple[Bundle, Solution[BundleState]] | None = None
+    # An initial guess that leaves less than this needs no alternative.
+    good_noise_px = 1.0
     for lens in _lenses(views, size_px, model, n_coefficients):
         try:
             bundle = _bundle(lens, size_px, views)
@@ -357,7 +357,7 @@ def _first_fit(
             continue
         if best is None or solution.scales[CORNERS] < best[1].scales[CORNERS]:
             best = bundle, solution
-        if CORNER_SIGMA_PX * solution.scales[CORNERS] < _GOOD_NOISE_PX:
+        if CORNER_SIGMA_PX * solution.scales[CORNERS] < good_noise_px:
             break
     if best is None:
         raise CalibrationError(

@@ -22,9 +22,6 @@ from aqualvs.calibration.detection.saddle_corners import GreyImage, SaddleFit, r
 from aqualvs.calibration.targets.targets import Board, aruco_dictionary
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 
-# Widest window of the local threshold, as a share of the picture's width.
-_WIDEST_WINDOW = 0.03
-
 
 @dataclass(frozen=True, slots=True)
 class Markers:
@@ -63,10 +60,12 @@ def read_markers(
         Odd width of the only local threshold; None tries several.
     """
     parameters = cv2.aruco.DetectorParameters()
+    # Widest window of the local threshold, as a share of the picture's width.
+    widest_window = 0.03
     if window_px is not None:
         parameters.adaptiveThreshWinSizeMin = parameters.adaptiveThreshWinSizeMax = window_px
     else:
-        widest = _WIDEST_WINDOW * image.shape[1]
+        widest = widest_window * image.shape[1]
         parameters.adaptiveThreshWinSizeMax = max(parameters.adaptiveThreshWinSizeMax, int(widest))
     markers = aruco_dictionary(dictionary)
     if n_first is not None:
@@ -79,14 +78,6 @@ def read_markers(
     return Markers(
         np.asarray(ids, np.int64).ravel(), np.asarray(corners, np.float64).reshape(-1, 4, 2)
     )
-
-
-# Greatest distance, in squares, of the neighbours that predict a corner.
-_REACH = 2
-# An affine map needs three neighbours; a fourth guards it.
-_MIN_NEIGHBOURS = 4
-# Nearer neighbours get more weight, because the map is affine only locally.
-_FALL = 0.7
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,21 +135,27 @@ def predict(pixels: FloatArray, known: BoolArray) -> PredictedCorners:
         True for known corners; others are ignored, even if NaN.
     """
     rows, columns = known.shape
-    weight = np.pad(known.astype(np.float64), _REACH)
-    values = np.pad(np.where(known[..., None], pixels, 0.0), ((_REACH,) * 2, (_REACH,) * 2, (0, 0)))
+    # Greatest distance, in squares, of the neighbours that predict a corner.
+    reach = 2
+    weight = np.pad(known.astype(np.float64), reach)
+    values = np.pad(np.where(known[..., None], pixels, 0.0), ((reach,) * 2, (reach,) * 2, (0, 0)))
     normal, right = np.zeros((rows, columns, 3, 3)), np.zeros((rows, columns, 3, 2))
     count = np.zeros((rows, columns), dtype=np.int64)
-    for dy in range(-_REACH, _REACH + 1):
-        for dx in range(-_REACH, _REACH + 1):
+    # Nearer neighbours get more weight, because the map is affine only locally.
+    fall = 0.7
+    for dy in range(-reach, reach + 1):
+        for dx in range(-reach, reach + 1):
             if dx == dy == 0:
                 continue
-            here = np.s_[_REACH + dy : _REACH + dy + rows, _REACH + dx : _REACH + dx + columns]
+            here = np.s_[reach + dy : reach + dy + rows, reach + dx : reach + dx + columns]
             basis = np.array([1.0, dx, dy])
-            share = weight[here] * np.exp(-_FALL * (dx * dx + dy * dy))
+            share = weight[here] * np.exp(-fall * (dx * dx + dy * dy))
             normal += share[..., None, None] * np.outer(basis, basis)
             right += share[..., None, None] * (basis[:, None] * values[here][..., None, :])
             count += weight[here] > 0.0
-    valid = (count >= _MIN_NEIGHBOURS) & _spread_both_ways(normal)
+    # An affine map needs three neighbours; a fourth guards it.
+    min_neighbours = 4
+    valid = (count >= min_neighbours) & _spread_both_ways(normal)
     safe = np.where(valid[..., None, None], normal, np.eye(3))
     solution = np.linalg.solve(safe, right)
     found = np.where(valid[..., None], solution[..., 0, :], np.nan)
@@ -196,8 +193,6 @@ def misfits(pixels: FloatArray, known: BoolArray, *, share: float) -> BoolArray:
 # OpenCV's finders look at every pixel; above this size a smaller picture finds the same board.
 _MAX_WIDTH_PX = 1400
 _MISFIT_SHARE = 0.12
-# Share of the corners that must be confirmed by the picture to stop trying finders.
-_ENOUGH = 0.8
 
 _Finder = Callable[[GreyImage, tuple[int, int]], tuple[bool, cv2.typing.MatLike]]
 
@@ -254,11 +249,13 @@ def find_chessboard(image: GreyImage, board: Board) -> CornerGrid:
     and the grid's notes say so.
     """
     best, used = _Attempt(nothing_known(board), first_is_light=False), ""
+    # Share of the corners that must be confirmed by the picture to stop trying finders.
+    enough = 0.8
     for name, rough in _rough_grids(image, board.corner_grid):
         found = _borne_out(image, rough)
         if found.n_known > best.n_known:
             best, used = found, name
-        if best.n_known >= _ENOUGH * board.n_corners:
+        if best.n_known >= enough * board.n_corners:
             break
     if not best.n_known:
         return nothing_known(board)
@@ -360,27 +357,6 @@ def _inside(pixels: FloatArray, image: GreyImage) -> BoolArray:
     return inside
 
 
-# Parts of the picture, about its centre, that are searched for markers in turn.
-_CROPS = (0.25, 0.5, 1.0)
-# Number of agreeing pairs of markers that suffices to find the other corners.
-_ENOUGH_AGREED = 8
-# Window of the local threshold for a quick look at a part, as a share of the picture's width.
-_QUICK_WINDOW = 0.01
-# Markers up to this many squares apart must agree on their offset, to this share of their distance:
-# blur makes them look a seventh too small, and on a tilted board squares grow. An error of one
-# square, as on a board of another pattern, is a third or more.
-_NEIGHBOUR_SQUARES = 3
-_AGREEMENT = 0.25
-# A marker supports the grid if their corners are this near, in sides, and contradicts it beyond
-# the second distance. Most must support it; only a few, misread ones, may contradict it.
-_SUPPORT = 0.25
-_SUPPORTED_SHARE = 0.6
-_CONTRADICTION = 0.5
-_CONTRADICTED_SHARE = 0.05
-# A corner that the picture did not confirm is tried again when more neighbours are known.
-_MAX_TRIES = 3
-
-
 @dataclass(frozen=True, slots=True)
 class Seeds:
     """Corners on which neighbouring markers agree.
@@ -411,13 +387,17 @@ def find_charuco(image: GreyImage, board: Board) -> CornerGrid:
     CornerGrid
         No corner known if no two markers agree on one.
     """
-    quick_px = 2 * max(round(0.5 * _QUICK_WINDOW * image.shape[1]), 1) + 1
+    # Window of the local threshold for a quick look at a part, as a share of the picture's width.
+    quick_window = 0.01
+    quick_px = 2 * max(round(0.5 * quick_window * image.shape[1]), 1) + 1
+    # Number of agreeing pairs of markers that suffices to find the other corners.
+    enough_agreed = 8
     for part, offset in _parts(image):
         window_px = None if part.shape == image.shape else quick_px
         found = read_markers(part, board.dictionary, n_first=board.n_markers, window_px=window_px)
         markers = Markers(found.ids, found.corners + offset)
         seeds = agreed_corners(markers, board)
-        if seeds.n_agreed >= _ENOUGH_AGREED:
+        if seeds.n_agreed >= enough_agreed:
             break
     grid = _grow(image, board, seeds)
     return grid if _supported(grid, markers, board) else nothing_known(board)
@@ -425,7 +405,9 @@ def find_charuco(image: GreyImage, board: Board) -> CornerGrid:
 
 def _parts(image: GreyImage) -> Iterator[tuple[GreyImage, FloatArray]]:
     height, width = image.shape
-    for share in _CROPS:
+    # Parts of the picture, about its centre, that are searched for markers in turn.
+    crops = (0.25, 0.5, 1.0)
+    for share in crops:
         x, y = round(0.5 * (1.0 - share) * width), round(0.5 * (1.0 - share) * height)
         part = np.ascontiguousarray(image[y : height - y, x : width - x])
         yield part, np.array([x, y], dtype=np.float64)
@@ -489,13 +471,18 @@ def _neighbours(
     """Return the masks (K, K) of near markers that agree on their offset, and that do not."""
     step = squares[None, :] - squares[:, None]
     distance = np.max(np.abs(step), axis=-1)
-    near = distance <= _NEIGHBOUR_SQUARES
+    # Markers up to this many squares apart must agree on their offset, to this share of their
+    # distance: blur makes them look a seventh too small, and on a tilted board squares grow. An
+    # error of one square, as on a board of another pattern, is a third or more.
+    neighbour_squares = 3
+    agreement = 0.25
+    near = distance <= neighbour_squares
     np.fill_diagonal(near, val=False)
     mean_axes = 0.5 * (axes[None, :] + axes[:, None])
     expected = np.einsum("ijkl,ijl->ijk", mean_axes, step.astype(np.float64))
     off = np.linalg.norm(centres[None, :] - centres[:, None] - expected, axis=-1)
     side = np.sqrt(np.abs(np.linalg.det(mean_axes)))
-    agree: BoolArray = near & (off < _AGREEMENT * side * distance)
+    agree: BoolArray = near & (off < agreement * side * distance)
     return agree, near & ~agree
 
 
@@ -509,9 +496,11 @@ def _grow(image: GreyImage, board: Board, seeds: Seeds) -> CornerGrid:
     pixels.reshape(-1, 2)[seeds.corners] = fits.pixels
     known.reshape(-1)[seeds.corners] = fits.valid
     known &= ~misfits(pixels, known, share=_MISFIT_SHARE)
+    # A corner that the picture did not confirm is tried again when more neighbours are known.
+    max_tries = 3
     while True:
         expected = predict(pixels, known)
-        new = ~known & expected.valid & (tries < _MAX_TRIES) & _inside(expected.pixels, image)
+        new = ~known & expected.valid & (tries < max_tries) & _inside(expected.pixels, image)
         if not np.any(new):
             break
         tries[new] += 1
@@ -537,13 +526,19 @@ def _supported(grid: CornerGrid, markers: Markers, board: Board) -> bool:
     # NaN, where nothing is expected, is neither near nor far.
     apart = np.linalg.norm(expected[row, column] - pixels, axis=-1)
     share = apart / np.sqrt(np.abs(np.linalg.det(axes)))[:, None]
-    supporting = inside & grid.known[row, column] & (share < _SUPPORT)
-    contradicting = inside & (share > _CONTRADICTION)
+    # A marker supports the grid if their corners are this near, in sides, and contradicts it beyond
+    # the second distance. Most must support it; only a few, misread ones, may contradict it.
+    support = 0.25
+    supported_share = 0.6
+    contradiction = 0.5
+    contradicted_share = 0.05
+    supporting = inside & grid.known[row, column] & (share < support)
+    contradicting = inside & (share > contradiction)
     n_for, n_against = (
         int(np.count_nonzero(np.any(which, axis=1))) for which in (supporting, contradicting)
     )
     n = len(places)
-    return n_for >= _SUPPORTED_SHARE * n and n_against <= max(1.0, _CONTRADICTED_SHARE * n)
+    return n_for >= supported_share * n and n_against <= max(1.0, contradicted_share * n)
 
 
 def _refine(

@@ -25,8 +25,6 @@ from aqualvs.calibration.targets.targets import DICTIONARIES, Board, BoardKind, 
 _ENOUGH = 4
 # The small dictionaries are the first markers of their large ones, ArUco's 36H12 aside.
 _LARGEST = tuple(name for name in DICTIONARIES if not name.endswith(("_50", "_100", "_250")))
-# Difference in the number of squares, each way, that a board file may have by mistake.
-_OTHER_COUNTS = 3
 
 
 def why_no_board(image: GreyImage, board: Board, n_corners: int, min_corners: int) -> str:
@@ -70,7 +68,9 @@ def _other_boards(board: Board) -> Iterator[tuple[Board, str]]:
     if board.squares[1] % 2 == 0:
         other = replace(board, legacy_pattern=not board.legacy_pattern)
         yield other, f"write 'legacy_pattern: {str(other.legacy_pattern).lower()}'"
-    for step in range(-_OTHER_COUNTS, _OTHER_COUNTS + 1):
+    # Difference in the number of squares, each way, that a board file may have by mistake.
+    other_counts = 3
+    for step in range(-other_counts, other_counts + 1):
         n_x = board.squares[0] + step
         if step and n_x >= 3:
             yield _wider(board, n_x), f"it looks as if squares_x were {n_x}"

@@ -13,6 +13,7 @@ Gaussian and the same everywhere; the tones are a level, a contrast and a slope 
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,17 +27,17 @@ MIN_PIVOT = 1e-12
 
 _SQRT_HALF = math.sqrt(0.5)
 _DENSITY_AT_ZERO = 1.0 / math.sqrt(2.0 * math.pi)
-# Beyond this many standard deviations of the blur an edge has its full height.
-_REACH = 4.0
 
 
 @inline_borrowing_kernel
 def blurred_edge(distance: float, blur: float) -> tuple[float, float]:
     """Return the height of a Gaussian edge, 0 to 1, and its derivative by `distance`."""
     t = distance / blur
-    if t > _REACH:
+    # Beyond this many standard deviations of the blur an edge has its full height.
+    reach = 4.0
+    if t > reach:
         return 1.0, 0.0
-    if t < -_REACH:
+    if t < -reach:
         return 0.0, 0.0
     return 0.5 + 0.5 * math.erf(_SQRT_HALF * t), _DENSITY_AT_ZERO * math.exp(-0.5 * t * t) / blur
 
@@ -45,24 +46,28 @@ U8Array = NDArray[np.uint8]
 
 # Unknowns: centre x, y; angles of the edges' normals; log of the blur; level, contrast, slopes.
 _N = 9
-_MAX_ROUNDS = 3
-_MAX_ITERATIONS = 12
-_SETTLED_PX = 4e-3
-_SETTLED_LOG_BLUR = 0.03
-_RECENTRE_PX = 0.6
-_RADIUS_LIMIT_PX = 8.0
-_RADIUS_SHARE = 0.47
-_MIN_RADIUS_PX = 2.4
-# Sine of the angle between the edges below which they no longer cross in a point.
-_MIN_SINE = 0.25
-# Initial guess of the blur, as a share of the square.
-_BLUR_SHARE = 0.06
-_MAX_STEP_PX = 2.0
-_MAX_STEP_ANGLE = 0.2
-_MAX_STEP_LOG_BLUR = 0.5
-_BLUR_PX = (0.25, 6.0)
-# Bits of a marker affect its border up to this many standard deviations of the blur.
-_BITS_REACH = 2.0
+
+
+class _FitOptions(NamedTuple):
+    """Window, steps and convergence of the fit of a corner."""
+
+    max_rounds: int = 3
+    max_iterations: int = 12
+    settled_px: float = 4e-3
+    settled_log_blur: float = 0.03
+    recentre_px: float = 0.6
+    radius_limit_px: float = 8.0
+    radius_share: float = 0.47
+    min_radius_px: float = 2.4
+    # Initial guess of the blur, as a share of the square.
+    blur_share: float = 0.06
+    max_step_px: float = 2.0
+    max_step_angle: float = 0.2
+    max_step_log_blur: float = 0.5
+    blur_px: tuple[float, float] = (0.25, 6.0)
+
+
+_FIT = _FitOptions()
 
 
 # The constants of one window, in this order, as kernels take them.
@@ -107,7 +112,9 @@ def _start(axes: FloatArray, pixel: FloatArray, window: FloatArray, unknowns: Fl
     area = axes[0, 0] * axes[1, 1] - axes[0, 1] * axes[1, 0]
     side_1 = math.hypot(axes[0, 0], axes[1, 0])
     side_2 = math.hypot(axes[0, 1], axes[1, 1])
-    if not abs(area) > _MIN_SINE * side_1 * side_2:
+    # Sine of the angle between the edges below which they no longer cross in a point.
+    min_sine = 0.25
+    if not abs(area) > min_sine * side_1 * side_2:
         return False
     window[_REACH_1], window[_REACH_2] = abs(area) / side_2, abs(area) / side_1
     # The edge along the board's y separates its x: its normal points to +x, the other's to +y.
@@ -116,7 +123,7 @@ def _start(axes: FloatArray, pixel: FloatArray, window: FloatArray, unknowns: Fl
     unknowns[2] = math.atan2(-turn * axes[0, 1], turn * axes[1, 1])
     unknowns[3] = math.atan2(turn * axes[0, 0], -turn * axes[1, 0])
     narrow = min(window[_REACH_1], window[_REACH_2])
-    unknowns[4] = math.log(min(max(_BLUR_SHARE * narrow, 0.7), 2.0))
+    unknowns[4] = math.log(min(max(_FIT.blur_share * narrow, 0.7), 2.0))
     return True
 
 
@@ -127,13 +134,13 @@ def _fit(
     """Fit one corner in vectors[0]; return sigma of a coordinate and the residual's share."""
     best, unit, column = vectors[0], vectors[1], vectors[2]
     rss, count = np.inf, 0
-    for _ in range(_MAX_ROUNDS):
+    for _ in range(_FIT.max_rounds):
         if not _place_window(image, best, window):
             return 0.0, 1.0
         rss, count = _descend(image, window, matrices, vectors)
         if not rss < np.inf:
             return 0.0, 1.0
-        if max(abs(best[0] - window[_X]), abs(best[1] - window[_Y])) < _RECENTRE_PX:
+        if max(abs(best[0] - window[_X]), abs(best[1] - window[_Y])) < _FIT.recentre_px:
             break
     if not best[6] > 0.0 or not factorise(matrices[0], 0.0, MIN_PIVOT, matrices[2]):
         return 0.0, 1.0
@@ -158,10 +165,10 @@ def _place_window(image: U8Array, unknowns: FloatArray, window: FloatArray) -> b
         return False
     x, y = round(unknowns[0]), round(unknowns[1])
     border = min(min(x, width - 1 - x), min(y, height - 1 - y)) + 0.5
-    narrow = _RADIUS_SHARE * min(window[_REACH_1], window[_REACH_2])
+    narrow = _FIT.radius_share * min(window[_REACH_1], window[_REACH_2])
     window[_X], window[_Y] = x, y
-    window[_RADIUS] = min(min(narrow, _RADIUS_LIMIT_PX), border)
-    return bool(window[_RADIUS] >= _MIN_RADIUS_PX)
+    window[_RADIUS] = min(min(narrow, _FIT.radius_limit_px), border)
+    return bool(window[_RADIUS] >= _FIT.min_radius_px)
 
 
 @borrowing_kernel
@@ -176,15 +183,15 @@ def _descend(
     _first_tones(image, window, best)
     rss, count = _sums(image, window, best, matrices[0], gradient, vectors[5])
     damping = 1e-3
-    for _ in range(_MAX_ITERATIONS):
+    for _ in range(_FIT.max_iterations):
         if count < 2 * _N or not factorise(matrices[0], damping, MIN_PIVOT, matrices[2]):
             return np.inf, 0
         solve_factorised(matrices[2], gradient, step)
         _advance(best, step, tried)
         new_rss, _ = _sums(image, window, tried, matrices[1], vectors[3], vectors[5])
         if new_rss <= rss:
-            settled = max(abs(step[0]), abs(step[1])) < _SETTLED_PX
-            settled = settled and abs(step[4]) < _SETTLED_LOG_BLUR
+            settled = max(abs(step[0]), abs(step[1])) < _FIT.settled_px
+            settled = settled and abs(step[4]) < _FIT.settled_log_blur
             rss, damping = new_rss, 0.1 * damping
             _keep(matrices, vectors)
             if settled:
@@ -206,13 +213,13 @@ def _keep(matrices: FloatArray, vectors: FloatArray) -> None:
 @inline_borrowing_kernel
 def _advance(best: FloatArray, step: FloatArray, tried: FloatArray) -> None:
     """Write the next trial; limit it to where the model still sees the edges."""
-    limit = _MAX_STEP_PX / max(_MAX_STEP_PX, math.hypot(step[0], step[1]))
+    limit = _FIT.max_step_px / max(_FIT.max_step_px, math.hypot(step[0], step[1]))
     for i in range(_N):
         tried[i] = best[i] + limit * step[i]
     for i in range(2, 4):
-        tried[i] = best[i] + min(max(step[i], -_MAX_STEP_ANGLE), _MAX_STEP_ANGLE)
-    log_blur = best[4] + min(max(step[4], -_MAX_STEP_LOG_BLUR), _MAX_STEP_LOG_BLUR)
-    tried[4] = min(max(log_blur, math.log(_BLUR_PX[0])), math.log(_BLUR_PX[1]))
+        tried[i] = best[i] + min(max(step[i], -_FIT.max_step_angle), _FIT.max_step_angle)
+    log_blur = best[4] + min(max(step[4], -_FIT.max_step_log_blur), _FIT.max_step_log_blur)
+    tried[4] = min(max(log_blur, math.log(_FIT.blur_px[0])), math.log(_FIT.blur_px[1]))
 
 
 @borrowing_kernel
@@ -289,8 +296,10 @@ def _among_bits(d_1: float, d_2: float, blur: float, window: FloatArray) -> bool
     """Return whether a pixel belongs to, or is blurred with, a marker's bits (not modelled)."""
     if window[_SIGN] * d_1 * d_2 <= 0.0:
         return False
-    u = (abs(d_1) + _BITS_REACH * blur) / window[_REACH_1]
-    v = (abs(d_2) + _BITS_REACH * blur) / window[_REACH_2]
+    # Bits of a marker affect its border up to this many standard deviations of the blur.
+    bits_reach = 2.0
+    u = (abs(d_1) + bits_reach * blur) / window[_REACH_1]
+    v = (abs(d_2) + bits_reach * blur) / window[_REACH_2]
     return bool(min(u, v) > window[_BITS_FROM])
 
 
@@ -326,12 +335,6 @@ def _lightness(
 
 GreyImage = NDArray[np.uint8]
 """A grey picture, shape (height, width)."""
-
-# Limits of an accepted fit: residual as a share of the contrast, turn of either edge, and
-# uncertainty of the crossing.
-_MAX_RESIDUAL_SHARE = 0.15
-_MAX_TURN = np.deg2rad(12.0)
-_MAX_SIGMA_PX = 0.3
 
 
 @dataclass(frozen=True, slots=True)
@@ -406,6 +409,11 @@ def refine_saddles(
     sigma, residual_share, turn, blur = quality.T
     side = np.sqrt(np.min(np.sum(np.square(axes), axis=1), axis=-1, initial=np.inf))
     wander = np.linalg.norm(pixels - starts, axis=1)
-    valid = (sigma > 0.0) & (sigma < _MAX_SIGMA_PX) & (wander <= max_wander * side)
-    valid &= (residual_share < _MAX_RESIDUAL_SHARE) & (turn < _MAX_TURN)
+    # Limits of an accepted fit: residual as a share of the contrast, turn of either edge, and
+    # uncertainty of the crossing.
+    max_residual_share = 0.15
+    max_turn = np.deg2rad(12.0)
+    max_sigma_px = 0.3
+    valid = (sigma > 0.0) & (sigma < max_sigma_px) & (wander <= max_wander * side)
+    valid &= (residual_share < max_residual_share) & (turn < max_turn)
     return SaddleFit(np.where(valid[:, None], pixels, starts), sigma, blur, valid)

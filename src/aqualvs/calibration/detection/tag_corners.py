@@ -17,6 +17,7 @@ Marker coordinates q: (-1, -1) is the top-left corner, (1, 1) the bottom-right o
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -35,8 +36,6 @@ U8Array = NDArray[np.uint8]
 # of the level 18-19 and of the contrast 20-21 along q.
 N_UNKNOWNS = 22
 BLUR, GAMMA, LEVEL, CONTRAST = 14, 15, 16, 17
-# Ratio of the ink's tone to the contrast below which ink is taken as black.
-_MIN_DARKNESS = 0.02
 
 
 @inline_borrowing_kernel
@@ -126,7 +125,9 @@ def _tone(h: float, gamma: float, darkness: float) -> tuple[float, float, float,
     """
     if h <= 0.0 or h >= 1.0:
         return h, 1.0, 0.0, 0.0
-    r = max(darkness, _MIN_DARKNESS)
+    # Ratio of the ink's tone to the contrast below which ink is taken as black.
+    min_darkness = 0.02
+    r = max(darkness, min_darkness)
     log_low, log_high = math.log(r), math.log(1.0 + r)
     low, high = math.exp(gamma * log_low), math.exp(gamma * log_high)
     light = low + h * (high - low)
@@ -135,7 +136,7 @@ def _tone(h: float, gamma: float, darkness: float) -> tuple[float, float, float,
     scale = grey / (gamma * light)
     by_gamma = low * log_low + h * (high * log_high - low * log_low)
     by_r = gamma * (low / r * (1.0 - h) + high / (1.0 + r) * h)
-    tone_by_r = scale * by_r - 1.0 if darkness > _MIN_DARKNESS else 0.0
+    tone_by_r = scale * by_r - 1.0 if darkness > min_darkness else 0.0
     by_log_gamma = scale * by_gamma * gamma - grey * log_light / gamma
     return grey - r, scale * (high - low), by_log_gamma, tone_by_r
 
@@ -296,11 +297,18 @@ def _sums(
     return squares
 
 
-_SETTLED_PX = 5e-3
-_SETTLED_LOG_BLUR = 0.03
-# Steps stay where the model still sees the edges.
-_MAX_STEP_PX = 1.5
-_MAX_STEP_LOG_BLUR = 0.4
+class _DescentOptions(NamedTuple):
+    """Steps of a marker's unknowns, and when they are settled."""
+
+    settled_px: float = 5e-3
+    settled_log_blur: float = 0.03
+    # Steps stay where the model still sees the edges.
+    max_step_px: float = 1.5
+    max_step_log_blur: float = 0.4
+
+
+_DESCENT = _DescentOptions()
+
 _LOG_BLUR = (math.log(0.25), math.log(8.0))
 _LOG_GAMMA = (math.log(0.5), math.log(5.0))
 
@@ -374,7 +382,10 @@ def descend(
         normal[:, :] = new_normal
         gradient[:] = new_gradient
         residuals[:, :] = new_residuals
-        if np.max(np.abs(step[:6])) < _SETTLED_PX and abs(step[BLUR]) < _SETTLED_LOG_BLUR:
+        if (
+            np.max(np.abs(step[:6])) < _DESCENT.settled_px
+            and abs(step[BLUR]) < _DESCENT.settled_log_blur
+        ):
             break
     if not factorise(normal, 0.0, MIN_PIVOT, lower):
         return False
@@ -400,33 +411,37 @@ def _shorten(step: FloatArray, unknowns: FloatArray) -> None:
     """Limit the shift of the marker's points and the change of the blur."""
     side = np.sqrt(abs(unknowns[2] * unknowns[5] - unknowns[3] * unknowns[4])) + 1e-9
     moved = np.max(np.abs(step[:6])) + side * np.max(np.abs(step[6:8]))
-    share = min(1.0, _MAX_STEP_PX / (moved + 1e-12))
-    share = min(share, _MAX_STEP_LOG_BLUR / (abs(step[BLUR]) + 1e-12))
+    share = min(1.0, _DESCENT.max_step_px / (moved + 1e-12))
+    share = min(share, _DESCENT.max_step_log_blur / (abs(step[BLUR]) + 1e-12))
     step *= share
 
 
-# Share of the light ring's cell that counts: a print may be cut off behind it.
-_RING_SHARE = 0.7
+class _FitOptions(NamedTuple):
+    """Fit of a marker's border, and what a good one is."""
+
+    # Share of the light ring's cell that counts: a print may be cut off behind it.
+    ring_share: float = 0.7
+    # Prior standard deviations: bend as a share of the side, log of blur and gamma, slopes of tones
+    # as shares of the contrast.
+    bend_share: float = 0.004
+    slope_share: float = 0.3
+    n_robust_rounds: int = 3
+    n_clean_rounds: int = 2
+    steps: int = 4
+    # Noise of rounding to whole grey levels.
+    min_noise: float = 0.3
+    min_contrast: float = 8.0
+    max_residual_share: float = 0.06
+    min_clean_share: float = 0.4
+    max_sigma_px: float = 0.15
+    max_wander_share: float = 0.1
+
+
+_FIT = _FitOptions()
+
 _CORNERS = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
-# Prior standard deviations: bend as a share of the side, log of blur and gamma, slopes of tones
-# as shares of the contrast.
-_BEND_SHARE = 0.004
 _BLUR = (np.log(0.8), 0.7)
 _GAMMA = (np.log(1.6), 0.5)
-_SLOPE_SHARE = 0.3
-_N_ROBUST_ROUNDS = 3
-_N_CLEAN_ROUNDS = 2
-_STEPS = 4
-# Pixels this many noise scales off, or this share of the contrast, show something else.
-_POLLUTED_SCALES = 4.5
-_POLLUTED_SHARE = 0.08
-# Noise of rounding to whole grey levels.
-_MIN_NOISE = 0.3
-_MIN_CONTRAST = 8.0
-_MAX_RESIDUAL_SHARE = 0.06
-_MIN_CLEAN_SHARE = 0.4
-_MAX_SIGMA_PX = 0.15
-_MAX_WANDER_SHARE = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -468,7 +483,7 @@ def refine_tags(image: GreyImage, ids: IntArray, quads: FloatArray, family: str)
         found = _fit(image, marker_cells(family, int(number)), quad)
         if found is not None:
             pixels[i], sigma[i] = found
-    valid = sigma < _MAX_SIGMA_PX
+    valid = sigma < _FIT.max_sigma_px
     return TagFit(np.where(valid[..., None], pixels, np.nan), sigma, valid)
 
 
@@ -486,7 +501,7 @@ def _fit(
     image: GreyImage, cells: FloatArray, quad: FloatArray
 ) -> tuple[FloatArray, FloatArray] | None:
     """Return the corners (4, 2) and their sigmas (4,); None if the marker does not fit."""
-    reach = 1.0 + 2.0 * _RING_SHARE / (len(cells) - 2)
+    reach = 1.0 + 2.0 * _FIT.ring_share / (len(cells) - 2)
     corner, shape = _window(image, quad, reach)
     unknowns = _start(image, cells, quad)
     if unknowns is None:
@@ -495,10 +510,10 @@ def _fit(
     weights, residuals = np.ones(shape), np.empty(shape)
     covariance = np.empty((N_UNKNOWNS, N_UNKNOWNS))
     noise = 0.05 * unknowns[CONTRAST]
-    for i in range(_N_ROBUST_ROUNDS + _N_CLEAN_ROUNDS):
+    for i in range(_FIT.n_robust_rounds + _FIT.n_clean_rounds):
         prior = _prior(side, unknowns[CONTRAST], noise)
         # Half of the pixels suffice to find polluted ones; all of them place the corners.
-        every = 2 if i < _N_ROBUST_ROUNDS else 1
+        every = 2 if i < _FIT.n_robust_rounds else 1
         if not descend(
             image,
             corner,
@@ -509,23 +524,23 @@ def _fit(
             unknowns,
             residuals,
             covariance,
-            _STEPS,
+            _FIT.steps,
             every,
         ):
             return None
-        if not unknowns[CONTRAST] > _MIN_CONTRAST:
+        if not unknowns[CONTRAST] > _FIT.min_contrast:
             return None
-        robust = i < _N_ROBUST_ROUNDS - 1
+        robust = i < _FIT.n_robust_rounds - 1
         last_weights = weights
         weights, noise = _weigh(residuals, float(unknowns[CONTRAST]), robust)
     clean = last_weights > 0.0
     seen = np.isfinite(residuals)
-    if np.count_nonzero(clean & seen) < _MIN_CLEAN_SHARE * np.count_nonzero(seen):
+    if np.count_nonzero(clean & seen) < _FIT.min_clean_share * np.count_nonzero(seen):
         return None
     rms = float(np.sqrt(np.mean(np.square(residuals[clean & seen]))))
-    if rms > _MAX_RESIDUAL_SHARE * unknowns[CONTRAST] + 1.0:
+    if rms > _FIT.max_residual_share * unknowns[CONTRAST] + 1.0:
         return None
-    return _corners(unknowns, covariance * max(rms, _MIN_NOISE) ** 2, quad, side)
+    return _corners(unknowns, covariance * max(rms, _FIT.min_noise) ** 2, quad, side)
 
 
 def _window(image: GreyImage, quad: FloatArray, reach: float) -> tuple[FloatArray, tuple[int, int]]:
@@ -561,17 +576,17 @@ def _start(image: GreyImage, cells: FloatArray, quad: FloatArray) -> FloatArray 
     # Medians: a stripe covers fewer than half of the cells.
     unknowns[LEVEL] = np.median(tones[~light])
     unknowns[CONTRAST] = np.median(tones[light]) - unknowns[LEVEL]
-    return unknowns if unknowns[CONTRAST] > _MIN_CONTRAST else None
+    return unknowns if unknowns[CONTRAST] > _FIT.min_contrast else None
 
 
 def _prior(side: float, contrast: float, noise: float) -> FloatArray:
     """Return the prior means of the unknowns and their weights (2, 22), for a given noise."""
     mean, spread = np.zeros(N_UNKNOWNS), np.full(N_UNKNOWNS, np.inf)
     spread[6:8] = 0.5
-    spread[8:14] = _BEND_SHARE * side
+    spread[8:14] = _FIT.bend_share * side
     mean[BLUR], spread[BLUR] = _BLUR
     mean[GAMMA], spread[GAMMA] = _GAMMA
-    spread[18:] = _SLOPE_SHARE * contrast
+    spread[18:] = _FIT.slope_share * contrast
     return np.stack([mean, np.square(noise / spread)])
 
 
@@ -581,9 +596,12 @@ def _weigh(residuals: FloatArray, contrast: float, robust: bool) -> tuple[FloatA
     The surroundings of polluted pixels are left out as well: the faint flank of a stripe biases.
     """
     size = np.abs(residuals)
-    noise = max(1.4826 * float(np.nanmedian(size)), _MIN_NOISE)
+    noise = max(1.4826 * float(np.nanmedian(size)), _FIT.min_noise)
     size = np.nan_to_num(size)
-    limit = max(_POLLUTED_SCALES * noise, _POLLUTED_SHARE * contrast)
+    # Pixels this many noise scales off, or this share of the contrast, show something else.
+    polluted_scales = 4.5
+    polluted_share = 0.08
+    limit = max(polluted_scales * noise, polluted_share * contrast)
     if robust:
         return np.square(1.0 / (1.0 + np.square(size / limit))), noise
     polluted = (size > limit).astype(np.uint8)
@@ -599,7 +617,7 @@ def _corners(
         by = _by_unknowns(unknowns, q_0, q_1)
         sigma[i] = np.sqrt(0.5 * np.trace(by @ covariance @ by.T))
     wander = np.linalg.norm(pixels - quad, axis=1)
-    sigma[wander > _MAX_WANDER_SHARE * 2.0 * side + 1.0] = np.inf
+    sigma[wander > _FIT.max_wander_share * 2.0 * side + 1.0] = np.inf
     return pixels, sigma
 
 

@@ -10,6 +10,7 @@ same solve finds its distance from the lens and its tilt.
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,7 +24,6 @@ from aqualvs.calibration.dome.checks import (
     noise_px,
     solved_by_offset,
 )
-from aqualvs.calibration.dome.cross_validation import compare_with_bare_lens
 from aqualvs.calibration.dome.problem import (
     LENS,
     ROTATION,
@@ -32,15 +32,20 @@ from aqualvs.calibration.dome.problem import (
     DomeProblem,
     PoseKind,
     check_sets,
+    compare_with_bare_lens,
     dome_problem,
     initial_rigs,
     place_names,
     with_board_tilt_as_found,
 )
-from aqualvs.calibration.solver.bundle import CORNER_SIGMA_PX, BundleState
+from aqualvs.calibration.solver.bundle import (
+    CORNER_SIGMA_PX,
+    BundleState,
+    rig_difference,
+    rig_numbers,
+)
 from aqualvs.calibration.solver.covariance import Observability, consider_covariance, observability
 from aqualvs.calibration.solver.least_squares import Solution, solve
-from aqualvs.calibration.solver.priors import rig_difference, rig_numbers
 from aqualvs.calibration.solver.result import (
     CrossValidation,
     DomeCalibration,
@@ -69,11 +74,20 @@ _WORDS = {
     "rotation_y": "rotation about y",
     "rotation_z": "rotation about z",
 }
-# Ratios of sigma to the prior's sigma: from the first on nothing was learnt, below the second
-# something.
-_NOTHING, _SOMETHING = 0.9, 0.5
-_CORRELATED = 0.95
-_FAR_FROM_PRIOR = 3.5
+
+
+class _FindingLimits(NamedTuple):
+    """Limits from which on a finding is reported."""
+
+    # Ratios of sigma to the prior's sigma: from the first on nothing was learnt, below the second
+    # something.
+    nothing: float = 0.9
+    something: float = 0.5
+    correlated: float = 0.95
+    far_from_prior: float = 3.5
+
+
+_LIMITS = _FindingLimits()
 
 
 def findings(
@@ -138,8 +152,8 @@ def _rotation(problem: DomeProblem, result: DomeCalibration) -> str:
 
 def _dome(names: Sequence[str], result: DomeCalibration, seen: Observability) -> list[str]:
     lines = []
-    nothing = seen.undetermined(names, _NOTHING)
-    some = [n for n in seen.undetermined(names, _SOMETHING) if n not in nothing]
+    nothing = seen.undetermined(names, _LIMITS.nothing)
+    some = [n for n in seen.undetermined(names, _LIMITS.something) if n not in nothing]
     rest = [n for n in names if n in seen.shrinkage and n not in nothing and n not in some]
     for group, what in (
         (nothing, "not determined by the pictures, taken as given"),
@@ -196,7 +210,7 @@ def _entangled(result: DomeCalibration) -> list[str]:
     sigma = np.sqrt(np.diag(uncertainty.covariance))
     with np.errstate(divide="ignore", invalid="ignore"):
         correlation = uncertainty.covariance / np.outer(sigma, sigma)
-    worst, pair, place = _CORRELATED, None, place_names(result.rig)
+    worst, pair, place = _LIMITS.correlated, None, place_names(result.rig)
     for i, name in enumerate(uncertainty.names):
         for j, other in enumerate(uncertainty.names):
             if name in place and other not in place and abs(correlation[i, j]) > worst:
@@ -229,7 +243,7 @@ def _against_priors(problem: DomeProblem, solution: Solution[BundleState]) -> li
         f"{_WORDS.get(name, name)}: moved by {abs(value):.1f} sigma of what was known of it; check "
         "that figure"
         for name, value in off.items()
-        if abs(value) > _FAR_FROM_PRIOR
+        if abs(value) > _LIMITS.far_from_prior
     ]
 
 
@@ -246,13 +260,16 @@ def _cross_validation(found: CrossValidation | None, what: str) -> list[str]:
     return [f"{text}: the pictures do not show that there is a {what}"]
 
 
-# A solve with smaller residuals has found the minimum; one with larger ones may be in another.
-_GOOD_NOISE_PX = 0.5
-# A view is bad if it is this many times noisier than the typical one, and noisier than this.
-_BAD_VIEW, _BAD_NOISE_PX = 5.0, 0.5
-_BAD_SHARE = 1.0 / 3.0
-# A given distance with an error of this many sigmas is a mistake.
-_WRONG_DISTANCE = 5.0
+class _BadViews(NamedTuple):
+    """Views that are left out, and how many may be."""
+
+    # A view is bad if it is this many times noisier than the typical one, and noisier than this.
+    times_typical: float = 5.0
+    noise_px: float = 0.5
+    max_share: float = 1.0 / 3.0
+
+
+_BAD = _BadViews()
 
 
 def dome(
@@ -311,6 +328,8 @@ def _solved(
     """Solve from the rig's lens position, or else from the dome's centre."""
     best: tuple[DomeProblem, Solution[BundleState]] | None = None
     trouble: list[CalibrationError | RigError] = []
+    # A solve with smaller residuals has found the minimum; one with larger ones may be in another.
+    good_noise_px = 0.5
     for start in initial_rigs(rig):
         try:
             problem = dome_problem(start, sets, known, options)
@@ -325,7 +344,7 @@ def _solved(
             continue
         if best is None or noise_px(solution) < noise_px(best[1]):
             best = problem, solution
-        if solution.converged and noise_px(solution) < _GOOD_NOISE_PX:
+        if solution.converged and noise_px(solution) < good_noise_px:
             break
     if best is None:
         raise trouble[0]
@@ -340,12 +359,12 @@ def _without_bad_views(
     noise = CORNER_SIGMA_PX * np.array(solution.block_scales[:n])
     typical = noise_px(solution)
     bad = {}
-    for i in np.flatnonzero((noise > _BAD_VIEW * typical) & (noise > _BAD_NOISE_PX)):
+    for i in np.flatnonzero((noise > _BAD.times_typical * typical) & (noise > _BAD.noise_px)):
         bad[int(i)] = (
             f"its corners are {noise[i]:.2g} px off, those of other views {typical:.2g} px; wrong "
             "pose, bent board or blurred picture?"
         )
-    if not bad or len(bad) > _BAD_SHARE * n:
+    if not bad or len(bad) > _BAD.max_share * n:
         return problem, solution
     return _again(problem.without(bad), solution, [i for i in range(n) if i not in bad])
 
@@ -361,7 +380,7 @@ def _without_wrong_distances(
         wrong = _wrong_distances(free, solve(free.bundle, solution.state))
     if not wrong:
         return problem, solution
-    if len(wrong) > _BAD_SHARE * len(problem.measured_views):
+    if len(wrong) > _BAD.max_share * len(problem.measured_views):
         raise contradicted_distances(problem, solution, sets)
     reasons = {
         f"distance of {problem.shots[i].label}": (
@@ -376,7 +395,9 @@ def _without_wrong_distances(
 
 def _wrong_distances(problem: DomeProblem, solution: Solution[BundleState]) -> list[int]:
     off = distance_blocks(problem, solution)
-    return [i for i, block in off.items() if block.lengths[0] > _WRONG_DISTANCE]
+    # A given distance with an error of this many sigmas is a mistake.
+    wrong_distance = 5.0
+    return [i for i, block in off.items() if block.lengths[0] > wrong_distance]
 
 
 def _again(

@@ -10,11 +10,20 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum, auto
+from typing import NamedTuple
 
 import numpy as np
 
 from aqualvs.calibration.dome.problem import BoardSet, DomeProblem, PoseKind, place_names
-from aqualvs.calibration.solver.bundle import CORNER_SIGMA_PX, CORNERS, PRIORS, Bundle, BundleState
+from aqualvs.calibration.solver.bundle import (
+    CORNER_SIGMA_PX,
+    CORNERS,
+    DISTANCES,
+    PRIORS,
+    Bundle,
+    BundleState,
+    plane_distance,
+)
 from aqualvs.calibration.solver.covariance import (
     all_alike,
     implausible_distance,
@@ -30,22 +39,26 @@ from aqualvs.calibration.solver.least_squares import (
     normal_equations,
     solve,
 )
-from aqualvs.calibration.solver.priors import DISTANCES, plane_distance
 from aqualvs.errors import CalibrationError, RigError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.optics.rig import RigUncertainty
 
-# An index this many sigmas from the stated one contradicts it.
-_SURE = 5.0
+
+class _MediumOptions(NamedTuple):
+    """Test whether the boards were in the medium that is stated."""
+
+    # An index this many sigmas from the stated one contradicts it.
+    sure: float = 5.0
+    # Between air and water.
+    halfway: float = 1.15
+    air: float = 1.0003
+    water: float = 1.3335
+
+
+_MEDIUM = _MediumOptions()
+
 MAX_NOISE_PX = 1.0
 """Corners noisier than this indicate an error other than noise."""
-# Differences that are refused, and that are reported.
-_WRONG, _WORTH_SAYING = 0.02, 0.003
-# Between air and water.
-_HALFWAY = 1.15
-_AIR, _WATER = 1.0003, 1.3335
-# With a larger uncertainty than this, an index near the stated one may be that of the other medium.
-_VAGUE = 0.03
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,13 +126,13 @@ def in_other_medium(problem: DomeProblem, medium: int) -> Solution[BundleState] 
 
 def other_medium(n: float) -> float:
     """Return the index of water for air, and of air for water."""
-    return _WATER if n < _HALFWAY else _AIR
+    return _MEDIUM.water if n < _MEDIUM.halfway else _MEDIUM.air
 
 
 def wrong_medium(one: BoardSet, index: float) -> CalibrationError:
     """Return the message on pictures that were taken in another medium than stated."""
-    crossed = (index < _HALFWAY) != (one.n_medium < _HALFWAY)
-    taken = "in air" if index < _HALFWAY else "in water"
+    crossed = (index < _MEDIUM.halfway) != (one.n_medium < _MEDIUM.halfway)
+    taken = "in air" if index < _MEDIUM.halfway else "in water"
     remedy = (
         f"were they taken {taken}?"
         if crossed
@@ -149,9 +162,12 @@ def _suspicion(
     problem: DomeProblem, solution: Solution[BundleState], medium: int, one: BoardSet
 ) -> _Suspicion:
     near = _nearby(_freed(problem.bundle, medium), solution, medium, one.n_medium)
-    if near.sigma > _VAGUE or noise_px(solution) > MAX_NOISE_PX:
+    # With a larger uncertainty than this, an index near the stated one may be that of the other
+    # medium.
+    vague = 0.03
+    if near.sigma > vague or noise_px(solution) > MAX_NOISE_PX:
         return _Suspicion.OTHER
-    far = abs(near.n - one.n_medium) > _SURE * near.sigma
+    far = abs(near.n - one.n_medium) > _MEDIUM.sure * near.sigma
     return _Suspicion.NEARBY if far else _Suspicion.NONE
 
 
@@ -188,10 +204,12 @@ def _weighed_against_best(
     column = int(free.medium_columns(medium)[0])
     n, sigma = float(best.state.media[medium]), float(np.sqrt(best.covariance[column, column]))
     off = abs(n - one.n_medium)
-    sure = off > _SURE * float(np.hypot(sigma, one.sigma_medium))
-    if not sure or off < _WORTH_SAYING or _gain(solution, best) < 0.5 * _SURE**2:
+    sure = off > _MEDIUM.sure * float(np.hypot(sigma, one.sigma_medium))
+    # Differences that are refused, and that are reported.
+    wrong, worth_saying = 0.02, 0.003
+    if not sure or off < worth_saying or _gain(solution, best) < 0.5 * _MEDIUM.sure**2:
         return []
-    if off > _WRONG:
+    if off > wrong:
         raise wrong_medium(one, n)
     return [
         f"{one.name}: the pictures fit n = {n:.4f} ± {sigma:.4f} rather than {one.n_medium:.4f}; "
@@ -208,9 +226,9 @@ def _weighed_against_other(
         return []
     gain = _gain(solution, rival)
     n = other_medium(one.n_medium)
-    if gain > 0.5 * _SURE**2:
+    if gain > 0.5 * _MEDIUM.sure**2:
         raise wrong_medium(one, n)
-    if gain > -0.5 * _SURE**2:
+    if gain > -0.5 * _MEDIUM.sure**2:
         return [
             f"{one.name}: the pictures do not tell n = {one.n_medium:.4f} from {n:.4f}; the lens "
             "position rests on the medium being the stated one"
@@ -228,13 +246,6 @@ def _gain(solution: Solution[BundleState], rival: Solution[BundleState]) -> floa
     both = [a & b for a, b in inliers]
     own, its = (cost(s.blocks[:n], both, scales, 0.0) for s in (solution, rival))
     return own - its
-
-
-_CHECK_SURE = 3.5
-# Shared errors beyond these (metres, share) are refused; smaller ones are reported.
-_MAX_OFFSET, _MAX_SCALE = 1e-3, 0.005
-# Index of the shift along y in a step of a pose.
-_SHIFT_Y = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -285,21 +296,24 @@ def check_shared_errors(
     given = {i: problem.given_distance(i) for i in blocks}
     offset = _shared_error(covariance, blocks, dict.fromkeys(blocks, 1.0))
     scale = _shared_error(covariance, blocks, given)
-    if max(offset.sigmas, scale.sigmas) < _CHECK_SURE:
+    check_sure = 3.5
+    if max(offset.sigmas, scale.sigmas) < check_sure:
         return []
+    # Shared errors beyond these (metres, share) are refused; smaller ones are reported.
+    max_offset, max_scale = 1e-3, 0.005
     if offset.sigmas >= scale.sigmas:
         text = (
             f"all given distances are {1e3 * offset.value:+.2f} ± {1e3 * offset.sigma:.2f} mm off "
             "together; they count from the dome's centre along its y axis, not from its front or "
             "from the lens"
         )
-        fatal = abs(offset.value) > _MAX_OFFSET
+        fatal = abs(offset.value) > max_offset
     else:
         text = (
             f"all given distances are {100.0 * scale.value:+.2f} ± {100.0 * scale.sigma:.2f} % off "
             "together, measured in the board's squares; measure the squares, and check the medium"
         )
-        fatal = abs(scale.value) > _MAX_SCALE
+        fatal = abs(scale.value) > max_scale
     if fatal:
         raise CalibrationError(text)
     return [text]
@@ -335,28 +349,20 @@ def _slopes(
 ) -> tuple[FloatArray, float, float]:
     """Return cross information with the solved numbers, own information, and minus the gradient."""
     slopes, own, gradient = np.zeros(n_parameters), 0.0, 0.0
+    # Index of the shift along y in a step of a pose.
+    shift_y = 4
     for i, block in blocks.items():
         weight = float(block.loss.weight(block.lengths)[0])
         # A given distance that is too large acts as a shift of the board along y.
-        by_error = shape[i] * float(block.jacobian[0, 0, _SHIFT_Y])
+        by_error = shape[i] * float(block.jacobian[0, 0, shift_y])
         slopes[block.columns] += weight * by_error * block.jacobian[0, 0]
         own += weight * by_error**2
         gradient -= weight * by_error * float(block.residuals[0, 0])
     return slopes, own, gradient
 
 
-# A lens this near the inner surface (in radii) was stopped by that limit.
-_AT_THE_WALL = 0.995
-# Uncertainty of the lens position (metres) that makes an error of 0.4 % of range.
-_MAX_LENS_SIGMA = 2e-3
 # Differences of scale that are too large for errors of boards and rails.
 _FINE_SCALE, _EXACT_SCALE = 0.003, 0.02
-# Larger limit before the solve: a wrong medium or lens position may look like a wrong scale.
-_COARSE_SCALE = 0.5
-# Ratios of lengths with less scatter than this show one wrong scale.
-_SAME_RATIO = 0.05
-# Distance from the image's centre, in its sizes, beyond which a board counts as not seen.
-_SURELY_SEEN = 2.0
 # Typical residual of distances, in sigmas, that agree with a solution.
 _FITTING_DISTANCE = 1.5
 _POSE_RULES = (
@@ -387,11 +393,13 @@ def check_initial_guess(problem: DomeProblem) -> None:
             "the end of the working range"
         )
     boards = [i for i, shot in enumerate(problem.shots) if shot.kind is PoseKind.DISTANCE]
+    # Larger limit before the solve: a wrong medium or lens position may look like a wrong scale.
+    coarse_scale = 0.5
     if boards:
         given = np.array([problem.given_distance(i) for i in boards])
         found = np.array([plane_distance(views[i].dome_from_target) for i in boards])
         _refuse_if(_sign_fault(given))
-        _refuse_if(scale_fault(length_ratio(given, found), _COARSE_SCALE))
+        _refuse_if(scale_fault(length_ratio(given, found), coarse_scale))
 
 
 def _check_seen(problem: DomeProblem) -> None:
@@ -399,13 +407,15 @@ def _check_seen(problem: DomeProblem) -> None:
     bundle = problem.bundle
     fixed = [i for i, view in enumerate(bundle.views) if view.fixed]
     unseen = []
+    # Distance from the image's centre, in its sizes, beyond which a board counts as not seen.
+    surely_seen = 2.0
     for i in fixed:
         view = bundle.views[i]
         camera = bundle.start.camera(view.medium)
         pixels, _ = camera.project(view.dome_from_target.apply(view.view.points))
         # Far outside the picture counts as not seen; NaN compares false.
         off_centre = np.abs(pixels / camera.size_px - 0.5).max(axis=1)
-        if np.mean(off_centre < _SURELY_SEEN) < 0.5:
+        if np.mean(off_centre < surely_seen) < 0.5:
             unseen.append(i)
     if len(unseen) > 0.5 * len(fixed):
         raise CalibrationError(
@@ -488,23 +498,27 @@ def _check_lens(
     problem: DomeProblem, solution: Solution[BundleState], uncertainty: RigUncertainty
 ) -> None:
     rig = solution.state.rig
+    # Uncertainty of the lens position (metres) that makes an error of 0.4 % of range.
+    max_lens_sigma = 2e-3
     if rig.flat_port is not None:
         sigma = uncertainty.sigmas["port_distance"]
-        if sigma > _MAX_LENS_SIGMA:
+        if sigma > max_lens_sigma:
             raise CalibrationError(
                 f"the pictures do not tell how far the port is from the lens: {1e3 * sigma:.1f} mm "
                 "uncertain; show more views in water, some near, with corners all over the picture"
             )
         return
     lens = rig.dome_from_cam.translation
-    if rig.dome is not None and np.linalg.norm(lens) > _AT_THE_WALL * rig.dome.inner_radius:
+    # A lens this near the inner surface (in radii) was stopped by that limit.
+    at_the_wall = 0.995
+    if rig.dome is not None and np.linalg.norm(lens) > at_the_wall * rig.dome.inner_radius:
         raise CalibrationError(
             f"the lens ends at the dome's wall, at {np.round(1e3 * lens, 1).tolist()} mm; check "
             "the dome's inner radius, the board's square_mm, the given distances and the medium"
         )
     values, vectors = np.linalg.eigh(uncertainty.of(place_names(rig)))
     sigma, axis = float(np.sqrt(values[-1])), vectors[:, -1] * np.sign(vectors[:, -1].sum())
-    if sigma > _MAX_LENS_SIGMA:
+    if sigma > max_lens_sigma:
         raise CalibrationError(
             f"the pictures do not tell where the lens is: {1e3 * sigma:.1f} mm uncertain along "
             f"{np.round(axis, 1).tolist()}; {_remedy(problem)}"
@@ -535,7 +549,9 @@ def _exact_pose_fault(problem: DomeProblem, solution: Solution[BundleState]) -> 
         return None
     ratios = np.array(found) / np.array(given)
     ratio = float(np.median(ratios))
-    one_scale = float(np.median(np.abs(ratios / ratio - 1.0))) < _SAME_RATIO
+    # Ratios of lengths with less scatter than this show one wrong scale.
+    same_ratio = 0.05
+    one_scale = float(np.median(np.abs(ratios / ratio - 1.0))) < same_ratio
     fault = scale_fault(ratio, _EXACT_SCALE) if one_scale else None
     return fault or f"the given poses contradict the pictures; {_POSE_RULES}"
 

@@ -9,6 +9,9 @@ The input is sets of views of boards, each set in one medium, and options (`Boar
 Prior of the boards' tilt: most boards of a rail stand square, some lean by a degree or more. How
 closely the good ones agree is not known beforehand. It is estimated by maximum likelihood, over a
 ladder of scales (`with_board_tilt_as_found`).
+
+Cross-validation: the dome's prediction of unused corners against that of a bare lens
+(`compare_with_bare_lens`).
 """
 
 from collections.abc import Iterator, Sequence
@@ -18,27 +21,31 @@ from typing import Protocol
 
 import numpy as np
 
-from aqualvs.calibration.solver.bundle import Bundle, BundleState, PoseTerm, TargetView
+from aqualvs.calibration.solver.bundle import (
+    TILTS,
+    Bundle,
+    BundleState,
+    KnownDistance,
+    PoseTerm,
+    SquareBoard,
+    TargetView,
+)
 from aqualvs.calibration.solver.covariance import implausible_distance
 from aqualvs.calibration.solver.initial_pose import (
     StartPose,
     square_rotation,
     start_pose,
+    target_pose,
     turned_square,
 )
 from aqualvs.calibration.solver.least_squares import Solution, solve
-from aqualvs.calibration.solver.priors import TILTS, KnownDistance, SquareBoard
+from aqualvs.calibration.solver.result import CrossValidation, rms_px
 from aqualvs.calibration.targets.targets import View
 from aqualvs.errors import CalibrationError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.transforms import SE3
 from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import Rig, RigUncertainty, combined
-
-_MIN_VIEWS = 3
-_MIN_POINTS = 60
-# Indices on both sides of a port that differ by less tell nothing of its place.
-_BENDING = 0.01
 
 
 class GivenPose(Protocol):
@@ -164,16 +171,18 @@ def check_sets(rig: Rig, sets: Sequence[BoardSet]) -> None:
     exact = any(
         kind_of(one.given(i)) is PoseKind.EXACT for one in sets for i in range(len(one.views))
     )
-    needed = 1 if exact else _MIN_VIEWS
+    min_views = 3
+    needed = 1 if exact else min_views
     if len(views) < needed:
         raise CalibrationError(
             f"{len(views)} pictures show the board; the dome needs {needed} at least, and 10 to 15 "
             "at distances all over the working range to be good"
         )
     points = sum(len(view) for view in views)
-    if points < _MIN_POINTS:
+    min_points = 60
+    if points < min_points:
         raise CalibrationError(
-            f"{points} board corners in {len(views)} pictures; the dome needs {_MIN_POINTS} at "
+            f"{points} board corners in {len(views)} pictures; the dome needs {min_points} at "
             "least; show more of the board, or more often"
         )
 
@@ -184,7 +193,9 @@ def _check_flat(rig: Rig, sets: Sequence[BoardSet]) -> None:
             f"rig {rig.name} has a flat port, whose place does not depend on the boards' poses; "
             "leave the poses out"
         )
-    if all(abs(one.n_medium - rig.n_air) < _BENDING for one in sets):
+    # Indices on both sides of a port that differ by less tell nothing of its place.
+    bending = 0.01
+    if all(abs(one.n_medium - rig.n_air) < bending for one in sets):
         raise CalibrationError(
             "all pictures were taken in air, where a flat port looks the same at any distance; "
             "take some with the port in water"
@@ -199,10 +210,6 @@ ROTATION = ("rotation_x", "rotation_y", "rotation_z")
 def place_names(rig: Rig) -> tuple[str, ...]:
     """Return the names of the numbers that say where lens and housing are to each other."""
     return LENS if rig.flat_port is None else PORT
-
-
-# For every lens position, poses of the right board are nearer than this.
-_MAX_MISFIT_PX = 30.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -383,7 +390,9 @@ def _started(rig: Rig, sets: Sequence[BoardSet]) -> tuple[list[Shot], list[SE3],
         misfits.append(start.median_px)
     if not shots:
         raise CalibrationError(_why_none(rig, sets) or next(iter(left_out.values())))
-    if np.median(misfits) > _MAX_MISFIT_PX:
+    # For every lens position, poses of the right board are nearer than this.
+    max_misfit_px = 30.0
+    if np.median(misfits) > max_misfit_px:
         raise CalibrationError(
             f"no pose of the board explains the pictures: corners are {np.median(misfits):.0f} px "
             "off; check the board's file against the print, and the camera's calibration"
@@ -439,8 +448,6 @@ def _priors(
 # Boards are not set up better than this: 0.9 mm a metre.
 _FINEST = float(np.deg2rad(0.05))
 _STEP = 0.5
-# A finer scale must raise the log likelihood by this much: odds of 20 to 1.
-_EVIDENCE = 3.0
 
 
 def with_board_tilt_as_found(
@@ -460,11 +467,13 @@ def with_board_tilt_as_found(
     problem, solution
         Unchanged if boards do not agree better, or nothing is known of their poses.
     """
+    # A finer scale must raise the log likelihood by this much: odds of 20 to 1.
+    evidence = 3.0
     while sigma * _STEP >= _FINEST * (1.0 - 1e-9):
         finer = problem.with_board_tilt_prior(sigma * _STEP)
         trial = solve(finer.bundle, solution.state)
         gain = _misfit(solution, sigma) - _misfit(trial, sigma * _STEP)
-        if not (trial.converged and gain > _EVIDENCE):
+        if not (trial.converged and gain > evidence):
             break
         problem, solution, sigma = finer, trial, sigma * _STEP
     return problem, solution
@@ -477,3 +486,110 @@ def _misfit(solution: Solution[BundleState], sigma: float) -> float:
         return 0.0
     squares = np.sum(np.square(leaning), axis=1)
     return float(1.5 * np.sum(np.log1p(squares)) + 2.0 * len(leaning) * np.log(sigma))
+
+
+def compare_with_bare_lens(
+    problem: DomeProblem, solution: Solution[BundleState]
+) -> CrossValidation | None:
+    """Solve both models from three views in four and predict the fourth; four times.
+
+    The pose of a view held out is found from half of its corners; the other half is predicted.
+    Outliers of the whole solve and corners that either model cannot see are left out for both.
+
+    Returns
+    -------
+    CrossValidation or None
+        None if there are too few views.
+    """
+    n = len(problem.shots)
+    believed = [
+        shot.view.where(inliers)
+        for shot, inliers in zip(problem.shots, solution.inliers[:n], strict=True)
+    ]
+    # Half a view must still determine a pose.
+    min_split_points = 12
+    usable = [i for i in range(n) if len(believed[i]) >= min_split_points]
+    # Number of folds, and least number of views; with fewer all are needed for the solve.
+    parts, min_split_views = 4, 8
+    if len(usable) < min_split_views:
+        return None
+    pairs: list[tuple[FloatArray, FloatArray]] = []
+    for part in range(parts):
+        held_out = usable[part::parts]
+        rest = [i for i in range(n) if i not in held_out]
+        media = [problem.shots[i].i_set for i in held_out]
+        views = [believed[i] for i in held_out]
+        try:
+            with_dome = predicted(_dome_state(problem, solution, rest), media, views)
+            bare = predicted(_bare_state(problem, solution, rest), media, views)
+        except CalibrationError:
+            return None
+        pairs += zip(with_dome, bare, strict=True)
+    return _compared(pairs)
+
+
+def _compared(pairs: Sequence[tuple[FloatArray, FloatArray]]) -> CrossValidation | None:
+    """Compare residuals (N, 2) of the same corners, view by view."""
+    rows = []
+    for dome, bare in pairs:
+        both = np.isfinite(dome).all(axis=1) & np.isfinite(bare).all(axis=1)
+        if both.any():
+            rows.append((rms_px(dome[both]), rms_px(bare[both]), np.count_nonzero(both)))
+    if not rows:
+        return None
+    dome_px, bare_px, counts = np.array(rows).T
+    return CrossValidation(dome_px, bare_px, counts.astype(np.int64))
+
+
+def _dome_state(
+    problem: DomeProblem, solution: Solution[BundleState], rest: Sequence[int]
+) -> BundleState:
+    part = problem.only(rest)
+    poses = tuple(solution.state.poses[i] for i in rest)
+    return solve(part.bundle, replace(solution.state, poses=poses)).state
+
+
+def _bare_state(
+    problem: DomeProblem, solution: Solution[BundleState], rest: Sequence[int]
+) -> BundleState:
+    """Solve a bare lens with free pose from the same pictures."""
+    bundle = problem.bundle
+    rig = replace(solution.state.rig, housing=None)
+    views = [_bare_view(rig.camera(), bundle.views[i], solution.state, i) for i in rest]
+    intrinsics = tuple(name for name in bundle.free if name in rig.lens.parameter_names)
+    # With unknown poses the place is arbitrary.
+    free = (LENS + ROTATION if problem.rotation_is_solved else ()) + intrinsics
+    start_rig = replace(bundle.start.rig, housing=None)
+    start = BundleState(start_rig, solution.state.media, tuple(v.dome_from_target for v in views))
+    bare = Bundle(
+        tuple(views),
+        free,
+        start,
+        bundle.priors.only(intrinsics),
+        np.zeros(len(bundle.media_sigma)),
+    )
+    return solve(bare, replace(start, rig=rig)).state
+
+
+def _bare_view(camera: Camera, target: TargetView, state: BundleState, i: int) -> TargetView:
+    if target.fixed:
+        return target
+    found = start_pose(camera, target.view)
+    pose = state.poses[i] if isinstance(found, str) else found.dome_from_target
+    return replace(target, dome_from_target=pose)
+
+
+def predicted(state: BundleState, media: Sequence[int], views: Sequence[View]) -> list[FloatArray]:
+    """Return residuals (N, 2) of each view's odd corners, from poses found with the even ones.
+
+    NaN for corners that the model cannot see.
+    """
+    errors = []
+    for medium, view in zip(media, views, strict=True):
+        camera = state.camera(medium)
+        even = np.arange(len(view)) % 2 == 0
+        pose = target_pose(camera, view.where(even), max_rms_px=float("inf")).dome_from_target
+        odd = view.where(~even)
+        pixels, _ = camera.project(pose.apply(odd.points))
+        errors.append(odd.pixels - pixels)
+    return errors

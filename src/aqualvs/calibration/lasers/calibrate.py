@@ -7,34 +7,33 @@ board with lasers that were calibrated from the other pictures.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from aqualvs.calibration.lasers.candidates import plane_residuals_px
 from aqualvs.calibration.lasers.checks import (
+    LaserCalibration,
+    LaserFigures,
+    SolvedLasers,
+    ViewFigures,
     check_count,
     check_distances,
     check_poses,
     check_size,
     far_apart,
+    laser_figures,
     like,
     loose_text,
     match_to_rig,
     named,
+    view_figures,
 )
 from aqualvs.calibration.lasers.covariance import CameraCovariance, joint_uncertainty
 from aqualvs.calibration.lasers.laser_assignment import (
     BENT_TOLERANCE_PX,
     LaserAssignment,
     assign_lasers,
-)
-from aqualvs.calibration.lasers.report import (
-    LaserCalibration,
-    LaserFigures,
-    SolvedLasers,
-    ViewFigures,
-    laser_figures,
-    view_figures,
 )
 from aqualvs.calibration.lasers.solve import InitialGuess, paper_planes, solve_lasers, tolerance_px
 from aqualvs.calibration.lasers.stripes_on_planes import PooledStripes, TargetSurfaces
@@ -44,12 +43,21 @@ from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig import Laser, Rig, RigUncertainty
 
-# Larger residuals of corners, in pixels, indicate a wrong rig, medium or target.
-_BAD_CORNERS_PX = 0.5
-# The same of stripes; paint and speckle leave a tenth to a third of a pixel.
-_BAD_STRIPES_PX = 0.7
-# A metre away this is 7 mm: too much to call a laser calibrated.
-_UNCERTAIN_NORMAL = np.deg2rad(0.4)
+
+class _FitLimits(NamedTuple):
+    """Residuals that indicate a fault, and points that determine a laser."""
+
+    # Larger residuals of corners, in pixels, indicate a wrong rig, medium or target.
+    bad_corners_px: float = 0.5
+    # The same of stripes; paint and speckle leave a tenth to a third of a pixel.
+    bad_stripes_px: float = 0.7
+    # Place of each laser's stripe by the board's pose, to distinguish the lasers.
+    near_px: float = 8.0
+    min_points: int = 20
+    n_fits: int = 10
+
+
+_LIMITS = _FitLimits()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -239,31 +247,27 @@ def _warnings(
         f"{view.name}: corners miss by {view.rms_corners_px:.2f} px (rms); check the rig, the "
         "medium and the target's file"
         for view in views
-        if view.rms_corners_px > _BAD_CORNERS_PX
+        if view.rms_corners_px > _LIMITS.bad_corners_px
     ]
+    # A metre away this is 7 mm: too much to call a laser calibrated.
+    uncertain_normal = np.deg2rad(0.4)
     words += [
         f"laser '{figures.laser.name}' is known to {np.rad2deg(figures.sigma_normal):.2f} deg "
         "only; add pictures in which its stripe lies on planes further apart"
         for figures in lasers
-        if figures.sigma_normal > _UNCERTAIN_NORMAL
+        if figures.sigma_normal > uncertain_normal
     ]
     words += [
         f"stripes of laser '{figures.laser.name}' miss by {figures.rms_px:.2f} px (rms); check "
         "the planes in the target's file, or whether the laser's window is in the rig"
         for figures in lasers
-        if figures.rms_px > _BAD_STRIPES_PX
+        if figures.rms_px > _LIMITS.bad_stripes_px
     ]
     if solved.problem.board_pose_prior is not None:
         words.append(loose_text(solved))
     if not solved.solution.converged:
         words.append("the solve did not settle; look at the residuals before using this rig")
     return words
-
-
-# Place of each laser's stripe by the board's pose, to distinguish the lasers.
-_NEAR_PX = 8.0
-_MIN_POINTS = 20
-_N_FITS = 10
 
 
 @dataclass(frozen=True, slots=True)
@@ -336,7 +340,7 @@ def _measured(
     placed = place_views(seen_rig.camera(), [view], surfaces)[0][0]
     planes = [figures.laser.plane for figures in calibration.lasers]
     points, laser = _triangulated(seen_rig, placed, pooled([placed], surfaces), planes)
-    if len(points) < _MIN_POINTS or len(np.unique(laser)) < 2:
+    if len(points) < _LIMITS.min_points or len(np.unique(laser)) < 2:
         raise CalibrationError(
             f"{view.view.name}: {len(points)} points on {len(np.unique(laser))} stripes; a plane "
             "needs two stripes"
@@ -361,7 +365,7 @@ def _triangulated(
     """Return points (N, 3) where pixels meet their laser's plane, and the lasers' indices."""
     residuals = np.abs(plane_residuals_px(stripes.placed, planes))
     nearest = np.argmin(residuals, axis=1)
-    near = residuals[np.arange(len(nearest)), nearest] <= _NEAR_PX
+    near = residuals[np.arange(len(nearest)), nearest] <= _LIMITS.near_px
     laser = nearest[near]
     rays = rig.camera().rays(view.stripes.pixels[stripes.placed.index[near]])
     points = np.full((len(laser), 3), np.nan)
@@ -375,7 +379,7 @@ def _triangulated(
 def fitted(points: FloatArray) -> Plane:
     """Fit a plane to points (N, 3), robustly (Cauchy weights); it faces away from the origin."""
     weights = np.ones(len(points))
-    for _ in range(_N_FITS):
+    for _ in range(_LIMITS.n_fits):
         middle = weights @ points / weights.sum()
         offsets = points - middle
         normal = np.linalg.eigh((weights[:, None] * offsets).T @ offsets)[1][:, 0]

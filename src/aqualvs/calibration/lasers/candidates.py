@@ -10,6 +10,7 @@ come from the pictures themselves. The number of points does not count.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import gammaln
@@ -18,16 +19,21 @@ from aqualvs.calibration.lasers.stripes_on_planes import PlacedStripes, PooledSt
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.planes import Plane
 
-# Points this near to a line, in pixels across their stripe, belong to it.
-_TOLERANCE_PX = 2.0
-# Points this near are removed with it: the halo of a stripe is no second stripe.
-_HALO_PX = 6.0
-# Largest tangent of the angle between a point's stripe and the line, in the image.
-_ALIGNED = 0.35
-_MIN_POINTS = 12
-_MIN_LENGTH_PX = 20.0
-_MAX_LINES = 40
-_N_GUESSES, _N_SAMPLED, _N_FITS = 800, 600, 3
+
+class _LineOptions(NamedTuple):
+    """Search for straight stripes on a surface of the target."""
+
+    # Largest tangent of the angle between a point's stripe and the line, in the image.
+    aligned: float = 0.35
+    min_points: int = 12
+    min_length_px: float = 20.0
+    max_lines: int = 40
+    n_guesses: int = 800
+    n_sampled: int = 600
+    n_fits: int = 3
+
+
+_LINES = _LineOptions()
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,28 +72,32 @@ def lines_on_patch(pooled: PooledStripes, members: IntArray, patch: int) -> list
     placed, normal = pooled.placed, pooled.patch_planes[patch].normal
     points, across = placed.points_in_dome[members], placed.by_across[members]
     along = placed.by_along[members]
-    some = slice(None, None, -(-len(members) // _N_SAMPLED) or 1)
+    some = slice(None, None, -(-len(members) // _LINES.n_sampled) or 1)
     i, j = _pairs(pooled.chain[members], patch)
     guessed, offsets = _guesses(points, normal, i, j)
     # Most pairs are of two stripes; their directions are not that of the line through both points.
     good = _runs_along(across[i], along[i], guessed) & _runs_along(across[j], along[j], guessed)
     guessed, offsets = guessed[good], offsets[good]
-    votes = _near(points[some], across[some], along[some], guessed, offsets, _TOLERANCE_PX)
+    # Points this near to a line, in pixels across their stripe, belong to it.
+    tolerance_px = 2.0
+    votes = _near(points[some], across[some], along[some], guessed, offsets, tolerance_px)
     counts = np.count_nonzero(votes, axis=0)
     lines: list[StripeLine] = []
     free = np.ones(len(members), np.bool_)
-    while len(lines) < _MAX_LINES and len(guessed):
+    # Points this near are removed with it: the halo of a stripe is no second stripe.
+    halo_px = 6.0
+    while len(lines) < _LINES.max_lines and len(guessed):
         best = int(np.argmax(counts))
         m, c = guessed[best], float(offsets[best])
-        for _ in range(_N_FITS):
-            near = free & _near(points, across, along, m[None], c, _TOLERANCE_PX)[:, 0]
-            if np.count_nonzero(near) < _MIN_POINTS:
+        for _ in range(_LINES.n_fits):
+            near = free & _near(points, across, along, m[None], c, tolerance_px)[:, 0]
+            if np.count_nonzero(near) < _LINES.min_points:
                 return lines
             m, c = _fitted(points[near], across[near], normal, m)
-        near = free & _near(points, across, along, m[None], c, _TOLERANCE_PX)[:, 0]
-        if _length_px(points[near], along[near]) >= _MIN_LENGTH_PX:
+        near = free & _near(points, across, along, m[None], c, tolerance_px)[:, 0]
+        if _length_px(points[near], along[near]) >= _LINES.min_length_px:
             lines.append(StripeLine(patch, members[near]))
-        taken = free & (near | _near(points, across, along, m[None], c, _HALO_PX)[:, 0])
+        taken = free & (near | _near(points, across, along, m[None], c, halo_px)[:, 0])
         free &= ~taken
         counts -= np.count_nonzero(votes[taken[some]], axis=0)
     return lines
@@ -99,8 +109,8 @@ def _pairs(chain: IntArray, seed: int) -> tuple[IntArray, IntArray]:
     if n < 2:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     rng = np.random.default_rng(seed)
-    i, j = rng.integers(0, n, (2, _N_GUESSES))
-    half = slice(0, _N_GUESSES // 2)
+    i, j = rng.integers(0, n, (2, _LINES.n_guesses))
+    half = slice(0, _LINES.n_guesses // 2)
     order = np.argsort(chain, kind="stable")
     first = np.searchsorted(chain[order], chain[i[half]], "left")
     last = np.searchsorted(chain[order], chain[i[half]], "right")
@@ -121,7 +131,7 @@ def _guesses(
 def _runs_along(across: FloatArray, along: FloatArray, m: FloatArray) -> BoolArray:
     """Return the mask of points (N) whose stripe runs along their line (N)."""
     gain = np.abs(np.einsum("ni,ni->n", across, m))
-    aligned: BoolArray = np.abs(np.einsum("ni,ni->n", along, m)) <= _ALIGNED * gain
+    aligned: BoolArray = np.abs(np.einsum("ni,ni->n", along, m)) <= _LINES.aligned * gain
     return aligned
 
 
@@ -136,7 +146,7 @@ def _near(
     """Return the mask (N, H) of points that are near lines and run along them."""
     gain = np.abs(across @ m.T)
     near: BoolArray = np.abs(points @ m.T - c) <= tolerance_px * gain
-    near &= np.abs(along @ m.T) <= _ALIGNED * gain
+    near &= np.abs(along @ m.T) <= _LINES.aligned * gain
     return near
 
 
@@ -165,22 +175,30 @@ def _length_px(points: FloatArray, along: FloatArray) -> float:
 # Limits within which two surfaces are the same: sine between normals, distance in metres.
 _SAME_NORMAL, _SAME_OFFSET = 0.05, 0.02
 _N_PLANE_FITS = 5
-# Largest tangent of the angle between a point's stripe and the plane's, in the image.
-_ALIGNED_WITH_PLANE = 0.35
-# Number of pairs beyond which they are sampled; number of planes tried at a time.
-_MAX_PLANES, _AT_ONCE = 6000, 500
-# Prior of the rate of accidents, for when few are seen: spread of the lines in pixels, and its
-# weight as a number of observed planes. Then the shift in pixels, the number of shifts and the
-# number of pairs in the random test of how often lines meet by accident.
-_SPREAD_PX, _PRIOR_WEIGHT = 1000.0, 20.0
-_MOVED_PX, _N_MOVES, _MAX_MOVED = 250.0, 8, 1000
-# A line nearer than this share of the tolerance is no better evidence: poses are not more accurate.
-_NEAREST = 0.1
-# Accidents of a line are counted on lines of its surface of at least this share of its length.
-_AS_LONG = 0.5
-# Rounds of removing the lines of found planes from the accidents.
-_N_ROUNDS = 3
-_MAX_TRIALS = 60
+
+
+class _AccidentOptions(NamedTuple):
+    """Test of how often lines meet in a plane by accident."""
+
+    # Prior of the rate of accidents, for when few are seen: spread of the lines in pixels, and its
+    # weight as a number of observed planes. Then the shift in pixels, the number of shifts and the
+    # number of pairs in the random test of how often lines meet by accident.
+    spread_px: float = 1000.0
+    prior_weight: float = 20.0
+    moved_px: float = 250.0
+    n_moves: int = 8
+    max_moved: int = 1000
+    # A line nearer than this share of the tolerance is no better evidence: poses are not more
+    # accurate.
+    nearest: float = 0.1
+    # Accidents of a line are counted on lines of its surface of at least this share of its length.
+    as_long: float = 0.5
+    # Rounds of removing the lines of found planes from the accidents.
+    n_rounds: int = 3
+    max_trials: int = 60
+
+
+_ACCIDENTS = _AccidentOptions()
 
 
 @dataclass(frozen=True, slots=True)
@@ -274,13 +292,15 @@ class _Hypotheses:
         normals, offsets = _planes_of_pairs(table, pairs)
         meet = _pairs_meet(table, pairs, normals, offsets, tolerance_px)
         kept = np.flatnonzero(meet)
-        share = min(1.0, _MAX_PLANES / max(len(kept), 1))
+        # Number of pairs beyond which they are sampled; number of planes tried at a time.
+        max_planes, at_once = 6000, 500
+        share = min(1.0, max_planes / max(len(kept), 1))
         if share < 1.0:
-            kept = np.sort(np.random.default_rng(0).choice(kept, _MAX_PLANES, replace=False))
+            kept = np.sort(np.random.default_rng(0).choice(kept, max_planes, replace=False))
         pairs, normals, offsets = pairs[kept], normals[kept], offsets[kept]
         worst = np.empty((len(kept), len(table.patch)))
-        for first in range(0, len(kept), _AT_ONCE):
-            some = slice(first, first + _AT_ONCE)
+        for first in range(0, len(kept), at_once):
+            some = slice(first, first + at_once)
             worst[some] = table.worst_px(normals[some], offsets[some])
         return cls(pairs, worst, normals, offsets, n_expected, share)
 
@@ -326,7 +346,7 @@ def find_candidates(
     if not len(planes.pairs):
         return found
     accidental = np.zeros(len(planes.pairs), np.bool_)
-    for _ in range(_N_ROUNDS):
+    for _ in range(_ACCIDENTS.n_rounds):
         accidents = _accidents(table, planes, accidental, tolerance_px)
         found = _collected(pooled, lines, table, planes, accidents, tolerance_px)
         accidental = _accidental(len(lines), planes.pairs, found)
@@ -351,9 +371,11 @@ def _accidents(
     met = np.count_nonzero(planes.worst[accidental] <= tolerance_px, axis=0)
     # A pair's own lines are met by construction.
     met = met - np.bincount(planes.pairs[accidental].ravel(), minlength=len(table.patch))
-    prior = min(1.0, 2.0 * tolerance_px / _SPREAD_PX)
-    own_rate = (np.maximum(met, 0) + _PRIOR_WEIGHT * prior) / (n + _PRIOR_WEIGHT)
-    as_long = table.length[None] >= _AS_LONG * table.length[:, None]
+    prior = min(1.0, 2.0 * tolerance_px / _ACCIDENTS.spread_px)
+    own_rate = (np.maximum(met, 0) + _ACCIDENTS.prior_weight * prior) / (
+        n + _ACCIDENTS.prior_weight
+    )
+    as_long = table.length[None] >= _ACCIDENTS.as_long * table.length[:, None]
     rivals = (table.patch[:, None] == table.patch[None]) & as_long
     rate = np.minimum(rivals @ own_rate, 1.0)
     # One of the pairs that meet is the plane's own; the rate is the same for lines elsewhere.
@@ -374,7 +396,7 @@ def _collected(
     free = np.ones(len(lines), np.bool_)
     alive = np.ones(len(planes.pairs), np.bool_)
     nearness = _nearness(planes.worst, tolerance_px)
-    for _ in range(_MAX_TRIALS):
+    for _ in range(_ACCIDENTS.max_trials):
         alive &= np.all(free[planes.pairs], axis=1)
         alarms = _log_false_alarms(table, np.where(free, nearness, np.inf), accidents)
         alarms[~alive] = np.inf
@@ -397,7 +419,7 @@ def _collected(
 
 def _nearness(worst: FloatArray, tolerance_px: float) -> FloatArray:
     """Return distances (H, L) as a share of the tolerance; infinite beyond it."""
-    near: FloatArray = np.maximum(worst / tolerance_px, _NEAREST)
+    near: FloatArray = np.maximum(worst / tolerance_px, _ACCIDENTS.nearest)
     near[near > 1.0] = np.inf
     return near
 
@@ -419,7 +441,7 @@ def _log_false_alarms(table: LineTable, nearness: FloatArray, accidents: _Accide
     choices = gammaln(n + 1) - gammaln(k + 1) - gammaln(n - k + 1)
     alarms: FloatArray = np.log(accidents.n_planes) + choices + np.log(further).sum(axis=1)
     meeting = np.where(np.isfinite(nearness), nearness, 0.0).max(axis=1)
-    return alarms + np.where(k == 0, np.log(np.maximum(meeting, _NEAREST)), 0.0)
+    return alarms + np.where(k == 0, np.log(np.maximum(meeting, _ACCIDENTS.nearest)), 0.0)
 
 
 def _fitted_candidate(
@@ -492,10 +514,10 @@ def _meeting_rate(table: LineTable, pairs: IntArray, tolerance_px: float) -> flo
     if not len(pairs):
         return 0.0
     rng = np.random.default_rng(1)
-    some = pairs[rng.permutation(len(pairs))[:_MAX_MOVED]]
+    some = pairs[rng.permutation(len(pairs))[: _ACCIDENTS.max_moved]]
     met = 0
-    for _ in range(_N_MOVES):
-        moves = rng.uniform(-_MOVED_PX, _MOVED_PX, len(some))[:, None, None]
+    for _ in range(_ACCIDENTS.n_moves):
+        moves = rng.uniform(-_ACCIDENTS.moved_px, _ACCIDENTS.moved_px, len(some))[:, None, None]
         points = table.points[some].copy()
         points[:, 1] += moves * table.by_across[some[:, 1]]
         moved = replace(
@@ -507,7 +529,7 @@ def _meeting_rate(table: LineTable, pairs: IntArray, tolerance_px: float) -> flo
         met += int(
             np.count_nonzero(_pairs_meet(moved, own, *_planes_of_pairs(moved, own), tolerance_px))
         )
-    return (met + 1.0) / (_N_MOVES * len(some) + 1.0)
+    return (met + 1.0) / (_ACCIDENTS.n_moves * len(some) + 1.0)
 
 
 def _same_surfaces(planes: Sequence[Plane]) -> BoolArray:
@@ -548,7 +570,9 @@ def plane_residuals_px(placed: PlacedStripes, planes: Sequence[Plane]) -> FloatA
     offsets = np.array([p.offset for p in planes])
     gain = np.abs(placed.by_across @ normals.T)
     slant = np.abs(placed.by_along @ normals.T)
+    # Largest tangent of the angle between a point's stripe and the plane's, in the image.
+    aligned_with_plane = 0.35
     with np.errstate(divide="ignore", invalid="ignore"):
         residuals: FloatArray = (placed.points_in_dome @ normals.T - offsets) / gain
-        residuals[~(slant <= _ALIGNED_WITH_PLANE * gain)] = np.inf
+        residuals[~(slant <= aligned_with_plane * gain)] = np.inf
     return residuals

@@ -9,6 +9,7 @@ plane is judged by its evidence and against the better planes: laser, no laser, 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,27 +25,22 @@ from aqualvs.calibration.lasers.stripes_on_planes import PlacedStripes, PooledSt
 from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.planes import Plane
 
-# False discovery rate of planes that are accepted as lasers (Benjamini & Hochberg 1995,
-# doi:10.1111/j.2517-6161.1995.tb02031.x); least number of points of a laser.
-_FALSE_SHARE = 1e-3
-_MIN_POINTS = 40
-# Distance from another laser's stripe, in pixels, within which light is its halo; on other
-# surfaces, where that laser is not seen, it may be the same laser on a board that is not flat.
-_HALO_PX, _TORN_PX = 6.0, 15.0
-# Share of points or surfaces that must agree.
-_MOST = 0.8
-# Largest overlap, as a share of their length, of two stripes of one laser that continues from the
-# target to a surface behind or before it; stripes of two lasers overlap for most of their length.
-# Least cosine between such stripes.
-_LITTLE, _ALIKE = 0.15, 0.8
-# A stripe that stays in one place of the target to within this, in pixels, may be printed there.
-_FIXED_PX = 1.5
-# The stripe of a plane nearer to the lens, in metres, stays in one place of the picture: it is a
-# scratch or an overlaid text.
-_MIN_BASELINE = 2e-3
-# Ratio of a plane's residual to the best laser's from which its light lies on something else;
-# errors of the poses make a tenth of a pixel for every stripe.
-_POORER, _MIN_RESIDUAL_PX = 5.0, 0.1
+
+class _AssignmentOptions(NamedTuple):
+    """Evidence that a plane is a laser's, and limits of its stripes in pixels."""
+
+    # False discovery rate of planes that are accepted as lasers (Benjamini & Hochberg 1995,
+    # doi:10.1111/j.2517-6161.1995.tb02031.x); least number of points of a laser.
+    false_share: float = 1e-3
+    min_points: int = 40
+    # Share of points or surfaces that must agree.
+    most: float = 0.8
+    # Distance from the stripe of a second laser within which its light biases a point's centre.
+    crossing_px: float = 9.0
+    n_fits: int = 5
+
+
+_SURE = _AssignmentOptions()
 
 
 class PlaneVerdict(Enum):
@@ -107,11 +103,14 @@ def judged(
     alarms = np.array([c.log_false_alarms for c in candidates])
     n_sure = _n_sure(alarms)
     seen: list[JudgedPlane] = []
+    # The stripe of a plane nearer to the lens, in metres, stays in one place of the picture: it is
+    # a scratch or an overlaid text.
+    min_baseline = 2e-3
     for i in _by_target(pooled, lines, candidates):
         candidate = candidates[i]
         members = _members(lines, candidate)
         fault = _fault(pooled, candidate, members, seen)
-        if abs(float(candidate.plane.signed_distance(lens_in_dome))) < _MIN_BASELINE:
+        if abs(float(candidate.plane.signed_distance(lens_in_dome))) < min_baseline:
             fault = PlaneVerdict.OTHER, "it stays in one place of the picture, near or far"
         if fault is None and i >= n_sure:
             fault = PlaneVerdict.WEAK, "too few stripes lie in it to tell it from an accident"
@@ -124,7 +123,7 @@ def judged(
 
 def _n_sure(log_alarms: FloatArray) -> int:
     """Return the number of best planes within the allowed false discovery rate."""
-    allowed = _FALSE_SHARE * np.arange(1, len(log_alarms) + 1)
+    allowed = _SURE.false_share * np.arange(1, len(log_alarms) + 1)
     good = np.flatnonzero(np.exp(np.sort(log_alarms)) <= allowed)
     return int(good[-1]) + 1 if len(good) else 0
 
@@ -138,7 +137,7 @@ def _by_target(
 ) -> list[int]:
     """Return the order of judging: planes with light on the target before those beside it."""
     beside = [
-        float(np.mean(pooled.on_target[_members(lines, c)])) < 1.0 - _MOST for c in candidates
+        float(np.mean(pooled.on_target[_members(lines, c)])) < 1.0 - _SURE.most for c in candidates
     ]
     return sorted(range(len(candidates)), key=lambda i: (beside[i], i))
 
@@ -150,7 +149,7 @@ def _fault(
     seen: Sequence[JudgedPlane],
 ) -> tuple[PlaneVerdict, str] | None:
     """Return the reason against a plane as a laser of its own, or None."""
-    if len(members) < _MIN_POINTS:
+    if len(members) < _SURE.min_points:
         return PlaneVerdict.OTHER, f"it has {len(members)} points only"
     if _is_fixed(pooled, members):
         return PlaneVerdict.DOUBTFUL, (
@@ -167,7 +166,10 @@ def _fault(
         (other.candidate.residual_px for other in seen if other.verdict is PlaneVerdict.LASER),
         default=np.inf,
     )
-    if candidate.residual_px > _POORER * max(best, _MIN_RESIDUAL_PX):
+    # Ratio of a plane's residual to the best laser's from which its light lies on something else;
+    # errors of the poses make a tenth of a pixel for every stripe.
+    poorer, min_residual_px = 5.0, 0.1
+    if candidate.residual_px > poorer * max(best, min_residual_px):
         return PlaneVerdict.DOUBTFUL, (
             f"its stripes miss a plane by {candidate.residual_px:.1f} px, those of another laser "
             f"by {best:.1f} px; they may lie on something else than the target"
@@ -185,14 +187,17 @@ def _same_light(
     shared = mine & set(other.patches)
     away = plane_residuals_px(pooled.placed, [other.candidate.plane])[members, 0]
     distance = float(np.median(np.abs(away)))
-    if distance <= _HALO_PX and shared:
+    # Distance from another laser's stripe, in pixels, within which light is its halo; on other
+    # surfaces, where that laser is not seen, it may be the same laser on a board that is not flat.
+    halo_px, torn_px = 6.0, 15.0
+    if distance <= halo_px and shared:
         return PlaneVerdict.OTHER, "it is the halo of another stripe"
-    if distance <= _TORN_PX and len(shared) <= (1.0 - _MOST) * len(mine):
+    if distance <= torn_px and len(shared) <= (1.0 - _SURE.most) * len(mine):
         return PlaneVerdict.TORN, (
             f"it is {distance:.0f} px away from a laser that is seen in other pictures"
         )
     goes_on = sum(_goes_on(pooled, members, other.members, patch) for patch in shared)
-    if len(shared) >= 2 and goes_on >= _MOST * len(mine):
+    if len(shared) >= 2 and goes_on >= _SURE.most * len(mine):
         return (
             PlaneVerdict.OTHER,
             "it begins where another stripe ends, as that laser's light does on ",
@@ -206,11 +211,15 @@ def _goes_on(pooled: PooledStripes, members: IntArray, others: IntArray, patch: 
     mine = points[members[pooled.patch[members] == patch]]
     theirs = points[others[pooled.patch[others] == patch]]
     middle, direction = theirs.mean(axis=0), _direction(theirs)
-    if abs(float(direction @ _direction(mine))) < _ALIKE:
+    # Largest overlap, as a share of their length, of two stripes of one laser that continues from
+    # the target to a surface behind or before it; stripes of two lasers overlap for most of their
+    # length. Least cosine between such stripes.
+    little, alike = 0.15, 0.8
+    if abs(float(direction @ _direction(mine))) < alike:
         return False
     first, last = np.quantile((theirs - middle) @ direction, [0.02, 0.98])
     way = (mine - middle) @ direction
-    return float(np.mean((way >= first) & (way <= last))) <= _LITTLE
+    return float(np.mean((way >= first) & (way <= last))) <= little
 
 
 def _direction(points: FloatArray) -> FloatArray:
@@ -239,20 +248,16 @@ def _is_fixed(pooled: PooledStripes, members: IntArray) -> bool:
         sizes = [float(np.median(size[pooled.view[mine] == v])) for v in views]
         rms = [np.sqrt(np.mean(d**2)) / px for d, px in zip(by_view, sizes, strict=True)]
         worst = max(worst, float(np.sqrt(np.mean(np.square(rms)))))
-    return several and worst <= _FIXED_PX
+    # A stripe that stays in one place of the target to within this, in pixels, may be printed
+    # there.
+    fixed_px = 1.5
+    return several and worst <= fixed_px
 
 
 TOLERANCE_PX = 3.0
 """Greatest distance of a stripe from its plane; errors of poses add to the noise of stripes."""
 BENT_TOLERANCE_PX = 10.0
 """The same for light that may be refracted at a window, so that no plane fits well."""
-# Distance from the stripe of a second laser within which its light biases a point's centre.
-_CROSSING_PX = 9.0
-_N_FITS = 5
-# Least share of its chains that a straight stripe holds; with less it is a chord of a curve.
-_MIN_OF_CHAIN = 0.25
-# Difference of log false alarms from which a plane is clearly worse.
-_CLEARLY_WORSE = 3.0
 # Greatest expected number of accidents of a plane that is needed for the given number of lasers,
 # and greatest length of a stripe in no plane as a multiple of its own: tuned on 24 simulated scenes
 # of one picture of a box with glints. Greatest expected number of accidents of an undecided plane.
@@ -363,18 +368,22 @@ def _may_be_laser(plane: JudgedPlane, lines: Sequence[StripeLine], longest: int)
 def _as_good(plane: JudgedPlane, other: JudgedPlane) -> bool:
     """Return whether a plane's evidence is nearly as good as that of a better one."""
     worse = plane.candidate.log_false_alarms - other.candidate.log_false_alarms
-    return plane.verdict is other.verdict and worse < _CLEARLY_WORSE
+    # Difference of log false alarms from which a plane is clearly worse.
+    clearly_worse = 3.0
+    return plane.verdict is other.verdict and worse < clearly_worse
 
 
 def _all_lines(pooled: PooledStripes) -> list[StripeLine]:
     lines = []
     n_of_chain = _counts_on_patch(pooled)
+    # Least share of its chains that a straight stripe holds; with less it is a chord of a curve.
+    min_of_chain = 0.25
     for patch in range(len(pooled.patch_planes)):
         members = np.flatnonzero(pooled.patch == patch)
         lines += [
             line
             for line in lines_on_patch(pooled, members, patch)
-            if _share_of_chains(pooled, line, n_of_chain) >= _MIN_OF_CHAIN
+            if _share_of_chains(pooled, line, n_of_chain) >= min_of_chain
         ]
     return lines
 
@@ -398,11 +407,11 @@ def _share_of_chains(pooled: PooledStripes, line: StripeLine, n_of_chain: IntArr
 
 def _refined(pooled: PooledStripes, planes: list[Plane], tolerance_px: float) -> list[Plane]:
     """Fit planes to all points near them and near no other."""
-    for _ in range(_N_FITS):
+    for _ in range(_SURE.n_fits):
         laser = assigned(pooled, planes, tolerance_px)
         planes = [
             fitted_plane(pooled.placed, np.flatnonzero(laser == i), plane)
-            if np.count_nonzero(laser == i) >= _MIN_POINTS
+            if np.count_nonzero(laser == i) >= _SURE.min_points
             else plane
             for i, plane in enumerate(planes)
         ]
@@ -419,7 +428,7 @@ def assigned(
     residuals = np.abs(plane_residuals_px(pooled.placed, planes))
     nearest = np.argmin(residuals, axis=1)
     clear = residuals[np.arange(n), nearest] <= tolerance_px
-    clear &= np.count_nonzero(_crossed_px(pooled.placed, planes) <= _CROSSING_PX, axis=1) <= 1
+    clear &= np.count_nonzero(_crossed_px(pooled.placed, planes) <= _SURE.crossing_px, axis=1) <= 1
     laser: IntArray = np.where(clear, nearest, -1)
     return laser
 
@@ -439,6 +448,6 @@ def _unmatched(lines: Sequence[StripeLine], laser: IntArray) -> tuple[StripeLine
     free = [
         line
         for line in lines
-        if len(line.members) >= _MIN_POINTS and np.mean(laser[line.members] >= 0) < 0.2
+        if len(line.members) >= _SURE.min_points and np.mean(laser[line.members] >= 0) < 0.2
     ]
     return tuple(sorted(free, key=lambda line: -len(line.members)))

@@ -11,7 +11,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from aqualvs.calibration.lasers.checks import contradicts, like, typical_corner_error_px
+from aqualvs.calibration.lasers.checks import (
+    SolvedLasers,
+    contradicts,
+    like,
+    typical_corner_error_px,
+)
 from aqualvs.calibration.lasers.covariance import CameraCovariance
 from aqualvs.calibration.lasers.laser_assignment import BENT_TOLERANCE_PX, TOLERANCE_PX, assigned
 from aqualvs.calibration.lasers.problem import (
@@ -20,7 +25,6 @@ from aqualvs.calibration.lasers.problem import (
     LaserProblem,
     LaserState,
 )
-from aqualvs.calibration.lasers.report import SolvedLasers
 from aqualvs.calibration.lasers.stripes_on_planes import (
     TargetSurfaces,
     binned,
@@ -36,10 +40,6 @@ from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig import Laser, Rig, RigUncertainty
 from aqualvs.optics.sheet import Sheet, sheet_in
-
-# Difference of the Bayesian information criterion that is strong evidence (Kass & Raftery 1995,
-# doi:10.1080/01621459.1995.10476572).
-_STRONG = 6.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,9 +126,12 @@ def _choice(flat: _Fit, bent: _Fit) -> tuple[bool, str]:
     n = min(flat.n_effective, bent.n_effective)
     evidence = 2.0 * n * float(np.log(max(flat.rms_px, 1e-9) / max(bent.rms_px, 1e-9)))
     residuals = f"residuals {bent.rms_px:.3f} px if bent at the window, {flat.rms_px:.3f} px if not"
-    if evidence > _STRONG:
+    # Difference of the Bayesian information criterion that is strong evidence (Kass & Raftery 1995,
+    # doi:10.1080/01621459.1995.10476572).
+    strong = 6.0
+    if evidence > strong:
         return True, f"bent at its window: {residuals}"
-    if evidence < -_STRONG:
+    if evidence < -strong:
         return False, f"plane, its window left out: {residuals}"
     return True, f"bent at its window as the rig says, though stripes cannot tell: {residuals}"
 

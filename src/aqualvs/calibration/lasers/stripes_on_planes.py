@@ -67,8 +67,6 @@ class StripePoints:
         )
 
 
-# Points this near to the edge of two surfaces may be light of the other one, or of both.
-_EDGE = 0.006
 # An open side of a box ends this share of the box's size beyond the outermost marker.
 _RIM_SHARE = 0.02
 _ON_PLANE = 1e-4
@@ -120,11 +118,13 @@ class TargetSurfaces:
         return Plane(normal, plane.offset + float(normal @ dome_from_target.translation))
 
     def _inside(self, points: FloatArray, i_own: int) -> BoolArray:
+        # Points this near to the edge of two surfaces may be light of the other one, or of both.
+        edge = 0.006
         with np.errstate(invalid="ignore"):
             inside: BoolArray = np.all((points >= self.lowest) & (points <= self.highest), axis=1)
             for i, plane in enumerate(self.planes):
                 if i != i_own:
-                    inside &= plane.signed_distance(points) <= -_EDGE
+                    inside &= plane.signed_distance(points) <= -edge
         return inside
 
 
@@ -320,10 +320,6 @@ def solve_on_surface(by_point: FloatArray, normals: FloatArray, right: FloatArra
 
 BIN_PX = 12.0
 """Length of a bin along a stripe: neighbouring points share speckle, paint and blur."""
-# A gap of more pixels than this along a stripe ends a bin.
-_GAP_PX = 10.0
-# Greatest lag of the autocorrelation, in bins, and least number of pairs at each lag.
-_MAX_LAG, _MIN_PAIRS = 12, 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -414,6 +410,8 @@ def binned(i_view: int, i_laser: int, points: StripePoints, surface: IntArray) -
 def _ordered(pixels: FloatArray, surface: IntArray) -> tuple[IntArray, IntArray]:
     """Return the order of points along their stripe, by surface, and each bin's first index."""
     order, starts, n = [], [], 0
+    # A gap of more pixels than this along a stripe ends a bin.
+    gap_px = 10.0
     for i in np.unique(surface):
         mine = np.flatnonzero(surface == i)
         offsets = pixels[mine] - pixels[mine].mean(axis=0)
@@ -422,7 +420,7 @@ def _ordered(pixels: FloatArray, surface: IntArray) -> tuple[IntArray, IntArray]
         order.append(mine[along])
         first = last = -np.inf
         for k, here in enumerate(way[along].tolist()):
-            if here - first >= BIN_PX or here - last > _GAP_PX:
+            if here - first >= BIN_PX or here - last > gap_px:
                 starts.append(n + k)
                 first = here
             last = here
@@ -494,20 +492,22 @@ def correlation_factor(sequences: Sequence[FloatArray]) -> float:
     One plus twice the sum of autocorrelations, up to the first that is not positive (Geyer 1992,
     doi:10.1214/ss/1177011137, initial positive sequence). At least 1.
     """
-    products = np.zeros(_MAX_LAG + 1)
-    pairs = np.zeros(_MAX_LAG + 1)
+    # Greatest lag of the autocorrelation, in bins, and least number of pairs at each lag.
+    max_lag, min_pairs = 12, 20
+    products = np.zeros(max_lag + 1)
+    pairs = np.zeros(max_lag + 1)
     for values in sequences:
         known = np.isfinite(values)
         filled = np.where(known, values, 0.0)
-        for lag in range(min(_MAX_LAG + 1, len(values))):
+        for lag in range(min(max_lag + 1, len(values))):
             end = len(values) - lag
             products[lag] += float(filled[:end] @ filled[lag:])
             pairs[lag] += float(np.count_nonzero(known[:end] & known[lag:]))
     if products[0] <= 0.0:
         return 1.0
     factor = 1.0
-    for lag in range(1, _MAX_LAG + 1):
-        if pairs[lag] < _MIN_PAIRS or products[lag] <= 0.0:
+    for lag in range(1, max_lag + 1):
+        if pairs[lag] < min_pairs or products[lag] <= 0.0:
             break
         factor += 2.0 * (products[lag] / pairs[lag]) / (products[0] / pairs[0])
     return factor

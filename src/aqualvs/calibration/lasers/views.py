@@ -113,11 +113,6 @@ def pose_difference(a: SE3, b: SE3, middle: FloatArray) -> tuple[float, float]:
     return angle, float(np.linalg.norm(a.apply(middle) - b.apply(middle)))
 
 
-_MIN_CORNERS = 4
-# Neighbouring points of a stripe are nearly redundant.
-_ENOUGH_POINTS = 2000
-
-
 @dataclass(frozen=True, slots=True)
 class LaserView:
     """Points of the target and of stripes on it in one picture.
@@ -209,7 +204,8 @@ def place_views(
 
 def _placed_view(camera: Camera, laser_view: LaserView, surfaces: TargetSurfaces) -> PlacedView:
     view = laser_view.view
-    if len(view) < _MIN_CORNERS:
+    min_corners = 4
+    if len(view) < min_corners:
         raise CalibrationError(
             f"{view.name}: {len(view)} corners of the target found; show more of it, with better "
             "light, or check the family and sizes in its file"
@@ -223,11 +219,13 @@ def _placed_view(camera: Camera, laser_view: LaserView, surfaces: TargetSurfaces
             f"{view.name}: the board could lean either way; take this picture from nearer, or "
             "more from the side"
         )
+    # Neighbouring points of a stripe are nearly redundant.
+    enough_points = 2000
     return replaced(
         camera,
         PlacedView(
             believed,
-            laser_view.stripes.thinned(_ENOUGH_POINTS),
+            laser_view.stripes.thinned(enough_points),
             pose.dome_from_target,
             spatial_pose(camera, believed, pose.dome_from_target),
             _none(),

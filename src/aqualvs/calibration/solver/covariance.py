@@ -23,14 +23,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from aqualvs.calibration.solver.bundle import Bundle, BundleState
+from aqualvs.calibration.solver.bundle import PRIORS, Bundle, BundleState
 from aqualvs.calibration.solver.least_squares import Block, Solution, inverse, normal_equations
-from aqualvs.calibration.solver.priors import PRIORS
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.optics.rig import RigUncertainty
 
-# Boards less than this apart in direction (radians) and in distance (share) are all alike.
-_SAME_DIRECTION, _SAME_DISTANCE = np.deg2rad(3.0), 0.05
 # Ratios of found to given lengths that a wrong unit explains, and the tolerance of the ratio.
 _UNITS = {
     1e3: "distances written in metres, or square_mm in micrometres",
@@ -42,7 +39,6 @@ _UNITS = {
     10.0: "distances in centimetres",
     0.1: "square_mm in centimetres",
 }
-_UNIT_TOLERANCE = 0.12
 
 
 def spread_of(normals: FloatArray, distances: FloatArray) -> tuple[float, float]:
@@ -61,7 +57,9 @@ def spread_of(normals: FloatArray, distances: FloatArray) -> tuple[float, float]
 def all_alike(normals: FloatArray, distances: FloatArray) -> bool:
     """Return whether all boards are parallel and at one distance."""
     direction, distance = spread_of(normals, distances)
-    return direction < _SAME_DIRECTION and distance < _SAME_DISTANCE
+    # Boards less than this apart in direction (radians) and in distance (share) are all alike.
+    same_direction, same_distance = np.deg2rad(3.0), 0.05
+    return direction < same_direction and distance < same_distance
 
 
 def length_ratio(given: FloatArray, found: FloatArray) -> float:
@@ -81,8 +79,9 @@ def scale_fault(ratio: float, tolerance: float) -> str | None:
     """Return what a ratio of found to given distances means; None if it is near 1."""
     if abs(ratio - 1.0) <= tolerance:
         return None
+    unit_tolerance = 0.12
     for unit, meaning in _UNITS.items():
-        if abs(ratio / unit - 1.0) < _UNIT_TOLERANCE:
+        if abs(ratio / unit - 1.0) < unit_tolerance:
             return (
                 f"the pictures put the boards {ratio:.4g} times as far away as the given distances "
                 f"do: {meaning}? Distances and square_mm are in millimetres"
@@ -266,8 +265,6 @@ def _cross_information(
 # A view with more than this share of the information on a combination has no other view to be
 # compared with there.
 _ALONE = 0.999
-# Student's distribution has a variance from three views on; fewer count as this number.
-_MIN_VIEWS = 3.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -404,7 +401,9 @@ def _spread(own: Sequence[FloatArray], scores: Sequence[FloatArray]) -> tuple[Fl
     # Few views determine their own scatter badly: a ratio to it has Student's distribution, whose
     # variance is larger. The noise of corners is known from many, and is present in any case.
     shares = np.einsum("sk,nst,tk->nk", vectors, np.array(own), vectors)
-    effective = np.maximum(np.sum(shares, axis=0) ** 2 / np.sum(shares**2, axis=0), _MIN_VIEWS)
+    # Student's distribution has a variance from three views on; fewer count as this number.
+    min_views = 3.0
+    effective = np.maximum(np.sum(shares, axis=0) ** 2 / np.sum(shares**2, axis=0), min_views)
     students = effective / (effective - 2.0)
     values = 1.0 + students * np.maximum(values - 1.0, 0.0)
     return (vectors * values) @ vectors.T, inflation

@@ -13,6 +13,7 @@ camera and boards together until most boards stand square to the dome.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -30,21 +31,29 @@ from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig
 MAX_RMS_PX = 5.0
 """Largest residual of corners of the right target."""
 _CORNERS = "corners"
-_MIN_POINTS = 4
-# Extents of a target, relative to its largest, below which it is a line, flat, and nearly flat.
-_LINE, _FLAT, _NEARLY_FLAT = 1e-3, 1e-6, 0.05
-# Error, in pixels, of taking all rays to meet in one point, which behind a dome they do not.
-_START_ERROR_PX = 8.0
-_FEW_INLIERS = 0.7
-# A second pose with residuals less than this many times larger may be the true one.
-_RIVAL = 1.5
-# Closed solutions this many times worse than the best are not worth refining.
-_HOPELESS = 5.0
-# Number of observations at the nominal noise that are added to a view's own residuals in the noise
-# estimate: the eight residuals of a single marker leave two degrees of freedom.
-_PRIOR_FREEDOM = 8.0
-# Rays further than this from their mean (cosine) are not used in the initial guess.
-_SIDEWAYS = 0.15
+
+
+class _PoseOptions(NamedTuple):
+    """Initial guess of a target's pose."""
+
+    min_points: int = 4
+    # Extents of a target, relative to its largest, below which it is a line, flat, and nearly flat.
+    line: float = 1e-3
+    flat: float = 1e-6
+    nearly_flat: float = 0.05
+    # Error, in pixels, of taking all rays to meet in one point, which behind a dome they do not.
+    start_error_px: float = 8.0
+    few_inliers: float = 0.7
+    # A second pose with residuals less than this many times larger may be the true one.
+    rival: float = 1.5
+    # Number of points of a view used for a starting pose: more gain nothing.
+    enough_points: int = 48
+    # A closed solution with a median error below this needs no refinement.
+    near_px: float = 2.0
+    start_min_points: int = 6
+
+
+_POSE = _PoseOptions()
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +117,7 @@ def target_pose(
             again, second = _best_two(camera, view, iter([start]), sigma_px)
             if again is not None and (best is None or _better(again, best)):
                 best, rival = again, second
-    if best is None or _rms_px(best, sigma_px) > max_rms_px or _believed(best) < _MIN_POINTS:
+    if best is None or _rms_px(best, sigma_px) > max_rms_px or _believed(best) < _POSE.min_points:
         raise CalibrationError(_not_found(view, best, sigma_px))
     return _result(best, rival, sigma_px)
 
@@ -144,13 +153,13 @@ class _PoseProblem:
 
 def _check(view: View, rays: Rays) -> None:
     n = int(np.count_nonzero(rays.valid))
-    if n < _MIN_POINTS:
+    if n < _POSE.min_points:
         raise CalibrationError(
-            f"{view.name}: {n} points of the target can be used but a pose needs {_MIN_POINTS}; "
-            "show more of the target"
+            f"{view.name}: {n} points of the target can be used but a pose needs "
+            f"{_POSE.min_points}; show more of the target"
         )
     extents = _extents(view.points[rays.valid])[0]
-    if extents[1] < _LINE * extents[0]:
+    if extents[1] < _POSE.line * extents[0]:
         raise CalibrationError(
             f"{view.name}: the {n} points found lie on one line; show more of the target"
         )
@@ -195,7 +204,7 @@ def _rms_px(solution: Solution[SE3], sigma_px: float) -> float:
 
 def _doubtful(solution: Solution[SE3], sigma_px: float, max_rms_px: float) -> bool:
     share = _believed(solution) / len(solution.inliers[0])
-    return share < _FEW_INLIERS or _rms_px(solution, sigma_px) > min(max_rms_px, MAX_RMS_PX)
+    return share < _POSE.few_inliers or _rms_px(solution, sigma_px) > min(max_rms_px, MAX_RMS_PX)
 
 
 def _better(a: Solution[SE3], b: Solution[SE3]) -> bool:
@@ -230,7 +239,9 @@ def _pinhole(view: View, rays: Rays) -> _Pinhole:
     side /= np.linalg.norm(side)
     pose = SE3(np.stack([side, np.cross(forward, side), forward], axis=1), centre)
     in_pinhole = directions @ pose.rotation
-    ahead = in_pinhole[:, 2] > _SIDEWAYS
+    # Rays further than this from their mean (cosine) are not used in the initial guess.
+    sideways = 0.15
+    ahead = in_pinhole[:, 2] > sideways
     normalised = in_pinhole[ahead, :2] / in_pinhole[ahead, 2:]
     return _Pinhole(pose, view.points[rays.valid][ahead], np.ascontiguousarray(normalised))
 
@@ -242,18 +253,18 @@ def closed_form_poses(view: View, rays: Rays) -> Iterator[SE3]:
     """
     pinhole = _pinhole(view, rays)
     extents, axes, middle = _extents(pinhole.points)
-    if extents[2] < _NEARLY_FLAT * extents[0]:
+    if extents[2] < _POSE.nearly_flat * extents[0]:
         flat = (pinhole.points - middle) @ axes.T
         flat[:, 2] = 0.0
         target_from_flat = SE3(axes.T, middle)
         for pose in _closed_form(pinhole, flat, cv2.SOLVEPNP_IPPE):
             yield pose @ target_from_flat.inverse()
-    if extents[2] > _FLAT * extents[0]:
+    if extents[2] > _POSE.flat * extents[0]:
         yield from _closed_form(pinhole, pinhole.points, cv2.SOLVEPNP_SQPNP)
 
 
 def _closed_form(pinhole: _Pinhole, points: FloatArray, method: int) -> Iterator[SE3]:
-    if len(points) < _MIN_POINTS:
+    if len(points) < _POSE.min_points:
         return
     try:
         _, rotvecs, translations, errors = cv2.solvePnPGeneric(
@@ -261,8 +272,10 @@ def _closed_form(pinhole: _Pinhole, points: FloatArray, method: int) -> Iterator
         )
     except cv2.error:  # it asserts where points are degenerate
         return
+    # Closed solutions this many times worse than the best are not worth refining.
+    hopeless = 5.0
     for rotvec, translation, error in zip(rotvecs, translations, np.ravel(errors), strict=True):
-        if error > _HOPELESS * np.min(errors):
+        if error > hopeless * np.min(errors):
             continue
         if np.all(np.isfinite(rotvec)) and np.all(np.isfinite(translation)):
             yield pinhole.pose(rotvec, translation)
@@ -270,7 +283,7 @@ def _closed_form(pinhole: _Pinhole, points: FloatArray, method: int) -> Iterator
 
 def _start_despite_outliers(camera: Camera, view: View, rays: Rays) -> SE3 | None:
     pinhole = _pinhole(view, rays)
-    if len(pinhole.points) < _MIN_POINTS + 1:
+    if len(pinhole.points) < _POSE.min_points + 1:
         return None
     try:
         found, rotvec, translation, _ = cv2.solvePnPRansac(
@@ -279,7 +292,7 @@ def _start_despite_outliers(camera: Camera, view: View, rays: Rays) -> SE3 | Non
             np.eye(3),
             None,
             iterationsCount=300,
-            reprojectionError=_START_ERROR_PX / max(camera.lens.fx, camera.lens.fy),
+            reprojectionError=_POSE.start_error_px / max(camera.lens.fx, camera.lens.fy),
             confidence=0.999,
             flags=cv2.SOLVEPNP_SQPNP,
         )
@@ -291,9 +304,12 @@ def _start_despite_outliers(camera: Camera, view: View, rays: Rays) -> SE3 | Non
 def _result(best: Solution[SE3], rival: Solution[SE3] | None, sigma_px: float) -> TargetPose:
     scale = best.scales[_CORNERS]
     freedom = 2.0 * _believed(best) - 6.0
-    tempered = (freedom * scale**2 + _PRIOR_FREEDOM) / (freedom + _PRIOR_FREEDOM)
+    # Number of observations at the nominal noise that are added to a view's own residuals in the
+    # noise estimate: the eight residuals of a single marker leave two degrees of freedom.
+    prior_freedom = 8.0
+    tempered = (freedom * scale**2 + prior_freedom) / (freedom + prior_freedom)
     rms = _rms_px(best, sigma_px)
-    ambiguous = rival is not None and _rms_px(rival, sigma_px) < _RIVAL * rms + 0.1 * sigma_px
+    ambiguous = rival is not None and _rms_px(rival, sigma_px) < _POSE.rival * rms + 0.1 * sigma_px
     return TargetPose(
         dome_from_target=best.state,
         covariance=best.covariance * (tempered / scale**2),
@@ -311,11 +327,6 @@ def _not_found(view: View, best: Solution[SE3] | None, sigma_px: float) -> str:
     )
 
 
-# Number of points of a view used for a starting pose: more gain nothing.
-_ENOUGH_POINTS = 48
-# A closed solution with a median error below this needs no refinement.
-_NEAR_PX = 2.0
-_START_MIN_POINTS = 6
 _QUARTER = 0.5 * np.pi
 
 
@@ -338,10 +349,10 @@ def start_pose(camera: Camera, view: View) -> StartPose | str:
     """Return a view's pose, even if the starting camera fits badly, or why there is none."""
     few = thinned(view)
     rays = camera.rays(few.pixels)
-    if np.count_nonzero(rays.valid) >= _START_MIN_POINTS:
+    if np.count_nonzero(rays.valid) >= _POSE.start_min_points:
         quick = [_judged(camera, few, pose) for pose in closed_form_poses(few, rays)]
         best = min(quick, key=lambda start: start.median_px, default=None)
-        if best is not None and best.median_px < _NEAR_PX:
+        if best is not None and best.median_px < _POSE.near_px:
             return best
     try:
         found = target_pose(camera, few, max_rms_px=float("inf"))
@@ -356,7 +367,7 @@ def _judged(camera: Camera, view: View, pose: SE3) -> StartPose:
     return StartPose(pose, float(np.median(off)))
 
 
-def thinned(view: View, n_points: int = _ENOUGH_POINTS) -> View:
+def thinned(view: View, n_points: int = _POSE.enough_points) -> View:
     """Return a view with a limited number of points, spread over the target."""
     if len(view) <= n_points:
         return view

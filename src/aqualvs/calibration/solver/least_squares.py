@@ -12,7 +12,7 @@ import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from scipy.stats import chi2
@@ -167,14 +167,8 @@ def cost(
     return total
 
 
-# Residuals longer than this, in scales, are outliers: 4e-6 of good corners.
-_REJECT = 5.0
-# Factor by which the median's scale may be too small by chance.
-_DOUBT = 1.5
 # Least scale, for data without noise.
 _TINY = 1e-6
-# Weight of the group's noise in that of a block, as a number of values.
-_GROUP_FREEDOM = 10.0
 # Least number of degrees of freedom for an estimate of the noise.
 _MIN_FREEDOM = 0.5
 
@@ -208,9 +202,11 @@ def believed(
     blocks: Sequence[Block], scales: Sequence[float], freedom: Sequence[float]
 ) -> list[BoolArray]:
     """Return the inliers of every block."""
+    # Residuals longer than this, in scales, are outliers: 4e-6 of good corners.
+    reject = 5.0
     return [
         # NaN compares false.
-        block.lengths < _REJECT * min(scale, _largest_scale(block, free))
+        block.lengths < reject * min(scale, _largest_scale(block, free))
         if block.scaled
         else block.seen
         for block, scale, free in zip(blocks, scales, freedom, strict=True)
@@ -253,13 +249,15 @@ def block_scales(
 ) -> list[float]:
     """Return the scale of every block: from its own residuals, shrunk towards its group's."""
     found = []
+    # Weight of the group's noise in that of a block, as a number of values.
+    group_freedom = 10.0
     for block, inside, scale, free in zip(blocks, inliers, scales, freedom, strict=True):
         if not block.scaled:
             found.append(1.0)
             continue
         prior = typical[block.group]
-        squares = _squares(block, inside, scale) + _GROUP_FREEDOM * prior**2
-        tempered = float(np.sqrt(squares / (max(free, 0.0) + _GROUP_FREEDOM)))
+        squares = _squares(block, inside, scale) + group_freedom * prior**2
+        tempered = float(np.sqrt(squares / (max(free, 0.0) + group_freedom)))
         found.append(min(tempered, max(_largest_scale(block, free), prior)))
     return found
 
@@ -272,7 +270,9 @@ def _largest_scale(block: Block, freedom: float) -> float:
     values = block.values(block.seen)
     if freedom <= _MIN_FREEDOM or not values:
         return float("inf")
-    return _DOUBT * _median_scale([block]) * float(np.sqrt(values / freedom))
+    # Factor by which the median's scale may be too small by chance.
+    doubt = 1.5
+    return doubt * _median_scale([block]) * float(np.sqrt(values / freedom))
 
 
 def _squares(block: Block, inliers: BoolArray, scale: float) -> float:
@@ -310,18 +310,23 @@ __all__ = [
     "solve",
 ]
 
-_MAX_ROUNDS = 20
-_MAX_ITERATIONS = 60
-_DAMPING_START, _DAMPING_LEAST, _DAMPING_LIMIT, _FREE = 1e-4, 1e-12, 1e10, 1e-3
-# Convergence: steps shorter than this, in sigmas, or a relative decrease of the cost below
-# rounding. The noise can be estimated before that.
-_SMALL_STEP, _SMALL_FALL, _NEAR = 2e-2, 1e-10, 0.5
-# Relative change of a noise scale that does not affect the solution.
-_SAME_SCALE = 5e-3
-# Residual, in sigmas, that stands for an observation that a step makes invisible.
-_LOST = 1e3
-# Relative information below which a combination is known to rounding only.
-_RANK = 1e-13
+
+class _DescentOptions(NamedTuple):
+    """Damping of the steps (Levenberg-Marquardt), and convergence."""
+
+    damping_start: float = 1e-4
+    damping_least: float = 1e-12
+    damping_limit: float = 1e10
+    free: float = 1e-3
+    # Convergence: steps shorter than this, in sigmas, or a relative decrease of the cost below
+    # rounding. The noise can be estimated before that.
+    small_step: float = 2e-2
+    small_fall: float = 1e-10
+    near: float = 0.5
+
+
+_DESCENT = _DescentOptions()
+
 
 State = TypeVar("State")
 
@@ -436,12 +441,13 @@ def solve(
 
 
 def _solved(run: "_Run[State]") -> Solution[State]:
-    run.descend(_NEAR)
-    for _ in range(_MAX_ROUNDS):
+    run.descend(_DESCENT.near)
+    max_rounds = 20
+    for _ in range(max_rounds):
         if not run.rescale():
             break
-        run.descend(_NEAR)
-    run.descend(_SMALL_STEP)
+        run.descend(_DESCENT.near)
+    run.descend(_DESCENT.small_step)
     return run.solution()
 
 
@@ -472,7 +478,9 @@ def inverse(information: FloatArray) -> FloatArray:
         return information
     size = _sizes(information)
     values, vectors = np.linalg.eigh(information / np.outer(size, size))
-    values = np.maximum(values, _RANK * values[-1])
+    # Relative information below which a combination is known to rounding only.
+    rank = 1e-13
+    values = np.maximum(values, rank * values[-1])
     inverted: FloatArray = (vectors / values) @ vectors.T / np.outer(size, size)
     return inverted
 
@@ -488,7 +496,7 @@ class _Run(Generic[State]):
     inliers: list[BoolArray] = field(default_factory=list)
     scales: list[float] = field(default_factory=list)
     typical: dict[str, float] = field(default_factory=dict)
-    damping: float = _DAMPING_START
+    damping: float = _DESCENT.damping_start
     converged: bool = False
     n_iterations: int = 0
 
@@ -505,15 +513,16 @@ class _Run(Generic[State]):
         """Iterate towards the minimum at the present scales and inliers, until steps are small."""
         self.converged = not self.problem.n_parameters
         here = self._cost(self.blocks)
-        for _ in range(_MAX_ITERATIONS):
+        max_iterations = 60
+        for _ in range(max_iterations):
             if self.converged:
                 return
             equations = self._equations()
             there, step = self._lower(equations, here)
             in_sigmas = float(np.sqrt(step @ equations.information @ step))
-            little = here - there <= _SMALL_FALL * here and in_sigmas < 1.0
+            little = here - there <= _DESCENT.small_fall * here and in_sigmas < 1.0
             # A damped step is always short: it is no sign of convergence.
-            free = self.damping <= _FREE
+            free = self.damping <= _DESCENT.free
             self.converged = free and (in_sigmas < small_step or little)
             here = there
 
@@ -527,7 +536,9 @@ class _Run(Generic[State]):
         self.typical = group_scales(self.blocks, self.inliers, self.scales, freedom)
         self.scales = block_scales(self.blocks, self.inliers, self.scales, freedom, self.typical)
         same = all(np.array_equal(a, b) for a, b in zip(before[1], self.inliers, strict=True))
-        return not (same and np.allclose(self.scales, before[0], rtol=_SAME_SCALE, atol=0.0))
+        # Relative change of a noise scale that does not affect the solution.
+        same_scale = 5e-3
+        return not (same and np.allclose(self.scales, before[0], rtol=same_scale, atol=0.0))
 
     def solution(self) -> Solution[State]:
         """Return the result."""
@@ -548,18 +559,18 @@ class _Run(Generic[State]):
     def _lower(self, equations: NormalEquations, here: float) -> tuple[float, FloatArray]:
         """Take the longest step that lowers the cost; return the cost there and the step."""
         diagonal = np.diag(equations.information)
-        while self.damping < _DAMPING_LIMIT:
+        while self.damping < _DESCENT.damping_limit:
             self.n_iterations += 1
             damped = equations.information + np.diag(self.damping * diagonal)
             step = _solve(damped, -equations.gradient)
             trial = self._try(step)
             if trial is not None and trial[2] <= here:
                 self.state, self.blocks, there = trial
-                self.damping = max(self.damping * 0.1, _DAMPING_LEAST)
+                self.damping = max(self.damping * 0.1, _DESCENT.damping_least)
                 return there, step
             self.damping *= 10.0
         # No decrease beyond rounding: the remaining gradient means nothing.
-        self.damping = _DAMPING_START
+        self.damping = _DESCENT.damping_start
         return here, np.zeros(self.problem.n_parameters)
 
     def _try(self, step: FloatArray) -> tuple[State, tuple[Block, ...], float] | None:
@@ -571,7 +582,9 @@ class _Run(Generic[State]):
         return state, blocks, self._cost(blocks)
 
     def _cost(self, blocks: Sequence[Block]) -> float:
-        return cost(blocks, self.inliers, self.scales, _LOST)
+        # Residual, in sigmas, that stands for an observation that a step makes invisible.
+        lost = 1e3
+        return cost(blocks, self.inliers, self.scales, lost)
 
     def _equations(self) -> NormalEquations:
         return normal_equations(self.problem.n_parameters, self.blocks, self.inliers, self.scales)

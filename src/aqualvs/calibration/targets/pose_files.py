@@ -88,10 +88,6 @@ __all__ = ["BoardPose", "load_poses", "match_poses", "picture_paths"]
 _MM = 1e3
 _MATRIX = tuple(f"T{row}{column}" for row in range(3) for column in range(4))
 _COLUMNS = ("file", "distance_mm", *_MATRIX)
-# Error of a rotation matrix by rounded digits.
-_ROTATION_TOLERANCE = 2e-3
-# Tolerance between a row's distance and its matrix: half a degree, half a millimetre.
-_DISTANCE_TOLERANCE_MM = 1.0
 # Limits that reveal other units: no board stands inside a dome, none is seen at 100 m.
 _DISTANCE_MM = (30.0, 1e5)
 _METRES_BELOW = 15.0
@@ -228,8 +224,10 @@ def _matrix_pose(matrix: list[float | None], place: str) -> SE3 | None:
     whole = np.array(known).reshape(3, 4)
     rotation = whole[:, :3]
     off = np.abs(rotation @ rotation.T - np.eye(3)).max()
-    if off > _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0.0:
-        what = "a mirror image" if off <= _ROTATION_TOLERANCE else f"off by {off:.2g}"
+    # Error of a rotation matrix by rounded digits.
+    rotation_tolerance = 2e-3
+    if off > rotation_tolerance or np.linalg.det(rotation) < 0.0:
+        what = "a mirror image" if off <= rotation_tolerance else f"off by {off:.2g}"
         raise CalibrationError(
             f"{place}: T00 to T22 are no rotation ({what}); give the columns of dome_from_board "
             "with at least four decimals"
@@ -246,7 +244,9 @@ def _check_agreement(pose: SE3, distance_mm: float, place: str) -> None:
             f"{place}: the board's plane hardly meets the y axis; leave its distance_mm empty"
         )
     by_matrix_mm = _MM * float(normal @ pose.translation / normal[1])
-    if abs(by_matrix_mm - distance_mm) > _DISTANCE_TOLERANCE_MM:
+    # Tolerance between a row's distance and its matrix: half a degree, half a millimetre.
+    distance_tolerance_mm = 1.0
+    if abs(by_matrix_mm - distance_mm) > distance_tolerance_mm:
         units = abs(_MM * by_matrix_mm - distance_mm) <= 0.01 * distance_mm
         hint = "T03, T13 and T23 look like metres, write millimetres" if units else "mend one"
         raise CalibrationError(

@@ -13,6 +13,7 @@
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -373,13 +374,19 @@ PAPERS_MM: dict[str, tuple[float, float]] = {
 FIT = "fit"
 """Paper that is cut to the size of the print."""
 
-_EDGE_MM = 8.0
-"""Margin that printers leave white."""
-_STRIP_MM = 14.0
-"""Strip below the print for ruler and caption."""
-_RULER_MM = 100.0
-_TEXT_MM = 3.2
-_HAIR_MM = 0.2
+
+class _PrintLayout(NamedTuple):
+    """Layout of a printed target, in millimetres of paper."""
+
+    # Margin that printers leave white.
+    edge_mm: float = 8.0
+    # Strip below the print for ruler and caption.
+    strip_mm: float = 14.0
+    ruler_mm: float = 100.0
+    hair_mm: float = 0.2
+
+
+_PRINT = _PrintLayout()
 
 
 @dataclass(frozen=True, slots=True)
@@ -402,14 +409,16 @@ class Paper:
         """Printable width and height, less the ruler's strip."""
         if self.size_mm is None:
             return np.inf, np.inf
-        return self.size_mm[0] - 2.0 * _EDGE_MM, self.size_mm[1] - 2.0 * _EDGE_MM - _STRIP_MM
+        return self.size_mm[0] - 2.0 * _PRINT.edge_mm, self.size_mm[
+            1
+        ] - 2.0 * _PRINT.edge_mm - _PRINT.strip_mm
 
     def page_mm(self, width: float, height: float) -> tuple[float, float]:
         """Return the page's size for a print of this size."""
         if self.size_mm is not None:
             return self.size_mm
-        wide = max(width, _RULER_MM + 60.0)
-        return wide + 2.0 * _EDGE_MM, height + 2.0 * _EDGE_MM + _STRIP_MM
+        wide = max(width, _PRINT.ruler_mm + 60.0)
+        return wide + 2.0 * _PRINT.edge_mm, height + 2.0 * _PRINT.edge_mm + _PRINT.strip_mm
 
 
 def papers(word: str) -> tuple[Paper, Paper]:
@@ -438,7 +447,7 @@ def papers(word: str) -> tuple[Paper, Paper]:
             "600x400"
         )
     width, height = float(match[1]), float(match[2])
-    if min(width, height) < _RULER_MM + 2.0 * _EDGE_MM:
+    if min(width, height) < _PRINT.ruler_mm + 2.0 * _PRINT.edge_mm:
         raise OptionError(
             f"--paper {word}: too small for the ruler of 100 mm; take at least 116x116"
         )
@@ -478,37 +487,38 @@ def sheet(paper: Paper, rectangles: FloatArray, size: tuple[float, float], words
         Caption, in small print.
     """
     width, height = paper.page_mm(*size)
-    left, top = 0.5 * (width - size[0]), _EDGE_MM
+    left, top = 0.5 * (width - size[0]), _PRINT.edge_mm
     if paper.size_mm is not None:
-        top = 0.5 * (height - _STRIP_MM - size[1])
+        top = 0.5 * (height - _PRINT.strip_mm - size[1])
     placed = rectangles + np.array([left, top, 0.0, 0.0])
-    ruler_y = height - _EDGE_MM - 8.0
+    ruler_y = height - _PRINT.edge_mm - 8.0
     scale = "the line above measures exactly 100 mm: print at 100 %, without fitting to the page"
+    text_mm = 3.2
     texts = (
-        Text(_EDGE_MM, height - _EDGE_MM - 4.2, _TEXT_MM, words),
-        Text(_EDGE_MM, height - _EDGE_MM, _TEXT_MM, scale),
+        Text(_PRINT.edge_mm, height - _PRINT.edge_mm - 4.2, text_mm, words),
+        Text(_PRINT.edge_mm, height - _PRINT.edge_mm, text_mm, scale),
     )
-    return PdfPage(width, height, np.concatenate([placed, ruler(_EDGE_MM, ruler_y)]), texts)
+    return PdfPage(width, height, np.concatenate([placed, ruler(_PRINT.edge_mm, ruler_y)]), texts)
 
 
 def ruler(x: float, y: float) -> FloatArray:
     """Return the rectangles (N, 4) of a ruler of 100 mm, with a tick every 10 mm."""
-    ticks = np.arange(0.0, _RULER_MM + 1.0, 10.0)
+    ticks = np.arange(0.0, _PRINT.ruler_mm + 1.0, 10.0)
     high = np.where(ticks % 50.0 == 0.0, 4.0, 2.5)
     # The outer edges of the first and the last tick are 100 mm apart.
-    lefts = x + ticks - _HAIR_MM * ticks / _RULER_MM
-    marks = np.stack([lefts, y - high, np.full_like(ticks, _HAIR_MM), high], axis=-1)
-    return np.concatenate([marks, [[x, y - _HAIR_MM, _RULER_MM, _HAIR_MM]]])
+    lefts = x + ticks - _PRINT.hair_mm * ticks / _PRINT.ruler_mm
+    marks = np.stack([lefts, y - high, np.full_like(ticks, _PRINT.hair_mm), high], axis=-1)
+    return np.concatenate([marks, [[x, y - _PRINT.hair_mm, _PRINT.ruler_mm, _PRINT.hair_mm]]])
 
 
 def outline(x: float, y: float, width: float, height: float) -> FloatArray:
     """Return the rectangles (4, 4) of a hairline to cut along, in its middle."""
-    half = 0.5 * _HAIR_MM
+    half = 0.5 * _PRINT.hair_mm
     return np.array(
         [
-            [x - half, y - half, width + _HAIR_MM, _HAIR_MM],
-            [x - half, y + height - half, width + _HAIR_MM, _HAIR_MM],
-            [x - half, y + half, _HAIR_MM, height - _HAIR_MM],
-            [x + width - half, y + half, _HAIR_MM, height - _HAIR_MM],
+            [x - half, y - half, width + _PRINT.hair_mm, _PRINT.hair_mm],
+            [x - half, y + height - half, width + _PRINT.hair_mm, _PRINT.hair_mm],
+            [x - half, y + half, _PRINT.hair_mm, height - _PRINT.hair_mm],
+            [x + width - half, y + half, _PRINT.hair_mm, height - _PRINT.hair_mm],
         ]
     )

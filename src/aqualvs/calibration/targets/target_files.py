@@ -9,7 +9,7 @@ markers at known places their sizes, corner order, planes and units.
 import difflib
 import re
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
 import yaml
@@ -159,14 +159,23 @@ def parse_target(content: dict[Any, Any], model: type[_File], source: str) -> _F
         raise CalibrationError(f"{source}: {_WORDS.first_fault(error, model)}") from None
 
 
-# Tolerance of a ruler, as a share of the marker and in millimetres.
-_SIDE_TOLERANCE = (0.02, 0.2)
-_PLANE_TOLERANCE_MM = 0.5
-_SMALLEST_MM = 3.0
-# Limits that reveal other units: a box with all markers nearer to its origin holds no vehicle, and
-# no dome is small enough for a target this near to its centre.
-_SMALLEST_BOX_MM = 100.0
-_NEAREST_TARGET_MM = 30.0
+class _Tolerances(NamedTuple):
+    """Tolerances and likely sizes of targets, in millimetres."""
+
+    # Tolerance of a ruler, as a share of the marker and in millimetres.
+    side: tuple[float, float] = (0.02, 0.2)
+    plane_mm: float = 0.5
+    smallest_mm: float = 3.0
+    # Limits that reveal other units: a box with all markers nearer to its origin holds no vehicle,
+    # and no dome is small enough for a target this near to its centre.
+    smallest_box_mm: float = 100.0
+    nearest_target_mm: float = 30.0
+    # Unlikely sizes of a board's squares.
+    square_mm: tuple[float, float] = (3.0, 1000.0)
+
+
+_TOLERANCES = _Tolerances()
+
 _UNITS = {1e-3: "metres", 1e-1: "centimetres"}
 
 
@@ -218,7 +227,7 @@ def _check_shape(part: MarkerPart) -> None:
     corners = np.array(part.corners)
     sides = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
     diagonals = np.linalg.norm(corners[2:] - corners[:2], axis=1)
-    if part.size_mm < _SMALLEST_MM:
+    if part.size_mm < _TOLERANCES.smallest_mm:
         unit = "metres" if part.size_mm < 0.3 else "centimetres"
         raise CalibrationError(
             f"marker {part.id}: size_mm is {part.size_mm:g}; it looks like {unit}, write "
@@ -230,7 +239,7 @@ def _check_shape(part: MarkerPart) -> None:
                 f"marker {part.id}: its corners are {sides[0]:g} apart, but size_mm is "
                 f"{part.size_mm:g}; the corners look like {unit}, write millimetres"
             )
-    tolerance = max(_SIDE_TOLERANCE[0] * part.size_mm, _SIDE_TOLERANCE[1])
+    tolerance = max(_TOLERANCES.side[0] * part.size_mm, _TOLERANCES.side[1])
     if np.any(np.abs(sides - np.sqrt(2.0) * part.size_mm) < tolerance):
         raise CalibrationError(
             f"marker {part.id}: its corners are not in order around it; write top-left, "
@@ -258,7 +267,7 @@ def _check_plane(part: MarkerPart, planes: dict[str, Plane]) -> None:
         raise CalibrationError(f"marker {part.id}: plane {part.plane!r} is not in planes; {known}")
     off = planes[part.plane].signed_distance(np.array(part.corners))
     worst = int(np.argmax(np.abs(off)))
-    if abs(off[worst]) > _PLANE_TOLERANCE_MM:
+    if abs(off[worst]) > _TOLERANCES.plane_mm:
         raise CalibrationError(
             f"marker {part.id}: corner {worst} lies {abs(off[worst]):.1f} mm off plane "
             f"{part.plane!r}; mend the corner, the plane's d, or the plane's name"
@@ -267,12 +276,12 @@ def _check_plane(part: MarkerPart, planes: dict[str, Plane]) -> None:
 
 def _check_extent(corners: FloatArray, frame: str) -> None:
     distance = np.linalg.norm(corners, axis=-1)
-    if frame == "box" and distance.max() < _SMALLEST_BOX_MM:
+    if frame == "box" and distance.max() < _TOLERANCES.smallest_box_mm:
         raise CalibrationError(
             f"no corner is farther than {distance.max():.3g} mm from the box's origin; it looks "
             "like centimetres, write millimetres"
         )
-    if frame == "dome" and distance.min() < _NEAREST_TARGET_MM:
+    if frame == "dome" and distance.min() < _TOLERANCES.nearest_target_mm:
         raise CalibrationError(
             f"a corner is only {distance.min():.3g} mm from the dome's centre, inside any dome; "
             "check the units (millimetres) and that corners are given in the dome's frame"
@@ -303,8 +312,6 @@ _FRAME_TEXTS = {
     "dome": "dome (origin at the dome's centre, x right, y forward, z up), mm",
     "plate": "plate (x right, y down, origin at its top left), mm; NOT the dome: measure its place",
 }
-# Unlikely sizes of a board's squares.
-_SQUARE_MM = (3.0, 1000.0)
 
 
 def load_board(path: str | Path) -> Board:
@@ -318,7 +325,7 @@ def load_board(path: str | Path) -> Board:
     source = Path(path)
     file = parse_target(read_mapping(source, "a board.yaml"), BoardFile, str(source))
     kind = _board_kind(file, source)
-    if not _SQUARE_MM[0] <= file.square_mm <= _SQUARE_MM[1]:
+    if not _TOLERANCES.square_mm[0] <= file.square_mm <= _TOLERANCES.square_mm[1]:
         raise CalibrationError(f"{source}: {_unlikely_square(file.square_mm)}")
     try:
         return Board(
@@ -371,7 +378,13 @@ def _squares(file: BoardFile, source: Path) -> tuple[int, int]:
 
 
 def _unlikely_square(square_mm: float) -> str:
-    unit = "metres" if square_mm < 0.5 else "centimetres" if square_mm < _SQUARE_MM[0] else ""
+    unit = (
+        "metres"
+        if square_mm < 0.5
+        else "centimetres"
+        if square_mm < _TOLERANCES.square_mm[0]
+        else ""
+    )
     looks = f"it looks like {unit}" if unit else "no camera sees one whole"
     return f"square_mm is {square_mm:g}; {looks}, give the side of a square in millimetres"
 

@@ -15,6 +15,7 @@ import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -44,16 +45,6 @@ from aqualvs.errors import CalibrationError, RigError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.optics.rig import Rig, RigUncertainty
 
-# Change to be detected: one standard deviation of a frame.
-_ALLOWANCE = 0.5
-# Independent normal innovations give a false alarm every exp(2 * 0.5 * 21) frames: years at 25 fps.
-_LIMIT = 20.0
-# Limit of a single frame, so that one wrong picture raises no alarm; four in a row do.
-_LARGEST = 7.0
-# Compression repeats its errors over a group of pictures: frames are correlated that long.
-_BLOCK = 12
-_MEMORY = 100
-
 
 @dataclass(slots=True)
 class CusumTest:
@@ -81,12 +72,19 @@ class CusumTest:
             Number of frames since the start of the change, this one included, if it raises the
             alarm; else 0.
         """
+        # Change to be detected: one standard deviation of a frame.
+        allowance = 0.5
+        # Independent normal innovations give a false alarm every exp(2 * 0.5 * 21) frames: years at
+        # 25 fps.
+        limit = 20.0
+        # Limit of a single frame, so that one wrong picture raises no alarm; four in a row do.
+        largest = 7.0
         for side, sign in enumerate((1.0, -1.0)):
-            bounded = min(max(sign * standardised, -_LARGEST), _LARGEST)
-            total = max(self._sums[side] + bounded - _ALLOWANCE, 0.0)
+            bounded = min(max(sign * standardised, -largest), largest)
+            total = max(self._sums[side] + bounded - allowance, 0.0)
             self._sums[side] = total
             self._lengths[side] = self._lengths[side] + 1 if total > 0.0 else 0
-            if total > _LIMIT:
+            if total > limit:
                 began = self._lengths[side]
                 self.forget()
                 return began
@@ -104,28 +102,37 @@ class CusumTest:
 
     def _spread(self, standardised: float) -> None:
         self._block.append(standardised)
-        if len(self._block) < _BLOCK:
+        # Compression repeats its errors over a group of pictures: frames are correlated that long.
+        block = 12
+        memory = 100
+        if len(self._block) < block:
             return
         self._n_blocks += 1
-        square = min(float(np.sum(self._block)) ** 2 / _BLOCK, 9.0)
-        share = 1.0 / min(self._n_blocks + 8, _MEMORY)
+        square = min(float(np.sum(self._block)) ** 2 / block, 9.0)
+        share = 1.0 / min(self._n_blocks + 8, memory)
         # Innovations are in units of the inflated noise: a spread above 1 raises the inflation.
         squared = self.inflation**2 * (1.0 + share * (square - 1.0))
         self.inflation = float(np.sqrt(min(max(squared, 1.0), 100.0)))
         self._block = []
 
 
-# Noise of a corner before any residuals, least estimate from a first frame, and least of all.
-_NOMINAL_NOISE, _FIRST_NOISE, _MIN_NOISE = 0.1, 0.03, 0.005
-_NOISE_MEMORY = 100
-_FIRST_ROUNDS = 4
-# A frame with a larger innovation waits for the next ones before it is used.
-_WAIT = 4.0
-# Number of frames that can be taken back after a step.
-_KEPT = 50
-_MISFIT = 2.0
-# Number of last frames of a run that determine the size of a jump, and largest cost of a frame.
-_TELLING, _GROSS = 5, 16.0
+class _FilterOptions(NamedTuple):
+    """Noise of the corners in pixels, and the treatment of frames that contradict."""
+
+    # Noise of a corner before any residuals, least estimate from a first frame, and least of all.
+    nominal_noise: float = 0.1
+    first_noise: float = 0.03
+    min_noise: float = 0.005
+    noise_memory: int = 100
+    first_rounds: int = 4
+    # A frame with a larger innovation waits for the next ones before it is used.
+    wait: float = 4.0
+    # Number of frames that can be taken back after a step.
+    kept: int = 50
+    misfit: float = 2.0
+
+
+_FILTER = _FilterOptions()
 
 
 @dataclass(slots=True)
@@ -161,7 +168,7 @@ class IndexEstimator:
     steps: list[IndexStep] = field(default_factory=list)
     _model: IndexModel = field(init=False, repr=False)
     _state: IndexState | None = None
-    _noise: float = _NOMINAL_NOISE
+    _noise: float = _FILTER.nominal_noise
     _n_frames: int = 0
     _n_lost: int = 0
     _contradicted: bool = False
@@ -171,7 +178,7 @@ class IndexEstimator:
     _sigma_frame: float = math.inf
     _test: CusumTest = field(default_factory=CusumTest, repr=False)
     _recent: deque[tuple[IndexState, Innovation]] = field(
-        default_factory=lambda: deque(maxlen=_KEPT), repr=False
+        default_factory=lambda: deque(maxlen=_FILTER.kept), repr=False
     )
 
     def __post_init__(self) -> None:
@@ -261,13 +268,13 @@ class IndexEstimator:
     def _first(self, name: str, frame: FrameCorners) -> IndexReading:
         self._model = self._model_about(frame.points.mean(axis=0))
         start = self.rig.n_water if self.prior is None else self.prior.n
-        state, noise = self._model.first(frame, start), _NOMINAL_NOISE
-        for _ in range(_FIRST_ROUNDS):
+        state, noise = self._model.first(frame, start), _FILTER.nominal_noise
+        for _ in range(_FILTER.first_rounds):
             seen = compare(self._model, state, frame, noise)
             if not seen.fits:
                 return self._reading(frame.time, name, _not_there(seen))
             update = believe(self._model, state, seen.frame, noise)
-            noise = max(update.noise, _FIRST_NOISE)
+            noise = max(update.noise, _FILTER.first_noise)
         self._last_time, self._noise = frame.time, noise
         return self._accept(name, seen, update, state.n)
 
@@ -278,7 +285,7 @@ class IndexEstimator:
         noise = self._noise * self._test.inflation
         seen = compare(self._model, state, frame, noise)
         # Corners that fit one by one may still be those of a plate that has moved slightly.
-        self._n_lost = 0 if seen.fits and seen.misfit < _MISFIT else self._n_lost + 1
+        self._n_lost = 0 if seen.fits and seen.misfit < _FILTER.misfit else self._n_lost + 1
         if not seen.fits:
             return self._reading(frame.time, name, _not_there(seen))
         self._recent.append((last, seen))
@@ -286,7 +293,7 @@ class IndexEstimator:
         began = self._test.add(standardised)
         if began:
             return self._jump(name, min(began, len(self._recent)))
-        if abs(standardised) > _WAIT:
+        if abs(standardised) > _FILTER.wait:
             n = state.n + seen.shift
             waits = f"alone it gives an index of {n:.4f}; the next frames will tell"
             return self._reading(frame.time, name, waits, n_frame=n)
@@ -296,9 +303,11 @@ class IndexEstimator:
     def _accept(self, name: str, seen: Innovation, update: Update, n: float) -> IndexReading:
         self._state = update.state
         self._n_frames += 1
-        share = max(1.0 / self._n_frames, 1.0 / _NOISE_MEMORY)
+        share = max(1.0 / self._n_frames, 1.0 / _FILTER.noise_memory)
         square = self._noise**2 + share * (update.noise**2 - self._noise**2)
-        self._noise = max(math.sqrt(square), _FIRST_NOISE if self._n_frames < 2 else _MIN_NOISE)
+        self._noise = max(
+            math.sqrt(square), _FILTER.first_noise if self._n_frames < 2 else _FILTER.min_noise
+        )
         self._sigma_frame = seen.sigma_frame
         return self._reading(seen.frame.time, name, n_frame=n + seen.shift, update=update)
 
@@ -317,7 +326,7 @@ class IndexEstimator:
         sigma, step = math.hypot(sigma, slope * size), None
         if abs(size) > max(self.options.smallest_step, 3.0 * sigma):
             misfit = float(np.median([seen.misfit for _, seen in since]))
-            step = IndexStep(since[0][1].frame.time, size, sigma, misfit < _MISFIT)
+            step = IndexStep(since[0][1].frame.time, size, sigma, misfit < _FILTER.misfit)
             self.steps.append(step)
             self._moved = self._moved or not step.by_medium
         return self._reading(self._last_time, name, n_frame=state.n, update=update, step=step)
@@ -332,7 +341,7 @@ class IndexEstimator:
         for _, later in since[1:]:
             state = self._until(update.state, later.frame)
             seen = compare(self._model, state, later.frame, noise)
-            if seen.fits and abs(seen.shift) < _WAIT * seen.sigma:
+            if seen.fits and abs(seen.shift) < _FILTER.wait * seen.sigma:
                 update = believe(self._model, state, seen.frame, noise)
         return update.state.later(self._last_time, self.options.drift), update
 
@@ -399,9 +408,11 @@ def _onset(standardised: FloatArray) -> int:
 
     By truncated least squares of a change of the mean from zero.
     """
-    after = float(np.median(standardised[-_TELLING:]))
-    without = np.minimum(standardised**2, _GROSS)
-    with_jump = np.minimum((standardised - after) ** 2, _GROSS)
+    # Number of last frames of a run that determine the size of a jump, and largest cost of a frame.
+    telling, gross = 5, 16.0
+    after = float(np.median(standardised[-telling:]))
+    without = np.minimum(standardised**2, gross)
+    with_jump = np.minimum((standardised - after) ** 2, gross)
     costs = np.concatenate([[0.0], np.cumsum(without - with_jump)[:-1]])
     return int(np.argmin(costs))
 

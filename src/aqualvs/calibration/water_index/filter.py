@@ -91,9 +91,6 @@ LINEAR = 1e-4
 """Steps of the index up to this are linear to far below the noise of a corner."""
 
 _LOWEST, _HIGHEST = 1.0, 1.7
-_NEWTON = 30
-# Changes of the camera's numbers up to this many standard deviations are linearised.
-_NEARLY = 0.02
 
 
 class Line(NamedTuple):
@@ -256,7 +253,8 @@ class IndexModel:
         be wrong.
         """
         n = min(max(state.n, _LOWEST), _HIGHEST)
-        for _ in range(_NEWTON):
+        newton = 30
+        for _ in range(newton):
             step = median_shift(self.line(at_index(state, n, slopes_too=True), frame))
             new = min(max(n + step, _LOWEST), _HIGHEST)
             if abs(new - n) < LINEAR:
@@ -280,7 +278,9 @@ class _MovedRig:
 
     def near(self, step: FloatArray) -> tuple[Rig, FloatArray]:
         """Return the rig moved by nearly `step`, and the remainder to be added linearly."""
-        if np.any(np.abs(step - self._step) > _NEARLY * self.sigmas):
+        # Changes of the camera's numbers up to this many standard deviations are linearised.
+        nearly = 0.02
+        if np.any(np.abs(step - self._step) > nearly * self.sigmas):
             self._last = rig_moved_by(self.rig, self.names, step)
             self._step = step.copy()
         return self._last, step - self._step
@@ -308,10 +308,6 @@ def median_shift(line: Line) -> float:
 
 
 _REJECT = 5.0
-_REJECTED = 1e-6
-_PASSES = 5
-# Median of the square of a normal deviate.
-_HALF = 0.4549
 
 
 @dataclass(frozen=True, slots=True)
@@ -414,18 +410,22 @@ def believe(model: IndexModel, state: IndexState, frame: FrameCorners, noise: fl
     state = state.with_slopes_near()
     state = model.settled(state, model.line(state, frame), frame)
     at, weights = state, np.ones(len(frame.ids))
-    for _ in range(_PASSES):
+    rejected = 1e-6
+    passes = 5
+    for _ in range(passes):
         used = weights
         step = _kalman_step(state, at, model.line(at, frame), np.repeat(noise**2 / used, 2))
         lengths = _lengths(step.left / np.sqrt(step.expected))
         close = abs(step.mean[N] - at.n) < LINEAR
         at = replace(state, mean=step.mean)
-        weights = np.where(lengths < _REJECT, RobustLoss.HUBER.weight(lengths), _REJECTED)
+        weights = np.where(lengths < _REJECT, RobustLoss.HUBER.weight(lengths), rejected)
         if close and np.allclose(weights, used, atol=0.05):
             break
-    good = np.repeat(used > _REJECTED, 2)
+    good = np.repeat(used > rejected, 2)
     rms = float(np.sqrt(np.mean(step.left[good] ** 2))) if np.any(good) else np.nan
-    estimate = noise * np.sqrt(np.median(step.left**2 / step.expected) / _HALF)
+    # Median of the square of a normal deviate.
+    half = 0.4549
+    estimate = noise * np.sqrt(np.median(step.left**2 / step.expected) / half)
     information = 1.0 / state.random_variance + step.information
     after = replace(at, covariance=step.covariance(), random_variance=1.0 / information)
     return Update(after, int(np.count_nonzero(good)) // 2, rms, float(estimate))

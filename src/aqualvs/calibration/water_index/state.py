@@ -20,8 +20,6 @@ from aqualvs.optics.water import (
     seawater_index_vacuum,
 )
 
-# Standard deviation of the fit of Quan & Fry (1995) to its data.
-_SIGMA_FORMULA = 1.5e-5
 # Air's index less one goes with its density: 3 K or 10 hPa change it by 1 %, 3e-6.
 _SIGMA_AIR = 1e-5
 _STEP_NM = 1.0
@@ -104,11 +102,13 @@ class IndexPrior:
         slopes = seawater_index_slopes(temperature_c, salinity_permille, wavelength_nm)
         side = math.copysign(_STEP_NM, GREEN_NM - wavelength_nm)
         beside = seawater_index_vacuum(temperature_c, salinity_permille, wavelength_nm + side)
+        # Standard deviation of the fit of Quan & Fry (1995) to its data.
+        sigma_formula = 1.5e-5
         parts = (
             float(slopes.by_temperature) * sigma_temperature_c,
             float(slopes.by_salinity) * sigma_salinity_permille,
             (float(beside) - n) / _STEP_NM * sigma_wavelength_nm,
-            _SIGMA_FORMULA,
+            sigma_formula,
         )
         source = f"{temperature_c:g} °C, {salinity_permille:g} per mille"
         return cls(n / N_AIR * n_air, math.hypot(*parts), source)
@@ -121,10 +121,6 @@ POSE = slice(3, 9)
 FIRST_CAMERA = 9
 FAR = 0.02
 """Change of the index from which derivatives are taken anew."""
-
-# Correlation length of corners' errors over the motion of the picture, and motion below which
-# errors are kept.
-_SAME_PX, _STILL_PX = 0.4, 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -249,8 +245,11 @@ class IndexState:
         known = np.isfinite(moved[:, 0])
         way = float(np.linalg.norm(np.median(moved[known], axis=0))) if np.any(known) else 0.0
         state, seen_at = self, self.seen_at.copy()
-        if way > _STILL_PX:
-            kept = math.exp(-((way / _SAME_PX) ** 2))
+        # Correlation length of corners' errors over the motion of the picture, and motion below
+        # which errors are kept.
+        same_px, still_px = 0.4, 0.1
+        if way > still_px:
+            kept = math.exp(-((way / same_px) ** 2))
             state = self._with_corners_renewed(kept, sigma_px)
             seen_at[:] = np.nan
         fresh = ~np.isfinite(seen_at[rows, 0])
@@ -314,10 +313,6 @@ def first_state(
 # Number of standard deviations beyond which the target counts as moved.
 _MOVED = 4.0
 _LOST_FRAMES = 10
-# Ratio of the corners' errors to the expected ones that is reported.
-_CROOKED = 2.0
-# Fresh water and sea water differ by 0.008: an index known to half of that still separates them.
-_LARGEST_SIGMA = 4e-3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -370,10 +365,13 @@ class IndexOptions:
         """
         _check_not_negative("--place-sigma-mm", place_sigma_mm)
         _check_not_negative("--turn-sigma-deg", turn_sigma_deg)
+        # Fresh water and sea water differ by 0.008: an index known to half of that still separates
+        # them.
+        largest_sigma = 4e-3
         return cls(
             sigma_place=place_sigma_mm / 1e3,
             sigma_turn=math.radians(turn_sigma_deg),
-            largest_sigma=_LARGEST_SIGMA,
+            largest_sigma=largest_sigma,
         )
 
     @property
@@ -592,7 +590,9 @@ class Knowledge:
             )
         corners = self.joint.mean[POSE.stop + self.n_camera :]
         off = float(np.sqrt(np.mean(corners**2))) if len(corners) else 0.0
-        if off > _CROOKED * self.options.sigma_corner_px:
+        # Ratio of the corners' errors to the expected ones that is reported.
+        crooked = 2.0
+        if off > crooked * self.options.sigma_corner_px:
             return (
                 f"corners are always off by {off:.2f} px, more than was assumed; check the "
                 "target's print and the camera's calibration"

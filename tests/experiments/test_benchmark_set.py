@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from aqualvs.errors import AqualvsError, SourceError
-from aqualvs.experiments.benchmark.set import (
+from aqualvs.experiments.benchmark_set import (
     BenchmarkSet,
     DiveTruth,
     load_set,

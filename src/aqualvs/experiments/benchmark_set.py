@@ -297,7 +297,6 @@ def _read_yaml(path: Path) -> dict[str, Any]:
 
 
 _README_MD = "README.md"
-_PICTURES_A_SECOND = 25.0
 
 
 def make_set(
@@ -339,8 +338,9 @@ def make_set(
     files = [out / name for name in (SET_FILE, _README_MD, *(dive.name for dive in dives))]
     claim = Claim("benchmark", files, overwrite=overwrite)
     rig = benchmark_rig()
+    pictures_a_second = 25.0
     if shutter is not None:
-        rig = replace(rig, shutter=shutter_from_words(shutter, _PICTURES_A_SECOND))
+        rig = replace(rig, shutter=shutter_from_words(shutter, pictures_a_second))
     renderer = Renderer(rig, threads=os.cpu_count() or 1)
     total = sum(dive.scenario.n_frames for dive in dives)
     with claim, writing(out), progress(BENCHMARK_NAME, total) as tick:

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aqualvs.experiments.benchmark.score import bars_against, compare, pooled, score
-from aqualvs.experiments.benchmark.set import Answers, DiveTruth
+from aqualvs.experiments.benchmark_score import bars_against, compare, pooled, score
+from aqualvs.experiments.benchmark_set import Answers, DiveTruth
 
 NAN = math.nan
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from aqualvs.errors import OptionError
-from aqualvs.experiments.benchmark.set import (
+from aqualvs.experiments.benchmark_set import (
     TARGET_FILE,
     Answers,
     BenchmarkSet,
@@ -31,7 +31,7 @@ from aqualvs.pipeline import run
 from aqualvs.results.files import Claim, writing
 from aqualvs.results.folder import POSTURE_BARE_CSV
 from aqualvs.results.run_request import RunRequest, scanner_options
-from aqualvs.scanning.target import TargetKind
+from aqualvs.scanning.surfaces import TargetKind
 from aqualvs.simulation.benchmark import VISIBLE_LIMIT
 
 WRONG_PERCENT = 5.0

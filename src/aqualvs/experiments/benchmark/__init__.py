@@ -1,1 +1,0 @@
-"""The public benchmark set and the scores of systems on it."""
