@@ -6,10 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from aqualvs.control.answer_watch import AnswerLimits, AnswerWatch
 from aqualvs.control.autopilot import Decision
 from aqualvs.control.gains_file import load_gains
 from aqualvs.control.missions import HoldMission
-from aqualvs.control.safety import AnswerLimits, AnswerWatch, LimitReason
+from aqualvs.control.safety import LimitReason
 from aqualvs.control.vehicle import NEUTRAL, Effort, Setpoint
 from aqualvs.errors import OptionError
 from aqualvs.follow.case import SimCase, sea, vehicle_model
@@ -20,6 +21,9 @@ from control_cases import FRAME_S, posture_at, state_at
 
 GAINS = load_gains("bluerov2")
 HELD = Effort(forward=0.3)
+DOUBTS = (LimitReason.FROZEN, LimitReason.NO_ANSWER)
+# No prediction is usually so good, and no attitude so still.
+EFFORTS_ALONE = AnswerLimits(usual=1e-9, swung=1.0)
 
 
 def noisy(rng: np.random.Generator, distance: float = 0.6, yaw: float = 0.0) -> Posture:
@@ -108,6 +112,9 @@ def test_a_way_along_a_curved_net_is_an_answer(turned_deg_s: float, receding_m_s
         watch.done(now_s, HELD)
 
 
+FREEZE_S = 14.0
+
+
 class NoticingSensor(SampledSensor):
     """One whose frozen picture is known for one from some time on, as the live run does."""
 
@@ -115,7 +122,9 @@ class NoticingSensor(SampledSensor):
 
     def look(self, world_from_dome: SE3, time_s: float) -> Posture | Refusal | None:
         seen = super().look(world_from_dome, time_s)
-        return Refusal(Reason.FROZEN) if time_s >= self.noticed_s else seen
+        if time_s < self.noticed_s:
+            return seen
+        return Refusal(Reason.FROZEN, still_s=time_s - FREEZE_S)
 
 
 def frozen_hold(
@@ -126,39 +135,48 @@ def frozen_hold(
     since_s: float = 0.3,
     noticed_s: float = math.inf,
     seed: int = 1,
+    waves: float = 0.0,
 ) -> tuple[float, float, list[Decision]]:
-    """Hold 0.6 m in calm water; sight freezes at 14 s, some time after the setpoint came."""
-    freeze_s, mission = 14.0, HoldMission(Setpoint(before))
+    """Hold 0.6 m; sight freezes some time after the setpoint came.
+
+    Return the time from the freeze to neutral that stays, the nearest range and the decisions.
+    """
+    mission = HoldMission(Setpoint(before))
     model = vehicle_model(name)
     case = SimCase(
         model=model,
         gains=load_gains(model.name),
-        water=sea(current=0.0, waves=0.0, seed=seed),
+        water=sea(current=0.0, waves=waves, seed=seed),
         start_range=before,
         seed=seed,
     )
-    blind = (Blind(freeze_s, math.inf, loss),)
+    blind = (Blind(FREEZE_S, math.inf, loss),)
     eye = NoticingSensor(case.net, np.random.default_rng(seed), blind=blind)
-    eye.noticed_s = freeze_s + noticed_s
+    eye.noticed_s = FREEZE_S + noticed_s
     loop, decisions = case.loop(eye, mission), []
 
     def keep(now_s: float, *step: object) -> None:
-        if now_s > freeze_s:
+        if now_s > FREEZE_S:
             assert isinstance(step[2], Decision)
             decisions.append((now_s, step[2]))
 
     def step(now_s: float) -> None:
-        if now_s >= freeze_s - since_s:
+        if now_s >= FREEZE_S - since_s:
             mission.setpoint = Setpoint(0.6)
 
     loop.on_step = keep
-    log = loop.run(freeze_s + 5.0, step)
-    neutral_s = next(at for at, one in decisions if one.effort == NEUTRAL) - freeze_s
-    after = log.column("time_s") >= freeze_s
+    log = loop.run(FREEZE_S + 5.0, step)
+    doubted_s = next((at for at, one in decisions if one.reason in DOUBTS), math.inf)
+    after_it = [(at, one) for at, one in decisions if at >= doubted_s]
+    neutral_s = next((at for at, one in after_it if one.effort == NEUTRAL), math.inf) - FREEZE_S
+    after = log.column("time_s") >= FREEZE_S
     return neutral_s, float(log.column("range")[after].min()), [one for _, one in decisions]
 
 
-@pytest.mark.parametrize("name", ["bluerov2", "bluerov2-heavy"])
+NAMES = pytest.mark.parametrize("name", ["bluerov2", "bluerov2-heavy"])
+
+
+@NAMES
 @pytest.mark.parametrize("before", [0.6, 0.75])
 def test_a_frozen_posture_stops_the_vehicle_in_time(name: str, before: float) -> None:
     neutral_s, nearest, decisions = frozen_hold(name, LossOfSight.FROZEN, before=before)
@@ -168,31 +186,86 @@ def test_a_frozen_posture_stops_the_vehicle_in_time(name: str, before: float) ->
     assert decisions[-1].reason is LimitReason.FROZEN
 
 
-@pytest.mark.parametrize("name", ["bluerov2", "bluerov2-heavy"])
-@pytest.mark.parametrize("noticed_s", [0.24, 0.4, 0.5])
-def test_a_vehicle_that_approaches_a_frozen_net_is_braked(name: str, noticed_s: float) -> None:
-    """In the midst of a step it coasts 0.3 m; as much effort astern as stops it prevents that."""
+@NAMES
+@pytest.mark.parametrize("noticed_s", [0.24, 0.32, 0.4])
+def test_a_vehicle_that_approaches_a_frozen_net_is_braked_while_there_is_time(
+    name: str, noticed_s: float
+) -> None:
+    """Half a second after the freeze at the latest it is neutral, and comes to rest."""
     for since_s in (0.9, 1.8):
-        _, nearest, decisions = frozen_hold(
+        neutral_s, nearest, decisions = frozen_hold(
             name, LossOfSight.STUCK, before=0.75, since_s=since_s, noticed_s=noticed_s
         )
-        assert nearest >= 0.45
-        # Not thrown back either.
-        assert nearest <= 0.75
-        doubted = [one for one in decisions if one.reason is LimitReason.FROZEN]
+        assert neutral_s <= 0.5
+        # Without a brake the BlueROV2 coasts by 0.3 m. Not thrown back either.
+        assert 0.3 < nearest <= 0.75
+        doubted = [one for one in decisions if one.reason in DOUBTS]
         pushes = [one.effort for one in doubted if one.effort != NEUTRAL]
         assert len(pushes) <= 3
         assert all(-1.0 <= one.forward < 0.0 and one.right == one.yaw == 0.0 for one in pushes)
         assert doubted[-1].effort == NEUTRAL
+        if noticed_s < 0.3:
+            assert nearest >= 0.45
 
 
-def test_a_vehicle_that_moves_unseen_is_given_back() -> None:
-    """The picture stands still, yet has noise: efforts alone tell."""
-    neutral_s, _, decisions = frozen_hold("bluerov2", LossOfSight.STUCK, before=0.75)
-    assert neutral_s <= 3.5
+@NAMES
+def test_an_approach_that_ends_at_once_is_a_still(name: str) -> None:
+    """It has noise of its own; no effort has ended the approach."""
+    neutral_s, nearest, decisions = frozen_hold(name, LossOfSight.STUCK, before=0.75, since_s=1.2)
+    assert neutral_s <= 0.55
+    assert nearest >= 0.45
     assert decisions[-1].reason is LimitReason.NO_ANSWER
     assert not decisions[-1].engaged
     assert LimitReason.NO_ANSWER.takes_over
+
+
+@NAMES
+def test_a_vehicle_that_moves_unseen_is_given_back(name: str) -> None:
+    """What the efforts promise is enough, in a sea where approaches may end at any moment."""
+    watch = AnswerWatch(load_gains(name.replace("-", "_")).vehicle, EFFORTS_ALONE)
+    rng, found = np.random.default_rng(9), []
+    for k in range(500):
+        now_s = FRAME_S * k
+        found.append(watch.see(now_s, noisy(rng), state_at(now_s)))
+        # Thrust that grows by what three seconds of an error in the range make of it.
+        watch.done(now_s, Effort(forward=0.3 + max(now_s - 14.0, 0.0) * 0.1))
+    first = found.index(LimitReason.NO_ANSWER) * FRAME_S
+    assert 14.0 < first < 18.0
+
+
+def rolling(k: int, degrees: float) -> float:
+    """Pitch or heading of a vehicle that swings."""
+    return math.radians(degrees) * math.sin(2.0 * math.pi * FRAME_S * k / 2.5)
+
+
+@pytest.mark.parametrize("part", ["pitch", "yaw"])
+@pytest.mark.parametrize("late", [0, 5])
+def test_a_posture_that_does_not_follow_the_attitude(part: str, late: int) -> None:
+    """The autopilot's attitude is known earlier than the posture."""
+    answering = []
+    for answers in (1.0, 0.0):
+        watch, rng = AnswerWatch(GAINS.vehicle), np.random.default_rng(10)
+        found = set()
+        for k in range(250):
+            now_s, told = FRAME_S * k, rolling(k, 3.0)
+            seen = noisy(rng)
+            value = getattr(seen, part) - answers * rolling(k - late, 3.0)
+            state = replace(state_at(now_s, heading=told if part == "yaw" else 0.0), pitch=0.0)
+            state = replace(state, pitch=told) if part == "pitch" else state
+            found.add(watch.see(now_s, replace(seen, **{part: value}), state))
+            watch.done(now_s, HELD)
+        answering.append(found)
+    assert answering == [{None}, {None, LimitReason.NO_ANSWER}]
+
+
+@NAMES
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_still_in_swell_is_told_by_the_attitude(name: str, seed: int) -> None:
+    neutral_s, _, decisions = frozen_hold(
+        name, LossOfSight.STUCK, before=0.75, since_s=1.2, seed=seed, waves=0.1
+    )
+    assert neutral_s <= 2.5
+    assert decisions[-1].reason is LimitReason.NO_ANSWER
 
 
 def test_limits_that_cannot_work_are_refused() -> None:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aqualvs.control.safety import LimitReason, SafetyGate, SafetyLimits
+from aqualvs.control.safety import Brake, LimitReason, SafetyGate, SafetyLimits
 from aqualvs.control.vehicle import NEUTRAL, Effort, Mode
 from aqualvs.errors import OptionError
 from control_cases import posture_at, state_at
@@ -238,7 +238,13 @@ def test_a_doubt_brakes_for_a_moment_then_stops(doubt: LimitReason) -> None:
         # Later doubts change nothing, nor does one that passes if it gives the vehicle back.
         late = doubt if k == 0 or not doubt.takes_over else None
         found = gate.check(
-            now, 0.0, posture_at(), state_at(now), ASKED, doubt=late, brake=0.9 - 0.1 * k
+            now,
+            0.0,
+            posture_at(),
+            state_at(now),
+            ASKED,
+            doubt=late,
+            brake=Brake(0.9 - 0.1 * k, now + 0.12),
         )
         assert found[1] is doubt
         sent.append(found[0])

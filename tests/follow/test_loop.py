@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from aqualvs.control.answer_watch import AnswerLimits
 from aqualvs.control.missions import HoldMission
-from aqualvs.control.safety import AnswerLimits
 from aqualvs.control.safety import LimitReason as GateReason
 from aqualvs.control.vehicle import Effort, Setpoint
 from aqualvs.errors import OptionError

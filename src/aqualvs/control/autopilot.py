@@ -6,9 +6,10 @@ Uses no clock, no threads and no link.
 import math
 from dataclasses import dataclass
 
+from aqualvs.control.answer_watch import AnswerWatch
 from aqualvs.control.controller import RangeYawController
 from aqualvs.control.missions import Guidance, Mission, Stage
-from aqualvs.control.safety import AnswerWatch, LimitReason, SafetyGate
+from aqualvs.control.safety import NO_BRAKE, LimitReason, SafetyGate
 from aqualvs.control.vehicle import NEUTRAL, Effort, VehicleState
 from aqualvs.errors import OptionError
 from aqualvs.scanning.posture import Posture, Refusal
@@ -85,6 +86,8 @@ class NetPilot:
         self.gate = gate or SafetyGate()
         self._watch = AnswerWatch(controller.gains.vehicle)
         self._doubt: LimitReason | None = None
+        # For how long the picture has stood still, where it tells so.
+        self._still_s: float | None = None
         self._posture: Posture | None = None
         self._seen_s = self._frame_s = -math.inf
         self._asked: Effort | None = None
@@ -146,10 +149,9 @@ class NetPilot:
             asked or NEUTRAL,
             range_rate=None if filtered is None else filtered.range_rate,
             doubt=self._doubt,
-            brake=0.0 if self._doubt is None else self._watch.brake(self._doubt),
+            brake=NO_BRAKE if self._doubt is None else self._watch.brake(now_s, self._still_s),
         )
-        wanted = None if guidance.setpoint is None else guidance.setpoint.range
-        self._watch.done(now_s, effort, wanted)
+        self._watch.done(now_s, effort)
         self._settle(asked, effort, reason)
         reason = self._end(guidance) or reason or _mission_says(guidance)
         if reason is None and self.gate.tips(state):
@@ -178,12 +180,12 @@ class NetPilot:
     ) -> Posture | None:
         """Return the posture of a new frame; a picture that stands still is none."""
         if isinstance(posture, Refusal) and posture.reason is NoPosture.FROZEN:
-            self._doubt = LimitReason.FROZEN
+            self._doubt, self._still_s = LimitReason.FROZEN, posture.still_s
             return None
         if not (isinstance(posture, Posture) and time_s > self._frame_s):
             return None
         self._frame_s = time_s
-        self._doubt = self._watch.see(now_s, posture, state)
+        self._doubt, self._still_s = self._watch.see(now_s, posture, state), None
         if self._doubt is LimitReason.FROZEN:
             return None
         self._posture, self._seen_s = posture, now_s

@@ -1,11 +1,8 @@
-"""Safety gate for every effort, and detection of postures that do not respond to the efforts.
+"""Safety gate for every effort.
 
 `SafetyGate` sits between controllers and vehicle, whoever steers, and protects vehicle and net. It
 never adds thrust towards the target, never arms, never changes the mode; docs/missions.md has its
 rules as a table.
-
-`AnswerWatch` detects postures that stand still while the vehicle moves. It does not use the
-pictures: it compares postures, efforts and the autopilot's reports.
 """
 
 import math
@@ -14,7 +11,6 @@ from dataclasses import dataclass, fields, replace
 from enum import StrEnum
 from typing import NamedTuple
 
-from aqualvs.control.gains import VehicleFacts
 from aqualvs.control.vehicle import NEUTRAL, Effort, Mode, VehicleState
 from aqualvs.errors import OptionError
 from aqualvs.scanning.posture import Posture
@@ -104,6 +100,25 @@ _REFUSED_MODES = {
 }
 
 
+class Brake(NamedTuple):
+    """Push astern that stops a vehicle whose posture is not to be trusted.
+
+    Attributes
+    ----------
+    effort : float
+        Astern, 0 to 1.
+    until_s : float
+        When neutral follows, by the clock of `VehicleState.heard_s`.
+    """
+
+    effort: float
+    until_s: float
+
+
+NO_BRAKE = Brake(0.0, -math.inf)
+"""Neutral at once."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SafetyLimits:
     """Limits at which the gate intervenes.
@@ -186,9 +201,9 @@ class SafetyGate:
         self.latched: LimitReason | None = LimitReason.NOT_ENGAGED
         self._last_s = -math.inf
         self._seen: deque[tuple[float, float]] = deque(maxlen=32)
-        # The doubt in force, since when, and the effort that brakes.
+        # The doubt in force, and its brake.
         self._doubt: LimitReason | None = None
-        self._doubt_s, self._brake = -math.inf, 0.0
+        self._brake = NO_BRAKE
 
     def engage(self, now_s: float, state: VehicleState) -> LimitReason | None:
         """Let efforts pass from now on, as the pilot wants it; return why not, None if so."""
@@ -220,7 +235,7 @@ class SafetyGate:
         *,
         range_rate: float | None = None,
         doubt: LimitReason | None = None,
-        brake: float = 0.0,
+        brake: Brake = NO_BRAKE,
     ) -> tuple[Effort, LimitReason | None]:
         """Return the effort that may be sent, and the reason if it differs from the request.
 
@@ -240,11 +255,11 @@ class SafetyGate:
             In m/s, where a filter knows it; else it follows from postures in a row.
         doubt : LimitReason, optional
             Why the posture is not to be trusted, where something has noticed.
-        brake : float
-            Effort astern, 0 or more, for `BRAKE_S` from the first of a row of doubts on.
+        brake : Brake
+            That of the first of a row of doubts counts.
         """
         refused = self._clock_refuses(now_s) or self._vehicle_stops(now_s, state)
-        if refused is None and self._doubts(now_s, doubt, brake) is not None:
+        if refused is None and self._doubts(doubt, brake) is not None:
             return self._effort_in_doubt(now_s), self._doubt
         refused = refused or self._sight_refuses(posture_age_s, posture) or _refused_effort(effort)
         if refused is not None or posture is None:
@@ -269,18 +284,17 @@ class SafetyGate:
             self.latched = self._vehicle_refuses(now_s, state)
         return self.latched
 
-    def _doubts(self, now_s: float, doubt: LimitReason | None, brake: float) -> LimitReason | None:
+    def _doubts(self, doubt: LimitReason | None, brake: Brake) -> LimitReason | None:
         """Return the doubt in force; one that gives the vehicle back stays while it brakes."""
         stays = self._doubt is not None and self._doubt.takes_over
         if doubt is not self._doubt and not stays:
-            self._doubt, self._doubt_s = doubt, now_s
-            self._brake = min(max(brake, 0.0), 1.0)
+            self._doubt, self._brake = doubt, brake
         return self._doubt
 
     def _effort_in_doubt(self, now_s: float) -> Effort:
         """Return the brake while it lasts, then neutral."""
-        if self._brake > 0.0 and now_s - self._doubt_s < BRAKE_S - _TICK_S:
-            return Effort(forward=-self._brake)
+        if self._brake.effort > 0.0 and now_s < self._brake.until_s - _TICK_S:
+            return Effort(forward=-min(self._brake.effort, 1.0))
         if self._doubt is not None and self._doubt.takes_over:
             self.latched = self._doubt
         return NEUTRAL
@@ -338,9 +352,6 @@ class SafetyGate:
         return _clipped(effort), None
 
 
-BRAKE_S = 0.12
-"""Time in seconds for which a vehicle whose picture stands still is braked: with the time until
-that is noticed less than 0.5 s, and within the pilot's 0.2 s after the last posture."""
 _TICK_S = 1e-3
 # The dome's centre is some 30 mm behind the hull's front, and pictures end at 0.3 m: the retreat
 # reaches its full effort before that.
@@ -372,301 +383,3 @@ def _clipped(effort: Effort) -> Effort:
         down=clip(effort.down),
         yaw=clip(effort.yaw),
     )
-
-
-# Number of consecutive postures whose second differences, of three quantities, measure the noise.
-_N_NOISE, _N_USUAL = 8, 50
-_ORDER = 6.0
-# Postures with less noise come from a simulation without noise: metres and radians.
-_MIN_RANGE, _MIN_ANGLE = 2e-5, math.radians(0.005)
-# The force that holds the vehicle in place is the mean thrust over so many seconds; known after so
-# many. Before that, a current that the controller has yet to find takes as much.
-_BALANCE_S, _BALANCED_S = 4.0, 10.0
-_SLOPE_S = 0.3
-# Greatest difference between means over parts of the window where a posture stands still, as share
-# of the range and in radians; and the number of parts.
-_STILL_RANGE, _STILL_YAW, _N_MEANS = 0.006, math.radians(0.6), 6
-# Least duration of efforts towards the target, in seconds.
-_PUSHED_S = 0.5
-# Least distance of the range beyond its setpoint, in metres.
-_OFF = 0.05
-# A picture that stands still is noticed within so many seconds: older postures are live. Slower
-# vehicles, in m/s, coast by little and are not braked: a hold in swell swings at 0.03.
-_TRUSTED_S, _SLOW = 0.6, 0.05
-# Water that passes at this speed and grows faster by so much, in m/s, takes efforts that promise a
-# way: the more the greater the drag.
-_WATER, _WATER_CHANGE = 0.4, 0.024
-# Greatest change between two reports of a heading; a greater one is a reset compass.
-_MAX_TURN = math.radians(20.0)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AnswerLimits:
-    """Limits beyond which a posture counts as not responding.
-
-    Attributes
-    ----------
-    repeats_s : float
-        Time after which a posture that is the same to the bit, while an effort is in force, counts
-        as a frozen picture.
-    quiet : float
-        Noise of the postures, as share of the usual standard deviation, below which the picture is
-        frozen. Twelve and more differences are looked at: sound noise is so small by chance once in
-        10^10 frames.
-    window_s : float
-        Efforts and motion are compared over this time, in seconds.
-    promised : float
-        Way towards the target by the efforts, in metres, that a posture which stands still must
-        answer to, in water that does not change. Standing still is 0.6 % of the range and 0.6
-        degrees.
-    turned : float
-        Turn of the heading within `window_s` that a posture which stands still must answer to, in
-        radians. An even way along a curved net turns the heading, too: at 0.8 m/s, the current's
-        speed included, and a radius of 8 m by 10 degrees.
-    """
-
-    repeats_s: float = 0.2
-    quiet: float = 0.1
-    window_s: float = 1.7
-    promised: float = 0.11
-    turned: float = math.radians(12.0)
-
-    def __post_init__(self) -> None:
-        """Refuse limits that cannot work.
-
-        Raises
-        ------
-        OptionError
-            Naming the first.
-        """
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if not (value > 0.0 and math.isfinite(value)):
-                raise OptionError(f"safety, {field.name} {value:g}: must be positive")
-
-
-class _Moment(NamedTuple):
-    """Posture with the integrals of the efforts until then."""
-
-    time_s: float
-    range: float
-    yaw: float
-    # Closing speed and way due to the efforts beyond the balance, since the start.
-    speed: float
-    way: float
-    # Heading without jumps.
-    heading: float
-
-
-class AnswerWatch:
-    """Detector of postures that do not respond to efforts.
-
-    `LimitReason.FROZEN` while postures repeat to the bit, or their noise has all but vanished: a
-    picture that stands still. `LimitReason.NO_ANSWER` where the efforts must have brought the
-    vehicle nearer, or the autopilot reports that it has turned, and the posture shows nothing of
-    it: a picture that stands still in spite of its noise, a vehicle that is caught, sticks that
-    turn the other way.
-
-    Parameters
-    ----------
-    vehicle : VehicleFacts
-        Its mass and thrust.
-    limits : AnswerLimits, optional
-        Defaults if left out.
-    """
-
-    def __init__(self, vehicle: VehicleFacts, limits: AnswerLimits | None = None) -> None:
-        self.limits = limits or AnswerLimits()
-        self._vehicle = vehicle
-        change = vehicle.forward_drag.slope(_WATER) * _WATER_CHANGE / vehicle.mass
-        self._promised = self.limits.promised + 0.5 * change * self.limits.window_s**2
-        self._noise = _Noise(self.limits.quiet)
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget everything, as for another stream."""
-        self._noise.reset()
-        self._last: tuple[float, float, float] | None = None
-        self._same_s = self._pushed_s = -math.inf
-        self._frozen = False
-        self.restart()
-
-    def restart(self) -> None:
-        """Begin to compare anew: nothing was done and nothing seen yet."""
-        self._moments: deque[_Moment] = deque()
-        self._now_s = math.nan
-        self._effort = NEUTRAL
-        self._balance, self._thrust_s = 0.0, 0.0
-        self._backed_s, self._wanted = -math.inf, math.inf
-        self._speed = self._way = 0.0
-        self._heading, self._told = 0.0, math.nan
-
-    def done(self, now_s: float, effort: Effort, wanted: float | None = None) -> None:
-        """Add a sent effort, and the range in metres that it was for."""
-        self._wanted = math.inf if wanted is None else wanted
-        if effort != NEUTRAL:
-            self._pushed_s = now_s
-        self._effort = effort
-
-    def see(self, now_s: float, posture: Posture, state: VehicleState) -> LimitReason | None:
-        """Add a new posture; return why it cannot be used, None if it can.
-
-        Parameters
-        ----------
-        now_s : float
-        posture : Posture
-            Of a frame that has not been seen before.
-        state : VehicleState
-            As the vehicle reports it.
-        """
-        if not all(map(math.isfinite, (now_s, posture.range, posture.pitch, posture.yaw))):
-            return None
-        self._go_on(now_s, posture.yaw, state)
-        if self._repeats(now_s, posture) or self._noise.vanished(posture):
-            return LimitReason.FROZEN
-        moment = _Moment(now_s, posture.range, posture.yaw, self._speed, self._way, self._heading)
-        self._moments.append(moment)
-        while now_s - self._moments[0].time_s > self.limits.window_s + _SLOPE_S:
-            self._moments.popleft()
-        return LimitReason.NO_ANSWER if self._is_unanswered() else None
-
-    def brake(self, doubt: LimitReason) -> float:
-        """Return the effort astern that stops the vehicle within `BRAKE_S`; 0 if it is slow.
-
-        Its speed is that of the last trusted postures and what the efforts since have added.
-
-        Parameters
-        ----------
-        doubt : LimitReason
-            Of the last posture.
-        """
-        blind_s = _TRUSTED_S if doubt is LimitReason.FROZEN else self.limits.window_s
-        before = [m for m in self._moments if self._now_s - m.time_s >= blind_s]
-        if len(before) < 2:
-            return 0.0
-        last = before[-1]
-        first = next(m for m in before if last.time_s - m.time_s <= _SLOPE_S)
-        if first is last:
-            return 0.0
-        speed = (first.range - last.range) / (last.time_s - first.time_s)
-        kept = math.exp(-self._damping() * (self._now_s - last.time_s))
-        speed = kept * (speed - last.speed) + self._speed
-        thrust = self._vehicle.thrust
-        force = self._vehicle.mass * speed / BRAKE_S
-        return thrust.effort(force / thrust.backward) if speed > _SLOW else 0.0
-
-    def _repeats(self, now_s: float, posture: Posture) -> bool:
-        """Return whether the posture has been the same to the bit while an effort was in force."""
-        found = (posture.range, posture.pitch, posture.yaw)
-        if found != self._last:
-            self._last, self._same_s, self._frozen = found, now_s, False
-        elif self._pushed_s >= self._same_s and now_s - self._same_s >= self.limits.repeats_s:
-            self._frozen = True
-        return self._frozen
-
-    def _go_on(self, now_s: float, yaw: float, state: VehicleState) -> None:
-        """Let the efforts act until now."""
-        step = now_s - self._now_s
-        self._now_s = now_s
-        if not 0.0 < step < _SLOPE_S:
-            self._moments.clear()
-            self._told = math.nan
-            # It has drifted: other efforts may be needed to hold it.
-            step = self._thrust_s = 0.0
-        # Sideways thrust balances the drag of a way along the target; it predicts no approach.
-        forward, _ = self._vehicle.thrust.forces(self._effort.forward, self._effort.right)
-        push = forward * math.cos(yaw) / self._vehicle.mass
-        if push <= 0.0:
-            self._backed_s = now_s
-        if self._effort != NEUTRAL and step > 0.0:
-            self._thrust_s += step
-            share = step / (step + min(self._thrust_s, _BALANCE_S))
-            self._balance += share * (push - self._balance)
-        self._way += step * self._speed
-        kept = math.exp(-self._damping() * step)
-        self._speed = kept * self._speed + step * (push - self._balance)
-        if state.heading is None:
-            return
-        turn = math.remainder(state.heading - self._told, 2.0 * math.pi)
-        if abs(turn) < _MAX_TURN:
-            self._heading += turn
-        self._told = state.heading
-
-    def _damping(self) -> float:
-        """Return the rate, per second, at which drag takes away a speed.
-
-        The balance is the drag of the water that passes.
-        """
-        drag, mass = self._vehicle.forward_drag, self._vehicle.mass
-        return drag.slope(drag.speed(mass * self._balance)) / mass
-
-    def _is_unanswered(self) -> bool:
-        first, last = self._moments[0], self._moments[-1]
-        begin = next((m for m in self._moments if m.time_s - first.time_s >= _SLOPE_S), None)
-        if begin is None:
-            return False
-        span = last.time_s - begin.time_s
-        before = (first.range - begin.range) / (begin.time_s - first.time_s)
-        damping = self._damping()
-        coasting = -math.expm1(-damping * span) / damping if damping else span
-        promised = last.way - begin.way + (before - begin.speed) * coasting
-        turned = abs(last.heading - begin.heading)
-        pushed = last.time_s - self._backed_s > _PUSHED_S and self._thrust_s > _BALANCED_S
-        # Near its setpoint the vehicle's thrust balances the changing current.
-        pushed = pushed and last.range - self._wanted > _OFF
-        promises = promised > self._promised and pushed
-        if not promises and turned < self.limits.turned:
-            return False
-        lately = [m for m in self._moments if m.time_s >= begin.time_s]
-        if _swing([m.yaw for m in lately]) > _STILL_YAW:
-            return False
-        return _swing([m.range for m in lately]) < _STILL_RANGE * last.range
-
-
-def _swing(values: list[float]) -> float:
-    """Return by how much the means over some values in a row differ, at most."""
-    n = max(len(values) // _N_MEANS, 1)
-    means = [sum(values[k : k + n]) / n for k in range(0, len(values) - n + 1, n)]
-    return max(means) - min(means)
-
-
-class _Noise:
-    """Comparison of the noise of the last postures with the usual noise."""
-
-    def __init__(self, quiet: float) -> None:
-        self._quiet = quiet * quiet
-        self.reset()
-
-    def reset(self) -> None:
-        self._postures: deque[tuple[float, float, float]] = deque(maxlen=3)
-        self._recent: deque[float] = deque(maxlen=_N_NOISE - 2)
-        self._usual = [0.0, 0.0, 0.0]
-        self._n = 0
-
-    def vanished(self, posture: Posture) -> bool:
-        """Add a posture; return whether the noise has almost vanished."""
-        self._postures.append((posture.range, posture.pitch, posture.yaw))
-        if len(self._postures) < 3:
-            return False
-        rows = zip(*self._postures, strict=True)
-        squares = [(a - 2.0 * b + c) ** 2 / _ORDER for a, b, c in rows]
-        known = self._n >= _N_USUAL and self._usual[0] > _MIN_RANGE**2
-        known = known and min(self._usual[1:]) > _MIN_ANGLE**2
-        if known:
-            shares = [one / usual for one, usual in zip(squares, self._usual, strict=True)]
-            self._recent.append(sum(shares) / 3.0)
-            if len(self._recent) == self._recent.maxlen:
-                mean = sum(self._recent) / len(self._recent)
-                if mean < self._quiet:
-                    return True
-        self._learn(squares)
-        return False
-
-    def _learn(self, squares: list[float]) -> None:
-        """Follow the usual noise; a wild posture counts as ten of the usual at most."""
-        self._n += 1
-        share = 1.0 / min(self._n, 2 * _N_USUAL)
-        for i, one in enumerate(squares):
-            usual = self._usual[i]
-            bounded = min(one, 10.0 * usual) if self._n > _N_USUAL else one
-            self._usual[i] = usual + share * (bounded - usual)

@@ -99,7 +99,7 @@ class RenderedSensor:
         # As the live run does.
         still_s = self._frozen.setdefault(field, FrozenPicture()).update(time_s, frame.luma)
         if still_s > 0.0:
-            return Refusal(Reason.FROZEN, f"the same picture for {still_s:.1f} s")
+            return Refusal(Reason.FROZEN, f"the same picture for {still_s:.1f} s", still_s)
         scan = self._scanner.process(frame)
         self.shots.append((frame, scan))
         return scan.posture

@@ -164,7 +164,7 @@ class FrozenPicture:
         self._begin()
 
     def update(self, time_s: float, luma: ImagePlane) -> float:
-        """Return for how long the picture has stood still, in seconds; 0 for a live one.
+        """Return for how long the picture has stood still at most, in seconds; 0 for a live one.
 
         Parameters
         ----------
@@ -192,7 +192,7 @@ class FrozenPicture:
 
     def _go_on(self) -> None:
         """Take the picture for a live one."""
-        self._since_s = self._moved_s = self._doubted_s = self._pace = math.nan
+        self._since_s = self._moved_s = self._doubted_s = self._pace = self._moving_s = math.nan
 
     def _continues(self, time_s: float, shape: tuple[int, int]) -> bool:
         last = self._kept[-1]
@@ -228,6 +228,7 @@ class FrozenPicture:
         if len(before) < _N_BEFORE:
             return False
         self._pace = float(np.median(before))
+        self._moving_s = max(at_s for at_s, _ in self._motions if at_s < stop_s)
         lately = max(motion for at_s, motion in self._motions if at_s >= stop_s)
         return self._pace >= options.motion and lately < options.stop * self._pace
 
@@ -238,7 +239,8 @@ class FrozenPicture:
         if not math.isnan(self._since_s):
             self._doubt(time_s, still=still)
         elif still | self._has_stopped(time_s):
-            self._since_s = self._kept[0].time_s
+            # The picture before the stop was compared with one so old: all until that may be live.
+            self._since_s = self._kept[0].time_s if still else self._moving_s - self._span_s
             self._doubted_s = math.nan if still else time_s
         else:
             self._usual.append(self.change)

@@ -496,7 +496,7 @@ class LiveRunner:
             return {}, Scan(frame.index, frame.time_s, refusal, ScanPoints.none(), rig.n_water)
         still_s = self._still_s(frame)
         if still_s > 0.0:
-            refusal = Refusal(Reason.FROZEN, f"the same picture for {still_s:.1f} s")
+            refusal = Refusal(Reason.FROZEN, f"the same picture for {still_s:.1f} s", still_s)
             return {}, Scan(frame.index, frame.time_s, refusal, ScanPoints.none(), rig.n_water)
         try:
             peaks = scanner.detect(frame)

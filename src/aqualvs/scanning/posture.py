@@ -54,10 +54,20 @@ class Reason(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """A refused posture with its reason; falsy."""
+    """A refused posture with its reason; falsy.
+
+    Attributes
+    ----------
+    reason : Reason
+    detail : str
+        In words.
+    still_s : float
+        For how long a frozen picture has stood still at most, in seconds.
+    """
 
     reason: Reason
     detail: str = ""
+    still_s: float = 0.0
 
     def __bool__(self) -> Literal[False]:
         """Return False, so that `if posture:` reads well."""
