@@ -9,8 +9,21 @@ from hypothesis import HealthCheck, settings
 
 from repository import ROOT
 
-# Folders of the longest tests.
-LONG = ("recovery", "cli", "docs")
+# Files and folders of the longest tests, the longest first. The second has other kernels compiled
+# than its neighbours: processes that want the same ones wait for each other.
+LONG = (
+    "cli/test_batch.py",
+    "recovery/test_closed_loop.py",
+    "recovery/test_real_light.py",
+    "docs/test_doc_commands.py",
+    "cli/test_fuzz.py",
+    "calibrate/test_shutter.py",
+    "cli/test_calibrate.py",
+    "live/test_command.py",
+    "recovery",
+    "cli",
+    "docs",
+)
 
 # As the command line does it, and before any test imports NumPy.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -34,7 +47,16 @@ def samples() -> Path:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put long files first: of several processes, none is left with one at the end."""
     long = [ROOT / "tests" / name for name in LONG]
-    items.sort(key=lambda item: not any(item.path.is_relative_to(folder) for folder in long))
+    for path in long:
+        assert path.exists(), f"{path} is in LONG of tests/conftest.py"
+
+    def place(path: Path) -> int:
+        found = (i for i, one in enumerate(long) if path.is_relative_to(one))
+        return next(found, len(long))
+
+    # Asked once for each file: there are thousands of tests.
+    places = {path: place(path) for path in {item.path for item in items}}
+    items.sort(key=lambda item: places[item.path])
 
 
 def pytest_collection_finish() -> None:

@@ -13,8 +13,12 @@ import aqualvs
 from aqualvs.calibration.water_index.state import IndexPrior
 from aqualvs.cli.main import main
 from aqualvs.experiments.simulate import calibration_commands
-from aqualvs.geometry.transforms import rotvec_from_rotation
+from aqualvs.geometry.transforms import SE3, rotvec_from_rotation
+from aqualvs.optics.flat_port import FlatPort
+from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL
 from aqualvs.optics.rigfile import load_rig, save_rig
+from aqualvs.optics.solved import rig_uncertainty
+from aqualvs.results.summary import compare_with_truth
 from aqualvs.simulation.calibration_set import SetSize, simulate_calibration
 from panel_cases import small_rig
 
@@ -206,3 +210,23 @@ def test_the_function_of_the_water_says_what_it_needs(calibrated):
     assert "n_water" in done.uncertainty.names
     assert done.rms_px < 1.0
     assert len(done.residuals_px) == len(pictures)
+
+
+def test_the_whole_way_behind_a_flat_port_ends_at_the_true_range(tmp_path):
+    pose, port = SE3(DOME_FROM_CAM_NOMINAL, np.zeros(3)), FlatPort(0.012, 0.005, 1.49, 0.01, -0.01)
+    truth = replace(small_rig(), housing=port, dome_from_cam=pose)
+    size = SetSize(camera=6, dome=6, box=2, index=1, dive=2)
+    files = simulate_calibration(truth, tmp_path, size=size)
+    for command in calibration_commands(files, tmp_path, 3)[:3]:
+        assert main(command) == 0
+    rig = load_rig(tmp_path / "rig.yaml")
+    sigmas = rig_uncertainty(rig).sigmas
+    off = abs(rig.flat_port.distance - port.distance)
+    assert off < 3.0 * sigmas["port_distance"] < 4e-3
+    dive = [str(files.dive), "--rig", str(tmp_path / "rig.yaml"), "-o", str(tmp_path / "run")]
+    assert main(["run", *dive, "--no-report"]) == 0
+    found = compare_with_truth(tmp_path / "run" / "posture.csv", files.dive_truth)
+    # Without the port the range would be 0.8 % off.
+    assert found.n_compared == 2
+    assert found.range_percent.max < 0.2
+    assert max(found.pitch_deg.max, found.yaw_deg.max) < 0.4

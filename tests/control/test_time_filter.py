@@ -161,11 +161,9 @@ def test_lag_is_short(period_s: float) -> None:
     np.testing.assert_allclose(gain, 1.0, atol=0.04)
 
 
-@pytest.mark.parametrize("axis", [0, 1, 2])
-def test_a_jump_is_rejected(axis: int) -> None:
+def test_a_jump_is_rejected() -> None:
     smoother = track_of(STILL, 1.0)
-    jump = np.zeros(3)
-    jump[axis] = 30 * SIGMA[axis]
+    jump = 30 * SIGMA * [1.0, 0.0, 0.0]
     found = smoother.update(1.04, posture(STILL + jump))
     assert found is not None
     assert not found.accepted
@@ -174,6 +172,45 @@ def test_a_jump_is_rejected(axis: int) -> None:
     after = smoother.update(1.08, posture(STILL))
     assert after is not None
     assert after.accepted
+
+
+@pytest.mark.parametrize("axis", [1, 2])
+def test_an_angle_that_jumps_is_left_out_alone(axis: int) -> None:
+    smoother = track_of(STILL, 1.0)
+    jump = np.zeros(3)
+    jump[0], jump[axis] = SIGMA[0], 100 * SIGMA[axis]
+    seen = []
+    for i in range(1, 9):
+        found = smoother.update(1.0 + 0.04 * i, posture(STILL + jump))
+        assert found is not None
+        assert found.accepted
+        seen.append(values_of(found))
+    # The range follows its measurements, the other angle stays.
+    assert abs(seen[3][0] - STILL[0] - SIGMA[0]) < 0.2 * SIGMA[0]
+    assert seen[-1][3 - axis] == pytest.approx(STILL[3 - axis], abs=SIGMA[3 - axis])
+    # The angle begins anew where it stays.
+    assert [one[axis] == pytest.approx(STILL[axis], abs=SIGMA[axis]) for one in seen] == [
+        *[True] * 4,
+        *[False] * 4,
+    ]
+    assert seen[-1][axis] == pytest.approx(STILL[axis] + jump[axis], abs=SIGMA[axis])
+
+
+def test_a_vehicle_that_pitches_over_keeps_its_range() -> None:
+    """At 200 degrees/s and more; the range must not coast away with the speed of before."""
+    smoother, rng = PostureFilter(), np.random.default_rng(6)
+    for i in range(100):
+        time_s = 0.04 * i
+        late = max(time_s - 2.0, 0.0)
+        # It closes in at 0.5 m/s, is braked within half a second, and pitches to and fro.
+        braked = min(late, 0.5)
+        way = 0.5 * min(time_s, 2.0) + 0.5 * braked - 0.5 * braked**2
+        true = STILL + np.array([1.5 - way, 0.8 * math.sin(5.0 * late), 0.0])
+        found = smoother.update(time_s, posture(true + SIGMA * rng.normal(size=3)))
+        assert found is not None
+        if time_s > 2.0:
+            # By the brake's 1 m/s², which is five times the model's: its lag.
+            assert found.range == pytest.approx(true[0], abs=0.03)
 
 
 def test_a_true_step_is_believed_after_a_few_frames() -> None:

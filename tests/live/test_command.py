@@ -23,9 +23,11 @@ from aqualvs.optics.rigfile import load_rig
 from aqualvs.recording import DiveRecording, is_recording
 from aqualvs.results.folder import POSTURE_COLUMNS
 from aqualvs.sources.base import bgr_of
+from complaints import complaints
 from live_cases import demo_frames, demo_rig
 from ports import free_port
 from repository import HELPERS
+from shell_cases import all_key_frames, cut_after
 from stream_sender import make_clip
 from waiting import TIMEOUT_S, until
 
@@ -319,6 +321,27 @@ def test_what_cannot_work_is_told_in_one_line(
     (line,) = [text for text in done.stderr.splitlines() if text.startswith("aqualvs: error")]
     assert words in line
     assert "Traceback" not in done.stderr
+
+
+def test_a_video_that_is_cut_short_is_told_in_one_line(rig_file: Path, tmp_path: Path) -> None:
+    """At its end; until then its frames are measured."""
+    content = bgr_of(demo_frames(1)[0])
+    cut = all_key_frames(
+        tmp_path / "cut.mp4", 6, size=demo_rig().size_px, content=lambda *_: content
+    )
+    cut_after(cut, 4)
+    command = [sys.executable, "-c", "from aqualvs.cli.main import main; exit(main())", "live"]
+    done = subprocess.run(
+        [*command, str(cut), "--rig", str(rig_file), "--fast"],
+        capture_output=True,
+        text=True,
+        timeout=4 * TIMEOUT_S,
+        check=False,
+    )
+    assert done.returncode == 2
+    (line,) = complaints(done.stderr)
+    assert line.startswith("aqualvs: error: ")
+    assert "cut short" in line
 
 
 def test_memory_and_handles_stay_flat_over_a_long_run(tmp_path: Path) -> None:

@@ -99,4 +99,5 @@ def test_what_a_shutter_means_is_told_in_one_line():
     fields = shutter_finding(replace(rig, shutter=_FIELDS)).sentence
     assert "fields 20 ms apart" in fields
     assert "4.0 mm and 0.30 degrees" in fields
-    assert "blurs over" in shutter_finding(replace(rig, shutter=Shutter(exposure=0.008))).sentence
+    blurred = shutter_finding(replace(rig, shutter=Shutter(exposure=0.008)))
+    assert "blurs a net over" in blurred.sentence

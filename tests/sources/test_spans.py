@@ -12,6 +12,7 @@ from aqualvs.sources.spans import (
     UnlikeProbeError,
     VideoParts,
     image_frames,
+    image_spans,
     video_spans,
 )
 from shell_cases import cut_after, damage_frame, destroy_frame, grain, packets, write_video
@@ -80,6 +81,22 @@ def test_the_parts_of_other_codecs_are_the_whole(tmp_path, codec):
     found = video_spans(path, 10)
     assert [span.first for span in found.spans] == [0, 10, 20, 30]
     assert_same_frames(path, found.spans)
+
+
+def test_parts_with_a_margin_reach_into_those_beside_them(tmp_path):
+    path = dive(tmp_path / "dive.mp4")
+    spans = video_spans(path, 20, 2).spans
+    assert [(one.first, one.lead, one.stop, one.trail) for one in spans] == [
+        (0, 0, 30, 10),
+        (10, 10, 40, 0),
+    ]
+    assert [frame.index for frame in frames_of(path, spans)] == [*range(30), *range(10, 40)]
+    images = image_spans([1] * 7, 3, 2)
+    assert [(one.first, one.lead, one.stop, one.trail, one.n_bytes) for one in images] == [
+        (0, 0, 5, 2, 3),
+        (1, 2, 7, 1, 3),
+        (4, 2, 7, 0, 1),
+    ]
 
 
 def test_parts_have_as_many_frames_as_asked(tmp_path):

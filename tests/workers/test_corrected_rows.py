@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from aqualvs.batch.parts import join_dive, measure_piece
 from aqualvs.batch.work import probe
 from aqualvs.errors import SourceError
 from aqualvs.optics.rigfile import load_rig, save_rig
@@ -101,6 +102,15 @@ def test_runs_and_batches_of_a_rolling_shutter_are_the_same(tmp_path, monkeypatc
     assert files("at once", 1, rig=DEMO / "rig.yaml") != alone
     # The stripes of the recording, measured again.
     assert files("again", 1, tmp_path / "alone" / "dive.mcap") == alone
-    # A piece would lack the frames beside it.
+    # Pieces measure the frames beside them, too.
     work = work_for(tmp_path / "batch", dive, rig=tmp_path / "rig.yaml")
-    assert "rolling shutter" in probe(work).why_whole
+    found = probe(work)
+    assert [(one.first, one.lead, one.trail) for one in found.spans] == [
+        (0, 0, 6),
+        (0, 6, 6),
+        (6, 6, 0),
+    ]
+    results = [measure_piece(work, found, number) for number in range(3)]
+    assert [one.n_frames for one in results] == [6, 6, 6]
+    join_dive(work, found, results)
+    assert [without_times(work.request.out / file) for file in RESULTS[:-1]] == alone

@@ -49,6 +49,7 @@ from aqualvs.results.points import PointsStream, export_batches, read_points_str
 from aqualvs.results.run_request import FrameWindow, RunFile, Status
 from aqualvs.results.summary import RunSummary
 from aqualvs.run_outputs import RunBareLens
+from aqualvs.scanning.row_motion import REACH
 from aqualvs.scanning.scan import Frame
 from aqualvs.sources.fields import frames_in, frames_of
 from aqualvs.sources.spans import Span, SpanKind, VideoParts, image_frames
@@ -101,14 +102,22 @@ class PieceResult:
 def piece_folder(work: DiveWork, probe: DiveProbe, number: int) -> Path:
     """Return the folder of a piece; another rig, option or version has another."""
     span = probe.spans[number]
-    kind = f"{span.first:08d}" if span.kind is not SpanKind.WHOLE else "whole"
+    kind = f"{span.first + span.lead:08d}" if span.kind is not SpanKind.WHOLE else "whole"
     return work.home / f"pieces-{probe.key[:12]}" / kind
 
 
 def piece_key(probe: DiveProbe, number: int) -> str:
     """Return what a piece is made from, as a short text."""
     span = probe.spans[number]
-    return digest({"dive": probe.key, "kind": span.kind, "first": span.first, "stop": span.stop})
+    return digest(
+        {
+            "dive": probe.key,
+            "kind": span.kind,
+            "first": span.first,
+            "stop": span.stop,
+            "lead": span.lead,
+        }
+    )
 
 
 def measure_piece(work: DiveWork, probe: DiveProbe, number: int) -> PieceResult:
@@ -183,13 +192,20 @@ def _write_piece(
 
 
 def _frames(dive: OpenDive, span: Span) -> Iterator[Frame]:
-    """Return the frames of a piece; the first of them has been decoded."""
+    """Return the frames of a piece, and those beside it that they need.
+
+    The first of a dive that is not cut has been decoded.
+    """
     path, shutter = Path(dive.request.source), dive.rig.shutter
+    if span.kind is SpanKind.WHOLE:
+        return ready(iter(dive.source), dive.source, FrameWindow())
     if span.kind is SpanKind.VIDEO:
-        return frames_of(_video_frames(path, span, dive.rig.size_px), shutter)
-    if span.kind is SpanKind.IMAGES:
-        return frames_of(image_frames(path, span, dive.request.fps or 1.0), shutter)
-    return ready(iter(dive.source), dive.source, FrameWindow())
+        pictures = _video_frames(path, span, dive.rig.size_px)
+    else:
+        pictures = image_frames(path, span, dive.request.fps or 1.0)
+    first, stop = frames_in(span, shutter)
+    near = range(first - REACH, stop + REACH)
+    return (frame for frame in frames_of(pictures, shutter) if frame.index in near)
 
 
 def _video_frames(path: Path, span: Span, size_px: tuple[int, int]) -> Iterator[Frame]:
@@ -202,11 +218,19 @@ def _blocks(
 ) -> Iterator[list[FrameResult]]:
     """Yield the results of a piece's frames, and refusals in place of lost frames."""
     # A recording tells of lost frames itself.
-    first = None if dive.is_replay else frames_in(span, dive.rig.shutter)[0]
-    pairs = with_losses(frames, first, dive.rig.n_water)
-    return corrected_rows(
+    first, stop = frames_in(span, dive.rig.shutter)
+    counted_from = None if dive.is_replay else first - min(span.lead, REACH)
+    pairs = with_losses(frames, counted_from, dive.rig.n_water)
+    blocks = corrected_rows(
         result_blocks(in_blocks(pairs, processor.block_length), processor), dive.rig
     )
+    if not (span.lead or span.trail):
+        yield from blocks
+        return
+    for block in blocks:
+        own = [measured for measured in block if first <= measured.scan.index < stop]
+        if own:
+            yield own
 
 
 class _Kept(threading.local):

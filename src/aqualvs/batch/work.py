@@ -20,6 +20,7 @@ from aqualvs.optics.rigfile import rig_to_mapping
 from aqualvs.pipeline import OpenDive, open_dive
 from aqualvs.results.files import writing
 from aqualvs.results.run_request import RunRequest, source_dict, versions
+from aqualvs.scanning.row_motion import REACH
 from aqualvs.sources.fields import source_of_pictures
 from aqualvs.sources.images import ImageSource, images_in
 from aqualvs.sources.spans import Span, SpanKind, image_spans, video_spans
@@ -175,10 +176,12 @@ def probe(work: DiveWork) -> DiveProbe:
             n_frames=dive.source.n_frames,
             source=source_dict(dive.source),
         )
-        rolls = dive.rig.shutter.rolls
-        stat = _stat_key(Path(work.request.source)) | {"frames": work.piece_frames}
+        # A rolling shutter is corrected by the frames beside each.
+        margin = REACH if dive.rig.shutter.rolls else 0
+        stat = _stat_key(Path(work.request.source))
+        stat |= {"frames": work.piece_frames, "margin": margin}
         content = _remembered(work, stat) or _remember(
-            work, stat, _content(dive, work.piece_frames)
+            work, stat, _content(dive, work.piece_frames, margin)
         )
     spans = tuple(Span(**{**span, "kind": SpanKind(span["kind"])}) for span in content["spans"])
     found = replace(
@@ -187,17 +190,15 @@ def probe(work: DiveWork) -> DiveProbe:
     why = content["why_whole"]
     if work.request.index_target is not None:
         why = "the water is followed from frame to frame"
-    elif rolls:
-        why = "its rolling shutter is corrected from frame to frame"
     return found.in_one_piece(why) if why or not spans else found
 
 
-def _content(dive: OpenDive, piece_frames: int) -> dict[str, Any]:
+def _content(dive: OpenDive, piece_frames: int, margin: int) -> dict[str, Any]:
     """Return what is found in the source itself, ready for JSON."""
     path, pictures = Path(dive.request.source), source_of_pictures(dive.source)
     if isinstance(pictures, VideoSource):
         try:
-            video = video_spans(path, piece_frames)
+            video = video_spans(path, piece_frames, margin)
         except (av.error.FFmpegError, OSError) as fault:
             return _uncut(path, f"cannot be looked through ({fault})")
         return {
@@ -207,16 +208,16 @@ def _content(dive: OpenDive, piece_frames: int) -> dict[str, Any]:
             "n_bytes": video.n_bytes,
         }
     if isinstance(pictures, ImageSource) and path.is_dir():
-        return _images(path, piece_frames)
+        return _images(path, piece_frames, margin)
     return _uncut(path, "recordings and bags are not cut")
 
 
-def _images(folder: Path, piece_frames: int) -> dict[str, Any]:
+def _images(folder: Path, piece_frames: int, margin: int) -> dict[str, Any]:
     files = [(path.name, path.stat()) for path in images_in(folder)]
     sizes = [stat.st_size for _, stat in files]
     return {
         "source_key": digest({"files": [(n, s.st_size, s.st_mtime_ns) for n, s in files]}),
-        "spans": [asdict(span) for span in image_spans(sizes, piece_frames)],
+        "spans": [asdict(span) for span in image_spans(sizes, piece_frames, margin)],
         "why_whole": "",
         "n_bytes": sum(sizes),
     }

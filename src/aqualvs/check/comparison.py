@@ -143,7 +143,7 @@ def _camera_changes(new: Rig, old: Rig) -> dict[str, float]:
     changes = dict(zip(POSE_PARAMETERS, map(float, values), strict=True))
     if new.housing is not None and type(new.housing) is type(old.housing):
         ours, theirs = _port_numbers(new), _port_numbers(old)
-        changes |= {name: ours[name] - theirs[name] for name in new.camera().params.port.names}
+        changes |= {name: ours[name] - theirs[name] for name in ours}
     if same_lens_model(new, old):
         numbers = zip(_intrinsics(new), _intrinsics(old), strict=True)
         differences = (ours - theirs for ours, theirs in numbers)

@@ -213,7 +213,7 @@ def shutter_finding(rig: Rig) -> Finding | None:
     blur = ""
     if shutter.exposure > 0.0:
         pixels = rig.focal_px * _TURN * shutter.exposure
-        blur = f"an exposure of {1e3 * shutter.exposure:g} ms blurs over {pixels:.1f} px"
+        blur = f"an exposure of {1e3 * shutter.exposure:g} ms blurs a net over {pixels:.1f} px"
     if shutter.kind is ShutterKind.GLOBAL:
         return Finding(Severity.OK, f"The shutter exposes all rows at once. {rates} {blur}.")
     blur = f"; {blur}" if blur else ""

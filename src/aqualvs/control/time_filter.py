@@ -68,7 +68,7 @@ class PostureFilterOptions:
         Share of sound measurements that pass the gate.
     n_rejected : int
         Rejected measurements in a row that agree with each other, after which the filter accepts
-        them: the target itself is elsewhere.
+        them: the target itself is elsewhere. An angle alone begins anew after so many.
     max_coast : float
         Seconds without an accepted measurement after which there is no filtered posture.
     """
@@ -117,6 +117,10 @@ class PostureFilter:
     time, so that the frame rate does not matter. Only measurements move the state; what `update`
     returns between them is a forecast. A measurement beyond the gate starts a rival track; the
     rival replaces the track once enough measurements in a row have agreed with it.
+
+    An angle alone beyond its gate is left out, and the rest of the measurement enters: a vehicle
+    that pitches over faster than the model allows must not lose its range. An angle that is left
+    out often enough in a row begins anew.
 
     Pitch and yaw stay within 90 degrees of the target's normal by their definition, so that no
     angle wraps. Errors of the rig are constant in time; no filter reduces them, and the covariance
@@ -185,7 +189,7 @@ class PostureFilter:
         """Return the rival track with a measurement that did not fit the track."""
         if self._rival is not None and time_s >= self._rival.time_s:
             updated = self._motion.updated(self._rival, time_s, measured, cov)
-            if updated is not None:
+            if updated is not None and not any(updated.n_left_out):
                 return updated
         return self._motion.started(time_s, measured, cov)
 
@@ -199,6 +203,8 @@ class _Track:
     cov: FloatArray
     n_measurements: int
     rig_covariance: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
+    # How often in a row pitch and yaw have been left out.
+    n_left_out: tuple[int, int] = (0, 0)
 
     def as_filtered(self, known: "_Track", time_s: float, accepted: bool) -> FilteredPosture:
         """Return this forecast in the words of the outputs."""
@@ -216,6 +222,10 @@ class _Track:
         )
 
 
+# A range forecast over a longer time is too uncertain to tell an angle alone from a wild posture.
+_FRESH_S = 0.15
+
+
 class _Motion:
     """Motion model: forecast of a track, and its update by measurements."""
 
@@ -226,6 +236,7 @@ class _Motion:
             options.yaw_acceleration,
         )
         self._noise = np.diag(np.square(accelerations))
+        self._n_rejected = options.n_rejected
         turn = options.initial_turn_rate
         self._initial_rates = np.diag(np.square((options.initial_speed, turn, turn)))
         # Imported here: a run that filters nothing need not wait for SciPy.
@@ -233,6 +244,8 @@ class _Motion:
 
         # Below this squared Mahalanobis distance lies the share of three normal variables.
         self._gate = float(chdtri(3.0, 1.0 - options.gate_probability))
+        # The same for one of them.
+        self._gate_alone = float(chdtri(1.0, 1.0 - options.gate_probability))
 
     def started(self, time_s: float, measured: FloatArray, cov: FloatArray) -> _Track:
         """Return a track from its first measurement: its rates are unknown."""
@@ -252,25 +265,55 @@ class _Motion:
         cov[:3, 3:] += self._noise * (dt**2 / 2.0)
         cov[3:, :3] += self._noise * (dt**2 / 2.0)
         cov[3:, 3:] += self._noise * dt
-        return _Track(time_s, move @ track.state, cov, track.n_measurements)
+        return replace(track, time_s=time_s, state=move @ track.state, cov=cov)
 
     def updated(
         self, track: _Track, time_s: float, measured: FloatArray, cov: FloatArray
     ) -> _Track | None:
         """Return the track after a measurement, None if that lies beyond the gate."""
         ahead = self.forecast(track, time_s)
-        standardised = measured - ahead.state[:3]
+        innovation = measured - ahead.state[:3]
         of_innovation = ahead.cov[:3, :3] + cov
-        weight = np.linalg.inv(of_innovation)
-        if standardised @ weight @ standardised > self._gate:
-            return None
-        gain = ahead.cov[:, :3] @ weight
+        used = np.ones(3, np.bool_)
+        if innovation @ np.linalg.inv(of_innovation) @ innovation > self._gate:
+            used = innovation**2 <= self._gate_alone * np.diag(of_innovation)
+            if not used[0] or used.all() or time_s - track.time_s > _FRESH_S:
+                return None
+        at = np.flatnonzero(used)
+        gain = ahead.cov[:, at] @ np.linalg.inv(of_innovation[np.ix_(at, at)])
         # Joseph's form stays positive whatever rounding does.
         keep = np.eye(6)
-        keep[:, :3] -= gain
-        after = keep @ ahead.cov @ keep.T + gain @ cov @ gain.T
-        state = ahead.state + gain @ standardised
-        return _Track(time_s, state, 0.5 * (after + after.T), track.n_measurements + 1)
+        keep[:, at] -= gain
+        after = keep @ ahead.cov @ keep.T + gain @ cov[np.ix_(at, at)] @ gain.T
+        state = ahead.state + gain @ innovation[at]
+        out_pitch, out_yaw = (
+            0 if one else n + 1 for one, n in zip(used[1:], ahead.n_left_out, strict=True)
+        )
+        updated = replace(
+            ahead,
+            state=state,
+            cov=0.5 * (after + after.T),
+            n_measurements=track.n_measurements + 1,
+            n_left_out=(out_pitch, out_yaw),
+        )
+        return self._angles_begun(updated, measured, cov)
+
+    def _angles_begun(self, track: _Track, measured: FloatArray, cov: FloatArray) -> _Track:
+        """Return the track with an angle that has been left out too often begun anew."""
+        out = [k for k, n in enumerate(track.n_left_out, 1) if n >= self._n_rejected]
+        if not out:
+            return track
+        state, after = track.state.copy(), track.cov.copy()
+        for k in out:
+            for at, value, variance in (
+                (k, measured[k], cov[k, k]),
+                (k + 3, 0.0, self._initial_rates[k, k]),
+            ):
+                state[at] = value
+                after[at] = after[:, at] = 0.0
+                after[at, at] = variance
+        pitch, yaw = (n if n < self._n_rejected else 0 for n in track.n_left_out)
+        return replace(track, state=state, cov=after, n_left_out=(pitch, yaw))
 
 
 def _measurement(posture: Posture | Refusal) -> tuple[FloatArray, FloatArray] | None:

@@ -104,7 +104,8 @@ class Console:
     def __init__(self, stream: TextIO | None = None) -> None:
         self._stream = sys.stderr if stream is None else stream
         self._on_screen = self._stream.isatty()
-        self._next_s = -math.inf
+        # A log begins with what goes wrong: of a run that ends at once, nothing else is told.
+        self._next_s = -math.inf if self._on_screen else time.monotonic() + _LOG_EVERY_S
         self._parts: dict[str, tuple[State, str]] = {}
 
     def send(self, sample: LiveSample) -> None:

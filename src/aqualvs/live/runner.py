@@ -279,9 +279,7 @@ class FrameReader:
         self._thread = threading.Thread(target=self._read, name="frames", daemon=True)
 
     def health(self) -> PartHealth:
-        """Return how the feed is."""
-        if self.fault is not None:
-            return PartHealth(self._feed.name, State.FAULT, str(self.fault))
+        """Return how the feed is; what ends it is the owner's to tell, once."""
         if self._trouble:
             return PartHealth(self._feed.name, State.FAULT, self._trouble)
         return self._feed.health()

@@ -24,7 +24,7 @@ from aqualvs.optics.camera import (
     moved_pose,
 )
 from aqualvs.optics.dome import Dome
-from aqualvs.optics.flat_port import FlatPort
+from aqualvs.optics.flat_port import FLAT_PARAMETERS, FlatPort
 from aqualvs.optics.lens import Lens
 from aqualvs.optics.shutter import AT_ONCE, Shutter
 
@@ -292,7 +292,7 @@ def rig_parameter_names(rig: Rig) -> tuple[str, ...]:
     A bare lens has those of a dome: the same rig may be used without it.
     """
     lasers = (name for laser in rig.lasers for name in laser_parameter_names(laser))
-    port = DOME_PARAMETERS if rig.housing is None else rig.camera().params.port.names
+    port = DOME_PARAMETERS if rig.flat_port is None else FLAT_PARAMETERS
     return (*POSE_PARAMETERS, *port, *rig.lens.parameter_names, *lasers)
 
 

@@ -94,9 +94,9 @@ def size_of_frames(rig: Rig) -> tuple[int, int]:
 
 
 def frames_in(span: Span, shutter: Shutter) -> tuple[int, int]:
-    """Return the first frame of consecutive pictures, and the first after them."""
+    """Return the first of a span's own frames, and the first after them."""
     n = 2 if shutter.is_interlaced else 1
-    return n * span.first, n * span.stop
+    return n * (span.first + span.lead), n * (span.stop - span.trail)
 
 
 class FieldSource(Closing):

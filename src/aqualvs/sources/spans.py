@@ -63,6 +63,9 @@ class Span:
         Size of the packets, or of the files.
     checksum : int
         CRC-32 of the packets with their times.
+    lead, trail : int
+        Frames at the beginning and at the end that are those of the spans beside it, for what
+        depends on a frame's neighbours; they count in `first`, `stop` and `checksum`.
     """
 
     kind: SpanKind
@@ -72,6 +75,8 @@ class Span:
     origin_pts: int = 0
     n_bytes: int = 0
     checksum: int = 0
+    lead: int = 0
+    trail: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +86,7 @@ class VideoSpans:
     Attributes
     ----------
     spans : tuple of Span
-        In order, without gaps; empty if the video must stay whole.
+        In order, without gaps between their own frames; empty if the video must stay whole.
     why_whole : str
         Why it must; empty if it need not.
     checksum : int
@@ -96,7 +101,7 @@ class VideoSpans:
     n_bytes: int
 
 
-def video_spans(path: Path, n_min: int) -> VideoSpans:
+def video_spans(path: Path, n_min: int, margin: int = 0) -> VideoSpans:
     """Read a video's packets, without decoding them, and find where it may be cut.
 
     Parameters
@@ -104,6 +109,8 @@ def video_spans(path: Path, n_min: int) -> VideoSpans:
     path : Path
     n_min : int
         Frames that a part has at least, but for the last.
+    margin : int
+        Frames that a part holds at least of those beside it.
 
     Raises
     ------
@@ -119,11 +126,11 @@ def video_spans(path: Path, n_min: int) -> VideoSpans:
         except av.error.FFmpegError as fault:
             packets.doubt(f"the file breaks off ({fault.strerror})")
         why = packets.why_whole() or _broken_promise(stream, packets)
-        spans = () if why else packets.spans(n_min)
+        spans = () if why else packets.spans(n_min, margin)
         return VideoSpans(spans, why, packets.checksum, packets.n_bytes)
 
 
-def image_spans(sizes: Sequence[int], n_min: int) -> tuple[Span, ...]:
+def image_spans(sizes: Sequence[int], n_min: int, margin: int = 0) -> tuple[Span, ...]:
     """Cut a folder of images into parts.
 
     Parameters
@@ -132,12 +139,24 @@ def image_spans(sizes: Sequence[int], n_min: int) -> tuple[Span, ...]:
         Of the files, in bytes, in their order.
     n_min : int
         Images that a part has, but for the last.
+    margin : int
+        As in `video_spans`.
     """
     edges = [*range(0, len(sizes), n_min), len(sizes)]
-    return tuple(
-        Span(kind=SpanKind.IMAGES, first=first, stop=stop, n_bytes=sum(sizes[first:stop]))
-        for first, stop in itertools.pairwise(edges)
-    )
+    found = []
+    for first, stop in itertools.pairwise(edges):
+        lead, trail = min(margin, first), min(margin, len(sizes) - stop)
+        found.append(
+            Span(
+                kind=SpanKind.IMAGES,
+                first=first - lead,
+                stop=stop + trail,
+                n_bytes=sum(sizes[first:stop]),
+                lead=lead,
+                trail=trail,
+            )
+        )
+    return tuple(found)
 
 
 def packet_checksum(packet: "Packet[VideoStream]") -> int:
@@ -207,23 +226,27 @@ class _Packets:
             return "pictures that share a time"
         return "" if self._cuts[:1] == [0] else "no key frame at the beginning"
 
-    def spans(self, n_min: int) -> tuple[Span, ...]:
+    def spans(self, n_min: int, margin: int) -> tuple[Span, ...]:
         """Return the spans, each of which begins at a picture that needs none before it."""
-        starts = _far_enough(self._sound_cuts(), n_min)
-        edges = [*starts, len(self._pts)]
-        origin = min(self._pts)
-        return tuple(
-            Span(
-                kind=SpanKind.VIDEO,
-                first=first,
-                stop=stop,
-                start_pts=self._pts[first],
-                origin_pts=origin,
-                n_bytes=sum(self._sizes[first:stop]),
-                checksum=joint_checksum(self._sums[first:stop]),
+        cuts, n = self._sound_cuts(), len(self._pts)
+        origin, found = min(self._pts), []
+        for first, stop in itertools.pairwise([*_far_enough(cuts, n_min), n]):
+            begin = max(cut for cut in cuts if cut <= max(first - margin, 0))
+            end = min(cut for cut in (*cuts, n) if cut >= min(stop + margin, n))
+            found.append(
+                Span(
+                    kind=SpanKind.VIDEO,
+                    first=begin,
+                    stop=end,
+                    start_pts=self._pts[begin],
+                    origin_pts=origin,
+                    n_bytes=sum(self._sizes[first:stop]),
+                    checksum=joint_checksum(self._sums[begin:end]),
+                    lead=first - begin,
+                    trail=end - stop,
+                )
             )
-            for first, stop in itertools.pairwise(edges)
-        )
+        return tuple(found)
 
     def latest_s(self) -> float:
         """Return the time of the last picture after the first, in seconds."""

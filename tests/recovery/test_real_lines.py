@@ -1,0 +1,51 @@
+"""Photographs of laser lines that no rig describes: the search over whole pictures.
+
+The truth is traced by hand, or the difference of a picture with lines and one without.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import real_lines
+
+
+def lines(samples: Path, fmt: str) -> Iterator[real_lines.Score]:
+    for shot in real_lines.shots(samples / "real-laser-lines", [fmt]):
+        yield from shot.scores
+
+
+@pytest.fixture(scope="module")
+def line_scores(samples: Path) -> dict[str, list[real_lines.Score]]:
+    return {fmt: list(lines(samples, fmt)) for fmt in ("png", "jpg80", "crf23")}
+
+
+@pytest.mark.samples
+@pytest.mark.parametrize("fmt", ["png", "jpg80", "crf23"])
+def test_green_lines_without_a_rig(line_scores, fmt: str) -> None:
+    bright = [s for s in line_scores[fmt] if s.picture.startswith("green15-bright")]
+    dark = [
+        s for s in line_scores[fmt] if s.picture.startswith("green15-dark") and s.group == "line"
+    ]
+    assert (len(bright), len(dark)) == (4, 3)
+    assert {s.picture: s.found for s in bright if s.found < 0.95} == {}
+    assert {s.picture: s.weakest for s in bright if s.weakest < 0.85} == {}
+    assert {s.picture: s.found for s in dark if s.found < 0.8} == {}
+
+
+@pytest.mark.samples
+@pytest.mark.parametrize("fmt", ["png", "jpg80", "crf23"])
+def test_nothing_is_found_without_laser(line_scores, fmt: str) -> None:
+    off = [s for s in line_scores[fmt] if s.group.startswith("off")]
+    assert len(off) == 2 * 14
+    assert {(s.picture, s.group): s.n_points for s in off if s.n_points > 0} == {}
+
+
+@pytest.mark.samples
+@pytest.mark.parametrize(("fmt", "n_min"), [("png", 8), ("jpg80", 7), ("crf23", 4)])
+def test_red_lines_of_pairs(line_scores, fmt: str, n_min: int) -> None:
+    """What is reached of 8: at 320 x 240, compression takes what colour a thin line has left."""
+    pairs = [s for s in line_scores[fmt] if s.group == "pair"]
+    assert len(pairs) == 10
+    assert sum(s.found >= 0.9 for s in pairs) >= n_min
