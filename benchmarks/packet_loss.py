@@ -43,7 +43,7 @@ from aqualvs.scanning.posture import Posture, Refusal
 from aqualvs.scanning.scan import Frame, ImagePlane
 from aqualvs.sources import open_source
 from aqualvs.sources.base import bgr_of, packet_with, planes_of
-from aqualvs.sources.h264 import IDR, SEI, SLICE, START_CODE
+from aqualvs.sources.h264 import START_CODE, NalType
 from aqualvs.sources.live_frames import LiveFrames, Reception
 from aqualvs.sources.rtp import TICKS_HZ, H264Depacketizer, RtpOrder, parse_rtp
 from aqualvs.sources.udp import decoded, decoder_of
@@ -131,7 +131,10 @@ def encode(frames: list[Frame], gop: int, bitrate: int, x264: str) -> list[list[
         picture.pts = i
         packets += codec.encode(picture)
     packets += codec.encode(None)
-    return [[unit for unit in units_of(bytes(packet)) if unit[0] & 31 != SEI] for packet in packets]
+    return [
+        [unit for unit in units_of(bytes(packet)) if unit[0] & 31 != NalType.SEI]
+        for packet in packets
+    ]
 
 
 def units_of(data: bytes) -> list[bytes]:
@@ -171,7 +174,7 @@ def lost_parts(parts: list[Part], share: float, run: float, seed: int) -> list[b
         begin = go_on = share
     for part in parts:
         lost = chance.random() < (go_on if lost else begin)
-        is_set = part.fragment == 0 and part.payload[0] & 31 > SEI
+        is_set = part.fragment == 0 and part.payload[0] & 31 > NalType.SEI
         found.append(lost and not is_set)
     return found
 
@@ -240,7 +243,7 @@ def missing(units: list[bytes], whole: set[int], shape: tuple[int, int]) -> np.n
     """
     height, width = (-(-n // MACROBLOCK) for n in shape)
     bad = np.ones(height * width, np.bool_)
-    slices = [k for k, unit in enumerate(units) if unit[0] & 31 in (SLICE, IDR)]
+    slices = [k for k, unit in enumerate(units) if unit[0] & 31 in (NalType.SLICE, NalType.IDR)]
     for k in slices:
         follows = k == slices[-1] or k + 1 in whole
         if k in whole and follows:
@@ -261,12 +264,12 @@ def with_damage(
         whole = {k for k in range(len(units)) if (i, k) not in torn}
         got = [unit for k, unit in enumerate(units) if k in whole]
         kinds = {unit[0] & 31 for unit in got}
-        if not kinds & {SLICE, IDR}:
+        if not kinds & {NalType.SLICE, NalType.IDR}:
             if last is not None:
                 for one, other in zip(*last, strict=True):
                     np.subtract(255, one, out=other)
             continue
-        if last is None and IDR not in kinds:
+        if last is None and NalType.IDR not in kinds:
             continue
         found, twin = decode(plain, got, i), decode(spoilt, got, i)
         if found is None or twin is None:

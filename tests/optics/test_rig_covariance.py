@@ -14,7 +14,7 @@ from aqualvs.optics.rig import Rig, RigUncertainty, Window, rig_moved_by, rig_pa
 from aqualvs.optics.rig_covariance import PostureErrors, fitted_plane
 from aqualvs.optics.sheet import sheets_of
 from aqualvs.optics.solved import (
-    FOCAL_SHARE,
+    SIGMAS,
     assumptions,
     completed_uncertainty,
     with_exact_numbers,
@@ -203,7 +203,7 @@ def test_what_is_written_by_hand_counts_with_defaults() -> None:
     lasers = {f"laser '{laser.name}'" for laser in rig.lasers}
     assert told == {"set of intrinsics", "lens's place", "dome", "water's index"} | lasers
     whole = completed_uncertainty(rig)
-    assert whole.sigmas["fx"] == pytest.approx(FOCAL_SHARE * rig.lens.fx, rel=0.01)
+    assert whole.sigmas["fx"] == pytest.approx(SIGMAS.focal_share * rig.lens.fx, rel=0.01)
     # fx and fy are known together far better than each of them.
     lens = whole.of(["fx", "fy"]) / np.outer([rig.lens.fx, rig.lens.fy], [rig.lens.fx, rig.lens.fy])
     assert np.sqrt(np.array([1, -1]) @ lens @ [1, -1]) == pytest.approx(5e-4, rel=1e-6)

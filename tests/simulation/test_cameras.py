@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from aqualvs.errors import OptionError
+from aqualvs.optics.water import GREEN_NM
 from aqualvs.simulation.cameras import (
     IDEAL,
     Development,
@@ -17,7 +18,7 @@ from aqualvs.simulation.cameras import (
     simulated_camera,
     spread,
 )
-from aqualvs.simulation.lasers import GREEN_NM, ColourFilters, band_shares, laser_wavelength_nm
+from aqualvs.simulation.lasers import ColourFilters, band_shares, laser_wavelength_nm
 from aqualvs.simulation.scenario import dome_from_target
 from aqualvs.simulation.scenarios import example_rig
 from aqualvs.simulation.scene import CameraSensor, Scene, WaterOptics

@@ -31,8 +31,6 @@ from aqualvs.results.folder import HOLES_CSV, NET_CSV, POINTS_PARQUET, POSTURE_C
 MANIFEST = "done.json"
 """Written last; says for what the content of a folder was made, and what it is."""
 
-_BLOCK = 1 << 20
-
 
 def write_manifest(
     folder: Path,
@@ -157,8 +155,9 @@ def _publish(draft: Path, folder: Path) -> None:
 def _fingerprint(path: Path) -> list[int]:
     """Return size and CRC-32 of a file."""
     size, checksum = 0, 0
+    block_bytes = 1 << 20
     with path.open("rb") as file:
-        while block := file.read(_BLOCK):
+        while block := file.read(block_bytes):
             size += len(block)
             checksum = zlib.crc32(block, checksum)
     return [size, checksum]

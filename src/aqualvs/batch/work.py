@@ -66,7 +66,9 @@ def result_key(dive: OpenDive) -> str:
     request = dive.request
     target_content = content_digest(request.index_target)
     facts = request.to_dict() | {"rig_file": None, "index_target": target_content}
-    target = asdict(target_dict(request.target))
+    told = target_dict(request.target)
+    target = asdict(told) | {"mesh_filter": asdict(told.mesh_filter)}
+    del target["filter_lengths"]
     found = {
         "format": _FORMAT,
         "rig": rig_to_mapping(dive.rig),

@@ -33,7 +33,7 @@ from aqualvs.optics.rig import Rig
 from aqualvs.optics.rigfile import check_rig_place, load_rig
 from aqualvs.optics.solved import (
     ASSUMED,
-    N_WATER,
+    SIGMAS,
     SolvedStep,
     completed_uncertainty,
     file_parameter_name,
@@ -248,7 +248,7 @@ def _board_set(
         views=found.views,
         poses=given,
         n_medium=n_medium,
-        sigma_medium=0.0 if in_air else rig_uncertainty(rig).sigmas.get("n_water", N_WATER),
+        sigma_medium=0.0 if in_air else rig_uncertainty(rig).sigmas.get("n_water", SIGMAS.n_water),
     )
     return found, board_set
 

@@ -33,12 +33,8 @@ from aqualvs.terminal import progress
 
 # Errors by the rates are proportional to the readout: any will do to find them.
 _NOMINAL = 0.02
-# The rates are corrected by the readout, which converges by a factor of ten or more a round.
-_ROUNDS = 6
 # Parts of the dive whose disagreement gives sigma, and the least frames in all.
 _N_PARTS, _MIN_FRAMES = 10, 50
-# A sigma beyond this, in seconds, is no result: 5 % of a usual readout.
-_MAX_SIGMA = 1e-3
 # The lasers move with the camera: a stripe moves by the change of range and tilt alone, 50 px/s and
 # less, and its width changes more by distance and brightness than by blur.
 _EXPOSURE = "The exposure is not observable from stripes: what the rig file says of it stays."
@@ -125,7 +121,9 @@ def calibrate_shutter(source: FrameSource, rig: Rig) -> ShutterCalibration:
             f"wall, at least {_MIN_FRAMES} frames"
         )
     found = _solve(scans, warps)
-    if not found.sigma <= _MAX_SIGMA:
+    # A sigma beyond this, in seconds, is no result: 5 % of a usual readout.
+    max_sigma = 1e-3
+    if not found.sigma <= max_sigma:
         raise CalibrationError(
             f"{source.name}: the readout is not observable, its sigma is {1e3 * found.sigma:.2g} "
             "ms; swing the vehicle in pitch and yaw before a wall, 10 degrees and more to each "
@@ -218,7 +216,9 @@ def _warp(scan: Scan, height: int) -> _Warp | None:
 def _solve(scans: Sequence[Scan], warps: Sequence[tuple[int, _Warp]]) -> ShutterCalibration:
     """Return the readout that explains the warps, and its sigma by the parts of the dive."""
     readout, share = 0.0, np.arange(len(warps)) * _N_PARTS // len(warps)
-    for _ in range(_ROUNDS):
+    # The rates are corrected by the readout, which converges by a factor of ten or more a round.
+    rounds = 6
+    for _ in range(rounds):
         # Of readout and static part.
         equations = list(_equations(scans, warps, readout))
         matrices = np.array([matrix for matrix, _ in equations])

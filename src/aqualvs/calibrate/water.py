@@ -46,8 +46,6 @@ from aqualvs.sources import FrameSource, open_source
 from aqualvs.sources.images import IMAGE_SUFFIXES, ImageSource
 from aqualvs.terminal import progress
 
-_FPS = 25.0
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WaterRequest:
@@ -209,9 +207,10 @@ def _prior(request: WaterRequest, rig: Rig) -> IndexPrior | None:
 def _source(request: WaterRequest) -> FrameSource:
     only = request.source[0]
     pictures = len(request.source) > 1 or Path(only).suffix.lower() in IMAGE_SUFFIXES
+    usual_fps = 25.0
     if pictures or any(sign in only for sign in "*?["):
-        return ImageSource(picture_paths(request.source), fps=request.fps or _FPS)
-    fps = request.fps or (_FPS if Path(only).is_dir() else None)
+        return ImageSource(picture_paths(request.source), fps=request.fps or usual_fps)
+    fps = request.fps or (usual_fps if Path(only).is_dir() else None)
     return open_source(only, fps=fps)
 
 

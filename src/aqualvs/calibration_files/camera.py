@@ -171,8 +171,6 @@ def camera_of_rig(rig: Rig) -> ForeignCamera:
 
 # YAML of C++ programs has numbers such as 1e-05, which YAML 1.1 reads as text; XML has text only.
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
-_LONGEST_NUMBER = 40
-_LARGEST = 1e9
 
 
 @dataclass(frozen=True, slots=True)
@@ -315,7 +313,8 @@ def number(value: object, place: str) -> float:
     RigError
         If it is none.
     """
-    if isinstance(value, str) and len(value) < _LONGEST_NUMBER and _NUMBER.fullmatch(value.strip()):
+    longest_number = 40
+    if isinstance(value, str) and len(value) < longest_number and _NUMBER.fullmatch(value.strip()):
         value = float(value)
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise RigError(f"{place} is {shown(value)}; write a finite number")
@@ -330,7 +329,8 @@ def whole(value: float, place: str) -> int:
     RigError
         If it is none, or larger than any size of a picture.
     """
-    if value != math.floor(value) or not 0 <= value <= _LARGEST:
+    largest = 1e9
+    if value != math.floor(value) or not 0 <= value <= largest:
         raise RigError(f"{place} is {value:g}; write a whole number of 0 or more")
     return int(value)
 

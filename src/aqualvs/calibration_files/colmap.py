@@ -52,8 +52,6 @@ _PORTS = {
     _DOME: ("Cx", "Cy", "Cz", "int_radius", "int_thick", "na", "ng", "nw"),
     _FLAT: ("Nx", "Ny", "Nz", "int_dist", "int_thick", "na", "ng", "nw"),
 }
-# Of a normal that is written with few digits.
-_NOT_UNIT = 1e-3
 
 
 class _Row(NamedTuple):
@@ -143,7 +141,9 @@ def _port(words: Sequence[str], place: str) -> ForeignHousing:
     if model == _DOME:
         return ForeignHousing(Dome(size, thickness, n_port), n_air, n_water, np.array([x, y, z]))
     length = math.hypot(x, y, z)
-    if not abs(length - 1.0) <= _NOT_UNIT:
+    # Of a normal that is written with few digits.
+    not_unit = 1e-3
+    if not abs(length - 1.0) <= not_unit:
         raise RigError(
             f"{place}: {model}: the normal Nx Ny Nz has the length {length:g}; write a unit vector"
         )

@@ -27,7 +27,6 @@ from aqualvs.yamlfile import TidyDumper, parse_yaml
 # Coefficients that each of ROS's models takes; image_geometry ignores none of them.
 _ROS_MODELS = {"plumb_bob": (0, 4, 5), "rational_polynomial": (8, 12, 14), "equidistant": (0, 4)}
 _FISHEYE = "equidistant"
-_WIDTH = 1000
 
 
 def read_ros(text: str, source: str) -> ForeignCamera:
@@ -113,8 +112,9 @@ def ros_text(camera: ForeignCamera) -> str:
 
 def yaml_text(content: Mapping[str, Any]) -> str:
     """Return keys and values as YAML, each list on one line."""
+    width = 1000
     text: str = yaml.dump(
-        content, Dumper=TidyDumper, sort_keys=False, width=_WIDTH, default_flow_style=False
+        content, Dumper=TidyDumper, sort_keys=False, width=width, default_flow_style=False
     )
     return text
 

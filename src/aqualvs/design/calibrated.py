@@ -8,6 +8,7 @@ its offset is neglected or known.
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,13 +23,18 @@ from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
 from aqualvs.optics.expected_error import WallView
 from aqualvs.optics.rig import Laser, Rig, rig_moved_by
 
-# Boards for the calibration of lasers: tilts (radians), places in the working range (as powers),
-# corners to a side, and half a side as a share of the range, such that they fill the picture.
-_LEANS = (np.deg2rad((25.0, 0.0, 10.0)), np.deg2rad((-15.0, 0.0, -25.0)))
-_PLACES = (0.15, 0.85)
-_N_CORNERS = 11
-_HALF_BOARD = 0.8
-_N_POINTS, _MIN_POINTS = 161, 40
+
+class _BoardOptions(NamedTuple):
+    """Boards for the calibration of lasers, and points on their stripes."""
+
+    places: tuple[float, float] = (0.15, 0.85)
+    n_corners: int = 11
+    half_board: float = 0.8
+    n_points: int = 161
+    min_points: int = 40
+
+
+_BOARD = _BoardOptions()
 
 
 def camera_errors(design: Design, ranges: Sequence[float]) -> dict[str, FloatArray]:
@@ -107,7 +113,7 @@ def lasers_by(believed: Rig, true: Rig) -> Rig | None:
             continue
         for points, laser in zip(lit, true.lasers, strict=True):
             points.append(_stripe_on(board, found, laser, believed, true))
-    if any(sum(map(len, points)) < _MIN_POINTS for points in lit):
+    if any(sum(map(len, points)) < _BOARD.min_points for points in lit):
         return None
     lasers = (
         replace(laser, plane=_fitted(np.concatenate(points)), window=None)
@@ -119,16 +125,20 @@ def lasers_by(believed: Rig, true: Rig) -> Rig | None:
 def _boards(working_range: tuple[float, float]) -> Iterator[SE3]:
     """Return poses `dome_from_board`; boards lie in their x-z plane."""
     near, far = working_range
-    for share in _PLACES:
+    # Boards for the calibration of lasers: tilts (radians), places in the working range (as
+    # powers), corners to a side, and half a side as a share of the range, such that they fill the
+    # picture.
+    leans = (np.deg2rad((25.0, 0.0, 10.0)), np.deg2rad((-15.0, 0.0, -25.0)))
+    for share in _BOARD.places:
         middle = np.array([0.0, near * (far / near) ** share, 0.0])
-        for lean in _LEANS:
+        for lean in leans:
             yield SE3(rotation_from_rotvec(lean), middle)
 
 
 def _found(believed: Rig, true: Rig, board: SE3) -> SE3 | None:
     """Return the pose of a board as the assumed camera finds it."""
-    half = _HALF_BOARD * float(board.translation[1])
-    x, z = np.meshgrid(*(np.linspace(-half, half, _N_CORNERS),) * 2)
+    half = _BOARD.half_board * float(board.translation[1])
+    x, z = np.meshgrid(*(np.linspace(-half, half, _BOARD.n_corners),) * 2)
     corners = np.stack([x, np.zeros_like(x), z], axis=-1).reshape(-1, 3)
     camera = true.camera()
     pixels, valid = camera.project(board.apply(corners))
@@ -150,8 +160,8 @@ def _stripe_on(board: SE3, found: SE3, laser: Laser, believed: Rig, true: Rig) -
     rows = np.stack([laser.plane.normal, face, along / length])
     middle = board.translation
     start = np.linalg.solve(rows, [laser.plane.offset, face @ middle, rows[2] @ middle])
-    half = _HALF_BOARD * float(middle[1])
-    points = start + np.linspace(-half, half, _N_POINTS)[:, None] * rows[2]
+    half = _BOARD.half_board * float(middle[1])
+    points = start + np.linspace(-half, half, _BOARD.n_points)[:, None] * rows[2]
     camera = true.camera()
     pixels, valid = camera.project(points)
     on_board = np.abs(board.inverse().apply(points)) <= half
@@ -171,9 +181,6 @@ def _fitted(points: FloatArray) -> Plane:
 
 INDEX_ERROR = 0.005
 """Approximate difference of the indices of sea water and fresh water."""
-
-# Greatest offset of a lens, as a share of the inner radius.
-_ROOM = 0.9
 
 
 @dataclass(frozen=True, slots=True)
@@ -226,7 +233,9 @@ def offset_costs(design: Design, ranges: Sequence[float]) -> tuple[OffsetCost, .
     usual = (0.0, 0.5e-3, 1e-3, 2e-3, 5e-3, 10e-3, 20e-3, 40e-3)
     offsets = {round(value, 5) for value in (*usual, own, design.centring)}
     rig = design.nominal_rig()
-    room = _ROOM * dome.inner_radius
+    # Greatest offset of a lens, as a share of the inner radius.
+    room_share = 0.9
+    room = room_share * dome.inner_radius
     return tuple(_cost(rig, offset, ranges) for offset in sorted(offsets) if offset <= room)
 
 

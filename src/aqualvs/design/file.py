@@ -29,7 +29,7 @@ from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig
 from aqualvs.optics.rigfile import load_rig, shutter_from_part
 from aqualvs.optics.rigschema import NotNegative, Number, Positive, ShutterPart, StrictPart, Tilt
 from aqualvs.optics.shutter import AT_ONCE, Shutter
-from aqualvs.optics.water import seawater_index_vacuum
+from aqualvs.optics.water import N_AIR, seawater_index_vacuum
 from aqualvs.scanning.plane_fit import SharedError
 from aqualvs.yamlfile import parse_yaml, read_yaml
 
@@ -57,7 +57,6 @@ goals: {range_percent: 0.5, angle_deg: 0.5}  # errors that are equally bad
 avoid_crossings: true
 """
 
-_N_AIR = 1.0003
 _MM = 1e-3
 
 _Index = Annotated[float, Field(ge=1.0, le=2.0, allow_inf_nan=False)]
@@ -297,7 +296,7 @@ def _design(file: DesignFile, folder: Path) -> Design:
         lens=lens,
         dome_from_cam=SE3(DOME_FROM_CAM_NOMINAL, position),
         housing=_housing(file),
-        n_air=_N_AIR,
+        n_air=N_AIR,
         n_water=_water_index(file.water),
         lasers=(),
         working_range=(near, far),
@@ -367,7 +366,7 @@ def _water_index(water: WaterDesign) -> float:
         return water.n
     if water.temperature_c is None or water.salinity_permille is None:
         raise OptionError("water has no index; write n, or temperature_c and salinity_permille")
-    return float(seawater_index_vacuum(water.temperature_c, water.salinity_permille, n_air=_N_AIR))
+    return float(seawater_index_vacuum(water.temperature_c, water.salinity_permille, n_air=N_AIR))
 
 
 def _mounts(file: DesignFile) -> tuple[Mount, ...]:

@@ -18,7 +18,6 @@ from aqualvs.geometry.linear_algebra import invert_symmetric
 # Least number of search lines of a stripe for the scanner; least number of lasers for a posture.
 MIN_LINES = 16
 """Least number of points of a visible stripe."""
-_SINGULAR = 1e-9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -200,7 +199,8 @@ def inverse_of(matrix: FloatArray) -> FloatArray:
     known = np.isfinite(size) & (size > 0.0)
     safe = np.where(known[..., None, None], matrix, np.eye(3))
     least = np.linalg.eigvalsh(safe)[..., 0]
-    known &= least > _SINGULAR * np.where(known, size, 1.0)
+    singular = 1e-9
+    known &= least > singular * np.where(known, size, 1.0)
     inverse = np.linalg.inv(np.where(known[..., None, None], safe, np.eye(3)))
     return np.where(known[..., None, None], inverse, np.nan)
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -43,12 +43,20 @@ _PLANE = ("fx", "fy", "cx", "cy")
 _PAPER_LENS = "3.0, 41.53, 3.0"
 _PAPER_TURN = "2.51, 1.31, 11.36"
 _PAPER_PLANE = "turned by -0.07°, -0.06°, -0.64°"
-# How well a place on a rail is read off, each by itself.
-_READING_SIGMA = 0.2e-3
-# Paper that is not flat and print that is not true, as corners of real boards show them.
-_CORNER_PX = 0.1
-_SEED = 3
-_BAR_SIGMAS = 3.0
+
+
+class _Setup(NamedTuple):
+    """Noise of the boards' poses and corners, and the bar."""
+
+    # How well a place on a rail is read off, each by itself.
+    reading_sigma: float = 0.2e-3
+    # Paper that is not flat and print that is not true, as corners of real boards show them.
+    corner_px: float = 0.1
+    seed: int = 3
+    bar_sigmas: float = 3.0
+
+
+_SETUP = _Setup()
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +109,7 @@ def solve_from_pictures(laboratory: Laboratory) -> SolvedDome:
     """
     files = calibration_pictures(laboratory)
     truth = load_rig(files.rig)
-    lens = camera(board_views(files.camera, files.board, _SEED + 1), truth.size_px)
+    lens = camera(board_views(files.camera, files.board, _SETUP.seed + 1), truth.size_px)
     start = Rig(
         name=truth.name,
         size_px=truth.size_px,
@@ -113,12 +121,14 @@ def solve_from_pictures(laboratory: Laboratory) -> SolvedDome:
         lasers=(),
         working_range=truth.working_range,
     )
-    views = board_views(files.dome, files.rail_board, _SEED + 2)
+    views = board_views(files.dome, files.rail_board, _SETUP.seed + 2)
     assert files.poses is not None
     rows = read_with_errors(load_poses(files.poses))
     given, _ = match_poses(rows, [view.name for view in views], files.poses)
     sets = [BoardSet(name="air", views=views, poses=given, n_medium=truth.n_air)]
-    options = DomeOptions(distance_sigma=_READING_SIGMA, distance_offset_sigma=_READING_SIGMA)
+    options = DomeOptions(
+        distance_sigma=_SETUP.reading_sigma, distance_offset_sigma=_SETUP.reading_sigma
+    )
     problem = dome_problem(start, sets, lens.uncertainty, options)
     return SolvedDome(
         truth=truth,
@@ -152,17 +162,17 @@ def board_views(folder: Path, board_file: Path, seed: int) -> tuple[View, ...]:
             raise CalibrationError(f"{path}: {view}")
     rng = np.random.default_rng(seed)
     return tuple(
-        replace(view, pixels=view.pixels + rng.normal(0.0, _CORNER_PX, view.pixels.shape))
+        replace(view, pixels=view.pixels + rng.normal(0.0, _SETUP.corner_px, view.pixels.shape))
         for view in found
         if isinstance(view, View)
     )
 
 
-def read_with_errors(rows: Sequence[BoardPose], seed: int = _SEED) -> tuple[BoardPose, ...]:
+def read_with_errors(rows: Sequence[BoardPose], seed: int = _SETUP.seed) -> tuple[BoardPose, ...]:
     """Return true distances as they are read off a rail: each 0.2 mm off, and all together too."""
     rng = np.random.default_rng(seed)
-    zero = rng.normal(0.0, _READING_SIGMA)
-    off = zero + rng.normal(0.0, _READING_SIGMA, len(rows))
+    zero = rng.normal(0.0, _SETUP.reading_sigma)
+    off = zero + rng.normal(0.0, _SETUP.reading_sigma, len(rows))
     return tuple(
         row if row.distance is None else replace(row, distance=row.distance + float(step))
         for row, step in zip(rows, off, strict=True)
@@ -220,8 +230,8 @@ def _findings(solved: SolvedDome, before_px: float) -> tuple[ExperimentRow, ...]
             what="largest error of lens and rotation, in standard deviations",
             paper="",
             ours=f"{worst:.1f}",
-            bar=f"<= {_BAR_SIGMAS:g}",
-            met=worst <= _BAR_SIGMAS,
+            bar=f"<= {_SETUP.bar_sigmas:g}",
+            met=worst <= _SETUP.bar_sigmas,
         ),
         ExperimentRow(
             what="corners, rms distance before and after (px)",

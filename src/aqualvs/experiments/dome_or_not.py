@@ -1,7 +1,7 @@
 """Gain of the dome model from 300 to 1250 mm, where the paper has figures 19 and 20."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -31,9 +31,18 @@ PLACES_MM = (*range(300, 1201, 100), 1250, *range(1150, 300, -100))
 PICKS = ("left", "central", "right")
 """Points of the level laser's stripe; their average is the fourth line of the table."""
 
-_FRAMES = 2
-_PAPER_FACTOR, _PAPER_PERCENT = 5, 5.3
-_BAR_FACTOR, _BAR_PERCENT = 40.0, 0.5
+
+class _Setup(NamedTuple):
+    """Frames at each distance, the paper's figures, and the bars."""
+
+    frames: int = 2
+    paper_factor: int = 5
+    paper_percent: float = 5.3
+    bar_factor: float = 40.0
+    bar_percent: float = 0.5
+
+
+_SETUP = _Setup()
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +72,7 @@ class Distances:
         return np.asarray(100.0 * ((slope * self.true + start) / self.true - 1.0))
 
 
-def away_and_back(frames: int = _FRAMES) -> Scenario:
+def away_and_back(frames: int = _SETUP.frames) -> Scenario:
     """Return the dive: so many frames at each place."""
     facts = {
         "duration_s": len(PLACES_MM) * frames / 25.0,
@@ -89,22 +98,22 @@ def _run(laboratory: Laboratory) -> ExperimentResult:
         sentence=f"From {min(PLACES_MM)} to {max(PLACES_MM)} mm and back single points are within "
         f"{worst:.2f} % of the truth with the dome model and within {bare:.1f} % without: "
         f"{min(factors):.0f} to {max(factors):.0f} times better by root mean square, where the "
-        f"paper has about {_PAPER_FACTOR}.",
+        f"paper has about {_SETUP.paper_factor}.",
         findings=(
             ExperimentRow(
                 what="how many times better with the dome model, the worst of left, central, "
                 "right and average",
-                paper=f"about {_PAPER_FACTOR}",
+                paper=f"about {_SETUP.paper_factor}",
                 ours=f"{min(factors):.0f}",
-                bar=f">= {_BAR_FACTOR:g}",
-                met=min(factors) >= _BAR_FACTOR,
+                bar=f">= {_SETUP.bar_factor:g}",
+                met=min(factors) >= _SETUP.bar_factor,
             ),
             ExperimentRow(
                 what="largest error of a single point with the dome model (%)",
-                paper=f"{_PAPER_PERCENT} (at 300 mm)",
+                paper=f"{_SETUP.paper_percent} (at 300 mm)",
                 ours=f"{worst:.3f}",
-                bar=f"<= {_BAR_PERCENT}",
-                met=worst <= _BAR_PERCENT,
+                bar=f"<= {_SETUP.bar_percent}",
+                met=worst <= _SETUP.bar_percent,
             ),
             ExperimentRow(
                 what="range of distances (mm)",

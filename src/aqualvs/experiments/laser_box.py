@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -38,10 +38,18 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-_RANGES = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
-# A stripe point lies this near to the wall that it is on.
-_NEAR_WALL = 4e-3
-_BAR_PERCENT, _BAR_DEG, _BAR_SIGMAS = 0.5, 0.5, 3.0
+class _Setup(NamedTuple):
+    """Ranges of the walls in metres, and the bars."""
+
+    ranges: tuple[float, ...] = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
+    # A stripe point lies this near to the wall that it is on.
+    near_wall: float = 4e-3
+    bar_percent: float = 0.5
+    bar_deg: float = 0.5
+    bar_sigmas: float = 3.0
+
+
+_SETUP = _Setup()
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +132,7 @@ def matched(found: Sequence[LaserFigures], lasers: Sequence[Laser]) -> list[Lase
     return [found[i] for i in order]
 
 
-def remaining(truth: Rig, found: Rig, ranges: Sequence[float] = _RANGES) -> Remaining:
+def remaining(truth: Rig, found: Rig, ranges: Sequence[float] = _SETUP.ranges) -> Remaining:
     """Return what a found rig makes of the pixels that the true one sees."""
     read = np.array([WallView.ahead(truth, far).read_by(found) for far in ranges])
     expected = expected_posture_errors(found, rig_uncertainty(found), ranges)
@@ -223,8 +231,8 @@ def _plane_findings(
             what="largest error of a plane, in standard deviations",
             paper="",
             ours=f"{worst:.1f}",
-            bar=f"<= {_BAR_SIGMAS:g}",
-            met=worst <= _BAR_SIGMAS,
+            bar=f"<= {_SETUP.bar_sigmas:g}",
+            met=worst <= _SETUP.bar_sigmas,
         ),
     )
 
@@ -237,15 +245,15 @@ def _left_findings(left: Remaining) -> tuple[ExperimentRow, ...]:
             what="range error that remains, 0.3 to 1 m, largest (%)",
             paper="",
             ours=f"{percent:.3f}",
-            bar=f"<= {_BAR_PERCENT}",
-            met=percent <= _BAR_PERCENT,
+            bar=f"<= {_SETUP.bar_percent}",
+            met=percent <= _SETUP.bar_percent,
         ),
         ExperimentRow(
             what="pitch and yaw error that remains, largest (°)",
             paper="",
             ours=f"{degrees:.3f}",
-            bar=f"<= {_BAR_DEG}",
-            met=degrees <= _BAR_DEG,
+            bar=f"<= {_SETUP.bar_deg}",
+            met=degrees <= _SETUP.bar_deg,
         ),
     )
 
@@ -355,7 +363,7 @@ def _lasers_of(laboratory: Laboratory, result: LaserCalibration, view: LaserView
         points = pose.inverse().apply(rays.origins + reach[:, None] * rays.directions)
         off.append(np.abs(points @ normals.T - offsets).min(axis=1))
     nearest: IntArray = np.argmin(off, axis=0)
-    return np.where(np.min(off, axis=0) < _NEAR_WALL, nearest, -1)
+    return np.where(np.min(off, axis=0) < _SETUP.near_wall, nearest, -1)
 
 
 def _draw_left(figure: "Figure", left: Remaining) -> None:
@@ -366,8 +374,8 @@ def _draw_left(figure: "Figure", left: Remaining) -> None:
     _draw_band(angles, left.ranges, degrees[:, 0], PURPLE, "pitch")
     _draw_band(angles, left.ranges, degrees[:, 1], GREEN, "yaw")
     for axes, bar, title in (
-        (ranges, _BAR_PERCENT, "range error (%)"),
-        (angles, _BAR_DEG, "angle error (°)"),
+        (ranges, _SETUP.bar_percent, "range error (%)"),
+        (angles, _SETUP.bar_deg, "angle error (°)"),
     ):
         axes.axhline(0.0, color=TRUTH, linewidth=0.8)
         for level in (-bar, bar):

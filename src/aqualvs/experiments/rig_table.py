@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 
 
 _FAR = 1.0
-# Rays of the drawing: rows of the picture, as shares of its height.
-_ROWS = (0.0, 0.2, 0.45, 0.7, 1.0)
 
 _CAPTION = (
     "In place of figures 1 and 2: a frame of a net at 0.52 m, with the stripe of each laser on "
@@ -118,7 +116,9 @@ def one_frame() -> Scenario:
 def _run(laboratory: Laboratory) -> ExperimentResult:
     rig = laboratory.rig
     width, height = rig.size_px
-    rows = np.array(_ROWS) * (height - 1)
+    # Rays of the drawing: rows of the picture, as shares of its height.
+    shares = (0.0, 0.2, 0.45, 0.7, 1.0)
+    rows = np.array(shares) * (height - 1)
     traced = bending(rig, np.column_stack([np.full_like(rows, rig.lens.cx), rows]))
     grid = np.stack(np.meshgrid(np.arange(0, width, 8.0), np.arange(0, height, 8.0)), axis=-1)
     everywhere = bending(rig, grid.reshape(-1, 2))

@@ -6,7 +6,7 @@ yaw under control before a net.
 
 import math
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -139,9 +139,19 @@ CONTROL = Experiment(
 )
 
 
-_SECONDS, _EVERY = 40.0, 10
-_RANGE, _DESCENT = 0.6, 0.08
-_BAR_PERCENT, _BAR_DEG, _BAR_VALID = 0.5, 0.5, 90.0
+class _Setup(NamedTuple):
+    """Descent along the net in m and m/s, and the bars."""
+
+    seconds: float = 40.0
+    every: int = 10
+    range: float = 0.6
+    descent: float = 0.08
+    bar_percent: float = 0.5
+    bar_deg: float = 0.5
+    bar_valid: float = 90.0
+
+
+_SETUP = _Setup()
 
 
 class _Descent:
@@ -161,7 +171,7 @@ class _Descent:
         """Return range, yaw and descent; nothing without the net."""
         if posture is None:
             return Guidance(setpoint=None, stage=Stage.WAITING)
-        return Guidance(setpoint=self._setpoint, down=_DESCENT, stage=Stage.CHANGING_DEPTH)
+        return Guidance(setpoint=self._setpoint, down=_SETUP.descent, stage=Stage.CHANGING_DEPTH)
 
     def restart(self) -> None:
         """Do nothing: no state is kept."""
@@ -184,7 +194,7 @@ class _Watched:
 
     def look(self, world_from_dome: SE3, time_s: float) -> Posture | Refusal | None:
         """Return the sampled posture."""
-        if self.n_looks % _EVERY == 0:
+        if self.n_looks % _SETUP.every == 0:
             posture = self.rendered.look(world_from_dome, time_s)
             truth = self.net.posture_at(world_from_dome, time_s)
             self.seen.append((time_s, posture, truth))
@@ -211,22 +221,22 @@ def _run_sea(laboratory: Laboratory) -> ExperimentResult:
                 what="pictures with a posture (%)",
                 paper="",
                 ours=f"{share:.0f} of {len(valid)}",
-                bar=f">= {_BAR_VALID:g}",
-                met=share >= _BAR_VALID,
+                bar=f">= {_SETUP.bar_valid:g}",
+                met=share >= _SETUP.bar_valid,
             ),
             ExperimentRow(
                 what="rms error of the range (%)",
                 paper="",
                 ours=f"{rms[0]:.3f}",
-                bar=f"<= {_BAR_PERCENT}",
-                met=bool(rms[0] <= _BAR_PERCENT),
+                bar=f"<= {_SETUP.bar_percent}",
+                met=bool(rms[0] <= _SETUP.bar_percent),
             ),
             ExperimentRow(
                 what="rms error of pitch, yaw (degrees)",
                 paper="",
                 ours=f"{rms[1]:.3f}, {rms[2]:.3f}",
-                bar=f"<= {_BAR_DEG}",
-                met=bool(rms[1:].max() <= _BAR_DEG),
+                bar=f"<= {_SETUP.bar_deg}",
+                met=bool(rms[1:].max() <= _SETUP.bar_deg),
             ),
             ExperimentRow(
                 what="correlation of heading and target yaw",
@@ -266,7 +276,7 @@ def _dive(laboratory: Laboratory) -> tuple[_Watched, LoopLog]:
         gains=load_gains(model.name),
         water=sea(current=0.15, waves=0.1, seed=sea_seed),
         net=net,
-        start_range=_RANGE,
+        start_range=_SETUP.range,
         seed=sea_seed,
     )
     scene = Scene(
@@ -280,8 +290,8 @@ def _dive(laboratory: Laboratory) -> tuple[_Watched, LoopLog]:
         RenderedSensor(net, laboratory.rig, np.random.default_rng([sea_seed, 2]), scene),
         laboratory,
     )
-    loop = case.loop(sensor, _Descent(Setpoint(_RANGE)))
-    return sensor, loop.run(_SECONDS)
+    loop = case.loop(sensor, _Descent(Setpoint(_SETUP.range)))
+    return sensor, loop.run(_SETUP.seconds)
 
 
 def _errors(sensor: _Watched) -> FloatArray:

@@ -3,7 +3,7 @@
 Figure 15 is the distance to the wall; figures 16 and 17 are pitch and yaw.
 """
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -27,18 +27,31 @@ if TYPE_CHECKING:
 _ANGLES = {"pitch": (1, 16), "yaw": (2, 17)}
 """Column of the posture, and the paper's figure."""
 
-_SWING_DEG, _PERIOD_S, _FPS = 20.0, 4.0, 10.0
-_BAR_DEG = 0.5
-_PAPER_PERCENT = 14
+
+class _AngleSetup(NamedTuple):
+    """Swing before the wall, the bar, and the paper's error."""
+
+    amplitude_deg: float = 20.0
+    period_s: float = 4.0
+    fps: float = 10.0
+    bar_deg: float = 0.5
+    paper_percent: int = 14
+
+
+_SWING = _AngleSetup()
 
 
 def swing(name: str) -> Scenario:
     """Return the dive: "pitch" or "yaw" swings to either side before a wall at 600 mm."""
     facts = {
-        "duration_s": _PERIOD_S,
-        "fps": _FPS,
+        "duration_s": _SWING.period_s,
+        "fps": _SWING.fps,
         "motion": {
-            f"{name}_deg": {"values": [0], "sway": _SWING_DEG, "period_s": _PERIOD_S},
+            f"{name}_deg": {
+                "values": [0],
+                "sway": _SWING.amplitude_deg,
+                "period_s": _SWING.period_s,
+            },
         },
         "walls": [{}],
     }
@@ -50,9 +63,9 @@ def _run_angles(laboratory: Laboratory) -> ExperimentResult:
     seen = {name: laboratory.measure(laboratory.dive(swing(name)), rig=rig) for name in _ANGLES}
     worst = {name: _largest_deg(seen[name], name) for name in _ANGLES}
     return ExperimentResult(
-        sentence=f"Through swings of {_SWING_DEG:g} degrees to either side pitch stays within "
-        f"{worst['pitch']:.2f} and yaw within {worst['yaw']:.2f} degrees of the truth; the paper "
-        f"is within {_PAPER_PERCENT} % of its compass.",
+        sentence=f"Through swings of {_SWING.amplitude_deg:g} degrees to either side pitch stays "
+        f"within {worst['pitch']:.2f} and yaw within {worst['yaw']:.2f} degrees of the truth; the "
+        f"paper is within {_SWING.paper_percent} % of its compass.",
         findings=tuple(row for name in _ANGLES for row in _findings(name, seen[name])),
         pictures=tuple(
             ExperimentFigure(
@@ -81,13 +94,13 @@ def _findings(name: str, measured: MeasuredDive) -> list[ExperimentRow]:
             what=f"largest error of {name} (degrees)",
             paper="",
             ours=f"{worst:.3f}",
-            bar=f"<= {_BAR_DEG}",
-            met=valid and worst <= _BAR_DEG,
+            bar=f"<= {_SWING.bar_deg}",
+            met=valid and worst <= _SWING.bar_deg,
         ),
         ExperimentRow(
             what=f"error of {name} in percent of the swing",
-            paper=f"{_PAPER_PERCENT}",
-            ours=f"{100.0 * worst / _SWING_DEG:.1f}",
+            paper=f"{_SWING.paper_percent}",
+            ours=f"{100.0 * worst / _SWING.amplitude_deg:.1f}",
         ),
         ExperimentRow(
             what=f"{name}: root mean square error (degrees)",
@@ -140,7 +153,7 @@ def _drawn(measured: MeasuredDive, name: str) -> "Figure":
             markersize=3.5,
             elinewidth=0.6,
         )
-        low.set_ylim(-_BAR_DEG, _BAR_DEG)
+        low.set_ylim(-_SWING.bar_deg, _SWING.bar_deg)
         low.set_ylabel("error (degrees)")
         low.set_xlabel("time (s)")
         figure.align_ylabels((top, low))
@@ -160,11 +173,19 @@ ANGLES = Experiment(
 PLACES_MM = (374, 438, 525, 659)
 """Where the vehicle stood before the wall (paper, section 5.3)."""
 
-_FRAMES = 8
-_DISTANCE_PAPER_PERCENT, _BAR_PERCENT = 2.3, 0.5
+
+class _DistanceSetup(NamedTuple):
+    """Frames at each place, the paper's error, and the bar."""
+
+    frames: int = 8
+    paper_percent: float = 2.3
+    bar_percent: float = 0.5
 
 
-def wall_at_places(frames: int = _FRAMES) -> Scenario:
+_DISTANCES = _DistanceSetup()
+
+
+def wall_at_places(frames: int = _DISTANCES.frames) -> Scenario:
     """Return the dive: so many frames at each of the paper's places, square to a wall."""
     facts = {
         "duration_s": len(PLACES_MM) * frames / 25.0,
@@ -192,14 +213,14 @@ def _run_distance(laboratory: Laboratory) -> ExperimentResult:
     return ExperimentResult(
         sentence=f"At {_listed(PLACES_MM)} mm every distance is within {worst:.3f} % of the truth "
         f"({worst_true:.3f} % with the rig known exactly), where the paper has "
-        f"{_DISTANCE_PAPER_PERCENT} %.",
+        f"{_DISTANCES.paper_percent} %.",
         findings=(
             ExperimentRow(
                 what="largest error of the distance, rig calibrated from pictures (%)",
-                paper=f"{_DISTANCE_PAPER_PERCENT}",
+                paper=f"{_DISTANCES.paper_percent}",
                 ours=f"{worst:.3f}",
-                bar=f"<= {_BAR_PERCENT}",
-                met=valid and worst <= _BAR_PERCENT,
+                bar=f"<= {_DISTANCES.bar_percent}",
+                met=valid and worst <= _DISTANCES.bar_percent,
             ),
             ExperimentRow(
                 what="largest error of the distance, true rig (%)",
@@ -267,9 +288,13 @@ def _distance_drawn(calibrated: MeasuredDive, true: MeasuredDive) -> "Figure":
         figure = new_figure(2.7)
         left, right = figure.subplots(1, 2, width_ratios=(1.0, 1.25))
         left.axhspan(
-            -_DISTANCE_PAPER_PERCENT, _DISTANCE_PAPER_PERCENT, color=PAPER, alpha=0.15, linewidth=0
+            -_DISTANCES.paper_percent,
+            _DISTANCES.paper_percent,
+            color=PAPER,
+            alpha=0.15,
+            linewidth=0,
         )
-        left.text(370, 1.95, f"paper: within {_DISTANCE_PAPER_PERCENT} %", color=PAPER, va="top")
+        left.text(370, 1.95, f"paper: within {_DISTANCES.paper_percent} %", color=PAPER, va="top")
         left.plot(1e3 * calibrated.truth[:, 0], calibrated.range_percent, ".", color=OURS)
         left.set_ylim(-2.6, 2.6)
         left.set_title("at the paper's scale", loc="left")

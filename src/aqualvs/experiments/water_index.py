@@ -6,7 +6,7 @@ the lens in the dome.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -154,16 +154,26 @@ def _draw_target(
 WATERS = (1.333, 1.335, 1.337, 1.339, 1.341, 1.343)
 """Indices relative to vacuum: fresh and warm, to salt and cold."""
 
-# Frames of each medium; a change is told from a fish before the target by the fourth.
-_FRAMES, _FPS = 10, 5.0
-_PLATE_FAR = 0.35
+
+class _Setup(NamedTuple):
+    """Target, frames and noise of the experiment, and its bar."""
+
+    # Frames of each medium; a change is told from a fish before the target by the fourth.
+    frames: int = 10
+    fps: float = 5.0
+    plate_far: float = 0.35
+    # Where the plate truly is: as far from the file as the options allow for.
+    turn_deg: tuple[float, float, float] = (0.06, -0.11, 0.08)
+    shift_mm: tuple[float, float, float] = (0.15, -0.22, 0.12)
+    corner_px: float = 0.1
+    seed: int = 21
+    bar_sigmas: float = 3.0
+    decentred_mm: tuple[float, ...] = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 41.7)
+
+
+_SETUP = _Setup()
+
 _OPTIONS = IndexOptions(largest_sigma=4e-3)
-# Where the plate truly is: as far from the file as the options allow for.
-_TURN_DEG, _SHIFT_MM = (0.06, -0.11, 0.08), (0.15, -0.22, 0.12)
-_CORNER_PX = 0.1
-_SEED = 21
-_BAR_SIGMAS = 3.0
-_DECENTRED_MM = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 41.7)
 _ROOM = RoomLight(level=0.30, tint=(0.75, 1.0, 0.95), veil=(0.012, 0.035, 0.028))
 
 
@@ -200,20 +210,22 @@ def cruise(laboratory: Laboratory, waters: Sequence[float] = WATERS) -> Cruise:
     plate, markers = _plate(laboratory, rig)
     truly = targets.moved(plate, _out_of_place(plate))
     media = (rig.n_air, *waters)
-    rng = np.random.default_rng(_SEED)
+    rng = np.random.default_rng(_SETUP.seed)
     views, picture = [], np.zeros((1, 1, 3), np.uint8)
     for i, n in enumerate(media):
         picture = PanelRenderer(rig.in_water(n).camera()).render(_scene(truly, i), rng)
         laboratory.rendered(i, len(media))
         found = _found(picture, markers, f"picture_{i}")
-        views += [_seen_again(found, f"frame_{_FRAMES * i + k}", rng) for k in range(_FRAMES)]
-    return Cruise(views, np.repeat(media, _FRAMES), picture)
+        views += [
+            _seen_again(found, f"frame_{_SETUP.frames * i + k}", rng) for k in range(_SETUP.frames)
+        ]
+    return Cruise(views, np.repeat(media, _SETUP.frames), picture)
 
 
 def _plate(laboratory: Laboratory, rig: Rig) -> tuple[targets.Marked, MarkerSet]:
     """Return the plate where it is meant to be, and its markers as the file says."""
     plate = targets.marker_plate()
-    plate = targets.moved(plate, plate_in_view(rig, plate.panel.texture.size, _PLATE_FAR))
+    plate = targets.moved(plate, plate_in_view(rig, plate.panel.texture.size, _SETUP.plate_far))
     path = laboratory.folder("index") / "target.yaml"
     targets.write_yaml(path, targets.target_mapping(plate))
     return plate, load_target(path)
@@ -222,8 +234,8 @@ def _plate(laboratory: Laboratory, rig: Rig) -> tuple[targets.Marked, MarkerSet]
 def _out_of_place(plate: targets.Marked) -> SE3:
     """Return the small move from where the file has the plate to where it is."""
     middle = plate.corners().reshape(-1, 3).mean(axis=0)
-    turn = rotation_from_rotvec(np.deg2rad(_TURN_DEG))
-    return SE3(turn, middle - turn @ middle + 1e-3 * np.array(_SHIFT_MM))
+    turn = rotation_from_rotvec(np.deg2rad(_SETUP.turn_deg))
+    return SE3(turn, middle - turn @ middle + 1e-3 * np.array(_SETUP.shift_mm))
 
 
 def _scene(plate: targets.Marked, i: int) -> PanelScene:
@@ -242,7 +254,7 @@ def _found(picture: "NDArray[np.uint8]", markers: MarkerSet, name: str) -> View:
 
 
 def _seen_again(view: View, name: str, rng: np.random.Generator) -> View:
-    noise = rng.normal(0.0, _CORNER_PX, view.pixels.shape)
+    noise = rng.normal(0.0, _SETUP.corner_px, view.pixels.shape)
     return replace(view, name=name, pixels=view.pixels + noise)
 
 
@@ -264,7 +276,7 @@ def follow(rig: Rig, taken: Cruise) -> tuple[Numbers, list[IndexStep]]:
     estimator = IndexEstimator(
         rig, uncertainty=rig_uncertainty(rig), options=_OPTIONS, prior=IndexPrior.air(rig.n_air)
     )
-    readings = [estimator.add(i / _FPS, view) for i, view in enumerate(taken.views)]
+    readings = [estimator.add(i / _SETUP.fps, view) for i, view in enumerate(taken.views)]
     numbers = Numbers(
         truth=taken.n_true,
         ours=np.array([reading.n for reading in readings]),
@@ -298,7 +310,7 @@ def _plane_through(points: FloatArray) -> Plane:
     return Plane.from_normal(normal, float(normal @ middle))
 
 
-def decentred(rig: Rig, lens_mm: Sequence[float] = _DECENTRED_MM) -> Decentred:
+def decentred(rig: Rig, lens_mm: Sequence[float] = _SETUP.decentred_mm) -> Decentred:
     """Return how well ten pictures determine the index, by the lens's distance from the centre."""
     exact = replace(_OPTIONS, sigma_place=0.0, sigma_turn=0.0)
     rows = []
@@ -314,14 +326,14 @@ def decentred(rig: Rig, lens_mm: Sequence[float] = _DECENTRED_MM) -> Decentred:
 
 def _projected(rig: Rig) -> list[View]:
     plate = targets.marker_plate()
-    plate = targets.moved(plate, plate_in_view(rig, plate.panel.texture.size, _PLATE_FAR))
+    plate = targets.moved(plate, plate_in_view(rig, plate.panel.texture.size, _SETUP.plate_far))
     points = plate.corners().reshape(-1, 3)
     pixels, _ = rig.camera().project(points)
-    rng = np.random.default_rng(_SEED)
+    rng = np.random.default_rng(_SETUP.seed)
     ids: IntArray = np.arange(len(points))
     return [
-        View(f"frame_{i}", ids, points, pixels + rng.normal(0.0, _CORNER_PX, pixels.shape))
-        for i in range(_FRAMES)
+        View(f"frame_{i}", ids, points, pixels + rng.normal(0.0, _SETUP.corner_px, pixels.shape))
+        for i in range(_SETUP.frames)
     ]
 
 
@@ -329,15 +341,15 @@ def _run(laboratory: Laboratory) -> ExperimentResult:
     taken = cruise(laboratory)
     numbers, alarms = follow(calibrated_rig(laboratory), taken)
     spread = decentred(laboratory.rig)
-    last = numbers.after(2 * _FRAMES - 1, _FRAMES)
+    last = numbers.after(2 * _SETUP.frames - 1, _SETUP.frames)
     worst, by_paper = (float(np.abs(n - last.truth).max()) for n in (last.ours, last.paper))
     return ExperimentResult(
         sentence=f"From {WATERS[0]} to {WATERS[-1]} the index is told to {worst:.4f} at worst, "
         f"within {_in_sigmas(last).max():.1f} standard deviations everywhere; the paper's way is "
         f"off by up to {by_paper:.4f} on the same frames.",
-        findings=_findings(last, numbers.after(_FRAMES), alarms, spread),
+        findings=_findings(last, numbers.after(_SETUP.frames), alarms, spread),
         pictures=(
-            index_picture(numbers.after(_FRAMES), _FRAMES),
+            index_picture(numbers.after(_SETUP.frames), _SETUP.frames),
             target_picture(taken.example, spread, _OPTIONS.largest_sigma),
         ),
         series=_series(numbers, spread),
@@ -374,7 +386,7 @@ def _findings(
         )
     ]
     worst = float(_in_sigmas(last).max())
-    in_each = wet.paper.reshape(-1, _FRAMES)
+    in_each = wet.paper.reshape(-1, _SETUP.frames)
     noticed, n_waters = sum(step.by_medium for step in alarms), len(last.truth)
     return (
         *rows,
@@ -382,8 +394,8 @@ def _findings(
             what="largest error, in standard deviations",
             paper="",
             ours=f"{worst:.1f}",
-            bar=f"<= {_BAR_SIGMAS:g}",
-            met=worst <= _BAR_SIGMAS,
+            bar=f"<= {_SETUP.bar_sigmas:g}",
+            met=worst <= _SETUP.bar_sigmas,
         ),
         ExperimentRow(
             what="scatter from frame to frame, the paper's way",

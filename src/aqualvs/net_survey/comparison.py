@@ -40,15 +40,11 @@ from aqualvs.net_survey.surveys import Survey
 
 # Two holes are one if their places differ by no more than chance makes in all but one of 1000.
 _GATE = float(stats.chi2.isf(1e-3, 2))
-# The middle of what lasers saw of a hole is off the hole's by this share of its diameter.
-_MIDDLE = 0.25
 # Lasers looked at a place if they did so with this chance, given how well places are known.
 LOOKED = 0.8
 # A hole has grown beyond chance in all but one of 100.
 _GROWN = float(stats.norm.isf(0.005))
 _SIDE = 0.1
-_MAX_SQUARES = 4_000_000
-_DRAWS = 256
 MISSED = 0.3
 """Share of the holes that lasers swept over and that one dive does not find
 (docs/net-condition.md: 15 of 21 were found)."""
@@ -193,7 +189,9 @@ def _distances(
     """Return squares of distances by uncertainty (n, m), and what lies inside known holes."""
     place, sigma, size = holes
     off = wrapped(place[mine][:, None] - place[known][None], frame)
-    middle = _MIDDLE * np.maximum(size[mine][:, None], size[known][None])
+    # The middle of what lasers saw of a hole is off the hole's by this share of its diameter.
+    off_middle = 0.25
+    middle = off_middle * np.maximum(size[mine][:, None], size[known][None])
     variance = sigma[mine][:, None] ** 2 + sigma[known][None] ** 2 + middle[..., None] ** 2
     inside = np.hypot(off[..., 0], off[..., 1]) <= 0.5 * size[known][None]
     return np.asarray((off**2 / variance).sum(axis=-1)), np.asarray(inside)
@@ -228,7 +226,8 @@ class _Visits:
     ) -> "_Visits":
         corners = np.concatenate([one.outline.reshape(-1, 2) for one in placed])
         low, high = corners.min(axis=0), corners.max(axis=0)
-        side = max(_SIDE, float(np.sqrt(np.prod(high - low) / _MAX_SQUARES)))
+        max_squares = 4_000_000
+        side = max(_SIDE, float(np.sqrt(np.prod(high - low) / max_squares)))
         raster = Raster.over(low, high, side, frame)
         dates = sorted({one.survey.date for one in placed})
         return cls(
@@ -251,7 +250,8 @@ class _Visits:
 
 def _normal() -> FloatArray:
     """Return places (n, 2) spread like a normal distribution, always the same ones."""
-    n = int(np.sqrt(_DRAWS))
+    draws = 256
+    n = int(np.sqrt(draws))
     at = stats.norm.ppf((np.arange(n) + 0.5) / n)
     return np.stack(np.meshgrid(at, at), axis=-1).reshape(-1, 2)
 

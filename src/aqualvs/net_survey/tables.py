@@ -11,7 +11,6 @@ from aqualvs.net_survey.frames import WallFrame
 from aqualvs.net_survey.growth import CellChange, Growth
 from aqualvs.nets.tables import Cell, write_table
 
-_WEEK = 7.0
 _ORDER = (
     HoleState.NEW,
     HoleState.GROWN,
@@ -63,7 +62,8 @@ def bearing_deg(u: float, frame: WallFrame) -> float:
 
 def rate_text(growth: Growth) -> str:
     """Return growth as percent of the net's area a week."""
-    week, sigma = 100.0 * _WEEK * growth.value, 100.0 * _WEEK * growth.sigma
+    days = 7.0
+    week, sigma = 100.0 * days * growth.value, 100.0 * days * growth.sigma
     return f"{week:+.1f} ± {sigma:.1f} % of the net's area a week"
 
 

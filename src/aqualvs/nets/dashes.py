@@ -5,6 +5,7 @@ interruption).
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,14 +14,24 @@ from aqualvs.geometry.compiled import kernel
 from aqualvs.nets.lit_intervals import LineState, NetSignal
 from aqualvs.nets.spectrum import Crossings
 
-# A dark gap of one search line does not end a dash: compression and specks make such gaps. A gap of
-# a few lines does not either, if both its ends are near the greatest brightness on this laser's
-# line and the dash begins fainter: light fades at the edge of a strand, whereas the detector drops
-# a white, overexposed core because it is not laser green.
-_BRIDGED, _WHITE, _UNFADED = 1, 3, 0.85
-# The length of a dash is measured above this share of its peak, regardless of exposure; its width
-# above the greater share.
-_LEVEL, _BRIGHT = 0.4, 0.8
+
+class _DashOptions(NamedTuple):
+    """Dashes of light along a stripe, and the gaps between them."""
+
+    # A dark gap of one search line does not end a dash: compression and specks make such gaps. A
+    # gap of a few lines does not either, if both its ends are near the greatest brightness on this
+    # laser's line and the dash begins fainter: light fades at the edge of a strand, whereas the
+    # detector drops a white, overexposed core because it is not laser green.
+    bridged: int = 1
+    white: int = 3
+    unfaded: float = 0.85
+    # The length of a dash is measured above this share of its peak, regardless of exposure; its
+    # width above the greater share.
+    level: float = 0.4
+    bright: float = 0.8
+
+
+_DASH = _DashOptions()
 
 
 @kernel
@@ -110,14 +121,14 @@ def _cut_span(
             j += 1
             continue
         first, last = j, j
-        bridged = _BRIDGED
-        if height[i, _turned(first, n_lines, back)] < _UNFADED * brightest:
-            bridged = _WHITE
+        bridged = _DASH.bridged
+        if height[i, _turned(first, n_lines, back)] < _DASH.unfaded * brightest:
+            bridged = _DASH.white
         while j < end and j - last <= bridged + 1:
             b = _turned(j, n_lines, back)
             if state[i, b] == 2:
                 ends = min(height[i, _turned(last, n_lines, back)], height[i, b])
-                if j - last > _BRIDGED + 1 and ends < _UNFADED * brightest:
+                if j - last > _DASH.bridged + 1 and ends < _DASH.unfaded * brightest:
                     break
                 last = j
             j += 1
@@ -127,10 +138,10 @@ def _cut_span(
             peak = max(peak, height[i, _turned(a, n_lines, back)])
         for a in range(first, last + 1):
             b = _turned(a, n_lines, back)
-            if height[i, b] >= _BRIGHT * peak:
+            if height[i, b] >= _DASH.bright * peak:
                 wide += width[i, b]
                 n_bright += 1
-        length = _length_above(i, first, last, back, _LEVEL * peak, step, height)
+        length = _length_above(i, first, last, back, _DASH.level * peak, step, height)
         low, high = _ends(i, first, last, back, along, step)
         dash[n, 0], dash[n, 1] = i, 1.0 if first > begin and last < end - 1 else 0.0
         dash[n, 2], dash[n, 3] = 0.5 * (low + high), length

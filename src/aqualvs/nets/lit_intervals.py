@@ -23,10 +23,6 @@ from aqualvs.scanning.laser_bands import SearchAxis, plan_bands
 from aqualvs.scanning.posture import Posture
 from aqualvs.scanning.scan import Label, Scan
 
-# A line across the net is followed this far to each side, in ranges.
-_REACH = 1.3
-_SAMPLES = 129
-
 
 class LineState(IntEnum):
     """State of the net at one search line."""
@@ -160,9 +156,12 @@ class NetReader:
         n, n_lines = len(self._laser_bands), self.n_lines
         lines = [_line_on(plane, net) for plane in self._planes]
         origin, direction = np.stack(lines, axis=1) if n else np.empty((2, 0, 2))
-        reach = _REACH * float(np.linalg.norm(net.translation))
-        s = np.linspace(-reach, reach, _SAMPLES)
-        flat = np.zeros((n, _SAMPLES, 3))
+        # A line across the net is followed this far to each side, in ranges.
+        reach_in_ranges = 1.3
+        n_samples = 129
+        reach = reach_in_ranges * float(np.linalg.norm(net.translation))
+        s = np.linspace(-reach, reach, n_samples)
+        flat = np.zeros((n, n_samples, 3))
         flat[..., :2] = origin[:, None] + s[:, None] * direction[:, None]
         dome_from_net = net.inverse()
         points = dome_from_net.apply(np.nan_to_num(flat))

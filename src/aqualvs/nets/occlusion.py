@@ -5,6 +5,7 @@ long. Too large an occlusion costs looks at the net, too small a one would turn 
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,16 +16,28 @@ from aqualvs.scanning.scan import Label, ScanPoints
 # Labels of objects, at the net's plane or before it; clutter at the plane may be part of the net.
 # Ambiguous points are left out: they may be wrong.
 _THINGS = (Label.SOLID, Label.FISH, Label.BUBBLE)
-# Pieces of light are on one object if at most this many search lines are between them, and at most
-# this many pixels along these, plus as many for each line. An object with this much light is not a
-# bubble or speck.
-_BETWEEN_LINES, _BETWEEN_PX, _SLOPE_PX, _LARGE_LINES = 8, 3.0, 1.0, 40
-# Extent of a small object beside its light: pixels, and a share of its length.
-_BESIDE_PX, _BESIDE = 8.0, 0.3
-# The same for a large object, projected on the net: share of its light's length.
-_HALF_WIDE = 0.5
-# Number of places along the light on a large object that represent it.
-_FEW = 12
+
+
+class _OcclusionOptions(NamedTuple):
+    """Pieces of light that are one object, and its extent beside its light."""
+
+    # Pieces of light are on one object if at most this many search lines are between them, and at
+    # most this many pixels along these, plus as many for each line. An object with this much light
+    # is not a bubble or speck.
+    between_lines: int = 8
+    between_px: float = 3.0
+    slope_px: float = 1.0
+    large_lines: int = 40
+    # Extent of a small object beside its light: pixels, and a share of its length.
+    beside_px: float = 8.0
+    beside: float = 0.3
+    # The same for a large object, projected on the net: share of its light's length.
+    half_wide: float = 0.5
+    # Number of places along the light on a large object that represent it.
+    few: int = 12
+
+
+_HIDDEN = _OcclusionOptions()
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,12 +184,16 @@ def _chain(laser: IntArray, row: IntArray, position: FloatArray) -> IntArray:
         kept, best, least = 0, -1, np.inf
         for e in range(n_ends):
             last = ends[e]
-            if laser[last] != laser[k] or row[k] - row[last] > _BETWEEN_LINES:
+            if laser[last] != laser[k] or row[k] - row[last] > _HIDDEN.between_lines:
                 continue
             ends[kept] = last
             between = row[k] - row[last]
             away = abs(position[k] - position[last])
-            if between > 0 and away <= _BETWEEN_PX + _SLOPE_PX * between and away < least:
+            if (
+                between > 0
+                and away <= _HIDDEN.between_px + _HIDDEN.slope_px * between
+                and away < least
+            ):
                 best, least = kept, away
             kept += 1
         n_ends = kept
@@ -214,7 +231,7 @@ def _hide(
         if k < n and thing[k] == thing[first]:
             continue
         i = laser[first]
-        if k - first < _LARGE_LINES:
+        if k - first < _HIDDEN.large_lines:
             _hide_beside(row[first:k], position[first:k], line_px[i], expected[i], hidden[i])
         else:
             _hide_behind(in_net[first:k], eye, origin, direction, along, hidden)
@@ -229,7 +246,7 @@ def _hide_beside(
     row: IntArray, position: FloatArray, line_px: int, expected: FloatArray, hidden: BoolArray
 ) -> None:
     """Mark where a laser's line passes, in the picture, beside its light on a small object."""
-    reach = _BESIDE_PX + _BESIDE * line_px * (row[-1] - row[0])
+    reach = _HIDDEN.beside_px + _HIDDEN.beside * line_px * (row[-1] - row[0])
     beyond = int(reach / line_px)
     at = 0
     for j in range(max(row[0] - beyond, 0), min(row[-1] + beyond + 1, len(hidden))):
@@ -269,9 +286,9 @@ def _hide_behind(
         on_net[k, 0], on_net[k, 1] = _cast(in_net[k], eye)
     wide = on_net[:, 0].max() - on_net[:, 0].min()
     high = on_net[:, 1].max() - on_net[:, 1].min()
-    radius = _HALF_WIDE * np.hypot(wide, high)
-    for few in range(_FEW):
-        x, y = on_net[few * (n - 1) // (_FEW - 1)]
+    radius = _HIDDEN.half_wide * np.hypot(wide, high)
+    for few in range(_HIDDEN.few):
+        x, y = on_net[few * (n - 1) // (_HIDDEN.few - 1)]
         for i in range(along.shape[0]):
             # Part of the line within that distance of the place.
             s = (x - origin[i, 0]) * direction[i, 0] + (y - origin[i, 1]) * direction[i, 1]

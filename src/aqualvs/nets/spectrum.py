@@ -277,10 +277,6 @@ class _SearchOptions(NamedTuple):
 
 _SEARCH = _SearchOptions()
 
-# The strongest waves of a honeycomb look like a diamond whose families lie sixty degrees apart, and
-# few diamonds do so by chance: penalty within this angle.
-_AS_HONEYCOMB, _RARE = np.deg2rad(2.5), 1.0
-
 
 class Mesh(StrEnum):
     """Shape of the openings."""
@@ -373,7 +369,10 @@ def _uneven(hypothesis: Hypothesis) -> float:
     first, second = hypothesis.basis
     a, b = np.hypot(*first), np.hypot(*second)
     angle = np.arccos(min(abs(first @ second) / (a * b), 1.0))
-    rare = _RARE * np.exp(-0.5 * ((angle - np.pi / 3.0) / _AS_HONEYCOMB) ** 2)
+    # The strongest waves of a honeycomb look like a diamond whose families lie sixty degrees apart,
+    # and few diamonds do so by chance: penalty within this angle.
+    honeycomb_angle, penalty = np.deg2rad(2.5), 1.0
+    rare = penalty * np.exp(-0.5 * ((angle - np.pi / 3.0) / honeycomb_angle) ** 2)
     return float(0.5 * (np.log(a / b) / _SEARCH.even) ** 2 + rare)
 
 

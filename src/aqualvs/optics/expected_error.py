@@ -115,9 +115,6 @@ N_POINTS = 100
 USUAL_RANGES = (0.3, 0.6, 1.0)
 """Ranges at which errors are reported, in metres."""
 
-# Points on one line leave one direction of m·X = 1 to rounding.
-_SINGULAR = 1e-10
-
 
 @dataclass(frozen=True, slots=True)
 class ExpectedError:
@@ -213,7 +210,9 @@ class WallView:
     def __post_init__(self) -> None:
         points, _ = self._weighed(self._points())
         singular = np.linalg.svd(points, compute_uv=False)
-        found = len(singular) == 3 and singular[-1] > _SINGULAR * singular[0]
+        # Points on one line leave one direction of m·X = 1 to rounding.
+        rounding = 1e-10
+        found = len(singular) == 3 and singular[-1] > rounding * singular[0]
         object.__setattr__(self, "determined", bool(found))
 
     @classmethod

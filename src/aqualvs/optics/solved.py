@@ -22,7 +22,7 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
@@ -76,10 +76,6 @@ _UNIT_OF = {
     **dict.fromkeys(("tilt_1", "tilt_2", "window_tilt_1", "window_tilt_2"), ("deg", _DEG)),
     **dict.fromkeys(("fx", "fy", "cx", "cy"), ("px", 1.0)),
 }
-# Enough digits that the variance of every combination of numbers, however nearly their errors
-# cancel, comes back within this share.
-_DIGITS = (5, 7, 9, 11, 13, 15)
-_LOST_SHARE = 1e-3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -250,13 +246,17 @@ def _shortened(sigma: FloatArray, correlation: FloatArray) -> tuple[FloatArray, 
     if not known.any():
         return sigma, correlation
     smallest = float(np.linalg.eigvalsh(exact)[0])
-    for digits in _DIGITS:
+    # Enough digits that the variance of every combination of numbers, however nearly their errors
+    # cancel, comes back within this share.
+    numbers_of_digits = (5, 7, 9, 11, 13, 15)
+    lost_share = 1e-3
+    for digits in numbers_of_digits:
         short_sigma = np.array([float(f"{value:.{digits}g}") for value in sigma])
         short = np.round(correlation, digits)
         np.fill_diagonal(short, np.diag(correlation))
         ratio = short_sigma[known] / sigma[known]
         lost = short[np.ix_(known, known)] * np.outer(ratio, ratio) - exact
-        if np.linalg.norm(lost, 2) < _LOST_SHARE * smallest:
+        if np.linalg.norm(lost, 2) < lost_share * smallest:
             return short_sigma, short + 0.0
     return sigma, correlation
 
@@ -321,25 +321,35 @@ def _date(value: object, place: str) -> datetime:
     return date if date.tzinfo is not None else date.replace(tzinfo=UTC)
 
 
-FOCAL_SHARE = 0.002
-"""Of the focal length. Calibrations of one camera from other pictures differ by 0.2 to 0.4 %."""
-ASPECT_SHARE = 0.0005
-"""Of fy over fx: pixels are made far better than a focal length is measured."""
-CENTRE_SHARE = 0.002
-"""Of the image centre, along each axis, as a share of the picture's width."""
-DISTORTION_K1 = 0.005
-"""Of the first distortion coefficient, where the rig has any."""
-LENS_M = 1e-3
-"""Of the lens's place in the dome along each axis, or its distance from a flat port: measured with
-a caliper."""
-RADIUS_M, THICKNESS_M, N_ACRYLIC = 1e-4, 1e-4, 3e-3
-"""Of the dome: the tolerances of the part that `calibrate dome` assumes as well."""
-PORT_TILT = math.radians(0.5)
-"""Of a flat port from square to the optical axis, about each axis: a camera mounted by hand."""
-N_WATER = 3e-3
-"""Of the water's index: between fresh and sea water, with which `calibrate dome` starts as well."""
-LASER_TILT, LASER_OFFSET_M = math.radians(0.2), 1e-3
-"""Of a laser's plane, its normal in each direction and its offset: a mount measured by hand."""
+class DefaultSigmas(NamedTuple):
+    """Standard deviations of numbers that were never calibrated, in metres and radians."""
+
+    # Of the focal length. Calibrations of one camera from other pictures differ by 0.2 to 0.4 %.
+    focal_share: float = 0.002
+    # Of fy over fx: pixels are made far better than a focal length is measured.
+    aspect_share: float = 0.0005
+    # Of the image centre, along each axis, as a share of the picture's width.
+    centre_share: float = 0.002
+    # Of the first distortion coefficient, where the rig has any.
+    distortion_k1: float = 0.005
+    # Of the lens's place in the dome along each axis, or its distance from a flat port: measured
+    # with a caliper.
+    lens_m: float = 1e-3
+    # Of the dome: the tolerances of the part that `calibrate dome` assumes as well.
+    radius_m: float = 1e-4
+    thickness_m: float = 1e-4
+    n_acrylic: float = 3e-3
+    # Of a flat port from square to the optical axis, about each axis: a camera mounted by hand.
+    port_tilt: float = math.radians(0.5)
+    # Of the water's index: between fresh and sea water, with which `calibrate dome` starts as well.
+    n_water: float = 3e-3
+    # Of a laser's plane, its normal in each direction and its offset: a mount measured by hand.
+    laser_tilt: float = math.radians(0.2)
+    laser_offset_m: float = 1e-3
+
+
+SIGMAS = DefaultSigmas()
+
 
 _LENS = ("lens_x", "lens_y", "lens_z")
 _SHELL = ("inner_radius", "thickness", "n_acrylic")
@@ -412,21 +422,30 @@ def _defaults(rig: Rig) -> Iterator[Assumption]:
     if rig.dome is not None:
         yield Assumption(
             "lens's place",
-            f"{LENS_M * 1e3:g} mm",
-            RigUncertainty.independent(dict.fromkeys(_LENS, LENS_M)),
+            f"{SIGMAS.lens_m * 1e3:g} mm",
+            RigUncertainty.independent(dict.fromkeys(_LENS, SIGMAS.lens_m)),
         )
-        sizes = dict(zip(_SHELL, (RADIUS_M, THICKNESS_M, N_ACRYLIC), strict=True))
+        sizes = dict(
+            zip(_SHELL, (SIGMAS.radius_m, SIGMAS.thickness_m, SIGMAS.n_acrylic), strict=True)
+        )
         yield Assumption(
             "dome",
-            f"{RADIUS_M * 1e3:g} mm in radius and thickness, {N_ACRYLIC:g} in index",
+            f"{SIGMAS.radius_m * 1e3:g} mm in radius and thickness, {SIGMAS.n_acrylic:g} in index",
             RigUncertainty.independent(sizes),
         )
     if rig.flat_port is not None:
-        tolerances = (LENS_M, THICKNESS_M, N_ACRYLIC, PORT_TILT, PORT_TILT)
+        tolerances = (
+            SIGMAS.lens_m,
+            SIGMAS.thickness_m,
+            SIGMAS.n_acrylic,
+            SIGMAS.port_tilt,
+            SIGMAS.port_tilt,
+        )
         yield Assumption(
             "flat port",
-            f"{LENS_M * 1e3:g} mm in distance, {THICKNESS_M * 1e3:g} mm in thickness, "
-            f"{N_ACRYLIC:g} in index, {math.degrees(PORT_TILT):g} degrees in tilt",
+            f"{SIGMAS.lens_m * 1e3:g} mm in distance, "
+            f"{SIGMAS.thickness_m * 1e3:g} mm in thickness, "
+            f"{SIGMAS.n_acrylic:g} in index, {math.degrees(SIGMAS.port_tilt):g} degrees in tilt",
             RigUncertainty.independent(dict(zip(_FLAT, tolerances, strict=True))),
         )
     bends = rig.housing is not None or any(laser.window is not None for laser in rig.lasers)
@@ -434,13 +453,19 @@ def _defaults(rig: Rig) -> Iterator[Assumption]:
     air = 1e-3
     if bends and abs(rig.n_water - rig.n_air) > air:
         yield Assumption(
-            "water's index", f"{N_WATER:g}", RigUncertainty.independent({"n_water": N_WATER})
+            "water's index",
+            f"{SIGMAS.n_water:g}",
+            RigUncertainty.independent({"n_water": SIGMAS.n_water}),
         )
     for laser in rig.lasers:
-        sigmas = zip(LASER_PARAMETERS, (LASER_TILT, LASER_TILT, LASER_OFFSET_M), strict=True)
+        sigmas = zip(
+            LASER_PARAMETERS,
+            (SIGMAS.laser_tilt, SIGMAS.laser_tilt, SIGMAS.laser_offset_m),
+            strict=True,
+        )
         yield Assumption(
             f"laser '{laser.name}'",
-            f"{math.degrees(LASER_TILT):g} degrees and {LASER_OFFSET_M * 1e3:g} mm",
+            f"{math.degrees(SIGMAS.laser_tilt):g} degrees and {SIGMAS.laser_offset_m * 1e3:g} mm",
             RigUncertainty.independent({f"{laser.name}:{name}": s for name, s in sigmas}),
         )
 
@@ -448,16 +473,24 @@ def _defaults(rig: Rig) -> Iterator[Assumption]:
 def _intrinsics(rig: Rig) -> Assumption:
     """Return that of the lens: the errors of fx and fy are equal but for the pixels' aspect."""
     lens = rig.lens
-    centre = CENTRE_SHARE * rig.size_px[0]
-    sigmas = {"fx": FOCAL_SHARE * lens.fx, "fy": FOCAL_SHARE * lens.fy, "cx": centre, "cy": centre}
-    words = f"{FOCAL_SHARE:.1%} in focal length, {CENTRE_SHARE:.1%} of the width in image centre"
+    centre = SIGMAS.centre_share * rig.size_px[0]
+    sigmas = {
+        "fx": SIGMAS.focal_share * lens.fx,
+        "fy": SIGMAS.focal_share * lens.fy,
+        "cx": centre,
+        "cy": centre,
+    }
+    words = (
+        f"{SIGMAS.focal_share:.1%} in focal length, "
+        f"{SIGMAS.centre_share:.1%} of the width in image centre"
+    )
     if "k1" in lens.parameter_names:
-        sigmas["k1"] = DISTORTION_K1
-        words += f", {DISTORTION_K1:g} in k1"
+        sigmas["k1"] = SIGMAS.distortion_k1
+        words += f", {SIGMAS.distortion_k1:g} in k1"
     covariance = RigUncertainty.independent(sigmas).covariance
-    covariance[0, 1] = covariance[1, 0] = FOCAL_SHARE**2 * lens.fx * lens.fy
-    covariance[0, 0] += (0.5 * ASPECT_SHARE * lens.fx) ** 2
-    covariance[1, 1] += (0.5 * ASPECT_SHARE * lens.fy) ** 2
-    covariance[0, 1] -= 0.25 * ASPECT_SHARE**2 * lens.fx * lens.fy
+    covariance[0, 1] = covariance[1, 0] = SIGMAS.focal_share**2 * lens.fx * lens.fy
+    covariance[0, 0] += (0.5 * SIGMAS.aspect_share * lens.fx) ** 2
+    covariance[1, 1] += (0.5 * SIGMAS.aspect_share * lens.fy) ** 2
+    covariance[0, 1] -= 0.25 * SIGMAS.aspect_share**2 * lens.fx * lens.fy
     covariance[1, 0] = covariance[0, 1]
     return Assumption("set of intrinsics", words, RigUncertainty(tuple(sigmas), covariance))

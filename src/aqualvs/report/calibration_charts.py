@@ -21,9 +21,6 @@ from aqualvs.report.calibration_material import MarkKind, Overlay, PictureShot, 
 from aqualvs.report.html import Raw
 from aqualvs.scanning.scan import ImagePlane
 
-# Greatest width and JPEG quality, tried in this order until a picture fits its share of the page.
-_SIZES = ((960, 80), (800, 75), (640, 72), (480, 65), (360, 55), (240, 45))
-
 
 class _FigureLimits(NamedTuple):
     """Size of a page: bytes of its pictures, and marks on them."""
@@ -77,7 +74,10 @@ def _embedded(image: ImagePlane, most_bytes: int) -> tuple[str, int, int]:
         raise ValueError(f"image has shape {image.shape} of {image.dtype}, expected 8-bit pixels")
     if image.ndim == 3 and image.shape[2] != 3:
         raise ValueError(f"image has {image.shape[2]} channels, expected grey or 3")
-    for widest, quality in _SIZES:
+    # Greatest width and JPEG quality, tried in this order until a picture fits its share of the
+    # page.
+    sizes = ((960, 80), (800, 75), (640, 72), (480, 65), (360, 55), (240, 45))
+    for widest, quality in sizes:
         jpeg, width, height = _jpeg(image, widest, quality)
         if len(jpeg) <= most_bytes:
             break

@@ -13,8 +13,6 @@ from aqualvs.report.points import PointSummary
 from aqualvs.report.run_data import Track
 from aqualvs.text import clock, signed
 
-_LOOSE = 0.02
-
 
 def headline(track: Track) -> list[Card]:
     """Return the numbers at the top of the report."""
@@ -161,9 +159,10 @@ def _range_warnings(track: Track, working_range: tuple[float, float] | None) -> 
 
 def _precision_warnings(track: Track) -> Iterator[str]:
     relative = track.sigma_total[track.valid, 0] / track.posture[track.valid, 0]
-    loose = float((relative > _LOOSE).mean()) if len(relative) else 0.0
+    loose_share = 0.02
+    loose = float((relative > loose_share).mean()) if len(relative) else 0.0
     if loose > 0.05:
-        yield f"{100 * loose:.0f} % of the ranges are looser than {100 * _LOOSE:g} % (1 σ)."
+        yield f"{100 * loose:.0f} % of the ranges are looser than {100 * loose_share:g} % (1 σ)."
     n_points = track.n_points[track.valid & np.isfinite(track.n_points)]
     few_points = 60
     if len(n_points) and np.median(n_points) < few_points:

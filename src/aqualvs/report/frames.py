@@ -40,7 +40,6 @@ class _CropLayout(NamedTuple):
 
 _CROP = _CropLayout()
 
-_DECODERS = 2
 # What a file raises that is no video, has no picture, or breaks off.
 _BROKEN = (av.error.FFmpegError, OSError, IndexError, StopIteration)
 # Colour at full resolution, else the lasers' colours bleed into the green stripes below.
@@ -120,8 +119,9 @@ def decode_frames(source: Path, track: Track, rows: list[int]) -> dict[int, Imag
         return _from_images(images_in(source), track, rows)
     if source.suffix.lower() in IMAGE_SUFFIXES:
         return _from_images([source], track, rows)
-    with ThreadPoolExecutor(_DECODERS) as pool:
-        parts = [rows[i::_DECODERS] for i in range(_DECODERS)]
+    decoders = 2
+    with ThreadPoolExecutor(decoders) as pool:
+        parts = [rows[i::decoders] for i in range(decoders)]
         found = pool.map(lambda part: _from_video(source, track, part), parts)
         return {row: picture for pictures in found for row, picture in pictures.items()}
 

@@ -42,11 +42,27 @@ if TYPE_CHECKING:
 
 
 _ZONE = "#e8f3ea"
-# Width and height of a detail, in mm.
-_DETAIL = (150.0, 75.0)
+
+
+class _PictureOptions(NamedTuple):
+    """Parts of the points that are drawn."""
+
+    # Width and height of a detail, in mm.
+    detail: tuple[float, float] = (150.0, 75.0)
+    # Stragglers beyond these quantiles do not set the scale of a picture.
+    stragglers: float = 0.005
+    batch: int = 1 << 16
+    # Frames have numbers of 32 bits, lasers of 8.
+    lasers: int = 1 << 8
+    # So many of the fullest frames and lasers are looked at; pieces of net are this far apart, in
+    # m.
+    candidates: int = 16
+    strand_gap: float = 4e-3
+
+
+_PICTURE = _PictureOptions()
+
 _RINGS = {"A": "#d55e00", "B": "#009e73", "C": "#7b3fb5"}
-# Stragglers beyond these quantiles do not set the scale of a picture.
-_STRAGGLERS = 0.005
 _NAMES = ("adaptive filter", "paper's filter")
 
 
@@ -170,8 +186,8 @@ def _filtered(r: Reflections, options: MeshFilterOptions) -> "Figure":
     spare = max(0.55 * width - 1.14 * height, 0.0)
     low[1], high[1] = low[1] - 0.5 * spare, high[1] + 0.14 * height + 0.5 * spare
     shape = min((high[1] - low[1]) / width, 1.3)
-    figure = new_canvas(7.2, 3.3 * (shape + _DETAIL[1] / _DETAIL[0]) + 1.5)
-    grid = figure.subplots(2, 2, height_ratios=[shape, _DETAIL[1] / _DETAIL[0]])
+    figure = new_canvas(7.2, 3.3 * (shape + _PICTURE.detail[1] / _PICTURE.detail[0]) + 1.5)
+    grid = figure.subplots(2, 2, height_ratios=[shape, _PICTURE.detail[1] / _PICTURE.detail[0]])
     view = _detail(1e3 * r.in_laser[r.adaptive | r.paper], xy)
     for column, (name, net) in enumerate(zip(_NAMES, (r.adaptive, r.paper), strict=True)):
         kept = 1e3 * r.in_laser[net & r.usable]
@@ -321,8 +337,8 @@ def _span(xy: FloatArray, margin: float) -> tuple[FloatArray, FloatArray]:
     """Return the corners of a box around nearly all points, with a margin; 1 m² without any."""
     if not len(xy):
         return np.array([-500.0, 0.0]), np.array([500.0, 1000.0])
-    low = np.quantile(xy, _STRAGGLERS, axis=0)
-    high = np.quantile(xy, 1.0 - _STRAGGLERS, axis=0)
+    low = np.quantile(xy, _PICTURE.stragglers, axis=0)
+    high = np.quantile(xy, 1.0 - _PICTURE.stragglers, axis=0)
     extra = margin * np.maximum(high - low, 50.0)
     return low - extra, high + extra
 
@@ -330,7 +346,7 @@ def _span(xy: FloatArray, margin: float) -> tuple[FloatArray, FloatArray]:
 def _detail(net: FloatArray, others: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the window that shows most of the net, wide enough for several meshes."""
     xy = net if len(net) else others
-    half = 0.5 * np.array(_DETAIL)
+    half = 0.5 * np.array(_PICTURE.detail)
     if not len(xy):
         return -half, half
     inside = [np.count_nonzero(np.all(np.abs(xy - at) < half, axis=1)) for at in xy]
@@ -347,12 +363,6 @@ def _box(low: FloatArray, high: FloatArray) -> Any:
     )
 
 
-_BATCH = 1 << 16
-# Frames have numbers of 32 bits, lasers of 8.
-_LASERS = 1 << 8
-# So many of the fullest frames and lasers are looked at; pieces of net are this far apart, in m.
-_CANDIDATES = 16
-_STRAND_GAP = 4e-3
 _NET = Label.NET.name.lower()
 _COLUMNS = ("x_m", "y_m", "z_m", "label")
 _PIXEL_COLUMNS = ("u_px", "v_px", "width_px", "label")
@@ -472,8 +482,13 @@ def _count(points: Path) -> _Counts:
     """Count net and other reflections, batch by batch, so that memory stays flat."""
     totals: dict[int, list[int]] = {}
     with parquet.ParquetFile(points.absolute()) as file:
-        for batch in file.iter_batches(batch_size=_BATCH, columns=["frame", "laser", "label"]):
-            key = batch["frame"].to_numpy().astype(np.int64) * _LASERS + batch["laser"].to_numpy()
+        for batch in file.iter_batches(
+            batch_size=_PICTURE.batch, columns=["frame", "laser", "label"]
+        ):
+            key = (
+                batch["frame"].to_numpy().astype(np.int64) * _PICTURE.lasers
+                + batch["laser"].to_numpy()
+            )
             is_net = _is_net(batch["label"])
             keys, place = np.unique(key, return_inverse=True)
             net = np.bincount(place, is_net, len(keys)).astype(np.int64)
@@ -484,7 +499,7 @@ def _count(points: Path) -> _Counts:
                 total[1] += m - n
     keys = np.array([*totals], dtype=np.int64)
     counts = np.array([*totals.values()], dtype=np.int64).reshape(-1, 2)
-    return _Counts(keys // _LASERS, keys % _LASERS, counts[:, 0], counts[:, 1])
+    return _Counts(keys // _PICTURE.lasers, keys % _PICTURE.lasers, counts[:, 0], counts[:, 1])
 
 
 def _is_net(label: Any) -> Any:
@@ -510,7 +525,7 @@ def _candidates(
     worth = np.minimum(counts.n_net[rows], counts.n_other[rows])
     best = rows[np.lexsort((counts.n_net[rows] + counts.n_other[rows], worth))[::-1]]
     found = [(int(counts.frame[row]), int(counts.laser[row])) for row in best]
-    return found[:_CANDIDATES]
+    return found[: _PICTURE.candidates]
 
 
 def _worth(r: Reflections) -> float:
@@ -519,7 +534,7 @@ def _worth(r: Reflections) -> float:
     A stripe along one strand shows no mesh, however long it is.
     """
     x = np.sort(r.in_laser[r.adaptive & r.usable, 0])
-    pieces = np.count_nonzero(np.diff(x) > _STRAND_GAP)
+    pieces = np.count_nonzero(np.diff(x) > _PICTURE.strand_gap)
     return float(pieces * np.sqrt(1.0 + np.count_nonzero(r.usable & ~r.adaptive)))
 
 

@@ -6,7 +6,7 @@ peaks in them within the lasers' bands.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import cv2
 import numpy as np
@@ -140,14 +140,23 @@ DETECTORS: dict[str, type[DetectorOptions]] = {
 }
 """Options of every detector, by its word on the command line and in files."""
 
-# One search line of this many is sampled first. Low peaks are used up to this many times the number
-# that the lasers can make.
-_SAMPLE_EVERY, _MAX_PEAKS = 48, 2.0
-# Quantile of the height of a frame's bright peaks.
-_BRIGHT_QUANTILE = 0.9
-_CACHE_LINE = 8  # numbers of 64 bits
-# An overexposed line is no wider than this share of the picture.
-_WIDEST_WHITE = 0.02
+
+class _SearchOptions(NamedTuple):
+    """Sample of a frame that tells how high its stripes are."""
+
+    # One search line of this many is sampled first. Low peaks are used up to this many times the
+    # number that the lasers can make.
+    sample_every: int = 48
+    max_peaks: float = 2.0
+    # Quantile of the height of a frame's bright peaks.
+    bright_quantile: float = 0.9
+    cache_line: int = 8
+    # An overexposed line is no wider than this share of the picture.
+    widest_white: float = 0.02
+
+
+_SEARCH = _SearchOptions()
+
 _NO_CHROMA = np.empty((0, 0), np.uint8)
 
 
@@ -206,7 +215,7 @@ class FrameDetector:
         # Peaks of all directions, one after the other. Rows whose length is a power of two would
         # all map to the same few lines of the processor's cache.
         self._line = np.empty(len(self._finders) * self._room, np.int64)
-        self._table = np.empty((N_MEASURES, len(self._line) + _CACHE_LINE))
+        self._table = np.empty((N_MEASURES, len(self._line) + _SEARCH.cache_line))
         self._threshold = (
             {} if isinstance(options, StripeOptions) else self._threshold_detectors(options)
         )
@@ -286,7 +295,7 @@ class FrameDetector:
             for axis, lines in self._lines.items()
         }
         # A sample of the search lines gives the least useful height of peaks.
-        _, sample, _ = self._find(images, options.min_contrast, _SAMPLE_EVERY)
+        _, sample, _ = self._find(images, options.min_contrast, _SEARCH.sample_every)
         contrast, paint = self._survey(sample, frame.chroma is not None)
         line, table, ends = self._find(images, max(contrast, options.min_contrast))
         if frame.chroma is None:
@@ -346,8 +355,8 @@ class FrameDetector:
 
         Above that height there are not many more peaks than the lasers can make.
         """
-        n_possible = self._n_possible / _SAMPLE_EVERY
-        most = _MAX_PEAKS * n_possible
+        n_possible = self._n_possible / _SEARCH.sample_every
+        most = _SEARCH.max_peaks * n_possible
         heights = np.sort(sample[HEIGHT])
         n = len(heights)
         crowded = round(min(float(heights[n - 1 - int(most)]), HIGHEST_USEFUL)) if n > most else 0
@@ -366,7 +375,7 @@ class FrameDetector:
             laser_likelihood(
                 table,
                 learn_colour(table, colour, paint) or expected_colour(table, colour, paint),
-                _WIDEST_WHITE * self._size_px[0],
+                _SEARCH.widest_white * self._size_px[0],
                 n_possible,
             )
             for colour in self._colours
@@ -399,7 +408,7 @@ def select_peaks(
         As in `StripeOptions`.
     """
     keep = likelihood >= min_likelihood
-    bright = min_share * element_at(table[HEIGHT][keep], _BRIGHT_QUANTILE)
+    bright = min_share * element_at(table[HEIGHT][keep], _SEARCH.bright_quantile)
     for k in range(ends.shape[0] - 1):
         rows = ends[k] + np.flatnonzero(keep[ends[k] : ends[k + 1]])
         long = in_a_row(line[rows], table[POSITION][rows])

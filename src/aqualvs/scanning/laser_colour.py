@@ -71,23 +71,35 @@ _PAINT = _PaintOptions()
 # enough to learn from, the least and the most that is accepted of a learned one, and the spread of
 # paint and glare about zero. Lines of nine cameras show 0.15 to 0.7.
 RATIO_EXPECTED, RATIO_LEAST, _RATIO_MOST, _RATIO_OF_PAINT = 0.25, 0.1, 0.75, 0.05
-# One frame's lines spread about their ratio by this share, and by the second one across their
-# direction: overexposed ones show less and differ in hue, faint ones more.
-_RATIO_SPREAD, _ACROSS_SPREAD = 0.35, 0.5
-# Paint shows up to this share of the tint of its flanks, and at most the second share of the chroma
-# of a line, however green the scene is.
-_TINT_SHARE, _PAINT_SHARE = 0.5, 0.5
+
+
+class _LikelihoodOptions(NamedTuple):
+    """Likelihood that a peak is a laser line, by its colour."""
+
+    # One frame's lines spread about their ratio by this share, and by the second one across their
+    # direction: overexposed ones show less and differ in hue, faint ones more.
+    ratio_spread: float = 0.35
+    across_spread: float = 0.5
+    # Paint shows up to this share of the tint of its flanks, and at most the second share of the
+    # chroma of a line, however green the scene is.
+    tint_share: float = 0.5
+    paint_share: float = 0.5
+    # The largest of three normal numbers is this many standard deviations above their mean; up to
+    # this many levels of noise the lines' own differences are larger.
+    largest_of_three: float = 0.85
+    quiet: float = 1.4
+    # Limit of the log-likelihood ratio.
+    max_log_odds: float = 12.0
+
+
+_LIKELIHOOD = _LikelihoodOptions()
+
 # Width of the bins of height, and number of refinements of the shares of lines in them.
 _KINDS_PER_OCTAVE, _N_KINDS, _ROUNDS = 2.0, 16, 3
 _KIND_OF_HEIGHT = np.minimum(_KINDS_PER_OCTAVE * np.log2(np.arange(256).clip(1)), _N_KINDS - 1)
 _KIND_OF_HEIGHT = _KIND_OF_HEIGHT.astype(np.int64)
 # The colour of a core this bright, in limited-range luma, is ignored: every light is white there.
 WHITE = 225.0
-# The largest of three normal numbers is this many standard deviations above their mean; up to this
-# many levels of noise the lines' own differences are larger.
-_LARGEST_OF_THREE, _QUIET = 0.85, 1.4
-# Limit of the log-likelihood ratio.
-_MAX_LOG_ODDS = 12.0
 
 
 HIGHEST_USEFUL = 32
@@ -191,8 +203,8 @@ class LineColour(NamedTuple):
     v: float
     ratio: float
     sigma: float
-    along: float = _RATIO_SPREAD
-    across: float = _ACROSS_SPREAD
+    along: float = _LIKELIHOOD.ratio_spread
+    across: float = _LIKELIHOOD.across_spread
     paint: Paint | None = None
 
 
@@ -344,7 +356,7 @@ def _learn(table: FloatArray, u: float, v: float) -> tuple[float, float, float, 
     # The learned ratio is the one that this share of the best stripes exceeds.
     learned_quantile = 0.35
     # Steps that differ from any paint are the most certain; a line as green as the water is not.
-    for tint_share in (1.0, _TINT_SHARE):
+    for tint_share in (1.0, _LIKELIHOOD.tint_share):
         best = _best_stripes(table, u, v, sigma, tint_share)
         if best.shape[0] < _LEARN.min_learned:
             continue
@@ -523,7 +535,9 @@ def _weigh(
         size = math.sqrt(step_u**2 + step_v**2)
         # A step is the largest of three, so its mean is not zero for noise alone.
         left = (
-            max(1.0 - _LARGEST_OF_THREE * max(sigma - _QUIET, 0.0) / size, 0.0)
+            max(
+                1.0 - _LIKELIHOOD.largest_of_three * max(sigma - _LIKELIHOOD.quiet, 0.0) / size, 0.0
+            )
             if size > 0.0
             else 0.0
         )
@@ -540,13 +554,15 @@ def _weigh(
             off_paint = off_u**2 / var_u + off_v**2 / var_v
             off_paint -= math.log(var_along * var_across / (var_u * var_v))
         else:
-            beyond_u, beyond_v = _beyond_paint(table, i, left, _TINT_SHARE, _PAINT_SHARE * line)
+            beyond_u, beyond_v = _beyond_paint(
+                table, i, left, _LIKELIHOOD.tint_share, _LIKELIHOOD.paint_share * line
+            )
             off_paint = (beyond_u**2 + beyond_v**2) / (sigma**2 + (_RATIO_OF_PAINT * height) ** 2)
         log_odds = 0.5 * (off_paint - off_line**2 / var_along - across**2 / var_across)
         if size > _LEARN.clear_sigmas * sigma and along < _LEARN.min_cosine * left * size:
             # Light of another colour.
-            log_odds = -_MAX_LOG_ODDS
-        odds[i] = math.exp(min(max(log_odds, -_MAX_LOG_ODDS), _MAX_LOG_ODDS))
+            log_odds = -_LIKELIHOOD.max_log_odds
+        odds[i] = math.exp(min(max(log_odds, -_LIKELIHOOD.max_log_odds), _LIKELIHOOD.max_log_odds))
         kind[i] = _kind_of(height)
     share = np.full(_N_KINDS, 0.5)
     for _ in range(_ROUNDS):

@@ -76,9 +76,6 @@ def _tone_curve(gamma: float) -> NDArray[np.uint8]:
 
 Rgb = NDArray[np.float32]
 
-# Full scale of the sensor's converter in counts (12 bits).
-_COUNTS = 4095.0
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Drift:
@@ -324,12 +321,14 @@ def _bell(sigma: float) -> NDArray[np.float32]:
 
 def _through_mosaic(raw: Rgb) -> Rgb:
     """Keep one colour a pixel, and interpolate the others (OpenCV's bilinear demosaicing)."""
-    counts = np.rint(raw * np.float32(_COUNTS)).astype(np.uint16)
+    # Full scale of the sensor's converter in counts (12 bits).
+    full_scale = 4095.0
+    counts = np.rint(raw * np.float32(full_scale)).astype(np.uint16)
     mosaic = counts[..., 1].copy()
     mosaic[::2, ::2], mosaic[1::2, 1::2] = counts[::2, ::2, 0], counts[1::2, 1::2, 2]
     # OpenCV names the pattern by the second row's second and third pixel.
     colours = cv2.demosaicing(mosaic, cv2.COLOR_BayerBG2RGB)
-    return np.asarray(colours.astype(np.float32) / np.float32(_COUNTS))
+    return np.asarray(colours.astype(np.float32) / np.float32(full_scale))
 
 
 IDEAL = SimulatedCamera(

@@ -31,10 +31,8 @@ from aqualvs.optics.sheet import (
     sheet_in,
     sheets_of,
 )
+from aqualvs.optics.water import GREEN_NM
 from aqualvs.simulation.scene import Vector
-
-GREEN_NM = 532.0
-"""Default wavelength of a laser: a frequency-doubled Nd:YAG diode."""
 
 # Middles of the bands red, green and blue, in which scenes and water are described.
 _BANDS_NM = np.array([620.0, GREEN_NM, 460.0])
@@ -120,8 +118,6 @@ SOURCE, NORMAL, CENTRE, SIDE, SIGMA, DIVERGENCE, POWER, REACH = 0, 3, 6, 9, 12, 
 # Colour of the light for the camera, and weights of the water's three bands in its attenuation.
 COLOUR, BANDS = 16, 19
 _COLUMNS = 22
-# `LaserSource.power` is stated at this distance.
-_REFERENCE = 0.5
 # Half thickness of a sheet, in sigmas, beyond which it is dark.
 CUT = 4.0
 N_FAN = 3001
@@ -361,7 +357,9 @@ def peak_irradiance(
 ) -> float:
     """Return the irradiance in a sheet's middle, spread by the fan and dimmed by the water."""
     row = sheets.table[i]
-    reference = _REFERENCE * (row[SIGMA] + _REFERENCE * row[DIVERGENCE])
+    # `LaserSource.power` is stated at this distance.
+    reference_m = 0.5
+    reference = reference_m * (row[SIGMA] + reference_m * row[DIVERGENCE])
     spread = reference / (distance * sigma)
     k = int(place)
     a = place - k

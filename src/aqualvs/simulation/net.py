@@ -92,16 +92,31 @@ KAPPA_U, KAPPA_V, IS_HEXAGON, BAR, RADIUS, FOULING, GROWTH, MISSING = range(12, 
 SEED, HALF_U, HALF_V, OFFSET_U, OFFSET_V, FAMILIES, DIRECTIONS = range(20, 27)
 SPACING, ALBEDO, NET_COLUMNS = 32, 35, 38
 
-# Helix of the twine: spacing of the plies along it, in radii, and depth of the grooves.
-_LAY = 2.2
-_GROOVE = 0.07
-# Extra thickness of a knot (or a joint of knotless netting), relative to the twine.
-_KNOT = 0.45
-_GROWTH_ALBEDO = (0.42, 0.46, 0.26)
-# Least step along a ray towards a folded net, and number of bisections of the last step.
-_STEP = 1e-3
-_MAX_STEPS = 200
-_HALVINGS = 16
+
+class _TwineLook(NamedTuple):
+    """Shape and look of twisted twine."""
+
+    # Helix of the twine: spacing of the plies along it, in radii, and depth of the grooves.
+    lay: float = 2.2
+    groove: float = 0.07
+    # Extra thickness of a knot (or a joint of knotless netting), relative to the twine.
+    knot: float = 0.45
+    growth_albedo: tuple[float, float, float] = (0.42, 0.46, 0.26)
+
+
+_TWINE = _TwineLook()
+
+
+class _FoldSteps(NamedTuple):
+    """Search along a ray for a folded net."""
+
+    # Least step along a ray towards a folded net, and number of bisections of the last step.
+    step: float = 1e-3
+    max_steps: int = 200
+    halvings: int = 16
+
+
+_STEPS = _FoldSteps()
 
 
 class Strand(NamedTuple):
@@ -199,16 +214,16 @@ def _next_crossing(
         return t if t > begin else np.inf
     first, last = _crossing(o, d, nets, i, low), _crossing(o, d, nets, i, high)
     t = max(min(first, last), begin)
-    end = max(first, last) + _STEP
+    end = max(first, last) + _STEPS.step
     if not end < 1e6:
         return np.inf
     # The height over the net limits the distance to it along the ray from below.
     share = 1.0 / (1.5 + steepest)
     side = _behind(o, d, t, nets, i, folds)
-    for _ in range(_MAX_STEPS):
+    for _ in range(_STEPS.max_steps):
         if t >= end:
             break
-        step = max(share * abs(side), _STEP)
+        step = max(share * abs(side), _STEPS.step)
         now = _behind(o, d, t + step, nets, i, folds)
         if side * now <= 0.0:
             return _halved(o, d, t, t + step, side, nets, i, folds)
@@ -228,7 +243,7 @@ def _halved(
     folds: FloatArray,
 ) -> float:
     """Return by bisection where a ray changes sides of the net between two places."""
-    for _ in range(_HALVINGS):
+    for _ in range(_STEPS.halvings):
         middle = 0.5 * (before + after)
         if side * _behind(o, d, middle, nets, i, folds) > 0.0:
             before = middle
@@ -304,9 +319,9 @@ def _profile(
 ) -> tuple[float, float]:
     """Return the strand's local radius and the growth's part of it, in clean radii."""
     r = nets[i, RADIUS]
-    phase = 2.0 * np.pi * place / (_LAY * r)
-    swell = _KNOT * np.exp(-((knot / (1.6 * r)) ** 2))
-    radius = r * (1.0 - _GROOVE + _GROOVE * np.cos(phase) + swell)
+    phase = 2.0 * np.pi * place / (_TWINE.lay * r)
+    swell = _TWINE.knot * np.exp(-((knot / (1.6 * r)) ** 2))
+    radius = r * (1.0 - _TWINE.groove + _TWINE.groove * np.cos(phase) + swell)
     fouling = nets[i, FOULING]
     if fouling <= 0.0:
         return radius, 0.0
@@ -378,7 +393,7 @@ def _meet_layer(
     if nets[i, IS_HEXAGON] != 0.0:
         cell = _hexagon_centre(u, v, nets, i)
     dz = dot(d, normal)
-    widest = nets[i, RADIUS] * (1.0 + _KNOT + nets[i, GROWTH] * (nets[i, FOULING] > 0.0))
+    widest = nets[i, RADIUS] * (1.0 + _TWINE.knot + nets[i, GROWTH] * (nets[i, FOULING] > 0.0))
     for k in range(int(nets[i, FAMILIES])):
         w, place, knot, line, bar = _nearest_axis(u, v, nets, i, k, cell)
         c, s = nets[i, DIRECTIONS + 2 * k], nets[i, DIRECTIONS + 2 * k + 1]
@@ -404,10 +419,10 @@ def _meet_layer(
 def strand_albedo(strand: Strand, nets: FloatArray, i: int, tiles: Tiles) -> Vec:
     """Return the diffuse reflectance of the twine: a helix of plies, or growth over it."""
     r = nets[i, RADIUS]
-    phase = 2.0 * np.pi * strand.along / (_LAY * r) + 2.0 * strand.across
+    phase = 2.0 * np.pi * strand.along / (_TWINE.lay * r) + 2.0 * strand.across
     dirt = sample(tiles.smooth, strand.along / 0.002, 40.0 * strand.across)
     shade = (0.80 + 0.20 * np.cos(phase)) * (0.85 + 0.30 * dirt)
     clean = scaled(row3(nets, i, ALBEDO), shade)
     cover = min(1.0, 2.0 * strand.growth)
-    grown = scaled(_GROWTH_ALBEDO, 0.6 + 0.8 * dirt)
+    grown = scaled(_TWINE.growth_albedo, 0.6 + 0.8 * dirt)
     return combine(clean, 1.0 - cover, grown, cover, grown, 0.0)

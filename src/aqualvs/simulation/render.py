@@ -35,8 +35,6 @@ from aqualvs.simulation.truth import LitPoints, find_lit_points, light_sheets
 _LOW, _HIGH = np.array([-0.6, 0.12, -0.5]), np.array([0.6, 1.3, 0.5])
 _DRIFT = np.array([0.03, -0.02, -0.012])
 _RADII = (0.2e-3, 1.0e-3)
-_REFLECTANCE = 0.7
-_SMALLEST_PX = 0.45
 
 
 def add_snow(
@@ -54,7 +52,8 @@ def add_snow(
     reach = np.exp(-np.outer(distance, scene.water.attenuation))
     colour = np.array(scene.water.ambient) + lit
     sizes = radii / distance * _pixels_per_radian(camera)
-    for pixel, size, light in zip(pixels[valid], sizes, _REFLECTANCE * colour * reach, strict=True):
+    reflectance = 0.7
+    for pixel, size, light in zip(pixels[valid], sizes, reflectance * colour * reach, strict=True):
         _splat(radiance, pixel, float(size), light)
 
 
@@ -87,7 +86,8 @@ def _splat(
     radiance: NDArray[np.float32], pixel: FloatArray, size: float, light: FloatArray
 ) -> None:
     """Add a round blob that keeps the light of particles smaller than a pixel."""
-    sigma = max(0.6 * size, _SMALLEST_PX)
+    smallest_px = 0.45
+    sigma = max(0.6 * size, smallest_px)
     half = int(np.ceil(3.0 * sigma))
     x0, y0 = (int(value) for value in np.rint(pixel))
     height, width = radiance.shape[:2]

@@ -297,11 +297,6 @@ class FieldEvidence:
         return ""
 
 
-# A stream is looked at so often until so many pairs of pictures have shown motion: 2 ms each of
-# 720x576 px, 9 ms of 1920x1080.
-_LOOK_EVERY_S, _ENOUGH_PAIRS = 0.5, 10
-
-
 class FieldWatch:
     """Watch of a stream's pictures for what contradicts the rig's shutter.
 
@@ -327,14 +322,17 @@ class FieldWatch:
     def look(self, picture: Frame) -> None:
         """Look at the next picture, if it is time."""
         before, self._last = self._last, picture
+        # A stream is looked at so often until so many pairs of pictures have shown motion: 2 ms
+        # each of 720x576 px, 9 ms of 1920x1080.
+        look_every_s, enough_pairs = 0.5, 10
         if before is None or self._first is None:
-            self._first, self._next_s = picture, picture.time_s + _LOOK_EVERY_S
+            self._first, self._next_s = picture, picture.time_s + look_every_s
             return
-        if len(self._pairs) >= _ENOUGH_PAIRS or picture.time_s < self._next_s:
+        if len(self._pairs) >= enough_pairs or picture.time_s < self._next_s:
             return
         if picture.index != before.index + 1 or picture.luma.shape != before.luma.shape:
             return
-        self._next_s = picture.time_s + _LOOK_EVERY_S
+        self._next_s = picture.time_s + look_every_s
         found = FieldEvidence.of([(before, picture)])
         if found.shows_motion:
             self._pairs.append(found)

@@ -8,6 +8,7 @@ and tables without another source are those of ITU-T H.264.
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from enum import IntEnum
 from typing import TypeAlias
 
 _START_CODE = b"\x00\x00\x01"
@@ -99,8 +100,16 @@ def _by_start_code(packet: bytes) -> Iterator[int]:
         at = packet.find(_START_CODE, at)
 
 
-SLICE, IDR, SEI, SPS, PPS, DELIMITER = 1, 5, 6, 7, 8, 9
-"""Types of NAL units (table 7-1)."""
+class NalType(IntEnum):
+    """Types of NAL units (table 7-1)."""
+
+    SLICE = 1
+    IDR = 5
+    SEI = 6
+    SPS = 7
+    PPS = 8
+    DELIMITER = 9
+
 
 START_CODE = b"\x00\x00\x00\x01"
 
@@ -159,10 +168,10 @@ class FrameNumbers:
             if len(unit) < 4:
                 continue
             kind = unit[0] & 31
-            if kind == SPS:
+            if kind == NalType.SPS:
                 self._bits = _frame_number_bits(unit)
-            elif kind in (SLICE, IDR):
-                return self._check(unit, is_idr=kind == IDR)
+            elif kind in (NalType.SLICE, NalType.IDR):
+                return self._check(unit, is_idr=kind == NalType.IDR)
         return False
 
     def _check(self, unit: bytes, *, is_idr: bool) -> bool:

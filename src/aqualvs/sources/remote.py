@@ -195,7 +195,6 @@ def remote_feed(address: str, *, transport: Transport = "tcp") -> RemoteFeed:
 
 
 _DEVICES = Path("/dev")
-_OPEN_S, _SILENT_S = 5.0, 2.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

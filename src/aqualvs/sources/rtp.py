@@ -6,7 +6,7 @@ Of RFC 6184, single NAL units, STAP-A and FU-A are read.
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from aqualvs.sources.h264 import DELIMITER, SEI, SPS, START_CODE
+from aqualvs.sources.h264 import START_CODE, NalType
 from aqualvs.sources.live_frames import Unwrapper
 
 _MAX_STEP = 3000
@@ -304,7 +304,7 @@ class H264Depacketizer:
         kind = payload[0] & 31
         if kind == _STAP_A and len(payload) > 3:
             kind = payload[3] & 31
-        if self._gap_before and kind not in (DELIMITER, SPS):
+        if self._gap_before and kind not in (NalType.DELIMITER, NalType.SPS):
             self._is_whole = False
         self._gap_before = False
 
@@ -353,7 +353,7 @@ class H264Depacketizer:
         timestamp, self._timestamp = self._timestamp or 0, None
         if self._fragments:
             self._spoil()
-        if self._is_whole and all(unit[0] & 31 >= SEI for unit in self._units):
+        if self._is_whole and all(unit[0] & 31 >= NalType.SEI for unit in self._units):
             return []
         whole, lossy = self._is_whole, self._after_loss or not self._is_whole
         data = b"".join(START_CODE + unit for unit in self._units) if whole else b""

@@ -176,7 +176,6 @@ def _with_utc(
     return TelemetryClock(table.at, log_s, boot_at, boot_s, start, sigma, notes)
 
 
-_ARMED = 128
 SUB_MODES = {
     0: "STABILIZE",
     1: "ACRO",
@@ -349,7 +348,8 @@ def _armed_and_modes(
     if table is None:
         return None, ()
     times, beat = clock.of(table), table.payload
-    armed = (beat["base_mode"] & _ARMED > 0).astype(float)
+    armed_flag = 128
+    armed = (beat["base_mode"] & armed_flag > 0).astype(float)
     number = beat["custom_mode"].astype(np.int64)
     changed = np.flatnonzero(np.diff(number, prepend=-1))
     ardupilot, submarine = 3, 12

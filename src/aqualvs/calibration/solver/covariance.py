@@ -262,11 +262,6 @@ def _cross_information(
     return cross
 
 
-# A view with more than this share of the information on a combination has no other view to be
-# compared with there.
-_ALONE = 0.999
-
-
 @dataclass(frozen=True, slots=True)
 class ViewCovariance:
     """Covariance of the shared parameters, by corners and by views.
@@ -386,11 +381,14 @@ def _spread(own: Sequence[FloatArray], scores: Sequence[FloatArray]) -> tuple[Fl
     """
     n, size = len(own), len(own[0])
     corrected, expected = np.zeros((n, size)), 0.0
+    # A view with more than this share of the information on a combination has no other view to be
+    # compared with there.
+    lone_share = 0.999
     for i, (information, score) in enumerate(zip(own, scores, strict=True)):
         values, vectors = np.linalg.eigh(information)
         values = np.clip(values, 0.0, 1.0)
-        alone = values > _ALONE
-        factor = np.where(alone, 0.0, 1.0 / np.sqrt(np.maximum(1.0 - values, 1.0 - _ALONE)))
+        alone = values > lone_share
+        factor = np.where(alone, 0.0, 1.0 / np.sqrt(np.maximum(1.0 - values, 1.0 - lone_share)))
         corrected[i] = vectors @ (factor * (vectors.T @ score))
         expected += float(values[~alone].sum())
     if expected <= 0.0:

@@ -88,9 +88,6 @@ __all__ = ["BoardPose", "load_poses", "match_poses", "picture_paths"]
 _MM = 1e3
 _MATRIX = tuple(f"T{row}{column}" for row in range(3) for column in range(4))
 _COLUMNS = ("file", "distance_mm", *_MATRIX)
-# Limits that reveal other units: no board stands inside a dome, none is seen at 100 m.
-_DISTANCE_MM = (30.0, 1e5)
-_METRES_BELOW = 15.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,9 +201,12 @@ def _number(key: str, cell: str, place: str) -> float | None:
 
 
 def _check_distance(distance_mm: float, place: str) -> None:
-    if not _DISTANCE_MM[0] <= distance_mm <= _DISTANCE_MM[1]:
-        small = 0.0 < distance_mm < _DISTANCE_MM[0]
-        unit = "metres" if distance_mm < _METRES_BELOW else "centimetres"
+    # Limits that reveal other units: no board stands inside a dome, none is seen at 100 m.
+    likely_mm = (30.0, 1e5)
+    metres_if_below = 15.0
+    if not likely_mm[0] <= distance_mm <= likely_mm[1]:
+        small = 0.0 < distance_mm < likely_mm[0]
+        unit = "metres" if distance_mm < metres_if_below else "centimetres"
         hint = f"it looks like {unit}, " if small else ""
         raise CalibrationError(
             f"{place}: distance_mm is {distance_mm:g}; {hint}give millimetres from the dome's "

@@ -23,9 +23,6 @@ from aqualvs.errors import CalibrationError, OptionError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.planes import Plane
 
-# Pitch of markers, in sides of a marker: leaves a light ring and room for stripes to cross.
-_PITCH = 1.7
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BoxPlan:
@@ -105,7 +102,9 @@ def box_patches(
     CalibrationError
         If a plane or a sheet is too small for a marker, or the dictionary has too few.
     """
-    pitch = _PITCH * plan.marker
+    # Pitch of markers, in sides of a marker: leaves a light ring and room for stripes to cross.
+    sides_apart = 1.7
+    pitch = sides_apart * plan.marker
     _check(plan, pitch, rooms)
     ids: list[int] = []
     corners: list[FloatArray] = []
