@@ -107,7 +107,7 @@ def measured(folder: Path) -> Result:
     pairs = [(t, r) for t, r, good in zip(truth, rows, valid, strict=True) if good]
     true = np.array([[float(t[c]) for c in _TRUTH] for t, _ in pairs]).reshape(-1, 3)
     answer = np.array([[float(r[c]) for c in _ANSWER] for _, r in pairs]).reshape(-1, 3)
-    sigma = np.array([[float(r[_sigma(c, r)]) for c in _ANSWER] for _, r in pairs]).reshape(-1, 3)
+    sigma = np.array([[float(r[_sigma(c)]) for c in _ANSWER] for _, r in pairs]).reshape(-1, 3)
     true[:, 0] *= 1e-3
     error = answer - true
     share = error / np.column_stack([true[:, 0], np.ones((len(true), 2))])
@@ -121,10 +121,10 @@ def measured(folder: Path) -> Result:
     )
 
 
-def _sigma(column: str, row: dict[str, str]) -> str:
-    """Return the column of the sigma that counts all errors, where there is one."""
-    total = f"sigma_total_{column}"
-    return total if total in row else f"sigma_{column}"
+def _sigma(column: str) -> str:
+    """Return the column of the sigma that counts all errors."""
+    name, unit = column.rsplit("_", 1)
+    return f"sigma_{name}_total_{unit}"
 
 
 def faults(result: Result, ideal: Result) -> list[str]:

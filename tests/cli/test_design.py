@@ -101,9 +101,9 @@ def test_the_rig_it_writes_is_sane_and_measures_as_predicted(folder, capsys):
         found = np.array([posture.range - wall_range, posture.pitch, posture.yaw])
         # Four sigma, and 0.01 % for the glow of the sheets in the water.
         assert np.all(np.abs(found) < 4.0 * told + [1e-4 * wall_range, 0.0, 0.0])
-        # The scanner's own sigma, from real residuals, is the prediction's.
+        # The scanner's own sigma, from real residuals and the glow of the sheets, is about that.
         stated = np.sqrt(np.diag(posture.covariance))
-        np.testing.assert_allclose(stated, told, rtol=0.3)
+        assert np.all((stated > 0.65 * told) & (stated < 1.5 * told))
 
 
 def test_it_draws_two_pictures(folder):

@@ -33,8 +33,7 @@ from aqualvs.simulation.scenarios import example_rig
 from scanning_cases import everywhere, lit_stripe
 
 WIDE = math.radians(160.0)
-NO_NOISE = SharedError(0.0, 0.0)
-POINT_ONLY = Noise(point=0.1, strand=0.1, wall=NO_NOISE, net=NO_NOISE, twine=0.0)
+POINT_ONLY = Noise(point=0.1, strand=0.1, shared=0.0, twine=0.0)
 
 
 NO_TOLERANCES = Tolerances(
@@ -106,25 +105,28 @@ class Wall:
 @pytest.mark.parametrize("wall_range", [0.4, 0.9])
 def test_noise_is_that_of_a_monte_carlo_through_the_scanners_fit(wall_range):
     rig, rng = example_rig(), np.random.default_rng(3)
-    noise = Noise(point=0.3, wall=SharedError(0.035, 0.05))
+    noise = Noise(point=0.3, shared=0.04)
     told = predict(as_design(rig, noise=noise), [wall_range])
     wall = Wall(rig, wall_range)
     found, stated, n_lasers = [], [], len(rig.lasers)
+    n = len(wall.pixels)
+    own = SharedError(np.full(n, noise.shared), np.empty((0, n)))
     for _ in range(500):
-        shared = rng.normal(0.0, noise.wall.shift_px, n_lasers)[wall.laser]
-        shared += rng.normal(0.0, noise.wall.tilt_px, n_lasers)[wall.laser] * wall.place
+        shared = rng.normal(0.0, noise.shared, n_lasers)[wall.laser]
+        shared += rng.normal(0.0, noise.shared, n_lasers)[wall.laser] * wall.place
         points, slope = wall.read(rig, shared + rng.normal(0.0, noise.point, len(shared)))
         sigma = np.full(len(points), noise.point)
-        fit = fit_robust(points, slope, sigma, wall.laser, wall.place, wall.start, noise.wall)
+        fit = fit_robust(points, slope, sigma, wall.laser, wall.place, wall.start, own)
         assert fit is not None
         found.append(range_pitch_yaw(fit.m))
         stated.append(fit.covariance[1, 1])
     # A standard deviation from 500 trials is known to 3.2 %, three times that; and the biweight
     # of the robust fit costs 2.5 %.
     np.testing.assert_allclose(np.std(found, axis=0), told.wall[0], rtol=0.12)
-    # What the fit itself says of the range, -range² dm_y.
-    sigma_range = wall_range**2 * np.sqrt(np.mean(stated))
-    np.testing.assert_allclose(told.wall[0, 0], sigma_range, rtol=0.04)
+    # What the fit itself says of the range, -range² dm_y. A frame judges what its stripes share by
+    # three numbers, so that this differs from frame to frame.
+    sigma_range = wall_range**2 * np.sqrt(np.median(stated))
+    np.testing.assert_allclose(told.wall[0, 0], sigma_range, rtol=0.2)
 
 
 def test_tolerances_are_what_moved_rigs_read():
@@ -176,30 +178,35 @@ def test_a_pair_of_lasers_has_a_closed_form():
         assert told.wall[0, 0] == pytest.approx(expected, rel=1e-5)
 
 
-def test_the_shift_of_all_strands_moves_the_range_whatever_the_number_of_lasers():
-    """Each pair of lasers as far from the lens tells the same wrong range: range² e / (f B)."""
-    twine_only = replace(POINT_ONLY, point=1e-9, strand=1e-9, twine=0.11)
-    two = pair(0.1, noise=twine_only)
+def test_the_shift_of_light_on_twine_is_a_length_on_the_target():
+    """Each stripe as far from the lens tells a wrong range alike: range e / B, whatever f is."""
+    twine_only = replace(POINT_ONLY, point=1e-9, strand=1e-9, twine=0.02, stripe=4e-3)
     beside = tuple(
         Mount(name=name, position=(x, 0.0, 0.0), stripe=math.pi / 2, tilt=0.0, fan=WIDE)
         for name, x in (("left", -0.1), ("right", 0.1))
     )
-    for design in (two, two.with_mounts([*two.mounts, *beside])):
-        told = predict(design, [0.4, 0.7])
-        expected = np.array([0.4, 0.7]) ** 2 * 0.11 / (700.0 * 0.1)
-        np.testing.assert_allclose(told.net[:, 0], expected, rtol=1e-5)
-        # To the angles it is the same on all sides, and a wall has no twine.
-        assert np.all(told.net[:, 1:] < 1e-6)
-        assert np.all(told.wall < 1e-8)
+    for rig in (pinhole(), pinhole(width=500, focal=350.0)):
+        two = pair(0.1, noise=twine_only, rig=rig)
+        for design in (two, two.with_mounts([*two.mounts, *beside])):
+            told = predict(design, [0.4, 0.7])
+            # All strands share it, and as much again those of one laser, which averages away.
+            all_share = np.array([0.4, 0.7]) * 0.02 * 4e-3 / 0.1
+            expected = all_share * math.sqrt(1.0 + 1.0 / len(design.mounts))
+            np.testing.assert_allclose(told.net[:, 0], expected, rtol=1e-5)
+            # A wall has no twine.
+            assert np.all(told.wall < 1e-8)
 
 
-def test_the_scores_error_counts_the_shift_of_all_strands():
+def test_the_scores_error_counts_the_shift_of_light_on_twine():
     design = pair(0.1, tolerances=NO_TOLERANCES)
-    wider = replace(design, noise=replace(design.noise, twine=0.11))
+    wider = replace(design, noise=replace(design.noise, twine=0.02))
     squares = score(wider).error ** 2 - score(design).error ** 2
-    # On the net alone, and in the range alone: one of two targets, one of three errors.
-    shift = design.ranges**2 * 0.11 / (700.0 * 0.1) / (design.ranges * design.goals.range_share)
-    assert squares == pytest.approx(np.mean(shift**2) / 6.0, rel=1e-3)
+    more = predict(wider).net ** 2 - predict(design).net ** 2
+    goals = np.full(more.shape, design.goals.angle)
+    goals[:, 0] = design.ranges * design.goals.range_share
+    # On the net alone: one of two targets.
+    assert squares == pytest.approx(0.5 * np.mean(more / goals**2), rel=1e-6)
+    assert squares > 0.0
 
 
 @settings(max_examples=25)
@@ -228,7 +235,7 @@ def test_finer_pixels_help_points_more_than_what_a_stripe_shares(share):
     grown = finer.size_px[0] / 1000.0
     # Search lines of two pixels, from 1280 on, halve the points.
     lines = 1.0 if finer.size_px[0] < 1280 else 0.5
-    shift = Noise(point=1e-9, wall=SharedError(0.05, 0.0))
+    shift = Noise(point=1e-9, shared=0.05)
     for noise, power, fewer in ((POINT_ONLY, 1.5, lines), (shift, 1.0, 1.0)):
         now = predict(pair(0.1, noise=noise), [0.6]).wall[0, 0]
         then = predict(pair(0.1, noise=noise, rig=finer), [0.6]).wall[0, 0]

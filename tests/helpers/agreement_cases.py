@@ -7,7 +7,7 @@ from aqualvs.geometry.transforms import rotation_from_rotvec
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.sheet import Sheet, sheets_of
 from aqualvs.scanning.laser_bands import SearchAxis, plan_bands
-from aqualvs.scanning.plane_fit import SOLID_ERROR, fit_robust
+from aqualvs.scanning.plane_fit import fit_robust, shared_error
 from aqualvs.scanning.posture import Posture, Reason, Refusal, posture_from_fit
 from aqualvs.scanning.scan import Scan, ScanPoints
 from aqualvs.scanning.triangulate import Triangulator
@@ -87,7 +87,7 @@ class Diver:
             laser,
             np.zeros(n),
             np.linalg.lstsq(points, np.ones(n))[0],
-            SOLID_ERROR,
+            shared_error(np.zeros(n)),
         )
         posture: Posture | Refusal = Refusal(Reason.COLLINEAR)
         if fit is not None:

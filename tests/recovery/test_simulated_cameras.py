@@ -18,6 +18,7 @@ import yaml
 
 from aqualvs.cli.main import main
 from aqualvs.geometry.arrays import FloatArray
+from aqualvs.optics.rig import Rig
 from aqualvs.optics.rigfile import save_rig
 from aqualvs.scanner import Scanner
 from aqualvs.scanning.posture import Posture
@@ -42,8 +43,9 @@ class FrameResult(NamedTuple):
 
 
 @cache
-def measured(dive: str, camera: str) -> FrameResult:
-    rig = example_rig()
+def measured(dive: str, camera: str, pixels: float = 1.0) -> FrameResult:
+    """Measure a dive with the example rig, or with one of fewer pixels each way."""
+    rig = _scaled(example_rig(), pixels)
     scenario = replace(load_scenario(dive), fps=_FPS[dive])
     with TemporaryDirectory() as folder:
         files = simulate_dive(
@@ -61,6 +63,14 @@ def measured(dive: str, camera: str) -> FrameResult:
     return FrameResult(valid, np.array(answer) - truth, np.array(sigma), truth[:, 0])
 
 
+def _scaled(rig: Rig, pixels: float) -> Rig:
+    lens = rig.lens
+    middle = [pixels * (one + 0.5) - 0.5 for one in (lens.cx, lens.cy)]
+    small = replace(lens, fx=pixels * lens.fx, fy=pixels * lens.fy, cx=middle[0], cy=middle[1])
+    size = round(pixels * rig.size_px[0]), round(pixels * rig.size_px[1])
+    return replace(rig, lens=small, size_px=size)
+
+
 @pytest.mark.parametrize("camera", REAL)
 @pytest.mark.parametrize("dive", list(_FPS))
 def test_a_real_camera_measures_as_the_ideal_one(dive: str, camera: str) -> None:
@@ -74,6 +84,22 @@ def test_a_real_camera_measures_as_the_ideal_one(dive: str, camera: str) -> None
     assert share.max() < 5e-3
     # Rms of nine values: at a true 1.3 it is below 1.9 in 98 of 100 cases.
     assert np.sqrt(np.mean((real.error / real.sigma) ** 2)) < 1.9
+
+
+@pytest.mark.parametrize(
+    "dives",
+    [
+        [("wall_yaw", camera, 1.0) for camera in REAL],
+        [("net_diamond", "ideal", 1.0), ("net_diamond", "ideal", 0.5)],
+    ],
+    ids=["cameras on a wall", "resolutions of a net"],
+)
+def test_sigmas_are_neither_too_small_nor_too_large(dives: list[tuple[str, str, float]]) -> None:
+    for dive in dives:
+        found = measured(*dive)
+        z = float(np.sqrt(np.mean((found.error / found.sigma)[found.valid] ** 2)))
+        # Rms of nine values that are not independent: at a true 1 between these in 95 of 100.
+        assert 0.5 < z < 1.6, (dive, z)
 
 
 def _rows(path: Path) -> list[dict[str, str]]:

@@ -14,7 +14,7 @@ from aqualvs.optics.rig import Laser, Rig
 from aqualvs.scanner import Scanner
 from aqualvs.scanning.detection import FrameDetector
 from aqualvs.scanning.laser_bands import LaserBand, SearchAxis
-from aqualvs.scanning.plane_fit import SOLID_ERROR, PlaneFit, fit_robust
+from aqualvs.scanning.plane_fit import PlaneFit, fit_robust, shared_error
 from aqualvs.scanning.posture import range_pitch_yaw
 from aqualvs.scanning.scan import Frame
 from aqualvs.scanning.stripe import StripeOptions, StripePeaks
@@ -186,8 +186,9 @@ def fit(
     along: FloatArray,
     start: FloatArray,
 ) -> PlaneFit:
+    shared = shared_error(np.zeros(len(points)))
     found = fit_robust(
-        points, per_px, np.full(len(points), 0.3), laser, along, start=start, shared=SOLID_ERROR
+        points, per_px, np.full(len(points), 0.3), laser, along, start=start, shared=shared
     )
     assert found is not None
     return found

@@ -17,7 +17,6 @@ from aqualvs.scanning.paraboloid import (
 from aqualvs.scanning.plane_fit import SharedError
 
 BASE = Plane.from_normal([0.1, 1.0, -0.05], 0.6)
-SHARED = SharedError(shift_px=0.02, tilt_px=0.02)
 _PX = 1.0e-3
 
 
@@ -47,10 +46,16 @@ def observed(patch: Patch, noise_px: float = 0.1, n: int = 40, wrong: int = 0) -
         points=points,
         sensitivity=np.tile(_PX * normal, (m, 1)),
         sigma_px=np.full(m, 0.1),
-        pull=np.zeros(m),
+        glow=np.zeros(m),
+        width=np.full(m, 5.0),
+        height=np.full(m, 80.0),
         line=line,
         laser=laser,
     )
+
+
+def shared(seen: Observations) -> SharedError:
+    return SharedError(np.full(len(seen.laser), 0.02), np.empty((0, len(seen.laser))))
 
 
 def patch_of(*coefficients: float) -> Patch:
@@ -73,7 +78,7 @@ def test_a_flat_patch_measures_heights_as_its_plane_does() -> None:
 def test_curvature_is_found_with_its_sigma(bend: tuple[float, float, float]) -> None:
     true = patch_of(0.002, 0.01, -0.02, *bend)
     seen = observed(true, wrong=12)
-    fit = fit_patch(seen, BASE, SHARED)
+    fit = fit_patch(seen, BASE, shared(seen))
     assert fit is not None
     sigma = np.sqrt(np.diag(fit.covariance))
     # Five standard deviations: 18 comparisons in all must hold.
@@ -84,7 +89,7 @@ def test_curvature_is_found_with_its_sigma(bend: tuple[float, float, float]) -> 
 
 def test_a_plane_is_left_a_plane() -> None:
     seen = observed(patch_of(*FLAT))
-    assert fit_patch(seen, BASE, SHARED) is None
+    assert fit_patch(seen, BASE, shared(seen)) is None
     assert not shows_curvature(seen, np.ones(len(seen.laser)), BASE)
 
 
@@ -116,7 +121,7 @@ def test_a_net_that_curls_around_the_vehicle_has_no_nearest_point() -> None:
 
 def test_the_covariance_of_the_tangent_follows_the_scatter() -> None:
     true = patch_of(0.0, 0.01, 0.0, 0.8, 0.0, 0.2)
-    fit = fit_patch(observed(true), BASE, SHARED)
+    fit = fit_patch(observed(true), BASE, shared(observed(true)))
     assert fit is not None
     m = nearest_tangent(fit.patch)
     expected = nearest_tangent(true)

@@ -18,7 +18,6 @@ from aqualvs.design.judge import Judge, Lot, predict, score
 from aqualvs.design.settings import Design, Mount, tangential
 from aqualvs.geometry.transforms import SE3
 from aqualvs.optics.lens import Lens
-from aqualvs.scanning.plane_fit import SharedError
 
 TILT_LIMITS = (math.radians(-40.0), math.radians(60.0))
 """Limits of the search for the best tilt."""
@@ -272,14 +271,11 @@ def _centred(design: Design) -> Design | None:
 def _averaged(design: Design) -> Design:
     """Average four frames with stripes at different places of the target: all noise halves.
 
-    But for the shift of all strands, which follows from twine and water, not from the place.
+    But for the shift of the light on twine, which follows from twine and water, not from the place.
     """
     noise = design.noise
-    wall, net = (
-        SharedError(0.5 * one.shift_px, 0.5 * one.tilt_px) for one in (noise.wall, noise.net)
-    )
-    halved = replace(noise, point=0.5 * noise.point, strand=0.5 * noise.strand, wall=wall, net=net)
-    return replace(design, noise=halved)
+    halved = {name: 0.5 * getattr(noise, name) for name in ("point", "strand", "shared")}
+    return replace(design, noise=replace(noise, **halved))
 
 
 def _better_known(*names: str) -> Callable[[Design], Design]:

@@ -30,7 +30,6 @@ from aqualvs.optics.rigfile import load_rig, shutter_from_part
 from aqualvs.optics.rigschema import NotNegative, Number, Positive, ShutterPart, StrictPart, Tilt
 from aqualvs.optics.shutter import AT_ONCE, Shutter
 from aqualvs.optics.water import N_AIR, seawater_index_vacuum
-from aqualvs.scanning.plane_fit import SharedError
 from aqualvs.yamlfile import parse_yaml, read_yaml
 
 KEY, VERSION = "aqualvs_design", 1
@@ -145,11 +144,9 @@ class NoisePart(StrictPart):
 
     point_px: Positive = Noise().point
     strand_px: Positive = Noise().strand
-    wall_shift_px: NotNegative = Noise().wall.shift_px
-    wall_tilt_px: NotNegative = Noise().wall.tilt_px
-    net_shift_px: NotNegative = Noise().net.shift_px
-    net_tilt_px: NotNegative = Noise().net.tilt_px
-    twine_px: NotNegative = Noise().twine
+    shared_px: NotNegative = Noise().shared
+    stripe_mm: NotNegative = Noise().stripe / _MM
+    twine_percent: NotNegative = 100.0 * Noise().twine
 
 
 class TolerancesPart(StrictPart):
@@ -407,9 +404,9 @@ def _noise(part: NoisePart) -> Noise:
     return Noise(
         point=part.point_px,
         strand=part.strand_px,
-        wall=SharedError(part.wall_shift_px, part.wall_tilt_px),
-        net=SharedError(part.net_shift_px, part.net_tilt_px),
-        twine=part.twine_px,
+        shared=part.shared_px,
+        stripe=part.stripe_mm * _MM,
+        twine=part.twine_percent / 100.0,
     )
 
 

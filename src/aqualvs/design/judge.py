@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from aqualvs.design.settings import Design, Mount, Noise, Tolerances, index_step
-from aqualvs.design.stripes import Stripes, line_pixels, see_stripes
+from aqualvs.design.stripes import OWN_ERRORS, Stripes, line_pixels, see_stripes
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.geometry.compiled import kernel
 from aqualvs.geometry.linear_algebra import invert_symmetric
@@ -18,6 +18,7 @@ from aqualvs.geometry.linear_algebra import invert_symmetric
 # Least number of search lines of a stripe for the scanner; least number of lasers for a posture.
 MIN_LINES = 16
 """Least number of points of a visible stripe."""
+_SHIFT, _OFFSET = OWN_ERRORS.index("shift"), OWN_ERRORS.index("laser_offset")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -118,15 +119,24 @@ class Sums:
 
 def wall_parts(stripes: Stripes, noise: Noise) -> Sums:
     """Return the contribution of each stripe (K, W) on an unbroken wall."""
-    shared = noise.wall.shift_px, noise.wall.tilt_px
-    return _parts(stripes, np.ones_like(stripes.lines), noise.point, shared)
+    lines = stripes.lines
+    return _parts(stripes, np.ones_like(lines), noise.point, np.full_like(lines, noise.shared))
 
 
 def net_parts(stripes: Stripes, design: Design) -> Sums:
     """Return the contribution of each stripe (K, W) on the design's net: one point a strand."""
     noise = design.noise
-    shared = noise.net.shift_px, noise.net.tilt_px
+    shared = np.hypot(noise.shared, twine_shift(stripes, noise))
     return _parts(stripes, net_share(stripes, design), noise.strand, shared)
+
+
+def twine_shift(stripes: Stripes, noise: Noise) -> FloatArray:
+    """Return the shift of the light on twine, (K, W) in pixels."""
+    # A sheet that is offset by its width moves its stripe in the picture by the stripe's width.
+    per_px, per_m = (np.linalg.norm(stripes.own[..., i, :], axis=-1) for i in (_SHIFT, _OFFSET))
+    px_per_m = per_m / np.where(per_px > 0.0, per_px, 1.0)
+    shift: FloatArray = noise.twine * noise.stripe * px_per_m
+    return shift
 
 
 def net_share(stripes: Stripes, design: Design) -> FloatArray:
@@ -156,14 +166,17 @@ def twine_pulls(stripes: Stripes, design: Design) -> FloatArray:
     """
     shift = stripes.own[..., 0, :]
     nearer = np.sign(shift[..., 1:2]) * net_share(stripes, design)[..., None]
-    pulls: FloatArray = design.noise.twine * nearer * shift
+    pulls: FloatArray = twine_shift(stripes, design.noise)[..., None] * nearer * shift
     return pulls
 
 
-def _parts(stripes: Stripes, share: FloatArray, point: float, shared: tuple[float, float]) -> Sums:
-    """Return the sums for `share` of the points (K, W), each with a noise of `point` pixels."""
+def _parts(stripes: Stripes, share: FloatArray, point: float, shared: FloatArray) -> Sums:
+    """Return the sums for `share` of the points (K, W), each with a noise of `point` pixels.
+
+    `shared` (K, W) is the shift of the stripe, and its tilt at the image border, in pixels.
+    """
     matrix = stripes.matrix * share[..., None, None]
-    pulls = stripes.own[..., :2, :] * share[..., None, None] * np.array(shared)[:, None]
+    pulls = stripes.own[..., :2, :] * (share * shared)[..., None, None]
     return Sums(matrix, point**2 * matrix + outer(pulls))
 
 

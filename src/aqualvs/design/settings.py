@@ -15,7 +15,7 @@ from aqualvs.geometry.planes import Plane
 from aqualvs.optics.camera import Camera, parameter_names
 from aqualvs.optics.rig import Laser, Rig
 from aqualvs.optics.sheet import sheet_in
-from aqualvs.scanning.plane_fit import MESH_ERROR, SOLID_ERROR, TWINE_ERROR_PX, SharedError
+from aqualvs.scanning.plane_fit import SHARED_ERROR_PX, twine_share
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -204,6 +204,10 @@ N_WALLS = 9
 """Number of ranges in the evaluation of a design, evenly spaced in their logarithm."""
 
 
+# Height of stripes on twine in clear water, in grey levels.
+_TWINE_HEIGHT = np.array(90.0)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Noise:
     """Noise of the scanner in one frame: standard deviations in pixels.
@@ -214,17 +218,20 @@ class Noise:
         Of a point of a stripe on a wall, on its search line.
     strand : float
         Of the light on one strand of a net.
-    wall, net : SharedError
-        Of the errors that a whole stripe shares.
+    shared : float
+        Of the shift that a whole stripe shares, and of its tilt at the image border.
+    stripe : float
+        Width of a stripe on the target, in metres.
     twine : float
-        Of the shift that all strands of a net share, towards the near side or the far one.
+        Of the shift of the light on twine, as a share of the width of the stripe: all strands of a
+        net share it, towards the near side or the far one, and as much again those of one laser.
     """
 
     point: float = 0.3
     strand: float = 0.15
-    wall: SharedError = SOLID_ERROR
-    net: SharedError = MESH_ERROR
-    twine: float = TWINE_ERROR_PX
+    shared: float = SHARED_ERROR_PX
+    stripe: float = 3e-3
+    twine: float = float(twine_share(_TWINE_HEIGHT))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

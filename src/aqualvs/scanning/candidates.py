@@ -23,7 +23,7 @@ from aqualvs.scanning.segments import (
     run_end,
     segment_peaks,
 )
-from aqualvs.scanning.stripe import StripePeaks
+from aqualvs.scanning.stripe import StripePeaks, flank_difference
 from aqualvs.scanning.triangulate import Triangulator
 
 SOURCE, LASER, LINE, COMPONENT, SUBSEGMENT, ALONG_X = range(6)
@@ -254,11 +254,13 @@ def summarise(
     centroid: FloatArray,
     mean_sensitivity: FloatArray,
     group_sigma_px: FloatArray,
-    group_pull: FloatArray,
+    group_glow: FloatArray,
+    group_width: FloatArray,
+    group_height: FloatArray,
     group_line: FloatArray,
     group_laser: IntArray,
 ) -> None:
-    """Write the centroids, mean sensitivities, position errors, pulls and lasers of groups."""
+    """Write the centroids, mean sensitivities, position errors and other means of groups."""
     n = group_sigma_px.shape[0]
     total, spread = np.zeros(n), np.zeros(n)
     for i in range(index.shape[0]):
@@ -272,7 +274,9 @@ def summarise(
             mean_sensitivity[c, k] += intensity_weight * sensitivity[i, k]
         # Error of a weighted mean of independent positions.
         group_sigma_px[c] += (intensity_weight * sigma_px[i]) ** 2
-        group_pull[c] += intensity_weight * pull[i]
+        group_glow[c] += intensity_weight * flank_difference(pull[i], width[i])
+        group_width[c] += intensity_weight * width[i]
+        group_height[c] += intensity_weight * height[i]
         group_line[c] += intensity_weight * line[i]
         group_laser[c] = laser[i]
     middle = np.empty(n)
@@ -284,7 +288,9 @@ def summarise(
             mean_sensitivity[c, k] *= share
             middle[c] += normal[k] * centroid[c, k]
         group_sigma_px[c] *= share * share
-        group_pull[c] *= share
+        group_glow[c] *= share
+        group_width[c] *= share
+        group_height[c] *= share
         group_line[c] *= share
     for i in range(index.shape[0]):
         c = index[i]
@@ -459,7 +465,9 @@ class Candidates:
             points=np.zeros((n, 3)),
             sensitivity=np.zeros((n, 3)),
             sigma_px=np.zeros(n),
-            pull=np.zeros(n),
+            glow=np.zeros(n),
+            width=np.zeros(n),
+            height=np.zeros(n),
             line=np.zeros(n),
             laser=np.empty(n, np.int64),
         )
@@ -477,7 +485,9 @@ class Candidates:
             seen.points,
             seen.sensitivity,
             seen.sigma_px,
-            seen.pull,
+            seen.glow,
+            seen.width,
+            seen.height,
             seen.line,
             seen.laser,
         )
@@ -494,8 +504,12 @@ class Observations:
         Centroid in `dome` (m) and its derivative by the stripe's position (m/px).
     sigma_px : array, shape (M,)
         Standard deviation of that position.
-    pull : array, shape (M,)
-        Mean shift of that position by an uneven background, in pixels.
+    glow : array, shape (M,)
+        Mean difference between the flanks of its peaks, as a share of their height, positive where
+        the background is brighter at greater positions.
+    width, height : array, shape (M,)
+        Of its peaks, means: full width at half height along the search line, in pixels; height
+        above the background, in grey levels.
     line : array, shape (M,)
         Mean search line.
     laser : int array, shape (M,)
@@ -505,7 +519,9 @@ class Observations:
     points: FloatArray
     sensitivity: FloatArray
     sigma_px: FloatArray
-    pull: FloatArray
+    glow: FloatArray
+    width: FloatArray
+    height: FloatArray
     line: FloatArray
     laser: IntArray
 

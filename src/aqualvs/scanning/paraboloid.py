@@ -66,8 +66,7 @@ def fit_over(
     line: FloatArray,
     laser: IntArray,
     gates: float,
-    shift_px: float,
-    tilt_px: float,
+    shared: SharedError,
     min_bend: float,
     inside: BoolArray,
     patch: FloatArray,
@@ -82,8 +81,8 @@ def fit_over(
         Of M observations.
     gates : float
         The fit begins with observations within this many gates of the base; 0: with `inside`.
-    shift_px, tilt_px : float
-        Errors that each laser's stripe shares, as standard deviations.
+    shared : SharedError
+        Errors that they share.
     min_bend : float
         Share of the range by which the net must bend where it is seen.
     inside : bool array, shape (M,)
@@ -107,9 +106,9 @@ def fit_over(
     by_range = GATE_SHARE * patch[OFFSET]
     n_on_plane = 0
     for i in range(n):
-        by_pixel = GATE_PX * per_px[i]
+        by_pixel = GATE_PX * abs(per_px[i])
         gate[i] = np.sqrt(by_range * by_range + by_pixel * by_pixel)
-        sigma[i] = per_px[i] * sigma_px[i]
+        sigma[i] = abs(per_px[i]) * sigma_px[i]
         n_on_plane += abs(height[i]) < gate[i]
         inside[i] = abs(height[i]) < gates * gate[i] if gates > 0.0 else inside[i]
     if not grow(terms, height, gate, inside, coefficients):
@@ -120,7 +119,7 @@ def fit_over(
             covariance[j, k] = inverse[j, k] * max(scale, 1.0) ** 2
     for i in range(n):
         pull[i] = weights[i] * per_px[i] / (sigma[i] * sigma[i])
-    add_shared(terms, pull, line, laser, shift_px, tilt_px, inverse, covariance)
+    add_shared(terms, pull, line, laser, shared, inverse, covariance)
     enough = min_bend * patch[OFFSET]
     asked = _asked_for(terms, height, inside, coefficients, covariance, n_on_plane, enough, rms)
     return True, asked, rms
@@ -175,7 +174,7 @@ def curvature_hint(
     terms, height, per_px = np.empty((n, N)), np.empty(n), np.empty(n)
     over_plane(points, sensitivity, patch, terms, height, per_px)
     for i in range(n):
-        per_px[i] *= sigma_px[i]
+        per_px[i] = abs(per_px[i]) * sigma_px[i]
     return curvature_in_sigmas(terms, height, per_px, weights)
 
 
@@ -210,7 +209,7 @@ def over_plane(
             d += patch[NORMAL + k] * sensitivity[i, k]
         terms[i, 0], terms[i, 1], terms[i, 2] = 1.0, u, v
         terms[i, 3], terms[i, 4], terms[i, 5] = 0.5 * u * u, u * v, 0.5 * v * v
-        height[i], per_px[i] = h, abs(d)
+        height[i], per_px[i] = h, d
 
 
 @kernel
@@ -356,12 +355,11 @@ def add_shared(
     pull: FloatArray,
     line: FloatArray,
     laser: IntArray,
-    shift_px: float,
-    tilt_px: float,
+    shared: SharedError,
     inverse: FloatArray,
     covariance: FloatArray,
 ) -> None:
-    """Add the covariance of a shift and a tilt that all of a laser's stripe may share.
+    """Add the covariance of the errors that a laser's stripe and all stripes share.
 
     Parameters
     ----------
@@ -371,8 +369,7 @@ def add_shared(
     line : array, shape (M,)
         Search lines.
     laser : int array, shape (M,)
-    shift_px, tilt_px : float
-        Standard deviations.
+    shared : SharedError
     inverse : array, shape (6, 6)
         Of the normal matrix.
     covariance : array, shape (6, 6)
@@ -390,18 +387,28 @@ def add_shared(
             if laser[i] == index:
                 along = 2.0 * (line[i] - low) / max(high - low, 1.0) - 1.0
                 for k in range(N):
-                    sums[0, k] += shift_px * pull[i] * terms[i, k]
-                    sums[1, k] += tilt_px * pull[i] * terms[i, k] * along
-        for mode in range(2):
-            moved = np.empty(N)
-            for j in range(N):
-                total = 0.0
-                for k in range(N):
-                    total += inverse[j, k] * sums[mode, k]
-                moved[j] = total
-            for j in range(N):
-                for k in range(N):
-                    covariance[j, k] += moved[j] * moved[k]
+                    sums[0, k] += shared.own[i] * pull[i] * terms[i, k]
+                    sums[1, k] += shared.own[i] * pull[i] * terms[i, k] * along
+        _add_moved(sums[0], inverse, covariance)
+        _add_moved(sums[1], inverse, covariance)
+    for cause in range(shared.common.shape[0]):
+        together = np.zeros(N)
+        for i in range(laser.shape[0]):
+            for k in range(N):
+                together[k] += shared.common[cause, i] * pull[i] * terms[i, k]
+        _add_moved(together, inverse, covariance)
+
+
+@kernel
+def _add_moved(sums: FloatArray, inverse: FloatArray, covariance: FloatArray) -> None:
+    """Add the covariance of one error, given the sums of its pulls (6,)."""
+    moved = np.zeros(N)
+    for j in range(N):
+        for k in range(N):
+            moved[j] += inverse[j, k] * sums[k]
+    for j in range(N):
+        for k in range(N):
+            covariance[j, k] += moved[j] * moved[k]
 
 
 __all__ = (
@@ -455,7 +462,7 @@ def fit_patch(
     plane : Plane
         As the search found it.
     shared : SharedError
-        Errors that each laser's stripe shares.
+        Errors that they share.
     min_bend : float
         Share of the range by which the net must bend where it is seen.
 
@@ -522,8 +529,7 @@ def _fit_over(
         seen.line,
         seen.laser,
         start if isinstance(start, float) else 0.0,
-        shared.shift_px,
-        shared.tilt_px,
+        shared,
         min_bend,
         inside,
         patch,

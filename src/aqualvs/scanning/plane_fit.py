@@ -2,49 +2,86 @@
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import kernel
-from aqualvs.geometry.linear_algebra import invert_symmetric, solve_symmetric
+from aqualvs.geometry.linear_algebra import (
+    factorise,
+    invert_symmetric,
+    solve_factorised,
+    solve_symmetric,
+)
+
+SHARED_ERROR_PX = 0.015
+"""Shift of one laser's stripe in one frame, and its tilt at the image border: standard deviations.
+
+Optics, sampling and compression move a whole stripe by about this much in a good picture. Residuals
+of single points do not show it, but how well the stripes of one frame make a plane does.
+"""
+# By this factor pictures differ in that: standard deviation of its logarithm. Rendered walls have
+# 0.01 to 0.06 px, most where compression is strong.
+_PICTURES_DIFFER = 4.0
+# Squares of the factors that are weighed against each other.
+_SQUARES = 4.0 ** np.linspace(-3.0, 3.0, 13)
+TWINE_SHARE, TWINE_LEVELS = 0.006, 1.2
+"""Shift of the light on twine as a share of the stripe's width, and grey levels that add to it.
+
+Twine is round, so that one side of the stripe is brighter: a length on the target, of which the
+stripe's width is the measure in every picture. On dim strands the light of the water counts, which
+ends at the strand: as a share of the width, about one grey level over the stripe's height.
+"""
+GLOW_PX = 0.5
+"""Shift of a stripe by a background as much brighter on one side as the stripe is high.
+
+Glow in the water ends at the stripe, where exactly is blurred by the camera. This error is left
+after the pull of a ramp is taken off.
+"""
 
 
-@dataclass(frozen=True, slots=True)
-class SharedError:
-    """Error common to all of one laser's stripe in one frame, as standard deviations.
-
-    Texture, compression, the sheet's own profile and the glow beside it move a whole stripe, not
-    only single points; residuals of the fit do not show this error.
+class SharedError(NamedTuple):
+    """Errors that points share, as standard deviations at each of N points in pixels.
 
     Attributes
     ----------
-    shift_px : float
-        Of the whole stripe.
-    tilt_px : float
-        At the image border, of a shift that grows from the image centre.
+    own : array, shape (N,)
+        Of the stripe of one laser: of its shift, and of its tilt at the image border.
+    common : array, shape (K, N)
+        Of all stripes together, one row for each cause, with its sign.
     """
 
-    shift_px: float
-    tilt_px: float
+    own: FloatArray
+    common: FloatArray
 
 
-# Found on the simulator and on independently rendered dives alike.
-SOLID_ERROR = SharedError(shift_px=0.035, tilt_px=0.035)
-"""For unbroken stripes."""
-MESH_ERROR = SharedError(shift_px=0.08, tilt_px=0.12)
-"""For the broken stripes of a net: strands are cut off by knots, seams and each other."""
-# A strand's light is brightest on the twine's front, and blur takes away the light on its edges:
-# its centroid lies before the mean of the surface it lights. On rendered nets of twelve kinds, in
-# clear and turbid water, all strands alike were 0.05 to 0.18 px off, to the near side; how far
-# depends on twine, growth and water, so that it is an error and no correction.
-TWINE_ERROR_PX = 0.11
-"""Standard deviation of the shift of all strands of a net alike, along the search lines."""
+def twine_share(height: FloatArray) -> FloatArray:
+    """Return the shift of the light on twine over the stripe's width, given its height."""
+    share: FloatArray = np.hypot(TWINE_SHARE, TWINE_LEVELS / height)
+    return share
+
+
+def shared_error(glow: FloatArray, twine: FloatArray | None = None) -> SharedError:
+    """Return the errors that points on a solid surface or on a net share.
+
+    Parameters
+    ----------
+    glow : array, shape (N,)
+        Difference between the flanks of the stripe, over its height.
+    twine : array, shape (N,), optional
+        Shift of the light on twine in pixels, with the sign that brings the point nearer. All
+        stripes share it, and as much again those of one laser. None on something solid.
+    """
+    if twine is None:
+        return SharedError(np.full(len(glow), SHARED_ERROR_PX), GLOW_PX * glow[None])
+    return SharedError(np.hypot(SHARED_ERROR_PX, twine), np.stack([GLOW_PX * glow, twine]))
+
 
 _TUKEY = 4.685  # 95 % efficiency for normal errors
 _ITERATIONS = 6
 # The stated errors count as much as the scatter of this many observations.
-_STATED_COUNT = 30.0
+_STATED_COUNT = 10.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +132,6 @@ def fit_robust(
     along: FloatArray,
     start: FloatArray,
     shared: SharedError,
-    common: FloatArray | None = None,
 ) -> PlaneFit | None:
     """Fit m·X = 1 by iteratively re-weighted least squares with Tukey's biweight.
 
@@ -117,10 +153,8 @@ def fit_robust(
     start : array, shape (3,)
         A first m, such as RANSAC gives.
     shared : SharedError
-        Error that each laser's stripe shares.
-    common : array, shape (N,), optional
-        Error that all stripes share: one standard deviation of it at each point, in pixels, with
-        its sign. None if left out.
+        Errors that the points share. How large those of single lasers are in this frame is judged
+        from how well the stripes of all lasers make a plane, beginning with `own`.
 
     Returns
     -------
@@ -131,9 +165,7 @@ def fit_robust(
     m = np.array(start, dtype=np.float64)
     covariance = np.empty((3, 3))
     weights = np.empty(len(points))
-    modes = shared.shift_px, shared.tilt_px
-    common = np.zeros(len(points)) if common is None else common
-    rms = _fit(points, sensitivity, sigma_px, laser, along, common, modes, m, covariance, weights)
+    rms = _fit(points, sensitivity, sigma_px, laser, along, shared, m, covariance, weights)
     if not math.isfinite(rms):
         return None
     return PlaneFit(m, covariance, weights, rms)
@@ -191,8 +223,7 @@ def _fit(
     sigma_px: FloatArray,
     laser: IntArray,
     along: FloatArray,
-    common: FloatArray,
-    modes: tuple[float, float],
+    shared: SharedError,
     m: FloatArray,
     covariance: FloatArray,
     weights: FloatArray,
@@ -223,12 +254,22 @@ def _fit(
     if not invert_symmetric(normal, covariance):
         return np.nan
     covariance *= factor
-    _add_shared_error(
-        points, sensitivity, sigma, weights, laser, along, common, modes, m, inverse, covariance
+    if not math.isfinite(factor):
+        return np.nan
+    # From here on `z` is m·X - 1.
+    weight, per_px = np.empty(n), np.empty(n)
+    for i in range(n):
+        weight[i] = weights[i] / (sigma[i] * sigma[i])
+        per_px[i] = m[0] * sensitivity[i, 0] + m[1] * sensitivity[i, 1] + m[2] * sensitivity[i, 2]
+        z[i] *= sigma[i]
+    _add_own_errors(
+        points, per_px, weight, z, laser, along, shared.own, factor, inverse, covariance
     )
+    for k in range(shared.common.shape[0]):
+        _add_error(points, per_px * weight * shared.common[k], inverse, covariance)
     if not np.isfinite(covariance).all():
         return np.nan
-    return _weighted_rms(sigma, z, weights, m)
+    return _weighted_rms(z, weights, m)
 
 
 @kernel
@@ -255,58 +296,112 @@ def _huber_factor(z: FloatArray, cut: float) -> float:
 
 
 @kernel
-def _add_shared_error(
+def _add_own_errors(
     points: FloatArray,
-    sensitivity: FloatArray,
-    sigma: FloatArray,
-    weights: FloatArray,
+    per_px: FloatArray,
+    weight: FloatArray,
+    off: FloatArray,
     laser: IntArray,
     along: FloatArray,
-    common: FloatArray,
-    modes: tuple[float, float],
-    m: FloatArray,
+    own: FloatArray,
+    factor: float,
     inverse: FloatArray,
     covariance: FloatArray,
 ) -> None:
-    """Widen by one shift and one tilt for each laser, each of its own, and by the common error."""
-    n_lasers = 0
-    for i in range(laser.shape[0]):
-        n_lasers = max(n_lasers, laser[i] + 1)
-    pull, together = np.zeros((n_lasers, 2, 3)), np.zeros(3)
-    shift = np.empty(3)
+    """Widen by one shift and one tilt for each laser, as large as this frame's residuals ask for.
+
+    `off` is m·X - 1; `factor` is that of the points' variances.
+    """
+    n_modes = 2 * (laser.max() + 1)
+    pull, residual = np.zeros((n_modes, 3)), np.zeros(n_modes)
+    matrix = np.zeros((n_modes, n_modes))
     for i in range(points.shape[0]):
-        per_px = m[0] * sensitivity[i, 0] + m[1] * sensitivity[i, 1] + m[2] * sensitivity[i, 2]
-        w = weights[i] * per_px / (sigma[i] * sigma[i])
+        shift = per_px[i] * own[i]
+        tilt = shift * along[i]
+        a = 2 * laser[i]
         for k in range(3):
-            pull[laser[i], 0, k] += w * points[i, k]
-            pull[laser[i], 1, k] += w * points[i, k] * along[i]
-            together[k] += w * points[i, k] * common[i]
-    for index in range(n_lasers):
-        for mode in range(2):
-            for j in range(3):
-                shift[j] = 0.0
-                for k in range(3):
-                    shift[j] += inverse[j, k] * pull[index, mode, k]
-                shift[j] *= modes[mode]
-            for j in range(3):
-                for k in range(3):
-                    covariance[j, k] += shift[j] * shift[k]
+            pull[a, k] += weight[i] * shift * points[i, k]
+            pull[a + 1, k] += weight[i] * tilt * points[i, k]
+        residual[a] -= weight[i] * shift * off[i]
+        residual[a + 1] -= weight[i] * tilt * off[i]
+        matrix[a, a] += weight[i] * shift * shift
+        matrix[a + 1, a] += weight[i] * shift * tilt
+        matrix[a + 1, a + 1] += weight[i] * tilt * tilt
+    moved = np.zeros((n_modes, 3))
+    for a in range(n_modes):
+        for j in range(3):
+            for k in range(3):
+                moved[a, j] += inverse[j, k] * pull[a, k]
+    # What a plane can follow does not show.
+    for a in range(n_modes):
+        for b in range(a + 1):
+            for k in range(3):
+                matrix[a, b] -= moved[a, k] * pull[b, k]
+    scale = _expected_square(matrix / factor, residual / factor)
+    for a in range(n_modes):
+        for j in range(3):
+            for k in range(3):
+                covariance[j, k] += scale * moved[a, j] * moved[a, k]
+
+
+@kernel
+def _expected_square(matrix: FloatArray, residual: FloatArray) -> float:
+    """Return the expected square of the factor on shared errors, given what a frame shows.
+
+    Errors that are normal with variance t have a marginal likelihood (Rasmussen and Williams 2006,
+    Eq. 2.30); it is weighed with the prior of t.
+
+    Parameters
+    ----------
+    matrix : array, shape (K, K)
+        Information of the frame on the K errors; lower half.
+    residual : array, shape (K,)
+        The same times their estimate.
+    """
+    n_modes, spread = residual.shape[0], 2.0 * np.log(_PICTURES_DIFFER)
+    lower, solved = np.empty((n_modes, n_modes)), np.empty(n_modes)
+    log_weight = np.full(_SQUARES.shape[0], -np.inf)
+    for f in range(_SQUARES.shape[0]):
+        t = _SQUARES[f]
+        for a in range(n_modes):
+            for b in range(a):
+                lower[a, b] = matrix[a, b]
+            lower[a, a] = max(matrix[a, a], 0.0) + 1.0 / t
+        if not factorise(lower, 0.0, 0.0, lower):
+            continue
+        solve_factorised(lower, residual, solved)
+        total = -((np.log(t) / spread) ** 2) - n_modes * np.log(t)
+        for a in range(n_modes):
+            total += residual[a] * solved[a] - 2.0 * np.log(lower[a, a])
+        log_weight[f] = 0.5 * total
+    most = log_weight.max()
+    if not math.isfinite(most):
+        return 1.0
+    weights = np.exp(log_weight - most)
+    return float((weights * _SQUARES).sum() / weights.sum())
+
+
+@kernel
+def _add_error(
+    points: FloatArray, weight: FloatArray, inverse: FloatArray, covariance: FloatArray
+) -> None:
+    """Widen by an error of all points together; `weight` is its standard deviation, weighted."""
+    pull, shift = np.zeros(3), np.empty(3)
+    for i in range(points.shape[0]):
+        for k in range(3):
+            pull[k] += weight[i] * points[i, k]
     for j in range(3):
-        shift[j] = 0.0
-        for k in range(3):
-            shift[j] += inverse[j, k] * together[k]
+        shift[j] = inverse[j, 0] * pull[0] + inverse[j, 1] * pull[1] + inverse[j, 2] * pull[2]
     for j in range(3):
         for k in range(3):
             covariance[j, k] += shift[j] * shift[k]
 
 
 @kernel
-def _weighted_rms(sigma: FloatArray, z: FloatArray, weights: FloatArray, m: FloatArray) -> float:
-    total = 0.0
-    weight = 0.0
-    for i in range(z.shape[0]):
-        distance = z[i] * sigma[i]
-        total += weights[i] * distance * distance
+def _weighted_rms(off: FloatArray, weights: FloatArray, m: FloatArray) -> float:
+    total, weight = 0.0, 0.0
+    for i in range(off.shape[0]):
+        total += weights[i] * off[i] * off[i]
         weight += weights[i]
     length = np.sqrt(m[0] * m[0] + m[1] * m[1] + m[2] * m[2])
     return float(np.sqrt(total / weight) / length)

@@ -39,13 +39,13 @@ from aqualvs.scanning.patch import (
     tangent_covariance,
 )
 from aqualvs.scanning.plane_fit import (
-    MESH_ERROR,
-    SOLID_ERROR,
-    TWINE_ERROR_PX,
     PlaneFit,
+    SharedError,
     fit_pseudo_inverse,
     fit_robust,
     mark_inliers,
+    shared_error,
+    twine_share,
     weigh_candidates,
 )
 from aqualvs.scanning.posture import MAX_RMS_SHARE, Posture, Reason, Refusal, posture_of, validate
@@ -305,7 +305,7 @@ class PostureEstimator:
         fit = self._fit(candidates, seen, target)
         if fit is None:
             return _refused(candidates, Refusal(Reason.COLLINEAR, "the points do not fix a plane"))
-        flat = self._posture_of_fit(candidates, seen, fit, on_twine=mesh)
+        flat = self._posture_of_fit(candidates, seen, fit)
         found = flat
         if mesh and self._fit_method is FitMethod.ROBUST:
             if flat is not None:
@@ -536,13 +536,14 @@ class PostureEstimator:
         seen = self._observe(candidates, candidates.component, _SHORTEST_STRAND, near, plane.normal)
         if not len(seen.observations.laser):
             return None
-        fit = fit_patch(seen.observations, plane, MESH_ERROR, min_bend)
-        fit = fit and refit_at_nearest(fit, seen.observations, MESH_ERROR)
+        shared = _shared_error(seen.observations, plane.normal, on_twine=True)
+        fit = fit_patch(seen.observations, plane, shared, min_bend)
+        fit = fit and refit_at_nearest(fit, seen.observations, shared)
         m = None if fit is None else nearest_tangent(fit.patch)
         if fit is None or m is None:
             return None
         tangent = PlaneFit(m, tangent_covariance(fit, m), fit.weights, fit.rms)
-        found = self._posture_of_fit(candidates, seen, tangent, on_twine=True)
+        found = self._posture_of_fit(candidates, seen, tangent)
         if found is None or isinstance(found.posture, Refusal):
             return None
         along = fit.patch.coefficients[[3, 5]].tolist()
@@ -585,9 +586,7 @@ class PostureEstimator:
             observations.laser,
             along,
             target.plane.normal / target.plane.offset,
-            MESH_ERROR if target.is_mesh else SOLID_ERROR,
-            # Glow begins at the stripe, so that it may pull twice as much as a ramp.
-            None if target.is_mesh else observations.pull,
+            _shared_error(observations, target.plane.normal, on_twine=target.is_mesh),
         )
         if robust is None or self._fit_method is FitMethod.ROBUST:
             return robust
@@ -601,13 +600,11 @@ class PostureEstimator:
         fit: PlaneFit,
         *,
         of_all: bool = False,
-        on_twine: bool = False,
     ) -> Measurement | None:
         """Return the posture of a fit; None unless a second laser determines the plane's angles.
 
         A line and one point always share a plane: an error of a single piece would not show.
-        With `of_all`, pieces that the fit has rejected count too. With `on_twine`, the range has
-        the error that the light on all strands shares.
+        With `of_all`, pieces that the fit has rejected count too.
         """
         inliers = np.empty(len(candidates), np.bool_)
         laser = seen.observations.laser
@@ -629,8 +626,6 @@ class PostureEstimator:
             weights,
         )
         posture = posture_of(fit, nearest, n_points, self._axis_in_dome)
-        if on_twine:
-            _add_twine_error(posture, fit, observations.sensitivity)
         return Measurement(posture, inliers, weights=weights)
 
 
@@ -647,10 +642,12 @@ def _plane_of(fit: PlaneFit) -> Plane:
     return Plane(fit.m * distance, distance)
 
 
-def _add_twine_error(posture: Posture, fit: PlaneFit, sensitivity: FloatArray) -> None:
-    """Widen the range of a posture, in place, by the error that the light on all strands shares."""
-    share = float(np.abs(sensitivity @ fit.m) @ fit.weights / fit.weights.sum())
-    posture.covariance[0, 0] += (TWINE_ERROR_PX * share * posture.range) ** 2
+def _shared_error(seen: Observations, normal: FloatArray, *, on_twine: bool) -> SharedError:
+    """Return the errors that observations of a surface share, given its approximate normal."""
+    if not on_twine:
+        return shared_error(seen.glow)
+    nearer = -np.sign(seen.sensitivity @ normal)
+    return shared_error(seen.glow, nearer * twine_share(seen.height) * seen.width)
 
 
 def _disputed(found: Measurement, other: Posture, intensity_share: float) -> Measurement:

@@ -492,6 +492,12 @@ def _pull(row: U8Array, peak: int, width: float, height: float) -> float:
 
 
 @inline_borrowing_kernel
+def flank_difference(pull: float, width: float) -> float:
+    """Return the difference between a peak's flanks, over its height, from its pull and width."""
+    return 2.0 * (int(width) + _FLANK_PX) * pull / (_PULL_OF_RAMP * width * width)
+
+
+@inline_borrowing_kernel
 def _measure_chroma(
     image: SearchImage,
     x: int,

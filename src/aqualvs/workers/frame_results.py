@@ -24,7 +24,7 @@ from aqualvs.geometry.compiled import borrowing_kernel
 from aqualvs.optics.rig import Rig
 from aqualvs.scanner import Scanner
 from aqualvs.scanning.laser_bands import plan_bands
-from aqualvs.scanning.plane_fit import SOLID_ERROR, PlaneFit, fit_robust, plane_of_all
+from aqualvs.scanning.plane_fit import PlaneFit, fit_robust, plane_of_all, shared_error
 from aqualvs.scanning.posture import Posture, Reason, Refusal, count_inliers, posture_of
 from aqualvs.scanning.row_motion import REACH, RowMotion
 from aqualvs.scanning.scan import Frame, Scan
@@ -88,7 +88,8 @@ class BareLensComparison:
         n, start = len(points), np.empty(3)
         if not plane_of_all(points, start):
             return None
-        return fit_robust(points, sensitivity, np.ones(n), laser, np.zeros(n), start, SOLID_ERROR)
+        shared = shared_error(np.zeros(n))
+        return fit_robust(points, sensitivity, np.ones(n), laser, np.zeros(n), start, shared)
 
 
 @borrowing_kernel
