@@ -6,19 +6,26 @@ from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 from aqualvs.batch.scheduler import Scheduler
-from aqualvs.errors import OptionError, SourceError
+from aqualvs.errors import SourceError
 from aqualvs.optics.rigfile import load_rig
 from aqualvs.pipeline import run, summary_lines
 from aqualvs.report.run_data import read_track
 from aqualvs.results.folder import POSTURE_COLUMNS
-from aqualvs.results.run_request import FrameWindow, RunRequest, read_run_yaml
+from aqualvs.results.run_request import FrameWindow, RunRequest, Water, read_run_yaml
 from aqualvs.results.summary import compare_with_truth, read_truth
+from aqualvs.scanner import ScannerOptions
 from aqualvs.scanning.posture import Posture
+from aqualvs.scanning.scan import Frame
+from aqualvs.simulation.calibration_set import SetSize, simulate_calibration
+from aqualvs.simulation.scenarios import example_rig
+from aqualvs.sources.fields import field_of
 from aqualvs.workers import pool
+from aqualvs.workers.run_frames import WaterFollowingScanner
 from batch_cases import DEMO, RESULTS, InlineWorkers, Listener, demo_dive, without_times, work_for
 from field_cases import FIELDS, interlaced_rig, woven_dive
 from shell_cases import destroy_frame
@@ -202,6 +209,13 @@ def test_a_run_with_the_wrong_shutter_says_so(tmp_path, dive, rig):
         assert [f"warning: {one}" for one in warnings] == told
 
 
-def test_markers_are_not_looked_for_in_fields(tmp_path, dive, rig):
-    with pytest.raises(OptionError, match="--index-target: markers are not looked for in fields"):
-        measured(dive, rig, tmp_path / "run", index_target=tmp_path / "target.yaml")
+def test_the_water_is_followed_in_fields(tmp_path):
+    rig, size = example_rig(), SetSize(camera=1, dome=1, box=1, index=1, dive=0)
+    files = simulate_calibration(rig, tmp_path, size=size)
+    luma = cv2.imread(str(files.index / "frame_000.png"), cv2.IMREAD_GRAYSCALE)
+    interlaced = replace(rig.in_water(1.34), shutter=FIELDS)
+    following = WaterFollowingScanner(interlaced, ScannerOptions(), files.target, Water())
+    for index, field in enumerate(("top", "bottom")):
+        following.look(replace(field_of(Frame(index, 0.0, luma), field), index=index))
+    found = following.scanner.rig.n_water
+    assert abs(found - rig.n_water) < 2.5 * following.sigma_n_water < 4e-3

@@ -18,6 +18,7 @@ from aqualvs.sources.fields import (
     combed_share,
     field_of,
     frames_of,
+    whole_luma,
 )
 from aqualvs.sources.video import sampled_pictures
 from batch_cases import DEMO
@@ -98,6 +99,14 @@ def test_fields_of_a_coded_video_are_the_pictures_that_it_was_woven_from(tmp_pat
             assert np.abs(frame.luma.astype(int) - luma[row::2]).mean() < 1.5
             for mine, plane in zip(frame.chroma, chroma, strict=True):
                 assert np.abs(mine.astype(int) - plane[row::2]).mean() < 1.0
+
+
+@pytest.mark.parametrize("field", ["top", "bottom"])
+def test_a_field_at_the_size_of_its_picture_has_its_rows_where_they_were(field):
+    ramp = np.repeat(np.arange(0, 160, 10, np.uint8)[:, None], 6, axis=1)
+    found = whole_luma(field_of(Frame(0, 0.0, ramp), field))
+    assert np.array_equal(found[1:-1], ramp[1:-1])
+    assert np.array_equal(whole_luma(Frame(0, 0.0, ramp)), ramp)
 
 
 def test_the_stream_says_that_it_is_interlaced(tmp_path):

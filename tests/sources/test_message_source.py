@@ -127,11 +127,11 @@ def json_image():
     return "/camera", "foxglove.CompressedImage", ("jsonschema", b"{}"), "json", messages
 
 
-def video_packets(n=6, gop=3):
+def video_packets(n=6, gop=3, **more):
     codec = av.CodecContext.create("libx264", "w")
     codec.width, codec.height = SIZE
     codec.pix_fmt, codec.time_base, codec.gop_size = "yuv420p", Fraction(1, 25), gop
-    codec.options = {"preset": "ultrafast", "tune": "zerolatency"}
+    codec.options = {"preset": "ultrafast", "tune": "zerolatency", **more}
     packets = []
     for i in range(n):
         frame = av.VideoFrame.from_ndarray(picture(i, SIZE), format="bgr24")
@@ -184,6 +184,14 @@ def test_images_of_an_mcap_file(tmp_path, make):
 
 def test_video_of_an_mcap_file(tmp_path):
     check(open_source(write_mcap(tmp_path / "a.mcap", [compressed_video()])))
+
+
+def test_video_of_fields_says_so(tmp_path):
+    packets = video_packets(flags="+ilme+ildct", **{"x264-params": "tff=1"})
+    for given, interlaced in ((packets, True), (None, False)):
+        path = write_mcap(tmp_path / f"{interlaced}.mcap", [compressed_video(given)])
+        with open_source(path) as source:
+            assert {frame.is_interlaced for frame in source} == {interlaced}
 
 
 def test_video_with_a_lost_packet_waits_for_the_next_key_frame(tmp_path):

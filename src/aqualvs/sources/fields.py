@@ -87,6 +87,22 @@ def _halved(plane: ImagePlane, n_rows: int) -> ImagePlane:
     return np.asarray(halved[:n_rows], np.uint8)
 
 
+def whole_luma(frame: Frame) -> ImagePlane:
+    """Return the luma of a frame at the size of its picture, for what stands still in it.
+
+    The rows that a field lacks are interpolated.
+    """
+    height, width = frame.luma.shape
+    if frame.field is None:
+        return np.ascontiguousarray(frame.luma)
+    rows_of_field = np.array([[1.0, 0.0, 0.0], [0.0, 0.5, -0.5 * FIRST_ROW[frame.field]]])
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    edge = cv2.BORDER_REPLICATE
+    luma = np.ascontiguousarray(frame.luma)
+    whole = cv2.warpAffine(luma, rows_of_field, (width, 2 * height), flags=flags, borderMode=edge)
+    return np.asarray(whole, np.uint8)
+
+
 def size_of_frames(rig: Rig) -> tuple[int, int]:
     """Return width and height of a rig's frames: half the height if it is interlaced."""
     width, height = rig.size_px

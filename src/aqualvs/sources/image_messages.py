@@ -8,7 +8,7 @@ has the frames of one topic.
 import base64
 import json
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeAlias, cast
 
 import av
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from aqualvs.closing import Closing
 from aqualvs.errors import OptionError, SourceError
 from aqualvs.scanning.scan import Frame, ImagePlane, Planes, planes_of_image
-from aqualvs.sources.base import packet_with, planes_of
+from aqualvs.sources.base import frame_of, packet_with
 from aqualvs.sources.images import quiet_decoders
 from aqualvs.sources.live_frames import LiveDecoder
 
@@ -480,9 +480,9 @@ class MessageSource(Closing):
         for index, (log_ns, message) in enumerate(self._messages()):
             if message is not None:
                 clock.note(index, message.stamp_ns or log_ns)
-                for at, planes in decoder.decode(index, message):
+                for frame in decoder.decode(index, message):
                     shown = index
-                    yield Frame(at, clock.time(at), *planes)
+                    yield replace(frame, time_s=clock.time(frame.index))
             if index - shown > _MAX_UNREADABLE:
                 raise SourceError(
                     f"{self.name}: {index - shown} messages in a row hold no image that can be "
@@ -525,11 +525,12 @@ class _Decoder:
         self._planes_of_picture = planes_of_picture
         self._video: LiveDecoder | None = None
 
-    def decode(self, index: int, message: ImageMessage) -> Iterator[tuple[int, Planes]]:
+    def decode(self, index: int, message: ImageMessage) -> Iterator[Frame]:
+        """Yield frames at time 0."""
         if message.codec is None:
             planes = self._planes_of_picture(message)
             if planes is not None:
-                yield index, planes
+                yield Frame(index, 0.0, *planes)
             return
         if self._video is None:
             context = cast("VideoCodecContext", av.CodecContext.create(message.codec, "r"))
@@ -537,4 +538,4 @@ class _Decoder:
         packet = packet_with(message.data)
         packet.pts = index
         for picture in self._video.decode(packet):
-            yield index if picture.pts is None else picture.pts, planes_of(picture)
+            yield frame_of(index if picture.pts is None else picture.pts, 0.0, picture)

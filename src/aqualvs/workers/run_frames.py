@@ -26,7 +26,7 @@ from aqualvs.scanning.posture import Reason, Refusal
 from aqualvs.scanning.scan import Frame, ImagePlane, Scan, ScanPoints
 from aqualvs.scanning.stripe import StripePeaks
 from aqualvs.sources import FrameSource, ImageSource, VideoSource
-from aqualvs.sources.fields import field_of, source_of_pictures
+from aqualvs.sources.fields import field_of, source_of_pictures, whole_luma
 from aqualvs.workers.frame_results import (
     FrameProcessor,
     FrameResult,
@@ -366,8 +366,6 @@ class WaterFollowingScanner:
     ------
     CalibrationError
         If the target's file cannot be used.
-    OptionError
-        If the camera is interlaced.
     """
 
     def __init__(self, rig: Rig, options: ScannerOptions, target: Path, water: Water) -> None:
@@ -376,11 +374,6 @@ class WaterFollowingScanner:
         from aqualvs.calibration.water_index.state import IndexOptions
 
         self._rig, self._options, self._target = rig, options, target
-        if rig.shutter.is_interlaced:
-            raise OptionError(
-                "--index-target: markers are not looked for in fields of an interlaced camera; "
-                "leave it out, and give --water-n or --temperature-c and --salinity"
-            )
         self.scanner = Scanner(rig, options)
         self._markers = load_target(target)
         # Accuracy of a user's measurement of the plate's place; only the index is tracked.
@@ -429,8 +422,7 @@ class WaterFollowingScanner:
         from aqualvs.calibration.targets.targets import View
 
         self._next_s = frame.time_s + _EVERY_S
-        grey = np.ascontiguousarray(frame.luma)
-        view = detect_markers(grey, self._markers, f"frame {frame.index}")
+        view = detect_markers(whole_luma(frame), self._markers, f"frame {frame.index}")
         if not isinstance(view, View):
             return
         reading = self._estimator.add(frame.time_s, view)
