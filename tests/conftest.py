@@ -27,8 +27,10 @@ LONG = (
 
 # As the command line does it, and before any test imports NumPy.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-# On a busy machine an example, or the making of one, may take seconds.
-settings.register_profile("aqualvs", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+# The same examples every time. On a busy machine one, or the making of it, may take seconds.
+settings.register_profile(
+    "aqualvs", derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow]
+)
 settings.load_profile("aqualvs")
 # Imports and thousands of tests leave nothing to free: searching them is a third of collecting.
 gc.disable()

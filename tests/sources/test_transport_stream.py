@@ -1,12 +1,13 @@
 """MPEG-TS as FFmpeg's muxer writes it: pictures come whole, at once, or not at all."""
 
 import random
+from itertools import groupby
 
 import av
 import numpy as np
 import pytest
 from av.video.frame import VideoFrame
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from aqualvs.sources.datagrams import BARE, RTP, TS, kind_of
@@ -68,12 +69,21 @@ def test_every_picture_comes_with_its_last_packet(tmp_path, codec, name, sound):
     assert [u.is_restart for u in found] == [True] + [False] * (len(found) - 1)
 
 
+def stream_of(packet):
+    """Number of the stream that a packet belongs to."""
+    return int.from_bytes(packet[1:3], "big") & 0x1FFF
+
+
 @given(st.sets(st.integers(0, 400), max_size=12), st.integers(1, 7))
 @settings(max_examples=60, deadline=None)
 def test_a_picture_comes_whole_or_not_at_all(plain, lost, n_each):
     """Datagrams of several packets are lost; the next picture tells of it."""
     content, pictures = plain
     packets = packets_of(content)
+    # The last packet is a picture's. Counters of four bits cannot tell of 16 lost ones.
+    streams = [stream_of(packet) for packet in packets]
+    gone = [i // n_each in lost for i, stream in enumerate(streams) if stream == streams[-1]]
+    assume(not any(is_gone and len(list(run)) % 16 == 0 for is_gone, run in groupby(gone)))
     groups = [packets[at : at + n_each] for at in range(0, len(packets), n_each)]
     stream, found = TransportStream(), []
     for k, group in enumerate(groups):
