@@ -95,7 +95,7 @@ class AnswerLimits:
     quiet: float = 0.1
     window_s: float = 1.7
     long_window_s: float = 3.0
-    promised: float = 0.11
+    promised: float = 0.22
     turned: float = math.radians(12.0)
     short: float = 4.0
     short_of: float = 0.01
@@ -158,8 +158,8 @@ class AnswerWatch:
     def __init__(self, vehicle: VehicleFacts, limits: AnswerLimits | None = None) -> None:
         self.limits = limits or AnswerLimits()
         self._vehicle = vehicle
-        change = vehicle.forward_drag.slope(_WATER) * _WATER_CHANGE / vehicle.mass
-        self._promised = self.limits.promised + 0.5 * change * self.limits.window_s**2
+        # Acceleration that a growing current takes.
+        self._change = vehicle.forward_drag.slope(_WATER) * _WATER_CHANGE / vehicle.mass
         self._noise = _Noise(self.limits.quiet)
         self.reset()
 
@@ -353,7 +353,8 @@ class AnswerWatch:
             turned = window_s == limits.window_s
             turned = turned and abs(last.heading - lately[0].heading) >= limits.turned
             promises = self._thrust_s > _BALANCED_S
-            promises = promises and self._way_of(before[0], lately) > self._promised
+            promised = limits.promised + 0.5 * self._change * window_s**2
+            promises = promises and self._way_of(before[0], lately) > promised
             if (turned or promises) and _stands_still(lately):
                 self._still_s, self._blind_s = 0.0, window_s
                 return True
