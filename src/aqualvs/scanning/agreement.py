@@ -36,9 +36,6 @@ from aqualvs.scanning.scan import Scan, ScanPoints
 N_BINS = 12
 """Bins of a stripe, from one border of the picture to the other."""
 
-# Points farther from the target's plane than this share of the range belong to something else: two
-# degrees of a laser are a quarter of the range at worst.
-_GATE = 0.4
 # In a bin, points within three times the typical scatter of the median are the stripe; the limit is
 # at least the first of these shares of the range and at most the second.
 _NEAR, _FAR = 0.003, 0.02
@@ -101,12 +98,15 @@ def _bin_stripes(
     n_cells = middle.shape[0] * N_BINS
     cell, off = np.empty(n, np.int64), np.empty(n)
     start = np.zeros(n_cells + 1, np.int64)
+    # Points farther from the target's plane than this share of the range belong to something else:
+    # two degrees of a laser are a quarter of the range at worst.
+    gate = 0.4
     for i in range(n):
         a = laser[i]
         off[i] = m[0] * points[i, 0] + m[1] * points[i, 1] + m[2] * points[i, 2] - 1.0
         share = pixels[i, 1] / size_y if along_x[a] else pixels[i, 0] / size_x
         piece = min(max(int(share * N_BINS), 0), N_BINS - 1)
-        cell[i] = a * N_BINS + piece if abs(off[i]) < _GATE else -1
+        cell[i] = a * N_BINS + piece if abs(off[i]) < gate else -1
         if cell[i] >= 0:
             start[cell[i] + 1] += 1
     for c in range(n_cells):
@@ -151,9 +151,6 @@ def _middle(
 CUT = 4.0
 """Cost limit of residuals, in sigmas: larger residuals count as this."""
 
-# Error of a bin of stripe that stays from frame to frame: texture, strands, the glow beside the
-# sheet, in pixels; and the unevenness that a target may have, as a share of the range.
-_SIGMA_PX, _UNEVEN = 0.25, 7e-4
 # Prior of a step: a laser that was knocked has turned rather than shifted, and hardly by more.
 _PRIOR = np.array([np.deg2rad(1.5), np.deg2rad(1.5), 0.005])
 # Limit of the steps; a laser so far off would not be seen at all.
@@ -385,7 +382,10 @@ class _Fit:
         least = _LEAST * view.seen
         m, _ = _planes(x, weight + least)
         per_px = np.abs(np.einsum("fbi,fi->fb", view.per_px, m))
-        sigma = np.hypot(_SIGMA_PX * per_px, _UNEVEN)
+        # Error of a bin of stripe that stays from frame to frame: texture, strands, the glow beside
+        # the sheet, in pixels; and the unevenness that a target may have, as a share of the range.
+        sigma_px, uneven = 0.25, 7e-4
+        sigma = np.hypot(sigma_px * per_px, uneven)
         w = (weight + least) / sigma**2
         m, inverse = _planes(x, w)
         residual = np.where(view.seen, np.einsum("fbi,fi->fb", x, m) - 1.0, 0.0)
@@ -445,15 +445,6 @@ def _spread(slope: FloatArray) -> FloatArray:
 # Frames in the fit; when there are twice as many, every other one is dropped.
 _MAX_FRAMES = 24
 _MIN_FRAMES = 5
-# At first one frame in this many is used: neighbouring frames show the same.
-_EVERY = 3
-# Bins of stripe that every laser must show for a frame to count.
-_MIN_PIECES = 4
-# An alarm needs a step of this significance, and of this size in angle or range.
-_SIGNIFICANT = 5.0
-_ANGLE, _EFFECT = math.radians(0.15), 0.005
-# Beyond this the target is bent: a laser so far off shows next to nothing.
-_UNLIKELY = math.radians(5.0)
 # Least share of the stripes that must be explained: by a flat target, or by the laser that moved.
 _EXPLAINED = 0.6
 # Another laser is excluded if its mean square is worse by this value and by the first share; a
@@ -545,7 +536,9 @@ class LaserAgreement:
         axes = [search.axis for search in plan_bands(rig, self._camera)]
         self._along_x = np.array([axis is SearchAxis.ALONG_X for axis in axes], np.int64)
         self._middles: dict[int, FloatArray] = {}
-        self._every = _EVERY
+        # At first one frame in this many is used: neighbouring frames show the same.
+        every = 3
+        self._every = every
         self._verdict: AgreementVerdict | None = None
 
     def add(self, scan: Scan) -> None:
@@ -558,7 +551,9 @@ class LaserAgreement:
             return
         m = scan.posture.normal_in_dome / scan.posture.range
         middles = bin_stripes(scan.points, m, self._along_x, self._rig.size_px)
-        if np.isfinite(middles[..., 0]).sum(axis=1).min() >= _MIN_PIECES:
+        # Bins of stripe that every laser must show for a frame to count.
+        min_pieces = 4
+        if np.isfinite(middles[..., 0]).sum(axis=1).min() >= min_pieces:
             self._sample({scan.index: middles})
 
     def arrays(self) -> dict[str, NDArray[Any]]:
@@ -611,7 +606,9 @@ class LaserAgreement:
             return _no_alarm(best, n_frames)
         if not _is_worse(none, best, _WORSE_SHARE_OF_NONE):
             return _no_alarm(none, n_frames)
-        if best.inliers < _EXPLAINED or float(np.linalg.norm(best.step[:2])) > _UNLIKELY:
+        # Beyond this the target is bent: a laser so far off shows next to nothing.
+        unlikely = math.radians(5.0)
+        if best.inliers < _EXPLAINED or float(np.linalg.norm(best.step[:2])) > unlikely:
             return AgreementVerdict(AgreementState.NOT_FLAT, n_frames)
         suspects = [one for one in found if one is best or not _is_worse(one, best)]
         if len(suspects) == len(found) > 2:
@@ -640,8 +637,11 @@ class LaserAgreement:
         """Return whether the step of a laser is significant, and large enough to matter."""
         step = found.step
         sigmas = math.sqrt(float(step @ np.linalg.solve(self._covariance(found), step)))
-        matters = found.effect > _EFFECT or float(np.linalg.norm(step[:2])) > _ANGLE
-        return sigmas > _SIGNIFICANT and matters
+        # An alarm needs a step of this significance, and of this size in angle or range.
+        significant = 5.0
+        angle, effect = math.radians(0.15), 0.005
+        matters = found.effect > effect or float(np.linalg.norm(step[:2])) > angle
+        return sigmas > significant and matters
 
     def _covariance(self, found: Explanation) -> FloatArray:
         """Return the covariance of a step, by errors of the stripes and of the calibration."""

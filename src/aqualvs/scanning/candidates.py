@@ -118,15 +118,6 @@ def append_candidates(
 # border.
 _SUBSEGMENT_FLOOR_PX = 0.08
 _SPREAD_SHARE = 0.12
-# Limit of a component's sampling weight in the search for surfaces: this many times the
-# typical one, but at least that of this many search lines.
-_WEIGHT_LIMIT_SHARE = 2.0
-_MIN_WEIGHT_LIMIT = 16.0
-# Factor on the sampling weight of a curved component: a fish has tangent planes, but is not a
-# plane.
-_CURVED_WEIGHT = 0.2
-# Shorter components are specks, and are left out of the typical weight.
-_SPECK_LINES = 3.0
 
 
 @borrowing_kernel
@@ -227,15 +218,24 @@ def _write_sampling_weights(
 ) -> None:
     """Write each subsegment's sampling weight: its light, less in long or curved components."""
     shapes = ComponentShapes(table[0], table[1], table[2], table[3], table[4], table[5])
-    strands = shapes.n_lines[shapes.n_lines >= _SPECK_LINES]
+    # Shorter components are specks, and are left out of the typical weight.
+    speck_lines = 3.0
+    strands = shapes.n_lines[shapes.n_lines >= speck_lines]
     typical = np.median(strands) if strands.shape[0] else 0.0
-    most_lines = max(_WEIGHT_LIMIT_SHARE * typical, _MIN_WEIGHT_LIMIT)
+    # Limit of a component's sampling weight in the search for surfaces: this many times the
+    # typical one, but at least that of this many search lines.
+    weight_limit_share = 2.0
+    min_weight_limit = 16.0
+    most_lines = max(weight_limit_share * typical, min_weight_limit)
     begin = 0
+    # Factor on the sampling weight of a curved component: a fish has tangent planes, but is not a
+    # plane.
+    curved_weight = 0.2
     for c in range(n_lines.shape[0]):
         s = component[begin]
         sampling_weight[c] = intensity_weight[c] * min(1.0, most_lines / shapes.n_lines[s])
         if is_curved(shapes, s):
-            sampling_weight[c] *= _CURVED_WEIGHT
+            sampling_weight[c] *= curved_weight
         begin += n_lines[c]
 
 

@@ -23,12 +23,6 @@ from aqualvs.scanning.scan import Label, ScanPoints
 from aqualvs.scanning.segments import ComponentShapes, is_bent, is_round, is_straight
 from aqualvs.scanning.surfaces import Surface, lit_cells, number_cells
 
-# Position error of the best peaks: quality 1.
-_BEST_SIGMA_PX = 0.1
-# A surface is a fish if this share of its light lies in bent components.
-_MOSTLY = 0.5
-# Quantile of the height of a frame's bright peaks.
-_BRIGHT_SHARE = 0.9
 # Compiled code takes numbers more easily than members of an enumeration.
 _NET, _SOLID, _FISH = np.uint8(Label.NET), np.uint8(Label.SOLID), np.uint8(Label.FISH)
 _BUBBLE, _BACKGROUND = np.uint8(Label.BUBBLE), np.uint8(Label.BACKGROUND)
@@ -82,8 +76,10 @@ def label_other(
     if n > 0 and 2 * n_behind == n:
         is_behind = nearest_before + nearest_behind > 0.0
     kind = _BACKGROUND
+    # A surface is a fish if this share of its light lies in bent components.
+    mostly = 0.5
     if not is_behind:
-        kind = _NET if is_mesh else _FISH if n_bent > _MOSTLY * n else _SOLID
+        kind = _NET if is_mesh else _FISH if n_bent > mostly * n else _SOLID
     for i in range(points.shape[0]):
         if members[subsegment_index[i]]:
             label[i] = kind
@@ -209,6 +205,8 @@ def label_loose(
     for k in range(n):
         candidates_of[source[rows[k]]] += 1
     bright = np.nan
+    # Quantile of the height of a frame's bright peaks.
+    bright_share = 0.9
     for k in range(n):
         i = rows[k]
         if explained[i]:
@@ -218,7 +216,7 @@ def label_loose(
         if candidates_of[source[i]] == 1:
             label[i] = _kind_of(points, i, is_straight(shapes, s), target, working_range)
         if is_round(shapes, s, 0.0) and bright != bright:
-            bright = element_at(height, _BRIGHT_SHARE)
+            bright = element_at(height, bright_share)
         if is_round(shapes, s, bright):
             label[i] = _BUBBLE
         elif is_bent(shapes, s):
@@ -281,6 +279,8 @@ def copy_points(
 
     `out_measures`, shape (4, len(rows)), gets sigma, intensity, width and quality.
     """
+    # Position error of the best peaks: quality 1.
+    best_sigma_px = 0.1
     for k in range(rows.shape[0]):
         i = rows[k]
         out_laser[k], out_label[k], out_used[k] = laser[i], label[i], used[i]
@@ -291,7 +291,7 @@ def copy_points(
             square += sensitivity[i, axis] * sensitivity[i, axis]
         out_measures[0, k] = sigma_px[i] * np.sqrt(square)
         out_measures[1, k], out_measures[2, k] = height[i], width[i]
-        out_measures[3, k] = min(_BEST_SIGMA_PX / sigma_px[i], 1.0)
+        out_measures[3, k] = min(best_sigma_px / sigma_px[i], 1.0)
 
 
 # Arguments of kernels where there is no target, and no net.

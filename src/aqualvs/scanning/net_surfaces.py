@@ -28,14 +28,6 @@ from aqualvs.scanning.posture import Posture
 _MAX_TURNS = 0.5
 _MIN_TURNS = 0.6
 _ENOUGH_TURNS = 8
-# The steepest flank of a fold, and what noise adds to the step from one piece to the next, as a
-# share of the range.
-_STEEPEST = 2.0
-_LOOSE_SHARE = 0.01
-# Share of the transitions at which the one surface must begin where the other ends.
-_MOST = 0.5
-# With this share of a net's light a plane is the net's plane, and the rest is folds in it.
-_MAIN_SHARE = 0.5
 
 
 def is_continuation(
@@ -56,7 +48,9 @@ def is_continuation(
     turns, at_random, met = _turns(
         subsegments.table, subsegments.laser, subsegments.first_line, first, second, packed
     )
-    return bool(0 < turns <= max(_MAX_TURNS * at_random, 1.0) and met >= _MOST * turns)
+    # Share of the transitions at which the one surface must begin where the other ends.
+    most = 0.5
+    return bool(0 < turns <= max(_MAX_TURNS * at_random, 1.0) and met >= most * turns)
 
 
 def seen_through(first: BoolArray, second: BoolArray, subsegments: Subsegments) -> bool:
@@ -116,7 +110,11 @@ def _meet(table: FloatArray, a: int, b: int, plane: FloatArray) -> bool:
         square += apart * apart
         step += plane[k] * apart
     beside = np.sqrt(max(square - step * step, 0.0))
-    return bool(abs(step) <= _STEEPEST * beside + _LOOSE_SHARE * plane[3])
+    # The steepest flank of a fold, and what noise adds to the step from one piece to the next, as a
+    # share of the range.
+    steepest = 2.0
+    loose_share = 0.01
+    return bool(abs(step) <= steepest * beside + loose_share * plane[3])
 
 
 def merged_plane(
@@ -135,7 +133,9 @@ def merged_plane(
     """
     sampling_weight = np.array([subsegments.table[WEIGHT] @ mine for mine in members])
     main = int(np.argmax(sampling_weight))
-    if sampling_weight[main] > _MAIN_SHARE * sampling_weight.sum():
+    # With this share of a net's light a plane is the net's plane, and the rest is folds in it.
+    main_share = 0.5
+    if sampling_weight[main] > main_share * sampling_weight.sum():
         return planes[main]
     mine = np.logical_or.reduce(members)
     weight = np.sqrt(subsegments.table[WEIGHT, mine])
@@ -143,11 +143,6 @@ def merged_plane(
     m = np.linalg.lstsq(weight[:, None] * points, weight)[0]
     length = float(np.linalg.norm(m))
     return Plane(m / length, 1.0 / length)
-
-
-_TUKEY = 4.685  # 95 % efficiency for normal errors
-_ITERATIONS = 5
-_EXACT = 1e-9
 
 
 def fit_mean(points: FloatArray, start: Plane) -> PlaneFit | None:
@@ -181,9 +176,12 @@ def _fit_mean(
     """Refine m in place, write weights and covariance; return the rms, NaN if undetermined."""
     n, one = points.shape[0], np.ones(points.shape[0])
     off, normal, right, inverse = np.empty(n), np.empty((3, 3)), np.empty(3), np.empty((3, 3))
-    for _ in range(_ITERATIONS):
+    tukey = 4.685  # 95 % efficiency for normal errors
+    iterations = 5
+    exact = 1e-9
+    for _ in range(iterations):
         _distances(points, m, off)
-        cut = _TUKEY * 1.4826 * max(np.median(np.abs(off)), _EXACT)
+        cut = tukey * 1.4826 * max(np.median(np.abs(off)), exact)
         for i in range(n):
             weights[i] = max(1.0 - (off[i] / cut) ** 2, 0.0) ** 2
         normal_equations(points, one, weights, normal, right)
@@ -241,9 +239,6 @@ def _apart(posture: Posture, other: Posture) -> FloatArray:
     )
 
 
-# Duty of a mesh at most: a typical lit interval over the sum of it and a typical gap. The gaps of a
-# net are longer than the lit strands; a wall behind a net is lit between short shadows.
-_MESH_DUTY = 0.6
 # Below this duty the gaps are real, not specks: a dense net, or a wall in a net's shadows.
 _GAPPY_DUTY = 0.9
 # Lit intervals with fewer dark search lines between them are one.
@@ -256,10 +251,6 @@ LONGEST_INTERVAL = 0.03
 # A stripe with this share of its light in intervals so much longer lies on something solid that is
 # partly hidden or broken by its texture; growth and strands along a laser make few of them.
 _UNBROKEN_SHARE, _UNBROKEN_LENGTHS = 0.4, 2.0
-# A subsegment whose sampling weight is a smaller share of its light lies in a curved component.
-_CURVED_WEIGHT = 0.21
-# Share of the lines at each end of a stripe that may be stragglers.
-_STRAGGLERS = 0.1
 
 
 class StripePattern(NamedTuple):
@@ -343,6 +334,9 @@ def _describe(
     """Write the light on strands; returns the rest of a `StripePattern`."""
     asked, broken, gappy, long, unbroken, n_intervals = 0, 0, 0, 0, 0, 0
     total = 0.0
+    # Duty of a mesh at most: a typical lit interval over the sum of it and a typical gap. The gaps
+    # of a net are longer than the lit strands; a wall behind a net is lit between short shadows.
+    mesh_duty = 0.6
     for index in range(on_strands.shape[0]):
         order, n_mine = _in_order(first_line, n_lines, laser, members, index)
         if n_mine < min_lines:
@@ -357,7 +351,7 @@ def _describe(
         long += not is_short
         is_gappy = n >= _MIN_INTERVALS and is_short and duty < _GAPPY_DUTY
         gappy += is_gappy
-        broken += is_gappy and duty < _MESH_DUTY
+        broken += is_gappy and duty < mesh_duty
         total += extent if is_gappy else 0.0
     few = not long and gappy == broken and n_intervals >= _FEW_INTERVALS
     enough = min(2, asked)
@@ -404,6 +398,8 @@ def _describe_stripe(
     n_intervals = 0
     begin = first_line[order[0]]
     end = last_line[order[0]] + 1
+    # A subsegment whose sampling weight is a smaller share of its light lies in a curved component.
+    curved_weight = 0.21
     for k in range(n):
         c = order[k]
         distance[k] = np.sqrt(table[0, c] ** 2 + table[1, c] ** 2 + table[2, c] ** 2)
@@ -414,7 +410,7 @@ def _describe_stripe(
             n_intervals += 1
             begin = first_line[c]
         end = max(end, last_line[c] + 1)
-        if table[WEIGHT, c] > _CURVED_WEIGHT * intensity_weight[c]:
+        if table[WEIGHT, c] > curved_weight * intensity_weight[c]:
             bright[n_intervals] += intensity_weight[c]
     extent = _extent(n_lines, first_line, last_line, order)
     gap = np.median(dark[:n_intervals]) if n_intervals else 0.0
@@ -443,11 +439,13 @@ def _extent(n_lines: IntArray, first_line: IntArray, last_line: IntArray, order:
     seen = 0
     begin = 0
     end = 0
+    # Share of the lines at each end of a stripe that may be stragglers.
+    stragglers = 0.1
     for k in range(order.shape[0]):
         c = order[k]
-        if seen <= _STRAGGLERS * total:
+        if seen <= stragglers * total:
             begin = first_line[c]
-        if seen < (1.0 - _STRAGGLERS) * total:
+        if seen < (1.0 - stragglers) * total:
             end = last_line[c]
         seen += n_lines[c]
     return float(end - begin + 1)

@@ -44,19 +44,6 @@ GATE_SHARE, GATE_PX = 0.004, 1.2
 MIN_PIECES = 12
 """Least number of observations of a patch."""
 
-_STEPS = 16
-_TUKEY = 4.685  # 95 % efficiency for normal errors
-_REWEIGHTS = 6
-# Largest curvature: a net does not bend with a radius below half a metre.
-_STRONGEST = 2.0
-# Curvature is fitted when it gains this share of the light or of the scatter ...
-_MORE_INTENSITY = 1.10
-_LESS_SCATTER = 0.6
-# ... and the curvature is significant.
-_SIGNIFICANT = 6.0
-# A pivot below this share of its diagonal is rounding, not information.
-_MIN_PIVOT = 1e-13
-
 
 @kernel
 def fit_over(
@@ -152,10 +139,15 @@ def _asked_for(
     sigmas = 0.0
     for k in range(3, N):
         sigmas = max(sigmas, abs(coefficients[k]) / np.sqrt(covariance[k, k]))
-    if sigmas < _SIGNIFICANT:
+    # ... and the curvature is significant.
+    significant = 6.0
+    if sigmas < significant:
         return False
-    less = rms < _LESS_SCATTER * np.sqrt(square / n_inside)
-    return bool(n_inside >= _MORE_INTENSITY * n_on_plane or less)
+    # Curvature is fitted when it gains this share of the light or of the scatter ...
+    more_intensity = 1.10
+    less_scatter = 0.6
+    less = rms < less_scatter * np.sqrt(square / n_inside)
+    return bool(n_inside >= more_intensity * n_on_plane or less)
 
 
 @kernel
@@ -238,7 +230,9 @@ def _solve(
             right[j] += part * height[i]
             for k in range(j + 1):
                 factor[j, k] += part * terms[i, k]
-    if not factorise(factor, 0.0, _MIN_PIVOT, factor):
+    # A pivot below this share of its diagonal is rounding, not information.
+    min_pivot = 1e-13
+    if not factorise(factor, 0.0, min_pivot, factor):
         return False
     solve_factorised(factor, right, coefficients)
     return True
@@ -283,14 +277,17 @@ def grow(
     """
     n = height.shape[0]
     weight, factor = np.empty(n), np.empty((N, N))
-    for _ in range(_STEPS):
+    steps = 16
+    # Largest curvature: a net does not bend with a radius below half a metre.
+    strongest = 2.0
+    for _ in range(steps):
         for i in range(n):
             weight[i] = 1.0 / (gate[i] * gate[i]) if inside[i] else 0.0
         if np.count_nonzero(inside) < MIN_PIECES or not _solve(
             terms, height, weight, factor, coefficients
         ):
             return False
-        if np.abs(coefficients[3:]).max() > _STRONGEST:
+        if np.abs(coefficients[3:]).max() > strongest:
             return False
         changed = False
         for i in range(n):
@@ -323,7 +320,9 @@ def reweight(
     z, weight = np.empty(n), np.empty(n)
     factor, known, better = np.empty((N, N)), np.eye(N), np.empty(N)
     scale = 1.0
-    for _ in range(_REWEIGHTS):
+    tukey = 4.685  # 95 % efficiency for normal errors
+    reweights = 6
+    for _ in range(reweights):
         for i in range(n):
             off = height[i]
             for k in range(N):
@@ -331,7 +330,7 @@ def reweight(
             z[i] = off / sigma[i]
         scale = max(1.4826 * np.median(np.abs(z[inside])), 0.1)
         for i in range(n):
-            rest = max(1.0 - (z[i] / (_TUKEY * scale)) ** 2, 0.0)
+            rest = max(1.0 - (z[i] / (tukey * scale)) ** 2, 0.0)
             weights[i] = rest * rest if inside[i] else 0.0
             weight[i] = weights[i] / (sigma[i] * sigma[i])
         if not _solve(terms, height, weight, factor, better):
@@ -427,10 +426,7 @@ __all__ = (
 MIN_BEND = 0.003
 """Least bend of a curved net where it is seen, as a share of the range."""
 
-_WIDE_GATE = 3.0
 _HINT = 2.0
-# Errors of strands on a bend are more correlated than on a plane: found on simulated nets.
-_LOOSENED = 1.5
 
 
 def shows_curvature(seen: Observations, weights: FloatArray, plane: Plane) -> bool:
@@ -473,7 +469,8 @@ def fit_patch(
     """
     # Few strands of a coarse net are on the plane, and the others not far from it.
     first = _fit_over(seen, plane, shared, 1.0, min_bend)
-    first = first or _fit_over(seen, plane, shared, _WIDE_GATE, min_bend)
+    wide_gate = 3.0
+    first = first or _fit_over(seen, plane, shared, wide_gate, min_bend)
     return first.fit if first is not None and first.asked_for else None
 
 
@@ -501,7 +498,9 @@ def refit_at_nearest(fit: PatchFit, seen: Observations, shared: SharedError) -> 
     length = float(np.linalg.norm(m))
     again = _fit_over(seen, Plane(m / length, 1.0 / length), shared, inside)
     best = fit if again is None else again.fit
-    return replace(best, covariance=_LOOSENED**2 * best.covariance)
+    # Errors of strands on a bend are more correlated than on a plane: found on simulated nets.
+    loosened = 1.5
+    return replace(best, covariance=loosened**2 * best.covariance)
 
 
 class _Attempt(NamedTuple):

@@ -19,10 +19,6 @@ NORMAL, OFFSET, RIGHT, UP, COEFFICIENTS, PACKED = 0, 3, 4, 7, 10, 16
 SIGMA_CURVATURE, SIGMA_TWIST = 2.0, 0.5
 """Prior standard deviations of the curvatures of nets, in 1/m: radius of a metre, little twist."""
 
-# Newton steps of the search for the nearest point, which must go downhill.
-_FOOT_STEPS = 12
-_MIN_CURVED = 0.05
-
 
 @borrowing_kernel
 def write_flat(normal: FloatArray, offset: float, patch: FloatArray) -> None:
@@ -68,7 +64,10 @@ def write_tangent(patch: FloatArray, m: FloatArray) -> bool:
     """Write m = n/d of the tangent plane at the point nearest to the origin; False without one."""
     a, b, c, p, q, r = patch[10], patch[11], patch[12], patch[13], patch[14], patch[15]
     u, v, h, slope_u, slope_v = 0.0, 0.0, 0.0, 0.0, 0.0
-    for _ in range(_FOOT_STEPS):
+    # Newton steps of the search for the nearest point, which must go downhill.
+    foot_steps = 12
+    min_curved = 0.05
+    for _ in range(foot_steps):
         h = a + b * u + c * v + 0.5 * (p * u * u + r * v * v) + q * u * v
         slope_u, slope_v = b + p * u + q * v, c + q * u + r * v
         # Half the squared distance is (u² + v² + (d + h)²) / 2.
@@ -77,7 +76,7 @@ def write_tangent(patch: FloatArray, m: FloatArray) -> bool:
         uu, vv = 1.0 + slope_u * slope_u + reach * p, 1.0 + slope_v * slope_v + reach * r
         uv = slope_u * slope_v + reach * q
         determinant = uu * vv - uv * uv
-        if determinant <= _MIN_CURVED or uu <= _MIN_CURVED:
+        if determinant <= min_curved or uu <= min_curved:
             return False
         u -= (vv * by_u - uv * by_v) / determinant
         v -= (uu * by_v - uv * by_u) / determinant

@@ -21,9 +21,6 @@ SHARED_ERROR_PX = 0.015
 Optics, sampling and compression move a whole stripe by about this much in a good picture. Residuals
 of single points do not show it, but how well the stripes of one frame make a plane does.
 """
-# By this factor pictures differ in that: standard deviation of its logarithm. Rendered walls have
-# 0.01 to 0.06 px, most where compression is strong.
-_PICTURES_DIFFER = 4.0
 # Squares of the factors that are weighed against each other.
 _SQUARES = 4.0 ** np.linspace(-3.0, 3.0, 13)
 TWINE_SHARE, TWINE_LEVELS = 0.006, 1.2
@@ -358,7 +355,10 @@ def _expected_square(matrix: FloatArray, residual: FloatArray) -> float:
     residual : array, shape (K,)
         The same times their estimate.
     """
-    n_modes, spread = residual.shape[0], 2.0 * np.log(_PICTURES_DIFFER)
+    # By this factor pictures differ in that: standard deviation of its logarithm. Rendered walls
+    # have 0.01 to 0.06 px, most where compression is strong.
+    pictures_differ = 4.0
+    n_modes, spread = residual.shape[0], 2.0 * np.log(pictures_differ)
     lower, solved = np.empty((n_modes, n_modes)), np.empty(n_modes)
     log_weight = np.full(_SQUARES.shape[0], -np.inf)
     for f in range(_SQUARES.shape[0]):

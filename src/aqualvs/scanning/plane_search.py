@@ -40,9 +40,6 @@ _NEIGHBOURHOOD = 8
 _LIGHTEST_SHARE = 0.5
 MIN_FACING = float(np.cos(np.deg2rad(55.0)))
 """Limit of a normal's deviation from the forward axis: others are no target ahead."""
-# Distance of a subsegment from a plane: this share of the range, and this shift of the stripe.
-_GATE_RANGE_SHARE = 0.003
-_GATE_PX = 1.0
 # Gate of a hypothesis before it is refined, and how near the best one it must come for that.
 _WIDE_GATE = 3.0
 _WORTH_REFINING = 0.8
@@ -53,8 +50,11 @@ MAX_TO_SECOND = 3.0
 @inline_kernel
 def squared_gate(per_px: float, offset: float) -> float:
     """Return the square of the largest distance (m) at which a subsegment belongs to a plane."""
-    by_range = _GATE_RANGE_SHARE * offset
-    by_pixel = _GATE_PX * per_px
+    # Distance of a subsegment from a plane: this share of the range, and this shift of the stripe.
+    gate_range_share = 0.003
+    gate_px = 1.0
+    by_range = gate_range_share * offset
+    by_pixel = gate_px * per_px
     return by_range * by_range + by_pixel * by_pixel
 
 

@@ -17,8 +17,6 @@ _MAX_SIGMA_RANGE_SHARE = 0.05
 _MAX_SIGMA_ANGLE = np.deg2rad(5.0)
 MAX_RMS_SHARE = 0.02
 """A plane fits a net or a wall within this share of the range, or it is not a plane."""
-# Tolerance at the edge of the working range for detection noise.
-_RANGE_TOLERANCE = 0.01
 
 
 class Reason(StrEnum):
@@ -202,7 +200,9 @@ def validate(
             f"points do not fix the plane: sigma {1e3 * sigma_range:.0f} mm, "
             f"{np.rad2deg(worst):.1f} deg",
         )
-    if not (1.0 - _RANGE_TOLERANCE) * near <= distance <= (1.0 + _RANGE_TOLERANCE) * far:
+    # Tolerance at the edge of the working range for detection noise.
+    range_tolerance = 0.01
+    if not (1.0 - range_tolerance) * near <= distance <= (1.0 + range_tolerance) * far:
         return Refusal(
             Reason.OUT_OF_RANGE,
             f"range {distance:.3f} m is outside the working range {near:.2f} to {far:.2f} m",

@@ -52,10 +52,6 @@ from aqualvs.scanning.posture import MAX_RMS_SHARE, Posture, Reason, Refusal, po
 from aqualvs.scanning.region_growing import SOME, grow_region, has_much_beside
 from aqualvs.scanning.surfaces import Surface
 
-# Reach of a crossing: this many full widths of the stripes, and this many pixels more.
-_CROSSING_WIDTHS = 1.2
-_CROSSING_PX = 2.0
-
 
 @kernel
 def select_units(
@@ -160,6 +156,9 @@ def in_crossing(
     """Return whether another laser's stripe crosses the target here (paper, section 3.1)."""
     x, y, z = points[i, 0], points[i, 1], points[i, 2]
     m_per_px = np.sqrt(x * x + y * y + z * z) / focal_px
+    # Reach of a crossing: this many full widths of the stripes, and this many pixels more.
+    crossing_widths = 1.2
+    crossing_px = 2.0
     for b in range(planes.shape[0]):
         if b == own or mean_width[b] < 0.0:
             continue
@@ -167,7 +166,7 @@ def in_crossing(
         if bent is not None:
             gap = sheet_distance(bent[b], x, y, z)
         wide = max(mean_width[b], mean_width[own])
-        if abs(gap) < (_CROSSING_WIDTHS * wide + _CROSSING_PX) * m_per_px:
+        if abs(gap) < (crossing_widths * wide + crossing_px) * m_per_px:
             return True
     return False
 
@@ -206,8 +205,6 @@ _BESIDE_SHARE, _FOLDED_STRANDS, _FOLDED_INTENSITY = 0.06, 0.5, 0.47
 # Square of the distance between two postures, over the covariance of the one: its expected value if
 # only chance parts them, and what chance exceeds once in 1000 times (chi-squared, 3 values).
 _EXPECTED, _CONTRADICTS = 3.0, 16.27
-# The light about a mean plane is selected at most this many times more.
-_MAX_SELECTIONS = 5
 # Independent pieces of stripe that the second best laser must show.
 _MIN_OBSERVATIONS = 3
 
@@ -475,7 +472,9 @@ class PostureEstimator:
         about the mean plane until it holds the same pieces.
         """
         off = np.empty(len(candidates))
-        for _ in range(_MAX_SELECTIONS):
+        # The light about a mean plane is selected at most this many times more.
+        max_selections = 5
+        for _ in range(max_selections):
             if mean is None or not isinstance(mean.posture, Posture):
                 break
             plane = Plane(mean.posture.normal_in_dome, mean.posture.range)

@@ -17,11 +17,6 @@ from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import kernel
 from aqualvs.scanning.net_surfaces import LONGEST_INTERVAL
 
-# Largest distance of light on the target: a share of the range, and pixels.
-_NEAR_SHARE = 0.010
-_NEAR_PX = 2.0
-# Share of a piece that must be near.
-_MOST = 0.5
 # Limits of light on a plane, and of light beside it, as shares of the range.
 _ON_IT, _BESIDE = 0.008, 0.04
 MUCH, SOME = 0.85, 0.5
@@ -75,7 +70,10 @@ def recruit_candidates(
     n = points.shape[0]
     near = np.zeros(n, np.bool_)
     n_near, n_all = np.zeros(n_subsegments), np.zeros(n_subsegments)
-    by_range = _NEAR_SHARE * patch[3]
+    # Largest distance of light on the target: a share of the range, and pixels.
+    near_share = 0.010
+    near_px = 2.0
+    by_range = near_share * patch[3]
     for i in range(n):
         off = -patch[3]
         per_px = 0.0
@@ -88,13 +86,15 @@ def recruit_candidates(
             v += patch[7 + k] * points[i, k]
         off -= patch[10] + patch[11] * u + patch[12] * v
         off -= 0.5 * (patch[13] * u * u + patch[15] * v * v) + patch[14] * u * v
-        by_pixel = _NEAR_PX * per_px
+        by_pixel = near_px * per_px
         near[i] = off * off < by_range * by_range + by_pixel * by_pixel
         n_all[subsegment_index[i]] += 1.0
         n_near[subsegment_index[i]] += near[i]
+    # Share of a piece that must be near.
+    most = 0.5
     for i in range(n):
         c = subsegment_index[i]
-        if near[i] and n_near[c] >= _MOST * n_all[c] and (other[i] or not taken[i]):
+        if near[i] and n_near[c] >= most * n_all[c] and (other[i] or not taken[i]):
             on_target[i] = True
 
 
@@ -107,22 +107,8 @@ _STEEPEST = 1.2
 _LOOSE_SHARE = 0.006
 # A single strand is accepted within this share of the range; farther off only as part of a flank.
 _LONELY_SHARE = 0.015
-# Least number of strands of a fold beyond that share, of all lasers.
-_MIN_STRANDS = 6
-# Largest distance to the next strand: a share of the range, and in usual distances.
-_FARTHEST_SHARE, _FARTHEST_GAP = 0.15, 2.5
-# A net strays from its plane by at most this share of the range.
-_DEEPEST_SHARE = 0.2
-# Number of preceding components that are compared, so that the cost does not grow with clutter.
-_LOOK_BACK = 16
 # A strand continues one of this many last strands on the net.
 _MAX_TRIED = 2
-# Least lines of a strand, less is a speck; and its least brightness as a share of the net's light.
-_SPECK_LINES = 3
-_DIMMEST = 0.6
-# In a fold the plane itself has no strands: least gap in usual distances, or half of that where the
-# net's last strand is on one side only.
-_FOLD_GAP = 1.7
 
 
 @kernel
@@ -171,7 +157,9 @@ def grow_region(
     _describe(points, line, laser, component, confidence, source, height, on_net, taken, facts)
     order, dimmest = _listed(facts, distance)
     usual = _drop_between(order, facts)
-    farthest = min(_FARTHEST_SHARE * distance, _FARTHEST_GAP * usual * m_per_line)
+    # Largest distance to the next strand: a share of the range, and in usual distances.
+    farthest_share, farthest_gap = 0.15, 2.5
+    farthest = min(farthest_share * distance, farthest_gap * usual * m_per_line)
     cost = np.full(n_components, np.inf)
     for way in (1, -1):
         _sweep(order, way, facts, distance, m_per_line, farthest, dimmest, cost)
@@ -224,20 +212,26 @@ def _listed(facts: FloatArray, distance: float) -> tuple[IntArray, float]:
     key = np.full(n, np.inf)
     total = 0.0
     n_seeds, n_listed = 0, 0
+    # A net strays from its plane by at most this share of the range.
+    deepest_share = 0.2
+    # Least lines of a strand, less is a speck; and its least brightness as a share of the net's
+    # light.
+    speck_lines = 3
+    dimmest = 0.6
     for s in range(n):
-        if facts[LINES, s] < _SPECK_LINES:
+        if facts[LINES, s] < speck_lines:
             continue
         seed = facts[ON_NET, s] >= 0.5
         if seed:
             total += facts[CONFIDENCE, s]
             n_seeds += 1
         short = facts[SIZE, s] < LONGEST_INTERVAL
-        near = abs(facts[HEIGHT, s]) < _DEEPEST_SHARE * distance
+        near = abs(facts[HEIGHT, s]) < deepest_share * distance
         loose = facts[TAKEN, s] < 0.5 and facts[ON_NET, s] == 0.0
         if seed or (short and near and loose):
             key[s] = facts[LASER, s] * 1e6 + facts[LINE, s]
             n_listed += 1
-    return np.argsort(key)[:n_listed], _DIMMEST * total / max(n_seeds, 1)
+    return np.argsort(key)[:n_listed], dimmest * total / max(n_seeds, 1)
 
 
 @kernel
@@ -246,7 +240,9 @@ def _drop_few(height: FloatArray, lonely: float, cost: FloatArray) -> None:
     n_far = 0
     for s in range(cost.shape[0]):
         n_far += cost[s] < np.inf and abs(height[s]) >= lonely
-    if n_far < _MIN_STRANDS:
+    # Least number of strands of a fold beyond that share, of all lasers.
+    min_strands = 6
+    if n_far < min_strands:
         for s in range(cost.shape[0]):
             if abs(height[s]) >= lonely:
                 cost[s] = np.inf
@@ -278,13 +274,16 @@ def _drop_between(order: IntArray, facts: FloatArray) -> float:
     if n_gaps == 0:
         return np.inf
     usual = float(np.median(gaps[:n_gaps]))
+    # In a fold the plane itself has no strands: least gap in usual distances, or half of that where
+    # the net's last strand is on one side only.
+    fold_gap = 1.7
     for at in range(n):
         s = order[at]
         if facts[ON_NET, s] > 0.0:
             continue
         both = after[at] - before[at]
         one = abs(facts[LINE, s] - (before[at] if after[at] != after[at] else after[at]))
-        wide = both > _FOLD_GAP * usual if both == both else one > 0.5 * _FOLD_GAP * usual
+        wide = both > fold_gap * usual if both == both else one > 0.5 * fold_gap * usual
         if not wide:
             facts[CONFIDENCE, s] = 0.0
     return usual
@@ -310,6 +309,8 @@ def _sweep(
     reached, parent = np.full(n_components, np.inf), np.full(n_components, -1)
     has_next = np.zeros(n_components, np.bool_)
     loose = _LOOSE_SHARE * distance
+    # Number of preceding components that are compared, so that the cost does not grow with clutter.
+    look_back = 16
     for at in range(n):
         s = order[at] if way > 0 else order[n - 1 - at]
         if facts[ON_NET, s] > 0.0:
@@ -318,7 +319,7 @@ def _sweep(
         if facts[CONFIDENCE, s] < dimmest:
             continue
         tried = 0
-        for back in range(at - 1, max(at - 1 - _LOOK_BACK, -1), -1):
+        for back in range(at - 1, max(at - 1 - look_back, -1), -1):
             p = order[back] if way > 0 else order[n - 1 - back]
             if facts[LASER, p] != facts[LASER, s]:
                 break

@@ -34,11 +34,6 @@ _REACH_S = 0.25
 # rates of range, pitch and yaw (m/s, rad/s), and of their changes (m/s², rad/s²).
 _RATES = np.array([0.3, np.deg2rad(20.0), np.deg2rad(20.0)])
 _ACCELERATIONS = np.array([0.5, np.deg2rad(40.0), np.deg2rad(40.0)])
-# A frame whose squared Mahalanobis distance is larger (once in 1000 times by chance, 3 values)
-# shows another surface, or is wrong.
-_GATE = 16.27
-# Of the fit of the rates to one frame, as in `plane_fit`.
-_TUKEY, _ITERATIONS = 4.685, 3
 # Some of the points are enough for it. They share the errors of their stripe: all together they
 # count as fewer still, so that a rate of which one frame tells little, such as that of the range,
 # stays near zero.
@@ -207,12 +202,14 @@ def _fit_rates(
     prior, both = np.zeros((6, 6)), np.concatenate([m, np.zeros(3)])
     scaled = _by_m(m) / _RATES[:, None]
     prior[3:, 3:] = scaled.T @ scaled
-    for _ in range(_ITERATIONS):
+    # Of the fit of the rates to one frame, as in `plane_fit`.
+    tukey, iterations = 4.685, 3
+    for _ in range(iterations):
         z = (terms @ both - 1.0) / sigma
         # NumPy's median takes several times as long.
         middle = float(np.partition(np.abs(z), len(z) // 2)[len(z) // 2])
         scale = max(1.4826 * middle, 0.1)
-        weights = (np.maximum(1.0 - (z / (_TUKEY * scale)) ** 2, 0.0) / (sigma * scale)) ** 2
+        weights = (np.maximum(1.0 - (z / (tukey * scale)) ** 2, 0.0) / (sigma * scale)) ** 2
         weighted = terms.T * (weights * min(_INDEPENDENT / len(points), 1.0))
         both = np.linalg.solve(weighted @ terms + prior, weighted.sum(axis=1))
     return both[:3], both[3:]
@@ -235,6 +232,9 @@ def rates_beside(scan: Scan, beside: Sequence[Scan]) -> tuple[FloatArray, FloatA
     matrix, right = np.zeros((9, 9)), np.zeros(9)
     prior = np.concatenate([_RATES, _ACCELERATIONS]) ** -2.0
     matrix[range(3, 9), range(3, 9)] = prior
+    # A frame whose squared Mahalanobis distance is larger (once in 1000 times by chance, 3 values)
+    # shows another surface, or is wrong.
+    gate = 16.27
     for one in (scan, *beside):
         found, t = one.posture, one.time_s - scan.time_s
         if not isinstance(found, Posture) or found.by_rates is None or abs(t) > _REACH_S:
@@ -246,7 +246,7 @@ def rates_beside(scan: Scan, beside: Sequence[Scan]) -> tuple[FloatArray, FloatA
         by_motion = by[:, 3:].copy()
         by_motion[:, :3] -= posture.by_rates
         expected = found.covariance + posture.covariance + (by_motion / prior) @ by_motion.T
-        if one is not scan and off @ np.linalg.solve(expected, off) > _GATE:
+        if one is not scan and off @ np.linalg.solve(expected, off) > gate:
             continue
         weighed = by.T @ np.linalg.inv(found.covariance)
         matrix += weighed @ by

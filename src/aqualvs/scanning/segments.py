@@ -25,11 +25,6 @@ from aqualvs.scanning.stripe import StripePeaks
 
 # Least height of a bend over its chord, beyond errors of the lens.
 _MIN_SAGITTA_PX = 1.0
-# Largest residual of a smooth bend: a floor, and a share of its height. A corner leaves more.
-_ROUGH_PX = 0.3
-_ROUGH_SHARE = 0.05
-# A bend of this height lies beyond the gate for planes.
-_CURVED_PX = 2.0
 # Shorter pieces are as short as the light on a strand and have no distinctive shape.
 _MIN_LINES = 16
 # A spot is as long as it is wide within these factors, and no larger than that.
@@ -93,7 +88,10 @@ class ComponentShapes(NamedTuple):
 def is_bent(shapes: ComponentShapes, s: int) -> bool:
     """Return whether component s is bent smoothly, as the flank of a fish."""
     sagitta_px = shapes.sagitta_px[s]
-    smooth = shapes.rough_px[s] < _ROUGH_PX + _ROUGH_SHARE * sagitta_px
+    # Largest residual of a smooth bend: a floor, and a share of its height. A corner leaves more.
+    rough_px = 0.3
+    rough_share = 0.05
+    smooth = shapes.rough_px[s] < rough_px + rough_share * sagitta_px
     bent = sagitta_px > _MIN_SAGITTA_PX and smooth
     return bool(shapes.n_lines[s] >= _MIN_LINES and bent)
 
@@ -101,7 +99,9 @@ def is_bent(shapes: ComponentShapes, s: int) -> bool:
 @inline_borrowing_kernel
 def is_curved(shapes: ComponentShapes, s: int) -> bool:
     """Return whether component s is not straight for any reason, so not on a plane."""
-    return bool(shapes.n_lines[s] >= _MIN_LINES and shapes.sagitta_px[s] > _CURVED_PX)
+    # A bend of this height lies beyond the gate for planes.
+    curved_px = 2.0
+    return bool(shapes.n_lines[s] >= _MIN_LINES and shapes.sagitta_px[s] > curved_px)
 
 
 @inline_borrowing_kernel
@@ -301,22 +301,12 @@ def _add_powers(
     sums[_SQUARES] += squares
 
 
-# Beyond any position on a search line.
-_ANYWHERE = 1 << 40
-
 SUBSEGMENT_LINES = 16
 """A long segment is cut into subsegments of at most this many peaks."""
 
 # A gap of one search line does not end a segment: H.264 and specks make such gaps.
 _MAX_LINE_STEP = 2
 _LINK_GATE_PX = 2.0
-# Segments shorter than this follow the strand; longer ones must follow the stripe.
-_LONG_SEGMENT = 24
-# A segment that begins this near to another one's end belongs to the same component.
-_JOIN_LINES = 4
-_JOIN_PX = 4.0
-# Tolerance of a segment's direction beyond the bounds for a plane target; covers curvature.
-_SLOPE_MARGIN = 0.15
 
 
 @dataclass(frozen=True, slots=True)
@@ -380,7 +370,9 @@ def in_a_row(line: IntArray, position: FloatArray) -> BoolArray:
     n_lines = line[n - 1] + 1 if n else 0
     segment_of = np.empty(n, np.int64)
     first, last, count = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, np.int64)
-    lowest, highest = np.full(n_lines, -_ANYWHERE), np.full(n_lines, _ANYWHERE)
+    # Beyond any position on a search line.
+    anywhere = 1 << 40
+    lowest, highest = np.full(n_lines, -anywhere), np.full(n_lines, anywhere)
     _link(line, position, lowest, highest, segment_of, first, last, count)
     long = np.empty(n, np.bool_)
     for i in range(n):
@@ -519,9 +511,11 @@ def _drop_foreign(
     """Keep the segments whose direction is possible, and count them; number their subsegments."""
     order, subsegment = numbers[0], numbers[2]
     n, n_subsegments, n_kept = 0, 0, 0
+    # Segments shorter than this follow the strand; longer ones must follow the stripe.
+    long_segment = 24
     for s in range(start.shape[0] - 1):
         begin, size = start[s], start[s + 1] - start[s]
-        if size >= _LONG_SEGMENT:
+        if size >= long_segment:
             members = order[begin : begin + size]
             if not _direction_possible(line, position, members, slope_low, slope_high):
                 continue
@@ -568,8 +562,10 @@ def _direction_possible(
     slope = product / spread
     row = int(mean_position) // SLOPE_CELL
     column = int(mean_line) // SLOPE_CELL
-    low = slope_low[row, column] - _SLOPE_MARGIN
-    high = slope_high[row, column] + _SLOPE_MARGIN
+    # Tolerance of a segment's direction beyond the bounds for a plane target; covers curvature.
+    slope_margin = 0.15
+    low = slope_low[row, column] - slope_margin
+    high = slope_high[row, column] + slope_margin
     return bool(low <= slope <= high)
 
 
@@ -581,11 +577,14 @@ def _join(line: IntArray, position: FloatArray, first: IntArray, last: IntArray)
     """
     n = first.shape[0]
     root = np.arange(n)
+    # A segment that begins this near to another one's end belongs to the same component.
+    join_lines = 4
+    join_px = 4.0
     for a in range(n):
         end, place = line[last[a]], position[last[a]]
-        b = _first_from(line, first, end - _JOIN_LINES)
-        while b < n and line[first[b]] <= end + _JOIN_LINES:
-            if a != b and abs(position[first[b]] - place) <= _JOIN_PX:
+        b = _first_from(line, first, end - join_lines)
+        while b < n and line[first[b]] <= end + join_lines:
+            if a != b and abs(position[first[b]] - place) <= join_px:
                 one, other = _root_of(root, a), _root_of(root, b)
                 root[max(one, other)] = min(one, other)
             b += 1

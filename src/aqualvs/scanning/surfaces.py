@@ -122,11 +122,6 @@ WORTH_SHARE = 0.08
 LINES, INLIER_WEIGHT, SAMPLING_WEIGHT = range(3)
 """Sums over a surface: search lines on it, light, and sampling weight."""
 
-_MIN_SUBSEGMENTS = 6
-_MIN_LINES = 30
-# Planes through noise hold up to a hundredth of the light in the frame, all candidates counted.
-_MIN_SHARE = 0.03
-
 
 @kernel
 def search_surfaces(
@@ -168,11 +163,15 @@ def search_surfaces(
     free = np.ones(laser.shape[0], np.bool_)
     cell = np.empty(pixels.shape[0], np.int64)
     n_cells, n_columns = 0, 0
-    enough = float(_MIN_LINES)
+    min_lines = 30
+    enough = float(min_lines)
     by_laser = np.empty((3, n_lasers))
+    min_subsegments = 6
+    # Planes through noise hold up to a hundredth of the light in the frame, all candidates counted.
+    min_share = 0.03
     for found in range(MAX_SURFACES):
         rows = np.flatnonzero(free)
-        if sum_of(n_lines[rows]) < enough or rows.shape[0] < _MIN_SUBSEGMENTS:
+        if sum_of(n_lines[rows]) < enough or rows.shape[0] < min_subsegments:
             return found
         if not _find_plane(table, laser, rows, n_lasers, nearest, farthest, found, planes[found]):
             return found
@@ -181,9 +180,9 @@ def search_surfaces(
         n = _collect(table, rows, planes[found], n_lines, intensity_weight, laser, mine, by_laser)
         supporting = np.count_nonzero(by_laser[LINES] >= MIN_LINES_PER_LASER)
         sums[found, LINES] = sum_of(by_laser[LINES])
-        if n < _MIN_SUBSEGMENTS or supporting < 2 or sums[found, LINES] < _MIN_LINES:
+        if n < min_subsegments or supporting < 2 or sums[found, LINES] < min_lines:
             return found
-        if sum_of(by_laser[INLIER_WEIGHT]) < _MIN_SHARE * sum_of(intensity_weight):
+        if sum_of(by_laser[INLIER_WEIGHT]) < min_share * sum_of(intensity_weight):
             return found
         sums[found, INLIER_WEIGHT] = on_two(by_laser[INLIER_WEIGHT])
         sums[found, SAMPLING_WEIGHT] = on_two(by_laser[SAMPLING_WEIGHT])
@@ -323,10 +322,6 @@ __all__ = (
     "surface_on",
 )
 
-# Least share of a net's light on strands; that of a fish lies in long or bent components.
-_STRANDS_SHARE = 0.4
-# A wall's shadows reach nearly as far as the net that casts them.
-_EXTENT_SHARE = 0.6
 # With more of its search lines on another surface it is a part of that one.
 _SHARED = 0.5
 
@@ -470,8 +465,10 @@ def _describe(
     """Make a surface from a plane and its subsegments."""
     lines, inlier_weight, sampling_weight = sums.tolist()
     pattern = describe_pattern(subsegments, members, n_lasers, MIN_LINES_PER_LASER, focal_px)
+    # Least share of a net's light on strands; that of a fish lies in long or bent components.
+    strands_share = 0.4
     # Strands near the vehicle are long in search lines, and still short.
-    on_strands = max(sampling_weight, on_two(pattern.on_strands)) > _STRANDS_SHARE * inlier_weight
+    on_strands = max(sampling_weight, on_two(pattern.on_strands)) > strands_share * inlier_weight
     return Surface(
         plane=Plane(plane[:3], float(plane[3])),
         members=members,
@@ -528,19 +525,18 @@ def _is_dense_net(surface: Surface, surfaces: list[Surface], subsegments: Subseg
 
     A net that is near may fill most of the stripes; it then has more light than what it shadows.
     """
+    # A wall's shadows reach nearly as far as the net that casts them.
+    extent_share = 0.6
     return not surface.is_mesh and any(
         other.is_gappy
         and (surface.is_gappy or surface.inlier_weight > other.inlier_weight)
         and other.plane.offset > surface.plane.offset
-        and other.extent >= _EXTENT_SHARE * surface.extent
+        and other.extent >= extent_share * surface.extent
         and seen_through(surface.members, other.members, subsegments)
         for other in surfaces
     )
 
 
-# Specks that share a plane by chance have less than these shares of the search lines of the surface
-# that has most, and of the extent of the one that reaches farthest; a sparse net reaches far.
-_LINES_SHARE, _REACH_SHARE = 0.1, 0.5
 # A mesh reaches far with this share of the widest mesh's extent.
 _WIDE_SHARE = 0.75
 # And it is well supported with this share of the best one's support.
@@ -591,12 +587,16 @@ def choose_target(
     lines = max((surface.n_lines for surface in surfaces), default=0)
     # Unbroken stripes have no extent; their number of search lines serves as one.
     reach = max((max(surface.extent, surface.n_lines) for surface in surfaces), default=0.0)
+    # Specks that share a plane by chance have less than these shares of the search lines of the
+    # surface that has most, and of the extent of the one that reaches farthest; a sparse net
+    # reaches far.
+    lines_share, reach_share = 0.1, 0.5
     meshes = [
         one
         for one in surfaces
         if one.is_mesh
         and one.sampling_weight >= WORTH_SHARE * most
-        and (one.n_lines >= _LINES_SHARE * lines or one.extent >= _REACH_SHARE * reach)
+        and (one.n_lines >= lines_share * lines or one.extent >= reach_share * reach)
     ]
     solids = [one for one in surfaces if not one.is_mesh]
     solid = max(solids, key=lambda surface: surface.inlier_weight, default=None)

@@ -203,12 +203,8 @@ def _belongs(blocks: _Blocks, place: int, near: IntArray, n_near: int, limits: L
 
 
 _FORWARD, _UP = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])
-# A forward axis whose projection into the laser plane is shorter has no direction worth following.
-_DEGENERATE = 1e-6
 # Lengths that are whole numbers of cells must not fall beside them by a rounding.
 _ROUNDING = 1e-9
-# Farther than any laser reaches, near enough for cells to be whole numbers.
-_FARTHEST = 1e6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -327,7 +323,10 @@ def laser_frame(plane: Plane) -> SE3:
         have z = 0 in `laser`.
     """
     e_z = plane.normal
-    square_to_forward = math.hypot(e_z[0], e_z[2]) < _DEGENERATE
+    # A forward axis whose projection into the laser plane is shorter has no direction worth
+    # following.
+    degenerate = 1e-6
+    square_to_forward = math.hypot(e_z[0], e_z[2]) < degenerate
     e_y = _in_plane(_UP if square_to_forward else _FORWARD, e_z)
     rotation = np.stack([np.cross(e_y, e_z), e_y, e_z])
     return SE3(rotation, np.array([0.0, 0.0, -plane.offset]))
@@ -490,9 +489,11 @@ def _usable_in_laser(
     in_laser = as_vectors(array, 2, "points") if array.shape[1] == 2 else _flatten(array, plane)
     with np.errstate(invalid="ignore", over="ignore"):
         distance = np.sqrt(in_laser[:, 0] ** 2 + in_laser[:, 1] ** 2 + plane.offset**2)
-    near, far = (0.0, _FARTHEST) if working_range is None else working_range
+    # Farther than any laser reaches, near enough for cells to be whole numbers.
+    farthest = 1e6
+    near, far = (0.0, farthest) if working_range is None else working_range
     # Comparisons with NaN are false, so points that do not exist are not usable.
-    usable: BoolArray = (distance >= near) & (distance <= min(far, _FARTHEST))
+    usable: BoolArray = (distance >= near) & (distance <= min(far, farthest))
     return in_laser, usable
 
 
