@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, settings
 from repository import ROOT
 
 # Files and folders of the longest tests, the longest first. The second has other kernels compiled
-# than its neighbours: processes that want the same ones wait for each other.
+# than its neighbours.
 LONG = (
     "cli/test_batch.py",
     "recovery/test_closed_loop.py",
@@ -64,4 +64,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def pytest_collection_finish() -> None:
     """Free memory as usual from here, without searching what was collected again and again."""
     gc.freeze()
+    # As the command line does it.
+    gc.set_threshold(50_000, 20, 50)
     gc.enable()

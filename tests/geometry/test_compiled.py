@@ -6,7 +6,6 @@ import sys
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from aqualvs.geometry.compiled import inline_kernel, kernel
 
@@ -149,45 +148,3 @@ def test_code_on_disk_for_a_class_that_is_gone_is_compiled_anew(tmp_path: Path) 
         (tmp_path / "pair.py").write_text(PAIR.format(name=name))
         assert run_caller(tmp_path, "of_pair.py") == ["1.0"]
     assert list((tmp_path / "cache").rglob("of_pair.half*.nbi"))
-
-
-SLOW = """
-import sys
-import time
-from pathlib import Path
-from aqualvs.geometry.compiled import kernel
-
-@kernel
-def half(x):
-    return 0.5 * x
-
-usual = half._compiler.compile
-
-def slowly(*arguments):
-    Path("compiling").touch()
-    while not Path("wanted").exists():
-        time.sleep(0.01)
-    # The other process has come to its call, and would have begun to compile.
-    time.sleep(0.5)
-    return usual(*arguments)
-
-half._compiler.compile = slowly
-if not sys.argv[1:]:
-    while not Path("compiling").exists():
-        time.sleep(0.01)
-    Path("wanted").touch()
-half(2.0)
-print(sum(half.stats.cache_hits.values()))
-"""
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="has no such locks")
-def test_a_kernel_that_another_process_compiles_is_waited_for(tmp_path: Path) -> None:
-    (tmp_path / "slow.py").write_text(SLOW)
-    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
-    command = [sys.executable, "slow.py"]
-    with subprocess.Popen(
-        [*command, "first"], cwd=tmp_path, env=environment, stdout=subprocess.PIPE, text=True
-    ) as first:
-        assert run_caller(tmp_path, "slow.py") == ["1"]
-        assert first.communicate()[0] == "0\n"

@@ -275,6 +275,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         0, or 2 for bad input, or 128 + signal for a run that was stopped; 141 where all went well
         but nobody read the output to its end.
     """
+    if arguments is None:
+        # To compile a kernel makes many objects and little garbage. With Python's thresholds, the
+        # search for it takes a tenth of a first run.
+        gc.set_threshold(50_000, 20, 50)
     with lenient_output() as output:
         code = _exit_code(arguments)
     code = _complete(code, output, ends=arguments is None)

@@ -6,11 +6,8 @@ arrays lie in memory, and on which of its callers a kernel was compiled for: a d
 several machines, or by several processes, would not equal the same dive measured by one.
 """
 
-import threading
-import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
-from typing import Any, BinaryIO, TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import numba
 import numpy as np
@@ -20,19 +17,6 @@ from numba.extending import overload
 _LOADS_LIGHTLY = numba.__version__.startswith("0.68.")
 if _LOADS_LIGHTLY:
     from aqualvs.geometry.kernel_loading import load_lightly
-
-try:
-    import fcntl
-except ImportError:
-    # Windows: every process compiles for itself.
-    fcntl = None  # type: ignore[assignment]
-
-_THREADS = threading.RLock()
-# Files on whose kernels this process holds the lock.
-_held: set[str] = set()
-# Longer than a module takes to compile on a busy machine; a process may have been stopped.
-_PATIENCE_S = 120.0
-_POLL_S = 0.02
 
 ZERO = cast(int, np.int64(0))
 """Initial value of a count that kernels pass on and get back; they would be compiled once more for
@@ -93,74 +77,7 @@ def _compiled(function: F, **options: object) -> F:
     _depend_on_callees(compiled, function, repr(sorted(options.items())))
     if _LOADS_LIGHTLY:
         load_lightly(compiled)
-    _one_at_a_time(compiled, function.__code__.co_filename)
     return cast(F, compiled)
-
-
-def _one_at_a_time(compiled: Any, file: str) -> None:
-    """Have processes that want the same kernel wait for the one that compiles it.
-
-    On a machine that has compiled nothing, the processes of a run or a batch want the same kernels
-    at the same moment; whoever waited loads the machine code from disk. What is there already is
-    loaded without waiting.
-    """
-    compile_for, load = compiled.compile, compiled._cache.load_overload
-    under_way: list[ExitStack] = []
-
-    def compile_alone(signature: Any) -> Any:
-        # A kernel's callees are compiled meanwhile. The order of locks is that of calls: kernels,
-        # threads included, cannot wait for each other.
-        with _THREADS, ExitStack() as locks:
-            under_way.append(locks)
-            try:
-                return compile_for(signature)
-            finally:
-                under_way.pop()
-
-    def load_or_wait(signature: Any, target: Any) -> Any:
-        found = load(signature, target)
-        if found is None and under_way:
-            under_way[-1].enter_context(_lock_of(file))
-            found = load(signature, target)
-        return found
-
-    compiled.compile, compiled._cache.load_overload = compile_alone, load_or_wait
-
-
-@contextmanager
-def _lock_of(file: str) -> Iterator[None]:
-    """Hold the lock on a module's kernels among processes, where there are such locks."""
-    if fcntl is None or file in _held:
-        yield
-        return
-    with ExitStack() as stack:
-        try:
-            source = stack.enter_context(open(file, "rb"))
-        except OSError:
-            source = None
-        if source is not None and _is_locked(source):
-            _held.add(file)
-            stack.callback(_held.discard, file)
-        yield
-
-
-def _is_locked(source: BinaryIO) -> bool:
-    """Wait for the lock on an open file; give up on what holds it for longer than compiling takes.
-
-    Closing the file gives the lock back, and so does the end of the process.
-    """
-    until = time.monotonic() + _PATIENCE_S
-    while time.monotonic() < until:
-        try:
-            fcntl.flock(source, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            time.sleep(_POLL_S)
-        except OSError:
-            # A file system without locks.
-            return False
-        else:
-            return True
-    return False
 
 
 def _depend_on_callees(compiled: Any, function: Callable[..., Any], options: str) -> None:
