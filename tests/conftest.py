@@ -9,9 +9,12 @@ from hypothesis import HealthCheck, settings
 
 from repository import ROOT
 
-# Files and folders of the longest tests, the longest first. The second has other kernels compiled
-# than its neighbours.
+# Files and folders in the order in which they begin, before all others. The first has the kernels
+# of a frame compiled, once for all, while its neighbours need others; then the longest tests.
 LONG = (
+    "test_scanner.py",
+    "calibration",
+    "control",
     "cli/test_batch.py",
     "recovery/test_closed_loop.py",
     "recovery/test_real_light.py",
