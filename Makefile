@@ -24,6 +24,8 @@ PARTS := $(filter-out helpers data,$(patsubst tests/%/,%,$(wildcard tests/*/))) 
   $(patsubst tests/test_%.py,%,$(wildcard tests/test_*.py))
 FILES = $(wildcard tests/$(PART)/test_*.py tests/$(PART)/*/test_*.py tests/test_$(PART).py)
 
+# Without byte code on disk each of some hundred processes would compile the package again.
+test: export PYTHONDONTWRITEBYTECODE :=
 test: $(STAMP) ## Run all tests, three files at a time (JOBS=3), or those of one part (PART=scanning)
 	$(if $(PART),$(if $(FILES),,$(error no tests of `$(PART)`; parts are: $(sort $(PARTS)))))
 	$(BIN)/python -m pytest --numprocesses=$(or $(JOBS),3) --dist=loadfile --no-loadscope-reorder \
