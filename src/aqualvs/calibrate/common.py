@@ -26,6 +26,7 @@ from aqualvs.optics.rig import Laser, Rig, RigUncertainty
 from aqualvs.optics.rigfile import keep_dated, load_rig, save_rig
 from aqualvs.optics.rigschema import LaserWavelength
 from aqualvs.optics.shutter import AT_ONCE, Shutter
+from aqualvs.optics.water import N_AIR
 from aqualvs.report.calibration_material import ResidualMap, ViewRow, missed_rows, residual_map
 from aqualvs.report.calibration_page import CalibrationPage, write_page
 from aqualvs.results.files import writing
@@ -69,7 +70,7 @@ class Nominal:
     name: str = "rig"
     size_px: tuple[int, int] | None = None
     housing: Housing | None = None
-    n_air: float = 1.0003
+    n_air: float = N_AIR
     n_water: float = WATER_N
     n_lasers: int | None = None
     wavelength_nm: float | None = None
@@ -108,7 +109,7 @@ class _File(_Part):
     image: _Image | None = None
     dome: _Dome | None = None
     flat: _Flat | None = None
-    n_air: _Index = 1.0003
+    n_air: _Index = N_AIR
     lasers: _Lasers | None = None
     fps: _Positive | None = None
 

@@ -19,6 +19,7 @@ from aqualvs.optics.flat_port import FlatPort
 from aqualvs.optics.lens import Lens, LensModel
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig
 from aqualvs.optics.rigfile import rig_from_mapping, rig_to_mapping
+from aqualvs.optics.water import N_AIR
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,7 +136,6 @@ def rig_of_camera(
         )
     port, turn = camera.port, DOME_FROM_CAM_NOMINAL
     lens_in_dome = np.zeros(3) if port is None else -(turn @ port.centre) + 0.0
-    n_air = 1.0003
     working_range_m = (0.25, 1.3)
     rig = Rig(
         name=camera.name,
@@ -143,8 +143,8 @@ def rig_of_camera(
         lens=camera.lens,
         dome_from_cam=SE3(turn.copy(), lens_in_dome),
         housing=None if port is None else port.housing,
-        n_air=n_air if port is None else port.n_air,
-        n_water=n_air if port is None else port.n_water,
+        n_air=N_AIR if port is None else port.n_air,
+        n_water=N_AIR if port is None else port.n_water,
         lasers=(),
         working_range=working_range_m,
         solved_from=solved_from or {},

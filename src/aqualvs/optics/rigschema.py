@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails
 
 from aqualvs.errors import RigError
+from aqualvs.optics.water import N_AIR
 
 VERSION = 1
 """Version of the format that this package reads and writes."""
@@ -232,7 +233,7 @@ class RigFile(StrictPart):
     ] = None
     dome: Annotated[DomePart | None, _said("Leave it out without a dome.")] = None
     flat: Annotated[FlatPart | None, _said("Leave it out without a flat port.")] = None
-    n_air: Annotated[Index, _said("Index inside the housing, relative to vacuum.")] = 1.0003
+    n_air: Annotated[Index, _said("Index inside the housing, relative to vacuum.")] = N_AIR
     water: Annotated[
         WaterPart | None, _said("What is outside; needed behind a housing, else air.")
     ] = None

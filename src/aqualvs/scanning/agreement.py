@@ -31,6 +31,7 @@ from aqualvs.optics.rig import LASER_PARAMETERS, Rig
 from aqualvs.optics.sheet import Sheet, sheets_of
 from aqualvs.optics.solved import rig_uncertainty
 from aqualvs.scanning.laser_bands import SearchAxis, plan_bands
+from aqualvs.scanning.plane_fit import TUKEY
 from aqualvs.scanning.scan import Scan, ScanPoints
 
 N_BINS = 12
@@ -156,7 +157,6 @@ _PRIOR = np.array([np.deg2rad(1.5), np.deg2rad(1.5), 0.005])
 # Limit of the steps; a laser so far off would not be seen at all.
 _FARTHEST = np.array([0.2, 0.2, 0.05])
 _STEP_PX = 0.25
-_TUKEY = 4.685  # 95 % efficiency for normal errors
 _ITERATIONS, _UNWEIGHTED = 12, 2
 _SMALL, _SETTLED = 1e-5, 1e-3
 _LEAST, _RIDGE = 1e-6, 1e-12
@@ -412,7 +412,7 @@ class _Fit:
     def tukey(self, seen: BoolArray) -> FloatArray:
         """Return Tukey's weights of the residuals."""
         scale = max(1.0, 1.4826 * float(np.median(np.abs(self.z[seen]))))
-        weight: FloatArray = np.maximum(1.0 - (self.z / (_TUKEY * scale)) ** 2, 0.0) ** 2 * seen
+        weight: FloatArray = np.maximum(1.0 - (self.z / (TUKEY * scale)) ** 2, 0.0) ** 2 * seen
         return weight
 
     def effect(self, view: _View, laser: int, step: FloatArray) -> float:

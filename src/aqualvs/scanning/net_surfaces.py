@@ -19,7 +19,7 @@ from aqualvs.geometry.compiled import borrowing_kernel, kernel
 from aqualvs.geometry.linear_algebra import invert_symmetric, solve_symmetric
 from aqualvs.geometry.planes import Plane
 from aqualvs.scanning.candidates import Subsegments
-from aqualvs.scanning.plane_fit import PlaneFit, normal_equations
+from aqualvs.scanning.plane_fit import TUKEY, PlaneFit, normal_equations
 from aqualvs.scanning.plane_search import WEIGHT, X, Z
 from aqualvs.scanning.posture import Posture
 
@@ -176,12 +176,11 @@ def _fit_mean(
     """Refine m in place, write weights and covariance; return the rms, NaN if undetermined."""
     n, one = points.shape[0], np.ones(points.shape[0])
     off, normal, right, inverse = np.empty(n), np.empty((3, 3)), np.empty(3), np.empty((3, 3))
-    tukey = 4.685  # 95 % efficiency for normal errors
     iterations = 5
     exact = 1e-9
     for _ in range(iterations):
         _distances(points, m, off)
-        cut = tukey * 1.4826 * max(np.median(np.abs(off)), exact)
+        cut = TUKEY * 1.4826 * max(np.median(np.abs(off)), exact)
         for i in range(n):
             weights[i] = max(1.0 - (off[i] / cut) ** 2, 0.0) ** 2
         normal_equations(points, one, weights, normal, right)

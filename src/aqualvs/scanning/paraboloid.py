@@ -35,7 +35,7 @@ from aqualvs.scanning.patch import (
     packed_plane,
     tangent_covariance,
 )
-from aqualvs.scanning.plane_fit import SharedError
+from aqualvs.scanning.plane_fit import TUKEY, SharedError, add_error
 
 N = 6
 """Coefficients a, b, c, p, q, r."""
@@ -139,11 +139,10 @@ def _asked_for(
     sigmas = 0.0
     for k in range(3, N):
         sigmas = max(sigmas, abs(coefficients[k]) / np.sqrt(covariance[k, k]))
-    # ... and the curvature is significant.
     significant = 6.0
     if sigmas < significant:
         return False
-    # Curvature is fitted when it gains this share of the light or of the scatter ...
+    # Significant curvature is fitted when it gains this share of the light or of the scatter.
     more_intensity = 1.10
     less_scatter = 0.6
     less = rms < less_scatter * np.sqrt(square / n_inside)
@@ -320,7 +319,6 @@ def reweight(
     z, weight = np.empty(n), np.empty(n)
     factor, known, better = np.empty((N, N)), np.eye(N), np.empty(N)
     scale = 1.0
-    tukey = 4.685  # 95 % efficiency for normal errors
     reweights = 6
     for _ in range(reweights):
         for i in range(n):
@@ -330,7 +328,7 @@ def reweight(
             z[i] = off / sigma[i]
         scale = max(1.4826 * np.median(np.abs(z[inside])), 0.1)
         for i in range(n):
-            rest = max(1.0 - (z[i] / (tukey * scale)) ** 2, 0.0)
+            rest = max(1.0 - (z[i] / (TUKEY * scale)) ** 2, 0.0)
             weights[i] = rest * rest if inside[i] else 0.0
             weight[i] = weights[i] / (sigma[i] * sigma[i])
         if not _solve(terms, height, weight, factor, better):
@@ -388,26 +386,14 @@ def add_shared(
                 for k in range(N):
                     sums[0, k] += shared.own[i] * pull[i] * terms[i, k]
                     sums[1, k] += shared.own[i] * pull[i] * terms[i, k] * along
-        _add_moved(sums[0], inverse, covariance)
-        _add_moved(sums[1], inverse, covariance)
+        add_error(sums[0], inverse, covariance)
+        add_error(sums[1], inverse, covariance)
     for cause in range(shared.common.shape[0]):
         together = np.zeros(N)
         for i in range(laser.shape[0]):
             for k in range(N):
                 together[k] += shared.common[cause, i] * pull[i] * terms[i, k]
-        _add_moved(together, inverse, covariance)
-
-
-@kernel
-def _add_moved(sums: FloatArray, inverse: FloatArray, covariance: FloatArray) -> None:
-    """Add the covariance of one error, given the sums of its pulls (6,)."""
-    moved = np.zeros(N)
-    for j in range(N):
-        for k in range(N):
-            moved[j] += inverse[j, k] * sums[k]
-    for j in range(N):
-        for k in range(N):
-            covariance[j, k] += moved[j] * moved[k]
+        add_error(together, inverse, covariance)
 
 
 __all__ = (

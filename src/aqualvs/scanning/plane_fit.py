@@ -75,7 +75,8 @@ def shared_error(glow: FloatArray, twine: FloatArray | None = None) -> SharedErr
     return SharedError(np.hypot(SHARED_ERROR_PX, twine), np.stack([GLOW_PX * glow, twine]))
 
 
-_TUKEY = 4.685  # 95 % efficiency for normal errors
+TUKEY = 4.685
+"""Cut of Tukey's biweight, in standard deviations: 95 % efficiency for normal errors."""
 _ITERATIONS = 6
 # The stated errors count as much as the scatter of this many observations.
 _STATED_COUNT = 10.0
@@ -236,14 +237,14 @@ def _fit(
         _normalised_residuals(points, sensitivity, sigma_px, m, sigma, z)
         scale = max(1.4826 * np.median(np.abs(z)), 0.1)
         for i in range(n):
-            ratio = z[i] / (_TUKEY * scale)
+            ratio = z[i] / (TUKEY * scale)
             kept = max(1.0 - ratio * ratio, 0.0)
             weights[i] = kept * kept
         normal_equations(points, sigma, weights, normal, right)
         if not solve_symmetric(normal, right, inverse, m):
             return np.nan
     _normalised_residuals(points, sensitivity, sigma_px, m, sigma, z)
-    factor = _huber_factor(z, _TUKEY * scale)
+    factor = _huber_factor(z, TUKEY * scale)
     if factor < 1.0:
         # With few observations, a scatter below the stated errors is chance.
         factor = (_STATED_COUNT + n * factor) / (_STATED_COUNT + n)
@@ -263,7 +264,11 @@ def _fit(
         points, per_px, weight, z, laser, along, shared.own, factor, inverse, covariance
     )
     for k in range(shared.common.shape[0]):
-        _add_error(points, per_px * weight * shared.common[k], inverse, covariance)
+        pull = np.zeros(3)
+        for i in range(n):
+            for j in range(3):
+                pull[j] += per_px[i] * weight[i] * shared.common[k, i] * points[i, j]
+        add_error(pull, inverse, covariance)
     if not np.isfinite(covariance).all():
         return np.nan
     return _weighted_rms(z, weights, m)
@@ -382,19 +387,18 @@ def _expected_square(matrix: FloatArray, residual: FloatArray) -> float:
 
 
 @kernel
-def _add_error(
-    points: FloatArray, weight: FloatArray, inverse: FloatArray, covariance: FloatArray
-) -> None:
-    """Widen by an error of all points together; `weight` is its standard deviation, weighted."""
-    pull, shift = np.zeros(3), np.empty(3)
-    for i in range(points.shape[0]):
-        for k in range(3):
-            pull[k] += weight[i] * points[i, k]
-    for j in range(3):
-        shift[j] = inverse[j, 0] * pull[0] + inverse[j, 1] * pull[1] + inverse[j, 2] * pull[2]
-    for j in range(3):
-        for k in range(3):
-            covariance[j, k] += shift[j] * shift[k]
+def add_error(pull: FloatArray, inverse: FloatArray, covariance: FloatArray) -> None:
+    """Widen a covariance (K, K) by an error of all observations together.
+
+    `pull` (K,) is what its standard deviation adds to the right side of the normal equations.
+    """
+    moved = np.zeros(pull.shape[0])
+    for j in range(pull.shape[0]):
+        for k in range(pull.shape[0]):
+            moved[j] += inverse[j, k] * pull[k]
+    for j in range(pull.shape[0]):
+        for k in range(pull.shape[0]):
+            covariance[j, k] += moved[j] * moved[k]
 
 
 @kernel

@@ -22,6 +22,7 @@ from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.rig_covariance import FittedSurface, posture_by_plane
 from aqualvs.scanning.candidates import Candidates
+from aqualvs.scanning.plane_fit import TUKEY
 from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.scan import Scan
 
@@ -202,14 +203,13 @@ def _fit_rates(
     prior, both = np.zeros((6, 6)), np.concatenate([m, np.zeros(3)])
     scaled = _by_m(m) / _RATES[:, None]
     prior[3:, 3:] = scaled.T @ scaled
-    # Of the fit of the rates to one frame, as in `plane_fit`.
-    tukey, iterations = 4.685, 3
-    for _ in range(iterations):
+    reweights = 3
+    for _ in range(reweights):
         z = (terms @ both - 1.0) / sigma
         # NumPy's median takes several times as long.
         middle = float(np.partition(np.abs(z), len(z) // 2)[len(z) // 2])
         scale = max(1.4826 * middle, 0.1)
-        weights = (np.maximum(1.0 - (z / (tukey * scale)) ** 2, 0.0) / (sigma * scale)) ** 2
+        weights = (np.maximum(1.0 - (z / (TUKEY * scale)) ** 2, 0.0) / (sigma * scale)) ** 2
         weighted = terms.T * (weights * min(_INDEPENDENT / len(points), 1.0))
         both = np.linalg.solve(weighted @ terms + prior, weighted.sum(axis=1))
     return both[:3], both[3:]

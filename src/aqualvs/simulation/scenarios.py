@@ -25,6 +25,7 @@ from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
 from aqualvs.optics.camera import Dome, FlatPort
 from aqualvs.optics.lens import Lens
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Laser, Rig
+from aqualvs.optics.water import N_AIR
 from aqualvs.simulation.scenario import (
     Scenario,
     dome_from_target,
@@ -48,7 +49,7 @@ def example_rig() -> Rig:
         ),
         dome_from_cam=_pose((2.3, 1.7, 0.9), (3.0, 41.5, 3.0)),
         housing=Dome(inner_radius=44.25e-3, thickness=5.75e-3, n_acrylic=1.49),
-        n_air=1.0003,
+        n_air=N_AIR,
         n_water=_N_FRESH_WATER,
         lasers=(
             Laser("lower", Plane.from_normal((-0.020, -0.340, 0.940), -0.143)),
@@ -69,7 +70,7 @@ def bluerov2_rig() -> Rig:
         ),
         dome_from_cam=_pose((0.6, -0.4, 0.2), (0.8, 5.8, -0.6)),
         housing=Dome(inner_radius=51.0e-3, thickness=6.0e-3, n_acrylic=1.49),
-        n_air=1.0003,
+        n_air=N_AIR,
         n_water=_N_FRESH_WATER,
         lasers=(
             Laser("lower", Plane.from_normal((0.015, -0.300, 0.954), -0.150)),

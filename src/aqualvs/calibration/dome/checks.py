@@ -42,6 +42,7 @@ from aqualvs.calibration.solver.least_squares import (
 from aqualvs.errors import CalibrationError, RigError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.optics.rig import RigUncertainty
+from aqualvs.optics.water import N_AIR
 
 
 class _MediumOptions(NamedTuple):
@@ -51,7 +52,7 @@ class _MediumOptions(NamedTuple):
     sure: float = 5.0
     # Between air and water.
     halfway: float = 1.15
-    air: float = 1.0003
+    air: float = N_AIR
     water: float = 1.3335
 
 

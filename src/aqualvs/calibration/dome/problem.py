@@ -46,6 +46,7 @@ from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.transforms import SE3
 from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import Rig, RigUncertainty, combined
+from aqualvs.optics.water import N_AIR
 
 
 class GivenPose(Protocol):
@@ -98,7 +99,7 @@ class BoardSet:
     name: str
     views: tuple[View, ...]
     poses: Sequence[GivenPose | None] = ()
-    n_medium: float = 1.0003
+    n_medium: float = N_AIR
     sigma_medium: float = 0.0
 
     def __post_init__(self) -> None:
