@@ -1,8 +1,7 @@
 """Statistics of a run's points, read once and batch by batch.
 
 One pass gathers counts, histograms and random samples of fixed size, so that memory does not grow
-with the dive. `add_points` is the compiled loop, the only one of the report that visits every
-point.
+with the dive.
 """
 
 from collections.abc import Iterator
@@ -16,81 +15,9 @@ from numpy.typing import NDArray
 from pyarrow import parquet
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import borrowing_kernel
 from aqualvs.report.run_data import Track
 from aqualvs.results.points import read_points_stream
 from aqualvs.scanning.scan import Label
-
-
-@borrowing_kernel
-def add_points(
-    frame: IntArray,
-    laser: IntArray,
-    label: IntArray,
-    used: BoolArray,
-    x: FloatArray,
-    y: FloatArray,
-    z: FloatArray,
-    frames: IntArray,
-    planes: FloatArray,
-    labels: IntArray,
-    on_target: IntArray,
-    squares: FloatArray,
-    n_squares: IntArray,
-    residual: IntArray,
-    lowest: float,
-    step: float,
-    target: IntArray,
-) -> int:
-    """Add points to the sums of a dive, and list those on the target.
-
-    Parameters
-    ----------
-    frame, laser, label, used : array, shape (N,)
-        Points of a frame that is not among `frames`, or of a laser beyond those of `labels`, are
-        passed over.
-    x, y, z : array, shape (N,)
-        Metres in `dome`.
-    frames : int array, shape (T,), ascending
-    planes : array, shape (T, 4)
-        Unit normal and distance in metres of each frame's target; NaN where it has none.
-    labels, on_target, squares, n_squares, residual : array
-        As `PointSummary` has them, added to; squares in mm².
-    lowest, step : float
-        First edge and width of the bins of `residual`, in mm.
-    target : int array, shape (N,)
-        Receives the numbers of the points on the target.
-
-    Returns
-    -------
-    n_target : int
-        How many those are.
-    """
-    n_target, row, known = 0, -1, False
-    last_bin = residual.shape[1] - 1
-    for i in range(frame.shape[0]):
-        if row < 0 or frames[row] != frame[i]:
-            row = np.searchsorted(frames, frame[i])
-            row = min(row, frames.shape[0] - 1)
-            known = frames[row] == frame[i]
-        k = laser[i]
-        if not known or k < 0 or k >= labels.shape[0]:
-            continue
-        labels[k, min(max(label[i], 0), labels.shape[1] - 1)] += 1
-        if not (used[i] and np.isfinite(x[i]) and np.isfinite(y[i]) and np.isfinite(z[i])):
-            continue
-        target[n_target] = i
-        n_target += 1
-        on_target[row, k] += 1
-        off = planes[row, 0] * x[i] + planes[row, 1] * y[i] + planes[row, 2] * z[i]
-        off = 1e3 * (off - planes[row, 3])
-        if np.isfinite(off):
-            squares[row] += off * off
-            n_squares[row] += 1
-            place = (off - lowest) / step
-            residual[k, int(min(max(place, 0.0), float(last_bin)))] += 1
-    return n_target
-
 
 _BATCH = 1 << 16
 _LABEL_OF_NAME = {label.name.lower(): int(label) for label in Label}
@@ -283,36 +210,66 @@ def _add(
 ) -> FloatArray:
     """Add one batch; returns the sampling keys of the cloud as it now is."""
     frame, laser, label = (batch[name].astype(np.int64) for name in ("frame", "laser", "label"))
-    x, y, z = xyz = [batch[f"{axis}_m"].astype(np.float64) for axis in "xyz"]
-    target = np.empty(len(frame), np.int64)
-    n_target = add_points(
-        frame,
-        laser,
-        label,
-        batch["used"].astype(np.bool_),
-        x,
-        y,
-        z,
-        track.frame,
-        planes,
-        summary.labels,
-        summary.on_target,
-        summary.squares_mm2,
-        summary.n_squares,
-        summary.residual,
-        float(RESIDUAL_EDGES_MM[0]),
-        float(RESIDUAL_EDGES_MM[1] - RESIDUAL_EDGES_MM[0]),
-        target,
-    )
-    target = target[:n_target]
+    xyz = [batch[f"{axis}_m"].astype(np.float64) for axis in "xyz"]
+    target, row = _add_counts(summary, batch["used"], frame, laser, label, xyz, track)
+    _add_residuals(summary, laser[target], row, [axis[target] for axis in xyz], planes[row])
     if "quality" in batch:
         quality = batch["quality"][target].astype(np.float64)
         _count(summary.quality, QUALITY_EDGES, laser[target], quality)
     _keep_samples(summary, batch, frame, laser, label, xyz, sample_frames)
     # Points of a frame without a posture have no place in the target's frame.
-    of_frames = planes[np.searchsorted(track.frame, frame[target])]
+    of_frames = planes[row]
     known = np.isfinite(of_frames[:, 3])
     return _grow_cloud(summary, xyz, laser, target[known], of_frames[known], keys, rng)
+
+
+def _add_counts(
+    summary: PointSummary,
+    used: NDArray[Any],
+    frame: IntArray,
+    laser: IntArray,
+    label: IntArray,
+    xyz: list[FloatArray],
+    track: Track,
+) -> tuple[IntArray, IntArray]:
+    """Count points by label and by frame.
+
+    Return the numbers of target points, and the rows of their frames in the track. Points of
+    frames that the track has not, or of lasers beyond `MAX_LASERS`, are passed over.
+    """
+    row = np.minimum(np.searchsorted(track.frame, frame), len(track) - 1)
+    known = (track.frame[row] == frame) & (laser >= 0) & (laser < MAX_LASERS)
+    n_labels = summary.labels.shape[1]
+    _count_cells(summary.labels, laser[known], np.clip(label[known], 0, n_labels - 1))
+    target = np.flatnonzero(known & used.astype(np.bool_) & np.isfinite(xyz).all(axis=0))
+    # A batch holds some frames of many.
+    row = row[target]
+    rows = slice(row.min(initial=len(track)), row.max(initial=0) + 1)
+    _count_cells(summary.on_target[rows], row - rows.start, laser[target])
+    return target, row
+
+
+def _add_residuals(
+    summary: PointSummary, laser: IntArray, row: IntArray, xyz: list[FloatArray], plane: FloatArray
+) -> None:
+    """Add the distances of target points from their frames' planes."""
+    off_mm = 1e3 * (sum(plane[:, k] * xyz[k] for k in range(3)) - plane[:, 3])
+    known = np.isfinite(off_mm)
+    off_mm, row = off_mm[known], row[known]
+    first = row.min(initial=len(summary.n_squares))
+    squares = np.bincount(row - first, off_mm**2)
+    rows = slice(first, first + len(squares))
+    summary.squares_mm2[rows] += squares
+    summary.n_squares[rows] += np.bincount(row - first)
+    step = RESIDUAL_EDGES_MM[1] - RESIDUAL_EDGES_MM[0]
+    place = np.clip((off_mm - RESIDUAL_EDGES_MM[0]) / step, 0, summary.residual.shape[1] - 1)
+    _count_cells(summary.residual, laser[known], place.astype(np.int64))
+
+
+def _count_cells(counts: IntArray, i: IntArray, j: IntArray) -> None:
+    """Add 1 to the cell (i, j) of a table for each of N points."""
+    cells = np.bincount(i * counts.shape[1] + j, minlength=counts.size)
+    counts += cells.reshape(counts.shape)
 
 
 def _keep_samples(

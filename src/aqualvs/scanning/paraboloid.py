@@ -89,7 +89,7 @@ def fit_over(
     n, coefficients = line.shape[0], patch[COEFFICIENTS:]
     terms, height, per_px = np.empty((n, N)), np.empty(n), np.empty(n)
     over_plane(points, sensitivity, patch, terms, height, per_px)
-    gate, sigma, pull, inverse = np.empty(n), np.empty(n), np.empty(n), np.empty((N, N))
+    gate, sigma, pull = np.empty(n), np.empty(n), np.empty(n)
     by_range = GATE_SHARE * patch[OFFSET]
     n_on_plane = 0
     for i in range(n):
@@ -100,7 +100,7 @@ def fit_over(
         inside[i] = abs(height[i]) < gates * gate[i] if gates > 0.0 else inside[i]
     if not grow(terms, height, gate, inside, coefficients):
         return False, False, np.nan
-    scale, rms = reweight(terms, height, sigma, inside, coefficients, weights, inverse)
+    scale, rms, inverse = reweight(terms, height, sigma, inside, coefficients, weights)
     for j in range(N):
         for k in range(N):
             covariance[j, k] = inverse[j, k] * max(scale, 1.0) ** 2
@@ -309,15 +309,14 @@ def reweight(
     inside: BoolArray,
     coefficients: FloatArray,
     weights: FloatArray,
-    covariance: FloatArray,
-) -> tuple[float, float]:
-    """Refine a grown fit with Tukey's biweight, in place; return the scale, and the rms in metres.
+) -> tuple[float, float, FloatArray]:
+    """Refine a grown fit with Tukey's biweight, in place.
 
-    The inverse of the normal matrix is written to `covariance`.
+    Return the scale, the rms in metres, and the inverse (6, 6) of the normal matrix.
     """
     n = height.shape[0]
     z, weight = np.empty(n), np.empty(n)
-    factor, known, better = np.empty((N, N)), np.eye(N), np.empty(N)
+    factor, known = np.empty((N, N)), np.eye(N)
     scale = 1.0
     reweights = 6
     for _ in range(reweights):
@@ -331,11 +330,9 @@ def reweight(
             rest = max(1.0 - (z[i] / (TUKEY * scale)) ** 2, 0.0)
             weights[i] = rest * rest if inside[i] else 0.0
             weight[i] = weights[i] / (sigma[i] * sigma[i])
-        if not _solve(terms, height, weight, factor, better):
+        if not _solve(terms, height, weight, factor, coefficients):
             break
-        coefficients[:] = better
-        known[:] = factor
-    covariance[:] = inverse_of(known)
+        factor, known = known, factor
     square, total = 0.0, 0.0
     for i in range(n):
         off = height[i]
@@ -343,7 +340,7 @@ def reweight(
             off -= terms[i, k] * coefficients[k]
         square += weights[i] * off * off
         total += weights[i]
-    return scale, np.sqrt(square / total)
+    return scale, np.sqrt(square / total), inverse_of(known)
 
 
 @kernel

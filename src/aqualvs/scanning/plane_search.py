@@ -333,7 +333,8 @@ def search_plane(
         if score <= best:
             continue
         best = score
-        best_plane[:] = plane
+        for k in range(4):
+            best_plane[k] = plane[k]
         # With a share s of the weight on the plane a trial succeeds with a probability of s^2 / 12
         # to s^2 / 5: half of the neighbours fit or fewer, and a third of the draws are of one
         # laser. Where two thirds of a net's light make a plane of their own, its trials leave one
