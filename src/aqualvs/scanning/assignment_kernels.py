@@ -281,22 +281,26 @@ def _keep_best(
     """Insert a plane from the second row on, unless a similar one is better; best first."""
     if _same(plane, planes[0], 2.0):
         return n
-    for k in range(1, n + 1):
-        if _same(plane, planes[k], 2.0):
-            if value > score[k]:
-                planes[k], score[k] = plane, value
-            return n
-    if n + 1 < planes.shape[0]:
-        n += 1
-        planes[n], score[n] = plane, value
+    at = 1
+    while at <= n and not _same(plane, planes[at], 2.0):
+        at += 1
+    if at == planes.shape[0]:
+        at = 1
+        for k in range(2, n + 1):
+            if score[k] < score[at]:
+                at = k
+    if at <= n and value <= score[at]:
         return n
-    worst = 1
-    for k in range(2, n + 1):
-        if score[k] < score[worst]:
-            worst = k
-    if value > score[worst]:
-        planes[worst], score[worst] = plane, value
-    return n
+    _copy_plane(plane, planes[at])
+    score[at] = value
+    return max(n, at)
+
+
+@inline_borrowing_kernel
+def _copy_plane(plane: FloatArray, out: FloatArray) -> None:
+    """Copy without the messages about shapes that Numba compiles for an assigned slice."""
+    for k in range(4):
+        out[k] = plane[k]
 
 
 @inline_borrowing_kernel
@@ -326,7 +330,7 @@ def _refine_rivals(
             good = good and not _same(plane, planes[j], 1.0)
         if good:
             kept += 1
-            planes[kept] = plane
+            _copy_plane(plane, planes[kept])
     return kept
 
 
