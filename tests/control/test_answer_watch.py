@@ -238,6 +238,22 @@ def test_an_approach_that_ends_at_once_is_a_still(name: str) -> None:
     assert LimitReason.NO_ANSWER.takes_over
 
 
+@pytest.mark.parametrize(
+    ("name", "since_s", "seed"), [("bluerov2", 0.9, 3), ("bluerov2-heavy", 1.5, 2)]
+)
+def test_the_brake_of_an_approach_that_ends_leaves_time(
+    name: str, since_s: float, seed: int
+) -> None:
+    """A stop that is noticed late looks younger than it is."""
+    neutral_s, nearest, decisions = frozen_hold(
+        name, LossOfSight.STUCK, before=0.75, since_s=since_s, seed=seed
+    )
+    doubted = [one for one in decisions if one.reason is LimitReason.NO_ANSWER]
+    assert doubted[0].effort.forward < 0.0
+    assert neutral_s <= 0.5 + 1e-9
+    assert nearest >= 0.45
+
+
 @NAMES
 def test_a_vehicle_that_moves_unseen_is_given_back(name: str) -> None:
     """What the efforts promise is enough, in a sea where approaches may end at any moment."""

@@ -337,7 +337,9 @@ class AnswerWatch:
             and short > max(limits.short * usual, limits.short_of)
             and usual < limits.usual
         ):
-            self._still_s, self._blind_s = short * took_s / predicted, _TRUSTED_S
+            # A stop before the line's end bends the line, and is taken to be younger than it is.
+            self._still_s = max(_STOP_S, short * took_s / predicted)
+            self._blind_s = _TRUSTED_S
             return True
         self._n_predicted += 1
         square = min(error**2, 9.0 * self._usual) if known else error**2
