@@ -10,7 +10,7 @@ from aqualvs.control.answer_watch import AnswerLimits, AnswerWatch
 from aqualvs.control.autopilot import Decision
 from aqualvs.control.gains_file import load_gains
 from aqualvs.control.missions import HoldMission
-from aqualvs.control.safety import LimitReason
+from aqualvs.control.safety import NO_BRAKE, LimitReason
 from aqualvs.control.vehicle import NEUTRAL, Effort, Setpoint
 from aqualvs.errors import OptionError
 from aqualvs.follow.case import SimCase, sea, vehicle_model
@@ -67,23 +67,42 @@ def test_without_thrust_nothing_need_move() -> None:
     assert set(watched([posture_at(0.6)] * 50, NEUTRAL)) == {None}
 
 
+def still_of(last: Posture, rng: np.random.Generator) -> Posture:
+    """Return the posture of a picture that an encoder repeats: it differs by next to nothing."""
+    return replace(
+        last,
+        range=last.range + 3e-5 * rng.normal(),
+        yaw=last.yaw + 1e-4 * rng.normal(),
+        pitch=last.pitch + 1e-4 * rng.normal(),
+    )
+
+
 def test_noise_that_vanishes_is_a_still_that_an_encoder_repeats() -> None:
     rng = np.random.default_rng(3)
     live = [noisy(rng) for _ in range(100)]
-    last = live[-1]
-    still = [
-        replace(
-            last,
-            range=last.range + 3e-5 * rng.normal(),
-            yaw=last.yaw + 1e-4 * rng.normal(),
-            pitch=last.pitch + 1e-4 * rng.normal(),
-        )
-        for _ in range(30)
-    ]
-    found = watched(live + still)
+    found = watched(live + [still_of(live[-1], rng) for _ in range(30)])
     assert set(found[:100]) == {None}
     # Eight postures tell it.
     assert set(found[107:]) == {LimitReason.FROZEN}
+
+
+@pytest.mark.parametrize("begins_anew", ["gap", "engaged"])
+def test_a_still_that_goes_on_after_a_gap_is_neutral_at_once(begins_anew: str) -> None:
+    """No brake: nothing tells how fast the vehicle is by now."""
+    rng, watch = np.random.default_rng(3), AnswerWatch(GAINS.vehicle)
+    live = [noisy(rng) for _ in range(100)]
+    found, brakes, gap_s = [], [], 0.0
+    for k, seen in enumerate(live + [still_of(live[-1], rng) for _ in range(40)]):
+        if k == 120 and begins_anew == "gap":
+            gap_s = 0.5
+        elif k == 120:
+            watch.restart()
+        now_s = FRAME_S * k + gap_s
+        found.append(watch.see(now_s, seen, state_at(now_s)))
+        brakes.append(watch.brake(now_s))
+        watch.done(now_s, NEUTRAL if found[-1] else HELD)
+    assert set(found[107:]) == {LimitReason.FROZEN}
+    assert set(brakes[120:]) == {NO_BRAKE}
 
 
 def test_a_yaw_that_does_not_follow_the_heading() -> None:
@@ -217,6 +236,22 @@ def test_an_approach_that_ends_at_once_is_a_still(name: str) -> None:
     assert decisions[-1].reason is LimitReason.NO_ANSWER
     assert not decisions[-1].engaged
     assert LimitReason.NO_ANSWER.takes_over
+
+
+@pytest.mark.parametrize(
+    ("name", "since_s", "seed"), [("bluerov2", 0.9, 3), ("bluerov2-heavy", 1.5, 2)]
+)
+def test_the_brake_of_an_approach_that_ends_leaves_time(
+    name: str, since_s: float, seed: int
+) -> None:
+    """A stop that is noticed late looks younger than it is."""
+    neutral_s, nearest, decisions = frozen_hold(
+        name, LossOfSight.STUCK, before=0.75, since_s=since_s, seed=seed
+    )
+    doubted = [one for one in decisions if one.reason is LimitReason.NO_ANSWER]
+    assert doubted[0].effort.forward < 0.0
+    assert neutral_s <= 0.5 + 1e-9
+    assert nearest >= 0.45
 
 
 @NAMES

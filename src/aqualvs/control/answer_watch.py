@@ -208,7 +208,9 @@ class AnswerWatch:
         if self._repeats(now_s, posture) or vanished:
             self._blind_s = _TRUSTED_S
             if vanished:
-                self._still_s = now_s - [m.time_s for m in self._moments][-_N_NOISE:][0]
+                # None where frames were missing just before, or the watch has begun anew.
+                n = min(_N_NOISE, len(self._moments))
+                self._still_s = now_s - self._moments[-n].time_s if n else 0.0
             return LimitReason.FROZEN
         moment = _Moment(
             now_s,
@@ -335,7 +337,9 @@ class AnswerWatch:
             and short > max(limits.short * usual, limits.short_of)
             and usual < limits.usual
         ):
-            self._still_s, self._blind_s = short * took_s / predicted, _TRUSTED_S
+            # A stop before the line's end bends the line, and is taken to be younger than it is.
+            self._still_s = max(_STOP_S, short * took_s / predicted)
+            self._blind_s = _TRUSTED_S
             return True
         self._n_predicted += 1
         square = min(error**2, 9.0 * self._usual) if known else error**2
@@ -394,8 +398,8 @@ class AnswerWatch:
         # A posture that follows one of them is live, however the net moves the other.
         follows = [
             _share(seen, told) >= limits.follows
-            for seen, told in ((pitch, attitude), (yaw, heading))
-            if _least_swing(told, n) > limits.swung
+            for seen, told in ((pitch, _delayed(attitude, n)), (yaw, _delayed(heading, n)))
+            if _least_swing(told) > limits.swung
         ]
         if not follows or any(follows):
             return False
@@ -439,14 +443,14 @@ def _delayed(told: FloatArray, n: int) -> list[FloatArray]:
     return [_about_line(told[k : k + n]) for k in range(len(told) - n + 1)]
 
 
-def _least_swing(told: FloatArray, n: int) -> float:
+def _least_swing(told: list[FloatArray]) -> float:
     """Return the least standard deviation over the delays; NaN where it told nothing."""
-    return min(float(one.std()) for one in _delayed(told, n))
+    return min(float(one.std()) for one in told)
 
 
-def _share(seen: FloatArray, told: FloatArray) -> float:
-    """Return the greatest share of what the autopilot told that is seen in postures."""
-    return max(abs(float(seen @ one)) / float(one @ one) for one in _delayed(told, len(seen)))
+def _share(seen: FloatArray, told: list[FloatArray]) -> float:
+    """Return the greatest share of what the autopilot told that is seen, over the delays."""
+    return max(abs(float(seen @ one)) / float(one @ one) for one in told)
 
 
 class _Noise:
