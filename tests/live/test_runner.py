@@ -8,8 +8,10 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
+from aqualvs.control.vehicle import VehicleState
 from aqualvs.errors import SourceError
 from aqualvs.live import runner as live_runner
 from aqualvs.live.health_monitor import FrozenOptions
@@ -18,7 +20,7 @@ from aqualvs.optics.shutter import AT_ONCE, Shutter, ShutterKind
 from aqualvs.scanner import Scanner
 from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.row_motion import RowMotion
-from aqualvs.scanning.scan import Frame, Scan
+from aqualvs.scanning.scan import Frame, Scan, Turning
 from aqualvs.sources.base import PartHealth, State
 from aqualvs.sources.fields import FrameFeed, frames_of
 from field_cases import FIELDS
@@ -144,6 +146,42 @@ def test_a_rolling_shutter_is_corrected_by_frames_of_the_past() -> None:
         # Half of readout and exposure.
         assert sample.instants.arrived_ns - sample.posture_ns == 14_000_000
     assert len(output.samples) == 8
+
+
+class _Autopilot(Collector):
+    """An output that an autopilot answers: the vehicle turns to the right by 10 degrees/s."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.asked_ns: list[int] = []
+
+    def vehicle_state(self) -> VehicleState:
+        return VehicleState()
+
+    def turning(self, at_ns: int) -> Turning:
+        self.asked_ns.append(at_ns)
+        return Turning(np.array([0.0, 0.0, math.radians(-10.0)]), math.radians(3.0))
+
+
+def test_an_autopilot_tells_how_a_rolling_camera_turns() -> None:
+    shutter = Shutter(kind=ShutterKind.ROLLING, readout=0.02, exposure=0.008)
+    scanner, output = Scanner(replace(demo_rig(), shutter=shutter)), _Autopilot()
+    runner(list(demo_frames(3)), output, keep_every=True, scanner=scanner).run(never)
+    assert output.asked_ns == [sample.posture_ns for sample in output.samples]
+    first, motion = output.samples[0].scan, RowMotion(scanner.rig)
+    seen = scanner.process(demo_frames(1)[0])
+    without = motion.correct(seen, []).posture
+    expected = motion.correct(replace(seen, turning=first.turning), []).posture
+    assert first.posture
+    assert expected
+    assert without
+    assert (first.posture.numbers == expected.numbers).all()
+    assert not (first.posture.numbers == without.numbers).all()
+    # Nobody asks for what is taken at once.
+    other = _Autopilot()
+    runner(list(demo_frames(2)), other, keep_every=True).run(never)
+    assert other.asked_ns == []
+    assert other.samples[0].scan.turning is None
 
 
 class _Waiting:

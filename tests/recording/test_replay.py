@@ -15,12 +15,14 @@ from pyarrow import parquet
 from aqualvs.cli.main import main
 from aqualvs.errors import OptionError, OutputError, SourceError
 from aqualvs.optics.rigfile import load_rig, save_rig
+from aqualvs.optics.shutter import Shutter, ShutterKind
 from aqualvs.pipeline import run
 from aqualvs.recording import DiveRecording, PictureFormat, Recorder, RecorderOptions, Recording
 from aqualvs.recording.encoding import TOPICS
 from aqualvs.recording.messages import stripes_message, stripes_of
 from aqualvs.results.run_request import FrameWindow, RunRequest, Water
 from aqualvs.scanner import Scanner, ScannerOptions
+from aqualvs.scanning.scan import Turning
 from aqualvs.scanning.stripe import ThresholdOptions
 from aqualvs.scanning.surfaces import TargetKind
 from live_cases import demo_rig, demo_samples
@@ -89,17 +91,36 @@ def test_a_recorded_run_replays_bit_for_bit(whole, tmp_path):
 def test_stripes_of_recordings_before_pulls_were_measured_have_none():
     (sample,) = demo_samples(1)
     message = stripes_message(sample, 0)
-    *_, peaks, _ = stripes_of(message)
+    *_, peaks, _, _ = stripes_of(message)
     pulls = {axis: found.pull for axis, found in sample.peaks.items()}
     assert len(peaks) == 2
     for axis, found in peaks.items():
         np.testing.assert_array_equal(found.pull, pulls[axis])
         assert np.count_nonzero(found.pull) > 0.5 * len(found)
-    # Their number, aligned to 8 bytes, and the numbers.
-    *_, old, _ = stripes_of(message[: -8 * (1 + sum(map(len, peaks.values())))])
+    # Their number, aligned to 8 bytes, the numbers, and no gyros (4 bytes).
+    *_, old, _, turning = stripes_of(message[: -8 * (1 + sum(map(len, peaks.values()))) - 4])
+    assert turning is None
     for axis, found in old.items():
         np.testing.assert_array_equal(found.position, peaks[axis].position)
         np.testing.assert_array_equal(found.pull, np.zeros(len(found)))
+
+
+def test_gyros_are_recorded_and_used_again(demo, tmp_path):
+    shutter = Shutter(kind=ShutterKind.ROLLING, readout=0.02)
+    rig = replace(load_rig(demo / "rig.yaml"), shutter=shutter)
+    turning = Turning(np.deg2rad([15.0, 0.0, -20.0]), np.deg2rad(2.0))
+    sample = demo_samples(1)[0]
+    for name, known in (("with", turning), ("without", None)):
+        recording = Recording(tmp_path / f"{name}.mcap", RecorderOptions())
+        recording.write(replace(sample, rig=rig, scan=replace(sample.scan, turning=known)))
+        recording.close()
+        again(tmp_path / f"{name}.mcap", tmp_path / name)
+    (kept,) = DiveRecording(tmp_path / "with.mcap").frames(with_pictures=False)
+    np.testing.assert_array_equal(kept.turning.rates, turning.rates)
+    assert kept.turning.sigma == turning.sigma
+    (found,), (without,) = rows(tmp_path / "with"), rows(tmp_path / "without")
+    assert float(found["sigma_yaw_deg"]) < 0.7 * float(without["sigma_yaw_deg"])
+    assert found["yaw_deg"] != without["yaw_deg"]
 
 
 def test_the_same_rig_from_its_file_gives_the_same(whole, demo, tmp_path):

@@ -8,8 +8,8 @@ import pytest
 from aqualvs.optics.shutter import AT_ONCE, Shutter, ShutterKind
 from aqualvs.scanner import Scanner
 from aqualvs.scanning.posture import Posture, Reason, Refusal
-from aqualvs.scanning.row_motion import RowMotion
-from aqualvs.scanning.scan import Frame, Scan, ScanPoints, planes_of_image
+from aqualvs.scanning.row_motion import RowMotion, rates_beside
+from aqualvs.scanning.scan import Frame, Scan, ScanPoints, Turning, planes_of_image
 from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenario import dome_from_target
 from aqualvs.simulation.scenarios import example_rig
@@ -141,3 +141,43 @@ def test_motion_is_no_scatter(scans):
     assert still.by_rates is None
     ratio = np.diag(scans[2].posture.covariance) / np.diag(still.covariance)
     assert np.all(ratio < 1.5**2)
+
+
+def turning_at(t, sigma_deg_s=1.0):
+    """How a vehicle turns at a time, from the poses of a wall that stands still."""
+    step = 1e-4
+    before, after = (scene_at(t + s).dome_from_scene.rotation for s in (-step, step))
+    # The wall turns by -w x.
+    spin = -(after - before) / (2.0 * step) @ scene_at(t).dome_from_scene.rotation.T
+    return Turning(np.array([spin[2, 1], spin[0, 2], spin[1, 0]]), np.deg2rad(sigma_deg_s))
+
+
+def test_gyros_tell_the_rates_of_pitch_and_yaw(scans):
+    alone = scans[2]
+    turning = turning_at(2 * STEP_S, 0.01)
+    rates, covariance = rates_beside(replace(alone, turning=turning), [])
+    assert rates[1:] == pytest.approx(RATES[1:], abs=np.deg2rad(0.1))
+    assert np.all(np.sqrt(np.diag(covariance)[1:]) < np.deg2rad(0.02))
+    # They tell nothing of how the range changes.
+    assert np.sqrt(covariance[0, 0]) == pytest.approx(0.3, rel=0.01)
+
+
+def test_gyros_help_a_lone_frame(scans):
+    motion, turning = RowMotion(ROLLING), turning_at(2 * STEP_S, 5.0)
+    without = motion.correct(scans[2], []).posture
+    found = motion.correct(replace(scans[2], turning=turning), []).posture
+    # Of the yaw, which the change of range leaves alone.
+    assert abs(found.yaw - truth(2)[2]) < 0.7 * abs(without.yaw - truth(2)[2])
+    assert found.covariance[2, 2] < 0.7**2 * without.covariance[2, 2]
+    assert abs(found.yaw - truth(2)[2]) < 3.0 * np.sqrt(found.covariance[2, 2])
+
+
+def test_gyros_that_contradict_the_frames_beside_count_for_nothing(scans):
+    motion, beside = RowMotion(ROLLING), [scans[1], scans[3]]
+    turning = turning_at(2 * STEP_S)
+    wrong = replace(scans[2], turning=replace(turning, rates=-turning.rates))
+    expected = motion.correct(scans[2], beside).posture
+    assert np.array_equal(motion.correct(wrong, beside).posture.numbers, expected.numbers)
+    right = motion.correct(replace(scans[2], turning=turning), beside).posture
+    assert not np.array_equal(right.numbers, expected.numbers)
+    assert right.numbers == pytest.approx(expected.numbers, abs=1e-3)

@@ -24,7 +24,7 @@ import numpy as np
 from aqualvs.control.time_filter import PostureFilter
 from aqualvs.errors import AqualvsError
 from aqualvs.live.health_monitor import FrozenOptions, FrozenPicture, HealthMonitor
-from aqualvs.live.outputs.base import Output
+from aqualvs.live.outputs.base import HearsVehicle, Output
 from aqualvs.optics.expected_error import see_stripe
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.sheet import sheets_of
@@ -398,6 +398,8 @@ class LiveRunner:
         Defaults if left out.
     posture_filter : PostureFilter or None
         Smooths over time, in addition to the raw values.
+
+    The first output that an autopilot answers tells how the vehicle turns, for a rolling shutter.
     """
 
     def __init__(
@@ -419,6 +421,7 @@ class LiveRunner:
         self._frozen: dict[Field | None, FrozenPicture] = {}
         rig = provider.scanner.rig
         self._row_motion = RowMotion(rig) if rig.shutter.needs_neighbours else None
+        self._gyros = next((one for one in outputs if isinstance(one, HearsVehicle)), None)
         self._before: deque[Scan] = deque(maxlen=REACH)
         self._last: Frame | None = None
         self._heard_ns = self._told_ns = 0
@@ -468,7 +471,7 @@ class LiveRunner:
         frame = self._last = arrival.frame
         self._heard_ns = arrival.arrived_ns
         scanner = self._provider.scanner
-        peaks, scan = self._scan(scanner, frame)
+        peaks, scan = self._scan(scanner, arrival)
         shutter, age_ns = scanner.rig.shutter, 0
         if frame.field == shutter.first_field:
             # It waited for the second field, with which it came.
@@ -483,8 +486,10 @@ class LiveRunner:
             scan.time_s,
         )
 
-    def _scan(self, scanner: Scanner, frame: Frame) -> tuple[dict[SearchAxis, StripePeaks], Scan]:
-        rig = scanner.rig
+    def _scan(
+        self, scanner: Scanner, arrival: Arrival
+    ) -> tuple[dict[SearchAxis, StripePeaks], Scan]:
+        rig, frame = scanner.rig, arrival.frame
         height, width = frame.luma.shape
         wanted = size_of_frames(rig)
         if (width, height) != wanted:
@@ -500,7 +505,8 @@ class LiveRunner:
             return {}, Scan(frame.index, frame.time_s, refusal, ScanPoints.none(), rig.n_water)
         try:
             peaks = scanner.detect(frame)
-            return peaks, self._at_middle(scanner.measure(frame.index, frame.time_s, peaks))
+            scan = scanner.measure(frame.index, frame.time_s, peaks)
+            return peaks, self._at_middle(scan, rig, arrival.arrived_ns)
         except Exception as fault:
             # One bad frame must not end a dive.
             if str(fault) != self._trouble:
@@ -516,10 +522,13 @@ class LiveRunner:
         frozen = self._frozen.setdefault(frame.field, FrozenPicture(self._options.frozen))
         return frozen.update(frame.time_s, frame.luma)
 
-    def _at_middle(self, scan: Scan) -> Scan:
-        """Return a scan as it is at its picture's middle, by those before it."""
+    def _at_middle(self, scan: Scan, rig: Rig, arrived_ns: int) -> Scan:
+        """Return a scan as it is at its picture's middle, by those before it and gyros."""
         if self._row_motion is None:
             return scan
+        if self._gyros is not None:
+            middle_ns = arrived_ns - round(1e9 * rig.shutter.middle_to_end)
+            scan = replace(scan, turning=self._gyros.turning(middle_ns))
         before = list(self._before)
         self._before.append(scan)
         return self._row_motion.correct(scan, before)

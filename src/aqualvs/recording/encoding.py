@@ -420,6 +420,9 @@ string detail
 aqualvs_msgs/Returns[] returns
 # Pull of each peak by an uneven background in pixels: those of the first entry, then the next.
 float64[] pull
+# Angular velocity of the vehicle about x, y and z of the dome at the picture's middle, and the
+# standard deviation of each, from its gyros; empty where they are not known or not of use.
+float64[] turning_rad_per_s
 """
 
 _PEAKS = """\

@@ -37,7 +37,7 @@ from aqualvs.recording.sample import LiveSample
 from aqualvs.scanner import ScannerOptions
 from aqualvs.scanning.laser_bands import SearchAxis
 from aqualvs.scanning.posture import Posture, Reason, Refusal
-from aqualvs.scanning.scan import Frame, ScanPoints
+from aqualvs.scanning.scan import Frame, ScanPoints, Turning
 from aqualvs.scanning.stripe import StripePeaks
 from aqualvs.sources.base import Health, PartHealth, State
 
@@ -87,13 +87,15 @@ def stripes_message(sample: LiveSample, stamp_ns: int) -> bytes:
             to.array(column)
     # Behind all that older recordings hold, so that both are read alike.
     to.array(np.concatenate([np.empty(0), *(found.pull for found in sample.peaks.values())]))
+    turning = scan.turning
+    to.array(np.empty(0) if turning is None else np.append(turning.rates, turning.sigma))
     return to.finish()
 
 
 def stripes_of(
     message: bytes,
-) -> tuple[int, float, float, dict[SearchAxis, StripePeaks], Refusal | None]:
-    """Return frame, time, index of the water, stripes and refusal of a message.
+) -> tuple[int, float, float, dict[SearchAxis, StripePeaks], Refusal | None, Turning | None]:
+    """Return frame, time, index of the water, stripes, refusal and turning of a message.
 
     Raises
     ------
@@ -120,7 +122,10 @@ def stripes_of(
             axis: replace(found, pull=pull)
             for (axis, found), pull in zip(peaks.items(), pulls, strict=False)
         }
-    return index, time_s, n_water, peaks, Refusal(Reason(reason), detail) if reason else None
+    gyros = np.empty(0) if of.at_end else of.array("f8")
+    turning = Turning(gyros[:3], float(gyros[3])) if len(gyros) == 4 else None
+    refusal = Refusal(Reason(reason), detail) if reason else None
+    return index, time_s, n_water, peaks, refusal, turning
 
 
 def points_message(points: ScanPoints, stamp_ns: int) -> bytes:

@@ -19,7 +19,7 @@ from aqualvs.recording.messages import image_of, rig_texts_of, stripes_of
 from aqualvs.scanner import ScannerOptions
 from aqualvs.scanning.laser_bands import SearchAxis
 from aqualvs.scanning.posture import Refusal
-from aqualvs.scanning.scan import Frame
+from aqualvs.scanning.scan import Frame, Turning
 from aqualvs.scanning.stripe import StripePeaks
 from aqualvs.sources.mcap_file import McapFile, StoredMessage
 
@@ -38,6 +38,8 @@ class RecordedFrame:
         Stripes as detected.
     refusal : Refusal or None
         Why it was not measured at all.
+    turning : Turning or None
+        As the vehicle's gyros told.
     picture : Frame or None
         None where there is none, or it was not asked for.
     """
@@ -47,6 +49,7 @@ class RecordedFrame:
     n_water: float
     peaks: dict[SearchAxis, StripePeaks]
     refusal: Refusal | None
+    turning: Turning | None
     picture: Frame | None
 
 
@@ -149,14 +152,14 @@ class DiveRecording:
     def _frame(self, parts: dict[str, StoredMessage]) -> RecordedFrame:
         stripes = parts[STRIPES.name]
         try:
-            index, time_s, n_water, peaks, refusal = stripes_of(stripes.data)
+            index, time_s, n_water, peaks, refusal, turning = stripes_of(stripes.data)
             picture = _picture(index, time_s, parts)
         except (ValueError, AqualvsError) as fault:
             raise SourceError(
                 f"{self.path}: a message cannot be understood ({fault}); "
                 "was it written by a later version?"
             ) from fault
-        return RecordedFrame(index, time_s, n_water, peaks, refusal, picture)
+        return RecordedFrame(index, time_s, n_water, peaks, refusal, turning, picture)
 
     def _mean_rate(self) -> float | None:
         """Return frames per second over the first few of them."""

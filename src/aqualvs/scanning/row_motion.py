@@ -7,6 +7,7 @@ errors by them: in frame j, at time t from the frame that is corrected,
     measured_j = posture + t rates + t²/2 acceleration + by_rates_j (rates + t acceleration) + e_j.
 
 Frames beside it never smooth a posture: it is moved by its `by_rates` times the rates, no more.
+Gyros, where they are known, tell the rates of pitch and yaw too: most of all of a lone frame.
 
 The points of one frame alone tell the rates too, but worse: they bend and twist a plane. That is
 enough to take the motion out of the scatter, before surfaces are fitted and sigmas are found.
@@ -24,7 +25,7 @@ from aqualvs.optics.rig_covariance import FittedSurface, posture_by_plane
 from aqualvs.scanning.candidates import Candidates
 from aqualvs.scanning.plane_fit import TUKEY
 from aqualvs.scanning.posture import Posture, Reason, Refusal
-from aqualvs.scanning.scan import Scan
+from aqualvs.scanning.scan import Scan, Turning
 
 REACH = 2
 """Frames to each side that tell the rates of a frame."""
@@ -252,7 +253,28 @@ def rates_beside(scan: Scan, beside: Sequence[Scan]) -> tuple[FloatArray, FloatA
         matrix += weighed @ by
         right += weighed @ off
     covariance = np.asarray(np.linalg.inv(matrix), np.float64)
-    return (covariance @ right)[3:6], covariance[3:6, 3:6]
+    rates, covariance = (covariance @ right)[3:6], covariance[3:6, 3:6]
+    if scan.turning is None:
+        return rates, covariance
+    return _with_gyros(rates, covariance, posture, scan.turning)
+
+
+def _with_gyros(
+    rates: FloatArray, covariance: FloatArray, posture: Posture, turning: Turning
+) -> tuple[FloatArray, FloatArray]:
+    """Return rates of range, pitch and yaw and their covariance, as gyros change them."""
+    m = posture.normal_in_dome / posture.range
+    # A target that stands still turns against the vehicle; its distance does not change by that.
+    by_turning = (_by_m(m) @ np.cross(m, np.eye(3)).T)[1:]
+    off = by_turning @ turning.rates - rates[1:]
+    expected = covariance[1:, 1:] + turning.sigma**2 * by_turning @ by_turning.T
+    # A squared Mahalanobis distance that is larger once in 1000 times by chance, of 2 values: the
+    # target moves by itself, or the gyros are not the vehicle's.
+    gate = 13.82
+    if not off @ np.linalg.solve(expected, off) <= gate:
+        return rates, covariance
+    gain = np.linalg.solve(expected, covariance[1:]).T
+    return rates + gain @ off, covariance - gain @ covariance[1:]
 
 
 def _velocity(m: FloatArray, m_rate: FloatArray, points: FloatArray) -> FloatArray:

@@ -149,6 +149,22 @@ class ScanPoints:
 
 
 @dataclass(frozen=True, slots=True)
+class Turning:
+    """Turning of the vehicle at a picture's middle, from its gyros.
+
+    Attributes
+    ----------
+    rates : array, shape (3,)
+        Angular velocity about the axes of `dome`, in rad/s.
+    sigma : float
+        Standard deviation of each, in rad/s, as the turning before a target that stands still.
+    """
+
+    rates: FloatArray
+    sigma: float
+
+
+@dataclass(frozen=True, slots=True)
 class Scan:
     """The scanner's result for one frame.
 
@@ -162,6 +178,8 @@ class Scan:
         Every stripe point, labelled.
     n_water : float
         Refractive index used.
+    turning : Turning or None
+        None where no gyros are known.
     """
 
     index: int
@@ -169,3 +187,4 @@ class Scan:
     posture: Posture | Refusal
     points: ScanPoints
     n_water: float
+    turning: Turning | None = None

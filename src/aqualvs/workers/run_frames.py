@@ -141,7 +141,8 @@ class Replay(Closing):
             return self.rig, scan, {}
         scanner = self._scanner_in(recorded.n_water)
         peaks = scanner.detect(frame) if self._detects else recorded.peaks
-        return scanner.rig, scanner.measure(frame.index, frame.time_s, peaks), peaks
+        scan = scanner.measure(frame.index, frame.time_s, peaks)
+        return scanner.rig, replace(scan, turning=recorded.turning), peaks
 
     def _scanner_in(self, n_water: float) -> Scanner:
         """Return the scanner for the water of a frame, as the dive's run knew it."""

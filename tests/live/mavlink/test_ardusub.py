@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -13,9 +14,12 @@ from hypothesis import strategies as st
 from aqualvs.control.sticks import StickShaping
 from aqualvs.control.vehicle import NEUTRAL, Effort, Mode
 from aqualvs.errors import OptionError
-from aqualvs.live.mavlink.ardusub import ArduSubLink, ArduSubOptions
+from aqualvs.geometry.transforms import SE3
+from aqualvs.live.mavlink.ardusub import ArduSubLink, ArduSubOptions, turning_of
 from aqualvs.live.mavlink.ardusub_commands import Command, is_finite
 from aqualvs.live.mavlink.link import Received
+from aqualvs.simulation.dive import vehicle_attitude
+from aqualvs.simulation.scenario import dome_from_target
 
 dialect = pytest.importorskip("pymavlink.dialects.v20.ardupilotmega")
 
@@ -171,6 +175,50 @@ def test_heard_between_heartbeats_by_attitude(wire: Wire, vehicle: ArduSubLink) 
     assert time.monotonic() - vehicle.state().heard_s > 2.5
     wire.put("ATTITUDE", age_s=1.5, roll=0.1, pitch=-0.2, yaw=0.0)
     assert vehicle.state().heading is None
+
+
+def test_gyros_turn_the_axes_of_the_dome(wire: Wire) -> None:
+    def pose(t: float) -> SE3:
+        return dome_from_target(0.6, 0.1 + 0.3 * t, -0.2 + 0.5 * t)
+
+    # Body rates of a flight controller by the rates of heading, roll and pitch.
+    step = 1e-4
+    heading, roll, pitch = vehicle_attitude(pose(0.0))
+    before, after = (np.array(vehicle_attitude(pose(t))) for t in (-step, step))
+    to_heading, to_roll, to_pitch = (after - before) / (2.0 * step)
+    wire.put(
+        "ATTITUDE",
+        roll=roll,
+        pitch=pitch,
+        yaw=heading,
+        rollspeed=to_roll - to_heading * math.sin(pitch),
+        pitchspeed=to_pitch * math.cos(roll) + to_heading * math.sin(roll) * math.cos(pitch),
+        yawspeed=-to_pitch * math.sin(roll) + to_heading * math.cos(roll) * math.cos(pitch),
+    )
+    found = turning_of(wire, time.monotonic_ns())  # type: ignore[arg-type]
+    assert found is not None
+    seen = [pose(t).rotation for t in (-step, step)]
+    spin = -(seen[1] - seen[0]) / (2.0 * step) @ pose(0.0).rotation.T
+    assert found.rates == pytest.approx([spin[2, 1], spin[0, 2], spin[1, 0]], abs=1e-6)
+    assert float(np.linalg.norm(found.rates)) > 0.4
+
+
+def test_gyros_are_worth_less_with_time_and_motion(wire: Wire) -> None:
+    def sigma(age_s: float, rate: float) -> float:
+        wire.put("ATTITUDE", age_s=age_s, rollspeed=0.0, pitchspeed=0.0, yawspeed=rate)
+        found = turning_of(wire, time.monotonic_ns())  # type: ignore[arg-type]
+        assert found is not None
+        return math.degrees(found.sigma)
+
+    assert turning_of(wire, time.monotonic_ns()) is None  # type: ignore[arg-type]
+    # Of a stream of unknown delay, and a net that moves by itself.
+    assert 4.0 < sigma(0.0, 0.0) < 5.0
+    assert 20.0 < sigma(0.5, 0.0) < 22.0
+    assert 10.0 < sigma(0.0, math.radians(90.0)) < 11.0
+    wire.put("ATTITUDE", rollspeed=math.nan, pitchspeed=0.0, yawspeed=0.0)
+    assert turning_of(wire, time.monotonic_ns()) is None  # type: ignore[arg-type]
+    wire.put("ATTITUDE", age_s=1.5, rollspeed=0.0, pitchspeed=0.0, yawspeed=0.0)
+    assert turning_of(wire, time.monotonic_ns()) is None  # type: ignore[arg-type]
 
 
 def test_depth_from_the_best_message(wire: Wire, vehicle: ArduSubLink) -> None:

@@ -25,6 +25,8 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Any, Final
 
+import numpy as np
+
 from aqualvs.control.sticks import FULL, MIDDLE, PARAMETERS, Sticks, shaping_of
 from aqualvs.control.vehicle import NEUTRAL, Effort, Mode, VehicleState
 from aqualvs.errors import OptionError
@@ -46,6 +48,7 @@ from aqualvs.live.mavlink.ardusub_parameters import (
     advise_on_station,
 )
 from aqualvs.live.mavlink.link import MAV_COMP_ID_ONBOARD_COMPUTER, MavlinkLink, Received
+from aqualvs.scanning.scan import Turning
 from aqualvs.vehicle_logs.tlog import SUB_MODES
 
 FRESH_S = 1.0
@@ -208,6 +211,34 @@ def attitude_of(link: MavlinkLink) -> tuple[float | None, float | None, float | 
         return None, None, None
     told = found.message
     return told.roll, told.pitch, told.yaw % (2.0 * math.pi)
+
+
+def turning_of(link: MavlinkLink, at_ns: int) -> Turning | None:
+    """Return the turning of an autopilot's vehicle; None if it has told none of use.
+
+    Parameters
+    ----------
+    link : MavlinkLink
+    at_ns : int
+        Time of a picture, by `time.monotonic_ns`.
+    """
+    found = link.latest("ATTITUDE", system=link.system, component=_AUTOPILOT)
+    if found is None or found.age_s > FRESH_S:
+        return None
+    told = found.message
+    # Forward, right, down to the dome's right, forward, up.
+    rates = np.array([told.pitchspeed, told.rollspeed, -told.yawspeed])
+    # A vehicle changes its rates by so much (rad/s², as in `row_motion`) in the time between the
+    # message and the picture. Of that, the delay of camera and network is not known; this (s) is
+    # that of a usual stream.
+    acceleration, delay = math.radians(40.0), 0.1
+    # A net in swell turns by itself (rad/s): rocking by 3 degrees in 7 s, rms.
+    target = math.radians(2.0)
+    # The axes of autopilot and dome differ by some 5 degrees, which is this share of the rates.
+    mounting = 0.1
+    apart = math.hypot(1e-9 * (found.received_ns - at_ns), delay)
+    sigma = math.hypot(acceleration * apart, target, mounting * float(np.linalg.norm(rates)))
+    return Turning(rates, sigma) if math.isfinite(sigma) else None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -4,6 +4,7 @@ from typing import Protocol, runtime_checkable
 
 from aqualvs.control.vehicle import VehicleState
 from aqualvs.recording.sample import LiveSample
+from aqualvs.scanning.scan import Turning
 from aqualvs.sources.base import PartHealth
 
 
@@ -59,3 +60,6 @@ class HearsVehicle(Protocol):
 
     def vehicle_state(self) -> VehicleState:
         """Return what the autopilot tells; returns at once."""
+
+    def turning(self, at_ns: int) -> Turning | None:
+        """Return what its gyros tell of a time by `time.monotonic_ns`; returns at once."""

@@ -5,11 +5,11 @@ from typing import Any
 
 from aqualvs.control.time_filter import FilteredPosture
 from aqualvs.control.vehicle import VehicleState
-from aqualvs.live.mavlink.ardusub import FRESH_S, DepthChoice, attitude_of
+from aqualvs.live.mavlink.ardusub import FRESH_S, DepthChoice, attitude_of, turning_of
 from aqualvs.live.mavlink.link import LinkOptions, MavlinkLink
 from aqualvs.recording.sample import LiveSample
 from aqualvs.scanning.posture import Posture, Refusal
-from aqualvs.scanning.scan import ScanPoints
+from aqualvs.scanning.scan import ScanPoints, Turning
 from aqualvs.sources.base import PartHealth
 
 # The scanner accepts ranges up to one percent beyond the working range.
@@ -96,6 +96,10 @@ class MavlinkOutput:
     def vehicle_state(self) -> VehicleState:
         """Return depth and heading as far as the autopilot tells them."""
         return VehicleState(depth=self._depth.read(), heading=attitude_of(self.link)[2])
+
+    def turning(self, at_ns: int) -> Turning | None:
+        """Return the vehicle's turning at a time, as far as the autopilot tells it."""
+        return turning_of(self.link, at_ns)
 
     def close(self) -> None:
         """Close the link if it was made here; further calls do nothing."""
