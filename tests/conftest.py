@@ -18,6 +18,7 @@ LONG = (
     "cli/test_batch.py",
     "recovery/test_closed_loop.py",
     "recovery/test_real_light.py",
+    "experiments/test_experiment.py",
     "docs/test_doc_commands.py",
     "cli/test_fuzz.py",
     "calibrate/test_shutter.py",

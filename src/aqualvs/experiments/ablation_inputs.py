@@ -53,10 +53,10 @@ def _run_video(laboratory: Laboratory) -> ExperimentResult:
         dive = laboratory.dive(course, recording=Compression(crf=crf))
         variants.append(_variant(laboratory, dive, f"H.264 crf {crf}", ours=crf == default))
     first, last = variants[1], variants[-1]
+    at_last = f"it is {last.rms[0]:.3f} %" if last.valid_percent else "no frame has a posture"
     return ExperimentResult(
         sentence=f"Against uncompressed pictures H.264 of good quality changes the range error "
-        f"from {variants[0].rms[0]:.3f} to {first.rms[0]:.3f} %; at {last.name} it is "
-        f"{last.rms[0]:.3f} %.",
+        f"from {variants[0].rms[0]:.3f} to {first.rms[0]:.3f} %; at {last.name} {at_last}.",
         findings=findings(variants),
         pictures=(
             ExperimentFigure(

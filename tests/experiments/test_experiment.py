@@ -1,0 +1,55 @@
+"""Every experiment of the catalogue runs, in small pictures and on a few frames of its dives."""
+
+from dataclasses import replace
+from functools import cached_property
+
+import pytest
+
+from aqualvs.experiments import growth_and_sun
+from aqualvs.experiments.experiment import MODULES, experiment
+from aqualvs.experiments.laboratory import Laboratory
+from aqualvs.experiments.page import save_outcome
+from camera_cases import half_size_rig
+
+N_FRAMES = 5
+# Bars for full pictures and whole dives; all others are reached by these, too.
+FOR_FULL_PICTURES = {
+    "changes of the medium noticed as such, the dive into the water among them",
+    "pitch and yaw error that remains, largest (°)",
+    "largest error of the range to the net (%)",
+    "largest error of a single point with the dome model (%)",
+}
+
+
+class BriefLaboratory(Laboratory):
+    """A laboratory with pictures of half the size and few frames of each dive."""
+
+    @cached_property
+    def rig(self):
+        return half_size_rig()
+
+    def dive(self, scenario, rig=None, *, recording=None, point_frames=()):
+        if not point_frames and scenario.n_frames > N_FRAMES:
+            scenario = replace(scenario, fps=N_FRAMES / scenario.duration)
+        return super().dive(scenario, rig, recording=recording, point_frames=point_frames)
+
+
+@pytest.fixture(scope="module")
+def laboratory(tmp_path_factory):
+    """Dives and the calibration are made once, as `reproduce` does it."""
+    return BriefLaboratory(tmp_path_factory.mktemp("tank"))
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_an_experiment_gives_its_results(laboratory, tmp_path, monkeypatch, name):
+    monkeypatch.setattr(growth_and_sun, "_SHOWN", N_FRAMES // 2)
+    found = experiment(name)
+    record = save_outcome(found, found.run(laboratory), tmp_path)
+    told = [record.sentence, *(row.ours for row in record.findings)]
+    assert all(told)
+    assert "nan" not in " ".join(told)
+    missed = {row.what for row in record.findings if row.met is False}
+    assert missed <= FOR_FULL_PICTURES
+    assert record.pictures
+    for one in record.pictures:
+        assert (tmp_path / "figures" / f"{one.file}.png").stat().st_size > 5_000
