@@ -26,7 +26,7 @@ from aqualvs.report.html import Card
 from aqualvs.results.run_request import check_fits
 from aqualvs.scanner import Scanner
 from aqualvs.scanning.posture import Posture
-from aqualvs.scanning.row_motion import REACH, rates_beside
+from aqualvs.scanning.row_motion import REACH, motion_beside
 from aqualvs.scanning.scan import Scan, ScanPoints
 from aqualvs.sources import FrameSource, open_source
 from aqualvs.terminal import progress
@@ -193,7 +193,7 @@ def _text(found: ShutterCalibration) -> str:
 def _warp(scan: Scan, height: int) -> _Warp | None:
     """Return how the points of a posture are bent by rates that last from row to row."""
     posture, points = scan.posture, scan.points
-    if not isinstance(posture, Posture) or posture.by_rates is None or not points.used.any():
+    if not isinstance(posture, Posture) or posture.by_motion is None or not points.used.any():
         return None
     seen = points.points_in_dome[points.used]
     m = posture.normal_in_dome / posture.range
@@ -248,14 +248,15 @@ def _equations(
     scaled = [_with_readout(scan, readout) for scan in scans]
     for i, warp in warps:
         beside = [*scaled[max(i - REACH, 0) : i], *scaled[i + 1 : i + 1 + REACH]]
-        rates, _ = rates_beside(scaled[i], beside)
-        terms = np.column_stack([-rates, np.eye(3)])
+        motion, _ = motion_beside(scaled[i], beside)
+        terms = np.column_stack([-motion[:3], np.eye(3)])
         yield terms.T @ warp.matrix @ terms, terms.T @ warp.right
 
 
 def _with_readout(scan: Scan, readout: float) -> Scan:
     posture = scan.posture
-    if not isinstance(posture, Posture) or posture.by_rates is None:
+    if not isinstance(posture, Posture) or posture.by_motion is None:
         return scan
-    by_rates = posture.by_rates * (readout / _NOMINAL)
-    return replace(scan, posture=replace(posture, by_rates=by_rates))
+    share = readout / _NOMINAL
+    by_motion = posture.by_motion * np.repeat([share, share**2], 3)
+    return replace(scan, posture=replace(posture, by_motion=by_motion))
