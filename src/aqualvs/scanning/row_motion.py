@@ -143,9 +143,12 @@ class RowMotion:
             return scan
         motion, covariance = motion_beside(scan, beside)
         m, m_rate = _at_middle(posture, by_motion, motion)
+        off = self._off_by_light(motion[:3], posture.range)
         corrected = replace(
             self._on(posture, m),
-            covariance=posture.covariance + by_motion @ covariance @ by_motion.T,
+            covariance=posture.covariance
+            + by_motion @ covariance @ by_motion.T
+            + np.outer(off, off),
         )
         points, seen = scan.points, scan.points.points_in_dome
         velocity = _velocity(m, m_rate, seen)
@@ -189,6 +192,19 @@ class RowMotion:
             slant_range=distance / approach if approach > 0.0 else float("inf"),
             by_motion=None,
         )
+
+    def _off_by_light(self, rates: FloatArray, distance: float) -> FloatArray:
+        """Return the error (3,) of a posture by light that changes during the exposure.
+
+        Stripes are brighter while the target is near, and so their mean is of another time than the
+        exposure's middle.
+        """
+        # Of the distance, by which light falls: a sheet spreads, its stripe is seen smaller, and
+        # water dims it to and fro.
+        power = 3.0
+        late = power * rates[0] / distance * self._shutter.exposure**2 / 12.0
+        error: FloatArray = late * rates
+        return error
 
     def _on(self, posture: Posture, m: FloatArray) -> Posture:
         """Return a posture as that to the plane m·X = 1."""
