@@ -6,6 +6,7 @@ from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
+import av
 import cv2
 import numpy as np
 import pytest
@@ -194,13 +195,27 @@ def test_the_truth_of_fields_is_not_compared_with_whole_pictures(tmp_path, dive)
 
 def test_a_run_with_the_wrong_shutter_says_so(tmp_path, dive, rig):
     few = {"frames": FrameWindow(0, 2), "report": False}
+    with av.open(str(dive)) as video:
+        images = [picture.to_ndarray(format="bgr24") for picture in video.decode(video=0)]
+    for name, shown in (("combed", images), ("whole", [one[::2].repeat(2, 0) for one in images])):
+        (tmp_path / name).mkdir()
+        for i, image in enumerate(shown):
+            cv2.imwrite(str(tmp_path / name / f"{i:02d}.png"), image)
     for source, of, said in (
         (dive, DEMO / "rig.yaml", "warning: the video is interlaced (the stream says so)"),
         (DEMO / "dive.mp4", rig, "warning: the rig says that the video is interlaced"),
         (dive, rig, None),
+        (
+            tmp_path / "combed",
+            DEMO / "rig.yaml",
+            "warning: the video is interlaced (rows of what moves are combed)",
+        ),
+        (tmp_path / "whole", rig, "warning: the rig says that the video is interlaced"),
+        (tmp_path / "whole", DEMO / "rig.yaml", None),
         (DEMO / "dive.mp4", DEMO / "rig.yaml", None),
     ):
-        out = tmp_path / f"{Path(source).parent.name}-{Path(of).parent.name}"
+        place = Path(source)
+        out = tmp_path / f"{place.parent.name}-{place.stem}-{Path(of).parent.name}"
         request = RunRequest(source=str(source), rig=of, out=out, **few)
         told = [line for line in summary_lines(request, run(request)) if "warning" in line]
         assert bool(told) == (said is not None)

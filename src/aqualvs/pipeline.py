@@ -18,7 +18,12 @@ from aqualvs.results.summary import RunSummary, TruthComparison, read_truth
 from aqualvs.scanner import Scanner, ScannerOptions
 from aqualvs.scanning.agreement import LaserAgreement
 from aqualvs.sources import FrameSource, VideoSource, open_source
-from aqualvs.sources.fields import FieldEvidence, source_of_frames, source_of_pictures
+from aqualvs.sources.fields import (
+    FieldEvidence,
+    first_pairs,
+    source_of_frames,
+    source_of_pictures,
+)
 from aqualvs.sources.video import sampled_pictures
 from aqualvs.terminal import StopSignals, progress
 from aqualvs.workers.frame_results import FrameScanner
@@ -253,11 +258,17 @@ def summary_for(dive: OpenDive) -> RunSummary:
 
 
 def _shutter_warnings(dive: OpenDive) -> list[str]:
-    """Return a warning if a video file is interlaced and the rig is not, or the reverse."""
+    """Return a warning if the pictures of a file are interlaced and the rig is not, or reverse."""
     path, pictures = Path(dive.request.source), source_of_pictures(dive.source)
-    if not isinstance(pictures, VideoSource) or not path.is_file():
+    if isinstance(pictures, VideoSource):
+        # A stream cannot be read twice.
+        groups, first_field = sampled_pictures(path) if path.is_file() else ([], None)
+        evidence = FieldEvidence.of(groups, first_field)
+    elif dive.is_replay:
+        # Of most recordings there are stripes alone.
         return []
-    evidence = FieldEvidence.of(*sampled_pictures(path))
+    else:
+        evidence = FieldEvidence.of(first_pairs(pictures))
     wrong = evidence.contradiction(dive.rig.shutter, pictures.fps)
     return [wrong] if wrong else []
 

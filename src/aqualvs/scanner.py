@@ -263,15 +263,14 @@ class Scanner:
         if self._row_motion is None:
             return self._posture_estimator.measure(candidates, subsegments, target)
         on_target = target.members[subsegments.of_candidate]
-        still, rates = self._row_motion.stilled(candidates, on_target, target.plane)
+        still = self._row_motion.stilled(candidates, on_target, target.plane)
         found = self._posture_estimator.measure(still, subsegments, target)
         posture = found.posture
         if not isinstance(posture, Posture) or found.weights is None:
             return found
-        surface, weights = _fitted(posture, found.patch, still.points, found.weights)
-        return replace(
-            found, posture=self._row_motion.as_exposed(posture, surface, still, weights, rates)
-        )
+        surface, weights = _fitted(posture, found.patch, candidates.points, found.weights)
+        exposed = self._row_motion.as_exposed(posture, surface, still, candidates, weights)
+        return replace(found, posture=exposed)
 
     def _with_rig_covariance(self, found: Measurement, candidates: Candidates) -> Posture | Refusal:
         """Return the posture with its covariance by the rig's uncertainty."""

@@ -29,8 +29,8 @@ def rig_with(shutter):
 
 
 def swinging(t):
-    """Up to 20 degrees/s in pitch and yaw, and 0.1 m/s."""
-    turn = np.deg2rad([4.0, 5.0]) * np.sin(2.0 * np.pi * t / np.array([1.26, 1.57]))
+    """Up to 40 degrees/s in pitch and yaw, and 0.1 m/s."""
+    turn = np.deg2rad([8.0, 10.0]) * np.sin(2.0 * np.pi * t / np.array([1.26, 1.57]))
     pose = dome_from_target(0.55 + 0.03 * np.sin(2.0 * np.pi * t / 1.9), *turn)
     return Scene(dome_from_scene=pose, walls=(Wall(),), target="wall")
 

@@ -7,8 +7,9 @@ import pytest
 
 from aqualvs.optics.shutter import AT_ONCE, Shutter, ShutterKind
 from aqualvs.scanner import Scanner
+from aqualvs.scanning import row_motion
 from aqualvs.scanning.posture import Posture, Reason, Refusal
-from aqualvs.scanning.row_motion import RowMotion, rates_beside
+from aqualvs.scanning.row_motion import RowMotion, motion_beside
 from aqualvs.scanning.scan import Frame, Scan, ScanPoints, Turning, planes_of_image
 from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenario import dome_from_target
@@ -41,16 +42,20 @@ def scene_at(t):
 
 
 @pytest.fixture(scope="module")
-def scans():
+def frames():
     """Consecutive pictures of a wall before a vehicle that turns and backs off."""
-    eye, scanner = Renderer(ROLLING), Scanner(ROLLING)
-    found = []
+    eye, found = Renderer(ROLLING), []
     for i in range(N):
         t = STEP_S * i
         image = eye.take(scene_at, t, np.random.default_rng(i)).image
-        frame = Frame(i, t, *planes_of_image(np.ascontiguousarray(image[:, :, ::-1])))
-        found.append(scanner.process(frame))
+        found.append(Frame(i, t, *planes_of_image(np.ascontiguousarray(image[:, :, ::-1]))))
     return found
+
+
+@pytest.fixture(scope="module")
+def scans(frames):
+    scanner = Scanner(ROLLING)
+    return [scanner.process(frame) for frame in frames]
 
 
 def error(scan, i):
@@ -71,7 +76,79 @@ def test_a_posture_is_that_of_the_pictures_middle(scans):
     assert np.all(np.abs(error(found, 2)) < [1.0, 0.15, 0.15])
     sigma = np.sqrt(np.diag(found.posture.covariance))
     assert np.all(np.abs(found.posture.numbers - truth(2)) < 3.0 * sigma)
-    assert found.posture.by_rates is None
+    assert found.posture.by_motion is None
+
+
+def test_a_wall_that_leans_for_its_motion_is_no_nearer(scans):
+    """It leans by 1.1 degrees, which is 0.2 permille of the range."""
+    motion = RowMotion(ROLLING)
+    found = [motion.correct(scan, [one for one in scans if one is not scan]) for scan in scans]
+    errors = np.array([error(one, i) for i, one in enumerate(found)])
+    assert np.all(np.abs(errors.mean(axis=0)) < [0.06, 0.04, 0.04])
+
+
+def test_the_rates_by_one_frame_leave_no_trace(frames, scans, monkeypatch):
+    fitted = row_motion._fit_rates
+
+    def other_rates(points, sigma, times, m):
+        m, m_rate = fitted(points, sigma, times, m)
+        # 0.3 m/s towards the wall.
+        return m, m_rate + 0.3 / truth(2)[0] * m
+
+    monkeypatch.setattr(row_motion, "_fit_rates", other_rates)
+    found = Scanner(ROLLING).process(frames[2]).posture
+    assert abs(found.by_motion[1, 0] * 0.3) > np.deg2rad(1.0)
+    off = (found.numbers - scans[2].posture.numbers) / [1e-3 * truth(2)[0], *2 * [np.pi / 180.0]]
+    assert np.all(np.abs(off) < [0.03, 0.006, 0.006])
+
+
+def test_a_posture_is_that_of_a_vehicle_that_brakes():
+    """Points of an even grid show the mean of their times, without noise."""
+    readout, exposure = 0.03, 0.06
+    rig = rig_with(Shutter(kind=ShutterKind.ROLLING, readout=readout, exposure=exposure))
+    accelerations, jerks = np.array([0.6, 0.5, -0.4]), np.array([1.0, 2.0, -1.0])
+
+    def plane(t):
+        distance, pitch, yaw = START + RATES * t + accelerations * t**2 / 2 + jerks * t**3 / 6
+        normal = np.array([np.tan(yaw), 1.0, np.tan(pitch)])
+        return normal / np.linalg.norm(normal) / distance
+
+    x, z = (one.ravel() for one in np.meshgrid([-0.3, 0.1, 0.25], np.linspace(0.3, -0.3, 51)))
+    times = np.repeat(np.linspace(-0.5, 0.5, 51) * readout, 3)[:, None]
+    within = np.linspace(-0.5, 0.5, 401) * exposure
+
+    def scan(i, middle):
+        shown = [
+            np.mean([plane(middle + t + one) for one in within], axis=0) for t in times[::3, 0]
+        ]
+        rays = np.column_stack([x, np.ones(len(x)), z])
+        points = rays / np.sum(rays * np.repeat(shown, 3, axis=0), axis=1)[:, None]
+        fit = np.linalg.solve(points.T @ points, points.T)
+        m = fit.sum(axis=1)
+        by_m = row_motion._by_m(m)
+        by_motion = [
+            by_m @ fit @ (points * share) @ np.linalg.inv(by_m)
+            for share in (times, 0.5 * (times**2 + exposure**2 / 12.0))
+        ]
+        posture = Posture(
+            range=1.0 / np.linalg.norm(m),
+            pitch=np.arctan2(m[2], m[1]),
+            yaw=np.arctan2(m[0], m[1]),
+            covariance=1e-10 * np.eye(3),
+            normal_in_dome=m / np.linalg.norm(m),
+            slant_range=0.6,
+            nearest=0.6,
+            n_points=len(points),
+            rms=0.0,
+            by_motion=np.hstack(by_motion),
+        )
+        return Scan(i, middle, posture, ScanPoints.none(), 1.33)
+
+    lone = scan(0, 0.0)
+    found = RowMotion(rig).correct(lone, [scan(i, 0.1 * i) for i in (-2, -1, 1, 2)]).posture
+    assert np.all(np.abs(found.numbers - START) < [1e-5, 1e-4, 1e-5])
+    # As exposed it is off by 1.3 degrees, and by the mean of a motion that brakes.
+    assert np.all(np.abs(lone.posture.numbers - START) > [2e-4, 2e-2, 5e-5])
 
 
 @pytest.mark.parametrize("beside", [[0, 1], [3, 4], [3]])
@@ -138,7 +215,7 @@ def test_motion_is_no_scatter(scans):
     frame = Frame(0, 0.0, *planes_of_image(np.ascontiguousarray(image[:, :, ::-1])))
     still = Scanner(rig).process(frame).posture
     assert isinstance(still, Posture)
-    assert still.by_rates is None
+    assert still.by_motion is None
     ratio = np.diag(scans[2].posture.covariance) / np.diag(still.covariance)
     assert np.all(ratio < 1.5**2)
 
@@ -155,9 +232,9 @@ def turning_at(t, sigma_deg_s=1.0):
 def test_gyros_tell_the_rates_of_pitch_and_yaw(scans):
     alone = scans[2]
     turning = turning_at(2 * STEP_S, 0.01)
-    rates, covariance = rates_beside(replace(alone, turning=turning), [])
-    assert rates[1:] == pytest.approx(RATES[1:], abs=np.deg2rad(0.1))
-    assert np.all(np.sqrt(np.diag(covariance)[1:]) < np.deg2rad(0.02))
+    motion, covariance = motion_beside(replace(alone, turning=turning), [])
+    assert motion[1:3] == pytest.approx(RATES[1:], abs=np.deg2rad(0.1))
+    assert np.all(np.sqrt(np.diag(covariance)[1:3]) < np.deg2rad(0.02))
     # They tell nothing of how the range changes.
     assert np.sqrt(covariance[0, 0]) == pytest.approx(0.3, rel=0.01)
 

@@ -15,6 +15,7 @@ import pytest
 
 from aqualvs.errors import OptionError, SourceError
 from aqualvs.sources import bags, image_messages, open_feed, open_source
+from aqualvs.sources.fields import FieldEvidence, first_pairs
 from aqualvs.sources.image_messages import ImageMessage, planes_of_message, protobuf_fields
 from aqualvs.sources.mcap_file import decompressed
 from shell_cases import luma_level, picture
@@ -191,6 +192,7 @@ def test_video_of_fields_says_so(tmp_path):
     for given, interlaced in ((packets, True), (None, False)):
         path = write_mcap(tmp_path / f"{interlaced}.mcap", [compressed_video(given)])
         with open_source(path) as source:
+            assert FieldEvidence.of(first_pairs(source)).is_marked == interlaced
             assert {frame.is_interlaced for frame in source} == {interlaced}
 
 

@@ -22,22 +22,24 @@ from batch_cases import DEMO, RESULTS, demo_dive, without_times, work_for
 RIG = replace(example_rig(), shutter=Shutter(kind=ShutterKind.ROLLING, readout=0.02))
 RATES = np.array([0.1, 0.2, -0.3])
 BY_RATES = np.array([[0.009, 0.0, 0.0], [0.08, -0.008, -0.005], [0.001, 0.0, -0.003]])
+BY_MOTION = np.hstack([BY_RATES, np.zeros((3, 3))])
 
 
 def result(i):
     """A frame of a vehicle that moves at constant rates, as its rows show it."""
     distance, pitch, yaw = np.array([0.6, 0.02, -0.01]) + RATES * 0.04 * i + BY_RATES @ RATES
+    normal = np.array([np.tan(yaw), 1.0, np.tan(pitch)])
     posture = Posture(
         range=distance,
         pitch=pitch,
         yaw=yaw,
         covariance=1e-8 * np.eye(3),
-        normal_in_dome=np.array([np.tan(yaw), 1.0, np.tan(pitch)]),
+        normal_in_dome=normal / np.linalg.norm(normal),
         slant_range=0.6,
         nearest=0.6,
         n_points=100,
         rms=0.0,
-        by_rates=BY_RATES,
+        by_motion=BY_MOTION,
     )
     scan = Scan(i, 0.04 * i, posture, ScanPoints.none(), 1.33)
     return FrameResult(scan, replace(posture, range=distance + 0.02))
@@ -78,7 +80,7 @@ def test_none_is_lost_where_the_source_breaks_off():
 def test_results_of_other_shutters_are_as_they_were():
     blocks = list(corrected_rows(in_blocks_of(4), example_rig()))
     assert [len(block) for block in blocks] == 5 * [4]
-    assert blocks[0][0].scan.posture.by_rates is BY_RATES
+    assert blocks[0][0].scan.posture.by_motion is BY_MOTION
 
 
 def test_runs_and_batches_of_a_rolling_shutter_are_the_same(tmp_path, monkeypatch):

@@ -3,7 +3,8 @@
 Points that are read as if all rows had been exposed at once lie on no plane while the vehicle
 turns: a pitch that changes bends it, a yaw that changes twists it, in proportion to the readout.
 The rates come from the frames beside each, as in a run. What does not change with them, such as
-errors of the rig, is fitted beside the readout.
+errors of the rig, is fitted beside the readout, and so is the warp by the change of range: it is so
+slight that errors of the picture outweigh it.
 """
 
 from collections.abc import Iterator, Sequence
@@ -26,15 +27,17 @@ from aqualvs.report.html import Card
 from aqualvs.results.run_request import check_fits
 from aqualvs.scanner import Scanner
 from aqualvs.scanning.posture import Posture
-from aqualvs.scanning.row_motion import REACH, rates_beside
+from aqualvs.scanning.row_motion import REACH, motion_beside
 from aqualvs.scanning.scan import Scan, ScanPoints
 from aqualvs.sources import FrameSource, open_source
 from aqualvs.terminal import progress
 
 # Errors by the rates are proportional to the readout: any will do to find them.
 _NOMINAL = 0.02
-# Parts of the dive whose disagreement gives sigma, and the least frames in all.
-_N_PARTS, _MIN_FRAMES = 10, 50
+# Parts of the dive whose disagreement gives sigma, in seconds: longer than errors of the picture
+# stay alike while a vehicle swings, and rates are told by the same frames. Their least number, and
+# the least frames in all.
+_PART_S, _MIN_PARTS, _MIN_FRAMES = 0.5, 4, 50
 # The lasers move with the camera: a stripe moves by the change of range and tilt alone, 50 px/s and
 # less, and its width changes more by distance and brightness than by blur.
 _EXPOSURE = "The exposure is not observable from stripes: what the rig file says of it stays."
@@ -193,7 +196,7 @@ def _text(found: ShutterCalibration) -> str:
 def _warp(scan: Scan, height: int) -> _Warp | None:
     """Return how the points of a posture are bent by rates that last from row to row."""
     posture, points = scan.posture, scan.points
-    if not isinstance(posture, Posture) or posture.by_rates is None or not points.used.any():
+    if not isinstance(posture, Posture) or posture.by_motion is None or not points.used.any():
         return None
     seen = points.points_in_dome[points.used]
     m = posture.normal_in_dome / posture.range
@@ -215,47 +218,56 @@ def _warp(scan: Scan, height: int) -> _Warp | None:
 
 def _solve(scans: Sequence[Scan], warps: Sequence[tuple[int, _Warp]]) -> ShutterCalibration:
     """Return the readout that explains the warps, and its sigma by the parts of the dive."""
-    readout, share = 0.0, np.arange(len(warps)) * _N_PARTS // len(warps)
+    readout = 0.0
     # The rates are corrected by the readout, which converges by a factor of ten or more a round.
     rounds = 6
     for _ in range(rounds):
-        # Of readout and static part.
         equations = list(_equations(scans, warps, readout))
         matrices = np.array([matrix for matrix, _ in equations])
         rights = np.array([right for _, right in equations])
         inverse = np.linalg.pinv(matrices.sum(axis=0))
-        solved = inverse @ rights.sum(axis=0)
-        readout = float(np.clip(solved[0], -1.0, 1.0))
-    pulls = rights - matrices @ solved
-    sums = np.array([pulls[share == part].sum(axis=0) for part in range(_N_PARTS)])
-    covariance = inverse @ (sums.T @ sums) @ inverse * _N_PARTS / (_N_PARTS - 1)
+        readout = float(np.clip(inverse[0] @ rights.sum(axis=0), -1.0, 1.0))
     times = np.array([warp.scan.time_s for _, warp in warps])
-    steps = [sums[part][0] / matrices[share == part].sum(axis=0)[0, 0] for part in range(_N_PARTS)]
+    n_parts = max(round(float(np.ptp(times)) / _PART_S), _MIN_PARTS)
+    share = np.arange(len(warps)) * n_parts // len(warps)
+    # Jackknife: the readout without each of the parts (Efron and Stein 1981).
+    left = [share != part for part in range(n_parts)]
+    without = np.array(
+        [np.linalg.pinv(matrices[one].sum(axis=0))[0] @ rights[one].sum(axis=0) for one in left]
+    )
+    # Few parts tell their scatter badly: the variance is that of Student's distribution.
+    variance = float((n_parts - 1) * np.var(without)) * (n_parts - 1) / (n_parts - 3)
     return ShutterCalibration(
         readout=readout,
         # Without motion the noise of the rates is taken for some, and chance may agree with it.
-        sigma=float(np.sqrt(max(covariance[0, 0], inverse[0, 0]))),
+        sigma=float(np.sqrt(max(variance, inverse[0, 0]))),
         n_frames=len(warps),
-        times=np.array([times[share == part].mean() for part in range(_N_PARTS)]),
-        parts=readout + np.array(steps),
+        times=np.array([times[share == part].mean() for part in range(n_parts)]),
+        parts=n_parts * without.mean() - (n_parts - 1) * without,
     )
 
 
 def _equations(
     scans: Sequence[Scan], warps: Sequence[tuple[int, _Warp]], readout: float
 ) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Yield the normal equations (4, 4) and (4,) of each frame, with rates for a readout."""
+    """Yield the normal equations of each frame, with rates for a readout.
+
+    Unknowns (5): the readout, the warp by the change of range, and the static one.
+    """
     scaled = [_with_readout(scan, readout) for scan in scans]
     for i, warp in warps:
         beside = [*scaled[max(i - REACH, 0) : i], *scaled[i + 1 : i + 1 + REACH]]
-        rates, _ = rates_beside(scaled[i], beside)
-        terms = np.column_stack([-rates, np.eye(3)])
+        motion, _ = motion_beside(scaled[i], beside)
+        of_range, of_pitch, of_yaw = motion[:3].tolist()
+        moved = [[0.0, -of_pitch, -of_yaw], [-of_range, 0.0, 0.0]]
+        terms = np.column_stack([*moved, np.eye(3)])
         yield terms.T @ warp.matrix @ terms, terms.T @ warp.right
 
 
 def _with_readout(scan: Scan, readout: float) -> Scan:
     posture = scan.posture
-    if not isinstance(posture, Posture) or posture.by_rates is None:
+    if not isinstance(posture, Posture) or posture.by_motion is None:
         return scan
-    by_rates = posture.by_rates * (readout / _NOMINAL)
-    return replace(scan, posture=replace(posture, by_rates=by_rates))
+    share = readout / _NOMINAL
+    by_motion = posture.by_motion * np.repeat([share, share**2], 3)
+    return replace(scan, posture=replace(posture, by_motion=by_motion))

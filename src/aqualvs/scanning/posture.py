@@ -101,10 +101,10 @@ class Posture:
         Of a curved net along the horizontal and along the vertical, in 1/m, and their standard
         deviations; positive where the net recedes beside the point nearest to the vehicle. Range,
         pitch and yaw are then those of the tangent plane at that point. None for a plane.
-    by_rates : array, shape (3, 3), or None
-        Error of (range, pitch, yaw) by their rates, in seconds, m and rad, where the rows of a
-        rolling shutter show the target at different times; `row_motion` corrects it. None where it
-        has been corrected, and where all rows are exposed at once.
+    by_motion : array, shape (3, 6), or None
+        Error of (range, pitch, yaw) by their rates and accelerations, in s and s², m and rad, where
+        the rows of a rolling shutter show the target at different times; `row_motion` corrects it.
+        None where it has been corrected, and where all rows are exposed at once.
     """
 
     range: float
@@ -119,7 +119,7 @@ class Posture:
     curvature: tuple[float, float] | None = None
     sigma_curvature: tuple[float, float] | None = None
     rig_covariance: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
-    by_rates: FloatArray | None = None
+    by_motion: FloatArray | None = None
 
     def __bool__(self) -> Literal[True]:
         """Return True: a posture is an answer."""

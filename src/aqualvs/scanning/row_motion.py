@@ -1,12 +1,13 @@
 """Correction of postures for the motion from row to row of a rolling shutter, and blur named.
 
-Every stripe point is seen at the time of its row, so that a posture is off by its `by_rates` times
-the rates of range, pitch and yaw. The rates come from the frames beside it, with the frames' own
-errors by them: in frame j, at time t from the frame that is corrected,
+Every stripe point is seen at the time of its row, so that a posture is off by its `by_motion` times
+the rates and accelerations of range, pitch and yaw. These come from the frames beside it, with the
+frames' own errors by them: in frame j, at time t from the frame that is corrected,
 
-    measured_j = posture + t rates + t²/2 acceleration + by_rates_j (rates + t acceleration) + e_j.
+    measured_j = posture + t rates + t²/2 acceleration
+                 + by_motion_j (rates + t acceleration, acceleration) + e_j.
 
-Frames beside it never smooth a posture: it is moved by its `by_rates` times the rates, no more.
+Frames beside it never smooth a posture: it is moved by its `by_motion` times both, no more.
 Gyros, where they are known, tell the rates of pitch and yaw too: most of all of a lone frame.
 
 The points of one frame alone tell the rates too, but worse: they bend and twist a plane. That is
@@ -24,7 +25,7 @@ from aqualvs.optics.rig import Rig
 from aqualvs.optics.rig_covariance import FittedSurface, posture_by_plane
 from aqualvs.scanning.candidates import Candidates
 from aqualvs.scanning.plane_fit import TUKEY
-from aqualvs.scanning.posture import Posture, Reason, Refusal
+from aqualvs.scanning.posture import Posture, Reason, Refusal, range_pitch_yaw
 from aqualvs.scanning.scan import Scan, Turning
 
 REACH = 2
@@ -33,9 +34,11 @@ REACH = 2
 # Frames further away tell little of the rates now.
 _REACH_S = 0.25
 # Standard deviations of a small vehicle's motion near a net, before anything is measured: of the
-# rates of range, pitch and yaw (m/s, rad/s), and of their changes (m/s², rad/s²).
+# rates of range, pitch and yaw (m/s, rad/s), of their changes (m/s², rad/s²), and of the changes of
+# these (m/s³, rad/s³): swings of 2 s.
 _RATES = np.array([0.3, np.deg2rad(20.0), np.deg2rad(20.0)])
 _ACCELERATIONS = np.array([0.5, np.deg2rad(40.0), np.deg2rad(40.0)])
+_JERKS = np.array([1.5, np.deg2rad(120.0), np.deg2rad(120.0)])
 # Some of the points are enough for it. They share the errors of their stripe: all together they
 # count as fewer still, so that a rate of which one frame tells little, such as that of the range,
 # stays near zero.
@@ -59,10 +62,8 @@ class RowMotion:
         self._shutter, self._height = rig.shutter, rig.size_px[1]
         self._axis_in_dome = rig.dome_from_cam.rotate([0.0, 0.0, 1.0])
 
-    def stilled(
-        self, candidates: Candidates, on_target: BoolArray, plane: Plane
-    ) -> tuple[Candidates, FloatArray]:
-        """Return candidates without the motion that one frame shows, and its rates (3,).
+    def stilled(self, candidates: Candidates, on_target: BoolArray, plane: Plane) -> Candidates:
+        """Return candidates without the motion that one frame shows.
 
         Parameters
         ----------
@@ -79,41 +80,47 @@ class RowMotion:
         sigma = np.abs(candidates.sensitivity[seen] @ m) * candidates.sigma_px[seen] + 1e-12
         m, m_rate = _fit_rates(candidates.points[seen], sigma, times[seen], m)
         still = candidates.points - times[:, None] * _velocity(m, m_rate, candidates.points)
-        return replace(candidates, points=still), _by_m(m) @ m_rate
+        return replace(candidates, points=still)
 
     def as_exposed(
         self,
         posture: Posture,
         surface: FittedSurface,
-        candidates: Candidates,
+        still: Candidates,
+        seen: Candidates,
         weights: FloatArray,
-        rates: FloatArray,
     ) -> Posture:
         """Return the posture to `stilled` candidates as that to the candidates themselves.
 
-        It has `by_rates`, and the noise of `rates` is no longer in it.
+        It has `by_motion`, and how `stilled` moved the points is no longer in it.
 
         Parameters
         ----------
         posture : Posture
         surface : FittedSurface
             Surface of the posture.
-        candidates : Candidates
-            N of them, to which it was fitted.
+        still, seen : Candidates
+            N of them, to which it was fitted, and as they were before.
         weights : array, shape (N,)
             1 over the variance of the residual, or 0.
-        rates : array, shape (3,)
-            From `stilled`.
         """
         m = posture.normal_in_dome / posture.range
         terms = surface.terms * weights[:, None]
         matrix = terms.T @ surface.terms + np.diag(surface.prior)
-        # At its time t a point lies on the plane m + t rate, and so off m by -t rate·X.
-        moved = terms.T @ (candidates.points * self._times(candidates.pixels)[:, None])
+        # At its time t a point lies on the plane m + t rate + t²/2 acceleration, and so off m by
+        # the rest times X. An exposure shows the mean of its own times.
+        t = self._times(seen.pixels)[:, None]
+        half_square = 0.5 * (t**2 + self._shutter.exposure**2 / 12.0)
+        back = (seen.points - still.points) @ m
+        moved = terms.T @ np.hstack([seen.points * t, seen.points * half_square, -back[:, None]])
         scale = float(np.linalg.norm(surface.normal) / np.linalg.norm(m))
-        by_m_rate = -scale * surface.posture @ np.linalg.solve(matrix, moved)
-        by_rates: FloatArray = by_m_rate @ np.linalg.inv(_by_m(m))
-        return replace(self.moved(posture, by_rates @ rates), by_rates=by_rates)
+        by_m = _by_m(m)
+        m_moved = -scale * np.linalg.solve(by_m, surface.posture @ np.linalg.solve(matrix, moved))
+        m = m + m_moved[:, 6]
+        by_m = _by_m(m)
+        to_m = np.linalg.inv(by_m)
+        by_motion = by_m @ np.hstack([m_moved[:, :3] @ to_m, m_moved[:, 3:6] @ to_m])
+        return replace(self._on(posture, m), by_motion=by_motion)
 
     def correct(self, scan: Scan, beside: Sequence[Scan]) -> Scan:
         """Return a scan with posture and points as they are at the picture's middle.
@@ -132,16 +139,19 @@ class RowMotion:
         posture = scan.posture
         if isinstance(posture, Refusal):
             return replace(scan, posture=self._with_blur_named(scan, posture, beside))
-        if posture.by_rates is None:
+        by_motion = posture.by_motion
+        if by_motion is None:
             return scan
-        rates, covariance = rates_beside(scan, beside)
+        motion, covariance = motion_beside(scan, beside)
+        m, m_rate = _at_middle(posture, by_motion, motion)
+        off = self._off_by_light(motion[:3], posture.range)
         corrected = replace(
-            self.moved(posture, -posture.by_rates @ rates),
-            covariance=posture.covariance + posture.by_rates @ covariance @ posture.by_rates.T,
+            self._on(posture, m),
+            covariance=posture.covariance
+            + by_motion @ covariance @ by_motion.T
+            + np.outer(off, off),
         )
         points, seen = scan.points, scan.points.points_in_dome
-        m = posture.normal_in_dome / posture.range
-        m_rate: FloatArray = np.linalg.inv(_by_m(m)) @ rates
         velocity = _velocity(m, m_rate, seen)
         moved = seen - self._times(points.pixels)[:, None] * velocity
         if points.used.any():
@@ -170,9 +180,9 @@ class RowMotion:
 
     def moved(self, posture: Posture, by: FloatArray) -> Posture:
         """Return a posture with a change (3,) of range, pitch and yaw, in m and rad."""
-        distance, pitch, yaw = (posture.numbers + by).tolist()
-        normal = np.array([np.tan(yaw), 1.0, np.tan(pitch)])
-        normal /= np.linalg.norm(normal)
+        numbers = posture.numbers + by
+        distance, pitch, yaw = numbers.tolist()
+        normal = distance * _plane_of(numbers)
         approach = float(normal @ self._axis_in_dome)
         return replace(
             posture,
@@ -181,8 +191,25 @@ class RowMotion:
             yaw=yaw,
             normal_in_dome=normal,
             slant_range=distance / approach if approach > 0.0 else float("inf"),
-            by_rates=None,
+            by_motion=None,
         )
+
+    def _off_by_light(self, rates: FloatArray, distance: float) -> FloatArray:
+        """Return the error (3,) of a posture by light that changes during the exposure.
+
+        Stripes are brighter while the target is near, and so their mean is of another time than the
+        exposure's middle.
+        """
+        # Of the distance, by which light falls: a sheet spreads, its stripe is seen smaller, and
+        # water dims it to and fro.
+        power = 3.0
+        late = power * rates[0] / distance * self._shutter.exposure**2 / 12.0
+        error: FloatArray = late * rates
+        return error
+
+    def _on(self, posture: Posture, m: FloatArray) -> Posture:
+        """Return a posture as that to the plane m·X = 1."""
+        return self.moved(posture, np.array(range_pitch_yaw(m)) - posture.numbers)
 
     def _times(self, pixels: FloatArray) -> FloatArray:
         return self._shutter.row_times(pixels[:, 1], self._height)
@@ -216,8 +243,10 @@ def _fit_rates(
     return both[:3], both[3:]
 
 
-def rates_beside(scan: Scan, beside: Sequence[Scan]) -> tuple[FloatArray, FloatArray]:
-    """Return the rates (3,) of range, pitch and yaw at a scan, and their covariance (3, 3).
+def motion_beside(scan: Scan, beside: Sequence[Scan]) -> tuple[FloatArray, FloatArray]:
+    """Return the motion (6,) at a scan, and its covariance (6, 6).
+
+    It is the rates of range, pitch and yaw, then their accelerations.
 
     Parameters
     ----------
@@ -227,54 +256,96 @@ def rates_beside(scan: Scan, beside: Sequence[Scan]) -> tuple[FloatArray, FloatA
         As in `RowMotion.correct`.
     """
     posture = scan.posture
-    if not isinstance(posture, Posture) or posture.by_rates is None:
+    if not isinstance(posture, Posture) or posture.by_motion is None:
         raise ValueError(f"frame {scan.index}: no posture as its rows were exposed")
-    # Unknowns: posture, rates, accelerations, relative to the scan's own measurement.
-    matrix, right = np.zeros((9, 9)), np.zeros(9)
-    prior = np.concatenate([_RATES, _ACCELERATIONS]) ** -2.0
-    matrix[range(3, 9), range(3, 9)] = prior
+    # Unknowns: posture and motion, relative to the scan's own measurement, and how accelerations
+    # change, of which the error during a picture is nothing.
+    matrix, right = np.zeros((12, 12)), np.zeros(12)
+    prior = np.concatenate([_RATES, _ACCELERATIONS, _JERKS]) ** -2.0
+    matrix[range(3, 12), range(3, 12)] = prior
     # A frame whose squared Mahalanobis distance is larger (once in 1000 times by chance, 3 values)
     # shows another surface, or is wrong.
     gate = 16.27
     for one in (scan, *beside):
         found, t = one.posture, one.time_s - scan.time_s
-        if not isinstance(found, Posture) or found.by_rates is None or abs(t) > _REACH_S:
+        if not isinstance(found, Posture) or found.by_motion is None or abs(t) > _REACH_S:
             continue
         off = found.numbers - posture.numbers
-        by = np.hstack([np.eye(3), t * np.eye(3) + found.by_rates])
-        by = np.hstack([by, 0.5 * t**2 * np.eye(3) + t * found.by_rates])
+        by_rates, by_accelerations = np.hsplit(found.by_motion, 2)
+        by_rates = t * np.eye(3) + by_rates
+        by_jerks = t * by_accelerations + 0.5 * t**2 * by_rates - t**3 / 3.0 * np.eye(3)
+        by_accelerations = by_accelerations + t * by_rates - 0.5 * t**2 * np.eye(3)
+        by = np.hstack([np.eye(3), by_rates, by_accelerations, by_jerks])
         # Of the difference between the two, in which their common error is not.
-        by_motion = by[:, 3:].copy()
-        by_motion[:, :3] -= posture.by_rates
-        expected = found.covariance + posture.covariance + (by_motion / prior) @ by_motion.T
+        of_both = by[:, 3:].copy()
+        of_both[:, :6] -= posture.by_motion
+        expected = found.covariance + posture.covariance + (of_both / prior) @ of_both.T
         if one is not scan and off @ np.linalg.solve(expected, off) > gate:
             continue
         weighed = by.T @ np.linalg.inv(found.covariance)
         matrix += weighed @ by
         right += weighed @ off
     covariance = np.asarray(np.linalg.inv(matrix), np.float64)
-    rates, covariance = (covariance @ right)[3:6], covariance[3:6, 3:6]
+    motion, covariance = (covariance @ right)[3:9], covariance[3:9, 3:9]
     if scan.turning is None:
-        return rates, covariance
-    return _with_gyros(rates, covariance, posture, scan.turning)
+        return motion, covariance
+    return _with_gyros(motion, covariance, posture, scan.turning)
 
 
 def _with_gyros(
-    rates: FloatArray, covariance: FloatArray, posture: Posture, turning: Turning
+    motion: FloatArray, covariance: FloatArray, posture: Posture, turning: Turning
 ) -> tuple[FloatArray, FloatArray]:
-    """Return rates of range, pitch and yaw and their covariance, as gyros change them."""
+    """Return a motion and its covariance as gyros change them."""
     m = posture.normal_in_dome / posture.range
     # A target that stands still turns against the vehicle; its distance does not change by that.
     by_turning = (_by_m(m) @ np.cross(m, np.eye(3)).T)[1:]
-    off = by_turning @ turning.rates - rates[1:]
-    expected = covariance[1:, 1:] + turning.sigma**2 * by_turning @ by_turning.T
+    angles = slice(1, 3)
+    off = by_turning @ turning.rates - motion[angles]
+    expected = covariance[angles, angles] + turning.sigma**2 * by_turning @ by_turning.T
     # A squared Mahalanobis distance that is larger once in 1000 times by chance, of 2 values: the
     # target moves by itself, or the gyros are not the vehicle's.
     gate = 13.82
     if not off @ np.linalg.solve(expected, off) <= gate:
-        return rates, covariance
-    gain = np.linalg.solve(expected, covariance[1:]).T
-    return rates + gain @ off, covariance - gain @ covariance[1:]
+        return motion, covariance
+    gain = np.linalg.solve(expected, covariance[angles]).T
+    return motion + gain @ off, covariance - gain @ covariance[angles]
+
+
+def _at_middle(
+    posture: Posture, by_motion: FloatArray, motion: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the plane m·X = 1 at the picture's middle, and the rate of m.
+
+    Rows that show it moving give a plane that is off by constants times rate and acceleration of m.
+    Range, pitch and yaw are not so simple: a plane that leans by 1.3 degrees, as by 0.3 m/s, is
+    nearer by 0.03 %.
+    """
+    exposed = posture.normal_in_dome / posture.range
+    by_m = _by_m(exposed)
+    m_by_rate, m_by_acceleration = (
+        np.linalg.solve(by_m, one @ by_m) for one in np.hsplit(by_motion, 2)
+    )
+    rates, accelerations = np.split(motion, 2)
+    m, step = exposed, 0.01
+    # The motion of m depends on m itself; each round leaves 2 % of the error.
+    rounds = 3
+    for _ in range(rounds):
+        now = np.array(range_pitch_yaw(m))
+        before, after = (
+            _plane_of(now + t * rates + 0.5 * t**2 * accelerations) for t in (-step, step)
+        )
+        m_rate = (after - before) / (2.0 * step)
+        m_acceleration = (after - 2.0 * m + before) / step**2
+        m = exposed - m_by_rate @ m_rate - m_by_acceleration @ m_acceleration
+    return m, m_rate
+
+
+def _plane_of(numbers: FloatArray) -> FloatArray:
+    """Return m of range, pitch and yaw, in m and rad."""
+    distance, pitch, yaw = numbers.tolist()
+    toward = np.array([np.tan(yaw), 1.0, np.tan(pitch)])
+    m: FloatArray = toward / (distance * np.linalg.norm(toward))
+    return m
 
 
 def _velocity(m: FloatArray, m_rate: FloatArray, points: FloatArray) -> FloatArray:

@@ -7,6 +7,7 @@ is left out. `FieldEvidence` tells from pictures whether they are interlaced, `F
 those of a stream as they come.
 """
 
+import contextlib
 import dataclasses
 import itertools
 from collections.abc import Iterable, Iterator, Sequence
@@ -16,6 +17,7 @@ import cv2
 import numpy as np
 
 from aqualvs.closing import Closing
+from aqualvs.errors import SourceError
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.shutter import FIRST_ROW, Field, Shutter
 from aqualvs.scanning.scan import Frame, ImagePlane
@@ -311,6 +313,24 @@ class FieldEvidence:
                 f"{self.first_field} in the rig file if the postures go to and fro"
             )
         return ""
+
+
+def first_pairs(source: FrameSource) -> Iterator[list[Frame]]:
+    """Yield some pairs of consecutive pictures from the beginning of a source, as far as it goes.
+
+    Parameters
+    ----------
+    source : FrameSource
+        That begins again when it is iterated again: images, or messages of a recording.
+    """
+    # Two seconds of video, in which a vehicle moves; reading them takes less than a second.
+    n_pictures, every = 50, 5
+    before = None
+    with contextlib.suppress(SourceError):
+        for n, picture in enumerate(itertools.islice(source, n_pictures)):
+            if before is not None and n % every == 1 and picture.index == before.index + 1:
+                yield [before, picture]
+            before = picture
 
 
 class FieldWatch:
