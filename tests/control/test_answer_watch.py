@@ -211,7 +211,7 @@ def test_a_vehicle_that_approaches_a_frozen_net_is_braked_while_there_is_time(
     name: str, noticed_s: float
 ) -> None:
     """Half a second after the freeze at the latest it is neutral, and comes to rest."""
-    for since_s in (0.9, 1.8):
+    for since_s in (0.9, 1.8, 2.25):
         neutral_s, nearest, decisions = frozen_hold(
             name, LossOfSight.STUCK, before=0.75, since_s=since_s, noticed_s=noticed_s
         )

@@ -121,6 +121,15 @@ def test_swings_after_a_loss_of_sight_stay_small() -> None:
     assert math.isinf(dive.safety.lost_s)
 
 
+@pytest.mark.parametrize("seed", [80094, 80103, 110492])
+def test_full_thrust_after_a_loss_of_sight_does_not_end_in_the_net(seed: int) -> None:
+    """Blind in 0.42 to 0.48 m/s, thrown back at several m/s²: the filtered range must follow."""
+    model = vehicle_model("bluerov2-heavy", pilot_gain=1.0)
+    dive = dive_and_measure(random_dive(model, tuned_gains(model), seed))
+    assert dive.safety.min_clearance > 0.3
+    assert math.isinf(dive.safety.lost_s)
+
+
 def _share_lost(found: list[DiveResult]) -> float:
     return sum(math.isfinite(dive.safety.lost_s) for dive in found) / len(found)
 

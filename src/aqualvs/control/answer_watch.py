@@ -33,9 +33,10 @@ _GAP_S = 0.3
 # Greatest difference between means over parts of a period where a posture stands still, as share
 # of the range and in radians; and the length of a part in seconds.
 _STILL_RANGE, _STILL_ANGLE, _PART_S = 0.006, math.radians(0.6), 0.28
-# A picture that stands still is noticed within so many seconds: older postures are live. Slower
-# vehicles, in m/s, coast by little and are not braked: a hold in swell swings at 0.03.
-_TRUSTED_S, _SLOW = 0.6, 0.05
+# A picture that stands still is noticed within so many seconds: older postures are live. So many
+# of them tell the speed. Slower vehicles, in m/s, coast by little and are not braked: noise of 2 mm
+# makes 0.003 of a line over 15 postures.
+_TRUSTED_S, _N_SPEED, _SLOW = 0.6, 3, 0.03
 # Greatest length of the brake, and the time from the first still picture to neutral: 0.1 s of
 # half a second are left to what happens before a picture arrives, and on the wire.
 _BRAKE_S, _NEUTRAL_S = 0.12, 0.4
@@ -245,19 +246,22 @@ class AnswerWatch:
         if still_s is not None:
             self._still_s, self._blind_s = still_s, _TRUSTED_S
         before = [m for m in self._moments if now_s - m.time_s >= self._blind_s]
-        if len(before) < 2:
+        if not before:
             return NO_BRAKE
         last = before[-1]
-        first = next(m for m in before if last.time_s - m.time_s <= _GAP_S)
+        line = [m for m in before if last.time_s - m.time_s <= _LINE_S]
+        if len(line) < _N_SPEED:
+            return NO_BRAKE
         # A brake ends with a frame.
         frame_s = self._moments[-1].time_s - self._moments[-2].time_s
         left_s = min(_BRAKE_S, _NEUTRAL_S - self._still_s) + _TICK_S
         length_s = math.floor(left_s / frame_s) * frame_s
-        if first is last or length_s <= 0.0:
+        if length_s <= 0.0:
             return NO_BRAKE
-        speed = (first.range - last.range) / (last.time_s - first.time_s)
+        # Without the way by the efforts the approach is even.
+        slope, _ = _line([m.time_s for m in line], [m.range + m.way for m in line])
         kept = math.exp(-self._damping(self._balance) * (now_s - last.time_s))
-        speed = kept * (speed - last.speed) + self._speed
+        speed = self._speed - kept * slope
         if speed <= _SLOW:
             return NO_BRAKE
         thrust = self._vehicle.thrust

@@ -79,7 +79,7 @@ class PostureFilterOptions:
     initial_speed: float = 0.5
     initial_turn_rate: float = 0.5
     gate_probability: float = 0.9999
-    n_rejected: int = 5
+    n_rejected: int = 3
     max_coast: float = 0.5
 
     def __post_init__(self) -> None:
@@ -117,6 +117,11 @@ class PostureFilter:
     time, so that the frame rate does not matter. Only measurements move the state; what `update`
     returns between them is a forecast. A measurement beyond the gate starts a rival track; the
     rival replaces the track once enough measurements in a row have agreed with it.
+
+    A vehicle under full thrust, or in a swell that tosses it, accelerates by more than the model
+    allows. The innovations of the range show it: where the mean of their normalised squares exceeds
+    2, the range's noise grows with it (adjustable level, Bar-Shalom et al. 2001, section 11.2). So
+    the filter is as smooth in calm water, and not late in a manoeuvre.
 
     An angle alone beyond its gate is left out, and the rest of the measurement enters: a vehicle
     that pitches over faster than the model allows must not lose its range. An angle that is left
@@ -205,6 +210,8 @@ class _Track:
     rig_covariance: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
     # How often in a row pitch and yaw have been left out.
     n_left_out: tuple[int, int] = (0, 0)
+    # Mean normalised square of the range's innovations; 1 where it moves as the model allows.
+    surprise: float = 1.0
 
     def as_filtered(self, known: "_Track", time_s: float, accepted: bool) -> FilteredPosture:
         """Return this forecast in the words of the outputs."""
@@ -261,10 +268,12 @@ class _Motion:
         move = np.eye(6)
         move[:3, 3:] = dt * np.eye(3)
         cov = move @ track.cov @ move.T
-        cov[:3, :3] += self._noise * (dt**3 / 3.0)
-        cov[:3, 3:] += self._noise * (dt**2 / 2.0)
-        cov[3:, :3] += self._noise * (dt**2 / 2.0)
-        cov[3:, 3:] += self._noise * dt
+        noise = self._noise.copy()
+        noise[0, 0] *= _manoeuvre_factor(track.surprise)
+        cov[:3, :3] += noise * (dt**3 / 3.0)
+        cov[:3, 3:] += noise * (dt**2 / 2.0)
+        cov[3:, :3] += noise * (dt**2 / 2.0)
+        cov[3:, 3:] += noise * dt
         return replace(track, time_s=time_s, state=move @ track.state, cov=cov)
 
     def updated(
@@ -289,8 +298,11 @@ class _Motion:
         out_pitch, out_yaw = (
             0 if one else n + 1 for one, n in zip(used[1:], ahead.n_left_out, strict=True)
         )
+        # The mean is over about two and a half frames.
+        surprise = float(innovation[0] ** 2 / of_innovation[0, 0])
         updated = replace(
             ahead,
+            surprise=ahead.surprise + 0.4 * (surprise - ahead.surprise),
             state=state,
             cov=0.5 * (after + after.T),
             n_measurements=track.n_measurements + 1,
@@ -314,6 +326,15 @@ class _Motion:
                 after[at, at] = variance
         pitch, yaw = (n if n < self._n_rejected else 0 for n in track.n_left_out)
         return replace(track, state=state, cov=after, n_left_out=(pitch, yaw))
+
+
+def _manoeuvre_factor(surprise: float) -> float:
+    """Return the factor on the variance of the range's acceleration.
+
+    Twice the expected square is no manoeuvre: noise alone exceeds it in one frame of eleven,
+    by little.
+    """
+    return max(1.0, surprise / 2.0) ** 2
 
 
 def _measurement(posture: Posture | Refusal) -> tuple[FloatArray, FloatArray] | None:
