@@ -38,7 +38,7 @@ def test_simulation_writes_log_figures_and_page(tmp_path: Path) -> None:
     page = (request.out / "follow.html").read_text(encoding="utf-8")
     assert page.count("data:image/png;base64,") == 2
     assert "range error, rms" in page
-    assert "reversals of the effort a minute" in page
+    assert "reversals of the thrusters a minute" in page
     assert any("rms" in line and "mm" in line for line in told)
     assert told[-1].endswith("follow.html")
     for name in ("figure_22.png", "figure_23.png"):

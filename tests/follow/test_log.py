@@ -14,6 +14,7 @@ from aqualvs.follow.log import (
     hold_measures,
     safety_measures,
     step_measures,
+    thruster_measures,
 )
 
 NAN = math.nan
@@ -134,3 +135,15 @@ def test_reversals_and_jumps_of_an_effort() -> None:
     assert found.reversals == pytest.approx(120.0)
     assert found.jumps == pytest.approx(120.0)
     assert effort_measures(LoopLog(rows), "turn").reversals == 0.0
+
+
+def test_a_forward_effort_that_no_thruster_turns_round_for() -> None:
+    """Along a net the pairs push against each other; the worse of them counts."""
+    rows = [ROW._replace(time_s=0.25 * k, forward=0.1 * (-1) ** k, right=0.3) for k in range(481)]
+    assert effort_measures(LoopLog(rows), "forward").reversals == pytest.approx(240.0)
+    assert thruster_measures(LoopLog(rows)).reversals == 0.0
+    slow = [row._replace(right=0.05) for row in rows]
+    assert thruster_measures(LoopLog(slow)).reversals == pytest.approx(240.0)
+    one = [row._replace(right=row.forward) for row in rows]
+    assert thruster_measures(LoopLog(one)).reversals == pytest.approx(240.0)
+    assert thruster_measures(LoopLog(one)).jumps == pytest.approx(240.0)

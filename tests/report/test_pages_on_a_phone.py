@@ -18,7 +18,7 @@ PIXEL = base64.b64decode(
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
     folder = tmp_path_factory.mktemp("phone")
-    facts = [("jumps of the effort above 0.25 a minute", "forward 0, right 0, yaw 18")] * 3
+    facts = [("jumps of the thrusters above 0.25 a minute", "horizontal 0, yaw 18")] * 3
     figure = f'<figure><img src="{html.data_url(PIXEL, "png")}" alt=""></figure>'
     parts = {
         "cards": html.cards([html.Card("range", "600 mm", "median")] * 7),

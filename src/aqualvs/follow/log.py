@@ -292,8 +292,30 @@ def effort_measures(
         Of the effort.
     start_s, end_s : float
     """
+    return _measured(log, log.column(name), start_s, end_s)
+
+
+def thruster_measures(
+    log: LoopLog, start_s: float = 0.0, end_s: float = math.inf
+) -> EffortMeasures:
+    """Return how often horizontal thrusters turned round between two times, the worse of two pairs.
+
+    Efforts forward and to the right add up in one pair of vectored thrusters and cancel in the
+    other. Along a target the pairs push against each other: the sign of the forward effort, which
+    is small then, changes with the noise, and no thruster turns round.
+    """
+    forward, right = log.column("forward"), log.column("right")
+    pairs = [
+        _measured(log, efforts, start_s, end_s) for efforts in (forward + right, forward - right)
+    ]
+    return EffortMeasures(
+        reversals=max(one.reversals for one in pairs), jumps=max(one.jumps for one in pairs)
+    )
+
+
+def _measured(log: LoopLog, efforts: FloatArray, start_s: float, end_s: float) -> EffortMeasures:
     here = _between(log, start_s, end_s)
-    efforts, time_s = log.column(name)[here], log.column("time_s")[here]
+    efforts, time_s = efforts[here], log.column("time_s")[here]
     minutes = max((time_s[-1] - time_s[0]) / 60.0, 1e-9) if len(time_s) else math.inf
     signs = np.sign(efforts)
     reversals = np.count_nonzero(np.diff(signs[signs != 0.0]))

@@ -14,7 +14,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from aqualvs.follow.log import JUMP, LoopLog, effort_measures, hold_measures, safety_measures
+from aqualvs.follow.log import (
+    JUMP,
+    LoopLog,
+    effort_measures,
+    hold_measures,
+    safety_measures,
+    thruster_measures,
+)
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.report import html
 from aqualvs.report.figure_style import BLUE, DARK, GREY, ORANGE, STYLE, new_canvas
@@ -251,14 +258,16 @@ def _headline(log: LoopLog) -> tuple[list[html.Card], list[str]]:
 
 
 def _efforts(log: LoopLog, start_s: float) -> list[tuple[str, str]]:
-    """Return how often the efforts turned round."""
-    names = {"forward": "forward", "right": "right", "turn": "yaw"}
-    found = {name: effort_measures(log, column, start_s) for column, name in names.items()}
+    """Return how often the thrusters turned round."""
+    found = {
+        "horizontal": thruster_measures(log, start_s),
+        "yaw": effort_measures(log, "turn", start_s),
+    }
     reversals = ", ".join(f"{name} {one.reversals:.0f}" for name, one in found.items())
     jumps = ", ".join(f"{name} {one.jumps:.0f}" for name, one in found.items())
     return [
-        ("reversals of the effort a minute", reversals),
-        (f"jumps of the effort above {JUMP:g} a minute", jumps),
+        ("reversals of the thrusters a minute", reversals),
+        (f"jumps of the thrusters above {JUMP:g} a minute", jumps),
     ]
 
 
