@@ -260,7 +260,7 @@ def motion_beside(scan: Scan, beside: Sequence[Scan]) -> tuple[FloatArray, Float
         raise ValueError(f"frame {scan.index}: no posture as its rows were exposed")
     # Unknowns: posture and motion, relative to the scan's own measurement, and how accelerations
     # change, of which the error during a picture is nothing.
-    matrix, right = np.zeros((12, 12)), np.zeros(12)
+    matrix, right, one_each = np.zeros((12, 12)), np.zeros(12), np.eye(3)
     prior = np.concatenate([_RATES, _ACCELERATIONS, _JERKS]) ** -2.0
     matrix[range(3, 12), range(3, 12)] = prior
     # A frame whose squared Mahalanobis distance is larger (once in 1000 times by chance, 3 values)
@@ -271,11 +271,11 @@ def motion_beside(scan: Scan, beside: Sequence[Scan]) -> tuple[FloatArray, Float
         if not isinstance(found, Posture) or found.by_motion is None or abs(t) > _REACH_S:
             continue
         off = found.numbers - posture.numbers
-        by_rates, by_accelerations = np.hsplit(found.by_motion, 2)
-        by_rates = t * np.eye(3) + by_rates
-        by_jerks = t * by_accelerations + 0.5 * t**2 * by_rates - t**3 / 3.0 * np.eye(3)
-        by_accelerations = by_accelerations + t * by_rates - 0.5 * t**2 * np.eye(3)
-        by = np.hstack([np.eye(3), by_rates, by_accelerations, by_jerks])
+        by_rates = found.by_motion[:, :3] + t * one_each
+        by_accelerations = found.by_motion[:, 3:]
+        by_jerks = t * by_accelerations + 0.5 * t**2 * by_rates - t**3 / 3.0 * one_each
+        by_accelerations = by_accelerations + t * by_rates - 0.5 * t**2 * one_each
+        by = np.hstack([one_each, by_rates, by_accelerations, by_jerks])
         # Of the difference between the two, in which their common error is not.
         of_both = by[:, 3:].copy()
         of_both[:, :6] -= posture.by_motion
@@ -328,7 +328,7 @@ def _at_middle(
     rates, accelerations = np.split(motion, 2)
     m, step = exposed, 0.01
     # The motion of m depends on m itself; each round leaves 2 % of the error.
-    rounds = 3
+    rounds = 2
     for _ in range(rounds):
         now = np.array(range_pitch_yaw(m))
         before, after = (
