@@ -206,3 +206,24 @@ def test_a_near_net_of_thick_twine_is_no_wall() -> None:
     posture = scanner.process(Frame(0, 0.0, luma, chroma)).posture
     assert posture
     assert abs(posture.range / 0.34 - 1.0) < 0.02
+
+
+@pytest.mark.parametrize("slide", [(0.0, 0.0), (0.429, 0.02475)])
+def test_a_laser_along_a_strand_makes_no_wall_of_a_net(slide: tuple[float, float]) -> None:
+    """An ROV and a square net hang level: now and then a laser lights one strand and no gap.
+
+    The light lies where the strand is, not where the laser's sheet is brightest: by 4 mm on a wall.
+    """
+    true = np.deg2rad([0.5, 2.0])
+    scene = Scene(dome_from_scene=dome_from_target(0.5, *true, slide), nets=(Net(mesh="square"),))
+    renderer, scanner = equipment()
+    picture = renderer.render(scene, 0.0, np.random.default_rng(7))
+    luma, chroma = planes_of_image(cv2.cvtColor(picture.image, cv2.COLOR_RGB2BGR))
+    scan = scanner.process(Frame(0, 0.0, luma, chroma))
+    posture = scan.posture
+    assert posture
+    off = np.array([posture.pitch, posture.yaw]) - true
+    assert np.all(np.abs(off) < 4.0 * np.sqrt(np.diag(posture.covariance)[1:]))
+    # The strand alone is much of the light.
+    assert np.ptp(scan.points.pixels[scan.points.laser == 0, 0]) > 600
+    assert np.mean(scan.points.label == Label.SOLID) < 0.05

@@ -467,8 +467,15 @@ def _describe(
     pattern = describe_pattern(subsegments, members, n_lasers, MIN_LINES_PER_LASER, focal_px)
     # Least share of a net's light on strands; that of a fish lies in long or bent components.
     strands_share = 0.4
+    light = np.bincount(
+        subsegments.laser[members], subsegments.intensity_weight[members], minlength=n_lasers
+    )
+    brightest = light.argmax()
+    if pattern.is_mesh and pattern.on_strands[brightest] == 0.0:
+        # It runs along a strand.
+        light[brightest] = 0.0
     # Strands near the vehicle are long in search lines, and still short.
-    on_strands = max(sampling_weight, on_two(pattern.on_strands)) > strands_share * inlier_weight
+    on_strands = max(sampling_weight, on_two(pattern.on_strands)) > strands_share * on_two(light)
     return Surface(
         plane=Plane(plane[:3], float(plane[3])),
         members=members,
