@@ -214,15 +214,16 @@ def test_a_laser_along_a_strand_makes_no_wall_of_a_net(slide: tuple[float, float
 
     The light lies where the strand is, not where the laser's sheet is brightest: by 4 mm on a wall.
     """
-    true = np.deg2rad([0.5, 2.0])
-    scene = Scene(dome_from_scene=dome_from_target(0.5, *true, slide), nets=(Net(mesh="square"),))
+    pitch, yaw = np.deg2rad([0.5, 2.0])
+    pose = dome_from_target(0.5, pitch, yaw, slide)
+    scene = Scene(dome_from_scene=pose, nets=(Net(mesh="square"),))
     renderer, scanner = equipment()
     picture = renderer.render(scene, 0.0, np.random.default_rng(7))
     luma, chroma = planes_of_image(cv2.cvtColor(picture.image, cv2.COLOR_RGB2BGR))
     scan = scanner.process(Frame(0, 0.0, luma, chroma))
     posture = scan.posture
     assert posture
-    off = np.array([posture.pitch, posture.yaw]) - true
+    off = np.array([posture.pitch - pitch, posture.yaw - yaw])
     assert np.all(np.abs(off) < 4.0 * np.sqrt(np.diag(posture.covariance)[1:]))
     # The strand alone is much of the light.
     assert np.ptp(scan.points.pixels[scan.points.laser == 0, 0]) > 600

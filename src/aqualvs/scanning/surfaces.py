@@ -467,9 +467,8 @@ def _describe(
     pattern = describe_pattern(subsegments, members, n_lasers, MIN_LINES_PER_LASER, focal_px)
     # Least share of a net's light on strands; that of a fish lies in long or bent components.
     strands_share = 0.4
-    light = np.bincount(
-        subsegments.laser[members], subsegments.intensity_weight[members], minlength=n_lasers
-    )
+    light = np.zeros(n_lasers)
+    np.add.at(light, subsegments.laser[members], subsegments.intensity_weight[members])
     brightest = light.argmax()
     if pattern.is_mesh and pattern.on_strands[brightest] == 0.0:
         # It runs along a strand.
