@@ -20,7 +20,7 @@ from aqualvs.optics.shutter import AT_ONCE, Shutter, ShutterKind
 from aqualvs.scanner import Scanner
 from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.row_motion import RowMotion
-from aqualvs.scanning.scan import Frame, Scan, Turning
+from aqualvs.scanning.scan import Frame, GyroRates, Scan
 from aqualvs.sources.base import PartHealth, State
 from aqualvs.sources.fields import FrameFeed, frames_of
 from field_cases import FIELDS
@@ -158,9 +158,9 @@ class _Autopilot(Collector):
     def vehicle_state(self) -> VehicleState:
         return VehicleState()
 
-    def turning(self, at_ns: int) -> Turning:
+    def turning(self, at_ns: int) -> GyroRates:
         self.asked_ns.append(at_ns)
-        return Turning(np.array([0.0, 0.0, math.radians(-10.0)]), math.radians(3.0))
+        return GyroRates(np.array([0.0, 0.0, math.radians(-10.0)]), math.radians(3.0))
 
 
 def test_an_autopilot_tells_how_a_rolling_camera_turns() -> None:

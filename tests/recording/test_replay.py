@@ -22,7 +22,7 @@ from aqualvs.recording.encoding import TOPICS
 from aqualvs.recording.messages import stripes_message, stripes_of
 from aqualvs.results.run_request import FrameWindow, RunRequest, Water
 from aqualvs.scanner import Scanner, ScannerOptions
-from aqualvs.scanning.scan import Turning
+from aqualvs.scanning.scan import GyroRates
 from aqualvs.scanning.stripe import ThresholdOptions
 from aqualvs.scanning.surfaces import TargetKind
 from live_cases import demo_rig, demo_samples
@@ -108,7 +108,7 @@ def test_stripes_of_recordings_before_pulls_were_measured_have_none():
 def test_gyros_are_recorded_and_used_again(demo, tmp_path):
     shutter = Shutter(kind=ShutterKind.ROLLING, readout=0.02)
     rig = replace(load_rig(demo / "rig.yaml"), shutter=shutter)
-    turning = Turning(np.deg2rad([15.0, 0.0, -20.0]), np.deg2rad(2.0))
+    turning = GyroRates(np.deg2rad([15.0, 0.0, -20.0]), np.deg2rad(2.0))
     sample = demo_samples(1)[0]
     for name, known in (("with", turning), ("without", None)):
         recording = Recording(tmp_path / f"{name}.mcap", RecorderOptions())

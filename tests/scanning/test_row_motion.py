@@ -10,7 +10,7 @@ from aqualvs.scanner import Scanner
 from aqualvs.scanning import row_motion
 from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.row_motion import RowMotion, motion_beside
-from aqualvs.scanning.scan import Frame, Scan, ScanPoints, Turning, planes_of_image
+from aqualvs.scanning.scan import Frame, GyroRates, Scan, ScanPoints, planes_of_image
 from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenario import dome_from_target
 from aqualvs.simulation.scenarios import example_rig
@@ -226,7 +226,7 @@ def turning_at(t, sigma_deg_s=1.0):
     before, after = (scene_at(t + s).dome_from_scene.rotation for s in (-step, step))
     # The wall turns by -w x.
     spin = -(after - before) / (2.0 * step) @ scene_at(t).dome_from_scene.rotation.T
-    return Turning(np.array([spin[2, 1], spin[0, 2], spin[1, 0]]), np.deg2rad(sigma_deg_s))
+    return GyroRates(np.array([spin[2, 1], spin[0, 2], spin[1, 0]]), np.deg2rad(sigma_deg_s))
 
 
 def test_gyros_tell_the_rates_of_pitch_and_yaw(scans):

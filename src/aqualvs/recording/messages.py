@@ -37,7 +37,7 @@ from aqualvs.recording.sample import LiveSample
 from aqualvs.scanner import ScannerOptions
 from aqualvs.scanning.laser_bands import SearchAxis
 from aqualvs.scanning.posture import Posture, Reason, Refusal
-from aqualvs.scanning.scan import Frame, ScanPoints, Turning
+from aqualvs.scanning.scan import Frame, GyroRates, ScanPoints
 from aqualvs.scanning.stripe import StripePeaks
 from aqualvs.sources.base import Health, PartHealth, State
 
@@ -94,7 +94,7 @@ def stripes_message(sample: LiveSample, stamp_ns: int) -> bytes:
 
 def stripes_of(
     message: bytes,
-) -> tuple[int, float, float, dict[SearchAxis, StripePeaks], Refusal | None, Turning | None]:
+) -> tuple[int, float, float, dict[SearchAxis, StripePeaks], Refusal | None, GyroRates | None]:
     """Return frame, time, index of the water, stripes, refusal and turning of a message.
 
     Raises
@@ -123,7 +123,7 @@ def stripes_of(
             for (axis, found), pull in zip(peaks.items(), pulls, strict=False)
         }
     gyros = np.empty(0) if of.at_end else of.array("f8")
-    turning = Turning(gyros[:3], float(gyros[3])) if len(gyros) == 4 else None
+    turning = GyroRates(gyros[:3], float(gyros[3])) if len(gyros) == 4 else None
     refusal = Refusal(Reason(reason), detail) if reason else None
     return index, time_s, n_water, peaks, refusal, turning
 

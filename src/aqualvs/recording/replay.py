@@ -19,7 +19,7 @@ from aqualvs.recording.messages import image_of, rig_texts_of, stripes_of
 from aqualvs.scanner import ScannerOptions
 from aqualvs.scanning.laser_bands import SearchAxis
 from aqualvs.scanning.posture import Refusal
-from aqualvs.scanning.scan import Frame, Turning
+from aqualvs.scanning.scan import Frame, GyroRates
 from aqualvs.scanning.stripe import StripePeaks
 from aqualvs.sources.mcap_file import McapFile, StoredMessage
 
@@ -38,7 +38,7 @@ class RecordedFrame:
         Stripes as detected.
     refusal : Refusal or None
         Why it was not measured at all.
-    turning : Turning or None
+    turning : GyroRates or None
         As the vehicle's gyros told.
     picture : Frame or None
         None where there is none, or it was not asked for.
@@ -49,7 +49,7 @@ class RecordedFrame:
     n_water: float
     peaks: dict[SearchAxis, StripePeaks]
     refusal: Refusal | None
-    turning: Turning | None
+    turning: GyroRates | None
     picture: Frame | None
 
 

@@ -26,7 +26,7 @@ from aqualvs.optics.rig_covariance import FittedSurface, posture_by_plane
 from aqualvs.scanning.candidates import Candidates
 from aqualvs.scanning.plane_fit import TUKEY
 from aqualvs.scanning.posture import Posture, Reason, Refusal, range_pitch_yaw
-from aqualvs.scanning.scan import Scan, Turning
+from aqualvs.scanning.scan import GyroRates, Scan
 
 REACH = 2
 """Frames to each side that tell the rates of a frame."""
@@ -293,7 +293,7 @@ def motion_beside(scan: Scan, beside: Sequence[Scan]) -> tuple[FloatArray, Float
 
 
 def _with_gyros(
-    motion: FloatArray, covariance: FloatArray, posture: Posture, turning: Turning
+    motion: FloatArray, covariance: FloatArray, posture: Posture, turning: GyroRates
 ) -> tuple[FloatArray, FloatArray]:
     """Return a motion and its covariance as gyros change them."""
     m = posture.normal_in_dome / posture.range

@@ -149,8 +149,8 @@ class ScanPoints:
 
 
 @dataclass(frozen=True, slots=True)
-class Turning:
-    """Turning of the vehicle at a picture's middle, from its gyros.
+class GyroRates:
+    """Angular velocity of the vehicle at a picture's middle, from its gyros.
 
     Attributes
     ----------
@@ -178,7 +178,7 @@ class Scan:
         Every stripe point, labelled.
     n_water : float
         Refractive index used.
-    turning : Turning or None
+    turning : GyroRates or None
         None where no gyros are known.
     """
 
@@ -187,4 +187,4 @@ class Scan:
     posture: Posture | Refusal
     points: ScanPoints
     n_water: float
-    turning: Turning | None = None
+    turning: GyroRates | None = None

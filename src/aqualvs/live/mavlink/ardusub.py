@@ -48,7 +48,7 @@ from aqualvs.live.mavlink.ardusub_parameters import (
     advise_on_station,
 )
 from aqualvs.live.mavlink.link import MAV_COMP_ID_ONBOARD_COMPUTER, MavlinkLink, Received
-from aqualvs.scanning.scan import Turning
+from aqualvs.scanning.scan import GyroRates
 from aqualvs.vehicle_logs.tlog import SUB_MODES
 
 FRESH_S = 1.0
@@ -213,7 +213,7 @@ def attitude_of(link: MavlinkLink) -> tuple[float | None, float | None, float | 
     return told.roll, told.pitch, told.yaw % (2.0 * math.pi)
 
 
-def turning_of(link: MavlinkLink, at_ns: int) -> Turning | None:
+def turning_of(link: MavlinkLink, at_ns: int) -> GyroRates | None:
     """Return the turning of an autopilot's vehicle; None if it has told none of use.
 
     Parameters
@@ -238,7 +238,7 @@ def turning_of(link: MavlinkLink, at_ns: int) -> Turning | None:
     mounting = 0.1
     apart = math.hypot(1e-9 * (found.received_ns - at_ns), delay)
     sigma = math.hypot(acceleration * apart, target, mounting * float(np.linalg.norm(rates)))
-    return Turning(rates, sigma) if math.isfinite(sigma) else None
+    return GyroRates(rates, sigma) if math.isfinite(sigma) else None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -4,7 +4,7 @@ from typing import Protocol, runtime_checkable
 
 from aqualvs.control.vehicle import VehicleState
 from aqualvs.recording.sample import LiveSample
-from aqualvs.scanning.scan import Turning
+from aqualvs.scanning.scan import GyroRates
 from aqualvs.sources.base import PartHealth
 
 
@@ -61,5 +61,5 @@ class HearsVehicle(Protocol):
     def vehicle_state(self) -> VehicleState:
         """Return what the autopilot tells; returns at once."""
 
-    def turning(self, at_ns: int) -> Turning | None:
+    def turning(self, at_ns: int) -> GyroRates | None:
         """Return what its gyros tell of a time by `time.monotonic_ns`; returns at once."""

@@ -9,7 +9,7 @@ from aqualvs.live.mavlink.ardusub import FRESH_S, DepthChoice, attitude_of, turn
 from aqualvs.live.mavlink.link import LinkOptions, MavlinkLink
 from aqualvs.recording.sample import LiveSample
 from aqualvs.scanning.posture import Posture, Refusal
-from aqualvs.scanning.scan import ScanPoints, Turning
+from aqualvs.scanning.scan import GyroRates, ScanPoints
 from aqualvs.sources.base import PartHealth
 
 # The scanner accepts ranges up to one percent beyond the working range.
@@ -97,7 +97,7 @@ class MavlinkOutput:
         """Return depth and heading as far as the autopilot tells them."""
         return VehicleState(depth=self._depth.read(), heading=attitude_of(self.link)[2])
 
-    def turning(self, at_ns: int) -> Turning | None:
+    def turning(self, at_ns: int) -> GyroRates | None:
         """Return the vehicle's turning at a time, as far as the autopilot tells it."""
         return turning_of(self.link, at_ns)
 
