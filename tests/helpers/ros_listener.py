@@ -65,6 +65,19 @@ class Listener:
         """What came on a topic so far, its name without leading parts such as `rt`."""
         return [h["message"] for h in self.heard if h.get("topic", "").endswith(topic)]
 
+    def has_heard(self, *topics: str) -> bool:
+        """Whether something came on every one of these topics.
+
+        A publisher and a subscriber find each other topic by topic, in any order: what came on one
+        says nothing of the others.
+        """
+        return all(self.messages(topic) for topic in topics)
+
+    def latest_ns(self, topic: str) -> int:
+        """Stamp of the latest message on a topic; 0 where none has come."""
+        messages = self.messages(topic)
+        return stamp_ns(messages[-1]) if messages else 0
+
     def delays_ms(self, topic: str) -> list[float]:
         """From the stamps to the moment of hearing."""
         return [
