@@ -1,6 +1,7 @@
 """The native ROS 2 node, with stand-ins for rclpy; its messages are those of rosbags."""
 
 import array
+import itertools
 import runpy
 import sys
 import threading
@@ -8,7 +9,7 @@ import time
 import tomllib
 import types
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 from unittest import mock
@@ -31,13 +32,16 @@ from aqualvs.live.outputs.ros_messages import (
 from aqualvs.recording.encoding import jpeg_of
 from aqualvs.recording.sample import LiveSample
 from aqualvs.scanning.posture import Posture, Reason, Refusal
-from aqualvs.scanning.scan import planes_of_image
-from aqualvs.sources.base import State, bgr_of
-from live_cases import demo_frames, demo_rig, demo_samples
+from aqualvs.scanning.scan import Frame, planes_of_image
+from aqualvs.sources.base import PartHealth, State, bgr_of
+from aqualvs.sources.opening import open_feed
+from live_cases import demo_frames, demo_rig, demo_samples, renumbered
 from repository import ROOT
 
 PACKAGE = ROOT / "ros2" / "aqualvs_ros"
 ENOUGH = 12
+# Topics that have a message for each posture, where a node has them; outputs work side by side.
+MOVING = {"~/posture", "~/cloud", "/tf"}
 STORE = get_typestore(Stores.ROS2_JAZZY)
 
 
@@ -62,8 +66,8 @@ class Node:
 
     asked: ClassVar[dict[str, Any]] = {}
     made: ClassVar[list["Node"]] = []
-    # By topic: what is published there again and again.
-    heard_by_all: ClassVar[dict[str, list[Any]]] = {}
+    # By topic: what is published there, one after the other.
+    heard_by_all: ClassVar[dict[str, Iterator[Any]]] = {}
 
     def __init__(self, name: str = "aqualvs") -> None:
         self.name = name
@@ -152,13 +156,14 @@ def replace_rclpy(monkeypatch: pytest.MonkeyPatch) -> None:
         while running.is_set():
             time.sleep(0.01)
             for topic, (kind, callback, _) in list(node.heard.items()):
-                waiting = node.heard_by_all.get(topic, [])
-                if waiting:
-                    message = waiting.pop(0)
+                message = next(node.heard_by_all.get(topic, iter(())), None)
+                if message is not None:
                     assert isinstance(message, kind)
                     callback(message)
                     time.sleep(0.03)
-            if len(node.published.get("~/posture", ())) >= ENOUGH:
+            if node.published and all(
+                len(node.published[topic]) >= ENOUGH for topic in MOVING & set(node.published)
+            ):
                 # As an interrupt does, in the middle of the dive.
                 running.clear()
         raise rclpy.executors.ExternalShutdownException
@@ -255,7 +260,34 @@ def run_node(monkeypatch: pytest.MonkeyPatch, **parameters: Any) -> tuple[int, N
     return code, node
 
 
+class Again:
+    """A source that is played again and again: a dive that nothing but an interrupt ends."""
+
+    def __init__(self, where: str) -> None:
+        self.name, self._where = where, where
+        self._feed = open_feed(where)
+        self._closed = False
+
+    def __iter__(self) -> Iterator[Frame]:
+        numbers = itertools.count()
+        while not self._closed:
+            for frame in self._feed:
+                yield renumbered(frame, next(numbers))
+            self._feed = open_feed(self._where)
+
+    def health(self) -> PartHealth:
+        return self._feed.health()
+
+    def close(self) -> None:
+        self._closed = True
+        self._feed.close()
+
+
 def test_node_measures_a_dive(make: Callable[..., Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    import aqualvs_ros.node
+
+    # Loading kernels may take longer than the dive, and more pictures are passed over then.
+    monkeypatch.setattr(aqualvs_ros.node, "open_feed", Again)
     folder = ROOT / "src" / "aqualvs" / "data" / "demo"
     code, node = run_node(
         monkeypatch,
@@ -265,7 +297,7 @@ def test_node_measures_a_dive(make: Callable[..., Any], monkeypatch: pytest.Monk
         filter=True,
     )
     assert (code, node.errors) == (0, [])
-    assert ENOUGH <= len(node.published["~/posture"]) < 100
+    assert len(node.published["~/posture"]) >= ENOUGH
     assert len(node.published["~/posture_filtered"]) >= ENOUGH
     assert node.published["~/range"][0].header.frame_id == "rov1/dome"
     assert node.publishers == {}
@@ -305,6 +337,17 @@ def image_messages(transport: str, stamps_ns: list[int]) -> list[Any]:
     return made
 
 
+def camera(transport: str, stamps_ns: list[int]) -> Iterator[Any]:
+    """Film the bundled dive again and again at 25 Hz, and note the stamps.
+
+    The node measures the latest picture: how many it passes over depends on the machine.
+    """
+    images = image_messages(transport, [0] * (ENOUGH + 4))
+    for i, image in enumerate(itertools.cycle(images)):
+        stamps_ns.append(5 * 10**9 + 40_000_000 * i)
+        yield replace(image, header=header(stamps_ns[-1]))
+
+
 def camera_info(**more: Any) -> Any:
     rig = demo_rig()
     width, height = rig.size_px
@@ -323,10 +366,10 @@ def camera_info(**more: Any) -> Any:
 def test_node_measures_an_image_topic(
     make: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, transport: str
 ) -> None:
-    stamps = [5 * 10**9 + 40_000_000 * i for i in range(ENOUGH + 4)]
+    stamps: list[int] = []
     topic = "/camera/image_raw" + ("" if transport == "raw" else "/compressed")
-    Node.heard_by_all[topic] = image_messages(transport, stamps)
-    Node.heard_by_all["/camera/camera_info"] = [camera_info()]
+    Node.heard_by_all[topic] = camera(transport, stamps)
+    Node.heard_by_all["/camera/camera_info"] = iter([camera_info()])
     code, node = run_node(
         monkeypatch,
         image_topic="/camera/image_raw",
@@ -338,11 +381,12 @@ def test_node_measures_an_image_topic(
     assert (code, node.errors, node.warnings) == (0, [], [])
     assert node.heard[topic][2] == {"depth": 1, "reliability": "best effort"}
     for name in ("~/posture", "~/cloud", "/tf"):
-        messages = node.published[name]
+        # A cloud without points tells of silence, which a busy machine makes too.
+        messages = [one for one in node.published[name] if getattr(one, "width", 1)]
         headers = [getattr(one, "header", None) or one.transforms[0].header for one in messages]
         # The times of the pictures, not those of their arrival.
         found = [head.stamp.sec * 10**9 + head.stamp.nanosec for head in headers]
-        assert len(found) >= ENOUGH - 4
+        assert len(found) >= ENOUGH
         assert set(found) <= set(stamps)
     (fixed,) = node.published["/tf_static"]
     assert [(one.header.frame_id, one.child_frame_id) for one in fixed.transforms] == [
