@@ -25,11 +25,17 @@ from aqualvs.geometry.linear_algebra import Vec, combine, row3, unit
 from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import Rig
 from aqualvs.simulation.cameras import IDEAL, CornerRays, SimulatedCamera, corner_rays
-from aqualvs.simulation.lasers import LaserSource, Sheets, default_sources, light_on_points
+from aqualvs.simulation.lasers import (
+    LaserSource,
+    Sheets,
+    default_sources,
+    light_on_points,
+    pack_sheets,
+)
 from aqualvs.simulation.scene import Scene
 from aqualvs.simulation.shading import Light, Members, pack_light, radiance
 from aqualvs.simulation.surfaces import Surfaces, pack_surfaces
-from aqualvs.simulation.truth import LitPoints, find_lit_points, light_sheets
+from aqualvs.simulation.truth import Beams, LitPoints, beams_of, find_lit_points
 
 # Particles drift in this box in `dome` and re-enter on the other side, in metres.
 _LOW, _HIGH = np.array([-0.6, 0.12, -0.5]), np.array([0.6, 1.3, 0.5])
@@ -224,11 +230,13 @@ class Renderer:
     threads: int = 1
     camera: SimulatedCamera = IDEAL
     _corners: CornerRays = field(init=False, repr=False)
+    _beams: Beams = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         if not self.sources:
             self.sources = default_sources(self.rig)
         self._corners = corner_rays(self.rig.camera())
+        self._beams = beams_of(self.rig, self.sources, self.camera.filters)
 
     def render(
         self, scene: Scene, t: float = 0.0, rng: np.random.Generator | None = None
@@ -339,8 +347,8 @@ class Renderer:
     def _pack(self, scene: Scene, t: float) -> tuple[Surfaces, Sheets]:
         surfaces = pack_surfaces(scene, t)
         if not scene.lasers_on:
-            return surfaces, light_sheets(replace(self.rig, lasers=()), (), surfaces)
-        return surfaces, light_sheets(self.rig, self.sources, surfaces, self.camera.filters)
+            return surfaces, pack_sheets(replace(self.rig, lasers=()), ())
+        return surfaces, self._beams.ended_by(surfaces)
 
     def _radiance(
         self,
@@ -375,6 +383,10 @@ class Renderer:
         def render_band(band: tuple[int, int]) -> None:
             _render(band, rays, self.samples, surfaces, members, everything, sheets, light, out)
 
+        if self.threads == 1:
+            # Of a picture that rolls this is called for every few rows.
+            render_band(rows)
+            return
         edges = np.linspace(*rows, self.threads + 1).astype(int).tolist()
         with ThreadPoolExecutor(self.threads) as pool:
             list(pool.map(render_band, pairwise(edges)))

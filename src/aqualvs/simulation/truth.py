@@ -19,6 +19,7 @@ from aqualvs.optics.rig import Rig
 from aqualvs.simulation.lasers import (
     COLOUR_BALANCED,
     ColourFilters,
+    FanRays,
     LaserSource,
     Sheets,
     fan_rays,
@@ -54,18 +55,35 @@ class LitPoints:
         return len(self.laser)
 
 
-def light_sheets(
-    rig: Rig,
-    sources: Sequence[LaserSource],
-    surfaces: Surfaces,
-    filters: ColourFilters = COLOUR_BALANCED,
-) -> Sheets:
-    """Return the tables of laser sheets with the distances at which surfaces end them."""
+class Beams(NamedTuple):
+    """Sheets of lasers as they leave their sources, before anything ends them.
+
+    They depend on the rig alone: who renders many scenes makes them once.
+
+    Attributes
+    ----------
+    sheets : Sheets
+    fans : tuple of FanRays
+        Rays in the middle of each sheet.
+    """
+
+    sheets: Sheets
+    fans: tuple[FanRays, ...]
+
+    def ended_by(self, surfaces: Surfaces) -> Sheets:
+        """Return the sheets with the distances at which surfaces end them."""
+        ends = np.full_like(self.sheets.first, np.inf)
+        for i, (origins, directions, way) in enumerate(self.fans):
+            ends[i] = way + cast(origins, directions, surfaces).solid
+        return self.sheets._replace(first=ends)
+
+
+def beams_of(
+    rig: Rig, sources: Sequence[LaserSource], filters: ColourFilters = COLOUR_BALANCED
+) -> Beams:
+    """Return the sheets of a rig's lasers; see `pack_sheets`."""
     sheets = pack_sheets(rig, sources, filters)
-    for i in range(len(rig.lasers)):
-        origins, directions, way = fan_rays(rig, sheets, i)
-        sheets.first[i] = way + cast(origins, directions, surfaces).solid
-    return sheets
+    return Beams(sheets, tuple(fan_rays(rig, sheets, i) for i in range(len(rig.lasers))))
 
 
 def find_lit_points(rig: Rig, surfaces: Surfaces, sheets: Sheets) -> LitPoints:
