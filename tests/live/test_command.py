@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 import pytest
 
+from aqualvs.cli.main import main
 from aqualvs.optics.rigfile import load_rig
 from aqualvs.recording import DiveRecording, is_recording
 from aqualvs.results.folder import POSTURE_COLUMNS
@@ -33,7 +34,7 @@ from waiting import TIMEOUT_S, until
 
 SENDER = HELPERS / "stream_sender.py"
 N_CLIP = 60
-# A busy machine measures fewer frames than come, but never so few of sixty.
+# A busy machine measures fewer frames than come; what needs this many is sent again until then.
 N_AT_LEAST = 10
 # A recording grows by 8 MB at a time: the second time fails.
 LIMIT = 9_000_000
@@ -98,6 +99,34 @@ class Live:
             command += ["--" + name.replace("_", "-"), str(value)]
         subprocess.run(command, stdout=subprocess.DEVNULL, check=True, timeout=2 * TIMEOUT_S)
 
+    def send_until(
+        self, clip: Path, condition: Callable[[], object], what: str, **options: object
+    ) -> None:
+        """Send a clip again and again: how many of its frames are measured is up to the machine."""
+
+        def sent() -> object:
+            self.send(clip, **options)
+            return condition()
+
+        self.wait(sent, what)
+
+    @contextlib.contextmanager
+    def sending(self, clip: Path) -> Iterator[None]:
+        """Send a clip again and again meanwhile."""
+        enough = threading.Event()
+
+        def fill() -> None:
+            while not enough.is_set():
+                self.send(clip)
+
+        sender = threading.Thread(target=fill)
+        sender.start()
+        try:
+            yield
+        finally:
+            enough.set()
+            sender.join()
+
     def valid(self, since: float = 0.0) -> list[tuple[float, dict[str, Any]]]:
         return [(at, line) for at, line in list(self.lines) if line["valid"] and at > since]
 
@@ -157,17 +186,13 @@ def test_a_stream_comes_goes_returns_and_the_recording_replays(
 ) -> None:
     options = ["--record", "--record-to", str(tmp_path / "dives"), "--filter"]
     with live(rig_file, *options) as run:
-        run.send(clips["dive"])
-        run.wait(lambda: run.valid() and "no_frames" in run.reasons(run.valid()[-1][0]), "silence")
-        assert len(run.valid()) >= N_AT_LEAST
+        run.send_until(clips["dive"], lambda: len(run.valid()) >= N_AT_LEAST, "postures")
+        run.wait(lambda: "no_frames" in run.reasons(run.valid()[-1][0]), "silence")
         silent_s = run.lines[-1][0]
-        run.send(clips["dive"])
-        run.wait(lambda: run.valid(silent_s), "posture after the return")
-        run.send(clips["small"])
-        run.wait(lambda: "wrong_size" in run.reasons(), "other size")
+        run.send_until(clips["dive"], lambda: run.valid(silent_s), "posture after the return")
+        run.send_until(clips["small"], lambda: "wrong_size" in run.reasons(), "other size")
         other_s = next(at for at, line in list(run.lines) if line["reason"] == "wrong_size")
-        run.send(clips["dive"])
-        run.wait(lambda: run.valid(other_s), "posture after the other size")
+        run.send_until(clips["dive"], lambda: run.valid(other_s), "posture after the other size")
         lines = [line for _, line in run.lines]
         assert run.end(signal.SIGTERM) == 0
     assert [line["frame"] for line in lines] == sorted(line["frame"] for line in lines)
@@ -184,15 +209,7 @@ def test_a_stream_comes_goes_returns_and_the_recording_replays(
 
 
 def replayed(recording: Path, out: Path) -> list[dict[str, str]]:
-    command = [sys.executable, "-c", "from aqualvs.cli.main import main; exit(main())", "run"]
-    done = subprocess.run(
-        [*command, str(recording), "-o", str(out), "--no-report"],
-        capture_output=True,
-        text=True,
-        timeout=4 * TIMEOUT_S,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
+    assert main(["run", str(recording), "-o", str(out), "--no-report", "--workers", "1"]) == 0
     text = (out / "posture.csv").read_text().splitlines()
     assert tuple(text[0].split(",")) == POSTURE_COLUMNS
     return [dict(zip(POSTURE_COLUMNS, line.split(","), strict=True)) for line in text[1:]]
@@ -206,26 +223,25 @@ def test_a_stream_that_repeats_its_picture_has_no_posture(
         run.wait(lambda: "frozen" in run.reasons(), "the reason")
         lines = [line for _, line in run.lines if line["reason"] != "no_frames"]
         assert run.end(signal.SIGTERM) == 0
-    # Time stamps run on: by these it is noticed, however busy the machine.
-    first = lines[0]["frame"]
+    # Time stamps run on: by these it is noticed, however few pictures a busy machine measures.
     told = next(line["frame"] for line in lines if line["reason"] == "frozen")
-    assert 50 < told - first <= 50 + 12
+    before = [line for line in lines if line["frame"] < told]
+    assert told > 50
+    assert before[-1]["frame"] <= 50 + 12
+    assert any(line["valid"] for line in before)
     assert not any(line["valid"] for line in lines if line["frame"] > told)
-    assert sum(line["valid"] for line in lines) > 10
 
 
 def test_after_a_kill_the_recording_holds_all_but_the_last_moment(
     clips: dict[str, Path], rig_file: Path, tmp_path: Path
 ) -> None:
-    with live(rig_file, "--record", "--record-to", str(tmp_path / "dives")) as run:
-        sender = threading.Thread(target=run.send, args=(clips["dive"],))
-        sender.start()
+    options = ["--record", "--record-to", str(tmp_path / "dives")]
+    with live(rig_file, *options) as run, run.sending(clips["dive"]):
         run.wait(lambda: len(run.valid()) >= N_AT_LEAST, "postures")
         frame = run.valid()[-1][1]["frame"]
         (recording,) = (tmp_path / "dives").glob("*.mcap")
         run.wait(lambda: frame in frames_of(recording), "these on the disk")
         run.process.kill()
-        sender.join()
     rows = replayed(recording, tmp_path / "run")
     assert int(rows[-1]["frame"]) >= frame
 
@@ -252,23 +268,12 @@ def test_a_full_disk_ends_the_recording_and_nothing_else(
         preexec_fn=no_more,
         env=environment,
     ) as run:
-        full = threading.Event()
-
-        def fill() -> None:
-            while not full.is_set():
-                run.send(clips["dive"])
-
-        sender = threading.Thread(target=fill)
-        sender.start()
-        try:
+        with run.sending(clips["dive"]):
             # How soon depends on how many frames a busy machine measures, and so records.
             run.wait(lambda: any("recorder: fault" in text for text in run.told), "the fault")
-        finally:
-            full.set()
-            sender.join()
         before = len(run.valid())
-        run.send(clips["dive"])
-        run.wait(lambda: len(run.valid()) >= before + N_AT_LEAST, "postures without a recording")
+        enough = before + N_AT_LEAST
+        run.send_until(clips["dive"], lambda: len(run.valid()) >= enough, "postures afterwards")
         assert run.end(signal.SIGINT) == 0
     (recording,) = (tmp_path / "dives").glob("*.mcap")
     assert recording.stat().st_size <= LIMIT
@@ -279,10 +284,11 @@ def test_five_percent_of_loss_gives_no_false_posture(
     clips: dict[str, Path], rig_file: Path
 ) -> None:
     with live(rig_file) as run:
-        run.send(clips["dive"], loss=0.05, seed=3, repeat=2)
+        # A lost packet costs all pictures up to the next key frame: few are left, but these are
+        # true.
+        lossy = {"loss": 0.05, "seed": 3, "repeat": 2}
+        run.send_until(clips["dive"], lambda: len(run.valid()) >= 3, "postures", **lossy)
         ranges = {line["frame"]: line["range_m"] for _, line in run.valid()}
-    # A lost packet costs all pictures up to the next key frame: few are left, but these are true.
-    assert len(ranges) >= 3
     rig = load_rig(rig_file)
     near, far = rig.working_range
     # The dive goes between these; a stripe patched up from another picture would leave them.
@@ -306,21 +312,20 @@ def test_five_percent_of_loss_gives_no_false_posture(
     ],
 )
 def test_what_cannot_work_is_told_in_one_line(
-    arguments: list[str], words: str, rig_file: Path, tmp_path: Path
+    arguments: list[str],
+    words: str,
+    rig_file: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
-    command = [sys.executable, "-c", "from aqualvs.cli.main import main; exit(main())", "live"]
-    done = subprocess.run(
-        [*command, *arguments, "--rig", str(rig_file)],
-        capture_output=True,
-        text=True,
-        timeout=4 * TIMEOUT_S,
-        cwd=tmp_path,
-        check=False,
-    )
-    assert done.returncode == 2
-    (line,) = [text for text in done.stderr.splitlines() if text.startswith("aqualvs: error")]
+    monkeypatch.chdir(tmp_path)
+    assert main(["live", *arguments, "--rig", str(rig_file)]) == 2
+    said = capfd.readouterr().err
+    # Libraries that open cameras say something of their own.
+    (line,) = [text for text in said.splitlines() if text.startswith("aqualvs: error: ")]
     assert words in line
-    assert "Traceback" not in done.stderr
+    assert "Traceback" not in said
 
 
 def test_a_video_that_is_cut_short_is_told_in_one_line(rig_file: Path, tmp_path: Path) -> None:
