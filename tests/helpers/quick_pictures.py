@@ -25,7 +25,8 @@ class QuickRenderer:
     """Renderer that traces every ray only where laser light can be seen.
 
     There, pictures are as ever. Elsewhere, where the detector finds nothing green, they are of a
-    third of the resolution, but with the same noise.
+    third of the resolution, but with the same noise. Postures differ by a third of their sigma at
+    most on walls and nets of usual twine; light beside thick twine and slack folds is cut off.
 
     Parameters
     ----------

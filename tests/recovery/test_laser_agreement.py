@@ -11,9 +11,9 @@ from aqualvs.optics.rig import Rig, rig_moved_by
 from aqualvs.scanner import Scanner
 from aqualvs.scanning.agreement import AgreementState, AgreementVerdict, LaserAgreement
 from aqualvs.scanning.scan import Frame, planes_of_image
-from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenarios import example_rig, load_scenario
 from aqualvs.sources import open_source
+from quick_pictures import QuickRenderer
 from rig_from_sample_truth import load_truth
 
 _TIMES = np.linspace(0.1, 3.7, 8)
@@ -22,7 +22,7 @@ _DIVES = ("wall", "wall_yaw", "wall_pitch", "wall_range", "net_diamond", "net_cl
 
 @cache
 def frames(scenario_name: str) -> tuple[Frame, ...]:
-    renderer, scenario = Renderer(example_rig(), threads=2), load_scenario(scenario_name)
+    renderer, scenario = QuickRenderer(example_rig()), load_scenario(scenario_name)
     found = []
     for i, t in enumerate(_TIMES.tolist()):
         rng = np.random.default_rng([5, round(1000 * t)])

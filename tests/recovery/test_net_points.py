@@ -27,6 +27,7 @@ from aqualvs.simulation.scene import Net, Scene, Wall
 from aqualvs.simulation.scene import SurfaceKind as Kind
 from aqualvs.simulation.truth import visible_fit
 from aqualvs.sources import open_source
+from quick_pictures import QuickRenderer
 from rig_from_sample_truth import load_truth
 
 DIFFICULTIES: tuple[Difficulty, ...] = ("clean", "usual", "hard")
@@ -131,12 +132,14 @@ def test_the_paper_filter_on_every_bright_pixel(samples: Path, dive: str) -> Non
 
 
 @cache
-def renderer() -> Renderer:
-    return Renderer(example_rig(), threads=2)
+def renderers() -> tuple[Renderer, QuickRenderer]:
+    return Renderer(example_rig(), threads=2), QuickRenderer(example_rig())
 
 
-def shoot(scene: Scene, seed: int) -> tuple[Frame, RenderedFrame]:
-    picture = renderer().render(scene, 0.0, np.random.default_rng([7, seed]))
+def shoot(scene: Scene, seed: int, *, whole: bool = False) -> tuple[Frame, RenderedFrame]:
+    """Take a picture, of which all or the light alone is rendered ray by ray."""
+    renderer = renderers()[0 if whole else 1]
+    picture = renderer.render(scene, 0.0, np.random.default_rng([7, seed]))
     luma, chroma = planes_of_image(cv2.cvtColor(picture.image, cv2.COLOR_RGB2BGR))
     return Frame(0, 0.0, luma, chroma), picture
 
@@ -146,7 +149,10 @@ def test_random_nets_are_measured_and_never_mistaken() -> None:
     errors, n_valid = [], 0
     for index in range(N_SCENES):
         rng = np.random.default_rng([2023, index])
-        frame, picture = shoot(random_scene(rng, DIFFICULTIES[index % 3]), index)
+        difficulty = DIFFICULTIES[index % 3]
+        # Fish, bubbles and turbid water might be mistaken: they are rendered as they are.
+        whole = difficulty != "clean"
+        frame, picture = shoot(random_scene(rng, difficulty), index, whole=whole)
         seen = visible_fit(picture.lit, Kind.NET)
         posture = scanner.process(frame).posture
         if seen is None or not posture:

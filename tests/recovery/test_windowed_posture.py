@@ -15,11 +15,11 @@ from aqualvs.optics.sheet import sheets_of
 from aqualvs.scanner import Scanner
 from aqualvs.scanning.posture import Posture
 from aqualvs.scanning.scan import Frame, Scan, planes_of_image
-from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenarios import example_rig, load_scenario
 from aqualvs.simulation.scene import Scene
 from aqualvs.simulation.scene import SurfaceKind as Kind
 from aqualvs.simulation.truth import visible_fit
+from quick_pictures import QuickRenderer
 from windowed_cases import windowed
 
 WALLS = [("wall", 0.2), ("wall_yaw", 1.0), ("wall_pitch", 3.0), ("wall_range", 2.5)]
@@ -31,8 +31,8 @@ def rig() -> Rig:
 
 
 @cache
-def renderer() -> Renderer:
-    return Renderer(rig(), threads=2)
+def renderer() -> QuickRenderer:
+    return QuickRenderer(rig())
 
 
 @cache
