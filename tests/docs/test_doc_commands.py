@@ -25,6 +25,7 @@ from aqualvs.experiments import simulate
 from aqualvs.simulation.scenario import Scenario
 from aqualvs.simulation.scenarios import load_scenario
 from doc_blocks import PAGES, Command, all_commands, commands
+from panel_cases import small_rig
 from ports import free_port
 from repository import ROOT
 from waiting import TIMEOUT_S
@@ -46,7 +47,7 @@ ELSEWHERE = {
     r"^reproduce( -o| distance)": "takes minutes: tests/cli/test_reproduce.py",
     r"^batch /mnt": "needs a cluster: tests/batch/test_cluster.py",
     r"^net-change out/2026": "dives along one net, by logs: tests/cli/test_net_change.py",
-    r"^design --rig": "needs nothing but a rig; tests/cli/test_design.py",
+    r"^design (--rig|--image .*--lens-mm|design.yaml)": "as the README's; tests/cli/test_design.py",
 }
 IN_ORDER = (ROOT / "README.md", ROOT / "docs" / "first-dive.md", ROOT / "docs" / "tour.md")
 # Commands that begin processes or threads of their own, or are the first that a user types.
@@ -114,7 +115,9 @@ def world(tmp_path_factory):
     """A user's folder after the first dive and the tour."""
     folder = tmp_path_factory.mktemp("user")
     with pytest.MonkeyPatch.context() as patch:
+        # Rendering would be most of the time: small pictures, and few of them.
         patch.setattr(simulate, "load_scenario", few_frames)
+        patch.setattr(simulate, "example_rig", small_rig)
         for command in {arguments_of(c): c for page in IN_ORDER for c in commands(page)}.values():
             run(command, folder)
     named = {path for page in IN_ORDER for path in files_named(page)}
