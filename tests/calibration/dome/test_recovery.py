@@ -41,9 +41,9 @@ SIGMA_WATER = 5e-4
     ("kinds", "n_runs"),
     [
         (("exact",), 30),
-        (("distance",), 25),
-        (("unknown",), 25),
-        (("distance", "unknown"), 15),
+        (("distance",), 16),
+        (("unknown",), 16),
+        (("distance", "unknown"), 12),
     ],
 )
 def test_normalised_errors_are_normal(kinds: tuple[str, ...], n_runs: int) -> None:
@@ -65,7 +65,7 @@ def test_normalised_errors_are_normal(kinds: tuple[str, ...], n_runs: int) -> No
         noise.append(found.noise_px)
     for kind, spread in _spreads(runs).items():
         # Over 200 runs every number by itself lies within 0.85 and 1.15. Errors of one kind go
-        # together within a run, so few runs scatter as one number does: by 13 to 18 %.
+        # together within a run, so few runs scatter as one number does: by 13 to 20 %.
         assert 0.6 < spread < 1.45, kind
     # Huber's weights take 1 % off the noise.
     assert np.mean(noise) == pytest.approx(0.1, rel=0.03)
