@@ -204,6 +204,10 @@ def _parse(text: str) -> Any:
         mark = error.problem_mark
         # The parser in C reports faults at the end in the line after the last.
         line = 0 if mark is None else min(mark.line + 1, max(1, len(text.splitlines())))
+        if "nesting depth" in problem:
+            # libyaml from 0.2.6 on has a limit of its own, 1000 levels, which its scanner meets
+            # before it has told of the first 50.
+            raise _too_deep(line) from None
         raise _TextError(f"is not YAML: {problem}", line) from None
     except (yaml.YAMLError, ValueError):
         # The parser in Python leaks a ValueError for an escape that is no character.

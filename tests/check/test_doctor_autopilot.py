@@ -64,8 +64,9 @@ def test_a_vehicle_that_is_ready(vehicle: Fake) -> None:
     assert told(findings, "MAV_GCS_SYSID 255", "are obeyed") is OK
     assert told(findings, "FS_PILOT_INPUT 1 (warn)") is OK
     assert told(findings, "FS_PILOT_TIMEOUT 1 s") is OK
-    assert told(findings, "PILOT_SPEED_UP 50: a full stick asks for 0.5 m/s") is OK
-    assert told(findings, "PILOT_SPEED_DN 50") is OK
+    # What the vehicle holds is shown, not what it makes of a 0.
+    said = "PILOT_SPEED_UP 50 (PILOT_SPEED_DN 0: as much downwards): a full stick asks for 0.5 m/s"
+    assert told(findings, said) is OK
     assert told(findings, "RNGFND1_TYPE 10, RNGFND1_ORIENT 0") is OK
     assert told(findings, "RNGFND1_MIN, RNGFND1_MAX: 0.2 to 7 m count") is OK
 
@@ -80,6 +81,12 @@ def test_a_vehicle_as_it_comes(vehicle: Fake) -> None:
     assert told(findings, "FS_PILOT_TIMEOUT 3 s", "set FS_PILOT_TIMEOUT 1") is WARN
     assert told(findings, "PILOT_SPEED_UP 500", "5 m/s", "PILOT_SPEED_DN 50") is WARN
     assert told(findings, "RNGFND1_TYPE 0", "set RNGFND1_TYPE 10") is WARN
+
+
+def test_a_vehicle_that_sinks_at_a_speed_of_its_own(vehicle: Fake) -> None:
+    findings = found(vehicle, parameters={**SOUND, "PILOT_SPEED_DN": 500.0})
+    assert told(findings, "PILOT_SPEED_UP 50: a full stick asks for 0.5 m/s") is OK
+    assert told(findings, "PILOT_SPEED_DN 500: a full stick asks for 5 m/s") is WARN
 
 
 def test_a_vehicle_that_does_not_obey_us(vehicle: Fake) -> None:

@@ -11,10 +11,11 @@ import pytest
 from aqualvs.control.missions import Guidance, Stage
 from aqualvs.control.safety import LimitReason
 from aqualvs.control.vehicle import Effort, Setpoint, VehicleState
-from aqualvs.errors import OptionError
+from aqualvs.errors import OptionError, OutputError
 from aqualvs.follow.command import FOLLOW_CSV, Aim
 from aqualvs.follow.vehicle import FollowLogOutput, FollowRequest, follow_and_tell
 from aqualvs.live.pilot import PilotReport
+from aqualvs.results.files import Claim
 from aqualvs.sources.base import State
 from live_cases import demo_samples
 
@@ -86,6 +87,39 @@ def test_a_dive_without_a_vehicle_is_logged_and_never_steered(tmp_path: Path) ->
     assert {row["engaged"] for row in rows} == {"0"}
     assert {row["forward"] for row in rows} == {"0.0000"}
     assert "valid" in {row["posture"] for row in rows}
+
+
+@pytest.mark.parametrize(
+    ("earlier", "overwrite", "words"),
+    [
+        ("somebody's own", False, "did not write it"),
+        ("somebody's own", True, "did not write it"),
+        ("a dive's", False, "add --overwrite"),
+    ],
+)
+def test_the_log_of_an_earlier_dive_stays(
+    earlier: str, overwrite: bool, words: str, tmp_path: Path
+) -> None:
+    log = tmp_path / FOLLOW_CSV
+    if earlier == "a dive's":
+        with Claim("follow", [log], overwrite=False):
+            log.write_text(earlier, encoding="utf-8")
+    else:
+        log.write_text(earlier, encoding="utf-8")
+    folder = importlib.resources.files("aqualvs") / "data" / "demo"
+    with importlib.resources.as_file(folder) as demo:
+        request = FollowRequest(
+            source=str(demo / "dive.mp4"),
+            rig=demo / "rig.yaml",
+            mavlink="udpout:127.0.0.1:9",
+            gains="bluerov2",
+            out=tmp_path,
+            aim=Aim(range=0.5),
+            overwrite=overwrite,
+        )
+        with pytest.raises(OutputError, match=words):
+            follow_and_tell(request, lambda _: None, io.StringIO())
+    assert log.read_text(encoding="utf-8") == earlier
 
 
 def test_gains_that_are_not_there_are_told(tmp_path: Path) -> None:

@@ -83,6 +83,7 @@ def test_holds_and_turns_in_calm_water(name: str) -> None:
         assert hold.range_rms <= 15e-3
         assert math.degrees(hold.yaw_rms) <= 0.3
         assert effort_measures(log, "forward", FROM_REST_S, 40.0).reversals <= 20.0
+        assert effort_measures(log, "turn", FROM_REST_S, 40.0).reversals <= 20.0
         time_s, yaw = log.column("time_s"), np.degrees(log.column("yaw"))
         away = time_s[(time_s > 40.0) & (np.abs(yaw - 10.0) > 1.0)]
         assert away[-1] - 40.0 <= 3.5

@@ -207,10 +207,14 @@ def advise_on_speed(
     up = parameters.get(SPEED_UP)
     if up is None:
         return [Advice(Weight.CARE, f"{SPEED_UP} is not told: plans that change the depth are off")]
-    # ArduSub takes 0 for the speed upwards (get_pilot_speed_dn).
-    down = parameters.get(SPEED_DOWN) or up
+    down = parameters.get(SPEED_DOWN, 0.0)
+    if down == 0.0:
+        # ArduSub takes 0 for the speed upwards (get_pilot_speed_dn).
+        same = "0" if SPEED_DOWN in parameters else "is not told"
+        both = f"{SPEED_UP} {up:.0f} ({SPEED_DOWN} {same}: as much downwards)"
+        return [_climb_advice(both, up, full_climb_rate)]
     return [
-        _climb_advice(name, speed, full_climb_rate)
+        _climb_advice(f"{name} {speed:.0f}", speed, full_climb_rate)
         for name, speed in ((SPEED_UP, up), (SPEED_DOWN, down))
     ]
 
@@ -251,9 +255,9 @@ def advise_on_distance(
     return [Advice(Weight.FINE, text), *_limits_advice(parameters, working_range)]
 
 
-def _climb_advice(name: str, told: float, full_climb_rate: float) -> Advice:
+def _climb_advice(setting: str, told: float, full_climb_rate: float) -> Advice:
     speed = 0.01 * told
-    means = f"{name} {told:.0f}: a full stick asks for {speed:.2g} m/s times the pilot gain"
+    means = f"{setting}: a full stick asks for {speed:.2g} m/s times the pilot gain"
     if full_climb_rate / _CLIMB_RATE_RATIO <= speed <= full_climb_rate * _CLIMB_RATE_RATIO:
         return Advice(Weight.FINE, means)
     return Advice(
