@@ -223,9 +223,9 @@ class VideoSource(Closing):
         with contextlib.suppress(SourceError):
             first += itertools.islice(self._packets, 2)
         self._packets = itertools.chain(first, self._packets)
-        return any(
-            pairs.is_second(memoryview(packet)) and packet.pts is not None for packet in first
-        )
+        coded = [packet for packet in first if packet.size]
+        seconds = [packet for packet in coded if pairs.is_second(memoryview(packet))]
+        return any(packet.pts is not None for packet in seconds)
 
     def _read_packets(self) -> Iterator["Packet[VideoStream]"]:
         """Read packets; a damaged container ends early, which the promise then reveals."""
