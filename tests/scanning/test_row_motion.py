@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from aqualvs.geometry.transforms import SE3
 from aqualvs.optics.shutter import AT_ONCE, Shutter, ShutterKind
 from aqualvs.scanner import Scanner
 from aqualvs.scanning import row_motion
@@ -77,6 +78,39 @@ def test_a_posture_is_that_of_the_pictures_middle(scans):
     sigma = np.sqrt(np.diag(found.posture.covariance))
     assert np.all(np.abs(found.posture.numbers - truth(2)) < 3.0 * sigma)
     assert found.posture.by_motion is None
+
+
+def test_a_picture_turned_upside_down_has_a_negative_readout(frames, scans):
+    lens, pose = ROLLING.lens, ROLLING.dome_from_cam
+    k1, k2, p1, p2 = lens.distortion[:4]
+    width, height = ROLLING.size_px
+    turned_lens = replace(
+        lens,
+        cx=width - 1.0 - lens.cx,
+        cy=height - 1.0 - lens.cy,
+        distortion=(k1, k2, -p1, -p2, *lens.distortion[4:]),
+    )
+    rig = replace(
+        ROLLING,
+        lens=turned_lens,
+        dome_from_cam=SE3(pose.rotation @ np.diag([-1.0, -1.0, 1.0]), pose.translation),
+        shutter=replace(ROLLING.shutter, readout=-ROLLING.shutter.readout),
+    )
+    scanner = Scanner(rig)
+
+    def upside_down(frame):
+        luma, *chroma = (
+            np.ascontiguousarray(one[::-1, ::-1]) for one in (frame.luma, *frame.chroma)
+        )
+        return scanner.process(replace(frame, luma=luma, chroma=tuple(chroma)))
+
+    found = [upside_down(frame) for frame in frames]
+    correct = RowMotion(rig).correct(found[2], [*found[:2], *found[3:]])
+    upright = RowMotion(ROLLING).correct(scans[2], [*scans[:2], *scans[3:]])
+    # Which of the points are used begins at another corner of the picture.
+    off = correct.posture.numbers - upright.posture.numbers
+    assert np.all(np.abs(off) < 0.5 * np.sqrt(np.diag(upright.posture.covariance)))
+    assert np.all(np.abs(error(correct, 2)) < [1.0, 0.15, 0.15])
 
 
 def test_a_wall_that_leans_for_its_motion_is_no_nearer(scans):

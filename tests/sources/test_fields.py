@@ -129,13 +129,35 @@ def test_fields_are_recognised_by_the_stream_and_by_the_comb(tmp_path, coded):
     found = evidence(woven_dive(tmp_path / "dive.mp4", 6, shutter=_BOTTOM, coded=coded))
     assert (found.is_marked, found.first_field) == ((True, "bottom") if coded else (False, None))
     assert found.combed > 0.005
-    order = ", first_field: bottom" if coded else ""
-    remedy = f"camera.shutter: {{kind: interlaced, readout_ms: 40{order}}}"
+    remedy = "camera.shutter: {kind: interlaced, readout_ms: 40, first_field: bottom}"
     for whole in (AT_ONCE, Shutter(kind=ShutterKind.ROLLING, readout=0.02)):
         assert remedy in found.contradiction(whole, 12.5)
     assert found.contradiction(_BOTTOM, 12.5) == ""
-    other = found.contradiction(FIELDS, 12.5)
-    assert ("camera.shutter.first_field: bottom" in other) == coded
+    assert found.first_by_motion == "bottom"
+    assert "camera.shutter.first_field: bottom" in found.contradiction(FIELDS, 12.5)
+
+
+@pytest.mark.parametrize("first", ["top", "bottom"])
+def test_motion_tells_the_order_of_fields_where_the_stream_is_wrong(tmp_path, first):
+    shutter = replace(FIELDS, first_field=first)
+    other = replace(FIELDS, first_field="top" if first == "bottom" else "bottom")
+    found = replace(
+        evidence(woven_dive(tmp_path / "dive.mp4", 6, shutter=shutter)),
+        first_field=other.first_field,
+    )
+    assert found.contradiction(shutter, 12.5) == ""
+    said = found.contradiction(other, 12.5)
+    assert f"the {first} field comes first, as what moves shows" in said
+    assert f"set camera.shutter.first_field: {first} in the rig file" in said
+
+
+def test_the_stream_tells_the_order_where_nothing_moves(tmp_path):
+    with open_source(woven_dive(tmp_path / "dive.mp4", 4, shutter=_BOTTOM)) as source:
+        still = 3 * [next(iter(source))]
+    found = FieldEvidence.of([still], "bottom")
+    assert found.first_by_motion is None
+    assert "if the postures go to and fro" in found.contradiction(FIELDS, 12.5)
+    assert FieldEvidence.of([still]).contradiction(FIELDS, 12.5) == ""
 
 
 def test_whole_pictures_are_recognised_where_something_moves():
@@ -176,7 +198,24 @@ def test_a_stream_of_fields_is_noticed_and_named_with_its_remedy(tmp_path):
     said = "camera.shutter: {kind: interlaced, readout_ms: 20}"
     assert said in watched(fields, AT_ONCE)
     assert "readout_ms: 16.667" in watched(fields, AT_ONCE, 30)
-    assert watched(fields, FIELDS) == ""
+
+
+@pytest.mark.parametrize("first", ["top", "bottom"])
+def test_a_stream_shows_which_field_comes_first(tmp_path, first):
+    video = woven_dive(tmp_path / "dive.mp4", 30, shutter=replace(FIELDS, first_field=first))
+    with open_source(video) as source:
+        fields = list(source)
+
+    def said(shutter):
+        watch = FieldWatch(shutter)
+        for one in fields:
+            watch.look(replace(one, is_interlaced=False))
+        return watch.warning
+
+    other = "top" if first == "bottom" else "bottom"
+    assert said(replace(FIELDS, first_field=first)) == ""
+    wrong = said(replace(FIELDS, first_field=other))
+    assert f"set camera.shutter.first_field: {first} in the rig file" in wrong
 
 
 def test_a_still_stream_is_interlaced_if_it_says_so():

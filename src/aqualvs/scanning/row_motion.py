@@ -14,12 +14,20 @@ The points of one frame alone tell the rates too, but worse: they bend and twist
 enough to take the motion out of the scatter, before surfaces are fitted and sigmas are found.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray
+from aqualvs.geometry.compiled import borrowing_kernel, kernel
+from aqualvs.geometry.linear_algebra import (
+    element_at,
+    factorise,
+    inverse_of,
+    solve_factorised,
+)
 from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.rig_covariance import FittedSurface, posture_by_plane
@@ -43,6 +51,7 @@ _JERKS = np.array([1.5, np.deg2rad(120.0), np.deg2rad(120.0)])
 # count as fewer still, so that a rate of which one frame tells little, such as that of the range,
 # stays near zero.
 _ENOUGH, _INDEPENDENT = 200, 30.0
+_REWEIGHTS = 3
 # Blur explains these reasons where the vehicle turns by more during an exposure: rendered nets at
 # 480 mm, meshes of 25 mm, were refused from 2.7 degrees on, and none up to 1.9.
 _BLURRED = np.deg2rad(2.5)
@@ -79,8 +88,7 @@ class RowMotion:
         times, m = self._times(candidates.pixels), plane.normal / plane.offset
         sigma = np.abs(candidates.sensitivity[seen] @ m) * candidates.sigma_px[seen] + 1e-12
         m, m_rate = _fit_rates(candidates.points[seen], sigma, times[seen], m)
-        still = candidates.points - times[:, None] * _velocity(m, m_rate, candidates.points)
-        return replace(candidates, points=still)
+        return replace(candidates, points=_moved_back(candidates.points, times, m, m_rate))
 
     def as_exposed(
         self,
@@ -105,21 +113,20 @@ class RowMotion:
             1 over the variance of the residual, or 0.
         """
         m = posture.normal_in_dome / posture.range
-        terms = surface.terms * weights[:, None]
-        matrix = terms.T @ surface.terms + np.diag(surface.prior)
-        # At its time t a point lies on the plane m + t rate + t²/2 acceleration, and so off m by
-        # the rest times X. An exposure shows the mean of its own times.
-        t = self._times(seen.pixels)[:, None]
-        half_square = 0.5 * (t**2 + self._shutter.exposure**2 / 12.0)
-        back = (seen.points - still.points) @ m
-        moved = terms.T @ np.hstack([seen.points * t, seen.points * half_square, -back[:, None]])
+        matrix, moved = np.diag(surface.prior), np.zeros((len(surface.prior), 7))
+        # An exposure shows the mean of its own times.
+        spread = self._shutter.exposure**2 / 12.0
+        times, terms = self._times(seen.pixels), np.ascontiguousarray(surface.terms)
+        _sum_up(terms, weights, seen.points, still.points, times, spread, m, matrix, moved)
         scale = float(np.linalg.norm(surface.normal) / np.linalg.norm(m))
         by_m = _by_m(m)
         m_moved = -scale * np.linalg.solve(by_m, surface.posture @ np.linalg.solve(matrix, moved))
         m = m + m_moved[:, 6]
         by_m = _by_m(m)
         to_m = np.linalg.inv(by_m)
-        by_motion = by_m @ np.hstack([m_moved[:, :3] @ to_m, m_moved[:, 3:6] @ to_m])
+        by_motion = np.empty((3, 6))
+        by_motion[:, :3] = by_m @ m_moved[:, :3] @ to_m
+        by_motion[:, 3:] = by_m @ m_moved[:, 3:6] @ to_m
         return replace(self._on(posture, m), by_motion=by_motion)
 
     def correct(self, scan: Scan, beside: Sequence[Scan]) -> Scan:
@@ -151,11 +158,11 @@ class RowMotion:
             + by_motion @ covariance @ by_motion.T
             + np.outer(off, off),
         )
-        points, seen = scan.points, scan.points.points_in_dome
-        velocity = _velocity(m, m_rate, seen)
-        moved = seen - self._times(points.pixels)[:, None] * velocity
+        points = scan.points
+        moved = _moved_back(points.points_in_dome, self._times(points.pixels), m, m_rate)
         if points.used.any():
-            nearest = float(np.linalg.norm(moved[points.used], axis=1).min())
+            near = moved[points.used]
+            nearest = math.sqrt(float(np.einsum("ij,ij->i", near, near).min()))
             corrected = replace(corrected, nearest=nearest)
         return replace(scan, posture=corrected, points=replace(points, points_in_dome=moved))
 
@@ -227,20 +234,100 @@ def _fit_rates(
     m : array, shape (3,)
         A first m.
     """
-    terms = np.hstack([points, points * times[:, None]])
     prior, both = np.zeros((6, 6)), np.concatenate([m, np.zeros(3)])
     scaled = _by_m(m) / _RATES[:, None]
     prior[3:, 3:] = scaled.T @ scaled
-    reweights = 3
-    for _ in range(reweights):
-        z = (terms @ both - 1.0) / sigma
-        # NumPy's median takes several times as long.
-        middle = float(np.partition(np.abs(z), len(z) // 2)[len(z) // 2])
-        scale = max(1.4826 * middle, 0.1)
-        weights = (np.maximum(1.0 - (z / (TUKEY * scale)) ** 2, 0.0) / (sigma * scale)) ** 2
-        weighted = terms.T * (weights * min(_INDEPENDENT / len(points), 1.0))
-        both = np.linalg.solve(weighted @ terms + prior, weighted.sum(axis=1))
+    share = min(_INDEPENDENT / max(len(points), 1), 1.0)
+    if not _reweight(points, sigma, times, prior, share, both):
+        return m, np.zeros(3)
     return both[:3], both[3:]
+
+
+@kernel
+def _reweight(
+    points: FloatArray,
+    sigma: FloatArray,
+    times: FloatArray,
+    prior: FloatArray,
+    share: float,
+    both: FloatArray,
+) -> bool:
+    """Fit m and its rate, one after the other in `both` (6,), with Tukey's weights times a share.
+
+    Return False where neither points nor prior tell one of them.
+    """
+    n = len(points)
+    z, matrix, right, term = np.empty(n), np.empty((6, 6)), np.empty(6), np.empty(6)
+    for _ in range(_REWEIGHTS):
+        for i in range(n):
+            off = -1.0
+            for k in range(3):
+                off += points[i, k] * (both[k] + times[i] * both[3 + k])
+            z[i] = abs(off / sigma[i])
+        scale = max(1.4826 * element_at(z, 0.5), 0.1)
+        matrix[:], right[:] = prior, 0.0
+        for i in range(n):
+            far = z[i] / (TUKEY * scale)
+            if not far < 1.0:
+                continue
+            weight = share * ((1.0 - far * far) / (sigma[i] * scale)) ** 2
+            for k in range(3):
+                term[k], term[3 + k] = points[i, k], points[i, k] * times[i]
+            for a in range(6):
+                right[a] += weight * term[a]
+                for b in range(a + 1):
+                    matrix[a, b] += weight * term[a] * term[b]
+        if not factorise(matrix, 0.0, 0.0, matrix):
+            return False
+        solve_factorised(matrix, right, both)
+    return True
+
+
+@kernel
+def _sum_up(
+    terms: FloatArray,
+    weights: FloatArray,
+    seen: FloatArray,
+    still: FloatArray,
+    times: FloatArray,
+    spread: float,
+    m: FloatArray,
+    matrix: FloatArray,
+    moved: FloatArray,
+) -> None:
+    """Add the normal matrix (K, K) of N points, and what motion adds to its right side (K, 7).
+
+    At its time t a point lies on the plane m + t rate + t²/2 acceleration, and so off m by the rest
+    times X: columns for the rate, for the acceleration, and for what took points from where they
+    were `seen`.
+
+    Parameters
+    ----------
+    terms, weights : array, shape (N, K), (N,)
+    seen, still : array, shape (N, 3)
+    times : array, shape (N,)
+        Middles of the exposures.
+    spread : float
+        Variance of the times within an exposure.
+    m : array, shape (3,)
+    matrix, moved : array, shape (K, K), (K, 7)
+    """
+    n_terms = terms.shape[1]
+    for i in range(len(weights)):
+        if weights[i] == 0.0:
+            continue
+        t = times[i]
+        half_square, back = 0.5 * (t * t + spread), 0.0
+        for k in range(3):
+            back += (seen[i, k] - still[i, k]) * m[k]
+        for a in range(n_terms):
+            term = weights[i] * terms[i, a]
+            for b in range(n_terms):
+                matrix[a, b] += term * terms[i, b]
+            for k in range(3):
+                moved[a, k] += term * seen[i, k] * t
+                moved[a, 3 + k] += term * seen[i, k] * half_square
+            moved[a, 6] -= term * back
 
 
 def motion_beside(scan: Scan, beside: Sequence[Scan]) -> tuple[FloatArray, FloatArray]:
@@ -258,38 +345,115 @@ def motion_beside(scan: Scan, beside: Sequence[Scan]) -> tuple[FloatArray, Float
     posture = scan.posture
     if not isinstance(posture, Posture) or posture.by_motion is None:
         raise ValueError(f"frame {scan.index}: no posture as its rows were exposed")
-    # Unknowns: posture and motion, relative to the scan's own measurement, and how accelerations
-    # change, of which the error during a picture is nothing.
-    matrix, right, one_each = np.zeros((12, 12)), np.zeros(12), np.eye(3)
-    prior = np.concatenate([_RATES, _ACCELERATIONS, _JERKS]) ** -2.0
-    matrix[range(3, 12), range(3, 12)] = prior
-    # A frame whose squared Mahalanobis distance is larger (once in 1000 times by chance, 3 values)
-    # shows another surface, or is wrong.
-    gate = 16.27
-    for one in (scan, *beside):
-        found, t = one.posture, one.time_s - scan.time_s
-        if not isinstance(found, Posture) or found.by_motion is None or abs(t) > _REACH_S:
-            continue
-        off = found.numbers - posture.numbers
-        by_rates = found.by_motion[:, :3] + t * one_each
-        by_accelerations = found.by_motion[:, 3:]
-        by_jerks = t * by_accelerations + 0.5 * t**2 * by_rates - t**3 / 3.0 * one_each
-        by_accelerations = by_accelerations + t * by_rates - 0.5 * t**2 * one_each
-        by = np.hstack([one_each, by_rates, by_accelerations, by_jerks])
-        # Of the difference between the two, in which their common error is not.
-        of_both = by[:, 3:].copy()
-        of_both[:, :6] -= posture.by_motion
-        expected = found.covariance + posture.covariance + (of_both / prior) @ of_both.T
-        if one is not scan and off @ np.linalg.solve(expected, off) > gate:
-            continue
-        weighed = by.T @ np.linalg.inv(found.covariance)
-        matrix += weighed @ by
-        right += weighed @ off
-    covariance = np.asarray(np.linalg.inv(matrix), np.float64)
-    motion, covariance = (covariance @ right)[3:9], covariance[3:9, 3:9]
+    known = [(0.0, posture, posture.by_motion)]
+    for one in beside:
+        found, after = one.posture, one.time_s - scan.time_s
+        is_near = isinstance(found, Posture) and abs(after) <= _REACH_S
+        if is_near and isinstance(found, Posture) and found.by_motion is not None:
+            known.append((after, found, found.by_motion))
+    motion, covariance = np.empty(12), np.empty((12, 12))
+    _weigh_motions(
+        np.array([after for after, _, _ in known]),
+        np.array([found.numbers for _, found, _ in known]),
+        np.array([found.covariance for _, found, _ in known]),
+        np.array([by for _, _, by in known]),
+        np.concatenate([_RATES, _ACCELERATIONS, _JERKS]) ** 2.0,
+        motion,
+        covariance,
+    )
+    motion, covariance = motion[3:9], covariance[3:9, 3:9]
     if scan.turning is None:
         return motion, covariance
     return _with_gyros(motion, covariance, posture, scan.turning)
+
+
+@kernel
+def _weigh_motions(
+    t: FloatArray,
+    numbers: FloatArray,
+    covariances: FloatArray,
+    by_motion: FloatArray,
+    variances: FloatArray,
+    motion: FloatArray,
+    covariance: FloatArray,
+) -> None:
+    """Write posture and motion (12,) at the first of some frames, and their covariance (12, 12).
+
+    Unknowns are the posture, relative to what the first frame measured, its rates, its
+    accelerations, and how these change, of which the error during a picture is nothing.
+
+    Parameters
+    ----------
+    t : array, shape (F,)
+        Times from the first frame.
+    numbers, covariances, by_motion : array, shape (F, 3), (F, 3, 3), (F, 3, 6)
+        Range, pitch and yaw, and what belongs to them.
+    variances : array, shape (9,)
+        Of the motion, before anything is measured.
+    motion, covariance : array
+    """
+    matrix, right = np.zeros((12, 12)), np.zeros(12)
+    for k in range(9):
+        matrix[3 + k, 3 + k] = 1.0 / variances[k]
+    by, off, weighed = np.empty((3, 12)), np.empty(3), np.empty((3, 3))
+    for f in range(len(t)):
+        off[:] = numbers[f] - numbers[0]
+        _fill_terms(t[f], by_motion[f], by)
+        both = covariances[f] + covariances[0]
+        agrees = f == 0 or _agree(off, by, by_motion[0], variances, both)
+        if not agrees or not factorise(covariances[f], 0.0, 0.0, weighed):
+            continue
+        weighed[:] = inverse_of(weighed)
+        for a in range(12):
+            for i in range(3):
+                term = 0.0
+                for j in range(3):
+                    term += by[j, a] * weighed[j, i]
+                right[a] += term * off[i]
+                for b in range(12):
+                    matrix[a, b] += term * by[i, b]
+    factorise(matrix, 0.0, 0.0, matrix)
+    covariance[:] = inverse_of(matrix)
+    solve_factorised(matrix, right, motion)
+
+
+@borrowing_kernel
+def _fill_terms(t: float, by_motion: FloatArray, by: FloatArray) -> None:
+    """Write the derivatives (3, 12) of what a frame measures at a time, by all unknowns."""
+    for i in range(3):
+        for k in range(3):
+            same = 1.0 if i == k else 0.0
+            rate, change = by_motion[i, k] + t * same, by_motion[i, 3 + k]
+            by[i, k], by[i, 3 + k] = same, rate
+            by[i, 6 + k] = change + t * rate - 0.5 * t**2 * same
+            by[i, 9 + k] = t * change + 0.5 * t**2 * rate - t**3 / 3.0 * same
+
+
+@kernel
+def _agree(
+    off: FloatArray,
+    by: FloatArray,
+    by_motion_of_first: FloatArray,
+    variances: FloatArray,
+    expected: FloatArray,
+) -> bool:
+    """Return whether two frames show one surface, from their difference (3,).
+
+    `expected` (3, 3), the sum of their covariances, is used up.
+    """
+    # A squared Mahalanobis distance that is larger once in 1000 times by chance, of 3 values.
+    gate = 16.27
+    # Of the difference, in which what both have in common is not.
+    of_both, told = by[:, 3:].copy(), np.empty(3)
+    of_both[:, :6] -= by_motion_of_first
+    for i in range(3):
+        for j in range(3):
+            for k in range(9):
+                expected[i, j] += of_both[i, k] * variances[k] * of_both[j, k]
+    if not factorise(expected, 0.0, 0.0, expected):
+        return False
+    solve_factorised(expected, off, told)
+    return bool(off[0] * told[0] + off[1] * told[1] + off[2] * told[2] <= gate)
 
 
 def _with_gyros(
@@ -322,41 +486,91 @@ def _at_middle(
     """
     exposed = posture.normal_in_dome / posture.range
     by_m = _by_m(exposed)
+    to_m = np.linalg.inv(by_m)
     m_by_rate, m_by_acceleration = (
-        np.linalg.solve(by_m, one @ by_m) for one in np.hsplit(by_motion, 2)
+        to_m @ one @ by_m for one in (by_motion[:, :3], by_motion[:, 3:])
     )
-    rates, accelerations = np.split(motion, 2)
-    m, step = exposed, 0.01
+    m, m_rate = exposed.copy(), np.empty(3)
+    _go_to_middle(exposed, m_by_rate, m_by_acceleration, motion, m, m_rate)
+    return m, m_rate
+
+
+@kernel
+def _go_to_middle(
+    exposed: FloatArray,
+    m_by_rate: FloatArray,
+    m_by_acceleration: FloatArray,
+    motion: FloatArray,
+    m: FloatArray,
+    m_rate: FloatArray,
+) -> None:
+    """Write m at the picture's middle over a first guess, and its rate."""
+    step, before, after = 0.01, np.empty(3), np.empty(3)
     # The motion of m depends on m itself; each round leaves 2 % of the error.
     rounds = 2
     for _ in range(rounds):
-        now = np.array(range_pitch_yaw(m))
-        before, after = (
-            _plane_of(now + t * rates + 0.5 * t**2 * accelerations) for t in (-step, step)
-        )
-        m_rate = (after - before) / (2.0 * step)
-        m_acceleration = (after - 2.0 * m + before) / step**2
-        m = exposed - m_by_rate @ m_rate - m_by_acceleration @ m_acceleration
-    return m, m_rate
+        distance = 1.0 / math.sqrt(m[0] * m[0] + m[1] * m[1] + m[2] * m[2])
+        pitch, yaw = math.atan2(m[2], m[1]), math.atan2(m[0], m[1])
+        for t, plane in ((-step, before), (step, after)):
+            half = 0.5 * t * t
+            x = math.tan(yaw + t * motion[2] + half * motion[5])
+            z = math.tan(pitch + t * motion[1] + half * motion[4])
+            far = distance + t * motion[0] + half * motion[3]
+            plane[1] = 1.0 / (far * math.sqrt(x * x + 1.0 + z * z))
+            plane[0], plane[2] = x * plane[1], z * plane[1]
+        for k in range(3):
+            m_rate[k] = (after[k] - before[k]) / (2.0 * step)
+            after[k] = (after[k] - 2.0 * m[k] + before[k]) / step**2
+        for i in range(3):
+            m[i] = exposed[i]
+            for k in range(3):
+                m[i] -= m_by_rate[i, k] * m_rate[k] + m_by_acceleration[i, k] * after[k]
 
 
 def _plane_of(numbers: FloatArray) -> FloatArray:
     """Return m of range, pitch and yaw, in m and rad."""
     distance, pitch, yaw = numbers.tolist()
-    toward = np.array([np.tan(yaw), 1.0, np.tan(pitch)])
-    m: FloatArray = toward / (distance * np.linalg.norm(toward))
-    return m
+    x, z = math.tan(yaw), math.tan(pitch)
+    scale = 1.0 / (distance * math.sqrt(x * x + 1.0 + z * z))
+    return np.array([x * scale, scale, z * scale])
 
 
-def _velocity(m: FloatArray, m_rate: FloatArray, points: FloatArray) -> FloatArray:
-    """Return the velocities (N, 3) of points (N, 3) that turn and move with the plane m·X = 1."""
+def _moved_back(
+    points: FloatArray, times: FloatArray, m: FloatArray, m_rate: FloatArray
+) -> FloatArray:
+    """Return points (N, 3) where they are at time 0.
+
+    Each was seen at its time (N,), and turns and moves with the plane m·X = 1.
+    """
     distance = float(1.0 / np.linalg.norm(m))
     normal = m * distance
     along = float(normal @ m_rate)
+    moved = np.empty(points.shape)
     turned = distance * (m_rate - along * normal)
-    turn = np.outer(normal, turned)
-    velocity: FloatArray = points @ (turn - turn.T) - along * distance**2 * normal
-    return velocity
+    _move_back(points, times, normal, turned, along * distance**2, moved)
+    return moved
+
+
+@borrowing_kernel
+def _move_back(
+    points: FloatArray,
+    times: FloatArray,
+    normal: FloatArray,
+    turned: FloatArray,
+    approach: float,
+    moved: FloatArray,
+) -> None:
+    """Write points (N, 3) less their times times their velocities.
+
+    The velocity at X is (n·X) turned - (turned·X + approach) n, with the unit normal n.
+    """
+    for i in range(len(points)):
+        ahead, across = 0.0, approach
+        for k in range(3):
+            ahead += points[i, k] * normal[k]
+            across += points[i, k] * turned[k]
+        for k in range(3):
+            moved[i, k] = points[i, k] - times[i] * (ahead * turned[k] - across * normal[k])
 
 
 def _by_m(m: FloatArray) -> FloatArray:

@@ -1,8 +1,9 @@
 """NAL units of H.264 and HEVC: their types, and the frame numbers that reveal lost pictures.
 
-Receivers read only what shows whether a picture is missing (`FrameNumbers`, H.264); the search for
-places to cut a video reads only the types of the units (`unit_reader`, H.264 and HEVC). Sections
-and tables without another source are those of ITU-T H.264.
+Receivers read only what shows whether a picture is missing (`FrameNumbers`, H.264), and which
+packets complete a picture that another one began (`FieldPairs`, H.264); the search for places to
+cut a video reads only the types of the units (`unit_reader`, H.264 and HEVC). Sections and tables
+without another source are those of ITU-T H.264.
 """
 
 import re
@@ -86,9 +87,14 @@ def _units(codec: _Codec, heads: Iterator[int]) -> Units:
 
 def _by_length(packet: memoryview, n_length: int) -> Iterator[int]:
     """Yield the first byte of each unit."""
+    return (packet[at] for at in _after_lengths(packet, n_length))
+
+
+def _after_lengths(packet: bytes | memoryview, n_length: int) -> Iterator[int]:
+    """Yield where each unit begins, behind its length."""
     at = 0
     while at + n_length < len(packet):
-        yield packet[at + n_length]
+        yield at + n_length
         at += n_length + int.from_bytes(packet[at : at + n_length], "big")
 
 
@@ -115,6 +121,9 @@ START_CODE = b"\x00\x00\x00\x01"
 
 _START = re.compile(b"\x00\x00\x01")
 
+# Bytes of a unit that hold all fields read here; a long scaling list is left unread.
+_HEAD = 64
+
 _CHROMA_PROFILES = frozenset({100, 110, 122, 244, 44, 83, 86, 118, 128, 138, 139, 134, 135})
 
 
@@ -130,9 +139,7 @@ def nal_units(data: bytes) -> list[bytes]:
     units : list of bytes
         At most 64 bytes of each, without start code.
     """
-    # Bytes of a unit that hold all fields read here; a long scaling list is left unread.
-    head = 64
-    return [data[m.end() : m.end() + head] for m in _START.finditer(data)]
+    return [data[m.end() : m.end() + _HEAD] for m in _START.finditer(data)]
 
 
 class FrameNumbers:
@@ -143,7 +150,7 @@ class FrameNumbers:
     """
 
     def __init__(self) -> None:
-        self._bits: int | None = None
+        self._form: _SliceForm | None = None
         self._last: tuple[int, bool] | None = None
 
     def restart(self) -> None:
@@ -169,24 +176,84 @@ class FrameNumbers:
                 continue
             kind = unit[0] & 31
             if kind == NalType.SPS:
-                self._bits = _frame_number_bits(unit)
+                form = _slice_form(unit)
+                self._form = None if form is None or form.may_skip_numbers else form
             elif kind in (NalType.SLICE, NalType.IDR):
                 return self._check(unit, is_idr=kind == NalType.IDR)
         return False
 
     def _check(self, unit: bytes, *, is_idr: bool) -> bool:
-        if self._bits is None:
+        if self._form is None:
             return False
-        bits = _Bits(unit[1:])
-        for _ in range(3):  # first_mb_in_slice, slice_type, pic_parameter_set_id
-            bits.golomb()
-        number = bits.read(self._bits)
+        number = self._form.number(_Bits(unit[1:]))
         last, self._last = self._last, (number, bool(unit[0] & 0x60))
         if last is None or is_idr:
             return False
         if number == last[0]:  # After a picture that is no reference, or the other field of one.
             return False
-        return not last[1] or number != (last[0] + 1) % (1 << self._bits)
+        return not last[1] or number != (last[0] + 1) % (1 << self._form.number_bits)
+
+
+class FieldPairs:
+    """Detector of packets with the second field of a picture, of streams that code fields singly.
+
+    An encoder of interlaced video may code each field by itself (PAFF), in a packet of its own. The
+    decoder makes one picture of two such packets.
+
+    Parameters
+    ----------
+    extradata : bytes
+        Of the stream: parameter sets, each after its length (ISO/IEC 14496-15) or a start code; or
+        nothing.
+    """
+
+    def __init__(self, extradata: bytes) -> None:
+        self._n_length = 0
+        self._form: _SliceForm | None = None
+        self._first: tuple[int, int] | None = None
+        length_at = _CODECS["h264"].length_at
+        if extradata[:1] == b"\x01" and len(extradata) > length_at + 3:
+            self._n_length = (extradata[length_at] & 3) + 1
+            # One byte for the number of sets, two for the length of the first.
+            self._form = _slice_form(extradata[length_at + 4 :])
+        else:
+            self.is_second(extradata)
+
+    def is_second(self, packet: bytes | memoryview) -> bool:
+        """Return whether a packet completes the picture of the packet before it.
+
+        Parameters
+        ----------
+        packet : bytes or memoryview
+            The next one of the stream, in the order of decoding.
+        """
+        for unit in self._units(packet):
+            kind = unit[0] & 31
+            if kind == NalType.SPS:
+                self._form = _slice_form(unit)
+            elif kind in (NalType.SLICE, NalType.IDR):
+                if kind == NalType.IDR:
+                    self._first = None  # No second field is an IDR picture.
+                return self._pairs(None if self._form is None else self._form.field(unit))
+        return False
+
+    def _pairs(self, field: tuple[int, int] | None) -> bool:
+        """Return whether a field, by frame number and parity, goes with the one before it."""
+        first = self._first
+        # 7.4.1.2.4: both fields of a picture have one frame number, and differ in parity.
+        if first is not None and field == (first[0], 1 - first[1]):
+            self._first = None
+            return True
+        self._first = field
+        return False
+
+    def _units(self, packet: bytes | memoryview) -> Iterator[bytes]:
+        """Yield the beginnings of the units that are not empty."""
+        starts = (m.end() for m in _START.finditer(packet))
+        if self._n_length:
+            starts = _after_lengths(packet, self._n_length)
+        # None is looked for behind the first slice, where most of a packet is.
+        return (bytes(packet[at : at + _HEAD]) for at in starts if at < len(packet))
 
 
 class _Bits:
@@ -210,11 +277,41 @@ class _Bits:
         return (1 << zeros) - 1 + self.read(zeros)
 
 
-def _frame_number_bits(unit: bytes) -> int | None:
-    """Return the width of `frame_num` that a sequence parameter set states (7.3.2.1.1).
+@dataclass(frozen=True, slots=True)
+class _SliceForm:
+    """What a sequence parameter set says of the heads of slices (7.3.2.1.1, 7.3.3).
 
-    None if numbers may be left out, or the set is one that this reader does not follow.
+    Attributes
+    ----------
+    number_bits : int
+        Width of `frame_num`.
+    may_skip_numbers : bool
+        Whether numbers may be left out on purpose.
+    may_hold_fields : bool
+        Whether slices say if they are of a field.
     """
+
+    number_bits: int
+    may_skip_numbers: bool
+    may_hold_fields: bool
+
+    def number(self, bits: "_Bits") -> int:
+        """Return `frame_num`, of a slice whose type byte has been read."""
+        for _ in range(3):  # first_mb_in_slice, slice_type, pic_parameter_set_id
+            bits.golomb()
+        return bits.read(self.number_bits)
+
+    def field(self, unit: bytes) -> tuple[int, int] | None:
+        """Return frame number and parity (1: bottom) of a slice's field; None for a frame's."""
+        if not self.may_hold_fields:
+            return None
+        bits = _Bits(unit[1:])
+        number = self.number(bits)
+        return (number, bits.read(1)) if bits.read(1) else None
+
+
+def _slice_form(unit: bytes) -> _SliceForm | None:
+    """Return what a sequence parameter set says; None if this reader does not follow it."""
     bits = _Bits(unit[1:])
     profile = bits.read(8)
     bits.read(16)
@@ -222,21 +319,23 @@ def _frame_number_bits(unit: bytes) -> int | None:
     if profile in _CHROMA_PROFILES and not _skip_chroma(bits):
         return None
     width = bits.golomb() + 4
-    if not _skip_order(bits):
+    if width > 16 or not _skip_order(bits):
         return None
     bits.golomb()
-    may_leave_out = bits.read(1)
-    return None if may_leave_out or width > 16 else width
+    may_skip_numbers = bool(bits.read(1))
+    for _ in range(2):  # pic_width_in_mbs_minus1, pic_height_in_map_units_minus1
+        bits.golomb()
+    return _SliceForm(width, may_skip_numbers, may_hold_fields=not bits.read(1))
 
 
 def _skip_chroma(bits: _Bits) -> bool:
-    """Skip the fields of the high profiles; return False if scaling matrices follow."""
-    if bits.golomb() == 3:
-        bits.read(1)
+    """Skip the fields of the high profiles; return False if this reader does not follow them."""
+    if bits.golomb() == 3 and bits.read(1):
+        return False  # Slices begin with a number of their colour plane.
     bits.golomb()
     bits.golomb()
     bits.read(1)
-    return not bits.read(1)
+    return not bits.read(1)  # Scaling matrices follow.
 
 
 def _skip_order(bits: _Bits) -> bool:

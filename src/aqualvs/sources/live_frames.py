@@ -396,6 +396,7 @@ class LiveFrames:
         """
         self._decoder = LiveDecoder(codec, hears_losses=hears_losses)
         self._frame_counter.restart()
+        self._frame_counter.begin(codec)
         self._lossy = False
         self._clock.set_tick(tick)
 

@@ -29,7 +29,7 @@ from aqualvs.sources.base import frame_of
 from aqualvs.sources.images import ImageSource, images_in
 
 if TYPE_CHECKING:
-    from aqualvs.sources.h264 import UnitReader
+    from aqualvs.sources.h264 import FieldPairs, UnitReader
 
 # Codecs without prediction between pictures.
 _INTRA_ONLY = frozenset({"mjpeg", "prores", "dnxhd", "rawvideo", "huffyuv", "ffvhuff", "utvideo"})
@@ -181,6 +181,7 @@ class _Packets:
         self._cuts: list[int] = []
         self._doubt = ""
         self._units = self._reader()
+        self._fields = self._field_pairs()
         self._sets_in_band = False
 
     @property
@@ -210,6 +211,8 @@ class _Packets:
             self.doubt("pictures without a time")
         if packet.is_corrupt or packet.is_discard:
             self.doubt("damaged or hidden pictures")
+        if self._fields is not None and self._fields.is_second(memoryview(packet)):
+            self.doubt("fields in packets of their own")
         if self._may_begin_here(packet):
             self._cuts.append(len(self._pts))
         self._pts.append(packet.pts or 0)
@@ -273,6 +276,12 @@ class _Packets:
         except ValueError as fault:
             self.doubt(str(fault))
             return None
+
+    def _field_pairs(self) -> "FieldPairs | None":
+        from aqualvs.sources.h264 import FieldPairs
+
+        context = self._stream.codec_context
+        return FieldPairs(context.extradata or b"") if context.name == "h264" else None
 
     def _may_begin_here(self, packet: "Packet[VideoStream]") -> bool:
         if self._units is None:

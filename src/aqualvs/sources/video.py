@@ -13,6 +13,7 @@ from pathlib import Path
 import av
 from av.container import InputContainer
 from av.packet import Packet
+from av.video.codeccontext import VideoCodecContext
 from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
 
@@ -21,6 +22,7 @@ from aqualvs.errors import SourceError
 from aqualvs.optics.shutter import Field
 from aqualvs.scanning.scan import Frame
 from aqualvs.sources.base import frame_of
+from aqualvs.sources.h264 import FieldPairs
 from aqualvs.sources.spans import promised_duration
 
 
@@ -38,12 +40,15 @@ class FrameCounter:
         Time of the first picture, in ticks of its stream.
     n_packets : int
         Packets noted.
+    n_second_fields : int
+        Of these, packets that complete the picture of the one before, see `FieldPairs`.
     """
 
     def __init__(self, *, counts_packets: bool) -> None:
         self.first_pts: int | None = None
-        self.n_packets = 0
+        self.n_packets = self.n_second_fields = 0
         self._counts_packets = counts_packets
+        self._fields: FieldPairs | None = None
         self._pending: list[int] = []
         self._next = 0
 
@@ -51,6 +56,16 @@ class FrameCounter:
     def n_known(self) -> int:
         """Pictures numbered so far and announced ones that have not come."""
         return self._next + len(self._pending)
+
+    def begin(self, codec: VideoCodecContext) -> None:
+        """Count the pictures of a stream from here on.
+
+        Parameters
+        ----------
+        codec : VideoCodecContext
+            Of the stream.
+        """
+        self._fields = FieldPairs(codec.extradata or b"") if codec.name == "h264" else None
 
     def expect(self, packet: "Packet[VideoStream]") -> None:
         """Note a packet; the empty one that flushes the decoder does not count.
@@ -62,6 +77,9 @@ class FrameCounter:
         if packet.size == 0:
             return
         self.n_packets += 1
+        if self._fields is not None and self._fields.is_second(memoryview(packet)):
+            self.n_second_fields += 1
+            return
         if packet.pts is None or packet.is_discard or not self._counts_packets:
             return
         heapq.heappush(self._pending, packet.pts)
@@ -156,6 +174,11 @@ class VideoSource(Closing):
         self._frame_counter = FrameCounter(
             counts_packets=self._stream.codec_context.name not in _HIDDEN_PACKETS
         )
+        self._frame_counter.begin(self._stream.codec_context)
+        self._packets = self._read_packets()
+        if self._packets_are_fields():
+            self.fps = None if self.fps is None else 0.5 * self.fps
+            self.n_frames = None if self.n_frames is None else self.n_frames // 2
 
     def __iter__(self) -> Iterator[Frame]:
         """Yield the sound frames; lost ones leave a gap in the index.
@@ -178,7 +201,7 @@ class VideoSource(Closing):
 
     def _pictures(self) -> Iterator[VideoFrame]:
         """Decode all undamaged pictures, in order of presentation."""
-        for packet in self._packets():
+        for packet in self._packets:
             self._frame_counter.expect(packet)
             if packet.is_corrupt and not self._damage_is_partial:
                 continue
@@ -190,7 +213,21 @@ class VideoSource(Closing):
                 if isinstance(picture, VideoFrame):
                     yield picture
 
-    def _packets(self) -> Iterator["Packet[VideoStream]"]:
+    def _packets_are_fields(self) -> bool:
+        """Return whether every packet is one field and has a time, which containers count."""
+        codec = self._stream.codec_context
+        pairs = FieldPairs(codec.extradata or b"") if codec.name == "h264" else None
+        if pairs is None:
+            return False
+        first: list[Packet[VideoStream]] = []
+        with contextlib.suppress(SourceError):
+            first += itertools.islice(self._packets, 2)
+        self._packets = itertools.chain(first, self._packets)
+        coded = [packet for packet in first if packet.size]
+        seconds = [packet for packet in coded if pairs.is_second(memoryview(packet))]
+        return any(packet.pts is not None for packet in seconds)
+
+    def _read_packets(self) -> Iterator["Packet[VideoStream]"]:
         """Read packets; a damaged container ends early, which the promise then reveals."""
         try:
             yield from self._container.demux(self._stream)
@@ -220,9 +257,8 @@ class VideoSource(Closing):
         cut = self._frame_counter.n_packets < exact if exact else self._ends_early(time_s)
         if not cut and index + 1 == self._frame_counter.n_known:
             return
-        promised = (
-            f"{exact}" if exact else f"about {max(self.n_frames or 0, self._frame_counter.n_known)}"
-        )
+        n_promised = max(self.n_frames or 0, self._frame_counter.n_known)
+        promised = f"{self.n_frames}" if exact else f"about {n_promised}"
         raise SourceError(
             f"{self.name}: only {n_delivered} of {promised} frames could be decoded, the last at "
             f"{time_s:.2f} s; the file is cut short or damaged, copy it again from the recorder"
