@@ -12,9 +12,10 @@ import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.compiled import (
-    borrowing_kernel,
     inline_borrowing_kernel,
     inline_kernel,
+    inner_borrowing_kernel,
+    inner_kernel,
     kernel,
 )
 
@@ -117,7 +118,7 @@ def solve_symmetric(
     return True
 
 
-@borrowing_kernel
+@inner_borrowing_kernel
 def factorise(matrix: FloatArray, damping: float, least: float, factor: FloatArray) -> bool:
     """Write the lower factor of a matrix (N, N), its diagonal times 1 + damping, to `factor`.
 
@@ -142,7 +143,7 @@ def factorise(matrix: FloatArray, damping: float, least: float, factor: FloatArr
     return True
 
 
-@borrowing_kernel
+@inner_borrowing_kernel
 def solve_factorised(factor: FloatArray, right: FloatArray, out: FloatArray) -> None:
     """Write the solution (N,) of factor factor' x = right to `out`, which may be `right` itself."""
     n = len(right)
@@ -158,7 +159,7 @@ def solve_factorised(factor: FloatArray, right: FloatArray, out: FloatArray) -> 
         out[i] = rest / factor[i, i]
 
 
-@kernel
+@inner_kernel
 def inverse_of(factor: FloatArray) -> FloatArray:
     """Return the inverse (N, N) of the matrix that a factor was made from."""
     inverse = np.eye(len(factor))

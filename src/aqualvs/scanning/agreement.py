@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import kernel
+from aqualvs.geometry.compiled import inner_kernel, kernel
 from aqualvs.geometry.planes import Rays
 from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import LASER_PARAMETERS, Rig
@@ -123,7 +123,7 @@ def _bin_stripes(
             _middle(rows, off, pixels, intensity, width, middle[c // N_BINS, c % N_BINS])
 
 
-@kernel
+@inner_kernel
 def _middle(
     rows: IntArray,
     off: FloatArray,

@@ -12,7 +12,13 @@ from dataclasses import dataclass, field, fields, replace
 import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import ZERO, borrowing_kernel, inline_borrowing_kernel, kernel
+from aqualvs.geometry.compiled import (
+    ZERO,
+    borrowing_kernel,
+    inline_borrowing_kernel,
+    inner_kernel,
+    kernel,
+)
 from aqualvs.geometry.linear_algebra import element_at
 from aqualvs.scanning.laser_bands import LaserBand, SearchAxis
 from aqualvs.scanning.segments import (
@@ -208,7 +214,7 @@ def _write_centroid(
     table[3, c], table[4, c], table[5, c] = share * jx, share * jy, share * jz
 
 
-@kernel
+@inner_kernel
 def _write_sampling_weights(
     n_lines: IntArray,
     component: IntArray,

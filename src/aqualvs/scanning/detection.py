@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray, IntArray
-from aqualvs.geometry.compiled import inline_kernel, kernel
+from aqualvs.geometry.compiled import inline_kernel, inner_kernel, kernel
 from aqualvs.geometry.linear_algebra import element_at
 from aqualvs.optics.shutter import FIRST_ROW, Field
 from aqualvs.scanning.laser_bands import LaserBand, SearchAxis
@@ -127,7 +127,7 @@ def _pair_columns(luma: U8Array, means: U8Array, columns: U8Array) -> None:
             out[x] = _mean(_mean(before[x], after[x]), middle[x])
 
 
-@kernel
+@inner_kernel
 def _pair_pixels(row: U8Array, mean: U8Array) -> None:
     for x in range(mean.shape[0]):
         mean[x] = _mean(row[2 * x], row[2 * x + 1])

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aqualvs.geometry.arrays import FloatArray, IntArray
-from aqualvs.geometry.compiled import inline_kernel, kernel
+from aqualvs.geometry.compiled import inline_kernel, inner_kernel, kernel
 from aqualvs.geometry.linear_algebra import element_at, sum_of
 from aqualvs.scanning.scan import Frame, ImagePlane
 from aqualvs.scanning.stripe import HEIGHT, IMBALANCE, STEP_U, STEP_V, TINT_U, TINT_V, TOP, WIDTH
@@ -370,7 +370,7 @@ def _learn(table: FloatArray, u: float, v: float) -> tuple[float, float, float, 
     return u, v, 0.0, sigma
 
 
-@kernel
+@inner_kernel
 def _shown(table: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
     """Return the steps of peaks in U and V, for each level of height that shows its colour."""
     of_u, of_v = np.empty(rows.shape[0]), np.empty(rows.shape[0])
@@ -381,7 +381,7 @@ def _shown(table: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
     return of_u, of_v
 
 
-@kernel
+@inner_kernel
 def _middle(of_u: FloatArray, of_v: FloatArray) -> tuple[float, float, bool]:
     """Return the median of steps, and whether at least half of them are near it."""
     u, v = element_at(of_u, 0.5), element_at(of_v, 0.5)
@@ -471,7 +471,7 @@ def _colour_left(top: float) -> float:
     return 1.0 - (1.0 - left_at_full) * min(max((top - clipped) / (full - clipped), 0.0), 1.0)
 
 
-@kernel
+@inner_kernel
 def _best_stripes(
     table: FloatArray, u: float, v: float, sigma: float, tint_share: float
 ) -> IntArray:

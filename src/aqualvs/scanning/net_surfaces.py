@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import borrowing_kernel, kernel
+from aqualvs.geometry.compiled import borrowing_kernel, inner_kernel, kernel
 from aqualvs.geometry.linear_algebra import invert_symmetric, solve_symmetric
 from aqualvs.geometry.planes import Plane
 from aqualvs.scanning.candidates import Subsegments
@@ -100,7 +100,7 @@ def _turns(
     return turns, at_random, met
 
 
-@kernel
+@inner_kernel
 def _meet(table: FloatArray, a: int, b: int, plane: FloatArray) -> bool:
     """Return whether the step from one subsegment to another is one that a fold makes."""
     square = 0.0
@@ -197,7 +197,7 @@ def _fit_mean(
     return float(np.sqrt(square / weight / (m[0] * m[0] + m[1] * m[1] + m[2] * m[2])))
 
 
-@kernel
+@inner_kernel
 def _distances(points: FloatArray, m: FloatArray, off: FloatArray) -> None:
     """Write m·X - 1 of each point."""
     for i in range(points.shape[0]):
@@ -357,7 +357,7 @@ def _describe(
     return broken >= enough or few, gappy >= enough or few, unbroken >= enough, total
 
 
-@kernel
+@inner_kernel
 def _in_order(
     first_line: IntArray, n_lines: IntArray, laser: IntArray, members: BoolArray, index: int
 ) -> tuple[IntArray, int]:
@@ -377,7 +377,7 @@ def _in_order(
     return order[:n], total
 
 
-@kernel
+@inner_kernel
 def _describe_stripe(
     table: FloatArray,
     intensity_weight: FloatArray,
@@ -429,7 +429,7 @@ def _describe_stripe(
     return n_intervals, duty, float(component * m_per_line), extent, on_strands, share
 
 
-@kernel
+@inner_kernel
 def _extent(n_lines: IntArray, first_line: IntArray, last_line: IntArray, order: IntArray) -> float:
     """Search lines between the 10 % and the 90 % point of one laser's light."""
     total = 0

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import borrowing_kernel, kernel
+from aqualvs.geometry.compiled import inner_borrowing_kernel, inner_kernel, kernel
 from aqualvs.geometry.linear_algebra import factorise, inverse_of, solve_factorised
 from aqualvs.geometry.planes import Plane
 from aqualvs.scanning.candidates import Observations
@@ -112,7 +112,7 @@ def fit_over(
     return True, asked, rms
 
 
-@borrowing_kernel
+@inner_borrowing_kernel
 def _asked_for(
     terms: FloatArray,
     height: FloatArray,
@@ -169,7 +169,7 @@ def curvature_hint(
     return curvature_in_sigmas(terms, height, per_px, weights)
 
 
-@borrowing_kernel
+@inner_borrowing_kernel
 def over_plane(
     points: FloatArray,
     sensitivity: FloatArray,
@@ -203,7 +203,7 @@ def over_plane(
         height[i], per_px[i] = h, d
 
 
-@kernel
+@inner_kernel
 def _solve(
     terms: FloatArray,
     height: FloatArray,
@@ -237,7 +237,7 @@ def _solve(
     return True
 
 
-@kernel
+@inner_kernel
 def curvature_in_sigmas(
     terms: FloatArray, height: FloatArray, sigma: FloatArray, weights: FloatArray
 ) -> float:
@@ -262,7 +262,7 @@ def curvature_in_sigmas(
     return most
 
 
-@kernel
+@inner_kernel
 def grow(
     terms: FloatArray,
     height: FloatArray,
@@ -301,7 +301,7 @@ def grow(
     return bool(np.count_nonzero(inside) >= MIN_PIECES)
 
 
-@kernel
+@inner_kernel
 def reweight(
     terms: FloatArray,
     height: FloatArray,
@@ -343,7 +343,7 @@ def reweight(
     return scale, np.sqrt(square / total), inverse_of(known)
 
 
-@kernel
+@inner_kernel
 def add_shared(
     terms: FloatArray,
     pull: FloatArray,

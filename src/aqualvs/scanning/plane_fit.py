@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import kernel
+from aqualvs.geometry.compiled import inner_kernel, kernel
 from aqualvs.geometry.linear_algebra import (
     factorise,
     invert_symmetric,
@@ -178,7 +178,7 @@ def plane_of_all(points: FloatArray, m: FloatArray) -> bool:
     return solve_symmetric(normal, right, inverse, m)
 
 
-@kernel
+@inner_kernel
 def _normalised_residuals(
     points: FloatArray,
     sensitivity: FloatArray,
@@ -274,7 +274,7 @@ def _fit(
     return _weighted_rms(z, weights, m)
 
 
-@kernel
+@inner_kernel
 def _huber_factor(z: FloatArray, cut: float) -> float:
     """Return the factor on the unweighted inverse of the normal matrix (Huber 1981, section 7.6).
 
@@ -297,7 +297,7 @@ def _huber_factor(z: FloatArray, cut: float) -> float:
     return float(correction**2 * scatter / (n - 3) / slope**2)
 
 
-@kernel
+@inner_kernel
 def _add_own_errors(
     points: FloatArray,
     per_px: FloatArray,
@@ -346,7 +346,7 @@ def _add_own_errors(
                 covariance[j, k] += scale * moved[a, j] * moved[a, k]
 
 
-@kernel
+@inner_kernel
 def _expected_square(matrix: FloatArray, residual: FloatArray) -> float:
     """Return the expected square of the factor on shared errors, given what a frame shows.
 
@@ -386,7 +386,7 @@ def _expected_square(matrix: FloatArray, residual: FloatArray) -> float:
     return float((weights * _SQUARES).sum() / weights.sum())
 
 
-@kernel
+@inner_kernel
 def add_error(pull: FloatArray, inverse: FloatArray, covariance: FloatArray) -> None:
     """Widen a covariance (K, K) by an error of all observations together.
 
@@ -401,7 +401,7 @@ def add_error(pull: FloatArray, inverse: FloatArray, covariance: FloatArray) -> 
             covariance[j, k] += moved[j] * moved[k]
 
 
-@kernel
+@inner_kernel
 def _weighted_rms(off: FloatArray, weights: FloatArray, m: FloatArray) -> float:
     total, weight = 0.0, 0.0
     for i in range(off.shape[0]):

@@ -15,10 +15,10 @@ import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.compiled import (
-    borrowing_kernel,
     inline_borrowing_kernel,
     inline_kernel,
-    kernel,
+    inner_borrowing_kernel,
+    inner_kernel,
 )
 from aqualvs.geometry.linear_algebra import solve_symmetric, sum_of
 
@@ -58,7 +58,7 @@ def squared_gate(per_px: float, offset: float) -> float:
     return by_range * by_range + by_pixel * by_pixel
 
 
-@borrowing_kernel
+@inner_borrowing_kernel
 def _score(
     table: FloatArray,
     laser_start: IntArray,
@@ -115,7 +115,7 @@ def _near(
     return value
 
 
-@kernel
+@inner_kernel
 def refine_plane(
     table: FloatArray,
     plane: FloatArray,
@@ -198,7 +198,7 @@ def _pick(cumulative_weight: FloatArray, guide: IntArray, draw: float) -> int:
     return int(at)
 
 
-@borrowing_kernel
+@inner_borrowing_kernel
 def _guide(cumulative_weight: FloatArray, guide: IntArray) -> None:
     """Write the start of the search in `_pick`, for as many draws as there are subsegments."""
     n = guide.shape[0]
@@ -210,7 +210,7 @@ def _guide(cumulative_weight: FloatArray, guide: IntArray) -> None:
         guide[k] = at
 
 
-@kernel
+@inner_kernel
 def _median_weight(sampling_weight: FloatArray) -> float:
     """Return the weighted median of the sampling weights."""
     values = sampling_weight.copy()
@@ -244,7 +244,7 @@ def _median_weight(sampling_weight: FloatArray) -> float:
     return float(values[min(low, values.shape[0] - 1)])
 
 
-@kernel
+@inner_kernel
 def _heavy(sampling_weight: FloatArray) -> IntArray:
     """Return the subsegments to sample: those not much below the weighted median.
 
@@ -253,7 +253,7 @@ def _heavy(sampling_weight: FloatArray) -> IntArray:
     return np.flatnonzero(sampling_weight >= _LIGHTEST_SHARE * _median_weight(sampling_weight))
 
 
-@kernel
+@inner_kernel
 def search_plane(
     table: FloatArray,
     laser: IntArray,

@@ -14,7 +14,7 @@ no such neighbours, or are farther off than the right candidate of the same ligh
 import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import kernel
+from aqualvs.geometry.compiled import inner_kernel, kernel
 from aqualvs.scanning.net_surfaces import LONGEST_INTERVAL
 
 # Limits of light on a plane, and of light beside it, as shares of the range.
@@ -39,7 +39,7 @@ def has_much_beside(off: FloatArray, much: float = MUCH) -> bool:
     return bool(near - on_it > much * on_it)
 
 
-@kernel
+@inner_kernel
 def recruit_candidates(
     points: FloatArray,
     sensitivity: FloatArray,
@@ -205,7 +205,7 @@ def _describe(
         facts[SIZE, s] = np.sqrt(facts[SIZE, s])
 
 
-@kernel
+@inner_kernel
 def _listed(facts: FloatArray, distance: float) -> tuple[IntArray, float]:
     """Return seeds and candidates in their order along the stripes, and the lowest confidence."""
     n = facts.shape[1]
@@ -234,7 +234,7 @@ def _listed(facts: FloatArray, distance: float) -> tuple[IntArray, float]:
     return np.argsort(key)[:n_listed], dimmest * total / max(n_seeds, 1)
 
 
-@kernel
+@inner_kernel
 def _drop_few(height: FloatArray, lonely: float, cost: FloatArray) -> None:
     """Remove components that leave the surface, where they are too few to be a fold."""
     n_far = 0
@@ -248,7 +248,7 @@ def _drop_few(height: FloatArray, lonely: float, cost: FloatArray) -> None:
                 cost[s] = np.inf
 
 
-@kernel
+@inner_kernel
 def _drop_between(order: IntArray, facts: FloatArray) -> float:
     """Remove components between regularly spaced strands on the plane.
 
@@ -289,7 +289,7 @@ def _drop_between(order: IntArray, facts: FloatArray) -> float:
     return usual
 
 
-@kernel
+@inner_kernel
 def _sweep(
     order: IntArray,
     way: int,
@@ -346,7 +346,7 @@ def _sweep(
             cost[s] = min(cost[s], reached[s])
 
 
-@kernel
+@inner_kernel
 def _settle(
     component: IntArray, source: IntArray, cost: FloatArray, taken: BoolArray, on_net: BoolArray
 ) -> None:

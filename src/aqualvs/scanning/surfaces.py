@@ -19,7 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel, kernel
+from aqualvs.geometry.compiled import (
+    borrowing_kernel,
+    inline_borrowing_kernel,
+    inner_borrowing_kernel,
+    inner_kernel,
+    kernel,
+)
 from aqualvs.geometry.linear_algebra import sum_of
 from aqualvs.geometry.planes import Plane
 from aqualvs.scanning.candidates import Subsegments
@@ -59,7 +65,7 @@ def _cell(coordinate: float) -> int:
     return (int(max(coordinate, 0.0)) * _SIXTH >> _SIXTH_BITS) + 1
 
 
-@kernel
+@inner_kernel
 def number_cells(pixels: FloatArray, cell: IntArray) -> tuple[int, int]:
     """Write the number of the cell in which each of N candidates lies.
 
@@ -95,7 +101,7 @@ def mark_cells(middle: int, n_columns: int, lit: U8Array) -> None:
     lit[middle] = _MIDDLE
 
 
-@kernel
+@inner_kernel
 def lit_cells(cell: IntArray, explained: BoolArray, n_cells: int, n_columns: int) -> U8Array:
     """Mark the cells in and around which explained candidates lie, with nonzero values.
 
@@ -193,7 +199,7 @@ def search_surfaces(
     return MAX_SURFACES
 
 
-@kernel
+@inner_kernel
 def _find_plane(
     table: FloatArray,
     laser: IntArray,
@@ -219,7 +225,7 @@ def _find_plane(
     return search_plane(some, its_laser, start, nearest, farthest, seed, plane)
 
 
-@borrowing_kernel
+@inner_borrowing_kernel
 def _collect(
     table: FloatArray,
     rows: IntArray,
@@ -291,7 +297,7 @@ def on_two(weight: FloatArray) -> float:
     return min(total, total - first + MAX_TO_SECOND * second)
 
 
-@kernel
+@inner_kernel
 def _claim_peaks(
     subsegment_index: IntArray,
     cell: IntArray,

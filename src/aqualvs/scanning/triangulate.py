@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel, kernel
+from aqualvs.geometry.compiled import inline_borrowing_kernel, inner_borrowing_kernel, kernel
 from aqualvs.optics.camera import Camera, CameraParams
 from aqualvs.optics.camera_kernels import rays_all
 from aqualvs.optics.rig import Rig
@@ -140,7 +140,7 @@ def _triangulate(
     return all_valid
 
 
-@borrowing_kernel
+@inner_borrowing_kernel
 def _place_rays(
     pixels: FloatArray,
     along_x: IntArray,
@@ -165,7 +165,7 @@ def _place_rays(
     return int(n_rays)
 
 
-@borrowing_kernel
+@inner_borrowing_kernel
 def _intersect_planes(
     planes: FloatArray,
     laser: IntArray,
@@ -212,7 +212,7 @@ def _distance_to_sheet(
     return float(-behind / approach)
 
 
-@borrowing_kernel
+@inner_borrowing_kernel
 def _intersect_bent_sheets(
     sheets: FloatArray,
     laser: IntArray,
