@@ -16,7 +16,7 @@ import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import borrowing_kernel, inner_kernel, kernel
-from aqualvs.geometry.linear_algebra import invert_symmetric, solve_symmetric
+from aqualvs.geometry.linear_algebra import invert_symmetric, median_of, order_of, solve_symmetric
 from aqualvs.geometry.planes import Plane
 from aqualvs.scanning.candidates import Subsegments
 from aqualvs.scanning.plane_fit import TUKEY, PlaneFit, normal_equations
@@ -83,8 +83,15 @@ def _turns(
     Also return their expected number in random order, and the number at which the step off the
     plane is one that a fold makes.
     """
-    rows = np.flatnonzero(first | second)
-    order = rows[np.argsort(laser[rows] * 1e6 + first_line[rows])]
+    rows, n = np.empty(laser.shape[0], np.int64), 0
+    key = np.empty(laser.shape[0])
+    for c in range(laser.shape[0]):
+        if first[c] or second[c]:
+            rows[n], key[n] = c, laser[c] * 1e6 + first_line[c]
+            n += 1
+    order = order_of(key[:n])
+    for k in range(n):
+        order[k] = rows[order[k]]
     turns, met, n, n_second = 0, 0, 0, 0
     at_random = 0.0
     for k in range(order.shape[0]):
@@ -174,13 +181,17 @@ def _fit_mean(
     points: FloatArray, m: FloatArray, weights: FloatArray, covariance: FloatArray
 ) -> float:
     """Refine m in place, write weights and covariance; return the rms, NaN if undetermined."""
-    n, one = points.shape[0], np.ones(points.shape[0])
+    n, one = points.shape[0], np.empty(points.shape[0])
+    for i in range(n):
+        one[i] = 1.0
     off, normal, right, inverse = np.empty(n), np.empty((3, 3)), np.empty(3), np.empty((3, 3))
     iterations = 5
     exact = 1e-9
     for _ in range(iterations):
         _distances(points, m, off)
-        cut = TUKEY * 1.4826 * max(np.median(np.abs(off)), exact)
+        for i in range(n):
+            weights[i] = abs(off[i])
+        cut = TUKEY * 1.4826 * max(median_of(weights), exact)
         for i in range(n):
             weights[i] = max(1.0 - (off[i] / cut) ** 2, 0.0) ** 2
         normal_equations(points, one, weights, normal, right)
@@ -193,7 +204,10 @@ def _fit_mean(
     for i in range(n):
         square += weights[i] * off[i] * off[i]
         weight += weights[i]
-    covariance *= square / (weight * (1.0 - 3.0 / n))
+    factor = square / (weight * (1.0 - 3.0 / n))
+    for j in range(3):
+        for k in range(3):
+            covariance[j, k] *= factor
     return float(np.sqrt(square / weight / (m[0] * m[0] + m[1] * m[1] + m[2] * m[2])))
 
 
@@ -412,11 +426,13 @@ def _describe_stripe(
         if table[WEIGHT, c] > curved_weight * intensity_weight[c]:
             bright[n_intervals] += intensity_weight[c]
     extent = _extent(n_lines, first_line, last_line, order)
-    gap = np.median(dark[:n_intervals]) if n_intervals else 0.0
+    gap = median_of(dark[:n_intervals]) if n_intervals else 0.0
     lit[n_intervals] = end - begin
     n_intervals += 1
-    component = np.median(lit[:n_intervals])
-    m_per_line = np.median(distance) / focal_px
+    m_per_line = median_of(distance) / focal_px
+    for k in range(n_intervals):
+        dark[k] = lit[k]
+    component = median_of(dark[:n_intervals])
     on_strands, all_lines, unbroken = 0.0, 0.0, 0.0
     for k in range(n_intervals):
         all_lines += lit[k]

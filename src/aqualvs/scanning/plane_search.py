@@ -20,7 +20,7 @@ from aqualvs.geometry.compiled import (
     inner_borrowing_kernel,
     inner_kernel,
 )
-from aqualvs.geometry.linear_algebra import solve_symmetric, sum_of
+from aqualvs.geometry.linear_algebra import at_rows, solve_symmetric, sum_of
 
 X, Y, Z, JX, JY, JZ, WEIGHT = range(7)
 """Rows of the table: centroid (m), sensitivity (m/px), sampling weight (search lines)."""
@@ -213,7 +213,9 @@ def _guide(cumulative_weight: FloatArray, guide: IntArray) -> None:
 @inner_kernel
 def _median_weight(sampling_weight: FloatArray) -> float:
     """Return the weighted median of the sampling weights."""
-    values = sampling_weight.copy()
+    values = np.empty(sampling_weight.shape[0])
+    for c in range(sampling_weight.shape[0]):
+        values[c] = sampling_weight[c]
     wanted, below = 0.5 * sum_of(sampling_weight), 0.0
     low, high = 0, values.shape[0]
     while high - low > 1:
@@ -250,7 +252,13 @@ def _heavy(sampling_weight: FloatArray) -> IntArray:
 
     Where glare makes thousands of specks, most neighbours on a stripe would be specks.
     """
-    return np.flatnonzero(sampling_weight >= _LIGHTEST_SHARE * _median_weight(sampling_weight))
+    least = _LIGHTEST_SHARE * _median_weight(sampling_weight)
+    heavy, n = np.empty(sampling_weight.shape[0], np.int64), 0
+    for c in range(sampling_weight.shape[0]):
+        if sampling_weight[c] >= least:
+            heavy[n] = c
+            n += 1
+    return heavy[:n]
 
 
 @inner_kernel
@@ -287,11 +295,13 @@ def search_plane(
     best = 0.0
     best_rough = 0.0
     heavy = _heavy(table[WEIGHT])
-    if seed == 0 and laser[heavy[0]] == laser[heavy[-1]]:
+    if seed == 0 and laser[heavy[0]] == laser[heavy[heavy.shape[0] - 1]]:
         # A sample needs two lasers. Later, such light is what a surface has left over.
-        heavy = np.arange(n)
+        heavy = np.empty(n, np.int64)
+        for c in range(n):
+            heavy[c] = c
     n_heavy = heavy.shape[0]
-    cumulative_weight = table[WEIGHT][heavy]
+    cumulative_weight = at_rows(table[WEIGHT], heavy)
     for k in range(1, n_heavy):
         cumulative_weight[k] += cumulative_weight[k - 1]
     guide = np.empty(n_heavy, np.int64)

@@ -15,6 +15,7 @@ import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import inner_kernel, kernel
+from aqualvs.geometry.linear_algebra import median_of, order_of
 from aqualvs.scanning.net_surfaces import LONGEST_INTERVAL
 
 # Limits of light on a plane, and of light beside it, as shares of the range.
@@ -231,7 +232,7 @@ def _listed(facts: FloatArray, distance: float) -> tuple[IntArray, float]:
         if seed or (short and near and loose):
             key[s] = facts[LASER, s] * 1e6 + facts[LINE, s]
             n_listed += 1
-    return np.argsort(key)[:n_listed], dimmest * total / max(n_seeds, 1)
+    return order_of(key)[:n_listed], dimmest * total / max(n_seeds, 1)
 
 
 @inner_kernel
@@ -273,7 +274,7 @@ def _drop_between(order: IntArray, facts: FloatArray) -> float:
             after[at] = facts[LINE, p] if facts[ON_NET, p] > 0.0 else after[at + 1]
     if n_gaps == 0:
         return np.inf
-    usual = float(np.median(gaps[:n_gaps]))
+    usual = median_of(gaps[:n_gaps])
     # In a fold the plane itself has no strands: least gap in usual distances, or half of that where
     # the net's last strand is on one side only.
     fold_gap = 1.7

@@ -26,7 +26,7 @@ from aqualvs.geometry.compiled import (
     inner_kernel,
     kernel,
 )
-from aqualvs.geometry.linear_algebra import sum_of
+from aqualvs.geometry.linear_algebra import sum_of, where
 from aqualvs.geometry.planes import Plane
 from aqualvs.scanning.candidates import Subsegments
 from aqualvs.scanning.net_surfaces import (
@@ -166,25 +166,28 @@ def search_surfaces(
         Written: search lines, light and sampling weight of each. Light and weight of the best laser
         count up to three times those of the second.
     """
-    free = np.ones(laser.shape[0], np.bool_)
+    free = np.empty(laser.shape[0], np.bool_)
+    for c in range(laser.shape[0]):
+        free[c] = True
     cell = np.empty(pixels.shape[0], np.int64)
     n_cells, n_columns = 0, 0
     min_lines = 30
     enough = float(min_lines)
-    by_laser = np.empty((3, n_lasers))
     min_subsegments = 6
     # Planes through noise hold up to a hundredth of the light in the frame, all candidates counted.
     min_share = 0.03
     for found in range(MAX_SURFACES):
-        rows = np.flatnonzero(free)
-        if sum_of(n_lines[rows]) < enough or rows.shape[0] < min_subsegments:
+        rows, left = where(free), 0
+        for k in range(rows.shape[0]):
+            left += n_lines[rows[k]]
+        if left < enough or rows.shape[0] < min_subsegments:
             return found
         if not _find_plane(table, laser, rows, n_lasers, nearest, farthest, found, planes[found]):
             return found
-        by_laser[:] = 0.0
-        mine = members[found]
+        mine, by_laser, supporting = members[found], np.zeros((3, n_lasers)), 0
         n = _collect(table, rows, planes[found], n_lines, intensity_weight, laser, mine, by_laser)
-        supporting = np.count_nonzero(by_laser[LINES] >= MIN_LINES_PER_LASER)
+        for i in range(n_lasers):
+            supporting += by_laser[LINES, i] >= MIN_LINES_PER_LASER
         sums[found, LINES] = sum_of(by_laser[LINES])
         if n < min_subsegments or supporting < 2 or sums[found, LINES] < min_lines:
             return found
