@@ -100,6 +100,14 @@ def test_kernels_round_as_python_does() -> None:
     np.testing.assert_array_equal(compiled, plain)
 
 
+def test_python_may_call_what_kernels_have_inlined() -> None:
+    """Their code has no entry for Python; a call gets code of its own, with the same rules."""
+    out = np.empty(1)
+    _quotients(np.ones(1), out)
+    assert out[0] == 1.0 - _quotient(1.0, 3.0)
+    assert _quotient(1.0, 0.0) == np.inf
+
+
 def test_cached_kernels_follow_their_callees(tmp_path: Path) -> None:
     (tmp_path / "caller.py").write_text(CALLER)
     (tmp_path / "callee.py").write_text(CALLEE.format(increment=1))

@@ -6,12 +6,13 @@ arrays lie in memory, and on which of its callers a kernel was compiled for: a d
 several machines, or by several processes, would not equal the same dive measured by one.
 """
 
+import functools
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, TypeVar, cast
 
 import numba
 import numpy as np
-from numba.extending import overload
+from numba.extending import overload, typeof_impl
 
 # What `kernel_loading` uses of Numba is private: no other version than those tested is trusted.
 _LOADS_LIGHTLY = numba.__version__.startswith("0.68.")
@@ -30,11 +31,6 @@ def kernel(function: F) -> F:
     return _compiled(function)
 
 
-def inline_kernel(function: F) -> F:
-    """Compile a scalar function that batch kernels call; always inlined by LLVM."""
-    return _compiled(function, forceinline=True)
-
-
 def borrowing_kernel(function: F) -> F:
     """Compile a batch kernel that only borrows its arrays and creates none.
 
@@ -44,9 +40,29 @@ def borrowing_kernel(function: F) -> F:
     return _compiled(function, _nrt=False)
 
 
+def inner_kernel(function: F) -> F:
+    """Compile a function that kernels call, and Python hardly ever.
+
+    Within kernels it is compiled without what calls from Python need: the conversion of every
+    argument and of the result, which makes a third of the code of a small function. The machine
+    code is part of the kernels that call it. From Python it is compiled once more.
+    """
+    return _inner(function)
+
+
+def inner_borrowing_kernel(function: F) -> F:
+    """Compile an `inner_kernel` that only borrows its arrays, as a `borrowing_kernel` does."""
+    return _inner(function, _nrt=False)
+
+
+def inline_kernel(function: F) -> F:
+    """Compile an `inner_kernel` that LLVM always inlines: a scalar function."""
+    return _inner(function, forceinline=True)
+
+
 def inline_borrowing_kernel(function: F) -> F:
-    """Compile a scalar function that borrowing kernels call; always inlined by LLVM."""
-    return _compiled(function, forceinline=True, _nrt=False)
+    """Compile an `inline_kernel` that borrowing kernels call."""
+    return _inner(function, forceinline=True, _nrt=False)
 
 
 def chosen_by_class(kernels: Mapping[type, Callable[..., Any]]) -> Callable[..., Any]:
@@ -68,7 +84,8 @@ def chosen_by_class(kernels: Mapping[type, Callable[..., Any]]) -> Callable[...,
     return stand_in
 
 
-_OPTIONS = {"error_model": "numpy", "nogil": True, "fastmath": False}
+# C code, which the wrapper left out would serve, calls no kernel.
+_OPTIONS = {"error_model": "numpy", "nogil": True, "fastmath": False, "no_cfunc_wrapper": True}
 
 
 def _compiled(function: F, **options: object) -> F:
@@ -78,6 +95,35 @@ def _compiled(function: F, **options: object) -> F:
     if _LOADS_LIGHTLY:
         load_lightly(compiled)
     return cast(F, compiled)
+
+
+class _InnerKernel:
+    """A function that is compiled once for kernels, and once more if Python calls it."""
+
+    def __init__(self, function: Callable[..., Any], options: Mapping[str, object]) -> None:
+        functools.update_wrapper(self, function)
+        self.py_func = function
+        self._options = options
+        self._for_kernels = _compiled(function, no_cpython_wrapper=True, **options)
+        self._stands_for = (self._for_kernels,)
+
+    def __call__(self, *arguments: Any) -> Any:
+        return self._for_python(*arguments)
+
+    @functools.cached_property
+    def _for_python(self) -> Callable[..., Any]:
+        return _compiled(self.py_func, **self._options)
+
+
+def _type_of_inner(inner: _InnerKernel, _: object) -> Any:
+    return numba.typeof(inner._for_kernels)
+
+
+typeof_impl.register(_InnerKernel)(_type_of_inner)
+
+
+def _inner(function: F, **options: object) -> F:
+    return cast(F, _InnerKernel(function, options))
 
 
 def _depend_on_callees(compiled: Any, function: Callable[..., Any], options: str) -> None:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import kernel
+from aqualvs.geometry.compiled import inner_kernel, kernel
 from aqualvs.nets.lit_intervals import LineState, NetSignal
 from aqualvs.nets.spectrum import Crossings
 
@@ -95,7 +95,7 @@ def cut_lines(
     return n, k, m
 
 
-@kernel
+@inner_kernel
 def _cut_span(
     i: int,
     begin: int,
@@ -157,7 +157,7 @@ def _cut_span(
     return n, k
 
 
-@kernel
+@inner_kernel
 def _length_above(
     i: int, first: int, last: int, back: bool, level: float, step: FloatArray, height: FloatArray
 ) -> float:
@@ -183,7 +183,7 @@ def _length_above(
     return length
 
 
-@kernel
+@inner_kernel
 def _put_gap(
     i: int,
     first: int,
@@ -210,7 +210,7 @@ def _put_gap(
     gap[k, 7] = seen / (last - first + 1)
 
 
-@kernel
+@inner_kernel
 def _ends(
     i: int, first: int, last: int, back: bool, along: FloatArray, step: FloatArray
 ) -> tuple[float, float]:
@@ -219,12 +219,12 @@ def _ends(
     return along[i, a] - 0.5 * step[i, a], along[i, b] + 0.5 * step[i, b]
 
 
-@kernel
+@inner_kernel
 def _turned(j: int, n: int, back: bool) -> int:
     return n - 1 - j if back else j
 
 
-@kernel
+@inner_kernel
 def _descends(along: FloatArray) -> bool:
     first, last = np.nan, np.nan
     for value in along:

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import kernel
+from aqualvs.geometry.compiled import inner_kernel, kernel
 from aqualvs.nets.dashes import NetView
 from aqualvs.nets.lattice import NetLattice
 from aqualvs.nets.spectrum import Mesh
@@ -464,7 +464,7 @@ def _predict(
     return n
 
 
-@kernel
+@inner_kernel
 def _gap_around(s: float, off: float, i: int, gap_laser: IntArray, gap: FloatArray) -> int:
     """Return the row of the gap that reaches farther than `off` to both sides of s, or -1."""
     for k in range(len(gap)):
@@ -473,7 +473,7 @@ def _gap_around(s: float, off: float, i: int, gap_laser: IntArray, gap: FloatArr
     return -1
 
 
-@kernel
+@inner_kernel
 def _on_bar(x: float, y: float, basis: FloatArray, bar: float) -> bool:
     """Return whether a place on a line of hexagon bars is on a bar, well inside its ends.
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import kernel
+from aqualvs.geometry.compiled import inner_kernel, kernel
 from aqualvs.scanning.scan import Label, ScanPoints
 
 # Labels of objects, at the net's plane or before it; clutter at the plane may be part of the net.
@@ -241,7 +241,7 @@ def _hide(
         first = k
 
 
-@kernel
+@inner_kernel
 def _hide_beside(
     row: IntArray, position: FloatArray, line_px: int, expected: FloatArray, hidden: BoolArray
 ) -> None:
@@ -261,7 +261,7 @@ def _hide_beside(
             hidden[j] = True
 
 
-@kernel
+@inner_kernel
 def _cast(point: FloatArray, source: FloatArray) -> tuple[float, float]:
     """Return the intersection of the net with the ray from a source through a point."""
     share = source[2] / max(source[2] - point[2], 1e-3)
@@ -270,7 +270,7 @@ def _cast(point: FloatArray, source: FloatArray) -> tuple[float, float]:
     return x, y
 
 
-@kernel
+@inner_kernel
 def _hide_behind(
     in_net: FloatArray,
     eye: FloatArray,
@@ -301,7 +301,7 @@ def _hide_behind(
                     hidden[i, j] = True
 
 
-@kernel
+@inner_kernel
 def _hide_in_shadow(
     in_net: FloatArray,
     source: FloatArray,

@@ -11,7 +11,7 @@ over that of random ones.
 import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import inline_kernel, kernel
+from aqualvs.geometry.compiled import inline_kernel, inner_kernel, kernel
 
 # Largest distance of a crossing of the wave's family from a crest, in periods.
 _ON_CREST = 0.12
@@ -191,7 +191,7 @@ def off_crests(
     return kept, new_start, low[:m].copy(), high[:m].copy(), origin[:m].copy(), new_span_start
 
 
-@kernel
+@inner_kernel
 def _between(
     i: int,
     a: float,
@@ -399,7 +399,7 @@ def families_gain(
     return float(gain)
 
 
-@kernel
+@inner_kernel
 def _comb_gain(
     place: FloatArray,
     start: IntArray,

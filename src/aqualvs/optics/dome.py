@@ -36,7 +36,7 @@ from typing import NamedTuple
 import numpy as np
 
 from aqualvs.errors import RigError
-from aqualvs.geometry.compiled import inline_kernel, kernel
+from aqualvs.geometry.compiled import inline_kernel, inner_kernel
 from aqualvs.geometry.transforms import SE3
 from aqualvs.optics.lens_kernels import Vector
 from aqualvs.optics.refraction import as_triple, check_index, leave_sphere, leave_sphere_tangent
@@ -249,7 +249,7 @@ def three_steps(
     return c, k, solved & (n_l * abs(k) * steepest(s) < 1.0)
 
 
-@kernel
+@inner_kernel
 def solve_guarded(
     s: AngleSines, n_l: float, cos_target: float, sin_target: float
 ) -> tuple[bool, float, float]:

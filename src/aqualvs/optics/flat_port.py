@@ -32,7 +32,7 @@ from typing import NamedTuple
 import numpy as np
 
 from aqualvs.errors import RigError
-from aqualvs.geometry.compiled import inline_kernel, kernel
+from aqualvs.geometry.compiled import inline_kernel, inner_kernel
 from aqualvs.geometry.transforms import SE3
 from aqualvs.optics.lens_kernels import Vector
 from aqualvs.optics.refraction import as_triple, check_index, leave_plane, leave_plane_tangent
@@ -201,7 +201,7 @@ def tangent_step(port: FlatParams, height: float, rho: float, t: float) -> tuple
     return t, solved & (t >= 0.0) & (min(square_g, square_w) > 1e-20)
 
 
-@kernel
+@inner_kernel
 def tangent_guarded(port: FlatParams, height: float, rho: float) -> tuple[bool, float]:
     """Solve rho(t) = rho by bisection over alpha; return (found, t). Slow, but safe."""
     low, high = 0.0, math.asin(min(1.0, min(port.n_port, port.n_water) / port.n_air))

@@ -8,7 +8,7 @@ direction in `cam`, "distorted" ones are those after the distortion: (u - cx)/fx
 import math
 from typing import NamedTuple, TypeAlias
 
-from aqualvs.geometry.compiled import inline_kernel, kernel
+from aqualvs.geometry.compiled import inline_kernel, inner_kernel, kernel
 
 Vector: TypeAlias = tuple[float, float, float]
 """A vector as scalar kernels take and return it."""
@@ -208,7 +208,7 @@ def opencv_undistort_round(
     return x, y, (abs(sx) + abs(sy) < STEP_SOLVED) & (x * x + y * y < lens.limit)
 
 
-@kernel
+@inner_kernel
 def opencv_undistort_guarded(lens: LensParams, xd: float, yd: float) -> tuple[bool, float, float]:
     """Solve distort(x, y) = (xd, yd) inside the limit by damped steps; return (found, x, y).
 

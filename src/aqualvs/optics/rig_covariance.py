@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray, IntArray
-from aqualvs.geometry.compiled import kernel
+from aqualvs.geometry.compiled import inner_kernel, kernel
 from aqualvs.geometry.linear_algebra import factorise, solve_factorised
 from aqualvs.optics.camera import Camera, parameter_names
 from aqualvs.optics.rig import Rig, RigUncertainty
@@ -258,7 +258,7 @@ def _sheet_moves(rig: Rig, camera: Camera, steps: dict[str, float]) -> _SheetMov
     )
 
 
-@kernel
+@inner_kernel
 def _sum_up(
     pixels: FloatArray,
     laser: IntArray,
@@ -397,7 +397,7 @@ def _propagate(
                 covariance[i, j] += passed * jacobian[j, p]
 
 
-@kernel
+@inner_kernel
 def _write_slopes(
     normal: FloatArray,
     bend: FloatArray,

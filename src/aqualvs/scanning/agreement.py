@@ -24,7 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import kernel
+from aqualvs.geometry.compiled import inner_kernel, kernel
+from aqualvs.geometry.linear_algebra import at_rows, median_of
 from aqualvs.geometry.planes import Rays
 from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import LASER_PARAMETERS, Rig
@@ -112,7 +113,9 @@ def _bin_stripes(
             start[cell[i] + 1] += 1
     for c in range(n_cells):
         start[c + 1] += start[c]
-    order, fill = np.empty(start[n_cells], np.int64), start[:-1].copy()
+    order, fill = np.empty(start[n_cells], np.int64), np.empty(n_cells, np.int64)
+    for c in range(n_cells):
+        fill[c] = start[c]
     for i in range(n):
         if cell[i] >= 0:
             order[fill[cell[i]]] = i
@@ -123,7 +126,7 @@ def _bin_stripes(
             _middle(rows, off, pixels, intensity, width, middle[c // N_BINS, c % N_BINS])
 
 
-@kernel
+@inner_kernel
 def _middle(
     rows: IntArray,
     off: FloatArray,
@@ -133,12 +136,15 @@ def _middle(
     out: FloatArray,
 ) -> None:
     """Write the middle of the light of the points that lie together."""
-    values = off[rows]
-    median = np.median(values)
-    near_by = min(max(_SCATTER * np.median(np.abs(values - median)), _NEAR), _FAR)
+    values = at_rows(off, rows)
+    median = median_of(values)
+    for k in range(values.shape[0]):
+        values[k] = abs(values[k] - median)
+    near_by = min(max(_SCATTER * median_of(values), _NEAR), _FAR)
     total, x, y = 0.0, 0.0, 0.0
     near = 0
-    for i in rows:
+    for k in range(rows.shape[0]):
+        i = rows[k]
         if abs(off[i] - median) < near_by:
             brightness = intensity[i] * width[i]
             near += 1

@@ -6,7 +6,13 @@ from typing import NamedTuple
 import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import ZERO, borrowing_kernel, inline_borrowing_kernel, kernel
+from aqualvs.geometry.compiled import (
+    ZERO,
+    inline_borrowing_kernel,
+    inner_borrowing_kernel,
+    inner_kernel,
+    kernel,
+)
 from aqualvs.geometry.linear_algebra import solve_symmetric
 from aqualvs.scanning.plane_search import (
     JX,
@@ -116,7 +122,7 @@ def find_rivals(
     return _refine_rivals(table, nearest, farthest, planes, n)
 
 
-@kernel
+@inner_kernel
 def _sum_candidates(
     source: IntArray,
     laser: IntArray,
@@ -156,7 +162,7 @@ def _sum_candidates(
         row[_SJZ] += w * sensitivity[i, 2]
 
 
-@kernel
+@inner_kernel
 def _choose_seeds(sums: FloatArray, place: FloatArray) -> IntArray:
     """Choose lasers whose stripes are bright and far from each other."""
     n_lasers = place.shape[0]
@@ -183,7 +189,7 @@ def _choose_seeds(sums: FloatArray, place: FloatArray) -> IntArray:
     return seeds[:n]
 
 
-@kernel
+@inner_kernel
 def _try_pair(
     sums: FloatArray,
     i: int,
@@ -249,7 +255,7 @@ def _fit_two(
     return True
 
 
-@borrowing_kernel
+@inner_borrowing_kernel
 def _explained(sums: FloatArray, plane: FloatArray) -> float:
     """Return the light of the stripes on a plane, each read as the laser that fits best.
 
@@ -274,7 +280,7 @@ def _explained(sums: FloatArray, plane: FloatArray) -> float:
     return total
 
 
-@kernel
+@inner_kernel
 def _keep_best(
     plane: FloatArray, value: float, planes: FloatArray, score: FloatArray, n: int
 ) -> int:
@@ -311,7 +317,7 @@ def _same(one: FloatArray, other: FloatArray, times: float) -> bool:
     return bool(near and 2.0 * (1.0 - cosine) < angle * angle)
 
 
-@kernel
+@inner_kernel
 def _refine_rivals(
     table: FloatArray, nearest: float, farthest: float, planes: FloatArray, n: int
 ) -> int:
@@ -388,7 +394,7 @@ def judge_planes(
         found[DARK] = _dark_lasers(lit, expected, along_x)
 
 
-@borrowing_kernel
+@inner_borrowing_kernel
 def _mark_lit_cells(
     plane: FloatArray,
     table: FloatArray,
@@ -411,7 +417,7 @@ def _mark_lit_cells(
                 lit[laser[c], cell] = True
 
 
-@borrowing_kernel
+@inner_borrowing_kernel
 def _intensity_on(
     number: int,
     near: FloatArray,
@@ -430,7 +436,7 @@ def _intensity_on(
     return total
 
 
-@borrowing_kernel
+@inner_borrowing_kernel
 def _variance(
     plane: FloatArray,
     table: FloatArray,
@@ -476,7 +482,7 @@ def _variance(
     return square / freedom + half_stripe_px * half_stripe_px, freedom, n_lit
 
 
-@borrowing_kernel
+@inner_borrowing_kernel
 def _mark_expected(plane: FloatArray, bands: FloatArray, expected: BoolArray) -> None:
     """Mark the cells in which each laser's stripe on a plane lies in its band in the picture."""
     x, y, z, offset = plane[0], plane[1], plane[2], plane[3]
@@ -632,7 +638,7 @@ def seen_of(
     return most, faint / max(asked, 1)
 
 
-@borrowing_kernel
+@inner_borrowing_kernel
 def _dark_lasers(lit: BoolArray, expected: BoolArray, along_x: BoolArray) -> float:
     """Count the lasers that show nothing where others do; a dim one counts in part."""
     n_lasers, n_cells = lit.shape

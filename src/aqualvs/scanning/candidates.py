@@ -12,8 +12,14 @@ from dataclasses import dataclass, field, fields, replace
 import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import ZERO, borrowing_kernel, inline_borrowing_kernel, kernel
-from aqualvs.geometry.linear_algebra import element_at
+from aqualvs.geometry.compiled import (
+    ZERO,
+    borrowing_kernel,
+    inline_borrowing_kernel,
+    inner_kernel,
+    kernel,
+)
+from aqualvs.geometry.linear_algebra import element_at, median_of
 from aqualvs.scanning.laser_bands import LaserBand, SearchAxis
 from aqualvs.scanning.segments import (
     ComponentShapes,
@@ -208,7 +214,7 @@ def _write_centroid(
     table[3, c], table[4, c], table[5, c] = share * jx, share * jy, share * jz
 
 
-@kernel
+@inner_kernel
 def _write_sampling_weights(
     n_lines: IntArray,
     component: IntArray,
@@ -220,8 +226,12 @@ def _write_sampling_weights(
     shapes = ComponentShapes(table[0], table[1], table[2], table[3], table[4], table[5])
     # Shorter components are specks, and are left out of the typical weight.
     speck_lines = 3.0
-    strands = shapes.n_lines[shapes.n_lines >= speck_lines]
-    typical = np.median(strands) if strands.shape[0] else 0.0
+    strands, n = np.empty(shapes.n_lines.shape[0]), 0
+    for s in range(shapes.n_lines.shape[0]):
+        if shapes.n_lines[s] >= speck_lines:
+            strands[n] = shapes.n_lines[s]
+            n += 1
+    typical = median_of(strands[:n]) if n else 0.0
     # Limit of a component's sampling weight in the search for surfaces: this many times the
     # typical one, but at least that of this many search lines.
     weight_limit_share = 2.0

@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray, IntArray
-from aqualvs.geometry.compiled import inline_kernel, kernel
-from aqualvs.geometry.linear_algebra import element_at
+from aqualvs.geometry.compiled import inline_kernel, inner_kernel, kernel
+from aqualvs.geometry.linear_algebra import at_rows, element_at, where
 from aqualvs.optics.shutter import FIRST_ROW, Field
 from aqualvs.scanning.laser_bands import LaserBand, SearchAxis
 from aqualvs.scanning.laser_colour import (
@@ -127,7 +127,7 @@ def _pair_columns(luma: U8Array, means: U8Array, columns: U8Array) -> None:
             out[x] = _mean(_mean(before[x], after[x]), middle[x])
 
 
-@kernel
+@inner_kernel
 def _pair_pixels(row: U8Array, mean: U8Array) -> None:
     for x in range(mean.shape[0]):
         mean[x] = _mean(row[2 * x], row[2 * x + 1])
@@ -407,14 +407,20 @@ def select_peaks(
     min_likelihood, min_share : float
         As in `StripeOptions`.
     """
-    keep = likelihood >= min_likelihood
-    bright = min_share * element_at(table[HEIGHT][keep], _SEARCH.bright_quantile)
+    keep = np.empty(likelihood.shape[0], np.bool_)
+    for i in range(keep.shape[0]):
+        keep[i] = likelihood[i] >= min_likelihood
+    bright = min_share * element_at(at_rows(table[HEIGHT], where(keep)), _SEARCH.bright_quantile)
     for k in range(ends.shape[0] - 1):
-        rows = ends[k] + np.flatnonzero(keep[ends[k] : ends[k + 1]])
-        long = in_a_row(line[rows], table[POSITION][rows])
+        rows = where(keep[ends[k] : ends[k + 1]])
+        its_line = np.empty(rows.shape[0], np.int64)
+        for i in range(rows.shape[0]):
+            rows[i] += ends[k]
+            its_line[i] = line[rows[i]]
+        long = in_a_row(its_line, at_rows(table[POSITION], rows))
         for i in range(rows.shape[0]):
             keep[rows[i]] = long[i] or table[HEIGHT, rows[i]] >= bright
-    return np.flatnonzero(keep)
+    return where(keep)
 
 
 def _in_picture(peaks: StripePeaks, field: Field) -> StripePeaks:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import borrowing_kernel, kernel
+from aqualvs.geometry.compiled import borrowing_kernel, inner_borrowing_kernel, inner_kernel, kernel
 from aqualvs.geometry.linear_algebra import element_at
 from aqualvs.geometry.planes import Plane
 from aqualvs.scanning.candidates import Candidates, Subsegments
@@ -148,7 +148,7 @@ def label_target(
             explained[i] = True
 
 
-@kernel
+@inner_kernel
 def _of_same_peak(source: IntArray, one: BoolArray, other: BoolArray) -> BoolArray:
     """Mark every candidate of the peaks that have a candidate marked in one of two ways."""
     known = np.zeros(_n_sources(source), np.bool_)
@@ -161,7 +161,7 @@ def _of_same_peak(source: IntArray, one: BoolArray, other: BoolArray) -> BoolArr
     return same
 
 
-@borrowing_kernel
+@inner_borrowing_kernel
 def _n_sources(source: IntArray) -> int:
     n = 0
     for i in range(source.shape[0]):
@@ -224,7 +224,7 @@ def label_loose(
     return n
 
 
-@kernel
+@inner_kernel
 def _list_kept(source: IntArray, pixels: FloatArray, explained: BoolArray, rows: IntArray) -> int:
     """List the explained candidates, and those whose light no surface explains."""
     cell = np.empty(source.shape[0], np.int64)
@@ -237,7 +237,7 @@ def _list_kept(source: IntArray, pixels: FloatArray, explained: BoolArray, rows:
     return n
 
 
-@borrowing_kernel
+@inner_borrowing_kernel
 def _kind_of(
     points: FloatArray,
     i: int,

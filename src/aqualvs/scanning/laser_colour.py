@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aqualvs.geometry.arrays import FloatArray, IntArray
-from aqualvs.geometry.compiled import inline_kernel, kernel
-from aqualvs.geometry.linear_algebra import element_at, sum_of
+from aqualvs.geometry.compiled import inline_kernel, inner_kernel, kernel
+from aqualvs.geometry.linear_algebra import at_rows, element_at, sum_of, where
 from aqualvs.scanning.scan import Frame, ImagePlane
 from aqualvs.scanning.stripe import HEIGHT, IMBALANCE, STEP_U, STEP_V, TINT_U, TINT_V, TOP, WIDTH
 
@@ -325,7 +325,10 @@ def _noise(table: FloatArray) -> float:
     """
     # A quarter of a normal distribution lies within this many standard deviations.
     quarter_of_normal = 0.3186
-    noise = element_at(np.abs(table[IMBALANCE]), 0.25) / quarter_of_normal
+    off = np.empty(table.shape[1])
+    for i in range(table.shape[1]):
+        off[i] = abs(table[IMBALANCE, i])
+    noise = element_at(off, 0.25) / quarter_of_normal
     # Least chroma noise after rounding and subsampling, in levels.
     min_sigma = 0.7
     return max(noise / math.sqrt(2.0), min_sigma)
@@ -365,12 +368,14 @@ def _learn(table: FloatArray, u: float, v: float) -> tuple[float, float, float, 
         if is_one_colour:
             size = math.hypot(line_u, line_v)
             line_u, line_v = line_u / size, line_v / size
-            ratio = element_at(line_u * of_u + line_v * of_v, learned_quantile)
+            for k in range(best.shape[0]):
+                of_u[k] = line_u * of_u[k] + line_v * of_v[k]
+            ratio = element_at(of_u, learned_quantile)
             return line_u, line_v, max(ratio, RATIO_LEAST), sigma
     return u, v, 0.0, sigma
 
 
-@kernel
+@inner_kernel
 def _shown(table: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
     """Return the steps of peaks in U and V, for each level of height that shows its colour."""
     of_u, of_v = np.empty(rows.shape[0]), np.empty(rows.shape[0])
@@ -381,11 +386,14 @@ def _shown(table: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
     return of_u, of_v
 
 
-@kernel
+@inner_kernel
 def _middle(of_u: FloatArray, of_v: FloatArray) -> tuple[float, float, bool]:
     """Return the median of steps, and whether at least half of them are near it."""
     u, v = element_at(of_u, 0.5), element_at(of_v, 0.5)
-    squared = element_at((of_u - u) ** 2 + (of_v - v) ** 2, 0.5)
+    apart = np.empty(of_u.shape[0])
+    for k in range(of_u.shape[0]):
+        apart[k] = (of_u[k] - u) ** 2 + (of_v[k] - v) ** 2
+    squared = element_at(apart, 0.5)
     return u, v, squared <= _LEARN.max_scatter**2 * (u**2 + v**2)
 
 
@@ -395,29 +403,45 @@ def _learn_paint(table: FloatArray, n_min: float) -> tuple[float, float, float, 
 
     The number is zero if at most `n_min` peaks are tall.
     """
-    tall = np.flatnonzero(table[HEIGHT] >= _PAINT.tall)
-    if tall.shape[0] <= n_min:
+    tall, n = np.empty(table.shape[1], np.int64), 0
+    for i in range(table.shape[1]):
+        if table[HEIGHT, i] >= _PAINT.tall:
+            tall[n] = i
+            n += 1
+    if n <= n_min:
         return 0.0, 0.0, 0.0, 0.0, 0.0, 0
-    height = table[HEIGHT][tall]
-    of_u, of_v = table[STEP_U][tall] / height, table[STEP_V][tall] / height
+    height, of_u, of_v = np.empty(n), np.empty(n), np.empty(n)
+    tint_of_u, tint_of_v = np.empty(n), np.empty(n)
+    for k in range(n):
+        i = tall[k]
+        height[k] = table[HEIGHT, i]
+        of_u[k], of_v[k] = table[STEP_U, i] / height[k], table[STEP_V, i] / height[k]
+        tint_of_u[k], tint_of_v[k] = table[TINT_U, i], table[TINT_V, i]
     noise = _noise(table) / element_at(height, 0.5)
     u, v, spread_u, spread_v = 0.0, 0.0, 0.0, 0.0
-    near = np.ones(height.shape[0], np.bool_)
+    near_u, near_v, n_near = np.empty(n), np.empty(n), n
+    for k in range(n):
+        near_u[k], near_v[k] = of_u[k], of_v[k]
     for _ in range(_ROUNDS):
-        some_u, some_v = of_u[near], of_v[near]
-        u, v = element_at(some_u, 0.5), element_at(some_v, 0.5)
-        seen_u = _PAINT.mad_to_sigma * element_at(np.abs(some_u - u), 0.5)
-        seen_v = _PAINT.mad_to_sigma * element_at(np.abs(some_v - v), 0.5)
+        u, v = element_at(near_u[:n_near], 0.5), element_at(near_v[:n_near], 0.5)
+        for k in range(n_near):
+            near_u[k], near_v[k] = abs(near_u[k] - u), abs(near_v[k] - v)
+        seen_u = _PAINT.mad_to_sigma * element_at(near_u[:n_near], 0.5)
+        seen_v = _PAINT.mad_to_sigma * element_at(near_v[:n_near], 0.5)
         spread_u = math.sqrt(max(seen_u**2 - noise**2, _PAINT.min_spread**2))
         spread_v = math.sqrt(max(seen_v**2 - noise**2, _PAINT.min_spread**2))
         var_u, var_v = spread_u**2 + noise**2, spread_v**2 + noise**2
-        near = (of_u - u) ** 2 / var_u + (of_v - v) ** 2 / var_v < _PAINT.of_crowd**2
-    tint_u, tint_v = element_at(table[TINT_U][tall], 0.5), element_at(table[TINT_V][tall], 0.5)
+        n_near = 0
+        for k in range(n):
+            if (of_u[k] - u) ** 2 / var_u + (of_v[k] - v) ** 2 / var_v < _PAINT.of_crowd**2:
+                near_u[n_near], near_v[n_near] = of_u[k], of_v[k]
+                n_near += 1
+    tint_u, tint_v = element_at(tint_of_u, 0.5), element_at(tint_of_v, 0.5)
     size = math.hypot(tint_u, tint_v)
     across = math.hypot(spread_u, spread_v)
     if size > _PAINT.min_spread:
         across = math.hypot(tint_v * spread_u, tint_u * spread_v) / size
-    return u, v, spread_u, spread_v, across, int(np.count_nonzero(near))
+    return u, v, spread_u, spread_v, across, n_near
 
 
 @kernel
@@ -439,7 +463,7 @@ def _learn_beside_paint(
             off_u, off_v = step_u - paint_u * height, step_v - paint_v * height
             var_u, var_v = (spread_u * height) ** 2 + sigma**2, (spread_v * height) ** 2 + sigma**2
             is_clear[i] = off_u**2 / var_u + off_v**2 / var_v > _PAINT.clear_of_paint**2
-    best = np.flatnonzero(is_clear)
+    best = where(is_clear)
     if best.shape[0] < _LEARN.min_learned:
         return u, v, 0.0, sigma, 1.0, 1.0
     of_u, of_v = _shown(table, best)
@@ -448,8 +472,10 @@ def _learn_beside_paint(
     if size > _RATIO_MOST or not is_one_colour:
         return u, v, 0.0, sigma, 1.0, 1.0
     line_u, line_v = line_u / size, line_v / size
-    off_along = np.abs(line_u * of_u + line_v * of_v - size)
-    off_across = np.abs(line_v * of_u - line_u * of_v)
+    off_along, off_across = np.empty(best.shape[0]), np.empty(best.shape[0])
+    for k in range(best.shape[0]):
+        off_along[k] = abs(line_u * of_u[k] + line_v * of_v[k] - size)
+        off_across[k] = abs(line_v * of_u[k] - line_u * of_v[k])
     along = max(_PAINT.mad_to_sigma * element_at(off_along, 0.5) / size, _LEARN.min_scatter)
     across = max(_PAINT.mad_to_sigma * element_at(off_across, 0.5) / size, _LEARN.min_scatter)
     return line_u, line_v, max(size, RATIO_LEAST), sigma, along, across
@@ -471,7 +497,7 @@ def _colour_left(top: float) -> float:
     return 1.0 - (1.0 - left_at_full) * min(max((top - clipped) / (full - clipped), 0.0), 1.0)
 
 
-@kernel
+@inner_kernel
 def _best_stripes(
     table: FloatArray, u: float, v: float, sigma: float, tint_share: float
 ) -> IntArray:
@@ -486,7 +512,13 @@ def _best_stripes(
             beyond_u, beyond_v = _beyond_paint(table, i, 1.0, tint_share, np.inf)
             size = math.sqrt(beyond_u**2 + beyond_v**2)
             share[i] = size / (height * _colour_left(table[TOP, i])) if size > least else 0.0
-    return np.flatnonzero(share > _LEARN.best_share * element_at(share[share > 0.0], 0.95))
+    chosen = np.empty(table.shape[1], np.bool_)
+    for i in range(table.shape[1]):
+        chosen[i] = share[i] > 0.0
+    lowest = _LEARN.best_share * element_at(at_rows(share, where(chosen)), 0.95)
+    for i in range(table.shape[1]):
+        chosen[i] = share[i] > lowest
+    return where(chosen)
 
 
 @kernel
@@ -564,16 +596,21 @@ def _weigh(
             log_odds = -_LIKELIHOOD.max_log_odds
         odds[i] = math.exp(min(max(log_odds, -_LIKELIHOOD.max_log_odds), _LIKELIHOOD.max_log_odds))
         kind[i] = _kind_of(height)
-    share = np.full(_N_KINDS, 0.5)
+    share, lines, peaks = np.empty(_N_KINDS), np.empty(_N_KINDS), np.empty(_N_KINDS)
+    for k in range(_N_KINDS):
+        share[k] = 0.5
     for _ in range(_ROUNDS):
-        lines, peaks = np.full(_N_KINDS, 1.0), np.full(_N_KINDS, 2.0)
+        for k in range(_N_KINDS):
+            lines[k], peaks[k] = 1.0, 2.0
         for i in range(n):
             prior = share[kind[i]]
             likelihood[i] = prior * odds[i] / (prior * odds[i] + 1.0 - prior)
             lines[kind[i]] += likelihood[i]
             peaks[kind[i]] += 1.0
         # The number of lines is limited to the number that the lasers can make.
-        share = lines / peaks * min(n_possible / sum_of(lines), 1.0)
+        most = min(n_possible / sum_of(lines), 1.0)
+        for k in range(_N_KINDS):
+            share[k] = lines[k] / peaks[k] * most
     for i in range(n):
         if table[TOP, i] >= WHITE and table[WIDTH, i] <= widest_white_px:
             likelihood[i] = max(likelihood[i], 0.5)

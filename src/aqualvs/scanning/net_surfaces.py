@@ -15,8 +15,8 @@ from typing import NamedTuple
 import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import borrowing_kernel, kernel
-from aqualvs.geometry.linear_algebra import invert_symmetric, solve_symmetric
+from aqualvs.geometry.compiled import borrowing_kernel, inner_kernel, kernel
+from aqualvs.geometry.linear_algebra import invert_symmetric, median_of, solve_symmetric
 from aqualvs.geometry.planes import Plane
 from aqualvs.scanning.candidates import Subsegments
 from aqualvs.scanning.plane_fit import TUKEY, PlaneFit, normal_equations
@@ -45,9 +45,7 @@ def is_continuation(
         C of them.
     """
     packed = np.append(plane.normal, plane.offset)
-    turns, at_random, met = _turns(
-        subsegments.table, subsegments.laser, subsegments.first_line, first, second, packed
-    )
+    turns, at_random, met = _turns(subsegments, first, second, packed)
     # Share of the transitions at which the one surface must begin where the other ends.
     most = 0.5
     return bool(0 < turns <= max(_MAX_TURNS * at_random, 1.0) and met >= most * turns)
@@ -63,20 +61,12 @@ def seen_through(first: BoolArray, second: BoolArray, subsegments: Subsegments) 
     subsegments : Subsegments
         C of them.
     """
-    turns, at_random, _ = _turns(
-        subsegments.table, subsegments.laser, subsegments.first_line, first, second, np.zeros(4)
-    )
+    turns, at_random, _ = _turns(subsegments, first, second, np.zeros(4))
     return bool(turns >= _ENOUGH_TURNS and turns >= _MIN_TURNS * at_random)
 
 
-@kernel
 def _turns(
-    table: FloatArray,
-    laser: IntArray,
-    first_line: IntArray,
-    first: BoolArray,
-    second: BoolArray,
-    plane: FloatArray,
+    subsegments: Subsegments, first: BoolArray, second: BoolArray, plane: FloatArray
 ) -> tuple[int, float, int]:
     """Count the transitions from one surface to the other along the stripes.
 
@@ -84,37 +74,24 @@ def _turns(
     plane is one that a fold makes.
     """
     rows = np.flatnonzero(first | second)
-    order = rows[np.argsort(laser[rows] * 1e6 + first_line[rows])]
-    turns, met, n, n_second = 0, 0, 0, 0
-    at_random = 0.0
-    for k in range(order.shape[0]):
-        c = order[k]
-        n += 1
-        n_second += second[c]
-        if k + 1 == order.shape[0] or laser[order[k + 1]] != laser[c]:
-            at_random += 2.0 * n_second * (n - n_second) / n
-            n, n_second = 0, 0
-        elif second[order[k + 1]] != second[c]:
-            turns += 1
-            met += _meet(table, c, order[k + 1], plane)
-    return turns, at_random, met
-
-
-@kernel
-def _meet(table: FloatArray, a: int, b: int, plane: FloatArray) -> bool:
-    """Return whether the step from one subsegment to another is one that a fold makes."""
-    square = 0.0
-    step = 0.0
-    for k in range(3):
-        apart = table[k, b] - table[k, a]
-        square += apart * apart
-        step += plane[k] * apart
-    beside = np.sqrt(max(square - step * step, 0.0))
+    rows = rows[np.lexsort((subsegments.first_line[rows], subsegments.laser[rows]))]
+    laser, on_second = subsegments.laser[rows], second[rows]
+    total, n_second = np.bincount(laser), np.bincount(laser, weights=on_second)
+    seen = total > 0
+    total, n_second = total[seen], n_second[seen]
+    at_random = float(np.sum(2.0 * n_second * (total - n_second) / total))
+    turns = np.flatnonzero((laser[1:] == laser[:-1]) & (on_second[1:] != on_second[:-1]))
+    apart = (
+        subsegments.table[X : Z + 1, rows[turns + 1]] - subsegments.table[X : Z + 1, rows[turns]]
+    )
+    step = plane[:3] @ apart
+    beside = np.sqrt(np.maximum((apart * apart).sum(axis=0) - step * step, 0.0))
     # The steepest flank of a fold, and what noise adds to the step from one piece to the next, as a
     # share of the range.
     steepest = 2.0
     loose_share = 0.01
-    return bool(abs(step) <= steepest * beside + loose_share * plane[3])
+    met = np.abs(step) <= steepest * beside + loose_share * plane[3]
+    return len(turns), at_random, int(np.count_nonzero(met))
 
 
 def merged_plane(
@@ -174,13 +151,17 @@ def _fit_mean(
     points: FloatArray, m: FloatArray, weights: FloatArray, covariance: FloatArray
 ) -> float:
     """Refine m in place, write weights and covariance; return the rms, NaN if undetermined."""
-    n, one = points.shape[0], np.ones(points.shape[0])
+    n, one = points.shape[0], np.empty(points.shape[0])
+    for i in range(n):
+        one[i] = 1.0
     off, normal, right, inverse = np.empty(n), np.empty((3, 3)), np.empty(3), np.empty((3, 3))
     iterations = 5
     exact = 1e-9
     for _ in range(iterations):
         _distances(points, m, off)
-        cut = TUKEY * 1.4826 * max(np.median(np.abs(off)), exact)
+        for i in range(n):
+            weights[i] = abs(off[i])
+        cut = TUKEY * 1.4826 * max(median_of(weights), exact)
         for i in range(n):
             weights[i] = max(1.0 - (off[i] / cut) ** 2, 0.0) ** 2
         normal_equations(points, one, weights, normal, right)
@@ -193,11 +174,14 @@ def _fit_mean(
     for i in range(n):
         square += weights[i] * off[i] * off[i]
         weight += weights[i]
-    covariance *= square / (weight * (1.0 - 3.0 / n))
+    factor = square / (weight * (1.0 - 3.0 / n))
+    for j in range(3):
+        for k in range(3):
+            covariance[j, k] *= factor
     return float(np.sqrt(square / weight / (m[0] * m[0] + m[1] * m[1] + m[2] * m[2])))
 
 
-@kernel
+@inner_kernel
 def _distances(points: FloatArray, m: FloatArray, off: FloatArray) -> None:
     """Write m·X - 1 of each point."""
     for i in range(points.shape[0]):
@@ -357,7 +341,7 @@ def _describe(
     return broken >= enough or few, gappy >= enough or few, unbroken >= enough, total
 
 
-@kernel
+@inner_kernel
 def _in_order(
     first_line: IntArray, n_lines: IntArray, laser: IntArray, members: BoolArray, index: int
 ) -> tuple[IntArray, int]:
@@ -377,7 +361,7 @@ def _in_order(
     return order[:n], total
 
 
-@kernel
+@inner_kernel
 def _describe_stripe(
     table: FloatArray,
     intensity_weight: FloatArray,
@@ -412,11 +396,13 @@ def _describe_stripe(
         if table[WEIGHT, c] > curved_weight * intensity_weight[c]:
             bright[n_intervals] += intensity_weight[c]
     extent = _extent(n_lines, first_line, last_line, order)
-    gap = np.median(dark[:n_intervals]) if n_intervals else 0.0
+    gap = median_of(dark[:n_intervals]) if n_intervals else 0.0
     lit[n_intervals] = end - begin
     n_intervals += 1
-    component = np.median(lit[:n_intervals])
-    m_per_line = np.median(distance) / focal_px
+    m_per_line = median_of(distance) / focal_px
+    for k in range(n_intervals):
+        dark[k] = lit[k]
+    component = median_of(dark[:n_intervals])
     on_strands, all_lines, unbroken = 0.0, 0.0, 0.0
     for k in range(n_intervals):
         all_lines += lit[k]
@@ -429,7 +415,7 @@ def _describe_stripe(
     return n_intervals, duty, float(component * m_per_line), extent, on_strands, share
 
 
-@kernel
+@inner_kernel
 def _extent(n_lines: IntArray, first_line: IntArray, last_line: IntArray, order: IntArray) -> float:
     """Search lines between the 10 % and the 90 % point of one laser's light."""
     total = 0

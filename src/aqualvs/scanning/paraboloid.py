@@ -15,8 +15,8 @@ from typing import NamedTuple
 import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import borrowing_kernel, kernel
-from aqualvs.geometry.linear_algebra import factorise, inverse_of, solve_factorised
+from aqualvs.geometry.compiled import ZERO, inner_borrowing_kernel, inner_kernel, kernel
+from aqualvs.geometry.linear_algebra import factorise, inverse_of, median_of, solve_factorised
 from aqualvs.geometry.planes import Plane
 from aqualvs.scanning.candidates import Observations
 from aqualvs.scanning.patch import (
@@ -91,7 +91,7 @@ def fit_over(
     over_plane(points, sensitivity, patch, terms, height, per_px)
     gate, sigma, pull = np.empty(n), np.empty(n), np.empty(n)
     by_range = GATE_SHARE * patch[OFFSET]
-    n_on_plane = 0
+    n_on_plane = ZERO
     for i in range(n):
         by_pixel = GATE_PX * abs(per_px[i])
         gate[i] = np.sqrt(by_range * by_range + by_pixel * by_pixel)
@@ -112,7 +112,7 @@ def fit_over(
     return True, asked, rms
 
 
-@borrowing_kernel
+@inner_borrowing_kernel
 def _asked_for(
     terms: FloatArray,
     height: FloatArray,
@@ -169,7 +169,7 @@ def curvature_hint(
     return curvature_in_sigmas(terms, height, per_px, weights)
 
 
-@borrowing_kernel
+@inner_borrowing_kernel
 def over_plane(
     points: FloatArray,
     sensitivity: FloatArray,
@@ -203,7 +203,7 @@ def over_plane(
         height[i], per_px[i] = h, d
 
 
-@kernel
+@inner_kernel
 def _solve(
     terms: FloatArray,
     height: FloatArray,
@@ -237,7 +237,7 @@ def _solve(
     return True
 
 
-@kernel
+@inner_kernel
 def curvature_in_sigmas(
     terms: FloatArray, height: FloatArray, sigma: FloatArray, weights: FloatArray
 ) -> float:
@@ -262,7 +262,7 @@ def curvature_in_sigmas(
     return most
 
 
-@kernel
+@inner_kernel
 def grow(
     terms: FloatArray,
     height: FloatArray,
@@ -280,15 +280,16 @@ def grow(
     # Largest curvature: a net does not bend with a radius below half a metre.
     strongest = 2.0
     for _ in range(steps):
+        n_inside = 0
         for i in range(n):
             weight[i] = 1.0 / (gate[i] * gate[i]) if inside[i] else 0.0
-        if np.count_nonzero(inside) < MIN_PIECES or not _solve(
-            terms, height, weight, factor, coefficients
-        ):
+            n_inside += inside[i]
+        if n_inside < MIN_PIECES or not _solve(terms, height, weight, factor, coefficients):
             return False
-        if np.abs(coefficients[3:]).max() > strongest:
-            return False
-        changed = False
+        for k in range(3, N):
+            if abs(coefficients[k]) > strongest:
+                return False
+        changed, n_inside = False, 0
         for i in range(n):
             off = height[i]
             for k in range(N):
@@ -296,12 +297,13 @@ def grow(
             now = abs(off) < gate[i]
             changed |= now != inside[i]
             inside[i] = now
+            n_inside += now
         if not changed:
             break
-    return bool(np.count_nonzero(inside) >= MIN_PIECES)
+    return n_inside >= MIN_PIECES
 
 
-@kernel
+@inner_kernel
 def reweight(
     terms: FloatArray,
     height: FloatArray,
@@ -316,16 +318,22 @@ def reweight(
     """
     n = height.shape[0]
     z, weight = np.empty(n), np.empty(n)
-    factor, known = np.empty((N, N)), np.eye(N)
+    factor, known = np.empty((N, N)), np.zeros((N, N))
+    for k in range(N):
+        known[k, k] = 1.0
     scale = 1.0
     reweights = 6
     for _ in range(reweights):
+        n_inside = 0
         for i in range(n):
             off = height[i]
             for k in range(N):
                 off -= terms[i, k] * coefficients[k]
             z[i] = off / sigma[i]
-        scale = max(1.4826 * np.median(np.abs(z[inside])), 0.1)
+            if inside[i]:
+                weight[n_inside] = abs(z[i])
+                n_inside += 1
+        scale = max(1.4826 * median_of(weight[:n_inside]), 0.1)
         for i in range(n):
             rest = max(1.0 - (z[i] / (TUKEY * scale)) ** 2, 0.0)
             weights[i] = rest * rest if inside[i] else 0.0
@@ -343,7 +351,7 @@ def reweight(
     return scale, np.sqrt(square / total), inverse_of(known)
 
 
-@kernel
+@inner_kernel
 def add_shared(
     terms: FloatArray,
     pull: FloatArray,
@@ -369,7 +377,10 @@ def add_shared(
     covariance : array, shape (6, 6)
         Completed in place.
     """
-    for index in range(laser.max() + 1):
+    n_lasers = 0
+    for i in range(laser.shape[0]):
+        n_lasers = max(n_lasers, laser[i] + 1)
+    for index in range(n_lasers):
         low, high = np.inf, -np.inf
         for i in range(laser.shape[0]):
             if laser[i] == index:

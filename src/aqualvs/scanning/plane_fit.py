@@ -7,10 +7,11 @@ from typing import NamedTuple
 import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import kernel
+from aqualvs.geometry.compiled import inner_kernel, kernel
 from aqualvs.geometry.linear_algebra import (
     factorise,
     invert_symmetric,
+    median_of,
     solve_factorised,
     solve_symmetric,
 )
@@ -178,7 +179,7 @@ def plane_of_all(points: FloatArray, m: FloatArray) -> bool:
     return solve_symmetric(normal, right, inverse, m)
 
 
-@kernel
+@inner_kernel
 def _normalised_residuals(
     points: FloatArray,
     sensitivity: FloatArray,
@@ -235,7 +236,9 @@ def _fit(
     scale = 1.0
     for _ in range(_ITERATIONS):
         _normalised_residuals(points, sensitivity, sigma_px, m, sigma, z)
-        scale = max(1.4826 * np.median(np.abs(z)), 0.1)
+        for i in range(n):
+            weights[i] = abs(z[i])
+        scale = max(1.4826 * median_of(weights), 0.1)
         for i in range(n):
             ratio = z[i] / (TUKEY * scale)
             kept = max(1.0 - ratio * ratio, 0.0)
@@ -248,14 +251,16 @@ def _fit(
     if factor < 1.0:
         # With few observations, a scatter below the stated errors is chance.
         factor = (_STATED_COUNT + n * factor) / (_STATED_COUNT + n)
-    normal_equations(points, sigma, np.ones(n), normal, right)
-    if not invert_symmetric(normal, covariance):
-        return np.nan
-    covariance *= factor
-    if not math.isfinite(factor):
-        return np.nan
-    # From here on `z` is m·X - 1.
     weight, per_px = np.empty(n), np.empty(n)
+    for i in range(n):
+        weight[i] = 1.0
+    normal_equations(points, sigma, weight, normal, right)
+    if not (invert_symmetric(normal, covariance) and math.isfinite(factor)):
+        return np.nan
+    for j in range(3):
+        for k in range(3):
+            covariance[j, k] *= factor
+    # From here on `z` is m·X - 1.
     for i in range(n):
         weight[i] = weights[i] / (sigma[i] * sigma[i])
         per_px[i] = m[0] * sensitivity[i, 0] + m[1] * sensitivity[i, 1] + m[2] * sensitivity[i, 2]
@@ -264,17 +269,20 @@ def _fit(
         points, per_px, weight, z, laser, along, shared.own, factor, inverse, covariance
     )
     for k in range(shared.common.shape[0]):
-        pull = np.zeros(3)
+        for j in range(3):
+            right[j] = 0.0
         for i in range(n):
             for j in range(3):
-                pull[j] += per_px[i] * weight[i] * shared.common[k, i] * points[i, j]
-        add_error(pull, inverse, covariance)
-    if not np.isfinite(covariance).all():
-        return np.nan
+                right[j] += per_px[i] * weight[i] * shared.common[k, i] * points[i, j]
+        add_error(right, inverse, covariance)
+    for j in range(3):
+        for k in range(3):
+            if not math.isfinite(covariance[j, k]):
+                return np.nan
     return _weighted_rms(z, weights, m)
 
 
-@kernel
+@inner_kernel
 def _huber_factor(z: FloatArray, cut: float) -> float:
     """Return the factor on the unweighted inverse of the normal matrix (Huber 1981, section 7.6).
 
@@ -297,7 +305,7 @@ def _huber_factor(z: FloatArray, cut: float) -> float:
     return float(correction**2 * scatter / (n - 3) / slope**2)
 
 
-@kernel
+@inner_kernel
 def _add_own_errors(
     points: FloatArray,
     per_px: FloatArray,
@@ -314,7 +322,9 @@ def _add_own_errors(
 
     `off` is m·X - 1; `factor` is that of the points' variances.
     """
-    n_modes = 2 * (laser.max() + 1)
+    n_modes = 0
+    for i in range(laser.shape[0]):
+        n_modes = max(n_modes, 2 * (laser[i] + 1))
     pull, residual = np.zeros((n_modes, 3)), np.zeros(n_modes)
     matrix = np.zeros((n_modes, n_modes))
     for i in range(points.shape[0]):
@@ -339,14 +349,18 @@ def _add_own_errors(
         for b in range(a + 1):
             for k in range(3):
                 matrix[a, b] -= moved[a, k] * pull[b, k]
-    scale = _expected_square(matrix / factor, residual / factor)
+    for a in range(n_modes):
+        residual[a] /= factor
+        for b in range(n_modes):
+            matrix[a, b] /= factor
+    scale = _expected_square(matrix, residual)
     for a in range(n_modes):
         for j in range(3):
             for k in range(3):
                 covariance[j, k] += scale * moved[a, j] * moved[a, k]
 
 
-@kernel
+@inner_kernel
 def _expected_square(matrix: FloatArray, residual: FloatArray) -> float:
     """Return the expected square of the factor on shared errors, given what a frame shows.
 
@@ -363,11 +377,12 @@ def _expected_square(matrix: FloatArray, residual: FloatArray) -> float:
     # By this factor pictures differ in that: standard deviation of its logarithm. Rendered walls
     # have 0.01 to 0.06 px, most where compression is strong.
     pictures_differ = 4.0
-    n_modes, spread = residual.shape[0], 2.0 * np.log(pictures_differ)
+    n_modes, spread = residual.shape[0], 2.0 * math.log(pictures_differ)
     lower, solved = np.empty((n_modes, n_modes)), np.empty(n_modes)
-    log_weight = np.full(_SQUARES.shape[0], -np.inf)
+    log_weight, most = np.empty(_SQUARES.shape[0]), -np.inf
     for f in range(_SQUARES.shape[0]):
         t = _SQUARES[f]
+        log_weight[f] = -np.inf
         for a in range(n_modes):
             for b in range(a):
                 lower[a, b] = matrix[a, b]
@@ -375,18 +390,24 @@ def _expected_square(matrix: FloatArray, residual: FloatArray) -> float:
         if not factorise(lower, 0.0, 0.0, lower):
             continue
         solve_factorised(lower, residual, solved)
-        total = -((np.log(t) / spread) ** 2) - n_modes * np.log(t)
+        total = -((math.log(t) / spread) ** 2) - n_modes * math.log(t)
         for a in range(n_modes):
-            total += residual[a] * solved[a] - 2.0 * np.log(lower[a, a])
+            total += residual[a] * solved[a] - 2.0 * math.log(lower[a, a])
         log_weight[f] = 0.5 * total
-    most = log_weight.max()
+        if math.isnan(log_weight[f]):
+            return 1.0
+        most = max(most, log_weight[f])
     if not math.isfinite(most):
         return 1.0
-    weights = np.exp(log_weight - most)
-    return float((weights * _SQUARES).sum() / weights.sum())
+    weighted, weight = 0.0, 0.0
+    for f in range(_SQUARES.shape[0]):
+        one = math.exp(log_weight[f] - most)
+        weighted += one * _SQUARES[f]
+        weight += one
+    return float(weighted / weight)
 
 
-@kernel
+@inner_kernel
 def add_error(pull: FloatArray, inverse: FloatArray, covariance: FloatArray) -> None:
     """Widen a covariance (K, K) by an error of all observations together.
 
@@ -401,7 +422,7 @@ def add_error(pull: FloatArray, inverse: FloatArray, covariance: FloatArray) -> 
             covariance[j, k] += moved[j] * moved[k]
 
 
-@kernel
+@inner_kernel
 def _weighted_rms(off: FloatArray, weights: FloatArray, m: FloatArray) -> float:
     total, weight = 0.0, 0.0
     for i in range(off.shape[0]):

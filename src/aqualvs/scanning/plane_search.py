@@ -15,12 +15,12 @@ import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.compiled import (
-    borrowing_kernel,
     inline_borrowing_kernel,
     inline_kernel,
-    kernel,
+    inner_borrowing_kernel,
+    inner_kernel,
 )
-from aqualvs.geometry.linear_algebra import solve_symmetric, sum_of
+from aqualvs.geometry.linear_algebra import at_rows, solve_symmetric, sum_of
 
 X, Y, Z, JX, JY, JZ, WEIGHT = range(7)
 """Rows of the table: centroid (m), sensitivity (m/px), sampling weight (search lines)."""
@@ -58,7 +58,7 @@ def squared_gate(per_px: float, offset: float) -> float:
     return by_range * by_range + by_pixel * by_pixel
 
 
-@borrowing_kernel
+@inner_borrowing_kernel
 def _score(
     table: FloatArray,
     laser_start: IntArray,
@@ -115,7 +115,7 @@ def _near(
     return value
 
 
-@kernel
+@inner_kernel
 def refine_plane(
     table: FloatArray,
     plane: FloatArray,
@@ -198,7 +198,7 @@ def _pick(cumulative_weight: FloatArray, guide: IntArray, draw: float) -> int:
     return int(at)
 
 
-@borrowing_kernel
+@inner_borrowing_kernel
 def _guide(cumulative_weight: FloatArray, guide: IntArray) -> None:
     """Write the start of the search in `_pick`, for as many draws as there are subsegments."""
     n = guide.shape[0]
@@ -210,10 +210,12 @@ def _guide(cumulative_weight: FloatArray, guide: IntArray) -> None:
         guide[k] = at
 
 
-@kernel
+@inner_kernel
 def _median_weight(sampling_weight: FloatArray) -> float:
     """Return the weighted median of the sampling weights."""
-    values = sampling_weight.copy()
+    values = np.empty(sampling_weight.shape[0])
+    for c in range(sampling_weight.shape[0]):
+        values[c] = sampling_weight[c]
     wanted, below = 0.5 * sum_of(sampling_weight), 0.0
     low, high = 0, values.shape[0]
     while high - low > 1:
@@ -244,16 +246,22 @@ def _median_weight(sampling_weight: FloatArray) -> float:
     return float(values[min(low, values.shape[0] - 1)])
 
 
-@kernel
+@inner_kernel
 def _heavy(sampling_weight: FloatArray) -> IntArray:
     """Return the subsegments to sample: those not much below the weighted median.
 
     Where glare makes thousands of specks, most neighbours on a stripe would be specks.
     """
-    return np.flatnonzero(sampling_weight >= _LIGHTEST_SHARE * _median_weight(sampling_weight))
+    least = _LIGHTEST_SHARE * _median_weight(sampling_weight)
+    heavy, n = np.empty(sampling_weight.shape[0], np.int64), 0
+    for c in range(sampling_weight.shape[0]):
+        if sampling_weight[c] >= least:
+            heavy[n] = c
+            n += 1
+    return heavy[:n]
 
 
-@kernel
+@inner_kernel
 def search_plane(
     table: FloatArray,
     laser: IntArray,
@@ -287,11 +295,13 @@ def search_plane(
     best = 0.0
     best_rough = 0.0
     heavy = _heavy(table[WEIGHT])
-    if seed == 0 and laser[heavy[0]] == laser[heavy[-1]]:
+    if seed == 0 and laser[heavy[0]] == laser[heavy[heavy.shape[0] - 1]]:
         # A sample needs two lasers. Later, such light is what a surface has left over.
-        heavy = np.arange(n)
+        heavy = np.empty(n, np.int64)
+        for c in range(n):
+            heavy[c] = c
     n_heavy = heavy.shape[0]
-    cumulative_weight = table[WEIGHT][heavy]
+    cumulative_weight = at_rows(table[WEIGHT], heavy)
     for k in range(1, n_heavy):
         cumulative_weight[k] += cumulative_weight[k - 1]
     guide = np.empty(n_heavy, np.int64)

@@ -14,7 +14,12 @@ from typing import NamedTuple
 import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel, kernel
+from aqualvs.geometry.compiled import (
+    borrowing_kernel,
+    inline_borrowing_kernel,
+    inner_kernel,
+    kernel,
+)
 from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.sheet import COLUMNS, START, WINDOWED, sheet_distance, sheets_of
@@ -111,7 +116,7 @@ def select_units(
     return n_groups, n_candidates
 
 
-@kernel
+@inner_kernel
 def _units_on(unit: IntArray, min_lines: int, on_target: BoolArray) -> IntArray:
     """Return -2 for each piece on the target that is long enough, -1 for others."""
     n_planes = 0
@@ -128,7 +133,7 @@ def _units_on(unit: IntArray, min_lines: int, on_target: BoolArray) -> IntArray:
     return number
 
 
-@kernel
+@inner_kernel
 def _mean_widths(
     laser: IntArray, width: FloatArray, unit: IntArray, number: IntArray, n_lasers: int
 ) -> FloatArray:

@@ -14,7 +14,8 @@ no such neighbours, or are farther off than the right candidate of the same ligh
 import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import kernel
+from aqualvs.geometry.compiled import inner_kernel, kernel
+from aqualvs.geometry.linear_algebra import median_of, order_of
 from aqualvs.scanning.net_surfaces import LONGEST_INTERVAL
 
 # Limits of light on a plane, and of light beside it, as shares of the range.
@@ -39,7 +40,7 @@ def has_much_beside(off: FloatArray, much: float = MUCH) -> bool:
     return bool(near - on_it > much * on_it)
 
 
-@kernel
+@inner_kernel
 def recruit_candidates(
     points: FloatArray,
     sensitivity: FloatArray,
@@ -205,7 +206,7 @@ def _describe(
         facts[SIZE, s] = np.sqrt(facts[SIZE, s])
 
 
-@kernel
+@inner_kernel
 def _listed(facts: FloatArray, distance: float) -> tuple[IntArray, float]:
     """Return seeds and candidates in their order along the stripes, and the lowest confidence."""
     n = facts.shape[1]
@@ -231,10 +232,10 @@ def _listed(facts: FloatArray, distance: float) -> tuple[IntArray, float]:
         if seed or (short and near and loose):
             key[s] = facts[LASER, s] * 1e6 + facts[LINE, s]
             n_listed += 1
-    return np.argsort(key)[:n_listed], dimmest * total / max(n_seeds, 1)
+    return order_of(key)[:n_listed], dimmest * total / max(n_seeds, 1)
 
 
-@kernel
+@inner_kernel
 def _drop_few(height: FloatArray, lonely: float, cost: FloatArray) -> None:
     """Remove components that leave the surface, where they are too few to be a fold."""
     n_far = 0
@@ -248,7 +249,7 @@ def _drop_few(height: FloatArray, lonely: float, cost: FloatArray) -> None:
                 cost[s] = np.inf
 
 
-@kernel
+@inner_kernel
 def _drop_between(order: IntArray, facts: FloatArray) -> float:
     """Remove components between regularly spaced strands on the plane.
 
@@ -273,7 +274,7 @@ def _drop_between(order: IntArray, facts: FloatArray) -> float:
             after[at] = facts[LINE, p] if facts[ON_NET, p] > 0.0 else after[at + 1]
     if n_gaps == 0:
         return np.inf
-    usual = float(np.median(gaps[:n_gaps]))
+    usual = median_of(gaps[:n_gaps])
     # In a fold the plane itself has no strands: least gap in usual distances, or half of that where
     # the net's last strand is on one side only.
     fold_gap = 1.7
@@ -289,7 +290,7 @@ def _drop_between(order: IntArray, facts: FloatArray) -> float:
     return usual
 
 
-@kernel
+@inner_kernel
 def _sweep(
     order: IntArray,
     way: int,
@@ -346,7 +347,7 @@ def _sweep(
             cost[s] = min(cost[s], reached[s])
 
 
-@kernel
+@inner_kernel
 def _settle(
     component: IntArray, source: IntArray, cost: FloatArray, taken: BoolArray, on_net: BoolArray
 ) -> None:

@@ -18,7 +18,13 @@ from typing import NamedTuple
 import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import ZERO, borrowing_kernel, inline_borrowing_kernel, kernel
+from aqualvs.geometry.compiled import (
+    ZERO,
+    inline_borrowing_kernel,
+    inner_borrowing_kernel,
+    inner_kernel,
+    kernel,
+)
 from aqualvs.geometry.linear_algebra import solve_symmetric
 from aqualvs.scanning.laser_bands import SLOPE_CELL, LaserBand
 from aqualvs.scanning.stripe import StripePeaks
@@ -187,7 +193,7 @@ def run_end(numbers: IntArray, begin: int) -> int:
     return end
 
 
-@borrowing_kernel
+@inner_borrowing_kernel
 def _measure_components(
     component: IntArray,
     line: IntArray,
@@ -218,7 +224,7 @@ def _measure_components(
         begin = end
 
 
-@kernel
+@inner_kernel
 def _fit_parabolas(
     component: IntArray,
     points: FloatArray,
@@ -357,7 +363,7 @@ def link_segments(peaks: StripePeaks, search: LaserBand) -> Segments:
     return Segments(order, component, subsegment)
 
 
-@kernel
+@inner_kernel
 def in_a_row(line: IntArray, position: FloatArray) -> BoolArray:
     """Mark the peaks (N,) of segments of at least `SUBSEGMENT_LINES`, of any direction.
 
@@ -428,7 +434,7 @@ def _still_due(x: int, n_alive: int, alive: IntArray, track: FloatArray, due: Fl
     return kept
 
 
-@kernel
+@inner_kernel
 def _link(
     line: IntArray,
     position: FloatArray,
@@ -480,7 +486,7 @@ def _link(
     return n_segments
 
 
-@kernel
+@inner_kernel
 def _sort(segment_of: IntArray, count: IntArray, numbers: IntArray) -> IntArray:
     """Sort the peaks by segment into the first row of `numbers`; return the segments' starts."""
     n_segments = count.shape[0]
@@ -497,7 +503,7 @@ def _sort(segment_of: IntArray, count: IntArray, numbers: IntArray) -> IntArray:
     return start
 
 
-@kernel
+@inner_kernel
 def _drop_foreign(
     line: IntArray,
     position: FloatArray,
@@ -536,7 +542,7 @@ def _drop_foreign(
     return n_kept
 
 
-@kernel
+@inner_kernel
 def _direction_possible(
     line: IntArray,
     position: FloatArray,
@@ -569,7 +575,7 @@ def _direction_possible(
     return bool(low <= slope <= high)
 
 
-@kernel
+@inner_kernel
 def _join(line: IntArray, position: FloatArray, first: IntArray, last: IntArray) -> IntArray:
     """Assign each connected component of segments whose ends meet the number of its first segment.
 
@@ -594,7 +600,7 @@ def _join(line: IntArray, position: FloatArray, first: IntArray, last: IntArray)
     return root
 
 
-@borrowing_kernel
+@inner_borrowing_kernel
 def _first_from(line: IntArray, first: IntArray, wanted: int) -> int:
     """Return the first segment that begins on the wanted search line or after it."""
     low, high = 0, first.shape[0]

@@ -20,7 +20,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import kernel
+from aqualvs.geometry.compiled import inner_kernel, kernel
 from aqualvs.scanning.laser_bands import LaserBand, SearchAxis
 from aqualvs.scanning.laser_colour import (
     RATIO_EXPECTED,
@@ -336,7 +336,7 @@ def _measure(
         table[x, k], table[y, k] = end, position[last]
 
 
-@kernel
+@inner_kernel
 def _sum_above_flanks(row: Rows, low: int, high: int) -> float:
     """Return the sum between two flanks above the straight line from one to the other."""
     left, right = 0.5 * (row[low] + row[low - 1]), 0.5 * (row[high] + row[high + 1])

@@ -19,8 +19,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel, kernel
-from aqualvs.geometry.linear_algebra import sum_of
+from aqualvs.geometry.compiled import (
+    borrowing_kernel,
+    inline_borrowing_kernel,
+    inner_borrowing_kernel,
+    inner_kernel,
+    kernel,
+)
+from aqualvs.geometry.linear_algebra import sum_of, where
 from aqualvs.geometry.planes import Plane
 from aqualvs.scanning.candidates import Subsegments
 from aqualvs.scanning.net_surfaces import (
@@ -59,7 +65,7 @@ def _cell(coordinate: float) -> int:
     return (int(max(coordinate, 0.0)) * _SIXTH >> _SIXTH_BITS) + 1
 
 
-@kernel
+@inner_kernel
 def number_cells(pixels: FloatArray, cell: IntArray) -> tuple[int, int]:
     """Write the number of the cell in which each of N candidates lies.
 
@@ -95,7 +101,7 @@ def mark_cells(middle: int, n_columns: int, lit: U8Array) -> None:
     lit[middle] = _MIDDLE
 
 
-@kernel
+@inner_kernel
 def lit_cells(cell: IntArray, explained: BoolArray, n_cells: int, n_columns: int) -> U8Array:
     """Mark the cells in and around which explained candidates lie, with nonzero values.
 
@@ -160,25 +166,28 @@ def search_surfaces(
         Written: search lines, light and sampling weight of each. Light and weight of the best laser
         count up to three times those of the second.
     """
-    free = np.ones(laser.shape[0], np.bool_)
+    free = np.empty(laser.shape[0], np.bool_)
+    for c in range(laser.shape[0]):
+        free[c] = True
     cell = np.empty(pixels.shape[0], np.int64)
     n_cells, n_columns = 0, 0
     min_lines = 30
     enough = float(min_lines)
-    by_laser = np.empty((3, n_lasers))
     min_subsegments = 6
     # Planes through noise hold up to a hundredth of the light in the frame, all candidates counted.
     min_share = 0.03
     for found in range(MAX_SURFACES):
-        rows = np.flatnonzero(free)
-        if sum_of(n_lines[rows]) < enough or rows.shape[0] < min_subsegments:
+        rows, left = where(free), 0
+        for k in range(rows.shape[0]):
+            left += n_lines[rows[k]]
+        if left < enough or rows.shape[0] < min_subsegments:
             return found
         if not _find_plane(table, laser, rows, n_lasers, nearest, farthest, found, planes[found]):
             return found
-        by_laser[:] = 0.0
-        mine = members[found]
+        mine, by_laser, supporting = members[found], np.zeros((3, n_lasers)), 0
         n = _collect(table, rows, planes[found], n_lines, intensity_weight, laser, mine, by_laser)
-        supporting = np.count_nonzero(by_laser[LINES] >= MIN_LINES_PER_LASER)
+        for i in range(n_lasers):
+            supporting += by_laser[LINES, i] >= MIN_LINES_PER_LASER
         sums[found, LINES] = sum_of(by_laser[LINES])
         if n < min_subsegments or supporting < 2 or sums[found, LINES] < min_lines:
             return found
@@ -193,7 +202,7 @@ def search_surfaces(
     return MAX_SURFACES
 
 
-@kernel
+@inner_kernel
 def _find_plane(
     table: FloatArray,
     laser: IntArray,
@@ -219,7 +228,7 @@ def _find_plane(
     return search_plane(some, its_laser, start, nearest, farthest, seed, plane)
 
 
-@borrowing_kernel
+@inner_borrowing_kernel
 def _collect(
     table: FloatArray,
     rows: IntArray,
@@ -291,7 +300,7 @@ def on_two(weight: FloatArray) -> float:
     return min(total, total - first + MAX_TO_SECOND * second)
 
 
-@kernel
+@inner_kernel
 def _claim_peaks(
     subsegment_index: IntArray,
     cell: IntArray,

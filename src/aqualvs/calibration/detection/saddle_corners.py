@@ -19,7 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray
-from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel, kernel
+from aqualvs.geometry.compiled import (
+    borrowing_kernel,
+    inline_borrowing_kernel,
+    inner_borrowing_kernel,
+    kernel,
+)
 from aqualvs.geometry.linear_algebra import factorise, solve_factorised
 
 MIN_PIVOT = 1e-12
@@ -171,7 +176,7 @@ def _place_window(image: U8Array, unknowns: FloatArray, window: FloatArray) -> b
     return bool(window[_RADIUS] >= _FIT.min_radius_px)
 
 
-@borrowing_kernel
+@inner_borrowing_kernel
 def _descend(
     image: U8Array, window: FloatArray, matrices: FloatArray, vectors: FloatArray
 ) -> tuple[float, int]:
@@ -222,7 +227,7 @@ def _advance(best: FloatArray, step: FloatArray, tried: FloatArray) -> None:
     tried[4] = min(max(log_blur, math.log(_FIT.blur_px[0])), math.log(_FIT.blur_px[1]))
 
 
-@borrowing_kernel
+@inner_borrowing_kernel
 def _first_tones(image: U8Array, window: FloatArray, unknowns: FloatArray) -> None:
     """Write level and contrast from the means of the two kinds of quadrants."""
     radius = window[_RADIUS]
@@ -244,7 +249,7 @@ def _first_tones(image: U8Array, window: FloatArray, unknowns: FloatArray) -> No
     unknowns[7], unknowns[8] = 0.0, 0.0
 
 
-@borrowing_kernel
+@inner_borrowing_kernel
 def _sums(
     image: U8Array,
     window: FloatArray,

@@ -26,7 +26,12 @@ from numpy.typing import NDArray
 from aqualvs.calibration.detection.saddle_corners import MIN_PIVOT, GreyImage, blurred_edge
 from aqualvs.calibration.targets.targets import aruco_dictionary
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel, kernel
+from aqualvs.geometry.compiled import (
+    inline_borrowing_kernel,
+    inner_borrowing_kernel,
+    inner_kernel,
+    kernel,
+)
 from aqualvs.geometry.linear_algebra import factorise, inverse_of, solve_factorised
 
 U8Array = NDArray[np.uint8]
@@ -206,7 +211,7 @@ def _pixel_to_marker(unknowns: FloatArray, x: float, y: float) -> tuple[float, f
     return q_0, q_1
 
 
-@kernel
+@inner_kernel
 def tag_sums(
     image: U8Array,
     corner: FloatArray,
@@ -255,7 +260,7 @@ def tag_sums(
     )
 
 
-@borrowing_kernel
+@inner_borrowing_kernel
 def _sums(
     image: U8Array,
     corner: FloatArray,
@@ -393,7 +398,7 @@ def descend(
     return True
 
 
-@kernel
+@inner_kernel
 def _add_prior(
     prior: FloatArray, unknowns: FloatArray, normal: FloatArray, gradient: FloatArray
 ) -> float:
@@ -406,7 +411,7 @@ def _add_prior(
     return squares
 
 
-@kernel
+@inner_kernel
 def _shorten(step: FloatArray, unknowns: FloatArray) -> None:
     """Limit the shift of the marker's points and the change of the blur."""
     side = np.sqrt(abs(unknowns[2] * unknowns[5] - unknowns[3] * unknowns[4])) + 1e-9

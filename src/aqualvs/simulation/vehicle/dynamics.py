@@ -22,7 +22,11 @@ from typing import NamedTuple
 import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray
-from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel
+from aqualvs.geometry.compiled import (
+    borrowing_kernel,
+    inline_borrowing_kernel,
+    inner_borrowing_kernel,
+)
 from aqualvs.geometry.linear_algebra import Vec, cross, minus
 from aqualvs.simulation.vehicle.models import DOWN, FORWARD, PITCH, RIGHT, ROLL, YAW, VehicleModel
 from aqualvs.simulation.vehicle.water_motion import Flow, orbit_at, stream_at, tether_force
@@ -223,7 +227,7 @@ def advance(
         thrusts[k] = wanted[k] + (thrusts[k] - wanted[k]) * half * half
 
 
-@borrowing_kernel
+@inner_borrowing_kernel
 def coast(
     y: FloatArray,
     thrusts: FloatArray,
