@@ -1,9 +1,8 @@
-"""The camera: pixels to rays in the outer medium, points to pixels, and every derivative.
+"""The camera: pixels to rays in the outer medium, points to pixels with derivatives.
 
 The cameras share one set of numbers: `parameter_names` gives their order in every parameter
 Jacobian, `moved_by` adds a small step to them, and `camera_params` checks them and packs them for
-kernels. For kernels of other modules `trace_pixel(camera.params, u, v)` and
-`project_point(camera.params, x, y, z)` are scalar compiled functions to call inside a `@kernel`.
+kernels. A scan projects no points, so the kernels of the projection are imported when it is used.
 """
 
 from collections.abc import Sequence
@@ -17,19 +16,10 @@ from aqualvs.errors import RigError
 from aqualvs.geometry.arrays import BoolArray, FloatArray, as_vectors
 from aqualvs.geometry.planes import Rays
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
-from aqualvs.optics.camera_kernels import (
-    CameraParams,
-    project_all,
-    project_jacobian_all,
-    project_point,
-    rays_all,
-    rays_jacobian_all,
-    trace_pixel,
-)
+from aqualvs.optics.camera_kernels import BareParams, CameraParams, rays_all
 from aqualvs.optics.dome import DOME_PARAMETERS, Dome
 from aqualvs.optics.flat_port import FLAT_PARAMETERS, FlatPort
 from aqualvs.optics.lens import Lens
-from aqualvs.optics.port_kernels import BareParams
 from aqualvs.optics.refraction import as_triple, check_index
 
 POSE_PARAMETERS = ("lens_x", "lens_y", "lens_z", "rotation_x", "rotation_y", "rotation_z")
@@ -157,8 +147,6 @@ __all__ = [
     "HousedCamera",
     "Housing",
     "parameter_names",
-    "project_point",
-    "trace_pixel",
 ]
 
 
@@ -184,25 +172,8 @@ class Camera(Protocol):
     def rays(self, pixels: ArrayLike) -> Rays:
         """Return the rays in `dome` that pixels (..., 2) see."""
 
-    def rays_into(
-        self,
-        pixels: FloatArray,
-        out_origins: FloatArray,
-        out_directions: FloatArray,
-        out_valid: BoolArray,
-    ) -> None:
-        """Write the rays of pixels (N, 2) into (N, 3), (N, 3) and (N) without allocation."""
-
-    def rays_with_jacobian(self, pixels: ArrayLike) -> tuple[Rays, FloatArray, FloatArray]:
-        """Return the rays and the derivatives (..., 3, 2) of origins and directions."""
-
     def project(self, points_in_dome: ArrayLike) -> tuple[FloatArray, BoolArray]:
         """Return pixels (..., 2) of points (..., 3) and whether they can be seen."""
-
-    def project_into(
-        self, points_in_dome: FloatArray, out_pixels: FloatArray, out_valid: BoolArray
-    ) -> None:
-        """Write the pixels of points (N, 3) into (N, 2) and (N) without allocation."""
 
     def project_with_jacobian(
         self, points_in_dome: ArrayLike
@@ -268,41 +239,6 @@ class _CompiledCamera:
         )
         return Rays(origins, directions, valid)
 
-    def rays_into(
-        self,
-        pixels: FloatArray,
-        out_origins: FloatArray,
-        out_directions: FloatArray,
-        out_valid: BoolArray,
-    ) -> None:
-        """Write the rays of pixels (N, 2) into arrays of shape (N, 3), (N, 3) and (N).
-
-        All float64 (bool for `out_valid`) and C-contiguous; nothing is allocated.
-        """
-        rays_all(self.params, pixels, out_origins, out_directions, out_valid)
-
-    def rays_with_jacobian(self, pixels: ArrayLike) -> tuple[Rays, FloatArray, FloatArray]:
-        """Trace pixels into the outer medium, with derivatives.
-
-        Returns
-        -------
-        rays : Rays
-            As `rays` gives them.
-        origin_jacobian, direction_jacobian : array, shape (..., 3, 2)
-            d origin / d pixel (metres per pixel) and d direction / d pixel; NaN where not valid.
-        """
-        p = as_vectors(pixels, 2, "pixels")
-        rays = self.rays(p)
-        by_origin, by_direction = np.empty((*p.shape[:-1], 3, 2)), np.empty((*p.shape[:-1], 3, 2))
-        rays_jacobian_all(
-            self.params,
-            p.reshape(-1, 2),
-            rays.valid.reshape(-1),
-            by_origin.reshape(-1, 3, 2),
-            by_direction.reshape(-1, 3, 2),
-        )
-        return rays, by_origin, by_direction
-
     def project(self, points_in_dome: ArrayLike) -> tuple[FloatArray, BoolArray]:
         """Project points of the outer medium.
 
@@ -322,17 +258,10 @@ class _CompiledCamera:
         p = as_vectors(points_in_dome, 3, "points_in_dome")
         pixels = np.empty((*p.shape[:-1], 2))
         valid = np.empty(p.shape[:-1], dtype=np.bool_)
-        self.project_into(p.reshape(-1, 3), pixels.reshape(-1, 2), valid.reshape(-1))
+        from aqualvs.optics.projection import project_all
+
+        project_all(self.params, p.reshape(-1, 3), pixels.reshape(-1, 2), valid.reshape(-1))
         return pixels, valid
-
-    def project_into(
-        self, points_in_dome: FloatArray, out_pixels: FloatArray, out_valid: BoolArray
-    ) -> None:
-        """Write the pixels of points (N, 3) into arrays of shape (N, 2) and (N).
-
-        All float64 (bool for `out_valid`) and C-contiguous; nothing is allocated.
-        """
-        project_all(self.params, points_in_dome, out_pixels, out_valid)
 
     def project_with_jacobian(
         self, points_in_dome: ArrayLike
@@ -373,6 +302,8 @@ class _CompiledCamera:
         shape = points.shape[:-1]
         pixels, valid = np.empty((*shape, 2)), np.empty(shape, dtype=np.bool_)
         by_point = np.empty((*shape, 2, 3))
+        from aqualvs.optics.projection import project_jacobian_all
+
         project_jacobian_all(
             self.params,
             points.reshape(-1, 3),

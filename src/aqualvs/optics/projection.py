@@ -1,93 +1,49 @@
-"""What refracts between a camera and the outer medium: nothing, a dome or a flat port.
+"""Points of the outer medium to pixels, and the derivatives by the point and by the camera.
 
-A port is a named tuple of numbers (`BareParams`, `DomeParams`, `FlatParams`) and six functions on
-it, one for each name that `chosen_by_class` defines here; kernels are compiled for the class of
-port that they are called with. Functions of blocks work on a scratch array whose rows are named
-here, `BLOCK` lanes long.
+Functions of blocks work on a scratch array whose rows are named here, `BLOCK` lanes long. What
+differs between a bare camera, a dome and a flat port is chosen by the class of the camera's `port`
+when a kernel is compiled. Every batch kernel writes NaN wherever it writes False into `valid`.
 """
 
 import math
-from typing import NamedTuple
 
-from aqualvs.geometry.arrays import FloatArray
-from aqualvs.geometry.compiled import chosen_by_class, inline_kernel
-from aqualvs.optics.dome import (
+import numpy as np
+
+from aqualvs.geometry.arrays import BoolArray, FloatArray
+from aqualvs.geometry.compiled import chosen_by_class, inline_kernel, kernel
+from aqualvs.optics.camera_kernels import BareParams, CameraParams, dome_from_cam
+from aqualvs.optics.dome import DomeParams
+from aqualvs.optics.flat_port import FLAT_PARAMETERS, FlatParams
+from aqualvs.optics.lens import BLOCK
+from aqualvs.optics.lens_kernels import Vector
+from aqualvs.optics.lens_projection import (
+    fisheye_pixel,
+    fisheye_pixel_jacobian,
+    opencv_pixel,
+    opencv_pixel_jacobian,
+    write_intrinsics_jacobian,
+)
+from aqualvs.optics.port_projection import (
     ROUNDS,
-    DomeParams,
     across_axis,
     back_derivative,
     blend,
     cross,
-    direction_to_point,
     dot,
+    flat_derivative,
+    height_and_reach,
+    is_in_front,
     is_outside,
     paraxial_start,
     perpendicular,
     polar_angle,
     solve_guarded,
     surfaces_at,
-    three_steps,
-    trace_direction,
-    trace_tangent,
-)
-from aqualvs.optics.flat_port import (
-    FLAT_PARAMETERS,
-    FlatParams,
-    flat_derivative,
-    height_and_reach,
-    is_in_front,
     tangent_guarded,
     tangent_start,
+    three_steps,
     three_tangent_steps,
-    trace_flat,
-    trace_flat_tangent,
 )
-from aqualvs.optics.lens import BLOCK
-from aqualvs.optics.lens_kernels import Vector
-
-
-class BareParams(NamedTuple):
-    """A lens in the outer medium itself, as kernels take it.
-
-    Attributes
-    ----------
-    centre : tuple of 3 float
-        The lens position L in `dome`, metres.
-    """
-
-    centre: Vector
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the parameters."""
-        return ()
-
-
-@inline_kernel
-def _trace_bare(
-    port: BareParams, dx: float, dy: float, dz: float
-) -> tuple[bool, float, float, float, float, float, float]:
-    ox, oy, oz = port.centre
-    return True, ox, oy, oz, dx, dy, dz
-
-
-@inline_kernel
-def _trace_bare_tangent(
-    _port: BareParams, _direction: Vector, direction_dot: Vector
-) -> tuple[Vector, Vector]:
-    return (0.0, 0.0, 0.0), direction_dot
-
-
-trace_port = chosen_by_class(
-    {BareParams: _trace_bare, DomeParams: trace_direction, FlatParams: trace_flat}
-)
-"""`trace_port(port, dx, dy, dz)`: a unit direction at the lens as the ray in the outer medium, see
-`trace_direction`."""
-trace_port_tangent = chosen_by_class(
-    {BareParams: _trace_bare_tangent, DomeParams: trace_tangent, FlatParams: trace_flat_tangent}
-)
-"""`trace_port_tangent(port, direction, direction_dot)`: its derivative."""
-
 
 # Rows of the scratch array: the point, which becomes the direction at the lens, then the pixel;
 # its polar coordinates (distance inverted), or, of a flat port, its height above the outer face
@@ -95,34 +51,6 @@ trace_port_tangent = chosen_by_class(
 # where valid.
 PX, PY, PZ, FAR, COS_T, SIN_T, EX, EY, EZ, COS_A, SIN_A, OK = (i_row * BLOCK for i_row in range(12))
 N_POINT_ROWS = 12
-
-
-@inline_kernel
-def _aim_bare(port: BareParams, x: float, y: float, z: float) -> tuple[bool, float, float, float]:
-    c = port.centre
-    return True, x - c[0], y - c[1], z - c[2]
-
-
-@inline_kernel
-def _aim_flat(port: FlatParams, x: float, y: float, z: float) -> tuple[bool, float, float, float]:
-    height, rho, e = height_and_reach(port, x, y, z)
-    t, solved = three_tangent_steps(port, height, rho, tangent_start(port, height, rho))
-    if not solved:
-        solved, t = tangent_guarded(port, height, rho)
-    m = port.normal
-    return (
-        solved and is_in_front(port, height),
-        m[0] + t * e[0],
-        m[1] + t * e[1],
-        m[2] + t * e[2],
-    )
-
-
-aim = chosen_by_class(
-    {BareParams: _aim_bare, DomeParams: direction_to_point, FlatParams: _aim_flat}
-)
-"""`aim(port, x, y, z)`: (valid, dx, dy, dz), a direction at the lens, of any length, whose ray
-meets the point."""
 
 
 @inline_kernel
@@ -366,3 +294,147 @@ turn_gradients_block = chosen_by_class(
     }
 )
 """`turn_gradients_block(port, w)`: the gradients by the camera's rotation, all lanes of a block."""
+
+
+@inline_kernel
+def cam_from_dome(camera: CameraParams, x: float, y: float, z: float) -> Vector:
+    """Rotate a direction from `dome` to `cam`."""
+    r = camera.rotation
+    return (
+        r[0] * x + r[3] * y + r[6] * z,
+        r[1] * x + r[4] * y + r[7] * z,
+        r[2] * x + r[5] * y + r[8] * z,
+    )
+
+
+@inline_kernel
+def load_points(points: FloatArray, start: int, count: int, w: FloatArray) -> None:
+    """Write `count` points from row `start` into the scratch `w`."""
+    for j in range(count):
+        w[PX + j] = points[start + j, 0]
+        w[PY + j] = points[start + j, 1]
+        w[PZ + j] = points[start + j, 2]
+
+
+@inline_kernel
+def see_block(camera: CameraParams, count: int, w: FloatArray) -> None:
+    """Turn directions in `dome` into pixels, all lanes of a block."""
+    for j in range(BLOCK):
+        x, y, z = cam_from_dome(camera, w[PX + j], w[PY + j], w[PZ + j])
+        w[PX + j], w[PY + j], w[PZ + j] = x, y, z
+    if camera.lens.fisheye:
+        for j in range(count):
+            seen, u, v = fisheye_pixel(camera.lens, w[PX + j], w[PY + j], w[PZ + j])
+            w[PX + j], w[PY + j] = u, v
+            w[OK + j] = w[OK + j] if seen else -1.0
+        return
+    for j in range(BLOCK):
+        seen, u, v = opencv_pixel(camera.lens, w[PX + j], w[PY + j], w[PZ + j])
+        w[PX + j], w[PY + j] = u, v
+        w[OK + j] = w[OK + j] if seen else -1.0
+
+
+@kernel
+def project_all(
+    camera: CameraParams, points: FloatArray, pixels: FloatArray, valid: BoolArray
+) -> None:
+    """Write pixels (N, 2) of points (N, 3)."""
+    w = np.zeros(N_POINT_ROWS * BLOCK)
+    for start in range(0, points.shape[0], BLOCK):
+        count = min(BLOCK, points.shape[0] - start)
+        load_points(points, start, count, w)
+        aim_block(camera.port, count, w)
+        see_block(camera, count, w)
+        for j in range(count):
+            ok = w[OK + j] > 0.0
+            valid[start + j] = ok
+            pixels[start + j, 0] = w[PX + j] if ok else np.nan
+            pixels[start + j, 1] = w[PY + j] if ok else np.nan
+
+
+@inline_kernel
+def _see_lane(
+    camera: CameraParams,
+    w: FloatArray,
+    j: int,
+    seen: tuple[bool, float, float, Vector, Vector],
+) -> None:
+    """Write the pixel and its gradients into lane j."""
+    ok, w[U + j], w[V + j], u_d, v_d = seen
+    w[GUX + j], w[GUY + j], w[GUZ + j] = dome_from_cam(camera, u_d[0], u_d[1], u_d[2])
+    w[GVX + j], w[GVY + j], w[GVZ + j] = dome_from_cam(camera, v_d[0], v_d[1], v_d[2])
+    w[OK + j] = w[OK + j] if ok else -1.0
+
+
+@inline_kernel
+def see_jacobian_block(camera: CameraParams, count: int, w: FloatArray) -> None:
+    """Turn directions in `dome` into pixels and their gradients, all lanes of a block."""
+    lens = camera.lens
+    for j in range(BLOCK):
+        x, y, z = cam_from_dome(camera, w[PX + j], w[PY + j], w[PZ + j])
+        w[CX + j], w[CY + j], w[CZ + j] = x, y, z
+    if lens.fisheye:
+        for j in range(count):
+            seen = fisheye_pixel_jacobian(lens, w[CX + j], w[CY + j], w[CZ + j])
+            _see_lane(camera, w, j, seen)
+        return
+    for j in range(BLOCK):
+        seen = opencv_pixel_jacobian(lens, w[CX + j], w[CY + j], w[CZ + j])
+        _see_lane(camera, w, j, seen)
+
+
+@inline_kernel
+def store_parameters(
+    camera: CameraParams,
+    n_before: int,
+    start: int,
+    count: int,
+    w: FloatArray,
+    jacobian: FloatArray,
+) -> None:
+    """Write `count` parameter Jacobians from the scratch `w` to the rows from `start`."""
+    for j in range(count):
+        if w[OK + j] < 0.0:
+            jacobian[start + j] = np.nan
+            continue
+        write_intrinsics_jacobian(
+            camera.lens, w[CX + j], w[CY + j], w[CZ + j], jacobian[start + j, :, n_before:]
+        )
+        for k in range(n_before):
+            jacobian[start + j, 0, k] = w[JU + (3 + k) * BLOCK + j]
+            jacobian[start + j, 1, k] = w[JV + (3 + k) * BLOCK + j]
+
+
+@kernel
+def project_jacobian_all(
+    camera: CameraParams,
+    points: FloatArray,
+    pixels: FloatArray,
+    valid: BoolArray,
+    point_jacobian: FloatArray,
+    parameter_jacobian: FloatArray,
+    n_before: int,
+) -> None:
+    """Write pixels (N, 2) of points (N, 3), derivatives by the point and, if asked, the parameters.
+
+    `parameter_jacobian` has shape (N, 2, P) in the order of `camera.parameter_names`, of which
+    `n_before` stand before the intrinsics, or (0, 2, P) to leave it out.
+    """
+    w = np.zeros(N_ROWS * BLOCK)
+    for start in range(0, points.shape[0], BLOCK):
+        count = min(BLOCK, points.shape[0] - start)
+        load_points(points, start, count, w)
+        aim_block(camera.port, count, w)
+        see_jacobian_block(camera, count, w)
+        gradients_block(camera.port, w)
+        for j in range(count):
+            ok = w[OK + j] > 0.0
+            valid[start + j] = ok
+            pixels[start + j, 0] = w[U + j] if ok else np.nan
+            pixels[start + j, 1] = w[V + j] if ok else np.nan
+            for k in range(3):
+                point_jacobian[start + j, 0, k] = w[JU + k * BLOCK + j] if ok else np.nan
+                point_jacobian[start + j, 1, k] = w[JV + k * BLOCK + j] if ok else np.nan
+        if parameter_jacobian.shape[0] > 0:
+            turn_gradients_block(camera.port, w)
+            store_parameters(camera, n_before, start, count, w, parameter_jacobian)
