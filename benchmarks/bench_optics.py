@@ -12,8 +12,7 @@ import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
-from aqualvs.optics.camera import BareCamera, HousedCamera, parameter_names
-from aqualvs.optics.camera_kernels import rays_all
+from aqualvs.optics.camera import BareCamera, HousedCamera, parameter_names, rays_all
 from aqualvs.optics.dome import Dome
 from aqualvs.optics.lens import Lens
 from aqualvs.optics.projection import project_all

@@ -15,7 +15,7 @@ from benchmarks.bench_optics import CAMERA
 
 from aqualvs.demo import bundled_dive
 from aqualvs.geometry import Plane
-from aqualvs.optics.camera_kernels import rays_all
+from aqualvs.optics.camera import rays_all
 from aqualvs.optics.projection import project_all
 from aqualvs.optics.rigfile import load_rig
 from aqualvs.scanner import Scanner

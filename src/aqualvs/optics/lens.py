@@ -1,7 +1,7 @@
 """The lens: pixels to directions in `cam` and back, with OpenCV's two distortion models.
 
 The batch kernels behind `Lens` write into arrays that they are given, and NaN wherever they write
-False into `valid`; those of the way back are in `aqualvs.optics.lens_projection`. The hot kernels
+False into `valid`; those of the way back are in `aqualvs.optics.projection`. The hot kernels
 work in blocks: rows of coordinates are copied into one flat scratch array, each quantity in a row
 of its own, and loops of constant length without branches run over it. One array and constant
 offsets let LLVM prove that nothing overlaps and use vector instructions; operations that need a
@@ -218,7 +218,7 @@ class Lens:
         """
         d = as_vectors(directions_in_cam, 3, "directions_in_cam")
         pixels, valid = _empty(d, 2), np.empty(d.shape[:-1], dtype=np.bool_)
-        from aqualvs.optics.lens_projection import pixels_all
+        from aqualvs.optics.projection import pixels_all
 
         pixels_all(self.params, d.reshape(-1, 3), pixels.reshape(-1, 2), valid.reshape(-1))
         return pixels, valid
@@ -230,7 +230,7 @@ class Lens:
         d = as_vectors(directions_in_cam, 3, "directions_in_cam")
         pixels, valid = _empty(d, 2), np.empty(d.shape[:-1], dtype=np.bool_)
         jacobian = _empty(d, 2, 3)
-        from aqualvs.optics.lens_projection import pixels_jacobian_all
+        from aqualvs.optics.projection import pixels_jacobian_all
 
         pixels_jacobian_all(
             self.params,
@@ -257,7 +257,7 @@ class Lens:
         pixels, valid, jacobian = self.pixels_with_jacobian(d)
         n_parameters = 4 + len(self.distortion)
         by_parameter = _empty(d, 2, n_parameters)
-        from aqualvs.optics.lens_projection import intrinsics_jacobian_all
+        from aqualvs.optics.projection import intrinsics_jacobian_all
 
         intrinsics_jacobian_all(
             self.params,

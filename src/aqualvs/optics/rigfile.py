@@ -50,10 +50,6 @@ def keep_dated(path: Path, now: datetime | None = None) -> Path:
     now : datetime, optional
         With a time zone; the current time if left out.
 
-    Returns
-    -------
-    copy : Path
-
     Raises
     ------
     OutputError

@@ -6,8 +6,7 @@ import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel, kernel
-from aqualvs.optics.camera import Camera, CameraParams
-from aqualvs.optics.camera_kernels import rays_all
+from aqualvs.optics.camera import Camera, CameraParams, rays_all
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.sheet import START, WINDOWED, meet_sheet, packed_sheets
 
