@@ -264,10 +264,6 @@ class CdrWriter:
 class CdrReader:
     """Reader of a CDR message, field by field in their order.
 
-    Parameters
-    ----------
-    content : bytes
-
     Raises
     ------
     ValueError
