@@ -19,8 +19,8 @@ from aqualvs.geometry.arrays import BoolArray, FloatArray, as_vectors
 from aqualvs.geometry.compiled import chosen_by_class, inline_kernel, kernel
 from aqualvs.geometry.planes import Rays
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
-from aqualvs.optics.dome import DOME_PARAMETERS, Dome, DomeParams, trace_direction
-from aqualvs.optics.flat_port import FLAT_PARAMETERS, FlatParams, FlatPort, trace_flat
+from aqualvs.optics.dome import Dome, DomeParams, trace_direction
+from aqualvs.optics.flat_port import FlatParams, FlatPort, trace_flat
 from aqualvs.optics.lens import (
     BLOCK,
     DX,
@@ -270,21 +270,6 @@ def _checked_pose(pose: SE3) -> tuple[FloatArray, FloatArray]:
             "matrix with determinant 1"
         )
     return rotation, centre
-
-
-__all__ = [
-    "DOME_PARAMETERS",
-    "FLAT_PARAMETERS",
-    "POSE_PARAMETERS",
-    "BareCamera",
-    "Camera",
-    "CameraParams",
-    "Dome",
-    "FlatPort",
-    "HousedCamera",
-    "Housing",
-    "parameter_names",
-]
 
 
 class Camera(Protocol):

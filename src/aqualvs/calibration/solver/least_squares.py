@@ -300,16 +300,6 @@ def _weighted_median(values: FloatArray, weights: FloatArray) -> float:
     return float(np.interp(0.5 * heaped[-1], heaped - 0.5 * weights[order], values[order]))
 
 
-__all__ = [
-    "Block",
-    "FreeParameterError",
-    "Problem",
-    "Solution",
-    "inverse",
-    "solve",
-]
-
-
 class _DescentOptions(NamedTuple):
     """Damping of the steps (Levenberg-Marquardt), and convergence."""
 
