@@ -12,11 +12,11 @@ import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
-from aqualvs.optics.camera import BareCamera, HousedCamera, parameter_names
-from aqualvs.optics.camera_kernels import trace_all
+from aqualvs.optics.camera import BareCamera, HousedCamera, parameter_names, rays_all
 from aqualvs.optics.dome import Dome
 from aqualvs.optics.flat_port import FlatPort
 from aqualvs.optics.lens import Lens
+from aqualvs.optics.projection import project_all
 
 SIZE_PX = (720, 576)
 LENS = Lens(
@@ -237,8 +237,7 @@ def run(quick: bool = False) -> list[dict[str, Any]]:
     origins, directions = np.empty((n, 3)), np.empty((n, 3))
     valid = np.empty(n, dtype=np.bool_)
     back = np.empty((n, 2))
-    at_lens = POSE.rotate(LENS.directions(pixels)[0])
-    CAMERA.rays_into(pixels, origins, directions, valid)
+    rays_all(CAMERA.params, pixels, origins, directions, valid)
     points = origins + DISTANCE * directions
     few = points[:: n // N_JACOBIANS]
     bare_valid = np.empty(n, dtype=np.bool_)
@@ -260,14 +259,8 @@ def run(quick: bool = False) -> list[dict[str, Any]]:
         row(
             "pixel to ray, 5 coefficients",
             n,
-            lambda: CAMERA.rays_into(pixels, *ray_out),
+            lambda: rays_all(CAMERA.params, pixels, *ray_out),
             lambda: numpy_rays(pixels),
-        ),
-        row(
-            "direction to ray",
-            n,
-            lambda: trace_all(CAMERA.params, at_lens, *ray_out),
-            lambda: numpy_trace(at_lens),
         ),
         row(
             "pixel to direction, 5 coefficients",
@@ -278,13 +271,13 @@ def run(quick: bool = False) -> list[dict[str, Any]]:
         row(
             "point to pixel, 5 coefficients",
             n,
-            lambda: CAMERA.project_into(points, back, valid),
+            lambda: project_all(CAMERA.params, points, back, valid),
             lambda: numpy_project(points),
         ),
         row(
             "point to pixel, bare lens",
             n,
-            lambda: BARE.project_into(points, back, bare_valid),
+            lambda: project_all(BARE.params, points, back, bare_valid),
             lambda: numpy_project_bare(points),
         ),
         row(

@@ -15,6 +15,8 @@ from benchmarks.bench_optics import CAMERA
 
 from aqualvs.demo import bundled_dive
 from aqualvs.geometry import Plane
+from aqualvs.optics.camera import rays_all
+from aqualvs.optics.projection import project_all
 from aqualvs.optics.rigfile import load_rig
 from aqualvs.scanner import Scanner
 from aqualvs.scanning.paper.mesh_filter import mesh_filter
@@ -41,14 +43,16 @@ def rays() -> Pair:
     pixels = np.stack([x.ravel(), y.ravel()], axis=-1)
     n = len(pixels)
     out = np.empty((n, 3)), np.empty((n, 3)), np.empty(n, np.bool_)
-    return lambda: CAMERA.rays_into(pixels, *out), lambda: bench_optics.numpy_rays(pixels)
+    return lambda: rays_all(CAMERA.params, pixels, *out), lambda: bench_optics.numpy_rays(pixels)
 
 
 def projection() -> Pair:
     x, y = np.meshgrid(np.linspace(-0.3, 0.3, 180), np.linspace(-0.25, 0.25, 144))
     points = np.stack([x.ravel(), np.full(x.size, 0.6), y.ravel()], axis=-1)
     out = np.empty((len(points), 2)), np.empty(len(points), np.bool_)
-    return lambda: CAMERA.project_into(points, *out), lambda: bench_optics.numpy_project(points)
+    return lambda: project_all(CAMERA.params, points, *out), lambda: bench_optics.numpy_project(
+        points
+    )
 
 
 def mesh() -> Pair:

@@ -1,4 +1,4 @@
-"""The one exception tree.
+"""The exception tree of the package.
 
 ::
 

@@ -1,6 +1,6 @@
 """The command `aqualvs run`: from a dive to posture, points and report.
 
-`run` is the whole way; `open_dive` and `summary_for` are shared with `aqualvs batch`.
+`run` does all of it; `open_dive` and `summary_for` are shared with `aqualvs batch`.
 """
 
 import time
@@ -180,7 +180,7 @@ class OpenDive(Closing):
         return isinstance(self.source, Replay)
 
     def scanner(self, scanner_for: ScannerFor = Scanner) -> FrameScanner:
-        """Return what measures the frames: the recording itself, or a scanner.
+        """Return the scanner of the frames, which is the source itself if it is a recording.
 
         Raises
         ------
@@ -233,10 +233,10 @@ def open_dive(request: RunRequest) -> OpenDive:
 
 
 def summary_for(dive: OpenDive) -> RunSummary:
-    """Return an empty summary with the monitors that a run of the dive has.
+    """Return an empty summary with the checks that a run of the dive makes.
 
-    One laser agrees with itself; and where refraction at the dome is left out, the lasers disagree
-    for that reason alone.
+    The agreement of the lasers is not checked for one laser, nor without refraction at the dome,
+    which alone makes lasers disagree.
 
     Raises
     ------
@@ -258,7 +258,7 @@ def summary_for(dive: OpenDive) -> RunSummary:
 
 
 def _shutter_warnings(dive: OpenDive) -> list[str]:
-    """Return a warning if the pictures of a file are interlaced and the rig is not, or reverse."""
+    """Return a warning if pictures and rig contradict each other in whether they are interlaced."""
     path, pictures = Path(dive.request.source), source_of_pictures(dive.source)
     if isinstance(pictures, VideoSource):
         # A stream cannot be read twice.
@@ -274,7 +274,7 @@ def _shutter_warnings(dive: OpenDive) -> list[str]:
 
 
 def _shared_work(dive: OpenDive, scanner_for: ScannerFor) -> PoolJob | None:
-    """Return how processes can share the dive; None where one process must measure all of it."""
+    """Return the job for a pool of processes; None if one process must measure the whole dive."""
     request = dive.request
     shows_pictures = request.overlay or request.rerun is not None
     alone = shows_pictures or request.mcap or request.index_target is not None

@@ -206,11 +206,6 @@ def _sample(
 class RunRerun(Closing):
     """Writer of a file of Rerun during a run, or of nothing; a context manager.
 
-    Parameters
-    ----------
-    path : Path or None
-    rig : Rig
-
     Raises
     ------
     OutputError
@@ -324,11 +319,6 @@ class RunOverlay(Closing):
 class RunBareLens(Closing):
     """Writer of `posture_bare.csv` during a run; of nothing for a rig without a housing.
 
-    Parameters
-    ----------
-    folder : Path
-    rig : Rig
-
     Raises
     ------
     OutputError
@@ -372,17 +362,7 @@ class RunBareLens(Closing):
 
 
 class RunWriters:
-    """The folder's files, the overlay, the recording and the state of the net, as one.
-
-    Parameters
-    ----------
-    outputs : RunOutputs
-    overlay : RunOverlay
-    bare_lens : RunBareLens
-    mcap : RunMcap
-    rerun : RunRerun
-    net : RunNet
-    """
+    """The folder's files, the overlay, the recording and the state of the net, as one."""
 
     def __init__(
         self,

@@ -1,7 +1,7 @@
 """The main path: a frame in, posture and points out."""
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -11,7 +11,13 @@ from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.rig_covariance import FittedSurface, PostureErrors, fitted_plane
 from aqualvs.optics.shutter import Field
-from aqualvs.scanning.assignment import NOT_TESTED, AssignmentTest, Verdict, inflate_for_rival
+from aqualvs.scanning.assignment import (
+    NOT_TESTED,
+    AssignmentOutcome,
+    AssignmentTest,
+    Verdict,
+    inflate_for_rival,
+)
 from aqualvs.scanning.candidates import Candidates, Subsegments, find_candidates
 from aqualvs.scanning.detection import DetectorOptions, FrameDetector
 from aqualvs.scanning.labels import label_candidates
@@ -19,7 +25,6 @@ from aqualvs.scanning.laser_bands import LaserBand, SearchAxis, plan_bands, sear
 from aqualvs.scanning.patch import Patch, fitted_patch
 from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.posture_estimator import MIN_LINES, FitMethod, Measurement, PostureEstimator
-from aqualvs.scanning.row_motion import RowMotion
 from aqualvs.scanning.scan import Frame, Scan, ScanPoints
 from aqualvs.scanning.stripe import StripeOptions, StripePeaks
 from aqualvs.scanning.surfaces import (
@@ -37,6 +42,7 @@ from aqualvs.scanning.triangulate import Triangulator
 if TYPE_CHECKING:
     from aqualvs.scanning.paper.detector import PaperFilter
     from aqualvs.scanning.paper.mesh_filter import MeshFilterOptions
+    from aqualvs.scanning.row_motion import RowMotion
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,6 +66,34 @@ class ScannerOptions:
     mesh_filter: "MeshFilterOptions | None" = None
     target: TargetKind = TargetKind.AUTO
     fit: FitMethod = FitMethod.ROBUST
+
+
+class _Stripes(NamedTuple):
+    """What a frame shows of the lasers, and the test of how its peaks are assigned to them."""
+
+    candidates: Candidates
+    subsegments: Subsegments
+    assignment: AssignmentTest
+
+
+class _Choice(NamedTuple):
+    """The target among the surfaces of a frame, and what speaks against it.
+
+    Attributes
+    ----------
+    surfaces : list of Surface
+        Of the requested kind.
+    target : Surface or None
+    before : Surface or None
+        A surface before the target that may be the net instead.
+    tested : AssignmentOutcome
+        Of the target's peaks, read as other lasers'.
+    """
+
+    surfaces: list[Surface]
+    target: Surface | None = None
+    before: Surface | None = None
+    tested: AssignmentOutcome = NOT_TESTED
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +136,7 @@ class Scanner:
         laser_bands = self._view(0).laser_bands
         self._posture_estimator = PostureEstimator(rig, laser_bands, self.options.fit)
         self._paper_filter = self._make_paper_filter(camera, laser_bands)
-        self._row_motion = RowMotion(rig) if rig.shutter.rolls else None
+        self._row_motion = self._make_row_motion()
         self._rig_errors = PostureErrors(rig, camera, completed_uncertainty(rig))
 
     def process(self, frame: Frame) -> Scan:
@@ -189,11 +223,19 @@ class Scanner:
         every_pixel = not isinstance(self.options.detector, StripeOptions)
         return PaperFilter(self.rig, camera, laser_bands, options, every_pixel=every_pixel)
 
+    def _make_row_motion(self) -> "RowMotion | None":
+        if not self.rig.shutter.rolls:
+            return None
+        # Only for rolling shutters.
+        from aqualvs.scanning.row_motion import RowMotion
+
+        return RowMotion(self.rig)
+
     def _estimate(
         self, candidates: Candidates, assignment: AssignmentTest
     ) -> tuple[Measurement, ScanPoints, IntArray]:
         """Return the posture, the labelled points, and the rows of their candidates."""
-        # Planes that several lasers agree on, and the one that is the target.
+        # Planes that several lasers agree on.
         subsegments = candidates.subsegments()
         surfaces = find_surfaces(
             subsegments,
@@ -202,61 +244,87 @@ class Scanner:
             search_range(self.rig.working_range),
             self.rig.focal_px,
         )
-        surfaces = as_requested_kind(surfaces, self.options.target)
-        surfaces, target, doubtful = self._chosen(candidates, subsegments, surfaces, assignment)
-        tested = NOT_TESTED
-        if target is not None:
-            # The same peaks, read as other lasers', may give a plane that is as good or better.
-            tested = assignment.test(candidates, subsegments, target)
-            if tested.verdict is Verdict.RIVAL and tested.other is not None:
-                surfaces = self._with_rival(surfaces, target, tested.other, subsegments)
-                surfaces, target, doubtful = self._chosen(
-                    candidates, subsegments, surfaces, assignment
-                )
-        # The posture from the target's points outside crossing zones.
-        if target is None:
-            found = _refuse_no_target(candidates, surfaces, self.options.target)
-        elif doubtful is not None:
-            found = _refuse_ambiguous(candidates, target.plane, doubtful.plane)
-        elif assignment.is_by_chance(candidates, subsegments, surfaces, target):
-            found = _refuse_chance_plane(candidates)
-        elif tested.verdict is Verdict.AMBIGUOUS and tested.other is not None:
-            found = _refuse_ambiguous(candidates, target.plane, tested.other)
-        elif self.options.target is TargetKind.AUTO and assignment.may_hide_net(
-            candidates, subsegments, surfaces, target
-        ):
-            found = _refuse_hidden_net(candidates, target.plane)
-        else:
-            found = self._measured(candidates, subsegments, target)
-            found = inflate_for_rival(found, tested)
-            # The mean plane of folds covers all of a net's light, nearer parts included.
-            other = None if found.folded else assignment.nearer_net(subsegments, surfaces, target)
-            if other is not None and found.posture:
-                found = _refuse_ambiguous(candidates, target.plane, other.plane)
+        # The one that is the target, and the posture from its points outside crossing zones.
+        stripes = _Stripes(candidates, subsegments, assignment)
+        choice = self._choose(stripes, surfaces)
+        found = self._measured(stripes, choice)
+        # What every point lies on.
         points, listed = label_candidates(
-            candidates, subsegments, surfaces, target, found, self.rig.working_range
+            candidates,
+            subsegments,
+            choice.surfaces,
+            choice.target,
+            found,
+            self.rig.working_range,
         )
         return found, points, listed
 
-    def _chosen(
-        self,
-        candidates: Candidates,
-        subsegments: Subsegments,
-        surfaces: list[Surface],
-        assignment: AssignmentTest,
+    def _choose(self, stripes: _Stripes, surfaces: list[Surface]) -> _Choice:
+        """Choose the target among the surfaces of the requested kind."""
+        surfaces = as_requested_kind(surfaces, self.options.target)
+        surfaces, target, before = self._preferred(stripes, surfaces)
+        if target is None:
+            return _Choice(surfaces)
+        # The same peaks, read as other lasers', may give a plane that is as good or better.
+        candidates, subsegments, assignment = stripes
+        tested = assignment.test(candidates, subsegments, target)
+        if tested.verdict is Verdict.RIVAL and tested.other is not None:
+            surfaces = self._with_rival(surfaces, target, tested.other, subsegments)
+            surfaces, target, before = self._preferred(stripes, surfaces)
+        return _Choice(surfaces, target, before, tested)
+
+    def _preferred(
+        self, stripes: _Stripes, surfaces: list[Surface]
     ) -> tuple[list[Surface], Surface | None, Surface | None]:
         """Return the surfaces, the target, and a surface before it that may be the net instead."""
         kind = self.options.target
         target = choose_target(surfaces, kind, self.rig.working_range)
         if target is None or kind is not TargetKind.AUTO:
             return surfaces, target, None
+        candidates, subsegments, assignment = stripes
         before = assignment.overlooked(candidates, subsegments, surfaces, target)
         if before is None or not before.is_mesh:
             return surfaces, target, before
         surfaces = [before if one.members is before.members else one for one in surfaces]
         return surfaces, before, None
 
-    def _measured(
+    def _measured(self, stripes: _Stripes, choice: _Choice) -> Measurement:
+        """Return the posture to the target, or why there is none."""
+        candidates, subsegments, assignment = stripes
+        surfaces, target, _, tested = choice
+        if target is None:
+            return _refused(candidates, _no_target(candidates, surfaces, self.options.target))
+        doubt = self._doubt(stripes, choice, target)
+        if doubt is not None:
+            return _refused(candidates, doubt)
+        found = inflate_for_rival(self._posture(candidates, subsegments, target), tested)
+        # The mean plane of folds covers all of a net's light, nearer parts included.
+        nearer = None if found.folded else assignment.nearer_net(subsegments, surfaces, target)
+        if nearer is None or not found.posture:
+            return found
+        return _refused(candidates, _ambiguous(target.plane, nearer.plane))
+
+    def _doubt(self, stripes: _Stripes, choice: _Choice, target: Surface) -> Refusal | None:
+        """Return why a target is not to be trusted, None if it is."""
+        candidates, subsegments, assignment = stripes
+        if choice.before is not None:
+            return _ambiguous(target.plane, choice.before.plane)
+        if assignment.is_by_chance(candidates, subsegments, choice.surfaces, target):
+            detail = "the best plane is small, and lasers that should be seen on it are not"
+            return Refusal(Reason.NOT_A_PLANE, detail)
+        if choice.tested.verdict is Verdict.AMBIGUOUS and choice.tested.other is not None:
+            return _ambiguous(target.plane, choice.tested.other)
+        if self.options.target is TargetKind.AUTO and assignment.may_hide_net(
+            candidates, subsegments, choice.surfaces, target
+        ):
+            detail = (
+                f"much light before the surface at {target.plane.offset:.3f} m shares no plane, "
+                "such as that on a net in folds"
+            )
+            return Refusal(Reason.AMBIGUOUS, detail)
+        return None
+
+    def _posture(
         self, candidates: Candidates, subsegments: Subsegments, target: Surface
     ) -> Measurement:
         """Return the posture to the target, as the rows of the picture show it."""
@@ -312,38 +380,20 @@ def _on_mesh(paper_filter: "PaperFilter", points: ScanPoints) -> BoolArray:
     return paper_filter.apply(points.pixels, points.width, laser).peaks_on_mesh(len(points))
 
 
-def _refuse_chance_plane(candidates: Candidates) -> Measurement:
-    detail = "the best plane is small, and lasers that should be seen on it are not"
-    return Measurement(Refusal(Reason.NOT_A_PLANE, detail), np.zeros(len(candidates), np.bool_))
+def _refused(candidates: Candidates, refusal: Refusal) -> Measurement:
+    return Measurement(refusal, np.zeros(len(candidates), np.bool_))
 
 
-def _refuse_hidden_net(candidates: Candidates, plane: Plane) -> Measurement:
-    detail = (
-        f"much light before the surface at {plane.offset:.3f} m shares no plane, such as that on a "
-        "net in folds"
-    )
-    return Measurement(Refusal(Reason.AMBIGUOUS, detail), np.zeros(len(candidates), np.bool_))
-
-
-def _refuse_ambiguous(candidates: Candidates, one: Plane, other: Plane) -> Measurement:
+def _ambiguous(one: Plane, other: Plane) -> Refusal:
     apart = np.rad2deg(np.arccos(min(float(one.normal @ other.normal), 1.0)))
     detail = (
         f"planes at {one.offset:.3f} m and {other.offset:.3f} m, {apart:.1f} deg apart, explain "
         "the stripes about as well"
     )
-    return Measurement(Refusal(Reason.AMBIGUOUS, detail), np.zeros(len(candidates), np.bool_))
+    return Refusal(Reason.AMBIGUOUS, detail)
 
 
-def _refuse_no_target(
-    candidates: Candidates, surfaces: list[Surface], wanted: TargetKind
-) -> Measurement:
-    refusal = _no_target_reason(candidates, surfaces, wanted)
-    return Measurement(refusal, np.zeros(len(candidates), np.bool_))
-
-
-def _no_target_reason(
-    candidates: Candidates, surfaces: list[Surface], wanted: TargetKind
-) -> Refusal:
+def _no_target(candidates: Candidates, surfaces: list[Surface], wanted: TargetKind) -> Refusal:
     peaks, candidate, candidates_of = np.unique(
         candidates.source, return_index=True, return_counts=True
     )

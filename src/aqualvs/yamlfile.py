@@ -74,8 +74,6 @@ def _block(key: str, value: object) -> str:
     return text
 
 
-__all__ = ["MAX_BYTES", "MAX_DEPTH", "MAX_VALUES", "parse_yaml", "read_text", "read_yaml"]
-
 MAX_BYTES = 8_000_000
 """Size of a file; a list of 10,000 dives has about one million bytes."""
 MAX_DEPTH = 50
@@ -399,8 +397,6 @@ def _foreign(tag: str, line: int) -> _TextError:
 def _too_deep(line: int) -> _TextError:
     return _TextError(f"nested deeper than {MAX_DEPTH} levels", line, "remove levels")
 
-
-__all__ = ["carry_comments"]
 
 _BREAK = re.compile("\r\n|[\n\r\x85\u2028\u2029]")
 _COMMENT = re.compile("#[^\n\r\x85\u2028\u2029]*")

@@ -6,8 +6,9 @@ import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
-from aqualvs.optics.camera import BareCamera, FlatPort, HousedCamera
+from aqualvs.optics.camera import BareCamera, HousedCamera
 from aqualvs.optics.dome import Dome
+from aqualvs.optics.flat_port import FlatPort
 from aqualvs.optics.lens import Lens, LensModel
 
 SIZE_PX = (720, 576)

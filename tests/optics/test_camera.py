@@ -8,15 +8,11 @@ import numpy as np
 import pytest
 
 from aqualvs.errors import RigError
-from aqualvs.geometry.compiled import kernel
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
 from aqualvs.optics.camera import (
-    BareCamera,
     Camera,
     HousedCamera,
     parameter_names,
-    project_point,
-    trace_pixel,
 )
 from aqualvs.optics.dome import Dome
 from aqualvs.optics.flat_port import FlatPort
@@ -134,22 +130,6 @@ def points_in_view(camera: Camera, distance: float = 0.5) -> np.ndarray:
     return rays.points_at(np.linspace(0.02, 2.0 * distance, len(rays.origins)))
 
 
-def test_ray_jacobians_are_the_derivatives(camera: Camera) -> None:
-    pixels = image_grid(100.0)
-    rays, by_origin, by_direction = camera.rays_with_jacobian(pixels)
-    assert rays.valid.all()
-    np.testing.assert_array_equal(rays.origins, camera.rays(pixels).origins)
-    # Step: truncation (0.02 px / 300 px)^2 / 6, rounding 1e-16 / 0.02 against slopes of 1e-3.
-    step = 0.02
-    numeric = central_difference(lambda p: camera.rays(p).directions, pixels, step)
-    assert relative_error(by_direction, numeric) < 1e-7
-    if not isinstance(camera, BareCamera):
-        numeric = central_difference(lambda p: camera.rays(p).origins, pixels, step)
-        assert relative_error(by_origin, numeric) < 1e-7
-    else:
-        assert (by_origin == 0.0).all()
-
-
 def test_projection_jacobian_is_the_derivative(camera: Camera) -> None:
     points = points_in_view(camera)
     pixels, valid, jacobian = camera.project_with_jacobian(points)
@@ -197,19 +177,6 @@ def test_derivatives_on_the_axis(lens_mm: tuple[int, int, int]) -> None:
     assert relative_error(by_parameter[..., :3], numeric[..., :3]) < 1e-6
 
 
-def test_ray_and_projection_jacobians_undo_each_other(camera: Camera) -> None:
-    pixels = image_grid(144.0)
-    rays, by_origin, by_direction = camera.rays_with_jacobian(pixels)
-    distance = 0.6
-    points = rays.points_at(np.full(pixels.shape[:-1], distance))
-    _, _, by_point = camera.project_with_jacobian(points)
-    product = by_point @ (by_origin + distance * by_direction)
-    np.testing.assert_allclose(product, np.broadcast_to(np.eye(2), product.shape), atol=1e-11)
-    along = np.einsum("...ij,...j->...i", by_point, rays.directions)
-    # Moving a point along its ray moves no pixel; slopes are of order 1000 px/m.
-    np.testing.assert_allclose(along, 0.0, atol=1e-9)
-
-
 def test_invalid_points_are_masked_and_nan() -> None:
     camera = dome_camera()
     points = np.array(
@@ -232,11 +199,11 @@ def test_invalid_points_are_masked_and_nan() -> None:
 
 def test_pixels_outside_the_lens_model_have_no_ray() -> None:
     lens = Lens(fx=500.0, fy=500.0, cx=360.0, cy=288.0, distortion=(-0.5, 0.0, 0.0, 0.0))
-    rays, by_origin, by_direction = dome_camera(lens=lens).rays_with_jacobian(image_grid(30.0))
+    rays = dome_camera(lens=lens).rays(image_grid(30.0))
     radius = np.linalg.norm(image_grid(30.0) - [360.0, 288.0], axis=-1)
     np.testing.assert_array_equal(rays.valid, radius < 500.0 * np.sqrt(2 / 3) * 2 / 3)
     assert not rays.valid.all()
-    for values in (rays.origins, rays.directions, by_origin, by_direction):
+    for values in (rays.origins, rays.directions):
         assert np.isnan(values[~rays.valid]).all()
         assert np.isfinite(values[rays.valid]).all()
 
@@ -324,40 +291,6 @@ def test_inside_image_includes_whole_border_pixels() -> None:
     camera = bare_camera()
     pixels = [[-0.5, -0.5], [719.49, 575.49], [719.5, 0.0], [0.0, -0.51], [np.nan, 1.0]]
     np.testing.assert_array_equal(camera.inside_image(pixels), [1, 1, 0, 0, 0])
-
-
-@kernel
-def trace_and_return(camera, pixels, back):  # type: ignore[no-untyped-def]
-    for i in range(pixels.shape[0]):
-        _, ox, oy, oz, dx, dy, dz = trace_pixel(camera, pixels[i, 0], pixels[i, 1])
-        _, u, v = project_point(camera, ox + 0.4 * dx, oy + 0.4 * dy, oz + 0.4 * dz)
-        back[i, 0], back[i, 1] = u, v
-
-
-@pytest.mark.parametrize(
-    "camera", [dome_camera(), bare_camera(), flat_camera()], ids=["dome", "bare", "flat"]
-)
-def test_scalar_kernels_serve_other_kernels(camera: Camera) -> None:
-    pixels = image_grid(80.0).reshape(-1, 2)
-    back = np.empty_like(pixels)
-    trace_and_return(camera.params, pixels, back)
-    np.testing.assert_allclose(back, pixels, rtol=0.0, atol=1e-10)
-
-
-def test_into_variants_write_the_same_numbers() -> None:
-    camera = dome_camera()
-    pixels = image_grid(17.0).reshape(-1, 2)
-    origins, directions = np.empty((len(pixels), 3)), np.empty((len(pixels), 3))
-    valid = np.empty(len(pixels), dtype=np.bool_)
-    camera.rays_into(pixels, origins, directions, valid)
-    rays = camera.rays(pixels)
-    np.testing.assert_array_equal(origins, rays.origins)
-    np.testing.assert_array_equal(directions, rays.directions)
-    assert valid.all()
-    points = rays.points_at(np.full(len(pixels), 0.5))
-    back = np.empty_like(pixels)
-    camera.project_into(points, back, valid)
-    np.testing.assert_array_equal(back, camera.project(points)[0])
 
 
 def test_shapes_follow_the_batch() -> None:

@@ -95,18 +95,6 @@ def test_round_trip_of_a_strongly_distorted_lens(coefficients: tuple[float, ...]
     np.testing.assert_allclose(back, unit, rtol=0.0, atol=3e-14)
 
 
-def test_direction_jacobian_is_the_derivative(lens: Lens) -> None:
-    pixels = image_grid(65.0).reshape(-1, 2)
-    pixels[0] = lens.cx, lens.cy
-    d, valid, jacobian = lens.directions_with_jacobian(pixels)
-    assert valid.all()
-    # Two code paths: they may differ by roundings.
-    np.testing.assert_allclose(d, lens.directions(pixels)[0], rtol=0.0, atol=1e-15)
-    numeric = central_difference(lambda p: lens.directions(p)[0], pixels, 1e-2)
-    # Truncation (1e-2 px over 800 px)^2 and rounding 1e-16 / 1e-2 against slopes of 1e-3.
-    assert relative_error(jacobian, numeric) < 1e-8
-
-
 def test_pixel_jacobians_are_the_derivatives(lens: Lens) -> None:
     d = directions_in_view(60)
     pixels, valid, jacobian, by_parameter = lens.pixels_with_parameter_jacobian(d)
@@ -124,14 +112,6 @@ def test_pixel_jacobians_are_the_derivatives(lens: Lens) -> None:
 
     numeric = central_difference(pixels_of, values, 1e-5)
     assert relative_error(by_parameter, numeric) < 1e-7
-
-
-def test_jacobians_are_inverse_to_each_other(lens: Lens) -> None:
-    pixels = image_grid(90.0)
-    d, _, by_pixel = lens.directions_with_jacobian(pixels)
-    _, _, by_direction = lens.pixels_with_jacobian(d)
-    identity = np.broadcast_to(np.eye(2), (*pixels.shape[:-1], 2, 2))
-    np.testing.assert_allclose(by_direction @ by_pixel, identity, rtol=0.0, atol=1e-12)
 
 
 def test_the_limit_is_where_the_radial_map_turns() -> None:
@@ -211,10 +191,9 @@ def test_fisheye_ends_where_its_polynomial_turns() -> None:
 
 
 def test_nan_in_gives_invalid_out(lens: Lens) -> None:
-    d, valid, jacobian = lens.directions_with_jacobian([[np.nan, 3.0], [300.0, 200.0]])
+    d, valid = lens.directions([[np.nan, 3.0], [300.0, 200.0]])
     np.testing.assert_array_equal(valid, [False, True])
     assert np.isnan(d[0]).all()
-    assert np.isnan(jacobian[0]).all()
     pixels, valid = lens.pixels([[np.nan, 0.0, 1.0], [np.inf, 0.0, 1.0]])
     assert not valid.any()
     assert np.isnan(pixels).all()
@@ -225,7 +204,6 @@ def test_shapes_follow_the_batch() -> None:
     assert (d.shape, valid.shape) == ((3,), ())
     d, valid = PAPER_LENS.directions(np.empty((0, 2)))
     assert (d.shape, valid.shape) == ((0, 3), (0,))
-    assert PAPER_LENS.directions_with_jacobian(image_grid(200.0))[2].shape[2:] == (3, 2)
     with pytest.raises(ValueError, match="pixels has shape"):
         PAPER_LENS.directions([1.0, 2.0, 3.0])
 

@@ -11,7 +11,8 @@ import pytest
 import rig_from_sample_truth
 from aqualvs.errors import RigError
 from aqualvs.geometry import rotvec_from_rotation
-from aqualvs.optics.camera import BareCamera, Dome, HousedCamera
+from aqualvs.optics.camera import BareCamera, HousedCamera
+from aqualvs.optics.dome import Dome
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig
 from aqualvs.optics.rigfile import load_rig
 from aqualvs.simulation.scenarios import example_rig

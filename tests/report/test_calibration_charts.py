@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.report.calibration_charts import residual_view
-from aqualvs.report.calibration_page import ResidualMap, Series
+from aqualvs.report.calibration_material import ResidualMap, Series
 from aqualvs.report.svg import Axis, decimals, line_chart, num, round_step, sampled
 
 NASTY = "<b>&\"'</b>"

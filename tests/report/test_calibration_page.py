@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from aqualvs.errors import OutputError
-from aqualvs.report.calibration_page import (
+from aqualvs.report.calibration_material import (
     CalibrationPage,
     ExpectationRow,
     LaserRow,
@@ -23,10 +23,8 @@ from aqualvs.report.calibration_page import (
     ResidualMap,
     Series,
     ViewRow,
-    number,
-    page_html,
-    write_page,
 )
+from aqualvs.report.calibration_page import number, page_html, write_page
 from aqualvs.report.html import Card
 
 NASTY = "<script>alert(1)</script>&\"'<!-- $title ${css} 水"

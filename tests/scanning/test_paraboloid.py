@@ -5,15 +5,8 @@ import pytest
 
 from aqualvs.geometry.planes import Plane
 from aqualvs.scanning.candidates import Observations
-from aqualvs.scanning.paraboloid import (
-    FLAT,
-    Patch,
-    fit_patch,
-    flat_patch,
-    nearest_tangent,
-    shows_curvature,
-    tangent_covariance,
-)
+from aqualvs.scanning.paraboloid import fit_patch, shows_curvature
+from aqualvs.scanning.patch import FLAT, Patch, flat_patch, nearest_tangent, tangent_covariance
 from aqualvs.scanning.plane_fit import SharedError
 
 BASE = Plane.from_normal([0.1, 1.0, -0.05], 0.6)

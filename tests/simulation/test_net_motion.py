@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from aqualvs.errors import OptionError
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
-from aqualvs.scanning.paraboloid import Patch, flat_patch, nearest_tangent
+from aqualvs.scanning.patch import Patch, flat_patch, nearest_tangent
 from aqualvs.scanning.posture import range_pitch_yaw
 from aqualvs.simulation.net_motion import NetWall
 from aqualvs.simulation.render import Renderer

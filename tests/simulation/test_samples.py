@@ -9,7 +9,7 @@ import pytest
 
 from aqualvs.geometry.planes import Plane
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
-from aqualvs.optics.camera import Dome
+from aqualvs.optics.dome import Dome
 from aqualvs.optics.lens import Lens
 from aqualvs.optics.rig import Laser, Rig
 from aqualvs.simulation.render import Renderer

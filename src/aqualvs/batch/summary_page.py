@@ -89,10 +89,6 @@ def write_summary(folder: Path, records: Sequence[DiveRecord]) -> Path:
     records : sequence of DiveRecord
         In the order of the page.
 
-    Returns
-    -------
-    path : Path
-
     Raises
     ------
     OutputError

@@ -21,14 +21,22 @@ from aqualvs.calibration.targets.targets import View
 from aqualvs.calibration_formats import refuse_foreign
 from aqualvs.errors import CalibrationError, OptionError, RigError
 from aqualvs.geometry.arrays import FloatArray
-from aqualvs.optics.camera import Dome, FlatPort, Housing
+from aqualvs.optics.camera import Housing
+from aqualvs.optics.dome import Dome
+from aqualvs.optics.flat_port import FlatPort
 from aqualvs.optics.rig import Laser, Rig, RigUncertainty
 from aqualvs.optics.rigfile import keep_dated, load_rig, save_rig
 from aqualvs.optics.rigschema import LaserWavelength
 from aqualvs.optics.shutter import AT_ONCE, Shutter
 from aqualvs.optics.water import N_AIR
-from aqualvs.report.calibration_material import ResidualMap, ViewRow, missed_rows, residual_map
-from aqualvs.report.calibration_page import CalibrationPage, write_page
+from aqualvs.report.calibration_material import (
+    CalibrationPage,
+    ResidualMap,
+    ViewRow,
+    missed_rows,
+    residual_map,
+)
+from aqualvs.report.calibration_page import write_page
 from aqualvs.results.files import writing
 from aqualvs.results.run_request import checked_index
 from aqualvs.sources.images import read_image

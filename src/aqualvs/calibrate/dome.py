@@ -28,8 +28,10 @@ from aqualvs.calibration.targets.pose_files import BoardPose, load_poses, match_
 from aqualvs.calibration.targets.target_files import load_board
 from aqualvs.calibration.targets.targets import Board
 from aqualvs.errors import OptionError
-from aqualvs.optics.camera import POSE_PARAMETERS, Dome, FlatPort, parameter_names
-from aqualvs.optics.rig import Rig
+from aqualvs.optics.camera import POSE_PARAMETERS, parameter_names
+from aqualvs.optics.dome import Dome
+from aqualvs.optics.flat_port import FlatPort
+from aqualvs.optics.rig import Rig, merged
 from aqualvs.optics.rigfile import check_rig_place, load_rig
 from aqualvs.optics.solved import (
     ASSUMED,
@@ -37,7 +39,6 @@ from aqualvs.optics.solved import (
     SolvedStep,
     completed_uncertainty,
     file_parameter_name,
-    merged,
     rig_uncertainty,
     with_step,
     with_uncertainty,

@@ -38,7 +38,7 @@ from aqualvs.calibration.targets.target_files import load_board, load_box
 from aqualvs.calibration.targets.targets import Board, MarkerSet, View
 from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import FloatArray
-from aqualvs.optics.rig import Laser, Rig, RigUncertainty
+from aqualvs.optics.rig import Laser, Rig, RigUncertainty, merged
 from aqualvs.optics.rigfile import check_rig_place, load_rig
 from aqualvs.optics.rigschema import LASER_NM, LASER_NM_REMEDY
 from aqualvs.optics.solved import (
@@ -46,7 +46,6 @@ from aqualvs.optics.solved import (
     SolvedStep,
     completed_uncertainty,
     file_parameter_name,
-    merged,
     rig_uncertainty,
     with_step,
     with_uncertainty,

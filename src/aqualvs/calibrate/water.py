@@ -24,15 +24,9 @@ from aqualvs.calibration.water_index.estimator import WaterCalibration
 from aqualvs.calibration.water_index.estimator import calibrate_water as solve_water
 from aqualvs.calibration.water_index.state import IndexOptions, IndexPrior
 from aqualvs.errors import CalibrationError, OptionError
-from aqualvs.optics.rig import Rig
+from aqualvs.optics.rig import Rig, merged
 from aqualvs.optics.rigfile import check_rig_place, load_rig
-from aqualvs.optics.solved import (
-    SolvedStep,
-    merged,
-    rig_uncertainty,
-    with_step,
-    with_uncertainty,
-)
+from aqualvs.optics.solved import SolvedStep, rig_uncertainty, with_step, with_uncertainty
 from aqualvs.report.calibration_material import (
     CalibrationPage,
     Series,

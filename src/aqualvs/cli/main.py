@@ -34,10 +34,6 @@ class LenientStream:
     Whoever reads the output may go before the end, as `head` does, and a terminal may be closed. A
     dive under way is measured to its end all the same.
 
-    Parameters
-    ----------
-    stream : TextIO
-
     Attributes
     ----------
     fault : OSError or None

@@ -23,7 +23,9 @@ from aqualvs.design.settings import (
 )
 from aqualvs.errors import OptionError, RigError
 from aqualvs.geometry.transforms import SE3
-from aqualvs.optics.camera import Dome, FlatPort, Housing
+from aqualvs.optics.camera import Housing
+from aqualvs.optics.dome import Dome
+from aqualvs.optics.flat_port import FlatPort
 from aqualvs.optics.lens import Lens, LensModel
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig
 from aqualvs.optics.rigfile import load_rig, shutter_from_part

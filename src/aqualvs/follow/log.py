@@ -258,11 +258,6 @@ class SafetyMeasures:
         """Whether the hull touched the net."""
         return self.min_clearance <= 0.0
 
-    @property
-    def neutral_in_time(self) -> bool:
-        """Whether thrust always ended in time."""
-        return self.neutral_late <= NEUTRAL_WITHIN_S + 1e-9
-
 
 def hold_measures(log: LoopLog, start_s: float, end_s: float = math.inf) -> HoldMeasures:
     """Return the measures of a period; frames without a setpoint count against the last one."""

@@ -24,7 +24,7 @@ from aqualvs.follow.log import (
 )
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.report import html
-from aqualvs.report.figure_style import BLUE, DARK, GREY, ORANGE, STYLE, new_canvas
+from aqualvs.report.figure_style import BLUE, DARK, GREY, ORANGE, STYLE, new_canvas, save_figures
 from aqualvs.results.files import replace_text, writing
 
 if TYPE_CHECKING:
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-_DPI = 160
 _LOST, _GUARDED = "#f3c9bd", "#f6e3a8"
 # Least span of an axis, so that noise does not fill it: metres, degrees.
 _MIN_DEPTH, _MIN_RANGE, _MIN_ANGLE = 0.2, 0.1, 6.0
@@ -60,12 +59,7 @@ def draw_follow_figures(log: LoopLog, out: Path) -> list[Path]:
     OSError
         If a picture cannot be written.
     """
-    written = []
-    for name, figure in drawn_follow_figures(log).items():
-        path = out / f"{name}.png"
-        figure.savefig(path, dpi=_DPI)
-        written.append(path)
-    return written
+    return save_figures(drawn_follow_figures(log), out, dpi=160)
 
 
 def drawn_follow_figures(log: LoopLog) -> "dict[str, Figure]":

@@ -137,10 +137,6 @@ def net_of_run(place: NetSource, request: NetRequest, echo: Callable[[str], obje
 class StoredDive:
     """Dive as stored in a run's folder.
 
-    Parameters
-    ----------
-    run_folder : Path
-
     Raises
     ------
     SourceError

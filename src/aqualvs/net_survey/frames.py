@@ -323,8 +323,6 @@ _ALIGNMENT = _AlignmentOptions()
 
 STEP = 0.1
 """Shifts that are tried are this far apart, in metres."""
-# Places in a stretch that are compared, along and across.
-_SAMPLES = 5
 
 
 @dataclass(frozen=True, slots=True)

@@ -97,10 +97,6 @@ class NetLattice:
         """Unit vectors across each family's strands, shape (F, 2)."""
         return self.waves * self.pitch[:, None]
 
-    def crossings_per_metre(self, direction: FloatArray) -> float:
-        """Return the crossings per metre of a line of unit direction (2,) with strands."""
-        return float(np.abs(self.waves @ direction) @ self.density)
-
 
 def find_lattice(
     frames: Sequence[Crossings], before: NetLattice | None = None

@@ -1,35 +1,38 @@
-"""The camera: pixels to rays in the outer medium, points to pixels, and every derivative.
+"""The camera: pixels to rays in the outer medium, points to pixels with derivatives.
 
 The cameras share one set of numbers: `parameter_names` gives their order in every parameter
 Jacobian, `moved_by` adds a small step to them, and `camera_params` checks them and packs them for
-kernels. For kernels of other modules `trace_pixel(camera.params, u, v)` and
-`project_point(camera.params, x, y, z)` are scalar compiled functions to call inside a `@kernel`.
+kernels. `rays_all` traces pixels, in blocks as `aqualvs.optics.lens` lays them out, and is compiled
+for the class of port that it is called with. A scan projects no points, so the kernels of
+`aqualvs.optics.projection` are imported when they are used.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from aqualvs.errors import RigError
 from aqualvs.geometry.arrays import BoolArray, FloatArray, as_vectors
+from aqualvs.geometry.compiled import chosen_by_class, inline_kernel, kernel
 from aqualvs.geometry.planes import Rays
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
-from aqualvs.optics.camera_kernels import (
-    CameraParams,
-    project_all,
-    project_jacobian_all,
-    project_point,
-    rays_all,
-    rays_jacobian_all,
-    trace_pixel,
+from aqualvs.optics.dome import Dome, DomeParams, trace_direction
+from aqualvs.optics.flat_port import FlatParams, FlatPort, trace_flat
+from aqualvs.optics.lens import (
+    BLOCK,
+    DX,
+    DY,
+    DZ,
+    LENS_OK,
+    N_LENS_ROWS,
+    Lens,
+    directions_block,
+    load_pixels,
 )
-from aqualvs.optics.dome import DOME_PARAMETERS, Dome
-from aqualvs.optics.flat_port import FLAT_PARAMETERS, FlatPort
-from aqualvs.optics.lens import Lens
-from aqualvs.optics.port_kernels import BareParams
+from aqualvs.optics.lens_kernels import LensParams, Vector
 from aqualvs.optics.refraction import as_triple, check_index
 
 POSE_PARAMETERS = ("lens_x", "lens_y", "lens_z", "rotation_x", "rotation_y", "rotation_z")
@@ -40,6 +43,130 @@ after the camera's rotation: `dome_from_cam.rotation = Rodrigues(w) @ rotation`,
 """
 Housing = Dome | FlatPort
 """What keeps the water from a camera, and refracts what it sees."""
+
+
+class BareParams(NamedTuple):
+    """A lens in the outer medium itself, as kernels take it.
+
+    Attributes
+    ----------
+    centre : tuple of 3 float
+        The lens position L in `dome`, metres.
+    """
+
+    centre: Vector
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return ()
+
+
+@inline_kernel
+def _trace_bare(
+    port: BareParams, dx: float, dy: float, dz: float
+) -> tuple[bool, float, float, float, float, float, float]:
+    ox, oy, oz = port.centre
+    return True, ox, oy, oz, dx, dy, dz
+
+
+trace_port = chosen_by_class(
+    {BareParams: _trace_bare, DomeParams: trace_direction, FlatParams: trace_flat}
+)
+"""`trace_port(port, dx, dy, dz)`: a unit direction at the lens as the ray in the outer medium, see
+`trace_direction`."""
+
+
+class CameraParams(NamedTuple):
+    """A camera as kernels take it; `camera.params` makes it.
+
+    Attributes
+    ----------
+    lens : LensParams
+        Intrinsics.
+    rotation : tuple of 9 float
+        `dome_from_cam`, row by row.
+    port : BareParams, DomeParams or FlatParams
+        What stands between the lens and the outer medium, and the lens position.
+    """
+
+    lens: LensParams
+    rotation: tuple[float, float, float, float, float, float, float, float, float]
+    port: BareParams | DomeParams | FlatParams
+
+
+@inline_kernel
+def dome_from_cam(camera: CameraParams, x: float, y: float, z: float) -> Vector:
+    """Rotate a direction from `cam` to `dome`."""
+    r = camera.rotation
+    return (
+        r[0] * x + r[1] * y + r[2] * z,
+        r[3] * x + r[4] * y + r[5] * z,
+        r[6] * x + r[7] * y + r[8] * z,
+    )
+
+
+# Rows of the scratch array after those of the lens: the origin of the ray.
+OX, OY, OZ = ((N_LENS_ROWS + i_row) * BLOCK for i_row in range(3))
+N_RAY_ROWS = N_LENS_ROWS + 3
+
+
+@inline_kernel
+def trace_block(camera: CameraParams, w: FloatArray) -> None:
+    """Turn unit directions in `dome` into rays in the outer medium, all lanes of a block."""
+    for j in range(BLOCK):
+        passed, ox, oy, oz, dx, dy, dz = trace_port(camera.port, w[DX + j], w[DY + j], w[DZ + j])
+        w[OX + j], w[OY + j], w[OZ + j] = ox, oy, oz
+        w[DX + j], w[DY + j], w[DZ + j] = dx, dy, dz
+        w[LENS_OK + j] = w[LENS_OK + j] if passed else -1.0
+
+
+@inline_kernel
+def rotate_block(camera: CameraParams, w: FloatArray) -> None:
+    """Rotate directions from `cam` to `dome`, all lanes of a block."""
+    for j in range(BLOCK):
+        x, y, z = dome_from_cam(camera, w[DX + j], w[DY + j], w[DZ + j])
+        w[DX + j], w[DY + j], w[DZ + j] = x, y, z
+
+
+@inline_kernel
+def store_rays(
+    start: int,
+    count: int,
+    w: FloatArray,
+    origins: FloatArray,
+    directions: FloatArray,
+    valid: BoolArray,
+) -> None:
+    """Write `count` rays from the scratch `w` to the rows from `start`."""
+    for j in range(count):
+        ok = w[LENS_OK + j] > 0.0
+        valid[start + j] = ok
+        origins[start + j, 0] = w[OX + j] if ok else np.nan
+        origins[start + j, 1] = w[OY + j] if ok else np.nan
+        origins[start + j, 2] = w[OZ + j] if ok else np.nan
+        directions[start + j, 0] = w[DX + j] if ok else np.nan
+        directions[start + j, 1] = w[DY + j] if ok else np.nan
+        directions[start + j, 2] = w[DZ + j] if ok else np.nan
+
+
+@kernel
+def rays_all(
+    camera: CameraParams,
+    pixels: FloatArray,
+    origins: FloatArray,
+    directions: FloatArray,
+    valid: BoolArray,
+) -> None:
+    """Write rays of pixels (N, 2): origins (N, 3), directions (N, 3), valid (N)."""
+    w = np.zeros(N_RAY_ROWS * BLOCK)
+    for start in range(0, pixels.shape[0], BLOCK):
+        count = min(BLOCK, pixels.shape[0] - start)
+        load_pixels(camera.lens, pixels, start, count, w)
+        directions_block(camera.lens, count, w)
+        rotate_block(camera, w)
+        trace_block(camera, w)
+        store_rays(start, count, w, origins, directions, valid)
 
 
 class HasParameters(Protocol):
@@ -145,23 +272,6 @@ def _checked_pose(pose: SE3) -> tuple[FloatArray, FloatArray]:
     return rotation, centre
 
 
-__all__ = [
-    "DOME_PARAMETERS",
-    "FLAT_PARAMETERS",
-    "POSE_PARAMETERS",
-    "BareCamera",
-    "Camera",
-    "CameraParams",
-    "Dome",
-    "FlatPort",
-    "HousedCamera",
-    "Housing",
-    "parameter_names",
-    "project_point",
-    "trace_pixel",
-]
-
-
 class Camera(Protocol):
     """Interface of a camera. Frames: `image` and `dome`."""
 
@@ -184,25 +294,8 @@ class Camera(Protocol):
     def rays(self, pixels: ArrayLike) -> Rays:
         """Return the rays in `dome` that pixels (..., 2) see."""
 
-    def rays_into(
-        self,
-        pixels: FloatArray,
-        out_origins: FloatArray,
-        out_directions: FloatArray,
-        out_valid: BoolArray,
-    ) -> None:
-        """Write the rays of pixels (N, 2) into (N, 3), (N, 3) and (N) without allocation."""
-
-    def rays_with_jacobian(self, pixels: ArrayLike) -> tuple[Rays, FloatArray, FloatArray]:
-        """Return the rays and the derivatives (..., 3, 2) of origins and directions."""
-
     def project(self, points_in_dome: ArrayLike) -> tuple[FloatArray, BoolArray]:
         """Return pixels (..., 2) of points (..., 3) and whether they can be seen."""
-
-    def project_into(
-        self, points_in_dome: FloatArray, out_pixels: FloatArray, out_valid: BoolArray
-    ) -> None:
-        """Write the pixels of points (N, 3) into (N, 2) and (N) without allocation."""
 
     def project_with_jacobian(
         self, points_in_dome: ArrayLike
@@ -268,41 +361,6 @@ class _CompiledCamera:
         )
         return Rays(origins, directions, valid)
 
-    def rays_into(
-        self,
-        pixels: FloatArray,
-        out_origins: FloatArray,
-        out_directions: FloatArray,
-        out_valid: BoolArray,
-    ) -> None:
-        """Write the rays of pixels (N, 2) into arrays of shape (N, 3), (N, 3) and (N).
-
-        All float64 (bool for `out_valid`) and C-contiguous; nothing is allocated.
-        """
-        rays_all(self.params, pixels, out_origins, out_directions, out_valid)
-
-    def rays_with_jacobian(self, pixels: ArrayLike) -> tuple[Rays, FloatArray, FloatArray]:
-        """Trace pixels into the outer medium, with derivatives.
-
-        Returns
-        -------
-        rays : Rays
-            As `rays` gives them.
-        origin_jacobian, direction_jacobian : array, shape (..., 3, 2)
-            d origin / d pixel (metres per pixel) and d direction / d pixel; NaN where not valid.
-        """
-        p = as_vectors(pixels, 2, "pixels")
-        rays = self.rays(p)
-        by_origin, by_direction = np.empty((*p.shape[:-1], 3, 2)), np.empty((*p.shape[:-1], 3, 2))
-        rays_jacobian_all(
-            self.params,
-            p.reshape(-1, 2),
-            rays.valid.reshape(-1),
-            by_origin.reshape(-1, 3, 2),
-            by_direction.reshape(-1, 3, 2),
-        )
-        return rays, by_origin, by_direction
-
     def project(self, points_in_dome: ArrayLike) -> tuple[FloatArray, BoolArray]:
         """Project points of the outer medium.
 
@@ -322,17 +380,10 @@ class _CompiledCamera:
         p = as_vectors(points_in_dome, 3, "points_in_dome")
         pixels = np.empty((*p.shape[:-1], 2))
         valid = np.empty(p.shape[:-1], dtype=np.bool_)
-        self.project_into(p.reshape(-1, 3), pixels.reshape(-1, 2), valid.reshape(-1))
+        from aqualvs.optics.projection import project_all
+
+        project_all(self.params, p.reshape(-1, 3), pixels.reshape(-1, 2), valid.reshape(-1))
         return pixels, valid
-
-    def project_into(
-        self, points_in_dome: FloatArray, out_pixels: FloatArray, out_valid: BoolArray
-    ) -> None:
-        """Write the pixels of points (N, 3) into arrays of shape (N, 2) and (N).
-
-        All float64 (bool for `out_valid`) and C-contiguous; nothing is allocated.
-        """
-        project_all(self.params, points_in_dome, out_pixels, out_valid)
 
     def project_with_jacobian(
         self, points_in_dome: ArrayLike
@@ -373,6 +424,8 @@ class _CompiledCamera:
         shape = points.shape[:-1]
         pixels, valid = np.empty((*shape, 2)), np.empty(shape, dtype=np.bool_)
         by_point = np.empty((*shape, 2, 3))
+        from aqualvs.optics.projection import project_jacobian_all
+
         project_jacobian_all(
             self.params,
             points.reshape(-1, 3),

@@ -1,10 +1,11 @@
 """The lens: pixels to directions in `cam` and back, with OpenCV's two distortion models.
 
 The batch kernels behind `Lens` write into arrays that they are given, and NaN wherever they write
-False into `valid`. The hot kernels work in blocks: rows of coordinates are copied into one flat
-scratch array, each quantity in a row of its own, and loops of constant length without branches run
-over it. One array and constant offsets let LLVM prove that nothing overlaps and use vector
-instructions; operations that need a branch are done lane by lane in between.
+False into `valid`; those of the way back are in `aqualvs.optics.projection`. The hot kernels
+work in blocks: rows of coordinates are copied into one flat scratch array, each quantity in a row
+of its own, and loops of constant length without branches run over it. One array and constant
+offsets let LLVM prove that nothing overlaps and use vector instructions; operations that need a
+branch are done lane by lane in between.
 """
 
 import math
@@ -21,11 +22,7 @@ from aqualvs.optics.lens_kernels import (
     ROUNDS,
     LensParams,
     fisheye_direction,
-    fisheye_distort,
     fisheye_limits,
-    lens_direction_jacobian,
-    lens_pixel,
-    lens_pixel_jacobian,
     opencv_limits,
     opencv_undistort_guarded,
     opencv_undistort_round,
@@ -109,124 +106,6 @@ def directions_all(
             directions[start + j, 0] = w[DX + j] if ok else np.nan
             directions[start + j, 1] = w[DY + j] if ok else np.nan
             directions[start + j, 2] = w[DZ + j] if ok else np.nan
-
-
-@kernel
-def directions_jacobian_all(
-    lens: LensParams,
-    pixels: FloatArray,
-    directions: FloatArray,
-    valid: BoolArray,
-    jacobian: FloatArray,
-) -> None:
-    """Write directions (N, 3) of pixels (N, 2) with their Jacobians (N, 3, 2)."""
-    for i in range(pixels.shape[0]):
-        ok, d, d_u, d_v = lens_direction_jacobian(lens, pixels[i, 0], pixels[i, 1])
-        valid[i] = ok
-        for k in range(3):
-            directions[i, k] = d[k] if ok else np.nan
-            jacobian[i, k, 0] = d_u[k] if ok else np.nan
-            jacobian[i, k, 1] = d_v[k] if ok else np.nan
-
-
-@kernel
-def pixels_all(
-    lens: LensParams, directions: FloatArray, pixels: FloatArray, valid: BoolArray
-) -> None:
-    """Write pixels (N, 2) of directions (N, 3)."""
-    for i in range(directions.shape[0]):
-        ok, u, v = lens_pixel(lens, directions[i, 0], directions[i, 1], directions[i, 2])
-        valid[i] = ok
-        pixels[i, 0] = u if ok else np.nan
-        pixels[i, 1] = v if ok else np.nan
-
-
-@kernel
-def pixels_jacobian_all(
-    lens: LensParams,
-    directions: FloatArray,
-    pixels: FloatArray,
-    valid: BoolArray,
-    jacobian: FloatArray,
-) -> None:
-    """Write pixels (N, 2) of directions (N, 3) with their Jacobians (N, 2, 3)."""
-    for i in range(directions.shape[0]):
-        ok, u, v, u_d, v_d = lens_pixel_jacobian(
-            lens, directions[i, 0], directions[i, 1], directions[i, 2]
-        )
-        valid[i] = ok
-        pixels[i, 0] = u if ok else np.nan
-        pixels[i, 1] = v if ok else np.nan
-        for k in range(3):
-            jacobian[i, 0, k] = u_d[k] if ok else np.nan
-            jacobian[i, 1, k] = v_d[k] if ok else np.nan
-
-
-@kernel
-def intrinsics_jacobian_all(
-    lens: LensParams, directions: FloatArray, valid: BoolArray, jacobian: FloatArray
-) -> None:
-    """Write derivatives (N, 2, 4 + n) of pixels by fx, fy, cx, cy and n distortion coefficients."""
-    for i in range(directions.shape[0]):
-        if valid[i]:
-            write_intrinsics_jacobian(
-                lens, directions[i, 0], directions[i, 1], directions[i, 2], jacobian[i]
-            )
-        else:
-            jacobian[i] = np.nan
-
-
-@inline_kernel
-def write_intrinsics_jacobian(
-    lens: LensParams, x: float, y: float, z: float, jacobian: FloatArray
-) -> None:
-    """Write d(u, v) / d(fx, fy, cx, cy, distortion...) of one direction into (2, 4 + n)."""
-    jacobian[:] = 0.0
-    if lens.fisheye:
-        _write_fisheye(lens, x, y, z, jacobian)
-    else:
-        _write_opencv(lens, x / z, y / z, jacobian)
-    jacobian[0, 2] = 1.0
-    jacobian[1, 3] = 1.0
-
-
-@inline_kernel
-def _write_opencv(lens: LensParams, x: float, y: float, jacobian: FloatArray) -> None:
-    q = x * x + y * y
-    inverse = 1.0 / (1.0 + q * (lens.k4 + q * (lens.k5 + q * lens.k6)))
-    f = (1.0 + q * (lens.k1 + q * (lens.k2 + q * lens.k3))) * inverse
-    cross = 2.0 * (lens.p1 * y + lens.p2 * x)
-    jacobian[0, 0] = x * (f + cross) + lens.p2 * q
-    jacobian[1, 1] = y * (f + cross) + lens.p1 * q
-    # Order of OpenCV: k1 k2 p1 p2 k3 k4 k5 k6.
-    by_coefficient = (
-        (x * q * inverse, y * q * inverse),
-        (x * q * q * inverse, y * q * q * inverse),
-        (2.0 * x * y, q + 2.0 * y * y),
-        (q + 2.0 * x * x, 2.0 * x * y),
-        (x * q * q * q * inverse, y * q * q * q * inverse),
-        (-x * f * q * inverse, -y * f * q * inverse),
-        (-x * f * q * q * inverse, -y * f * q * q * inverse),
-        (-x * f * q * q * q * inverse, -y * f * q * q * q * inverse),
-    )
-    for k in range(jacobian.shape[1] - 4):
-        jacobian[0, 4 + k] = lens.fx * by_coefficient[k][0]
-        jacobian[1, 4 + k] = lens.fy * by_coefficient[k][1]
-
-
-@inline_kernel
-def _write_fisheye(lens: LensParams, x: float, y: float, z: float, jacobian: FloatArray) -> None:
-    radius = math.sqrt(x * x + y * y)
-    theta = math.atan2(radius, z)
-    value, _ = fisheye_distort(lens, theta)
-    ex = x / radius if radius > 0.0 else 0.0
-    ey = y / radius if radius > 0.0 else 0.0
-    jacobian[0, 0], jacobian[1, 1] = value * ex, value * ey
-    power = theta
-    for k in range(jacobian.shape[1] - 4):
-        power = power * theta * theta
-        jacobian[0, 4 + k] = lens.fx * power * ex
-        jacobian[1, 4 + k] = lens.fy * power * ey
 
 
 _OPENCV_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
@@ -322,22 +201,6 @@ class Lens:
         directions_all(self.params, p.reshape(-1, 2), directions.reshape(-1, 3), valid.reshape(-1))
         return directions, valid
 
-    def directions_with_jacobian(
-        self, pixels: ArrayLike
-    ) -> tuple[FloatArray, BoolArray, FloatArray]:
-        """Return `directions` and their derivatives by the pixel, shape (..., 3, 2)."""
-        p = as_vectors(pixels, 2, "pixels")
-        directions, valid = _empty(p, 3), np.empty(p.shape[:-1], dtype=np.bool_)
-        jacobian = _empty(p, 3, 2)
-        directions_jacobian_all(
-            self.params,
-            p.reshape(-1, 2),
-            directions.reshape(-1, 3),
-            valid.reshape(-1),
-            jacobian.reshape(-1, 3, 2),
-        )
-        return directions, valid, jacobian
-
     def pixels(self, directions_in_cam: ArrayLike) -> tuple[FloatArray, BoolArray]:
         """Return the pixels that directions are seen at.
 
@@ -355,6 +218,8 @@ class Lens:
         """
         d = as_vectors(directions_in_cam, 3, "directions_in_cam")
         pixels, valid = _empty(d, 2), np.empty(d.shape[:-1], dtype=np.bool_)
+        from aqualvs.optics.projection import pixels_all
+
         pixels_all(self.params, d.reshape(-1, 3), pixels.reshape(-1, 2), valid.reshape(-1))
         return pixels, valid
 
@@ -365,6 +230,8 @@ class Lens:
         d = as_vectors(directions_in_cam, 3, "directions_in_cam")
         pixels, valid = _empty(d, 2), np.empty(d.shape[:-1], dtype=np.bool_)
         jacobian = _empty(d, 2, 3)
+        from aqualvs.optics.projection import pixels_jacobian_all
+
         pixels_jacobian_all(
             self.params,
             d.reshape(-1, 3),
@@ -390,6 +257,8 @@ class Lens:
         pixels, valid, jacobian = self.pixels_with_jacobian(d)
         n_parameters = 4 + len(self.distortion)
         by_parameter = _empty(d, 2, n_parameters)
+        from aqualvs.optics.projection import intrinsics_jacobian_all
+
         intrinsics_jacobian_all(
             self.params,
             d.reshape(-1, 3),

@@ -79,47 +79,6 @@ def leave_sphere(
 
 
 @inline_kernel
-def leave_sphere_tangent(
-    p: tuple[float, float, float],
-    d: tuple[float, float, float],
-    p_dot: tuple[float, float, float],
-    d_dot: tuple[float, float, float],
-    radius: float,
-    ratio: float,
-) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
-    """Return the derivative of `leave_sphere`'s point and direction along (p_dot, d_dot)."""
-    along = p[0] * d[0] + p[1] * d[1] + p[2] * d[2]
-    p_p_dot = p[0] * p_dot[0] + p[1] * p_dot[1] + p[2] * p_dot[2]
-    along_dot = (
-        p_dot[0] * d[0]
-        + p_dot[1] * d[1]
-        + p_dot[2] * d[2]
-        + p[0] * d_dot[0]
-        + p[1] * d_dot[1]
-        + p[2] * d_dot[2]
-    )
-    reach = math.sqrt(along * along + radius * radius - (p[0] * p[0] + p[1] * p[1] + p[2] * p[2]))
-    reach_dot = (along * along_dot - p_p_dot) / reach
-    step, step_dot = reach - along, reach_dot - along_dot
-    qx, qy, qz = p[0] + step * d[0], p[1] + step * d[1], p[2] + step * d[2]
-    qx_dot = p_dot[0] + step_dot * d[0] + step * d_dot[0]
-    qy_dot = p_dot[1] + step_dot * d[1] + step * d_dot[1]
-    qz_dot = p_dot[2] + step_dot * d[2] + step * d_dot[2]
-    cos_in, cos_in_dot = reach / radius, reach_dot / radius
-    cos_out = math.sqrt(1.0 - ratio * ratio * (1.0 - cos_in * cos_in))
-    k = (ratio * cos_in - cos_out) / radius
-    k_dot = ratio * cos_in_dot * (1.0 - ratio * cos_in / cos_out) / radius
-    return (
-        (qx_dot, qy_dot, qz_dot),
-        (
-            ratio * d_dot[0] - k_dot * qx - k * qx_dot,
-            ratio * d_dot[1] - k_dot * qy - k * qy_dot,
-            ratio * d_dot[2] - k_dot * qz - k * qz_dot,
-        ),
-    )
-
-
-@inline_kernel
 def leave_plane(
     p: tuple[float, float, float],
     d: tuple[float, float, float],
@@ -156,39 +115,6 @@ def leave_plane(
             ratio * d[0] - k * normal[0],
             ratio * d[1] - k * normal[1],
             ratio * d[2] - k * normal[2],
-        ),
-    )
-
-
-@inline_kernel
-def leave_plane_tangent(
-    d: tuple[float, float, float],
-    p_dot: tuple[float, float, float],
-    d_dot: tuple[float, float, float],
-    normal: tuple[float, float, float],
-    height: float,
-    ratio: float,
-) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
-    """Return the derivative of `leave_plane`'s point and direction along (p_dot, d_dot).
-
-    `p_dot` lies in a plane parallel to it: the height does not change.
-    """
-    cos_in = d[0] * normal[0] + d[1] * normal[1] + d[2] * normal[2]
-    cos_dot = d_dot[0] * normal[0] + d_dot[1] * normal[1] + d_dot[2] * normal[2]
-    step = height / cos_in
-    step_dot = -step * cos_dot / cos_in
-    cos_out = math.sqrt(1.0 - ratio * ratio * (1.0 - cos_in * cos_in))
-    k_dot = ratio * cos_dot * (1.0 - ratio * cos_in / cos_out)
-    return (
-        (
-            p_dot[0] + step_dot * d[0] + step * d_dot[0],
-            p_dot[1] + step_dot * d[1] + step * d_dot[1],
-            p_dot[2] + step_dot * d[2] + step * d_dot[2],
-        ),
-        (
-            ratio * d_dot[0] - k_dot * normal[0],
-            ratio * d_dot[1] - k_dot * normal[1],
-            ratio * d_dot[2] - k_dot * normal[2],
         ),
     )
 

@@ -14,7 +14,6 @@ from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.geometry.transforms import SE3
 from aqualvs.optics.camera import (
-    DOME_PARAMETERS,
     POSE_PARAMETERS,
     BareCamera,
     Camera,
@@ -23,7 +22,7 @@ from aqualvs.optics.camera import (
     moved_lens,
     moved_pose,
 )
-from aqualvs.optics.dome import Dome
+from aqualvs.optics.dome import DOME_PARAMETERS, Dome
 from aqualvs.optics.flat_port import FLAT_PARAMETERS, FlatPort
 from aqualvs.optics.lens import Lens
 from aqualvs.optics.shutter import AT_ONCE, Shutter

@@ -21,7 +21,9 @@ from aqualvs.errors import AqualvsError, OptionError, OutputError, RigError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec, rotvec_from_rotation
-from aqualvs.optics.camera import Dome, FlatPort, Housing
+from aqualvs.optics.camera import Housing
+from aqualvs.optics.dome import Dome
+from aqualvs.optics.flat_port import FlatPort
 from aqualvs.optics.lens import Lens, LensModel
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Laser, Rig, Window
 from aqualvs.optics.rigschema import (
@@ -49,10 +51,6 @@ def keep_dated(path: Path, now: datetime | None = None) -> Path:
     path : Path
     now : datetime, optional
         With a time zone; the current time if left out.
-
-    Returns
-    -------
-    copy : Path
 
     Raises
     ------
@@ -100,8 +98,6 @@ def _uncopied(path: Path, fault: OSError) -> OutputError:
         "the disk or choose another place"
     )
 
-
-__all__ = ["check_rig_place", "load_rig", "rig_from_mapping", "rig_to_mapping", "save_rig"]
 
 _MILLI = 1e3
 _ROTATION_DECIMALS = 12

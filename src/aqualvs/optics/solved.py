@@ -32,26 +32,8 @@ from aqualvs.optics.rig import (
     LASER_PARAMETERS,
     Rig,
     RigUncertainty,
-    combined,
-    merged,
     rig_parameter_names,
 )
-
-__all__ = [
-    "ASSUMED",
-    "EXACT",
-    "STEPS",
-    "SolvedStep",
-    "combined",
-    "file_parameter_name",
-    "is_exact",
-    "merged",
-    "rig_uncertainty",
-    "solved_steps",
-    "with_exact_numbers",
-    "with_step",
-    "with_uncertainty",
-]
 
 STEPS = ("camera", "dome", "lasers", "water")
 """Keys of `solved_from` under which calibrations leave a `SolvedStep`."""

@@ -23,7 +23,9 @@ from numpy.typing import NDArray
 from aqualvs.errors import RigError
 from aqualvs.geometry.planes import Plane
 from aqualvs.geometry.transforms import SE3
-from aqualvs.optics.camera import Dome, FlatPort, Housing
+from aqualvs.optics.camera import Housing
+from aqualvs.optics.dome import Dome
+from aqualvs.optics.flat_port import FlatPort
 from aqualvs.optics.rig import Laser, Rig, Window
 from aqualvs.optics.rigfile import rig_from_mapping, rig_to_mapping
 from aqualvs.scanner import ScannerOptions
@@ -263,10 +265,6 @@ class CdrWriter:
 
 class CdrReader:
     """Reader of a CDR message, field by field in their order.
-
-    Parameters
-    ----------
-    content : bytes
 
     Raises
     ------

@@ -315,12 +315,7 @@ class RecorderOptions:
 
 
 class SampleEncoder:
-    """Encoder of samples as messages.
-
-    Parameters
-    ----------
-    options : RecorderOptions
-    """
+    """Encoder of samples as messages."""
 
     def __init__(self, options: RecorderOptions) -> None:
         self._options = options

@@ -29,10 +29,6 @@ MAX_CHUNK_BYTES = 4 << 20
 class SampleChunks:
     """Chunk under construction: gathers the messages of samples until it is due.
 
-    Parameters
-    ----------
-    options : RecorderOptions
-
     Attributes
     ----------
     n_samples : int

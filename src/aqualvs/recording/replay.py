@@ -56,10 +56,6 @@ class RecordedFrame:
 class DiveRecording:
     """A recording of a dive.
 
-    Parameters
-    ----------
-    path : Path
-
     Attributes
     ----------
     path : Path

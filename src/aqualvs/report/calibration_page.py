@@ -18,11 +18,7 @@ from aqualvs.report.calibration_material import (
     CalibrationPage,
     ExpectationRow,
     LaserRow,
-    Overlay,
     ParameterRow,
-    PictureShot,
-    ResidualMap,
-    Series,
     ViewRow,
 )
 from aqualvs.report.html import Raw, swatch, table
@@ -258,21 +254,6 @@ def _expectation_text(rows: Sequence[ExpectationRow]) -> str:
     )
     kind = "good" if fine else "bad"
     return f'<p class="verdict {kind}"><b>{start}</b>{means}</p>'
-
-
-__all__ = [
-    "CalibrationPage",
-    "ExpectationRow",
-    "LaserRow",
-    "Overlay",
-    "ParameterRow",
-    "PictureShot",
-    "ResidualMap",
-    "Series",
-    "ViewRow",
-    "page_html",
-    "write_page",
-]
 
 
 def write_page(page: CalibrationPage, path: Path) -> Path:

@@ -4,6 +4,7 @@ Figures are one or two columns wide and use the Agg canvas.
 """
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 if TYPE_CHECKING:
@@ -63,3 +64,17 @@ def new_figure(height_in: float, width: Literal["column", "page"] = "page") -> "
         As wide as a journal's column or page.
     """
     return new_canvas(WIDTH_IN[width], height_in)
+
+
+def save_figures(figures: "Mapping[str, Figure]", folder: Path, dpi: float) -> list[Path]:
+    """Write figures as `NAME.png` into a folder that exists, and return their paths.
+
+    Raises
+    ------
+    OSError
+        If a picture cannot be written.
+    """
+    paths = [folder / f"{name}.png" for name in figures]
+    for path, figure in zip(paths, figures.values(), strict=True):
+        figure.savefig(path, dpi=dpi)
+    return paths

@@ -21,7 +21,7 @@ from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.nets.target_file import target_dict
 from aqualvs.optics.rigfile import rig_from_mapping
-from aqualvs.report.figure_style import BLUE, DARK, GREY, PINK, STYLE, new_canvas
+from aqualvs.report.figure_style import BLUE, DARK, GREY, PINK, STYLE, new_canvas, save_figures
 from aqualvs.report.run_data import LaserFacts, lasers_of, read_run_file, working_range_m
 from aqualvs.results.files import Claim, writing
 from aqualvs.results.folder import POINTS_PARQUET, check_run_files
@@ -129,13 +129,7 @@ def draw_figures(reflections: Reflections, options: MeshFilterOptions, out: Path
     OSError
         If a picture cannot be written.
     """
-    written = []
-    dpi = 220
-    for name, figure in drawn_figures(reflections, options).items():
-        path = out / f"{name}.png"
-        figure.savefig(path, dpi=dpi)
-        written.append(path)
-    return written
+    return save_figures(drawn_figures(reflections, options), out, dpi=220)
 
 
 def drawn_figures(reflections: Reflections, options: MeshFilterOptions) -> "dict[str, Figure]":

@@ -21,7 +21,6 @@ from aqualvs.geometry.planes import Plane
 from aqualvs.scanning.candidates import Observations
 from aqualvs.scanning.patch import (
     COEFFICIENTS,
-    FLAT,
     NORMAL,
     OFFSET,
     RIGHT,
@@ -30,10 +29,8 @@ from aqualvs.scanning.patch import (
     UP,
     Patch,
     PatchFit,
-    flat_patch,
     nearest_tangent,
     packed_plane,
-    tangent_covariance,
 )
 from aqualvs.scanning.plane_fit import TUKEY, SharedError, add_error
 
@@ -403,19 +400,6 @@ def add_shared(
                 together[k] += shared.common[cause, i] * pull[i] * terms[i, k]
         add_error(together, inverse, covariance)
 
-
-__all__ = (
-    "FLAT",
-    "MIN_BEND",
-    "Patch",
-    "PatchFit",
-    "fit_patch",
-    "flat_patch",
-    "nearest_tangent",
-    "refit_at_nearest",
-    "shows_curvature",
-    "tangent_covariance",
-)
 
 MIN_BEND = 0.003
 """Least bend of a curved net where it is seen, as a share of the range."""

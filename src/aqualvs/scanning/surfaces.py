@@ -322,15 +322,6 @@ def _claim_peaks(
             free[c] = False
 
 
-__all__ = (
-    "MIN_LINES_PER_LASER",
-    "WORTH_SHARE",
-    "Surface",
-    "find_surfaces",
-    "shares_peaks",
-    "surface_on",
-)
-
 # With more of its search lines on another surface it is a part of that one.
 _SHARED = 0.5
 

@@ -10,8 +10,7 @@ from aqualvs.geometry.compiled import (
     inline_borrowing_kernel,
     inner_borrowing_kernel,
 )
-from aqualvs.optics.camera import Camera
-from aqualvs.optics.camera_kernels import rays_all
+from aqualvs.optics.camera import Camera, rays_all
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.sheet import START, WINDOWED, meet_sheet, packed_sheets
 

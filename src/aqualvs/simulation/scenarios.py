@@ -22,7 +22,8 @@ from aqualvs.errors import OptionError
 from aqualvs.geometry.linear_algebra import Vec
 from aqualvs.geometry.planes import Plane
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
-from aqualvs.optics.camera import Dome, FlatPort
+from aqualvs.optics.dome import Dome
+from aqualvs.optics.flat_port import FlatPort
 from aqualvs.optics.lens import Lens
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Laser, Rig
 from aqualvs.optics.water import N_AIR

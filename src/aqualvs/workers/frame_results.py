@@ -13,7 +13,7 @@ import threading
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
-from typing import Protocol, TypeVar
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,9 +26,11 @@ from aqualvs.scanner import Scanner
 from aqualvs.scanning.laser_bands import plan_bands
 from aqualvs.scanning.plane_fit import PlaneFit, fit_robust, plane_of_all, shared_error
 from aqualvs.scanning.posture import Posture, Reason, Refusal, count_inliers, posture_of
-from aqualvs.scanning.row_motion import REACH, RowMotion
 from aqualvs.scanning.scan import Frame, Scan
 from aqualvs.scanning.triangulate import Triangulator
+
+if TYPE_CHECKING:
+    from aqualvs.scanning.row_motion import RowMotion
 
 # Neighbouring points are redundant; a few hundred are enough for a comparison.
 _EVERY = 4
@@ -280,11 +282,10 @@ class FrameProcessor:
 def corrected_rows(
     blocks: Generator[list[FrameResult], None, None], rig: Rig
 ) -> Generator[list[FrameResult], None, None]:
-    """Yield results as they are at the middles of the pictures of a rolling shutter, blur named.
+    """Yield results corrected to the middle of each rolling-shutter picture, blurred ones refused.
 
-    Those of shutters that need no neighbours are yielded as they are. Others come a few frames
-    after they were measured, when the frames after them are known; none is lost where their source
-    breaks off.
+    Results of shutters that need no neighbours are yielded unchanged. Others come a few frames
+    late, when the frames after them are known; none is lost where their source breaks off.
 
     Parameters
     ----------
@@ -296,6 +297,8 @@ def corrected_rows(
         if not rig.shutter.needs_neighbours:
             yield from blocks
             return
+        from aqualvs.scanning.row_motion import REACH, RowMotion
+
         motion, measured, n_done = RowMotion(rig), list[FrameResult](), 0
         block: list[FrameResult] | None = []
         broken_off = None
@@ -307,17 +310,19 @@ def corrected_rows(
             measured += block or []
             stop = max(n_done, len(measured) - (0 if block is None else REACH))
             if stop > n_done:
-                yield [_corrected(motion, measured, i) for i in range(n_done, stop)]
+                yield [_corrected(motion, measured, i, REACH) for i in range(n_done, stop)]
             n_done = min(stop, REACH)
             del measured[: stop - n_done]
         if broken_off is not None:
             raise broken_off
 
 
-def _corrected(motion: RowMotion, measured: Sequence[FrameResult], i: int) -> FrameResult:
-    """Return a result as it is at its picture's middle, by those beside it."""
+def _corrected(
+    motion: "RowMotion", measured: Sequence[FrameResult], i: int, reach: int
+) -> FrameResult:
+    """Return a result corrected to its picture's middle by up to `reach` results on each side."""
     one = measured[i]
-    beside = [*measured[max(i - REACH, 0) : i], *measured[i + 1 : i + 1 + REACH]]
+    beside = [*measured[max(i - reach, 0) : i], *measured[i + 1 : i + 1 + reach]]
     scan = motion.correct(one.scan, [other.scan for other in beside])
     seen, found, bare = one.scan.posture, scan.posture, one.bare
     if isinstance(seen, Posture) and isinstance(found, Posture) and isinstance(bare, Posture):

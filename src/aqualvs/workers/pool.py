@@ -159,7 +159,7 @@ _TAKEN = -1
 
 
 class SharedMemory:
-    """Memory that this process shares with one that it begins, to which it is given.
+    """Memory that this process shares with a process that it starts.
 
     It lies in no folder: none has to have room for it, and nothing is left behind.
 
@@ -200,11 +200,11 @@ class SharedMemory:
             return None
 
     def seal(self) -> None:
-        """Give it to no further process."""
+        """Stop giving it to further processes."""
         os.close(self._file)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Give it to a process that is about to begin."""
+        """Give it to a process that is being started."""
         return _received, (reduction.DupFd(self._file),)
 
 
@@ -215,7 +215,7 @@ def _received(file: Any) -> SharedMemory:
 
 
 class Sender:
-    """The end of a process that measures.
+    """The sending end of the channel, in a process that measures.
 
     Parameters
     ----------
@@ -256,7 +256,7 @@ class Sender:
 
 
 class Receiver:
-    """The other end, of the process that writes; see `Sender`."""
+    """The receiving end of the channel, in the process that writes; see `Sender`."""
 
     def __init__(self, pipe: Connection, memory: SharedMemory | None) -> None:
         self._pipe, self._memory = pipe, memory

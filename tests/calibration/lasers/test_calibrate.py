@@ -10,9 +10,6 @@ import pytest
 from aqualvs.calibration.lasers.calibrate import (
     LaserOptions,
     calibrate_lasers,
-    fitted,
-    leave_one_out,
-    posture,
 )
 from aqualvs.calibration.lasers.checks import LaserCalibration, match_to_rig, named
 from aqualvs.calibration.lasers.solve import InitialGuess, paper_plane, solve_lasers
@@ -185,36 +182,6 @@ def test_a_board_that_leans_is_noticed() -> None:
     trusting = calibrate_lasers(RIG, views, board_surface(), options=LaserOptions(loose=False))
     assert not any("lie unevenly" in words for words in trusting.warnings)
     assert trusting.lasers[0].sigma_normal < result.lasers[0].sigma_normal
-
-
-def test_boards_are_left_out_in_turn() -> None:
-    views = board_views(RIG, noise=NOISE, spacing=0.004)
-    held = leave_one_out(RIG, views, board_surface())
-    assert [h.name for h in held] == [v.view.name for v in views]
-    for i, h in enumerate(held):
-        assert h.n_lasers == 3
-        pose = dome_from_board(i)
-        true = pose.rotation[:, 2] @ pose.translation
-        assert h.by_board.offset == pytest.approx(true, abs=1e-3)
-        # Three stripes, a tenth of a pixel each, of three other boards.
-        assert abs(h.range_error) < 2e-3
-        assert np.rad2deg(abs(h.pitch_error)) < 1.0
-        assert np.rad2deg(abs(h.yaw_error)) < 1.0
-    with pytest.raises(CalibrationError, match="not with a box"):
-        leave_one_out(RIG, box_seen(), box())
-
-
-def test_planes_are_fitted_robustly() -> None:
-    rng = np.random.default_rng(1)
-    points = rng.uniform(-0.2, 0.2, (500, 3))
-    points[:, 1] += 0.5
-    plane = Plane.from_normal((0.1, 1.0, -0.2), 0.5)
-    points -= np.outer(plane.signed_distance(points), plane.normal)
-    points[:60, 1] += 0.1
-    found = fitted(points)
-    np.testing.assert_allclose(found.normal, plane.normal, atol=1e-4)
-    assert posture(found)[1] == pytest.approx(np.arctan2(-0.2, 1.0), abs=1e-4)
-    assert posture(found)[2] == pytest.approx(np.arctan2(0.1, 1.0), abs=1e-4)
 
 
 def test_the_papers_pseudo_inverse() -> None:

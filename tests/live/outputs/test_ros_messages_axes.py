@@ -11,11 +11,9 @@ from scipy.spatial.transform import Rotation
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.live.outputs.ros_messages import (
     FLU_FROM_DOME,
-    FRD_FROM_DOME,
     UNOBSERVABLE_VARIANCE,
     flu_angles,
     flu_from_dome,
-    frd_from_dome,
     normal_in_dome,
     plane_pose,
     pose_jacobian,
@@ -36,15 +34,12 @@ def pose_parameters(distance: float, pitch: float, yaw: float) -> FloatArray:
 
 def test_body_axes() -> None:
     assert flu_from_dome([FORWARD, -RIGHT, UP]).tolist() == np.eye(3).tolist()
-    assert frd_from_dome([FORWARD, RIGHT, -UP]).tolist() == np.eye(3).tolist()
 
 
 def test_matrices_agree_with_functions_and_are_rotations() -> None:
     points = np.random.default_rng(1).normal(size=(4, 5, 3))
     assert np.array_equal(flu_from_dome(points), points @ FLU_FROM_DOME.T)
-    assert np.array_equal(frd_from_dome(points), points @ FRD_FROM_DOME.T)
     assert np.linalg.det(FLU_FROM_DOME) == pytest.approx(1.0)
-    assert np.linalg.det(FRD_FROM_DOME) == pytest.approx(1.0)
 
 
 @given(distance=ranges, pitch=angles, yaw=angles)

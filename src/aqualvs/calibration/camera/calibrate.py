@@ -259,10 +259,6 @@ def camera(
     n_coefficients : int, optional
         Number of distortion coefficients; by default as many as the views support.
 
-    Returns
-    -------
-    CameraCalibration
-
     Raises
     ------
     CalibrationError

@@ -292,10 +292,6 @@ def dome(
         Of the intrinsics (and of the rotation, if no pose is known); by default the rig's own.
         Intrinsics without an uncertainty are taken as exact.
 
-    Returns
-    -------
-    DomeCalibration
-
     Raises
     ------
     CalibrationError

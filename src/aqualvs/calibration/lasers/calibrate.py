@@ -1,8 +1,7 @@
 """Calibration of the lasers: planes from pictures of a box, board or wall that they shine on.
 
 This is the paper's automatic calibration (section 3.3) with all lasers on at once, several pictures
-in one solve, and a covariance that includes the camera's. `leave_one_out` measures each picture's
-board with lasers that were calibrated from the other pictures.
+in one solve, and a covariance that includes the camera's.
 """
 
 from collections.abc import Sequence
@@ -11,7 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from aqualvs.calibration.lasers.candidates import plane_residuals_px
 from aqualvs.calibration.lasers.checks import (
     LaserCalibration,
     LaserFigures,
@@ -36,25 +34,20 @@ from aqualvs.calibration.lasers.laser_assignment import (
     assign_lasers,
 )
 from aqualvs.calibration.lasers.solve import InitialGuess, paper_planes, solve_lasers, tolerance_px
-from aqualvs.calibration.lasers.stripes_on_planes import PooledStripes, TargetSurfaces
+from aqualvs.calibration.lasers.stripes_on_planes import TargetSurfaces
 from aqualvs.calibration.lasers.views import LaserView, PlacedView, place_views, pooled
 from aqualvs.errors import CalibrationError, OptionError
-from aqualvs.geometry.arrays import FloatArray, IntArray
-from aqualvs.geometry.planes import Plane
+from aqualvs.geometry.arrays import IntArray
 from aqualvs.optics.rig import Laser, Rig, RigUncertainty
 
 
 class _FitLimits(NamedTuple):
-    """Residuals that indicate a fault, and points that determine a laser."""
+    """Residuals that indicate a fault."""
 
     # Larger residuals of corners, in pixels, indicate a wrong rig, medium or target.
     bad_corners_px: float = 0.5
     # The same of stripes; paint and speckle leave a tenth to a third of a pixel.
     bad_stripes_px: float = 0.7
-    # Place of each laser's stripe by the board's pose, to distinguish the lasers.
-    near_px: float = 8.0
-    min_points: int = 20
-    n_fits: int = 10
 
 
 _LIMITS = _FitLimits()
@@ -122,10 +115,6 @@ def calibrate_lasers(
     options : LaserOptions, optional
     uncertainty : RigUncertainty, optional
         Of the camera's numbers; without it they are exact.
-
-    Returns
-    -------
-    LaserCalibration
 
     Raises
     ------
@@ -268,128 +257,3 @@ def _warnings(
     if not solved.solution.converged:
         words.append("the solve did not settle; look at the residuals before using this rig")
     return words
-
-
-@dataclass(frozen=True, slots=True)
-class LeaveOneOutView:
-    """One picture, measured by lasers that were calibrated from the others.
-
-    Attributes
-    ----------
-    name : str
-        File name.
-    n_lasers : int
-        Number of lasers seen in it.
-    by_lasers, by_board : Plane
-        The surface in `dome` as measured by the lasers, and by the board's corners.
-    range_error, pitch_error, yaw_error : float
-        Lasers minus board, in metres and radians; errors of the board are included.
-    """
-
-    name: str
-    n_lasers: int
-    by_lasers: Plane
-    by_board: Plane
-    range_error: float
-    pitch_error: float
-    yaw_error: float
-
-
-def leave_one_out(
-    rig: Rig,
-    views: Sequence[LaserView],
-    surfaces: TargetSurfaces,
-    *,
-    options: LaserOptions | None = None,
-    uncertainty: RigUncertainty | None = None,
-) -> list[LeaveOneOutView]:
-    """Calibrate without each picture in turn, and measure that picture's board with the lasers.
-
-    Parameters
-    ----------
-    rig, views, surfaces, options, uncertainty
-        As `calibrate_lasers`; the target must be a board.
-
-    Returns
-    -------
-    list of LeaveOneOutView
-        One for each picture.
-
-    Raises
-    ------
-    CalibrationError
-        If a calibration fails, or a picture shows too little for a measurement.
-    """
-    if len(surfaces.planes) != 1:
-        raise CalibrationError("pictures are left out in turn only with a board, not with a box")
-    found = []
-    for i, view in enumerate(views):
-        others = [*views[:i], *views[i + 1 :]]
-        calibration = calibrate_lasers(
-            rig, others, surfaces, options=options, uncertainty=uncertainty
-        )
-        found.append(_measured(calibration, view, surfaces, options or LaserOptions()))
-    return found
-
-
-def _measured(
-    calibration: LaserCalibration, view: LaserView, surfaces: TargetSurfaces, options: LaserOptions
-) -> LeaveOneOutView:
-    rig = calibration.rig
-    seen_rig = rig if options.n_medium is None else rig.in_water(options.n_medium)
-    placed = place_views(seen_rig.camera(), [view], surfaces)[0][0]
-    planes = [figures.laser.plane for figures in calibration.lasers]
-    points, laser = _triangulated(seen_rig, placed, pooled([placed], surfaces), planes)
-    if len(points) < _LIMITS.min_points or len(np.unique(laser)) < 2:
-        raise CalibrationError(
-            f"{view.view.name}: {len(points)} points on {len(np.unique(laser))} stripes; a plane "
-            "needs two stripes"
-        )
-    by_lasers = fitted(points)
-    by_board = surfaces.placed(0, placed.dome_from_target).facing_origin()
-    ours, theirs = posture(by_lasers), posture(by_board)
-    return LeaveOneOutView(
-        name=view.view.name,
-        n_lasers=len(np.unique(laser)),
-        by_lasers=by_lasers,
-        by_board=by_board,
-        range_error=ours[0] - theirs[0],
-        pitch_error=ours[1] - theirs[1],
-        yaw_error=ours[2] - theirs[2],
-    )
-
-
-def _triangulated(
-    rig: Rig, view: PlacedView, stripes: PooledStripes, planes: Sequence[Plane]
-) -> tuple[FloatArray, FloatArray]:
-    """Return points (N, 3) where pixels meet their laser's plane, and the lasers' indices."""
-    residuals = np.abs(plane_residuals_px(stripes.placed, planes))
-    nearest = np.argmin(residuals, axis=1)
-    near = residuals[np.arange(len(nearest)), nearest] <= _LIMITS.near_px
-    laser = nearest[near]
-    rays = rig.camera().rays(view.stripes.pixels[stripes.placed.index[near]])
-    points = np.full((len(laser), 3), np.nan)
-    for i, plane in enumerate(planes):
-        mine = laser == i
-        points[mine] = plane.intersect(rays)[0][mine]
-    seen = np.all(np.isfinite(points), axis=1)
-    return points[seen], laser[seen]
-
-
-def fitted(points: FloatArray) -> Plane:
-    """Fit a plane to points (N, 3), robustly (Cauchy weights); it faces away from the origin."""
-    weights = np.ones(len(points))
-    for _ in range(_LIMITS.n_fits):
-        middle = weights @ points / weights.sum()
-        offsets = points - middle
-        normal = np.linalg.eigh((weights[:, None] * offsets).T @ offsets)[1][:, 0]
-        distance = offsets @ normal
-        scale = max(1.4826 * float(np.median(np.abs(distance))), 1e-9)
-        weights = 1.0 / (1.0 + (distance / scale) ** 2)
-    return Plane(normal, float(normal @ middle)).facing_origin()
-
-
-def posture(plane: Plane) -> tuple[float, float, float]:
-    """Return range (m), pitch and yaw (radians) of a plane, as defined in docs/conventions.md."""
-    n = plane.normal
-    return plane.offset, float(np.arctan2(n[2], n[1])), float(np.arctan2(n[0], n[1]))

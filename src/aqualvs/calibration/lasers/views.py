@@ -65,10 +65,6 @@ def spatial_pose(camera: Camera, view: View, start: SE3) -> SpatialPose:
     start : SE3
         `dome_from_target` near the solution.
 
-    Returns
-    -------
-    SpatialPose
-
     Raises
     ------
     CalibrationError

@@ -319,19 +319,6 @@ def _cross(arms: FloatArray, by_point: FloatArray) -> FloatArray:
     return np.stack([y * gz - z * gy, z * gx - x * gz, x * gy - y * gx], axis=-1)
 
 
-__all__ = [
-    "CORNERS",
-    "CORNER_SIGMA_PX",
-    "PRIORS",
-    "Bundle",
-    "BundleState",
-    "PoseTerm",
-    "TargetView",
-    "moved_target",
-    "point_by_pose",
-    "rig_difference",
-]
-
 _N_WATER = "n_water"
 
 

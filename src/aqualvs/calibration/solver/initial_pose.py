@@ -99,10 +99,6 @@ def target_pose(
     max_rms_px : float
         Largest residual of the inliers of a view of this target. Infinite accepts any pose.
 
-    Returns
-    -------
-    TargetPose
-
     Raises
     ------
     CalibrationError

@@ -300,17 +300,6 @@ def _weighted_median(values: FloatArray, weights: FloatArray) -> float:
     return float(np.interp(0.5 * heaped[-1], heaped - 0.5 * weights[order], values[order]))
 
 
-__all__ = [
-    "Block",
-    "FreeParameterError",
-    "Problem",
-    "Solution",
-    "information_of",
-    "inverse",
-    "solve",
-]
-
-
 class _DescentOptions(NamedTuple):
     """Damping of the steps (Levenberg-Marquardt), and convergence."""
 
@@ -423,10 +412,6 @@ def solve(
     remedy : callable, optional
         Gives the message, with the remedy, for a parameter that is not determined.
 
-    Returns
-    -------
-    Solution
-
     Raises
     ------
     CalibrationError
@@ -449,19 +434,6 @@ def _solved(run: "_Run[State]") -> Solution[State]:
         run.descend(_DESCENT.near)
     run.descend(_DESCENT.small_step)
     return run.solution()
-
-
-def information_of(
-    solution: Solution[State], n_parameters: int, wanted: Callable[[Block], bool]
-) -> FloatArray:
-    """Return the contribution (P, P) of some blocks to a solution's information."""
-    chosen = [i for i, block in enumerate(solution.blocks) if wanted(block)]
-    return normal_equations(
-        n_parameters,
-        [solution.blocks[i] for i in chosen],
-        [solution.inliers[i] for i in chosen],
-        [solution.block_scales[i] for i in chosen],
-    ).information
 
 
 def inverse(information: FloatArray) -> FloatArray:

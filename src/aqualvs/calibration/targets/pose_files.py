@@ -83,8 +83,6 @@ def _natural(path: Path) -> list[tuple[int, str]]:
     return [(int(n or -1), text) for n, text in re.findall(r"(\d+)|(\D+)", str(path))]
 
 
-__all__ = ["BoardPose", "load_poses", "match_poses", "picture_paths"]
-
 _MM = 1e3
 _MATRIX = tuple(f"T{row}{column}" for row in range(3) for column in range(4))
 _COLUMNS = ("file", "distance_mm", *_MATRIX)

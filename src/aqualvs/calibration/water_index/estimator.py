@@ -498,10 +498,6 @@ def calibrate_water(
     options : IndexOptions
         Assumptions about target and medium.
 
-    Returns
-    -------
-    WaterCalibration
-
     Raises
     ------
     CalibrationError

@@ -34,10 +34,7 @@ from aqualvs.sources.base import Health, PartHealth, State
 
 FLU_FROM_DOME: FloatArray = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 """Rotation from `dome` to forward, left, up."""
-FRD_FROM_DOME: FloatArray = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
-"""Rotation from `dome` to forward, right, down."""
 FLU_FROM_DOME.flags.writeable = False
-FRD_FROM_DOME.flags.writeable = False
 
 UNOBSERVABLE_VARIANCE = 1.0e4
 """Variance, in m² and rad², of what a plane leaves undetermined: 100 m, 100 rad."""
@@ -68,12 +65,6 @@ def flu_from_dome(vectors_in_dome: ArrayLike) -> FloatArray:
     """Return vectors (..., 3) of `dome` in forward, left, up."""
     vectors = as_vectors(vectors_in_dome, 3, "vectors_in_dome")
     return np.stack((vectors[..., 1], -vectors[..., 0], vectors[..., 2]), axis=-1)
-
-
-def frd_from_dome(vectors_in_dome: ArrayLike) -> FloatArray:
-    """Return vectors (..., 3) of `dome` in forward, right, down."""
-    vectors = as_vectors(vectors_in_dome, 3, "vectors_in_dome")
-    return np.stack((vectors[..., 1], vectors[..., 0], -vectors[..., 2]), axis=-1)
 
 
 def normal_in_dome(pitch: float, yaw: float) -> FloatArray:
