@@ -208,7 +208,8 @@ def test_faults_of_the_system_are_one_line(monkeypatch, capsys):
 
     monkeypatch.setattr(cli, "app", fail)
     assert main(["run"]) == 2
-    assert capsys.readouterr().err == "aqualvs: error: /somewhere/dive.mp4: Permission denied\n"
+    said = "/somewhere/dive.mp4: Permission denied; change its rights, or choose another path"
+    assert capsys.readouterr().err == f"aqualvs: error: {said}\n"
 
 
 def aqualvs(*arguments, **more):

@@ -296,7 +296,10 @@ def _exit_code(arguments: Sequence[str] | None) -> int:
     except OSError as fault:
         if fault.filename is None:
             raise
-        return _complain(f"{os.fsdecode(fault.filename)}: {fault.strerror}", _EXIT_BAD_INPUT)
+        rights = isinstance(fault, PermissionError)
+        remedy = "; change its rights, or choose another path" if rights else ""
+        said = f"{os.fsdecode(fault.filename)}: {fault.strerror}{remedy}"
+        return _complain(said, _EXIT_BAD_INPUT)
     except _USAGE_ERROR as fault:
         return _complain(f"{_usage(fault)}; see aqualvs --help", _EXIT_BAD_INPUT)
     return int(code or 0)
