@@ -249,9 +249,10 @@ class FieldPairs:
 
     def _units(self, packet: bytes | memoryview) -> Iterator[bytes]:
         """Yield the beginnings of the units that are not empty."""
-        starts = (m.end() for m in _START.finditer(packet))
         if self._n_length:
             starts = _after_lengths(packet, self._n_length)
+        else:
+            starts = (m.end() for m in _START.finditer(packet))
         # None is looked for behind the first slice, where most of a packet is.
         return (bytes(packet[at : at + _HEAD]) for at in starts if at < len(packet))
 
