@@ -17,6 +17,8 @@ NOT_FOR_A_RUN = {
     *("scipy.fft", "scipy.ndimage", "scipy.optimize", "scipy.signal", "scipy.special"),
     *("matplotlib", "pyarrow.compute", "rich", "aqualvs.vehicle_logs", "aqualvs.recording"),
     *("aqualvs.calibration.water_index.estimator", "aqualvs.nets.condition"),
+    # Points to pixels: for calibration, simulation and nets. Row motion: for rolling shutters.
+    *("aqualvs.optics.projection", "aqualvs.scanning.row_motion"),
 }
 PROGRAM = """
 import sys
