@@ -2,6 +2,7 @@
 
 import gc
 import os
+import sys
 from pathlib import Path
 
 import pytest
@@ -9,23 +10,26 @@ from hypothesis import HealthCheck, settings
 
 from repository import ROOT
 
-# Files and folders in the order in which they begin, before all others. The first has the kernels
-# of a frame compiled, once for all, while its neighbours need others; then the longest tests.
+# Files and folders in the order in which they begin, before all others. Each of the first has other
+# kernels compiled that many tests need: those of a frame, of rendering, of calibrations and of the
+# vehicle. Then the longest tests; those of commands in processes of their own, which would compile
+# the same kernels once more, only when these are there.
 LONG = (
     "test_scanner.py",
+    "simulation/test_render.py",
     "calibration",
     "control",
-    "cli/test_batch.py",
     "recovery/test_closed_loop.py",
-    "recovery/test_real_light.py",
+    "calibrate/test_shutter.py",
     "experiments/test_experiment.py",
+    "recovery/test_real_light.py",
     "docs/test_doc_commands.py",
     "cli/test_fuzz.py",
-    "calibrate/test_shutter.py",
+    "recovery",
     "cli/test_calibrate.py",
     "live/test_command.py",
-    "recovery",
     "cli",
+    "batch",
     "docs",
 )
 
@@ -67,6 +71,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 def pytest_collection_finish() -> None:
     """Free memory as usual from here, without searching what was collected again and again."""
+    if "numba" in sys.modules:
+        from kernel_locks import compile_one_at_a_time
+
+        compile_one_at_a_time()
     gc.freeze()
     # As the command line does it.
     gc.set_threshold(50_000, 20, 50)

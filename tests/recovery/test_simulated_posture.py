@@ -18,6 +18,7 @@ from aqualvs.simulation.scenario import dome_from_target
 from aqualvs.simulation.scenarios import bluerov2_rig, example_rig, flat_port_rig, load_scenario
 from aqualvs.simulation.scene import Scene, SurfaceKind, Wall, WaterOptics
 from aqualvs.simulation.truth import visible_fit
+from quick_pictures import QuickRenderer
 
 SMALL, WIDE, FLAT = "example", "bluerov2", "flat port"
 RIGS = {SMALL: example_rig, WIDE: bluerov2_rig, FLAT: flat_port_rig}
@@ -45,11 +46,19 @@ def equipment(rig_name: str) -> tuple[Renderer, Scanner]:
 
 
 @cache
+def quick(rig_name: str) -> QuickRenderer:
+    return QuickRenderer(RIGS[rig_name]())
+
+
+@cache
 def shoot(scenario_name: str, t: float, rig_name: str = SMALL) -> Shot:
     renderer, scanner = equipment(rig_name)
     scenario = load_scenario(scenario_name)
     scene = scenario.scene_at(t)
-    picture = renderer.render(scene, t, np.random.default_rng([7, round(1000 * t)]))
+    # On walls nothing but light is there, and large pictures are for what the lens does to it.
+    light_alone = rig_name != SMALL or scene.target == "wall"
+    eye = quick(rig_name) if light_alone else renderer
+    picture = eye.render(scene, t, np.random.default_rng([7, round(1000 * t)]))
     luma, chroma = planes_of_image(cv2.cvtColor(picture.image, cv2.COLOR_RGB2BGR))
     posture = scanner.process(Frame(0, t, luma, chroma)).posture
     if scene.target == "none":
