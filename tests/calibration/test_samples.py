@@ -40,7 +40,9 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def _run(*arguments: object) -> None:
-    assert main(["calibrate", *map(str, arguments)]) == 0
+    """Run a command whose last argument is the file to write, unless that is there already."""
+    if not Path(str(arguments[-1])).exists():
+        assert main(["calibrate", *map(str, arguments)]) == 0
 
 
 @pytest.fixture(scope="module")
