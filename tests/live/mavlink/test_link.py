@@ -7,6 +7,7 @@ import math
 import os
 import queue
 import signal
+import statistics
 import subprocess
 import sys
 import threading
@@ -324,15 +325,19 @@ def test_a_peer_that_takes_nothing_holds_nobody_up(lab: Lab, tmp_path: Path, kin
     output = lab.output(f"tcp:127.0.0.1:{peer.port}" if kind == "tcp" else f"serial:{device}")
     becomes(output, State.OK, "ArduSub")
     os.kill(peer.process.pid, signal.SIGSTOP)
-    took: list[float] = []
+    found_full: list[float] = []
+    n_dropped = 0
     end = time.monotonic() + TIMEOUT_S
-    while output.health().n_dropped < 50:
+    while n_dropped < 50:
         start = time.perf_counter()
         output.send(first_sample())
-        took.append(time.perf_counter() - start)
+        took = time.perf_counter() - start
+        before, n_dropped = n_dropped, output.health().n_dropped
+        if n_dropped > before:
+            found_full.append(took)
         assert time.monotonic() < end, "the line never filled"
-    # No call waited for the line: fifty of them found it full.
-    assert sorted(took)[-25] < CALL_S
+    # A busy machine holds up some of the calls that found the line full, but not half of them.
+    assert statistics.median(found_full) < CALL_S
     os.kill(peer.process.pid, signal.SIGCONT)
     peer.forget()
     stream(output, lambda: "DISTANCE_SENSOR" in kinds(peer), "a sample after the stall")
