@@ -269,7 +269,8 @@ class FieldEvidence:
                 shares.append([combed_share(luma) for luma in (one.luma, *mixed)])
         if not shares:
             return cls(is_marked, 0.0, 0.0, first_field=first_field)
-        return cls(is_marked, *np.mean(shares, axis=0).tolist(), first_field)
+        combed, woven, woven_top = np.mean(shares, axis=0).tolist()
+        return cls(is_marked, combed, woven, woven_top, first_field)
 
     @property
     def are_whole(self) -> bool:
