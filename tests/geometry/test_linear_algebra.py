@@ -1,9 +1,18 @@
-"""Cholesky's factor inside kernels, against LAPACK."""
+"""What kernels use instead of LAPACK and NumPy, against them."""
 
 import numpy as np
 import pytest
 
-from aqualvs.geometry.linear_algebra import factorise, inverse_of, solve_factorised
+from aqualvs.geometry.linear_algebra import (
+    at_rows,
+    factorise,
+    inverse_of,
+    median_of,
+    order_of,
+    select_nth,
+    solve_factorised,
+    where,
+)
 
 LEAST = 1e-13
 
@@ -49,3 +58,23 @@ def test_damping_adds_to_the_diagonal() -> None:
     assert factorise(matrix, 0.5, LEAST, factor)
     damped = matrix + 0.5 * np.diag(np.diag(matrix))
     np.testing.assert_allclose(factor, np.linalg.cholesky(damped), rtol=1e-10)
+
+
+@pytest.mark.parametrize("n", [0, 1, 2, 3, 4, 7, 40, 257])
+@pytest.mark.parametrize("with_ties", [False, True])
+def test_order_and_choice_are_those_of_numpy(n: int, with_ties: bool) -> None:
+    random = np.random.default_rng(n)
+    values = random.integers(0, 5, n).astype(float) if with_ties else random.normal(size=n)
+    np.testing.assert_array_equal(order_of(values), np.argsort(values, kind="stable"))
+    for k in {0, n // 3, n // 2, n - 1} if n else ():
+        assert select_nth(values.copy(), k) == np.sort(values)[k]
+    np.testing.assert_equal(median_of(values.copy()), np.median(values) if n else np.nan)
+    rows = where(values > 0.5)
+    np.testing.assert_array_equal(rows, np.flatnonzero(values > 0.5))
+    np.testing.assert_array_equal(at_rows(values, rows), values[values > 0.5])
+
+
+def test_nan_counts_as_highest() -> None:
+    values = np.array([3.0, np.nan, 1.0, np.nan, 2.0])
+    assert [select_nth(values.copy(), k) for k in range(3)] == [1.0, 2.0, 3.0]
+    assert np.isnan([select_nth(values.copy(), k) for k in (3, 4)]).all()

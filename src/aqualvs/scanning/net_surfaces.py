@@ -16,7 +16,7 @@ import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import borrowing_kernel, inner_kernel, kernel
-from aqualvs.geometry.linear_algebra import invert_symmetric, median_of, order_of, solve_symmetric
+from aqualvs.geometry.linear_algebra import invert_symmetric, median_of, solve_symmetric
 from aqualvs.geometry.planes import Plane
 from aqualvs.scanning.candidates import Subsegments
 from aqualvs.scanning.plane_fit import TUKEY, PlaneFit, normal_equations
@@ -45,9 +45,7 @@ def is_continuation(
         C of them.
     """
     packed = np.append(plane.normal, plane.offset)
-    turns, at_random, met = _turns(
-        subsegments.table, subsegments.laser, subsegments.first_line, first, second, packed
-    )
+    turns, at_random, met = _turns(subsegments, first, second, packed)
     # Share of the transitions at which the one surface must begin where the other ends.
     most = 0.5
     return bool(0 < turns <= max(_MAX_TURNS * at_random, 1.0) and met >= most * turns)
@@ -63,65 +61,37 @@ def seen_through(first: BoolArray, second: BoolArray, subsegments: Subsegments) 
     subsegments : Subsegments
         C of them.
     """
-    turns, at_random, _ = _turns(
-        subsegments.table, subsegments.laser, subsegments.first_line, first, second, np.zeros(4)
-    )
+    turns, at_random, _ = _turns(subsegments, first, second, np.zeros(4))
     return bool(turns >= _ENOUGH_TURNS and turns >= _MIN_TURNS * at_random)
 
 
-@kernel
 def _turns(
-    table: FloatArray,
-    laser: IntArray,
-    first_line: IntArray,
-    first: BoolArray,
-    second: BoolArray,
-    plane: FloatArray,
+    subsegments: Subsegments, first: BoolArray, second: BoolArray, plane: FloatArray
 ) -> tuple[int, float, int]:
     """Count the transitions from one surface to the other along the stripes.
 
     Also return their expected number in random order, and the number at which the step off the
     plane is one that a fold makes.
     """
-    rows, n = np.empty(laser.shape[0], np.int64), 0
-    key = np.empty(laser.shape[0])
-    for c in range(laser.shape[0]):
-        if first[c] or second[c]:
-            rows[n], key[n] = c, laser[c] * 1e6 + first_line[c]
-            n += 1
-    order = order_of(key[:n])
-    for k in range(n):
-        order[k] = rows[order[k]]
-    turns, met, n, n_second = 0, 0, 0, 0
-    at_random = 0.0
-    for k in range(order.shape[0]):
-        c = order[k]
-        n += 1
-        n_second += second[c]
-        if k + 1 == order.shape[0] or laser[order[k + 1]] != laser[c]:
-            at_random += 2.0 * n_second * (n - n_second) / n
-            n, n_second = 0, 0
-        elif second[order[k + 1]] != second[c]:
-            turns += 1
-            met += _meet(table, c, order[k + 1], plane)
-    return turns, at_random, met
-
-
-@inner_kernel
-def _meet(table: FloatArray, a: int, b: int, plane: FloatArray) -> bool:
-    """Return whether the step from one subsegment to another is one that a fold makes."""
-    square = 0.0
-    step = 0.0
-    for k in range(3):
-        apart = table[k, b] - table[k, a]
-        square += apart * apart
-        step += plane[k] * apart
-    beside = np.sqrt(max(square - step * step, 0.0))
+    rows = np.flatnonzero(first | second)
+    rows = rows[np.lexsort((subsegments.first_line[rows], subsegments.laser[rows]))]
+    laser, on_second = subsegments.laser[rows], second[rows]
+    total, n_second = np.bincount(laser), np.bincount(laser, weights=on_second)
+    seen = total > 0
+    total, n_second = total[seen], n_second[seen]
+    at_random = float(np.sum(2.0 * n_second * (total - n_second) / total))
+    turns = np.flatnonzero((laser[1:] == laser[:-1]) & (on_second[1:] != on_second[:-1]))
+    apart = (
+        subsegments.table[X : Z + 1, rows[turns + 1]] - subsegments.table[X : Z + 1, rows[turns]]
+    )
+    step = plane[:3] @ apart
+    beside = np.sqrt(np.maximum((apart * apart).sum(axis=0) - step * step, 0.0))
     # The steepest flank of a fold, and what noise adds to the step from one piece to the next, as a
     # share of the range.
     steepest = 2.0
     loose_share = 0.01
-    return bool(abs(step) <= steepest * beside + loose_share * plane[3])
+    met = np.abs(step) <= steepest * beside + loose_share * plane[3]
+    return len(turns), at_random, int(np.count_nonzero(met))
 
 
 def merged_plane(

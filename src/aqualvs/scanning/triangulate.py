@@ -5,8 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import inline_borrowing_kernel, inner_borrowing_kernel, kernel
-from aqualvs.optics.camera import Camera, CameraParams
+from aqualvs.geometry.compiled import (
+    borrowing_kernel,
+    inline_borrowing_kernel,
+    inner_borrowing_kernel,
+)
+from aqualvs.optics.camera import Camera
 from aqualvs.optics.camera_kernels import rays_all
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.sheet import START, WINDOWED, meet_sheet, packed_sheets
@@ -94,14 +98,20 @@ class Triangulator:
         out_valid: BoolArray,
     ) -> bool:
         """Triangulate into arrays (N, 3), (N, 3) and (N); return whether all points are valid."""
-        all_valid: bool = _triangulate(
-            self._camera.params,
+        n = len(pixels)
+        rays_px, owner = np.empty((2 * n, 2)), np.empty(n, np.int64)
+        n_rays = _place_rays(pixels, along_x, group, rays_px, owner)
+        origins, directions = np.empty((2, n_rays, 3))
+        seen = np.empty(n_rays, np.bool_)
+        rays_all(self._camera.params, rays_px[:n_rays], origins, directions, seen)
+        all_valid: bool = _intersect(
             self._planes,
             self._bent,
-            pixels,
-            along_x,
             laser,
-            group,
+            owner,
+            origins,
+            directions,
+            seen,
             out_points,
             out_sensitivity,
             out_valid,
@@ -109,38 +119,32 @@ class Triangulator:
         return all_valid
 
 
-@kernel
-def _triangulate(
-    camera: CameraParams,
+@borrowing_kernel
+def _intersect(
     planes: FloatArray,
     bent: FloatArray | None,
-    pixels: FloatArray,
-    along_x: IntArray,
     laser: IntArray,
-    group: IntArray,
+    owner: IntArray,
+    origins: FloatArray,
+    directions: FloatArray,
+    seen: BoolArray,
     points: FloatArray,
     sensitivity: FloatArray,
     valid: BoolArray,
 ) -> bool:
-    """Trace the pixels to the sheets; return whether all points are valid."""
-    n = pixels.shape[0]
-    rays_px, owner = np.empty((2 * n, 2)), np.empty(n, np.int64)
-    n_rays = _place_rays(pixels, along_x, group, rays_px, owner)
-    origins, directions = np.empty((n_rays, 3)), np.empty((n_rays, 3))
-    seen = np.empty(n_rays, np.bool_)
-    rays_all(camera, rays_px[:n_rays], origins, directions, seen)
+    """Intersect the rays with the sheets; return whether all points are valid."""
     _intersect_planes(planes, laser, owner, origins, directions, seen, points, sensitivity, valid)
     if bent is not None:
         _intersect_bent_sheets(
             bent, laser, owner, origins, directions, seen, points, sensitivity, valid
         )
     all_valid = True
-    for i in range(n):
+    for i in range(points.shape[0]):
         all_valid &= valid[i]
     return all_valid
 
 
-@inner_borrowing_kernel
+@borrowing_kernel
 def _place_rays(
     pixels: FloatArray,
     along_x: IntArray,
