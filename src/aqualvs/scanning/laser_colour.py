@@ -254,9 +254,7 @@ def learn_colour(table: FloatArray, colour: LaserColour, paint: Paint | None) ->
     enough = 2500
     if paint is None:
         every = 1 + table.shape[1] // enough
-        # Kernels are compiled for tables without gaps in memory.
-        some = np.ascontiguousarray(table[:, ::every])
-        found = LineColour(*_learn(some, *colour.value))
+        found = LineColour(*_learn(table[:, ::every], *colour.value))
     else:
         found = LineColour(*_learn_beside_paint(table, *colour.value, *paint), paint)
     return found if found.ratio > 0.0 else None

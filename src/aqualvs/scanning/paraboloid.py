@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import inner_borrowing_kernel, inner_kernel, kernel
+from aqualvs.geometry.compiled import ZERO, inner_borrowing_kernel, inner_kernel, kernel
 from aqualvs.geometry.linear_algebra import factorise, inverse_of, median_of, solve_factorised
 from aqualvs.geometry.planes import Plane
 from aqualvs.scanning.candidates import Observations
@@ -91,7 +91,7 @@ def fit_over(
     over_plane(points, sensitivity, patch, terms, height, per_px)
     gate, sigma, pull = np.empty(n), np.empty(n), np.empty(n)
     by_range = GATE_SHARE * patch[OFFSET]
-    n_on_plane = 0
+    n_on_plane = ZERO
     for i in range(n):
         by_pixel = GATE_PX * abs(per_px[i])
         gate[i] = np.sqrt(by_range * by_range + by_pixel * by_pixel)
