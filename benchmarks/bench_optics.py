@@ -193,14 +193,14 @@ def flat_port_rows(pixels: FloatArray) -> list[dict[str, Any]]:
         row(
             "pixel to ray, flat port",
             n,
-            lambda: FLAT.rays_into(pixels, *out),
-            lambda: CAMERA.rays_into(pixels, *out),
+            lambda: rays_all(FLAT.params, pixels, *out),
+            lambda: rays_all(CAMERA.params, pixels, *out),
         ),
         row(
             "point to pixel, flat port",
             n,
-            lambda: FLAT.project_into(flat, back, valid),
-            lambda: CAMERA.project_into(domed, back, valid),
+            lambda: project_all(FLAT.params, flat, back, valid),
+            lambda: project_all(CAMERA.params, domed, back, valid),
         ),
         row(
             "point to pixel with Jacobian, flat port",
