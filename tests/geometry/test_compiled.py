@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from aqualvs.geometry.compiled import inline_kernel, kernel
 
@@ -106,6 +107,40 @@ def test_python_may_call_what_kernels_have_inlined() -> None:
     _quotients(np.ones(1), out)
     assert out[0] == 1.0 - _quotient(1.0, 3.0)
     assert _quotient(1.0, 0.0) == np.inf
+
+
+OF_BOTH = """
+import sys
+import numpy as np
+from aqualvs.geometry.compiled import inner_kernel, kernel
+
+@inner_kernel
+def doubled(x):
+    return 2.0 * x
+
+@kernel
+def summed(x):
+    return doubled(x[0]) + doubled(x[1])
+
+calls = {"python": lambda: doubled(1.0), "kernel": lambda: summed(np.ones(2))}
+inner = doubled._for_kernels, doubled._for_python
+print(*(calls[word]() for word in ORDER), *(sum(one.stats.cache_hits.values()) for one in inner))
+"""
+
+
+@pytest.mark.parametrize("order", [["python", "kernel"], ["kernel", "python"]])
+def test_code_for_kernels_and_for_python_are_kept_apart_on_disk(
+    order: list[str], tmp_path: Path
+) -> None:
+    """One process loads what another left there; of the same code, it would jump nowhere."""
+    (tmp_path / "of_both.py").write_text(OF_BOTH.replace("ORDER", repr(order)))
+    said = {"python": "2.0", "kernel": "4.0"}
+    assert run_caller(tmp_path, "of_both.py") == [*(said[word] for word in order), "0", "0"]
+    # `summed` is loaded as a whole, and needs no `doubled`.
+    assert run_caller(tmp_path, "of_both.py") == [*(said[word] for word in order), "0", "1"]
+    for path in (tmp_path / "cache").rglob("*summed*"):
+        path.unlink()
+    assert run_caller(tmp_path, "of_both.py") == [*(said[word] for word in order), "1", "1"]
 
 
 def test_cached_kernels_follow_their_callees(tmp_path: Path) -> None:

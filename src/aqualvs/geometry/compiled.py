@@ -7,6 +7,7 @@ several machines, or by several processes, would not equal the same dive measure
 """
 
 import functools
+import types
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, TypeVar, cast
 
@@ -112,7 +113,19 @@ class _InnerKernel:
 
     @functools.cached_property
     def _for_python(self) -> Callable[..., Any]:
-        return _compiled(self.py_func, **self._options)
+        # Numba names files on disk by functions: under one name, a process could load the code
+        # without an entry for Python, and jump nowhere.
+        function = self.py_func
+        own = types.FunctionType(
+            function.__code__,
+            function.__globals__,
+            function.__name__,
+            function.__defaults__,
+            function.__closure__,
+        )
+        functools.update_wrapper(own, function)
+        own.__qualname__ += "_for_python"
+        return _compiled(own, **self._options)
 
 
 def _type_of_inner(inner: _InnerKernel, _: object) -> Any:
