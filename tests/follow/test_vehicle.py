@@ -1,16 +1,17 @@
 """`aqualvs follow SOURCE`: the parts together, with a recorded dive and no vehicle that answers."""
 
 import csv
-import importlib.resources
 import io
 import socket
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from aqualvs.control.missions import Guidance, Stage
 from aqualvs.control.safety import LimitReason
 from aqualvs.control.vehicle import Effort, Setpoint, VehicleState
+from aqualvs.demo import bundled_dive
 from aqualvs.errors import OptionError, OutputError
 from aqualvs.follow.command import FOLLOW_CSV, Aim
 from aqualvs.follow.vehicle import FollowLogOutput, FollowRequest, follow_and_tell
@@ -61,24 +62,24 @@ def test_log_has_a_row_for_every_step(tmp_path: Path) -> None:
         assert (row["posture"] == "valid") is bool(sample.scan.posture)
 
 
+def demo_request(out: Path, **more: Any) -> FollowRequest:
+    """Return a request to follow the net of the bundled dive, with BlueROV2's gains."""
+    demo = Path(str(bundled_dive()))
+    usual: dict[str, Any] = {"gains": "bluerov2", "aim": Aim(range=0.5)}
+    return FollowRequest(
+        source=str(demo / "dive.mp4"), rig=demo / "rig.yaml", out=out, **(usual | more)
+    )
+
+
 def test_a_dive_without_a_vehicle_is_logged_and_never_steered(tmp_path: Path) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as nobody:
         nobody.bind(("127.0.0.1", 0))
         port = nobody.getsockname()[1]
         told: list[str] = []
-        folder = importlib.resources.files("aqualvs") / "data" / "demo"
-        with importlib.resources.as_file(folder) as demo:
-            request = FollowRequest(
-                source=str(demo / "dive.mp4"),
-                rig=demo / "rig.yaml",
-                mavlink=f"udpout:127.0.0.1:{port}",
-                gains="bluerov2",
-                out=tmp_path,
-                aim=Aim(range=0.5),
-            )
-            # Two lines: both times there is no vehicle that could be steered.
-            keys = io.StringIO("\n\n")
-            assert follow_and_tell(request, lambda line: told.append(line), keys) == 0
+        request = demo_request(tmp_path, mavlink=f"udpout:127.0.0.1:{port}")
+        # Two lines: both times there is no vehicle that could be steered.
+        keys = io.StringIO("\n\n")
+        assert follow_and_tell(request, lambda line: told.append(line), keys) == 0
     assert sum("not engaged" in line and "silent" in line for line in told) == 2
     with (tmp_path / FOLLOW_CSV).open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
@@ -106,32 +107,13 @@ def test_the_log_of_an_earlier_dive_stays(
             log.write_text(earlier, encoding="utf-8")
     else:
         log.write_text(earlier, encoding="utf-8")
-    folder = importlib.resources.files("aqualvs") / "data" / "demo"
-    with importlib.resources.as_file(folder) as demo:
-        request = FollowRequest(
-            source=str(demo / "dive.mp4"),
-            rig=demo / "rig.yaml",
-            mavlink="udpout:127.0.0.1:9",
-            gains="bluerov2",
-            out=tmp_path,
-            aim=Aim(range=0.5),
-            overwrite=overwrite,
-        )
-        with pytest.raises(OutputError, match=words):
-            follow_and_tell(request, lambda _: None, io.StringIO())
+    request = demo_request(tmp_path, mavlink="udpout:127.0.0.1:9", overwrite=overwrite)
+    with pytest.raises(OutputError, match=words):
+        follow_and_tell(request, lambda _: None, io.StringIO())
     assert log.read_text(encoding="utf-8") == earlier
 
 
 def test_gains_that_are_not_there_are_told(tmp_path: Path) -> None:
-    folder = importlib.resources.files("aqualvs") / "data" / "demo"
-    with importlib.resources.as_file(folder) as demo:
-        request = FollowRequest(
-            source=str(demo / "dive.mp4"),
-            rig=demo / "rig.yaml",
-            mavlink="udpout:127.0.0.1:14550",
-            gains="submarine",
-            out=tmp_path,
-            aim=Aim(),
-        )
-        with pytest.raises(OptionError, match="submarine"):
-            follow_and_tell(request, print, io.StringIO())
+    request = demo_request(tmp_path, mavlink="udpout:127.0.0.1:14550", gains="submarine", aim=Aim())
+    with pytest.raises(OptionError, match="submarine"):
+        follow_and_tell(request, print, io.StringIO())

@@ -257,6 +257,19 @@ class FieldPairs:
         return (bytes(packet[at : at + _HEAD]) for at in starts if at < len(packet))
 
 
+def field_pairs(codec: str, extradata: bytes | None) -> FieldPairs | None:
+    """Return the detector of second fields for a stream; None if it is not H.264.
+
+    Parameters
+    ----------
+    codec : str
+        Name that FFmpeg gives the codec.
+    extradata : bytes or None
+        Of the stream.
+    """
+    return FieldPairs(extradata or b"") if codec == "h264" else None
+
+
 class _Bits:
     """Reader of bits and Exp-Golomb codes (9.1) of a unit's payload; zeros past its end."""
 

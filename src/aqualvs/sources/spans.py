@@ -278,10 +278,10 @@ class _Packets:
             return None
 
     def _field_pairs(self) -> "FieldPairs | None":
-        from aqualvs.sources.h264 import FieldPairs
+        from aqualvs.sources.h264 import field_pairs
 
         context = self._stream.codec_context
-        return FieldPairs(context.extradata or b"") if context.name == "h264" else None
+        return field_pairs(context.name, context.extradata)
 
     def _may_begin_here(self, packet: "Packet[VideoStream]") -> bool:
         if self._units is None:

@@ -22,7 +22,7 @@ from aqualvs.errors import SourceError
 from aqualvs.optics.shutter import Field
 from aqualvs.scanning.scan import Frame
 from aqualvs.sources.base import frame_of
-from aqualvs.sources.h264 import FieldPairs
+from aqualvs.sources.h264 import FieldPairs, field_pairs
 from aqualvs.sources.spans import promised_duration
 
 
@@ -65,7 +65,7 @@ class FrameCounter:
         codec : VideoCodecContext
             Of the stream.
         """
-        self._fields = FieldPairs(codec.extradata or b"") if codec.name == "h264" else None
+        self._fields = field_pairs(codec.name, codec.extradata)
 
     def expect(self, packet: "Packet[VideoStream]") -> None:
         """Note a packet; the empty one that flushes the decoder does not count.
@@ -216,7 +216,7 @@ class VideoSource(Closing):
     def _packets_are_fields(self) -> bool:
         """Return whether every packet is one field and has a time, which containers count."""
         codec = self._stream.codec_context
-        pairs = FieldPairs(codec.extradata or b"") if codec.name == "h264" else None
+        pairs = field_pairs(codec.name, codec.extradata)
         if pairs is None:
             return False
         first: list[Packet[VideoStream]] = []
