@@ -6,6 +6,7 @@ at random such that the camera meets them. A scenario file is short YAML with th
 """
 
 import difflib
+import functools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -173,7 +174,13 @@ class Course:
         if self.mode == "steps":
             # The small addition keeps frame times such as 0.4 s after a step despite rounding.
             return float(self.values[min(int(share * n + 1e-9), n - 1)])
-        return float(PchipInterpolator(np.linspace(0.0, 1.0, n), self.values)(share))
+        return float(_smooth(tuple(self.values))(share))
+
+
+# Pictures of a shutter that rolls ask for some hundred times each.
+@functools.lru_cache(maxsize=64)
+def _smooth(values: tuple[float, ...]) -> PchipInterpolator:
+    return PchipInterpolator(np.linspace(0.0, 1.0, len(values)), values)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
