@@ -57,33 +57,17 @@ _Count = Annotated[int, Field(gt=0)]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Nominal:
-    """Nominal rig, as known from its drawings.
-
-    Attributes
-    ----------
-    name : str
-    size_px : (int, int) or None
-        Image width and height.
-    housing : Dome, FlatPort or None
-    n_air, n_water : float
-    n_lasers : int or None
-    wavelength_nm : float or None
-        Of the lasers; None if unknown, or if they differ.
-    working_range : (float, float)
-        Metres.
-    shutter : Shutter
-        Of the camera.
-    """
+    """Nominal rig, as known from its drawings."""
 
     name: str = "rig"
-    size_px: tuple[int, int] | None = None
+    size_px: tuple[int, int] | None = None  # Image width and height.
     housing: Housing | None = None
     n_air: float = N_AIR
     n_water: float = WATER_N
     n_lasers: int | None = None
-    wavelength_nm: float | None = None
-    working_range: tuple[float, float] = (0.25, 1.3)
-    shutter: Shutter = AT_ONCE
+    wavelength_nm: float | None = None  # Of the lasers; None if unknown, or if they differ.
+    working_range: tuple[float, float] = (0.25, 1.3)  # Metres.
+    shutter: Shutter = AT_ONCE  # Of the camera.
 
 
 class _Part(BaseModel):
@@ -202,27 +186,13 @@ Detect: TypeAlias = Callable[[str, Image], View | str]
 
 @dataclass(frozen=True, slots=True)
 class DetectedTargets:
-    """Targets found in a set of pictures.
+    """Targets found in a set of pictures."""
 
-    Attributes
-    ----------
-    views : tuple of View
-        Of the pictures in which the target was found.
-    pictures : tuple of Picture
-        Those pictures.
-    size_px : (int, int)
-        Width and height of every picture.
-    missed : dict
-        Names of pictures in which it was not found, with the reason.
-    pose_notes : tuple of str
-        Remarks on the poses that were given for them.
-    """
-
-    views: tuple[View, ...]
-    pictures: tuple[Picture, ...]
-    size_px: tuple[int, int]
-    missed: dict[str, str]
-    pose_notes: tuple[str, ...] = ()
+    views: tuple[View, ...]  # Of the pictures in which the target was found.
+    pictures: tuple[Picture, ...]  # Those pictures.
+    size_px: tuple[int, int]  # Width and height of every picture.
+    missed: dict[str, str]  # Names of pictures in which it was not found, with the reason.
+    pose_notes: tuple[str, ...] = ()  # Remarks on the poses that were given for them.
 
     @property
     def first(self) -> str:

@@ -103,17 +103,11 @@ class _Target:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LasersResult(Calibration[LaserCalibration]):
-    """Result of `calibrate_lasers`.
+    """Result of `calibrate_lasers`."""
 
-    Attributes
-    ----------
-    n_medium : float
-        Index outside of the dome in the pictures.
-    views : tuple of LaserView
-        Corners and stripes of every picture in which the target was found.
-    """
-
+    # Index outside of the dome in the pictures.
     n_medium: float
+    # Corners and stripes of every picture in which the target was found.
     views: tuple[LaserView, ...]
 
 

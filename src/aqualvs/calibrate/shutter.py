@@ -55,21 +55,14 @@ class ShutterRequest:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ShutterCalibration:
-    """Readout of a shutter, as a dive shows it.
+    """Readout of a shutter, as a dive shows it."""
 
-    Attributes
-    ----------
-    readout, sigma : float
-        As in `Shutter`, and its standard deviation, in seconds.
-    n_frames : int
-        Frames with a posture.
-    times, parts : array, shape (N,)
-        Middles of the parts of the dive, and the readout of each, in seconds.
-    """
-
+    # As in `Shutter`, and its standard deviation, in seconds.
     readout: float
     sigma: float
+    # Frames with a posture.
     n_frames: int
+    # Shape (N,): middles of the parts of the dive, and the readout of each, in seconds.
     times: FloatArray
     parts: FloatArray
 

@@ -24,42 +24,25 @@ from aqualvs.optics.water import N_AIR
 
 @dataclass(frozen=True, slots=True)
 class ForeignHousing:
-    """A housing and the media inside and outside of it, in the frame of the camera.
-
-    Attributes
-    ----------
-    housing : Dome or FlatPort
-    n_air, n_water : float
-        Refractive indices.
-    centre : array, shape (3,)
-        Centre of the dome in `cam`, in metres; zero for a flat port, whose origin is the lens.
-    """
+    """A housing and the media inside and outside of it, in the frame of the camera."""
 
     housing: Dome | FlatPort
+    # Refractive indices.
     n_air: float
     n_water: float
+    # Shape (3,): centre of the dome in `cam`, in metres; zero for a flat port, whose origin is the
+    # lens.
     centre: FloatArray = field(default_factory=lambda: np.zeros(3))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ForeignCamera:
-    """What the file of another program says of one camera.
-
-    Attributes
-    ----------
-    name : str
-    size_px : (int, int) or None
-        Image width and height; None where the file does not say it.
-    lens : Lens
-        The centre of the top-left pixel is (0, 0).
-    port : ForeignHousing or None
-        None for a camera without a housing.
-    """
+    """What the file of another program says of one camera."""
 
     name: str
-    size_px: tuple[int, int] | None
-    lens: Lens
-    port: ForeignHousing | None = None
+    size_px: tuple[int, int] | None  # Image width and height; None where the file does not say it.
+    lens: Lens  # The centre of the top-left pixel is (0, 0).
+    port: ForeignHousing | None = None  # None for a camera without a housing.
 
 
 def opencv_lens(core: Sequence[float], distortion: Sequence[float], *, fisheye: bool) -> Lens:
@@ -175,17 +158,10 @@ _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 
 @dataclass(frozen=True, slots=True)
 class Entries:
-    """A mapping of a file.
-
-    Attributes
-    ----------
-    content : mapping
-    place : str
-        Where it is in the file, such as "cam0."; empty at the top.
-    """
+    """A mapping of a file."""
 
     content: Mapping[Any, Any]
-    place: str = ""
+    place: str = ""  # Where it is in the file, such as "cam0."; empty at the top.
 
     def first(self, keys: Sequence[str]) -> str:
         """Return the first of some keys that there is.

@@ -186,47 +186,32 @@ _LIMITS = _FindingLimits()
 
 @dataclass(frozen=True, slots=True)
 class CameraCalibration:
-    """Result of a camera calibration: intrinsics with their uncertainty.
-
-    Attributes
-    ----------
-    lens : Lens
-    size_px : (int, int)
-        Image width and height.
-    uncertainty : RigUncertainty
-        Of the intrinsics, from the disagreement of the views (`solver.covariance`).
-    inflation : float
-        Ratio of that variance to the variance for independent errors of corners.
-    views : tuple of ViewFit
-        Poses are `cam_from_target`.
-    left_out : dict
-        Names of views that were not used, with the reason.
-    noise_px : float
-        Typical standard deviation of a corner's coordinate.
-    coverage : int array, shape (6, 8)
-        Number of corners in each cell of the picture.
-    cross_validation_rms_px : float
-        Root mean square error of a model from three views in four for the corners of the
-        fourth; NaN where there are too few views.
-    bend_height : float
-        Height difference between the highest and the lowest corner of a bent board, in metres;
-        0 for a board whose views show no bend.
-    findings : tuple of str
-        Remarks for the user, in plain words.
-    n_iterations : int
-    """
+    """Result of a camera calibration: intrinsics with their uncertainty."""
 
     lens: Lens
+    # Image width and height.
     size_px: tuple[int, int]
+    # Of the intrinsics, from the disagreement of the views (`solver.covariance`).
     uncertainty: RigUncertainty
+    # Ratio of that variance to the variance for independent errors of corners.
     inflation: float
+    # Poses are `cam_from_target`.
     views: tuple[ViewFit, ...]
+    # Names of views that were not used, with the reason.
     left_out: dict[str, str]
+    # Typical standard deviation of a corner's coordinate.
     noise_px: float
+    # Shape (6, 8): number of corners in each cell of the picture.
     coverage: IntArray
+    # Root mean square error of a model from three views in four for the corners of the fourth; NaN
+    # where there are too few views.
     cross_validation_rms_px: float
+    # Height difference between the highest and the lowest corner of a bent board, in metres; 0 for
+    # a board whose views show no bend.
     bend_height: float
+    # Remarks for the user, in plain words.
     findings: tuple[str, ...]
+
     n_iterations: int
 
     @property

@@ -46,24 +46,12 @@ _TERMS = {2: ((2, 0), (1, 1), (0, 2)), 3: ((3, 0), (2, 1), (1, 2), (0, 3))}
 
 @dataclass(frozen=True, slots=True)
 class BoardBend:
-    """A board's surface: z = sum of coefficient times x^i y^j, beside a plane.
+    """A board's surface: z = sum of coefficient times x^i y^j, beside a plane."""
 
-    Attributes
-    ----------
-    centre : array, shape (2,)
-        Origin of x and y, in `board`, metres.
-    half_size : float
-        Unit of x and y, in metres: half of the corners' longer extent.
-    exponents : tuple of (int, int)
-        i and j of every term.
-    coefficients : array, shape (K,)
-        In metres.
-    """
-
-    centre: FloatArray
-    half_size: float
-    exponents: tuple[tuple[int, int], ...]
-    coefficients: FloatArray
+    centre: FloatArray  # Shape (2,): origin of x and y, in `board`, metres.
+    half_size: float  # Unit of x and y, in metres: half of the corners' longer extent.
+    exponents: tuple[tuple[int, int], ...]  # i and j of every term.
+    coefficients: FloatArray  # Shape (K,): in metres.
 
     @classmethod
     def flat(cls, views: Sequence[View], degree: int) -> "BoardBend":
@@ -153,19 +141,12 @@ class _BentBundle:
 
 @dataclass(frozen=True, slots=True)
 class BentFit:
-    """A bundle solved together with its board's bend.
-
-    Attributes
-    ----------
-    bend : BoardBend
-    bundle : Bundle
-        With its points on the bent board.
-    solution : Solution
-        The bend's coefficients are the last columns of its covariance.
-    """
+    """A bundle solved together with its board's bend."""
 
     bend: BoardBend
+    # With its points on the bent board.
     bundle: Bundle
+    # The bend's coefficients are the last columns of its covariance.
     solution: Solution[BundleState]
 
 

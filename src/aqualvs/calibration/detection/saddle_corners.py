@@ -344,23 +344,15 @@ GreyImage = NDArray[np.uint8]
 
 @dataclass(frozen=True, slots=True)
 class SaddleFit:
-    """Corners refined to sub-pixel accuracy.
+    """Corners refined to sub-pixel accuracy."""
 
-    Attributes
-    ----------
-    pixels : array, shape (N, 2)
-        In `image`; the starting place where not valid.
-    sigma : array, shape (N,)
-        Standard deviation of a coordinate from the fit's own residual, in pixels.
-    blur : array, shape (N,)
-        Standard deviation of the blur across the edges, in pixels.
-    valid : bool array, shape (N,)
-        False where the pixels do not fit the model, or the corner moved too far.
-    """
-
+    # Shape (N, 2): in `image`; the starting place where not valid.
     pixels: FloatArray
+    # Shape (N,): standard deviation of a coordinate from the fit's own residual, in pixels.
     sigma: FloatArray
+    # Shape (N,): standard deviation of the blur across the edges, in pixels.
     blur: FloatArray
+    # Shape (N,): False where the pixels do not fit the model, or the corner moved too far.
     valid: BoolArray
 
 

@@ -251,14 +251,9 @@ def _gain(solution: Solution[BundleState], rival: Solution[BundleState]) -> floa
 
 @dataclass(frozen=True, slots=True)
 class SharedDistanceError:
-    """An error that all given distances share, estimated from the pictures.
+    """An error that all given distances share, estimated from the pictures."""
 
-    Attributes
-    ----------
-    value, sigma : float
-        In metres for an offset; a share for a scale. Given minus true.
-    """
-
+    # In metres for an offset; a share for a scale. Given minus true.
     value: float
     sigma: float
 

@@ -90,21 +90,11 @@ _COLUMNS = ("file", "distance_mm", *_MATRIX)
 
 @dataclass(frozen=True, slots=True)
 class BoardPose:
-    """Measured pose of a board, one row of the file.
+    """Measured pose of a board, one row of the file."""
 
-    Attributes
-    ----------
-    name : str
-        File name of the picture.
-    distance : float or None
-        Distance along the y axis of `dome` to the board's plane, in metres.
-    dome_from_board : SE3 or None
-        The whole pose.
-    """
-
-    name: str
-    distance: float | None
-    dome_from_board: SE3 | None
+    name: str  # File name of the picture.
+    distance: float | None  # Distance along the y axis of `dome` to the board's plane, in metres.
+    dome_from_board: SE3 | None  # The whole pose.
 
 
 def load_poses(path: str | Path) -> tuple[BoardPose, ...]:
