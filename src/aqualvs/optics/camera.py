@@ -46,15 +46,9 @@ Housing = Dome | FlatPort
 
 
 class BareParams(NamedTuple):
-    """A lens in the outer medium itself, as kernels take it.
+    """A lens in the outer medium itself, as kernels take it."""
 
-    Attributes
-    ----------
-    centre : tuple of 3 float
-        The lens position L in `dome`, metres.
-    """
-
-    centre: Vector
+    centre: Vector  # The lens position L in `dome`, metres.
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -78,20 +72,13 @@ trace_port = chosen_by_class(
 
 
 class CameraParams(NamedTuple):
-    """A camera as kernels take it; `camera.params` makes it.
+    """A camera as kernels take it; `camera.params` makes it."""
 
-    Attributes
-    ----------
-    lens : LensParams
-        Intrinsics.
-    rotation : tuple of 9 float
-        `dome_from_cam`, row by row.
-    port : BareParams, DomeParams or FlatParams
-        What stands between the lens and the outer medium, and the lens position.
-    """
-
+    # Intrinsics.
     lens: LensParams
+    # `dome_from_cam`, row by row.
     rotation: tuple[float, float, float, float, float, float, float, float, float]
+    # What stands between the lens and the outer medium, and the lens position.
     port: BareParams | DomeParams | FlatParams
 
 
@@ -316,21 +303,11 @@ class Camera(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _CompiledCamera:
-    """A camera computed by compiled kernels from the numbers in `params`.
+    """A camera computed by compiled kernels from the numbers in `params`."""
 
-    Attributes
-    ----------
-    size_px : (int, int)
-        Image width and height.
-    lens : Lens
-        Intrinsics, calibrated in air without the housing.
-    dome_from_cam : SE3
-        Camera pose in `dome`; the translation is the lens position L in metres.
-    """
-
-    size_px: tuple[int, int]
-    lens: Lens
-    dome_from_cam: SE3
+    size_px: tuple[int, int]  # Image width and height.
+    lens: Lens  # Intrinsics, calibrated in air without the housing.
+    dome_from_cam: SE3  # Camera pose in `dome`; the translation is the lens position L in metres.
     params: CameraParams = field(init=False, repr=False, compare=False)
     """Packed numbers for compiled kernels."""
 

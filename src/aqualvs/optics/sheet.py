@@ -282,22 +282,16 @@ _USUAL_REACH = 0.6
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sheet:
-    """The light of one laser in the water, in `dome`.
+    """The light of one laser in the water, in `dome`."""
 
-    Attributes
-    ----------
-    plane : Plane
-        As `Laser.plane`: in air, where there is a window.
-    window : Window or None
-        As `Laser.window`.
-    n_air, n_water : float
-        Refractive indices behind the window and in front of it.
-    """
-
+    # As `Laser.plane`: in air, where there is a window.
     plane: Plane
+    # As `Laser.window`.
     window: Window | None = None
+    # Refractive indices behind the window and in front of it.
     n_air: float = 1.0
     n_water: float = 1.0
+
     _row: FloatArray = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:

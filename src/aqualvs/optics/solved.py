@@ -62,24 +62,16 @@ _UNIT_OF = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SolvedStep:
-    """Record of a calibration step: its date, data and residuals.
+    """Record of a calibration step: its date, data and residuals."""
 
-    Attributes
-    ----------
-    date : datetime
-        With a time zone.
-    pictures, points : int
-        Number used; points are corners or stripe points.
-    rms_px : float
-        Root mean square residual of a coordinate, in pixels.
-    extras : mapping
-        Other values to keep: numbers, strings, lists of them.
-    """
-
+    # With a time zone.
     date: datetime = field(default_factory=lambda: datetime.now(UTC))
+    # Number used; points are corners or stripe points.
     pictures: int
     points: int
+    # Root mean square residual of a coordinate, in pixels.
     rms_px: float
+    # Other values to keep: numbers, strings, lists of them.
     extras: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -340,19 +332,10 @@ _FLAT = ("port_distance", "thickness", "n_port", "port_tilt_x", "port_tilt_y")
 
 @dataclass(frozen=True, slots=True)
 class Assumption:
-    """Default uncertainty of numbers of a rig that belong together.
+    """Default uncertainty of numbers of a rig that belong together."""
 
-    Attributes
-    ----------
-    what : str
-        Name of the group of numbers.
-    words : str
-        The standard deviations as text.
-    uncertainty : RigUncertainty
-    """
-
-    what: str
-    words: str
+    what: str  # Name of the group of numbers.
+    words: str  # The standard deviations as text.
     uncertainty: RigUncertainty
 
 

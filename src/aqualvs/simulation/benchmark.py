@@ -299,21 +299,11 @@ _OVER: dict[str, dict[str, dict[str, Any]]] = {
 
 @dataclass(frozen=True, slots=True)
 class BenchmarkDive:
-    """A dive of the set.
+    """A dive of the set."""
 
-    Attributes
-    ----------
-    name : str
-        `LEVEL_COURSE`; the name of its folder and of its row in scores.
-    level : str
-        One of `LEVELS`.
-    scenario : Scenario
-        Scenario to render.
-    """
-
-    name: str
-    level: str
-    scenario: Scenario
+    name: str  # `LEVEL_COURSE`; the name of its folder and of its row in scores.
+    level: str  # One of `LEVELS`.
+    scenario: Scenario  # Scenario to render.
 
     def shortened(self, n_frames: int) -> "BenchmarkDive":
         """Return the same dive in fewer frames, spread over all of its time."""

@@ -120,21 +120,14 @@ def _foot(scenario: Scenario, t: float) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class DiveFiles:
-    """Files written by `simulate_dive`.
+    """Files written by `simulate_dive`."""
 
-    Attributes
-    ----------
-    video, truth : Path
-        `dive.mp4` and `truth.csv`.
-    points : tuple of Path
-        `points_FFFF.npz` of the requested frames.
-    n_frames : int
-        Frames written.
-    """
-
+    # `dive.mp4` and `truth.csv`.
     video: Path
     truth: Path
+    # `points_FFFF.npz` of the requested frames.
     points: tuple[Path, ...]
+    # Frames written.
     n_frames: int
 
 

@@ -120,27 +120,13 @@ _STEPS = _FoldSteps()
 
 
 class Strand(NamedTuple):
-    """Intersection of a ray with a strand.
+    """Intersection of a ray with a strand."""
 
-    Attributes
-    ----------
-    t : float
-        Distance along the ray; infinite where it misses.
-    normal : (float, float, float)
-        Outward normal of the cylinder in `dome`.
-    along : float
-        Position along the strand, in metres.
-    across : float
-        Lateral position on the strand, -1 to 1 of its radius.
-    growth : float
-        Thickness of the growth there, as a fraction of the twine's radius.
-    """
-
-    t: float
-    normal: Vec
-    along: float
-    across: float
-    growth: float
+    t: float  # Distance along the ray; infinite where it misses.
+    normal: Vec  # Outward normal of the cylinder in `dome`.
+    along: float  # Position along the strand, in metres.
+    across: float  # Lateral position on the strand, -1 to 1 of its radius.
+    growth: float  # Thickness of the growth there, as a fraction of the twine's radius.
 
 
 def pack_net(net: Net, dome_from_scene: SE3) -> FloatArray:

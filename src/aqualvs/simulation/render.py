@@ -187,17 +187,11 @@ SceneAt: TypeAlias = Callable[[float], Scene]
 
 @dataclass(frozen=True, slots=True)
 class RenderedFrame:
-    """One rendered frame and its truth.
+    """One rendered frame and its truth."""
 
-    Attributes
-    ----------
-    image : uint8 array, shape (height, width, 3)
-        Red, green, blue.
-    lit : LitPoints
-        Points where the middles of the laser sheets meet surfaces that the camera sees.
-    """
-
+    # Shape (height, width, 3): red, green, blue.
     image: NDArray[np.uint8]
+    # Points where the middles of the laser sheets meet surfaces that the camera sees.
     lit: LitPoints
 
 
@@ -205,30 +199,23 @@ class RenderedFrame:
 class Renderer:
     """Renderer of scenes for one rig in one water.
 
-    Attributes
-    ----------
-    rig : Rig
-        Camera, housing, water and lasers.
-    sources : sequence of LaserSource
-        One for each laser; by default they follow from the rig (`default_sources`).
-    samples : int
-        Rays along each side of a pixel: 2 means four rays a pixel.
-    threads : int
-        Number of bands of rows rendered in parallel; the picture does not depend on it.
-    camera : SimulatedCamera
-        Sensor and processing; the rig has the place of the lens.
-
     Raises
     ------
     RigError
         If the sources do not fit the rig's lasers.
     """
 
+    # Camera, housing, water and lasers.
     rig: Rig
+    # One for each laser; by default they follow from the rig (`default_sources`).
     sources: Sequence[LaserSource] = ()
+    # Rays along each side of a pixel: 2 means four rays a pixel.
     samples: int = 2
+    # Number of bands of rows rendered in parallel; the picture does not depend on it.
     threads: int = 1
+    # Sensor and processing; the rig has the place of the lens.
     camera: SimulatedCamera = IDEAL
+
     _corners: CornerRays = field(init=False, repr=False)
     _beams: Beams = field(init=False, repr=False)
 

@@ -140,24 +140,16 @@ def dome_from_target(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Course:
-    """One quantity over time: interpolated values, with a sway on top.
+    """One quantity over time: interpolated values, with a sway on top."""
 
-    Attributes
-    ----------
-    values : sequence of float
-        Passed at equal intervals from the start to the end of the dive; one value holds still.
-    mode : {"smooth", "steps"}
-        Smooth passes through the values without overshoot; steps holds each of them for its
-        share of the dive.
-    sway : float
-        Amplitude of a sine on top.
-    period : float
-        Of that sine, in seconds.
-    """
-
+    # Passed at equal intervals from the start to the end of the dive; one value holds still.
     values: Sequence[float] = (0.0,)
+    # Smooth passes through the values without overshoot; steps holds each of them for its share of
+    # the dive.
     mode: Literal["smooth", "steps"] = "smooth"
+    # Amplitude of a sine on top.
     sway: float = 0.0
+    # Of that sine, in seconds.
     period: float = 4.0
 
     def at(self, t: float, duration: float) -> float:
@@ -178,19 +170,13 @@ class Course:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Trajectory:
-    """Posture over time.
+    """Posture over time."""
 
-    Attributes
-    ----------
-    distance, pitch, yaw : Course
-        Metres and radians.
-    slide_x, slide_z : Course
-        Shift of the target in its plane, in metres.
-    """
-
+    # Metres and radians.
     distance: Course = field(default_factory=lambda: Course(values=(0.6,)))
     pitch: Course = field(default_factory=Course)
     yaw: Course = field(default_factory=Course)
+    # Shift of the target in its plane, in metres.
     slide_x: Course = field(default_factory=Course)
     slide_z: Course = field(default_factory=Course)
 
@@ -207,34 +193,21 @@ class Trajectory:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scenario:
-    """Scenario of a dive: scene and motion, before rendering.
+    """Scenario of a dive: scene and motion, before rendering."""
 
-    Attributes
-    ----------
-    name : str
-        Name in reports.
-    duration : float
-        In seconds.
-    fps : float
-        Frames a second.
-    seed : int
-        Seed of noise and everything else that is random.
-    shutter : str or None
-        Of the camera, in the words of `--shutter`; None leaves the rig's.
-    trajectory : Trajectory
-        Posture of the vehicle over time.
-    target : {"net", "wall", "none"}
-        Content of the target plane; "none" if it is empty.
-    walls, nets, fish, bubbles, boxes, water, sensor, lasers_on
-        As in `Scene`; they move with the target.
-    """
-
+    # Name in reports.
     name: str
+    # In seconds.
     duration: float
+    # Frames a second.
     fps: float = 25.0
+    # Seed of noise and everything else that is random.
     seed: int = 0
+    # Posture of the vehicle over time.
     trajectory: Trajectory = field(default_factory=Trajectory)
+    # Content of the target plane; "none" if it is empty.
     target: Target = "none"
+    # As in `Scene`; they move with the target.
     walls: tuple[Wall, ...] = ()
     nets: tuple[Net, ...] = ()
     fish: tuple[Fish, ...] = ()
@@ -243,6 +216,7 @@ class Scenario:
     water: WaterOptics = field(default_factory=WaterOptics)
     sensor: CameraSensor = field(default_factory=CameraSensor)
     lasers_on: bool = True
+    # Of the camera, in the words of `--shutter`; None leaves the rig's.
     shutter: str | None = None
 
     @property

@@ -52,22 +52,15 @@ class Surfaces(NamedTuple):
 
 
 class Hit(NamedTuple):
-    """Intersection of a ray with the first opaque surface.
+    """Intersection of a ray with the first opaque surface."""
 
-    Attributes
-    ----------
-    t : float
-        Distance along the ray in metres; infinite if the ray meets nothing.
-    kind, row : int
-        `Label` of the surface and its place in the table.
-    normal : (float, float, float)
-        Unit normal towards the ray's origin; only set for nets and boxes, whose intersection
-        gives it.
-    """
-
+    # Distance along the ray in metres; infinite if the ray meets nothing.
     t: float
+    # `Label` of the surface and its place in the table.
     kind: int
     row: int
+    # Unit normal towards the ray's origin; only set for nets and boxes, whose intersection gives
+    # it.
     normal: Vec
 
 

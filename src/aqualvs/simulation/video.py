@@ -24,27 +24,21 @@ Codec: TypeAlias = Literal["h264", "lossless", "mjpeg"]
 class Compression:
     """Compression of a video.
 
-    Attributes
-    ----------
-    codec : {"h264", "lossless", "mjpeg"}
-        H.264 with chroma at half resolution (4:2:0), as ROVs record; lossless H.264 in RGB; or
-        every frame as a separate JPEG (4:2:0, full range), as from USB cameras.
-    crf : int
-        Quality of "h264", 0 to 51; smaller is better. Ignored when `bit_rate` is given.
-    bit_rate : int or None
-        Bits a second of "h264".
-    jpeg_quality : int
-        Of "mjpeg", 1 to 100; larger is better.
-
     Raises
     ------
     OptionError
         If a value makes no sense.
     """
 
+    # {"h264", "lossless", "mjpeg"}: H.264 with chroma at half resolution (4:2:0), as ROVs record;
+    # lossless H.264 in RGB; or every frame as a separate JPEG (4:2:0, full range), as from USB
+    # cameras.
     codec: Codec = "h264"
+    # Quality of "h264", 0 to 51; smaller is better. Ignored when `bit_rate` is given.
     crf: int = 20
+    # Bits a second of "h264".
     bit_rate: int | None = None
+    # Of "mjpeg", 1 to 100; larger is better.
     jpeg_quality: int = 80
 
     def __post_init__(self) -> None:
