@@ -18,41 +18,27 @@ from aqualvs.scanning.posture import Reason as NoPosture
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """Range and yaw with their rates, as a time filter gives them.
+    """Range and yaw with their rates, as a time filter gives them."""
 
-    Attributes
-    ----------
-    range, yaw : float
-        Metres and radians, as in `Posture`.
-    range_rate, yaw_rate : float
-        Per second.
-    """
-
+    # Metres and radians, as in `Posture`.
     range: float
     yaw: float
+    # Per second.
     range_rate: float
     yaw_rate: float
 
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """Result of one step.
+    """Result of one step."""
 
-    Attributes
-    ----------
-    effort : Effort
-        What may be sent; neutral unless engaged.
-    reason : LimitReason or None
-        Why it is not what the controller asked for, or why that is no more than to stay.
-    guidance : Guidance
-        What the mission wanted.
-    engaged : bool
-        Whether efforts pass; False until `NetPilot.engage`.
-    """
-
+    # What may be sent; neutral unless engaged.
     effort: Effort
+    # Why it is not what the controller asked for, or why that is no more than to stay.
     reason: LimitReason | None
+    # What the mission wanted.
     guidance: Guidance
+    # Whether efforts pass; False until `NetPilot.engage`.
     engaged: bool
 
 

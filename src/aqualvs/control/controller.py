@@ -25,31 +25,21 @@ from aqualvs.errors import OptionError
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PidOptions:
-    """Gains and limits; units follow from those of measurement and output.
+    """Gains and limits; units follow from those of measurement and output."""
 
-    Attributes
-    ----------
-    proportional, integral, derivative : float
-        Output per error, per error and second, per error's rate. 0 or more.
-    derivative_time : float
-        Time constant of the first-order filter on the derivative, in seconds; used where no rate
-        is measured.
-    low, high : float
-        Limits of the output.
-    output_rate : float
-        Greatest change of the output per second.
-    longest_step : float
-        Seconds between two updates beyond which nothing is integrated and the derivative starts
-        anew.
-    """
-
+    # Output per error, per error and second, per error's rate. 0 or more.
     proportional: float
     integral: float = 0.0
     derivative: float = 0.0
+    # Time constant of the first-order filter on the derivative, in seconds; used where no rate is
+    # measured.
     derivative_time: float = 0.1
+    # Limits of the output.
     low: float = -math.inf
     high: float = math.inf
+    # Greatest change of the output per second.
     output_rate: float = math.inf
+    # Seconds between two updates beyond which nothing is integrated and the derivative starts anew.
     longest_step: float = 0.5
 
     def __post_init__(self) -> None:

@@ -26,25 +26,18 @@ class ThrustMap:
 
     Beyond the dead band thrust is full * (linear x + (1 - linear) x²), x being the rest of the
     effort's travel.
-
-    Attributes
-    ----------
-    forward, backward, right : float
-        Thrust at effort 1 along the axis alone, in newtons; `right` is 0 where the vehicle cannot
-        move sideways.
-    dead_band : float
-        Effort below which nothing happens.
-    linear : float
-        Share of the curve that is straight.
-    layout : Layout
-        Of the level thrusters.
     """
 
+    # Thrust at effort 1 along the axis alone, in newtons; `right` is 0 where the vehicle cannot
+    # move sideways.
     forward: float
     backward: float
     right: float
+    # Effort below which nothing happens.
     dead_band: float = 0.0
+    # Share of the curve that is straight.
     linear: float = 1.0
+    # Of the level thrusters.
     layout: Layout = Layout.VECTORED
 
     def __post_init__(self) -> None:
@@ -217,28 +210,19 @@ _MAX_EXPONENT = 50.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VehicleFacts:
-    """Assumed properties of a vehicle.
-
-    Attributes
-    ----------
-    name : str
-    mass : float
-        Of the vehicle and the water that moves with it, forward, in kg.
-    forward_drag, right_drag : Drag
-    thrust : ThrustMap
-    turning_rate, climb_rate : float
-        At effort 1, in rad/s and m/s.
-    dome_forward : float
-        Distance of the dome's centre ahead of the vehicle's, in metres.
-    """
+    """Assumed properties of a vehicle."""
 
     name: str
+    # Of the vehicle and the water that moves with it, forward, in kg.
     mass: float
+
     forward_drag: Drag
     right_drag: Drag
     thrust: ThrustMap
+    # At effort 1, in rad/s and m/s.
     turning_rate: float
     climb_rate: float
+    # Distance of the dome's centre ahead of the vehicle's, in metres.
     dome_forward: float = 0.0
 
     def __post_init__(self) -> None:
@@ -328,36 +312,24 @@ class RangeGains:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class YawGains:
-    """Gains of the loop that holds the yaw.
+    """Gains of the loop that holds the yaw."""
 
-    Attributes
-    ----------
-    proportional : float
-        Turning rate by the yaw's error, in rad/s per rad.
-    integral : float
-        Turning rate by error and second, in rad/s² per rad: what a curved target asks for.
-    derivative : float
-        Turning rate by the yaw's rate; 0 or more.
-    greatest_rate : float
-        Turning rate, in rad/s.
-    ramp_rate, ramp_acceleration : float
-        With which a new setpoint is approached, in rad/s and rad/s².
-    acceleration : float
-        Greatest change of the turning rate asked for, in rad/s².
-    lag : float
-        As of the range.
-    quiet_rate : float
-        Turning rate below which no turn begins, in rad/s.
-    """
-
+    # Turning rate by the yaw's error, in rad/s per rad.
     proportional: float
+    # Turning rate by error and second, in rad/s² per rad: what a curved target asks for.
     integral: float
+    # As of the range.
     lag: float
+    # Turning rate by the yaw's rate; 0 or more.
     derivative: float = 0.0
+    # Turning rate, in rad/s.
     greatest_rate: float = math.radians(30.0)
+    # With which a new setpoint is approached, in rad/s and rad/s².
     ramp_rate: float = math.radians(15.0)
     ramp_acceleration: float = math.radians(15.0)
+    # Greatest change of the turning rate asked for, in rad/s².
     acceleration: float = math.radians(200.0)
+    # Turning rate below which no turn begins, in rad/s.
     quiet_rate: float = math.radians(0.8)
 
     def __post_init__(self) -> None:
@@ -375,23 +347,14 @@ class YawGains:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ControlGains:
-    """All that a controller needs for one vehicle.
-
-    Attributes
-    ----------
-    vehicle : VehicleFacts
-    range : RangeGains
-    yaw : YawGains
-    rate_time : float
-        Time constant in seconds of the filters on differences, where no time filter gives rates.
-    memory : float
-        Seconds for which a stopped controller remembers the disturbance it had found.
-    """
+    """All that a controller needs for one vehicle."""
 
     vehicle: VehicleFacts
     range: RangeGains
     yaw: YawGains
+    # Time constant in seconds of the filters on differences, where no time filter gives rates.
     rate_time: float = 0.1
+    # Seconds for which a stopped controller remembers the disturbance it had found.
     memory: float = 10.0
 
     def __post_init__(self) -> None:

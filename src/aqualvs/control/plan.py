@@ -92,17 +92,9 @@ class PlanFile(StrictPart):
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """Contents of a plan file.
+    """Contents of a plan file."""
 
-    Attributes
-    ----------
-    name : str
-        Of the mission: hold, follow or survey.
-    setpoint : Setpoint
-    limits : SafetyLimits
-    """
-
-    name: str
+    name: str  # Of the mission: hold, follow or survey.
     setpoint: Setpoint
     limits: SafetyLimits
     _file: PlanFile

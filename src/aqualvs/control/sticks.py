@@ -68,24 +68,16 @@ class StickChannel:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StickShaping:
-    """ArduSub's conversion of sticks; the defaults are its own.
+    """ArduSub's conversion of sticks; the defaults are its own."""
 
-    Attributes
-    ----------
-    gain : float
-        Pilot gain (JS_GAIN_DEFAULT). Where trims are 1500 us it does not matter but for the rate
-        of climb.
-    throttle_gain : float
-        JS_THR_GAIN.
-    throttle_dead_zone : float
-        THR_DZ, in thousandths of the throttle's travel.
-    throttle, yaw, forward, right : StickChannel
-        RC3 to RC6.
-    """
-
+    # Pilot gain (JS_GAIN_DEFAULT). Where trims are 1500 us it does not matter but for the rate of
+    # climb.
     gain: float = 0.5
+    # JS_THR_GAIN.
     throttle_gain: float = 1.0
+    # THR_DZ, in thousandths of the throttle's travel.
     throttle_dead_zone: float = 100.0
+    # RC3 to RC6.
     throttle: StickChannel = field(default_factory=lambda: StickChannel(dead_zone=30.0))
     yaw: StickChannel = field(default_factory=lambda: StickChannel(dead_zone=40.0))
     forward: StickChannel = field(default_factory=StickChannel)

@@ -32,37 +32,25 @@ _MODELS = dict(zip(VEHICLE_NAMES, (BLUEROV2, BLUEROV2_HEAVY, VIDEORAY), strict=T
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SimCase:
-    """One simulated run.
+    """One simulated run."""
 
-    Attributes
-    ----------
-    model : VehicleModel
-        The true vehicle.
-    gains : ControlGains
-        Of the controller, for its model of the vehicle.
-    water : WaterMotion
-    net : NetWall
-    start_range, start_yaw : float
-        Posture at the start, at rest, in metres and radians.
-    timing : Timing
-        Of the frames.
-    wire : float
-        Time from an effort to its arrival at the vehicle, in seconds.
-    limits : SafetyLimits
-        Of the safety gate.
-    seed : int
-        Of the noise of sensors and pictures.
-    """
-
+    # The true vehicle.
     model: VehicleModel
+    # Of the controller, for its model of the vehicle.
     gains: ControlGains
+
     water: WaterMotion = field(default_factory=WaterMotion)
     net: NetWall = field(default_factory=NetWall)
+    # Posture at the start, at rest, in metres and radians.
     start_range: float = 0.6
     start_yaw: float = 0.0
+    # Of the frames.
     timing: Timing = field(default_factory=Timing)
+    # Time from an effort to its arrival at the vehicle, in seconds.
     wire: float = 0.02
+    # Of the safety gate.
     limits: SafetyLimits = field(default_factory=SafetyLimits)
+    # Of the noise of sensors and pictures.
     seed: int = 0
 
     def loop(self, sensor: RangeSensor, mission: Mission) -> SimulatedLoop:
@@ -161,28 +149,14 @@ CURVED = NetWall(curvature=-0.1, sway=0.05, sway_period=8.0, rock=math.radians(1
 
 @dataclass(frozen=True, slots=True)
 class Trials:
-    """Trials of one vehicle.
-
-    Parameters
-    ----------
-    model : VehicleModel
-    gains : ControlGains
-    rendered : bool
-        Pictures through the scanner, else postures with its noise.
-    fps : float
-        Frames a second.
-    seed : int
-        Of waves and noise.
-    waves : float
-        Amplitude in metres.
-    """
+    """Trials of one vehicle."""
 
     model: VehicleModel
     gains: ControlGains
-    rendered: bool = False
-    fps: float = 25.0
-    seed: int = 0
-    waves: float = 0.1
+    rendered: bool = False  # Pictures through the scanner, else postures with its noise.
+    fps: float = 25.0  # Frames a second.
+    seed: int = 0  # Of waves and noise.
+    waves: float = 0.1  # Amplitude in metres.
 
     def begin(self, seconds: float) -> LoopLog:
         """Take hold before a flat net, from rest in the current."""

@@ -105,21 +105,14 @@ class RangeSensor(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Timing:
-    """Timing of the frames.
+    """Timing of the frames."""
 
-    Attributes
-    ----------
-    fps : float
-        Frames a second.
-    delay : float
-        From the exposure to the measured posture, in seconds.
-    field : float
-        Time that every other frame, from the first on, waits for the next besides, in seconds: as
-        the first field of an interlaced picture does for the second.
-    """
-
+    # Frames a second.
     fps: float = 25.0
+    # From the exposure to the measured posture, in seconds.
     delay: float = 0.06
+    # Time that every other frame, from the first on, waits for the next besides, in seconds: as the
+    # first field of an interlaced picture does for the second.
     field: float = 0.0
 
     def __post_init__(self) -> None:

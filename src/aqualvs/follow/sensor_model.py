@@ -150,37 +150,25 @@ class LossOfSight(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Blind:
-    """Period without a valid posture.
+    """Period without a valid posture."""
 
-    Attributes
-    ----------
-    start_s, end_s : float
-        Of the exposures, in seconds.
-    loss : LossOfSight
-    """
-
+    # Of the exposures, in seconds.
     start_s: float
     end_s: float
+
     loss: LossOfSight = LossOfSight.TARGET
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PostureNoise:
-    """Standard deviations, of each frame by itself.
+    """Standard deviations, of each frame by itself."""
 
-    Attributes
-    ----------
-    range_share : float
-        Of the range.
-    pitch, yaw : float
-        In radians.
-    outliers : float
-        Share of frames with ten times that noise, unknown to the scanner.
-    """
-
+    # Of the range.
     range_share: float = 0.003
+    # In radians.
     pitch: float = math.radians(0.4)
     yaw: float = math.radians(0.4)
+    # Share of frames with ten times that noise, unknown to the scanner.
     outliers: float = 0.0
 
 

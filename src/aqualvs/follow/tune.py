@@ -30,41 +30,27 @@ _BAND = 0.05
 
 @dataclass(frozen=True, slots=True)
 class StepOptions:
-    """Options of the simulated step.
+    """Options of the simulated step."""
 
-    Attributes
-    ----------
-    begin, end : float
-        Ranges before and after, in metres.
-    delay : float
-        From a frame to its effort at the vehicle, in seconds.
-    frame : float
-        Seconds between frames.
-    """
-
+    # Ranges before and after, in metres.
     begin: float = 0.8
     end: float = 0.6
+    # From a frame to its effort at the vehicle, in seconds.
     delay: float = 0.1
+    # Seconds between frames.
     frame: float = 0.04
 
 
 @dataclass(frozen=True, slots=True)
 class StepAnswer:
-    """Response to the step.
+    """Response to the step."""
 
-    Attributes
-    ----------
-    time, range : array, shape (N,)
-        Seconds since the step, from before it on; metres.
-    overshoot : float
-        Share of the step.
-    settling : float
-        Seconds after which the range stays within 5 % of the step; infinite if it does not.
-    """
-
+    # Shape (N,): seconds since the step, from before it on; metres.
     time: FloatArray
     range: FloatArray
+    # Share of the step.
     overshoot: float
+    # Seconds after which the range stays within 5 % of the step; infinite if it does not.
     settling: float
 
 
@@ -125,24 +111,12 @@ def _answer(time: FloatArray, ranges: FloatArray, options: StepOptions) -> StepA
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TuneRequest:
-    """Request of the command line.
+    """Request of the command line."""
 
-    Attributes
-    ----------
-    model : str
-        Name of a vehicle model.
-    output : Path or None
-        Gains file; None prints the gains.
-    overwrite : bool
-        Whether to replace a file that this command wrote before.
-    options : TuneOptions
-        What the loops must stand.
-    """
-
-    model: str
-    output: Path | None = None
-    overwrite: bool = False
-    options: TuneOptions = field(default_factory=TuneOptions)
+    model: str  # Name of a vehicle model.
+    output: Path | None = None  # Gains file; None prints the gains.
+    overwrite: bool = False  # Whether to replace a file that this command wrote before.
+    options: TuneOptions = field(default_factory=TuneOptions)  # What the loops must stand.
 
 
 def tune_and_tell(request: TuneRequest, echo: Callable[[str], None]) -> None:

@@ -168,24 +168,12 @@ SWITCH_S = 0.0005
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FeedRequest:
-    """Request for the delivery of a source, where it has a choice; see `open_feed`.
+    """Request for the delivery of a source, where it has a choice; see `open_feed`."""
 
-    Attributes
-    ----------
-    fps : float or None
-        Of images, or asked of a camera.
-    size : str or None
-        `WIDTHxHEIGHT`, asked of a camera.
-    pixel_format : str or None
-        Asked of a camera.
-    transport : {"tcp", "udp"} or None
-        How RTSP shall send.
-    """
-
-    fps: float | None = None
-    size: str | None = None
-    pixel_format: str | None = None
-    transport: Transport | None = None
+    fps: float | None = None  # Of images, or asked of a camera.
+    size: str | None = None  # `WIDTHxHEIGHT`, asked of a camera.
+    pixel_format: str | None = None  # Asked of a camera.
+    transport: Transport | None = None  # How RTSP shall send.
 
     def opened(self, source: str, *, realtime: bool) -> Feed:
         """Return the feed of a source.
@@ -214,50 +202,34 @@ def _size_px(text: str) -> tuple[int, int]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LiveRequest:
-    """Request for a live run.
+    """Request for a live run."""
 
-    Attributes
-    ----------
-    source : str
-        As `open_feed` takes it.
-    rig : Path
-    feed : FeedRequest
-    outputs : OutputRequest
-    dashboard : str or None
-        Address HOST:PORT of the pilot's page.
-    token : str or None
-        Its password.
-    embed_from : tuple of str
-        Origins of pages that may show it.
-    record : bool
-        Whether to record from the start; the page's button begins and ends recordings, too.
-    record_to : Path
-        Folder of recordings.
-    record_video : bool
-    smooth : bool
-        Whether the time filter runs.
-    fast : bool
-        Measure every frame of a file, as fast as possible.
-    water : Water
-    scanner : ScannerOptions
-    index_target : Path or None
-        Markers on the vehicle that show the water's index.
-    """
-
+    # As `open_feed` takes it.
     source: str
+
     rig: Path
     feed: FeedRequest = field(default_factory=FeedRequest)
     outputs: OutputRequest = field(default_factory=OutputRequest)
+    # Address HOST:PORT of the pilot's page.
     dashboard: str | None = None
+    # Its password.
     token: str | None = None
+    # Origins of pages that may show it.
     embed_from: tuple[str, ...] = ()
+    # Whether to record from the start; the page's button begins and ends recordings, too.
     record: bool = False
+    # Folder of recordings.
     record_to: Path = Path("dives")
+
     record_video: bool = False
+    # Whether the time filter runs.
     smooth: bool = False
+    # Measure every frame of a file, as fast as possible.
     fast: bool = False
+
     water: Water = field(default_factory=Water)
     scanner: ScannerOptions = field(default_factory=ScannerOptions)
+    # Markers on the vehicle that show the water's index.
     index_target: Path | None = None
 
 

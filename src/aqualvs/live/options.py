@@ -53,16 +53,9 @@ class VehicleFile(StrictPart):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VehicleSetup:
-    """Contents of a vehicle file.
+    """Contents of a vehicle file."""
 
-    Attributes
-    ----------
-    link : LinkOptions
-        Of the connection.
-    steering : ArduSubOptions
-    """
-
-    link: LinkOptions = field(default_factory=LinkOptions)
+    link: LinkOptions = field(default_factory=LinkOptions)  # Of the connection.
     steering: ArduSubOptions = field(default_factory=ArduSubOptions)
 
 
@@ -128,27 +121,19 @@ FOXGLOVE_PORT, DASHBOARD_PORT = 8765, 8100
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OutputRequest:
-    """Request for outputs of a live run; all are off by default.
+    """Request for outputs of a live run; all are off by default."""
 
-    Attributes
-    ----------
-    mavlink, json : tuple of str
-        Addresses; one output for each.
-    link : LinkOptions
-        Of every MAVLink connection.
-    ros2, ros1 : bool
-    foxglove : str or None
-        Address HOST:PORT to listen on.
-    rerun : str or None
-        As `RerunOutput` takes it.
-    """
-
+    # Addresses; one output for each.
     mavlink: tuple[str, ...] = ()
     json: tuple[str, ...] = ()
+    # Of every MAVLink connection.
     link: LinkOptions = field(default_factory=LinkOptions)
+
     ros2: bool = False
     ros1: bool = False
+    # Address HOST:PORT to listen on.
     foxglove: str | None = None
+    # As `RerunOutput` takes it.
     rerun: str | None = None
 
 

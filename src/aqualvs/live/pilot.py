@@ -119,33 +119,15 @@ _TELL_MODE = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PilotReport:
-    """One step of the pilot.
+    """One step of the pilot."""
 
-    Attributes
-    ----------
-    at_ns : int
-        By `time.monotonic_ns`.
-    frame : int
-        Number of the frame that it rests on; the last one's where the stream is silent.
-    engaged : bool
-        Whether efforts go out.
-    effort : Effort
-        What was sent; neutral where nothing was.
-    reason : LimitReason or None
-        Why it is not what the controller asked for.
-    guidance : Guidance
-        What the mission wants.
-    state : VehicleState
-        As the vehicle reported it.
-    """
-
-    at_ns: int
-    frame: int
-    engaged: bool
-    effort: Effort
-    reason: LimitReason | None
-    guidance: Guidance
-    state: VehicleState
+    at_ns: int  # By `time.monotonic_ns`.
+    frame: int  # Number of the frame that it rests on; the last one's where the stream is silent.
+    engaged: bool  # Whether efforts go out.
+    effort: Effort  # What was sent; neutral where nothing was.
+    reason: LimitReason | None  # Why it is not what the controller asked for.
+    guidance: Guidance  # What the mission wants.
+    state: VehicleState  # As the vehicle reported it.
 
     @property
     def words(self) -> str:

@@ -170,20 +170,11 @@ class OutputWorker:
 
 @dataclass(frozen=True, slots=True)
 class Arrival:
-    """A frame and when it came.
-
-    Attributes
-    ----------
-    frame : Frame
-    arrived_ns : int
-        By `time.monotonic_ns`.
-    utc_ns : int
-        By the system clock.
-    """
+    """A frame and when it came."""
 
     frame: Frame
-    arrived_ns: int
-    utc_ns: int
+    arrived_ns: int  # By `time.monotonic_ns`.
+    utc_ns: int  # By the system clock.
 
 
 class Mailbox:
@@ -367,20 +358,13 @@ class FixedScanner:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LiveOptions:
-    """Options of the live loop.
+    """Options of the live loop."""
 
-    Attributes
-    ----------
-    stale_after_s : float
-        A stream that is silent for this time has no posture any more.
-    keep_every : bool
-        Measure every frame regardless of the delay: for files.
-    frozen : FrozenOptions or None
-        When a picture counts as frozen, and has no posture; None where none does.
-    """
-
+    # A stream that is silent for this time has no posture any more.
     stale_after_s: float = 0.15
+    # Measure every frame regardless of the delay: for files.
     keep_every: bool = False
+    # When a picture counts as frozen, and has no posture; None where none does.
     frozen: FrozenOptions | None = field(default_factory=FrozenOptions)
 
 

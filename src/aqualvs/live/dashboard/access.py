@@ -149,20 +149,13 @@ _LOCAL_NAMES = frozenset({"localhost", "127.0.0.1", "::1"})
 
 @dataclass(frozen=True, slots=True)
 class Access:
-    """Access rules: this machine may watch; with the token, any client may watch and command.
+    """Access rules: this machine may watch; with the token, any client may watch and command."""
 
-    Attributes
-    ----------
-    host : str
-        Address that the page is served at.
-    token : str
-        The password.
-    embedders : tuple of str
-        Origins whose pages may show this one inside themselves; none if empty.
-    """
-
+    # Address that the page is served at.
     host: str
+    # The password.
     token: str
+    # Origins whose pages may show this one inside themselves; none if empty.
     embedders: tuple[str, ...] = ()
 
     @property

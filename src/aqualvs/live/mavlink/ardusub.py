@@ -243,34 +243,23 @@ def turning_of(link: MavlinkLink, at_ns: int) -> GyroRates | None:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ArduSubOptions:
-    """Options of steering ArduSub, and of the ground station that must be present.
+    """Options of steering ArduSub, and of the ground station that must be present."""
 
-    Attributes
-    ----------
-    command : Command
-        Sticks, or speeds in GUIDED.
-    modes : tuple of str
-        Modes in which it takes our efforts; empty for ALT_HOLD, or GUIDED.
-    ground_station : int
-        System id of the ground station, the vehicle's MAV_GCS_SYSID (before ArduSub 4.7:
-        SYSID_MYGCS). Sticks are sent in its name: ArduSub ignores all others.
-    station_timeout_s : float or None
-        Without its heartbeat for this time no efforts are sent: our own sticks would keep ArduSub
-        from noticing that its ground station is gone. None if no station is required.
-    stick_dead_band : float
-        Deflection of the pilot's sticks that counts as centred, as a share of the full one.
-    speed : float
-        In GUIDED: what an effort of 1 forward, right or down asks for, in m/s.
-    turning_rate : float
-        In GUIDED: what an effort of 1 in yaw asks for, in rad/s.
-    """
-
+    # Sticks, or speeds in GUIDED.
     command: Command = Command.STICKS
+    # Modes in which it takes our efforts; empty for ALT_HOLD, or GUIDED.
     modes: tuple[str, ...] = ()
+    # System id of the ground station, the vehicle's MAV_GCS_SYSID (before ArduSub 4.7:
+    # SYSID_MYGCS). Sticks are sent in its name: ArduSub ignores all others.
     ground_station: int = 255
+    # Without its heartbeat for this time no efforts are sent: our own sticks would keep ArduSub
+    # from noticing that its ground station is gone. None if no station is required.
     station_timeout_s: float | None = 3.0
+    # Deflection of the pilot's sticks that counts as centred, as a share of the full one.
     stick_dead_band: float = 0.1
+    # In GUIDED: what an effort of 1 forward, right or down asks for, in m/s.
     speed: float = 0.3
+    # In GUIDED: what an effort of 1 in yaw asks for, in rad/s.
     turning_rate: float = math.radians(30.0)
 
     def __post_init__(self) -> None:

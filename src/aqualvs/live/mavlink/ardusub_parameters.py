@@ -47,17 +47,10 @@ class Weight(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Advice:
-    """Advice on a setting of the vehicle.
-
-    Attributes
-    ----------
-    weight : Weight
-    text : str
-        One line: name, value, meaning, and what to set.
-    """
+    """Advice on a setting of the vehicle."""
 
     weight: Weight
-    text: str
+    text: str  # One line: name, value, meaning, and what to set.
 
 
 class StationRange:

@@ -36,21 +36,14 @@ NetKind: TypeAlias = Literal["udpout", "udpin", "udpbcast", "tcp"]
 
 @dataclass(frozen=True, slots=True)
 class NetAddress:
-    """A peer in the network, or the port that peers send to.
+    """A peer in the network, or the port that peers send to."""
 
-    Attributes
-    ----------
-    kind : str
-        `udpout` sends to the address; `udpin` listens there and answers all known senders;
-        `udpbcast` sends to a broadcast address; `tcp` connects.
-    host : str
-        Name or number.
-    port : int
-        1 to 65535; 0, any free one, for `udpin`.
-    """
-
+    # `udpout` sends to the address; `udpin` listens there and answers all known senders; `udpbcast`
+    # sends to a broadcast address; `tcp` connects.
     kind: NetKind
+    # Name or number.
     host: str
+    # 1 to 65535; 0, any free one, for `udpin`.
     port: int
 
     def __str__(self) -> str:

@@ -55,20 +55,11 @@ _PARTS = {
 
 @dataclass(frozen=True, slots=True)
 class Ros1Type:
-    """A message type as publishers and subscribers agree on it.
-
-    Attributes
-    ----------
-    name : str
-    md5sum : str
-        Of the definition; subscribers with another one are refused.
-    definition : str
-        Its text and those of all parts, as bags keep it.
-    """
+    """A message type as publishers and subscribers agree on it."""
 
     name: str
-    md5sum: str
-    definition: str
+    md5sum: str  # Of the definition; subscribers with another one are refused.
+    definition: str  # Its text and those of all parts, as bags keep it.
 
 
 def _type(name: str, text: str, parts: Iterable[str], md5sum: str) -> Ros1Type:

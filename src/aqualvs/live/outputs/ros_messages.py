@@ -42,22 +42,16 @@ UNOBSERVABLE_VARIANCE = 1.0e4
 
 @dataclass(frozen=True, slots=True)
 class PlanePose:
-    """Pose of the target's plane in FLU axes at the dome's centre.
+    """Pose of the target's plane in FLU axes at the dome's centre."""
 
-    Attributes
-    ----------
-    position : array, shape (3,)
-        Foot of the perpendicular from the dome's centre, in metres.
-    quaternion : array, shape (4,)
-        Orientation as (x, y, z, w): x along the normal away from the vehicle, y horizontal to the
-        left as the vehicle sees it, z up the plane. Identity where the vehicle looks squarely at
-        the target.
-    covariance : array, shape (6, 6)
-        Of (x, y, z, roll, pitch, yaw) in FLU, m and rad, angles about fixed axes (REP-103).
-    """
-
+    # Shape (3,): foot of the perpendicular from the dome's centre, in metres.
     position: FloatArray
+    # Shape (4,): orientation as (x, y, z, w): x along the normal away from the vehicle, y
+    # horizontal to the left as the vehicle sees it, z up the plane. Identity where the vehicle
+    # looks squarely at the target.
     quaternion: FloatArray
+    # Shape (6, 6): of (x, y, z, roll, pitch, yaw) in FLU, m and rad, angles about fixed axes
+    # (REP-103).
     covariance: FloatArray
 
 
@@ -327,26 +321,20 @@ class PublishedTopic(StrEnum):
 class RosOptions:
     """Names, and how hard it is tried to deliver.
 
-    Attributes
-    ----------
-    namespace : str
-        What the topics' names start with; `diagnostics` stays at the root, where ROS looks for it.
-    frame_id : str
-        Name of the frame at the dome's centre, forward, left, up.
-    reliable : bool
-        ROS 2: offer to repeat what gets lost. Then every subscriber fits, whichever it asks for;
-        without, only those that ask for best effort.
-    diagnostics_period_s : float
-
     Raises
     ------
     OptionError
         If a name is none that ROS allows, or the period is not positive.
     """
 
+    # What the topics' names start with; `diagnostics` stays at the root, where ROS looks for it.
     namespace: str = "aqualvs"
+    # Name of the frame at the dome's centre, forward, left, up.
     frame_id: str = "aqualvs_dome"
+    # ROS 2: offer to repeat what gets lost. Then every subscriber fits, whichever it asks for;
+    # without, only those that ask for best effort.
     reliable: bool = True
+
     diagnostics_period_s: float = 1.0
 
     def __post_init__(self) -> None:
