@@ -42,25 +42,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NetSource:
-    """Source of a survey: a dive or a run, and the folder to write.
+    """Source of a survey: a dive or a run, and the folder to write."""
 
-    Attributes
-    ----------
-    source : str
-        Folder of a run, or a dive as `open_source` takes it.
-    rig, out : Path or None
-        A dive needs a rig (a recording brings its own); its default folder is beside it. A run has
-        its own rig, and its own folder is the default.
-    target : str
-        As `aqualvs run` takes it; for a dive.
-    overwrite : bool
-        Whether what is already there may be replaced.
-    """
-
+    # Folder of a run, or a dive as `open_source` takes it.
     source: str
+    # A dive needs a rig (a recording brings its own); its default folder is beside it. A run has
+    # its own rig, and its own folder is the default.
     rig: Path | None = None
     out: Path | None = None
+    # As `aqualvs run` takes it; for a dive.
     target: str = "auto"
+    # Whether what is already there may be replaced.
     overwrite: bool = False
 
 
@@ -191,25 +183,12 @@ _GIVEN = "the user"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NetChangeRequest:
-    """Request for `aqualvs net-change`.
+    """Request for `aqualvs net-change`."""
 
-    Attributes
-    ----------
-    runs : tuple of Path
-        Folders of runs, or of batches.
-    out : Path
-        Folder to write.
-    dates : tuple of str
-        None, or one for each of `runs`.
-    cell_m : float
-        Side of the map's cells.
-    overwrite : bool
-    """
-
-    runs: tuple[Path, ...]
-    out: Path
-    dates: tuple[str, ...] = ()
-    cell_m: float = 1.0
+    runs: tuple[Path, ...]  # Folders of runs, or of batches.
+    out: Path  # Folder to write.
+    dates: tuple[str, ...] = ()  # None, or one for each of `runs`.
+    cell_m: float = 1.0  # Side of the map's cells.
     overwrite: bool = False
 
     def __post_init__(self) -> None:

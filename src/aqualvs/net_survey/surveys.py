@@ -106,83 +106,58 @@ _DIVES = "dives"
 
 @dataclass(frozen=True, slots=True)
 class Stretches:
-    """Stretches of a dive, K of them; NaN where not known.
+    """Stretches of a dive, K of them; NaN where not known."""
 
-    Attributes
-    ----------
-    begin_s, along, depth, bearing, seen : array, shape (K,)
-        Dive time; metres along the net; metres; radians; metres of laser line looked at.
-    solidity, sigma : array, shape (K,)
-        Share of the area, and its standard deviation as `net.csv` has it.
-    usable : bool array, shape (K,)
-        Enough of the mesh was seen to rely on it.
-    placed : bool array, shape (K,)
-        There is a track: `along` means something.
-    outline : array, shape (K, 4, 2)
-        Of what the picture passed over, as `net.geojson` has it.
-    """
-
+    # Shape (K,): dive time; metres along the net; metres; radians; metres of laser line looked at.
     begin_s: FloatArray
     along: FloatArray
     depth: FloatArray
     bearing: FloatArray
     seen: FloatArray
+    # Shape (K,): share of the area, and its standard deviation as `net.csv` has it.
     solidity: FloatArray
     sigma: FloatArray
+    # Shape (K,): enough of the mesh was seen to rely on it.
     usable: BoolArray
+    # Shape (K,): there is a track: `along` means something.
     placed: BoolArray
+    # Shape (K, 4, 2): of what the picture passed over, as `net.geojson` has it.
     outline: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
 class Holes:
-    """Holes of a dive, H of them; NaN where not known.
+    """Holes of a dive, H of them; NaN where not known."""
 
-    Attributes
-    ----------
-    number : list of str
-        As `holes.csv` numbers them.
-    time_s, along, depth, bearing : array, shape (H,)
-    diameter, sigma : array, shape (H,)
-        In metres.
-    """
-
+    # As `holes.csv` numbers them.
     number: list[str]
+    # Shape (H,).
     time_s: FloatArray
     along: FloatArray
     depth: FloatArray
     bearing: FloatArray
+    # Shape (H,): in metres.
     diameter: FloatArray
     sigma: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
 class Survey:
-    """A dive along the net.
-
-    Attributes
-    ----------
-    folder : Path
-    date : date
-        On which it took place.
-    stretches : Stretches
-    holes : Holes
-    by_bearing, by_depth : bool
-        Whether x of the outlines is a bearing in degrees instead of metres along the net, and y
-        minus the depth instead of metres above the start.
-    lasers_share : float
-        Part of the height of what the picture passed over in which lasers looked for holes.
-    facts : mapping
-        Member `aqualvs_net` of `net.geojson`.
-    """
+    """A dive along the net."""
 
     folder: Path
+    # On which it took place.
     date: date
+
     stretches: Stretches
     holes: Holes
+    # Whether x of the outlines is a bearing in degrees instead of metres along the net, and y minus
+    # the depth instead of metres above the start.
     by_bearing: bool
     by_depth: bool
+    # Part of the height of what the picture passed over in which lasers looked for holes.
     lasers_share: float
+    # Member `aqualvs_net` of `net.geojson`.
     facts: Mapping[str, Any]
 
     @property

@@ -94,15 +94,9 @@ class Hole:
 
 @dataclass(slots=True)
 class HoleMap:
-    """The map of looks, fixed to the net, and the holes in it.
+    """The map of looks, fixed to the net, and the holes in it."""
 
-    Attributes
-    ----------
-    holes : list of Hole
-        In the order in which they were found.
-    """
-
-    holes: list[Hole] = field(default_factory=list)
+    holes: list[Hole] = field(default_factory=list)  # In the order in which they were found.
     _bar: float = 0.0
     _piece: int = -1
     _looks: Looks = field(default_factory=Looks)

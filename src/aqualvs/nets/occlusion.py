@@ -42,19 +42,13 @@ _HIDDEN = _OcclusionOptions()
 
 @dataclass(frozen=True, slots=True)
 class LaserLines:
-    """The lasers' lines across the net's plane; L lasers, J search lines.
+    """The lasers' lines across the net's plane; L lasers, J search lines."""
 
-    Attributes
-    ----------
-    origin, direction : array, shape (L, 2)
-        A place on every line in `net` and its unit direction.
-    along, position, step : array, shape (L, J)
-        Place of each search line: metres along the laser's line, pixels along the search line, and
-        metres of laser line per search line.
-    """
-
+    # Shape (L, 2): a place on every line in `net` and its unit direction.
     origin: FloatArray
     direction: FloatArray
+    # Shape (L, J): place of each search line: metres along the laser's line, pixels along the
+    # search line, and metres of laser line per search line.
     along: FloatArray
     position: FloatArray
     step: FloatArray

@@ -48,24 +48,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NetRequest:
-    """Request for the condition of a net, with its options.
+    """Request for the condition of a net, with its options."""
 
-    Attributes
-    ----------
-    twine_mm : float or None
-        Diameter of the bare twine, where it is known.
-    stretch_m : float
-        Length of a stretch of net.
-    log : Path or None
-        The vehicle's log.
-    log_offset_s : float or None
-        Its clock minus the dive's, where it is known.
-    """
-
-    twine_mm: float | None = None
-    stretch_m: float = 0.5
-    log: Path | None = None
-    log_offset_s: float | None = None
+    twine_mm: float | None = None  # Diameter of the bare twine, where it is known.
+    stretch_m: float = 0.5  # Length of a stretch of net.
+    log: Path | None = None  # The vehicle's log.
+    log_offset_s: float | None = None  # Its clock minus the dive's, where it is known.
 
     def __post_init__(self) -> None:
         """Refuse values that cannot be."""
@@ -127,20 +115,11 @@ _DISTANCES = {
 
 @dataclass(frozen=True, slots=True)
 class NetFacts:
-    """The net as described by the target file.
+    """The net as described by the target file."""
 
-    Attributes
-    ----------
-    mesh : {"diamond", "square", "hexagon"}
-    bar : float
-        Length of one side of an opening, in metres.
-    twine : float or None
-        Diameter of the twine, in metres.
-    """
-
-    mesh: str
-    bar: float
-    twine: float | None = None
+    mesh: str  # "diamond", "square" or "hexagon".
+    bar: float  # Length of one side of an opening, in metres.
+    twine: float | None = None  # Diameter of the twine, in metres.
 
     @property
     def crossings_per_bar(self) -> float:
@@ -160,20 +139,13 @@ class NetFacts:
 
 @dataclass(frozen=True, slots=True)
 class TargetFacts:
-    """Prior information on the target.
+    """Prior information on the target."""
 
-    Attributes
-    ----------
-    kind : TargetKind
-        What the posture is measured to.
-    filter_lengths : mapping
-        Parameters of the paper's mesh filter in metres, those that differ from the defaults.
-    net : NetFacts or None
-        What the net is said to be, where the file says it.
-    """
-
+    # What the posture is measured to.
     kind: TargetKind = TargetKind.AUTO
+    # Parameters of the paper's mesh filter in metres, those that differ from the defaults.
     filter_lengths: Mapping[str, float] = field(default_factory=dict)
+    # What the net is said to be, where the file says it.
     net: NetFacts | None = None
 
     @property
@@ -275,23 +247,15 @@ _CHECK = _CheckOptions()
 
 @dataclass(slots=True)
 class NetCheck:
-    """Comparison of the distances between strands with those of the described net.
+    """Comparison of the distances between strands with those of the described net."""
 
-    Attributes
-    ----------
-    said : NetFacts
-        The target file's net.
-    source : str
-        The target file's name, for the sentence.
-    planes : sequence of Plane
-        Of the lasers, in `dome`.
-    bars : array of float
-        Bar of the frames that were evaluated, in metres.
-    """
-
+    # The target file's net.
     said: NetFacts
+    # The target file's name, for the sentence.
     source: str
+    # Of the lasers, in `dome`.
     planes: Sequence[Plane]
+    # Bar of the frames that were evaluated, in metres.
     bars: "array[float]" = field(default_factory=lambda: array("d"))
 
     def add(self, scan: Scan) -> None:
