@@ -159,20 +159,11 @@ def summary_lines(request: RunRequest, result: RunResult) -> list[str]:
 
 @dataclass(slots=True)
 class OpenDive(Closing):
-    """A dive that is ready to be measured; a context manager that closes its source.
-
-    Attributes
-    ----------
-    source : FrameSource or Replay
-    rig : Rig
-        In the water of the dive.
-    request : RunRequest
-        With the options that count, which a recording may bring itself.
-    """
+    """A dive that is ready to be measured; a context manager that closes its source."""
 
     source: FrameSource
-    rig: Rig
-    request: RunRequest
+    rig: Rig  # In the water of the dive.
+    request: RunRequest  # With the options that count, which a recording may bring itself.
 
     @property
     def is_replay(self) -> bool:

@@ -33,51 +33,36 @@ _NAMES, _LOCK = "names.json", "lock"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BatchRequest:
-    """Request for a batch: dives, rig, options and the folder to write.
+    """Request for a batch: dives, rig, options and the folder to write."""
 
-    Attributes
-    ----------
-    dives : tuple of str
-        As `find_dives` takes them.
-    out : Path
-        Folder to write, or of an earlier batch to go on with.
-    rig : Path or None
-        As `find_dives` takes it.
-    water : Water
-    scheduler : str or None
-        Address of a Dask scheduler; None works on this machine.
-    n_workers : int or None
-        Processes on this machine; None for one per core.
-    no_dome : bool
-    fps : float or None
-        Of folders of images.
-    scanner : ScannerOptions
-    chosen : frozenset of str or None
-        As in `RunRequest`.
-    target : str
-    index_target : Path or None
-    report : bool
-        Whether each dive gets its report.
-    net : NetRequest or None
-        What to find out about the net of each dive, if anything; logs are those of the dives.
-    piece_frames : int
-        Frames that a piece of a dive has at least.
-    """
-
+    # As `find_dives` takes them.
     dives: tuple[str, ...]
+    # Folder to write, or of an earlier batch to go on with.
     out: Path
+    # As `find_dives` takes it.
     rig: Path | None = None
+
     water: Water = field(default_factory=Water)
+    # Address of a Dask scheduler; None works on this machine.
     scheduler: str | None = None
+    # Processes on this machine; None for one per core.
     n_workers: int | None = None
+
     no_dome: bool = False
+    # Of folders of images.
     fps: float | None = None
+
     scanner: ScannerOptions = field(default_factory=ScannerOptions)
+    # As in `RunRequest`.
     chosen: frozenset[str] | None = None
+
     target: str = "auto"
     index_target: Path | None = None
+    # Whether each dive gets its report.
     report: bool = True
+    # What to find out about the net of each dive, if anything; logs are those of the dives.
     net: NetRequest | None = None
+    # Frames that a piece of a dive has at least.
     piece_frames: int = PIECE_FRAMES
 
 

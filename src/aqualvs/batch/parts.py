@@ -69,33 +69,22 @@ SUMMARY = "summary.npz"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PieceResult:
-    """Outcome of measuring one piece.
+    """Outcome of measuring one piece."""
 
-    Attributes
-    ----------
-    number : int
-        Of the piece in its dive.
-    n_frames, n_valid : int
-        Frames, and those with a posture.
-    duration_s : float
-        Time of the last frame.
-    fault : str
-        What ended the source early; empty if nothing did.
-    cpu_s : float
-        Spent on it, by the process that did it; 0 for one that was finished before.
-    peak_bytes : int
-        Most memory that process had so far.
-    reused : bool
-        Whether it was finished before.
-    """
-
+    # Of the piece in its dive.
     number: int
+    # Frames, and those with a posture.
     n_frames: int
     n_valid: int
+    # Time of the last frame.
     duration_s: float
+    # What ended the source early; empty if nothing did.
     fault: str
+    # Spent on it, by the process that did it; 0 for one that was finished before.
     cpu_s: float = 0.0
+    # Most memory that process had so far.
     peak_bytes: int = 0
+    # Whether it was finished before.
     reused: bool = False
 
 

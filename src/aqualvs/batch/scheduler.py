@@ -63,21 +63,11 @@ _TIMEOUT_S = 30.0
 
 @dataclass(frozen=True, slots=True)
 class FinishedTask:
-    """A task that has ended.
+    """A task that has ended."""
 
-    Attributes
-    ----------
-    token : object
-        As it was submitted.
-    value : object
-        What it returned; None after an error.
-    error : Exception or None
-        What it raised.
-    """
-
-    token: Any
-    value: Any = None
-    error: BaseException | None = None
+    token: Any  # As it was submitted.
+    value: Any = None  # What it returned; None after an error.
+    error: BaseException | None = None  # What it raised.
 
 
 class WorkersLostError(Exception):
@@ -403,14 +393,9 @@ def join(work: DiveWork, found: DiveProbe, results: Sequence[PieceResult]) -> di
 
 @dataclass(frozen=True, slots=True)
 class Steps:
-    """Tasks of a dive, in the order in which the processes do them.
+    """Tasks of a dive, in the order in which the processes do them."""
 
-    Attributes
-    ----------
-    look, measure, join : callable
-        As `look`, `measure_piece` and `join`.
-    """
-
+    # As `look`, `measure_piece` and `join`.
     look: Callable[[DiveWork], tuple[DiveProbe, dict[str, Any] | None]] = look
     measure: Callable[[DiveWork, DiveProbe, int], PieceResult] = measure_piece
     join: Callable[[DiveWork, DiveProbe, Sequence[PieceResult]], dict[str, Any]] = join

@@ -200,23 +200,15 @@ _STREAM_S = 8.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DoctorRequest:
-    """Things to check beyond the machine itself: stream, rig, autopilot.
+    """Things to check beyond the machine itself: stream, rig, autopilot."""
 
-    Attributes
-    ----------
-    source : str or None
-        Stream, camera or file.
-    rig : Path or None
-        Rig that the pictures should fit.
-    mavlink : str or None
-        Address of an autopilot.
-    vehicle : VehicleSetup
-        Who is to be there, and how it is to be steered.
-    """
-
+    # Stream, camera or file.
     source: str | None = None
+    # Rig that the pictures should fit.
     rig: Path | None = None
+    # Address of an autopilot.
     mavlink: str | None = None
+    # Who is to be there, and how it is to be steered.
     vehicle: VehicleSetup = field(default_factory=VehicleSetup)
 
 

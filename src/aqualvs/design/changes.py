@@ -127,24 +127,16 @@ def _starts(lots: Sequence[Sequence[Mount]]) -> list[list[int]]:
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """Effect of a change; all numbers are ratios to the present values, 1 is no effect.
+    """Effect of a change; all numbers are ratios to the present values, 1 is no effect."""
 
-    Attributes
-    ----------
-    words : str
-        Description of the change.
-    score : float
-        Root mean square of all errors, in goals, on walls and nets.
-    noise_range, noise_angle : float
-        Errors of a single frame on a wall, from noise alone, root mean square over the range.
-    systematic_range, systematic_angle : float
-        Errors from the tolerances of lasers and water.
-    """
-
+    # Description of the change.
     words: str
+    # Root mean square of all errors, in goals, on walls and nets.
     score: float
+    # Errors of a single frame on a wall, from noise alone, root mean square over the range.
     noise_range: float
     noise_angle: float
+    # Errors from the tolerances of lasers and water.
     systematic_range: float
     systematic_angle: float
 

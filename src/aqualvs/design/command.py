@@ -49,36 +49,24 @@ RIG_YAML = "rig.yaml"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DesignRequest:
-    """Request of `aqualvs design`, see its `--help`.
+    """Request of `aqualvs design`, see its `--help`."""
 
-    Attributes
-    ----------
-    design, rig : Path or None
-        A design file, or a rig file that exists; the example if neither is given.
-    out : Path or None
-        Output folder.
-    given : mapping
-        Replacements of the file's values, see `merged_content`.
-    fan_deg : float or None
-        Opening of the fans of a rig's lasers.
-    turn : bool
-        Whether to optimise the stripes' directions of the tilted lasers, too.
-    tilt : bool
-        Whether to optimise the tilts.
-    try_changes : bool
-        Whether to report changes that would help.
-    overwrite : bool
-        Whether to replace earlier output of this command in `out`.
-    """
-
+    # A design file, or a rig file that exists; the example if neither is given.
     design: Path | None = None
     rig: Path | None = None
+    # Output folder.
     out: Path | None = None
+    # Replacements of the file's values, see `merged_content`.
     given: Mapping[str, Any] = field(default_factory=dict)
+    # Opening of the fans of a rig's lasers.
     fan_deg: float | None = None
+    # Whether to optimise the stripes' directions of the tilted lasers, too.
     turn: bool = False
+    # Whether to optimise the tilts.
     tilt: bool = True
+    # Whether to report changes that would help.
     try_changes: bool = True
+    # Whether to replace earlier output of this command in `out`.
     overwrite: bool = False
 
 

@@ -144,43 +144,28 @@ _COLUMNS = ("frame", "range_m", "pitch_deg", "yaw_deg", "n_visible")
 
 @dataclass(frozen=True, slots=True)
 class DiveTruth:
-    """Truth of one dive, N frames.
-
-    Attributes
-    ----------
-    name, level : str
-    frames : int array, shape (N,)
-        Numbers from 0.
-    posture : array, shape (N, 3)
-        Range (m), pitch and yaw (deg); NaN where there is no target.
-    n_visible : int array, shape (N,)
-        Stripe points on the target that the picture truly shows.
-    """
+    """Truth of one dive, N frames."""
 
     name: str
     level: str
+    # Shape (N,): numbers from 0.
     frames: IntArray
+    # Shape (N, 3): range (m), pitch and yaw (deg); NaN where there is no target.
     posture: FloatArray
+    # Shape (N,): stripe points on the target that the picture truly shows.
     n_visible: IntArray
 
 
 @dataclass(frozen=True, slots=True)
 class BenchmarkSet:
-    """A set of dives with truth.
+    """A set of dives with truth."""
 
-    Attributes
-    ----------
-    name, checksum : str
-        Of the set's definition.
-    whole : bool
-        False for a part of the set, or one in fewer frames: its scores stand for themselves.
-    folder : Path
-    dives : tuple of DiveTruth
-    """
-
+    # Of the set's definition.
     name: str
     checksum: str
+    # False for a part of the set, or one in fewer frames: its scores stand for themselves.
     whole: bool
+
     folder: Path
     dives: tuple[DiveTruth, ...]
 
@@ -438,38 +423,24 @@ Row = dict[str, str | None]
 
 @dataclass(frozen=True, slots=True)
 class Answers:
-    """Answers of a system to the N frames of one dive, in the order of the truth.
+    """Answers of a system to the N frames of one dive, in the order of the truth."""
 
-    Attributes
-    ----------
-    valid : bool array, shape (N,)
-    posture : array, shape (N, 3)
-        Range (m), pitch and yaw (deg); NaN where a frame has none.
-    sigma : array, shape (N, 3)
-        Standard deviations that the system claims, same units; NaN where it claims none.
-    """
-
+    # Shape (N,).
     valid: BoolArray
+    # Shape (N, 3): range (m), pitch and yaw (deg); NaN where a frame has none.
     posture: FloatArray
+    # Shape (N, 3): standard deviations that the system claims, same units; NaN where it claims
+    # none.
     sigma: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
 class System:
-    """A system under test.
-
-    Attributes
-    ----------
-    name : str
-    answers : dict of str to Answers
-        By dive; every dive of the set is there.
-    missing : tuple of str
-        Dives for which it brought no file; it has no valid answer in them.
-    """
+    """A system under test."""
 
     name: str
-    answers: dict[str, Answers]
-    missing: tuple[str, ...]
+    answers: dict[str, Answers]  # By dive; every dive of the set is there.
+    missing: tuple[str, ...]  # Dives for which it brought no file; it has no valid answer in them.
 
 
 def read_system(argument: str, benchmark: BenchmarkSet) -> System:

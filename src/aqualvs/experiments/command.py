@@ -201,18 +201,10 @@ _FAILURES = "failures"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReproduceRequest:
-    """Request for `aqualvs reproduce`; see its `--help`.
+    """Request for `aqualvs reproduce`; see its `--help`."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        Experiments; all of them if empty.
-    out : Path
-        Folder to write.
-    """
-
-    names: tuple[str, ...]
-    out: Path
+    names: tuple[str, ...]  # Experiments; all of them if empty.
+    out: Path  # Folder to write.
 
 
 def print_experiments(echo: Echo) -> None:

@@ -61,30 +61,15 @@ _SETUP = _Setup()
 
 @dataclass(frozen=True, slots=True)
 class SolvedDome:
-    """The two steps of a calibration, with what they were given.
-
-    Attributes
-    ----------
-    truth : Rig
-    start : Rig
-        Before the second step: lens at the dome's centre, camera straight ahead.
-    start_poses : tuple of SE3
-        Of the boards, as they best fit `start`.
-    lens : CameraCalibration
-    dome : DomeCalibration
-    poses : tuple of BoardPose
-        What was measured of the boards.
-    folder : Path
-        Of the boards' pictures.
-    """
+    """The two steps of a calibration, with what they were given."""
 
     truth: Rig
-    start: Rig
-    start_poses: tuple[SE3, ...]
+    start: Rig  # Before the second step: lens at the dome's centre, camera straight ahead.
+    start_poses: tuple[SE3, ...]  # Of the boards, as they best fit `start`.
     lens: CameraCalibration
     dome: DomeCalibration
-    poses: tuple[BoardPose, ...]
-    folder: Path
+    poses: tuple[BoardPose, ...]  # What was measured of the boards.
+    folder: Path  # Of the boards' pictures.
 
     @property
     def errors(self) -> dict[str, float]:

@@ -47,17 +47,12 @@ _SETUP = _Setup()
 
 @dataclass(frozen=True, slots=True)
 class Distances:
-    """Distances of the wall from three points of a stripe, N frames.
+    """Distances of the wall from three points of a stripe, N frames."""
 
-    Attributes
-    ----------
-    true : array, shape (N,)
-    dome, bare, refitted : array, shape (N, 4)
-        In metres: left, central, right, and their average. With the dome model; without it; and
-        without it, but with a laser that was calibrated without it too.
-    """
-
+    # Shape (N,).
     true: FloatArray
+    # Shape (N, 4): in metres: left, central, right, and their average. With the dome model; without
+    # it; and without it, but with a laser that was calibrated without it too.
     dome: FloatArray
     bare: FloatArray
     refitted: FloatArray

@@ -45,21 +45,14 @@ _VIDEO, _TRUTH, _RIG, _READY = "dive.mp4", "truth.csv", "rig.yaml", "ready.json"
 
 @dataclass(frozen=True, slots=True)
 class RenderedDive:
-    """A rendered dive on disk.
-
-    Attributes
-    ----------
-    name : str
-    folder : Path
-        Holds `dive.mp4`, `truth.csv` and `rig.yaml`, and `points_FFFF.npz` of the frames asked for.
-    rig : Rig
-        The true one.
-    scenario : Scenario
-    """
+    """A rendered dive on disk."""
 
     name: str
+    # Holds `dive.mp4`, `truth.csv` and `rig.yaml`, and `points_FFFF.npz` of the frames asked for.
     folder: Path
+    # The true one.
     rig: Rig
+
     scenario: Scenario
 
     @property
@@ -75,16 +68,10 @@ class RenderedDive:
 
 @dataclass(frozen=True, slots=True)
 class MeasuredDive:
-    """Dive as one scanner measured it, frame by frame, N of them, beside the truth.
-
-    Attributes
-    ----------
-    scans : list of Scan
-    truth : float array, shape (N, 3)
-        Range in m, pitch and yaw in radians; NaN where there is none.
-    """
+    """Dive as one scanner measured it, frame by frame, N of them, beside the truth."""
 
     scans: list[Scan]
+    # Shape (N, 3): range in m, pitch and yaw in radians; NaN where there is none.
     truth: FloatArray
 
     @property
@@ -273,19 +260,11 @@ QUANTITIES = ("range (%)", "pitch (degrees)", "yaw (degrees)")
 
 @dataclass(frozen=True, slots=True)
 class Variant:
-    """One way to measure, over one dive or several.
-
-    Attributes
-    ----------
-    name : str
-    measured : tuple of MeasuredDive
-    ours : bool
-        Whether this is what `aqualvs` does by default.
-    """
+    """One way to measure, over one dive or several."""
 
     name: str
     measured: tuple[MeasuredDive, ...]
-    ours: bool = False
+    ours: bool = False  # Whether this is what `aqualvs` does by default.
 
     @property
     def valid_percent(self) -> float:

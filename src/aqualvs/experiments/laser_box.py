@@ -54,39 +54,26 @@ _SETUP = _Setup()
 
 @dataclass(frozen=True, slots=True)
 class PlaneError:
-    """Error of a found laser plane against the true one.
+    """Error of a found laser plane against the true one."""
 
-    Attributes
-    ----------
-    angle, sigma_angle : float
-        Between the normals, radians.
-    offset, sigma_offset : float
-        Found minus true, metres.
-    paper_angle, paper_offset : float
-        The same of the plane by the paper's way.
-    """
-
+    # Between the normals, radians.
     angle: float
     sigma_angle: float
+    # Found minus true, metres.
     offset: float
     sigma_offset: float
+    # The same of the plane by the paper's way.
     paper_angle: float
     paper_offset: float
 
 
 @dataclass(frozen=True, slots=True)
 class Remaining:
-    """Range errors that a calibration leaves on walls square ahead, without noise, W of them.
+    """Range errors that a calibration leaves on walls square ahead, without noise, W of them."""
 
-    Attributes
-    ----------
-    ranges : array, shape (W,)
-        True ones, metres.
-    errors, sigmas : array, shape (W, 3)
-        Of range, pitch and yaw, m and rad; the sigmas are what the calibration states.
-    """
-
+    # Shape (W,): True ones, metres.
     ranges: FloatArray
+    # Shape (W, 3): of range, pitch and yaw, m and rad; the sigmas are what the calibration states.
     errors: FloatArray
     sigmas: FloatArray
 

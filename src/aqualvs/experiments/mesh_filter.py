@@ -110,18 +110,11 @@ class Judged(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class LitTruth:
-    """Points that the lasers light and the camera sees, N of them.
+    """Points that the lasers light and the camera sees, N of them."""
 
-    Attributes
-    ----------
-    pixels : array, shape (N, 2)
-    laser : int array, shape (N,)
-    on_net : bool array, shape (N,)
-    """
-
-    pixels: FloatArray
-    laser: IntArray
-    on_net: BoolArray
+    pixels: FloatArray  # Shape (N, 2).
+    laser: IntArray  # Shape (N,).
+    on_net: BoolArray  # Shape (N,).
 
     @classmethod
     def read(cls, path: Path) -> "LitTruth":

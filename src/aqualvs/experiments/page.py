@@ -68,31 +68,22 @@ class PrintedFigure:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Record:
-    """An experiment that was run, as `results.json` keeps it.
+    """An experiment that was run, as `results.json` keeps it."""
 
-    Attributes
-    ----------
-    name, title, paper, about : str
-        As in `Experiment`.
-    sentence : str
-    findings : tuple of ExperimentRow
-    pictures : tuple of PrintedFigure
-    series : tuple of str
-        Files in `series/`.
-    notes : tuple of str
-    failure : str
-        Why there is no outcome; empty if there is one.
-    """
-
+    # As in `Experiment`.
     name: str
     title: str
     paper: str
     about: str
+
     sentence: str = ""
     findings: tuple[ExperimentRow, ...] = ()
     pictures: tuple[PrintedFigure, ...] = ()
+    # Files in `series/`.
     series: tuple[str, ...] = ()
+
     notes: tuple[str, ...] = ()
+    # Why there is no outcome; empty if there is one.
     failure: str = ""
 
 

@@ -43,20 +43,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Numbers:
-    """Index and its uncertainty after each frame, F of them, shape (F,) each.
-
-    Attributes
-    ----------
-    truth : array
-    ours, sigma : array
-        Joint estimate and its standard deviation.
-    paper : array
-        The paper's way: each frame by itself, everything but the index held.
-    """
+    """Index and its uncertainty after each frame, F of them, shape (F,) each."""
 
     truth: FloatArray
+    # Joint estimate and its standard deviation.
     ours: FloatArray
     sigma: FloatArray
+    # The paper's way: each frame by itself, everything but the index held.
     paper: FloatArray
 
     def after(self, start: int, every: int = 1) -> "Numbers":
@@ -67,20 +60,13 @@ class Numbers:
 
 @dataclass(frozen=True, slots=True)
 class Decentred:
-    """Uncertainty of an index by the lens's distance from the dome's centre, shape (L,) each.
-
-    Attributes
-    ----------
-    lens_mm : array
-    noise, placed : array
-        Standard deviation of the index, target's place known exactly, or as well as one measures.
-    observable : bool array
-        Whether the system believes the latter.
-    """
+    """Uncertainty of an index by the lens's distance from the dome's centre, shape (L,) each."""
 
     lens_mm: FloatArray
+    # Standard deviation of the index, target's place known exactly, or as well as one measures.
     noise: FloatArray
     placed: FloatArray
+    # Whether the system believes the latter.
     observable: BoolArray
 
 
@@ -179,21 +165,11 @@ _ROOM = RoomLight(level=0.30, tint=(0.75, 1.0, 0.95), veil=(0.012, 0.035, 0.028)
 
 @dataclass(frozen=True, slots=True)
 class Cruise:
-    """Frames of the target, from the deck through all waters, F of them.
+    """Frames of the target, from the deck through all waters, F of them."""
 
-    Attributes
-    ----------
-    views : list of View
-        Points where the target's file puts them, pixels where they were found.
-    n_true : array, shape (F,)
-        Index of the medium in each.
-    example : uint8 array, shape (height, width, 3)
-        The last picture.
-    """
-
-    views: list[View]
-    n_true: FloatArray
-    example: "NDArray[np.uint8]"
+    views: list[View]  # Points where the target's file puts them, pixels where they were found.
+    n_true: FloatArray  # Shape (F,): index of the medium in each.
+    example: "NDArray[np.uint8]"  # Shape (height, width, 3): the last picture.
 
 
 def cruise(laboratory: Laboratory, waters: Sequence[float] = WATERS) -> Cruise:

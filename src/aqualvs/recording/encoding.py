@@ -331,23 +331,12 @@ _HEADER = "std_msgs/Header", "builtin_interfaces/Time stamp\nstring frame_id\n"
 
 @dataclass(frozen=True, slots=True)
 class RecordedTopic:
-    """A topic.
+    """A topic."""
 
-    Attributes
-    ----------
-    number : int
-        Of its channel and its schema in the file; from 1.
-    name : str
-    kind : str
-        Full name of its messages.
-    definition : str
-        Of its messages and of all that they hold.
-    """
-
-    number: int
+    number: int  # Of its channel and its schema in the file; from 1.
     name: str
-    kind: str
-    definition: str
+    kind: str  # Full name of its messages.
+    definition: str  # Of its messages and of all that they hold.
 
 
 def _definition(own: str, *parts: tuple[str, str]) -> str:

@@ -26,30 +26,20 @@ from aqualvs.sources.mcap_file import McapFile, StoredMessage
 
 @dataclass(frozen=True, slots=True)
 class RecordedFrame:
-    """Frame as a recording holds it.
+    """Frame as a recording holds it."""
 
-    Attributes
-    ----------
-    index, time_s
-        As in the `Frame`.
-    n_water : float
-        Index that it was measured with.
-    peaks : dict
-        Stripes as detected.
-    refusal : Refusal or None
-        Why it was not measured at all.
-    turning : GyroRates or None
-        As the vehicle's gyros told.
-    picture : Frame or None
-        None where there is none, or it was not asked for.
-    """
-
+    # As in the `Frame`.
     index: int
     time_s: float
+    # Index that it was measured with.
     n_water: float
+    # Stripes as detected.
     peaks: dict[SearchAxis, StripePeaks]
+    # Why it was not measured at all.
     refusal: Refusal | None
+    # As the vehicle's gyros told.
     turning: GyroRates | None
+    # None where there is none, or it was not asked for.
     picture: Frame | None
 
 

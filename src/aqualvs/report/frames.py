@@ -54,19 +54,12 @@ _HOLE_COLOUR = bgr("#ffb347")
 
 @dataclass(frozen=True, slots=True)
 class SampleFrame:
-    """A sample frame ready for the page.
-
-    Attributes
-    ----------
-    jpeg_base64 : str
-    size_px : (int, int)
-        Width and height as embedded.
-    saturated : float
-        Share of the target points that lie on a saturated pixel; NaN without target points.
-    """
+    """A sample frame ready for the page."""
 
     jpeg_base64: str
+    # Width and height as embedded.
     size_px: tuple[int, int]
+    # Share of the target points that lie on a saturated pixel; NaN without target points.
     saturated: float = float("nan")
 
 

@@ -68,35 +68,23 @@ _NAMES = ("adaptive filter", "paper's filter")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reflections:
-    """Points that one laser lit in one frame, N of them.
-
-    Attributes
-    ----------
-    frame : int
-    laser : str
-        Its name.
-    in_laser : array, shape (N, 2)
-        Points in `laser`, in metres: x across, y forward.
-    offset : float
-        Distance of the laser's plane from the dome's centre, in metres.
-    working_range : (float, float)
-        Operational range zone, distances from the dome's centre in metres.
-    usable : bool array, shape (N,)
-        Points in that zone.
-    adaptive, paper : bool array, shape (N,)
-        Points that the two filters take for net.
-    every_pixel : bool
-        Whether the points are bright pixels, or centres of returns.
-    """
+    """Points that one laser lit in one frame, N of them."""
 
     frame: int
+    # Its name.
     laser: str
+    # Shape (N, 2): points in `laser`, in metres: x across, y forward.
     in_laser: FloatArray
+    # Distance of the laser's plane from the dome's centre, in metres.
     offset: float
+    # Operational range zone, distances from the dome's centre in metres.
     working_range: tuple[float, float]
+    # Shape (N,): points in that zone.
     usable: BoolArray
+    # Shape (N,): points that the two filters take for net.
     adaptive: BoolArray
     paper: BoolArray
+    # Whether the points are bright pixels, or centres of returns.
     every_pixel: bool = False
 
     @property
@@ -363,17 +351,12 @@ _PIXEL_COLUMNS = ("u_px", "v_px", "width_px", "label")
 
 
 class _Counts(NamedTuple):
-    """Reflections of every frame and laser that has any, K of them.
+    """Reflections of every frame and laser that has any, K of them."""
 
-    Attributes
-    ----------
-    frame, laser : int array, shape (K,)
-    n_net, n_other : int array, shape (K,)
-        Labelled net, and anything else.
-    """
-
+    # Shape (K,).
     frame: IntArray
     laser: IntArray
+    # Shape (K,): labelled net, and anything else.
     n_net: IntArray
     n_other: IntArray
 

@@ -24,21 +24,14 @@ Row: TypeAlias = Mapping[str, str]
 
 @dataclass(frozen=True, slots=True)
 class NetTables:
-    """Files on the condition of a net, read from a run's folder.
+    """Files on the condition of a net, read from a run's folder."""
 
-    Attributes
-    ----------
-    stretches, holes : list of mapping
-        Rows of `net.csv` and `holes.csv`, column to cell.
-    facts : mapping
-        Member `aqualvs_net` of `net.geojson`; empty where it is missing.
-    map_base64 : str
-        `net_map.png`; "" where it is missing.
-    """
-
+    # Rows of `net.csv` and `holes.csv`, column to cell.
     stretches: list[Row]
     holes: list[Row]
+    # Member `aqualvs_net` of `net.geojson`; empty where it is missing.
     facts: Mapping[str, Any]
+    # `net_map.png`; "" where it is missing.
     map_base64: str
 
     @property
@@ -100,23 +93,12 @@ def net_cards(net: NetTables | None) -> list[Card]:
 
 @dataclass(frozen=True, slots=True)
 class HolePicture:
-    """Where a hole is to be cut out of the dive's pictures.
+    """Where a hole is to be cut out of the dive's pictures."""
 
-    Attributes
-    ----------
-    number : str
-        As `holes.csv` has it.
-    frame : int
-    middle : (float, float)
-        Column and row in that frame's picture.
-    diameter : float
-        In pixels.
-    """
-
-    number: str
+    number: str  # As `holes.csv` has it.
     frame: int
-    middle: tuple[float, float]
-    diameter: float
+    middle: tuple[float, float]  # Column and row in that frame's picture.
+    diameter: float  # In pixels.
 
 
 def hole_pictures(net: NetTables) -> list[HolePicture]:

@@ -50,38 +50,29 @@ class NoFrameError(SourceError):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Track:
-    """`posture.csv` as arrays, one entry per frame, ordered by frame.
+    """`posture.csv` as arrays, one entry per frame, ordered by frame."""
 
-    Attributes
-    ----------
-    frame : int array, shape (N,)
-    time_s : array, shape (N,)
-    valid : bool array, shape (N,)
-    reason : int array, shape (N,)
-        Index into `reasons`; meaningful where not valid.
-    reasons : tuple of str
-        As the file spells them.
-    posture, sigma : array, shape (N, 3)
-        Range in metres, pitch and yaw in degrees; NaN where not valid. `sigma` is what the noise of
-        one frame makes.
-    sigma_total : array, shape (N, 3)
-        By noise and rig together; that of the noise in runs of older versions.
-    n_points, n_water : array, shape (N,)
-        NaN where the file has none.
-    first_field : {"top", "bottom"} or None
-        Field of even frames of an interlaced camera; None where frames are whole pictures.
-    """
-
+    # Shape (N,).
     frame: IntArray
+    # Shape (N,).
     time_s: FloatArray
+    # Shape (N,).
     valid: BoolArray
+    # Shape (N,): index into `reasons`; meaningful where not valid.
     reason: IntArray
+    # As the file spells them.
     reasons: tuple[str, ...]
+    # Shape (N, 3): range in metres, pitch and yaw in degrees; NaN where not valid. `sigma` is what
+    # the noise of one frame makes.
     posture: FloatArray
     sigma: FloatArray
+    # Shape (N, 3): by noise and rig together; that of the noise in runs of older versions.
     sigma_total: FloatArray
+    # Shape (N,): NaN where the file has none.
     n_points: FloatArray
     n_water: FloatArray
+    # Field of even frames of an interlaced camera; None where frames are whole
+    # pictures.
     first_field: Field | None = None
 
     def __len__(self) -> int:
@@ -288,23 +279,12 @@ def _numbers(column: Any) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class LaserFacts:
-    """A laser as the report needs it.
-
-    Attributes
-    ----------
-    name : str
-    normal : array, shape (3,)
-        Unit normal in `dome`; NaN where the file has none.
-    offset : float
-        Metres.
-    bent : bool
-        Whether the plane only fits a bent sheet.
-    """
+    """A laser as the report needs it."""
 
     name: str
-    normal: FloatArray
-    offset: float
-    bent: bool = False
+    normal: FloatArray  # Shape (3,): unit normal in `dome`; NaN where the file has none.
+    offset: float  # Metres.
+    bent: bool = False  # Whether the plane only fits a bent sheet.
 
     @classmethod
     def unknown(cls, index: int) -> "LaserFacts":

@@ -49,24 +49,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class NetResult:
-    """Result of a net's evaluation, as written to its files.
+    """Result of a net's evaluation, as written to its files."""
 
-    Attributes
-    ----------
-    wall : UnrolledNet
-        Stretches and holes on the unrolled net.
-    summary : dict
-        The same in numbers, as `net.geojson` has it.
-    lines : list of str
-        The summary in words.
-    log : LaidLog or None
-        The vehicle's log.
-    """
-
-    wall: "UnrolledNet"
-    summary: dict[str, Any]
-    lines: list[str]
-    log: "LaidLog | None"
+    wall: "UnrolledNet"  # Stretches and holes on the unrolled net.
+    summary: dict[str, Any]  # The same in numbers, as `net.geojson` has it.
+    lines: list[str]  # The summary in words.
+    log: "LaidLog | None"  # The vehicle's log.
 
 
 class NetPass:

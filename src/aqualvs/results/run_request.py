@@ -47,21 +47,14 @@ class Status(StrEnum):
 
 @dataclass(slots=True)
 class RunFile:
-    """Content of `run.yaml`.
-
-    Attributes
-    ----------
-    path : Path
-    source, rig, options : mapping
-        Facts that do not change during the run, ready for YAML.
-    started : str
-        ISO 8601 with the time zone.
-    """
+    """Content of `run.yaml`."""
 
     path: Path
+    # Facts that do not change during the run, ready for YAML.
     source: Mapping[str, Any]
     rig: Mapping[str, Any]
     options: Mapping[str, Any]
+    # ISO 8601 with the time zone.
     started: str = field(default_factory=lambda: now())
 
     def write(
@@ -132,17 +125,11 @@ def now() -> str:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Water:
-    """Medium as stated by the user; all None leaves the rig's own index.
+    """Medium as stated by the user; all None leaves the rig's own index."""
 
-    Attributes
-    ----------
-    n_water : float or None
-        Refractive index relative to vacuum.
-    temperature_c, salinity : float or None
-        Degrees Celsius and per mille; only together.
-    """
-
+    # Refractive index relative to vacuum.
     n_water: float | None = None
+    # Degrees Celsius and per mille; only together.
     temperature_c: float | None = None
     salinity: float | None = None
 

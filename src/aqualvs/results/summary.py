@@ -36,23 +36,15 @@ class Deviation:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TruthComparison:
-    """Deviation of a run's postures from the truth.
+    """Deviation of a run's postures from the truth."""
 
-    Attributes
-    ----------
-    n_compared : int
-        Frames with a posture and a truth.
-    n_missed : int
-        Frames with a truth but without a posture.
-    range_percent : Deviation
-        Of the range, in percent of the true range.
-    pitch_deg, yaw_deg : Deviation
-        In degrees.
-    """
-
+    # Frames with a posture and a truth.
     n_compared: int
+    # Frames with a truth but without a posture.
     n_missed: int
+    # Of the range, in percent of the true range.
     range_percent: Deviation
+    # In degrees.
     pitch_deg: Deviation
     yaw_deg: Deviation
 
@@ -190,25 +182,17 @@ class RunSummary:
     """Statistics over the frames of a run: refusals, ranges, agreement of the lasers, the net.
 
     Summaries of consecutive parts of a dive add up to that of the dive: `save` and `extend`.
-
-    Attributes
-    ----------
-    refused : counter
-        Frames without posture, by reason.
-    ranges : array of float
-        Metres, one for each frame; NaN without a posture.
-    agreement : LaserAgreement or None
-        Monitor of the lasers, if they are monitored.
-    net_check : NetCheck or None
-        Comparison of the net with the target file's, if the file describes one.
-    warnings : list of str
-        Of the source and the rig, before anything is measured.
     """
 
+    # Frames without posture, by reason.
     refused: Counter[str] = field(default_factory=Counter)
+    # Metres, one for each frame; NaN without a posture.
     ranges: "array[float]" = field(default_factory=lambda: array("d"))
+    # Monitor of the lasers, if they are monitored.
     agreement: LaserAgreement | None = None
+    # Comparison of the net with the target file's, if the file describes one.
     net_check: NetCheck | None = None
+    # Of the source and the rig, before anything is measured.
     warnings: list[str] = field(default_factory=list)
 
     @property

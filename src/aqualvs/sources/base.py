@@ -40,22 +40,12 @@ class State(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class PartHealth:
-    """Health of one part: the stream, an output or a laser.
-
-    Attributes
-    ----------
-    name : str
-    state : State
-    detail : str
-        In a few words, also for a part that is well.
-    n_dropped : int
-        Samples, or frames, that it could not take.
-    """
+    """Health of one part: the stream, an output or a laser."""
 
     name: str
     state: State
-    detail: str = ""
-    n_dropped: int = 0
+    detail: str = ""  # In a few words, also for a part that is well.
+    n_dropped: int = 0  # Samples, or frames, that it could not take.
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,36 +59,25 @@ class StageDelay:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Health:
-    """Health of a live run, over the last seconds.
+    """Health of a live run, over the last seconds."""
 
-    Attributes
-    ----------
-    rate_hz : float
-        Frames measured per second.
-    valid_share : float
-        Share of them with a posture; NaN without frames.
-    n_frames, n_dropped, n_lost : int
-        Since the start: measured; skipped because a newer one had come; not decoded.
-    delays : tuple of StageDelay
-        From the decoded frame on.
-    source : PartHealth
-    lasers, outputs : tuple of PartHealth
-    quality : float
-        Mean stripe quality on the target, 0 to 1; NaN without points.
-    n_water, sigma_n_water : float
-        Refractive index in use, and its standard deviation where it is measured on line (else NaN).
-    """
-
+    # Frames measured per second.
     rate_hz: float = 0.0
+    # Share of them with a posture; NaN without frames.
     valid_share: float = float("nan")
+    # Since the start: measured; skipped because a newer one had come; not decoded.
     n_frames: int = 0
     n_dropped: int = 0
     n_lost: int = 0
+    # From the decoded frame on.
     delays: tuple[StageDelay, ...] = ()
+
     source: PartHealth = field(default_factory=lambda: PartHealth("source", State.OFF))
     lasers: tuple[PartHealth, ...] = ()
     outputs: tuple[PartHealth, ...] = ()
+    # Mean stripe quality on the target, 0 to 1; NaN without points.
     quality: float = float("nan")
+    # Refractive index in use, and its standard deviation where it is measured on line (else NaN).
     n_water: float = float("nan")
     sigma_n_water: float = float("nan")
 

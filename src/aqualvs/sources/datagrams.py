@@ -22,18 +22,10 @@ from aqualvs.sources.rtp import PACKET_BYTES, SYNC, parse_rtp
 
 @dataclass(frozen=True, slots=True)
 class UdpAddress:
-    """Address and port to listen on.
+    """Address and port to listen on."""
 
-    Attributes
-    ----------
-    host : str
-        An address of this machine, a multicast group, or empty for every address.
-    port : int
-        0 for any free one.
-    """
-
-    host: str
-    port: int
+    host: str  # An address of this machine, a multicast group, or empty for every address.
+    port: int  # 0 for any free one.
 
     def __str__(self) -> str:
         host = f"[{self.host}]" if ":" in self.host else self.host

@@ -233,26 +233,17 @@ def combed_share(luma: ImagePlane) -> float:
 
 @dataclass(frozen=True, slots=True)
 class FieldEvidence:
-    """Signs of fields in whole pictures of a source.
+    """Signs of fields in whole pictures of a source."""
 
-    Attributes
-    ----------
-    is_marked : bool
-        Whether the stream says that its pictures are interlaced.
-    combed : float
-        Mean share of combed pixels.
-    woven : float
-        The same if the bottom rows came from the next picture: what fields would show at most.
-    woven_top : float
-        The same if the top rows did.
-    first_field : {"top", "bottom"} or None
-        As the stream states it, if it does.
-    """
-
+    # Whether the stream says that its pictures are interlaced.
     is_marked: bool
+    # Mean share of combed pixels.
     combed: float
+    # The same if the bottom rows came from the next picture: what fields would show at most.
     woven: float
+    # The same if the top rows did.
     woven_top: float = 0.0
+    # As the stream states it, if it does.
     first_field: Field | None = None
 
     @classmethod

@@ -17,17 +17,11 @@ _START_CODE = b"\x00\x00\x01"
 
 @dataclass(frozen=True, slots=True)
 class Units:
-    """Units of a packet up to its first coded slice.
+    """Units of a packet up to its first coded slice."""
 
-    Attributes
-    ----------
-    is_refresh : bool
-        Whether the picture is an IDR picture: decoding may begin with it.
-    has_parameter_sets, has_all_parameter_sets : bool
-        Whether there are any before it, and all that decoding needs.
-    """
-
+    # Whether the picture is an IDR picture: decoding may begin with it.
     is_refresh: bool
+    # Whether there are any before it, and all that decoding needs.
     has_parameter_sets: bool
     has_all_parameter_sets: bool
 
@@ -293,21 +287,11 @@ class _Bits:
 
 @dataclass(frozen=True, slots=True)
 class _SliceForm:
-    """What a sequence parameter set says of the heads of slices (7.3.2.1.1, 7.3.3).
+    """What a sequence parameter set says of the heads of slices (7.3.2.1.1, 7.3.3)."""
 
-    Attributes
-    ----------
-    number_bits : int
-        Width of `frame_num`.
-    may_skip_numbers : bool
-        Whether numbers may be left out on purpose.
-    may_hold_fields : bool
-        Whether slices say if they are of a field.
-    """
-
-    number_bits: int
-    may_skip_numbers: bool
-    may_hold_fields: bool
+    number_bits: int  # Width of `frame_num`.
+    may_skip_numbers: bool  # Whether numbers may be left out on purpose.
+    may_hold_fields: bool  # Whether slices say if they are of a field.
 
     def number(self, bits: "_Bits") -> int:
         """Return `frame_num`, of a slice whose type byte has been read."""

@@ -51,28 +51,19 @@ ENCODINGS = tuple(sorted({*_GREY, *_GREY_16, *_TO_BGR, *_PACKED_422}))
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ImageMessage:
-    """One picture, or one packet of a video.
+    """One picture, or one packet of a video."""
 
-    Attributes
-    ----------
-    stamp_ns : int
-        Time of the picture, nanoseconds; 0 if the message has none.
-    encoding : str
-        Of the pixels where `size_px` is given, else of the file or video: "jpeg", "png", "h264".
-    data : bytes
-    size_px : (int, int) or None
-        Width and height of a picture that is not compressed.
-    step : int
-        Bytes from row to row.
-    is_big_endian : bool
-        Byte order of pixels of 16 bits.
-    """
-
+    # Time of the picture, nanoseconds; 0 if the message has none.
     stamp_ns: int
+    # Of the pixels where `size_px` is given, else of the file or video: "jpeg", "png", "h264".
     encoding: str
+
     data: bytes
+    # Width and height of a picture that is not compressed.
     size_px: tuple[int, int] | None = None
+    # Bytes from row to row.
     step: int = 0
+    # Byte order of pixels of 16 bits.
     is_big_endian: bool = False
 
     @property
@@ -353,17 +344,10 @@ Logged: TypeAlias = tuple[int, ImageMessage | None]
 
 @dataclass(frozen=True, slots=True)
 class ImageTopic:
-    """A topic with images.
-
-    Attributes
-    ----------
-    name : str
-    n_messages : int or None
-        None where the recording does not state it.
-    """
+    """A topic with images."""
 
     name: str
-    n_messages: int | None
+    n_messages: int | None  # None where the recording does not state it.
 
 
 def choose_topic(where: str, topics: list[ImageTopic], wanted: str | None) -> ImageTopic:

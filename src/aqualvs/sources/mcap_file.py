@@ -193,14 +193,7 @@ _KNOWN = frozenset(Op)
 
 @dataclass(frozen=True, slots=True)
 class StoredMessage:
-    """One message.
-
-    Attributes
-    ----------
-    topic : str
-    log_ns, publish_ns : int
-    data : bytes
-    """
+    """One message."""
 
     topic: str
     log_ns: int
@@ -210,26 +203,17 @@ class StoredMessage:
 
 @dataclass(slots=True)
 class _Listing:
-    """Contents of a file as stated by one of its ends.
+    """Contents of a file as stated by one of its ends."""
 
-    Attributes
-    ----------
-    channels : list of (int, str)
-        Numbers and topics.
-    chunks : dict
-        From a chunk's place in the file to the length of its record; None where not known.
-    counts : dict or None
-        Messages by channel.
-    n_chunks : int or None
-        As the statistics have it.
-    whole : bool
-        Whether it was read to its end.
-    """
-
+    # Numbers and topics.
     channels: list[tuple[int, str]] = field(default_factory=list)
+    # From a chunk's place in the file to the length of its record; None where not known.
     chunks: dict[int, int | None] = field(default_factory=dict)
+    # Messages by channel.
     counts: dict[int, int] | None = None
+    # As the statistics have it.
     n_chunks: int | None = None
+    # Whether it was read to its end.
     whole: bool = False
 
 

@@ -199,21 +199,14 @@ _DEVICES = Path("/dev")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraOptions:
-    """Options requested of a camera; the camera chooses those left out.
+    """Options requested of a camera; the camera chooses those left out."""
 
-    Attributes
-    ----------
-    size_px : (int, int) or None
-        Width and height.
-    fps : float or None
-        Frames per second.
-    pixel_format : str or None
-        As FFmpeg calls it: `h264`, `mjpeg`, `yuyv422`. Many cameras reach their full rate with the
-        first two only.
-    """
-
+    # Width and height.
     size_px: tuple[int, int] | None = None
+    # Frames per second.
     fps: float | None = None
+    # As FFmpeg calls it: `h264`, `mjpeg`, `yuyv422`. Many cameras reach their full rate with the
+    # first two only.
     pixel_format: str | None = None
 
     def for_ffmpeg(self) -> dict[str, str]:

@@ -18,27 +18,13 @@ _RESTART_SILENCE_S = 0.1
 
 @dataclass(frozen=True, slots=True)
 class RtpPacket:
-    """One packet.
-
-    Attributes
-    ----------
-    payload_type : int
-    marker : bool
-        Ends a picture.
-    sequence : int
-        16 bits.
-    timestamp : int
-        32 bits, in ticks of the payload's clock.
-    sender : int
-        Synchronisation source (SSRC).
-    payload : bytes
-    """
+    """One packet."""
 
     payload_type: int
-    marker: bool
-    sequence: int
-    timestamp: int
-    sender: int
+    marker: bool  # Ends a picture.
+    sequence: int  # 16 bits.
+    timestamp: int  # 32 bits, in ticks of the payload's clock.
+    sender: int  # Synchronisation source (SSRC).
     payload: bytes
 
 
@@ -75,20 +61,11 @@ def parse_rtp(datagram: bytes) -> RtpPacket | None:
 
 
 class Ordered(NamedTuple):
-    """A packet in its place.
-
-    Attributes
-    ----------
-    packet : RtpPacket
-    after_loss : bool
-        Packets right before it are missing.
-    is_restart : bool
-        The first of another sender, or of a restarted one.
-    """
+    """A packet in its place."""
 
     packet: RtpPacket
-    after_loss: bool
-    is_restart: bool
+    after_loss: bool  # Packets right before it are missing.
+    is_restart: bool  # The first of another sender, or of a restarted one.
 
 
 class RtpOrder:
@@ -216,27 +193,13 @@ _UNUSED = frozenset({0, 2, 3, 4, 30, 31})
 
 @dataclass(frozen=True, slots=True)
 class AccessUnit:
-    """One coded picture.
+    """One coded picture."""
 
-    Attributes
-    ----------
-    ticks : int
-        Time, 90 kHz, continued past 32 bits.
-    data : bytes
-        Its units as a byte stream; empty if `is_whole` is False.
-    is_whole : bool
-        Nothing of it is missing.
-    after_loss : bool
-        Packets before it, or of it, are lost.
-    is_restart : bool
-        The first of a restarted sender.
-    """
-
-    ticks: int
-    data: bytes
-    is_whole: bool
-    after_loss: bool
-    is_restart: bool
+    ticks: int  # Time, 90 kHz, continued past 32 bits.
+    data: bytes  # Its units as a byte stream; empty if `is_whole` is False.
+    is_whole: bool  # Nothing of it is missing.
+    after_loss: bool  # Packets before it, or of it, are lost.
+    is_restart: bool  # The first of a restarted sender.
 
 
 class H264Depacketizer:

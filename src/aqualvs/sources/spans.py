@@ -50,54 +50,36 @@ class SpanKind(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Span:
-    """Consecutive frames of a dive.
-
-    Attributes
-    ----------
-    kind : SpanKind
-    first, stop : int
-        Frames `first` to `stop` - 1, by their index; 0 and 0 for a whole dive of unknown length.
-    start_pts, origin_pts : int
-        Time of the first packet and of the dive's first picture, in ticks of the stream.
-    n_bytes : int
-        Size of the packets, or of the files.
-    checksum : int
-        CRC-32 of the packets with their times.
-    lead, trail : int
-        Frames at the beginning and at the end that are those of the spans beside it, for what
-        depends on a frame's neighbours; they count in `first`, `stop` and `checksum`.
-    """
+    """Consecutive frames of a dive."""
 
     kind: SpanKind
+    # Frames `first` to `stop` - 1, by their index; 0 and 0 for a whole dive of unknown length.
     first: int = 0
     stop: int = 0
+    # Time of the first packet and of the dive's first picture, in ticks of the stream.
     start_pts: int = 0
     origin_pts: int = 0
+    # Size of the packets, or of the files.
     n_bytes: int = 0
+    # CRC-32 of the packets with their times.
     checksum: int = 0
+    # Frames at the beginning and at the end that are those of the spans beside it, for what depends
+    # on a frame's neighbours; they count in `first`, `stop` and `checksum`.
     lead: int = 0
     trail: int = 0
 
 
 @dataclass(frozen=True, slots=True)
 class VideoSpans:
-    """Spans into which a video may be cut.
+    """Spans into which a video may be cut."""
 
-    Attributes
-    ----------
-    spans : tuple of Span
-        In order, without gaps between their own frames; empty if the video must stay whole.
-    why_whole : str
-        Why it must; empty if it need not.
-    checksum : int
-        Of all packets.
-    n_bytes : int
-        Of all packets.
-    """
-
+    # In order, without gaps between their own frames; empty if the video must stay whole.
     spans: tuple[Span, ...]
+    # Why it must; empty if it need not.
     why_whole: str
+    # Of all packets.
     checksum: int
+    # Of all packets.
     n_bytes: int
 
 

@@ -53,22 +53,15 @@ from aqualvs.special_files import refuse_special
 
 @dataclass(frozen=True, slots=True)
 class SdpVideo:
-    """The video that a session description announces.
+    """The video that a session description announces."""
 
-    Attributes
-    ----------
-    address : UdpAddress
-        Where it arrives; the host is kept for multicast only.
-    payload_type : int
-    codec : str
-        As in RTP, upper case: "H264".
-    parameter_sets : bytes
-        SPS and PPS of H.264 as a byte stream; empty if they come in the stream.
-    """
-
+    # Where it arrives; the host is kept for multicast only.
     address: UdpAddress
+
     payload_type: int
+    # As in RTP, upper case: "H264".
     codec: str
+    # SPS and PPS of H.264 as a byte stream; empty if they come in the stream.
     parameter_sets: bytes
 
 

@@ -58,24 +58,12 @@ _TYPES = {
 
 @dataclass(frozen=True, slots=True)
 class Format:
-    """Format of one kind of record, as its `FMT` record describes it.
+    """Format of one kind of record, as its `FMT` record describes it."""
 
-    Attributes
-    ----------
-    name : str
-        Kind, such as 'ATT'.
-    length : int
-        Bytes of a record, its head of three included.
-    codes : str
-        One format character a column.
-    columns : tuple of str
-        Names of the columns.
-    """
-
-    name: str
-    length: int
-    codes: str
-    columns: tuple[str, ...]
+    name: str  # Kind, such as 'ATT'.
+    length: int  # Bytes of a record, its head of three included.
+    codes: str  # One format character a column.
+    columns: tuple[str, ...]  # Names of the columns.
 
     @property
     def dtype(self) -> np.dtype[np.void] | None:
@@ -93,25 +81,17 @@ class Format:
 
 @dataclass(frozen=True, slots=True)
 class Records:
-    """The wanted records of a dataflash log.
+    """The wanted records of a dataflash log."""
 
-    Attributes
-    ----------
-    tables : mapping of str to mapping of str to array
-        Kind to columns; numbers as float64 in the units that the log's text form has. A table
-        without records is missing. `time_s`, seconds since the autopilot started, is in each.
-    n_records : int
-        Records of any kind.
-    skipped : tuple of (int, int)
-        Stretches without records: place in the file (or line, of text), and length in bytes (or
-        lines).
-    n_bogus : int
-        Wanted records with an impossible time; they are left out.
-    """
-
+    # Kind to columns; numbers as float64 in the units that the log's text form has. A table without
+    # records is missing. `time_s`, seconds since the autopilot started, is in each.
     tables: Mapping[str, Mapping[str, FloatArray]]
+    # Records of any kind.
     n_records: int
+    # Stretches without records: place in the file (or line, of text), and length in bytes (or
+    # lines).
     skipped: tuple[tuple[int, int], ...]
+    # Wanted records with an impossible time; they are left out.
     n_bogus: int
 
 

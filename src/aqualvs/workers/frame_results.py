@@ -213,22 +213,14 @@ class FrameScanner(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class FrameResult:
-    """Result of one frame.
-
-    Attributes
-    ----------
-    scan : Scan
-    bare : Posture, Refusal or None
-        Result when the dome is ignored; None for a rig without a dome.
-    frame : Frame or None
-        None for a frame that was lost, or that another process has measured.
-    is_lost : bool
-        Whether the scan is that of a frame that could not be decoded.
-    """
+    """Result of one frame."""
 
     scan: Scan
+    # Result when the dome is ignored; None for a rig without a dome.
     bare: Posture | Refusal | None
+    # None for a frame that was lost, or that another process has measured.
     frame: Frame | None = None
+    # Whether the scan is that of a frame that could not be decoded.
     is_lost: bool = False
 
 

@@ -277,42 +277,24 @@ class Receiver:
 
 @dataclass(frozen=True, slots=True)
 class SpanPart:
-    """Wanted frames of a span.
-
-    Attributes
-    ----------
-    span : Span
-    first, stop : int
-        Frames `first` to `stop` - 1, which lie in the span; numbers of fields if the camera is
-        interlaced, while spans count pictures.
-    """
+    """Wanted frames of a span."""
 
     span: Span
+    # Frames `first` to `stop` - 1, which lie in the span; numbers of fields if the camera is
+    # interlaced, while spans count pictures.
     first: int
     stop: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PoolJob:
-    """Work of a pool: the dive, its parts, and what measures it.
+    """Work of a pool: the dive, its parts, and what measures it."""
 
-    Attributes
-    ----------
-    path : Path
-        A video, or a folder of images.
-    parts : tuple of SpanPart
-        In the order of the dive.
-    rig : Rig
-    options : ScannerOptions
-    fps : float
-        Frame rate of images.
-    """
-
-    path: Path
-    parts: tuple[SpanPart, ...]
+    path: Path  # A video, or a folder of images.
+    parts: tuple[SpanPart, ...]  # In the order of the dive.
     rig: Rig
     options: ScannerOptions
-    fps: float
+    fps: float  # Frame rate of images.
 
 
 def serve(

@@ -45,14 +45,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class ReplayedFrame(Frame):
-    """A frame from a recording; black where the recording has no picture.
+    """A frame from a recording; black where the recording has no picture."""
 
-    Attributes
-    ----------
-    recorded : RecordedFrame or None
-        Never None; only a base class with defaults asks for one.
-    """
-
+    # Never None; only a base class with defaults asks for one.
     recorded: "RecordedFrame | None" = None
 
 
