@@ -115,7 +115,6 @@ class RunMcap(Closing):
 
     Parameters
     ----------
-    folder : Path
     rig : Rig
         For frames that were lost.
     options : ScannerOptions
@@ -275,8 +274,6 @@ class RunOverlay(Closing):
 
     Parameters
     ----------
-    folder : Path
-    rig : Rig
     source : FrameSource
         Gives size and rate of the video.
     wanted : bool

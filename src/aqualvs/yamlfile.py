@@ -118,7 +118,6 @@ def read_yaml(path: Path, what: str, error: type[AqualvsError]) -> Any:
 
     Parameters
     ----------
-    path : Path
     what : str
         Kind of the file in messages, such as "a rig file".
     error : type
@@ -171,7 +170,6 @@ def parse_yaml(text: str, source: str, error: type[AqualvsError]) -> Any:
 
     Parameters
     ----------
-    text : str
     source : str
         Name of the text in messages.
     error : type
@@ -218,8 +216,6 @@ class _Node:
 
     Attributes
     ----------
-    value : object
-    anchor : str or None
     count, height : int
         Values that it holds, itself included, and levels of lists and mappings.
     key : object

@@ -226,7 +226,6 @@ class BatchProgress(Closing):
 
     Parameters
     ----------
-    n_dives : int
     echo : callable
         Takes one line of text.
     """

@@ -43,7 +43,6 @@ def write_manifest(
 
     Parameters
     ----------
-    folder : Path
     key : str
         What the files were made from.
     facts : mapping
@@ -236,7 +235,6 @@ def put_net(dataset: Path, name: str, folder: Path) -> None:
 
     Parameters
     ----------
-    dataset : Path
     name : str
         Of the dive.
     folder : Path
@@ -266,7 +264,6 @@ def write_dives(dataset: Path, rows: Iterable[Mapping[str, Any]]) -> None:
 
     Parameters
     ----------
-    dataset : Path
     rows : iterable of mappings
         With the columns of `DIVES_SCHEMA`; absent ones are null.
 

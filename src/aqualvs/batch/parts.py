@@ -245,7 +245,6 @@ def joined_summary(dive: OpenDive, pieces: Sequence[Path]) -> RunSummary:
 
     Parameters
     ----------
-    dive : OpenDive
     pieces : sequence of Path
         Folders of all pieces, in order.
     """
@@ -283,8 +282,6 @@ def join_dive(work: DiveWork, probe: DiveProbe, results: Sequence[PieceResult]) 
 
     Parameters
     ----------
-    work : DiveWork
-    probe : DiveProbe
     results : sequence of PieceResult
         Of all pieces, in order.
 

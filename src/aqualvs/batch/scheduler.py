@@ -267,7 +267,6 @@ def with_net(work: DiveWork, key: str, facts: Mapping[str, Any]) -> dict[str, An
 
     Parameters
     ----------
-    work : DiveWork
     key : str
         Of the dive's result, `DiveProbe.key`.
     facts : mapping
@@ -408,8 +407,6 @@ class Scheduler:
     ----------
     works : sequence of (DiveWork, int)
         The dives with the sizes of their sources in bytes, in the order in which they are begun.
-    workers : Workers
-    observer : BatchObserver
     steps : Steps, optional
         In place of the real ones.
     """

@@ -68,7 +68,6 @@ def read_colmap(text: str, source: str, *, name: str | None = None) -> ForeignCa
 
     Parameters
     ----------
-    text, source : str
     name : str, optional
         CAMERA_ID; needed where there are several.
 
@@ -162,7 +161,6 @@ def colmap_text(camera: ForeignCamera, *, refractive: bool) -> str:
 
     Parameters
     ----------
-    camera : ForeignCamera
     refractive : bool
         Whether to write the housing, for Refractive COLMAP.
 

@@ -71,7 +71,6 @@ def read_camera(
 
     Parameters
     ----------
-    path : str or Path
     camera : str, optional
         Name of the camera, where a file of Kalibr or COLMAP holds several.
     model : str, optional
@@ -117,7 +116,6 @@ def camera_text(camera: ForeignCamera, to: str, *, suffix: str = "") -> str:
 
     Parameters
     ----------
-    camera : ForeignCamera
     to : str
         One of `EXPORTS`.
     suffix : str

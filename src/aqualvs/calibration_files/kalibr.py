@@ -26,7 +26,6 @@ def read_kalibr(text: str, source: str, *, name: str | None = None) -> ForeignCa
 
     Parameters
     ----------
-    text, source : str
     name : str, optional
         Key of the camera, such as "cam0"; needed where there are several.
 

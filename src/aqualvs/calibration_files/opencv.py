@@ -147,7 +147,6 @@ def read_opencv(text: str, source: str, *, model: str | None = None) -> ForeignC
 
     Parameters
     ----------
-    text, source : str
     model : str, optional
         "opencv" or "fisheye" where the file does not say it (`fisheye_model`).
 

@@ -74,7 +74,6 @@ def autopilot(address: str, vehicle: VehicleSetup, rig: Path | None = None) -> I
     ----------
     address : str
         As in `parse_address`.
-    vehicle : VehicleSetup
     rig : Path or None
         Whose working range the autopilot's rangefinder should take.
     """

@@ -65,7 +65,6 @@ def check_solved(
 
     Parameters
     ----------
-    rig : Rig
     steps : dict of SolvedStep
         As `solved_steps` gives them.
     uncertainty : RigUncertainty
@@ -294,7 +293,6 @@ def check_rig(rig: Rig, now: datetime | None = None) -> list[Finding]:
 
     Parameters
     ----------
-    rig : Rig
     now : datetime, optional
         With a time zone; calibrations are as old as it makes them. The computer's clock if left
         out.

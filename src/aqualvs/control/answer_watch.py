@@ -184,7 +184,6 @@ class AnswerWatch:
 
         Parameters
         ----------
-        now_s : float
         posture : Posture
             Of a frame that has not been seen before.
         state : VehicleState
@@ -226,7 +225,6 @@ class AnswerWatch:
 
         Parameters
         ----------
-        now_s : float
         still_s : float, optional
             For how long the picture has stood still, if the picture tells it; else as the last
             posture has told.

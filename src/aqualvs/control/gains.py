@@ -122,7 +122,6 @@ class DeadBandCrossing:
 
     Parameters
     ----------
-    thrust : ThrustMap
     impulse : float
         Share of the full thrust, times seconds.
     great : float
@@ -373,7 +372,6 @@ def gain_schedule(gains: RangeGains, damping: float) -> tuple[float, float]:
 
     Parameters
     ----------
-    gains : RangeGains
     damping : float
         Slope of the drag over mass, in 1/s.
     """

@@ -36,7 +36,6 @@ def load_settings(path: Path, kind: type[AnyPart], key: str, version: int) -> An
 
     Parameters
     ----------
-    path : Path
     kind : type
         What the file may hold.
     key : str

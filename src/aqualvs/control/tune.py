@@ -318,7 +318,6 @@ class Tuned:
 
     Attributes
     ----------
-    gains : ControlGains
     range_usual, yaw_usual : Margins
         At the usual delay with the model as it is, in still water.
     range_corner : Margins

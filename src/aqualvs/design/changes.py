@@ -40,7 +40,6 @@ def best_angles(design: Design, *, quick: bool = False) -> Design:
 
     Parameters
     ----------
-    design : Design
     quick : bool
         Start from the mounts' own angles only: sufficient after small changes of a design.
     """

@@ -195,7 +195,6 @@ def load_design(path: Path, given: Mapping[str, Any] | None = None) -> Design:
 
     Parameters
     ----------
-    path : Path
     given : mapping, optional
         Replacements of the file's values by the command line, see `merged_content`.
 

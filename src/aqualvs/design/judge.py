@@ -62,7 +62,6 @@ def predict(design: Design, ranges: Sequence[float] | FloatArray | None = None) 
 
     Parameters
     ----------
-    design : Design
     ranges : sequence of float, optional
         Walls square to the forward axis, metres; the design's own if left out.
     """

@@ -332,7 +332,6 @@ def write_page(
 
     Parameters
     ----------
-    path : Path
     name : str
         Of the rig.
     first : str

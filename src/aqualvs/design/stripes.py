@@ -71,8 +71,6 @@ def see_stripes(
 
     Parameters
     ----------
-    camera : Camera
-    mounts : sequence of Mount
     ranges : array, shape (W,)
         Metres.
     common : array, shape (P, G)

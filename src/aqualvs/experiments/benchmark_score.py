@@ -265,7 +265,6 @@ def lines(scores: Scores, *, dives: bool) -> list[str]:
 
     Parameters
     ----------
-    scores : Scores
     dives : bool
         Whether to show every dive before its level.
     """
@@ -403,7 +402,6 @@ def run_own(
 
     Parameters
     ----------
-    benchmark : BenchmarkSet
     folder : Path
         A run goes to SYSTEM/DIVE in it.
     echo : callable

@@ -115,13 +115,7 @@ class TimeLeft:
 
 
 class ExperimentBar:
-    """A progress bar over experiments.
-
-    Parameters
-    ----------
-    bar : rich.progress.Progress
-    names : sequence of str
-    """
+    """A progress bar over experiments."""
 
     def __init__(self, bar: Progress, names: Sequence[str]) -> None:
         self._bar = bar
@@ -222,7 +216,6 @@ def reproduce(request: ReproduceRequest, echo: Echo, load: Load = catalogue.expe
 
     Parameters
     ----------
-    request : ReproduceRequest
     echo : callable
         Takes one line of text.
     load : callable

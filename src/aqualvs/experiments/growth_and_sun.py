@@ -48,7 +48,6 @@ def visible_points(laboratory: Laboratory, dive: RenderedDive) -> FloatArray:
     ----------
     laboratory : Laboratory
         Counts the frames, which are rendered once more for this.
-    dive : RenderedDive
     """
     path = dive.folder / _FILE
     if not path.exists():

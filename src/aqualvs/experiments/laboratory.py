@@ -210,8 +210,6 @@ class Laboratory:
 
         Parameters
         ----------
-        dive : RenderedDive
-        options : ScannerOptions, optional
         rig : Rig, optional
             What the scanner believes; the true rig by default.
         no_dome : bool

@@ -50,8 +50,6 @@ def papers_pixels(
 
     Parameters
     ----------
-    laboratory : Laboratory
-    dive : RenderedDive
     options : MeshFilterOptions
         Of the filter; by default those of section 5.2.
     level : int, optional
@@ -142,7 +140,6 @@ def judge_pixels(pixels: FloatArray, laser: IntArray, truth: LitTruth) -> Judged
     ----------
     pixels : array, shape (N, 2)
     laser : int array, shape (N,)
-    truth : LitTruth
 
     Returns
     -------
@@ -179,7 +176,6 @@ def judge_reflections(found: FilteredPeaks, truth: LitTruth) -> Judged:
     ----------
     found : FilteredPeaks
         All pixels of the frame, and which of them are said to lie on the net.
-    truth : LitTruth
 
     Returns
     -------

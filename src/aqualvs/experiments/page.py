@@ -268,7 +268,6 @@ def write_page(records: Sequence[Record], seconds: Mapping[str, float], folder: 
         In the order in which they shall stand.
     seconds : mapping
         How long experiments took, as far as it is known.
-    folder : Path
 
     Returns
     -------

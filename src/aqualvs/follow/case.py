@@ -73,7 +73,6 @@ def vehicle_model(name: str, pilot_gain: float = 0.5) -> VehicleModel:
 
     Parameters
     ----------
-    name : str
     pilot_gain : float
         ArduSub's: the share of the thrust that a full effort asks for.
 

@@ -57,8 +57,6 @@ class LoopPage:
     ----------
     page : Output
         Closed with this.
-    rig : Rig
-    loop : SimulatedLoop
     holder : SetpointHolder
         Where the page puts the setpoint; a mission that holds follows it.
     """
@@ -156,12 +154,10 @@ class RunWatch:
 
     Parameters
     ----------
-    loop : SimulatedLoop
     seconds : float
         Of the whole run.
     echo : callable
         Takes one line.
-    stop : StopSignals
     slow : bool
         Whether a simulated second takes seconds, so that progress is printed.
     """

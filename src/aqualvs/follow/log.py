@@ -229,10 +229,8 @@ def effort_measures(
 
     Parameters
     ----------
-    log : LoopLog
     name : {"forward", "right", "down", "turn"}
         Of the effort.
-    start_s, end_s : float
     """
     return _measured(log, log.column(name), start_s, end_s)
 

@@ -38,7 +38,6 @@ class SimulatedLink:
 
     Attributes
     ----------
-    vehicle : SimulatedVehicle
     effort : Effort
         The last that was sent.
     """
@@ -168,8 +167,6 @@ class SimulatedLoop:
     ----------
     link : SimulatedLink
         To the vehicle.
-    net : NetWall
-    sensor : RangeSensor
     steering : NetPilot
         Engaged at the start.
     timing : Timing, optional

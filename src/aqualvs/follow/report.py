@@ -50,10 +50,6 @@ def draw_follow_figures(log: LoopLog, out: Path) -> list[Path]:
     out : Path
         Folder that exists.
 
-    Returns
-    -------
-    list of Path
-
     Raises
     ------
     OSError

@@ -44,7 +44,6 @@ class RenderedSensor:
 
     Parameters
     ----------
-    net : NetWall
     rig : Rig
         That the pictures are taken with, and measured with.
     rng : Generator
@@ -177,7 +176,6 @@ class SampledSensor:
 
     Parameters
     ----------
-    net : NetWall
     rng : Generator
         Source of the noise.
     noise : PostureNoise, optional

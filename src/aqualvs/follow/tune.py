@@ -66,8 +66,6 @@ def simulate_step(
     ----------
     model : VehicleModel
         Need not be the one that the gains are for.
-    gains : ControlGains
-    options : StepOptions, optional
     water : WaterMotion, optional
         Still if left out.
     """

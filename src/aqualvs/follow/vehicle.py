@@ -50,7 +50,6 @@ class FollowLogOutput:
     ----------
     path : Path
         Created, or overwritten.
-    pilot : Pilot
 
     Raises
     ------

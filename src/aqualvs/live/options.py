@@ -244,7 +244,6 @@ def serve_page(
         HOST:PORT.
     token : str or None
         Its password; a new one if left out.
-    rig : Rig
     holder : SetpointHolder
         Where the page puts what is to be held.
     recorder : RecorderSwitch or None

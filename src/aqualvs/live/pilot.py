@@ -33,7 +33,6 @@ class Watchdog:
 
     Parameters
     ----------
-    vehicle : VehicleLink
     timeout_s : float
         Time that an effort may stay in force.
 
@@ -59,7 +58,6 @@ class Watchdog:
 
         Parameters
         ----------
-        effort : Effort
         known_s : float
             Time at which its posture was known, by `time.monotonic`.
 

@@ -249,7 +249,6 @@ class FrameReader:
 
     Parameters
     ----------
-    feed : Feed
     mailbox : Mailbox
         Closed when the feed ends.
 
@@ -338,12 +337,7 @@ class ScannerSupply(Protocol):
 
 
 class FixedScanner:
-    """Provider of always the same scanner.
-
-    Parameters
-    ----------
-    scanner : Scanner
-    """
+    """Provider of always the same scanner."""
 
     def __init__(self, scanner: Scanner) -> None:
         self.scanner = scanner

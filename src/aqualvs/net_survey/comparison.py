@@ -101,10 +101,8 @@ def find_sites(
 
     Parameters
     ----------
-    placed : sequence
     shifts : sequence
         What each shift leaves open is in its sigma.
-    frame : WallFrame
     """
     dates = sorted({one.survey.date for one in placed})
     parts = [(i, k) for i, one in enumerate(placed) for k in _known(one)]

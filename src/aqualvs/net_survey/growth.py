@@ -105,7 +105,6 @@ class WallHistory:
 
         Parameters
         ----------
-        value : float
         of_stretches : array, shape (K,)
             Factors of the stretches times their sigmas.
         place : float
@@ -124,10 +123,8 @@ def history(
 
     Parameters
     ----------
-    placed : sequence
     shifts : sequence
         What each shift leaves open is in its sigma.
-    frame : WallFrame
     cell : float
         Side of a cell in metres.
     """

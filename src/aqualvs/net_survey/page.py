@@ -299,10 +299,8 @@ def write_page(path: Path, picture: Path, result: Comparison, origins: Mapping[s
 
     Parameters
     ----------
-    path : Path
     picture : Path
         Of the map, which goes into the page.
-    result : Comparison
     origins : mapping
         Folder of a run to what told its date.
 

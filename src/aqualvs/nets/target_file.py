@@ -299,7 +299,6 @@ def net_check(target: str, rig: Rig) -> NetCheck | None:
     ----------
     target : str
         A word or the path of a target file, as `target_dict` takes it.
-    rig : Rig
 
     Raises
     ------

@@ -321,7 +321,6 @@ def back_derivative(
 
     Parameters
     ----------
-    port : DomeParams
     s : AngleSines
         Of the point.
     target : (float, float, float)

@@ -48,7 +48,6 @@ def keep_dated(path: Path, now: datetime | None = None) -> Path:
 
     Parameters
     ----------
-    path : Path
     now : datetime, optional
         With a time zone; the current time if left out.
 

@@ -57,7 +57,6 @@ def jpeg_of(frame: Frame, quality: int) -> bytes:
 
     Parameters
     ----------
-    frame : Frame
     quality : int
         1 to 100.
     """

@@ -140,7 +140,6 @@ class GrowingFile:
         What the file begins with: magic, header, schemas and channels.
     repeated : bytes
         Schemas and channels once more, for the summary.
-    n_schemas : int
     channels : sequence of int
         Their numbers.
     open_file : callable, optional

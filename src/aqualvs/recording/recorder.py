@@ -83,7 +83,6 @@ class Recording:
     ----------
     path : Path
         Must not exist.
-    options : RecorderOptions
 
     Raises
     ------
@@ -166,7 +165,6 @@ class Recorder:
     ----------
     name, inline, keeps_all
         As in `Output`.
-    path : Path
 
     Raises
     ------

@@ -48,7 +48,6 @@ class DiveRecording:
 
     Attributes
     ----------
-    path : Path
     rig : Rig or None
         That the dive was measured with at its beginning; None where it is lost or not understood.
     options : ScannerOptions or None
@@ -57,7 +56,6 @@ class DiveRecording:
         None where a torn file does not say.
     fps : float or None
         Mean rate.
-    has_pictures : bool
 
     Raises
     ------

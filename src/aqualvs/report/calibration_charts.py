@@ -223,7 +223,6 @@ def residual_view(found: ResidualMap, names: Sequence[str], *, n_vectors: int = 
 
     Parameters
     ----------
-    found : ResidualMap
     names : sequence of str
         Names of the views that `found.view_index` counts.
     n_vectors : int

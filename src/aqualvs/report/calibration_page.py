@@ -261,7 +261,6 @@ def write_page(page: CalibrationPage, path: Path) -> Path:
 
     Parameters
     ----------
-    page : CalibrationPage
     path : Path
         The file to write.
 

@@ -76,7 +76,6 @@ def breaks(rows: IntArray, interrupted: BoolArray) -> list[int]:
 
     Parameters
     ----------
-    rows : int array, ascending
     interrupted : bool array, shape (N,)
         True for every row of the full series at which a line must not pass.
     """

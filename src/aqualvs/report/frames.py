@@ -68,7 +68,6 @@ def choose_pictures(track: Track, source: Path | None = None) -> list[int]:
 
     Parameters
     ----------
-    track : Track
     source : Path or None
         Of a video, those of the spread are at key frames where one is near: others can only be
         decoded with all frames from there on.

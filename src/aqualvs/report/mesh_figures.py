@@ -102,15 +102,10 @@ def draw_figures(reflections: Reflections, options: MeshFilterOptions, out: Path
 
     Parameters
     ----------
-    reflections : Reflections
     options : MeshFilterOptions
         Of the paper's filter.
     out : Path
         Folder that exists.
-
-    Returns
-    -------
-    list of Path
 
     Raises
     ------

@@ -118,7 +118,6 @@ def net_view(net: NetTables | None, crops: Mapping[str, SampleFrame] = MappingPr
 
     Parameters
     ----------
-    net : NetTables or None
     crops : mapping
         Number of a hole to its picture.
     """

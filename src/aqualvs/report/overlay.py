@@ -35,7 +35,6 @@ def draw_overlay(
         BGR; left as it is.
     points : ScanPoints
         Target points are drawn full in their laser's colour, all others as faint crosses.
-    posture : Posture or Refusal
     rig : Rig
         Gives the lasers' names.
 

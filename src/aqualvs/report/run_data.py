@@ -141,7 +141,6 @@ def read_truth(path: Path, track: Track) -> FloatArray:
     ----------
     path : Path
         As `aqualvs.results.summary.read_truth` takes it.
-    track : Track
 
     Returns
     -------

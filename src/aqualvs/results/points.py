@@ -202,7 +202,6 @@ class PointsExport:
 
     Parameters
     ----------
-    points_parquet : Path
     points_ply : Path
         Binary PLY: x, y, z in `dome` in metres, red, green, blue by laser; of the points that
         entered a posture.
@@ -295,7 +294,6 @@ def export_points(points_stream: Path, points_parquet: Path, points_ply: Path) -
     ----------
     points_stream : Path
         May lack its end; what follows the last whole batch is left out.
-    points_parquet, points_ply : Path
 
     Returns
     -------

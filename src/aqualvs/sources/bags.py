@@ -54,10 +54,6 @@ def open_bag(path: Path, topic: str | None = None) -> MessageSource:
     topic : str or None
         Needed where several topics have images.
 
-    Returns
-    -------
-    source : MessageSource
-
     Raises
     ------
     SourceError
@@ -207,13 +203,8 @@ def open_mcap(path: Path, topic: str | None = None) -> MessageSource:
 
     Parameters
     ----------
-    path : Path
     topic : str or None
         Needed where several topics have images.
-
-    Returns
-    -------
-    source : MessageSource
 
     Raises
     ------

@@ -92,10 +92,6 @@ class Health:
 def bgr_of(frame: Frame) -> ImagePlane:
     """Return a frame as a BGR picture.
 
-    Parameters
-    ----------
-    frame : Frame
-
     Returns
     -------
     image : uint8 array, shape (height, width, 3)
@@ -181,8 +177,6 @@ def frame_of(index: int, time_s: float, picture: VideoFrame) -> Frame:
 
     Parameters
     ----------
-    index : int
-    time_s : float
     picture : VideoFrame
         As `planes_of` takes it.
     """

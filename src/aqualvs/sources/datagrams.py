@@ -74,10 +74,6 @@ class Datagram(NamedTuple):
 class Datagrams:
     """Receiver on a UDP port; a thread of its own empties the system's buffer.
 
-    Parameters
-    ----------
-    address : UdpAddress
-
     Raises
     ------
     OSError
@@ -141,13 +137,7 @@ class Datagrams:
 
 
 def why_not(address: UdpAddress, fault: OSError) -> str:
-    """Return in a few words why listening is impossible.
-
-    Parameters
-    ----------
-    address : UdpAddress
-    fault : OSError
-    """
+    """Return in a few words why listening is impossible."""
     if fault.errno == errno.EADDRINUSE:
         return f"port {address.port} is taken by another program, such as QGroundControl"
     if fault.errno == errno.EADDRNOTAVAIL:
@@ -204,10 +194,6 @@ _MAX_LAG_S = 2.0
 def kind_of(datagram: bytes) -> str | None:
     """Return the kind of content of a datagram, or None if it is unknown.
 
-    Parameters
-    ----------
-    datagram : bytes
-
     Returns
     -------
     kind : str or None
@@ -222,12 +208,7 @@ def kind_of(datagram: bytes) -> str | None:
 
 
 def transport_content(datagram: bytes) -> bytes | None:
-    """Return the MPEG-TS packets in a datagram, bare or in RTP (RFC 2250), or None.
-
-    Parameters
-    ----------
-    datagram : bytes
-    """
+    """Return the MPEG-TS packets in a datagram, bare or in RTP (RFC 2250), or None."""
     ts_in_rtp = 33
     if datagram[:1] != bytes([SYNC]):
         packet = parse_rtp(datagram)
@@ -243,7 +224,6 @@ class DatagramQueue:
 
     Parameters
     ----------
-    datagrams : Datagrams
     closed : Event
         Set when the feed ends.
     reception : Reception
@@ -302,7 +282,6 @@ class DatagramQueue:
 
         Parameters
         ----------
-        datagram : Datagram
         fits : bool
             Whether it is of the kind that is being read.
         """

@@ -30,7 +30,6 @@ def frames_of(pictures: Iterable[Frame], shutter: Shutter) -> Iterator[Frame]:
 
     Parameters
     ----------
-    pictures : iterable of Frame
     shutter : Shutter
         Of the camera. The first field has the time of its picture, the second follows after
         `readout`.
@@ -129,8 +128,6 @@ class FieldSource(Closing):
 
     Attributes
     ----------
-    pictures : FrameSource
-    name : str
     size_px : (int, int)
         Of the pictures.
     fps : float or None
@@ -161,7 +158,6 @@ class FrameFeed:
 
     Parameters
     ----------
-    pictures : Feed
     shutter : Shutter
         Of the rig.
     """
@@ -292,7 +288,6 @@ class FieldEvidence:
 
         Parameters
         ----------
-        shutter : Shutter
         fps : float or None
             Pictures a second.
         """

@@ -124,10 +124,6 @@ _CHROMA_PROFILES = frozenset({100, 110, 122, 244, 44, 83, 86, 118, 128, 138, 139
 def nal_units(data: bytes) -> list[bytes]:
     """Return the beginnings of the NAL units of a byte stream (annex B).
 
-    Parameters
-    ----------
-    data : bytes
-
     Returns
     -------
     units : list of bytes

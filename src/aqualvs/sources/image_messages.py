@@ -210,10 +210,6 @@ def image_of_ros(message: Any) -> ImageMessage:
 def image_of_json(content: bytes) -> ImageMessage:
     """Return the image in a Foxglove message written as JSON.
 
-    Parameters
-    ----------
-    content : bytes
-
     Raises
     ------
     ValueError
@@ -269,10 +265,6 @@ def image_of_protobuf(schema: str) -> Callable[[bytes], ImageMessage]:
 
 def protobuf_fields(content: bytes) -> dict[int, int | bytes]:
     """Return the last value of each field of a Protobuf message, by its number.
-
-    Parameters
-    ----------
-    content : bytes
 
     Raises
     ------
@@ -359,7 +351,6 @@ def choose_topic(where: str, topics: list[ImageTopic], wanted: str | None) -> Im
         For messages.
     topics : list of ImageTopic
         With images.
-    wanted : str or None
 
     Raises
     ------

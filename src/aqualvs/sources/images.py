@@ -147,7 +147,6 @@ def read_image(path: Path, how: int = cv2.IMREAD_ANYCOLOR) -> ImagePlane | None:
 
     Parameters
     ----------
-    path : Path
     how : int
         OpenCV's flag; the default returns grey images as grey.
 

@@ -199,22 +199,12 @@ class Reception:
             self._forget(now)
 
     def hold(self, n: int) -> None:
-        """Note how many pictures are not delivered, since the last one that was, after a loss.
-
-        Parameters
-        ----------
-        n : int
-        """
+        """Note how many pictures are not delivered, since the last one that was, after a loss."""
         with self._lock:
             self._n_held = n
 
     def end(self, words: str) -> None:
-        """Note that nothing more will come.
-
-        Parameters
-        ----------
-        words : str
-        """
+        """Note that nothing more will come."""
         with self._lock:
             self._over = words
 
@@ -413,12 +403,7 @@ class LiveFrames:
             self._decoder.distrust()
 
     def announce(self, packet: "Packet[VideoStream]") -> None:
-        """Count a picture that is too damaged to be decoded.
-
-        Parameters
-        ----------
-        packet : Packet
-        """
+        """Count a picture that is too damaged to be decoded."""
         self._frame_counter.expect(packet)
         self._hold()
 

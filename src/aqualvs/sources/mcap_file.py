@@ -130,7 +130,6 @@ def chunk_index(
         Where each channel's message index is in the file.
     index_length : int
         Of all these indexes together.
-    compression : str
     sizes : (int, int)
         Compressed and raw.
     """
@@ -152,7 +151,6 @@ def statistics(
 
     Parameters
     ----------
-    n_schemas, n_chunks : int
     times_ns : (int, int)
         Of the first and the last message.
     counts : mapping
@@ -224,10 +222,6 @@ class McapFile:
     or the end is missing, as after a loss of power or with a bit that flipped on the disk, the file
     is read from its beginning as far as it goes, and further contents of the summary are added:
     damage in one place loses the chunk that it is in.
-
-    Parameters
-    ----------
-    path : Path
 
     Attributes
     ----------

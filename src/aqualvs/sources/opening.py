@@ -179,7 +179,6 @@ def open_feed(
 
     Parameters
     ----------
-    where : str or Path
     realtime : bool
         Whether a recording is played at its own pace, or as fast as it is taken. Streams and
         cameras have one pace only.

@@ -228,7 +228,6 @@ class CameraFeed(RemoteFeed):
     ----------
     where : str
         `/dev/video0`, `camera:0`, or `camera:` and a path.
-    options : CameraOptions
     """
 
     def __init__(self, where: str, options: CameraOptions) -> None:
@@ -262,10 +261,6 @@ class CameraFeed(RemoteFeed):
 def camera_device(where: str) -> str:
     """Return the device that `camera:0`, `camera:/dev/video2` or `/dev/video0` names.
 
-    Parameters
-    ----------
-    where : str
-
     Raises
     ------
     SourceError
@@ -278,12 +273,7 @@ def camera_device(where: str) -> str:
 
 
 def is_camera(where: str) -> bool:
-    """Return whether `where` names a camera.
-
-    Parameters
-    ----------
-    where : str
-    """
+    """Return whether `where` names a camera."""
     return where.startswith(("camera:", f"{_DEVICES}/video", f"{_DEVICES}/v4l/"))
 
 

@@ -29,16 +29,7 @@ class RtpPacket:
 
 
 def parse_rtp(datagram: bytes) -> RtpPacket | None:
-    """Return the packet in a datagram, or None if there is none.
-
-    Parameters
-    ----------
-    datagram : bytes
-
-    Returns
-    -------
-    packet : RtpPacket or None
-    """
+    """Return the packet in a datagram, or None if there is none."""
     if len(datagram) < 13 or datagram[0] >> 6 != 2:
         return None
     first, second = datagram[0], datagram[1]
@@ -100,13 +91,8 @@ class RtpOrder:
 
         Parameters
         ----------
-        packet : RtpPacket
         arrival : float
             Seconds on the monotonic clock.
-
-        Returns
-        -------
-        ordered : list of Ordered
         """
         if self._sender is None:
             return self._begin([packet], arrival)
@@ -224,10 +210,6 @@ class H264Depacketizer:
 
     def push(self, ordered: Ordered) -> list[AccessUnit]:
         """Return the pictures that a packet completes.
-
-        Parameters
-        ----------
-        ordered : Ordered
 
         Returns
         -------

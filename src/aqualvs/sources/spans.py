@@ -88,7 +88,6 @@ def video_spans(path: Path, n_min: int, margin: int = 0) -> VideoSpans:
 
     Parameters
     ----------
-    path : Path
     n_min : int
         Frames that a part has at least, but for the last.
     margin : int
@@ -316,7 +315,6 @@ class VideoParts(Closing):
 
     Parameters
     ----------
-    path : Path
     size_px : (int, int)
         Width and height of every picture.
     """

@@ -68,10 +68,6 @@ class SdpVideo:
 def read_sdp(path: Path) -> SdpVideo:
     """Read the first video from an SDP file.
 
-    Parameters
-    ----------
-    path : Path
-
     Raises
     ------
     SourceError
@@ -131,7 +127,6 @@ class RtpReader:
 
     Parameters
     ----------
-    frames : LiveFrames
     parameter_sets : bytes
         SPS and PPS as a byte stream, or nothing.
     payload_type : int or None
@@ -144,12 +139,7 @@ class RtpReader:
         self._payload_type = payload_type
 
     def frames(self, datagram_queue: DatagramQueue) -> Iterator[Frame]:
-        """Yield frames until the feed ends or another kind comes.
-
-        Parameters
-        ----------
-        datagram_queue : DatagramQueue
-        """
+        """Yield frames until the feed ends or another kind comes."""
         order, pictures = RtpOrder(), H264Depacketizer()
         self._frames.connect(
             decoder_of("h264", self._parameter_sets), 1 / TICKS_HZ, hears_losses=True
@@ -186,23 +176,13 @@ class RtpReader:
 
 
 class TransportReader:
-    """Reader of MPEG-TS.
-
-    Parameters
-    ----------
-    frames : LiveFrames
-    """
+    """Reader of MPEG-TS."""
 
     def __init__(self, frames: LiveFrames) -> None:
         self._frames = frames
 
     def frames(self, datagram_queue: DatagramQueue) -> Iterator[Frame]:
-        """Yield frames until the feed ends or another kind comes.
-
-        Parameters
-        ----------
-        datagram_queue : DatagramQueue
-        """
+        """Yield frames until the feed ends or another kind comes."""
         stream, codec = TransportStream(), None
         while not datagram_queue.is_closed:
             datagram = datagram_queue.get()
@@ -224,23 +204,13 @@ class TransportReader:
 
 
 class BareReader:
-    """Reader of H.264 without a container, cut into datagrams anywhere.
-
-    Parameters
-    ----------
-    frames : LiveFrames
-    """
+    """Reader of H.264 without a container, cut into datagrams anywhere."""
 
     def __init__(self, frames: LiveFrames) -> None:
         self._frames = frames
 
     def frames(self, datagram_queue: DatagramQueue) -> Iterator[Frame]:
-        """Yield frames until the feed ends or another kind comes.
-
-        Parameters
-        ----------
-        datagram_queue : DatagramQueue
-        """
+        """Yield frames until the feed ends or another kind comes."""
         codec = decoder_of("h264")
         self._frames.connect(codec, 1e-6, hears_losses=False)
         while not datagram_queue.is_closed:
@@ -260,13 +230,7 @@ class BareReader:
 
 
 def decoded(frames: LiveFrames, picture: AccessUnit) -> Iterator[Frame]:
-    """Yield the frames that a picture completes; a torn one is counted only.
-
-    Parameters
-    ----------
-    frames : LiveFrames
-    picture : AccessUnit
-    """
+    """Yield the frames that a picture completes; a torn one is counted only."""
     if picture.is_restart:
         frames.restart()
     if picture.after_loss:
@@ -315,7 +279,6 @@ class UdpFeed:
     ----------
     name : str
         How health and messages call it.
-    address : UdpAddress
     parameter_sets : bytes
         SPS and PPS as a byte stream, where an SDP file has them; else they come in the stream.
     payload_type : int or None

@@ -68,12 +68,7 @@ class FrameCounter:
         self._fields = field_pairs(codec.name, codec.extradata)
 
     def expect(self, packet: "Packet[VideoStream]") -> None:
-        """Note a packet; the empty one that flushes the decoder does not count.
-
-        Parameters
-        ----------
-        packet : Packet
-        """
+        """Note a packet; the empty one that flushes the decoder does not count."""
         if packet.size == 0:
             return
         self.n_packets += 1
@@ -298,10 +293,6 @@ _TOP_FIRST, _BOTTOM_FIRST = (2, 5), (3, 4)
 
 def sampled_pictures(path: Path) -> tuple[list[list[Frame]], Field | None]:
     """Return a few pictures in a row from some places of a video, and which field comes first.
-
-    Parameters
-    ----------
-    path : Path
 
     Returns
     -------

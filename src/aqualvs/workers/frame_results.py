@@ -138,8 +138,6 @@ def in_blocks(
 
     Parameters
     ----------
-    items : iterator
-    length : int
     breaks : type of exception
         How it breaks off; raised after the items before it.
     """
@@ -229,7 +227,6 @@ class FrameProcessor:
 
     Parameters
     ----------
-    rig : Rig
     scanner : FrameScanner
         For the same rig.
 
@@ -283,7 +280,6 @@ def corrected_rows(
     ----------
     blocks : generator of list
         Results as measured, in the order of the dive; closed at the end.
-    rig : Rig
     """
     with closing(blocks):
         if not rig.shutter.needs_neighbours:
@@ -334,7 +330,6 @@ def result_blocks(
     ----------
     blocks : iterator of list
         Of frames with the scans of the lost ones right before, see `with_losses`.
-    processor : FrameProcessor
 
     Yields
     ------

@@ -219,7 +219,6 @@ class Sender:
 
     Parameters
     ----------
-    pipe : Connection
     memory : SharedMemory or None
         Without it all goes through the pipe.
 
@@ -374,9 +373,6 @@ def pool_job(
     ----------
     source : FrameSource
         Of the dive; a video file or a folder of images can be shared.
-    window : FrameWindow
-    rig : Rig
-    options : ScannerOptions
     """
     pictures = source_of_pictures(source)
     spans = [(span, *frames_in(span, rig.shutter)) for span in _spans(pictures)]
@@ -423,7 +419,6 @@ class WorkerPool(Closing):
 
     Parameters
     ----------
-    work : PoolJob
     n_processes : int
         There are no more than parts.
 

@@ -56,7 +56,6 @@ class Replay(Closing):
 
     Parameters
     ----------
-    path : Path
     request : RunRequest
         Rig, water and the `chosen` options stand for the recorded ones; an overlay needs pictures
         even if stripes are not looked for again.
@@ -243,12 +242,10 @@ class DiveProcessor(Closing):
     ----------
     source : FrameSource or Replay
         Open, and not yet read from.
-    rig : Rig
     window : FrameWindow
         Of the frames to measure.
     work : PoolJob or None
         How processes may share the dive; None has this process measure it.
-    n_processes : int
     """
 
     def __init__(
@@ -347,7 +344,6 @@ class WaterFollowingScanner:
     ----------
     rig : Rig
         In the water to begin with.
-    options : ScannerOptions
     target : Path
         Markers on the vehicle (target.yaml).
     water : Water

@@ -78,10 +78,8 @@ def check_camera_solution(
 
     Parameters
     ----------
-    solution : Solution
     covariance : array, shape (P, P)
         Of the intrinsics, as if corners were independent: focal lengths and image centre first.
-    views : sequence of View
 
     Raises
     ------
@@ -240,7 +238,6 @@ def camera(
         Of a flat board in air, without the dome, tilted by 20 to 40 degrees in most of them.
     size_px : (int, int)
         Image width and height.
-    model : LensModel
     n_coefficients : int, optional
         Number of distortion coefficients; by default as many as the views support.
 

@@ -162,8 +162,6 @@ def bend_is_significant(
     ----------
     bundle : Bundle
         With points on a flat board, or one bent by terms of lower degree.
-    solution : Solution
-        Of it.
     degree : int
         Of the terms in question, one of `BEND_DEGREES`.
     n_solved : int
@@ -417,7 +415,6 @@ def direction_sigma_px(lens: Lens, covariance: FloatArray, pixels: FloatArray) -
 
     Parameters
     ----------
-    lens : Lens
     covariance : array, shape (P, P)
         Of its parameters.
     pixels : array, shape (N, 2)

@@ -270,9 +270,6 @@ def check_shared_errors(
 
     Parameters
     ----------
-    problem : DomeProblem
-    solution : Solution
-        Of it.
     covariance : array, shape (P, P)
         Of the solved numbers, with the uncertainty of considered ones propagated.
 
@@ -463,9 +460,6 @@ def check_solution(
 
     Parameters
     ----------
-    problem : DomeProblem
-    solution : Solution
-        Of it.
     uncertainty : RigUncertainty
         Of the solved numbers, with the uncertainty of considered ones propagated.
 

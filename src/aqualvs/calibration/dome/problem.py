@@ -309,10 +309,8 @@ def dome_problem(
     ----------
     rig : Rig
         Initial guess; its lens lies inside the dome, or behind the flat port.
-    sets : sequence of BoardSet
     known : RigUncertainty
         Of the rig beforehand: intrinsics from the camera's calibration.
-    options : DomeOptions
 
     Raises
     ------

@@ -211,7 +211,6 @@ def solve_lasers(
 
     Parameters
     ----------
-    start : InitialGuess
     lasers : sequence of Laser
         `plane` fits the light in the medium of the pictures roughly.
     laser_of : int array, shape (N,)
@@ -293,7 +292,6 @@ def free_text(
 
     Parameters
     ----------
-    problem : LaserProblem
     names : sequence of str
         Of the lasers.
     views : sequence of PlacedView

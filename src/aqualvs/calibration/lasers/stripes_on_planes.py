@@ -436,7 +436,6 @@ def with_shared_error(group: StripeGroup, error_px: float) -> StripeGroup:
 
     Parameters
     ----------
-    group : StripeGroup
     error_px : float
         Standard deviation of a shift and turn of the whole stripe in its picture. All bins
         together then determine place and direction no better than that.

@@ -262,7 +262,6 @@ def corner_blocks(camera: Camera, shared: Sequence[str], views: Sequence[PosedVi
         Looking into that medium.
     shared : sequence of str
         The camera's numbers that are solved for, named as by `parameter_names`.
-    views : sequence of PosedView
     """
     if not views:
         return []

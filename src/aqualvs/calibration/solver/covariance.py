@@ -154,9 +154,6 @@ def observability(
 
     Parameters
     ----------
-    bundle : Bundle
-    solution : Solution
-        Of it.
     uncertainty : RigUncertainty
         After the solve, with the uncertainty of considered numbers propagated.
     names : sequence of str
@@ -201,8 +198,6 @@ def consider_covariance(
     ----------
     bundle : Bundle
         The problem.
-    solution : Solution
-        Of it.
     considered : RigUncertainty
         Of numbers that the bundle does not solve for.
 

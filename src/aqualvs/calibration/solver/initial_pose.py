@@ -384,7 +384,6 @@ def turned_square(
 
     Parameters
     ----------
-    rig : Rig
     poses : sequence of SE3
         Of all boards.
     square : array, shape (3, 3)

@@ -322,7 +322,6 @@ def compare(model: IndexModel, state: IndexState, frame: FrameCorners, noise: fl
 
     Parameters
     ----------
-    model : IndexModel
     state : IndexState
         At the frame's time, with entries for its corners.
     frame : FrameCorners
@@ -352,7 +351,6 @@ def believe(model: IndexModel, state: IndexState, frame: FrameCorners, noise: fl
 
     Parameters
     ----------
-    model : IndexModel
     state : IndexState
         At the frame's time, with entries for its corners.
     frame : FrameCorners

@@ -110,13 +110,7 @@ class NoRecorder:
 
 
 class Controls:
-    """Controls of the page: setpoint and recorder.
-
-    Parameters
-    ----------
-    setpoint : SetpointHolder
-    recorder : RecordButton
-    """
+    """Controls of the page: setpoint and recorder."""
 
     def __init__(self, setpoint: SetpointHolder, recorder: RecordButton) -> None:
         self.setpoint, self.recorder = setpoint, recorder
@@ -315,10 +309,6 @@ class TokenGate:
 
     Addresses that have shown the right token come first, then those with the fewest wrong ones, so
     that guesses do not keep the pilot waiting. Used from one event loop alone.
-
-    Parameters
-    ----------
-    access : Access
     """
 
     WRONG_S: ClassVar[float] = 1.0

@@ -67,7 +67,6 @@ class Dashboard:
     ----------
     server : DashboardServer
         Owned from here on.
-    controls : Controls
     vehicle : callable or None
         Returns what the autopilot tells of depth and heading.
     """
@@ -114,12 +113,7 @@ _DISK_EVERY_S = 1.0
 
 
 class SwitchButton:
-    """The page's record button on a recorder's switch.
-
-    Parameters
-    ----------
-    switch : RecorderSwitch
-    """
+    """The page's record button on a recorder's switch."""
 
     def __init__(self, switch: RecorderSwitch) -> None:
         self._switch = switch

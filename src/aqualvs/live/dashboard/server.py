@@ -284,15 +284,11 @@ class DashboardServer:
     ----------
     host, port
         Where to listen; port 0 takes any that is free.
-    access : Access
-    rig : Rig
-    controls : Controls
 
     Attributes
     ----------
     port : int
         Where it listens.
-    hub : Hub
 
     Raises
     ------

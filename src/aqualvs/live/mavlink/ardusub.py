@@ -67,7 +67,6 @@ class PilotSticks:
 
     Parameters
     ----------
-    link : MavlinkLink
     own : (int, int)
         System and component in whose name we send sticks ourselves.
     dead_band : float
@@ -148,7 +147,6 @@ class DepthChoice:
 
     Parameters
     ----------
-    link : MavlinkLink
     fresh_s : float
         Older messages do not count.
     """
@@ -218,7 +216,6 @@ def turning_of(link: MavlinkLink, at_ns: int) -> GyroRates | None:
 
     Parameters
     ----------
-    link : MavlinkLink
     at_ns : int
         Time of a picture, by `time.monotonic_ns`.
     """

@@ -91,7 +91,6 @@ class ParameterWatch:
 
     Parameters
     ----------
-    link : MavlinkLink
     names : tuple of str
         At most ten.
     """
@@ -193,7 +192,6 @@ def advise_on_speed(
 
     Parameters
     ----------
-    parameters : mapping
     full_climb_rate : float
         At a full stick and a pilot gain of 1, in m/s.
     """
@@ -219,7 +217,6 @@ def advise_on_distance(
 
     Parameters
     ----------
-    parameters : mapping
     working_range : (float, float), optional
         Of the rig, in metres.
     """

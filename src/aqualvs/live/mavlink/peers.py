@@ -244,8 +244,6 @@ class PeerTable:
 
         Parameters
         ----------
-        peer : tuple
-        data : bytes
         whole : bool
             Whether it is a datagram: one that begins like a message begins one, and what was left
             of the one before belongs to none.

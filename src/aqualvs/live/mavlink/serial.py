@@ -44,10 +44,6 @@ class SerialPort(StreamPort):
 
     A thread reads, because Windows cannot wait for serial ports and sockets together.
 
-    Parameters
-    ----------
-    address : SerialAddress
-
     Raises
     ------
     OSError

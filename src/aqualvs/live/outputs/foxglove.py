@@ -98,7 +98,6 @@ def laser_lines(
 
     Parameters
     ----------
-    lasers : tuple of Laser
     normal : array, shape (3,)
         Of the target.
     points : ScanPoints

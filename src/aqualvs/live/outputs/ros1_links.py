@@ -112,7 +112,6 @@ def to_ros1(message: Message, seq: int) -> bytes:
 
     Parameters
     ----------
-    message : Message
     seq : int
         Number of the message on its topic.
     """

@@ -393,12 +393,7 @@ Message: TypeAlias = PoseMessage | RangeMessage | CloudMessage | DiagnosticsMess
 
 
 class MessageMaker:
-    """Converter of samples to messages; diagnostics once per period.
-
-    Parameters
-    ----------
-    options : RosOptions
-    """
+    """Converter of samples to messages; diagnostics once per period."""
 
     def __init__(self, options: RosOptions) -> None:
         self._options = options
