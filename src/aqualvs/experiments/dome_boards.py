@@ -211,16 +211,14 @@ def _findings(solved: SolvedDome, before_px: float) -> tuple[ExperimentRow, ...]
         _vector("lens in the dome x, y, z (mm)", _PAPER_LENS, solved, _LENS, 1e3, 2),
         _vector("camera's rotation x, y, z (°)", _PAPER_TURN, solved, _TURN, 180.0 / np.pi, 3),
         _vector("image plane fx, fy, cx, cy (px)", _PAPER_PLANE, solved, _PLANE, 1.0, 1),
-        ExperimentRow(
-            what="largest error of lens and rotation, in standard deviations",
-            paper="",
-            ours=f"{worst:.1f}",
-            bar=f"<= {_SETUP.bar_sigmas:g}",
-            met=worst <= _SETUP.bar_sigmas,
+        ExperimentRow.at_most(
+            "largest error of lens and rotation, in standard deviations",
+            worst,
+            _SETUP.bar_sigmas,
+            digits=1,
         ),
         ExperimentRow(
             what="corners, rms distance before and after (px)",
-            paper="",
             ours=f"{before_px:.2f} and {solved.dome.rms_px:.2f}",
         ),
     )
@@ -230,7 +228,6 @@ def _findings(solved: SolvedDome, before_px: float) -> tuple[ExperimentRow, ...]
         *found,
         ExperimentRow(
             what="corners of boards held out: with the dome, and best without it (px)",
-            paper="",
             ours=f"{held.dome_rms_px:.3f} and {held.bare_rms_px:.3f}",
         ),
     )

@@ -8,11 +8,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
 from types import MappingProxyType
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Self, TypeAlias
 
 from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import FloatArray, IntArray
-from aqualvs.report.figure_style import STYLE, new_figure
+from aqualvs.report.figure_style import new_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -28,10 +28,30 @@ class ExperimentRow:
     """One row of an experiment's table."""
 
     what: str  # The quantity, with its unit.
-    paper: str  # As the paper prints it; empty where it says nothing.
+    paper: str = ""  # As the paper prints it; empty where it says nothing.
     ours: str  # As measured here.
     bar: str = ""  # What we hold ourselves to; empty where there is no such thing.
     met: bool | None = None  # Whether it is reached; None without a bar.
+
+    @classmethod
+    def at_most(
+        cls,
+        what: str,
+        value: float,
+        limit: float,
+        *,
+        digits: int,
+        paper: str = "",
+        valid: bool = True,
+    ) -> Self:
+        """Return the row of a value that must not exceed a limit; it misses where not `valid`."""
+        return cls(
+            what=what,
+            paper=paper,
+            ours=f"{value:.{digits}f}",
+            bar=f"<= {limit:g}",
+            met=valid and bool(value <= limit),
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,7 +94,7 @@ class Experiment:
 
     title: str
     # Where the paper has it, such as "section 5.3, figure 15"; empty for our own.
-    paper: str
+    paper: str = ""
     # The setting, in one or two sentences.
     about: str
     # Takes the laboratory, gives the outcome. It must depend on nothing else, so that the same
@@ -96,10 +116,7 @@ def drawn(
     draw : callable
         Fills the figure.
     """
-    from matplotlib import rc_context
-
-    with rc_context(dict(STYLE)):
-        figure = new_figure(height_in)
+    with new_figure(height_in) as figure:
         draw(figure)
     return ExperimentFigure(name=name, caption=caption, figure=figure)
 

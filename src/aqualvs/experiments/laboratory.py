@@ -23,7 +23,7 @@ from aqualvs.experiments.experiment import DataColumns, ExperimentRow
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.rigfile import load_rig, rig_to_mapping, save_rig
-from aqualvs.report.figure_style import GREY, OURS, STYLE, new_figure
+from aqualvs.report.figure_style import GREY, OURS, new_figure
 from aqualvs.results.summary import read_truth
 from aqualvs.scanner import Scanner, ScannerOptions
 from aqualvs.scanning.posture import Posture
@@ -286,7 +286,6 @@ def findings(variants: Sequence[Variant]) -> tuple[ExperimentRow, ...]:
     return tuple(
         ExperimentRow(
             what=f"{one.name}: rms error of range (%), pitch, yaw (degrees); frames with a posture",
-            paper="",
             ours=f"{told(one.rms)}; {one.valid_percent:.0f} %",
         )
         for one in variants
@@ -310,14 +309,11 @@ def series(name: str, variants: Sequence[Variant]) -> DataColumns:
 
 def drawn(variants: Sequence[Variant]) -> "Figure":
     """Draw rms errors as bars on a logarithmic scale, and the share of frames with a posture."""
-    from matplotlib import rc_context
-
     names = [one.name for one in variants]
     rms = np.array([one.rms for one in variants])
     valid = np.array([one.valid_percent for one in variants])
     least = 1e-3
-    with rc_context(dict(STYLE)):
-        figure = new_figure(0.9 + 0.3 * len(variants))
+    with new_figure(0.9 + 0.3 * len(variants)) as figure:
         panels = figure.subplots(1, 4, sharey=True)
         for k, axes in enumerate(panels[:3]):
             _bars(axes, variants, rms[:, k], QUANTITIES[k])

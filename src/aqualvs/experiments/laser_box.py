@@ -214,12 +214,8 @@ def _plane_findings(
     worst = max(max(e.angle / e.sigma_angle, abs(e.offset) / e.sigma_offset) for e in errors)
     return (
         *rows,
-        ExperimentRow(
-            what="largest error of a plane, in standard deviations",
-            paper="",
-            ours=f"{worst:.1f}",
-            bar=f"<= {_SETUP.bar_sigmas:g}",
-            met=worst <= _SETUP.bar_sigmas,
+        ExperimentRow.at_most(
+            "largest error of a plane, in standard deviations", worst, _SETUP.bar_sigmas, digits=1
         ),
     )
 
@@ -228,19 +224,14 @@ def _left_findings(left: Remaining) -> tuple[ExperimentRow, ...]:
     percent = float(np.abs(left.percent).max())
     degrees = float(np.rad2deg(np.abs(left.errors[:, 1:])).max())
     return (
-        ExperimentRow(
-            what="range error that remains, 0.3 to 1 m, largest (%)",
-            paper="",
-            ours=f"{percent:.3f}",
-            bar=f"<= {_SETUP.bar_percent}",
-            met=percent <= _SETUP.bar_percent,
+        ExperimentRow.at_most(
+            "range error that remains, 0.3 to 1 m, largest (%)",
+            percent,
+            _SETUP.bar_percent,
+            digits=3,
         ),
-        ExperimentRow(
-            what="pitch and yaw error that remains, largest (°)",
-            paper="",
-            ours=f"{degrees:.3f}",
-            bar=f"<= {_SETUP.bar_deg}",
-            met=degrees <= _SETUP.bar_deg,
+        ExperimentRow.at_most(
+            "pitch and yaw error that remains, largest (°)", degrees, _SETUP.bar_deg, digits=3
         ),
     )
 

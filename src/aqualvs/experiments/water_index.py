@@ -366,28 +366,21 @@ def _findings(
     noticed, n_waters = sum(step.by_medium for step in alarms), len(last.truth)
     return (
         *rows,
-        ExperimentRow(
-            what="largest error, in standard deviations",
-            paper="",
-            ours=f"{worst:.1f}",
-            bar=f"<= {_SETUP.bar_sigmas:g}",
-            met=worst <= _SETUP.bar_sigmas,
+        ExperimentRow.at_most(
+            "largest error, in standard deviations", worst, _SETUP.bar_sigmas, digits=1
         ),
         ExperimentRow(
             what="scatter from frame to frame, the paper's way",
-            paper="",
             ours=f"{float(np.sqrt(in_each.var(axis=1).mean())):.5f}",
         ),
         ExperimentRow(
             what="changes of the medium noticed as such, the dive into the water among them",
-            paper="",
             ours=f"{noticed} of {n_waters}, {len(alarms) - noticed} false",
             bar="all, none false",
             met=noticed == len(alarms) == n_waters,
         ),
         ExperimentRow(
             what="index with the lens at the dome's centre",
-            paper="",
             ours="told" if spread.observable[0] else "refused as unobservable",
             bar="refused",
             met=not spread.observable[0],
