@@ -49,9 +49,9 @@ class CameraRequest:
     images: tuple[str, ...]
     board: Path
     out: Path
-    nominal: Path | None
-    model: str
-    n_coefficients: int | None
+    nominal: Path | None = None
+    model: str = "opencv"
+    n_coefficients: int | None = None
 
 
 def calibrate_camera(

@@ -81,13 +81,13 @@ class LasersRequest:
     images: tuple[str, ...]
     rig: Path
     out: Path
-    box: Path | None
-    board: Path | None
-    medium: str | None
-    n_lasers: int | None
-    names: tuple[str, ...] | None
-    board_offset_mm: float
-    refine: bool
+    box: Path | None = None
+    board: Path | None = None
+    medium: str | None = None
+    n_lasers: int | None = None
+    names: tuple[str, ...] | None = None
+    board_offset_mm: float = 0.0
+    refine: bool = False
     wavelength_nm: float | None = None
 
 

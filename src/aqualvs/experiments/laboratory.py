@@ -402,67 +402,18 @@ def _noted_files(folder: Path) -> CalibrationFiles:
 def _calibrate(files: CalibrationFiles, rig: Path, n_lasers: int) -> None:
     # The last step writes the file that tells that all is done.
     draft = rig.with_name(_DRAFT)
-    for step in (_camera, _dome):
-        step(files, draft)
-    _lasers(files, draft, rig, n_lasers)
-
-
-def _camera(files: CalibrationFiles, rig: Path) -> None:
-    run_camera(
-        CameraRequest(
-            images=(str(files.camera),),
-            board=files.board,
-            out=rig,
-            nominal=files.nominal,
-            model="opencv",
-            n_coefficients=None,
-        ),
-        _say_nothing,
+    camera = CameraRequest(
+        images=(str(files.camera),), board=files.board, out=draft, nominal=files.nominal
     )
-
-
-def _dome(files: CalibrationFiles, rig: Path) -> None:
-    run_dome(
-        DomeRequest(
-            images=(str(files.dome),),
-            board=files.rail_board,
-            rig=rig,
-            out=rig,
-            poses=files.poses,
-            medium="air",
-            water_images=(),
-            water_board=None,
-            water_poses=None,
-            inner_radius_mm=None,
-            port_distance_mm=None,
-            thickness_mm=None,
-            n_acrylic=None,
-            radius_tolerance_mm=0.1,
-            thickness_tolerance_mm=0.1,
-            acrylic_tolerance=0.003,
-            distance_sigma_mm=0.2,
-            refine_intrinsics=True,
-        ),
-        _say_nothing,
+    run_camera(camera, _say_nothing)
+    dome = DomeRequest(
+        images=(str(files.dome),), board=files.rail_board, rig=draft, out=draft, poses=files.poses
     )
-
-
-def _lasers(files: CalibrationFiles, draft: Path, rig: Path, n_lasers: int) -> None:
-    run_lasers(
-        LasersRequest(
-            images=(str(files.box),),
-            rig=draft,
-            out=rig,
-            box=files.box_file,
-            board=None,
-            medium=None,
-            n_lasers=n_lasers,
-            names=None,
-            board_offset_mm=0.0,
-            refine=False,
-        ),
-        _say_nothing,
+    run_dome(dome, _say_nothing)
+    lasers = LasersRequest(
+        images=(str(files.box),), rig=draft, out=rig, box=files.box_file, n_lasers=n_lasers
     )
+    run_lasers(lasers, _say_nothing)
 
 
 def _say_nothing(_line: str) -> None:
