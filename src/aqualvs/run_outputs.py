@@ -205,12 +205,8 @@ def _sample(
 class RunRerun(Closing):
     """Writer of a file of Rerun during a run, or of nothing; a context manager.
 
-    Raises
-    ------
-    OutputError
-        If the file cannot be written.
-    OptionError
-        If rerun-sdk is not installed.
+    Raises `OutputError` if the file cannot be written. Raises `OptionError` if rerun-sdk is not
+    installed.
     """
 
     def __init__(self, path: Path | None, rig: Rig) -> None:
@@ -244,10 +240,7 @@ def _recording(path: Path, options: ScannerOptions) -> "Recording":
 def check_source_stays(folder: Path, source: str) -> None:
     """Make sure that a run does not replace its own source.
 
-    Raises
-    ------
-    OptionError
-        If the run's own source would be replaced.
+    Raises `OptionError` if the run's own source would be replaced.
     """
     path = Path(source)
     is_ours = path.is_file() and path.name in RUN_FILES
@@ -316,10 +309,7 @@ class RunOverlay(Closing):
 class RunBareLens(Closing):
     """Writer of `posture_bare.csv` during a run; of nothing for a rig without a housing.
 
-    Raises
-    ------
-    OutputError
-        From every method, if the file cannot be written.
+    Raises `OutputError` from every method, if the file cannot be written.
     """
 
     def __init__(self, folder: Path, rig: Rig) -> None:
@@ -400,12 +390,8 @@ class RunWriters:
 def prepare(request: RunRequest) -> ExitStack:
     """Make sure that the run can be written; returns the claims to be closed at its end.
 
-    Raises
-    ------
-    OutputError
-        If it cannot, or its folder holds another that may not be replaced.
-    OptionError
-        If a file of Rerun is requested but cannot be.
+    Raises `OutputError` if it cannot, or its folder holds another that may not be replaced. Raises
+    `OptionError` if a file of Rerun is requested but cannot be.
     """
     check_source_stays(request.out, request.source)
     with ExitStack() as claims:

@@ -24,10 +24,7 @@ _HEADER = "# A rig of aqualvs: lengths in mm, angles in degrees, frame 'dome' (d
 def write_text(path: Path, text: str) -> None:
     """Write a file.
 
-    Raises
-    ------
-    OutputError
-        If it cannot be written.
+    Raises `OutputError` if it cannot be written.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -251,10 +248,7 @@ class _Builder:
     def add(self, event: yaml.Event) -> None:
         """Process the next event.
 
-        Raises
-        ------
-        _TextError
-            If a limit is passed, or a value is not plain.
+        Raises `_TextError` if a limit is passed, or a value is not plain.
         """
         line = 0 if event.start_mark is None else event.start_mark.line + 1
         if isinstance(event, yaml.ScalarEvent):

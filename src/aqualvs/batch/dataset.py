@@ -106,10 +106,7 @@ def drafted(folder: Path) -> Iterator[Path]:
     Two processes may fill the same folder at a time, as when one of them was taken for dead: the
     first to finish wins, and the other's work is dropped.
 
-    Raises
-    ------
-    OSError
-        As the system says it.
+    Raises `OSError` as the system says it.
     """
     draft = folder.with_name(f"{folder.name}.{uuid.uuid4().hex[:8]}.part")
     draft.mkdir(parents=True)
@@ -207,10 +204,7 @@ def put_dive(dataset: Path, name: str, run_folder: Path) -> None:
 
     The points are not stored twice where the file system can give one file two names.
 
-    Raises
-    ------
-    OSError
-        As the system says it.
+    Raises `OSError` as the system says it.
     """
     _put_table(dataset, name, run_folder / POSTURE_CSV, null_words=False)
     with _replacing(_partition(dataset, name, POINTS_PARQUET)) as draft:

@@ -141,10 +141,7 @@ class ListedDive:
 def read_list(path: Path) -> list[ListedDive]:
     """Read a list of dives.
 
-    Raises
-    ------
-    OptionError
-        If it cannot be read, a row has no dive, or what it says is not understood.
+    Raises `OptionError` if it cannot be read, a row has no dive, or what it says is not understood.
     """
     text = read_text(path, "a list of dives", OptionError)
     rows = list(_csv_rows(text, path) if path.suffix.lower() == ".csv" else _yaml_rows(text, path))

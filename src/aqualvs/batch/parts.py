@@ -112,12 +112,8 @@ def piece_key(probe: DiveProbe, number: int) -> str:
 def measure_piece(work: DiveWork, probe: DiveProbe, number: int) -> PieceResult:
     """Measure one piece of a dive, or take what an earlier batch has finished.
 
-    Raises
-    ------
-    UnlikeProbeError
-        If the piece does not hold what the survey promised.
-    AqualvsError
-        If the dive cannot be read any more, or the piece not be written.
+    Raises `UnlikeProbeError` if the piece does not hold what the survey promised. Raises
+    `AqualvsError` if the dive cannot be read any more, or the piece not be written.
     """
     folder, span = piece_folder(work, probe, number), probe.spans[number]
     key = piece_key(probe, number)

@@ -128,10 +128,7 @@ class DaskWorkers(Closing):
     def n_slots(self) -> int:
         """Tasks that can be under way at a time, at least one.
 
-        Raises
-        ------
-        WorkersGoneError
-            If there has been no worker for minutes.
+        Raises `WorkersGoneError` if there has been no worker for minutes.
         """
         now_s = time.monotonic()
         count_every_s = 5.0
@@ -171,10 +168,7 @@ class DaskWorkers(Closing):
     def check_sight(self, path: Path) -> None:
         """Raise unless every worker sees a file and has the same versions as this process.
 
-        Raises
-        ------
-        OptionError
-            If one does not.
+        Raises `OptionError` if one does not.
         """
         mine, option = versions(), f"--scheduler {self._client.scheduler.address}"
         try:
@@ -375,10 +369,7 @@ def look(work: DiveWork) -> tuple[DiveProbe, dict[str, Any] | None]:
 
     Then the state of its net is told, if it is wanted and has not been.
 
-    Raises
-    ------
-    AqualvsError
-        If the dive or its rig cannot be used.
+    Raises `AqualvsError` if the dive or its rig cannot be used.
     """
     found = probe(work)
     facts = finished_dive(work, found)

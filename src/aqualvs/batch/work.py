@@ -75,10 +75,7 @@ def digest(facts: Mapping[str, Any]) -> str:
 def content_digest(path: Path | None) -> str | None:
     """Return a text that differs for files of different content; None for no file.
 
-    Raises
-    ------
-    OptionError
-        If the file cannot be read.
+    Raises `OptionError` if the file cannot be read.
     """
     if path is None:
         return None
@@ -136,10 +133,7 @@ def probe(work: DiveWork) -> DiveProbe:
 
     Reads the whole file once, unless an earlier look is still valid, but decodes nothing.
 
-    Raises
-    ------
-    AqualvsError
-        If the dive or its rig cannot be used.
+    Raises `AqualvsError` if the dive or its rig cannot be used.
     """
     with open_dive(work.request) as dive:
         found = DiveProbe(

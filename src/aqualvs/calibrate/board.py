@@ -80,12 +80,8 @@ class BoardRequest:
 def print_board(request: BoardRequest, echo: Echo) -> None:
     """Write the PDF and the yaml of a target.
 
-    Raises
-    ------
-    OptionError
-        If the target is impossible, or does not fit the paper.
-    OutputError
-        If a file cannot be written.
+    Raises `OptionError` if the target is impossible, or does not fit the paper. Raises
+    `OutputError` if a file cannot be written.
     """
     out = request.out.with_suffix("") if request.out.suffix == ".pdf" else request.out
     pdf, yaml = out.with_name(f"{out.name}.pdf"), out.with_name(f"{out.name}.yaml")

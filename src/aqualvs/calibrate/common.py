@@ -109,10 +109,7 @@ class _File(_Part):
 def load_nominal(path: Path) -> Nominal:
     """Read a nominal rig, or take over what a rig file knows.
 
-    Raises
-    ------
-    RigError
-        One line that names the file, the place in it, the value and the remedy.
+    Raises `RigError` with one line that names the file, the place in it, the value and the remedy.
     """
     what = "a nominal rig or a rig file"
     text = read_text(path, what, RigError)
@@ -349,10 +346,7 @@ def _name_of(picture: Picture, i: int) -> str:
 def read_grey(picture: Picture) -> Image:
     """Read a picture as grey.
 
-    Raises
-    ------
-    CalibrationError
-        If it is no picture.
+    Raises `CalibrationError` if it is no picture.
     """
     if isinstance(picture, str | Path):
         return _read(Path(picture), cv2.IMREAD_GRAYSCALE)
@@ -362,10 +356,7 @@ def read_grey(picture: Picture) -> Image:
 def read_colour(picture: Picture) -> Image:
     """Read a picture as blue, green, red.
 
-    Raises
-    ------
-    CalibrationError
-        If it is no picture.
+    Raises `CalibrationError` if it is no picture.
     """
     if isinstance(picture, str | Path):
         return _read(Path(picture), cv2.IMREAD_COLOR)
@@ -375,10 +366,7 @@ def read_colour(picture: Picture) -> Image:
 def medium_index(word: str | float | None, rig: Rig, default: float) -> float:
     """Return the index of `--medium`: "air", "water" (the rig's), or a number.
 
-    Raises
-    ------
-    OptionError
-        If it is none of these.
+    Raises `OptionError` if it is none of these.
     """
     if word is None:
         return default
@@ -424,10 +412,7 @@ def finish(
 
     A rig and a page that are there already are kept under dated names.
 
-    Raises
-    ------
-    OutputError
-        If one cannot be written, or `out` is a file but no rig.
+    Raises `OutputError` if one cannot be written, or `out` is a file but no rig.
     """
     with writing(out):
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -444,10 +429,7 @@ def finish(
 def check_same_size(rig: Rig, found: DetectedTargets) -> None:
     """Refuse pictures of another size than the rig's.
 
-    Raises
-    ------
-    CalibrationError
-        With both sizes.
+    Raises `CalibrationError` with both sizes.
     """
     if found.size_px != rig.size_px:
         (w, h), (rw, rh) = found.size_px, rig.size_px

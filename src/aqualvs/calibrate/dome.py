@@ -151,10 +151,7 @@ def calibrate_dome(
 def run_dome(request: DomeRequest, echo: Echo) -> None:
     """Calibrate the dome and write the rig and its report.
 
-    Raises
-    ------
-    AqualvsError
-        As `calibrate_dome`, or if an output cannot be written.
+    Raises `AqualvsError` as `calibrate_dome`, or if an output cannot be written.
     """
     check_rig_place(request.out)
     rig = _with_housing(load_rig(request.rig, need_lasers=False), request)

@@ -202,10 +202,7 @@ def calibrate_lasers(
 def run_lasers(request: LasersRequest, echo: Echo) -> None:
     """Calibrate the lasers and write the rig and its report.
 
-    Raises
-    ------
-    AqualvsError
-        As `calibrate_lasers`, or if an output cannot be written.
+    Raises `AqualvsError` as `calibrate_lasers`, or if an output cannot be written.
     """
     check_rig_place(request.out)
     before = _coloured(load_rig(request.rig, need_lasers=False), request.wavelength_nm)

@@ -131,10 +131,8 @@ def calibrate_shutter(source: FrameSource, rig: Rig) -> ShutterCalibration:
 def run_shutter(request: ShutterRequest, echo: Echo) -> None:
     """Calibrate the shutter and write the rig with it, and its report.
 
-    Raises
-    ------
-    AqualvsError
-        As `calibrate_shutter`, or if the rig cannot be used or an output not be written.
+    Raises `AqualvsError` as `calibrate_shutter`, or if the rig cannot be used or an output not be
+    written.
     """
     check_rig_place(request.out)
     rig = load_rig(request.rig)

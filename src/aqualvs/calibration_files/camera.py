@@ -79,10 +79,7 @@ def opencv_lens(core: Sequence[float], distortion: Sequence[float], *, fisheye: 
 def padded(lens: Lens, n: int) -> tuple[float, ...]:
     """Return n distortion coefficients of a lens, zeros for those that it lacks.
 
-    Raises
-    ------
-    RigError
-        If one that is not zero would be lost.
+    Raises `RigError` if one that is not zero would be lost.
     """
     values = (*lens.distortion, *(0.0,) * n)
     if any(values[n:]):
@@ -166,10 +163,7 @@ class Entries:
     def first(self, keys: Sequence[str]) -> str:
         """Return the first of some keys that there is.
 
-        Raises
-        ------
-        RigError
-            If there is none.
+        Raises `RigError` if there is none.
         """
         for key in keys:
             if self.content.get(key) is not None:
@@ -183,10 +177,7 @@ class Entries:
     def part(self, key: str) -> "Entries":
         """Return the mapping at a key.
 
-        Raises
-        ------
-        RigError
-            If there is none.
+        Raises `RigError` if there is none.
         """
         value = self.content.get(key)
         if not isinstance(value, Mapping):
@@ -220,10 +211,7 @@ class Entries:
     def numbers(self, *keys: str) -> list[float]:
         """Return the numbers of a list, matrix or vector at the first of some keys that there is.
 
-        Raises
-        ------
-        RigError
-            If it holds anything else, or not as many numbers as it says.
+        Raises `RigError` if it holds anything else, or not as many numbers as it says.
         """
         key = self.first(keys)
         value, place = self.content[key], self.place + key
@@ -247,10 +235,7 @@ class Entries:
     def listed(self, n: int, *keys: str) -> list[float]:
         """Return the numbers at the first of some keys that there is, which must be n.
 
-        Raises
-        ------
-        RigError
-            If it holds anything else.
+        Raises `RigError` if it holds anything else.
         """
         values = self.numbers(*keys)
         if len(values) != n:
@@ -267,10 +252,7 @@ class Entries:
     def core(self, *keys: str) -> tuple[float, float, float, float]:
         """Return fx, fy, cx, cy of the camera matrix at the first of some keys that there is.
 
-        Raises
-        ------
-        RigError
-            If it is no camera matrix, or has skew.
+        Raises `RigError` if it is no camera matrix, or has skew.
         """
         key = self.place + self.first(keys)
         fx, skew, cx, zero, fy, cy, *last = self.listed(9, *keys)
@@ -284,10 +266,7 @@ class Entries:
 def number(value: object, place: str) -> float:
     """Return a value as a finite number.
 
-    Raises
-    ------
-    RigError
-        If it is none.
+    Raises `RigError` if it is none.
     """
     longest_number = 40
     if isinstance(value, str) and len(value) < longest_number and _NUMBER.fullmatch(value.strip()):
@@ -300,10 +279,7 @@ def number(value: object, place: str) -> float:
 def whole(value: float, place: str) -> int:
     """Return a number as a whole one.
 
-    Raises
-    ------
-    RigError
-        If it is none, or larger than any size of a picture.
+    Raises `RigError` if it is none, or larger than any size of a picture.
     """
     largest = 1e9
     if value != math.floor(value) or not 0 <= value <= largest:

@@ -71,10 +71,7 @@ def read_kalibr(text: str, source: str, *, name: str | None = None) -> ForeignCa
 def one_of(cameras: list[str], name: str | None) -> str:
     """Return the name of the camera that is meant.
 
-    Raises
-    ------
-    RigError
-        If there is none, or which one is not said.
+    Raises `RigError` if there is none, or which one is not said.
     """
     listed = ", ".join(cameras[:20])
     if not cameras:
@@ -89,10 +86,7 @@ def one_of(cameras: list[str], name: str | None) -> str:
 def kalibr_text(camera: ForeignCamera) -> str:
     """Return the `camchain.yaml` of one camera.
 
-    Raises
-    ------
-    RigError
-        If Kalibr lacks the camera's model.
+    Raises `RigError` if Kalibr lacks the camera's model.
     """
     lens = camera.lens
     if lens.model is LensModel.FISHEYE:
@@ -116,11 +110,8 @@ def kalibr_text(camera: ForeignCamera) -> str:
 def read_kalibr_target(text: str, source: str) -> Board:
     """Return the board of a target file.
 
-    Raises
-    ------
-    RigError
-        One line without the file's name, but for faults of the YAML; also for targets that aqualvs
-        does not find in pictures.
+    Raises `RigError` with one line without the file's name, but for faults of the YAML; also for
+    targets that aqualvs does not find in pictures.
     """
     content = parse_yaml(text, source, RigError)
     if not isinstance(content, Mapping):

@@ -258,10 +258,8 @@ def last_calibration(path: Path) -> Path:
     Steps that follow one another within half a day are one calibration, of which every step leaves
     a copy.
 
-    Raises
-    ------
-    RigError
-        If the rig notes no calibration, or no copy of an earlier one is kept beside it.
+    Raises `RigError` if the rig notes no calibration, or no copy of an earlier one is kept beside
+    it.
     """
     dates = {
         name: step.date for name, step in solved_steps(load_rig(path, need_lasers=False)).items()
@@ -290,10 +288,7 @@ def last_calibration(path: Path) -> Path:
 def run_compare(new: Path, old: Path, console: Console | None = None) -> int:
     """Compare two rig files, print what has changed, and return the exit code 0.
 
-    Raises
-    ------
-    RigError
-        If one of the files is not a rig file.
+    Raises `RigError` if one of the files is not a rig file.
     """
     new_rig, new_uncertainty = _loaded(new)
     old_rig, old_uncertainty = _loaded(old)

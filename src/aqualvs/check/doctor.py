@@ -214,10 +214,7 @@ class DoctorRequest:
 def run_doctor(request: DoctorRequest, console: Console | None = None) -> None:
     """Look at everything and print what was found.
 
-    Raises
-    ------
-    AqualvsError
-        At the end, if something does not work: the first such finding.
+    Raises `AqualvsError` at the end, if something does not work: the first such finding.
     """
     console = console or Console()
     console.print(f"aqualvs {__version__}", style="bold", highlight=False)

@@ -118,10 +118,7 @@ class CheckedCommand(TyperCommand):
     def invoke(self, ctx: Any) -> Any:
         """Check the values and run the command.
 
-        Raises
-        ------
-        OptionError
-            With the option and its value.
+        Raises `OptionError` with the option and its value.
         """
         for parameter in self.params:
             for value in _plain(ctx.params.get(parameter.name)):

@@ -95,10 +95,7 @@ class AnswerLimits:
     def __post_init__(self) -> None:
         """Refuse limits that cannot work.
 
-        Raises
-        ------
-        OptionError
-            Naming the first.
+        Raises `OptionError` naming the first.
         """
         for field in fields(self):
             value = getattr(self, field.name)

@@ -45,10 +45,7 @@ class PidOptions:
     def __post_init__(self) -> None:
         """Refuse impossible values.
 
-        Raises
-        ------
-        OptionError
-            If a gain is negative or a limit is none.
+        Raises `OptionError` if a gain is negative or a limit is none.
         """
         for name in ("proportional", "integral", "derivative", "derivative_time"):
             value = getattr(self, name)

@@ -48,10 +48,7 @@ class CoverageOptions:
     def __post_init__(self) -> None:
         """Refuse sizes that are not positive.
 
-        Raises
-        ------
-        OptionError
-            Naming them.
+        Raises `OptionError` naming them.
         """
         sizes = (self.depth_cell, self.bearing_cell, self.along_cell)
         if not min(sizes) > 0.0:

@@ -76,10 +76,7 @@ class FollowLog(Closing):
     ) -> None:
         """Append the row of one step.
 
-        Raises
-        ------
-        OutputError
-            If it cannot be written.
+        Raises `OutputError` if it cannot be written.
         """
         row = follow_row(now_s, frame_time_s, posture, decision, state)
         self._append([row[name] for name in FOLLOW_COLUMNS])

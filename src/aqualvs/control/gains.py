@@ -43,10 +43,7 @@ class ThrustMap:
     def __post_init__(self) -> None:
         """Refuse maps that cannot be inverted.
 
-        Raises
-        ------
-        OptionError
-            If a thrust is not positive or a share none.
+        Raises `OptionError` if a thrust is not positive or a share none.
         """
         if not (min(self.forward, self.backward) > 0.0 and self.right >= 0.0):
             raise OptionError(
@@ -227,10 +224,7 @@ class VehicleFacts:
     def __post_init__(self) -> None:
         """Refuse impossible vehicles.
 
-        Raises
-        ------
-        OptionError
-            If a number is not positive.
+        Raises `OptionError` if a number is not positive.
         """
         _check_positive(self, f"vehicle {self.name}", ("mass", "turning_rate", "climb_rate"))
         for drag in (self.forward_drag, self.right_drag):
@@ -299,10 +293,7 @@ class RangeGains:
     def __post_init__(self) -> None:
         """Refuse gains that are not positive; integral and swell may be 0.
 
-        Raises
-        ------
-        OptionError
-            Naming the first.
+        Raises `OptionError` naming the first.
         """
         free = ("integral", "lag", "swell", "crossing_impulse", "crossing_share")
         _check_positive(self, "range", [f.name for f in fields(self) if f.name not in free])
@@ -334,10 +325,7 @@ class YawGains:
     def __post_init__(self) -> None:
         """Refuse gains that are not positive; integral, derivative and lag may be 0.
 
-        Raises
-        ------
-        OptionError
-            Naming the first.
+        Raises `OptionError` naming the first.
         """
         free = ("integral", "derivative", "lag", "quiet_rate")
         _check_positive(self, "yaw", [f.name for f in fields(self) if f.name not in free])
@@ -359,10 +347,7 @@ class ControlGains:
     def __post_init__(self) -> None:
         """Refuse times that are not positive.
 
-        Raises
-        ------
-        OptionError
-            Naming the first.
+        Raises `OptionError` naming the first.
         """
         _check_positive(self, "controller", ("rate_time", "memory"))
 

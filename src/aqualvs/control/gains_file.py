@@ -57,10 +57,7 @@ def parse_settings(
 ) -> AnyPart:
     """Return settings checked key by key; `name` is how messages call their source.
 
-    Raises
-    ------
-    OptionError
-        One line: source, place, value, remedy.
+    Raises `OptionError` with one line: source, place, value, remedy.
     """
     if not isinstance(content, Mapping) or key not in content:
         raise OptionError(f"{name}: {key} is missing; such a file begins with '{key}: {version}'")
@@ -213,10 +210,7 @@ class GainsFile(StrictPart):
 def load_gains(source: Path | str) -> ControlGains:
     """Return gains from a file, or those that come with the package by a vehicle's name.
 
-    Raises
-    ------
-    OptionError
-        One line: file, place, value, remedy.
+    Raises `OptionError` with one line: file, place, value, remedy.
     """
     if str(source) in VEHICLES:
         text = _packaged(str(source))
@@ -238,10 +232,7 @@ def load_gains(source: Path | str) -> ControlGains:
 def save_gains(gains: ControlGains, path: Path) -> None:
     """Write a gains file.
 
-    Raises
-    ------
-    OutputError
-        If it cannot be written.
+    Raises `OutputError` if it cannot be written.
     """
     write_text(path, gains_text(gains))
 

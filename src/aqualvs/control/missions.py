@@ -86,10 +86,7 @@ class LossOptions:
     def __post_init__(self) -> None:
         """Refuse impossible values.
 
-        Raises
-        ------
-        OptionError
-            If one is not positive.
+        Raises `OptionError` if one is not positive.
         """
         if not (self.after > 0.0 and self.steady >= 0.0 and self.give_up > self.after):
             raise OptionError(
@@ -226,10 +223,7 @@ class LegOptions:
     def __post_init__(self) -> None:
         """Refuse impossible values.
 
-        Raises
-        ------
-        OptionError
-            If a time or distance is not positive.
+        Raises `OptionError` if a time or distance is not positive.
         """
         if not (self.time > 0.0 and self.distance > 0.0):
             raise OptionError(
@@ -379,10 +373,7 @@ class SurveyOptions:
     def __post_init__(self) -> None:
         """Refuse surveys without end or direction.
 
-        Raises
-        ------
-        OptionError
-            Naming the value.
+        Raises `OptionError` naming the value.
         """
         if not self.depths or not all(depth >= 0.0 for depth in self.depths):
             raise OptionError(f"survey: depths {list(self.depths)} m; give one or more, 0 or more")

@@ -119,10 +119,7 @@ class Plan:
 def load_plan(path: Path | str) -> Plan:
     """Return the plan of a file.
 
-    Raises
-    ------
-    OptionError
-        One line: file, place, value, remedy.
+    Raises `OptionError` with one line: file, place, value, remedy.
     """
     path = Path(path)
     content = load_settings(path, PlanFile, _KEY, VERSION)

@@ -141,10 +141,7 @@ class SafetyLimits:
     def __post_init__(self) -> None:
         """Refuse limits that cannot work.
 
-        Raises
-        ------
-        OptionError
-            If one makes no sense.
+        Raises `OptionError` if one makes no sense.
         """
         for field in fields(self):
             value = getattr(self, field.name)

@@ -66,10 +66,7 @@ class PostureFilterOptions:
     def __post_init__(self) -> None:
         """Check every value.
 
-        Raises
-        ------
-        OptionError
-            If one makes no sense.
+        Raises `OptionError` if one makes no sense.
         """
         names = ("range_acceleration", "pitch_acceleration", "yaw_acceleration")
         for name in (*names, "initial_speed", "initial_turn_rate", "max_coast"):

@@ -287,10 +287,7 @@ class TuneOptions:
     def __post_init__(self) -> None:
         """Refuse impossible values.
 
-        Raises
-        ------
-        OptionError
-            Naming the value.
+        Raises `OptionError` naming the value.
         """
         if not 0.0 <= self.delay <= self.greatest_delay <= _MAX_S:
             raise OptionError(
@@ -337,10 +334,7 @@ class Tuned:
 def tune(model: VehicleModel, options: TuneOptions | None = None) -> Tuned:
     """Return the fastest gains for a model that stay stable in every corner.
 
-    Raises
-    ------
-    OptionError
-        If there are none.
+    Raises `OptionError` if there are none.
     """
     options = options or TuneOptions()
     facts = facts_of(model)

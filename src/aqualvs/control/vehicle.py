@@ -50,10 +50,7 @@ class SetpointHolder:
     def put(self, setpoint: Setpoint | None) -> None:
         """Set, or take back.
 
-        Raises
-        ------
-        OptionError
-            If it cannot be held; the one in force stays.
+        Raises `OptionError` if it cannot be held; the one in force stays.
         """
         if setpoint is not None:
             self._check(setpoint)
@@ -150,10 +147,7 @@ class VehicleLink(Protocol):
         The vehicle must forget it by itself if no other comes (ArduSub: after its pilot-input
         fail-safe time).
 
-        Raises
-        ------
-        OSError
-            If it could not be sent.
+        Raises `OSError` if it could not be sent.
         """
 
     def close(self) -> None:

@@ -73,10 +73,7 @@ class DesignRequest:
 def design_and_tell(request: DesignRequest, console: Console | None = None) -> None:
     """Evaluate a design and print its predicted errors.
 
-    Raises
-    ------
-    AqualvsError
-        If a file or an option cannot be used, or the folder cannot be written.
+    Raises `AqualvsError` if a file or an option cannot be used, or the folder cannot be written.
     """
     told = _Telling(console or Console())
     design = _asked_for(request)

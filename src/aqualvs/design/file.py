@@ -269,10 +269,7 @@ def design_from(content: object, *, name: str, folder: Path) -> Design:
 def design_of_rig(rig: Rig, fan_deg: float = FAN_DEG) -> Design:
     """Return the design of an existing rig: its lasers may be tilted, but keep their places.
 
-    Raises
-    ------
-    RigError
-        If a laser can draw no stripe.
+    Raises `RigError` if a laser can draw no stripe.
     """
     fan = math.radians(fan_deg)
     mounts = tuple(mount_of_laser(laser, rig, fan) for laser in rig.lasers)

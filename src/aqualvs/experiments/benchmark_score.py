@@ -295,10 +295,7 @@ SCORE_FILES = ("scores.csv", "scores.json", "scores.md")
 def write_scores(scores: Scores, folder: Path) -> list[Path]:
     """Write `scores.csv`, `scores.json` and `scores.md`; return their paths.
 
-    Raises
-    ------
-    OSError
-        If the folder or a file cannot be written.
+    Raises `OSError` if the folder or a file cannot be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
     table, data, text = (folder / name for name in SCORE_FILES)

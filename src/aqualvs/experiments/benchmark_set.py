@@ -186,10 +186,7 @@ class BenchmarkSet:
 def load_set(folder: Path) -> BenchmarkSet:
     """Read a set that `aqualvs benchmark` wrote.
 
-    Raises
-    ------
-    SourceError
-        If the folder holds none, or a file of it cannot be read.
+    Raises `SourceError` if the folder holds none, or a file of it cannot be read.
     """
     path = folder / SET_FILE
     content = _read_yaml(path)
@@ -210,10 +207,7 @@ def load_set(folder: Path) -> BenchmarkSet:
 def read_dive(path: Path, name: str, level: str) -> DiveTruth:
     """Read the truth of one dive.
 
-    Raises
-    ------
-    SourceError
-        If the file cannot be read, lacks a column, or holds what is no number.
+    Raises `SourceError` if the file cannot be read, lacks a column, or holds what is no number.
     """
     rows = read_rows(path, _COLUMNS)
     cells = [[cell(path, i, row, column) for column in _COLUMNS] for i, row in enumerate(rows)]
@@ -230,10 +224,7 @@ def read_dive(path: Path, name: str, level: str) -> DiveTruth:
 def read_rows(path: Path, needed: tuple[str, ...]) -> list[dict[str, str | None]]:
     """Return the rows of a CSV file with a header, its names without space around them.
 
-    Raises
-    ------
-    SourceError
-        If it cannot be read, holds no row, or lacks a column.
+    Raises `SourceError` if it cannot be read, holds no row, or lacks a column.
     """
     refuse_special(path)
     try:
@@ -260,10 +251,7 @@ def read_rows(path: Path, needed: tuple[str, ...]) -> list[dict[str, str | None]
 def cell(path: Path, i_row: int, row: dict[str, str | None], column: str) -> float:
     """Return the number in a cell; NaN where it is empty.
 
-    Raises
-    ------
-    SourceError
-        If it holds something else.
+    Raises `SourceError` if it holds something else.
     """
     text = (row.get(column) or "").strip()
     try:
@@ -348,10 +336,7 @@ def make_set(
 def chosen_dives(names: Sequence[str], n_frames: int | None) -> list[BenchmarkDive]:
     """Return the dives of some levels or names, in the set's order, shortened if wished.
 
-    Raises
-    ------
-    OptionError
-        If a name is not known or the number of frames makes no sense.
+    Raises `OptionError` if a name is not known or the number of frames makes no sense.
     """
     dives = benchmark_dives()
     known = [*LEVELS, *(dive.name for dive in dives)]

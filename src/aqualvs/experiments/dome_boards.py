@@ -87,10 +87,7 @@ class SolvedDome:
 def solve_from_pictures(laboratory: Laboratory) -> SolvedDome:
     """Solve lens and dome from rendered pictures, distances read off with 0.2 mm of error.
 
-    Raises
-    ------
-    CalibrationError
-        If a picture does not show its board.
+    Raises `CalibrationError` if a picture does not show its board.
     """
     files = calibration_pictures(laboratory)
     truth = load_rig(files.rig)
@@ -129,10 +126,7 @@ def solve_from_pictures(laboratory: Laboratory) -> SolvedDome:
 def board_views(folder: Path, board_file: Path, seed: int) -> tuple[View, ...]:
     """Find a board in all pictures of a folder, and blur what was found as real boards would.
 
-    Raises
-    ------
-    CalibrationError
-        If one does not show it.
+    Raises `CalibrationError` if one does not show it.
     """
     board = load_board(board_file)
 

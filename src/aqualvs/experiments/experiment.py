@@ -150,10 +150,7 @@ MODULES: Mapping[str, str] = MappingProxyType(
 def ordered(names: Sequence[str]) -> list[str]:
     """Return these names in the catalogue's order, each once; all of them for none.
 
-    Raises
-    ------
-    OptionError
-        If a name is not in the catalogue.
+    Raises `OptionError` if a name is not in the catalogue.
     """
     for name in names:
         if name not in MODULES:

@@ -104,10 +104,7 @@ def angle_between(a: FloatArray, b: FloatArray) -> float:
 def matched(found: Sequence[LaserFigures], lasers: Sequence[Laser]) -> list[LaserFigures]:
     """Return the found lasers in the order of the true ones.
 
-    Raises
-    ------
-    CalibrationError
-        If two of them are nearest to the same.
+    Raises `CalibrationError` if two of them are nearest to the same.
     """
 
     def apart(one: LaserFigures, laser: Laser) -> float:

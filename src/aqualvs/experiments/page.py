@@ -90,12 +90,8 @@ class Record:
 def save_outcome(experiment: Experiment, outcome: ExperimentResult, folder: Path) -> Record:
     """Write the figures and series of an outcome and return its record.
 
-    Raises
-    ------
-    OutputError
-        If something cannot be written.
-    ValueError
-        If the columns of a series differ in length.
+    Raises `OutputError` if something cannot be written. Raises `ValueError` if the columns of a
+    series differ in length.
     """
     return Record(
         name=experiment.name,
@@ -113,10 +109,7 @@ def save_outcome(experiment: Experiment, outcome: ExperimentResult, folder: Path
 def write_results(records: Sequence[Record], seconds: Mapping[str, float], folder: Path) -> None:
     """Write `results.json` and `times.json`.
 
-    Raises
-    ------
-    OutputError
-        If one of them cannot be written.
+    Raises `OutputError` if one of them cannot be written.
     """
     content = {
         "aqualvs": __version__,
@@ -152,10 +145,7 @@ def is_reproduced(folder: Path) -> bool:
 def work_folder(folder: Path) -> Path:
     """Return the folder for rendered dives, emptied of what another version left in it.
 
-    Raises
-    ------
-    OutputError
-        If it cannot be made.
+    Raises `OutputError` if it cannot be made.
     """
     work = folder / WORK
     mark = work / _MADE_BY
@@ -289,10 +279,7 @@ def write_page(records: Sequence[Record], seconds: Mapping[str, float], folder: 
 def page_html(records: Sequence[Record], seconds: Mapping[str, float], folder: Path) -> str:
     """Return the page as HTML; see `write_page`.
 
-    Raises
-    ------
-    OSError
-        If a figure cannot be read.
+    Raises `OSError` if a figure cannot be read.
     """
     return html.page(
         "reproduce.html",

@@ -72,10 +72,7 @@ class Bending:
 def bending(rig: Rig, pixels: FloatArray) -> Bending:
     """Trace pixels (R, 2) through a rig's dome.
 
-    Raises
-    ------
-    RigError
-        If the rig has no dome.
+    Raises `RigError` if the rig has no dome.
     """
     if rig.dome is None:
         raise RigError(f"rig {rig.name} has no dome; give one that has")

@@ -177,10 +177,7 @@ def cruise(laboratory: Laboratory, waters: Sequence[float] = WATERS) -> Cruise:
 
     One picture is rendered in each medium; its corners are seen ten times, with new noise.
 
-    Raises
-    ------
-    CalibrationError
-        If it cannot be found.
+    Raises `CalibrationError` if it cannot be found.
     """
     rig = laboratory.rig
     plate, markers = _plate(laboratory, rig)

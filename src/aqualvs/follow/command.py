@@ -212,10 +212,8 @@ class Aim:
     def mission(self, working_range: tuple[float, float]) -> tuple[Mission, SafetyLimits, Setpoint]:
         """Return the mission, the limits of the safety gate, and the first setpoint.
 
-        Raises
-        ------
-        OptionError
-            If both are given, the plan cannot be used, or the range cannot be measured.
+        Raises `OptionError` if both are given, the plan cannot be used, or the range cannot be
+        measured.
         """
         holder = SetpointHolder(working_range)
         if self.plan is not None:
@@ -279,10 +277,7 @@ class SimRequest:
     def __post_init__(self) -> None:
         """Refuse requests that cannot be simulated.
 
-        Raises
-        ------
-        OptionError
-            Naming the value.
+        Raises `OptionError` naming the value.
         """
         if not _FOLLOW_LEAST_S <= self.seconds <= _MAX_S:
             raise OptionError(
@@ -319,10 +314,7 @@ _MAX_S, _MIN_FPS, _MAX_FPS = 86_400.0, 1.0, 1000.0
 def simulate_and_tell(request: SimRequest, echo: Callable[[str], object]) -> int:
     """Run the loop, write log, figures and page, and print the summary; return 0.
 
-    Raises
-    ------
-    AqualvsError
-        If an input cannot be used, or the folder cannot be written.
+    Raises `AqualvsError` if an input cannot be used, or the folder cannot be written.
     """
     rig = example_rig()
     if request.shutter is not None:

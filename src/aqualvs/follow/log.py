@@ -100,10 +100,7 @@ _UNITS = {
 def write_log(log: LoopLog, path: Path) -> None:
     """Write the rows as CSV; units are in the names, cells of unknown values are empty.
 
-    Raises
-    ------
-    OutputError
-        If the file cannot be written.
+    Raises `OutputError` if the file cannot be written.
     """
     columns = [_column(name) for name in LoopRow._fields]
     with writing(path), path.open("w", newline="", encoding="utf-8") as file:

@@ -117,10 +117,7 @@ class Timing:
     def __post_init__(self) -> None:
         """Refuse impossible values.
 
-        Raises
-        ------
-        OptionError
-            If there are no frames, or they come before their time.
+        Raises `OptionError` if there are no frames, or they come before their time.
         """
         if not (self.fps > 0.0 and self.delay >= 0.0 and self.field >= 0.0):
             raise OptionError(

@@ -120,12 +120,8 @@ class TuneRequest:
 def tune_and_tell(request: TuneRequest, echo: Callable[[str], None]) -> None:
     """Tune, try a step, write or print the gains.
 
-    Raises
-    ------
-    OptionError
-        If the model is unknown, or nothing stands what is asked.
-    OutputError
-        If the file cannot be written.
+    Raises `OptionError` if the model is unknown, or nothing stands what is asked. Raises
+    `OutputError` if the file cannot be written.
     """
     model = VEHICLES.get(request.model)
     if model is None:

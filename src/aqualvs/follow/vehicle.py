@@ -143,10 +143,7 @@ def follow_and_tell(
 
     It starts disengaged: a line on `keys` (the terminal) engages or disengages.
 
-    Raises
-    ------
-    AqualvsError
-        If an input cannot be used, or the source can never work.
+    Raises `AqualvsError` if an input cannot be used, or the source can never work.
     """
     rig = prepared_rig(request.rig, request.water, no_dome=False)
     mission, limits, setpoint = request.aim.mission(rig.working_range)

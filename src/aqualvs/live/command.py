@@ -178,10 +178,7 @@ class FeedRequest:
     def opened(self, source: str, *, realtime: bool) -> Feed:
         """Return the feed of a source.
 
-        Raises
-        ------
-        OptionError, SourceError
-            As `open_feed`; also if the size is none.
+        Raises `OptionError` or `SourceError` as `open_feed`; also if the size is none.
         """
         return open_feed(
             source,
@@ -236,10 +233,7 @@ class LiveRequest:
 def live_and_tell(request: LiveRequest, echo: Callable[[str], object]) -> int:
     """Run until the source ends or the user stops it, the normal end of a live run; return 0.
 
-    Raises
-    ------
-    AqualvsError
-        If an input cannot be used, or the source can never work.
+    Raises `AqualvsError` if an input cannot be used, or the source can never work.
     """
     rig = prepared_rig(request.rig, request.water, no_dome=False)
     pictures = request.feed.opened(request.source, realtime=not request.fast)

@@ -82,10 +82,7 @@ class FrozenOptions:
     def __post_init__(self) -> None:
         """Refuse impossible values.
 
-        Raises
-        ------
-        OptionError
-            Naming the value.
+        Raises `OptionError` naming the value.
         """
         for field in fields(self):
             name, value = field.name, getattr(self, field.name)

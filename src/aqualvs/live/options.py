@@ -62,10 +62,7 @@ class VehicleSetup:
 def load_vehicle(path: Path) -> VehicleSetup:
     """Return the contents of a vehicle file; its key file is looked for beside it.
 
-    Raises
-    ------
-    OptionError
-        One line: file, place, value, remedy.
+    Raises `OptionError` with one line: file, place, value, remedy.
     """
     content = load_settings(path, VehicleFile, _KEY, VERSION)
     try:
@@ -140,11 +137,8 @@ class OutputRequest:
 def make_outputs(request: OutputRequest) -> list[Output]:
     """Make the outputs that were asked for.
 
-    Raises
-    ------
-    OptionError
-        If an address cannot be understood, or the extra that an output needs is not installed; the
-        outputs made before it are closed.
+    Raises `OptionError` if an address cannot be understood, or the extra that an output needs is
+    not installed; the outputs made before it are closed.
     """
     makers: list[Callable[[], Output]] = [
         partial(_mavlink, url, request.link) for url in request.mavlink
@@ -171,10 +165,7 @@ def make_outputs(request: OutputRequest) -> list[Output]:
 def host_and_port(text: str, default_port: int, option: str) -> tuple[str, int]:
     """Return host and port of `HOST:PORT`, `HOST`, `:PORT` or "" (127.0.0.1).
 
-    Raises
-    ------
-    OptionError
-        If there is no such port.
+    Raises `OptionError` if there is no such port.
     """
     host, _, port = text.rpartition(":") if ":" in text else (text, "", "")
     if port and not (port.isdecimal() and 0 <= int(port) < 2**16):

@@ -214,10 +214,8 @@ class Pilot:
     def engage(self) -> None:
         """Engage on request of the user.
 
-        Raises
-        ------
-        OptionError
-            If that cannot be: no setpoint, another mode, disarmed, sticks off their centre.
+        Raises `OptionError` if that cannot be: no setpoint, another mode, disarmed, sticks off
+        their centre.
         """
         with self._stepping:
             if self._takes_setpoint() and not self._setpoint_known():

@@ -129,10 +129,7 @@ def net_of_run(place: NetSource, request: NetRequest, echo: Callable[[str], obje
 class StoredDive:
     """Dive as stored in a run's folder.
 
-    Raises
-    ------
-    SourceError
-        If `run.yaml`, postures or points cannot be read.
+    Raises `SourceError` if `run.yaml`, postures or points cannot be read.
     """
 
     def __init__(self, run_folder: Path) -> None:
@@ -157,10 +154,7 @@ class StoredDive:
     def net_pass(self, request: NetRequest) -> NetPass:
         """Return the evaluation of the net, to which the dive's scans are to be given.
 
-        Raises
-        ------
-        AqualvsError
-            If the rig in `run.yaml` is none, or the log cannot be read.
+        Raises `AqualvsError` if the rig in `run.yaml` is none, or the log cannot be read.
         """
         rig = rig_from_mapping(self._content["rig"], source_name=str(self._folder / RUN_YAML))
         return NetPass(rig, request)
@@ -200,10 +194,8 @@ class NetChangeRequest:
 def net_change(request: NetChangeRequest, echo: Callable[[str], object]) -> "Comparison":
     """Compare dives along the same net, write the changes and print them.
 
-    Raises
-    ------
-    AqualvsError
-        If a run cannot be read or a file not be written, or there is nothing to compare.
+    Raises `AqualvsError` if a run cannot be read or a file not be written, or there is nothing to
+    compare.
     """
     # `aqualvs net` and the processes of a batch need neither SciPy nor charts.
     from aqualvs.net_survey.comparison import compare

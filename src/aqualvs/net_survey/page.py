@@ -70,10 +70,7 @@ _STYLE: dict[Any, Any] = {**STYLE, "axes.grid": False, "hatch.linewidth": 0.5}
 def draw_change(result: Comparison, path: Path) -> None:
     """Draw the map; where places cannot be compared, the means date by date.
 
-    Raises
-    ------
-    OSError
-        As the system says it.
+    Raises `OSError` as the system says it.
     """
     import matplotlib as mpl
 

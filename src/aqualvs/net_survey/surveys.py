@@ -28,10 +28,7 @@ AUTO = "auto"
 def given_dates(texts: Sequence[str], n: int) -> list[date | None]:
     """Return the dates that the user gives for `n` folders; None where to be found.
 
-    Raises
-    ------
-    OptionError
-        If there is not one for every folder, or one is no date.
+    Raises `OptionError` if there is not one for every folder, or one is no date.
     """
     if texts and len(texts) != n:
         raise OptionError(
@@ -47,10 +44,7 @@ def date_of_run(folder: Path) -> tuple[date, str]:
     The date in the name of its folder counts first, then that in the name of the video, then the
     time that the video's container states. When it was evaluated says nothing.
 
-    Raises
-    ------
-    OptionError
-        If nothing tells.
+    Raises `OptionError` if nothing tells.
     """
     source = _source(folder)
     names = [(folder.resolve().name, "the folder's name"), (source.name, "the video's name")]
@@ -169,10 +163,7 @@ class Survey:
 def find_runs(folder: Path) -> list[Path]:
     """Return the runs that a folder is or, as that of a batch, holds.
 
-    Raises
-    ------
-    SourceError
-        If there is none with the state of a net.
+    Raises `SourceError` if there is none with the state of a net.
     """
     if (folder / NET_CSV).is_file():
         return [folder]
@@ -208,10 +199,7 @@ def left_out(folder: Path) -> list[str]:
 def read_survey(folder: Path, day: date) -> Survey:
     """Read the state of a net from a run's folder.
 
-    Raises
-    ------
-    SourceError
-        If a file is missing or cannot be understood.
+    Raises `SourceError` if a file is missing or cannot be understood.
     """
     check_run_files(folder)
     rows, holes = _rows(folder / NET_CSV), _rows(folder / HOLES_CSV)
@@ -236,10 +224,7 @@ def read_survey(folder: Path, day: date) -> Survey:
 def check_surveys(surveys: Sequence[Survey]) -> None:
     """Refuse runs that cannot be compared at all.
 
-    Raises
-    ------
-    OptionError
-        If there are fewer than two, or all are of one day, or one is named twice.
+    Raises `OptionError` if there are fewer than two, or all are of one day, or one is named twice.
     """
     folders = [one.folder.resolve() for one in surveys]
     for one, folder in zip(surveys, folders, strict=True):

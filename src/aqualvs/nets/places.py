@@ -179,12 +179,8 @@ class LaidLog:
 def open_log(path: Path | None, offset_s: float | None) -> VehicleLog | None:
     """Read the log that the user names, if any.
 
-    Raises
-    ------
-    SourceError
-        If it cannot be read.
-    OptionError
-        If there is an offset without a log, or the log's format needs an extra.
+    Raises `SourceError` if it cannot be read. Raises `OptionError` if there is an offset without a
+    log, or the log's format needs an extra.
     """
     if path is not None:
         return read_vehicle_log(path)

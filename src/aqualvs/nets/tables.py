@@ -249,10 +249,7 @@ def fouling_of(stretch: NetStretch) -> float | None:
 def write_table(path: Path, columns: Sequence[str], rows: Sequence[Mapping[str, Cell]]) -> None:
     """Write a table as CSV.
 
-    Raises
-    ------
-    OSError
-        As the system says it.
+    Raises `OSError` as the system says it.
     """
     text = io.StringIO(newline="")
     table = csv.DictWriter(text, columns, lineterminator="\n")

@@ -80,10 +80,8 @@ def net_request(
 ) -> NetRequest | None:
     """Return the request for the condition of a net, None if it is not wanted.
 
-    Raises
-    ------
-    OptionError
-        If an option is given although the condition is not wanted, or a value is not valid.
+    Raises `OptionError` if an option is given although the condition is not wanted, or a value is
+    not valid.
     """
     given = {"twine_mm": twine_mm, "stretch_m": stretch_m}
     known: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
@@ -160,10 +158,7 @@ class TargetFacts:
 def target_dict(text: str) -> TargetFacts:
     """Return what a word (auto, net, solid) or the path of a target file says.
 
-    Raises
-    ------
-    OptionError
-        If it is neither, or the file says what cannot be.
+    Raises `OptionError` if it is neither, or the file says what cannot be.
     """
     if text in set(TargetKind):
         return TargetFacts(TargetKind(text))

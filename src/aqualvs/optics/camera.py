@@ -216,11 +216,8 @@ def camera_params(
 ) -> CameraParams:
     """Check a camera and return it as kernels take it.
 
-    Raises
-    ------
-    RigError
-        If the lens lies outside the inner sphere of a dome, an index or the size is not valid, or
-        the pose is not one finite rigid transform.
+    Raises `RigError` if the lens lies outside the inner sphere of a dome, an index or the size is
+    not valid, or the pose is not one finite rigid transform.
     """
     _check_size(size_px)
     check_index("camera", "n_air", n_air)

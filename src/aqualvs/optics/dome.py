@@ -77,11 +77,8 @@ def trace_direction(
 class Dome:
     """A hemispherical port; its centre is the origin of `dome`.
 
-    Raises
-    ------
-    RigError
-        If a value is not finite, the inner radius is not positive, the thickness is negative, or
-        the index lies outside 1 to 3.
+    Raises `RigError` if a value is not finite, the inner radius is not positive, the thickness is
+    negative, or the index lies outside 1 to 3.
     """
 
     inner_radius: float  # In metres.
@@ -119,10 +116,7 @@ class Dome:
     def params(self, dome_from_cam: SE3, n_air: float, n_water: float) -> DomeParams:
         """Return the dome around a camera as kernels take it.
 
-        Raises
-        ------
-        RigError
-            If the lens lies outside the inner sphere.
+        Raises `RigError` if the lens lies outside the inner sphere.
         """
         centre = np.asarray(dome_from_cam.translation, dtype=np.float64)
         decentring = float(np.linalg.norm(centre))

@@ -80,11 +80,8 @@ def trace_flat(
 class FlatPort:
     """A flat window in front of the camera, fixed to it.
 
-    Raises
-    ------
-    RigError
-        If a value is not finite, the distance is not positive, the thickness is negative, the index
-        lies outside 1 to 3, or a tilt exceeds 45 degrees.
+    Raises `RigError` if a value is not finite, the distance is not positive, the thickness is
+    negative, the index lies outside 1 to 3, or a tilt exceeds 45 degrees.
     """
 
     # From the lens's projection centre to the inner face, along the normal, in metres.

@@ -278,10 +278,7 @@ def rig_parameter_names(rig: Rig) -> tuple[str, ...]:
 def rig_moved_by(rig: Rig, names: Sequence[str], step: FloatArray) -> Rig:
     """Return the rig with `step` (P,) added to the named numbers.
 
-    Raises
-    ------
-    RigError
-        If the moved rig is not valid.
+    Raises `RigError` if the moved rig is not valid.
     """
     values = dict(zip(names, np.asarray(step, np.float64).tolist(), strict=True))
     pose = {name: values.get(name, 0.0) for name in POSE_PARAMETERS}

@@ -306,10 +306,7 @@ class Sheet:
     def source(self) -> FloatArray:
         """Point that the light fans out from, exactly in the plane, shape (3,).
 
-        Raises
-        ------
-        ValueError
-            If there is no window: the source is then not known, and not needed.
+        Raises `ValueError` if there is no window: the source is then not known, and not needed.
         """
         if self.window is None:
             raise ValueError("a sheet without a window has no source")

@@ -38,10 +38,7 @@ class ShutterKind(StrEnum):
 class Shutter:
     """Exposure of a picture, in seconds.
 
-    Raises
-    ------
-    RigError
-        If the values contradict each other; the message names keys of the rig file.
+    Raises `RigError` if the values contradict each other; the message names keys of the rig file.
     """
 
     kind: ShutterKind = ShutterKind.GLOBAL

@@ -96,10 +96,7 @@ class SolvedStep:
     def from_mapping(cls, mapping: Mapping[str, Any], place: str) -> Self:
         """Read a step from a rig file.
 
-        Raises
-        ------
-        RigError
-            One line that names the place, the value and the remedy.
+        Raises `RigError` with one line that names the place, the value and the remedy.
         """
         rest = dict(mapping)
         date = _date(rest.pop("date", None), f"{place}.date")
@@ -123,10 +120,7 @@ def solved_steps(rig: Rig) -> dict[str, SolvedStep]:
 
     An entry under one of these names without a date is a note of the user and is left out.
 
-    Raises
-    ------
-    RigError
-        One line, if a record is malformed.
+    Raises `RigError` with one line, if a record is malformed.
     """
     notes = ((name, rig.solved_from.get(name)) for name in STEPS)
     return {
@@ -158,10 +152,8 @@ def is_exact(rig: Rig) -> bool:
 def rig_uncertainty(rig: Rig) -> RigUncertainty:
     """Return the uncertainty written down in a rig; zero for one that is exact or has none.
 
-    Raises
-    ------
-    RigError
-        One line, if it is malformed, not a covariance, or of numbers that the rig does not have.
+    Raises `RigError` with one line, if it is malformed, not a covariance, or of numbers that the
+    rig does not have.
     """
     content = rig.solved_from.get(_UNCERTAINTY)
     if content is None:
@@ -347,10 +339,7 @@ def assumptions(rig: Rig) -> tuple[Assumption, ...]:
     count as exact. The origin and the axes of the frame `dome` are exact by definition where
     nothing physical fixes them: the camera's rotation, and the place of a lens without a dome.
 
-    Raises
-    ------
-    RigError
-        As `rig_uncertainty`.
+    Raises `RigError` as `rig_uncertainty` does.
     """
     known = set(rig_uncertainty(rig).names)
     return tuple(one for one in _defaults(rig) if known.isdisjoint(_settled_by(one)))
@@ -359,10 +348,7 @@ def assumptions(rig: Rig) -> tuple[Assumption, ...]:
 def completed_uncertainty(rig: Rig) -> RigUncertainty:
     """Return the uncertainty written down in a rig, with the defaults for the other numbers.
 
-    Raises
-    ------
-    RigError
-        As `rig_uncertainty`.
+    Raises `RigError` as `rig_uncertainty` does.
     """
     parts = (rig_uncertainty(rig), *(one.uncertainty for one in assumptions(rig)))
     names = tuple(name for part in parts for name in part.names)

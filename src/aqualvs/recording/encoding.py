@@ -77,10 +77,7 @@ def png_of(frame: Frame) -> tuple[bytes, bytes | None]:
 def frame_of(index: int, time_s: float, kind: str, picture: bytes, chroma: bytes | None) -> Frame:
     """Return the frame that a recording's pictures show.
 
-    Raises
-    ------
-    ValueError
-        If they cannot be decoded.
+    Raises `ValueError` if they cannot be decoded.
     """
     image = _decoded(picture)
     if kind == PictureFormat.JPEG:
@@ -176,10 +173,7 @@ def options_text(options: ScannerOptions) -> str:
 def options_from_text(text: str) -> ScannerOptions:
     """Return the scanner's options that `options_text` wrote.
 
-    Raises
-    ------
-    ValueError, KeyError, TypeError
-        If the text is none that this version knows.
+    Raises `ValueError`, `KeyError` or `TypeError` if the text is none that this version knows.
     """
     found = json.loads(text)
     detector = dict(found["detector"])
@@ -265,10 +259,7 @@ class CdrWriter:
 class CdrReader:
     """Reader of a CDR message, field by field in their order.
 
-    Raises
-    ------
-    ValueError
-        From every method, if the message is cut short or not little-endian CDR.
+    Raises `ValueError` from every method, if the message is cut short or not little-endian CDR.
     """
 
     def __init__(self, content: bytes) -> None:

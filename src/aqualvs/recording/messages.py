@@ -97,10 +97,7 @@ def stripes_of(
 ) -> tuple[int, float, float, dict[SearchAxis, StripePeaks], Refusal | None, GyroRates | None]:
     """Return frame, time, index of the water, stripes, refusal and turning of a message.
 
-    Raises
-    ------
-    ValueError
-        If it is none of `stripes_message`.
+    Raises `ValueError` if it is none of `stripes_message`.
     """
     of = CdrReader(message)
     of.header()
@@ -190,10 +187,7 @@ def rig_message(texts: tuple[str, str, str], stamp_ns: int) -> bytes:
 def rig_texts_of(message: bytes) -> tuple[str, str, str]:
     """Return the rig file, its exact numbers and the scanner's options of a message.
 
-    Raises
-    ------
-    ValueError
-        If it is none of `rig_message`.
+    Raises `ValueError` if it is none of `rig_message`.
     """
     of = CdrReader(message)
     of.header()
@@ -212,10 +206,7 @@ def image_message(kind: str, data: bytes, stamp_ns: int) -> bytes:
 def image_of(message: bytes) -> tuple[str, bytes]:
     """Return kind and bytes of a picture's message.
 
-    Raises
-    ------
-    ValueError
-        If it is none of `image_message`.
+    Raises `ValueError` if it is none of `image_message`.
     """
     of = CdrReader(message)
     of.header()

@@ -122,10 +122,7 @@ class Recording:
 def recording_file(path: Path, open_file: Callable[[Path], BinaryIO] | None = None) -> GrowingFile:
     """Begin a file with the topics of a recording.
 
-    Raises
-    ------
-    OSError
-        As `GrowingFile`.
+    Raises `OSError` as `GrowingFile` does.
     """
     repeated = b"".join(
         mcap_file.schema(topic.number, topic.kind, topic.definition)

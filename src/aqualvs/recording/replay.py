@@ -84,10 +84,7 @@ class DiveRecording:
     def need_rig(self) -> Rig:
         """Return the rig.
 
-        Raises
-        ------
-        SourceError
-            If it is lost or not understood.
+        Raises `SourceError` if it is lost or not understood.
         """
         if self.rig is None:
             raise SourceError(f"{self.path}: {self._no_rig}")

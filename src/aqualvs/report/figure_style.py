@@ -69,10 +69,7 @@ def new_figure(height_in: float, width: Literal["column", "page"] = "page") -> I
 def save_figures(figures: "Mapping[str, Figure]", folder: Path, dpi: float) -> list[Path]:
     """Write figures as `NAME.png` into a folder that exists, and return their paths.
 
-    Raises
-    ------
-    OSError
-        If a picture cannot be written.
+    Raises `OSError` if a picture cannot be written.
     """
     paths = [folder / f"{name}.png" for name in figures]
     for path, figure in zip(paths, figures.values(), strict=True):

@@ -158,10 +158,7 @@ def _batches(run_dir: Path) -> Iterator[dict[str, NDArray[Any]]]:
 def _columns(batch: Any) -> dict[str, NDArray[Any]]:
     """Return the columns that the report needs.
 
-    Raises
-    ------
-    KeyError
-        Naming a column that is absent.
+    Raises `KeyError` naming a column that is absent.
     """
     present = [name for name in _OPTIONAL if name in batch.schema.names]
     return {

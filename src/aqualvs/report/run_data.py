@@ -96,10 +96,8 @@ def read_run_file(run_dir: Path) -> tuple[dict[str, Any], str]:
 def read_track(path: Path) -> Track:
     """Read a `posture.csv`; rows that are damaged or cut short are left out.
 
-    Raises
-    ------
-    SourceError
-        If the file is missing, holds no frame, or holds something that is no number.
+    Raises `SourceError` if the file is missing, holds no frame, or holds something that is no
+    number.
     """
     columns, texts = _read_columns(path, _NUMBERS, ("valid", "reason", "field"))
     order = np.argsort(columns["frame"], kind="stable")

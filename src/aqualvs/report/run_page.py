@@ -99,10 +99,7 @@ class Material:
 def gather(run_dir: Path, truth: Path | None) -> Material:
     """Read a run folder; only `posture.csv` must be there.
 
-    Raises
-    ------
-    SourceError
-        If `posture.csv`, or the truth, cannot be read or holds no frame.
+    Raises `SourceError` if `posture.csv`, or the truth, cannot be read or holds no frame.
     """
     check_run_files(run_dir)
     run, trouble = read_run_file(run_dir)

@@ -324,10 +324,7 @@ def prepare_folder(folder: Path, *, overwrite: bool) -> Claim:
 def claim_run(folder: Path, names: Sequence[str], *, overwrite: bool) -> Claim:
     """Return a claim on files of a run's folder, which all commands share that write to it.
 
-    Raises
-    ------
-    OutputError
-        As `Claim` does.
+    Raises `OutputError` as `Claim` does.
     """
     paths = [folder / name for name in names]
     known = [folder / name for name in RUN_FILES] if _is_run(folder) else []
@@ -344,10 +341,7 @@ def _is_run(folder: Path) -> bool:
 def check_run_files(folder: Path) -> None:
     """Refuse a folder with a pipe or a device in the place of a run's file.
 
-    Raises
-    ------
-    SourceError
-        With its path.
+    Raises `SourceError` with its path.
     """
     for name in RUN_FILES:
         refuse_special(folder / name)
@@ -383,10 +377,7 @@ def recover(folder: Path) -> bool:
 def _new_points_stream(folder: Path) -> PointsStream:
     """Begin the journal of a run.
 
-    Raises
-    ------
-    OutputError
-        If another run has started one since `prepare_folder`.
+    Raises `OutputError` if another run has started one since `prepare_folder`.
     """
     try:
         with locked_folder(folder):

@@ -139,10 +139,7 @@ class NetPass:
 def write_net_files(folder: Path, wall: "UnrolledNet", facts: dict[str, Any]) -> None:
     """Write tables first, pictures last.
 
-    Raises
-    ------
-    OSError
-        As the system says it.
+    Raises `OSError` as the system says it.
     """
     from aqualvs.nets.map import draw_map
     from aqualvs.nets.tables import (
@@ -218,10 +215,7 @@ def read_run(run_folder: str | Path) -> Iterator[Scan]:
 def check_stored(run_folder: Path) -> None:
     """Raise if `read_run` could not read a run.
 
-    Raises
-    ------
-    SourceError
-        As `read_run`.
+    Raises `SourceError` as `read_run` does.
     """
     check_run_files(run_folder)
     next(_posture_rows(run_folder / POSTURE_CSV), None)

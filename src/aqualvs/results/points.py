@@ -165,10 +165,7 @@ def read_points_stream(path: Path) -> Iterator[Any]:
 def check_idle(path: Path) -> None:
     """Raise if another process is still writing this journal.
 
-    Raises
-    ------
-    OutputError
-        If it is.
+    Raises `OutputError` if it is.
     """
     if is_locked(path):
         raise OutputError(

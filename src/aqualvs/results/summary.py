@@ -224,10 +224,7 @@ class RunSummary:
     def save(self, path: Path) -> None:
         """Write the summary of a part of a dive to a file, in NumPy's npz format.
 
-        Raises
-        ------
-        OSError
-            As the system says it.
+        Raises `OSError` as the system says it.
         """
         stored: dict[str, NDArray[Any]] = {
             "ranges": np.asarray(self.ranges),
@@ -243,10 +240,7 @@ class RunSummary:
     def extend(self, path: Path) -> None:
         """Add the frames of a part of the dive, as `save` has written them.
 
-        Raises
-        ------
-        OSError, ValueError
-            If the file cannot be read.
+        Raises `OSError` or `ValueError` if the file cannot be read.
         """
         with np.load(path) as file:
             stored: dict[str, NDArray[Any]] = {name: file[name] for name in file.files}

@@ -383,10 +383,7 @@ def list_cameras() -> dict[str, str]:
 def simulated_camera(name: str) -> SimulatedCamera:
     """Return a camera by its name.
 
-    Raises
-    ------
-    OptionError
-        If there is none of that name.
+    Raises `OptionError` if there is none of that name.
     """
     if name not in _CAMERAS:
         raise OptionError(f"--camera {name}: no such camera; choose one of {', '.join(_CAMERAS)}")

@@ -261,10 +261,7 @@ def shutter_from_words(words: str, fps: float, place: str = "--shutter") -> Shut
 def check_shutter(shutter: Shutter, fps: float) -> None:
     """Refuse a shutter that takes longer for a picture than pictures are apart.
 
-    Raises
-    ------
-    OptionError
-        If it does.
+    Raises `OptionError` if it does.
     """
     # Two fields make a frame, and the second is as far from the next frame's first.
     needed = abs(shutter.readout) * (2.0 if shutter.is_interlaced else 1.0)

@@ -193,11 +193,8 @@ def pack_sheets(
 ) -> Sheets:
     """Return the tables of a rig's laser sheets that nothing shadows yet, as a camera sees them.
 
-    Raises
-    ------
-    RigError
-        If there is not one source for every laser, or a source is off its laser's plane or not
-        that of its laser's window.
+    Raises `RigError` if there is not one source for every laser, or a source is off its laser's
+    plane or not that of its laser's window.
     """
     lasers, sheets = rig.lasers, sheets_of(rig)
     if len(sources) != len(lasers):

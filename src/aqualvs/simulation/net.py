@@ -39,10 +39,7 @@ NET, DIRECTION_U, DIRECTION_V, PLACE, HEIGHT, WIDTH, PERIOD, FOLD_COLUMNS = rang
 def pack_fold(i_net: int, fold: Fold) -> FloatArray:
     """Return one row of the fold table, shape (N_COLUMNS,).
 
-    Raises
-    ------
-    OptionError
-        If the width is not positive, or the folds of a row run into each other.
+    Raises `OptionError` if the width is not positive, or the folds of a row run into each other.
     """
     if not fold.width > 0.0:
         raise OptionError(f"fold of a net: width is {1e3 * fold.width:g} mm; it must be positive")

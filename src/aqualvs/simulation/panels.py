@@ -326,10 +326,7 @@ class PanelRenderer:
 
         Exposure and white balance of `eye` drift with the time `t`, in seconds.
 
-        Raises
-        ------
-        OptionError
-            If the scene has no panels.
+        Raises `OptionError` if the scene has no panels.
         """
         clear = WaterOptics(forward_scatter=0.0)
         return self.eye.picture(self.radiance(scene), clear, scene.sensor, t, rng)
@@ -362,10 +359,7 @@ def panel_sheets(
 ) -> Sheets:
     """Return the sheets of a rig's lasers in the rig's medium, all of one power.
 
-    Raises
-    ------
-    RigError
-        If a laser's plane is square to the view.
+    Raises `RigError` if a laser's plane is square to the view.
     """
     sources = [replace(source, power=power) for source in default_sources(rig)]
     return pack_sheets(rig, sources, filters)

@@ -199,10 +199,7 @@ class RenderedFrame:
 class Renderer:
     """Renderer of scenes for one rig in one water.
 
-    Raises
-    ------
-    RigError
-        If the sources do not fit the rig's lasers.
+    Raises `RigError` if the sources do not fit the rig's lasers.
     """
 
     # Camera, housing, water and lasers.

@@ -395,11 +395,8 @@ class ScenarioFile(_Strict):
 def read_scenario(path: Path) -> Scenario:
     """Read a scenario file; the scenario has the file's name.
 
-    Raises
-    ------
-    OptionError
-        If the file cannot be read, is not YAML, or holds a key or value that makes no sense; the
-        message names the file, the key and the remedy.
+    Raises `OptionError` if the file cannot be read, is not YAML, or holds a key or value that makes
+    no sense; the message names the file, the key and the remedy.
     """
     content = read_yaml(path, "a scenario file, or the name of a built-in scenario", OptionError)
     return parse_scenario(content, path.stem, str(path))
@@ -408,10 +405,7 @@ def read_scenario(path: Path) -> Scenario:
 def parse_scenario(content: Any, name: str, source: str) -> Scenario:
     """Return the scenario that a mapping describes; `source` is named in the error.
 
-    Raises
-    ------
-    OptionError
-        If a key is unknown or a value makes no sense.
+    Raises `OptionError` if a key is unknown or a value makes no sense.
     """
     try:
         return ScenarioFile.model_validate({} if content is None else content).scenario(name)

@@ -326,10 +326,7 @@ def list_scenarios() -> dict[str, str]:
 def load_scenario(name_or_path: str | Path) -> Scenario:
     """Return a built-in scenario by its name, or the one that a YAML file describes.
 
-    Raises
-    ------
-    OptionError
-        If there is no such name or file, or the file makes no sense.
+    Raises `OptionError` if there is no such name or file, or the file makes no sense.
     """
     name = str(name_or_path)
     if name in _BUILT_IN:

@@ -140,11 +140,8 @@ class MarkerPrint:
 def charuco_texture(board: CharucoPrint) -> Texture:
     """Return a ChArUco board with its border.
 
-    Raises
-    ------
-    OptionError
-        If square, marker and border are not whole numbers of the markers' cells, or the dictionary
-        has too few markers.
+    Raises `OptionError` if square, marker and border are not whole numbers of the markers' cells,
+    or the dictionary has too few markers.
     """
     book = _dictionary(board.dictionary)
     cell = board.marker / (book.markerSize + 2 * _FRAME)

@@ -24,10 +24,7 @@ Codec: TypeAlias = Literal["h264", "lossless", "mjpeg"]
 class Compression:
     """Compression of a video.
 
-    Raises
-    ------
-    OptionError
-        If a value makes no sense.
+    Raises `OptionError` if a value makes no sense.
     """
 
     # {"h264", "lossless", "mjpeg"}: H.264 with chroma at half resolution (4:2:0), as ROVs record;
@@ -125,10 +122,7 @@ class VideoWriter(Closing):
     def write(self, image: NDArray[np.uint8]) -> None:
         """Append one frame, uint8 RGB of shape (height, width, 3).
 
-        Raises
-        ------
-        OutputError
-            If it cannot be written.
+        Raises `OutputError` if it cannot be written.
         """
         if self._recording.codec == "mjpeg":
             self._mux([self._jpeg_packet(image)])

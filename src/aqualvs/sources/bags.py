@@ -377,10 +377,7 @@ class _Bounded:
     def read(self, n: int = -1) -> bytes:
         """Return the next bytes.
 
-        Raises
-        ------
-        ValueError
-            If these are too many.
+        Raises `ValueError` if these are too many.
         """
         if not 0 <= n <= MAX_RECORD_BYTES:
             raise ValueError(f"a record of {n} bytes")

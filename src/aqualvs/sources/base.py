@@ -220,11 +220,8 @@ class Feed(Protocol):
         `Frame.index` rises strictly, `Frame.time_s` never falls, also over a reconnection; a gap
         in the index says that frames were lost. Frames may change their size.
 
-        Raises
-        ------
-        SourceError
-            If it can never work: no such file, no such camera. A stream that is merely not there
-            is tried again.
+        Raises `SourceError` if it can never work: no such file, no such camera. A stream that is
+        merely not there is tried again.
         """
 
     def health(self) -> PartHealth:

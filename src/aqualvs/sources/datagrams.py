@@ -74,10 +74,7 @@ class Datagram(NamedTuple):
 class Datagrams:
     """Receiver on a UDP port; a thread of its own empties the system's buffer.
 
-    Raises
-    ------
-    OSError
-        If the system refuses: the port is taken, the address is none of this machine.
+    Raises `OSError` if the system refuses: the port is taken, the address is none of this machine.
     """
 
     def __init__(self, address: UdpAddress) -> None:

@@ -210,10 +210,7 @@ def image_of_ros(message: Any) -> ImageMessage:
 def image_of_json(content: bytes) -> ImageMessage:
     """Return the image in a Foxglove message written as JSON.
 
-    Raises
-    ------
-    ValueError
-        If fields are missing or wrong.
+    Raises `ValueError` if fields are missing or wrong.
     """
     try:
         found = json.loads(content)
@@ -266,10 +263,7 @@ def image_of_protobuf(schema: str) -> Callable[[bytes], ImageMessage]:
 def protobuf_fields(content: bytes) -> dict[int, int | bytes]:
     """Return the last value of each field of a Protobuf message, by its number.
 
-    Raises
-    ------
-    ValueError
-        If the message is cut short or uses groups.
+    Raises `ValueError` if the message is cut short or uses groups.
     """
     fields: dict[int, int | bytes] = {}
     at = 0
@@ -408,11 +402,8 @@ class MessageSource(Closing):
     def __iter__(self) -> Iterator[Frame]:
         """Yield the readable images; others leave a gap in the index.
 
-        Raises
-        ------
-        SourceError
-            When the size changes, and at the end if the recording is cut short or its last images
-            cannot be decoded.
+        Raises `SourceError` when the size changes, and at the end if the recording is cut short or
+        its last images cannot be decoded.
         """
         last = -1
         for frame in self._frames():

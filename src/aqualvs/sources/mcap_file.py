@@ -52,10 +52,7 @@ def head(kind: Op, length: int) -> bytes:
 def padding_head(span: int) -> bytes:
     """Return the head of a padding record that spans this many bytes, its head included.
 
-    Raises
-    ------
-    ValueError
-        If it cannot even hold its head.
+    Raises `ValueError` if it cannot even hold its head.
     """
     if span < HEAD_BYTES:
         raise ValueError(f"a record cannot span {span} bytes")
@@ -275,10 +272,7 @@ class McapFile:
     def messages(self, topics: Collection[str]) -> Iterator[StoredMessage]:
         """Yield the messages of some topics in the order of the file.
 
-        Raises
-        ------
-        SourceError
-            If the file cannot be read any more.
+        Raises `SourceError` if the file cannot be read any more.
         """
         wanted = {
             number: name
@@ -375,10 +369,7 @@ def _merged_topics(front: _Listing, summary: _Listing) -> dict[int, tuple[str, .
 def _note(found: _Listing, kind: int, content: bytes) -> None:
     """Add a record to the contents.
 
-    Raises
-    ------
-    struct.error, ValueError
-        If it is none.
+    Raises `struct.error` or `ValueError` if it is none.
     """
     if kind == Op.CHANNEL:
         number, _, n_bytes = struct.unpack_from("<HHI", content)
@@ -439,10 +430,8 @@ def _chunk_at(file: BinaryIO, at: int) -> bytes | None:
 def decompressed(compression: str, data: bytes, raw_size: int) -> bytes:
     """Return the raw content of a chunk.
 
-    Raises
-    ------
-    ValueError, OSError, ArrowException
-        If it has another size than its head says, or is too large.
+    Raises `ValueError`, `OSError` or `ArrowException` if it has another size than its head says, or
+    is too large.
     """
     if not compression:
         return data

@@ -244,10 +244,7 @@ class CameraFeed(RemoteFeed):
     def __iter__(self) -> Iterator[Frame]:
         """Yield frames until closed.
 
-        Raises
-        ------
-        SourceError
-            If there is no such camera, or no Video4Linux, at the start.
+        Raises `SourceError` if there is no such camera, or no Video4Linux, at the start.
         """
         if not sys.platform.startswith("linux"):
             raise SourceError(
@@ -261,10 +258,7 @@ class CameraFeed(RemoteFeed):
 def camera_device(where: str) -> str:
     """Return the device that `camera:0`, `camera:/dev/video2` or `/dev/video0` names.
 
-    Raises
-    ------
-    SourceError
-        If nothing follows `camera:`.
+    Raises `SourceError` if nothing follows `camera:`.
     """
     name = where.removeprefix("camera:")
     if not name:

@@ -375,10 +375,7 @@ class VideoParts(Closing):
 def image_frames(folder: Path, span: Span, fps: float) -> Iterator[Frame]:
     """Read a part of a folder of images, as `ImageSource` reads all of it.
 
-    Raises
-    ------
-    UnlikeProbeError
-        If an image cannot be read, or there are others than there were.
+    Raises `UnlikeProbeError` if an image cannot be read, or there are others than there were.
     """
     try:
         source = ImageSource(images_in(folder)[span.first : span.stop], fps=fps)

@@ -68,10 +68,7 @@ class SdpVideo:
 def read_sdp(path: Path) -> SdpVideo:
     """Read the first video from an SDP file.
 
-    Raises
-    ------
-    SourceError
-        If the file cannot be read or announces no video over RTP and UDP.
+    Raises `SourceError` if the file cannot be read or announces no video over RTP and UDP.
     """
     refuse_special(path)
     max_bytes = 64 << 10

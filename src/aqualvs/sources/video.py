@@ -178,11 +178,8 @@ class VideoSource(Closing):
     def __iter__(self) -> Iterator[Frame]:
         """Yield the sound frames; lost ones leave a gap in the index.
 
-        Raises
-        ------
-        SourceError
-            At the end, if frames that the container promised did not come; or when the picture
-            size changes, or a stream stalls.
+        Raises `SourceError` at the end, if frames that the container promised did not come; or when
+        the picture size changes, or a stream stalls.
         """
         n_delivered, last = 0, None
         for picture in self._pictures():

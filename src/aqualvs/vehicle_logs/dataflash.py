@@ -272,10 +272,7 @@ def looks_like_dataflash_text(head: bytes) -> bool:
 def read_dataflash(path: Path) -> VehicleLog:
     """Read a binary dataflash log.
 
-    Raises
-    ------
-    SourceError
-        If nothing that is wanted is in it.
+    Raises `SourceError` if nothing that is wanted is in it.
     """
     records = read_binary(path.read_bytes(), _WANTED)
     return _log(path, records, "dataflash", "bytes")
@@ -284,10 +281,7 @@ def read_dataflash(path: Path) -> VehicleLog:
 def read_dataflash_text(path: Path) -> VehicleLog:
     """Read a dataflash log in text.
 
-    Raises
-    ------
-    SourceError
-        If nothing that is wanted is in it.
+    Raises `SourceError` if nothing that is wanted is in it.
     """
     text = path.read_text(encoding="utf-8", errors="replace")
     return _log(path, read_text(text, _WANTED), "dataflash text", "lines")

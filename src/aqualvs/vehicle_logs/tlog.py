@@ -180,10 +180,7 @@ _Found = tuple[Signal | None, str]
 def read_tlog(path: Path) -> VehicleLog:
     """Read a telemetry log.
 
-    Raises
-    ------
-    SourceError
-        If no autopilot speaks in it.
+    Raises `SourceError` if no autopilot speaks in it.
     """
     frames = read_frames(path.read_bytes())
     source, others = _autopilot(frames, path)

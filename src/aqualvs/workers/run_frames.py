@@ -95,10 +95,7 @@ class Replay(Closing):
     def __iter__(self) -> Iterator[ReplayedFrame]:
         """Yield the recorded frames.
 
-        Raises
-        ------
-        SourceError
-            At the end, if parts of the recording were torn.
+        Raises `SourceError` at the end, if parts of the recording were torn.
         """
         for recorded in self._recording.frames(with_pictures=self._pictures):
             frame = recorded.picture or Frame(recorded.index, recorded.time_s, self._black)
@@ -148,10 +145,7 @@ class Replay(Closing):
 def replay_of(request: RunRequest) -> Replay | None:
     """Return the replay of a request's source, None where it is no recording.
 
-    Raises
-    ------
-    AqualvsError
-        As `Replay`.
+    Raises `AqualvsError` as `Replay` does.
     """
     path = Path(request.source)
     if path.suffix.lower() != ".mcap":
@@ -306,10 +300,7 @@ class DiveProcessor(Closing):
     def wait_for_first(self) -> None:
         """Wait for the first frame; to be called before `blocks`.
 
-        Raises
-        ------
-        SourceError, OptionError
-            If there is none.
+        Raises `SourceError` or `OptionError` if there is none.
         """
         self._head = next(self._shared, None)
         if self._head is None:

@@ -44,10 +44,7 @@ COVERAGE_CELLS = (6, 8)
 def check_camera_views(views: Sequence[View], size_px: tuple[int, int]) -> None:
     """Refuse too few views, or views of another picture size.
 
-    Raises
-    ------
-    CalibrationError
-        With what is given and what is needed.
+    Raises `CalibrationError` with what is given and what is needed.
     """
     min_views = 3
     if len(views) < min_views:

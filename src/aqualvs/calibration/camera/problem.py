@@ -236,10 +236,7 @@ def fitted_camera(
     of Schwarz (1978, doi:10.1214/aos/1176344136) requires: superfluous ones would distort the
     picture's corners, where no board was seen.
 
-    Raises
-    ------
-    CalibrationError
-        If no camera model explains the views.
+    Raises `CalibrationError` if no camera model explains the views.
     """
     first = _STEPS[model][0] if n_coefficients is None else n_coefficients
     bundle, solution = _first_fit(views, size_px, model, first)

@@ -367,10 +367,7 @@ _POSE_RULES = (
 def check_initial_guess(problem: DomeProblem) -> None:
     """Refuse boards at impossible distances, or grossly different from the given ones.
 
-    Raises
-    ------
-    CalibrationError
-        With the likely mistake.
+    Raises `CalibrationError` with the likely mistake.
     """
     _check_seen(problem)
     views = problem.bundle.views

@@ -135,10 +135,7 @@ class DomeOptions:
 def check_sets(rig: Rig, sets: Sequence[BoardSet]) -> None:
     """Refuse a rig without a housing, and sets with too little in them.
 
-    Raises
-    ------
-    CalibrationError
-        With what is given and what is needed.
+    Raises `CalibrationError` with what is given and what is needed.
     """
     if rig.housing is None:
         raise CalibrationError(

@@ -319,10 +319,7 @@ _MIN_BINS = 5
 def check_size(views: Sequence[LaserView]) -> None:
     """Refuse targets whose size indicates a wrong unit.
 
-    Raises
-    ------
-    CalibrationError
-        If so.
+    Raises `CalibrationError` if so.
     """
     points = [v.view.points for v in views if len(v.view)]
     if not points:
@@ -341,10 +338,7 @@ def check_size(views: Sequence[LaserView]) -> None:
 def check_poses(views: Sequence[PlacedView]) -> None:
     """Refuse pictures with corners that contradict the rig, the medium or the target's file.
 
-    Raises
-    ------
-    CalibrationError
-        If so.
+    Raises `CalibrationError` if so.
     """
     misses = float(np.median([view.rms_px for view in views]))
     # Larger than any error of detection, in pixels.
@@ -359,10 +353,7 @@ def check_poses(views: Sequence[PlacedView]) -> None:
 def check_distances(views: Sequence[PlacedView], rig: Rig) -> None:
     """Refuse stripes at distances that indicate a wrong unit, or no stripes on the target.
 
-    Raises
-    ------
-    CalibrationError
-        If so.
+    Raises `CalibrationError` if so.
     """
     if not any(len(view.placed) for view in views):
         raise CalibrationError(
@@ -390,11 +381,8 @@ def check_count(
 ) -> list[str]:
     """Refuse fewer or more lasers than expected, or an undecided number; warn of uncertain ones.
 
-    Raises
-    ------
-    CalibrationError
-        If there are fewer, more, or none, or if the pictures do not decide whether planes of
-        light are lasers.
+    Raises `CalibrationError` if there are fewer, more, or none, or if the pictures do not decide
+    whether planes of light are lasers.
     """
     found = len(split.planes)
     if found < (expected or 1):

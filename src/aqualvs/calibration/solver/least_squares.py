@@ -405,10 +405,7 @@ def inverse(information: FloatArray) -> FloatArray:
 
     Combinations known to rounding only get a variance that is huge, but finite.
 
-    Raises
-    ------
-    CalibrationError
-        If one of the parameters is not determined at all.
+    Raises `CalibrationError` if one of the parameters is not determined at all.
     """
     if not len(information):
         return information

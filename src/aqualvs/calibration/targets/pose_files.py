@@ -100,10 +100,7 @@ class BoardPose:
 def load_poses(path: str | Path) -> tuple[BoardPose, ...]:
     """Load a `poses.csv`.
 
-    Raises
-    ------
-    CalibrationError
-        One line that names the file, the line, the value and the remedy.
+    Raises `CalibrationError` with one line that names the file, the line, the value and the remedy.
     """
     source = Path(path)
     text = read_text(source, "a poses.csv", CalibrationError)

@@ -418,10 +418,7 @@ def papers(word: str) -> tuple[Paper, Paper]:
 def best_paper(word: str, width: float, height: float, what: str) -> Paper:
     """Return the orientation that has room for a print of this size, in millimetres.
 
-    Raises
-    ------
-    OptionError
-        If neither has.
+    Raises `OptionError` if neither has.
     """
     for paper in papers(word):
         room = paper.room_mm

@@ -76,10 +76,7 @@ class BoardKind(StrEnum):
 class Board:
     """A flat board of squares.
 
-    Raises
-    ------
-    CalibrationError
-        If such a board is impossible.
+    Raises `CalibrationError` if such a board is impossible.
     """
 
     # Chessboard or ChArUco.
@@ -226,10 +223,7 @@ class MarkerSet:
 def aruco_dictionary(name: str) -> cv2.aruco.Dictionary:
     """Return OpenCV's dictionary of that name.
 
-    Raises
-    ------
-    CalibrationError
-        If OpenCV does not know it.
+    Raises `CalibrationError` if OpenCV does not know it.
     """
     number = dictionary_id(name)
     if number is None:

@@ -138,10 +138,7 @@ class IndexEstimator:
     One estimator serves one target, one rig and one dive. Started in air (`IndexPrior.air`), it
     learns the target's place better than by a ruler, and keeps that in the water.
 
-    Raises
-    ------
-    CalibrationError
-        If the rig has no housing.
+    Raises `CalibrationError` if the rig has no housing.
     """
 
     # Behind a housing.
@@ -225,10 +222,7 @@ class IndexEstimator:
     def residuals(self, view: View) -> FloatArray:
         """Return measured minus predicted pixels (M, 2) of a view by the present estimate.
 
-        Raises
-        ------
-        CalibrationError
-            Before the first used frame.
+        Raises `CalibrationError` before the first used frame.
         """
         if self.state is None:
             raise CalibrationError("no picture shows enough of the target yet; add one that does")

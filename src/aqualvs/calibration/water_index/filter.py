@@ -92,10 +92,7 @@ class Line(NamedTuple):
 class IndexModel:
     """Model of a target on the vehicle, seen through media of different index.
 
-    Raises
-    ------
-    CalibrationError
-        If the rig has no housing.
+    Raises `CalibrationError` if the rig has no housing.
     """
 
     # Behind a housing; its own `n_water` plays no part.

@@ -29,10 +29,7 @@ _STEP_NM = 1.0
 class IndexPrior:
     """Prior of a refractive index.
 
-    Raises
-    ------
-    OptionError
-        If the index is impossible or sigma is not positive.
+    Raises `OptionError` if the index is impossible or sigma is not positive.
     """
 
     n: float  # Relative to vacuum.
@@ -300,10 +297,7 @@ _LOST_FRAMES = 10
 class IndexOptions:
     """Options: assumptions about target and medium.
 
-    Raises
-    ------
-    OptionError
-        If a value is negative or not finite.
+    Raises `OptionError` if a value is negative or not finite.
     """
 
     # Standard deviation of the target's place on the vehicle, along each axis of `dome`, in metres.
@@ -329,10 +323,7 @@ class IndexOptions:
 
         An index counts as observable if it separates fresh water from sea water.
 
-        Raises
-        ------
-        OptionError
-            If one of them is negative or no number.
+        Raises `OptionError` if one of them is negative or no number.
         """
         _check_not_negative("--place-sigma-mm", place_sigma_mm)
         _check_not_negative("--turn-sigma-deg", turn_sigma_deg)

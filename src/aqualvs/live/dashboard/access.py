@@ -70,10 +70,7 @@ _ADAPTER: TypeAdapter[Message] = TypeAdapter(Message)
 def parse_message(text: str) -> Message:
     """Return a page's message.
 
-    Raises
-    ------
-    ValueError
-        If it is none.
+    Raises `ValueError` if it is none.
     """
     return _ADAPTER.validate_json(text)
 
@@ -118,10 +115,7 @@ class Controls:
     def carry_out(self, command: Command) -> None:
         """Carry out a command of a page that has the right to command.
 
-        Raises
-        ------
-        AqualvsError
-            If it cannot be done; nothing has changed then.
+        Raises `AqualvsError` if it cannot be done; nothing has changed then.
         """
         if isinstance(command, SetpointCommand):
             wanted = None
@@ -220,10 +214,7 @@ def _is_origin(text: str) -> bool:
 def make_access(host: str, token: str | None, embedders: Sequence[str] = ()) -> Access:
     """Return the rules for an address; without a token a new one is made.
 
-    Raises
-    ------
-    OptionError
-        If an embedder is no origin of web pages.
+    Raises `OptionError` if an embedder is no origin of web pages.
     """
     for origin in embedders:
         # Anything else, such as a wildcard, would let strangers lay a page over the buttons.

@@ -161,10 +161,8 @@ def start_dashboard(
 ) -> Dashboard:
     """Serve the page and print its address; without a recorder, its button refuses.
 
-    Raises
-    ------
-    OptionError
-        If the token is too short, an embedder is no origin, or the address cannot be listened to.
+    Raises `OptionError` if the token is too short, an embedder is no origin, or the address cannot
+    be listened to.
     """
     fault = token_fault(token)
     if fault:

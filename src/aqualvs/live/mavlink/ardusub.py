@@ -262,10 +262,7 @@ class ArduSubOptions:
     def __post_init__(self) -> None:
         """Check every value.
 
-        Raises
-        ------
-        OptionError
-            If one makes no sense.
+        Raises `OptionError` if one makes no sense.
         """
         allowed = _KEEPS_DEPTH[self.command]
         for mode in self.modes:
@@ -372,12 +369,8 @@ class ArduSubLink:
         ArduSub keeps it until another one comes, from us or from the ground station, or until its
         pilot-input fail-safe (FS_PILOT_TIMEOUT; in GUIDED 3 s) has run out.
 
-        Raises
-        ------
-        OSError
-            If it could not be sent.
-        ValueError
-            If a part of it is not finite; neutral is sent then.
+        Raises `OSError` if it could not be sent. Raises `ValueError` if a part of it is not finite;
+        neutral is sent then.
         """
         finite = is_finite(effort)
         sent = self._send(effort if finite else NEUTRAL)

@@ -85,10 +85,7 @@ class LinkOptions:
     def __post_init__(self) -> None:
         """Check every value.
 
-        Raises
-        ------
-        OptionError
-            If one makes no sense.
+        Raises `OptionError` if one makes no sense.
         """
         _check_id("system", self.system)
         _check_id("component", self.component)

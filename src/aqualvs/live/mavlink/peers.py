@@ -36,10 +36,7 @@ def load_key(path: Path) -> bytes:
 
     The key of a passphrase is its SHA-256, as in MAVProxy, Mission Planner and QGroundControl.
 
-    Raises
-    ------
-    OptionError
-        If there is no such file, or it holds neither.
+    Raises `OptionError` if there is no such file, or it holds neither.
     """
     try:
         if not path.is_file():

@@ -216,10 +216,7 @@ class Port(Protocol):
 def open_port(address: Address) -> Port:
     """Open the way to a peer; may take a second for TCP, and longer for names.
 
-    Raises
-    ------
-    OSError
-        If it cannot be opened now; later it may.
+    Raises `OSError` if it cannot be opened now; later it may.
     """
     if isinstance(address, SerialAddress):
         from aqualvs.live.mavlink.serial import SerialPort
@@ -235,10 +232,7 @@ def open_port(address: Address) -> Port:
 def check_address(address: Address) -> None:
     """Raise if this computer can never open such an address.
 
-    Raises
-    ------
-    OptionError
-        For a serial port without pyserial, or at a speed that it does not know.
+    Raises `OptionError` for a serial port without pyserial, or at a speed that it does not know.
     """
     if not isinstance(address, SerialAddress):
         return

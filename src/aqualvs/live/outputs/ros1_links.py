@@ -229,10 +229,7 @@ class _Link:
     def write(self) -> None:
         """Send as much as goes.
 
-        Raises
-        ------
-        OSError
-            If the peer is gone.
+        Raises `OSError` if the peer is gone.
         """
         while self.wants_to_write():
             if not self.rest:

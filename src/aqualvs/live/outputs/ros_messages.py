@@ -321,10 +321,7 @@ class PublishedTopic(StrEnum):
 class RosOptions:
     """Names, and how hard it is tried to deliver.
 
-    Raises
-    ------
-    OptionError
-        If a name is none that ROS allows, or the period is not positive.
+    Raises `OptionError` if a name is none that ROS allows, or the period is not positive.
     """
 
     # What the topics' names start with; `diagnostics` stays at the root, where ROS looks for it.

@@ -268,10 +268,7 @@ class SimulatedVehicle:
     def step(self, sticks: StickPositions | None, dt: float) -> None:
         """Send stick positions, or none, and advance by `dt` seconds.
 
-        Raises
-        ------
-        OptionError
-            If `dt` is not positive, or a position is no number.
+        Raises `OptionError` if `dt` is not positive, or a position is no number.
         """
         if not dt > 0.0:
             raise OptionError(f"vehicle: step of {dt:g} s; it must be positive")
