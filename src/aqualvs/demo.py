@@ -19,8 +19,6 @@ def demo(out: Path, echo: Callable[[str], object], *, overwrite: bool = False) -
     ----------
     out : Path
         Folder to write.
-    echo : callable
-        Takes one line of text.
     overwrite : bool
         Whether to replace a run that is already there.
 

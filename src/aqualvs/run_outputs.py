@@ -66,8 +66,6 @@ class RunNet:
 
     Parameters
     ----------
-    rig : Rig
-        Of the run.
     request : NetRequest or None
         What to find out, if anything.
 
@@ -90,8 +88,6 @@ class RunNet:
 
         Parameters
         ----------
-        folder : Path
-            Of the run.
         source : str
             Of the frames; the clock of a video may help to lay a log on it.
 

@@ -222,13 +222,7 @@ def _summary_lines(
 
 
 class BatchProgress(Closing):
-    """Progress of a batch: a bar on a terminal, and a line for each dive; a context manager.
-
-    Parameters
-    ----------
-    echo : callable
-        Takes one line of text.
-    """
+    """Progress of a batch: a bar on a terminal, and a line for each dive; a context manager."""
 
     def __init__(self, n_dives: int, echo: Callable[[str], object]) -> None:
         self._n_dives, self._n_ended, self._n_frames = n_dives, 0, 0

@@ -285,8 +285,6 @@ def detect_targets(pictures: Sequence[Picture], detect: Detect, target: str) -> 
     ----------
     pictures : sequence of Picture
         Files or pixels; pixels are named by their number.
-    detect : callable
-        Finds the target in one picture.
     target : str
         Name of the target in messages, such as "board.yaml".
 

@@ -137,8 +137,6 @@ class AnswerWatch:
     ----------
     vehicle : VehicleFacts
         Its mass and thrust.
-    limits : AnswerLimits, optional
-        Defaults if left out.
     """
 
     def __init__(self, vehicle: VehicleFacts, limits: AnswerLimits | None = None) -> None:

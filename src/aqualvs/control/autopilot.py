@@ -51,8 +51,6 @@ class NetPilot:
         What to do.
     controller : RangeYawController
         Made for the vehicle.
-    gate : SafetyGate, optional
-        With default limits if left out.
 
     Raises
     ------

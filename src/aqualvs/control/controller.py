@@ -147,8 +147,6 @@ class Pid:
 
         Parameters
         ----------
-        time_s : float
-            Of the measurement.
         setpoint, measured : float
             In one unit.
         rate : float, optional
@@ -465,8 +463,6 @@ class RangeYawController:
 
         Parameters
         ----------
-        time_s : float
-            Of the frame.
         range, yaw : float
             Its posture, in metres and radians; finite.
         range_rate, yaw_rate : float or None

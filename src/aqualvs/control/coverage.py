@@ -83,13 +83,7 @@ class CoverageMap:
 
 
 class Coverage:
-    """Builder of the coverage map, step by step.
-
-    Parameters
-    ----------
-    options : CoverageOptions, optional
-        Defaults if left out.
-    """
+    """Builder of the coverage map, step by step."""
 
     # Longer steps are gaps, in seconds.
     LONGEST_STEP_S = 1.0

@@ -162,11 +162,6 @@ class SafetyGate:
 
     It starts disengaged.
 
-    Parameters
-    ----------
-    limits : SafetyLimits, optional
-        Defaults if left out.
-
     Attributes
     ----------
     latched : LimitReason or None

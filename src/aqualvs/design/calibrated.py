@@ -98,8 +98,6 @@ def lasers_by(believed: Rig, true: Rig) -> Rig | None:
     ----------
     believed : Rig
         Rig whose camera is assumed.
-    true : Rig
-        Rig that takes the pictures.
 
     Returns
     -------

@@ -334,8 +334,6 @@ def write_page(
     ----------
     name : str
         Of the rig.
-    first : str
-        The verdict.
     parts : sequence of str or Table
         Sentences belong to the table before them.
     pictures : sequence of Path

@@ -128,8 +128,6 @@ def mount_of_laser(laser: Laser, rig: Rig, fan: float) -> Mount:
     ----------
     laser : Laser
         Behind a window the plane that fits its light best is used.
-    rig : Rig
-        Its rig.
     fan : float
         Full opening, radians.
 

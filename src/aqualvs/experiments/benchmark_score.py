@@ -401,8 +401,6 @@ def run_own(
     ----------
     folder : Path
         A run goes to SYSTEM/DIVE in it.
-    echo : callable
-        Takes one line of text.
     overwrite : bool
         Whether to replace runs that are there.
 
@@ -473,8 +471,6 @@ def score_and_tell(
         NAME=PATH or paths, as `read_system` takes them.
     truth : Path
         Folder of the set.
-    echo : callable
-        Takes one line of text.
     own : Path or None
         Folder in which to run what comes with aqualvs first, to be scored too.
     out : Path or None

@@ -289,8 +289,6 @@ def make_set(
         Folder to write.
     names : sequence of str
         Levels or dives; none for all.
-    echo : callable
-        Takes one line of text.
     n_frames : int or None
         Frames of every dive; None for all.
     shutter : str or None

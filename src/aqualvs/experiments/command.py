@@ -214,13 +214,6 @@ def reproduce(request: ReproduceRequest, echo: Echo, load: Load = catalogue.expe
 
     Results of other experiments that the same version left in the folder stay on the page.
 
-    Parameters
-    ----------
-    echo : callable
-        Takes one line of text.
-    load : callable
-        From a name to its experiment.
-
     Returns
     -------
     exit_code : int

@@ -59,8 +59,6 @@ def simulate(
         None takes the example rig.
     out : Path or None
         Folder to write.
-    echo : callable
-        Takes one line of text.
     camera : str
         Name of the camera that takes the pictures.
     shutter : str or None
@@ -192,8 +190,6 @@ def calibration_commands(files: CalibrationFiles, out: Path, n_lasers: int) -> l
 
     Parameters
     ----------
-    files : CalibrationFiles
-        The set.
     out : Path
         Folder in which `rig.yaml` and `run` are to be written.
     n_lasers : int

@@ -156,8 +156,6 @@ class RunWatch:
     ----------
     seconds : float
         Of the whole run.
-    echo : callable
-        Takes one line.
     slow : bool
         Whether a simulated second takes seconds, so that progress is printed.
     """

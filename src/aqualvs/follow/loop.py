@@ -162,12 +162,8 @@ class SimulatedLoop:
 
     Parameters
     ----------
-    link : SimulatedLink
-        To the vehicle.
     steering : NetPilot
         Engaged at the start.
-    timing : Timing, optional
-        Defaults if left out.
     posture_filter : PostureFilter, optional
         With default options if left out.
     on_step : callable, optional

@@ -50,8 +50,6 @@ class RenderedSensor:
         Source of the sensor's noise.
     scene : Scene, optional
         In the frame of the net at rest; `net_scene` if left out.
-    options : ScannerOptions, optional
-        Defaults if left out.
     samples : int
         Rays along each side of a pixel.
     camera : SimulatedCamera
@@ -178,8 +176,6 @@ class SampledSensor:
     ----------
     rng : Generator
         Source of the noise.
-    noise : PostureNoise, optional
-        Defaults if left out.
     blind : sequence of Blind
         Periods without sight.
     working_range : (float, float)

@@ -123,11 +123,6 @@ class FrozenPicture:
     improves moves no edge. A vehicle slows down little by little, and one that turns round moves
     again soon; a picture whose motion ends at once, and does not return, has stopped itself.
 
-    Parameters
-    ----------
-    options : FrozenOptions, optional
-        Defaults if left out.
-
     Attributes
     ----------
     change : float

@@ -92,8 +92,6 @@ def vehicle_setup(file: Path | None, peers: Sequence[str] | None, key: Path | No
 
     Parameters
     ----------
-    file : Path or None
-        `--vehicle-file`; defaults if left out.
     peers : sequence of str or None
         `--mavlink-peer`; instead of those of the file.
     key : Path or None
@@ -239,8 +237,6 @@ def serve_page(
         Where the page puts what is to be held.
     recorder : RecorderSwitch or None
         What its record button moves; None where nothing can be recorded.
-    echo : callable
-        Takes one line.
     vehicle : callable, optional
         Returns what the autopilot tells of depth and heading.
     embedders : sequence of str, optional

@@ -372,8 +372,6 @@ class LiveRunner:
         Closed at the end.
     outputs : sequence of Output
         Closed at the end.
-    options : LiveOptions, optional
-        Defaults if left out.
     posture_filter : PostureFilter or None
         Smooths over time, in addition to the raw values.
 

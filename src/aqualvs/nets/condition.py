@@ -112,8 +112,6 @@ class NetCondition:
     ----------
     rig : Rig
         Rig of the scans.
-    options : NetConditionOptions, optional
-        Defaults if left out.
     camera : Camera, optional
         Replaces `rig.camera()`.
 

@@ -256,13 +256,7 @@ class TrackStart:
 
 
 class LatticeFitter:
-    """Fitter of the place of a lattice in frames.
-
-    Parameters
-    ----------
-    lattice : NetLattice
-        Of the frames.
-    """
+    """Fitter of the place of a lattice in frames."""
 
     def __init__(self, lattice: NetLattice) -> None:
         self.lattice = lattice
@@ -284,8 +278,6 @@ class LatticeFitter:
 
         Parameters
         ----------
-        crossings : Crossings
-            Of the frame.
         expected : array, shape (2,), optional
             Expected place of the lattice; it selects one of many equivalent shifts.
         precision : array, shape (2, 2), optional
@@ -485,10 +477,6 @@ class NetTrack:
         ----------
         fitter : LatticeFitter
             With the stretch's lattice.
-        crossings : Crossings
-            Of the frame.
-        time_s : float
-            Of the frame.
         velocity : array, shape (2,), optional
             Of the vehicle along the net, right and up, if another sensor measures it.
         start : TrackStart, optional

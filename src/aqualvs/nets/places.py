@@ -198,8 +198,6 @@ def lay_log(
     ----------
     log : VehicleLog
         Of the same dive.
-    postures : DivePostures
-        Of the dive.
     offset_s : float or None
         Log time minus dive time, where the user knows it.
     video : Path or None

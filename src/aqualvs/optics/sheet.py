@@ -384,8 +384,6 @@ class Sheet:
 
         Parameters
         ----------
-        camera : Camera
-            The camera that sees the sheet.
         working_range : (float, float)
             Points at these distances from the dome's centre count, in metres.
         """

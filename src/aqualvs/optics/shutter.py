@@ -117,11 +117,6 @@ class Shutter:
 
         Every picture of an interlaced camera makes two frames: 2 n is the first field of picture n,
         2 n + 1 its second.
-
-        Parameters
-        ----------
-        index : int
-            Of the frame.
         """
         if not self.is_interlaced:
             return None

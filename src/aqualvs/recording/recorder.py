@@ -153,8 +153,6 @@ class Recorder:
     ----------
     path : Path
         Must not exist.
-    options : RecorderOptions, optional
-        Defaults if left out.
     open_file : callable, optional
         As in `GrowingFile`; for tests.
 
@@ -319,8 +317,6 @@ class RecorderSwitch:
     ----------
     folder : Path
         Made when it is needed.
-    options : RecorderOptions, optional
-        Defaults if left out.
 
     Attributes
     ----------

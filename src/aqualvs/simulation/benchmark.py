@@ -394,8 +394,6 @@ def render_benchmark_dive(
 
     Parameters
     ----------
-    dive : BenchmarkDive
-        Dive to render.
     renderer : Renderer
         For `benchmark_rig()`, with any shutter; of an interlaced one each field is a frame.
     folder : Path

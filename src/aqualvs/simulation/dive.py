@@ -151,8 +151,6 @@ def simulate_dive(
 
     Parameters
     ----------
-    scenario : Scenario
-        Scenario to render.
     rig : Rig
         Camera with its shutter, dome, water and lasers.
     out_dir : Path

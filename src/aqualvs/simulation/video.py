@@ -66,8 +66,6 @@ class VideoWriter(Closing):
         Width and height of every frame.
     fps : float
         Frames a second.
-    recording : Compression
-        Compression of the frames.
     first_field : {"top", "bottom"} or None
         Field that comes first in interlaced pictures: "h264" codes them as such, with chroma of
         each field by itself, as capture devices do; the other codecs know no fields. None for

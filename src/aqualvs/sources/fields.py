@@ -350,11 +350,6 @@ def first_pairs(source: FrameSource) -> Iterator[list[Frame]]:
 class FieldWatch:
     """Watch of a stream's pictures for what contradicts the rig's shutter.
 
-    Parameters
-    ----------
-    shutter : Shutter
-        Of the rig.
-
     Attributes
     ----------
     warning : str

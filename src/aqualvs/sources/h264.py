@@ -254,8 +254,6 @@ def field_pairs(codec: str, extradata: bytes | None) -> FieldPairs | None:
     ----------
     codec : str
         Name that FFmpeg gives the codec.
-    extradata : bytes or None
-        Of the stream.
     """
     return FieldPairs(extradata or b"") if codec == "h264" else None
 

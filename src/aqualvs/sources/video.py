@@ -58,13 +58,7 @@ class FrameCounter:
         return self._next + len(self._pending)
 
     def begin(self, codec: VideoCodecContext) -> None:
-        """Count the pictures of a stream from here on.
-
-        Parameters
-        ----------
-        codec : VideoCodecContext
-            Of the stream.
-        """
+        """Count the pictures of a stream from here on."""
         self._fields = field_pairs(codec.name, codec.extradata)
 
     def expect(self, packet: "Packet[VideoStream]") -> None:

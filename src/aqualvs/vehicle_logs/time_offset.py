@@ -89,8 +89,6 @@ def find_time_offset(
     ----------
     log : VehicleLog
         With heading, pitch or both.
-    posture_track : PostureTrack
-        Of the dive.
     start : TimeOffset, optional
         What clocks say. Where motion alone leaves a doubt, only offsets within four of its sigmas
         are considered.

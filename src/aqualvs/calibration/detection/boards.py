@@ -44,8 +44,6 @@ def read_markers(
     ----------
     image : uint8 array, shape (height, width)
         Grey picture.
-    dictionary : str
-        Name of the markers' dictionary.
     n_first : int or None
         Read only the first `n_first` markers of the dictionary, which is faster.
     window_px : int or None

@@ -384,8 +384,6 @@ def turned_square(
 
     Parameters
     ----------
-    poses : sequence of SE3
-        Of all boards.
     square : array, shape (3, 3)
         Rotation of a square board.
     boards : sequence of int

@@ -367,8 +367,6 @@ def solve(
 
     Parameters
     ----------
-    problem : Problem
-        Problem to solve.
     start : State
         Initial guess, near enough to the solution for Newton's method.
     reject : bool

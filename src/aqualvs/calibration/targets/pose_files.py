@@ -249,8 +249,6 @@ def match_poses(
     ----------
     poses : sequence of BoardPose
         Rows of the file.
-    names : sequence of str
-        File names of the pictures.
     source : Path
         The file, for messages.
 

@@ -74,8 +74,6 @@ def box_patches(
 
     Parameters
     ----------
-    plan : BoxPlan
-        The box.
     rooms : sequence of (float, float)
         Printable width and height of a sheet of paper, in metres: upright and across. Infinite
         for sheets as large as a plane.
@@ -225,8 +223,6 @@ def marker_rectangles(family: str, number: int, corner: FloatArray, size: float)
     ----------
     family : str
         Name of the dictionary.
-    number : int
-        Number of the marker in it.
     corner : array, shape (2,)
         The marker's top-left corner, in the unit of `size`.
     size : float

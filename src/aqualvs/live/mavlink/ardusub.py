@@ -297,8 +297,6 @@ class ArduSubLink:
     ----------
     link : str or MavlinkLink
         Address as in `parse_address`, or a link that others use too; such a one is not closed here.
-    options : ArduSubOptions, optional
-        Defaults if left out.
     advises : bool
         Whether settings of the vehicle that are not safe are logged.
 

@@ -106,8 +106,6 @@ class MavlinkLink:
     ----------
     url : str
         See `parse_address`.
-    options : LinkOptions, optional
-        Defaults if left out.
 
     Attributes
     ----------
@@ -198,8 +196,6 @@ class MavlinkLink:
 
         Parameters
         ----------
-        kind : str
-            Name of the message.
         system, component : int or None
             Only from these; from any if None.
         """

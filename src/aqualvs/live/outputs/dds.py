@@ -175,8 +175,6 @@ class DdsOutput:
 
     Parameters
     ----------
-    options : RosOptions, optional
-        Defaults if left out.
     domain_id : int or None
         None for `ROS_DOMAIN_ID`, 0 where that is not set.
     distro : str or None

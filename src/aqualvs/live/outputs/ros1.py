@@ -288,8 +288,6 @@ class Ros1Output:
 
     Parameters
     ----------
-    options : RosOptions, optional
-        Defaults if left out.
     master_uri : str or None
         Where roscore is. None for `ROS_MASTER_URI`, this machine where that is not set.
     node_name : str
