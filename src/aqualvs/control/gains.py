@@ -242,51 +242,37 @@ class VehicleFacts:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RangeGains:
-    """Gains of the cascade that holds the range.
+    """Gains of the cascade that holds the range."""
 
-    Attributes
-    ----------
-    position : float
-        Speed asked for by an error of the range, in m/s per m.
-    speed : float
-        Acceleration asked for by an error of the speed, in m/s² per m/s.
-    integral : float
-        Acceleration by that error and second, in m/s² per m.
-    greatest_speed : float
-        Asked for towards and away from the target, in m/s.
-    ramp_speed, ramp_acceleration : float
-        With which a new setpoint is approached, in m/s and m/s².
-    approach_speed : float
-        In place of `ramp_speed` towards the target, where that is faster, in m/s: for vehicles
-        that coast far when the picture stands still and thrust ends.
-    jerk : float
-        Greatest change of the acceleration asked for, per second. What it holds back comes late:
-        with 8 the pitch of a BlueROV2 Heavy, which thrust below its centre moves, swings up.
-    lag : float
-        Time from an effort until pictures show it, in seconds: so much later a setpoint's change
-        is expected to be seen.
-    crossing_impulse, crossing_share : float
-        Thrust across the thrusters' dead band that must be owed before it is crossed: as share of
-        the full thrust, summed over seconds, or at once. 0 crosses at every change of sign.
-    swell : float
-        Share by which `speed` is greater for errors that swing with the swell's period; 0 for
-        calm water.
-    swell_period, swell_damping : float
-        In seconds, and the width of the band over its middle, halved.
-    """
-
+    # Speed asked for by an error of the range, in m/s per m.
     position: float
+    # Acceleration asked for by an error of the speed, in m/s² per m/s.
     speed: float
+    # Acceleration by that error and second, in m/s² per m.
     integral: float
+    # Time from an effort until pictures show it, in seconds: so much later a setpoint's change is
+    # expected to be seen.
     lag: float
+    # Asked for towards and away from the target, in m/s.
     greatest_speed: float = 0.25
+    # With which a new setpoint is approached, in m/s and m/s².
     ramp_speed: float = 0.15
+    # In place of `ramp_speed` towards the target, where that is faster, in m/s: for vehicles that
+    # coast far when the picture stands still and thrust ends.
     approach_speed: float = 0.15
+    # As `ramp_speed`.
     ramp_acceleration: float = 0.12
+    # Greatest change of the acceleration asked for, per second. What it holds back comes late: with
+    # 8 the pitch of a BlueROV2 Heavy, which thrust below its centre moves, swings up.
     jerk: float = 30.0
+    # Thrust across the thrusters' dead band that must be owed before it is crossed: as share of the
+    # full thrust, summed over seconds, or at once. 0 crosses at every change of sign.
     crossing_impulse: float = 0.0175
     crossing_share: float = 0.4
+    # Share by which `speed` is greater for errors that swing with the swell's period; 0 for calm
+    # water.
     swell: float = 0.0
+    # In seconds, and the width of the band over its middle, halved.
     swell_period: float = 5.0
     swell_damping: float = 0.15
 

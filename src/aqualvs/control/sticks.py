@@ -33,20 +33,12 @@ _CHANNELS = {"throttle": 3, "yaw": 4, "forward": 5, "right": 6}
 
 @dataclass(frozen=True, slots=True)
 class Sticks:
-    """The axes of `MANUAL_CONTROL` as ArduSub takes them.
+    """The axes of `MANUAL_CONTROL` as ArduSub takes them."""
 
-    Attributes
-    ----------
-    x, y, r : int
-        Forward, right, clockwise, -1000 to 1000.
-    z : int
-        Up, 0 to 1000; 500 is neutral, contrary to the MAVLink specification.
-    """
-
-    x: int = 0
-    y: int = 0
-    z: int = MIDDLE
-    r: int = 0
+    x: int = 0  # Forward, -1000 to 1000.
+    y: int = 0  # Right, as far.
+    z: int = MIDDLE  # Up, 0 to 1000; 500 is neutral, contrary to the MAVLink specification.
+    r: int = 0  # Clockwise, as far as `x`.
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

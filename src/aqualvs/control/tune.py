@@ -311,24 +311,14 @@ class TuneOptions:
 
 @dataclass(frozen=True, slots=True)
 class Tuned:
-    """Result of tuning.
-
-    Attributes
-    ----------
-    range_usual, yaw_usual : Margins
-        At the usual delay with the model as it is, in still water.
-    range_corner : Margins
-        At the usual delay in the worst corner.
-    range_late, yaw_late : Margins
-        At the greatest delay in the worst corner.
-    """
+    """Result of tuning."""
 
     gains: ControlGains
-    range_usual: Margins
-    range_corner: Margins
-    range_late: Margins
-    yaw_usual: Margins
-    yaw_late: Margins
+    range_usual: Margins  # At the usual delay with the model as it is, in still water.
+    range_corner: Margins  # At the usual delay in the worst corner.
+    range_late: Margins  # At the greatest delay in the worst corner.
+    yaw_usual: Margins  # As `range_usual`.
+    yaw_late: Margins  # As `range_late`.
 
 
 def tune(model: VehicleModel, options: TuneOptions | None = None) -> Tuned:

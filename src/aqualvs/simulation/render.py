@@ -114,23 +114,13 @@ TILE = 32
 
 
 class TileMembers(NamedTuple):
-    """Rows of the tables that each tile can show, as one array with the start of each tile.
+    """Rows of the tables that each tile can show, as one array with the start of each tile."""
 
-    Attributes
-    ----------
-    n_columns : int
-        Number of tiles in a row.
-    ellipsoids, bubbles : int arrays
-        Rows, tile after tile.
-    ellipsoid_start, bubble_start : int arrays, shape (n_tiles + 1,)
-        Start of each tile's part.
-    """
-
-    n_columns: int
-    ellipsoids: IntArray
-    ellipsoid_start: IntArray
-    bubbles: IntArray
-    bubble_start: IntArray
+    n_columns: int  # Number of tiles in a row.
+    ellipsoids: IntArray  # Rows, tile after tile.
+    ellipsoid_start: IntArray  # Shape (n_tiles + 1,): start of each tile's part.
+    bubbles: IntArray  # As `ellipsoids`.
+    bubble_start: IntArray  # As `ellipsoid_start`.
 
 
 def tile_members(camera: Camera, size_px: tuple[int, int], surfaces: Surfaces) -> TileMembers:

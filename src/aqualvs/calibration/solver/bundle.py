@@ -30,18 +30,10 @@ ROLLS = "rolls"
 
 @dataclass(frozen=True, slots=True)
 class KnownDistance:
-    """Prior on a pose: measured distance of the board's plane along the dome's y axis (paper, 2.2).
+    """Prior on a pose: the board's measured distance along the dome's y axis (paper, 2.2)."""
 
-    Attributes
-    ----------
-    distance : float
-        From the dome's centre, in metres.
-    sigma : float
-        Its standard deviation, in metres.
-    """
-
-    distance: float
-    sigma: float
+    distance: float  # Of the board's plane from the dome's centre, in metres.
+    sigma: float  # Its standard deviation, in metres.
 
     def blocks(self, dome_from_target: SE3, centre: FloatArray, columns: IntArray) -> list[Block]:
         """Return one residual: found minus given distance."""
