@@ -10,6 +10,7 @@ from aqualvs.control.answer_watch import AnswerWatch
 from aqualvs.control.controller import RangeYawController
 from aqualvs.control.missions import Guidance, Mission, Stage
 from aqualvs.control.safety import NO_BRAKE, LimitReason, SafetyGate
+from aqualvs.control.time_filter import FilteredPosture
 from aqualvs.control.vehicle import NEUTRAL, Effort, VehicleState
 from aqualvs.errors import OptionError
 from aqualvs.scanning.posture import Posture, Refusal
@@ -26,6 +27,14 @@ class Motion:
     # Per second.
     range_rate: float
     yaw_rate: float
+
+
+def motion_of(filtered: FilteredPosture | None) -> Motion | None:
+    """Return the answer of the package's own filter."""
+    if filtered is None:
+        return None
+    range_rate, _, yaw_rate = filtered.rates.tolist()
+    return Motion(filtered.range, filtered.yaw, range_rate, yaw_rate)
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol, TypeAlias
 
-from aqualvs.control.autopilot import Decision, Motion, NetPilot
+from aqualvs.control.autopilot import Decision, NetPilot, motion_of
 from aqualvs.control.time_filter import FilteredPosture, PostureFilter
 from aqualvs.control.tune import shaping_of_model
 from aqualvs.control.vehicle import NEUTRAL, Effort, Mode, VehicleState
@@ -286,7 +286,7 @@ class SimulatedLoop:
         self._filtered = self._filter.update(filter_s, posture)
         state = self.link.state()
         decision = self._decision = self.steering.step(
-            now_s, frame_s, posture, _motion(self._filtered), state
+            now_s, frame_s, posture, motion_of(self._filtered), state
         )
         if self.on_step is not None:
             self.on_step(now_s, frame_s, posture, decision, state)
@@ -343,11 +343,3 @@ def _why_not(posture: Posture | Refusal | None) -> str:
     if posture is None:
         return Reason.NO_FRAMES.value
     return posture.reason.value if isinstance(posture, Refusal) else ""
-
-
-def _motion(filtered: FilteredPosture | None) -> Motion | None:
-    """Return the filter's answer in control's words, as the live pilot does."""
-    if filtered is None:
-        return None
-    range_rate, _, yaw_rate = filtered.rates.tolist()
-    return Motion(filtered.range, filtered.yaw, range_rate, yaw_rate)

@@ -10,10 +10,9 @@ import threading
 import time
 from dataclasses import dataclass, replace
 
-from aqualvs.control.autopilot import Decision, Motion, NetPilot
+from aqualvs.control.autopilot import Decision, NetPilot, motion_of
 from aqualvs.control.missions import Guidance, HoldMission
 from aqualvs.control.safety import LimitReason
-from aqualvs.control.time_filter import FilteredPosture
 from aqualvs.control.vehicle import NEUTRAL, Effort, Mode, SetpointHolder, VehicleLink, VehicleState
 from aqualvs.errors import OptionError
 from aqualvs.recording.sample import LiveSample
@@ -296,7 +295,7 @@ class Pilot:
             now_s,
             sample.scan.time_s,
             self._present(sample, now_s),
-            _motion(sample.filtered),
+            motion_of(sample.filtered),
             state,
         )
 
@@ -366,11 +365,3 @@ class Pilot:
         self._told = told
         level = logging.INFO if report.colour is State.OK else logging.WARNING
         _log.log(level, "pilot, frame %d: %s", report.frame, report.words)
-
-
-def _motion(filtered: FilteredPosture | None) -> Motion | None:
-    """Return the filter's answer in control's words."""
-    if filtered is None:
-        return None
-    range_rate, _, yaw_rate = filtered.rates.tolist()
-    return Motion(filtered.range, filtered.yaw, range_rate, yaw_rate)

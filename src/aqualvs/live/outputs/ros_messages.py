@@ -32,10 +32,6 @@ from aqualvs.scanning.posture import Posture, Reason
 from aqualvs.scanning.scan import Label, ScanPoints
 from aqualvs.sources.base import Health, PartHealth, State
 
-FLU_FROM_DOME: FloatArray = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-"""Rotation from `dome` to forward, left, up."""
-FLU_FROM_DOME.flags.writeable = False
-
 UNOBSERVABLE_VARIANCE = 1.0e4
 """Variance, in m² and rad², of what a plane leaves undetermined: 100 m, 100 rad."""
 
@@ -59,18 +55,6 @@ def flu_from_dome(vectors_in_dome: ArrayLike) -> FloatArray:
     """Return vectors (..., 3) of `dome` in forward, left, up."""
     vectors = as_vectors(vectors_in_dome, 3, "vectors_in_dome")
     return np.stack((vectors[..., 1], -vectors[..., 0], vectors[..., 2]), axis=-1)
-
-
-def normal_in_dome(pitch: float, yaw: float) -> FloatArray:
-    """Return the unit normal (3,) in `dome` of a target plane before the vehicle.
-
-    Parameters
-    ----------
-    pitch, yaw : float
-        As in `Posture`, in radians, within a right angle.
-    """
-    x, z = math.tan(yaw), math.tan(pitch)
-    return np.array([x, 1.0, z]) / math.sqrt(1.0 + x * x + z * z)
 
 
 def flu_angles(pitch: float, yaw: float) -> tuple[float, float]:
