@@ -173,7 +173,7 @@ def _sources(folder: Traversable, above: str) -> list[tuple[str, Traversable]]:
         name = f"{above}/{entry.name}"
         if entry.is_dir():
             found.extend(_sources(entry, name))
-        elif name.endswith(".py"):
+        elif name.endswith((".py", ".yaml")):
             found.append((name, entry))
     return found
 

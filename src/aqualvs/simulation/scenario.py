@@ -6,8 +6,10 @@ at random such that the camera meets them. A scenario file is short YAML with th
 """
 
 import difflib
+import functools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
@@ -31,7 +33,7 @@ from aqualvs.simulation.scene import (
     Wall,
     WaterOptics,
 )
-from aqualvs.yamlfile import read_yaml
+from aqualvs.yamlfile import parse_yaml, read_yaml
 
 _IN_FRONT = 0.10
 _SIDE, _HEIGHT = 0.20, 0.13
@@ -400,6 +402,14 @@ def read_scenario(path: Path) -> Scenario:
     """
     content = read_yaml(path, "a scenario file, or the name of a built-in scenario", OptionError)
     return parse_scenario(content, path.stem, str(path))
+
+
+@functools.cache
+def packaged(name: str) -> dict[str, Any]:
+    """Return the content of a file of the folder `data/scenarios`; it must not be changed."""
+    text = (files("aqualvs") / "data" / "scenarios" / name).read_text(encoding="utf-8")
+    content: dict[str, Any] = parse_yaml(text, name, OptionError)
+    return content
 
 
 def parse_scenario(content: Any, name: str, source: str) -> Scenario:
