@@ -16,7 +16,6 @@ import contextlib
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
@@ -246,12 +245,7 @@ class RunOutputs:
         """Return the writer."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        fault: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, _kind: object, fault: BaseException | None, _trace: object) -> None:
         """Complete the folder: `points.parquet` and `points.ply` replace the journal."""
         if isinstance(fault, OutputError):
             self._leave_as_it_is(fault)

@@ -12,7 +12,6 @@ import os
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
@@ -112,12 +111,7 @@ class PointsStream:
         """Return the writer."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        fault: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, _kind: object, fault: BaseException | None, _trace: object) -> None:
         """Finish the stream, or leave it as it is where writing failed."""
         if isinstance(fault, OSError):
             self.abandon()
