@@ -70,12 +70,12 @@ class DesignRequest:
     overwrite: bool = False
 
 
-def design_and_tell(request: DesignRequest, console: Console | None = None) -> None:
+def design_and_tell(request: DesignRequest) -> None:
     """Evaluate a design and print its predicted errors.
 
     Raises `AqualvsError` if a file or an option cannot be used, or the folder cannot be written.
     """
-    told = _Telling(console or Console())
+    told = _Telling()
     design = _asked_for(request)
     names = () if request.out is None else (RIG_YAML, ERRORS_PNG, PICTURE_PNG, DESIGN_HTML)
     files = [(request.out or Path()) / name for name in names]
@@ -112,7 +112,7 @@ def design_and_tell(request: DesignRequest, console: Console | None = None) -> N
 class _Telling:
     """Printer of a design's parts, which the page repeats."""
 
-    console: Console
+    console: Console = field(default_factory=Console)
     parts: list[str | Table] = field(default_factory=list)
 
     def __call__(self, *parts: str | Table) -> None:

@@ -204,7 +204,6 @@ class Laboratory:
         options: ScannerOptions | None = None,
         *,
         rig: Rig | None = None,
-        no_dome: bool = False,
     ) -> MeasuredDive:
         """Measure every frame of a dive.
 
@@ -212,17 +211,13 @@ class Laboratory:
         ----------
         rig : Rig, optional
             What the scanner believes; the true rig by default.
-        no_dome : bool
-            Leave refraction out, as `aqualvs run --no-dome` does.
         """
         believed = rig or dive.rig
         options = options or ScannerOptions()
-        key = (dive.name, _digest([repr(options), rig_to_mapping(believed), no_dome]))
+        key = (dive.name, _digest([repr(options), rig_to_mapping(believed)]))
         if key not in self._measured:
-            camera = believed.bare_camera() if no_dome else None
-            own = options == ScannerOptions() and camera is None
-            scanner = Scanner(believed, options, camera)
-            self._measured[key] = _measured(dive, scanner, self.frame_s if own else [])
+            frame_s = self.frame_s if options == ScannerOptions() else []
+            self._measured[key] = _measured(dive, Scanner(believed, options), frame_s)
         return self._measured[key]
 
 

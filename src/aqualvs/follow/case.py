@@ -162,23 +162,21 @@ class Trials:
         case = self._case(NetWall())
         return case.loop(self._sensor(case), HoldMission(Setpoint(RANGE))).run(seconds)
 
-    def hold_and_step(
-        self, seconds: float = HOLD_END_S, step_s: float = STEP_S
-    ) -> tuple[LoopLog, HoldMeasures, StepMeasures]:
+    def hold_and_step(self) -> tuple[LoopLog, HoldMeasures, StepMeasures]:
         """Hold before a flat net, then step away from it."""
         case = self._case(NetWall())
         mission = HoldMission(Setpoint(RANGE))
 
         def step(now_s: float) -> None:
-            if now_s >= step_s:
+            if now_s >= STEP_S:
                 mission.setpoint = Setpoint(RANGE + STEP)
 
-        log = case.loop(self._sensor(case), mission).run(seconds, step)
+        log = case.loop(self._sensor(case), mission).run(HOLD_END_S, step)
         answer = step_measures(
-            log.column("time_s"), log.column("range"), step_s, RANGE, RANGE + STEP
+            log.column("time_s"), log.column("range"), STEP_S, RANGE, RANGE + STEP
         )
         # The setpoint in force lags the frame by its delay.
-        return log, hold_measures(log, FROM_REST_S, step_s), answer
+        return log, hold_measures(log, FROM_REST_S, STEP_S), answer
 
     def follow(
         self, seconds: float = FOLLOW_END_S, every_frame: Callable[[float], object] | None = None

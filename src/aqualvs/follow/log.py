@@ -232,10 +232,8 @@ def effort_measures(
     return _measured(log, log.column(name), start_s, end_s)
 
 
-def thruster_measures(
-    log: LoopLog, start_s: float = 0.0, end_s: float = math.inf
-) -> EffortMeasures:
-    """Return how often horizontal thrusters turned round between two times, the worse of two pairs.
+def thruster_measures(log: LoopLog, start_s: float = 0.0) -> EffortMeasures:
+    """Return how often horizontal thrusters turned round from a time on, the worse of two pairs.
 
     Efforts forward and to the right add up in one pair of vectored thrusters and cancel in the
     other. Along a target the pairs push against each other: the sign of the forward effort, which
@@ -243,7 +241,7 @@ def thruster_measures(
     """
     forward, right = log.column("forward"), log.column("right")
     pairs = [
-        _measured(log, efforts, start_s, end_s) for efforts in (forward + right, forward - right)
+        _measured(log, efforts, start_s, math.inf) for efforts in (forward + right, forward - right)
     ]
     return EffortMeasures(
         reversals=max(one.reversals for one in pairs), jumps=max(one.jumps for one in pairs)

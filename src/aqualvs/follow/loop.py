@@ -164,9 +164,10 @@ class SimulatedLoop:
     ----------
     steering : NetPilot
         Engaged at the start.
-    posture_filter : PostureFilter, optional
-        With default options if left out.
-    on_step : callable, optional
+
+    Attributes
+    ----------
+    on_step : callable or None
         Called after every step of the pilot with the time, the frame's time, what was measured,
         the decision and the vehicle's state.
     """
@@ -178,13 +179,11 @@ class SimulatedLoop:
         sensor: RangeSensor,
         steering: NetPilot,
         timing: Timing | None = None,
-        posture_filter: PostureFilter | None = None,
-        on_step: OnStep | None = None,
     ) -> None:
         self.link, self.net, self.eye, self.steering = link, net, sensor, steering
         self.timing = timing or Timing()
-        self._filter = posture_filter or PostureFilter()
-        self.on_step = on_step
+        self._filter = PostureFilter()
+        self.on_step: OnStep | None = None
         self._sight = _Sight(steering.gate.limits.posture_age)
         self._decision: Decision | None = None
         self._filtered: FilteredPosture | None = None

@@ -58,22 +58,19 @@ def simulate_step(
     model: VehicleModel,
     gains: ControlGains,
     options: StepOptions | None = None,
-    water: WaterMotion | None = None,
 ) -> StepAnswer:
-    """Hold a range before a wall, then another one; postures are exact.
+    """Hold a range before a wall in still water, then another one; postures are exact.
 
     Parameters
     ----------
     model : VehicleModel
         Need not be the one that the gains are for.
-    water : WaterMotion, optional
-        Still if left out.
     """
     options = options or StepOptions()
     ahead = _WALL - options.begin - model.dome_position[0]
     pose = level_pose(np.array([ahead, 0.0, _DEPTH]), 0.0)
     vehicle = SimulatedVehicle(
-        model, water or WaterMotion(), np.random.default_rng(0), pose, latency=options.delay
+        model, WaterMotion(), np.random.default_rng(0), pose, latency=options.delay
     )
     controller, shaping = RangeYawController(gains), shaping_of_model(model)
     n_rest, n_after = (round(span / options.frame) for span in (_REST_S, _AFTER_S))

@@ -13,7 +13,6 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TextIO
 
 from aqualvs.control.time_filter import PostureFilter
 from aqualvs.control.vehicle import SetpointHolder
@@ -89,20 +88,14 @@ _SCREEN_EVERY_S, _LOG_EVERY_S = 0.2, 10.0
 
 
 class Console:
-    """Output to the terminal of the user who started the run.
-
-    Parameters
-    ----------
-    stream : file, optional
-        Standard error if left out.
-    """
+    """Output to the terminal of the user who started the run, by standard error."""
 
     name = "console"
     inline = False
     keeps_all = False
 
-    def __init__(self, stream: TextIO | None = None) -> None:
-        self._stream = sys.stderr if stream is None else stream
+    def __init__(self) -> None:
+        self._stream = sys.stderr
         self._on_screen = self._stream.isatty()
         # A log begins with what goes wrong: of a run that ends at once, nothing else is told.
         self._next_s = -math.inf if self._on_screen else time.monotonic() + _LOG_EVERY_S

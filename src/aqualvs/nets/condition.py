@@ -25,7 +25,6 @@ from aqualvs.nets.lattice import (
 )
 from aqualvs.nets.lit_intervals import LineState, NetReader, NetSignal
 from aqualvs.nets.spectrum import Crossings, Mesh
-from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import Rig
 from aqualvs.scanning.scan import Scan
 
@@ -112,8 +111,6 @@ class NetCondition:
     ----------
     rig : Rig
         Rig of the scans.
-    camera : Camera, optional
-        Replaces `rig.camera()`.
 
     Attributes
     ----------
@@ -122,12 +119,10 @@ class NetCondition:
         stretches and the holes in them are filled in then.
     """
 
-    def __init__(
-        self, rig: Rig, options: NetConditionOptions | None = None, camera: Camera | None = None
-    ) -> None:
+    def __init__(self, rig: Rig, options: NetConditionOptions | None = None) -> None:
         self.options = options or NetConditionOptions()
         self.stretches: list[NetStretch] = []
-        self._reader = NetReader(rig, camera)
+        self._reader = NetReader(rig)
         self._signals: list[NetSignal] = []
         self._velocities: list[FloatArray | None] = []
         # Stretches before the first lattice, by their number.

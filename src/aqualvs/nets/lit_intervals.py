@@ -16,7 +16,6 @@ from aqualvs.geometry.compiled import kernel
 from aqualvs.geometry.planes import Plane
 from aqualvs.geometry.transforms import SE3
 from aqualvs.nets.occlusion import LaserLines, hidden_lines, light_beyond
-from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.sheet import Sheet, sheets_of
 from aqualvs.scanning.laser_bands import SearchAxis, plan_bands
@@ -94,13 +93,11 @@ class NetReader:
     ----------
     rig : Rig
         Camera and lasers of the scans.
-    camera : Camera, optional
-        Replaces `rig.camera()`.
     """
 
-    def __init__(self, rig: Rig, camera: Camera | None = None) -> None:
+    def __init__(self, rig: Rig) -> None:
         self.rig = rig
-        self._camera = camera or rig.camera()
+        self._camera = rig.camera()
         self._laser_bands = plan_bands(rig, self._camera, rig.shutter.field_of(0))
         self._sheets = sheets_of(rig)
         self._planes = [sheet.best_plane(self._camera, rig.working_range) for sheet in self._sheets]

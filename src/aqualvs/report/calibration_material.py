@@ -66,7 +66,6 @@ class ParameterRow:
     unit: str = ""
     digits: int = 2  # Decimals of the value.
     before: float | None = None  # What the rig said before the calibration.
-    remark: str = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -216,7 +215,6 @@ def parameter_rows(
     uncertainty: RigUncertainty,
     names: Sequence[str],
     before: Rig | None = None,
-    remarks: Mapping[str, str] | None = None,
 ) -> tuple[ParameterRow, ...]:
     """Return the named numbers of a rig's camera, with sigma and what they were before."""
     values, sigmas = camera_numbers(rig), uncertainty.sigmas
@@ -233,7 +231,6 @@ def parameter_rows(
                 unit=unit,
                 digits=digits,
                 before=factor * old[name] if name in old else None,
-                remark=(remarks or {}).get(name, ""),
             )
         )
     return tuple(rows)

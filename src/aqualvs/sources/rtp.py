@@ -59,13 +59,15 @@ class Ordered(NamedTuple):
     is_restart: bool  # The first of another sender, or of a restarted one.
 
 
+# Later packets kept while one is missing.
+_MOST_KEPT = 32
+
+
 class RtpOrder:
     """Reordering buffer for the packets of one sender, which also detects losses.
 
     Parameters
     ----------
-    depth : int
-        So many later packets are kept while one is missing.
     patience : float
         Seconds for which a missing packet is awaited.
 
@@ -76,8 +78,7 @@ class RtpOrder:
     silent, so that of two senders to one port the first is kept.
     """
 
-    def __init__(self, *, depth: int = 32, patience: float = 0.02) -> None:
-        self._depth = depth
+    def __init__(self, *, patience: float = 0.02) -> None:
         self._timeout = patience
         self._sender: int | None = None
         self._next = 0
@@ -128,7 +129,7 @@ class RtpOrder:
     def _due(self, arrival: float) -> list[Ordered]:
         ready = self._run(after_loss=False)
         late = arrival - self._missing_since >= self._timeout
-        while self._kept and (late or len(self._kept) > self._depth):
+        while self._kept and (late or len(self._kept) > _MOST_KEPT):
             self._next = min(self._kept, key=self._distance)
             ready += self._run(after_loss=True)
             self._missing_since = arrival

@@ -133,9 +133,10 @@ class Observability:
     # Independent combinations, best determined first.
     directions: tuple[Direction, ...]
 
-    def unobservable(self, limit: float = 0.1) -> list[Direction]:
+    def unobservable(self) -> list[Direction]:
         """Return the combinations with far less information from the data than from the priors."""
-        return [direction for direction in self.directions if direction.gain < limit]
+        least_gain = 0.1
+        return [direction for direction in self.directions if direction.gain < least_gain]
 
     def undetermined(self, names: Sequence[str], limit: float = 0.9) -> list[str]:
         """Return those of the names that the data hardly determine."""

@@ -215,8 +215,6 @@ class FoxgloveOutput:
         0 takes any that is free.
     picture_hz, points_hz : float
         Most pictures, and point clouds, per second; 0 for none.
-    scanner : ScannerOptions, optional
-        Shown with the rig.
 
     Attributes
     ----------
@@ -244,10 +242,8 @@ class FoxgloveOutput:
         *,
         picture_hz: float = 5.0,
         points_hz: float = 10.0,
-        scanner: ScannerOptions | None = None,
     ) -> None:
         foxglove = _sdk()
-        self._scanner = scanner or ScannerOptions()
         self._viewers = _Viewers()
         self._clock = RecordClock()
         # Channels do not keep it alive.
@@ -317,7 +313,7 @@ class FoxgloveOutput:
 
     def _log_seldom(self, sample: LiveSample, at_ns: int) -> None:
         """Send data that rarely change, also to new viewers."""
-        rig, health, options = sample.rig, sample.health, self._scanner
+        rig, health, options = sample.rig, sample.health, ScannerOptions()
         if self._transforms.has_sinks():
             self._transforms.log(transforms(rig, at_ns), log_time=at_ns)
         self._log(HEALTH, at_ns, lambda: messages.health_message(health, at_ns))
