@@ -412,10 +412,7 @@ def carry_comments(old: str, new: str) -> str:
     gone the comment moves to the enclosing key, or to the top. No comment is lost, unless `old` has
     more than 500,000 characters. The values are those of `new`.
 
-    Parameters
-    ----------
-    old, new : str
-        YAML texts; an `old` that is not YAML has no comments.
+    `old`, `new`: YAML texts; an `old` that is not YAML has no comments.
     """
     # Comments of texts beyond these are not placed: rigs have up to 50,000 characters.
     max_characters, max_comments = 500_000, 1000

@@ -239,10 +239,7 @@ def _scanner(dive: OpenDive, probe: DiveProbe) -> FrameScanner:
 def joined_summary(dive: OpenDive, pieces: Sequence[Path]) -> RunSummary:
     """Return the summary that a run of the whole dive would have gathered.
 
-    Parameters
-    ----------
-    pieces : sequence of Path
-        Folders of all pieces, in order.
+    `pieces`: folders of all pieces, in order.
     """
     summary = summary_for(dive)
     for piece in pieces:

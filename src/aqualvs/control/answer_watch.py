@@ -133,10 +133,7 @@ class AnswerWatch:
     - the efforts must have brought it nearer;
     - the autopilot reports that it has turned, or that it pitches or swings to and fro.
 
-    Parameters
-    ----------
-    vehicle : VehicleFacts
-        Its mass and thrust.
+    `vehicle`: its mass and thrust.
     """
 
     def __init__(self, vehicle: VehicleFacts, limits: AnswerLimits | None = None) -> None:
@@ -218,11 +215,8 @@ class AnswerWatch:
 
         Its speed is that of the last live postures and what the efforts since have added.
 
-        Parameters
-        ----------
-        still_s : float, optional
-            For how long the picture has stood still, if the picture tells it; else as the last
-            posture has told.
+        `still_s`: for how long the picture has stood still, if the picture tells it; else as the
+        last posture has told.
         """
         if still_s is not None:
             self._still_s, self._blind_s = still_s, _TRUSTED_S

@@ -69,10 +69,7 @@ class Pid:
     finite number, and a time that stands still or steps back, changes nothing: the last output is
     returned. A time that steps back by more than `longest_step` is that of another stream.
 
-    Parameters
-    ----------
-    options : PidOptions
-        Gains and limits.
+    `options`: gains and limits.
     """
 
     def __init__(self, options: PidOptions) -> None:
@@ -309,10 +306,7 @@ class QuietZone:
 
     From rest a rate must exceed `quiet`; a turn ends when the rate changes its sign.
 
-    Parameters
-    ----------
-    quiet : float
-        In rad/s.
+    `quiet`: in rad/s.
     """
 
     def __init__(self, quiet: float) -> None:

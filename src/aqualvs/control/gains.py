@@ -341,10 +341,7 @@ class ControlGains:
 def gain_schedule(gains: RangeGains, damping: float) -> tuple[float, float]:
     """Return the factors on speed's gain and integral of the range where drag damps the vehicle.
 
-    Parameters
-    ----------
-    damping : float
-        Slope of the drag over mass, in 1/s.
+    `damping`: slope of the drag over mass, in 1/s.
     """
     relative = damping / gains.speed
     return (

@@ -246,10 +246,7 @@ def bearing_of(posture: Posture, state: VehicleState) -> float | None:
 class Leg:
     """One way along the net, with the time and distance covered.
 
-    Parameters
-    ----------
-    options : LegOptions
-        Where it ends.
+    `options`: where it ends.
     """
 
     def __init__(self, options: LegOptions) -> None:

@@ -186,10 +186,8 @@ PARAMETERS: tuple[str, ...] = (
 def shaping_of(parameters: Mapping[str, float]) -> StickShaping:
     """Return the shaping of a vehicle by its reported parameters.
 
-    Parameters
-    ----------
-    parameters : mapping of str to float
-        By name, any of `PARAMETERS`. What is missing, or cannot be, has ArduSub's default.
+    `parameters`: by name, any of `PARAMETERS`. What is missing, or cannot be, has ArduSub's
+    default.
     """
     own = StickShaping()
     found = {}

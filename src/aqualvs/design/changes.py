@@ -38,10 +38,7 @@ def best_angles(design: Design, *, quick: bool = False) -> Design:
     The fans of these mounts are swung so that their middles are abreast of the forward axis halfway
     through the working range.
 
-    Parameters
-    ----------
-    quick : bool
-        Start from the mounts' own angles only: sufficient after small changes of a design.
+    `quick`: start from the mounts' own angles only: sufficient after small changes of a design.
     """
     if not any(mount.free_tilt or mount.free_stripe for mount in design.mounts):
         return design
@@ -143,10 +140,7 @@ class Change:
 def changes(design: Design) -> list[Change]:
     """Try every change and return them, the most helpful first.
 
-    Parameters
-    ----------
-    design : Design
-        With the final tilts of its lasers. Those that are free to turn are turned again.
+    `design`: with the final tilts of its lasers. Those that are free to turn are turned again.
     """
     now = _measures(design)
     tried = ((words, change(design)) for words, change in _CHANGES.items())

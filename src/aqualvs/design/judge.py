@@ -60,10 +60,7 @@ class PredictedErrors:
 def predict(design: Design, ranges: Sequence[float] | FloatArray | None = None) -> PredictedErrors:
     """Predict a design's errors.
 
-    Parameters
-    ----------
-    ranges : sequence of float, optional
-        Walls square to the forward axis, metres; the design's own if left out.
+    `ranges`: walls square to the forward axis, metres; the design's own if left out.
     """
     walls = design.ranges if ranges is None else np.asarray(ranges, np.float64)
     camera = design.rig.camera()

@@ -263,10 +263,7 @@ def _bars(system: str, level: str, names: list[str], frames: dict[str, FrameAnsw
 def lines(scores: Scores, *, dives: bool) -> list[str]:
     """Return the table to read: level after level, the systems below each other.
 
-    Parameters
-    ----------
-    dives : bool
-        Whether to show every dive before its level.
+    `dives`: whether to show every dive before its level.
     """
     rows = _rows(scores, dives=dives)
     widths = [max(len(row[k]) for row in (_HEADER, *rows)) for k in range(len(_HEADER))]

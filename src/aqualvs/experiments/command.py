@@ -151,10 +151,7 @@ class ExperimentBar:
 def experiment_bar(names: Sequence[str]) -> Iterator[ExperimentBar]:
     """Show how far the experiments are; nothing where standard error is not a terminal.
 
-    Parameters
-    ----------
-    names : sequence of str
-        Experiments to come, in their order.
+    `names`: experiments to come, in their order.
     """
     console = Console(stderr=True)
     columns = (

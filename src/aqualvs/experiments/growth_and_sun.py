@@ -44,10 +44,7 @@ def visible_points(laboratory: Laboratory, dive: RenderedDive) -> FloatArray:
 
     See `aqualvs.simulation.benchmark` for what stands out. The numbers are kept beside the dive.
 
-    Parameters
-    ----------
-    laboratory : Laboratory
-        Counts the frames, which are rendered once more for this.
+    `laboratory`: counts the frames, which are rendered once more for this.
     """
     path = dive.folder / _FILE
     if not path.exists():

@@ -207,10 +207,7 @@ class Laboratory:
     ) -> MeasuredDive:
         """Measure every frame of a dive.
 
-        Parameters
-        ----------
-        rig : Rig, optional
-            What the scanner believes; the true rig by default.
+        `rig`: what the scanner believes; the true rig by default.
         """
         believed = rig or dive.rig
         options = options or ScannerOptions()

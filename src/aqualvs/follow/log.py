@@ -224,10 +224,7 @@ def effort_measures(
 ) -> EffortMeasures:
     """Return how often an effort turned round between two times.
 
-    Parameters
-    ----------
-    name : {"forward", "right", "down", "turn"}
-        Of the effort.
+    `name`, one of {"forward", "right", "down", "turn"}: of the effort.
     """
     return _measured(log, log.column(name), start_s, end_s)
 

@@ -61,10 +61,7 @@ def simulate_step(
 ) -> StepAnswer:
     """Hold a range before a wall in still water, then another one; postures are exact.
 
-    Parameters
-    ----------
-    model : VehicleModel
-        Need not be the one that the gains are for.
+    `model`: need not be the one that the gains are for.
     """
     options = options or StepOptions()
     ahead = _WALL - options.begin - model.dome_position[0]

@@ -40,10 +40,7 @@ _TIMEOUT_S = 3.0
 class WaterFollower:
     """Provider of the scanner for the present water; a thread reads the target.
 
-    Parameters
-    ----------
-    following : WaterFollowingScanner
-        Looks at the target; used by the thread alone from here on.
+    `following`: looks at the target; used by the thread alone from here on.
     """
 
     def __init__(self, following: WaterFollowingScanner) -> None:

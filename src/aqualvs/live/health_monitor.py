@@ -395,10 +395,7 @@ class _Passed:
 class HealthMonitor:
     """Health statistics, gathered frame by frame; `health` is cheap.
 
-    Parameters
-    ----------
-    rig : Rig
-        Whose lasers are watched.
+    `rig`: whose lasers are watched.
     """
 
     def __init__(self, rig: Rig) -> None:

@@ -84,10 +84,7 @@ _log = logging.getLogger(__name__)
 class OutputWorker:
     """Worker of one output: a thread of its own, unless the output never waits.
 
-    Parameters
-    ----------
-    output : Output
-        Owned from here on.
+    `output`: owned from here on.
     """
 
     def __init__(self, output: Output) -> None:

@@ -99,10 +99,7 @@ def find_sites(
 ) -> list[Site]:
     """Bring holes of dives, already shifted, together.
 
-    Parameters
-    ----------
-    shifts : sequence
-        What each shift leaves open is in its sigma.
+    `shifts`: what each shift leaves open is in its sigma.
     """
     dates = sorted({one.survey.date for one in placed})
     parts = [(i, k) for i, one in enumerate(placed) for k in _known(one)]

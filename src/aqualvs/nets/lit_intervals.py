@@ -89,10 +89,7 @@ def net_from_dome(normal_in_dome: FloatArray, distance: float) -> SE3:
 class NetReader:
     """Reader of scans as signals along the lasers' lines.
 
-    Parameters
-    ----------
-    rig : Rig
-        Camera and lasers of the scans.
+    `rig`: camera and lasers of the scans.
     """
 
     def __init__(self, rig: Rig) -> None:

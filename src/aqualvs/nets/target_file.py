@@ -343,10 +343,7 @@ def bar_of(scan: Scan, planes: Sequence[Plane], said: NetFacts) -> float | None:
 def strand_distance(along: FloatArray) -> float | None:
     """Return the mean distance between the strands on one stripe, in metres.
 
-    Parameters
-    ----------
-    along : array, shape (N,)
-        Places of points on the net along the stripe, in metres, in any order.
+    `along`, shape (N,): places of points on the net along the stripe, in metres, in any order.
     """
     if len(along) < _CHECK.min_strands * _CHECK.min_points:
         return None

@@ -243,10 +243,7 @@ class WallView:
 
         All points are read as if they had been taken at the picture's middle.
 
-        Parameters
-        ----------
-        row_times : callable
-            From rows to the times of their exposure, in seconds from the picture's middle.
+        `row_times`: from rows to the times of their exposure, in seconds from the picture's middle.
         """
         if not self.determined:
             return np.full((3, 3), np.nan)

@@ -382,10 +382,7 @@ class Sheet:
         For uses that need only an approximate plane: frames of drawings, the mesh filter, initial
         guesses. Without a window it is `plane`.
 
-        Parameters
-        ----------
-        working_range : (float, float)
-            Points at these distances from the dome's centre count, in metres.
+        `working_range`: points at these distances from the dome's centre count, in metres.
         """
         if self.window is None:
             return self.plane
@@ -497,10 +494,7 @@ class Sheet:
     def packed(self, start: Plane | None = None) -> FloatArray:
         """Return the sheet as kernels take it, shape (COLUMNS,).
 
-        Parameters
-        ----------
-        start : Plane, optional
-            Where searches along rays begin, such as `best_plane`; a tangent plane if left out.
+        `start`: where searches along rays begin, such as `best_plane`; a tangent plane if left out.
         """
         row = self._row.copy()
         if start is not None and self.window is not None:

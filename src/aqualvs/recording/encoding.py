@@ -55,10 +55,7 @@ class PictureFormat(StrEnum):
 def jpeg_of(frame: Frame, quality: int) -> bytes:
     """Return a frame as JPEG, in colour where it has any.
 
-    Parameters
-    ----------
-    quality : int
-        1 to 100.
+    `quality`: 1 to 100.
     """
     image = bgr_of(frame)
     if frame.chroma is None:

@@ -396,10 +396,7 @@ class RecordClock:
 class RateLimit:
     """Rate limit of a message.
 
-    Parameters
-    ----------
-    hz : float
-        0 for none at all.
+    `hz`: 0 for none at all.
     """
 
     def __init__(self, hz: float) -> None:

@@ -66,11 +66,8 @@ class SampleFrame:
 def choose_pictures(track: Track, source: Path | None = None) -> list[int]:
     """Return rows of the frames worth a picture: refusals, the worst posture, an even spread.
 
-    Parameters
-    ----------
-    source : Path or None
-        Of a video, those of the spread are at key frames where one is near: others can only be
-        decoded with all frames from there on.
+    `source`: of a video, those of the spread are at key frames where one is near: others can only
+    be decoded with all frames from there on.
     """
     chosen = _refused_rows(track)
     valid = np.flatnonzero(track.valid)

@@ -116,10 +116,7 @@ def hole_pictures(net: NetTables) -> list[HolePicture]:
 def net_view(net: NetTables | None, crops: Mapping[str, SampleFrame] = MappingProxyType({})) -> str:
     """Return the section on the net; nothing without one.
 
-    Parameters
-    ----------
-    crops : mapping
-        Number of a hole to its picture.
+    `crops`: number of a hole to its picture.
     """
     if net is None:
         return ""

@@ -42,10 +42,7 @@ _SIGMA_DEPTH, _SIGMA_ANGLE = 0.005, float(np.deg2rad(0.2))
 def vehicle_attitude(dome_from_scene: SE3) -> tuple[float, float, float]:
     """Return heading, roll and pitch in radians, as in MAVLink's ATTITUDE.
 
-    Parameters
-    ----------
-    dome_from_scene : SE3
-        Pose of the scene, whose net hangs plumb and faces `NET_BEARING`.
+    `dome_from_scene`: pose of the scene, whose net hangs plumb and faces `NET_BEARING`.
     """
     s, c = np.sin(NET_BEARING), np.cos(NET_BEARING)
     # The scene's x, y and z are along the net, away from the vehicle and up.

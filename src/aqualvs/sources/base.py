@@ -174,10 +174,7 @@ def _as_420(picture: VideoFrame) -> VideoFrame:
 def frame_of(index: int, time_s: float, picture: VideoFrame) -> Frame:
     """Return the frame that a decoded picture makes.
 
-    Parameters
-    ----------
-    picture : VideoFrame
-        As `planes_of` takes it.
+    `picture`: as `planes_of` takes it.
     """
     luma, chroma = planes_of(picture)
     return Frame(index, time_s, luma, chroma, is_interlaced=bool(picture.interlaced_frame))
@@ -190,10 +187,7 @@ def packet_with(data: bytes) -> "Packet[VideoStream]":
     (AV_INPUT_BUFFER_PADDING_SIZE of FFmpeg). Memory that FFmpeg allocates has them; Python's bytes
     end where they end, so that an intact picture may count as damaged.
 
-    Parameters
-    ----------
-    data : bytes
-        One coded picture.
+    `data`: one coded picture.
     """
     packet = cast("Packet[VideoStream]", Packet(len(data)))
     packet.update(data)

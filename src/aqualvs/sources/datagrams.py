@@ -88,10 +88,7 @@ class Datagrams:
     def get(self, timeout: float) -> Datagram | None:
         """Return the oldest datagram, or None if there is none in time, or after `close`.
 
-        Parameters
-        ----------
-        timeout : float
-            Seconds.
+        `timeout`: seconds.
         """
         try:
             return self._waiting.get(timeout=timeout)
@@ -253,10 +250,7 @@ class DatagramQueue:
     def get(self, timeout: float = WAIT_S) -> Datagram | None:
         """Return the next datagram, or None if none comes in time.
 
-        Parameters
-        ----------
-        timeout : float
-            Seconds.
+        `timeout`: seconds.
         """
         peeked, self._peeked = self._peeked, None
         return peeked or self._datagrams.get(timeout)
@@ -264,10 +258,7 @@ class DatagramQueue:
     def is_late(self, datagram: Datagram) -> bool:
         """Return whether decoding lags too far behind; if so, drop the waiting datagrams.
 
-        Parameters
-        ----------
-        datagram : Datagram
-            The oldest.
+        `datagram`: the oldest.
         """
         if time.monotonic() - datagram.arrival < _MAX_LAG_S:
             return False
@@ -277,10 +268,7 @@ class DatagramQueue:
     def is_foreign(self, datagram: Datagram, *, fits: bool) -> bool:
         """Return whether the sender has changed to another kind.
 
-        Parameters
-        ----------
-        fits : bool
-            Whether it is of the kind that is being read.
+        `fits`: whether it is of the kind that is being read.
         """
         self._n_foreign = 0 if fits else self._n_foreign + 1
         if self._n_foreign < MAX_FOREIGN:

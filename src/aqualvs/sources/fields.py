@@ -28,11 +28,8 @@ from aqualvs.sources.spans import Span
 def frames_of(pictures: Iterable[Frame], shutter: Shutter) -> Iterator[Frame]:
     """Yield two frames for each picture of an interlaced camera, and those of others as they are.
 
-    Parameters
-    ----------
-    shutter : Shutter
-        Of the camera. The first field has the time of its picture, the second follows after
-        `readout`.
+    `shutter`: of the camera. The first field has the time of its picture, the second follows after
+    `readout`.
     """
     if not shutter.is_interlaced:
         yield from pictures
@@ -156,10 +153,7 @@ class FrameFeed:
 
     Its health warns where the pictures contradict the rig's shutter.
 
-    Parameters
-    ----------
-    shutter : Shutter
-        Of the rig.
+    `shutter`: of the rig.
     """
 
     def __init__(self, pictures: Feed, shutter: Shutter) -> None:
@@ -286,10 +280,7 @@ class FieldEvidence:
     def contradiction(self, shutter: Shutter, fps: float | None) -> str:
         """Return what is wrong with the rig's shutter for these pictures; empty if nothing is.
 
-        Parameters
-        ----------
-        fps : float or None
-            Pictures a second.
+        `fps`: pictures a second.
         """
         if not shutter.is_interlaced:
             if not self.are_fields:
@@ -332,10 +323,7 @@ class FieldEvidence:
 def first_pairs(source: FrameSource) -> Iterator[list[Frame]]:
     """Yield some pairs of consecutive pictures from the beginning of a source, as far as it goes.
 
-    Parameters
-    ----------
-    source : FrameSource
-        That begins again when it is iterated again: images, or messages of a recording.
+    `source`: that begins again when it is iterated again: images, or messages of a recording.
     """
     # Two seconds of video, in which a vehicle moves; reading them takes less than a second.
     n_pictures, every = 50, 5

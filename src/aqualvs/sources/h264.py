@@ -190,11 +190,8 @@ class FieldPairs:
     An encoder of interlaced video may code each field by itself (PAFF), in a packet of its own. The
     decoder makes one picture of two such packets.
 
-    Parameters
-    ----------
-    extradata : bytes
-        Of the stream: parameter sets, each after its length (ISO/IEC 14496-15) or a start code; or
-        nothing.
+    `extradata`: of the stream: parameter sets, each after its length (ISO/IEC 14496-15) or a start
+    code; or nothing.
     """
 
     def __init__(self, extradata: bytes) -> None:
@@ -212,10 +209,7 @@ class FieldPairs:
     def is_second(self, packet: bytes | memoryview) -> bool:
         """Return whether a packet completes the picture of the packet before it.
 
-        Parameters
-        ----------
-        packet : bytes or memoryview
-            The next one of the stream, in the order of decoding.
+        `packet`: the next one of the stream, in the order of decoding.
         """
         for unit in self._units(packet):
             kind = unit[0] & 31
@@ -250,10 +244,7 @@ class FieldPairs:
 def field_pairs(codec: str, extradata: bytes | None) -> FieldPairs | None:
     """Return the detector of second fields for a stream; None if it is not H.264.
 
-    Parameters
-    ----------
-    codec : str
-        Name that FFmpeg gives the codec.
+    `codec`: name that FFmpeg gives the codec.
     """
     return FieldPairs(extradata or b"") if codec == "h264" else None
 

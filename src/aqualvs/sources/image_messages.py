@@ -187,10 +187,7 @@ def kind_of_schema(name: str) -> str | None:
 def image_of_ros(message: Any) -> ImageMessage:
     """Return the image in a decoded ROS message of any kind known here.
 
-    Parameters
-    ----------
-    message : object
-        With the fields of `sensor_msgs` or `foxglove_msgs` as attributes.
+    `message`: with the fields of `sensor_msgs` or `foxglove_msgs` as attributes.
     """
     stamp = message.header.stamp if hasattr(message, "header") else message.timestamp
     stamp_ns = int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
@@ -236,10 +233,7 @@ def image_of_json(content: bytes) -> ImageMessage:
 def image_of_protobuf(schema: str) -> Callable[[bytes], ImageMessage]:
     """Return the function that decodes a Foxglove message written as Protobuf.
 
-    Parameters
-    ----------
-    schema : str
-        `foxglove.RawImage`, `foxglove.CompressedImage` or `foxglove.CompressedVideo`.
+    `schema`: `foxglove.RawImage`, `foxglove.CompressedImage` or `foxglove.CompressedVideo`.
     """
 
     def read(content: bytes) -> ImageMessage:

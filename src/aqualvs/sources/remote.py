@@ -224,10 +224,7 @@ class CameraOptions:
 class CameraFeed(RemoteFeed):
     """Feed of a camera; reopened when it is unplugged and returns.
 
-    Parameters
-    ----------
-    where : str
-        `/dev/video0`, `camera:0`, or `camera:` and a path.
+    `where`: `/dev/video0`, `camera:0`, or `camera:` and a path.
     """
 
     def __init__(self, where: str, options: CameraOptions) -> None:

@@ -90,10 +90,7 @@ class RtpOrder:
     def push(self, packet: RtpPacket, arrival: float) -> list[Ordered]:
         """Return the packets whose turn has come.
 
-        Parameters
-        ----------
-        arrival : float
-            Seconds on the monotonic clock.
+        `arrival`: seconds on the monotonic clock.
         """
         if self._sender is None:
             return self._begin([packet], arrival)
@@ -119,10 +116,7 @@ class RtpOrder:
     def overdue(self, arrival: float) -> list[Ordered]:
         """Return the packets that have waited too long for a missing one.
 
-        Parameters
-        ----------
-        arrival : float
-            Now, in seconds on the monotonic clock.
+        `arrival`: now, in seconds on the monotonic clock.
         """
         return self._due(arrival)
 

@@ -313,10 +313,7 @@ class UnlikeProbeError(Exception):
 class VideoParts(Closing):
     """Reader of spans of a video, opened once for all of them; a context manager.
 
-    Parameters
-    ----------
-    size_px : (int, int)
-        Width and height of every picture.
+    `size_px`: width and height of every picture.
     """
 
     def __init__(self, path: Path, size_px: tuple[int, int]) -> None:

@@ -99,10 +99,7 @@ class FrameCounter:
     def skip(self, n: int) -> None:
         """Count pictures as lost whose packets never came.
 
-        Parameters
-        ----------
-        n : int
-            Not negative.
+        `n`: not negative.
         """
         self._next += n
 

@@ -118,10 +118,7 @@ def looks_like_frames(head: bytes) -> bool:
 def read_frames(data: bytes) -> SelectedMessages:
     """Read the wanted messages of a telemetry log.
 
-    Parameters
-    ----------
-    data : bytes
-        The whole file.
+    `data`: the whole file.
     """
     places, n_frames, skipped = _scan(data)
     octets = np.frombuffer(data, np.uint8)

@@ -227,10 +227,7 @@ class VehicleLog:
     def at(self, time_s: ArrayLike) -> LoggedStates:
         """Return the vehicle's state at other times; values in gaps are not valid.
 
-        Parameters
-        ----------
-        time_s : array, shape (n,)
-            Log time, in any order.
+        `time_s`, shape (n,): log time, in any order.
         """
         times = np.atleast_1d(np.asarray(time_s, float))
         depth, depth_valid = _at(self.depth, times)

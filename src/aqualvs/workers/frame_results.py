@@ -43,10 +43,7 @@ class BareLensComparison:
     Detection, classification and the choice of the target are taken over from the scan, so that
     the difference is that of the ray model alone (paper, section 5.4).
 
-    Parameters
-    ----------
-    rig : Rig
-        A rig with a housing.
+    `rig`: a rig with a housing.
     """
 
     def __init__(self, rig: Rig) -> None:
@@ -136,10 +133,7 @@ def in_blocks(
 ) -> Iterator[list[T]]:
     """Yield lists of up to `length` items; none is lost where their source breaks off.
 
-    Parameters
-    ----------
-    breaks : type of exception
-        How it breaks off; raised after the items before it.
+    `breaks`: how it breaks off; raised after the items before it.
     """
     block: list[T] = []
     try:
@@ -276,10 +270,7 @@ def corrected_rows(
     Results of shutters that need no neighbours are yielded unchanged. Others come a few frames
     late, when the frames after them are known; none is lost where their source breaks off.
 
-    Parameters
-    ----------
-    blocks : generator of list
-        Results as measured, in the order of the dive; closed at the end.
+    `blocks`: results as measured, in the order of the dive; closed at the end.
     """
     with closing(blocks):
         if not rig.shutter.needs_neighbours:

@@ -369,10 +369,7 @@ def pool_job(
 
     Reads a video once without decoding it: 25 ms for 1000 frames of standard definition.
 
-    Parameters
-    ----------
-    source : FrameSource
-        Of the dive; a video file or a folder of images can be shared.
+    `source`: of the dive; a video file or a folder of images can be shared.
     """
     pictures = source_of_pictures(source)
     spans = [(span, *frames_in(span, rig.shutter)) for span in _spans(pictures)]

@@ -77,10 +77,7 @@ class BoardBend:
     def height(self, views: Sequence[View]) -> float:
         """Return the height difference of the corners over their best plane, in metres.
 
-        Parameters
-        ----------
-        views : sequence of View
-            Of the flat board.
+        `views`: of the flat board.
         """
         points = np.unique(np.concatenate([view.points for view in views]), axis=0)
         z = self.terms_at(points) @ self.coefficients

@@ -152,11 +152,8 @@ def box_surfaces(planes: Mapping[str, Plane], points: FloatArray) -> TargetSurfa
 def board_surface(*, thickness: float = 0.0) -> TargetSurfaces:
     """Return the surface of a board, for stripes on the board or beside it.
 
-    Parameters
-    ----------
-    thickness : float
-        Distance of the board's printed face in front of the surface of the stripes, in metres; 0
-        if the print is on the surface itself.
+    `thickness`: distance of the board's printed face in front of the surface of the stripes, in
+    metres; 0 if the print is on the surface itself.
     """
     far = np.full(3, np.inf)
     # A board's z axis points into it (OpenCV).
@@ -434,11 +431,8 @@ def with_gain(
 def with_shared_error(group: StripeGroup, error_px: float) -> StripeGroup:
     """Return the group with the noise of its bins raised by an error that they share.
 
-    Parameters
-    ----------
-    error_px : float
-        Standard deviation of a shift and turn of the whole stripe in its picture. All bins
-        together then determine place and direction no better than that.
+    `error_px`: standard deviation of a shift and turn of the whole stripe in its picture. All bins
+    together then determine place and direction no better than that.
     """
     shared = error_px * np.sqrt(0.5 * len(group))
     return replace(group, sigma_px=np.hypot(group.sigma_px, shared))

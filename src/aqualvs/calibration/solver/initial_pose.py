@@ -362,10 +362,7 @@ def square_rotation(rotations: Sequence[FloatArray]) -> FloatArray:
     Boards stand upright, on a side or upside down: x and y along the dome's x and -z axes, or a
     quarter turn about y further.
 
-    Parameters
-    ----------
-    rotations : sequence of array, shape (3, 3)
-        Of the boards; the majority decides.
+    `rotations`, each of shape (3, 3): of the boards; the majority decides.
     """
     choices = [
         rotation_from_rotvec([0.0, k * _QUARTER, 0.0]) @ DOME_FROM_CAM_NOMINAL for k in range(4)

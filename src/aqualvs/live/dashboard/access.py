@@ -183,10 +183,7 @@ class Access:
 def are_addresses(hosts: Sequence[str], origins: Sequence[str]) -> bool:
     """Return whether the headers `Host` and `Origin` of a request are written as addresses are.
 
-    Parameters
-    ----------
-    hosts, origins : sequence of str
-        All values of these headers; a program may send none, and no client two.
+    `hosts`, `origins`: all values of these headers; a program may send none, and no client two.
     """
     if len(hosts) > 1 or len(origins) > 1:
         return False

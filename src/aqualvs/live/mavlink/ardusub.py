@@ -145,10 +145,7 @@ _STUCK_SHARE, _DIVED_M = 0.1, 0.5
 class DepthChoice:
     """Reader of the depth; remembers which estimates stood still.
 
-    Parameters
-    ----------
-    fresh_s : float
-        Older messages do not count.
+    `fresh_s`: older messages do not count.
     """
 
     def __init__(self, link: MavlinkLink, fresh_s: float) -> None:
@@ -214,10 +211,7 @@ def attitude_of(link: MavlinkLink) -> tuple[float | None, float | None, float | 
 def turning_of(link: MavlinkLink, at_ns: int) -> GyroRates | None:
     """Return the turning of an autopilot's vehicle; None if it has told none of use.
 
-    Parameters
-    ----------
-    at_ns : int
-        Time of a picture, by `time.monotonic_ns`.
+    `at_ns`: time of a picture, by `time.monotonic_ns`.
     """
     found = link.latest("ATTITUDE", system=link.system, component=_AUTOPILOT)
     if found is None or found.age_s > FRESH_S:

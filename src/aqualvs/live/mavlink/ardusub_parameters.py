@@ -56,10 +56,7 @@ class Advice:
 class StationRange:
     """The system ids that the vehicle takes for its ground station.
 
-    Parameters
-    ----------
-    parameters : mapping
-        As the vehicle reported them.
+    `parameters`: as the vehicle reported them.
     """
 
     def __init__(self, parameters: Mapping[str, float]) -> None:
@@ -89,10 +86,7 @@ class StationRange:
 class ParameterWatch:
     """Requests for the vehicle's parameters, repeated until it has answered; never waits.
 
-    Parameters
-    ----------
-    names : tuple of str
-        At most ten.
+    `names`: at most ten.
     """
 
     def __init__(self, link: MavlinkLink, names: tuple[str, ...]) -> None:
@@ -207,10 +201,7 @@ def advise_on_distance(
 ) -> list[Advice]:
     """Advise on the vehicle's use of `DISTANCE_SENSOR`.
 
-    Parameters
-    ----------
-    working_range : (float, float), optional
-        Of the rig, in metres.
+    `working_range`: of the rig, in metres.
     """
     kind = parameters.get(RANGE_TYPE)
     if kind is None:

@@ -194,10 +194,7 @@ class MavlinkLink:
     ) -> Received | None:
         """Return the last message of a kind (such as `ATTITUDE`), None if none has come.
 
-        Parameters
-        ----------
-        system, component : int or None
-            Only from these; from any if None.
+        `system`, `component`: only from these; from any if None.
         """
         found = [
             entry

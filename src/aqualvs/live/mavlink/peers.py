@@ -239,11 +239,8 @@ class PeerTable:
     def decode(self, peer: Peer, data: bytes, *, whole: bool) -> list[Any]:
         """Return the valid messages that have come from an address.
 
-        Parameters
-        ----------
-        whole : bool
-            Whether it is a datagram: one that begins like a message begins one, and what was left
-            of the one before belongs to none.
+        `whole`: whether it is a datagram: one that begins like a message begins one, and what was
+        left of the one before belongs to none.
         """
         sender = self._senders.get(peer)
         parser = self._make_parser() if sender is None else sender.parser

@@ -110,10 +110,7 @@ ROS1_TYPES = {
 def to_ros1(message: Message, seq: int) -> bytes:
     """Return a message as bytes.
 
-    Parameters
-    ----------
-    seq : int
-        Number of the message on its topic.
+    `seq`: number of the message on its topic.
     """
     match message:
         case PoseMessage():
