@@ -70,18 +70,9 @@ def batch(request: BatchRequest, echo: Callable[[str], object]) -> int:
     """Measure dives, report progress line by line, and write results, summary and data set.
 
     What an earlier batch in the same folder has finished, of the same dives with the same rig,
-    options and versions, is checked and taken as it is.
-
-    Returns
-    -------
-    exit_code : int
-        0 if all dives are finished, 1 if one is not, 128 + signal if it was stopped.
-
-    Raises
-    ------
-    AqualvsError
-        If nothing can be begun: no such dive, a dive without a rig, a folder that cannot be
-        written, no workers.
+    options and versions, is checked and taken as it is. The exit code is 0 if all dives are
+    finished, 1 if one is not, 128 + signal if it was stopped. Raises `AqualvsError` if nothing can
+    be begun: no such dive, a dive without a rig, a folder that cannot be written, no workers.
     """
     _check(request)
     dives = find_dives(request.dives, rig=request.rig, water=request.water, out=request.out)

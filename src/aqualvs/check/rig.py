@@ -257,15 +257,8 @@ EXIT_SANE, EXIT_BAD = 0, 2
 def run_check(path: Path, console: Console | None = None) -> int:
     """Check a rig file, print what was found, and return the exit code.
 
-    Returns
-    -------
-    int
-        0 where the rig is sane, warnings allowed; 2 where something is bad.
-
-    Raises
-    ------
-    RigError
-        If the file is not a rig file.
+    It is 0 where the rig is sane, warnings allowed, and 2 where something is bad. Raises `RigError`
+    if the file is not a rig file.
     """
     rig = load_rig(path, need_lasers=False)
     console = console or Console()

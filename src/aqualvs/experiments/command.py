@@ -207,21 +207,11 @@ def print_experiments(echo: Echo) -> None:
 
 
 def reproduce(request: ReproduceRequest, echo: Echo, load: Load = catalogue.experiment) -> int:
-    """Run experiments, write the page after each of them, and return the exit code.
+    """Run experiments, write the page after each of them, and return 0, or 1 if one failed.
 
-    Results of other experiments that the same version left in the folder stay on the page.
-
-    Returns
-    -------
-    exit_code : int
-        0, or 1 if an experiment failed.
-
-    Raises
-    ------
-    OptionError
-        If there is no experiment of some name.
-    OutputError
-        If the folder cannot be written.
+    Results of other experiments that the same version left in the folder stay on the page. Raises
+    `OptionError` if there is no experiment of some name, `OutputError` if the folder cannot be
+    written.
     """
     names = catalogue.ordered(request.names)
     # Results of other experiments in the folder stay; those of the same are brought up to date.

@@ -46,10 +46,7 @@ _ROUNDS = 2
 def warm_up(scanner: Scanner) -> Scan:
     """Let a scanner measure made-up pictures, which loads its compiled kernels.
 
-    Returns
-    -------
-    scan : Scan
-        Of a wall in the middle of the working range, square to the vehicle.
+    Returns the scan of a wall in the middle of the working range, square to the vehicle.
     """
     picture = wall_frame(scanner.rig)
     for _ in range(_ROUNDS):

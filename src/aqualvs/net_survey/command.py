@@ -59,15 +59,8 @@ class NetSource:
 def net(place: NetSource, request: NetRequest, echo: Callable[[str], object]) -> int:
     """Evaluate the condition of a net, write it and print it.
 
-    Returns
-    -------
-    exit_code : int
-        0, or 128 + signal if it was stopped: then the files tell of what came before.
-
-    Raises
-    ------
-    AqualvsError
-        If an input cannot be used, or a file not be written.
+    Returns 0, or 128 + signal if it was stopped: then the files tell of what came before. Raises
+    `AqualvsError` if an input cannot be used, or a file not be written.
     """
     # A run without its postures is refused by its name; as a dive it would lack a rig.
     if any((Path(place.source) / name).is_file() for name in (POSTURE_CSV, RUN_YAML)):
@@ -87,15 +80,7 @@ def net(place: NetSource, request: NetRequest, echo: Callable[[str], object]) ->
 def net_of_run(place: NetSource, request: NetRequest, echo: Callable[[str], object]) -> int:
     """Find the state of a net from a run that is on disk; one that was killed is completed first.
 
-    Returns
-    -------
-    exit_code : int
-        0, or 128 + signal if it was stopped: then the files tell of what came before.
-
-    Raises
-    ------
-    AqualvsError
-        If the run cannot be read, or a file not be written.
+    Returns and raises as `net`.
     """
     run_folder = Path(place.source)
     folder = place.out or run_folder

@@ -61,15 +61,7 @@ class PlacedSurvey:
 
 
 def common_frame(surveys: Sequence[Survey]) -> tuple[WallFrame | None, str]:
-    """Return what the dives' places have in common.
-
-    Returns
-    -------
-    frame : WallFrame or None
-        None where places cannot be compared.
-    why : str
-        Then in words; "" otherwise.
-    """
+    """Return what the dives' places have in common, or None and the reason in words."""
     known = [one for one in surveys if has_places(one)]
     if len({one.date for one in known}) < 2:
         return None, (

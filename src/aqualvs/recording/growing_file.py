@@ -234,10 +234,7 @@ class GrowingFile:
     def _insert(self, at: int, content: bytes, limit: int) -> int:
         """Replace the beginning of the padding at `at`, which ends at `limit`, by whole records.
 
-        Returns
-        -------
-        at : int
-            Where the padding begins now.
+        Returns where the padding begins now.
         """
         content += self._fill(at + len(content))
         end = at + len(content)

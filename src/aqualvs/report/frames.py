@@ -97,13 +97,7 @@ def choose_samples(track: Track, pictures: list[int]) -> list[int]:
 
 
 def decode_frames(source: Path, track: Track, rows: list[int]) -> dict[int, ImagePlane]:
-    """Decode the frames of some rows again.
-
-    Returns
-    -------
-    pictures : dict
-        Row to BGR picture, shape (height, width, 3); rows that cannot be decoded are absent.
-    """
+    """Decode the frames of some rows again: BGR pictures by row, those absent that cannot be."""
     if source.is_dir():
         return _from_images(images_in(source), track, rows)
     if source.suffix.lower() in IMAGE_SUFFIXES:

@@ -42,14 +42,9 @@ class NetTables:
 
 
 def read_net(run_dir: Path) -> tuple[NetTables | None, str]:
-    """Read the state of a net from a run's folder.
+    """Read the state of a net from a run's folder, None where it holds none.
 
-    Returns
-    -------
-    net : NetTables or None
-        None where the folder holds none.
-    trouble : str
-        What is wrong with it, in words; "" if nothing.
+    Returns also what is wrong with it, in words; "" if nothing.
     """
     if not (run_dir / NET_CSV).is_file():
         return None, ""

@@ -88,12 +88,8 @@ def summarize_points(
 ) -> tuple[PointSummary | None, str]:
     """Read a run's points once, in batches: `points.parquet`, else the journal of a killed run.
 
-    Returns
-    -------
-    summary : PointSummary or None
-        None where there are no points that can be read.
-    trouble : str
-        What is wrong, in words; "" if nothing.
+    Returns None where there are no points that can be read; and what is wrong, in words, "" if
+    nothing.
     """
     summary = _empty(track)
     rng = np.random.default_rng(20210126)

@@ -161,13 +161,8 @@ def read_truth(path: Path, track: Track) -> FloatArray:
 def read_bare(run_dir: Path, track: Track) -> tuple[FloatArray | None, str]:
     """Read the posture that a bare-lens camera gives on the same pixels, if the run has it.
 
-    Returns
-    -------
-    posture : array, shape (N, 3), or None
-        As `Track.posture`, on the frames of `track`.
-    trouble : str
-        What is wrong with the file, in words; "" if nothing is, or the run was killed before it
-        had a row.
+    Returns it as `Track.posture`, shape (N, 3), on the frames of `track`; and what is wrong with
+    the file, in words, "" if nothing is, or the run was killed before it had a row.
     """
     path = run_dir / POSTURE_BARE_CSV
     if not path.is_file() or path.stat().st_size == 0:

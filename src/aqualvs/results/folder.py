@@ -342,17 +342,10 @@ def check_run_files(folder: Path) -> None:
 
 
 def recover(folder: Path) -> bool:
-    """Complete the folder of a run that was killed.
+    """Complete the folder of a run that was killed; return False if there was nothing left to do.
 
-    Returns
-    -------
-    recovered : bool
-        False if there was nothing left to do.
-
-    Raises
-    ------
-    OutputError
-        If `folder` holds no run, the run is still under way, or the folder cannot be written.
+    Raises `OutputError` if `folder` holds no run, the run is still under way, or the folder cannot
+    be written.
     """
     if not (folder / POSTURE_CSV).is_file():
         raise OutputError(f"{folder}: holds no run (no {POSTURE_CSV}); give the folder of a run")

@@ -71,12 +71,9 @@ class PointsStream:
         self._closed = False
 
     def write(self, *scans: Scan) -> Any:
-        """Append the points of frames, all or none; those without points leave no trace.
+        """Append the points of frames, all or none, and return them as a record batch.
 
-        Returns
-        -------
-        batch : pyarrow.RecordBatch or None
-            What was appended.
+        Frames without points leave no trace.
         """
         if not any(len(scan.points) for scan in scans):
             return None

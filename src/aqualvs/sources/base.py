@@ -89,13 +89,10 @@ class Health:
 
 
 def bgr_of(frame: Frame) -> ImagePlane:
-    """Return a frame as a BGR picture.
+    """Return a frame as a BGR picture, shape (height, width, 3), grey where it has no chroma.
 
-    Returns
-    -------
-    image : uint8 array, shape (height, width, 3)
-        A new array; grey where the frame has no chroma. A field has each of its rows twice, so that
-        pixels of the picture lie where they do in the picture.
+    A field has each of its rows twice, so that pixels of the picture lie where they do in the
+    picture.
     """
     image = _bgr_of(frame)
     return image if frame.field is None else np.repeat(image, 2, axis=0)

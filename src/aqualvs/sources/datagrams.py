@@ -186,13 +186,7 @@ _MAX_LAG_S = 2.0
 
 
 def kind_of(datagram: bytes) -> str | None:
-    """Return the kind of content of a datagram, or None if it is unknown.
-
-    Returns
-    -------
-    kind : str or None
-        "RTP H.264", "MPEG-TS" or "bare H.264".
-    """
+    """Return "RTP H.264", "MPEG-TS" or "bare H.264" for a datagram's content, or None."""
     if transport_content(datagram) is not None:
         return TS
     if datagram.startswith((b"\x00\x00\x01", b"\x00\x00\x00\x01")):

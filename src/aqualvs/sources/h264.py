@@ -122,12 +122,9 @@ _CHROMA_PROFILES = frozenset({100, 110, 122, 244, 44, 83, 86, 118, 128, 138, 139
 
 
 def nal_units(data: bytes) -> list[bytes]:
-    """Return the beginnings of the NAL units of a byte stream (annex B).
+    """Return the first 64 bytes, at most, of the NAL units of a byte stream (annex B).
 
-    Returns
-    -------
-    units : list of bytes
-        At most 64 bytes of each, without start code.
+    Start codes are left out.
     """
     return [data[m.end() : m.end() + _HEAD] for m in _START.finditer(data)]
 

@@ -206,10 +206,7 @@ class H264Depacketizer:
     def push(self, ordered: Ordered) -> list[AccessUnit]:
         """Return the pictures that a packet completes.
 
-        Returns
-        -------
-        pictures : list of AccessUnit
-            None, one, or two: one that was left open, and its own.
+        There is none, one, or two: one that was left open, and its own.
         """
         packet, done = ordered.packet, []
         if self._timestamp is not None and (

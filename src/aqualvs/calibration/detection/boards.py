@@ -346,13 +346,7 @@ class Seeds:
 
 
 def find_charuco(image: GreyImage, board: Board) -> CornerGrid:
-    """Find the corners of a ChArUco board.
-
-    Returns
-    -------
-    CornerGrid
-        No corner known if no two markers agree on one.
-    """
+    """Find the corners of a ChArUco board; none is known if no two markers agree on one."""
     # Window of the local threshold for a quick look at a part, as a share of the picture's width.
     quick_window = 0.01
     quick_px = 2 * max(round(0.5 * quick_window * image.shape[1]), 1) + 1

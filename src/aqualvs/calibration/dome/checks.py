@@ -78,17 +78,9 @@ def noise_px(solution: Solution[BundleState]) -> float:
 def check_media(
     problem: DomeProblem, solution: Solution[BundleState], sets: Sequence[BoardSet]
 ) -> list[str]:
-    """Compare every stated index with the one that fits the pictures best.
+    """Compare every stated index with the one that fits the pictures best; return warnings.
 
-    Returns
-    -------
-    list of str
-        Warnings, in plain words.
-
-    Raises
-    ------
-    CalibrationError
-        If the pictures were taken in another medium.
+    Raises `CalibrationError` if the pictures were taken in another medium.
     """
     doubts = []
     for medium, one in enumerate(sets):

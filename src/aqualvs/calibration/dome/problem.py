@@ -458,12 +458,8 @@ def compare_with_bare_lens(
     """Solve both models from three views in four and predict the fourth; four times.
 
     The pose of a view held out is found from half of its corners; the other half is predicted.
-    Outliers of the whole solve and corners that either model cannot see are left out for both.
-
-    Returns
-    -------
-    CrossValidation or None
-        None if there are too few views.
+    Outliers of the whole solve and corners that either model cannot see are left out for both. None
+    if there are too few views.
     """
     n = len(problem.shots)
     believed = [

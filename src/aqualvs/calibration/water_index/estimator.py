@@ -62,11 +62,8 @@ class CusumTest:
     def add(self, standardised: float) -> int:
         """Add the innovation of a frame, in standard deviations.
 
-        Returns
-        -------
-        int
-            Number of frames since the start of the change, this one included, if it raises the
-            alarm; else 0.
+        Returns the number of frames since the start of the change, this one included, if it raises
+        the alarm; else 0.
         """
         # Change to be detected: one standard deviation of a frame.
         allowance = 0.5
