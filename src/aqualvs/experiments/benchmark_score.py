@@ -392,24 +392,10 @@ BARE_LENS = "bare-lens"
 def run_own(
     benchmark: BenchmarkSet, folder: Path, echo: Callable[[str], object], *, overwrite: bool
 ) -> list[str]:
-    """Measure every dive of a set with every system of `OWN_SYSTEMS`.
+    """Measure every dive of a set with every system of `OWN_SYSTEMS`, into SYSTEM/DIVE of a folder.
 
-    Parameters
-    ----------
-    folder : Path
-        A run goes to SYSTEM/DIVE in it.
-    overwrite : bool
-        Whether to replace runs that are there.
-
-    Returns
-    -------
-    arguments : list of str
-        NAME=PATH of every system, to be scored.
-
-    Raises
-    ------
-    AqualvsError
-        If a dive cannot be read or the folder not be written.
+    Returns NAME=PATH of every system, to be scored. Raises `AqualvsError` if a dive cannot be read
+    or the folder not be written.
     """
     for system in OWN_SYSTEMS:
         for dive in benchmark.dives:
@@ -462,25 +448,8 @@ def score_and_tell(
 ) -> None:
     """Score systems side by side and print the table.
 
-    Parameters
-    ----------
-    results : sequence of str
-        NAME=PATH or paths, as `read_system` takes them.
-    truth : Path
-        Folder of the set.
-    own : Path or None
-        Folder in which to run what comes with aqualvs first, to be scored too.
-    out : Path or None
-        Folder for `scores.csv`, `scores.json` and `scores.md`.
-    dives : bool
-        Whether the table shows every dive.
-    overwrite : bool
-        Whether to replace what this command wrote to `own` and `out` before.
-
-    Raises
-    ------
-    AqualvsError
-        If truth or results cannot be used, or a folder cannot be written.
+    Options are those of `aqualvs score`, see its `--help`. Raises `AqualvsError` if truth or
+    results cannot be used, or a folder cannot be written.
     """
     if not results and own is None:
         raise OptionError(

@@ -187,27 +187,12 @@ def make_set(
 ) -> None:
     """Render dives of the set, with truth and a README, into a folder.
 
-    Parameters
-    ----------
-    out : Path
-        Folder to write.
-    names : sequence of str
-        Levels or dives; none for all.
-    n_frames : int or None
-        Frames of every dive; None for all.
-    shutter : str or None
-        Of the camera, as `shutter_from_words` reads it for 25 pictures a second, which the set's
-        few are some of; None exposes all rows at once. A set with a shutter is a part: its scores
-        stand for themselves.
-    overwrite : bool
-        Whether a set that is there may be replaced.
+    Options are those of `aqualvs benchmark`, see its `--help`. A shutter is read for 25 pictures a
+    second, which the set's few are some of; a set with one is a part: its scores stand for
+    themselves.
 
-    Raises
-    ------
-    OptionError
-        If a name is not known or the number of frames makes no sense.
-    OutputError
-        If the folder holds a set already or cannot be written.
+    Raises `OptionError` if a name is not known or the number of frames makes no sense,
+    `OutputError` if the folder holds a set already or cannot be written.
     """
     dives = chosen_dives(names, n_frames)
     written = [out / name for name in (SET_FILE, _README_MD, *(dive.name for dive in dives))]
@@ -332,22 +317,13 @@ class System:
 
 
 def read_system(argument: str, benchmark: BenchmarkSet) -> System:
-    """Read the results of a system.
+    """Read the results of a system for the dives of a set.
 
-    Parameters
-    ----------
-    argument : str
-        NAME=PATH, or a path, which is then called as its last part. The path is a folder with
-        DIVE.csv or DIVE/posture.csv for every dive, or one CSV with a column `dive`.
-    benchmark : BenchmarkSet
-        The set whose dives they are.
+    `argument`: NAME=PATH, or a path, which is then called as its last part. The path is a folder
+    with DIVE.csv or DIVE/posture.csv for every dive, or one CSV with a column `dive`.
 
-    Raises
-    ------
-    SourceError
-        If a file cannot be read or makes no sense.
-    OptionError
-        If there is nothing for any dive.
+    Raises `SourceError` if a file cannot be read or makes no sense, `OptionError` if there is
+    nothing for any dive.
     """
     given, equals, rest = argument.partition("=")
     path = Path(rest if equals else argument)

@@ -250,24 +250,10 @@ _HEAD = ("quantity", "paper", "ours", "bar", "met")
 
 
 def write_page(records: Sequence[Record], seconds: Mapping[str, float], folder: Path) -> Path:
-    """Write the page from records, and from the figures that are in the folder.
+    """Write the page from records, in their order, and from the figures that are in the folder.
 
-    Parameters
-    ----------
-    records : sequence of Record
-        In the order in which they shall stand.
-    seconds : mapping
-        How long experiments took, as far as it is known.
-
-    Returns
-    -------
-    path : Path
-        The page; `reproduce.html` in the folder.
-
-    Raises
-    ------
-    OutputError
-        If a figure cannot be read or the page cannot be written.
+    `seconds`: how long experiments took, as far as it is known. Returns the page, `reproduce.html`
+    in the folder. Raises `OutputError` if a figure cannot be read or the page cannot be written.
     """
     path = folder / PAGE
     with writing(path):

@@ -292,19 +292,9 @@ _MINUS = re.compile(r"(?<![\w-])-(?=\d)")
 
 
 def write_page(path: Path, picture: Path, result: Comparison, origins: Mapping[str, str]) -> None:
-    """Write the page.
+    """Write the page, with the picture of the map in it.
 
-    Parameters
-    ----------
-    picture : Path
-        Of the map, which goes into the page.
-    origins : mapping
-        Folder of a run to what told its date.
-
-    Raises
-    ------
-    OSError
-        As the system says it.
+    `origins`: folder of a run to what told its date. Raises `OSError` as the system says it.
     """
     first, last = result.dates[0], result.dates[-1]
     lines = [line for line in summary_lines(result) if not line.startswith("warning: ")]

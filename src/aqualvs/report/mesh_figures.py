@@ -369,39 +369,12 @@ def figures(
     """Draw figures 13 and 14 of the paper, and its laser-plane image, from a run's folder.
 
     A run with the threshold detector is shown by all its bright pixels, others by the centres of
-    their returns.
+    their returns. Options are those of `aqualvs figures`, see its `--help`. Returns the paths of
+    what was written.
 
-    Parameters
-    ----------
-    folder : Path
-        Of a finished run.
-    out : Path
-        Folder for the pictures; made if it is not there.
-    echo : callable
-        Takes lines for the user.
-    frame : int, optional
-        The frame; by default the one that shows most of both net and other reflections.
-    laser : str, optional
-        Name of the laser, likewise.
-    target : Path, optional
-        Target file with the parameters of the paper's filter; those of the run if left out.
-    overwrite : bool
-        Whether to replace pictures that this command wrote there before.
-
-    Returns
-    -------
-    list of Path
-        What was written.
-
-    Raises
-    ------
-    SourceError
-        If the folder holds no points, or the rig is not on record.
-    OptionError
-        If the frame or laser has no points, or the run has already dropped what its filter
-        rejected.
-    OutputError
-        If the pictures cannot be written.
+    Raises `SourceError` if the folder holds no points, or the rig is not on record; `OptionError`
+    if the frame or laser has no points, or the run has already dropped what its filter rejected;
+    `OutputError` if the pictures cannot be written.
     """
     check_run_files(folder)
     run, trouble = read_run_file(folder)
