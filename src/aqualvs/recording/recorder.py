@@ -156,11 +156,6 @@ class Recorder:
     open_file : callable, optional
         As in `GrowingFile`; for tests.
 
-    Attributes
-    ----------
-    name, inline, keeps_all
-        As in `Output`.
-
     Raises
     ------
     OutputError
@@ -317,11 +312,6 @@ class RecorderSwitch:
     ----------
     folder : Path
         Made when it is needed.
-
-    Attributes
-    ----------
-    name, inline, keeps_all
-        As in `Output`.
     """
 
     name = "recorder"

@@ -126,11 +126,6 @@ class VideoSource(Closing):
     where : str or Path
         Path or address.
 
-    Attributes
-    ----------
-    name, size_px, fps, n_frames
-        As in `FrameSource`.
-
     Raises
     ------
     SourceError

@@ -66,8 +66,6 @@ class Replay(Closing):
         To measure with.
     options : ScannerOptions
         To measure with.
-    name, size_px, fps, n_frames
-        As in `FrameSource`.
 
     Raises
     ------

@@ -218,8 +218,6 @@ class FoxgloveOutput:
 
     Attributes
     ----------
-    name, inline, keeps_all
-        As in `Output`.
     port : int
         That it listens on.
 
