@@ -64,15 +64,8 @@ if TYPE_CHECKING:
 class RunNet:
     """Evaluation of the net as the frames come; does nothing if not requested.
 
-    Parameters
-    ----------
-    request : NetRequest or None
-        What to find out, if anything.
-
-    Raises
-    ------
-    AqualvsError
-        If the log that the request names cannot be read.
+    `request`: what to find out, if anything. Raises `AqualvsError` if the log that the request
+    names cannot be read.
     """
 
     def __init__(self, rig: Rig, request: NetRequest | None) -> None:
@@ -86,15 +79,8 @@ class RunNet:
     def write(self, folder: Path, source: str) -> list[str]:
         """Finish, write the net's files and return the summary as lines.
 
-        Parameters
-        ----------
-        source : str
-            Of the frames; the clock of a video may help to lay a log on it.
-
-        Raises
-        ------
-        OutputError
-            If a file cannot be written.
+        `source`: of the frames; the clock of a video may help to lay a log on it. Raises
+        `OutputError` if a file cannot be written.
         """
         if self._net is None:
             return []

@@ -131,15 +131,8 @@ def read_yaml(path: Path, what: str, error: type[AqualvsError]) -> Any:
 def read_text(path: Path, what: str, error: type[AqualvsError]) -> str:
     """Return the text of a file in UTF-8, with or without a byte order mark.
 
-    Parameters
-    ----------
-    path, what, error
-        As `read_yaml` takes them.
-
-    Raises
-    ------
-    AqualvsError
-        Of type `error`; one line, if the file is missing, unreadable, too large or not text.
+    `path`, `what`, `error`: as `read_yaml` takes them. Raises `AqualvsError` of type `error`; one
+    line, if the file is missing, unreadable, too large or not text.
     """
     remedy = f"give the path of {what}"
     try:

@@ -256,15 +256,8 @@ def drop_net(dataset: Path, name: str) -> None:
 def write_dives(dataset: Path, rows: Iterable[Mapping[str, Any]]) -> None:
     """Write `dives.parquet`.
 
-    Parameters
-    ----------
-    rows : iterable of mappings
-        With the columns of `DIVES_SCHEMA`; absent ones are null.
-
-    Raises
-    ------
-    OSError
-        As the system says it.
+    `rows`: with the columns of `DIVES_SCHEMA`; absent ones are null. Raises `OSError` as the system
+    says it.
     """
     table = pa.Table.from_pylist([dict(row) for row in rows], schema=DIVES_SCHEMA)
     with _replacing(dataset / DIVES_PARQUET) as draft:

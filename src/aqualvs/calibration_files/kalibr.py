@@ -24,15 +24,8 @@ _DISTORTIONS = {
 def read_kalibr(text: str, source: str, *, name: str | None = None) -> ForeignCamera:
     """Return one camera of a `camchain.yaml`.
 
-    Parameters
-    ----------
-    name : str, optional
-        Key of the camera, such as "cam0"; needed where there are several.
-
-    Raises
-    ------
-    RigError
-        One line without the file's name, but for faults of the YAML.
+    `name`: key of the camera, such as "cam0"; needed where there are several. Raises `RigError`
+    with one line without the file's name, but for faults of the YAML.
     """
     content = parse_yaml(text, source, RigError)
     if not isinstance(content, Mapping):

@@ -142,15 +142,8 @@ _SIZES = ("image_size", "imageSize", "cameraResolution", "resolution")
 def read_opencv(text: str, source: str, *, model: str | None = None) -> ForeignCamera:
     """Return the camera of a FileStorage in YAML, XML or JSON.
 
-    Parameters
-    ----------
-    model : str, optional
-        "opencv" or "fisheye" where the file does not say it (`fisheye_model`).
-
-    Raises
-    ------
-    RigError
-        One line without the file's name, but for faults of the YAML.
+    `model`: "opencv" or "fisheye" where the file does not say it (`fisheye_model`). Raises
+    `RigError` with one line without the file's name, but for faults of the YAML.
     """
     entries = _storage(text, source)
     core = entries.core(*_MATRIX)

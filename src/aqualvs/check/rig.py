@@ -284,16 +284,8 @@ def run_check(path: Path, console: Console | None = None) -> int:
 def check_rig(rig: Rig, now: datetime | None = None) -> list[Finding]:
     """Return everything worth saying about a rig, in the order in which light passes it.
 
-    Parameters
-    ----------
-    now : datetime, optional
-        With a time zone; calibrations are as old as it makes them. The computer's clock if left
-        out.
-
-    Raises
-    ------
-    RigError
-        If what calibrations have noted down in the rig cannot be understood.
+    `now`: with a time zone; calibrations are as old as it makes them. The computer's clock if left
+    out. Raises `RigError` if what calibrations have noted down in the rig cannot be understood.
     """
     camera, uncertainty = rig.camera(), rig_uncertainty(rig)
     shutter = shutter_finding(rig)

@@ -45,15 +45,7 @@ are empty."""
 class FollowLog(Closing):
     """Writer of the log, row by row.
 
-    Parameters
-    ----------
-    path : Path
-        Created, or overwritten.
-
-    Raises
-    ------
-    OutputError
-        If it cannot be written.
+    `path`: created, or overwritten. Raises `OutputError` if it cannot be written.
     """
 
     def __init__(self, path: Path) -> None:

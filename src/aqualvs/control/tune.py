@@ -368,15 +368,8 @@ def usable_gains(source: Path | str) -> ControlGains:
     The vehicle is taken as the gains describe it: their `lag`, of the vehicle and the posture
     together, counts as a delay, at least that of `TuneOptions`.
 
-    Parameters
-    ----------
-    source : Path or str
-        As `load_gains` takes it.
-
-    Raises
-    ------
-    OptionError
-        As `load_gains`; or with the axis, and what is left of its margins.
+    `source`: as `load_gains` takes it. Raises `OptionError` as `load_gains`; or with the axis, and
+    what is left of its margins.
     """
     gains = load_gains(source)
     usual = TuneOptions().delay

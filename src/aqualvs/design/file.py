@@ -193,15 +193,8 @@ class DesignFile(StrictPart):
 def load_design(path: Path, given: Mapping[str, Any] | None = None) -> Design:
     """Read a design file.
 
-    Parameters
-    ----------
-    given : mapping, optional
-        Replacements of the file's values by the command line, see `merged_content`.
-
-    Raises
-    ------
-    OptionError, RigError
-        One line: file, place, value, remedy.
+    `given`: replacements of the file's values by the command line, see `merged_content`. Raises
+    `OptionError` or `RigError` with one line: file, place, value, remedy.
     """
     content = read_yaml(path, "a design file", OptionError)
     if not isinstance(content, Mapping):

@@ -71,15 +71,8 @@ class SimCase:
 def vehicle_model(name: str, pilot_gain: float = 0.5) -> VehicleModel:
     """Return a vehicle by the name that the command line knows.
 
-    Parameters
-    ----------
-    pilot_gain : float
-        ArduSub's: the share of the thrust that a full effort asks for.
-
-    Raises
-    ------
-    OptionError
-        If there is no such vehicle, or the gain is none.
+    `pilot_gain`: ArduSub's: the share of the thrust that a full effort asks for. Raises
+    `OptionError` if there is no such vehicle, or the gain is none.
     """
     model = _MODELS.get(name.replace("_", "-"))
     if model is None:

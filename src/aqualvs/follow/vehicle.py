@@ -46,15 +46,7 @@ _Step: TypeAlias = tuple[PilotReport, float, Posture | Refusal]
 class FollowLogOutput:
     """Writer of the pilot's steps; comes after the pilot among the outputs.
 
-    Parameters
-    ----------
-    path : Path
-        Created, or overwritten.
-
-    Raises
-    ------
-    OutputError
-        If it cannot be written.
+    `path`: created, or overwritten. Raises `OutputError` if it cannot be written.
     """
 
     name = "follow log"

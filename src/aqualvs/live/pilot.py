@@ -55,15 +55,8 @@ class Watchdog:
     def send(self, effort: Effort, known_s: float) -> Effort:
         """Send an effort, or neutral if it is already too old; return the sent effort.
 
-        Parameters
-        ----------
-        known_s : float
-            Time at which its posture was known, by `time.monotonic`.
-
-        Raises
-        ------
-        OSError, ValueError
-            As `VehicleLink.send`.
+        `known_s`: time at which its posture was known, by `time.monotonic`. Raises `OSError` or
+        `ValueError` as `VehicleLink.send`.
         """
         with self._sending:
             if time.monotonic() - known_s > self._timeout_s:

@@ -290,15 +290,8 @@ class NetCheck:
 def net_check(target: str, rig: Rig) -> NetCheck | None:
     """Return the check of the net that a target file describes; None where it describes none.
 
-    Parameters
-    ----------
-    target : str
-        A word or the path of a target file, as `target_dict` takes it.
-
-    Raises
-    ------
-    OptionError
-        As `target_dict`.
+    `target`: a word or the path of a target file, as `target_dict` takes it. Raises `OptionError`
+    as `target_dict`.
     """
     said = target_dict(target).net
     if said is None:

@@ -46,15 +46,8 @@ _STAMP = re.compile(r"\.(\d{4}-\d\d-\d\dT\d{6})(?:-(\d+))?")
 def keep_dated(path: Path, now: datetime | None = None) -> Path:
     """Copy a file beside itself, under a name with the time that no other file has.
 
-    Parameters
-    ----------
-    now : datetime, optional
-        With a time zone; the current time if left out.
-
-    Raises
-    ------
-    OutputError
-        If it cannot be copied.
+    `now`: with a time zone; the current time if left out. Raises `OutputError` if it cannot be
+    copied.
     """
     stamp = (now or datetime.now(UTC)).astimezone(UTC).strftime("%Y-%m-%dT%H%M%S")
     number = 1

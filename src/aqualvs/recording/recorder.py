@@ -79,15 +79,8 @@ class SampleChunks:
 class Recording:
     """Writer of samples to a file that is readable at any time.
 
-    Parameters
-    ----------
-    path : Path
-        Must not exist.
-
-    Raises
-    ------
-    OSError
-        From every method, as the system says it; what was written stays readable.
+    `path`: must not exist. Raises `OSError` from every method, as the system says it; what was
+    written stays readable.
     """
 
     def __init__(self, path: Path, options: RecorderOptions) -> None:
@@ -308,10 +301,7 @@ def _words(fault: OSError) -> str:
 class RecorderSwitch:
     """Output whose recording is switched on and off; every start makes a file of its own.
 
-    Parameters
-    ----------
-    folder : Path
-        Made when it is needed.
+    `folder`: made when it is needed.
     """
 
     name = "recorder"

@@ -110,15 +110,8 @@ class DiveRecording:
     def frames(self, *, with_pictures: bool) -> Iterator[RecordedFrame]:
         """Yield the frames in the order of their recording.
 
-        Parameters
-        ----------
-        with_pictures : bool
-            Whether to decode pictures, where there are any.
-
-        Raises
-        ------
-        SourceError
-            If a message cannot be understood.
+        `with_pictures`: whether to decode pictures, where there are any. Raises `SourceError` if a
+        message cannot be understood.
         """
         wanted = [STRIPES.name]
         if with_pictures:

@@ -50,15 +50,8 @@ _BLUE, _PALE, _AMBER = (51, 153, 255, 90), (51, 153, 255, 255), (240, 228, 66, 2
 class RerunLog(Closing):
     """Writer of samples to one place, chosen by `save`, `connect` or `spawn`; a context manager.
 
-    Parameters
-    ----------
-    picture_hz, points_hz : float
-        Most pictures, with the points in them, and point clouds per second; 0 for none.
-
-    Raises
-    ------
-    OptionError
-        If rerun-sdk is not installed.
+    `picture_hz`, `points_hz`: most pictures, with the points in them, and point clouds per second;
+    0 for none. Raises `OptionError` if rerun-sdk is not installed.
     """
 
     def __init__(self, *, picture_hz: float = 5.0, points_hz: float = 10.0) -> None:

@@ -103,18 +103,11 @@ def compare_with_truth(posture_csv: Path, truth_csv: Path) -> TruthComparison:
 def read_truth(path: Path) -> dict[int, tuple[float, float, float]]:
     """Return range (m), pitch and yaw (deg) by frame, of rows where all are finite.
 
-    Parameters
-    ----------
-    path : Path
-        Columns `frame`, `range_m` or `range_mm`, `pitch_deg`, `yaw_deg`. Where a row has
-        `visible_fit_range_mm`, `visible_fit_pitch_deg` and `visible_fit_yaw_deg` as well, these
-        count: the plane through what the lasers light. Light falls on the front of a net's twine,
-        a radius before the net's own plane. Other columns are ignored.
-
-    Raises
-    ------
-    SourceError
-        If the file cannot be read or lacks a column.
+    `path`: columns `frame`, `range_m` or `range_mm`, `pitch_deg`, `yaw_deg`. Where a row has
+    `visible_fit_range_mm`, `visible_fit_pitch_deg` and `visible_fit_yaw_deg` as well, these count:
+    the plane through what the lasers light. Light falls on the front of a net's twine, a radius
+    before the net's own plane. Other columns are ignored. Raises `SourceError` if the file cannot
+    be read or lacks a column.
     """
     rows = _rows(path)
     range_column = _range_column(path, rows)

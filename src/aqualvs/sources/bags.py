@@ -201,17 +201,9 @@ def _words(fault: Exception) -> str:
 def open_mcap(path: Path, topic: str | None = None) -> MessageSource:
     """Open the images of an MCAP file.
 
-    Parameters
-    ----------
-    topic : str or None
-        Needed where several topics have images.
-
-    Raises
-    ------
-    SourceError
-        If the file cannot be read or has no images.
-    OptionError
-        If the topic is missing or wrong, or a package is missing.
+    `topic`: needed where several topics have images. Raises `SourceError` if the file cannot be
+    read or has no images. Raises `OptionError` if the topic is missing or wrong, or a package is
+    missing.
     """
     _require("mcap.reader", path, "MCAP files")
     return _source(path, topic, _mcap_image_topics(path), functools.partial(_mcap_messages, path))

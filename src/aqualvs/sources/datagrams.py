@@ -35,15 +35,8 @@ class UdpAddress:
 def parse_udp(where: str) -> UdpAddress:
     """Return where to listen, from `udp://HOST:PORT`, `rtp://HOST:PORT` and the like.
 
-    Parameters
-    ----------
-    where : str
-        Host may be missing, or written as `@` or `@HOST`; options after `?` are ignored.
-
-    Raises
-    ------
-    SourceError
-        If there is no port, or the host is no numeric address.
+    `where`: host may be missing, or written as `@` or `@HOST`; options after `?` are ignored.
+    Raises `SourceError` if there is no port, or the host is no numeric address.
     """
     scheme = where.partition("://")[0]
     try:

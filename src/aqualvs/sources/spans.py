@@ -323,16 +323,8 @@ class VideoParts(Closing):
     def frames(self, span: Span) -> Iterator[Frame]:
         """Decode a part; frames have the index and the time that the whole video gives them.
 
-        Parameters
-        ----------
-        span : Span
-            From `video_spans` of the same file.
-
-        Raises
-        ------
-        UnlikeProbeError
-            If any picture is damaged or missing: the whole video decides what becomes of those
-            that follow.
+        `span`: from `video_spans` of the same file. Raises `UnlikeProbeError` if any picture is
+        damaged or missing: the whole video decides what becomes of those that follow.
         """
         index, latest = span.first, span.origin_pts - 1
         try:

@@ -217,15 +217,8 @@ def _received(file: Any) -> SharedMemory:
 class Sender:
     """The sending end of the channel, in a process that measures.
 
-    Parameters
-    ----------
-    memory : SharedMemory or None
-        Without it all goes through the pipe.
-
-    Raises
-    ------
-    EOFError, OSError
-        From both methods, once the other end has gone.
+    `memory`: without it all goes through the pipe. Raises `EOFError` or `OSError` from both
+    methods, once the other end has gone.
     """
 
     def __init__(self, pipe: Connection, memory: SharedMemory | None) -> None:

@@ -73,15 +73,8 @@ def check_camera_solution(
 ) -> None:
     """Refuse intrinsics that do not explain the views, or that the views do not determine.
 
-    Parameters
-    ----------
-    covariance : array, shape (P, P)
-        Of the intrinsics, as if corners were independent: focal lengths and image centre first.
-
-    Raises
-    ------
-    CalibrationError
-        With the likely cause and the remedy.
+    `covariance`, shape (P, P): of the intrinsics, as if corners were independent: focal lengths and
+    image centre first. Raises `CalibrationError` with the likely cause and the remedy.
     """
     noise = CORNER_SIGMA_PX * solution.scales[CORNERS]
     # Corners noisier than this indicate an error other than noise.

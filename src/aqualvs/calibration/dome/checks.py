@@ -447,15 +447,8 @@ def check_solution(
 ) -> None:
     """Refuse a solution that does not explain the pictures, or is not determined by them.
 
-    Parameters
-    ----------
-    uncertainty : RigUncertainty
-        Of the solved numbers, with the uncertainty of considered ones propagated.
-
-    Raises
-    ------
-    CalibrationError
-        With the likely cause and the remedy.
+    `uncertainty`: of the solved numbers, with the uncertainty of considered ones propagated. Raises
+    `CalibrationError` with the likely cause and the remedy.
     """
     noise = noise_px(solution)
     if noise > MAX_NOISE_PX:

@@ -30,17 +30,10 @@ PICTURE_SUFFIXES = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", 
 def picture_paths(arguments: Sequence[str | Path]) -> list[Path]:
     """Return the pictures given by files, folders and patterns, each once.
 
-    Parameters
-    ----------
-    arguments : sequence of str or Path
-        Pictures, folders of them, or patterns such as 'air/*.png'. The pictures of one argument
-        are sorted naturally (`img2` before `img10`).
-
-    Raises
-    ------
-    CalibrationError
-        If an argument matches no picture, or two of the pictures have the same file name: poses
-        and reports identify pictures by their names.
+    `arguments`: pictures, folders of them, or patterns such as 'air/*.png'. The pictures of one
+    argument are sorted naturally (`img2` before `img10`). Raises `CalibrationError` if an argument
+    matches no picture, or two of the pictures have the same file name: poses and reports identify
+    pictures by their names.
     """
     paths = [path for argument in arguments for path in _meant(str(argument))]
     if not paths:

@@ -72,16 +72,9 @@ def box_patches(
 ) -> tuple[MarkerSet, tuple[SheetPatch, ...]]:
     """Return a box's markers, and the patches in which they can be printed.
 
-    Parameters
-    ----------
-    rooms : sequence of (float, float)
-        Printable width and height of a sheet of paper, in metres: upright and across. Infinite
-        for sheets as large as a plane.
-
-    Raises
-    ------
-    CalibrationError
-        If a plane or a sheet is too small for a marker, or the dictionary has too few.
+    `rooms`: printable width and height of a sheet of paper, in metres: upright and across. Infinite
+    for sheets as large as a plane. Raises `CalibrationError` if a plane or a sheet is too small for
+    a marker, or the dictionary has too few.
     """
     # Pitch of markers, in sides of a marker: leaves a light ring and room for stripes to cross.
     sides_apart = 1.7
@@ -381,15 +374,8 @@ class Paper:
 def papers(word: str) -> tuple[Paper, Paper]:
     """Return a paper upright and across.
 
-    Parameters
-    ----------
-    word : str
-        "a4", "a3" and so on, "fit", or width x height in millimetres, such as "600x400".
-
-    Raises
-    ------
-    OptionError
-        If it is none of these.
+    `word`: "a4", "a3" and so on, "fit", or width x height in millimetres, such as "600x400". Raises
+    `OptionError` if it is none of these.
     """
     key = word.strip().lower()
     if key == FIT:

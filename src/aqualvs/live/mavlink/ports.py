@@ -100,15 +100,8 @@ def parse_address(url: str) -> Address:
 class AllowedPeers:
     """Addresses that are heard.
 
-    Parameters
-    ----------
-    rules : sequence of str
-        Each `ADDRESS`, `ADDRESS:PORT` or `NETWORK/BITS`, in numbers; everybody if there is none.
-
-    Raises
-    ------
-    OptionError
-        If one is none of these.
+    `rules`: each `ADDRESS`, `ADDRESS:PORT` or `NETWORK/BITS`, in numbers; everybody if there is
+    none. Raises `OptionError` if one is none of these.
     """
 
     def __init__(self, rules: Sequence[str] = ()) -> None:

@@ -159,15 +159,8 @@ _REFUSED_FOR_S = 3.0
 class UdpJsonOutput:
     """Output that sends every sample to every receiver.
 
-    Parameters
-    ----------
-    receivers : str or sequence of str
-        `HOST:PORT`, or `[IPV6]:PORT`; a broadcast address reaches all that listen in the network.
-
-    Raises
-    ------
-    OptionError
-        If there is none, or one that makes no sense.
+    `receivers`: `HOST:PORT`, or `[IPV6]:PORT`; a broadcast address reaches all that listen in the
+    network. Raises `OptionError` if there is none, or one that makes no sense.
     """
 
     inline = True
