@@ -1,7 +1,7 @@
 """The closed loop in simulation: trials against what is asked for, and 500 random dives.
 
 Run `python -m benchmarks control`. Vehicle, sea, net and delays are those of
-`aqualvs.follow.case` and `aqualvs.follow.monte_carlo`; postures are sampled with the scanner's
+`aqualvs.follow.case` and `random_dives`; postures are sampled with the scanner's
 noise. Set AQUALVS_LOOP_RENDERED=1 for the trials through rendered pictures as well (half an hour).
 References are what the loop must reach.
 """
@@ -12,6 +12,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from benchmarks.random_dives import DiveResult, random_dives
 
 from aqualvs.control.gains_file import load_gains
 from aqualvs.control.missions import HoldMission
@@ -30,7 +31,6 @@ from aqualvs.follow.case import (
     vehicle_model,
 )
 from aqualvs.follow.log import LoopLog, effort_measures, hold_measures, step_measures
-from aqualvs.follow.monte_carlo import DiveResult, random_dives
 from aqualvs.follow.sensor_model import SampledSensor
 from aqualvs.simulation.vehicle.models import VehicleModel
 from aqualvs.simulation.vehicle.water_motion import WaterMotion

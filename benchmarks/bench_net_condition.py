@@ -13,13 +13,14 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from benchmarks.random_scenes import Difficulty
 
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.nets.condition import NetCondition, NetStretch
 from aqualvs.nets.holes import Hole
 from aqualvs.optics.rig import Rig
 from aqualvs.scanning.scan import Scan
-from aqualvs.simulation.scenarios import Difficulty, bluerov2_rig, example_rig
+from aqualvs.simulation.scenarios import bluerov2_rig, example_rig
 from aqualvs.simulation.scene import Net
 from net_cases import NetCamera
 from net_dives import (

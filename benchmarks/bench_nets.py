@@ -10,6 +10,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from benchmarks.random_scenes import Difficulty, random_scene
 
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.scanner import Scanner
@@ -23,7 +24,7 @@ from aqualvs.scanning.stripe import StripeOptions
 from aqualvs.scanning.surfaces import TargetKind, choose_target, find_surfaces
 from aqualvs.scanning.triangulate import Triangulator
 from aqualvs.simulation.render import Renderer
-from aqualvs.simulation.scenarios import Difficulty, example_rig, random_scene
+from aqualvs.simulation.scenarios import example_rig
 from aqualvs.simulation.scene import Scene, SurfaceKind
 from aqualvs.simulation.truth import visible_fit
 

@@ -16,13 +16,14 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from benchmarks.random_scenes import Difficulty, random_scene
 
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.scanner import Scanner
 from aqualvs.scanning.posture import Posture
 from aqualvs.scanning.scan import Frame, ImagePlane, planes_of_image
 from aqualvs.simulation.render import Renderer
-from aqualvs.simulation.scenarios import Difficulty, example_rig, random_scene
+from aqualvs.simulation.scenarios import example_rig
 from aqualvs.simulation.scene import SurfaceKind
 from aqualvs.simulation.truth import visible_fit
 

@@ -9,13 +9,7 @@ _EXIT_INTERRUPTED = 130
 
 
 def main() -> int:
-    """Run the command line of this process.
-
-    Returns
-    -------
-    exit_code : int
-        As `aqualvs.cli.main.main`.
-    """
+    """Run the command line of this process; return the exit code of `aqualvs.cli.main.main`."""
     _open_standard_files()
     interruptible = signal.getsignal(signal.SIGINT) is signal.default_int_handler
     if interruptible:

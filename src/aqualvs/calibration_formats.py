@@ -70,7 +70,6 @@ def refuse_foreign(text: str, path: Path, wanted: str, error: type[AqualvsError]
     ----------
     text : str
         Content of the file.
-    path : Path
     wanted : str
         What was expected, such as "a rig file".
     error : type

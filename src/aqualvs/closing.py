@@ -1,6 +1,5 @@
 """Base class of context managers that close themselves."""
 
-from types import TracebackType
 from typing import Self
 
 
@@ -14,11 +13,6 @@ class Closing:
         """Return itself."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        fault: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Close, however the statement ends."""
         self.close()

@@ -15,19 +15,7 @@ _FILES = ("dive.mp4", "rig.yaml", "truth.csv")
 def demo(out: Path, echo: Callable[[str], object], *, overwrite: bool = False) -> int:
     """Run the bundled dive, print posture and error, and return the exit code.
 
-    Parameters
-    ----------
-    out : Path
-        Folder to write.
-    echo : callable
-        Takes one line of text.
-    overwrite : bool
-        Whether to replace a run that is already there.
-
-    Raises
-    ------
-    AqualvsError
-        If the installation lacks the dive, or `out` cannot be written.
+    Raises `AqualvsError` if the installation lacks the dive, or `out` cannot be written.
     """
     with importlib.resources.as_file(bundled_dive()) as folder:
         dive, rig, truth = (_present(folder / name) for name in _FILES)

@@ -128,10 +128,7 @@ def run(request: RunRequest, *, scanner_for: ScannerFor = Scanner) -> RunResult:
 def run_and_print(request: RunRequest, echo: Callable[[str], object]) -> int:
     """Run a dive, print its results line by line, and return the exit code.
 
-    Raises
-    ------
-    AqualvsError
-        As `run`, and the result's `fault`.
+    Raises `AqualvsError` as `run`, and the result's `fault`.
     """
     result = run(request)
     for line in summary_lines(request, result):
@@ -159,20 +156,11 @@ def summary_lines(request: RunRequest, result: RunResult) -> list[str]:
 
 @dataclass(slots=True)
 class OpenDive(Closing):
-    """A dive that is ready to be measured; a context manager that closes its source.
-
-    Attributes
-    ----------
-    source : FrameSource or Replay
-    rig : Rig
-        In the water of the dive.
-    request : RunRequest
-        With the options that count, which a recording may bring itself.
-    """
+    """A dive that is ready to be measured; a context manager that closes its source."""
 
     source: FrameSource
-    rig: Rig
-    request: RunRequest
+    rig: Rig  # In the water of the dive.
+    request: RunRequest  # With the options that count, which a recording may bring itself.
 
     @property
     def is_replay(self) -> bool:
@@ -182,10 +170,7 @@ class OpenDive(Closing):
     def scanner(self, scanner_for: ScannerFor = Scanner) -> FrameScanner:
         """Return the scanner of the frames, which is the source itself if it is a recording.
 
-        Raises
-        ------
-        AqualvsError
-            If the target for the water's index cannot be used.
+        Raises `AqualvsError` if the target for the water's index cannot be used.
         """
         request, rig = self.request, self.rig
         if request.index_target is not None:
@@ -206,10 +191,8 @@ class OpenDive(Closing):
 def open_dive(request: RunRequest) -> OpenDive:
     """Open the source of a dive and load its rig.
 
-    Raises
-    ------
-    AqualvsError
-        If one of them, or the truth, cannot be used, or they do not belong together.
+    Raises `AqualvsError` if one of them, or the truth, cannot be used, or they do not belong
+    together.
     """
     replay = replay_of(request)
     if replay is not None and request.fps is not None:
@@ -238,10 +221,7 @@ def summary_for(dive: OpenDive) -> RunSummary:
     The agreement of the lasers is not checked for one laser, nor without refraction at the dome,
     which alone makes lasers disagree.
 
-    Raises
-    ------
-    AqualvsError
-        If the uncertainty of the rig, or the target file, cannot be used.
+    Raises `AqualvsError` if the uncertainty of the rig, or the target file, cannot be used.
     """
     request, rig = dive.request, dive.rig
     agreement = None

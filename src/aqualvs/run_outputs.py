@@ -64,17 +64,8 @@ if TYPE_CHECKING:
 class RunNet:
     """Evaluation of the net as the frames come; does nothing if not requested.
 
-    Parameters
-    ----------
-    rig : Rig
-        Of the run.
-    request : NetRequest or None
-        What to find out, if anything.
-
-    Raises
-    ------
-    AqualvsError
-        If the log that the request names cannot be read.
+    `request`: what to find out, if anything. Raises `AqualvsError` if the log that the request
+    names cannot be read.
     """
 
     def __init__(self, rig: Rig, request: NetRequest | None) -> None:
@@ -88,17 +79,8 @@ class RunNet:
     def write(self, folder: Path, source: str) -> list[str]:
         """Finish, write the net's files and return the summary as lines.
 
-        Parameters
-        ----------
-        folder : Path
-            Of the run.
-        source : str
-            Of the frames; the clock of a video may help to lay a log on it.
-
-        Raises
-        ------
-        OutputError
-            If a file cannot be written.
+        `source`: of the frames; the clock of a video may help to lay a log on it. Raises
+        `OutputError` if a file cannot be written.
         """
         if self._net is None:
             return []
@@ -115,7 +97,6 @@ class RunMcap(Closing):
 
     Parameters
     ----------
-    folder : Path
     rig : Rig
         For frames that were lost.
     options : ScannerOptions
@@ -206,12 +187,8 @@ def _sample(
 class RunRerun(Closing):
     """Writer of a file of Rerun during a run, or of nothing; a context manager.
 
-    Raises
-    ------
-    OutputError
-        If the file cannot be written.
-    OptionError
-        If rerun-sdk is not installed.
+    Raises `OutputError` if the file cannot be written. Raises `OptionError` if rerun-sdk is not
+    installed.
     """
 
     def __init__(self, path: Path | None, rig: Rig) -> None:
@@ -245,10 +222,7 @@ def _recording(path: Path, options: ScannerOptions) -> "Recording":
 def check_source_stays(folder: Path, source: str) -> None:
     """Make sure that a run does not replace its own source.
 
-    Raises
-    ------
-    OptionError
-        If the run's own source would be replaced.
+    Raises `OptionError` if the run's own source would be replaced.
     """
     path = Path(source)
     is_ours = path.is_file() and path.name in RUN_FILES
@@ -275,8 +249,6 @@ class RunOverlay(Closing):
 
     Parameters
     ----------
-    folder : Path
-    rig : Rig
     source : FrameSource
         Gives size and rate of the video.
     wanted : bool
@@ -319,10 +291,7 @@ class RunOverlay(Closing):
 class RunBareLens(Closing):
     """Writer of `posture_bare.csv` during a run; of nothing for a rig without a housing.
 
-    Raises
-    ------
-    OutputError
-        From every method, if the file cannot be written.
+    Raises `OutputError` from every method, if the file cannot be written.
     """
 
     def __init__(self, folder: Path, rig: Rig) -> None:
@@ -403,12 +372,8 @@ class RunWriters:
 def prepare(request: RunRequest) -> ExitStack:
     """Make sure that the run can be written; returns the claims to be closed at its end.
 
-    Raises
-    ------
-    OutputError
-        If it cannot, or its folder holds another that may not be replaced.
-    OptionError
-        If a file of Rerun is requested but cannot be.
+    Raises `OutputError` if it cannot, or its folder holds another that may not be replaced. Raises
+    `OptionError` if a file of Rerun is requested but cannot be.
     """
     check_source_stays(request.out, request.source)
     with ExitStack() as claims:

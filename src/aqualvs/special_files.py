@@ -20,10 +20,7 @@ def refuse_special(
 ) -> None:
     """Refuse a path of a pipe, device or socket; accept files, folders and free paths.
 
-    Raises
-    ------
-    AqualvsError
-        Of type `error`, if there is a pipe, a device or a socket.
+    Raises `AqualvsError` of type `error`, if there is a pipe, a device or a socket.
     """
     try:
         kind = _KINDS.get(stat.S_IFMT(path.stat().st_mode))

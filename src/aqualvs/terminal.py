@@ -86,21 +86,8 @@ def hidden_progress() -> Iterator[None]:
 def progress(label: str, n_frames: int | None, unit: str = "frames") -> Iterator[Tick]:
     """Show a progress bar; print one line instead where standard error is no terminal.
 
-    Inside `hidden_progress`, show nothing.
-
-    Parameters
-    ----------
-    label : str
-        Text before the bar.
-    n_frames : int or None
-        Frames to come, if known.
-    unit : str
-        Unit that is counted, if not frames.
-
-    Yields
-    ------
-    tick : callable
-        Call it with the number of frames completed since the last call.
+    Inside `hidden_progress`, show nothing. `n_frames` is None where it is not known. Yields what is
+    to be called with the number of frames completed since the last call.
     """
     if _HIDDEN.get():
         yield _echo_nothing

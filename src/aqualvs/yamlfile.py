@@ -24,10 +24,7 @@ _HEADER = "# A rig of aqualvs: lengths in mm, angles in degrees, frame 'dome' (d
 def write_text(path: Path, text: str) -> None:
     """Write a file.
 
-    Raises
-    ------
-    OutputError
-        If it cannot be written.
+    Raises `OutputError` if it cannot be written.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -118,7 +115,6 @@ def read_yaml(path: Path, what: str, error: type[AqualvsError]) -> Any:
 
     Parameters
     ----------
-    path : Path
     what : str
         Kind of the file in messages, such as "a rig file".
     error : type
@@ -135,15 +131,8 @@ def read_yaml(path: Path, what: str, error: type[AqualvsError]) -> Any:
 def read_text(path: Path, what: str, error: type[AqualvsError]) -> str:
     """Return the text of a file in UTF-8, with or without a byte order mark.
 
-    Parameters
-    ----------
-    path, what, error
-        As `read_yaml` takes them.
-
-    Raises
-    ------
-    AqualvsError
-        Of type `error`; one line, if the file is missing, unreadable, too large or not text.
+    `path`, `what`, `error`: as `read_yaml` takes them. Raises `AqualvsError` of type `error`; one
+    line, if the file is missing, unreadable, too large or not text.
     """
     remedy = f"give the path of {what}"
     try:
@@ -171,7 +160,6 @@ def parse_yaml(text: str, source: str, error: type[AqualvsError]) -> Any:
 
     Parameters
     ----------
-    text : str
     source : str
         Name of the text in messages.
     error : type
@@ -218,8 +206,6 @@ class _Node:
 
     Attributes
     ----------
-    value : object
-    anchor : str or None
     count, height : int
         Values that it holds, itself included, and levels of lists and mappings.
     key : object
@@ -255,10 +241,7 @@ class _Builder:
     def add(self, event: yaml.Event) -> None:
         """Process the next event.
 
-        Raises
-        ------
-        _TextError
-            If a limit is passed, or a value is not plain.
+        Raises `_TextError` if a limit is passed, or a value is not plain.
         """
         line = 0 if event.start_mark is None else event.start_mark.line + 1
         if isinstance(event, yaml.ScalarEvent):
@@ -422,10 +405,7 @@ def carry_comments(old: str, new: str) -> str:
     gone the comment moves to the enclosing key, or to the top. No comment is lost, unless `old` has
     more than 500,000 characters. The values are those of `new`.
 
-    Parameters
-    ----------
-    old, new : str
-        YAML texts; an `old` that is not YAML has no comments.
+    `old`, `new`: YAML texts; an `old` that is not YAML has no comments.
     """
     # Comments of texts beyond these are not placed: rigs have up to 50,000 characters.
     max_characters, max_comments = 500_000, 1000

@@ -29,8 +29,8 @@ from aqualvs.terminal import hidden_progress, progress
 
 
 def chart():
-    figure = new_figure(1.0, "column")
-    figure.add_subplot().plot([1, 2], [3, 4])
+    with new_figure(1.0, "column") as figure:
+        figure.add_subplot().plot([1, 2], [3, 4])
     return ExperimentFigure(name="chart", caption="Two points.", figure=figure)
 
 

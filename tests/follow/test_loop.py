@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from benchmarks.random_dives import random_dive
 
 from aqualvs.control.answer_watch import AnswerLimits
 from aqualvs.control.missions import HoldMission
@@ -16,7 +17,6 @@ from aqualvs.errors import OptionError
 from aqualvs.follow.case import SimCase, sea, tuned_gains, vehicle_model
 from aqualvs.follow.log import NEUTRAL_WITHIN_S, LoopLog, LoopRow, write_log
 from aqualvs.follow.loop import SimulatedLoop, Timing
-from aqualvs.follow.monte_carlo import random_dive
 from aqualvs.follow.sensor_model import Blind, LossOfSight, PostureNoise, SampledSensor
 from aqualvs.scanning.posture import Posture, Reason
 from aqualvs.simulation.net_motion import NetWall

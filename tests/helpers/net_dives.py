@@ -7,6 +7,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from benchmarks.random_scenes import Difficulty, random_scene
 from numpy.typing import NDArray
 
 from aqualvs.geometry.arrays import FloatArray
@@ -16,7 +17,6 @@ from aqualvs.scanner import Scanner
 from aqualvs.scanning.scan import Frame, Scan, planes_of_image
 from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenario import dome_from_target, random_bubbles, random_fish
-from aqualvs.simulation.scenarios import Difficulty, random_scene
 from aqualvs.simulation.scene import Net, Scene, SurfaceKind, Wall
 from aqualvs.simulation.surfaces import pack_surfaces
 from aqualvs.simulation.truth import cast

@@ -9,6 +9,7 @@ import os
 
 import numpy as np
 import pytest
+from benchmarks.random_dives import DiveResult, dive_and_measure, random_dive, random_dives
 
 from aqualvs.control.gains_file import load_gains
 from aqualvs.control.missions import HoldMission
@@ -24,7 +25,6 @@ from aqualvs.follow.case import (
     vehicle_model,
 )
 from aqualvs.follow.log import effort_measures, hold_measures, step_measures
-from aqualvs.follow.monte_carlo import DiveResult, dive_and_measure, random_dive, random_dives
 from aqualvs.follow.sensor_model import SampledSensor
 
 N_RUNS = int(os.environ.get("AQUALVS_LOOP_RUNS", "0"))

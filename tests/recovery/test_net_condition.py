@@ -5,11 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from benchmarks.random_scenes import Difficulty
 
 from aqualvs.nets.condition import NetCondition, NetStretch
 from aqualvs.nets.spectrum import Mesh
 from aqualvs.scanner import Scanner
-from aqualvs.simulation.scenarios import Difficulty, example_rig
+from aqualvs.simulation.scenarios import example_rig
 from aqualvs.sources import open_source
 from net_cases import NetCamera
 from net_dives import Dive, passed_holes, random_dive, true_solidity

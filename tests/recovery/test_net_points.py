@@ -8,6 +8,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import pytest
+from benchmarks.random_scenes import Difficulty, random_scene
 from scipy.spatial import cKDTree
 
 from aqualvs.experiments.mesh_filter import Judged as Reflections
@@ -22,7 +23,7 @@ from aqualvs.scanning.stripe import ThresholdOptions
 from aqualvs.scanning.surfaces import TargetKind
 from aqualvs.simulation.render import RenderedFrame, Renderer
 from aqualvs.simulation.scenario import dome_from_target
-from aqualvs.simulation.scenarios import Difficulty, example_rig, random_scene
+from aqualvs.simulation.scenarios import example_rig
 from aqualvs.simulation.scene import Net, Scene, Wall
 from aqualvs.simulation.scene import SurfaceKind as Kind
 from aqualvs.simulation.truth import visible_fit

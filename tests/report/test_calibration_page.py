@@ -128,9 +128,7 @@ def full_page(words: str = "plain") -> CalibrationPage:
             for used in (True, True, False)
         ),
         parameters=(
-            ParameterRow(
-                name=words, value=1.0, sigma=0.1, unit=words, digits=2, before=1.2, remark=words
-            ),
+            ParameterRow(name=words, value=1.0, sigma=0.1, unit=words, digits=2, before=1.2),
         ),
         expectations=(expectation(0.6),),
         lasers=(laser(name=words, surfaces=words, model=words, moved=words),),
@@ -276,15 +274,15 @@ def test_parameters_tell_what_moved_in_sigmas() -> None:
     rows = (
         ParameterRow(name="x", value=3.08, sigma=0.061, unit="mm", digits=2, before=3.1),
         ParameterRow(name="y", value=41.92, sigma=0.21, unit="mm", digits=2, before=40.2),
-        ParameterRow(name="z", value=-3.0, sigma=0.00234, unit="mm", digits=1, remark="known"),
+        ParameterRow(name="z", value=-3.0, sigma=0.00234, unit="mm", digits=1),
         ParameterRow(name="radius", value=44.25, sigma=None, unit="mm", digits=2),
     )
     html = page_html(CalibrationPage(title="t", parameters=rows))
     head, x, y, z, radius = rows_of(html, "parameters")
     assert head[4:7] == ["before", "change", "change in σ"]
-    assert x == ["x", "3.08", "0.061", "mm", "3.10", "−0.02", "−0.3", ""]
-    assert y == ["y", "41.92", "0.21", "mm", "40.20", "+1.72", "+8.2", ""]
-    assert z == ["z", "−3.0", "0.0023", "mm", "–", "–", "–", "known"]
+    assert x == ["x", "3.08", "0.061", "mm", "3.10", "−0.02", "−0.3"]
+    assert y == ["y", "41.92", "0.21", "mm", "40.20", "+1.72", "+8.2"]
+    assert z == ["z", "−3.0", "0.0023", "mm", "–", "–", "–"]
     assert radius[2] == "held"
     assert re.findall(r'class="refused">(.*?)<', html) == ["+8.2"]
 

@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+from benchmarks.random_scenes import random_scene
 
 from aqualvs.errors import OptionError
-from aqualvs.simulation.scenarios import list_scenarios, load_scenario, random_scene
+from aqualvs.simulation.scenarios import list_scenarios, load_scenario
 
 
 @pytest.mark.parametrize("name", list_scenarios())

@@ -33,51 +33,36 @@ _NAMES, _LOCK = "names.json", "lock"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BatchRequest:
-    """Request for a batch: dives, rig, options and the folder to write.
+    """Request for a batch: dives, rig, options and the folder to write."""
 
-    Attributes
-    ----------
-    dives : tuple of str
-        As `find_dives` takes them.
-    out : Path
-        Folder to write, or of an earlier batch to go on with.
-    rig : Path or None
-        As `find_dives` takes it.
-    water : Water
-    scheduler : str or None
-        Address of a Dask scheduler; None works on this machine.
-    n_workers : int or None
-        Processes on this machine; None for one per core.
-    no_dome : bool
-    fps : float or None
-        Of folders of images.
-    scanner : ScannerOptions
-    chosen : frozenset of str or None
-        As in `RunRequest`.
-    target : str
-    index_target : Path or None
-    report : bool
-        Whether each dive gets its report.
-    net : NetRequest or None
-        What to find out about the net of each dive, if anything; logs are those of the dives.
-    piece_frames : int
-        Frames that a piece of a dive has at least.
-    """
-
+    # As `find_dives` takes them.
     dives: tuple[str, ...]
+    # Folder to write, or of an earlier batch to go on with.
     out: Path
+    # As `find_dives` takes it.
     rig: Path | None = None
+
     water: Water = field(default_factory=Water)
+    # Address of a Dask scheduler; None works on this machine.
     scheduler: str | None = None
+    # Processes on this machine; None for one per core.
     n_workers: int | None = None
+
     no_dome: bool = False
+    # Of folders of images.
     fps: float | None = None
+
     scanner: ScannerOptions = field(default_factory=ScannerOptions)
+    # As in `RunRequest`.
     chosen: frozenset[str] | None = None
+
     target: str = "auto"
     index_target: Path | None = None
+    # Whether each dive gets its report.
     report: bool = True
+    # What to find out about the net of each dive, if anything; logs are those of the dives.
     net: NetRequest | None = None
+    # Frames that a piece of a dive has at least.
     piece_frames: int = PIECE_FRAMES
 
 
@@ -85,18 +70,9 @@ def batch(request: BatchRequest, echo: Callable[[str], object]) -> int:
     """Measure dives, report progress line by line, and write results, summary and data set.
 
     What an earlier batch in the same folder has finished, of the same dives with the same rig,
-    options and versions, is checked and taken as it is.
-
-    Returns
-    -------
-    exit_code : int
-        0 if all dives are finished, 1 if one is not, 128 + signal if it was stopped.
-
-    Raises
-    ------
-    AqualvsError
-        If nothing can be begun: no such dive, a dive without a rig, a folder that cannot be
-        written, no workers.
+    options and versions, is checked and taken as it is. The exit code is 0 if all dives are
+    finished, 1 if one is not, 128 + signal if it was stopped. Raises `AqualvsError` if nothing can
+    be begun: no such dive, a dive without a rig, a folder that cannot be written, no workers.
     """
     _check(request)
     dives = find_dives(request.dives, rig=request.rig, water=request.water, out=request.out)
@@ -237,14 +213,7 @@ def _summary_lines(
 
 
 class BatchProgress(Closing):
-    """Progress of a batch: a bar on a terminal, and a line for each dive; a context manager.
-
-    Parameters
-    ----------
-    n_dives : int
-    echo : callable
-        Takes one line of text.
-    """
+    """Progress of a batch: a bar on a terminal, and a line for each dive; a context manager."""
 
     def __init__(self, n_dives: int, echo: Callable[[str], object]) -> None:
         self._n_dives, self._n_ended, self._n_frames = n_dives, 0, 0

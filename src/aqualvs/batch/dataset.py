@@ -43,7 +43,6 @@ def write_manifest(
 
     Parameters
     ----------
-    folder : Path
     key : str
         What the files were made from.
     facts : mapping
@@ -107,10 +106,7 @@ def drafted(folder: Path) -> Iterator[Path]:
     Two processes may fill the same folder at a time, as when one of them was taken for dead: the
     first to finish wins, and the other's work is dropped.
 
-    Raises
-    ------
-    OSError
-        As the system says it.
+    Raises `OSError` as the system says it.
     """
     draft = folder.with_name(f"{folder.name}.{uuid.uuid4().hex[:8]}.part")
     draft.mkdir(parents=True)
@@ -208,10 +204,7 @@ def put_dive(dataset: Path, name: str, run_folder: Path) -> None:
 
     The points are not stored twice where the file system can give one file two names.
 
-    Raises
-    ------
-    OSError
-        As the system says it.
+    Raises `OSError` as the system says it.
     """
     _put_table(dataset, name, run_folder / POSTURE_CSV, null_words=False)
     with _replacing(_partition(dataset, name, POINTS_PARQUET)) as draft:
@@ -236,7 +229,6 @@ def put_net(dataset: Path, name: str, folder: Path) -> None:
 
     Parameters
     ----------
-    dataset : Path
     name : str
         Of the dive.
     folder : Path
@@ -264,16 +256,8 @@ def drop_net(dataset: Path, name: str) -> None:
 def write_dives(dataset: Path, rows: Iterable[Mapping[str, Any]]) -> None:
     """Write `dives.parquet`.
 
-    Parameters
-    ----------
-    dataset : Path
-    rows : iterable of mappings
-        With the columns of `DIVES_SCHEMA`; absent ones are null.
-
-    Raises
-    ------
-    OSError
-        As the system says it.
+    `rows`: with the columns of `DIVES_SCHEMA`; absent ones are null. Raises `OSError` as the system
+    says it.
     """
     table = pa.Table.from_pylist([dict(row) for row in rows], schema=DIVES_SCHEMA)
     with _replacing(dataset / DIVES_PARQUET) as draft:

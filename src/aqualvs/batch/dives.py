@@ -128,38 +128,20 @@ _KEYS = ("dive", "rig", "name", *_NUMBERS, "log", "log_offset_s")
 
 @dataclass(frozen=True, slots=True)
 class ListedDive:
-    """A dive as the user names it.
-
-    Attributes
-    ----------
-    source : Path
-    rig : Path or None
-        None where the list does not say.
-    name : str
-        Empty where the list does not say.
-    water : Water
-        Nothing where the list does not say.
-    log : Path or None
-        The vehicle's, where the list says it.
-    log_offset_s : float or None
-        Its clock minus the dive's, where the list says it.
-    """
+    """A dive as the user names it."""
 
     source: Path
-    rig: Path | None = None
-    name: str = ""
-    water: Water = field(default_factory=Water)
-    log: Path | None = None
-    log_offset_s: float | None = None
+    rig: Path | None = None  # None where the list does not say.
+    name: str = ""  # Empty where the list does not say.
+    water: Water = field(default_factory=Water)  # Nothing where the list does not say.
+    log: Path | None = None  # The vehicle's, where the list says it.
+    log_offset_s: float | None = None  # Its clock minus the dive's, where the list says it.
 
 
 def read_list(path: Path) -> list[ListedDive]:
     """Read a list of dives.
 
-    Raises
-    ------
-    OptionError
-        If it cannot be read, a row has no dive, or what it says is not understood.
+    Raises `OptionError` if it cannot be read, a row has no dive, or what it says is not understood.
     """
     text = read_text(path, "a list of dives", OptionError)
     rows = list(_csv_rows(text, path) if path.suffix.lower() == ".csv" else _yaml_rows(text, path))
@@ -251,30 +233,14 @@ _RECORDING = ".mcap"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Dive:
-    """A dive to be measured.
+    """A dive to be measured."""
 
-    Attributes
-    ----------
-    source : Path
-        Video, folder of images or recording; absolute.
-    rig : Path or None
-        Absolute; None for a recording, which has its own.
-    name : str
-        As the user calls it; empty if it shall be named after its file.
-    water : Water
-        What the user says about the water of this dive.
-    log : Path or None
-        The vehicle's; absolute.
-    log_offset_s : float or None
-        Its clock minus the dive's, where it is known.
-    """
-
-    source: Path
-    rig: Path | None
-    name: str = ""
-    water: Water = field(default_factory=Water)
-    log: Path | None = None
-    log_offset_s: float | None = None
+    source: Path  # Video, folder of images or recording; absolute.
+    rig: Path | None  # Absolute; None for a recording, which has its own.
+    name: str = ""  # As the user calls it; empty if it shall be named after its file.
+    water: Water = field(default_factory=Water)  # What the user says about the water of this dive.
+    log: Path | None = None  # The vehicle's; absolute.
+    log_offset_s: float | None = None  # Its clock minus the dive's, where it is known.
 
 
 def find_dives(
@@ -422,27 +388,18 @@ class DiveState(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DiveRecord:
-    """Status and results of a dive.
-
-    Attributes
-    ----------
-    name : str
-    source : str
-        Where the dive is.
-    state : DiveState
-    words : str
-        Why it is not finished; empty if it is.
-    facts : mapping
-        From `with_net`; empty without a result.
-    reused : bool
-        Whether an earlier batch had finished it.
-    """
+    """Status and results of a dive."""
 
     name: str
+    # Where the dive is.
     source: str
+
     state: DiveState
+    # Why it is not finished; empty if it is.
     words: str = ""
+    # From `with_net`; empty without a result.
     facts: Mapping[str, Any] = field(default_factory=dict)
+    # Whether an earlier batch had finished it.
     reused: bool = False
 
     @classmethod

@@ -69,33 +69,22 @@ SUMMARY = "summary.npz"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PieceResult:
-    """Outcome of measuring one piece.
+    """Outcome of measuring one piece."""
 
-    Attributes
-    ----------
-    number : int
-        Of the piece in its dive.
-    n_frames, n_valid : int
-        Frames, and those with a posture.
-    duration_s : float
-        Time of the last frame.
-    fault : str
-        What ended the source early; empty if nothing did.
-    cpu_s : float
-        Spent on it, by the process that did it; 0 for one that was finished before.
-    peak_bytes : int
-        Most memory that process had so far.
-    reused : bool
-        Whether it was finished before.
-    """
-
+    # Of the piece in its dive.
     number: int
+    # Frames, and those with a posture.
     n_frames: int
     n_valid: int
+    # Time of the last frame.
     duration_s: float
+    # What ended the source early; empty if nothing did.
     fault: str
+    # Spent on it, by the process that did it; 0 for one that was finished before.
     cpu_s: float = 0.0
+    # Most memory that process had so far.
     peak_bytes: int = 0
+    # Whether it was finished before.
     reused: bool = False
 
 
@@ -123,12 +112,8 @@ def piece_key(probe: DiveProbe, number: int) -> str:
 def measure_piece(work: DiveWork, probe: DiveProbe, number: int) -> PieceResult:
     """Measure one piece of a dive, or take what an earlier batch has finished.
 
-    Raises
-    ------
-    UnlikeProbeError
-        If the piece does not hold what the survey promised.
-    AqualvsError
-        If the dive cannot be read any more, or the piece not be written.
+    Raises `UnlikeProbeError` if the piece does not hold what the survey promised. Raises
+    `AqualvsError` if the dive cannot be read any more, or the piece not be written.
     """
     folder, span = piece_folder(work, probe, number), probe.spans[number]
     key = piece_key(probe, number)
@@ -254,11 +239,7 @@ def _scanner(dive: OpenDive, probe: DiveProbe) -> FrameScanner:
 def joined_summary(dive: OpenDive, pieces: Sequence[Path]) -> RunSummary:
     """Return the summary that a run of the whole dive would have gathered.
 
-    Parameters
-    ----------
-    dive : OpenDive
-    pieces : sequence of Path
-        Folders of all pieces, in order.
+    `pieces`: folders of all pieces, in order.
     """
     summary = summary_for(dive)
     for piece in pieces:
@@ -294,8 +275,6 @@ def join_dive(work: DiveWork, probe: DiveProbe, results: Sequence[PieceResult]) 
 
     Parameters
     ----------
-    work : DiveWork
-    probe : DiveProbe
     results : sequence of PieceResult
         Of all pieces, in order.
 

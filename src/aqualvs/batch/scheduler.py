@@ -63,21 +63,11 @@ _TIMEOUT_S = 30.0
 
 @dataclass(frozen=True, slots=True)
 class FinishedTask:
-    """A task that has ended.
+    """A task that has ended."""
 
-    Attributes
-    ----------
-    token : object
-        As it was submitted.
-    value : object
-        What it returned; None after an error.
-    error : Exception or None
-        What it raised.
-    """
-
-    token: Any
-    value: Any = None
-    error: BaseException | None = None
+    token: Any  # As it was submitted.
+    value: Any = None  # What it returned; None after an error.
+    error: BaseException | None = None  # What it raised.
 
 
 class WorkersLostError(Exception):
@@ -138,10 +128,7 @@ class DaskWorkers(Closing):
     def n_slots(self) -> int:
         """Tasks that can be under way at a time, at least one.
 
-        Raises
-        ------
-        WorkersGoneError
-            If there has been no worker for minutes.
+        Raises `WorkersGoneError` if there has been no worker for minutes.
         """
         now_s = time.monotonic()
         count_every_s = 5.0
@@ -181,10 +168,7 @@ class DaskWorkers(Closing):
     def check_sight(self, path: Path) -> None:
         """Raise unless every worker sees a file and has the same versions as this process.
 
-        Raises
-        ------
-        OptionError
-            If one does not.
+        Raises `OptionError` if one does not.
         """
         mine, option = versions(), f"--scheduler {self._client.scheduler.address}"
         try:
@@ -277,7 +261,6 @@ def with_net(work: DiveWork, key: str, facts: Mapping[str, Any]) -> dict[str, An
 
     Parameters
     ----------
-    work : DiveWork
     key : str
         Of the dive's result, `DiveProbe.key`.
     facts : mapping
@@ -386,10 +369,7 @@ def look(work: DiveWork) -> tuple[DiveProbe, dict[str, Any] | None]:
 
     Then the state of its net is told, if it is wanted and has not been.
 
-    Raises
-    ------
-    AqualvsError
-        If the dive or its rig cannot be used.
+    Raises `AqualvsError` if the dive or its rig cannot be used.
     """
     found = probe(work)
     facts = finished_dive(work, found)
@@ -403,14 +383,9 @@ def join(work: DiveWork, found: DiveProbe, results: Sequence[PieceResult]) -> di
 
 @dataclass(frozen=True, slots=True)
 class Steps:
-    """Tasks of a dive, in the order in which the processes do them.
+    """Tasks of a dive, in the order in which the processes do them."""
 
-    Attributes
-    ----------
-    look, measure, join : callable
-        As `look`, `measure_piece` and `join`.
-    """
-
+    # As `look`, `measure_piece` and `join`.
     look: Callable[[DiveWork], tuple[DiveProbe, dict[str, Any] | None]] = look
     measure: Callable[[DiveWork, DiveProbe, int], PieceResult] = measure_piece
     join: Callable[[DiveWork, DiveProbe, Sequence[PieceResult]], dict[str, Any]] = join
@@ -423,8 +398,6 @@ class Scheduler:
     ----------
     works : sequence of (DiveWork, int)
         The dives with the sizes of their sources in bytes, in the order in which they are begun.
-    workers : Workers
-    observer : BatchObserver
     steps : Steps, optional
         In place of the real ones.
     """

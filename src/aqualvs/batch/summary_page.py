@@ -25,10 +25,7 @@ from aqualvs.text import clock
 def range_steps(ranges: ArrayLike) -> list[float | None]:
     """Return the median range in at most 120 equal parts of a dive, in metres; None without any.
 
-    Parameters
-    ----------
-    ranges : array, shape (N,)
-        Metres, NaN without a posture.
+    `ranges`, shape (N,): metres, NaN without a posture.
     """
     steps = 120
     parts = np.array_split(np.asarray(ranges, np.float64), steps)

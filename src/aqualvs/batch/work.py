@@ -35,27 +35,13 @@ _FORMAT = 3
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DiveWork:
-    """One dive of a batch.
+    """One dive of a batch."""
 
-    Attributes
-    ----------
-    name : str
-        Of the dive in the batch.
-    request : RunRequest
-        The run that the result equals; its `out` is the dive's folder.
-    home : Path
-        Folder for what is finished of the dive, until it is whole.
-    dataset : Path
-        Folder of the batch's Parquet data set.
-    piece_frames : int
-        Frames that a piece has at least.
-    """
-
-    name: str
-    request: RunRequest
-    home: Path
-    dataset: Path
-    piece_frames: int = PIECE_FRAMES
+    name: str  # Of the dive in the batch.
+    request: RunRequest  # The run that the result equals; its `out` is the dive's folder.
+    home: Path  # Folder for what is finished of the dive, until it is whole.
+    dataset: Path  # Folder of the batch's Parquet data set.
+    piece_frames: int = PIECE_FRAMES  # Frames that a piece has at least.
 
 
 def result_key(dive: OpenDive) -> str:
@@ -89,10 +75,7 @@ def digest(facts: Mapping[str, Any]) -> str:
 def content_digest(path: Path | None) -> str | None:
     """Return a text that differs for files of different content; None for no file.
 
-    Raises
-    ------
-    OptionError
-        If the file cannot be read.
+    Raises `OptionError` if the file cannot be read.
     """
     if path is None:
         return None
@@ -108,32 +91,21 @@ _MEMORY = "survey"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DiveProbe:
-    """Result of the first look at a dive: its content, and where it is cut.
+    """Result of the first look at a dive: its content, and where it is cut."""
 
-    Attributes
-    ----------
-    source_key : str
-        Of the dive's content; other pictures give another key.
-    result_key : str
-        Of all else that the result depends on.
-    spans : tuple of Span
-        The pieces, at least one.
-    why_whole : str
-        Why the dive is not cut, where it could be longer than a piece; empty if it is.
-    n_bytes : int
-        Size of the source.
-    n_frames : int or None
-        If known.
-    source : mapping
-        For `run.yaml`.
-    """
-
+    # Of the dive's content; other pictures give another key.
     source_key: str
+    # Of all else that the result depends on.
     result_key: str
+    # The pieces, at least one.
     spans: tuple[Span, ...]
+    # Why the dive is not cut, where it could be longer than a piece; empty if it is.
     why_whole: str
+    # Size of the source.
     n_bytes: int
+    # If known.
     n_frames: int | None
+    # For `run.yaml`.
     source: Mapping[str, Any]
 
     @property
@@ -161,10 +133,7 @@ def probe(work: DiveWork) -> DiveProbe:
 
     Reads the whole file once, unless an earlier look is still valid, but decodes nothing.
 
-    Raises
-    ------
-    AqualvsError
-        If the dive or its rig cannot be used.
+    Raises `AqualvsError` if the dive or its rig cannot be used.
     """
     with open_dive(work.request) as dive:
         found = DiveProbe(

@@ -44,65 +44,44 @@ _COUNT_SUFFIXES = (50, 100, 250, 1000)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BoardRequest:
-    """Request of `aqualvs board`, see its `--help`. Lengths in millimetres, angles in degrees.
+    """Request of `aqualvs board`, see its `--help`. Lengths in millimetres, angles in degrees."""
 
-    Attributes
-    ----------
-    kind : str
-        Kind of target.
-    out : Path
-        `OUT.pdf` and `OUT.yaml` are written.
-    paper : str
-        A4 to A0, letter, WIDTHxHEIGHT, or "fit".
-    squares_x, squares_y : int
-        Of a board, or columns and rows of markers on a plate.
-    square_mm : float or None
-        Side of a square; None takes the largest whole one that the paper holds.
-    marker_mm : float or None
-        Side of a marker; None takes 3/4 of the square on a board, 48 in a box, 12 on a plate.
-    dictionary : str or None
-        None takes the smallest DICT_4X4 on a board, AprilTag 36h11 otherwise.
-    border_mm : float or None
-        Light border; None takes a quarter of a square.
-    width_mm, height_mm, depth_mm : float
-        Of the box, inside.
-    first_id : int
-        Number of the first marker of a box or plate.
-    position_mm : (float, float, float) or None
-        Place of the plate's first corner (top left of its first marker) in `dome`.
-    rotation_deg : (float, float, float)
-        Rotation vector in `dome`, applied to a plate that faces the camera upright.
-    overwrite : bool
-        Whether to replace files that this command wrote before.
-    """
-
+    # Kind of target.
     kind: Literal["charuco", "chessboard", "box", "plate"]
+    # `OUT.pdf` and `OUT.yaml` are written.
     out: Path
+    # A4 to A0, letter, WIDTHxHEIGHT, or "fit".
     paper: str = "a4"
+    # Of a board, or columns and rows of markers on a plate.
     squares_x: int | None = None
     squares_y: int | None = None
+    # Side of a square; None takes the largest whole one that the paper holds.
     square_mm: float | None = None
+    # Side of a marker; None takes 3/4 of the square on a board, 48 in a box, 12 on a plate.
     marker_mm: float | None = None
+    # None takes the smallest DICT_4X4 on a board, AprilTag 36h11 otherwise.
     dictionary: str | None = None
+    # Light border; None takes a quarter of a square.
     border_mm: float | None = None
+    # Of the box, inside.
     width_mm: float = 400.0
     height_mm: float = 380.0
     depth_mm: float = 700.0
+    # Number of the first marker of a box or plate.
     first_id: int = 0
+    # Place of the plate's first corner (top left of its first marker) in `dome`.
     position_mm: tuple[float, float, float] | None = None
+    # Rotation vector in `dome`, applied to a plate that faces the camera upright.
     rotation_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    # Whether to replace files that this command wrote before.
     overwrite: bool = False
 
 
 def print_board(request: BoardRequest, echo: Echo) -> None:
     """Write the PDF and the yaml of a target.
 
-    Raises
-    ------
-    OptionError
-        If the target is impossible, or does not fit the paper.
-    OutputError
-        If a file cannot be written.
+    Raises `OptionError` if the target is impossible, or does not fit the paper. Raises
+    `OutputError` if a file cannot be written.
     """
     out = request.out.with_suffix("") if request.out.suffix == ".pdf" else request.out
     pdf, yaml = out.with_name(f"{out.name}.pdf"), out.with_name(f"{out.name}.yaml")

@@ -49,9 +49,9 @@ class CameraRequest:
     images: tuple[str, ...]
     board: Path
     out: Path
-    nominal: Path | None
-    model: str
-    n_coefficients: int | None
+    nominal: Path | None = None
+    model: str = "opencv"
+    n_coefficients: int | None = None
 
 
 def calibrate_camera(
@@ -113,10 +113,7 @@ def calibrate_camera(
 def run_camera(request: CameraRequest, echo: Echo) -> None:
     """Calibrate the camera and write the rig and its report.
 
-    Raises
-    ------
-    AqualvsError
-        As `calibrate_camera`, or if an output cannot be written.
+    Raises `AqualvsError` as `calibrate_camera`, or if an output cannot be written.
     """
     check_rig_place(request.out)
     done = calibrate_camera(

@@ -57,33 +57,17 @@ _Count = Annotated[int, Field(gt=0)]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Nominal:
-    """Nominal rig, as known from its drawings.
-
-    Attributes
-    ----------
-    name : str
-    size_px : (int, int) or None
-        Image width and height.
-    housing : Dome, FlatPort or None
-    n_air, n_water : float
-    n_lasers : int or None
-    wavelength_nm : float or None
-        Of the lasers; None if unknown, or if they differ.
-    working_range : (float, float)
-        Metres.
-    shutter : Shutter
-        Of the camera.
-    """
+    """Nominal rig, as known from its drawings."""
 
     name: str = "rig"
-    size_px: tuple[int, int] | None = None
+    size_px: tuple[int, int] | None = None  # Image width and height.
     housing: Housing | None = None
     n_air: float = N_AIR
     n_water: float = WATER_N
     n_lasers: int | None = None
-    wavelength_nm: float | None = None
-    working_range: tuple[float, float] = (0.25, 1.3)
-    shutter: Shutter = AT_ONCE
+    wavelength_nm: float | None = None  # Of the lasers; None if unknown, or if they differ.
+    working_range: tuple[float, float] = (0.25, 1.3)  # Metres.
+    shutter: Shutter = AT_ONCE  # Of the camera.
 
 
 class _Part(BaseModel):
@@ -125,10 +109,7 @@ class _File(_Part):
 def load_nominal(path: Path) -> Nominal:
     """Read a nominal rig, or take over what a rig file knows.
 
-    Raises
-    ------
-    RigError
-        One line that names the file, the place in it, the value and the remedy.
+    Raises `RigError` with one line that names the file, the place in it, the value and the remedy.
     """
     what = "a nominal rig or a rig file"
     text = read_text(path, what, RigError)
@@ -202,27 +183,13 @@ Detect: TypeAlias = Callable[[str, Image], View | str]
 
 @dataclass(frozen=True, slots=True)
 class DetectedTargets:
-    """Targets found in a set of pictures.
+    """Targets found in a set of pictures."""
 
-    Attributes
-    ----------
-    views : tuple of View
-        Of the pictures in which the target was found.
-    pictures : tuple of Picture
-        Those pictures.
-    size_px : (int, int)
-        Width and height of every picture.
-    missed : dict
-        Names of pictures in which it was not found, with the reason.
-    pose_notes : tuple of str
-        Remarks on the poses that were given for them.
-    """
-
-    views: tuple[View, ...]
-    pictures: tuple[Picture, ...]
-    size_px: tuple[int, int]
-    missed: dict[str, str]
-    pose_notes: tuple[str, ...] = ()
+    views: tuple[View, ...]  # Of the pictures in which the target was found.
+    pictures: tuple[Picture, ...]  # Those pictures.
+    size_px: tuple[int, int]  # Width and height of every picture.
+    missed: dict[str, str]  # Names of pictures in which it was not found, with the reason.
+    pose_notes: tuple[str, ...] = ()  # Remarks on the poses that were given for them.
 
     @property
     def first(self) -> str:
@@ -318,8 +285,6 @@ def detect_targets(pictures: Sequence[Picture], detect: Detect, target: str) -> 
     ----------
     pictures : sequence of Picture
         Files or pixels; pixels are named by their number.
-    detect : callable
-        Finds the target in one picture.
     target : str
         Name of the target in messages, such as "board.yaml".
 
@@ -379,10 +344,7 @@ def _name_of(picture: Picture, i: int) -> str:
 def read_grey(picture: Picture) -> Image:
     """Read a picture as grey.
 
-    Raises
-    ------
-    CalibrationError
-        If it is no picture.
+    Raises `CalibrationError` if it is no picture.
     """
     if isinstance(picture, str | Path):
         return _read(Path(picture), cv2.IMREAD_GRAYSCALE)
@@ -392,10 +354,7 @@ def read_grey(picture: Picture) -> Image:
 def read_colour(picture: Picture) -> Image:
     """Read a picture as blue, green, red.
 
-    Raises
-    ------
-    CalibrationError
-        If it is no picture.
+    Raises `CalibrationError` if it is no picture.
     """
     if isinstance(picture, str | Path):
         return _read(Path(picture), cv2.IMREAD_COLOR)
@@ -405,10 +364,7 @@ def read_colour(picture: Picture) -> Image:
 def medium_index(word: str | float | None, rig: Rig, default: float) -> float:
     """Return the index of `--medium`: "air", "water" (the rig's), or a number.
 
-    Raises
-    ------
-    OptionError
-        If it is none of these.
+    Raises `OptionError` if it is none of these.
     """
     if word is None:
         return default
@@ -454,10 +410,7 @@ def finish(
 
     A rig and a page that are there already are kept under dated names.
 
-    Raises
-    ------
-    OutputError
-        If one cannot be written, or `out` is a file but no rig.
+    Raises `OutputError` if one cannot be written, or `out` is a file but no rig.
     """
     with writing(out):
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -474,10 +427,7 @@ def finish(
 def check_same_size(rig: Rig, found: DetectedTargets) -> None:
     """Refuse pictures of another size than the rig's.
 
-    Raises
-    ------
-    CalibrationError
-        With both sizes.
+    Raises `CalibrationError` with both sizes.
     """
     if found.size_px != rig.size_px:
         (w, h), (rw, rh) = found.size_px, rig.size_px

@@ -63,20 +63,20 @@ class DomeRequest:
     board: Path
     rig: Path
     out: Path
-    poses: Path | None
-    medium: str
-    water_images: tuple[str, ...]
-    water_board: Path | None
-    water_poses: Path | None
-    inner_radius_mm: float | None
-    thickness_mm: float | None
-    n_acrylic: float | None
-    port_distance_mm: float | None
-    radius_tolerance_mm: float
-    thickness_tolerance_mm: float
-    acrylic_tolerance: float
-    distance_sigma_mm: float
-    refine_intrinsics: bool
+    poses: Path | None = None
+    medium: str = "air"
+    water_images: tuple[str, ...] = ()
+    water_board: Path | None = None
+    water_poses: Path | None = None
+    inner_radius_mm: float | None = None
+    thickness_mm: float | None = None
+    n_acrylic: float | None = None
+    port_distance_mm: float | None = None
+    radius_tolerance_mm: float = 0.1
+    thickness_tolerance_mm: float = 0.1
+    acrylic_tolerance: float = 0.003
+    distance_sigma_mm: float = 0.2
+    refine_intrinsics: bool = True
 
 
 def calibrate_dome(
@@ -151,10 +151,7 @@ def calibrate_dome(
 def run_dome(request: DomeRequest, echo: Echo) -> None:
     """Calibrate the dome and write the rig and its report.
 
-    Raises
-    ------
-    AqualvsError
-        As `calibrate_dome`, or if an output cannot be written.
+    Raises `AqualvsError` as `calibrate_dome`, or if an output cannot be written.
     """
     check_rig_place(request.out)
     rig = _with_housing(load_rig(request.rig, need_lasers=False), request)

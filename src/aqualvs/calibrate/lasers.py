@@ -81,13 +81,13 @@ class LasersRequest:
     images: tuple[str, ...]
     rig: Path
     out: Path
-    box: Path | None
-    board: Path | None
-    medium: str | None
-    n_lasers: int | None
-    names: tuple[str, ...] | None
-    board_offset_mm: float
-    refine: bool
+    box: Path | None = None
+    board: Path | None = None
+    medium: str | None = None
+    n_lasers: int | None = None
+    names: tuple[str, ...] | None = None
+    board_offset_mm: float = 0.0
+    refine: bool = False
     wavelength_nm: float | None = None
 
 
@@ -103,17 +103,11 @@ class _Target:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LasersResult(Calibration[LaserCalibration]):
-    """Result of `calibrate_lasers`.
+    """Result of `calibrate_lasers`."""
 
-    Attributes
-    ----------
-    n_medium : float
-        Index outside of the dome in the pictures.
-    views : tuple of LaserView
-        Corners and stripes of every picture in which the target was found.
-    """
-
+    # Index outside of the dome in the pictures.
     n_medium: float
+    # Corners and stripes of every picture in which the target was found.
     views: tuple[LaserView, ...]
 
 
@@ -208,10 +202,7 @@ def calibrate_lasers(
 def run_lasers(request: LasersRequest, echo: Echo) -> None:
     """Calibrate the lasers and write the rig and its report.
 
-    Raises
-    ------
-    AqualvsError
-        As `calibrate_lasers`, or if an output cannot be written.
+    Raises `AqualvsError` as `calibrate_lasers`, or if an output cannot be written.
     """
     check_rig_place(request.out)
     before = _coloured(load_rig(request.rig, need_lasers=False), request.wavelength_nm)

@@ -55,21 +55,14 @@ class ShutterRequest:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ShutterCalibration:
-    """Readout of a shutter, as a dive shows it.
+    """Readout of a shutter, as a dive shows it."""
 
-    Attributes
-    ----------
-    readout, sigma : float
-        As in `Shutter`, and its standard deviation, in seconds.
-    n_frames : int
-        Frames with a posture.
-    times, parts : array, shape (N,)
-        Middles of the parts of the dive, and the readout of each, in seconds.
-    """
-
+    # As in `Shutter`, and its standard deviation, in seconds.
     readout: float
     sigma: float
+    # Frames with a posture.
     n_frames: int
+    # Shape (N,): middles of the parts of the dive, and the readout of each, in seconds.
     times: FloatArray
     parts: FloatArray
 
@@ -138,10 +131,8 @@ def calibrate_shutter(source: FrameSource, rig: Rig) -> ShutterCalibration:
 def run_shutter(request: ShutterRequest, echo: Echo) -> None:
     """Calibrate the shutter and write the rig with it, and its report.
 
-    Raises
-    ------
-    AqualvsError
-        As `calibrate_shutter`, or if the rig cannot be used or an output not be written.
+    Raises `AqualvsError` as `calibrate_shutter`, or if the rig cannot be used or an output not be
+    written.
     """
     check_rig_place(request.out)
     rig = load_rig(request.rig)

@@ -125,10 +125,7 @@ def calibrate_water(
 def run_water(request: WaterRequest, echo: Echo) -> None:
     """Calibrate the water's index and write the rig in that water, and its report.
 
-    Raises
-    ------
-    AqualvsError
-        As `calibrate_water`, or if an output cannot be written.
+    Raises `AqualvsError` as `calibrate_water`, or if an output cannot be written.
     """
     check_rig_place(request.out)
     rig = load_rig(request.rig, need_lasers=False)

@@ -24,42 +24,25 @@ from aqualvs.optics.water import N_AIR
 
 @dataclass(frozen=True, slots=True)
 class ForeignHousing:
-    """A housing and the media inside and outside of it, in the frame of the camera.
-
-    Attributes
-    ----------
-    housing : Dome or FlatPort
-    n_air, n_water : float
-        Refractive indices.
-    centre : array, shape (3,)
-        Centre of the dome in `cam`, in metres; zero for a flat port, whose origin is the lens.
-    """
+    """A housing and the media inside and outside of it, in the frame of the camera."""
 
     housing: Dome | FlatPort
+    # Refractive indices.
     n_air: float
     n_water: float
+    # Shape (3,): centre of the dome in `cam`, in metres; zero for a flat port, whose origin is the
+    # lens.
     centre: FloatArray = field(default_factory=lambda: np.zeros(3))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ForeignCamera:
-    """What the file of another program says of one camera.
-
-    Attributes
-    ----------
-    name : str
-    size_px : (int, int) or None
-        Image width and height; None where the file does not say it.
-    lens : Lens
-        The centre of the top-left pixel is (0, 0).
-    port : ForeignHousing or None
-        None for a camera without a housing.
-    """
+    """What the file of another program says of one camera."""
 
     name: str
-    size_px: tuple[int, int] | None
-    lens: Lens
-    port: ForeignHousing | None = None
+    size_px: tuple[int, int] | None  # Image width and height; None where the file does not say it.
+    lens: Lens  # The centre of the top-left pixel is (0, 0).
+    port: ForeignHousing | None = None  # None for a camera without a housing.
 
 
 def opencv_lens(core: Sequence[float], distortion: Sequence[float], *, fisheye: bool) -> Lens:
@@ -96,10 +79,7 @@ def opencv_lens(core: Sequence[float], distortion: Sequence[float], *, fisheye: 
 def padded(lens: Lens, n: int) -> tuple[float, ...]:
     """Return n distortion coefficients of a lens, zeros for those that it lacks.
 
-    Raises
-    ------
-    RigError
-        If one that is not zero would be lost.
+    Raises `RigError` if one that is not zero would be lost.
     """
     values = (*lens.distortion, *(0.0,) * n)
     if any(values[n:]):
@@ -175,25 +155,15 @@ _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 
 @dataclass(frozen=True, slots=True)
 class Entries:
-    """A mapping of a file.
-
-    Attributes
-    ----------
-    content : mapping
-    place : str
-        Where it is in the file, such as "cam0."; empty at the top.
-    """
+    """A mapping of a file."""
 
     content: Mapping[Any, Any]
-    place: str = ""
+    place: str = ""  # Where it is in the file, such as "cam0."; empty at the top.
 
     def first(self, keys: Sequence[str]) -> str:
         """Return the first of some keys that there is.
 
-        Raises
-        ------
-        RigError
-            If there is none.
+        Raises `RigError` if there is none.
         """
         for key in keys:
             if self.content.get(key) is not None:
@@ -207,10 +177,7 @@ class Entries:
     def part(self, key: str) -> "Entries":
         """Return the mapping at a key.
 
-        Raises
-        ------
-        RigError
-            If there is none.
+        Raises `RigError` if there is none.
         """
         value = self.content.get(key)
         if not isinstance(value, Mapping):
@@ -244,10 +211,7 @@ class Entries:
     def numbers(self, *keys: str) -> list[float]:
         """Return the numbers of a list, matrix or vector at the first of some keys that there is.
 
-        Raises
-        ------
-        RigError
-            If it holds anything else, or not as many numbers as it says.
+        Raises `RigError` if it holds anything else, or not as many numbers as it says.
         """
         key = self.first(keys)
         value, place = self.content[key], self.place + key
@@ -271,10 +235,7 @@ class Entries:
     def listed(self, n: int, *keys: str) -> list[float]:
         """Return the numbers at the first of some keys that there is, which must be n.
 
-        Raises
-        ------
-        RigError
-            If it holds anything else.
+        Raises `RigError` if it holds anything else.
         """
         values = self.numbers(*keys)
         if len(values) != n:
@@ -291,10 +252,7 @@ class Entries:
     def core(self, *keys: str) -> tuple[float, float, float, float]:
         """Return fx, fy, cx, cy of the camera matrix at the first of some keys that there is.
 
-        Raises
-        ------
-        RigError
-            If it is no camera matrix, or has skew.
+        Raises `RigError` if it is no camera matrix, or has skew.
         """
         key = self.place + self.first(keys)
         fx, skew, cx, zero, fy, cy, *last = self.listed(9, *keys)
@@ -308,10 +266,7 @@ class Entries:
 def number(value: object, place: str) -> float:
     """Return a value as a finite number.
 
-    Raises
-    ------
-    RigError
-        If it is none.
+    Raises `RigError` if it is none.
     """
     longest_number = 40
     if isinstance(value, str) and len(value) < longest_number and _NUMBER.fullmatch(value.strip()):
@@ -324,10 +279,7 @@ def number(value: object, place: str) -> float:
 def whole(value: float, place: str) -> int:
     """Return a number as a whole one.
 
-    Raises
-    ------
-    RigError
-        If it is none, or larger than any size of a picture.
+    Raises `RigError` if it is none, or larger than any size of a picture.
     """
     largest = 1e9
     if value != math.floor(value) or not 0 <= value <= largest:

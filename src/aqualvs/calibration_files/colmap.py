@@ -66,16 +66,8 @@ class _Row(NamedTuple):
 def read_colmap(text: str, source: str, *, name: str | None = None) -> ForeignCamera:
     """Return one camera of a `cameras.txt`.
 
-    Parameters
-    ----------
-    text, source : str
-    name : str, optional
-        CAMERA_ID; needed where there are several.
-
-    Raises
-    ------
-    RigError
-        One line without the file's name.
+    `name`: CAMERA_ID; needed where there are several. Raises `RigError` with one line without the
+    file's name.
     """
     rows: dict[str, _Row] = {}
     for n_line, line in enumerate(text.splitlines(), 1):
@@ -160,16 +152,8 @@ def _named(words: Sequence[str], names: Sequence[str], place: str) -> Mapping[st
 def colmap_text(camera: ForeignCamera, *, refractive: bool) -> str:
     """Return the `cameras.txt` of one camera.
 
-    Parameters
-    ----------
-    camera : ForeignCamera
-    refractive : bool
-        Whether to write the housing, for Refractive COLMAP.
-
-    Raises
-    ------
-    RigError
-        If there is no housing to write.
+    `refractive`: whether to write the housing, for Refractive COLMAP. Raises `RigError` if there is
+    no housing to write.
     """
     if refractive and camera.port is None:
         raise RigError(

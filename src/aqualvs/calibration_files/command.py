@@ -42,10 +42,7 @@ _WHAT = "a calibration file of another program"
 def format_of(path: Path) -> tuple[CalibrationFormat, str]:
     """Return the format of a file, and its text.
 
-    Raises
-    ------
-    RigError
-        If the file cannot be read, or is of none of the formats.
+    Raises `RigError` if the file cannot be read, or is of none of the formats.
     """
     text = read_text(path, _WHAT, RigError)
     found = recognised(text)
@@ -71,7 +68,6 @@ def read_camera(
 
     Parameters
     ----------
-    path : str or Path
     camera : str, optional
         Name of the camera, where a file of Kalibr or COLMAP holds several.
     model : str, optional
@@ -100,10 +96,7 @@ def read_camera(
 def read_board(path: str | Path) -> Board:
     """Read a board from a target file of Kalibr.
 
-    Raises
-    ------
-    RigError
-        One line that names the file, the value and the remedy.
+    Raises `RigError` with one line that names the file, the value and the remedy.
     """
     found, text = format_of(Path(path))
     with _naming(path):
@@ -117,7 +110,6 @@ def camera_text(camera: ForeignCamera, to: str, *, suffix: str = "") -> str:
 
     Parameters
     ----------
-    camera : ForeignCamera
     to : str
         One of `EXPORTS`.
     suffix : str
@@ -185,10 +177,8 @@ class ExportRequest:
 def run_import(request: ImportRequest, echo: Echo) -> None:
     """Write the rig or the board of a calibration file.
 
-    Raises
-    ------
-    AqualvsError
-        If the file cannot be read, holds what aqualvs lacks, or the output cannot be written.
+    Raises `AqualvsError` if the file cannot be read, holds what aqualvs lacks, or the output cannot
+    be written.
     """
     found, _ = format_of(request.source)
     what = request.what or ("board" if found is CalibrationFormat.KALIBR_TARGET else "rig")
@@ -258,10 +248,8 @@ def _remarks(rig: Rig, *, dropped: bool) -> list[str]:
 def run_export(request: ExportRequest, echo: Echo) -> None:
     """Write the camera of a rig in the format of another program.
 
-    Raises
-    ------
-    AqualvsError
-        If the rig cannot be read, the format cannot hold it, or the file cannot be written.
+    Raises `AqualvsError` if the rig cannot be read, the format cannot hold it, or the file cannot
+    be written.
     """
     rig = load_rig(request.rig, need_lasers=False)
     try:

@@ -24,16 +24,8 @@ _DISTORTIONS = {
 def read_kalibr(text: str, source: str, *, name: str | None = None) -> ForeignCamera:
     """Return one camera of a `camchain.yaml`.
 
-    Parameters
-    ----------
-    text, source : str
-    name : str, optional
-        Key of the camera, such as "cam0"; needed where there are several.
-
-    Raises
-    ------
-    RigError
-        One line without the file's name, but for faults of the YAML.
+    `name`: key of the camera, such as "cam0"; needed where there are several. Raises `RigError`
+    with one line without the file's name, but for faults of the YAML.
     """
     content = parse_yaml(text, source, RigError)
     if not isinstance(content, Mapping):
@@ -72,10 +64,7 @@ def read_kalibr(text: str, source: str, *, name: str | None = None) -> ForeignCa
 def one_of(cameras: list[str], name: str | None) -> str:
     """Return the name of the camera that is meant.
 
-    Raises
-    ------
-    RigError
-        If there is none, or which one is not said.
+    Raises `RigError` if there is none, or which one is not said.
     """
     listed = ", ".join(cameras[:20])
     if not cameras:
@@ -90,10 +79,7 @@ def one_of(cameras: list[str], name: str | None) -> str:
 def kalibr_text(camera: ForeignCamera) -> str:
     """Return the `camchain.yaml` of one camera.
 
-    Raises
-    ------
-    RigError
-        If Kalibr lacks the camera's model.
+    Raises `RigError` if Kalibr lacks the camera's model.
     """
     lens = camera.lens
     if lens.model is LensModel.FISHEYE:
@@ -117,11 +103,8 @@ def kalibr_text(camera: ForeignCamera) -> str:
 def read_kalibr_target(text: str, source: str) -> Board:
     """Return the board of a target file.
 
-    Raises
-    ------
-    RigError
-        One line without the file's name, but for faults of the YAML; also for targets that aqualvs
-        does not find in pictures.
+    Raises `RigError` with one line without the file's name, but for faults of the YAML; also for
+    targets that aqualvs does not find in pictures.
     """
     content = parse_yaml(text, source, RigError)
     if not isinstance(content, Mapping):

@@ -32,10 +32,7 @@ _FISHEYE = "equidistant"
 def read_ros(text: str, source: str) -> ForeignCamera:
     """Return the camera of a `camera_info.yaml`, or of a printed sensor_msgs/CameraInfo.
 
-    Raises
-    ------
-    RigError
-        One line without the file's name, but for faults of the YAML.
+    Raises `RigError` with one line without the file's name, but for faults of the YAML.
     """
     # `ros2 topic echo` ends each message with this line.
     content = parse_yaml(re.sub(r"(?:^---\s*)+\Z", "", text, flags=re.MULTILINE), source, RigError)
@@ -145,16 +142,8 @@ _SIZES = ("image_size", "imageSize", "cameraResolution", "resolution")
 def read_opencv(text: str, source: str, *, model: str | None = None) -> ForeignCamera:
     """Return the camera of a FileStorage in YAML, XML or JSON.
 
-    Parameters
-    ----------
-    text, source : str
-    model : str, optional
-        "opencv" or "fisheye" where the file does not say it (`fisheye_model`).
-
-    Raises
-    ------
-    RigError
-        One line without the file's name, but for faults of the YAML.
+    `model`: "opencv" or "fisheye" where the file does not say it (`fisheye_model`). Raises
+    `RigError` with one line without the file's name, but for faults of the YAML.
     """
     entries = _storage(text, source)
     core = entries.core(*_MATRIX)
@@ -233,10 +222,7 @@ _COUNTS = {
 def read_mrcal(text: str, source: str) -> ForeignCamera:
     """Return the camera of a `.cameramodel`.
 
-    Raises
-    ------
-    RigError
-        One line without the file's name.
+    Raises `RigError` with one line without the file's name.
     """
     try:
         with warnings.catch_warnings():
@@ -265,10 +251,7 @@ def read_mrcal(text: str, source: str) -> ForeignCamera:
 def mrcal_text(camera: ForeignCamera) -> str:
     """Return the `.cameramodel` of a camera.
 
-    Raises
-    ------
-    RigError
-        If mrcal lacks the camera's model.
+    Raises `RigError` if mrcal lacks the camera's model.
     """
     lens = camera.lens
     if lens.model is LensModel.FISHEYE:

@@ -44,20 +44,13 @@ _ROUNDING = 1e-12
 
 @dataclass(frozen=True, slots=True)
 class RigDifference:
-    """Changes of the numbers that two rigs share.
+    """Changes of the numbers that two rigs share."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        As `RigUncertainty.names` has them; lasers are those of the old rig.
-    change : array, shape (P,)
-        New minus old, SI units and radians.
-    covariance : array, shape (P, P)
-        Of `change`; zero where neither rig says how well it is known.
-    """
-
+    # As `RigUncertainty.names` has them; lasers are those of the old rig.
     names: tuple[str, ...]
+    # Shape (P,): new minus old, SI units and radians.
     change: FloatArray
+    # Shape (P, P): of `change`; zero where neither rig says how well it is known.
     covariance: FloatArray
 
     def of(self, name: str) -> float:
@@ -227,27 +220,18 @@ _SCALES = {"mm": 1e3, "deg": math.degrees(1.0)}
 
 @dataclass(frozen=True, slots=True)
 class ComparedPart:
-    """A part of a rig and how it has changed.
+    """A part of a rig and how it has changed."""
 
-    Attributes
-    ----------
-    name : str
-        As the verdict calls it.
-    did, stayed : str
-        What it did or did not, in words: "moved by 0.4 mm", "stayed".
-    sigmas : float or None
-        How many sigmas that is; None where no sigma is known.
-    moved : bool
-        Whether that is more than chance, or, without sigmas, more than what matters.
-    matters : bool
-        Whether it is enough to be seen in a dive.
-    """
-
+    # As the verdict calls it.
     name: str
+    # What it did or did not, in words: "moved by 0.4 mm", "stayed".
     did: str
     stayed: str
+    # How many sigmas that is; None where no sigma is known.
     sigmas: float | None
+    # Whether that is more than chance, or, without sigmas, more than what matters.
     moved: bool
+    # Whether it is enough to be seen in a dive.
     matters: bool
 
     @property
@@ -274,10 +258,8 @@ def last_calibration(path: Path) -> Path:
     Steps that follow one another within half a day are one calibration, of which every step leaves
     a copy.
 
-    Raises
-    ------
-    RigError
-        If the rig notes no calibration, or no copy of an earlier one is kept beside it.
+    Raises `RigError` if the rig notes no calibration, or no copy of an earlier one is kept beside
+    it.
     """
     dates = {
         name: step.date for name, step in solved_steps(load_rig(path, need_lasers=False)).items()
@@ -306,10 +288,7 @@ def last_calibration(path: Path) -> Path:
 def run_compare(new: Path, old: Path, console: Console | None = None) -> int:
     """Compare two rig files, print what has changed, and return the exit code 0.
 
-    Raises
-    ------
-    RigError
-        If one of the files is not a rig file.
+    Raises `RigError` if one of the files is not a rig file.
     """
     new_rig, new_uncertainty = _loaded(new)
     old_rig, old_uncertainty = _loaded(old)

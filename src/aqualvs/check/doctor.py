@@ -74,7 +74,6 @@ def autopilot(address: str, vehicle: VehicleSetup, rig: Path | None = None) -> I
     ----------
     address : str
         As in `parse_address`.
-    vehicle : VehicleSetup
     rig : Path or None
         Whose working range the autopilot's rangefinder should take.
     """
@@ -200,33 +199,22 @@ _STREAM_S = 8.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DoctorRequest:
-    """Things to check beyond the machine itself: stream, rig, autopilot.
+    """Things to check beyond the machine itself: stream, rig, autopilot."""
 
-    Attributes
-    ----------
-    source : str or None
-        Stream, camera or file.
-    rig : Path or None
-        Rig that the pictures should fit.
-    mavlink : str or None
-        Address of an autopilot.
-    vehicle : VehicleSetup
-        Who is to be there, and how it is to be steered.
-    """
-
+    # Stream, camera or file.
     source: str | None = None
+    # Rig that the pictures should fit.
     rig: Path | None = None
+    # Address of an autopilot.
     mavlink: str | None = None
+    # Who is to be there, and how it is to be steered.
     vehicle: VehicleSetup = field(default_factory=VehicleSetup)
 
 
 def run_doctor(request: DoctorRequest, console: Console | None = None) -> None:
     """Look at everything and print what was found.
 
-    Raises
-    ------
-    AqualvsError
-        At the end, if something does not work: the first such finding.
+    Raises `AqualvsError` at the end, if something does not work: the first such finding.
     """
     console = console or Console()
     console.print(f"aqualvs {__version__}", style="bold", highlight=False)

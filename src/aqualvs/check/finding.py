@@ -37,17 +37,10 @@ class Severity(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One thing found about a rig.
-
-    Attributes
-    ----------
-    severity : Severity
-    sentence : str
-        What was found, with the value, and the remedy where one is needed.
-    """
+    """One thing found about a rig."""
 
     severity: Severity
-    sentence: str
+    sentence: str  # What was found, with the value, and the remedy where one is needed.
 
 
 def findings_table(findings: Sequence[Finding]) -> Table:

@@ -65,7 +65,6 @@ def check_solved(
 
     Parameters
     ----------
-    rig : Rig
     steps : dict of SolvedStep
         As `solved_steps` gives them.
     uncertainty : RigUncertainty
@@ -258,15 +257,8 @@ EXIT_SANE, EXIT_BAD = 0, 2
 def run_check(path: Path, console: Console | None = None) -> int:
     """Check a rig file, print what was found, and return the exit code.
 
-    Returns
-    -------
-    int
-        0 where the rig is sane, warnings allowed; 2 where something is bad.
-
-    Raises
-    ------
-    RigError
-        If the file is not a rig file.
+    It is 0 where the rig is sane, warnings allowed, and 2 where something is bad. Raises `RigError`
+    if the file is not a rig file.
     """
     rig = load_rig(path, need_lasers=False)
     console = console or Console()
@@ -292,17 +284,8 @@ def run_check(path: Path, console: Console | None = None) -> int:
 def check_rig(rig: Rig, now: datetime | None = None) -> list[Finding]:
     """Return everything worth saying about a rig, in the order in which light passes it.
 
-    Parameters
-    ----------
-    rig : Rig
-    now : datetime, optional
-        With a time zone; calibrations are as old as it makes them. The computer's clock if left
-        out.
-
-    Raises
-    ------
-    RigError
-        If what calibrations have noted down in the rig cannot be understood.
+    `now`: with a time zone; calibrations are as old as it makes them. The computer's clock if left
+    out. Raises `RigError` if what calibrations have noted down in the rig cannot be understood.
     """
     camera, uncertainty = rig.camera(), rig_uncertainty(rig)
     shutter = shutter_finding(rig)

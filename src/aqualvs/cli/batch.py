@@ -29,34 +29,24 @@ def batch(
             help="Videos, recordings, folders, patterns such as 'dives/**/*.mp4', or a list (CSV "
             "or YAML) with columns dive, rig, name, water_n, temperature_c, salinity, log, "
             "log_offset_s.",
-            show_default=False,
         ),
     ],
-    out: Annotated[
-        Path,
-        typer.Option("--out", "-o", help="Folder to write, or to go on with.", show_default=False),
-    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write, or to go on with.")],
     rig: Annotated[
         Path | None,
         typer.Option(
-            help="Rig file of all dives; if left out, NAME.rig.yaml or rig.yaml beside each dive.",
-            show_default=False,
+            help="Rig file of all dives; if left out, NAME.rig.yaml or rig.yaml beside each dive."
         ),
     ] = None,
     workers: Annotated[
         int | None,
-        typer.Option(
-            max=MAX_WORKERS,
-            help="Processes on this machine; one per core by default.",
-            show_default=False,
-        ),
+        typer.Option(max=MAX_WORKERS, help="Processes on this machine; one per core by default."),
     ] = None,
     scheduler: Annotated[
         str | None,
         typer.Option(
             metavar="URL",
             help="Dask scheduler whose workers do it, such as tcp://192.168.1.10:8786.",
-            show_default=False,
         ),
     ] = None,
     target: Target = "auto",
@@ -67,15 +57,12 @@ def batch(
     temperature_c: Celsius = None,
     salinity: Salinity = None,
     dome: Refraction = True,
-    fps: Annotated[
-        float | None, typer.Option(help="Frame rate of folders of images.", show_default=False)
-    ] = None,
+    fps: Annotated[float | None, typer.Option(help="Frame rate of folders of images.")] = None,
     index_target: Annotated[
         Path | None,
         typer.Option(
             help="Target on the vehicle (target.yaml) that tells the water's index on the way; "
-            "dives are then not cut.",
-            show_default=False,
+            "dives are then not cut."
         ),
     ] = None,
     report: Annotated[bool, typer.Option(help="Write report.html for each dive.")] = True,
@@ -89,15 +76,10 @@ def batch(
     ] = False,
     twine_mm: Annotated[
         float | None,
-        typer.Option(
-            help="With --net: diameter of the bare twine, where it is known.", show_default=False
-        ),
+        typer.Option(help="With --net: diameter of the bare twine, where it is known."),
     ] = None,
     stretch_m: Annotated[
-        float | None,
-        typer.Option(
-            help="With --net: length of a stretch of net, 0.5 by default.", show_default=False
-        ),
+        float | None, typer.Option(help="With --net: length of a stretch of net, 0.5 by default.")
     ] = None,
 ) -> None:
     """Measure many dives."""

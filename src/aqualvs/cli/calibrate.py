@@ -20,19 +20,12 @@ calibrate = typer.Typer(
 Pictures = Annotated[
     list[str], typer.Argument(help="Pictures, folders of them, or patterns such as 'air/*.png'.")
 ]
-BoardFile = Annotated[
-    Path, typer.Option("--board", help="Board in the pictures (board.yaml).", show_default=False)
-]
-RigIn = Annotated[
-    Path, typer.Option("--rig", help="Rig file of the step before.", show_default=False)
-]
+BoardFile = Annotated[Path, typer.Option("--board", help="Board in the pictures (board.yaml).")]
+RigIn = Annotated[Path, typer.Option("--rig", help="Rig file of the step before.")]
 RigOut = Annotated[
     Path,
     typer.Option(
-        "--out",
-        "-o",
-        help="Rig file to write; one that is there is kept under a dated name.",
-        show_default=False,
+        "--out", "-o", help="Rig file to write; one that is there is kept under a dated name."
     ),
 ]
 Medium = Annotated[
@@ -57,8 +50,7 @@ def camera(
     nominal: Annotated[
         Path | None,
         typer.Option(
-            help="What is known of the rig beforehand: a rig file, or name, dome and lasers.",
-            show_default=False,
+            help="What is known of the rig beforehand: a rig file, or name, dome and lasers."
         ),
     ] = None,
     model: Annotated[
@@ -101,36 +93,26 @@ def dome(
     poses: Annotated[
         Path | None,
         typer.Option(
-            help="What is known of the boards' poses (poses.csv): distances, or full poses.",
-            show_default=False,
+            help="What is known of the boards' poses (poses.csv): distances, or full poses."
         ),
     ] = None,
     medium: Medium = "air",
     water_images: Annotated[
-        list[str] | None,
-        typer.Option(help="Further pictures, taken in water; repeatable.", show_default=False),
+        list[str] | None, typer.Option(help="Further pictures, taken in water; repeatable.")
     ] = None,
     water_board: Annotated[
-        Path | None,
-        typer.Option(help="Board of those, if it is another one.", show_default=False),
+        Path | None, typer.Option(help="Board of those, if it is another one.")
     ] = None,
-    water_poses: Annotated[
-        Path | None, typer.Option(help="Poses of those.", show_default=False)
-    ] = None,
-    inner_radius_mm: Annotated[
-        float | None, typer.Option(help="Inner radius of the dome.", show_default=False)
-    ] = None,
-    thickness_mm: Annotated[
-        float | None, typer.Option(help="Thickness of the housing.", show_default=False)
-    ] = None,
+    water_poses: Annotated[Path | None, typer.Option(help="Poses of those.")] = None,
+    inner_radius_mm: Annotated[float | None, typer.Option(help="Inner radius of the dome.")] = None,
+    thickness_mm: Annotated[float | None, typer.Option(help="Thickness of the housing.")] = None,
     n_acrylic: Annotated[
-        float | None, typer.Option(help="Index of the housing's material.", show_default=False)
+        float | None, typer.Option(help="Index of the housing's material.")
     ] = None,
     port_distance_mm: Annotated[
         float | None,
         typer.Option(
-            help="Distance of a flat port from the lens, in place of a dome: an initial guess.",
-            show_default=False,
+            help="Distance of a flat port from the lens, in place of a dome: an initial guess."
         ),
     ] = None,
     radius_tolerance_mm: Annotated[
@@ -191,28 +173,22 @@ def lasers(
     images: Pictures,
     rig: RigIn,
     out: RigOut,
-    box: Annotated[
-        Path | None, typer.Option(help="Box of markers (box.yaml).", show_default=False)
-    ] = None,
+    box: Annotated[Path | None, typer.Option(help="Box of markers (box.yaml).")] = None,
     board: Annotated[
-        Path | None,
-        typer.Option(help="Board on the plane that the stripes lie on.", show_default=False),
+        Path | None, typer.Option(help="Board on the plane that the stripes lie on.")
     ] = None,
     medium: Medium = None,
     n_lasers: Annotated[
-        int | None,
-        typer.Option("--lasers", help="How many there are, if known.", show_default=False),
+        int | None, typer.Option("--lasers", help="How many there are, if known.")
     ] = None,
     names: Annotated[
-        str | None,
-        typer.Option(metavar="A,B,C", help="Names, left to right by image.", show_default=False),
+        str | None, typer.Option(metavar="A,B,C", help="Names, left to right by image.")
     ] = None,
     wavelength_nm: Annotated[
         float | None,
         typer.Option(
             help="Wavelength of the lasers, for example 650 for red ones; without it that of the "
-            "rig's lasers, or else green.",
-            show_default=False,
+            "rig's lasers, or else green."
         ),
     ] = None,
     board_offset_mm: Annotated[
@@ -253,17 +229,12 @@ def lasers(
 )
 def water(
     source: Annotated[list[str], typer.Argument(help="Video, pictures, or a folder of them.")],
-    target: Annotated[
-        Path,
-        typer.Option(help="Target on the vehicle (target.yaml).", show_default=False),
-    ],
+    target: Annotated[Path, typer.Option(help="Target on the vehicle (target.yaml).")],
     rig: RigIn,
     out: RigOut,
     temperature_c: Celsius = None,
     salinity: Salinity = None,
-    fps: Annotated[
-        float | None, typer.Option(help="Frame rate of pictures.", show_default=False)
-    ] = None,
+    fps: Annotated[float | None, typer.Option(help="Frame rate of pictures.")] = None,
     place_sigma_mm: Annotated[
         float, typer.Option(help="How well the target's place is known (one sigma).")
     ] = 0.2,
@@ -300,9 +271,7 @@ def shutter(
     source: Annotated[str, typer.Argument(help="Video, or a folder of pictures.")],
     rig: RigIn,
     out: RigOut,
-    fps: Annotated[
-        float | None, typer.Option(help="Frame rate of pictures.", show_default=False)
-    ] = None,
+    fps: Annotated[float | None, typer.Option(help="Frame rate of pictures.")] = None,
 ) -> None:
     """Calibrate the shutter."""
     from aqualvs.calibrate import shutter as body
@@ -321,32 +290,22 @@ def board(
             "of markers, fixed on the vehicle, for the water."
         ),
     ],
-    out: Annotated[
-        Path,
-        typer.Option("--out", "-o", help="OUT.pdf and OUT.yaml are written.", show_default=False),
-    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="OUT.pdf and OUT.yaml are written.")],
     paper: Annotated[
         str, typer.Option(metavar="a4..a0|letter|WxH|fit", help="Paper; WxH in millimetres.")
     ] = "a4",
     squares_x: Annotated[
-        int | None, typer.Option(help="Squares, or markers of a plate, across.", show_default=False)
+        int | None, typer.Option(help="Squares, or markers of a plate, across.")
     ] = None,
     squares_y: Annotated[
-        int | None, typer.Option(help="Squares, or markers of a plate, down.", show_default=False)
+        int | None, typer.Option(help="Squares, or markers of a plate, down.")
     ] = None,
     square_mm: Annotated[
-        float | None,
-        typer.Option(help="Side of a square; as large as fits if left out.", show_default=False),
+        float | None, typer.Option(help="Side of a square; as large as fits if left out.")
     ] = None,
-    marker_mm: Annotated[
-        float | None, typer.Option(help="Side of a marker.", show_default=False)
-    ] = None,
-    dictionary: Annotated[
-        str | None, typer.Option(help="OpenCV's name of the markers.", show_default=False)
-    ] = None,
-    border_mm: Annotated[
-        float | None, typer.Option(help="Light border of a board.", show_default=False)
-    ] = None,
+    marker_mm: Annotated[float | None, typer.Option(help="Side of a marker.")] = None,
+    dictionary: Annotated[str | None, typer.Option(help="OpenCV's name of the markers.")] = None,
+    border_mm: Annotated[float | None, typer.Option(help="Light border of a board.")] = None,
     width_mm: Annotated[float, typer.Option(help="Width of the box, inside.")] = 400.0,
     height_mm: Annotated[float, typer.Option(help="Height of the box, inside.")] = 380.0,
     depth_mm: Annotated[float, typer.Option(help="Depth of the box, inside.")] = 700.0,
@@ -354,9 +313,7 @@ def board(
     position_mm: Annotated[
         tuple[float, float, float] | None,
         typer.Option(
-            metavar="X Y Z",
-            help="Where the plate's first corner is in the dome's frame.",
-            show_default=False,
+            metavar="X Y Z", help="Where the plate's first corner is in the dome's frame."
         ),
     ] = None,
     rotation_deg: Annotated[
@@ -406,7 +363,6 @@ def import_file(
             "-o",
             help="Rig file to write, or board.yaml; a rig that is there is kept under a dated "
             "name.",
-            show_default=False,
         ),
     ],
     what: Annotated[
@@ -415,27 +371,17 @@ def import_file(
             "--as",
             help="camera: the intrinsics alone; rig: the dome too, if the file has one; board: a "
             "target of Kalibr. Without it, all that the file holds.",
-            show_default=False,
         ),
     ] = None,
     camera: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME", help="Which camera, if there are several.", show_default=False
-        ),
+        str | None, typer.Option(metavar="NAME", help="Which camera, if there are several.")
     ] = None,
     model: Annotated[
         Literal["opencv", "fisheye"] | None,
-        typer.Option(
-            help="Distortion model, where a FileStorage of OpenCV does not say it.",
-            show_default=False,
-        ),
+        typer.Option(help="Distortion model, where a FileStorage of OpenCV does not say it."),
     ] = None,
     image: Annotated[
-        str | None,
-        typer.Option(
-            metavar="WxH", help="Size of the pictures, if the file lacks it.", show_default=False
-        ),
+        str | None, typer.Option(metavar="WxH", help="Size of the pictures, if the file lacks it.")
     ] = None,
     overwrite: Overwrite = False,
 ) -> None:
@@ -465,10 +411,7 @@ def export(
     out: Annotated[
         Path,
         typer.Option(
-            "--out",
-            "-o",
-            help="File to write; .xml and .json choose the form of a FileStorage.",
-            show_default=False,
+            "--out", "-o", help="File to write; .xml and .json choose the form of a FileStorage."
         ),
     ],
     overwrite: Overwrite = False,

@@ -57,15 +57,9 @@ Fit = Annotated[
     Literal["robust", "pseudo_inverse"],
     typer.Option(help="Plane fit; pseudo_inverse is the paper's, for comparison."),
 ]
-WaterIndex = Annotated[
-    float | None, typer.Option(help="Refractive index of the water.", show_default=False)
-]
-Celsius = Annotated[
-    float | None, typer.Option(help="Water temperature, for its index.", show_default=False)
-]
-Salinity = Annotated[
-    float | None, typer.Option(help="Salinity in per mille, for its index.", show_default=False)
-]
+WaterIndex = Annotated[float | None, typer.Option(help="Refractive index of the water.")]
+Celsius = Annotated[float | None, typer.Option(help="Water temperature, for its index.")]
+Salinity = Annotated[float | None, typer.Option(help="Salinity in per mille, for its index.")]
 Refraction = Annotated[
     bool,
     typer.Option("--dome/--no-dome", help="Refract at the dome or the flat port, or ignore it."),
@@ -73,8 +67,7 @@ Refraction = Annotated[
 IndexTarget = Annotated[
     Path | None,
     typer.Option(
-        help="Target on the vehicle (target.yaml) that tells the water's index on the way.",
-        show_default=False,
+        help="Target on the vehicle (target.yaml) that tells the water's index on the way."
     ),
 ]
 VehicleFileOption = Annotated[
@@ -83,7 +76,6 @@ VehicleFileOption = Annotated[
         "--vehicle-file",
         metavar="FILE",
         help="MAVLink: system ids, ground station, modes, peers, key (YAML; docs/ardusub.md).",
-        show_default=False,
     ),
 ]
 MavlinkPeer = Annotated[
@@ -99,7 +91,6 @@ MavlinkKey = Annotated[
     typer.Option(
         metavar="FILE",
         help="MAVLink: sign, and hear nobody without this key; a passphrase or 64 hex digits.",
-        show_default=False,
     ),
 ]
 
@@ -127,10 +118,7 @@ class CheckedCommand(TyperCommand):
     def invoke(self, ctx: Any) -> Any:
         """Check the values and run the command.
 
-        Raises
-        ------
-        OptionError
-            With the option and its value.
+        Raises `OptionError` with the option and its value.
         """
         for parameter in self.params:
             for value in _plain(ctx.params.get(parameter.name)):

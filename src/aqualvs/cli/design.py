@@ -11,67 +11,41 @@ from aqualvs.cli.command import Overwrite
 
 def design(
     file: Annotated[
-        Path | None,
-        typer.Argument(metavar="[DESIGN]", help="Design file (YAML).", show_default=False),
+        Path | None, typer.Argument(metavar="[DESIGN]", help="Design file (YAML).")
     ] = None,
     example: Annotated[
         bool, typer.Option("--example", help="Print a design file to begin with, and end.")
     ] = False,
     rig: Annotated[
-        Path | None,
-        typer.Option(
-            help="Rig file of a rig that exists, in a design's place.", show_default=False
-        ),
+        Path | None, typer.Option(help="Rig file of a rig that exists, in a design's place.")
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(
-            "--out",
-            "-o",
-            help="Folder for rig.yaml, design.html and its pictures.",
-            show_default=False,
-        ),
+        typer.Option("--out", "-o", help="Folder for rig.yaml, design.html and its pictures."),
     ] = None,
     image: Annotated[
-        str | None,
-        typer.Option(metavar="WIDTHxHEIGHT", help="Size of the picture.", show_default=False),
+        str | None, typer.Option(metavar="WIDTHxHEIGHT", help="Size of the picture.")
     ] = None,
-    fov_deg: Annotated[
-        float | None, typer.Option(help="Field of view across, in air.", show_default=False)
-    ] = None,
+    fov_deg: Annotated[float | None, typer.Option(help="Field of view across, in air.")] = None,
     dome_mm: Annotated[
-        str | None,
-        typer.Option(
-            metavar="RADIUS:THICKNESS", help="Inner radius and thickness.", show_default=False
-        ),
+        str | None, typer.Option(metavar="RADIUS:THICKNESS", help="Inner radius and thickness.")
     ] = None,
     flat_mm: Annotated[
         str | None,
         typer.Option(
-            metavar="DISTANCE:THICKNESS",
-            help="A flat port in the dome's place: ahead of the lens.",
-            show_default=False,
+            metavar="DISTANCE:THICKNESS", help="A flat port in the dome's place: ahead of the lens."
         ),
     ] = None,
     lens_mm: Annotated[
         str | None,
-        typer.Option(
-            metavar="X,Y,Z",
-            help="Lens from the dome's centre: right, ahead, up.",
-            show_default=False,
-        ),
+        typer.Option(metavar="X,Y,Z", help="Lens from the dome's centre: right, ahead, up."),
     ] = None,
     baseline_mm: Annotated[
-        float | None, typer.Option(help="Lasers from the dome's centre.", show_default=False)
+        float | None, typer.Option(help="Lasers from the dome's centre.")
     ] = None,
-    lasers: Annotated[int | None, typer.Option(help="How many.", show_default=False)] = None,
-    fan_deg: Annotated[
-        float | None, typer.Option(help="Opening of a laser's fan.", show_default=False)
-    ] = None,
-    range_mm: Annotated[
-        str | None,
-        typer.Option(metavar="NEAR:FAR", help="Working range.", show_default=False),
-    ] = None,
+    lasers: Annotated[int | None, typer.Option(help="How many.")] = None,
+    fan_deg: Annotated[float | None, typer.Option(help="Opening of a laser's fan.")] = None,
+    range_mm: Annotated[str | None, typer.Option(metavar="NEAR:FAR", help="Working range.")] = None,
     turn: Annotated[
         bool, typer.Option("--turn", help="Look for the stripes' best directions, too.")
     ] = False,

@@ -11,18 +11,11 @@ from aqualvs.cli.command import Overwrite
 def benchmark(
     names: Annotated[
         list[str] | None,
-        typer.Argument(
-            metavar="[LEVEL|DIVE]...",
-            help="Which levels or dives; all if left out.",
-            show_default=False,
-        ),
+        typer.Argument(metavar="[LEVEL|DIVE]...", help="Which levels or dives; all if left out."),
     ] = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder to write.", show_default=False)
-    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder to write.")] = None,
     frames: Annotated[
-        int | None,
-        typer.Option(help="Frames of every dive, for a quick look.", show_default=False),
+        int | None, typer.Option(help="Frames of every dive, for a quick look.")
     ] = None,
     shutter: Annotated[
         str | None,
@@ -30,7 +23,6 @@ def benchmark(
             metavar="KIND[:MS]",
             help="rolling:READOUT:EXPOSURE, interlaced:EXPOSURE or global:EXPOSURE; all rows at "
             "once if left out.",
-            show_default=False,
         ),
     ] = None,
     overwrite: Overwrite = False,
@@ -51,30 +43,23 @@ def benchmark(
 
 
 def score(
-    truth: Annotated[
-        Path, typer.Option(help="Folder of the set, from 'aqualvs benchmark'.", show_default=False)
-    ],
+    truth: Annotated[Path, typer.Option(help="Folder of the set, from 'aqualvs benchmark'.")],
     results: Annotated[
         list[str] | None,
         typer.Argument(
             metavar="[NAME=PATH]...",
             help="What a system answered: a folder with DIVE.csv or DIVE/posture.csv, or one CSV "
             "with a column dive.",
-            show_default=False,
         ),
     ] = None,
     own: Annotated[
         Path | None,
         typer.Option(
-            help="Run aqualvs and its baselines over the set into this folder, and score them too.",
-            show_default=False,
+            help="Run aqualvs and its baselines over the set into this folder, and score them too."
         ),
     ] = None,
     out: Annotated[
-        Path | None,
-        typer.Option(
-            "--out", "-o", help="Folder for scores.csv, .json and .md.", show_default=False
-        ),
+        Path | None, typer.Option("--out", "-o", help="Folder for scores.csv, .json and .md.")
     ] = None,
     dives: Annotated[bool, typer.Option("--dives", help="Show every dive in the table.")] = False,
     overwrite: Overwrite = False,
@@ -90,11 +75,7 @@ def score(
 def reproduce(
     experiments: Annotated[
         list[str] | None,
-        typer.Argument(
-            metavar="EXPERIMENT",
-            help="Names from --list; all of them if left out.",
-            show_default=False,
-        ),
+        typer.Argument(metavar="EXPERIMENT", help="Names from --list; all of them if left out."),
     ] = None,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")] = Path(
         "out/reproduce"

@@ -14,8 +14,7 @@ def tune(
         str, typer.Argument(help="Vehicle model: bluerov2_heavy, bluerov2 or videoray.")
     ],
     output: Annotated[
-        Path | None,
-        typer.Option("-o", "--output", help="Gains file; printed if left out.", show_default=False),
+        Path | None, typer.Option("-o", "--output", help="Gains file; printed if left out.")
     ] = None,
     overwrite: Overwrite = False,
     delay_ms: Annotated[
@@ -49,20 +48,13 @@ def tune(
 
 def follow(
     source: Annotated[
-        str | None,
-        typer.Argument(help="Stream or camera of a real vehicle.", show_default=False),
+        str | None, typer.Argument(help="Stream or camera of a real vehicle.")
     ] = None,
     sim: Annotated[bool, typer.Option("--sim", help="Simulate vehicle, sea and net.")] = False,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")] = Path("follow"),
-    plan: Annotated[
-        Path | None,
-        typer.Option(help="Plan file (YAML; docs/missions.md).", show_default=False),
-    ] = None,
+    plan: Annotated[Path | None, typer.Option(help="Plan file (YAML; docs/missions.md).")] = None,
     hold_range: Annotated[
-        float | None,
-        typer.Option(
-            "--range", help="Range to hold in metres; 0.6 if left out.", show_default=False
-        ),
+        float | None, typer.Option("--range", help="Range to hold in metres; 0.6 if left out.")
     ] = None,
     yaw: Annotated[float, typer.Option(help="Yaw to hold, in degrees; 0 is square.")] = 0.0,
     gains: Annotated[
@@ -70,15 +62,11 @@ def follow(
         typer.Option(
             metavar="FILE|NAME",
             help="Gains: a file of 'aqualvs tune', or bluerov2, bluerov2_heavy, videoray.",
-            show_default=False,
         ),
     ] = None,
-    rig: Annotated[
-        Path | None, typer.Option(help="Vehicle: rig file (YAML).", show_default=False)
-    ] = None,
+    rig: Annotated[Path | None, typer.Option(help="Vehicle: rig file (YAML).")] = None,
     mavlink: Annotated[
-        str | None,
-        typer.Option(help="Vehicle: ArduSub, such as udpin:0.0.0.0:14550.", show_default=False),
+        str | None, typer.Option(help="Vehicle: ArduSub, such as udpin:0.0.0.0:14550.")
     ] = None,
     vehicle_file: VehicleFileOption = None,
     mavlink_peer: MavlinkPeer = None,
@@ -91,15 +79,13 @@ def follow(
         str, typer.Option(metavar="HOST:PORT", help="Where to serve it.")
     ] = "127.0.0.1:8100",
     token: Annotated[
-        str | None,
-        typer.Option(envvar="AQUALVS_TOKEN", help="Password of the page.", show_default=False),
+        str | None, typer.Option(envvar="AQUALVS_TOKEN", help="Password of the page.")
     ] = None,
     record: Annotated[
         bool, typer.Option("--record", help="Vehicle: record from the start.")
     ] = False,
     record_to: Annotated[
-        Path | None,
-        typer.Option(help="Vehicle: folder of recordings; that of -o if left out."),
+        Path | None, typer.Option(help="Vehicle: folder of recordings; that of -o if left out.")
     ] = None,
     record_video: Annotated[
         bool, typer.Option("--record-video", help="Vehicle: record the pictures too.")
@@ -112,8 +98,7 @@ def follow(
         ),
     ] = "auto",
     water_n: Annotated[
-        float | None,
-        typer.Option(help="Vehicle: refractive index of the water.", show_default=False),
+        float | None, typer.Option(help="Vehicle: refractive index of the water.")
     ] = None,
     vehicle: Annotated[
         Literal["bluerov2", "bluerov2-heavy", "videoray"], typer.Option(help="Sim: which one.")
@@ -137,8 +122,7 @@ def follow(
     camera: Annotated[
         str | None,
         typer.Option(
-            help="Sim, rendered: camera that takes the frames; ideal, webcam, action or pal.",
-            show_default=False,
+            help="Sim, rendered: camera that takes the frames; ideal, webcam, action or pal."
         ),
     ] = None,
     shutter: Annotated[
@@ -146,14 +130,12 @@ def follow(
         typer.Option(
             metavar="KIND[:MS]",
             help="Sim, rendered: rolling:READOUT:EXPOSURE, interlaced:EXPOSURE, global:EXPOSURE.",
-            show_default=False,
         ),
     ] = None,
     fps: Annotated[float, typer.Option(help="Sim: frames a second.")] = 25.0,
     seed: Annotated[int, typer.Option(min=0, help="Sim: of waves and noise.")] = 0,
     freeze: Annotated[
-        float | None,
-        typer.Option(help="Sim: the picture stands still from this second on.", show_default=False),
+        float | None, typer.Option(help="Sim: the picture stands still from this second on.")
     ] = None,
     overwrite: Overwrite = False,
 ) -> None:

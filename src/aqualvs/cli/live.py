@@ -21,7 +21,7 @@ def live(
     source: Annotated[
         str, typer.Argument(help="Stream, camera or file; docs/sources.md has a table.")
     ],
-    rig: Annotated[Path, typer.Option("--rig", help="Rig file (YAML).", show_default=False)],
+    rig: Annotated[Path, typer.Option("--rig", help="Rig file (YAML).")],
     mavlink: Annotated[
         list[str] | None,
         typer.Option(help="Send to an autopilot, such as udpout:192.168.2.1:14550; repeatable."),
@@ -45,7 +45,6 @@ def live(
         typer.Option(
             metavar="viewer|HOST:PORT|FILE.rrd",
             help="Show in Rerun: open a viewer, use one that is open, or write a file.",
-            show_default=False,
         ),
     ] = None,
     dashboard: Annotated[
@@ -60,9 +59,7 @@ def live(
     token: Annotated[
         str | None,
         typer.Option(
-            envvar="AQUALVS_TOKEN",
-            help="Password of the page; made and printed if one is needed.",
-            show_default=False,
+            envvar="AQUALVS_TOKEN", help="Password of the page; made and printed if one is needed."
         ),
     ] = None,
     embed_from: Annotated[
@@ -71,7 +68,6 @@ def live(
             envvar="AQUALVS_EMBED_FROM",
             metavar="ORIGIN",
             help="Let pages of this origin show the page, such as http://blueos.local; repeatable.",
-            show_default=False,
         ),
     ] = None,
     record: Annotated[bool, typer.Option("--record", help="Record from the start.")] = False,
@@ -85,20 +81,15 @@ def live(
     fast: Annotated[
         bool, typer.Option("--fast", help="Files: every frame, as fast as possible.")
     ] = False,
-    fps: Annotated[
-        float | None, typer.Option(help="Of images, or asked of a camera.", show_default=False)
-    ] = None,
+    fps: Annotated[float | None, typer.Option(help="Of images, or asked of a camera.")] = None,
     size: Annotated[
-        str | None,
-        typer.Option(metavar="WxH", help="Picture size asked of a camera.", show_default=False),
+        str | None, typer.Option(metavar="WxH", help="Picture size asked of a camera.")
     ] = None,
     pixel_format: Annotated[
-        str | None,
-        typer.Option(help="Asked of a camera: h264, mjpeg, yuyv422.", show_default=False),
+        str | None, typer.Option(help="Asked of a camera: h264, mjpeg, yuyv422.")
     ] = None,
     transport: Annotated[
-        Literal["tcp", "udp"] | None,
-        typer.Option(help="How RTSP shall send; tcp if left out.", show_default=False),
+        Literal["tcp", "udp"] | None, typer.Option(help="How RTSP shall send; tcp if left out.")
     ] = None,
     target: Target = "auto",
     detector: Annotated[Literal["ridge", "threshold"], typer.Option(help="Stripe detector.")] = (
@@ -143,15 +134,9 @@ def live(
 
 
 def doctor(
-    source: Annotated[
-        str | None, typer.Argument(help="Stream, camera or file to look at.", show_default=False)
-    ] = None,
-    rig: Annotated[
-        Path | None, typer.Option(help="Rig that the pictures should fit.", show_default=False)
-    ] = None,
-    mavlink: Annotated[
-        str | None, typer.Option(help="Autopilot to listen for.", show_default=False)
-    ] = None,
+    source: Annotated[str | None, typer.Argument(help="Stream, camera or file to look at.")] = None,
+    rig: Annotated[Path | None, typer.Option(help="Rig that the pictures should fit.")] = None,
+    mavlink: Annotated[str | None, typer.Option(help="Autopilot to listen for.")] = None,
     vehicle_file: VehicleFileOption = None,
     mavlink_peer: MavlinkPeer = None,
     mavlink_key: MavlinkKey = None,

@@ -31,17 +31,15 @@ def net_change(
         typer.Argument(
             metavar="RUN...",
             help="Folders of runs with the state of their net (aqualvs net), or of batches.",
-            show_default=False,
         ),
     ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write.", show_default=False)],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")],
     date: Annotated[
         list[str] | None,
         typer.Option(
             metavar="YYYY-MM-DD|auto",
             help="Day of the dive, once for every RUN in their order; else from the names or the "
             "video's clock.",
-            show_default=False,
         ),
     ] = None,
     cell_m: Annotated[float, typer.Option(help="Side of the map's cells.")] = 1.0,
@@ -61,16 +59,10 @@ def run(
     source: Annotated[str, typer.Argument(help="Video, folder of images, address, or recording.")],
     out: Annotated[
         Path | None,
-        typer.Option(
-            "--out",
-            "-o",
-            help="Folder to write; NAME_run beside the dive if left out.",
-            show_default=False,
-        ),
+        typer.Option("--out", "-o", help="Folder to write; NAME_run beside the dive if left out."),
     ] = None,
     rig: Annotated[
-        Path | None,
-        typer.Option("--rig", help="Rig file; a recording has its own.", show_default=False),
+        Path | None, typer.Option("--rig", help="Rig file; a recording has its own.")
     ] = None,
     overwrite: Overwrite = False,
     target: Target = "auto",
@@ -84,14 +76,10 @@ def run(
     frames: Annotated[
         str, typer.Option(metavar="A:B", help="Only frames A to B-1.", show_default=False)
     ] = ":",
-    fps: Annotated[
-        float | None, typer.Option(help="Frame rate of a folder of images.", show_default=False)
-    ] = None,
+    fps: Annotated[float | None, typer.Option(help="Frame rate of a folder of images.")] = None,
     overlay: Annotated[bool, typer.Option("--overlay", help="Write overlay.mp4 too.")] = False,
     report: Annotated[bool, typer.Option(help="Write report.html.")] = True,
-    truth: Annotated[
-        Path | None, typer.Option(help="CSV with the truth to compare with.", show_default=False)
-    ] = None,
+    truth: Annotated[Path | None, typer.Option(help="CSV with the truth to compare with.")] = None,
     index_target: IndexTarget = None,
     net: Annotated[
         bool, typer.Option("--net", help="Echo the state of the net too, see aqualvs net.")
@@ -100,16 +88,12 @@ def run(
         bool, typer.Option("--mcap", help="Write dive.mcap too, for Foxglove and for replays.")
     ] = False,
     rerun: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE.rrd", help="Write a file of Rerun too.", show_default=False),
+        Path | None, typer.Option(metavar="FILE.rrd", help="Write a file of Rerun too.")
     ] = None,
     workers: Annotated[
         int | None,
         typer.Option(
-            min=1,
-            max=MAX_WORKERS,
-            help="Processes that measure; one per core by default.",
-            show_default=False,
+            min=1, max=MAX_WORKERS, help="Processes that measure; one per core by default."
         ),
     ] = None,
 ) -> None:
@@ -153,12 +137,10 @@ def net(
             "--out",
             "-o",
             help="Folder to write; if left out a run's own, or NAME_run beside a dive.",
-            show_default=False,
         ),
     ] = None,
     rig: Annotated[
-        Path | None,
-        typer.Option(help="Rig file, for a dive; a run has its own.", show_default=False),
+        Path | None, typer.Option(help="Rig file, for a dive; a run has its own.")
     ] = None,
     target: Annotated[
         str,
@@ -168,21 +150,14 @@ def net(
     ] = "auto",
     log: Annotated[
         Path | None,
-        typer.Option(
-            help="The vehicle's log, for depth and bearing: CSV, .tlog or .BIN.",
-            show_default=False,
-        ),
+        typer.Option(help="The vehicle's log, for depth and bearing: CSV, .tlog or .BIN."),
     ] = None,
     log_offset_s: Annotated[
         float | None,
-        typer.Option(
-            help="Log's clock minus the dive's; found from the motion if left out.",
-            show_default=False,
-        ),
+        typer.Option(help="Log's clock minus the dive's; found from the motion if left out."),
     ] = None,
     twine_mm: Annotated[
-        float | None,
-        typer.Option(help="Diameter of the bare twine, where it is known.", show_default=False),
+        float | None, typer.Option(help="Diameter of the bare twine, where it is known.")
     ] = None,
     stretch_m: Annotated[float, typer.Option(help="Length of a stretch of net.")] = 0.5,
     overwrite: Overwrite = False,
@@ -201,26 +176,18 @@ def figures(
     out: Annotated[
         Path | None,
         typer.Option(
-            "--out",
-            "-o",
-            help="Folder to write; figures in the run's folder if left out.",
-            show_default=False,
+            "--out", "-o", help="Folder to write; figures in the run's folder if left out."
         ),
     ] = None,
     frame: Annotated[
-        int | None,
-        typer.Option(help="Frame; the one that shows most if left out.", show_default=False),
+        int | None, typer.Option(help="Frame; the one that shows most if left out.")
     ] = None,
     laser: Annotated[
-        str | None,
-        typer.Option(help="Laser's name; the one that shows most if left out.", show_default=False),
+        str | None, typer.Option(help="Laser's name; the one that shows most if left out.")
     ] = None,
     target: Annotated[
         Path | None,
-        typer.Option(
-            help="Target file (net.yaml) with the parameters of the paper's filter.",
-            show_default=False,
-        ),
+        typer.Option(help="Target file (net.yaml) with the parameters of the paper's filter."),
     ] = None,
     overwrite: Overwrite = False,
 ) -> None:
@@ -240,9 +207,7 @@ def figures(
 
 def report(
     folder: Annotated[Path, typer.Argument(help="Folder of the run.")],
-    truth: Annotated[
-        Path | None, typer.Option(help="CSV with the truth to show.", show_default=False)
-    ] = None,
+    truth: Annotated[Path | None, typer.Option(help="CSV with the truth to show.")] = None,
 ) -> None:
     """Write a report again."""
     from aqualvs.report.run_page import write_report
@@ -256,15 +221,9 @@ def report(
 
 
 def simulate(
-    scenario: Annotated[
-        str | None, typer.Argument(help="Scenario name or YAML file.", show_default=False)
-    ] = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder to write.", show_default=False)
-    ] = None,
-    rig: Annotated[
-        Path | None, typer.Option(help="Rig file; the example rig if left out.", show_default=False)
-    ] = None,
+    scenario: Annotated[str | None, typer.Argument(help="Scenario name or YAML file.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder to write.")] = None,
+    rig: Annotated[Path | None, typer.Option(help="Rig file; the example rig if left out.")] = None,
     camera: Annotated[
         str, typer.Option(help="Camera that takes the pictures: ideal, webcam, action or pal.")
     ] = "ideal",
@@ -274,7 +233,6 @@ def simulate(
             metavar="KIND:MS",
             help="How the camera exposes a picture, in milliseconds: rolling:READOUT:EXPOSURE, "
             "interlaced:EXPOSURE or global:EXPOSURE; the rig's if left out.",
-            show_default=False,
         ),
     ] = None,
     overwrite: Overwrite = False,
@@ -309,7 +267,6 @@ def check(
         typer.Option(
             metavar="last|FILE",
             help="Say what has moved since the last calibration, or an older rig file.",
-            show_default=False,
         ),
     ] = None,
 ) -> None:

@@ -60,57 +60,42 @@ _ATTITUDE_S, _STILL_S, _LATE_S, _N_ATTITUDE = 1.6, 0.8, 0.24, 16
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AnswerLimits:
-    """Limits beyond which a posture counts as not responding.
+    """Limits beyond which a posture counts as not responding."""
 
-    Attributes
-    ----------
-    repeats_s : float
-        Time after which a posture that is the same to the bit, while an effort is in force, counts
-        as a frozen picture.
-    quiet : float
-        Noise of the postures, as share of the usual standard deviation, below which the picture is
-        frozen. Twelve and more differences are looked at: sound noise is so small by chance once in
-        10^10 frames.
-    window_s, long_window_s : float
-        Efforts and motion are compared over these times, in seconds.
-    promised : float
-        Way towards the target by the efforts, in metres, that a posture which stands still must
-        answer to, in water that does not change. Standing still is 0.6 % of the range and 0.6
-        degrees.
-    turned : float
-        Turn of the heading within `window_s` that a posture which stands still must answer to, in
-        radians. An even way along a curved net turns the heading, too: at 0.8 m/s, the current's
-        speed included, and a radius of 8 m by 10 degrees.
-    short, short_of : float
-        An approach that ends at once, short of what is predicted by so many times the usual error
-        of the prediction, and by so many metres, is that of a posture which stands still.
-    usual : float
-        Greatest usual error of the prediction, in metres, at which it is used: in swell an approach
-        may end at any moment.
-    swung, follows : float
-        Standard deviation of the autopilot's pitch or heading about an even turn, in radians, that
-        a posture must follow by more than this share.
-    """
-
+    # Time after which a posture that is the same to the bit, while an effort is in force, counts as
+    # a frozen picture.
     repeats_s: float = 0.2
+    # Noise of the postures, as share of the usual standard deviation, below which the picture is
+    # frozen. Twelve and more differences are looked at: sound noise is so small by chance once in
+    # 10^10 frames.
     quiet: float = 0.1
+    # Efforts and motion are compared over these times, in seconds.
     window_s: float = 1.7
     long_window_s: float = 3.0
+    # Way towards the target by the efforts, in metres, that a posture which stands still must
+    # answer to, in water that does not change. Standing still is 0.6 % of the range and 0.6
+    # degrees.
     promised: float = 0.22
+    # Turn of the heading within `window_s` that a posture which stands still must answer to, in
+    # radians. An even way along a curved net turns the heading, too: at 0.8 m/s, the current's
+    # speed included, and a radius of 8 m by 10 degrees.
     turned: float = math.radians(12.0)
+    # An approach that ends at once, short of what is predicted by so many times the usual error of
+    # the prediction, and by so many metres, is that of a posture which stands still.
     short: float = 4.0
     short_of: float = 0.01
+    # Greatest usual error of the prediction, in metres, at which it is used: in swell an approach
+    # may end at any moment.
     usual: float = 0.005
+    # Standard deviation of the autopilot's pitch or heading about an even turn, in radians, that a
+    # posture must follow by more than this share.
     swung: float = math.radians(1.0)
     follows: float = 0.35
 
     def __post_init__(self) -> None:
         """Refuse limits that cannot work.
 
-        Raises
-        ------
-        OptionError
-            Naming the first.
+        Raises `OptionError` naming the first.
         """
         for field in fields(self):
             value = getattr(self, field.name)
@@ -148,12 +133,7 @@ class AnswerWatch:
     - the efforts must have brought it nearer;
     - the autopilot reports that it has turned, or that it pitches or swings to and fro.
 
-    Parameters
-    ----------
-    vehicle : VehicleFacts
-        Its mass and thrust.
-    limits : AnswerLimits, optional
-        Defaults if left out.
+    `vehicle`: its mass and thrust.
     """
 
     def __init__(self, vehicle: VehicleFacts, limits: AnswerLimits | None = None) -> None:
@@ -196,7 +176,6 @@ class AnswerWatch:
 
         Parameters
         ----------
-        now_s : float
         posture : Posture
             Of a frame that has not been seen before.
         state : VehicleState
@@ -236,12 +215,8 @@ class AnswerWatch:
 
         Its speed is that of the last live postures and what the efforts since have added.
 
-        Parameters
-        ----------
-        now_s : float
-        still_s : float, optional
-            For how long the picture has stood still, if the picture tells it; else as the last
-            posture has told.
+        `still_s`: for how long the picture has stood still, if the picture tells it; else as the
+        last posture has told.
         """
         if still_s is not None:
             self._still_s, self._blind_s = still_s, _TRUSTED_S

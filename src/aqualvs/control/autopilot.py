@@ -10,6 +10,7 @@ from aqualvs.control.answer_watch import AnswerWatch
 from aqualvs.control.controller import RangeYawController
 from aqualvs.control.missions import Guidance, Mission, Stage
 from aqualvs.control.safety import NO_BRAKE, LimitReason, SafetyGate
+from aqualvs.control.time_filter import FilteredPosture
 from aqualvs.control.vehicle import NEUTRAL, Effort, VehicleState
 from aqualvs.errors import OptionError
 from aqualvs.scanning.posture import Posture, Refusal
@@ -18,41 +19,35 @@ from aqualvs.scanning.posture import Reason as NoPosture
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """Range and yaw with their rates, as a time filter gives them.
+    """Range and yaw with their rates, as a time filter gives them."""
 
-    Attributes
-    ----------
-    range, yaw : float
-        Metres and radians, as in `Posture`.
-    range_rate, yaw_rate : float
-        Per second.
-    """
-
+    # Metres and radians, as in `Posture`.
     range: float
     yaw: float
+    # Per second.
     range_rate: float
     yaw_rate: float
 
 
+def motion_of(filtered: FilteredPosture | None) -> Motion | None:
+    """Return the answer of the package's own filter."""
+    if filtered is None:
+        return None
+    range_rate, _, yaw_rate = filtered.rates.tolist()
+    return Motion(filtered.range, filtered.yaw, range_rate, yaw_rate)
+
+
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """Result of one step.
+    """Result of one step."""
 
-    Attributes
-    ----------
-    effort : Effort
-        What may be sent; neutral unless engaged.
-    reason : LimitReason or None
-        Why it is not what the controller asked for, or why that is no more than to stay.
-    guidance : Guidance
-        What the mission wanted.
-    engaged : bool
-        Whether efforts pass; False until `NetPilot.engage`.
-    """
-
+    # What may be sent; neutral unless engaged.
     effort: Effort
+    # Why it is not what the controller asked for, or why that is no more than to stay.
     reason: LimitReason | None
+    # What the mission wanted.
     guidance: Guidance
+    # Whether efforts pass; False until `NetPilot.engage`.
     engaged: bool
 
 
@@ -65,8 +60,6 @@ class NetPilot:
         What to do.
     controller : RangeYawController
         Made for the vehicle.
-    gate : SafetyGate, optional
-        With default limits if left out.
 
     Raises
     ------

@@ -25,40 +25,27 @@ from aqualvs.errors import OptionError
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PidOptions:
-    """Gains and limits; units follow from those of measurement and output.
+    """Gains and limits; units follow from those of measurement and output."""
 
-    Attributes
-    ----------
-    proportional, integral, derivative : float
-        Output per error, per error and second, per error's rate. 0 or more.
-    derivative_time : float
-        Time constant of the first-order filter on the derivative, in seconds; used where no rate
-        is measured.
-    low, high : float
-        Limits of the output.
-    output_rate : float
-        Greatest change of the output per second.
-    longest_step : float
-        Seconds between two updates beyond which nothing is integrated and the derivative starts
-        anew.
-    """
-
+    # Output per error, per error and second, per error's rate. 0 or more.
     proportional: float
     integral: float = 0.0
     derivative: float = 0.0
+    # Time constant of the first-order filter on the derivative, in seconds; used where no rate is
+    # measured.
     derivative_time: float = 0.1
+    # Limits of the output.
     low: float = -math.inf
     high: float = math.inf
+    # Greatest change of the output per second.
     output_rate: float = math.inf
+    # Seconds between two updates beyond which nothing is integrated and the derivative starts anew.
     longest_step: float = 0.5
 
     def __post_init__(self) -> None:
         """Refuse impossible values.
 
-        Raises
-        ------
-        OptionError
-            If a gain is negative or a limit is none.
+        Raises `OptionError` if a gain is negative or a limit is none.
         """
         for name in ("proportional", "integral", "derivative", "derivative_time"):
             value = getattr(self, name)
@@ -82,10 +69,7 @@ class Pid:
     finite number, and a time that stands still or steps back, changes nothing: the last output is
     returned. A time that steps back by more than `longest_step` is that of another stream.
 
-    Parameters
-    ----------
-    options : PidOptions
-        Gains and limits.
+    `options`: gains and limits.
     """
 
     def __init__(self, options: PidOptions) -> None:
@@ -160,8 +144,6 @@ class Pid:
 
         Parameters
         ----------
-        time_s : float
-            Of the measurement.
         setpoint, measured : float
             In one unit.
         rate : float, optional
@@ -324,10 +306,7 @@ class QuietZone:
 
     From rest a rate must exceed `quiet`; a turn ends when the rate changes its sign.
 
-    Parameters
-    ----------
-    quiet : float
-        In rad/s.
+    `quiet`: in rad/s.
     """
 
     def __init__(self, quiet: float) -> None:
@@ -478,8 +457,6 @@ class RangeYawController:
 
         Parameters
         ----------
-        time_s : float
-            Of the frame.
         range, yaw : float
             Its posture, in metres and radians; finite.
         range_rate, yaw_rate : float or None

@@ -30,37 +30,25 @@ class Across(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CoverageOptions:
-    """Resolution of the map, and the size of the field of view.
+    """Resolution of the map, and the size of the field of view."""
 
-    Attributes
-    ----------
-    depth_cell : float
-        Height of a cell in metres.
-    bearing_cell, along_cell : float
-        Width in radians, or metres.
-    seen_up : float
-        How far above and below its own depth the vehicle sees the net at a range of 1 m, in metres;
-        grows with the range.
-    seen_aside : float
-        As much to either side; counts along metres, and for bearings as `radius` says.
-    radius : float or None
-        Of a round cage, in metres, to turn metres into bearings; None counts the middle alone.
-    """
-
+    # Height of a cell in metres.
     depth_cell: float = 0.1
+    # Width in radians, or metres.
     bearing_cell: float = math.radians(1.0)
     along_cell: float = 0.1
+    # How far above and below its own depth the vehicle sees the net at a range of 1 m, in metres;
+    # grows with the range.
     seen_up: float = 0.2
+    # As much to either side; counts along metres, and for bearings as `radius` says.
     seen_aside: float = 0.2
+    # Of a round cage, in metres, to turn metres into bearings; None counts the middle alone.
     radius: float | None = None
 
     def __post_init__(self) -> None:
         """Refuse sizes that are not positive.
 
-        Raises
-        ------
-        OptionError
-            Naming them.
+        Raises `OptionError` naming them.
         """
         sizes = (self.depth_cell, self.bearing_cell, self.along_cell)
         if not min(sizes) > 0.0:
@@ -74,27 +62,18 @@ class CoverageOptions:
 
 @dataclass(frozen=True, slots=True)
 class CoverageMap:
-    """Map of what has been seen.
+    """Map of what has been seen."""
 
-    Attributes
-    ----------
-    across : Across
-        What counts from left to right.
-    depth_edges : array, shape (N + 1,)
-        Metres, downward.
-    across_edges : array, shape (M + 1,)
-        Radians, or metres. Bearings go on beyond a full turn where that joins them; those of more
-        than a turn are folded into 0 to 2 pi.
-    seconds : array, shape (N, M)
-        For how long each cell was in view; 0 is unseen.
-    path : array, shape (K, 3)
-        Time, place across and depth of the vehicle's foot on the net.
-    """
-
+    # What counts from left to right.
     across: Across
+    # Shape (N + 1,): metres, downward.
     depth_edges: FloatArray
+    # Shape (M + 1,): radians, or metres. Bearings go on beyond a full turn where that joins them;
+    # those of more than a turn are folded into 0 to 2 pi.
     across_edges: FloatArray
+    # Shape (N, M): for how long each cell was in view; 0 is unseen.
     seconds: FloatArray
+    # Shape (K, 3): time, place across and depth of the vehicle's foot on the net.
     path: FloatArray
 
     @property
@@ -104,13 +83,7 @@ class CoverageMap:
 
 
 class Coverage:
-    """Builder of the coverage map, step by step.
-
-    Parameters
-    ----------
-    options : CoverageOptions, optional
-        Defaults if left out.
-    """
+    """Builder of the coverage map, step by step."""
 
     # Longer steps are gaps, in seconds.
     LONGEST_STEP_S = 1.0

@@ -45,15 +45,7 @@ are empty."""
 class FollowLog(Closing):
     """Writer of the log, row by row.
 
-    Parameters
-    ----------
-    path : Path
-        Created, or overwritten.
-
-    Raises
-    ------
-    OutputError
-        If it cannot be written.
+    `path`: created, or overwritten. Raises `OutputError` if it cannot be written.
     """
 
     def __init__(self, path: Path) -> None:
@@ -76,10 +68,7 @@ class FollowLog(Closing):
     ) -> None:
         """Append the row of one step.
 
-        Raises
-        ------
-        OutputError
-            If it cannot be written.
+        Raises `OutputError` if it cannot be written.
         """
         row = follow_row(now_s, frame_time_s, posture, decision, state)
         self._append([row[name] for name in FOLLOW_COLUMNS])

@@ -26,34 +26,24 @@ class ThrustMap:
 
     Beyond the dead band thrust is full * (linear x + (1 - linear) x²), x being the rest of the
     effort's travel.
-
-    Attributes
-    ----------
-    forward, backward, right : float
-        Thrust at effort 1 along the axis alone, in newtons; `right` is 0 where the vehicle cannot
-        move sideways.
-    dead_band : float
-        Effort below which nothing happens.
-    linear : float
-        Share of the curve that is straight.
-    layout : Layout
-        Of the level thrusters.
     """
 
+    # Thrust at effort 1 along the axis alone, in newtons; `right` is 0 where the vehicle cannot
+    # move sideways.
     forward: float
     backward: float
     right: float
+    # Effort below which nothing happens.
     dead_band: float = 0.0
+    # Share of the curve that is straight.
     linear: float = 1.0
+    # Of the level thrusters.
     layout: Layout = Layout.VECTORED
 
     def __post_init__(self) -> None:
         """Refuse maps that cannot be inverted.
 
-        Raises
-        ------
-        OptionError
-            If a thrust is not positive or a share none.
+        Raises `OptionError` if a thrust is not positive or a share none.
         """
         if not (min(self.forward, self.backward) > 0.0 and self.right >= 0.0):
             raise OptionError(
@@ -129,7 +119,6 @@ class DeadBandCrossing:
 
     Parameters
     ----------
-    thrust : ThrustMap
     impulse : float
         Share of the full thrust, times seconds.
     great : float
@@ -217,37 +206,25 @@ _MAX_EXPONENT = 50.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VehicleFacts:
-    """Assumed properties of a vehicle.
-
-    Attributes
-    ----------
-    name : str
-    mass : float
-        Of the vehicle and the water that moves with it, forward, in kg.
-    forward_drag, right_drag : Drag
-    thrust : ThrustMap
-    turning_rate, climb_rate : float
-        At effort 1, in rad/s and m/s.
-    dome_forward : float
-        Distance of the dome's centre ahead of the vehicle's, in metres.
-    """
+    """Assumed properties of a vehicle."""
 
     name: str
+    # Of the vehicle and the water that moves with it, forward, in kg.
     mass: float
+
     forward_drag: Drag
     right_drag: Drag
     thrust: ThrustMap
+    # At effort 1, in rad/s and m/s.
     turning_rate: float
     climb_rate: float
+    # Distance of the dome's centre ahead of the vehicle's, in metres.
     dome_forward: float = 0.0
 
     def __post_init__(self) -> None:
         """Refuse impossible vehicles.
 
-        Raises
-        ------
-        OptionError
-            If a number is not positive.
+        Raises `OptionError` if a number is not positive.
         """
         _check_positive(self, f"vehicle {self.name}", ("mass", "turning_rate", "climb_rate"))
         for drag in (self.forward_drag, self.right_drag):
@@ -265,61 +242,44 @@ class VehicleFacts:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RangeGains:
-    """Gains of the cascade that holds the range.
+    """Gains of the cascade that holds the range."""
 
-    Attributes
-    ----------
-    position : float
-        Speed asked for by an error of the range, in m/s per m.
-    speed : float
-        Acceleration asked for by an error of the speed, in m/s² per m/s.
-    integral : float
-        Acceleration by that error and second, in m/s² per m.
-    greatest_speed : float
-        Asked for towards and away from the target, in m/s.
-    ramp_speed, ramp_acceleration : float
-        With which a new setpoint is approached, in m/s and m/s².
-    approach_speed : float
-        In place of `ramp_speed` towards the target, where that is faster, in m/s: for vehicles
-        that coast far when the picture stands still and thrust ends.
-    jerk : float
-        Greatest change of the acceleration asked for, per second. What it holds back comes late:
-        with 8 the pitch of a BlueROV2 Heavy, which thrust below its centre moves, swings up.
-    lag : float
-        Time from an effort until pictures show it, in seconds: so much later a setpoint's change
-        is expected to be seen.
-    crossing_impulse, crossing_share : float
-        Thrust across the thrusters' dead band that must be owed before it is crossed: as share of
-        the full thrust, summed over seconds, or at once. 0 crosses at every change of sign.
-    swell : float
-        Share by which `speed` is greater for errors that swing with the swell's period; 0 for
-        calm water.
-    swell_period, swell_damping : float
-        In seconds, and the width of the band over its middle, halved.
-    """
-
+    # Speed asked for by an error of the range, in m/s per m.
     position: float
+    # Acceleration asked for by an error of the speed, in m/s² per m/s.
     speed: float
+    # Acceleration by that error and second, in m/s² per m.
     integral: float
+    # Time from an effort until pictures show it, in seconds: so much later a setpoint's change is
+    # expected to be seen.
     lag: float
+    # Asked for towards and away from the target, in m/s.
     greatest_speed: float = 0.25
+    # With which a new setpoint is approached, in m/s and m/s².
     ramp_speed: float = 0.15
+    # In place of `ramp_speed` towards the target, where that is faster, in m/s: for vehicles that
+    # coast far when the picture stands still and thrust ends.
     approach_speed: float = 0.15
+    # As `ramp_speed`.
     ramp_acceleration: float = 0.12
+    # Greatest change of the acceleration asked for, per second. What it holds back comes late: with
+    # 8 the pitch of a BlueROV2 Heavy, which thrust below its centre moves, swings up.
     jerk: float = 30.0
+    # Thrust across the thrusters' dead band that must be owed before it is crossed: as share of the
+    # full thrust, summed over seconds, or at once. 0 crosses at every change of sign.
     crossing_impulse: float = 0.0175
     crossing_share: float = 0.4
+    # Share by which `speed` is greater for errors that swing with the swell's period; 0 for calm
+    # water.
     swell: float = 0.0
+    # In seconds, and the width of the band over its middle, halved.
     swell_period: float = 5.0
     swell_damping: float = 0.15
 
     def __post_init__(self) -> None:
         """Refuse gains that are not positive; integral and swell may be 0.
 
-        Raises
-        ------
-        OptionError
-            Naming the first.
+        Raises `OptionError` naming the first.
         """
         free = ("integral", "lag", "swell", "crossing_impulse", "crossing_share")
         _check_positive(self, "range", [f.name for f in fields(self) if f.name not in free])
@@ -328,45 +288,30 @@ class RangeGains:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class YawGains:
-    """Gains of the loop that holds the yaw.
+    """Gains of the loop that holds the yaw."""
 
-    Attributes
-    ----------
-    proportional : float
-        Turning rate by the yaw's error, in rad/s per rad.
-    integral : float
-        Turning rate by error and second, in rad/s² per rad: what a curved target asks for.
-    derivative : float
-        Turning rate by the yaw's rate; 0 or more.
-    greatest_rate : float
-        Turning rate, in rad/s.
-    ramp_rate, ramp_acceleration : float
-        With which a new setpoint is approached, in rad/s and rad/s².
-    acceleration : float
-        Greatest change of the turning rate asked for, in rad/s².
-    lag : float
-        As of the range.
-    quiet_rate : float
-        Turning rate below which no turn begins, in rad/s.
-    """
-
+    # Turning rate by the yaw's error, in rad/s per rad.
     proportional: float
+    # Turning rate by error and second, in rad/s² per rad: what a curved target asks for.
     integral: float
+    # As of the range.
     lag: float
+    # Turning rate by the yaw's rate; 0 or more.
     derivative: float = 0.0
+    # Turning rate, in rad/s.
     greatest_rate: float = math.radians(30.0)
+    # With which a new setpoint is approached, in rad/s and rad/s².
     ramp_rate: float = math.radians(15.0)
     ramp_acceleration: float = math.radians(15.0)
+    # Greatest change of the turning rate asked for, in rad/s².
     acceleration: float = math.radians(200.0)
+    # Turning rate below which no turn begins, in rad/s.
     quiet_rate: float = math.radians(0.8)
 
     def __post_init__(self) -> None:
         """Refuse gains that are not positive; integral, derivative and lag may be 0.
 
-        Raises
-        ------
-        OptionError
-            Naming the first.
+        Raises `OptionError` naming the first.
         """
         free = ("integral", "derivative", "lag", "quiet_rate")
         _check_positive(self, "yaw", [f.name for f in fields(self) if f.name not in free])
@@ -375,32 +320,20 @@ class YawGains:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ControlGains:
-    """All that a controller needs for one vehicle.
-
-    Attributes
-    ----------
-    vehicle : VehicleFacts
-    range : RangeGains
-    yaw : YawGains
-    rate_time : float
-        Time constant in seconds of the filters on differences, where no time filter gives rates.
-    memory : float
-        Seconds for which a stopped controller remembers the disturbance it had found.
-    """
+    """All that a controller needs for one vehicle."""
 
     vehicle: VehicleFacts
     range: RangeGains
     yaw: YawGains
+    # Time constant in seconds of the filters on differences, where no time filter gives rates.
     rate_time: float = 0.1
+    # Seconds for which a stopped controller remembers the disturbance it had found.
     memory: float = 10.0
 
     def __post_init__(self) -> None:
         """Refuse times that are not positive.
 
-        Raises
-        ------
-        OptionError
-            Naming the first.
+        Raises `OptionError` naming the first.
         """
         _check_positive(self, "controller", ("rate_time", "memory"))
 
@@ -408,11 +341,7 @@ class ControlGains:
 def gain_schedule(gains: RangeGains, damping: float) -> tuple[float, float]:
     """Return the factors on speed's gain and integral of the range where drag damps the vehicle.
 
-    Parameters
-    ----------
-    gains : RangeGains
-    damping : float
-        Slope of the drag over mass, in 1/s.
+    `damping`: slope of the drag over mass, in 1/s.
     """
     relative = damping / gains.speed
     return (

@@ -6,6 +6,7 @@ and reports a fault in one line.
 
 import difflib
 import math
+import re
 from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
@@ -36,7 +37,6 @@ def load_settings(path: Path, kind: type[AnyPart], key: str, version: int) -> An
 
     Parameters
     ----------
-    path : Path
     kind : type
         What the file may hold.
     key : str
@@ -58,10 +58,7 @@ def parse_settings(
 ) -> AnyPart:
     """Return settings checked key by key; `name` is how messages call their source.
 
-    Raises
-    ------
-    OptionError
-        One line: source, place, value, remedy.
+    Raises `OptionError` with one line: source, place, value, remedy.
     """
     if not isinstance(content, Mapping) or key not in content:
         raise OptionError(f"{name}: {key} is missing; such a file begins with '{key}: {version}'")
@@ -123,6 +120,24 @@ def _part_of(annotation: Any) -> type[StrictPart] | None:
     options = (annotation, *getattr(annotation, "__args__", ()))
     parts = [one for one in options if isinstance(one, type) and issubclass(one, StrictPart)]
     return parts[0] if parts else None
+
+
+# What a key ends with to tell its unit.
+_UNIT = re.compile(r"_(per_s2?|deg(_s2?)?|m(_s[23]?)?|n|s)$")
+
+
+def si_values(part: StrictPart) -> dict[str, Any]:
+    """Return the values of a part by their keys without units, angles in radians."""
+    return {
+        _UNIT.sub("", key): math.radians(value) if "_deg" in key else value
+        for key, value in part.model_dump().items()
+    }
+
+
+def _in_file_units(kind: type[AnyPart], gains: object) -> AnyPart:
+    """Return the part whose values `si_values` gives back, but for rounding."""
+    values = {key: getattr(gains, _UNIT.sub("", key)) for key in kind.model_fields}
+    return kind(**{key: _degrees(v) if "_deg" in key else v for key, v in values.items()})
 
 
 VERSION = 1
@@ -214,10 +229,7 @@ class GainsFile(StrictPart):
 def load_gains(source: Path | str) -> ControlGains:
     """Return gains from a file, or those that come with the package by a vehicle's name.
 
-    Raises
-    ------
-    OptionError
-        One line: file, place, value, remedy.
+    Raises `OptionError` with one line: file, place, value, remedy.
     """
     if str(source) in VEHICLES:
         text = _packaged(str(source))
@@ -239,10 +251,7 @@ def load_gains(source: Path | str) -> ControlGains:
 def save_gains(gains: ControlGains, path: Path) -> None:
     """Write a gains file.
 
-    Raises
-    ------
-    OutputError
-        If it cannot be written.
+    Raises `OutputError` if it cannot be written.
     """
     write_text(path, gains_text(gains))
 
@@ -261,8 +270,8 @@ def _packaged(name: str) -> str:
 def _gains(content: GainsFile) -> ControlGains:
     return ControlGains(
         vehicle=_vehicle(content),
-        range=_range(content.range),
-        yaw=_yaw(content.yaw),
+        range=RangeGains(**si_values(content.range)),
+        yaw=YawGains(**si_values(content.yaw)),
         rate_time=content.rate_time_s,
         memory=content.memory_s,
     )
@@ -270,20 +279,12 @@ def _gains(content: GainsFile) -> ControlGains:
 
 def _vehicle(content: GainsFile) -> VehicleFacts:
     part = content.vehicle
-    thrust = part.thrust
     return VehicleFacts(
         name=content.name,
         mass=part.mass_kg,
         forward_drag=_drag(part.forward_drag),
         right_drag=_drag(part.right_drag),
-        thrust=ThrustMap(
-            forward=thrust.forward_n,
-            backward=thrust.backward_n,
-            right=thrust.right_n,
-            dead_band=thrust.dead_band,
-            linear=thrust.linear,
-            layout=Layout(thrust.layout),
-        ),
+        thrust=ThrustMap(**si_values(part.thrust) | {"layout": Layout(part.thrust.layout)}),
         turning_rate=math.radians(part.turning_rate_deg_s),
         climb_rate=part.climb_rate_m_s,
         dome_forward=part.dome_forward_m,
@@ -294,72 +295,13 @@ def _drag(part: DragPart) -> Drag:
     return Drag(part.linear_n_s_m, part.quadratic_n_s2_m2)
 
 
-def _range(part: RangePart) -> RangeGains:
-    return RangeGains(
-        position=part.position_per_s,
-        speed=part.speed_per_s,
-        integral=part.integral_per_s2,
-        lag=part.lag_s,
-        swell=part.swell,
-        swell_period=part.swell_period_s,
-        swell_damping=part.swell_damping,
-        greatest_speed=part.greatest_speed_m_s,
-        ramp_speed=part.ramp_speed_m_s,
-        approach_speed=part.approach_speed_m_s,
-        ramp_acceleration=part.ramp_acceleration_m_s2,
-        jerk=part.jerk_m_s3,
-        crossing_impulse=part.crossing_impulse_s,
-        crossing_share=part.crossing_share,
-    )
-
-
-def _yaw(part: YawPart) -> YawGains:
-    return YawGains(
-        proportional=part.proportional_per_s,
-        integral=part.integral_per_s2,
-        derivative=part.derivative,
-        lag=part.lag_s,
-        greatest_rate=math.radians(part.greatest_rate_deg_s),
-        ramp_rate=math.radians(part.ramp_rate_deg_s),
-        ramp_acceleration=math.radians(part.ramp_acceleration_deg_s2),
-        acceleration=math.radians(part.acceleration_deg_s2),
-        quiet_rate=math.radians(part.quiet_rate_deg_s),
-    )
-
-
 def _content(gains: ControlGains) -> GainsFile:
-    near, turn = gains.range, gains.yaw
     return GainsFile(
         aqualvs_gains=VERSION,
         name=gains.vehicle.name,
         vehicle=_vehicle_part(gains.vehicle),
-        range=RangePart(
-            position_per_s=near.position,
-            speed_per_s=near.speed,
-            integral_per_s2=near.integral,
-            lag_s=near.lag,
-            swell=near.swell,
-            swell_period_s=near.swell_period,
-            swell_damping=near.swell_damping,
-            greatest_speed_m_s=near.greatest_speed,
-            ramp_speed_m_s=near.ramp_speed,
-            approach_speed_m_s=near.approach_speed,
-            ramp_acceleration_m_s2=near.ramp_acceleration,
-            jerk_m_s3=near.jerk,
-            crossing_impulse_s=near.crossing_impulse,
-            crossing_share=near.crossing_share,
-        ),
-        yaw=YawPart(
-            proportional_per_s=turn.proportional,
-            integral_per_s2=turn.integral,
-            derivative=turn.derivative,
-            lag_s=turn.lag,
-            greatest_rate_deg_s=_degrees(turn.greatest_rate),
-            ramp_rate_deg_s=_degrees(turn.ramp_rate),
-            ramp_acceleration_deg_s2=_degrees(turn.ramp_acceleration),
-            acceleration_deg_s2=_degrees(turn.acceleration),
-            quiet_rate_deg_s=_degrees(turn.quiet_rate),
-        ),
+        range=_in_file_units(RangePart, gains.range),
+        yaw=_in_file_units(YawPart, gains.yaw),
         rate_time_s=gains.rate_time,
         memory_s=gains.memory,
     )

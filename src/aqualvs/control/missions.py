@@ -43,22 +43,11 @@ class Stage(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Guidance:
-    """Present request of a mission.
+    """Present request of a mission."""
 
-    Attributes
-    ----------
-    setpoint : Setpoint or None
-        Range and yaw; None where nothing is to be held.
-    sway : float
-        Speed through the water along the target, to the right positive, in m/s.
-    down : float
-        Speed of descent, in m/s; 0 keeps the depth.
-    stage : Stage
-    """
-
-    setpoint: Setpoint | None
-    sway: float = 0.0
-    down: float = 0.0
+    setpoint: Setpoint | None  # Range and yaw; None where nothing is to be held.
+    sway: float = 0.0  # Speed through the water along the target, to the right positive, in m/s.
+    down: float = 0.0  # Speed of descent, in m/s; 0 keeps the depth.
     stage: Stage = Stage.HOLDING
 
 
@@ -88,29 +77,16 @@ class Mission(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LossOptions:
-    """Behaviour without the target.
+    """Behaviour without the target."""
 
-    Attributes
-    ----------
-    after : float
-        Seconds without a posture after which the mission waits.
-    steady : float
-        Seconds of consecutive postures before it continues.
-    give_up : float
-        Seconds of waiting after which it ends.
-    """
-
-    after: float = 0.15
-    steady: float = 0.1
-    give_up: float = 10.0
+    after: float = 0.15  # Seconds without a posture after which the mission waits.
+    steady: float = 0.1  # Seconds of consecutive postures before it continues.
+    give_up: float = 10.0  # Seconds of waiting after which it ends.
 
     def __post_init__(self) -> None:
         """Refuse impossible values.
 
-        Raises
-        ------
-        OptionError
-            If one is not positive.
+        Raises `OptionError` if one is not positive.
         """
         if not (self.after > 0.0 and self.steady >= 0.0 and self.give_up > self.after):
             raise OptionError(
@@ -234,30 +210,20 @@ class Sector:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LegOptions:
-    """End of a leg along the net: time, distance or sector, whichever comes first.
+    """End of a leg along the net: time, distance or sector, whichever comes first."""
 
-    Attributes
-    ----------
-    time : float
-        Seconds with the target in sight.
-    distance : float
-        Metres, by the speed through the water: a current along the net counts for or against it.
-    sector : Sector or None
-        Of the net's bearing: heading plus the posture's yaw. A leg ends where it leaves the sector
-        after it has been inside.
-    """
-
+    # Seconds with the target in sight.
     time: float = math.inf
+    # Metres, by the speed through the water: a current along the net counts for or against it.
     distance: float = math.inf
+    # Of the net's bearing: heading plus the posture's yaw. A leg ends where it leaves the sector
+    # after it has been inside.
     sector: Sector | None = None
 
     def __post_init__(self) -> None:
         """Refuse impossible values.
 
-        Raises
-        ------
-        OptionError
-            If a time or distance is not positive.
+        Raises `OptionError` if a time or distance is not positive.
         """
         if not (self.time > 0.0 and self.distance > 0.0):
             raise OptionError(
@@ -280,10 +246,7 @@ def bearing_of(posture: Posture, state: VehicleState) -> float | None:
 class Leg:
     """One way along the net, with the time and distance covered.
 
-    Parameters
-    ----------
-    options : LegOptions
-        Where it ends.
+    `options`: where it ends.
     """
 
     def __init__(self, options: LegOptions) -> None:
@@ -388,39 +351,26 @@ class Turn(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SurveyOptions:
-    """The lawn and the mower.
+    """The lawn and the mower."""
 
-    Attributes
-    ----------
-    depths : tuple of float
-        One leg at each, in this order; metres, down positive.
-    sway : float
-        Speed of the first leg through the water, to the right positive, in m/s.
-    leg : LegOptions
-        Where each leg ends.
-    turn : Turn
-        Whether the next leg goes back or on.
-    descent : float
-        Greatest speed between depths, in m/s.
-    patience : float
-        Seconds that a change of depth may take beyond what it should before the next leg begins
-        all the same: something is in the way.
-    """
-
+    # One leg at each, in this order; metres, down positive.
     depths: tuple[float, ...]
+    # Speed of the first leg through the water, to the right positive, in m/s.
     sway: float
+    # Where each leg ends.
     leg: LegOptions
+    # Whether the next leg goes back or on.
     turn: Turn = Turn.BACK
+    # Greatest speed between depths, in m/s.
     descent: float = 0.1
+    # Seconds that a change of depth may take beyond what it should before the next leg begins all
+    # the same: something is in the way.
     patience: float = 20.0
 
     def __post_init__(self) -> None:
         """Refuse surveys without end or direction.
 
-        Raises
-        ------
-        OptionError
-            Naming the value.
+        Raises `OptionError` naming the value.
         """
         if not self.depths or not all(depth >= 0.0 for depth in self.depths):
             raise OptionError(f"survey: depths {list(self.depths)} m; give one or more, 0 or more")

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from aqualvs.control.gains_file import load_settings
+from aqualvs.control.gains_file import load_settings, si_values
 from aqualvs.control.missions import (
     FollowMission,
     HoldMission,
@@ -92,17 +92,9 @@ class PlanFile(StrictPart):
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """Contents of a plan file.
+    """Contents of a plan file."""
 
-    Attributes
-    ----------
-    name : str
-        Of the mission: hold, follow or survey.
-    setpoint : Setpoint
-    limits : SafetyLimits
-    """
-
-    name: str
+    name: str  # Of the mission: hold, follow or survey.
     setpoint: Setpoint
     limits: SafetyLimits
     _file: PlanFile
@@ -110,11 +102,7 @@ class Plan:
     def mission(self) -> Mission:
         """Return a new mission, at its beginning."""
         content = self._file
-        loss = LossOptions(
-            after=content.loss.after_s,
-            steady=content.loss.steady_s,
-            give_up=content.loss.give_up_s,
-        )
+        loss = LossOptions(**si_values(content.loss))
         leg, sway = _leg(content), content.sway_m_s or 0.0
         if content.survey is not None:
             return SurveyMission(self.setpoint, _survey(content.survey, leg, sway), loss=loss)
@@ -127,17 +115,14 @@ class Plan:
 def load_plan(path: Path | str) -> Plan:
     """Return the plan of a file.
 
-    Raises
-    ------
-    OptionError
-        One line: file, place, value, remedy.
+    Raises `OptionError` with one line: file, place, value, remedy.
     """
     path = Path(path)
     content = load_settings(path, PlanFile, _KEY, VERSION)
     try:
         _check_together(content)
         setpoint = Setpoint(content.range_m, math.radians(content.yaw_deg))
-        limits = _limits(content.safety)
+        limits = SafetyLimits(**si_values(content.safety))
         _check_setpoint(setpoint, limits)
         plan = Plan(content.mission, setpoint, limits, content)
         # A plan that cannot begin must be refused now, not under water.
@@ -178,19 +163,6 @@ def _check_setpoint(setpoint: Setpoint, limits: SafetyLimits) -> None:
             f"yaw_deg is {math.degrees(setpoint.yaw):g}; choose at most "
             f"{math.degrees(SetpointHolder.MAX_YAW):.0f} to either side"
         )
-
-
-def _limits(part: SafetyPart) -> SafetyLimits:
-    return SafetyLimits(
-        posture_age=part.posture_age_s,
-        heartbeat_age=part.heartbeat_age_s,
-        least_range=part.least_range_m,
-        approach_speed=part.approach_speed_m_s,
-        stopping_time=part.stopping_time_s,
-        retreat_effort=part.retreat_effort,
-        brake_effort=part.brake_effort,
-        tilt=math.radians(part.tilt_deg),
-    )
 
 
 def _leg(content: PlanFile) -> LegOptions:

@@ -101,18 +101,10 @@ _REFUSED_MODES = {
 
 
 class Brake(NamedTuple):
-    """Push astern that stops a vehicle whose posture is not to be trusted.
+    """Push astern that stops a vehicle whose posture is not to be trusted."""
 
-    Attributes
-    ----------
-    effort : float
-        Astern, 0 to 1.
-    until_s : float
-        When neutral follows, by the clock of `VehicleState.heard_s`.
-    """
-
-    effort: float
-    until_s: float
+    effort: float  # Astern, 0 to 1.
+    until_s: float  # When neutral follows, by the clock of `VehicleState.heard_s`.
 
 
 NO_BRAKE = Brake(0.0, -math.inf)
@@ -121,50 +113,35 @@ NO_BRAKE = Brake(0.0, -math.inf)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SafetyLimits:
-    """Limits at which the gate intervenes.
+    """Limits at which the gate intervenes."""
 
-    Attributes
-    ----------
-    posture_age : float
-        Seconds after the last valid posture from which on there is no thrust. The rule is 0.2 s;
-        0.15 s leaves room for the frame at which it is noticed.
-    heartbeat_age : float
-        Seconds of silence after which the vehicle counts as lost. Where the link counts nothing
-        but heartbeats, which come once a second, choose 2.5.
-    least_range : float
-        Metres to the target, from the dome's centre, within which nothing approaches.
-    approach_speed : float
-        Greatest closing speed far from the target, in m/s.
-    stopping_time : float
-        Seconds to the least range, at the present closing speed, that must remain: the speed
-        allowed shrinks with the way that is left.
-    retreat_effort : float
-        With which it backs away from too close; more where the controller asks for more. Must
-        exceed the thrusters' dead band. It grows to `brake_effort` within the next 50 mm: a
-        vehicle that still comes closer is pushed by the water.
-    brake_effort : float
-        With which it brakes what closes in by two thirds or more faster than allowed; likewise.
-        Below it is less in proportion: braking is not to throw the vehicle out of sight.
-    tilt : float
-        Angle in radians by which roll or pitch may be off level; beyond, the pilot is warned.
-    """
-
+    # Seconds after the last valid posture from which on there is no thrust. The rule is 0.2 s; 0.15
+    # s leaves room for the frame at which it is noticed.
     posture_age: float = 0.15
+    # Seconds of silence after which the vehicle counts as lost. Where the link counts nothing but
+    # heartbeats, which come once a second, choose 2.5.
     heartbeat_age: float = 1.0
+    # Metres to the target, from the dome's centre, within which nothing approaches.
     least_range: float = 0.35
+    # Greatest closing speed far from the target, in m/s.
     approach_speed: float = 0.3
+    # Seconds to the least range, at the present closing speed, that must remain: the speed allowed
+    # shrinks with the way that is left.
     stopping_time: float = 0.7
+    # With which it backs away from too close; more where the controller asks for more. Must exceed
+    # the thrusters' dead band. It grows to `brake_effort` within the next 50 mm: a vehicle that
+    # still comes closer is pushed by the water.
     retreat_effort: float = 0.25
+    # With which it brakes what closes in by two thirds or more faster than allowed; likewise. Below
+    # it is less in proportion: braking is not to throw the vehicle out of sight.
     brake_effort: float = 0.5
+    # Angle in radians by which roll or pitch may be off level; beyond, the pilot is warned.
     tilt: float = math.radians(45.0)
 
     def __post_init__(self) -> None:
         """Refuse limits that cannot work.
 
-        Raises
-        ------
-        OptionError
-            If one makes no sense.
+        Raises `OptionError` if one makes no sense.
         """
         for field in fields(self):
             value = getattr(self, field.name)
@@ -184,11 +161,6 @@ class SafetyGate:
     """Gate that passes, changes or stops efforts; pure, all time comes from outside.
 
     It starts disengaged.
-
-    Parameters
-    ----------
-    limits : SafetyLimits, optional
-        Defaults if left out.
 
     Attributes
     ----------

@@ -33,20 +33,12 @@ _CHANNELS = {"throttle": 3, "yaw": 4, "forward": 5, "right": 6}
 
 @dataclass(frozen=True, slots=True)
 class Sticks:
-    """The axes of `MANUAL_CONTROL` as ArduSub takes them.
+    """The axes of `MANUAL_CONTROL` as ArduSub takes them."""
 
-    Attributes
-    ----------
-    x, y, r : int
-        Forward, right, clockwise, -1000 to 1000.
-    z : int
-        Up, 0 to 1000; 500 is neutral, contrary to the MAVLink specification.
-    """
-
-    x: int = 0
-    y: int = 0
-    z: int = MIDDLE
-    r: int = 0
+    x: int = 0  # Forward, -1000 to 1000.
+    y: int = 0  # Right, as far.
+    z: int = MIDDLE  # Up, 0 to 1000; 500 is neutral, contrary to the MAVLink specification.
+    r: int = 0  # Clockwise, as far as `x`.
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,24 +60,16 @@ class StickChannel:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StickShaping:
-    """ArduSub's conversion of sticks; the defaults are its own.
+    """ArduSub's conversion of sticks; the defaults are its own."""
 
-    Attributes
-    ----------
-    gain : float
-        Pilot gain (JS_GAIN_DEFAULT). Where trims are 1500 us it does not matter but for the rate
-        of climb.
-    throttle_gain : float
-        JS_THR_GAIN.
-    throttle_dead_zone : float
-        THR_DZ, in thousandths of the throttle's travel.
-    throttle, yaw, forward, right : StickChannel
-        RC3 to RC6.
-    """
-
+    # Pilot gain (JS_GAIN_DEFAULT). Where trims are 1500 us it does not matter but for the rate of
+    # climb.
     gain: float = 0.5
+    # JS_THR_GAIN.
     throttle_gain: float = 1.0
+    # THR_DZ, in thousandths of the throttle's travel.
     throttle_dead_zone: float = 100.0
+    # RC3 to RC6.
     throttle: StickChannel = field(default_factory=lambda: StickChannel(dead_zone=30.0))
     yaw: StickChannel = field(default_factory=lambda: StickChannel(dead_zone=40.0))
     forward: StickChannel = field(default_factory=StickChannel)
@@ -202,10 +186,8 @@ PARAMETERS: tuple[str, ...] = (
 def shaping_of(parameters: Mapping[str, float]) -> StickShaping:
     """Return the shaping of a vehicle by its reported parameters.
 
-    Parameters
-    ----------
-    parameters : mapping of str to float
-        By name, any of `PARAMETERS`. What is missing, or cannot be, has ArduSub's default.
+    `parameters`: by name, any of `PARAMETERS`. What is missing, or cannot be, has ArduSub's
+    default.
     """
     own = StickShaping()
     found = {}

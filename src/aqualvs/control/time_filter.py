@@ -15,33 +15,24 @@ _MIN_VARIANCE = 1e-12 * np.eye(3)
 
 @dataclass(frozen=True, slots=True)
 class FilteredPosture:
-    """State of the time filter.
+    """State of the time filter."""
 
-    Attributes
-    ----------
-    range, pitch, yaw : float
-        Metres and radians, as in `Posture`.
-    rates : array, shape (3,)
-        Their time derivatives, in m/s and rad/s.
-    covariance : array, shape (6, 6)
-        Of (range, pitch, yaw) and the rates, by the noise of the frames and the unknown motion.
-    age_s : float
-        Time since the last measurement that entered.
-    accepted : bool
-        Whether this frame's measurement entered; False where it was refused by the gate, or there
-        was none.
-    rig_covariance : array, shape (3, 3)
-        Of (range, pitch, yaw) by the uncertainty of the rig, as the last measurement that entered
-        had it: common to all frames, so no filter reduces it.
-    """
-
+    # Metres and radians, as in `Posture`.
     range: float
     pitch: float
     yaw: float
+    # Shape (3,): their time derivatives, in m/s and rad/s.
     rates: FloatArray
+    # Shape (6, 6): of (range, pitch, yaw) and the rates, by the noise of the frames and the unknown
+    # motion.
     covariance: FloatArray
+    # Time since the last measurement that entered.
     age_s: float
+    # Whether this frame's measurement entered; False where it was refused by the gate, or there was
+    # none.
     accepted: bool
+    # Shape (3, 3): of (range, pitch, yaw) by the uncertainty of the rig, as the last measurement
+    # that entered had it: common to all frames, so no filter reduces it.
     rig_covariance: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
 
     @property
@@ -53,42 +44,29 @@ class FilteredPosture:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PostureFilterOptions:
-    """Motion model and gate of the filter.
+    """Motion model and gate of the filter."""
 
-    Attributes
-    ----------
-    range_acceleration : float
-        Random acceleration towards and from the target, in m/s², that acts for about a second: the
-        speed a second ahead is uncertain by the same number in m/s.
-    pitch_acceleration, yaw_acceleration : float
-        The same for the angles, in rad/s².
-    initial_speed, initial_turn_rate : float
-        Standard deviation of the rates when the filter starts, in m/s and rad/s.
-    gate_probability : float
-        Share of sound measurements that pass the gate.
-    n_rejected : int
-        Rejected measurements in a row that agree with each other, after which the filter accepts
-        them: the target itself is elsewhere. An angle alone begins anew after so many.
-    max_coast : float
-        Seconds without an accepted measurement after which there is no filtered posture.
-    """
-
+    # Random acceleration towards and from the target, in m/s², that acts for about a second: the
+    # speed a second ahead is uncertain by the same number in m/s.
     range_acceleration: float = 0.2
+    # The same for the angles, in rad/s².
     pitch_acceleration: float = 0.3
     yaw_acceleration: float = 0.5
+    # Standard deviation of the rates when the filter starts, in m/s and rad/s.
     initial_speed: float = 0.5
     initial_turn_rate: float = 0.5
+    # Share of sound measurements that pass the gate.
     gate_probability: float = 0.9999
+    # Rejected measurements in a row that agree with each other, after which the filter accepts
+    # them: the target itself is elsewhere. An angle alone begins anew after so many.
     n_rejected: int = 3
+    # Seconds without an accepted measurement after which there is no filtered posture.
     max_coast: float = 0.5
 
     def __post_init__(self) -> None:
         """Check every value.
 
-        Raises
-        ------
-        OptionError
-            If one makes no sense.
+        Raises `OptionError` if one makes no sense.
         """
         names = ("range_acceleration", "pitch_acceleration", "yaw_acceleration")
         for name in (*names, "initial_speed", "initial_turn_rate", "max_coast"):

@@ -116,10 +116,6 @@ class Turning:
 
     The shaping of the stick, the thrusters' lag, and the rate loop: inertia over the moment that it
     gives for a rate.
-
-    Attributes
-    ----------
-    shaping, thrusters, rate_loop : float
     """
 
     shaping: float
@@ -155,18 +151,12 @@ _PADE = 4
 
 @dataclass(frozen=True, slots=True)
 class Loop:
-    """An open loop: numerator over denominator, polynomials in s, and a delay.
+    """An open loop: numerator over denominator, polynomials in s, and a delay."""
 
-    Attributes
-    ----------
-    above, below : array
-        Coefficients, highest power first.
-    delay : float
-        In seconds.
-    """
-
+    # Coefficients, highest power first.
     above: FloatArray
     below: FloatArray
+    # In seconds.
     delay: float
 
     def at(self, omega: FloatArray) -> ComplexArray:
@@ -188,30 +178,20 @@ class Loop:
 
 @dataclass(frozen=True, slots=True)
 class Margins:
-    """Stability margins of one loop.
+    """Stability margins of one loop."""
 
-    Attributes
-    ----------
-    stable : bool
-        The others mean nothing where it is False.
-    crossover : float
-        Highest frequency at which the loop's gain is 1, in rad/s; NaN if there is none.
-    phase : float
-        Least phase that may still be lost at such a frequency, in radians.
-    gain : float
-        Factor by which the gain may grow.
-    delay : float
-        That may be added, in seconds.
-    modulus : float
-        Least distance of the loop from -1; 1 / modulus is the greatest amplification of a
-        disturbance.
-    """
-
+    # The others mean nothing where it is False.
     stable: bool
+    # Highest frequency at which the loop's gain is 1, in rad/s; NaN if there is none.
     crossover: float
+    # Least phase that may still be lost at such a frequency, in radians.
     phase: float
+    # Factor by which the gain may grow.
     gain: float
+    # That may be added, in seconds.
     delay: float
+    # Least distance of the loop from -1; 1 / modulus is the greatest amplification of a
+    # disturbance.
     modulus: float
 
 
@@ -283,46 +263,31 @@ _MIN_USABLE_MODULUS = 0.25
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TuneOptions:
-    """Conditions under which the loops must stay stable.
+    """Conditions under which the loops must stay stable."""
 
-    Attributes
-    ----------
-    delay : float
-        From the exposure to the effort at the vehicle, in seconds: what it usually is.
-    greatest_delay : float
-        What it may become; performance may suffer there, stability must not.
-    frame : float
-        Seconds between frames; half of it counts as delay: efforts are held until the next frame.
-    mass_factor, drag_factor : float
-        By which mass and drag may be off, either way.
-    current : float
-        Greatest speed of the water, in m/s.
-    least_modulus : float
-        Least distance of the loop from -1 at the usual delay, in the worst corner, where mass, drag
-        and current are off at once.
-    least_late_modulus : float
-        As much at the greatest delay.
-    least_yaw_modulus : float
-        Of the yaw at the greatest delay; it has less to fight.
-    """
-
+    # From the exposure to the effort at the vehicle, in seconds: what it usually is.
     delay: float = 0.12
+    # What it may become; performance may suffer there, stability must not.
     greatest_delay: float = 0.2
+    # Seconds between frames; half of it counts as delay: efforts are held until the next frame.
     frame: float = 0.04
+    # By which mass and drag may be off, either way.
     mass_factor: float = 1.2
     drag_factor: float = 2.0
+    # Greatest speed of the water, in m/s.
     current: float = 0.5
+    # Least distance of the loop from -1 at the usual delay, in the worst corner, where mass, drag
+    # and current are off at once.
     least_modulus: float = 0.35
+    # As much at the greatest delay.
     least_late_modulus: float = 0.2
+    # Of the yaw at the greatest delay; it has less to fight.
     least_yaw_modulus: float = 0.45
 
     def __post_init__(self) -> None:
         """Refuse impossible values.
 
-        Raises
-        ------
-        OptionError
-            Naming the value.
+        Raises `OptionError` naming the value.
         """
         if not 0.0 <= self.delay <= self.greatest_delay <= _MAX_S:
             raise OptionError(
@@ -346,34 +311,20 @@ class TuneOptions:
 
 @dataclass(frozen=True, slots=True)
 class Tuned:
-    """Result of tuning.
-
-    Attributes
-    ----------
-    gains : ControlGains
-    range_usual, yaw_usual : Margins
-        At the usual delay with the model as it is, in still water.
-    range_corner : Margins
-        At the usual delay in the worst corner.
-    range_late, yaw_late : Margins
-        At the greatest delay in the worst corner.
-    """
+    """Result of tuning."""
 
     gains: ControlGains
-    range_usual: Margins
-    range_corner: Margins
-    range_late: Margins
-    yaw_usual: Margins
-    yaw_late: Margins
+    range_usual: Margins  # At the usual delay with the model as it is, in still water.
+    range_corner: Margins  # At the usual delay in the worst corner.
+    range_late: Margins  # At the greatest delay in the worst corner.
+    yaw_usual: Margins  # As `range_usual`.
+    yaw_late: Margins  # As `range_late`.
 
 
 def tune(model: VehicleModel, options: TuneOptions | None = None) -> Tuned:
     """Return the fastest gains for a model that stay stable in every corner.
 
-    Raises
-    ------
-    OptionError
-        If there are none.
+    Raises `OptionError` if there are none.
     """
     options = options or TuneOptions()
     facts = facts_of(model)
@@ -417,15 +368,8 @@ def usable_gains(source: Path | str) -> ControlGains:
     The vehicle is taken as the gains describe it: their `lag`, of the vehicle and the posture
     together, counts as a delay, at least that of `TuneOptions`.
 
-    Parameters
-    ----------
-    source : Path or str
-        As `load_gains` takes it.
-
-    Raises
-    ------
-    OptionError
-        As `load_gains`; or with the axis, and what is left of its margins.
+    `source`: as `load_gains` takes it. Raises `OptionError` as `load_gains`; or with the axis, and
+    what is left of its margins.
     """
     gains = load_gains(source)
     usual = TuneOptions().delay

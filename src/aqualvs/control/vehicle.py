@@ -16,18 +16,10 @@ from aqualvs.errors import OptionError
 
 @dataclass(frozen=True, slots=True)
 class Setpoint:
-    """Wanted posture to the target.
+    """Wanted posture to the target."""
 
-    Attributes
-    ----------
-    range : float
-        Metres.
-    yaw : float
-        Radians, as `Posture.yaw`; 0 is square to the target.
-    """
-
-    range: float
-    yaw: float = 0.0
+    range: float  # Metres.
+    yaw: float = 0.0  # Radians, as `Posture.yaw`; 0 is square to the target.
 
 
 class SetpointHolder:
@@ -58,10 +50,7 @@ class SetpointHolder:
     def put(self, setpoint: Setpoint | None) -> None:
         """Set, or take back.
 
-        Raises
-        ------
-        OptionError
-            If it cannot be held; the one in force stays.
+        Raises `OptionError` if it cannot be held; the one in force stays.
         """
         if setpoint is not None:
             self._check(setpoint)
@@ -84,22 +73,15 @@ class SetpointHolder:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Effort:
-    """Effort as by a pilot's sticks, -1 to 1, as ArduSub's depth hold takes it.
+    """Effort as by a pilot's sticks, -1 to 1, as ArduSub's depth hold takes it."""
 
-    Attributes
-    ----------
-    forward, right : float
-        Share of the greatest thrust along the body axes.
-    down : float
-        Share of the greatest rate of descent; in depth hold the vehicle keeps its depth at 0.
-    yaw : float
-        Share of the greatest turning rate, clockwise from above positive; the vehicle keeps its
-        heading at 0.
-    """
-
+    # Share of the greatest thrust along the body axes.
     forward: float = 0.0
     right: float = 0.0
+    # Share of the greatest rate of descent; in depth hold the vehicle keeps its depth at 0.
     down: float = 0.0
+    # Share of the greatest turning rate, clockwise from above positive; the vehicle keeps its
+    # heading at 0.
     yaw: float = 0.0
 
 
@@ -126,38 +108,26 @@ class Mode(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VehicleState:
-    """State as the vehicle reports it; None where it does not, or not recently.
+    """State as the vehicle reports it; None where it does not, or not recently."""
 
-    Attributes
-    ----------
-    heard_s : float
-        When its last heartbeat came, on the clock of `time.monotonic`; -inf if never.
-    armed : bool
-    mode : Mode
-    mode_name : str
-        As the vehicle calls it.
-    pilot_moves : bool
-        Whether the pilot's sticks are off their centre.
-    depth : float or None
-        Metres, down positive.
-    heading, roll, pitch : float or None
-        Radians; heading clockwise from north.
-    doubt : str
-        Why it seems not to obey; empty if it does, or nothing is known.
-    rival : str
-        Other sender that speaks as the vehicle, and agrees with it; empty if there is none.
-    """
-
+    # When its last heartbeat came, on the clock of `time.monotonic`; -inf if never.
     heard_s: float = float("-inf")
+
     armed: bool = False
     mode: Mode = Mode.UNKNOWN
+    # As the vehicle calls it.
     mode_name: str = ""
+    # Whether the pilot's sticks are off their centre.
     pilot_moves: bool = False
+    # Metres, down positive.
     depth: float | None = None
+    # Radians; heading clockwise from north.
     heading: float | None = None
     roll: float | None = None
     pitch: float | None = None
+    # Why it seems not to obey; empty if it does, or nothing is known.
     doubt: str = ""
+    # Other sender that speaks as the vehicle, and agrees with it; empty if there is none.
     rival: str = ""
 
 
@@ -177,10 +147,7 @@ class VehicleLink(Protocol):
         The vehicle must forget it by itself if no other comes (ArduSub: after its pilot-input
         fail-safe time).
 
-        Raises
-        ------
-        OSError
-            If it could not be sent.
+        Raises `OSError` if it could not be sent.
         """
 
     def close(self) -> None:

@@ -98,8 +98,6 @@ def lasers_by(believed: Rig, true: Rig) -> Rig | None:
     ----------
     believed : Rig
         Rig whose camera is assumed.
-    true : Rig
-        Rig that takes the pictures.
 
     Returns
     -------
@@ -185,32 +183,23 @@ INDEX_ERROR = 0.005
 
 @dataclass(frozen=True, slots=True)
 class OffsetCost:
-    """Errors by an offset of the lens ahead of the dome's centre.
+    """Errors by an offset of the lens ahead of the dome's centre."""
 
-    Attributes
-    ----------
-    offset : float
-        Metres.
-    neglected : array, shape (W, 3)
-        Errors of (range, pitch, yaw), in m and rad, if the lens is taken to be in the centre and
-        all else is right.
-    calibrated : array, shape (W, 3)
-        The same if the lasers, too, were calibrated with the lens taken to be in the centre, on
-        boards whose places are then wrong as well. NaN if no board's place can be found.
-    aside : array, shape (W, 3)
-        As `neglected`, for an equal offset to the right.
-    index_error : array, shape (W, 3)
-        Errors if the offset is known, but the water's index is too large by `INDEX_ERROR`.
-    index_sigma : float
-        Standard deviation of the water's index from one picture of a known target; see
-        `aqualvs.check.finding.index_sigma`.
-    """
-
+    # Metres.
     offset: float
+    # Shape (W, 3): errors of (range, pitch, yaw), in m and rad, if the lens is taken to be in the
+    # centre and all else is right.
     neglected: FloatArray
+    # Shape (W, 3): the same if the lasers, too, were calibrated with the lens taken to be in the
+    # centre, on boards whose places are then wrong as well. NaN if no board's place can be found.
     calibrated: FloatArray
+    # Shape (W, 3): as `neglected`, for an equal offset to the right.
     aside: FloatArray
+    # Shape (W, 3): errors if the offset is known, but the water's index is too large by
+    # `INDEX_ERROR`.
     index_error: FloatArray
+    # Standard deviation of the water's index from one picture of a known target; see
+    # `aqualvs.check.finding.index_sigma`.
     index_sigma: float
 
 

@@ -38,11 +38,7 @@ def best_angles(design: Design, *, quick: bool = False) -> Design:
     The fans of these mounts are swung so that their middles are abreast of the forward axis halfway
     through the working range.
 
-    Parameters
-    ----------
-    design : Design
-    quick : bool
-        Start from the mounts' own angles only: sufficient after small changes of a design.
+    `quick`: start from the mounts' own angles only: sufficient after small changes of a design.
     """
     if not any(mount.free_tilt or mount.free_stripe for mount in design.mounts):
         return design
@@ -127,24 +123,16 @@ def _starts(lots: Sequence[Sequence[Mount]]) -> list[list[int]]:
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """Effect of a change; all numbers are ratios to the present values, 1 is no effect.
+    """Effect of a change; all numbers are ratios to the present values, 1 is no effect."""
 
-    Attributes
-    ----------
-    words : str
-        Description of the change.
-    score : float
-        Root mean square of all errors, in goals, on walls and nets.
-    noise_range, noise_angle : float
-        Errors of a single frame on a wall, from noise alone, root mean square over the range.
-    systematic_range, systematic_angle : float
-        Errors from the tolerances of lasers and water.
-    """
-
+    # Description of the change.
     words: str
+    # Root mean square of all errors, in goals, on walls and nets.
     score: float
+    # Errors of a single frame on a wall, from noise alone, root mean square over the range.
     noise_range: float
     noise_angle: float
+    # Errors from the tolerances of lasers and water.
     systematic_range: float
     systematic_angle: float
 
@@ -152,10 +140,7 @@ class Change:
 def changes(design: Design) -> list[Change]:
     """Try every change and return them, the most helpful first.
 
-    Parameters
-    ----------
-    design : Design
-        With the final tilts of its lasers. Those that are free to turn are turned again.
+    `design`: with the final tilts of its lasers. Those that are free to turn are turned again.
     """
     now = _measures(design)
     tried = ((words, change(design)) for words, change in _CHANGES.items())

@@ -49,48 +49,33 @@ RIG_YAML = "rig.yaml"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DesignRequest:
-    """Request of `aqualvs design`, see its `--help`.
+    """Request of `aqualvs design`, see its `--help`."""
 
-    Attributes
-    ----------
-    design, rig : Path or None
-        A design file, or a rig file that exists; the example if neither is given.
-    out : Path or None
-        Output folder.
-    given : mapping
-        Replacements of the file's values, see `merged_content`.
-    fan_deg : float or None
-        Opening of the fans of a rig's lasers.
-    turn : bool
-        Whether to optimise the stripes' directions of the tilted lasers, too.
-    tilt : bool
-        Whether to optimise the tilts.
-    try_changes : bool
-        Whether to report changes that would help.
-    overwrite : bool
-        Whether to replace earlier output of this command in `out`.
-    """
-
+    # A design file, or a rig file that exists; the example if neither is given.
     design: Path | None = None
     rig: Path | None = None
+    # Output folder.
     out: Path | None = None
+    # Replacements of the file's values, see `merged_content`.
     given: Mapping[str, Any] = field(default_factory=dict)
+    # Opening of the fans of a rig's lasers.
     fan_deg: float | None = None
+    # Whether to optimise the stripes' directions of the tilted lasers, too.
     turn: bool = False
+    # Whether to optimise the tilts.
     tilt: bool = True
+    # Whether to report changes that would help.
     try_changes: bool = True
+    # Whether to replace earlier output of this command in `out`.
     overwrite: bool = False
 
 
-def design_and_tell(request: DesignRequest, console: Console | None = None) -> None:
+def design_and_tell(request: DesignRequest) -> None:
     """Evaluate a design and print its predicted errors.
 
-    Raises
-    ------
-    AqualvsError
-        If a file or an option cannot be used, or the folder cannot be written.
+    Raises `AqualvsError` if a file or an option cannot be used, or the folder cannot be written.
     """
-    told = _Telling(console or Console())
+    told = _Telling()
     design = _asked_for(request)
     names = () if request.out is None else (RIG_YAML, ERRORS_PNG, PICTURE_PNG, DESIGN_HTML)
     files = [(request.out or Path()) / name for name in names]
@@ -127,7 +112,7 @@ def design_and_tell(request: DesignRequest, console: Console | None = None) -> N
 class _Telling:
     """Printer of a design's parts, which the page repeats."""
 
-    console: Console
+    console: Console = field(default_factory=Console)
     parts: list[str | Table] = field(default_factory=list)
 
     def __call__(self, *parts: str | Table) -> None:

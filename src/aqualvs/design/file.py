@@ -193,16 +193,8 @@ class DesignFile(StrictPart):
 def load_design(path: Path, given: Mapping[str, Any] | None = None) -> Design:
     """Read a design file.
 
-    Parameters
-    ----------
-    path : Path
-    given : mapping, optional
-        Replacements of the file's values by the command line, see `merged_content`.
-
-    Raises
-    ------
-    OptionError, RigError
-        One line: file, place, value, remedy.
+    `given`: replacements of the file's values by the command line, see `merged_content`. Raises
+    `OptionError` or `RigError` with one line: file, place, value, remedy.
     """
     content = read_yaml(path, "a design file", OptionError)
     if not isinstance(content, Mapping):
@@ -270,10 +262,7 @@ def design_from(content: object, *, name: str, folder: Path) -> Design:
 def design_of_rig(rig: Rig, fan_deg: float = FAN_DEG) -> Design:
     """Return the design of an existing rig: its lasers may be tilted, but keep their places.
 
-    Raises
-    ------
-    RigError
-        If a laser can draw no stripe.
+    Raises `RigError` if a laser can draw no stripe.
     """
     fan = math.radians(fan_deg)
     mounts = tuple(mount_of_laser(laser, rig, fan) for laser in rig.lasers)

@@ -23,32 +23,22 @@ _SHIFT, _OFFSET = OWN_ERRORS.index("shift"), OWN_ERRORS.index("laser_offset")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PredictedErrors:
-    """Predicted errors of a design on walls and nets square ahead, at W ranges.
+    """Predicted errors of a design on walls and nets square ahead, at W ranges."""
 
-    Attributes
-    ----------
-    ranges : array, shape (W,)
-        Metres.
-    stripes : Stripes
-        Of the design's lasers, L of them.
-    wall, net : array, shape (W, 3)
-        Standard deviations of (range, pitch, yaw) of a single frame from noise, on a wall and on
-        the design's net, in m and rad; NaN without a posture.
-    systematic : mapping from cause to array, shape (W, 3)
-        Standard deviations by the tolerances of lasers and water, each alone; the same in all
-        frames. `calibrated.camera_errors` gives those by the camera's.
-    strands : array, shape (L, W)
-        Number of strands of the net that each stripe meets.
-    crossing : bool array, shape (L, L, W)
-        True if two stripes cross in the picture.
-    """
-
+    # Shape (W,): metres.
     ranges: FloatArray
+    # Of the design's lasers, L of them.
     stripes: Stripes
+    # Shape (W, 3): standard deviations of (range, pitch, yaw) of a single frame from noise, on a
+    # wall and on the design's net, in m and rad; NaN without a posture.
     wall: FloatArray
     net: FloatArray
+    # Shape (W, 3): standard deviations by the tolerances of lasers and water, each alone; the same
+    # in all frames. `calibrated.camera_errors` gives those by the camera's.
     systematic: dict[str, FloatArray]
+    # Shape (L, W): number of strands of the net that each stripe meets.
     strands: FloatArray
+    # Shape (L, L, W): True if two stripes cross in the picture.
     crossing: BoolArray
 
     @property
@@ -70,11 +60,7 @@ class PredictedErrors:
 def predict(design: Design, ranges: Sequence[float] | FloatArray | None = None) -> PredictedErrors:
     """Predict a design's errors.
 
-    Parameters
-    ----------
-    design : Design
-    ranges : sequence of float, optional
-        Walls square to the forward axis, metres; the design's own if left out.
+    `ranges`: walls square to the forward axis, metres; the design's own if left out.
     """
     walls = design.ranges if ranges is None else np.asarray(ranges, np.float64)
     camera = design.rig.camera()
@@ -99,18 +85,10 @@ def together(causes: Mapping[str, FloatArray]) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class Sums:
-    """Normal equations of wall fits, and the scatter added by shared errors.
+    """Normal equations of wall fits, and the scatter added by shared errors."""
 
-    Attributes
-    ----------
-    matrix : array, shape (..., W, 3, 3)
-        sum w X X', for errors of 1 px.
-    scatter : array, shape (..., W, 3, 3)
-        Covariance of sum w X r, where r are the residuals.
-    """
-
-    matrix: FloatArray
-    scatter: FloatArray
+    matrix: FloatArray  # Shape (..., W, 3, 3): sum w X X', for errors of 1 px.
+    scatter: FloatArray  # Shape (..., W, 3, 3): covariance of sum w X r, where r are the residuals.
 
     def total(self) -> "Sums":
         """Return the sums over the first axis: over the lasers."""
@@ -272,33 +250,22 @@ _MARGIN_SHARE, _LENGTH_SHARE = 0.05, 0.3
 
 @dataclass(frozen=True, slots=True)
 class AngleScore:
-    """Score of a choice of angles; less is better.
+    """Score of a choice of angles; less is better."""
 
-    Attributes
-    ----------
-    error : float
-        Root mean square of the errors of range, pitch and yaw over the working range, from noise
-        and the tolerances of lasers and water, on walls and nets alike, in goals.
-    total : float
-        The same with the penalties of missing and crossing stripes.
-    """
-
+    # Root mean square of the errors of range, pitch and yaw over the working range, from noise and
+    # the tolerances of lasers and water, on walls and nets alike, in goals.
     error: float
+    # The same with the penalties of missing and crossing stripes.
     total: float
 
 
 @dataclass(frozen=True, slots=True)
 class Lot:
-    """K candidates for one laser, or the chosen stripes of several.
-
-    Attributes
-    ----------
-    stripes : Stripes
-    parts : tuple of (matrix, scatter, common)
-        On a wall and on the net: arrays (K, W, 3, 3), (K, W, 3, 3) and (K, W, G, 3).
-    """
+    """K candidates for one laser, or the chosen stripes of several."""
 
     stripes: Stripes
+    # Tuple of (matrix, scatter, common): on a wall and on the net: arrays (K, W, 3, 3), (K, W, 3,
+    # 3) and (K, W, G, 3).
     parts: tuple[tuple[FloatArray, FloatArray, FloatArray], ...]
 
     def take(self, rows: Sequence[int]) -> "Lot":

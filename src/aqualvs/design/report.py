@@ -330,24 +330,9 @@ def write_page(
 ) -> None:
     """Write a design's page: the verdict, the figures, and what the terminal shows.
 
-    Parameters
-    ----------
-    path : Path
-    name : str
-        Of the rig.
-    first : str
-        The verdict.
-    parts : sequence of str or Table
-        Sentences belong to the table before them.
-    pictures : sequence of Path
-        Of `draw_figures`.
-    fine : bool
-        Whether the goals are met.
-
-    Raises
-    ------
-    OSError
-        As the system says it.
+    `name` is the rig's, `pictures` are from `draw_figures`, and `fine` is whether the goals are
+    met. Sentences among `parts` belong to the table before them. Raises `OSError` as the system
+    says it.
     """
     figures = "".join(
         f'<figure><img src="{html.data_url(one.read_bytes(), "png")}" alt="{_FIGURES[one.name]}">'

@@ -20,38 +20,26 @@ from aqualvs.scanning.plane_fit import SHARED_ERROR_PX, twine_share
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Mount:
-    """Mount of a line laser.
+    """Mount of a line laser."""
 
-    Attributes
-    ----------
-    name : str
-        Name in tables.
-    position : (float, float, float)
-        Origin of the fan, in `dome`, metres.
-    stripe : float
-        Direction of the stripe on a wall square ahead, in radians: 0 level, pi/2 upright,
-        counter-clockwise as the camera sees it.
-    tilt : float
-        Tilt of the sheet towards the forward axis through the dome's centre, in radians; negative
-        is away from it.
-    fan : float
-        Full opening of the fan, in radians.
-    swing : float
-        Turn of the fan's middle within its sheet, along the stripe's direction, in radians.
-    free_tilt, free_stripe : bool
-        Whether to optimise these angles, or keep them.
-    wavelength_nm : float or None
-        As `Laser.wavelength_nm`.
-    """
-
+    # Name in tables.
     name: str
+    # Origin of the fan, in `dome`, metres.
     position: tuple[float, float, float]
+    # Direction of the stripe on a wall square ahead, in radians: 0 level, pi/2 upright,
+    # counter-clockwise as the camera sees it.
     stripe: float
+    # Tilt of the sheet towards the forward axis through the dome's centre, in radians; negative is
+    # away from it.
     tilt: float
+    # Full opening of the fan, in radians.
     fan: float
+    # Turn of the fan's middle within its sheet, along the stripe's direction, in radians.
     swing: float = 0.0
+    # Whether to optimise these angles, or keep them.
     free_tilt: bool = True
     free_stripe: bool = False
+    # As `Laser.wavelength_nm`.
     wavelength_nm: float | None = None
 
     @property
@@ -140,8 +128,6 @@ def mount_of_laser(laser: Laser, rig: Rig, fan: float) -> Mount:
     ----------
     laser : Laser
         Behind a window the plane that fits its light best is used.
-    rig : Rig
-        Its rig.
     fan : float
         Full opening, radians.
 
@@ -210,55 +196,36 @@ _TWINE_HEIGHT = np.array(90.0)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Noise:
-    """Noise of the scanner in one frame: standard deviations in pixels.
+    """Noise of the scanner in one frame: standard deviations in pixels."""
 
-    Attributes
-    ----------
-    point : float
-        Of a point of a stripe on a wall, on its search line.
-    strand : float
-        Of the light on one strand of a net.
-    shared : float
-        Of the shift that a whole stripe shares, and of its tilt at the image border.
-    stripe : float
-        Width of a stripe on the target, in metres.
-    twine : float
-        Of the shift of the light on twine, as a share of the width of the stripe: all strands of a
-        net share it, towards the near side or the far one, and as much again those of one laser.
-    """
-
+    # Of a point of a stripe on a wall, on its search line.
     point: float = 0.3
+    # Of the light on one strand of a net.
     strand: float = 0.15
+    # Of the shift that a whole stripe shares, and of its tilt at the image border.
     shared: float = SHARED_ERROR_PX
+    # Width of a stripe on the target, in metres.
     stripe: float = 3e-3
+    # Of the shift of the light on twine, as a share of the width of the stripe: all strands of a
+    # net share it, towards the near side or the far one, and as much again those of one laser.
     twine: float = float(twine_share(_TWINE_HEIGHT))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Tolerances:
-    """Tolerances: one sigma of the errors after calibration, in metres, radians and shares.
+    """Tolerances: one sigma of the errors after calibration, in metres, radians and shares."""
 
-    Attributes
-    ----------
-    lens : float
-        Of the lens's place, along each axis.
-    rotation : float
-        Of the camera's rotation, about each axis.
-    focal : float
-        Of the focal length, as a share of it.
-    dome : float
-        Of the dome's inner radius and of its thickness.
-    n_water : float
-        Of the water's index.
-    laser_angle, laser_offset : float
-        Of each laser's plane.
-    """
-
+    # Of the lens's place, along each axis.
     lens: float = 0.03e-3
+    # Of the camera's rotation, about each axis.
     rotation: float = math.radians(0.01)
+    # Of the focal length, as a share of it.
     focal: float = 1e-4
+    # Of the dome's inner radius and of its thickness.
     dome: float = 0.05e-3
+    # Of the water's index.
     n_water: float = 3e-4
+    # Of each laser's plane.
     laser_angle: float = math.radians(0.005)
     laser_offset: float = 0.07e-3
 
@@ -292,30 +259,20 @@ class Goals:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Design:
-    """Design to be evaluated.
+    """Design to be evaluated."""
 
-    Attributes
-    ----------
-    rig : Rig
-        Nominal camera, dome, water and working range. Its lasers are ignored.
-    mounts : tuple of Mount
-    centring : float
-        Standard deviation of the lens's place before a calibration, metres.
-    noise : Noise
-    tolerances : Tolerances
-    net : NominalNet
-    goals : Goals
-    avoid_crossings : bool
-        Whether stripes that cross in the picture count against a design.
-    """
-
+    # Nominal camera, dome, water and working range. Its lasers are ignored.
     rig: Rig
+
     mounts: tuple[Mount, ...]
+    # Standard deviation of the lens's place before a calibration, metres.
     centring: float = 1e-3
+
     noise: Noise = field(default_factory=Noise)
     tolerances: Tolerances = field(default_factory=Tolerances)
     net: NominalNet = field(default_factory=lambda: NominalNet(bar=15e-3, twine=2.5e-3))
     goals: Goals = field(default_factory=Goals)
+    # Whether stripes that cross in the picture count against a design.
     avoid_crossings: bool = True
 
     @property

@@ -27,36 +27,26 @@ _N_SEARCH, _N_PASSES, _N_SUM = 33, 2, 24
 
 @dataclass(frozen=True, slots=True)
 class Stripes:
-    """Sums over the visible parts of the stripes of K sheets on W walls.
+    """Sums over the visible parts of the stripes of K sheets on W walls."""
 
-    Attributes
-    ----------
-    lines : array, shape (K, W)
-        Number of search lines that see the stripe, one point each; 0 if it is out of the picture.
-    length : array, shape (K, W)
-        Visible length on the wall, metres.
-    middle : array, shape (K, W, 2)
-        Pixel of the visible part's middle, in `image`; NaN if there is none.
-    matrix : array, shape (K, W, 3, 3)
-        sum w X X', each point weighted by its inverse variance for an error of 1 px.
-    own : array, shape (K, W, 5, 3)
-        sum w X d(m·X)/d(error) for `OWN_ERRORS`.
-    common : array, shape (K, W, G, 3)
-        The same for errors that all stripes share.
-    centre, along : array, shapes (K, W, 3) and (K, 3)
-        The stripe's line on the wall, in `dome`.
-    ends : array, shape (K, W, 2)
-        Begin and end of the visible part along it, in metres; NaN if there is none.
-    """
-
+    # Shape (K, W): number of search lines that see the stripe, one point each; 0 if it is out of
+    # the picture.
     lines: FloatArray
+    # Shape (K, W): visible length on the wall, metres.
     length: FloatArray
+    # Shape (K, W, 2): pixel of the visible part's middle, in `image`; NaN if there is none.
     middle: FloatArray
+    # Shape (K, W, 3, 3): sum w X X', each point weighted by its inverse variance for an error of 1
+    # px.
     matrix: FloatArray
+    # Shape (K, W, 5, 3): sum w X d(m·X)/d(error) for `OWN_ERRORS`.
     own: FloatArray
+    # Shape (K, W, G, 3): the same for errors that all stripes share.
     common: FloatArray
+    # Shapes (K, W, 3) and (K, 3): the stripe's line on the wall, in `dome`.
     centre: FloatArray
     along: FloatArray
+    # Shape (K, W, 2): begin and end of the visible part along it, in metres; NaN if there is none.
     ends: FloatArray
 
     def take(self, rows: Sequence[int]) -> "Stripes":
@@ -81,8 +71,6 @@ def see_stripes(
 
     Parameters
     ----------
-    camera : Camera
-    mounts : sequence of Mount
     ranges : array, shape (W,)
         Metres.
     common : array, shape (P, G)
@@ -231,21 +219,14 @@ def _place(camera: Camera, pixels: FloatArray, is_row: BoolArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class _Sensitivity:
-    """Derivatives of m·X at the points (K, W, S) that fixed pixels triangulate to.
+    """Derivatives of m·X at the points (K, W, S) that fixed pixels triangulate to."""
 
-    Attributes
-    ----------
-    by_x, by_y : array, shape (K, W, S)
-        By the pixel, in 1/px.
-    by_normal : array, shape (K, W, S)
-        By a step of the sheet along its normal, in 1/m.
-    by_common : array, shape (K, W, S, G)
-        By the camera's errors.
-    """
-
+    # Shape (K, W, S): by the pixel, in 1/px.
     by_x: FloatArray
     by_y: FloatArray
+    # Shape (K, W, S): by a step of the sheet along its normal, in 1/m.
     by_normal: FloatArray
+    # Shape (K, W, S, G): by the camera's errors.
     by_common: FloatArray
 
     @classmethod

@@ -33,7 +33,7 @@ from aqualvs.geometry.planes import Plane
 from aqualvs.geometry.transforms import SE3
 from aqualvs.optics.rig import Laser, Rig, Window
 from aqualvs.optics.sheet import sheets_of
-from aqualvs.report.figure_style import BLUE, GREEN, GREY, ORANGE, STYLE, new_figure
+from aqualvs.report.figure_style import BLUE, GREEN, GREY, ORANGE, new_figure
 from aqualvs.simulation.lasers import LaserSource, default_sources
 from aqualvs.simulation.scenario import Scenario, parse_scenario
 from aqualvs.simulation.video import Compression
@@ -80,7 +80,6 @@ def _variant(laboratory: Laboratory, dive: RenderedDive, name: str, ours: bool =
 VIDEO = Experiment(
     name="video",
     title="What H.264 costs",
-    paper="",
     about="The same pictures of a clear net, uncompressed and as H.264 at four qualities.",
     run=_run_video,
 )
@@ -123,7 +122,6 @@ def _run_sheets(laboratory: Laboratory) -> ExperimentResult:
                 ExperimentRow(
                     what=f"laser behind a window tilted by {tilt:g} degrees: farthest from its "
                     "best plane in the working range (mm)",
-                    paper="",
                     ours=f"{mm:.1f}",
                 )
                 for tilt, mm in zip(_TILTS_DEG, off, strict=True)
@@ -187,7 +185,6 @@ def _off_plane_mm(rig: Rig) -> list[float]:
 SHEETS = Experiment(
     name="sheets",
     title="Why refracted laser sheets",
-    paper="",
     about="The rig with each laser behind a flat window that is tilted against its beam; the wall "
     "measured with the refracted-sheet model and with the planes of the paper's Eq. 19.",
     run=_run_sheets,
@@ -219,14 +216,11 @@ def _run_beliefs(laboratory: Laboratory) -> ExperimentResult:
         f"dome; a lens believed 1 mm from its place costs up to {per_mm.max():.1f} %.",
         findings=(
             ExperimentRow(
-                what=f"range error for an index wrong by {_WATERS} (%)",
-                paper="",
-                ours=f"{per_index:.2f}",
+                what=f"range error for an index wrong by {_WATERS} (%)", ours=f"{per_index:.2f}"
             ),
             *(
                 ExperimentRow(
                     what=f"range error for each mm that the lens is believed too far {name} (%)",
-                    paper="",
                     ours=f"{cost:.2f}",
                 )
                 for name, cost in zip(_AXES, per_mm, strict=True)
@@ -290,10 +284,7 @@ def _slope(steps: Sequence[float], percent: FloatArray) -> float:
 
 
 def _drawn(index: FloatArray, lens: FloatArray) -> "Figure":
-    from matplotlib import rc_context
-
-    with rc_context(dict(STYLE)):
-        figure = new_figure(2.7)
+    with new_figure(2.7) as figure:
         left, right = figure.subplots(1, 2)
         left.plot(_INDEX_STEPS, index, ".-", color=BLUE)
         left.set_xlabel("error of the index believed")
@@ -310,7 +301,6 @@ def _drawn(index: FloatArray, lens: FloatArray) -> "Figure":
 BELIEFS = Experiment(
     name="beliefs",
     title="What wrong beliefs cost",
-    paper="",
     about="The wall at the paper's four distances, measured with the true rig but for one "
     "parameter: the index of the water, or the place of the lens in the dome.",
     run=_run_beliefs,

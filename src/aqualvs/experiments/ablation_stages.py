@@ -110,7 +110,6 @@ def _variants(laboratory: Laboratory, dive: RenderedDive, where: str) -> list[Va
 STRIPES = Experiment(
     name="stripes",
     title="Why a sub-pixel detector",
-    paper="",
     about="The wall at the paper's four distances, and the net in the sun, with the sub-pixel "
     "stripe detector and with fixed thresholds as in section 3.1.",
     run=_run_stripes,
@@ -159,7 +158,6 @@ def _run_fits(laboratory: Laboratory) -> ExperimentResult:
 FITS = Experiment(
     name="fits",
     title="Why a robust fit",
-    paper="",
     about="The points of the target in three dives, fitted robustly with their covariances, and "
     "all alike by pseudo-inverse.",
     run=_run_fits,
@@ -304,12 +302,8 @@ class _Row:
     def findings(self) -> list[ExperimentRow]:
         """Return the rows of the table."""
         what = f"{self.where}: precision, recall of net reflections"
-        return [ExperimentRow(what=f"{what}, adaptive", paper="", ours=told(self.adaptive))] + [
-            ExperimentRow(
-                what=f"{what}, {kind}",
-                paper="",
-                ours=f"{told(judged)} ({one.told})",
-            )
+        return [ExperimentRow(what=f"{what}, adaptive", ours=told(self.adaptive))] + [
+            ExperimentRow(what=f"{what}, {kind}", ours=f"{told(judged)} ({one.told})")
             for kind, (one, judged) in self.paper.items()
         ]
 
@@ -362,7 +356,6 @@ def _series(rows: Sequence[_Row]) -> DataColumns:
 FILTERS = Experiment(
     name="filters",
     title="Why an adaptive mesh filter",
-    paper="",
     about="Two nets at three ranges, and the net of the mesh experiment; a threshold and the "
     "paper's filter on every bright pixel, with its own and with other parameters, against the "
     "adaptive filter.",

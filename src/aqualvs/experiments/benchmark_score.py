@@ -40,23 +40,16 @@ WRONG_PERCENT = 5.0
 
 @dataclass(frozen=True, slots=True)
 class FrameAnswers:
-    """Answers against the truth of N frames, of one dive or of many.
+    """Answers against the truth of N frames, of one dive or of many."""
 
-    Attributes
-    ----------
-    valid : bool array, shape (N,)
-        Frames with an answer.
-    n_visible : array, shape (N,)
-        Visible stripe points.
-    error : array, shape (N, 3)
-        Range in percent of the true one, pitch and yaw in degrees; NaN without answer or target.
-    sigma : array, shape (N, 3)
-        What the system claims for them, same units.
-    """
-
+    # Shape (N,): frames with an answer.
     valid: BoolArray
+    # Shape (N,): visible stripe points.
     n_visible: FloatArray
+    # Shape (N, 3): range in percent of the true one, pitch and yaw in degrees; NaN without answer
+    # or target.
     error: FloatArray
+    # Shape (N, 3): what the system claims for them, same units.
     sigma: FloatArray
 
     @property
@@ -78,41 +71,30 @@ class ErrorSpread:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Score:
-    """Score of a system on some frames.
+    """Score of a system on some frames."""
 
-    Attributes
-    ----------
-    n_frames, n_measurable, n_available : int
-        Frames; those with at least `VISIBLE_LIMIT` visible stripe points; those of them with an
-        answer.
-    available_percent : float
-        Share of the last two; NaN where nothing is measurable.
-    range_percent, pitch_deg, yaw_deg : ErrorSpread
-        Errors of the answers in measurable frames.
-    n_wrong : int
-        Answers off by more than `WRONG_PERCENT` of the range in frames with any visible point.
-    n_empty, n_false : int
-        Frames without any visible point, and those of them that were answered all the same.
-    z_range, z_pitch, z_yaw : float
-        Rms of error over claimed sigma in measurable frames: 1 is honest, more is too sure; NaN
-        where no sigma is claimed.
-    sigma_range_percent, sigma_pitch_deg, sigma_yaw_deg : float
-        Medians of the claimed sigmas in measurable frames.
-    """
-
+    # Frames; those with at least `VISIBLE_LIMIT` visible stripe points; those of them with an
+    # answer.
     n_frames: int
     n_measurable: int
     n_available: int
+    # Share of the last two; NaN where nothing is measurable.
     available_percent: float
+    # Errors of the answers in measurable frames.
     range_percent: ErrorSpread
     pitch_deg: ErrorSpread
     yaw_deg: ErrorSpread
+    # Answers off by more than `WRONG_PERCENT` of the range in frames with any visible point.
     n_wrong: int
+    # Frames without any visible point, and those of them that were answered all the same.
     n_empty: int
     n_false: int
+    # Rms of error over claimed sigma in measurable frames: 1 is honest, more is too sure; NaN where
+    # no sigma is claimed.
     z_range: float
     z_pitch: float
     z_yaw: float
+    # Medians of the claimed sigmas in measurable frames.
     sigma_range_percent: float
     sigma_pitch_deg: float
     sigma_yaw_deg: float
@@ -218,36 +200,21 @@ _HEADER = (
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """A score and what it is of.
-
-    Attributes
-    ----------
-    system : str
-    scope : {"dive", "level", "total"}
-    name : str
-        Of the dive or level; "total" for all.
-    score : Score
-    """
+    """A score and what it is of."""
 
     system: str
-    scope: str
-    name: str
+    scope: str  # "dive", "level" or "total".
+    name: str  # Of the dive or level; "total" for all.
     score: Score
 
 
 @dataclass(frozen=True, slots=True)
 class Bars:
-    """Median length of error bars on a level, relative to those of the clear twins.
-
-    Attributes
-    ----------
-    system, level : str
-    range, pitch, yaw : float
-        NaN where the system claims none.
-    """
+    """Median length of error bars on a level, relative to those of the clear twins."""
 
     system: str
     level: str
+    # NaN where the system claims none.
     range: float
     pitch: float
     yaw: float
@@ -255,19 +222,10 @@ class Bars:
 
 @dataclass(frozen=True, slots=True)
 class Scores:
-    """Everything that was found of some systems.
+    """Everything that was found of some systems."""
 
-    Attributes
-    ----------
-    title : str
-        The set's.
-    entries : tuple of Entry
-        By system: dives, levels, total.
-    bars : tuple of Bars
-    """
-
-    title: str
-    entries: tuple[Entry, ...]
+    title: str  # The set's.
+    entries: tuple[Entry, ...]  # By system: dives, levels, total.
     bars: tuple[Bars, ...]
 
 
@@ -305,11 +263,7 @@ def _bars(system: str, level: str, names: list[str], frames: dict[str, FrameAnsw
 def lines(scores: Scores, *, dives: bool) -> list[str]:
     """Return the table to read: level after level, the systems below each other.
 
-    Parameters
-    ----------
-    scores : Scores
-    dives : bool
-        Whether to show every dive before its level.
+    `dives`: whether to show every dive before its level.
     """
     rows = _rows(scores, dives=dives)
     widths = [max(len(row[k]) for row in (_HEADER, *rows)) for k in range(len(_HEADER))]
@@ -338,10 +292,7 @@ SCORE_FILES = ("scores.csv", "scores.json", "scores.md")
 def write_scores(scores: Scores, folder: Path) -> list[Path]:
     """Write `scores.csv`, `scores.json` and `scores.md`; return their paths.
 
-    Raises
-    ------
-    OSError
-        If the folder or a file cannot be written.
+    Raises `OSError` if the folder or a file cannot be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
     table, data, text = (folder / name for name in SCORE_FILES)
@@ -415,21 +366,12 @@ def _bar_line(bar: Bars) -> str:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OwnSystem:
-    """Options of `aqualvs run`.
-
-    Attributes
-    ----------
-    name : str
-    detector : {"ridge", "threshold"}
-    mesh_filter : {"none", "paper"}
-    fit : {"robust", "pseudo_inverse"}
-    no_dome : bool
-    """
+    """Options of `aqualvs run`."""
 
     name: str
-    detector: str = "ridge"
-    mesh_filter: str = "none"
-    fit: str = "robust"
+    detector: str = "ridge"  # "ridge" or "threshold".
+    mesh_filter: str = "none"  # "none" or "paper".
+    fit: str = "robust"  # "robust" or "pseudo_inverse".
     no_dome: bool = False
 
 
@@ -450,27 +392,10 @@ BARE_LENS = "bare-lens"
 def run_own(
     benchmark: BenchmarkSet, folder: Path, echo: Callable[[str], object], *, overwrite: bool
 ) -> list[str]:
-    """Measure every dive of a set with every system of `OWN_SYSTEMS`.
+    """Measure every dive of a set with every system of `OWN_SYSTEMS`, into SYSTEM/DIVE of a folder.
 
-    Parameters
-    ----------
-    benchmark : BenchmarkSet
-    folder : Path
-        A run goes to SYSTEM/DIVE in it.
-    echo : callable
-        Takes one line of text.
-    overwrite : bool
-        Whether to replace runs that are there.
-
-    Returns
-    -------
-    arguments : list of str
-        NAME=PATH of every system, to be scored.
-
-    Raises
-    ------
-    AqualvsError
-        If a dive cannot be read or the folder not be written.
+    Returns NAME=PATH of every system, to be scored. Raises `AqualvsError` if a dive cannot be read
+    or the folder not be written.
     """
     for system in OWN_SYSTEMS:
         for dive in benchmark.dives:
@@ -523,27 +448,8 @@ def score_and_tell(
 ) -> None:
     """Score systems side by side and print the table.
 
-    Parameters
-    ----------
-    results : sequence of str
-        NAME=PATH or paths, as `read_system` takes them.
-    truth : Path
-        Folder of the set.
-    echo : callable
-        Takes one line of text.
-    own : Path or None
-        Folder in which to run what comes with aqualvs first, to be scored too.
-    out : Path or None
-        Folder for `scores.csv`, `scores.json` and `scores.md`.
-    dives : bool
-        Whether the table shows every dive.
-    overwrite : bool
-        Whether to replace what this command wrote to `own` and `out` before.
-
-    Raises
-    ------
-    AqualvsError
-        If truth or results cannot be used, or a folder cannot be written.
+    Options are those of `aqualvs score`, see its `--help`. Raises `AqualvsError` if truth or
+    results cannot be used, or a folder cannot be written.
     """
     if not results and own is None:
         raise OptionError(

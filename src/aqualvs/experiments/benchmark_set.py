@@ -9,6 +9,7 @@ import math
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -37,103 +38,6 @@ from aqualvs.special_files import refuse_special
 from aqualvs.terminal import progress
 from aqualvs.yamlfile import read_yaml
 
-README = """\
-# Range and orientation from laser stripes under water: a benchmark
-
-A camera behind a small dome looks at a net or a wall; three green line lasers beside it draw
-stripes. For every frame: how far away is the target, and how is it turned? The pictures are
-rendered, so the truth is exact.
-
-## What is here
-
-- `benchmark.yaml`: name and checksum of the set, its dives and their levels of difficulty. `whole:
-  false` means that this is a part of the set, whose scores stand for themselves.
-- `DIVE/dive.mp4`: the video, H.264. Single pictures: `ffmpeg -i dive.mp4 frame_%04d.png` (ffmpeg
-  counts from 1; frames here count from 0).
-- `DIVE/rig.yaml`: camera, dome, water and lasers, the same for all dives. Nothing has to be
-  calibrated.
-- `DIVE/target.yaml`: what may be known of the target beforehand: net or wall, and the net's
-  mesh. Say if your system uses it; aqualvs itself does not.
-- `DIVE/truth.csv`: the truth, for scoring. A system must not read it.
-
-Levels: clear, turbid, sun, fouled, folded, crowded; and empty, where there is nothing to measure.
-The dives of a course (near, far, swing, wall) move alike on every level, and before the same
-target, but for what the level does to it.
-
-## Frames of reference and what is asked for
-
-`dome`: origin in the dome's centre, x right, y forward, z up; metres. The target is the plane
-n . X = d with |n| = 1 and d > 0.
-
-- range = d, the distance of the dome's centre from the plane
-- pitch = atan2(n_z, n_y), positive when the plane's far normal points up
-- yaw = atan2(n_x, n_y), positive when it points to the right
-
-The plane meant is the one through the stripe points on the target that the picture truly shows
-(least squares). On a net they lie on the front of its twine.
-
-## The rig: how a pixel becomes a ray
-
-`camera` is a pinhole with lens distortion k1 k2 p1 p2 as in OpenCV (`cv2.undistortPoints`); the
-centre of the top left pixel is (0, 0); camera axes x right, y down, z forward. A direction
-(x, y, z) of the camera is (x, z, -y) in `dome`, then turned by the rotation vector `rotation_deg`
-(axis times angle). `position_mm` is the lens in `dome`: it is NOT in the dome's centre, so rays
-bend.
-
-The dome is two spheres around the origin, of radius `inner_radius_mm` and `inner_radius_mm +
-thickness_mm`. Follow the ray from the lens to the inner sphere, refract it there from `n_air` to
-`n_acrylic`, go on to the outer sphere, and refract it from `n_acrylic` to the water's index
-(Snell's law in three dimensions). To leave this out costs several percent of the range.
-
-A laser lights the plane normal . X = offset_mm, in `dome` (normals there are made units first;
-offsets belong to the unit normal). Where a ray in the water meets a laser's plane is a point of the
-target.
-
-## What to write
-
-One CSV for every dive, `RESULTS/DIVE.csv` (or all in one file with a further column `dive`):
-
-    frame,range_m,pitch_deg,yaw_deg
-    0,0.3131,6.42,-9.87
-    1,0.3204,6.31,-9.02
-
-Frames without an answer are left out, or have `valid` 0. Columns that may be added, in any order:
-
-- `valid`: 1 or 0
-- `sigma_range_m`, `sigma_pitch_deg`, `sigma_yaw_deg`: the standard deviations that you claim
-- `range_mm` and `sigma_range_mm` in place of the metres
-
-## Scores
-
-    pip install aqualvs
-    aqualvs score mine=RESULTS other=OTHER_RESULTS --truth . -o scores
-
-- *available*: share of the frames with at least 40 visible stripe points that have an answer. A
-  point is visible where the stripe lifts a pixel by at least 10 of 255 grey levels; a stripe has
-  one point in every pixel along it.
-- *range*, *pitch*, *yaw*: errors of the answers in those frames: rms, median, 95th percentile,
-  maximum.
-- *wrong*: answers whose range is off by more than 5 %: to a fish, a wall behind, the water's glow.
-- *false*: answers in frames without any visible point.
-- *z*: rms of error over claimed sigma; 1 is honest, more is too sure.
-
-## Columns of truth.csv
-
-| column | meaning |
-|---|---|
-| frame, time_s | from 0 |
-| range_m, pitch_deg, yaw_deg | of the plane through the visible stripe points |
-| n_visible | visible stripe points on the target |
-| n_visible_lasers | lasers with at least five of them |
-| residual_mm | largest distance of a visible point from the plane: folds, growth, twine |
-| plane_range_m, plane_pitch_deg, plane_yaw_deg | of the target's own plane |
-
-The target's own plane holds the axes of a net's twine, without folds. Without a target all of these
-are empty.
-"""
-"""Written as `README.md` into every set."""
-
-
 SET_FILE = "benchmark.yaml"
 TRUTH_FILE = "truth.csv"
 TARGET_FILE = "target.yaml"
@@ -144,43 +48,28 @@ _COLUMNS = ("frame", "range_m", "pitch_deg", "yaw_deg", "n_visible")
 
 @dataclass(frozen=True, slots=True)
 class DiveTruth:
-    """Truth of one dive, N frames.
-
-    Attributes
-    ----------
-    name, level : str
-    frames : int array, shape (N,)
-        Numbers from 0.
-    posture : array, shape (N, 3)
-        Range (m), pitch and yaw (deg); NaN where there is no target.
-    n_visible : int array, shape (N,)
-        Stripe points on the target that the picture truly shows.
-    """
+    """Truth of one dive, N frames."""
 
     name: str
     level: str
+    # Shape (N,): numbers from 0.
     frames: IntArray
+    # Shape (N, 3): range (m), pitch and yaw (deg); NaN where there is no target.
     posture: FloatArray
+    # Shape (N,): stripe points on the target that the picture truly shows.
     n_visible: IntArray
 
 
 @dataclass(frozen=True, slots=True)
 class BenchmarkSet:
-    """A set of dives with truth.
+    """A set of dives with truth."""
 
-    Attributes
-    ----------
-    name, checksum : str
-        Of the set's definition.
-    whole : bool
-        False for a part of the set, or one in fewer frames: its scores stand for themselves.
-    folder : Path
-    dives : tuple of DiveTruth
-    """
-
+    # Of the set's definition.
     name: str
     checksum: str
+    # False for a part of the set, or one in fewer frames: its scores stand for themselves.
     whole: bool
+
     folder: Path
     dives: tuple[DiveTruth, ...]
 
@@ -201,10 +90,7 @@ class BenchmarkSet:
 def load_set(folder: Path) -> BenchmarkSet:
     """Read a set that `aqualvs benchmark` wrote.
 
-    Raises
-    ------
-    SourceError
-        If the folder holds none, or a file of it cannot be read.
+    Raises `SourceError` if the folder holds none, or a file of it cannot be read.
     """
     path = folder / SET_FILE
     content = _read_yaml(path)
@@ -225,10 +111,7 @@ def load_set(folder: Path) -> BenchmarkSet:
 def read_dive(path: Path, name: str, level: str) -> DiveTruth:
     """Read the truth of one dive.
 
-    Raises
-    ------
-    SourceError
-        If the file cannot be read, lacks a column, or holds what is no number.
+    Raises `SourceError` if the file cannot be read, lacks a column, or holds what is no number.
     """
     rows = read_rows(path, _COLUMNS)
     cells = [[cell(path, i, row, column) for column in _COLUMNS] for i, row in enumerate(rows)]
@@ -245,10 +128,7 @@ def read_dive(path: Path, name: str, level: str) -> DiveTruth:
 def read_rows(path: Path, needed: tuple[str, ...]) -> list[dict[str, str | None]]:
     """Return the rows of a CSV file with a header, its names without space around them.
 
-    Raises
-    ------
-    SourceError
-        If it cannot be read, holds no row, or lacks a column.
+    Raises `SourceError` if it cannot be read, holds no row, or lacks a column.
     """
     refuse_special(path)
     try:
@@ -275,10 +155,7 @@ def read_rows(path: Path, needed: tuple[str, ...]) -> list[dict[str, str | None]
 def cell(path: Path, i_row: int, row: dict[str, str | None], column: str) -> float:
     """Return the number in a cell; NaN where it is empty.
 
-    Raises
-    ------
-    SourceError
-        If it holds something else.
+    Raises `SourceError` if it holds something else.
     """
     text = (row.get(column) or "").strip()
     try:
@@ -310,33 +187,16 @@ def make_set(
 ) -> None:
     """Render dives of the set, with truth and a README, into a folder.
 
-    Parameters
-    ----------
-    out : Path
-        Folder to write.
-    names : sequence of str
-        Levels or dives; none for all.
-    echo : callable
-        Takes one line of text.
-    n_frames : int or None
-        Frames of every dive; None for all.
-    shutter : str or None
-        Of the camera, as `shutter_from_words` reads it for 25 pictures a second, which the set's
-        few are some of; None exposes all rows at once. A set with a shutter is a part: its scores
-        stand for themselves.
-    overwrite : bool
-        Whether a set that is there may be replaced.
+    Options are those of `aqualvs benchmark`, see its `--help`. A shutter is read for 25 pictures a
+    second, which the set's few are some of; a set with one is a part: its scores stand for
+    themselves.
 
-    Raises
-    ------
-    OptionError
-        If a name is not known or the number of frames makes no sense.
-    OutputError
-        If the folder holds a set already or cannot be written.
+    Raises `OptionError` if a name is not known or the number of frames makes no sense,
+    `OutputError` if the folder holds a set already or cannot be written.
     """
     dives = chosen_dives(names, n_frames)
-    files = [out / name for name in (SET_FILE, _README_MD, *(dive.name for dive in dives))]
-    claim = Claim("benchmark", files, overwrite=overwrite)
+    written = [out / name for name in (SET_FILE, _README_MD, *(dive.name for dive in dives))]
+    claim = Claim("benchmark", written, overwrite=overwrite)
     rig = benchmark_rig()
     pictures_a_second = 25.0
     if shutter is not None:
@@ -349,7 +209,8 @@ def make_set(
         for dive in dives:
             render_benchmark_dive(dive, renderer, out / dive.name, tick=tick)
             (out / dive.name / TARGET_FILE).write_text(target_text(dive), encoding="utf-8")
-        (out / _README_MD).write_text(README, encoding="utf-8")
+        readme = files("aqualvs.experiments") / "assets" / "benchmark.md"
+        (out / _README_MD).write_text(readme.read_text(encoding="utf-8"), encoding="utf-8")
         facts = set_facts(dives)
         if shutter is not None:
             facts |= {"whole": False, "shutter": shutter}
@@ -363,10 +224,7 @@ def make_set(
 def chosen_dives(names: Sequence[str], n_frames: int | None) -> list[BenchmarkDive]:
     """Return the dives of some levels or names, in the set's order, shortened if wished.
 
-    Raises
-    ------
-    OptionError
-        If a name is not known or the number of frames makes no sense.
+    Raises `OptionError` if a name is not known or the number of frames makes no sense.
     """
     dives = benchmark_dives()
     known = [*LEVELS, *(dive.name for dive in dives)]
@@ -438,57 +296,34 @@ Row = dict[str, str | None]
 
 @dataclass(frozen=True, slots=True)
 class Answers:
-    """Answers of a system to the N frames of one dive, in the order of the truth.
+    """Answers of a system to the N frames of one dive, in the order of the truth."""
 
-    Attributes
-    ----------
-    valid : bool array, shape (N,)
-    posture : array, shape (N, 3)
-        Range (m), pitch and yaw (deg); NaN where a frame has none.
-    sigma : array, shape (N, 3)
-        Standard deviations that the system claims, same units; NaN where it claims none.
-    """
-
+    # Shape (N,).
     valid: BoolArray
+    # Shape (N, 3): range (m), pitch and yaw (deg); NaN where a frame has none.
     posture: FloatArray
+    # Shape (N, 3): standard deviations that the system claims, same units; NaN where it claims
+    # none.
     sigma: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
 class System:
-    """A system under test.
-
-    Attributes
-    ----------
-    name : str
-    answers : dict of str to Answers
-        By dive; every dive of the set is there.
-    missing : tuple of str
-        Dives for which it brought no file; it has no valid answer in them.
-    """
+    """A system under test."""
 
     name: str
-    answers: dict[str, Answers]
-    missing: tuple[str, ...]
+    answers: dict[str, Answers]  # By dive; every dive of the set is there.
+    missing: tuple[str, ...]  # Dives for which it brought no file; it has no valid answer in them.
 
 
 def read_system(argument: str, benchmark: BenchmarkSet) -> System:
-    """Read the results of a system.
+    """Read the results of a system for the dives of a set.
 
-    Parameters
-    ----------
-    argument : str
-        NAME=PATH, or a path, which is then called as its last part. The path is a folder with
-        DIVE.csv or DIVE/posture.csv for every dive, or one CSV with a column `dive`.
-    benchmark : BenchmarkSet
-        The set whose dives they are.
+    `argument`: NAME=PATH, or a path, which is then called as its last part. The path is a folder
+    with DIVE.csv or DIVE/posture.csv for every dive, or one CSV with a column `dive`.
 
-    Raises
-    ------
-    SourceError
-        If a file cannot be read or makes no sense.
-    OptionError
-        If there is nothing for any dive.
+    Raises `SourceError` if a file cannot be read or makes no sense, `OptionError` if there is
+    nothing for any dive.
     """
     given, equals, rest = argument.partition("=")
     path = Path(rest if equals else argument)

@@ -115,13 +115,7 @@ class TimeLeft:
 
 
 class ExperimentBar:
-    """A progress bar over experiments.
-
-    Parameters
-    ----------
-    bar : rich.progress.Progress
-    names : sequence of str
-    """
+    """A progress bar over experiments."""
 
     def __init__(self, bar: Progress, names: Sequence[str]) -> None:
         self._bar = bar
@@ -157,10 +151,7 @@ class ExperimentBar:
 def experiment_bar(names: Sequence[str]) -> Iterator[ExperimentBar]:
     """Show how far the experiments are; nothing where standard error is not a terminal.
 
-    Parameters
-    ----------
-    names : sequence of str
-        Experiments to come, in their order.
+    `names`: experiments to come, in their order.
     """
     console = Console(stderr=True)
     columns = (
@@ -201,18 +192,10 @@ _FAILURES = "failures"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReproduceRequest:
-    """Request for `aqualvs reproduce`; see its `--help`.
+    """Request for `aqualvs reproduce`; see its `--help`."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        Experiments; all of them if empty.
-    out : Path
-        Folder to write.
-    """
-
-    names: tuple[str, ...]
-    out: Path
+    names: tuple[str, ...]  # Experiments; all of them if empty.
+    out: Path  # Folder to write.
 
 
 def print_experiments(echo: Echo) -> None:
@@ -224,29 +207,11 @@ def print_experiments(echo: Echo) -> None:
 
 
 def reproduce(request: ReproduceRequest, echo: Echo, load: Load = catalogue.experiment) -> int:
-    """Run experiments, write the page after each of them, and return the exit code.
+    """Run experiments, write the page after each of them, and return 0, or 1 if one failed.
 
-    Results of other experiments that the same version left in the folder stay on the page.
-
-    Parameters
-    ----------
-    request : ReproduceRequest
-    echo : callable
-        Takes one line of text.
-    load : callable
-        From a name to its experiment.
-
-    Returns
-    -------
-    exit_code : int
-        0, or 1 if an experiment failed.
-
-    Raises
-    ------
-    OptionError
-        If there is no experiment of some name.
-    OutputError
-        If the folder cannot be written.
+    Results of other experiments that the same version left in the folder stay on the page. Raises
+    `OptionError` if there is no experiment of some name, `OutputError` if the folder cannot be
+    written.
     """
     names = catalogue.ordered(request.names)
     # Results of other experiments in the folder stay; those of the same are brought up to date.

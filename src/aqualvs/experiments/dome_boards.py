@@ -61,30 +61,15 @@ _SETUP = _Setup()
 
 @dataclass(frozen=True, slots=True)
 class SolvedDome:
-    """The two steps of a calibration, with what they were given.
-
-    Attributes
-    ----------
-    truth : Rig
-    start : Rig
-        Before the second step: lens at the dome's centre, camera straight ahead.
-    start_poses : tuple of SE3
-        Of the boards, as they best fit `start`.
-    lens : CameraCalibration
-    dome : DomeCalibration
-    poses : tuple of BoardPose
-        What was measured of the boards.
-    folder : Path
-        Of the boards' pictures.
-    """
+    """The two steps of a calibration, with what they were given."""
 
     truth: Rig
-    start: Rig
-    start_poses: tuple[SE3, ...]
+    start: Rig  # Before the second step: lens at the dome's centre, camera straight ahead.
+    start_poses: tuple[SE3, ...]  # Of the boards, as they best fit `start`.
     lens: CameraCalibration
     dome: DomeCalibration
-    poses: tuple[BoardPose, ...]
-    folder: Path
+    poses: tuple[BoardPose, ...]  # What was measured of the boards.
+    folder: Path  # Of the boards' pictures.
 
     @property
     def errors(self) -> dict[str, float]:
@@ -102,10 +87,7 @@ class SolvedDome:
 def solve_from_pictures(laboratory: Laboratory) -> SolvedDome:
     """Solve lens and dome from rendered pictures, distances read off with 0.2 mm of error.
 
-    Raises
-    ------
-    CalibrationError
-        If a picture does not show its board.
+    Raises `CalibrationError` if a picture does not show its board.
     """
     files = calibration_pictures(laboratory)
     truth = load_rig(files.rig)
@@ -144,10 +126,7 @@ def solve_from_pictures(laboratory: Laboratory) -> SolvedDome:
 def board_views(folder: Path, board_file: Path, seed: int) -> tuple[View, ...]:
     """Find a board in all pictures of a folder, and blur what was found as real boards would.
 
-    Raises
-    ------
-    CalibrationError
-        If one does not show it.
+    Raises `CalibrationError` if one does not show it.
     """
     board = load_board(board_file)
 
@@ -226,16 +205,14 @@ def _findings(solved: SolvedDome, before_px: float) -> tuple[ExperimentRow, ...]
         _vector("lens in the dome x, y, z (mm)", _PAPER_LENS, solved, _LENS, 1e3, 2),
         _vector("camera's rotation x, y, z (°)", _PAPER_TURN, solved, _TURN, 180.0 / np.pi, 3),
         _vector("image plane fx, fy, cx, cy (px)", _PAPER_PLANE, solved, _PLANE, 1.0, 1),
-        ExperimentRow(
-            what="largest error of lens and rotation, in standard deviations",
-            paper="",
-            ours=f"{worst:.1f}",
-            bar=f"<= {_SETUP.bar_sigmas:g}",
-            met=worst <= _SETUP.bar_sigmas,
+        ExperimentRow.at_most(
+            "largest error of lens and rotation, in standard deviations",
+            worst,
+            _SETUP.bar_sigmas,
+            digits=1,
         ),
         ExperimentRow(
             what="corners, rms distance before and after (px)",
-            paper="",
             ours=f"{before_px:.2f} and {solved.dome.rms_px:.2f}",
         ),
     )
@@ -245,7 +222,6 @@ def _findings(solved: SolvedDome, before_px: float) -> tuple[ExperimentRow, ...]
         *found,
         ExperimentRow(
             what="corners of boards held out: with the dome, and best without it (px)",
-            paper="",
             ours=f"{held.dome_rms_px:.3f} and {held.bare_rms_px:.3f}",
         ),
     )

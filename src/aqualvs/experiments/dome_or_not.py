@@ -16,7 +16,7 @@ from aqualvs.experiments.laboratory import Laboratory, MeasuredDive, calibrated_
 from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.planes import Plane, Rays
 from aqualvs.optics.rig import Rig
-from aqualvs.report.figure_style import GREEN, OURS, PAPER, STYLE, TRUTH, new_figure
+from aqualvs.report.figure_style import GREEN, OURS, PAPER, TRUTH, new_figure
 from aqualvs.scanning.scan import Label, ScanPoints
 from aqualvs.simulation.scenario import Scenario, parse_scenario
 
@@ -47,17 +47,12 @@ _SETUP = _Setup()
 
 @dataclass(frozen=True, slots=True)
 class Distances:
-    """Distances of the wall from three points of a stripe, N frames.
+    """Distances of the wall from three points of a stripe, N frames."""
 
-    Attributes
-    ----------
-    true : array, shape (N,)
-    dome, bare, refitted : array, shape (N, 4)
-        In metres: left, central, right, and their average. With the dome model; without it; and
-        without it, but with a laser that was calibrated without it too.
-    """
-
+    # Shape (N,).
     true: FloatArray
+    # Shape (N, 4): in metres: left, central, right, and their average. With the dome model; without
+    # it; and without it, but with a laser that was calibrated without it too.
     dome: FloatArray
     bare: FloatArray
     refitted: FloatArray
@@ -108,12 +103,12 @@ def _run(laboratory: Laboratory) -> ExperimentResult:
                 bar=f">= {_SETUP.bar_factor:g}",
                 met=min(factors) >= _SETUP.bar_factor,
             ),
-            ExperimentRow(
-                what="largest error of a single point with the dome model (%)",
+            ExperimentRow.at_most(
+                "largest error of a single point with the dome model (%)",
+                worst,
+                _SETUP.bar_percent,
+                digits=3,
                 paper=f"{_SETUP.paper_percent} (at 300 mm)",
-                ours=f"{worst:.3f}",
-                bar=f"<= {_SETUP.bar_percent}",
-                met=worst <= _SETUP.bar_percent,
             ),
             ExperimentRow(
                 what="range of distances (mm)",
@@ -236,7 +231,6 @@ def _row(found: Distances, pick: int, name: str) -> ExperimentRow:
     bare = np.polyfit(found.true, found.bare[:, pick], 1)[0]
     return ExperimentRow(
         what=f"{name}: root mean square error with, without the model (%); slope of the lines",
-        paper="",
         ours=f"{_rms(found, found.dome, pick):.3f}, {_rms(found, found.bare, pick):.2f}; "
         f"{slope:.5f}, {bare:.4f}",
     )
@@ -252,10 +246,7 @@ def _series(found: Distances) -> DataColumns:
 
 
 def _distances_drawn(found: Distances) -> "Figure":
-    from matplotlib import rc_context
-
-    with rc_context(dict(STYLE)):
-        figure = new_figure(3.1)
+    with new_figure(3.1) as figure:
         for axes, pick, name in zip(
             figure.subplots(1, 2, sharey=True), (0, 3), ("leftmost point", "average"), strict=True
         ):
@@ -277,10 +268,7 @@ def _distances_drawn(found: Distances) -> "Figure":
 
 
 def _errors_drawn(found: Distances) -> "Figure":
-    from matplotlib import rc_context
-
-    with rc_context(dict(STYLE)):
-        figure = new_figure(4.2)
+    with new_figure(4.2) as figure:
         grid = figure.subplots(2, 2, sharex=True, sharey="row", height_ratios=(1.4, 1.0))
         for column, (pick, name) in enumerate(((0, "leftmost point"), (3, "average"))):
             top, low = grid[0, column], grid[1, column]

@@ -8,11 +8,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
 from types import MappingProxyType
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Self, TypeAlias
 
 from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import FloatArray, IntArray
-from aqualvs.report.figure_style import STYLE, new_figure
+from aqualvs.report.figure_style import new_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -25,46 +25,42 @@ Column: TypeAlias = FloatArray | IntArray | list[str]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ExperimentRow:
-    """One row of an experiment's table.
+    """One row of an experiment's table."""
 
-    Attributes
-    ----------
-    what : str
-        The quantity, with its unit.
-    paper : str
-        As the paper prints it; empty where it says nothing.
-    ours : str
-        As measured here.
-    bar : str
-        What we hold ourselves to; empty where there is no such thing.
-    met : bool or None
-        Whether it is reached; None without a bar.
-    """
+    what: str  # The quantity, with its unit.
+    paper: str = ""  # As the paper prints it; empty where it says nothing.
+    ours: str  # As measured here.
+    bar: str = ""  # What we hold ourselves to; empty where there is no such thing.
+    met: bool | None = None  # Whether it is reached; None without a bar.
 
-    what: str
-    paper: str
-    ours: str
-    bar: str = ""
-    met: bool | None = None
+    @classmethod
+    def at_most(
+        cls,
+        what: str,
+        value: float,
+        limit: float,
+        *,
+        digits: int,
+        paper: str = "",
+        valid: bool = True,
+    ) -> Self:
+        """Return the row of a value that must not exceed a limit; it misses where not `valid`."""
+        return cls(
+            what=what,
+            paper=paper,
+            ours=f"{value:.{digits}f}",
+            bar=f"<= {limit:g}",
+            met=valid and bool(value <= limit),
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ExperimentFigure:
-    """A figure to print.
+    """A figure to print."""
 
-    Attributes
-    ----------
-    name : str
-        Stem of its files, such as `figure_15`.
-    caption : str
-        What it shows and which figure of the paper it stands beside.
-    figure : matplotlib.figure.Figure
-        From `figure_style.new_figure`.
-    """
-
-    name: str
-    caption: str
-    figure: "Figure"
+    name: str  # Stem of its files, such as `figure_15`.
+    caption: str  # What it shows and which figure of the paper it stands beside.
+    figure: "Figure"  # From `figure_style.new_figure`.
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -77,48 +73,32 @@ class DataColumns:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ExperimentResult:
-    """Results of an experiment.
+    """Results of an experiment."""
 
-    Attributes
-    ----------
-    sentence : str
-        The result in one sentence, with its numbers.
-    findings : tuple of ExperimentRow
-    pictures : tuple of ExperimentFigure
-    series : tuple of DataColumns
-    notes : tuple of str
-        What a reader must know to judge it: where it differs from the paper's setting, and why.
-    """
-
+    # The result in one sentence, with its numbers.
     sentence: str
+
     findings: tuple[ExperimentRow, ...]
     pictures: tuple[ExperimentFigure, ...] = ()
     series: tuple[DataColumns, ...] = ()
+    # What a reader must know to judge it: where it differs from the paper's setting, and why.
     notes: tuple[str, ...] = field(default=())
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Experiment:
-    """One experiment of the paper, or one that explains a choice of ours.
+    """One experiment of the paper, or one that explains a choice of ours."""
 
-    Attributes
-    ----------
-    name : str
-        What is typed to run it alone.
-    title : str
-    paper : str
-        Where the paper has it, such as "section 5.3, figure 15"; empty for our own.
-    about : str
-        The setting, in one or two sentences.
-    run : callable
-        Takes the laboratory, gives the outcome. It must depend on nothing else, so that the same
-        version gives the same numbers on every machine.
-    """
-
+    # What is typed to run it alone.
     name: str
+
     title: str
-    paper: str
+    # Where the paper has it, such as "section 5.3, figure 15"; empty for our own.
+    paper: str = ""
+    # The setting, in one or two sentences.
     about: str
+    # Takes the laboratory, gives the outcome. It must depend on nothing else, so that the same
+    # version gives the same numbers on every machine.
     run: "Callable[[Laboratory], ExperimentResult]"
 
 
@@ -136,10 +116,7 @@ def drawn(
     draw : callable
         Fills the figure.
     """
-    from matplotlib import rc_context
-
-    with rc_context(dict(STYLE)):
-        figure = new_figure(height_in)
+    with new_figure(height_in) as figure:
         draw(figure)
     return ExperimentFigure(name=name, caption=caption, figure=figure)
 
@@ -173,10 +150,7 @@ MODULES: Mapping[str, str] = MappingProxyType(
 def ordered(names: Sequence[str]) -> list[str]:
     """Return these names in the catalogue's order, each once; all of them for none.
 
-    Raises
-    ------
-    OptionError
-        If a name is not in the catalogue.
+    Raises `OptionError` if a name is not in the catalogue.
     """
     for name in names:
         if name not in MODULES:

@@ -20,7 +20,7 @@ from aqualvs.experiments.experiment import (
 )
 from aqualvs.experiments.laboratory import Laboratory, MeasuredDive, RenderedDive, frames_of
 from aqualvs.geometry.arrays import BoolArray, FloatArray
-from aqualvs.report.figure_style import BLUE, GREEN, ORANGE, STYLE, new_figure
+from aqualvs.report.figure_style import BLUE, GREEN, ORANGE, new_figure
 from aqualvs.scanner import ScannerOptions
 from aqualvs.scanning.paper.mesh_filter import MeshFilterOptions
 from aqualvs.scanning.posture_estimator import FitMethod
@@ -44,11 +44,7 @@ def visible_points(laboratory: Laboratory, dive: RenderedDive) -> FloatArray:
 
     See `aqualvs.simulation.benchmark` for what stands out. The numbers are kept beside the dive.
 
-    Parameters
-    ----------
-    laboratory : Laboratory
-        Counts the frames, which are rendered once more for this.
-    dive : RenderedDive
+    `laboratory`: counts the frames, which are rendered once more for this.
     """
     path = dive.folder / _FILE
     if not path.exists():
@@ -199,22 +195,16 @@ def _findings(name: str, seen: Mapping[str, MeasuredScene]) -> list[ExperimentRo
         ),
         ExperimentRow(
             what=f"{name}: largest error of range (%), pitch, yaw (degrees)",
-            paper="",
             ours=_told(one.largest),
             bar="<= " + ", ".join(f"{limit:g}" for limit in limits),
             met=bool(np.all(one.largest <= limits)),
         ),
         ExperimentRow(
             what=f"{name}: root mean square error, and as many times the clear scene's",
-            paper="",
             ours=_told(one.rms)
             + (f"; {', '.join(f'{x:.1f}' for x in one.rms / clear.rms)}" if judged else ""),
         ),
-        ExperimentRow(
-            what=f"{name}: stated sigma (median)",
-            paper="",
-            ours=_told(one.sigmas),
-        ),
+        ExperimentRow(what=f"{name}: stated sigma (median)", ours=_told(one.sigmas)),
     ]
 
 
@@ -233,10 +223,7 @@ def _series(name: str, one: MeasuredScene) -> DataColumns:
 
 
 def _drawn(seen: Mapping[str, MeasuredScene]) -> "Figure":
-    from matplotlib import rc_context
-
-    with rc_context(dict(STYLE)):
-        figure = new_figure(5.6)
+    with new_figure(5.6) as figure:
         grid = figure.subplots(3, 3, height_ratios=(1.6, 1.0, 1.0), sharey="row")
         for column, (name, one) in enumerate(seen.items()):
             picture, *errors = grid[:, column]

@@ -23,7 +23,7 @@ from aqualvs.experiments.experiment import DataColumns, ExperimentRow
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.rigfile import load_rig, rig_to_mapping, save_rig
-from aqualvs.report.figure_style import GREY, OURS, STYLE, new_figure
+from aqualvs.report.figure_style import GREY, OURS, new_figure
 from aqualvs.results.summary import read_truth
 from aqualvs.scanner import Scanner, ScannerOptions
 from aqualvs.scanning.posture import Posture
@@ -45,21 +45,14 @@ _VIDEO, _TRUTH, _RIG, _READY = "dive.mp4", "truth.csv", "rig.yaml", "ready.json"
 
 @dataclass(frozen=True, slots=True)
 class RenderedDive:
-    """A rendered dive on disk.
-
-    Attributes
-    ----------
-    name : str
-    folder : Path
-        Holds `dive.mp4`, `truth.csv` and `rig.yaml`, and `points_FFFF.npz` of the frames asked for.
-    rig : Rig
-        The true one.
-    scenario : Scenario
-    """
+    """A rendered dive on disk."""
 
     name: str
+    # Holds `dive.mp4`, `truth.csv` and `rig.yaml`, and `points_FFFF.npz` of the frames asked for.
     folder: Path
+    # The true one.
     rig: Rig
+
     scenario: Scenario
 
     @property
@@ -75,16 +68,10 @@ class RenderedDive:
 
 @dataclass(frozen=True, slots=True)
 class MeasuredDive:
-    """Dive as one scanner measured it, frame by frame, N of them, beside the truth.
-
-    Attributes
-    ----------
-    scans : list of Scan
-    truth : float array, shape (N, 3)
-        Range in m, pitch and yaw in radians; NaN where there is none.
-    """
+    """Dive as one scanner measured it, frame by frame, N of them, beside the truth."""
 
     scans: list[Scan]
+    # Shape (N, 3): range in m, pitch and yaw in radians; NaN where there is none.
     truth: FloatArray
 
     @property
@@ -217,27 +204,17 @@ class Laboratory:
         options: ScannerOptions | None = None,
         *,
         rig: Rig | None = None,
-        no_dome: bool = False,
     ) -> MeasuredDive:
         """Measure every frame of a dive.
 
-        Parameters
-        ----------
-        dive : RenderedDive
-        options : ScannerOptions, optional
-        rig : Rig, optional
-            What the scanner believes; the true rig by default.
-        no_dome : bool
-            Leave refraction out, as `aqualvs run --no-dome` does.
+        `rig`: what the scanner believes; the true rig by default.
         """
         believed = rig or dive.rig
         options = options or ScannerOptions()
-        key = (dive.name, _digest([repr(options), rig_to_mapping(believed), no_dome]))
+        key = (dive.name, _digest([repr(options), rig_to_mapping(believed)]))
         if key not in self._measured:
-            camera = believed.bare_camera() if no_dome else None
-            own = options == ScannerOptions() and camera is None
-            scanner = Scanner(believed, options, camera)
-            self._measured[key] = _measured(dive, scanner, self.frame_s if own else [])
+            frame_s = self.frame_s if options == ScannerOptions() else []
+            self._measured[key] = _measured(dive, Scanner(believed, options), frame_s)
         return self._measured[key]
 
 
@@ -273,19 +250,11 @@ QUANTITIES = ("range (%)", "pitch (degrees)", "yaw (degrees)")
 
 @dataclass(frozen=True, slots=True)
 class Variant:
-    """One way to measure, over one dive or several.
-
-    Attributes
-    ----------
-    name : str
-    measured : tuple of MeasuredDive
-    ours : bool
-        Whether this is what `aqualvs` does by default.
-    """
+    """One way to measure, over one dive or several."""
 
     name: str
     measured: tuple[MeasuredDive, ...]
-    ours: bool = False
+    ours: bool = False  # Whether this is what `aqualvs` does by default.
 
     @property
     def valid_percent(self) -> float:
@@ -309,7 +278,6 @@ def findings(variants: Sequence[Variant]) -> tuple[ExperimentRow, ...]:
     return tuple(
         ExperimentRow(
             what=f"{one.name}: rms error of range (%), pitch, yaw (degrees); frames with a posture",
-            paper="",
             ours=f"{told(one.rms)}; {one.valid_percent:.0f} %",
         )
         for one in variants
@@ -333,14 +301,11 @@ def series(name: str, variants: Sequence[Variant]) -> DataColumns:
 
 def drawn(variants: Sequence[Variant]) -> "Figure":
     """Draw rms errors as bars on a logarithmic scale, and the share of frames with a posture."""
-    from matplotlib import rc_context
-
     names = [one.name for one in variants]
     rms = np.array([one.rms for one in variants])
     valid = np.array([one.valid_percent for one in variants])
     least = 1e-3
-    with rc_context(dict(STYLE)):
-        figure = new_figure(0.9 + 0.3 * len(variants))
+    with new_figure(0.9 + 0.3 * len(variants)) as figure:
         panels = figure.subplots(1, 4, sharey=True)
         for k, axes in enumerate(panels[:3]):
             _bars(axes, variants, rms[:, k], QUANTITIES[k])
@@ -429,67 +394,18 @@ def _noted_files(folder: Path) -> CalibrationFiles:
 def _calibrate(files: CalibrationFiles, rig: Path, n_lasers: int) -> None:
     # The last step writes the file that tells that all is done.
     draft = rig.with_name(_DRAFT)
-    for step in (_camera, _dome):
-        step(files, draft)
-    _lasers(files, draft, rig, n_lasers)
-
-
-def _camera(files: CalibrationFiles, rig: Path) -> None:
-    run_camera(
-        CameraRequest(
-            images=(str(files.camera),),
-            board=files.board,
-            out=rig,
-            nominal=files.nominal,
-            model="opencv",
-            n_coefficients=None,
-        ),
-        _say_nothing,
+    camera = CameraRequest(
+        images=(str(files.camera),), board=files.board, out=draft, nominal=files.nominal
     )
-
-
-def _dome(files: CalibrationFiles, rig: Path) -> None:
-    run_dome(
-        DomeRequest(
-            images=(str(files.dome),),
-            board=files.rail_board,
-            rig=rig,
-            out=rig,
-            poses=files.poses,
-            medium="air",
-            water_images=(),
-            water_board=None,
-            water_poses=None,
-            inner_radius_mm=None,
-            port_distance_mm=None,
-            thickness_mm=None,
-            n_acrylic=None,
-            radius_tolerance_mm=0.1,
-            thickness_tolerance_mm=0.1,
-            acrylic_tolerance=0.003,
-            distance_sigma_mm=0.2,
-            refine_intrinsics=True,
-        ),
-        _say_nothing,
+    run_camera(camera, _say_nothing)
+    dome = DomeRequest(
+        images=(str(files.dome),), board=files.rail_board, rig=draft, out=draft, poses=files.poses
     )
-
-
-def _lasers(files: CalibrationFiles, draft: Path, rig: Path, n_lasers: int) -> None:
-    run_lasers(
-        LasersRequest(
-            images=(str(files.box),),
-            rig=draft,
-            out=rig,
-            box=files.box_file,
-            board=None,
-            medium=None,
-            n_lasers=n_lasers,
-            names=None,
-            board_offset_mm=0.0,
-            refine=False,
-        ),
-        _say_nothing,
+    run_dome(dome, _say_nothing)
+    lasers = LasersRequest(
+        images=(str(files.box),), rig=draft, out=rig, box=files.box_file, n_lasers=n_lasers
     )
+    run_lasers(lasers, _say_nothing)
 
 
 def _say_nothing(_line: str) -> None:

@@ -54,39 +54,26 @@ _SETUP = _Setup()
 
 @dataclass(frozen=True, slots=True)
 class PlaneError:
-    """Error of a found laser plane against the true one.
+    """Error of a found laser plane against the true one."""
 
-    Attributes
-    ----------
-    angle, sigma_angle : float
-        Between the normals, radians.
-    offset, sigma_offset : float
-        Found minus true, metres.
-    paper_angle, paper_offset : float
-        The same of the plane by the paper's way.
-    """
-
+    # Between the normals, radians.
     angle: float
     sigma_angle: float
+    # Found minus true, metres.
     offset: float
     sigma_offset: float
+    # The same of the plane by the paper's way.
     paper_angle: float
     paper_offset: float
 
 
 @dataclass(frozen=True, slots=True)
 class Remaining:
-    """Range errors that a calibration leaves on walls square ahead, without noise, W of them.
+    """Range errors that a calibration leaves on walls square ahead, without noise, W of them."""
 
-    Attributes
-    ----------
-    ranges : array, shape (W,)
-        True ones, metres.
-    errors, sigmas : array, shape (W, 3)
-        Of range, pitch and yaw, m and rad; the sigmas are what the calibration states.
-    """
-
+    # Shape (W,): True ones, metres.
     ranges: FloatArray
+    # Shape (W, 3): of range, pitch and yaw, m and rad; the sigmas are what the calibration states.
     errors: FloatArray
     sigmas: FloatArray
 
@@ -117,10 +104,7 @@ def angle_between(a: FloatArray, b: FloatArray) -> float:
 def matched(found: Sequence[LaserFigures], lasers: Sequence[Laser]) -> list[LaserFigures]:
     """Return the found lasers in the order of the true ones.
 
-    Raises
-    ------
-    CalibrationError
-        If two of them are nearest to the same.
+    Raises `CalibrationError` if two of them are nearest to the same.
     """
 
     def apart(one: LaserFigures, laser: Laser) -> float:
@@ -227,12 +211,8 @@ def _plane_findings(
     worst = max(max(e.angle / e.sigma_angle, abs(e.offset) / e.sigma_offset) for e in errors)
     return (
         *rows,
-        ExperimentRow(
-            what="largest error of a plane, in standard deviations",
-            paper="",
-            ours=f"{worst:.1f}",
-            bar=f"<= {_SETUP.bar_sigmas:g}",
-            met=worst <= _SETUP.bar_sigmas,
+        ExperimentRow.at_most(
+            "largest error of a plane, in standard deviations", worst, _SETUP.bar_sigmas, digits=1
         ),
     )
 
@@ -241,19 +221,14 @@ def _left_findings(left: Remaining) -> tuple[ExperimentRow, ...]:
     percent = float(np.abs(left.percent).max())
     degrees = float(np.rad2deg(np.abs(left.errors[:, 1:])).max())
     return (
-        ExperimentRow(
-            what="range error that remains, 0.3 to 1 m, largest (%)",
-            paper="",
-            ours=f"{percent:.3f}",
-            bar=f"<= {_SETUP.bar_percent}",
-            met=percent <= _SETUP.bar_percent,
+        ExperimentRow.at_most(
+            "range error that remains, 0.3 to 1 m, largest (%)",
+            percent,
+            _SETUP.bar_percent,
+            digits=3,
         ),
-        ExperimentRow(
-            what="pitch and yaw error that remains, largest (°)",
-            paper="",
-            ours=f"{degrees:.3f}",
-            bar=f"<= {_SETUP.bar_deg}",
-            met=degrees <= _SETUP.bar_deg,
+        ExperimentRow.at_most(
+            "pitch and yaw error that remains, largest (°)", degrees, _SETUP.bar_deg, digits=3
         ),
     )
 

@@ -26,7 +26,7 @@ from aqualvs.experiments.experiment import (
 from aqualvs.experiments.laboratory import Laboratory, MeasuredDive, RenderedDive, frames_of, told
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.optics.rig import Rig
-from aqualvs.report.figure_style import OURS, PINK, STYLE, new_figure
+from aqualvs.report.figure_style import OURS, PINK, new_figure
 from aqualvs.report.mesh_figures import Reflections, drawn_figures
 from aqualvs.scanner import ScannerOptions
 from aqualvs.scanning.laser_bands import plan_bands
@@ -50,8 +50,6 @@ def papers_pixels(
 
     Parameters
     ----------
-    laboratory : Laboratory
-    dive : RenderedDive
     options : MeshFilterOptions
         Of the filter; by default those of section 5.2.
     level : int, optional
@@ -110,18 +108,11 @@ class Judged(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class LitTruth:
-    """Points that the lasers light and the camera sees, N of them.
+    """Points that the lasers light and the camera sees, N of them."""
 
-    Attributes
-    ----------
-    pixels : array, shape (N, 2)
-    laser : int array, shape (N,)
-    on_net : bool array, shape (N,)
-    """
-
-    pixels: FloatArray
-    laser: IntArray
-    on_net: BoolArray
+    pixels: FloatArray  # Shape (N, 2).
+    laser: IntArray  # Shape (N,).
+    on_net: BoolArray  # Shape (N,).
 
     @classmethod
     def read(cls, path: Path) -> "LitTruth":
@@ -149,7 +140,6 @@ def judge_pixels(pixels: FloatArray, laser: IntArray, truth: LitTruth) -> Judged
     ----------
     pixels : array, shape (N, 2)
     laser : int array, shape (N,)
-    truth : LitTruth
 
     Returns
     -------
@@ -186,7 +176,6 @@ def judge_reflections(found: FilteredPeaks, truth: LitTruth) -> Judged:
     ----------
     found : FilteredPeaks
         All pixels of the frame, and which of them are said to lie on the net.
-    truth : LitTruth
 
     Returns
     -------
@@ -337,24 +326,22 @@ def _findings(
         ),
         ExperimentRow(
             what="recall of net points",
-            paper="",
             ours=f"{mine.recall:.3f}",
             bar=f">= {bar_recall}",
             met=mine.recall >= bar_recall,
         ),
-        ExperimentRow(what="precision and recall of net reflections", paper="", ours=told(whole)),
+        ExperimentRow(what="precision and recall of net reflections", ours=told(whole)),
         ExperimentRow(
             what="threshold and paper's filter, section 5.2's parameters: of net pixels",
-            paper="",
             ours=told(theirs),
         ),
-        ExperimentRow(what="the same of net reflections", paper="", ours=told(their_whole)),
-        ExperimentRow(
-            what="largest error of the range to the net (%)",
-            paper="",
-            ours=f"{worst:.3f}",
-            bar=f"<= {bar_range}",
-            met=bool(measured.valid.all()) and worst <= bar_range,
+        ExperimentRow(what="the same of net reflections", ours=told(their_whole)),
+        ExperimentRow.at_most(
+            "largest error of the range to the net (%)",
+            worst,
+            bar_range,
+            digits=3,
+            valid=bool(measured.valid.all()),
         ),
     )
 
@@ -414,12 +401,9 @@ def _in_laser(points_in_dome: FloatArray, rig: Rig, laser: int) -> FloatArray:
 
 
 def _seen(frame: Frame) -> "Figure":
-    from matplotlib import rc_context
-
     from aqualvs.sources.base import bgr_of
 
-    with rc_context(dict(STYLE)):
-        figure = new_figure(2.9)
+    with new_figure(2.9) as figure:
         left, right = figure.subplots(1, 2)
         left.imshow(bgr_of(frame)[..., ::-1], interpolation="nearest")
         level = ThresholdOptions().level
@@ -434,15 +418,12 @@ def _seen(frame: Frame) -> "Figure":
 
 
 def _filtered(papers: FilteredPeaks, scan: Scan, rig: Rig, laser: int) -> "Figure":
-    from matplotlib import rc_context
-
     own, bright = scan.points.laser == laser, papers.laser == laser
     columns = (
         (scan.points.points_in_dome[own], np.asarray(scan.points.label[own] == Label.NET)),
         (papers.points_in_dome[bright], papers.on_mesh[bright]),
     )
-    with rc_context(dict(STYLE)):
-        figure = new_figure(2.6)
+    with new_figure(2.6) as figure:
         names = ("(a) sub-pixel, adaptive filter", "(b) threshold, paper's filter")
         for axes, (points, net), name in zip(
             figure.subplots(1, 2, sharex=True, sharey=True), columns, names, strict=True

@@ -68,43 +68,30 @@ class PrintedFigure:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Record:
-    """An experiment that was run, as `results.json` keeps it.
+    """An experiment that was run, as `results.json` keeps it."""
 
-    Attributes
-    ----------
-    name, title, paper, about : str
-        As in `Experiment`.
-    sentence : str
-    findings : tuple of ExperimentRow
-    pictures : tuple of PrintedFigure
-    series : tuple of str
-        Files in `series/`.
-    notes : tuple of str
-    failure : str
-        Why there is no outcome; empty if there is one.
-    """
-
+    # As in `Experiment`.
     name: str
     title: str
     paper: str
     about: str
+
     sentence: str = ""
     findings: tuple[ExperimentRow, ...] = ()
     pictures: tuple[PrintedFigure, ...] = ()
+    # Files in `series/`.
     series: tuple[str, ...] = ()
+
     notes: tuple[str, ...] = ()
+    # Why there is no outcome; empty if there is one.
     failure: str = ""
 
 
 def save_outcome(experiment: Experiment, outcome: ExperimentResult, folder: Path) -> Record:
     """Write the figures and series of an outcome and return its record.
 
-    Raises
-    ------
-    OutputError
-        If something cannot be written.
-    ValueError
-        If the columns of a series differ in length.
+    Raises `OutputError` if something cannot be written. Raises `ValueError` if the columns of a
+    series differ in length.
     """
     return Record(
         name=experiment.name,
@@ -122,10 +109,7 @@ def save_outcome(experiment: Experiment, outcome: ExperimentResult, folder: Path
 def write_results(records: Sequence[Record], seconds: Mapping[str, float], folder: Path) -> None:
     """Write `results.json` and `times.json`.
 
-    Raises
-    ------
-    OutputError
-        If one of them cannot be written.
+    Raises `OutputError` if one of them cannot be written.
     """
     content = {
         "aqualvs": __version__,
@@ -161,10 +145,7 @@ def is_reproduced(folder: Path) -> bool:
 def work_folder(folder: Path) -> Path:
     """Return the folder for rendered dives, emptied of what another version left in it.
 
-    Raises
-    ------
-    OutputError
-        If it cannot be made.
+    Raises `OutputError` if it cannot be made.
     """
     work = folder / WORK
     mark = work / _MADE_BY
@@ -192,7 +173,7 @@ def _sources(folder: Traversable, above: str) -> list[tuple[str, Traversable]]:
         name = f"{above}/{entry.name}"
         if entry.is_dir():
             found.extend(_sources(entry, name))
-        elif name.endswith(".py"):
+        elif name.endswith((".py", ".yaml")):
             found.append((name, entry))
     return found
 
@@ -269,25 +250,10 @@ _HEAD = ("quantity", "paper", "ours", "bar", "met")
 
 
 def write_page(records: Sequence[Record], seconds: Mapping[str, float], folder: Path) -> Path:
-    """Write the page from records, and from the figures that are in the folder.
+    """Write the page from records, in their order, and from the figures that are in the folder.
 
-    Parameters
-    ----------
-    records : sequence of Record
-        In the order in which they shall stand.
-    seconds : mapping
-        How long experiments took, as far as it is known.
-    folder : Path
-
-    Returns
-    -------
-    path : Path
-        The page; `reproduce.html` in the folder.
-
-    Raises
-    ------
-    OutputError
-        If a figure cannot be read or the page cannot be written.
+    `seconds`: how long experiments took, as far as it is known. Returns the page, `reproduce.html`
+    in the folder. Raises `OutputError` if a figure cannot be read or the page cannot be written.
     """
     path = folder / PAGE
     with writing(path):
@@ -299,10 +265,7 @@ def write_page(records: Sequence[Record], seconds: Mapping[str, float], folder: 
 def page_html(records: Sequence[Record], seconds: Mapping[str, float], folder: Path) -> str:
     """Return the page as HTML; see `write_page`.
 
-    Raises
-    ------
-    OSError
-        If a figure cannot be read.
+    Raises `OSError` if a figure cannot be read.
     """
     return html.page(
         "reproduce.html",

@@ -41,20 +41,14 @@ _CAPTION = (
 
 @dataclass(frozen=True, slots=True)
 class Bending:
-    """Rays through the dome, from lens to water, R of them, in `dome`.
+    """Rays through the dome, from lens to water, R of them, in `dome`."""
 
-    Attributes
-    ----------
-    lens : array, shape (3,)
-    inner, outer : array, shape (R, 3)
-        Where they meet the dome's surfaces, metres.
-    straight, water : array, shape (R, 3)
-        Unit directions, in the air inside, and in the water.
-    """
-
+    # Shape (3,).
     lens: FloatArray
+    # Shape (R, 3): where they meet the dome's surfaces, metres.
     inner: FloatArray
     outer: FloatArray
+    # Shape (R, 3): unit directions, in the air inside, and in the water.
     straight: FloatArray
     water: FloatArray
 
@@ -78,10 +72,7 @@ class Bending:
 def bending(rig: Rig, pixels: FloatArray) -> Bending:
     """Trace pixels (R, 2) through a rig's dome.
 
-    Raises
-    ------
-    RigError
-        If the rig has no dome.
+    Raises `RigError` if the rig has no dome.
     """
     if rig.dome is None:
         raise RigError(f"rig {rig.name} has no dome; give one that has")

@@ -27,7 +27,7 @@ from aqualvs.follow.report import drawn_follow_figures
 from aqualvs.follow.sensor_model import RenderedSensor, SampledSensor
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.transforms import SE3
-from aqualvs.report.figure_style import BLUE, DARK, GREY, ORANGE, STYLE, new_figure
+from aqualvs.report.figure_style import BLUE, DARK, GREY, ORANGE, new_figure
 from aqualvs.scanning.posture import Posture, Refusal
 from aqualvs.simulation.net_motion import NetPosture, NetWall
 from aqualvs.simulation.scene import Net, Scene
@@ -87,14 +87,12 @@ def _hold_rows(vehicle: str, hold: HoldMeasures, step: StepMeasures) -> tuple[Ex
     return (
         ExperimentRow(
             what=f"{vehicle}, hold: rms of range (mm), yaw (degrees)",
-            paper="",
             ours=f"{range_mm:.1f}, {yaw_deg:.2f}",
             bar=f"<= {bar_range_mm:g}, {bar_yaw_deg:g}",
             met=range_mm <= bar_range_mm and yaw_deg <= bar_yaw_deg,
         ),
         ExperimentRow(
             what=f"{vehicle}, step of 0.2 m: settling (s), overshoot (%)",
-            paper="",
             ours=f"{step.settling:.1f}, {100.0 * step.overshoot:.0f}",
             bar=f"<= {bar_settling_s:g}, {100.0 * bar_overshoot:g}",
             met=step.settling <= bar_settling_s and step.overshoot <= bar_overshoot,
@@ -111,7 +109,6 @@ def _follow_rows(vehicle: str, log: LoopLog, follow: HoldMeasures) -> tuple[Expe
         ExperimentRow(
             what=f"{vehicle}, following a curved, moving net over {along[-1] - along[0]:.0f} m: "
             "rms of range (mm), yaw (degrees)",
-            paper="",
             ours=f"{range_mm:.1f}, {yaw_deg:.2f}" + ("" if free else "; touched or lost the net"),
             bar=f"<= {bar_follow_mm:g}, {bar_follow_deg:g}",
             met=free and range_mm <= bar_follow_mm and yaw_deg <= bar_follow_deg,
@@ -219,21 +216,15 @@ def _run_sea(laboratory: Laboratory) -> ExperimentResult:
         findings=(
             ExperimentRow(
                 what="pictures with a posture (%)",
-                paper="",
                 ours=f"{share:.0f} of {len(valid)}",
                 bar=f">= {_SETUP.bar_valid:g}",
                 met=share >= _SETUP.bar_valid,
             ),
-            ExperimentRow(
-                what="rms error of the range (%)",
-                paper="",
-                ours=f"{rms[0]:.3f}",
-                bar=f"<= {_SETUP.bar_percent}",
-                met=bool(rms[0] <= _SETUP.bar_percent),
+            ExperimentRow.at_most(
+                "rms error of the range (%)", rms[0], _SETUP.bar_percent, digits=3
             ),
             ExperimentRow(
                 what="rms error of pitch, yaw (degrees)",
-                paper="",
                 ours=f"{rms[1]:.3f}, {rms[2]:.3f}",
                 bar=f"<= {_SETUP.bar_deg}",
                 met=bool(rms[1:].max() <= _SETUP.bar_deg),
@@ -336,12 +327,9 @@ def _sea_series(sensor: _Watched, time_s: FloatArray) -> DataColumns:
 
 
 def _drawn(sensor: _Watched, log: LoopLog, valid: FloatArray) -> "Figure":
-    from matplotlib import rc_context
-
     time_s, seen_s = log.column("time_s"), np.array([t for t, _, _ in sensor.seen])
     measured = _measured(sensor)
-    with rc_context(dict(STYLE)):
-        figure = new_figure(5.0)
+    with new_figure(5.0) as figure:
         depth, ranges, angles = figure.subplots(3, 1, sharex=True)
         depth.plot(time_s, log.column("depth"), color=BLUE)
         depth.invert_yaxis()

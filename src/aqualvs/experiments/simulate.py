@@ -49,34 +49,10 @@ def simulate(
 ) -> int:
     """Render a scenario into a folder and print how to run it.
 
-    SIGINT and SIGTERM end it after the frame under way; what was rendered can be used.
-
-    Parameters
-    ----------
-    scenario : str or None
-        Built-in name or path of a YAML file; `CALIBRATION` for pictures to calibrate from.
-    rig_file : Path or None
-        None takes the example rig.
-    out : Path or None
-        Folder to write.
-    echo : callable
-        Takes one line of text.
-    camera : str
-        Name of the camera that takes the pictures.
-    shutter : str or None
-        As `shutter_from_words` reads it; None takes the scenario's, or else the rig's.
-    overwrite : bool
-        Whether what is already there may be replaced.
-
-    Returns
-    -------
-    exit_code : int
-        0, or 128 + signal if it was stopped.
-
-    Raises
-    ------
-    AqualvsError
-        If scenario, camera, rig or folder cannot be used.
+    Options are those of `aqualvs simulate`, see its `--help`; the scenario `CALIBRATION` renders
+    pictures to calibrate from. SIGINT and SIGTERM end it after the frame under way; what was
+    rendered can be used. Returns 0, or 128 + signal if it was stopped. Raises `AqualvsError` if
+    scenario, camera, rig or folder cannot be used.
     """
     if scenario is None:
         raise OptionError("SCENARIO: missing; choose one from aqualvs simulate --list")
@@ -192,8 +168,6 @@ def calibration_commands(files: CalibrationFiles, out: Path, n_lasers: int) -> l
 
     Parameters
     ----------
-    files : CalibrationFiles
-        The set.
     out : Path
         Folder in which `rig.yaml` and `run` are to be written.
     n_lasers : int

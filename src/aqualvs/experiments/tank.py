@@ -16,7 +16,7 @@ from aqualvs.experiments.experiment import (
 )
 from aqualvs.experiments.laboratory import Laboratory, MeasuredDive, RenderedDive, calibrated_rig
 from aqualvs.geometry.arrays import FloatArray
-from aqualvs.report.figure_style import DARK, GREY, OURS, PAPER, STYLE, TRUTH, new_figure
+from aqualvs.report.figure_style import DARK, GREY, OURS, PAPER, TRUTH, new_figure
 from aqualvs.simulation.scenario import Scenario, parse_scenario
 
 if TYPE_CHECKING:
@@ -90,12 +90,8 @@ def _findings(name: str, measured: MeasuredDive) -> list[ExperimentRow]:
     worst = _largest_deg(measured, name)
     valid = bool(measured.valid.all())
     return [
-        ExperimentRow(
-            what=f"largest error of {name} (degrees)",
-            paper="",
-            ours=f"{worst:.3f}",
-            bar=f"<= {_SWING.bar_deg}",
-            met=valid and worst <= _SWING.bar_deg,
+        ExperimentRow.at_most(
+            f"largest error of {name} (degrees)", worst, _SWING.bar_deg, digits=3, valid=valid
         ),
         ExperimentRow(
             what=f"error of {name} in percent of the swing",
@@ -104,7 +100,6 @@ def _findings(name: str, measured: MeasuredDive) -> list[ExperimentRow]:
         ),
         ExperimentRow(
             what=f"{name}: root mean square error (degrees)",
-            paper="",
             ours=f"{np.sqrt(np.nanmean(_errors_deg(measured, name) ** 2)):.3f}",
         ),
     ]
@@ -132,12 +127,9 @@ def _series(name: str, measured: MeasuredDive) -> DataColumns:
 
 
 def _drawn(measured: MeasuredDive, name: str) -> "Figure":
-    from matplotlib import rc_context
-
     column = _ANGLES[name][0]
     degrees = np.degrees(np.column_stack([a[:, column] for a in (measured.truth, measured.values)]))
-    with rc_context(dict(STYLE)):
-        figure = new_figure(3.4, "column")
+    with new_figure(3.4, "column") as figure:
         top, low = figure.subplots(2, 1, sharex=True, height_ratios=(2.0, 1.0))
         top.plot(measured.time_s, degrees[:, 0], color=TRUTH, linewidth=2.2, alpha=0.35)
         top.plot(measured.time_s, degrees[:, 1], ".", color=OURS)
@@ -215,26 +207,22 @@ def _run_distance(laboratory: Laboratory) -> ExperimentResult:
         f"({worst_true:.3f} % with the rig known exactly), where the paper has "
         f"{_DISTANCES.paper_percent} %.",
         findings=(
-            ExperimentRow(
-                what="largest error of the distance, rig calibrated from pictures (%)",
+            ExperimentRow.at_most(
+                "largest error of the distance, rig calibrated from pictures (%)",
+                worst,
+                _DISTANCES.bar_percent,
+                digits=3,
                 paper=f"{_DISTANCES.paper_percent}",
-                ours=f"{worst:.3f}",
-                bar=f"<= {_DISTANCES.bar_percent}",
-                met=valid and worst <= _DISTANCES.bar_percent,
+                valid=valid,
             ),
             ExperimentRow(
-                what="largest error of the distance, true rig (%)",
-                paper="",
-                ours=f"{worst_true:.3f}",
+                what="largest error of the distance, true rig (%)", ours=f"{worst_true:.3f}"
             ),
             ExperimentRow(
-                what="spread between frames at one place (%)",
-                paper="",
-                ours=f"{_spread(calibrated):.4f}",
+                what="spread between frames at one place (%)", ours=f"{_spread(calibrated):.4f}"
             ),
             ExperimentRow(
                 what="frames with a posture",
-                paper="",
                 ours=f"{np.count_nonzero(calibrated.valid)} of {len(calibrated.scans)}",
             ),
         ),
@@ -282,10 +270,7 @@ def _distance_series(calibrated: MeasuredDive, true: MeasuredDive) -> DataColumn
 
 
 def _distance_drawn(calibrated: MeasuredDive, true: MeasuredDive) -> "Figure":
-    from matplotlib import rc_context
-
-    with rc_context(dict(STYLE)):
-        figure = new_figure(2.7)
+    with new_figure(2.7) as figure:
         left, right = figure.subplots(1, 2, width_ratios=(1.0, 1.25))
         left.axhspan(
             -_DISTANCES.paper_percent,

@@ -43,20 +43,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Numbers:
-    """Index and its uncertainty after each frame, F of them, shape (F,) each.
-
-    Attributes
-    ----------
-    truth : array
-    ours, sigma : array
-        Joint estimate and its standard deviation.
-    paper : array
-        The paper's way: each frame by itself, everything but the index held.
-    """
+    """Index and its uncertainty after each frame, F of them, shape (F,) each."""
 
     truth: FloatArray
+    # Joint estimate and its standard deviation.
     ours: FloatArray
     sigma: FloatArray
+    # The paper's way: each frame by itself, everything but the index held.
     paper: FloatArray
 
     def after(self, start: int, every: int = 1) -> "Numbers":
@@ -67,20 +60,13 @@ class Numbers:
 
 @dataclass(frozen=True, slots=True)
 class Decentred:
-    """Uncertainty of an index by the lens's distance from the dome's centre, shape (L,) each.
-
-    Attributes
-    ----------
-    lens_mm : array
-    noise, placed : array
-        Standard deviation of the index, target's place known exactly, or as well as one measures.
-    observable : bool array
-        Whether the system believes the latter.
-    """
+    """Uncertainty of an index by the lens's distance from the dome's centre, shape (L,) each."""
 
     lens_mm: FloatArray
+    # Standard deviation of the index, target's place known exactly, or as well as one measures.
     noise: FloatArray
     placed: FloatArray
+    # Whether the system believes the latter.
     observable: BoolArray
 
 
@@ -179,21 +165,11 @@ _ROOM = RoomLight(level=0.30, tint=(0.75, 1.0, 0.95), veil=(0.012, 0.035, 0.028)
 
 @dataclass(frozen=True, slots=True)
 class Cruise:
-    """Frames of the target, from the deck through all waters, F of them.
+    """Frames of the target, from the deck through all waters, F of them."""
 
-    Attributes
-    ----------
-    views : list of View
-        Points where the target's file puts them, pixels where they were found.
-    n_true : array, shape (F,)
-        Index of the medium in each.
-    example : uint8 array, shape (height, width, 3)
-        The last picture.
-    """
-
-    views: list[View]
-    n_true: FloatArray
-    example: "NDArray[np.uint8]"
+    views: list[View]  # Points where the target's file puts them, pixels where they were found.
+    n_true: FloatArray  # Shape (F,): index of the medium in each.
+    example: "NDArray[np.uint8]"  # Shape (height, width, 3): the last picture.
 
 
 def cruise(laboratory: Laboratory, waters: Sequence[float] = WATERS) -> Cruise:
@@ -201,10 +177,7 @@ def cruise(laboratory: Laboratory, waters: Sequence[float] = WATERS) -> Cruise:
 
     One picture is rendered in each medium; its corners are seen ten times, with new noise.
 
-    Raises
-    ------
-    CalibrationError
-        If it cannot be found.
+    Raises `CalibrationError` if it cannot be found.
     """
     rig = laboratory.rig
     plate, markers = _plate(laboratory, rig)
@@ -390,28 +363,21 @@ def _findings(
     noticed, n_waters = sum(step.by_medium for step in alarms), len(last.truth)
     return (
         *rows,
-        ExperimentRow(
-            what="largest error, in standard deviations",
-            paper="",
-            ours=f"{worst:.1f}",
-            bar=f"<= {_SETUP.bar_sigmas:g}",
-            met=worst <= _SETUP.bar_sigmas,
+        ExperimentRow.at_most(
+            "largest error, in standard deviations", worst, _SETUP.bar_sigmas, digits=1
         ),
         ExperimentRow(
             what="scatter from frame to frame, the paper's way",
-            paper="",
             ours=f"{float(np.sqrt(in_each.var(axis=1).mean())):.5f}",
         ),
         ExperimentRow(
             what="changes of the medium noticed as such, the dive into the water among them",
-            paper="",
             ours=f"{noticed} of {n_waters}, {len(alarms) - noticed} false",
             bar="all, none false",
             met=noticed == len(alarms) == n_waters,
         ),
         ExperimentRow(
             what="index with the lens at the dome's centre",
-            paper="",
             ours="told" if spread.observable[0] else "refused as unobservable",
             bar="refused",
             met=not spread.observable[0],

@@ -32,37 +32,25 @@ _MODELS = dict(zip(VEHICLE_NAMES, (BLUEROV2, BLUEROV2_HEAVY, VIDEORAY), strict=T
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SimCase:
-    """One simulated run.
+    """One simulated run."""
 
-    Attributes
-    ----------
-    model : VehicleModel
-        The true vehicle.
-    gains : ControlGains
-        Of the controller, for its model of the vehicle.
-    water : WaterMotion
-    net : NetWall
-    start_range, start_yaw : float
-        Posture at the start, at rest, in metres and radians.
-    timing : Timing
-        Of the frames.
-    wire : float
-        Time from an effort to its arrival at the vehicle, in seconds.
-    limits : SafetyLimits
-        Of the safety gate.
-    seed : int
-        Of the noise of sensors and pictures.
-    """
-
+    # The true vehicle.
     model: VehicleModel
+    # Of the controller, for its model of the vehicle.
     gains: ControlGains
+
     water: WaterMotion = field(default_factory=WaterMotion)
     net: NetWall = field(default_factory=NetWall)
+    # Posture at the start, at rest, in metres and radians.
     start_range: float = 0.6
     start_yaw: float = 0.0
+    # Of the frames.
     timing: Timing = field(default_factory=Timing)
+    # Time from an effort to its arrival at the vehicle, in seconds.
     wire: float = 0.02
+    # Of the safety gate.
     limits: SafetyLimits = field(default_factory=SafetyLimits)
+    # Of the noise of sensors and pictures.
     seed: int = 0
 
     def loop(self, sensor: RangeSensor, mission: Mission) -> SimulatedLoop:
@@ -83,16 +71,8 @@ class SimCase:
 def vehicle_model(name: str, pilot_gain: float = 0.5) -> VehicleModel:
     """Return a vehicle by the name that the command line knows.
 
-    Parameters
-    ----------
-    name : str
-    pilot_gain : float
-        ArduSub's: the share of the thrust that a full effort asks for.
-
-    Raises
-    ------
-    OptionError
-        If there is no such vehicle, or the gain is none.
+    `pilot_gain`: ArduSub's: the share of the thrust that a full effort asks for. Raises
+    `OptionError` if there is no such vehicle, or the gain is none.
     """
     model = _MODELS.get(name.replace("_", "-"))
     if model is None:
@@ -161,51 +141,35 @@ CURVED = NetWall(curvature=-0.1, sway=0.05, sway_period=8.0, rock=math.radians(1
 
 @dataclass(frozen=True, slots=True)
 class Trials:
-    """Trials of one vehicle.
-
-    Parameters
-    ----------
-    model : VehicleModel
-    gains : ControlGains
-    rendered : bool
-        Pictures through the scanner, else postures with its noise.
-    fps : float
-        Frames a second.
-    seed : int
-        Of waves and noise.
-    waves : float
-        Amplitude in metres.
-    """
+    """Trials of one vehicle."""
 
     model: VehicleModel
     gains: ControlGains
-    rendered: bool = False
-    fps: float = 25.0
-    seed: int = 0
-    waves: float = 0.1
+    rendered: bool = False  # Pictures through the scanner, else postures with its noise.
+    fps: float = 25.0  # Frames a second.
+    seed: int = 0  # Of waves and noise.
+    waves: float = 0.1  # Amplitude in metres.
 
     def begin(self, seconds: float) -> LoopLog:
         """Take hold before a flat net, from rest in the current."""
         case = self._case(NetWall())
         return case.loop(self._sensor(case), HoldMission(Setpoint(RANGE))).run(seconds)
 
-    def hold_and_step(
-        self, seconds: float = HOLD_END_S, step_s: float = STEP_S
-    ) -> tuple[LoopLog, HoldMeasures, StepMeasures]:
+    def hold_and_step(self) -> tuple[LoopLog, HoldMeasures, StepMeasures]:
         """Hold before a flat net, then step away from it."""
         case = self._case(NetWall())
         mission = HoldMission(Setpoint(RANGE))
 
         def step(now_s: float) -> None:
-            if now_s >= step_s:
+            if now_s >= STEP_S:
                 mission.setpoint = Setpoint(RANGE + STEP)
 
-        log = case.loop(self._sensor(case), mission).run(seconds, step)
+        log = case.loop(self._sensor(case), mission).run(HOLD_END_S, step)
         answer = step_measures(
-            log.column("time_s"), log.column("range"), step_s, RANGE, RANGE + STEP
+            log.column("time_s"), log.column("range"), STEP_S, RANGE, RANGE + STEP
         )
         # The setpoint in force lags the frame by its delay.
-        return log, hold_measures(log, FROM_REST_S, step_s), answer
+        return log, hold_measures(log, FROM_REST_S, STEP_S), answer
 
     def follow(
         self, seconds: float = FOLLOW_END_S, every_frame: Callable[[float], object] | None = None

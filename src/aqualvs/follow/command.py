@@ -57,8 +57,6 @@ class LoopPage:
     ----------
     page : Output
         Closed with this.
-    rig : Rig
-    loop : SimulatedLoop
     holder : SetpointHolder
         Where the page puts the setpoint; a mission that holds follows it.
     """
@@ -156,12 +154,8 @@ class RunWatch:
 
     Parameters
     ----------
-    loop : SimulatedLoop
     seconds : float
         Of the whole run.
-    echo : callable
-        Takes one line.
-    stop : StopSignals
     slow : bool
         Whether a simulated second takes seconds, so that progress is printed.
     """
@@ -207,28 +201,17 @@ FOLLOW_CSV, TRUTH_CSV = "follow.csv", "truth.csv"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Aim:
-    """Aim of the loop: a plan file, or a range and yaw to hold.
-
-    Attributes
-    ----------
-    plan : Path or None
-    range : float or None
-        Metres; 0.6 if neither it nor a plan is given.
-    yaw : float
-        Radians.
-    """
+    """Aim of the loop: a plan file, or a range and yaw to hold."""
 
     plan: Path | None = None
-    range: float | None = None
-    yaw: float = 0.0
+    range: float | None = None  # Metres; 0.6 if neither it nor a plan is given.
+    yaw: float = 0.0  # Radians.
 
     def mission(self, working_range: tuple[float, float]) -> tuple[Mission, SafetyLimits, Setpoint]:
         """Return the mission, the limits of the safety gate, and the first setpoint.
 
-        Raises
-        ------
-        OptionError
-            If both are given, the plan cannot be used, or the range cannot be measured.
+        Raises `OptionError` if both are given, the plan cannot be used, or the range cannot be
+        measured.
         """
         holder = SetpointHolder(working_range)
         if self.plan is not None:
@@ -247,75 +230,52 @@ _DEFAULT_RANGE = 0.6
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SimRequest:
-    """Request for a simulation.
+    """Request for a simulation."""
 
-    Attributes
-    ----------
-    out : Path
-        Folder to write.
-    aim : Aim
-    vehicle : str
-        A name of `VEHICLE_NAMES`.
-    gains : str or None
-        Gains file, or a vehicle's name; tuned for the vehicle if left out.
-    pilot_gain : float
-        ArduSub's.
-    current, current_to : float
-        Speed in m/s, and where it flows, in radians clockwise from the way one looks at the net.
-    waves : float
-        Amplitude in metres.
-    cage_radius : float
-        Of a round net seen from inside, in metres; 0 is a flat one.
-    net_sway : float
-        Amplitude of the net's own motion to and fro, in metres.
-    seconds : float
-    fps : float
-        Frames a second.
-    rendered : bool
-        Render every frame and measure in it, instead of sampling the scanner's noise.
-    camera : str or None
-        Simulated camera that takes the rendered frames; the ideal one if left out.
-    shutter : str or None
-        Of that camera, as `shutter_from_words` reads it; all rows at once if left out.
-    seed : int
-    freeze : float or None
-        When the picture begins to stand still, in seconds; never if left out.
-    dashboard : str or None
-        Address HOST:PORT of the pilot's page; the run then goes no faster than the clock.
-    token : str or None
-        Its password.
-    overwrite : bool
-        Whether to replace what this command wrote to `out` before.
-    """
-
+    # Folder to write.
     out: Path
+
     aim: Aim
+    # A name of `VEHICLE_NAMES`.
     vehicle: str = "bluerov2"
+    # Gains file, or a vehicle's name; tuned for the vehicle if left out.
     gains: str | None = None
+    # ArduSub's.
     pilot_gain: float = 0.5
+    # Speed in m/s, and where it flows, in radians clockwise from the way one looks at the net.
     current: float = 0.3
     current_to: float = math.radians(60.0)
+    # Amplitude in metres.
     waves: float = 0.1
+    # Of a round net seen from inside, in metres; 0 is a flat one.
     cage_radius: float = 0.0
+    # Amplitude of the net's own motion to and fro, in metres.
     net_sway: float = 0.0
+
     seconds: float = 60.0
+    # Frames a second.
     fps: float = 25.0
+    # Render every frame and measure in it, instead of sampling the scanner's noise.
     rendered: bool = False
+    # Simulated camera that takes the rendered frames; the ideal one if left out.
     camera: str | None = None
+    # Of that camera, as `shutter_from_words` reads it; all rows at once if left out.
     shutter: str | None = None
+
     seed: int = 0
+    # When the picture begins to stand still, in seconds; never if left out.
     freeze: float | None = None
+    # Address HOST:PORT of the pilot's page; the run then goes no faster than the clock.
     dashboard: str | None = None
+    # Its password.
     token: str | None = None
+    # Whether to replace what this command wrote to `out` before.
     overwrite: bool = False
 
     def __post_init__(self) -> None:
         """Refuse requests that cannot be simulated.
 
-        Raises
-        ------
-        OptionError
-            Naming the value.
+        Raises `OptionError` naming the value.
         """
         if not _FOLLOW_LEAST_S <= self.seconds <= _MAX_S:
             raise OptionError(
@@ -352,10 +312,7 @@ _MAX_S, _MIN_FPS, _MAX_FPS = 86_400.0, 1.0, 1000.0
 def simulate_and_tell(request: SimRequest, echo: Callable[[str], object]) -> int:
     """Run the loop, write log, figures and page, and print the summary; return 0.
 
-    Raises
-    ------
-    AqualvsError
-        If an input cannot be used, or the folder cannot be written.
+    Raises `AqualvsError` if an input cannot be used, or the folder cannot be written.
     """
     rig = example_rig()
     if request.shutter is not None:

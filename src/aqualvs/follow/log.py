@@ -16,55 +16,41 @@ NEUTRAL_WITHIN_S = 0.2
 
 
 class LoopRow(NamedTuple):
-    """The state at one frame's exposure; SI units and radians, NaN where nothing is known.
-
-    Attributes
-    ----------
-    time_s : float
-    range, pitch, yaw, along, up : float
-        In truth, as `NetPosture`.
-    clearance : float
-        Least distance between hull and net.
-    tilt : float
-        Angle between the vehicle's upright and the plumb line.
-    measured_range, measured_pitch, measured_yaw : float
-        By the lasers in this frame.
-    filtered_range, filtered_yaw : float
-        From the time filter, as known by now.
-    wanted_range, wanted_yaw, sway : float
-        What the mission asks for.
-    forward, right, down, turn : float
-        The last effort sent.
-    depth, heading : float
-        As the vehicle reports them.
-    engaged : bool
-    stage, reason, refusal : str
-        Of the mission; why the effort was changed; why there is no posture.
-    """
+    """The state at one frame's exposure; SI units and radians, NaN where nothing is known."""
 
     time_s: float
+    # In truth, as `NetPosture`.
     range: float
     pitch: float
     yaw: float
     along: float
     up: float
+    # Least distance between hull and net.
     clearance: float
+    # Angle between the vehicle's upright and the plumb line.
     tilt: float
+    # By the lasers in this frame.
     measured_range: float
     measured_pitch: float
     measured_yaw: float
+    # From the time filter, as known by now.
     filtered_range: float
     filtered_yaw: float
+    # What the mission asks for.
     wanted_range: float
     wanted_yaw: float
     sway: float
+    # The last effort sent.
     forward: float
     right: float
     down: float
     turn: float
+    # As the vehicle reports them.
     depth: float
     heading: float
+
     engaged: bool
+    # Of the mission; why the effort was changed; why there is no posture.
     stage: str
     reason: str
     refusal: str
@@ -72,21 +58,15 @@ class LoopRow(NamedTuple):
 
 @dataclass(slots=True)
 class LoopLog:
-    """All rows, and how long thrust outlived the sight of the net.
-
-    Attributes
-    ----------
-    rows : list of LoopRow
-    blind_thrust_s : list of float
-        For each period of more than `NEUTRAL_WITHIN_S` without a valid posture into which thrust
-        reached: time from the last valid posture to neutral.
-    n_blind : int
-        Such periods, with or without thrust.
-    """
+    """All rows, and how long thrust outlived the sight of the net."""
 
     rows: list[LoopRow] = field(default_factory=list)
+    # For each period of more than `NEUTRAL_WITHIN_S` without a valid posture into which thrust
+    # reached: time from the last valid posture to neutral.
     blind_thrust_s: list[float] = field(default_factory=list)
+    # Such periods, with or without thrust.
     n_blind: int = 0
+
     _neutral_s: float = math.inf
 
     def column(self, name: str) -> FloatArray:
@@ -120,10 +100,7 @@ _UNITS = {
 def write_log(log: LoopLog, path: Path) -> None:
     """Write the rows as CSV; units are in the names, cells of unknown values are empty.
 
-    Raises
-    ------
-    OutputError
-        If the file cannot be written.
+    Raises `OutputError` if the file cannot be written.
     """
     columns = [_column(name) for name in LoopRow._fields]
     with writing(path), path.open("w", newline="", encoding="utf-8") as file:
@@ -166,60 +143,37 @@ _GROWS, _GROWS_BY = 2.0, 0.05
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HoldMeasures:
-    """Measures of a period with a constant setpoint.
+    """Measures of a period with a constant setpoint."""
 
-    Attributes
-    ----------
-    range_rms, yaw_rms : float
-        Of the true posture about the setpoint, in metres and radians.
-    range_worst : float
-        Greatest error of the range, in metres.
-    min_clearance : float
-        Between hull and net, in metres; negative is contact.
-    n_lost : int
-        Frames without a posture.
-    n_guarded : int
-        Frames at which the safety gate changed the effort.
-    """
-
+    # Of the true posture about the setpoint, in metres and radians.
     range_rms: float
     yaw_rms: float
+    # Greatest error of the range, in metres.
     range_worst: float
+    # Between hull and net, in metres; negative is contact.
     min_clearance: float
+    # Frames without a posture.
     n_lost: int
+    # Frames at which the safety gate changed the effort.
     n_guarded: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StepMeasures:
-    """Answer to a step of the range.
+    """Answer to a step of the range."""
 
-    Attributes
-    ----------
-    settling : float
-        Seconds until the range stays within `SETTLED_SHARE` of the step; infinite if it never does.
-    overshoot : float
-        Share of the step by which it is exceeded; 0 if it is not.
-    """
-
+    # Seconds until the range stays within `SETTLED_SHARE` of the step; infinite if it never does.
     settling: float
+    # Share of the step by which it is exceeded; 0 if it is not.
     overshoot: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EffortMeasures:
-    """Rate of an effort's reversals, which wear thrusters and shake the camera.
+    """Rate of an effort's reversals, which wear thrusters and shake the camera."""
 
-    Attributes
-    ----------
-    reversals : float
-        Changes of the sign a minute; neutral between two of one sign is none.
-    jumps : float
-        Changes by more than `JUMP` from one frame to the next, a minute.
-    """
-
-    reversals: float
-    jumps: float
+    reversals: float  # Changes of the sign a minute; neutral between two of one sign is none.
+    jumps: float  # Changes by more than `JUMP` from one frame to the next, a minute.
 
 
 JUMP = 0.25
@@ -228,29 +182,19 @@ JUMP = 0.25
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SafetyMeasures:
-    """Safety measures of a whole run.
+    """Safety measures of a whole run."""
 
-    Attributes
-    ----------
-    min_clearance : float
-        In metres; negative is contact.
-    n_blind : int
-        Periods of more than 0.2 s without a valid posture.
-    neutral_late : float
-        Longest time from a last valid posture to neutral, in seconds; 0 where there was no thrust.
-    stable : bool
-        Whether swings of the range do not grow while the net is in sight.
-    lost_s : float
-        When sight was lost for good; infinite if it was not.
-    greatest_tilt : float
-        Of the vehicle, in radians.
-    """
-
+    # In metres; negative is contact.
     min_clearance: float
+    # Periods of more than 0.2 s without a valid posture.
     n_blind: int
+    # Longest time from a last valid posture to neutral, in seconds; 0 where there was no thrust.
     neutral_late: float
+    # Whether swings of the range do not grow while the net is in sight.
     stable: bool
+    # When sight was lost for good; infinite if it was not.
     lost_s: float
+    # Of the vehicle, in radians.
     greatest_tilt: float
 
     @property
@@ -280,20 +224,13 @@ def effort_measures(
 ) -> EffortMeasures:
     """Return how often an effort turned round between two times.
 
-    Parameters
-    ----------
-    log : LoopLog
-    name : {"forward", "right", "down", "turn"}
-        Of the effort.
-    start_s, end_s : float
+    `name`, one of {"forward", "right", "down", "turn"}: of the effort.
     """
     return _measured(log, log.column(name), start_s, end_s)
 
 
-def thruster_measures(
-    log: LoopLog, start_s: float = 0.0, end_s: float = math.inf
-) -> EffortMeasures:
-    """Return how often horizontal thrusters turned round between two times, the worse of two pairs.
+def thruster_measures(log: LoopLog, start_s: float = 0.0) -> EffortMeasures:
+    """Return how often horizontal thrusters turned round from a time on, the worse of two pairs.
 
     Efforts forward and to the right add up in one pair of vectored thrusters and cancel in the
     other. Along a target the pairs push against each other: the sign of the forward effort, which
@@ -301,7 +238,7 @@ def thruster_measures(
     """
     forward, right = log.column("forward"), log.column("right")
     pairs = [
-        _measured(log, efforts, start_s, end_s) for efforts in (forward + right, forward - right)
+        _measured(log, efforts, start_s, math.inf) for efforts in (forward + right, forward - right)
     ]
     return EffortMeasures(
         reversals=max(one.reversals for one in pairs), jumps=max(one.jumps for one in pairs)

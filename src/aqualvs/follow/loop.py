@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol, TypeAlias
 
-from aqualvs.control.autopilot import Decision, Motion, NetPilot
+from aqualvs.control.autopilot import Decision, NetPilot, motion_of
 from aqualvs.control.time_filter import FilteredPosture, PostureFilter
 from aqualvs.control.tune import shaping_of_model
 from aqualvs.control.vehicle import NEUTRAL, Effort, Mode, VehicleState
@@ -38,7 +38,6 @@ class SimulatedLink:
 
     Attributes
     ----------
-    vehicle : SimulatedVehicle
     effort : Effort
         The last that was sent.
     """
@@ -105,30 +104,20 @@ class RangeSensor(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Timing:
-    """Timing of the frames.
+    """Timing of the frames."""
 
-    Attributes
-    ----------
-    fps : float
-        Frames a second.
-    delay : float
-        From the exposure to the measured posture, in seconds.
-    field : float
-        Time that every other frame, from the first on, waits for the next besides, in seconds: as
-        the first field of an interlaced picture does for the second.
-    """
-
+    # Frames a second.
     fps: float = 25.0
+    # From the exposure to the measured posture, in seconds.
     delay: float = 0.06
+    # Time that every other frame, from the first on, waits for the next besides, in seconds: as the
+    # first field of an interlaced picture does for the second.
     field: float = 0.0
 
     def __post_init__(self) -> None:
         """Refuse impossible values.
 
-        Raises
-        ------
-        OptionError
-            If there are no frames, or they come before their time.
+        Raises `OptionError` if there are no frames, or they come before their time.
         """
         if not (self.fps > 0.0 and self.delay >= 0.0 and self.field >= 0.0):
             raise OptionError(
@@ -173,17 +162,12 @@ class SimulatedLoop:
 
     Parameters
     ----------
-    link : SimulatedLink
-        To the vehicle.
-    net : NetWall
-    sensor : RangeSensor
     steering : NetPilot
         Engaged at the start.
-    timing : Timing, optional
-        Defaults if left out.
-    posture_filter : PostureFilter, optional
-        With default options if left out.
-    on_step : callable, optional
+
+    Attributes
+    ----------
+    on_step : callable or None
         Called after every step of the pilot with the time, the frame's time, what was measured,
         the decision and the vehicle's state.
     """
@@ -195,13 +179,11 @@ class SimulatedLoop:
         sensor: RangeSensor,
         steering: NetPilot,
         timing: Timing | None = None,
-        posture_filter: PostureFilter | None = None,
-        on_step: OnStep | None = None,
     ) -> None:
         self.link, self.net, self.eye, self.steering = link, net, sensor, steering
         self.timing = timing or Timing()
-        self._filter = posture_filter or PostureFilter()
-        self.on_step = on_step
+        self._filter = PostureFilter()
+        self.on_step: OnStep | None = None
         self._sight = _Sight(steering.gate.limits.posture_age)
         self._decision: Decision | None = None
         self._filtered: FilteredPosture | None = None
@@ -303,7 +285,7 @@ class SimulatedLoop:
         self._filtered = self._filter.update(filter_s, posture)
         state = self.link.state()
         decision = self._decision = self.steering.step(
-            now_s, frame_s, posture, _motion(self._filtered), state
+            now_s, frame_s, posture, motion_of(self._filtered), state
         )
         if self.on_step is not None:
             self.on_step(now_s, frame_s, posture, decision, state)
@@ -360,11 +342,3 @@ def _why_not(posture: Posture | Refusal | None) -> str:
     if posture is None:
         return Reason.NO_FRAMES.value
     return posture.reason.value if isinstance(posture, Refusal) else ""
-
-
-def _motion(filtered: FilteredPosture | None) -> Motion | None:
-    """Return the filter's answer in control's words, as the live pilot does."""
-    if filtered is None:
-        return None
-    range_rate, _, yaw_rate = filtered.rates.tolist()
-    return Motion(filtered.range, filtered.yaw, range_rate, yaw_rate)

@@ -50,10 +50,6 @@ def draw_follow_figures(log: LoopLog, out: Path) -> list[Path]:
     out : Path
         Folder that exists.
 
-    Returns
-    -------
-    list of Path
-
     Raises
     ------
     OSError
@@ -275,10 +271,7 @@ def summary_lines(log: LoopLog, facts: RunFacts) -> list[str]:
 def write_report(log: LoopLog, facts: RunFacts, out: Path) -> Path:
     """Draw the figures and write the page beside them; returns the page.
 
-    Raises
-    ------
-    OutputError
-        If something cannot be written.
+    Raises `OutputError` if something cannot be written.
     """
     with writing(out):
         figures = draw_follow_figures(log, out)

@@ -17,7 +17,7 @@ from aqualvs.geometry.transforms import SE3, rotation_from_rotvec, rotvec_from_r
 from aqualvs.live.health_monitor import FrozenPicture
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.shutter import FIRST_ROW, Field
-from aqualvs.scanner import Scanner, ScannerOptions
+from aqualvs.scanner import Scanner
 from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.scan import Frame, Planes, Scan, planes_of_image
 from aqualvs.simulation.cameras import IDEAL, SimulatedCamera
@@ -29,9 +29,9 @@ from aqualvs.simulation.scene import Net, Scene
 _N_KEPT = 8
 
 
-def net_scene(seed: int = 0) -> Scene:
+def net_scene() -> Scene:
     """Return a diamond net with a little growth, in clear water."""
-    net = Net(bar=0.025, twine=0.0022, fouling=0.1, seed=seed)
+    net = Net(bar=0.025, twine=0.0022, fouling=0.1)
     return Scene(dome_from_scene=SE3.identity(), nets=(net,), target="net")
 
 
@@ -44,17 +44,12 @@ class RenderedSensor:
 
     Parameters
     ----------
-    net : NetWall
     rig : Rig
         That the pictures are taken with, and measured with.
     rng : Generator
         Source of the sensor's noise.
     scene : Scene, optional
         In the frame of the net at rest; `net_scene` if left out.
-    options : ScannerOptions, optional
-        Defaults if left out.
-    samples : int
-        Rays along each side of a pixel.
     camera : SimulatedCamera
         Takes the pictures; they are measured before it compresses them.
     freeze_s : float
@@ -72,15 +67,13 @@ class RenderedSensor:
         rig: Rig,
         rng: np.random.Generator,
         scene: Scene | None = None,
-        options: ScannerOptions | None = None,
-        samples: int = 1,
         camera: SimulatedCamera = IDEAL,
         freeze_s: float = math.inf,
     ) -> None:
         self._net, self._rng = net, rng
         self._scene = net_scene() if scene is None else scene
-        self._renderer = Renderer(rig, samples=samples, camera=camera)
-        self._scanner = Scanner(rig, options)
+        self._renderer = Renderer(rig, camera=camera)
+        self._scanner = Scanner(rig)
         self._n_frames = 0
         self._freeze_s = freeze_s
         self._frozen: dict[Field | None, FrozenPicture] = {}
@@ -150,37 +143,25 @@ class LossOfSight(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Blind:
-    """Period without a valid posture.
+    """Period without a valid posture."""
 
-    Attributes
-    ----------
-    start_s, end_s : float
-        Of the exposures, in seconds.
-    loss : LossOfSight
-    """
-
+    # Of the exposures, in seconds.
     start_s: float
     end_s: float
+
     loss: LossOfSight = LossOfSight.TARGET
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PostureNoise:
-    """Standard deviations, of each frame by itself.
+    """Standard deviations, of each frame by itself."""
 
-    Attributes
-    ----------
-    range_share : float
-        Of the range.
-    pitch, yaw : float
-        In radians.
-    outliers : float
-        Share of frames with ten times that noise, unknown to the scanner.
-    """
-
+    # Of the range.
     range_share: float = 0.003
+    # In radians.
     pitch: float = math.radians(0.4)
     yaw: float = math.radians(0.4)
+    # Share of frames with ten times that noise, unknown to the scanner.
     outliers: float = 0.0
 
 
@@ -189,11 +170,8 @@ class SampledSensor:
 
     Parameters
     ----------
-    net : NetWall
     rng : Generator
         Source of the noise.
-    noise : PostureNoise, optional
-        Defaults if left out.
     blind : sequence of Blind
         Periods without sight.
     working_range : (float, float)

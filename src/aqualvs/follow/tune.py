@@ -30,41 +30,27 @@ _BAND = 0.05
 
 @dataclass(frozen=True, slots=True)
 class StepOptions:
-    """Options of the simulated step.
+    """Options of the simulated step."""
 
-    Attributes
-    ----------
-    begin, end : float
-        Ranges before and after, in metres.
-    delay : float
-        From a frame to its effort at the vehicle, in seconds.
-    frame : float
-        Seconds between frames.
-    """
-
+    # Ranges before and after, in metres.
     begin: float = 0.8
     end: float = 0.6
+    # From a frame to its effort at the vehicle, in seconds.
     delay: float = 0.1
+    # Seconds between frames.
     frame: float = 0.04
 
 
 @dataclass(frozen=True, slots=True)
 class StepAnswer:
-    """Response to the step.
+    """Response to the step."""
 
-    Attributes
-    ----------
-    time, range : array, shape (N,)
-        Seconds since the step, from before it on; metres.
-    overshoot : float
-        Share of the step.
-    settling : float
-        Seconds after which the range stays within 5 % of the step; infinite if it does not.
-    """
-
+    # Shape (N,): seconds since the step, from before it on; metres.
     time: FloatArray
     range: FloatArray
+    # Share of the step.
     overshoot: float
+    # Seconds after which the range stays within 5 % of the step; infinite if it does not.
     settling: float
 
 
@@ -72,24 +58,16 @@ def simulate_step(
     model: VehicleModel,
     gains: ControlGains,
     options: StepOptions | None = None,
-    water: WaterMotion | None = None,
 ) -> StepAnswer:
-    """Hold a range before a wall, then another one; postures are exact.
+    """Hold a range before a wall in still water, then another one; postures are exact.
 
-    Parameters
-    ----------
-    model : VehicleModel
-        Need not be the one that the gains are for.
-    gains : ControlGains
-    options : StepOptions, optional
-    water : WaterMotion, optional
-        Still if left out.
+    `model`: need not be the one that the gains are for.
     """
     options = options or StepOptions()
     ahead = _WALL - options.begin - model.dome_position[0]
     pose = level_pose(np.array([ahead, 0.0, _DEPTH]), 0.0)
     vehicle = SimulatedVehicle(
-        model, water or WaterMotion(), np.random.default_rng(0), pose, latency=options.delay
+        model, WaterMotion(), np.random.default_rng(0), pose, latency=options.delay
     )
     controller, shaping = RangeYawController(gains), shaping_of_model(model)
     n_rest, n_after = (round(span / options.frame) for span in (_REST_S, _AFTER_S))
@@ -125,35 +103,19 @@ def _answer(time: FloatArray, ranges: FloatArray, options: StepOptions) -> StepA
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TuneRequest:
-    """Request of the command line.
+    """Request of the command line."""
 
-    Attributes
-    ----------
-    model : str
-        Name of a vehicle model.
-    output : Path or None
-        Gains file; None prints the gains.
-    overwrite : bool
-        Whether to replace a file that this command wrote before.
-    options : TuneOptions
-        What the loops must stand.
-    """
-
-    model: str
-    output: Path | None = None
-    overwrite: bool = False
-    options: TuneOptions = field(default_factory=TuneOptions)
+    model: str  # Name of a vehicle model.
+    output: Path | None = None  # Gains file; None prints the gains.
+    overwrite: bool = False  # Whether to replace a file that this command wrote before.
+    options: TuneOptions = field(default_factory=TuneOptions)  # What the loops must stand.
 
 
 def tune_and_tell(request: TuneRequest, echo: Callable[[str], None]) -> None:
     """Tune, try a step, write or print the gains.
 
-    Raises
-    ------
-    OptionError
-        If the model is unknown, or nothing stands what is asked.
-    OutputError
-        If the file cannot be written.
+    Raises `OptionError` if the model is unknown, or nothing stands what is asked. Raises
+    `OutputError` if the file cannot be written.
     """
     model = VEHICLES.get(request.model)
     if model is None:

@@ -46,16 +46,7 @@ _Step: TypeAlias = tuple[PilotReport, float, Posture | Refusal]
 class FollowLogOutput:
     """Writer of the pilot's steps; comes after the pilot among the outputs.
 
-    Parameters
-    ----------
-    path : Path
-        Created, or overwritten.
-    pilot : Pilot
-
-    Raises
-    ------
-    OutputError
-        If it cannot be written.
+    `path`: created, or overwritten. Raises `OutputError` if it cannot be written.
     """
 
     name = "follow log"
@@ -104,48 +95,33 @@ class FollowLogOutput:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FollowRequest:
-    """Request to steer a vehicle.
+    """Request to steer a vehicle."""
 
-    Attributes
-    ----------
-    source : str
-        As `open_feed` takes it.
-    rig : Path
-    mavlink : str
-        Address of the vehicle.
-    vehicle : VehicleSetup
-        Who is there, and how it is steered.
-    gains : str
-        Gains file, or the name of a vehicle whose gains come with the package.
-    out : Path
-        Folder for the log.
-    aim : Aim
-    feed : FeedRequest
-    dashboard : str or None
-        Address HOST:PORT of the pilot's page.
-    token : str or None
-        Its password.
-    record : bool
-        Whether to record from the start; the page's button begins and ends recordings, too.
-    record_to : Path or None
-        Folder of recordings; `out` if left out.
-    record_video : bool
-    water : Water
-    scanner : ScannerOptions
-    """
-
+    # As `open_feed` takes it.
     source: str
+
     rig: Path
+    # Address of the vehicle.
     mavlink: str
+    # Gains file, or the name of a vehicle whose gains come with the package.
     gains: str
+    # Folder for the log.
     out: Path
+
     aim: Aim
+    # Who is there, and how it is steered.
     vehicle: VehicleSetup = field(default_factory=VehicleSetup)
+
     feed: FeedRequest = field(default_factory=FeedRequest)
+    # Address HOST:PORT of the pilot's page.
     dashboard: str | None = None
+    # Its password.
     token: str | None = None
+    # Whether to record from the start; the page's button begins and ends recordings, too.
     record: bool = False
+    # Folder of recordings; `out` if left out.
     record_to: Path | None = None
+
     record_video: bool = False
     water: Water = field(default_factory=Water)
     scanner: ScannerOptions = field(default_factory=ScannerOptions)
@@ -159,10 +135,7 @@ def follow_and_tell(
 
     It starts disengaged: a line on `keys` (the terminal) engages or disengages.
 
-    Raises
-    ------
-    AqualvsError
-        If an input cannot be used, or the source can never work.
+    Raises `AqualvsError` if an input cannot be used, or the source can never work.
     """
     rig = prepared_rig(request.rig, request.water, no_dome=False)
     mission, limits, setpoint = request.aim.mission(rig.working_range)

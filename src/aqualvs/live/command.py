@@ -13,7 +13,6 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TextIO
 
 from aqualvs.control.time_filter import PostureFilter
 from aqualvs.control.vehicle import SetpointHolder
@@ -41,10 +40,7 @@ _TIMEOUT_S = 3.0
 class WaterFollower:
     """Provider of the scanner for the present water; a thread reads the target.
 
-    Parameters
-    ----------
-    following : WaterFollowingScanner
-        Looks at the target; used by the thread alone from here on.
+    `following`: looks at the target; used by the thread alone from here on.
     """
 
     def __init__(self, following: WaterFollowingScanner) -> None:
@@ -89,20 +85,14 @@ _SCREEN_EVERY_S, _LOG_EVERY_S = 0.2, 10.0
 
 
 class Console:
-    """Output to the terminal of the user who started the run.
-
-    Parameters
-    ----------
-    stream : file, optional
-        Standard error if left out.
-    """
+    """Output to the terminal of the user who started the run, by standard error."""
 
     name = "console"
     inline = False
     keeps_all = False
 
-    def __init__(self, stream: TextIO | None = None) -> None:
-        self._stream = sys.stderr if stream is None else stream
+    def __init__(self) -> None:
+        self._stream = sys.stderr
         self._on_screen = self._stream.isatty()
         # A log begins with what goes wrong: of a run that ends at once, nothing else is told.
         self._next_s = -math.inf if self._on_screen else time.monotonic() + _LOG_EVERY_S
@@ -168,32 +158,17 @@ SWITCH_S = 0.0005
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FeedRequest:
-    """Request for the delivery of a source, where it has a choice; see `open_feed`.
+    """Request for the delivery of a source, where it has a choice; see `open_feed`."""
 
-    Attributes
-    ----------
-    fps : float or None
-        Of images, or asked of a camera.
-    size : str or None
-        `WIDTHxHEIGHT`, asked of a camera.
-    pixel_format : str or None
-        Asked of a camera.
-    transport : {"tcp", "udp"} or None
-        How RTSP shall send.
-    """
-
-    fps: float | None = None
-    size: str | None = None
-    pixel_format: str | None = None
-    transport: Transport | None = None
+    fps: float | None = None  # Of images, or asked of a camera.
+    size: str | None = None  # `WIDTHxHEIGHT`, asked of a camera.
+    pixel_format: str | None = None  # Asked of a camera.
+    transport: Transport | None = None  # How RTSP shall send.
 
     def opened(self, source: str, *, realtime: bool) -> Feed:
         """Return the feed of a source.
 
-        Raises
-        ------
-        OptionError, SourceError
-            As `open_feed`; also if the size is none.
+        Raises `OptionError` or `SourceError` as `open_feed`; also if the size is none.
         """
         return open_feed(
             source,
@@ -214,60 +189,41 @@ def _size_px(text: str) -> tuple[int, int]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LiveRequest:
-    """Request for a live run.
+    """Request for a live run."""
 
-    Attributes
-    ----------
-    source : str
-        As `open_feed` takes it.
-    rig : Path
-    feed : FeedRequest
-    outputs : OutputRequest
-    dashboard : str or None
-        Address HOST:PORT of the pilot's page.
-    token : str or None
-        Its password.
-    embed_from : tuple of str
-        Origins of pages that may show it.
-    record : bool
-        Whether to record from the start; the page's button begins and ends recordings, too.
-    record_to : Path
-        Folder of recordings.
-    record_video : bool
-    smooth : bool
-        Whether the time filter runs.
-    fast : bool
-        Measure every frame of a file, as fast as possible.
-    water : Water
-    scanner : ScannerOptions
-    index_target : Path or None
-        Markers on the vehicle that show the water's index.
-    """
-
+    # As `open_feed` takes it.
     source: str
+
     rig: Path
     feed: FeedRequest = field(default_factory=FeedRequest)
     outputs: OutputRequest = field(default_factory=OutputRequest)
+    # Address HOST:PORT of the pilot's page.
     dashboard: str | None = None
+    # Its password.
     token: str | None = None
+    # Origins of pages that may show it.
     embed_from: tuple[str, ...] = ()
+    # Whether to record from the start; the page's button begins and ends recordings, too.
     record: bool = False
+    # Folder of recordings.
     record_to: Path = Path("dives")
+
     record_video: bool = False
+    # Whether the time filter runs.
     smooth: bool = False
+    # Measure every frame of a file, as fast as possible.
     fast: bool = False
+
     water: Water = field(default_factory=Water)
     scanner: ScannerOptions = field(default_factory=ScannerOptions)
+    # Markers on the vehicle that show the water's index.
     index_target: Path | None = None
 
 
 def live_and_tell(request: LiveRequest, echo: Callable[[str], object]) -> int:
     """Run until the source ends or the user stops it, the normal end of a live run; return 0.
 
-    Raises
-    ------
-    AqualvsError
-        If an input cannot be used, or the source can never work.
+    Raises `AqualvsError` if an input cannot be used, or the source can never work.
     """
     rig = prepared_rig(request.rig, request.water, no_dome=False)
     pictures = request.feed.opened(request.source, realtime=not request.fast)

@@ -53,51 +53,36 @@ _EPS_S = 1e-6
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrozenOptions:
-    """Thresholds by which a picture counts as frozen.
+    """Thresholds by which a picture counts as frozen."""
 
-    Attributes
-    ----------
-    span_s : float
-        Pictures so far apart, in seconds, are compared: long enough for cameras that repeat each
-        picture two or four times, as they do in dim light.
-    greatest : float
-        A greater change is never that of a frozen picture, in grey levels. An encoder's
-        improvements of a still are less after 0.4 s.
-    least : float
-        A smaller change is always that of a frozen picture, in grey levels.
-    share : float
-        Between these two: as share of the change that this stream shows at its quietest (5 % of
-        its last pictures change less).
-    motion : float
-        Motion within `span_s`, in pixels of a picture that is reduced to a width of about 360,
-        from which on a sudden stop is one of the picture and not of the vehicle.
-    stop : float
-        The picture has stopped where its motion stays below this share of the motion before.
-    stopped_s : float
-        For so long, in seconds. A vehicle that turns round stops for a moment: at constant
-        acceleration its motion, `stopped_s` / 2 from the turning point, is a third of the median
-        over the `span_s` before.
-    confirmed_s : float
-        Within this time, in seconds, the changes of a stopped picture must fall below the limits
-        above, or it counts as live again.
-    """
-
+    # Pictures so far apart, in seconds, are compared: long enough for cameras that repeat each
+    # picture two or four times, as they do in dim light.
     span_s: float = 0.24
+    # A greater change is never that of a frozen picture, in grey levels. An encoder's improvements
+    # of a still are less after 0.4 s.
     greatest: float = 0.8
+    # A smaller change is always that of a frozen picture, in grey levels.
     least: float = 0.1
+    # Between these two: as share of the change that this stream shows at its quietest (5 % of its
+    # last pictures change less).
     share: float = 0.65
+    # Motion within `span_s`, in pixels of a picture that is reduced to a width of about 360, from
+    # which on a sudden stop is one of the picture and not of the vehicle.
     motion: float = 0.15
+    # The picture has stopped where its motion stays below this share of the motion before.
     stop: float = 0.25
+    # For so long, in seconds. A vehicle that turns round stops for a moment: at constant
+    # acceleration its motion, `stopped_s` / 2 from the turning point, is a third of the median over
+    # the `span_s` before.
     stopped_s: float = 0.16
+    # Within this time, in seconds, the changes of a stopped picture must fall below the limits
+    # above, or it counts as live again.
     confirmed_s: float = 2.0
 
     def __post_init__(self) -> None:
         """Refuse impossible values.
 
-        Raises
-        ------
-        OptionError
-            Naming the value.
+        Raises `OptionError` naming the value.
         """
         for field in fields(self):
             name, value = field.name, getattr(self, field.name)
@@ -106,20 +91,13 @@ class FrozenOptions:
 
 
 class _Patches(NamedTuple):
-    """Patches of a reduced picture with the strongest edges.
+    """Patches of a reduced picture with the strongest edges."""
 
-    Attributes
-    ----------
-    at : int array, shape (N,)
-        Numbers of the patches.
-    edges : array, shape (N, pixels)
-        Derivative across the main direction of the edges of the patch.
-    pixels : array, shape (N, pixels)
-        Grey levels.
-    """
-
+    # Shape (N,): numbers of the patches.
     at: IntArray
+    # Shape (N, pixels): derivative across the main direction of the edges of the patch.
     edges: NDArray[np.float32]
+    # Shape (N, pixels): grey levels.
     pixels: NDArray[np.float32]
 
 
@@ -144,11 +122,6 @@ class FrozenPicture:
     earlier: the 80 % quantile of the displacements of patches across their edges. What an encoder
     improves moves no edge. A vehicle slows down little by little, and one that turns round moves
     again soon; a picture whose motion ends at once, and does not return, has stopped itself.
-
-    Parameters
-    ----------
-    options : FrozenOptions, optional
-        Defaults if left out.
 
     Attributes
     ----------
@@ -422,10 +395,7 @@ class _Passed:
 class HealthMonitor:
     """Health statistics, gathered frame by frame; `health` is cheap.
 
-    Parameters
-    ----------
-    rig : Rig
-        Whose lasers are watched.
+    `rig`: whose lasers are watched.
     """
 
     def __init__(self, rig: Rig) -> None:

@@ -6,10 +6,9 @@ page of `aqualvs live` and `follow`, if its packages are installed.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -53,26 +52,16 @@ class VehicleFile(StrictPart):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VehicleSetup:
-    """Contents of a vehicle file.
+    """Contents of a vehicle file."""
 
-    Attributes
-    ----------
-    link : LinkOptions
-        Of the connection.
-    steering : ArduSubOptions
-    """
-
-    link: LinkOptions = field(default_factory=LinkOptions)
+    link: LinkOptions = field(default_factory=LinkOptions)  # Of the connection.
     steering: ArduSubOptions = field(default_factory=ArduSubOptions)
 
 
 def load_vehicle(path: Path) -> VehicleSetup:
     """Return the contents of a vehicle file; its key file is looked for beside it.
 
-    Raises
-    ------
-    OptionError
-        One line: file, place, value, remedy.
+    Raises `OptionError` with one line: file, place, value, remedy.
     """
     content = load_settings(path, VehicleFile, _KEY, VERSION)
     try:
@@ -102,8 +91,6 @@ def vehicle_setup(file: Path | None, peers: Sequence[str] | None, key: Path | No
 
     Parameters
     ----------
-    file : Path or None
-        `--vehicle-file`; defaults if left out.
     peers : sequence of str or None
         `--mavlink-peer`; instead of those of the file.
     key : Path or None
@@ -128,110 +115,75 @@ FOXGLOVE_PORT, DASHBOARD_PORT = 8765, 8100
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OutputRequest:
-    """Request for outputs of a live run; all are off by default.
+    """Request for outputs of a live run; all are off by default."""
 
-    Attributes
-    ----------
-    mavlink, json : tuple of str
-        Addresses; one output for each.
-    link : LinkOptions
-        Of every MAVLink connection.
-    ros2, ros1 : bool
-    foxglove : str or None
-        Address HOST:PORT to listen on.
-    rerun : str or None
-        As `RerunOutput` takes it.
-    """
-
+    # Addresses; one output for each.
     mavlink: tuple[str, ...] = ()
     json: tuple[str, ...] = ()
+    # Of every MAVLink connection.
     link: LinkOptions = field(default_factory=LinkOptions)
+
     ros2: bool = False
     ros1: bool = False
+    # Address HOST:PORT to listen on.
     foxglove: str | None = None
+    # As `RerunOutput` takes it.
     rerun: str | None = None
 
 
 def make_outputs(request: OutputRequest) -> list[Output]:
     """Make the outputs that were asked for.
 
-    Raises
-    ------
-    OptionError
-        If an address cannot be understood, or the extra that an output needs is not installed; the
-        outputs made before it are closed.
+    Raises `OptionError` if an address cannot be understood, or the extra that an output needs is
+    not installed; the outputs made before it are closed.
     """
-    makers: list[Callable[[], Output]] = [
-        partial(_mavlink, url, request.link) for url in request.mavlink
-    ]
-    if request.json:
-        makers.append(partial(_json, request.json))
-    if request.ros2:
-        makers.append(_ros2)
-    if request.ros1:
-        makers.append(_ros1)
-    if request.foxglove is not None:
-        makers.append(partial(_foxglove, request.foxglove))
-    if request.rerun is not None:
-        makers.append(partial(_rerun, request.rerun))
     with ExitStack() as made:
         outputs = []
-        for make in makers:
-            outputs.append(make())
-            made.callback(outputs[-1].close)
+        for output in _requested(request):
+            outputs.append(output)
+            made.callback(output.close)
         made.pop_all()
     return outputs
+
+
+def _requested(request: OutputRequest) -> Iterator[Output]:
+    """Yield the outputs one by one; only what is asked for is imported."""
+    for url in request.mavlink:
+        from aqualvs.live.outputs.mavlink import MavlinkOutput
+
+        yield MavlinkOutput(url, request.link)
+    if request.json:
+        from aqualvs.live.outputs.udp_json import UdpJsonOutput
+
+        yield UdpJsonOutput(request.json)
+    if request.ros2:
+        from aqualvs.live.outputs.dds import DdsOutput
+
+        yield DdsOutput()
+    if request.ros1:
+        from aqualvs.live.outputs.ros1 import Ros1Output
+
+        yield Ros1Output()
+    if request.foxglove is not None:
+        from aqualvs.live.outputs.foxglove import FoxgloveOutput
+
+        host, port = host_and_port(request.foxglove, FOXGLOVE_PORT, "--foxglove-address")
+        yield FoxgloveOutput(host, port)
+    if request.rerun is not None:
+        from aqualvs.live.outputs.rerun import RerunOutput
+
+        yield RerunOutput(request.rerun)
 
 
 def host_and_port(text: str, default_port: int, option: str) -> tuple[str, int]:
     """Return host and port of `HOST:PORT`, `HOST`, `:PORT` or "" (127.0.0.1).
 
-    Raises
-    ------
-    OptionError
-        If there is no such port.
+    Raises `OptionError` if there is no such port.
     """
     host, _, port = text.rpartition(":") if ":" in text else (text, "", "")
     if port and not (port.isdecimal() and 0 <= int(port) < 2**16):
         raise OptionError(f"{option} {text}: port {port}; give HOST:PORT with a port up to 65535")
     return host.strip("[]") or "127.0.0.1", int(port) if port else default_port
-
-
-def _mavlink(url: str, options: LinkOptions) -> Output:
-    from aqualvs.live.outputs.mavlink import MavlinkOutput
-
-    return MavlinkOutput(url, options)
-
-
-def _json(receivers: tuple[str, ...]) -> Output:
-    from aqualvs.live.outputs.udp_json import UdpJsonOutput
-
-    return UdpJsonOutput(receivers)
-
-
-def _ros2() -> Output:
-    from aqualvs.live.outputs.dds import DdsOutput
-
-    return DdsOutput()
-
-
-def _ros1() -> Output:
-    from aqualvs.live.outputs.ros1 import Ros1Output
-
-    return Ros1Output()
-
-
-def _foxglove(address: str) -> Output:
-    from aqualvs.live.outputs.foxglove import FoxgloveOutput
-
-    host, port = host_and_port(address, FOXGLOVE_PORT, "--foxglove-address")
-    return FoxgloveOutput(host, port)
-
-
-def _rerun(where: str) -> Output:
-    from aqualvs.live.outputs.rerun import RerunOutput
-
-    return RerunOutput(where)
 
 
 def vehicle_reader(outputs: Sequence[Output]) -> Callable[[], VehicleState | None]:
@@ -259,13 +211,10 @@ def serve_page(
         HOST:PORT.
     token : str or None
         Its password; a new one if left out.
-    rig : Rig
     holder : SetpointHolder
         Where the page puts what is to be held.
     recorder : RecorderSwitch or None
-        What its record button moves; None where nothing can be recorded.
-    echo : callable
-        Takes one line.
+        What its record button moves; without one the button refuses.
     vehicle : callable, optional
         Returns what the autopilot tells of depth and heading.
     embedders : sequence of str, optional
@@ -278,10 +227,20 @@ def serve_page(
         cannot be used.
     """
     try:
-        from aqualvs.live.dashboard.output import start_dashboard
-    except ImportError as fault:
+        from aqualvs.live.dashboard.access import Controls, NoRecorder, make_access, token_fault
+        from aqualvs.live.dashboard.output import Dashboard, SwitchButton
+        from aqualvs.live.dashboard.server import DashboardServer
+    except ImportError as lack:
         raise OptionError(
-            f"--dashboard: {fault.name} is missing; pip install 'aqualvs[dashboard]'"
-        ) from fault
+            f"--dashboard: {lack.name} is missing; pip install 'aqualvs[dashboard]'"
+        ) from lack
     host, port = host_and_port(address, DASHBOARD_PORT, "--dashboard-address")
-    return start_dashboard(host, port, token, rig, holder, recorder, echo, vehicle, embedders)
+    fault = token_fault(token)
+    if fault:
+        raise OptionError(fault)
+    access = make_access(host, token, embedders)
+    controls = Controls(holder, NoRecorder() if recorder is None else SwitchButton(recorder))
+    server = DashboardServer(host, port, access, rig, controls)
+    shown = f"[{host}]" if ":" in host else host
+    echo(f"dashboard: http://{shown}:{server.port}/#token={access.token}")
+    return Dashboard(server, controls, vehicle)

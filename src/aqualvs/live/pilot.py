@@ -10,10 +10,9 @@ import threading
 import time
 from dataclasses import dataclass, replace
 
-from aqualvs.control.autopilot import Decision, Motion, NetPilot
+from aqualvs.control.autopilot import Decision, NetPilot, motion_of
 from aqualvs.control.missions import Guidance, HoldMission
 from aqualvs.control.safety import LimitReason
-from aqualvs.control.time_filter import FilteredPosture
 from aqualvs.control.vehicle import NEUTRAL, Effort, Mode, SetpointHolder, VehicleLink, VehicleState
 from aqualvs.errors import OptionError
 from aqualvs.recording.sample import LiveSample
@@ -33,7 +32,6 @@ class Watchdog:
 
     Parameters
     ----------
-    vehicle : VehicleLink
     timeout_s : float
         Time that an effort may stay in force.
 
@@ -57,16 +55,8 @@ class Watchdog:
     def send(self, effort: Effort, known_s: float) -> Effort:
         """Send an effort, or neutral if it is already too old; return the sent effort.
 
-        Parameters
-        ----------
-        effort : Effort
-        known_s : float
-            Time at which its posture was known, by `time.monotonic`.
-
-        Raises
-        ------
-        OSError, ValueError
-            As `VehicleLink.send`.
+        `known_s`: time at which its posture was known, by `time.monotonic`. Raises `OSError` or
+        `ValueError` as `VehicleLink.send`.
         """
         with self._sending:
             if time.monotonic() - known_s > self._timeout_s:
@@ -119,33 +109,15 @@ _TELL_MODE = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PilotReport:
-    """One step of the pilot.
+    """One step of the pilot."""
 
-    Attributes
-    ----------
-    at_ns : int
-        By `time.monotonic_ns`.
-    frame : int
-        Number of the frame that it rests on; the last one's where the stream is silent.
-    engaged : bool
-        Whether efforts go out.
-    effort : Effort
-        What was sent; neutral where nothing was.
-    reason : LimitReason or None
-        Why it is not what the controller asked for.
-    guidance : Guidance
-        What the mission wants.
-    state : VehicleState
-        As the vehicle reported it.
-    """
-
-    at_ns: int
-    frame: int
-    engaged: bool
-    effort: Effort
-    reason: LimitReason | None
-    guidance: Guidance
-    state: VehicleState
+    at_ns: int  # By `time.monotonic_ns`.
+    frame: int  # Number of the frame that it rests on; the last one's where the stream is silent.
+    engaged: bool  # Whether efforts go out.
+    effort: Effort  # What was sent; neutral where nothing was.
+    reason: LimitReason | None  # Why it is not what the controller asked for.
+    guidance: Guidance  # What the mission wants.
+    state: VehicleState  # As the vehicle reported it.
 
     @property
     def words(self) -> str:
@@ -234,10 +206,8 @@ class Pilot:
     def engage(self) -> None:
         """Engage on request of the user.
 
-        Raises
-        ------
-        OptionError
-            If that cannot be: no setpoint, another mode, disarmed, sticks off their centre.
+        Raises `OptionError` if that cannot be: no setpoint, another mode, disarmed, sticks off
+        their centre.
         """
         with self._stepping:
             if self._takes_setpoint() and not self._setpoint_known():
@@ -318,7 +288,7 @@ class Pilot:
             now_s,
             sample.scan.time_s,
             self._present(sample, now_s),
-            _motion(sample.filtered),
+            motion_of(sample.filtered),
             state,
         )
 
@@ -388,11 +358,3 @@ class Pilot:
         self._told = told
         level = logging.INFO if report.colour is State.OK else logging.WARNING
         _log.log(level, "pilot, frame %d: %s", report.frame, report.words)
-
-
-def _motion(filtered: FilteredPosture | None) -> Motion | None:
-    """Return the filter's answer in control's words."""
-    if filtered is None:
-        return None
-    range_rate, _, yaw_rate = filtered.rates.tolist()
-    return Motion(filtered.range, filtered.yaw, range_rate, yaw_rate)

@@ -46,10 +46,7 @@ _ROUNDS = 2
 def warm_up(scanner: Scanner) -> Scan:
     """Let a scanner measure made-up pictures, which loads its compiled kernels.
 
-    Returns
-    -------
-    scan : Scan
-        Of a wall in the middle of the working range, square to the vehicle.
+    Returns the scan of a wall in the middle of the working range, square to the vehicle.
     """
     picture = wall_frame(scanner.rig)
     for _ in range(_ROUNDS):
@@ -84,10 +81,7 @@ _log = logging.getLogger(__name__)
 class OutputWorker:
     """Worker of one output: a thread of its own, unless the output never waits.
 
-    Parameters
-    ----------
-    output : Output
-        Owned from here on.
+    `output`: owned from here on.
     """
 
     def __init__(self, output: Output) -> None:
@@ -170,20 +164,11 @@ class OutputWorker:
 
 @dataclass(frozen=True, slots=True)
 class Arrival:
-    """A frame and when it came.
-
-    Attributes
-    ----------
-    frame : Frame
-    arrived_ns : int
-        By `time.monotonic_ns`.
-    utc_ns : int
-        By the system clock.
-    """
+    """A frame and when it came."""
 
     frame: Frame
-    arrived_ns: int
-    utc_ns: int
+    arrived_ns: int  # By `time.monotonic_ns`.
+    utc_ns: int  # By the system clock.
 
 
 class Mailbox:
@@ -258,7 +243,6 @@ class FrameReader:
 
     Parameters
     ----------
-    feed : Feed
     mailbox : Mailbox
         Closed when the feed ends.
 
@@ -347,12 +331,7 @@ class ScannerSupply(Protocol):
 
 
 class FixedScanner:
-    """Provider of always the same scanner.
-
-    Parameters
-    ----------
-    scanner : Scanner
-    """
+    """Provider of always the same scanner."""
 
     def __init__(self, scanner: Scanner) -> None:
         self.scanner = scanner
@@ -367,20 +346,13 @@ class FixedScanner:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LiveOptions:
-    """Options of the live loop.
+    """Options of the live loop."""
 
-    Attributes
-    ----------
-    stale_after_s : float
-        A stream that is silent for this time has no posture any more.
-    keep_every : bool
-        Measure every frame regardless of the delay: for files.
-    frozen : FrozenOptions or None
-        When a picture counts as frozen, and has no posture; None where none does.
-    """
-
+    # A stream that is silent for this time has no posture any more.
     stale_after_s: float = 0.15
+    # Measure every frame regardless of the delay: for files.
     keep_every: bool = False
+    # When a picture counts as frozen, and has no posture; None where none does.
     frozen: FrozenOptions | None = field(default_factory=FrozenOptions)
 
 
@@ -394,8 +366,6 @@ class LiveRunner:
         Closed at the end.
     outputs : sequence of Output
         Closed at the end.
-    options : LiveOptions, optional
-        Defaults if left out.
     posture_filter : PostureFilter or None
         Smooths over time, in addition to the raw values.
 

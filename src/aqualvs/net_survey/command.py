@@ -42,40 +42,25 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NetSource:
-    """Source of a survey: a dive or a run, and the folder to write.
+    """Source of a survey: a dive or a run, and the folder to write."""
 
-    Attributes
-    ----------
-    source : str
-        Folder of a run, or a dive as `open_source` takes it.
-    rig, out : Path or None
-        A dive needs a rig (a recording brings its own); its default folder is beside it. A run has
-        its own rig, and its own folder is the default.
-    target : str
-        As `aqualvs run` takes it; for a dive.
-    overwrite : bool
-        Whether what is already there may be replaced.
-    """
-
+    # Folder of a run, or a dive as `open_source` takes it.
     source: str
+    # A dive needs a rig (a recording brings its own); its default folder is beside it. A run has
+    # its own rig, and its own folder is the default.
     rig: Path | None = None
     out: Path | None = None
+    # As `aqualvs run` takes it; for a dive.
     target: str = "auto"
+    # Whether what is already there may be replaced.
     overwrite: bool = False
 
 
 def net(place: NetSource, request: NetRequest, echo: Callable[[str], object]) -> int:
     """Evaluate the condition of a net, write it and print it.
 
-    Returns
-    -------
-    exit_code : int
-        0, or 128 + signal if it was stopped: then the files tell of what came before.
-
-    Raises
-    ------
-    AqualvsError
-        If an input cannot be used, or a file not be written.
+    Returns 0, or 128 + signal if it was stopped: then the files tell of what came before. Raises
+    `AqualvsError` if an input cannot be used, or a file not be written.
     """
     # A run without its postures is refused by its name; as a dive it would lack a rig.
     if any((Path(place.source) / name).is_file() for name in (POSTURE_CSV, RUN_YAML)):
@@ -95,15 +80,7 @@ def net(place: NetSource, request: NetRequest, echo: Callable[[str], object]) ->
 def net_of_run(place: NetSource, request: NetRequest, echo: Callable[[str], object]) -> int:
     """Find the state of a net from a run that is on disk; one that was killed is completed first.
 
-    Returns
-    -------
-    exit_code : int
-        0, or 128 + signal if it was stopped: then the files tell of what came before.
-
-    Raises
-    ------
-    AqualvsError
-        If the run cannot be read, or a file not be written.
+    Returns and raises as `net`.
     """
     run_folder = Path(place.source)
     folder = place.out or run_folder
@@ -137,10 +114,7 @@ def net_of_run(place: NetSource, request: NetRequest, echo: Callable[[str], obje
 class StoredDive:
     """Dive as stored in a run's folder.
 
-    Raises
-    ------
-    SourceError
-        If `run.yaml`, postures or points cannot be read.
+    Raises `SourceError` if `run.yaml`, postures or points cannot be read.
     """
 
     def __init__(self, run_folder: Path) -> None:
@@ -165,10 +139,7 @@ class StoredDive:
     def net_pass(self, request: NetRequest) -> NetPass:
         """Return the evaluation of the net, to which the dive's scans are to be given.
 
-        Raises
-        ------
-        AqualvsError
-            If the rig in `run.yaml` is none, or the log cannot be read.
+        Raises `AqualvsError` if the rig in `run.yaml` is none, or the log cannot be read.
         """
         rig = rig_from_mapping(self._content["rig"], source_name=str(self._folder / RUN_YAML))
         return NetPass(rig, request)
@@ -191,25 +162,12 @@ _GIVEN = "the user"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NetChangeRequest:
-    """Request for `aqualvs net-change`.
+    """Request for `aqualvs net-change`."""
 
-    Attributes
-    ----------
-    runs : tuple of Path
-        Folders of runs, or of batches.
-    out : Path
-        Folder to write.
-    dates : tuple of str
-        None, or one for each of `runs`.
-    cell_m : float
-        Side of the map's cells.
-    overwrite : bool
-    """
-
-    runs: tuple[Path, ...]
-    out: Path
-    dates: tuple[str, ...] = ()
-    cell_m: float = 1.0
+    runs: tuple[Path, ...]  # Folders of runs, or of batches.
+    out: Path  # Folder to write.
+    dates: tuple[str, ...] = ()  # None, or one for each of `runs`.
+    cell_m: float = 1.0  # Side of the map's cells.
     overwrite: bool = False
 
     def __post_init__(self) -> None:
@@ -221,10 +179,8 @@ class NetChangeRequest:
 def net_change(request: NetChangeRequest, echo: Callable[[str], object]) -> "Comparison":
     """Compare dives along the same net, write the changes and print them.
 
-    Raises
-    ------
-    AqualvsError
-        If a run cannot be read or a file not be written, or there is nothing to compare.
+    Raises `AqualvsError` if a run cannot be read or a file not be written, or there is nothing to
+    compare.
     """
     # `aqualvs net` and the processes of a batch need neither SciPy nor charts.
     from aqualvs.net_survey.comparison import compare

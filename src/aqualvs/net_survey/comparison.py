@@ -68,27 +68,18 @@ class HoleState(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Site:
-    """A place on the net with a hole on one date or more.
-
-    Attributes
-    ----------
-    state : HoleState
-    place, sigma : array, shape (2,)
-        u and d in metres.
-    sizes, sigma_sizes : array, shape (V,)
-        Diameter on each date in metres; NaN where it was not seen.
-    looked : array, shape (V,)
-        Chance that lasers looked there on each date.
-    numbers : list of str
-        Run and number in its `holes.csv`.
-    """
+    """A place on the net with a hole on one date or more."""
 
     state: HoleState
+    # Shape (2,): u and d in metres.
     place: FloatArray
     sigma: FloatArray
+    # Shape (V,): diameter on each date in metres; NaN where it was not seen.
     sizes: FloatArray
     sigma_sizes: FloatArray
+    # Shape (V,): chance that lasers looked there on each date.
     looked: FloatArray
+    # Run and number in its `holes.csv`.
     numbers: list[str]
 
     @property
@@ -108,12 +99,7 @@ def find_sites(
 ) -> list[Site]:
     """Bring holes of dives, already shifted, together.
 
-    Parameters
-    ----------
-    placed : sequence
-    shifts : sequence
-        What each shift leaves open is in its sigma.
-    frame : WallFrame
+    `shifts`: what each shift leaves open is in its sigma.
     """
     dates = sorted({one.survey.date for one in placed})
     parts = [(i, k) for i, one in enumerate(placed) for k in _known(one)]
@@ -307,58 +293,33 @@ def _state(sizes: FloatArray, errors: FloatArray, looked: FloatArray) -> HoleSta
 
 @dataclass(frozen=True, slots=True)
 class OnWall:
-    """Changes by place: cells and hole sites on the wall.
-
-    Attributes
-    ----------
-    frame : WallFrame
-    placed : list of PlacedSurvey
-        Dives in the common frame, shifted.
-    shifts : list of SurveyShift
-        Theirs.
-    history : WallHistory
-    cells : list of CellChange
-    growth : Growth or None
-        Per day, over all cells seen on two dates; None without one.
-    means : list of Growth or None
-        Of the cells seen on every date, date by date.
-    sites : list of Site
-        Holes.
-    """
+    """Changes by place: cells and hole sites on the wall."""
 
     frame: WallFrame
-    placed: list[PlacedSurvey]
-    shifts: list[SurveyShift]
+    placed: list[PlacedSurvey]  # Dives in the common frame, shifted.
+    shifts: list[SurveyShift]  # Theirs.
     history: WallHistory
     cells: list[CellChange]
-    growth: Growth | None
-    means: list[Growth | None]
-    sites: list[Site]
+    growth: Growth | None  # Per day, over all cells seen on two dates; None without one.
+    means: list[Growth | None]  # Of the cells seen on every date, date by date.
+    sites: list[Site]  # Holes.
 
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """Result of comparing dives along the same net.
+    """Result of comparing dives along the same net."""
 
-    Attributes
-    ----------
-    surveys : list of Survey
-        In the order of time.
-    dates : list of date
-    whole : list of Growth or None
-        Mean solidity of all that was seen, date by date: of other parts of the net, perhaps.
-    rate : Growth or None
-        Change of that per day.
-    wall : OnWall or None
-        None where places cannot be compared.
-    warnings : list of str
-    """
-
+    # In the order of time.
     surveys: list[Survey]
+
     dates: list[date]
+    # Mean solidity of all that was seen, date by date: of other parts of the net, perhaps.
     whole: list[Growth | None]
+    # Change of that per day.
     rate: Growth | None
+    # None where places cannot be compared.
     wall: OnWall | None
+
     warnings: list[str]
 
 

@@ -32,21 +32,11 @@ _MAD = 1.4826
 
 @dataclass(frozen=True, slots=True)
 class WallFrame:
-    """Meaning of the coordinate u on a wall: around a round net, or along a flat one.
+    """Meaning of the coordinate u on a wall: around a round net, or along a flat one."""
 
-    Attributes
-    ----------
-    round : bool
-        Around a round net, else along a flat one.
-    radius : float
-        Metres; 0 for a flat net.
-    sign : float
-        -1 where bearings fall to the right: the net is seen from outside.
-    """
-
-    round: bool
-    radius: float = 0.0
-    sign: float = 1.0
+    round: bool  # Around a round net, else along a flat one.
+    radius: float = 0.0  # Metres; 0 for a flat net.
+    sign: float = 1.0  # -1 where bearings fall to the right: the net is seen from outside.
 
     @property
     def period(self) -> float:
@@ -56,26 +46,13 @@ class WallFrame:
 
 @dataclass(frozen=True, slots=True)
 class PlacedSurvey:
-    """A dive's stretches (K, only usable ones) and holes (H) in a common frame.
-
-    Attributes
-    ----------
-    survey : Survey
-    rows : int array, shape (K,)
-        Which stretches of the survey.
-    outline : array, shape (K, 4, 2)
-        u and d.
-    holes : array, shape (H, 2)
-        u and d.
-    sigma : array, shape (2,)
-        Error of a place within the dive.
-    """
+    """A dive's stretches (K, only usable ones) and holes (H) in a common frame."""
 
     survey: Survey
-    rows: IntArray
-    outline: FloatArray
-    holes: FloatArray
-    sigma: FloatArray
+    rows: IntArray  # Shape (K,): which stretches of the survey.
+    outline: FloatArray  # Shape (K, 4, 2): u and d.
+    holes: FloatArray  # Shape (H, 2): u and d.
+    sigma: FloatArray  # Shape (2,): error of a place within the dive.
 
     @property
     def solidity(self) -> FloatArray:
@@ -84,15 +61,7 @@ class PlacedSurvey:
 
 
 def common_frame(surveys: Sequence[Survey]) -> tuple[WallFrame | None, str]:
-    """Return what the dives' places have in common.
-
-    Returns
-    -------
-    frame : WallFrame or None
-        None where places cannot be compared.
-    why : str
-        Then in words; "" otherwise.
-    """
+    """Return what the dives' places have in common, or None and the reason in words."""
     known = [one for one in surveys if has_places(one)]
     if len({one.date for one in known}) < 2:
         return None, (
@@ -197,24 +166,12 @@ def _holes(survey: Survey, frame: WallFrame) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class Raster:
-    """Squares on the wall.
+    """Squares on the wall."""
 
-    Attributes
-    ----------
-    low : array, shape (2,)
-        Least u and d.
-    size : array, shape (2,)
-        Of a square; round a net it goes round it in whole squares.
-    shape : (int, int)
-        Squares along u and d.
-    periodic : bool
-        Whether u goes round.
-    """
-
-    low: FloatArray
-    size: FloatArray
-    shape: tuple[int, int]
-    periodic: bool
+    low: FloatArray  # Shape (2,): least u and d.
+    size: FloatArray  # Shape (2,): of a square; round a net it goes round it in whole squares.
+    shape: tuple[int, int]  # Squares along u and d.
+    periodic: bool  # Whether u goes round.
 
     @classmethod
     def over(cls, low: FloatArray, high: FloatArray, side: float, frame: WallFrame) -> "Raster":
@@ -327,21 +284,14 @@ STEP = 0.1
 
 @dataclass(frozen=True, slots=True)
 class SurveyShift:
-    """Offset added to a dive's places to align them with those of the first dive.
+    """Offset added to a dive's places to align them with those of the first dive."""
 
-    Attributes
-    ----------
-    value, sigma : array, shape (2,)
-        Metres in u and d; the value is 0 where it is not told.
-    told : bool array, shape (2,)
-        Whether what stayed tells it.
-    by_pattern, by_holes : bool
-        What told it: agreement of the growth's pattern beyond chance; holes found again.
-    """
-
+    # Shape (2,): metres in u and d; the value is 0 where it is not told.
     value: FloatArray
     sigma: FloatArray
+    # Shape (2,): whether what stayed tells it.
     told: BoolArray
+    # What told it: agreement of the growth's pattern beyond chance; holes found again.
     by_pattern: bool = False
     by_holes: bool = False
 
@@ -353,17 +303,10 @@ class SurveyShift:
 
 @dataclass(frozen=True, slots=True)
 class ShiftGrid:
-    """Grid of the shifts that are tried.
+    """Grid of the shifts that are tried."""
 
-    Attributes
-    ----------
-    steps : (int array, int array)
-        In u and d, as multiples of `STEP`.
-    log_prior : array, shape (n_u, n_d)
-    """
-
-    steps: tuple[FloatArray, FloatArray]
-    log_prior: FloatArray
+    steps: tuple[FloatArray, FloatArray]  # In u and d, as multiples of `STEP`.
+    log_prior: FloatArray  # Shape (n_u, n_d).
 
 
 def prior_sigma(frame: WallFrame) -> FloatArray:

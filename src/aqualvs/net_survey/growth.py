@@ -26,14 +26,9 @@ FALSE_SHARE = 0.05
 
 @dataclass(frozen=True, slots=True)
 class Growth:
-    """Growth with its sigma: a rate per day, or a difference.
+    """Growth with its sigma: a rate per day, or a difference."""
 
-    Attributes
-    ----------
-    value, sigma : float
-        Of solidity, 0 to 1.
-    """
-
+    # Of solidity, 0 to 1.
     value: float
     sigma: float
 
@@ -45,69 +40,47 @@ class Growth:
 
 @dataclass(frozen=True, slots=True)
 class CellChange:
-    """Change of a cell between dates.
+    """Change of a cell between dates."""
 
-    Attributes
-    ----------
-    cell : int
-        In the raster.
-    first, last : int
-        Dates between which it is told.
-    n_dates : int
-        On which it was seen.
-    before, after, difference, per_day : Growth
-        Solidity on those two dates, and its change.
-    seen : (float, float)
-        Metres of laser line on those two dates.
-    excess : Growth
-        Rate less that of the whole wall: what is common to a dive's errors is not in its sigma.
-    changed, apart : bool
-        Whether difference and excess are beyond chance, among all cells.
-    """
-
+    # In the raster.
     cell: int
+    # Dates between which it is told.
     first: int
     last: int
+    # On which it was seen.
     n_dates: int
+    # Solidity on those two dates, and its change.
     before: Growth
     after: Growth
     difference: Growth
     per_day: Growth
+    # Metres of laser line on those two dates.
     seen: tuple[float, float]
+    # Rate less that of the whole wall: what is common to a dive's errors is not in its sigma.
     excess: Growth
+    # Whether difference and excess are beyond chance, among all cells.
     changed: bool = False
     apart: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class WallHistory:
-    """Solidity of cells (C) on dates (V), of stretches (K) of all dives.
+    """Solidity of cells (C) on dates (V), of stretches (K) of all dives."""
 
-    Attributes
-    ----------
-    dates : list of date
-        Increasing.
-    raster : Raster
-        C squares.
-    solidity, seen : array, shape (C, V)
-        NaN, and 0, where not seen.
-    place_variance : array, shape (C, V)
-        For the places' uncertainty and for having seen another part of the cell.
-    weights : sparse array, shape (C * V, K)
-        Of the stretches in each cell and date.
-    sigma : array, shape (K,)
-        Of the stretches.
-    dive : int array, shape (K,)
-        Of the stretches.
-    """
-
+    # Increasing.
     dates: list[date]
+    # C squares.
     raster: Raster
+    # Shape (C, V): NaN, and 0, where not seen.
     solidity: FloatArray
     seen: FloatArray
+    # Shape (C, V): for the places' uncertainty and for having seen another part of the cell.
     place_variance: FloatArray
+    # Shape (C * V, K): of the stretches in each cell and date.
     weights: sparse.csr_array
+    # Shape (K,): of the stretches.
     sigma: FloatArray
+    # Shape (K,): of the stretches.
     dive: IntArray
 
     @property
@@ -132,7 +105,6 @@ class WallHistory:
 
         Parameters
         ----------
-        value : float
         of_stretches : array, shape (K,)
             Factors of the stretches times their sigmas.
         place : float
@@ -151,10 +123,8 @@ def history(
 
     Parameters
     ----------
-    placed : sequence
     shifts : sequence
         What each shift leaves open is in its sigma.
-    frame : WallFrame
     cell : float
         Side of a cell in metres.
     """

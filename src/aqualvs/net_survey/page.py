@@ -70,10 +70,7 @@ _STYLE: dict[Any, Any] = {**STYLE, "axes.grid": False, "hatch.linewidth": 0.5}
 def draw_change(result: Comparison, path: Path) -> None:
     """Draw the map; where places cannot be compared, the means date by date.
 
-    Raises
-    ------
-    OSError
-        As the system says it.
+    Raises `OSError` as the system says it.
     """
     import matplotlib as mpl
 
@@ -295,21 +292,9 @@ _MINUS = re.compile(r"(?<![\w-])-(?=\d)")
 
 
 def write_page(path: Path, picture: Path, result: Comparison, origins: Mapping[str, str]) -> None:
-    """Write the page.
+    """Write the page, with the picture of the map in it.
 
-    Parameters
-    ----------
-    path : Path
-    picture : Path
-        Of the map, which goes into the page.
-    result : Comparison
-    origins : mapping
-        Folder of a run to what told its date.
-
-    Raises
-    ------
-    OSError
-        As the system says it.
+    `origins`: folder of a run to what told its date. Raises `OSError` as the system says it.
     """
     first, last = result.dates[0], result.dates[-1]
     lines = [line for line in summary_lines(result) if not line.startswith("warning: ")]

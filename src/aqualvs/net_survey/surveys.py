@@ -28,10 +28,7 @@ AUTO = "auto"
 def given_dates(texts: Sequence[str], n: int) -> list[date | None]:
     """Return the dates that the user gives for `n` folders; None where to be found.
 
-    Raises
-    ------
-    OptionError
-        If there is not one for every folder, or one is no date.
+    Raises `OptionError` if there is not one for every folder, or one is no date.
     """
     if texts and len(texts) != n:
         raise OptionError(
@@ -47,10 +44,7 @@ def date_of_run(folder: Path) -> tuple[date, str]:
     The date in the name of its folder counts first, then that in the name of the video, then the
     time that the video's container states. When it was evaluated says nothing.
 
-    Raises
-    ------
-    OptionError
-        If nothing tells.
+    Raises `OptionError` if nothing tells.
     """
     source = _source(folder)
     names = [(folder.resolve().name, "the folder's name"), (source.name, "the video's name")]
@@ -106,83 +100,58 @@ _DIVES = "dives"
 
 @dataclass(frozen=True, slots=True)
 class Stretches:
-    """Stretches of a dive, K of them; NaN where not known.
+    """Stretches of a dive, K of them; NaN where not known."""
 
-    Attributes
-    ----------
-    begin_s, along, depth, bearing, seen : array, shape (K,)
-        Dive time; metres along the net; metres; radians; metres of laser line looked at.
-    solidity, sigma : array, shape (K,)
-        Share of the area, and its standard deviation as `net.csv` has it.
-    usable : bool array, shape (K,)
-        Enough of the mesh was seen to rely on it.
-    placed : bool array, shape (K,)
-        There is a track: `along` means something.
-    outline : array, shape (K, 4, 2)
-        Of what the picture passed over, as `net.geojson` has it.
-    """
-
+    # Shape (K,): dive time; metres along the net; metres; radians; metres of laser line looked at.
     begin_s: FloatArray
     along: FloatArray
     depth: FloatArray
     bearing: FloatArray
     seen: FloatArray
+    # Shape (K,): share of the area, and its standard deviation as `net.csv` has it.
     solidity: FloatArray
     sigma: FloatArray
+    # Shape (K,): enough of the mesh was seen to rely on it.
     usable: BoolArray
+    # Shape (K,): there is a track: `along` means something.
     placed: BoolArray
+    # Shape (K, 4, 2): of what the picture passed over, as `net.geojson` has it.
     outline: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
 class Holes:
-    """Holes of a dive, H of them; NaN where not known.
+    """Holes of a dive, H of them; NaN where not known."""
 
-    Attributes
-    ----------
-    number : list of str
-        As `holes.csv` numbers them.
-    time_s, along, depth, bearing : array, shape (H,)
-    diameter, sigma : array, shape (H,)
-        In metres.
-    """
-
+    # As `holes.csv` numbers them.
     number: list[str]
+    # Shape (H,).
     time_s: FloatArray
     along: FloatArray
     depth: FloatArray
     bearing: FloatArray
+    # Shape (H,): in metres.
     diameter: FloatArray
     sigma: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
 class Survey:
-    """A dive along the net.
-
-    Attributes
-    ----------
-    folder : Path
-    date : date
-        On which it took place.
-    stretches : Stretches
-    holes : Holes
-    by_bearing, by_depth : bool
-        Whether x of the outlines is a bearing in degrees instead of metres along the net, and y
-        minus the depth instead of metres above the start.
-    lasers_share : float
-        Part of the height of what the picture passed over in which lasers looked for holes.
-    facts : mapping
-        Member `aqualvs_net` of `net.geojson`.
-    """
+    """A dive along the net."""
 
     folder: Path
+    # On which it took place.
     date: date
+
     stretches: Stretches
     holes: Holes
+    # Whether x of the outlines is a bearing in degrees instead of metres along the net, and y minus
+    # the depth instead of metres above the start.
     by_bearing: bool
     by_depth: bool
+    # Part of the height of what the picture passed over in which lasers looked for holes.
     lasers_share: float
+    # Member `aqualvs_net` of `net.geojson`.
     facts: Mapping[str, Any]
 
     @property
@@ -194,10 +163,7 @@ class Survey:
 def find_runs(folder: Path) -> list[Path]:
     """Return the runs that a folder is or, as that of a batch, holds.
 
-    Raises
-    ------
-    SourceError
-        If there is none with the state of a net.
+    Raises `SourceError` if there is none with the state of a net.
     """
     if (folder / NET_CSV).is_file():
         return [folder]
@@ -233,10 +199,7 @@ def left_out(folder: Path) -> list[str]:
 def read_survey(folder: Path, day: date) -> Survey:
     """Read the state of a net from a run's folder.
 
-    Raises
-    ------
-    SourceError
-        If a file is missing or cannot be understood.
+    Raises `SourceError` if a file is missing or cannot be understood.
     """
     check_run_files(folder)
     rows, holes = _rows(folder / NET_CSV), _rows(folder / HOLES_CSV)
@@ -261,10 +224,7 @@ def read_survey(folder: Path, day: date) -> Survey:
 def check_surveys(surveys: Sequence[Survey]) -> None:
     """Refuse runs that cannot be compared at all.
 
-    Raises
-    ------
-    OptionError
-        If there are fewer than two, or all are of one day, or one is named twice.
+    Raises `OptionError` if there are fewer than two, or all are of one day, or one is named twice.
     """
     folders = [one.folder.resolve() for one in surveys]
     for one, folder in zip(surveys, folders, strict=True):

@@ -297,10 +297,7 @@ def hole_rows(result: Comparison) -> list[dict[str, Cell]]:
 def write_tables(folder: Path, result: Comparison, names: tuple[str, str]) -> None:
     """Write both tables.
 
-    Raises
-    ------
-    OSError
-        As the system says it.
+    Raises `OSError` as the system says it.
     """
     write_table(folder / names[0], NET_CHANGE_COLUMNS, cell_rows(result))
     write_table(folder / names[1], HOLES_CHANGE_COLUMNS, hole_rows(result))

@@ -25,27 +25,19 @@ from aqualvs.nets.lattice import (
 )
 from aqualvs.nets.lit_intervals import LineState, NetReader, NetSignal
 from aqualvs.nets.spectrum import Crossings, Mesh
-from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import Rig
 from aqualvs.scanning.scan import Scan
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NetConditionOptions:
-    """Options of the evaluation: length of a section of net, and the known twine.
+    """Options of the evaluation: length of a section of net, and the known twine."""
 
-    Attributes
-    ----------
-    stretch_s : float
-        A stretch of net ends after this time,
-    stretch : float
-        or after the vehicle has moved this far along the net, in metres.
-    twine : float or None
-        Diameter of the bare twine in metres, where it is known: makes solidity more accurate.
-    """
-
+    # A stretch of net ends after this time,
     stretch_s: float = 5.0
+    # or after the vehicle has moved this far along the net, in metres.
     stretch: float = 0.5
+    # Diameter of the bare twine in metres, where it is known: makes solidity more accurate.
     twine: float | None = None
 
     def __post_init__(self) -> None:
@@ -60,50 +52,35 @@ class NetConditionOptions:
 
 @dataclass(frozen=True, slots=True)
 class NetStretch:
-    """Condition of a section (stretch) of net; None for values that could not be measured.
+    """Condition of a section (stretch) of net; None for values that could not be measured."""
 
-    Attributes
-    ----------
-    first_frame, last_frame : int
-        Frames in which it was seen.
-    begin_s, end_s : float
-        Their times.
-    n_frames : int
-        Frames with a posture.
-    range : float
-        Mean distance from the vehicle, in metres.
-    begin_place, place : array, shape (2,)
-        The vehicle's foot on the net (of the perpendicular from the dome's centre) at its beginning
-        and its end: right and up of the track's start, in metres.
-    piece : int
-        Piece of track that `place` belongs to; a change from the stretch before means that the
-        track was lost in between.
-    lattice : NetLattice or None
-        Shape and size of the mesh, directions of the strands.
-    twine : Twine or None
-        Thickness of the twine.
-    solidity, sigma_solidity : float or None
-        Share of the area that strands and growth cover, 0 to 1.
-    n_strands : float
-        Mean number of strands in a frame.
-    seen_length : float
-        Observed length of laser line, in metres.
-    """
-
+    # Frames in which it was seen.
     first_frame: int
     last_frame: int
+    # Their times.
     begin_s: float
     end_s: float
+    # Frames with a posture.
     n_frames: int
+    # Mean distance from the vehicle, in metres.
     range: float
+    # Shape (2,): the vehicle's foot on the net (of the perpendicular from the dome's centre) at its
+    # beginning and its end: right and up of the track's start, in metres.
     begin_place: FloatArray
     place: FloatArray
+    # Piece of track that `place` belongs to; a change from the stretch before means that the track
+    # was lost in between.
     piece: int
+    # Shape and size of the mesh, directions of the strands.
     lattice: NetLattice | None
+    # Thickness of the twine.
     twine: Twine | None
+    # Share of the area that strands and growth cover, 0 to 1.
     solidity: float | None
     sigma_solidity: float | None
+    # Mean number of strands in a frame.
     n_strands: float
+    # Observed length of laser line, in metres.
     seen_length: float
 
     @property
@@ -134,10 +111,6 @@ class NetCondition:
     ----------
     rig : Rig
         Rig of the scans.
-    options : NetConditionOptions, optional
-        Defaults if left out.
-    camera : Camera, optional
-        Replaces `rig.camera()`.
 
     Attributes
     ----------
@@ -146,12 +119,10 @@ class NetCondition:
         stretches and the holes in them are filled in then.
     """
 
-    def __init__(
-        self, rig: Rig, options: NetConditionOptions | None = None, camera: Camera | None = None
-    ) -> None:
+    def __init__(self, rig: Rig, options: NetConditionOptions | None = None) -> None:
         self.options = options or NetConditionOptions()
         self.stretches: list[NetStretch] = []
-        self._reader = NetReader(rig, camera)
+        self._reader = NetReader(rig)
         self._signals: list[NetSignal] = []
         self._velocities: list[FloatArray | None] = []
         # Stretches before the first lattice, by their number.

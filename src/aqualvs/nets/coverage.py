@@ -68,66 +68,44 @@ _USUAL, _SPREAD = np.log([2.2e-3, 2.8e-3, 0.95]), np.array([1.5, 0.2, 0.1])
 
 @dataclass(frozen=True, slots=True)
 class DashKind:
-    """Mean dash of one laser on one family of strands.
+    """Mean dash of one laser on one family of strands."""
 
-    Attributes
-    ----------
-    laser, family : int
-        Of the dashes.
-    across : float
-        Sine of the angle between the laser's line and the strands, 0 to 1.
-    slant : float
-        Displacement of the strand along the line, measured by search lines, per metre across it.
-    length : float
-        Of a typical dash along the line, in metres.
-    width : float
-        Of its light at half height, square to the line, in metres.
-    height : float
-        Of its light, in grey levels.
-    step : float
-        Length of laser line per search line, in metres.
-    pixel : float
-        Size of a pixel on the net, in metres.
-    spread : float
-        Logarithm of the ratio of long dashes to short ones: a measure of growth.
-    count : int
-        Dashes.
-    """
-
+    # Of the dashes.
     laser: int
     family: int
+    # Sine of the angle between the laser's line and the strands, 0 to 1.
     across: float
+    # Displacement of the strand along the line, measured by search lines, per metre across it.
     slant: float
+    # Of a typical dash along the line, in metres.
     length: float
+    # Of its light at half height, square to the line, in metres.
     width: float
+    # Of its light, in grey levels.
     height: float
+    # Length of laser line per search line, in metres.
     step: float
+    # Size of a pixel on the net, in metres.
     pixel: float
+    # Logarithm of the ratio of long dashes to short ones: a measure of growth.
     spread: float
+    # Dashes.
     count: int
 
 
 @dataclass(frozen=True, slots=True)
 class Twine:
-    """Estimated thickness of twine, and the widths that explain its dashes.
+    """Estimated thickness of twine, and the widths that explain its dashes."""
 
-    Attributes
-    ----------
-    thickness, sigma : float
-        Diameter and its standard deviation, in metres.
-    body : float
-        Width of its silhouette, in metres.
-    sheet : float
-        Width within which the light sheet is seen, in metres.
-    halo, sigma_halo : float
-        Lit width of a strand beyond its body where search lines are close, in metres, and the
-        standard deviation of the separation of body and halo.
-    """
-
+    # Diameter and its standard deviation, in metres.
     thickness: float
     sigma: float
+    # Width of its silhouette, in metres.
     body: float
+    # Width within which the light sheet is seen, in metres.
     sheet: float
+    # Lit width of a strand beyond its body where search lines are close, in metres, and the
+    # standard deviation of the separation of body and halo.
     halo: float
     sigma_halo: float
 
@@ -300,40 +278,23 @@ _ERRORS = _SolidityErrors()
 
 @dataclass(frozen=True, slots=True)
 class RegisteredView:
-    """A frame with the place of the lattice in it.
+    """A frame with the place of the lattice in it."""
 
-    Attributes
-    ----------
-    view : NetView
-        Dashes and gaps of the frame.
-    fit : Fit
-        Assignment of its dashes to strands.
-    place : array, shape (2,)
-        Place of the origin of `net` on the net itself, as `NetTrack.place`.
-    """
-
+    # Dashes and gaps of the frame.
     view: NetView
+    # Assignment of its dashes to strands.
     fit: Fit
+    # Shape (2,): place of the origin of `net` on the net itself, as `NetTrack.place`.
     place: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
 class _Angles:
-    """Angles between strands and a laser's line and search lines; arrays of equal shape.
+    """Angles between strands and a laser's line and search lines; arrays of equal shape."""
 
-    Attributes
-    ----------
-    across : array
-        Sine of the angle between line and strand.
-    slant : array
-        As in `DashKind`.
-    square : array
-        Sine of the angle between line and search lines.
-    """
-
-    across: FloatArray
-    slant: FloatArray
-    square: FloatArray
+    across: FloatArray  # Sine of the angle between line and strand.
+    slant: FloatArray  # As in `DashKind`.
+    square: FloatArray  # Sine of the angle between line and search lines.
 
     @classmethod
     def of(cls, line: FloatArray, search: FloatArray, normal: FloatArray) -> "_Angles":

@@ -237,30 +237,22 @@ def _descends(along: FloatArray) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Dashes:
-    """Lit pieces of the lasers' lines in one frame, N of them.
+    """Lit pieces of the lasers' lines in one frame, N of them."""
 
-    Attributes
-    ----------
-    laser : int array, shape (N,)
-        Index of the laser.
-    along : array, shape (N,)
-        Middle of the dash on the laser's line, in metres.
-    place : array, shape (N, 2)
-        The same in `net`.
-    length : array, shape (N,)
-        Length along the line within which its light is above a share of its peak, in metres.
-    height, width : array, shape (N,)
-        Peak height (grey levels) and, where it is bright, mean width across the search line (m).
-    whole : bool array, shape (N,)
-        Whether both ends were seen: the length of a cut-off dash is not known.
-    """
-
+    # Shape (N,): index of the laser.
     laser: IntArray
+    # Shape (N,): middle of the dash on the laser's line, in metres.
     along: FloatArray
+    # Shape (N, 2): the same in `net`.
     place: FloatArray
+    # Shape (N,): length along the line within which its light is above a share of its peak, in
+    # metres.
     length: FloatArray
+    # Shape (N,): peak height (grey levels) and, where it is bright, mean width across the search
+    # line (m).
     height: FloatArray
     width: FloatArray
+    # Shape (N,): whether both ends were seen: the length of a cut-off dash is not known.
     whole: BoolArray
 
     def __len__(self) -> int:
@@ -270,26 +262,17 @@ class Dashes:
 
 @dataclass(frozen=True, slots=True)
 class Gaps:
-    """Dark pieces of the lasers' lines in one frame, K of them; ends ascend along the line.
+    """Dark pieces of the lasers' lines in one frame, K of them; ends ascend along the line."""
 
-    Attributes
-    ----------
-    laser : int array, shape (K,)
-        Index of the laser.
-    ends : array, shape (K, 2)
-        On the laser's line, in metres.
-    middles : array, shape (K, 2)
-        Middles of the dashes at both ends; as `ends` where there is none.
-    closed : bool array, shape (K, 2)
-        Whether a dash ends the gap there; otherwise the view ends.
-    beyond : array, shape (K,)
-        Share of its search lines whose light is seen on something behind the net.
-    """
-
+    # Shape (K,): index of the laser.
     laser: IntArray
+    # Shape (K, 2): on the laser's line, in metres.
     ends: FloatArray
+    # Shape (K, 2): middles of the dashes at both ends; as `ends` where there is none.
     middles: FloatArray
+    # Shape (K, 2): whether a dash ends the gap there; otherwise the view ends.
     closed: BoolArray
+    # Shape (K,): share of its search lines whose light is seen on something behind the net.
     beyond: FloatArray
 
     @property
@@ -300,26 +283,9 @@ class Gaps:
 
 @dataclass(frozen=True, slots=True)
 class NetView:
-    """Dashes and gaps of the net in one frame, L lasers; a summary of the `NetSignal`.
+    """Dashes and gaps of the net in one frame, L lasers; a summary of the `NetSignal`."""
 
-    Attributes
-    ----------
-    index, time_s, range, origin, direction, search, pixel
-        As in the `NetSignal`.
-    step : array, shape (L,)
-        Typical length of laser line per search line, in metres.
-    beyond : array, shape (L,)
-        Share of each laser's dark search lines whose light is seen on something behind the net.
-    dashes : Dashes
-        Lit pieces.
-    gaps : Gaps
-        Dark pieces.
-    span_laser : int array, shape (M,)
-        Index of the laser of every span: a piece of line that was seen without interruption.
-    span : array, shape (M, 2)
-        Its two ends on the laser's line, ascending, in metres.
-    """
-
+    # As in the `NetSignal`.
     index: int
     time_s: float
     range: float
@@ -327,11 +293,19 @@ class NetView:
     direction: FloatArray
     search: FloatArray
     pixel: float
+    # Shape (L,): typical length of laser line per search line, in metres.
     step: FloatArray
+    # Shape (L,): share of each laser's dark search lines whose light is seen on something behind
+    # the net.
     beyond: FloatArray
+    # Lit pieces.
     dashes: Dashes
+    # Dark pieces.
     gaps: Gaps
+    # Shape (M,): index of the laser of every span: a piece of line that was seen without
+    # interruption.
     span_laser: IntArray
+    # Shape (M, 2): its two ends on the laser's line, ascending, in metres.
     span: FloatArray
 
     @property

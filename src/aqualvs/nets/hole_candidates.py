@@ -56,20 +56,13 @@ LASERS = 1 << 5
 
 @dataclass(slots=True)
 class Looks:
-    """Looks at cells of the net, n of them, each of one laser and one outcome.
+    """Looks at cells of the net, n of them, each of one laser and one outcome."""
 
-    Attributes
-    ----------
-    keys : int array, shape (n,)
-        Cell, laser, and whether the strands were missed.
-    sums : array, shape (n, 4)
-        Number of looks, sums of their places and of their log-likelihoods for a hole.
-    frames : int array, shape (n, 2)
-        Their first and last frame.
-    """
-
+    # Shape (n,): cell, laser, and whether the strands were missed.
     keys: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
+    # Shape (n, 4): number of looks, sums of their places and of their log-likelihoods for a hole.
     sums: FloatArray = field(default_factory=lambda: np.empty((0, 4)))
+    # Shape (n, 2): their first and last frame.
     frames: IntArray = field(default_factory=lambda: np.empty((0, 2), np.int64))
 
     def added(self, keys: IntArray, rows: FloatArray, frame: IntArray) -> "Looks":
@@ -223,21 +216,14 @@ _RADII: FloatArray = np.arange(0.5, 6.01, 0.25)
 
 @dataclass(frozen=True, slots=True)
 class Disc:
-    """A round patch where strands are missing.
+    """A round patch where strands are missing."""
 
-    Attributes
-    ----------
-    middle : array, shape (2,)
-        In metres.
-    radius, sigma : float
-        Mean over all discs that explain what was seen, and standard deviation, in metres.
-    score : float
-        Log-likelihood over sound net.
-    """
-
+    # Shape (2,): in metres.
     middle: FloatArray
+    # Mean over all discs that explain what was seen, and standard deviation, in metres.
     radius: float
     sigma: float
+    # Log-likelihood over sound net.
     score: float
 
 
@@ -341,30 +327,20 @@ _OFF, _OFF_STEPS = 0.2, 1.5
 
 @dataclass(frozen=True, slots=True)
 class Strands:
-    """Crossings of one frame that the lattice predicts and that could be seen, N of them.
+    """Crossings of one frame that the lattice predicts and that could be seen, N of them."""
 
-    Attributes
-    ----------
-    place : array, shape (N, 2)
-        In `net`, in metres.
-    along : array, shape (N,)
-        The same on the laser's line, in metres.
-    laser, family : int array, shape (N,)
-        Laser, and family of the strand.
-    missed : bool array, shape (N,)
-        Whether it is dark there.
-    run : int array, shape (N,)
-        Number of crossings missed in the same dark piece; 0 for those seen.
-    closed : bool array, shape (N,)
-        Whether strands are seen at both ends of that piece; False for those seen.
-    """
-
+    # Shape (N, 2): in `net`, in metres.
     place: FloatArray
+    # Shape (N,): the same on the laser's line, in metres.
     along: FloatArray
+    # Shape (N,): laser, and family of the strand.
     laser: IntArray
     family: IntArray
+    # Shape (N,): whether it is dark there.
     missed: BoolArray
+    # Shape (N,): number of crossings missed in the same dark piece; 0 for those seen.
     run: IntArray
+    # Shape (N,): whether strands are seen at both ends of that piece; False for those seen.
     closed: BoolArray
 
 

@@ -52,57 +52,37 @@ Foot: TypeAlias = tuple[int, float, FloatArray]
 
 @dataclass(frozen=True, slots=True)
 class Hole:
-    """A hole in the net.
+    """A hole in the net."""
 
-    Attributes
-    ----------
-    piece : int
-        Piece of track that `place` belongs to (`NetTrack.piece`).
-    place : array, shape (2,)
-        Its middle: right and up of the track's start on the net, in metres.
-    extent : (float, float)
-        Width and height, in metres.
-    diameter : float
-        Of a round hole of the same area, in metres.
-    sigma_diameter : float
-        Its standard deviation.
-    missing_meshes : float
-        Its area in openings of the net.
-    frame, time_s : int, float
-        Of the look nearest to its middle.
-    from_foot : array, shape (2,)
-        Its middle at that time, right and up of the vehicle's foot on the net (of the perpendicular
-        from the dome's centre), in metres.
-    n_looks : int
-        Looks through it.
-    feet : sequence of (int, float, array of shape (2,))
-        Frame, time, and place of the vehicle's foot in frames from different places around it.
-    """
-
+    # Piece of track that `place` belongs to (`NetTrack.piece`).
     piece: int
+    # Shape (2,): its middle: right and up of the track's start on the net, in metres.
     place: FloatArray
+    # Width and height, in metres.
     extent: tuple[float, float]
+    # Of a round hole of the same area, in metres.
     diameter: float
+    # Its standard deviation.
     sigma_diameter: float
+    # Its area in openings of the net.
     missing_meshes: float
+    # Of the look nearest to its middle.
     frame: int
     time_s: float
+    # Shape (2,): its middle at that time, right and up of the vehicle's foot on the net (of the
+    # perpendicular from the dome's centre), in metres.
     from_foot: FloatArray
+    # Looks through it.
     n_looks: int
+    # Frame, time, and place (2,) of the vehicle's foot in frames from different places around it.
     feet: Sequence[Foot] = ()
 
 
 @dataclass(slots=True)
 class HoleMap:
-    """The map of looks, fixed to the net, and the holes in it.
+    """The map of looks, fixed to the net, and the holes in it."""
 
-    Attributes
-    ----------
-    holes : list of Hole
-        In the order in which they were found.
-    """
-
-    holes: list[Hole] = field(default_factory=list)
+    holes: list[Hole] = field(default_factory=list)  # In the order in which they were found.
     _bar: float = 0.0
     _piece: int = -1
     _looks: Looks = field(default_factory=Looks)

@@ -54,29 +54,20 @@ _FIT = _FitOptions()
 
 @dataclass(frozen=True, slots=True)
 class NetLattice:
-    """A net's lattice in `net` directions.
+    """A net's lattice in `net` directions."""
 
-    Attributes
-    ----------
-    mesh : Mesh
-        Shape of the openings.
-    bar : float
-        Length of a side of an opening (half mesh), in metres.
-    sigma_bar : float
-        Its standard deviation.
-    waves : array, shape (F, 2)
-        Wave vector of every family of strands: normal to the strands, one over their distance.
-    score : float
-        Log-likelihood per frame over crossings at random.
-    density : array, shape (F,)
-        Share of each family's lines that exists: 1, or 1/3 for the bars of hexagons.
-    """
-
+    # Shape of the openings.
     mesh: Mesh
+    # Length of a side of an opening (half mesh), in metres.
     bar: float
+    # Its standard deviation.
     sigma_bar: float
+    # Shape (F, 2): wave vector of every family of strands: normal to the strands, one over their
+    # distance.
     waves: FloatArray
+    # Log-likelihood per frame over crossings at random.
     score: float
+    # Shape (F,): share of each family's lines that exists: 1, or 1/3 for the bars of hexagons.
     density: FloatArray
 
     @property
@@ -226,23 +217,15 @@ START_FRAMES, START_S = 8, 0.5
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """Assignment of a frame's dashes to strands of the lattice.
+    """Assignment of a frame's dashes to strands of the lattice."""
 
-    Attributes
-    ----------
-    family : int array, shape (N,)
-        Family whose strand is nearest to each dash.
-    strand : int array, shape (N,)
-        Index of that strand.
-    off : array, shape (N,)
-        Distance of the dash from it, in metres.
-    clear : array, shape (N,)
-        Distance from the nearest strand of any other family, in metres.
-    """
-
+    # Shape (N,): family whose strand is nearest to each dash.
     family: IntArray
+    # Shape (N,): index of that strand.
     strand: IntArray
+    # Shape (N,): distance of the dash from it, in metres.
     off: FloatArray
+    # Shape (N,): distance from the nearest strand of any other family, in metres.
     clear: FloatArray
 
     @property
@@ -253,45 +236,27 @@ class Fit:
 
 @dataclass(frozen=True, slots=True)
 class LatticeShift:
-    """Place of the lattice in one frame, with its information.
+    """Place of the lattice in one frame, with its information."""
 
-    Attributes
-    ----------
-    place : array, shape (2,)
-        Of a knot (four-sided) or the middle of an opening (six-sided) in `net`, in metres; all
-        knots or openings are equivalent.
-    information : array, shape (2, 2)
-        Inverse of its covariance; may be singular.
-    """
-
+    # Shape (2,): of a knot (four-sided) or the middle of an opening (six-sided) in `net`, in
+    # metres; all knots or openings are equivalent.
     place: FloatArray
+    # Shape (2, 2): inverse of its covariance; may be singular.
     information: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
 class TrackStart:
-    """Start of a track: place and velocity common to some consecutive frames.
+    """Start of a track: place and velocity common to some consecutive frames."""
 
-    Attributes
-    ----------
-    place : array, shape (2,)
-        Place of the lattice in the first frame, as `LatticeShift.place`.
-    velocity : array, shape (2,)
-        Of the vehicle along the net, in m/s.
-    """
-
+    # Shape (2,): place of the lattice in the first frame, as `LatticeShift.place`.
     place: FloatArray
+    # Shape (2,): of the vehicle along the net, in m/s.
     velocity: FloatArray
 
 
 class LatticeFitter:
-    """Fitter of the place of a lattice in frames.
-
-    Parameters
-    ----------
-    lattice : NetLattice
-        Of the frames.
-    """
+    """Fitter of the place of a lattice in frames."""
 
     def __init__(self, lattice: NetLattice) -> None:
         self.lattice = lattice
@@ -313,8 +278,6 @@ class LatticeFitter:
 
         Parameters
         ----------
-        crossings : Crossings
-            Of the frame.
         expected : array, shape (2,), optional
             Expected place of the lattice; it selects one of many equivalent shifts.
         precision : array, shape (2, 2), optional
@@ -514,10 +477,6 @@ class NetTrack:
         ----------
         fitter : LatticeFitter
             With the stretch's lattice.
-        crossings : Crossings
-            Of the frame.
-        time_s : float
-            Of the frame.
         velocity : array, shape (2,), optional
             Of the vehicle along the net, right and up, if another sensor measures it.
         start : TrackStart, optional

@@ -16,7 +16,6 @@ from aqualvs.geometry.compiled import kernel
 from aqualvs.geometry.planes import Plane
 from aqualvs.geometry.transforms import SE3
 from aqualvs.nets.occlusion import LaserLines, hidden_lines, light_beyond
-from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.sheet import Sheet, sheets_of
 from aqualvs.scanning.laser_bands import SearchAxis, plan_bands
@@ -37,49 +36,36 @@ class LineState(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class NetSignal:
-    """Signals of the net along the lasers' lines in one frame; L lasers, J search lines (padded).
+    """Signals of the net along the lasers' lines in a frame; L lasers, J search lines (padded)."""
 
-    Attributes
-    ----------
-    index, time_s
-        As in the `Scan`.
-    range : float
-        Distance of the dome's centre from the net's plane, in metres.
-    origin, direction : array, shape (L, 2)
-        Each laser's line in `net`: the place where `along` is zero and a unit vector. `net` is
-        the target plane, x right and y up, its origin the foot of the perpendicular from the
-        dome's centre. NaN where a laser does not meet the net.
-    search : array, shape (L, 2)
-        Unit vector in `net` along which each laser's search lines run, where most is seen.
-    pixel : float
-        Size of a pixel on the net, in metres.
-    along : float array, shape (L, J)
-        Place on the laser's line in metres, ascending or descending; NaN where a search line
-        does not meet it.
-    step : float array, shape (L, J)
-        Length of laser line per search line, in metres.
-    state : uint8 array, shape (L, J)
-        `LineState` values.
-    height : array, shape (L, J)
-        Peak of the return above its background in grey levels where lit, else zero.
-    width : array, shape (L, J)
-        Full width at half height of the stripe, in metres on the net, where lit, else zero.
-    beyond : bool array, shape (L, J)
-        Whether the light of a search line is seen on something behind the net.
-    """
-
+    # As in the `Scan`.
     index: int
     time_s: float
+    # Distance of the dome's centre from the net's plane, in metres.
     range: float
+    # Shape (L, 2): each laser's line in `net`: the place where `along` is zero and a unit vector.
+    # `net` is the target plane, x right and y up, its origin the foot of the perpendicular from the
+    # dome's centre. NaN where a laser does not meet the net.
     origin: FloatArray
     direction: FloatArray
+    # Shape (L, 2): unit vector in `net` along which each laser's search lines run, where most is
+    # seen.
     search: FloatArray
+    # Size of a pixel on the net, in metres.
     pixel: float
+    # Shape (L, J): place on the laser's line in metres, ascending or descending; NaN where a search
+    # line does not meet it.
     along: FloatArray
+    # Shape (L, J): length of laser line per search line, in metres.
     step: FloatArray
+    # Shape (L, J): `LineState` values.
     state: NDArray[np.uint8]
+    # Shape (L, J): peak of the return above its background in grey levels where lit, else zero.
     height: FloatArray
+    # Shape (L, J): full width at half height of the stripe, in metres on the net, where lit, else
+    # zero.
     width: FloatArray
+    # Shape (L, J): whether the light of a search line is seen on something behind the net.
     beyond: BoolArray
 
 
@@ -103,17 +89,12 @@ def net_from_dome(normal_in_dome: FloatArray, distance: float) -> SE3:
 class NetReader:
     """Reader of scans as signals along the lasers' lines.
 
-    Parameters
-    ----------
-    rig : Rig
-        Camera and lasers of the scans.
-    camera : Camera, optional
-        Replaces `rig.camera()`.
+    `rig`: camera and lasers of the scans.
     """
 
-    def __init__(self, rig: Rig, camera: Camera | None = None) -> None:
+    def __init__(self, rig: Rig) -> None:
         self.rig = rig
-        self._camera = camera or rig.camera()
+        self._camera = rig.camera()
         self._laser_bands = plan_bands(rig, self._camera, rig.shutter.field_of(0))
         self._sheets = sheets_of(rig)
         self._planes = [sheet.best_plane(self._camera, rig.working_range) for sheet in self._sheets]

@@ -42,19 +42,13 @@ _HIDDEN = _OcclusionOptions()
 
 @dataclass(frozen=True, slots=True)
 class LaserLines:
-    """The lasers' lines across the net's plane; L lasers, J search lines.
+    """The lasers' lines across the net's plane; L lasers, J search lines."""
 
-    Attributes
-    ----------
-    origin, direction : array, shape (L, 2)
-        A place on every line in `net` and its unit direction.
-    along, position, step : array, shape (L, J)
-        Place of each search line: metres along the laser's line, pixels along the search line, and
-        metres of laser line per search line.
-    """
-
+    # Shape (L, 2): a place on every line in `net` and its unit direction.
     origin: FloatArray
     direction: FloatArray
+    # Shape (L, J): place of each search line: metres along the laser's line, pixels along the
+    # search line, and metres of laser line per search line.
     along: FloatArray
     position: FloatArray
     step: FloatArray
@@ -137,24 +131,9 @@ def hidden_lines(
 def light_beyond(
     points: ScanPoints, in_net: FloatArray, sources: FloatArray, lines: LaserLines, off: float
 ) -> BoolArray:
-    """Mark where light passed through the net and is seen on something behind it.
+    """Mark where light passed through the net and is seen on something behind it, shape (L, J).
 
-    Parameters
-    ----------
-    points : ScanPoints
-        N of them.
-    in_net : array, shape (N, 3)
-        Their places in `net`.
-    sources : array, shape (L, 3)
-        Roughly where each laser's light comes from, in `net`.
-    lines : LaserLines
-        Where the lasers' lines run.
-    off : float
-        What is nearer to the net's plane is on it, in metres.
-
-    Returns
-    -------
-    bool array, shape (L, J)
+    Parameters are those of `hidden_lines`.
     """
     beyond = np.zeros(lines.along.shape, np.bool_)
     behind = points.label == Label.BACKGROUND

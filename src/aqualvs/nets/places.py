@@ -36,17 +36,11 @@ from aqualvs.vehicle_logs import (
 
 @dataclass(frozen=True, slots=True)
 class DivePostures:
-    """Postures to the net over a dive, N of them, all valid.
+    """Postures to the net over a dive, N of them, all valid."""
 
-    Attributes
-    ----------
-    time_s : array, shape (N,)
-        Dive time, increasing.
-    range, pitch, yaw : array, shape (N,)
-        Metres and radians.
-    """
-
+    # Shape (N,): dive time, increasing.
     time_s: FloatArray
+    # Shape (N,): metres and radians.
     range: FloatArray
     pitch: FloatArray
     yaw: FloatArray
@@ -64,25 +58,17 @@ class DivePostures:
 
 @dataclass(frozen=True, slots=True)
 class ViewedPlaces:
-    """Depth and bearing of the net at the times of a dive's postures; NaN where not known.
+    """Depth and bearing of the net at the times of a dive's postures; NaN where not known."""
 
-    Attributes
-    ----------
-    time_s : array, shape (N,)
-        Dive time.
-    foot_depth : array, shape (N,)
-        Depth of the foot of the perpendicular on the net, in metres.
-    net, nose : array, shape (N,)
-        Bearing of the net and heading of the vehicle, in radians.
-    lean : array, shape (N,)
-        Elevation of the net's far normal, in radians; a level vehicle is assumed where the log has
-        no attitude.
-    """
-
+    # Shape (N,): dive time.
     time_s: FloatArray
+    # Shape (N,): depth of the foot of the perpendicular on the net, in metres.
     foot_depth: FloatArray
+    # Shape (N,): bearing of the net and heading of the vehicle, in radians.
     net: FloatArray
     nose: FloatArray
+    # Shape (N,): elevation of the net's far normal, in radians; a level vehicle is assumed where
+    # the log has no attitude.
     lean: FloatArray
 
     @classmethod
@@ -146,20 +132,13 @@ def _or_none(value: float) -> float | None:
 
 @dataclass(frozen=True, slots=True)
 class LaidLog:
-    """A log and its alignment with the dive's clock.
+    """A log and its alignment with the dive's clock."""
 
-    Attributes
-    ----------
-    log : VehicleLog
-        As it was read.
-    offset : TimeOffset or OffsetRefusal
-        Log time minus dive time, or the reason why it is not known.
-    overlap : bool
-        Whether the log covers any of the dive.
-    """
-
+    # As it was read.
     log: VehicleLog
+    # Log time minus dive time, or the reason why it is not known.
     offset: TimeOffset | OffsetRefusal
+    # Whether the log covers any of the dive.
     overlap: bool
 
     @property
@@ -200,12 +179,8 @@ class LaidLog:
 def open_log(path: Path | None, offset_s: float | None) -> VehicleLog | None:
     """Read the log that the user names, if any.
 
-    Raises
-    ------
-    SourceError
-        If it cannot be read.
-    OptionError
-        If there is an offset without a log, or the log's format needs an extra.
+    Raises `SourceError` if it cannot be read. Raises `OptionError` if there is an offset without a
+    log, or the log's format needs an extra.
     """
     if path is not None:
         return read_vehicle_log(path)
@@ -223,8 +198,6 @@ def lay_log(
     ----------
     log : VehicleLog
         Of the same dive.
-    postures : DivePostures
-        Of the dive.
     offset_s : float or None
         Log time minus dive time, where the user knows it.
     video : Path or None
@@ -271,48 +244,33 @@ class PlacedBy(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class NetPlace:
-    """A place on the unrolled net; None where not known.
+    """A place on the unrolled net; None where not known."""
 
-    Attributes
-    ----------
-    along, up : float
-        Metres to the right and, plumb, above the start of the dive's track.
-    depth : float or None
-        Metres below the surface.
-    bearing, heading : float or None
-        Compass direction of the net's far normal, and of the vehicle's nose, in [0, 2 pi).
-    placed_by : PlacedBy
-        Source of `along`.
-    """
-
+    # Metres to the right and, plumb, above the start of the dive's track.
     along: float
     up: float
+    # Metres below the surface.
     depth: float | None
+    # Compass direction of the net's far normal, and of the vehicle's nose, in [0, 2 pi).
     bearing: float | None
     heading: float | None
+    # Source of `along`.
     placed_by: PlacedBy
 
 
 @dataclass(frozen=True, slots=True)
 class NetPlaces:
-    """Places of all stretches and holes of a dive.
+    """Places of all stretches and holes of a dive."""
 
-    Attributes
-    ----------
-    begin, middle, end : list of NetPlace
-        Of every stretch.
-    holes : list of NetPlace
-        Of the middle of every hole.
-    slip : float
-        Height difference in metres between the track and the log's depth; 0 where they agree, or
-        there is no depth. A track that slipped has counted meshes wrongly: its places along the net
-        and its sizes are wrong as well.
-    """
-
+    # Of every stretch.
     begin: list[NetPlace]
     middle: list[NetPlace]
     end: list[NetPlace]
+    # Of the middle of every hole.
     holes: list[NetPlace]
+    # Height difference in metres between the track and the log's depth; 0 where they agree, or
+    # there is no depth. A track that slipped has counted meshes wrongly: its places along the net
+    # and its sizes are wrong as well.
     slip: float
 
 
@@ -371,31 +329,22 @@ def _middle(begin: NetPlace, end: NetPlace) -> NetPlace:
 
 @dataclass(frozen=True, slots=True)
 class _Nodes:
-    """The start of the first stretch and the ends of all; one more than there are stretches.
+    """The start of the first stretch and the ends of all; one more than there are stretches."""
 
-    Attributes
-    ----------
-    time_s, along, up : array, shape (n,)
-        On the unrolled net, all pieces joined.
-    raw : array, shape (n, 2)
-        Places in the track: right, and up in the net's plane.
-    piece, run : int array, shape (n,)
-        Piece of track; and run of nodes between which the track gives every step.
-    upright : float
-        Plumb metres per metre up in the net's plane.
-    depth : array, shape (n,)
-        Corrected by the log; NaN where the log has none.
-    placed_by : list of PlacedBy
-    """
-
+    # Shape (n,): on the unrolled net, all pieces joined.
     time_s: FloatArray
     along: FloatArray
     up: FloatArray
+    # Shape (n, 2): places in the track: right, and up in the net's plane.
     raw: FloatArray
+    # Shape (n,): piece of track; and run of nodes between which the track gives every step.
     piece: IntArray
     run: IntArray
+    # Plumb metres per metre up in the net's plane.
     upright: float
+    # Shape (n,): corrected by the log; NaN where the log has none.
     depth: FloatArray
+
     placed_by: list[PlacedBy]
 
     @classmethod

@@ -59,33 +59,22 @@ Swings: TypeAlias = NDArray[np.complex64]
 
 @dataclass(frozen=True, slots=True)
 class Crossings:
-    """Crossings of one frame's lasers with strands, and the visible pieces of their lines.
+    """Crossings of one frame's lasers with strands, and the visible pieces of their lines."""
 
-    Attributes
-    ----------
-    place : array, shape (N, 2)
-        Middles of the dashes in `net`, metres.
-    laser : int array, shape (N,)
-        Index of the laser.
-    begin, end : array, shape (M, 2)
-        Ends of the visible pieces of line, in `net`, metres.
-    span_laser : int array, shape (M,)
-        Index of the laser of each of them.
-    direction : array, shape (L, 2)
-        Of the lasers' lines; NaN where there is none.
-    length : array, shape (L,)
-        Visible metres of line.
-    lit : float
-        Share of it that is lit, which is the share of crossings that merge with others.
-    """
-
+    # Shape (N, 2): middles of the dashes in `net`, metres.
     place: FloatArray
+    # Shape (N,): index of the laser.
     laser: IntArray
+    # Shape (M, 2): ends of the visible pieces of line, in `net`, metres.
     begin: FloatArray
     end: FloatArray
+    # Shape (M,): index of the laser of each of them.
     span_laser: IntArray
+    # Shape (L, 2): of the lasers' lines; NaN where there is none.
     direction: FloatArray
+    # Shape (L,): visible metres of line.
     length: FloatArray
+    # Share of it that is lit, which is the share of crossings that merge with others.
     lit: float
 
 

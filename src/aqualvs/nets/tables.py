@@ -35,37 +35,27 @@ METRES_PER_DEGREE = 0.17
 
 @dataclass(frozen=True, slots=True)
 class UnrolledNet:
-    """Stretches and holes on the unrolled net.
+    """Stretches and holes on the unrolled net."""
 
-    Attributes
-    ----------
-    stretches, holes : sequence
-        Stretches and holes that were found.
-    places : NetPlaces
-        Their places.
-    by_bearing : bool
-        Whether x is a bearing in degrees, because there is no track.
-    by_depth : bool
-        Whether y is minus a depth, or metres above the start.
-    outlines : list of array, shape (4, 2)
-        Of the area that the picture passed over in every stretch: x and y, counter-clockwise.
-    path : list of array, shape (n, 2)
-        Of the vehicle's foot on the net: one line for every piece in which the track holds.
-    holes_xy : array, shape (H, 2)
-        Middles of the holes.
-    holes_px : array, shape (H, 4)
-        Frame whose picture has them nearest to its centre, column and row of their middles in it,
-        and diameter in pixels; NaN where no picture shows any of a hole.
-    """
-
+    # Stretches and holes that were found.
     stretches: Sequence[NetStretch]
     holes: Sequence[Hole]
+    # Their places.
     places: NetPlaces
+    # Whether x is a bearing in degrees, because there is no track.
     by_bearing: bool
+    # Whether y is minus a depth, or metres above the start.
     by_depth: bool
+    # Shape (4, 2): of the area that the picture passed over in every stretch: x and y,
+    # counter-clockwise.
     outlines: list[FloatArray]
+    # Shape (n, 2): of the vehicle's foot on the net: one line for every piece in which the track
+    # holds.
     path: list[FloatArray]
+    # Shape (H, 2): middles of the holes.
     holes_xy: FloatArray
+    # Shape (H, 4): frame whose picture has them nearest to its centre, column and row of their
+    # middles in it, and diameter in pixels; NaN where no picture shows any of a hole.
     holes_px: FloatArray
 
 
@@ -259,10 +249,7 @@ def fouling_of(stretch: NetStretch) -> float | None:
 def write_table(path: Path, columns: Sequence[str], rows: Sequence[Mapping[str, Cell]]) -> None:
     """Write a table as CSV.
 
-    Raises
-    ------
-    OSError
-        As the system says it.
+    Raises `OSError` as the system says it.
     """
     text = io.StringIO(newline="")
     table = csv.DictWriter(text, columns, lineterminator="\n")

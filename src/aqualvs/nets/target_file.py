@@ -48,24 +48,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NetRequest:
-    """Request for the condition of a net, with its options.
+    """Request for the condition of a net, with its options."""
 
-    Attributes
-    ----------
-    twine_mm : float or None
-        Diameter of the bare twine, where it is known.
-    stretch_m : float
-        Length of a stretch of net.
-    log : Path or None
-        The vehicle's log.
-    log_offset_s : float or None
-        Its clock minus the dive's, where it is known.
-    """
-
-    twine_mm: float | None = None
-    stretch_m: float = 0.5
-    log: Path | None = None
-    log_offset_s: float | None = None
+    twine_mm: float | None = None  # Diameter of the bare twine, where it is known.
+    stretch_m: float = 0.5  # Length of a stretch of net.
+    log: Path | None = None  # The vehicle's log.
+    log_offset_s: float | None = None  # Its clock minus the dive's, where it is known.
 
     def __post_init__(self) -> None:
         """Refuse values that cannot be."""
@@ -92,10 +80,8 @@ def net_request(
 ) -> NetRequest | None:
     """Return the request for the condition of a net, None if it is not wanted.
 
-    Raises
-    ------
-    OptionError
-        If an option is given although the condition is not wanted, or a value is not valid.
+    Raises `OptionError` if an option is given although the condition is not wanted, or a value is
+    not valid.
     """
     given = {"twine_mm": twine_mm, "stretch_m": stretch_m}
     known: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
@@ -127,20 +113,11 @@ _DISTANCES = {
 
 @dataclass(frozen=True, slots=True)
 class NetFacts:
-    """The net as described by the target file.
+    """The net as described by the target file."""
 
-    Attributes
-    ----------
-    mesh : {"diamond", "square", "hexagon"}
-    bar : float
-        Length of one side of an opening, in metres.
-    twine : float or None
-        Diameter of the twine, in metres.
-    """
-
-    mesh: str
-    bar: float
-    twine: float | None = None
+    mesh: str  # "diamond", "square" or "hexagon".
+    bar: float  # Length of one side of an opening, in metres.
+    twine: float | None = None  # Diameter of the twine, in metres.
 
     @property
     def crossings_per_bar(self) -> float:
@@ -160,20 +137,13 @@ class NetFacts:
 
 @dataclass(frozen=True, slots=True)
 class TargetFacts:
-    """Prior information on the target.
+    """Prior information on the target."""
 
-    Attributes
-    ----------
-    kind : TargetKind
-        What the posture is measured to.
-    filter_lengths : mapping
-        Parameters of the paper's mesh filter in metres, those that differ from the defaults.
-    net : NetFacts or None
-        What the net is said to be, where the file says it.
-    """
-
+    # What the posture is measured to.
     kind: TargetKind = TargetKind.AUTO
+    # Parameters of the paper's mesh filter in metres, those that differ from the defaults.
     filter_lengths: Mapping[str, float] = field(default_factory=dict)
+    # What the net is said to be, where the file says it.
     net: NetFacts | None = None
 
     @property
@@ -188,10 +158,7 @@ class TargetFacts:
 def target_dict(text: str) -> TargetFacts:
     """Return what a word (auto, net, solid) or the path of a target file says.
 
-    Raises
-    ------
-    OptionError
-        If it is neither, or the file says what cannot be.
+    Raises `OptionError` if it is neither, or the file says what cannot be.
     """
     if text in set(TargetKind):
         return TargetFacts(TargetKind(text))
@@ -275,23 +242,15 @@ _CHECK = _CheckOptions()
 
 @dataclass(slots=True)
 class NetCheck:
-    """Comparison of the distances between strands with those of the described net.
+    """Comparison of the distances between strands with those of the described net."""
 
-    Attributes
-    ----------
-    said : NetFacts
-        The target file's net.
-    source : str
-        The target file's name, for the sentence.
-    planes : sequence of Plane
-        Of the lasers, in `dome`.
-    bars : array of float
-        Bar of the frames that were evaluated, in metres.
-    """
-
+    # The target file's net.
     said: NetFacts
+    # The target file's name, for the sentence.
     source: str
+    # Of the lasers, in `dome`.
     planes: Sequence[Plane]
+    # Bar of the frames that were evaluated, in metres.
     bars: "array[float]" = field(default_factory=lambda: array("d"))
 
     def add(self, scan: Scan) -> None:
@@ -331,16 +290,8 @@ class NetCheck:
 def net_check(target: str, rig: Rig) -> NetCheck | None:
     """Return the check of the net that a target file describes; None where it describes none.
 
-    Parameters
-    ----------
-    target : str
-        A word or the path of a target file, as `target_dict` takes it.
-    rig : Rig
-
-    Raises
-    ------
-    OptionError
-        As `target_dict`.
+    `target`: a word or the path of a target file, as `target_dict` takes it. Raises `OptionError`
+    as `target_dict`.
     """
     said = target_dict(target).net
     if said is None:
@@ -385,10 +336,7 @@ def bar_of(scan: Scan, planes: Sequence[Plane], said: NetFacts) -> float | None:
 def strand_distance(along: FloatArray) -> float | None:
     """Return the mean distance between the strands on one stripe, in metres.
 
-    Parameters
-    ----------
-    along : array, shape (N,)
-        Places of points on the net along the stripe, in metres, in any order.
+    `along`, shape (N,): places of points on the net along the stripe, in metres, in any order.
     """
     if len(along) < _CHECK.min_strands * _CHECK.min_points:
         return None

@@ -8,7 +8,7 @@ for the class of port that it is called with. A scan projects no points, so the 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -46,15 +46,9 @@ Housing = Dome | FlatPort
 
 
 class BareParams(NamedTuple):
-    """A lens in the outer medium itself, as kernels take it.
+    """A lens in the outer medium itself, as kernels take it."""
 
-    Attributes
-    ----------
-    centre : tuple of 3 float
-        The lens position L in `dome`, metres.
-    """
-
-    centre: Vector
+    centre: Vector  # The lens position L in `dome`, metres.
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -78,20 +72,13 @@ trace_port = chosen_by_class(
 
 
 class CameraParams(NamedTuple):
-    """A camera as kernels take it; `camera.params` makes it.
+    """A camera as kernels take it; `camera.params` makes it."""
 
-    Attributes
-    ----------
-    lens : LensParams
-        Intrinsics.
-    rotation : tuple of 9 float
-        `dome_from_cam`, row by row.
-    port : BareParams, DomeParams or FlatParams
-        What stands between the lens and the outer medium, and the lens position.
-    """
-
+    # Intrinsics.
     lens: LensParams
+    # `dome_from_cam`, row by row.
     rotation: tuple[float, float, float, float, float, float, float, float, float]
+    # What stands between the lens and the outer medium, and the lens position.
     port: BareParams | DomeParams | FlatParams
 
 
@@ -218,36 +205,6 @@ def moved_lens(lens: Lens, step: dict[str, float]) -> Lens:
     )
 
 
-def camera_params(
-    *,
-    size_px: tuple[int, int],
-    lens: Lens,
-    dome_from_cam: SE3,
-    housing: Housing | None,
-    n_air: float,
-    n_water: float,
-) -> CameraParams:
-    """Check a camera and return it as kernels take it.
-
-    Raises
-    ------
-    RigError
-        If the lens lies outside the inner sphere of a dome, an index or the size is not valid, or
-        the pose is not one finite rigid transform.
-    """
-    _check_size(size_px)
-    check_index("camera", "n_air", n_air)
-    check_index("camera", "n_water", n_water)
-    rotation, centre = _checked_pose(dome_from_cam)
-    return CameraParams(
-        lens=lens.params,
-        rotation=(*as_triple(rotation[0]), *as_triple(rotation[1]), *as_triple(rotation[2])),
-        port=BareParams(as_triple(centre))
-        if housing is None
-        else housing.params(dome_from_cam, n_air, n_water),
-    )
-
-
 def _check_size(size_px: tuple[int, int]) -> None:
     if len(size_px) != 2 or not all(side > 0 for side in size_px):
         raise RigError(f"camera has size {size_px} px; width and height must be positive")
@@ -316,23 +273,28 @@ class Camera(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _CompiledCamera:
-    """A camera computed by compiled kernels from the numbers in `params`.
+    """A camera computed by compiled kernels from the numbers in `params`."""
 
-    Attributes
-    ----------
-    size_px : (int, int)
-        Image width and height.
-    lens : Lens
-        Intrinsics, calibrated in air without the housing.
-    dome_from_cam : SE3
-        Camera pose in `dome`; the translation is the lens position L in metres.
-    """
-
-    size_px: tuple[int, int]
-    lens: Lens
-    dome_from_cam: SE3
+    size_px: tuple[int, int]  # Image width and height.
+    lens: Lens  # Intrinsics, calibrated in air without the housing.
+    dome_from_cam: SE3  # Camera pose in `dome`; the translation is the lens position L in metres.
     params: CameraParams = field(init=False, repr=False, compare=False)
     """Packed numbers for compiled kernels."""
+
+    def _pack(self, housing: Housing | None, n_air: float, n_water: float) -> None:
+        """Check the camera and set `params`."""
+        _check_size(self.size_px)
+        check_index("camera", "n_air", n_air)
+        check_index("camera", "n_water", n_water)
+        rotation, centre = _checked_pose(self.dome_from_cam)
+        params = CameraParams(
+            lens=self.lens.params,
+            rotation=(*as_triple(rotation[0]), *as_triple(rotation[1]), *as_triple(rotation[2])),
+            port=BareParams(as_triple(centre))
+            if housing is None
+            else housing.params(self.dome_from_cam, n_air, n_water),
+        )
+        object.__setattr__(self, "params", params)
 
     def rays(self, pixels: ArrayLike) -> Rays:
         """Trace pixels into the outer medium.
@@ -451,37 +413,17 @@ class _CompiledCamera:
 class BareCamera(_CompiledCamera):
     """A camera without a dome: the lens itself in the outer medium.
 
-    Attributes
-    ----------
-    size_px : (int, int)
-        Image width and height.
-    lens : Lens
-        Intrinsics.
-    dome_from_cam : SE3
-        Camera pose in `dome`; the translation is the lens position L in metres.
-
-    Raises
-    ------
-    RigError
-        If the size is not positive or the pose is not one finite rigid transform.
+    Raises `RigError` if the size is not positive or the pose is not one finite rigid transform.
     """
 
     def __post_init__(self) -> None:
-        params = camera_params(
-            size_px=self.size_px,
-            lens=self.lens,
-            dome_from_cam=self.dome_from_cam,
-            housing=None,
-            n_air=1.0,
-            n_water=1.0,
-        )
-        object.__setattr__(self, "params", params)
+        self._pack(None, 1.0, 1.0)
 
     def moved_by(self, step: ArrayLike) -> "BareCamera":
         """Return the camera with `step` (P,) added to its parameters, see `parameter_names`."""
         values = named_step(self, step)
-        return BareCamera(
-            size_px=self.size_px,
+        return replace(
+            self,
             lens=moved_lens(self.lens, values),
             dome_from_cam=moved_pose(self.dome_from_cam, values),
         )
@@ -491,46 +433,24 @@ class BareCamera(_CompiledCamera):
 class HousedCamera(_CompiledCamera):
     """A camera behind a dome or a flat port.
 
-    Attributes
-    ----------
-    size_px : (int, int)
-        Image width and height.
-    lens : Lens
-        Intrinsics, calibrated in air without the housing.
-    dome_from_cam : SE3
-        Camera pose in `dome`; the translation is the lens position L in metres.
-    housing : Dome or FlatPort
-        Sizes and material; a flat port is fixed to the camera.
-    n_air, n_water : float
-        Refractive indices (vacuum = 1) inside and outside the housing.
-
-    Raises
-    ------
-    RigError
-        If the lens lies outside the inner sphere of a dome, an index or the size is not valid, or
-        the pose is not one finite rigid transform.
+    Raises `RigError` if the lens lies outside the inner sphere of a dome, an index or the size is
+    not valid, or the pose is not one finite rigid transform.
     """
 
+    # Sizes and material; a flat port is fixed to the camera.
     housing: Housing
+    # Refractive indices (vacuum = 1) inside and outside the housing.
     n_air: float
     n_water: float
 
     def __post_init__(self) -> None:
-        params = camera_params(
-            size_px=self.size_px,
-            lens=self.lens,
-            dome_from_cam=self.dome_from_cam,
-            housing=self.housing,
-            n_air=self.n_air,
-            n_water=self.n_water,
-        )
-        object.__setattr__(self, "params", params)
+        self._pack(self.housing, self.n_air, self.n_water)
 
     def moved_by(self, step: ArrayLike) -> "HousedCamera":
         """Return the camera with `step` (P,) added to its parameters, see `parameter_names`."""
         values = named_step(self, step)
-        return HousedCamera(
-            size_px=self.size_px,
+        return replace(
+            self,
             lens=moved_lens(self.lens, values),
             dome_from_cam=moved_pose(self.dome_from_cam, values),
             housing=self.housing.moved_by(values),

@@ -23,29 +23,20 @@ sphere along."""
 
 
 class DomeParams(NamedTuple):
-    """A dome as kernels take it; `Dome.params` makes it.
+    """A dome as kernels take it; `Dome.params` makes it."""
 
-    Attributes
-    ----------
-    centre : tuple of 3 float
-        The lens position L in `dome`, metres.
-    inner_radius, outer_radius : float
-        Metres.
-    n_air, n_acrylic, n_water : float
-        Refractive indices, vacuum = 1.
-    decentring : float
-        |L| in metres.
-    axis : tuple of 3 float
-        L/|L| in `dome`; any unit vector when L is zero.
-    """
-
+    # The lens position L in `dome`, metres.
     centre: Vector
+    # Metres.
     inner_radius: float
     outer_radius: float
+    # Refractive indices, vacuum = 1.
     n_air: float
     n_acrylic: float
     n_water: float
+    # |L| in metres.
     decentring: float
+    # L/|L| in `dome`; any unit vector when L is zero.
     axis: Vector
 
     @property
@@ -86,25 +77,13 @@ def trace_direction(
 class Dome:
     """A hemispherical port; its centre is the origin of `dome`.
 
-    Attributes
-    ----------
-    inner_radius : float
-        In metres.
-    thickness : float
-        In metres; zero gives an infinitely thin dome.
-    n_acrylic : float
-        Refractive index of the dome's material, vacuum = 1.
-
-    Raises
-    ------
-    RigError
-        If a value is not finite, the inner radius is not positive, the thickness is negative, or
-        the index lies outside 1 to 3.
+    Raises `RigError` if a value is not finite, the inner radius is not positive, the thickness is
+    negative, or the index lies outside 1 to 3.
     """
 
-    inner_radius: float
-    thickness: float
-    n_acrylic: float
+    inner_radius: float  # In metres.
+    thickness: float  # In metres; zero gives an infinitely thin dome.
+    n_acrylic: float  # Refractive index of the dome's material, vacuum = 1.
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.inner_radius) and self.inner_radius > 0.0):
@@ -137,10 +116,7 @@ class Dome:
     def params(self, dome_from_cam: SE3, n_air: float, n_water: float) -> DomeParams:
         """Return the dome around a camera as kernels take it.
 
-        Raises
-        ------
-        RigError
-            If the lens lies outside the inner sphere.
+        Raises `RigError` if the lens lies outside the inner sphere.
         """
         centre = np.asarray(dome_from_cam.translation, dtype=np.float64)
         decentring = float(np.linalg.norm(centre))

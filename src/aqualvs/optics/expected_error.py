@@ -22,23 +22,15 @@ from aqualvs.optics.sheet import Sheet, sheets_of
 
 @dataclass(frozen=True, slots=True)
 class StripeView:
-    """The visible part of one stripe on a wall square to the forward axis.
+    """The visible part of one stripe on a wall square to the forward axis."""
 
-    Attributes
-    ----------
-    sheet : Sheet
-        The laser's light, in `dome`.
-    points_in_dome : array, shape (N, 3)
-        Along the stripe, metres; none where the stripe is out of the picture.
-    pixels : array, shape (N, 2)
-        Where the camera sees them.
-    length_px : float
-        Length of the stripe in the picture.
-    """
-
+    # The laser's light, in `dome`.
     sheet: Sheet
+    # Shape (N, 3): along the stripe, metres; none where the stripe is out of the picture.
     points_in_dome: FloatArray
+    # Shape (N, 2): where the camera sees them.
     pixels: FloatArray
+    # Length of the stripe in the picture.
     length_px: float
 
     @property
@@ -118,22 +110,15 @@ USUAL_RANGES = (0.3, 0.6, 1.0)
 
 @dataclass(frozen=True, slots=True)
 class ExpectedError:
-    """Expected error of the posture to a wall square to the forward axis.
+    """Expected error of the posture to a wall square to the forward axis."""
 
-    Attributes
-    ----------
-    wall_range : float
-        Metres.
-    per_pixel : tuple of float
-        Range error for one pixel across the stripe, for every laser, in m/px; NaN where its
-        stripe is out of the picture.
-    noise, calibration : array, shape (3, 3)
-        Covariance of (range, pitch, yaw), in m and rad, from pixel noise in one frame and from the
-        uncertainty of the rig; NaN where the stripes determine no plane.
-    """
-
+    # Metres.
     wall_range: float
+    # Range error for one pixel across the stripe, for every laser, in m/px; NaN where its stripe is
+    # out of the picture.
     per_pixel: tuple[float, ...]
+    # Shape (3, 3): covariance of (range, pitch, yaw), in m and rad, from pixel noise in one frame
+    # and from the uncertainty of the rig; NaN where the stripes determine no plane.
     noise: FloatArray
     calibration: FloatArray
 
@@ -187,23 +172,17 @@ def expected_posture_errors(
 
 @dataclass(frozen=True, slots=True)
 class WallView:
-    """The stripes that a rig sees on a wall square ahead, and the posture error they give.
+    """The stripes that a rig sees on a wall square ahead, and the posture error they give."""
 
-    Attributes
-    ----------
-    wall_range : float
-        Metres.
-    stripes : tuple of StripeView
-        For every laser; `N_POINTS` each, fewer where the stripe is hardly in the picture, none
-        where it is out of it.
-    slopes : tuple of array, shape (N,)
-        For every laser, the change of its points' distance ahead by a pixel across the stripe,
-        in m/px.
-    """
-
+    # Metres.
     wall_range: float
+    # For every laser; `N_POINTS` each, fewer where the stripe is hardly in the picture, none where
+    # it is out of it.
     stripes: tuple[StripeView, ...]
+    # Shape (N,): for every laser, the change of its points' distance ahead by a pixel across the
+    # stripe, in m/px.
     slopes: tuple[FloatArray, ...]
+
     determined: bool = field(init=False)
     """Whether the stripes determine a plane."""
 
@@ -264,10 +243,7 @@ class WallView:
 
         All points are read as if they had been taken at the picture's middle.
 
-        Parameters
-        ----------
-        row_times : callable
-            From rows to the times of their exposure, in seconds from the picture's middle.
+        `row_times`: from rows to the times of their exposure, in seconds from the picture's middle.
         """
         if not self.determined:
             return np.full((3, 3), np.nan)

@@ -34,27 +34,19 @@ MAX_TILT = math.radians(45.0)
 
 
 class FlatParams(NamedTuple):
-    """A flat port as kernels take it; `FlatPort.params` makes it.
+    """A flat port as kernels take it; `FlatPort.params` makes it."""
 
-    Attributes
-    ----------
-    centre : tuple of 3 float
-        The lens position L in `dome`, metres.
-    normal, turn_x, turn_y : tuple of 3 float
-        The port's normal away from the camera, and the axes about which its tilts turn it; unit
-        vectors in `dome`.
-    distance, thickness : float
-        Metres.
-    n_air, n_port, n_water : float
-        Refractive indices, vacuum = 1.
-    """
-
+    # The lens position L in `dome`, metres.
     centre: Vector
+    # The port's normal away from the camera, and the axes about which its tilts turn it; unit
+    # vectors in `dome`.
     normal: Vector
     turn_x: Vector
     turn_y: Vector
+    # Metres.
     distance: float
     thickness: float
+    # Refractive indices, vacuum = 1.
     n_air: float
     n_port: float
     n_water: float
@@ -88,28 +80,18 @@ def trace_flat(
 class FlatPort:
     """A flat window in front of the camera, fixed to it.
 
-    Attributes
-    ----------
-    distance : float
-        From the lens's projection centre to the inner face, along the normal, in metres.
-    thickness : float
-        In metres; zero gives an infinitely thin port.
-    n_port : float
-        Refractive index of the port's material, vacuum = 1: acrylic 1.49, glass 1.46 to 1.52.
-    tilt_x, tilt_y : float
-        Of the port's normal from the optical axis, in radians: turned about the camera's y axis by
-        `tilt_y`, then about its x axis by `tilt_x`.
-
-    Raises
-    ------
-    RigError
-        If a value is not finite, the distance is not positive, the thickness is negative, the index
-        lies outside 1 to 3, or a tilt exceeds 45 degrees.
+    Raises `RigError` if a value is not finite, the distance is not positive, the thickness is
+    negative, the index lies outside 1 to 3, or a tilt exceeds 45 degrees.
     """
 
+    # From the lens's projection centre to the inner face, along the normal, in metres.
     distance: float
+    # In metres; zero gives an infinitely thin port.
     thickness: float
+    # Refractive index of the port's material, vacuum = 1: acrylic 1.49, glass 1.46 to 1.52.
     n_port: float
+    # Of the port's normal from the optical axis, in radians: turned about the camera's y axis by
+    # `tilt_y`, then about its x axis by `tilt_x`.
     tilt_x: float = 0.0
     tilt_y: float = 0.0
 

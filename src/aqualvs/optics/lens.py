@@ -128,17 +128,6 @@ _COEFFICIENTS = {LensModel.OPENCV: (0, 4, 5, 8), LensModel.FISHEYE: (0, 4)}
 class Lens:
     """Intrinsics of a camera, calibrated in air without the dome.
 
-    Attributes
-    ----------
-    model : LensModel
-        Distortion model.
-    fx, fy : float
-        Focal lengths in pixels.
-    cx, cy : float
-        Image centre in pixels; the centre of the top-left pixel is (0, 0).
-    distortion : tuple of float
-        `opencv`: none, or k1 k2 p1 p2 [k3 [k4 k5 k6]]; `fisheye`: none, or k1 k2 k3 k4.
-
     Raises
     ------
     RigError
@@ -152,12 +141,17 @@ class Lens:
     pixels they map to. Outside, two directions share a pixel.
     """
 
+    # Distortion model.
     model: LensModel = LensModel.OPENCV
+    # Focal lengths in pixels.
     fx: float
     fy: float
+    # Image centre in pixels; the centre of the top-left pixel is (0, 0).
     cx: float
     cy: float
+    # `opencv`: none, or k1 k2 p1 p2 [k3 [k4 k5 k6]]; `fisheye`: none, or k1 k2 k3 k4.
     distortion: tuple[float, ...] = ()
+
     params: LensParams = field(init=False, repr=False, compare=False)
     """Packed numbers for compiled kernels."""
 

@@ -288,32 +288,22 @@ def is_outside(port: DomeParams, inverse_rho: float) -> bool:
 
 
 class BackDerivative(NamedTuple):
-    """Terms of the derivatives of a solved projection.
+    """Terms of the derivatives of a solved projection."""
 
-    Attributes
-    ----------
-    turn, normal : vector
-        u and m of the module's docstring.
-    along_point : vector
-        d alpha / d point, 1/m.
-    across_point : float
-        Factor of m m^T for the point, 1/m.
-    along_lens, across_lens : float
-        Factors of u u^T and m m^T for the lens position, 1/m.
-    by_inner, by_thickness : float
-        d alpha by inner radius and thickness, 1/m.
-    by_n_air, by_n_acrylic, by_n_water : float
-        d alpha by the indices.
-    """
-
+    # u and m of the module's docstring.
     turn: Vector
     normal: Vector
+    # d alpha / d point, 1/m.
     along_point: Vector
+    # Factor of m m^T for the point, 1/m.
     across_point: float
+    # Factors of u u^T and m m^T for the lens position, 1/m.
     along_lens: float
     across_lens: float
+    # d alpha by inner radius and thickness, 1/m.
     by_inner: float
     by_thickness: float
+    # d alpha by the indices.
     by_n_air: float
     by_n_acrylic: float
     by_n_water: float
@@ -331,7 +321,6 @@ def back_derivative(
 
     Parameters
     ----------
-    port : DomeParams
     s : AngleSines
         Of the point.
     target : (float, float, float)
@@ -468,26 +457,17 @@ def tangent_guarded(port: FlatParams, height: float, rho: float) -> tuple[bool, 
 
 
 class FlatDerivative(NamedTuple):
-    """Terms of the derivatives of a solved projection behind a flat port.
+    """Terms of the derivatives of a solved projection behind a flat port."""
 
-    Attributes
-    ----------
-    turn : vector
-        u of the module's docstring.
-    by_reach : float
-        d alpha / d rho, 1/m.
-    across_point : float
-        sin alpha / rho, 1/m.
-    water_tangent : float
-        w, the tangent of the angle in the water.
-    by_distance, by_thickness, by_n_air, by_n_port, by_n_water : float
-        d alpha by the parameters.
-    """
-
+    # u of the module's docstring.
     turn: Vector
+    # d alpha / d rho, 1/m.
     by_reach: float
+    # sin alpha / rho, 1/m.
     across_point: float
+    # w, the tangent of the angle in the water.
     water_tangent: float
+    # d alpha by the parameters.
     by_distance: float
     by_thickness: float
     by_n_air: float

@@ -37,43 +37,29 @@ DOME_FROM_CAM_NOMINAL.flags.writeable = False
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """A flat window that a laser's light leaves its housing by.
+    """A flat window that a laser's light leaves its housing by."""
 
-    Attributes
-    ----------
-    face : Plane
-        The outer face in `dome`; the normal may point either way. The pane counts as thin; a thick
-        one shifts the light as a source would that is nearer to the outer face by a third of the
-        pane (glass of index 1.5), to 0.12 mm for 6 mm tilted by 25 degrees.
-    source : array, shape (3,)
-        Point in `dome` that the light fans out from, in metres. It is projected onto the laser's
-        plane.
-    """
-
+    # The outer face in `dome`; the normal may point either way. The pane counts as thin; a thick
+    # one shifts the light as a source would that is nearer to the outer face by a third of the pane
+    # (glass of index 1.5), to 0.12 mm for 6 mm tilted by 25 degrees.
     face: Plane
+    # Shape (3,): point in `dome` that the light fans out from, in metres. It is projected onto the
+    # laser's plane.
     source: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
 class Laser:
-    """A line laser, a thin sheet of light.
+    """A line laser, a thin sheet of light."""
 
-    Attributes
-    ----------
-    name : str
-        Name in reports.
-    plane : Plane
-        The sheet in `dome`: in the water, or, behind a window, in the air of the laser's housing.
-    window : Window or None
-        Window that bends the sheet, see `aqualvs.optics.sheet`. None where the sheet in the water
-        is the plane.
-    wavelength_nm : float or None
-        Of the light, in nanometres; None if not stated: green, 520 to 532.
-    """
-
+    # Name in reports.
     name: str
+    # The sheet in `dome`: in the water, or, behind a window, in the air of the laser's housing.
     plane: Plane
+    # Window that bends the sheet, see `aqualvs.optics.sheet`. None where the sheet in the water is
+    # the plane.
     window: Window | None = None
+    # Of the light, in nanometres; None if not stated: green, 520 to 532.
     wavelength_nm: float | None = None
 
 
@@ -171,18 +157,12 @@ of the laser plane's normal."""
 
 @dataclass(frozen=True, slots=True)
 class RigUncertainty:
-    """Joint covariance of some of a rig's numbers.
+    """Joint covariance of some of a rig's numbers."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        As `parameter_names(camera)` has them, and `<laser's name>:tilt_1`, `:tilt_2`, `:offset`
-        for lasers, see `laser_parameter_names`. Numbers that are not named are taken as exact.
-    covariance : array, shape (P, P)
-        SI units and radians.
-    """
-
+    # As `parameter_names(camera)` has them, and `<laser's name>:tilt_1`, `:tilt_2`, `:offset` for
+    # lasers, see `laser_parameter_names`. Numbers that are not named are taken as exact.
     names: tuple[str, ...]
+    # Shape (P, P): SI units and radians.
     covariance: FloatArray
 
     def __post_init__(self) -> None:
@@ -298,10 +278,7 @@ def rig_parameter_names(rig: Rig) -> tuple[str, ...]:
 def rig_moved_by(rig: Rig, names: Sequence[str], step: FloatArray) -> Rig:
     """Return the rig with `step` (P,) added to the named numbers.
 
-    Raises
-    ------
-    RigError
-        If the moved rig is not valid.
+    Raises `RigError` if the moved rig is not valid.
     """
     values = dict(zip(names, np.asarray(step, np.float64).tolist(), strict=True))
     pose = {name: values.get(name, 0.0) for name in POSE_PARAMETERS}

@@ -67,24 +67,16 @@ def fitted_plane(m: FloatArray, points: FloatArray) -> FittedSurface:
 
 
 class StripeSums(NamedTuple):
-    """Sums over B short segments of the stripes on a surface with K coefficients.
+    """Sums over B short segments of the stripes on a surface with K coefficients."""
 
-    Attributes
-    ----------
-    pixels, points : array, shape (B, 2), (B, 3)
-        Weighted means.
-    laser : int array, shape (B,)
-        Index of the laser.
-    pulls : array, shape (B, K)
-        Weighted sum of the terms.
-    matrix : array, shape (K, K)
-        Normal matrix of the fit; only its lower half.
-    """
-
+    # Shape (B, 2), (B, 3): weighted means.
     pixels: FloatArray
     points: FloatArray
+    # Shape (B,): index of the laser.
     laser: IntArray
+    # Shape (B, K): weighted sum of the terms.
     pulls: FloatArray
+    # Shape (K, K): normal matrix of the fit; only its lower half.
     matrix: FloatArray
 
 

@@ -46,16 +46,8 @@ _STAMP = re.compile(r"\.(\d{4}-\d\d-\d\dT\d{6})(?:-(\d+))?")
 def keep_dated(path: Path, now: datetime | None = None) -> Path:
     """Copy a file beside itself, under a name with the time that no other file has.
 
-    Parameters
-    ----------
-    path : Path
-    now : datetime, optional
-        With a time zone; the current time if left out.
-
-    Raises
-    ------
-    OutputError
-        If it cannot be copied.
+    `now`: with a time zone; the current time if left out. Raises `OutputError` if it cannot be
+    copied.
     """
     stamp = (now or datetime.now(UTC)).astimezone(UTC).strftime("%Y-%m-%dT%H%M%S")
     number = 1
@@ -178,10 +170,7 @@ def save_rig(rig: Rig, path: str | Path, *, comments_of: str | Path | None = Non
 def check_rig_place(path: Path) -> None:
     """Make sure that `save_rig` may write there, before anything is computed.
 
-    Raises
-    ------
-    OutputError
-        If the path is a file but no rig.
+    Raises `OutputError` if the path is a file but no rig.
     """
     if os.path.lexists(path):
         _old_rig(path)
@@ -190,10 +179,7 @@ def check_rig_place(path: Path) -> None:
 def _old_rig(path: Path) -> str:
     """Return the text of a rig file that is about to be replaced.
 
-    Raises
-    ------
-    OutputError
-        If the file is no rig file, and so must not be replaced by one.
+    Raises `OutputError` if the file is no rig file, and so must not be replaced by one.
     """
     try:
         text = read_text(path, "a rig file", OutputError)
@@ -312,10 +298,7 @@ def _housing(file: RigFile) -> Housing | None:
 def shutter_from_part(part: ShutterPart) -> Shutter:
     """Return the shutter that a file's `camera.shutter` describes.
 
-    Raises
-    ------
-    RigError
-        If its values contradict each other.
+    Raises `RigError` if its values contradict each other.
     """
     try:
         return Shutter(

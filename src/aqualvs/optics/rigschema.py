@@ -319,27 +319,13 @@ _LIMITS = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SchemaWords:
-    """Messages on the faults of one kind of file.
+    """Messages on the faults of one kind of file."""
 
-    Attributes
-    ----------
-    file : str
-        Kind of the file, such as "a rig file".
-    parts : mapping
-        Schemas below the top, by their key.
-    examples : mapping
-        A line that is right, by its key.
-    first_line : str
-        The example for any other key.
-    a_list : str
-        What to write where a list is missing.
-    """
-
-    file: str
-    parts: Mapping[str, type[BaseModel]]
-    examples: Mapping[str, str]
-    first_line: str
-    a_list: str = "a list"
+    file: str  # Kind of the file, such as "a rig file".
+    parts: Mapping[str, type[BaseModel]]  # Schemas below the top, by their key.
+    examples: Mapping[str, str]  # A line that is right, by its key.
+    first_line: str  # The example for any other key.
+    a_list: str = "a list"  # What to write where a list is missing.
 
     def first_fault(self, error: ValidationError, model: type[BaseModel]) -> str:
         """Return one line on the fault to mend first; a misspelt key explains the missing one."""

@@ -282,22 +282,16 @@ _USUAL_REACH = 0.6
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sheet:
-    """The light of one laser in the water, in `dome`.
+    """The light of one laser in the water, in `dome`."""
 
-    Attributes
-    ----------
-    plane : Plane
-        As `Laser.plane`: in air, where there is a window.
-    window : Window or None
-        As `Laser.window`.
-    n_air, n_water : float
-        Refractive indices behind the window and in front of it.
-    """
-
+    # As `Laser.plane`: in air, where there is a window.
     plane: Plane
+    # As `Laser.window`.
     window: Window | None = None
+    # Refractive indices behind the window and in front of it.
     n_air: float = 1.0
     n_water: float = 1.0
+
     _row: FloatArray = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -312,10 +306,7 @@ class Sheet:
     def source(self) -> FloatArray:
         """Point that the light fans out from, exactly in the plane, shape (3,).
 
-        Raises
-        ------
-        ValueError
-            If there is no window: the source is then not known, and not needed.
+        Raises `ValueError` if there is no window: the source is then not known, and not needed.
         """
         if self.window is None:
             raise ValueError("a sheet without a window has no source")
@@ -391,12 +382,7 @@ class Sheet:
         For uses that need only an approximate plane: frames of drawings, the mesh filter, initial
         guesses. Without a window it is `plane`.
 
-        Parameters
-        ----------
-        camera : Camera
-            The camera that sees the sheet.
-        working_range : (float, float)
-            Points at these distances from the dome's centre count, in metres.
+        `working_range`: points at these distances from the dome's centre count, in metres.
         """
         if self.window is None:
             return self.plane
@@ -508,10 +494,7 @@ class Sheet:
     def packed(self, start: Plane | None = None) -> FloatArray:
         """Return the sheet as kernels take it, shape (COLUMNS,).
 
-        Parameters
-        ----------
-        start : Plane, optional
-            Where searches along rays begin, such as `best_plane`; a tangent plane if left out.
+        `start`: where searches along rays begin, such as `best_plane`; a tangent plane if left out.
         """
         row = self._row.copy()
         if start is not None and self.window is not None:

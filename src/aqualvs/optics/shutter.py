@@ -38,27 +38,18 @@ class ShutterKind(StrEnum):
 class Shutter:
     """Exposure of a picture, in seconds.
 
-    Attributes
-    ----------
-    kind : ShutterKind
-    readout : float
-        From the first row to the last (rolling; negative if the last comes first, as in a picture
-        that is turned upside down), or from the first field to the second (interlaced); 0 for a
-        global shutter.
-    exposure : float
-        Time that each row gathers light; 0 where it is not stated.
-    first_field : {"top", "bottom"}
-        Field that an interlaced camera exposes first: "top" holds rows 0, 2, 4 and so on.
-
-    Raises
-    ------
-    RigError
-        If the values contradict each other; the message names keys of the rig file.
+    Raises `RigError` if the values contradict each other; the message names keys of the rig file.
     """
 
     kind: ShutterKind = ShutterKind.GLOBAL
+    # From the first row to the last (rolling; negative if the last comes first, as in a picture
+    # that is turned upside down), or from the first field to the second (interlaced); 0 for a
+    # global shutter.
     readout: float = 0.0
+    # Time that each row gathers light; 0 where it is not stated.
     exposure: float = 0.0
+    # Field that an interlaced camera exposes first: "top" holds rows 0, 2, 4 and
+    # so on.
     first_field: Field = "top"
 
     def __post_init__(self) -> None:
@@ -126,11 +117,6 @@ class Shutter:
 
         Every picture of an interlaced camera makes two frames: 2 n is the first field of picture n,
         2 n + 1 its second.
-
-        Parameters
-        ----------
-        index : int
-            Of the frame.
         """
         if not self.is_interlaced:
             return None

@@ -62,24 +62,16 @@ _UNIT_OF = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SolvedStep:
-    """Record of a calibration step: its date, data and residuals.
+    """Record of a calibration step: its date, data and residuals."""
 
-    Attributes
-    ----------
-    date : datetime
-        With a time zone.
-    pictures, points : int
-        Number used; points are corners or stripe points.
-    rms_px : float
-        Root mean square residual of a coordinate, in pixels.
-    extras : mapping
-        Other values to keep: numbers, strings, lists of them.
-    """
-
+    # With a time zone.
     date: datetime = field(default_factory=lambda: datetime.now(UTC))
+    # Number used; points are corners or stripe points.
     pictures: int
     points: int
+    # Root mean square residual of a coordinate, in pixels.
     rms_px: float
+    # Other values to keep: numbers, strings, lists of them.
     extras: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -104,10 +96,7 @@ class SolvedStep:
     def from_mapping(cls, mapping: Mapping[str, Any], place: str) -> Self:
         """Read a step from a rig file.
 
-        Raises
-        ------
-        RigError
-            One line that names the place, the value and the remedy.
+        Raises `RigError` with one line that names the place, the value and the remedy.
         """
         rest = dict(mapping)
         date = _date(rest.pop("date", None), f"{place}.date")
@@ -131,10 +120,7 @@ def solved_steps(rig: Rig) -> dict[str, SolvedStep]:
 
     An entry under one of these names without a date is a note of the user and is left out.
 
-    Raises
-    ------
-    RigError
-        One line, if a record is malformed.
+    Raises `RigError` with one line, if a record is malformed.
     """
     notes = ((name, rig.solved_from.get(name)) for name in STEPS)
     return {
@@ -166,10 +152,8 @@ def is_exact(rig: Rig) -> bool:
 def rig_uncertainty(rig: Rig) -> RigUncertainty:
     """Return the uncertainty written down in a rig; zero for one that is exact or has none.
 
-    Raises
-    ------
-    RigError
-        One line, if it is malformed, not a covariance, or of numbers that the rig does not have.
+    Raises `RigError` with one line, if it is malformed, not a covariance, or of numbers that the
+    rig does not have.
     """
     content = rig.solved_from.get(_UNCERTAINTY)
     if content is None:
@@ -340,19 +324,10 @@ _FLAT = ("port_distance", "thickness", "n_port", "port_tilt_x", "port_tilt_y")
 
 @dataclass(frozen=True, slots=True)
 class Assumption:
-    """Default uncertainty of numbers of a rig that belong together.
+    """Default uncertainty of numbers of a rig that belong together."""
 
-    Attributes
-    ----------
-    what : str
-        Name of the group of numbers.
-    words : str
-        The standard deviations as text.
-    uncertainty : RigUncertainty
-    """
-
-    what: str
-    words: str
+    what: str  # Name of the group of numbers.
+    words: str  # The standard deviations as text.
     uncertainty: RigUncertainty
 
 
@@ -364,10 +339,7 @@ def assumptions(rig: Rig) -> tuple[Assumption, ...]:
     count as exact. The origin and the axes of the frame `dome` are exact by definition where
     nothing physical fixes them: the camera's rotation, and the place of a lens without a dome.
 
-    Raises
-    ------
-    RigError
-        As `rig_uncertainty`.
+    Raises `RigError` as `rig_uncertainty` does.
     """
     known = set(rig_uncertainty(rig).names)
     return tuple(one for one in _defaults(rig) if known.isdisjoint(_settled_by(one)))
@@ -376,10 +348,7 @@ def assumptions(rig: Rig) -> tuple[Assumption, ...]:
 def completed_uncertainty(rig: Rig) -> RigUncertainty:
     """Return the uncertainty written down in a rig, with the defaults for the other numbers.
 
-    Raises
-    ------
-    RigError
-        As `rig_uncertainty`.
+    Raises `RigError` as `rig_uncertainty` does.
     """
     parts = (rig_uncertainty(rig), *(one.uncertainty for one in assumptions(rig)))
     names = tuple(name for part in parts for name in part.names)

@@ -38,18 +38,10 @@ _FORMULA = _QuanFry()
 
 
 class IndexSlopes(NamedTuple):
-    """Derivatives of the index of seawater relative to air.
+    """Derivatives of the index of seawater relative to air."""
 
-    Attributes
-    ----------
-    by_temperature : array
-        Per degree Celsius.
-    by_salinity : array
-        Per per mille.
-    """
-
-    by_temperature: FloatArray
-    by_salinity: FloatArray
+    by_temperature: FloatArray  # Per degree Celsius.
+    by_salinity: FloatArray  # Per per mille.
 
 
 def seawater_index(

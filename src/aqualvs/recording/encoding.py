@@ -55,11 +55,7 @@ class PictureFormat(StrEnum):
 def jpeg_of(frame: Frame, quality: int) -> bytes:
     """Return a frame as JPEG, in colour where it has any.
 
-    Parameters
-    ----------
-    frame : Frame
-    quality : int
-        1 to 100.
+    `quality`: 1 to 100.
     """
     image = bgr_of(frame)
     if frame.chroma is None:
@@ -78,10 +74,7 @@ def png_of(frame: Frame) -> tuple[bytes, bytes | None]:
 def frame_of(index: int, time_s: float, kind: str, picture: bytes, chroma: bytes | None) -> Frame:
     """Return the frame that a recording's pictures show.
 
-    Raises
-    ------
-    ValueError
-        If they cannot be decoded.
+    Raises `ValueError` if they cannot be decoded.
     """
     image = _decoded(picture)
     if kind == PictureFormat.JPEG:
@@ -177,10 +170,7 @@ def options_text(options: ScannerOptions) -> str:
 def options_from_text(text: str) -> ScannerOptions:
     """Return the scanner's options that `options_text` wrote.
 
-    Raises
-    ------
-    ValueError, KeyError, TypeError
-        If the text is none that this version knows.
+    Raises `ValueError`, `KeyError` or `TypeError` if the text is none that this version knows.
     """
     found = json.loads(text)
     detector = dict(found["detector"])
@@ -266,10 +256,7 @@ class CdrWriter:
 class CdrReader:
     """Reader of a CDR message, field by field in their order.
 
-    Raises
-    ------
-    ValueError
-        From every method, if the message is cut short or not little-endian CDR.
+    Raises `ValueError` from every method, if the message is cut short or not little-endian CDR.
     """
 
     def __init__(self, content: bytes) -> None:
@@ -331,23 +318,12 @@ _HEADER = "std_msgs/Header", "builtin_interfaces/Time stamp\nstring frame_id\n"
 
 @dataclass(frozen=True, slots=True)
 class RecordedTopic:
-    """A topic.
+    """A topic."""
 
-    Attributes
-    ----------
-    number : int
-        Of its channel and its schema in the file; from 1.
-    name : str
-    kind : str
-        Full name of its messages.
-    definition : str
-        Of its messages and of all that they hold.
-    """
-
-    number: int
+    number: int  # Of its channel and its schema in the file; from 1.
     name: str
-    kind: str
-    definition: str
+    kind: str  # Full name of its messages.
+    definition: str  # Of its messages and of all that they hold.
 
 
 def _definition(own: str, *parts: tuple[str, str]) -> str:

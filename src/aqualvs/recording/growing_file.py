@@ -43,29 +43,19 @@ _COMPRESSION = "zstd"
 
 @dataclass(frozen=True, slots=True)
 class Chunk:
-    """A chunk ready for the file.
+    """A chunk ready for the file."""
 
-    Attributes
-    ----------
-    content : bytes
-        The chunk's record and its message indexes.
-    length : int
-        Of the record alone.
-    index_offsets : dict
-        Where each channel's message index begins, from the chunk's start.
-    times_ns : (int, int)
-        Log times of the first and the last message.
-    sizes : (int, int)
-        Compressed and raw.
-    counts : dict
-        Messages by channel.
-    """
-
+    # The chunk's record and its message indexes.
     content: bytes
+    # Of the record alone.
     length: int
+    # Where each channel's message index begins, from the chunk's start.
     index_offsets: dict[int, int]
+    # Log times of the first and the last message.
     times_ns: tuple[int, int]
+    # Compressed and raw.
     sizes: tuple[int, int]
+    # Messages by channel.
     counts: dict[int, int]
 
     def index_at(self, at: int) -> bytes:
@@ -150,7 +140,6 @@ class GrowingFile:
         What the file begins with: magic, header, schemas and channels.
     repeated : bytes
         Schemas and channels once more, for the summary.
-    n_schemas : int
     channels : sequence of int
         Their numbers.
     open_file : callable, optional
@@ -245,10 +234,7 @@ class GrowingFile:
     def _insert(self, at: int, content: bytes, limit: int) -> int:
         """Replace the beginning of the padding at `at`, which ends at `limit`, by whole records.
 
-        Returns
-        -------
-        at : int
-            Where the padding begins now.
+        Returns where the padding begins now.
         """
         content += self._fill(at + len(content))
         end = at + len(content)

@@ -97,10 +97,7 @@ def stripes_of(
 ) -> tuple[int, float, float, dict[SearchAxis, StripePeaks], Refusal | None, GyroRates | None]:
     """Return frame, time, index of the water, stripes, refusal and turning of a message.
 
-    Raises
-    ------
-    ValueError
-        If it is none of `stripes_message`.
+    Raises `ValueError` if it is none of `stripes_message`.
     """
     of = CdrReader(message)
     of.header()
@@ -190,10 +187,7 @@ def rig_message(texts: tuple[str, str, str], stamp_ns: int) -> bytes:
 def rig_texts_of(message: bytes) -> tuple[str, str, str]:
     """Return the rig file, its exact numbers and the scanner's options of a message.
 
-    Raises
-    ------
-    ValueError
-        If it is none of `rig_message`.
+    Raises `ValueError` if it is none of `rig_message`.
     """
     of = CdrReader(message)
     of.header()
@@ -212,10 +206,7 @@ def image_message(kind: str, data: bytes, stamp_ns: int) -> bytes:
 def image_of(message: bytes) -> tuple[str, bytes]:
     """Return kind and bytes of a picture's message.
 
-    Raises
-    ------
-    ValueError
-        If it is none of `image_message`.
+    Raises `ValueError` if it is none of `image_message`.
     """
     of = CdrReader(message)
     of.header()
@@ -276,34 +267,23 @@ def _put_part(to: CdrWriter, kind: str, part: PartHealth) -> None:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RecorderOptions:
-    """Options of a recording: its contents, and how often it is written.
+    """Options of a recording: its contents, and how often it is written."""
 
-    Attributes
-    ----------
-    pictures : PictureFormat or None
-        Every frame's picture, or none of them.
-    jpeg_quality : int
-        1 to 100.
-    points_hz : float or None
-        Point clouds per second, for the eye: stripes, from which every point can be had again bit
-        for bit, are always kept. 0 for none, None for those of every frame.
-    scanner : ScannerOptions
-        That the run measures with; a replay uses them.
-    chunk_s : float
-        Time after which what was gathered is written: what the death of the process costs.
-    sync_s : float or None
-        Time after which it is also on the disk: what a loss of power costs. None leaves it to the
-        system.
-    max_waiting_bytes : int
-        Memory for what the disk has not taken yet.
-    """
-
+    # Every frame's picture, or none of them.
     pictures: PictureFormat | None = None
+    # 1 to 100.
     jpeg_quality: int = 90
+    # Point clouds per second, for the eye: stripes, from which every point can be had again bit for
+    # bit, are always kept. 0 for none, None for those of every frame.
     points_hz: float | None = 5.0
+    # That the run measures with; a replay uses them.
     scanner: ScannerOptions = field(default_factory=ScannerOptions)
+    # Time after which what was gathered is written: what the death of the process costs.
     chunk_s: float = 0.5
+    # Time after which it is also on the disk: what a loss of power costs. None leaves it to the
+    # system.
     sync_s: float | None = 5.0
+    # Memory for what the disk has not taken yet.
     max_waiting_bytes: int = 64 << 20
 
     def __post_init__(self) -> None:
@@ -416,10 +396,7 @@ class RecordClock:
 class RateLimit:
     """Rate limit of a message.
 
-    Parameters
-    ----------
-    hz : float
-        0 for none at all.
+    `hz`: 0 for none at all.
     """
 
     def __init__(self, hz: float) -> None:

@@ -79,16 +79,8 @@ class SampleChunks:
 class Recording:
     """Writer of samples to a file that is readable at any time.
 
-    Parameters
-    ----------
-    path : Path
-        Must not exist.
-    options : RecorderOptions
-
-    Raises
-    ------
-    OSError
-        From every method, as the system says it; what was written stays readable.
+    `path`: must not exist. Raises `OSError` from every method, as the system says it; what was
+    written stays readable.
     """
 
     def __init__(self, path: Path, options: RecorderOptions) -> None:
@@ -123,10 +115,7 @@ class Recording:
 def recording_file(path: Path, open_file: Callable[[Path], BinaryIO] | None = None) -> GrowingFile:
     """Begin a file with the topics of a recording.
 
-    Raises
-    ------
-    OSError
-        As `GrowingFile`.
+    Raises `OSError` as `GrowingFile` does.
     """
     repeated = b"".join(
         mcap_file.schema(topic.number, topic.kind, topic.definition)
@@ -157,16 +146,8 @@ class Recorder:
     ----------
     path : Path
         Must not exist.
-    options : RecorderOptions, optional
-        Defaults if left out.
     open_file : callable, optional
         As in `GrowingFile`; for tests.
-
-    Attributes
-    ----------
-    name, inline, keeps_all
-        As in `Output`.
-    path : Path
 
     Raises
     ------
@@ -320,17 +301,7 @@ def _words(fault: OSError) -> str:
 class RecorderSwitch:
     """Output whose recording is switched on and off; every start makes a file of its own.
 
-    Parameters
-    ----------
-    folder : Path
-        Made when it is needed.
-    options : RecorderOptions, optional
-        Defaults if left out.
-
-    Attributes
-    ----------
-    name, inline, keeps_all
-        As in `Output`.
+    `folder`: made when it is needed.
     """
 
     name = "recorder"

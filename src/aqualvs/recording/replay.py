@@ -26,30 +26,20 @@ from aqualvs.sources.mcap_file import McapFile, StoredMessage
 
 @dataclass(frozen=True, slots=True)
 class RecordedFrame:
-    """Frame as a recording holds it.
+    """Frame as a recording holds it."""
 
-    Attributes
-    ----------
-    index, time_s
-        As in the `Frame`.
-    n_water : float
-        Index that it was measured with.
-    peaks : dict
-        Stripes as detected.
-    refusal : Refusal or None
-        Why it was not measured at all.
-    turning : GyroRates or None
-        As the vehicle's gyros told.
-    picture : Frame or None
-        None where there is none, or it was not asked for.
-    """
-
+    # As in the `Frame`.
     index: int
     time_s: float
+    # Index that it was measured with.
     n_water: float
+    # Stripes as detected.
     peaks: dict[SearchAxis, StripePeaks]
+    # Why it was not measured at all.
     refusal: Refusal | None
+    # As the vehicle's gyros told.
     turning: GyroRates | None
+    # None where there is none, or it was not asked for.
     picture: Frame | None
 
 
@@ -58,7 +48,6 @@ class DiveRecording:
 
     Attributes
     ----------
-    path : Path
     rig : Rig or None
         That the dive was measured with at its beginning; None where it is lost or not understood.
     options : ScannerOptions or None
@@ -67,7 +56,6 @@ class DiveRecording:
         None where a torn file does not say.
     fps : float or None
         Mean rate.
-    has_pictures : bool
 
     Raises
     ------
@@ -96,10 +84,7 @@ class DiveRecording:
     def need_rig(self) -> Rig:
         """Return the rig.
 
-        Raises
-        ------
-        SourceError
-            If it is lost or not understood.
+        Raises `SourceError` if it is lost or not understood.
         """
         if self.rig is None:
             raise SourceError(f"{self.path}: {self._no_rig}")
@@ -125,15 +110,8 @@ class DiveRecording:
     def frames(self, *, with_pictures: bool) -> Iterator[RecordedFrame]:
         """Yield the frames in the order of their recording.
 
-        Parameters
-        ----------
-        with_pictures : bool
-            Whether to decode pictures, where there are any.
-
-        Raises
-        ------
-        SourceError
-            If a message cannot be understood.
+        `with_pictures`: whether to decode pictures, where there are any. Raises `SourceError` if a
+        message cannot be understood.
         """
         wanted = [STRIPES.name]
         if with_pictures:

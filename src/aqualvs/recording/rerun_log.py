@@ -50,15 +50,8 @@ _BLUE, _PALE, _AMBER = (51, 153, 255, 90), (51, 153, 255, 255), (240, 228, 66, 2
 class RerunLog(Closing):
     """Writer of samples to one place, chosen by `save`, `connect` or `spawn`; a context manager.
 
-    Parameters
-    ----------
-    picture_hz, points_hz : float
-        Most pictures, with the points in them, and point clouds per second; 0 for none.
-
-    Raises
-    ------
-    OptionError
-        If rerun-sdk is not installed.
+    `picture_hz`, `points_hz`: most pictures, with the points in them, and point clouds per second;
+    0 for none. Raises `OptionError` if rerun-sdk is not installed.
     """
 
     def __init__(self, *, picture_hz: float = 5.0, points_hz: float = 10.0) -> None:
@@ -71,10 +64,7 @@ class RerunLog(Closing):
     def save(self, path: Path) -> None:
         """Write to a file, which is replaced.
 
-        Raises
-        ------
-        OSError
-            If it cannot be written.
+        Raises `OSError` if it cannot be written.
         """
         # The SDK words such faults in its own way.
         path.open("wb").close()
@@ -83,20 +73,14 @@ class RerunLog(Closing):
     def connect(self, url: str) -> None:
         """Send to a viewer; may wait for it for seconds.
 
-        Raises
-        ------
-        RuntimeError
-            If the address is none.
+        Raises `RuntimeError` if the address is none.
         """
         self._stream.connect_grpc(url, default_blueprint=_blueprint())
 
     def spawn(self) -> None:
         """Open a viewer on this machine, which outlives this process, and send to it.
 
-        Raises
-        ------
-        RuntimeError
-            If there is no viewer.
+        Raises `RuntimeError` if there is no viewer.
         """
         self._stream.spawn(default_blueprint=_blueprint())
 
@@ -127,10 +111,7 @@ class RerunLog(Closing):
     def flush(self, timeout_s: float) -> None:
         """Wait until everything has gone out.
 
-        Raises
-        ------
-        RuntimeError
-            If it does not within the time.
+        Raises `RuntimeError` if it does not within the time.
         """
         self._stream.flush(timeout_sec=timeout_s)
 
@@ -245,10 +226,7 @@ def plane_sigma(posture: Posture, places: FloatArray) -> FloatArray:
 def rerun_sdk() -> Any:
     """Return the module `rerun`.
 
-    Raises
-    ------
-    OptionError
-        If it is not installed.
+    Raises `OptionError` if it is not installed.
     """
     try:
         import rerun

@@ -12,54 +12,33 @@ from aqualvs.sources.base import Health
 
 @dataclass(frozen=True, slots=True)
 class Instants:
-    """Times at which a frame passed the stages, by `time.monotonic_ns`.
+    """Times at which a frame passed the stages, by `time.monotonic_ns`."""
 
-    Attributes
-    ----------
-    arrived_ns : int
-        Decoded, or in the hands of the source.
-    taken_ns : int
-        Taken from the mailbox.
-    scanned_ns : int
-        Measured.
-    """
-
-    arrived_ns: int
-    taken_ns: int
-    scanned_ns: int
+    arrived_ns: int  # Decoded, or in the hands of the source.
+    taken_ns: int  # Taken from the mailbox.
+    scanned_ns: int  # Measured.
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LiveSample:
-    """One frame's answer on its way to pilot, autopilot and log.
+    """One frame's answer on its way to pilot, autopilot and log."""
 
-    Attributes
-    ----------
-    rig : Rig
-        That it was measured with, in the water as it is known.
-    scan : Scan
-        Raw posture or refusal, and the points. Where the stream is silent there is no frame: the
-        scan then has the refusal `no_frames` and the number and time of the last frame.
-    peaks : dict
-        Stripes by search direction, as detected; empty where there is no frame.
-    frame : Frame or None
-        The picture.
-    utc_ns : int
-        System time of arrival, nanoseconds since 1970; may jump, as system clocks do.
-    instants : Instants
-    filtered : FilteredPosture or None
-        From the time filter, where it is switched on and running.
-    health : Health
-        As of this frame.
-    """
-
+    # That it was measured with, in the water as it is known.
     rig: Rig
+    # Raw posture or refusal, and the points. Where the stream is silent there is no frame: the scan
+    # then has the refusal `no_frames` and the number and time of the last frame.
     scan: Scan
+    # Stripes by search direction, as detected; empty where there is no frame.
     peaks: dict[SearchAxis, StripePeaks]
+    # The picture.
     frame: Frame | None
+    # System time of arrival, nanoseconds since 1970; may jump, as system clocks do.
     utc_ns: int
+
     instants: Instants
+    # From the time filter, where it is switched on and running.
     filtered: FilteredPosture | None
+    # As of this frame.
     health: Health
 
     @property

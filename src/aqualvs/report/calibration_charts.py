@@ -44,10 +44,7 @@ _SHAPES: dict[MarkKind, tuple[float, float, float]] = {
 def picture_view(shots: Sequence[PictureShot]) -> Raw:
     """Return pictures with their points, captions and legends.
 
-    Raises
-    ------
-    ValueError
-        If an image is empty, not of 8 bits, or neither grey nor of three channels.
+    Raises `ValueError` if an image is empty, not of 8 bits, or neither grey nor of three channels.
     """
     figures = "".join(_figure(shot, index, len(shots)) for index, shot in enumerate(shots))
     return Raw(f'<div class="shots">{figures}</div>')
@@ -223,7 +220,6 @@ def residual_view(found: ResidualMap, names: Sequence[str], *, n_vectors: int = 
 
     Parameters
     ----------
-    found : ResidualMap
     names : sequence of str
         Names of the views that `found.view_index` counts.
     n_vectors : int

@@ -30,99 +30,55 @@ MarkKind: TypeAlias = Literal["cross", "dot", "circle"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ResidualMap:
-    """Reprojection residuals over the picture, for the points of all views together.
-
-    Attributes
-    ----------
-    title : str
-    size_px : (int, int)
-        Width and height of the pictures.
-    pixels : array, shape (N, 2)
-        Measured points as (x, y); rows that are not finite are left out.
-    residuals : array, shape (N, 2)
-        Measured minus predicted, in pixels.
-    view_index : int array, shape (N,)
-        Row of the view in `CalibrationPage.views`.
-    inliers : bool array, shape (N,)
-        False for points that the solution did not use.
-    """
+    """Reprojection residuals over the picture, for the points of all views together."""
 
     title: str
+    # Width and height of the pictures.
     size_px: tuple[int, int]
+    # Shape (N, 2): measured points as (x, y); rows that are not finite are left out.
     pixels: FloatArray
+    # Shape (N, 2): measured minus predicted, in pixels.
     residuals: FloatArray
+    # Shape (N,): row of the view in `CalibrationPage.views`.
     view_index: IntArray
+    # Shape (N,): False for points that the solution did not use.
     inliers: BoolArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ViewRow:
-    """One view: a picture in which the target was looked for.
-
-    Attributes
-    ----------
-    name : str
-    n_points : int
-    rms_px : float
-        Of the distances between measured and predicted points.
-    remark : str
-        Why it was left out, say; may be empty.
-    used : bool
-        Whether the solution rests on it.
-    """
+    """One view: a picture in which the target was looked for."""
 
     name: str
     n_points: int
-    rms_px: float
-    remark: str = ""
-    used: bool = True
+    rms_px: float  # Of the distances between measured and predicted points.
+    remark: str = ""  # Why it was left out, say; may be empty.
+    used: bool = True  # Whether the solution rests on it.
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ParameterRow:
-    """One calibrated parameter.
-
-    Attributes
-    ----------
-    name : str
-    value : float
-    sigma : float or None
-        Standard deviation; None for a parameter that was held.
-    unit : str
-    digits : int
-        Decimals of the value.
-    before : float or None
-        What the rig said before the calibration.
-    remark : str
-    """
+    """One calibrated parameter."""
 
     name: str
     value: float
-    sigma: float | None
+    sigma: float | None  # Standard deviation; None for a parameter that was held.
     unit: str = ""
-    digits: int = 2
-    before: float | None = None
-    remark: str = ""
+    digits: int = 2  # Decimals of the value.
+    before: float | None = None  # What the rig said before the calibration.
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ExpectationRow:
-    """Standard deviations of posture to expect on a target after the calibration.
+    """Standard deviations of posture to expect on a target after the calibration."""
 
-    Attributes
-    ----------
-    range_m : float
-        Distance of the target.
-    sigma_range_mm, sigma_pitch_deg, sigma_yaw_deg : float
-        Systematic: from the calibration's covariance, the same in every picture.
-    noise_range_mm, noise_pitch_deg, noise_yaw_deg : float
-        Random: from the noise of the stripes in one picture.
-    """
-
+    # Distance of the target.
     range_m: float
+    # Systematic: from the calibration's covariance, the same in every picture.
     sigma_range_mm: float
     sigma_pitch_deg: float
     sigma_yaw_deg: float
+    # Random: from the noise of the stripes in one picture.
     noise_range_mm: float = float("nan")
     noise_pitch_deg: float = float("nan")
     noise_yaw_deg: float = float("nan")
@@ -130,142 +86,86 @@ class ExpectationRow:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LaserRow:
-    """One calibrated laser plane, n·X = offset in `dome`.
-
-    Attributes
-    ----------
-    name : str
-    normal : array, shape (3,)
-        Unit normal in `dome`.
-    offset_mm : float
-    sigma_normal_deg, sigma_offset_mm : float
-        Standard deviations of the normal's direction and of the offset.
-    rms_px, rms_mm : float
-        Of the points' distances from the plane, in the picture and in space.
-    n_points : int
-    surfaces : str
-        What its stripes were seen on: "floor, back wall".
-    model : str
-        "plane" or "refracted sheet".
-    moved : str
-        In words, against the rig before; may be empty.
-    """
+    """One calibrated laser plane, n·X = offset in `dome`."""
 
     name: str
+    # Shape (3,): unit normal in `dome`.
     normal: FloatArray
+
     offset_mm: float
+    # Standard deviations of the normal's direction and of the offset.
     sigma_normal_deg: float
     sigma_offset_mm: float
+    # Of the points' distances from the plane, in the picture and in space.
     rms_px: float
     rms_mm: float
+
     n_points: int
+    # What its stripes were seen on: "floor, back wall".
     surfaces: str = ""
+    # "plane" or "refracted sheet".
     model: str = "plane"
+    # In words, against the rig before; may be empty.
     moved: str = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Series:
-    """A value over something, usually time.
-
-    Attributes
-    ----------
-    title, x_label, y_label : str
-    x, y : array, shape (N,)
-        `x` ascending; the line is broken where `y` is NaN.
-    sigma : array, shape (N,), or None
-        Standard deviations of `y`, drawn as a band.
-    level : (str, float) or None
-        A named horizontal line.
-    marks : tuple of (float, str)
-        Places on the x axis and what happened there.
-    """
+    """A value over something, usually time."""
 
     title: str
     x_label: str
     y_label: str
+    # Shape (N,): `x` ascending; the line is broken where `y` is NaN.
     x: FloatArray
     y: FloatArray
+    # Shape (N,): standard deviations of `y`, drawn as a band.
     sigma: FloatArray | None = None
+    # A named horizontal line.
     level: tuple[str, float] | None = None
+    # Places on the x axis and what happened there.
     marks: tuple[tuple[float, str], ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Overlay:
-    """Points drawn over a picture.
+    """Points drawn over a picture."""
 
-    Attributes
-    ----------
-    pixels : array, shape (N, 2)
-        (x, y) in the full picture; rows that are not finite are left out.
-    colour : str
-        #RRGGBB.
-    kind : {'cross', 'dot', 'circle'}
-    label : str
-        What they are, for the legend; without one the legend leaves them out.
-    """
-
+    # Shape (N, 2): (x, y) in the full picture; rows that are not finite are left out.
     pixels: FloatArray
+    # #RRGGBB.
     colour: str
     kind: MarkKind = "cross"
+    # What they are, for the legend; without one the legend leaves them out.
     label: str = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PictureShot:
-    """A picture with points drawn over it.
-
-    Attributes
-    ----------
-    caption : str
-    image : uint8 array, shape (height, width) or (height, width, 3)
-        Grey, or blue, green, red.
-    points : tuple of Overlay
-    """
+    """A picture with points drawn over it."""
 
     caption: str
-    image: ImagePlane
+    image: ImagePlane  # Shape (height, width) or (height, width, 3): grey, or blue, green, red.
     points: tuple[Overlay, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CalibrationPage:
-    """The page of one calibration.
-
-    Attributes
-    ----------
-    title, subtitle : str
-    cards : tuple of Card
-        The headline's numbers.
-    warnings : tuple of str
-    words : tuple of str
-        What was found, one plain sentence each.
-    residual_maps : tuple of ResidualMap
-    views : tuple of ViewRow
-    parameters : tuple of ParameterRow
-    expectations : tuple of ExpectationRow
-    lasers : tuple of LaserRow
-        In the rig's order, which gives them their colours.
-    series : tuple of Series
-    pictures : tuple of PictureShot
-    facts : tuple of (str, str)
-        Date, command, versions, files.
-    """
+    """The page of one calibration."""
 
     title: str
     subtitle: str = ""
-    cards: tuple[Card, ...] = ()
+    cards: tuple[Card, ...] = ()  # The headline's numbers.
     warnings: tuple[str, ...] = ()
-    words: tuple[str, ...] = ()
+    words: tuple[str, ...] = ()  # What was found, one plain sentence each.
     residual_maps: tuple[ResidualMap, ...] = ()
     views: tuple[ViewRow, ...] = ()
     parameters: tuple[ParameterRow, ...] = ()
     expectations: tuple[ExpectationRow, ...] = ()
-    lasers: tuple[LaserRow, ...] = ()
+    lasers: tuple[LaserRow, ...] = ()  # In the rig's order, which gives them their colours.
     series: tuple[Series, ...] = ()
     pictures: tuple[PictureShot, ...] = ()
-    facts: tuple[tuple[str, str], ...] = ()
+    facts: tuple[tuple[str, str], ...] = ()  # Date, command, versions, files.
 
 
 _DEG = 180.0 / math.pi
@@ -315,7 +215,6 @@ def parameter_rows(
     uncertainty: RigUncertainty,
     names: Sequence[str],
     before: Rig | None = None,
-    remarks: Mapping[str, str] | None = None,
 ) -> tuple[ParameterRow, ...]:
     """Return the named numbers of a rig's camera, with sigma and what they were before."""
     values, sigmas = camera_numbers(rig), uncertainty.sigmas
@@ -332,7 +231,6 @@ def parameter_rows(
                 unit=unit,
                 digits=digits,
                 before=factor * old[name] if name in old else None,
-                remark=(remarks or {}).get(name, ""),
             )
         )
     return tuple(rows)

@@ -65,17 +65,14 @@ def view_table(views: Sequence[ViewRow]) -> Raw:
 def parameter_table(rows: Sequence[ParameterRow]) -> Raw:
     """Return values with their sigmas and, where it is known, what they were before."""
     changed = any(_known(row.before) for row in rows)
-    remarks = any(row.remark for row in rows)
     head = ["parameter", "value", "± σ", "unit"]
     head += ["before", "change", "change in σ"] if changed else []
-    head += ["remark"] if remarks else []
     cells = []
     for row in rows:
         line = [row.name, number(row.value, row.digits), _sigma_text(row), row.unit or DASH]
         line += _change_cells(row) if changed else []
-        line += [row.remark] if remarks else []
         cells.append(line)
-    return Raw(table(head, cells, tail=int(remarks)))
+    return Raw(table(head, cells))
 
 
 def expectation_view(rows: Sequence[ExpectationRow]) -> Raw:
@@ -261,7 +258,6 @@ def write_page(page: CalibrationPage, path: Path) -> Path:
 
     Parameters
     ----------
-    page : CalibrationPage
     path : Path
         The file to write.
 

@@ -74,11 +74,7 @@ def thin(values: FloatArray, limit: int) -> IntArray:
 def breaks(rows: IntArray, interrupted: BoolArray) -> list[int]:
     """Return the positions in `rows` after which a drawn line must be lifted.
 
-    Parameters
-    ----------
-    rows : int array, ascending
-    interrupted : bool array, shape (N,)
-        True for every row of the full series at which a line must not pass.
+    `interrupted`, shape (N,): True for every row of the full series at which a line must not pass.
     """
     before = np.cumsum(interrupted)
     return [int(i) for i in np.flatnonzero(before[rows[1:]] > before[rows[:-1]])]

@@ -3,7 +3,8 @@
 Figures are one or two columns wide and use the Agg canvas.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -53,26 +54,22 @@ STYLE: dict[Any, Any] = {
 }
 
 
-def new_figure(height_in: float, width: Literal["column", "page"] = "page") -> "Figure":
-    """Return an empty figure that needs no display; draw inside `style()`.
+@contextmanager
+def new_figure(height_in: float, width: Literal["column", "page"] = "page") -> Iterator["Figure"]:
+    """Yield an empty figure that needs no display, as wide as a journal's column or page.
 
-    Parameters
-    ----------
-    height_in : float
-        Height in inches.
-    width : {"column", "page"}
-        As wide as a journal's column or page.
+    What is drawn inside the `with` block has the style of all figures.
     """
-    return new_canvas(WIDTH_IN[width], height_in)
+    from matplotlib import rc_context
+
+    with rc_context(STYLE):
+        yield new_canvas(WIDTH_IN[width], height_in)
 
 
 def save_figures(figures: "Mapping[str, Figure]", folder: Path, dpi: float) -> list[Path]:
     """Write figures as `NAME.png` into a folder that exists, and return their paths.
 
-    Raises
-    ------
-    OSError
-        If a picture cannot be written.
+    Raises `OSError` if a picture cannot be written.
     """
     paths = [folder / f"{name}.png" for name in figures]
     for path, figure in zip(paths, figures.values(), strict=True):

@@ -65,10 +65,8 @@ def warnings_of(
 def errors_against(truth: FloatArray, posture: FloatArray) -> tuple[FloatArray, FloatArray, int]:
     """Return rms and greatest absolute error (3,) each, and the number of frames compared.
 
-    Parameters
-    ----------
-    truth, posture : array, shape (N, 3)
-        Range in metres, pitch and yaw in degrees; NaN where there is none.
+    `truth`, `posture`, shape (N, 3): range in metres, pitch and yaw in degrees; NaN where there is
+    none.
     """
     error = posture - truth
     error = error[np.isfinite(error).all(axis=1)]

@@ -54,31 +54,20 @@ _HOLE_COLOUR = bgr("#ffb347")
 
 @dataclass(frozen=True, slots=True)
 class SampleFrame:
-    """A sample frame ready for the page.
-
-    Attributes
-    ----------
-    jpeg_base64 : str
-    size_px : (int, int)
-        Width and height as embedded.
-    saturated : float
-        Share of the target points that lie on a saturated pixel; NaN without target points.
-    """
+    """A sample frame ready for the page."""
 
     jpeg_base64: str
+    # Width and height as embedded.
     size_px: tuple[int, int]
+    # Share of the target points that lie on a saturated pixel; NaN without target points.
     saturated: float = float("nan")
 
 
 def choose_pictures(track: Track, source: Path | None = None) -> list[int]:
     """Return rows of the frames worth a picture: refusals, the worst posture, an even spread.
 
-    Parameters
-    ----------
-    track : Track
-    source : Path or None
-        Of a video, those of the spread are at key frames where one is near: others can only be
-        decoded with all frames from there on.
+    `source`: of a video, those of the spread are at key frames where one is near: others can only
+    be decoded with all frames from there on.
     """
     chosen = _refused_rows(track)
     valid = np.flatnonzero(track.valid)
@@ -108,13 +97,7 @@ def choose_samples(track: Track, pictures: list[int]) -> list[int]:
 
 
 def decode_frames(source: Path, track: Track, rows: list[int]) -> dict[int, ImagePlane]:
-    """Decode the frames of some rows again.
-
-    Returns
-    -------
-    pictures : dict
-        Row to BGR picture, shape (height, width, 3); rows that cannot be decoded are absent.
-    """
+    """Decode the frames of some rows again: BGR pictures by row, those absent that cannot be."""
     if source.is_dir():
         return _from_images(images_in(source), track, rows)
     if source.suffix.lower() in IMAGE_SUFFIXES:

@@ -95,10 +95,7 @@ class Card:
 def embedded_json(data: object) -> str:
     """Return JSON that is safe inside a script element.
 
-    Raises
-    ------
-    ValueError
-        If a number is not finite; JSON has no word for it.
+    Raises `ValueError` if a number is not finite; JSON has no word for it.
     """
     text = json.dumps(data, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")

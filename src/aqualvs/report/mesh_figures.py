@@ -68,35 +68,23 @@ _NAMES = ("adaptive filter", "paper's filter")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reflections:
-    """Points that one laser lit in one frame, N of them.
-
-    Attributes
-    ----------
-    frame : int
-    laser : str
-        Its name.
-    in_laser : array, shape (N, 2)
-        Points in `laser`, in metres: x across, y forward.
-    offset : float
-        Distance of the laser's plane from the dome's centre, in metres.
-    working_range : (float, float)
-        Operational range zone, distances from the dome's centre in metres.
-    usable : bool array, shape (N,)
-        Points in that zone.
-    adaptive, paper : bool array, shape (N,)
-        Points that the two filters take for net.
-    every_pixel : bool
-        Whether the points are bright pixels, or centres of returns.
-    """
+    """Points that one laser lit in one frame, N of them."""
 
     frame: int
+    # Its name.
     laser: str
+    # Shape (N, 2): points in `laser`, in metres: x across, y forward.
     in_laser: FloatArray
+    # Distance of the laser's plane from the dome's centre, in metres.
     offset: float
+    # Operational range zone, distances from the dome's centre in metres.
     working_range: tuple[float, float]
+    # Shape (N,): points in that zone.
     usable: BoolArray
+    # Shape (N,): points that the two filters take for net.
     adaptive: BoolArray
     paper: BoolArray
+    # Whether the points are bright pixels, or centres of returns.
     every_pixel: bool = False
 
     @property
@@ -114,15 +102,10 @@ def draw_figures(reflections: Reflections, options: MeshFilterOptions, out: Path
 
     Parameters
     ----------
-    reflections : Reflections
     options : MeshFilterOptions
         Of the paper's filter.
     out : Path
         Folder that exists.
-
-    Returns
-    -------
-    list of Path
 
     Raises
     ------
@@ -363,17 +346,12 @@ _PIXEL_COLUMNS = ("u_px", "v_px", "width_px", "label")
 
 
 class _Counts(NamedTuple):
-    """Reflections of every frame and laser that has any, K of them.
+    """Reflections of every frame and laser that has any, K of them."""
 
-    Attributes
-    ----------
-    frame, laser : int array, shape (K,)
-    n_net, n_other : int array, shape (K,)
-        Labelled net, and anything else.
-    """
-
+    # Shape (K,).
     frame: IntArray
     laser: IntArray
+    # Shape (K,): labelled net, and anything else.
     n_net: IntArray
     n_other: IntArray
 
@@ -391,39 +369,12 @@ def figures(
     """Draw figures 13 and 14 of the paper, and its laser-plane image, from a run's folder.
 
     A run with the threshold detector is shown by all its bright pixels, others by the centres of
-    their returns.
+    their returns. Options are those of `aqualvs figures`, see its `--help`. Returns the paths of
+    what was written.
 
-    Parameters
-    ----------
-    folder : Path
-        Of a finished run.
-    out : Path
-        Folder for the pictures; made if it is not there.
-    echo : callable
-        Takes lines for the user.
-    frame : int, optional
-        The frame; by default the one that shows most of both net and other reflections.
-    laser : str, optional
-        Name of the laser, likewise.
-    target : Path, optional
-        Target file with the parameters of the paper's filter; those of the run if left out.
-    overwrite : bool
-        Whether to replace pictures that this command wrote there before.
-
-    Returns
-    -------
-    list of Path
-        What was written.
-
-    Raises
-    ------
-    SourceError
-        If the folder holds no points, or the rig is not on record.
-    OptionError
-        If the frame or laser has no points, or the run has already dropped what its filter
-        rejected.
-    OutputError
-        If the pictures cannot be written.
+    Raises `SourceError` if the folder holds no points, or the rig is not on record; `OptionError`
+    if the frame or laser has no points, or the run has already dropped what its filter rejected;
+    `OutputError` if the pictures cannot be written.
     """
     check_run_files(folder)
     run, trouble = read_run_file(folder)

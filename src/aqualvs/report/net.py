@@ -24,21 +24,14 @@ Row: TypeAlias = Mapping[str, str]
 
 @dataclass(frozen=True, slots=True)
 class NetTables:
-    """Files on the condition of a net, read from a run's folder.
+    """Files on the condition of a net, read from a run's folder."""
 
-    Attributes
-    ----------
-    stretches, holes : list of mapping
-        Rows of `net.csv` and `holes.csv`, column to cell.
-    facts : mapping
-        Member `aqualvs_net` of `net.geojson`; empty where it is missing.
-    map_base64 : str
-        `net_map.png`; "" where it is missing.
-    """
-
+    # Rows of `net.csv` and `holes.csv`, column to cell.
     stretches: list[Row]
     holes: list[Row]
+    # Member `aqualvs_net` of `net.geojson`; empty where it is missing.
     facts: Mapping[str, Any]
+    # `net_map.png`; "" where it is missing.
     map_base64: str
 
     @property
@@ -49,14 +42,9 @@ class NetTables:
 
 
 def read_net(run_dir: Path) -> tuple[NetTables | None, str]:
-    """Read the state of a net from a run's folder.
+    """Read the state of a net from a run's folder, None where it holds none.
 
-    Returns
-    -------
-    net : NetTables or None
-        None where the folder holds none.
-    trouble : str
-        What is wrong with it, in words; "" if nothing.
+    Returns also what is wrong with it, in words; "" if nothing.
     """
     if not (run_dir / NET_CSV).is_file():
         return None, ""
@@ -100,23 +88,12 @@ def net_cards(net: NetTables | None) -> list[Card]:
 
 @dataclass(frozen=True, slots=True)
 class HolePicture:
-    """Where a hole is to be cut out of the dive's pictures.
+    """Where a hole is to be cut out of the dive's pictures."""
 
-    Attributes
-    ----------
-    number : str
-        As `holes.csv` has it.
-    frame : int
-    middle : (float, float)
-        Column and row in that frame's picture.
-    diameter : float
-        In pixels.
-    """
-
-    number: str
+    number: str  # As `holes.csv` has it.
     frame: int
-    middle: tuple[float, float]
-    diameter: float
+    middle: tuple[float, float]  # Column and row in that frame's picture.
+    diameter: float  # In pixels.
 
 
 def hole_pictures(net: NetTables) -> list[HolePicture]:
@@ -134,11 +111,7 @@ def hole_pictures(net: NetTables) -> list[HolePicture]:
 def net_view(net: NetTables | None, crops: Mapping[str, SampleFrame] = MappingProxyType({})) -> str:
     """Return the section on the net; nothing without one.
 
-    Parameters
-    ----------
-    net : NetTables or None
-    crops : mapping
-        Number of a hole to its picture.
+    `crops`: number of a hole to its picture.
     """
     if net is None:
         return ""

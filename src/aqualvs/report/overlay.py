@@ -35,7 +35,6 @@ def draw_overlay(
         BGR; left as it is.
     points : ScanPoints
         Target points are drawn full in their laser's colour, all others as faint crosses.
-    posture : Posture or Refusal
     rig : Rig
         Gives the lasers' names.
 
@@ -154,10 +153,7 @@ class OverlayWriter(Closing):
     def write(self, image: ImagePlane) -> None:
         """Append a BGR picture of the size given at the start.
 
-        Raises
-        ------
-        ValueError
-            If the picture has another size.
+        Raises `ValueError` if the picture has another size.
         """
         width, height = self._size
         if image.shape != (height, width, 3):

@@ -32,55 +32,42 @@ RESIDUAL_EDGES_MM = np.linspace(-50.0, 50.0, 1001)
 
 @dataclass(frozen=True, slots=True)
 class FramePoints:
-    """Stripe points of one sample frame, M of them.
+    """Stripe points of one sample frame, M of them."""
 
-    Attributes
-    ----------
-    laser, label : integer array, shape (M,)
-    used : bool array, shape (M,)
-        Points that entered the posture: the target points.
-    pixels : array, shape (M, 2)
-    points_in_dome : array, shape (M, 3)
-        Metres.
-    """
-
+    # Shape (M,).
     laser: IntArray
     label: IntArray
+    # Shape (M,): points that entered the posture: the target points.
     used: BoolArray
+    # Shape (M, 2).
     pixels: FloatArray
+    # Shape (M, 3): metres.
     points_in_dome: FloatArray
 
 
 @dataclass(slots=True)
 class PointSummary:
-    """Statistics of all points of a dive for the report; their size does not grow with the dive.
+    """Statistics of all points of a dive for the report; their size does not grow with the dive."""
 
-    Attributes
-    ----------
-    on_target : int array, shape (n_frames, MAX_LASERS)
-        Points that entered the posture, per frame and laser: the target points.
-    labels : int array, shape (MAX_LASERS, len(Label))
-        Points per laser and label over the dive.
-    squares_mm2, n_squares : array, shape (n_frames,)
-        Sum of squared distances of target points from the frame's plane, and their number.
-    quality, residual : int array, shape (MAX_LASERS, bins)
-        Histograms of the target points over `QUALITY_EDGES` and `RESIDUAL_EDGES_MM`.
-    cloud_in_target, cloud_laser : array, shape (K, 3) and (K,)
-        Random target points of the dive, at most 15,000, the same ones every time: right of the
-        foot of the perpendicular from the dome's centre, beyond the target plane, and up, in
-        metres. Those of all frames lie on each other, wherever the vehicle was.
-    samples : dict
-        Frame number to the points of that frame.
-    """
-
+    # Shape (n_frames, MAX_LASERS): points that entered the posture, per frame and laser: the target
+    # points.
     on_target: IntArray
+    # Shape (n_frames,): sum of squared distances of target points from the frame's plane, and their
+    # number.
     squares_mm2: FloatArray
     n_squares: IntArray
+    # Shape (MAX_LASERS, len(Label)): points per laser and label over the dive.
     labels: IntArray = field(default_factory=lambda: _counts(len(Label)))
+    # Shape (MAX_LASERS, bins): histograms of the target points over `QUALITY_EDGES` and
+    # `RESIDUAL_EDGES_MM`.
     quality: IntArray = field(default_factory=lambda: _counts(len(QUALITY_EDGES) - 1))
     residual: IntArray = field(default_factory=lambda: _counts(len(RESIDUAL_EDGES_MM) - 1))
+    # Shape (K, 3) and (K,): random target points of the dive, at most 15,000, the same ones every
+    # time: right of the foot of the perpendicular from the dome's centre, beyond the target plane,
+    # and up, in metres. Those of all frames lie on each other, wherever the vehicle was.
     cloud_in_target: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     cloud_laser: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    # Frame number to the points of that frame.
     samples: dict[int, FramePoints] = field(default_factory=dict)
 
     @property
@@ -101,12 +88,8 @@ def summarize_points(
 ) -> tuple[PointSummary | None, str]:
     """Read a run's points once, in batches: `points.parquet`, else the journal of a killed run.
 
-    Returns
-    -------
-    summary : PointSummary or None
-        None where there are no points that can be read.
-    trouble : str
-        What is wrong, in words; "" if nothing.
+    Returns None where there are no points that can be read; and what is wrong, in words, "" if
+    nothing.
     """
     summary = _empty(track)
     rng = np.random.default_rng(20210126)
@@ -171,10 +154,7 @@ def _batches(run_dir: Path) -> Iterator[dict[str, NDArray[Any]]]:
 def _columns(batch: Any) -> dict[str, NDArray[Any]]:
     """Return the columns that the report needs.
 
-    Raises
-    ------
-    KeyError
-        Naming a column that is absent.
+    Raises `KeyError` naming a column that is absent.
     """
     present = [name for name in _OPTIONAL if name in batch.schema.names]
     return {

@@ -50,38 +50,29 @@ class NoFrameError(SourceError):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Track:
-    """`posture.csv` as arrays, one entry per frame, ordered by frame.
+    """`posture.csv` as arrays, one entry per frame, ordered by frame."""
 
-    Attributes
-    ----------
-    frame : int array, shape (N,)
-    time_s : array, shape (N,)
-    valid : bool array, shape (N,)
-    reason : int array, shape (N,)
-        Index into `reasons`; meaningful where not valid.
-    reasons : tuple of str
-        As the file spells them.
-    posture, sigma : array, shape (N, 3)
-        Range in metres, pitch and yaw in degrees; NaN where not valid. `sigma` is what the noise of
-        one frame makes.
-    sigma_total : array, shape (N, 3)
-        By noise and rig together; that of the noise in runs of older versions.
-    n_points, n_water : array, shape (N,)
-        NaN where the file has none.
-    first_field : {"top", "bottom"} or None
-        Field of even frames of an interlaced camera; None where frames are whole pictures.
-    """
-
+    # Shape (N,).
     frame: IntArray
+    # Shape (N,).
     time_s: FloatArray
+    # Shape (N,).
     valid: BoolArray
+    # Shape (N,): index into `reasons`; meaningful where not valid.
     reason: IntArray
+    # As the file spells them.
     reasons: tuple[str, ...]
+    # Shape (N, 3): range in metres, pitch and yaw in degrees; NaN where not valid. `sigma` is what
+    # the noise of one frame makes.
     posture: FloatArray
     sigma: FloatArray
+    # Shape (N, 3): by noise and rig together; that of the noise in runs of older versions.
     sigma_total: FloatArray
+    # Shape (N,): NaN where the file has none.
     n_points: FloatArray
     n_water: FloatArray
+    # Field of even frames of an interlaced camera; None where frames are whole
+    # pictures.
     first_field: Field | None = None
 
     def __len__(self) -> int:
@@ -105,10 +96,8 @@ def read_run_file(run_dir: Path) -> tuple[dict[str, Any], str]:
 def read_track(path: Path) -> Track:
     """Read a `posture.csv`; rows that are damaged or cut short are left out.
 
-    Raises
-    ------
-    SourceError
-        If the file is missing, holds no frame, or holds something that is no number.
+    Raises `SourceError` if the file is missing, holds no frame, or holds something that is no
+    number.
     """
     columns, texts = _read_columns(path, _NUMBERS, ("valid", "reason", "field"))
     order = np.argsort(columns["frame"], kind="stable")
@@ -150,7 +139,6 @@ def read_truth(path: Path, track: Track) -> FloatArray:
     ----------
     path : Path
         As `aqualvs.results.summary.read_truth` takes it.
-    track : Track
 
     Returns
     -------
@@ -173,13 +161,8 @@ def read_truth(path: Path, track: Track) -> FloatArray:
 def read_bare(run_dir: Path, track: Track) -> tuple[FloatArray | None, str]:
     """Read the posture that a bare-lens camera gives on the same pixels, if the run has it.
 
-    Returns
-    -------
-    posture : array, shape (N, 3), or None
-        As `Track.posture`, on the frames of `track`.
-    trouble : str
-        What is wrong with the file, in words; "" if nothing is, or the run was killed before it
-        had a row.
+    Returns it as `Track.posture`, shape (N, 3), on the frames of `track`; and what is wrong with
+    the file, in words, "" if nothing is, or the run was killed before it had a row.
     """
     path = run_dir / POSTURE_BARE_CSV
     if not path.is_file() or path.stat().st_size == 0:
@@ -288,23 +271,12 @@ def _numbers(column: Any) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class LaserFacts:
-    """A laser as the report needs it.
-
-    Attributes
-    ----------
-    name : str
-    normal : array, shape (3,)
-        Unit normal in `dome`; NaN where the file has none.
-    offset : float
-        Metres.
-    bent : bool
-        Whether the plane only fits a bent sheet.
-    """
+    """A laser as the report needs it."""
 
     name: str
-    normal: FloatArray
-    offset: float
-    bent: bool = False
+    normal: FloatArray  # Shape (3,): unit normal in `dome`; NaN where the file has none.
+    offset: float  # Metres.
+    bent: bool = False  # Whether the plane only fits a bent sheet.
 
     @classmethod
     def unknown(cls, index: int) -> "LaserFacts":

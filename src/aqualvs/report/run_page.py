@@ -56,46 +56,33 @@ from aqualvs.text import LABEL_COLOURS, LABEL_WORDS, clock, signed
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Material:
-    """Content of a run's report.
+    """Content of a run's report."""
 
-    Attributes
-    ----------
-    title : str
-        The dive's name.
-    run : mapping
-        Content of `run.yaml`, empty where it is missing.
-    track : Track
-    truth, bare : array, shape (N, 3), or None
-        On the frames of the track: range in metres, pitch and yaw in degrees.
-    points : PointSummary or None
-    lasers : list of LaserFacts
-        At least as many as have points.
-    picture_rows, sample_rows : list of int
-        Rows of the track with a picture, and in the laser-plane view.
-    pictures : dict
-        Row to picture, where the source could be decoded again.
-    no_pictures : str
-        Why pictures are missing; "" where none is.
-    net : NetTables or None
-        The state of the net, where it was evaluated.
-    crops : dict
-        Number of a hole to its picture.
-    warnings : list of str
-    """
-
+    # The dive's name.
     title: str
+    # Content of `run.yaml`, empty where it is missing.
     run: Mapping[str, Any]
+
     track: Track
+    # Shape (N, 3): on the frames of the track: range in metres, pitch and yaw in degrees.
     truth: FloatArray | None
     bare: FloatArray | None
+
     points: PointSummary | None
+    # At least as many as have points.
     lasers: list[LaserFacts]
+    # Rows of the track with a picture, and in the laser-plane view.
     picture_rows: list[int]
     sample_rows: list[int]
+    # Row to picture, where the source could be decoded again.
     pictures: dict[int, SampleFrame]
+    # Why pictures are missing; "" where none is.
     no_pictures: str
+    # The state of the net, where it was evaluated.
     net: NetTables | None
+    # Number of a hole to its picture.
     crops: dict[str, SampleFrame]
+
     warnings: list[str]
 
     @property
@@ -112,10 +99,7 @@ class Material:
 def gather(run_dir: Path, truth: Path | None) -> Material:
     """Read a run folder; only `posture.csv` must be there.
 
-    Raises
-    ------
-    SourceError
-        If `posture.csv`, or the truth, cannot be read or holds no frame.
+    Raises `SourceError` if `posture.csv`, or the truth, cannot be read or holds no frame.
     """
     check_run_files(run_dir)
     run, trouble = read_run_file(run_dir)

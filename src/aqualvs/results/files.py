@@ -122,10 +122,7 @@ _REMEDIES = {
 def writing(path: Path) -> Iterator[None]:
     """Turn a fault of the operating system while writing to `path` into one line.
 
-    Raises
-    ------
-    OutputError
-        In place of any `OSError`.
+    Raises `OutputError` in place of any `OSError`.
     """
     try:
         yield
@@ -136,10 +133,7 @@ def writing(path: Path) -> Iterator[None]:
 def replace_text(path: Path, text: str) -> None:
     """Write a text file, whole or not at all: the old one stays until the new one is complete.
 
-    Raises
-    ------
-    OSError
-        As the system says it.
+    Raises `OSError` as the system says it.
     """
     # A name of its own: two processes may write the same file at the same moment.
     draft = path.with_name(f"{path.name}.{uuid.uuid4().hex[:8]}.part")
@@ -153,12 +147,8 @@ def replace_text(path: Path, text: str) -> None:
 def read_json(path: Path) -> Any:
     """Return the content of a JSON file.
 
-    Raises
-    ------
-    OSError
-        As the system says it.
-    ValueError
-        If it is no JSON in UTF-8, or nested too deeply.
+    Raises `OSError` as the system says it. Raises `ValueError` if it is no JSON in UTF-8, or nested
+    too deeply.
     """
     try:
         return json.loads(path.read_text(encoding="utf-8"))

@@ -16,7 +16,6 @@ import contextlib
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
@@ -246,12 +245,7 @@ class RunOutputs:
         """Return the writer."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        fault: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, _kind: object, fault: BaseException | None, _trace: object) -> None:
         """Complete the folder: `points.parquet` and `points.ply` replace the journal."""
         if isinstance(fault, OutputError):
             self._leave_as_it_is(fault)
@@ -324,10 +318,7 @@ def prepare_folder(folder: Path, *, overwrite: bool) -> Claim:
 def claim_run(folder: Path, names: Sequence[str], *, overwrite: bool) -> Claim:
     """Return a claim on files of a run's folder, which all commands share that write to it.
 
-    Raises
-    ------
-    OutputError
-        As `Claim` does.
+    Raises `OutputError` as `Claim` does.
     """
     paths = [folder / name for name in names]
     known = [folder / name for name in RUN_FILES] if _is_run(folder) else []
@@ -344,27 +335,17 @@ def _is_run(folder: Path) -> bool:
 def check_run_files(folder: Path) -> None:
     """Refuse a folder with a pipe or a device in the place of a run's file.
 
-    Raises
-    ------
-    SourceError
-        With its path.
+    Raises `SourceError` with its path.
     """
     for name in RUN_FILES:
         refuse_special(folder / name)
 
 
 def recover(folder: Path) -> bool:
-    """Complete the folder of a run that was killed.
+    """Complete the folder of a run that was killed; return False if there was nothing left to do.
 
-    Returns
-    -------
-    recovered : bool
-        False if there was nothing left to do.
-
-    Raises
-    ------
-    OutputError
-        If `folder` holds no run, the run is still under way, or the folder cannot be written.
+    Raises `OutputError` if `folder` holds no run, the run is still under way, or the folder cannot
+    be written.
     """
     if not (folder / POSTURE_CSV).is_file():
         raise OutputError(f"{folder}: holds no run (no {POSTURE_CSV}); give the folder of a run")
@@ -383,10 +364,7 @@ def recover(folder: Path) -> bool:
 def _new_points_stream(folder: Path) -> PointsStream:
     """Begin the journal of a run.
 
-    Raises
-    ------
-    OutputError
-        If another run has started one since `prepare_folder`.
+    Raises `OutputError` if another run has started one since `prepare_folder`.
     """
     try:
         with locked_folder(folder):

@@ -49,24 +49,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class NetResult:
-    """Result of a net's evaluation, as written to its files.
+    """Result of a net's evaluation, as written to its files."""
 
-    Attributes
-    ----------
-    wall : UnrolledNet
-        Stretches and holes on the unrolled net.
-    summary : dict
-        The same in numbers, as `net.geojson` has it.
-    lines : list of str
-        The summary in words.
-    log : LaidLog or None
-        The vehicle's log.
-    """
-
-    wall: "UnrolledNet"
-    summary: dict[str, Any]
-    lines: list[str]
-    log: "LaidLog | None"
+    wall: "UnrolledNet"  # Stretches and holes on the unrolled net.
+    summary: dict[str, Any]  # The same in numbers, as `net.geojson` has it.
+    lines: list[str]  # The summary in words.
+    log: "LaidLog | None"  # The vehicle's log.
 
 
 class NetPass:
@@ -151,10 +139,7 @@ class NetPass:
 def write_net_files(folder: Path, wall: "UnrolledNet", facts: dict[str, Any]) -> None:
     """Write tables first, pictures last.
 
-    Raises
-    ------
-    OSError
-        As the system says it.
+    Raises `OSError` as the system says it.
     """
     from aqualvs.nets.map import draw_map
     from aqualvs.nets.tables import (
@@ -230,10 +215,7 @@ def read_run(run_folder: str | Path) -> Iterator[Scan]:
 def check_stored(run_folder: Path) -> None:
     """Raise if `read_run` could not read a run.
 
-    Raises
-    ------
-    SourceError
-        As `read_run`.
+    Raises `SourceError` as `read_run` does.
     """
     check_run_files(run_folder)
     next(_posture_rows(run_folder / POSTURE_CSV), None)

@@ -12,7 +12,6 @@ import os
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
@@ -72,12 +71,9 @@ class PointsStream:
         self._closed = False
 
     def write(self, *scans: Scan) -> Any:
-        """Append the points of frames, all or none; those without points leave no trace.
+        """Append the points of frames, all or none, and return them as a record batch.
 
-        Returns
-        -------
-        batch : pyarrow.RecordBatch or None
-            What was appended.
+        Frames without points leave no trace.
         """
         if not any(len(scan.points) for scan in scans):
             return None
@@ -112,12 +108,7 @@ class PointsStream:
         """Return the writer."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        fault: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, _kind: object, fault: BaseException | None, _trace: object) -> None:
         """Finish the stream, or leave it as it is where writing failed."""
         if isinstance(fault, OSError):
             self.abandon()
@@ -165,10 +156,7 @@ def read_points_stream(path: Path) -> Iterator[Any]:
 def check_idle(path: Path) -> None:
     """Raise if another process is still writing this journal.
 
-    Raises
-    ------
-    OutputError
-        If it is.
+    Raises `OutputError` if it is.
     """
     if is_locked(path):
         raise OutputError(
@@ -202,7 +190,6 @@ class PointsExport:
 
     Parameters
     ----------
-    points_parquet : Path
     points_ply : Path
         Binary PLY: x, y, z in `dome` in metres, red, green, blue by laser; of the points that
         entered a posture.
@@ -295,7 +282,6 @@ def export_points(points_stream: Path, points_parquet: Path, points_ply: Path) -
     ----------
     points_stream : Path
         May lack its end; what follows the last whole batch is left out.
-    points_parquet, points_ply : Path
 
     Returns
     -------

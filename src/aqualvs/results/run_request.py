@@ -47,21 +47,14 @@ class Status(StrEnum):
 
 @dataclass(slots=True)
 class RunFile:
-    """Content of `run.yaml`.
-
-    Attributes
-    ----------
-    path : Path
-    source, rig, options : mapping
-        Facts that do not change during the run, ready for YAML.
-    started : str
-        ISO 8601 with the time zone.
-    """
+    """Content of `run.yaml`."""
 
     path: Path
+    # Facts that do not change during the run, ready for YAML.
     source: Mapping[str, Any]
     rig: Mapping[str, Any]
     options: Mapping[str, Any]
+    # ISO 8601 with the time zone.
     started: str = field(default_factory=lambda: now())
 
     def write(
@@ -69,10 +62,7 @@ class RunFile:
     ) -> None:
         """Write the file, whole or not at all.
 
-        Raises
-        ------
-        OSError
-            As the system says it.
+        Raises `OSError` as the system says it.
         """
         content: dict[str, Any] = {"status": status.value, "started": self.started}
         if status is not Status.RUNNING:
@@ -99,10 +89,7 @@ def write_yaml(path: Path, content: Mapping[str, Any]) -> None:
 def read_run_yaml(folder: Path) -> dict[str, Any]:
     """Return the content of a run's `run.yaml`.
 
-    Raises
-    ------
-    SourceError
-        If it cannot be read, or holds no keys.
+    Raises `SourceError` if it cannot be read, or holds no keys.
     """
     path = folder / "run.yaml"
     content = read_yaml(path, "the run.yaml of a run", SourceError)
@@ -132,27 +119,19 @@ def now() -> str:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Water:
-    """Medium as stated by the user; all None leaves the rig's own index.
+    """Medium as stated by the user; all None leaves the rig's own index."""
 
-    Attributes
-    ----------
-    n_water : float or None
-        Refractive index relative to vacuum.
-    temperature_c, salinity : float or None
-        Degrees Celsius and per mille; only together.
-    """
-
+    # Refractive index relative to vacuum.
     n_water: float | None = None
+    # Degrees Celsius and per mille; only together.
     temperature_c: float | None = None
     salinity: float | None = None
 
     def applied_to(self, rig: Rig) -> Rig:
         """Return the rig in this water.
 
-        Raises
-        ------
-        OptionError
-            If the values contradict each other or lie outside of what water can be.
+        Raises `OptionError` if the values contradict each other or lie outside of what water can
+        be.
         """
         seawater = (self.temperature_c, self.salinity)
         if self.n_water is not None:
@@ -179,10 +158,7 @@ class FrameWindow:
     def parse(cls, text: str) -> "FrameWindow":
         """Return the window that "A:B", "A:" or ":B" means.
 
-        Raises
-        ------
-        OptionError
-            If the text is none of these, or the window is empty.
+        Raises `OptionError` if the text is none of these, or the window is empty.
         """
         first, colon, stop = text.partition(":")
         remedy = "give A:B with frame numbers from 0, such as 100:200, 100: or :200"
@@ -304,12 +280,8 @@ def scanner_dict(options: ScannerOptions) -> dict[str, Any]:
 def prepared_rig(path: Path | None, water: Water, *, no_dome: bool) -> Rig:
     """Load a rig and put it into the water it is used in.
 
-    Raises
-    ------
-    RigError
-        If the file cannot be used, or the rig has no lasers.
-    OptionError
-        If there is no path, or the water makes no sense.
+    Raises `RigError` if the file cannot be used, or the rig has no lasers. Raises `OptionError` if
+    there is no path, or the water makes no sense.
     """
     if path is None:
         raise OptionError("--rig: missing; give the rig file (only a recording brings its own)")
@@ -319,10 +291,7 @@ def prepared_rig(path: Path | None, water: Water, *, no_dome: bool) -> Rig:
 def in_water(rig: Rig, water: Water, *, no_dome: bool) -> Rig:
     """Put a rig into the water it is used in.
 
-    Raises
-    ------
-    OptionError
-        If the water makes no sense.
+    Raises `OptionError` if the water makes no sense.
     """
     rig = water.applied_to(rig)
     return replace(rig, housing=None) if no_dome else rig
@@ -331,10 +300,7 @@ def in_water(rig: Rig, water: Water, *, no_dome: bool) -> Rig:
 def check_fits(source: FrameSource, rig: Rig) -> None:
     """Raise if the pictures are not of the size that the rig was calibrated for.
 
-    Raises
-    ------
-    SourceError
-        If they are not.
+    Raises `SourceError` if they are not.
     """
     if source.size_px != rig.size_px:
         have, need = ("x".join(map(str, size)) for size in (source.size_px, rig.size_px))
@@ -361,10 +327,7 @@ def source_dict(source: FrameSource) -> dict[str, Any]:
 def checked_index(n: float, option: str) -> float:
     """Return an index that the user gave by an option.
 
-    Raises
-    ------
-    OptionError
-        If it is that of no medium one dives in.
+    Raises `OptionError` if it is that of no medium one dives in.
     """
     # Air is 1.0003, the densest brine about 1.39.
     index_limits = (1.0, 1.5)

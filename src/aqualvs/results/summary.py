@@ -36,23 +36,15 @@ class Deviation:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TruthComparison:
-    """Deviation of a run's postures from the truth.
+    """Deviation of a run's postures from the truth."""
 
-    Attributes
-    ----------
-    n_compared : int
-        Frames with a posture and a truth.
-    n_missed : int
-        Frames with a truth but without a posture.
-    range_percent : Deviation
-        Of the range, in percent of the true range.
-    pitch_deg, yaw_deg : Deviation
-        In degrees.
-    """
-
+    # Frames with a posture and a truth.
     n_compared: int
+    # Frames with a truth but without a posture.
     n_missed: int
+    # Of the range, in percent of the true range.
     range_percent: Deviation
+    # In degrees.
     pitch_deg: Deviation
     yaw_deg: Deviation
 
@@ -111,18 +103,11 @@ def compare_with_truth(posture_csv: Path, truth_csv: Path) -> TruthComparison:
 def read_truth(path: Path) -> dict[int, tuple[float, float, float]]:
     """Return range (m), pitch and yaw (deg) by frame, of rows where all are finite.
 
-    Parameters
-    ----------
-    path : Path
-        Columns `frame`, `range_m` or `range_mm`, `pitch_deg`, `yaw_deg`. Where a row has
-        `visible_fit_range_mm`, `visible_fit_pitch_deg` and `visible_fit_yaw_deg` as well, these
-        count: the plane through what the lasers light. Light falls on the front of a net's twine,
-        a radius before the net's own plane. Other columns are ignored.
-
-    Raises
-    ------
-    SourceError
-        If the file cannot be read or lacks a column.
+    `path`: columns `frame`, `range_m` or `range_mm`, `pitch_deg`, `yaw_deg`. Where a row has
+    `visible_fit_range_mm`, `visible_fit_pitch_deg` and `visible_fit_yaw_deg` as well, these count:
+    the plane through what the lasers light. Light falls on the front of a net's twine, a radius
+    before the net's own plane. Other columns are ignored. Raises `SourceError` if the file cannot
+    be read or lacks a column.
     """
     rows = _rows(path)
     range_column = _range_column(path, rows)
@@ -190,25 +175,17 @@ class RunSummary:
     """Statistics over the frames of a run: refusals, ranges, agreement of the lasers, the net.
 
     Summaries of consecutive parts of a dive add up to that of the dive: `save` and `extend`.
-
-    Attributes
-    ----------
-    refused : counter
-        Frames without posture, by reason.
-    ranges : array of float
-        Metres, one for each frame; NaN without a posture.
-    agreement : LaserAgreement or None
-        Monitor of the lasers, if they are monitored.
-    net_check : NetCheck or None
-        Comparison of the net with the target file's, if the file describes one.
-    warnings : list of str
-        Of the source and the rig, before anything is measured.
     """
 
+    # Frames without posture, by reason.
     refused: Counter[str] = field(default_factory=Counter)
+    # Metres, one for each frame; NaN without a posture.
     ranges: "array[float]" = field(default_factory=lambda: array("d"))
+    # Monitor of the lasers, if they are monitored.
     agreement: LaserAgreement | None = None
+    # Comparison of the net with the target file's, if the file describes one.
     net_check: NetCheck | None = None
+    # Of the source and the rig, before anything is measured.
     warnings: list[str] = field(default_factory=list)
 
     @property
@@ -240,10 +217,7 @@ class RunSummary:
     def save(self, path: Path) -> None:
         """Write the summary of a part of a dive to a file, in NumPy's npz format.
 
-        Raises
-        ------
-        OSError
-            As the system says it.
+        Raises `OSError` as the system says it.
         """
         stored: dict[str, NDArray[Any]] = {
             "ranges": np.asarray(self.ranges),
@@ -259,10 +233,7 @@ class RunSummary:
     def extend(self, path: Path) -> None:
         """Add the frames of a part of the dive, as `save` has written them.
 
-        Raises
-        ------
-        OSError, ValueError
-            If the file cannot be read.
+        Raises `OSError` or `ValueError` if the file cannot be read.
         """
         with np.load(path) as file:
             stored: dict[str, NDArray[Any]] = {name: file[name] for name in file.files}

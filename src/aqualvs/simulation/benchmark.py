@@ -30,7 +30,7 @@ from aqualvs.optics.solved import with_exact_numbers
 from aqualvs.simulation.cameras import expose, spread
 from aqualvs.simulation.dive import frames_of_picture
 from aqualvs.simulation.render import Renderer, SceneAt
-from aqualvs.simulation.scenario import Scenario, parse_scenario
+from aqualvs.simulation.scenario import Scenario, packaged, parse_scenario
 from aqualvs.simulation.scenarios import example_rig
 from aqualvs.simulation.scene import Scene, SurfaceKind
 from aqualvs.simulation.truth import LitPoints, visible_fit
@@ -172,148 +172,14 @@ LEVELS: Mapping[str, str] = MappingProxyType(
 )
 """Levels of difficulty, each with one line about it."""
 
-_COURSES: dict[str, dict[str, Any]] = {
-    "near": {
-        "range_mm": {"values": [310, 420, 560, 650], "sway": 4, "period_s": 2.3},
-        "pitch_deg": {"values": [6, -4, 8], "sway": 1.5, "period_s": 3.1},
-        "yaw_deg": {"values": [-10, 12, -4], "sway": 1.5, "period_s": 2.7},
-        "slide_x_mm": [0, 90, 200],
-        "slide_z_mm": [0, -15, 20],
-    },
-    "far": {
-        "range_mm": {"values": [500, 800, 1250, 900], "sway": 6, "period_s": 2.9},
-        "pitch_deg": {"values": [-5, 6, -2], "sway": 1, "period_s": 3.1},
-        "yaw_deg": {"values": [8, -12, 5], "sway": 1, "period_s": 2.3},
-        "slide_x_mm": [0, -120, -260],
-        "slide_z_mm": [0, 30, -20],
-    },
-    "swing": {
-        "range_mm": {"values": [520, 660, 580], "sway": 5, "period_s": 2.6},
-        "pitch_deg": {"values": [-14, 15, -8, 10]},
-        "yaw_deg": {"values": [24, -25, 14, -20]},
-        "slide_x_mm": [0, 60, 20],
-        "slide_z_mm": [0, 40, 90],
-    },
-}
-_COURSES["wall"] = _COURSES["swing"]
-
-_TARGETS: dict[str, dict[str, Any]] = {
-    "near": {"net": {"bar_mm": 25, "twine_mm": 2.2, "roll_deg": 3}},
-    "far": {"net": {"mesh": "square", "bar_mm": 30, "twine_mm": 2.6, "roll_deg": 12}},
-    "swing": {"net": {"mesh": "hexagon", "bar_mm": 18, "twine_mm": 2.0, "roll_deg": 20}},
-    "wall": {"walls": [{"tile_mm": 150}]},
-}
-
-_MURKY: dict[str, Any] = {
-    "attenuation_per_m": [2.0, 1.25, 1.6],
-    "veil": [0.115, 0.235, 0.165],
-    "sheet_scatter_per_m": 1.5,
-    "forward_scatter": 0.16,
-    "halo_px": 12,
-    "snow": 1500,
-}
-_HAZY: dict[str, Any] = {
-    "attenuation_per_m": [1.3, 0.75, 1.0],
-    "veil": [0.095, 0.22, 0.165],
-    "sheet_scatter_per_m": 0.8,
-    "forward_scatter": 0.10,
-    "halo_px": 11,
-    "snow": 900,
-}
-_SUN: dict[str, Any] = {"caustics": 0.65, "glare": 0.5, "ambient": [0.50, 0.82, 0.78]}
-_STRONG_SUN: dict[str, Any] = {"caustics": 0.9, "glare": 1.0, "ambient": [0.8, 1.3, 1.2]}
-# Overexposed: half of a wall is at full scale.
-_BLINDING_SUN: dict[str, Any] = {"caustics": 1.0, "glare": 1.0, "ambient": [1.2, 2.0, 1.9]}
-
-_OVER: dict[str, dict[str, dict[str, Any]]] = {
-    "clear": {"near": {}, "far": {}, "swing": {}, "wall": {}},
-    "turbid": {"near": {"water": _MURKY}, "far": {"water": _MURKY}, "wall": {"water": _HAZY}},
-    "sun": {
-        "near": {"water": _STRONG_SUN, "walls": [{"behind_mm": 200}]},
-        "far": {"water": _STRONG_SUN},
-        "swing": {"water": _SUN},
-        "wall": {"water": _BLINDING_SUN},
-    },
-    "fouled": {
-        "near": {"net": {"fouling": 0.6, "growth": 2.5}, "walls": [{"behind_mm": 200}]},
-        "far": {"net": {"fouling": 0.45, "growth": 1.5}},
-        "swing": {"net": {"fouling": 0.6, "growth": 2.0}},
-    },
-    "folded": {
-        "near": {
-            "net": {
-                "folds": [
-                    {"direction_deg": 10, "height_mm": -24, "width_mm": 45, "every_mm": 90},
-                ]
-            }
-        },
-        "far": {
-            "net": {
-                "folds": [
-                    {"direction_deg": -15, "height_mm": -40, "width_mm": 75, "every_mm": 150},
-                    {"direction_deg": 60, "height_mm": -15, "width_mm": 60, "every_mm": 120},
-                ]
-            }
-        },
-        "swing": {
-            "net": {
-                "folds": [
-                    {"direction_deg": 35, "height_mm": -30, "width_mm": 50, "every_mm": 100},
-                ]
-            }
-        },
-    },
-    "crowded": {
-        "near": {
-            "net": {"bar_mm": 30, "holes_mm": [[60, 40, 35]]},
-            "walls": [{"behind_mm": 450, "yaw_deg": 4, "tile_mm": 150}],
-            "fish": 4,
-            "bubbles": 60,
-        },
-        "far": {
-            "net": {"fouling": 0.1, "missing": 0.05},
-            "walls": [{"behind_mm": 250, "pitch_deg": -5}],
-            "boxes": [{"centre_mm": [330, 120, -60], "heading_deg": 12}],
-            "fish": 5,
-            "bubbles": 40,
-            "water": {"snow": 300},
-        },
-        "swing": {
-            "net": {"fouling": 0.15, "holes_mm": [[-90, 0, 50], [120, -60, 40]]},
-            "boxes": [{"centre_mm": [-260, 220, -80], "heading_deg": -20}],
-            "fish": 4,
-            "bubbles": 80,
-        },
-    },
-    "empty": {
-        "open": {"fish": 3, "bubbles": 25, "water": {"snow": 600}},
-        "dark": {
-            "motion": _COURSES["near"],
-            "net": {"bar_mm": 25, "twine_mm": 2.2, "fouling": 0.3},
-            "water": _SUN,
-            "lasers_on": False,
-        },
-    },
-}
-
 
 @dataclass(frozen=True, slots=True)
 class BenchmarkDive:
-    """A dive of the set.
+    """A dive of the set."""
 
-    Attributes
-    ----------
-    name : str
-        `LEVEL_COURSE`; the name of its folder and of its row in scores.
-    level : str
-        One of `LEVELS`.
-    scenario : Scenario
-        Scenario to render.
-    """
-
-    name: str
-    level: str
-    scenario: Scenario
+    name: str  # `LEVEL_COURSE`; the name of its folder and of its row in scores.
+    level: str  # One of `LEVELS`.
+    scenario: Scenario  # Scenario to render.
 
     def shortened(self, n_frames: int) -> "BenchmarkDive":
         """Return the same dive in fewer frames, spread over all of its time."""
@@ -354,10 +220,11 @@ def _definitions() -> list[tuple[str, str, dict[str, Any]]]:
     """Return name, level and scenario mapping of every dive, seeds included."""
     found: list[tuple[str, str, dict[str, Any]]] = []
     duration_s = 5.0
-    for level, courses in _OVER.items():
+    parts = packaged("benchmark.yaml")
+    for level, courses in parts["levels"].items():
         for course, over in courses.items():
-            content = _laid_over(_TARGETS.get(course, {}), over)
-            content["motion"] = content.get("motion", _COURSES.get(course, {}))
+            content = _laid_over(parts["targets"].get(course, {}), over)
+            content["motion"] = content.get("motion", parts["courses"].get(course, {}))
             timing = {"duration_s": duration_s, "fps": N_FRAMES / duration_s}
             seed = 1000 + len(found)
             found.append((f"{level}_{course}", level, {**timing, "seed": seed, **content}))
@@ -404,8 +271,6 @@ def render_benchmark_dive(
 
     Parameters
     ----------
-    dive : BenchmarkDive
-        Dive to render.
     renderer : Renderer
         For `benchmark_rig()`, with any shutter; of an interlaced one each field is a frame.
     folder : Path

@@ -176,21 +176,11 @@ _DOME_FRAME = "dome (origin at the dome's centre, x right, y forward, z up), mm"
 
 @dataclass(frozen=True, slots=True)
 class Marked:
-    """Panel with markers, in a frame of its own.
+    """Panel with markers, in a frame of its own."""
 
-    Attributes
-    ----------
-    name : str
-        Of its plane.
-    panel : Panel
-        In that frame, not yet in `dome`.
-    prints : MarkerPrint
-        Its markers.
-    """
-
-    name: str
-    panel: Panel
-    prints: MarkerPrint
+    name: str  # Of its plane.
+    panel: Panel  # In that frame, not yet in `dome`.
+    prints: MarkerPrint  # Its markers.
 
     def corners(self) -> FloatArray:
         """Return the corners of its markers (M, 4, 3) in OpenCV's order, in metres."""

@@ -79,21 +79,11 @@ Rgb = NDArray[np.float32]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Drift:
-    """Drift of a control loop: a slow swing and a faster, smaller one.
+    """Drift of a control loop: a slow swing and a faster, smaller one."""
 
-    Attributes
-    ----------
-    swing : float
-        Relative amplitude of the gain, 0.1 for 10 %.
-    period_s : float
-        Of the slow swing, in seconds.
-    phase : float
-        Of the slow swing at time 0, in turns.
-    """
-
-    swing: float = 0.0
-    period_s: float = 10.0
-    phase: float = 0.0
+    swing: float = 0.0  # Relative amplitude of the gain, 0.1 for 10 %.
+    period_s: float = 10.0  # Of the slow swing, in seconds.
+    phase: float = 0.0  # Of the slow swing at time 0, in turns.
 
     def at(self, t: float) -> float:
         """Return the factor on the gain at a time in seconds."""
@@ -104,65 +94,44 @@ class Drift:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Development:
-    """Processing between the lens and the recorder of a camera that is not ideal.
+    """Processing between the lens and the recorder of a camera that is not ideal."""
 
-    Attributes
-    ----------
-    lamp : (float, float, float)
-        Radiance of a white surface in the light of the camera's own lamps, which is even over the
-        whole view and added to the daylight of the water.
-    defocus_px : float
-        Standard deviation of the blur of lens and pixels, in pixels.
-    flare : float
-        Share of the light that the lens spreads over a halo.
-    flare_px : float
-        Standard deviation of that halo, in pixels.
-    exposure : float
-        Mean grey (0 to 1, linear) that automatic exposure aims at.
-    gains : (float, float)
-        Least and greatest gain of automatic exposure.
-    exposure_drift, red_drift, blue_drift : Drift
-        Drift of the overall gain and of the balance of red and of blue.
-    white_balance : float
-        Strength of automatic white balance towards a grey mean of the picture, 0 to 1.
-    read_noise : float
-        Standard deviation in the dark, of full scale at gain 1.
-    shot_noise : float
-        Variance of the noise per unit of light, of full scale squared at gain 1.
-    mosaic : bool
-        One colour a pixel (Bayer, red top left), the others interpolated between neighbours.
-    gamma : float
-        Grey level = light**(1 / gamma), before `contrast`.
-    contrast : float
-        Strength of an S curve over that, 0 to 1: darker shadows, lights that reach white earlier.
-    black : float
-        Grey level of no light, of full scale.
-    sharpening : float
-        Strength of the unsharp mask on luma.
-    sharpening_px : (float, float)
-        Its standard deviations along x and y, in pixels; 0 leaves a direction alone.
-    chroma_px : (float, float)
-        Blur of chroma along x and y, in pixels: noise reduction, or bandwidth.
-    """
-
+    # Radiance of a white surface in the light of the camera's own lamps, which is even over the
+    # whole view and added to the daylight of the water.
     lamp: Vector = (0.0, 0.0, 0.0)
+    # Standard deviation of the blur of lens and pixels, in pixels.
     defocus_px: float = 0.75
+    # Share of the light that the lens spreads over a halo.
     flare: float = 0.02
+    # Standard deviation of that halo, in pixels.
     flare_px: float = 12.0
+    # Mean grey (0 to 1, linear) that automatic exposure aims at.
     exposure: float = 0.22
+    # Least and greatest gain of automatic exposure.
     gains: tuple[float, float] = (0.25, 4.0)
+    # Drift of the overall gain and of the balance of red and of blue.
     exposure_drift: Drift = Drift()
     red_drift: Drift = Drift()
     blue_drift: Drift = Drift()
+    # Strength of automatic white balance towards a grey mean of the picture, 0 to 1.
     white_balance: float = 0.6
+    # Standard deviation in the dark, of full scale at gain 1.
     read_noise: float = 0.004
+    # Variance of the noise per unit of light, of full scale squared at gain 1.
     shot_noise: float = 1.5e-4
+    # One colour a pixel (Bayer, red top left), the others interpolated between neighbours.
     mosaic: bool = True
+    # Grey level = light**(1 / gamma), before `contrast`.
     gamma: float = 2.0
+    # Strength of an S curve over that, 0 to 1: darker shadows, lights that reach white earlier.
     contrast: float = 0.0
+    # Grey level of no light, of full scale.
     black: float = 0.0
+    # Strength of the unsharp mask on luma.
     sharpening: float = 0.0
+    # Its standard deviations along x and y, in pixels; 0 leaves a direction alone.
     sharpening_px: tuple[float, float] = (1.0, 1.0)
+    # Blur of chroma along x and y, in pixels: noise reduction, or bandwidth.
     chroma_px: tuple[float, float] = (0.0, 0.0)
 
     def develop(
@@ -240,29 +209,19 @@ class Development:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SimulatedCamera:
-    """Camera for simulated pictures.
+    """Camera for simulated pictures."""
 
-    Attributes
-    ----------
-    name : str
-        Name for `aqualvs simulate --camera`.
-    about : str
-        One line for lists.
-    filters : ColourFilters
-        Response of its sensor to daylight and lasers.
-    development : Development or None
-        None uses the scene's own `CameraSensor` only.
-    recording : Compression
-        Compression of its videos.
-    still_quality : int or None
-        JPEG quality (0 to 100) of its single pictures; None writes them as PNG.
-    """
-
+    # Name for `aqualvs simulate --camera`.
     name: str
+    # One line for lists.
     about: str
+    # Response of its sensor to daylight and lasers.
     filters: ColourFilters = COLOUR_BALANCED
+    # None uses the scene's own `CameraSensor` only.
     development: Development | None = None
+    # Compression of its videos.
     recording: Compression = field(default_factory=Compression)
+    # JPEG quality (0 to 100) of its single pictures; None writes them as PNG.
     still_quality: int | None = None
 
     def light(self, scene: Scene) -> Scene:
@@ -424,10 +383,7 @@ def list_cameras() -> dict[str, str]:
 def simulated_camera(name: str) -> SimulatedCamera:
     """Return a camera by its name.
 
-    Raises
-    ------
-    OptionError
-        If there is none of that name.
+    Raises `OptionError` if there is none of that name.
     """
     if name not in _CAMERAS:
         raise OptionError(f"--camera {name}: no such camera; choose one of {', '.join(_CAMERAS)}")

@@ -42,10 +42,7 @@ _SIGMA_DEPTH, _SIGMA_ANGLE = 0.005, float(np.deg2rad(0.2))
 def vehicle_attitude(dome_from_scene: SE3) -> tuple[float, float, float]:
     """Return heading, roll and pitch in radians, as in MAVLink's ATTITUDE.
 
-    Parameters
-    ----------
-    dome_from_scene : SE3
-        Pose of the scene, whose net hangs plumb and faces `NET_BEARING`.
+    `dome_from_scene`: pose of the scene, whose net hangs plumb and faces `NET_BEARING`.
     """
     s, c = np.sin(NET_BEARING), np.cos(NET_BEARING)
     # The scene's x, y and z are along the net, away from the vehicle and up.
@@ -120,21 +117,14 @@ def _foot(scenario: Scenario, t: float) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class DiveFiles:
-    """Files written by `simulate_dive`.
+    """Files written by `simulate_dive`."""
 
-    Attributes
-    ----------
-    video, truth : Path
-        `dive.mp4` and `truth.csv`.
-    points : tuple of Path
-        `points_FFFF.npz` of the requested frames.
-    n_frames : int
-        Frames written.
-    """
-
+    # `dive.mp4` and `truth.csv`.
     video: Path
     truth: Path
+    # `points_FFFF.npz` of the requested frames.
     points: tuple[Path, ...]
+    # Frames written.
     n_frames: int
 
 
@@ -158,8 +148,6 @@ def simulate_dive(
 
     Parameters
     ----------
-    scenario : Scenario
-        Scenario to render.
     rig : Rig
         Camera with its shutter, dome, water and lasers.
     out_dir : Path
@@ -268,10 +256,7 @@ def shutter_from_words(words: str, fps: float, place: str = "--shutter") -> Shut
 def check_shutter(shutter: Shutter, fps: float) -> None:
     """Refuse a shutter that takes longer for a picture than pictures are apart.
 
-    Raises
-    ------
-    OptionError
-        If it does.
+    Raises `OptionError` if it does.
     """
     # Two fields make a frame, and the second is as far from the next frame's first.
     needed = abs(shutter.readout) * (2.0 if shutter.is_interlaced else 1.0)

@@ -58,28 +58,20 @@ def band_shares(wavelength_nm: float) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ColourFilters:
-    """Colour filters of a sensor, and the colour matrix that corrects their crosstalk.
+    """Colour filters of a sensor, and the colour matrix that corrects their crosstalk."""
 
-    Attributes
-    ----------
-    at_green : (float, float, float)
-        Response of the pixels under the red, the green and the blue filter to a laser of
-        `GREEN_NM`, relative to that to white light; the green one has 1.
-    saturation : float
-        Loss of the colour of daylight by crosstalk between the filters, restored by the camera's
-        colour matrix: colour minus luma is divided, then multiplied by 1 plus this. Daylight is
-        unchanged; a laser, whose single wavelength has crosstalk of its own, gets less red than
-        was recorded, or a negative amount: it darkens red.
-    peak_nm : (float, float, float)
-        Middles of the filters in nanometres. Each falls off as a Gaussian.
-    width_nm : float
-        Standard deviation of the green filter, and of the others on the side away from green; on
-        the side towards green their width follows from `at_green`.
-    """
-
+    # Response of the pixels under the red, the green and the blue filter to a laser of `GREEN_NM`,
+    # relative to that to white light; the green one has 1.
     at_green: Vector = (0.40, 1.0, 0.27)
+    # Loss of the colour of daylight by crosstalk between the filters, restored by the camera's
+    # colour matrix: colour minus luma is divided, then multiplied by 1 plus this. Daylight is
+    # unchanged; a laser, whose single wavelength has crosstalk of its own, gets less red than was
+    # recorded, or a negative amount: it darkens red.
     saturation: float = 0.0
+    # Middles of the filters in nanometres. Each falls off as a Gaussian.
     peak_nm: Vector = (600.0, GREEN_NM, 460.0)
+    # Standard deviation of the green filter, and of the others on the side away from green; on the
+    # side towards green their width follows from `at_green`.
     width_nm: float = 45.0
 
     @property
@@ -128,59 +120,41 @@ _ON_PLANE = 1e-6
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LaserSource:
-    """Source of a laser sheet: place, direction and distribution of its light.
+    """Source of a laser sheet: place, direction and distribution of its light."""
 
-    Attributes
-    ----------
-    position : array, shape (3,)
-        The fan's origin in `dome`, on the laser's plane, in metres. Behind a window it is the
-        window's source.
-    direction : array, shape (3,)
-        Unit vector of the fan's middle in `dome`, in the laser's plane (in air, behind a window).
-    half_angle : float
-        Half the fan's opening in radians (in air, behind a window).
-    sigma : float
-        Standard deviation of the sheet's thickness at the source, in metres.
-    divergence : float
-        Growth of that standard deviation with distance (in the water), in radians.
-    power : float
-        Radiance of a white surface at the sheet's centre, square to the light 0.5 m from the
-        source, in clear water.
-    wavelength_nm : float
-        In nanometres; decides the response of the colour filters and the attenuation by the water.
-    """
-
+    # Shape (3,): the fan's origin in `dome`, on the laser's plane, in metres. Behind a window it is
+    # the window's source.
     position: FloatArray
+    # Shape (3,): unit vector of the fan's middle in `dome`, in the laser's plane (in air, behind a
+    # window).
     direction: FloatArray
+    # Half the fan's opening in radians (in air, behind a window).
     half_angle: float = float(np.deg2rad(34.0))
+    # Standard deviation of the sheet's thickness at the source, in metres.
     sigma: float = 0.45e-3
+    # Growth of that standard deviation with distance (in the water), in radians.
     divergence: float = 0.75e-3
+    # Radiance of a white surface at the sheet's centre, square to the light 0.5 m from the source,
+    # in clear water.
     power: float = 10.0
+    # In nanometres; decides the response of the colour filters and the attenuation by the water.
     wavelength_nm: float = GREEN_NM
 
 
 class Sheets(NamedTuple):
-    """Laser sheets as tables.
+    """Laser sheets as tables."""
 
-    Attributes
-    ----------
-    table : array, shape (n, 22)
-        See the column constants of this module.
-    fan : array, shape (n, N_FAN)
-        Relative power over the tangent of the fan angle, from -reach to reach.
-    first : array, shape (n, N_FAN)
-        Distance from the source at which the sheet's middle meets a surface; infinite where none.
-    optics : array, shape (n, COLUMNS)
-        The sheets for the kernels of `aqualvs.optics.sheet`.
-    stray : array, shape (n, 2)
-        Greatest distance of a bent sheet from the plane near it: metres at the window, and
-        metres for every metre from the source.
-    """
-
+    # Shape (n, 22): see the column constants of this module.
     table: FloatArray
+    # Shape (n, N_FAN): relative power over the tangent of the fan angle, from -reach to reach.
     fan: FloatArray
+    # Shape (n, N_FAN): distance from the source at which the sheet's middle meets a surface;
+    # infinite where none.
     first: FloatArray
+    # Shape (n, COLUMNS): the sheets for the kernels of `aqualvs.optics.sheet`.
     optics: FloatArray
+    # Shape (n, 2): greatest distance of a bent sheet from the plane near it: metres at the window,
+    # and metres for every metre from the source.
     stray: FloatArray
 
 
@@ -219,11 +193,8 @@ def pack_sheets(
 ) -> Sheets:
     """Return the tables of a rig's laser sheets that nothing shadows yet, as a camera sees them.
 
-    Raises
-    ------
-    RigError
-        If there is not one source for every laser, or a source is off its laser's plane or not
-        that of its laser's window.
+    Raises `RigError` if there is not one source for every laser, or a source is off its laser's
+    plane or not that of its laser's window.
     """
     lasers, sheets = rig.lasers, sheets_of(rig)
     if len(sources) != len(lasers):
@@ -272,18 +243,13 @@ def _pack_sheet(
 
 
 class FanRays(NamedTuple):
-    """Rays in a sheet's middle, in the water.
+    """Rays in a sheet's middle, in the water."""
 
-    Attributes
-    ----------
-    origins, directions : array, shape (N_FAN, 3)
-        Points of entry into the water, or the source without a window; unit directions.
-    way : array, shape (N_FAN,)
-        Length of the light's way from the source to there.
-    """
-
+    # Shape (N_FAN, 3): points of entry into the water, or the source without a window; unit
+    # directions.
     origins: FloatArray
     directions: FloatArray
+    # Shape (N_FAN,): length of the light's way from the source to there.
     way: FloatArray
 
 

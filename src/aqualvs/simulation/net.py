@@ -39,10 +39,7 @@ NET, DIRECTION_U, DIRECTION_V, PLACE, HEIGHT, WIDTH, PERIOD, FOLD_COLUMNS = rang
 def pack_fold(i_net: int, fold: Fold) -> FloatArray:
     """Return one row of the fold table, shape (N_COLUMNS,).
 
-    Raises
-    ------
-    OptionError
-        If the width is not positive, or the folds of a row run into each other.
+    Raises `OptionError` if the width is not positive, or the folds of a row run into each other.
     """
     if not fold.width > 0.0:
         raise OptionError(f"fold of a net: width is {1e3 * fold.width:g} mm; it must be positive")
@@ -120,27 +117,13 @@ _STEPS = _FoldSteps()
 
 
 class Strand(NamedTuple):
-    """Intersection of a ray with a strand.
+    """Intersection of a ray with a strand."""
 
-    Attributes
-    ----------
-    t : float
-        Distance along the ray; infinite where it misses.
-    normal : (float, float, float)
-        Outward normal of the cylinder in `dome`.
-    along : float
-        Position along the strand, in metres.
-    across : float
-        Lateral position on the strand, -1 to 1 of its radius.
-    growth : float
-        Thickness of the growth there, as a fraction of the twine's radius.
-    """
-
-    t: float
-    normal: Vec
-    along: float
-    across: float
-    growth: float
+    t: float  # Distance along the ray; infinite where it misses.
+    normal: Vec  # Outward normal of the cylinder in `dome`.
+    along: float  # Position along the strand, in metres.
+    across: float  # Lateral position on the strand, -1 to 1 of its radius.
+    growth: float  # Thickness of the growth there, as a fraction of the twine's radius.
 
 
 def pack_net(net: Net, dome_from_scene: SE3) -> FloatArray:

@@ -25,57 +25,39 @@ _EDGES = np.array([(i, i + step) for step in (1, 2, 4) for i in range(8) if not 
 
 
 class NetPosture(NamedTuple):
-    """True posture of a vehicle to the net; see docs/conventions.md.
+    """True posture of a vehicle to the net; see docs/conventions.md."""
 
-    Attributes
-    ----------
-    range : float
-        Distance of the dome's centre from the net's nearest point, in metres; negative behind it.
-    pitch, yaw : float
-        Of the tangent plane at that point, in radians.
-    along, up : float
-        Place of that point on the net, in metres: along it to the right, and up.
-    """
-
+    # Distance of the dome's centre from the net's nearest point, in metres; negative behind it.
     range: float
+    # Of the tangent plane at that point, in radians.
     pitch: float
     yaw: float
+    # Place of that point on the net, in metres: along it to the right, and up.
     along: float
     up: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NetWall:
-    """Upright net, flat or an upright cylinder, that sways, drifts and tilts as a whole.
+    """Upright net, flat or an upright cylinder, that sways, drifts and tilts as a whole."""
 
-    Attributes
-    ----------
-    position : (float, float, float)
-        Middle of the net at rest, in the world, in metres.
-    bearing : float
-        Viewing direction to the middle, in radians clockwise from north.
-    curvature : float
-        In 1/m: 0 is flat, positive a cage seen from outside (it recedes to both sides), negative
-        one seen from inside.
-    sway, sway_period, sway_phase : float
-        Amplitude in metres, period in seconds, phase in radians of a sine along `bearing`.
-    drift : float
-        Steady speed along `bearing`, in m/s.
-    tilt : float
-        In radians about the horizontal through the middle; positive where the far normal points
-        up, as pitch.
-    rock, rock_period, rock_phase : float
-        Amplitude in radians, period in seconds, phase in radians of a sine on top of the tilt.
-    """
-
+    # Middle of the net at rest, in the world, in metres.
     position: Vec = (0.0, 0.0, 5.0)
+    # Viewing direction to the middle, in radians clockwise from north.
     bearing: float = 0.0
+    # In 1/m: 0 is flat, positive a cage seen from outside (it recedes to both sides), negative one
+    # seen from inside.
     curvature: float = 0.0
+    # Amplitude in metres, period in seconds, phase in radians of a sine along `bearing`.
     sway: float = 0.0
     sway_period: float = 6.0
     sway_phase: float = 0.0
+    # Steady speed along `bearing`, in m/s.
     drift: float = 0.0
+    # In radians about the horizontal through the middle; positive where the far normal points up,
+    # as pitch.
     tilt: float = 0.0
+    # Amplitude in radians, period in seconds, phase in radians of a sine on top of the tilt.
     rock: float = 0.0
     rock_period: float = 7.0
     rock_phase: float = 0.0

@@ -264,85 +264,56 @@ def _is_shadowed(p: Vec, way: Vec, own: int, panels: PanelTables) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """A printed rectangle.
+    """A printed rectangle."""
 
-    Attributes
-    ----------
-    dome_from_panel : SE3
-        Of the frame with x to the right, y down, z into the panel and its origin at the outer
-        corner of the top-left cell.
-    texture : Texture
-        The print; from behind it is seen mirrored.
-    """
-
+    # Of the frame with x to the right, y down, z into the panel and its origin at the outer corner
+    # of the top-left cell.
     dome_from_panel: SE3
+    # The print; from behind it is seen mirrored.
     texture: Texture
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RoomLight:
-    """Light besides the lasers: an even part, and that of a lamp far behind the camera.
+    """Light besides the lasers: an even part, and that of a lamp far behind the camera."""
 
-    Attributes
-    ----------
-    level : float
-        Radiance of a white panel that faces the lamp.
-    lamp : (float, float, float)
-        The lamp's place in `dome`, in metres.
-    lamp_share : float
-        Share of the light that falls off with the angle to the lamp, 0 to 1.
-    tint : (float, float, float)
-        Red, green and blue of white.
-    veil : (float, float, float)
-        Radiance that the water adds everywhere.
-    """
-
+    # Radiance of a white panel that faces the lamp.
     level: float = 0.62
+    # The lamp's place in `dome`, in metres.
     lamp: Vector = (0.5, -0.6, 0.9)
+    # Share of the light that falls off with the angle to the lamp, 0 to 1.
     lamp_share: float = 0.45
+    # Red, green and blue of white.
     tint: Vector = (1.0, 0.98, 0.93)
+    # Radiance that the water adds everywhere.
     veil: Vector = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PanelScene:
-    """Scene of panels in front of the camera.
+    """Scene of panels in front of the camera."""
 
-    Attributes
-    ----------
-    panels : sequence of Panel
-        The nearest one on a ray is seen.
-    light : RoomLight
-        Light besides the lasers.
-    sensor : CameraSensor
-        Blur, noise and tone of the camera.
-    """
-
+    # The nearest one on a ray is seen.
     panels: Sequence[Panel]
+    # Light besides the lasers.
     light: RoomLight = field(default_factory=RoomLight)
+    # Blur, noise and tone of the camera.
     sensor: CameraSensor = field(default_factory=CameraSensor)
 
 
 @dataclass(slots=True)
 class PanelRenderer:
-    """Renderer of panels for one camera.
+    """Renderer of panels for one camera."""
 
-    Attributes
-    ----------
-    camera : Camera
-        Behind its dome, in any medium, or bare.
-    sheets : Sheets or None
-        The lasers, see `panel_sheets`; None switches them off.
-    samples : int
-        Rays along each side of a pixel.
-    eye : SimulatedCamera
-        Sensor and processing; the sheets must be packed with its filters.
-    """
-
+    # Behind its dome, in any medium, or bare.
     camera: Camera
+    # The lasers, see `panel_sheets`; None switches them off.
     sheets: Sheets | None = None
+    # Rays along each side of a pixel.
     samples: int = 2
+    # Sensor and processing; the sheets must be packed with its filters.
     eye: SimulatedCamera = IDEAL
+
     _rays: CornerRays = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -355,10 +326,7 @@ class PanelRenderer:
 
         Exposure and white balance of `eye` drift with the time `t`, in seconds.
 
-        Raises
-        ------
-        OptionError
-            If the scene has no panels.
+        Raises `OptionError` if the scene has no panels.
         """
         clear = WaterOptics(forward_scatter=0.0)
         return self.eye.picture(self.radiance(scene), clear, scene.sensor, t, rng)
@@ -391,10 +359,7 @@ def panel_sheets(
 ) -> Sheets:
     """Return the sheets of a rig's lasers in the rig's medium, all of one power.
 
-    Raises
-    ------
-    RigError
-        If a laser's plane is square to the view.
+    Raises `RigError` if a laser's plane is square to the view.
     """
     sources = [replace(source, power=power) for source in default_sources(rig)]
     return pack_sheets(rig, sources, filters)

@@ -114,23 +114,13 @@ TILE = 32
 
 
 class TileMembers(NamedTuple):
-    """Rows of the tables that each tile can show, as one array with the start of each tile.
+    """Rows of the tables that each tile can show, as one array with the start of each tile."""
 
-    Attributes
-    ----------
-    n_columns : int
-        Number of tiles in a row.
-    ellipsoids, bubbles : int arrays
-        Rows, tile after tile.
-    ellipsoid_start, bubble_start : int arrays, shape (n_tiles + 1,)
-        Start of each tile's part.
-    """
-
-    n_columns: int
-    ellipsoids: IntArray
-    ellipsoid_start: IntArray
-    bubbles: IntArray
-    bubble_start: IntArray
+    n_columns: int  # Number of tiles in a row.
+    ellipsoids: IntArray  # Rows, tile after tile.
+    ellipsoid_start: IntArray  # Shape (n_tiles + 1,): start of each tile's part.
+    bubbles: IntArray  # As `ellipsoids`.
+    bubble_start: IntArray  # As `ellipsoid_start`.
 
 
 def tile_members(camera: Camera, size_px: tuple[int, int], surfaces: Surfaces) -> TileMembers:
@@ -187,17 +177,11 @@ SceneAt: TypeAlias = Callable[[float], Scene]
 
 @dataclass(frozen=True, slots=True)
 class RenderedFrame:
-    """One rendered frame and its truth.
+    """One rendered frame and its truth."""
 
-    Attributes
-    ----------
-    image : uint8 array, shape (height, width, 3)
-        Red, green, blue.
-    lit : LitPoints
-        Points where the middles of the laser sheets meet surfaces that the camera sees.
-    """
-
+    # Shape (height, width, 3): red, green, blue.
     image: NDArray[np.uint8]
+    # Points where the middles of the laser sheets meet surfaces that the camera sees.
     lit: LitPoints
 
 
@@ -205,30 +189,20 @@ class RenderedFrame:
 class Renderer:
     """Renderer of scenes for one rig in one water.
 
-    Attributes
-    ----------
-    rig : Rig
-        Camera, housing, water and lasers.
-    sources : sequence of LaserSource
-        One for each laser; by default they follow from the rig (`default_sources`).
-    samples : int
-        Rays along each side of a pixel: 2 means four rays a pixel.
-    threads : int
-        Number of bands of rows rendered in parallel; the picture does not depend on it.
-    camera : SimulatedCamera
-        Sensor and processing; the rig has the place of the lens.
-
-    Raises
-    ------
-    RigError
-        If the sources do not fit the rig's lasers.
+    Raises `RigError` if the sources do not fit the rig's lasers.
     """
 
+    # Camera, housing, water and lasers.
     rig: Rig
+    # One for each laser; by default they follow from the rig (`default_sources`).
     sources: Sequence[LaserSource] = ()
+    # Rays along each side of a pixel: 2 means four rays a pixel.
     samples: int = 2
+    # Number of bands of rows rendered in parallel; the picture does not depend on it.
     threads: int = 1
+    # Sensor and processing; the rig has the place of the lens.
     camera: SimulatedCamera = IDEAL
+
     _corners: CornerRays = field(init=False, repr=False)
     _beams: Beams = field(init=False, repr=False)
 

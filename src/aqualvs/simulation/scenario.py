@@ -9,6 +9,7 @@ import difflib
 import functools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
@@ -32,7 +33,7 @@ from aqualvs.simulation.scene import (
     Wall,
     WaterOptics,
 )
-from aqualvs.yamlfile import read_yaml
+from aqualvs.yamlfile import parse_yaml, read_yaml
 
 _IN_FRONT = 0.10
 _SIDE, _HEIGHT = 0.20, 0.13
@@ -141,24 +142,16 @@ def dome_from_target(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Course:
-    """One quantity over time: interpolated values, with a sway on top.
+    """One quantity over time: interpolated values, with a sway on top."""
 
-    Attributes
-    ----------
-    values : sequence of float
-        Passed at equal intervals from the start to the end of the dive; one value holds still.
-    mode : {"smooth", "steps"}
-        Smooth passes through the values without overshoot; steps holds each of them for its
-        share of the dive.
-    sway : float
-        Amplitude of a sine on top.
-    period : float
-        Of that sine, in seconds.
-    """
-
+    # Passed at equal intervals from the start to the end of the dive; one value holds still.
     values: Sequence[float] = (0.0,)
+    # Smooth passes through the values without overshoot; steps holds each of them for its share of
+    # the dive.
     mode: Literal["smooth", "steps"] = "smooth"
+    # Amplitude of a sine on top.
     sway: float = 0.0
+    # Of that sine, in seconds.
     period: float = 4.0
 
     def at(self, t: float, duration: float) -> float:
@@ -185,19 +178,13 @@ def _smooth(values: tuple[float, ...]) -> PchipInterpolator:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Trajectory:
-    """Posture over time.
+    """Posture over time."""
 
-    Attributes
-    ----------
-    distance, pitch, yaw : Course
-        Metres and radians.
-    slide_x, slide_z : Course
-        Shift of the target in its plane, in metres.
-    """
-
+    # Metres and radians.
     distance: Course = field(default_factory=lambda: Course(values=(0.6,)))
     pitch: Course = field(default_factory=Course)
     yaw: Course = field(default_factory=Course)
+    # Shift of the target in its plane, in metres.
     slide_x: Course = field(default_factory=Course)
     slide_z: Course = field(default_factory=Course)
 
@@ -214,34 +201,21 @@ class Trajectory:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scenario:
-    """Scenario of a dive: scene and motion, before rendering.
+    """Scenario of a dive: scene and motion, before rendering."""
 
-    Attributes
-    ----------
-    name : str
-        Name in reports.
-    duration : float
-        In seconds.
-    fps : float
-        Frames a second.
-    seed : int
-        Seed of noise and everything else that is random.
-    shutter : str or None
-        Of the camera, in the words of `--shutter`; None leaves the rig's.
-    trajectory : Trajectory
-        Posture of the vehicle over time.
-    target : {"net", "wall", "none"}
-        Content of the target plane; "none" if it is empty.
-    walls, nets, fish, bubbles, boxes, water, sensor, lasers_on
-        As in `Scene`; they move with the target.
-    """
-
+    # Name in reports.
     name: str
+    # In seconds.
     duration: float
+    # Frames a second.
     fps: float = 25.0
+    # Seed of noise and everything else that is random.
     seed: int = 0
+    # Posture of the vehicle over time.
     trajectory: Trajectory = field(default_factory=Trajectory)
+    # Content of the target plane; "none" if it is empty.
     target: Target = "none"
+    # As in `Scene`; they move with the target.
     walls: tuple[Wall, ...] = ()
     nets: tuple[Net, ...] = ()
     fish: tuple[Fish, ...] = ()
@@ -250,6 +224,7 @@ class Scenario:
     water: WaterOptics = field(default_factory=WaterOptics)
     sensor: CameraSensor = field(default_factory=CameraSensor)
     lasers_on: bool = True
+    # Of the camera, in the words of `--shutter`; None leaves the rig's.
     shutter: str | None = None
 
     @property
@@ -428,23 +403,25 @@ class ScenarioFile(_Strict):
 def read_scenario(path: Path) -> Scenario:
     """Read a scenario file; the scenario has the file's name.
 
-    Raises
-    ------
-    OptionError
-        If the file cannot be read, is not YAML, or holds a key or value that makes no sense; the
-        message names the file, the key and the remedy.
+    Raises `OptionError` if the file cannot be read, is not YAML, or holds a key or value that makes
+    no sense; the message names the file, the key and the remedy.
     """
     content = read_yaml(path, "a scenario file, or the name of a built-in scenario", OptionError)
     return parse_scenario(content, path.stem, str(path))
 
 
+@functools.cache
+def packaged(name: str) -> dict[str, Any]:
+    """Return the content of a file of the folder `data/scenarios`; it must not be changed."""
+    text = (files("aqualvs") / "data" / "scenarios" / name).read_text(encoding="utf-8")
+    content: dict[str, Any] = parse_yaml(text, name, OptionError)
+    return content
+
+
 def parse_scenario(content: Any, name: str, source: str) -> Scenario:
     """Return the scenario that a mapping describes; `source` is named in the error.
 
-    Raises
-    ------
-    OptionError
-        If a key is unknown or a value makes no sense.
+    Raises `OptionError` if a key is unknown or a value makes no sense.
     """
     try:
         return ScenarioFile.model_validate({} if content is None else content).scenario(name)

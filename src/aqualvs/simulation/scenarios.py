@@ -1,7 +1,7 @@
-"""Built-in scenarios by name, example rigs and random scenes.
+"""Built-in scenarios by name, and example rigs.
 
-`load_scenario` takes a name or the path of a scenario file. `random_scene` draws scenes for
-statistics over conditions rather than over one dive.
+`load_scenario` takes a name or the path of a scenario file; `data/scenarios/built_in.yaml` has the
+named ones.
 
 The rigs are in round numbers. `example_rig` resembles the rig of the paper: a lens strongly off the
 dome's centre and three lasers, one nearly level below, one nearly upright on the left, one diagonal
@@ -10,11 +10,8 @@ on the right. `bluerov2_rig` resembles a BlueROV2: a wide camera near the centre
 """
 
 import math
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 
@@ -27,16 +24,9 @@ from aqualvs.optics.flat_port import FlatPort
 from aqualvs.optics.lens import Lens
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Laser, Rig
 from aqualvs.optics.water import N_AIR
-from aqualvs.simulation.scenario import (
-    Scenario,
-    dome_from_target,
-    parse_scenario,
-    random_bubbles,
-    random_fish,
-    read_scenario,
-)
-from aqualvs.simulation.scene import Mesh, Net, Scene, Wall, WaterOptics
+from aqualvs.simulation.scenario import Scenario, packaged, parse_scenario, read_scenario
 
+_BUILT_IN = "built_in.yaml"
 _N_FRESH_WATER = 1.3333
 
 
@@ -98,245 +88,24 @@ def _pose(rotation_deg: Vec, lens_mm: Vec) -> SE3:
     return SE3(turn @ DOME_FROM_CAM_NOMINAL, np.array(lens_mm) / 1e3)
 
 
-Difficulty: TypeAlias = Literal["clean", "usual", "hard"]
-
-# By difficulty: greatest fouling, numbers of fish and bubbles, probability of a wall behind and of
-# glare, spread of the attenuation (factor on clear water).
-_LIMITS: dict[str, tuple[float, int, int, float, float, float]] = {
-    "clean": (0.0, 0, 0, 0.0, 0.0, 1.0),
-    "usual": (0.3, 1, 12, 0.5, 0.15, 1.6),
-    "hard": (0.6, 3, 40, 0.7, 0.5, 3.0),
-}
-
-
-def random_scene(rng: np.random.Generator, difficulty: Difficulty = "usual") -> Scene:
-    """Return a random scene of a net before the vehicle.
-
-    Mesh 15-50 mm, twine 1-4 mm, range 0.3-1.0 m, roll 0-90 deg, yaw and pitch within 20 deg, all
-    uniform; fouling up to 60 %, fish, bubbles, a wall behind, turbidity, caustics and glare as
-    allowed by the difficulty.
-
-    Parameters
-    ----------
-    rng : Generator
-        Random number generator; the same state gives the same scene.
-    difficulty : {"clean", "usual", "hard"}
-    A clean net in open water; usual conditions of a dive; everything at once.
-
-    Raises
-    ------
-    OptionError
-        If there is no such difficulty.
-    """
-    if difficulty not in _LIMITS:
-        raise OptionError(
-            f"difficulty is {difficulty!r}; choose one of {', '.join(get_args(Difficulty))}"
-        )
-    _, n_fish, n_bubbles, wall, _, _ = _LIMITS[difficulty]
-    pitch, yaw = np.deg2rad(rng.uniform(-20.0, 20.0, 2))
-    pose = dome_from_target(float(rng.uniform(0.3, 1.0)), float(pitch), float(yaw))
-    net = _net(rng, difficulty)
-    behind = float(rng.uniform(0.15, 0.9))
-    walls = (Wall(depth=behind, yaw=float(rng.normal(0.0, 0.1))),) if rng.random() < wall else ()
-    return Scene(
-        dome_from_scene=pose,
-        walls=walls,
-        nets=(net,),
-        fish=random_fish(rng, int(rng.integers(0, n_fish + 1)), 0.2, behind),
-        bubbles=random_bubbles(rng, int(rng.integers(0, n_bubbles + 1)), 0.2, behind),
-        target="net",
-        water=_water(rng, difficulty),
-    )
-
-
-def _net(rng: np.random.Generator, difficulty: str) -> Net:
-    fouling = _LIMITS[difficulty][0]
-    meshes: tuple[Mesh, ...] = get_args(Mesh)
-    bar, twine = float(rng.uniform(0.015, 0.050)), float(rng.uniform(0.001, 0.004))
-    return Net(
-        mesh=meshes[int(rng.integers(len(meshes)))],
-        bar=bar,
-        # Limit the twine so that openings are at least two thirds of the bar.
-        twine=min(twine, bar / 3.0),
-        roll=float(np.deg2rad(rng.uniform(0.0, 90.0))),
-        hanging_ratio=float(rng.uniform(0.5, 0.85)),
-        fouling=float(rng.uniform(0.0, fouling)),
-        offset=(float(rng.uniform(0.0, 0.1)), float(rng.uniform(0.0, 0.1))),
-        seed=int(rng.integers(256)),
-    )
-
-
-def _water(rng: np.random.Generator, difficulty: str) -> WaterOptics:
-    *_, glare, spread = _LIMITS[difficulty]
-    clear = WaterOptics()
-    factor = float(rng.uniform(1.0, spread)) if spread > 1.0 else 1.0
-    sunny = rng.random() < glare
-    red, green, blue = clear.attenuation
-    return WaterOptics(
-        attenuation=(red * factor, green * factor, blue * factor),
-        sheet_scatter=clear.sheet_scatter * factor**2,
-        forward_scatter=clear.forward_scatter * factor,
-        caustics=float(rng.uniform(0.2, 0.7)) if sunny else 0.0,
-        glare=float(rng.uniform(0.1, 0.5)) if sunny else 0.0,
-        snow=int(300 * (factor - 1.0)),
-    )
-
-
-_NET_MOTION: dict[str, Any] = {
-    "range_mm": {"values": [350, 520, 430], "sway": 4, "period_s": 2.3},
-    "pitch_deg": {"values": [5, -3, 2], "sway": 1.5, "period_s": 3.1},
-    "yaw_deg": {"values": [-6, 8, 0], "sway": 1.5, "period_s": 2.7},
-    "slide_x_mm": [0, 90, 200],
-    "slide_z_mm": [0, -15, 20],
-}
-_TURBID: dict[str, Any] = {
-    "attenuation_per_m": [2.0, 1.25, 1.6],
-    "veil": [0.115, 0.235, 0.165],
-    "sheet_scatter_per_m": 1.5,
-    "forward_scatter": 0.16,
-    "halo_px": 12,
-    "snow": 1500,
-}
-_SUN: dict[str, Any] = {"caustics": 0.65, "glare": 0.5, "ambient": [0.50, 0.82, 0.78]}
-
-_BUILT_IN: Mapping[str, tuple[str, dict[str, Any]]] = MappingProxyType(
-    {
-        "wall": (
-            "a wall square to the vehicle at 374, 438, 525 and 659 mm",
-            {
-                "duration_s": 1.6,
-                "motion": {"range_mm": {"values": [374, 438, 525, 659], "mode": "steps"}},
-                "walls": [{}],
-            },
-        ),
-        "wall_range": (
-            "a wall that recedes from 300 to 1250 mm",
-            {"motion": {"range_mm": [300, 1250]}, "walls": [{}]},
-        ),
-        "wall_yaw": (
-            "a wall at 600 mm, yaw swings through 20 degrees to either side",
-            {"motion": {"yaw_deg": {"values": [0], "sway": 20, "period_s": 4}}, "walls": [{}]},
-        ),
-        "wall_pitch": (
-            "a wall at 600 mm, pitch swings through 20 degrees to either side",
-            {"motion": {"pitch_deg": {"values": [0], "sway": 20, "period_s": 4}}, "walls": [{}]},
-        ),
-        "net_diamond": (
-            "a diamond net in open water",
-            {"motion": _NET_MOTION, "net": {"twine_mm": 2.2, "roll_deg": 3}},
-        ),
-        "net_square": (
-            "a square net with some growth on it",
-            {
-                "motion": _NET_MOTION,
-                "net": {"mesh": "square", "bar_mm": 22, "roll_deg": 8, "fouling": 0.15},
-            },
-        ),
-        "net_hexagon": (
-            "a hexagonal net, slightly bulging",
-            {
-                "motion": _NET_MOTION,
-                "net": {
-                    "mesh": "hexagon",
-                    "bar_mm": 18,
-                    "roll_deg": 12,
-                    "curvature_per_m": [0.25, 0.1],
-                },
-            },
-        ),
-        "net_clutter": (
-            "a net with a hole, a tiled wall behind it, fish, bubbles and a box",
-            {
-                "motion": {**_NET_MOTION, "range_mm": [420, 600, 500]},
-                "net": {"bar_mm": 30, "fouling": 0.1, "holes_mm": [[60, 40, 35]]},
-                "walls": [{"behind_mm": 450, "yaw_deg": 4, "tile_mm": 150}],
-                "boxes": [{"centre_mm": [330, 300, -60], "heading_deg": 12}],
-                "fish": 3,
-                "bubbles": 40,
-            },
-        ),
-        "net_holes": (
-            "along a fouled net with three holes at 0.2 m/s, with the vehicle's log",
-            {
-                "duration_s": 12.0,
-                "motion": {
-                    "range_mm": {"values": [480, 430, 520, 450], "sway": 6, "period_s": 2.9},
-                    "pitch_deg": {"values": [2, -3, 3, -1], "sway": 1.5, "period_s": 3.1},
-                    "yaw_deg": {"values": [-5, 7, -3, 6], "sway": 4, "period_s": 4.3},
-                    # From rest to 0.2 m/s and to rest again.
-                    "slide_x_mm": [0, -70, -270, *range(-490, -2200, -220), -2250, -2300],
-                    "slide_z_mm": [0, -120, 60, -40],
-                },
-                "net": {
-                    "bar_mm": 25,
-                    "twine_mm": 2.5,
-                    "fouling": 0.45,
-                    "growth": 1.5,
-                    "holes_mm": [[500, 40, 55], [1250, -20, 75], [1950, 90, 65]],
-                },
-            },
-        ),
-        "demo": (
-            "the bundled dive: along a fouled net with a hole, among fish and bubbles",
-            {
-                "duration_s": 6.0,
-                "motion": {
-                    "range_mm": {"values": [800, 450, 600, 520], "sway": 8, "period_s": 2.9},
-                    "pitch_deg": {"values": [-6, 4, -2, 3], "sway": 2, "period_s": 3.1},
-                    "yaw_deg": {"values": [12, -4, -10, 2], "sway": 2, "period_s": 2.3},
-                    "slide_x_mm": [0, 120, 260],
-                    "slide_z_mm": [0, -30, 25],
-                },
-                "net": {"bar_mm": 25, "twine_mm": 2.5, "fouling": 0.12, "holes_mm": [[80, 10, 40]]},
-                "walls": [{"behind_mm": 600, "yaw_deg": 5, "tile_mm": 200}],
-                "fish": 4,
-                "bubbles": 30,
-            },
-        ),
-        "lasers_off": (
-            "a wall with the lasers off: no posture may come of it",
-            {"duration_s": 1.0, "walls": [{}], "lasers_on": False},
-        ),
-        "empty": (
-            "open water with nothing in range: no posture may come of it",
-            {"duration_s": 1.0, "bubbles": 10, "water": {"snow": 200}},
-        ),
-        "turbid": (
-            "a net in turbid water: glowing sheets, halo and marine snow",
-            {"motion": _NET_MOTION, "net": {"fouling": 0.1}, "water": _TURBID},
-        ),
-        "sun": (
-            "a net and a wall behind it close below the surface: caustics and glare",
-            {
-                "motion": _NET_MOTION,
-                "net": {"twine_mm": 2.2},
-                "walls": [{"behind_mm": 350}],
-                "water": _SUN,
-            },
-        ),
-    }
-)
-
-
 def list_scenarios() -> dict[str, str]:
     """Return the names of the built-in scenarios, each with one line about it."""
-    return {name: about for name, (about, _) in _BUILT_IN.items()}
+    return {name: content["about"] for name, content in packaged(_BUILT_IN).items()}
 
 
 def load_scenario(name_or_path: str | Path) -> Scenario:
     """Return a built-in scenario by its name, or the one that a YAML file describes.
 
-    Raises
-    ------
-    OptionError
-        If there is no such name or file, or the file makes no sense.
+    Raises `OptionError` if there is no such name or file, or the file makes no sense.
     """
     name = str(name_or_path)
-    if name in _BUILT_IN:
-        return parse_scenario(_BUILT_IN[name][1], name, name)
+    built_in = packaged(_BUILT_IN)
+    if name in built_in:
+        content = {key: value for key, value in built_in[name].items() if key != "about"}
+        return parse_scenario(content, name, name)
     path = Path(name_or_path)
     if path.suffix.lower() not in {".yaml", ".yml"}:
-        known = ", ".join(_BUILT_IN)
+        known = ", ".join(built_in)
         raise OptionError(
             f"scenario {name}: no such name; choose one of {known}, or give the path of a .yaml "
             "file"

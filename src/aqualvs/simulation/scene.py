@@ -33,27 +33,18 @@ class SurfaceKind(IntEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Wall:
-    """Wall: a plane with a procedural texture, parallel to the target plane unless turned.
+    """Wall: a plane with a procedural texture, parallel to the target plane unless turned."""
 
-    Attributes
-    ----------
-    depth : float
-        Place of the wall on the scene's y axis, in metres; 0 is the target plane.
-    yaw, pitch : float
-        Turn of the wall against the target plane, in radians; signs as for postures.
-    albedo : (float, float, float)
-        Mean diffuse reflectance.
-    contrast : float
-        Relative swing of the stains, 0 to 1.
-    tile_pitch : float
-        Distance of the joints between tiles in metres; 0 leaves the wall without joints.
-    """
-
+    # Place of the wall on the scene's y axis, in metres; 0 is the target plane.
     depth: float = 0.0
+    # Turn of the wall against the target plane, in radians; signs as for postures.
     yaw: float = 0.0
     pitch: float = 0.0
+    # Mean diffuse reflectance.
     albedo: Vector = (0.50, 0.54, 0.52)
+    # Relative swing of the stains, 0 to 1.
     contrast: float = 0.35
+    # Distance of the joints between tiles in metres; 0 leaves the wall without joints.
     tile_pitch: float = 0.0
 
 
@@ -64,26 +55,18 @@ class Fold:
     Over the distance s from its crest the net stands out by height * cos²(pi s / (2 width)) up to
     s = width, and not beyond. With a period of twice the width a row of folds is a sine wave, as
     on a slack net.
-
-    Attributes
-    ----------
-    direction : float
-        Direction from the crest into the fold's flank, in radians from x towards z; the crest
-        is at right angles to it.
-    place : float
-        Place of the crest along that direction, from the target's origin, in metres.
-    height : float
-        In metres; positive away from the vehicle, as curvature.
-    width : float
-        Half the width at the foot, in metres.
-    period : float
-        Distance from crest to crest in metres; 0 is a single fold.
     """
 
+    # Direction from the crest into the fold's flank, in radians from x towards z; the crest is at
+    # right angles to it.
     direction: float = 0.0
+    # Place of the crest along that direction, from the target's origin, in metres.
     place: float = 0.0
+    # In metres; positive away from the vehicle, as curvature.
     height: float = -0.03
+    # Half the width at the foot, in metres.
     width: float = 0.05
+    # Distance from crest to crest in metres; 0 is a single fold.
     period: float = 0.0
 
 
@@ -94,78 +77,52 @@ class Net:
     The twine is a true cylinder around an axis in that plane: lit points lie within one twine
     radius (plus growth) of the net plane, on the side that faces the vehicle. Where the net leaves
     the plane, its mesh is stretched: seen along the plane's normal it stays unchanged.
-
-    Attributes
-    ----------
-    mesh : {"diamond", "square", "hexagon"}
-        Shape of the openings.
-    bar : float
-        Length of one side of an opening, in metres.
-    twine : float
-        Diameter of the clean twine, in metres.
-    roll : float
-        Turn of the mesh about the net's normal, in radians, counter-clockwise for the vehicle.
-    hanging_ratio : float
-        Width of a diamond over its stretched width; 0.707 makes it a square on its corner.
-    fouling : float
-        Fraction of the twine's length that carries growth, 0 to 1.
-    growth : float
-        Thickness of the growth at its thickest, in twine diameters.
-    missing : float
-        Fraction of the bars that are cut out, 0 to 1.
-    holes : tuple of (x, z, radius)
-        Round holes in scene coordinates, in metres.
-    curvature : (float, float)
-        Along x and z in 1/m; positive bulges away from the vehicle.
-    folds : tuple of Fold
-        Folds on top of that; heights add up.
-    half_size : (float, float)
-        Half extent along x and z in metres; infinite by default.
-    offset : (float, float)
-        Slide of the mesh in its plane along x and z, in metres.
-    albedo : (float, float, float)
-        Diffuse reflectance of the clean twine.
-    seed : int
-        Seed of missing bars and growth.
     """
 
+    # Shape of the openings.
     mesh: Mesh = "diamond"
+    # Length of one side of an opening, in metres.
     bar: float = 0.025
+    # Diameter of the clean twine, in metres.
     twine: float = 0.002
+    # Turn of the mesh about the net's normal, in radians, counter-clockwise for the vehicle.
     roll: float = 0.0
+    # Width of a diamond over its stretched width; 0.707 makes it a square on its corner.
     hanging_ratio: float = 0.7071
+    # Fraction of the twine's length that carries growth, 0 to 1.
     fouling: float = 0.0
+    # Thickness of the growth at its thickest, in twine diameters.
     growth: float = 1.0
+    # Fraction of the bars that are cut out, 0 to 1.
     missing: float = 0.0
+    # Round holes in scene coordinates, in metres.
     holes: tuple[Vector, ...] = ()
+    # Along x and z in 1/m; positive bulges away from the vehicle.
     curvature: tuple[float, float] = (0.0, 0.0)
+    # Folds on top of that; heights add up.
     folds: tuple[Fold, ...] = ()
+    # Half extent along x and z in metres; infinite by default.
     half_size: tuple[float, float] = (np.inf, np.inf)
+    # Slide of the mesh in its plane along x and z, in metres.
     offset: tuple[float, float] = (0.0, 0.0)
+    # Diffuse reflectance of the clean twine.
     albedo: Vector = (0.60, 0.62, 0.62)
+    # Seed of missing bars and growth.
     seed: int = 0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fish:
-    """Fish: an ellipsoid with tail and eye that swims straight on and beats its tail.
+    """Fish: an ellipsoid with tail and eye that swims straight on and beats its tail."""
 
-    Attributes
-    ----------
-    position, velocity : (float, float, float)
-        In `scene`, in metres and m/s, at time 0.
-    length : float
-        Length of the body in metres; height and thickness follow.
-    albedo : (float, float, float)
-        Diffuse reflectance of the flank.
-    beat : float
-        Beats of the tail a second.
-    """
-
+    # In `scene`, in metres and m/s, at time 0.
     position: Vector
     velocity: Vector = (0.15, 0.0, 0.0)
+    # Length of the body in metres; height and thickness follow.
     length: float = 0.25
+    # Diffuse reflectance of the flank.
     albedo: Vector = (0.40, 0.43, 0.42)
+    # Beats of the tail a second.
     beat: float = 1.5
 
     def at(self, t: float) -> "Fish":
@@ -175,18 +132,12 @@ class Fish:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Bubble:
-    """Bubble with a bright rim, a clear middle and glints of sun and lasers.
+    """Bubble with a bright rim, a clear middle and glints of sun and lasers."""
 
-    Attributes
-    ----------
-    position, velocity : (float, float, float)
-        In `scene`, in metres and m/s, at time 0.
-    radius : float
-        In metres.
-    """
-
+    # In `scene`, in metres and m/s, at time 0.
     position: Vector
     velocity: Vector = (0.0, 0.0, 0.2)
+    # In metres.
     radius: float = 0.004
 
     def at(self, t: float) -> "Bubble":
@@ -196,117 +147,73 @@ class Bubble:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Box:
-    """A box, turned about the vertical.
+    """A box, turned about the vertical."""
 
-    Attributes
-    ----------
-    centre : (float, float, float)
-        In `scene`, in metres.
-    size : (float, float, float)
-        Edge lengths along its x, y, z, in metres.
-    heading : float
-        Turn about z, in radians.
-    albedo : (float, float, float)
-        Diffuse reflectance.
-    """
-
-    centre: Vector
-    size: Vector = (0.3, 0.2, 0.3)
-    heading: float = 0.0
-    albedo: Vector = (0.46, 0.42, 0.26)
+    centre: Vector  # In `scene`, in metres.
+    size: Vector = (0.3, 0.2, 0.3)  # Edge lengths along its x, y, z, in metres.
+    heading: float = 0.0  # Turn about z, in radians.
+    albedo: Vector = (0.46, 0.42, 0.26)  # Diffuse reflectance.
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WaterOptics:
-    """Optical properties of water: attenuation, veil, scatter, blur.
+    """Optical properties of water: attenuation, veil, scatter, blur."""
 
-    Attributes
-    ----------
-    attenuation : (float, float, float)
-        Beam attenuation per metre for red, green and blue; the lasers use the green one.
-    veil : (float, float, float)
-        Radiance of endless water, the limit of the veil with distance.
-    ambient : (float, float, float)
-        Daylight that reaches a surface; a white one has this radiance.
-    sheet_scatter : float
-        Light that the water scatters from a laser sheet to the camera, per metre and steradian.
-    forward_scatter : float
-        Fraction of the light that arrives in a halo, out of focus.
-    halo_px : float
-        Standard deviation of that halo, in pixels.
-    caustics : float
-        Relative strength of the moving light network of the waves, 0 to 1.
-    glare : float
-        Radiance of the sun's glare at its brightest.
-    snow : int
-        Number of drifting particles before the camera.
-    """
-
+    # Beam attenuation per metre for red, green and blue; the lasers use the green one.
     attenuation: Vector = (0.75, 0.30, 0.42)
+    # Radiance of endless water, the limit of the veil with distance.
     veil: Vector = (0.072, 0.205, 0.165)
+    # Daylight that reaches a surface; a white one has this radiance.
     ambient: Vector = (0.36, 0.62, 0.60)
+    # Light that the water scatters from a laser sheet to the camera, per metre and steradian.
     sheet_scatter: float = 0.25
+    # Fraction of the light that arrives in a halo, out of focus.
     forward_scatter: float = 0.04
+    # Standard deviation of that halo, in pixels.
     halo_px: float = 9.0
+    # Relative strength of the moving light network of the waves, 0 to 1.
     caustics: float = 0.0
+    # Radiance of the sun's glare at its brightest.
     glare: float = 0.0
+    # Number of drifting particles before the camera.
     snow: int = 0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraSensor:
-    """Sensor of the ideal camera: from radiance to grey levels.
+    """Sensor of the ideal camera: from radiance to grey levels."""
 
-    Attributes
-    ----------
-    gain : float
-        Exposure: factor on the radiance before it is clipped at the full scale of 1.
-    gamma : float
-        Grey level = 255 * radiance**(1 / gamma).
-    read_noise : float
-        Standard deviation in the dark, of full scale.
-    shot_noise : float
-        Variance of the noise per unit of radiance, of full scale squared.
-    defocus_px : float
-        Standard deviation of the blur of lens and sensor, in pixels.
-    """
-
+    # Exposure: factor on the radiance before it is clipped at the full scale of 1.
     gain: float = 1.0
+    # Grey level = 255 * radiance**(1 / gamma).
     gamma: float = 1.25
+    # Standard deviation in the dark, of full scale.
     read_noise: float = 0.004
+    # Variance of the noise per unit of radiance, of full scale squared.
     shot_noise: float = 1.5e-4
+    # Standard deviation of the blur of lens and sensor, in pixels.
     defocus_px: float = 0.75
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scene:
-    """Scene in front of the camera at one instant; moving bodies have their velocity.
+    """Scene in front of the camera at one instant; moving bodies have their velocity."""
 
-    Attributes
-    ----------
-    dome_from_scene : SE3
-        Places the scene; see `aqualvs.simulation.scenario.dome_from_target`.
-    walls, nets, fish, bubbles, boxes
-        Surfaces.
-    target : {"net", "wall", "none"}
-        Content of the plane y = 0, for the truth files.
-    water : WaterOptics
-        Optical properties of the water.
-    sensor : CameraSensor
-        Optical and electronic properties of the camera.
-    lasers_on : bool
-        False switches all lasers off.
-    """
-
+    # Places the scene; see `aqualvs.simulation.scenario.dome_from_target`.
     dome_from_scene: SE3
+    # Surfaces.
     walls: tuple[Wall, ...] = ()
     nets: tuple[Net, ...] = ()
     fish: tuple[Fish, ...] = ()
     bubbles: tuple[Bubble, ...] = ()
     boxes: tuple[Box, ...] = ()
+    # Content of the plane y = 0, for the truth files.
     target: Target = "none"
+    # Optical properties of the water.
     water: WaterOptics = field(default_factory=WaterOptics)
+    # Optical and electronic properties of the camera.
     sensor: CameraSensor = field(default_factory=CameraSensor)
+    # False switches all lasers off.
     lasers_on: bool = True
 
     def at(self, t: float) -> "Scene":

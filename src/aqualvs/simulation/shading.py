@@ -38,22 +38,15 @@ _EVERYWHERE = 1e3
 
 
 class Light(NamedTuple):
-    """Numbers of `WaterOptics` for the kernels of rays.
+    """Numbers of `WaterOptics` for the kernels of rays."""
 
-    Attributes
-    ----------
-    colours : array, shape (3, 3)
-        Rows: attenuation per metre, veil, ambient.
-    sheet_scatter, caustics, glare : float
-        As in `WaterOptics`.
-    time : float
-        Moves the caustics, in seconds.
-    """
-
+    # Shape (3, 3): rows: attenuation per metre, veil, ambient.
     colours: FloatArray
+    # As in `WaterOptics`.
     sheet_scatter: float
     caustics: float
     glare: float
+    # Moves the caustics, in seconds.
     time: float
 
 
@@ -67,18 +60,12 @@ def pack_light(scene: Scene, t: float) -> Light:
 
 
 class Members(NamedTuple):
-    """Ellipsoids and bubbles that a ray may meet.
+    """Ellipsoids and bubbles that a ray may meet."""
 
-    Attributes
-    ----------
-    ellipsoids, bubbles : int arrays
-        Rows of the tables, tile after tile.
-    first, last, first_bubble, last_bubble : int
-        The part of those arrays that belongs to the ray's tile.
-    """
-
+    # Rows of the tables, tile after tile.
     ellipsoids: IntArray
     bubbles: IntArray
+    # The part of those arrays that belongs to the ray's tile.
     first: int
     last: int
     first_bubble: int

@@ -27,47 +27,36 @@ NONE, NET, WALL, FISH, BUBBLE, SOLID = range(6)
 
 
 class Surfaces(NamedTuple):
-    """Tables of one scene in `dome`, one row a surface.
+    """Tables of one scene in `dome`, one row a surface."""
 
-    Attributes
-    ----------
-    walls, nets, ellipsoids, boxes, bubbles : arrays, shape (n, columns)
-        See the column constants of this module and of `net`.
-    holes : array, shape (n, 4)
-        Index of the net, u, v and radius.
-    folds : array, shape (n, columns)
-        See `net.pack_fold`; the first column is the index of the net.
-    tiles : Tiles
-        Noise for textures.
-    """
-
+    # Shape (n, columns): see the column constants of this module and of `net`.
     walls: FloatArray
+    # As `walls`.
     nets: FloatArray
+    # Shape (n, 4): index of the net, u, v and radius.
     holes: FloatArray
+    # Shape (n, columns): see `net.pack_fold`; the first column is the index of the net.
     folds: FloatArray
+    # As `walls`.
     ellipsoids: FloatArray
+    # As `walls`.
     boxes: FloatArray
+    # As `walls`.
     bubbles: FloatArray
+    # Noise for textures.
     tiles: Tiles
 
 
 class Hit(NamedTuple):
-    """Intersection of a ray with the first opaque surface.
+    """Intersection of a ray with the first opaque surface."""
 
-    Attributes
-    ----------
-    t : float
-        Distance along the ray in metres; infinite if the ray meets nothing.
-    kind, row : int
-        `Label` of the surface and its place in the table.
-    normal : (float, float, float)
-        Unit normal towards the ray's origin; only set for nets and boxes, whose intersection
-        gives it.
-    """
-
+    # Distance along the ray in metres; infinite if the ray meets nothing.
     t: float
+    # `Label` of the surface and its place in the table.
     kind: int
     row: int
+    # Unit normal towards the ray's origin; only set for nets and boxes, whose intersection gives
+    # it.
     normal: Vec
 
 

@@ -25,20 +25,14 @@ _WHITE_MASK = 255
 
 
 class Tiles(NamedTuple):
-    """Tiles of noise that repeat seamlessly.
+    """Tiles of noise that repeat seamlessly."""
 
-    Attributes
-    ----------
-    smooth : float32 array, shape (512, 512)
-        Fractal noise whose values are uniform in [0, 1): a threshold of f covers a fraction f.
-    ridges : float32 array, shape (512, 512)
-        Bright network on dark ground, mean 1: light focused by waves.
-    white : float32 array, shape (256, 256)
-        Independent uniform values.
-    """
-
+    # Shape (512, 512): fractal noise whose values are uniform in [0, 1): a threshold of f covers a
+    # fraction f.
     smooth: NDArray[np.float32]
+    # Shape (512, 512): bright network on dark ground, mean 1: light focused by waves.
     ridges: NDArray[np.float32]
+    # Shape (256, 256): independent uniform values.
     white: NDArray[np.float32]
 
 
@@ -101,18 +95,10 @@ _EXACT = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class Texture:
-    """A grid of square cells.
+    """A grid of square cells."""
 
-    Attributes
-    ----------
-    albedo : array, shape (rows, columns)
-        Diffuse reflectance; rows go down, as in an image.
-    cell : float
-        Side of a cell, in metres.
-    """
-
-    albedo: FloatArray
-    cell: float
+    albedo: FloatArray  # Shape (rows, columns): diffuse reflectance; rows go down, as in an image.
+    cell: float  # Side of a cell, in metres.
 
     @property
     def size(self) -> tuple[float, float]:
@@ -123,58 +109,39 @@ class Texture:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CharucoPrint:
-    """Printed ChArUco board (OpenCV's current pattern).
+    """Printed ChArUco board (OpenCV's current pattern)."""
 
-    Attributes
-    ----------
-    squares : (int, int)
-        Number of squares along x and y.
-    square, marker, border : float
-        Side of a square and of a marker, width of the light border, in metres.
-    dictionary : str
-        OpenCV's name of the markers' dictionary.
-    """
-
+    # Number of squares along x and y.
     squares: tuple[int, int]
+    # Side of a square and of a marker, width of the light border, in metres.
     square: float
     marker: float
     border: float
+    # OpenCV's name of the markers' dictionary.
     dictionary: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MarkerPrint:
-    """Markers on one flat sheet, in cells of a texture.
+    """Markers on one flat sheet, in cells of a texture."""
 
-    Attributes
-    ----------
-    dictionary : str
-        OpenCV's name of their dictionary.
-    ids : int array, shape (M,)
-        Number of each in the dictionary.
-    corners : int array, shape (M, 2)
-        Column and row of each one's top-left corner, in cells.
-    side : int
-        Cells along a marker's side; a multiple of its bits and its frame together.
-    ring : int
-        Cells of white paper around each.
-    """
-
+    # OpenCV's name of their dictionary.
     dictionary: str
+    # Shape (M,): number of each in the dictionary.
     ids: IntArray
+    # Shape (M, 2): column and row of each one's top-left corner, in cells.
     corners: IntArray = field(repr=False)
+    # Cells along a marker's side; a multiple of its bits and its frame together.
     side: int
+    # Cells of white paper around each.
     ring: int
 
 
 def charuco_texture(board: CharucoPrint) -> Texture:
     """Return a ChArUco board with its border.
 
-    Raises
-    ------
-    OptionError
-        If square, marker and border are not whole numbers of the markers' cells, or the dictionary
-        has too few markers.
+    Raises `OptionError` if square, marker and border are not whole numbers of the markers' cells,
+    or the dictionary has too few markers.
     """
     book = _dictionary(board.dictionary)
     cell = board.marker / (book.markerSize + 2 * _FRAME)

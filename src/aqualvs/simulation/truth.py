@@ -31,23 +31,15 @@ from aqualvs.simulation.surfaces import Surfaces, first_hit, meet_bubbles
 
 @dataclass(frozen=True, slots=True)
 class LitPoints:
-    """N points on the middles of the stripes that the camera sees, ordered by laser.
+    """N points on the middles of the stripes that the camera sees, ordered by laser."""
 
-    Attributes
-    ----------
-    points_in_dome : array, shape (N, 3)
-        Metres. On twine they lie on its surface, not on the net plane.
-    pixels : array, shape (N, 2)
-        Exact projections in `image`.
-    laser : int32 array, shape (N,)
-        Index into `Rig.lasers`.
-    label : int32 array, shape (N,)
-        `SurfaceKind` values.
-    """
-
+    # Shape (N, 3): metres. On twine they lie on its surface, not on the net plane.
     points_in_dome: FloatArray
+    # Shape (N, 2): exact projections in `image`.
     pixels: FloatArray
+    # Shape (N,): index into `Rig.lasers`.
     laser: NDArray[np.int32]
+    # Shape (N,): `SurfaceKind` values.
     label: NDArray[np.int32]
 
     def __len__(self) -> int:
@@ -59,16 +51,10 @@ class Beams(NamedTuple):
     """Sheets of lasers as they leave their sources, before anything ends them.
 
     They depend on the rig alone: who renders many scenes makes them once.
-
-    Attributes
-    ----------
-    sheets : Sheets
-    fans : tuple of FanRays
-        Rays in the middle of each sheet.
     """
 
     sheets: Sheets
-    fans: tuple[FanRays, ...]
+    fans: tuple[FanRays, ...]  # Rays in the middle of each sheet.
 
     def ended_by(self, surfaces: Surfaces) -> Sheets:
         """Return the sheets with the distances at which surfaces end them."""
@@ -126,21 +112,11 @@ def _lit_by(
 
 
 class Reach(NamedTuple):
-    """First intersections of n rays, shape (n,) each.
+    """First intersections of n rays, shape (n,) each."""
 
-    Attributes
-    ----------
-    solid : array
-        Distance of the first opaque surface in metres; infinite if there is none.
-    kind : int array
-        Its `SurfaceKind`.
-    bubble : array
-        Distance of the first bubble.
-    """
-
-    solid: FloatArray
-    kind: IntArray
-    bubble: FloatArray
+    solid: FloatArray  # Distance of the first opaque surface in metres; infinite if there is none.
+    kind: IntArray  # Its `SurfaceKind`.
+    bubble: FloatArray  # Distance of the first bubble.
 
 
 def cast(origins: FloatArray, directions: FloatArray, surfaces: Surfaces) -> Reach:

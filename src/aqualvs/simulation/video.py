@@ -24,27 +24,18 @@ Codec: TypeAlias = Literal["h264", "lossless", "mjpeg"]
 class Compression:
     """Compression of a video.
 
-    Attributes
-    ----------
-    codec : {"h264", "lossless", "mjpeg"}
-        H.264 with chroma at half resolution (4:2:0), as ROVs record; lossless H.264 in RGB; or
-        every frame as a separate JPEG (4:2:0, full range), as from USB cameras.
-    crf : int
-        Quality of "h264", 0 to 51; smaller is better. Ignored when `bit_rate` is given.
-    bit_rate : int or None
-        Bits a second of "h264".
-    jpeg_quality : int
-        Of "mjpeg", 1 to 100; larger is better.
-
-    Raises
-    ------
-    OptionError
-        If a value makes no sense.
+    Raises `OptionError` if a value makes no sense.
     """
 
+    # {"h264", "lossless", "mjpeg"}: H.264 with chroma at half resolution (4:2:0), as ROVs record;
+    # lossless H.264 in RGB; or every frame as a separate JPEG (4:2:0, full range), as from USB
+    # cameras.
     codec: Codec = "h264"
+    # Quality of "h264", 0 to 51; smaller is better. Ignored when `bit_rate` is given.
     crf: int = 20
+    # Bits a second of "h264".
     bit_rate: int | None = None
+    # Of "mjpeg", 1 to 100; larger is better.
     jpeg_quality: int = 80
 
     def __post_init__(self) -> None:
@@ -75,8 +66,6 @@ class VideoWriter(Closing):
         Width and height of every frame.
     fps : float
         Frames a second.
-    recording : Compression
-        Compression of the frames.
     first_field : {"top", "bottom"} or None
         Field that comes first in interlaced pictures: "h264" codes them as such, with chroma of
         each field by itself, as capture devices do; the other codecs know no fields. None for
@@ -131,10 +120,7 @@ class VideoWriter(Closing):
     def write(self, image: NDArray[np.uint8]) -> None:
         """Append one frame, uint8 RGB of shape (height, width, 3).
 
-        Raises
-        ------
-        OutputError
-            If it cannot be written.
+        Raises `OutputError` if it cannot be written.
         """
         if self._recording.codec == "mjpeg":
             self._mux([self._jpeg_packet(image)])

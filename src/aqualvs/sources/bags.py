@@ -54,10 +54,6 @@ def open_bag(path: Path, topic: str | None = None) -> MessageSource:
     topic : str or None
         Needed where several topics have images.
 
-    Returns
-    -------
-    source : MessageSource
-
     Raises
     ------
     SourceError
@@ -205,22 +201,9 @@ def _words(fault: Exception) -> str:
 def open_mcap(path: Path, topic: str | None = None) -> MessageSource:
     """Open the images of an MCAP file.
 
-    Parameters
-    ----------
-    path : Path
-    topic : str or None
-        Needed where several topics have images.
-
-    Returns
-    -------
-    source : MessageSource
-
-    Raises
-    ------
-    SourceError
-        If the file cannot be read or has no images.
-    OptionError
-        If the topic is missing or wrong, or a package is missing.
+    `topic`: needed where several topics have images. Raises `SourceError` if the file cannot be
+    read or has no images. Raises `OptionError` if the topic is missing or wrong, or a package is
+    missing.
     """
     _require("mcap.reader", path, "MCAP files")
     return _source(path, topic, _mcap_image_topics(path), functools.partial(_mcap_messages, path))
@@ -386,10 +369,7 @@ class _Bounded:
     def read(self, n: int = -1) -> bytes:
         """Return the next bytes.
 
-        Raises
-        ------
-        ValueError
-            If these are too many.
+        Raises `ValueError` if these are too many.
         """
         if not 0 <= n <= MAX_RECORD_BYTES:
             raise ValueError(f"a record of {n} bytes")

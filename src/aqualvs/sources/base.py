@@ -12,7 +12,6 @@
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from enum import StrEnum
-from types import TracebackType
 from typing import Protocol, Self, cast
 
 import cv2
@@ -40,22 +39,12 @@ class State(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class PartHealth:
-    """Health of one part: the stream, an output or a laser.
-
-    Attributes
-    ----------
-    name : str
-    state : State
-    detail : str
-        In a few words, also for a part that is well.
-    n_dropped : int
-        Samples, or frames, that it could not take.
-    """
+    """Health of one part: the stream, an output or a laser."""
 
     name: str
     state: State
-    detail: str = ""
-    n_dropped: int = 0
+    detail: str = ""  # In a few words, also for a part that is well.
+    n_dropped: int = 0  # Samples, or frames, that it could not take.
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,36 +58,25 @@ class StageDelay:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Health:
-    """Health of a live run, over the last seconds.
+    """Health of a live run, over the last seconds."""
 
-    Attributes
-    ----------
-    rate_hz : float
-        Frames measured per second.
-    valid_share : float
-        Share of them with a posture; NaN without frames.
-    n_frames, n_dropped, n_lost : int
-        Since the start: measured; skipped because a newer one had come; not decoded.
-    delays : tuple of StageDelay
-        From the decoded frame on.
-    source : PartHealth
-    lasers, outputs : tuple of PartHealth
-    quality : float
-        Mean stripe quality on the target, 0 to 1; NaN without points.
-    n_water, sigma_n_water : float
-        Refractive index in use, and its standard deviation where it is measured on line (else NaN).
-    """
-
+    # Frames measured per second.
     rate_hz: float = 0.0
+    # Share of them with a posture; NaN without frames.
     valid_share: float = float("nan")
+    # Since the start: measured; skipped because a newer one had come; not decoded.
     n_frames: int = 0
     n_dropped: int = 0
     n_lost: int = 0
+    # From the decoded frame on.
     delays: tuple[StageDelay, ...] = ()
+
     source: PartHealth = field(default_factory=lambda: PartHealth("source", State.OFF))
     lasers: tuple[PartHealth, ...] = ()
     outputs: tuple[PartHealth, ...] = ()
+    # Mean stripe quality on the target, 0 to 1; NaN without points.
     quality: float = float("nan")
+    # Refractive index in use, and its standard deviation where it is measured on line (else NaN).
     n_water: float = float("nan")
     sigma_n_water: float = float("nan")
 
@@ -111,17 +89,10 @@ class Health:
 
 
 def bgr_of(frame: Frame) -> ImagePlane:
-    """Return a frame as a BGR picture.
+    """Return a frame as a BGR picture, shape (height, width, 3), grey where it has no chroma.
 
-    Parameters
-    ----------
-    frame : Frame
-
-    Returns
-    -------
-    image : uint8 array, shape (height, width, 3)
-        A new array; grey where the frame has no chroma. A field has each of its rows twice, so that
-        pixels of the picture lie where they do in the picture.
+    A field has each of its rows twice, so that pixels of the picture lie where they do in the
+    picture.
     """
     image = _bgr_of(frame)
     return image if frame.field is None else np.repeat(image, 2, axis=0)
@@ -200,12 +171,7 @@ def _as_420(picture: VideoFrame) -> VideoFrame:
 def frame_of(index: int, time_s: float, picture: VideoFrame) -> Frame:
     """Return the frame that a decoded picture makes.
 
-    Parameters
-    ----------
-    index : int
-    time_s : float
-    picture : VideoFrame
-        As `planes_of` takes it.
+    `picture`: as `planes_of` takes it.
     """
     luma, chroma = planes_of(picture)
     return Frame(index, time_s, luma, chroma, is_interlaced=bool(picture.interlaced_frame))
@@ -218,10 +184,7 @@ def packet_with(data: bytes) -> "Packet[VideoStream]":
     (AV_INPUT_BUFFER_PADDING_SIZE of FFmpeg). Memory that FFmpeg allocates has them; Python's bytes
     end where they end, so that an intact picture may count as damaged.
 
-    Parameters
-    ----------
-    data : bytes
-        One coded picture.
+    `data`: one coded picture.
     """
     packet = cast("Packet[VideoStream]", Packet(len(data)))
     packet.update(data)
@@ -247,11 +210,8 @@ class Feed(Protocol):
         `Frame.index` rises strictly, `Frame.time_s` never falls, also over a reconnection; a gap
         in the index says that frames were lost. Frames may change their size.
 
-        Raises
-        ------
-        SourceError
-            If it can never work: no such file, no such camera. A stream that is merely not there
-            is tried again.
+        Raises `SourceError` if it can never work: no such file, no such camera. A stream that is
+        merely not there is tried again.
         """
 
     def health(self) -> PartHealth:
@@ -301,9 +261,4 @@ class FrameSource(Protocol):
 
     def __enter__(self) -> Self: ...
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        fault: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None: ...
+    def __exit__(self, *_: object) -> None: ...

@@ -22,18 +22,10 @@ from aqualvs.sources.rtp import PACKET_BYTES, SYNC, parse_rtp
 
 @dataclass(frozen=True, slots=True)
 class UdpAddress:
-    """Address and port to listen on.
+    """Address and port to listen on."""
 
-    Attributes
-    ----------
-    host : str
-        An address of this machine, a multicast group, or empty for every address.
-    port : int
-        0 for any free one.
-    """
-
-    host: str
-    port: int
+    host: str  # An address of this machine, a multicast group, or empty for every address.
+    port: int  # 0 for any free one.
 
     def __str__(self) -> str:
         host = f"[{self.host}]" if ":" in self.host else self.host
@@ -43,15 +35,8 @@ class UdpAddress:
 def parse_udp(where: str) -> UdpAddress:
     """Return where to listen, from `udp://HOST:PORT`, `rtp://HOST:PORT` and the like.
 
-    Parameters
-    ----------
-    where : str
-        Host may be missing, or written as `@` or `@HOST`; options after `?` are ignored.
-
-    Raises
-    ------
-    SourceError
-        If there is no port, or the host is no numeric address.
+    `where`: host may be missing, or written as `@` or `@HOST`; options after `?` are ignored.
+    Raises `SourceError` if there is no port, or the host is no numeric address.
     """
     scheme = where.partition("://")[0]
     try:
@@ -82,14 +67,7 @@ class Datagram(NamedTuple):
 class Datagrams:
     """Receiver on a UDP port; a thread of its own empties the system's buffer.
 
-    Parameters
-    ----------
-    address : UdpAddress
-
-    Raises
-    ------
-    OSError
-        If the system refuses: the port is taken, the address is none of this machine.
+    Raises `OSError` if the system refuses: the port is taken, the address is none of this machine.
     """
 
     def __init__(self, address: UdpAddress) -> None:
@@ -103,10 +81,7 @@ class Datagrams:
     def get(self, timeout: float) -> Datagram | None:
         """Return the oldest datagram, or None if there is none in time, or after `close`.
 
-        Parameters
-        ----------
-        timeout : float
-            Seconds.
+        `timeout`: seconds.
         """
         try:
             return self._waiting.get(timeout=timeout)
@@ -149,13 +124,7 @@ class Datagrams:
 
 
 def why_not(address: UdpAddress, fault: OSError) -> str:
-    """Return in a few words why listening is impossible.
-
-    Parameters
-    ----------
-    address : UdpAddress
-    fault : OSError
-    """
+    """Return in a few words why listening is impossible."""
     if fault.errno == errno.EADDRINUSE:
         return f"port {address.port} is taken by another program, such as QGroundControl"
     if fault.errno == errno.EADDRNOTAVAIL:
@@ -210,17 +179,7 @@ _MAX_LAG_S = 2.0
 
 
 def kind_of(datagram: bytes) -> str | None:
-    """Return the kind of content of a datagram, or None if it is unknown.
-
-    Parameters
-    ----------
-    datagram : bytes
-
-    Returns
-    -------
-    kind : str or None
-        "RTP H.264", "MPEG-TS" or "bare H.264".
-    """
+    """Return "RTP H.264", "MPEG-TS" or "bare H.264" for a datagram's content, or None."""
     if transport_content(datagram) is not None:
         return TS
     if datagram.startswith((b"\x00\x00\x01", b"\x00\x00\x00\x01")):
@@ -230,12 +189,7 @@ def kind_of(datagram: bytes) -> str | None:
 
 
 def transport_content(datagram: bytes) -> bytes | None:
-    """Return the MPEG-TS packets in a datagram, bare or in RTP (RFC 2250), or None.
-
-    Parameters
-    ----------
-    datagram : bytes
-    """
+    """Return the MPEG-TS packets in a datagram, bare or in RTP (RFC 2250), or None."""
     ts_in_rtp = 33
     if datagram[:1] != bytes([SYNC]):
         packet = parse_rtp(datagram)
@@ -251,7 +205,6 @@ class DatagramQueue:
 
     Parameters
     ----------
-    datagrams : Datagrams
     closed : Event
         Set when the feed ends.
     reception : Reception
@@ -284,10 +237,7 @@ class DatagramQueue:
     def get(self, timeout: float = WAIT_S) -> Datagram | None:
         """Return the next datagram, or None if none comes in time.
 
-        Parameters
-        ----------
-        timeout : float
-            Seconds.
+        `timeout`: seconds.
         """
         peeked, self._peeked = self._peeked, None
         return peeked or self._datagrams.get(timeout)
@@ -295,10 +245,7 @@ class DatagramQueue:
     def is_late(self, datagram: Datagram) -> bool:
         """Return whether decoding lags too far behind; if so, drop the waiting datagrams.
 
-        Parameters
-        ----------
-        datagram : Datagram
-            The oldest.
+        `datagram`: the oldest.
         """
         if time.monotonic() - datagram.arrival < _MAX_LAG_S:
             return False
@@ -308,11 +255,7 @@ class DatagramQueue:
     def is_foreign(self, datagram: Datagram, *, fits: bool) -> bool:
         """Return whether the sender has changed to another kind.
 
-        Parameters
-        ----------
-        datagram : Datagram
-        fits : bool
-            Whether it is of the kind that is being read.
+        `fits`: whether it is of the kind that is being read.
         """
         self._n_foreign = 0 if fits else self._n_foreign + 1
         if self._n_foreign < MAX_FOREIGN:

@@ -28,12 +28,8 @@ from aqualvs.sources.spans import Span
 def frames_of(pictures: Iterable[Frame], shutter: Shutter) -> Iterator[Frame]:
     """Yield two frames for each picture of an interlaced camera, and those of others as they are.
 
-    Parameters
-    ----------
-    pictures : iterable of Frame
-    shutter : Shutter
-        Of the camera. The first field has the time of its picture, the second follows after
-        `readout`.
+    `shutter`: of the camera. The first field has the time of its picture, the second follows after
+    `readout`.
     """
     if not shutter.is_interlaced:
         yield from pictures
@@ -129,8 +125,6 @@ class FieldSource(Closing):
 
     Attributes
     ----------
-    pictures : FrameSource
-    name : str
     size_px : (int, int)
         Of the pictures.
     fps : float or None
@@ -159,11 +153,7 @@ class FrameFeed:
 
     Its health warns where the pictures contradict the rig's shutter.
 
-    Parameters
-    ----------
-    pictures : Feed
-    shutter : Shutter
-        Of the rig.
+    `shutter`: of the rig.
     """
 
     def __init__(self, pictures: Feed, shutter: Shutter) -> None:
@@ -233,26 +223,17 @@ def combed_share(luma: ImagePlane) -> float:
 
 @dataclass(frozen=True, slots=True)
 class FieldEvidence:
-    """Signs of fields in whole pictures of a source.
+    """Signs of fields in whole pictures of a source."""
 
-    Attributes
-    ----------
-    is_marked : bool
-        Whether the stream says that its pictures are interlaced.
-    combed : float
-        Mean share of combed pixels.
-    woven : float
-        The same if the bottom rows came from the next picture: what fields would show at most.
-    woven_top : float
-        The same if the top rows did.
-    first_field : {"top", "bottom"} or None
-        As the stream states it, if it does.
-    """
-
+    # Whether the stream says that its pictures are interlaced.
     is_marked: bool
+    # Mean share of combed pixels.
     combed: float
+    # The same if the bottom rows came from the next picture: what fields would show at most.
     woven: float
+    # The same if the top rows did.
     woven_top: float = 0.0
+    # As the stream states it, if it does.
     first_field: Field | None = None
 
     @classmethod
@@ -299,11 +280,7 @@ class FieldEvidence:
     def contradiction(self, shutter: Shutter, fps: float | None) -> str:
         """Return what is wrong with the rig's shutter for these pictures; empty if nothing is.
 
-        Parameters
-        ----------
-        shutter : Shutter
-        fps : float or None
-            Pictures a second.
+        `fps`: pictures a second.
         """
         if not shutter.is_interlaced:
             if not self.are_fields:
@@ -346,10 +323,7 @@ class FieldEvidence:
 def first_pairs(source: FrameSource) -> Iterator[list[Frame]]:
     """Yield some pairs of consecutive pictures from the beginning of a source, as far as it goes.
 
-    Parameters
-    ----------
-    source : FrameSource
-        That begins again when it is iterated again: images, or messages of a recording.
+    `source`: that begins again when it is iterated again: images, or messages of a recording.
     """
     # Two seconds of video, in which a vehicle moves; reading them takes less than a second.
     n_pictures, every = 50, 5
@@ -363,11 +337,6 @@ def first_pairs(source: FrameSource) -> Iterator[list[Frame]]:
 
 class FieldWatch:
     """Watch of a stream's pictures for what contradicts the rig's shutter.
-
-    Parameters
-    ----------
-    shutter : Shutter
-        Of the rig.
 
     Attributes
     ----------

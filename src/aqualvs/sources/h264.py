@@ -17,17 +17,11 @@ _START_CODE = b"\x00\x00\x01"
 
 @dataclass(frozen=True, slots=True)
 class Units:
-    """Units of a packet up to its first coded slice.
+    """Units of a packet up to its first coded slice."""
 
-    Attributes
-    ----------
-    is_refresh : bool
-        Whether the picture is an IDR picture: decoding may begin with it.
-    has_parameter_sets, has_all_parameter_sets : bool
-        Whether there are any before it, and all that decoding needs.
-    """
-
+    # Whether the picture is an IDR picture: decoding may begin with it.
     is_refresh: bool
+    # Whether there are any before it, and all that decoding needs.
     has_parameter_sets: bool
     has_all_parameter_sets: bool
 
@@ -128,16 +122,9 @@ _CHROMA_PROFILES = frozenset({100, 110, 122, 244, 44, 83, 86, 118, 128, 138, 139
 
 
 def nal_units(data: bytes) -> list[bytes]:
-    """Return the beginnings of the NAL units of a byte stream (annex B).
+    """Return the first 64 bytes, at most, of the NAL units of a byte stream (annex B).
 
-    Parameters
-    ----------
-    data : bytes
-
-    Returns
-    -------
-    units : list of bytes
-        At most 64 bytes of each, without start code.
+    Start codes are left out.
     """
     return [data[m.end() : m.end() + _HEAD] for m in _START.finditer(data)]
 
@@ -200,11 +187,8 @@ class FieldPairs:
     An encoder of interlaced video may code each field by itself (PAFF), in a packet of its own. The
     decoder makes one picture of two such packets.
 
-    Parameters
-    ----------
-    extradata : bytes
-        Of the stream: parameter sets, each after its length (ISO/IEC 14496-15) or a start code; or
-        nothing.
+    `extradata`: of the stream: parameter sets, each after its length (ISO/IEC 14496-15) or a start
+    code; or nothing.
     """
 
     def __init__(self, extradata: bytes) -> None:
@@ -222,10 +206,7 @@ class FieldPairs:
     def is_second(self, packet: bytes | memoryview) -> bool:
         """Return whether a packet completes the picture of the packet before it.
 
-        Parameters
-        ----------
-        packet : bytes or memoryview
-            The next one of the stream, in the order of decoding.
+        `packet`: the next one of the stream, in the order of decoding.
         """
         for unit in self._units(packet):
             kind = unit[0] & 31
@@ -260,12 +241,7 @@ class FieldPairs:
 def field_pairs(codec: str, extradata: bytes | None) -> FieldPairs | None:
     """Return the detector of second fields for a stream; None if it is not H.264.
 
-    Parameters
-    ----------
-    codec : str
-        Name that FFmpeg gives the codec.
-    extradata : bytes or None
-        Of the stream.
+    `codec`: name that FFmpeg gives the codec.
     """
     return FieldPairs(extradata or b"") if codec == "h264" else None
 
@@ -293,21 +269,11 @@ class _Bits:
 
 @dataclass(frozen=True, slots=True)
 class _SliceForm:
-    """What a sequence parameter set says of the heads of slices (7.3.2.1.1, 7.3.3).
+    """What a sequence parameter set says of the heads of slices (7.3.2.1.1, 7.3.3)."""
 
-    Attributes
-    ----------
-    number_bits : int
-        Width of `frame_num`.
-    may_skip_numbers : bool
-        Whether numbers may be left out on purpose.
-    may_hold_fields : bool
-        Whether slices say if they are of a field.
-    """
-
-    number_bits: int
-    may_skip_numbers: bool
-    may_hold_fields: bool
+    number_bits: int  # Width of `frame_num`.
+    may_skip_numbers: bool  # Whether numbers may be left out on purpose.
+    may_hold_fields: bool  # Whether slices say if they are of a field.
 
     def number(self, bits: "_Bits") -> int:
         """Return `frame_num`, of a slice whose type byte has been read."""

@@ -51,28 +51,19 @@ ENCODINGS = tuple(sorted({*_GREY, *_GREY_16, *_TO_BGR, *_PACKED_422}))
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ImageMessage:
-    """One picture, or one packet of a video.
+    """One picture, or one packet of a video."""
 
-    Attributes
-    ----------
-    stamp_ns : int
-        Time of the picture, nanoseconds; 0 if the message has none.
-    encoding : str
-        Of the pixels where `size_px` is given, else of the file or video: "jpeg", "png", "h264".
-    data : bytes
-    size_px : (int, int) or None
-        Width and height of a picture that is not compressed.
-    step : int
-        Bytes from row to row.
-    is_big_endian : bool
-        Byte order of pixels of 16 bits.
-    """
-
+    # Time of the picture, nanoseconds; 0 if the message has none.
     stamp_ns: int
+    # Of the pixels where `size_px` is given, else of the file or video: "jpeg", "png", "h264".
     encoding: str
+
     data: bytes
+    # Width and height of a picture that is not compressed.
     size_px: tuple[int, int] | None = None
+    # Bytes from row to row.
     step: int = 0
+    # Byte order of pixels of 16 bits.
     is_big_endian: bool = False
 
     @property
@@ -196,10 +187,7 @@ def kind_of_schema(name: str) -> str | None:
 def image_of_ros(message: Any) -> ImageMessage:
     """Return the image in a decoded ROS message of any kind known here.
 
-    Parameters
-    ----------
-    message : object
-        With the fields of `sensor_msgs` or `foxglove_msgs` as attributes.
+    `message`: with the fields of `sensor_msgs` or `foxglove_msgs` as attributes.
     """
     stamp = message.header.stamp if hasattr(message, "header") else message.timestamp
     stamp_ns = int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
@@ -219,14 +207,7 @@ def image_of_ros(message: Any) -> ImageMessage:
 def image_of_json(content: bytes) -> ImageMessage:
     """Return the image in a Foxglove message written as JSON.
 
-    Parameters
-    ----------
-    content : bytes
-
-    Raises
-    ------
-    ValueError
-        If fields are missing or wrong.
+    Raises `ValueError` if fields are missing or wrong.
     """
     try:
         found = json.loads(content)
@@ -252,10 +233,7 @@ def image_of_json(content: bytes) -> ImageMessage:
 def image_of_protobuf(schema: str) -> Callable[[bytes], ImageMessage]:
     """Return the function that decodes a Foxglove message written as Protobuf.
 
-    Parameters
-    ----------
-    schema : str
-        `foxglove.RawImage`, `foxglove.CompressedImage` or `foxglove.CompressedVideo`.
+    `schema`: `foxglove.RawImage`, `foxglove.CompressedImage` or `foxglove.CompressedVideo`.
     """
 
     def read(content: bytes) -> ImageMessage:
@@ -279,14 +257,7 @@ def image_of_protobuf(schema: str) -> Callable[[bytes], ImageMessage]:
 def protobuf_fields(content: bytes) -> dict[int, int | bytes]:
     """Return the last value of each field of a Protobuf message, by its number.
 
-    Parameters
-    ----------
-    content : bytes
-
-    Raises
-    ------
-    ValueError
-        If the message is cut short or uses groups.
+    Raises `ValueError` if the message is cut short or uses groups.
     """
     fields: dict[int, int | bytes] = {}
     at = 0
@@ -353,17 +324,10 @@ Logged: TypeAlias = tuple[int, ImageMessage | None]
 
 @dataclass(frozen=True, slots=True)
 class ImageTopic:
-    """A topic with images.
-
-    Attributes
-    ----------
-    name : str
-    n_messages : int or None
-        None where the recording does not state it.
-    """
+    """A topic with images."""
 
     name: str
-    n_messages: int | None
+    n_messages: int | None  # None where the recording does not state it.
 
 
 def choose_topic(where: str, topics: list[ImageTopic], wanted: str | None) -> ImageTopic:
@@ -375,7 +339,6 @@ def choose_topic(where: str, topics: list[ImageTopic], wanted: str | None) -> Im
         For messages.
     topics : list of ImageTopic
         With images.
-    wanted : str or None
 
     Raises
     ------
@@ -433,11 +396,8 @@ class MessageSource(Closing):
     def __iter__(self) -> Iterator[Frame]:
         """Yield the readable images; others leave a gap in the index.
 
-        Raises
-        ------
-        SourceError
-            When the size changes, and at the end if the recording is cut short or its last images
-            cannot be decoded.
+        Raises `SourceError` when the size changes, and at the end if the recording is cut short or
+        its last images cannot be decoded.
         """
         last = -1
         for frame in self._frames():

@@ -122,10 +122,7 @@ class ImageSource(Closing):
 def images_in(folder: Path) -> list[Path]:
     """Return the images in a folder, sorted naturally.
 
-    Raises
-    ------
-    SourceError
-        If the folder holds none, or cannot be listed.
+    Raises `SourceError` if the folder holds none, or cannot be listed.
     """
     try:
         found = [p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES]
@@ -147,7 +144,6 @@ def read_image(path: Path, how: int = cv2.IMREAD_ANYCOLOR) -> ImagePlane | None:
 
     Parameters
     ----------
-    path : Path
     how : int
         OpenCV's flag; the default returns grey images as grey.
 

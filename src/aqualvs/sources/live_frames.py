@@ -28,10 +28,7 @@ from aqualvs.sources.video import FrameCounter
 class Unwrapper:
     """Unwrapped counter: continues a counter of fixed width past its overflow.
 
-    Parameters
-    ----------
-    bits : int
-        Width of the counter: 32 for the time in RTP, 33 for that in MPEG-TS.
+    `bits`: width of the counter: 32 for the time in RTP, 33 for that in MPEG-TS.
     """
 
     def __init__(self, bits: int) -> None:
@@ -65,10 +62,7 @@ class StreamClock:
     arrival by more than 5 s, or falls, the stream goes on as long after the last picture as the
     new one arrived after it.
 
-    Parameters
-    ----------
-    tick : float
-        Length of a tick in seconds; positive.
+    `tick`: length of a tick in seconds; positive.
     """
 
     def __init__(self, tick: float) -> None:
@@ -81,10 +75,7 @@ class StreamClock:
     def set_tick(self, tick: float) -> None:
         """Go on with ticks of another length, after a new connection.
 
-        Parameters
-        ----------
-        tick : float
-            Seconds; positive.
+        `tick`: seconds; positive.
         """
         self._tick = tick
         self._anchor_ticks = None
@@ -156,10 +147,7 @@ class Reception:
     def hear(self, content: str = "") -> None:
         """Note that something came; ends a trouble.
 
-        Parameters
-        ----------
-        content : str
-            What it is; empty if that is known.
+        `content`: what it is; empty if that is known.
         """
         with self._lock:
             self._heard = time.monotonic()
@@ -169,10 +157,7 @@ class Reception:
     def complain(self, words: str) -> None:
         """Note why nothing of use comes, until something does.
 
-        Parameters
-        ----------
-        words : str
-            Empty if the reason is gone.
+        `words`: empty if the reason is gone.
         """
         with self._lock:
             self._trouble = words
@@ -199,22 +184,12 @@ class Reception:
             self._forget(now)
 
     def hold(self, n: int) -> None:
-        """Note how many pictures are not delivered, since the last one that was, after a loss.
-
-        Parameters
-        ----------
-        n : int
-        """
+        """Note how many pictures are not delivered, since the last one that was, after a loss."""
         with self._lock:
             self._n_held = n
 
     def end(self, words: str) -> None:
-        """Note that nothing more will come.
-
-        Parameters
-        ----------
-        words : str
-        """
+        """Note that nothing more will come."""
         with self._lock:
             self._over = words
 
@@ -364,10 +339,7 @@ class LiveDecoder:
 class LiveFrames:
     """Frames of a stream over reconnections: numbers rise, time never falls.
 
-    Parameters
-    ----------
-    reception : Reception
-        Told of every frame.
+    `reception`: told of every frame.
     """
 
     def __init__(self, reception: Reception) -> None:
@@ -413,12 +385,7 @@ class LiveFrames:
             self._decoder.distrust()
 
     def announce(self, packet: "Packet[VideoStream]") -> None:
-        """Count a picture that is too damaged to be decoded.
-
-        Parameters
-        ----------
-        packet : Packet
-        """
+        """Count a picture that is too damaged to be decoded."""
         self._frame_counter.expect(packet)
         self._hold()
 

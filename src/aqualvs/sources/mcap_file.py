@@ -52,10 +52,7 @@ def head(kind: Op, length: int) -> bytes:
 def padding_head(span: int) -> bytes:
     """Return the head of a padding record that spans this many bytes, its head included.
 
-    Raises
-    ------
-    ValueError
-        If it cannot even hold its head.
+    Raises `ValueError` if it cannot even hold its head.
     """
     if span < HEAD_BYTES:
         raise ValueError(f"a record cannot span {span} bytes")
@@ -130,7 +127,6 @@ def chunk_index(
         Where each channel's message index is in the file.
     index_length : int
         Of all these indexes together.
-    compression : str
     sizes : (int, int)
         Compressed and raw.
     """
@@ -152,7 +148,6 @@ def statistics(
 
     Parameters
     ----------
-    n_schemas, n_chunks : int
     times_ns : (int, int)
         Of the first and the last message.
     counts : mapping
@@ -193,14 +188,7 @@ _KNOWN = frozenset(Op)
 
 @dataclass(frozen=True, slots=True)
 class StoredMessage:
-    """One message.
-
-    Attributes
-    ----------
-    topic : str
-    log_ns, publish_ns : int
-    data : bytes
-    """
+    """One message."""
 
     topic: str
     log_ns: int
@@ -210,26 +198,17 @@ class StoredMessage:
 
 @dataclass(slots=True)
 class _Listing:
-    """Contents of a file as stated by one of its ends.
+    """Contents of a file as stated by one of its ends."""
 
-    Attributes
-    ----------
-    channels : list of (int, str)
-        Numbers and topics.
-    chunks : dict
-        From a chunk's place in the file to the length of its record; None where not known.
-    counts : dict or None
-        Messages by channel.
-    n_chunks : int or None
-        As the statistics have it.
-    whole : bool
-        Whether it was read to its end.
-    """
-
+    # Numbers and topics.
     channels: list[tuple[int, str]] = field(default_factory=list)
+    # From a chunk's place in the file to the length of its record; None where not known.
     chunks: dict[int, int | None] = field(default_factory=dict)
+    # Messages by channel.
     counts: dict[int, int] | None = None
+    # As the statistics have it.
     n_chunks: int | None = None
+    # Whether it was read to its end.
     whole: bool = False
 
 
@@ -240,10 +219,6 @@ class McapFile:
     or the end is missing, as after a loss of power or with a bit that flipped on the disk, the file
     is read from its beginning as far as it goes, and further contents of the summary are added:
     damage in one place loses the chunk that it is in.
-
-    Parameters
-    ----------
-    path : Path
 
     Attributes
     ----------
@@ -297,10 +272,7 @@ class McapFile:
     def messages(self, topics: Collection[str]) -> Iterator[StoredMessage]:
         """Yield the messages of some topics in the order of the file.
 
-        Raises
-        ------
-        SourceError
-            If the file cannot be read any more.
+        Raises `SourceError` if the file cannot be read any more.
         """
         wanted = {
             number: name
@@ -397,10 +369,7 @@ def _merged_topics(front: _Listing, summary: _Listing) -> dict[int, tuple[str, .
 def _note(found: _Listing, kind: int, content: bytes) -> None:
     """Add a record to the contents.
 
-    Raises
-    ------
-    struct.error, ValueError
-        If it is none.
+    Raises `struct.error` or `ValueError` if it is none.
     """
     if kind == Op.CHANNEL:
         number, _, n_bytes = struct.unpack_from("<HHI", content)
@@ -461,10 +430,8 @@ def _chunk_at(file: BinaryIO, at: int) -> bytes | None:
 def decompressed(compression: str, data: bytes, raw_size: int) -> bytes:
     """Return the raw content of a chunk.
 
-    Raises
-    ------
-    ValueError, OSError, ArrowException
-        If it has another size than its head says, or is too large.
+    Raises `ValueError`, `OSError` or `ArrowException` if it has another size than its head says, or
+    is too large.
     """
     if not compression:
         return data

@@ -54,10 +54,7 @@ class PacedFeed:
     def __iter__(self) -> Iterator[Frame]:
         """Yield frames until the source ends or `close` is called.
 
-        Raises
-        ------
-        SourceError
-            At the end, if the recording is cut short.
+        Raises `SourceError` at the end, if the recording is cut short.
         """
         with self._source as source:
             began = time.monotonic()
@@ -179,7 +176,6 @@ def open_feed(
 
     Parameters
     ----------
-    where : str or Path
     realtime : bool
         Whether a recording is played at its own pace, or as fast as it is taken. Streams and
         cameras have one pace only.
@@ -294,10 +290,7 @@ def _described(path: Path) -> Feed:
 def folder_beside(where: str) -> Path:
     """Return where the results of a source go by default: a folder beside it, `NAME_run`.
 
-    Raises
-    ------
-    OptionError
-        If the source is an address.
+    Raises `OptionError` if the source is an address.
     """
     if is_address(where):
         raise OptionError(f"--out: missing; give the folder to write for {where}")

@@ -199,21 +199,14 @@ _DEVICES = Path("/dev")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraOptions:
-    """Options requested of a camera; the camera chooses those left out.
+    """Options requested of a camera; the camera chooses those left out."""
 
-    Attributes
-    ----------
-    size_px : (int, int) or None
-        Width and height.
-    fps : float or None
-        Frames per second.
-    pixel_format : str or None
-        As FFmpeg calls it: `h264`, `mjpeg`, `yuyv422`. Many cameras reach their full rate with the
-        first two only.
-    """
-
+    # Width and height.
     size_px: tuple[int, int] | None = None
+    # Frames per second.
     fps: float | None = None
+    # As FFmpeg calls it: `h264`, `mjpeg`, `yuyv422`. Many cameras reach their full rate with the
+    # first two only.
     pixel_format: str | None = None
 
     def for_ffmpeg(self) -> dict[str, str]:
@@ -231,11 +224,7 @@ class CameraOptions:
 class CameraFeed(RemoteFeed):
     """Feed of a camera; reopened when it is unplugged and returns.
 
-    Parameters
-    ----------
-    where : str
-        `/dev/video0`, `camera:0`, or `camera:` and a path.
-    options : CameraOptions
+    `where`: `/dev/video0`, `camera:0`, or `camera:` and a path.
     """
 
     def __init__(self, where: str, options: CameraOptions) -> None:
@@ -252,10 +241,7 @@ class CameraFeed(RemoteFeed):
     def __iter__(self) -> Iterator[Frame]:
         """Yield frames until closed.
 
-        Raises
-        ------
-        SourceError
-            If there is no such camera, or no Video4Linux, at the start.
+        Raises `SourceError` if there is no such camera, or no Video4Linux, at the start.
         """
         if not sys.platform.startswith("linux"):
             raise SourceError(
@@ -269,14 +255,7 @@ class CameraFeed(RemoteFeed):
 def camera_device(where: str) -> str:
     """Return the device that `camera:0`, `camera:/dev/video2` or `/dev/video0` names.
 
-    Parameters
-    ----------
-    where : str
-
-    Raises
-    ------
-    SourceError
-        If nothing follows `camera:`.
+    Raises `SourceError` if nothing follows `camera:`.
     """
     name = where.removeprefix("camera:")
     if not name:
@@ -285,12 +264,7 @@ def camera_device(where: str) -> str:
 
 
 def is_camera(where: str) -> bool:
-    """Return whether `where` names a camera.
-
-    Parameters
-    ----------
-    where : str
-    """
+    """Return whether `where` names a camera."""
     return where.startswith(("camera:", f"{_DEVICES}/video", f"{_DEVICES}/v4l/"))
 
 

@@ -18,41 +18,18 @@ _RESTART_SILENCE_S = 0.1
 
 @dataclass(frozen=True, slots=True)
 class RtpPacket:
-    """One packet.
-
-    Attributes
-    ----------
-    payload_type : int
-    marker : bool
-        Ends a picture.
-    sequence : int
-        16 bits.
-    timestamp : int
-        32 bits, in ticks of the payload's clock.
-    sender : int
-        Synchronisation source (SSRC).
-    payload : bytes
-    """
+    """One packet."""
 
     payload_type: int
-    marker: bool
-    sequence: int
-    timestamp: int
-    sender: int
+    marker: bool  # Ends a picture.
+    sequence: int  # 16 bits.
+    timestamp: int  # 32 bits, in ticks of the payload's clock.
+    sender: int  # Synchronisation source (SSRC).
     payload: bytes
 
 
 def parse_rtp(datagram: bytes) -> RtpPacket | None:
-    """Return the packet in a datagram, or None if there is none.
-
-    Parameters
-    ----------
-    datagram : bytes
-
-    Returns
-    -------
-    packet : RtpPacket or None
-    """
+    """Return the packet in a datagram, or None if there is none."""
     if len(datagram) < 13 or datagram[0] >> 6 != 2:
         return None
     first, second = datagram[0], datagram[1]
@@ -75,20 +52,15 @@ def parse_rtp(datagram: bytes) -> RtpPacket | None:
 
 
 class Ordered(NamedTuple):
-    """A packet in its place.
-
-    Attributes
-    ----------
-    packet : RtpPacket
-    after_loss : bool
-        Packets right before it are missing.
-    is_restart : bool
-        The first of another sender, or of a restarted one.
-    """
+    """A packet in its place."""
 
     packet: RtpPacket
-    after_loss: bool
-    is_restart: bool
+    after_loss: bool  # Packets right before it are missing.
+    is_restart: bool  # The first of another sender, or of a restarted one.
+
+
+# Later packets kept while one is missing.
+_MOST_KEPT = 32
 
 
 class RtpOrder:
@@ -96,8 +68,6 @@ class RtpOrder:
 
     Parameters
     ----------
-    depth : int
-        So many later packets are kept while one is missing.
     patience : float
         Seconds for which a missing packet is awaited.
 
@@ -108,8 +78,7 @@ class RtpOrder:
     silent, so that of two senders to one port the first is kept.
     """
 
-    def __init__(self, *, depth: int = 32, patience: float = 0.02) -> None:
-        self._depth = depth
+    def __init__(self, *, patience: float = 0.02) -> None:
         self._timeout = patience
         self._sender: int | None = None
         self._next = 0
@@ -121,15 +90,7 @@ class RtpOrder:
     def push(self, packet: RtpPacket, arrival: float) -> list[Ordered]:
         """Return the packets whose turn has come.
 
-        Parameters
-        ----------
-        packet : RtpPacket
-        arrival : float
-            Seconds on the monotonic clock.
-
-        Returns
-        -------
-        ordered : list of Ordered
+        `arrival`: seconds on the monotonic clock.
         """
         if self._sender is None:
             return self._begin([packet], arrival)
@@ -155,17 +116,14 @@ class RtpOrder:
     def overdue(self, arrival: float) -> list[Ordered]:
         """Return the packets that have waited too long for a missing one.
 
-        Parameters
-        ----------
-        arrival : float
-            Now, in seconds on the monotonic clock.
+        `arrival`: now, in seconds on the monotonic clock.
         """
         return self._due(arrival)
 
     def _due(self, arrival: float) -> list[Ordered]:
         ready = self._run(after_loss=False)
         late = arrival - self._missing_since >= self._timeout
-        while self._kept and (late or len(self._kept) > self._depth):
+        while self._kept and (late or len(self._kept) > _MOST_KEPT):
             self._next = min(self._kept, key=self._distance)
             ready += self._run(after_loss=True)
             self._missing_since = arrival
@@ -216,27 +174,13 @@ _UNUSED = frozenset({0, 2, 3, 4, 30, 31})
 
 @dataclass(frozen=True, slots=True)
 class AccessUnit:
-    """One coded picture.
+    """One coded picture."""
 
-    Attributes
-    ----------
-    ticks : int
-        Time, 90 kHz, continued past 32 bits.
-    data : bytes
-        Its units as a byte stream; empty if `is_whole` is False.
-    is_whole : bool
-        Nothing of it is missing.
-    after_loss : bool
-        Packets before it, or of it, are lost.
-    is_restart : bool
-        The first of a restarted sender.
-    """
-
-    ticks: int
-    data: bytes
-    is_whole: bool
-    after_loss: bool
-    is_restart: bool
+    ticks: int  # Time, 90 kHz, continued past 32 bits.
+    data: bytes  # Its units as a byte stream; empty if `is_whole` is False.
+    is_whole: bool  # Nothing of it is missing.
+    after_loss: bool  # Packets before it, or of it, are lost.
+    is_restart: bool  # The first of a restarted sender.
 
 
 class H264Depacketizer:
@@ -262,14 +206,7 @@ class H264Depacketizer:
     def push(self, ordered: Ordered) -> list[AccessUnit]:
         """Return the pictures that a packet completes.
 
-        Parameters
-        ----------
-        ordered : Ordered
-
-        Returns
-        -------
-        pictures : list of AccessUnit
-            None, one, or two: one that was left open, and its own.
+        There is none, one, or two: one that was left open, and its own.
         """
         packet, done = ordered.packet, []
         if self._timestamp is not None and (

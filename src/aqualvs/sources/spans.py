@@ -50,54 +50,36 @@ class SpanKind(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Span:
-    """Consecutive frames of a dive.
-
-    Attributes
-    ----------
-    kind : SpanKind
-    first, stop : int
-        Frames `first` to `stop` - 1, by their index; 0 and 0 for a whole dive of unknown length.
-    start_pts, origin_pts : int
-        Time of the first packet and of the dive's first picture, in ticks of the stream.
-    n_bytes : int
-        Size of the packets, or of the files.
-    checksum : int
-        CRC-32 of the packets with their times.
-    lead, trail : int
-        Frames at the beginning and at the end that are those of the spans beside it, for what
-        depends on a frame's neighbours; they count in `first`, `stop` and `checksum`.
-    """
+    """Consecutive frames of a dive."""
 
     kind: SpanKind
+    # Frames `first` to `stop` - 1, by their index; 0 and 0 for a whole dive of unknown length.
     first: int = 0
     stop: int = 0
+    # Time of the first packet and of the dive's first picture, in ticks of the stream.
     start_pts: int = 0
     origin_pts: int = 0
+    # Size of the packets, or of the files.
     n_bytes: int = 0
+    # CRC-32 of the packets with their times.
     checksum: int = 0
+    # Frames at the beginning and at the end that are those of the spans beside it, for what depends
+    # on a frame's neighbours; they count in `first`, `stop` and `checksum`.
     lead: int = 0
     trail: int = 0
 
 
 @dataclass(frozen=True, slots=True)
 class VideoSpans:
-    """Spans into which a video may be cut.
+    """Spans into which a video may be cut."""
 
-    Attributes
-    ----------
-    spans : tuple of Span
-        In order, without gaps between their own frames; empty if the video must stay whole.
-    why_whole : str
-        Why it must; empty if it need not.
-    checksum : int
-        Of all packets.
-    n_bytes : int
-        Of all packets.
-    """
-
+    # In order, without gaps between their own frames; empty if the video must stay whole.
     spans: tuple[Span, ...]
+    # Why it must; empty if it need not.
     why_whole: str
+    # Of all packets.
     checksum: int
+    # Of all packets.
     n_bytes: int
 
 
@@ -106,7 +88,6 @@ def video_spans(path: Path, n_min: int, margin: int = 0) -> VideoSpans:
 
     Parameters
     ----------
-    path : Path
     n_min : int
         Frames that a part has at least, but for the last.
     margin : int
@@ -332,11 +313,7 @@ class UnlikeProbeError(Exception):
 class VideoParts(Closing):
     """Reader of spans of a video, opened once for all of them; a context manager.
 
-    Parameters
-    ----------
-    path : Path
-    size_px : (int, int)
-        Width and height of every picture.
+    `size_px`: width and height of every picture.
     """
 
     def __init__(self, path: Path, size_px: tuple[int, int]) -> None:
@@ -346,16 +323,8 @@ class VideoParts(Closing):
     def frames(self, span: Span) -> Iterator[Frame]:
         """Decode a part; frames have the index and the time that the whole video gives them.
 
-        Parameters
-        ----------
-        span : Span
-            From `video_spans` of the same file.
-
-        Raises
-        ------
-        UnlikeProbeError
-            If any picture is damaged or missing: the whole video decides what becomes of those
-            that follow.
+        `span`: from `video_spans` of the same file. Raises `UnlikeProbeError` if any picture is
+        damaged or missing: the whole video decides what becomes of those that follow.
         """
         index, latest = span.first, span.origin_pts - 1
         try:
@@ -395,10 +364,7 @@ class VideoParts(Closing):
 def image_frames(folder: Path, span: Span, fps: float) -> Iterator[Frame]:
     """Read a part of a folder of images, as `ImageSource` reads all of it.
 
-    Raises
-    ------
-    UnlikeProbeError
-        If an image cannot be read, or there are others than there were.
+    Raises `UnlikeProbeError` if an image cannot be read, or there are others than there were.
     """
     try:
         source = ImageSource(images_in(folder)[span.first : span.stop], fps=fps)

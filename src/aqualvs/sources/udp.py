@@ -1,7 +1,7 @@
 """Live video over UDP: RTP with H.264, MPEG-TS, or a bare H.264 byte stream.
 
-`UdpFeed` listens on a port and picks the reader for the content: `RtpReader`, `TransportReader` or
-`BareReader`. `read_sdp` reads the session description (RFC 8866) of an RTP stream.
+`UdpFeed` listens on a port and reads its content by `rtp_frames`, `transport_frames` or
+`bare_frames`. `read_sdp` reads the session description (RFC 8866) of an RTP stream.
 """
 
 import base64
@@ -9,7 +9,7 @@ import binascii
 import re
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass
 from fractions import Fraction
@@ -30,6 +30,7 @@ from aqualvs.sources.datagrams import (
     RTP,
     TS,
     WAIT_S,
+    Datagram,
     DatagramQueue,
     Datagrams,
     UdpAddress,
@@ -53,36 +54,22 @@ from aqualvs.special_files import refuse_special
 
 @dataclass(frozen=True, slots=True)
 class SdpVideo:
-    """The video that a session description announces.
+    """The video that a session description announces."""
 
-    Attributes
-    ----------
-    address : UdpAddress
-        Where it arrives; the host is kept for multicast only.
-    payload_type : int
-    codec : str
-        As in RTP, upper case: "H264".
-    parameter_sets : bytes
-        SPS and PPS of H.264 as a byte stream; empty if they come in the stream.
-    """
-
+    # Where it arrives; the host is kept for multicast only.
     address: UdpAddress
+
     payload_type: int
+    # As in RTP, upper case: "H264".
     codec: str
+    # SPS and PPS of H.264 as a byte stream; empty if they come in the stream.
     parameter_sets: bytes
 
 
 def read_sdp(path: Path) -> SdpVideo:
     """Read the first video from an SDP file.
 
-    Parameters
-    ----------
-    path : Path
-
-    Raises
-    ------
-    SourceError
-        If the file cannot be read or announces no video over RTP and UDP.
+    Raises `SourceError` if the file cannot be read or announces no video over RTP and UDP.
     """
     refuse_special(path)
     max_bytes = 64 << 10
@@ -133,147 +120,93 @@ def _parameter_sets(part: str, payload_type: int) -> bytes:
     return b"".join(START_CODE + each for each in sets)
 
 
-class RtpReader:
-    """Reader of RTP with H.264.
-
-    Parameters
-    ----------
-    frames : LiveFrames
-    parameter_sets : bytes
-        SPS and PPS as a byte stream, or nothing.
-    payload_type : int or None
-        None takes every dynamic one.
-    """
-
-    def __init__(self, frames: LiveFrames, parameter_sets: bytes, payload_type: int | None) -> None:
-        self._frames = frames
-        self._parameter_sets = parameter_sets
-        self._payload_type = payload_type
-
-    def frames(self, datagram_queue: DatagramQueue) -> Iterator[Frame]:
-        """Yield frames until the feed ends or another kind comes.
-
-        Parameters
-        ----------
-        datagram_queue : DatagramQueue
-        """
-        order, pictures = RtpOrder(), H264Depacketizer()
-        self._frames.connect(
-            decoder_of("h264", self._parameter_sets), 1 / TICKS_HZ, hears_losses=True
-        )
-        while not datagram_queue.is_closed:
-            datagram = datagram_queue.get(order.wait or WAIT_S)
-            if datagram is None:
-                due = order.overdue(time.monotonic())
-            elif datagram_queue.is_late(datagram):
-                self._frames.lose()
-                continue
-            else:
-                packet = parse_rtp(datagram.content)
-                if datagram_queue.is_foreign(datagram, fits=packet is not None):
-                    return
-                if packet is None or not self._is_video(packet):
-                    continue
-                due = order.push(packet, datagram.arrival)
-                self._tell(datagram_queue.reception, pictures)
-            for ordered in due:
-                for picture in pictures.push(ordered):
-                    yield from decoded(self._frames, picture)
-
-    def _is_video(self, packet: RtpPacket) -> bool:
-        if self._payload_type is None:
-            return packet.payload_type >= 96
-        return packet.payload_type == self._payload_type
-
-    def _tell(self, reception: Reception, pictures: H264Depacketizer) -> None:
-        if pictures.n_foreign > MAX_FOREIGN:
-            reception.complain("RTP comes, but not of H.264; set the camera to H.264")
+def rtp_frames(
+    frames: LiveFrames,
+    datagram_queue: DatagramQueue,
+    parameter_sets: bytes,
+    payload_type: int | None,
+) -> Iterator[Frame]:
+    """Yield the frames of RTP with H.264 until the feed ends or another kind comes."""
+    order, pictures = RtpOrder(), H264Depacketizer()
+    frames.connect(decoder_of("h264", parameter_sets), 1 / TICKS_HZ, hears_losses=True)
+    while not datagram_queue.is_closed:
+        datagram = datagram_queue.get(order.wait or WAIT_S)
+        if datagram is None:
+            due = order.overdue(time.monotonic())
+        elif datagram_queue.is_late(datagram):
+            frames.lose()
+            continue
         else:
-            reception.hear(RTP)
-
-
-class TransportReader:
-    """Reader of MPEG-TS.
-
-    Parameters
-    ----------
-    frames : LiveFrames
-    """
-
-    def __init__(self, frames: LiveFrames) -> None:
-        self._frames = frames
-
-    def frames(self, datagram_queue: DatagramQueue) -> Iterator[Frame]:
-        """Yield frames until the feed ends or another kind comes.
-
-        Parameters
-        ----------
-        datagram_queue : DatagramQueue
-        """
-        stream, codec = TransportStream(), None
-        while not datagram_queue.is_closed:
-            datagram = datagram_queue.get()
-            if datagram is None:
-                continue
-            if datagram_queue.is_late(datagram):
-                self._frames.lose()
-                continue
-            content = transport_content(datagram.content)
-            if datagram_queue.is_foreign(datagram, fits=content is not None):
+            packet = parse_rtp(datagram.content)
+            if datagram_queue.is_foreign(datagram, fits=packet is not None):
                 return
-            datagram_queue.reception.hear(TS)
-            for picture in stream.push(content or b""):
-                if codec != stream.codec:
-                    codec = stream.codec or ""
-                    # A loss of 16 packets, or a multiple of that, shows in no counter.
-                    self._frames.connect(decoder_of(codec), 1 / TICKS_HZ, hears_losses=False)
-                yield from decoded(self._frames, picture)
+            if packet is None or not _is_video(packet, payload_type):
+                continue
+            due = order.push(packet, datagram.arrival)
+            if pictures.n_foreign > MAX_FOREIGN:
+                fault = "RTP comes, but not of H.264; set the camera to H.264"
+                datagram_queue.reception.complain(fault)
+            else:
+                datagram_queue.reception.hear(RTP)
+        for ordered in due:
+            for picture in pictures.push(ordered):
+                yield from decoded(frames, picture)
 
 
-class BareReader:
-    """Reader of H.264 without a container, cut into datagrams anywhere.
+def _is_video(packet: RtpPacket, payload_type: int | None) -> bool:
+    """Return whether a packet is of the type wanted, or, without one, of a dynamic type."""
+    return (
+        packet.payload_type >= 96 if payload_type is None else packet.payload_type == payload_type
+    )
 
-    Parameters
-    ----------
-    frames : LiveFrames
+
+def _in_time(frames: LiveFrames, datagram_queue: DatagramQueue) -> Iterator[Datagram]:
+    """Yield datagrams as they come, until the feed ends; late ones are lost."""
+    while not datagram_queue.is_closed:
+        datagram = datagram_queue.get()
+        if datagram is None:
+            continue
+        if datagram_queue.is_late(datagram):
+            frames.lose()
+        else:
+            yield datagram
+
+
+def transport_frames(frames: LiveFrames, datagram_queue: DatagramQueue) -> Iterator[Frame]:
+    """Yield the frames of MPEG-TS until the feed ends or another kind comes."""
+    stream, codec = TransportStream(), None
+    for datagram in _in_time(frames, datagram_queue):
+        content = transport_content(datagram.content)
+        if datagram_queue.is_foreign(datagram, fits=content is not None):
+            return
+        datagram_queue.reception.hear(TS)
+        for picture in stream.push(content or b""):
+            if codec != stream.codec:
+                codec = stream.codec or ""
+                # A loss of 16 packets, or a multiple of that, shows in no counter.
+                frames.connect(decoder_of(codec), 1 / TICKS_HZ, hears_losses=False)
+            yield from decoded(frames, picture)
+
+
+def bare_frames(frames: LiveFrames, datagram_queue: DatagramQueue) -> Iterator[Frame]:
+    """Yield the frames of H.264 without a container, cut into datagrams anywhere.
+
+    Ends with the feed, or when another kind comes.
     """
-
-    def __init__(self, frames: LiveFrames) -> None:
-        self._frames = frames
-
-    def frames(self, datagram_queue: DatagramQueue) -> Iterator[Frame]:
-        """Yield frames until the feed ends or another kind comes.
-
-        Parameters
-        ----------
-        datagram_queue : DatagramQueue
-        """
-        codec = decoder_of("h264")
-        self._frames.connect(codec, 1e-6, hears_losses=False)
-        while not datagram_queue.is_closed:
-            datagram = datagram_queue.get()
-            if datagram is None:
-                continue
-            if datagram_queue.is_late(datagram):
-                self._frames.lose()
-                continue
-            other = kind_of(datagram.content) in (RTP, TS)
-            if datagram_queue.is_foreign(datagram, fits=not other):
-                return
-            datagram_queue.reception.hear(BARE)
-            for unit in codec.parse(datagram.content):
-                unit.pts, unit.time_base = int(1e6 * datagram.arrival), Fraction(1, 1_000_000)
-                yield from self._frames.feed(unit)
+    codec = decoder_of("h264")
+    frames.connect(codec, 1e-6, hears_losses=False)
+    for datagram in _in_time(frames, datagram_queue):
+        other = kind_of(datagram.content) in (RTP, TS)
+        if datagram_queue.is_foreign(datagram, fits=not other):
+            return
+        datagram_queue.reception.hear(BARE)
+        for unit in codec.parse(datagram.content):
+            unit.pts, unit.time_base = int(1e6 * datagram.arrival), Fraction(1, 1_000_000)
+            yield from frames.feed(unit)
 
 
 def decoded(frames: LiveFrames, picture: AccessUnit) -> Iterator[Frame]:
-    """Yield the frames that a picture completes; a torn one is counted only.
-
-    Parameters
-    ----------
-    frames : LiveFrames
-    picture : AccessUnit
-    """
+    """Yield the frames that a picture completes; a torn one is counted only."""
     if picture.is_restart:
         frames.restart()
     if picture.after_loss:
@@ -322,7 +255,6 @@ class UdpFeed:
     ----------
     name : str
         How health and messages call it.
-    address : UdpAddress
     parameter_sets : bytes
         SPS and PPS as a byte stream, where an SDP file has them; else they come in the stream.
     payload_type : int or None
@@ -393,13 +325,14 @@ class UdpFeed:
 
     def _receive(self, datagrams: Datagrams) -> Iterator[Frame]:
         """Yield frames of any kind of content, which may change."""
-        readers: dict[str, Callable[[DatagramQueue], Iterator[Frame]]] = {
-            RTP: RtpReader(self._frames, self._parameter_sets, self._payload_type).frames,
-            TS: TransportReader(self._frames).frames,
-            BARE: BareReader(self._frames).frames,
-        }
         datagram_queue = DatagramQueue(datagrams, self._closed, self._reception)
+        frames = self._frames
         while not self._closed.is_set():
             kind = datagram_queue.peek_kind()
-            if kind is not None:
-                yield from readers[kind](datagram_queue)
+            if kind == RTP:
+                rtp = self._parameter_sets, self._payload_type
+                yield from rtp_frames(frames, datagram_queue, *rtp)
+            elif kind == TS:
+                yield from transport_frames(frames, datagram_queue)
+            elif kind == BARE:
+                yield from bare_frames(frames, datagram_queue)

@@ -58,22 +58,11 @@ class FrameCounter:
         return self._next + len(self._pending)
 
     def begin(self, codec: VideoCodecContext) -> None:
-        """Count the pictures of a stream from here on.
-
-        Parameters
-        ----------
-        codec : VideoCodecContext
-            Of the stream.
-        """
+        """Count the pictures of a stream from here on."""
         self._fields = field_pairs(codec.name, codec.extradata)
 
     def expect(self, packet: "Packet[VideoStream]") -> None:
-        """Note a packet; the empty one that flushes the decoder does not count.
-
-        Parameters
-        ----------
-        packet : Packet
-        """
+        """Note a packet; the empty one that flushes the decoder does not count."""
         if packet.size == 0:
             return
         self.n_packets += 1
@@ -110,10 +99,7 @@ class FrameCounter:
     def skip(self, n: int) -> None:
         """Count pictures as lost whose packets never came.
 
-        Parameters
-        ----------
-        n : int
-            Not negative.
+        `n`: not negative.
         """
         self._next += n
 
@@ -139,11 +125,6 @@ class VideoSource(Closing):
     ----------
     where : str or Path
         Path or address.
-
-    Attributes
-    ----------
-    name, size_px, fps, n_frames
-        As in `FrameSource`.
 
     Raises
     ------
@@ -183,11 +164,8 @@ class VideoSource(Closing):
     def __iter__(self) -> Iterator[Frame]:
         """Yield the sound frames; lost ones leave a gap in the index.
 
-        Raises
-        ------
-        SourceError
-            At the end, if frames that the container promised did not come; or when the picture
-            size changes, or a stream stalls.
+        Raises `SourceError` at the end, if frames that the container promised did not come; or when
+        the picture size changes, or a stream stalls.
         """
         n_delivered, last = 0, None
         for picture in self._pictures():
@@ -298,10 +276,6 @@ _TOP_FIRST, _BOTTOM_FIRST = (2, 5), (3, 4)
 
 def sampled_pictures(path: Path) -> tuple[list[list[Frame]], Field | None]:
     """Return a few pictures in a row from some places of a video, and which field comes first.
-
-    Parameters
-    ----------
-    path : Path
 
     Returns
     -------

@@ -58,24 +58,12 @@ _TYPES = {
 
 @dataclass(frozen=True, slots=True)
 class Format:
-    """Format of one kind of record, as its `FMT` record describes it.
+    """Format of one kind of record, as its `FMT` record describes it."""
 
-    Attributes
-    ----------
-    name : str
-        Kind, such as 'ATT'.
-    length : int
-        Bytes of a record, its head of three included.
-    codes : str
-        One format character a column.
-    columns : tuple of str
-        Names of the columns.
-    """
-
-    name: str
-    length: int
-    codes: str
-    columns: tuple[str, ...]
+    name: str  # Kind, such as 'ATT'.
+    length: int  # Bytes of a record, its head of three included.
+    codes: str  # One format character a column.
+    columns: tuple[str, ...]  # Names of the columns.
 
     @property
     def dtype(self) -> np.dtype[np.void] | None:
@@ -93,25 +81,17 @@ class Format:
 
 @dataclass(frozen=True, slots=True)
 class Records:
-    """The wanted records of a dataflash log.
+    """The wanted records of a dataflash log."""
 
-    Attributes
-    ----------
-    tables : mapping of str to mapping of str to array
-        Kind to columns; numbers as float64 in the units that the log's text form has. A table
-        without records is missing. `time_s`, seconds since the autopilot started, is in each.
-    n_records : int
-        Records of any kind.
-    skipped : tuple of (int, int)
-        Stretches without records: place in the file (or line, of text), and length in bytes (or
-        lines).
-    n_bogus : int
-        Wanted records with an impossible time; they are left out.
-    """
-
+    # Kind to columns; numbers as float64 in the units that the log's text form has. A table without
+    # records is missing. `time_s`, seconds since the autopilot started, is in each.
     tables: Mapping[str, Mapping[str, FloatArray]]
+    # Records of any kind.
     n_records: int
+    # Stretches without records: place in the file (or line, of text), and length in bytes (or
+    # lines).
     skipped: tuple[tuple[int, int], ...]
+    # Wanted records with an impossible time; they are left out.
     n_bogus: int
 
 
@@ -292,10 +272,7 @@ def looks_like_dataflash_text(head: bytes) -> bool:
 def read_dataflash(path: Path) -> VehicleLog:
     """Read a binary dataflash log.
 
-    Raises
-    ------
-    SourceError
-        If nothing that is wanted is in it.
+    Raises `SourceError` if nothing that is wanted is in it.
     """
     records = read_binary(path.read_bytes(), _WANTED)
     return _log(path, records, "dataflash", "bytes")
@@ -304,10 +281,7 @@ def read_dataflash(path: Path) -> VehicleLog:
 def read_dataflash_text(path: Path) -> VehicleLog:
     """Read a dataflash log in text.
 
-    Raises
-    ------
-    SourceError
-        If nothing that is wanted is in it.
+    Raises `SourceError` if nothing that is wanted is in it.
     """
     text = path.read_text(encoding="utf-8", errors="replace")
     return _log(path, read_text(text, _WANTED), "dataflash text", "lines")

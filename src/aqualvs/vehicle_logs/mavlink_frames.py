@@ -24,21 +24,11 @@ _RECORD = re.compile(rb"\x00[\x00-\x0e].{6}[\xfd\xfe]", re.DOTALL)
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """Wire layout of one message: fields in the order of their transfer, little-endian.
+    """Wire layout of one message: fields in the order of their transfer, little-endian."""
 
-    Attributes
-    ----------
-    name : str
-        As in MAVLink's definitions.
-    fields : tuple of (str, str)
-        Name and NumPy type; extensions are left out.
-    crc_extra : int
-        Seed that guards against other definitions of the message.
-    """
-
-    name: str
-    fields: tuple[tuple[str, str], ...]
-    crc_extra: int
+    name: str  # As in MAVLink's definitions.
+    fields: tuple[tuple[str, str], ...]  # Name and NumPy type; extensions are left out.
+    crc_extra: int  # Seed that guards against other definitions of the message.
 
     @property
     def dtype(self) -> np.dtype[np.void]:
@@ -92,24 +82,12 @@ MESSAGES: Mapping[int, Message] = {
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """All sound frames of one message, in the order of the file.
+    """All sound frames of one message, in the order of the file."""
 
-    Attributes
-    ----------
-    at : array, shape (n,)
-        Places in the file.
-    received_us : array, shape (n,)
-        Time of receipt, UTC, in microseconds.
-    source : array, shape (n,)
-        Sender: 256 times the system's number plus the component's.
-    payload : structured array, shape (n,)
-        Fields as in `MESSAGES`.
-    """
-
-    at: IntArray
-    received_us: IntArray
-    source: IntArray
-    payload: np.ndarray
+    at: IntArray  # Shape (n,): places in the file.
+    received_us: IntArray  # Shape (n,): time of receipt, UTC, in microseconds.
+    source: IntArray  # Shape (n,): sender: 256 times the system's number plus the component's.
+    payload: np.ndarray  # Shape (n,): fields as in `MESSAGES`.
 
     def __getitem__(self, chosen: BoolArray) -> "Table":
         """Return the chosen frames."""
@@ -120,23 +98,15 @@ class Table:
 
 @dataclass(frozen=True, slots=True)
 class SelectedMessages:
-    """Wanted messages of a telemetry log.
+    """Wanted messages of a telemetry log."""
 
-    Attributes
-    ----------
-    tables : mapping of str to Table
-        By message name; messages that did not come are missing.
-    n_frames : int
-        Frames of any kind.
-    n_failed : int
-        Wanted frames whose checksum is wrong; they are left out.
-    skipped : tuple of (int, int)
-        Stretches that hold no frames: place in the file, and length in bytes.
-    """
-
+    # By message name; messages that did not come are missing.
     tables: Mapping[str, Table]
+    # Frames of any kind.
     n_frames: int
+    # Wanted frames whose checksum is wrong; they are left out.
     n_failed: int
+    # Stretches that hold no frames: place in the file, and length in bytes.
     skipped: tuple[tuple[int, int], ...]
 
 
@@ -148,10 +118,7 @@ def looks_like_frames(head: bytes) -> bool:
 def read_frames(data: bytes) -> SelectedMessages:
     """Read the wanted messages of a telemetry log.
 
-    Parameters
-    ----------
-    data : bytes
-        The whole file.
+    `data`: the whole file.
     """
     places, n_frames, skipped = _scan(data)
     octets = np.frombuffer(data, np.uint8)

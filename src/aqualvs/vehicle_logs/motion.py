@@ -25,21 +25,11 @@ _TREND_S = 5.0
 
 @dataclass(frozen=True, slots=True)
 class Rates:
-    """Band-passed rates of one angle.
+    """Band-passed rates of one angle."""
 
-    Attributes
-    ----------
-    start_s : float
-        Time of the first; they are `STEP_S` apart.
-    rate : array, shape (n,)
-        Radians a second, extreme ones cut down; 0 where not valid.
-    valid : bool array, shape (n,)
-        Where there are enough values.
-    """
-
-    start_s: float
-    rate: FloatArray
-    valid: BoolArray
+    start_s: float  # Time of the first; they are `STEP_S` apart.
+    rate: FloatArray  # Shape (n,): radians a second, extreme ones cut down; 0 where not valid.
+    valid: BoolArray  # Shape (n,): where there are enough values.
 
     @property
     def time_s(self) -> FloatArray:
@@ -156,39 +146,22 @@ def _autocorrelation(rates: Rates, reach: int) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class Channel:
-    """One angle, seen from the net and logged by the vehicle.
+    """One angle, seen from the net and logged by the vehicle."""
 
-    Attributes
-    ----------
-    name : str
-        'yaw' or 'pitch'.
-    seen : Rates
-        Of the posture, in dive time.
-    logged : Rates
-        Of the vehicle, in log time. Posture's angles change opposite to the vehicle's.
-    """
-
-    name: str
-    seen: Rates
-    logged: Rates
+    name: str  # 'yaw' or 'pitch'.
+    seen: Rates  # Of the posture, in dive time.
+    logged: Rates  # Of the vehicle, in log time. Posture's angles change opposite to the vehicle's.
 
 
 @dataclass(frozen=True, slots=True)
 class OffsetScores:
-    """Agreement of all channels at every offset of the grid.
+    """Agreement of all channels at every offset of the grid."""
 
-    Attributes
-    ----------
-    offset_s : array, shape (k,)
-        Log time minus dive time, rising by `STEP_S`.
-    score : array, shape (k,)
-        Logarithm of the likelihood ratio between "the motions agree" and "they do not".
-    overlap_s : array, shape (k,)
-        Time for which both are known, of the channel that has most.
-    """
-
+    # Shape (k,): log time minus dive time, rising by `STEP_S`.
     offset_s: FloatArray
+    # Shape (k,): logarithm of the likelihood ratio between "the motions agree" and "they do not".
     score: FloatArray
+    # Shape (k,): time for which both are known, of the channel that has most.
     overlap_s: FloatArray
 
 
@@ -237,26 +210,18 @@ def _correlations(seen: Rates, logged: Rates) -> tuple[FloatArray, FloatArray]:
 
 @dataclass(frozen=True, slots=True)
 class Match:
-    """Seen and logged rates of a channel at one offset, sample by sample of the seen ones.
+    """Seen and logged rates of a channel at one offset, sample by sample of the seen ones."""
 
-    Attributes
-    ----------
-    residual : array, shape (n,)
-        Seen rate less what the logged one predicts; less the mean only, where it is not known.
-    predicted : bool array, shape (n,)
-        Where both rates are known.
-    gain : float
-        Share of the vehicle's motion that the net shows: 1 for a plane, still net.
-    slope : array, shape (n,)
-        Change of the logged rate with time, 0 where not known.
-    correlation : float
-        Between seen and opposite logged rates.
-    """
-
+    # Shape (n,): seen rate less what the logged one predicts; less the mean only, where it is not
+    # known.
     residual: FloatArray
+    # Shape (n,): where both rates are known.
     predicted: BoolArray
+    # Share of the vehicle's motion that the net shows: 1 for a plane, still net.
     gain: float
+    # Shape (n,): change of the logged rate with time, 0 where not known.
     slope: FloatArray
+    # Between seen and opposite logged rates.
     correlation: float
 
 

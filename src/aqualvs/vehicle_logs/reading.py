@@ -39,10 +39,7 @@ _LARGEST = {"depth_m": 12000.0, "heading_deg": 720.0, "roll_deg": 360.0, "pitch_
 def read_csv_log(path: Path) -> VehicleLog:
     """Read a table of depth and heading.
 
-    Raises
-    ------
-    SourceError
-        One line that names the file, the line, the value and the remedy.
+    Raises `SourceError` with one line that names the file, the line, the value and the remedy.
     """
     try:
         text = path.read_text(encoding="utf-8-sig")

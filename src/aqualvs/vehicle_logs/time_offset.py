@@ -38,21 +38,14 @@ _START_SIGMAS = 4.0
 
 @dataclass(frozen=True, slots=True)
 class PostureTrack:
-    """Posture over a dive.
+    """Posture over a dive."""
 
-    Attributes
-    ----------
-    time_s : array, shape (n,)
-        Dive time, increasing.
-    yaw, pitch : array, shape (n,)
-        Posture to the net in radians (paper, Eq. 24-26); anything where not valid.
-    valid : bool array, shape (n,)
-        Where the posture is valid.
-    """
-
+    # Shape (n,): dive time, increasing.
     time_s: FloatArray
+    # Shape (n,): posture to the net in radians (paper, Eq. 24-26); anything where not valid.
     yaw: FloatArray
     pitch: FloatArray
+    # Shape (n,): where the posture is valid.
     valid: BoolArray
 
     def __post_init__(self) -> None:
@@ -63,38 +56,24 @@ class PostureTrack:
 
 @dataclass(frozen=True, slots=True)
 class TimeOffset:
-    """Offset between two clocks: log time = dive time + offset_s.
+    """Offset between two clocks: log time = dive time + offset_s."""
 
-    Attributes
-    ----------
-    offset_s : float
-        Seconds.
-    sigma_s : float
-        Its standard deviation.
-    correlation : float or None
-        Between the vehicle's and the net's motion at this offset, 1 for full agreement; None where
-        the offset does not come from motion.
-    how : str
-        In words, where it comes from.
-    """
-
+    # Seconds.
     offset_s: float
+    # Its standard deviation.
     sigma_s: float
+    # Between the vehicle's and the net's motion at this offset, 1 for full agreement; None where
+    # the offset does not come from motion.
     correlation: float | None
+    # In words, where it comes from.
     how: str
 
 
 @dataclass(frozen=True, slots=True)
 class OffsetRefusal:
-    """No offset, and why; falsy.
+    """No offset, and why; falsy."""
 
-    Attributes
-    ----------
-    reason : str
-        One line, with the remedy.
-    """
-
-    reason: str
+    reason: str  # One line, with the remedy.
 
     def __bool__(self) -> Literal[False]:
         """Return False, so that `if offset:` reads well."""
@@ -110,8 +89,6 @@ def find_time_offset(
     ----------
     log : VehicleLog
         With heading, pitch or both.
-    posture_track : PostureTrack
-        Of the dive.
     start : TimeOffset, optional
         What clocks say. Where motion alone leaves a doubt, only offsets within four of its sigmas
         are considered.

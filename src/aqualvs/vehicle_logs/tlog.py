@@ -29,18 +29,10 @@ from aqualvs.vehicle_logs.vehicle_log import Interpolation, Signal, VehicleLog, 
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """A depth that a log holds.
+    """A depth that a log holds."""
 
-    Attributes
-    ----------
-    label : str
-        Where it stands in the log.
-    depth : Signal or None
-        Metres, positive down; None where the log does not have it.
-    """
-
-    label: str
-    depth: Signal | None
+    label: str  # Where it stands in the log.
+    depth: Signal | None  # Metres, positive down; None where the log does not have it.
 
 
 def choose_depth(
@@ -84,30 +76,20 @@ _FIRST_BELIEVED = datetime.datetime(1990, 1, 1, tzinfo=datetime.UTC).timestamp()
 
 @dataclass(frozen=True, slots=True)
 class TelemetryClock:
-    """Log time of every message.
+    """Log time of every message."""
 
-    Attributes
-    ----------
-    at : array, shape (n,)
-        Places in the file of the messages that define the clock.
-    log_s : array, shape (n,)
-        Their log time.
-    boot_at : array, shape (k,)
-        Place in the file from which each run of the autopilot counts.
-    boot_s : array, shape (k,)
-        Log time at which each run began.
-    start_utc_s, start_utc_sigma_s : float or None
-        UTC of log time 0, and how far to trust it.
-    notes : tuple of str
-        Reboots, and steps of the computer's clock.
-    """
-
+    # Shape (n,): places in the file of the messages that define the clock.
     at: IntArray
+    # Shape (n,): their log time.
     log_s: FloatArray
+    # Shape (k,): place in the file from which each run of the autopilot counts.
     boot_at: IntArray
+    # Shape (k,): log time at which each run began.
     boot_s: FloatArray
+    # UTC of log time 0, and how far to trust it.
     start_utc_s: float | None
     start_utc_sigma_s: float | None
+    # Reboots, and steps of the computer's clock.
     notes: tuple[str, ...]
 
     def of(self, table: Table) -> FloatArray:
@@ -198,10 +180,7 @@ _Found = tuple[Signal | None, str]
 def read_tlog(path: Path) -> VehicleLog:
     """Read a telemetry log.
 
-    Raises
-    ------
-    SourceError
-        If no autopilot speaks in it.
+    Raises `SourceError` if no autopilot speaks in it.
     """
     frames = read_frames(path.read_bytes())
     source, others = _autopilot(frames, path)

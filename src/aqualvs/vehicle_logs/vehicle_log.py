@@ -37,24 +37,12 @@ class Interpolation(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Signal:
-    """A quantity with its own time stamps.
+    """A quantity with its own time stamps."""
 
-    Attributes
-    ----------
-    time_s : array, shape (n,)
-        Log time, strictly increasing; n is at least 1.
-    values : array, shape (n,) or (n, k)
-        Finite; SI units and radians.
-    interpolation : Interpolation
-        How values between samples are found.
-    max_gap_s : float
-        Values between samples that are further apart than this are not valid.
-    """
-
-    time_s: FloatArray
-    values: FloatArray
-    interpolation: Interpolation
-    max_gap_s: float
+    time_s: FloatArray  # Shape (n,): log time, strictly increasing; n is at least 1.
+    values: FloatArray  # Shape (n,) or (n, k): finite; SI units and radians.
+    interpolation: Interpolation  # How values between samples are found.
+    max_gap_s: float  # Values between samples that are further apart than this are not valid.
 
     @classmethod
     def from_samples(
@@ -166,23 +154,16 @@ def bearing_of(angle: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoggedStates:
-    """The vehicle at some times; NaN and False where the log has no value.
+    """The vehicle at some times; NaN and False where the log has no value."""
 
-    Attributes
-    ----------
-    time_s : array, shape (n,)
-        Log time.
-    depth, heading, roll, pitch : array, shape (n,)
-        Metres, positive down; radians, heading in [0, 2 pi).
-    depth_valid, heading_valid, roll_valid, pitch_valid : bool array, shape (n,)
-        Where the log has them.
-    """
-
+    # Shape (n,): log time.
     time_s: FloatArray
+    # Shape (n,): metres, positive down; radians, heading in [0, 2 pi).
     depth: FloatArray
     heading: FloatArray
     roll: FloatArray
     pitch: FloatArray
+    # Shape (n,): where the log has them.
     depth_valid: BoolArray
     heading_valid: BoolArray
     roll_valid: BoolArray
@@ -191,49 +172,33 @@ class LoggedStates:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VehicleLog:
-    """A vehicle's log: signals on one clock, each with its own time stamps.
+    """A vehicle's log: signals on one clock, each with its own time stamps."""
 
-    Attributes
-    ----------
-    name : str
-        How messages call it: the file's path.
-    kind : str
-        'csv', 'tlog' (MAVLink telemetry), 'dataflash' or 'dataflash text'.
-    depth : Signal or None
-        Metres below the surface, positive down.
-    heading : Signal or None
-        Radians clockwise from north as the vehicle knows it, in [0, 2 pi).
-    roll, pitch : Signal or None
-        Radians, MAVLink's axes (forward, right, down): roll is positive with the right side down,
-        pitch with the nose up.
-    velocity_ned : Signal or None
-        North, east and down, in m/s.
-    armed : Signal or None
-        1 while the thrusters could turn, else 0.
-    modes : tuple of (float, str)
-        Log time of each change of the flight mode, and the new mode.
-    start_utc_s : float or None
-        UTC (seconds since 1970) of log time 0, where the log knows it.
-    start_utc_sigma_s : float or None
-        How far to trust it.
-    sources : mapping of str to str
-        Signal to what in the file it was read from, and why where there was a choice.
-    notes : tuple of str
-        What is wrong with the file, one line each: cut short, corrupt sections, clock steps.
-    """
-
+    # How messages call it: the file's path.
     name: str
+    # 'csv', 'tlog' (MAVLink telemetry), 'dataflash' or 'dataflash text'.
     kind: str
+    # Metres below the surface, positive down.
     depth: Signal | None = None
+    # Radians clockwise from north as the vehicle knows it, in [0, 2 pi).
     heading: Signal | None = None
+    # Radians, MAVLink's axes (forward, right, down): roll is positive with the right side down,
+    # pitch with the nose up.
     roll: Signal | None = None
     pitch: Signal | None = None
+    # North, east and down, in m/s.
     velocity_ned: Signal | None = None
+    # 1 while the thrusters could turn, else 0.
     armed: Signal | None = None
+    # Log time of each change of the flight mode, and the new mode.
     modes: tuple[tuple[float, str], ...] = ()
+    # UTC (seconds since 1970) of log time 0, where the log knows it.
     start_utc_s: float | None = None
+    # How far to trust it.
     start_utc_sigma_s: float | None = None
+    # Signal to what in the file it was read from, and why where there was a choice.
     sources: Mapping[str, str] = field(default_factory=dict)
+    # What is wrong with the file, one line each: cut short, corrupt sections, clock steps.
     notes: tuple[str, ...] = ()
 
     @property
@@ -262,10 +227,7 @@ class VehicleLog:
     def at(self, time_s: ArrayLike) -> LoggedStates:
         """Return the vehicle's state at other times; values in gaps are not valid.
 
-        Parameters
-        ----------
-        time_s : array, shape (n,)
-            Log time, in any order.
+        `time_s`, shape (n,): log time, in any order.
         """
         times = np.atleast_1d(np.asarray(time_s, float))
         depth, depth_valid = _at(self.depth, times)
@@ -298,60 +260,42 @@ def _at(signal: Signal | None, times: FloatArray) -> tuple[FloatArray, BoolArray
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Places:
-    """Vehicle and net in `world` at some dive times; NaN where not valid.
+    """Vehicle and net in `world` at some dive times; NaN where not valid."""
 
-    Attributes
-    ----------
-    time_s : array, shape (n,)
-        Dive time.
-    depth : array, shape (n,)
-        Of the vehicle's depth sensor, in metres, positive down.
-    heading : array, shape (n,)
-        Of the vehicle's nose (the dome's y axis), radians clockwise from north, in [0, 2 pi).
-    bearing : array, shape (n,)
-        Of the net's far normal: the compass direction in which one looks when square to the net,
-        radians in [0, 2 pi). From inside a round cage it says where on the wall the vehicle is.
-    lean : array, shape (n,)
-        Elevation of the far normal: 0 for a net that hangs plumb, positive where the net's top
-        leans towards the vehicle, radians. Needs the vehicle's roll and pitch.
-    depth_valid, heading_valid, bearing_valid, lean_valid : bool array, shape (n,)
-        Where they are known.
-    ned_from_dome : array, shape (n, 3, 3)
-        Rotations from `dome` to `world` (north, east, down). The depth of a point in `dome` is
-        `depth + (ned_from_dome @ p_in_dome)[2]`, but for the lever arm between the depth sensor
-        and the dome. NaN where the heading is not known.
-    level : bool array, shape (n,)
-        Where roll or pitch is not known and the vehicle was taken as level in `ned_from_dome`
-        and `bearing`.
-    """
-
+    # Shape (n,): dive time.
     time_s: FloatArray
+    # Shape (n,): of the vehicle's depth sensor, in metres, positive down.
     depth: FloatArray
+    # Shape (n,): of the vehicle's nose (the dome's y axis), radians clockwise from north, in [0, 2
+    # pi).
     heading: FloatArray
+    # Shape (n,): of the net's far normal: the compass direction in which one looks when square to
+    # the net, radians in [0, 2 pi). From inside a round cage it says where on the wall the vehicle
+    # is.
     bearing: FloatArray
+    # Shape (n,): elevation of the far normal: 0 for a net that hangs plumb, positive where the
+    # net's top leans towards the vehicle, radians. Needs the vehicle's roll and pitch.
     lean: FloatArray
+    # Shape (n,): where they are known.
     depth_valid: BoolArray
     heading_valid: BoolArray
     bearing_valid: BoolArray
     lean_valid: BoolArray
+    # Shape (n, 3, 3): rotations from `dome` to `world` (north, east, down). The depth of a point in
+    # `dome` is `depth + (ned_from_dome @ p_in_dome)[2]`, but for the lever arm between the depth
+    # sensor and the dome. NaN where the heading is not known.
     ned_from_dome: FloatArray
+    # Shape (n,): where roll or pitch is not known and the vehicle was taken as level in
+    # `ned_from_dome` and `bearing`.
     level: BoolArray
 
 
 @dataclass(frozen=True, slots=True)
 class VehiclePlaces:
-    """A log next to a dive: answers for dive times.
+    """A log next to a dive: answers for dive times."""
 
-    Attributes
-    ----------
-    log : VehicleLog
-        The vehicle's log.
-    offset_s : float
-        Log time = dive time + offset_s.
-    """
-
-    log: VehicleLog
-    offset_s: float = 0.0
+    log: VehicleLog  # The vehicle's log.
+    offset_s: float = 0.0  # Log time = dive time + offset_s.
 
     def __post_init__(self) -> None:
         if not np.isfinite(self.offset_s):

@@ -43,10 +43,7 @@ class BareLensComparison:
     Detection, classification and the choice of the target are taken over from the scan, so that
     the difference is that of the ray model alone (paper, section 5.4).
 
-    Parameters
-    ----------
-    rig : Rig
-        A rig with a housing.
+    `rig`: a rig with a housing.
     """
 
     def __init__(self, rig: Rig) -> None:
@@ -136,12 +133,7 @@ def in_blocks(
 ) -> Iterator[list[T]]:
     """Yield lists of up to `length` items; none is lost where their source breaks off.
 
-    Parameters
-    ----------
-    items : iterator
-    length : int
-    breaks : type of exception
-        How it breaks off; raised after the items before it.
+    `breaks`: how it breaks off; raised after the items before it.
     """
     block: list[T] = []
     try:
@@ -213,22 +205,14 @@ class FrameScanner(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class FrameResult:
-    """Result of one frame.
-
-    Attributes
-    ----------
-    scan : Scan
-    bare : Posture, Refusal or None
-        Result when the dome is ignored; None for a rig without a dome.
-    frame : Frame or None
-        None for a frame that was lost, or that another process has measured.
-    is_lost : bool
-        Whether the scan is that of a frame that could not be decoded.
-    """
+    """Result of one frame."""
 
     scan: Scan
+    # Result when the dome is ignored; None for a rig without a dome.
     bare: Posture | Refusal | None
+    # None for a frame that was lost, or that another process has measured.
     frame: Frame | None = None
+    # Whether the scan is that of a frame that could not be decoded.
     is_lost: bool = False
 
 
@@ -237,7 +221,6 @@ class FrameProcessor:
 
     Parameters
     ----------
-    rig : Rig
     scanner : FrameScanner
         For the same rig.
 
@@ -287,11 +270,7 @@ def corrected_rows(
     Results of shutters that need no neighbours are yielded unchanged. Others come a few frames
     late, when the frames after them are known; none is lost where their source breaks off.
 
-    Parameters
-    ----------
-    blocks : generator of list
-        Results as measured, in the order of the dive; closed at the end.
-    rig : Rig
+    `blocks`: results as measured, in the order of the dive; closed at the end.
     """
     with closing(blocks):
         if not rig.shutter.needs_neighbours:
@@ -342,7 +321,6 @@ def result_blocks(
     ----------
     blocks : iterator of list
         Of frames with the scans of the lost ones right before, see `with_losses`.
-    processor : FrameProcessor
 
     Yields
     ------

@@ -217,16 +217,8 @@ def _received(file: Any) -> SharedMemory:
 class Sender:
     """The sending end of the channel, in a process that measures.
 
-    Parameters
-    ----------
-    pipe : Connection
-    memory : SharedMemory or None
-        Without it all goes through the pipe.
-
-    Raises
-    ------
-    EOFError, OSError
-        From both methods, once the other end has gone.
+    `memory`: without it all goes through the pipe. Raises `EOFError` or `OSError` from both
+    methods, once the other end has gone.
     """
 
     def __init__(self, pipe: Connection, memory: SharedMemory | None) -> None:
@@ -277,42 +269,24 @@ class Receiver:
 
 @dataclass(frozen=True, slots=True)
 class SpanPart:
-    """Wanted frames of a span.
-
-    Attributes
-    ----------
-    span : Span
-    first, stop : int
-        Frames `first` to `stop` - 1, which lie in the span; numbers of fields if the camera is
-        interlaced, while spans count pictures.
-    """
+    """Wanted frames of a span."""
 
     span: Span
+    # Frames `first` to `stop` - 1, which lie in the span; numbers of fields if the camera is
+    # interlaced, while spans count pictures.
     first: int
     stop: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PoolJob:
-    """Work of a pool: the dive, its parts, and what measures it.
+    """Work of a pool: the dive, its parts, and what measures it."""
 
-    Attributes
-    ----------
-    path : Path
-        A video, or a folder of images.
-    parts : tuple of SpanPart
-        In the order of the dive.
-    rig : Rig
-    options : ScannerOptions
-    fps : float
-        Frame rate of images.
-    """
-
-    path: Path
-    parts: tuple[SpanPart, ...]
+    path: Path  # A video, or a folder of images.
+    parts: tuple[SpanPart, ...]  # In the order of the dive.
     rig: Rig
     options: ScannerOptions
-    fps: float
+    fps: float  # Frame rate of images.
 
 
 def serve(
@@ -388,13 +362,7 @@ def pool_job(
 
     Reads a video once without decoding it: 25 ms for 1000 frames of standard definition.
 
-    Parameters
-    ----------
-    source : FrameSource
-        Of the dive; a video file or a folder of images can be shared.
-    window : FrameWindow
-    rig : Rig
-    options : ScannerOptions
+    `source`: of the dive; a video file or a folder of images can be shared.
     """
     pictures = source_of_pictures(source)
     spans = [(span, *frames_in(span, rig.shutter)) for span in _spans(pictures)]
@@ -441,7 +409,6 @@ class WorkerPool(Closing):
 
     Parameters
     ----------
-    work : PoolJob
     n_processes : int
         There are no more than parts.
 

@@ -45,14 +45,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class ReplayedFrame(Frame):
-    """A frame from a recording; black where the recording has no picture.
+    """A frame from a recording; black where the recording has no picture."""
 
-    Attributes
-    ----------
-    recorded : RecordedFrame or None
-        Never None; only a base class with defaults asks for one.
-    """
-
+    # Never None; only a base class with defaults asks for one.
     recorded: "RecordedFrame | None" = None
 
 
@@ -61,7 +56,6 @@ class Replay(Closing):
 
     Parameters
     ----------
-    path : Path
     request : RunRequest
         Rig, water and the `chosen` options stand for the recorded ones; an overlay needs pictures
         even if stripes are not looked for again.
@@ -72,8 +66,6 @@ class Replay(Closing):
         To measure with.
     options : ScannerOptions
         To measure with.
-    name, size_px, fps, n_frames
-        As in `FrameSource`.
 
     Raises
     ------
@@ -101,10 +93,7 @@ class Replay(Closing):
     def __iter__(self) -> Iterator[ReplayedFrame]:
         """Yield the recorded frames.
 
-        Raises
-        ------
-        SourceError
-            At the end, if parts of the recording were torn.
+        Raises `SourceError` at the end, if parts of the recording were torn.
         """
         for recorded in self._recording.frames(with_pictures=self._pictures):
             frame = recorded.picture or Frame(recorded.index, recorded.time_s, self._black)
@@ -154,10 +143,7 @@ class Replay(Closing):
 def replay_of(request: RunRequest) -> Replay | None:
     """Return the replay of a request's source, None where it is no recording.
 
-    Raises
-    ------
-    AqualvsError
-        As `Replay`.
+    Raises `AqualvsError` as `Replay` does.
     """
     path = Path(request.source)
     if path.suffix.lower() != ".mcap":
@@ -248,12 +234,10 @@ class DiveProcessor(Closing):
     ----------
     source : FrameSource or Replay
         Open, and not yet read from.
-    rig : Rig
     window : FrameWindow
         Of the frames to measure.
     work : PoolJob or None
         How processes may share the dive; None has this process measure it.
-    n_processes : int
     """
 
     def __init__(
@@ -314,10 +298,7 @@ class DiveProcessor(Closing):
     def wait_for_first(self) -> None:
         """Wait for the first frame; to be called before `blocks`.
 
-        Raises
-        ------
-        SourceError, OptionError
-            If there is none.
+        Raises `SourceError` or `OptionError` if there is none.
         """
         self._head = next(self._shared, None)
         if self._head is None:
@@ -352,7 +333,6 @@ class WaterFollowingScanner:
     ----------
     rig : Rig
         In the water to begin with.
-    options : ScannerOptions
     target : Path
         Markers on the vehicle (target.yaml).
     water : Water

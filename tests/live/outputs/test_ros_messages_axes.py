@@ -10,19 +10,24 @@ from scipy.spatial.transform import Rotation
 
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.live.outputs.ros_messages import (
-    FLU_FROM_DOME,
     UNOBSERVABLE_VARIANCE,
     flu_angles,
     flu_from_dome,
-    normal_in_dome,
     plane_pose,
     pose_jacobian,
 )
 from aqualvs.scanning.posture import range_pitch_yaw
 
 RIGHT, FORWARD, UP = np.eye(3)
+FLU_FROM_DOME = np.array([FORWARD, -RIGHT, UP])
 angles = st.floats(-1.2, 1.2)
 ranges = st.floats(0.1, 5.0)
+
+
+def normal_in_dome(pitch: float, yaw: float) -> FloatArray:
+    """Unit normal of the target's plane, by the definition of pitch and yaw."""
+    normal = np.array([math.tan(yaw), 1.0, math.tan(pitch)])
+    return normal / np.linalg.norm(normal)
 
 
 def pose_parameters(distance: float, pitch: float, yaw: float) -> FloatArray:

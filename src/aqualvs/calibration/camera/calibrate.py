@@ -44,10 +44,7 @@ COVERAGE_CELLS = (6, 8)
 def check_camera_views(views: Sequence[View], size_px: tuple[int, int]) -> None:
     """Refuse too few views, or views of another picture size.
 
-    Raises
-    ------
-    CalibrationError
-        With what is given and what is needed.
+    Raises `CalibrationError` with what is given and what is needed.
     """
     min_views = 3
     if len(views) < min_views:
@@ -76,17 +73,8 @@ def check_camera_solution(
 ) -> None:
     """Refuse intrinsics that do not explain the views, or that the views do not determine.
 
-    Parameters
-    ----------
-    solution : Solution
-    covariance : array, shape (P, P)
-        Of the intrinsics, as if corners were independent: focal lengths and image centre first.
-    views : sequence of View
-
-    Raises
-    ------
-    CalibrationError
-        With the likely cause and the remedy.
+    `covariance`, shape (P, P): of the intrinsics, as if corners were independent: focal lengths and
+    image centre first. Raises `CalibrationError` with the likely cause and the remedy.
     """
     noise = CORNER_SIGMA_PX * solution.scales[CORNERS]
     # Corners noisier than this indicate an error other than noise.
@@ -186,47 +174,32 @@ _LIMITS = _FindingLimits()
 
 @dataclass(frozen=True, slots=True)
 class CameraCalibration:
-    """Result of a camera calibration: intrinsics with their uncertainty.
-
-    Attributes
-    ----------
-    lens : Lens
-    size_px : (int, int)
-        Image width and height.
-    uncertainty : RigUncertainty
-        Of the intrinsics, from the disagreement of the views (`solver.covariance`).
-    inflation : float
-        Ratio of that variance to the variance for independent errors of corners.
-    views : tuple of ViewFit
-        Poses are `cam_from_target`.
-    left_out : dict
-        Names of views that were not used, with the reason.
-    noise_px : float
-        Typical standard deviation of a corner's coordinate.
-    coverage : int array, shape (6, 8)
-        Number of corners in each cell of the picture.
-    cross_validation_rms_px : float
-        Root mean square error of a model from three views in four for the corners of the
-        fourth; NaN where there are too few views.
-    bend_height : float
-        Height difference between the highest and the lowest corner of a bent board, in metres;
-        0 for a board whose views show no bend.
-    findings : tuple of str
-        Remarks for the user, in plain words.
-    n_iterations : int
-    """
+    """Result of a camera calibration: intrinsics with their uncertainty."""
 
     lens: Lens
+    # Image width and height.
     size_px: tuple[int, int]
+    # Of the intrinsics, from the disagreement of the views (`solver.covariance`).
     uncertainty: RigUncertainty
+    # Ratio of that variance to the variance for independent errors of corners.
     inflation: float
+    # Poses are `cam_from_target`.
     views: tuple[ViewFit, ...]
+    # Names of views that were not used, with the reason.
     left_out: dict[str, str]
+    # Typical standard deviation of a corner's coordinate.
     noise_px: float
+    # Shape (6, 8): number of corners in each cell of the picture.
     coverage: IntArray
+    # Root mean square error of a model from three views in four for the corners of the fourth; NaN
+    # where there are too few views.
     cross_validation_rms_px: float
+    # Height difference between the highest and the lowest corner of a bent board, in metres; 0 for
+    # a board whose views show no bend.
     bend_height: float
+    # Remarks for the user, in plain words.
     findings: tuple[str, ...]
+
     n_iterations: int
 
     @property
@@ -255,7 +228,6 @@ def camera(
         Of a flat board in air, without the dome, tilted by 20 to 40 degrees in most of them.
     size_px : (int, int)
         Image width and height.
-    model : LensModel
     n_coefficients : int, optional
         Number of distortion coefficients; by default as many as the views support.
 

@@ -46,24 +46,12 @@ _TERMS = {2: ((2, 0), (1, 1), (0, 2)), 3: ((3, 0), (2, 1), (1, 2), (0, 3))}
 
 @dataclass(frozen=True, slots=True)
 class BoardBend:
-    """A board's surface: z = sum of coefficient times x^i y^j, beside a plane.
+    """A board's surface: z = sum of coefficient times x^i y^j, beside a plane."""
 
-    Attributes
-    ----------
-    centre : array, shape (2,)
-        Origin of x and y, in `board`, metres.
-    half_size : float
-        Unit of x and y, in metres: half of the corners' longer extent.
-    exponents : tuple of (int, int)
-        i and j of every term.
-    coefficients : array, shape (K,)
-        In metres.
-    """
-
-    centre: FloatArray
-    half_size: float
-    exponents: tuple[tuple[int, int], ...]
-    coefficients: FloatArray
+    centre: FloatArray  # Shape (2,): origin of x and y, in `board`, metres.
+    half_size: float  # Unit of x and y, in metres: half of the corners' longer extent.
+    exponents: tuple[tuple[int, int], ...]  # i and j of every term.
+    coefficients: FloatArray  # Shape (K,): in metres.
 
     @classmethod
     def flat(cls, views: Sequence[View], degree: int) -> "BoardBend":
@@ -89,10 +77,7 @@ class BoardBend:
     def height(self, views: Sequence[View]) -> float:
         """Return the height difference of the corners over their best plane, in metres.
 
-        Parameters
-        ----------
-        views : sequence of View
-            Of the flat board.
+        `views`: of the flat board.
         """
         points = np.unique(np.concatenate([view.points for view in views]), axis=0)
         z = self.terms_at(points) @ self.coefficients
@@ -153,19 +138,12 @@ class _BentBundle:
 
 @dataclass(frozen=True, slots=True)
 class BentFit:
-    """A bundle solved together with its board's bend.
-
-    Attributes
-    ----------
-    bend : BoardBend
-    bundle : Bundle
-        With its points on the bent board.
-    solution : Solution
-        The bend's coefficients are the last columns of its covariance.
-    """
+    """A bundle solved together with its board's bend."""
 
     bend: BoardBend
+    # With its points on the bent board.
     bundle: Bundle
+    # The bend's coefficients are the last columns of its covariance.
     solution: Solution[BundleState]
 
 
@@ -181,8 +159,6 @@ def bend_is_significant(
     ----------
     bundle : Bundle
         With points on a flat board, or one bent by terms of lower degree.
-    solution : Solution
-        Of it.
     degree : int
         Of the terms in question, one of `BEND_DEGREES`.
     n_solved : int
@@ -257,10 +233,7 @@ def fitted_camera(
     of Schwarz (1978, doi:10.1214/aos/1176344136) requires: superfluous ones would distort the
     picture's corners, where no board was seen.
 
-    Raises
-    ------
-    CalibrationError
-        If no camera model explains the views.
+    Raises `CalibrationError` if no camera model explains the views.
     """
     first = _STEPS[model][0] if n_coefficients is None else n_coefficients
     bundle, solution = _first_fit(views, size_px, model, first)
@@ -436,7 +409,6 @@ def direction_sigma_px(lens: Lens, covariance: FloatArray, pixels: FloatArray) -
 
     Parameters
     ----------
-    lens : Lens
     covariance : array, shape (P, P)
         Of its parameters.
     pixels : array, shape (N, 2)

@@ -25,18 +25,10 @@ from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 
 @dataclass(frozen=True, slots=True)
 class Markers:
-    """Markers as read by OpenCV, not refined.
+    """Markers as read by OpenCV, not refined."""
 
-    Attributes
-    ----------
-    ids : int array, shape (M,)
-        Numbers in the dictionary.
-    corners : array, shape (M, 4, 2)
-        In `image`, in OpenCV's order.
-    """
-
-    ids: IntArray
-    corners: FloatArray
+    ids: IntArray  # Shape (M,): numbers in the dictionary.
+    corners: FloatArray  # Shape (M, 4, 2): in `image`, in OpenCV's order.
 
     def __len__(self) -> int:
         """Return the number of markers."""
@@ -52,8 +44,6 @@ def read_markers(
     ----------
     image : uint8 array, shape (height, width)
         Grey picture.
-    dictionary : str
-        Name of the markers' dictionary.
     n_first : int or None
         Read only the first `n_first` markers of the dictionary, which is faster.
     window_px : int or None
@@ -82,39 +72,23 @@ def read_markers(
 
 @dataclass(frozen=True, slots=True)
 class CornerGrid:
-    """Corners of a board in one picture.
+    """Corners of a board in one picture."""
 
-    Attributes
-    ----------
-    pixels : array, shape (rows, columns, 2)
-        In `image`.
-    known : bool array, shape (rows, columns)
-        True for corners that were found.
-    notes : tuple of str
-        Remarks for the user on the detection.
-    """
-
-    pixels: FloatArray
-    known: BoolArray
-    notes: tuple[str, ...] = ()
+    pixels: FloatArray  # Shape (rows, columns, 2): in `image`.
+    known: BoolArray  # Shape (rows, columns): True for corners that were found.
+    notes: tuple[str, ...] = ()  # Remarks for the user on the detection.
 
 
 @dataclass(frozen=True, slots=True)
 class PredictedCorners:
-    """Places of the grid points as predicted from their neighbours.
+    """Places of the grid points as predicted from their neighbours."""
 
-    Attributes
-    ----------
-    pixels : array, shape (rows, columns, 2)
-        In `image`; NaN where not valid.
-    axes : array, shape (rows, columns, 2, 2)
-        Side of a square along the board's x (`[..., 0]`) and y (`[..., 1]`), in pixels.
-    valid : bool array, shape (rows, columns)
-        False where too few neighbours are known, or all on one line.
-    """
-
+    # Shape (rows, columns, 2): in `image`; NaN where not valid.
     pixels: FloatArray
+    # Shape (rows, columns, 2, 2): side of a square along the board's x (`[..., 0]`) and y (`[...,
+    # 1]`), in pixels.
     axes: FloatArray
+    # Shape (rows, columns): False where too few neighbours are known, or all on one line.
     valid: BoolArray
 
 
@@ -359,34 +333,20 @@ def _inside(pixels: FloatArray, image: GreyImage) -> BoolArray:
 
 @dataclass(frozen=True, slots=True)
 class Seeds:
-    """Corners on which neighbouring markers agree.
+    """Corners on which neighbouring markers agree."""
 
-    Attributes
-    ----------
-    corners : int array, shape (K,)
-        Indices of inner corners of the board.
-    pixels : array, shape (K, 2)
-        Their approximate places, in `image`.
-    axes : array, shape (K, 2, 2)
-        Sides of a square along the board's x and y there, as columns, in pixels.
-    n_agreed : int
-        Number of pairs of markers that agree across rows.
-    """
-
+    # Shape (K,): indices of inner corners of the board.
     corners: IntArray
+    # Shape (K, 2): their approximate places, in `image`.
     pixels: FloatArray
+    # Shape (K, 2, 2): sides of a square along the board's x and y there, as columns, in pixels.
     axes: FloatArray
+    # Number of pairs of markers that agree across rows.
     n_agreed: int
 
 
 def find_charuco(image: GreyImage, board: Board) -> CornerGrid:
-    """Find the corners of a ChArUco board.
-
-    Returns
-    -------
-    CornerGrid
-        No corner known if no two markers agree on one.
-    """
+    """Find the corners of a ChArUco board; none is known if no two markers agree on one."""
     # Window of the local threshold for a quick look at a part, as a share of the picture's width.
     quick_window = 0.01
     quick_px = 2 * max(round(0.5 * quick_window * image.shape[1]), 1) + 1

@@ -30,14 +30,7 @@ _LARGEST = tuple(name for name in DICTIONARIES if not name.endswith(("_50", "_10
 def why_no_board(image: GreyImage, board: Board, n_corners: int, min_corners: int) -> str:
     """Return one clause on the reason why there is no view of a board.
 
-    Parameters
-    ----------
-    image : uint8 array, shape (height, width)
-        Grey picture.
-    board : Board
-        The target.
-    n_corners, min_corners : int
-        Numbers of corners found and needed.
+    `n_corners` corners were found, of `min_corners` needed.
     """
     if n_corners > 0:
         return (
@@ -87,16 +80,8 @@ def why_no_markers(
 ) -> str:
     """Return one clause on the reason why there is no view of a set of markers.
 
-    Parameters
-    ----------
-    image : uint8 array, shape (height, width)
-        Grey picture.
-    marker_set : MarkerSet
-        The target.
-    markers : Markers
-        All markers of its family that were read.
-    n_corners, min_corners : int
-        Numbers of corners refined and needed.
+    `markers` are all of its family that were read; `n_corners` corners were refined, of
+    `min_corners` needed.
     """
     ours = np.isin(markers.ids, marker_set.ids)
     if np.any(ours):
@@ -138,24 +123,11 @@ MIN_CORNERS = 6
 def detect_board(
     image: GreyImage, board: Board, name: str, *, min_corners: int = MIN_CORNERS
 ) -> View | str:
-    """Find the inner corners of a board.
+    """Find the inner corners of a board in a grey picture, which messages call `name`.
 
-    Parameters
-    ----------
-    image : uint8 array, shape (height, width)
-        Grey picture.
-    board : Board
-        The target. A ChArUco board may be seen in part, a chessboard only whole.
-    name : str
-        Name of the picture in messages.
-    min_corners : int
-        Least number of corners of a view.
-
-    Returns
-    -------
-    View or str
-        Points in `board`, ids count the inner corners row by row; or, in a clause, the reason
-        why there is none.
+    A ChArUco board may be seen in part, a chessboard only whole. Points of the view are in `board`,
+    ids count the inner corners row by row. With fewer than `min_corners` corners the reason is
+    returned instead, in a clause.
     """
     find = find_charuco if board.kind is BoardKind.CHARUCO else find_chessboard
     grid = find(image, board)
@@ -173,25 +145,12 @@ def _view(grid: CornerGrid, board: Board, name: str) -> View:
 def detect_markers(
     image: GreyImage, marker_set: MarkerSet, name: str, *, min_corners: int = MIN_CORNERS
 ) -> View | str:
-    """Find the corners of the markers of a set.
+    """Find the corners of the markers of a set in a grey picture, which messages call `name`.
 
-    Parameters
-    ----------
-    image : uint8 array, shape (height, width)
-        Grey picture.
-    marker_set : MarkerSet
-        The target; other markers of the family are ignored.
-    name : str
-        Name of the picture in messages.
-    min_corners : int
-        Least number of corners of a view.
-
-    Returns
-    -------
-    View or str
-        Points in the set's frame, ids are four times the index in the set plus the corner's place;
-        or, in a clause, the reason why there is none. Corners that could not be refined cleanly,
-        under a laser stripe for example, are missing.
+    Other markers of the family are ignored. Points of the view are in the set's frame, ids are four
+    times the index in the set plus the corner's place. Corners that could not be refined cleanly,
+    under a laser stripe for example, are missing. With fewer than `min_corners` corners the reason
+    is returned instead, in a clause.
     """
     markers = read_markers(image, marker_set.family)
     index = {int(number): i for i, number in enumerate(marker_set.ids)}

@@ -344,23 +344,15 @@ GreyImage = NDArray[np.uint8]
 
 @dataclass(frozen=True, slots=True)
 class SaddleFit:
-    """Corners refined to sub-pixel accuracy.
+    """Corners refined to sub-pixel accuracy."""
 
-    Attributes
-    ----------
-    pixels : array, shape (N, 2)
-        In `image`; the starting place where not valid.
-    sigma : array, shape (N,)
-        Standard deviation of a coordinate from the fit's own residual, in pixels.
-    blur : array, shape (N,)
-        Standard deviation of the blur across the edges, in pixels.
-    valid : bool array, shape (N,)
-        False where the pixels do not fit the model, or the corner moved too far.
-    """
-
+    # Shape (N, 2): in `image`; the starting place where not valid.
     pixels: FloatArray
+    # Shape (N,): standard deviation of a coordinate from the fit's own residual, in pixels.
     sigma: FloatArray
+    # Shape (N,): standard deviation of the blur across the edges, in pixels.
     blur: FloatArray
+    # Shape (N,): False where the pixels do not fit the model, or the corner moved too far.
     valid: BoolArray
 
 
@@ -372,7 +364,6 @@ def refine_saddles(
     *,
     margin: float,
     bits_from: float,
-    max_wander: float = 0.25,
 ) -> SaddleFit:
     """Fit the crossing of the edges at each start.
 
@@ -392,8 +383,6 @@ def refine_saddles(
     bits_from : float
         Distance from the corner beyond which the square's content is unknown, as a share of the
         square; 1 without markers.
-    max_wander : float
-        Greatest move of a corner away from its start, in sides of a square.
 
     Returns
     -------
@@ -414,8 +403,9 @@ def refine_saddles(
     sigma, residual_share, turn, blur = quality.T
     side = np.sqrt(np.min(np.sum(np.square(axes), axis=1), axis=-1, initial=np.inf))
     wander = np.linalg.norm(pixels - starts, axis=1)
-    # Limits of an accepted fit: residual as a share of the contrast, turn of either edge, and
-    # uncertainty of the crossing.
+    # Limits of an accepted fit: move from the start in sides of a square, residual as a share of
+    # the contrast, turn of either edge, and uncertainty of the crossing.
+    max_wander = 0.25
     max_residual_share = 0.15
     max_turn = np.deg2rad(12.0)
     max_sigma_px = 0.3

@@ -451,20 +451,14 @@ _GAMMA = (np.log(1.6), 0.5)
 
 @dataclass(frozen=True, slots=True)
 class TagFit:
-    """Corners of markers, refined to sub-pixel accuracy.
+    """Corners of markers, refined to sub-pixel accuracy."""
 
-    Attributes
-    ----------
-    pixels : array, shape (M, 4, 2)
-        In `image`, in OpenCV's order; NaN where not valid.
-    sigma : array, shape (M, 4)
-        Standard deviation of a coordinate, from the residual, in pixels; NaN where not valid.
-    valid : bool array, shape (M, 4)
-        False where a corner could not be refined cleanly.
-    """
-
+    # Shape (M, 4, 2): in `image`, in OpenCV's order; NaN where not valid.
     pixels: FloatArray
+    # Shape (M, 4): standard deviation of a coordinate, from the residual, in pixels; NaN where not
+    # valid.
     sigma: FloatArray
+    # Shape (M, 4): False where a corner could not be refined cleanly.
     valid: BoolArray
 
 

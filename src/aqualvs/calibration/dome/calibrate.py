@@ -287,7 +287,6 @@ def dome(
         inside a dome. Without known poses its rotation is kept.
     sets : sequence of BoardSet
         One for each medium.
-    options : DomeOptions, optional
     known : RigUncertainty, optional
         Of the intrinsics (and of the rotation, if no pose is known); by default the rig's own.
         Intrinsics without an uncertainty are taken as exact.

@@ -78,17 +78,9 @@ def noise_px(solution: Solution[BundleState]) -> float:
 def check_media(
     problem: DomeProblem, solution: Solution[BundleState], sets: Sequence[BoardSet]
 ) -> list[str]:
-    """Compare every stated index with the one that fits the pictures best.
+    """Compare every stated index with the one that fits the pictures best; return warnings.
 
-    Returns
-    -------
-    list of str
-        Warnings, in plain words.
-
-    Raises
-    ------
-    CalibrationError
-        If the pictures were taken in another medium.
+    Raises `CalibrationError` if the pictures were taken in another medium.
     """
     doubts = []
     for medium, one in enumerate(sets):
@@ -251,14 +243,9 @@ def _gain(solution: Solution[BundleState], rival: Solution[BundleState]) -> floa
 
 @dataclass(frozen=True, slots=True)
 class SharedDistanceError:
-    """An error that all given distances share, estimated from the pictures.
+    """An error that all given distances share, estimated from the pictures."""
 
-    Attributes
-    ----------
-    value, sigma : float
-        In metres for an offset; a share for a scale. Given minus true.
-    """
-
+    # In metres for an offset; a share for a scale. Given minus true.
     value: float
     sigma: float
 
@@ -275,9 +262,6 @@ def check_shared_errors(
 
     Parameters
     ----------
-    problem : DomeProblem
-    solution : Solution
-        Of it.
     covariance : array, shape (P, P)
         Of the solved numbers, with the uncertainty of considered ones propagated.
 
@@ -375,10 +359,7 @@ _POSE_RULES = (
 def check_initial_guess(problem: DomeProblem) -> None:
     """Refuse boards at impossible distances, or grossly different from the given ones.
 
-    Raises
-    ------
-    CalibrationError
-        With the likely mistake.
+    Raises `CalibrationError` with the likely mistake.
     """
     _check_seen(problem)
     views = problem.bundle.views
@@ -466,18 +447,8 @@ def check_solution(
 ) -> None:
     """Refuse a solution that does not explain the pictures, or is not determined by them.
 
-    Parameters
-    ----------
-    problem : DomeProblem
-    solution : Solution
-        Of it.
-    uncertainty : RigUncertainty
-        Of the solved numbers, with the uncertainty of considered ones propagated.
-
-    Raises
-    ------
-    CalibrationError
-        With the likely cause and the remedy.
+    `uncertainty`: of the solved numbers, with the uncertainty of considered ones propagated. Raises
+    `CalibrationError` with the likely cause and the remedy.
     """
     noise = noise_px(solution)
     if noise > MAX_NOISE_PX:

@@ -80,26 +80,17 @@ def kind_of(given: GivenPose | None) -> PoseKind:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BoardSet:
-    """Views taken in one medium.
+    """Views taken in one medium."""
 
-    Attributes
-    ----------
-    name : str
-        For messages: "air", "pool", a folder.
-    views : tuple of View
-        One for each picture.
-    poses : tuple of GivenPose or None
-        Measurements of each view's board; empty if nothing is known of any.
-    n_medium : float
-        Index outside the dome (vacuum = 1).
-    sigma_medium : float
-        Its standard deviation; 0 takes it as exact.
-    """
-
+    # For messages: "air", "pool", a folder.
     name: str
+    # One for each picture.
     views: tuple[View, ...]
+    # Measurements of each view's board; empty if nothing is known of any.
     poses: Sequence[GivenPose | None] = ()
+    # Index outside the dome (vacuum = 1).
     n_medium: float = N_AIR
+    # Its standard deviation; 0 takes it as exact.
     sigma_medium: float = 0.0
 
     def __post_init__(self) -> None:
@@ -113,36 +104,24 @@ class BoardSet:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DomeOptions:
-    """Options of `calibrate dome`; SI units and radians.
+    """Options of `calibrate dome`; SI units and radians."""
 
-    Attributes
-    ----------
-    inner_radius_sigma, thickness_sigma : float
-        Standard deviations of the housing's sizes; 0 takes one as exact. A flat port has no radius.
-    n_acrylic_sigma : float
-        Standard deviation of the index of the dome or the flat port.
-    distance_sigma : float
-        Standard deviation of given distances, independent of each other.
-    distance_offset_sigma : float
-        Standard deviation of the zero of all distances: this shared error shifts the lens as a
-        whole.
-    tilt_sigma : float
-        Standard deviation, about each axis, of well set up boards at known distances from
-        square to the dome. A minority of boards may be off by any amount.
-    refine_intrinsics : bool
-        Whether intrinsics are solved too, with the camera's calibration as their prior. If not,
-        they are held, and their uncertainty is propagated to the result.
-    check_cross_validation : bool
-        Whether to compare the dome with a bare lens on views held out.
-    """
-
+    # Standard deviations of the housing's sizes; 0 takes one as exact. A flat port has no radius.
     inner_radius_sigma: float = 1e-4
     thickness_sigma: float = 1e-4
+    # Standard deviation of the index of the dome or the flat port.
     n_acrylic_sigma: float = 3e-3
+    # Standard deviation of given distances, independent of each other.
     distance_sigma: float = 2e-4
+    # Standard deviation of the zero of all distances: this shared error shifts the lens as a whole.
     distance_offset_sigma: float = 2e-4
+    # Standard deviation, about each axis, of well set up boards at known distances from square to
+    # the dome. A minority of boards may be off by any amount.
     tilt_sigma: float = field(default=float(np.deg2rad(0.2)))
+    # Whether intrinsics are solved too, with the camera's calibration as their prior. If not, they
+    # are held, and their uncertainty is propagated to the result.
     refine_intrinsics: bool = True
+    # Whether to compare the dome with a bare lens on views held out.
     check_cross_validation: bool = True
 
     def __post_init__(self) -> None:
@@ -156,10 +135,7 @@ class DomeOptions:
 def check_sets(rig: Rig, sets: Sequence[BoardSet]) -> None:
     """Refuse a rig without a housing, and sets with too little in them.
 
-    Raises
-    ------
-    CalibrationError
-        With what is given and what is needed.
+    Raises `CalibrationError` with what is given and what is needed.
     """
     if rig.housing is None:
         raise CalibrationError(
@@ -230,23 +206,12 @@ class Shot:
 
 @dataclass(frozen=True, slots=True)
 class DomeProblem:
-    """The least-squares problem: a bundle and the views it was made of.
-
-    Attributes
-    ----------
-    bundle : Bundle
-    shots : tuple of Shot
-        One for each of the bundle's views.
-    considered : RigUncertainty
-        Uncertainty of numbers that are not solved for.
-    left_out : dict
-        Labels of views that could not be used, with the reason.
-    """
+    """The least-squares problem: a bundle and the views it was made of."""
 
     bundle: Bundle
-    shots: tuple[Shot, ...]
-    considered: RigUncertainty
-    left_out: dict[str, str]
+    shots: tuple[Shot, ...]  # One for each of the bundle's views.
+    considered: RigUncertainty  # Uncertainty of numbers that are not solved for.
+    left_out: dict[str, str]  # Labels of views that could not be used, with the reason.
 
     @property
     def rotation_is_solved(self) -> bool:
@@ -341,10 +306,8 @@ def dome_problem(
     ----------
     rig : Rig
         Initial guess; its lens lies inside the dome, or behind the flat port.
-    sets : sequence of BoardSet
     known : RigUncertainty
         Of the rig beforehand: intrinsics from the camera's calibration.
-    options : DomeOptions
 
     Raises
     ------
@@ -495,12 +458,8 @@ def compare_with_bare_lens(
     """Solve both models from three views in four and predict the fourth; four times.
 
     The pose of a view held out is found from half of its corners; the other half is predicted.
-    Outliers of the whole solve and corners that either model cannot see are left out for both.
-
-    Returns
-    -------
-    CrossValidation or None
-        None if there are too few views.
+    Outliers of the whole solve and corners that either model cannot see are left out for both. None
+    if there are too few views.
     """
     n = len(problem.shots)
     believed = [

@@ -55,33 +55,23 @@ _LIMITS = _FitLimits()
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LaserOptions:
-    """Options of `calibrate_lasers`.
+    """Options of `calibrate_lasers`."""
 
-    Attributes
-    ----------
-    n_lasers : int or None
-        Number of lasers that shine. None for as many as the rig has, or, if it has none, as many
-        as can be distinguished.
-    n_medium : float or None
-        Index of the medium in the pictures; None for the rig's own water.
-    sigma_n_medium : float
-        Its standard deviation; for the rig's own water the rig's uncertainty counts instead.
-    refine : bool
-        Whether the camera's uncertain numbers are solved too, with their uncertainty as prior;
-        else they are held, and their uncertainty is propagated.
-    stripe_bias_px : float
-        Standard deviation of the error that all centres of one laser's stripe share on one
-        surface: by glow in the water, or by a gradient of the surface's lightness.
-    loose : bool or None
-        Whether a board may lie unevenly on the surface that the stripes are on, or bend. None to
-        decide by the pictures: it does if stripes and corners contradict each other.
-    """
-
+    # Number of lasers that shine. None for as many as the rig has, or, if it has none, as many as
+    # can be distinguished.
     n_lasers: int | None = None
+    # Index of the medium in the pictures; None for the rig's own water.
     n_medium: float | None = None
+    # Its standard deviation; for the rig's own water the rig's uncertainty counts instead.
     sigma_n_medium: float = 0.0
+    # Whether the camera's uncertain numbers are solved too, with their uncertainty as prior; else
+    # they are held, and their uncertainty is propagated.
     refine: bool = False
+    # Standard deviation of the error that all centres of one laser's stripe share on one surface:
+    # by glow in the water, or by a gradient of the surface's lightness.
     stripe_bias_px: float = 0.03
+    # Whether a board may lie unevenly on the surface that the stripes are on, or bend. None to
+    # decide by the pictures: it does if stripes and corners contradict each other.
     loose: bool | None = None
 
     def __post_init__(self) -> None:

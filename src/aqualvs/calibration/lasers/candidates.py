@@ -38,18 +38,10 @@ _LINES = _LineOptions()
 
 @dataclass(frozen=True, slots=True)
 class StripeLine:
-    """A straight stripe on a surface.
+    """A straight stripe on a surface."""
 
-    Attributes
-    ----------
-    patch : int
-        Index of the surface of a view.
-    members : int array, shape (M,)
-        Indices of its points among those of all patches.
-    """
-
-    patch: int
-    members: IntArray
+    patch: int  # Index of the surface of a view.
+    members: IntArray  # Shape (M,): indices of its points among those of all patches.
 
 
 def lines_on_patch(pooled: PooledStripes, members: IntArray, patch: int) -> list[StripeLine]:
@@ -203,46 +195,30 @@ _ACCIDENTS = _AccidentOptions()
 
 @dataclass(frozen=True, slots=True)
 class PlaneCandidate:
-    """A plane that may be a laser's.
+    """A plane that may be a laser's."""
 
-    Attributes
-    ----------
-    plane : Plane
-        In `dome`.
-    lines : int array, shape (K,)
-        Indices of the lines in it.
-    log_false_alarms : float
-        Natural logarithm of the number of accidental planes as good as this one that are expected
-        in these pictures.
-    residual_px : float
-        Root mean square over surfaces of the distance of lines from the plane, at their worst end.
-    """
-
+    # In `dome`.
     plane: Plane
+    # Shape (K,): indices of the lines in it.
     lines: IntArray
+    # Natural logarithm of the number of accidental planes as good as this one that are expected in
+    # these pictures.
     log_false_alarms: float
+    # Root mean square over surfaces of the distance of lines from the plane, at their worst end.
     residual_px: float
 
 
 @dataclass(frozen=True, slots=True)
 class LineTable:
-    """Ends and middles of L lines, from which planes are guessed and on which they are tested.
+    """Ends and middles of L lines, from which planes are guessed and on which they are tested."""
 
-    Attributes
-    ----------
-    patch : int array, shape (L,)
-        Index of the line's surface of a view.
-    length : array, shape (L,)
-        In metres.
-    points : array, shape (L, 3, 3)
-        Ends and middle, in `dome`.
-    by_across : array, shape (L, 3, 3)
-        Their derivative by the pixel across the stripe, metres per pixel.
-    """
-
+    # Shape (L,): index of the line's surface of a view.
     patch: IntArray
+    # Shape (L,): in metres.
     length: FloatArray
+    # Shape (L, 3, 3): ends and middle, in `dome`.
     points: FloatArray
+    # Shape (L, 3, 3): their derivative by the pixel across the stripe, metres per pixel.
     by_across: FloatArray
 
     @classmethod
@@ -307,17 +283,11 @@ class _Hypotheses:
 
 @dataclass(frozen=True, slots=True)
 class _Accidents:
-    """Rates at which planes and lines of different lasers meet.
+    """Rates at which planes and lines of different lasers meet."""
 
-    Attributes
-    ----------
-    rate : array, shape (L,)
-        Probability that an accidental plane meets a line of this length on its surface.
-    n_planes : float
-        Number of accidental pairs of lines that meet.
-    """
-
+    # Shape (L,): probability that an accidental plane meets a line of this length on its surface.
     rate: FloatArray
+    # Number of accidental pairs of lines that meet.
     n_planes: float
 
 

@@ -28,121 +28,82 @@ from aqualvs.optics.rig import Laser, Rig, RigUncertainty
 
 @dataclass(frozen=True, slots=True)
 class LaserFigures:
-    """Figures of one calibrated laser.
+    """Figures of one calibrated laser."""
 
-    Attributes
-    ----------
-    laser : Laser
-        As solved.
-    sigma_normal : float
-        Standard deviation of the normal's direction, along the worst axis, in radians.
-    sigma_offset : float
-        Standard deviation of the offset, in metres.
-    rms_px, rms : float
-        Root mean square distance of stripe points, by bins, from the sheet: in pixels across the
-        stripe, and in metres.
-    n_points, n_outliers : int
-        Stripe points used, and outliers among them.
-    n_effective : float
-        Number of independent measurements that the points are worth.
-    surfaces : tuple of str
-        Surfaces that the laser was seen on.
-    n_views : int
-        Number of pictures that it was seen in.
-    paper_plane : Plane
-        By the paper's method (Eq. 33-36), for comparison: poses by distances in space, then the
-        pseudo-inverse.
-    sheet : str
-        In words, the chosen model of the sheet and the reason.
-    """
-
+    # As solved.
     laser: Laser
+    # Standard deviation of the normal's direction, along the worst axis, in radians.
     sigma_normal: float
+    # Standard deviation of the offset, in metres.
     sigma_offset: float
+    # Root mean square distance of stripe points, by bins, from the sheet: in pixels across the
+    # stripe, and in metres.
     rms_px: float
     rms: float
+    # Stripe points used, and outliers among them.
     n_points: int
     n_outliers: int
+    # Number of independent measurements that the points are worth.
     n_effective: float
+    # Surfaces that the laser was seen on.
     surfaces: tuple[str, ...]
+    # Number of pictures that it was seen in.
     n_views: int
+    # By the paper's method (Eq. 33-36), for comparison: poses by distances in space, then the
+    # pseudo-inverse.
     paper_plane: Plane
+    # In words, the chosen model of the sheet and the reason.
     sheet: str
 
 
 @dataclass(frozen=True, slots=True)
 class ViewFigures:
-    """Figures of one picture of the calibration.
+    """Figures of one picture of the calibration."""
 
-    Attributes
-    ----------
-    name : str
-        File name.
-    dome_from_target : SE3
-        Pose by corners and stripes together.
-    rms_corners_px, rms_stripes_px : float
-        Of the inliers; NaN if there are none.
-    n_corners, n_corners_rejected, n_stripe_points : int
-        Corners found, outliers among them, and stripe points on surfaces.
-    spatial_pose : SE3
-        `dome_from_target` by the paper's cost (Eq. 32-33).
-    spatial_cost : float
-        The paper's V at its minimum, in square metres.
-    spatial_rms : float
-        Root mean square distance of corners from their rays, in metres.
-    pose_angle, pose_shift : float
-        Difference of the two poses, in radians, and in metres at the middle of the corners.
-    corners_px, corner_residuals_px : array, shape (N, 2)
-        Measured corners, and their residuals.
-    corner_inliers : bool array, shape (N,)
-        Inlier corners.
-    """
-
+    # File name.
     name: str
+    # Pose by corners and stripes together.
     dome_from_target: SE3
+    # Of the inliers; NaN if there are none.
     rms_corners_px: float
     rms_stripes_px: float
+    # Corners found, outliers among them, and stripe points on surfaces.
     n_corners: int
     n_corners_rejected: int
     n_stripe_points: int
+    # `dome_from_target` by the paper's cost (Eq. 32-33).
     spatial_pose: SE3
+    # The paper's V at its minimum, in square metres.
     spatial_cost: float
+    # Root mean square distance of corners from their rays, in metres.
     spatial_rms: float
+    # Difference of the two poses, in radians, and in metres at the middle of the corners.
     pose_angle: float
     pose_shift: float
+    # Shape (N, 2): measured corners, and their residuals.
     corners_px: FloatArray
     corner_residuals_px: FloatArray
+    # Shape (N,): inlier corners.
     corner_inliers: BoolArray
 
 
 @dataclass(frozen=True, slots=True)
 class LaserCalibration:
-    """Result of a calibration of lasers.
+    """Result of a calibration of lasers."""
 
-    Attributes
-    ----------
-    rig : Rig
-        With the lasers, and the camera's numbers if they were refined.
-    uncertainty : RigUncertainty
-        Joint, of all numbers that were uncertain before and of the lasers.
-    lasers : tuple of LaserFigures
-        In the order of `rig.lasers`.
-    views : tuple of ViewFigures
-        Pictures that were used.
-    left_out : dict
-        Names of the others, with the reason.
-    warnings : tuple of str
-        Warnings for the user, in words.
-    refined : bool
-        Whether the camera's numbers were solved too.
-    """
-
+    # With the lasers, and the camera's numbers if they were refined.
     rig: Rig
+    # Joint, of all numbers that were uncertain before and of the lasers.
     uncertainty: RigUncertainty
+    # In the order of `rig.lasers`.
     lasers: tuple[LaserFigures, ...]
+    # Pictures that were used.
     views: tuple[ViewFigures, ...]
+    # Names of the others, with the reason.
     left_out: dict[str, str]
+    # Warnings for the user, in words.
     warnings: tuple[str, ...]
+    # Whether the camera's numbers were solved too.
     refined: bool
 
 
@@ -358,10 +319,7 @@ _MIN_BINS = 5
 def check_size(views: Sequence[LaserView]) -> None:
     """Refuse targets whose size indicates a wrong unit.
 
-    Raises
-    ------
-    CalibrationError
-        If so.
+    Raises `CalibrationError` if so.
     """
     points = [v.view.points for v in views if len(v.view)]
     if not points:
@@ -380,10 +338,7 @@ def check_size(views: Sequence[LaserView]) -> None:
 def check_poses(views: Sequence[PlacedView]) -> None:
     """Refuse pictures with corners that contradict the rig, the medium or the target's file.
 
-    Raises
-    ------
-    CalibrationError
-        If so.
+    Raises `CalibrationError` if so.
     """
     misses = float(np.median([view.rms_px for view in views]))
     # Larger than any error of detection, in pixels.
@@ -398,10 +353,7 @@ def check_poses(views: Sequence[PlacedView]) -> None:
 def check_distances(views: Sequence[PlacedView], rig: Rig) -> None:
     """Refuse stripes at distances that indicate a wrong unit, or no stripes on the target.
 
-    Raises
-    ------
-    CalibrationError
-        If so.
+    Raises `CalibrationError` if so.
     """
     if not any(len(view.placed) for view in views):
         raise CalibrationError(
@@ -429,11 +381,8 @@ def check_count(
 ) -> list[str]:
     """Refuse fewer or more lasers than expected, or an undecided number; warn of uncertain ones.
 
-    Raises
-    ------
-    CalibrationError
-        If there are fewer, more, or none, or if the pictures do not decide whether planes of
-        light are lasers.
+    Raises `CalibrationError` if there are fewer, more, or none, or if the pictures do not decide
+    whether planes of light are lasers.
     """
     found = len(split.planes)
     if found < (expected or 1):

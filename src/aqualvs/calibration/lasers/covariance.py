@@ -23,23 +23,15 @@ from aqualvs.optics.rig import LASER_PARAMETERS, Laser, Rig, RigUncertainty
 
 @dataclass(frozen=True, slots=True)
 class CameraCovariance:
-    """Uncertain numbers of the camera, and uncertainty of the medium's index.
+    """Uncertain numbers of the camera, and uncertainty of the medium's index."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        Of the rig's numbers, without the medium's index.
-    sigma_medium : float
-        Standard deviation of the index of the medium in the pictures; 0 if exact.
-    medium_is_water : bool
-        True if that medium is the rig's own water, so that both indices are the same number.
-    given : RigUncertainty
-        Prior uncertainty.
-    """
-
+    # Of the rig's numbers, without the medium's index.
     names: tuple[str, ...]
+    # Standard deviation of the index of the medium in the pictures; 0 if exact.
     sigma_medium: float
+    # True if that medium is the rig's own water, so that both indices are the same number.
     medium_is_water: bool
+    # Prior uncertainty.
     given: RigUncertainty
 
     @classmethod
@@ -97,20 +89,13 @@ class CameraCovariance:
 
 @dataclass(frozen=True, slots=True)
 class JointResult:
-    """Covariances of a solved problem.
+    """Covariances of a solved problem."""
 
-    Attributes
-    ----------
-    uncertainty : RigUncertainty
-        Of all given numbers and all lasers' planes together; windows are taken as given.
-    lasers : array, shape (3 L, 3 L)
-        Covariance of the lasers' planes.
-    correlation : tuple of float
-        For every laser, the number of binned residuals that are worth one independent one.
-    """
-
+    # Of all given numbers and all lasers' planes together; windows are taken as given.
     uncertainty: RigUncertainty
+    # Shape (3 L, 3 L): covariance of the lasers' planes.
     lasers: FloatArray
+    # For every laser, the number of binned residuals that are worth one independent one.
     correlation: tuple[float, ...]
 
 

@@ -55,25 +55,13 @@ class PlaneVerdict(Enum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JudgedPlane:
-    """Plane of light with the verdict on it.
-
-    Attributes
-    ----------
-    candidate : PlaneCandidate
-    members : int array, shape (M,)
-        Indices of its points.
-    patches : tuple of int
-        Surfaces of views that it is seen on.
-    verdict : PlaneVerdict
-    why : str
-        In words, the reason why it is no laser or may be none; empty for lasers.
-    """
+    """Plane of light with the verdict on it."""
 
     candidate: PlaneCandidate
-    members: IntArray
-    patches: tuple[int, ...]
+    members: IntArray  # Shape (M,): indices of its points.
+    patches: tuple[int, ...]  # Surfaces of views that it is seen on.
     verdict: PlaneVerdict
-    why: str = ""
+    why: str = ""  # In words, the reason why it is no laser or may be none; empty for lasers.
 
 
 def judged(
@@ -268,23 +256,15 @@ _HARDLY_AN_ACCIDENT = float(np.log(0.05))
 
 @dataclass(frozen=True, slots=True)
 class LaserAssignment:
-    """Points sorted by laser.
+    """Points sorted by laser."""
 
-    Attributes
-    ----------
-    planes : tuple of Plane
-        Rough planes of the lasers, the one with the best evidence first.
-    laser : int array, shape (N,)
-        Index into `planes`; -1 for points of none, or near the crossing of two stripes.
-    unmatched : tuple of StripeLine
-        Long stripes that belong to none of the planes, the longest first.
-    spare : tuple of JudgedPlane
-        Further planes of light that are not accepted as lasers; undecided ones first.
-    """
-
+    # Rough planes of the lasers, the one with the best evidence first.
     planes: tuple[Plane, ...]
+    # Shape (N,): index into `planes`; -1 for points of none, or near the crossing of two stripes.
     laser: IntArray
+    # Long stripes that belong to none of the planes, the longest first.
     unmatched: tuple[StripeLine, ...]
+    # Further planes of light that are not accepted as lasers; undecided ones first.
     spare: tuple[JudgedPlane, ...] = ()
 
     @property

@@ -39,18 +39,10 @@ def stripes_group(i_laser: int) -> str:
 
 @dataclass(frozen=True, slots=True)
 class BoardPosePrior:
-    """Standard deviations of a board's pose on the surface of the stripes.
+    """Standard deviations of a board's pose on the surface of the stripes."""
 
-    Attributes
-    ----------
-    tilt : float
-        Of the angle between them about either axis of the board, in radians.
-    offset : float
-        Of the distance at the board's middle, in metres.
-    """
-
-    tilt: float
-    offset: float
+    tilt: float  # Of the angle between them about either axis of the board, in radians.
+    offset: float  # Of the distance at the board's middle, in metres.
 
     @property
     def sigmas(self) -> FloatArray:
@@ -60,21 +52,15 @@ class BoardPosePrior:
 
 @dataclass(frozen=True, slots=True)
 class LaserState:
-    """Unknowns of the problem.
+    """Unknowns of the problem."""
 
-    Attributes
-    ----------
-    bundle : BundleState
-        Camera, medium and poses.
-    sheets : tuple of Sheet
-        Sheet of every laser.
-    board_poses : array, shape (V, 3)
-        Difference between the surface of the stripes and the target's own in every view: two
-        tilts about the target's middle (radians), and an offset away from the camera (metres).
-    """
-
+    # Camera, medium and poses.
     bundle: BundleState
+    # Sheet of every laser.
     sheets: tuple[Sheet, ...]
+    # Shape (V, 3): difference between the surface of the stripes and the target's own in every
+    # view: two tilts about the target's middle (radians), and an offset away from the camera
+    # (metres).
     board_poses: FloatArray
 
 
@@ -95,24 +81,17 @@ class LaserProblem:
 
     Columns: those of `bundle`, then `LASER_PARAMETERS` of every laser, then, with a
     prior on the boards' poses, three for every view.
-
-    Attributes
-    ----------
-    bundle : Bundle
-        Corners and priors; all views in its first medium.
-    surfaces : TargetSurfaces
-        Of the target.
-    groups : tuple of StripeGroup
-        Stripes; their residuals come before the corners'.
-    n_lasers : int
-    board_pose_prior : BoardPosePrior or None
-        Uncertainty of the target's pose on the surface; None if the target is the surface.
     """
 
+    # Corners and priors; all views in its first medium.
     bundle: Bundle
+    # Of the target.
     surfaces: TargetSurfaces
+    # Stripes; their residuals come before the corners'.
     groups: tuple[StripeGroup, ...]
+
     n_lasers: int
+    # Uncertainty of the target's pose on the surface; None if the target is the surface.
     board_pose_prior: BoardPosePrior | None = None
 
     @property

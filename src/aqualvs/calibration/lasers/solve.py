@@ -159,28 +159,19 @@ _MIN_POINTS = 5
 
 @dataclass(frozen=True, slots=True)
 class InitialGuess:
-    """Input and initial guess of a solve.
+    """Input and initial guess of a solve."""
 
-    Attributes
-    ----------
-    rig : Rig
-        In the medium of the pictures.
-    surfaces : TargetSurfaces
-        Of the target.
-    views : tuple of PlacedView
-    camera_covariance : CameraCovariance or None
-        Numbers that are refined too; None if the camera is held.
-    board_pose_prior : BoardPosePrior or None
-        Uncertainty of a board's pose on its surface; None if it is the surface.
-    shared_error_px : float
-        Error that shifts or turns a whole stripe in its picture.
-    """
-
+    # In the medium of the pictures.
     rig: Rig
+    # Of the target.
     surfaces: TargetSurfaces
+
     views: tuple[PlacedView, ...]
+    # Numbers that are refined too; None if the camera is held.
     camera_covariance: CameraCovariance | None
+    # Uncertainty of a board's pose on its surface; None if it is the surface.
     board_pose_prior: BoardPosePrior | None = None
+    # Error that shifts or turns a whole stripe in its picture.
     shared_error_px: float = 0.0
 
     def planes(self, view: PlacedView) -> list[Plane]:
@@ -220,7 +211,6 @@ def solve_lasers(
 
     Parameters
     ----------
-    start : InitialGuess
     lasers : sequence of Laser
         `plane` fits the light in the medium of the pictures roughly.
     laser_of : int array, shape (N,)
@@ -302,7 +292,6 @@ def free_text(
 
     Parameters
     ----------
-    problem : LaserProblem
     names : sequence of str
         Of the lasers.
     views : sequence of PlacedView

@@ -21,26 +21,19 @@ from aqualvs.optics.sheet import Sheet
 
 @dataclass(frozen=True, slots=True)
 class StripePoints:
-    """Points on laser stripes, found in one picture.
+    """Points on laser stripes, found in one picture."""
 
-    Attributes
-    ----------
-    name : str
-        File name of the picture, for messages and reports.
-    pixels : array, shape (N, 2)
-        Sub-pixel centres, in `image`.
-    across : array, shape (N, 2)
-        Unit vectors in `image` at right angles to the stripe: a point is measured along these only.
-    chain : int array, shape (N,)
-        Index of the unbroken segment of a stripe that a point belongs to; segments may bend.
-    sigma_px : array, shape (N,)
-        Nominal standard deviation along `across`; solves estimate the real one.
-    """
-
+    # File name of the picture, for messages and reports.
     name: str
+    # Shape (N, 2): sub-pixel centres, in `image`.
     pixels: FloatArray
+    # Shape (N, 2): unit vectors in `image` at right angles to the stripe: a point is measured along
+    # these only.
     across: FloatArray
+    # Shape (N,): index of the unbroken segment of a stripe that a point belongs to; segments may
+    # bend.
     chain: IntArray
+    # Shape (N,): nominal standard deviation along `across`; solves estimate the real one.
     sigma_px: FloatArray
 
     def __len__(self) -> int:
@@ -75,20 +68,13 @@ _PIXEL_STEPS: FloatArray = np.array([[1.0, 0.0], [0.0, 1.0], [0.0, 0.0]])
 
 @dataclass(frozen=True, slots=True)
 class TargetSurfaces:
-    """Flat surfaces of a target that stripes are seen on, in the target's frame.
+    """Flat surfaces of a target that stripes are seen on, in the target's frame."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        Names in messages.
-    planes : tuple of Plane
-        Normals point away from the side that is seen.
-    lowest, highest : array, shape (3,)
-        Bounds in metres; stripes outside lie on something else.
-    """
-
+    # Names in messages.
     names: tuple[str, ...]
+    # Normals point away from the side that is seen.
     planes: tuple[Plane, ...]
+    # Shape (3,): bounds in metres; stripes outside lie on something else.
     lowest: FloatArray
     highest: FloatArray
 
@@ -166,11 +152,8 @@ def box_surfaces(planes: Mapping[str, Plane], points: FloatArray) -> TargetSurfa
 def board_surface(*, thickness: float = 0.0) -> TargetSurfaces:
     """Return the surface of a board, for stripes on the board or beside it.
 
-    Parameters
-    ----------
-    thickness : float
-        Distance of the board's printed face in front of the surface of the stripes, in metres; 0
-        if the print is on the surface itself.
+    `thickness`: distance of the board's printed face in front of the surface of the stripes, in
+    metres; 0 if the print is on the surface itself.
     """
     far = np.full(3, np.inf)
     # A board's z axis points into it (OpenCV).
@@ -179,26 +162,17 @@ def board_surface(*, thickness: float = 0.0) -> TargetSurfaces:
 
 @dataclass(frozen=True, slots=True)
 class PlacedStripes:
-    """Stripe points of one picture on the surfaces of its target, N of them.
+    """Stripe points of one picture on the surfaces of its target, N of them."""
 
-    Attributes
-    ----------
-    index : int array, shape (N,)
-        Indices into the `StripePoints`.
-    surface : int array, shape (N,)
-        Index into `TargetSurfaces`.
-    points_in_dome : array, shape (N, 3)
-        In metres.
-    by_pixel : array, shape (N, 3, 2)
-        Derivative of a point on its surface by its pixel, metres per pixel.
-    across : array, shape (N, 2)
-        As `StripePoints.across`.
-    """
-
+    # Shape (N,): indices into the `StripePoints`.
     index: IntArray
+    # Shape (N,): index into `TargetSurfaces`.
     surface: IntArray
+    # Shape (N, 3): in metres.
     points_in_dome: FloatArray
+    # Shape (N, 3, 2): derivative of a point on its surface by its pixel, metres per pixel.
     by_pixel: FloatArray
+    # Shape (N, 2): as `StripePoints.across`.
     across: FloatArray
 
     @property
@@ -221,32 +195,21 @@ class PlacedStripes:
 
 @dataclass(frozen=True, slots=True)
 class PooledStripes:
-    """Stripe points of all views, on all surfaces.
+    """Stripe points of all views, on all surfaces."""
 
-    Attributes
-    ----------
-    placed : PlacedStripes
-        N points of all views; `index` counts within each view.
-    patch : int array, shape (N,)
-        Surface of a view that a point lies on, counted through all views.
-    patch_planes : tuple of Plane
-        Surface of every patch, in `dome`.
-    view : int array, shape (N,)
-        View of each point.
-    points_in_target : array, shape (N, 3)
-        In metres.
-    on_target : bool array, shape (N,)
-        True for points within the bounds of the target's corners.
-    chain : int array, shape (N,)
-        Unbroken segment of a stripe, counted through all views.
-    """
-
+    # N points of all views; `index` counts within each view.
     placed: PlacedStripes
+    # Shape (N,): surface of a view that a point lies on, counted through all views.
     patch: IntArray
+    # Surface of every patch, in `dome`.
     patch_planes: tuple[Plane, ...]
+    # Shape (N,): view of each point.
     view: IntArray
+    # Shape (N, 3): in metres.
     points_in_target: FloatArray
+    # Shape (N,): True for points within the bounds of the target's corners.
     on_target: BoolArray
+    # Shape (N,): unbroken segment of a stripe, counted through all views.
     chain: IntArray
 
 
@@ -468,12 +431,8 @@ def with_gain(
 def with_shared_error(group: StripeGroup, error_px: float) -> StripeGroup:
     """Return the group with the noise of its bins raised by an error that they share.
 
-    Parameters
-    ----------
-    group : StripeGroup
-    error_px : float
-        Standard deviation of a shift and turn of the whole stripe in its picture. All bins
-        together then determine place and direction no better than that.
+    `error_px`: standard deviation of a shift and turn of the whole stripe in its picture. All bins
+    together then determine place and direction no better than that.
     """
     shared = error_px * np.sqrt(0.5 * len(group))
     return replace(group, sigma_px=np.hypot(group.sigma_px, shared))

@@ -36,21 +36,11 @@ _SMALL_TURN, _SMALL_SHIFT = 1e-10, 1e-10
 
 @dataclass(frozen=True, slots=True)
 class SpatialPose:
-    """A pose by the paper's cost function.
+    """A pose by the paper's cost function."""
 
-    Attributes
-    ----------
-    dome_from_target : SE3
-        The inverse of the paper's (S^G, R_S^G).
-    cost : float
-        V of Eq. 32 at its minimum, in square metres.
-    rms : float
-        Root mean square distance of corners from their rays, in metres.
-    """
-
-    dome_from_target: SE3
-    cost: float
-    rms: float
+    dome_from_target: SE3  # The inverse of the paper's (S^G, R_S^G).
+    cost: float  # V of Eq. 32 at its minimum, in square metres.
+    rms: float  # Root mean square distance of corners from their rays, in metres.
 
 
 def spatial_pose(camera: Camera, view: View, start: SE3) -> SpatialPose:
@@ -111,49 +101,23 @@ def pose_difference(a: SE3, b: SE3, middle: FloatArray) -> tuple[float, float]:
 
 @dataclass(frozen=True, slots=True)
 class LaserView:
-    """Points of the target and of stripes on it in one picture.
+    """Points of the target and of stripes on it in one picture."""
 
-    Attributes
-    ----------
-    view : View
-        Corners of markers or of the board.
-    stripes : StripePoints
-        Of all lasers together.
-    """
-
-    view: View
-    stripes: StripePoints
+    view: View  # Corners of markers or of the board.
+    stripes: StripePoints  # Of all lasers together.
 
 
 @dataclass(frozen=True, slots=True)
 class PlacedView:
-    """Picture with the target's pose and the stripes on its surfaces.
+    """Picture with the target's pose and the stripes on its surfaces."""
 
-    Attributes
-    ----------
-    view : View
-        Inlier corners.
-    stripes : StripePoints
-        As found.
-    dome_from_target : SE3
-        By reprojection.
-    spatial : SpatialPose
-        By the paper's cost.
-    placed : PlacedStripes
-        Stripe points on the target's surfaces.
-    n_corners_rejected : int
-        Number of outlier corners.
-    rms_px : float
-        Root mean square residual of the corners for the pose by them alone.
-    """
-
-    view: View
-    stripes: StripePoints
-    dome_from_target: SE3
-    spatial: SpatialPose
-    placed: PlacedStripes
-    n_corners_rejected: int
-    rms_px: float
+    view: View  # Inlier corners.
+    stripes: StripePoints  # As found.
+    dome_from_target: SE3  # By reprojection.
+    spatial: SpatialPose  # By the paper's cost.
+    placed: PlacedStripes  # Stripe points on the target's surfaces.
+    n_corners_rejected: int  # Number of outlier corners.
+    rms_px: float  # Root mean square residual of the corners for the pose by them alone.
 
 
 def place_views(

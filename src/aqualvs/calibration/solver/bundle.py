@@ -30,18 +30,10 @@ ROLLS = "rolls"
 
 @dataclass(frozen=True, slots=True)
 class KnownDistance:
-    """Prior on a pose: measured distance of the board's plane along the dome's y axis (paper, 2.2).
+    """Prior on a pose: the board's measured distance along the dome's y axis (paper, 2.2)."""
 
-    Attributes
-    ----------
-    distance : float
-        From the dome's centre, in metres.
-    sigma : float
-        Its standard deviation, in metres.
-    """
-
-    distance: float
-    sigma: float
+    distance: float  # Of the board's plane from the dome's centre, in metres.
+    sigma: float  # Its standard deviation, in metres.
 
     def blocks(self, dome_from_target: SE3, centre: FloatArray, columns: IntArray) -> list[Block]:
         """Return one residual: found minus given distance."""
@@ -60,19 +52,13 @@ class KnownDistance:
 
 @dataclass(frozen=True, slots=True)
 class SquareBoard:
-    """Prior on a pose: the board stands square to the dome's axes, with possible outliers.
+    """Prior on a pose: the board stands square to the dome's axes, with possible outliers."""
 
-    Attributes
-    ----------
-    square : array, shape (3, 3)
-        `dome_from_target` rotation of a board without tilt.
-    board_tilt_sigma, roll_sigma : float
-        Standard deviations of well set up boards, in radians about each axis; boards far beyond
-        count little (Cauchy), so that the square majority decides. Tilt (about x and z) and roll
-        (about y) are judged separately: a rail keeps the roll of all.
-    """
-
+    # Shape (3, 3): `dome_from_target` rotation of a board without tilt.
     square: FloatArray
+    # Standard deviations of well set up boards, in radians about each axis; boards far beyond count
+    # little (Cauchy), so that the square majority decides. Tilt (about x and z) and roll (about y)
+    # are judged separately: a rail keeps the roll of all.
     board_tilt_sigma: float
     roll_sigma: float
 
@@ -249,21 +235,13 @@ CORNER_SIGMA_PX = 0.1
 
 @dataclass(frozen=True, slots=True)
 class PosedView:
-    """A view with the pose of its target and the columns of its derivatives.
-
-    Attributes
-    ----------
-    view : View
-    dome_from_target : SE3
-    shared_columns : int array, shape (S,)
-        Of the camera's numbers, in the order of `shared` in `corner_blocks`.
-    pose_columns : int array, shape (6,) or (0,)
-        Of the pose; none if it is exact.
-    """
+    """A view with the pose of its target and the columns of its derivatives."""
 
     view: View
     dome_from_target: SE3
+    # Shape (S,): of the camera's numbers, in the order of `shared` in `corner_blocks`.
     shared_columns: IntArray
+    # Shape (6,) or (0,): of the pose; none if it is exact.
     pose_columns: IntArray
 
 
@@ -276,7 +254,6 @@ def corner_blocks(camera: Camera, shared: Sequence[str], views: Sequence[PosedVi
         Looking into that medium.
     shared : sequence of str
         The camera's numbers that are solved for, named as by `parameter_names`.
-    views : sequence of PosedView
     """
     if not views:
         return []
@@ -331,46 +308,22 @@ class PoseTerm(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class TargetView:
-    """A view with the starting pose of its target and the priors on it.
+    """A view with the starting pose of its target and the priors on it."""
 
-    Attributes
-    ----------
-    view : View
-        Points and pixels.
-    medium : int
-        Index into `BundleState.media`.
-    dome_from_target : SE3
-        Initial guess of the pose, or the exact pose.
-    fixed : bool
-        Whether the pose is exact.
-    known : tuple of PoseTerm
-        Priors on the pose.
-    """
-
-    view: View
-    medium: int
-    dome_from_target: SE3
-    fixed: bool = False
-    known: tuple[PoseTerm, ...] = ()
+    view: View  # Points and pixels.
+    medium: int  # Index into `BundleState.media`.
+    dome_from_target: SE3  # Initial guess of the pose, or the exact pose.
+    fixed: bool = False  # Whether the pose is exact.
+    known: tuple[PoseTerm, ...] = ()  # Priors on the pose.
 
 
 @dataclass(frozen=True, slots=True)
 class BundleState:
-    """Unknowns of a bundle.
+    """Unknowns of a bundle."""
 
-    Attributes
-    ----------
-    rig : Rig
-        Camera and housing; its own `n_water` plays no part.
-    media : array, shape (M,)
-        Refractive indices outside the dome.
-    poses : tuple of SE3
-        `dome_from_target` of every view.
-    """
-
-    rig: Rig
-    media: FloatArray
-    poses: tuple[SE3, ...]
+    rig: Rig  # Camera and housing; its own `n_water` plays no part.
+    media: FloatArray  # Shape (M,): refractive indices outside the dome.
+    poses: tuple[SE3, ...]  # `dome_from_target` of every view.
 
     def camera(self, medium: int) -> Camera:
         """Return the camera looking into one of the media."""
@@ -383,25 +336,17 @@ class Bundle:
 
     Columns: the rig's free numbers, the free media, then six for each view whose pose is free (a
     turn about the middle of its points, radians in `dome`, and a shift, metres).
-
-    Attributes
-    ----------
-    views : tuple of TargetView
-    free : tuple of str
-        Names of the rig's numbers that are solved for, as in `parameter_names`, without
-        `n_water`.
-    start : BundleState
-        Initial guess, and mean of the priors.
-    priors : RigUncertainty
-        Uncertainty of the start; numbers that it does not name have no prior.
-    media_sigma : array, shape (M,)
-        Standard deviation of the start's media: 0 keeps one exact, infinite leaves it free.
     """
 
     views: tuple[TargetView, ...]
+    # Names of the rig's numbers that are solved for, as in `parameter_names`, without `n_water`.
     free: tuple[str, ...]
+    # Initial guess, and mean of the priors.
     start: BundleState
+    # Uncertainty of the start; numbers that it does not name have no prior.
     priors: RigUncertainty
+    # Shape (M,): standard deviation of the start's media: 0 keeps one exact, infinite leaves it
+    # free.
     media_sigma: FloatArray
 
     @property

@@ -112,18 +112,10 @@ def implausible_distance(distances: FloatArray, labels: Sequence[str]) -> str | 
 
 @dataclass(frozen=True, slots=True)
 class Direction:
-    """A combination of numbers, each in sigmas of its prior.
+    """A combination of numbers, each in sigmas of its prior."""
 
-    Attributes
-    ----------
-    weights : dict
-        Component of every number, squares adding up to 1.
-    gain : float
-        Ratio of the information of the data to that of the prior.
-    """
-
-    weights: dict[str, float]
-    gain: float
+    weights: dict[str, float]  # Component of every number, squares adding up to 1.
+    gain: float  # Ratio of the information of the data to that of the prior.
 
     @property
     def main(self) -> dict[str, float]:
@@ -134,23 +126,17 @@ class Direction:
 
 @dataclass(frozen=True, slots=True)
 class Observability:
-    """Observability of numbers with a prior: how far the data determined them.
+    """Observability of numbers with a prior: how far the data determined them."""
 
-    Attributes
-    ----------
-    shrinkage : dict
-        Ratio of each number's sigma after the solve to that before: 1 if the data added
-        nothing.
-    directions : tuple of Direction
-        Independent combinations, best determined first.
-    """
-
+    # Ratio of each number's sigma after the solve to that before: 1 if the data added nothing.
     shrinkage: dict[str, float]
+    # Independent combinations, best determined first.
     directions: tuple[Direction, ...]
 
-    def unobservable(self, limit: float = 0.1) -> list[Direction]:
+    def unobservable(self) -> list[Direction]:
         """Return the combinations with far less information from the data than from the priors."""
-        return [direction for direction in self.directions if direction.gain < limit]
+        least_gain = 0.1
+        return [direction for direction in self.directions if direction.gain < least_gain]
 
     def undetermined(self, names: Sequence[str], limit: float = 0.9) -> list[str]:
         """Return those of the names that the data hardly determine."""
@@ -169,9 +155,6 @@ def observability(
 
     Parameters
     ----------
-    bundle : Bundle
-    solution : Solution
-        Of it.
     uncertainty : RigUncertainty
         After the solve, with the uncertainty of considered numbers propagated.
     names : sequence of str
@@ -216,8 +199,6 @@ def consider_covariance(
     ----------
     bundle : Bundle
         The problem.
-    solution : Solution
-        Of it.
     considered : RigUncertainty
         Of numbers that the bundle does not solve for.
 
@@ -264,25 +245,17 @@ def _cross_information(
 
 @dataclass(frozen=True, slots=True)
 class ViewCovariance:
-    """Covariance of the shared parameters, by corners and by views.
+    """Covariance of the shared parameters, by corners and by views."""
 
-    Attributes
-    ----------
-    by_corners : array, shape (S, S)
-        As if the errors of all corners were independent.
-    by_views : array, shape (S, S)
-        From the disagreement of the views; nowhere smaller than `by_corners`.
-    inflation : float
-        Ratio of the variance by views to that by corners, over all combinations; 1 if the
-        corners' errors are independent, or less by chance.
-    step : array, shape (S,)
-        One Gauss-Newton step of the parameters; zero at the solution. The disagreement of the
-        views is evaluated after this step.
-    """
-
+    # Shape (S, S): as if the errors of all corners were independent.
     by_corners: FloatArray
+    # Shape (S, S): from the disagreement of the views; nowhere smaller than `by_corners`.
     by_views: FloatArray
+    # Ratio of the variance by views to that by corners, over all combinations; 1 if the corners'
+    # errors are independent, or less by chance.
     inflation: float
+    # Shape (S,): one Gauss-Newton step of the parameters; zero at the solution. The disagreement of
+    # the views is evaluated after this step.
     step: FloatArray
 
 

@@ -58,28 +58,18 @@ _POSE = _PoseOptions()
 
 @dataclass(frozen=True, slots=True)
 class TargetPose:
-    """A target's pose with its uncertainty.
+    """A target's pose with its uncertainty."""
 
-    Attributes
-    ----------
-    dome_from_target : SE3
-        The pose.
-    covariance : array, shape (6, 6)
-        Of the step of `bundle.moved_target`: a turn about the middle of the view's points
-        (radians) and a shift (metres), both in `dome`; camera and medium taken as exact.
-    rms_px : float
-        Root mean square distance of the inliers from their predicted pixels.
-    inliers : bool array, shape (N,)
-        Mask of the view's points that were used.
-    ambiguous : bool
-        True if a second pose, a flat target leaning the other way, explains the view nearly as
-        well.
-    """
-
+    # The pose.
     dome_from_target: SE3
+    # Shape (6, 6): of the step of `bundle.moved_target`: a turn about the middle of the view's
+    # points (radians) and a shift (metres), both in `dome`; camera and medium taken as exact.
     covariance: FloatArray
+    # Root mean square distance of the inliers from their predicted pixels.
     rms_px: float
+    # Shape (N,): mask of the view's points that were used.
     inliers: BoolArray
+    # True if a second pose, a flat target leaning the other way, explains the view nearly as well.
     ambiguous: bool
 
 
@@ -328,17 +318,10 @@ _QUARTER = 0.5 * np.pi
 
 @dataclass(frozen=True, slots=True)
 class StartPose:
-    """A first pose of a view.
-
-    Attributes
-    ----------
-    dome_from_target : SE3
-    median_px : float
-        Median error of the points it was found from.
-    """
+    """A first pose of a view."""
 
     dome_from_target: SE3
-    median_px: float
+    median_px: float  # Median error of the points it was found from.
 
 
 def start_pose(camera: Camera, view: View) -> StartPose | str:
@@ -379,10 +362,7 @@ def square_rotation(rotations: Sequence[FloatArray]) -> FloatArray:
     Boards stand upright, on a side or upside down: x and y along the dome's x and -z axes, or a
     quarter turn about y further.
 
-    Parameters
-    ----------
-    rotations : sequence of array, shape (3, 3)
-        Of the boards; the majority decides.
+    `rotations`, each of shape (3, 3): of the boards; the majority decides.
     """
     choices = [
         rotation_from_rotvec([0.0, k * _QUARTER, 0.0]) @ DOME_FROM_CAM_NOMINAL for k in range(4)
@@ -401,9 +381,6 @@ def turned_square(
 
     Parameters
     ----------
-    rig : Rig
-    poses : sequence of SE3
-        Of all boards.
     square : array, shape (3, 3)
         Rotation of a square board.
     boards : sequence of int

@@ -59,31 +59,22 @@ class RobustLoss(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """Residuals that depend on the same parameters.
+    """Residuals that depend on the same parameters."""
 
-    Attributes
-    ----------
-    group : str
-        Measurements of one group are of one kind, with much the same noise.
-    columns : int array, shape (C,)
-        Parameters these residuals depend on.
-    residuals : array, shape (N, K)
-        Measured minus predicted, or its negative, over its nominal standard deviation. K values
-        belong to one observation, such as x and y of a corner. NaN rows are not seen.
-    jacobian : array, shape (N, K, C)
-        Derivative of `residuals`.
-    loss : RobustLoss
-        Loss of the length of an observation's residual.
-    scaled : bool
-        Whether the noise is estimated, as a multiple of the nominal one; for priors it is not.
-    """
-
+    # Measurements of one group are of one kind, with much the same noise.
     group: str
+    # Shape (C,): parameters these residuals depend on.
     columns: IntArray
+    # Shape (N, K): measured minus predicted, or its negative, over its nominal standard deviation.
+    # K values belong to one observation, such as x and y of a corner. NaN rows are not seen.
     residuals: FloatArray
+    # Shape (N, K, C): derivative of `residuals`.
     jacobian: FloatArray
+    # Loss of the length of an observation's residual.
     loss: RobustLoss = RobustLoss.HUBER
+    # Whether the noise is estimated, as a multiple of the nominal one; for priors it is not.
     scaled: bool = True
+
     lengths: FloatArray = field(init=False, repr=False, compare=False)
     """Lengths (N,) of the observations' residuals."""
 
@@ -105,18 +96,13 @@ class Block:
 
 @dataclass(frozen=True, slots=True)
 class NormalEquations:
-    """Normal equations of Gauss-Newton at one state.
+    """Normal equations of Gauss-Newton at one state."""
 
-    Attributes
-    ----------
-    information : array, shape (P, P)
-    gradient : array, shape (P,)
-    own : tuple of array, shape (C, C)
-        Every block's part of `information`, in its own columns.
-    """
-
+    # Shape (P, P).
     information: FloatArray
+    # Shape (P,).
     gradient: FloatArray
+    # Shape (C, C): every block's part of `information`, in its own columns.
     own: tuple[FloatArray, ...]
 
 
@@ -356,38 +342,16 @@ class Problem(Protocol[State]):
 
 @dataclass(frozen=True, slots=True)
 class Solution(Generic[State]):
-    """Result of a solve.
+    """Result of a solve."""
 
-    Attributes
-    ----------
-    state : State
-        The solution.
-    blocks : tuple of Block
-        Residuals there.
-    inliers : tuple of bool array, shape (N,)
-        For every block, the mask of inlier observations.
-    block_scales : tuple of float
-        For every block, its noise as a multiple of the nominal one.
-    scales : dict
-        The typical noise of every group whose noise was estimated.
-    information : array, shape (P, P)
-        Of data and priors together, at the estimated noise.
-    covariance : array, shape (P, P)
-        Inverse of `information`.
-    cost : float
-        Minimum of the cost, at the estimated noise.
-    converged : bool
-    n_iterations : int
-    """
-
-    state: State
-    blocks: tuple[Block, ...]
-    inliers: tuple[BoolArray, ...]
-    block_scales: tuple[float, ...]
-    scales: dict[str, float]
-    information: FloatArray
-    covariance: FloatArray
-    cost: float
+    state: State  # The solution.
+    blocks: tuple[Block, ...]  # Residuals there.
+    inliers: tuple[BoolArray, ...]  # Shape (N,): for every block, the mask of inlier observations.
+    block_scales: tuple[float, ...]  # For every block, its noise as a multiple of the nominal one.
+    scales: dict[str, float]  # The typical noise of every group whose noise was estimated.
+    information: FloatArray  # Shape (P, P): of data and priors together, at the estimated noise.
+    covariance: FloatArray  # Shape (P, P): inverse of `information`.
+    cost: float  # Minimum of the cost, at the estimated noise.
     converged: bool
     n_iterations: int
 
@@ -403,8 +367,6 @@ def solve(
 
     Parameters
     ----------
-    problem : Problem
-        Problem to solve.
     start : State
         Initial guess, near enough to the solution for Newton's method.
     reject : bool
@@ -441,10 +403,7 @@ def inverse(information: FloatArray) -> FloatArray:
 
     Combinations known to rounding only get a variance that is huge, but finite.
 
-    Raises
-    ------
-    CalibrationError
-        If one of the parameters is not determined at all.
+    Raises `CalibrationError` if one of the parameters is not determined at all.
     """
     if not len(information):
         return information

@@ -18,31 +18,21 @@ _MIN_COMPARED, _CHANCE = 3, 0.01
 
 @dataclass(frozen=True, slots=True)
 class ViewFit:
-    """Fit of one view: pose, residuals and noise.
+    """Fit of one view: pose, residuals and noise."""
 
-    Attributes
-    ----------
-    label : str
-        Name in messages.
-    view : View
-    dome_from_target : SE3
-        Pose of its target.
-    covariance : array, shape (6, 6)
-        Of the step of `bundle.moved_target`; zero if the pose was exact.
-    residuals : array, shape (N, 2)
-        Measured minus predicted pixels; NaN where the target's point cannot be seen.
-    inliers : bool array, shape (N,)
-        Mask of points that were used.
-    noise_px : float
-        Estimated standard deviation of a coordinate.
-    """
-
+    # Name in messages.
     label: str
+
     view: View
+    # Pose of its target.
     dome_from_target: SE3
+    # Shape (6, 6): of the step of `bundle.moved_target`; zero if the pose was exact.
     covariance: FloatArray
+    # Shape (N, 2): measured minus predicted pixels; NaN where the target's point cannot be seen.
     residuals: FloatArray
+    # Shape (N,): mask of points that were used.
     inliers: BoolArray
+    # Estimated standard deviation of a coordinate.
     noise_px: float
 
     @property
@@ -62,19 +52,13 @@ class SolvedMedium:
 
 @dataclass(frozen=True, slots=True)
 class CrossValidation:
-    """Cross-validation of dome and bare lens: prediction of the same unused corners.
+    """Cross-validation of dome and bare lens: prediction of the same unused corners."""
 
-    Attributes
-    ----------
-    dome_px, bare_px : array, shape (V,)
-        For every view held out, the root mean square distance of its predicted corners with the
-        dome, and with a bare lens of free pose.
-    n_by_view : int array, shape (V,)
-        Numbers of corners that both predicted.
-    """
-
+    # Shape (V,): for every view held out, the root mean square distance of its predicted corners
+    # with the dome, and with a bare lens of free pose.
     dome_px: FloatArray
     bare_px: FloatArray
+    # Shape (V,): numbers of corners that both predicted.
     n_by_view: IntArray
 
     @property
@@ -122,39 +106,27 @@ class CrossValidation:
 
 @dataclass(frozen=True, slots=True)
 class DomeCalibration:
-    """Result of a dome calibration: the solved rig with its uncertainty.
+    """Result of a dome calibration: the solved rig with its uncertainty."""
 
-    Attributes
-    ----------
-    rig : Rig
-        With lens, rotation, dome and intrinsics as solved; everything else unchanged.
-    uncertainty : RigUncertainty
-        Joint covariance of all solved and considered numbers, scaled by the residuals.
-    media : tuple of SolvedMedium
-        One for each set.
-    views : tuple of ViewFit
-    left_out : dict
-        Labels of views, or of their measurements, that were not used, with the reason.
-    noise_px : float
-        Typical standard deviation of a corner's coordinate.
-    rotation_is_solved : bool
-        Whether boards determined the camera's rotation; if not, it is that of the given rig.
-    cross_validation : CrossValidation or None
-        None if not requested, or if there are too few views.
-    findings : tuple of str
-        In plain words: what the data determined, and what not.
-    n_iterations : int
-    """
-
+    # With lens, rotation, dome and intrinsics as solved; everything else unchanged.
     rig: Rig
+    # Joint covariance of all solved and considered numbers, scaled by the residuals.
     uncertainty: RigUncertainty
+    # One for each set.
     media: tuple[SolvedMedium, ...]
+
     views: tuple[ViewFit, ...]
+    # Labels of views, or of their measurements, that were not used, with the reason.
     left_out: dict[str, str]
+    # Typical standard deviation of a corner's coordinate.
     noise_px: float
+    # Whether boards determined the camera's rotation; if not, it is that of the given rig.
     rotation_is_solved: bool
+    # None if not requested, or if there are too few views.
     cross_validation: CrossValidation | None
+    # In plain words: what the data determined, and what not.
     findings: tuple[str, ...]
+
     n_iterations: int
 
     @property

@@ -30,17 +30,10 @@ PICTURE_SUFFIXES = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", 
 def picture_paths(arguments: Sequence[str | Path]) -> list[Path]:
     """Return the pictures given by files, folders and patterns, each once.
 
-    Parameters
-    ----------
-    arguments : sequence of str or Path
-        Pictures, folders of them, or patterns such as 'air/*.png'. The pictures of one argument
-        are sorted naturally (`img2` before `img10`).
-
-    Raises
-    ------
-    CalibrationError
-        If an argument matches no picture, or two of the pictures have the same file name: poses
-        and reports identify pictures by their names.
+    `arguments`: pictures, folders of them, or patterns such as 'air/*.png'. The pictures of one
+    argument are sorted naturally (`img2` before `img10`). Raises `CalibrationError` if an argument
+    matches no picture, or two of the pictures have the same file name: poses and reports identify
+    pictures by their names.
     """
     paths = [path for argument in arguments for path in _meant(str(argument))]
     if not paths:
@@ -90,30 +83,17 @@ _COLUMNS = ("file", "distance_mm", *_MATRIX)
 
 @dataclass(frozen=True, slots=True)
 class BoardPose:
-    """Measured pose of a board, one row of the file.
+    """Measured pose of a board, one row of the file."""
 
-    Attributes
-    ----------
-    name : str
-        File name of the picture.
-    distance : float or None
-        Distance along the y axis of `dome` to the board's plane, in metres.
-    dome_from_board : SE3 or None
-        The whole pose.
-    """
-
-    name: str
-    distance: float | None
-    dome_from_board: SE3 | None
+    name: str  # File name of the picture.
+    distance: float | None  # Distance along the y axis of `dome` to the board's plane, in metres.
+    dome_from_board: SE3 | None  # The whole pose.
 
 
 def load_poses(path: str | Path) -> tuple[BoardPose, ...]:
     """Load a `poses.csv`.
 
-    Raises
-    ------
-    CalibrationError
-        One line that names the file, the line, the value and the remedy.
+    Raises `CalibrationError` with one line that names the file, the line, the value and the remedy.
     """
     source = Path(path)
     text = read_text(source, "a poses.csv", CalibrationError)
@@ -262,8 +242,6 @@ def match_poses(
     ----------
     poses : sequence of BoardPose
         Rows of the file.
-    names : sequence of str
-        File names of the pictures.
     source : Path
         The file, for messages.
 

@@ -26,50 +26,33 @@ from aqualvs.geometry.planes import Plane
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BoxPlan:
-    """A marker box, open towards the vehicle and at its top.
+    """A marker box, open towards the vehicle and at its top."""
 
-    Attributes
-    ----------
-    width, height, depth : float
-        Inside, along x, z and y, in metres.
-    marker : float
-        Side of a marker, in metres.
-    family : str
-        Name of the markers' dictionary.
-    first_id : int
-        Number of the first marker; the others follow.
-    """
-
+    # Inside, along x, z and y, in metres.
     width: float
     height: float
     depth: float
+    # Side of a marker, in metres.
     marker: float
+    # Name of the markers' dictionary.
     family: str
+    # Number of the first marker; the others follow.
     first_id: int = 0
 
 
 @dataclass(frozen=True, slots=True)
 class SheetPatch:
-    """Part of a plane that one sheet of paper covers.
+    """Part of a plane that one sheet of paper covers."""
 
-    Attributes
-    ----------
-    plane : str
-        Name of its plane.
-    offset : (float, float)
-        From the plane's top-left corner to its own, right and down as seen from inside, in metres.
-    size : (float, float)
-        Width and height, in metres.
-    ids : tuple of int
-        Numbers of its markers.
-    corners : array, shape (M, 2)
-        Top-left corners of the markers, from the patch's own, in metres.
-    """
-
+    # Name of its plane.
     plane: str
+    # From the plane's top-left corner to its own, right and down as seen from inside, in metres.
     offset: tuple[float, float]
+    # Width and height, in metres.
     size: tuple[float, float]
+    # Numbers of its markers.
     ids: tuple[int, ...]
+    # Shape (M, 2): top-left corners of the markers, from the patch's own, in metres.
     corners: FloatArray
 
 
@@ -89,18 +72,9 @@ def box_patches(
 ) -> tuple[MarkerSet, tuple[SheetPatch, ...]]:
     """Return a box's markers, and the patches in which they can be printed.
 
-    Parameters
-    ----------
-    plan : BoxPlan
-        The box.
-    rooms : sequence of (float, float)
-        Printable width and height of a sheet of paper, in metres: upright and across. Infinite
-        for sheets as large as a plane.
-
-    Raises
-    ------
-    CalibrationError
-        If a plane or a sheet is too small for a marker, or the dictionary has too few.
+    `rooms`: printable width and height of a sheet of paper, in metres: upright and across. Infinite
+    for sheets as large as a plane. Raises `CalibrationError` if a plane or a sheet is too small for
+    a marker, or the dictionary has too few.
     """
     # Pitch of markers, in sides of a marker: leaves a light ring and room for stripes to cross.
     sides_apart = 1.7
@@ -242,8 +216,6 @@ def marker_rectangles(family: str, number: int, corner: FloatArray, size: float)
     ----------
     family : str
         Name of the dictionary.
-    number : int
-        Number of the marker in it.
     corner : array, shape (2,)
         The marker's top-left corner, in the unit of `size`.
     size : float
@@ -266,40 +238,27 @@ _POINTS_PER_MM = 72.0 / 25.4
 
 @dataclass(frozen=True, slots=True)
 class Text:
-    """A line of Helvetica.
+    """A line of Helvetica."""
 
-    Attributes
-    ----------
-    x, y : float
-        Start of its base line, in millimetres.
-    size : float
-        Size of the font (em), in millimetres.
-    words : str
-        The text, in Latin letters.
-    """
-
+    # Start of its base line, in millimetres.
     x: float
     y: float
+    # Size of the font (em), in millimetres.
     size: float
+    # The text, in Latin letters.
     words: str
 
 
 @dataclass(frozen=True, slots=True)
 class PdfPage:
-    """Page of the PDF file.
+    """Page of the PDF file."""
 
-    Attributes
-    ----------
-    width, height : float
-        In millimetres.
-    rectangles : array, shape (N, 4)
-        x, y, width, height of black rectangles, in millimetres.
-    texts : tuple of Text
-    """
-
+    # In millimetres.
     width: float
     height: float
+    # Shape (N, 4): x, y, width, height of black rectangles, in millimetres.
     rectangles: FloatArray
+
     texts: tuple[Text, ...] = field(default=())
 
 
@@ -390,18 +349,10 @@ _PRINT = _PrintLayout()
 
 @dataclass(frozen=True, slots=True)
 class Paper:
-    """Sheet of paper in one of its two orientations.
+    """Sheet of paper in one of its two orientations."""
 
-    Attributes
-    ----------
-    size_mm : (float, float) or None
-        Width and height; None for paper that fits.
-    name : str
-        Name in messages.
-    """
-
-    size_mm: tuple[float, float] | None
-    name: str
+    size_mm: tuple[float, float] | None  # Width and height; None for paper that fits.
+    name: str  # Name in messages.
 
     @property
     def room_mm(self) -> tuple[float, float]:
@@ -423,15 +374,8 @@ class Paper:
 def papers(word: str) -> tuple[Paper, Paper]:
     """Return a paper upright and across.
 
-    Parameters
-    ----------
-    word : str
-        "a4", "a3" and so on, "fit", or width x height in millimetres, such as "600x400".
-
-    Raises
-    ------
-    OptionError
-        If it is none of these.
+    `word`: "a4", "a3" and so on, "fit", or width x height in millimetres, such as "600x400". Raises
+    `OptionError` if it is none of these.
     """
     key = word.strip().lower()
     if key == FIT:
@@ -456,10 +400,7 @@ def papers(word: str) -> tuple[Paper, Paper]:
 def best_paper(word: str, width: float, height: float, what: str) -> Paper:
     """Return the orientation that has room for a print of this size, in millimetres.
 
-    Raises
-    ------
-    OptionError
-        If neither has.
+    Raises `OptionError` if neither has.
     """
     for paper in papers(word):
         room = paper.room_mm

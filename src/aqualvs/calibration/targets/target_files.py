@@ -39,10 +39,8 @@ _FREE_TEXT = re.compile(
 def read_mapping(path: Path, what: str) -> dict[Any, Any]:
     """Return the keys and values of a YAML file; `what` names its kind in messages.
 
-    Raises
-    ------
-    CalibrationError
-        One line, if the file cannot be read or does not hold keys and values.
+    Raises `CalibrationError` with one line, if the file cannot be read or does not hold keys and
+    values.
     """
     raw = read_text(path, what, CalibrationError)
     refuse_foreign(raw, path, what, CalibrationError)
@@ -148,10 +146,7 @@ _WORDS = SchemaWords(file="this file", parts=_PARTS, examples=_EXAMPLES, first_l
 def parse_target(content: dict[Any, Any], model: type[_File], source: str) -> _File:
     """Check the content of a target file, key by key.
 
-    Raises
-    ------
-    CalibrationError
-        One line on the first fault: file, place, value, remedy.
+    Raises `CalibrationError` with one line on the first fault: file, place, value, remedy.
     """
     try:
         return model.model_validate(content)
@@ -182,10 +177,7 @@ _UNITS = {1e-3: "metres", 1e-1: "centimetres"}
 def check_markers(file: MarkersFile, frame: str, source: Path) -> None:
     """Check the markers of a file as a whole; lengths in it are millimetres.
 
-    Raises
-    ------
-    CalibrationError
-        One line on the first fault: file, marker, value, remedy.
+    Raises `CalibrationError` with one line on the first fault: file, marker, value, remedy.
     """
     try:
         _check_ids(file)
@@ -317,10 +309,7 @@ _FRAME_TEXTS = {
 def load_board(path: str | Path) -> Board:
     """Load a `board.yaml`.
 
-    Raises
-    ------
-    CalibrationError
-        One line that names the file, the value and the remedy.
+    Raises `CalibrationError` with one line that names the file, the value and the remedy.
     """
     source = Path(path)
     file = parse_target(read_mapping(source, "a board.yaml"), BoardFile, str(source))
@@ -431,10 +420,7 @@ def load_box(path: str | Path) -> tuple[MarkerSet, float | None]:
 def load_target(path: str | Path) -> MarkerSet:
     """Load a `target.yaml`: markers fixed to the vehicle, in `dome`.
 
-    Raises
-    ------
-    CalibrationError
-        One line that names the file, the value and the remedy.
+    Raises `CalibrationError` with one line that names the file, the value and the remedy.
     """
     source = Path(path)
     file = parse_target(read_mapping(source, "a target.yaml"), MarkersFile, str(source))
@@ -469,10 +455,7 @@ def _markers(file: MarkersFile, frame: str, source: Path) -> MarkerSet:
 def save_board(board: Board, path: str | Path, *, note: str = "") -> None:
     """Write a `board.yaml` that `load_board` turns into the same board.
 
-    Raises
-    ------
-    OutputError
-        If the file cannot be written.
+    Raises `OutputError` if the file cannot be written.
     """
     content: dict[str, Any] = {
         "kind": str(board.kind),
@@ -493,10 +476,7 @@ def save_board(board: Board, path: str | Path, *, note: str = "") -> None:
 def save_markers(markers: MarkerSet, path: str | Path, *, note: str = "") -> None:
     """Write a `box.yaml` or `target.yaml` in the form that `load_box` and `load_target` read.
 
-    Raises
-    ------
-    OutputError
-        If the file cannot be written.
+    Raises `OutputError` if the file cannot be written.
     """
     content: dict[str, Any] = {"frame": _FRAME_TEXTS.get(markers.frame, markers.frame)}
     if note:

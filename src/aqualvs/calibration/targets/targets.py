@@ -19,28 +19,19 @@ from aqualvs.geometry.planes import Plane
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """View of a target: its points found in one picture.
+    """View of a target: its points found in one picture."""
 
-    Attributes
-    ----------
-    name : str
-        File name of the picture, for messages and reports.
-    ids : int array, shape (N,)
-        Points of the target: corner of a board, or four times the index of a marker plus the
-        corner's place.
-    points : array, shape (N, 3)
-        The points in the target's own frame (`board`, `box`, or `dome` for an index target), in
-        metres.
-    pixels : array, shape (N, 2)
-        Their measured places, in `image`.
-    notes : tuple of str
-        Remarks for the user on the detection.
-    """
-
+    # File name of the picture, for messages and reports.
     name: str
+    # Shape (N,): points of the target: corner of a board, or four times the index of a marker plus
+    # the corner's place.
     ids: IntArray
+    # Shape (N, 3): the points in the target's own frame (`board`, `box`, or `dome` for an index
+    # target), in metres.
     points: FloatArray
+    # Shape (N, 2): their measured places, in `image`.
     pixels: FloatArray
+    # Remarks for the user on the detection.
     notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
@@ -85,35 +76,22 @@ class BoardKind(StrEnum):
 class Board:
     """A flat board of squares.
 
-    Attributes
-    ----------
-    kind : BoardKind
-        Chessboard or ChArUco.
-    squares : (int, int)
-        Number of squares along x and y. Points are the inner corners, one less each way.
-    square : float
-        Side of a square, in metres.
-    marker : float
-        Side of a marker, in metres; 0 on a chessboard.
-    dictionary : str
-        Name of the markers' dictionary; empty on a chessboard.
-    border : float
-        Light border around the squares, in metres.
-    legacy_pattern : bool
-        ChArUco pattern of OpenCV before 4.6: with an even number of rows its first square is light.
-
-    Raises
-    ------
-    CalibrationError
-        If such a board is impossible.
+    Raises `CalibrationError` if such a board is impossible.
     """
 
+    # Chessboard or ChArUco.
     kind: BoardKind
+    # Number of squares along x and y. Points are the inner corners, one less each way.
     squares: tuple[int, int]
+    # Side of a square, in metres.
     square: float
+    # Side of a marker, in metres; 0 on a chessboard.
     marker: float = 0.0
+    # Name of the markers' dictionary; empty on a chessboard.
     dictionary: str = ""
+    # Light border around the squares, in metres.
     border: float = 0.0
+    # ChArUco pattern of OpenCV before 4.6: with an even number of rows its first square is light.
     legacy_pattern: bool = False
 
     def __post_init__(self) -> None:
@@ -217,29 +195,20 @@ class Board:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MarkerSet:
-    """Markers at known places: in a box, or on a plate fixed to the vehicle.
+    """Markers at known places: in a box, or on a plate fixed to the vehicle."""
 
-    Attributes
-    ----------
-    frame : str
-        Frame of the corners: `box`, or `dome` for an index target.
-    family : str
-        Name of the markers' dictionary.
-    ids : int array, shape (M,)
-        Number of each marker in its dictionary.
-    corners : array, shape (M, 4, 3)
-        In `frame`, metres; top-left, top-right, bottom-right, bottom-left of the upright marker.
-    plane_names : tuple of str or None, length M
-        Plane of each marker.
-    planes : dict of str to Plane
-        The planes that carry markers, in `frame`.
-    """
-
+    # Frame of the corners: `box`, or `dome` for an index target.
     frame: str
+    # Name of the markers' dictionary.
     family: str
+    # Shape (M,): number of each marker in its dictionary.
     ids: IntArray
+    # Shape (M, 4, 3): in `frame`, metres; top-left, top-right, bottom-right, bottom-left of the
+    # upright marker.
     corners: FloatArray
+    # Length M: plane of each marker.
     plane_names: tuple[str | None, ...]
+    # The planes that carry markers, in `frame`.
     planes: dict[str, Plane] = field(default_factory=dict)
 
     def __len__(self) -> int:
@@ -254,10 +223,7 @@ class MarkerSet:
 def aruco_dictionary(name: str) -> cv2.aruco.Dictionary:
     """Return OpenCV's dictionary of that name.
 
-    Raises
-    ------
-    CalibrationError
-        If OpenCV does not know it.
+    Raises `CalibrationError` if OpenCV does not know it.
     """
     number = dictionary_id(name)
     if number is None:

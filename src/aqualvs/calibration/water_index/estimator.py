@@ -48,16 +48,12 @@ from aqualvs.optics.rig import Rig, RigUncertainty
 
 @dataclass(slots=True)
 class CusumTest:
-    """Two-sided cumulative sum (CUSUM) test of the innovations of frames.
+    """Two-sided cumulative sum (CUSUM) test of the innovations of frames."""
 
-    Attributes
-    ----------
-    inflation : float
-        Standard deviation of the innovations over blocks of frames, at least 1: factor on the
-        noise of corners, because the errors of neighbouring corners and frames are correlated.
-    """
-
+    # Standard deviation of the innovations over blocks of frames, at least 1: factor on the noise
+    # of corners, because the errors of neighbouring corners and frames are correlated.
     inflation: float = 1.0
+
     _sums: list[float] = field(default_factory=lambda: [0.0, 0.0])
     _lengths: list[int] = field(default_factory=lambda: [0, 0])
     _block: list[float] = field(default_factory=list)
@@ -66,11 +62,8 @@ class CusumTest:
     def add(self, standardised: float) -> int:
         """Add the innovation of a frame, in standard deviations.
 
-        Returns
-        -------
-        int
-            Number of frames since the start of the change, this one included, if it raises the
-            alarm; else 0.
+        Returns the number of frames since the start of the change, this one included, if it raises
+        the alarm; else 0.
         """
         # Change to be detected: one standard deviation of a frame.
         allowance = 0.5
@@ -142,30 +135,20 @@ class IndexEstimator:
     One estimator serves one target, one rig and one dive. Started in air (`IndexPrior.air`), it
     learns the target's place better than by a ruler, and keeps that in the water.
 
-    Attributes
-    ----------
-    rig : Rig
-        Behind a housing.
-    uncertainty : RigUncertainty
-        Of the rig.
-    options : IndexOptions
-        Assumptions about target and medium.
-    prior : IndexPrior or None
-        Prior of the index at the first frame; `set_prior` gives a later one.
-    steps : list of IndexStep
-        All alarms so far.
-
-    Raises
-    ------
-    CalibrationError
-        If the rig has no housing.
+    Raises `CalibrationError` if the rig has no housing.
     """
 
+    # Behind a housing.
     rig: Rig
+    # Of the rig.
     uncertainty: RigUncertainty = field(default_factory=RigUncertainty.none)
+    # Assumptions about target and medium.
     options: IndexOptions = field(default_factory=IndexOptions)
+    # Prior of the index at the first frame; `set_prior` gives a later one.
     prior: IndexPrior | None = None
+    # All alarms so far.
     steps: list[IndexStep] = field(default_factory=list)
+
     _model: IndexModel = field(init=False, repr=False)
     _state: IndexState | None = None
     _noise: float = _FILTER.nominal_noise
@@ -236,10 +219,7 @@ class IndexEstimator:
     def residuals(self, view: View) -> FloatArray:
         """Return measured minus predicted pixels (M, 2) of a view by the present estimate.
 
-        Raises
-        ------
-        CalibrationError
-            Before the first used frame.
+        Raises `CalibrationError` before the first used frame.
         """
         if self.state is None:
             raise CalibrationError("no picture shows enough of the target yet; add one that does")
@@ -430,40 +410,26 @@ _DEFAULT_OPTIONS = IndexOptions()
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WaterCalibration:
-    """Result of a calibration of the water's index: a rig in its medium.
+    """Result of a calibration of the water's index: a rig in its medium."""
 
-    Attributes
-    ----------
-    rig : Rig
-        With the index found at the last picture.
-    uncertainty : RigUncertainty
-        Of the rig's numbers, with `n_water` and its covariance with the others.
-    sigma, sigma_random : float
-        Standard deviation of the index, and its part that more pictures reduce.
-    observable : bool
-        False if the pictures do not determine the index; `remarks` says why.
-    steps : tuple of IndexStep
-        Alarms.
-    readings : tuple of IndexReading
-        Estimate after each picture.
-    rms_px : float
-        Root mean square residual of the used corners.
-    residuals : dict
-        By the name of each used picture: measured minus predicted pixels (M, 2) by the last
-        estimate.
-    remarks : tuple of str
-        Remarks for the user, one sentence each.
-    """
-
+    # With the index found at the last picture.
     rig: Rig
+    # Of the rig's numbers, with `n_water` and its covariance with the others.
     uncertainty: RigUncertainty
+    # Standard deviation of the index, and its part that more pictures reduce.
     sigma: float
     sigma_random: float
+    # False if the pictures do not determine the index; `remarks` says why.
     observable: bool
+    # Alarms.
     steps: tuple[IndexStep, ...]
+    # Estimate after each picture.
     readings: tuple[IndexReading, ...] = field(repr=False)
+    # Root mean square residual of the used corners.
     rms_px: float
+    # By the name of each used picture: measured minus predicted pixels (M, 2) by the last estimate.
     residuals: dict[str, FloatArray] = field(repr=False)
+    # Remarks for the user, one sentence each.
     remarks: tuple[str, ...]
 
     @property

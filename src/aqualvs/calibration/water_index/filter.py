@@ -42,24 +42,12 @@ MAX_POINTS = 64
 
 @dataclass(frozen=True, slots=True)
 class FrameCorners:
-    """Corners of one picture for the estimate.
+    """Corners of one picture for the estimate."""
 
-    Attributes
-    ----------
-    time : float
-        In seconds.
-    ids : tuple of int
-        Corners.
-    points : array, shape (M, 3)
-        Places by `target.yaml`, in `dome`, metres.
-    pixels : array, shape (M, 2)
-        Measured places.
-    """
-
-    time: float
-    ids: tuple[int, ...]
-    points: FloatArray
-    pixels: FloatArray
+    time: float  # In seconds.
+    ids: tuple[int, ...]  # Corners.
+    points: FloatArray  # Shape (M, 3): places by `target.yaml`, in `dome`, metres.
+    pixels: FloatArray  # Shape (M, 2): measured places.
 
     @classmethod
     def of(cls, time: float, view: View, known: tuple[int, ...] = ()) -> "FrameCorners":
@@ -94,51 +82,33 @@ _LOWEST, _HIGHEST = 1.0, 1.7
 
 
 class Line(NamedTuple):
-    """Prediction of a frame near a state.
+    """Prediction of a frame near a state."""
 
-    Attributes
-    ----------
-    residuals : array, shape (2M,)
-        Measured minus predicted pixels.
-    slopes : array, shape (2M, D)
-        Derivative of the prediction by the state's mean.
-    """
-
-    residuals: FloatArray
-    slopes: FloatArray
+    residuals: FloatArray  # Shape (2M,): measured minus predicted pixels.
+    slopes: FloatArray  # Shape (2M, D): derivative of the prediction by the state's mean.
 
 
 @dataclass(frozen=True, slots=True)
 class IndexModel:
     """Model of a target on the vehicle, seen through media of different index.
 
-    Attributes
-    ----------
-    rig : Rig
-        Behind a housing; its own `n_water` plays no part.
-    uncertainty : RigUncertainty
-        Of the camera's numbers.
-    pose_sigmas : array, shape (6,)
-        Standard deviations of the target's place: turn about its middle (radians), shift (metres).
-    sigma_corner : float
-        Standard deviation of the constant error of a corner, in pixels.
-    middle : array, shape (3,)
-        Centre of the target's turn, in `dome`.
-    camera_names : tuple of str
-        Numbers of the camera that are uncertain, in the state's order.
-
-    Raises
-    ------
-    CalibrationError
-        If the rig has no housing.
+    Raises `CalibrationError` if the rig has no housing.
     """
 
+    # Behind a housing; its own `n_water` plays no part.
     rig: Rig
+    # Of the camera's numbers.
     uncertainty: RigUncertainty
+    # Shape (6,): standard deviations of the target's place: turn about its middle (radians), shift
+    # (metres).
     pose_sigmas: FloatArray
+    # Standard deviation of the constant error of a corner, in pixels.
     sigma_corner: float
+    # Shape (3,): centre of the target's turn, in `dome`.
     middle: FloatArray
+    # Numbers of the camera that are uncertain, in the state's order.
     camera_names: tuple[str, ...] = field(init=False)
+
     _moved: "_MovedRig" = field(init=False, repr=False, compare=False)
     _cache: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
 
@@ -312,29 +282,20 @@ _REJECT = 5.0
 
 @dataclass(frozen=True, slots=True)
 class Innovation:
-    """Innovation: difference between a frame and the prediction by a state.
+    """Innovation: difference between a frame and the prediction by a state."""
 
-    Attributes
-    ----------
-    frame : FrameCorners
-        Its corners that fit.
-    n_points : int
-        Number of corners before the misfits were left out.
-    shift, sigma : float
-        Change of the index that explains the frame best, and its expected standard deviation
-        without a change. Infinite sigma if the index is not observable.
-    sigma_frame : float
-        Part of `sigma` that is the frame's own noise.
-    misfit : float
-        Squared residuals that no change of index explains, normalised by their covariance and
-        number: about 1.
-    """
-
+    # Its corners that fit.
     frame: FrameCorners
+    # Number of corners before the misfits were left out.
     n_points: int
+    # Change of the index that explains the frame best, and its expected standard deviation without
+    # a change. Infinite sigma if the index is not observable.
     shift: float
     sigma: float
+    # Part of `sigma` that is the frame's own noise.
     sigma_frame: float
+    # Squared residuals that no change of index explains, normalised by their covariance and number:
+    # about 1.
     misfit: float
 
     @property
@@ -345,23 +306,12 @@ class Innovation:
 
 @dataclass(frozen=True, slots=True)
 class Update:
-    """Updated state after a frame.
-
-    Attributes
-    ----------
-    state : IndexState
-    used : int
-        Number of used corners.
-    rms : float
-        Root mean square residual of a coordinate of those, in pixels.
-    noise : float
-        Noise of a coordinate estimated from the residuals, in pixels.
-    """
+    """Updated state after a frame."""
 
     state: IndexState
-    used: int
-    rms: float
-    noise: float
+    used: int  # Number of used corners.
+    rms: float  # Root mean square residual of a coordinate of those, in pixels.
+    noise: float  # Noise of a coordinate estimated from the residuals, in pixels.
 
 
 def compare(model: IndexModel, state: IndexState, frame: FrameCorners, noise: float) -> Innovation:
@@ -369,7 +319,6 @@ def compare(model: IndexModel, state: IndexState, frame: FrameCorners, noise: fl
 
     Parameters
     ----------
-    model : IndexModel
     state : IndexState
         At the frame's time, with entries for its corners.
     frame : FrameCorners
@@ -399,7 +348,6 @@ def believe(model: IndexModel, state: IndexState, frame: FrameCorners, noise: fl
 
     Parameters
     ----------
-    model : IndexModel
     state : IndexState
         At the frame's time, with entries for its corners.
     frame : FrameCorners

@@ -29,24 +29,12 @@ _STEP_NM = 1.0
 class IndexPrior:
     """Prior of a refractive index.
 
-    Attributes
-    ----------
-    n : float
-        Relative to vacuum.
-    sigma : float
-        Standard deviation, positive.
-    source : str
-        Its origin, for reports.
-
-    Raises
-    ------
-    OptionError
-        If the index is impossible or sigma is not positive.
+    Raises `OptionError` if the index is impossible or sigma is not positive.
     """
 
-    n: float
-    sigma: float
-    source: str = "given"
+    n: float  # Relative to vacuum.
+    sigma: float  # Standard deviation, positive.
+    source: str = "given"  # Its origin, for reports.
 
     def __post_init__(self) -> None:
         if not 1.0 <= self.n <= 2.0:
@@ -125,33 +113,23 @@ FAR = 0.02
 
 @dataclass(frozen=True, slots=True)
 class IndexState:
-    """State of the estimate, a joint Gaussian; immutable.
+    """State of the estimate, a joint Gaussian; immutable."""
 
-    Attributes
-    ----------
-    time : float
-        Of the last frame, in seconds.
-    mean : array, shape (D,)
-        Three indices (`N`, `ANCHOR`, `BEFORE`); errors of the target's place: a turn about its
-        middle (radians) and a shift (metres) in `dome`; errors of the camera's numbers; and for
-        each corner, the constant error of its pixel (x and y).
-    covariance : array, shape (D, D)
-    ids : tuple of int
-        Corners with such entries, in order.
-    random_variance : float
-        Of the index now if all constants were known: the part that more frames reduce.
-    n_of_slopes : float
-        Index at which derivatives are taken, see `IndexModel.line`.
-    seen_at : array, shape (K, 2)
-        Pixels of the corners for which their errors are valid; NaN before the first.
-    """
-
+    # Of the last frame, in seconds.
     time: float
+    # Shape (D,): three indices (`N`, `ANCHOR`, `BEFORE`); errors of the target's place: a turn
+    # about its middle (radians) and a shift (metres) in `dome`; errors of the camera's numbers; and
+    # for each corner, the constant error of its pixel (x and y).
     mean: FloatArray
+    # Shape (D, D).
     covariance: FloatArray
+    # Corners with such entries, in order.
     ids: tuple[int, ...]
+    # Of the index now if all constants were known: the part that more frames reduce.
     random_variance: float
+    # Index at which derivatives are taken, see `IndexModel.line`.
     n_of_slopes: float
+    # Shape (K, 2): pixels of the corners for which their errors are valid; NaN before the first.
     seen_at: FloatArray
 
     @property
@@ -319,33 +297,20 @@ _LOST_FRAMES = 10
 class IndexOptions:
     """Options: assumptions about target and medium.
 
-    Attributes
-    ----------
-    sigma_place : float
-        Standard deviation of the target's place on the vehicle, along each axis of `dome`, in
-        metres.
-    sigma_turn : float
-        The same of its turn about each axis, in radians.
-    sigma_corner_px : float
-        Standard deviation of a corner's constant error, by its printing and its detection.
-    drift : float
-        Random walk of the index per root second.
-    smallest_step : float
-        Smallest step that raises an alarm.
-    largest_sigma : float
-        Without a prior, an index known less well than this is called unobservable.
-
-    Raises
-    ------
-    OptionError
-        If a value is negative or not finite.
+    Raises `OptionError` if a value is negative or not finite.
     """
 
+    # Standard deviation of the target's place on the vehicle, along each axis of `dome`, in metres.
     sigma_place: float = 0.2e-3
+    # The same of its turn about each axis, in radians.
     sigma_turn: float = math.radians(0.1)
+    # Standard deviation of a corner's constant error, by its printing and its detection.
     sigma_corner_px: float = 0.05
+    # Random walk of the index per root second.
     drift: float = 1e-5
+    # Smallest step that raises an alarm.
     smallest_step: float = 3e-4
+    # Without a prior, an index known less well than this is called unobservable.
     largest_sigma: float = 2e-3
 
     def __post_init__(self) -> None:
@@ -358,10 +323,7 @@ class IndexOptions:
 
         An index counts as observable if it separates fresh water from sea water.
 
-        Raises
-        ------
-        OptionError
-            If one of them is negative or no number.
+        Raises `OptionError` if one of them is negative or no number.
         """
         _check_not_negative("--place-sigma-mm", place_sigma_mm)
         _check_not_negative("--turn-sigma-deg", turn_sigma_deg)
@@ -387,22 +349,15 @@ def _check_not_negative(name: str, value: float) -> None:
 
 @dataclass(frozen=True, slots=True)
 class IndexStep:
-    """A sudden change of the index.
+    """A sudden change of the index."""
 
-    Attributes
-    ----------
-    time : float
-        Of the first frame after it, in seconds.
-    size, sigma : float
-        Change of the index and its standard deviation.
-    by_medium : bool
-        False if no change of index explains the corners' motion: then the target or the lens has
-        moved, and `size` means nothing.
-    """
-
+    # Of the first frame after it, in seconds.
     time: float
+    # Change of the index and its standard deviation.
     size: float
     sigma: float
+    # False if no change of index explains the corners' motion: then the target or the lens has
+    # moved, and `size` means nothing.
     by_medium: bool
 
     def text(self) -> str:
@@ -419,55 +374,38 @@ class IndexStep:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class IndexReading:
-    """Estimate of the index after a frame.
+    """Estimate of the index after a frame."""
 
-    Attributes
-    ----------
-    name : str
-        Of the picture.
-    time : float
-        In seconds.
-    refused : str
-        Reason why the frame was left out; empty for a used one.
-    n, sigma : float
-        Present index of the medium and its standard deviation, prior included; NaN and infinite
-        before the first used frame without a prior.
-    sigma_random : float
-        Part of `sigma` that more frames reduce; about the smallest visible change.
-    n_pictures, sigma_pictures : float
-        `n` and `sigma` without the prior.
-    n_frame, sigma_frame : float
-        From this frame alone, with the present constants, and its noise.
-    n_points : int
-        Number of used corners.
-    rms_px : float
-        Root mean square residual of their coordinates.
-    observable : bool
-        Whether the pictures determine the index: False if they give less information than the
-        prior, or, without one, than `IndexOptions.largest_sigma`.
-    prior_used : bool
-        False without a prior, and if it contradicts the pictures.
-    step : IndexStep or None
-        The alarm, in the frame that raises it.
-    remarks : tuple of str
-        Remarks for the user, one sentence each.
-    """
-
+    # Of the picture.
     name: str
+    # In seconds.
     time: float
+    # Reason why the frame was left out; empty for a used one.
     refused: str = ""
+    # Present index of the medium and its standard deviation, prior included; NaN and infinite
+    # before the first used frame without a prior.
     n: float
     sigma: float
+    # Part of `sigma` that more frames reduce; about the smallest visible change.
     sigma_random: float
+    # `n` and `sigma` without the prior.
     n_pictures: float
     sigma_pictures: float
+    # From this frame alone, with the present constants, and its noise.
     n_frame: float = math.nan
     sigma_frame: float = math.inf
+    # Number of used corners.
     n_points: int = 0
+    # Root mean square residual of their coordinates.
     rms_px: float = math.nan
+    # Whether the pictures determine the index: False if they give less information than the prior,
+    # or, without one, than `IndexOptions.largest_sigma`.
     observable: bool
+    # False without a prior, and if it contradicts the pictures.
     prior_used: bool
+    # The alarm, in the frame that raises it.
     step: IndexStep | None = None
+    # Remarks for the user, one sentence each.
     remarks: tuple[str, ...]
 
     def __bool__(self) -> bool:
@@ -477,42 +415,28 @@ class IndexReading:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Knowledge:
-    """Data that decide whether an index is observable, and its remarks.
+    """Data that decide whether an index is observable, and its remarks."""
 
-    Attributes
-    ----------
-    own, joint : IndexState or None
-        Without and with the prior; None before the first used frame.
-    prior : IndexPrior or None
-        As given.
-    contradicted : bool
-        Whether the prior disagrees with the pictures.
-    since_prior : float
-        Variance of the index added by drift and steps since the prior was given.
-    sigma_frame : float
-        Noise of the index from one frame.
-    decentring : float or None
-        Distance of the lens from the dome's centre, metres; None behind a flat port.
-    n_lost : int
-        Number of frames since the target was last at its place.
-    moved : bool
-        Whether a step was not caused by the medium.
-    n_camera : int
-        Number of the camera's uncertain numbers in the states.
-    options : IndexOptions
-        As given.
-    """
-
+    # Without and with the prior; None before the first used frame.
     own: IndexState | None
     joint: IndexState | None
+    # As given.
     prior: IndexPrior | None
+    # Whether the prior disagrees with the pictures.
     contradicted: bool
+    # Variance of the index added by drift and steps since the prior was given.
     since_prior: float
+    # Noise of the index from one frame.
     sigma_frame: float
+    # Distance of the lens from the dome's centre, metres; None behind a flat port.
     decentring: float | None
+    # Number of frames since the target was last at its place.
     n_lost: int
+    # Whether a step was not caused by the medium.
     moved: bool
+    # Number of the camera's uncertain numbers in the states.
     n_camera: int
+    # As given.
     options: IndexOptions
 
     @property

@@ -70,10 +70,7 @@ _ADAPTER: TypeAdapter[Message] = TypeAdapter(Message)
 def parse_message(text: str) -> Message:
     """Return a page's message.
 
-    Raises
-    ------
-    ValueError
-        If it is none.
+    Raises `ValueError` if it is none.
     """
     return _ADAPTER.validate_json(text)
 
@@ -110,13 +107,7 @@ class NoRecorder:
 
 
 class Controls:
-    """Controls of the page: setpoint and recorder.
-
-    Parameters
-    ----------
-    setpoint : SetpointHolder
-    recorder : RecordButton
-    """
+    """Controls of the page: setpoint and recorder."""
 
     def __init__(self, setpoint: SetpointHolder, recorder: RecordButton) -> None:
         self.setpoint, self.recorder = setpoint, recorder
@@ -124,10 +115,7 @@ class Controls:
     def carry_out(self, command: Command) -> None:
         """Carry out a command of a page that has the right to command.
 
-        Raises
-        ------
-        AqualvsError
-            If it cannot be done; nothing has changed then.
+        Raises `AqualvsError` if it cannot be done; nothing has changed then.
         """
         if isinstance(command, SetpointCommand):
             wanted = None
@@ -149,20 +137,13 @@ _LOCAL_NAMES = frozenset({"localhost", "127.0.0.1", "::1"})
 
 @dataclass(frozen=True, slots=True)
 class Access:
-    """Access rules: this machine may watch; with the token, any client may watch and command.
+    """Access rules: this machine may watch; with the token, any client may watch and command."""
 
-    Attributes
-    ----------
-    host : str
-        Address that the page is served at.
-    token : str
-        The password.
-    embedders : tuple of str
-        Origins whose pages may show this one inside themselves; none if empty.
-    """
-
+    # Address that the page is served at.
     host: str
+    # The password.
     token: str
+    # Origins whose pages may show this one inside themselves; none if empty.
     embedders: tuple[str, ...] = ()
 
     @property
@@ -202,10 +183,7 @@ class Access:
 def are_addresses(hosts: Sequence[str], origins: Sequence[str]) -> bool:
     """Return whether the headers `Host` and `Origin` of a request are written as addresses are.
 
-    Parameters
-    ----------
-    hosts, origins : sequence of str
-        All values of these headers; a program may send none, and no client two.
+    `hosts`, `origins`: all values of these headers; a program may send none, and no client two.
     """
     if len(hosts) > 1 or len(origins) > 1:
         return False
@@ -233,10 +211,7 @@ def _is_origin(text: str) -> bool:
 def make_access(host: str, token: str | None, embedders: Sequence[str] = ()) -> Access:
     """Return the rules for an address; without a token a new one is made.
 
-    Raises
-    ------
-    OptionError
-        If an embedder is no origin of web pages.
+    Raises `OptionError` if an embedder is no origin of web pages.
     """
     for origin in embedders:
         # Anything else, such as a wildcard, would let strangers lay a page over the buttons.
@@ -322,10 +297,6 @@ class TokenGate:
 
     Addresses that have shown the right token come first, then those with the fewest wrong ones, so
     that guesses do not keep the pilot waiting. Used from one event loop alone.
-
-    Parameters
-    ----------
-    access : Access
     """
 
     WRONG_S: ClassVar[float] = 1.0

@@ -1,4 +1,4 @@
-"""The pilot's page as an output of a live run, and the start of its server.
+"""The pilot's page as an output of a live run, and its record button.
 
 The camera's picture is reduced for the page (`page_picture`), so that it is small and cheap to
 make.
@@ -8,18 +8,16 @@ import contextlib
 import math
 import shutil
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
-from aqualvs.control.vehicle import SetpointHolder, VehicleState
-from aqualvs.errors import OptionError
-from aqualvs.live.dashboard.access import Controls, NoRecorder, make_access, token_fault
+from aqualvs.control.vehicle import VehicleState
+from aqualvs.live.dashboard.access import Controls
 from aqualvs.live.dashboard.server import DashboardServer, page_state
-from aqualvs.optics.rig import Rig
 from aqualvs.recording import RecorderSwitch
 from aqualvs.recording.sample import LiveSample
 from aqualvs.scanning.scan import Frame, ImagePlane
@@ -67,7 +65,6 @@ class Dashboard:
     ----------
     server : DashboardServer
         Owned from here on.
-    controls : Controls
     vehicle : callable or None
         Returns what the autopilot tells of depth and heading.
     """
@@ -114,12 +111,7 @@ _DISK_EVERY_S = 1.0
 
 
 class SwitchButton:
-    """The page's record button on a recorder's switch.
-
-    Parameters
-    ----------
-    switch : RecorderSwitch
-    """
+    """The page's record button on a recorder's switch."""
 
     def __init__(self, switch: RecorderSwitch) -> None:
         self._switch = switch
@@ -152,32 +144,3 @@ class SwitchButton:
                 left_s = free / rate if rate else None
                 self._found |= {"seconds": seconds, "free_bytes": free, "left_s": left_s}
         return self._found
-
-
-def start_dashboard(
-    host: str,
-    port: int,
-    token: str | None,
-    rig: Rig,
-    holder: SetpointHolder,
-    recorder: RecorderSwitch | None,
-    echo: Callable[[str], object],
-    vehicle: Callable[[], VehicleState | None] = lambda: None,
-    embedders: Sequence[str] = (),
-) -> Dashboard:
-    """Serve the page and print its address; without a recorder, its button refuses.
-
-    Raises
-    ------
-    OptionError
-        If the token is too short, an embedder is no origin, or the address cannot be listened to.
-    """
-    fault = token_fault(token)
-    if fault:
-        raise OptionError(fault)
-    access = make_access(host, token, embedders)
-    controls = Controls(holder, NoRecorder() if recorder is None else SwitchButton(recorder))
-    server = DashboardServer(host, port, access, rig, controls)
-    shown = f"[{host}]" if ":" in host else host
-    echo(f"dashboard: http://{shown}:{server.port}/#token={access.token}")
-    return Dashboard(server, controls, vehicle)

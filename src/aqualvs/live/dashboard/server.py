@@ -178,20 +178,14 @@ _ON_THE_WAY = 2
 
 @dataclass(slots=True, eq=False)
 class PageClient:
-    """One page.
-
-    Attributes
-    ----------
-    may_command : bool
-    unshown : int
-        Pictures that were sent and not yet shown.
-    gone : Event
-        Set when another page takes this one's place.
-    """
+    """One page."""
 
     may_command: bool
+    # Pictures that were sent and not yet shown.
     unshown: int = 0
+    # Set when another page takes this one's place.
     gone: asyncio.Event = field(default_factory=asyncio.Event)
+
     _state: str | None = None
     _picture: bytes | None = None
     _news: asyncio.Event = field(default_factory=asyncio.Event)
@@ -290,15 +284,11 @@ class DashboardServer:
     ----------
     host, port
         Where to listen; port 0 takes any that is free.
-    access : Access
-    rig : Rig
-    controls : Controls
 
     Attributes
     ----------
     port : int
         Where it listens.
-    hub : Hub
 
     Raises
     ------

@@ -67,7 +67,6 @@ class PilotSticks:
 
     Parameters
     ----------
-    link : MavlinkLink
     own : (int, int)
         System and component in whose name we send sticks ourselves.
     dead_band : float
@@ -146,11 +145,7 @@ _STUCK_SHARE, _DIVED_M = 0.1, 0.5
 class DepthChoice:
     """Reader of the depth; remembers which estimates stood still.
 
-    Parameters
-    ----------
-    link : MavlinkLink
-    fresh_s : float
-        Older messages do not count.
+    `fresh_s`: older messages do not count.
     """
 
     def __init__(self, link: MavlinkLink, fresh_s: float) -> None:
@@ -216,11 +211,7 @@ def attitude_of(link: MavlinkLink) -> tuple[float | None, float | None, float | 
 def turning_of(link: MavlinkLink, at_ns: int) -> GyroRates | None:
     """Return the turning of an autopilot's vehicle; None if it has told none of use.
 
-    Parameters
-    ----------
-    link : MavlinkLink
-    at_ns : int
-        Time of a picture, by `time.monotonic_ns`.
+    `at_ns`: time of a picture, by `time.monotonic_ns`.
     """
     found = link.latest("ATTITUDE", system=link.system, component=_AUTOPILOT)
     if found is None or found.age_s > FRESH_S:
@@ -243,43 +234,29 @@ def turning_of(link: MavlinkLink, at_ns: int) -> GyroRates | None:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ArduSubOptions:
-    """Options of steering ArduSub, and of the ground station that must be present.
+    """Options of steering ArduSub, and of the ground station that must be present."""
 
-    Attributes
-    ----------
-    command : Command
-        Sticks, or speeds in GUIDED.
-    modes : tuple of str
-        Modes in which it takes our efforts; empty for ALT_HOLD, or GUIDED.
-    ground_station : int
-        System id of the ground station, the vehicle's MAV_GCS_SYSID (before ArduSub 4.7:
-        SYSID_MYGCS). Sticks are sent in its name: ArduSub ignores all others.
-    station_timeout_s : float or None
-        Without its heartbeat for this time no efforts are sent: our own sticks would keep ArduSub
-        from noticing that its ground station is gone. None if no station is required.
-    stick_dead_band : float
-        Deflection of the pilot's sticks that counts as centred, as a share of the full one.
-    speed : float
-        In GUIDED: what an effort of 1 forward, right or down asks for, in m/s.
-    turning_rate : float
-        In GUIDED: what an effort of 1 in yaw asks for, in rad/s.
-    """
-
+    # Sticks, or speeds in GUIDED.
     command: Command = Command.STICKS
+    # Modes in which it takes our efforts; empty for ALT_HOLD, or GUIDED.
     modes: tuple[str, ...] = ()
+    # System id of the ground station, the vehicle's MAV_GCS_SYSID (before ArduSub 4.7:
+    # SYSID_MYGCS). Sticks are sent in its name: ArduSub ignores all others.
     ground_station: int = 255
+    # Without its heartbeat for this time no efforts are sent: our own sticks would keep ArduSub
+    # from noticing that its ground station is gone. None if no station is required.
     station_timeout_s: float | None = 3.0
+    # Deflection of the pilot's sticks that counts as centred, as a share of the full one.
     stick_dead_band: float = 0.1
+    # In GUIDED: what an effort of 1 forward, right or down asks for, in m/s.
     speed: float = 0.3
+    # In GUIDED: what an effort of 1 in yaw asks for, in rad/s.
     turning_rate: float = math.radians(30.0)
 
     def __post_init__(self) -> None:
         """Check every value.
 
-        Raises
-        ------
-        OptionError
-            If one makes no sense.
+        Raises `OptionError` if one makes no sense.
         """
         allowed = _KEEPS_DEPTH[self.command]
         for mode in self.modes:
@@ -314,8 +291,6 @@ class ArduSubLink:
     ----------
     link : str or MavlinkLink
         Address as in `parse_address`, or a link that others use too; such a one is not closed here.
-    options : ArduSubOptions, optional
-        Defaults if left out.
     advises : bool
         Whether settings of the vehicle that are not safe are logged.
 
@@ -386,12 +361,8 @@ class ArduSubLink:
         ArduSub keeps it until another one comes, from us or from the ground station, or until its
         pilot-input fail-safe (FS_PILOT_TIMEOUT; in GUIDED 3 s) has run out.
 
-        Raises
-        ------
-        OSError
-            If it could not be sent.
-        ValueError
-            If a part of it is not finite; neutral is sent then.
+        Raises `OSError` if it could not be sent. Raises `ValueError` if a part of it is not finite;
+        neutral is sent then.
         """
         finite = is_finite(effort)
         sent = self._send(effort if finite else NEUTRAL)

@@ -35,12 +35,7 @@ _AXES = (("chan5_raw", "x"), ("chan6_raw", "y"), ("chan4_raw", "r"))
 
 
 class StickResponse:
-    """Comparison of our sticks with the channels and the turning that follow.
-
-    Parameters
-    ----------
-    link : MavlinkLink
-    """
+    """Comparison of our sticks with the channels and the turning that follow."""
 
     def __init__(self, link: MavlinkLink) -> None:
         self._link = link

@@ -47,26 +47,16 @@ class Weight(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Advice:
-    """Advice on a setting of the vehicle.
-
-    Attributes
-    ----------
-    weight : Weight
-    text : str
-        One line: name, value, meaning, and what to set.
-    """
+    """Advice on a setting of the vehicle."""
 
     weight: Weight
-    text: str
+    text: str  # One line: name, value, meaning, and what to set.
 
 
 class StationRange:
     """The system ids that the vehicle takes for its ground station.
 
-    Parameters
-    ----------
-    parameters : mapping
-        As the vehicle reported them.
+    `parameters`: as the vehicle reported them.
     """
 
     def __init__(self, parameters: Mapping[str, float]) -> None:
@@ -96,11 +86,7 @@ class StationRange:
 class ParameterWatch:
     """Requests for the vehicle's parameters, repeated until it has answered; never waits.
 
-    Parameters
-    ----------
-    link : MavlinkLink
-    names : tuple of str
-        At most ten.
+    `names`: at most ten.
     """
 
     def __init__(self, link: MavlinkLink, names: tuple[str, ...]) -> None:
@@ -193,17 +179,8 @@ def advise_on_fail_safe(parameters: Mapping[str, float]) -> list[Advice]:
     return found
 
 
-def advise_on_speed(
-    parameters: Mapping[str, float], full_climb_rate: float = FULL_CLIMB_RATE
-) -> list[Advice]:
-    """Advise on the climb rate of a full vertical stick, compared with the gains' assumption.
-
-    Parameters
-    ----------
-    parameters : mapping
-    full_climb_rate : float
-        At a full stick and a pilot gain of 1, in m/s.
-    """
+def advise_on_speed(parameters: Mapping[str, float]) -> list[Advice]:
+    """Advise on the climb rate of a full vertical stick, compared with the gains' assumption."""
     up = parameters.get(SPEED_UP)
     if up is None:
         return [Advice(Weight.CARE, f"{SPEED_UP} is not told: plans that change the depth are off")]
@@ -212,9 +189,9 @@ def advise_on_speed(
         # ArduSub takes 0 for the speed upwards (get_pilot_speed_dn).
         same = "0" if SPEED_DOWN in parameters else "is not told"
         both = f"{SPEED_UP} {up:.0f} ({SPEED_DOWN} {same}: as much downwards)"
-        return [_climb_advice(both, up, full_climb_rate)]
+        return [_climb_advice(both, up)]
     return [
-        _climb_advice(f"{name} {speed:.0f}", speed, full_climb_rate)
+        _climb_advice(f"{name} {speed:.0f}", speed)
         for name, speed in ((SPEED_UP, up), (SPEED_DOWN, down))
     ]
 
@@ -224,11 +201,7 @@ def advise_on_distance(
 ) -> list[Advice]:
     """Advise on the vehicle's use of `DISTANCE_SENSOR`.
 
-    Parameters
-    ----------
-    parameters : mapping
-    working_range : (float, float), optional
-        Of the rig, in metres.
+    `working_range`: of the rig, in metres.
     """
     kind = parameters.get(RANGE_TYPE)
     if kind is None:
@@ -255,15 +228,15 @@ def advise_on_distance(
     return [Advice(Weight.FINE, text), *_limits_advice(parameters, working_range)]
 
 
-def _climb_advice(setting: str, told: float, full_climb_rate: float) -> Advice:
+def _climb_advice(setting: str, told: float) -> Advice:
     speed = 0.01 * told
     means = f"{setting}: a full stick asks for {speed:.2g} m/s times the pilot gain"
-    if full_climb_rate / _CLIMB_RATE_RATIO <= speed <= full_climb_rate * _CLIMB_RATE_RATIO:
+    if FULL_CLIMB_RATE / _CLIMB_RATE_RATIO <= speed <= FULL_CLIMB_RATE * _CLIMB_RATE_RATIO:
         return Advice(Weight.FINE, means)
     return Advice(
         Weight.CARE,
-        f"{means}, but gains take {full_climb_rate:g} m/s: follow changes the depth at another "
-        f"speed than planned; set {SPEED_UP} and {SPEED_DOWN} {100.0 * full_climb_rate:.0f}",
+        f"{means}, but gains take {FULL_CLIMB_RATE:g} m/s: follow changes the depth at another "
+        f"speed than planned; set {SPEED_UP} and {SPEED_DOWN} {100.0 * FULL_CLIMB_RATE:.0f}",
     )
 
 

@@ -51,20 +51,13 @@ _AUTOPILOT_NAMES = {_ARDUPILOT: "ArduPilot", 12: "PX4"}
 
 @dataclass(frozen=True, slots=True)
 class Received:
-    """A message that came in.
+    """A message that came in."""
 
-    Attributes
-    ----------
-    message : object
-        As pymavlink decodes it.
-    received_ns : int
-        By `time.monotonic_ns`.
-    system, component : int
-        Who sent it.
-    """
-
+    # As pymavlink decodes it.
     message: Any
+    # By `time.monotonic_ns`.
     received_ns: int
+    # Who sent it.
     system: int
     component: int
 
@@ -76,34 +69,23 @@ class Received:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinkOptions:
-    """Own identity on a connection, and the peers that are heard.
+    """Own identity on a connection, and the peers that are heard."""
 
-    Attributes
-    ----------
-    system : int
-        Own system id; that of the vehicle, whose part this computer is.
-    component : int
-        Own component id.
-    peers : tuple of str
-        Where a port listens, the only addresses that are heard, as `AllowedPeers` takes them;
-        everybody if empty. Other connections hear one peer only.
-    key : bytes or None
-        Of MAVLink 2 signing, see `load_key`: what is sent is signed, and what is not signed with
-        it is not heard. None: nothing is signed, and nothing checked.
-    """
-
+    # Own system id; that of the vehicle, whose part this computer is.
     system: int = 1
+    # Own component id.
     component: int = MAV_COMP_ID_ONBOARD_COMPUTER
+    # Where a port listens, the only addresses that are heard, as `AllowedPeers` takes them;
+    # everybody if empty. Other connections hear one peer only.
     peers: tuple[str, ...] = ()
+    # Of MAVLink 2 signing, see `load_key`: what is sent is signed, and what is not signed with it
+    # is not heard. None: nothing is signed, and nothing checked.
     key: bytes | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         """Check every value.
 
-        Raises
-        ------
-        OptionError
-            If one makes no sense.
+        Raises `OptionError` if one makes no sense.
         """
         _check_id("system", self.system)
         _check_id("component", self.component)
@@ -124,8 +106,6 @@ class MavlinkLink:
     ----------
     url : str
         See `parse_address`.
-    options : LinkOptions, optional
-        Defaults if left out.
 
     Attributes
     ----------
@@ -214,12 +194,7 @@ class MavlinkLink:
     ) -> Received | None:
         """Return the last message of a kind (such as `ATTITUDE`), None if none has come.
 
-        Parameters
-        ----------
-        kind : str
-            Name of the message.
-        system, component : int or None
-            Only from these; from any if None.
+        `system`, `component`: only from these; from any if None.
         """
         found = [
             entry

@@ -36,10 +36,7 @@ def load_key(path: Path) -> bytes:
 
     The key of a passphrase is its SHA-256, as in MAVProxy, Mission Planner and QGroundControl.
 
-    Raises
-    ------
-    OptionError
-        If there is no such file, or it holds neither.
+    Raises `OptionError` if there is no such file, or it holds neither.
     """
     try:
         if not path.is_file():
@@ -242,13 +239,8 @@ class PeerTable:
     def decode(self, peer: Peer, data: bytes, *, whole: bool) -> list[Any]:
         """Return the valid messages that have come from an address.
 
-        Parameters
-        ----------
-        peer : tuple
-        data : bytes
-        whole : bool
-            Whether it is a datagram: one that begins like a message begins one, and what was left
-            of the one before belongs to none.
+        `whole`: whether it is a datagram: one that begins like a message begins one, and what was
+        left of the one before belongs to none.
         """
         sender = self._senders.get(peer)
         parser = self._make_parser() if sender is None else sender.parser

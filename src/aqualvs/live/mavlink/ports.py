@@ -36,21 +36,14 @@ NetKind: TypeAlias = Literal["udpout", "udpin", "udpbcast", "tcp"]
 
 @dataclass(frozen=True, slots=True)
 class NetAddress:
-    """A peer in the network, or the port that peers send to.
+    """A peer in the network, or the port that peers send to."""
 
-    Attributes
-    ----------
-    kind : str
-        `udpout` sends to the address; `udpin` listens there and answers all known senders;
-        `udpbcast` sends to a broadcast address; `tcp` connects.
-    host : str
-        Name or number.
-    port : int
-        1 to 65535; 0, any free one, for `udpin`.
-    """
-
+    # `udpout` sends to the address; `udpin` listens there and answers all known senders; `udpbcast`
+    # sends to a broadcast address; `tcp` connects.
     kind: NetKind
+    # Name or number.
     host: str
+    # 1 to 65535; 0, any free one, for `udpin`.
     port: int
 
     def __str__(self) -> str:
@@ -107,15 +100,8 @@ def parse_address(url: str) -> Address:
 class AllowedPeers:
     """Addresses that are heard.
 
-    Parameters
-    ----------
-    rules : sequence of str
-        Each `ADDRESS`, `ADDRESS:PORT` or `NETWORK/BITS`, in numbers; everybody if there is none.
-
-    Raises
-    ------
-    OptionError
-        If one is none of these.
+    `rules`: each `ADDRESS`, `ADDRESS:PORT` or `NETWORK/BITS`, in numbers; everybody if there is
+    none. Raises `OptionError` if one is none of these.
     """
 
     def __init__(self, rules: Sequence[str] = ()) -> None:
@@ -223,10 +209,7 @@ class Port(Protocol):
 def open_port(address: Address) -> Port:
     """Open the way to a peer; may take a second for TCP, and longer for names.
 
-    Raises
-    ------
-    OSError
-        If it cannot be opened now; later it may.
+    Raises `OSError` if it cannot be opened now; later it may.
     """
     if isinstance(address, SerialAddress):
         from aqualvs.live.mavlink.serial import SerialPort
@@ -242,10 +225,7 @@ def open_port(address: Address) -> Port:
 def check_address(address: Address) -> None:
     """Raise if this computer can never open such an address.
 
-    Raises
-    ------
-    OptionError
-        For a serial port without pyserial, or at a speed that it does not know.
+    Raises `OptionError` for a serial port without pyserial, or at a speed that it does not know.
     """
     if not isinstance(address, SerialAddress):
         return

@@ -44,14 +44,7 @@ class SerialPort(StreamPort):
 
     A thread reads, because Windows cannot wait for serial ports and sockets together.
 
-    Parameters
-    ----------
-    address : SerialAddress
-
-    Raises
-    ------
-    OSError
-        If it is not there, not a serial port, or not ours to open.
+    Raises `OSError` if it is not there, not a serial port, or not ours to open.
     """
 
     def __init__(self, address: SerialAddress) -> None:

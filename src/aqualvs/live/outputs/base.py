@@ -41,10 +41,8 @@ class Output(Protocol):
     def send(self, sample: LiveSample) -> None:
         """Send one sample.
 
-        Raises
-        ------
-        OSError, RuntimeError
-            If it could not be sent; the next one is tried all the same.
+        Raises `OSError` or `RuntimeError` if it could not be sent; the next one is tried all the
+        same.
         """
 
     def health(self) -> PartHealth:

@@ -76,10 +76,7 @@ def type_hash(topic: PublishedTopic) -> bytes:
 def dds_types(distro: str) -> Ros2Types:
     """Return the types as a release of ROS 2 has them.
 
-    Raises
-    ------
-    OptionError
-        If cyclonedds is not installed.
+    Raises `OptionError` if cyclonedds is not installed.
     """
     try:
         from cyclonedds.idl import make_idl_struct
@@ -178,8 +175,6 @@ class DdsOutput:
 
     Parameters
     ----------
-    options : RosOptions, optional
-        Defaults if left out.
     domain_id : int or None
         None for `ROS_DOMAIN_ID`, 0 where that is not set.
     distro : str or None
@@ -290,10 +285,7 @@ class DdsOutput:
 def domain_of_this_machine(environment: Mapping[str, str] = os.environ) -> int:
     """Return the domain that `ROS_DOMAIN_ID` names, 0 without.
 
-    Raises
-    ------
-    OptionError
-        If it is no number.
+    Raises `OptionError` if it is no number.
     """
     text = environment.get("ROS_DOMAIN_ID", "").strip()
     try:

@@ -98,7 +98,6 @@ def laser_lines(
 
     Parameters
     ----------
-    lasers : tuple of Laser
     normal : array, shape (3,)
         Of the target.
     points : ScanPoints
@@ -216,13 +215,9 @@ class FoxgloveOutput:
         0 takes any that is free.
     picture_hz, points_hz : float
         Most pictures, and point clouds, per second; 0 for none.
-    scanner : ScannerOptions, optional
-        Shown with the rig.
 
     Attributes
     ----------
-    name, inline, keeps_all
-        As in `Output`.
     port : int
         That it listens on.
 
@@ -245,10 +240,8 @@ class FoxgloveOutput:
         *,
         picture_hz: float = 5.0,
         points_hz: float = 10.0,
-        scanner: ScannerOptions | None = None,
     ) -> None:
         foxglove = _sdk()
-        self._scanner = scanner or ScannerOptions()
         self._viewers = _Viewers()
         self._clock = RecordClock()
         # Channels do not keep it alive.
@@ -318,7 +311,7 @@ class FoxgloveOutput:
 
     def _log_seldom(self, sample: LiveSample, at_ns: int) -> None:
         """Send data that rarely change, also to new viewers."""
-        rig, health, options = sample.rig, sample.health, self._scanner
+        rig, health, options = sample.rig, sample.health, ScannerOptions()
         if self._transforms.has_sinks():
             self._transforms.log(transforms(rig, at_ns), log_time=at_ns)
         self._log(HEALTH, at_ns, lambda: messages.health_message(health, at_ns))

@@ -115,10 +115,7 @@ def boot_ms(monotonic_ns: int) -> int:
 def distance_limits_cm(working_range: tuple[float, float]) -> tuple[int, int]:
     """Return the least and greatest distance that is ever sent, in whole centimetres outwards.
 
-    Parameters
-    ----------
-    working_range : (float, float)
-        In metres.
+    `working_range`: in metres.
     """
     near, far = working_range
     least = math.floor(100.0 * near * (1.0 - _RANGE_TOLERANCE))

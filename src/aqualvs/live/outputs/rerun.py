@@ -62,10 +62,7 @@ class RerunOutput:
     def send(self, sample: LiveSample) -> None:
         """Log a sample.
 
-        Raises
-        ------
-        OSError, RuntimeError
-            If no viewer is there.
+        Raises `OSError` or `RuntimeError` if no viewer is there.
         """
         if self._closed:
             return

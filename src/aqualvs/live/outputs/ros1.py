@@ -230,10 +230,7 @@ def _master(uri: str) -> xmlrpc.client.ServerProxy:
 def _answer(value: Any) -> tuple[int, str, Any]:
     """Return the three parts of roscore's answer.
 
-    Raises
-    ------
-    ValueError
-        If it is no such answer: something else listens at that port.
+    Raises `ValueError` if it is no such answer: something else listens at that port.
     """
     if not (isinstance(value, list) and len(value) == 3):
         raise ValueError("what answers there is not roscore")
@@ -243,10 +240,7 @@ def _answer(value: Any) -> tuple[int, str, Any]:
 def master_host(uri: str) -> str:
     """Return the host in the address of roscore.
 
-    Raises
-    ------
-    OptionError
-        If it is no address.
+    Raises `OptionError` if it is no address.
     """
     parts = urlsplit(uri)
     try:
@@ -294,8 +288,6 @@ class Ros1Output:
 
     Parameters
     ----------
-    options : RosOptions, optional
-        Defaults if left out.
     master_uri : str or None
         Where roscore is. None for `ROS_MASTER_URI`, this machine where that is not set.
     node_name : str

@@ -55,20 +55,11 @@ _PARTS = {
 
 @dataclass(frozen=True, slots=True)
 class Ros1Type:
-    """A message type as publishers and subscribers agree on it.
-
-    Attributes
-    ----------
-    name : str
-    md5sum : str
-        Of the definition; subscribers with another one are refused.
-    definition : str
-        Its text and those of all parts, as bags keep it.
-    """
+    """A message type as publishers and subscribers agree on it."""
 
     name: str
-    md5sum: str
-    definition: str
+    md5sum: str  # Of the definition; subscribers with another one are refused.
+    definition: str  # Its text and those of all parts, as bags keep it.
 
 
 def _type(name: str, text: str, parts: Iterable[str], md5sum: str) -> Ros1Type:
@@ -119,11 +110,7 @@ ROS1_TYPES = {
 def to_ros1(message: Message, seq: int) -> bytes:
     """Return a message as bytes.
 
-    Parameters
-    ----------
-    message : Message
-    seq : int
-        Number of the message on its topic.
+    `seq`: number of the message on its topic.
     """
     match message:
         case PoseMessage():
@@ -239,10 +226,7 @@ class _Link:
     def write(self) -> None:
         """Send as much as goes.
 
-        Raises
-        ------
-        OSError
-            If the peer is gone.
+        Raises `OSError` if the peer is gone.
         """
         while self.wants_to_write():
             if not self.rest:

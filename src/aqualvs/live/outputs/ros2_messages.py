@@ -37,23 +37,15 @@ TYPE_NAMES = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ros2Types:
-    """The message classes to use; each is called with its fields by name.
+    """The message classes to use; each is called with its fields by name."""
 
-    Attributes
-    ----------
-    classes : dict
-        By name, such as `sensor_msgs/msg/Range`.
-    range_has_variance : bool
-        False before ROS 2 Iron.
-    octet : callable
-        Makes a value of the type `byte`, which rclpy wants as one byte and DDS as a number.
-    octets : callable
-        Makes a sequence of `uint8` of bytes; rclpy copies an `array` without looking at each.
-    """
-
+    # By name, such as `sensor_msgs/msg/Range`.
     classes: dict[str, Any]
+    # False before ROS 2 Iron.
     range_has_variance: bool
+    # Makes a value of the type `byte`, which rclpy wants as one byte and DDS as a number.
     octet: Callable[[int], Any]
+    # Makes a sequence of `uint8` of bytes; rclpy copies an `array` without looking at each.
     octets: Callable[[bytes], Any]
 
     def make(self, name: str, /, **fields: Any) -> Any:

@@ -32,32 +32,22 @@ from aqualvs.scanning.posture import Posture, Reason
 from aqualvs.scanning.scan import Label, ScanPoints
 from aqualvs.sources.base import Health, PartHealth, State
 
-FLU_FROM_DOME: FloatArray = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-"""Rotation from `dome` to forward, left, up."""
-FLU_FROM_DOME.flags.writeable = False
-
 UNOBSERVABLE_VARIANCE = 1.0e4
 """Variance, in m² and rad², of what a plane leaves undetermined: 100 m, 100 rad."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlanePose:
-    """Pose of the target's plane in FLU axes at the dome's centre.
+    """Pose of the target's plane in FLU axes at the dome's centre."""
 
-    Attributes
-    ----------
-    position : array, shape (3,)
-        Foot of the perpendicular from the dome's centre, in metres.
-    quaternion : array, shape (4,)
-        Orientation as (x, y, z, w): x along the normal away from the vehicle, y horizontal to the
-        left as the vehicle sees it, z up the plane. Identity where the vehicle looks squarely at
-        the target.
-    covariance : array, shape (6, 6)
-        Of (x, y, z, roll, pitch, yaw) in FLU, m and rad, angles about fixed axes (REP-103).
-    """
-
+    # Shape (3,): foot of the perpendicular from the dome's centre, in metres.
     position: FloatArray
+    # Shape (4,): orientation as (x, y, z, w): x along the normal away from the vehicle, y
+    # horizontal to the left as the vehicle sees it, z up the plane. Identity where the vehicle
+    # looks squarely at the target.
     quaternion: FloatArray
+    # Shape (6, 6): of (x, y, z, roll, pitch, yaw) in FLU, m and rad, angles about fixed axes
+    # (REP-103).
     covariance: FloatArray
 
 
@@ -65,18 +55,6 @@ def flu_from_dome(vectors_in_dome: ArrayLike) -> FloatArray:
     """Return vectors (..., 3) of `dome` in forward, left, up."""
     vectors = as_vectors(vectors_in_dome, 3, "vectors_in_dome")
     return np.stack((vectors[..., 1], -vectors[..., 0], vectors[..., 2]), axis=-1)
-
-
-def normal_in_dome(pitch: float, yaw: float) -> FloatArray:
-    """Return the unit normal (3,) in `dome` of a target plane before the vehicle.
-
-    Parameters
-    ----------
-    pitch, yaw : float
-        As in `Posture`, in radians, within a right angle.
-    """
-    x, z = math.tan(yaw), math.tan(pitch)
-    return np.array([x, 1.0, z]) / math.sqrt(1.0 + x * x + z * z)
 
 
 def flu_angles(pitch: float, yaw: float) -> tuple[float, float]:
@@ -327,26 +305,17 @@ class PublishedTopic(StrEnum):
 class RosOptions:
     """Names, and how hard it is tried to deliver.
 
-    Attributes
-    ----------
-    namespace : str
-        What the topics' names start with; `diagnostics` stays at the root, where ROS looks for it.
-    frame_id : str
-        Name of the frame at the dome's centre, forward, left, up.
-    reliable : bool
-        ROS 2: offer to repeat what gets lost. Then every subscriber fits, whichever it asks for;
-        without, only those that ask for best effort.
-    diagnostics_period_s : float
-
-    Raises
-    ------
-    OptionError
-        If a name is none that ROS allows, or the period is not positive.
+    Raises `OptionError` if a name is none that ROS allows, or the period is not positive.
     """
 
+    # What the topics' names start with; `diagnostics` stays at the root, where ROS looks for it.
     namespace: str = "aqualvs"
+    # Name of the frame at the dome's centre, forward, left, up.
     frame_id: str = "aqualvs_dome"
+    # ROS 2: offer to repeat what gets lost. Then every subscriber fits, whichever it asks for;
+    # without, only those that ask for best effort.
     reliable: bool = True
+
     diagnostics_period_s: float = 1.0
 
     def __post_init__(self) -> None:
@@ -405,12 +374,7 @@ Message: TypeAlias = PoseMessage | RangeMessage | CloudMessage | DiagnosticsMess
 
 
 class MessageMaker:
-    """Converter of samples to messages; diagnostics once per period.
-
-    Parameters
-    ----------
-    options : RosOptions
-    """
+    """Converter of samples to messages; diagnostics once per period."""
 
     def __init__(self, options: RosOptions) -> None:
         self._options = options

@@ -16,6 +16,7 @@ from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.live.mavlink.ports import parse_host_port
 from aqualvs.recording.sample import LiveSample
+from aqualvs.results.folder import POSTURE_COLUMNS
 from aqualvs.scanning.posture import Posture, Refusal
 from aqualvs.sources.base import PartHealth, State
 
@@ -24,26 +25,9 @@ FORMAT_VERSION = 1
 
 Value: TypeAlias = str | int | float | bool | None
 
-_POSTURE_KEYS = (
-    "range_m",
-    "pitch_deg",
-    "yaw_deg",
-    "sigma_range_m",
-    "sigma_pitch_deg",
-    "sigma_yaw_deg",
-    "slant_range_m",
-    "nearest_m",
-    "n_points",
-    "curvature_x_per_m",
-    "curvature_z_per_m",
-    "sigma_curvature_x_per_m",
-    "sigma_curvature_z_per_m",
-    "sigma_range_rig_m",
-    "sigma_pitch_rig_deg",
-    "sigma_yaw_rig_deg",
-    "sigma_range_total_m",
-    "sigma_pitch_total_deg",
-    "sigma_yaw_total_deg",
+# The numbers of `posture.csv` that follow from the posture.
+_POSTURE_KEYS = tuple(
+    name for name in POSTURE_COLUMNS[POSTURE_COLUMNS.index("range_m") :] if name != "n_water"
 )
 _FILTERED_KEYS = (
     "filtered_range_m",
@@ -175,15 +159,8 @@ _REFUSED_FOR_S = 3.0
 class UdpJsonOutput:
     """Output that sends every sample to every receiver.
 
-    Parameters
-    ----------
-    receivers : str or sequence of str
-        `HOST:PORT`, or `[IPV6]:PORT`; a broadcast address reaches all that listen in the network.
-
-    Raises
-    ------
-    OptionError
-        If there is none, or one that makes no sense.
+    `receivers`: `HOST:PORT`, or `[IPV6]:PORT`; a broadcast address reaches all that listen in the
+    network. Raises `OptionError` if there is none, or one that makes no sense.
     """
 
     inline = True

@@ -40,21 +40,14 @@ Turn = tuple[Vec, Vec, Vec]
 
 
 class Body(NamedTuple):
-    """Numbers of a hull and its thrusters, for kernels.
+    """Numbers of a hull and its thrusters, for kernels."""
 
-    Attributes
-    ----------
-    hull : array, shape (5, 6)
-        Rigid and added inertia, linear and quadratic drag; weight, buoyancy, centre of buoyancy,
-        displaced mass.
-    allocation : array, shape (6, n)
-        Force and moment of every thruster's unit thrust.
-    lag : float
-        Time constant of the thrusters, in seconds.
-    """
-
+    # Shape (5, 6): rigid and added inertia, linear and quadratic drag; weight, buoyancy, centre of
+    # buoyancy, displaced mass.
     hull: FloatArray
+    # Shape (6, n): force and moment of every thruster's unit thrust.
     allocation: FloatArray
+    # Time constant of the thrusters, in seconds.
     lag: float
 
 
@@ -260,27 +253,13 @@ _MAX_DEPTH_ERROR = 0.5
 
 
 class PackedAutopilot(NamedTuple):
-    """Numbers and working memory of an autopilot, for kernels.
+    """Numbers and working memory of an autopilot, for kernels."""
 
-    Attributes
-    ----------
-    gains : array, shape (15,)
-        Of `Autopilot` and `Sticks`.
-    mixing : array, shape (n, 6)
-        See `VehicleModel.mixing`.
-    curve : array, shape (4,)
-        Of `ThrustCurve`.
-    inputs : array, shape (6,)
-        Memory for the motor inputs.
-    wanted : array, shape (n,)
-        Memory for the requested thrusts, in newtons.
-    """
-
-    gains: FloatArray
-    mixing: FloatArray
-    curve: FloatArray
-    inputs: FloatArray
-    wanted: FloatArray
+    gains: FloatArray  # Shape (15,): of `Autopilot` and `Sticks`.
+    mixing: FloatArray  # Shape (n, 6): see `VehicleModel.mixing`.
+    curve: FloatArray  # Shape (4,): of `ThrustCurve`.
+    inputs: FloatArray  # Shape (6,): memory for the motor inputs.
+    wanted: FloatArray  # Shape (n,): memory for the requested thrusts, in newtons.
 
 
 def pack_pilot(model: VehicleModel) -> PackedAutopilot:

@@ -28,18 +28,10 @@ ROLL, PITCH, YAW, DOWN, FORWARD, RIGHT = range(6)
 
 @dataclass(frozen=True, slots=True)
 class Thruster:
-    """Thruster of a vehicle.
+    """Thruster of a vehicle."""
 
-    Attributes
-    ----------
-    position : (float, float, float)
-        In body axes, in metres.
-    direction : (float, float, float)
-        Unit vector of its force on the vehicle when it runs forward.
-    """
-
-    position: Vec
-    direction: Vec
+    position: Vec  # In body axes, in metres.
+    direction: Vec  # Unit vector of its force on the vehicle when it runs forward.
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,24 +40,17 @@ class ThrustCurve:
 
     Beyond the dead band the thrust is greatest * (linear x + (1 - linear) x²), where x is the share
     of the remaining travel.
-
-    Attributes
-    ----------
-    forward, reverse : float
-        Greatest thrust either way, in newtons. The defaults are a T200's at 14 V, 4.52 and 3.52
-        kgf (Blue Robotics' chart; 5.25 and 4.10 kgf at 16 V).
-    dead_band : float
-        Share of the command's travel without thrust. 0.07 is 28 of 400 µs.
-    linear : float
-        0.6 follows the same chart at 12 V within 3 % of the greatest thrust, both ways.
-    lag : float
-        Time constant in seconds; 0.1 is a round number for a small propeller, not measured.
     """
 
+    # Greatest thrust either way, in newtons. The defaults are a T200's at 14 V, 4.52 and 3.52 kgf
+    # (Blue Robotics' chart; 5.25 and 4.10 kgf at 16 V).
     forward: float = 44.3
     reverse: float = 34.5
+    # Share of the command's travel without thrust. 0.07 is 28 of 400 µs.
     dead_band: float = 0.07
+    # 0.6 follows the same chart at 12 V within 3 % of the greatest thrust, both ways.
     linear: float = 0.6
+    # Time constant in seconds; 0.1 is a round number for a small propeller, not measured.
     lag: float = 0.1
 
     def __post_init__(self) -> None:
@@ -83,29 +68,20 @@ class StickInput:
 
     Its parameters are RCn_MIN 1100 and RCn_MAX 1900 us and, except for those below, ArduSub's after
     a reset. No axis has an expo.
-
-    Attributes
-    ----------
-    gain : float
-        Pilot gain (JS_GAIN_DEFAULT): share of the full range at full stick.
-    turning_rate : float
-        At a pulse of 1900 us, in rad/s. ArduSub: 45 degrees times ACRO_YAW_P, 3.375 a second.
-    climb_rate : float
-        Greatest, in m/s. ArduSub's PILOT_SPEED_UP is 5 m/s by default, which none of these vehicles
-        reaches; 0.5 is a pilot's choice.
-    yaw_dead_zone : int
-        RC4_DZ, in microseconds; shrinks with the gain, as the next one.
-    throttle_dead_zone : int
-        THR_DZ, in thousandths of the throttle's travel.
-    trims : (int, int, int)
-        RC4_TRIM (yaw), RC5_TRIM (forward) and RC6_TRIM (right), in microseconds.
     """
 
+    # Pilot gain (JS_GAIN_DEFAULT): share of the full range at full stick.
     gain: float = 0.5
+    # At a pulse of 1900 us, in rad/s. ArduSub: 45 degrees times ACRO_YAW_P, 3.375 a second.
     turning_rate: float = math.radians(45.0) * 3.375
+    # Greatest, in m/s. ArduSub's PILOT_SPEED_UP is 5 m/s by default, which none of these vehicles
+    # reaches; 0.5 is a pilot's choice.
     climb_rate: float = 0.5
+    # RC4_DZ, in microseconds; shrinks with the gain, as the next one.
     yaw_dead_zone: int = 40
+    # THR_DZ, in thousandths of the throttle's travel.
     throttle_dead_zone: int = 100
+    # RC4_TRIM (yaw), RC5_TRIM (forward) and RC6_TRIM (right), in microseconds.
     trims: tuple[int, int, int] = (1500, 1500, 1500)
 
     def __post_init__(self) -> None:
@@ -184,82 +160,56 @@ class Autopilot:
     filters and small D terms. The outer gains are lower than its 6 and 3 a second, which leave
     these models, with their thrusters' lag, hardly damped. The heading is held no better than the
     thrusters' dead band lets it: within dead_band / (rate * angle) where nothing else loads them.
-
-    Attributes
-    ----------
-    angle : float
-        Requested rate per error of the angle, in rad/s per rad.
-    rate, rate_integral : (float, float, float)
-        Of roll, pitch, yaw: motor input per rad/s, and per rad/s and second.
-    depth : float
-        Requested climb rate per error of the depth, in m/s per metre.
-    climb, climb_integral : float
-        Motor input per m/s, and per m/s and second.
-    input_time : float
-        Time constant of requested turning rates, in seconds (ATC_INPUT_TC).
-    acceleration : float
-        Acceleration to requested climb rates, in m/s² (PILOT_ACCEL_Z).
-    settle : float
-        Time after the last requested turn during which the held heading follows the present one,
-        in seconds (ArduSub's mode_althold.cpp).
     """
 
+    # Requested rate per error of the angle, in rad/s per rad.
     angle: float = 4.5
+    # Of roll, pitch, yaw: motor input per rad/s, and per rad/s and second.
     rate: Vec = (0.135, 0.135, 0.18)
     rate_integral: Vec = (0.09, 0.09, 0.018)
+    # Requested climb rate per error of the depth, in m/s per metre.
     depth: float = 1.0
+    # Motor input per m/s, and per m/s and second.
     climb: float = 1.5
     climb_integral: float = 0.75
+    # Time constant of requested turning rates, in seconds (ATC_INPUT_TC).
     input_time: float = 0.15
+    # Acceleration to requested climb rates, in m/s² (PILOT_ACCEL_Z).
     acceleration: float = 1.0
+    # Time after the last requested turn during which the held heading follows the present one, in
+    # seconds (ArduSub's mode_althold.cpp).
     settle: float = 0.25
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VehicleModel:
-    """Parameters of a vehicle, in SI units.
+    """Parameters of a vehicle, in SI units."""
 
-    Attributes
-    ----------
-    name : str
-        Name in reports.
-    mass : float
-        In air, in kg.
-    inertia : (float, float, float)
-        About forward, right and down, in kg m².
-    buoyancy : float
-        In newtons; it gives the displaced mass.
-    centre_of_buoyancy : (float, float, float)
-        In body axes, in metres; above the centre of gravity is negative.
-    added_mass, linear_drag, quadratic_drag : tuple of 6 floats
-        Positive, along forward, right, down and about them.
-    thrusters : sequence of Thruster
-        Any number; all with the same curve.
-    curve : ThrustCurve
-        Of every thruster.
-    sticks : StickInput
-        Response to the sticks.
-    autopilot : Autopilot
-        Gains of the vehicle's own loops.
-    dome_position : (float, float, float)
-        Centre of the camera's dome in body axes, in metres.
-    half_size : (float, float, float)
-        Half length, width and height of the hull, in metres.
-    """
-
+    # Name in reports.
     name: str
+    # In air, in kg.
     mass: float
+    # About forward, right and down, in kg m².
     inertia: Vec
+    # In newtons; it gives the displaced mass.
     buoyancy: float
+    # In body axes, in metres; above the centre of gravity is negative.
     centre_of_buoyancy: Vec
+    # Positive, along forward, right, down and about them.
     added_mass: Six
     linear_drag: Six
     quadratic_drag: Six
+    # Any number; all with the same curve.
     thrusters: Sequence[Thruster]
+    # Of every thruster.
     curve: ThrustCurve = field(default_factory=ThrustCurve)
+    # Response to the sticks.
     sticks: StickInput = field(default_factory=StickInput)
+    # Gains of the vehicle's own loops.
     autopilot: Autopilot = field(default_factory=Autopilot)
+    # Centre of the camera's dome in body axes, in metres.
     dome_position: Vec = (0.20, 0.0, 0.0)
+    # Half length, width and height of the hull, in metres.
     half_size: Vec = (0.2286, 0.169, 0.127)
 
     def __post_init__(self) -> None:

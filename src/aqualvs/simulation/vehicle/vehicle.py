@@ -35,25 +35,16 @@ from aqualvs.simulation.vehicle.water_motion import GRAVITY, WaterMotion
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SensorErrors:
-    """Errors of a sensor, in the unit of its quantity.
+    """Errors of a sensor, in the unit of its quantity."""
 
-    Attributes
-    ----------
-    noise : float
-        Standard deviation of the white noise of a reading.
-    bias : float
-        Constant error.
-    wander, wander_time : float
-        Standard deviation and correlation time in seconds of a slow error (first-order
-        Gauss-Markov).
-    rate : float
-        Readings a second.
-    """
-
+    # Standard deviation of the white noise of a reading.
     noise: float = 0.0
+    # Constant error.
     bias: float = 0.0
+    # Standard deviation and correlation time in seconds of a slow error (first-order Gauss-Markov).
     wander: float = 0.0
     wander_time: float = 30.0
+    # Readings a second.
     rate: float = 10.0
 
     def __post_init__(self) -> None:
@@ -67,17 +58,11 @@ class SensorErrors:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sensors:
-    """All sensors of a vehicle.
+    """All sensors of a vehicle."""
 
-    Attributes
-    ----------
-    depth : SensorErrors
-        Metres. The default noise is a Bar30's with the sea on top.
-    heading, tilt : SensorErrors
-        Radians; tilt is roll and pitch.
-    """
-
+    # Metres. The default noise is a Bar30's with the sea on top.
     depth: SensorErrors = field(default_factory=lambda: SensorErrors(noise=0.005))
+    # Radians; tilt is roll and pitch.
     heading: SensorErrors = field(
         default_factory=lambda: SensorErrors(noise=math.radians(0.2), wander=math.radians(1.0))
     )
@@ -86,28 +71,19 @@ class Sensors:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Telemetry:
-    """Telemetry of the vehicle, as MAVLink would carry it.
+    """Telemetry of the vehicle, as MAVLink would carry it."""
 
-    Attributes
-    ----------
-    time_s : float
-        Time of the reading, in the vehicle's time.
-    armed : bool
-    obeys : bool
-        Whether its mode accepts stick positions.
-    lapsed : bool
-        Whether it holds still because no stick positions have come for a time.
-    depth : float
-        Metres, down positive.
-    heading, roll, pitch : float
-        Radians; heading clockwise from north, -pi to pi.
-    """
-
+    # Time of the reading, in the vehicle's time.
     time_s: float
+
     armed: bool
+    # Whether its mode accepts stick positions.
     obeys: bool
+    # Whether it holds still because no stick positions have come for a time.
     lapsed: bool
+    # Metres, down positive.
     depth: float
+    # Radians; heading clockwise from north, -pi to pi.
     heading: float
     roll: float
     pitch: float
@@ -292,10 +268,7 @@ class SimulatedVehicle:
     def step(self, sticks: StickPositions | None, dt: float) -> None:
         """Send stick positions, or none, and advance by `dt` seconds.
 
-        Raises
-        ------
-        OptionError
-            If `dt` is not positive, or a position is no number.
+        Raises `OptionError` if `dt` is not positive, or a position is no number.
         """
         if not dt > 0.0:
             raise OptionError(f"vehicle: step of {dt:g} s; it must be positive")

@@ -29,27 +29,18 @@ _STEEPEST = 0.44
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Waves:
-    """Surface waves.
+    """Surface waves."""
 
-    Attributes
-    ----------
-    amplitude : float
-        Half the height from trough to crest, in metres. Irregular waves have the same mean square.
-    period : float
-        In seconds; of irregular waves the middle one.
-    direction : float
-        Direction of propagation, in radians clockwise from north.
-    n : int
-        Number of sine waves; 1 is a regular swell.
-    spread : float
-        Periods of irregular waves are spread evenly over this share of the period to either side,
-        directions at random over as many radians.
-    """
-
+    # Half the height from trough to crest, in metres. Irregular waves have the same mean square.
     amplitude: float
+    # In seconds; of irregular waves the middle one.
     period: float = 5.0
+    # Direction of propagation, in radians clockwise from north.
     direction: float = 0.0
+    # Number of sine waves; 1 is a regular swell.
     n: int = 1
+    # Periods of irregular waves are spread evenly over this share of the period to either side,
+    # directions at random over as many radians.
     spread: float = 0.25
 
     def __post_init__(self) -> None:
@@ -88,25 +79,17 @@ class Tether:
     Each element of it has the drag of a cylinder across the flow; the force at the vehicle's end
     follows from the balance of moments about the upper end; the cable's velocity falls linearly to
     zero at that end.
-
-    Attributes
-    ----------
-    length : float
-        In the water, in metres; 0 is no drag.
-    diameter : float
-        In metres; 7.6 mm is Blue Robotics' Fathom tether.
-    drag : float
-        Drag coefficient across the flow; about 1.2 for a smooth cylinder at these Reynolds numbers.
-    attached_at : (float, float, float)
-        On the vehicle, in body axes (forward, right, down), in metres.
-    pull : (float, float, float)
-        Steady pull beside the drag, in world axes (north, east, down), in newtons.
     """
 
+    # In the water, in metres; 0 is no drag.
     length: float = 0.0
+    # In metres; 7.6 mm is Blue Robotics' Fathom tether.
     diameter: float = 0.0076
+    # Drag coefficient across the flow; about 1.2 for a smooth cylinder at these Reynolds numbers.
     drag: float = 1.2
+    # On the vehicle, in body axes (forward, right, down), in metres.
     attached_at: Vec = (-0.15, 0.0, -0.05)
+    # Steady pull beside the drag, in world axes (north, east, down), in newtons.
     pull: Vec = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
@@ -119,31 +102,21 @@ class Tether:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WaterMotion:
-    """Motion of the water: current, waves, and the tether that they move.
+    """Motion of the water: current, waves, and the tether that they move."""
 
-    Attributes
-    ----------
-    current : (float, float, float)
-        Mean velocity of the water in world axes (north, east, down), in m/s.
-    wander, wander_period : float
-        Standard deviation of the current's slow changes, in m/s along north and along east each,
-        and their period, in seconds.
-    waves : Waves, optional
-        None for calm water.
-    tether : Tether
-        Drags and pulls at the vehicle.
-    density : float
-        In kg/m³.
-    seed : int
-        Seed of the phases of waves and wander.
-    """
-
+    # Mean velocity of the water in world axes (north, east, down), in m/s.
     current: Vec = (0.0, 0.0, 0.0)
+    # Standard deviation of the current's slow changes, in m/s along north and along east each, and
+    # their period, in seconds.
     wander: float = 0.0
     wander_period: float = 40.0
+    # None for calm water.
     waves: Waves | None = None
+    # Drags and pulls at the vehicle.
     tether: Tether = field(default_factory=Tether)
+    # In kg/m³.
     density: float = 1025.0
+    # Seed of the phases of waves and wander.
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -186,23 +159,15 @@ class WaterMotion:
 
 
 class Flow(NamedTuple):
-    """Numbers of `WaterMotion`, for kernels.
+    """Numbers of `WaterMotion`, for kernels."""
 
-    Attributes
-    ----------
-    current : array, shape (3,)
-        As there.
-    drift : array, shape (m, 4)
-        Angular frequency, phase, amplitudes along north and east.
-    waves : array, shape (n, 6)
-        Angular frequency, wave number, direction as north and east, amplitude, phase.
-    line : array, shape (7,)
-        Of the tether: half density times drag times area; where it is attached; its pull.
-    """
-
+    # Shape (3,): as there.
     current: FloatArray
+    # Shape (m, 4): angular frequency, phase, amplitudes along north and east.
     drift: FloatArray
+    # Shape (n, 6): angular frequency, wave number, direction as north and east, amplitude, phase.
     waves: FloatArray
+    # Shape (7,): of the tether: half density times drag times area; where it is attached; its pull.
     line: FloatArray
 
 

@@ -38,24 +38,13 @@ _WORKING_RANGE = bluerov2_rig().working_range
 
 @dataclass(frozen=True, slots=True)
 class RandomDive:
-    """One dive, as drawn.
-
-    Attributes
-    ----------
-    seed : int
-    case : SimCase
-    setpoint : Setpoint
-    sway : float
-        In m/s; 0 is a dive that holds.
-    blind : tuple of Blind
-        Periods without sight.
-    """
+    """One dive, as drawn."""
 
     seed: int
     case: SimCase
     setpoint: Setpoint
-    sway: float
-    blind: tuple[Blind, ...]
+    sway: float  # In m/s; 0 is a dive that holds.
+    blind: tuple[Blind, ...]  # Periods without sight.
 
     def mission(self) -> Mission:
         """Return a new mission."""
@@ -91,24 +80,12 @@ class DiveResult:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DiveSpread:
-    """Widths of the distributions that dives are drawn from.
+    """Widths of the distributions that dives are drawn from."""
 
-    Attributes
-    ----------
-    mass : float
-        Greatest deviation from the controller's value, as a share.
-    drag : float
-        Greatest factor either way.
-    current : float
-        Greatest speed, in m/s, in any direction.
-    delay : float
-        Greatest time from the exposure to the vehicle, in seconds.
-    """
-
-    mass: float = 0.2
-    drag: float = 2.0
-    current: float = 0.5
-    delay: float = 0.2
+    mass: float = 0.2  # Greatest deviation from the controller's value, as a share.
+    drag: float = 2.0  # Greatest factor either way.
+    current: float = 0.5  # Greatest speed, in m/s, in any direction.
+    delay: float = 0.2  # Greatest time from the exposure to the vehicle, in seconds.
 
 
 def random_dive(
