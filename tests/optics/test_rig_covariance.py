@@ -30,7 +30,10 @@ from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenarios import bluerov2_rig, example_rig, load_scenario
 from aqualvs.simulation.scene import SurfaceKind
 from aqualvs.simulation.truth import visible_fit
+from whole import WHOLE
 
+# More than a rig has numbers.
+N_DRAWS = 60 if WHOLE else 30
 WINDOW = Window(Plane.from_normal([-0.3, 0.95, 0.1], 0.05), np.array([-0.15, 0.0, 0.0]))
 
 
@@ -109,7 +112,7 @@ def test_errors_over_the_total_sigma_are_of_size_one(rig: Rig, scenario: str) ->
     views = [seen(rig.name, scenario, t) for t in times]
     sigma = np.array([*uncertainty.sigmas.values()])
     # Draws whose own second moments are exactly those of the covariance: fewer do.
-    draws = np.linalg.qr(rng.normal(size=(60, len(sigma))))[0] * np.sqrt(60)
+    draws = np.linalg.qr(rng.normal(size=(N_DRAWS, len(sigma))))[0] * np.sqrt(N_DRAWS)
     z = []
     for draw in draws:
         moved = rig_moved_by(rig, uncertainty.names, sigma * draw)
