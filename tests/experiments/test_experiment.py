@@ -9,6 +9,7 @@ from aqualvs.experiments import ablation_stages, growth_and_sun, page
 from aqualvs.experiments.experiment import MODULES, experiment
 from aqualvs.experiments.laboratory import Laboratory
 from aqualvs.experiments.page import save_outcome
+from aqualvs.report.figure_style import STYLE
 from aqualvs.simulation import dive
 from aqualvs.simulation.render import Renderer
 from camera_cases import half_size_rig
@@ -50,7 +51,7 @@ def laboratory(tmp_path_factory):
 def plain_figures(monkeypatch):
     """Figures in one format, coarsely: `test_command.py` writes others, and as they are."""
     monkeypatch.setattr(page, "_FORMATS", {"png": {}})
-    monkeypatch.setattr(page, "STYLE", {**page.STYLE, "savefig.dpi": 60})
+    monkeypatch.setattr(page, "STYLE", {**STYLE, "savefig.dpi": 60})
 
 
 @pytest.mark.parametrize("name", MODULES)

@@ -495,7 +495,7 @@ def _range_loop(
     ahead = known * gains.position
     above = np.polyadd(above, ahead * np.convolve([1.0, 0.0], swell)) / mass
     below = np.convolve(np.convolve([1.0, damping, 0.0, 0.0], [lag, 1.0]), swell)
-    return Loop(above, below, delay)
+    return Loop(np.asarray(above, np.float64), below, delay)
 
 
 def _range_worst(
