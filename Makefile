@@ -26,7 +26,9 @@ FILES = $(wildcard tests/$(PART)/test_*.py tests/$(PART)/*/test_*.py tests/test_
 
 # Without byte code on disk each of some hundred processes would compile the package again.
 test: export PYTHONDONTWRITEBYTECODE :=
-test: $(STAMP) ## Run all tests, three files at a time (JOBS=3), or those of one part (PART=scanning)
+# What takes long is done in part, unless WHOLE=1 is given: tests/helpers/whole.py.
+test: export AQUALVS_WHOLE := $(or $(WHOLE),$(AQUALVS_WHOLE))
+test: $(STAMP) ## Run all tests, three files at a time (JOBS=3), or one part (PART=scanning), in full by WHOLE=1
 	$(if $(PART),$(if $(FILES),,$(error no tests of `$(PART)`; parts are: $(sort $(PARTS)))))
 	$(BIN)/python -m pytest --numprocesses=$(or $(JOBS),3) --dist=loadfile --no-loadscope-reorder \
 	  --durations=30 --durations-min=5 \

@@ -31,6 +31,9 @@ LONG = (
     "cli",
     "batch",
     "docs",
+    "geometry/test_compiled.py",
+    "report/test_run_page_browser.py",
+    "test_pipeline_fields.py",
 )
 
 # As the command line does it, and before any test imports NumPy.

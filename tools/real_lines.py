@@ -31,6 +31,7 @@ import av
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from aqualvs.scanning.scan import Frame
 from aqualvs.scanning.uncalibrated_stripes import (
@@ -152,33 +153,26 @@ def walk(polyline: Array) -> Array:
     return np.stack([np.interp(at, way, polyline[:, i]) for i in (0, 1)], axis=-1)
 
 
-def near(
-    points: Array, others: Array, distance_px: float, size: tuple[int, int]
-) -> NDArray[np.bool_]:
-    """Return which points (N,) have one of the others within a distance, to 0.25 px."""
+def near(points: Array, others: Array, distance_px: float) -> NDArray[np.bool_]:
+    """Return which points (N,) have one of the others within a distance."""
     if len(others) == 0 or len(points) == 0:
         return np.zeros(len(points), bool)
-    scale = 4
-    clear = np.full((size[0] * scale, size[1] * scale), 255, np.uint8)
-    at = np.clip(np.rint(others * scale), 0, np.array(size[::-1]) * scale - 1).astype(int)
-    clear[at[:, 1], at[:, 0]] = 0
-    distance = cv2.distanceTransform(clear, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    at = np.clip(np.rint(points * scale), 0, np.array(size[::-1]) * scale - 1).astype(int)
-    return np.asarray(distance[at[:, 1], at[:, 0]] <= distance_px * scale)
+    distance, _ = cKDTree(others).query(points, distance_upper_bound=distance_px)
+    return np.asarray(np.isfinite(distance))
 
 
 def score_lines(
-    name: str, fmt: str, found: Array, lines: Sequence[tuple[str, Array]], size: tuple[int, int]
+    name: str, fmt: str, found: Array, lines: Sequence[tuple[str, Array]]
 ) -> list[Score]:
     """Return a score for each group of a picture's lines."""
     reach = NEAR_PX[name.split("/")[0]]
     everything = np.concatenate([walk(polyline) for _, polyline in lines])
-    elsewhere = int((~near(found, everything, 2.0 * reach, size)).sum())
+    elsewhere = int((~near(found, everything, 2.0 * reach)).sum())
     scores = []
     for group in dict.fromkeys(group for group, _ in lines):
         walks = [walk(polyline) for of, polyline in lines if of == group]
         # Along the line a point counts for its neighbours too: fast lines have one every row.
-        seen = near(np.concatenate(walks), found, reach, size)
+        seen = near(np.concatenate(walks), found, reach)
         parts = np.split(seen, np.cumsum([len(w) for w in walks])[:-1])
         weakest = min(float(part.mean()) for part in parts)
         scores.append(Score(name, fmt, group, len(found), float(seen.mean()), weakest, elsewhere))
@@ -267,7 +261,7 @@ def shots(
                 if line is not None:
                     scores = [score_pair(name, fmt, points, line)]
                 elif name in traced:
-                    scores = score_lines(name, fmt, points, traced[name], image.shape[:2])
+                    scores = score_lines(name, fmt, points, traced[name])
                 else:
                     n, none = len(points), float("nan")
                     scores = [Score(name, fmt, f"off{nm:.0f}", n, none, none, n)]

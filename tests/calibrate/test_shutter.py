@@ -38,7 +38,7 @@ def swinging(t):
 @pytest.fixture(scope="module")
 def pictures():
     """Consecutive pictures, blue, green, red."""
-    eye = Renderer(rig_with(Shutter(kind=ShutterKind.ROLLING, readout=0.025)))
+    eye = Renderer(rig_with(Shutter(kind=ShutterKind.ROLLING, readout=0.025)), samples=1)
     images = [eye.take(swinging, i / FPS, np.random.default_rng(i)).image for i in range(N)]
     return [np.ascontiguousarray(image[:, :, ::-1]) for image in images]
 

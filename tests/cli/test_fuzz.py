@@ -8,10 +8,11 @@ import sys
 import pytest
 
 from fuzz_cases import Bench, failures
+from whole import WHOLE
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="judges copies of this process")
 
-N_CASES = 150
+N_CASES = 150 if WHOLE else 100
 
 
 @pytest.fixture(scope="module")

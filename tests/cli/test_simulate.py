@@ -12,12 +12,13 @@ import pytest
 from aqualvs.calibration.targets.target_files import load_board
 from aqualvs.cli.main import main
 from aqualvs.experiments.simulate import CALIBRATION
-from aqualvs.optics.rigfile import load_rig
+from aqualvs.optics.rigfile import load_rig, save_rig
 from aqualvs.optics.shutter import AT_ONCE
 from aqualvs.simulation.calibration_set import SetSize
 from aqualvs.simulation.cameras import list_cameras
 from aqualvs.simulation.scenarios import list_scenarios
 from aqualvs.sources import open_source
+from panel_cases import small_rig
 from shell_cases import rig_file
 from waiting import TIMEOUT_S, until
 
@@ -133,13 +134,16 @@ def test_ctrl_c_leaves_a_dive_that_can_be_measured(tmp_path):
 
 
 def test_ctrl_c_leaves_whole_folders_of_calibration_pictures(tmp_path):
-    said = interrupted(tmp_path / "dome_air", "calibration", "-o", tmp_path)
+    save_rig(small_rig(), tmp_path / "small.yaml")
+    out = tmp_path / "out"
+    rig = ("--rig", tmp_path / "small.yaml")
+    said = interrupted(out / "dome_air", "calibration", *rig, "-o", out)
     complete = re.search(r"stopped by SIGINT after \d+ of 43 pictures; complete in .*: (.*)", said)
     assert "camera_air" in complete[1].split(", ")
     assert "dive" not in complete[1].split(", ")
-    assert len(list((tmp_path / "camera_air").glob("*.png"))) == SetSize().camera
-    load_board(tmp_path / "camera_air" / "board.yaml")
-    assert (tmp_path / "nominal.yaml").is_file()
+    assert len(list((out / "camera_air").glob("*.png"))) == SetSize().camera
+    load_board(out / "camera_air" / "board.yaml")
+    assert (out / "nominal.yaml").is_file()
 
 
 def test_a_scenario_may_state_the_shutter(tmp_path, capsys):

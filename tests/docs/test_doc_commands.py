@@ -14,6 +14,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,8 @@ import typer
 
 from aqualvs.cli.main import app, main
 from aqualvs.experiments import simulate
+from aqualvs.simulation import dive
+from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenario import Scenario
 from aqualvs.simulation.scenarios import load_scenario
 from doc_blocks import PAGES, Command, all_commands, commands
@@ -115,7 +118,8 @@ def world(tmp_path_factory):
     """A user's folder after the first dive and the tour."""
     folder = tmp_path_factory.mktemp("user")
     with pytest.MonkeyPatch.context() as patch:
-        # Rendering would be most of the time: small pictures, and few of them.
+        # Rendering would be most of the time: small pictures of one ray a pixel, and few of them.
+        patch.setattr(dive, "Renderer", partial(Renderer, samples=1))
         patch.setattr(simulate, "load_scenario", few_frames)
         patch.setattr(simulate, "example_rig", small_rig)
         for command in {arguments_of(c): c for page in IN_ORDER for c in commands(page)}.values():

@@ -1,14 +1,17 @@
 """Every experiment of the catalogue runs, in small pictures and on a few frames of its dives."""
 
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import pytest
 
-from aqualvs.experiments import growth_and_sun
+from aqualvs.experiments import ablation_stages, growth_and_sun, page
 from aqualvs.experiments.experiment import MODULES, experiment
 from aqualvs.experiments.laboratory import Laboratory
 from aqualvs.experiments.page import save_outcome
+from aqualvs.report.figure_style import STYLE
+from aqualvs.simulation import dive
+from aqualvs.simulation.render import Renderer
 from camera_cases import half_size_rig
 
 N_FRAMES = 5
@@ -37,12 +40,26 @@ class BriefLaboratory(Laboratory):
 @pytest.fixture(scope="module")
 def laboratory(tmp_path_factory):
     """Dives and the calibration are made once, as `reproduce` does it."""
-    return BriefLaboratory(tmp_path_factory.mktemp("tank"))
+    with pytest.MonkeyPatch.context() as patch:
+        # One ray for each pixel: rendering would be most of the time.
+        for module in (dive, growth_and_sun):
+            patch.setattr(module, "Renderer", partial(Renderer, samples=1))
+        yield BriefLaboratory(tmp_path_factory.mktemp("tank"))
+
+
+@pytest.fixture
+def plain_figures(monkeypatch):
+    """Figures in one format, coarsely: `test_command.py` writes others, and as they are."""
+    monkeypatch.setattr(page, "_FORMATS", {"png": {}})
+    monkeypatch.setattr(page, "STYLE", {**STYLE, "savefig.dpi": 60})
 
 
 @pytest.mark.parametrize("name", MODULES)
-def test_an_experiment_gives_its_results(laboratory, tmp_path, monkeypatch, name):
+def test_an_experiment_gives_its_results(laboratory, plain_figures, tmp_path, monkeypatch, name):
     monkeypatch.setattr(growth_and_sun, "_SHOWN", N_FRAMES // 2)
+    # Every fourth set of parameters that is tried.
+    few = {kind: sets[::4] for kind, sets in ablation_stages._KINDS.items()}
+    monkeypatch.setattr(ablation_stages, "_KINDS", few)
     found = experiment(name)
     record = save_outcome(found, found.run(laboratory), tmp_path)
     told = [record.sentence, *(row.ours for row in record.findings)]
@@ -52,4 +69,5 @@ def test_an_experiment_gives_its_results(laboratory, tmp_path, monkeypatch, name
     assert missed <= FOR_FULL_PICTURES
     assert record.pictures
     for one in record.pictures:
+        # Something is drawn: more than axes without a curve.
         assert (tmp_path / "figures" / f"{one.file}.png").stat().st_size > 5_000

@@ -16,9 +16,9 @@ from aqualvs.simulation.surfaces import pack_surfaces
 from aqualvs.simulation.truth import beams_of, cast
 from net_dives import Dive, frame_of
 
-# Every third pixel away from the lasers' light, which reaches so far to each side: on surfaces in
-# metres, and in the picture in pixels; and the share of a fan's power that counts.
-_COARSE, _THICK, _HALO_PX, _FAN = 3, 1.5e-3, 11, 0.05
+# Every third pixel away from the lasers' light, which reaches so far to each side on surfaces, in
+# metres; and the share of a fan's power that counts.
+_COARSE, _THICK, _FAN = 3, 1.5e-3, 0.05
 
 
 class QuickRenderer:
@@ -26,16 +26,19 @@ class QuickRenderer:
 
     There, pictures are as ever. Elsewhere, where the detector finds nothing green, they are of a
     third of the resolution, but with the same noise. Postures differ by a third of their sigma at
-    most on walls and nets of usual twine; light beside thick twine and slack folds is cut off.
+    most on walls and nets of usual twine; light beside thick twine and slack folds is cut off,
+    unless `halo_px` is 31.
 
     Parameters
     ----------
     rig : Rig
         The sides of its pictures must be divisible by three.
+    halo_px : int
+        Width of what is traced around a pixel that shows where a sheet meets a surface.
     """
 
-    def __init__(self, rig: Rig) -> None:
-        self.rig = rig
+    def __init__(self, rig: Rig, halo_px: int = 11) -> None:
+        self.rig, self._halo = rig, np.ones((halo_px, halo_px), np.uint8)
         self._full, self._coarse = Renderer(rig), Renderer(_coarse(rig), samples=1)
         self._beams = beams_of(rig, self._full.sources)
 
@@ -69,7 +72,7 @@ class QuickRenderer:
         x, y = np.rint(pixels[valid & camera.inside_image(pixels)]).astype(int).T
         marked = np.zeros((height, width), np.uint8)
         marked[y.clip(0, height - 1), x.clip(0, width - 1)] = 1
-        return np.asarray(cv2.dilate(marked, np.ones((_HALO_PX, _HALO_PX), np.uint8)) > 0)
+        return np.asarray(cv2.dilate(marked, self._halo) > 0)
 
 
 def quick_scans(dive: Dive, rig: Rig, seed: int = 0) -> list[Scan]:

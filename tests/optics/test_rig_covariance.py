@@ -26,11 +26,14 @@ from aqualvs.scanning.patch import Patch, fitted_patch, nearest_tangent
 from aqualvs.scanning.posture import Posture, Refusal, range_pitch_yaw
 from aqualvs.scanning.scan import Frame, planes_of_image
 from aqualvs.scanning.stripe import StripePeaks
-from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenarios import bluerov2_rig, example_rig, load_scenario
 from aqualvs.simulation.scene import SurfaceKind
 from aqualvs.simulation.truth import visible_fit
+from quick_pictures import QuickRenderer
+from whole import WHOLE
 
+# More than a rig has numbers.
+N_DRAWS = 60 if WHOLE else 40
 WINDOW = Window(Plane.from_normal([-0.3, 0.95, 0.1], 0.05), np.array([-0.15, 0.0, 0.0]))
 
 
@@ -52,7 +55,7 @@ def seen(
     """What the scanner of the true rig finds in a picture, and range, pitch and yaw in truth."""
     rig = {"example": example_rig, "bluerov2": bluerov2_rig}[name]()
     scene = load_scenario(scenario).scene_at(time_s)
-    picture = Renderer(rig, threads=1).render(scene, time_s, np.random.default_rng(0))
+    picture = QuickRenderer(rig).render(scene, time_s, np.random.default_rng(0))
     plane = scene.target_plane()
     if scene.target == "net":
         # Lit twine stands a twine radius in front of the net plane.
@@ -109,7 +112,7 @@ def test_errors_over_the_total_sigma_are_of_size_one(rig: Rig, scenario: str) ->
     views = [seen(rig.name, scenario, t) for t in times]
     sigma = np.array([*uncertainty.sigmas.values()])
     # Draws whose own second moments are exactly those of the covariance: fewer do.
-    draws = np.linalg.qr(rng.normal(size=(60, len(sigma))))[0] * np.sqrt(60)
+    draws = np.linalg.qr(rng.normal(size=(N_DRAWS, len(sigma))))[0] * np.sqrt(N_DRAWS)
     z = []
     for draw in draws:
         moved = rig_moved_by(rig, uncertainty.names, sigma * draw)
@@ -125,7 +128,7 @@ def test_errors_over_the_total_sigma_are_of_size_one(rig: Rig, scenario: str) ->
     # that disagree, does not answer in proportion.
     rms = np.sqrt(np.mean(np.square(z), axis=0))
     # Stated is also what twine may shift, of which the same three views hold one example.
-    assert ((rms > 0.65) & (rms < 1.3)).all(), rms
+    assert ((rms > 0.6) & (rms < 1.3)).all(), rms
 
 
 def test_an_exact_rig_makes_no_error() -> None:

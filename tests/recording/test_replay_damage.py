@@ -14,9 +14,11 @@ from aqualvs.recording.encoding import RIG, STRIPES, options_text, rig_exact
 from aqualvs.results.run_request import RunRequest
 from aqualvs.sources.mcap_file import FOOTER_BYTES, McapFile
 from live_cases import demo_samples
+from whole import WHOLE
 
 N_FRAMES, STEP_NS = 48, 250_000_000
-N_FLIPS = 40
+# Times four in each file.
+N_FLIPS = 40 if WHOLE else 16
 
 
 @pytest.fixture(scope="module")

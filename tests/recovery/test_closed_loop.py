@@ -29,8 +29,8 @@ from aqualvs.follow.sensor_model import SampledSensor
 
 N_RUNS = int(os.environ.get("AQUALVS_LOOP_RUNS", "0"))
 # Some of any kind, and the hardest that were met: a BlueROV2 Heavy that swings its pitch up with
-# too high a gain (29, 49, 151), strong currents onto the net (104, 173).
-HARD_SEEDS = (*range(5), 29, 49, 104, 151, 173)
+# too high a gain, strong currents onto the net (104, 173).
+HARD_SEEDS = {"bluerov2": (*range(4), 104, 173), "bluerov2-heavy": (0, 1, 29, 49, 104, 151, 173)}
 RENDERED = "AQUALVS_LOOP_RENDERED" in os.environ
 BOTH = pytest.mark.parametrize("name", ["bluerov2", "bluerov2-heavy"])
 SEEDS = (1, 2, 3)
@@ -63,7 +63,7 @@ def test_holds_and_steps_in_current_and_waves(name: str) -> None:
 def test_holds_and_turns_in_calm_water(name: str) -> None:
     """Through the dead zones of the vehicle's sticks, which the link takes out, and thrusters."""
     model = vehicle_model(name)
-    for seed in SEEDS:
+    for seed in SEEDS[:2]:
         case = SimCase(
             model=model,
             gains=load_gains(model.name),
@@ -105,7 +105,7 @@ def test_follows_a_curved_net_that_moves(name: str) -> None:
 def test_random_dives_are_safe(name: str) -> None:
     # A full stick is full thrust: half of it does not hold every drag and current drawn here.
     model = vehicle_model(name, pilot_gain=1.0)
-    seeds = range(N_RUNS // 2) if N_RUNS else HARD_SEEDS
+    seeds = range(N_RUNS // 2) if N_RUNS else HARD_SEEDS[name]
     found = list(random_dives(model, tuned_gains(model), seeds))
     assert not any(dive.safety.contact for dive in found)
     assert max(dive.safety.neutral_late for dive in found) <= 0.2
@@ -141,7 +141,7 @@ def test_a_rendered_loop_takes_hold(name: str) -> None:
     run = trials(name, 1, rendered=True)
     if not RENDERED:
         # Rendering is most of the time, and the pictures of both vehicles are alike.
-        log = run.begin(3.0 if name == "bluerov2" else 1.2)
+        log = run.begin(2.0 if name == "bluerov2" else 0.8)
         error = log.column("range") - RANGE
         # From rest in the current: pushed off by less than 0.1 m, and seen in every frame.
         assert np.abs(error).max() < 0.1

@@ -30,9 +30,10 @@ from aqualvs.simulation.truth import visible_fit
 from aqualvs.sources import open_source
 from quick_pictures import QuickRenderer
 from rig_from_sample_truth import load_truth
+from whole import WHOLE
 
 DIFFICULTIES: tuple[Difficulty, ...] = ("clean", "usual", "hard")
-N_SCENES = 24
+N_SCENES = 24 if WHOLE else 15
 
 
 class Judged(NamedTuple):
@@ -162,7 +163,7 @@ def test_random_nets_are_measured_and_never_mistaken() -> None:
         n, d = seen[0].normal, seen[0].offset
         pitch, yaw = posture.pitch - np.arctan2(n[2], n[1]), posture.yaw - np.arctan2(n[0], n[1])
         errors.append([posture.range / d - 1.0, np.rad2deg(pitch), np.rad2deg(yaw)])
-    # Over 402 scenes 98 % are valid and no target is wrong; one of 24 may be hidden by a fish.
+    # Over 402 scenes 98 % are valid and no target is wrong; one may be hidden by a fish.
     assert n_valid >= 0.9 * N_SCENES
     share, pitch, yaw = np.abs(errors).T
     assert share.max() < 0.05

@@ -5,6 +5,7 @@ than those of rendered pictures: the board itself may be a millimetre or a degre
 """
 
 import hashlib
+import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from scipy.special import chdtri
 
 import real_wall as wall
 from aqualvs.calibrate import lasers
@@ -20,12 +22,14 @@ from aqualvs.optics.rigfile import load_rig
 from aqualvs.scanning.uncalibrated_stripes import find_stripes as find_stripes
 from laser_cases import laser_error
 from repository import ROOT
+from whole import WHOLE
 
 PICTURES = ("image2", "image5")
 PHOTOGRAPHS = ROOT / "tests" / "data" / "real-wall"
 # Of the photographs, in those they were cropped from: x, y, width, height.
 CROP = (100, 60, 1400, 1070)
-FORMATS = ("png", "jpg80", "crf18", "crf23", "crf28")
+# Weaker compression by H.264 lies between PNG and the strongest.
+FORMATS = wall.FORMATS if WHOLE else ("png", "jpg80", "crf28")
 
 
 @pytest.fixture(scope="module")
@@ -104,8 +108,10 @@ def once_for_each_picture(function: Callable[..., Any]) -> Callable[..., Any]:
     return remembered
 
 
-# The others, between these, are measured on two photographs above.
-LEFT_OUT_FORMATS = ("png", "crf23", "crf28")
+# JPEG is measured on two photographs above.
+LEFT_OUT_FORMATS = ("png", "crf23", "crf28") if WHOLE else ("png", "crf28")
+# Image 7 contradicts the others by most.
+LEFT_OUT = [f"image{i}" for i in (range(1, 10) if WHOLE else (3, 7, 8))]
 
 
 @pytest.fixture(scope="module")
@@ -122,9 +128,13 @@ def work(tmp_path_factory) -> Iterator[Path]:
 
 @pytest.fixture(scope="module")
 def left_out(samples: Path, work: Path) -> dict[str, list]:
-    """Every photograph of the set by lasers of the eight others, by format."""
+    """Photographs of the set, each by lasers of the eight others, by format."""
     results = wall.leave_one_out(
-        samples / "real-laser-on-wall", work, formats=LEFT_OUT_FORMATS, echo=lambda _: None
+        samples / "real-laser-on-wall",
+        work,
+        formats=LEFT_OUT_FORMATS,
+        pictures=LEFT_OUT,
+        echo=lambda _: None,
     )
     return {fmt: [m for m in results if m.format == fmt] for fmt in LEFT_OUT_FORMATS}
 
@@ -133,13 +143,13 @@ def left_out(samples: Path, work: Path) -> dict[str, list]:
 def test_any_eight_photographs_give_the_same_fifteen_planes(
     samples: Path, work: Path, left_out
 ) -> None:
-    """Nobody tells how many lines there are, but for two of the sets."""
+    """Nobody tells how many lines there are, but for one of the sets, or two."""
     paths = sorted((samples / "real-laser-on-wall").glob("*.png"))
     rigs = [wall.calibrate(paths, work / "every"), *sorted(work.glob("auto/*/rig.yaml"))]
-    for i in (1, 7):
+    for i in (1, 7) if WHOLE else (7,):
         rigs.append(wall.calibrate([*paths[:i], *paths[i + 1 :]], work / f"told{i}", 15))
     every, *found = (load_rig(path).lasers for path in rigs)
-    assert len(found) == 11
+    assert len(found) == (11 if WHOLE else 4)
     for planes in (every, *found):
         assert len(planes) == 15
         for laser, same in zip(planes, every, strict=True):
@@ -151,16 +161,18 @@ def test_any_eight_photographs_give_the_same_fifteen_planes(
 
 @pytest.mark.samples
 @pytest.mark.parametrize("fmt", LEFT_OUT_FORMATS)
-def test_nine_photographs_leaving_one_out(left_out, fmt: str) -> None:
+def test_photographs_by_lasers_of_the_others(left_out, fmt: str) -> None:
     results = left_out[fmt]
     good = [m for m in results if m.valid]
-    assert len(results) == 9
-    assert len(good) >= (8 if fmt == "crf28" else 9)
+    assert len(results) == len(LEFT_OUT)
+    assert len(good) >= len(LEFT_OUT) - (1 if WHOLE and fmt == "crf28" else 0)
     errors = np.abs([(m.range_error_mm, m.yaw_error_deg, m.pitch_error_deg) for m in good])
     # None is nonsense, whatever the picture looks like after H.264.
     assert max(abs(m.range_error_mm) / (1e3 * m.board_range_m) for m in good) < 0.05
     assert (np.median(errors, axis=0) <= (4.0, 1.0, 0.25)).all()
     scores = np.array([(m.range_score, m.yaw_score, m.pitch_score) for m in good])
     rms = np.sqrt((scores**2).mean(axis=0))
-    assert 0.7 <= rms[0] <= 1.6
-    assert (rms[1:] <= 1.6).all()
+    # Exceeded by chance in one set of a hundred: 1.55 for nine photographs, 1.94 for three.
+    limit = math.sqrt(chdtri(len(good), 0.01) / len(good))
+    assert 0.7 <= rms[0] <= limit
+    assert (rms[1:] <= limit).all()

@@ -3,26 +3,26 @@
 The truth is traced by hand, or the difference of a picture with lines and one without.
 """
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 import real_lines
 
-
-def lines(samples: Path, fmt: str) -> Iterator[real_lines.Score]:
-    for shot in real_lines.shots(samples / "real-laser-lines", [fmt]):
-        yield from shot.scores
+FORMATS = ("png", "jpg80", "crf23")
 
 
 @pytest.fixture(scope="module")
 def line_scores(samples: Path) -> dict[str, list[real_lines.Score]]:
-    return {fmt: list(lines(samples, fmt)) for fmt in ("png", "jpg80", "crf23")}
+    scores: dict[str, list[real_lines.Score]] = {fmt: [] for fmt in FORMATS}
+    for shot in real_lines.shots(samples / "real-laser-lines", FORMATS):
+        for score in shot.scores:
+            scores[score.format].append(score)
+    return scores
 
 
 @pytest.mark.samples
-@pytest.mark.parametrize("fmt", ["png", "jpg80", "crf23"])
+@pytest.mark.parametrize("fmt", FORMATS)
 def test_green_lines_without_a_rig(line_scores, fmt: str) -> None:
     bright = [s for s in line_scores[fmt] if s.picture.startswith("green15-bright")]
     dark = [
@@ -35,7 +35,7 @@ def test_green_lines_without_a_rig(line_scores, fmt: str) -> None:
 
 
 @pytest.mark.samples
-@pytest.mark.parametrize("fmt", ["png", "jpg80", "crf23"])
+@pytest.mark.parametrize("fmt", FORMATS)
 def test_nothing_is_found_without_laser(line_scores, fmt: str) -> None:
     off = [s for s in line_scores[fmt] if s.group.startswith("off")]
     assert len(off) == 2 * 14

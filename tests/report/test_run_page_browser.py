@@ -98,8 +98,14 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def shown(
     browser: str, page: Path, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[str, list[str]]:
-    return opened(browser, page, tmp_path_factory.mktemp("profile"), 1280)
+) -> dict[int, tuple[str, list[str]]]:
+    """By the window's width: the report after hands played with it."""
+    probed = page.with_name("probed.html")
+    probed.write_text(page.read_text(encoding="utf-8") + PROBE, encoding="utf-8")
+    return {
+        width: opened(browser, probed, tmp_path_factory.mktemp("profile"), width)
+        for width in (820, 1280)
+    }
 
 
 def opened(browser: str, page: Path, profile: Path, width: int) -> tuple[str, list[str]]:
@@ -124,8 +130,10 @@ def chart(document: str, name: str) -> str:
     return document[start:following]
 
 
-def test_report_draws_every_chart_and_complains_of_nothing(shown: tuple[str, list[str]]) -> None:
-    document, said = shown
+def test_report_draws_every_chart_and_complains_of_nothing(
+    shown: dict[int, tuple[str, list[str]]],
+) -> None:
+    document, said = shown[1280]
     assert said == []
     assert attribute(document, "ready") == "true"
     assert "data-owned" not in document[: document.index("<head")]
@@ -144,8 +152,8 @@ def test_report_draws_every_chart_and_complains_of_nothing(shown: tuple[str, lis
     assert "<canvas" in chart(document, "chart-cloud")
 
 
-def test_cloud_is_really_drawn(shown: tuple[str, list[str]]) -> None:
-    document, _ = shown
+def test_cloud_is_really_drawn(shown: dict[int, tuple[str, list[str]]]) -> None:
+    document, _ = shown[1280]
     found = re.search(r'id="cloud-paper"[^>]*src="data:image/png;base64,([^"]+)"', document)
     found = found or re.search(
         r'src="data:image/png;base64,([^"]+)"[^>]*id="cloud-paper"', document
@@ -164,11 +172,9 @@ def test_cloud_is_really_drawn(shown: tuple[str, list[str]]) -> None:
 
 @pytest.mark.parametrize("width", [820, 1280])
 def test_report_fits_and_answers_to_hands(
-    browser: str, page: Path, tmp_path: Path, width: int
+    shown: dict[int, tuple[str, list[str]]], width: int
 ) -> None:
-    probed = tmp_path / "probed.html"
-    probed.write_text(page.read_text(encoding="utf-8") + PROBE, encoding="utf-8")
-    document, said = opened(browser, probed, tmp_path / "profile", width)
+    document, said = shown[width]
     assert said == []
     assert attribute(document, "fits") == "true"
     assert attribute(document, "first").startswith("frame 0, 0.00 s: range 600.0 ± 0.8 mm")

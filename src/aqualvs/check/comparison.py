@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 from rich.table import Table
-from scipy.stats import chi2, norm
+from scipy.special import chdtri, ndtr
 
 from aqualvs.check.finding import escaped
 from aqualvs.errors import RigError
@@ -93,7 +93,7 @@ class RigDifference:
         distance = self.sigmas(names)
         if distance is None:
             return None
-        limit = chi2.isf(2.0 * norm.sf(SIGNIFICANT), max(len(names), 1))
+        limit = chdtri(max(len(names), 1), 2.0 * ndtr(-SIGNIFICANT))
         return distance > float(np.sqrt(limit))
 
 

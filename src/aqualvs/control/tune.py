@@ -172,7 +172,7 @@ class Loop:
         """
         lag = _pade(self.delay)
         lead = lag * (-1.0) ** np.arange(len(lag) - 1, -1, -1)
-        closed = np.polyadd(np.polymul(self.below, lag), np.polymul(self.above, lead))
+        closed = np.polyadd(np.convolve(self.below, lag), np.convolve(self.above, lead))
         return np.asarray(np.roots(closed), dtype=np.complex128)
 
 
@@ -432,14 +432,14 @@ def _range_loop(
     known = slope / facts.mass
     of_speed, of_integral = gain_schedule(gains, known)
     speed, integral = of_speed * gains.speed, of_integral * gains.integral
-    pushes = np.polymul([speed, integral], swell)
-    pushes = np.polyadd(pushes, speed * np.polymul([1.0, 0.0], swings))
-    above = np.polymul(pushes, [1.0, gains.position])
+    pushes = np.convolve([speed, integral], swell)
+    pushes = np.polyadd(pushes, speed * np.convolve([1.0, 0.0], swings))
+    above = np.convolve(pushes, [1.0, gains.position])
     # Drag is fed forward at the requested speed, which follows the position.
     ahead = known * gains.position
-    above = np.polyadd(above, ahead * np.polymul([1.0, 0.0], swell)) / mass
-    below = np.polymul(np.polymul([1.0, damping, 0.0, 0.0], [lag, 1.0]), swell)
-    return Loop(above, below, delay)
+    above = np.polyadd(above, ahead * np.convolve([1.0, 0.0], swell)) / mass
+    below = np.convolve(np.convolve([1.0, damping, 0.0, 0.0], [lag, 1.0]), swell)
+    return Loop(np.asarray(above, np.float64), below, delay)
 
 
 def _range_worst(

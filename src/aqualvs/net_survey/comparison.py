@@ -9,7 +9,8 @@ from datetime import date
 from enum import StrEnum
 
 import numpy as np
-from scipy import optimize, sparse, stats
+from scipy import optimize, sparse
+from scipy.special import chdtri, ndtri
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.net_survey.frames import (
@@ -39,11 +40,11 @@ from aqualvs.net_survey.growth import (
 from aqualvs.net_survey.surveys import Survey
 
 # Two holes are one if their places differ by no more than chance makes in all but one of 1000.
-_GATE = float(stats.chi2.isf(1e-3, 2))
+_GATE = float(chdtri(2, 1e-3))
 # Lasers looked at a place if they did so with this chance, given how well places are known.
 LOOKED = 0.8
 # A hole has grown beyond chance in all but one of 100.
-_GROWN = float(stats.norm.isf(0.005))
+_GROWN = float(-ndtri(0.005))
 _SIDE = 0.1
 MISSED = 0.3
 """Share of the holes that lasers swept over and that one dive does not find
@@ -238,7 +239,7 @@ def _normal() -> FloatArray:
     """Return places (n, 2) spread like a normal distribution, always the same ones."""
     draws = 256
     n = int(np.sqrt(draws))
-    at = stats.norm.ppf((np.arange(n) + 0.5) / n)
+    at = ndtri((np.arange(n) + 0.5) / n)
     return np.stack(np.meshgrid(at, at), axis=-1).reshape(-1, 2)
 
 

@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 from datetime import date
 
 import numpy as np
-from scipy import sparse, stats
+from scipy import sparse
+from scipy.special import ndtr
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.net_survey.frames import PlacedSurvey, Raster, SurveyShift, WallFrame, spread_over
@@ -349,7 +350,7 @@ def _discoveries(z: FloatArray) -> BoolArray:
     """Mark what is beyond chance among many, at most a share `FALSE_SHARE` of it falsely."""
     if not len(z):
         return np.zeros(0, np.bool_)
-    chance = 2.0 * stats.norm.sf(np.abs(z))
+    chance = 2.0 * ndtr(-np.abs(z))
     order = np.sort(chance)
     below = order <= FALSE_SHARE * np.arange(1, len(z) + 1) / len(z)
     limit = order[np.flatnonzero(below)[-1]] if below.any() else -1.0

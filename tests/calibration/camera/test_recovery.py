@@ -15,11 +15,13 @@ from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
 from aqualvs.optics.camera import BareCamera
 from aqualvs.optics.lens import Lens, LensModel
 from dome_cases import board_points, see
+from whole import WHOLE
 
 SIZE = (720, 576)
 LENS = Lens(fx=817.5, fy=878.0, cx=368.9, cy=281.7, distortion=(-0.126, 0.0827, 6.2e-4, -4.5e-4))
 NAMES = ("fx", "fy", "cx", "cy")
 N_VIEWS = 28
+N_SEEDS = 10 if WHOLE else 6
 POINTS = board_points(11, 8, 0.024)
 MIDDLE = POINTS.mean(axis=0)
 # From the middle to the short sides.
@@ -84,7 +86,7 @@ def test_halves_of_the_views_differ_by_their_sigmas(
     shoot: Callable[[int], list[View]], before: tuple[float, float]
 ) -> None:
     by_corners, by_views, larger = [], [], []
-    for seed in range(10):
+    for seed in range(N_SEEDS):
         halves = []
         views = shoot(seed)
         for half in (views[::2], views[1::2]):
@@ -97,7 +99,7 @@ def test_halves_of_the_views_differ_by_their_sigmas(
         (a, a_corners, a_views), (b, b_corners, b_views) = halves
         by_corners.append((a - b) / np.sqrt(a_corners + b_corners))
         by_views.append((a - b) / np.sqrt(a_views + b_views))
-    # 80 differences, correlated in places: 1 ± 0.15.
+    # 48 differences, correlated in places: 1 ± 0.2.
     assert 0.7 < _rms(by_views) < 1.4
     assert before[0] < _rms(by_corners) < before[1]
     if shoot is _clean:
@@ -108,7 +110,7 @@ def test_halves_of_the_views_differ_by_their_sigmas(
 def test_few_views_promise_no_more_than_they_hold() -> None:
     """Six views; none of the sigmas may be small by chance."""
     errors = []
-    for seed in range(10):
+    for seed in range(N_SEEDS):
         for part in range(4):
             views = _moved(seed)[part : part + 21 : 4]
             bundle, solution = fitted_camera(views, SIZE, LensModel.OPENCV, 4)
@@ -140,7 +142,7 @@ def test_a_bent_board_is_recognised_and_solved_for(bend: tuple[float, ...]) -> N
 
 def test_a_flat_board_is_left_flat() -> None:
     """Also where views share errors, which a bend that is common to all could seem to explain."""
-    for seed in range(5):
+    for seed in range(5 if WHOLE else 3):
         for shoot in (_clean, _moved):
             found = camera(shoot(seed), SIZE)
             assert found.bend_height == 0.0

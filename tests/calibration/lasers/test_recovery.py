@@ -34,6 +34,7 @@ from laser_cases import (
     without_lasers,
 )
 from rig_from_sample_truth import load_truth
+from whole import WHOLE
 
 BIAS_PX = 0.03
 
@@ -63,7 +64,7 @@ def test_errors_are_as_large_as_promised(target: str) -> None:
     lower = np.linalg.cholesky(given.covariance)
     surfaces = box() if target == "box" else board_surface()
     scores = []
-    for k in range(30):
+    for k in range(30 if WHOLE else 15):
         rng = np.random.default_rng(1000 + k)
         camera_error = lower @ rng.standard_normal(len(given.names))
         true = rig_moved_by(nominal, given.names, camera_error)
@@ -80,8 +81,9 @@ def test_errors_are_as_large_as_promised(target: str) -> None:
         )
         scores.append(whitened(result.rig, true, result.uncertainty, camera_error))
     lasers = np.array(scores)[:, len(given.names) :]
-    # 270 values: their standard deviation is known to 4 % if they are independent.
-    assert 0.85 < lasers.std() < 1.15
+    # Nine values of each: independent, their standard deviation is known to 6 % (3.5 sigma: 0.21).
+    allowed = 3.5 / np.sqrt(2.0 * lasers.size)
+    assert 1.0 - allowed < lasers.std() < 1.0 + allowed
     assert np.abs(lasers).max() < 4.5
 
 
@@ -95,7 +97,7 @@ def stripes_of(image: np.ndarray, name: str) -> StripePoints:
 
 
 @pytest.mark.samples
-@pytest.mark.parametrize("folder", ["box", "box_water"])
+@pytest.mark.parametrize("folder", ["box", "box_water"] if WHOLE else ["box_water"])
 def test_lasers_of_the_sample_box(folder: str, samples: Path) -> None:
     rig = true_rig(samples / "lab-paper")
     markers, n_medium = load_box(samples / "lab-paper" / folder / "box.yaml")

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from scipy.stats import f as f_distribution
+from scipy.special import fdtri
 
 from aqualvs.calibration.solver.bundle import (
     CORNER_SIGMA_PX,
@@ -179,7 +179,7 @@ def bend_is_significant(
     squares = terms / size @ np.linalg.solve(covariance / np.outer(size, size), terms / size)
     # Probability that a flat board is taken for bent.
     chance = 1e-3
-    threshold = f_distribution.isf(chance, n_terms, n - n_terms)
+    threshold = fdtri(n_terms, n - n_terms, 1.0 - chance)
     return bool(squares / n_terms > threshold)
 
 

@@ -15,7 +15,7 @@ from enum import StrEnum
 from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
 from aqualvs.errors import CalibrationError, RigError
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
@@ -276,8 +276,8 @@ def _median_scale(blocks: Sequence[Block]) -> float:
 
 @functools.cache
 def _median_length(n_values: int) -> float:
-    """Return the median length of a vector of values with unit noise."""
-    return float(np.sqrt(chi2.ppf(0.5, n_values)))
+    """Return the median length of a vector of values with unit noise, that of chi."""
+    return float(np.sqrt(2.0 * gammaincinv(0.5 * n_values, 0.5)))
 
 
 def _weighted_median(values: FloatArray, weights: FloatArray) -> float:
