@@ -166,7 +166,7 @@ def _piece(search: LaserBand, peaks: StripePeaks, chain: IntArray) -> StripePixe
     width = peaks.width[chain]
     # At just 45 degrees one of the axes must have it.
     steep_enough = np.abs(slope) <= _STEEPEST * (1.0 if axis is SearchAxis.ALONG_Y else 0.999999)
-    keep = steep_enough & ~_in_dot(width / search.line_px)
+    keep = steep_enough & ~_in_dot(width, search.line_px)
     chain, line, slope = chain[keep], line[keep], slope[keep]
     along_x = axis is SearchAxis.ALONG_X
     cosine = 1.0 / np.hypot(1.0, slope)
@@ -183,15 +183,17 @@ def _piece(search: LaserBand, peaks: StripePeaks, chain: IntArray) -> StripePixe
     )
 
 
-def _in_dot(width: FloatArray) -> BoolArray:
-    """Mark the peaks (N,) of a chain that lie on a dot; widths are in search lines."""
+def _in_dot(width: FloatArray, line_px: int) -> BoolArray:
+    """Mark the peaks (N,) of a chain that lie on a dot, by their widths in pixels."""
     # Returns wider than this many median widths of their chain are a dot on the stripe, unless they
     # go on for longer than this many of their own widths: then a pale surface saturates the camera.
     max_width, longest_dot = 1.8, 1.5
-    wide = width > max_width * np.median(width)
+    # The measured width of a thinner line tells where it lies between two pixels.
+    thinnest_px = 2.0
+    wide = width > max_width * max(float(np.median(width)), thinnest_px)
     bounds = np.flatnonzero(np.diff(wide, prepend=False, append=False))
     for first, end in bounds.reshape(-1, 2):
-        if end - first > longest_dot * np.median(width[first:end]):
+        if line_px * (end - first) > longest_dot * np.median(width[first:end]):
             wide[first:end] = False
     return wide
 
