@@ -72,9 +72,8 @@ class _EvidenceOptions(NamedTuple):
     certain_share: float = 0.08
     certain_if_long: float = 1.0
     long_share: float = 0.2
-    # Bonus in log odds of a piece that continues a line straight on: largest gap as a share of the
-    # picture's width; largest deviation from its direction in pixels, and as a share of the gap.
-    help: float = 2.0
+    # Dashes in a row: largest gap as a share of the picture's width; largest deviation from the
+    # direction of a piece in pixels, and as a share of the gap.
     max_gap: float = 0.1
     off_px: float = 1.5
     off_share: float = 0.05
@@ -532,109 +531,6 @@ def _length_in_a_row(table: FloatArray, width_px: int) -> FloatArray:
     linked |= linked.T | np.eye(len(ends), dtype=bool)
     _, row = connected_components(csr_array(linked), directed=False)
     return np.asarray(np.bincount(row, table[LENGTH])[row], np.float64)
-
-
-def continued(table: FloatArray, log_odds: FloatArray, least: float, width_px: int) -> BoolArray:
-    """Mark the pieces that are lines: likely ones, and less likely ones that continue them.
-
-    Parameters
-    ----------
-    table : array, shape (12, P)
-        Measures of all pieces of one picture.
-    log_odds : array, shape (P,)
-        That each is a line.
-    least : float
-        Log odds from which on a piece needs no other.
-    width_px : int
-        Of the picture.
-
-    Returns
-    -------
-    bool array, shape (P,)
-    """
-    keep: BoolArray = log_odds >= least
-    waiting = np.flatnonzero(~keep & (log_odds >= least - _EVIDENCE.help))
-    new = np.flatnonzero(keep)
-    ends = _ends(table)
-    while len(new) and len(waiting):
-        goes_on = np.zeros(len(waiting), bool)
-        for k in new:
-            goes_on |= _goes_on(ends[k], ends[waiting], width_px)
-        new = waiting[goes_on]
-        keep[new] = True
-        waiting = waiting[~goes_on]
-    return keep
-
-
-def extended(segments: StripeSegments, keep: BoolArray) -> list[IntArray]:
-    """Return the chains of peaks of kept pieces, each with the peaks that follow at its ends.
-
-    A piece ends at a kink or a gap; a few peaks beyond may still belong to the line.
-
-    Parameters
-    ----------
-    segments : StripeSegments
-    keep : bool array, shape (P,)
-        Which pieces are lines.
-    """
-    peaks = segments.peaks
-    first_of = np.searchsorted(peaks.line, np.arange(len(segments.search.lowest) + 1))
-    chains = [
-        segments.order[segments.start[k] : segments.start[k + 1]] for k in np.flatnonzero(keep)
-    ]
-    used = np.zeros(len(peaks), bool)
-    for chain in chains:
-        used[chain] = True
-    longer = []
-    for chain in chains:
-        after = _following(chain, 1, peaks.line, peaks.position, peaks.height, first_of, used)
-        before = _following(
-            chain[::-1], -1, peaks.line, peaks.position, peaks.height, first_of, used
-        )
-        longer.append(np.concatenate([before[::-1], chain, after]))
-    return longer
-
-
-@kernel
-def _following(
-    chain: IntArray,
-    step: int,
-    line: IntArray,
-    position: FloatArray,
-    height: FloatArray,
-    first_of: IntArray,
-    used: BoolArray,
-) -> IntArray:
-    """Return and mark the peaks that follow the last one of a chain, one a search line."""
-    n = chain.shape[0]
-    # Extension of a line at its end: most peaks; largest distance in pixels from the extrapolation
-    # by its slope over this many peaks; least height as a share of the line's; and limit of the
-    # search lines missed.
-    max_following, follow_px, slope_peaks, min_height_share, max_missed = 8, 1.2, 6, 0.3, 4
-    last, back = chain[n - 1], chain[max(n - 1 - slope_peaks, 0)]
-    slope = (position[last] - position[back]) / max(abs(line[last] - line[back]), 1)
-    least = min_height_share * np.median(height[chain])
-    found = np.empty(max_following, np.int64)
-    n_found, x, place, gap = 0, line[last], position[last], 0
-    while n_found < max_following and gap < max_missed:
-        x += step
-        if x < 0 or x >= first_of.shape[0] - 1:
-            break
-        gap += 1
-        best, best_miss = -1, follow_px
-        for i in range(first_of[x], first_of[x + 1]):
-            miss = abs(position[i] - (place + slope * gap))
-            if miss < best_miss and height[i] >= least:
-                best, best_miss = i, miss
-        if best < 0:
-            continue
-        if used[best]:
-            break
-        place, gap = position[best], 0
-        used[best] = True
-        found[n_found] = best
-        n_found += 1
-    return found[:n_found].copy()
 
 
 def _ends(table: FloatArray) -> FloatArray:
