@@ -263,3 +263,11 @@ def test_a_wide_stretch_of_a_line_is_no_dot() -> None:
     found = find_stripes(image)
     wide = (found.pixels[:, 0] > 155) & (found.pixels[:, 0] < 215)
     assert np.count_nonzero(wide & (np.abs(distances(found, line)) < 1.0)) > 50
+
+
+def test_a_line_thinner_than_two_pixels_has_no_dots() -> None:
+    """Its measured width doubles where it lies between two pixels."""
+    line = (0.1, 1.0, 100.0)
+    found = find_stripes(picture(line, width=0.8, noise=0.5))
+    assert np.max(np.abs(distances(found, line))) < 0.5
+    assert len(np.unique(found.pixels[:, 0])) > 0.99 * SIZE[0]

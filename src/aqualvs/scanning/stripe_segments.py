@@ -6,8 +6,8 @@ piece, the evidence is strong: a laser's line is long for its width, thin, highe
 and moves the chroma along the wavelength's direction and not across it. Where a camera or codec has
 blurred the chroma, a line shows it only beside itself, as a halo. The evidence is weighted by
 logistic regression, twice: first with general statistics of lines, then with those of the picture's
-own lines, which are learned from the pieces that are certain. Where no piece is certain, there is
-no line.
+own lines, which are learned from the pieces that are certain. Where these lie and how they run is
+evidence too. Where no piece is certain, there is no line.
 """
 
 import math
@@ -72,9 +72,8 @@ class _EvidenceOptions(NamedTuple):
     certain_share: float = 0.08
     certain_if_long: float = 1.0
     long_share: float = 0.2
-    # Bonus in log odds of a piece that continues a line straight on: largest gap as a share of the
-    # picture's width; largest deviation from its direction in pixels, and as a share of the gap.
-    help: float = 2.0
+    # Dashes in a row: largest gap as a share of the picture's width; largest deviation from the
+    # direction of a piece in pixels, and as a share of the gap.
     max_gap: float = 0.1
     off_px: float = 1.5
     off_share: float = 0.05
@@ -487,6 +486,73 @@ def own_evidence(
     return np.concatenate([general, own], axis=1)
 
 
+def place_evidence(table: FloatArray, log_odds: FloatArray, width_px: int) -> FloatArray:
+    """Return how much likelier lines than other things lie and run as pieces do, as log odds.
+
+    Lines of one laser pass through a part of the picture only, in about one direction, or in a few
+    on bent surfaces. Both densities are those of the picture's other pieces. Lines may lie where
+    none is known: each piece that is certain makes that less likely, as in a Dirichlet process.
+    Where few are certain, or where lines and other things lie alike, this tells little.
+
+    Parameters
+    ----------
+    table : array, shape (12, P)
+        Measures of all pieces of one picture.
+    log_odds : array, shape (P,)
+        That each is a line, by its shape and colour.
+    width_px : int
+        Of the picture.
+
+    Returns
+    -------
+    array, shape (P,)
+    """
+    # Pieces of more than these log odds tell where lines are, pieces below zero where others are.
+    certain = 2.0
+    # What is not known counts as this many pieces: a picture has but a few lasers, and each of its
+    # lines breaks into a few pieces. With 3 or 8 as many red lines are found in the photographs of
+    # docs/real-light.md, and with more, more of a second laser that was not seen well.
+    n_unknown = 5.0
+    # In the second round, pieces count that their places made certain in the first.
+    n_rounds = 2
+    # Of many other things, this many or more tell as much.
+    n_enough = 500
+    evidence = np.zeros(len(log_odds))
+    for _ in range(n_rounds):
+        now = log_odds + evidence
+        lines, others = np.flatnonzero(now > certain), np.flatnonzero(now < 0.0)
+        others = others[:: max(len(others) // n_enough, 1)]
+        of_others = _density(table, others, width_px)
+        of_others = (n_unknown + len(others) * of_others) / (n_unknown + len(others))
+        ratio = _density(table, lines, width_px) / of_others
+        evidence = np.log((n_unknown + len(lines) * ratio) / (n_unknown + len(lines)))
+    return evidence
+
+
+def _density(table: FloatArray, of: IntArray, width_px: int) -> FloatArray:
+    """Return how densely pieces `of` lie along each piece (P,), itself left out; 1 if evenly."""
+    # Spread of the directions of one laser's lines on bent surfaces, and of short pieces; spread of
+    # places across lines by the depth of the scene, as a share of the picture's width.
+    spread_rad, spread_share = 0.2, 0.04
+    x, y = 0.5 * (table[FIRST_X] + table[LAST_X]), 0.5 * (table[FIRST_Y] + table[LAST_Y])
+    angle = np.arctan2(table[LAST_Y] - table[FIRST_Y], table[LAST_X] - table[FIRST_X])
+    cosine, sine = np.cos(angle), np.sin(angle)
+    height = math.pi / (2.0 * math.pi * spread_rad * spread_share)
+    density = np.zeros(len(x))
+    total = float(table[LENGTH, of].sum())
+    for k in of:
+        turn = angle - angle[k]
+        turn -= math.pi * np.rint(turn / math.pi)
+        off = ((y - y[k]) * cosine[k] - (x - x[k]) * sine[k]) / (spread_share * width_px)
+        near = np.exp(-0.5 * ((turn / spread_rad) ** 2 + off**2))
+        near[k] = 0.0
+        density += table[LENGTH, k] * near
+    total_of_others = np.full(len(x), total)
+    total_of_others[of] -= table[LENGTH, of]
+    density *= height / np.maximum(total_of_others, 1e-9)
+    return density
+
+
 def line_log_odds(
     table: FloatArray, width_px: int, *, has_colour: bool, weights: Weights = WEIGHTS
 ) -> FloatArray:
@@ -518,7 +584,7 @@ def line_log_odds(
     if lines is None:
         return np.full(table.shape[1], -np.inf)
     found: FloatArray = own_evidence(table, lines, width_px, has_colour=has_colour) @ weights.own
-    return found
+    return found + place_evidence(table, found, width_px)
 
 
 def _length_in_a_row(table: FloatArray, width_px: int) -> FloatArray:
@@ -532,109 +598,6 @@ def _length_in_a_row(table: FloatArray, width_px: int) -> FloatArray:
     linked |= linked.T | np.eye(len(ends), dtype=bool)
     _, row = connected_components(csr_array(linked), directed=False)
     return np.asarray(np.bincount(row, table[LENGTH])[row], np.float64)
-
-
-def continued(table: FloatArray, log_odds: FloatArray, least: float, width_px: int) -> BoolArray:
-    """Mark the pieces that are lines: likely ones, and less likely ones that continue them.
-
-    Parameters
-    ----------
-    table : array, shape (12, P)
-        Measures of all pieces of one picture.
-    log_odds : array, shape (P,)
-        That each is a line.
-    least : float
-        Log odds from which on a piece needs no other.
-    width_px : int
-        Of the picture.
-
-    Returns
-    -------
-    bool array, shape (P,)
-    """
-    keep: BoolArray = log_odds >= least
-    waiting = np.flatnonzero(~keep & (log_odds >= least - _EVIDENCE.help))
-    new = np.flatnonzero(keep)
-    ends = _ends(table)
-    while len(new) and len(waiting):
-        goes_on = np.zeros(len(waiting), bool)
-        for k in new:
-            goes_on |= _goes_on(ends[k], ends[waiting], width_px)
-        new = waiting[goes_on]
-        keep[new] = True
-        waiting = waiting[~goes_on]
-    return keep
-
-
-def extended(segments: StripeSegments, keep: BoolArray) -> list[IntArray]:
-    """Return the chains of peaks of kept pieces, each with the peaks that follow at its ends.
-
-    A piece ends at a kink or a gap; a few peaks beyond may still belong to the line.
-
-    Parameters
-    ----------
-    segments : StripeSegments
-    keep : bool array, shape (P,)
-        Which pieces are lines.
-    """
-    peaks = segments.peaks
-    first_of = np.searchsorted(peaks.line, np.arange(len(segments.search.lowest) + 1))
-    chains = [
-        segments.order[segments.start[k] : segments.start[k + 1]] for k in np.flatnonzero(keep)
-    ]
-    used = np.zeros(len(peaks), bool)
-    for chain in chains:
-        used[chain] = True
-    longer = []
-    for chain in chains:
-        after = _following(chain, 1, peaks.line, peaks.position, peaks.height, first_of, used)
-        before = _following(
-            chain[::-1], -1, peaks.line, peaks.position, peaks.height, first_of, used
-        )
-        longer.append(np.concatenate([before[::-1], chain, after]))
-    return longer
-
-
-@kernel
-def _following(
-    chain: IntArray,
-    step: int,
-    line: IntArray,
-    position: FloatArray,
-    height: FloatArray,
-    first_of: IntArray,
-    used: BoolArray,
-) -> IntArray:
-    """Return and mark the peaks that follow the last one of a chain, one a search line."""
-    n = chain.shape[0]
-    # Extension of a line at its end: most peaks; largest distance in pixels from the extrapolation
-    # by its slope over this many peaks; least height as a share of the line's; and limit of the
-    # search lines missed.
-    max_following, follow_px, slope_peaks, min_height_share, max_missed = 8, 1.2, 6, 0.3, 4
-    last, back = chain[n - 1], chain[max(n - 1 - slope_peaks, 0)]
-    slope = (position[last] - position[back]) / max(abs(line[last] - line[back]), 1)
-    least = min_height_share * np.median(height[chain])
-    found = np.empty(max_following, np.int64)
-    n_found, x, place, gap = 0, line[last], position[last], 0
-    while n_found < max_following and gap < max_missed:
-        x += step
-        if x < 0 or x >= first_of.shape[0] - 1:
-            break
-        gap += 1
-        best, best_miss = -1, follow_px
-        for i in range(first_of[x], first_of[x + 1]):
-            miss = abs(position[i] - (place + slope * gap))
-            if miss < best_miss and height[i] >= least:
-                best, best_miss = i, miss
-        if best < 0:
-            continue
-        if used[best]:
-            break
-        place, gap = position[best], 0
-        used[best] = True
-        found[n_found] = best
-        n_found += 1
-    return found[:n_found].copy()
 
 
 def _ends(table: FloatArray) -> FloatArray:

@@ -12,20 +12,12 @@ from aqualvs.scanning.laser_bands import SLOPE_CELL, LaserBand, SearchAxis, pixe
 from aqualvs.scanning.laser_colour import LaserColour
 from aqualvs.scanning.scan import Frame, ImagePlane, planes_of_image
 from aqualvs.scanning.stripe import StripePeaks
-from aqualvs.scanning.stripe_segments import (
-    LENGTH as LENGTH,
-)
+from aqualvs.scanning.stripe_continuation import continued, extended
 from aqualvs.scanning.stripe_segments import (
     SMOOTHING as SMOOTHING,
 )
 from aqualvs.scanning.stripe_segments import (
     StripeSegments as StripeSegments,
-)
-from aqualvs.scanning.stripe_segments import (
-    continued as continued,
-)
-from aqualvs.scanning.stripe_segments import (
-    extended as extended,
 )
 from aqualvs.scanning.stripe_segments import (
     find_segments as find_segments,
@@ -51,7 +43,8 @@ class UncalibratedStripeOptions:
         Least likelihood, 0 to 1, that a piece of stripe is a laser's line, by its shape and colour
         and by the picture's other lines.
     min_length_share : float
-        Shortest unbroken piece of a stripe, as a share of the picture's width.
+        Shortest unbroken piece of a stripe that continues no other, as a share of the picture's
+        width.
     wavelength_nm : float or None
         Of the lasers; green if None.
     """
@@ -124,15 +117,17 @@ def find_stripes(
     table = np.concatenate([segments.table for segments in found], axis=1)
     log_odds = line_log_odds(table, width, has_colour=frame.chroma is not None)
     least = math.log(options.min_likelihood / (1.0 - options.min_likelihood))
-    keep = continued(table, log_odds, least, width)
-    keep &= table[LENGTH] >= options.min_length_share * width
-    parts, first = [], 0
+    size_px = width, frame.luma.shape[0]
+    keep, line = continued(found, log_odds, least, options.min_length_share * width, size_px)
+    parts: dict[int, list[StripePixels]] = {}
+    first = 0
     for segments in found:
-        n = len(segments.start) - 1
-        for chain in extended(segments, keep[first : first + n]):
-            parts.append(_piece(segments.search, segments.peaks, chain))
-        first += n
-    stripes = _joined([segment for segment in parts if _is_long(segment)])
+        here = slice(first, first + len(segments.start) - 1)
+        chains = extended(segments, keep[here])
+        for of, chain in zip(line[here][keep[here]], chains, strict=True):
+            parts.setdefault(int(of), []).append(_piece(segments.search, segments.peaks, chain))
+        first = here.stop
+    stripes = _joined([piece for of in parts.values() for piece in _unless_blob(of)])
     return replace(stripes, sigma_px=_sigma_px(frame.luma, stripes))
 
 
@@ -166,7 +161,7 @@ def _piece(search: LaserBand, peaks: StripePeaks, chain: IntArray) -> StripePixe
     width = peaks.width[chain]
     # At just 45 degrees one of the axes must have it.
     steep_enough = np.abs(slope) <= _STEEPEST * (1.0 if axis is SearchAxis.ALONG_Y else 0.999999)
-    keep = steep_enough & ~_in_dot(width / search.line_px)
+    keep = steep_enough & ~_in_dot(width, search.line_px)
     chain, line, slope = chain[keep], line[keep], slope[keep]
     along_x = axis is SearchAxis.ALONG_X
     cosine = 1.0 / np.hypot(1.0, slope)
@@ -183,15 +178,17 @@ def _piece(search: LaserBand, peaks: StripePeaks, chain: IntArray) -> StripePixe
     )
 
 
-def _in_dot(width: FloatArray) -> BoolArray:
-    """Mark the peaks (N,) of a chain that lie on a dot; widths are in search lines."""
+def _in_dot(width: FloatArray, line_px: int) -> BoolArray:
+    """Mark the peaks (N,) of a chain that lie on a dot, by their widths in pixels."""
     # Returns wider than this many median widths of their chain are a dot on the stripe, unless they
     # go on for longer than this many of their own widths: then a pale surface saturates the camera.
     max_width, longest_dot = 1.8, 1.5
-    wide = width > max_width * np.median(width)
+    # The measured width of a thinner line tells where it lies between two pixels.
+    thinnest_px = 2.0
+    wide = width > max_width * max(float(np.median(width)), thinnest_px)
     bounds = np.flatnonzero(np.diff(wide, prepend=False, append=False))
     for first, end in bounds.reshape(-1, 2):
-        if end - first > longest_dot * np.median(width[first:end]):
+        if line_px * (end - first) > longest_dot * np.median(width[first:end]):
             wide[first:end] = False
     return wide
 
@@ -255,14 +252,17 @@ def _slopes(line: FloatArray, position: FloatArray) -> FloatArray:
     return slope
 
 
-def _is_long(segment: StripePixels) -> bool:
-    if len(segment) < 3:
-        return False
-    length = float(np.hypot(*(segment.pixels[-1] - segment.pixels[0])))
-    # A chain shorter than this many of its own widths is a blob: the beam's own dot, a glint, a
+def _unless_blob(line: list[StripePixels]) -> list[StripePixels]:
+    """Return the pieces of a line that have at least three points; none if they are a blob."""
+    pieces = [piece for piece in line if len(piece) >= 3]
+    if not pieces:
+        return []
+    length = sum(float(np.hypot(*(piece.pixels[-1] - piece.pixels[0]))) for piece in pieces)
+    # A line shorter than this many of its own widths is a blob: the beam's own dot, a glint, a
     # mark.
     min_length_in_widths = 2.5
-    return length >= min_length_in_widths * float(np.median(segment.width))
+    width = np.median(np.concatenate([piece.width for piece in pieces]))
+    return pieces if length >= min_length_in_widths * float(width) else []
 
 
 def _joined(parts: list[StripePixels]) -> StripePixels:
