@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from aqualvs.scanning.laser_bands import LaserBand, SearchAxis
 from aqualvs.scanning.laser_colour import LaserColour
@@ -11,6 +12,7 @@ from aqualvs.scanning.stripe import StripePeaks
 from aqualvs.scanning.stripe_continuation import continued as continued
 from aqualvs.scanning.stripe_segments import FIRST_X, FIRST_Y, LAST_X, LAST_Y, LENGTH, WIDTH
 from aqualvs.scanning.stripe_segments import StripeSegments as StripeSegments
+from aqualvs.scanning.stripe_segments import place_evidence as place_evidence
 
 SIZE = (320, 240)
 # x of the first and of the last peak, y of the first, and slope.
@@ -105,3 +107,51 @@ def test_other_things_continue_a_line_as_seldom_as_stated(n_others: int) -> None
     # from there. A third of all run alike: 1 + 1/2 + ... + 1/70 is 4.8. Three sigmas of a count.
     expected = 2 * 0.01 * 4.8 * n_pictures
     assert n_added < expected + 3.0 * math.sqrt(expected)
+
+
+def table_of(middle: NDArray[np.float64], angle: NDArray[np.float64]) -> NDArray[np.float64]:
+    table = np.zeros((12, len(angle)))
+    half = 10.0 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    table[[FIRST_X, FIRST_Y]], table[[LAST_X, LAST_Y]] = (middle - half).T, (middle + half).T
+    table[LENGTH] = 20.0
+    return table
+
+
+def test_where_the_lines_of_a_picture_lie_is_evidence() -> None:
+    rng = np.random.default_rng(4)
+    n_lines, n_others = 10, 200
+    at = np.stack([rng.uniform(0, 320, n_lines), rng.normal(100.0, 3.0, n_lines)], axis=-1)
+    others = rng.uniform((0, 0), SIZE, (n_others, 2))
+    asked = np.array([[150.0, 102.0], [150.0, 102.0], [150.0, 200.0]])
+    table = table_of(
+        np.concatenate([asked, at, others]),
+        np.concatenate([[0.0, 1.2, 0.0], rng.normal(0.0, 0.05, n_lines), rng.uniform(0, 3, 200)]),
+    )
+    log_odds = np.concatenate([[0.5] * 3, np.full(n_lines, 3.0), np.full(n_others, -3.0)])
+    along, across, below = place_evidence(table, log_odds, SIZE[0])[:3]
+    assert along > 2.0
+    # Lines may lie elsewhere: as five unknown ones of fifteen.
+    assert across == pytest.approx(math.log(5.0 / 15.0), abs=0.1)
+    assert below == pytest.approx(math.log(5.0 / 15.0), abs=0.1)
+
+
+def test_without_certain_lines_places_tell_nothing() -> None:
+    rng = np.random.default_rng(5)
+    table = table_of(rng.uniform((0, 0), SIZE, (50, 2)), rng.uniform(0, 3, 50))
+    assert place_evidence(table, np.full(50, 1.0), SIZE[0]) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_one_certain_line_rules_out_little() -> None:
+    """Lasers that cross: one was seen well, the other not."""
+    rng = np.random.default_rng(6)
+    table = table_of(np.full((102, 2), 100.0), np.concatenate([[0.0, 1.5], rng.uniform(0, 3, 100)]))
+    log_odds = np.concatenate([[3.0, 0.5], np.full(100, -3.0)])
+    assert place_evidence(table, log_odds, SIZE[0])[1] > math.log(5.0 / 6.0) - 0.01
+
+
+def test_lines_that_lie_as_other_things_do_tell_nothing() -> None:
+    rng = np.random.default_rng(7)
+    table = table_of(rng.uniform((0, 0), SIZE, (2000, 2)), rng.uniform(0, math.pi, 2000))
+    log_odds = np.where(np.arange(2000) % 2 == 0, 3.0, -3.0)
+    # Each density is the mean of some twenty neighbours, a third of them.
+    assert np.abs(np.median(place_evidence(table, log_odds, SIZE[0]))) < 0.2
