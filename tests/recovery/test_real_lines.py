@@ -30,8 +30,8 @@ def test_green_lines_without_a_rig(line_scores, fmt: str) -> None:
     ]
     assert (len(bright), len(dark)) == (4, 3)
     assert {s.picture: s.found for s in bright if s.found < 0.95} == {}
-    assert {s.picture: s.weakest for s in bright if s.weakest < 0.85} == {}
-    assert {s.picture: s.found for s in dark if s.found < 0.8} == {}
+    assert {s.picture: s.weakest for s in bright if s.weakest < 0.95} == {}
+    assert {s.picture: s.found for s in dark if s.found < 0.85} == {}
 
 
 @pytest.mark.samples
@@ -43,9 +43,9 @@ def test_nothing_is_found_without_laser(line_scores, fmt: str) -> None:
 
 
 @pytest.mark.samples
-@pytest.mark.parametrize(("fmt", "n_min"), [("png", 8), ("jpg80", 7), ("crf23", 4)])
+@pytest.mark.parametrize(("fmt", "n_min"), [("png", 9), ("jpg80", 9), ("crf23", 8)])
 def test_red_lines_of_pairs(line_scores, fmt: str, n_min: int) -> None:
-    """What is reached of 8: at 320 x 240, compression takes what colour a thin line has left."""
+    """At 320 x 240, compression takes what colour a thin line has left; 10, 10 and 9 are reached."""
     pairs = [s for s in line_scores[fmt] if s.group == "pair"]
     assert len(pairs) == 10
     assert sum(s.found >= 0.9 for s in pairs) >= n_min
