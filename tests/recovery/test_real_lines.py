@@ -45,7 +45,7 @@ def test_nothing_is_found_without_laser(line_scores, fmt: str) -> None:
 @pytest.mark.samples
 @pytest.mark.parametrize(("fmt", "n_min"), [("png", 9), ("jpg80", 9), ("crf23", 8)])
 def test_red_lines_of_pairs(line_scores, fmt: str, n_min: int) -> None:
-    """At 320 x 240, compression takes what colour a thin line has left; 10, 10 and 9 are reached."""
+    """Compression takes what colour a line of a pixel has left; 10, 10 and 9 are reached."""
     pairs = [s for s in line_scores[fmt] if s.group == "pair"]
     assert len(pairs) == 10
     assert sum(s.found >= 0.9 for s in pairs) >= n_min
