@@ -1,29 +1,36 @@
-"""Stripes in a whole picture, for lasers whose planes are not known yet."""
+"""Stripes in a whole picture, for lasers whose planes are not known yet.
+
+Compression takes the colour of a thin line piece by piece, and print or a dark surface its height,
+so that what is left of it, taken alone, may as well be another thing. A line's own direction at its
+end leads to a window that widens with the way, as the direction is uncertain and the surface may
+bend. How many other pieces are at least as likely to be a line, and run the same way, is counted in
+the picture itself. A piece continues the line if a hundredth of such a piece, or less, is expected
+by chance in the window up to it (the number of false alarms of Desolneux, Moisan and Morel 2000,
+"Meaningful Alignments"). Only peaks that were found are added, and nothing where no piece is
+certain.
+"""
 
 import math
+from collections import deque
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 
 from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.geometry.compiled import kernel
 from aqualvs.scanning.laser_bands import SLOPE_CELL, LaserBand, SearchAxis, pixels_per_line
 from aqualvs.scanning.laser_colour import LaserColour
 from aqualvs.scanning.scan import Frame, ImagePlane, planes_of_image
 from aqualvs.scanning.stripe import StripePeaks
-from aqualvs.scanning.stripe_continuation import continued, extended
 from aqualvs.scanning.stripe_segments import (
-    SMOOTHING as SMOOTHING,
-)
-from aqualvs.scanning.stripe_segments import (
-    StripeSegments as StripeSegments,
-)
-from aqualvs.scanning.stripe_segments import (
-    find_segments as find_segments,
-)
-from aqualvs.scanning.stripe_segments import (
-    line_log_odds as line_log_odds,
+    LENGTH,
+    SMOOTHING,
+    StripeSegments,
+    find_segments,
+    line_log_odds,
 )
 
 # A stripe at less than 45 degrees to a search line is left to the other axis.
@@ -31,6 +38,12 @@ _STEEPEST = 1.0
 # Full width at half height of a normal distribution, in standard deviations.
 _WIDTH_OF_SIGMA = 2.355
 _MAP_LENGTH = 30000
+# Pieces that are less likely than needed by more than these log odds continue nothing.
+_HELP = 2.0
+# Pieces expected by chance in the window up to one that continues a line. Of the pieces of a class
+# the k-th likeliest is met with this chance over k, so that some hundredths of all ends are
+# continued by another thing.
+_MAX_FALSE_ALARMS = 0.01
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -284,3 +297,273 @@ def _joined(parts: list[StripePixels]) -> StripePixels:
         np.concatenate([part.width for part in parts]),
         np.concatenate([part.sigma_px for part in parts]),
     )
+
+
+class _Window(NamedTuple):
+    """Where a line may go on beyond its end."""
+
+    # Half width in pixels, and its growth for each pixel of the way on bent surfaces; largest
+    # change of direction in radians there; standard deviations of what noise adds to both. Pieces
+    # may overlap by some pixels.
+    half_px: float = 0.75
+    widening: float = 0.04
+    turn_rad: float = 0.15
+    n_sigmas: float = 2.0
+    overlap_px: float = 2.5
+
+
+_WINDOW = _Window()
+
+
+class _Ends(NamedTuple):
+    """Both ends of pieces, P of them.
+
+    Attributes
+    ----------
+    at : array, shape (P, 2, 2)
+        First and last point of a straight fit to the peaks at that end.
+    outward : array, shape (P, 2, 2)
+        Unit vectors along it, away from the piece.
+    sigma_px, sigma_rad : array, shape (P, 2)
+        Standard deviations of its place across the piece and of its direction.
+    is_steep : bool array, shape (P,)
+        Whether the piece is nearer to its search lines than to a right angle with them; then the
+        other search direction has it.
+    """
+
+    at: FloatArray
+    outward: FloatArray
+    sigma_px: FloatArray
+    sigma_rad: FloatArray
+    is_steep: BoolArray
+
+
+def continued(
+    found: list[StripeSegments],
+    log_odds: FloatArray,
+    least: float,
+    min_length_px: float,
+    size_px: tuple[int, int],
+) -> tuple[BoolArray, IntArray]:
+    """Mark the pieces that are lines: likely long ones, and others that continue these.
+
+    Parameters
+    ----------
+    found : list of StripeSegments
+        All pieces of one picture, P in all.
+    log_odds : array, shape (P,)
+        That each is a line.
+    least : float
+        Log odds from which on a piece needs no other.
+    min_length_px : float
+        Length from which on it needs no other.
+    size_px : tuple of int
+        Width and height of the picture.
+
+    Returns
+    -------
+    is_line : bool array, shape (P,)
+    line : int array, shape (P,)
+        Number of the line that a piece belongs to, -1 if to none. Its other pieces may be of the
+        other search direction.
+    """
+    length = np.concatenate([segments.table[LENGTH] for segments in found])
+    pool = np.flatnonzero(log_odds >= least - _HELP)
+    is_line, line = np.zeros(len(length), bool), np.full(len(length), -1)
+    ends = _ends(found, pool)
+    in_line = (log_odds[pool] >= least) & (length[pool] >= min_length_px)
+    by_chance = np.flatnonzero(~in_line & ~ends.is_steep)
+    root = np.arange(len(pool))
+    waiting = deque(int(a) for a in np.flatnonzero(in_line))
+    area_px = float(size_px[0] * size_px[1])
+    while waiting:
+        a = waiting.popleft()
+        for end in (0, 1):
+            b = _next_piece(ends, a, end, log_odds[pool], in_line, by_chance, area_px)
+            if b < 0:
+                continue
+            root[root == root[b]] = root[a]
+            if not in_line[b]:
+                in_line[b] = True
+                waiting.append(b)
+    is_line[pool[in_line]] = True
+    line[pool[in_line]] = root[in_line]
+    return is_line, line
+
+
+def _next_piece(
+    ends: _Ends,
+    a: int,
+    end: int,
+    log_odds: FloatArray,
+    in_line: BoolArray,
+    by_chance: IntArray,
+    area_px: float,
+) -> int:
+    """Return the piece that continues piece `a` beyond one of its ends, or -1."""
+    ahead, way_px, near = _ahead(ends, a, end)
+    turn = _turn(ends.outward[a, end], ends.outward[by_chance, 1])
+    for b in ahead[np.argsort(way_px[ahead])]:
+        turn_rad = _turn_limit(ends.sigma_rad[a, end], ends.sigma_rad[b, near[b]])
+        others = (log_odds[by_chance] >= log_odds[b]) & (turn <= turn_rad)
+        # One at least, so that windows do not reach across a picture with little else in it.
+        n = max(int(np.count_nonzero(others)), 1)
+        if n / area_px * _window_px(ends, a, end, way_px[b]) <= _MAX_FALSE_ALARMS:
+            return int(b)
+        if in_line[b]:
+            break
+    return -1
+
+
+def _ahead(ends: _Ends, a: int, end: int) -> tuple[IntArray, FloatArray, IntArray]:
+    """Return the pieces in the window of an end; of all pieces, the way there and the near end."""
+    along = ends.outward[a, end]
+    off = ends.at - ends.at[a, end]
+    way, across = off @ along, off @ np.array([-along[1], along[0]])
+    near = np.argmin(way, axis=1)
+    every = np.arange(len(way))
+    way_px, far_px, beside_px = way[every, near], way[every, 1 - near], across[every, near]
+    noise = ends.sigma_px[a, end] ** 2 + (ends.sigma_rad[a, end] * way_px) ** 2
+    noise = np.sqrt(noise + ends.sigma_px[every, near] ** 2)
+    half_px = _WINDOW.half_px + _WINDOW.widening * np.maximum(way_px, 0.0)
+    inside = np.abs(beside_px) <= half_px + _WINDOW.n_sigmas * noise
+    inside &= (way_px > -_WINDOW.overlap_px) & (far_px > np.maximum(way_px, 0.0))
+    limit = _turn_limit(ends.sigma_rad[a, end], ends.sigma_rad[every, near])
+    inside &= _turn(along, ends.outward[every, 1 - near]) <= limit
+    inside &= ~ends.is_steep
+    inside[a] = False
+    return np.flatnonzero(inside), way_px, near
+
+
+def _turn(along: FloatArray, others: FloatArray) -> FloatArray:
+    """Return the angles (N,) between a direction and others (N, 2), whichever way these point."""
+    turn: FloatArray = np.arccos(np.minimum(np.abs(others @ along), 1.0))
+    return turn
+
+
+def _turn_limit(one_rad: FloatArray, other_rad: FloatArray) -> FloatArray:
+    limit: FloatArray = _WINDOW.turn_rad + _WINDOW.n_sigmas * np.hypot(one_rad, other_rad)
+    return limit
+
+
+def _window_px(ends: _Ends, a: int, end: int, way_px: float) -> float:
+    """Return the area of the window of an end up to a way."""
+    way_px = max(way_px, 1.0)
+    half_px = _WINDOW.half_px + _WINDOW.n_sigmas * float(ends.sigma_px[a, end])
+    widening = _WINDOW.widening + _WINDOW.n_sigmas * float(ends.sigma_rad[a, end])
+    return (2.0 * half_px + widening * way_px) * way_px
+
+
+def _ends(found: list[StripeSegments], pool: IntArray) -> _Ends:
+    """Fit straight lines to both ends of the pieces `pool`."""
+    n = len(pool)
+    points, sigmas = np.zeros((2, n, 2, 2)), np.zeros((2, n, 2))
+    ends = _Ends(points[0], points[1], sigmas[0], sigmas[1], np.zeros(n, bool))
+    first = 0
+    for segments in found:
+        last = first + len(segments.start) - 1
+        line = segments.search.line_px * (segments.peaks.line.astype(np.float64) + 0.5) - 0.5
+        mine = np.flatnonzero((pool >= first) & (pool < last))
+        for i in mine:
+            k = pool[i] - first
+            chain = segments.order[segments.start[k] : segments.start[k + 1]]
+            x, y = line[chain], segments.peaks.position[chain]
+            _fit_ends(x, y, ends, int(i))
+            ends.is_steep[i] = abs(y[-1] - y[0]) > x[-1] - x[0]
+        if segments.search.axis is SearchAxis.ALONG_X:
+            ends.at[mine] = ends.at[mine][..., ::-1]
+            ends.outward[mine] = ends.outward[mine][..., ::-1]
+        first = last
+    return ends
+
+
+def _fit_ends(line: FloatArray, position: FloatArray, ends: _Ends, i: int) -> None:
+    """Write the ends of piece i, with search lines as x."""
+    # Peaks to fit, and least noise of a peak in pixels: neighbours share the noise that smoothing
+    # along the stripe leaves.
+    n_fit, min_sigma_px = 16, 0.3
+    for end, peaks in ((0, slice(None, n_fit)), (1, slice(-n_fit, None))):
+        x, y = line[peaks], position[peaks]
+        n, middle = len(x), x.mean()
+        spread = float(((x - middle) ** 2).sum())
+        slope = float(((x - middle) * y).sum()) / spread
+        left = y - y.mean() - slope * (x - middle)
+        sigma = max(math.sqrt(float((left**2).sum()) / max(n - 2, 1)), min_sigma_px)
+        cosine = 1.0 / math.hypot(1.0, slope)
+        at = x[-end]
+        ends.at[i, end] = at, y.mean() + slope * (at - middle)
+        ends.outward[i, end] = np.array([cosine, slope * cosine]) * (1.0 if end else -1.0)
+        place = math.sqrt(1.0 / n + (at - middle) ** 2 / spread)
+        ends.sigma_px[i, end] = sigma * cosine * place
+        ends.sigma_rad[i, end] = sigma * cosine**2 / math.sqrt(spread)
+
+
+def extended(segments: StripeSegments, keep: BoolArray) -> list[IntArray]:
+    """Return the chains of peaks of kept pieces, each with the peaks that follow at its ends.
+
+    A piece ends at a kink or a gap; a few peaks beyond may still belong to the line.
+
+    Parameters
+    ----------
+    segments : StripeSegments
+    keep : bool array, shape (P,)
+        Which pieces are lines.
+    """
+    peaks = segments.peaks
+    first_of = np.searchsorted(peaks.line, np.arange(len(segments.search.lowest) + 1))
+    chains = [
+        segments.order[segments.start[k] : segments.start[k + 1]] for k in np.flatnonzero(keep)
+    ]
+    used = np.zeros(len(peaks), bool)
+    for chain in chains:
+        used[chain] = True
+    longer = []
+    for chain in chains:
+        after = _following(chain, 1, peaks.line, peaks.position, peaks.height, first_of, used)
+        before = _following(
+            chain[::-1], -1, peaks.line, peaks.position, peaks.height, first_of, used
+        )
+        longer.append(np.concatenate([before[::-1], chain, after]))
+    return longer
+
+
+@kernel
+def _following(
+    chain: IntArray,
+    step: int,
+    line: IntArray,
+    position: FloatArray,
+    height: FloatArray,
+    first_of: IntArray,
+    used: BoolArray,
+) -> IntArray:
+    """Return and mark the peaks that follow the last one of a chain, one a search line."""
+    n = chain.shape[0]
+    # Extension of a line at its end: most peaks; largest distance in pixels from the extrapolation
+    # by its slope over this many peaks; least height as a share of the line's; and limit of the
+    # search lines missed.
+    max_following, follow_px, slope_peaks, min_height_share, max_missed = 8, 1.2, 6, 0.3, 4
+    last, back = chain[n - 1], chain[max(n - 1 - slope_peaks, 0)]
+    slope = (position[last] - position[back]) / max(abs(line[last] - line[back]), 1)
+    least = min_height_share * np.median(height[chain])
+    found = np.empty(max_following, np.int64)
+    n_found, x, place, gap = 0, line[last], position[last], 0
+    while n_found < max_following and gap < max_missed:
+        x += step
+        if x < 0 or x >= first_of.shape[0] - 1:
+            break
+        gap += 1
+        best, best_miss = -1, follow_px
+        for i in range(first_of[x], first_of[x + 1]):
+            miss = abs(position[i] - (place + slope * gap))
+            if miss < best_miss and height[i] >= least:
+                best, best_miss = i, miss
+        if best < 0:
+            continue
+        if used[best]:
+            break
+        place, gap = position[best], 0
+        used[best] = True
+        found[n_found] = best
+        n_found += 1
+    return found[:n_found].copy()
