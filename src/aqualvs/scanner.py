@@ -77,23 +77,12 @@ class _Stripes(NamedTuple):
 
 
 class _Choice(NamedTuple):
-    """The target among the surfaces of a frame, and what speaks against it.
+    """The target among the surfaces of a frame, and what speaks against it."""
 
-    Attributes
-    ----------
-    surfaces : list of Surface
-        Of the requested kind.
-    target : Surface or None
-    before : Surface or None
-        A surface before the target that may be the net instead.
-    tested : AssignmentOutcome
-        Of the target's peaks, read as other lasers'.
-    """
-
-    surfaces: list[Surface]
+    surfaces: list[Surface]  # Of the requested kind.
     target: Surface | None = None
-    before: Surface | None = None
-    tested: AssignmentOutcome = NOT_TESTED
+    before: Surface | None = None  # A surface before the target that may be the net instead.
+    tested: AssignmentOutcome = NOT_TESTED  # Of the target's peaks, read as other lasers'.
 
 
 @dataclass(frozen=True, slots=True)

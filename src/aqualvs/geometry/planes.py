@@ -10,21 +10,14 @@ from aqualvs.geometry.arrays import BoolArray, FloatArray, as_vectors
 
 @dataclass(frozen=True, slots=True)
 class Rays:
-    """A batch of rays in one coordinate frame.
+    """A batch of rays in one coordinate frame."""
 
-    Attributes
-    ----------
-    origins : array, shape (..., 3)
-        Where each ray starts, in metres.
-    directions : array, shape (..., 3)
-        Unit directions, away from the camera.
-    valid : bool array, shape (...)
-        False where no such ray exists (total reflection, pixel outside the lens model). Origins
-        and directions are NaN there.
-    """
-
+    # Shape (..., 3): where each ray starts, in metres.
     origins: FloatArray
+    # Shape (..., 3): unit directions, away from the camera.
     directions: FloatArray
+    # Shape (...): False where no such ray exists (total reflection, pixel outside the lens model).
+    # Origins and directions are NaN there.
     valid: BoolArray
 
     def points_at(self, distances: FloatArray) -> FloatArray:
@@ -35,18 +28,10 @@ class Rays:
 
 @dataclass(frozen=True, slots=True)
 class Plane:
-    """The plane normal·X = offset in one coordinate frame.
+    """The plane normal·X = offset in one coordinate frame."""
 
-    Attributes
-    ----------
-    normal : array, shape (3,)
-        Unit normal.
-    offset : float
-        Signed distance of the plane from the origin along the normal, in metres.
-    """
-
-    normal: FloatArray
-    offset: float
+    normal: FloatArray  # Shape (3,): unit normal.
+    offset: float  # Signed distance of the plane from the origin along the normal, in metres.
 
     @classmethod
     def from_normal(cls, normal: ArrayLike, offset: float) -> "Plane":

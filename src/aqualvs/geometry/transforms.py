@@ -92,17 +92,11 @@ def quaternion_from_rotation(rotation: FloatArray) -> tuple[float, float, float,
 
 @dataclass(frozen=True, slots=True)
 class SE3:
-    """A rigid transform `dst_from_src`, possibly a batch of them.
+    """A rigid transform `dst_from_src`, possibly a batch of them."""
 
-    Attributes
-    ----------
-    rotation : array, shape (..., 3, 3)
-        Rotation part.
-    translation : array, shape (..., 3)
-        Origin of the source frame in the destination frame, in metres.
-    """
-
+    # Shape (..., 3, 3): rotation part.
     rotation: FloatArray
+    # Shape (..., 3): origin of the source frame in the destination frame, in metres.
     translation: FloatArray
 
     @classmethod

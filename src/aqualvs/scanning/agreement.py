@@ -170,20 +170,15 @@ _LEAST, _RIDGE = 1e-6, 1e-12
 
 @dataclass(frozen=True, slots=True)
 class SeenStripes:
-    """Stripes on flat-looking targets, as rays; F frames, L lasers, K bins.
+    """Stripes on flat-looking targets, as rays; F frames, L lasers, K bins."""
 
-    Attributes
-    ----------
-    origins, directions : array, shape (L, F, K, 3)
-        Of the rays, in `dome`.
-    beside : array, shape (L, F, K, 3, 2)
-        Origins and directions of the rays that pass `_STEP_PX` beside, across the stripe.
-    seen : bool array, shape (L, F, K)
-    """
-
+    # Shape (L, F, K, 3): of the rays, in `dome`.
     origins: FloatArray
     directions: FloatArray
+    # Shape (L, F, K, 3, 2): origins and directions of the rays that pass `_STEP_PX` beside, across
+    # the stripe.
     beside: FloatArray
+    # Shape (L, F, K).
     seen: BoolArray
 
     @classmethod
@@ -203,30 +198,20 @@ class SeenStripes:
 
 @dataclass(frozen=True, slots=True)
 class Explanation:
-    """Fit of the frames under the hypothesis that one laser, or none, has moved.
+    """Fit of the frames under the hypothesis that one laser, or none, has moved."""
 
-    Attributes
-    ----------
-    laser : int or None
-        The one that may have moved.
-    step : array, shape (3,)
-        Its step as `moved_plane` takes it: tilts (rad) and offset (m).
-    cost : float
-        Mean square residual in sigmas, none counted beyond `CUT`.
-    inliers : float
-        Share of residuals below `CUT`.
-    effect : float
-        Root mean square distance of that laser's stripe from the targets, as a share of range.
-    information : array, shape (3 L, 3 L)
-        Of the steps of all lasers, from a typical frame: errors of a stripe are the same in all
-        frames, so more frames add no information.
-    """
-
+    # The one that may have moved.
     laser: int | None
+    # Shape (3,): its step as `moved_plane` takes it: tilts (rad) and offset (m).
     step: FloatArray
+    # Mean square residual in sigmas, none counted beyond `CUT`.
     cost: float
+    # Share of residuals below `CUT`.
     inliers: float
+    # Root mean square distance of that laser's stripe from the targets, as a share of range.
     effect: float
+    # Shape (3 L, 3 L): of the steps of all lasers, from a typical frame: errors of a stripe are the
+    # same in all frames, so more frames add no information.
     information: FloatArray
 
     def covariance(self) -> FloatArray:
@@ -303,21 +288,15 @@ def _moved(sheet: Sheet, step: FloatArray) -> Sheet:
 
 @dataclass(frozen=True, slots=True)
 class _View:
-    """Points of stripes on the assumed sheets; frames first, the bins of all lasers in one axis.
+    """Points of stripes on the assumed sheets; frames first, the bins of all lasers in one axis."""
 
-    Attributes
-    ----------
-    points : array, shape (F, L K, 3)
-    per_px : array, shape (F, L K, 3)
-        Derivative of the points by a pixel across the stripe.
-    by_step : array, shape (F, L K, 3, 3)
-        Derivative of the points by a step of their own laser.
-    seen : bool array, shape (F, L K)
-    """
-
+    # Shape (F, L K, 3).
     points: FloatArray
+    # Shape (F, L K, 3): derivative of the points by a pixel across the stripe.
     per_px: FloatArray
+    # Shape (F, L K, 3, 3): derivative of the points by a step of their own laser.
     by_step: FloatArray
+    # Shape (F, L K).
     seen: BoolArray
 
     @classmethod
@@ -363,21 +342,15 @@ def _on_sheet(stripes: SeenStripes, laser: int, sheet: Sheet) -> _View:
 
 @dataclass(frozen=True, slots=True)
 class _Fit:
-    """Planes fitted to all frames, and their residuals.
+    """Planes fitted to all frames, and their residuals."""
 
-    Attributes
-    ----------
-    m : array, shape (F, 3)
-    weight, residual, z : array, shape (F, L K)
-        Weights by errors and outliers; residuals of m·X = 1, and the same in sigmas.
-    inverse : array, shape (F, 3, 3)
-        Of the planes' normal equations.
-    """
-
+    # Shape (F, 3).
     m: FloatArray
+    # Shape (F, L K): weights by errors and outliers; residuals of m·X = 1, and the same in sigmas.
     weight: FloatArray
     residual: FloatArray
     z: FloatArray
+    # Shape (F, 3, 3): of the planes' normal equations.
     inverse: FloatArray
 
     @classmethod
@@ -474,29 +447,19 @@ class AgreementState(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class AgreementVerdict:
-    """The verdict on the lasers: their agreement, and the suspects if they disagree.
-
-    Attributes
-    ----------
-    state : AgreementState
-    n_frames : int
-        Frames that the verdict is based on.
-    suspects : tuple of int
-        Lasers of which one has moved, numbered from 0, the likeliest first.
-    names : tuple of str
-        Of the suspects.
-    angle, sigma_angle : float
-        By how much the first of them has turned (rad) if it is the one; NaN without suspects.
-    effect : float
-        How far its stripe lies off the plane of the others, as a share of the range; NaN likewise.
-    """
+    """The verdict on the lasers: their agreement, and the suspects if they disagree."""
 
     state: AgreementState
+    # Frames that the verdict is based on.
     n_frames: int
+    # Lasers of which one has moved, numbered from 0, the likeliest first.
     suspects: tuple[int, ...] = ()
+    # Of the suspects.
     names: tuple[str, ...] = ()
+    # By how much the first of them has turned (rad) if it is the one; NaN without suspects.
     angle: float = math.nan
     sigma_angle: float = math.nan
+    # How far its stripe lies off the plane of the others, as a share of the range; NaN likewise.
     effect: float = math.nan
 
     def to_dict(self) -> dict[str, Any]:

@@ -320,32 +320,23 @@ def summarise(
 
 @dataclass(frozen=True, slots=True)
 class Subsegments:
-    """Subsegments of stripes, C of them, ordered by laser.
+    """Subsegments of stripes, C of them, ordered by laser."""
 
-    Attributes
-    ----------
-    of_candidate : int array, shape (N,)
-        Row of the subsegment that each candidate belongs to; ascending.
-    table : array, shape (7, C)
-        Rows as `plane_search` names them: centroid in `dome` (m), mean derivative of the points by
-        the stripe's position (m/px), and sampling weight: its light, but a long component
-        weighs no more than a few strands, because it may follow one strand off the sheet's middle.
-    intensity_weight : array, shape (C,)
-        Search lines in it, each weighted by the confidence that its peak is laser light.
-    n_lines : int array, shape (C,)
-        Search lines in it.
-    first_line, last_line : int array, shape (C,)
-        Its extent in search lines; separates lit from dark intervals.
-    laser : int array, shape (C,)
-        Index of the laser; ascending.
-    """
-
+    # Shape (N,): row of the subsegment that each candidate belongs to; ascending.
     of_candidate: IntArray
+    # Shape (7, C): rows as `plane_search` names them: centroid in `dome` (m), mean derivative of
+    # the points by the stripe's position (m/px), and sampling weight: its light, but a long
+    # component weighs no more than a few strands, because it may follow one strand off the sheet's
+    # middle.
     table: FloatArray
+    # Shape (C,): search lines in it, each weighted by the confidence that its peak is laser light.
     intensity_weight: FloatArray
+    # Shape (C,): search lines in it.
     n_lines: IntArray
+    # Shape (C,): its extent in search lines; separates lit from dark intervals.
     first_line: IntArray
     last_line: IntArray
+    # Shape (C,): index of the laser; ascending.
     laser: IntArray
 
     def __len__(self) -> int:
@@ -365,48 +356,33 @@ FORWARD: FloatArray = np.array([0.0, 1.0, 0.0])
 
 @dataclass(frozen=True, slots=True)
 class Candidates:
-    """Triangulated candidates, N of them, ordered by laser, segment and subsegment.
+    """Triangulated candidates, N of them, ordered by laser, segment and subsegment."""
 
-    Attributes
-    ----------
-    source : int array, shape (N,)
-        Number of the peak; equal for all candidates of one peak.
-    laser : int array, shape (N,)
-        Index of the laser that the peak is read as.
-    line : int array, shape (N,)
-        Search line.
-    component, subsegment : int array, shape (N,)
-        Numbers of the component (connected segments) and the subsegment; those of the subsegments
-        ascend.
-    pixels : array, shape (N, 2)
-        In `image`.
-    height, width : array, shape (N,)
-        Of the peak: grey levels, pixels.
-    sigma_px : array, shape (N,)
-        Standard deviation of the position along the search line.
-    confidence : array, shape (N,)
-        Confidence that the peak is laser light, from its height as a share of the frame's best and
-        its likelihood; 0 to 1.
-    pull : array, shape (N,)
-        Shift of the position by an uneven background, in pixels, as in `StripePeaks`.
-    points : array, shape (N, 3)
-        In `dome`, metres.
-    sensitivity : array, shape (N, 3)
-        Derivative of the point by the position, m/px.
-    """
-
+    # Shape (N,): number of the peak; equal for all candidates of one peak.
     source: IntArray
+    # Shape (N,): index of the laser that the peak is read as.
     laser: IntArray
+    # Shape (N,): search line.
     line: IntArray
+    # Shape (N,): numbers of the component (connected segments) and the subsegment; those of the
+    # subsegments ascend.
     component: IntArray
     subsegment: IntArray
+    # Shape (N, 2): in `image`.
     pixels: FloatArray
+    # Shape (N,): of the peak: grey levels, pixels.
     height: FloatArray
     width: FloatArray
+    # Shape (N,): standard deviation of the position along the search line.
     sigma_px: FloatArray
+    # Shape (N,): confidence that the peak is laser light, from its height as a share of the frame's
+    # best and its likelihood; 0 to 1.
     confidence: FloatArray
+    # Shape (N,): shift of the position by an uneven background, in pixels, as in `StripePeaks`.
     pull: FloatArray
+    # Shape (N, 3): in `dome`, metres.
     points: FloatArray
+    # Shape (N, 3): derivative of the point by the position, m/px.
     sensitivity: FloatArray
     # Cached: used by the search for surfaces and by the labels.
     _shapes: ComponentShapes | None = field(default=None, init=False, repr=False, compare=False)
@@ -506,33 +482,23 @@ class Candidates:
 
 @dataclass(frozen=True, slots=True)
 class Observations:
-    """Independent observations of a surface: centroids of M pieces of stripe.
+    """Independent observations of a surface: centroids of M pieces of stripe."""
 
-    Attributes
-    ----------
-    points, sensitivity : array, shape (M, 3)
-        Centroid in `dome` (m) and its derivative by the stripe's position (m/px).
-    sigma_px : array, shape (M,)
-        Standard deviation of that position.
-    glow : array, shape (M,)
-        Mean difference between the flanks of its peaks, as a share of their height, positive where
-        the background is brighter at greater positions.
-    width, height : array, shape (M,)
-        Of its peaks, means: full width at half height along the search line, in pixels; height
-        above the background, in grey levels.
-    line : array, shape (M,)
-        Mean search line.
-    laser : int array, shape (M,)
-        Index of the laser.
-    """
-
+    # Shape (M, 3): centroid in `dome` (m) and its derivative by the stripe's position (m/px).
     points: FloatArray
     sensitivity: FloatArray
+    # Shape (M,): standard deviation of that position.
     sigma_px: FloatArray
+    # Shape (M,): mean difference between the flanks of its peaks, as a share of their height,
+    # positive where the background is brighter at greater positions.
     glow: FloatArray
+    # Shape (M,): of its peaks, means: full width at half height along the search line, in pixels;
+    # height above the background, in grey levels.
     width: FloatArray
     height: FloatArray
+    # Shape (M,): mean search line.
     line: FloatArray
+    # Shape (M,): index of the laser.
     laser: IntArray
 
 

@@ -32,35 +32,25 @@ class SearchAxis(Enum):
 
 @dataclass(frozen=True, slots=True)
 class LaserBand:
-    """The search band of one laser in the image.
+    """The search band of one laser in the image."""
 
-    Attributes
-    ----------
-    axis : SearchAxis
-        Direction of the search lines.
-    line_px : int
-        Pixels across one search line, 1 or 2: the mean of so many rows or columns of pixels, or one
-        row of every two in a field.
-    lowest, highest : int array, shape (n_lines,)
-        First and last position of the band on each search line; lowest > highest where the laser
-        cannot be seen.
-    slope_low, slope_high : array, shape (ceil(length/8), ceil(n_lines/8))
-        Range of d(position)/d(line) that a plane target within 45 degrees of square allows, by
-        cell of 8 positions by 8 lines.
-    colour : LaserColour
-        Of the laser's light.
-    shift_px : float
-        Of the lines from the middle of the pixels that each stands for; 0 but for the rows of a
-        field.
-    """
-
+    # Direction of the search lines.
     axis: SearchAxis
+    # Pixels across one search line, 1 or 2: the mean of so many rows or columns of pixels, or one
+    # row of every two in a field.
     line_px: int
+    # Shape (n_lines,): first and last position of the band on each search line; lowest > highest
+    # where the laser cannot be seen.
     lowest: IntArray
     highest: IntArray
+    # Shape (ceil(length/8), ceil(n_lines/8)): range of d(position)/d(line) that a plane target
+    # within 45 degrees of square allows, by cell of 8 positions by 8 lines.
     slope_low: FloatArray
     slope_high: FloatArray
+    # Of the laser's light.
     colour: LaserColour = LaserColour.GREEN
+    # Of the lines from the middle of the pixels that each stands for; 0 but for the rows of a
+    # field.
     shift_px: float = 0.0
 
     @property

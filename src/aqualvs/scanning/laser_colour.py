@@ -166,45 +166,30 @@ def full_size(half: NDArray[np.float32], frame: Frame) -> NDArray[np.float32]:
 
 
 class Paint(NamedTuple):
-    """Colour of the paint in one frame, in levels of chroma for each grey level of height.
+    """Colour of the paint in one frame, in levels of chroma for each grey level of height."""
 
-    Attributes
-    ----------
-    u, v : float
-        Its middle.
-    spread_u, spread_v : float
-        Standard deviations, without noise.
-    """
-
+    # Its middle.
     u: float
     v: float
+    # Standard deviations, without noise.
     spread_u: float
     spread_v: float
 
 
 class LineColour(NamedTuple):
-    """Chroma step of the laser lines of one frame.
+    """Chroma step of the laser lines of one frame."""
 
-    Attributes
-    ----------
-    u, v : float
-        Unit vector in the (U, V) plane.
-    ratio : float
-        Levels along it for each grey level of a line's height.
-    sigma : float
-        Standard deviation of a step by noise alone, in levels.
-    along, across : float
-        Spread of lines about their mean, as shares of `ratio`, along their direction and across.
-    paint : Paint or None
-        Colour of the peaks that are not lines, where most are of one colour.
-    """
-
+    # Unit vector in the (U, V) plane.
     u: float
     v: float
+    # Levels along it for each grey level of a line's height.
     ratio: float
+    # Standard deviation of a step by noise alone, in levels.
     sigma: float
+    # Spread of lines about their mean, as shares of `ratio`, along their direction and across.
     along: float = _LIKELIHOOD.ratio_spread
     across: float = _LIKELIHOOD.across_spread
+    # Colour of the peaks that are not lines, where most are of one colour.
     paint: Paint | None = None
 
 

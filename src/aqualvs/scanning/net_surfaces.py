@@ -237,29 +237,20 @@ _UNBROKEN_SHARE, _UNBROKEN_LENGTHS = 0.4, 2.0
 
 
 class StripePattern(NamedTuple):
-    """Pattern of lit intervals and gaps of the stripes on a surface.
+    """Pattern of lit intervals and gaps of the stripes on a surface."""
 
-    Attributes
-    ----------
-    is_mesh : bool
-        As on a net: two lasers (or the only one asked) show short lit intervals between longer
-        gaps. One laser may run along a strand and look unbroken even on a net. Where little is
-        seen, a few short intervals and nothing longer are enough.
-    is_gappy : bool
-        As on a dense net, or as on a wall in the shadows of a net: short intervals at any gaps.
-    is_unbroken : bool
-        As on something solid, if need be with gaps: on two lasers (or the only one asked) much
-        of the light is in intervals longer than those on strands.
-    extent : float
-        Search lines over which the gappy stripes reach, summed over the lasers.
-    on_strands : array, shape (n_lasers,)
-        Light in intervals as short as those on a strand, and not curved.
-    """
-
+    # As on a net: two lasers (or the only one asked) show short lit intervals between longer gaps.
+    # One laser may run along a strand and look unbroken even on a net. Where little is seen, a few
+    # short intervals and nothing longer are enough.
     is_mesh: bool
+    # As on a dense net, or as on a wall in the shadows of a net: short intervals at any gaps.
     is_gappy: bool
+    # As on something solid, if need be with gaps: on two lasers (or the only one asked) much of the
+    # light is in intervals longer than those on strands.
     is_unbroken: bool
+    # Search lines over which the gappy stripes reach, summed over the lasers.
     extent: float
+    # Shape (n_lasers,): light in intervals as short as those on a strand, and not curved.
     on_strands: FloatArray
 
 

@@ -158,21 +158,14 @@ _FACING = 0.57
 
 @dataclass(frozen=True, slots=True)
 class Patch:
-    """A curved piece of net over a base plane.
+    """A curved piece of net over a base plane."""
 
-    Attributes
-    ----------
-    base : Plane
-        In `dome`; heights are measured along its normal.
-    right, up : array, shape (3,)
-        Unit vectors in the base plane along which u and v run, in `dome`.
-    coefficients : array, shape (6,)
-        a (m), b, c, p, q, r (1/m) of the height.
-    """
-
+    # In `dome`; heights are measured along its normal.
     base: Plane
+    # Shape (3,): unit vectors in the base plane along which u and v run, in `dome`.
     right: FloatArray
     up: FloatArray
+    # Shape (6,): a (m), b, c, p, q, r (1/m) of the height.
     coefficients: FloatArray
 
     def height(self, points: FloatArray) -> FloatArray:
@@ -192,24 +185,12 @@ class Patch:
 
 @dataclass(frozen=True, slots=True)
 class PatchFit:
-    """A fitted patch with its covariance.
+    """A fitted patch with its covariance."""
 
-    Attributes
-    ----------
-    patch : Patch
-        Least squares, robust.
-    covariance : array, shape (6, 6)
-        Of its coefficients.
-    weights : array, shape (M,)
-        Robust weight of each observation, 0 to 1.
-    rms : float
-        Weighted root mean square distance from the patch, in metres.
-    """
-
-    patch: Patch
-    covariance: FloatArray
-    weights: FloatArray
-    rms: float
+    patch: Patch  # Least squares, robust.
+    covariance: FloatArray  # Shape (6, 6): of its coefficients.
+    weights: FloatArray  # Shape (M,): robust weight of each observation, 0 to 1.
+    rms: float  # Weighted root mean square distance from the patch, in metres.
 
 
 def flat_patch(plane: Plane) -> Patch:

@@ -40,17 +40,11 @@ after the pull of a ramp is taken off.
 
 
 class SharedError(NamedTuple):
-    """Errors that points share, as standard deviations at each of N points in pixels.
+    """Errors that points share, as standard deviations at each of N points in pixels."""
 
-    Attributes
-    ----------
-    own : array, shape (N,)
-        Of the stripe of one laser: of its shift, and of its tilt at the image border.
-    common : array, shape (K, N)
-        Of all stripes together, one row for each cause, with its sign.
-    """
-
+    # Shape (N,): of the stripe of one laser: of its shift, and of its tilt at the image border.
     own: FloatArray
+    # Shape (K, N): of all stripes together, one row for each cause, with its sign.
     common: FloatArray
 
 
@@ -85,24 +79,12 @@ _STATED_COUNT = 10.0
 
 @dataclass(frozen=True, slots=True)
 class PlaneFit:
-    """A fitted plane m·X = 1 with its covariance.
+    """A fitted plane m·X = 1 with its covariance."""
 
-    Attributes
-    ----------
-    m : array, shape (3,)
-        Normal divided by distance (paper, Eq. 23), in 1/m.
-    covariance : array, shape (3, 3)
-        Of `m`, in 1/m².
-    weights : array, shape (N,)
-        Robust weight of each point, 0 (outlier) to 1.
-    rms : float
-        Weighted root mean square distance of the points from the plane, in metres.
-    """
-
-    m: FloatArray
-    covariance: FloatArray
-    weights: FloatArray
-    rms: float
+    m: FloatArray  # Shape (3,): normal divided by distance (paper, Eq. 23), in 1/m.
+    covariance: FloatArray  # Shape (3, 3): of `m`, in 1/m².
+    weights: FloatArray  # Shape (N,): robust weight of each point, 0 (outlier) to 1.
+    rms: float  # Weighted root mean square distance of the points from the plane, in metres.
 
 
 def fit_pseudo_inverse(points: FloatArray, n_groups: int, covariance: FloatArray) -> PlaneFit:

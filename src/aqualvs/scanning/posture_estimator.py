@@ -225,30 +225,21 @@ class FitMethod(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Measurement:
-    """A posture or its refusal, with the inliers and their weights.
+    """A posture or its refusal, with the inliers and their weights."""
 
-    Attributes
-    ----------
-    posture : Posture or Refusal
-        The result.
-    inliers : bool array, shape (N,)
-        Inliers: candidates in the posture; none where it is refused.
-    patch : Patch or None
-        The curved surface, where a plane does not describe the net.
-    net_mask : bool array, shape (N,), or None
-        Mask of the net: candidates on it, also where its folds leave the surface; None if the
-        target is no net.
-    weights : array, shape (N,), or None
-        Weight of each candidate in the fit, 1 over the variance of m·X; None without a posture.
-    folded : bool
-        Whether the posture is that of a folded net's mean plane.
-    """
-
+    # The result.
     posture: Posture | Refusal
+    # Shape (N,): inliers: candidates in the posture; none where it is refused.
     inliers: BoolArray
+    # The curved surface, where a plane does not describe the net.
     patch: Patch | None = None
+    # Shape (N,): mask of the net: candidates on it, also where its folds leave the surface; None if
+    # the target is no net.
     net_mask: BoolArray | None = None
+    # Shape (N,): weight of each candidate in the fit, 1 over the variance of m·X; None without a
+    # posture.
     weights: FloatArray | None = None
+    # Whether the posture is that of a folded net's mean plane.
     folded: bool = False
 
 

@@ -150,17 +150,11 @@ class ScanPoints:
 
 @dataclass(frozen=True, slots=True)
 class GyroRates:
-    """Angular velocity of the vehicle at a picture's middle, from its gyros.
+    """Angular velocity of the vehicle at a picture's middle, from its gyros."""
 
-    Attributes
-    ----------
-    rates : array, shape (3,)
-        Angular velocity about the axes of `dome`, in rad/s.
-    sigma : float
-        Standard deviation of each, in rad/s, as the turning before a target that stands still.
-    """
-
+    # Shape (3,): angular velocity about the axes of `dome`, in rad/s.
     rates: FloatArray
+    # Standard deviation of each, in rad/s, as the turning before a target that stands still.
     sigma: float
 
 

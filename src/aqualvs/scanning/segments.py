@@ -44,30 +44,20 @@ _MOMENTS, _SQUARES, _N_SUMS = 5, 8, 9
 
 
 class ComponentShapes(NamedTuple):
-    """Shapes of components (connected segments), one row for each component number.
+    """Shapes of components (connected segments), one row for each component number."""
 
-    Attributes
-    ----------
-    n_lines : array, shape (S,)
-        Search lines in it.
-    sagitta_px : array, shape (S,)
-        Height of its bend over its chord, as a shift of the stripe; 0 where it is too short to have
-        a shape.
-    rough_px : array, shape (S,)
-        Root mean square of what a parabola leaves, likewise.
-    size : array, shape (S,)
-        Chord in metres.
-    thickness : array, shape (S,)
-        Mean width of its peaks in search lines.
-    height : array, shape (S,)
-        Mean height of its peaks in grey levels.
-    """
-
+    # Shape (S,): search lines in it.
     n_lines: FloatArray
+    # Shape (S,): height of its bend over its chord, as a shift of the stripe; 0 where it is too
+    # short to have a shape.
     sagitta_px: FloatArray
+    # Shape (S,): root mean square of what a parabola leaves, likewise.
     rough_px: FloatArray
+    # Shape (S,): chord in metres.
     size: FloatArray
+    # Shape (S,): mean width of its peaks in search lines.
     thickness: FloatArray
+    # Shape (S,): mean height of its peaks in grey levels.
     height: FloatArray
 
     def bent(self) -> BoolArray:
@@ -317,21 +307,15 @@ _LINK_GATE_PX = 2.0
 
 @dataclass(frozen=True, slots=True)
 class Segments:
-    """Peaks of one laser's search, grouped by segment, component and subsegment.
+    """Peaks of one laser's search, grouped by segment, component and subsegment."""
 
-    Attributes
-    ----------
-    order : int array, shape (N,)
-        Indices into the `StripePeaks`, segment by segment, along each segment.
-    component : int array, shape (N,)
-        Number of the component (connected segments) of each peak, in the order of `order`.
-    subsegment : int array, shape (N,)
-        Number of the subsegment, likewise; a segment's subsegments are consecutive. A short
-        segment, such as the light on one strand of a net, is one subsegment.
-    """
-
+    # Shape (N,): indices into the `StripePeaks`, segment by segment, along each segment.
     order: IntArray
+    # Shape (N,): number of the component (connected segments) of each peak, in the order of
+    # `order`.
     component: IntArray
+    # Shape (N,): number of the subsegment, likewise; a segment's subsegments are consecutive. A
+    # short segment, such as the light on one strand of a net, is one subsegment.
     subsegment: IntArray
 
 

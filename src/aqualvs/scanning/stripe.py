@@ -42,32 +42,23 @@ N_MEASURES = 10
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StripeOptions:
-    """Options of the sub-pixel detector.
+    """Options of the sub-pixel detector."""
 
-    Attributes
-    ----------
-    min_contrast : int
-        Smallest height of a peak above its background, in grey levels; raised where hardly any
-        return of that height is laser light.
-    reach_share : float
-        Reach of the search for the background on each side, as a share of the image width; must
-        exceed the width of the widest stripe.
-    min_likelihood : float
-        Least likelihood, 0 to 1, that the colour of a peak is laser light. Only used where the
-        source has colour.
-    min_share : float
-        Peaks lower than this share of the frame's bright peaks (their 90 % quantile) are kept
-        only where many follow one another, as on a distant wall or of a weak laser; others are
-        noise, or the glow beside a strand.
-    max_returns : int
-        Returns kept per frame and search direction; where there are more, the contrast threshold
-        is doubled until there are not.
-    """
-
+    # Smallest height of a peak above its background, in grey levels; raised where hardly any return
+    # of that height is laser light.
     min_contrast: int = 6
+    # Reach of the search for the background on each side, as a share of the image width; must
+    # exceed the width of the widest stripe.
     reach_share: float = 0.045
+    # Least likelihood, 0 to 1, that the colour of a peak is laser light. Only used where the source
+    # has colour.
     min_likelihood: float = 0.1
+    # Peaks lower than this share of the frame's bright peaks (their 90 % quantile) are kept only
+    # where many follow one another, as on a distant wall or of a weak laser; others are noise, or
+    # the glow beside a strand.
     min_share: float = 0.25
+    # Returns kept per frame and search direction; where there are more, the contrast threshold is
+    # doubled until there are not.
     max_returns: int = 16384
 
     def __post_init__(self) -> None:
@@ -84,19 +75,13 @@ class StripeOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ThresholdOptions:
-    """Options of the threshold detector.
+    """Options of the threshold detector."""
 
-    Attributes
-    ----------
-    level : int
-        Pixels at least this bright are laser light, in grey levels.
-    max_returns, max_pixels : int
-        Runs of bright pixels, and bright pixels, allowed per frame and search direction. Where
-        there are more, the lowest higher level is used at which there are not; if even white is
-        too much, the frame has no peaks.
-    """
-
+    # Pixels at least this bright are laser light, in grey levels.
     level: int = 140
+    # Runs of bright pixels, and bright pixels, allowed per frame and search direction. Where there
+    # are more, the lowest higher level is used at which there are not; if even white is too much,
+    # the frame has no peaks.
     max_returns: int = 16384
     max_pixels: int = 131072
 
@@ -108,30 +93,21 @@ class ThresholdOptions:
 
 @dataclass(frozen=True, slots=True)
 class StripePeaks:
-    """Stripe peaks of one search direction, ordered by search line, then by position.
+    """Stripe peaks of one search direction, ordered by search line, then by position."""
 
-    Attributes
-    ----------
-    line : int array, shape (N,)
-        Search line: x for searches along y, y for searches along x.
-    position : array, shape (N,)
-        Sub-pixel centre along the line.
-    height : array, shape (N,)
-        Peak above background, in grey levels.
-    width : array, shape (N,)
-        Full width at half height along the line, in pixels.
-    likelihood : array, shape (N,)
-        Likelihood that the peak is laser light, by its colour: 0 to 1; 1 for a grey source.
-    pull : array, shape (N,)
-        Shift of `position` by a background that is brighter on one side, taken for a ramp between
-        the flanks; in pixels. 0 where it is not measured.
-    """
-
+    # Shape (N,): search line: x for searches along y, y for searches along x.
     line: IntArray
+    # Shape (N,): sub-pixel centre along the line.
     position: FloatArray
+    # Shape (N,): peak above background, in grey levels.
     height: FloatArray
+    # Shape (N,): full width at half height along the line, in pixels.
     width: FloatArray
+    # Shape (N,): likelihood that the peak is laser light, by its colour: 0 to 1; 1 for a grey
+    # source.
     likelihood: FloatArray
+    # Shape (N,): shift of `position` by a background that is brighter on one side, taken for a ramp
+    # between the flanks; in pixels. 0 where it is not measured.
     pull: FloatArray
 
     def __len__(self) -> int:
@@ -140,24 +116,17 @@ class StripePeaks:
 
 
 class SearchImage(NamedTuple):
-    """A frame laid out for one search direction, with search lines as rows.
+    """A frame laid out for one search direction, with search lines as rows."""
 
-    Attributes
-    ----------
-    lines : uint8 array, shape (n_lines, length)
-        Search lines as rows.
-    u, v : uint8 array, shape (ceil(height / 2), ceil(width / 2))
-        Chroma of the frame as it is, not turned; of shape (0, 0) for a grey source.
-    line_px : int
-        Pixels across one search line.
-    along_x : bool
-        Whether search lines are rows of the frame; else they are columns.
-    """
-
+    # Shape (n_lines, length): search lines as rows.
     lines: U8Array
+    # Shape (ceil(height / 2), ceil(width / 2)): chroma of the frame as it is, not turned; of shape
+    # (0, 0) for a grey source.
     u: U8Array
     v: U8Array
+    # Pixels across one search line.
     line_px: int
+    # Whether search lines are rows of the frame; else they are columns.
     along_x: bool
 
 

@@ -83,18 +83,10 @@ _EVIDENCE = _EvidenceOptions()
 
 
 class Weights(NamedTuple):
-    """Weights of the evidence, as log odds.
+    """Weights of the evidence, as log odds."""
 
-    Attributes
-    ----------
-    general : array, shape (14,)
-        Weights of what `general_evidence` returns.
-    own : array, shape (17,)
-        Weights of what `own_evidence` returns.
-    """
-
-    general: FloatArray
-    own: FloatArray
+    general: FloatArray  # Shape (14,): weights of what `general_evidence` returns.
+    own: FloatArray  # Shape (17,): weights of what `own_evidence` returns.
 
 
 WEIGHTS = Weights(
@@ -115,42 +107,22 @@ WEIGHTS = Weights(
 
 
 class StripeSegments(NamedTuple):
-    """Pieces of stripes, P of them, along one search direction.
+    """Pieces of stripes, P of them, along one search direction."""
 
-    Attributes
-    ----------
-    search : LaserBand
-        Of the whole picture.
-    peaks : StripePeaks
-        All peaks of the search direction.
-    order : int array, shape (N,)
-        Indices into the peaks, piece by piece, along each piece.
-    start : int array, shape (P + 1,)
-        Where each piece begins in `order`, and N.
-    table : array, shape (12, P)
-        Measures of the pieces, rows as named above.
-    """
-
-    search: LaserBand
-    peaks: StripePeaks
-    order: IntArray
-    start: IntArray
-    table: FloatArray
+    search: LaserBand  # Of the whole picture.
+    peaks: StripePeaks  # All peaks of the search direction.
+    order: IntArray  # Shape (N,): indices into the peaks, piece by piece, along each piece.
+    start: IntArray  # Shape (P + 1,): where each piece begins in `order`, and N.
+    table: FloatArray  # Shape (12, P): measures of the pieces, rows as named above.
 
 
 class PictureRows(NamedTuple):
-    """A picture laid out for one search direction, with search lines as rows.
+    """A picture laid out for one search direction, with search lines as rows."""
 
-    Attributes
-    ----------
-    intensity_weight : float32 array, shape (n_lines, length)
-        Grey levels of the channel in which the laser is brightest.
-    along, across : float32 array, shape (n_lines, length)
-        Chroma along the direction of the laser's colour and at right angles to it; of shape (0, 0)
-        for a grey picture.
-    """
-
+    # Shape (n_lines, length): grey levels of the channel in which the laser is brightest.
     intensity_weight: Rows
+    # Shape (n_lines, length): chroma along the direction of the laser's colour and at right angles
+    # to it; of shape (0, 0) for a grey picture.
     along: Rows
     across: Rows
 

@@ -328,44 +328,29 @@ _SHARED = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Surface:
-    """A plane that subsegments of at least two lasers agree on.
+    """A plane that subsegments of at least two lasers agree on."""
 
-    Attributes
-    ----------
-    plane : Plane
-        In `dome`, offset > 0.
-    members : bool array, shape (C,)
-        Subsegments on it.
-    n_lines : int
-        Search lines on it.
-    inlier_weight : float
-        Inlier weight: light on it, that of the best laser up to three times the second's, because
-        a plane needs two lasers.
-    sampling_weight : float
-        Sampling weight: the same, but a long component counts as a few strands.
-    extent : float
-        Search lines over which its broken stripes reach, summed over the lasers, stragglers left
-        out.
-    is_mesh : bool
-        Whether its stripes are broken as those on a net are.
-    is_gappy : bool
-        Whether they are broken at least, as on a dense net or in a net's shadows.
-    is_unbroken : bool
-        Whether much of the light is in long components all the same, as on a table with gaps.
-    n_planes : int
-        Planes that were joined, because a folded or bent net goes on from one to the next. `plane`
-        is then that of the largest, or their mean where none of them has half of the light.
-    """
-
+    # In `dome`, offset > 0.
     plane: Plane
+    # Shape (C,): subsegments on it.
     members: BoolArray
+    # Search lines on it.
     n_lines: int
+    # Inlier weight: light on it, that of the best laser up to three times the second's, because a
+    # plane needs two lasers.
     inlier_weight: float
+    # Sampling weight: the same, but a long component counts as a few strands.
     sampling_weight: float
+    # Search lines over which its broken stripes reach, summed over the lasers, stragglers left out.
     extent: float
+    # Whether its stripes are broken as those on a net are.
     is_mesh: bool
+    # Whether they are broken at least, as on a dense net or in a net's shadows.
     is_gappy: bool = False
+    # Whether much of the light is in long components all the same, as on a table with gaps.
     is_unbroken: bool = False
+    # Planes that were joined, because a folded or bent net goes on from one to the next. `plane` is
+    # then that of the largest, or their mean where none of them has half of the light.
     n_planes: int = 1
 
 

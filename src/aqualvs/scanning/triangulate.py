@@ -21,22 +21,15 @@ _DIFFERENCE_PX = 0.25
 
 @dataclass(frozen=True, slots=True)
 class Triangulation:
-    """Points on laser sheets, N of them.
+    """Points on laser sheets, N of them."""
 
-    Attributes
-    ----------
-    points_in_dome : array, shape (N, 3)
-        Metres; NaN where not valid.
-    sensitivity : array, shape (N, 3)
-        Derivative of the point by the stripe's position along the search line, in m/px. The
-        covariance of a point is sigma_px² times its outer product: an error along the stripe
-        stays on the stripe.
-    valid : bool array, shape (N,)
-        False where the pixel sees nothing or its ray misses the sheet.
-    """
-
+    # Shape (N, 3): metres; NaN where not valid.
     points_in_dome: FloatArray
+    # Shape (N, 3): derivative of the point by the stripe's position along the search line, in m/px.
+    # The covariance of a point is sigma_px² times its outer product: an error along the stripe
+    # stays on the stripe.
     sensitivity: FloatArray
+    # Shape (N,): False where the pixel sees nothing or its ray misses the sheet.
     valid: BoolArray
 
 

@@ -48,22 +48,15 @@ _MAX_FALSE_ALARMS = 0.01
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class UncalibratedStripeOptions:
-    """Options of `find_stripes`.
+    """Options of `find_stripes`."""
 
-    Attributes
-    ----------
-    min_likelihood : float
-        Least likelihood, 0 to 1, that a piece of stripe is a laser's line, by its shape and colour
-        and by the picture's other lines.
-    min_length_share : float
-        Shortest unbroken piece of a stripe that continues no other, as a share of the picture's
-        width.
-    wavelength_nm : float or None
-        Of the lasers; green if None.
-    """
-
+    # Least likelihood, 0 to 1, that a piece of stripe is a laser's line, by its shape and colour
+    # and by the picture's other lines.
     min_likelihood: float = 0.5
+    # Shortest unbroken piece of a stripe that continues no other, as a share of the picture's
+    # width.
     min_length_share: float = 0.015
+    # Of the lasers; green if None.
     wavelength_nm: float | None = None
 
     def __post_init__(self) -> None:
@@ -76,30 +69,14 @@ class UncalibratedStripeOptions:
 
 @dataclass(frozen=True, slots=True)
 class StripePixels:
-    """Points on stripes of a picture, N of them, chain by chain along each stripe.
+    """Points on stripes of a picture, N of them, chain by chain along each stripe."""
 
-    Attributes
-    ----------
-    pixels : array, shape (N, 2)
-        Sub-pixel centres, in `image`.
-    across : array, shape (N, 2)
-        Unit vectors at right angles to the stripe.
-    chain : int array, shape (N,)
-        Number of the unbroken piece of a stripe that a point belongs to.
-    height : array, shape (N,)
-        Peak above background, in grey levels.
-    width : array, shape (N,)
-        Full width at half height across the stripe, in pixels.
-    sigma_px : array, shape (N,)
-        Nominal standard deviation of the centre across the stripe.
-    """
-
-    pixels: FloatArray
-    across: FloatArray
-    chain: IntArray
-    height: FloatArray
-    width: FloatArray
-    sigma_px: FloatArray
+    pixels: FloatArray  # Shape (N, 2): sub-pixel centres, in `image`.
+    across: FloatArray  # Shape (N, 2): unit vectors at right angles to the stripe.
+    chain: IntArray  # Shape (N,): number of the unbroken piece of a stripe that a point belongs to.
+    height: FloatArray  # Shape (N,): peak above background, in grey levels.
+    width: FloatArray  # Shape (N,): full width at half height across the stripe, in pixels.
+    sigma_px: FloatArray  # Shape (N,): nominal standard deviation of the centre across the stripe.
 
     def __len__(self) -> int:
         """Return the number of points."""
@@ -316,25 +293,17 @@ _WINDOW = _Window()
 
 
 class _Ends(NamedTuple):
-    """Both ends of pieces, P of them.
+    """Both ends of pieces, P of them."""
 
-    Attributes
-    ----------
-    at : array, shape (P, 2, 2)
-        First and last point of a straight fit to the peaks at that end.
-    outward : array, shape (P, 2, 2)
-        Unit vectors along it, away from the piece.
-    sigma_px, sigma_rad : array, shape (P, 2)
-        Standard deviations of its place across the piece and of its direction.
-    is_steep : bool array, shape (P,)
-        Whether the piece is nearer to its search lines than to a right angle with them; then the
-        other search direction has it.
-    """
-
+    # Shape (P, 2, 2): first and last point of a straight fit to the peaks at that end.
     at: FloatArray
+    # Shape (P, 2, 2): unit vectors along it, away from the piece.
     outward: FloatArray
+    # Shape (P, 2): standard deviations of its place across the piece and of its direction.
     sigma_px: FloatArray
     sigma_rad: FloatArray
+    # Shape (P,): whether the piece is nearer to its search lines than to a right angle with them;
+    # then the other search direction has it.
     is_steep: BoolArray
 
 

@@ -150,26 +150,17 @@ def _brightest(flat: NDArray[np.uint8], first: IntArray, end: IntArray) -> Float
 
 @dataclass(frozen=True, slots=True)
 class FilteredPeaks:
-    """Points of N peaks as the paper's filter takes them, M of them, and its answer.
+    """Points of N peaks as the paper's filter takes them, M of them, and its answer."""
 
-    Attributes
-    ----------
-    source : int array, shape (M,)
-        Row of the peak that each point belongs to, ascending.
-    laser : int array, shape (M,)
-        Index of its laser.
-    pixels : array, shape (M, 2)
-        In `image`.
-    points_in_dome : array, shape (M, 3)
-        Metres. A pixel whose ray misses the laser's sheet is no point.
-    on_mesh : bool array, shape (M,)
-        Points that the filter keeps.
-    """
-
+    # Shape (M,): row of the peak that each point belongs to, ascending.
     source: IntArray
+    # Shape (M,): index of its laser.
     laser: IntArray
+    # Shape (M, 2): in `image`.
     pixels: FloatArray
+    # Shape (M, 3): metres. A pixel whose ray misses the laser's sheet is no point.
     points_in_dome: FloatArray
+    # Shape (M,): points that the filter keeps.
     on_mesh: BoolArray
 
     def peaks_on_mesh(self, n: int) -> BoolArray:

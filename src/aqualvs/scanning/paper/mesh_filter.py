@@ -24,67 +24,42 @@ from aqualvs.geometry.transforms import SE3
 
 
 class Limits(NamedTuple):
-    """Limits by which a cell belongs to the mesh (paper, Algorithm 1).
+    """Limits by which a cell belongs to the mesh (paper, Algorithm 1)."""
 
-    Attributes
-    ----------
-    a, b, c : int
-        Greatest squared distance, in cells, of the cells of the regions A, B and C.
-    min_in_a, max_in_a : int
-        Lit cells in A.
-    max_in_ab : int
-        Lit cells in A and B together.
-    min_in_c, max_in_c : int
-        Lit cells in C.
-    reach : int
-        Side of the blocks of the hash, in cells; not below the radius of C.
-    """
-
+    # Greatest squared distance, in cells, of the cells of the regions A, B and C.
     a: int
     b: int
     c: int
+    # Lit cells in A.
     min_in_a: int
     max_in_a: int
+    # Lit cells in A and B together.
     max_in_ab: int
+    # Lit cells in C.
     min_in_c: int
     max_in_c: int
+    # Side of the blocks of the hash, in cells; not below the radius of C.
     reach: int
 
 
 class _Numbering(NamedTuple):
-    """Distinct pairs of integers, numbered in the order in which they first appear.
+    """Distinct pairs of integers, numbered in the order in which they first appear."""
 
-    Attributes
-    ----------
-    table : int64 array
-        Hash table of the numbers; -1 in empty slots.
-    number : int64 array, shape (N,)
-        Number of every pair.
-    first : int64 array, shape (n,)
-        Where every numbered pair first appears.
-    """
-
-    table: IntArray
-    number: IntArray
-    first: IntArray
+    table: IntArray  # Hash table of the numbers; -1 in empty slots.
+    number: IntArray  # Shape (N,): number of every pair.
+    first: IntArray  # Shape (n,): where every numbered pair first appears.
 
 
 class _Blocks(NamedTuple):
-    """Cells sorted by the block that they lie in.
+    """Cells sorted by the block that they lie in."""
 
-    Attributes
-    ----------
-    m, n : array, shape (n_cells,)
-        The cells, block by block. Whole numbers kept as floats, which processors square faster.
-    start : int64 array, shape (n_blocks + 1,)
-        Where every block begins.
-    place : int64 array, shape (n_cells,)
-        Where every cell went.
-    """
-
+    # Shape (n_cells,): the cells, block by block. Whole numbers kept as floats, which processors
+    # square faster.
     m: FloatArray
     n: FloatArray
+    # Shape (n_blocks + 1,): where every block begins.
     start: IntArray
+    # Shape (n_cells,): where every cell went.
     place: IntArray
 
 
@@ -211,24 +186,17 @@ _ROUNDING = 1e-9
 class MeshFilterOptions:
     """Parameters of the mesh filter, in metres; defaults from section 5.2 of the paper.
 
-    Attributes
-    ----------
-    rd_theta : float
-        Size of a thread's reflection along the stripe.
-    dd : float
-        Side of a cell of the laser-plane image.
-    r_min, r_max : float
-        Least and greatest distance between consecutive threads, centre to centre, in the laser
-        plane.
-
     Raises
     ------
     OptionError
         If a length is not positive, r_min is not below r_max, or rd_theta is not below r_max.
     """
 
+    # Size of a thread's reflection along the stripe.
     rd_theta: float = 10e-3
+    # Side of a cell of the laser-plane image.
     dd: float = 1e-3
+    # Least and greatest distance between consecutive threads, centre to centre, in the laser plane.
     r_min: float = 15e-3
     r_max: float = 35e-3
 
@@ -290,17 +258,11 @@ class MeshFilterOptions:
 
 @dataclass(frozen=True, slots=True)
 class LaserImage:
-    """The laser-plane image (paper, Eq. 41-42).
+    """The laser-plane image (paper, Eq. 41-42)."""
 
-    Attributes
-    ----------
-    lit : bool array, shape (n_x, n_y)
-        Im(m, n): whether a cell holds points.
-    cells : int64 array, shape (N, 2)
-        Cell (m, n) of every point: S_idx(m, n) is where `cells` equals (m, n).
-    """
-
+    # Shape (n_x, n_y): im(m, n): whether a cell holds points.
     lit: BoolArray
+    # Shape (N, 2): cell (m, n) of every point: S_idx(m, n) is where `cells` equals (m, n).
     cells: IntArray
 
 
