@@ -258,7 +258,7 @@ def _outputs(request: LiveRequest, rig: Rig, echo: Callable[[str], object]) -> l
         made.callback(recorder.close)
         if request.record:
             echo(f"recording: {recorder.start()}")
-        outputs += make_outputs(request.outputs)
+        outputs += make_outputs(request.outputs, request.scanner)
         for output in outputs[2:]:
             made.callback(output.close)
         if request.dashboard is not None:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field
 
@@ -25,6 +25,9 @@ from aqualvs.live.outputs.base import HearsVehicle, Output
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.rigschema import Positive, StrictPart
 from aqualvs.recording import RecorderSwitch
+
+if TYPE_CHECKING:
+    from aqualvs.scanner import ScannerOptions
 
 VERSION = 1
 """Version of the format that is read."""
@@ -131,7 +134,7 @@ class OutputRequest:
     rerun: str | None = None
 
 
-def make_outputs(request: OutputRequest) -> list[Output]:
+def make_outputs(request: OutputRequest, scanner: "ScannerOptions") -> list[Output]:
     """Make the outputs that were asked for.
 
     Raises `OptionError` if an address cannot be understood, or the extra that an output needs is
@@ -139,14 +142,14 @@ def make_outputs(request: OutputRequest) -> list[Output]:
     """
     with ExitStack() as made:
         outputs = []
-        for output in _requested(request):
+        for output in _requested(request, scanner):
             outputs.append(output)
             made.callback(output.close)
         made.pop_all()
     return outputs
 
 
-def _requested(request: OutputRequest) -> Iterator[Output]:
+def _requested(request: OutputRequest, scanner: "ScannerOptions") -> Iterator[Output]:
     """Yield the outputs one by one; only what is asked for is imported."""
     for url in request.mavlink:
         from aqualvs.live.outputs.mavlink import MavlinkOutput
@@ -168,7 +171,7 @@ def _requested(request: OutputRequest) -> Iterator[Output]:
         from aqualvs.live.outputs.foxglove import FoxgloveOutput
 
         host, port = host_and_port(request.foxglove, FOXGLOVE_PORT, "--foxglove-address")
-        yield FoxgloveOutput(host, port)
+        yield FoxgloveOutput(host, port, scanner=scanner)
     if request.rerun is not None:
         from aqualvs.live.outputs.rerun import RerunOutput
 

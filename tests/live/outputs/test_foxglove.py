@@ -75,15 +75,18 @@ def facts(store, channel, name, content):
     if name == "picture":
         return {"format": message.format, "data": bytes(message.data).hex()}
     if name == "rig":
-        return {"yaml": message.yaml}
+        return {"yaml": message.yaml, "options": message.options}
     return {"rate_hz": message.rate_hz, "parts": [part.name for part in message.parts]}
 
 
 @pytest.fixture
 def output():
     from aqualvs.live.outputs.foxglove import FoxgloveOutput
+    from aqualvs.scanner import ScannerOptions
+    from aqualvs.scanning.stripe import StripeOptions
 
-    made = FoxgloveOutput(port=0, points_hz=1000.0)
+    options = ScannerOptions(detector=StripeOptions(min_contrast=17))
+    made = FoxgloveOutput(port=0, scanner=options, points_hz=1000.0)
     yield made
     made.close()
     made.close()
@@ -168,6 +171,7 @@ def test_a_viewer_sees_what_was_sent(output, watch, samples):
     assert told["counts"]["rig"] == told["counts"]["transforms"] == 1
     assert found["health"] == {"rate_hz": 25.0, "parts": ["source"]}
     assert "aqualvs_rig: 1" in found["rig"]["yaml"]
+    assert json.loads(found["rig"]["options"])["detector"]["min_contrast"] == 17
     assert told["kinds"]["/aqualvs/points"] == "sensor_msgs/msg/PointCloud2"
     assert told["kinds"]["/aqualvs/scene"] == "foxglove.SceneUpdate"
     until(lambda: "nobody watches" in output.health().detail)

@@ -213,6 +213,8 @@ class FoxgloveOutput:
         opens it to the network.
     port : int
         0 takes any that is free.
+    scanner : ScannerOptions, optional
+        Options that the postures are measured with; shown beside the rig.
     picture_hz, points_hz : float
         Most pictures, and point clouds, per second; 0 for none.
 
@@ -238,10 +240,12 @@ class FoxgloveOutput:
         host: str = "127.0.0.1",
         port: int = 8765,
         *,
+        scanner: ScannerOptions | None = None,
         picture_hz: float = 5.0,
         points_hz: float = 10.0,
     ) -> None:
         foxglove = _sdk()
+        self._options = scanner or ScannerOptions()
         self._viewers = _Viewers()
         self._clock = RecordClock()
         # Channels do not keep it alive.
@@ -311,7 +315,7 @@ class FoxgloveOutput:
 
     def _log_seldom(self, sample: LiveSample, at_ns: int) -> None:
         """Send data that rarely change, also to new viewers."""
-        rig, health, options = sample.rig, sample.health, ScannerOptions()
+        rig, health, options = sample.rig, sample.health, self._options
         if self._transforms.has_sinks():
             self._transforms.log(transforms(rig, at_ns), log_time=at_ns)
         self._log(HEALTH, at_ns, lambda: messages.health_message(health, at_ns))
