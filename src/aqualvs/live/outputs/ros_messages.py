@@ -32,6 +32,10 @@ from aqualvs.scanning.posture import Posture, Reason
 from aqualvs.scanning.scan import Label, ScanPoints
 from aqualvs.sources.base import Health, PartHealth, State
 
+FLU_FROM_DOME: FloatArray = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+"""Rotation from `dome` to forward, left, up."""
+FLU_FROM_DOME.flags.writeable = False
+
 UNOBSERVABLE_VARIANCE = 1.0e4
 """Variance, in m² and rad², of what a plane leaves undetermined: 100 m, 100 rad."""
 
