@@ -47,3 +47,26 @@ def test_a_plane_is_found_whose_heavy_light_is_all_of_one_laser() -> None:
     found = np.empty(4)
     assert search_plane(table, laser, start, 0.24, 1.8, 0, found)
     np.testing.assert_allclose(found, [0.0, 1.0, 0.0, 0.5], atol=1e-9)
+
+
+def test_a_plane_is_found_among_many_lasers_and_much_noise() -> None:
+    n_lasers, n_each, n_seeds = 15, 680, 30
+    rng = np.random.default_rng(8)
+    table = np.zeros((N_ROWS, n_lasers * n_each))
+    laser, start = np.repeat(np.arange(n_lasers), n_each), np.arange(n_lasers + 1) * n_each
+    depth = rng.uniform(0.3, 1.5, len(laser))
+    weight = np.full(len(laser), 3.0)
+    # Pieces of four, with an eighth of the light.
+    for first in start[:-1]:
+        for run in rng.permutation(n_each // 4)[:8]:
+            lit = slice(first + 4 * run, first + 4 * run + 4)
+            depth[lit], weight[lit] = 0.6, 9.0
+    along = np.tile(np.linspace(-0.25, 0.25, n_each), n_lasers)
+    points = np.stack([along, np.ones(len(laser)), 0.03 * (laser - 7.0)]) * depth
+    table[X : Z + 1] = points + rng.normal(0.0, 3e-4, points.shape)
+    table[JY], table[WEIGHT] = 1e-3, weight
+    found = np.empty((n_seeds, 4))
+    for seed in range(n_seeds):
+        assert search_plane(table, laser, start, 0.24, 1.8, seed, found[seed])
+    # With a sixth of the trials 12 miss it.
+    assert np.count_nonzero(np.abs(found[:, 3] - 0.6) > 0.01) <= 1

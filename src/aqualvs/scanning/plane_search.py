@@ -30,8 +30,10 @@ _MAX_HYPOTHESES = 6000
 # Trials for a plane, times the square of its share of the sampling weight; beyond the second number
 # in total, only this part of them.
 _TRIALS, _MANY, _SOME = 45.0, 2500.0, 0.55
-# Limit of the subsegments scored in total: a frame full of noise must not delay a live run.
-_MAX_WORK = 10_000_000
+# Limit of the subsegments of all hypotheses, most of which are scored in part only: a frame full of
+# noise must not delay a live run. A sixth of it was too few for a photograph with 15 lasers, of
+# whose 10,000 subsegments JPEG had made most: every other search missed the board.
+_MAX_WORK = 60_000_000
 # Subsegments scored between checks whether the rest can change the result.
 _STEP = 32
 # A neighbour for sampling lies at most this many subsegments away in the same laser's list.
