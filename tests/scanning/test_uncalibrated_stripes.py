@@ -45,8 +45,8 @@ def pieces(
 
 
 def added(found: list[StripeSegments], log_odds: list[float]) -> list[int]:
-    keep, _ = continued(found, np.array(log_odds), 0.0, 10.0, SIZE)
-    return list(np.flatnonzero(keep))
+    line = continued(found, np.array(log_odds), 0.0, 10.0, SIZE)
+    return list(np.flatnonzero(line >= 0))
 
 
 @pytest.mark.parametrize("axis", list(SearchAxis))
@@ -65,8 +65,8 @@ def test_a_short_piece_counts_where_it_continues_a_line() -> None:
 
 def test_pieces_in_a_row_are_one_line() -> None:
     found = pieces([(40, 70, 80, 0.0), (74, 84, 80, 0), (88, 120, 80, 0), (40, 120, 160, 0)])
-    keep, line = continued([found], np.array([3.0, -1.0, 3.0, 3.0]), 0.0, 10.0, SIZE)
-    assert keep.all()
+    line = continued([found], np.array([3.0, -1.0, 3.0, 3.0]), 0.0, 10.0, SIZE)
+    assert (line >= 0).all()
     assert line[0] == line[1] == line[2] != line[3]
 
 
@@ -101,8 +101,8 @@ def test_other_things_continue_a_line_as_seldom_as_stated(n_others: int) -> None
         others = [(a, a + 8, b, c) for a, b, c in zip(x, y, slope, strict=True)]
         log_odds = np.concatenate([[3.0], rng.uniform(-2.0, 0.0, n_others)])
         found = pieces([(130, 190, 120.0, 0.0), *others])
-        keep, _ = continued([found], log_odds, 0.0, 10.0, SIZE)
-        n_added += int(np.count_nonzero(keep)) - 1
+        line = continued([found], log_odds, 0.0, 10.0, SIZE)
+        n_added += int(np.count_nonzero(line >= 0)) - 1
     # Two ends, a hundredth over k for the k-th likeliest of those that run alike, and what goes on
     # from there. A third of all run alike: 1 + 1/2 + ... + 1/70 is 4.8. Three sigmas of a count.
     expected = 2 * 0.01 * 4.8 * n_pictures

@@ -108,13 +108,13 @@ def find_stripes(
     log_odds = line_log_odds(table, width, has_colour=frame.chroma is not None)
     least = math.log(options.min_likelihood / (1.0 - options.min_likelihood))
     size_px = width, frame.luma.shape[0]
-    keep, line = continued(found, log_odds, least, options.min_length_share * width, size_px)
+    line = continued(found, log_odds, least, options.min_length_share * width, size_px)
     parts: dict[int, list[StripePixels]] = {}
     first = 0
     for segments in found:
         here = slice(first, first + len(segments.start) - 1)
-        chains = extended(segments, keep[here])
-        for of, chain in zip(line[here][keep[here]], chains, strict=True):
+        keep = line[here] >= 0
+        for of, chain in zip(line[here][keep], extended(segments, keep), strict=True):
             parts.setdefault(int(of), []).append(_piece(segments.search, segments.peaks, chain))
         first = here.stop
     stripes = _joined([piece for of in parts.values() for piece in _unless_blob(of)])
@@ -313,8 +313,8 @@ def continued(
     least: float,
     min_length_px: float,
     size_px: tuple[int, int],
-) -> tuple[BoolArray, IntArray]:
-    """Mark the pieces that are lines: likely long ones, and others that continue these.
+) -> IntArray:
+    """Find the pieces that are lines: likely long ones, and others that continue these.
 
     Parameters
     ----------
@@ -331,16 +331,14 @@ def continued(
 
     Returns
     -------
-    is_line : bool array, shape (P,)
     line : int array, shape (P,)
         Number of the line that a piece belongs to, -1 if to none. Its other pieces may be of the
         other search direction.
     """
     length = np.concatenate([segments.table[LENGTH] for segments in found])
     pool = np.flatnonzero(log_odds >= least - _HELP)
-    is_line, line = np.zeros(len(length), bool), np.full(len(length), -1)
-    ends = _ends(found, pool)
-    in_line = (log_odds[pool] >= least) & (length[pool] >= min_length_px)
+    ends, log_odds = _ends(found, pool), log_odds[pool]
+    in_line = (log_odds >= least) & (length[pool] >= min_length_px)
     by_chance = np.flatnonzero(~in_line & ~ends.is_steep)
     root = np.arange(len(pool))
     waiting = deque(int(a) for a in np.flatnonzero(in_line))
@@ -348,16 +346,16 @@ def continued(
     while waiting:
         a = waiting.popleft()
         for end in (0, 1):
-            b = _next_piece(ends, a, end, log_odds[pool], in_line, by_chance, area_px)
+            b = _next_piece(ends, a, end, log_odds, in_line, by_chance, area_px)
             if b < 0:
                 continue
             root[root == root[b]] = root[a]
             if not in_line[b]:
                 in_line[b] = True
                 waiting.append(b)
-    is_line[pool[in_line]] = True
+    line = np.full(len(length), -1)
     line[pool[in_line]] = root[in_line]
-    return is_line, line
+    return line
 
 
 def _next_piece(
