@@ -19,6 +19,7 @@ from aqualvs.live.outputs.dds import dds_types, type_hash
 from aqualvs.live.outputs.ros1_links import ROS1_TYPES, to_ros1
 from aqualvs.live.outputs.ros2_messages import TYPE_NAMES, Ros2Types, range_has_variance, to_ros2
 from aqualvs.live.outputs.ros_messages import (
+    FLU_FROM_DOME,
     POINT_FIELDS,
     POINT_TYPE,
     CloudMessage,
@@ -39,7 +40,6 @@ from aqualvs.scanning.scan import ScanPoints
 from aqualvs.sources.base import Health, PartHealth, StageDelay, State
 from live_cases import demo_samples
 
-FLU_FROM_DOME = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 STORES = {
     "humble": Stores.ROS2_HUMBLE,
     "iron": Stores.ROS2_IRON,
