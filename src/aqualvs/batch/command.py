@@ -35,31 +35,19 @@ _NAMES, _LOCK = "names.json", "lock"
 class BatchRequest:
     """Request for a batch: dives, rig, options and the folder to write."""
 
-    # As `find_dives` takes them.
-    dives: tuple[str, ...]
-    # Folder to write, or of an earlier batch to go on with.
-    out: Path
-    # As `find_dives` takes it.
-    rig: Path | None = None
-
+    dives: tuple[str, ...]  # As `find_dives` takes them.
+    out: Path  # Folder to write, or of an earlier batch to go on with.
+    rig: Path | None = None  # As `find_dives` takes it.
     water: Water = field(default_factory=Water)
-    # Address of a Dask scheduler; None works on this machine.
-    scheduler: str | None = None
-    # Processes on this machine; None for one per core.
-    n_workers: int | None = None
-
+    scheduler: str | None = None  # Address of a Dask scheduler; None works on this machine.
+    n_workers: int | None = None  # Processes on this machine; None for one per core.
     no_dome: bool = False
-    # Of folders of images.
-    fps: float | None = None
-
+    fps: float | None = None  # Of folders of images.
     scanner: ScannerOptions = field(default_factory=ScannerOptions)
-    # As in `RunRequest`.
-    chosen: frozenset[str] | None = None
-
+    chosen: frozenset[str] | None = None  # As in `RunRequest`.
     target: str = "auto"
     index_target: Path | None = None
-    # Whether each dive gets its report.
-    report: bool = True
+    report: bool = True  # Whether each dive gets its report.
     # What to find out about the net of each dive, if anything; logs are those of the dives.
     net: NetRequest | None = None
     # Frames that a piece of a dive has at least.

@@ -391,12 +391,9 @@ class DiveRecord:
     """Status and results of a dive."""
 
     name: str
-    # Where the dive is.
-    source: str
-
+    source: str  # Where the dive is.
     state: DiveState
-    # Why it is not finished; empty if it is.
-    words: str = ""
+    words: str = ""  # Why it is not finished; empty if it is.
     # From `with_net`; empty without a result.
     facts: Mapping[str, Any] = field(default_factory=dict)
     # Whether an earlier batch had finished it.

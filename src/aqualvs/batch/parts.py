@@ -71,8 +71,7 @@ SUMMARY = "summary.npz"
 class PieceResult:
     """Outcome of measuring one piece."""
 
-    # Of the piece in its dive.
-    number: int
+    number: int  # Of the piece in its dive.
     # Frames, and those with a posture.
     n_frames: int
     n_valid: int

@@ -93,12 +93,9 @@ _MEMORY = "survey"
 class DiveProbe:
     """Result of the first look at a dive: its content, and where it is cut."""
 
-    # Of the dive's content; other pictures give another key.
-    source_key: str
-    # Of all else that the result depends on.
-    result_key: str
-    # The pieces, at least one.
-    spans: tuple[Span, ...]
+    source_key: str  # Of the dive's content; other pictures give another key.
+    result_key: str  # Of all else that the result depends on.
+    spans: tuple[Span, ...]  # The pieces, at least one.
     # Why the dive is not cut, where it could be longer than a piece; empty if it is.
     why_whole: str
     # Size of the source.

@@ -46,12 +46,9 @@ _COUNT_SUFFIXES = (50, 100, 250, 1000)
 class BoardRequest:
     """Request of `aqualvs board`, see its `--help`. Lengths in millimetres, angles in degrees."""
 
-    # Kind of target.
-    kind: Literal["charuco", "chessboard", "box", "plate"]
-    # `OUT.pdf` and `OUT.yaml` are written.
-    out: Path
-    # A4 to A0, letter, WIDTHxHEIGHT, or "fit".
-    paper: str = "a4"
+    kind: Literal["charuco", "chessboard", "box", "plate"]  # Kind of target.
+    out: Path  # `OUT.pdf` and `OUT.yaml` are written.
+    paper: str = "a4"  # A4 to A0, letter, WIDTHxHEIGHT, or "fit".
     # Of a board, or columns and rows of markers on a plate.
     squares_x: int | None = None
     squares_y: int | None = None

@@ -105,8 +105,7 @@ class _Target:
 class LasersResult(Calibration[LaserCalibration]):
     """Result of `calibrate_lasers`."""
 
-    # Index outside of the dome in the pictures.
-    n_medium: float
+    n_medium: float  # Index outside of the dome in the pictures.
     # Corners and stripes of every picture in which the target was found.
     views: tuple[LaserView, ...]
 

@@ -46,10 +46,8 @@ _ROUNDING = 1e-12
 class RigDifference:
     """Changes of the numbers that two rigs share."""
 
-    # As `RigUncertainty.names` has them; lasers are those of the old rig.
-    names: tuple[str, ...]
-    # Shape (P,): new minus old, SI units and radians.
-    change: FloatArray
+    names: tuple[str, ...]  # As `RigUncertainty.names` has them; lasers are those of the old rig.
+    change: FloatArray  # Shape (P,): new minus old, SI units and radians.
     # Shape (P, P): of `change`; zero where neither rig says how well it is known.
     covariance: FloatArray
 
@@ -222,8 +220,7 @@ _SCALES = {"mm": 1e3, "deg": math.degrees(1.0)}
 class ComparedPart:
     """A part of a rig and how it has changed."""
 
-    # As the verdict calls it.
-    name: str
+    name: str  # As the verdict calls it.
     # What it did or did not, in words: "moved by 0.4 mm", "stayed".
     did: str
     stayed: str

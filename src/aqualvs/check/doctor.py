@@ -201,12 +201,9 @@ _STREAM_S = 8.0
 class DoctorRequest:
     """Things to check beyond the machine itself: stream, rig, autopilot."""
 
-    # Stream, camera or file.
-    source: str | None = None
-    # Rig that the pictures should fit.
-    rig: Path | None = None
-    # Address of an autopilot.
-    mavlink: str | None = None
+    source: str | None = None  # Stream, camera or file.
+    rig: Path | None = None  # Rig that the pictures should fit.
+    mavlink: str | None = None  # Address of an autopilot.
     # Who is to be there, and how it is to be steered.
     vehicle: VehicleSetup = field(default_factory=VehicleSetup)
 

@@ -41,8 +41,7 @@ def motion_of(filtered: FilteredPosture | None) -> Motion | None:
 class Decision:
     """Result of one step."""
 
-    # What may be sent; neutral unless engaged.
-    effort: Effort
+    effort: Effort  # What may be sent; neutral unless engaged.
     # Why it is not what the controller asked for, or why that is no more than to stay.
     reason: LimitReason | None
     # What the mission wanted.

@@ -32,8 +32,7 @@ class Across(StrEnum):
 class CoverageOptions:
     """Resolution of the map, and the size of the field of view."""
 
-    # Height of a cell in metres.
-    depth_cell: float = 0.1
+    depth_cell: float = 0.1  # Height of a cell in metres.
     # Width in radians, or metres.
     bearing_cell: float = math.radians(1.0)
     along_cell: float = 0.1
@@ -64,10 +63,8 @@ class CoverageOptions:
 class CoverageMap:
     """Map of what has been seen."""
 
-    # What counts from left to right.
-    across: Across
-    # Shape (N + 1,): metres, downward.
-    depth_edges: FloatArray
+    across: Across  # What counts from left to right.
+    depth_edges: FloatArray  # Shape (N + 1,): metres, downward.
     # Shape (M + 1,): radians, or metres. Bearings go on beyond a full turn where that joins them;
     # those of more than a turn are folded into 0 to 2 pi.
     across_edges: FloatArray

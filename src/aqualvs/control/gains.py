@@ -209,9 +209,7 @@ class VehicleFacts:
     """Assumed properties of a vehicle."""
 
     name: str
-    # Of the vehicle and the water that moves with it, forward, in kg.
-    mass: float
-
+    mass: float  # Of the vehicle and the water that moves with it, forward, in kg.
     forward_drag: Drag
     right_drag: Drag
     thrust: ThrustMap
@@ -244,12 +242,9 @@ class VehicleFacts:
 class RangeGains:
     """Gains of the cascade that holds the range."""
 
-    # Speed asked for by an error of the range, in m/s per m.
-    position: float
-    # Acceleration asked for by an error of the speed, in m/s² per m/s.
-    speed: float
-    # Acceleration by that error and second, in m/s² per m.
-    integral: float
+    position: float  # Speed asked for by an error of the range, in m/s per m.
+    speed: float  # Acceleration asked for by an error of the speed, in m/s² per m/s.
+    integral: float  # Acceleration by that error and second, in m/s² per m.
     # Time from an effort until pictures show it, in seconds: so much later a setpoint's change is
     # expected to be seen.
     lag: float
@@ -290,8 +285,7 @@ class RangeGains:
 class YawGains:
     """Gains of the loop that holds the yaw."""
 
-    # Turning rate by the yaw's error, in rad/s per rad.
-    proportional: float
+    proportional: float  # Turning rate by the yaw's error, in rad/s per rad.
     # Turning rate by error and second, in rad/s² per rad: what a curved target asks for.
     integral: float
     # As of the range.

@@ -212,8 +212,7 @@ class Sector:
 class LegOptions:
     """End of a leg along the net: time, distance or sector, whichever comes first."""
 
-    # Seconds with the target in sight.
-    time: float = math.inf
+    time: float = math.inf  # Seconds with the target in sight.
     # Metres, by the speed through the water: a current along the net counts for or against it.
     distance: float = math.inf
     # Of the net's bearing: heading plus the posture's yaw. A leg ends where it leaves the sector
@@ -353,16 +352,11 @@ class Turn(StrEnum):
 class SurveyOptions:
     """The lawn and the mower."""
 
-    # One leg at each, in this order; metres, down positive.
-    depths: tuple[float, ...]
-    # Speed of the first leg through the water, to the right positive, in m/s.
-    sway: float
-    # Where each leg ends.
-    leg: LegOptions
-    # Whether the next leg goes back or on.
-    turn: Turn = Turn.BACK
-    # Greatest speed between depths, in m/s.
-    descent: float = 0.1
+    depths: tuple[float, ...]  # One leg at each, in this order; metres, down positive.
+    sway: float  # Speed of the first leg through the water, to the right positive, in m/s.
+    leg: LegOptions  # Where each leg ends.
+    turn: Turn = Turn.BACK  # Whether the next leg goes back or on.
+    descent: float = 0.1  # Greatest speed between depths, in m/s.
     # Seconds that a change of depth may take beyond what it should before the next leg begins all
     # the same: something is in the way.
     patience: float = 20.0

@@ -186,8 +186,7 @@ class _Track:
     cov: FloatArray
     n_measurements: int
     rig_covariance: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
-    # How often in a row pitch and yaw have been left out.
-    n_left_out: tuple[int, int] = (0, 0)
+    n_left_out: tuple[int, int] = (0, 0)  # How often in a row pitch and yaw have been left out.
     # Mean normalised square of the range's innovations; 1 where it moves as the model allows.
     surprise: float = 1.0
 

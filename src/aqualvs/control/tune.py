@@ -180,8 +180,7 @@ class Loop:
 class Margins:
     """Stability margins of one loop."""
 
-    # The others mean nothing where it is False.
-    stable: bool
+    stable: bool  # The others mean nothing where it is False.
     # Highest frequency at which the loop's gain is 1, in rad/s; NaN if there is none.
     crossover: float
     # Least phase that may still be lost at such a frequency, in radians.

@@ -115,12 +115,9 @@ class VehicleState:
 
     armed: bool = False
     mode: Mode = Mode.UNKNOWN
-    # As the vehicle calls it.
-    mode_name: str = ""
-    # Whether the pilot's sticks are off their centre.
-    pilot_moves: bool = False
-    # Metres, down positive.
-    depth: float | None = None
+    mode_name: str = ""  # As the vehicle calls it.
+    pilot_moves: bool = False  # Whether the pilot's sticks are off their centre.
+    depth: float | None = None  # Metres, down positive.
     # Radians; heading clockwise from north.
     heading: float | None = None
     roll: float | None = None

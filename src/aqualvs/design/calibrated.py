@@ -202,8 +202,7 @@ INDEX_ERROR = 0.005
 class OffsetCost:
     """Errors by an offset of the lens ahead of the dome's centre."""
 
-    # Metres.
-    offset: float
+    offset: float  # Metres.
     # Shape (W, 3): errors of (range, pitch, yaw), in m and rad, if the lens is taken to be in the
     # centre and all else is right.
     neglected: FloatArray

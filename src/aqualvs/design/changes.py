@@ -125,10 +125,8 @@ def _starts(lots: Sequence[Sequence[Mount]]) -> list[list[int]]:
 class Change:
     """Effect of a change; all numbers are ratios to the present values, 1 is no effect."""
 
-    # Description of the change.
-    words: str
-    # Root mean square of all errors, in goals, on walls and nets.
-    score: float
+    words: str  # Description of the change.
+    score: float  # Root mean square of all errors, in goals, on walls and nets.
     # Errors of a single frame on a wall, from noise alone, root mean square over the range.
     noise_range: float
     noise_angle: float

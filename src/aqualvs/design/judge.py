@@ -25,10 +25,8 @@ _SHIFT, _OFFSET = OWN_ERRORS.index("shift"), OWN_ERRORS.index("laser_offset")
 class PredictedErrors:
     """Predicted errors of a design on walls and nets square ahead, at W ranges."""
 
-    # Shape (W,): metres.
-    ranges: FloatArray
-    # Of the design's lasers, L of them.
-    stripes: Stripes
+    ranges: FloatArray  # Shape (W,): metres.
+    stripes: Stripes  # Of the design's lasers, L of them.
     # Shape (W, 3): standard deviations of (range, pitch, yaw) of a single frame from noise, on a
     # wall and on the design's net, in m and rad; NaN without a posture.
     wall: FloatArray

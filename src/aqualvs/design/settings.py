@@ -22,10 +22,8 @@ from aqualvs.scanning.plane_fit import SHARED_ERROR_PX, twine_share
 class Mount:
     """Mount of a line laser."""
 
-    # Name in tables.
-    name: str
-    # Origin of the fan, in `dome`, metres.
-    position: tuple[float, float, float]
+    name: str  # Name in tables.
+    position: tuple[float, float, float]  # Origin of the fan, in `dome`, metres.
     # Direction of the stripe on a wall square ahead, in radians: 0 level, pi/2 upright,
     # counter-clockwise as the camera sees it.
     stripe: float
@@ -198,10 +196,8 @@ _TWINE_HEIGHT = np.array(90.0)
 class Noise:
     """Noise of the scanner in one frame: standard deviations in pixels."""
 
-    # Of a point of a stripe on a wall, on its search line.
-    point: float = 0.3
-    # Of the light on one strand of a net.
-    strand: float = 0.15
+    point: float = 0.3  # Of a point of a stripe on a wall, on its search line.
+    strand: float = 0.15  # Of the light on one strand of a net.
     # Of the shift that a whole stripe shares, and of its tilt at the image border.
     shared: float = SHARED_ERROR_PX
     # Width of a stripe on the target, in metres.
@@ -215,16 +211,11 @@ class Noise:
 class Tolerances:
     """Tolerances: one sigma of the errors after calibration, in metres, radians and shares."""
 
-    # Of the lens's place, along each axis.
-    lens: float = 0.03e-3
-    # Of the camera's rotation, about each axis.
-    rotation: float = math.radians(0.01)
-    # Of the focal length, as a share of it.
-    focal: float = 1e-4
-    # Of the dome's inner radius and of its thickness.
-    dome: float = 0.05e-3
-    # Of the water's index.
-    n_water: float = 3e-4
+    lens: float = 0.03e-3  # Of the lens's place, along each axis.
+    rotation: float = math.radians(0.01)  # Of the camera's rotation, about each axis.
+    focal: float = 1e-4  # Of the focal length, as a share of it.
+    dome: float = 0.05e-3  # Of the dome's inner radius and of its thickness.
+    n_water: float = 3e-4  # Of the water's index.
     # Of each laser's plane.
     laser_angle: float = math.radians(0.005)
     laser_offset: float = 0.07e-3
@@ -261,13 +252,9 @@ class Goals:
 class Design:
     """Design to be evaluated."""
 
-    # Nominal camera, dome, water and working range. Its lasers are ignored.
-    rig: Rig
-
+    rig: Rig  # Nominal camera, dome, water and working range. Its lasers are ignored.
     mounts: tuple[Mount, ...]
-    # Standard deviation of the lens's place before a calibration, metres.
-    centring: float = 1e-3
-
+    centring: float = 1e-3  # Standard deviation of the lens's place before a calibration, metres.
     noise: Noise = field(default_factory=Noise)
     tolerances: Tolerances = field(default_factory=Tolerances)
     net: NominalNet = field(default_factory=lambda: NominalNet(bar=15e-3, twine=2.5e-3))

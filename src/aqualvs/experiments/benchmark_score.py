@@ -42,10 +42,8 @@ WRONG_PERCENT = 5.0
 class FrameAnswers:
     """Answers against the truth of N frames, of one dive or of many."""
 
-    # Shape (N,): frames with an answer.
-    valid: BoolArray
-    # Shape (N,): visible stripe points.
-    n_visible: FloatArray
+    valid: BoolArray  # Shape (N,): frames with an answer.
+    n_visible: FloatArray  # Shape (N,): visible stripe points.
     # Shape (N, 3): range in percent of the true one, pitch and yaw in degrees; NaN without answer
     # or target.
     error: FloatArray

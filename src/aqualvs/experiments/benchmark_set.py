@@ -52,8 +52,7 @@ class DiveTruth:
 
     name: str
     level: str
-    # Shape (N,): numbers from 0.
-    frames: IntArray
+    frames: IntArray  # Shape (N,): numbers from 0.
     # Shape (N, 3): range (m), pitch and yaw (deg); NaN where there is no target.
     posture: FloatArray
     # Shape (N,): stripe points on the target that the picture truly shows.
@@ -298,10 +297,8 @@ Row = dict[str, str | None]
 class Answers:
     """Answers of a system to the N frames of one dive, in the order of the truth."""
 
-    # Shape (N,).
-    valid: BoolArray
-    # Shape (N, 3): range (m), pitch and yaw (deg); NaN where a frame has none.
-    posture: FloatArray
+    valid: BoolArray  # Shape (N,).
+    posture: FloatArray  # Shape (N, 3): range (m), pitch and yaw (deg); NaN where a frame has none.
     # Shape (N, 3): standard deviations that the system claims, same units; NaN where it claims
     # none.
     sigma: FloatArray

@@ -48,8 +48,7 @@ _PAPER_PLANE = "turned by -0.07°, -0.06°, -0.64°"
 class _Setup(NamedTuple):
     """Noise of the boards' poses and corners, and the bar."""
 
-    # How well a place on a rail is read off, each by itself.
-    reading_sigma: float = 0.2e-3
+    reading_sigma: float = 0.2e-3  # How well a place on a rail is read off, each by itself.
     # Paper that is not flat and print that is not true, as corners of real boards show them.
     corner_px: float = 0.1
     seed: int = 3

@@ -49,8 +49,7 @@ _SETUP = _Setup()
 class Distances:
     """Distances of the wall from three points of a stripe, N frames."""
 
-    # Shape (N,).
-    true: FloatArray
+    true: FloatArray  # Shape (N,).
     # Shape (N, 4): in metres: left, central, right, and their average. With the dome model; without
     # it; and without it, but with a laser that was calibrated without it too.
     dome: FloatArray

@@ -75,9 +75,7 @@ class DataColumns:
 class ExperimentResult:
     """Results of an experiment."""
 
-    # The result in one sentence, with its numbers.
-    sentence: str
-
+    sentence: str  # The result in one sentence, with its numbers.
     findings: tuple[ExperimentRow, ...]
     pictures: tuple[ExperimentFigure, ...] = ()
     series: tuple[DataColumns, ...] = ()
@@ -89,14 +87,10 @@ class ExperimentResult:
 class Experiment:
     """One experiment of the paper, or one that explains a choice of ours."""
 
-    # What is typed to run it alone.
-    name: str
-
+    name: str  # What is typed to run it alone.
     title: str
-    # Where the paper has it, such as "section 5.3, figure 15"; empty for our own.
-    paper: str = ""
-    # The setting, in one or two sentences.
-    about: str
+    paper: str = ""  # Where the paper has it, such as "section 5.3, figure 15"; empty for our own.
+    about: str  # The setting, in one or two sentences.
     # Takes the laboratory, gives the outcome. It must depend on nothing else, so that the same
     # version gives the same numbers on every machine.
     run: "Callable[[Laboratory], ExperimentResult]"

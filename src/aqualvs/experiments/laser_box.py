@@ -71,8 +71,7 @@ class PlaneError:
 class Remaining:
     """Range errors that a calibration leaves on walls square ahead, without noise, W of them."""
 
-    # Shape (W,): True ones, metres.
-    ranges: FloatArray
+    ranges: FloatArray  # Shape (W,): True ones, metres.
     # Shape (W, 3): of range, pitch and yaw, m and rad; the sigmas are what the calibration states.
     errors: FloatArray
     sigmas: FloatArray

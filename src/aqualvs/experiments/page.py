@@ -79,12 +79,9 @@ class Record:
     sentence: str = ""
     findings: tuple[ExperimentRow, ...] = ()
     pictures: tuple[PrintedFigure, ...] = ()
-    # Files in `series/`.
-    series: tuple[str, ...] = ()
-
+    series: tuple[str, ...] = ()  # Files in `series/`.
     notes: tuple[str, ...] = ()
-    # Why there is no outcome; empty if there is one.
-    failure: str = ""
+    failure: str = ""  # Why there is no outcome; empty if there is one.
 
 
 def save_outcome(experiment: Experiment, outcome: ExperimentResult, folder: Path) -> Record:

@@ -43,8 +43,7 @@ _CAPTION = (
 class Bending:
     """Rays through the dome, from lens to water, R of them, in `dome`."""
 
-    # Shape (3,).
-    lens: FloatArray
+    lens: FloatArray  # Shape (3,).
     # Shape (R, 3): where they meet the dome's surfaces, metres.
     inner: FloatArray
     outer: FloatArray

@@ -34,11 +34,8 @@ _MODELS = dict(zip(VEHICLE_NAMES, (BLUEROV2, BLUEROV2_HEAVY, VIDEORAY), strict=T
 class SimCase:
     """One simulated run."""
 
-    # The true vehicle.
-    model: VehicleModel
-    # Of the controller, for its model of the vehicle.
-    gains: ControlGains
-
+    model: VehicleModel  # The true vehicle.
+    gains: ControlGains  # Of the controller, for its model of the vehicle.
     water: WaterMotion = field(default_factory=WaterMotion)
     net: NetWall = field(default_factory=NetWall)
     # Posture at the start, at rest, in metres and radians.

@@ -232,16 +232,11 @@ _DEFAULT_RANGE = 0.6
 class SimRequest:
     """Request for a simulation."""
 
-    # Folder to write.
-    out: Path
-
+    out: Path  # Folder to write.
     aim: Aim
-    # A name of `VEHICLE_NAMES`.
-    vehicle: str = "bluerov2"
-    # Gains file, or a vehicle's name; tuned for the vehicle if left out.
-    gains: str | None = None
-    # ArduSub's.
-    pilot_gain: float = 0.5
+    vehicle: str = "bluerov2"  # A name of `VEHICLE_NAMES`.
+    gains: str | None = None  # Gains file, or a vehicle's name; tuned for the vehicle if left out.
+    pilot_gain: float = 0.5  # ArduSub's.
     # Speed in m/s, and where it flows, in radians clockwise from the way one looks at the net.
     current: float = 0.3
     current_to: float = math.radians(60.0)
@@ -253,8 +248,7 @@ class SimRequest:
     net_sway: float = 0.0
 
     seconds: float = 60.0
-    # Frames a second.
-    fps: float = 25.0
+    fps: float = 25.0  # Frames a second.
     # Render every frame and measure in it, instead of sampling the scanner's noise.
     rendered: bool = False
     # Simulated camera that takes the rendered frames; the ideal one if left out.

@@ -184,10 +184,8 @@ JUMP = 0.25
 class SafetyMeasures:
     """Safety measures of a whole run."""
 
-    # In metres; negative is contact.
-    min_clearance: float
-    # Periods of more than 0.2 s without a valid posture.
-    n_blind: int
+    min_clearance: float  # In metres; negative is contact.
+    n_blind: int  # Periods of more than 0.2 s without a valid posture.
     # Longest time from a last valid posture to neutral, in seconds; 0 where there was no thrust.
     neutral_late: float
     # Whether swings of the range do not grow while the net is in sight.

@@ -106,10 +106,8 @@ class RangeSensor(Protocol):
 class Timing:
     """Timing of the frames."""
 
-    # Frames a second.
-    fps: float = 25.0
-    # From the exposure to the measured posture, in seconds.
-    delay: float = 0.06
+    fps: float = 25.0  # Frames a second.
+    delay: float = 0.06  # From the exposure to the measured posture, in seconds.
     # Time that every other frame, from the first on, waits for the next besides, in seconds: as the
     # first field of an interlaced picture does for the second.
     field: float = 0.0

@@ -156,8 +156,7 @@ class Blind:
 class PostureNoise:
     """Standard deviations, of each frame by itself."""
 
-    # Of the range.
-    range_share: float = 0.003
+    range_share: float = 0.003  # Of the range.
     # In radians.
     pitch: float = math.radians(0.4)
     yaw: float = math.radians(0.4)

@@ -97,26 +97,18 @@ class FollowLogOutput:
 class FollowRequest:
     """Request to steer a vehicle."""
 
-    # As `open_feed` takes it.
-    source: str
-
+    source: str  # As `open_feed` takes it.
     rig: Path
-    # Address of the vehicle.
-    mavlink: str
-    # Gains file, or the name of a vehicle whose gains come with the package.
-    gains: str
-    # Folder for the log.
-    out: Path
-
+    mavlink: str  # Address of the vehicle.
+    gains: str  # Gains file, or the name of a vehicle whose gains come with the package.
+    out: Path  # Folder for the log.
     aim: Aim
     # Who is there, and how it is steered.
     vehicle: VehicleSetup = field(default_factory=VehicleSetup)
 
     feed: FeedRequest = field(default_factory=FeedRequest)
-    # Address HOST:PORT of the pilot's page.
-    dashboard: str | None = None
-    # Its password.
-    token: str | None = None
+    dashboard: str | None = None  # Address HOST:PORT of the pilot's page.
+    token: str | None = None  # Its password.
     # Whether to record from the start; the page's button begins and ends recordings, too.
     record: bool = False
     # Folder of recordings; `out` if left out.

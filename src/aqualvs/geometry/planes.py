@@ -12,10 +12,8 @@ from aqualvs.geometry.arrays import BoolArray, FloatArray, as_vectors
 class Rays:
     """A batch of rays in one coordinate frame."""
 
-    # Shape (..., 3): where each ray starts, in metres.
-    origins: FloatArray
-    # Shape (..., 3): unit directions, away from the camera.
-    directions: FloatArray
+    origins: FloatArray  # Shape (..., 3): where each ray starts, in metres.
+    directions: FloatArray  # Shape (..., 3): unit directions, away from the camera.
     # Shape (...): False where no such ray exists (total reflection, pixel outside the lens model).
     # Origins and directions are NaN there.
     valid: BoolArray

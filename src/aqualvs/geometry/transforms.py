@@ -94,8 +94,7 @@ def quaternion_from_rotation(rotation: FloatArray) -> tuple[float, float, float,
 class SE3:
     """A rigid transform `dst_from_src`, possibly a batch of them."""
 
-    # Shape (..., 3, 3): rotation part.
-    rotation: FloatArray
+    rotation: FloatArray  # Shape (..., 3, 3): rotation part.
     # Shape (..., 3): origin of the source frame in the destination frame, in metres.
     translation: FloatArray
 

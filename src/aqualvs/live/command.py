@@ -191,33 +191,24 @@ def _size_px(text: str) -> tuple[int, int]:
 class LiveRequest:
     """Request for a live run."""
 
-    # As `open_feed` takes it.
-    source: str
-
+    source: str  # As `open_feed` takes it.
     rig: Path
     feed: FeedRequest = field(default_factory=FeedRequest)
     outputs: OutputRequest = field(default_factory=OutputRequest)
-    # Address HOST:PORT of the pilot's page.
-    dashboard: str | None = None
-    # Its password.
-    token: str | None = None
-    # Origins of pages that may show it.
-    embed_from: tuple[str, ...] = ()
+    dashboard: str | None = None  # Address HOST:PORT of the pilot's page.
+    token: str | None = None  # Its password.
+    embed_from: tuple[str, ...] = ()  # Origins of pages that may show it.
     # Whether to record from the start; the page's button begins and ends recordings, too.
     record: bool = False
     # Folder of recordings.
     record_to: Path = Path("dives")
 
     record_video: bool = False
-    # Whether the time filter runs.
-    smooth: bool = False
-    # Measure every frame of a file, as fast as possible.
-    fast: bool = False
-
+    smooth: bool = False  # Whether the time filter runs.
+    fast: bool = False  # Measure every frame of a file, as fast as possible.
     water: Water = field(default_factory=Water)
     scanner: ScannerOptions = field(default_factory=ScannerOptions)
-    # Markers on the vehicle that show the water's index.
-    index_target: Path | None = None
+    index_target: Path | None = None  # Markers on the vehicle that show the water's index.
 
 
 def live_and_tell(request: LiveRequest, echo: Callable[[str], object]) -> int:

@@ -93,8 +93,7 @@ class FrozenOptions:
 class _Patches(NamedTuple):
     """Patches of a reduced picture with the strongest edges."""
 
-    # Shape (N,): numbers of the patches.
-    at: IntArray
+    at: IntArray  # Shape (N,): numbers of the patches.
     # Shape (N, pixels): derivative across the main direction of the edges of the patch.
     edges: NDArray[np.float32]
     # Shape (N, pixels): grey levels.

@@ -128,10 +128,8 @@ class OutputRequest:
 
     ros2: bool = False
     ros1: bool = False
-    # Address HOST:PORT to listen on.
-    foxglove: str | None = None
-    # As `RerunOutput` takes it.
-    rerun: str | None = None
+    foxglove: str | None = None  # Address HOST:PORT to listen on.
+    rerun: str | None = None  # As `RerunOutput` takes it.
 
 
 def make_outputs(request: OutputRequest, scanner: "ScannerOptions") -> list[Output]:

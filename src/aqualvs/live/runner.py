@@ -348,10 +348,8 @@ class FixedScanner:
 class LiveOptions:
     """Options of the live loop."""
 
-    # A stream that is silent for this time has no posture any more.
-    stale_after_s: float = 0.15
-    # Measure every frame regardless of the delay: for files.
-    keep_every: bool = False
+    stale_after_s: float = 0.15  # A stream that is silent for this time has no posture any more.
+    keep_every: bool = False  # Measure every frame regardless of the delay: for files.
     # When a picture counts as frozen, and has no posture; None where none does.
     frozen: FrozenOptions | None = field(default_factory=FrozenOptions)
 

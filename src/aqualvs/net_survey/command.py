@@ -44,8 +44,7 @@ if TYPE_CHECKING:
 class NetSource:
     """Source of a survey: a dive or a run, and the folder to write."""
 
-    # Folder of a run, or a dive as `open_source` takes it.
-    source: str
+    source: str  # Folder of a run, or a dive as `open_source` takes it.
     # A dive needs a rig (a recording brings its own); its default folder is beside it. A run has
     # its own rig, and its own folder is the default.
     rig: Path | None = None

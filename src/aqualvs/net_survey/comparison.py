@@ -310,9 +310,7 @@ class OnWall:
 class Comparison:
     """Result of comparing dives along the same net."""
 
-    # In the order of time.
-    surveys: list[Survey]
-
+    surveys: list[Survey]  # In the order of time.
     dates: list[date]
     # Mean solidity of all that was seen, date by date: of other parts of the net, perhaps.
     whole: list[Growth | None]

@@ -43,8 +43,7 @@ class Growth:
 class CellChange:
     """Change of a cell between dates."""
 
-    # In the raster.
-    cell: int
+    cell: int  # In the raster.
     # Dates between which it is told.
     first: int
     last: int
@@ -68,10 +67,8 @@ class CellChange:
 class WallHistory:
     """Solidity of cells (C) on dates (V), of stretches (K) of all dives."""
 
-    # Increasing.
-    dates: list[date]
-    # C squares.
-    raster: Raster
+    dates: list[date]  # Increasing.
+    raster: Raster  # C squares.
     # Shape (C, V): NaN, and 0, where not seen.
     solidity: FloatArray
     seen: FloatArray

@@ -123,8 +123,7 @@ class Stretches:
 class Holes:
     """Holes of a dive, H of them; NaN where not known."""
 
-    # As `holes.csv` numbers them.
-    number: list[str]
+    number: list[str]  # As `holes.csv` numbers them.
     # Shape (H,).
     time_s: FloatArray
     along: FloatArray
@@ -140,9 +139,7 @@ class Survey:
     """A dive along the net."""
 
     folder: Path
-    # On which it took place.
-    date: date
-
+    date: date  # On which it took place.
     stretches: Stretches
     holes: Holes
     # Whether x of the outlines is a bearing in degrees instead of metres along the net, and y minus

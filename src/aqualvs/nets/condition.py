@@ -33,10 +33,8 @@ from aqualvs.scanning.scan import Scan
 class NetConditionOptions:
     """Options of the evaluation: length of a section of net, and the known twine."""
 
-    # A stretch of net ends after this time,
-    stretch_s: float = 5.0
-    # or after the vehicle has moved this far along the net, in metres.
-    stretch: float = 0.5
+    stretch_s: float = 5.0  # A stretch of net ends after this time,
+    stretch: float = 0.5  # or after the vehicle has moved this far along the net, in metres.
     # Diameter of the bare twine in metres, where it is known: makes solidity more accurate.
     twine: float | None = None
 

@@ -280,10 +280,8 @@ _ERRORS = _SolidityErrors()
 class RegisteredView:
     """A frame with the place of the lattice in it."""
 
-    # Dashes and gaps of the frame.
-    view: NetView
-    # Assignment of its dashes to strands.
-    fit: Fit
+    view: NetView  # Dashes and gaps of the frame.
+    fit: Fit  # Assignment of its dashes to strands.
     # Shape (2,): place of the origin of `net` on the net itself, as `NetTrack.place`.
     place: FloatArray
 

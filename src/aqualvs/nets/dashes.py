@@ -239,12 +239,9 @@ def _descends(along: FloatArray) -> bool:
 class Dashes:
     """Lit pieces of the lasers' lines in one frame, N of them."""
 
-    # Shape (N,): index of the laser.
-    laser: IntArray
-    # Shape (N,): middle of the dash on the laser's line, in metres.
-    along: FloatArray
-    # Shape (N, 2): the same in `net`.
-    place: FloatArray
+    laser: IntArray  # Shape (N,): index of the laser.
+    along: FloatArray  # Shape (N,): middle of the dash on the laser's line, in metres.
+    place: FloatArray  # Shape (N, 2): the same in `net`.
     # Shape (N,): length along the line within which its light is above a share of its peak, in
     # metres.
     length: FloatArray
@@ -264,10 +261,8 @@ class Dashes:
 class Gaps:
     """Dark pieces of the lasers' lines in one frame, K of them; ends ascend along the line."""
 
-    # Shape (K,): index of the laser.
-    laser: IntArray
-    # Shape (K, 2): on the laser's line, in metres.
-    ends: FloatArray
+    laser: IntArray  # Shape (K,): index of the laser.
+    ends: FloatArray  # Shape (K, 2): on the laser's line, in metres.
     # Shape (K, 2): middles of the dashes at both ends; as `ends` where there is none.
     middles: FloatArray
     # Shape (K, 2): whether a dash ends the gap there; otherwise the view ends.

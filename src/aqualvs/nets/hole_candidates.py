@@ -218,8 +218,7 @@ _RADII: FloatArray = np.arange(0.5, 6.01, 0.25)
 class Disc:
     """A round patch where strands are missing."""
 
-    # Shape (2,): in metres.
-    middle: FloatArray
+    middle: FloatArray  # Shape (2,): in metres.
     # Mean over all discs that explain what was seen, and standard deviation, in metres.
     radius: float
     sigma: float
@@ -329,10 +328,8 @@ _OFF, _OFF_STEPS = 0.2, 1.5
 class Strands:
     """Crossings of one frame that the lattice predicts and that could be seen, N of them."""
 
-    # Shape (N, 2): in `net`, in metres.
-    place: FloatArray
-    # Shape (N,): the same on the laser's line, in metres.
-    along: FloatArray
+    place: FloatArray  # Shape (N, 2): in `net`, in metres.
+    along: FloatArray  # Shape (N,): the same on the laser's line, in metres.
     # Shape (N,): laser, and family of the strand.
     laser: IntArray
     family: IntArray

@@ -54,8 +54,7 @@ Foot: TypeAlias = tuple[int, float, FloatArray]
 class Hole:
     """A hole in the net."""
 
-    # Piece of track that `place` belongs to (`NetTrack.piece`).
-    piece: int
+    piece: int  # Piece of track that `place` belongs to (`NetTrack.piece`).
     # Shape (2,): its middle: right and up of the track's start on the net, in metres.
     place: FloatArray
     # Width and height, in metres.

@@ -56,12 +56,9 @@ _FIT = _FitOptions()
 class NetLattice:
     """A net's lattice in `net` directions."""
 
-    # Shape of the openings.
-    mesh: Mesh
-    # Length of a side of an opening (half mesh), in metres.
-    bar: float
-    # Its standard deviation.
-    sigma_bar: float
+    mesh: Mesh  # Shape of the openings.
+    bar: float  # Length of a side of an opening (half mesh), in metres.
+    sigma_bar: float  # Its standard deviation.
     # Shape (F, 2): wave vector of every family of strands: normal to the strands, one over their
     # distance.
     waves: FloatArray
@@ -219,12 +216,9 @@ START_FRAMES, START_S = 8, 0.5
 class Fit:
     """Assignment of a frame's dashes to strands of the lattice."""
 
-    # Shape (N,): family whose strand is nearest to each dash.
-    family: IntArray
-    # Shape (N,): index of that strand.
-    strand: IntArray
-    # Shape (N,): distance of the dash from it, in metres.
-    off: FloatArray
+    family: IntArray  # Shape (N,): family whose strand is nearest to each dash.
+    strand: IntArray  # Shape (N,): index of that strand.
+    off: FloatArray  # Shape (N,): distance of the dash from it, in metres.
     # Shape (N,): distance from the nearest strand of any other family, in metres.
     clear: FloatArray
 

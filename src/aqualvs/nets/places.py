@@ -38,8 +38,7 @@ from aqualvs.vehicle_logs import (
 class DivePostures:
     """Postures to the net over a dive, N of them, all valid."""
 
-    # Shape (N,): dive time, increasing.
-    time_s: FloatArray
+    time_s: FloatArray  # Shape (N,): dive time, increasing.
     # Shape (N,): metres and radians.
     range: FloatArray
     pitch: FloatArray
@@ -60,8 +59,7 @@ class DivePostures:
 class ViewedPlaces:
     """Depth and bearing of the net at the times of a dive's postures; NaN where not known."""
 
-    # Shape (N,): dive time.
-    time_s: FloatArray
+    time_s: FloatArray  # Shape (N,): dive time.
     # Shape (N,): depth of the foot of the perpendicular on the net, in metres.
     foot_depth: FloatArray
     # Shape (N,): bearing of the net and heading of the vehicle, in radians.
@@ -134,8 +132,7 @@ def _or_none(value: float) -> float | None:
 class LaidLog:
     """A log and its alignment with the dive's clock."""
 
-    # As it was read.
-    log: VehicleLog
+    log: VehicleLog  # As it was read.
     # Log time minus dive time, or the reason why it is not known.
     offset: TimeOffset | OffsetRefusal
     # Whether the log covers any of the dive.

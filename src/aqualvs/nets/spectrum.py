@@ -61,10 +61,8 @@ Swings: TypeAlias = NDArray[np.complex64]
 class Crossings:
     """Crossings of one frame's lasers with strands, and the visible pieces of their lines."""
 
-    # Shape (N, 2): middles of the dashes in `net`, metres.
-    place: FloatArray
-    # Shape (N,): index of the laser.
-    laser: IntArray
+    place: FloatArray  # Shape (N, 2): middles of the dashes in `net`, metres.
+    laser: IntArray  # Shape (N,): index of the laser.
     # Shape (M, 2): ends of the visible pieces of line, in `net`, metres.
     begin: FloatArray
     end: FloatArray
@@ -251,8 +249,7 @@ def _swings(place: FloatArray, first: float, n: int) -> Swings:
 class _SearchOptions(NamedTuple):
     """Search for lattices in the spectrum of the crossings."""
 
-    # Least length of bars in the search for lattices, in metres.
-    shortest_bar: float = 0.010
+    shortest_bar: float = 0.010  # Least length of bars in the search for lattices, in metres.
     # Number of waves, and of the best ones that are not neighbours and are followed up; number of
     # second families for each of them.
     tried: int = 1000

@@ -139,8 +139,7 @@ class NetFacts:
 class TargetFacts:
     """Prior information on the target."""
 
-    # What the posture is measured to.
-    kind: TargetKind = TargetKind.AUTO
+    kind: TargetKind = TargetKind.AUTO  # What the posture is measured to.
     # Parameters of the paper's mesh filter in metres, those that differ from the defaults.
     filter_lengths: Mapping[str, float] = field(default_factory=dict)
     # What the net is said to be, where the file says it.
@@ -244,12 +243,9 @@ _CHECK = _CheckOptions()
 class NetCheck:
     """Comparison of the distances between strands with those of the described net."""
 
-    # The target file's net.
-    said: NetFacts
-    # The target file's name, for the sentence.
-    source: str
-    # Of the lasers, in `dome`.
-    planes: Sequence[Plane]
+    said: NetFacts  # The target file's net.
+    source: str  # The target file's name, for the sentence.
+    planes: Sequence[Plane]  # Of the lasers, in `dome`.
     # Bar of the frames that were evaluated, in metres.
     bars: "array[float]" = field(default_factory=lambda: array("d"))
 

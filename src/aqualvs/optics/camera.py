@@ -74,8 +74,7 @@ trace_port = chosen_by_class(
 class CameraParams(NamedTuple):
     """A camera as kernels take it; `camera.params` makes it."""
 
-    # Intrinsics.
-    lens: LensParams
+    lens: LensParams  # Intrinsics.
     # `dome_from_cam`, row by row.
     rotation: tuple[float, float, float, float, float, float, float, float, float]
     # What stands between the lens and the outer medium, and the lens position.
@@ -437,8 +436,7 @@ class HousedCamera(_CompiledCamera):
     not valid, or the pose is not one finite rigid transform.
     """
 
-    # Sizes and material; a flat port is fixed to the camera.
-    housing: Housing
+    housing: Housing  # Sizes and material; a flat port is fixed to the camera.
     # Refractive indices (vacuum = 1) inside and outside the housing.
     n_air: float
     n_water: float

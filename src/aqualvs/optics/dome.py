@@ -25,8 +25,7 @@ sphere along."""
 class DomeParams(NamedTuple):
     """A dome as kernels take it; `Dome.params` makes it."""
 
-    # The lens position L in `dome`, metres.
-    centre: Vector
+    centre: Vector  # The lens position L in `dome`, metres.
     # Metres.
     inner_radius: float
     outer_radius: float

@@ -24,8 +24,7 @@ from aqualvs.optics.sheet import Sheet, sheets_of
 class StripeView:
     """The visible part of one stripe on a wall square to the forward axis."""
 
-    # The laser's light, in `dome`.
-    sheet: Sheet
+    sheet: Sheet  # The laser's light, in `dome`.
     # Shape (N, 3): along the stripe, metres; none where the stripe is out of the picture.
     points_in_dome: FloatArray
     # Shape (N, 2): where the camera sees them.
@@ -112,8 +111,7 @@ USUAL_RANGES = (0.3, 0.6, 1.0)
 class ExpectedError:
     """Expected error of the posture to a wall square to the forward axis."""
 
-    # Metres.
-    wall_range: float
+    wall_range: float  # Metres.
     # Range error for one pixel across the stripe, for every laser, in m/px; NaN where its stripe is
     # out of the picture.
     per_pixel: tuple[float, ...]
@@ -174,8 +172,7 @@ def expected_posture_errors(
 class WallView:
     """The stripes that a rig sees on a wall square ahead, and the posture error they give."""
 
-    # Metres.
-    wall_range: float
+    wall_range: float  # Metres.
     # For every laser; `N_POINTS` each, fewer where the stripe is hardly in the picture, none where
     # it is out of it.
     stripes: tuple[StripeView, ...]

@@ -36,8 +36,7 @@ MAX_TILT = math.radians(45.0)
 class FlatParams(NamedTuple):
     """A flat port as kernels take it; `FlatPort.params` makes it."""
 
-    # The lens position L in `dome`, metres.
-    centre: Vector
+    centre: Vector  # The lens position L in `dome`, metres.
     # The port's normal away from the camera, and the axes about which its tilts turn it; unit
     # vectors in `dome`.
     normal: Vector

@@ -141,8 +141,7 @@ class Lens:
     pixels they map to. Outside, two directions share a pixel.
     """
 
-    # Distortion model.
-    model: LensModel = LensModel.OPENCV
+    model: LensModel = LensModel.OPENCV  # Distortion model.
     # Focal lengths in pixels.
     fx: float
     fy: float

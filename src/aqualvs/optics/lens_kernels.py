@@ -17,8 +17,7 @@ Vector: TypeAlias = tuple[float, float, float]
 class LensParams(NamedTuple):
     """Numbers of a lens; `Lens.params` makes it."""
 
-    # Model: equidistant fisheye, else the rational model of OpenCV.
-    fisheye: bool
+    fisheye: bool  # Model: equidistant fisheye, else the rational model of OpenCV.
     # Pixels.
     fx: float
     fy: float

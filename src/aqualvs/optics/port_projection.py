@@ -459,14 +459,10 @@ def tangent_guarded(port: FlatParams, height: float, rho: float) -> tuple[bool, 
 class FlatDerivative(NamedTuple):
     """Terms of the derivatives of a solved projection behind a flat port."""
 
-    # u of the module's docstring.
-    turn: Vector
-    # d alpha / d rho, 1/m.
-    by_reach: float
-    # sin alpha / rho, 1/m.
-    across_point: float
-    # w, the tangent of the angle in the water.
-    water_tangent: float
+    turn: Vector  # u of the module's docstring.
+    by_reach: float  # d alpha / d rho, 1/m.
+    across_point: float  # sin alpha / rho, 1/m.
+    water_tangent: float  # w, the tangent of the angle in the water.
     # d alpha by the parameters.
     by_distance: float
     by_thickness: float

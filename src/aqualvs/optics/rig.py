@@ -52,8 +52,7 @@ class Window:
 class Laser:
     """A line laser, a thin sheet of light."""
 
-    # Name in reports.
-    name: str
+    name: str  # Name in reports.
     # The sheet in `dome`: in the water, or, behind a window, in the air of the laser's housing.
     plane: Plane
     # Window that bends the sheet, see `aqualvs.optics.sheet`. None where the sheet in the water is

@@ -284,10 +284,8 @@ _USUAL_REACH = 0.6
 class Sheet:
     """The light of one laser in the water, in `dome`."""
 
-    # As `Laser.plane`: in air, where there is a window.
-    plane: Plane
-    # As `Laser.window`.
-    window: Window | None = None
+    plane: Plane  # As `Laser.plane`: in air, where there is a window.
+    window: Window | None = None  # As `Laser.window`.
     # Refractive indices behind the window and in front of it.
     n_air: float = 1.0
     n_water: float = 1.0

@@ -64,8 +64,7 @@ _UNIT_OF = {
 class SolvedStep:
     """Record of a calibration step: its date, data and residuals."""
 
-    # With a time zone.
-    date: datetime = field(default_factory=lambda: datetime.now(UTC))
+    date: datetime = field(default_factory=lambda: datetime.now(UTC))  # With a time zone.
     # Number used; points are corners or stripe points.
     pictures: int
     points: int

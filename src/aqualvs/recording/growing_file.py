@@ -45,10 +45,8 @@ _COMPRESSION = "zstd"
 class Chunk:
     """A chunk ready for the file."""
 
-    # The chunk's record and its message indexes.
-    content: bytes
-    # Of the record alone.
-    length: int
+    content: bytes  # The chunk's record and its message indexes.
+    length: int  # Of the record alone.
     # Where each channel's message index begins, from the chunk's start.
     index_offsets: dict[int, int]
     # Log times of the first and the last message.

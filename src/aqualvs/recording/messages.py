@@ -269,10 +269,8 @@ def _put_part(to: CdrWriter, kind: str, part: PartHealth) -> None:
 class RecorderOptions:
     """Options of a recording: its contents, and how often it is written."""
 
-    # Every frame's picture, or none of them.
-    pictures: PictureFormat | None = None
-    # 1 to 100.
-    jpeg_quality: int = 90
+    pictures: PictureFormat | None = None  # Every frame's picture, or none of them.
+    jpeg_quality: int = 90  # 1 to 100.
     # Point clouds per second, for the eye: stripes, from which every point can be had again bit for
     # bit, are always kept. 0 for none, None for those of every frame.
     points_hz: float | None = 5.0

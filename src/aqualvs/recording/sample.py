@@ -23,8 +23,7 @@ class Instants:
 class LiveSample:
     """One frame's answer on its way to pilot, autopilot and log."""
 
-    # That it was measured with, in the water as it is known.
-    rig: Rig
+    rig: Rig  # That it was measured with, in the water as it is known.
     # Raw posture or refusal, and the points. Where the stream is silent there is no frame: the scan
     # then has the refusal `no_frames` and the number and time of the last frame.
     scan: Scan
@@ -36,10 +35,8 @@ class LiveSample:
     utc_ns: int
 
     instants: Instants
-    # From the time filter, where it is switched on and running.
-    filtered: FilteredPosture | None
-    # As of this frame.
-    health: Health
+    filtered: FilteredPosture | None  # From the time filter, where it is switched on and running.
+    health: Health  # As of this frame.
 
     @property
     def posture_ns(self) -> int:

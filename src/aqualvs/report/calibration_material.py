@@ -33,8 +33,7 @@ class ResidualMap:
     """Reprojection residuals over the picture, for the points of all views together."""
 
     title: str
-    # Width and height of the pictures.
-    size_px: tuple[int, int]
+    size_px: tuple[int, int]  # Width and height of the pictures.
     # Shape (N, 2): measured points as (x, y); rows that are not finite are left out.
     pixels: FloatArray
     # Shape (N, 2): measured minus predicted, in pixels.
@@ -72,8 +71,7 @@ class ParameterRow:
 class ExpectationRow:
     """Standard deviations of posture to expect on a target after the calibration."""
 
-    # Distance of the target.
-    range_m: float
+    range_m: float  # Distance of the target.
     # Systematic: from the calibration's covariance, the same in every picture.
     sigma_range_mm: float
     sigma_pitch_deg: float
@@ -89,9 +87,7 @@ class LaserRow:
     """One calibrated laser plane, n·X = offset in `dome`."""
 
     name: str
-    # Shape (3,): unit normal in `dome`.
-    normal: FloatArray
-
+    normal: FloatArray  # Shape (3,): unit normal in `dome`.
     offset_mm: float
     # Standard deviations of the normal's direction and of the offset.
     sigma_normal_deg: float
@@ -101,12 +97,9 @@ class LaserRow:
     rms_mm: float
 
     n_points: int
-    # What its stripes were seen on: "floor, back wall".
-    surfaces: str = ""
-    # "plane" or "refracted sheet".
-    model: str = "plane"
-    # In words, against the rig before; may be empty.
-    moved: str = ""
+    surfaces: str = ""  # What its stripes were seen on: "floor, back wall".
+    model: str = "plane"  # "plane" or "refracted sheet".
+    moved: str = ""  # In words, against the rig before; may be empty.
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

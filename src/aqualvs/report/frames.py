@@ -57,8 +57,7 @@ class SampleFrame:
     """A sample frame ready for the page."""
 
     jpeg_base64: str
-    # Width and height as embedded.
-    size_px: tuple[int, int]
+    size_px: tuple[int, int]  # Width and height as embedded.
     # Share of the target points that lie on a saturated pixel; NaN without target points.
     saturated: float = float("nan")
 

@@ -47,8 +47,7 @@ _ZONE = "#e8f3ea"
 class _PictureOptions(NamedTuple):
     """Parts of the points that are drawn."""
 
-    # Width and height of a detail, in mm.
-    detail: tuple[float, float] = (150.0, 75.0)
+    detail: tuple[float, float] = (150.0, 75.0)  # Width and height of a detail, in mm.
     # Stragglers beyond these quantiles do not set the scale of a picture.
     stragglers: float = 0.005
     batch: int = 1 << 16
@@ -71,12 +70,9 @@ class Reflections:
     """Points that one laser lit in one frame, N of them."""
 
     frame: int
-    # Its name.
-    laser: str
-    # Shape (N, 2): points in `laser`, in metres: x across, y forward.
-    in_laser: FloatArray
-    # Distance of the laser's plane from the dome's centre, in metres.
-    offset: float
+    laser: str  # Its name.
+    in_laser: FloatArray  # Shape (N, 2): points in `laser`, in metres: x across, y forward.
+    offset: float  # Distance of the laser's plane from the dome's centre, in metres.
     # Operational range zone, distances from the dome's centre in metres.
     working_range: tuple[float, float]
     # Shape (N,): points in that zone.

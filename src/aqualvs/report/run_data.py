@@ -52,16 +52,11 @@ class NoFrameError(SourceError):
 class Track:
     """`posture.csv` as arrays, one entry per frame, ordered by frame."""
 
-    # Shape (N,).
-    frame: IntArray
-    # Shape (N,).
-    time_s: FloatArray
-    # Shape (N,).
-    valid: BoolArray
-    # Shape (N,): index into `reasons`; meaningful where not valid.
-    reason: IntArray
-    # As the file spells them.
-    reasons: tuple[str, ...]
+    frame: IntArray  # Shape (N,).
+    time_s: FloatArray  # Shape (N,).
+    valid: BoolArray  # Shape (N,).
+    reason: IntArray  # Shape (N,): index into `reasons`; meaningful where not valid.
+    reasons: tuple[str, ...]  # As the file spells them.
     # Shape (N, 3): range in metres, pitch and yaw in degrees; NaN where not valid. `sigma` is what
     # the noise of one frame makes.
     posture: FloatArray

@@ -58,19 +58,15 @@ from aqualvs.text import LABEL_COLOURS, LABEL_WORDS, clock, signed
 class Material:
     """Content of a run's report."""
 
-    # The dive's name.
-    title: str
-    # Content of `run.yaml`, empty where it is missing.
-    run: Mapping[str, Any]
-
+    title: str  # The dive's name.
+    run: Mapping[str, Any]  # Content of `run.yaml`, empty where it is missing.
     track: Track
     # Shape (N, 3): on the frames of the track: range in metres, pitch and yaw in degrees.
     truth: FloatArray | None
     bare: FloatArray | None
 
     points: PointSummary | None
-    # At least as many as have points.
-    lasers: list[LaserFacts]
+    lasers: list[LaserFacts]  # At least as many as have points.
     # Rows of the track with a picture, and in the laser-plane view.
     picture_rows: list[int]
     sample_rows: list[int]

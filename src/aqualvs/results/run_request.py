@@ -121,8 +121,7 @@ def now() -> str:
 class Water:
     """Medium as stated by the user; all None leaves the rig's own index."""
 
-    # Refractive index relative to vacuum.
-    n_water: float | None = None
+    n_water: float | None = None  # Refractive index relative to vacuum.
     # Degrees Celsius and per mille; only together.
     temperature_c: float | None = None
     salinity: float | None = None

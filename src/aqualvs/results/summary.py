@@ -38,12 +38,9 @@ class Deviation:
 class TruthComparison:
     """Deviation of a run's postures from the truth."""
 
-    # Frames with a posture and a truth.
-    n_compared: int
-    # Frames with a truth but without a posture.
-    n_missed: int
-    # Of the range, in percent of the true range.
-    range_percent: Deviation
+    n_compared: int  # Frames with a posture and a truth.
+    n_missed: int  # Frames with a truth but without a posture.
+    range_percent: Deviation  # Of the range, in percent of the true range.
     # In degrees.
     pitch_deg: Deviation
     yaw_deg: Deviation
@@ -177,8 +174,7 @@ class RunSummary:
     Summaries of consecutive parts of a dive add up to that of the dive: `save` and `extend`.
     """
 
-    # Frames without posture, by reason.
-    refused: Counter[str] = field(default_factory=Counter)
+    refused: Counter[str] = field(default_factory=Counter)  # Frames without posture, by reason.
     # Metres, one for each frame; NaN without a posture.
     ranges: "array[float]" = field(default_factory=lambda: array("d"))
     # Monitor of the lasers, if they are monitored.

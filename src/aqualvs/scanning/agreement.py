@@ -200,14 +200,10 @@ class SeenStripes:
 class Explanation:
     """Fit of the frames under the hypothesis that one laser, or none, has moved."""
 
-    # The one that may have moved.
-    laser: int | None
-    # Shape (3,): its step as `moved_plane` takes it: tilts (rad) and offset (m).
-    step: FloatArray
-    # Mean square residual in sigmas, none counted beyond `CUT`.
-    cost: float
-    # Share of residuals below `CUT`.
-    inliers: float
+    laser: int | None  # The one that may have moved.
+    step: FloatArray  # Shape (3,): its step as `moved_plane` takes it: tilts (rad) and offset (m).
+    cost: float  # Mean square residual in sigmas, none counted beyond `CUT`.
+    inliers: float  # Share of residuals below `CUT`.
     # Root mean square distance of that laser's stripe from the targets, as a share of range.
     effect: float
     # Shape (3 L, 3 L): of the steps of all lasers, from a typical frame: errors of a stripe are the
@@ -290,10 +286,8 @@ def _moved(sheet: Sheet, step: FloatArray) -> Sheet:
 class _View:
     """Points of stripes on the assumed sheets; frames first, the bins of all lasers in one axis."""
 
-    # Shape (F, L K, 3).
-    points: FloatArray
-    # Shape (F, L K, 3): derivative of the points by a pixel across the stripe.
-    per_px: FloatArray
+    points: FloatArray  # Shape (F, L K, 3).
+    per_px: FloatArray  # Shape (F, L K, 3): derivative of the points by a pixel across the stripe.
     # Shape (F, L K, 3, 3): derivative of the points by a step of their own laser.
     by_step: FloatArray
     # Shape (F, L K).
@@ -344,8 +338,7 @@ def _on_sheet(stripes: SeenStripes, laser: int, sheet: Sheet) -> _View:
 class _Fit:
     """Planes fitted to all frames, and their residuals."""
 
-    # Shape (F, 3).
-    m: FloatArray
+    m: FloatArray  # Shape (F, 3).
     # Shape (F, L K): weights by errors and outliers; residuals of m·X = 1, and the same in sigmas.
     weight: FloatArray
     residual: FloatArray
@@ -450,8 +443,7 @@ class AgreementVerdict:
     """The verdict on the lasers: their agreement, and the suspects if they disagree."""
 
     state: AgreementState
-    # Frames that the verdict is based on.
-    n_frames: int
+    n_frames: int  # Frames that the verdict is based on.
     # Lasers of which one has moved, numbered from 0, the likeliest first.
     suspects: tuple[int, ...] = ()
     # Of the suspects.

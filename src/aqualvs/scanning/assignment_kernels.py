@@ -39,8 +39,7 @@ SAME_RANGE, SAME_ANGLE = 0.004, math.radians(0.4)
 class _EvidenceOptions(NamedTuple):
     """Light of the lasers on a plane, and what counts as dark or faint."""
 
-    # Least light that a rival must explain, as a share of the surface's.
-    rival_share: float = 0.5
+    rival_share: float = 0.5  # Least light that a rival must explain, as a share of the surface's.
     # Light within this many gates of a plane is on it: lasers whose calibration is less accurate
     # than the peaks must not count as dark, nor their light as foreign.
     wide: float = 2.5

@@ -358,12 +358,9 @@ FORWARD: FloatArray = np.array([0.0, 1.0, 0.0])
 class Candidates:
     """Triangulated candidates, N of them, ordered by laser, segment and subsegment."""
 
-    # Shape (N,): number of the peak; equal for all candidates of one peak.
-    source: IntArray
-    # Shape (N,): index of the laser that the peak is read as.
-    laser: IntArray
-    # Shape (N,): search line.
-    line: IntArray
+    source: IntArray  # Shape (N,): number of the peak; equal for all candidates of one peak.
+    laser: IntArray  # Shape (N,): index of the laser that the peak is read as.
+    line: IntArray  # Shape (N,): search line.
     # Shape (N,): numbers of the component (connected segments) and the subsegment; those of the
     # subsegments ascend.
     component: IntArray

@@ -34,8 +34,7 @@ class SearchAxis(Enum):
 class LaserBand:
     """The search band of one laser in the image."""
 
-    # Direction of the search lines.
-    axis: SearchAxis
+    axis: SearchAxis  # Direction of the search lines.
     # Pixels across one search line, 1 or 2: the mean of so many rows or columns of pixels, or one
     # row of every two in a field.
     line_px: int

@@ -160,8 +160,7 @@ _FACING = 0.57
 class Patch:
     """A curved piece of net over a base plane."""
 
-    # In `dome`; heights are measured along its normal.
-    base: Plane
+    base: Plane  # In `dome`; heights are measured along its normal.
     # Shape (3,): unit vectors in the base plane along which u and v run, in `dome`.
     right: FloatArray
     up: FloatArray

@@ -227,12 +227,9 @@ class FitMethod(StrEnum):
 class Measurement:
     """A posture or its refusal, with the inliers and their weights."""
 
-    # The result.
-    posture: Posture | Refusal
-    # Shape (N,): inliers: candidates in the posture; none where it is refused.
-    inliers: BoolArray
-    # The curved surface, where a plane does not describe the net.
-    patch: Patch | None = None
+    posture: Posture | Refusal  # The result.
+    inliers: BoolArray  # Shape (N,): inliers: candidates in the posture; none where it is refused.
+    patch: Patch | None = None  # The curved surface, where a plane does not describe the net.
     # Shape (N,): mask of the net: candidates on it, also where its folds leave the surface; None if
     # the target is no net.
     net_mask: BoolArray | None = None

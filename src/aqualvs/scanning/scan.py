@@ -152,8 +152,7 @@ class ScanPoints:
 class GyroRates:
     """Angular velocity of the vehicle at a picture's middle, from its gyros."""
 
-    # Shape (3,): angular velocity about the axes of `dome`, in rad/s.
-    rates: FloatArray
+    rates: FloatArray  # Shape (3,): angular velocity about the axes of `dome`, in rad/s.
     # Standard deviation of each, in rad/s, as the turning before a target that stands still.
     sigma: float
 

@@ -46,8 +46,7 @@ _MOMENTS, _SQUARES, _N_SUMS = 5, 8, 9
 class ComponentShapes(NamedTuple):
     """Shapes of components (connected segments), one row for each component number."""
 
-    # Shape (S,): search lines in it.
-    n_lines: FloatArray
+    n_lines: FloatArray  # Shape (S,): search lines in it.
     # Shape (S,): height of its bend over its chord, as a shift of the stripe; 0 where it is too
     # short to have a shape.
     sagitta_px: FloatArray

@@ -330,12 +330,9 @@ _SHARED = 0.5
 class Surface:
     """A plane that subsegments of at least two lasers agree on."""
 
-    # In `dome`, offset > 0.
-    plane: Plane
-    # Shape (C,): subsegments on it.
-    members: BoolArray
-    # Search lines on it.
-    n_lines: int
+    plane: Plane  # In `dome`, offset > 0.
+    members: BoolArray  # Shape (C,): subsegments on it.
+    n_lines: int  # Search lines on it.
     # Inlier weight: light on it, that of the best laser up to three times the second's, because a
     # plane needs two lasers.
     inlier_weight: float

@@ -23,8 +23,7 @@ _DIFFERENCE_PX = 0.25
 class Triangulation:
     """Points on laser sheets, N of them."""
 
-    # Shape (N, 3): metres; NaN where not valid.
-    points_in_dome: FloatArray
+    points_in_dome: FloatArray  # Shape (N, 3): metres; NaN where not valid.
     # Shape (N, 3): derivative of the point by the stripe's position along the search line, in m/px.
     # The covariance of a point is sigma_px² times its outer product: an error along the stripe
     # stays on the stripe.

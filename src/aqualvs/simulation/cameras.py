@@ -211,16 +211,11 @@ class Development:
 class SimulatedCamera:
     """Camera for simulated pictures."""
 
-    # Name for `aqualvs simulate --camera`.
-    name: str
-    # One line for lists.
-    about: str
-    # Response of its sensor to daylight and lasers.
-    filters: ColourFilters = COLOUR_BALANCED
-    # None uses the scene's own `CameraSensor` only.
-    development: Development | None = None
-    # Compression of its videos.
-    recording: Compression = field(default_factory=Compression)
+    name: str  # Name for `aqualvs simulate --camera`.
+    about: str  # One line for lists.
+    filters: ColourFilters = COLOUR_BALANCED  # Response of its sensor to daylight and lasers.
+    development: Development | None = None  # None uses the scene's own `CameraSensor` only.
+    recording: Compression = field(default_factory=Compression)  # Compression of its videos.
     # JPEG quality (0 to 100) of its single pictures; None writes them as PNG.
     still_quality: int | None = None
 

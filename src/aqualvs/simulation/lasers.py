@@ -144,8 +144,7 @@ class LaserSource:
 class Sheets(NamedTuple):
     """Laser sheets as tables."""
 
-    # Shape (n, 22): see the column constants of this module.
-    table: FloatArray
+    table: FloatArray  # Shape (n, 22): see the column constants of this module.
     # Shape (n, N_FAN): relative power over the tangent of the fan angle, from -reach to reach.
     fan: FloatArray
     # Shape (n, N_FAN): distance from the source at which the sheet's middle meets a surface;

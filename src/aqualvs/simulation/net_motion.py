@@ -41,10 +41,8 @@ class NetPosture(NamedTuple):
 class NetWall:
     """Upright net, flat or an upright cylinder, that sways, drifts and tilts as a whole."""
 
-    # Middle of the net at rest, in the world, in metres.
-    position: Vec = (0.0, 0.0, 5.0)
-    # Viewing direction to the middle, in radians clockwise from north.
-    bearing: float = 0.0
+    position: Vec = (0.0, 0.0, 5.0)  # Middle of the net at rest, in the world, in metres.
+    bearing: float = 0.0  # Viewing direction to the middle, in radians clockwise from north.
     # In 1/m: 0 is flat, positive a cage seen from outside (it recedes to both sides), negative one
     # seen from inside.
     curvature: float = 0.0

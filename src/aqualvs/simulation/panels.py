@@ -277,10 +277,8 @@ class Panel:
 class RoomLight:
     """Light besides the lasers: an even part, and that of a lamp far behind the camera."""
 
-    # Radiance of a white panel that faces the lamp.
-    level: float = 0.62
-    # The lamp's place in `dome`, in metres.
-    lamp: Vector = (0.5, -0.6, 0.9)
+    level: float = 0.62  # Radiance of a white panel that faces the lamp.
+    lamp: Vector = (0.5, -0.6, 0.9)  # The lamp's place in `dome`, in metres.
     # Share of the light that falls off with the angle to the lamp, 0 to 1.
     lamp_share: float = 0.45
     # Red, green and blue of white.
@@ -293,10 +291,8 @@ class RoomLight:
 class PanelScene:
     """Scene of panels in front of the camera."""
 
-    # The nearest one on a ray is seen.
-    panels: Sequence[Panel]
-    # Light besides the lasers.
-    light: RoomLight = field(default_factory=RoomLight)
+    panels: Sequence[Panel]  # The nearest one on a ray is seen.
+    light: RoomLight = field(default_factory=RoomLight)  # Light besides the lasers.
     # Blur, noise and tone of the camera.
     sensor: CameraSensor = field(default_factory=CameraSensor)
 
@@ -305,12 +301,9 @@ class PanelScene:
 class PanelRenderer:
     """Renderer of panels for one camera."""
 
-    # Behind its dome, in any medium, or bare.
-    camera: Camera
-    # The lasers, see `panel_sheets`; None switches them off.
-    sheets: Sheets | None = None
-    # Rays along each side of a pixel.
-    samples: int = 2
+    camera: Camera  # Behind its dome, in any medium, or bare.
+    sheets: Sheets | None = None  # The lasers, see `panel_sheets`; None switches them off.
+    samples: int = 2  # Rays along each side of a pixel.
     # Sensor and processing; the sheets must be packed with its filters.
     eye: SimulatedCamera = IDEAL
 

@@ -179,8 +179,7 @@ SceneAt: TypeAlias = Callable[[float], Scene]
 class RenderedFrame:
     """One rendered frame and its truth."""
 
-    # Shape (height, width, 3): red, green, blue.
-    image: NDArray[np.uint8]
+    image: NDArray[np.uint8]  # Shape (height, width, 3): red, green, blue.
     # Points where the middles of the laser sheets meet surfaces that the camera sees.
     lit: LitPoints
 
@@ -192,8 +191,7 @@ class Renderer:
     Raises `RigError` if the sources do not fit the rig's lasers.
     """
 
-    # Camera, housing, water and lasers.
-    rig: Rig
+    rig: Rig  # Camera, housing, water and lasers.
     # One for each laser; by default they follow from the rig (`default_sources`).
     sources: Sequence[LaserSource] = ()
     # Rays along each side of a pixel: 2 means four rays a pixel.

@@ -203,18 +203,12 @@ class Trajectory:
 class Scenario:
     """Scenario of a dive: scene and motion, before rendering."""
 
-    # Name in reports.
-    name: str
-    # In seconds.
-    duration: float
-    # Frames a second.
-    fps: float = 25.0
-    # Seed of noise and everything else that is random.
-    seed: int = 0
-    # Posture of the vehicle over time.
-    trajectory: Trajectory = field(default_factory=Trajectory)
-    # Content of the target plane; "none" if it is empty.
-    target: Target = "none"
+    name: str  # Name in reports.
+    duration: float  # In seconds.
+    fps: float = 25.0  # Frames a second.
+    seed: int = 0  # Seed of noise and everything else that is random.
+    trajectory: Trajectory = field(default_factory=Trajectory)  # Posture of the vehicle over time.
+    target: Target = "none"  # Content of the target plane; "none" if it is empty.
     # As in `Scene`; they move with the target.
     walls: tuple[Wall, ...] = ()
     nets: tuple[Net, ...] = ()

@@ -35,8 +35,7 @@ class SurfaceKind(IntEnum):
 class Wall:
     """Wall: a plane with a procedural texture, parallel to the target plane unless turned."""
 
-    # Place of the wall on the scene's y axis, in metres; 0 is the target plane.
-    depth: float = 0.0
+    depth: float = 0.0  # Place of the wall on the scene's y axis, in metres; 0 is the target plane.
     # Turn of the wall against the target plane, in radians; signs as for postures.
     yaw: float = 0.0
     pitch: float = 0.0
@@ -79,12 +78,9 @@ class Net:
     the plane, its mesh is stretched: seen along the plane's normal it stays unchanged.
     """
 
-    # Shape of the openings.
-    mesh: Mesh = "diamond"
-    # Length of one side of an opening, in metres.
-    bar: float = 0.025
-    # Diameter of the clean twine, in metres.
-    twine: float = 0.002
+    mesh: Mesh = "diamond"  # Shape of the openings.
+    bar: float = 0.025  # Length of one side of an opening, in metres.
+    twine: float = 0.002  # Diameter of the clean twine, in metres.
     # Turn of the mesh about the net's normal, in radians, counter-clockwise for the vehicle.
     roll: float = 0.0
     # Width of a diamond over its stretched width; 0.707 makes it a square on its corner.
@@ -199,8 +195,7 @@ class CameraSensor:
 class Scene:
     """Scene in front of the camera at one instant; moving bodies have their velocity."""
 
-    # Places the scene; see `aqualvs.simulation.scenario.dome_from_target`.
-    dome_from_scene: SE3
+    dome_from_scene: SE3  # Places the scene; see `aqualvs.simulation.scenario.dome_from_target`.
     # Surfaces.
     walls: tuple[Wall, ...] = ()
     nets: tuple[Net, ...] = ()

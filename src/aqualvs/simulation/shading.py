@@ -40,8 +40,7 @@ _EVERYWHERE = 1e3
 class Light(NamedTuple):
     """Numbers of `WaterOptics` for the kernels of rays."""
 
-    # Shape (3, 3): rows: attenuation per metre, veil, ambient.
-    colours: FloatArray
+    colours: FloatArray  # Shape (3, 3): rows: attenuation per metre, veil, ambient.
     # As in `WaterOptics`.
     sheet_scatter: float
     caustics: float

@@ -29,12 +29,9 @@ NONE, NET, WALL, FISH, BUBBLE, SOLID = range(6)
 class Surfaces(NamedTuple):
     """Tables of one scene in `dome`, one row a surface."""
 
-    # Shape (n, columns): see the column constants of this module and of `net`.
-    walls: FloatArray
-    # As `walls`.
-    nets: FloatArray
-    # Shape (n, 4): index of the net, u, v and radius.
-    holes: FloatArray
+    walls: FloatArray  # Shape (n, columns): see the column constants of this module and of `net`.
+    nets: FloatArray  # As `walls`.
+    holes: FloatArray  # Shape (n, 4): index of the net, u, v and radius.
     # Shape (n, columns): see `net.pack_fold`; the first column is the index of the net.
     folds: FloatArray
     # As `walls`.
@@ -50,8 +47,7 @@ class Surfaces(NamedTuple):
 class Hit(NamedTuple):
     """Intersection of a ray with the first opaque surface."""
 
-    # Distance along the ray in metres; infinite if the ray meets nothing.
-    t: float
+    t: float  # Distance along the ray in metres; infinite if the ray meets nothing.
     # `Label` of the surface and its place in the table.
     kind: int
     row: int

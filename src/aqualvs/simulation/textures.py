@@ -111,8 +111,7 @@ class Texture:
 class CharucoPrint:
     """Printed ChArUco board (OpenCV's current pattern)."""
 
-    # Number of squares along x and y.
-    squares: tuple[int, int]
+    squares: tuple[int, int]  # Number of squares along x and y.
     # Side of a square and of a marker, width of the light border, in metres.
     square: float
     marker: float
@@ -125,10 +124,8 @@ class CharucoPrint:
 class MarkerPrint:
     """Markers on one flat sheet, in cells of a texture."""
 
-    # OpenCV's name of their dictionary.
-    dictionary: str
-    # Shape (M,): number of each in the dictionary.
-    ids: IntArray
+    dictionary: str  # OpenCV's name of their dictionary.
+    ids: IntArray  # Shape (M,): number of each in the dictionary.
     # Shape (M, 2): column and row of each one's top-left corner, in cells.
     corners: IntArray = field(repr=False)
     # Cells along a marker's side; a multiple of its bits and its frame together.

@@ -60,10 +60,8 @@ class StageDelay:
 class Health:
     """Health of a live run, over the last seconds."""
 
-    # Frames measured per second.
-    rate_hz: float = 0.0
-    # Share of them with a posture; NaN without frames.
-    valid_share: float = float("nan")
+    rate_hz: float = 0.0  # Frames measured per second.
+    valid_share: float = float("nan")  # Share of them with a posture; NaN without frames.
     # Since the start: measured; skipped because a newer one had come; not decoded.
     n_frames: int = 0
     n_dropped: int = 0
@@ -74,8 +72,7 @@ class Health:
     source: PartHealth = field(default_factory=lambda: PartHealth("source", State.OFF))
     lasers: tuple[PartHealth, ...] = ()
     outputs: tuple[PartHealth, ...] = ()
-    # Mean stripe quality on the target, 0 to 1; NaN without points.
-    quality: float = float("nan")
+    quality: float = float("nan")  # Mean stripe quality on the target, 0 to 1; NaN without points.
     # Refractive index in use, and its standard deviation where it is measured on line (else NaN).
     n_water: float = float("nan")
     sigma_n_water: float = float("nan")

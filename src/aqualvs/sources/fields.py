@@ -225,10 +225,8 @@ def combed_share(luma: ImagePlane) -> float:
 class FieldEvidence:
     """Signs of fields in whole pictures of a source."""
 
-    # Whether the stream says that its pictures are interlaced.
-    is_marked: bool
-    # Mean share of combed pixels.
-    combed: float
+    is_marked: bool  # Whether the stream says that its pictures are interlaced.
+    combed: float  # Mean share of combed pixels.
     # The same if the bottom rows came from the next picture: what fields would show at most.
     woven: float
     # The same if the top rows did.

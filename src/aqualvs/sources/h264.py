@@ -19,8 +19,7 @@ _START_CODE = b"\x00\x00\x01"
 class Units:
     """Units of a packet up to its first coded slice."""
 
-    # Whether the picture is an IDR picture: decoding may begin with it.
-    is_refresh: bool
+    is_refresh: bool  # Whether the picture is an IDR picture: decoding may begin with it.
     # Whether there are any before it, and all that decoding needs.
     has_parameter_sets: bool
     has_all_parameter_sets: bool

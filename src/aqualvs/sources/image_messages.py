@@ -53,18 +53,14 @@ ENCODINGS = tuple(sorted({*_GREY, *_GREY_16, *_TO_BGR, *_PACKED_422}))
 class ImageMessage:
     """One picture, or one packet of a video."""
 
-    # Time of the picture, nanoseconds; 0 if the message has none.
-    stamp_ns: int
+    stamp_ns: int  # Time of the picture, nanoseconds; 0 if the message has none.
     # Of the pixels where `size_px` is given, else of the file or video: "jpeg", "png", "h264".
     encoding: str
 
     data: bytes
-    # Width and height of a picture that is not compressed.
-    size_px: tuple[int, int] | None = None
-    # Bytes from row to row.
-    step: int = 0
-    # Byte order of pixels of 16 bits.
-    is_big_endian: bool = False
+    size_px: tuple[int, int] | None = None  # Width and height of a picture that is not compressed.
+    step: int = 0  # Bytes from row to row.
+    is_big_endian: bool = False  # Byte order of pixels of 16 bits.
 
     @property
     def codec(self) -> str | None:

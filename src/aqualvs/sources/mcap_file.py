@@ -200,8 +200,7 @@ class StoredMessage:
 class _Listing:
     """Contents of a file as stated by one of its ends."""
 
-    # Numbers and topics.
-    channels: list[tuple[int, str]] = field(default_factory=list)
+    channels: list[tuple[int, str]] = field(default_factory=list)  # Numbers and topics.
     # From a chunk's place in the file to the length of its record; None where not known.
     chunks: dict[int, int | None] = field(default_factory=dict)
     # Messages by channel.

@@ -201,10 +201,8 @@ _DEVICES = Path("/dev")
 class CameraOptions:
     """Options requested of a camera; the camera chooses those left out."""
 
-    # Width and height.
-    size_px: tuple[int, int] | None = None
-    # Frames per second.
-    fps: float | None = None
+    size_px: tuple[int, int] | None = None  # Width and height.
+    fps: float | None = None  # Frames per second.
     # As FFmpeg calls it: `h264`, `mjpeg`, `yuyv422`. Many cameras reach their full rate with the
     # first two only.
     pixel_format: str | None = None

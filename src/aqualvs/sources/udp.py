@@ -56,12 +56,9 @@ from aqualvs.special_files import refuse_special
 class SdpVideo:
     """The video that a session description announces."""
 
-    # Where it arrives; the host is kept for multicast only.
-    address: UdpAddress
-
+    address: UdpAddress  # Where it arrives; the host is kept for multicast only.
     payload_type: int
-    # As in RTP, upper case: "H264".
-    codec: str
+    codec: str  # As in RTP, upper case: "H264".
     # SPS and PPS of H.264 as a byte stream; empty if they come in the stream.
     parameter_sets: bytes
 

@@ -100,12 +100,9 @@ class Table:
 class SelectedMessages:
     """Wanted messages of a telemetry log."""
 
-    # By message name; messages that did not come are missing.
-    tables: Mapping[str, Table]
-    # Frames of any kind.
-    n_frames: int
-    # Wanted frames whose checksum is wrong; they are left out.
-    n_failed: int
+    tables: Mapping[str, Table]  # By message name; messages that did not come are missing.
+    n_frames: int  # Frames of any kind.
+    n_failed: int  # Wanted frames whose checksum is wrong; they are left out.
     # Stretches that hold no frames: place in the file, and length in bytes.
     skipped: tuple[tuple[int, int], ...]
 

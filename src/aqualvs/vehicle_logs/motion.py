@@ -157,8 +157,7 @@ class Channel:
 class OffsetScores:
     """Agreement of all channels at every offset of the grid."""
 
-    # Shape (k,): log time minus dive time, rising by `STEP_S`.
-    offset_s: FloatArray
+    offset_s: FloatArray  # Shape (k,): log time minus dive time, rising by `STEP_S`.
     # Shape (k,): logarithm of the likelihood ratio between "the motions agree" and "they do not".
     score: FloatArray
     # Shape (k,): time for which both are known, of the channel that has most.

@@ -40,8 +40,7 @@ _START_SIGMAS = 4.0
 class PostureTrack:
     """Posture over a dive."""
 
-    # Shape (n,): dive time, increasing.
-    time_s: FloatArray
+    time_s: FloatArray  # Shape (n,): dive time, increasing.
     # Shape (n,): posture to the net in radians (paper, Eq. 24-26); anything where not valid.
     yaw: FloatArray
     pitch: FloatArray
@@ -58,10 +57,8 @@ class PostureTrack:
 class TimeOffset:
     """Offset between two clocks: log time = dive time + offset_s."""
 
-    # Seconds.
-    offset_s: float
-    # Its standard deviation.
-    sigma_s: float
+    offset_s: float  # Seconds.
+    sigma_s: float  # Its standard deviation.
     # Between the vehicle's and the net's motion at this offset, 1 for full agreement; None where
     # the offset does not come from motion.
     correlation: float | None

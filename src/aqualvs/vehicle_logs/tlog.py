@@ -78,14 +78,10 @@ _FIRST_BELIEVED = datetime.datetime(1990, 1, 1, tzinfo=datetime.UTC).timestamp()
 class TelemetryClock:
     """Log time of every message."""
 
-    # Shape (n,): places in the file of the messages that define the clock.
-    at: IntArray
-    # Shape (n,): their log time.
-    log_s: FloatArray
-    # Shape (k,): place in the file from which each run of the autopilot counts.
-    boot_at: IntArray
-    # Shape (k,): log time at which each run began.
-    boot_s: FloatArray
+    at: IntArray  # Shape (n,): places in the file of the messages that define the clock.
+    log_s: FloatArray  # Shape (n,): their log time.
+    boot_at: IntArray  # Shape (k,): place in the file from which each run of the autopilot counts.
+    boot_s: FloatArray  # Shape (k,): log time at which each run began.
     # UTC of log time 0, and how far to trust it.
     start_utc_s: float | None
     start_utc_sigma_s: float | None

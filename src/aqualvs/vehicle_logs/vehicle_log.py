@@ -156,8 +156,7 @@ def bearing_of(angle: FloatArray) -> FloatArray:
 class LoggedStates:
     """The vehicle at some times; NaN and False where the log has no value."""
 
-    # Shape (n,): log time.
-    time_s: FloatArray
+    time_s: FloatArray  # Shape (n,): log time.
     # Shape (n,): metres, positive down; radians, heading in [0, 2 pi).
     depth: FloatArray
     heading: FloatArray
@@ -174,12 +173,9 @@ class LoggedStates:
 class VehicleLog:
     """A vehicle's log: signals on one clock, each with its own time stamps."""
 
-    # How messages call it: the file's path.
-    name: str
-    # 'csv', 'tlog' (MAVLink telemetry), 'dataflash' or 'dataflash text'.
-    kind: str
-    # Metres below the surface, positive down.
-    depth: Signal | None = None
+    name: str  # How messages call it: the file's path.
+    kind: str  # 'csv', 'tlog' (MAVLink telemetry), 'dataflash' or 'dataflash text'.
+    depth: Signal | None = None  # Metres below the surface, positive down.
     # Radians clockwise from north as the vehicle knows it, in [0, 2 pi).
     heading: Signal | None = None
     # Radians, MAVLink's axes (forward, right, down): roll is positive with the right side down,
@@ -262,10 +258,8 @@ def _at(signal: Signal | None, times: FloatArray) -> tuple[FloatArray, BoolArray
 class Places:
     """Vehicle and net in `world` at some dive times; NaN where not valid."""
 
-    # Shape (n,): dive time.
-    time_s: FloatArray
-    # Shape (n,): of the vehicle's depth sensor, in metres, positive down.
-    depth: FloatArray
+    time_s: FloatArray  # Shape (n,): dive time.
+    depth: FloatArray  # Shape (n,): of the vehicle's depth sensor, in metres, positive down.
     # Shape (n,): of the vehicle's nose (the dome's y axis), radians clockwise from north, in [0, 2
     # pi).
     heading: FloatArray

@@ -177,8 +177,7 @@ class CameraCalibration:
     """Result of a camera calibration: intrinsics with their uncertainty."""
 
     lens: Lens
-    # Image width and height.
-    size_px: tuple[int, int]
+    size_px: tuple[int, int]  # Image width and height.
     # Of the intrinsics, from the disagreement of the views (`solver.covariance`).
     uncertainty: RigUncertainty
     # Ratio of that variance to the variance for independent errors of corners.

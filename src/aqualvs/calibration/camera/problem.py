@@ -141,8 +141,7 @@ class BentFit:
     """A bundle solved together with its board's bend."""
 
     bend: BoardBend
-    # With its points on the bent board.
-    bundle: Bundle
+    bundle: Bundle  # With its points on the bent board.
     # The bend's coefficients are the last columns of its covariance.
     solution: Solution[BundleState]
 

@@ -83,8 +83,7 @@ class CornerGrid:
 class PredictedCorners:
     """Places of the grid points as predicted from their neighbours."""
 
-    # Shape (rows, columns, 2): in `image`; NaN where not valid.
-    pixels: FloatArray
+    pixels: FloatArray  # Shape (rows, columns, 2): in `image`; NaN where not valid.
     # Shape (rows, columns, 2, 2): side of a square along the board's x (`[..., 0]`) and y (`[...,
     # 1]`), in pixels.
     axes: FloatArray
@@ -335,10 +334,8 @@ def _inside(pixels: FloatArray, image: GreyImage) -> BoolArray:
 class Seeds:
     """Corners on which neighbouring markers agree."""
 
-    # Shape (K,): indices of inner corners of the board.
-    corners: IntArray
-    # Shape (K, 2): their approximate places, in `image`.
-    pixels: FloatArray
+    corners: IntArray  # Shape (K,): indices of inner corners of the board.
+    pixels: FloatArray  # Shape (K, 2): their approximate places, in `image`.
     # Shape (K, 2, 2): sides of a square along the board's x and y there, as columns, in pixels.
     axes: FloatArray
     # Number of pairs of markers that agree across rows.

@@ -346,8 +346,7 @@ GreyImage = NDArray[np.uint8]
 class SaddleFit:
     """Corners refined to sub-pixel accuracy."""
 
-    # Shape (N, 2): in `image`; the starting place where not valid.
-    pixels: FloatArray
+    pixels: FloatArray  # Shape (N, 2): in `image`; the starting place where not valid.
     # Shape (N,): standard deviation of a coordinate from the fit's own residual, in pixels.
     sigma: FloatArray
     # Shape (N,): standard deviation of the blur across the edges, in pixels.

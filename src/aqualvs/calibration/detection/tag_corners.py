@@ -453,8 +453,7 @@ _GAMMA = (np.log(1.6), 0.5)
 class TagFit:
     """Corners of markers, refined to sub-pixel accuracy."""
 
-    # Shape (M, 4, 2): in `image`, in OpenCV's order; NaN where not valid.
-    pixels: FloatArray
+    pixels: FloatArray  # Shape (M, 4, 2): in `image`, in OpenCV's order; NaN where not valid.
     # Shape (M, 4): standard deviation of a coordinate, from the residual, in pixels; NaN where not
     # valid.
     sigma: FloatArray

@@ -48,8 +48,7 @@ from aqualvs.optics.water import N_AIR
 class _MediumOptions(NamedTuple):
     """Test whether the boards were in the medium that is stated."""
 
-    # An index this many sigmas from the stated one contradicts it.
-    sure: float = 5.0
+    sure: float = 5.0  # An index this many sigmas from the stated one contradicts it.
     # Between air and water.
     halfway: float = 1.15
     air: float = N_AIR

@@ -82,10 +82,8 @@ def kind_of(given: GivenPose | None) -> PoseKind:
 class BoardSet:
     """Views taken in one medium."""
 
-    # For messages: "air", "pool", a folder.
-    name: str
-    # One for each picture.
-    views: tuple[View, ...]
+    name: str  # For messages: "air", "pool", a folder.
+    views: tuple[View, ...]  # One for each picture.
     # Measurements of each view's board; empty if nothing is known of any.
     poses: Sequence[GivenPose | None] = ()
     # Index outside the dome (vacuum = 1).

@@ -197,10 +197,8 @@ _ACCIDENTS = _AccidentOptions()
 class PlaneCandidate:
     """A plane that may be a laser's."""
 
-    # In `dome`.
-    plane: Plane
-    # Shape (K,): indices of the lines in it.
-    lines: IntArray
+    plane: Plane  # In `dome`.
+    lines: IntArray  # Shape (K,): indices of the lines in it.
     # Natural logarithm of the number of accidental planes as good as this one that are expected in
     # these pictures.
     log_false_alarms: float
@@ -212,12 +210,9 @@ class PlaneCandidate:
 class LineTable:
     """Ends and middles of L lines, from which planes are guessed and on which they are tested."""
 
-    # Shape (L,): index of the line's surface of a view.
-    patch: IntArray
-    # Shape (L,): in metres.
-    length: FloatArray
-    # Shape (L, 3, 3): ends and middle, in `dome`.
-    points: FloatArray
+    patch: IntArray  # Shape (L,): index of the line's surface of a view.
+    length: FloatArray  # Shape (L,): in metres.
+    points: FloatArray  # Shape (L, 3, 3): ends and middle, in `dome`.
     # Shape (L, 3, 3): their derivative by the pixel across the stripe, metres per pixel.
     by_across: FloatArray
 

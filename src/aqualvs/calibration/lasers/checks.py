@@ -30,8 +30,7 @@ from aqualvs.optics.rig import Laser, Rig, RigUncertainty
 class LaserFigures:
     """Figures of one calibrated laser."""
 
-    # As solved.
-    laser: Laser
+    laser: Laser  # As solved.
     # Standard deviation of the normal's direction, along the worst axis, in radians.
     sigma_normal: float
     # Standard deviation of the offset, in metres.
@@ -60,10 +59,8 @@ class LaserFigures:
 class ViewFigures:
     """Figures of one picture of the calibration."""
 
-    # File name.
-    name: str
-    # Pose by corners and stripes together.
-    dome_from_target: SE3
+    name: str  # File name.
+    dome_from_target: SE3  # Pose by corners and stripes together.
     # Of the inliers; NaN if there are none.
     rms_corners_px: float
     rms_stripes_px: float
@@ -91,8 +88,7 @@ class ViewFigures:
 class LaserCalibration:
     """Result of a calibration of lasers."""
 
-    # With the lasers, and the camera's numbers if they were refined.
-    rig: Rig
+    rig: Rig  # With the lasers, and the camera's numbers if they were refined.
     # Joint, of all numbers that were uncertain before and of the lasers.
     uncertainty: RigUncertainty
     # In the order of `rig.lasers`.

@@ -25,8 +25,7 @@ from aqualvs.optics.rig import LASER_PARAMETERS, Laser, Rig, RigUncertainty
 class CameraCovariance:
     """Uncertain numbers of the camera, and uncertainty of the medium's index."""
 
-    # Of the rig's numbers, without the medium's index.
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # Of the rig's numbers, without the medium's index.
     # Standard deviation of the index of the medium in the pictures; 0 if exact.
     sigma_medium: float
     # True if that medium is the rig's own water, so that both indices are the same number.

@@ -258,8 +258,7 @@ _HARDLY_AN_ACCIDENT = float(np.log(0.05))
 class LaserAssignment:
     """Points sorted by laser."""
 
-    # Rough planes of the lasers, the one with the best evidence first.
-    planes: tuple[Plane, ...]
+    planes: tuple[Plane, ...]  # Rough planes of the lasers, the one with the best evidence first.
     # Shape (N,): index into `planes`; -1 for points of none, or near the crossing of two stripes.
     laser: IntArray
     # Long stripes that belong to none of the planes, the longest first.

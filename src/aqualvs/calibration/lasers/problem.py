@@ -54,10 +54,8 @@ class BoardPosePrior:
 class LaserState:
     """Unknowns of the problem."""
 
-    # Camera, medium and poses.
-    bundle: BundleState
-    # Sheet of every laser.
-    sheets: tuple[Sheet, ...]
+    bundle: BundleState  # Camera, medium and poses.
+    sheets: tuple[Sheet, ...]  # Sheet of every laser.
     # Shape (V, 3): difference between the surface of the stripes and the target's own in every
     # view: two tilts about the target's middle (radians), and an offset away from the camera
     # (metres).
@@ -83,13 +81,9 @@ class LaserProblem:
     prior on the boards' poses, three for every view.
     """
 
-    # Corners and priors; all views in its first medium.
-    bundle: Bundle
-    # Of the target.
-    surfaces: TargetSurfaces
-    # Stripes; their residuals come before the corners'.
-    groups: tuple[StripeGroup, ...]
-
+    bundle: Bundle  # Corners and priors; all views in its first medium.
+    surfaces: TargetSurfaces  # Of the target.
+    groups: tuple[StripeGroup, ...]  # Stripes; their residuals come before the corners'.
     n_lasers: int
     # Uncertainty of the target's pose on the surface; None if the target is the surface.
     board_pose_prior: BoardPosePrior | None = None

@@ -161,11 +161,8 @@ _MIN_POINTS = 5
 class InitialGuess:
     """Input and initial guess of a solve."""
 
-    # In the medium of the pictures.
-    rig: Rig
-    # Of the target.
-    surfaces: TargetSurfaces
-
+    rig: Rig  # In the medium of the pictures.
+    surfaces: TargetSurfaces  # Of the target.
     views: tuple[PlacedView, ...]
     # Numbers that are refined too; None if the camera is held.
     camera_covariance: CameraCovariance | None

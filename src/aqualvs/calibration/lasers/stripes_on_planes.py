@@ -23,10 +23,8 @@ from aqualvs.optics.sheet import Sheet
 class StripePoints:
     """Points on laser stripes, found in one picture."""
 
-    # File name of the picture, for messages and reports.
-    name: str
-    # Shape (N, 2): sub-pixel centres, in `image`.
-    pixels: FloatArray
+    name: str  # File name of the picture, for messages and reports.
+    pixels: FloatArray  # Shape (N, 2): sub-pixel centres, in `image`.
     # Shape (N, 2): unit vectors in `image` at right angles to the stripe: a point is measured along
     # these only.
     across: FloatArray
@@ -70,10 +68,8 @@ _PIXEL_STEPS: FloatArray = np.array([[1.0, 0.0], [0.0, 1.0], [0.0, 0.0]])
 class TargetSurfaces:
     """Flat surfaces of a target that stripes are seen on, in the target's frame."""
 
-    # Names in messages.
-    names: tuple[str, ...]
-    # Normals point away from the side that is seen.
-    planes: tuple[Plane, ...]
+    names: tuple[str, ...]  # Names in messages.
+    planes: tuple[Plane, ...]  # Normals point away from the side that is seen.
     # Shape (3,): bounds in metres; stripes outside lie on something else.
     lowest: FloatArray
     highest: FloatArray
@@ -164,12 +160,9 @@ def board_surface(*, thickness: float = 0.0) -> TargetSurfaces:
 class PlacedStripes:
     """Stripe points of one picture on the surfaces of its target, N of them."""
 
-    # Shape (N,): indices into the `StripePoints`.
-    index: IntArray
-    # Shape (N,): index into `TargetSurfaces`.
-    surface: IntArray
-    # Shape (N, 3): in metres.
-    points_in_dome: FloatArray
+    index: IntArray  # Shape (N,): indices into the `StripePoints`.
+    surface: IntArray  # Shape (N,): index into `TargetSurfaces`.
+    points_in_dome: FloatArray  # Shape (N, 3): in metres.
     # Shape (N, 3, 2): derivative of a point on its surface by its pixel, metres per pixel.
     by_pixel: FloatArray
     # Shape (N, 2): as `StripePoints.across`.
@@ -197,8 +190,7 @@ class PlacedStripes:
 class PooledStripes:
     """Stripe points of all views, on all surfaces."""
 
-    # N points of all views; `index` counts within each view.
-    placed: PlacedStripes
+    placed: PlacedStripes  # N points of all views; `index` counts within each view.
     # Shape (N,): surface of a view that a point lies on, counted through all views.
     patch: IntArray
     # Surface of every patch, in `dome`.

@@ -54,8 +54,7 @@ class KnownDistance:
 class SquareBoard:
     """Prior on a pose: the board stands square to the dome's axes, with possible outliers."""
 
-    # Shape (3, 3): `dome_from_target` rotation of a board without tilt.
-    square: FloatArray
+    square: FloatArray  # Shape (3, 3): `dome_from_target` rotation of a board without tilt.
     # Standard deviations of well set up boards, in radians about each axis; boards far beyond count
     # little (Cauchy), so that the square majority decides. Tilt (about x and z) and roll (about y)
     # are judged separately: a rail keeps the roll of all.

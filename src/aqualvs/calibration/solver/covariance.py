@@ -247,8 +247,7 @@ def _cross_information(
 class ViewCovariance:
     """Covariance of the shared parameters, by corners and by views."""
 
-    # Shape (S, S): as if the errors of all corners were independent.
-    by_corners: FloatArray
+    by_corners: FloatArray  # Shape (S, S): as if the errors of all corners were independent.
     # Shape (S, S): from the disagreement of the views; nowhere smaller than `by_corners`.
     by_views: FloatArray
     # Ratio of the variance by views to that by corners, over all combinations; 1 if the corners'

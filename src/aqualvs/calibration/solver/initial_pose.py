@@ -60,8 +60,7 @@ _POSE = _PoseOptions()
 class TargetPose:
     """A target's pose with its uncertainty."""
 
-    # The pose.
-    dome_from_target: SE3
+    dome_from_target: SE3  # The pose.
     # Shape (6, 6): of the step of `bundle.moved_target`: a turn about the middle of the view's
     # points (radians) and a shift (metres), both in `dome`; camera and medium taken as exact.
     covariance: FloatArray

@@ -61,10 +61,8 @@ class RobustLoss(StrEnum):
 class Block:
     """Residuals that depend on the same parameters."""
 
-    # Measurements of one group are of one kind, with much the same noise.
-    group: str
-    # Shape (C,): parameters these residuals depend on.
-    columns: IntArray
+    group: str  # Measurements of one group are of one kind, with much the same noise.
+    columns: IntArray  # Shape (C,): parameters these residuals depend on.
     # Shape (N, K): measured minus predicted, or its negative, over its nominal standard deviation.
     # K values belong to one observation, such as x and y of a corner. NaN rows are not seen.
     residuals: FloatArray
@@ -98,10 +96,8 @@ class Block:
 class NormalEquations:
     """Normal equations of Gauss-Newton at one state."""
 
-    # Shape (P, P).
-    information: FloatArray
-    # Shape (P,).
-    gradient: FloatArray
+    information: FloatArray  # Shape (P, P).
+    gradient: FloatArray  # Shape (P,).
     # Shape (C, C): every block's part of `information`, in its own columns.
     own: tuple[FloatArray, ...]
 

@@ -20,12 +20,9 @@ _MIN_COMPARED, _CHANCE = 3, 0.01
 class ViewFit:
     """Fit of one view: pose, residuals and noise."""
 
-    # Name in messages.
-    label: str
-
+    label: str  # Name in messages.
     view: View
-    # Pose of its target.
-    dome_from_target: SE3
+    dome_from_target: SE3  # Pose of its target.
     # Shape (6, 6): of the step of `bundle.moved_target`; zero if the pose was exact.
     covariance: FloatArray
     # Shape (N, 2): measured minus predicted pixels; NaN where the target's point cannot be seen.
@@ -110,8 +107,7 @@ class CrossValidation:
 class DomeCalibration:
     """Result of a dome calibration: the solved rig with its uncertainty."""
 
-    # With lens, rotation, dome and intrinsics as solved; everything else unchanged.
-    rig: Rig
+    rig: Rig  # With lens, rotation, dome and intrinsics as solved; everything else unchanged.
     # Joint covariance of all solved and considered numbers, scaled by the residuals.
     uncertainty: RigUncertainty
     # One for each set.

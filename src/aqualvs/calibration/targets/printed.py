@@ -44,8 +44,7 @@ class BoxPlan:
 class SheetPatch:
     """Part of a plane that one sheet of paper covers."""
 
-    # Name of its plane.
-    plane: str
+    plane: str  # Name of its plane.
     # From the plane's top-left corner to its own, right and down as seen from inside, in metres.
     offset: tuple[float, float]
     # Width and height, in metres.
@@ -336,8 +335,7 @@ FIT = "fit"
 class _PrintLayout(NamedTuple):
     """Layout of a printed target, in millimetres of paper."""
 
-    # Margin that printers leave white.
-    edge_mm: float = 8.0
+    edge_mm: float = 8.0  # Margin that printers leave white.
     # Strip below the print for ruler and caption.
     strip_mm: float = 14.0
     ruler_mm: float = 100.0

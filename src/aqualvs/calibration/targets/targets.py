@@ -21,8 +21,7 @@ from aqualvs.geometry.planes import Plane
 class View:
     """View of a target: its points found in one picture."""
 
-    # File name of the picture, for messages and reports.
-    name: str
+    name: str  # File name of the picture, for messages and reports.
     # Shape (N,): points of the target: corner of a board, or four times the index of a marker plus
     # the corner's place.
     ids: IntArray
@@ -79,8 +78,7 @@ class Board:
     Raises `CalibrationError` if such a board is impossible.
     """
 
-    # Chessboard or ChArUco.
-    kind: BoardKind
+    kind: BoardKind  # Chessboard or ChArUco.
     # Number of squares along x and y. Points are the inner corners, one less each way.
     squares: tuple[int, int]
     # Side of a square, in metres.
@@ -197,12 +195,9 @@ class Board:
 class MarkerSet:
     """Markers at known places: in a box, or on a plate fixed to the vehicle."""
 
-    # Frame of the corners: `box`, or `dome` for an index target.
-    frame: str
-    # Name of the markers' dictionary.
-    family: str
-    # Shape (M,): number of each marker in its dictionary.
-    ids: IntArray
+    frame: str  # Frame of the corners: `box`, or `dome` for an index target.
+    family: str  # Name of the markers' dictionary.
+    ids: IntArray  # Shape (M,): number of each marker in its dictionary.
     # Shape (M, 4, 3): in `frame`, metres; top-left, top-right, bottom-right, bottom-left of the
     # upright marker.
     corners: FloatArray

@@ -138,10 +138,8 @@ class IndexEstimator:
     Raises `CalibrationError` if the rig has no housing.
     """
 
-    # Behind a housing.
-    rig: Rig
-    # Of the rig.
-    uncertainty: RigUncertainty = field(default_factory=RigUncertainty.none)
+    rig: Rig  # Behind a housing.
+    uncertainty: RigUncertainty = field(default_factory=RigUncertainty.none)  # Of the rig.
     # Assumptions about target and medium.
     options: IndexOptions = field(default_factory=IndexOptions)
     # Prior of the index at the first frame; `set_prior` gives a later one.
@@ -412,8 +410,7 @@ _DEFAULT_OPTIONS = IndexOptions()
 class WaterCalibration:
     """Result of a calibration of the water's index: a rig in its medium."""
 
-    # With the index found at the last picture.
-    rig: Rig
+    rig: Rig  # With the index found at the last picture.
     # Of the rig's numbers, with `n_water` and its covariance with the others.
     uncertainty: RigUncertainty
     # Standard deviation of the index, and its part that more pictures reduce.

@@ -95,10 +95,8 @@ class IndexModel:
     Raises `CalibrationError` if the rig has no housing.
     """
 
-    # Behind a housing; its own `n_water` plays no part.
-    rig: Rig
-    # Of the camera's numbers.
-    uncertainty: RigUncertainty
+    rig: Rig  # Behind a housing; its own `n_water` plays no part.
+    uncertainty: RigUncertainty  # Of the camera's numbers.
     # Shape (6,): standard deviations of the target's place: turn about its middle (radians), shift
     # (metres).
     pose_sigmas: FloatArray
@@ -284,10 +282,8 @@ _REJECT = 5.0
 class Innovation:
     """Innovation: difference between a frame and the prediction by a state."""
 
-    # Its corners that fit.
-    frame: FrameCorners
-    # Number of corners before the misfits were left out.
-    n_points: int
+    frame: FrameCorners  # Its corners that fit.
+    n_points: int  # Number of corners before the misfits were left out.
     # Change of the index that explains the frame best, and its expected standard deviation without
     # a change. Infinite sigma if the index is not observable.
     shift: float

@@ -115,8 +115,7 @@ FAR = 0.02
 class IndexState:
     """State of the estimate, a joint Gaussian; immutable."""
 
-    # Of the last frame, in seconds.
-    time: float
+    time: float  # Of the last frame, in seconds.
     # Shape (D,): three indices (`N`, `ANCHOR`, `BEFORE`); errors of the target's place: a turn
     # about its middle (radians) and a shift (metres) in `dome`; errors of the camera's numbers; and
     # for each corner, the constant error of its pixel (x and y).
@@ -351,8 +350,7 @@ def _check_not_negative(name: str, value: float) -> None:
 class IndexStep:
     """A sudden change of the index."""
 
-    # Of the first frame after it, in seconds.
-    time: float
+    time: float  # Of the first frame after it, in seconds.
     # Change of the index and its standard deviation.
     size: float
     sigma: float
@@ -376,12 +374,9 @@ class IndexStep:
 class IndexReading:
     """Estimate of the index after a frame."""
 
-    # Of the picture.
-    name: str
-    # In seconds.
-    time: float
-    # Reason why the frame was left out; empty for a used one.
-    refused: str = ""
+    name: str  # Of the picture.
+    time: float  # In seconds.
+    refused: str = ""  # Reason why the frame was left out; empty for a used one.
     # Present index of the medium and its standard deviation, prior included; NaN and infinite
     # before the first used frame without a prior.
     n: float

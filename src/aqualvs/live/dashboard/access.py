@@ -139,10 +139,8 @@ _LOCAL_NAMES = frozenset({"localhost", "127.0.0.1", "::1"})
 class Access:
     """Access rules: this machine may watch; with the token, any client may watch and command."""
 
-    # Address that the page is served at.
-    host: str
-    # The password.
-    token: str
+    host: str  # Address that the page is served at.
+    token: str  # The password.
     # Origins whose pages may show this one inside themselves; none if empty.
     embedders: tuple[str, ...] = ()
 

@@ -181,8 +181,7 @@ class PageClient:
     """One page."""
 
     may_command: bool
-    # Pictures that were sent and not yet shown.
-    unshown: int = 0
+    unshown: int = 0  # Pictures that were sent and not yet shown.
     # Set when another page takes this one's place.
     gone: asyncio.Event = field(default_factory=asyncio.Event)
 

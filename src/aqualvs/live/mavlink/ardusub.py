@@ -236,8 +236,7 @@ def turning_of(link: MavlinkLink, at_ns: int) -> GyroRates | None:
 class ArduSubOptions:
     """Options of steering ArduSub, and of the ground station that must be present."""
 
-    # Sticks, or speeds in GUIDED.
-    command: Command = Command.STICKS
+    command: Command = Command.STICKS  # Sticks, or speeds in GUIDED.
     # Modes in which it takes our efforts; empty for ALT_HOLD, or GUIDED.
     modes: tuple[str, ...] = ()
     # System id of the ground station, the vehicle's MAV_GCS_SYSID (before ArduSub 4.7:

@@ -53,10 +53,8 @@ _AUTOPILOT_NAMES = {_ARDUPILOT: "ArduPilot", 12: "PX4"}
 class Received:
     """A message that came in."""
 
-    # As pymavlink decodes it.
-    message: Any
-    # By `time.monotonic_ns`.
-    received_ns: int
+    message: Any  # As pymavlink decodes it.
+    received_ns: int  # By `time.monotonic_ns`.
     # Who sent it.
     system: int
     component: int
@@ -71,10 +69,8 @@ class Received:
 class LinkOptions:
     """Own identity on a connection, and the peers that are heard."""
 
-    # Own system id; that of the vehicle, whose part this computer is.
-    system: int = 1
-    # Own component id.
-    component: int = MAV_COMP_ID_ONBOARD_COMPUTER
+    system: int = 1  # Own system id; that of the vehicle, whose part this computer is.
+    component: int = MAV_COMP_ID_ONBOARD_COMPUTER  # Own component id.
     # Where a port listens, the only addresses that are heard, as `AllowedPeers` takes them;
     # everybody if empty. Other connections hear one peer only.
     peers: tuple[str, ...] = ()

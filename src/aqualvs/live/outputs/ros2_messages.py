@@ -39,10 +39,8 @@ TYPE_NAMES = {
 class Ros2Types:
     """The message classes to use; each is called with its fields by name."""
 
-    # By name, such as `sensor_msgs/msg/Range`.
-    classes: dict[str, Any]
-    # False before ROS 2 Iron.
-    range_has_variance: bool
+    classes: dict[str, Any]  # By name, such as `sensor_msgs/msg/Range`.
+    range_has_variance: bool  # False before ROS 2 Iron.
     # Makes a value of the type `byte`, which rclpy wants as one byte and DDS as a number.
     octet: Callable[[int], Any]
     # Makes a sequence of `uint8` of bytes; rclpy copies an `array` without looking at each.

@@ -44,8 +44,7 @@ UNOBSERVABLE_VARIANCE = 1.0e4
 class PlanePose:
     """Pose of the target's plane in FLU axes at the dome's centre."""
 
-    # Shape (3,): foot of the perpendicular from the dome's centre, in metres.
-    position: FloatArray
+    position: FloatArray  # Shape (3,): foot of the perpendicular from the dome's centre, in metres.
     # Shape (4,): orientation as (x, y, z, w): x along the normal away from the vehicle, y
     # horizontal to the left as the vehicle sees it, z up the plane. Identity where the vehicle
     # looks squarely at the target.

@@ -152,12 +152,9 @@ def _brightest(flat: NDArray[np.uint8], first: IntArray, end: IntArray) -> Float
 class FilteredPeaks:
     """Points of N peaks as the paper's filter takes them, M of them, and its answer."""
 
-    # Shape (M,): row of the peak that each point belongs to, ascending.
-    source: IntArray
-    # Shape (M,): index of its laser.
-    laser: IntArray
-    # Shape (M, 2): in `image`.
-    pixels: FloatArray
+    source: IntArray  # Shape (M,): row of the peak that each point belongs to, ascending.
+    laser: IntArray  # Shape (M,): index of its laser.
+    pixels: FloatArray  # Shape (M, 2): in `image`.
     # Shape (M, 3): metres. A pixel whose ray misses the laser's sheet is no point.
     points_in_dome: FloatArray
     # Shape (M,): points that the filter keeps.

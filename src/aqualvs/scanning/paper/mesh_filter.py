@@ -192,10 +192,8 @@ class MeshFilterOptions:
         If a length is not positive, r_min is not below r_max, or rd_theta is not below r_max.
     """
 
-    # Size of a thread's reflection along the stripe.
-    rd_theta: float = 10e-3
-    # Side of a cell of the laser-plane image.
-    dd: float = 1e-3
+    rd_theta: float = 10e-3  # Size of a thread's reflection along the stripe.
+    dd: float = 1e-3  # Side of a cell of the laser-plane image.
     # Least and greatest distance between consecutive threads, centre to centre, in the laser plane.
     r_min: float = 15e-3
     r_max: float = 35e-3
@@ -260,8 +258,7 @@ class MeshFilterOptions:
 class LaserImage:
     """The laser-plane image (paper, Eq. 41-42)."""
 
-    # Shape (n_x, n_y): im(m, n): whether a cell holds points.
-    lit: BoolArray
+    lit: BoolArray  # Shape (n_x, n_y): im(m, n): whether a cell holds points.
     # Shape (N, 2): cell (m, n) of every point: S_idx(m, n) is where `cells` equals (m, n).
     cells: IntArray
 

@@ -70,8 +70,7 @@ class StickInput:
     a reset. No axis has an expo.
     """
 
-    # Pilot gain (JS_GAIN_DEFAULT): share of the full range at full stick.
-    gain: float = 0.5
+    gain: float = 0.5  # Pilot gain (JS_GAIN_DEFAULT): share of the full range at full stick.
     # At a pulse of 1900 us, in rad/s. ArduSub: 45 degrees times ACRO_YAW_P, 3.375 a second.
     turning_rate: float = math.radians(45.0) * 3.375
     # Greatest, in m/s. ArduSub's PILOT_SPEED_UP is 5 m/s by default, which none of these vehicles
@@ -162,8 +161,7 @@ class Autopilot:
     thrusters' dead band lets it: within dead_band / (rate * angle) where nothing else loads them.
     """
 
-    # Requested rate per error of the angle, in rad/s per rad.
-    angle: float = 4.5
+    angle: float = 4.5  # Requested rate per error of the angle, in rad/s per rad.
     # Of roll, pitch, yaw: motor input per rad/s, and per rad/s and second.
     rate: Vec = (0.135, 0.135, 0.18)
     rate_integral: Vec = (0.09, 0.09, 0.018)
@@ -185,16 +183,11 @@ class Autopilot:
 class VehicleModel:
     """Parameters of a vehicle, in SI units."""
 
-    # Name in reports.
-    name: str
-    # In air, in kg.
-    mass: float
-    # About forward, right and down, in kg m².
-    inertia: Vec
-    # In newtons; it gives the displaced mass.
-    buoyancy: float
-    # In body axes, in metres; above the centre of gravity is negative.
-    centre_of_buoyancy: Vec
+    name: str  # Name in reports.
+    mass: float  # In air, in kg.
+    inertia: Vec  # About forward, right and down, in kg m².
+    buoyancy: float  # In newtons; it gives the displaced mass.
+    centre_of_buoyancy: Vec  # In body axes, in metres; above the centre of gravity is negative.
     # Positive, along forward, right, down and about them.
     added_mass: Six
     linear_drag: Six

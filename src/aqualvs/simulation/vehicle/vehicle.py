@@ -37,10 +37,8 @@ from aqualvs.simulation.vehicle.water_motion import GRAVITY, WaterMotion
 class SensorErrors:
     """Errors of a sensor, in the unit of its quantity."""
 
-    # Standard deviation of the white noise of a reading.
-    noise: float = 0.0
-    # Constant error.
-    bias: float = 0.0
+    noise: float = 0.0  # Standard deviation of the white noise of a reading.
+    bias: float = 0.0  # Constant error.
     # Standard deviation and correlation time in seconds of a slow error (first-order Gauss-Markov).
     wander: float = 0.0
     wander_time: float = 30.0
@@ -73,16 +71,11 @@ class Sensors:
 class Telemetry:
     """Telemetry of the vehicle, as MAVLink would carry it."""
 
-    # Time of the reading, in the vehicle's time.
-    time_s: float
-
+    time_s: float  # Time of the reading, in the vehicle's time.
     armed: bool
-    # Whether its mode accepts stick positions.
-    obeys: bool
-    # Whether it holds still because no stick positions have come for a time.
-    lapsed: bool
-    # Metres, down positive.
-    depth: float
+    obeys: bool  # Whether its mode accepts stick positions.
+    lapsed: bool  # Whether it holds still because no stick positions have come for a time.
+    depth: float  # Metres, down positive.
     # Radians; heading clockwise from north, -pi to pi.
     heading: float
     roll: float

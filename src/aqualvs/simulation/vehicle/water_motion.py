@@ -81,10 +81,8 @@ class Tether:
     zero at that end.
     """
 
-    # In the water, in metres; 0 is no drag.
-    length: float = 0.0
-    # In metres; 7.6 mm is Blue Robotics' Fathom tether.
-    diameter: float = 0.0076
+    length: float = 0.0  # In the water, in metres; 0 is no drag.
+    diameter: float = 0.0076  # In metres; 7.6 mm is Blue Robotics' Fathom tether.
     # Drag coefficient across the flow; about 1.2 for a smooth cylinder at these Reynolds numbers.
     drag: float = 1.2
     # On the vehicle, in body axes (forward, right, down), in metres.
@@ -161,10 +159,8 @@ class WaterMotion:
 class Flow(NamedTuple):
     """Numbers of `WaterMotion`, for kernels."""
 
-    # Shape (3,): as there.
-    current: FloatArray
-    # Shape (m, 4): angular frequency, phase, amplitudes along north and east.
-    drift: FloatArray
+    current: FloatArray  # Shape (3,): as there.
+    drift: FloatArray  # Shape (m, 4): angular frequency, phase, amplitudes along north and east.
     # Shape (n, 6): angular frequency, wave number, direction as north and east, amplitude, phase.
     waves: FloatArray
     # Shape (7,): of the tether: half density times drag times area; where it is attached; its pull.
