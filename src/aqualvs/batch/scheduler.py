@@ -95,17 +95,9 @@ class Workers(Protocol):
 class DaskWorkers(Closing):
     """Workers of a Dask scheduler; a context manager.
 
-    Parameters
-    ----------
-    n_workers : int or None
-        Processes on this machine, each with one thread; None for one per core.
-    scheduler : str or None
-        Address of a scheduler whose workers are used instead.
-
-    Raises
-    ------
-    OptionError
-        If `distributed` is missing, or the scheduler does not answer.
+    `n_workers`: processes on this machine, each with one thread; None for one per core.
+    `scheduler`: address of a scheduler whose workers are used instead. Raises `OptionError` if
+    `distributed` is missing, or the scheduler does not answer.
     """
 
     def __init__(self, n_workers: int | None = None, scheduler: str | None = None) -> None:
@@ -259,12 +251,7 @@ NET = "net"
 def with_net(work: DiveWork, key: str, facts: Mapping[str, Any]) -> dict[str, Any]:
     """Return a finished dive's facts with the condition of its net, evaluated now if it is wanted.
 
-    Parameters
-    ----------
-    key : str
-        Of the dive's result, `DiveProbe.key`.
-    facts : mapping
-        From `join_dive`.
+    `key`: of the dive's result, `DiveProbe.key`. `facts`: from `join_dive`.
 
     Returns
     -------
@@ -284,12 +271,7 @@ def with_net(work: DiveWork, key: str, facts: Mapping[str, Any]) -> dict[str, An
 def known_net(home: Path, key: str) -> dict[str, Any]:
     """Return the stored condition of a dive's net, as from `with_net`; empty if there is none.
 
-    Parameters
-    ----------
-    home : Path
-        Of the dive.
-    key : str
-        Of its result; what was told of another does not count.
+    `home`: of the dive. `key`: of its result; what was told of another does not count.
     """
     found = read_manifest(home / NET)
     if found is None or not str(found["key"]).startswith(f"{key}-"):
@@ -394,12 +376,8 @@ class Steps:
 class Scheduler:
     """Scheduler that measures many dives with many processes.
 
-    Parameters
-    ----------
-    works : sequence of (DiveWork, int)
-        The dives with the sizes of their sources in bytes, in the order in which they are begun.
-    steps : Steps, optional
-        In place of the real ones.
+    `works`: the dives with the sizes of their sources in bytes, in the order in which they are
+    begun. `steps`: in place of the real ones.
     """
 
     def __init__(

@@ -260,10 +260,7 @@ def _root(
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line.
 
-    Parameters
-    ----------
-    arguments : sequence of str or None
-        Without the program's name; None takes them from the process.
+    `arguments`: without the program's name; None takes them from the process.
 
     Returns
     -------

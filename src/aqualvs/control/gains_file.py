@@ -35,19 +35,9 @@ AnyPart = TypeVar("AnyPart", bound=StrictPart)
 def load_settings(path: Path, kind: type[AnyPart], key: str, version: int) -> AnyPart:
     """Return the content of a file, checked key by key.
 
-    Parameters
-    ----------
-    kind : type
-        What the file may hold.
-    key : str
-        First key of such a file, whose value is the version of its format.
-    version : int
-        Version that is read.
-
-    Raises
-    ------
-    OptionError
-        One line: file, place, value, remedy.
+    `kind`: what the file may hold. `key`: first key of such a file, whose value is the version of
+    its format. `version`: version that is read. Raises `OptionError`: one line: file, place, value,
+    remedy.
     """
     content = read_yaml(path, f"a file that begins with '{key}: {version}'", OptionError)
     return parse_settings(content, kind, key, version, str(path))

@@ -42,12 +42,7 @@ _BOARD = _BoardOptions()
 def camera_errors(design: Design, ranges: Sequence[float]) -> dict[str, FloatArray]:
     """Return the posture errors by the camera's tolerances after a calibration of the lasers.
 
-    Parameters
-    ----------
-    design : Design
-        With the final tilts of its lasers.
-    ranges : sequence of float
-        Walls square ahead, metres.
+    `design`: with the final tilts of its lasers. `ranges`: walls square ahead, metres.
 
     Returns
     -------
@@ -96,10 +91,7 @@ def lasers_by(believed: Rig, true: Rig) -> Rig | None:
     A calibration without noise: the assumed camera gives the poses of boards in the working range,
     and the stripes on them the lasers.
 
-    Parameters
-    ----------
-    believed : Rig
-        Rig whose camera is assumed.
+    `believed`: rig whose camera is assumed.
 
     Returns
     -------
@@ -224,12 +216,7 @@ def offset_costs(design: Design, ranges: Sequence[float]) -> tuple[OffsetCost, .
 
     Among them are the design's own offset and its centring tolerance. None without a dome.
 
-    Parameters
-    ----------
-    design : Design
-        With the final tilts of its lasers.
-    ranges : sequence of float
-        Walls square ahead, metres.
+    `design`: with the final tilts of its lasers. `ranges`: walls square ahead, metres.
     """
     dome = design.rig.dome
     if dome is None:

@@ -64,12 +64,7 @@ TYPICAL_S: Mapping[str, float] = {
 class TimeLeft:
     """Guess of the time that is left, from what the experiments so far took.
 
-    Parameters
-    ----------
-    names : sequence of str
-        Experiments to come.
-    now : callable
-        Clock in seconds.
+    `names`: experiments to come. `now`: clock in seconds.
     """
 
     def __init__(self, names: Sequence[str], now: Callable[[], float] = time.monotonic) -> None:

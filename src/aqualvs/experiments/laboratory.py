@@ -124,12 +124,8 @@ class MeasuredDive:
 class Laboratory:
     """Simulated tank that renders dives and measures them; repeated calls reuse the results.
 
-    Parameters
-    ----------
-    work : Path
-        Folder for the dives; kept, so that another run finds them.
-    tick : callable, optional
-        Called with the number of frames rendered since the last call.
+    `work`: folder for the dives; kept, so that another run finds them. `tick`: called with the
+    number of frames rendered since the last call.
 
     Attributes
     ----------
@@ -168,14 +164,8 @@ class Laboratory:
     ) -> RenderedDive:
         """Return a dive with its truth, rendered where it has not been yet.
 
-        Parameters
-        ----------
-        scenario : Scenario
-            Its name, with a digest of everything that shapes the pictures, names the folder.
-        rig : Rig, optional
-            `self.rig` by default.
-        recording, point_frames
-            As in `simulate_dive`.
+        `scenario`: its name, with a digest of everything that shapes the pictures, names the
+        folder. `rig`: `self.rig` by default. `recording`, `point_frames`: as in `simulate_dive`.
         """
         rig = rig or self.rig
         facts = {

@@ -166,12 +166,7 @@ def _simulate_calibration(
 def calibration_commands(files: CalibrationFiles, out: Path, n_lasers: int) -> list[list[str]]:
     """Return the arguments of `aqualvs` that calibrate from a simulated set, in turn.
 
-    Parameters
-    ----------
-    out : Path
-        Folder in which `rig.yaml` and `run` are to be written.
-    n_lasers : int
-        Lasers of the rig.
+    `out`: folder in which `rig.yaml` and `run` are to be written. `n_lasers`: lasers of the rig.
     """
     rig = str(out / "rig.yaml")
     update = ["--rig", rig, "-o", rig]

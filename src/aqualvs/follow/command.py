@@ -53,12 +53,8 @@ _N_SHARE = 50
 class LoopPage:
     """Page that shows a loop step by step, in real time at most.
 
-    Parameters
-    ----------
-    page : Output
-        Closed with this.
-    holder : SetpointHolder
-        Where the page puts the setpoint; a mission that holds follows it.
+    `page`: closed with this. `holder`: where the page puts the setpoint; a mission that holds
+    follows it.
     """
 
     def __init__(self, page: Output, rig: Rig, loop: SimulatedLoop, holder: SetpointHolder) -> None:
@@ -152,12 +148,8 @@ _MIN_S = 1.0
 class RunWatch:
     """Called before each frame; returns whether to go on.
 
-    Parameters
-    ----------
-    seconds : float
-        Of the whole run.
-    slow : bool
-        Whether a simulated second takes seconds, so that progress is printed.
+    `seconds`: of the whole run. `slow`: whether a simulated second takes seconds, so that progress
+    is printed.
     """
 
     def __init__(

@@ -258,14 +258,8 @@ def step_measures(
 ) -> StepMeasures:
     """Return settling time and overshoot of a step.
 
-    Parameters
-    ----------
-    time_s, ranges : array, shape (n,)
-        True ranges, or their mean over several runs.
-    step_s : float
-        When the setpoint changed.
-    before, after : float
-        Setpoints in metres.
+    `time_s`, `ranges`, shape (n,): true ranges, or their mean over several runs. `step_s`: when the
+    setpoint changed. `before`, `after`: setpoints in metres.
     """
     later = time_s > step_s
     share = (ranges[later] - before) / (after - before)

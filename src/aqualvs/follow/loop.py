@@ -31,10 +31,7 @@ _TELLS_HZ = 10.0
 class SimulatedLink:
     """Link to a simulated vehicle, in its own time.
 
-    Parameters
-    ----------
-    vehicle : SimulatedVehicle
-        Its latency is that of the wire.
+    `vehicle`: its latency is that of the wire.
 
     Attributes
     ----------
@@ -158,10 +155,7 @@ class _Sight:
 class SimulatedLoop:
     """A vehicle before a net that it sees with lasers and steers by.
 
-    Parameters
-    ----------
-    steering : NetPilot
-        Engaged at the start.
+    `steering`: engaged at the start.
 
     Attributes
     ----------

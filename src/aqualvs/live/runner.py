@@ -174,10 +174,8 @@ class Arrival:
 class Mailbox:
     """Room for one picture: the latest, or both its fields.
 
-    Parameters
-    ----------
-    keep_every : bool
-        Let the writer wait until its frame has been taken, instead of replacing one that has not.
+    `keep_every`: let the writer wait until its frame has been taken, instead of replacing one that
+    has not.
 
     Attributes
     ----------
@@ -241,10 +239,7 @@ _AGAIN_S = 1.0
 class FrameReader:
     """Reader of a feed in a thread of its own; a context manager.
 
-    Parameters
-    ----------
-    mailbox : Mailbox
-        Closed when the feed ends.
+    `mailbox`: closed when the feed ends.
 
     Attributes
     ----------

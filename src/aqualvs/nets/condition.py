@@ -105,10 +105,7 @@ class _Seen:
 class NetCondition:
     """Accumulator of the condition of a net over a dive.
 
-    Parameters
-    ----------
-    rig : Rig
-        Rig of the scans.
+    `rig`: rig of the scans.
 
     Attributes
     ----------
@@ -144,12 +141,9 @@ class NetCondition:
     def add(self, scan: Scan, velocity: FloatArray | None = None) -> NetStretch | None:
         """Add a scan; return the stretch that it completes, if any.
 
-        Parameters
-        ----------
-        scan : Scan
-            In the order of time. Frames without a posture, or without a net, are skipped.
-        velocity : array, shape (2,), optional
-            Of the vehicle along the net, right and up in m/s, if another sensor measures it.
+        `scan`: in the order of time. Frames without a posture, or without a net, are skipped.
+        `velocity`, shape (2,): of the vehicle along the net, right and up in m/s, if another sensor
+        measures it.
         """
         finished = None
         if self._signals and scan.time_s - self._signals[0].time_s >= self._length_s():

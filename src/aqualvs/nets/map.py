@@ -56,17 +56,8 @@ _STYLE: dict[Any, Any] = {
 def draw_map(wall: UnrolledNet, paths: Sequence[Path]) -> None:
     """Draw the map of a net.
 
-    Parameters
-    ----------
-    wall : UnrolledNet
-        Net to draw; without a stretch the picture says so.
-    paths : sequence of Path
-        Files to write; the suffix (`.png`, `.svg`, `.pdf`) selects the format.
-
-    Raises
-    ------
-    OSError
-        If a file cannot be written.
+    `wall`: net to draw; without a stretch the picture says so. `paths`: files to write; the suffix
+    (`.png`, `.svg`, `.pdf`) selects the format. Raises `OSError` if a file cannot be written.
     """
     import matplotlib as mpl
 

@@ -298,10 +298,7 @@ class _CompiledCamera:
     def rays(self, pixels: ArrayLike) -> Rays:
         """Trace pixels into the outer medium.
 
-        Parameters
-        ----------
-        pixels : array, shape (..., 2)
-            In `image`, in pixels.
+        `pixels`, shape (..., 2): in `image`, in pixels.
 
         Returns
         -------
@@ -325,10 +322,7 @@ class _CompiledCamera:
     def project(self, points_in_dome: ArrayLike) -> tuple[FloatArray, BoolArray]:
         """Project points of the outer medium.
 
-        Parameters
-        ----------
-        points_in_dome : array, shape (..., 3)
-            In metres.
+        `points_in_dome`, shape (..., 3): in metres.
 
         Returns
         -------

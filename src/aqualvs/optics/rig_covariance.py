@@ -105,14 +105,8 @@ class _Lattice(NamedTuple):
 class PostureErrors:
     """Propagation of the uncertainty of one rig to range, pitch and yaw.
 
-    Parameters
-    ----------
-    rig : Rig
-        With lasers.
-    camera : Camera
-        Of the rig, behind its dome or bare.
-    uncertainty : RigUncertainty
-        Numbers that it does not name are exact.
+    `rig`: with lasers. `camera`: of the rig, behind its dome or bare. `uncertainty`: numbers that
+    it does not name are exact.
 
     Attributes
     ----------

@@ -256,20 +256,12 @@ def _expectation_text(rows: Sequence[ExpectationRow]) -> str:
 def write_page(page: CalibrationPage, path: Path) -> Path:
     """Write the report of a calibration.
 
-    Parameters
-    ----------
-    path : Path
-        The file to write.
+    `path`: the file to write. Raises `OutputError` if the page cannot be written.
 
     Returns
     -------
     path : Path
         The page. It carries all it needs and asks no network.
-
-    Raises
-    ------
-    OutputError
-        If the page cannot be written.
     """
     # Names of files that are no Unicode reach Python as surrogates, which UTF-8 refuses.
     data = page_html(page).encode("utf-8", errors="replace")

@@ -126,14 +126,8 @@ def make_picture(image: ImagePlane, points: FramePoints | None) -> SampleFrame:
 def make_crop(image: ImagePlane, middle: tuple[float, float], diameter: float) -> SampleFrame:
     """Cut the surroundings of a place out of a picture, with a ring around the place.
 
-    Parameters
-    ----------
-    image : uint8 array, shape (height, width, 3)
-        BGR.
-    middle : (float, float)
-        Column and row.
-    diameter : float
-        Of the ring, in pixels.
+    `image`, shape (height, width, 3): BGR. `middle`: column and row. `diameter`: of the ring, in
+    pixels.
     """
     height, width = map(int, image.shape[:2])
     side = min(round(max(_CROP.diameters * diameter, _CROP.px)), width, height)

@@ -423,12 +423,8 @@ def _picture_view(
 ) -> str:
     """Return the sample frames.
 
-    Parameters
-    ----------
-    captions : mapping
-        Row to (heading, posture or refusal in words, whether there is a posture).
-    missing : str
-        Why pictures are absent.
+    `captions`: row to (heading, posture or refusal in words, whether there is a posture).
+    `missing`: why pictures are absent.
     """
     shots = "\n".join(
         f"<figure>{_image(pictures.get(row), missing, heading)}"

@@ -230,13 +230,7 @@ class Explanation:
 def explain(stripes: SeenStripes, sheets: Sequence[Sheet], laser: int | None) -> Explanation:
     """Fit a plane to every frame, and a step of one laser, or of none, to all of them.
 
-    Parameters
-    ----------
-    stripes : SeenStripes
-    sheets : sequence of Sheet
-        One for each laser, as the rig has them.
-    laser : int or None
-        The one that may have moved.
+    `sheets`: one for each laser, as the rig has them. `laser`: the one that may have moved.
     """
     step = np.zeros(3)
     view = _View.of(stripes, sheets)
@@ -483,11 +477,8 @@ class AgreementVerdict:
 class LaserAgreement:
     """Monitor of the agreement of a rig's lasers over a dive.
 
-    Parameters
-    ----------
-    rig : Rig
-        The rig of the scans. Its uncertainty counts: a disagreement within the uncertainty of the
-        calibration is no fault.
+    `rig`: the rig of the scans. Its uncertainty counts: a disagreement within the uncertainty of
+    the calibration is no fault.
     """
 
     def __init__(self, rig: Rig) -> None:

@@ -104,14 +104,8 @@ NOT_TESTED = AssignmentOutcome(Verdict.CLEAR)
 class AssignmentTest:
     """Tests surfaces of one rig against rival assignments.
 
-    Parameters
-    ----------
-    laser_bands : sequence of LaserBand
-        One for each laser.
-    triangulator : Triangulator
-        Of the same rig.
-    searched : (float, float)
-        Nearest and farthest plane that is considered, in metres.
+    `laser_bands`: one for each laser. `triangulator`: of the same rig. `searched`: nearest and
+    farthest plane that is considered, in metres.
     """
 
     def __init__(
@@ -133,14 +127,8 @@ class AssignmentTest:
     ) -> bool:
         """Return whether a surface is so small, and seen so unevenly, that it may be chance.
 
-        Parameters
-        ----------
-        candidates, subsegments
-            As in `test`.
-        surfaces : sequence of Surface
-            All that were found: light on the others does not speak against this one.
-        target : Surface
-            The one to judge.
+        `candidates`, `subsegments`: as in `test`. `surfaces`: all that were found: light on the
+        others does not speak against this one. `target`: the one to judge.
         """
         # A fish before a wall that is out of range: the wall is no target, and the fish is none.
         outweighed = not target.is_mesh and any(
@@ -162,12 +150,8 @@ class AssignmentTest:
         a fish shows few lasers and long stripes, and specks that share a plane by chance have
         little light.
 
-        Parameters
-        ----------
-        candidates, subsegments, surfaces
-            As in `is_by_chance`.
-        target : Surface
-            The one that was chosen.
+        `candidates`, `subsegments`, `surfaces`: as in `is_by_chance`. `target`: the one that was
+        chosen.
 
         Returns
         -------
@@ -200,10 +184,7 @@ class AssignmentTest:
         Its light lies loose before the target, in short pieces. Where something is seen behind the
         target, that is no wall behind a net.
 
-        Parameters
-        ----------
-        candidates, subsegments, surfaces, target
-            As in `is_by_chance`.
+        `candidates`, `subsegments`, `surfaces`, `target`: as in `is_by_chance`.
         """
         if target.is_mesh or any(one.plane.offset > target.plane.offset for one in surfaces):
             return False
@@ -273,14 +254,7 @@ class AssignmentTest:
         test without being a plane, while the third laser, which should be seen there, lights the
         net elsewhere. Other light behind a net is normal; light nearer than the net is not.
 
-        Parameters
-        ----------
-        subsegments : Subsegments
-            C of them.
-        surfaces : sequence of Surface
-            All that were found.
-        target : Surface
-            The one to judge.
+        `subsegments`: C of them. `surfaces`: all that were found. `target`: the one to judge.
         """
         if not target.is_mesh:
             return None
@@ -300,14 +274,7 @@ class AssignmentTest:
     ) -> AssignmentOutcome:
         """Test a surface.
 
-        Parameters
-        ----------
-        candidates : Candidates
-            N of them.
-        subsegments : Subsegments
-            C of them.
-        surface : Surface
-            The one to test.
+        `candidates`: N of them. `subsegments`: C of them. `surface`: the one to test.
         """
         n_lasers = len(self._along_x)
         if n_lasers < 2:
@@ -361,12 +328,7 @@ def _is_nearer(one: Surface, target: Surface, subsegments: Subsegments) -> bool:
 def inflate_for_rival(found: Measurement, outcome: AssignmentOutcome) -> Measurement:
     """Return a measurement with its covariance widened by a near rival.
 
-    Parameters
-    ----------
-    found : Measurement
-        Of the surface that was tested.
-    outcome : AssignmentOutcome
-        Of the test.
+    `found`: of the surface that was tested. `outcome`: of the test.
     """
     posture, other = found.posture, outcome.other
     if outcome.verdict is not Verdict.NEAR or other is None or isinstance(posture, Refusal):

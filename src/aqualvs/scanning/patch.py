@@ -210,12 +210,8 @@ def nearest_in_view(m: FloatArray, points: FloatArray) -> bool:
 
     Farther out a paraboloid does not describe the net.
 
-    Parameters
-    ----------
-    m : array, shape (3,)
-        From `nearest_tangent`.
-    points : array, shape (N, 3)
-        Visible points of the net, in `dome`.
+    `m`, shape (3,): from `nearest_tangent`. `points`, shape (N, 3): visible points of the net, in
+    `dome`.
     """
     foot = m / float(m @ m)
     low, high = points.min(axis=0), points.max(axis=0)
@@ -248,13 +244,7 @@ def tangent_covariance(fit: PatchFit, m: FloatArray) -> FloatArray:
 def fitted_patch(patch: Patch, m: FloatArray, points: FloatArray) -> FittedSurface:
     """Return a patch as fitted to points (N, 3); the posture is that of its tangent.
 
-    Parameters
-    ----------
-    patch : Patch
-    m : array, shape (3,)
-        From `nearest_tangent`.
-    points : array, shape (N, 3)
-        In `dome`, metres.
+    `m`, shape (3,): from `nearest_tangent`. `points`, shape (N, 3): in `dome`, metres.
     """
     packed, terms = patch.packed(), np.empty((len(points), len(FLAT)))
     by_plane, by_terms = np.empty((3, 3)), np.empty((3, len(FLAT)))

@@ -51,9 +51,7 @@ class Frame:
 def planes_of_image(image: ImagePlane) -> Planes:
     """Return luma and chroma of an image, grey or BGR, as OpenCV reads it.
 
-    Parameters
-    ----------
-    image : uint8 array, shape (height, width) or (height, width, 3)
+    `image`, shape (height, width) or (height, width, 3).
 
     Returns
     -------

@@ -126,10 +126,7 @@ def component_shapes(
 ) -> ComponentShapes:
     """Describe the components of N candidates.
 
-    Parameters
-    ----------
-    component, line, points, sensitivity, width, height
-        As in `Candidates`.
+    `component`, `line`, `points`, `sensitivity`, `width`, `height`: as in `Candidates`.
 
     Returns
     -------
@@ -321,12 +318,7 @@ class Segments:
 def link_segments(peaks: StripePeaks, search: LaserBand) -> Segments:
     """Group the peaks inside a laser's band; segments of another laser's direction are dropped.
 
-    Parameters
-    ----------
-    peaks : StripePeaks
-        Of the search direction of `search`.
-    search : LaserBand
-        Band and slopes of the laser.
+    `peaks`: of the search direction of `search`. `search`: band and slopes of the laser.
 
     Returns
     -------
@@ -350,10 +342,7 @@ def link_segments(peaks: StripePeaks, search: LaserBand) -> Segments:
 def in_a_row(line: IntArray, position: FloatArray) -> BoolArray:
     """Mark the peaks (N,) of segments of at least `SUBSEGMENT_LINES`, of any direction.
 
-    Parameters
-    ----------
-    line, position
-        As in `StripePeaks`.
+    `line`, `position`: as in `StripePeaks`.
     """
     n = line.shape[0]
     n_lines = line[n - 1] + 1 if n else 0

@@ -35,12 +35,8 @@ class Triangulation:
 class Triangulator:
     """Triangulation of pixels with a rig's laser sheets (paper, Eq. 17-21, for planes).
 
-    Parameters
-    ----------
-    rig : Rig
-        Lasers, with the indices of air and water for those behind windows.
-    camera : Camera
-        Of the rig, behind its dome or bare.
+    `rig`: lasers, with the indices of air and water for those behind windows. `camera`: of the rig,
+    behind its dome or bare.
     """
 
     def __init__(self, rig: Rig, camera: Camera) -> None:

@@ -88,11 +88,8 @@ def find_stripes(
 ) -> StripePixels:
     """Find the lines of lasers: thin, long, of the lasers' colour, and similar to each other.
 
-    Parameters
-    ----------
-    image : uint8 array, shape (height, width) or (height, width, 3), or Frame
-        Grey, or BGR as OpenCV reads it. In a grey picture every thin bright line counts.
-    options : UncalibratedStripeOptions, optional
+    `image`, shape (height, width) or (height, width, 3): grey, or BGR as OpenCV reads it. In a grey
+    picture every thin bright line counts.
 
     Returns
     -------
@@ -124,11 +121,7 @@ def find_stripes(
 def find_all_segments(frame: Frame, options: UncalibratedStripeOptions) -> list[StripeSegments]:
     """Find pieces of stripes along both search directions, lines of lasers and others.
 
-    Parameters
-    ----------
-    frame : Frame
-    options : UncalibratedStripeOptions
-        The wavelength says in which channel lines are brightest.
+    `options`: the wavelength says in which channel lines are brightest.
     """
     size_px = frame.luma.shape[1], frame.luma.shape[0]
     colour = LaserColour.of(options.wavelength_nm)
@@ -470,11 +463,7 @@ def extended(segments: StripeSegments, keep: BoolArray) -> list[IntArray]:
 
     A piece ends at a kink or a gap; a few peaks beyond may still belong to the line.
 
-    Parameters
-    ----------
-    segments : StripeSegments
-    keep : bool array, shape (P,)
-        Which pieces are lines.
+    `keep`, shape (P,): which pieces are lines.
     """
     peaks = segments.peaks
     first_of = np.searchsorted(peaks.line, np.arange(len(segments.search.lowest) + 1))

@@ -203,12 +203,7 @@ def transport_content(datagram: bytes) -> bytes | None:
 class DatagramQueue:
     """Queue of datagrams of one kind, until another kind arrives.
 
-    Parameters
-    ----------
-    closed : Event
-        Set when the feed ends.
-    reception : Reception
-        Told of what cannot be used.
+    `closed`: set when the feed ends. `reception`: told of what cannot be used.
     """
 
     def __init__(self, datagrams: Datagrams, closed: threading.Event, reception: Reception) -> None:

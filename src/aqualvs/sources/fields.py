@@ -116,12 +116,7 @@ def frames_in(span: Span, shutter: Shutter) -> tuple[int, int]:
 class FieldSource(Closing):
     """Source of the fields of another source's pictures; satisfies `FrameSource`.
 
-    Parameters
-    ----------
-    pictures : FrameSource
-        Closed with this one.
-    shutter : Shutter
-        Interlaced.
+    `pictures`: closed with this one. `shutter`: interlaced.
 
     Attributes
     ----------

@@ -38,10 +38,7 @@ class Unwrapper:
     def __call__(self, value: int) -> int:
         """Return the value on an endless line, nearest to the one before.
 
-        Parameters
-        ----------
-        value : int
-            As received; may lie a little before the last one.
+        `value`: as received; may lie a little before the last one.
 
         Returns
         -------
@@ -83,12 +80,8 @@ class StreamClock:
     def time_of(self, ticks: int | None, arrival: float) -> float:
         """Return the time of a picture.
 
-        Parameters
-        ----------
-        ticks : int or None
-            By the stream's clock; None where it has none, then the arrival counts.
-        arrival : float
-            Seconds on this machine's monotonic clock.
+        `ticks`: by the stream's clock; None where it has none, then the arrival counts. `arrival`:
+        seconds on this machine's monotonic clock.
 
         Returns
         -------
@@ -121,12 +114,7 @@ _SILENT_S = 0.5
 class Reception:
     """Log of what arrived and when; written by the source, read from another thread.
 
-    Parameters
-    ----------
-    name : str
-        Of the part.
-    content : str
-        What arrives, such as "RTP H.264"; may be set later.
+    `name`: of the part. `content`: what arrives, such as "RTP H.264"; may be set later.
     """
 
     def __init__(self, name: str, content: str = "") -> None:
@@ -165,12 +153,7 @@ class Reception:
     def deliver(self, size_px: tuple[int, int], n_lost: int) -> None:
         """Note a frame that goes out.
 
-        Parameters
-        ----------
-        size_px : (int, int)
-            Width and height.
-        n_lost : int
-            Frames lost before it.
+        `size_px`: width and height. `n_lost`: frames lost before it.
         """
         now = time.monotonic()
         with self._lock:
@@ -301,10 +284,7 @@ class LiveDecoder:
     def decode(self, packet: "Packet[VideoStream]") -> list[VideoFrame]:
         """Return the sound pictures that a packet completes.
 
-        Parameters
-        ----------
-        packet : Packet
-            A whole picture.
+        `packet`: a whole picture.
 
         Returns
         -------
@@ -357,14 +337,8 @@ class LiveFrames:
     def connect(self, codec: VideoCodecContext, tick: float, *, hears_losses: bool) -> None:
         """Begin with a new decoder; pictures in the old one are lost.
 
-        Parameters
-        ----------
-        codec : VideoCodecContext
-            Not yet opened.
-        tick : float
-            Unit of the packets' time, in seconds.
-        hears_losses : bool
-            As for `LiveDecoder`.
+        `codec`: not yet opened. `tick`: unit of the packets' time, in seconds. `hears_losses`: as
+        for `LiveDecoder`.
         """
         self._decoder = LiveDecoder(codec, hears_losses=hears_losses)
         self._frame_counter.restart()
@@ -392,10 +366,7 @@ class LiveFrames:
     def feed(self, packet: "Packet[VideoStream]") -> Iterator[Frame]:
         """Yield the frames that a packet completes.
 
-        Parameters
-        ----------
-        packet : Packet
-            A whole picture; `pts` in ticks, None where the stream has no clock.
+        `packet`: a whole picture; `pts` in ticks, None where the stream has no clock.
 
         Yields
         ------

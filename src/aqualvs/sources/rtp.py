@@ -342,10 +342,7 @@ class TransportStream:
     def push(self, content: bytes) -> list[AccessUnit]:
         """Return the pictures that some packets complete.
 
-        Parameters
-        ----------
-        content : bytes
-            Whole packets; what does not begin as one is ignored.
+        `content`: whole packets; what does not begin as one is ignored.
 
         Returns
         -------

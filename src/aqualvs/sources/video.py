@@ -29,10 +29,7 @@ from aqualvs.sources.spans import promised_duration
 class FrameCounter:
     """Numbers of pictures by the packets that announced them; lost ones leave a gap.
 
-    Parameters
-    ----------
-    counts_packets : bool
-        Whether each packet shows a picture.
+    `counts_packets`: whether each packet shows a picture.
 
     Attributes
     ----------
@@ -76,10 +73,7 @@ class FrameCounter:
     def number(self, pts: int | None) -> int:
         """Return the number of a picture, counting those lost before it.
 
-        Parameters
-        ----------
-        pts : int or None
-            Its time, in ticks of its stream.
+        `pts`: its time, in ticks of its stream.
 
         Returns
         -------

@@ -54,12 +54,8 @@ def rates_of(angle: Signal, start_s: float, end_s: float) -> Rates:
 def without_outliers(angle: ArrayLike, valid: ArrayLike) -> BoolArray:
     """Return which valid samples are not far from their neighbours.
 
-    Parameters
-    ----------
-    angle : array, shape (n,)
-        Radians, in the order of time.
-    valid : bool array, shape (n,)
-        Samples that count at all.
+    `angle`, shape (n,): radians, in the order of time. `valid`, shape (n,): samples that count at
+    all.
     """
     values, kept = np.asarray(angle, float), np.array(valid, bool)
     kept &= np.isfinite(values)

@@ -337,10 +337,7 @@ def dive_start_utc(video: str | Path) -> float | None:
 
     Only the container's `creation_time` counts; times of the file change when it is copied.
 
-    Parameters
-    ----------
-    video : str or Path
-        A video file.
+    `video`: a video file.
 
     Returns
     -------
@@ -381,14 +378,8 @@ def offset_from_clocks(
 ) -> TimeOffset | OffsetRefusal:
     """Return the offset that the clocks of dive and log give.
 
-    Parameters
-    ----------
-    log : VehicleLog
-        With `start_utc_s`.
-    dive_start_utc_s : float or None
-        UTC of dive time 0.
-    sigma_s : float
-        How far to trust it.
+    `log`: with `start_utc_s`. `dive_start_utc_s`: UTC of dive time 0. `sigma_s`: how far to trust
+    it.
     """
     if log.start_utc_s is None or log.start_utc_sigma_s is None:
         return OffsetRefusal(f"{log.name} does not know the time of day")

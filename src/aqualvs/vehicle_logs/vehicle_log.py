@@ -82,10 +82,7 @@ class Signal:
     def at(self, time_s: ArrayLike) -> tuple[FloatArray, BoolArray]:
         """Return the values at other times.
 
-        Parameters
-        ----------
-        time_s : array, shape (m,)
-            Log time, in any order.
+        `time_s`, shape (m,): log time, in any order.
 
         Returns
         -------
@@ -355,12 +352,9 @@ class VehiclePlaces:
 def ned_from_dome_of(heading: ArrayLike, pitch: ArrayLike, roll: ArrayLike) -> FloatArray:
     """Return rotations from `dome` (right, forward, up) to north, east, down.
 
-    Parameters
-    ----------
-    heading, pitch, roll : array, shape (n,)
-        Of the vehicle, radians, as MAVLink's ATTITUDE: heading clockwise from north, pitch positive
-        with the nose up, roll positive with the right side down; applied in the order roll, pitch,
-        heading.
+    `heading`, `pitch`, `roll`, shape (n,): of the vehicle, radians, as MAVLink's ATTITUDE: heading
+    clockwise from north, pitch positive with the nose up, roll positive with the right side down;
+    applied in the order roll, pitch, heading.
 
     Returns
     -------

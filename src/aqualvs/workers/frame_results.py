@@ -219,10 +219,7 @@ class FrameResult:
 class FrameProcessor:
     """Measurement of frames, with the dome and without.
 
-    Parameters
-    ----------
-    scanner : FrameScanner
-        For the same rig.
+    `scanner`: for the same rig.
 
     Attributes
     ----------
@@ -317,10 +314,7 @@ def result_blocks(
 ) -> Generator[list[FrameResult], None, None]:
     """Yield the results of frames, and scans of lost ones, in the order of the dive.
 
-    Parameters
-    ----------
-    blocks : iterator of list
-        Of frames with the scans of the lost ones right before, see `with_losses`.
+    `blocks`: of frames with the scans of the lost ones right before, see `with_losses`.
 
     Yields
     ------

@@ -163,19 +163,12 @@ class SharedMemory:
 
     It lies in no folder: none has to have room for it, and nothing is left behind.
 
-    Parameters
-    ----------
-    file : int
-        Descriptor of a file in memory; stays open until `seal`.
+    `file`: Descriptor of a file in memory; stays open until `seal`. Raises `OSError` if the memory
+    is not available.
 
     Attributes
     ----------
     slots : uint8 array, shape (n_slots, n_bytes)
-
-    Raises
-    ------
-    OSError
-        If the memory is not available.
     """
 
     def __init__(self, file: int) -> None:
@@ -407,10 +400,7 @@ class _Worker:
 class WorkerPool(Closing):
     """Pool of processes that measure the parts of a dive; a context manager that ends them.
 
-    Parameters
-    ----------
-    n_processes : int
-        There are no more than parts.
+    `n_processes`: there are no more than parts.
 
     Attributes
     ----------

@@ -61,12 +61,7 @@ _STATE_EVERY_S, _PICTURE_EVERY_S = 0.04, 0.08
 class Dashboard:
     """Output to the open pages; costs next to nothing while there is none.
 
-    Parameters
-    ----------
-    server : DashboardServer
-        Owned from here on.
-    vehicle : callable or None
-        Returns what the autopilot tells of depth and heading.
+    `server`: Owned from here on. `vehicle`: returns what the autopilot tells of depth and heading.
     """
 
     name = "dashboard"
