@@ -134,10 +134,7 @@ def judge_pixels(pixels: FloatArray, laser: IntArray, truth: LitTruth) -> Judged
 
     `pixels`, shape (N, 2). `laser`, shape (N,).
 
-    Returns
-    -------
-    Judged
-        Precision is NaN where nothing can be judged, recall where there is no net.
+    Returns a `Judged`: precision is NaN where nothing can be judged, recall where there is no net.
     """
     right = judged = found = true = 0
     for one in np.unique(truth.laser):
@@ -167,10 +164,7 @@ def judge_reflections(found: FilteredPeaks, truth: LitTruth) -> Judged:
 
     `found`: all pixels of the frame, and which of them are said to lie on the net.
 
-    Returns
-    -------
-    Judged
-        As `judge_pixels`.
+    Returns a `Judged`: as `judge_pixels`.
     """
     right = judged = n_found = n_true = 0
     for one in np.unique(truth.laser):

@@ -46,6 +46,8 @@ class RecordedFrame:
 class DiveRecording:
     """A recording of a dive.
 
+    Raises `SourceError` if it cannot be read, or holds no stripes.
+
     Attributes
     ----------
     rig : Rig or None
@@ -56,11 +58,6 @@ class DiveRecording:
         None where a torn file does not say.
     fps : float or None
         Mean rate.
-
-    Raises
-    ------
-    SourceError
-        If it cannot be read, or holds no stripes.
     """
 
     def __init__(self, path: Path) -> None:

@@ -48,10 +48,7 @@ def thin(values: FloatArray, limit: int) -> IntArray:
 
     `values`, shape (N,): NaN rows are never chosen.
 
-    Returns
-    -------
-    rows : int array, ascending
-        All finite rows if they are few enough.
+    Returns `rows`, ascending: all finite rows if they are few enough.
     """
     finite = np.flatnonzero(np.isfinite(values))
     if len(finite) <= limit:

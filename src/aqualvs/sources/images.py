@@ -136,11 +136,8 @@ def read_image(path: Path, how: int = cv2.IMREAD_ANYCOLOR) -> ImagePlane | None:
 
     `how`: OpenCV's flag; the default returns grey images as grey.
 
-    Returns
-    -------
-    image : array or None
-        None for pipes and devices too, and for images of more pixels than OpenCV is told to take
-        (`aqualvs/__init__.py`).
+    Returns `image`: None for pipes and devices too, and for images of more pixels than OpenCV is
+    told to take (`aqualvs/__init__.py`).
     """
     try:
         with quiet_decoders():
