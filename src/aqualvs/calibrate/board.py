@@ -227,8 +227,7 @@ def _plate_corners(columns: int, rows: int, size: float) -> FloatArray:
     pitch = (1.0 + _PLATE_GAP_SHARE) * size
     column, row = np.meshgrid(np.arange(columns), np.arange(rows))
     first = pitch * np.stack([column.ravel(), row.ravel()], axis=-1)
-    corners: FloatArray = first[:, None, :] + size * np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
-    return corners
+    return first[:, None, :] + size * np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
 
 
 def _plate_markers(

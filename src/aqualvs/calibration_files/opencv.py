@@ -206,8 +206,7 @@ def opencv_text(camera: ForeignCamera, suffix: str) -> str:
     # Both models of OpenCV take four coefficients at least.
     n = max(4, len(camera.lens.distortion))
     storage.write("distortion_coefficients", np.array([padded(camera.lens, n)]))
-    text: str = storage.releaseAndGetString()
-    return text
+    return storage.releaseAndGetString()
 
 
 _COUNTS = {

@@ -408,8 +408,7 @@ def _about_line(values: FloatArray) -> FloatArray:
     """Return values without their mean and even change."""
     ramp = np.linspace(-1.0, 1.0, len(values))
     values = values - values.mean()
-    rest: FloatArray = values - ramp * (ramp @ values) / (ramp @ ramp)
-    return rest
+    return values - ramp * (ramp @ values) / (ramp @ ramp)
 
 
 def _delayed(told: FloatArray, n: int) -> list[FloatArray]:

@@ -38,8 +38,7 @@ class FilteredPosture:
     @property
     def total_covariance(self) -> FloatArray:
         """Covariance (3, 3) of (range, pitch, yaw) by noise, motion and rig together."""
-        total: FloatArray = self.covariance[:3, :3] + self.rig_covariance
-        return total
+        return self.covariance[:3, :3] + self.rig_covariance
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

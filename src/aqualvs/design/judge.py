@@ -118,8 +118,7 @@ def twine_shift(stripes: Stripes, noise: Noise) -> FloatArray:
 def net_share(stripes: Stripes, design: Design) -> FloatArray:
     """Return the strands of the design's net for every point on a wall, (K, W)."""
     strands = stripes.length * design.net.strands_per_metre
-    share: FloatArray = np.minimum(strands / np.maximum(stripes.lines, 1.0), 1.0)
-    return share
+    return np.minimum(strands / np.maximum(stripes.lines, 1.0), 1.0)
 
 
 def wall_sums(stripes: Stripes, noise: Noise) -> Sums:
@@ -142,8 +141,7 @@ def twine_pulls(stripes: Stripes, design: Design) -> FloatArray:
     """
     shift = stripes.own[..., 0, :]
     nearer = np.sign(shift[..., 1:2]) * net_share(stripes, design)[..., None]
-    pulls: FloatArray = twine_shift(stripes, design.noise)[..., None] * nearer * shift
-    return pulls
+    return twine_shift(stripes, design.noise)[..., None] * nearer * shift
 
 
 def _parts(stripes: Stripes, share: FloatArray, point: float, shared: FloatArray) -> Sums:
@@ -178,8 +176,7 @@ def posture_covariance(sums: Sums, ranges: FloatArray) -> FloatArray:
     order = [1, 2, 0]
     scale = np.stack([-(ranges**2), ranges, ranges], axis=-1)
     picked = covariance[..., order, :][..., :, order]
-    posture: FloatArray = picked * scale[..., :, None] * scale[..., None, :]
-    return posture
+    return picked * scale[..., :, None] * scale[..., None, :]
 
 
 def inverse_of(matrix: FloatArray) -> FloatArray:
@@ -210,13 +207,11 @@ def cross(one: Stripes, other: Stripes) -> BoolArray:
         s, t = _turn(apart, f) / turn, _turn(apart, e) / turn
         here = (s >= one.ends[:, None, :, 0]) & (s <= one.ends[:, None, :, 1])
         there = (t >= other.ends[None, ..., 0]) & (t <= other.ends[None, ..., 1])
-    met: BoolArray = here & there & (np.abs(turn) > 1e-9)
-    return met
+    return here & there & (np.abs(turn) > 1e-9)
 
 
 def _turn(a: FloatArray, b: FloatArray) -> FloatArray:
-    turn: FloatArray = a[..., 0] * b[..., 2] - a[..., 2] * b[..., 0]
-    return turn
+    return a[..., 0] * b[..., 2] - a[..., 2] * b[..., 0]
 
 
 def _systematic(

@@ -129,8 +129,7 @@ def _visible_ends(
 
 
 def _points(centre: FloatArray, along: FloatArray, place: FloatArray) -> FloatArray:
-    points: FloatArray = centre[..., None, :] + place[..., None] * along[:, None, None, :]
-    return points
+    return centre[..., None, :] + place[..., None] * along[:, None, None, :]
 
 
 def _depth_in_picture(camera: Camera, points: FloatArray, margin: float) -> FloatArray:
@@ -146,8 +145,7 @@ def _depth_in_picture(camera: Camera, points: FloatArray, margin: float) -> Floa
 def _at(values: FloatArray, i: IntArray) -> FloatArray:
     """Return values (K, W, S) at places (K, W), clipped to the ends."""
     row = np.clip(i, 0, values.shape[-1] - 1)[..., None]
-    found: FloatArray = np.take_along_axis(values, row, -1)[..., 0]
-    return found
+    return np.take_along_axis(values, row, -1)[..., 0]
 
 
 def _edge(place: FloatArray, inside: FloatArray, i: IntArray, step: int) -> FloatArray:
@@ -158,8 +156,7 @@ def _edge(place: FloatArray, inside: FloatArray, i: IntArray, step: int) -> Floa
         share = here / (here - there)
     # Beyond the lens model, or the fan, the length of the stripe is unknown.
     share = np.where((there <= 0.0) & np.isfinite(share), share, 0.0)
-    edge: FloatArray = at + share * (to - at)
-    return edge
+    return at + share * (to - at)
 
 
 def _summed(camera: Camera, line: _Lines, ranges: FloatArray, common: FloatArray) -> Stripes:
@@ -208,8 +205,7 @@ def _place(camera: Camera, pixels: FloatArray, is_row: BoolArray) -> FloatArray:
     """Return places along the stripe, from -1 at one border of the picture to 1 at the other."""
     width, height = camera.size_px
     x, y = 2.0 * pixels[..., 0] / (width - 1) - 1.0, 2.0 * pixels[..., 1] / (height - 1) - 1.0
-    place: FloatArray = np.where(is_row, y, x)
-    return place
+    return np.where(is_row, y, x)
 
 
 @dataclass(frozen=True, slots=True)
@@ -252,8 +248,7 @@ def _volume(n: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def _cross_y(a: FloatArray, b: FloatArray) -> FloatArray:
-    y: FloatArray = a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]
-    return y
+    return a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]
 
 
 def _own(

@@ -53,8 +53,7 @@ class FrameAnswers:
     @property
     def measurable(self) -> BoolArray:
         """Frames that show enough to be measured, and must be."""
-        enough: BoolArray = self.n_visible >= VISIBLE_LIMIT
-        return enough
+        return self.n_visible >= VISIBLE_LIMIT
 
 
 @dataclass(frozen=True, slots=True)

@@ -336,8 +336,7 @@ def _run(laboratory: Laboratory) -> ExperimentResult:
 
 
 def _in_sigmas(last: Numbers) -> FloatArray:
-    off: FloatArray = np.abs(last.ours - last.truth) / last.sigma
-    return off
+    return np.abs(last.ours - last.truth) / last.sigma
 
 
 def _findings(

@@ -307,8 +307,7 @@ def _is_stable(log: LoopLog) -> bool:
 
 def _between(log: LoopLog, start_s: float, end_s: float) -> BoolArray:
     time_s = log.column("time_s")
-    here: BoolArray = (time_s >= start_s) & (time_s <= end_s)
-    return here
+    return (time_s >= start_s) & (time_s <= end_s)
 
 
 def _filled(values: FloatArray) -> FloatArray:
@@ -318,8 +317,7 @@ def _filled(values: FloatArray) -> FloatArray:
         return values
     last = np.maximum.accumulate(np.where(known, np.arange(len(values)), -1))
     first = int(np.argmax(known))
-    filled: FloatArray = values[np.where(last < 0, first, last)]
-    return filled
+    return values[np.where(last < 0, first, last)]
 
 
 def _rms(values: FloatArray) -> float:

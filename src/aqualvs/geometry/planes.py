@@ -20,8 +20,7 @@ class Rays:
 
     def points_at(self, distances: FloatArray) -> FloatArray:
         """Return the points `distances` (shape (...), metres) along the rays, shape (..., 3)."""
-        points: FloatArray = self.origins + distances[..., None] * self.directions
-        return points
+        return self.origins + distances[..., None] * self.directions
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,8 +44,7 @@ class Plane:
 
     def signed_distance(self, points: FloatArray) -> FloatArray:
         """Return normal·X - offset for points of shape (..., 3)."""
-        distance: FloatArray = points @ self.normal - self.offset
-        return distance
+        return points @ self.normal - self.offset
 
     def intersect(self, rays: Rays) -> tuple[FloatArray, BoolArray]:
         """Intersect rays with the plane (paper, Eq. 16 and 20).
@@ -80,5 +78,4 @@ def upright_axes(normal: FloatArray) -> FloatArray:
     """
     right = np.cross(normal, (0.0, 0.0, 1.0))
     right /= max(float(np.linalg.norm(right)), 1e-9)
-    axes: FloatArray = np.stack([right, normal, np.cross(right, normal)], axis=1)
-    return axes
+    return np.stack([right, normal, np.cross(right, normal)], axis=1)

@@ -293,8 +293,7 @@ def free_gains(power: FloatArray, per_frame: float) -> FloatArray:
     """Return `free_gain_of` for many powers."""
     mean = np.maximum(power, 1.0)
     price = _FREEDOM * per_frame / (per_frame + _FEW_CROSSINGS)
-    gain: FloatArray = mean - 1.0 - np.log(mean) - price
-    return gain
+    return mean - 1.0 - np.log(mean) - price
 
 
 @kernel

@@ -226,8 +226,7 @@ class WallView:
             return np.full((3, 3), np.nan)
         points, _ = self._weighed(self._points())
         by_m = self._by_m()
-        covariance: FloatArray = by_m @ np.linalg.inv(points.T @ points) @ by_m.T
-        return covariance
+        return by_m @ np.linalg.inv(points.T @ points) @ by_m.T
 
     def by_rates(self, row_times: Callable[[FloatArray], FloatArray]) -> FloatArray:
         """Return the error (3, 3) of range, pitch and yaw by their rates; NaN where none.
@@ -287,5 +286,4 @@ class WallView:
 
 def _sigmas(covariance: FloatArray) -> FloatArray:
     # Cancellation leaves rounding errors, which may be negative.
-    sigmas: FloatArray = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    return sigmas
+    return np.sqrt(np.maximum(np.diag(covariance), 0.0))

@@ -80,8 +80,7 @@ def interruptions(track: Track) -> BoolArray:
     if len(track) > 2:
         step = np.diff(track.time_s)
         missing[1:] = step > max(1.0, 5.0 * float(np.nanmedian(step)))
-    interrupted: BoolArray = ~track.valid | missing
-    return interrupted
+    return ~track.valid | missing
 
 
 def stretches(track: Track) -> list[Stretch]:

@@ -270,8 +270,7 @@ def _typical(r: Reflections, corner: FloatArray, dd: float) -> FloatArray:
             strand = xy[np.linalg.norm(xy - nearest, axis=1) < 5.0]
             place: FloatArray = np.median(strand, axis=0)
             break
-    snapped: FloatArray = corner + dd * (np.floor((place - corner) / dd) + 0.5)
-    return snapped
+    return corner + dd * (np.floor((place - corner) / dd) + 0.5)
 
 
 def _zone(axes: "Axes", r: Reflections) -> None:

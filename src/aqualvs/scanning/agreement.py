@@ -218,8 +218,7 @@ class Explanation:
 
     def spill(self) -> FloatArray:
         """Return the derivative (3, 3 L) of `step` by the steps of all lasers (3 L)."""
-        spill: FloatArray = self.covariance() @ self.information[self._own()]
-        return spill
+        return self.covariance() @ self.information[self._own()]
 
     def _own(self) -> slice:
         if self.laser is None:
@@ -378,8 +377,7 @@ class _Fit:
     def tukey(self, seen: BoolArray) -> FloatArray:
         """Return Tukey's weights of the residuals."""
         scale = max(1.0, 1.4826 * float(np.median(np.abs(self.z[seen]))))
-        weight: FloatArray = np.maximum(1.0 - (self.z / (TUKEY * scale)) ** 2, 0.0) ** 2 * seen
-        return weight
+        return np.maximum(1.0 - (self.z / (TUKEY * scale)) ** 2, 0.0) ** 2 * seen
 
     def effect(self, view: _View, laser: int, step: FloatArray) -> float:
         """Return the shift of its laser's stripe off the targets by a step, over the range."""
@@ -599,8 +597,7 @@ class LaserAgreement:
         """Return the covariance of a step, by errors of the stripes and of the calibration."""
         names = [f"{laser.name}:{name}" for laser in self._rig.lasers for name in LASER_PARAMETERS]
         spill = found.spill()
-        total: FloatArray = found.covariance() + spill @ self._known.of(names) @ spill.T
-        return total
+        return found.covariance() + spill @ self._known.of(names) @ spill.T
 
 
 def _no_alarm(found: Explanation, n_frames: int) -> AgreementVerdict:

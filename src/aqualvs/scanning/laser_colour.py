@@ -149,8 +149,7 @@ def channel_image(frame: Frame, colour: LaserColour) -> ImagePlane:
         (frame.chroma[1], red_of_v) if colour is LaserColour.RED else (frame.chroma[0], blue_of_u)
     )
     mixed = frame.luma + weight * (full_size(chroma.astype(np.float32), frame) - 128.0)
-    image: ImagePlane = np.clip(np.rint(mixed), 0, 255).astype(np.uint8)
-    return image
+    return np.clip(np.rint(mixed), 0, 255).astype(np.uint8)
 
 
 def full_size(half: NDArray[np.float32], frame: Frame) -> NDArray[np.float32]:

@@ -50,8 +50,7 @@ class SharedError(NamedTuple):
 
 def twine_share(height: FloatArray) -> FloatArray:
     """Return the shift of the light on twine over the stripe's width, given its height."""
-    share: FloatArray = np.hypot(TWINE_SHARE, TWINE_LEVELS / height)
-    return share
+    return np.hypot(TWINE_SHARE, TWINE_LEVELS / height)
 
 
 def shared_error(glow: FloatArray, twine: FloatArray | None = None) -> SharedError:

@@ -136,8 +136,7 @@ class Posture:
 
         The expected error of the posture, for use outside of the package.
         """
-        total: FloatArray = self.covariance + self.rig_covariance
-        return total
+        return self.covariance + self.rig_covariance
 
 
 def posture_from_fit(fit: PlaneFit, points: FloatArray, camera_axis_in_dome: FloatArray) -> Posture:

@@ -542,8 +542,7 @@ def _length_in_a_row(table: FloatArray, width_px: int) -> FloatArray:
 
 def _ends(table: FloatArray) -> FloatArray:
     """Return the first and the last point (P, 2, 2) of pieces."""
-    ends: FloatArray = table[[FIRST_X, FIRST_Y, LAST_X, LAST_Y]].T.reshape(-1, 2, 2)
-    return ends
+    return table[[FIRST_X, FIRST_Y, LAST_X, LAST_Y]].T.reshape(-1, 2, 2)
 
 
 def _goes_on(segment: FloatArray, others: FloatArray, width_px: int) -> BoolArray:

@@ -186,8 +186,7 @@ def _sigma_px(luma: ImagePlane, stripes: StripePixels) -> FloatArray:
     def lopsided(at: float) -> FloatArray:
         arms = at * stripes.width[:, None] * stripes.across
         sides = [_bilinear(luma, stripes.pixels + sign * arms) for sign in (-1.0, 1.0)]
-        share: FloatArray = (sides[1] - sides[0]) / stripes.height
-        return share
+        return (sides[1] - sides[0]) / stripes.height
 
     # Where one side is lighter than the other, beyond the stripe or on its slopes, paint shifts the
     # centre by about this many widths, relative to the height of the stripe.
@@ -228,8 +227,7 @@ def _slopes(line: FloatArray, position: FloatArray) -> FloatArray:
 
     n = (last - first).astype(np.float64)
     spread = window(x * x) - window(x) ** 2 / n
-    slope: FloatArray = (window(x * y) - window(x) * window(y) / n) / np.maximum(spread, 1e-9)
-    return slope
+    return (window(x * y) - window(x) * window(y) / n) / np.maximum(spread, 1e-9)
 
 
 def _unless_blob(line: list[StripePixels]) -> list[StripePixels]:
@@ -394,13 +392,11 @@ def _ahead(ends: _Ends, a: int, end: int) -> tuple[IntArray, FloatArray, IntArra
 
 def _turn(along: FloatArray, others: FloatArray) -> FloatArray:
     """Return the angles (N,) between a direction and others (N, 2), whichever way these point."""
-    turn: FloatArray = np.arccos(np.minimum(np.abs(others @ along), 1.0))
-    return turn
+    return np.arccos(np.minimum(np.abs(others @ along), 1.0))
 
 
 def _turn_limit(one_rad: FloatArray, other_rad: FloatArray) -> FloatArray:
-    limit: FloatArray = _WINDOW.turn_rad + _WINDOW.n_sigmas * np.hypot(one_rad, other_rad)
-    return limit
+    return _WINDOW.turn_rad + _WINDOW.n_sigmas * np.hypot(one_rad, other_rad)
 
 
 def _window_px(ends: _Ends, a: int, end: int, way_px: float) -> float:

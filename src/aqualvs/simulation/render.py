@@ -76,8 +76,7 @@ def _particles(count: int, t: float) -> tuple[FloatArray, FloatArray]:
 def _before_target(points: FloatArray, scene: Scene) -> BoolArray:
     if scene.target == "none":
         return np.ones(len(points), dtype=np.bool_)
-    before: BoolArray = scene.target_plane().signed_distance(points) < 0.0
-    return before
+    return scene.target_plane().signed_distance(points) < 0.0
 
 
 def _pixels_per_radian(camera: Camera) -> float:

@@ -90,8 +90,7 @@ class TelemetryClock:
         A message without time of its own takes it from its neighbours in the file.
         """
         if _BOOT not in (table.payload.dtype.names or ()) or not len(self.boot_at):
-            between: FloatArray = np.interp(table.at, self.at, self.log_s)
-            return between
+            return np.interp(table.at, self.at, self.log_s)
         run = np.maximum(np.searchsorted(self.boot_at, table.at, side="right") - 1, 0)
         return table.payload[_BOOT] / 1e3 + self.boot_s[run]
 

@@ -121,8 +121,7 @@ class Signal:
 
         Across a gap the shorter way round is assumed.
         """
-        whole: FloatArray = np.unwrap(self.values, axis=0)
-        return whole
+        return np.unwrap(self.values, axis=0)
 
 
 def usual_gap(time_s: FloatArray) -> float:
@@ -138,8 +137,7 @@ def usual_gap(time_s: FloatArray) -> float:
 
 def wrap(angle: FloatArray) -> FloatArray:
     """Return angles as their equals in (-pi, pi]."""
-    wrapped: FloatArray = math.pi - np.mod(math.pi - angle, _TURN)
-    return wrapped
+    return math.pi - np.mod(math.pi - angle, _TURN)
 
 
 def bearing_of(angle: FloatArray) -> FloatArray:

@@ -65,8 +65,7 @@ class BoardBend:
     def terms_at(self, points: FloatArray) -> FloatArray:
         """Return the terms (N, K) at points (N, 3) of the board, without their coefficients."""
         x, y = (points[:, :2] - self.centre).T / self.half_size
-        terms: FloatArray = np.stack([x**i * y**j for i, j in self.exponents], axis=-1)
-        return terms
+        return np.stack([x**i * y**j for i, j in self.exponents], axis=-1)
 
     def applied(self, view: View) -> View:
         """Return a view of the flat board with its points on the bent one."""

@@ -307,8 +307,7 @@ def solved_by_offset(problem: DomeProblem, solution: Solution[BundleState]) -> F
     """Return the derivative (P,) of the solution by an error that all distances share."""
     blocks = distance_blocks(problem, solution)
     slopes, _, _ = _slopes(len(solution.covariance), blocks, dict.fromkeys(blocks, 1.0))
-    by_offset: FloatArray = solution.covariance @ slopes
-    return by_offset
+    return solution.covariance @ slopes
 
 
 def _shared_error(

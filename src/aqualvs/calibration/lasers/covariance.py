@@ -249,8 +249,7 @@ def _with_given(covariance: FloatArray, camera_covariance: CameraCovariance) -> 
     joint[:n_given, n_given:] = follow @ covariance[:n, n:]
     joint[n_given:, :n_given] = joint[:n_given, n_given:].T
     joint[n_given:, n_given:] = covariance[n:, n:]
-    symmetric: FloatArray = 0.5 * (joint + joint.T)
-    return symmetric
+    return 0.5 * (joint + joint.T)
 
 
 def _pseudo_inverse(covariance: FloatArray) -> FloatArray:

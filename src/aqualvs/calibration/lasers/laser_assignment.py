@@ -408,8 +408,7 @@ def assigned(
     nearest = np.argmin(residuals, axis=1)
     clear = residuals[np.arange(n), nearest] <= tolerance_px
     clear &= np.count_nonzero(_crossed_px(pooled.placed, planes) <= _SURE.crossing_px, axis=1) <= 1
-    laser: IntArray = np.where(clear, nearest, -1)
-    return laser
+    return np.where(clear, nearest, -1)
 
 
 def _crossed_px(placed: PlacedStripes, planes: Sequence[Plane]) -> FloatArray:

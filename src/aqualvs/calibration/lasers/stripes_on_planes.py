@@ -331,8 +331,7 @@ def binned(i_view: int, i_laser: int, points: StripePoints, surface: IntArray) -
 
     def mean(values: FloatArray) -> FloatArray:
         summed = np.add.reduceat(values[order] * weights[:, None], starts, axis=0)
-        result: FloatArray = summed / total[:, None]
-        return result
+        return summed / total[:, None]
 
     # Stripes found along x and along y may have opposite signs.
     along_first = np.sign(points.across @ points.across[0])

@@ -162,8 +162,7 @@ def _whiten(covariance: FloatArray) -> FloatArray:
     """Return W with W.T @ W the inverse of a covariance, whatever its units."""
     sigma = np.sqrt(np.diag(covariance))
     lower = np.linalg.cholesky(covariance / np.outer(sigma, sigma))
-    whiten: FloatArray = np.linalg.inv(lower) / sigma
-    return whiten
+    return np.linalg.inv(lower) / sigma
 
 
 def _prior(columns: IntArray, moved: FloatArray, whiten: FloatArray) -> Block:
@@ -260,8 +259,7 @@ def _block(posed: PosedView, n_shared: int, residuals: FloatArray, jacobian: Flo
 
 def _in_dome(posed: PosedView) -> FloatArray:
     pose = posed.dome_from_target
-    points: FloatArray = posed.view.points @ pose.rotation.T + pose.translation
-    return points
+    return posed.view.points @ pose.rotation.T + pose.translation
 
 
 def _cross(arms: FloatArray, by_point: FloatArray) -> FloatArray:

@@ -178,8 +178,7 @@ def _marginal(information: FloatArray, columns: IntArray) -> FloatArray:
     others = np.setdiff1d(np.arange(len(information)), columns)
     cross = information[np.ix_(columns, others)]
     own = information[np.ix_(columns, columns)]
-    marginal: FloatArray = own - cross @ inverse(information[np.ix_(others, others)]) @ cross.T
-    return marginal
+    return own - cross @ inverse(information[np.ix_(others, others)]) @ cross.T
 
 
 def consider_covariance(

@@ -43,8 +43,7 @@ class RobustLoss(StrEnum):
         if self is RobustLoss.HUBER:
             return np.where(lengths <= _HUBER, square, _HUBER * (lengths - 0.5 * _HUBER))
         if self is RobustLoss.CAUCHY:
-            logarithm: FloatArray = 0.5 * _CAUCHY**2 * np.log1p((lengths / _CAUCHY) ** 2)
-            return logarithm
+            return 0.5 * _CAUCHY**2 * np.log1p((lengths / _CAUCHY) ** 2)
         return square
 
     def weight(self, lengths: FloatArray) -> FloatArray:
@@ -52,8 +51,7 @@ class RobustLoss(StrEnum):
         if self is RobustLoss.HUBER:
             return np.where(lengths <= _HUBER, 1.0, _HUBER / np.maximum(lengths, _HUBER))
         if self is RobustLoss.CAUCHY:
-            weight: FloatArray = 1.0 / (1.0 + (lengths / _CAUCHY) ** 2)
-            return weight
+            return 1.0 / (1.0 + (lengths / _CAUCHY) ** 2)
         return np.ones_like(lengths)
 
 
@@ -83,8 +81,7 @@ class Block:
     @property
     def seen(self) -> BoolArray:
         """Mask (N,) of observations that have a residual."""
-        seen: BoolArray = np.isfinite(self.lengths)
-        return seen
+        return np.isfinite(self.lengths)
 
     def values(self, inliers: BoolArray) -> int:
         """Return the number of values in the marked observations."""
@@ -519,8 +516,7 @@ class _Run(Generic[State]):
 
 def _solve(matrix: FloatArray, right: FloatArray) -> FloatArray:
     size = _sizes(matrix)
-    solved: FloatArray = np.linalg.solve(matrix / np.outer(size, size), right / size) / size
-    return solved
+    return np.linalg.solve(matrix / np.outer(size, size), right / size) / size
 
 
 def _sizes(information: FloatArray) -> FloatArray:

@@ -188,8 +188,7 @@ def _block(room: tuple[float, float], pitch: float, rows: int, columns: int) -> 
 def _in_box(wall: _Wall, corner: FloatArray, marker: float) -> FloatArray:
     """Return a marker's corners (4, 3) in `box`."""
     flat = corner + marker * np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
-    points: FloatArray = wall.origin + flat[:, :1] * wall.right + flat[:, 1:] * wall.down
-    return points
+    return wall.origin + flat[:, :1] * wall.right + flat[:, 1:] * wall.down
 
 
 def board_rectangles(board: Board) -> FloatArray:

@@ -218,8 +218,7 @@ class IndexEstimator:
         if self.state is None:
             raise CalibrationError("no picture shows enough of the target yet; add one that does")
         frame = FrameCorners.of(self.state.time, view, self.state.ids)
-        left: FloatArray = self._model.line(self.state, frame).residuals.reshape(-1, 2)
-        return left
+        return self._model.line(self.state, frame).residuals.reshape(-1, 2)
 
     def _model_about(self, middle: FloatArray) -> IndexModel:
         options = self.options
@@ -534,5 +533,4 @@ def _solve(covariance: FloatArray, right: FloatArray) -> FloatArray:
     """Solve with a covariance of different units that may be singular."""
     size = np.sqrt(np.diag(covariance))
     scaled = np.linalg.pinv(covariance / np.outer(size, size), hermitian=True)
-    solved: FloatArray = scaled @ (right / size) / size
-    return solved
+    return scaled @ (right / size) / size

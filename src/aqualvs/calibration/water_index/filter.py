@@ -196,8 +196,7 @@ class IndexModel:
         camera = rig.in_water(min(max(n, _LOWEST), _HIGHEST)).camera()
         target = moved_target(SE3.identity(), self.middle, mean[POSE])
         slopes = camera.project_with_parameter_jacobian(target.apply(frame.points))[3]
-        by_n: FloatArray = slopes[..., parameter_names(camera).index("n_water")]
-        return by_n
+        return slopes[..., parameter_names(camera).index("n_water")]
 
     def _slopes(self, n: float, frame: FrameCorners) -> FloatArray:
         """Return derivatives (M, 2, 9 + C) of pixels by all but the corners' errors."""
@@ -381,8 +380,7 @@ class _KalmanStep(NamedTuple):
     def covariance(self) -> FloatArray:
         """Return the new covariance."""
         new = self.old_covariance - self.reach @ cho_solve(self.factor, self.reach.T)
-        symmetric: FloatArray = 0.5 * (new + new.T)
-        return symmetric
+        return 0.5 * (new + new.T)
 
 
 def _kalman_step(

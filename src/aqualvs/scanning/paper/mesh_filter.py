@@ -283,8 +283,7 @@ def _in_plane(axis: FloatArray, normal: FloatArray) -> FloatArray:
     direction /= np.linalg.norm(direction)
     # What the first projection left along the normal grew when a short result became a unit.
     direction -= normal * (normal @ direction)
-    unit: FloatArray = direction / np.linalg.norm(direction)
-    return unit
+    return direction / np.linalg.norm(direction)
 
 
 def laser_cells(points_in_laser: FloatArray, dd: float) -> IntArray:

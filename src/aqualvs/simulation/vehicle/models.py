@@ -265,8 +265,7 @@ class VehicleModel:
 
 
 def _sign(values: FloatArray) -> FloatArray:
-    signs: FloatArray = np.where(np.abs(values) > _TAKES_PART, np.sign(values), 0.0)
-    return signs
+    return np.where(np.abs(values) > _TAKES_PART, np.sign(values), 0.0)
 
 
 def _scaled3(values: Vec, factor: float) -> Vec:
