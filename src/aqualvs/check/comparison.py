@@ -16,11 +16,11 @@ from rich.console import Console
 from rich.table import Table
 from scipy.special import chdtri, ndtr
 
+from aqualvs.calibration.solver.bundle import rig_difference as step_between
 from aqualvs.check.finding import escaped
 from aqualvs.errors import RigError
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.geometry.planes import Plane
-from aqualvs.geometry.transforms import rotvec_from_rotation
 from aqualvs.optics.camera import POSE_PARAMETERS
 from aqualvs.optics.expected_error import WallView
 from aqualvs.optics.rig import (
@@ -33,7 +33,12 @@ from aqualvs.optics.rig import (
 )
 from aqualvs.optics.rigfile import dated_copies, load_rig
 from aqualvs.optics.sheet import sheet_in
-from aqualvs.optics.solved import file_parameter_name, rig_uncertainty, solved_steps
+from aqualvs.optics.solved import (
+    file_parameter_name,
+    rig_numbers,
+    rig_uncertainty,
+    solved_steps,
+)
 
 SIGNIFICANT = 5.0
 """Sigmas from which on a change is no chance."""
@@ -126,25 +131,14 @@ def rig_difference(
 
 
 def _camera_changes(new: Rig, old: Rig) -> dict[str, float]:
-    shift = new.dome_from_cam.translation - old.dome_from_cam.translation
-    turn = new.dome_from_cam.rotation @ old.dome_from_cam.rotation.T
-    rotvec = rotvec_from_rotation(turn)
-    rotvec[np.abs(rotvec) < _ROUNDING] = 0.0
-    values = [*shift, *rotvec]
-    changes = dict(zip(POSE_PARAMETERS, map(float, values), strict=True))
+    names: tuple[str, ...] = POSE_PARAMETERS
     if new.housing is not None and type(new.housing) is type(old.housing):
-        ours, theirs = _port_numbers(new), _port_numbers(old)
-        changes |= {name: ours[name] - theirs[name] for name in ours}
+        names += (*new.housing.numbers(), "n_air", "n_water")
     if same_lens_model(new, old):
-        numbers = zip(_intrinsics(new), _intrinsics(old), strict=True)
-        differences = (ours - theirs for ours, theirs in numbers)
-        changes |= dict(zip(old.lens.parameter_names, differences, strict=True))
-    return changes
-
-
-def _port_numbers(rig: Rig) -> dict[str, float]:
-    own = {} if rig.housing is None else rig.housing.numbers()
-    return {**own, "n_air": rig.n_air, "n_water": rig.n_water}
+        names += old.lens.parameter_names
+    changes = dict(zip(names, step_between(old, new, names).tolist(), strict=True))
+    small = {n: 0.0 for n in POSE_PARAMETERS[3:] if abs(changes[n]) < _ROUNDING}
+    return changes | small
 
 
 def same_lens_model(new: Rig, old: Rig) -> bool:
@@ -154,11 +148,6 @@ def same_lens_model(new: Rig, old: Rig) -> bool:
         and new.size_px == old.size_px
         and new.lens.parameter_names == old.lens.parameter_names
     )
-
-
-def _intrinsics(rig: Rig) -> tuple[float, ...]:
-    lens = rig.lens
-    return (lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion)
 
 
 def _laser_change(new: Laser, old: Laser) -> tuple[FloatArray, FloatArray]:
@@ -523,9 +512,10 @@ def _table(new: Rig, old: Rig, difference: RigDifference) -> Table:
     table.add_column("number")
     for name in ("old", "new", "change", "sigma", "in sigmas"):
         table.add_column(name, justify="right")
+    values, values_before = rig_numbers(new), rig_numbers(old)
     for name in difference.names:
         if ":" not in name:
-            table.add_row(*_row(name, _value(new, name), _value(old, name), difference))
+            table.add_row(*_row(name, values[name], values_before[name], difference))
     for ours, theirs in _shared_lasers(new, old):
         for row in _laser_rows(new, ours, theirs, difference):
             table.add_row(*row)
@@ -536,12 +526,10 @@ def _row(name: str, new: float, old: float, difference: RigDifference) -> list[s
     label = file_parameter_name(name)
     scale = _SCALES.get(label.rpartition("_")[2], 1.0)
     change, sigma = scale * difference.of(name), scale * difference.sigma(name)
-    return [
-        label,
-        "" if math.isnan(old) else f"{scale * old:.6g}",
-        "" if math.isnan(new) else f"{scale * new:.6g}",
-        *_change_cells(change, sigma),
-    ]
+    # Rotations are given by their change.
+    is_rotation = name in POSE_PARAMETERS[3:]
+    values = ["", ""] if is_rotation else [f"{scale * old:.6g}", f"{scale * new:.6g}"]
+    return [label, *values, *_change_cells(change, sigma)]
 
 
 def _change_cells(change: float, sigma: float) -> list[str]:
@@ -572,19 +560,6 @@ def _tilt_sigma(laser: Laser, difference: RigDifference) -> float:
     if length == 0.0:
         return 0.0
     return math.sqrt(float(tilt @ difference.covariance[np.ix_(rows, rows)] @ tilt)) / length
-
-
-def _value(rig: Rig, name: str) -> float:
-    """Return one of a camera's numbers, NaN for rotations, which are given by their change."""
-    values: dict[str, float | FloatArray] = {
-        **dict(zip(POSE_PARAMETERS[:3], rig.dome_from_cam.translation.tolist(), strict=True)),
-        **dict.fromkeys(POSE_PARAMETERS[3:], math.nan),
-        **_port_numbers(rig),
-    }
-    lens = rig.lens
-    intrinsics = (lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion)
-    values |= dict(zip(lens.parameter_names, intrinsics, strict=True))
-    return float(values[name])
 
 
 def _degrees(angle: float) -> str:

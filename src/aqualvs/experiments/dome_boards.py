@@ -13,7 +13,7 @@ from aqualvs.calibration.camera.calibrate import CameraCalibration, camera
 from aqualvs.calibration.detection.detection import detect_board
 from aqualvs.calibration.dome.calibrate import dome
 from aqualvs.calibration.dome.problem import BoardSet, DomeOptions, dome_problem
-from aqualvs.calibration.solver.bundle import rig_difference, rig_numbers
+from aqualvs.calibration.solver.bundle import rig_difference
 from aqualvs.calibration.solver.result import DomeCalibration, rms_px
 from aqualvs.calibration.targets.pose_files import BoardPose, load_poses, match_poses, picture_paths
 from aqualvs.calibration.targets.target_files import load_board
@@ -28,9 +28,10 @@ from aqualvs.experiments.experiment import (
 )
 from aqualvs.experiments.laboratory import Laboratory, calibration_pictures
 from aqualvs.geometry.arrays import FloatArray
-from aqualvs.geometry.transforms import SE3, rotvec_from_rotation
+from aqualvs.geometry.transforms import SE3
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig
 from aqualvs.optics.rigfile import load_rig
+from aqualvs.optics.solved import rig_numbers
 from aqualvs.report.figure_style import BLUE, DARK, GREY, ORANGE, PALE
 
 if TYPE_CHECKING:
@@ -229,17 +230,12 @@ def _findings(solved: SolvedDome, before_px: float) -> tuple[ExperimentRow, ...]
 def _vector(
     what: str, paper: str, solved: SolvedDome, names: Sequence[str], scale: float, digits: int
 ) -> ExperimentRow:
-    true = scale * np.array([_numbers(solved.truth)[name] for name in names])
+    true = scale * np.array([rig_numbers(solved.truth)[name] for name in names])
     off = scale * np.array([solved.errors[name] for name in names])
     sigma = scale * np.array([solved.sigmas[name] for name in names])
     found, right = (", ".join(f"{v:.{digits}f}" for v in vs) for vs in (true + off, true))
     spread = ", ".join(f"{v:.{digits}f}" for v in sigma)
     return ExperimentRow(what=what, paper=paper, ours=f"{found} ± {spread} (truth {right})")
-
-
-def _numbers(rig: Rig) -> dict[str, float]:
-    turn = rotvec_from_rotation(rig.dome_from_cam.rotation @ DOME_FROM_CAM_NOMINAL.T)
-    return {**rig_numbers(rig), **dict(zip(_TURN, turn.tolist(), strict=True))}
 
 
 def _finite(residuals: Sequence[FloatArray]) -> FloatArray:
@@ -251,7 +247,7 @@ def _series(
     solved: SolvedDome, before: Sequence[FloatArray], after: Sequence[FloatArray]
 ) -> tuple[DataColumns, ...]:
     names = (*_LENS, *_TURN, *_PLANE)
-    true = _numbers(solved.truth)
+    true = rig_numbers(solved.truth)
     parameters = DataColumns(
         name="parameters",
         columns={

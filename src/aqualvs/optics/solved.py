@@ -28,7 +28,10 @@ import numpy as np
 
 from aqualvs.errors import RigError
 from aqualvs.geometry.arrays import FloatArray
+from aqualvs.geometry.transforms import rotvec_from_rotation
+from aqualvs.optics.camera import POSE_PARAMETERS
 from aqualvs.optics.rig import (
+    DOME_FROM_CAM_NOMINAL,
     LASER_PARAMETERS,
     Rig,
     RigUncertainty,
@@ -177,6 +180,23 @@ def _noting(rig: Rig, notes: Mapping[str, Any]) -> Rig:
     if uncertainty is not None:
         merged_notes[_UNCERTAINTY] = uncertainty
     return replace(rig, solved_from=merged_notes)
+
+
+def rig_numbers(rig: Rig) -> dict[str, float]:
+    """Return the numbers of a rig's camera by their names, SI units and radians.
+
+    The rotation is the rig file's: a vector that is applied after the nominal mounting.
+    """
+    lens, turn = rig.lens, rig.dome_from_cam.rotation @ DOME_FROM_CAM_NOMINAL.T
+    pose = [*rig.dome_from_cam.translation.tolist(), *rotvec_from_rotation(turn).tolist()]
+    intrinsics = (lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion)
+    return {
+        **dict(zip(lens.parameter_names, intrinsics, strict=True)),
+        **dict(zip(POSE_PARAMETERS, pose, strict=True)),
+        **({} if rig.housing is None else rig.housing.numbers()),
+        "n_air": rig.n_air,
+        "n_water": rig.n_water,
+    }
 
 
 def file_parameter_name(name: str) -> str:

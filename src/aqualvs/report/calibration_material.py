@@ -18,10 +18,9 @@ import numpy as np
 from aqualvs import __version__
 from aqualvs.calibration.targets.targets import View
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.transforms import rotvec_from_rotation
 from aqualvs.optics.expected_error import expected_posture_errors
-from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig, RigUncertainty
-from aqualvs.optics.solved import completed_uncertainty
+from aqualvs.optics.rig import Rig, RigUncertainty
+from aqualvs.optics.solved import completed_uncertainty, rig_numbers
 from aqualvs.report.html import Card
 from aqualvs.scanning.scan import ImagePlane
 
@@ -210,8 +209,8 @@ def parameter_rows(
     before: Rig | None = None,
 ) -> tuple[ParameterRow, ...]:
     """Return the named numbers of a rig's camera, with sigma and what they were before."""
-    values, sigmas = camera_numbers(rig), uncertainty.sigmas
-    old = {} if before is None else camera_numbers(before)
+    values, sigmas = rig_numbers(rig), uncertainty.sigmas
+    old = {} if before is None else rig_numbers(before)
     rows = []
     for name in names:
         label, unit, factor, digits = _NAMES.get(name, (name, "", 1.0, 5))
@@ -227,22 +226,6 @@ def parameter_rows(
             )
         )
     return tuple(rows)
-
-
-def camera_numbers(rig: Rig) -> dict[str, float]:
-    """Return the numbers of a rig's camera by name, SI units and radians.
-
-    The rotation is the rig file's: a vector that is applied after the nominal mounting.
-    """
-    lens = rig.lens
-    values = (lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion)
-    numbers = dict(zip(lens.parameter_names, values, strict=True))
-    turn = rotvec_from_rotation(rig.dome_from_cam.rotation @ DOME_FROM_CAM_NOMINAL.T)
-    for axis, place, angle in zip("xyz", rig.dome_from_cam.translation, turn, strict=True):
-        numbers[f"lens_{axis}"] = float(place)
-        numbers[f"rotation_{axis}"] = float(angle)
-    numbers["n_air"], numbers["n_water"] = rig.n_air, rig.n_water
-    return numbers if rig.housing is None else numbers | rig.housing.numbers()
 
 
 def residual_map(

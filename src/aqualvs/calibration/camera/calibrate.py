@@ -30,7 +30,7 @@ from aqualvs.calibration.solver.covariance import (
     shared_covariance,
 )
 from aqualvs.calibration.solver.least_squares import Solution, solve
-from aqualvs.calibration.solver.result import ViewFit, rms_px, view_fit
+from aqualvs.calibration.solver.result import FittedViews, ViewFit, rms_px, view_fits
 from aqualvs.calibration.targets.targets import View
 from aqualvs.errors import CalibrationError
 from aqualvs.geometry.arrays import FloatArray, IntArray
@@ -173,7 +173,7 @@ _LIMITS = _FindingLimits()
 
 
 @dataclass(frozen=True, slots=True)
-class CameraCalibration:
+class CameraCalibration(FittedViews):
     """Result of a camera calibration: intrinsics with their uncertainty."""
 
     lens: Lens
@@ -200,16 +200,6 @@ class CameraCalibration:
     findings: tuple[str, ...]
 
     n_iterations: int
-
-    @property
-    def rms_px(self) -> float:
-        """Root mean square distance of all inliers from their predicted pixels (as OpenCV)."""
-        return rms_px(np.concatenate([v.residuals[v.inliers] for v in self.views]))
-
-    @property
-    def n_points(self) -> int:
-        """Number of inlier corners."""
-        return sum(int(np.count_nonzero(v.inliers)) for v in self.views)
 
 
 def camera(
@@ -293,23 +283,11 @@ def _without_bad_views(
     if not bad or len(bad) > bad_share * len(bundle.views):
         return bundle, solution, {}
     keep = [i for i in range(len(bundle.views)) if i not in bad]
-    part = _part(bundle, keep)
+    part = bundle.only(keep)
     reasons = {
         bundle.views[i].view.name: f"{why}; blurred, or the board bent?" for i, why in bad.items()
     }
-    return part, solve(part, _state(solution.state, keep)), reasons
-
-
-def _part(bundle: Bundle, keep: Sequence[int]) -> Bundle:
-    return replace(
-        bundle,
-        views=tuple(bundle.views[i] for i in keep),
-        start=_state(bundle.start, keep),
-    )
-
-
-def _state(state: BundleState, keep: Sequence[int]) -> BundleState:
-    return replace(state, poses=tuple(state.poses[i] for i in keep))
+    return part, solve(part, solution.state.only(keep)), reasons
 
 
 def _result(
@@ -319,27 +297,15 @@ def _result(
     left_out: dict[str, str],
 ) -> CameraCalibration:
     rig, n = solution.state.rig, len(bundle.free)
-    fits = []
-    for i, target in enumerate(bundle.views):
-        columns = bundle.pose_columns(i)
-        fits.append(
-            view_fit(
-                target.view.name,
-                target.view,
-                solution.state.poses[i],
-                solution.covariance[np.ix_(columns, columns)],
-                solution.blocks[i],
-                solution.inliers[i],
-                solution.block_scales[i],
-            )
-        )
+    labels = [target.view.name for target in bundle.views]
+    fits = view_fits(labels, bundle, solution, solution.covariance)
     seen = np.concatenate([fit.view.pixels[fit.inliers] for fit in fits])
     return CameraCalibration(
         lens=rig.lens,
         size_px=rig.size_px,
         uncertainty=RigUncertainty(bundle.free, covariance.by_views[:n, :n]),
         inflation=covariance.inflation,
-        views=tuple(fits),
+        views=fits,
         left_out=left_out,
         noise_px=CORNER_SIGMA_PX * solution.scales[CORNERS],
         coverage=coverage(seen, rig.size_px),
@@ -360,7 +326,7 @@ def _cross_validation(bundle: Bundle, solution: Solution[BundleState]) -> float:
         return float("nan")
     rest = [i for i in range(n) if i not in held_out]
     try:
-        state = solve(_part(bundle, rest), _state(solution.state, rest)).state
+        state = solve(bundle.only(rest), solution.state.only(rest)).state
         errors = np.concatenate(
             predicted(state, [0] * len(held_out), [believed[i] for i in held_out])
         )

@@ -42,7 +42,6 @@ from aqualvs.calibration.solver.bundle import (
     CORNER_SIGMA_PX,
     BundleState,
     rig_difference,
-    rig_numbers,
 )
 from aqualvs.calibration.solver.covariance import Observability, consider_covariance, observability
 from aqualvs.calibration.solver.least_squares import Solution, solve
@@ -50,13 +49,12 @@ from aqualvs.calibration.solver.result import (
     CrossValidation,
     DomeCalibration,
     SolvedMedium,
-    ViewFit,
-    view_fit,
+    view_fits,
 )
 from aqualvs.errors import CalibrationError, RigError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.optics.rig import Rig, RigUncertainty
-from aqualvs.optics.solved import rig_uncertainty
+from aqualvs.optics.solved import rig_numbers, rig_uncertainty
 
 _SIZES = ("inner_radius", "thickness", "n_acrylic", "n_port")
 _WORDS = {
@@ -361,7 +359,9 @@ def _without_bad_views(
         )
     if not bad or len(bad) > _BAD.max_share * n:
         return problem, solution
-    return _again(problem.without(bad), solution, [i for i in range(n) if i not in bad])
+    problem = problem.without(bad)
+    kept = [i for i in range(n) if i not in bad]
+    return problem, solve(problem.bundle, solution.state.only(kept))
 
 
 def _without_wrong_distances(
@@ -385,7 +385,7 @@ def _without_wrong_distances(
     }
     forgotten = problem.without_distances(wrong)
     forgotten = replace(forgotten, left_out={**problem.left_out, **reasons})
-    return _again(forgotten, solution, list(range(len(problem.shots))))
+    return forgotten, solve(forgotten.bundle, solution.state)
 
 
 def _wrong_distances(problem: DomeProblem, solution: Solution[BundleState]) -> list[int]:
@@ -393,14 +393,6 @@ def _wrong_distances(problem: DomeProblem, solution: Solution[BundleState]) -> l
     # A given distance with an error of this many sigmas is a mistake.
     wrong_distance = 5.0
     return [i for i, block in off.items() if block.lengths[0] > wrong_distance]
-
-
-def _again(
-    problem: DomeProblem, solution: Solution[BundleState], kept: Sequence[int]
-) -> tuple[DomeProblem, Solution[BundleState]]:
-    state = solution.state
-    start = replace(state, poses=tuple(state.poses[i] for i in kept))
-    return problem, solve(problem.bundle, start)
 
 
 def _of_rail(
@@ -426,11 +418,12 @@ def _result(
         # The one medium that was solved for is the water that the rig will be used in.
         rig = rig.in_water(float(state.media[bundle.free_media[0]]))
         names, columns = (*names, "n_water"), [*columns, n_free]
+    labels = [shot.label for shot in problem.shots]
     return DomeCalibration(
         rig=rig,
         uncertainty=RigUncertainty(names, covariance[np.ix_(columns, columns)]),
         media=_solved_media(problem, solution, sets, covariance),
-        views=_view_fits(problem, solution, covariance),
+        views=view_fits(labels, bundle, solution, covariance),
         left_out=problem.left_out,
         noise_px=noise_px(solution),
         rotation_is_solved=problem.rotation_is_solved,
@@ -452,23 +445,3 @@ def _solved_media(
         sigma = float(np.sqrt(covariance[column[0], column[0]])) if len(column) else 0.0
         media.append(SolvedMedium(one.name, float(solution.state.media[i]), sigma))
     return tuple(media)
-
-
-def _view_fits(
-    problem: DomeProblem, solution: Solution[BundleState], covariance: FloatArray
-) -> tuple[ViewFit, ...]:
-    fits = []
-    for i, shot in enumerate(problem.shots):
-        columns = problem.bundle.pose_columns(i)
-        fits.append(
-            view_fit(
-                shot.label,
-                shot.view,
-                solution.state.poses[i],
-                covariance[np.ix_(columns, columns)],
-                solution.blocks[i],
-                solution.inliers[i],
-                solution.block_scales[i],
-            )
-        )
-    return tuple(fits)

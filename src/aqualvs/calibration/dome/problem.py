@@ -238,13 +238,8 @@ class DomeProblem:
 
     def only(self, keep: Sequence[int]) -> "DomeProblem":
         """Return the problem of some of its views."""
-        start = replace(self.bundle.start, poses=tuple(self.bundle.start.poses[i] for i in keep))
-        views = tuple(self.bundle.views[i] for i in keep)
-        return replace(
-            self,
-            bundle=replace(self.bundle, views=views, start=start),
-            shots=tuple(self.shots[i] for i in keep),
-        )
+        shots = tuple(self.shots[i] for i in keep)
+        return replace(self, bundle=self.bundle.only(keep), shots=shots)
 
     def with_considered_free(self) -> "DomeProblem":
         """Return the problem with the considered numbers solved for, with priors."""
@@ -465,7 +460,8 @@ def compare_with_bare_lens(
         media = [problem.shots[i].i_set for i in held_out]
         views = [believed[i] for i in held_out]
         try:
-            with_dome = predicted(_dome_state(problem, solution, rest), media, views)
+            state = solve(problem.only(rest).bundle, solution.state.only(rest)).state
+            with_dome = predicted(state, media, views)
             bare = predicted(_bare_state(problem, solution, rest), media, views)
         except CalibrationError:
             return None
@@ -484,14 +480,6 @@ def _compared(pairs: Sequence[tuple[FloatArray, FloatArray]]) -> CrossValidation
         return None
     dome_px, bare_px, counts = np.array(rows).T
     return CrossValidation(dome_px, bare_px, counts.astype(np.int64))
-
-
-def _dome_state(
-    problem: DomeProblem, solution: Solution[BundleState], rest: Sequence[int]
-) -> BundleState:
-    part = problem.only(rest)
-    poses = tuple(solution.state.poses[i] for i in rest)
-    return solve(part.bundle, replace(solution.state, poses=poses)).state
 
 
 def _bare_state(

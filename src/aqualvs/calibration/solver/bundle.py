@@ -11,7 +11,7 @@ steps (`moved_target`).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -20,8 +20,9 @@ from aqualvs.calibration.solver.least_squares import Block, RobustLoss
 from aqualvs.calibration.targets.targets import View
 from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec, rotvec_from_rotation, skew
-from aqualvs.optics.camera import Camera, parameter_names
+from aqualvs.optics.camera import POSE_PARAMETERS, Camera, parameter_names
 from aqualvs.optics.rig import Rig, RigUncertainty, rig_moved_by
+from aqualvs.optics.solved import rig_numbers
 
 DISTANCES = "distances"
 TILTS = "tilts"
@@ -105,7 +106,7 @@ def plane_distance(dome_from_target: SE3) -> float:
 
 
 PRIORS = "priors"
-_ROTATION = ("rotation_x", "rotation_y", "rotation_z")
+_ROTATION = POSE_PARAMETERS[3:]
 
 
 def rig_prior(start: Rig, rig: Rig, free: Sequence[str], priors: RigUncertainty) -> list[Block]:
@@ -143,19 +144,6 @@ def rig_difference(start: Rig, rig: Rig, names: Sequence[str]) -> FloatArray:
     turn = rotvec_from_rotation(rig.dome_from_cam.rotation @ start.dome_from_cam.rotation.T)
     rotation = dict(zip(_ROTATION, turn, strict=True))
     return np.array([rotation[n] if n in rotation else b[n] - a[n] for n in names])
-
-
-def rig_numbers(rig: Rig) -> dict[str, float]:
-    """Return a rig's numbers by the names of `parameter_names`; those of rotations are zero."""
-    lens = rig.lens
-    values = (lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion)
-    numbers = dict(zip(lens.parameter_names, values, strict=True))
-    position = rig.dome_from_cam.translation.tolist()
-    numbers.update(zip(("lens_x", "lens_y", "lens_z"), position, strict=True))
-    numbers.update(dict.fromkeys(_ROTATION, 0.0), n_air=rig.n_air, n_water=rig.n_water)
-    if rig.housing is not None:
-        numbers.update(rig.housing.numbers())
-    return numbers
 
 
 def _whiten(covariance: FloatArray) -> FloatArray:
@@ -298,6 +286,10 @@ class BundleState:
     media: FloatArray  # Shape (M,): refractive indices outside the dome.
     poses: tuple[SE3, ...]  # `dome_from_target` of every view.
 
+    def only(self, keep: Sequence[int]) -> "BundleState":
+        """Return the state of some of the views."""
+        return replace(self, poses=tuple(self.poses[i] for i in keep))
+
     def camera(self, medium: int) -> Camera:
         """Return the camera looking into one of the media."""
         return self.rig.in_water(float(self.media[medium])).camera()
@@ -336,6 +328,11 @@ class Bundle:
     def n_parameters(self) -> int:
         """Length of a step."""
         return self.n_shared + 6 * sum(not v.fixed for v in self.views)
+
+    def only(self, keep: Sequence[int]) -> "Bundle":
+        """Return the problem of some of its views."""
+        views = tuple(self.views[i] for i in keep)
+        return replace(self, views=views, start=self.start.only(keep))
 
     def medium_columns(self, medium: int) -> IntArray:
         """Return the column of a medium; none if it is exact."""

@@ -1,12 +1,13 @@
 """Results of `calibrate dome` and `calibrate camera`: the solved rig and the fit of each view."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import stdtr
 
-from aqualvs.calibration.solver.bundle import CORNER_SIGMA_PX
-from aqualvs.calibration.solver.least_squares import Block
+from aqualvs.calibration.solver.bundle import CORNER_SIGMA_PX, Bundle, BundleState
+from aqualvs.calibration.solver.least_squares import Solution
 from aqualvs.calibration.targets.targets import View
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.transforms import SE3
@@ -36,6 +37,23 @@ class ViewFit:
     def rms_px(self) -> float:
         """Root mean square distance of the inliers from their predicted pixels (as OpenCV)."""
         return rms_px(self.residuals[self.inliers])
+
+
+class FittedViews:
+    """Figures of all views of a calibration together."""
+
+    __slots__ = ()
+    views: tuple[ViewFit, ...]
+
+    @property
+    def rms_px(self) -> float:
+        """Root mean square distance of all inliers from their predicted pixels (as OpenCV)."""
+        return rms_px(np.concatenate([v.residuals[v.inliers] for v in self.views]))
+
+    @property
+    def n_points(self) -> int:
+        """Number of inlier corners."""
+        return sum(int(np.count_nonzero(v.inliers)) for v in self.views)
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +122,7 @@ class CrossValidation:
 
 
 @dataclass(frozen=True, slots=True)
-class DomeCalibration:
+class DomeCalibration(FittedViews):
     """Result of a dome calibration: the solved rig with its uncertainty."""
 
     rig: Rig  # With lens, rotation, dome and intrinsics as solved; everything else unchanged.
@@ -127,16 +145,6 @@ class DomeCalibration:
 
     n_iterations: int
 
-    @property
-    def rms_px(self) -> float:
-        """Root mean square distance of all inliers from their predicted pixels (as OpenCV)."""
-        return rms_px(np.concatenate([v.residuals[v.inliers] for v in self.views]))
-
-    @property
-    def n_points(self) -> int:
-        """Number of inlier corners."""
-        return sum(int(np.count_nonzero(v.inliers)) for v in self.views)
-
 
 def rms_px(residuals: FloatArray) -> float:
     """Return the root mean square length of residuals (N, 2)."""
@@ -145,17 +153,19 @@ def rms_px(residuals: FloatArray) -> float:
     return float(np.sqrt(np.mean(np.sum(residuals**2, axis=-1))))
 
 
-def view_fit(
-    label: str,
-    view: View,
-    pose: SE3,
+def view_fits(
+    labels: Sequence[str],
+    bundle: Bundle,
+    solution: Solution[BundleState],
     covariance: FloatArray,
-    block: Block,
-    inliers: BoolArray,
-    scale: float,
-) -> ViewFit:
-    """Return the fit of a view, from its block of corners in a bundle."""
-    if not len(covariance):
-        covariance = np.zeros((6, 6))
-    residuals = -CORNER_SIGMA_PX * block.residuals
-    return ViewFit(label, view, pose, covariance, residuals, inliers, CORNER_SIGMA_PX * scale)
+) -> tuple[ViewFit, ...]:
+    """Return the fits of a bundle's views; `covariance` has the bundle's columns."""
+    fits = []
+    for i, (label, target) in enumerate(zip(labels, bundle.views, strict=True)):
+        columns = bundle.pose_columns(i)
+        of_pose = covariance[np.ix_(columns, columns)] if len(columns) else np.zeros((6, 6))
+        residuals = -CORNER_SIGMA_PX * solution.blocks[i].residuals
+        noise_px = CORNER_SIGMA_PX * solution.block_scales[i]
+        pose, inliers = solution.state.poses[i], solution.inliers[i]
+        fits.append(ViewFit(label, target.view, pose, of_pose, residuals, inliers, noise_px))
+    return tuple(fits)
