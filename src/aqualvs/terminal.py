@@ -26,15 +26,10 @@ class StopSignals(Closing):
 
     The second signal is not caught, so that it ends the process. Outside of the main thread, where
     Python allows no handlers, no signal is caught.
-
-    Attributes
-    ----------
-    caught : Signals or None
-        The signal that asked to stop.
     """
 
     def __init__(self) -> None:
-        self.caught: signal.Signals | None = None
+        self.caught: signal.Signals | None = None  # The signal that asked to stop.
         self._previous: dict[signal.Signals, Any] = {}
 
     @property

@@ -184,30 +184,20 @@ def _parse(text: str) -> Any:
 
 
 class _Node:
-    """A value under construction, or an anchored one.
-
-    Attributes
-    ----------
-    count, height : int
-        Values that it holds, itself included, and levels of lists and mappings.
-    key : object
-        Key of a mapping that waits for its value, or `_NO_KEY`, or `_MERGE` (`<<`).
-    merges : bool
-        Whether it is `<<`, plain and without a tag.
-    merged : list of dict
-        Mappings to fill up from.
-    """
+    """A value under construction, or an anchored one."""
 
     __slots__ = ("anchor", "count", "height", "key", "merged", "merges", "value")
 
     def __init__(self, value: Any, anchor: str | None, *, count: int = 1, height: int = 0) -> None:
         self.value = value
         self.anchor = anchor
+        # Values that it holds, itself included, and levels of lists and mappings.
         self.count = count
         self.height = height
+        # Key of a mapping that waits for its value, or `_NO_KEY`, or `_MERGE` (`<<`).
         self.key: Any = _NO_KEY
-        self.merges = False
-        self.merged: list[dict[Any, Any]] = []
+        self.merges = False  # Whether it is `<<`, plain and without a tag.
+        self.merged: list[dict[Any, Any]] = []  # Mappings to fill up from.
 
 
 class _Builder:

@@ -33,16 +33,11 @@ class LenientStream:
 
     Whoever reads the output may go before the end, as `head` does, and a terminal may be closed. A
     dive under way is measured to its end all the same.
-
-    Attributes
-    ----------
-    fault : OSError or None
-        Why nothing is written any more.
     """
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
-        self.fault: OSError | None = None
+        self.fault: OSError | None = None  # Why nothing is written any more.
 
     def write(self, text: str) -> int:
         """Write a text, or drop it after a fault."""

@@ -91,22 +91,15 @@ class LossOptions:
 
 
 class LossWatch:
-    """State of the target: present, waited for, or lost.
-
-    Attributes
-    ----------
-    stage : Stage or None
-        WAITING, GAVE_UP, or None while the target is there.
-    spent_s : float
-        Time since the last update that counts as spent with the target, in seconds.
-    """
+    """State of the target: present, waited for, or lost."""
 
     # Longer steps are gaps (a stopped process, a mission that was halted), not time spent.
     LONGEST_STEP_S = 1.0
 
     def __init__(self, options: LossOptions | None = None) -> None:
         self.options = options or LossOptions()
-        self.stage: Stage | None = None
+        self.stage: Stage | None = None  # WAITING, GAVE_UP, or None while the target is there.
+        # Time since the last update that counts as spent with the target, in seconds.
         self.spent_s = 0.0
         self._last_s = math.nan
         self._away_s = 0.0
@@ -365,11 +358,6 @@ class SurveyMission:
 
     `setpoint`: range and yaw on the way. `options`: the lawn. `loss`: what to do without the
     target.
-
-    Attributes
-    ----------
-    i_leg : int
-        The leg gone now, or whose depth is sought; counts from 0.
     """
 
     def __init__(
@@ -378,7 +366,7 @@ class SurveyMission:
         self.setpoint = setpoint
         self._options = options
         self._watch = LossWatch(loss)
-        self.i_leg = 0
+        self.i_leg = 0  # The leg gone now, or whose depth is sought; counts from 0.
         self._leg: Leg | None = None
         self._begin_change()
 

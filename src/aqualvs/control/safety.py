@@ -161,15 +161,11 @@ class SafetyGate:
     """Gate that passes, changes or stops efforts; pure, all time comes from outside.
 
     It starts disengaged.
-
-    Attributes
-    ----------
-    latched : LimitReason or None
-        Why nothing passes until `engage`; None while engaged.
     """
 
     def __init__(self, limits: SafetyLimits | None = None) -> None:
         self.limits = limits or SafetyLimits()
+        # Why nothing passes until `engage`; None while engaged.
         self.latched: LimitReason | None = LimitReason.NOT_ENGAGED
         self._last_s = -math.inf
         self._seen: deque[tuple[float, float]] = deque(maxlen=32)

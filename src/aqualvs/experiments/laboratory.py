@@ -126,17 +126,14 @@ class Laboratory:
 
     `work`: folder for the dives; kept, so that another run finds them. `tick`: called with the
     number of frames rendered since the last call.
-
-    Attributes
-    ----------
-    frame_s : list of float
-        How long the scanner took for each frame that it measured with its own options, in seconds.
     """
 
     def __init__(self, work: Path, tick: Callable[[int], None] | None = None) -> None:
         self._work = work
         self._tick = tick or (lambda _n: None)
         self._measured: dict[tuple[str, str], MeasuredDive] = {}
+        # How long the scanner took for each frame that it measured with its own options, in
+        # seconds.
         self.frame_s: list[float] = []
 
     @cached_property

@@ -32,16 +32,11 @@ class SimulatedLink:
     """Link to a simulated vehicle, in its own time.
 
     `vehicle`: its latency is that of the wire.
-
-    Attributes
-    ----------
-    effort : Effort
-        The last that was sent.
     """
 
     def __init__(self, vehicle: SimulatedVehicle) -> None:
         self.vehicle = vehicle
-        self.effort = NEUTRAL
+        self.effort = NEUTRAL  # The last that was sent.
         self._shaping = shaping_of_model(vehicle.model)
         self._unsent: Effort | None = None
         self._closed = False
@@ -156,12 +151,6 @@ class SimulatedLoop:
     """A vehicle before a net that it sees with lasers and steers by.
 
     `steering`: engaged at the start.
-
-    Attributes
-    ----------
-    on_step : callable or None
-        Called after every step of the pilot with the time, the frame's time, what was measured,
-        the decision and the vehicle's state.
     """
 
     def __init__(
@@ -175,6 +164,8 @@ class SimulatedLoop:
         self.link, self.net, self.eye, self.steering = link, net, sensor, steering
         self.timing = timing or Timing()
         self._filter = PostureFilter()
+        # Called after every step of the pilot with the time, the frame's time, what was measured,
+        # the decision and the vehicle's state.
         self.on_step: OnStep | None = None
         self._sight = _Sight(steering.gate.limits.posture_age)
         self._decision: Decision | None = None

@@ -54,11 +54,6 @@ class RenderedSensor:
         Takes the pictures; they are measured before it compresses them.
     freeze_s : float
         From then on the last picture comes again and again, with time stamps that run on.
-
-    Attributes
-    ----------
-    shots : deque of (Frame, Scan)
-        The last pictures, and what was measured in them.
     """
 
     def __init__(
@@ -79,6 +74,7 @@ class RenderedSensor:
         self._frozen: dict[Field | None, FrozenPicture] = {}
         self._planes: dict[Field | None, Planes] = {}
         self._poses: deque[tuple[float, SE3]] = deque(maxlen=2)
+        # The last pictures, and what was measured in them.
         self.shots: deque[tuple[Frame, Scan]] = deque(maxlen=_N_KEPT)
 
     def look(self, world_from_dome: SE3, time_s: float) -> Posture | Refusal:

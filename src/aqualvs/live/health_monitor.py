@@ -304,14 +304,10 @@ class DriftWatch:
     """Detector of lasers that moved: tests every few seconds, in a thread of its own.
 
     `rig`: with one laser, or without a dome, there is nothing to watch.
-
-    Attributes
-    ----------
-    off : dict
-        Number of the laser to what is wrong with it; empty where nothing is.
     """
 
     def __init__(self, rig: Rig) -> None:
+        # Number of the laser to what is wrong with it; empty where nothing is.
         self.off: dict[int, str] = {}
         self._scans: queue.Queue[Scan | None] = queue.Queue(8)
         self._thread: threading.Thread | None = None

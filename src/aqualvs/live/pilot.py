@@ -31,11 +31,6 @@ class Watchdog:
     standing; the vehicle's own fail-safe comes later, and does not act while others send it sticks.
 
     `timeout_s`: time that an effort may stay in force.
-
-    Attributes
-    ----------
-    n_barks : int
-        How often it had to act.
     """
 
     def __init__(self, vehicle: VehicleLink, timeout_s: float) -> None:
@@ -45,7 +40,7 @@ class Watchdog:
         self._known_s = float("-inf")
         self._thrusting = threading.Event()
         self._closing = threading.Event()
-        self.n_barks = 0
+        self.n_barks = 0  # How often it had to act.
         self._thread = threading.Thread(target=self._run, name="pilot watchdog", daemon=True)
         self._thread.start()
 

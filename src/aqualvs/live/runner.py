@@ -176,15 +176,10 @@ class Mailbox:
 
     `keep_every`: let the writer wait until its frame has been taken, instead of replacing one that
     has not.
-
-    Attributes
-    ----------
-    n_dropped : int
-        Frames that were replaced by a newer one before they were taken.
     """
 
     def __init__(self, *, keep_every: bool = False) -> None:
-        self.n_dropped = 0
+        self.n_dropped = 0  # Frames that were replaced by a newer one before they were taken.
         self._keep_every = keep_every
         self._changed = threading.Condition()
         self._waiting: deque[Arrival] = deque()
@@ -240,18 +235,11 @@ class FrameReader:
     """Reader of a feed in a thread of its own; a context manager.
 
     `mailbox`: closed when the feed ends.
-
-    Attributes
-    ----------
-    n_lost : int
-        Frames that the feed could not decode, by the gaps in their numbers.
-    fault : AqualvsError or None
-        What ended the feed, if it did not end by itself.
     """
 
     def __init__(self, feed: Feed, mailbox: Mailbox) -> None:
-        self.n_lost = 0
-        self.fault: AqualvsError | None = None
+        self.n_lost = 0  # Frames that the feed could not decode, by the gaps in their numbers.
+        self.fault: AqualvsError | None = None  # What ended the feed, if it did not end by itself.
         self._feed, self._mailbox = feed, mailbox
         self._trouble = ""
         self._closing = threading.Event()

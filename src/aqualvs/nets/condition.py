@@ -106,16 +106,12 @@ class NetCondition:
     """Accumulator of the condition of a net over a dive.
 
     `rig`: rig of the scans.
-
-    Attributes
-    ----------
-    stretches : list of NetStretch
-        Completed stretches. Where the net's lattice is found only later, the places of earlier
-        stretches and the holes in them are filled in then.
     """
 
     def __init__(self, rig: Rig, options: NetConditionOptions | None = None) -> None:
         self.options = options or NetConditionOptions()
+        # Completed stretches. Where the net's lattice is found only later, the places of earlier
+        # stretches and the holes in them are filled in then.
         self.stretches: list[NetStretch] = []
         self._reader = NetReader(rig)
         self._signals: list[NetSignal] = []

@@ -37,25 +37,13 @@ _STEP_SHARE, _LARGEST_STEP = 0.1, 1e-4
 
 
 class FittedSurface(NamedTuple):
-    """A surface with K coefficients that was fitted to N points.
+    """A surface with K coefficients that was fitted to N points."""
 
-    Attributes
-    ----------
-    terms : array, shape (N, K)
-        Factors of the coefficients at each point.
-    prior : array, shape (K,)
-        Prior information on each coefficient.
-    normal : array, shape (3,), bend : array, shape (3, 3)
-        The gradient at X of the residual is `normal + bend @ X`.
-    posture : array, shape (3, K)
-        Derivatives of range, pitch and yaw by the coefficients.
-    """
-
-    terms: FloatArray
-    prior: FloatArray
-    normal: FloatArray
-    bend: FloatArray
-    posture: FloatArray
+    terms: FloatArray  # Shape (N, K): factors of the coefficients at each point.
+    prior: FloatArray  # Shape (K,): prior information on each coefficient.
+    normal: FloatArray  # Shape (3,): the gradient at X of the residual is `normal + bend @ X`.
+    bend: FloatArray  # Shape (3, 3).
+    posture: FloatArray  # Shape (3, K): derivatives of range, pitch and yaw by the coefficients.
 
 
 def fitted_plane(m: FloatArray, points: FloatArray) -> FittedSurface:
@@ -107,19 +95,13 @@ class PostureErrors:
 
     `rig`: with lasers. `camera`: of the rig, behind its dome or bare. `uncertainty`: numbers that
     it does not name are exact.
-
-    Attributes
-    ----------
-    names : tuple of str
-        Numbers of the rig that have an uncertainty, P of them.
-    covariance : array, shape (P, P)
-        Theirs.
     """
 
     def __init__(self, rig: Rig, camera: Camera, uncertainty: RigUncertainty) -> None:
         sigmas = uncertainty.sigmas
+        # Numbers of the rig that have an uncertainty, P of them.
         self.names = tuple(name for name in uncertainty.names if sigmas[name] > 0.0)
-        self.covariance = uncertainty.of(self.names)
+        self.covariance = uncertainty.of(self.names)  # Shape (P, P): theirs.
         steps = {name: min(_STEP_SHARE * sigmas[name], _LARGEST_STEP) for name in self.names}
         self._camera = camera
         self._n_lasers = len(rig.lasers)

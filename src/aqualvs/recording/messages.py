@@ -371,16 +371,11 @@ class RecordClock:
     """Clock of a recording: its times rise, whatever the system's clock does.
 
     That of the first sample is the system's; from there on the monotonic clock counts.
-
-    Attributes
-    ----------
-    last_ns : int
-        Time of the last sample.
     """
 
     def __init__(self) -> None:
         self._offset_ns: int | None = None
-        self.last_ns = 0
+        self.last_ns = 0  # Time of the last sample.
 
     def stamp_ns(self, sample: LiveSample) -> int:
         """Return the time of a sample's arrival, nanoseconds since 1970."""

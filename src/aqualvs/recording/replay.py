@@ -47,17 +47,6 @@ class DiveRecording:
     """A recording of a dive.
 
     Raises `SourceError` if it cannot be read, or holds no stripes.
-
-    Attributes
-    ----------
-    rig : Rig or None
-        That the dive was measured with at its beginning; None where it is lost or not understood.
-    options : ScannerOptions or None
-        As the dive was measured; likewise.
-    n_frames : int or None
-        None where a torn file does not say.
-    fps : float or None
-        Mean rate.
     """
 
     def __init__(self, path: Path) -> None:
@@ -65,8 +54,9 @@ class DiveRecording:
         self._file = McapFile(path)
         if STRIPES.name not in self._file.topics:
             raise SourceError(f"{path}: holds no stripes; give a recording of aqualvs, or a video")
+        # That the dive was measured with at its beginning; None where it is lost or not understood.
         self.rig: Rig | None = None
-        self.options: ScannerOptions | None = None
+        self.options: ScannerOptions | None = None  # As the dive was measured; likewise.
         self._no_rig = "its rig is in none of its undamaged parts; add --rig"
         # The rig is recorded every minute, so it survives the loss of the first part.
         stored = next(self._file.messages([RIG.name]), None)
@@ -74,9 +64,9 @@ class DiveRecording:
             self._read_rig(stored.data)
         elif next(self._file.messages([STRIPES.name]), None) is None:
             raise SourceError(f"{path}: holds no stripes; give a recording of aqualvs, or a video")
-        self.n_frames = self._file.count(STRIPES.name)
+        self.n_frames = self._file.count(STRIPES.name)  # None where a torn file does not say.
         self.has_pictures = next(self._file.messages([PICTURE.name]), None) is not None
-        self.fps = self._mean_rate()
+        self.fps = self._mean_rate()  # Mean rate.
 
     def need_rig(self) -> Rig:
         """Return the rig.

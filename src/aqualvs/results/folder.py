@@ -173,13 +173,6 @@ class RunOutputs:
     `folder`: from `prepare_folder`. `source`, `rig`, `options`: for `run.yaml`. `summary`: to which
     the frames are added; its monitors are those of the run. `shutter`: of the camera. Raises
     `OutputError`: from every method, if the disk is full or the folder cannot be written.
-
-    Attributes
-    ----------
-    status : Status
-        What `run.yaml` will say if the run ends without a fault; set it before the end.
-    summary : RunSummary
-        So far.
     """
 
     def __init__(
@@ -193,8 +186,9 @@ class RunOutputs:
         shutter: Shutter = AT_ONCE,
     ) -> None:
         self.folder = folder
+        # What `run.yaml` will say if the run ends without a fault; set it before the end.
         self.status = Status.FINISHED
-        self.summary = RunSummary() if summary is None else summary
+        self.summary = RunSummary() if summary is None else summary  # So far.
         self._run_file = RunFile(folder / RUN_YAML, source, rig, options)
         with contextlib.ExitStack() as stack, writing(folder):
             # First, so that only one of two runs that begin at the same moment continues.

@@ -189,13 +189,7 @@ def packet_with(data: bytes) -> "Packet[VideoStream]":
 
 
 class Feed(Protocol):
-    """Frames of a live stream, which may stall, change its size, break off and return.
-
-    Attributes
-    ----------
-    name : str
-        How health and messages call it.
-    """
+    """Frames of a live stream, which may stall, change its size, break off and return."""
 
     @property
     def name(self) -> str:

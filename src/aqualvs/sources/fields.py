@@ -329,16 +329,10 @@ def first_pairs(source: FrameSource) -> Iterator[list[Frame]]:
 
 
 class FieldWatch:
-    """Watch of a stream's pictures for what contradicts the rig's shutter.
-
-    Attributes
-    ----------
-    warning : str
-        As from `FieldEvidence.contradiction`; empty if nothing is wrong.
-    """
+    """Watch of a stream's pictures for what contradicts the rig's shutter."""
 
     def __init__(self, shutter: Shutter) -> None:
-        self.warning = ""
+        self.warning = ""  # As from `FieldEvidence.contradiction`; empty if nothing is wrong.
         self._shutter = shutter
         self._first: Frame | None = None
         self._last: Frame | None = None

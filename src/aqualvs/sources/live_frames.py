@@ -237,11 +237,6 @@ class LiveDecoder:
         Whether the caller learns of every loss from the transport. If not, the numbers of H.264's
         pictures are watched.
 
-    Attributes
-    ----------
-    is_waiting : bool
-        Since damage no sound picture has come.
-
     Notes
     -----
     A picture predicted from a lost or damaged one looks sound and is not: stripes stand where they
@@ -254,7 +249,7 @@ class LiveDecoder:
     """
 
     def __init__(self, codec: VideoCodecContext, *, hears_losses: bool) -> None:
-        self.is_waiting = False
+        self.is_waiting = False  # Since damage no sound picture has come.
         self._codec = codec
         codec.thread_count = 1
         codec.flags |= int(Flags.low_delay)

@@ -216,11 +216,6 @@ class McapFile:
     damage in one place loses the chunk that it is in.
 
     Raises `SourceError` if the file is missing or no MCAP file.
-
-    Attributes
-    ----------
-    n_torn : int
-        Chunks left out so far because they are damaged.
     """
 
     def __init__(self, path: Path) -> None:

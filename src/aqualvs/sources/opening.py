@@ -31,15 +31,10 @@ class PacedFeed:
 
     `source`: closed at the end. `realtime`: whether each frame waits for its time. A consumer that
     is late is not made later: frames that are due come at once.
-
-    Attributes
-    ----------
-    name : str
-        Of the source.
     """
 
     def __init__(self, source: FrameSource, *, realtime: bool) -> None:
-        self.name = source.name
+        self.name = source.name  # Of the source.
         self._source = source
         self._realtime = realtime
         self._closed = threading.Event()

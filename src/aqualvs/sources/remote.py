@@ -32,18 +32,11 @@ class Connection:
     joined: it ends by itself when FFmpeg's time runs out, and closes what it opened.
 
     `opener`: returns an open container, or raises what PyAV raises; its timeouts must be set.
-
-    Attributes
-    ----------
-    reason : str
-        Why the connection ended, in a few words; empty for a plain end.
-    fault : Exception or None
-        What PyAV raised when opening.
     """
 
     def __init__(self, opener: Opener) -> None:
-        self.reason = ""
-        self.fault: Exception | None = None
+        self.reason = ""  # Why the connection ended, in a few words; empty for a plain end.
+        self.fault: Exception | None = None  # What PyAV raised when opening.
         self._opener = opener
         self._abandoned = threading.Event()
         self._packets: queue.SimpleQueue[VideoPacket | None] = queue.SimpleQueue()

@@ -184,16 +184,10 @@ class AccessUnit:
 
 
 class H264Depacketizer:
-    """Depacketizer of H.264: builds pictures from packets in order.
-
-    Attributes
-    ----------
-    n_foreign : int
-        Packets in a row that are no H.264.
-    """
+    """Depacketizer of H.264: builds pictures from packets in order."""
 
     def __init__(self) -> None:
-        self.n_foreign = 0
+        self.n_foreign = 0  # Packets in a row that are no H.264.
         self._unwrap = Unwrapper(32)
         self._timestamp: int | None = None
         self._units: list[bytes] = []
@@ -313,11 +307,6 @@ _RESTART_TICKS = 10 * TICKS_HZ
 class TransportStream:
     """Demultiplexer of the first video of an MPEG-TS, from packets of 188 bytes.
 
-    Attributes
-    ----------
-    codec : str or None
-        FFmpeg's name; None until the tables have come.
-
     Notes
     -----
     The stream does not say where a picture ends, only where the next one begins. Muxers fill up
@@ -326,7 +315,7 @@ class TransportStream:
     """
 
     def __init__(self) -> None:
-        self.codec: str | None = None
+        self.codec: str | None = None  # FFmpeg's name; None until the tables have come.
         self._tables: int | None = None
         self._video: int | None = None
         self._counts: dict[int, int] = {}

@@ -220,15 +220,11 @@ class FrameProcessor:
     """Measurement of frames, with the dome and without.
 
     `scanner`: for the same rig.
-
-    Attributes
-    ----------
-    block_length : int
-        How many frames it is best given at a time.
     """
 
     def __init__(self, rig: Rig, scanner: FrameScanner) -> None:
         self._scanner = scanner
+        # How many frames it is best given at a time.
         self.block_length = block_length(rig.size_px) if isinstance(scanner, Scanner) else 1
         self._bare_lens = BareLensComparison(rig) if rig.housing is not None else None
 

@@ -165,16 +165,13 @@ class SharedMemory:
 
     `file`: Descriptor of a file in memory; stays open until `seal`. Raises `OSError` if the memory
     is not available.
-
-    Attributes
-    ----------
-    slots : uint8 array, shape (n_slots, n_bytes)
     """
 
     def __init__(self, file: int) -> None:
         self._file = file
         os.ftruncate(file, _N_SLOTS * _SLOT_BYTES)
         memory = mmap.mmap(file, _N_SLOTS * _SLOT_BYTES)
+        # Shape (n_slots, n_bytes).
         self.slots = np.frombuffer(memory, np.uint8).reshape(_N_SLOTS, _SLOT_BYTES)
 
     @classmethod
@@ -401,19 +398,12 @@ class WorkerPool(Closing):
     """Pool of processes that measure the parts of a dive; a context manager that ends them.
 
     `n_processes`: there are no more than parts.
-
-    Attributes
-    ----------
-    next_frame : int
-        The first frame of which nothing has come yet.
-    is_done : bool
-        Whether all has come.
     """
 
     def __init__(self, work: PoolJob, n_processes: int) -> None:
         self._work = work
-        self.next_frame = work.parts[0].first
-        self.is_done = False
+        self.next_frame = work.parts[0].first  # The first frame of which nothing has come yet.
+        self.is_done = False  # Whether all has come.
         self._n_given = 0
         self._workers: list[_Worker] = []
         self._found: defaultdict[int, deque[Message]] = defaultdict(deque)

@@ -60,13 +60,6 @@ class Replay(Closing):
         Rig, water and the `chosen` options stand for the recorded ones; an overlay needs pictures
         even if stripes are not looked for again.
 
-    Attributes
-    ----------
-    rig : Rig
-        To measure with.
-    options : ScannerOptions
-        To measure with.
-
     Raises
     ------
     SourceError, RigError, OptionError
@@ -79,8 +72,8 @@ class Replay(Closing):
 
         self._recording = recording = DiveRecording(path)
         self.name = str(path)
-        self.options = _options(recording, request)
-        self.rig = _rig(recording, request)
+        self.options = _options(recording, request)  # To measure with.
+        self.rig = _rig(recording, request)  # To measure with.
         self.size_px, self.fps = (recording.rig or self.rig).size_px, recording.fps
         self.n_frames = recording.n_frames
         self._follows = request.rig is None and request.water == Water()
@@ -318,11 +311,6 @@ class WaterFollowingScanner:
     `rig`: in the water to begin with. `target`: markers on the vehicle (target.yaml). `water`:
     temperature and salinity, if given, are a prior. Raises `CalibrationError` if the target's file
     cannot be used.
-
-    Attributes
-    ----------
-    scanner : Scanner
-        For the water as it is known.
     """
 
     def __init__(self, rig: Rig, options: ScannerOptions, target: Path, water: Water) -> None:
@@ -331,7 +319,7 @@ class WaterFollowingScanner:
         from aqualvs.calibration.water_index.state import IndexOptions
 
         self._rig, self._options, self._target = rig, options, target
-        self.scanner = Scanner(rig, options)
+        self.scanner = Scanner(rig, options)  # For the water as it is known.
         self._markers = load_target(target)
         # Accuracy of a user's measurement of the plate's place; only the index is tracked.
         place_mm, turn_deg = 0.2, 0.1

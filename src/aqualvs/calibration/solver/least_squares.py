@@ -300,20 +300,14 @@ State = TypeVar("State")
 
 
 class FreeParameterError(CalibrationError):
-    """Error: neither measurements nor priors determine a parameter.
-
-    Attributes
-    ----------
-    parameter : int
-        Its index in the problem.
-    """
+    """Error: neither measurements nor priors determine a parameter."""
 
     def __init__(self, parameter: int) -> None:
         super().__init__(
             f"parameter {parameter} of the solve is entirely free: no picture says anything about "
             "it; take more pictures, from other distances and angles"
         )
-        self.parameter = parameter
+        self.parameter = parameter  # Its index in the problem.
 
 
 class Problem(Protocol[State]):

@@ -281,11 +281,6 @@ class DashboardServer:
 
     `host`, `port`: where to listen; port 0 takes any that is free. Raises `OptionError` if the
     address cannot be listened to.
-
-    Attributes
-    ----------
-    port : int
-        Where it listens.
     """
 
     def __init__(self, host: str, port: int, access: Access, rig: Rig, controls: Controls) -> None:
@@ -294,7 +289,7 @@ class DashboardServer:
         self._policy = _policy(access)
         self._limits, self._gate = ConnectionLimits(), TokenGate(access)
         self._socket = _listening(host, port)
-        self.port: int = self._socket.getsockname()[1]
+        self.port: int = self._socket.getsockname()[1]  # Where it listens.
         self._loop: asyncio.AbstractEventLoop | None = None
         self._server = uvicorn.Server(
             uvicorn.Config(

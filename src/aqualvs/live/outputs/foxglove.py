@@ -213,11 +213,6 @@ class FoxgloveOutput:
     picture_hz, points_hz : float
         Most pictures, and point clouds, per second; 0 for none.
 
-    Attributes
-    ----------
-    port : int
-        That it listens on.
-
     Raises
     ------
     OptionError
@@ -264,7 +259,7 @@ class FoxgloveOutput:
                 f"foxglove: cannot listen on {host}:{port} ({fault}); "
                 "choose another port, or end the program that has it"
             ) from fault
-        self.port: int = self._server.port
+        self.port: int = self._server.port  # That it listens on.
         self._where = f"{host}:{self.port}"
         self._closed = False
 

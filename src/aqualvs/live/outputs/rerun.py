@@ -23,11 +23,6 @@ class RerunOutput:
     `where`: `viewer` to open one, HOST:PORT of one that is open, or a file that ends in `.rrd`.
     Raises `OptionError` if rerun-sdk is not installed, or `where` is none of these. Raises
     `OutputError` if the file exists or cannot be written.
-
-    Attributes
-    ----------
-    name, inline, keeps_all
-        As in `Output`; a file gets all samples.
     """
 
     name = "rerun"
@@ -36,7 +31,7 @@ class RerunOutput:
     def __init__(self, where: str) -> None:
         rerun_sdk()
         self._where = where
-        self.keeps_all = where.endswith(RRD)
+        self.keeps_all = where.endswith(RRD)  # A file gets all samples.
         self._log: RerunLog | None = None
         self._address: tuple[str, int] | None = None
         self._next_s, self._closed = -math.inf, False
