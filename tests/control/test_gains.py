@@ -161,7 +161,7 @@ def refusal(content: object, tmp_path: Path) -> str:
         ("range", "speed_per_s", -1.0, "range.speed_per_s is -1.0"),
         ("range", "speed_per_s", "fast", "range.speed_per_s is 'fast'"),
         ("range", "lag_s", math.nan, "range.lag_s is nan"),
-        ("yaw", "proportional_per_s", None, "yaw.proportional_per_s is None"),
+        ("yaw", "proportional_per_s", None, "yaw.proportional_per_s is empty"),
         ("vehicle", "mass_kg", 0.0, "vehicle.mass_kg is 0.0"),
     ],
 )

@@ -103,5 +103,5 @@ def test_scenario_files_have_folds() -> None:
     content = {"net": {"folds": [{"direction_deg": 90, "height_mm": -20, "every_mm": 200}]}}
     fold = parse_scenario(content, "pleats", "pleats.yaml").nets[0].folds[0]
     assert fold == Fold(direction=np.pi / 2, height=-0.02, width=0.05, period=0.2)
-    with pytest.raises(OptionError, match="did you mean height_mm"):
+    with pytest.raises(OptionError, match="did you mean 'height_mm'"):
         parse_scenario({"net": {"folds": [{"hight_mm": 3}]}}, "pleats", "pleats.yaml")

@@ -66,13 +66,13 @@ def test_file_is_read_in_its_units(tmp_path):
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("nett: {}", "unknown key nett; did you mean net?"),
-        ("net: {bar: 25}", "unknown key net.bar; did you mean bar_mm?"),
-        ("motion: {rolling: 3}", "known keys: range_mm"),
+        ("nett: {}", "nett is not a key of this file; did you mean 'net'?"),
+        ("net: {bar: 25}", "net.bar is not a key of this file; did you mean 'bar_mm'?"),
+        ("motion: {rolling: 3}", "allowed here: range_mm"),
         ("net: {bar_mm: -3}", "net.bar_mm is -3"),
         ("net: {mesh: round}", "net.mesh is 'round'"),
         ("duration_s: .nan", "duration_s is nan"),
-        ("walls: [{behind: 3}]", "did you mean behind_mm?"),
+        ("walls: [{behind: 3}]", "walls[0].behind is not a key of this file; did you mean 'behind_mm'?"),
         ("[1, 2", "not YAML"),
         ("- 1", "the file is [1]"),
     ],

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Generic, TypeAlias, TypeVar
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import ConfigDict, Field
 
 from aqualvs.calibration.solver.result import ViewFit
 from aqualvs.calibration.targets.targets import View
@@ -39,6 +39,7 @@ from aqualvs.report.calibration_material import (
 from aqualvs.report.calibration_page import write_page
 from aqualvs.results.files import writing
 from aqualvs.results.run_request import checked_index
+from aqualvs.schema import Index, NotNegative, Positive, SchemaWords, StrictPart, validated
 from aqualvs.sources.images import read_image
 from aqualvs.terminal import progress
 from aqualvs.yamlfile import parse_yaml, read_text
@@ -50,8 +51,6 @@ N_LASERS = "n_lasers"
 WAVELENGTH_NM = "wavelength_nm"
 """The same for their wavelength, in nanometres."""
 
-_Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
-_Index = Annotated[float, Field(ge=1.0, le=2.0, allow_inf_nan=False)]
 _Count = Annotated[int, Field(gt=0)]
 
 
@@ -70,8 +69,8 @@ class Nominal:
     shutter: Shutter = AT_ONCE  # Of the camera.
 
 
-class _Part(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+class _Part(StrictPart):
+    model_config = ConfigDict(strict=False)
 
 
 class _Image(_Part):
@@ -80,15 +79,15 @@ class _Image(_Part):
 
 
 class _Dome(_Part):
-    inner_radius_mm: _Positive
-    thickness_mm: Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
-    n_acrylic: _Index = 1.49
+    inner_radius_mm: Positive
+    thickness_mm: NotNegative
+    n_acrylic: Index = 1.49
 
 
 class _Flat(_Part):
-    distance_mm: _Positive
-    thickness_mm: Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
-    n_port: _Index = 1.49
+    distance_mm: Positive
+    thickness_mm: NotNegative
+    n_port: Index = 1.49
 
 
 class _Lasers(_Part):
@@ -101,9 +100,9 @@ class _File(_Part):
     image: _Image | None = None
     dome: _Dome | None = None
     flat: _Flat | None = None
-    n_air: _Index = N_AIR
+    n_air: Index = N_AIR
     lasers: _Lasers | None = None
-    fps: _Positive | None = None
+    fps: Positive | None = None
 
 
 def load_nominal(path: Path) -> Nominal:
@@ -143,15 +142,7 @@ def _of_rig_file(path: Path) -> Nominal:
 
 
 def _of_mapping(content: Mapping[str, Any], path: Path) -> Nominal:
-    try:
-        file = _File.model_validate(dict(content))
-    except ValidationError as error:
-        fault = error.errors(include_url=False)[0]
-        place = ".".join(map(str, fault["loc"]))
-        raise RigError(
-            f"{path}: {place} is {fault['input']!r}: {fault['msg'].lower()}; a nominal rig has "
-            f"{', '.join(_File.model_fields)}"
-        ) from None
+    file = validated(_File, dict(content), path, RigError, SchemaWords(file="a nominal rig"))
     return Nominal(
         name=file.name,
         size_px=None if file.image is None else (file.image.width, file.image.height),

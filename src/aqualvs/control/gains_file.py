@@ -1,20 +1,13 @@
-"""The gains file, a short YAML with unit suffixes (docs/control.md), and its strict reader.
+"""The gains file, a short YAML with unit suffixes (docs/control.md), and its strict reader."""
 
-`load_settings` also reads the other files that people write for the controllers: it checks each key
-and reports a fault in one line.
-"""
-
-import difflib
 import math
 import re
-from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal
 
 import yaml
-from pydantic import Field, ValidationError
-from pydantic_core import ErrorDetails
+from pydantic import Field
 
 from aqualvs.control.gains import (
     ControlGains,
@@ -26,91 +19,16 @@ from aqualvs.control.gains import (
     YawGains,
 )
 from aqualvs.errors import OptionError
-from aqualvs.optics.rigschema import NotNegative, Number, Positive, StrictPart
-from aqualvs.yamlfile import parse_yaml, read_yaml, write_text
-
-AnyPart = TypeVar("AnyPart", bound=StrictPart)
-
-
-def load_settings(path: Path, kind: type[AnyPart], key: str, version: int) -> AnyPart:
-    """Return the content of a file, checked key by key.
-
-    `kind`: what the file may hold. `key`: first key of such a file, whose value is the version of
-    its format. `version`: version that is read. Raises `OptionError`: one line: file, place, value,
-    remedy.
-    """
-    content = read_yaml(path, f"a file that begins with '{key}: {version}'", OptionError)
-    return parse_settings(content, kind, key, version, str(path))
-
-
-def parse_settings(
-    content: object, kind: type[AnyPart], key: str, version: int, name: str
-) -> AnyPart:
-    """Return settings checked key by key; `name` is how messages call their source.
-
-    Raises `OptionError` with one line: source, place, value, remedy.
-    """
-    if not isinstance(content, Mapping) or key not in content:
-        raise OptionError(f"{name}: {key} is missing; such a file begins with '{key}: {version}'")
-    found = content[key]
-    if type(found) is not int or found != version:
-        raise OptionError(
-            f"{name}: {key} is {found!r}, but this aqualvs reads version {version}; write the file "
-            "anew, or install an aqualvs that reads it"
-        )
-    try:
-        return kind.model_validate(dict(content))
-    except ValidationError as error:
-        raise OptionError(f"{name}: {_first_fault(error, kind)}") from None
-
-
-def _first_fault(error: ValidationError, kind: type[StrictPart]) -> str:
-    """One line on the fault to mend first; a misspelt key explains the one that is missing."""
-    faults = error.errors(include_url=False)
-    unknown = [fault for fault in faults if fault["type"] == "extra_forbidden"]
-    fault = (unknown or faults)[0]
-    place = ".".join(str(step) for step in fault["loc"])
-    if fault["type"] == "extra_forbidden":
-        return f"{place} is no key here; {_closest(fault, kind)}"
-    if fault["type"] == "missing":
-        return f"{place} is missing; add it"
-    value = fault["input"]
-    shown = f"'{value}'" if isinstance(value, str) else repr(value)
-    shown = "keys and values" if isinstance(value, dict) else shown
-    return f"{place} is {shown}; {_remedy(fault)}"
-
-
-def _remedy(fault: ErrorDetails) -> str:
-    if fault["type"] == "literal_error":
-        return f"write {fault['ctx']['expected']}"
-    message = fault["msg"].removeprefix("Value error, ").removeprefix("Input ")
-    return message[0].lower() + message[1:] if message.startswith("S") else f"it {message}"
-
-
-def _closest(fault: ErrorDetails, kind: type[StrictPart]) -> str:
-    known = _keys_at(kind, fault["loc"][:-1])
-    close = difflib.get_close_matches(str(fault["loc"][-1]), known, n=1)
-    if close:
-        return f"did you mean '{close[0]}'?"
-    return f"known are {', '.join(known)}" if known else "leave it out"
-
-
-def _keys_at(kind: type[StrictPart], places: tuple[int | str, ...]) -> list[str]:
-    """Return the keys that a mapping at a place may have."""
-    for place in places:
-        field = kind.model_fields.get(str(place))
-        inner = None if field is None else _part_of(field.annotation)
-        if inner is None:
-            return []
-        kind = inner
-    return list(kind.model_fields)
-
-
-def _part_of(annotation: Any) -> type[StrictPart] | None:
-    options = (annotation, *getattr(annotation, "__args__", ()))
-    parts = [one for one in options if isinstance(one, type) and issubclass(one, StrictPart)]
-    return parts[0] if parts else None
-
+from aqualvs.schema import (
+    AnyPart,
+    NotNegative,
+    Number,
+    Positive,
+    StrictPart,
+    load_settings,
+    parse_settings,
+)
+from aqualvs.yamlfile import parse_yaml, write_text
 
 # What a key ends with to tell its unit.
 _UNIT = re.compile(r"_(per_s2?|deg(_s2?)?|m(_s[23]?)?|n|s)$")

@@ -9,7 +9,6 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from aqualvs.control.gains_file import parse_settings
 from aqualvs.design.settings import (
     Design,
     Goals,
@@ -29,9 +28,10 @@ from aqualvs.optics.flat_port import FlatPort
 from aqualvs.optics.lens import Lens, LensModel
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig
 from aqualvs.optics.rigfile import load_rig, shutter_from_part
-from aqualvs.optics.rigschema import NotNegative, Number, Positive, ShutterPart, StrictPart, Tilt
+from aqualvs.optics.rigschema import ShutterPart, Tilt
 from aqualvs.optics.shutter import AT_ONCE, Shutter
 from aqualvs.optics.water import N_AIR, seawater_index_vacuum
+from aqualvs.schema import Index, NotNegative, Number, Positive, StrictPart, parse_settings
 from aqualvs.yamlfile import parse_yaml, read_yaml
 
 KEY, VERSION = "aqualvs_design", 1
@@ -60,7 +60,6 @@ avoid_crossings: true
 
 _MM = 1e-3
 
-_Index = Annotated[float, Field(ge=1.0, le=2.0, allow_inf_nan=False)]
 # Limits beyond which numbers are mistakes: 100 m, and the pictures of the largest cameras.
 _MAX_MM, _MAX_PX = 1e5, 32_768
 _Place = Annotated[float, Field(ge=-_MAX_MM, le=_MAX_MM, allow_inf_nan=False)]
@@ -87,7 +86,7 @@ class DomeDesign(StrictPart):
 
     inner_radius_mm: _Length
     thickness_mm: Annotated[float, Field(ge=0.0, le=_MAX_MM, allow_inf_nan=False)]
-    n_acrylic: _Index = 1.49
+    n_acrylic: Index = 1.49
 
 
 class FlatDesign(StrictPart):
@@ -95,7 +94,7 @@ class FlatDesign(StrictPart):
 
     distance_mm: _Length
     thickness_mm: Annotated[float, Field(ge=0.0, le=_MAX_MM, allow_inf_nan=False)]
-    n_port: _Index = 1.49
+    n_port: Index = 1.49
     tilt_deg: Annotated[list[Tilt], Field(min_length=2, max_length=2)] = Field(default=[0.0, 0.0])
 
 
@@ -109,7 +108,7 @@ class LensDesign(StrictPart):
 class WaterDesign(StrictPart):
     """Schema of `water`: its index, or the values to compute it from."""
 
-    n: _Index | None = None
+    n: Index | None = None
     temperature_c: Number | None = None
     salinity_permille: Number | None = None
 

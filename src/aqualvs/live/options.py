@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field
 
-from aqualvs.control.gains_file import load_settings
 from aqualvs.control.vehicle import SetpointHolder, VehicleState
 from aqualvs.errors import OptionError
 from aqualvs.live.mavlink.ardusub import ArduSubOptions
@@ -23,8 +22,8 @@ from aqualvs.live.mavlink.link import LinkOptions
 from aqualvs.live.mavlink.peers import load_key
 from aqualvs.live.outputs.base import HearsVehicle, Output
 from aqualvs.optics.rig import Rig
-from aqualvs.optics.rigschema import Positive, StrictPart
 from aqualvs.recording import RecorderSwitch
+from aqualvs.schema import Positive, StrictPart, load_settings
 
 if TYPE_CHECKING:
     from aqualvs.scanner import ScannerOptions

@@ -27,7 +27,7 @@ from array import array
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -39,6 +39,7 @@ from aqualvs.optics.sheet import sheets_of
 from aqualvs.scanning.posture import Posture
 from aqualvs.scanning.scan import Label, Scan
 from aqualvs.scanning.surfaces import TargetKind
+from aqualvs.schema import Number, Positive, SchemaWords, StrictPart, validated
 from aqualvs.yamlfile import read_yaml
 
 if TYPE_CHECKING:
@@ -94,8 +95,6 @@ def net_request(
 
 
 _KINDS = ", ".join(kind.value for kind in TargetKind)
-_LENGTHS = ("rd_theta_mm", "dd_mm", "r_min_mm", "r_max_mm")
-_NET_KEYS = ("mesh", "bar_mm", "twine_mm")
 # Crossings with a line on a bar's length, on the mean of all directions (Crofton).
 _CROSSINGS = {
     "diamond": 4.0 / math.pi,
@@ -135,6 +134,31 @@ class NetFacts:
         return lengths
 
 
+class _NetPart(StrictPart):
+    bar_mm: Positive
+    mesh: Literal["diamond", "square", "hexagon"] = "diamond"
+    twine_mm: Positive | None = None
+
+
+class _FilterPart(StrictPart):
+    rd_theta_mm: Number | None = None
+    dd_mm: Number | None = None
+    r_min_mm: Number | None = None
+    r_max_mm: Number | None = None
+
+
+class _TargetFile(StrictPart):
+    kind: Literal["auto", "net", "solid"] = "auto"
+    net: _NetPart | None = None
+    mesh_filter: _FilterPart | None = None
+
+
+_WORDS = SchemaWords(
+    file="a net.yaml",
+    examples={"net": "net: {mesh: diamond, bar_mm: 25}", "mesh_filter": "mesh_filter: {dd_mm: 1}"},
+)
+
+
 @dataclass(frozen=True, slots=True)
 class TargetFacts:
     """Prior information on the target."""
@@ -167,59 +191,22 @@ def target_dict(text: str) -> TargetFacts:
     content = read_yaml(path, "a net.yaml", OptionError)
     if not isinstance(content, dict):
         raise OptionError(f"{path}: holds no keys; write for example 'kind: net'")
-    _refuse_unknown(path, "", content, ("kind", "mesh_filter", "net"))
-    kind = content.get("kind", TargetKind.AUTO.value)
-    if kind not in set(TargetKind):
-        raise OptionError(f"{path}: kind is {kind!r}; use one of {_KINDS}")
-    net = _net(path, content["net"]) if "net" in content else None
-    facts = TargetFacts(
-        TargetKind(kind), _filter_lengths(path, content.get("mesh_filter") or {}, net), net
-    )
+    file = validated(_TargetFile, content, path, OptionError, _WORDS)
+    net, given = file.net, file.mesh_filter
+    said = None
+    if net is not None:
+        twine = None if net.twine_mm is None else 1e-3 * net.twine_mm
+        said = NetFacts(net.mesh, 1e-3 * net.bar_mm, twine)
+    lengths = {} if said is None else said.filter_lengths()
+    if given is not None:
+        own = given.model_dump(exclude_none=True)
+        lengths |= {name.removesuffix("_mm"): 1e-3 * value for name, value in own.items()}
+    facts = TargetFacts(TargetKind(file.kind), lengths, said)
     try:
         _ = facts.mesh_filter
     except OptionError as fault:
         raise OptionError(f"{path}: {fault}") from fault
     return facts
-
-
-def _net(path: Path, content: Any) -> NetFacts:
-    if not isinstance(content, dict) or "bar_mm" not in content:
-        raise OptionError(f"{path}: net holds no bar_mm; give it, or leave net out")
-    _refuse_unknown(path, "net.", content, _NET_KEYS)
-    mesh = content.get("mesh", "diamond")
-    if mesh not in _CROSSINGS:
-        raise OptionError(f"{path}: net.mesh is {mesh!r}; use one of {', '.join(_CROSSINGS)}")
-    twine = _metres(path, "net.twine_mm", content["twine_mm"]) if "twine_mm" in content else None
-    return NetFacts(mesh, _metres(path, "net.bar_mm", content["bar_mm"]), twine)
-
-
-def _metres(path: Path, place: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise OptionError(f"{path}: {place} is {value!r}; give millimetres")
-    if not (math.isfinite(value) and value > 0.0):
-        raise OptionError(f"{path}: {place} is {value:g}; it must be positive")
-    return 1e-3 * float(value)
-
-
-def _filter_lengths(path: Path, content: Any, net: NetFacts | None) -> dict[str, float]:
-    if not isinstance(content, dict):
-        raise OptionError(f"{path}: mesh_filter holds no keys; give {', '.join(_LENGTHS)}")
-    _refuse_unknown(path, "mesh_filter.", content, _LENGTHS)
-    lengths = {} if net is None else net.filter_lengths()
-    for name, value in content.items():
-        number = isinstance(value, int | float) and not isinstance(value, bool)
-        if not number or not math.isfinite(value):
-            raise OptionError(f"{path}: mesh_filter.{name} is {value!r}; give millimetres")
-        lengths[name.removesuffix("_mm")] = 1e-3 * value
-    return lengths
-
-
-def _refuse_unknown(
-    path: Path, place: str, content: dict[Any, Any], known: tuple[str, ...]
-) -> None:
-    for name in content:
-        if name not in known:
-            raise OptionError(f"{path}: unknown key {place}{name}; known are {', '.join(known)}")
 
 
 class _CheckOptions(NamedTuple):

@@ -4,41 +4,38 @@
 the rig as a whole (the lens inside the dome, say) are checked in `aqualvs.optics.rigfile`.
 """
 
-import difflib
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
-from pydantic_core import ErrorDetails
+from pydantic import ConfigDict, Field
 
 from aqualvs.errors import RigError
 from aqualvs.optics.water import N_AIR
+from aqualvs.schema import (
+    Index,
+    NotNegative,
+    Number,
+    Positive,
+    SchemaWords,
+    StrictPart,
+    Triple,
+    shown,
+    validated,
+)
 
 VERSION = 1
 """Version of the format that this package reads and writes."""
 
-Number = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
-NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 FocalLength = Annotated[float, Field(gt=0.0, le=1e7, allow_inf_nan=False)]
 """In pixels; a lens of 10 m before pixels of 1 micrometre has the greatest."""
-Index = Annotated[float, Field(ge=1.0, le=2.0, allow_inf_nan=False)]
 Pixels = Annotated[int, Field(gt=0)]
 Tilt = Annotated[float, Field(ge=-45.0, le=45.0, allow_inf_nan=False)]
-Triple = Annotated[list[Number], Field(min_length=3, max_length=3)]
 Pair = Annotated[list[Positive], Field(min_length=2, max_length=2)]
 Name = Annotated[str, Field(min_length=1)]
 LASER_NM = (380.0, 780.0)
 """Least and greatest wavelength of a laser that a silicon camera sees well, in nanometres."""
 LASER_NM_REMEDY = "write the wavelength in nanometres, 380 to 780, for example 532"
 LaserWavelength = Annotated[float, Field(ge=LASER_NM[0], le=LASER_NM[1], allow_inf_nan=False)]
-
-
-class StrictPart(BaseModel):
-    """A mapping of known keys; anything else is refused."""
-
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
 
 def _said(text: str) -> Any:
@@ -110,14 +107,14 @@ class CameraPart(StrictPart):
     distortion: Annotated[
         list[Number],
         _said("opencv: none, or k1 k2 p1 p2 [k3 [k4 k5 k6]]; fisheye: none, or k1 k2 k3 k4."),
-    ] = []
+    ] = Field(default=[])
     position_mm: Annotated[
         Triple | None,
         _said("Projection centre of the lens in the frame `dome`; needed behind a dome."),
     ] = None
     rotation_deg: Annotated[
         Triple, _said("Rotation vector in `dome`, applied after the nominal mounting.")
-    ] = [0.0, 0.0, 0.0]
+    ] = Field(default=[0.0, 0.0, 0.0])
     shutter: Annotated[ShutterPart, _said("When rows are exposed; all at once if left out.")] = (
         ShutterPart()
     )
@@ -141,7 +138,7 @@ class FlatPart(StrictPart):
         list[Tilt],
         Field(min_length=2, max_length=2),
         _said("Of its normal from the optical axis, about the camera's x and y axes."),
-    ] = [0.0, 0.0]
+    ] = Field(default=[0.0, 0.0])
 
 
 class WaterPart(StrictPart):
@@ -237,11 +234,15 @@ class RigFile(StrictPart):
     water: Annotated[
         WaterPart | None, _said("What is outside; needed behind a housing, else air.")
     ] = None
-    lasers: Annotated[list[LaserPart], _said("One to measure points, two for a posture.")] = []
+    lasers: Annotated[list[LaserPart], _said("One to measure points, two for a posture.")] = Field(
+        default=[]
+    )
     working_range_mm: Annotated[
         Pair, _said("Nearest and farthest target at which stripes are believed.")
-    ] = [250.0, 1300.0]
-    solved_from: Annotated[dict[str, Any], _said("What calibrations note down; kept.")] = {}
+    ] = Field(default=[250.0, 1300.0])
+    solved_from: Annotated[dict[str, Any], _said("What calibrations note down; kept.")] = Field(
+        default={}
+    )
 
 
 def rig_json_schema() -> dict[str, Any]:
@@ -263,14 +264,11 @@ def parse_rig(content: object, source_name: str) -> RigFile:
     """
     if not isinstance(content, Mapping):
         raise RigError(
-            f"{source_name}: is {_shown(content)}, not a rig; a rig file is a list of keys that "
+            f"{source_name}: is {shown(content)}, not a rig; a rig file is a list of keys that "
             f"begins with 'aqualvs_rig: {VERSION}' (docs/rig.md)"
         )
     _check_version(content, source_name)
-    try:
-        return RigFile.model_validate(dict(content))
-    except ValidationError as error:
-        raise RigError(f"{source_name}: {_WORDS.first_fault(error, RigFile)}") from None
+    return validated(RigFile, dict(content), source_name, RigError, _WORDS)
 
 
 def _check_version(content: Mapping[Any, Any], source_name: str) -> None:
@@ -282,96 +280,9 @@ def _check_version(content: Mapping[Any, Any], source_name: str) -> None:
     version = content["aqualvs_rig"]
     if type(version) is not int or version != VERSION:
         raise RigError(
-            f"{source_name}: aqualvs_rig is {_shown(version)}, but this aqualvs reads version "
+            f"{source_name}: aqualvs_rig is {shown(version)}, but this aqualvs reads version "
             f"{VERSION}; write the file again with this aqualvs, or install one that reads it"
         )
-
-
-_TYPES = {
-    "float_type": "a plain number",
-    "int_type": "a whole number",
-    "bool_type": "true or false",
-    "string_type": "a word",
-    "list_type": "a list",
-    "model_type": "keys and values",
-    "model_attributes_type": "keys and values",
-    "dict_type": "keys and values",
-}
-_LIMITS = {
-    "finite_number": "write a finite number",
-    "greater_than": "it must be greater than {gt:g}",
-    "greater_than_equal": "it must be at least {ge:g}",
-    "less_than_equal": "it must be at most {le:g}",
-    "too_short": "write {min_length} values",
-    "too_long": "write {max_length} values",
-    "string_too_short": "give it a name",
-}
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SchemaWords:
-    """Messages on the faults of one kind of file."""
-
-    file: str  # Kind of the file, such as "a rig file".
-    parts: Mapping[str, type[BaseModel]]  # Schemas below the top, by their key.
-    examples: Mapping[str, str]  # A line that is right, by its key.
-    first_line: str  # The example for any other key.
-    a_list: str = "a list"  # What to write where a list is missing.
-
-    def first_fault(self, error: ValidationError, model: type[BaseModel]) -> str:
-        """Return one line on the fault to mend first; a misspelt key explains the missing one."""
-        faults = error.errors(include_url=False)
-        unknown = [fault for fault in faults if fault["type"] == "extra_forbidden"]
-        return self._sentence((unknown or faults)[0], model)
-
-    def _sentence(self, fault: ErrorDetails, model: type[BaseModel]) -> str:
-        place, kind = _place(fault["loc"]), fault["type"]
-        if kind == "extra_forbidden":
-            return f"{place} is not a key of {self.file}; {self._closest(fault['loc'], model)}"
-        if kind == "missing":
-            return self.missing(place, fault["loc"])
-        shown = f"{place} is {_shown(fault['input'])}"
-        if kind == "literal_error":
-            return f"{shown}; write {fault['ctx']['expected']}"
-        return f"{shown}; {self._remedy(fault)}"
-
-    def missing(self, place: str, loc: tuple[int | str, ...]) -> str:
-        """Return the sentence on a key that must be there."""
-        return f"{place} is missing; add it, for example '{self._example(loc)}'"
-
-    def _remedy(self, fault: ErrorDetails) -> str:
-        kind, place = fault["type"], fault["loc"]
-        if place[0] == "lasers" and place[-1] == "wavelength_nm":
-            return LASER_NM_REMEDY
-        if kind in _LIMITS:
-            return _LIMITS[kind].format(**fault.get("ctx", {}))
-        if kind in _TYPES:
-            wanted = self.a_list if kind == "list_type" else _TYPES[kind]
-            return f"write {wanted}, for example '{self._example(place)}'"
-        return fault["msg"]
-
-    def _example(self, place: tuple[int | str, ...]) -> str:
-        known = [self.examples[str(step)] for step in place if step in self.examples]
-        return known[-1] if known else self.first_line
-
-    def _closest(self, place: tuple[int | str, ...], model: type[BaseModel]) -> str:
-        for step in place[:-1]:
-            model = self.parts.get(str(step), model)
-        known = list(model.model_fields)
-        close = difflib.get_close_matches(str(place[-1]), known, n=1, cutoff=0.5)
-        return f"did you mean '{close[0]}'?" if close else f"allowed here: {', '.join(known)}"
-
-
-def _place(loc: tuple[int | str, ...]) -> str:
-    text = ""
-    for part in loc:
-        text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else str(part)
-    return text
-
-
-def _shown(value: object) -> str:
-    text = "empty" if value is None else repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."
 
 
 _EXAMPLES: dict[str, str] = {
@@ -414,24 +325,12 @@ _EXAMPLES: dict[str, str] = {
     "solved_from": "solved_from: {views: 14}",
 }
 
-_PARTS: dict[str, type[BaseModel]] = {
-    "image": ImagePart,
-    "camera": CameraPart,
-    "shutter": ShutterPart,
-    "dome": DomePart,
-    "flat": FlatPart,
-    "water": WaterPart,
-    "lasers": LaserPart,
-    "window": WindowPart,
-}
-
-
 _WORDS = SchemaWords(
     file="a rig file",
-    parts=_PARTS,
     examples=_EXAMPLES,
     first_line="aqualvs_rig: 1",
     a_list="a list in square brackets",
+    remedies={("lasers", "wavelength_nm"): LASER_NM_REMEDY},
 )
 
 

@@ -5,7 +5,6 @@ at random such that the camera meets them. A scenario file is short YAML with th
 (`read_scenario`).
 """
 
-import difflib
 import functools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -14,12 +13,13 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import ConfigDict, Field
 from scipy.interpolate import PchipInterpolator
 
 from aqualvs.errors import OptionError
 from aqualvs.geometry.linear_algebra import Vec
 from aqualvs.geometry.transforms import SE3
+from aqualvs.schema import NotNegative, Number, Positive, StrictPart, validated
 from aqualvs.simulation.scene import (
     Box,
     Bubble,
@@ -238,32 +238,29 @@ class Scenario:
         )
 
 
-Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
-NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Triple: TypeAlias = tuple[Finite, Finite, Finite]
+Triple: TypeAlias = tuple[Number, Number, Number]
 
 
-class _Strict(BaseModel):
-    """Base of the schemas: refuses unknown keys."""
+class _Part(StrictPart):
+    """Base of the schemas: a list may stand for a tuple."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(strict=False)
 
 
-class CourseFile(_Strict):
+class CourseFile(_Part):
     """Schema of one quantity over the dive; see `Course`."""
 
-    values: Annotated[list[Finite], Field(min_length=1)]
+    values: Annotated[list[Number], Field(min_length=1)]
     mode: Literal["smooth", "steps"] = "smooth"
     sway: NotNegative = 0.0
     period_s: Positive = 4.0
 
 
-Motion: TypeAlias = Finite | list[Finite] | CourseFile
+Motion: TypeAlias = Number | list[Number] | CourseFile
 
 
-class MotionFile(_Strict):
+class MotionFile(_Part):
     """Schema of the posture over the dive: numbers, lists of numbers, or `CourseFile`."""
 
     range_mm: Motion = 600.0
@@ -273,34 +270,34 @@ class MotionFile(_Strict):
     slide_z_mm: Motion = 0.0
 
 
-class FoldFile(_Strict):
+class FoldFile(_Part):
     """Schema of a fold across the net, or a row of them; see `scene.Fold`."""
 
-    direction_deg: Finite = 0.0
-    place_mm: Finite = 0.0
-    height_mm: Finite = -30.0
+    direction_deg: Number = 0.0
+    place_mm: Number = 0.0
+    height_mm: Number = -30.0
     width_mm: Positive = 50.0
     every_mm: NotNegative = 0.0
 
 
-class NetFile(_Strict):
+class NetFile(_Part):
     """Schema of a net in the target plane; see `scene.Net`."""
 
     mesh: Mesh = "diamond"
     bar_mm: Positive = 25.0
     twine_mm: Positive = 2.0
-    roll_deg: Finite = 0.0
+    roll_deg: Number = 0.0
     hanging_ratio: Annotated[float, Field(ge=0.2, le=0.98)] = 0.7071
     fouling: Fraction = 0.0
     growth: NotNegative = 1.0
     missing: Fraction = 0.0
-    holes_mm: list[Triple] = []
-    curvature_per_m: tuple[Finite, Finite] = (0.0, 0.0)
-    folds: list[FoldFile] = []
+    holes_mm: list[Triple] = Field(default=[])
+    curvature_per_m: tuple[Number, Number] = (0.0, 0.0)
+    folds: list[FoldFile] = Field(default=[])
     half_size_mm: tuple[Positive, Positive] | None = None
 
 
-class WallFile(_Strict):
+class WallFile(_Part):
     """Schema of a wall; `behind_mm` 0 puts it in the target plane; see `scene.Wall`."""
 
     behind_mm: NotNegative = 0.0
@@ -310,15 +307,15 @@ class WallFile(_Strict):
     tile_mm: NotNegative = 0.0
 
 
-class BoxFile(_Strict):
+class BoxFile(_Part):
     """Schema of a box, its position from the target plane's middle; see `scene.Box`."""
 
     centre_mm: Triple
     size_mm: tuple[Positive, Positive, Positive] = (300.0, 200.0, 300.0)
-    heading_deg: Finite = 0.0
+    heading_deg: Number = 0.0
 
 
-class WaterFile(_Strict):
+class WaterFile(_Part):
     """Schema of the water; see `scene.WaterOptics`."""
 
     attenuation_per_m: tuple[NotNegative, NotNegative, NotNegative] = WaterOptics().attenuation
@@ -332,7 +329,7 @@ class WaterFile(_Strict):
     snow: Annotated[int, Field(ge=0, le=20_000)] = 0
 
 
-class SensorFile(_Strict):
+class SensorFile(_Part):
     """Schema of the sensor; see `scene.Sensor`."""
 
     gain: Positive = 1.0
@@ -342,7 +339,7 @@ class SensorFile(_Strict):
     defocus_px: NotNegative = CameraSensor().defocus_px
 
 
-class ScenarioFile(_Strict):
+class ScenarioFile(_Part):
     """Schema of the whole file; the target is `net`, a wall in the target plane, or none."""
 
     duration_s: Positive = 4.0
@@ -350,8 +347,8 @@ class ScenarioFile(_Strict):
     seed: Annotated[int, Field(ge=0)] = 0
     motion: MotionFile = MotionFile()
     net: NetFile | None = None
-    walls: list[WallFile] = []
-    boxes: list[BoxFile] = []
+    walls: list[WallFile] = Field(default=[])
+    boxes: list[BoxFile] = Field(default=[])
     fish: Annotated[int, Field(ge=0, le=50)] = 0
     bubbles: Annotated[int, Field(ge=0, le=500)] = 0
     water: WaterFile = WaterFile()
@@ -406,41 +403,8 @@ def parse_scenario(content: Any, name: str, source: str) -> Scenario:
 
     Raises `OptionError` if a key is unknown or a value makes no sense.
     """
-    try:
-        return ScenarioFile.model_validate({} if content is None else content).scenario(name)
-    except ValidationError as error:
-        raise OptionError(f"scenario {source}: {_first_fault(error)}") from None
-
-
-def _first_fault(error: ValidationError) -> str:
-    fault = error.errors(include_url=False)[0]
-    names = [str(part) for part in fault["loc"]]
-    where = ".".join(names) or "the file"
-    if fault["type"] != "extra_forbidden":
-        return f"{where} is {fault['input']!r}: {fault['msg'].lower()}"
-    known = _known_keys(names[:-1])
-    near = difflib.get_close_matches(names[-1], known, n=1)
-    hint = f"did you mean {near[0]}?" if near else f"known keys: {', '.join(known)}"
-    return f"unknown key {where}; {hint}"
-
-
-_MODELS: dict[str, type[_Strict]] = {
-    "motion": MotionFile,
-    "net": NetFile,
-    "walls": WallFile,
-    "boxes": BoxFile,
-    "water": WaterFile,
-    "sensor": SensorFile,
-}
-
-
-def _known_keys(parents: list[str]) -> list[str]:
-    model: type[_Strict] = _MODELS.get(parents[0], ScenarioFile) if parents else ScenarioFile
-    if "CourseFile" in parents:
-        model = CourseFile
-    if "folds" in parents:
-        model = FoldFile
-    return list(model.model_fields)
+    content = {} if content is None else content
+    return validated(ScenarioFile, content, f"scenario {source}", OptionError).scenario(name)
 
 
 def _course(motion: Motion, unit: float) -> Course:

@@ -9,11 +9,11 @@ markers at known places their sizes, corner order, planes and units.
 import difflib
 import re
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, TypeVar
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 import yaml
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import Field
 
 from aqualvs.calibration.targets.targets import (
     DICTIONARIES,
@@ -27,7 +27,16 @@ from aqualvs.calibration_formats import refuse_foreign
 from aqualvs.errors import CalibrationError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.planes import Plane
-from aqualvs.optics.rigschema import NotNegative, Number, Positive, SchemaWords, StrictPart, Triple
+from aqualvs.schema import (
+    Index,
+    NotNegative,
+    Number,
+    Positive,
+    SchemaWords,
+    StrictPart,
+    Triple,
+    validated,
+)
 from aqualvs.yamlfile import TidyDumper, parse_yaml, read_text, write_text
 
 # Keys of free text, often written without quotes but with colons, which YAML would reject.
@@ -95,7 +104,7 @@ class MarkerPart(StrictPart):
 class MediumPart(StrictPart):
     """Schema of `medium`, in which the pictures were taken."""
 
-    n_outside_nominal: Annotated[float, Field(ge=1.0, le=2.0, allow_inf_nan=False)]
+    n_outside_nominal: Index
 
 
 class MarkersFile(StrictPart):
@@ -110,13 +119,6 @@ class MarkersFile(StrictPart):
     note: Any = None
 
 
-_File = TypeVar("_File", BoardFile, MarkersFile)
-
-_PARTS: dict[str, type[BaseModel]] = {
-    "planes": PlanePart,
-    "markers": MarkerPart,
-    "medium": MediumPart,
-}
 _EXAMPLES = {
     "kind": "kind: charuco",
     "squares_x": "squares_x: 11",
@@ -140,18 +142,7 @@ _EXAMPLES = {
     "medium": "medium: {n_outside_nominal: 1.333}",
     "n_outside_nominal": "n_outside_nominal: 1.333",
 }
-_WORDS = SchemaWords(file="this file", parts=_PARTS, examples=_EXAMPLES, first_line="note: text")
-
-
-def parse_target(content: dict[Any, Any], model: type[_File], source: str) -> _File:
-    """Check the content of a target file, key by key.
-
-    Raises `CalibrationError` with one line on the first fault: file, place, value, remedy.
-    """
-    try:
-        return model.model_validate(content)
-    except ValidationError as error:
-        raise CalibrationError(f"{source}: {_WORDS.first_fault(error, model)}") from None
+_WORDS = SchemaWords(examples=_EXAMPLES, first_line="note: text")
 
 
 class _Tolerances(NamedTuple):
@@ -312,7 +303,8 @@ def load_board(path: str | Path) -> Board:
     Raises `CalibrationError` with one line that names the file, the value and the remedy.
     """
     source = Path(path)
-    file = parse_target(read_mapping(source, "a board.yaml"), BoardFile, str(source))
+    content = read_mapping(source, "a board.yaml")
+    file = validated(BoardFile, content, source, CalibrationError, _WORDS)
     kind = _board_kind(file, source)
     if not _TOLERANCES.square_mm[0] <= file.square_mm <= _TOLERANCES.square_mm[1]:
         raise CalibrationError(f"{source}: {_unlikely_square(file.square_mm)}")
@@ -399,7 +391,8 @@ def load_box(path: str | Path) -> tuple[MarkerSet, float | None]:
         Stated index of the medium of the pictures.
     """
     source = Path(path)
-    file = parse_target(read_mapping(source, "a box.yaml"), MarkersFile, str(source))
+    content = read_mapping(source, "a box.yaml")
+    file = validated(MarkersFile, content, source, CalibrationError, _WORDS)
     if not file.planes:
         raise CalibrationError(
             f"{source}: planes is missing; a box has planes, each with 'normal' and 'd'"
@@ -420,7 +413,8 @@ def load_target(path: str | Path) -> MarkerSet:
     Raises `CalibrationError` with one line that names the file, the value and the remedy.
     """
     source = Path(path)
-    file = parse_target(read_mapping(source, "a target.yaml"), MarkersFile, str(source))
+    content = read_mapping(source, "a target.yaml")
+    file = validated(MarkersFile, content, source, CalibrationError, _WORDS)
     if (file.frame or "").startswith("plate"):
         raise CalibrationError(
             f"{source}: frame is plate, so its corners are not in the dome's frame; measure the "

@@ -1,0 +1,183 @@
+"""Files that people write, checked key by key, with one-line messages on their faults.
+
+A file's keys, types and limits are a `StrictPart`; `validated` checks the content against it, and
+`load_settings` also the version that such a file begins with.
+"""
+
+import difflib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, TypeVar, get_args
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic_core import ErrorDetails
+
+from aqualvs.errors import AqualvsError, OptionError
+from aqualvs.yamlfile import read_yaml
+
+Number = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+Index = Annotated[float, Field(ge=1.0, le=2.0, allow_inf_nan=False)]
+Triple = Annotated[list[Number], Field(min_length=3, max_length=3)]
+
+
+class StrictPart(BaseModel):
+    """A mapping of known keys; anything else is refused."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
+
+
+AnyPart = TypeVar("AnyPart", bound=StrictPart)
+
+
+_TYPES = {
+    "float_type": "a plain number",
+    "int_type": "a whole number",
+    "bool_type": "true or false",
+    "string_type": "a word",
+    "list_type": "a list",
+    "model_type": "keys and values",
+    "model_attributes_type": "keys and values",
+    "dict_type": "keys and values",
+}
+_LIMITS = {
+    "finite_number": "write a finite number",
+    "greater_than": "it must be greater than {gt:g}",
+    "greater_than_equal": "it must be at least {ge:g}",
+    "less_than": "it must be less than {lt:g}",
+    "less_than_equal": "it must be at most {le:g}",
+    "too_short": "write {min_length} values",
+    "too_long": "write {max_length} values",
+    "string_too_short": "give it a name",
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SchemaWords:
+    """Messages on the faults of one kind of file."""
+
+    file: str = "this file"  # Kind of the file, such as "a rig file".
+    # A line that is right, by its key; and the example for any other key.
+    examples: Mapping[str, str] = field(default_factory=dict)
+    first_line: str = ""
+    a_list: str = "a list"  # What to write where a list is missing.
+    # What to say of values that are wrong, by the first and the last key of their place.
+    remedies: Mapping[tuple[str, str], str] = field(default_factory=dict)
+
+    def first_fault(self, error: ValidationError, model: type[BaseModel]) -> str:
+        """Return one line on the fault to mend first; a misspelt key explains the missing one."""
+        faults = error.errors(include_url=False)
+        unknown = [fault for fault in faults if fault["type"] == "extra_forbidden"]
+        return self._sentence((unknown or faults)[0], model)
+
+    def _sentence(self, fault: ErrorDetails, model: type[BaseModel]) -> str:
+        place, kind = _place(fault["loc"]) or "the file", fault["type"]
+        if kind == "extra_forbidden":
+            return f"{place} is not a key of {self.file}; {_closest(fault['loc'], model)}"
+        if kind == "missing":
+            return self.missing(place, fault["loc"])
+        remedy = self._remedy(fault)
+        if kind == "literal_error":
+            remedy = f"write {fault['ctx']['expected']}"
+        return f"{place} is {shown(fault['input'])}; {remedy}"
+
+    def missing(self, place: str, loc: tuple[int | str, ...]) -> str:
+        """Return the sentence on a key that must be there."""
+        return f"{place} is missing; add it{self._example(loc)}"
+
+    def _remedy(self, fault: ErrorDetails) -> str:
+        kind, place = fault["type"], fault["loc"]
+        ends = str(place[0]) if place else "", str(place[-1]) if place else ""
+        if ends in self.remedies:
+            return self.remedies[ends]
+        if kind in _LIMITS:
+            return _LIMITS[kind].format(**fault.get("ctx", {}))
+        if kind in _TYPES:
+            wanted = self.a_list if kind == "list_type" else _TYPES[kind]
+            return f"write {wanted}{self._example(place)}"
+        return fault["msg"]
+
+    def _example(self, place: tuple[int | str, ...]) -> str:
+        known = [self.examples[str(step)] for step in place if step in self.examples]
+        example = known[-1] if known else self.first_line
+        return f", for example '{example}'" if example else ""
+
+
+def _closest(place: tuple[int | str, ...], model: type[BaseModel]) -> str:
+    for step in place[:-1]:
+        here = model.model_fields.get(str(step))
+        model = next(_parts_in(here.annotation), model) if here else model
+    known = list(model.model_fields)
+    close = difflib.get_close_matches(str(place[-1]), known, n=1, cutoff=0.5)
+    return f"did you mean '{close[0]}'?" if close else f"allowed here: {', '.join(known)}"
+
+
+def _parts_in(annotation: object) -> Iterator[type[BaseModel]]:
+    """Yield the schemas that a field's type holds, such as X of `list[X] | None`."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    for part in get_args(annotation):
+        yield from _parts_in(part)
+
+
+def _place(loc: tuple[int | str, ...]) -> str:
+    text = ""
+    for part in loc:
+        text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else str(part)
+    return text
+
+
+def shown(value: object) -> str:
+    """Return a value in one line, cut where it is long."""
+    text = "empty" if value is None else repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def validated(
+    kind: type[AnyPart],
+    content: object,
+    source: object,
+    error: type[AqualvsError],
+    words: SchemaWords | None = None,
+) -> AnyPart:
+    """Return the content of a file as its schema.
+
+    `source`: how messages call the file. Raises `error` with one line: source, place, value,
+    remedy.
+    """
+    try:
+        return kind.model_validate(content)
+    except ValidationError as fault:
+        told = (words or SchemaWords()).first_fault(fault, kind)
+        raise error(f"{source}: {told}") from None
+
+
+def load_settings(path: Path, kind: type[AnyPart], key: str, version: int) -> AnyPart:
+    """Return the content of a file, checked key by key.
+
+    `kind`: what the file may hold. `key`: first key of such a file, whose value is the version of
+    its format. `version`: version that is read. Raises `OptionError`: one line: file, place, value,
+    remedy.
+    """
+    content = read_yaml(path, f"a file that begins with '{key}: {version}'", OptionError)
+    return parse_settings(content, kind, key, version, str(path))
+
+
+def parse_settings(
+    content: object, kind: type[AnyPart], key: str, version: int, name: str
+) -> AnyPart:
+    """Return settings checked key by key; `name` is how messages call their source.
+
+    Raises `OptionError` with one line: source, place, value, remedy.
+    """
+    if not isinstance(content, Mapping) or key not in content:
+        raise OptionError(f"{name}: {key} is missing; such a file begins with '{key}: {version}'")
+    found = content[key]
+    if type(found) is not int or found != version:
+        raise OptionError(
+            f"{name}: {key} is {found!r}, but this aqualvs reads version {version}; write the file "
+            "anew, or install an aqualvs that reads it"
+        )
+    return validated(kind, dict(content), name, OptionError)
