@@ -6,7 +6,7 @@ Drawn without a display; Matplotlib is loaded only when a map is drawn.
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,22 +18,6 @@ if TYPE_CHECKING:
     from matplotlib.cm import ScalarMappable
     from matplotlib.figure import Figure
 
-
-class _MapLayout(NamedTuple):
-    """Layout of the map, in inches and shares."""
-
-    # The wall is cut into rows until a row is at least this high for its width, or up to this
-    # number.
-    min_ratio: float = 0.13
-    max_rows: int = 8
-    margin: float = 0.09
-    min_scale: float = 0.1
-    scale_step: float = 0.05
-    # Bearings that are written above a row.
-    bearings: int = 7
-
-
-_LAYOUT = _MapLayout()
 
 # Looks alike in all kinds of colour vision, from dark blue (clean) to yellow.
 _COLOURS = "cividis"
@@ -112,6 +96,7 @@ def _figure(wall: UnrolledNet) -> "Figure":
 
 def _extent(wall: UnrolledNet) -> tuple[FloatArray, FloatArray]:
     """Return the corners of the drawing, holes included, with a margin."""
+    margin_share = 0.09
     holes = [
         middle + 0.5 * np.array(_drawn_size(wall, hole.extent)) * sign
         for hole, middle in zip(wall.holes, wall.holes_xy, strict=True)
@@ -119,7 +104,7 @@ def _extent(wall: UnrolledNet) -> tuple[FloatArray, FloatArray]:
     ]
     corners = np.concatenate([*wall.outlines, *wall.path, np.reshape(holes, (-1, 2))])
     low, high = corners.min(axis=0), corners.max(axis=0)
-    margin = _LAYOUT.margin * (high - low)
+    margin = margin_share * (high - low)
     if not wall.by_bearing:
         margin[:] = margin.min()
     return low - margin, high + margin
@@ -127,16 +112,22 @@ def _extent(wall: UnrolledNet) -> tuple[FloatArray, FloatArray]:
 
 def _rows(size: FloatArray) -> int:
     """Return the number of rows that a wall is cut into, so that no row is a thin line."""
-    return min(max(math.ceil(_LAYOUT.min_ratio * float(size[0] / size[1])), 1), _LAYOUT.max_rows)
+    # The wall is cut into rows until a row is at least this high for its width, or up to this
+    # number.
+    min_ratio = 0.13
+    max_rows = 8
+    return min(max(math.ceil(min_ratio * float(size[0] / size[1])), 1), max_rows)
 
 
 def _shades(wall: UnrolledNet) -> "ScalarMappable":
+    min_scale = 0.1
+    scale_step = 0.05
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
 
     known = [value for value in map(fouling_of, wall.stretches) if value is not None]
-    most = max([*known, _LAYOUT.min_scale])
-    top = _LAYOUT.scale_step * math.ceil(most / _LAYOUT.scale_step - 1e-9)
+    most = max([*known, min_scale])
+    top = scale_step * math.ceil(most / scale_step - 1e-9)
     return ScalarMappable(Normalize(0.0, top), _COLOURS)
 
 
@@ -224,6 +215,7 @@ def _to_the_edge(band: FloatArray, middle: FloatArray, sign: float) -> float:
 
 def _mark_bearings(axes: "Axes", wall: UnrolledNet, *, name: bool) -> None:
     """Put the net's bearing above the axes, where it grows or falls all along."""
+    bearings = 7  # Bearings that are written above a row.
     places = [one for one in wall.places.middle if one.bearing is not None]
     if wall.by_bearing or len(places) < 2 or _single_bearing(wall) is not None:
         return
@@ -233,9 +225,7 @@ def _mark_bearings(axes: "Axes", wall: UnrolledNet, *, name: bool) -> None:
     inside = np.flatnonzero((along >= low) & (along <= high))
     if np.any(np.diff(along) <= 0.0) or not len(inside):
         return
-    chosen = inside[
-        np.unique(np.linspace(0, len(inside) - 1, _LAYOUT.bearings).round().astype(int))
-    ]
+    chosen = inside[np.unique(np.linspace(0, len(inside) - 1, bearings).round().astype(int))]
     top = axes.secondary_xaxis("top")
     top.set_xticks(along[chosen], [f"{bearing[i]:.0f}°" for i in chosen])
     if name:

@@ -27,7 +27,7 @@ from array import array
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -209,23 +209,6 @@ def target_dict(text: str) -> TargetFacts:
     return facts
 
 
-class _CheckOptions(NamedTuple):
-    """Check of the net's stated bar against the stripes."""
-
-    # A frame now and then is enough, and costs the run nothing.
-    every: int = 5
-    enough_frames: int = 5
-    # Largest gap in the light of one strand, in metres; least number of points of a strand, of
-    # strands of a stripe, and of stripes of a frame.
-    gap: float = 3e-3
-    min_points: int = 3
-    min_strands: int = 4
-    min_lasers: int = 2
-
-
-_CHECK = _CheckOptions()
-
-
 @dataclass(slots=True)
 class NetCheck:
     """Comparison of the distances between strands with those of the described net."""
@@ -238,14 +221,16 @@ class NetCheck:
 
     def add(self, scan: Scan) -> None:
         """Evaluate a frame, if it is sampled (by its number in the dive) and shows a net."""
-        if scan.index % _CHECK.every == 0:
+        every = 5  # A frame now and then is enough, and costs the run nothing.
+        if scan.index % every == 0:
             bar = bar_of(scan, self.planes, self.said)
             if bar is not None:
                 self.bars.append(bar)
 
     def bar(self) -> float | None:
         """Return the estimated bar over the dive, in metres; None where too little was seen."""
-        return float(np.median(self.bars)) if len(self.bars) >= _CHECK.enough_frames else None
+        enough_frames = 5
+        return float(np.median(self.bars)) if len(self.bars) >= enough_frames else None
 
     def sentence(self) -> str:
         """Return the contradiction to the file in one line, "" if there is none."""
@@ -290,6 +275,7 @@ def bar_of(scan: Scan, planes: Sequence[Plane], said: NetFacts) -> float | None:
     `scan`: its points labelled net are used. `planes`: of the lasers, in `dome`. `said`: its shape
     of mesh is taken as given.
     """
+    min_lasers = 2
     posture = scan.posture
     if not isinstance(posture, Posture):
         return None
@@ -302,7 +288,7 @@ def bar_of(scan: Scan, planes: Sequence[Plane], said: NetFacts) -> float | None:
         distance = strand_distance(scan.points.points_in_dome[mine] @ along)
         if distance is not None:
             densities.append(1.0 / distance)
-    if len(densities) < _CHECK.min_lasers:
+    if len(densities) < min_lasers:
         return None
     # Strands that meet at a knot count once and dim ones are missed: found on random simulated
     # nets.
@@ -315,13 +301,18 @@ def strand_distance(along: FloatArray) -> float | None:
 
     `along`, shape (N,): places of points on the net along the stripe, in metres, in any order.
     """
-    if len(along) < _CHECK.min_strands * _CHECK.min_points:
+    # Largest gap in the light of one strand, in metres; least number of points of a strand, of
+    # strands of a stripe, and of stripes of a frame.
+    gap = 3e-3
+    min_points = 3
+    min_strands = 4
+    if len(along) < min_strands * min_points:
         return None
     along = np.sort(along)
-    gaps = np.flatnonzero(np.diff(along) > _CHECK.gap)
+    gaps = np.flatnonzero(np.diff(along) > gap)
     first, last = np.append(0, gaps + 1), np.append(gaps, len(along) - 1)
-    strand = last - first + 1 >= _CHECK.min_points
-    if np.count_nonzero(strand) < _CHECK.min_strands:
+    strand = last - first + 1 >= min_points
+    if np.count_nonzero(strand) < min_strands:
         return None
     apart = np.diff(0.5 * (along[first] + along[last])[strand])
     # Gaps wider than this many usual distances are holes, or objects before the net.

@@ -21,17 +21,6 @@ from aqualvs.report.calibration_material import MarkKind, Overlay, PictureShot, 
 from aqualvs.report.html import Raw
 from aqualvs.scanning.scan import ImagePlane
 
-
-class _FigureLimits(NamedTuple):
-    """Size of a page: bytes of its pictures, and marks on them."""
-
-    all_bytes: int = 340_000
-    max_bytes: int = 130_000
-    all_marks: int = 6000
-
-
-_LIMITS = _FigureLimits()
-
 _UNDER = "#10181c"
 # Size of a mark and widths of its line and of the dark edge under it, for a picture 640 wide.
 _SHAPES: dict[MarkKind, tuple[float, float, float]] = {
@@ -51,10 +40,13 @@ def picture_view(shots: Sequence[PictureShot]) -> Raw:
 
 
 def _figure(shot: PictureShot, index: int, count: int) -> str:
-    jpeg, width, height = _embedded(shot.image, min(_LIMITS.max_bytes, _LIMITS.all_bytes // count))
+    all_bytes = 340_000
+    max_bytes = 130_000
+    all_marks = 6000
+    jpeg, width, height = _embedded(shot.image, min(max_bytes, all_bytes // count))
     scale = width / shot.image.shape[1]
     body = [f'<image href="data:image/jpeg;base64,{jpeg}" width="{width}" height="{height}"/>']
-    limit = _LIMITS.all_marks // count // max(len(shot.points), 1)
+    limit = all_marks // count // max(len(shot.points), 1)
     for layer, overlay in enumerate(shot.points):
         name = f"marks-{index}-{layer}"
         body.append(_marks(overlay, name, scale, width / 640.0, limit))

@@ -6,7 +6,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
-from typing import NamedTuple
 
 import av
 import cv2
@@ -28,17 +27,6 @@ from aqualvs.text import bgr
 N_PICTURES = 6
 N_SAMPLES = 24
 
-
-class _CropLayout(NamedTuple):
-    """Crops of frames, in pixels."""
-
-    # Pictures of holes: least side and size on the page in pixels, and hole diameters across.
-    px: int = 160
-    shown_px: int = 320
-    diameters: float = 2.5
-
-
-_CROP = _CropLayout()
 
 # What a file raises that is no video, has no picture, or breaks off.
 _BROKEN = (av.error.FFmpegError, OSError, IndexError, StopIteration)
@@ -129,15 +117,19 @@ def make_crop(image: ImagePlane, middle: tuple[float, float], diameter: float) -
     `image`, shape (height, width, 3): BGR. `middle`: column and row. `diameter`: of the ring, in
     pixels.
     """
+    # Pictures of holes: least side and size on the page in pixels, and hole diameters across.
+    px = 160
+    shown_px = 320
+    diameters = 2.5
     height, width = map(int, image.shape[:2])
-    side = min(round(max(_CROP.diameters * diameter, _CROP.px)), width, height)
+    side = min(round(max(diameters * diameter, px)), width, height)
     left, top = (
         min(max(round(at - 0.5 * side), 0), most - side)
         for at, most in zip(middle, (width, height), strict=True)
     )
     crop = image[top : top + side, left : left + side]
-    scale = _CROP.shown_px / side
-    shown = cv2.resize(crop, (_CROP.shown_px, _CROP.shown_px), interpolation=cv2.INTER_AREA)
+    scale = shown_px / side
+    shown = cv2.resize(crop, (shown_px, shown_px), interpolation=cv2.INTER_AREA)
     centre = (round(scale * (middle[0] - left)), round(scale * (middle[1] - top)))
     radius = round(0.5 * scale * diameter)
     cv2.circle(shown, centre, radius, _HOLE_COLOUR, 2, cv2.LINE_AA)

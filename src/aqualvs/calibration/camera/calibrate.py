@@ -9,7 +9,6 @@ corners or uncertain intrinsics.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -147,29 +146,6 @@ def pixel_grid(size_px: tuple[int, int]) -> FloatArray:
         np.linspace(0.0, size_px[1] - 1.0, rows + 1),
     )
     return np.stack([u.ravel(), v.ravel()], axis=-1)
-
-
-class _ValidationOptions(NamedTuple):
-    """Cross-validation over the views."""
-
-    # One view out of this number is held out; least number of views and of corners in one for that.
-    folds: int = 4
-    min_views: int = 8
-    min_points: int = 12
-
-
-_VALIDATION = _ValidationOptions()
-
-
-class _FindingLimits(NamedTuple):
-    """Limits from which on a finding is reported."""
-
-    many_outliers: float = 0.05
-    weak_pixel_px: float = 1.0
-    thin_coverage: float = 0.6
-
-
-_LIMITS = _FindingLimits()
 
 
 @dataclass(frozen=True, slots=True)
@@ -317,12 +293,14 @@ def _result(
 
 
 def _cross_validation(bundle: Bundle, solution: Solution[BundleState]) -> float:
+    # One view out of this number is held out; least number of views and of corners in one for that.
+    folds = 4
+    min_views = 8
+    min_points = 12
     n = len(bundle.views)
     believed = [bundle.views[i].view.where(solution.inliers[i]) for i in range(n)]
-    held_out = [
-        i for i in range(1, n, _VALIDATION.folds) if len(believed[i]) >= _VALIDATION.min_points
-    ]
-    if n < _VALIDATION.min_views or not held_out:
+    held_out = [i for i in range(1, n, folds) if len(believed[i]) >= min_points]
+    if n < min_views or not held_out:
         return float("nan")
     rest = [i for i in range(n) if i not in held_out]
     try:
@@ -336,6 +314,7 @@ def _cross_validation(bundle: Bundle, solution: Solution[BundleState]) -> float:
 
 
 def _findings(result: CameraCalibration) -> list[str]:
+    many_outliers = 0.05
     sigmas, lens = result.uncertainty.sigmas, result.lens
     n = len(lens.distortion)
     lines = [
@@ -352,7 +331,7 @@ def _findings(result: CameraCalibration) -> list[str]:
     lines += [f"left out, {name}: {why}" for name, why in result.left_out.items()]
     for fit in result.views:
         wrong = int(np.count_nonzero(~fit.inliers))
-        if wrong > _LIMITS.many_outliers * len(fit.view):
+        if wrong > many_outliers * len(fit.view):
             lines.append(f"{fit.label}: {wrong} of its {len(fit.view)} corners do not fit")
     return lines + _weak_places(result)
 
@@ -388,9 +367,11 @@ def _shared_errors(result: CameraCalibration) -> list[str]:
 
 
 def _weak_places(result: CameraCalibration) -> list[str]:
+    weak_pixel_px = 1.0
+    thin_coverage = 0.6
     lines = []
     covered = float(np.mean(result.coverage > 0))
-    if covered < _LIMITS.thin_coverage:
+    if covered < thin_coverage:
         lines.append(
             f"corners were seen in {100.0 * covered:.0f} % of the picture; show the board in all "
             "parts of it"
@@ -400,7 +381,7 @@ def _weak_places(result: CameraCalibration) -> list[str]:
     if not np.isfinite(sigma).all():
         lines.append("the distortion model does not reach all corners of the picture")
     worst = int(np.argmax(np.nan_to_num(sigma)))
-    if np.nan_to_num(sigma)[worst] > _LIMITS.weak_pixel_px:
+    if np.nan_to_num(sigma)[worst] > weak_pixel_px:
         u, v = grid[worst]
         lines.append(
             f"at pixel ({u:.0f}, {v:.0f}) the intrinsics are uncertain by {sigma[worst]:.1f} px; "

@@ -74,20 +74,6 @@ _WORDS = {
 }
 
 
-class _FindingLimits(NamedTuple):
-    """Limits from which on a finding is reported."""
-
-    # Ratios of sigma to the prior's sigma: from the first on nothing was learnt, below the second
-    # something.
-    nothing: float = 0.9
-    something: float = 0.5
-    correlated: float = 0.95
-    far_from_prior: float = 3.5
-
-
-_LIMITS = _FindingLimits()
-
-
 def findings(
     problem: DomeProblem, solution: Solution[BundleState], result: DomeCalibration
 ) -> list[str]:
@@ -149,9 +135,13 @@ def _rotation(problem: DomeProblem, result: DomeCalibration) -> str:
 
 
 def _dome(names: Sequence[str], result: DomeCalibration, seen: Observability) -> list[str]:
+    # Ratios of sigma to the prior's sigma: from the first on nothing was learnt, below the second
+    # something.
+    learnt_nothing = 0.9
+    learnt_something = 0.5
     lines = []
-    nothing = seen.undetermined(names, _LIMITS.nothing)
-    some = [n for n in seen.undetermined(names, _LIMITS.something) if n not in nothing]
+    nothing = seen.undetermined(names, learnt_nothing)
+    some = [n for n in seen.undetermined(names, learnt_something) if n not in nothing]
     rest = [n for n in names if n in seen.shrinkage and n not in nothing and n not in some]
     for group, what in (
         (nothing, "not determined by the pictures, taken as given"),
@@ -204,11 +194,12 @@ def _unobservable(seen: Observability) -> list[str]:
 
 def _entangled(result: DomeCalibration) -> list[str]:
     """Name the pair of numbers with the strongest correlation, if the data hardly separate them."""
+    correlated = 0.95
     uncertainty = result.uncertainty
     sigma = np.sqrt(np.diag(uncertainty.covariance))
     with np.errstate(divide="ignore", invalid="ignore"):
         correlation = uncertainty.covariance / np.outer(sigma, sigma)
-    worst, pair, place = _LIMITS.correlated, None, place_names(result.rig)
+    worst, pair, place = correlated, None, place_names(result.rig)
     for i, name in enumerate(uncertainty.names):
         for j, other in enumerate(uncertainty.names):
             if name in place and other not in place and abs(correlation[i, j]) > worst:
@@ -232,6 +223,7 @@ def _media(problem: DomeProblem, result: DomeCalibration) -> list[str]:
 
 def _against_priors(problem: DomeProblem, solution: Solution[BundleState]) -> list[str]:
     """Name the numbers that moved further than their priors allow."""
+    far_from_prior = 3.5
     bundle = problem.bundle
     names = [name for name in bundle.free if name in bundle.priors.names]
     moved = rig_difference(bundle.start.rig, solution.state.rig, names)
@@ -241,7 +233,7 @@ def _against_priors(problem: DomeProblem, solution: Solution[BundleState]) -> li
         f"{_WORDS.get(name, name)}: moved by {abs(value):.1f} sigma of what was known of it; check "
         "that figure"
         for name, value in off.items()
-        if abs(value) > _LIMITS.far_from_prior
+        if abs(value) > far_from_prior
     ]
 
 

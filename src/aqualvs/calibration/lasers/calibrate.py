@@ -6,7 +6,6 @@ in one solve, and a covariance that includes the camera's.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -39,18 +38,6 @@ from aqualvs.calibration.lasers.views import LaserView, PlacedView, place_views,
 from aqualvs.errors import CalibrationError, OptionError
 from aqualvs.geometry.arrays import IntArray
 from aqualvs.optics.rig import Laser, Rig, RigUncertainty
-
-
-class _FitLimits(NamedTuple):
-    """Residuals that indicate a fault."""
-
-    # Larger residuals of corners, in pixels, indicate a wrong rig, medium or target.
-    bad_corners_px: float = 0.5
-    # The same of stripes; paint and speckle leave a tenth to a third of a pixel.
-    bad_stripes_px: float = 0.7
-
-
-_LIMITS = _FitLimits()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -222,11 +209,15 @@ def _result_rig(
 def _warnings(
     solved: SolvedLasers, lasers: Sequence[LaserFigures], views: Sequence[ViewFigures]
 ) -> list[str]:
+    # Larger residuals of corners, in pixels, indicate a wrong rig, medium or target.
+    bad_corners_px = 0.5
+    # The same of stripes; paint and speckle leave a tenth to a third of a pixel.
+    bad_stripes_px = 0.7
     words = [
         f"{view.name}: corners miss by {view.rms_corners_px:.2f} px (rms); check the rig, the "
         "medium and the target's file"
         for view in views
-        if view.rms_corners_px > _LIMITS.bad_corners_px
+        if view.rms_corners_px > bad_corners_px
     ]
     # A metre away this is 7 mm: too much to call a laser calibrated.
     uncertain_normal = np.deg2rad(0.4)
@@ -240,7 +231,7 @@ def _warnings(
         f"stripes of laser '{figures.laser.name}' miss by {figures.rms_px:.2f} px (rms); check "
         "the planes in the target's file, or whether the laser's window is in the rig"
         for figures in lasers
-        if figures.rms_px > _LIMITS.bad_stripes_px
+        if figures.rms_px > bad_stripes_px
     ]
     if solved.problem.board_pose_prior is not None:
         words.append(loose_text(solved))
