@@ -5,8 +5,6 @@ import signal
 import sys
 from types import FrameType
 
-_EXIT_INTERRUPTED = 130
-
 
 def main() -> int:
     """Run the command line of this process; return the exit code of `aqualvs.cli.main.main`."""
@@ -23,8 +21,9 @@ def main() -> int:
 
 def _leave(_number: int, _frame: FrameType | None) -> None:
     """End without a traceback while modules are being imported."""
+    exit_interrupted = 130
     os.write(2, b"aqualvs: error: interrupted\n")
-    os._exit(_EXIT_INTERRUPTED)
+    os._exit(exit_interrupted)
 
 
 def _open_standard_files() -> None:

@@ -103,11 +103,6 @@ def given(context: typer.Context, names: Sequence[str]) -> frozenset[str]:
     )
 
 
-_MAX_INTEGER = 2**31 - 1
-# Characters; sentences in `--help` are wrapped, not cut.
-_MAX_SUMMARY = 200
-
-
 class CheckedCommand(TyperCommand):
     """A command that refuses values that no option and no argument can take.
 
@@ -135,10 +130,11 @@ class CommandGroups(TyperGroup):
 
     def format_commands(self, _ctx: Any, formatter: Any) -> None:
         """Write a section for every group, and one for commands without a group."""
+        max_summary = 200  # Characters; sentences in `--help` are wrapped, not cut.
         groups: dict[str, list[tuple[str, str]]] = {}
         for name, command in self.commands.items():
             if not command.hidden:
-                summary = command.get_short_help_str(limit=_MAX_SUMMARY)
+                summary = command.get_short_help_str(limit=max_summary)
                 group = getattr(command, "rich_help_panel", None)
                 groups.setdefault(group if isinstance(group, str) else "Commands", []).append(
                     (name, summary)
@@ -167,10 +163,11 @@ def _name(parameter: Any) -> str:
 
 
 def _check(value: Any, name: str) -> None:
+    max_integer = 2**31 - 1
     if isinstance(value, float) and not math.isfinite(value):
         raise OptionError(f"{name} {value:g}: give a finite number")
-    if isinstance(value, int) and abs(value) > _MAX_INTEGER:
-        raise OptionError(f"{name} {value}: too large; give a number up to {_MAX_INTEGER}")
+    if isinstance(value, int) and abs(value) > max_integer:
+        raise OptionError(f"{name} {value}: too large; give a number up to {max_integer}")
     if isinstance(value, str | Path) and not _is_text(str(value)):
         raise OptionError(f"{name} {str(value)!r}: not UTF-8; rename it")
     if isinstance(value, Path):

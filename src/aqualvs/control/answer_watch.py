@@ -41,15 +41,10 @@ _TRUSTED_S, _N_SPEED, _SLOW = 0.6, 3, 0.03
 # half a second are left to what happens before a picture arrives, and on the wire.
 _BRAKE_S, _NEUTRAL_S = 0.12, 0.4
 _TICK_S = 1e-3
-# Water that passes at this speed and grows faster by so much, in m/s, takes efforts that promise a
-# way: the more the greater the drag.
-_WATER, _WATER_CHANGE = 0.4, 0.024
 # Greatest change between two reports of a heading; a greater one is a reset compass.
 _MAX_TURN = math.radians(20.0)
 # An approach is predicted over the first time by a line through the second, in seconds.
 _STOP_S, _LINE_S, _N_LINE = 0.32, 0.6, 6
-# The prediction's usual error follows so many postures, and is known after so many.
-_N_FOLLOWED, _N_PREDICTED = 250, 100
 # An approach has stopped where less than this share of it is seen, and two means over three
 # postures differ by less than so many metres.
 _SEEN_SHARE, _N_STOPPED, _STOPPED = 0.35, 3, 0.004
@@ -137,10 +132,13 @@ class AnswerWatch:
     """
 
     def __init__(self, vehicle: VehicleFacts, limits: AnswerLimits | None = None) -> None:
+        # Water that passes at this speed and grows faster by so much, in m/s, takes efforts that
+        # promise a way: the more the greater the drag.
+        water, water_change = 0.4, 0.024
         self.limits = limits or AnswerLimits()
         self._vehicle = vehicle
         # Acceleration that a growing current takes.
-        self._change = vehicle.forward_drag.slope(_WATER) * _WATER_CHANGE / vehicle.mass
+        self._change = vehicle.forward_drag.slope(water) * water_change / vehicle.mass
         self._noise = _Noise(self.limits.quiet)
         self.reset()
 
@@ -284,6 +282,8 @@ class AnswerWatch:
 
     def _has_stopped(self) -> bool:
         """Return whether an even approach has ended at once, and no effort has ended it."""
+        # The prediction's usual error follows so many postures, and is known after so many.
+        n_followed, n_predicted = 250, 100
         begin_s = self._now_s - _STOP_S
         if self._moments[0].time_s > begin_s - _LINE_S:
             return False
@@ -304,7 +304,7 @@ class AnswerWatch:
         predicted = min(predicted, (at.speed - slope) * took_s)
         short = predicted - seen
         limits, usual = self.limits, math.sqrt(self._usual)
-        known = self._n_predicted >= _N_PREDICTED
+        known = self._n_predicted >= n_predicted
         stopped = abs(median((a.range, b.range, c.range)) - now) < _STOPPED
         if (
             (known and stopped and abs(seen) < _SEEN_SHARE * predicted)
@@ -317,7 +317,7 @@ class AnswerWatch:
             return True
         self._n_predicted += 1
         square = min(error**2, 9.0 * self._usual) if known else error**2
-        self._usual += (square - self._usual) / min(self._n_predicted, _N_FOLLOWED)
+        self._usual += (square - self._usual) / min(self._n_predicted, n_followed)
         return False
 
     def _is_unanswered(self) -> bool:

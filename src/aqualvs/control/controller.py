@@ -176,15 +176,13 @@ class Pid:
         return allowed
 
     def _near_last(self, wanted: float, step: float) -> float:
+        first_step_s = 0.04
         # The first update has no time step; its output may change as much as in a short one.
-        most = self.options.output_rate * (step or _FIRST_STEP_S)
+        most = self.options.output_rate * (step or first_step_s)
         return min(max(wanted, self._output - most), self._output + most)
 
     def _limited(self, output: float) -> float:
         return min(max(output, self.options.low), self.options.high)
-
-
-_FIRST_STEP_S = 0.04
 
 
 class SwellFilter:

@@ -134,8 +134,11 @@ class DeadBandCrossing:
     @property
     def turns(self) -> bool:
         """Whether thrust waits to change its side, or has just done so."""
-        waits = abs(self._owed) > _WAITING_SHARE * self._impulse
-        return waits or (self._stood_s < _STANDS_S and self._impulse > 0.0)
+        # Noise of postures owes less than this share of the impulse; and thrust must stay on one
+        # side for this time, in seconds, before it is more than a correction of the last one.
+        waiting_share, stands_s = 1.0 / 3.0, 2.0
+        waits = abs(self._owed) > waiting_share * self._impulse
+        return waits or (self._stood_s < stands_s and self._impulse > 0.0)
 
     def effort(self, share: float, step: float) -> float:
         """Return the effort for a share of the full thrust, `step` seconds after the last one."""
@@ -159,11 +162,6 @@ class DeadBandCrossing:
         return self._side * self._thrust.dead_band
 
 
-# Noise of postures owes less than this share of the impulse; and thrust must stay on one side for
-# this time, in seconds, before it is more than a correction of the last one.
-_WAITING_SHARE, _STANDS_S = 1.0 / 3.0, 2.0
-
-
 def _clipped(value: float, most: float) -> float:
     return min(max(value, -most), most)
 
@@ -185,8 +183,9 @@ class Drag:
 
     def coasting_speed(self, way: float, seconds: float, mass: float) -> float:
         """Return the speed from which a mass in kg coasts so many metres in a time."""
+        max_exponent = 50.0  # Keeps exponentials finite.
         share, rate = self.quadratic / mass, self.linear / mass
-        grown = math.expm1(min(share * way, _MAX_EXPONENT)) / share if share else way
+        grown = math.expm1(min(share * way, max_exponent)) / share if share else way
         slowed = -math.expm1(-rate * seconds) / rate if rate else seconds
         return grown / slowed
 
@@ -194,10 +193,6 @@ class Drag:
         """Return the speed that a force keeps, in m/s."""
         root = math.sqrt(self.linear**2 + 4.0 * self.quadratic * abs(force))
         return 0.0 if force == 0.0 else 2.0 * force / (self.linear + root)
-
-
-# Keeps exponentials finite.
-_MAX_EXPONENT = 50.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -333,16 +328,17 @@ def gain_schedule(gains: RangeGains, damping: float) -> tuple[float, float]:
 
     `damping`: slope of the drag over mass, in 1/s.
     """
+    # Drag damps like the speed's gain, but its assumed value may be twice the truth. The limit
+    # allows for that, and for pitch: with 3, thrust makes a BlueROV2 Heavy in 0.45 m/s pitch ever
+    # more.
+    damping_share, max_schedule = 0.8, 2.2
     relative = damping / gains.speed
     return (
-        min(1.0 + _DAMPING_SHARE * relative, _MAX_SCHEDULE),
+        min(1.0 + damping_share * relative, max_schedule),
         min(1.0 + _INTEGRAL_SHARE * relative, _MAX_INTEGRAL),
     )
 
 
-# Drag damps like the speed's gain, but its assumed value may be twice the truth. The limit allows
-# for that, and for pitch: with 3, thrust makes a BlueROV2 Heavy in 0.45 m/s pitch ever more.
-_DAMPING_SHARE, _MAX_SCHEDULE = 0.8, 2.2
 # Drag makes the loop stiff in position; without a greater gain, the integral takes 10 s to find the
 # force of a strong current.
 _INTEGRAL_SHARE, _MAX_INTEGRAL = 1.2, 6.0

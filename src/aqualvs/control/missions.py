@@ -306,8 +306,6 @@ def paced(setpoint: Setpoint, sway: float, lost: Stage | None, done: bool) -> Gu
 
 # Speed of descent by a depth's error, in m/s per m, and the tolerance of a depth.
 _DESCENT_GAIN, _DEPTH_REACHED = 0.8, 0.07
-# Seconds that a depth must be kept before the next leg, longer than a wave.
-_DEPTH_STEADY_S = 1.0
 
 
 class Turn(StrEnum):
@@ -421,6 +419,8 @@ class SurveyMission:
         return min(max(wanted, -self._options.descent), self._options.descent)
 
     def _depth_reached(self, state: VehicleState) -> bool:
+        # Seconds that a depth must be kept before the next leg, longer than a wave.
+        depth_steady_s = 1.0
         if state.depth is None or not math.isfinite(state.depth):
             return False
         left = abs(self.depth - state.depth)
@@ -429,4 +429,4 @@ class SurveyMission:
         self._changing_s += self._watch.spent_s
         near = left <= _DEPTH_REACHED
         self._steady_s = self._steady_s + self._watch.spent_s if near else 0.0
-        return self._steady_s >= _DEPTH_STEADY_S or self._changing_s >= self._allowed_s
+        return self._steady_s >= depth_steady_s or self._changing_s >= self._allowed_s

@@ -27,10 +27,6 @@ from aqualvs.schema import NotNegative, Number, Positive, StrictPart, load_setti
 VERSION = 1
 """Version of the format that is read."""
 _KEY = "aqualvs_plan"
-# Least distance of a setpoint from the least range, in metres: room to swing.
-_ROOM = 0.1
-# Greatest number of depths of a survey; more are a typing error.
-_MAX_DEPTHS = 1000
 
 Two = Annotated[list[Number], Field(min_length=2, max_length=2)]
 Speed = Annotated[float, Field(ge=-1.0, le=1.0, allow_inf_nan=False)]
@@ -153,10 +149,11 @@ def _check_together(content: PlanFile) -> None:
 
 
 def _check_setpoint(setpoint: Setpoint, limits: SafetyLimits) -> None:
-    if setpoint.range < limits.least_range + _ROOM:
+    room = 0.1  # Least distance of a setpoint from the least range, in metres: room to swing.
+    if setpoint.range < limits.least_range + room:
         raise OptionError(
             f"range_m is {setpoint.range:g}, but nothing approaches within safety.least_range_m, "
-            f"{limits.least_range:g}; choose at least {limits.least_range + _ROOM:.2f}"
+            f"{limits.least_range:g}; choose at least {limits.least_range + room:.2f}"
         )
     if not abs(setpoint.yaw) <= SetpointHolder.MAX_YAW:
         raise OptionError(
@@ -191,6 +188,7 @@ def _survey(part: SurveyPart, leg: LegOptions, sway: float) -> SurveyOptions:
 
 def _depths(part: SurveyPart) -> tuple[float, ...]:
     """Return the depths themselves, or those from the first to the last by a step."""
+    max_depths = 1000  # Greatest number of depths of a survey; more are a typing error.
     if part.step_m is None:
         return tuple(part.depths_m)
     if len(part.depths_m) != 2:
@@ -199,7 +197,7 @@ def _depths(part: SurveyPart) -> tuple[float, ...]:
         )
     first, last = part.depths_m
     n = math.floor(abs(last - first) / part.step_m + 1e-9) + 1
-    if n > _MAX_DEPTHS:
+    if n > max_depths:
         raise OptionError(f"survey.step_m {part.step_m:g} makes {n} legs; choose a greater one")
     step = math.copysign(part.step_m, last - first)
     depths = [first + i * step for i in range(n)]

@@ -205,10 +205,6 @@ class _Track:
         )
 
 
-# A range forecast over a longer time is too uncertain to tell an angle alone from a wild posture.
-_FRESH_S = 0.15
-
-
 class _Motion:
     """Motion model: forecast of a track, and its update by measurements."""
 
@@ -256,13 +252,16 @@ class _Motion:
         self, track: _Track, time_s: float, measured: FloatArray, cov: FloatArray
     ) -> _Track | None:
         """Return the track after a measurement, None if that lies beyond the gate."""
+        # A range forecast over a longer time is too uncertain to tell an angle alone from a wild
+        # posture.
+        fresh_s = 0.15
         ahead = self.forecast(track, time_s)
         innovation = measured - ahead.state[:3]
         of_innovation = ahead.cov[:3, :3] + cov
         used = np.ones(3, np.bool_)
         if innovation @ np.linalg.inv(of_innovation) @ innovation > self._gate:
             used = innovation**2 <= self._gate_alone * np.diag(of_innovation)
-            if not used[0] or used.all() or time_s - track.time_s > _FRESH_S:
+            if not used[0] or used.all() or time_s - track.time_s > fresh_s:
                 return None
         at = np.flatnonzero(used)
         gain = ahead.cov[:, at] @ np.linalg.inv(of_innovation[np.ix_(at, at)])

@@ -236,28 +236,13 @@ def _pade(delay: float) -> FloatArray:
 
 
 _POSITION_SHARE, _INTEGRAL_SHARE, _TURN_INTEGRAL_SHARE = 0.3, 0.25, 0.15
-_SWELL = 1.2
 # Integral of the missing closing speed before thrust changes its sign, in metres. With 15 mm, the
 # thrust of a BlueROV2 Heavy in calm water changes its sign more than 20 times a minute; with 21 mm,
 # the step of a BlueROV2 takes twice the time. The second bounds it for weak thrusters, as share of
 # their thrust times seconds: with 0.022 the step of a VideoRay-like vehicle takes twice the time.
 _CROSSING, _MAX_CROSSING = 0.018, 0.0175
-# Speed of a new setpoint, in m/s. Towards the target it is less for a vehicle that would coast
-# farther than so many metres in so many seconds, where the picture has stood still for that long
-# until it is noticed and thrust ends.
-_RAMP_SPEED, _COAST, _COAST_S, _UNSEEN_S = 0.15, 0.3, 5.0, 0.6
-# Error of the yaw that begins a turn, in degrees: twice the noise of a posture. With 0.6 the yaw
-# effort of a BlueROV2 in calm water changes its sign 22 to 46 times a minute, with 0.8 8 to 13
-# times. With 1.2 that of the Heavy does so still less, but its yaw is off by 0.25 degrees there.
-_QUIET_ERROR_DEG = 0.8
-# Factor by which the autopilot's lag behind a turning rate grows in the thrusters' dead band.
-_SLUGGISH = 4.0
-# Limits of the bisection of a gain, in 1/s.
-_LEAST, _GREATEST = 0.05, 20.0
 # Greatest delays and frame intervals in seconds, and greatest current in m/s.
 _MAX_S, _MAX_CURRENT = 60.0, 10.0
-# Packaged gains have 0.40 to 0.55; 1.5 times these gains 0.28 to 0.37, twice these 0.13 to 0.19.
-_MIN_USABLE_MODULUS = 0.25
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -370,6 +355,9 @@ def usable_gains(source: Path | str) -> ControlGains:
     `source`: as `load_gains` takes it. Raises `OptionError` as `load_gains`; or with the axis, and
     what is left of its margins.
     """
+    # Packaged gains have 0.40 to 0.55; 1.5 times these gains 0.28 to 0.37, twice these 0.13 to
+    # 0.19.
+    min_usable_modulus = 0.25
     gains = load_gains(source)
     usual = TuneOptions().delay
     loops = {
@@ -378,25 +366,30 @@ def usable_gains(source: Path | str) -> ControlGains:
     }
     for axis, loop in loops.items():
         found = margins(loop)
-        if not _enough(found, _MIN_USABLE_MODULUS):
+        if not _enough(found, min_usable_modulus):
             left = f"modulus {found.modulus:.2f}" if found.stable else "unstable"
             raise OptionError(
                 f"{source}: the {axis} loop would swing up ({left}, at least "
-                f"{_MIN_USABLE_MODULUS:g} is needed); make gains with aqualvs tune"
+                f"{min_usable_modulus:g} is needed); make gains with aqualvs tune"
             )
     return gains
 
 
 def _range_gains(speed: float, lag: float, facts: VehicleFacts) -> RangeGains:
+    # Speed of a new setpoint, in m/s. Towards the target it is less for a vehicle that would coast
+    # farther than so many metres in so many seconds, where the picture has stood still for that
+    # long until it is noticed and thrust ends.
+    ramp_speed, coast, coast_s, unseen_s = 0.15, 0.3, 5.0, 0.6
+    swell = 1.2
     crossing = _CROSSING * speed * facts.mass / facts.thrust.forward
     # While it sees nothing of its motion the loop pushes as from rest.
-    unseen = 1.0 + speed * _UNSEEN_S
-    coasting = facts.forward_drag.coasting_speed(_COAST, _COAST_S, facts.mass)
+    unseen = 1.0 + speed * unseen_s
+    coasting = facts.forward_drag.coasting_speed(coast, coast_s, facts.mass)
     return RangeGains(
-        ramp_speed=_RAMP_SPEED,
-        approach_speed=tidy(min(coasting / unseen, _RAMP_SPEED)),
+        ramp_speed=ramp_speed,
+        approach_speed=tidy(min(coasting / unseen, ramp_speed)),
         crossing_impulse=tidy(min(crossing, _MAX_CROSSING)),
-        swell=_SWELL,
+        swell=swell,
         lag=tidy(lag),
         position=tidy(_POSITION_SHARE * speed),
         speed=tidy(speed),
@@ -405,11 +398,16 @@ def _range_gains(speed: float, lag: float, facts: VehicleFacts) -> RangeGains:
 
 
 def _yaw_gains(proportional: float, lag: float) -> YawGains:
+    # Error of the yaw that begins a turn, in degrees: twice the noise of a posture. With 0.6 the
+    # yaw effort of a BlueROV2 in calm water changes its sign 22 to 46 times a minute, with 0.8 8 to
+    # 13 times. With 1.2 that of the Heavy does so still less, but its yaw is off by 0.25 degrees
+    # there.
+    quiet_error_deg = 0.8
     return YawGains(
         lag=tidy(lag),
         proportional=tidy(proportional),
         integral=tidy(_TURN_INTEGRAL_SHARE * proportional * proportional),
-        quiet_rate=math.radians(round(_QUIET_ERROR_DEG * proportional, 1)),
+        quiet_rate=math.radians(round(quiet_error_deg * proportional, 1)),
     )
 
 
@@ -462,8 +460,10 @@ def _yaw_loop(lag: float, gains: YawGains, delay: float) -> Loop:
 
 
 def _yaw_worst(turning: Turning, gains: YawGains, options: TuneOptions) -> Margins:
+    # Factor by which the autopilot's lag behind a turning rate grows in the thrusters' dead band.
+    sluggish = 4.0
     delay = options.greatest_delay + 0.5 * options.frame
-    lags = (turning.lag(slower) for slower in (1.0, _SLUGGISH))
+    lags = (turning.lag(slower) for slower in (1.0, sluggish))
     return worst(margins(_yaw_loop(lag, gains, delay)) for lag in lags)
 
 
@@ -473,11 +473,12 @@ def _enough(found: Margins, least: float) -> bool:
 
 def _greatest(name: str, enough: Callable[[float], bool]) -> float:
     """Return the greatest gain whose margins are enough, by bisection."""
-    if not enough(_LEAST):
+    least, greatest = 0.05, 20.0  # Limits of the bisection of a gain, in 1/s.
+    if not enough(least):
         raise OptionError(
             f"tune {name}: no gains leave the margins asked for; lower the delays, or the margins"
         )
-    low, high = _LEAST, _GREATEST
+    low, high = least, greatest
     while high > 1.005 * low:
         middle = math.sqrt(low * high)
         low, high = (middle, high) if enough(middle) else (low, middle)

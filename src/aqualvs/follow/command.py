@@ -44,11 +44,6 @@ from aqualvs.simulation.scenarios import example_rig
 from aqualvs.sources.base import Health, PartHealth, State
 from aqualvs.terminal import StopSignals
 
-# Lag behind the clock beyond which a run does not catch up.
-_LATE_S = 0.2
-# Number of frames over which the share of valid ones is taken.
-_N_SHARE = 50
-
 
 class LoopPage:
     """Page that shows a loop step by step, in real time at most.
@@ -58,19 +53,21 @@ class LoopPage:
     """
 
     def __init__(self, page: Output, rig: Rig, loop: SimulatedLoop, holder: SetpointHolder) -> None:
+        n_share = 50  # Number of frames over which the share of valid ones is taken.
         self._page, self._rig, self._loop, self._holder = page, rig, loop, holder
         self._began_s = time.monotonic()
-        self._valid: deque[bool] = deque(maxlen=_N_SHARE)
+        self._valid: deque[bool] = deque(maxlen=n_share)
 
     def keep_pace(self, now_s: float) -> None:
         """Take over the page's setpoint, and wait for the clock to reach a simulated time."""
+        late_s = 0.2  # Lag behind the clock beyond which a run does not catch up.
         mission = self._loop.steering.mission
         if isinstance(mission, HoldMission):
             mission.setpoint = self._holder.setpoint
         ahead_s = self._began_s + now_s - time.monotonic()
         if ahead_s > 0.0:
             time.sleep(ahead_s)
-        elif ahead_s < -_LATE_S:
+        elif ahead_s < -late_s:
             self._began_s -= ahead_s
 
     def take(
@@ -138,13 +135,6 @@ class LoopPage:
         )
 
 
-_TELL_EVERY_S = 10.0
-# A plan that is over continues to hold: time to show that it does.
-_HOLDS_ON_S = 5.0
-# Least length of a run: a report needs some rows.
-_MIN_S = 1.0
-
-
 class RunWatch:
     """Called before each frame; returns whether to go on.
 
@@ -167,7 +157,10 @@ class RunWatch:
 
     def __call__(self, now_s: float) -> bool:
         """Report changes; return False to end the run."""
-        if now_s - self._told_s >= _TELL_EVERY_S:
+        min_s = 1.0  # Least length of a run: a report needs some rows.
+        holds_on_s = 5.0  # A plan that is over continues to hold: time to show that it does.
+        tell_every_s = 10.0
+        if now_s - self._told_s >= tell_every_s:
             self._told_s = now_s
             self._tell(f"simulated {now_s:.0f} of {self._seconds:g} s")
         if not self._loop.steering.engaged:
@@ -176,8 +169,8 @@ class RunWatch:
         if self._over_s == math.inf and self._is_over():
             self._over_s = now_s
             self._tell(f"at {now_s:.1f} s: {LimitReason.MISSION_OVER.words}")
-        stopped = self._stop.caught is not None and now_s >= _MIN_S
-        return not stopped and now_s < self._over_s + _HOLDS_ON_S
+        stopped = self._stop.caught is not None and now_s >= min_s
+        return not stopped and now_s < self._over_s + holds_on_s
 
     def _is_over(self) -> bool:
         rows = self._loop.log.rows
@@ -205,6 +198,7 @@ class Aim:
         Raises `OptionError` if both are given, the plan cannot be used, or the range cannot be
         measured.
         """
+        default_range = 0.6
         holder = SetpointHolder(working_range)
         if self.plan is not None:
             if self.range is not None or self.yaw:
@@ -212,12 +206,9 @@ class Aim:
             plan = load_plan(self.plan)
             holder.put(plan.setpoint)
             return plan.mission(), plan.limits, plan.setpoint
-        setpoint = Setpoint(_DEFAULT_RANGE if self.range is None else self.range, self.yaw)
+        setpoint = Setpoint(default_range if self.range is None else self.range, self.yaw)
         holder.put(setpoint)
         return HoldMission(setpoint), SafetyLimits(), setpoint
-
-
-_DEFAULT_RANGE = 0.6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -263,22 +254,24 @@ class SimRequest:
 
         Raises `OptionError` naming the value.
         """
-        if not _FOLLOW_LEAST_S <= self.seconds <= _MAX_S:
+        # A day; frame rates of the slowest and the fastest cameras.
+        max_s, min_fps, max_fps = 86_400.0, 1.0, 1000.0
+        follow_least_s, min_radius = 1.0, 2.0
+        if not follow_least_s <= self.seconds <= max_s:
             raise OptionError(
-                f"--seconds {self.seconds:g}: choose at least {_FOLLOW_LEAST_S:g}, "
-                f"at most {_MAX_S:g}"
+                f"--seconds {self.seconds:g}: choose at least {follow_least_s:g}, at most {max_s:g}"
             )
-        if not _MIN_FPS <= self.fps <= _MAX_FPS:
-            raise OptionError(f"--fps {self.fps:g}: choose {_MIN_FPS:g} to {_MAX_FPS:g}")
+        if not min_fps <= self.fps <= max_fps:
+            raise OptionError(f"--fps {self.fps:g}: choose {min_fps:g} to {max_fps:g}")
         if self.camera is not None and not self.rendered:
             raise OptionError(f"--camera {self.camera}: takes rendered frames; add --rendered")
         if self.shutter is not None:
             if not self.rendered:
                 raise OptionError(f"--shutter {self.shutter}: of rendered frames; add --rendered")
             check_shutter(shutter_from_words(self.shutter, self.fps), self.fps)
-        if self.cage_radius and not self.cage_radius >= _MIN_RADIUS:
+        if self.cage_radius and not self.cage_radius >= min_radius:
             raise OptionError(
-                f"--cage-radius {self.cage_radius:g}: choose at least {_MIN_RADIUS:g} m, or 0 "
+                f"--cage-radius {self.cage_radius:g}: choose at least {min_radius:g} m, or 0 "
                 "for a flat net"
             )
         if not (0.0 <= self.current <= 2.0 and 0.0 <= self.net_sway <= 1.0):
@@ -288,11 +281,6 @@ class SimRequest:
             )
         if self.freeze is not None and not self.freeze >= 0.0:
             raise OptionError(f"--freeze {self.freeze:g}: choose 0 s or later")
-
-
-_FOLLOW_LEAST_S, _MIN_RADIUS = 1.0, 2.0
-# A day; frame rates of the slowest and the fastest cameras.
-_MAX_S, _MIN_FPS, _MAX_FPS = 86_400.0, 1.0, 1000.0
 
 
 def simulate_and_tell(request: SimRequest, echo: Callable[[str], object]) -> int:

@@ -137,8 +137,6 @@ SETTLED_SHARE = 0.1
 """A step has settled once the range stays within this share of it."""
 LOST_AFTER_S = 2.5
 """Without sight for longer, in seconds, a human has to take over."""
-# Greater increase of the swings from the middle to the end of a run counts as growth, in metres.
-_GROWS, _GROWS_BY = 2.0, 0.05
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -296,13 +294,16 @@ def _last_seen_s(log: LoopLog) -> float:
 
 def _is_stable(log: LoopLog) -> bool:
     """Return whether the last third swings no more than the second, both about their setpoints."""
+    # Greater increase of the swings from the middle to the end of a run counts as growth, in
+    # metres.
+    grows, grows_by = 2.0, 0.05
     off = log.column("range") - _filled(log.column("wanted_range"))
     off = off[log.column("time_s") <= _last_seen_s(log)]
     third = len(off) // 3
     if third == 0 or not np.isfinite(off[-1]):
         return third == 0
     middle, last = _rms(off[third : 2 * third]), _rms(off[2 * third :])
-    return last <= _GROWS * middle + _GROWS_BY
+    return last <= grows * middle + grows_by
 
 
 def _between(log: LoopLog, start_s: float, end_s: float) -> BoolArray:

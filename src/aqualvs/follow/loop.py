@@ -24,9 +24,6 @@ from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.simulation.net_motion import NetWall
 from aqualvs.simulation.vehicle.vehicle import SimulatedVehicle
 
-# A vehicle reports its attitude ten times a second.
-_TELLS_HZ = 10.0
-
 
 class SimulatedLink:
     """Link to a simulated vehicle, in its own time.
@@ -48,9 +45,10 @@ class SimulatedLink:
 
     def state(self) -> VehicleState:
         """Return the vehicle's reported state, by the vehicle's clock."""
+        tells_hz = 10.0  # A vehicle reports its attitude ten times a second.
         told = self.vehicle.telemetry()
         return VehicleState(
-            heard_s=math.floor(told.time_s * _TELLS_HZ) / _TELLS_HZ,
+            heard_s=math.floor(told.time_s * tells_hz) / tells_hz,
             armed=told.armed,
             mode=Mode.OURS if told.obeys else Mode.PILOT,
             mode_name="ALT_HOLD" if told.obeys else "MANUAL",

@@ -25,9 +25,6 @@ from aqualvs.simulation.net_motion import NetPosture, NetWall
 from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scene import Net, Scene
 
-# More pictures than are in transit from the exposure to the pilot.
-_N_KEPT = 8
-
 
 def net_scene() -> Scene:
     """Return a diamond net with a little growth, in clear water."""
@@ -65,6 +62,7 @@ class RenderedSensor:
         camera: SimulatedCamera = IDEAL,
         freeze_s: float = math.inf,
     ) -> None:
+        n_kept = 8  # More pictures than are in transit from the exposure to the pilot.
         self._net, self._rng = net, rng
         self._scene = net_scene() if scene is None else scene
         self._renderer = Renderer(rig, camera=camera)
@@ -75,7 +73,7 @@ class RenderedSensor:
         self._planes: dict[Field | None, Planes] = {}
         self._poses: deque[tuple[float, SE3]] = deque(maxlen=2)
         # The last pictures, and what was measured in them.
-        self.shots: deque[tuple[Frame, Scan]] = deque(maxlen=_N_KEPT)
+        self.shots: deque[tuple[Frame, Scan]] = deque(maxlen=n_kept)
 
     def look(self, world_from_dome: SE3, time_s: float) -> Posture | Refusal:
         """Return the result for the frame whose exposure ends now; None for a lost frame."""

@@ -31,21 +31,15 @@ from aqualvs.sources.base import Health, PartHealth, StageDelay, State
 # Side of a cell in pixels; every fourth row of cells is compared.
 _CELL, _EVERY = 8, 4
 _ONES = np.ones(_CELL, np.float32)
-# Laser stripes fill at least a hundredth of a picture.
-_QUANTILE = 0.99
 # Number of stored changes of a live picture, and the least number for their quantile: a vehicle in
 # swell has turned round by then, so that its slowest moments are known.
 _N_KEPT, _N_KNOWN = 250, 50
 _USUAL = 0.05
-# A stream that returns after this time counts as a new one, in seconds.
-_GAP_S = 2.0
 # Width to which a picture is reduced for its motion, and the side of a patch there, in pixels.
 _REDUCED_PX, _PATCH = 360, 16
 # Share of the patches that are compared: those with the strongest edges. The quantile of their
 # displacements leaves room for text that is drawn into the picture, whose edges never move.
 _STRONG, _PATCH_QUANTILE = 0.15, 0.8
-# Keeps patches without edges at rest, in squared grey levels per pixel.
-_FLAT = 1e-3
 # Number of motions before a stop that give their median.
 _N_BEFORE = 3
 _EPS_S = 1e-6
@@ -163,16 +157,18 @@ class FrozenPicture:
         self._since_s = self._moved_s = self._doubted_s = self._pace = self._moving_s = math.nan
 
     def _continues(self, time_s: float, shape: tuple[int, int]) -> bool:
+        gap_s = 2.0  # A stream that returns after this time counts as a new one, in seconds.
         last = self._kept[-1]
-        return last.time_s <= time_s <= last.time_s + _GAP_S and last.shape == shape
+        return last.time_s <= time_s <= last.time_s + gap_s and last.shape == shape
 
     def _compare(self, time_s: float, cells: FloatArray, reduced: NDArray[np.float32]) -> None:
         """Compare with the oldest picture kept, if it is old enough."""
+        quantile = 0.99  # Laser stripes fill at least a hundredth of a picture.
         self.change = self.motion = math.nan
         if not (self._kept and time_s - self._kept[0].time_s >= self._span_s) or not cells.size:
             return
         before = self._kept[0]
-        self.change = _upper(np.abs(cells - before.cells).ravel(), _QUANTILE)
+        self.change = _upper(np.abs(cells - before.cells).ravel(), quantile)
         if before.patches.at.size:
             displacements = np.abs(_displacements(before.patches, reduced))
             self.motion = _upper(displacements, _PATCH_QUANTILE)
@@ -275,10 +271,11 @@ def _strong_patches(reduced: NDArray[np.float32]) -> _Patches:
 
 def _displacements(before: _Patches, reduced: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return by how much patches have moved across their edges, in pixels; least squares."""
+    flat = 1e-3  # Keeps patches without edges at rest, in squared grey levels per pixel.
     changes = _patches_at(reduced, before.at) - before.pixels
     squares = np.einsum("ij,ij->i", before.edges, before.edges)
     moved = np.einsum("ij,ij->i", before.edges, changes)
-    return np.asarray(-moved / (squares + _FLAT * _PATCH**2))
+    return np.asarray(-moved / (squares + flat * _PATCH**2))
 
 
 def _cell_means(luma: ImagePlane) -> FloatArray:

@@ -20,7 +20,6 @@ from aqualvs.scanning.posture import Posture, Refusal
 from aqualvs.scanning.posture import Reason as NoPosture
 from aqualvs.sources.base import PartHealth, State
 
-_LOOK_S = 0.02
 _log = logging.getLogger(__name__)
 
 
@@ -69,8 +68,9 @@ class Watchdog:
         self._thread.join(1.0)
 
     def _run(self) -> None:
+        look_s = 0.02
         self._thrusting.wait()
-        while not self._closing.wait(_LOOK_S):
+        while not self._closing.wait(look_s):
             self._look()
             self._thrusting.wait()
 

@@ -197,10 +197,6 @@ _COMBED_SHARE = 1e-4
 # Of what moves from picture to picture, the share that is combed: about a half in fields, none in
 # whole pictures.
 _MOVING_SHARE, _STILL_WHOLE = 2e-3, 0.02
-# The second field of a picture and the first of the next are one step of time apart; the other two
-# of both pictures, three steps, which combs more by at least this factor. On the bundled dive, its
-# pictures woven in either order, it was 1.9 or more for each of 74 pairs, 3.3 in the middle.
-_LATER_COMBS = 1.5
 
 
 def combed_share(luma: ImagePlane) -> float:
@@ -265,8 +261,13 @@ class FieldEvidence:
     @property
     def first_by_motion(self) -> Field | None:
         """Field that comes first, as what moves shows it; None where too little does."""
+        # The second field of a picture and the first of the next are one step of time apart; the
+        # other two of both pictures, three steps, which combs more by at least this factor. On the
+        # bundled dive, its pictures woven in either order, it was 1.9 or more for each of 74 pairs,
+        # 3.3 in the middle.
+        later_combs = 1.5
         early, late = sorted([self.woven, self.woven_top])
-        if late < _MOVING_SHARE or late < _LATER_COMBS * early:
+        if late < _MOVING_SHARE or late < later_combs * early:
             return None
         return "top" if self.woven > self.woven_top else "bottom"
 

@@ -59,10 +59,6 @@ class Ordered(NamedTuple):
     is_restart: bool  # The first of another sender, or of a restarted one.
 
 
-# Later packets kept while one is missing.
-_MOST_KEPT = 32
-
-
 class RtpOrder:
     """Reordering buffer for the packets of one sender, which also detects losses.
 
@@ -121,9 +117,10 @@ class RtpOrder:
         return self._due(arrival)
 
     def _due(self, arrival: float) -> list[Ordered]:
+        most_kept = 32  # Later packets kept while one is missing.
         ready = self._run(after_loss=False)
         late = arrival - self._missing_since >= self._timeout
-        while self._kept and (late or len(self._kept) > _MOST_KEPT):
+        while self._kept and (late or len(self._kept) > most_kept):
             self._next = min(self._kept, key=self._distance)
             ready += self._run(after_loss=True)
             self._missing_since = arrival

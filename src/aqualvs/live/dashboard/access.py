@@ -128,10 +128,8 @@ class Controls:
             self.recorder.stop()
 
 
-_MIN_TOKEN = 8
 _HOST = re.compile(r"(?:\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9_.-]+)(?::([0-9]{1,5}))?", re.ASCII)
 _SCHEME = re.compile(r"[a-z][a-z0-9+.-]*://", re.ASCII)
-_MAX_PORT = 65535
 _LOCAL_NAMES = frozenset({"localhost", "127.0.0.1", "::1"})
 
 
@@ -186,8 +184,9 @@ def are_addresses(hosts: Sequence[str], origins: Sequence[str]) -> bool:
 
 def _is_host(text: str) -> bool:
     """Return whether a text is a name or an IP address, with or without a port (RFC 9110, 7.2)."""
+    max_port = 65535
     found = _HOST.fullmatch(text)
-    if found is None or int(found[1] or 0) > _MAX_PORT:
+    if found is None or int(found[1] or 0) > max_port:
         return False
     try:
         # Brackets without an IPv6 address raise here.
@@ -219,9 +218,10 @@ def make_access(host: str, token: str | None, embedders: Sequence[str] = ()) -> 
 
 def token_fault(token: str | None) -> str:
     """Return the fault of a token that a user chose; "" if there is none."""
-    if token is None or len(token) >= _MIN_TOKEN:
+    min_token = 8
+    if token is None or len(token) >= min_token:
         return ""
-    return f"--token: {len(token)} characters; choose at least {_MIN_TOKEN}, or leave it out"
+    return f"--token: {len(token)} characters; choose at least {min_token}, or leave it out"
 
 
 Peer = tuple[str, int]

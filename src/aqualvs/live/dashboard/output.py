@@ -23,15 +23,14 @@ from aqualvs.recording.sample import LiveSample
 from aqualvs.scanning.scan import Frame, ImagePlane
 from aqualvs.sources.base import PartHealth, State
 
-_MAX_WIDTH, _QUALITY = 960, 70
-
 
 def page_picture(frame: Frame) -> bytes:
     """Return the frame as a JPEG of at most 960 px width."""
+    max_width, quality = 960, 70
     height, width = frame.luma.shape
     # Rows of a field are two rows apart.
     height = height if frame.field is None else 2 * height
-    scale = min(1.0, _MAX_WIDTH / width)
+    scale = min(1.0, max_width / width)
     # Even numbers: the colour planes have half the size.
     size = (2 * round(scale * width / 2), 2 * round(scale * height / 2))
     luma = _resized(frame.luma, size)
@@ -42,7 +41,7 @@ def page_picture(frame: Frame) -> bytes:
         planes = [luma.ravel(), *(_resized(plane, half).ravel() for plane in frame.chroma)]
         stacked = np.concatenate(planes).reshape(size[1] * 3 // 2, size[0])
         image = np.asarray(cv2.cvtColor(stacked, cv2.COLOR_YUV2BGR_I420), np.uint8)
-    done, code = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+    done, code = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
     if not done:
         raise RuntimeError("the picture could not be encoded")
     return bytes(code)
@@ -52,10 +51,6 @@ def _resized(plane: ImagePlane, size: tuple[int, int]) -> ImagePlane:
     if (plane.shape[1], plane.shape[0]) == size:
         return np.ascontiguousarray(plane)
     return np.asarray(cv2.resize(plane, size, interpolation=cv2.INTER_AREA), np.uint8)
-
-
-# More than a pilot perceives; the remaining time of the machine is for the measurement.
-_STATE_EVERY_S, _PICTURE_EVERY_S = 0.04, 0.08
 
 
 class Dashboard:
@@ -79,12 +74,14 @@ class Dashboard:
 
     def send(self, sample: LiveSample) -> None:
         """Send a sample, and at intervals its picture behind the number of its frame."""
+        # More than a pilot perceives; the remaining time of the machine is for the measurement.
+        state_every_s, picture_every_s = 0.04, 0.08
         now_s = time.monotonic()
-        if not self._server.hub.n_viewers or now_s - self._state_s < 0.5 * _STATE_EVERY_S:
+        if not self._server.hub.n_viewers or now_s - self._state_s < 0.5 * state_every_s:
             return
         self._state_s = now_s
         picture = None
-        if sample.frame is not None and now_s - self._picture_s > _PICTURE_EVERY_S:
+        if sample.frame is not None and now_s - self._picture_s > picture_every_s:
             self._picture_s = now_s
             picture = sample.frame.index.to_bytes(4, "big") + page_picture(sample.frame)
         recording = self._controls.recorder.to_dict()
@@ -99,10 +96,6 @@ class Dashboard:
     def close(self) -> None:
         """End the server."""
         self._server.close()
-
-
-# Between looks at the size of the recording and at the disk.
-_DISK_EVERY_S = 1.0
 
 
 class SwitchButton:
@@ -124,8 +117,9 @@ class SwitchButton:
 
     def to_dict(self) -> Mapping[str, Any]:
         """Return whether a recording is on, its file or its fault, its time and the disk's room."""
+        disk_every_s = 1.0  # Between looks at the size of the recording and at the disk.
         now_s, path = time.monotonic(), self._switch.path
-        if path is self._path and now_s - self._asked_s < _DISK_EVERY_S:
+        if path is self._path and now_s - self._asked_s < disk_every_s:
             return self._found
         self._path, self._asked_s = path, now_s
         health = self._switch.health()
@@ -135,7 +129,7 @@ class SwitchButton:
             # A disk that has been taken away is the recorder's fault to tell.
             with contextlib.suppress(OSError):
                 free, seconds = shutil.disk_usage(path.parent).free, self._switch.seconds
-                rate = path.stat().st_size / seconds if seconds > _DISK_EVERY_S else 0.0
+                rate = path.stat().st_size / seconds if seconds > disk_every_s else 0.0
                 left_s = free / rate if rate else None
                 self._found |= {"seconds": seconds, "free_bytes": free, "left_s": left_s}
         return self._found

@@ -50,8 +50,6 @@ from aqualvs.scanning.scan import Label, ScanPoints
 from aqualvs.sources.base import Health, PartHealth
 from aqualvs.text import laser_colour
 
-_MAX_POINTS = 360
-
 
 def page_state(
     sample: LiveSample,
@@ -102,7 +100,8 @@ def rig_state(rig: Rig, *, may_command: bool, holds: bool) -> str:
 
 def _points(points: ScanPoints) -> dict[str, Any]:
     """Return every so-many-th point: in the picture, and in metres from above and from the side."""
-    step = max(1, math.ceil(len(points) / _MAX_POINTS))
+    max_points = 360
+    step = max(1, math.ceil(len(points) / max_points))
     some = slice(None, None, step)
     xyz = np.round(points.points_in_dome[some], 3)
     pixels = np.round(points.pixels[some], 1)
@@ -172,10 +171,6 @@ def _without_nan(value: Any) -> Any:
     return value
 
 
-# Pictures sent to a page and not yet shown: one being drawn, one in transit.
-_ON_THE_WAY = 2
-
-
 @dataclass(slots=True, eq=False)
 class PageClient:
     """One page."""
@@ -202,12 +197,14 @@ class PageClient:
 
     async def next(self) -> tuple[str | None, bytes | None]:
         """Wait for news; returns a state and, where the page keeps up, a picture."""
+        # Pictures sent to a page and not yet shown: one being drawn, one in transit.
+        on_the_way = 2
         while True:
             await self._news.wait()
             self._news.clear()
             state, self._state = self._state, None
             picture = None
-            if self._picture is not None and self.unshown < _ON_THE_WAY:
+            if self._picture is not None and self.unshown < on_the_way:
                 picture, self._picture = self._picture, None
                 self.unshown += 1
             if state is not None or picture is not None:

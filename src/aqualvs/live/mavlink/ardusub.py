@@ -133,9 +133,6 @@ _CANDIDATES: Final = (
     ("AHRS2", "altitude", -1.0),
 )
 _PRESSURE: Final = ("SCALED_PRESSURE2", "press_abs", 100.0 / (1025.0 * 9.80665))
-# An estimate that stands still while the outer pressure changes is that of a filter without
-# origin, not a depth.
-_STUCK_SHARE, _DIVED_M = 0.1, 0.5
 
 
 class DepthChoice:
@@ -168,8 +165,11 @@ class DepthChoice:
         return value
 
     def _stands_still(self, kind: str) -> bool:
+        # An estimate that stands still while the outer pressure changes is that of a filter without
+        # origin, not a depth.
+        stuck_share, dived_m = 0.1, 0.5
         dived = self._span(_PRESSURE[0])
-        return dived > _DIVED_M and self._span(kind) < _STUCK_SHARE * dived
+        return dived > dived_m and self._span(kind) < stuck_share * dived
 
     def _span(self, kind: str) -> float:
         low, high = self._spans.get(kind, (0.0, 0.0))

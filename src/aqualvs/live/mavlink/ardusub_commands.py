@@ -19,13 +19,6 @@ from aqualvs.live.mavlink.link import MavlinkLink
 # Length of the window of sticks and responses, and their least number: six messages of three
 # channels, or as many of the attitude.
 _WINDOW_S, _MIN_PAIRS = 6.0, 18
-# Least sum of the squares of all sticks: six at a tenth are enough for channels.
-_LEAST_SQUARES = 6 * 0.1**2
-# The least pilot gain is 0.1, 40 us for a full stick; half of the messages may hold the pilot's
-# own sticks, so that a quarter of that still counts as a response.
-_MIN_SLOPE_US = 10.0
-# Sticks may alternate faster than channels are reported; the channels then move all the same.
-_STILL_US = 3.0
 # Smaller sticks may lie within the dead zone of the channel. A vehicle that turns by less for a
 # full stick does not respond to it.
 _TURNING_STICK, _MIN_TURN = 0.5, math.radians(2.0)
@@ -54,6 +47,12 @@ class StickResponse:
 
     def doubt(self) -> str:
         """Return why the vehicle seems not to obey; empty if it does or nothing is known."""
+        # Sticks may alternate faster than channels are reported; the channels then move all the
+        # same.
+        still_us = 3.0
+        # The least pilot gain is 0.1, 40 us for a full stick; half of the messages may hold the
+        # pilot's own sticks, so that a quarter of that still counts as a response.
+        min_slope_us = 10.0
         now_s, stick = time.monotonic(), self._stick
         if stick is None or now_s - stick[0] > _LONGEST_STICK_S:
             for pairs in (*self._channels.values(), self._turns):
@@ -61,8 +60,8 @@ class StickResponse:
             return ""
         self._take(now_s, stick[1])
         channels = [pair for pairs in self._channels.values() for pair in pairs.since(now_s)]
-        still = all(pairs.swing <= _STILL_US for pairs in self._channels.values())
-        if still and _slope(channels) < _MIN_SLOPE_US:
+        still = all(pairs.swing <= still_us for pairs in self._channels.values())
+        if still and _slope(channels) < min_slope_us:
             return "RC_CHANNELS does not follow our sticks: the vehicle does not obey them"
         if channels or now_s - self._began_s < 0.5 * _WINDOW_S:
             return ""
@@ -121,13 +120,12 @@ class _Pairs:
 
 def _slope(pairs: list[tuple[float, float]]) -> float:
     """Return the answer to a full stick by least squares; infinite where too little is known."""
+    # Least sum of the squares of all sticks: six at a tenth are enough for channels.
+    least_squares = 6 * 0.1**2
     squares = sum(share * share for share, _ in pairs)
-    if len(pairs) < _MIN_PAIRS or squares < _LEAST_SQUARES:
+    if len(pairs) < _MIN_PAIRS or squares < least_squares:
         return math.inf
     return sum(share * answer for share, answer in pairs) / squares
-
-
-_MAX_SEQ = 256
 
 
 class Command(StrEnum):
@@ -244,8 +242,9 @@ class _OnBehalf:
         self._message, self._packer = message, packer
 
     def pack(self, _packer: Any, /) -> bytes:
+        max_seq = 256
         frame: bytes = self._message.pack(self._packer)
-        self._packer.seq = (self._packer.seq + 1) % _MAX_SEQ
+        self._packer.seq = (self._packer.seq + 1) % max_seq
         return frame
 
 

@@ -26,10 +26,7 @@ FOR_DISTANCE = (RANGE_TYPE, RANGE_ORIENT, *(name for name, _ in (*RANGE_NEAR, *R
 FULL_CLIMB_RATE = 0.5
 """Speed of a full stick at a pilot gain of 1 in m/s, as the packaged gains assume it."""
 
-_DISABLED, _DISARM = 0, 2
 _MAVLINK_RANGEFINDER, _FORWARD = 10, 0
-# A last effort that stays in force longer than this moves the vehicle far.
-_LONGEST_TIMEOUT_S = 1.0
 # The rate of descent is controlled by the depth: half or twice the rate still works.
 _CLIMB_RATE_RATIO = 2.0
 _ASK_EVERY_S, _ASK_SELDOM_S, _ROUNDS = 1.0, 30.0, 5
@@ -135,11 +132,14 @@ def advise_on_station(parameters: Mapping[str, float], station: int) -> Advice:
 
 def advise_on_fail_safe(parameters: Mapping[str, float]) -> list[Advice]:
     """Advise on the effect of the pilot-input fail-safe when efforts end."""
+    # A last effort that stays in force longer than this moves the vehicle far.
+    longest_timeout_s = 1.0
+    disabled, disarm = 0, 2
     action, timeout_s = parameters.get(PILOT_INPUT), parameters.get(PILOT_TIMEOUT)
     found = []
     if action is None:
         found.append(Advice(Weight.CARE, f"{PILOT_INPUT} is not told; see that it is 1 or 2"))
-    elif round(action) == _DISABLED:
+    elif round(action) == disabled:
         found.append(
             Advice(
                 Weight.BROKEN,
@@ -147,7 +147,7 @@ def advise_on_fail_safe(parameters: Mapping[str, float]) -> list[Advice]:
                 f"{PILOT_INPUT} 1",
             )
         )
-    elif round(action) == _DISARM:
+    elif round(action) == disarm:
         found.append(
             Advice(
                 Weight.CARE,
@@ -160,7 +160,7 @@ def advise_on_fail_safe(parameters: Mapping[str, float]) -> list[Advice]:
         found.append(Advice(Weight.FINE, f"{PILOT_INPUT} 1 (warn): sticks go neutral, armed"))
     if timeout_s is None:
         found.append(Advice(Weight.CARE, f"{PILOT_TIMEOUT} is not told; see that it is 0.5 to 1"))
-    elif timeout_s > _LONGEST_TIMEOUT_S:
+    elif timeout_s > longest_timeout_s:
         found.append(
             Advice(
                 Weight.CARE,

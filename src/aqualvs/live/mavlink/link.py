@@ -30,15 +30,9 @@ SILENT_AFTER_S = MOVES_AFTER_S
 
 _LOOK_EVERY_S = 0.1
 _FIRST_WAIT_S, _LONGEST_WAIT_S = 0.25, 4.0
-# After a connection that lasted this long, the next attempt follows quickly again.
-_LASTING_S = 2.0
 # A peer that was heard and falls silent may have moved to another address.
 _REOPEN_AFTER_S = 10.0
 _REFUSED_FOR_S = 3.0
-# Number of senders, besides the vehicle, whose latest message of each kind is kept.
-_MAX_SENDERS = 64
-# Datagrams received before sending is checked again.
-_READ_AT_ONCE = 64
 # Greatest delay of a message by data in the serial driver's buffer; beyond it, it is dropped.
 _TIMEOUT_S, _URGENT_TIMEOUT_S = 0.02, 0.1
 _ARDUPILOT, _NO_AUTOPILOT = 3, 8
@@ -328,6 +322,8 @@ class MavlinkLink:
         return frame
 
     def _run(self) -> None:
+        # After a connection that lasted this long, the next attempt follows quickly again.
+        lasting_s = 2.0
         wait_s = _FIRST_WAIT_S
         while not self._closing.is_set():
             began_s = time.monotonic()
@@ -335,7 +331,7 @@ class MavlinkLink:
                 self._serve(open_port(self._address))
             except (OSError, ValueError) as fault:
                 # A name that cannot be one is a ValueError.
-                if time.monotonic() - began_s > _LASTING_S:
+                if time.monotonic() - began_s > lasting_s:
                     wait_s = _FIRST_WAIT_S
                 again = f"tried again every {wait_s:.2g} s"
                 self._fault = f"{self._address}: {why(fault)}; {again}"
@@ -396,7 +392,8 @@ class MavlinkLink:
 
     def _read(self, port: Port) -> None:
         """Read incoming data, but not for so long that sending has to wait."""
-        for _ in range(_READ_AT_ONCE):
+        read_at_once = 64  # Datagrams received before sending is checked again.
+        for _ in range(read_at_once):
             data, peer = port.read()
             if not data:
                 return
@@ -409,13 +406,15 @@ class MavlinkLink:
 
     def _keep(self, peer: Peer, message: Any) -> None:
         """Store a message as the latest of its kind and sender."""
+        # Number of senders, besides the vehicle, whose latest message of each kind is kept.
+        max_senders = 64
         kind, received_ns = message.get_type(), time.monotonic_ns()
         sender = (message.get_srcSystem(), message.get_srcComponent())
         with self._receiving:
             latest = self._queue.setdefault(kind, {})
             latest.pop((*sender, peer), None)
             latest[*sender, peer] = Received(message, received_ns, *sender)
-            if len(latest) > _MAX_SENDERS:
+            if len(latest) > max_senders:
                 others = [key for key in latest if key[0] != self.system]
                 del latest[(others or list(latest))[0]]
             self._n_received[kind] += sender == self._autopilot_ids

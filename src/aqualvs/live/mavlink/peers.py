@@ -24,7 +24,6 @@ from typing import Any, TypeAlias
 from aqualvs.errors import OptionError
 
 _HEX_KEY = re.compile(r"[0-9A-Fa-f]{64}")
-_LONGEST_KEY = 1000
 # Signatures count units of 10 us since 2015-01-01 00:00 UTC.
 _EPOCH_S, _UNITS_PER_S = 1_420_070_400, 100_000
 _READABLE_BY_OTHERS = 0o077
@@ -38,18 +37,19 @@ def load_key(path: Path) -> bytes:
 
     Raises `OptionError` if there is no such file, or it holds neither.
     """
+    longest_key = 1000
     try:
         if not path.is_file():
             raise FileNotFoundError(0, "no such file")
         with path.open("rb") as file:
-            data = file.read(_LONGEST_KEY + 1)
+            data = file.read(longest_key + 1)
         readable = os.name == "posix" and bool(path.stat().st_mode & _READABLE_BY_OTHERS)
         text = data.decode().strip()
     except OSError as fault:
         raise OptionError(f"MAVLink key {path}: cannot be read ({fault.strerror})") from None
     except UnicodeDecodeError:
         text = ""
-    if not text or len(data) > _LONGEST_KEY or not text.isprintable():
+    if not text or len(data) > longest_key or not text.isprintable():
         raise OptionError(
             f"MAVLink key {path}: write one line, a passphrase or 64 hexadecimal digits"
         )

@@ -152,9 +152,7 @@ def _serial_address(text: str, url: str) -> SerialAddress:
     return SerialAddress(match[1], int(match[2] or DEFAULT_BAUD))
 
 
-_DATAGRAM = 65_535
 _CHUNK = 4096
-_CONNECT_S = 1.0
 # A stream that accepts no data for this time is broken.
 _STALLED_S = 5.0
 _SEND_BUFFER = 16_384
@@ -285,8 +283,9 @@ class _UdpPort:
         return False
 
     def _received(self) -> tuple[bytes, Peer]:
+        datagram = 65_535
         try:
-            return self._socket.recvfrom(_DATAGRAM)
+            return self._socket.recvfrom(datagram)
         except (ConnectionRefusedError, ConnectionResetError):
             self.refused_s = time.monotonic()
         except OSError as fault:
@@ -449,8 +448,9 @@ class _TcpPort(StreamPort):
     """A TCP connection to a server."""
 
     def __init__(self, address: NetAddress) -> None:
+        connect_s = 1.0
         super().__init__()
-        self._socket = socket.create_connection((address.host, address.port), _CONNECT_S)
+        self._socket = socket.create_connection((address.host, address.port), connect_s)
         self._socket.setblocking(False)
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         # Data beyond this buffer would be too old when sent.

@@ -10,9 +10,6 @@ from aqualvs.errors import OptionError
 from aqualvs.live.mavlink.ports import SerialAddress, StreamPort
 
 _CHUNK = 4096
-_BITS_PER_BYTE = 10
-# How long the reader waits for a byte before it looks whether the port was closed.
-_READ_S = 0.1
 # On Windows, a write that the driver does not take at once is given up after this time.
 _WRITE_S = 0.1
 
@@ -46,15 +43,18 @@ class SerialPort(StreamPort):
     """
 
     def __init__(self, address: SerialAddress) -> None:
+        # How long the reader waits for a byte before it looks whether the port was closed.
+        read_s = 0.1
+        bits_per_byte = 10
         super().__init__()
         # Only those who have a serial line need it.
         from serial import Serial
 
-        self._bytes_per_s = address.baud / _BITS_PER_BYTE
+        self._bytes_per_s = address.baud / bits_per_byte
         write_s = 0.0 if os.name == "posix" else _WRITE_S
         try:
             self._serial = Serial(
-                address.device, address.baud, timeout=_READ_S, write_timeout=write_s
+                address.device, address.baud, timeout=read_s, write_timeout=write_s
             )
         except Exception as fault:
             raise _as_os_error(fault) from fault

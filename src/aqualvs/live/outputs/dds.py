@@ -133,7 +133,6 @@ def _serialize_cloud(
     return b"".join((rest[:-5], length, data, rest[-1:]))
 
 
-_DEPTH = 5
 # Longest time that a slow reader blocks a reliable writer.
 _MAX_BLOCKING_NS = 50_000_000
 _MAX_DOMAIN = 232
@@ -332,6 +331,7 @@ def _domain(domain_id: int) -> Any:
 
 
 def _quality(topic: PublishedTopic, options: RosOptions, types: Ros2Types) -> Any:
+    depth = 5
     from cyclonedds.qos import Policy, Qos
 
     reliable = options.reliable or topic is PublishedTopic.DIAGNOSTICS
@@ -340,7 +340,7 @@ def _quality(topic: PublishedTopic, options: RosOptions, types: Ros2Types) -> An
         if reliable
         else Policy.Reliability.BestEffort,
         Policy.Durability.Volatile,
-        Policy.History.KeepLast(_DEPTH),
+        Policy.History.KeepLast(depth),
         Policy.DataRepresentation(use_cdrv0_representation=True, use_xcdrv2_representation=False),
     ]
     if types.range_has_variance:

@@ -47,7 +47,6 @@ VEHICLE = "vehicle"
 """Axes of REP-103: x forward, y left, z up, as 3D views expect them; origin as `dome`."""
 
 _VEHICLE_FROM_DOME: FloatArray = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-_LIFETIME_S = 0.5
 # Side of the square that represents the target, as a share of its range.
 _SIDE_SHARE = 1.0
 _GREEN, _BLUE = (0.1, 1.0, 0.3, 1.0), (0.2, 0.6, 1.0, 0.25)
@@ -72,6 +71,7 @@ def scene(rig: Rig, scan: Scan, stamp_ns: int) -> "SceneUpdate":
 
     What was drawn before vanishes by itself after half a second.
     """
+    lifetime_s = 0.5
     from foxglove.messages import Duration, SceneEntity, SceneUpdate
 
     posture = scan.posture
@@ -81,7 +81,7 @@ def scene(rig: Rig, scan: Scan, stamp_ns: int) -> "SceneUpdate":
         timestamp=_stamp(stamp_ns),
         frame_id=FRAME_ID,
         id="target",
-        lifetime=Duration.from_secs(_LIFETIME_S),
+        lifetime=Duration.from_secs(lifetime_s),
         cubes=[_plate(posture)],
         lines=[
             _line(ends) for ends in laser_lines(rig.lasers, posture.normal_in_dome, scan.points)
@@ -194,8 +194,6 @@ LAYOUT = Path(__file__).with_name("foxglove_layout.json")
 """A layout that shows everything; import it in Foxglove."""
 
 _TRANSFORMS, _SCENE = "/aqualvs/transforms", "/aqualvs/scene"
-_JPEG_QUALITY = 75
-_SELDOM_HZ = 1.0
 
 
 class FoxgloveOutput:
@@ -234,6 +232,7 @@ class FoxgloveOutput:
         picture_hz: float = 5.0,
         points_hz: float = 10.0,
     ) -> None:
+        seldom_hz = 1.0
         foxglove = _sdk()
         self._options = scanner or ScannerOptions()
         self._viewers = _Viewers()
@@ -245,7 +244,7 @@ class FoxgloveOutput:
         self._transforms = foxglove.channels.FrameTransformsChannel(_TRANSFORMS, context=context)
         self._scene = foxglove.channels.SceneUpdateChannel(_SCENE, context=context)
         self._picture_due, self._points_due = RateLimit(picture_hz), RateLimit(points_hz)
-        self._seldom_due = RateLimit(_SELDOM_HZ)
+        self._seldom_due = RateLimit(seldom_hz)
         try:
             self._server = foxglove.start_server(
                 name="aqualvs",
@@ -265,6 +264,7 @@ class FoxgloveOutput:
 
     def send(self, sample: LiveSample) -> None:
         """Send a sample to those who watch."""
+        jpeg_quality = 75
         if self._closed:
             return
         at_ns = self._clock.stamp_ns(sample)
@@ -283,7 +283,7 @@ class FoxgloveOutput:
             self._log(
                 PICTURE,
                 at_ns,
-                lambda: messages.image_message("jpeg", jpeg_of(frame, _JPEG_QUALITY), at_ns),
+                lambda: messages.image_message("jpeg", jpeg_of(frame, jpeg_quality), at_ns),
                 self._picture_due,
             )
         if self._seldom_due.at(at_ns) or self._viewers.take_news():

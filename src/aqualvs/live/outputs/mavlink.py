@@ -21,7 +21,6 @@ _INVALID_CM = 0
 """Below any least distance: ArduPilot and PX4 then have no distance, while one that is too large
 would mean to PX4 that the way is free."""
 
-_FLOAT_MAX = 3.4e38
 _NAN = float("nan")
 
 NAMES = (
@@ -172,9 +171,10 @@ def _value_messages(dialect: Any, names: tuple[str, ...]) -> tuple[Any, ...]:
 
 
 def _fill(messages: tuple[Any, ...], time_boot_ms: int, numbers: tuple[float, ...]) -> Any:
+    float_max = 3.4e38
     for message, number in zip(messages, numbers, strict=True):
         message.time_boot_ms = time_boot_ms
-        message.value = number if -_FLOAT_MAX < number < _FLOAT_MAX else _NAN
+        message.value = number if -float_max < number < float_max else _NAN
     return messages
 
 

@@ -27,9 +27,6 @@ from aqualvs.recording.sample import LiveSample
 from aqualvs.sources.base import PartHealth, State
 
 DEFAULT_MASTER = "http://localhost:11311"
-_ASK_EVERY_S = 2.0
-_FIRST_WAIT_S, _LONGEST_WAIT_S = 0.5, 8.0
-_MASTER_S = 2.0
 _TIMEOUT_S = 3.0
 # No packet is ever sent there; the system is only asked for the route.
 _FAR_AWAY = "198.51.100.1"
@@ -94,7 +91,9 @@ class Ros1Node:
 
     def _keep(self) -> None:
         """See to it that roscore knows the node, also one that was restarted."""
-        wait_s, registered, next_wait_s = 0.0, False, _FIRST_WAIT_S
+        first_wait_s, longest_wait_s = 0.5, 8.0
+        ask_every_s = 2.0
+        wait_s, registered, next_wait_s = 0.0, False, first_wait_s
         while not self._stop.wait(wait_s):
             try:
                 with _master(self.master_uri) as master:
@@ -103,10 +102,10 @@ class Ros1Node:
             except _TROUBLE as fault:
                 registered = False
                 self._trouble = f"no roscore at {self.master_uri} ({fault})"
-                wait_s, next_wait_s = next_wait_s, min(2.0 * next_wait_s, _LONGEST_WAIT_S)
+                wait_s, next_wait_s = next_wait_s, min(2.0 * next_wait_s, longest_wait_s)
             else:
                 registered, self._trouble = True, ""
-                wait_s, next_wait_s = _ASK_EVERY_S, _FIRST_WAIT_S
+                wait_s, next_wait_s = ask_every_s, first_wait_s
         if registered:
             self._unregister()
 
@@ -206,8 +205,9 @@ class _Transport(xmlrpc.client.Transport):
     """Transport with a timeout, for a roscore that does not answer."""
 
     def make_connection(self, host: Any) -> http.client.HTTPConnection:
+        master_s = 2.0
         connection = super().make_connection(host)
-        connection.timeout = _MASTER_S
+        connection.timeout = master_s
         return connection
 
 

@@ -31,7 +31,6 @@ from aqualvs.live.outputs.ros_messages import (
     RangeMessage,
 )
 
-_INFRARED = 1
 _RULE = 80 * "="
 
 _PARTS = {
@@ -140,9 +139,10 @@ def _pose(message: PoseMessage, seq: int) -> bytes:
 
 
 def _range(message: RangeMessage, seq: int) -> bytes:
+    infrared = 1
     return _header(seq, message.stamp_ns, message.frame_id) + struct.pack(
         "<B4f",
-        _INFRARED,
+        infrared,
         message.field_of_view,
         message.min_range,
         message.max_range,

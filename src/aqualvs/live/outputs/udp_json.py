@@ -151,9 +151,6 @@ def _short(value: float) -> Value:
 
 
 _NOT_NOW = (errno.EAGAIN, errno.EWOULDBLOCK, errno.ENOBUFS, errno.EINTR)
-_REOPEN_EVERY_S = 0.25
-_RESOLVE_EVERY_S = 2.0
-_REFUSED_FOR_S = 3.0
 
 
 class UdpJsonOutput:
@@ -221,7 +218,8 @@ class _Receiver:
 
     def fault(self) -> str:
         """Return the fault of this receiver, empty if there is none."""
-        if time.monotonic() - self._refused_s < _REFUSED_FOR_S:
+        refused_for_s = 3.0
+        if time.monotonic() - self._refused_s < refused_for_s:
             return f"nobody listens at {self._address}"
         return f"{self._address}: {self._trouble}" if self._trouble else ""
 
@@ -259,10 +257,11 @@ class _Receiver:
 
     def _open(self) -> bool:
         """Open the socket if necessary; return whether it is open."""
+        reopen_every_s = 0.25
         if self._socket is not None:
             return True
         now = time.monotonic()
-        if self._where is None or now - self._opened_s < _REOPEN_EVERY_S:
+        if self._where is None or now - self._opened_s < reopen_every_s:
             return False
         self._opened_s = now
         family, where = self._where
@@ -279,10 +278,11 @@ class _Receiver:
             self._socket = None
 
     def _resolve(self) -> None:
+        resolve_every_s = 2.0
         while self._where is None and not self._closing.is_set():
             self._where = self._lookup(0)
             if self._where is None:
-                self._closing.wait(_RESOLVE_EVERY_S)
+                self._closing.wait(resolve_every_s)
 
     def _lookup(self, flags: int) -> tuple[int, tuple[object, ...]] | None:
         """Return family and address of the host, IPv4 first; None if it is not known."""
