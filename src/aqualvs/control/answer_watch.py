@@ -37,10 +37,6 @@ _STILL_RANGE, _STILL_ANGLE, _PART_S = 0.006, math.radians(0.6), 0.28
 # of them tell the speed. Slower vehicles, in m/s, coast by little and are not braked: noise of 2 mm
 # makes 0.003 of a line over 15 postures.
 _TRUSTED_S, _N_SPEED, _SLOW = 0.6, 3, 0.03
-# Greatest length of the brake, and the time from the first still picture to neutral: 0.1 s of
-# half a second are left to what happens before a picture arrives, and on the wire.
-_BRAKE_S, _NEUTRAL_S = 0.12, 0.4
-_TICK_S = 1e-3
 # Greatest change between two reports of a heading; a greater one is a reset compass.
 _MAX_TURN = math.radians(20.0)
 # An approach is predicted over the first time by a line through the second, in seconds.
@@ -211,6 +207,10 @@ class AnswerWatch:
         `still_s`: for how long the picture has stood still, if the picture tells it; else as the
         last posture has told.
         """
+        # Greatest length of the brake, and the time from the first still picture to neutral: 0.1 s
+        # of half a second are left to what happens before a picture arrives, and on the wire.
+        brake_s, neutral_s = 0.12, 0.4
+        tick_s = 1e-3
         if still_s is not None:
             self._still_s, self._blind_s = still_s, _TRUSTED_S
         before = [m for m in self._moments if now_s - m.time_s >= self._blind_s]
@@ -222,7 +222,7 @@ class AnswerWatch:
             return NO_BRAKE
         # A brake ends with a frame.
         frame_s = self._moments[-1].time_s - self._moments[-2].time_s
-        left_s = min(_BRAKE_S, _NEUTRAL_S - self._still_s) + _TICK_S
+        left_s = min(brake_s, neutral_s - self._still_s) + tick_s
         length_s = math.floor(left_s / frame_s) * frame_s
         if length_s <= 0.0:
             return NO_BRAKE

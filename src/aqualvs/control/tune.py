@@ -241,8 +241,6 @@ _POSITION_SHARE, _INTEGRAL_SHARE, _TURN_INTEGRAL_SHARE = 0.3, 0.25, 0.15
 # the step of a BlueROV2 takes twice the time. The second bounds it for weak thrusters, as share of
 # their thrust times seconds: with 0.022 the step of a VideoRay-like vehicle takes twice the time.
 _CROSSING, _MAX_CROSSING = 0.018, 0.0175
-# Greatest delays and frame intervals in seconds, and greatest current in m/s.
-_MAX_S, _MAX_CURRENT = 60.0, 10.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -273,22 +271,24 @@ class TuneOptions:
 
         Raises `OptionError` naming the value.
         """
-        if not 0.0 <= self.delay <= self.greatest_delay <= _MAX_S:
+        # Greatest delays and frame intervals in seconds, and greatest current in m/s.
+        max_s, max_current = 60.0, 10.0
+        if not 0.0 <= self.delay <= self.greatest_delay <= max_s:
             raise OptionError(
                 f"tune: delay {self.delay:g} s; choose 0 to the greatest, "
-                f"{self.greatest_delay:g} s, and that up to {_MAX_S:g} s"
+                f"{self.greatest_delay:g} s, and that up to {max_s:g} s"
             )
-        if not (0.0 < self.frame <= _MAX_S and min(self.mass_factor, self.drag_factor) >= 1.0):
+        if not (0.0 < self.frame <= max_s and min(self.mass_factor, self.drag_factor) >= 1.0):
             raise OptionError(
                 f"tune: frame {self.frame:g} s, factors {self.mass_factor:g} and "
-                f"{self.drag_factor:g}; the first is positive, up to {_MAX_S:g} s, the others are "
+                f"{self.drag_factor:g}; the first is positive, up to {max_s:g} s, the others are "
                 "at least 1"
             )
         moduli = (self.least_modulus, self.least_late_modulus, self.least_yaw_modulus)
-        if not (0.0 <= self.current <= _MAX_CURRENT and 0.0 < min(moduli) <= max(moduli) < 1.0):
+        if not (0.0 <= self.current <= max_current and 0.0 < min(moduli) <= max(moduli) < 1.0):
             raise OptionError(
                 f"tune: current {self.current:g} m/s, least moduli "
-                f"{', '.join(f'{one:g}' for one in moduli)}; the first is 0 to {_MAX_CURRENT:g}, "
+                f"{', '.join(f'{one:g}' for one in moduli)}; the first is 0 to {max_current:g}, "
                 "the others between 0 and 1"
             )
 

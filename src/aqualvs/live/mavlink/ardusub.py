@@ -184,9 +184,6 @@ _ARDUPILOT, _SUBMARINE, _GROUND_STATION = 3, 12, 6
 _ARMED = 128
 # Two and a half of ArduSub's heartbeats.
 _BEATS_WITHIN_S = 2.5
-# Sticks used within this time may still be in force when the link is closed.
-_LATELY_S = 3.0
-_GOODBYES, _GOODBYE_EVERY_S = 3, 0.02
 # Depth hold only: in other modes the vehicle sinks or rises at neutral sticks, or steers itself.
 _KEEPS_DEPTH: Final = {
     Command.STICKS: ("ALT_HOLD", "POSHOLD", "SURFTRAK"),
@@ -360,14 +357,17 @@ class ArduSubLink:
 
     def close(self) -> None:
         """Send neutral, if efforts may still be in force, and free everything."""
+        # Sticks used within this time may still be in force when the link is closed.
+        lately_s = 3.0
+        goodbyes, goodbye_every_s = 3, 0.02
         if self._closed:
             return
         self._closed = True
-        if time.monotonic() - self._sent_s < _LATELY_S:
-            for _ in range(_GOODBYES):
+        if time.monotonic() - self._sent_s < lately_s:
+            for _ in range(goodbyes):
                 with contextlib.suppress(OSError):
                     self._send(NEUTRAL)
-                time.sleep(_GOODBYE_EVERY_S)
+                time.sleep(goodbye_every_s)
         if self._owns_link:
             self.link.close()
 
