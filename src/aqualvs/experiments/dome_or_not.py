@@ -13,12 +13,12 @@ from aqualvs.experiments.experiment import (
     ExperimentRow,
 )
 from aqualvs.experiments.laboratory import Laboratory, MeasuredDive, calibrated_rig
+from aqualvs.experiments.tank import wall_at_places
 from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.planes import Plane, Rays
 from aqualvs.optics.rig import Rig
 from aqualvs.report.figure_style import GREEN, OURS, PAPER, TRUTH, new_figure
 from aqualvs.scanning.scan import Label, ScanPoints
-from aqualvs.simulation.scenario import Scenario, parse_scenario
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -66,21 +66,8 @@ class Distances:
         return np.asarray(100.0 * ((slope * self.true + start) / self.true - 1.0))
 
 
-def away_and_back(frames: int = _SETUP.frames) -> Scenario:
-    """Return the dive: so many frames at each place."""
-    facts = {
-        "duration_s": len(PLACES_MM) * frames / 25.0,
-        "motion": {
-            "range_mm": {"values": list(PLACES_MM), "mode": "steps"},
-            "slide_x_mm": {"values": [0], "sway": 25, "period_s": 0.5},
-        },
-        "walls": [{}],
-    }
-    return parse_scenario(facts, "dome_or_not", "dome_or_not")
-
-
 def _run(laboratory: Laboratory) -> ExperimentResult:
-    dive = laboratory.dive(away_and_back())
+    dive = laboratory.dive(wall_at_places(PLACES_MM, _SETUP.frames, "dome_or_not"))
     rig = calibrated_rig(laboratory)
     found = distances(laboratory.measure(dive, rig=rig), rig, level_laser(rig))
     factors = [_rms(found, found.bare, k) / _rms(found, found.dome, k) for k in range(4)]

@@ -3,6 +3,7 @@
 Figure 15 is the distance to the wall; figures 16 and 17 are pitch and yaw.
 """
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -177,23 +178,23 @@ class _DistanceSetup(NamedTuple):
 _DISTANCES = _DistanceSetup()
 
 
-def wall_at_places(frames: int = _DISTANCES.frames) -> Scenario:
-    """Return the dive: so many frames at each of the paper's places, square to a wall."""
+def wall_at_places(places_mm: Sequence[int], frames: int, name: str) -> Scenario:
+    """Return the dive: so many frames at each of some distances, square to a wall."""
     facts = {
-        "duration_s": len(PLACES_MM) * frames / 25.0,
+        "duration_s": len(places_mm) * frames / 25.0,
         "motion": {
-            "range_mm": {"values": list(PLACES_MM), "mode": "steps"},
+            "range_mm": {"values": list(places_mm), "mode": "steps"},
             # Along the wall, so that the stripes lie on other stains in every frame.
             "slide_x_mm": {"values": [0], "sway": 25, "period_s": 0.5},
         },
         "walls": [{}],
     }
-    return parse_scenario(facts, "distance", "distance")
+    return parse_scenario(facts, name, name)
 
 
 def wall_dive(laboratory: Laboratory) -> RenderedDive:
     """Return the dive before the wall, shared with those who ask what our choices are worth."""
-    return laboratory.dive(wall_at_places())
+    return laboratory.dive(wall_at_places(PLACES_MM, _DISTANCES.frames, "distance"))
 
 
 def _run_distance(laboratory: Laboratory) -> ExperimentResult:

@@ -301,7 +301,9 @@ class SampleEncoder:
         self._exact = ""
         self._rig_texts: tuple[str, str, str] | None = None
         self._rig_wait_ns = self._rig_from_ns = 0
-        self._health_from_ns = self._points_from_ns = 0
+        self._health_from_ns = 0
+        hz = options.points_hz
+        self._points_due = RateLimit(math.inf if hz is None else hz)
 
     def messages(self, sample: LiveSample, stamp_ns: int) -> Iterator[tuple[RecordedTopic, bytes]]:
         """Yield topic and content; pictures come before the stripes that belong to them."""
@@ -311,7 +313,7 @@ class SampleEncoder:
         if not _is_silence(sample):
             yield STRIPES, stripes_message(sample, stamp_ns)
         yield POSTURE, posture_message(sample, stamp_ns)
-        if self._points_due(sample, stamp_ns):
+        if len(sample.scan.points) and self._points_due.at(stamp_ns):
             yield POINTS, points_message(sample.scan.points, stamp_ns)
         health_every_ns = 1_000_000_000
         if stamp_ns >= self._health_from_ns:
@@ -357,15 +359,6 @@ class SampleEncoder:
             if chroma is not None:
                 yield CHROMA, image_message(kind, chroma, stamp_ns)
 
-    def _points_due(self, sample: LiveSample, stamp_ns: int) -> bool:
-        hz = self._options.points_hz
-        if not len(sample.scan.points) or hz == 0.0 or stamp_ns < self._points_from_ns:
-            return False
-        if hz is not None:
-            # A tenth of a period early rather than a whole frame late.
-            self._points_from_ns = stamp_ns + round(0.9e9 / hz)
-        return True
-
 
 class RecordClock:
     """Clock of a recording: its times rise, whatever the system's clock does.
@@ -389,7 +382,7 @@ class RecordClock:
 class RateLimit:
     """Rate limit of a message.
 
-    `hz`: 0 for none at all.
+    `hz`: 0 for none at all, infinite for every one.
     """
 
     def __init__(self, hz: float) -> None:

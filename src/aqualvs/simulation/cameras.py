@@ -21,6 +21,8 @@ from numpy.typing import NDArray
 
 from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import BoolArray, FloatArray
+from aqualvs.geometry.compiled import inline_borrowing_kernel
+from aqualvs.geometry.linear_algebra import Vec, combine, row3
 from aqualvs.optics.camera import Camera
 from aqualvs.simulation.lasers import COLOUR_BALANCED, LUMA, ColourFilters
 from aqualvs.simulation.scene import CameraSensor, Scene, Vector, WaterOptics
@@ -399,6 +401,27 @@ class CornerRays(NamedTuple):
             for columns in (slice(None, -1), slice(1, None)):
                 wanted[rows, columns] |= where
         return self._replace(valid=self.valid & wanted)
+
+
+@inline_borrowing_kernel
+def sees_out(valid: BoolArray, row: int, column: int) -> bool:
+    """Return whether all four corners of a pixel see out."""
+    return bool(
+        valid[row, column]
+        and valid[row, column + 1]
+        and valid[row + 1, column]
+        and valid[row + 1, column + 1]
+    )
+
+
+@inline_borrowing_kernel
+def between_corners(corners: FloatArray, row: int, column: int, x: float, y: float) -> Vec:
+    """Return the bilinear value between the corners of a pixel, x and y in 0..1."""
+    a, b = row3(corners[row], column, 0), row3(corners[row], column + 1, 0)
+    c, e = row3(corners[row + 1], column, 0), row3(corners[row + 1], column + 1, 0)
+    zero = (0.0, 0.0, 0.0)
+    top = combine(a, 1.0 - x, b, x, zero, 0.0)
+    return combine(top, 1.0 - y, combine(c, 1.0 - x, e, x, zero, 0.0), y, zero, 0.0)
 
 
 def corner_rays(camera: Camera) -> CornerRays:

@@ -17,11 +17,18 @@ from numpy.typing import NDArray
 from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel
-from aqualvs.geometry.linear_algebra import Vec, along, combine, dot, minus, row3, unit
+from aqualvs.geometry.linear_algebra import Vec, along, dot, minus, row3, unit
 from aqualvs.geometry.transforms import SE3
 from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import Rig
-from aqualvs.simulation.cameras import IDEAL, CornerRays, SimulatedCamera, corner_rays
+from aqualvs.simulation.cameras import (
+    IDEAL,
+    CornerRays,
+    SimulatedCamera,
+    between_corners,
+    corner_rays,
+    sees_out,
+)
 from aqualvs.simulation.lasers import (
     COLOUR,
     COLOUR_BALANCED,
@@ -91,12 +98,7 @@ def render_panels(
     valid = rays.valid
     for row in range(out.shape[0]):
         for column in range(out.shape[1]):
-            if not (
-                valid[row, column]
-                and valid[row, column + 1]
-                and valid[row + 1, column]
-                and valid[row + 1, column + 1]
-            ):
+            if not sees_out(valid, row, column):
                 continue
             room, laser = 0.0, 0.0
             for k in range(samples * samples):
@@ -139,19 +141,9 @@ def _radiance(
 def _ray(rays: CornerRays, row: int, column: int, x: float, y: float) -> tuple[Vec, Vec]:
     """Return the ray at (x, y) in 0..1 inside a pixel."""
     return (
-        _between(rays.origins, row, column, x, y),
-        unit(_between(rays.directions, row, column, x, y)),
+        between_corners(rays.origins, row, column, x, y),
+        unit(between_corners(rays.directions, row, column, x, y)),
     )
-
-
-@inline_borrowing_kernel
-def _between(corners: FloatArray, row: int, column: int, x: float, y: float) -> Vec:
-    """Return the bilinear value between the corners of a pixel."""
-    a, b = row3(corners[row], column, 0), row3(corners[row], column + 1, 0)
-    c, e = row3(corners[row + 1], column, 0), row3(corners[row + 1], column + 1, 0)
-    zero = (0.0, 0.0, 0.0)
-    top = combine(a, 1.0 - x, b, x, zero, 0.0)
-    return combine(top, 1.0 - y, combine(c, 1.0 - x, e, x, zero, 0.0), y, zero, 0.0)
 
 
 @inline_borrowing_kernel

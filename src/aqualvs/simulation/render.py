@@ -21,10 +21,17 @@ from numpy.typing import NDArray
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel
-from aqualvs.geometry.linear_algebra import Vec, combine, row3, unit
+from aqualvs.geometry.linear_algebra import unit
 from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import Rig
-from aqualvs.simulation.cameras import IDEAL, CornerRays, SimulatedCamera, corner_rays
+from aqualvs.simulation.cameras import (
+    IDEAL,
+    CornerRays,
+    SimulatedCamera,
+    between_corners,
+    corner_rays,
+    sees_out,
+)
 from aqualvs.simulation.lasers import (
     LaserSource,
     Sheets,
@@ -349,24 +356,6 @@ class Renderer:
 
 
 @inline_borrowing_kernel
-def _between(corners: FloatArray, row: int, column: int, x: float, y: float) -> Vec:
-    """Return the bilinear value between the corners of a pixel, x and y in 0..1."""
-    zero = (0.0, 0.0, 0.0)
-    top = combine(
-        row3(corners[row], column, 0), 1.0 - x, row3(corners[row], column + 1, 0), x, zero, 0.0
-    )
-    low = combine(
-        row3(corners[row + 1], column, 0),
-        1.0 - x,
-        row3(corners[row + 1], column + 1, 0),
-        x,
-        zero,
-        0.0,
-    )
-    return combine(top, 1.0 - y, low, y, zero, 0.0)
-
-
-@inline_borrowing_kernel
 def _members_at(members: TileMembers, row: int, column: int) -> Members:
     i = (row // TILE) * members.n_columns + column // TILE
     return Members(
@@ -396,19 +385,14 @@ def _render(
     origins, directions, valid = rays
     for row in range(band[0], band[1]):
         for column in range(out.shape[1]):
-            if not (
-                valid[row, column]
-                and valid[row, column + 1]
-                and valid[row + 1, column]
-                and valid[row + 1, column + 1]
-            ):
+            if not sees_out(valid, row, column):
                 continue
             near = _members_at(members, row, column)
             red, green, blue = 0.0, 0.0, 0.0
             for k in range(samples * samples):
                 x, y = (k % samples + 0.5) / samples, (k // samples + 0.5) / samples
-                o = _between(origins, row, column, x, y)
-                d = unit(_between(directions, row, column, x, y))
+                o = between_corners(origins, row, column, x, y)
+                d = unit(between_corners(directions, row, column, x, y))
                 seen = radiance(o, d, s, near, everything, sheets, light)
                 red, green, blue = red + seen[0], green + seen[1], blue + seen[2]
             out[row, column, 0] = red * weight

@@ -26,7 +26,7 @@ from scipy import ndimage
 
 from aqualvs.errors import SourceError
 from aqualvs.geometry.arrays import BoolArray, FloatArray
-from aqualvs.vehicle_logs.tlog import SUB_MODES, Candidate, choose_depth
+from aqualvs.vehicle_logs.tlog import SUB_MODES, Candidate, choose_depth, damage_notes
 from aqualvs.vehicle_logs.vehicle_log import Interpolation, Signal, VehicleLog, bearing_of, wrap
 
 HEAD = b"\xa3\x95"
@@ -315,6 +315,9 @@ def _log(path: Path, records: Records, kind: str, unit: str) -> VehicleLog:
     }
     # A vehicle's clock is set once, to about the second.
     utc_sigma_s = 1.0
+    damage = damage_notes(records.skipped, unit, "records")
+    if records.n_bogus:
+        damage.append(f"{records.n_bogus} records have an impossible time and are left out")
     return VehicleLog(
         name=str(path),
         kind=kind,
@@ -328,7 +331,7 @@ def _log(path: Path, records: Records, kind: str, unit: str) -> VehicleLog:
         start_utc_s=utc,
         start_utc_sigma_s=None if utc is None else utc_sigma_s,
         sources={name: where for name, where in sources.items() if where},
-        notes=tuple(n for n in (*_damage(records, unit), stuck) if n),
+        notes=tuple(n for n in (*damage, stuck) if n),
     )
 
 
@@ -341,19 +344,6 @@ def _first_core(tables: _Tables) -> _Tables:
             first = table["C"] == 0
             kept[name] = {column: values[first] for column, values in table.items()}
     return kept
-
-
-def _damage(records: Records, unit: str) -> list[str]:
-    notes = []
-    if records.skipped:
-        lost = sum(length for _, length in records.skipped)
-        notes.append(
-            f"{lost} {unit} are no records and are left out, the first at {unit[:-1]} "
-            f"{records.skipped[0][0]}: the file is damaged or cut short"
-        )
-    if records.n_bogus:
-        notes.append(f"{records.n_bogus} records have an impossible time and are left out")
-    return notes
 
 
 def _signal(

@@ -35,6 +35,17 @@ class Candidate:
     depth: Signal | None  # Metres, positive down; None where the log does not have it.
 
 
+def damage_notes(skipped: Sequence[tuple[int, int]], unit: str, what: str) -> list[str]:
+    """Return a note on the stretches of a file that hold none of what it should, if any."""
+    if not skipped:
+        return []
+    lost = sum(length for _, length in skipped)
+    return [
+        f"{lost} {unit} are no {what} and are left out, the first at {unit[:-1]} "
+        f"{skipped[0][0]}: the file is damaged or cut short"
+    ]
+
+
 def choose_depth(
     candidates: Sequence[Candidate], pressure_depth: Signal | None
 ) -> tuple[Candidate | None, str | None]:
@@ -192,6 +203,9 @@ def read_tlog(path: Path) -> VehicleLog:
         "velocity_ned": velocity_from,
         "armed": "HEARTBEAT.base_mode" if armed else "",
     }
+    damage = damage_notes(frames.skipped, "bytes", "messages")
+    if frames.n_failed:
+        damage.append(f"{frames.n_failed} messages have a wrong checksum and are left out")
     return VehicleLog(
         name=str(path),
         kind="tlog",
@@ -205,7 +219,7 @@ def read_tlog(path: Path) -> VehicleLog:
         start_utc_s=clock.start_utc_s,
         start_utc_sigma_s=clock.start_utc_sigma_s,
         sources={name: where for name, where in sources.items() if where},
-        notes=tuple(n for n in (others, *_damage(frames), *clock.notes, stuck) if n),
+        notes=tuple(n for n in (others, *damage, *clock.notes, stuck) if n),
     )
 
 
@@ -235,19 +249,6 @@ def _autopilot(frames: SelectedMessages, path: Path) -> tuple[int, str | None]:
         return best, None
     named = ", ".join(str(system) for system in systems)
     return best, f"vehicles {named} speak; {best >> 8} is read, which speaks most"
-
-
-def _damage(frames: SelectedMessages) -> list[str]:
-    notes = []
-    if frames.skipped:
-        lost = sum(length for _, length in frames.skipped)
-        notes.append(
-            f"{lost} bytes are no messages and are left out, the first at byte "
-            f"{frames.skipped[0][0]}: the file is damaged or cut short"
-        )
-    if frames.n_failed:
-        notes.append(f"{frames.n_failed} messages have a wrong checksum and are left out")
-    return notes
 
 
 def _signal(
