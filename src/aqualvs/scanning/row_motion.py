@@ -207,8 +207,8 @@ def _fit_rates(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the plane m·X = 1 at time 0 and the rate of m, from points (N, 3) at their times.
 
-    `points`, `sigma`, `times`, shape (N, 3): in `dome` (m); standard deviations of m·X; seconds.
-    `m`, shape (3,): a first m.
+    `points`, `sigma`, `times`, shapes (N, 3), (N,), (N,): in `dome` (m); standard deviations of
+    m·X; seconds. `m`, shape (3,): a first m.
     """
     prior, both = np.zeros((6, 6)), np.concatenate([m, np.zeros(3)])
     scaled = _by_m(m) / _RATES[:, None]
@@ -353,9 +353,9 @@ def _weigh_motions(
     Unknowns are the posture, relative to what the first frame measured, its rates, its
     accelerations, and how these change, of which the error during a picture is nothing.
 
-    `t`, shape (F,): times from the first frame. `numbers`, `covariances`, `by_motion`, shape (F,
-    3): range, pitch and yaw, and what belongs to them. `variances`, shape (9,): of the motion,
-    before anything is measured.
+    `t`, shape (F,): times from the first frame. `numbers`, `covariances`, `by_motion`, shapes
+    (F, 3), (F, 3, 3), (F, 3, 6): range, pitch and yaw, and what belongs to them. `variances`,
+    shape (9,): of the motion, before anything is measured.
     """
     matrix, right = np.zeros((12, 12)), np.zeros(12)
     for k in range(9):
