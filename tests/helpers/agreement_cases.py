@@ -7,8 +7,8 @@ from aqualvs.geometry.transforms import rotation_from_rotvec
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.sheet import Sheet, sheets_of
 from aqualvs.scanning.laser_bands import SearchAxis, plan_bands
-from aqualvs.scanning.plane_fit import fit_robust, shared_error
-from aqualvs.scanning.posture import Posture, Reason, Refusal, posture_from_fit
+from aqualvs.scanning.plane_fit import PlaneFit, fit_robust, shared_error
+from aqualvs.scanning.posture import Posture, Reason, Refusal, count_inliers, posture_of
 from aqualvs.scanning.scan import Scan, ScanPoints
 from aqualvs.scanning.triangulate import Triangulator
 
@@ -49,6 +49,12 @@ class Target:
             slope = (ahead - behind) / 2e-5
             points = points - (self.height(points) / slope)[:, None] * deeper
         return points
+
+
+def posture_from_fit(fit: PlaneFit, points: np.ndarray, camera_axis_in_dome: np.ndarray) -> Posture:
+    """The posture of a fit to points that all count (paper, Eq. 23-26), without validation."""
+    n_points, nearest = count_inliers(points, np.ones(len(points)))
+    return posture_of(fit, nearest, n_points, camera_axis_in_dome)
 
 
 class Diver:

@@ -30,7 +30,10 @@ def test_file(tmp_path: Path) -> None:
     [
         ("kind: fish", "kind is 'fish'; write 'auto', 'net' or 'solid'"),
         ("type: net", "type is not a key of a net.yaml; allowed here: kind, net, mesh_filter"),
-        ("kind: net\nmesh_filter: {rd_mm: 3}", "mesh_filter.rd_mm is not a key of a net.yaml; did you mean"),
+        (
+            "kind: net\nmesh_filter: {rd_mm: 3}",
+            "mesh_filter.rd_mm is not a key of a net.yaml; did you mean",
+        ),
         ("kind: net\nmesh_filter: {dd_mm: wide}", "mesh_filter.dd_mm is 'wide'"),
         ("kind: net\nmesh_filter: {dd_mm: -1}", "dd is -1 mm"),
         ("- net", "holds no keys"),

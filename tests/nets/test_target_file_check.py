@@ -166,8 +166,14 @@ def test_the_file_says_what_the_net_is(tmp_path: Path) -> None:
         ("net: 25", "net is 25; write keys and values, for example"),
         ("net: {bar_mm: wide}", "net.bar_mm is 'wide'; write a plain number"),
         ("net: {bar_mm: 0}", "net.bar_mm is 0; it must be greater than 0"),
-        ("net: {bar_mm: 20, mesh: knitted}", "net.mesh is 'knitted'; write 'diamond', 'square' or 'hexagon'"),
-        ("net: {bar_mm: 20, colour: green}", "net.colour is not a key of a net.yaml; allowed here: bar_mm"),
+        (
+            "net: {bar_mm: 20, mesh: knitted}",
+            "net.mesh is 'knitted'; write 'diamond', 'square' or 'hexagon'",
+        ),
+        (
+            "net: {bar_mm: 20, colour: green}",
+            "net.colour is not a key of a net.yaml; allowed here: bar_mm",
+        ),
     ],
 )
 def test_bad_nets_are_named(tmp_path: Path, content: str, words: str) -> None:

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
+from agreement_cases import posture_from_fit
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.scanning.plane_fit import PlaneFit
 from aqualvs.scanning.posture import (
     Posture,
     Reason,
     Refusal,
-    posture_from_fit,
     range_pitch_yaw,
     validate,
 )

@@ -72,7 +72,10 @@ def test_file_is_read_in_its_units(tmp_path):
         ("net: {bar_mm: -3}", "net.bar_mm is -3"),
         ("net: {mesh: round}", "net.mesh is 'round'"),
         ("duration_s: .nan", "duration_s is nan"),
-        ("walls: [{behind: 3}]", "walls[0].behind is not a key of this file; did you mean 'behind_mm'?"),
+        (
+            "walls: [{behind: 3}]",
+            "walls[0].behind is not a key of this file; did you mean 'behind_mm'?",
+        ),
         ("[1, 2", "not YAML"),
         ("- 1", "the file is [1]"),
     ],

@@ -111,8 +111,6 @@ def test_a_telemetry_log_is_read(tmp_path: Path, how: dict[str, object]) -> None
     assert log.armed is not None
     assert log.armed.values.tolist() == [0.0] * 3 + [1.0] * 7
     assert [mode for _, mode in log.modes] == ["MANUAL", "ALT_HOLD"]
-    assert log.mode_at(4.0) == "MANUAL"
-    assert log.mode_at(-1.0) is None
     assert log.start_utc_s == pytest.approx(START_US / 1e6 + 0.02, abs=1e-3)
 
 

@@ -139,16 +139,6 @@ class Posture:
         return self.covariance + self.rig_covariance
 
 
-def posture_from_fit(fit: PlaneFit, points: FloatArray, camera_axis_in_dome: FloatArray) -> Posture:
-    """Convert a plane fit to a posture (paper, Eq. 23-26), without validation.
-
-    `fit`: of the target. `points`, shape (N, 3): the inliers of the fit, in `dome`, metres.
-    `camera_axis_in_dome`, shape (3,): unit vector along which the camera looks.
-    """
-    n_points, nearest = count_inliers(points, np.ones(len(points)))
-    return posture_of(fit, nearest, n_points, camera_axis_in_dome)
-
-
 def posture_of(
     fit: PlaneFit, nearest: float, n_points: int, camera_axis_in_dome: FloatArray
 ) -> Posture:

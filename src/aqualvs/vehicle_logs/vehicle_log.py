@@ -237,11 +237,6 @@ class VehicleLog:
             pitch_valid=pitch_valid,
         )
 
-    def mode_at(self, time_s: float) -> str | None:
-        """Return the flight mode at a log time; None before the first that is known."""
-        known = [mode for since, mode in self.modes if since <= time_s]
-        return known[-1] if known else None
-
 
 def _at(signal: Signal | None, times: FloatArray) -> tuple[FloatArray, BoolArray]:
     if signal is None:
