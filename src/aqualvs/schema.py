@@ -5,10 +5,12 @@ A file's keys, types and limits are a `StrictPart`; `validated` checks the conte
 """
 
 import difflib
+import math
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, TypeVar, get_args
+from typing import Annotated, Any, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails
@@ -181,3 +183,29 @@ def parse_settings(
             "anew, or install an aqualvs that reads it"
         )
     return validated(kind, dict(content), name, OptionError)
+
+
+# What a key ends with to tell its unit.
+_UNIT = re.compile(r"_(per_s2?|per_m|deg(_s2?)?|mm|m(_s[23]?)?|n|s|percent|px)$")
+
+
+def without_unit(key: str) -> str:
+    """Return a key without its unit."""
+    return _UNIT.sub("", key)
+
+
+def si_values(part: StrictPart) -> dict[str, Any]:
+    """Return the values of a part by their keys without units: metres, radians and shares."""
+    keys = type(part).model_fields
+    return {without_unit(key): _in_si(key, getattr(part, key)) for key in keys}
+
+
+def _in_si(key: str, value: Any) -> Any:
+    if isinstance(value, list | tuple):
+        return tuple(_in_si(key, one) for one in value)
+    if not isinstance(value, int | float):
+        return value
+    if "_deg" in key:
+        return math.radians(value)
+    per_unit = {"mm": 1e3, "percent": 100.0}.get(key.rpartition("_")[2])
+    return value / per_unit if per_unit else value

@@ -1,10 +1,9 @@
 """The gains file, a short YAML with unit suffixes (docs/control.md), and its strict reader."""
 
 import math
-import re
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import yaml
 from pydantic import Field
@@ -27,24 +26,15 @@ from aqualvs.schema import (
     StrictPart,
     load_settings,
     parse_settings,
+    si_values,
+    without_unit,
 )
 from aqualvs.yamlfile import parse_yaml, write_text
-
-# What a key ends with to tell its unit.
-_UNIT = re.compile(r"_(per_s2?|deg(_s2?)?|m(_s[23]?)?|n|s)$")
-
-
-def si_values(part: StrictPart) -> dict[str, Any]:
-    """Return the values of a part by their keys without units, angles in radians."""
-    return {
-        _UNIT.sub("", key): math.radians(value) if "_deg" in key else value
-        for key, value in part.model_dump().items()
-    }
 
 
 def _in_file_units(kind: type[AnyPart], gains: object) -> AnyPart:
     """Return the part whose values `si_values` gives back, but for rounding."""
-    values = {key: getattr(gains, _UNIT.sub("", key)) for key in kind.model_fields}
+    values = {key: getattr(gains, without_unit(key)) for key in kind.model_fields}
     return kind(**{key: _degrees(v) if "_deg" in key else v for key, v in values.items()})
 
 

@@ -7,7 +7,6 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from aqualvs.control.gains_file import si_values
 from aqualvs.control.missions import (
     FollowMission,
     HoldMission,
@@ -22,7 +21,7 @@ from aqualvs.control.missions import (
 from aqualvs.control.safety import SafetyLimits
 from aqualvs.control.vehicle import Setpoint, SetpointHolder
 from aqualvs.errors import OptionError
-from aqualvs.schema import NotNegative, Number, Positive, StrictPart, load_settings
+from aqualvs.schema import NotNegative, Number, Positive, StrictPart, load_settings, si_values
 
 VERSION = 1
 """Version of the format that is read."""

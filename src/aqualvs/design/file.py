@@ -31,7 +31,15 @@ from aqualvs.optics.rigfile import load_rig, shutter_from_part
 from aqualvs.optics.rigschema import ShutterPart, Tilt
 from aqualvs.optics.shutter import AT_ONCE, Shutter
 from aqualvs.optics.water import N_AIR, seawater_index_vacuum
-from aqualvs.schema import Index, NotNegative, Number, Positive, StrictPart, parse_settings
+from aqualvs.schema import (
+    Index,
+    NotNegative,
+    Number,
+    Positive,
+    StrictPart,
+    parse_settings,
+    si_values,
+)
 from aqualvs.yamlfile import parse_yaml, read_yaml
 
 KEY, VERSION = "aqualvs_design", 1
@@ -58,7 +66,7 @@ goals: {range_percent: 0.5, angle_deg: 0.5}  # errors that are equally bad
 avoid_crossings: true
 """
 
-_MM = 1e-3
+_MM = 1e3
 
 # Limits beyond which numbers are mistakes: 100 m, and the pictures of the largest cameras.
 _MAX_MM, _MAX_PX = 1e5, 32_768
@@ -146,7 +154,7 @@ class NoisePart(StrictPart):
     point_px: Positive = Noise().point
     strand_px: Positive = Noise().strand
     shared_px: NotNegative = Noise().shared
-    stripe_mm: NotNegative = Noise().stripe / _MM
+    stripe_mm: NotNegative = 1e3 * Noise().stripe
     twine_percent: NotNegative = 100.0 * Noise().twine
 
 
@@ -258,14 +266,14 @@ def design_of_rig(rig: Rig, fan_deg: float = FAN_DEG) -> Design:
 
 
 def _design(file: DesignFile, folder: Path) -> Design:
-    near, far = (value * _MM for value in file.working_range_mm)
+    near, far = (value / _MM for value in file.working_range_mm)
     if not near < far:
         raise OptionError(
             f"working_range_mm is {file.working_range_mm}; write the nearest range first, then a "
             "larger one"
         )
     lens, size_px, shutter = _camera(file.camera, folder)
-    position = np.array(file.lens.position_mm) * _MM
+    position = np.array(file.lens.position_mm) / _MM
     rig = Rig(
         name=file.name,
         size_px=size_px,
@@ -282,10 +290,10 @@ def _design(file: DesignFile, folder: Path) -> Design:
     return Design(
         rig=rig,
         mounts=_mounts(file),
-        centring=file.lens.centring_mm * _MM,
-        noise=_noise(file.noise),
+        centring=file.lens.centring_mm / _MM,
+        noise=Noise(**si_values(file.noise)),
         tolerances=_tolerances(file.tolerances),
-        net=NominalNet(bar=file.net.bar_mm * _MM, twine=file.net.twine_mm * _MM),
+        net=NominalNet(**si_values(file.net)),
         goals=Goals(
             range_share=file.goals.range_percent / 100.0,
             angle=math.radians(file.goals.angle_deg),
@@ -299,11 +307,11 @@ def _housing(file: DesignFile) -> Housing | None:
     if dome is not None and flat is not None:
         raise OptionError("dome and flat are both given; leave one out")
     if dome is not None:
-        return Dome(dome.inner_radius_mm * _MM, dome.thickness_mm * _MM, dome.n_acrylic)
+        return Dome(dome.inner_radius_mm / _MM, dome.thickness_mm / _MM, dome.n_acrylic)
     if flat is None:
         return None
     tilt = [math.radians(value) for value in flat.tilt_deg]
-    return FlatPort(flat.distance_mm * _MM, flat.thickness_mm * _MM, flat.n_port, *tilt)
+    return FlatPort(flat.distance_mm / _MM, flat.thickness_mm / _MM, flat.n_port, *tilt)
 
 
 def _camera(camera: CameraDesign, folder: Path) -> tuple[Lens, tuple[int, int], Shutter]:
@@ -352,8 +360,8 @@ def _mounts(file: DesignFile) -> tuple[Mount, ...]:
     if lasers is not None:
         placed = ring(
             lasers.count,
-            lasers.baseline_mm * _MM,
-            lasers.back_mm * _MM,
+            lasers.baseline_mm / _MM,
+            lasers.back_mm / _MM,
             math.radians(lasers.fan_deg),
         )
         return tuple(replace(mount, free_stripe=lasers.turn_stripes) for mount in placed)
@@ -365,7 +373,7 @@ def _mounts(file: DesignFile) -> tuple[Mount, ...]:
 
 
 def _mount(part: MountPart) -> Mount:
-    x, y, z = (value * _MM for value in part.position_mm)
+    x, y, z = (value / _MM for value in part.position_mm)
     given = part.stripe_deg
     stripe = math.radians(given) % math.pi if isinstance(given, float | int) else None
     return Mount(
@@ -379,23 +387,13 @@ def _mount(part: MountPart) -> Mount:
     )
 
 
-def _noise(part: NoisePart) -> Noise:
-    return Noise(
-        point=part.point_px,
-        strand=part.strand_px,
-        shared=part.shared_px,
-        stripe=part.stripe_mm * _MM,
-        twine=part.twine_percent / 100.0,
-    )
-
-
 def _tolerances(part: TolerancesPart) -> Tolerances:
     return Tolerances(
-        lens=part.lens_mm * _MM,
+        lens=part.lens_mm / _MM,
         rotation=math.radians(part.rotation_deg),
         focal=part.focal_percent / 100.0,
-        dome=part.dome_mm * _MM,
+        dome=part.dome_mm / _MM,
         n_water=part.n_water,
         laser_angle=math.radians(part.laser_deg),
-        laser_offset=part.laser_mm * _MM,
+        laser_offset=part.laser_mm / _MM,
     )

@@ -17,9 +17,8 @@ from pydantic import ConfigDict, Field
 from scipy.interpolate import PchipInterpolator
 
 from aqualvs.errors import OptionError
-from aqualvs.geometry.linear_algebra import Vec
 from aqualvs.geometry.transforms import SE3
-from aqualvs.schema import NotNegative, Number, Positive, StrictPart, validated
+from aqualvs.schema import NotNegative, Number, Positive, StrictPart, si_values, validated
 from aqualvs.simulation.scene import (
     Box,
     Bubble,
@@ -372,7 +371,7 @@ class ScenarioFile(_Part):
             nets=(_net(self.net, self.seed),) if self.net else (),
             fish=random_fish(rng, self.fish, self.duration_s, behind),
             bubbles=random_bubbles(rng, self.bubbles, self.duration_s, behind),
-            boxes=tuple(_box(box) for box in self.boxes),
+            boxes=tuple(Box(**si_values(box)) for box in self.boxes),
             water=_water(self.water),
             sensor=CameraSensor(**self.sensor.model_dump()),
             lasers_on=self.lasers_on,
@@ -434,55 +433,21 @@ def _target(file: ScenarioFile) -> Target:
     return "wall" if upright else "none"
 
 
-def _metres(values: tuple[float, float, float]) -> Vec:
-    return values[0] / 1e3, values[1] / 1e3, values[2] / 1e3
-
-
 def _net(net: NetFile, seed: int) -> Net:
-    half = net.half_size_mm or (np.inf, np.inf)
-    return Net(
-        mesh=net.mesh,
-        bar=net.bar_mm / 1e3,
-        twine=net.twine_mm / 1e3,
-        roll=float(np.deg2rad(net.roll_deg)),
-        hanging_ratio=net.hanging_ratio,
-        fouling=net.fouling,
-        growth=net.growth,
-        missing=net.missing,
-        holes=tuple(_metres(hole) for hole in net.holes_mm),
-        curvature=net.curvature_per_m,
-        folds=tuple(_fold(fold) for fold in net.folds),
-        half_size=(half[0] / 1e3, half[1] / 1e3),
-        seed=seed,
-    )
+    values = si_values(net)
+    values["folds"] = tuple(_fold(fold) for fold in net.folds)
+    values["half_size"] = values["half_size"] or (np.inf, np.inf)
+    return Net(**values, seed=seed)
 
 
 def _fold(fold: FoldFile) -> Fold:
-    return Fold(
-        direction=float(np.deg2rad(fold.direction_deg)),
-        place=fold.place_mm / 1e3,
-        height=fold.height_mm / 1e3,
-        width=fold.width_mm / 1e3,
-        period=fold.every_mm / 1e3,
-    )
+    values = si_values(fold)
+    return Fold(period=values.pop("every"), **values)
 
 
 def _wall(wall: WallFile) -> Wall:
-    return Wall(
-        depth=wall.behind_mm / 1e3,
-        yaw=float(np.deg2rad(wall.yaw_deg)),
-        pitch=float(np.deg2rad(wall.pitch_deg)),
-        contrast=wall.contrast,
-        tile_pitch=wall.tile_mm / 1e3,
-    )
-
-
-def _box(box: BoxFile) -> Box:
-    return Box(
-        centre=_metres(box.centre_mm),
-        size=_metres(box.size_mm),
-        heading=float(np.deg2rad(box.heading_deg)),
-    )
+    values = si_values(wall)
+    return Wall(depth=values.pop("behind"), tile_pitch=values.pop("tile"), **values)
 
 
 def _water(water: WaterFile) -> WaterOptics:
