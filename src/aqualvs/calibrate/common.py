@@ -22,10 +22,8 @@ from aqualvs.calibration_formats import refuse_foreign
 from aqualvs.errors import CalibrationError, OptionError, RigError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.optics.camera import Housing
-from aqualvs.optics.dome import Dome
-from aqualvs.optics.flat_port import FlatPort
 from aqualvs.optics.rig import Laser, Rig, RigUncertainty
-from aqualvs.optics.rigfile import keep_dated, load_rig, save_rig
+from aqualvs.optics.rigfile import housing_of, keep_dated, load_rig, save_rig
 from aqualvs.optics.rigschema import LaserWavelength
 from aqualvs.optics.shutter import AT_ONCE, Shutter
 from aqualvs.optics.water import N_AIR
@@ -157,11 +155,7 @@ def _housing(file: _File, path: Path) -> Housing | None:
     dome, flat = file.dome, file.flat
     if dome is not None and flat is not None:
         raise RigError(f"{path}: dome and flat: both are given; leave one out")
-    if dome is not None:
-        return Dome(dome.inner_radius_mm / 1e3, dome.thickness_mm / 1e3, dome.n_acrylic)
-    if flat is None:
-        return None
-    return FlatPort(flat.distance_mm / 1e3, flat.thickness_mm / 1e3, flat.n_port)
+    return housing_of(dome, flat)
 
 
 Echo: TypeAlias = Callable[[str], object]

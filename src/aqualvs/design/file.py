@@ -23,11 +23,9 @@ from aqualvs.design.settings import (
 from aqualvs.errors import OptionError, RigError
 from aqualvs.geometry.transforms import SE3
 from aqualvs.optics.camera import Housing
-from aqualvs.optics.dome import Dome
-from aqualvs.optics.flat_port import FlatPort
 from aqualvs.optics.lens import Lens, LensModel
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig
-from aqualvs.optics.rigfile import load_rig, shutter_from_part
+from aqualvs.optics.rigfile import housing_of, load_rig, shutter_from_part
 from aqualvs.optics.rigschema import ShutterPart, Tilt
 from aqualvs.optics.shutter import AT_ONCE, Shutter
 from aqualvs.optics.water import N_AIR, seawater_index_vacuum
@@ -306,12 +304,7 @@ def _housing(file: DesignFile) -> Housing | None:
     dome, flat = file.dome, file.flat
     if dome is not None and flat is not None:
         raise OptionError("dome and flat are both given; leave one out")
-    if dome is not None:
-        return Dome(dome.inner_radius_mm / _MM, dome.thickness_mm / _MM, dome.n_acrylic)
-    if flat is None:
-        return None
-    tilt = [math.radians(value) for value in flat.tilt_deg]
-    return FlatPort(flat.distance_mm / _MM, flat.thickness_mm / _MM, flat.n_port, *tilt)
+    return housing_of(dome, flat)
 
 
 def _camera(camera: CameraDesign, folder: Path) -> tuple[Lens, tuple[int, int], Shutter]:

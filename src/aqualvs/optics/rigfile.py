@@ -38,6 +38,7 @@ from aqualvs.optics.rigschema import (
 from aqualvs.optics.shutter import AT_ONCE, Shutter, ShutterKind
 from aqualvs.optics.solved import rig_uncertainty
 from aqualvs.optics.water import GREEN_NM, seawater_index_vacuum
+from aqualvs.schema import StrictPart, si_values
 from aqualvs.yamlfile import carry_comments, parse_yaml, read_text, rig_text
 
 _STAMP = re.compile(r"\.(\d{4}-\d\d-\d\dT\d{6})(?:-(\d+))?")
@@ -277,12 +278,18 @@ def _housing(file: RigFile) -> Housing | None:
     if file.housing not in (None, kind):
         said = "neither 'dome' nor 'flat' is given" if kind == "none" else f"'{kind}' is given"
         raise RigError(f"housing is {file.housing!r} but {said}; make them agree")
+    return housing_of(dome, flat)
+
+
+def housing_of(dome: StrictPart | None, flat: StrictPart | None) -> Housing | None:
+    """Return the housing that one of two sections of a file describes; None without both."""
     if dome is not None:
-        return Dome(dome.inner_radius_mm / _MILLI, dome.thickness_mm / _MILLI, dome.n_acrylic)
+        return Dome(**si_values(dome))
     if flat is None:
         return None
-    tilt = [math.radians(value) for value in flat.tilt_deg]
-    return FlatPort(flat.distance_mm / _MILLI, flat.thickness_mm / _MILLI, flat.n_port, *tilt)
+    values = si_values(flat)
+    tilt_x, tilt_y = values.pop("tilt", (0.0, 0.0))
+    return FlatPort(**values, tilt_x=tilt_x, tilt_y=tilt_y)
 
 
 def shutter_from_part(part: ShutterPart) -> Shutter:
