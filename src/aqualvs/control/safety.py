@@ -261,7 +261,8 @@ class SafetyGate:
 
     def _effort_in_doubt(self, now_s: float) -> Effort:
         """Return the brake while it lasts, then neutral."""
-        if self._brake.effort > 0.0 and now_s < self._brake.until_s - _TICK_S:
+        tick_s = 1e-3
+        if self._brake.effort > 0.0 and now_s < self._brake.until_s - tick_s:
             return Effort(forward=-min(self._brake.effort, 1.0))
         if self._doubt is not None and self._doubt.takes_over:
             self.latched = self._doubt
@@ -320,7 +321,6 @@ class SafetyGate:
         return _clipped(effort), None
 
 
-_TICK_S = 1e-3
 # The dome's centre is some 30 mm behind the hull's front, and pictures end at 0.3 m: the retreat
 # reaches its full effort before that.
 _FIRM_WITHIN_M = 0.05

@@ -39,17 +39,15 @@ from aqualvs.scanning.stripe import StripePeaks
 from aqualvs.sources.base import Feed, Health, PartHealth, State
 from aqualvs.sources.fields import frames_of, size_of_frames
 
-_GREY, _LIGHT, _THICK_PX, _BLUR_PX = 30, 150, 3, 1.2
-_ROUNDS = 2
-
 
 def warm_up(scanner: Scanner) -> Scan:
     """Let a scanner measure made-up pictures, which loads its compiled kernels.
 
     Returns the scan of a wall in the middle of the working range, square to the vehicle.
     """
+    rounds = 2
     picture = wall_frame(scanner.rig)
-    for _ in range(_ROUNDS):
+    for _ in range(rounds):
         for frame in frames_of([picture], scanner.rig.shutter):
             scan = scanner.process(frame)
     return scan
@@ -57,17 +55,18 @@ def warm_up(scanner: Scanner) -> Scan:
 
 def wall_frame(rig: Rig) -> Frame:
     """Return a picture of the stripes on a wall in the middle of the working range."""
+    grey, light, thick_px, blur_px = 30, 150, 3, 1.2
     camera = rig.camera()
     width, height = rig.size_px
-    luma = np.full((height, width), _GREY, np.uint8)
+    luma = np.full((height, width), grey, np.uint8)
     for sheet in sheets_of(rig):
         stripe = see_stripe(camera, sheet, 0.5 * sum(rig.working_range))
         # OpenCV takes fixed-point coordinates, here in 1/16 px.
         pixels = np.rint(16.0 * stripe.pixels).astype(np.int32)
-        cv2.polylines(luma, [pixels], False, _LIGHT, _THICK_PX, cv2.LINE_AA, shift=4)
-    luma = np.asarray(cv2.GaussianBlur(luma, (0, 0), _BLUR_PX), np.uint8)
+        cv2.polylines(luma, [pixels], False, light, thick_px, cv2.LINE_AA, shift=4)
+    luma = np.asarray(cv2.GaussianBlur(luma, (0, 0), blur_px), np.uint8)
     half = (-(-width // 2), -(-height // 2))
-    lit = cv2.resize(luma, half, interpolation=cv2.INTER_AREA).astype(np.float64) - _GREY
+    lit = cv2.resize(luma, half, interpolation=cv2.INTER_AREA).astype(np.float64) - grey
     u = np.clip(120.0 - 0.4 * lit, 0.0, 255.0).astype(np.uint8)
     return Frame(0, 0.0, luma, (u, np.full_like(u, 110)))
 
@@ -225,12 +224,6 @@ def _are_one_picture(first: Frame, second: Frame) -> bool:
     return second.field is not None and first.index // 2 == second.index // 2
 
 
-# A feed promises to end within a second of being closed.
-_READER_TIMEOUT_S = 3.0
-# After an unexpected exception the feed is restarted.
-_AGAIN_S = 1.0
-
-
 class FrameReader:
     """Reader of a feed in a thread of its own; a context manager.
 
@@ -258,14 +251,16 @@ class FrameReader:
 
     def __exit__(self, *_: object) -> None:
         """End the feed and the thread."""
+        reader_timeout_s = 3.0  # A feed promises to end within a second of being closed.
         self._closing.set()
         self._feed.close()
         self._mailbox.close()
-        self._thread.join(_READER_TIMEOUT_S)
+        self._thread.join(reader_timeout_s)
         if self._thread.is_alive():
             _log.warning("%s: did not end in time", self._feed.name)
 
     def _read(self) -> None:
+        again_s = 1.0  # After an unexpected exception the feed is restarted.
         try:
             while not self._closing.is_set():
                 try:
@@ -277,7 +272,7 @@ class FrameReader:
                     # The thread must not die silently: the pilot would see an old picture.
                     _log.exception("%s: reading failed; trying again", self._feed.name)
                     self._trouble = f"{type(fault).__name__}: {fault}"
-                    self._closing.wait(_AGAIN_S)
+                    self._closing.wait(again_s)
         finally:
             self._mailbox.close()
 

@@ -24,16 +24,12 @@ from aqualvs.optics.camera import Camera, parameter_names
 from aqualvs.optics.rig import Rig, RigUncertainty
 from aqualvs.optics.sheet import packed_sheets, sheet_distance, sheet_tangent, sheets_of
 
-# Nodes of the lattice: bilinear interpolation of r^6 over it is good to 2 % in the corners.
-_LATTICE = (33, 25)
 # Segments of stripe that represent all of it: in total, and per laser at least.
 _BINS, _MIN_BINS = 24, 3
 # Least number of points that are summed, where there are as many.
 _ENOUGH = 384
 # A pivot below this share of its diagonal is rounding, not information.
 _MIN_PIVOT = 1e-12
-# Central differences: this share of a sigma, and no more than this in any unit.
-_STEP_SHARE, _LARGEST_STEP = 0.1, 1e-4
 
 
 class FittedSurface(NamedTuple):
@@ -98,11 +94,13 @@ class PostureErrors:
     """
 
     def __init__(self, rig: Rig, camera: Camera, uncertainty: RigUncertainty) -> None:
+        # Central differences: this share of a sigma, and no more than this in any unit.
+        step_share, largest_step = 0.1, 1e-4
         sigmas = uncertainty.sigmas
         # Numbers of the rig that have an uncertainty, P of them.
         self.names = tuple(name for name in uncertainty.names if sigmas[name] > 0.0)
         self.covariance = uncertainty.of(self.names)  # Shape (P, P): theirs.
-        steps = {name: min(_STEP_SHARE * sigmas[name], _LARGEST_STEP) for name in self.names}
+        steps = {name: min(step_share * sigmas[name], largest_step) for name in self.names}
         self._camera = camera
         self._n_lasers = len(rig.lasers)
         self._moves = _sheet_moves(rig, camera, steps)
@@ -167,8 +165,10 @@ class PostureErrors:
         return jacobian, covariance
 
     def _derivatives_on_lattice(self) -> "_Lattice":
+        # Nodes of the lattice: bilinear interpolation of r^6 over it is good to 2 % in the corners.
+        lattice = (33, 25)
         width, height = self._camera.size_px
-        n_x, n_y = _LATTICE
+        n_x, n_y = lattice
         x, y = np.meshgrid(np.linspace(0, width - 1, n_x), np.linspace(0, height - 1, n_y))
         pixels = np.stack([x, y], axis=-1).reshape(-1, 2)
         rays = self._camera.rays(pixels)

@@ -509,12 +509,6 @@ def _is_dense_net(surface: Surface, surfaces: list[Surface], subsegments: Subseg
     )
 
 
-# A mesh reaches far with this share of the widest mesh's extent.
-_WIDE_SHARE = 0.75
-# And it is well supported with this share of the best one's support.
-_INLIER_SHARE = 0.35
-
-
 class TargetKind(StrEnum):
     """Kind of surface that the posture is measured to."""
 
@@ -579,6 +573,8 @@ def choose_target(
 
 
 def _nearest_far_reaching(meshes: Sequence[Surface]) -> Surface | None:
+    wide_share = 0.75  # A mesh reaches far with this share of the widest mesh's extent.
+    inlier_share = 0.35  # And it is well supported with this share of the best one's support.
     farthest = max((surface.extent for surface in meshes), default=0.0)
     # What has long intervals as well may be a wall in a net's shadows: no measure of a net's light.
     broken = [surface for surface in meshes if not surface.is_unbroken] or meshes
@@ -586,7 +582,7 @@ def _nearest_far_reaching(meshes: Sequence[Surface]) -> Surface | None:
     wide = [
         one
         for one in meshes
-        if one.extent >= _WIDE_SHARE * farthest and one.sampling_weight >= _INLIER_SHARE * most
+        if one.extent >= wide_share * farthest and one.sampling_weight >= inlier_share * most
     ]
     best = max(meshes, key=lambda surface: surface.sampling_weight, default=None)
     return min(wide, key=lambda surface: surface.plane.offset, default=best)

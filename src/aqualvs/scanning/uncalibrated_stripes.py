@@ -40,10 +40,6 @@ _WIDTH_OF_SIGMA = 2.355
 _MAP_LENGTH = 30000
 # Pieces that are less likely than needed by more than these log odds continue nothing.
 _HELP = 2.0
-# Pieces expected by chance in the window up to one that continues a line. Of the pieces of a class
-# the k-th likeliest is met with this chance over k, so that some hundredths of all ends are
-# continued by another thing.
-_MAX_FALSE_ALARMS = 0.01
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -356,6 +352,10 @@ def _next_piece(
     area_px: float,
 ) -> int:
     """Return the piece that continues piece `a` beyond one of its ends, or -1."""
+    # Pieces expected by chance in the window up to one that continues a line. Of the pieces of a
+    # class the k-th likeliest is met with this chance over k, so that some hundredths of all ends
+    # are continued by another thing.
+    max_false_alarms = 0.01
     ahead, way_px, near = _ahead(ends, a, end)
     turn = _turn(ends.outward[a, end], ends.outward[by_chance, 1])
     for b in ahead[np.argsort(way_px[ahead])]:
@@ -363,7 +363,7 @@ def _next_piece(
         others = (log_odds[by_chance] >= log_odds[b]) & (turn <= turn_rad)
         # One at least, so that windows do not reach across a picture with little else in it.
         n = max(int(np.count_nonzero(others)), 1)
-        if n / area_px * _window_px(ends, a, end, way_px[b]) <= _MAX_FALSE_ALARMS:
+        if n / area_px * _window_px(ends, a, end, way_px[b]) <= max_false_alarms:
             return int(b)
         if in_line[b]:
             break

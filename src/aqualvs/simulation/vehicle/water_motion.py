@@ -23,8 +23,6 @@ GRAVITY = 9.81
 _OMEGA, _NUMBER, _NORTH, _EAST, _HEIGHT, _PHASE, _WAVE_COLUMNS = range(7)
 _DRIFT_NORTH, _DRIFT_EAST, _DRIFT_COLUMNS = 2, 3, 4
 _DRIFT_TERMS = 6
-# Steeper waves break (Stokes' limit is 0.44 for amplitude times wave number).
-_STEEPEST = 0.44
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,6 +42,8 @@ class Waves:
     spread: float = 0.25
 
     def __post_init__(self) -> None:
+        # Steeper waves break (Stokes' limit is 0.44 for amplitude times wave number).
+        steepest = 0.44
         if not (self.amplitude >= 0.0 and self.period > 0.0 and self.n >= 1):
             raise OptionError(
                 f"waves: amplitude {self.amplitude:g} m, period {self.period:g} s, n {self.n}; "
@@ -52,10 +52,10 @@ class Waves:
         if not 0.0 <= self.spread < 1.0:
             raise OptionError(f"waves: spread {self.spread:g}; choose 0 or more, less than 1")
         number = (2.0 * math.pi / self.period) ** 2 / GRAVITY
-        if self.amplitude * number > _STEEPEST:
+        if self.amplitude * number > steepest:
             raise OptionError(
                 f"waves: amplitude {self.amplitude:g} m at a period of {self.period:g} s would "
-                f"break; choose at most {_STEEPEST / number:.2f} m"
+                f"break; choose at most {steepest / number:.2f} m"
             )
 
     def table(self, rng: np.random.Generator) -> FloatArray:
