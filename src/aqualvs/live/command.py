@@ -25,7 +25,7 @@ from aqualvs.recording import PictureFormat, RecorderOptions, RecorderSwitch
 from aqualvs.recording.sample import LiveSample
 from aqualvs.results.run_request import Water, prepared_rig
 from aqualvs.scanner import Scanner, ScannerOptions
-from aqualvs.scanning.posture import Posture
+from aqualvs.scanning.posture import Posture, deviations
 from aqualvs.scanning.scan import Frame
 from aqualvs.sources.base import Feed, PartHealth, State
 from aqualvs.sources.fields import FrameFeed
@@ -138,11 +138,11 @@ def status_line(sample: LiveSample) -> str:
     """Return posture and health of a sample in one line."""
     posture, health = sample.scan.posture, sample.health
     if isinstance(posture, Posture):
-        sigma = posture.total_covariance.diagonal() ** 0.5
+        sigma = deviations(posture.total_covariance)
         told = (
             f"range {posture.range:.3f} ± {sigma[0]:.3f} m  "
-            f"yaw {math.degrees(posture.yaw):+.1f} ± {math.degrees(sigma[2]):.1f} deg  "
-            f"pitch {math.degrees(posture.pitch):+.1f} ± {math.degrees(sigma[1]):.1f} deg"
+            f"yaw {math.degrees(posture.yaw):+.1f} ± {sigma[2]:.1f} deg  "
+            f"pitch {math.degrees(posture.pitch):+.1f} ± {sigma[1]:.1f} deg"
         )
     else:
         told = f"no posture: {posture.detail or posture.reason.value}"

@@ -13,7 +13,6 @@ import numpy as np
 
 from aqualvs.control.time_filter import FilteredPosture
 from aqualvs.errors import OptionError
-from aqualvs.geometry.arrays import FloatArray
 from aqualvs.optics.rig import Rig
 from aqualvs.recording.encoding import (
     CHROMA,
@@ -36,7 +35,7 @@ from aqualvs.recording.encoding import (
 from aqualvs.recording.sample import LiveSample
 from aqualvs.scanner import ScannerOptions
 from aqualvs.scanning.laser_bands import SearchAxis
-from aqualvs.scanning.posture import Posture, Reason, Refusal
+from aqualvs.scanning.posture import Posture, Reason, Refusal, deviations
 from aqualvs.scanning.scan import Frame, GyroRates, ScanPoints
 from aqualvs.scanning.stripe import StripePeaks
 from aqualvs.sources.base import Health, PartHealth, State
@@ -221,7 +220,7 @@ def _posture_values(posture: Posture | Refusal) -> list[float]:
     sigma_curvature = posture.sigma_curvature or (_NAN, _NAN)
     return [
         *(posture.range, math.degrees(posture.pitch), math.degrees(posture.yaw)),
-        *_sigmas(posture.covariance),
+        *deviations(posture.covariance),
         *(posture.slant_range, posture.nearest, posture.rms),
         *posture.normal_in_dome,
         *np.ravel(posture.covariance),
@@ -235,15 +234,10 @@ def _rig_values(posture: Posture | Refusal) -> list[float]:
     if not isinstance(posture, Posture):
         return [_NAN] * 15
     return [
-        *_sigmas(posture.rig_covariance),
-        *_sigmas(posture.total_covariance),
+        *deviations(posture.rig_covariance),
+        *deviations(posture.total_covariance),
         *np.ravel(posture.rig_covariance),
     ]
-
-
-def _sigmas(covariance: FloatArray) -> list[float]:
-    sigma = np.sqrt(np.diagonal(covariance))
-    return [sigma[0], math.degrees(sigma[1]), math.degrees(sigma[2])]
 
 
 def _filtered_values(filtered: FilteredPosture | None) -> list[float]:

@@ -1,5 +1,6 @@
 """Overlay of stripe points and posture on a picture, and the video of such pictures."""
 
+import math
 from fractions import Fraction
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from aqualvs.closing import Closing
 from aqualvs.errors import OutputError
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.optics.rig import Rig
-from aqualvs.scanning.posture import Posture, Refusal
+from aqualvs.scanning.posture import Posture, Refusal, deviations
 from aqualvs.scanning.scan import ImagePlane, ScanPoints
 from aqualvs.text import bgr, laser_colour, reason_text
 
@@ -70,11 +71,10 @@ def posture_lines(posture: Posture | Refusal) -> list[str]:
     if isinstance(posture, Refusal):
         lines = ["no posture", reason_text(posture.reason)]
         return [*lines, posture.detail] if posture.detail else lines
-    sigma = np.sqrt(np.diag(posture.total_covariance))
-    pitch, yaw = np.rad2deg([posture.pitch, posture.yaw])
-    sigma_pitch, sigma_yaw = np.rad2deg(sigma[1:])
+    sigma_range, sigma_pitch, sigma_yaw = deviations(posture.total_covariance)
+    pitch, yaw = math.degrees(posture.pitch), math.degrees(posture.yaw)
     return [
-        f"range {posture.range * 1e3:7.1f} ± {sigma[0] * 1e3:.1f} mm",
+        f"range {posture.range * 1e3:7.1f} ± {sigma_range * 1e3:.1f} mm",
         f"pitch {pitch:+7.2f} ± {sigma_pitch:.2f}°",
         f"yaw   {yaw:+7.2f} ± {sigma_yaw:.2f}°",
     ]

@@ -18,8 +18,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
-import numpy as np
-
 from aqualvs.closing import Closing
 from aqualvs.errors import OutputError, SourceError
 from aqualvs.geometry.arrays import FloatArray
@@ -28,7 +26,7 @@ from aqualvs.results.files import AppendFile, Claim, explain, locked_folder, wri
 from aqualvs.results.points import DRAFT, PointsExport, PointsStream, check_idle, export_points
 from aqualvs.results.run_request import RunFile, Status, now, read_run_yaml, write_yaml
 from aqualvs.results.summary import RunSummary, summary_of
-from aqualvs.scanning.posture import Posture
+from aqualvs.scanning.posture import Posture, deviations
 from aqualvs.scanning.scan import Scan
 from aqualvs.special_files import refuse_special
 
@@ -97,6 +95,11 @@ class PostureCsv(Closing):
         self._file.append(row.encode("ascii"))
 
 
+def posture_cells(scan: Scan) -> dict[str, str]:
+    """Return the cells of a frame's row by their columns."""
+    return dict(zip(POSTURE_COLUMNS, posture_row(scan).rstrip("\n").split(","), strict=True))
+
+
 def posture_row(scan: Scan) -> str:
     """Return a frame's row with its line end; without a posture the numbers stay empty."""
     head = f"{scan.index},{scan.time_s:.6f}"
@@ -119,9 +122,7 @@ def _rig(posture: Posture) -> str:
 
 
 def _sigmas(covariance: FloatArray) -> str:
-    """Return standard deviations of range (m), pitch and yaw (deg)."""
-    sigma_range, sigma_pitch, sigma_yaw = np.sqrt(covariance.diagonal()).tolist()
-    return f"{sigma_range:.4g},{math.degrees(sigma_pitch):.4g},{math.degrees(sigma_yaw):.4g}"
+    return ",".join(f"{sigma:.4g}" for sigma in deviations(covariance))
 
 
 def _numbers(posture: Posture) -> str:

@@ -191,6 +191,13 @@ def validate(
     return posture
 
 
+def deviations(covariance: FloatArray) -> tuple[float, float, float]:
+    """Return standard deviations of range (m), pitch and yaw (degrees); NaN where unknown."""
+    variances = covariance.diagonal()[:3]
+    sigma_range, pitch, yaw = np.sqrt(np.where(variances >= 0.0, variances, np.nan)).tolist()
+    return sigma_range, math.degrees(pitch), math.degrees(yaw)
+
+
 def range_pitch_yaw(m: FloatArray) -> tuple[float, float, float]:
     """Return range (m), pitch and yaw (rad) of m·X = 1 (paper, Eq. 25-26 as arctangents)."""
     x, y, z = m.tolist()

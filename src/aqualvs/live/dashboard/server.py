@@ -44,8 +44,8 @@ from aqualvs.live.dashboard.access import (
 )
 from aqualvs.optics.rig import Rig
 from aqualvs.recording.sample import LiveSample
-from aqualvs.results.folder import POSTURE_COLUMNS, posture_row
-from aqualvs.scanning.posture import Refusal
+from aqualvs.results.folder import posture_cells
+from aqualvs.scanning.posture import Refusal, deviations
 from aqualvs.scanning.scan import Label, ScanPoints
 from aqualvs.sources.base import Health, PartHealth
 from aqualvs.text import laser_colour
@@ -61,12 +61,11 @@ def page_state(
 
     Its `posture` holds the cells of the frame's row in `posture.csv`, as they are written there.
     """
-    row = posture_row(sample.scan).rstrip("\n").split(",")
     posture = sample.scan.posture
     found = {
         "kind": "state",
         "utc_ms": sample.utc_ns // 10**6,
-        "posture": dict(zip(POSTURE_COLUMNS, row, strict=True)),
+        "posture": posture_cells(sample.scan),
         "detail": posture.detail if isinstance(posture, Refusal) else "",
         "n_water": f"{sample.scan.n_water:.4f}",
         "filtered": _filtered(sample.filtered),
@@ -127,12 +126,11 @@ def _vehicle(state: VehicleState | None) -> dict[str, float | None] | None:
 def _filtered(filtered: FilteredPosture | None) -> dict[str, float] | None:
     if filtered is None:
         return None
-    sigma = np.sqrt(filtered.total_covariance.diagonal())
     return {
         "range_m": filtered.range,
         "pitch_deg": math.degrees(filtered.pitch),
         "yaw_deg": math.degrees(filtered.yaw),
-        "sigma_range_m": float(sigma[0]),
+        "sigma_range_m": deviations(filtered.total_covariance)[0],
         "age_s": filtered.age_s,
     }
 

@@ -235,15 +235,24 @@ def check_address(address: Address) -> None:
 def _open_udp(address: NetAddress, *, passive: bool) -> tuple[socket.socket, tuple[object, ...]]:
     """Return a socket that never waits, and the address as the system writes it."""
     flags = socket.AI_PASSIVE if passive else 0
-    found = socket.getaddrinfo(address.host, address.port, type=socket.SOCK_DGRAM, flags=flags)
-    # Autopilots and their routers listen on IPv4, also where the name has both kinds of address.
-    family, kind, protocol, _, where = min(found, key=lambda entry: entry[0] != socket.AF_INET)
-    made = socket.socket(family, kind, protocol)
+    family, where = find_host(address.host, address.port, flags)
+    made = socket.socket(family, socket.SOCK_DGRAM)
     made.setblocking(False)
     return made, where
 
 
-class _UdpPort:
+def find_host(host: str, port: int, flags: int) -> tuple[int, tuple[object, ...]]:
+    """Return family and address of a host for datagrams.
+
+    It is IPv4 where the name has both kinds of address: autopilots and their routers listen there.
+    `flags`: of `getaddrinfo`, whose exceptions it raises.
+    """
+    found = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM, flags=flags)
+    family, _, _, _, where = min(found, key=lambda entry: entry[0] != socket.AF_INET)
+    return family, where
+
+
+class UdpPort:
     """Common base of UDP ports: a datagram goes at once or not at all."""
 
     unsent = False
@@ -255,15 +264,17 @@ class _UdpPort:
         self.refused_s: float | None = None
 
     def fileno(self) -> int:
+        """Return the number of the socket."""
         return self._socket.fileno()
 
     def flush(self) -> None:
         """Do nothing: nothing ever waits."""
 
     def close(self) -> None:
+        """Free the socket."""
         self._socket.close()
 
-    def _sent(self, frames: bytes, where: Peer) -> bool:
+    def sent(self, frames: bytes, where: Peer) -> bool:
         """Send a datagram to an address, or to the connected peer if that is empty."""
         # A refusal belongs to an earlier datagram; this one has not been tried yet.
         for _ in range(2):
@@ -294,7 +305,7 @@ class _UdpPort:
         return b"", ()
 
 
-class _UdpSender(_UdpPort):
+class _UdpSender(UdpPort):
     """Port that sends to one address and hears only that."""
 
     many = False
@@ -313,13 +324,13 @@ class _UdpSender(_UdpPort):
         return self._received()[0], ()
 
     def write(self, frames: bytes, _peer: Peer, /) -> bool:
-        return self._sent(frames, ())
+        return self.sent(frames, ())
 
     def write_all(self, frames: bytes, _heard: Sequence[Peer], /) -> bool:
-        return self._sent(frames, ())
+        return self.sent(frames, ())
 
 
-class _UdpBroadcaster(_UdpPort):
+class _UdpBroadcaster(UdpPort):
     """Port that sends to a broadcast address and hears all that answer."""
 
     many = True
@@ -339,13 +350,13 @@ class _UdpBroadcaster(_UdpPort):
         return self._received()
 
     def write(self, frames: bytes, peer: Peer, /) -> bool:
-        return self._sent(frames, peer)
+        return self.sent(frames, peer)
 
     def write_all(self, frames: bytes, _heard: Sequence[Peer], /) -> bool:
-        return self._sent(frames, self._where)
+        return self.sent(frames, self._where)
 
 
-class _UdpListener(_UdpPort):
+class _UdpListener(UdpPort):
     """Listens, and sends to those it has heard."""
 
     many = True
@@ -370,7 +381,7 @@ class _UdpListener(_UdpPort):
     def write(self, frames: bytes, peer: Peer, /) -> bool:
         """Send to one peer; one that cannot be reached must not keep it from the others."""
         try:
-            return self._sent(frames, peer)
+            return self.sent(frames, peer)
         except OSError:
             return False
 

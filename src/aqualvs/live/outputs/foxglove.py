@@ -16,6 +16,7 @@ from aqualvs.errors import OptionError, OutputError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.planes import upright_axes
 from aqualvs.geometry.transforms import quaternion_from_rotation
+from aqualvs.live.outputs.ros_messages import FLU_FROM_DOME
 from aqualvs.optics.rig import Laser, Rig
 from aqualvs.recording import messages
 from aqualvs.recording.encoding import HEALTH, PICTURE, POINTS, POSTURE, RIG, RecordedTopic, jpeg_of
@@ -46,7 +47,6 @@ if TYPE_CHECKING:
 VEHICLE = "vehicle"
 """Axes of REP-103: x forward, y left, z up, as 3D views expect them; origin as `dome`."""
 
-_VEHICLE_FROM_DOME: FloatArray = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 # Side of the square that represents the target, as a share of its range.
 _SIDE_SHARE = 1.0
 _GREEN, _BLUE = (0.1, 1.0, 0.3, 1.0), (0.2, 0.6, 1.0, 0.25)
@@ -60,7 +60,7 @@ def transforms(rig: Rig, stamp_ns: int) -> "FrameTransforms":
     camera = rig.dome_from_cam
     return FrameTransforms(
         transforms=[
-            _transform(VEHICLE, FRAME_ID, _VEHICLE_FROM_DOME, np.zeros(3), stamp_ns),
+            _transform(VEHICLE, FRAME_ID, FLU_FROM_DOME, np.zeros(3), stamp_ns),
             _transform(FRAME_ID, "cam", camera.rotation, camera.translation, stamp_ns),
         ]
     )

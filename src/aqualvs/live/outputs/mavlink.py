@@ -8,7 +8,7 @@ from aqualvs.control.vehicle import VehicleState
 from aqualvs.live.mavlink.ardusub import FRESH_S, DepthChoice, attitude_of, turning_of
 from aqualvs.live.mavlink.link import LinkOptions, MavlinkLink
 from aqualvs.recording.sample import LiveSample
-from aqualvs.scanning.posture import Posture, Refusal
+from aqualvs.scanning.posture import Posture, Refusal, deviations
 from aqualvs.scanning.scan import GyroRates, ScanPoints
 from aqualvs.sources.base import PartHealth
 
@@ -182,15 +182,15 @@ def _numbers(posture: Posture | Refusal, n_water: float) -> tuple[float, ...]:
     """Return what `NAMES` names."""
     if not isinstance(posture, Posture):
         return (0.0, _NAN, _NAN, _NAN, _NAN, _NAN, _NAN, n_water)
-    variance = posture.total_covariance
+    sigma_range, sigma_pitch, sigma_yaw = deviations(posture.total_covariance)
     return (
         1.0,
         1e3 * posture.range,
         math.degrees(posture.pitch),
         math.degrees(posture.yaw),
-        1e3 * _root(variance[0, 0]),
-        math.degrees(_root(variance[1, 1])),
-        math.degrees(_root(variance[2, 2])),
+        1e3 * sigma_range,
+        sigma_pitch,
+        sigma_yaw,
         n_water,
     )
 
@@ -206,7 +206,3 @@ def _filtered_numbers(filtered: FilteredPosture | None) -> tuple[float, ...]:
         math.degrees(filtered.yaw),
         1e3 * float(filtered.rates[0]),
     )
-
-
-def _root(variance: float) -> float:
-    return math.sqrt(variance) if variance >= 0.0 else _NAN

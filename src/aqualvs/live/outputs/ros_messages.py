@@ -28,7 +28,7 @@ from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import FloatArray, as_vectors
 from aqualvs.optics.rig import Rig
 from aqualvs.recording.sample import LiveSample
-from aqualvs.scanning.posture import Posture, Reason
+from aqualvs.scanning.posture import Posture, Reason, deviations
 from aqualvs.scanning.scan import Label, ScanPoints
 from aqualvs.sources.base import Health, PartHealth, State
 
@@ -185,10 +185,7 @@ def _posture_status(sample: LiveSample) -> DiagnosticStatus:
         told = f"{posture.reason}: {posture.detail}" if posture.detail else str(posture.reason)
         return DiagnosticStatus(Level.WARN, name, told, rig, (("reason", str(posture.reason)),))
     pitch, yaw = math.degrees(posture.pitch), math.degrees(posture.yaw)
-    frame, whole = (
-        [math.sqrt(covariance[i, i]) for i in range(3)]
-        for covariance in (posture.covariance, posture.total_covariance)
-    )
+    frame, whole = deviations(posture.covariance), deviations(posture.total_covariance)
     return DiagnosticStatus(
         Level.OK,
         name,
@@ -199,11 +196,11 @@ def _posture_status(sample: LiveSample) -> DiagnosticStatus:
             pitch_deg=pitch,
             yaw_deg=yaw,
             sigma_range_m=frame[0],
-            sigma_pitch_deg=math.degrees(frame[1]),
-            sigma_yaw_deg=math.degrees(frame[2]),
+            sigma_pitch_deg=frame[1],
+            sigma_yaw_deg=frame[2],
             sigma_range_total_m=whole[0],
-            sigma_pitch_total_deg=math.degrees(whole[1]),
-            sigma_yaw_total_deg=math.degrees(whole[2]),
+            sigma_pitch_total_deg=whole[1],
+            sigma_yaw_total_deg=whole[2],
             slant_range_m=posture.slant_range,
             nearest_m=posture.nearest,
             n_points=posture.n_points,

@@ -1,6 +1,5 @@
 """Posture as one line of JSON in a UDP datagram."""
 
-import errno
 import json
 import math
 import socket
@@ -9,15 +8,13 @@ import time
 from collections.abc import Sequence
 from typing import TypeAlias
 
-import numpy as np
-
 from aqualvs.control.time_filter import FilteredPosture
 from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import FloatArray
-from aqualvs.live.mavlink.ports import parse_host_port
+from aqualvs.live.mavlink.ports import UdpPort, find_host, parse_host_port
 from aqualvs.recording.sample import LiveSample
-from aqualvs.results.folder import POSTURE_COLUMNS
-from aqualvs.scanning.posture import Posture, Refusal
+from aqualvs.results.folder import POSTURE_COLUMNS, posture_cells
+from aqualvs.scanning.posture import Refusal, deviations
 from aqualvs.sources.base import PartHealth, State
 
 FORMAT_VERSION = 1
@@ -71,7 +68,8 @@ def json_fields(sample: LiveSample) -> dict[str, Value]:
     }
     if refusal is not None:
         fields["reason"], fields["detail"] = refusal.reason.value, refusal.detail or None
-    fields |= _posture_fields(posture if isinstance(posture, Posture) else None)
+    cells = posture_cells(scan)
+    fields |= {key: _number(cells[key]) for key in _POSTURE_KEYS}
     fields["n_water"] = _fixed(scan.n_water, 6)
     fields |= _filtered_fields(sample.filtered)
     fields["rate_hz"] = _fixed(sample.health.rate_hz, 3)
@@ -80,28 +78,11 @@ def json_fields(sample: LiveSample) -> dict[str, Value]:
     return fields
 
 
-def _posture_fields(posture: Posture | None) -> dict[str, Value]:
-    if posture is None:
-        return dict.fromkeys(_POSTURE_KEYS)
-    bent = (*(posture.curvature or ()), *(posture.sigma_curvature or ()))
-    return dict(
-        zip(
-            _POSTURE_KEYS,
-            (
-                _fixed(posture.range, 6),
-                _fixed(math.degrees(posture.pitch), 5),
-                _fixed(math.degrees(posture.yaw), 5),
-                *_sigmas(posture.covariance),
-                _fixed(posture.slant_range, 6),
-                _fixed(posture.nearest, 6),
-                posture.n_points,
-                *([_short(value) for value in bent] if len(bent) == 4 else [None] * 4),
-                *_sigmas(posture.rig_covariance),
-                *_sigmas(posture.total_covariance),
-            ),
-            strict=True,
-        )
-    )
+def _number(cell: str) -> Value:
+    """Return the number in a cell of `posture.csv`."""
+    if cell.isdecimal():
+        return int(cell)
+    return float(cell) if cell and math.isfinite(float(cell)) else None
 
 
 def _filtered_fields(filtered: FilteredPosture | None) -> dict[str, Value]:
@@ -135,22 +116,12 @@ def _delay_s(sample: LiveSample) -> Value:
     return _fixed(1e-9 * (sample.instants.scanned_ns - sample.instants.arrived_ns), 6)
 
 
-def _sigmas(cov: FloatArray) -> list[Value]:
-    """Return the standard deviations of range (m), pitch and yaw (deg); None for missing ones."""
-    variances = np.diagonal(cov)[:3].tolist()
-    sigma = [math.sqrt(value) if value >= 0.0 else math.nan for value in variances]
-    return [_short(value) for value in (sigma[0], math.degrees(sigma[1]), math.degrees(sigma[2]))]
+def _sigmas(covariance: FloatArray) -> list[Value]:
+    return [_number(f"{sigma:.4g}") for sigma in deviations(covariance)]
 
 
 def _fixed(value: float, digits: int) -> Value:
     return round(float(value), digits) if math.isfinite(value) else None
-
-
-def _short(value: float) -> Value:
-    return float(f"{value:.4g}") if math.isfinite(value) else None
-
-
-_NOT_NOW = (errno.EAGAIN, errno.EWOULDBLOCK, errno.ENOBUFS, errno.EINTR)
 
 
 class UdpJsonOutput:
@@ -205,11 +176,11 @@ class _Receiver:
         found = parse_host_port(address)
         if found is None or not all(found):
             raise OptionError(f"JSON over UDP, receiver {address!r}: write HOST:PORT")
-        self._address, (self._host, self._port) = address, found
+        self._address, (self._host, self._number) = address, found
         self.n_dropped = 0
         self._trouble = ""
-        self._refused_s = self._opened_s = -math.inf
-        self._socket: socket.socket | None = None
+        self._opened_s = -math.inf
+        self._port: UdpPort | None = None
         self._closing = threading.Event()
         self._where = self._lookup(socket.AI_NUMERICHOST)
         if self._where is None:
@@ -219,63 +190,48 @@ class _Receiver:
     def fault(self) -> str:
         """Return the fault of this receiver, empty if there is none."""
         refused_for_s = 3.0
-        if time.monotonic() - self._refused_s < refused_for_s:
+        refused_s = None if self._port is None else self._port.refused_s
+        if refused_s is not None and time.monotonic() - refused_s < refused_for_s:
             return f"nobody listens at {self._address}"
         return f"{self._address}: {self._trouble}" if self._trouble else ""
 
     def send(self, line: bytes) -> None:
         """Send a line or drop it."""
         try:
-            sent = self._open() and self._sent(line)
+            port = self._opened()
+            sent = port is not None and port.sent(line, ())
         except OSError as fault:
             self._trouble = fault.strerror or str(fault)
-            self._drop_socket()
+            self._drop_port()
             sent = False
+        if sent:
+            self._trouble = ""
         self.n_dropped += not sent
 
     def close(self) -> None:
         self._closing.set()
-        self._drop_socket()
+        self._drop_port()
 
-    def _sent(self, line: bytes) -> bool:
-        if self._socket is None:
-            return False
-        # A refusal belongs to an earlier datagram; this one has not been tried yet.
-        for _ in range(2):
-            try:
-                self._socket.send(line)
-            except (ConnectionRefusedError, ConnectionResetError):
-                self._refused_s = time.monotonic()
-            except OSError as fault:
-                if fault.errno in _NOT_NOW:
-                    return False
-                raise
-            else:
-                self._trouble = ""
-                return True
-        return False
-
-    def _open(self) -> bool:
-        """Open the socket if necessary; return whether it is open."""
+    def _opened(self) -> UdpPort | None:
+        """Return the port, opened if necessary; None while that cannot be tried."""
         reopen_every_s = 0.25
-        if self._socket is not None:
-            return True
         now = time.monotonic()
-        if self._where is None or now - self._opened_s < reopen_every_s:
-            return False
-        self._opened_s = now
-        family, where = self._where
-        self._socket = socket.socket(family, socket.SOCK_DGRAM)
-        self._socket.setblocking(False)
-        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
-        # Connected, so that the system reports a closed port.
-        self._socket.connect(where)
-        return True
+        due = now - self._opened_s >= reopen_every_s
+        if self._port is None and self._where is not None and due:
+            self._opened_s = now
+            family, where = self._where
+            made = socket.socket(family, socket.SOCK_DGRAM)
+            self._port = UdpPort(made)
+            made.setblocking(False)
+            made.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+            # Connected, so that the system reports a closed port.
+            made.connect(where)
+        return self._port
 
-    def _drop_socket(self) -> None:
-        if self._socket is not None:
-            self._socket.close()
-            self._socket = None
+    def _drop_port(self) -> None:
+        if self._port is not None:
+            self._port.close()
+            self._port = None
 
     def _resolve(self) -> None:
         resolve_every_s = 2.0
@@ -287,10 +243,9 @@ class _Receiver:
     def _lookup(self, flags: int) -> tuple[int, tuple[object, ...]] | None:
         """Return family and address of the host, IPv4 first; None if it is not known."""
         try:
-            found = socket.getaddrinfo(self._host, self._port, type=socket.SOCK_DGRAM, flags=flags)
+            found = find_host(self._host, self._number, flags)
         except (OSError, UnicodeError) as fault:
             self._trouble = (fault.strerror if isinstance(fault, OSError) else "") or str(fault)
             return None
         self._trouble = ""
-        family, _, _, _, where = min(found, key=lambda entry: entry[0] != socket.AF_INET)
-        return family, where
+        return found
