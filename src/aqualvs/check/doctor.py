@@ -49,8 +49,6 @@ from aqualvs.sources.opening import is_address
 from aqualvs.sources.video import sampled_pictures
 
 _HEARTBEAT_S, _LISTEN_S = 6.0, 3.0
-# Between heartbeats the attitude tells that the vehicle is there; channels show the pilot's sticks.
-_ATTITUDE_HZ, _CHANNELS_HZ = 10.0, 5.0
 _SUBMARINE = 12
 _SEVERITY = {
     Weight.FINE: Severity.OK,
@@ -154,19 +152,23 @@ def _station(link: MavlinkLink, steering: ArduSubOptions) -> Finding:
 
 
 def _attitude(rate_hz: float) -> Finding:
+    # Between heartbeats it tells that the vehicle is there.
+    enough_hz = 10.0
     words = f"ATTITUDE {rate_hz:.0f} Hz"
-    if rate_hz >= _ATTITUDE_HZ:
+    if rate_hz >= enough_hz:
         return Finding(Severity.OK, f"{words}: follow hears the vehicle between its heartbeats")
     return Finding(
         Severity.WARN,
         f"{words}: follow takes the vehicle for silent between its heartbeats; set MAV1_EXTRA1 "
-        f"{_ATTITUDE_HZ:.0f} (before 4.7: SR0_EXTRA1; the number is that of the autopilot's port)",
+        f"{enough_hz:.0f} (before 4.7: SR0_EXTRA1; the number is that of the autopilot's port)",
     )
 
 
 def _channels(rate_hz: float) -> Finding:
+    # Channels show the pilot's sticks.
+    enough_hz = 5.0
     words = f"RC_CHANNELS {rate_hz:.0f} Hz"
-    if rate_hz >= _CHANNELS_HZ:
+    if rate_hz >= enough_hz:
         return Finding(
             Severity.OK, f"{words}: follow sees the pilot's sticks, and whether ours are obeyed"
         )

@@ -47,9 +47,6 @@ from aqualvs.optics.solved import (
 SURFACES = "surfaces"
 """Extra of the step `lasers`: the surfaces that lasers were seen on, or how many there were."""
 
-# What good pictures leave: corners 0.05 to 0.2 px, stripes 0.1 to 0.3.
-_LARGE_RMS_PX = 1.0
-_OLD_DAYS = 365
 _FEW_PICTURES = {"camera": 5, "dome": 2}
 # Beyond these a calibration has not found what it was for.
 _LENS_M, _TURN, _FOCAL_SHARE, _INDEX = 2e-3, math.radians(0.5), 0.005, 2e-3
@@ -91,7 +88,9 @@ def _told(name: str, step: SolvedStep, now: datetime) -> Finding:
         f"{count_text(step.pictures, 'picture')} with {count_text(step.points, 'point')}, to "
         f"{step.rms_px:.2g} px rms"
     )
-    if step.rms_px > _LARGE_RMS_PX:
+    # Good pictures leave 0.05 to 0.2 px for corners, 0.1 to 0.3 for stripes.
+    large_rms_px = 1.0
+    if step.rms_px > large_rms_px:
         return Finding(
             Severity.WARN,
             f"{sentence}: good pictures leave 0.3 px or less; check the board's square size and "
@@ -101,14 +100,14 @@ def _told(name: str, step: SolvedStep, now: datetime) -> Finding:
 
 
 def _doubts(name: str, step: SolvedStep, now: datetime) -> Iterator[Finding]:
-    days = (now - step.date).days
+    days, old_days = (now - step.date).days, 365
     if days < -1:
         yield Finding(
             Severity.WARN,
             f"The date of solved_from.{name}, {step.date:%Y-%m-%d}, is yet to come; set the clock "
             "of the computer that calibrates.",
         )
-    if days > _OLD_DAYS:
+    if days > old_days:
         yield Finding(
             Severity.WARN,
             f"The calibration of the {name} is more than a year old; take one picture of a known "
@@ -244,9 +243,6 @@ def _angle(rays: Rays, first: int, second: int) -> float:
     return float(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
 
-EXIT_SANE, EXIT_BAD = 0, 2
-
-
 def run_check(path: Path, console: Console | None = None) -> int:
     """Check a rig file, print what was found, and return the exit code.
 
@@ -271,7 +267,7 @@ def run_check(path: Path, console: Console | None = None) -> int:
     if errors:
         console.print(sensitivity_table(rig, errors))
         console.print(error_table(errors))
-    return EXIT_BAD if bad else EXIT_SANE
+    return 2 if bad else 0
 
 
 def check_rig(rig: Rig, now: datetime | None = None) -> list[Finding]:

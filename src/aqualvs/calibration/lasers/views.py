@@ -30,8 +30,6 @@ from aqualvs.optics.camera import Camera
 
 # A corner belongs to a plane of the box within this distance, in metres.
 _ON_PLANE = 1e-4
-_MAX_STEPS = 50
-_SMALL_TURN, _SMALL_SHIFT = 1e-10, 1e-10
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,13 +57,14 @@ def spatial_pose(camera: Camera, view: View, start: SE3) -> SpatialPose:
     # With the closed form of lambda the residual is the part at right angles to the ray.
     across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
     middle, pose = points.mean(axis=0), start
-    for _ in range(_MAX_STEPS):
+    max_steps, small_turn, small_shift = 50, 1e-10, 1e-10
+    for _ in range(max_steps):
         in_dome = pose.apply(points)
         rows = np.einsum("nij,nj->ni", across, in_dome - origins).reshape(-1)
         slopes = (across @ point_by_pose(in_dome, pose.apply(middle))).reshape(-1, 6)
         step = -np.linalg.lstsq(slopes, rows, rcond=None)[0]
         pose = moved_target(pose, middle, step)
-        if np.all(np.abs(step[:3]) < _SMALL_TURN) and np.all(np.abs(step[3:]) < _SMALL_SHIFT):
+        if np.all(np.abs(step[:3]) < small_turn) and np.all(np.abs(step[3:]) < small_shift):
             break
     missed = np.einsum("nij,nj->ni", across, pose.apply(points) - origins)
     cost = float(np.sum(missed**2))

@@ -20,10 +20,6 @@ from aqualvs.optics.water import (
     seawater_index_vacuum,
 )
 
-# Air's index less one goes with its density: 3 K or 10 hPa change it by 1 %, 3e-6.
-_SIGMA_AIR = 1e-5
-_STEP_NM = 1.0
-
 
 @dataclass(frozen=True, slots=True)
 class IndexPrior:
@@ -53,7 +49,9 @@ class IndexPrior:
         The accuracy that target place and lens reach with this index is kept when the vehicle goes
         into the water.
         """
-        return cls(n_air, _SIGMA_AIR, "air")
+        # Air's index less one goes with its density: 3 K or 10 hPa change it by 1 %, 3e-6.
+        sigma_air = 1e-5
+        return cls(n_air, sigma_air, "air")
 
     @classmethod
     def seawater(
@@ -88,14 +86,15 @@ class IndexPrior:
         """
         n = float(seawater_index_vacuum(temperature_c, salinity_permille, wavelength_nm))
         slopes = seawater_index_slopes(temperature_c, salinity_permille, wavelength_nm)
-        side = math.copysign(_STEP_NM, GREEN_NM - wavelength_nm)
+        step_nm = 1.0
+        side = math.copysign(step_nm, GREEN_NM - wavelength_nm)
         beside = seawater_index_vacuum(temperature_c, salinity_permille, wavelength_nm + side)
         # Standard deviation of the fit of Quan & Fry (1995) to its data.
         sigma_formula = 1.5e-5
         parts = (
             float(slopes.by_temperature) * sigma_temperature_c,
             float(slopes.by_salinity) * sigma_salinity_permille,
-            (float(beside) - n) / _STEP_NM * sigma_wavelength_nm,
+            (float(beside) - n) / step_nm * sigma_wavelength_nm,
             sigma_formula,
         )
         source = f"{temperature_c:g} °C, {salinity_permille:g} per mille"
