@@ -13,9 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from aqualvs.errors import OutputError
+from aqualvs.optics.expected_error import ExpectedError
 from aqualvs.report.calibration_material import (
     CalibrationPage,
-    ExpectationRow,
     LaserRow,
     Overlay,
     ParameterRow,
@@ -98,17 +98,15 @@ def laser(**changes: Any) -> LaserRow:
     return replace(row, **changes)
 
 
-def expectation(range_m: float, **changes: Any) -> ExpectationRow:
-    row = ExpectationRow(
-        range_m=range_m,
-        sigma_range_mm=0.3,
-        sigma_pitch_deg=0.03,
-        sigma_yaw_deg=0.06,
-        noise_range_mm=0.4,
-        noise_pitch_deg=0.04,
-        noise_yaw_deg=0.08,
-    )
-    return replace(row, **changes)
+def expectation(
+    range_m: float,
+    sigma: tuple[float, float, float] = (0.3, 0.03, 0.06),
+    noise: tuple[float, float, float] = (0.4, 0.04, 0.08),
+) -> ExpectedError:
+    """Return an error of `sigma` and `noise` of range, pitch and yaw, in mm and degrees."""
+    units = np.array([1e-3, np.pi / 180.0, np.pi / 180.0])
+    of_noise, of_rig = (np.diag((units * some) ** 2) for some in (noise, sigma))
+    return ExpectedError(wall_range=range_m, per_pixel=(), noise=of_noise, calibration=of_rig)
 
 
 def full_page(words: str = "plain") -> CalibrationPage:
@@ -232,7 +230,7 @@ def test_unknown_numbers_show_as_a_dash() -> None:
             ParameterRow(name="r", value=float("inf"), sigma=0.0, before=2.0),
         ),
         expectations=(
-            expectation(1.0, sigma_yaw_deg=NAN),
+            expectation(1.0, (0.3, 0.03, NAN)),
             expectation(NAN),
             expectation(0.0),
         ),
@@ -309,13 +307,13 @@ def test_expectation_adds_both_causes_and_is_fine_within_limits() -> None:
 @pytest.mark.parametrize(
     ("changes", "flagged"),
     [
-        ({"noise_range_mm": 5.1}, {"0.510", "0.511"}),
-        ({"sigma_pitch_deg": 0.51}, {"0.510", "0.512"}),
-        ({"noise_yaw_deg": 0.499, "sigma_yaw_deg": 0.4}, {"0.640"}),
+        ({"noise": (5.1, 0.04, 0.08)}, {"0.510", "0.511"}),
+        ({"sigma": (0.3, 0.51, 0.06)}, {"0.510", "0.512"}),
+        ({"noise": (0.4, 0.04, 0.499), "sigma": (0.3, 0.03, 0.4)}, {"0.640"}),
     ],
 )
 def test_expectation_beyond_a_limit_is_flagged(
-    changes: dict[str, float], flagged: set[str]
+    changes: dict[str, tuple[float, float, float]], flagged: set[str]
 ) -> None:
     html = page_html(
         CalibrationPage(title="t", expectations=(expectation(0.5), expectation(1.0, **changes)))
@@ -327,11 +325,11 @@ def test_expectation_beyond_a_limit_is_flagged(
 
 
 def test_expectation_without_noise_speaks_for_the_calibration_alone() -> None:
-    alone = {"noise_range_mm": NAN, "noise_pitch_deg": NAN, "noise_yaw_deg": NAN}
-    html = page_html(CalibrationPage(title="t", expectations=(expectation(1.0, **alone),)))
+    alone = expectation(1.0, noise=(NAN, NAN, NAN))
+    html = page_html(CalibrationPage(title="t", expectations=(alone,)))
     assert "the calibration alone gives the range to 0.3 mm (0.03 %)" in html
     unknown = page_html(
-        CalibrationPage(title="t", expectations=(expectation(1.0, sigma_range_mm=NAN),))
+        CalibrationPage(title="t", expectations=(expectation(1.0, (NAN, 0.03, 0.06)),))
     )
     assert "is not known" in unknown
     assert "Good to" not in unknown

@@ -13,7 +13,6 @@ from enum import StrEnum
 import numpy as np
 from rich.table import Table
 
-from aqualvs.geometry.arrays import FloatArray
 from aqualvs.optics.expected_error import (
     N_POINTS,
     SIGMA_PX,
@@ -21,6 +20,7 @@ from aqualvs.optics.expected_error import (
     ExpectedError,
     WallView,
     expected_posture_errors,
+    in_mm_and_degrees,
 )
 from aqualvs.optics.rig import Rig, RigUncertainty
 from aqualvs.optics.shutter import ShutterKind
@@ -88,7 +88,7 @@ def check_errors(errors: Sequence[ExpectedError]) -> Iterator[Finding]:
 
 
 def _noise_finding(expected: ExpectedError, place: str) -> Finding:
-    range_mm, pitch, yaw = _shown_units(expected.sigma_noise)
+    range_mm, pitch, yaw = in_mm_and_degrees(expected.sigma_noise)
     sentence = (
         f"{place} noise of {SIGMA_PX} px alone gives a standard deviation of {range_mm:.2g} mm in "
         f"range, {pitch:.2g} degrees in pitch and {yaw:.2g} in yaw"
@@ -101,7 +101,7 @@ def _noise_finding(expected: ExpectedError, place: str) -> Finding:
 
 
 def _calibration_finding(expected: ExpectedError, place: str) -> Finding:
-    range_mm, pitch, yaw = _shown_units(expected.sigma_calibration)
+    range_mm, pitch, yaw = in_mm_and_degrees(expected.sigma_calibration)
     share = 1e-3 * range_mm / expected.wall_range
     sentence = (
         f"{place} the uncertainty of the rig leaves a systematic error of {range_mm:.2g} mm "
@@ -145,7 +145,7 @@ def error_table(errors: Sequence[ExpectedError]) -> Table:
             "both": expected.sigma,
         }
         for i, (name, sigmas) in enumerate(rows.items()):
-            range_mm, pitch, yaw = _shown_units(sigmas)
+            range_mm, pitch, yaw = in_mm_and_degrees(sigmas)
             share = 0.1 * range_mm / expected.wall_range
             place = "" if i else f"{expected.wall_range * 1e3:.0f}"
             table.add_row(place, name, *map(_shown, (range_mm, share, pitch, yaw)))
@@ -157,7 +157,7 @@ def error_words(errors: Sequence[ExpectedError]) -> Iterator[str]:
     if not errors or not errors[len(errors) // 2].valid:
         return
     middle = errors[len(errors) // 2]
-    range_mm, pitch, yaw = _shown_units(middle.sigma)
+    range_mm, pitch, yaw = in_mm_and_degrees(middle.sigma)
     share = 1e-3 * range_mm / middle.wall_range
     yield (
         f"At {middle.wall_range * 1e3:.0f} mm expect errors of {range_mm:.2g} mm ({share:.2%}) in "
@@ -181,12 +181,6 @@ def index_sigma(rig: Rig) -> float:
     slope = (more - here)[seen & seen_more] / index_step
     information = float(np.sum(slope**2)) / SIGMA_PX**2
     return 1.0 / np.sqrt(information) if information > 0.0 else np.inf
-
-
-def _shown_units(sigmas: FloatArray) -> tuple[float, float, float]:
-    """Return (range, pitch, yaw) in millimetres and degrees."""
-    range_m, pitch, yaw = sigmas.tolist()
-    return range_m * 1e3, math.degrees(pitch), math.degrees(yaw)
 
 
 def _shown(value: float) -> str:

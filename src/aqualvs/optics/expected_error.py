@@ -7,6 +7,7 @@ to point and from frame to frame; calibration errors are the same in all frames 
 averaging does not reduce them.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
@@ -139,6 +140,12 @@ class ExpectedError:
     def sigma(self) -> FloatArray:
         """Standard deviations (range, pitch, yaw) of both together."""
         return _sigmas(self.noise + self.calibration)
+
+
+def in_mm_and_degrees(sigmas: FloatArray) -> tuple[float, float, float]:
+    """Return standard deviations of (range, pitch, yaw) in millimetres and degrees."""
+    range_m, pitch, yaw = sigmas.tolist()
+    return 1e3 * range_m, math.degrees(pitch), math.degrees(yaw)
 
 
 def expected_posture_errors(

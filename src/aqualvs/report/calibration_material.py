@@ -18,7 +18,7 @@ import numpy as np
 from aqualvs import __version__
 from aqualvs.calibration.targets.targets import View
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.optics.expected_error import expected_posture_errors
+from aqualvs.optics.expected_error import ExpectedError, expected_posture_errors
 from aqualvs.optics.rig import Rig, RigUncertainty
 from aqualvs.optics.solved import completed_uncertainty, rig_numbers
 from aqualvs.report.html import Card
@@ -42,6 +42,11 @@ class ResidualMap:
     # Shape (N,): False for points that the solution did not use.
     inliers: BoolArray
 
+    @property
+    def used_residuals(self) -> FloatArray:
+        """Residuals of the points that the solution used."""
+        return self.residuals[self.inliers]
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ViewRow:
@@ -64,21 +69,6 @@ class ParameterRow:
     unit: str = ""
     digits: int = 2  # Decimals of the value.
     before: float | None = None  # What the rig said before the calibration.
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ExpectationRow:
-    """Standard deviations of posture to expect on a target after the calibration."""
-
-    range_m: float  # Distance of the target.
-    # Systematic: from the calibration's covariance, the same in every picture.
-    sigma_range_mm: float
-    sigma_pitch_deg: float
-    sigma_yaw_deg: float
-    # Random: from the noise of the stripes in one picture.
-    noise_range_mm: float = float("nan")
-    noise_pitch_deg: float = float("nan")
-    noise_yaw_deg: float = float("nan")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -153,7 +143,7 @@ class CalibrationPage:
     residual_maps: tuple[ResidualMap, ...] = ()
     views: tuple[ViewRow, ...] = ()
     parameters: tuple[ParameterRow, ...] = ()
-    expectations: tuple[ExpectationRow, ...] = ()
+    expectations: tuple[ExpectedError, ...] = ()  # On targets.
     lasers: tuple[LaserRow, ...] = ()  # In the rig's order, which gives them their colours.
     series: tuple[Series, ...] = ()
     pictures: tuple[PictureShot, ...] = ()
@@ -184,22 +174,9 @@ _NAMES = {
 }
 
 
-def expectations(rig: Rig) -> tuple[ExpectationRow, ...]:
+def expectations(rig: Rig) -> tuple[ExpectedError, ...]:
     """Return what a rig's calibration means on a wall at the usual ranges; none without lasers."""
-    if not rig.lasers:
-        return ()
-    return tuple(
-        ExpectationRow(
-            range_m=found.wall_range,
-            sigma_range_mm=1e3 * float(found.sigma_calibration[0]),
-            sigma_pitch_deg=_DEG * float(found.sigma_calibration[1]),
-            sigma_yaw_deg=_DEG * float(found.sigma_calibration[2]),
-            noise_range_mm=1e3 * float(found.sigma_noise[0]),
-            noise_pitch_deg=_DEG * float(found.sigma_noise[1]),
-            noise_yaw_deg=_DEG * float(found.sigma_noise[2]),
-        )
-        for found in expected_posture_errors(rig, completed_uncertainty(rig))
-    )
+    return expected_posture_errors(rig, completed_uncertainty(rig)) if rig.lasers else ()
 
 
 def parameter_rows(

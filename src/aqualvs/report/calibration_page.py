@@ -11,12 +11,12 @@ from pathlib import Path
 
 import numpy as np
 
+from aqualvs.optics.expected_error import ExpectedError, in_mm_and_degrees
 from aqualvs.report import html
 from aqualvs.report import svg as draw
 from aqualvs.report.calibration_charts import N_VECTORS, picture_view, residual_view
 from aqualvs.report.calibration_material import (
     CalibrationPage,
-    ExpectationRow,
     LaserRow,
     ParameterRow,
     ViewRow,
@@ -75,7 +75,7 @@ def parameter_table(rows: Sequence[ParameterRow]) -> Raw:
     return Raw(table(head, cells))
 
 
-def expectation_view(rows: Sequence[ExpectationRow]) -> Raw:
+def expectation_view(rows: Sequence[ExpectedError]) -> Raw:
     """Return what the calibration lets expect on a target: a sentence and a table."""
     head = ("target at", "σ from", "range, mm", "range, %", "pitch, °", "yaw, °")
     cells = [line for row in rows for line in _expectation_lines(row)]
@@ -186,10 +186,10 @@ def _change_cells(row: ParameterRow) -> list[str]:
     ]
 
 
-def _parts_of(row: ExpectationRow) -> dict[str, tuple[float, float, float]]:
+def _parts_of(row: ExpectedError) -> dict[str, tuple[float, float, float]]:
     """Return standard deviations of range (mm), pitch and yaw (degrees) by their cause."""
-    system = (row.sigma_range_mm, row.sigma_pitch_deg, row.sigma_yaw_deg)
-    noise = (row.noise_range_mm, row.noise_pitch_deg, row.noise_yaw_deg)
+    system = in_mm_and_degrees(row.sigma_calibration)
+    noise = in_mm_and_degrees(row.sigma_noise)
     both = [math.hypot(s, n) for s, n in zip(system, noise, strict=True)]
     return {
         "calibration": system,
@@ -198,16 +198,16 @@ def _parts_of(row: ExpectationRow) -> dict[str, tuple[float, float, float]]:
     }
 
 
-def _percent(row: ExpectationRow, range_mm: float) -> float:
-    return 0.1 * range_mm / row.range_m if row.range_m > 0.0 else math.nan
+def _percent(row: ExpectedError, range_mm: float) -> float:
+    return 0.1 * range_mm / row.wall_range if row.wall_range > 0.0 else math.nan
 
 
-def _expectation_lines(row: ExpectationRow) -> Iterator[list[str]]:
+def _expectation_lines(row: ExpectedError) -> Iterator[list[str]]:
     for cause, (range_mm, pitch, yaw) in _parts_of(row).items():
         percent = _percent(row, range_mm)
         strong = cause == "both"
         yield [
-            f"{number(row.range_m, 2)} m" if cause == "calibration" else "",
+            f"{number(row.wall_range, 2)} m" if cause == "calibration" else "",
             Raw(f"<b>{cause}</b>") if strong else cause,
             number(range_mm, 2),
             _marked(number(percent, 3), percent > LIMIT_PERCENT),
@@ -216,21 +216,21 @@ def _expectation_lines(row: ExpectationRow) -> Iterator[list[str]]:
         ]
 
 
-def _excess(row: ExpectationRow) -> float:
+def _excess(row: ExpectedError) -> float:
     """Return the worst of range, pitch and yaw, relative to what it should stay within."""
     range_mm, pitch, yaw = _seen(row)
     parts = (_percent(row, range_mm) / LIMIT_PERCENT, pitch / LIMIT_DEG, yaw / LIMIT_DEG)
     return math.nan if any(math.isnan(part) for part in parts) else max(parts)
 
 
-def _seen(row: ExpectationRow) -> tuple[float, float, float]:
+def _seen(row: ExpectedError) -> tuple[float, float, float]:
     """Return both causes together; the calibration's alone where the noise is not known."""
     parts = _parts_of(row)
     both = parts["both"]
     return both if all(map(math.isfinite, both)) else parts["calibration"]
 
 
-def _expectation_text(rows: Sequence[ExpectationRow]) -> str:
+def _expectation_text(rows: Sequence[ExpectedError]) -> str:
     known = [row for row in rows if math.isfinite(_excess(row))]
     if not known:
         return '<p class="verdict bad">What to expect on a target is not known.</p>'
@@ -244,7 +244,7 @@ def _expectation_text(rows: Sequence[ExpectationRow]) -> str:
     if not all(map(math.isfinite, _parts_of(worst)["both"])):
         cause, end = "the calibration alone gives", "the noise of the picture comes on top."
     means = (
-        f" On a target at {number(worst.range_m, 2)} m {cause} the range to "
+        f" On a target at {number(worst.wall_range, 2)} m {cause} the range to "
         f"{number(range_mm, 1)} mm ({number(_percent(worst, range_mm), 2)} %), pitch to "
         f"{number(pitch, 2)}° and yaw to {number(yaw, 2)}° (one standard deviation). The "
         f"calibration’s part is the same in every picture: {end}"
