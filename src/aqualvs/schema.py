@@ -186,7 +186,7 @@ def parse_settings(
 
 
 # What a key ends with to tell its unit.
-_UNIT = re.compile(r"_(per_s2?|per_m|deg(_s2?)?|mm|m(_s[23]?)?|n|s|percent|px)$")
+_UNIT = re.compile(r"_(per_s2?|n_s2?_m2?|kg|per_m|deg(_s2?)?|mm|m(_s[23]?)?|n|s|percent|px)$")
 
 
 def without_unit(key: str) -> str:

@@ -3,7 +3,7 @@
 import math
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import yaml
 from pydantic import Field
@@ -34,8 +34,15 @@ from aqualvs.yamlfile import parse_yaml, write_text
 
 def _in_file_units(kind: type[AnyPart], gains: object) -> AnyPart:
     """Return the part whose values `si_values` gives back, but for rounding."""
-    values = {key: getattr(gains, without_unit(key)) for key in kind.model_fields}
-    return kind(**{key: _degrees(v) if "_deg" in key else v for key, v in values.items()})
+
+    def told(key: str) -> Any:
+        value, part = getattr(gains, without_unit(key)), kind.model_fields[key].annotation
+        if isinstance(part, type) and issubclass(part, StrictPart):
+            return _in_file_units(part, value)
+        # More digits than users set, fewer than rounding errors leave.
+        return float(f"{math.degrees(value):.10g}") if "_deg" in key else value
+
+    return kind(**{key: told(key) for key in kind.model_fields})
 
 
 VERSION = 1
@@ -177,58 +184,21 @@ def _gains(content: GainsFile) -> ControlGains:
 
 def _vehicle(content: GainsFile) -> VehicleFacts:
     part = content.vehicle
-    return VehicleFacts(
-        name=content.name,
-        mass=part.mass_kg,
-        forward_drag=_drag(part.forward_drag),
-        right_drag=_drag(part.right_drag),
-        thrust=ThrustMap(**si_values(part.thrust) | {"layout": Layout(part.thrust.layout)}),
-        turning_rate=math.radians(part.turning_rate_deg_s),
-        climb_rate=part.climb_rate_m_s,
-        dome_forward=part.dome_forward_m,
-    )
-
-
-def _drag(part: DragPart) -> Drag:
-    return Drag(part.linear_n_s_m, part.quadratic_n_s2_m2)
+    parts = {
+        "forward_drag": Drag(**si_values(part.forward_drag)),
+        "right_drag": Drag(**si_values(part.right_drag)),
+        "thrust": ThrustMap(**si_values(part.thrust) | {"layout": Layout(part.thrust.layout)}),
+    }
+    return VehicleFacts(name=content.name, **si_values(part) | parts)
 
 
 def _content(gains: ControlGains) -> GainsFile:
     return GainsFile(
         aqualvs_gains=VERSION,
         name=gains.vehicle.name,
-        vehicle=_vehicle_part(gains.vehicle),
+        vehicle=_in_file_units(VehiclePart, gains.vehicle),
         range=_in_file_units(RangePart, gains.range),
         yaw=_in_file_units(YawPart, gains.yaw),
         rate_time_s=gains.rate_time,
         memory_s=gains.memory,
     )
-
-
-def _vehicle_part(facts: VehicleFacts) -> VehiclePart:
-    thrust = facts.thrust
-    return VehiclePart(
-        mass_kg=facts.mass,
-        forward_drag=_drag_part(facts.forward_drag),
-        right_drag=_drag_part(facts.right_drag),
-        thrust=ThrustPart(
-            forward_n=thrust.forward,
-            backward_n=thrust.backward,
-            right_n=thrust.right,
-            dead_band=thrust.dead_band,
-            linear=thrust.linear,
-            layout=thrust.layout.value,
-        ),
-        turning_rate_deg_s=_degrees(facts.turning_rate),
-        climb_rate_m_s=facts.climb_rate,
-        dome_forward_m=facts.dome_forward,
-    )
-
-
-def _drag_part(drag: Drag) -> DragPart:
-    return DragPart(linear_n_s_m=drag.linear, quadratic_n_s2_m2=drag.quadratic)
-
-
-def _degrees(angle: float) -> float:
-    # More digits than users set, fewer than rounding errors leave.
-    return float(f"{math.degrees(angle):.10g}")
