@@ -12,7 +12,7 @@ single shift stands out, none is applied, and the places keep the uncertainty of
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -345,9 +345,7 @@ def align(
 
 def shifted(one: PlacedSurvey, shift: SurveyShift) -> PlacedSurvey:
     """Return a dive with its places shifted; what the shift leaves open is not in its sigma."""
-    return PlacedSurvey(
-        one.survey, one.rows, one.outline + shift.value, one.holes + shift.value, one.sigma
-    )
+    return replace(one, outline=one.outline + shift.value, holes=one.holes + shift.value)
 
 
 def _grid(later: PlacedSurvey, earlier: Sequence[PlacedSurvey], frame: WallFrame) -> ShiftGrid:

@@ -8,7 +8,7 @@ JPEG, scaled down to a size that suits a page.
 import base64
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 from typing import NamedTuple
 
@@ -172,21 +172,6 @@ _GAUSS_WITHIN_ONE = math.erf(math.sqrt(0.5))
 
 
 @dataclass(frozen=True, slots=True)
-class _Points:
-    """The points of a map that are finite."""
-
-    size_px: tuple[int, int]
-    pixels: FloatArray
-    residuals: FloatArray
-    view: IntArray
-    used: BoolArray
-
-    @property
-    def used_residuals(self) -> FloatArray:
-        return self.residuals[self.used]
-
-
-@dataclass(frozen=True, slots=True)
 class _Scale:
     """From pixels to places in the chart, and from residuals to vectors."""
 
@@ -216,9 +201,9 @@ def residual_view(found: ResidualMap, names: Sequence[str], *, n_vectors: int = 
     points = _finite(found)
     side = "".join(
         f"<figure>{chart}<figcaption>{escape(words)}</figcaption></figure>"
-        for chart, words in (_coverage_chart(points, found.title), _histogram(points, found.title))
+        for chart, words in (_coverage_chart(points), _histogram(points))
     )
-    vectors, words, legend = _vector_chart(points, found.title, names, n_vectors)
+    vectors, words, legend = _vector_chart(points, names, n_vectors)
     return Raw(
         f'<div class="residuals"><figure>{vectors}{legend}<figcaption>{escape(words)}'
         f'</figcaption></figure><div class="side">{side}</div></div>'
@@ -226,7 +211,7 @@ def residual_view(found: ResidualMap, names: Sequence[str], *, n_vectors: int = 
 
 
 def _vector_chart(
-    points: _Points, title: str, names: Sequence[str], n_vectors: int
+    points: ResidualMap, names: Sequence[str], n_vectors: int
 ) -> tuple[Raw, str, Raw]:
     """Return one vector per point, what to say of them, and a legend."""
     scale = _scale_of(points)
@@ -241,17 +226,17 @@ def _vector_chart(
         *_frame(points.size_px, scale),
         f'<svg x="{x}" y="{y}" width="{w}" height="{h}" viewBox="{frame}">',
         *_view_groups(points, rows, starts, vectors, names),
-        *_outliers(rows[~points.used[rows]], starts, vectors),
+        *_outliers(rows[~points.inliers[rows]], starts, vectors),
         "</svg>",
         *_scale_bar(scale),
     ]
     words = _vector_text(points, len(rows), bool(cut[rows].any()))
     total = (width + _VECTORS.left + _VECTORS.right, height + _VECTORS.head + _VECTORS.foot)
-    chart = draw.svg(*total, body, alt=f"{title}: residual vectors. {words}", kind="map")
-    return chart, words, _vector_legend(bool((~points.used).any()))
+    chart = draw.svg(*total, body, alt=f"{points.title}: residual vectors. {words}", kind="map")
+    return chart, words, _vector_legend(bool((~points.inliers).any()))
 
 
-def _coverage_chart(points: _Points, title: str) -> tuple[Raw, str]:
+def _coverage_chart(points: ResidualMap) -> tuple[Raw, str]:
     """Return how many used points lie in each cell of the picture, and the share covered."""
     counts = _cell_counts(points)
     covered = 100.0 * float((counts > 0).mean())
@@ -265,11 +250,11 @@ def _coverage_chart(points: _Points, title: str) -> tuple[Raw, str]:
         body += _cell(x, y, dx, dy, int(count), int(counts.max()))
     words = f"Coverage: {covered:.0f} % of the picture’s cells hold points, as many as they say"
     words += "." if counts.all() else "; hatched cells hold none."
-    alt = f"{title}: coverage of the picture, {covered:.0f} % of its cells hold points"
+    alt = f"{points.title}: coverage of the picture, {covered:.0f} % of its cells hold points"
     return draw.svg(_BESIDE.width, tall + 2.0, body, alt=alt, kind="coverage"), words
 
 
-def _histogram(points: _Points, title: str) -> tuple[Raw, str]:
+def _histogram(points: ResidualMap) -> tuple[Raw, str]:
     """Return the histogram of used residuals beside the Gaussian of their rms."""
     values = points.used_residuals.ravel()
     rms = _rms(values)
@@ -288,26 +273,26 @@ def _histogram(points: _Points, title: str) -> tuple[Raw, str]:
         *_histogram_axis(x_axis, y_axis),
     ]
     words = _histogram_text(values, rms)
-    alt = f"{title}: histogram of residuals. {words}"
+    alt = f"{points.title}: histogram of residuals. {words}"
     return draw.svg(_BESIDE.width, _BESIDE.height, body, alt=alt, kind="histogram"), words
 
 
-def _finite(found: ResidualMap) -> _Points:
+def _finite(found: ResidualMap) -> ResidualMap:
     fine = np.isfinite(found.pixels).all(axis=1) & np.isfinite(found.residuals).all(axis=1)
-    return _Points(
-        found.size_px,
-        found.pixels[fine],
-        found.residuals[fine],
-        found.view_index[fine],
-        found.inliers[fine],
+    return replace(
+        found,
+        pixels=found.pixels[fine],
+        residuals=found.residuals[fine],
+        view_index=found.view_index[fine],
+        inliers=found.inliers[fine],
     )
 
 
-def _scale_of(points: _Points) -> _Scale:
+def _scale_of(points: ResidualMap) -> _Scale:
     """Return the scale at which nine of ten used residuals are at most of typical length."""
     width = points.size_px[0]
     per_px = (_VECTORS.width - _VECTORS.left - _VECTORS.right) / width
-    residuals = points.used_residuals if points.used.any() else points.residuals
+    residuals = points.used_residuals if points.inliers.any() else points.residuals
     lengths = np.hypot(residuals[:, 0], residuals[:, 1])
     typical = float(np.quantile(lengths, 0.9)) if len(lengths) else 0.0
     # Without any residual every magnification is as good; one pixel then fills the typical length.
@@ -315,9 +300,9 @@ def _scale_of(points: _Points) -> _Scale:
     return _Scale(per_px, draw.round_step(least / 2.0), _VECTORS.longest * width * per_px)
 
 
-def _thinned(points: _Points, limit: int) -> IntArray:
+def _thinned(points: ResidualMap, limit: int) -> IntArray:
     """Return the rows to draw: outliers up to half the limit, then used points at random."""
-    outliers, used = np.flatnonzero(~points.used), np.flatnonzero(points.used)
+    outliers, used = np.flatnonzero(~points.inliers), np.flatnonzero(points.inliers)
     outliers = outliers[draw.sampled(len(outliers), max(limit // 2, limit - len(used)))]
     used = used[draw.sampled(len(used), limit - len(outliers))]
     return np.sort(np.concatenate([outliers, used]))
@@ -342,14 +327,18 @@ def _frame(size_px: tuple[int, int], scale: _Scale) -> Iterator[str]:
 
 
 def _view_groups(
-    points: _Points, rows: IntArray, starts: FloatArray, vectors: FloatArray, names: Sequence[str]
+    points: ResidualMap,
+    rows: IntArray,
+    starts: FloatArray,
+    vectors: FloatArray,
+    names: Sequence[str],
 ) -> Iterator[str]:
     """Yield the used points, view by view, with a tooltip of the view and its rms."""
     style = f'stroke="{draw.ACCENT}" fill="none" stroke-linecap="round"'
-    rows = rows[points.used[rows]]
-    for view in np.unique(points.view[rows]).tolist():
-        mine = rows[points.view[rows] == view]
-        rms = _rms_of_lengths(points.residuals[points.used & (points.view == view)])
+    rows = rows[points.inliers[rows]]
+    for view in np.unique(points.view_index[rows]).tolist():
+        mine = rows[points.view_index[rows] == view]
+        rms = _rms_of_lengths(points.residuals[points.inliers & (points.view_index == view)])
         name = names[view] if 0 <= view < len(names) else f"view {view + 1}"
         yield (
             f"<g {style}><title>{escape(name)}: {rms:.3f} px rms</title>"
@@ -391,11 +380,11 @@ def _scale_bar(scale: _Scale) -> Iterator[str]:
     yield draw.words_at(end + 10, y + 5, words, anchor="start", kind="strong")
 
 
-def _vector_text(points: _Points, drawn: int, cut: bool) -> str:
-    total, used = len(points.used), points.used_residuals
+def _vector_text(points: ResidualMap, drawn: int, cut: bool) -> str:
+    total, used = len(points.inliers), points.used_residuals
     if not total:
         return "No points."
-    said = f"{int(points.used.sum()):,} points used"
+    said = f"{int(points.inliers.sum()):,} points used"
     if len(used):
         said += f", {_rms_of_lengths(used):.3f} px rms"
     if total > len(used):
@@ -426,11 +415,11 @@ def _vector_legend(outliers: bool) -> Raw:
     return Raw(f'<ul class="legend">{items}</ul>')
 
 
-def _cell_counts(points: _Points) -> IntArray:
+def _cell_counts(points: ResidualMap) -> IntArray:
     """Return the used points in each cell; cells are about square, ten to a row."""
     width, height = points.size_px
     rows = max(1, round(_BESIDE.columns * height / width))
-    pixels = points.pixels[points.used] + 0.5
+    pixels = points.pixels[points.inliers] + 0.5
     counts, _, _ = np.histogram2d(
         pixels[:, 1], pixels[:, 0], bins=(rows, _BESIDE.columns), range=((0, height), (0, width))
     )
