@@ -17,7 +17,6 @@ import numpy as np
 from aqualvs.design.judge import Judge, Lot, predict, score
 from aqualvs.design.settings import Design, Mount, tangential
 from aqualvs.geometry.transforms import SE3
-from aqualvs.optics.lens import Lens
 
 TILT_LIMITS = (math.radians(-40.0), math.radians(60.0))
 """Limits of the search for the best tilt."""
@@ -180,28 +179,15 @@ def _finer(design: Design) -> Design:
     rig = design.rig
     lens, (width, height) = rig.lens, rig.size_px
     # The centre of the top-left pixel is (0, 0), its corner (-0.5, -0.5).
-    finer = Lens(
-        model=lens.model,
-        fx=2.0 * lens.fx,
-        fy=2.0 * lens.fy,
-        cx=2.0 * lens.cx + 0.5,
-        cy=2.0 * lens.cy + 0.5,
-        distortion=lens.distortion,
-    )
+    cx, cy = 2.0 * lens.cx + 0.5, 2.0 * lens.cy + 0.5
+    finer = replace(lens, fx=2.0 * lens.fx, fy=2.0 * lens.fy, cx=cx, cy=cy)
     return replace(design, rig=replace(rig, lens=finer, size_px=(2 * width, 2 * height)))
 
 
 def _longer_lens(share: float) -> Callable[[Design], Design]:
     def change(design: Design) -> Design:
         lens = design.rig.lens
-        longer = Lens(
-            model=lens.model,
-            fx=share * lens.fx,
-            fy=share * lens.fy,
-            cx=lens.cx,
-            cy=lens.cy,
-            distortion=lens.distortion,
-        )
+        longer = replace(lens, fx=share * lens.fx, fy=share * lens.fy)
         return replace(design, rig=replace(design.rig, lens=longer))
 
     return change
