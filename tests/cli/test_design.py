@@ -79,7 +79,7 @@ def test_a_flat_port_takes_the_place_of_the_dome(tmp_path, capsys):
     assert rig.flat_port is not None
     assert rig.flat_port.distance == pytest.approx(0.012)
     assert main(["design", *options, "--dome-mm", "51:6"]) == 2
-    assert "dome and flat are both given" in capsys.readouterr().err
+    assert "dome and flat: both are given" in capsys.readouterr().err
 
 
 def test_the_rig_it_writes_is_sane_and_measures_as_predicted(folder, capsys):

@@ -10,7 +10,7 @@ import yaml
 
 from aqualvs.design.file import EXAMPLE, design_from, design_of_rig, load_design
 from aqualvs.design.settings import Tolerances
-from aqualvs.errors import AqualvsError, OptionError
+from aqualvs.errors import AqualvsError, RigError
 from aqualvs.optics.flat_port import FlatPort
 from aqualvs.optics.rigfile import save_rig
 from aqualvs.simulation.scenarios import example_rig
@@ -81,7 +81,7 @@ def test_flat_ports():
     flat = {"distance_mm": 12, "thickness_mm": 5, "n_port": 1.5, "tilt_deg": [1, 0]}
     rig = read(dome=None, flat=flat).rig
     assert rig.housing == FlatPort(0.012, 0.005, 1.5, math.radians(1.0))
-    with pytest.raises(OptionError, match="dome and flat are both given"):
+    with pytest.raises(RigError, match="dome and flat: both are given"):
         read(flat=flat)
 
 

@@ -21,6 +21,7 @@ from aqualvs.calibrate.common import (
     load_nominal,
     named,
     residuals_of,
+    summary,
 )
 from aqualvs.calibration.camera.calibrate import CameraCalibration
 from aqualvs.calibration.camera.calibrate import camera as solve_camera
@@ -124,13 +125,7 @@ def run_camera(request: CameraRequest, echo: Echo) -> None:
         n_coefficients=request.n_coefficients,
     )
     result, found = done.solution, done.found[0]
-    n_pictures = len(found.views) + len(found.missed)
-    of = f" of {n_pictures}" if len(result.views) < n_pictures else ""
-    echo(
-        f"{len(result.views)}{of} pictures, {result.n_points} corners, residual "
-        f"{result.rms_px:.3f} px (rms)"
-    )
-    for line in (*found.remarks, *result.findings):
+    for line in summary(done):
         echo(line)
     finish(done.rig, _page(done.rig, result, found, request), request.out, "camera", echo)
 

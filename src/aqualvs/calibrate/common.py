@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 
-from aqualvs.calibration.solver.result import ViewFit
+from aqualvs.calibration.camera.calibrate import CameraCalibration
+from aqualvs.calibration.solver.result import DomeCalibration, ViewFit
 from aqualvs.calibration.targets.targets import View
 from aqualvs.calibration_formats import refuse_foreign
 from aqualvs.errors import CalibrationError, OptionError, RigError
@@ -141,21 +142,18 @@ def _of_rig_file(path: Path) -> Nominal:
 
 def _of_mapping(content: Mapping[str, Any], path: Path) -> Nominal:
     file = validated(_File, dict(content), path, RigError, SchemaWords(file="a nominal rig"))
+    try:
+        housing = housing_of(file.dome, file.flat)
+    except RigError as fault:
+        raise RigError(f"{path}: {fault}") from None
     return Nominal(
         name=file.name,
         size_px=None if file.image is None else (file.image.width, file.image.height),
-        housing=_housing(file, path),
+        housing=housing,
         n_air=file.n_air,
         n_lasers=None if file.lasers is None else file.lasers.count,
         wavelength_nm=None if file.lasers is None else file.lasers.wavelength_nm,
     )
-
-
-def _housing(file: _File, path: Path) -> Housing | None:
-    dome, flat = file.dome, file.flat
-    if dome is not None and flat is not None:
-        raise RigError(f"{path}: dome and flat: both are given; leave one out")
-    return housing_of(dome, flat)
 
 
 Echo: TypeAlias = Callable[[str], object]
@@ -251,6 +249,19 @@ class Calibration(Generic[SolutionT]):
         """Root mean square length of the residuals."""
         stacked = np.concatenate(list(self.residuals_px.values()))
         return float(np.sqrt(np.mean(np.sum(stacked**2, axis=1))))
+
+
+def summary(done: Calibration[CameraCalibration] | Calibration[DomeCalibration]) -> list[str]:
+    """Return the numbers of pictures used and left out, the residual and the reasons."""
+    result = done.solution
+    n_pictures = sum(len(one.views) + len(one.missed) for one in done.found)
+    used = len(result.views)
+    of = f" of {n_pictures}" if used < n_pictures else ""
+    return [
+        f"{used}{of} pictures, {result.n_points} corners, residual {result.rms_px:.3f} px (rms)",
+        *(line for one in done.found for line in one.remarks),
+        *result.findings,
+    ]
 
 
 def residuals_of(views: Iterable[ViewFit]) -> dict[str, FloatArray]:

@@ -19,6 +19,7 @@ from aqualvs.calibrate.common import (
     medium_index,
     named,
     residuals_of,
+    summary,
 )
 from aqualvs.calibration.detection.detection import detect_board
 from aqualvs.calibration.dome.calibrate import dome as solve_dome
@@ -166,21 +167,9 @@ def run_dome(request: DomeRequest, echo: Echo) -> None:
         water_poses=request.water_poses,
         options=_options(request),
     )
-    for line in (*_summary(done), *done.solution.findings):
+    for line in summary(done):
         echo(line)
     finish(done.rig, _page(rig, done, request), request.out, "dome", echo, comments_of=request.rig)
-
-
-def _summary(done: Calibration[DomeCalibration]) -> list[str]:
-    """Return the numbers of pictures used and left out, the residual and the reasons."""
-    result = done.solution
-    n_pictures = sum(len(one.views) + len(one.missed) for one in done.found)
-    used = len(result.views)
-    of = f" of {n_pictures}" if used < n_pictures else ""
-    return [
-        f"{used}{of} pictures, {result.n_points} corners, residual {result.rms_px:.3f} px (rms)",
-        *(line for one in done.found for line in one.remarks),
-    ]
 
 
 def _with_housing(rig: Rig, request: DomeRequest) -> Rig:

@@ -22,7 +22,6 @@ from aqualvs.design.settings import (
 )
 from aqualvs.errors import OptionError, RigError
 from aqualvs.geometry.transforms import SE3
-from aqualvs.optics.camera import Housing
 from aqualvs.optics.lens import Lens, LensModel
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig
 from aqualvs.optics.rigfile import housing_of, load_rig, shutter_from_part
@@ -277,7 +276,7 @@ def _design(file: DesignFile, folder: Path) -> Design:
         size_px=size_px,
         lens=lens,
         dome_from_cam=SE3(DOME_FROM_CAM_NOMINAL, position),
-        housing=_housing(file),
+        housing=housing_of(file.dome, file.flat),
         n_air=N_AIR,
         n_water=_water_index(file.water),
         lasers=(),
@@ -298,13 +297,6 @@ def _design(file: DesignFile, folder: Path) -> Design:
         ),
         avoid_crossings=file.avoid_crossings,
     )
-
-
-def _housing(file: DesignFile) -> Housing | None:
-    dome, flat = file.dome, file.flat
-    if dome is not None and flat is not None:
-        raise OptionError("dome and flat are both given; leave one out")
-    return housing_of(dome, flat)
 
 
 def _camera(camera: CameraDesign, folder: Path) -> tuple[Lens, tuple[int, int], Shutter]:

@@ -271,18 +271,21 @@ def _rig(file: RigFile) -> Rig:
 
 
 def _housing(file: RigFile) -> Housing | None:
-    dome, flat = file.dome, file.flat
-    if dome is not None and flat is not None:
-        raise RigError("dome and flat: both are given; leave one out, a camera has one housing")
-    kind = "dome" if dome is not None else "flat" if flat is not None else "none"
+    found = housing_of(file.dome, file.flat)
+    kind = "dome" if file.dome is not None else "flat" if file.flat is not None else "none"
     if file.housing not in (None, kind):
         said = "neither 'dome' nor 'flat' is given" if kind == "none" else f"'{kind}' is given"
         raise RigError(f"housing is {file.housing!r} but {said}; make them agree")
-    return housing_of(dome, flat)
+    return found
 
 
 def housing_of(dome: StrictPart | None, flat: StrictPart | None) -> Housing | None:
-    """Return the housing that one of two sections of a file describes; None without both."""
+    """Return the housing that one of two sections of a file describes; None without both.
+
+    Raises `RigError` if both are given.
+    """
+    if dome is not None and flat is not None:
+        raise RigError("dome and flat: both are given; leave one out, a camera has one housing")
     if dome is not None:
         return Dome(**si_values(dome))
     if flat is None:
