@@ -30,7 +30,7 @@ from aqualvs.calibration.solver.covariance import (
 )
 from aqualvs.calibration.solver.least_squares import Solution, solve
 from aqualvs.calibration.solver.result import FittedViews, ViewFit, rms_px, view_fits
-from aqualvs.calibration.targets.targets import View
+from aqualvs.calibration.targets.targets import View, check_enough
 from aqualvs.errors import CalibrationError
 from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.optics.lens import Lens, LensModel
@@ -45,19 +45,7 @@ def check_camera_views(views: Sequence[View], size_px: tuple[int, int]) -> None:
 
     Raises `CalibrationError` with what is given and what is needed.
     """
-    min_views = 3
-    if len(views) < min_views:
-        raise CalibrationError(
-            f"{len(views)} pictures show the board; the camera needs {min_views} at least, and "
-            "15 to 20 from different sides to be good"
-        )
-    points = sum(len(view) for view in views)
-    min_points = 60
-    if points < min_points:
-        raise CalibrationError(
-            f"{points} board corners in {len(views)} pictures; the camera needs {min_points} at "
-            "least; show more of the board, or more often"
-        )
+    check_enough(views, 3, "camera", "15 to 20 from different sides")
     for view in views:
         inside = np.all((view.pixels > -1.0) & (view.pixels < size_px), axis=1)
         if not inside.all():

@@ -40,7 +40,7 @@ from aqualvs.calibration.solver.initial_pose import (
 )
 from aqualvs.calibration.solver.least_squares import Solution, solve
 from aqualvs.calibration.solver.result import CrossValidation, rms_px
-from aqualvs.calibration.targets.targets import View
+from aqualvs.calibration.targets.targets import View, check_enough
 from aqualvs.errors import CalibrationError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.transforms import SE3
@@ -146,20 +146,8 @@ def check_sets(rig: Rig, sets: Sequence[BoardSet]) -> None:
     exact = any(
         kind_of(one.given(i)) is PoseKind.EXACT for one in sets for i in range(len(one.views))
     )
-    min_views = 3
-    needed = 1 if exact else min_views
-    if len(views) < needed:
-        raise CalibrationError(
-            f"{len(views)} pictures show the board; the dome needs {needed} at least, and 10 to 15 "
-            "at distances all over the working range to be good"
-        )
-    points = sum(len(view) for view in views)
-    min_points = 60
-    if points < min_points:
-        raise CalibrationError(
-            f"{points} board corners in {len(views)} pictures; the dome needs {min_points} at "
-            "least; show more of the board, or more often"
-        )
+    good = "10 to 15 at distances all over the working range"
+    check_enough(views, 1 if exact else 3, "dome", good)
 
 
 def _check_flat(rig: Rig, sets: Sequence[BoardSet]) -> None:

@@ -6,6 +6,7 @@ Frame `board` is OpenCV's: x right, y down, z into the board, origin at the oute
 top-left square. Lengths in metres.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
@@ -55,6 +56,25 @@ DICTIONARIES: dict[str, int] = {
     if name.startswith("DICT_") and name.replace("h", "H") == name
 }
 """Marker dictionaries by name; `dictionary_id` knows further spellings of AprilTag families."""
+
+
+def check_enough(views: Sequence[View], n_needed: int, what: str, good: str) -> None:
+    """Refuse too few pictures of a board, or too few corners in them.
+
+    `what`, `good`: what is calibrated, and what makes it good, in words. Raises `CalibrationError`.
+    """
+    if len(views) < n_needed:
+        raise CalibrationError(
+            f"{len(views)} pictures show the board; the {what} needs {n_needed} at least, and "
+            f"{good} to be good"
+        )
+    points = sum(len(view) for view in views)
+    min_points = 60
+    if points < min_points:
+        raise CalibrationError(
+            f"{points} board corners in {len(views)} pictures; the {what} needs {min_points} at "
+            "least; show more of the board, or more often"
+        )
 
 
 def dictionary_id(name: str) -> int | None:
