@@ -174,10 +174,6 @@ class OpenDive(Closing):
         """
         request, rig = self.request, self.rig
         if request.index_target is not None:
-            if rig.housing is None:
-                raise OptionError(
-                    "--index-target: without a housing the water's index cannot be seen"
-                )
             return WaterFollowingScanner(rig, request.scanner, request.index_target, request.water)
         if isinstance(self.source, Replay):
             return self.source

@@ -23,7 +23,7 @@ from aqualvs.calibration.targets.targets import MarkerSet, View
 from aqualvs.calibration.water_index.estimator import WaterCalibration
 from aqualvs.calibration.water_index.estimator import calibrate_water as solve_water
 from aqualvs.calibration.water_index.state import IndexOptions, IndexPrior
-from aqualvs.errors import CalibrationError, OptionError
+from aqualvs.errors import CalibrationError
 from aqualvs.optics.rig import Rig, merged
 from aqualvs.optics.rigfile import check_rig_place, load_rig
 from aqualvs.optics.solved import SolvedStep, rig_uncertainty, with_step, with_uncertainty
@@ -35,7 +35,7 @@ from aqualvs.report.calibration_material import (
     facts,
 )
 from aqualvs.report.html import Card
-from aqualvs.results.run_request import check_fits
+from aqualvs.results.run_request import Water, check_fits
 from aqualvs.sources import FrameSource, open_source
 from aqualvs.sources.images import IMAGE_SUFFIXES, ImageSource
 from aqualvs.terminal import progress
@@ -187,12 +187,8 @@ def _check(result: WaterCalibration) -> None:
 
 
 def _prior(request: WaterRequest, rig: Rig) -> IndexPrior | None:
-    if request.temperature_c is None and request.salinity is None:
-        return None
-    if request.temperature_c is None or request.salinity is None:
-        missing = "--salinity" if request.salinity is None else "--temperature-c"
-        raise OptionError(f"{missing}: missing; the index of water needs both")
-    return IndexPrior.seawater(request.temperature_c, request.salinity, n_air=rig.n_air)
+    seawater = Water(temperature_c=request.temperature_c, salinity=request.salinity).seawater
+    return None if seawater is None else IndexPrior.seawater(*seawater, n_air=rig.n_air)
 
 
 def _source(request: WaterRequest) -> FrameSource:

@@ -270,8 +270,6 @@ def _provider(request: LiveRequest, rig: Rig) -> ScannerSupply:
         scanner = Scanner(rig, request.scanner)
         warm_up(scanner)
         return FixedScanner(scanner)
-    if rig.housing is None:
-        raise OptionError("--index-target: without a housing the water's index cannot be seen")
     following = WaterFollowingScanner(rig, request.scanner, request.index_target, request.water)
     warm_up(following.scanner)
     return WaterFollower(following)

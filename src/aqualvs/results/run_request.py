@@ -126,24 +126,32 @@ class Water:
     temperature_c: float | None = None
     salinity: float | None = None
 
+    @property
+    def seawater(self) -> tuple[float, float] | None:
+        """Temperature and salinity; None without them.
+
+        Raises `OptionError` if one is missing.
+        """
+        if self.temperature_c is None and self.salinity is None:
+            return None
+        if self.temperature_c is None or self.salinity is None:
+            missing = "--salinity" if self.salinity is None else "--temperature-c"
+            raise OptionError(f"{missing}: missing; the index of water needs both")
+        return self.temperature_c, self.salinity
+
     def applied_to(self, rig: Rig) -> Rig:
         """Return the rig in this water.
 
         Raises `OptionError` if the values contradict each other or lie outside of what water can
         be.
         """
-        seawater = (self.temperature_c, self.salinity)
         if self.n_water is not None:
-            if seawater != (None, None):
+            if (self.temperature_c, self.salinity) != (None, None):
                 raise OptionError("--water-n: give the index or temperature and salinity, not both")
             return rig.in_water(checked_index(self.n_water, "--water-n"))
-        if self.temperature_c is None and self.salinity is None:
+        if self.seawater is None:
             return rig
-        if self.temperature_c is None or self.salinity is None:
-            missing = "--salinity" if self.salinity is None else "--temperature-c"
-            raise OptionError(f"{missing}: missing; the index of water needs both")
-        index = seawater_index_vacuum(self.temperature_c, self.salinity, n_air=rig.n_air)
-        return rig.in_water(float(index))
+        return rig.in_water(float(seawater_index_vacuum(*self.seawater, n_air=rig.n_air)))
 
 
 @dataclass(frozen=True, slots=True)

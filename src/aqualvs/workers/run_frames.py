@@ -310,7 +310,7 @@ class WaterFollowingScanner:
 
     `rig`: in the water to begin with. `target`: markers on the vehicle (target.yaml). `water`:
     temperature and salinity, if given, are a prior. Raises `CalibrationError` if the target's file
-    cannot be used.
+    cannot be used, `OptionError` if the rig has no housing.
     """
 
     def __init__(self, rig: Rig, options: ScannerOptions, target: Path, water: Water) -> None:
@@ -318,6 +318,8 @@ class WaterFollowingScanner:
         from aqualvs.calibration.water_index.estimator import IndexEstimator
         from aqualvs.calibration.water_index.state import IndexOptions
 
+        if rig.housing is None:
+            raise OptionError("--index-target: without a housing the water's index cannot be seen")
         self._rig, self._options, self._target = rig, options, target
         self.scanner = Scanner(rig, options)  # For the water as it is known.
         self._markers = load_target(target)
@@ -386,6 +388,5 @@ class WaterFollowingScanner:
 def _prior(water: Water, rig: Rig) -> "IndexPrior | None":
     from aqualvs.calibration.water_index.state import IndexPrior
 
-    if water.temperature_c is None or water.salinity is None:
-        return None
-    return IndexPrior.seawater(water.temperature_c, water.salinity, n_air=rig.n_air)
+    seawater = water.seawater
+    return None if seawater is None else IndexPrior.seawater(*seawater, n_air=rig.n_air)
