@@ -27,12 +27,7 @@ POSE = SE3(rotation_from_rotvec([0.04, 0.029, 0.016]) @ NOMINAL, np.array([3.1, 
 DOME = Dome(0.04425, 0.00575, 1.49)
 N_AIR, N_WATER = 1.0003, 1.3333
 CAMERA = HousedCamera(
-    size_px=SIZE_PX,
-    lens=LENS,
-    dome_from_cam=POSE,
-    housing=DOME,
-    n_air=N_AIR,
-    n_water=N_WATER,
+    size_px=SIZE_PX, lens=LENS, dome_from_cam=POSE, housing=DOME, n_air=N_AIR, n_water=N_WATER
 )
 FLAT = HousedCamera(
     size_px=SIZE_PX,
@@ -167,13 +162,7 @@ def row(
     name: str, count: int, call: Callable[[], object], reference: Callable[[], object]
 ) -> dict[str, Any]:
     value, slow = (rate / 1e6 for rate in best_rates(count, call, reference, rounds=5))
-    return {
-        "name": name,
-        "value": value,
-        "unit": "M/s",
-        "reference": slow,
-        "ratio": value / slow,
-    }
+    return {"name": name, "value": value, "unit": "M/s", "reference": slow, "ratio": value / slow}
 
 
 def flat_port_rows(pixels: FloatArray) -> list[dict[str, Any]]:

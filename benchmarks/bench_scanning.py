@@ -199,11 +199,7 @@ def stage_rows(case: Case, name: str) -> list[dict[str, Any]]:
     def surfaces() -> tuple[Subsegments, Any]:
         subsegments = candidates.subsegments()
         found = find_surfaces(
-            subsegments,
-            candidates.pixels,
-            len(rig.lasers),
-            (0.8 * near, 1.2 * far),
-            rig.focal_px,
+            subsegments, candidates.pixels, len(rig.lasers), (0.8 * near, 1.2 * far), rig.focal_px
         )
         return subsegments, choose_target(found, TargetKind.AUTO, rig.working_range)
 

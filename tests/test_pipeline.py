@@ -294,8 +294,7 @@ def test_an_existing_run_is_refused_and_kept(request_for, dive):
 
 
 @pytest.mark.parametrize(
-    ("text", "window"),
-    [(":", (0, None)), ("3:", (3, None)), (":7", (0, 7)), ("3:7", (3, 7))],
+    ("text", "window"), [(":", (0, None)), ("3:", (3, None)), (":7", (0, 7)), ("3:7", (3, 7))]
 )
 def test_windows_are_understood(text, window):
     assert FrameWindow.parse(text) == FrameWindow(*window)

@@ -163,11 +163,7 @@ def test_a_net_in_open_water(target: Plane) -> None:
 def test_a_net_before_a_wall_is_the_target_unless_the_wall_is_asked_for() -> None:
     net, wall = plane(0.45, 2.0, -5.0), plane(0.85, 0.0, 4.0)
     both = [(net, strands), (wall, everywhere)]
-    for kind, target in (
-        (TargetKind.AUTO, net),
-        (TargetKind.NET, net),
-        (TargetKind.SOLID, wall),
-    ):
+    for kind, target in ((TargetKind.AUTO, net), (TargetKind.NET, net), (TargetKind.SOLID, wall)):
         found = scan(both, options=ScannerOptions(target=kind))
         assert_posture(found.posture, target, share=0.01, deg=1.5)
     found = scan(both)
@@ -283,10 +279,7 @@ def test_stripes_side_by_side_far_away_do_not_fix_a_plane() -> None:
         first, name="beside", plane=Plane(first.plane.normal, first.plane.offset + 0.013)
     )
     found = scan(
-        [(plane(1.7), strands)],
-        rig=replace(rig, lasers=(first, second)),
-        lasers=(0, 1),
-        noise=3.0,
+        [(plane(1.7), strands)], rig=replace(rig, lasers=(first, second)), lasers=(0, 1), noise=3.0
     )
     # What is noticed first depends on which strands are taken for which laser's.
     reasons = {Reason.COLLINEAR, Reason.ONE_LASER, Reason.OUT_OF_RANGE}

@@ -18,12 +18,7 @@ from aqualvs.results.summary import RunSummary, TruthComparison, read_truth
 from aqualvs.scanner import Scanner, ScannerOptions
 from aqualvs.scanning.agreement import LaserAgreement
 from aqualvs.sources import FrameSource, VideoSource, open_source
-from aqualvs.sources.fields import (
-    FieldEvidence,
-    first_pairs,
-    source_of_frames,
-    source_of_pictures,
-)
+from aqualvs.sources.fields import FieldEvidence, first_pairs, source_of_frames, source_of_pictures
 from aqualvs.sources.video import sampled_pictures
 from aqualvs.terminal import StopSignals, progress
 from aqualvs.workers.frame_results import FrameScanner
@@ -111,11 +106,7 @@ def run(request: RunRequest, *, scanner_for: ScannerFor = Scanner) -> RunResult:
         exit_code=stop.exit_code,
         stopped_by=stop.caught.name if stop.caught else "",
         summary=summary,
-        lines=[
-            *water,
-            *writers.dome_lines(),
-            *net.write(request.out, request.source),
-        ],
+        lines=[*water, *writers.dome_lines(), *net.write(request.out, request.source)],
         elapsed_s=time.perf_counter() - started,
         report=outputs.report(request),
         comparison=outputs.comparison(request),

@@ -138,9 +138,7 @@ class _RecordedScanner:
     """Scanner that measures as another one does, and keeps the stripes of its scans."""
 
     def __init__(
-        self,
-        scanner: FrameScanner,
-        stripes: deque[tuple[Rig, dict[SearchAxis, StripePeaks]]],
+        self, scanner: FrameScanner, stripes: deque[tuple[Rig, dict[SearchAxis, StripePeaks]]]
     ) -> None:
         self._scanner, self._stripes = scanner, stripes
 

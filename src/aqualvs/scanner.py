@@ -239,12 +239,7 @@ class Scanner:
         found = self._measured(stripes, choice)
         # What every point lies on.
         points, listed = label_candidates(
-            candidates,
-            subsegments,
-            choice.surfaces,
-            choice.target,
-            found,
-            self.rig.working_range,
+            candidates, subsegments, choice.surfaces, choice.target, found, self.rig.working_range
         )
         return found, points, listed
 

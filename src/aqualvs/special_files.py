@@ -14,9 +14,7 @@ _KINDS = {
 
 
 def refuse_special(
-    path: Path,
-    error: type[AqualvsError] = SourceError,
-    remedy: str = "give a file or a folder",
+    path: Path, error: type[AqualvsError] = SourceError, remedy: str = "give a file or a folder"
 ) -> None:
     """Refuse a path of a pipe, device or socket; accept files, folders and free paths.
 

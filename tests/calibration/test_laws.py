@@ -105,10 +105,7 @@ def test_a_larger_world_gives_a_larger_rig(factor: float) -> None:
     wider = replace(QUICK, inner_radius_sigma=factor * 1e-4, thickness_sigma=factor * 1e-4)
     small = dome(guessed(rig, rotation_known=True), [shoot.as_set()], QUICK, INTRINSICS)
     large = dome(
-        guessed(grown, rotation_known=True),
-        [BoardSet(name="air", views=views)],
-        wider,
-        INTRINSICS,
+        guessed(grown, rotation_known=True), [BoardSet(name="air", views=views)], wider, INTRINSICS
     )
     sigma = np.sqrt(np.diag(small.uncertainty.of(("lens_x", "lens_y", "lens_z"))))
     off = large.rig.dome_from_cam.translation / factor - small.rig.dome_from_cam.translation

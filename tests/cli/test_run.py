@@ -84,11 +84,7 @@ def test_a_dive_from_video_to_report(tmp_path, rig, capsys):
 
 @pytest.mark.parametrize(
     ("content", "words"),
-    [
-        (None, "no such file"),
-        (b"", "is empty"),
-        (b"not a video\n" * 40, "not a video"),
-    ],
+    [(None, "no such file"), (b"", "is empty"), (b"not a video\n" * 40, "not a video")],
 )
 def test_a_source_that_is_no_video(tmp_path, rig, refused, content, words):
     source = tmp_path / "dive.mp4"

@@ -93,8 +93,7 @@ def test_a_gap_in_time_is_not_time_spent() -> None:
 
 
 @pytest.mark.parametrize(
-    ("leg", "seconds"),
-    [(LegOptions(time=4.0), 4.0), (LegOptions(distance=1.0), 5.0)],
+    ("leg", "seconds"), [(LegOptions(time=4.0), 4.0), (LegOptions(distance=1.0), 5.0)]
 )
 def test_follow_ends_by_time_or_distance(leg: LegOptions, seconds: float) -> None:
     mission = FollowMission(HOLD, -0.2, leg=leg)

@@ -29,8 +29,7 @@ def written(tmp_path: Path, content: object) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("name", "kind"),
-    [("hold", HoldMission), ("follow", FollowMission), ("survey", SurveyMission)],
+    ("name", "kind"), [("hold", HoldMission), ("follow", FollowMission), ("survey", SurveyMission)]
 )
 def test_examples_are_plans(name: str, kind: type) -> None:
     plan = load_plan(EXAMPLES / f"plan_{name}.yaml")

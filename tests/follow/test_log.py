@@ -17,11 +17,7 @@ from aqualvs.follow.log import (
 
 NAN = math.nan
 ROW = LoopRow(
-    **dict.fromkeys(LoopRow._fields[:-4], 0.0),
-    engaged=True,
-    stage="holding",
-    reason="",
-    refusal="",
+    **dict.fromkeys(LoopRow._fields[:-4], 0.0), engaged=True, stage="holding", reason="", refusal=""
 )
 
 

@@ -5,12 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aqualvs.geometry.transforms import (
-    SE3,
-    rotation_from_rotvec,
-    rotvec_from_rotation,
-    skew,
-)
+from aqualvs.geometry.transforms import SE3, rotation_from_rotvec, rotvec_from_rotation, skew
 
 COORDINATE = st.floats(-1.0, 1.0)
 VECTOR = st.tuples(COORDINATE, COORDINATE, COORDINATE).map(np.array)

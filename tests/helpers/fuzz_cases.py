@@ -708,10 +708,7 @@ class Bench:
                 )
             )
         for name in (".aqualvs.json", "points.ply", "net_map.svg"):
-            calls = [
-                lambda p: ["report", p.parent],
-                lambda p: ["net", p.parent, "--overwrite"],
-            ]
+            calls = [lambda p: ["report", p.parent], lambda p: ["net", p.parent, "--overwrite"]]
             path = self.run / name
             add(Format(name, path.read_bytes(), calls, binary=True, optional=True, inside=self.run))
 

@@ -2,13 +2,7 @@
 
 import math
 
-_TYPES = {
-    "object": dict,
-    "array": list,
-    "string": str,
-    "null": type(None),
-    "boolean": bool,
-}
+_TYPES = {"object": dict, "array": list, "string": str, "null": type(None), "boolean": bool}
 _IGNORED = {"$schema", "$defs", "title", "description", "default"}
 
 

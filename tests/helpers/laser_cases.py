@@ -164,8 +164,7 @@ def _lit(pose: SE3, surface: Plane, sheet: Sheet, spacing: float) -> tuple[Float
     direction = np.cross(normal, surface.normal)
     direction /= np.linalg.norm(direction)
     start = np.linalg.solve(
-        np.stack([normal, surface.normal, direction]),
-        [sheet.plane.offset, surface.offset, 0.0],
+        np.stack([normal, surface.normal, direction]), [sheet.plane.offset, surface.offset, 0.0]
     )
     steps = np.arange(-1.2, 1.2, spacing)
     points = start + steps[:, None] * direction

@@ -111,11 +111,7 @@ def _facts(n, log):
     return {
         "coordinates": {"system": "local", "x": "metres along the net to the right", "y": y},
         "options": {"twine_mm": None, "stretch_m": 0.5},
-        "summary": {
-            "bar_mm": 25.0,
-            "area_m2": n * STEP * HEIGHT * SHARE,
-            "track_slip_m": 0.0,
-        },
+        "summary": {"bar_mm": 25.0, "area_m2": n * STEP * HEIGHT * SHARE, "track_slip_m": 0.0},
     }
 
 

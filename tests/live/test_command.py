@@ -386,11 +386,7 @@ def test_memory_and_handles_stay_flat_over_a_long_run(tmp_path: Path) -> None:
     switch.start()
     outputs = [Looks(), UdpJsonOutput("127.0.0.1:9"), switch]
     LiveRunner(
-        feed,
-        FixedScanner(demo_scanner()),
-        outputs,
-        LiveOptions(keep_every=True),
-        PostureFilter(),
+        feed, FixedScanner(demo_scanner()), outputs, LiveOptions(keep_every=True), PostureFilter()
     ).run(lambda: False)
     memory, handles = np.array(sizes).T
     assert len(memory) == 8

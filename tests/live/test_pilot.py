@@ -127,8 +127,7 @@ def test_not_engaged_without_a_setpoint(vehicle: Vehicle) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "n"),
-    [({"mode": Mode.PILOT}, 3), ({"armed": False}, 3), ({"pilot_moves": True}, 1)],
+    ("change", "n"), [({"mode": Mode.PILOT}, 3), ({"armed": False}, 3), ({"pilot_moves": True}, 1)]
 )
 def test_a_few_neutrals_and_then_nothing(
     pilot: Pilot, vehicle: Vehicle, change: dict[str, object], n: int

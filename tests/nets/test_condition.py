@@ -105,8 +105,7 @@ def test_frames_without_posture_or_net_are_passed_over() -> None:
     refused = [replace(scan, posture=Refusal(Reason.NO_TARGET)) for scan in dive()]
     wall = [
         replace(
-            scan,
-            points=replace(scan.points, label=np.full_like(scan.points.label, Label.SOLID)),
+            scan, points=replace(scan.points, label=np.full_like(scan.points.label, Label.SOLID))
         )
         for scan in dive()
     ]

@@ -45,8 +45,7 @@ def kinds_of(
 
 @settings(max_examples=40, deadline=None)
 @given(
-    twine=st.floats(1.0e-3, 5e-3),
-    angles=st.lists(st.floats(30.0, 90.0), min_size=3, max_size=6),
+    twine=st.floats(1.0e-3, 5e-3), angles=st.lists(st.floats(30.0, 90.0), min_size=3, max_size=6)
 )
 def test_twine_is_found_at_any_angles(twine: float, angles: list[float]) -> None:
     across = [float(np.sin(np.deg2rad(a))) for a in angles]

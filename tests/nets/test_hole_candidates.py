@@ -68,11 +68,7 @@ def test_a_miss_says_the_less_the_more_are_missed(share: float) -> None:
     n = 4000
     missed = rng.random(n) < share
     says = looks_say(
-        np.zeros(n, np.int64),
-        np.zeros(n, np.int64),
-        np.zeros(n),
-        missed,
-        missed.astype(np.int64),
+        np.zeros(n, np.int64), np.zeros(n, np.int64), np.zeros(n), missed, missed.astype(np.int64)
     )
     # A share of 0.03 is always allowed for; chance, and what single ones do not tell, a fifth.
     assert np.exp(-says[missed][0]) == pytest.approx(0.03 + share, rel=0.2)

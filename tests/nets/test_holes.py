@@ -42,11 +42,7 @@ def _dark(view: NetView, strands: Strands, which: BoolArray) -> NetView:
 
 def _gaps(table: FloatArray) -> Gaps:
     return Gaps(
-        table[:, 0].astype(int),
-        table[:, 1:3],
-        table[:, 3:5],
-        table[:, 5:7] == 1.0,
-        table[:, 7],
+        table[:, 0].astype(int), table[:, 1:3], table[:, 3:5], table[:, 5:7] == 1.0, table[:, 7]
     )
 
 

@@ -74,11 +74,7 @@ def test_without_motion_and_clocks_the_log_is_not_used(still, monkeypatch):
     laid = lay_log(log, dive, None, VIDEO)
     assert laid.places is None
     assert "is not used" in laid.words()
-    assert laid.to_dict() == {
-        "file": "vehicle.csv",
-        "used": False,
-        "refused": laid.offset.reason,
-    }
+    assert laid.to_dict() == {"file": "vehicle.csv", "used": False, "refused": laid.offset.reason}
 
 
 def test_a_log_that_covers_none_of_the_dive_is_not_used(moving):

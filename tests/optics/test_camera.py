@@ -9,11 +9,7 @@ import pytest
 
 from aqualvs.errors import RigError
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
-from aqualvs.optics.camera import (
-    Camera,
-    HousedCamera,
-    parameter_names,
-)
+from aqualvs.optics.camera import Camera, HousedCamera, parameter_names
 from aqualvs.optics.dome import Dome
 from aqualvs.optics.flat_port import FlatPort
 from aqualvs.optics.lens import Lens

@@ -6,13 +6,7 @@ import pytest
 
 from aqualvs.errors import RigError
 from aqualvs.optics.lens import Lens, LensModel
-from optics_cases import (
-    FISHEYE_LENS,
-    PAPER_LENS,
-    central_difference,
-    image_grid,
-    relative_error,
-)
+from optics_cases import FISHEYE_LENS, PAPER_LENS, central_difference, image_grid, relative_error
 
 INTRINSICS = {"fx": 817.5, "fy": 878.0, "cx": 368.9, "cy": 281.7}
 RATIONAL = (0.31, -0.11, 5e-4, -3e-4, 0.012, 0.42, -0.06, 0.021)

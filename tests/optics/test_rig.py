@@ -64,12 +64,7 @@ def test_tool_converts() -> None:
     rig = rig_from_sample_truth.rig_from_truth(TRUTH)
     assert rig.size_px == (640, 480)
     assert (rig.dome.inner_radius, rig.dome.thickness) == (0.05, 0.005)
-    assert [laser.name for laser in rig.lasers] == [
-        "horizontal",
-        "vertical",
-        "diagonal",
-        "laser 4",
-    ]
+    assert [laser.name for laser in rig.lasers] == ["horizontal", "vertical", "diagonal", "laser 4"]
     assert rig.lasers[0].plane.offset == -0.12
     np.testing.assert_array_equal(rig.dome_from_cam.translation, [0.001, 0.02, -0.002])
     turn = rotvec_from_rotation(rig.dome_from_cam.rotation @ DOME_FROM_CAM_NOMINAL.T)

@@ -213,14 +213,8 @@ FAULTS: list[tuple[dict[str, Any], tuple[str, ...]]] = [
     ({"camera__fx_px": 1e300}, ("camera.fx_px is 1e+300", "at most 1e+07")),
     ({"camera__fx_px": None}, ("camera.fx_px is empty", "plain number")),
     ({"camera__cx_px": float("nan")}, ("camera.cx_px is nan", "finite")),
-    (
-        {"camera__distortion": [0.1, float("inf"), 0, 0]},
-        ("camera.distortion[1] is inf", "finite"),
-    ),
-    (
-        {"camera__distortion": [0.1, 0.2, 0.3]},
-        ("camera.distortion has 3 values", "0, 4, 5 or 8"),
-    ),
+    ({"camera__distortion": [0.1, float("inf"), 0, 0]}, ("camera.distortion[1] is inf", "finite")),
+    ({"camera__distortion": [0.1, 0.2, 0.3]}, ("camera.distortion has 3 values", "0, 4, 5 or 8")),
     (
         {"camera__model": "fisheye", "camera__distortion": [0.1] * 5},
         ("camera.distortion has 5 values", "fisheye", "0 or 4"),

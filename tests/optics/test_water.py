@@ -4,12 +4,7 @@ import numpy as np
 import pytest
 
 from aqualvs.errors import OptionError
-from aqualvs.optics.water import (
-    N_AIR,
-    seawater_index,
-    seawater_index_slopes,
-    seawater_index_vacuum,
-)
+from aqualvs.optics.water import N_AIR, seawater_index, seawater_index_slopes, seawater_index_vacuum
 
 SODIUM_NM = 589.3
 

@@ -297,12 +297,7 @@ def test_cost_of_a_chunk_does_not_grow_with_the_dive(tmp_path):
     chunk = chunk_of(1, n_messages=3, n_bytes=60)
     content = chunk.content + b"\x80" + (40_000).to_bytes(8, "little") + bytes(40_000)
     chunk = chunk.__class__(
-        content,
-        chunk.length,
-        chunk.index_offsets,
-        chunk.times_ns,
-        chunk.sizes,
-        chunk.counts,
+        content, chunk.length, chunk.index_offsets, chunk.times_ns, chunk.sizes, chunk.counts
     )
     overhead = []
     for _ in range(4):

@@ -229,11 +229,7 @@ def test_unknown_numbers_show_as_a_dash() -> None:
             ParameterRow(name="q", value=1.0, sigma=None, before=NAN),
             ParameterRow(name="r", value=float("inf"), sigma=0.0, before=2.0),
         ),
-        expectations=(
-            expectation(1.0, (0.3, 0.03, NAN)),
-            expectation(NAN),
-            expectation(0.0),
-        ),
+        expectations=(expectation(1.0, (0.3, 0.03, NAN)), expectation(NAN), expectation(0.0)),
         lasers=(laser(normal=np.full(3, NAN), offset_mm=NAN, rms_px=NAN, sigma_normal_deg=NAN),),
         series=(Series(title="s", x_label="x", y_label="y", x=np.arange(20.0), y=unknown),),
         residual_maps=(replace(residual_map(20), residuals=np.stack([unknown, unknown], axis=1)),),

@@ -315,8 +315,7 @@ def test_a_finished_run_is_complete(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("fault", "status"),
-    [(ValueError("odd"), "failed"), (KeyboardInterrupt(), "interrupted")],
+    ("fault", "status"), [(ValueError("odd"), "failed"), (KeyboardInterrupt(), "interrupted")]
 )
 def test_a_run_that_dies_of_an_exception_is_complete(tmp_path, fault, status):
     def run():

@@ -119,10 +119,7 @@ def test_rows_and_columns_are_searched_alike(seed: int) -> None:
     wide=st.booleans(),
 )
 def test_projecting_and_triangulating_are_inverse(
-    seed: int,
-    lens_mm: tuple[float, float, float],
-    rotvec: tuple[float, float, float],
-    wide: bool,
+    seed: int, lens_mm: tuple[float, float, float], rotvec: tuple[float, float, float], wide: bool
 ) -> None:
     base = bluerov2_rig() if wide else example_rig()
     turn = rotation_from_rotvec(np.array(rotvec)) @ base.dome_from_cam.rotation
@@ -258,11 +255,7 @@ def wall_frame(rig: Rig, wall: Plane) -> Frame:
     yaw=st.floats(-0.3, 0.3),
 )
 def test_the_posture_does_not_hang_on_how_the_rig_is_written_down(
-    order: list[int],
-    flipped: tuple[bool, bool, bool],
-    distance: float,
-    pitch: float,
-    yaw: float,
+    order: list[int], flipped: tuple[bool, bool, bool], distance: float, pitch: float, yaw: float
 ) -> None:
     rig = example_rig()
     pose = dome_from_target(distance, pitch, yaw)

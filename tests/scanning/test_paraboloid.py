@@ -92,9 +92,7 @@ def test_a_bend_is_hinted_at() -> None:
 
 
 @pytest.mark.parametrize("bend", [(1.0, 0.0, 0.0), (-0.8, 0.1, 0.4), (0.0, 0.0, 0.0)])
-def test_the_nearest_tangent_touches_at_the_nearest_point(
-    bend: tuple[float, float, float],
-) -> None:
+def test_the_nearest_tangent_touches_at_the_nearest_point(bend: tuple[float, float, float]) -> None:
     patch = patch_of(0.003, 0.05, -0.04, *bend)
     m = nearest_tangent(patch)
     assert m is not None

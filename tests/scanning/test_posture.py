@@ -6,13 +6,7 @@ import pytest
 from agreement_cases import posture_from_fit
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.scanning.plane_fit import PlaneFit
-from aqualvs.scanning.posture import (
-    Posture,
-    Reason,
-    Refusal,
-    range_pitch_yaw,
-    validate,
-)
+from aqualvs.scanning.posture import Posture, Reason, Refusal, range_pitch_yaw, validate
 from aqualvs.simulation.scenario import dome_from_target
 
 POINTS = np.array([[0.0, 0.55, 0.0], [0.1, 0.5, -0.1], [-0.2, 0.5, 0.1]])

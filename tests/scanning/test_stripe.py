@@ -66,11 +66,7 @@ def detect(
 
 
 def gaussian(
-    centres: FloatArray,
-    *,
-    sigma: float = 2.5,
-    height: float = 120.0,
-    length: int = 200,
+    centres: FloatArray, *, sigma: float = 2.5, height: float = 120.0, length: int = 200
 ) -> FloatArray:
     """Light of one stripe, shape (length, n_lines)."""
     v = np.arange(length)[:, None]

@@ -181,11 +181,7 @@ def test_pixels_that_are_no_numbers_are_not_valid(bad: float) -> None:
 def test_no_pixels_give_no_points() -> None:
     rig = example_rig()
     found = triangulate(
-        rig,
-        rig.camera(),
-        np.empty((0, 2)),
-        np.empty(0, np.bool_),
-        np.empty(0, np.int64),
+        rig, rig.camera(), np.empty((0, 2)), np.empty(0, np.bool_), np.empty(0, np.int64)
     )
     assert found.points_in_dome.shape == found.sensitivity.shape == (0, 3)
     assert found.valid.shape == (0,)

@@ -104,10 +104,7 @@ def test_on_a_clear_wall_a_stripe_has_one_point_in_every_pixel_along_it(renderer
 
 @pytest.mark.parametrize(
     "water",
-    [
-        replace(_CLEAR, attenuation=(20.0, 20.0, 20.0)),
-        replace(_CLEAR, ambient=(60.0, 60.0, 60.0)),
-    ],
+    [replace(_CLEAR, attenuation=(20.0, 20.0, 20.0)), replace(_CLEAR, ambient=(60.0, 60.0, 60.0))],
     ids=["swallowed by the water", "drowned in daylight"],
 )
 def test_what_no_picture_shows_is_not_visible(renderer, water):

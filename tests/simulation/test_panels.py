@@ -14,13 +14,7 @@ from aqualvs.geometry.transforms import SE3
 from aqualvs.optics.sheet import sheets_of
 from aqualvs.simulation.calibration_targets import board_panel, squares_size
 from aqualvs.simulation.lasers import default_sources
-from aqualvs.simulation.panels import (
-    Panel,
-    PanelRenderer,
-    PanelScene,
-    RoomLight,
-    panel_sheets,
-)
+from aqualvs.simulation.panels import Panel, PanelRenderer, PanelScene, RoomLight, panel_sheets
 from aqualvs.simulation.scene import CameraSensor
 from aqualvs.simulation.textures import (
     INK,

@@ -303,10 +303,7 @@ def test_a_taken_port_is_said_and_used_once_it_is_free(clips):
 
 
 def test_something_else_on_the_port_is_said():
-    with (
-        udp_listener() as heard,
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stray,
-    ):
+    with udp_listener() as heard, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stray:
         stray.sendto(b"hello, is this the echo sounder?", ("127.0.0.1", heard.feed.port))
         heard.wait(lambda: "neither RTP" in heard.feed.health().detail)
 

@@ -233,8 +233,7 @@ def test_a_change_of_picture_size_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("content", "words"),
-    [(None, "no such file"), (b"", "empty"), (b"hello\n" * 50, "not a video")],
+    ("content", "words"), [(None, "no such file"), (b"", "empty"), (b"hello\n" * 50, "not a video")]
 )
 def test_what_is_no_video_is_refused_in_one_line(tmp_path, content, words):
     path = tmp_path / "a.mp4"

@@ -190,12 +190,7 @@ def _images(folder: Path, piece_frames: int, margin: int) -> dict[str, Any]:
 
 def _uncut(path: Path, why: str) -> dict[str, Any]:
     stat = _stat_key(path)
-    return {
-        "source_key": digest(stat),
-        "spans": [],
-        "why_whole": why,
-        "n_bytes": size_of(path),
-    }
+    return {"source_key": digest(stat), "spans": [], "why_whole": why, "n_bytes": size_of(path)}
 
 
 def size_of(path: Path) -> int:

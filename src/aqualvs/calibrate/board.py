@@ -240,11 +240,7 @@ def _plate_markers(
         corners = SE3(turn, np.array(request.position_mm) / _MM).apply(corners)
         frame = "dome"
     return MarkerSet(
-        frame=frame,
-        family=family,
-        ids=ids,
-        corners=corners,
-        plane_names=(None,) * len(ids),
+        frame=frame, family=family, ids=ids, corners=corners, plane_names=(None,) * len(ids)
     )
 
 

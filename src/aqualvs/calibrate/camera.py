@@ -35,11 +35,7 @@ from aqualvs.optics.lens import LensModel
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig
 from aqualvs.optics.rigfile import check_rig_place
 from aqualvs.optics.solved import SolvedStep, with_step, with_uncertainty
-from aqualvs.report.calibration_material import (
-    CalibrationPage,
-    facts,
-    parameter_rows,
-)
+from aqualvs.report.calibration_material import CalibrationPage, facts, parameter_rows
 from aqualvs.report.html import Card
 
 
@@ -92,9 +88,7 @@ def calibrate_camera(
     known = load_nominal(Path(nominal)) if isinstance(nominal, str | Path) else nominal or Nominal()
     pattern = board if isinstance(board, Board) else load_board(board)
     found = detect_targets(
-        pictures,
-        lambda name, image: detect_board(image, pattern, name),
-        named(board, "the board"),
+        pictures, lambda name, image: detect_board(image, pattern, name), named(board, "the board")
     )
     _check_size(found, known, nominal)
     result = solve_camera(
@@ -188,10 +182,7 @@ def _page(
         title="Calibration of the camera",
         subtitle=f"Rig “{rig.name}”",
         cards=tuple(cards),
-        warnings=(
-            *found.remarks,
-            *(f"{name}: {why}" for name, why in result.left_out.items()),
-        ),
+        warnings=(*found.remarks, *(f"{name}: {why}" for name, why in result.left_out.items())),
         words=result.findings,
         parameters=parameter_rows(rig, result.uncertainty, lens.parameter_names),
         residual_maps=(corner_residuals(result.views, result.size_px),),

@@ -44,12 +44,7 @@ from aqualvs.optics.solved import (
     with_step,
     with_uncertainty,
 )
-from aqualvs.report.calibration_material import (
-    CalibrationPage,
-    expectations,
-    facts,
-    parameter_rows,
-)
+from aqualvs.report.calibration_material import CalibrationPage, expectations, facts, parameter_rows
 from aqualvs.report.html import Card
 
 # Difference of indices below which a medium is the air inside.

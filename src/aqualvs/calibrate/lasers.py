@@ -223,12 +223,7 @@ def run_lasers(request: LasersRequest, echo: Echo) -> None:
     for figures, laser in zip(done.solution.lasers, done.rig.lasers, strict=True):
         echo(_words(figures, laser))
     finish(
-        done.rig,
-        _page(before, done, request),
-        request.out,
-        "lasers",
-        echo,
-        comments_of=request.rig,
+        done.rig, _page(before, done, request), request.out, "lasers", echo, comments_of=request.rig
     )
 
 

@@ -108,12 +108,7 @@ def _lens(row: _Row, place: str) -> Lens:
         )
     values = _named(row.params, _MODELS[row.model], f"{place}: {row.model}")
     f = values.get("f", 0.0)
-    core = (
-        values.get("fx", f),
-        values.get("fy", f),
-        values["cx"] - _HALF,
-        values["cy"] - _HALF,
-    )
+    core = (values.get("fx", f), values.get("fy", f), values["cx"] - _HALF, values["cy"] - _HALF)
     if row.model == _FISHEYE:
         return opencv_lens(core, [values[key] for key in ("k1", "k2", "k3", "k4")], fisheye=True)
     known = [values.get(key, 0.0) for key in _ORDER]

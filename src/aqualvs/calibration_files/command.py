@@ -239,10 +239,7 @@ def run_export(request: ExportRequest, echo: Echo) -> None:
         text = camera_text(camera_of_rig(rig), request.to, suffix=request.out.suffix)
     except RigError as fault:
         raise RigError(f"{request.rig}: {fault}") from None
-    with (
-        Claim("export", [request.out], overwrite=request.overwrite),
-        writing(request.out),
-    ):
+    with Claim("export", [request.out], overwrite=request.overwrite), writing(request.out):
         replace_text(request.out, text)
     echo(f"{request.to}: {request.out}")
     left_out = _left_out(rig, request.to)

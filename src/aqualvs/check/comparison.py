@@ -33,12 +33,7 @@ from aqualvs.optics.rig import (
 )
 from aqualvs.optics.rigfile import dated_copies, load_rig
 from aqualvs.optics.sheet import sheet_in
-from aqualvs.optics.solved import (
-    file_parameter_name,
-    rig_numbers,
-    rig_uncertainty,
-    solved_steps,
-)
+from aqualvs.optics.solved import file_parameter_name, rig_numbers, rig_uncertainty, solved_steps
 
 SIGNIFICANT = 5.0
 """Sigmas from which on a change is no chance."""

@@ -50,11 +50,7 @@ from aqualvs.sources.video import sampled_pictures
 
 _HEARTBEAT_S, _LISTEN_S = 6.0, 3.0
 _SUBMARINE = 12
-_SEVERITY = {
-    Weight.FINE: Severity.OK,
-    Weight.CARE: Severity.WARN,
-    Weight.BROKEN: Severity.BAD,
-}
+_SEVERITY = {Weight.FINE: Severity.OK, Weight.CARE: Severity.WARN, Weight.BROKEN: Severity.BAD}
 _MODES = {
     Mode.OURS: "follow engages in it",
     Mode.PILOT: "follow does not engage in it; choose {own}",

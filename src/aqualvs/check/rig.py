@@ -198,8 +198,7 @@ def _loose(rig: Rig, uncertainty: RigUncertainty) -> Iterator[Finding]:
     index = _largest(uncertainty, ("n_water",))
     if index > _INDEX:
         yield _warning(
-            f"The water's index is known only to {index:.1g}",
-            "give temperature and salinity",
+            f"The water's index is known only to {index:.1g}", "give temperature and salinity"
         )
     for laser in rig.lasers:
         tilt_1, tilt_2, offset = laser_parameter_names(laser)[:3]

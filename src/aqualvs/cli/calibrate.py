@@ -276,10 +276,7 @@ def shutter(
     """Calibrate the shutter."""
     from aqualvs.calibrate import shutter as body
 
-    body.run_shutter(
-        body.ShutterRequest(source=source, rig=rig, out=out, fps=fps),
-        typer.echo,
-    )
+    body.run_shutter(body.ShutterRequest(source=source, rig=rig, out=out, fps=fps), typer.echo)
 
 
 def board(

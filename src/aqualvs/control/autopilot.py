@@ -181,11 +181,7 @@ class NetPilot:
         return self.mission.update(now_s, posture, state)
 
     def _ask(
-        self,
-        time_s: float,
-        posture: Posture | None,
-        filtered: Motion | None,
-        guidance: Guidance,
+        self, time_s: float, posture: Posture | None, filtered: Motion | None, guidance: Guidance
     ) -> Effort | None:
         """Return the controller's effort; None, and the controller at rest, if it must not act."""
         motion = _motion(posture, filtered)

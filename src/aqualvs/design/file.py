@@ -292,8 +292,7 @@ def _design(file: DesignFile, folder: Path) -> Design:
         tolerances=_tolerances(file.tolerances),
         net=NominalNet(**si_values(file.net)),
         goals=Goals(
-            range_share=file.goals.range_percent / 100.0,
-            angle=math.radians(file.goals.angle_deg),
+            range_share=file.goals.range_percent / 100.0, angle=math.radians(file.goals.angle_deg)
         ),
         avoid_crossings=file.avoid_crossings,
     )

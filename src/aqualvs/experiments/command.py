@@ -124,9 +124,7 @@ class ExperimentBar:
         self._i += 1
         self._left.start(name)
         self._bar.update(
-            self._task,
-            description=f"{self._i}/{self._n} {name}",
-            completed=self._left.share,
+            self._task, description=f"{self._i}/{self._n} {name}", completed=self._left.share
         )
 
     def tick(self, n_frames: int) -> None:

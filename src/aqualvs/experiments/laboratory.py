@@ -186,11 +186,7 @@ class Laboratory:
         return RenderedDive(folder.name, folder, rig, scenario)
 
     def measure(
-        self,
-        dive: RenderedDive,
-        options: ScannerOptions | None = None,
-        *,
-        rig: Rig | None = None,
+        self, dive: RenderedDive, options: ScannerOptions | None = None, *, rig: Rig | None = None
     ) -> MeasuredDive:
         """Measure every frame of a dive.
 

@@ -52,7 +52,7 @@ def swing(name: str) -> Scenario:
                 "values": [0],
                 "sway": _SWING.amplitude_deg,
                 "period_s": _SWING.period_s,
-            },
+            }
         },
         "walls": [{}],
     }

@@ -118,11 +118,7 @@ def sea(
     flow = (current * math.cos(current_to), current * math.sin(current_to), 0.0)
     swell = Waves(amplitude=waves, period=period, direction=waves_to, n=6) if waves else None
     return WaterMotion(
-        current=flow,
-        wander=wander,
-        waves=swell,
-        tether=Tether(length=tether),
-        seed=seed,
+        current=flow, wander=wander, waves=swell, tether=Tether(length=tether), seed=seed
     )
 
 

@@ -55,9 +55,7 @@ class StepAnswer:
 
 
 def simulate_step(
-    model: VehicleModel,
-    gains: ControlGains,
-    options: StepOptions | None = None,
+    model: VehicleModel, gains: ControlGains, options: StepOptions | None = None
 ) -> StepAnswer:
     """Hold a range before a wall in still water, then another one; postures are exact.
 

@@ -31,11 +31,7 @@ def dot(a: Vec, b: Vec) -> float:
 @inline_borrowing_kernel
 def cross(a: Vec, b: Vec) -> Vec:
     """Return the vector product."""
-    return (
-        a[1] * b[2] - a[2] * b[1],
-        a[2] * b[0] - a[0] * b[2],
-        a[0] * b[1] - a[1] * b[0],
-    )
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
 @inline_borrowing_kernel

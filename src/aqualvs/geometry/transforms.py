@@ -115,10 +115,7 @@ class SE3:
 
     def __matmul__(self, other: "SE3") -> "SE3":
         """Compose: `a_from_c = a_from_b @ b_from_c`."""
-        return SE3(
-            self.rotation @ other.rotation,
-            self.apply(other.translation),
-        )
+        return SE3(self.rotation @ other.rotation, self.apply(other.translation))
 
     def apply(self, points: ArrayLike) -> FloatArray:
         """Transform points (..., 3) from the source to the destination frame."""

@@ -69,10 +69,7 @@ def load_vehicle(path: Path) -> VehicleSetup:
     try:
         key = None if content.key is None else load_key(path.parent / content.key)
         link = LinkOptions(
-            system=content.system,
-            component=content.component,
-            peers=tuple(content.peers),
-            key=key,
+            system=content.system, component=content.component, peers=tuple(content.peers), key=key
         )
         steering = ArduSubOptions(
             command=Command(content.command),

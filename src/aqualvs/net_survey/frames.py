@@ -310,11 +310,7 @@ def prior_sigma(frame: WallFrame) -> FloatArray:
     return np.array([along, PRIOR_DEPTH])
 
 
-def align(
-    later: PlacedSurvey,
-    earlier: Sequence[PlacedSurvey],
-    frame: WallFrame,
-) -> SurveyShift:
+def align(later: PlacedSurvey, earlier: Sequence[PlacedSurvey], frame: WallFrame) -> SurveyShift:
     """Return the shift that lays a dive on earlier ones, which are laid already."""
     sigma = prior_sigma(frame)
     grid = _grid(later, earlier, frame)

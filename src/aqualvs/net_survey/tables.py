@@ -342,10 +342,7 @@ def _cell_row(one: CellChange, wall: OnWall) -> dict[str, Cell]:
 
 
 def _between(name: str, unit: str, low: float, high: float) -> dict[str, Cell]:
-    return {
-        f"{name}_from_{unit}": round(low, _PLACES),
-        f"{name}_to_{unit}": round(high, _PLACES),
-    }
+    return {f"{name}_from_{unit}": round(low, _PLACES), f"{name}_to_{unit}": round(high, _PLACES)}
 
 
 def _numbers(before: Growth, after: Growth, change: Growth, rate: Growth) -> dict[str, Cell]:

@@ -291,9 +291,5 @@ def _legend(figure: "Figure", wall: UnrolledNet) -> None:
     if any(fouling_of(one) is None for one in wall.stretches):
         shown["not measured"] = Patch(facecolor=_GREY, edgecolor="white", hatch="////")
     figure.legend(
-        list(shown.values()),
-        list(shown),
-        loc="outside lower left",
-        ncols=len(shown),
-        frameon=False,
+        list(shown.values()), list(shown), loc="outside lower left", ncols=len(shown), frameon=False
     )

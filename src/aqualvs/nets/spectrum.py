@@ -152,14 +152,7 @@ class Spectrum:
         """Return the spectrum of the crossings that do not lie on the crests of a wave."""
         phase = crest_phases(self.place, self.start, wave[0], wave[1])
         kept, start, begin, end, origin, span_start = off_crests(
-            self.place,
-            self.start,
-            self.begin,
-            self.end,
-            self.span_start,
-            phase,
-            wave[0],
-            wave[1],
+            self.place, self.start, self.begin, self.end, self.span_start, phase, wave[0], wave[1]
         )
         return Spectrum(
             self.place[kept],
@@ -274,10 +267,7 @@ class Mesh(StrEnum):
 
 
 # Coordinates in which lattices may differ: wave and axis.
-_COORDINATES = {
-    Mesh.FOUR_SIDED: ((0, 0), (0, 1), (1, 0), (1, 1)),
-    Mesh.SIX_SIDED: ((0, 0), (0, 1)),
-}
+_COORDINATES = {Mesh.FOUR_SIDED: ((0, 0), (0, 1), (1, 0), (1, 1)), Mesh.SIX_SIDED: ((0, 0), (0, 1))}
 
 
 @dataclass(frozen=True, slots=True)
@@ -365,10 +355,7 @@ def _uneven(hypothesis: Hypothesis) -> float:
 def hypotheses(spectrum: Spectrum) -> list[Hypothesis]:
     """Return lattices that explain peaks of the spectrum; most of them are wrong."""
     size, angle, power = spectrum.polar()
-    return [
-        *_four_sided(spectrum, size, angle, power),
-        *_six_sided(spectrum, size, angle, power),
-    ]
+    return [*_four_sided(spectrum, size, angle, power), *_six_sided(spectrum, size, angle, power)]
 
 
 def _family_gain(power: FloatArray, size: FloatArray, per_frame: float, share: float) -> FloatArray:

@@ -532,10 +532,7 @@ def project_all(
 
 @inline_kernel
 def _see_lane(
-    camera: CameraParams,
-    w: FloatArray,
-    j: int,
-    seen: tuple[bool, float, float, Vector, Vector],
+    camera: CameraParams, w: FloatArray, j: int, seen: tuple[bool, float, float, Vector, Vector]
 ) -> None:
     """Write the pixel and its gradients into lane j."""
     ok, w[U + j], w[V + j], u_d, v_d = seen
@@ -563,12 +560,7 @@ def see_jacobian_block(camera: CameraParams, count: int, w: FloatArray) -> None:
 
 @inline_kernel
 def store_parameters(
-    camera: CameraParams,
-    n_before: int,
-    start: int,
-    count: int,
-    w: FloatArray,
-    jacobian: FloatArray,
+    camera: CameraParams, n_before: int, start: int, count: int, w: FloatArray, jacobian: FloatArray
 ) -> None:
     """Write `count` parameter Jacobians from the scratch `w` to the rows from `start`."""
     for j in range(count):

@@ -37,14 +37,7 @@ def snell_weight(cos_in: float, ratio: float) -> tuple[float, float]:
 
 @inline_kernel
 def leave_sphere(
-    px: float,
-    py: float,
-    pz: float,
-    dx: float,
-    dy: float,
-    dz: float,
-    radius: float,
-    ratio: float,
+    px: float, py: float, pz: float, dx: float, dy: float, dz: float, radius: float, ratio: float
 ) -> tuple[float, float, float, float, float, float, float]:
     """Carry a ray from inside a sphere round the origin to its surface and refract it there.
 
@@ -111,11 +104,7 @@ def leave_plane(
     return (
         radicand if cos_in > 0.0 else -1.0,
         (p[0] + step * d[0], p[1] + step * d[1], p[2] + step * d[2]),
-        (
-            ratio * d[0] - k * normal[0],
-            ratio * d[1] - k * normal[1],
-            ratio * d[2] - k * normal[2],
-        ),
+        (ratio * d[0] - k * normal[0], ratio * d[1] - k * normal[1], ratio * d[2] - k * normal[2]),
     )
 
 

@@ -87,24 +87,14 @@ def crossing(
     off = row[NORMAL] * vx + row[NORMAL + 1] * vy + row[NORMAL + 2] * vz
     if not h > 0.0:
         return off, 0.0, 0.0, 0.0, h
-    lx, ly, lz = (
-        vx - height * row[FACE],
-        vy - height * row[FACE + 1],
-        vz - height * row[FACE + 2],
-    )
+    lx, ly, lz = (vx - height * row[FACE], vy - height * row[FACE + 1], vz - height * row[FACE + 2])
     rho = lx * lx + ly * ly + lz * lz
     m = _steepness(s, h, k, rho)
     slant = row[SLANT]
     bend = (1.0 - k * k) * slant * slant
     f = (off - slant * (height - 1.0 / m)) / math.sqrt(1.0 + bend * (1.0 + m * m * rho))
     a = s * m
-    return (
-        f,
-        a * lx + s * row[FACE],
-        a * ly + s * row[FACE + 1],
-        a * lz + s * row[FACE + 2],
-        h,
-    )
+    return (f, a * lx + s * row[FACE], a * ly + s * row[FACE + 1], a * lz + s * row[FACE + 2], h)
 
 
 @inline_borrowing_kernel
@@ -128,11 +118,7 @@ def differential(
     height = row[FACE] * vx + row[FACE + 1] * vy + row[FACE + 2] * vz
     s, k, slant = row[DEPTH], row[RATIO], row[SLANT]
     h = height - s
-    lx, ly, lz = (
-        vx - height * row[FACE],
-        vy - height * row[FACE + 1],
-        vz - height * row[FACE + 2],
-    )
+    lx, ly, lz = (vx - height * row[FACE], vy - height * row[FACE + 1], vz - height * row[FACE + 2])
     off = row[NORMAL] * vx + row[NORMAL + 1] * vy + row[NORMAL + 2] * vz
     if not (row[WINDOWED] != 0.0 and h > 0.0):
         return off, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, height, lx, ly, lz
@@ -184,14 +170,7 @@ def sheet_tangent(
 
 @inline_borrowing_kernel
 def meet_sheet(
-    row: FloatArray,
-    ox: float,
-    oy: float,
-    oz: float,
-    dx: float,
-    dy: float,
-    dz: float,
-    near: float,
+    row: FloatArray, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, near: float
 ) -> tuple[float, float, float, float]:
     """Return the distance along a ray to a windowed sheet in the water, and f's gradient there.
 

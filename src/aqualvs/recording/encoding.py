@@ -497,10 +497,7 @@ HEALTH = RecordedTopic(
 )
 RIG = RecordedTopic(5, "/aqualvs/rig", "aqualvs_msgs/msg/Rig", _definition(_RIG, _HEADER, _TIME))
 PICTURE = RecordedTopic(
-    6,
-    "/aqualvs/picture",
-    "sensor_msgs/msg/CompressedImage",
-    _definition(_IMAGE, _HEADER, _TIME),
+    6, "/aqualvs/picture", "sensor_msgs/msg/CompressedImage", _definition(_IMAGE, _HEADER, _TIME)
 )
 CHROMA = RecordedTopic(
     7,

@@ -126,8 +126,7 @@ class RerunLog(Closing):
         self._rig = rig
         camera = rig.dome_from_cam
         self._log_static(
-            _CAMERA,
-            rr.Transform3D(translation=camera.translation, mat3x3=camera.rotation),
+            _CAMERA, rr.Transform3D(translation=camera.translation, mat3x3=camera.rotation)
         )
         # Of the lens in air: neither its distortion nor the dome is in it.
         pinhole = rr.Pinhole(

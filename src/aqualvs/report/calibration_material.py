@@ -180,10 +180,7 @@ def expectations(rig: Rig) -> tuple[ExpectedError, ...]:
 
 
 def parameter_rows(
-    rig: Rig,
-    uncertainty: RigUncertainty,
-    names: Sequence[str],
-    before: Rig | None = None,
+    rig: Rig, uncertainty: RigUncertainty, names: Sequence[str], before: Rig | None = None
 ) -> tuple[ParameterRow, ...]:
     """Return the named numbers of a rig's camera, with sigma and what they were before."""
     values, sigmas = rig_numbers(rig), uncertainty.sigmas

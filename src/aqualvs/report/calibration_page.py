@@ -15,12 +15,7 @@ from aqualvs.optics.expected_error import ExpectedError, in_mm_and_degrees
 from aqualvs.report import html
 from aqualvs.report import svg as draw
 from aqualvs.report.calibration_charts import N_VECTORS, picture_view, residual_view
-from aqualvs.report.calibration_material import (
-    CalibrationPage,
-    LaserRow,
-    ParameterRow,
-    ViewRow,
-)
+from aqualvs.report.calibration_material import CalibrationPage, LaserRow, ParameterRow, ViewRow
 from aqualvs.report.html import Raw, swatch, table
 from aqualvs.report.svg import line_chart
 from aqualvs.results.files import writing

@@ -138,11 +138,7 @@ def hover_places(start: float, end: float, whole: float) -> Iterator[float]:
 
 
 _PER_LINE = 2000
-_QUANTITIES = (
-    ("range", "mm", 1e3, 2, 4.0),
-    ("pitch", "°", 1.0, 3, 0.5),
-    ("yaw", "°", 1.0, 3, 0.5),
-)
+_QUANTITIES = (("range", "mm", 1e3, 2, 4.0), ("pitch", "°", 1.0, 3, 0.5), ("yaw", "°", 1.0, 3, 0.5))
 _SYMBOLS = (
     *("circle", "square", "triangle-up", "star", "square-open", "x"),
     *("diamond", "circle-open"),
@@ -174,13 +170,7 @@ def error_chart(track: Track, truth: FloatArray) -> Json:
         strip["name"] += " error"
         strip["error"] = True
     span = rounded([track.time_s[0] * scale, track.time_s[-1] * scale], 4)
-    return {
-        "time_unit": unit,
-        "measured": "error",
-        "strips": strips,
-        "span": span,
-        "stretches": [],
-    }
+    return {"time_unit": unit, "measured": "error", "strips": strips, "span": span, "stretches": []}
 
 
 def plane_charts(

@@ -232,11 +232,7 @@ def _rings(
     from matplotlib.patches import Circle
 
     half, dd = 1e3 * options.rd_theta / 2.0, 1e3 * options.dd
-    outer = {
-        "A": half,
-        "B": max(1e3 * options.r_min - half, half),
-        "C": 1e3 * options.r_max + half,
-    }
+    outer = {"A": half, "B": max(1e3 * options.r_min - half, half), "C": 1e3 * options.r_max + half}
     at = np.rint((middle - corner) / dd - 0.5).astype(np.int64)
     offset = cells - at + options.padding
     near = np.all((offset >= 0) & (offset <= 2 * options.padding), axis=1)

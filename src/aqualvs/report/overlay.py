@@ -42,10 +42,7 @@ def draw_overlay(
 
 
 def draw_points(
-    image: ImagePlane,
-    laser: NDArray[np.integer],
-    pixels: FloatArray,
-    used: BoolArray,
+    image: ImagePlane, laser: NDArray[np.integer], pixels: FloatArray, used: BoolArray
 ) -> ImagePlane:
     """Return a copy of a BGR picture with stripe points drawn into it.
 

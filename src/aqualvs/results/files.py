@@ -189,12 +189,7 @@ class Claim(Closing):
     """
 
     def __init__(
-        self,
-        writer: str,
-        paths: Sequence[Path],
-        *,
-        overwrite: bool,
-        known: Sequence[Path] = (),
+        self, writer: str, paths: Sequence[Path], *, overwrite: bool, known: Sequence[Path] = ()
     ) -> None:
         self._writer = writer
         self._adopt([path for path in known if os.path.lexists(path)])

@@ -267,10 +267,7 @@ class AssignmentTest:
         return None
 
     def test(
-        self,
-        candidates: Candidates,
-        subsegments: Subsegments,
-        surface: Surface,
+        self, candidates: Candidates, subsegments: Subsegments, surface: Surface
     ) -> AssignmentOutcome:
         """Test a surface.
 

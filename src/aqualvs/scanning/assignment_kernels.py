@@ -599,11 +599,7 @@ def loose_share_before(
 
 @kernel
 def seen_of(
-    plane: FloatArray,
-    members: BoolArray,
-    n_lines: IntArray,
-    laser: IntArray,
-    bands: FloatArray,
+    plane: FloatArray, members: BoolArray, n_lines: IntArray, laser: IntArray, bands: FloatArray
 ) -> tuple[float, float]:
     """Return the share of its best stripe that a surface shows, and the share of faint lasers.
 

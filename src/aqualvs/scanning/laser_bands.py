@@ -121,10 +121,7 @@ def _plan_band(
 
 
 def _points_on_grid(
-    sheet: Sheet,
-    working_range: tuple[float, float],
-    camera: Camera,
-    steps: tuple[int, int],
+    sheet: Sheet, working_range: tuple[float, float], camera: Camera, steps: tuple[int, int]
 ) -> tuple[FloatArray, BoolArray]:
     """Return points on the sheet that a grid of pixels sees, and a mask of those in range."""
     width, height = camera.size_px

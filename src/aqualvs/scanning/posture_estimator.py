@@ -574,12 +574,7 @@ class PostureEstimator:
         return fit_pseudo_inverse(points, len(observations.laser), robust.covariance)
 
     def _posture_of_fit(
-        self,
-        candidates: Candidates,
-        seen: "_Observed",
-        fit: PlaneFit,
-        *,
-        of_all: bool = False,
+        self, candidates: Candidates, seen: "_Observed", fit: PlaneFit, *, of_all: bool = False
     ) -> Measurement | None:
         """Return the posture of a fit; None unless a second laser determines the plane's angles.
 

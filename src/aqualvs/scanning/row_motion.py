@@ -22,12 +22,7 @@ import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.geometry.compiled import borrowing_kernel, kernel
-from aqualvs.geometry.linear_algebra import (
-    element_at,
-    factorise,
-    inverse_of,
-    solve_factorised,
-)
+from aqualvs.geometry.linear_algebra import element_at, factorise, inverse_of, solve_factorised
 from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.rig_covariance import FittedSurface, posture_by_plane

@@ -47,11 +47,7 @@ class Triangulator:
         self._bent = sheets if sheets[:, WINDOWED].any() else None
 
     def triangulate(
-        self,
-        pixels: FloatArray,
-        along_x: IntArray,
-        laser: IntArray,
-        group: IntArray | None = None,
+        self, pixels: FloatArray, along_x: IntArray, laser: IntArray, group: IntArray | None = None
     ) -> Triangulation:
         """Triangulate pixels (N, 2), each with the laser whose index is given.
 
@@ -133,11 +129,7 @@ def _intersect(
 
 @borrowing_kernel
 def _place_rays(
-    pixels: FloatArray,
-    along_x: IntArray,
-    group: IntArray,
-    rays_px: FloatArray,
-    owner: IntArray,
+    pixels: FloatArray, along_x: IntArray, group: IntArray, rays_px: FloatArray, owner: IntArray
 ) -> int:
     """Write the pixels, and after them the first of each group moved along the search line.
 

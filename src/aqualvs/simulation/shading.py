@@ -21,13 +21,7 @@ from aqualvs.simulation.lasers import (
     through_window,
 )
 from aqualvs.simulation.scene import Scene
-from aqualvs.simulation.surfaces import (
-    NONE,
-    Surfaces,
-    first_hit,
-    meet_bubbles,
-    normal_and_albedo,
-)
+from aqualvs.simulation.surfaces import NONE, Surfaces, first_hit, meet_bubbles, normal_and_albedo
 from aqualvs.simulation.textures import Tiles, sample
 
 # Daylight comes down steeply, inclined towards the target.
@@ -162,11 +156,7 @@ def _from_source(p: Vec, off: float, sigma: float, sheets: Sheets, i: int) -> tu
     source = row3(sheets.table, i, SOURCE)
     if sheets.optics[i, WINDOWED] != 0.0:
         source = along(source, through_window(p, sheets, i)[1], 1.0)
-    start = along(
-        source,
-        row3(sheets.table, i, NORMAL),
-        off * sheets.table[i, SIGMA] / sigma,
-    )
+    start = along(source, row3(sheets.table, i, NORMAL), off * sheets.table[i, SIGMA] / sigma)
     way = minus(p, start)
     length = np.sqrt(dot(way, way))
     return scaled(way, 1.0 / length), length

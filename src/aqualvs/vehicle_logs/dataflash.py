@@ -347,11 +347,7 @@ def _first_core(tables: _Tables) -> _Tables:
 
 
 def _signal(
-    tables: _Tables,
-    begin: float,
-    kind: str,
-    column: str,
-    scale: float = 1.0,
+    tables: _Tables, begin: float, kind: str, column: str, scale: float = 1.0
 ) -> Signal | None:
     table = tables.get(kind)
     if table is None or column not in table:

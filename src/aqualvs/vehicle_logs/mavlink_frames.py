@@ -129,9 +129,7 @@ def read_frames(data: bytes) -> SelectedMessages:
     return SelectedMessages(tables, n_frames, n_failed, tuple(skipped))
 
 
-def _scan(
-    data: bytes,
-) -> tuple[dict[tuple[int, int], list[int]], int, list[tuple[int, int]]]:
+def _scan(data: bytes) -> tuple[dict[tuple[int, int], list[int]], int, list[tuple[int, int]]]:
     """Follow the chain; return the places of wanted frames by message and version of MAVLink."""
     places: dict[tuple[int, int], list[int]] = defaultdict(list)
     skipped: list[tuple[int, int]] = []

@@ -280,10 +280,7 @@ class PoolJob:
 
 
 def serve(
-    work: PoolJob,
-    pipe: Connection,
-    memory: SharedMemory | None,
-    others: Sequence[Connection],
+    work: PoolJob, pipe: Connection, memory: SharedMemory | None, others: Sequence[Connection]
 ) -> None:
     """Measure the parts whose numbers come through a pipe, until its other end is closed.
 
@@ -343,10 +340,7 @@ _PART_FRAMES = 32
 
 
 def pool_job(
-    source: FrameSource,
-    window: FrameWindow,
-    rig: Rig,
-    options: ScannerOptions,
+    source: FrameSource, window: FrameWindow, rig: Rig, options: ScannerOptions
 ) -> PoolJob | None:
     """Return how a dive can be shared, or None where it cannot, or is too short.
 

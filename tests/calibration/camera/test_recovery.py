@@ -121,8 +121,7 @@ def test_few_views_promise_no_more_than_they_hold() -> None:
 
 
 @pytest.mark.parametrize(
-    "bend",
-    [(0.9e-3, 0.2e-3, -0.4e-3, 0.0), (-0.2e-3, 0.1e-3, 0.0, 1e-3), (0.2e-3, 0.0, 0.0, 0.0)],
+    "bend", [(0.9e-3, 0.2e-3, -0.4e-3, 0.0), (-0.2e-3, 0.1e-3, 0.0, 1e-3), (0.2e-3, 0.0, 0.0, 0.0)]
 )
 def test_a_bent_board_is_recognised_and_solved_for(bend: tuple[float, ...]) -> None:
     bent = _bent(np.array(bend))

@@ -13,16 +13,7 @@ from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
 from aqualvs.optics.flat_port import FlatPort
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig, RigUncertainty, rig_moved_by
 from aqualvs.simulation.scenarios import flat_port_rig
-from dome_cases import (
-    AIR,
-    INTRINSICS,
-    WATER,
-    Given,
-    Shoot,
-    board_points,
-    normalised_errors,
-    see,
-)
+from dome_cases import AIR, INTRINSICS, WATER, Given, Shoot, board_points, normalised_errors, see
 
 QUICK = DomeOptions(check_cross_validation=False)
 SIGMA_WATER = 5e-4

@@ -40,12 +40,7 @@ SIGMA_WATER = 5e-4
 
 @pytest.mark.parametrize(
     ("kinds", "n_runs"),
-    [
-        (("exact",), 30),
-        (("distance",), 16),
-        (("unknown",), 16),
-        (("distance", "unknown"), 12),
-    ],
+    [(("exact",), 30), (("distance",), 16), (("unknown",), 16), (("distance", "unknown"), 12)],
 )
 def test_normalised_errors_are_normal(kinds: tuple[str, ...], n_runs: int) -> None:
     """Dome and intrinsics are off within what is known of them; the second set is in water."""

@@ -7,10 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from aqualvs.calibration.lasers.calibrate import (
-    LaserOptions,
-    calibrate_lasers,
-)
+from aqualvs.calibration.lasers.calibrate import LaserOptions, calibrate_lasers
 from aqualvs.calibration.lasers.checks import LaserCalibration, match_to_rig, named
 from aqualvs.calibration.lasers.solve import InitialGuess, paper_plane, solve_lasers
 from aqualvs.calibration.lasers.stripes_on_planes import board_surface

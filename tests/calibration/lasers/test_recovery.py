@@ -7,21 +7,12 @@ import numpy as np
 import pytest
 
 from aqualvs.calibration.detection.detection import detect_markers
-from aqualvs.calibration.lasers.calibrate import (
-    LaserOptions,
-    calibrate_lasers,
-)
+from aqualvs.calibration.lasers.calibrate import LaserOptions, calibrate_lasers
 from aqualvs.calibration.lasers.stripes_on_planes import StripePoints, board_surface, box_surfaces
 from aqualvs.calibration.lasers.views import LaserView
 from aqualvs.calibration.targets.target_files import load_box
 from aqualvs.geometry.arrays import FloatArray
-from aqualvs.optics.rig import (
-    LASER_PARAMETERS,
-    Rig,
-    RigUncertainty,
-    rig_moved_by,
-    tangent_basis,
-)
+from aqualvs.optics.rig import LASER_PARAMETERS, Rig, RigUncertainty, rig_moved_by, tangent_basis
 from aqualvs.scanning.uncalibrated_stripes import find_stripes as find_stripes
 from aqualvs.simulation.scenarios import example_rig
 from laser_cases import (

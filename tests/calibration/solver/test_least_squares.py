@@ -8,12 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aqualvs.calibration.solver.least_squares import (
-    Block,
-    RobustLoss,
-    inverse,
-    solve,
-)
+from aqualvs.calibration.solver.least_squares import Block, RobustLoss, inverse, solve
 from aqualvs.errors import CalibrationError, RigError
 from aqualvs.geometry.arrays import FloatArray
 

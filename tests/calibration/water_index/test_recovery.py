@@ -115,10 +115,7 @@ def test_a_step_is_flagged_within_two_seconds_and_followed(before: float, after:
         (
             i / FPS,
             seen(
-                rig,
-                points,
-                before if i < 40 else after,
-                bias + rng.normal(0.0, 0.05, bias.shape),
+                rig, points, before if i < 40 else after, bias + rng.normal(0.0, 0.05, bias.shape)
             ),
         )
         for i in range(90)

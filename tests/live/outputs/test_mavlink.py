@@ -222,9 +222,7 @@ def test_quality_leaves_one_to_the_invalid(qualities: list[float], expected: int
     n = len(qualities)
     # A point that the posture does not rest on must not count.
     points = replace(
-        ScanPoints.none(),
-        quality=np.array([*qualities, 0.9]),
-        used=np.array([True] * n + [False]),
+        ScanPoints.none(), quality=np.array([*qualities, 0.9]), used=np.array([True] * n + [False])
     )
     assert signal_quality(points) == expected
 

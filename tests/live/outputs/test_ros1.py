@@ -84,10 +84,7 @@ class Roscore:
         command = ["roscore"] if complete else ["rosmaster", "--core", "-w", "3"]
         command += ["-p", str(self._port)]
         self._process = subprocess.Popen(
-            command,
-            env=self.environment,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
+            command, env=self.environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
         )
         assert until(self._answers), "roscore did not start"
 

@@ -209,10 +209,7 @@ _STEPS = {LensModel.OPENCV: (4, 5, 8), LensModel.FISHEYE: (4,)}
 
 
 def fitted_camera(
-    views: Sequence[View],
-    size_px: tuple[int, int],
-    model: LensModel,
-    n_coefficients: int | None,
+    views: Sequence[View], size_px: tuple[int, int], model: LensModel, n_coefficients: int | None
 ) -> tuple[Bundle, Solution[BundleState]]:
     """Solve the camera, with as many distortion coefficients as the views support.
 

@@ -168,10 +168,7 @@ def _quads(flags: int) -> _Finder:
 # In the order of use; the first is the best and the fastest.
 _FINDERS: tuple[tuple[str, _Finder], ...] = (
     ("findChessboardCornersSB", _sectors(cv2.CALIB_CB_NORMALIZE_IMAGE)),
-    (
-        "findChessboardCorners",
-        _quads(cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE),
-    ),
+    ("findChessboardCorners", _quads(cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE)),
     (
         "findChessboardCornersSB, exhaustive",
         _sectors(cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE),
@@ -491,10 +488,5 @@ def _refine(
     # The first cell of a marker is its dark border; its bits follow.
     cell = board.marker / board.square / (aruco_dictionary(board.dictionary).markerSize + 2)
     return refine_saddles(
-        image,
-        starts,
-        axes,
-        light,
-        margin=board.margin_share,
-        bits_from=board.margin_share + cell,
+        image, starts, axes, light, margin=board.margin_share, bits_from=board.margin_share + cell
     )

@@ -38,11 +38,7 @@ from aqualvs.calibration.dome.problem import (
     place_names,
     with_board_tilt_as_found,
 )
-from aqualvs.calibration.solver.bundle import (
-    CORNER_SIGMA_PX,
-    BundleState,
-    rig_difference,
-)
+from aqualvs.calibration.solver.bundle import CORNER_SIGMA_PX, BundleState, rig_difference
 from aqualvs.calibration.solver.covariance import Observability, consider_covariance, observability
 from aqualvs.calibration.solver.least_squares import Solution, solve
 from aqualvs.calibration.solver.result import (

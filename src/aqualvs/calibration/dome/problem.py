@@ -483,11 +483,7 @@ def _bare_state(
     start_rig = replace(bundle.start.rig, housing=None)
     start = BundleState(start_rig, solution.state.media, tuple(v.dome_from_target for v in views))
     bare = Bundle(
-        tuple(views),
-        free,
-        start,
-        bundle.priors.only(intrinsics),
-        np.zeros(len(bundle.media_sigma)),
+        tuple(views), free, start, bundle.priors.only(intrinsics), np.zeros(len(bundle.media_sigma))
     )
     return solve(bare, replace(start, rig=rig)).state
 

@@ -444,11 +444,7 @@ def _planes_of_pairs(table: LineTable, pairs: IntArray) -> tuple[FloatArray, Flo
 
 
 def _pairs_meet(
-    table: LineTable,
-    pairs: IntArray,
-    normals: FloatArray,
-    offsets: FloatArray,
-    tolerance_px: float,
+    table: LineTable, pairs: IntArray, normals: FloatArray, offsets: FloatArray, tolerance_px: float
 ) -> BoolArray:
     """Return the mask of pairs (P,) that lie in their plane to within the tolerance."""
     distance = np.abs(

@@ -131,10 +131,7 @@ def _by_target(
 
 
 def _fault(
-    pooled: PooledStripes,
-    candidate: PlaneCandidate,
-    members: IntArray,
-    seen: Sequence[JudgedPlane],
+    pooled: PooledStripes, candidate: PlaneCandidate, members: IntArray, seen: Sequence[JudgedPlane]
 ) -> tuple[PlaneVerdict, str] | None:
     """Return the reason against a plane as a laser of its own, or None."""
     if len(members) < _SURE.min_points:
@@ -166,9 +163,7 @@ def _fault(
 
 
 def _same_light(
-    pooled: PooledStripes,
-    members: IntArray,
-    other: JudgedPlane,
+    pooled: PooledStripes, members: IntArray, other: JudgedPlane
 ) -> tuple[PlaneVerdict, str] | None:
     """Return the reason why a plane's stripes may be of another plane's laser, or None."""
     mine = set(pooled.patch[members].tolist())

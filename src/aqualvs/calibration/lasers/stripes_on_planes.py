@@ -217,9 +217,7 @@ def place_stripes(
     rays = camera.rays(stripes.pixels)
     target_from_dome = dome_from_target.inverse()
     in_target = Rays(
-        target_from_dome.apply(rays.origins),
-        target_from_dome.rotate(rays.directions),
-        rays.valid,
+        target_from_dome.apply(rays.origins), target_from_dome.rotate(rays.directions), rays.valid
     )
     points, surface = surfaces.hits(in_target)
     index = np.flatnonzero(surface >= 0)

@@ -88,11 +88,7 @@ def tilt_of(off_square: FloatArray) -> FloatArray:
     """Return the axis of a rotation (..., 3, 3) times the sine of its angle, shape (..., 3)."""
     r = off_square
     return 0.5 * np.stack(
-        [
-            r[..., 2, 1] - r[..., 1, 2],
-            r[..., 0, 2] - r[..., 2, 0],
-            r[..., 1, 0] - r[..., 0, 1],
-        ],
+        [r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]],
         axis=-1,
     )
 

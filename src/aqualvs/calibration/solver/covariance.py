@@ -259,10 +259,7 @@ def shared_covariance(bundle: Bundle, solution: Solution[BundleState]) -> ViewCo
 
 
 def view_covariance(
-    blocks: Sequence[Block],
-    inliers: Sequence[BoolArray],
-    scales: Sequence[float],
-    shared: IntArray,
+    blocks: Sequence[Block], inliers: Sequence[BoolArray], scales: Sequence[float], shared: IntArray
 ) -> ViewCovariance:
     """Estimate the covariance of shared parameters from views with a pose each.
 

@@ -154,10 +154,7 @@ def rms_px(residuals: FloatArray) -> float:
 
 
 def view_fits(
-    labels: Sequence[str],
-    bundle: Bundle,
-    solution: Solution[BundleState],
-    covariance: FloatArray,
+    labels: Sequence[str], bundle: Bundle, solution: Solution[BundleState], covariance: FloatArray
 ) -> tuple[ViewFit, ...]:
     """Return the fits of a bundle's views; `covariance` has the bundle's columns."""
     fits = []

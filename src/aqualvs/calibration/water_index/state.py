@@ -13,12 +13,7 @@ import numpy as np
 
 from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import FloatArray
-from aqualvs.optics.water import (
-    GREEN_NM,
-    N_AIR,
-    seawater_index_slopes,
-    seawater_index_vacuum,
-)
+from aqualvs.optics.water import GREEN_NM, N_AIR, seawater_index_slopes, seawater_index_vacuum
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,10 +151,7 @@ class IndexState:
         covariance = self.covariance.copy()
         covariance[N, N] += grown
         return replace(
-            self,
-            time=time,
-            covariance=covariance,
-            random_variance=self.random_variance + grown,
+            self, time=time, covariance=covariance, random_variance=self.random_variance + grown
         )
 
     def anchored(self) -> "IndexState":

@@ -298,9 +298,7 @@ class ArduSubLink:
         station = self.options.ground_station
         self._commander = self._make_commander()
         self._sticks = PilotSticks(
-            self.link,
-            own=(station, _SENDER),
-            dead_band=self.options.stick_dead_band,
+            self.link, own=(station, _SENDER), dead_band=self.options.stick_dead_band
         )
         self._depth = DepthChoice(self.link, FRESH_S)
         self._response = StickResponse(self.link)

@@ -173,10 +173,7 @@ class PeerTable:
     """
 
     def __init__(
-        self,
-        make_parser: Callable[[], Any],
-        errors: tuple[type[Exception], ...],
-        system: int,
+        self, make_parser: Callable[[], Any], errors: tuple[type[Exception], ...], system: int
     ) -> None:
         self._make_parser, self._system = make_parser, system
         self._errors: tuple[type[Exception], ...] = (*errors, struct.error, IndexError, ValueError)

@@ -247,11 +247,7 @@ class FoxgloveOutput:
         self._seldom_due = RateLimit(seldom_hz)
         try:
             self._server = foxglove.start_server(
-                name="aqualvs",
-                host=host,
-                port=port,
-                context=context,
-                server_listener=self._viewers,
+                name="aqualvs", host=host, port=port, context=context, server_listener=self._viewers
             )
         except (OSError, RuntimeError) as fault:
             raise OutputError(
@@ -274,10 +270,7 @@ class FoxgloveOutput:
             self._scene.log(scene(sample.rig, scan, at_ns), log_time=at_ns)
         if len(scan.points):
             self._log(
-                POINTS,
-                at_ns,
-                lambda: messages.points_message(scan.points, at_ns),
-                self._points_due,
+                POINTS, at_ns, lambda: messages.points_message(scan.points, at_ns), self._points_due
             )
         if frame is not None:
             self._log(
@@ -309,11 +302,7 @@ class FoxgloveOutput:
         if self._transforms.has_sinks():
             self._transforms.log(transforms(rig, at_ns), log_time=at_ns)
         self._log(HEALTH, at_ns, lambda: messages.health_message(health, at_ns))
-        self._log(
-            RIG,
-            at_ns,
-            lambda: messages.rig_message(messages.rig_texts(rig, options), at_ns),
-        )
+        self._log(RIG, at_ns, lambda: messages.rig_message(messages.rig_texts(rig, options), at_ns))
 
     def _log(
         self,

@@ -141,12 +141,7 @@ def _pose(message: PoseMessage, seq: int) -> bytes:
 def _range(message: RangeMessage, seq: int) -> bytes:
     infrared = 1
     return _header(seq, message.stamp_ns, message.frame_id) + struct.pack(
-        "<B4f",
-        infrared,
-        message.field_of_view,
-        message.min_range,
-        message.max_range,
-        message.range,
+        "<B4f", infrared, message.field_of_view, message.min_range, message.max_range, message.range
     )
 
 
