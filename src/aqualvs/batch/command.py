@@ -1,7 +1,6 @@
 """`aqualvs batch`: many dives measured on one machine or on many."""
 
 import json
-import os
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
@@ -20,7 +19,7 @@ from aqualvs.batch.work import PIECE_FRAMES, DiveWork, size_of
 from aqualvs.closing import Closing
 from aqualvs.errors import OptionError, OutputError
 from aqualvs.nets.target_file import NetRequest
-from aqualvs.results.files import AppendFile, Claim, is_locked, read_json, writing
+from aqualvs.results.files import AppendFile, Claim, is_locked, read_json, replace_text, writing
 from aqualvs.results.run_request import RunRequest, Water
 from aqualvs.scanner import ScannerOptions
 from aqualvs.terminal import StopSignals
@@ -126,10 +125,7 @@ def _works(request: BatchRequest, dives: Sequence[Dive]) -> list[DiveWork]:
     known = _known_names(out)
     names = name_dives([(dive.source, dive.name) for dive in dives], known)
     known |= {str(dive.source): name for dive, name in zip(dives, names, strict=True)}
-    path = out / HOME / _NAMES
-    draft = path.with_name(f"{_NAMES}.part")
-    draft.write_text(json.dumps(known, indent=1, ensure_ascii=False), encoding="utf-8")
-    os.replace(draft, path)
+    replace_text(out / HOME / _NAMES, json.dumps(known, indent=1, ensure_ascii=False))
     return [_work(request, dive, name, out) for dive, name in zip(dives, names, strict=True)]
 
 

@@ -25,7 +25,7 @@ from typing import Any
 import pyarrow as pa
 from pyarrow import csv, parquet
 
-from aqualvs.results.files import read_json
+from aqualvs.results.files import read_json, replace_text
 from aqualvs.results.folder import HOLES_CSV, NET_CSV, POINTS_PARQUET, POSTURE_CSV
 
 MANIFEST = "done.json"
@@ -47,9 +47,7 @@ def write_manifest(
     """
     files = {name: _fingerprint((place or folder) / name) for name in names}
     content = {"key": key, "files": files, "facts": dict(facts)}
-    draft = folder / f"{MANIFEST}.{uuid.uuid4().hex[:8]}.part"
-    draft.write_text(json.dumps(content), encoding="utf-8")
-    os.replace(draft, folder / MANIFEST)
+    replace_text(folder / MANIFEST, json.dumps(content))
 
 
 def read_valid_manifest(folder: Path, key: str, place: Path | None = None) -> dict[str, Any] | None:
