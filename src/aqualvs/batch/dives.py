@@ -28,7 +28,7 @@ from aqualvs.errors import OptionError, RigError, SourceError
 from aqualvs.recording import is_recording
 from aqualvs.results.folder import RUN_YAML
 from aqualvs.results.run_request import Water
-from aqualvs.sources.images import IMAGE_SUFFIXES
+from aqualvs.sources.images import IMAGE_SUFFIXES, natural_key
 from aqualvs.text import hole_count
 from aqualvs.yamlfile import parse_yaml, read_text
 
@@ -334,11 +334,6 @@ def _holds_images(folder: Path) -> bool:
     if (folder / RUN_YAML).exists():
         return False
     return any(path.suffix.lower() in IMAGE_SUFFIXES for path in folder.iterdir())
-
-
-def natural_key(path: Path) -> list[tuple[int, str]]:
-    """Return a key that sorts `dive2` before `dive10`."""
-    return [(int(n or -1), text) for n, text in re.findall(r"(\d+)|(\D+)", str(path))]
 
 
 def _is_dive(path: Path) -> bool:

@@ -20,13 +20,13 @@ from aqualvs.calibrate.common import (
     finish,
     load_nominal,
     named,
+    picture_paths,
     residuals_of,
     summary,
 )
 from aqualvs.calibration.camera.calibrate import CameraCalibration
 from aqualvs.calibration.camera.calibrate import camera as solve_camera
 from aqualvs.calibration.detection.detection import detect_board
-from aqualvs.calibration.targets.pose_files import picture_paths
 from aqualvs.calibration.targets.target_files import load_board
 from aqualvs.calibration.targets.targets import Board
 from aqualvs.errors import CalibrationError

@@ -5,6 +5,7 @@ The nominal rig (`load_nominal`) is known before any calibration: name, picture 
 `calibrate_water` return; the commands of `aqualvs calibrate` write it down.
 """
 
+import glob
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -39,7 +40,8 @@ from aqualvs.report.calibration_page import write_page
 from aqualvs.results.files import writing
 from aqualvs.results.run_request import checked_index
 from aqualvs.schema import Index, NotNegative, Positive, SchemaWords, StrictPart, validated
-from aqualvs.sources.images import read_image
+from aqualvs.sources.images import IMAGE_SUFFIXES, natural_key, read_image
+from aqualvs.special_files import refuse_special
 from aqualvs.terminal import progress
 from aqualvs.yamlfile import parse_yaml, read_text
 
@@ -262,6 +264,50 @@ def summary(done: Calibration[CameraCalibration] | Calibration[DomeCalibration])
         *(line for one in done.found for line in one.remarks),
         *result.findings,
     ]
+
+
+def picture_paths(arguments: Sequence[str | Path]) -> list[Path]:
+    """Return the pictures given by files, folders and patterns, each once.
+
+    `arguments`: pictures, folders of them, or patterns such as 'air/*.png'. The pictures of one
+    argument are sorted naturally (`img2` before `img10`). Raises `CalibrationError` if an argument
+    matches no picture, or two of the pictures have the same file name: poses and reports identify
+    pictures by their names.
+    """
+    paths = [path for argument in arguments for path in _meant(str(argument))]
+    if not paths:
+        raise CalibrationError("no pictures given; name pictures, a folder, or a pattern")
+    unique = list(dict.fromkeys(paths))
+    first: dict[str, Path] = {}
+    for path in unique:
+        other = first.setdefault(path.name, path)
+        if other is not path:
+            raise CalibrationError(
+                f"{path}: has the same file name as {other}; rename one, pictures are known by name"
+            )
+    return unique
+
+
+def _meant(argument: str) -> list[Path]:
+    path = Path(argument)
+    if path.is_dir():
+        found = [p for p in path.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES]
+        if not found:
+            raise CalibrationError(
+                f"{path}: no pictures in this folder; looked for "
+                f"{', '.join(sorted(IMAGE_SUFFIXES))}"
+            )
+        return sorted(found, key=natural_key)
+    if path.exists():
+        refuse_special(path, CalibrationError)
+        return [path]
+    if glob.has_magic(argument):
+        matches = [Path(match) for match in glob.glob(argument, recursive=True)]
+        found = [p for p in matches if p.is_file()]
+        if found:
+            return sorted(found, key=natural_key)
+        raise CalibrationError(f"{argument}: no file matches this pattern; check folder and ending")
+    raise CalibrationError(f"{path}: no such picture or folder; check the path")
 
 
 def residuals_of(views: Iterable[ViewFit]) -> dict[str, FloatArray]:

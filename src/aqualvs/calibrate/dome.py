@@ -18,6 +18,7 @@ from aqualvs.calibrate.common import (
     finish,
     medium_index,
     named,
+    picture_paths,
     residuals_of,
     summary,
 )
@@ -25,7 +26,7 @@ from aqualvs.calibration.detection.detection import detect_board
 from aqualvs.calibration.dome.calibrate import dome as solve_dome
 from aqualvs.calibration.dome.problem import BoardSet, DomeOptions
 from aqualvs.calibration.solver.result import DomeCalibration
-from aqualvs.calibration.targets.pose_files import BoardPose, load_poses, match_poses, picture_paths
+from aqualvs.calibration.targets.pose_files import BoardPose, load_poses, match_poses
 from aqualvs.calibration.targets.target_files import load_board
 from aqualvs.calibration.targets.targets import Board
 from aqualvs.errors import OptionError

@@ -20,6 +20,7 @@ from aqualvs.calibrate.common import (
     finish,
     medium_index,
     named,
+    picture_paths,
     read_colour,
 )
 from aqualvs.calibration.detection.detection import detect_board, detect_markers
@@ -33,7 +34,6 @@ from aqualvs.calibration.lasers.stripes_on_planes import (
     box_surfaces,
 )
 from aqualvs.calibration.lasers.views import LaserView
-from aqualvs.calibration.targets.pose_files import picture_paths
 from aqualvs.calibration.targets.target_files import load_board, load_box
 from aqualvs.calibration.targets.targets import Board, MarkerSet, View
 from aqualvs.errors import OptionError

@@ -15,9 +15,9 @@ from aqualvs.calibrate.common import (
     detect_targets,
     finish,
     named,
+    picture_paths,
 )
 from aqualvs.calibration.detection.detection import detect_markers
-from aqualvs.calibration.targets.pose_files import picture_paths
 from aqualvs.calibration.targets.target_files import load_target
 from aqualvs.calibration.targets.targets import MarkerSet, View
 from aqualvs.calibration.water_index.estimator import WaterCalibration

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from aqualvs.calibrate.common import read_grey
+from aqualvs.calibrate.common import picture_paths, read_grey
 from aqualvs.calibration.camera.calibrate import CameraCalibration, camera
 from aqualvs.calibration.detection.detection import detect_board
 from aqualvs.calibration.dome.calibrate import dome
 from aqualvs.calibration.dome.problem import BoardSet, DomeOptions, dome_problem
 from aqualvs.calibration.solver.bundle import rig_difference
 from aqualvs.calibration.solver.result import DomeCalibration, rms_px
-from aqualvs.calibration.targets.pose_files import BoardPose, load_poses, match_poses, picture_paths
+from aqualvs.calibration.targets.pose_files import BoardPose, load_poses, match_poses
 from aqualvs.calibration.targets.target_files import load_board
 from aqualvs.calibration.targets.targets import View
 from aqualvs.errors import CalibrationError

@@ -7,13 +7,12 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from aqualvs.calibrate.common import read_colour, read_grey
+from aqualvs.calibrate.common import picture_paths, read_colour, read_grey
 from aqualvs.calibration.detection.detection import detect_markers
 from aqualvs.calibration.lasers.calibrate import LaserOptions, calibrate_lasers
 from aqualvs.calibration.lasers.checks import LaserCalibration, LaserFigures, like
 from aqualvs.calibration.lasers.stripes_on_planes import StripePoints, box_surfaces
 from aqualvs.calibration.lasers.views import LaserView
-from aqualvs.calibration.targets.pose_files import picture_paths
 from aqualvs.calibration.targets.target_files import load_box
 from aqualvs.errors import CalibrationError
 from aqualvs.experiments.experiment import (

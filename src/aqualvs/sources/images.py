@@ -123,12 +123,12 @@ def images_in(folder: Path) -> list[Path]:
     if not found:
         kinds = ", ".join(sorted(IMAGE_SUFFIXES))
         raise SourceError(f"{folder}: no images in this folder; looked for {kinds}")
-    return sorted(found, key=_natural)
+    return sorted(found, key=lambda path: natural_key(path.name))
 
 
-def _natural(path: Path) -> list[tuple[int, str]]:
+def natural_key(path: Path | str) -> list[tuple[int, str]]:
     """Return a sort key in which runs of digits count by value."""
-    return [(int(n or -1), text) for n, text in re.findall(r"(\d+)|(\D+)", path.name)]
+    return [(int(n or -1), text) for n, text in re.findall(r"(\d+)|(\D+)", str(path))]
 
 
 def read_image(path: Path, how: int = cv2.IMREAD_ANYCOLOR) -> ImagePlane | None:

@@ -3,7 +3,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from aqualvs.calibration.targets.pose_files import load_poses, match_poses, picture_paths
+from aqualvs.calibrate.common import picture_paths
+from aqualvs.calibration.targets.pose_files import load_poses, match_poses
 from aqualvs.errors import CalibrationError
 
 _MATRIX = "T00,T01,T02,T03,T10,T11,T12,T13,T20,T21,T22,T23"

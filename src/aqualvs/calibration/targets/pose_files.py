@@ -1,17 +1,13 @@
-"""`poses.csv`, the measured poses of boards, one row a picture; and the pictures of a command.
+"""`poses.csv`, the measured poses of boards, one row a picture.
 
 Columns of the file: `file`; `distance_mm`, where the board's plane meets the dome's y axis; and
 `T00` to `T23`, the first three rows of dome_from_board (translations in millimetres). Either the
 distance or the matrix may be left out.
-
-`picture_paths` expands files, folders and patterns on the command line.
 """
 
 import csv
 import difflib
-import glob
 import io
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,61 +16,7 @@ import numpy as np
 
 from aqualvs.errors import CalibrationError
 from aqualvs.geometry.transforms import SE3
-from aqualvs.special_files import refuse_special
 from aqualvs.yamlfile import read_text
-
-PICTURE_SUFFIXES = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"})
-"""File name extensions of pictures in a folder."""
-
-
-def picture_paths(arguments: Sequence[str | Path]) -> list[Path]:
-    """Return the pictures given by files, folders and patterns, each once.
-
-    `arguments`: pictures, folders of them, or patterns such as 'air/*.png'. The pictures of one
-    argument are sorted naturally (`img2` before `img10`). Raises `CalibrationError` if an argument
-    matches no picture, or two of the pictures have the same file name: poses and reports identify
-    pictures by their names.
-    """
-    paths = [path for argument in arguments for path in _meant(str(argument))]
-    if not paths:
-        raise CalibrationError("no pictures given; name pictures, a folder, or a pattern")
-    unique = list(dict.fromkeys(paths))
-    first: dict[str, Path] = {}
-    for path in unique:
-        other = first.setdefault(path.name, path)
-        if other is not path:
-            raise CalibrationError(
-                f"{path}: has the same file name as {other}; rename one, pictures are known by name"
-            )
-    return unique
-
-
-def _meant(argument: str) -> list[Path]:
-    path = Path(argument)
-    if path.is_dir():
-        found = [p for p in path.iterdir() if p.suffix.lower() in PICTURE_SUFFIXES]
-        if not found:
-            raise CalibrationError(
-                f"{path}: no pictures in this folder; looked for "
-                f"{', '.join(sorted(PICTURE_SUFFIXES))}"
-            )
-        return sorted(found, key=_natural)
-    if path.exists():
-        refuse_special(path, CalibrationError)
-        return [path]
-    if glob.has_magic(argument):
-        matches = [Path(match) for match in glob.glob(argument, recursive=True)]
-        found = [p for p in matches if p.is_file()]
-        if found:
-            return sorted(found, key=_natural)
-        raise CalibrationError(f"{argument}: no file matches this pattern; check folder and ending")
-    raise CalibrationError(f"{path}: no such picture or folder; check the path")
-
-
-def _natural(path: Path) -> list[tuple[int, str]]:
-    """Return a sort key in which runs of digits count by value."""
-    return [(int(n or -1), text) for n, text in re.findall(r"(\d+)|(\D+)", str(path))]
-
 
 _MM = 1e3
 _MATRIX = tuple(f"T{row}{column}" for row in range(3) for column in range(4))
