@@ -95,7 +95,7 @@ FrameOutput = tuple[Rig, Scan, dict[SearchAxis, StripePeaks]]
 class RunMcap(Closing):
     """Writer of `dive.mcap` during a run, or of nothing; a context manager.
 
-    `rig`: for frames that were lost. `options`: that the run measures with. `wanted`: False makes
+    `rig`: for frames that were lost. `options`: that the run measures with. `wanted`: false makes
     it measure frames and nothing else. Raises `OutputError`: from every method, if the file cannot
     be written.
     """
@@ -235,7 +235,7 @@ def _measured(scanner: FrameScanner, frame: Frame) -> FrameOutput:
 class RunOverlay(Closing):
     """Writer of `overlay.mp4` during a run, or of nothing; a context manager.
 
-    `source`: gives size and rate of the video. `wanted`: False makes `write` do nothing. Raises
+    `source`: gives size and rate of the video. `wanted`: false makes `write` do nothing. Raises
     `OutputError`: from every method, if the video cannot be written.
     """
 

@@ -41,9 +41,21 @@ def write_manifest(
 ) -> None:
     """Declare files in a folder finished.
 
-    `key`: what the files were made from. `facts`: to be had back; ready for JSON. `names`: the
-    files, which are read for their checksums. `place`: where the files are, if not in `folder`.
-    Raises `OSError` as the system says it.
+    Parameters
+    ----------
+    key : str
+        What the files were made from.
+    facts : mapping
+        To be had back; ready for JSON.
+    names : sequence of str
+        The files, which are read for their checksums.
+    place : Path or None
+        Where the files are, if not in `folder`.
+
+    Raises
+    ------
+    OSError
+        As the system says it.
     """
     files = {name: _fingerprint((place or folder) / name) for name in names}
     content = {"key": key, "files": files, "facts": dict(facts)}

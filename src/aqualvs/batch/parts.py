@@ -275,7 +275,10 @@ def join_dive(work: DiveWork, probe: DiveProbe, results: Sequence[PieceResult]) 
     `results`: of all pieces, in order. Raises `PieceLostError` if a piece must be measured again.
     Raises `AqualvsError` if the dive's folder cannot be written.
 
-    Returns `facts`: of the dive, for the summary; ready for JSON.
+    Returns
+    -------
+    facts : dict
+        Of the dive, for the summary; ready for JSON.
     """
     pieces = [piece_folder(work, probe, number) for number in range(len(probe.spans))]
     for number, piece in enumerate(pieces):

@@ -253,8 +253,11 @@ def with_net(work: DiveWork, key: str, facts: Mapping[str, Any]) -> dict[str, An
 
     `key`: of the dive's result, `DiveProbe.key`. `facts`: from `join_dive`.
 
-    Returns `facts`: with `net`, as `net_dict` has it, where it is known, or with `net_fault`, which
-    says why not. The dive's own result stands in any case.
+    Returns
+    -------
+    facts : dict
+        With `net`, as `net_dict` has it, where it is known, or with `net_fault`, which says why
+        not. The dive's own result stands in any case.
     """
     request = work.request.net
     if request is None:

@@ -68,7 +68,10 @@ class LenientStream:
 def lenient_output() -> Iterator[LenientStream | None]:
     """Make standard output and error lenient inside, and let them take every character.
 
-    Yields `output`: standard output; None where it is closed.
+    Yields
+    ------
+    output : LenientStream or None
+        Standard output; None where it is closed.
     """
     before = sys.stdout, sys.stderr
     output = None if sys.stdout is None else _lenient(sys.stdout)
@@ -254,8 +257,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     `arguments`: without the program's name; None takes them from the process.
 
-    Returns `exit_code`: 0, or 2 for bad input, or 128 + signal for a run that was stopped; 141
-    where all went well but nobody read the output to its end.
+    Returns
+    -------
+    exit_code : int
+        0, or 2 for bad input, or 128 + signal for a run that was stopped; 141 where all went well
+        but nobody read the output to its end.
     """
     if arguments is None:
         # To compile a kernel makes many objects and little garbage. With Python's thresholds, the

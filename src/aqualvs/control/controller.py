@@ -102,9 +102,16 @@ class Pid:
     ) -> None:
         """Start such that the output continues from `output`: the integral takes the difference.
 
-        `time_s`: now; the next update comes later. `setpoint`, `measured`: as of now, at rest.
-        `output`: what the actuator does now. `forward`: the feed-forward that the next update will
-        come with.
+        Parameters
+        ----------
+        time_s : float
+            Now; the next update comes later.
+        setpoint, measured : float
+            As of now, at rest.
+        output : float
+            What the actuator does now.
+        forward : float
+            The feed-forward that the next update will come with.
         """
         values = (time_s, setpoint, measured, output, forward)
         if not all(map(math.isfinite, values)):
@@ -135,9 +142,16 @@ class Pid:
     ) -> float:
         """Return the output for a measurement.
 
-        `setpoint`, `measured`: in one unit. `rate`: the measurement's rate, where it is known; else
-        it is filtered from differences. `forward`: added to the output. `schedule`: factors on
-        proportional and integral gain, for a plant that is known to change.
+        Parameters
+        ----------
+        setpoint, measured : float
+            In one unit.
+        rate : float, optional
+            The measurement's rate, where it is known; else it is filtered from differences.
+        forward : float
+            Added to the output.
+        schedule : (float, float)
+            Factors on proportional and integral gain, for a plant that is known to change.
         """
         step = time_s - self._time_s
         values = (time_s, setpoint, measured, forward, *schedule, 0.0 if rate is None else rate)

@@ -259,9 +259,21 @@ class Leg:
 class FollowMission:
     """Go along the net in one direction.
 
-    `setpoint`: range and yaw on the way. `sway`: speed through the water, to the right positive, in
-    m/s. `leg`: where it ends; never if left out. `loss`: what to do without the target. Raises
-    `OptionError` if the speed is 0.
+    Parameters
+    ----------
+    setpoint : Setpoint
+        Range and yaw on the way.
+    sway : float
+        Speed through the water, to the right positive, in m/s.
+    leg : LegOptions, optional
+        Where it ends; never if left out.
+    loss : LossOptions, optional
+        What to do without the target.
+
+    Raises
+    ------
+    OptionError
+        If the speed is 0.
     """
 
     def __init__(

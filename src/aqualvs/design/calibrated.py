@@ -44,8 +44,10 @@ def camera_errors(design: Design, ranges: Sequence[float]) -> dict[str, FloatArr
 
     `design`: with the final tilts of its lasers. `ranges`: walls square ahead, metres.
 
-    Returns each of shape (W, 3): standard deviations of (range, pitch, yaw), m and rad; NaN if
-    lasers light no board.
+    Returns
+    -------
+    mapping from cause to array, shape (W, 3)
+        Standard deviations of (range, pitch, yaw), m and rad; NaN if lasers light no board.
     """
     rig = design.nominal_rig()
     walls = [WallView.ahead(rig, wall) for wall in ranges]

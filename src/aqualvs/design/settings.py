@@ -84,8 +84,16 @@ def ring(count: int, baseline: float, back: float, fan: float) -> tuple[Mount, .
 
     The first is below. Two are put below and beside, because opposite ones draw parallel stripes.
 
-    `count`: number of lasers. `baseline`: distance from the forward axis, metres. `back`: distance
-    behind the dome's centre, metres. `fan`: full opening, radians.
+    Parameters
+    ----------
+    count : int
+        Number of lasers.
+    baseline : float
+        Distance from the forward axis, metres.
+    back : float
+        Distance behind the dome's centre, metres.
+    fan : float
+        Full opening, radians.
     """
     step = math.tau / count if count > 2 else math.pi / 2
     mounts = []

@@ -151,8 +151,11 @@ def bars_against(frames: FrameAnswers, clear: FrameAnswers) -> FloatArray:
 
     `frames`, `clear`: frame by frame the same course before the same target.
 
-    Returns `ratios`, shape (N, 3): sigma of range (in percent), pitch and yaw over that in clear
-    water; NaN where a frame is not measurable or lacks one.
+    Returns
+    -------
+    ratios : array, shape (N, 3)
+        Sigma of range (in percent), pitch and yaw over that in clear water; NaN where a frame is
+        not measurable or lacks one.
     """
     both = frames.measurable & clear.measurable
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -134,7 +134,10 @@ def judge_pixels(pixels: FloatArray, laser: IntArray, truth: LitTruth) -> Judged
 
     `pixels`, shape (N, 2). `laser`, shape (N,).
 
-    Returns a `Judged`: precision is NaN where nothing can be judged, recall where there is no net.
+    Returns
+    -------
+    Judged
+        Precision is NaN where nothing can be judged, recall where there is no net.
     """
     right = judged = found = true = 0
     for one in np.unique(truth.laser):
@@ -164,7 +167,10 @@ def judge_reflections(found: FilteredPeaks, truth: LitTruth) -> Judged:
 
     `found`: all pixels of the frame, and which of them are said to lie on the net.
 
-    Returns a `Judged`: as `judge_pixels`.
+    Returns
+    -------
+    Judged
+        As `judge_pixels`.
     """
     right = judged = n_found = n_true = 0
     for one in np.unique(truth.laser):

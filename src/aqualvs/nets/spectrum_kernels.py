@@ -32,9 +32,16 @@ def comb_power(
 ) -> None:
     """Add up the power of a wave's harmonics over frames.
 
-    `place`, `start`: as `Spectrum`. `begin`, `end`, `expected`, `span_start`: as `Spectrum`, with
-    the crossings expected on each span, shape (M,). `qx`, `qy`: the wave, in periods a metre.
-    `power`, shape (n,): of n harmonics; added to in place.
+    Parameters
+    ----------
+    place, start
+        As `Spectrum`.
+    begin, end, expected, span_start
+        As `Spectrum`, with the crossings expected on each span, shape (M,).
+    qx, qy : float
+        The wave, in periods a metre.
+    power : array, shape (n,)
+        Of n harmonics; added to in place.
     """
     n = power.shape[0]
     real, imaginary, share = np.zeros(n), np.zeros(n), np.zeros(n)
@@ -233,9 +240,16 @@ def wave_sums(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the sums of waves over places, less those expected over spans.
 
-    `place`, shape (N, 2): crossings of one frame. `begin`, `end`, shape (M, 2): ends of the visible
-    pieces of line. `expected`, shape (M,): crossings expected on each. `waves`, shape (Q, 2): wave
-    vectors.
+    Parameters
+    ----------
+    place : array, shape (N, 2)
+        Crossings of one frame.
+    begin, end : array, shape (M, 2)
+        Ends of the visible pieces of line.
+    expected : array, shape (M,)
+        Crossings expected on each.
+    waves : array, shape (Q, 2)
+        Wave vectors.
 
     Returns
     -------

@@ -68,8 +68,16 @@ def unroll(
 ) -> UnrolledNet:
     """Project stretches and holes to the plane of the unrolled net.
 
-    `stretches`, `holes`: of a dive. `places`: theirs. `rig`: whose picture tells how much of the
-    net is seen at a time. `postures`: of the same dive.
+    Parameters
+    ----------
+    stretches, holes : sequence
+        Of a dive.
+    places : NetPlaces
+        Theirs.
+    rig : Rig
+        Whose picture tells how much of the net is seen at a time.
+    postures : DivePostures
+        Of the same dive.
     """
     nodes = [*places.begin[:1], *places.end]
     by_bearing = all(one.placed_by is PlacedBy.NOTHING for one in nodes) and any(
@@ -155,9 +163,11 @@ def bands(nodes: FloatArray, half: FloatArray) -> list[FloatArray]:
     `nodes`, shape (n + 1, 2): places of the picture's middle, in turn. `half`, shape (n, 2): half
     its width and height on the way from each to the next.
 
-    Returns `outlines`, each of shape (4, 2): counter-clockwise. Bands that follow each other meet
-    in one edge, unless the way turns sharply; where the picture hardly moves, it is the picture
-    itself.
+    Returns
+    -------
+    outlines : list of n arrays, shape (4, 2)
+        Counter-clockwise. Bands that follow each other meet in one edge, unless the way turns
+        sharply; where the picture hardly moves, it is the picture itself.
     """
     moves = np.diff(nodes, axis=0)
     length = np.hypot(*moves.T)

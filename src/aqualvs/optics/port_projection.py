@@ -319,9 +319,16 @@ def back_derivative(
 ) -> BackDerivative:
     """Return the derivatives at a solution, without branches.
 
-    `s`: of the point. `target`: 1/rho, cos and sin of the point as `polar_angle` gives them. `e`:
-    unit vector from the axis to the point, perpendicular to the axis. `solution`: (cos alpha, sin
-    alpha).
+    Parameters
+    ----------
+    s : AngleSines
+        Of the point.
+    target : (float, float, float)
+        1/rho, cos and sin of the point as `polar_angle` gives them.
+    e : vector
+        Unit vector from the axis to the point, perpendicular to the axis.
+    solution : (float, float)
+        (cos alpha, sin alpha).
     """
     (inverse_rho, cos_t, sin_t), (c, k) = target, solution
     n_l = port.n_air * port.decentring

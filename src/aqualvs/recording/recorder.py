@@ -323,7 +323,10 @@ class RecorderSwitch:
         `path`: file to write, which must not exist; None names it by the time (UTC). Raises
         `OutputError` if it cannot be begun.
 
-        Returns `path`: file that is being written.
+        Returns
+        -------
+        path : Path
+            File that is being written.
         """
         with self._lock:
             if self._recorder is None:

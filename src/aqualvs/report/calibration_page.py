@@ -253,7 +253,10 @@ def write_page(page: CalibrationPage, path: Path) -> Path:
 
     `path`: the file to write. Raises `OutputError` if the page cannot be written.
 
-    Returns `path`: the page. It carries all it needs and asks no network.
+    Returns
+    -------
+    path : Path
+        The page. It carries all it needs and asks no network.
     """
     # Names of files that are no Unicode reach Python as surrogates, which UTF-8 refuses.
     data = page_html(page).encode("utf-8", errors="replace")

@@ -48,7 +48,10 @@ def thin(values: FloatArray, limit: int) -> IntArray:
 
     `values`, shape (N,): NaN rows are never chosen.
 
-    Returns `rows`, ascending: all finite rows if they are few enough.
+    Returns
+    -------
+    rows : int array, ascending
+        All finite rows if they are few enough.
     """
     finite = np.flatnonzero(np.isfinite(values))
     if len(finite) <= limit:

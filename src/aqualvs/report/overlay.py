@@ -33,7 +33,10 @@ def draw_overlay(
     `image`, shape (height, width, 3): BGR; left as it is. `points`: target points are drawn full in
     their laser's colour, all others as faint crosses. `rig`: gives the lasers' names.
 
-    Returns `image`, shape (height, width, 3): a new picture, BGR.
+    Returns
+    -------
+    image : uint8 array, shape (height, width, 3)
+        A new picture, BGR.
     """
     drawn = draw_points(image, points.laser, points.pixels, points.used)
     draw_caption(drawn, posture_lines(posture), warn=not posture)
@@ -46,9 +49,14 @@ def draw_points(
 ) -> ImagePlane:
     """Return a copy of a BGR picture with stripe points drawn into it.
 
-    `image`, shape (height, width, 3). `laser`, shape (N,). `pixels`, shape (N, 2): points outside
-    of the picture, or not finite, are left out. `used`, shape (N,): points that entered the
-    posture: dots; others are faint crosses.
+    Parameters
+    ----------
+    image : uint8 array, shape (height, width, 3)
+    laser : integer array, shape (N,)
+    pixels : array, shape (N, 2)
+        Points outside of the picture, or not finite, are left out.
+    used : bool array, shape (N,)
+        Points that entered the posture: dots; others are faint crosses.
     """
     drawn = np.array(image, dtype=np.uint8)
     scale = _mark_scale(drawn)

@@ -133,7 +133,10 @@ def read_truth(path: Path, track: Track) -> FloatArray:
     `path`: as `aqualvs.results.summary.read_truth` takes it. Raises `SourceError` if the file
     cannot be read or shares no frame with the track.
 
-    Returns `truth`, shape (N, 3): as `Track.posture`; NaN where the file has no such frame.
+    Returns
+    -------
+    truth : array, shape (N, 3)
+        As `Track.posture`; NaN where the file has no such frame.
     """
     rows = truth_by_frame(path)
     values = np.array([*rows.values()], dtype=np.float64).reshape(-1, 3)

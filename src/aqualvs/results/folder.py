@@ -171,9 +171,28 @@ _KILLED = "the run ended before it could close its files; the folder was complet
 class RunOutputs:
     """Writer of a run's folder; a context manager that completes it however the run ends.
 
-    `folder`: from `prepare_folder`. `source`, `rig`, `options`: for `run.yaml`. `summary`: to which
-    the frames are added; its monitors are those of the run. `shutter`: of the camera. Raises
-    `OutputError`: from every method, if the disk is full or the folder cannot be written.
+    Parameters
+    ----------
+    folder : Path
+        From `prepare_folder`.
+    source, rig, options : mapping
+        For `run.yaml`.
+    summary : RunSummary, optional
+        To which the frames are added; its monitors are those of the run.
+    shutter : Shutter
+        Of the camera.
+
+    Attributes
+    ----------
+    status : Status
+        What `run.yaml` will say if the run ends without a fault; set it before the end.
+    summary : RunSummary
+        So far.
+
+    Raises
+    ------
+    OutputError
+        From every method, if the disk is full or the folder cannot be written.
     """
 
     def __init__(

@@ -272,7 +272,10 @@ def export_points(points_stream: Path, points_parquet: Path, points_ply: Path) -
     `points_stream`: may lack its end; what follows the last whole batch is left out. Raises
     `OSError` as the system says it, a full disk for example; the journal is left as it is.
 
-    Returns `n_points`: points in `points_parquet`.
+    Returns
+    -------
+    n_points : int
+        Points in `points_parquet`.
     """
     return export_batches(read_points_stream(points_stream), points_parquet, points_ply)
 

@@ -603,8 +603,16 @@ def seen_of(
 ) -> tuple[float, float]:
     """Return the share of its best stripe that a surface shows, and the share of faint lasers.
 
-    `plane`, shape (4,): normal and offset. `members`, shape (C,): subsegments on the surface.
-    `n_lines`, `laser`: as in `Subsegments`. `bands`: as in `judge_planes`.
+    Parameters
+    ----------
+    plane : array, shape (4,)
+        Normal and offset.
+    members : bool array, shape (C,)
+        Subsegments on the surface.
+    n_lines, laser
+        As in `Subsegments`.
+    bands
+        As in `judge_planes`.
     """
     n_lasers, n_cells = bands.shape[0], bands.shape[1]
     expected, way = np.empty((n_lasers, n_cells), np.bool_), np.zeros(n_lasers)

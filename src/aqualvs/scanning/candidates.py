@@ -504,7 +504,10 @@ def find_candidates(
     `peaks`: as `FrameDetector.detect` gives them. `laser_bands`: one for each laser.
     `triangulator`: of the same rig.
 
-    Returns a `Candidates`: only those whose ray meets the laser's sheet in front of the camera.
+    Returns
+    -------
+    Candidates
+        Only those whose ray meets the laser's sheet in front of the camera.
     """
     along_x, along_y = (peaks.get(axis, _NO_PEAKS) for axis in _AXES)
     by_search = [along_x if one.axis is SearchAxis.ALONG_X else along_y for one in laser_bands]

@@ -70,8 +70,10 @@ class SearchLines:
 
         `luma`, shape (height, width): Contiguous.
 
-        Returns shape (n_lines, length): overwritten by the next call; the picture itself where that
-        is the same.
+        Returns
+        -------
+        uint8 array, shape (n_lines, length)
+            Overwritten by the next call; the picture itself where that is the same.
         """
         lines = luma
         if self._paired:

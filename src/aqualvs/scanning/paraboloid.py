@@ -177,9 +177,16 @@ def over_plane(
 ) -> None:
     """Write the terms of a fit over a patch's base for M observations.
 
-    `points`, `sensitivity`, shape (M, 3): in `dome`: metres, and m/px. `patch`, shape (16,): only
-    its base is used. `terms`, shape (M, 6): written. `height`, `per_px`, shape (M,): written:
-    distance behind the plane, and its change by the stripe's position.
+    Parameters
+    ----------
+    points, sensitivity : array, shape (M, 3)
+        In `dome`: metres, and m/px.
+    patch : array, shape (16,)
+        Only its base is used.
+    terms : array, shape (M, 6)
+        Written.
+    height, per_px : array, shape (M,)
+        Written: distance behind the plane, and its change by the stripe's position.
     """
     for i in range(points.shape[0]):
         u, v, h, d = 0.0, 0.0, -patch[OFFSET], 0.0

@@ -225,7 +225,10 @@ def nearest_tangent(patch: Patch) -> FloatArray | None:
 
     Range and angles of a plane are those at the foot of the perpendicular; so are a curved net's.
 
-    Returns shape (3,): None where there is no such point: the net curls around the vehicle.
+    Returns
+    -------
+    array, shape (3,), or None
+        None where there is no such point: the net curls around the vehicle.
     """
     m = np.empty(3)
     return m if write_tangent(patch.packed(), m) else None
@@ -263,8 +266,16 @@ def intensity_share_near(
 ) -> float:
     """Return the share of the light in pieces nearer to a patch than `near`, in metres.
 
-    `group`, shape (N,): from `select_units`. `confidence`, shape (N,): of the candidates. `points`,
-    shape (M, 3): of the pieces. `patch`, shape (16,): as `Patch.packed` gives it.
+    Parameters
+    ----------
+    group : int array, shape (N,)
+        From `select_units`.
+    confidence : array, shape (N,)
+        Of the candidates.
+    points : array, shape (M, 3)
+        Of the pieces.
+    patch : array, shape (16,)
+        As `Patch.packed` gives it.
     """
     height = np.empty(points.shape[0])
     heights_over(points, patch, height)

@@ -88,8 +88,15 @@ class RowMotion:
 
         It has `by_motion`, and how `stilled` moved the points is no longer in it.
 
-        `surface`: surface of the posture. `still`, `seen`: N of them, to which it was fitted, and
-        as they were before. `weights`, shape (N,): 1 over the variance of the residual, or 0.
+        Parameters
+        ----------
+        posture : Posture
+        surface : FittedSurface
+            Surface of the posture.
+        still, seen : Candidates
+            N of them, to which it was fitted, and as they were before.
+        weights : array, shape (N,)
+            1 over the variance of the residual, or 0.
         """
         m = posture.normal_in_dome / posture.range
         matrix, moved = np.diag(surface.prior), np.zeros((len(surface.prior), 7))
@@ -348,9 +355,15 @@ def _weigh_motions(
     Unknowns are the posture, relative to what the first frame measured, its rates, its
     accelerations, and how these change, of which the error during a picture is nothing.
 
-    `t`, shape (F,): times from the first frame. `numbers`, `covariances`, `by_motion`, shapes
-    (F, 3), (F, 3, 3), (F, 3, 6): range, pitch and yaw, and what belongs to them. `variances`,
-    shape (9,): of the motion, before anything is measured.
+    Parameters
+    ----------
+    t : array, shape (F,)
+        Times from the first frame.
+    numbers, covariances, by_motion : array, shape (F, 3), (F, 3, 3), (F, 3, 6)
+        Range, pitch and yaw, and what belongs to them.
+    variances : array, shape (9,)
+        Of the motion, before anything is measured.
+    motion, covariance : array
     """
     matrix, right = np.zeros((12, 12)), np.zeros(12)
     for k in range(9):

@@ -128,7 +128,10 @@ def component_shapes(
 
     `component`, `line`, `points`, `sensitivity`, `width`, `height`: as in `Candidates`.
 
-    Returns a `ComponentShapes`: S rows, one more than the highest component number.
+    Returns
+    -------
+    ComponentShapes
+        S rows, one more than the highest component number.
     """
     return ComponentShapes(
         *describe_components(component, line, points, sensitivity, width, height)

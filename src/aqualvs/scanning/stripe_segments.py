@@ -510,9 +510,21 @@ def line_log_odds(
 ) -> FloatArray:
     """Return the log odds that each piece is a laser's line.
 
-    `table`, shape (12, P): measures of all pieces of one picture. `width_px`: of the picture.
-    `has_colour`: whether the picture has chroma. `weights`: of the evidence. Returns shape (P,):
-    minus infinity for all where none is certain.
+    Parameters
+    ----------
+    table : array, shape (12, P)
+        Measures of all pieces of one picture.
+    width_px : int
+        Of the picture.
+    has_colour : bool
+        Whether the picture has chroma.
+    weights : Weights, optional
+        Of the evidence.
+
+    Returns
+    -------
+    array, shape (P,)
+        Minus infinity for all where none is certain.
     """
     log_odds = general_evidence(table, width_px, has_colour=has_colour) @ weights.general
     # Dashes in a row are as long as all of them together.

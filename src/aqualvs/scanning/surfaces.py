@@ -71,8 +71,10 @@ def number_cells(pixels: FloatArray, cell: IntArray) -> tuple[int, int]:
 
     `pixels`, shape (N, 2): in `image`. `cell`, shape (N,): written.
 
-    Returns `n_cells`, `n_columns`: cells in total, and in a row; cells are numbered row by row, as
-    the pixels of a picture.
+    Returns
+    -------
+    n_cells, n_columns : int
+        Cells in total, and in a row; cells are numbered row by row, as the pixels of a picture.
     """
     right, low = 0.0, 0.0
     for i in range(pixels.shape[0]):

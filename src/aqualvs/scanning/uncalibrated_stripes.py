@@ -87,8 +87,11 @@ def find_stripes(
     `image`, shape (height, width) or (height, width, 3): grey, or BGR as OpenCV reads it. In a grey
     picture every thin bright line counts.
 
-    Returns a `StripePixels`: each piece of a stripe is searched along the axis that crosses it
-    nearer to a right angle. Empty if no piece is certain.
+    Returns
+    -------
+    StripePixels
+        Each piece of a stripe is searched along the axis that crosses it nearer to a right angle.
+        Empty if no piece is certain.
     """
     options = options or UncalibratedStripeOptions()
     frame = image if isinstance(image, Frame) else Frame(0, 0.0, *planes_of_image(image))

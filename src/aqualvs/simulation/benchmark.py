@@ -111,7 +111,10 @@ def visible_points(lit: LitPoints, label: int, contrast: NDArray[np.float32]) ->
     `lit`: of the frame. `label`: `SurfaceKind` of the target. `contrast`, shape (height, width):
     from `stripe_contrast`.
 
-    Returns `i_points`, shape (N,): indices into `lit`, ordered by laser.
+    Returns
+    -------
+    i_points : int array, shape (N,)
+        Indices into `lit`, ordered by laser.
     """
     bright = np.asarray(cv2.dilate(contrast, np.ones((3, 3), np.uint8)))
     x, y = _places(lit.pixels, contrast.shape).T

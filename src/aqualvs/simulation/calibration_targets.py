@@ -43,8 +43,16 @@ _GOLDEN = np.pi * (3.0 - np.sqrt(5.0))
 def board_across(rig: Rig, size: Size, count: int, rng: np.random.Generator) -> list[SE3]:
     """Return `dome_from_board` of a board all over a bare camera's picture, mostly tilted.
 
-    `rig`: its lens and its place; the dome plays no part. `size`: width and height of the board's
-    squares, in metres. `count`: number of poses. `rng`: random number generator.
+    Parameters
+    ----------
+    rig : Rig
+        Its lens and its place; the dome plays no part.
+    size : (float, float)
+        Width and height of the board's squares, in metres.
+    count : int
+        Number of poses.
+    rng : Generator
+        Random number generator.
     """
     poses = []
     # Widths of the board as shares of the picture's, in turn.

@@ -172,9 +172,21 @@ class NetWall:
     ) -> SE3:
         """Return world_from_dome of a level dome at a distance and yaw before a place on the net.
 
-        `distance`: from the nearest point, in metres. `along`, `up`: place of that point on the
-        net, in metres. `yaw`: as `Posture.yaw`, in radians. `time_s`: time in seconds. Raises
-        `OptionError` if the distance is not positive, or reaches the axis of a cage from inside.
+        Parameters
+        ----------
+        distance : float
+            From the nearest point, in metres.
+        along, up : float
+            Place of that point on the net, in metres.
+        yaw : float
+            As `Posture.yaw`, in radians.
+        time_s : float
+            Time in seconds.
+
+        Raises
+        ------
+        OptionError
+            If the distance is not positive, or reaches the axis of a cage from inside.
         """
         if not distance > 0.0 or distance * self.curvature <= -1.0:
             raise OptionError(

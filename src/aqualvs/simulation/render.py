@@ -298,8 +298,11 @@ class Renderer:
         `scene`: at time `t`. `t`: in seconds. `where`, shape (height, width): pixels to be traced;
         others may lack all light except that of marine snow.
 
-        Returns `radiance`, shape (height, width, 3): red, green, blue; 1 is the sensor's full scale
-        at gain 1. Zero where the lens model or the housing lets no light through.
+        Returns
+        -------
+        radiance : float32 array, shape (height, width, 3)
+            Red, green, blue; 1 is the sensor's full scale at gain 1. Zero where the lens model
+            or the housing lets no light through.
         """
         return self._radiance(scene, t, *self._pack(scene, t), where)
 

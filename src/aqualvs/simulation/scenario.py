@@ -43,8 +43,16 @@ def random_fish(
 ) -> tuple[Fish, ...]:
     """Return fish that cross the view at some time of the dive.
 
-    `rng`: random number generator. `count`: number of fish. `duration`: of the dive, in seconds.
-    `behind`: free room behind the target plane, in metres, for example before a wall.
+    Parameters
+    ----------
+    rng : Generator
+        Random number generator.
+    count : int
+        Number of fish.
+    duration : float
+        Of the dive, in seconds.
+    behind : float
+        Free room behind the target plane, in metres, for example before a wall.
     """
     return tuple(_fish(rng, duration, behind) for _ in range(count))
 

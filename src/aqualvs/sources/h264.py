@@ -144,8 +144,11 @@ class FrameNumbers:
 
         `data`: all units of a picture, as a byte stream (annex B).
 
-        Returns `gap`: False also where that is unknown: before a parameter set, in streams that
-        leave numbers out on purpose.
+        Returns
+        -------
+        gap : bool
+            False also where that is unknown: before a parameter set, in streams that leave
+            numbers out on purpose.
         """
         for unit in nal_units(data):
             if len(unit) < 4:

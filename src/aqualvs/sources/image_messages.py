@@ -166,7 +166,10 @@ def kind_of_schema(name: str) -> str | None:
 
     `name`: `sensor_msgs/msg/Image`, `foxglove.CompressedVideo` and the like.
 
-    Returns `kind`: "Image", "RawImage" or "CompressedImage".
+    Returns
+    -------
+    kind : str or None
+        "Image", "RawImage" or "CompressedImage".
     """
     return _KINDS.get(name.replace("/msg/", "/"))
 

@@ -136,8 +136,11 @@ def read_image(path: Path, how: int = cv2.IMREAD_ANYCOLOR) -> ImagePlane | None:
 
     `how`: OpenCV's flag; the default returns grey images as grey.
 
-    Returns `image`: None for pipes and devices too, and for images of more pixels than OpenCV is
-    told to take (`aqualvs/__init__.py`).
+    Returns
+    -------
+    image : array or None
+        None for pipes and devices too, and for images of more pixels than OpenCV is told to take
+        (`aqualvs/__init__.py`).
     """
     try:
         with quiet_decoders():

@@ -83,7 +83,10 @@ class StreamClock:
         `ticks`: by the stream's clock; None where it has none, then the arrival counts. `arrival`:
         seconds on this machine's monotonic clock.
 
-        Returns `time`: seconds since the first picture asked for.
+        Returns
+        -------
+        time : float
+            Seconds since the first picture asked for.
         """
         passed = 0.0 if self._last_arrival is None else max(0.0, arrival - self._last_arrival)
         expected = self._last + passed
@@ -278,7 +281,10 @@ class LiveDecoder:
 
         `packet`: a whole picture.
 
-        Returns `pictures`: in order of presentation; empty while waiting.
+        Returns
+        -------
+        pictures : list of VideoFrame
+            In order of presentation; empty while waiting.
         """
         if packet.is_corrupt:
             self.distrust()

@@ -330,7 +330,10 @@ class TransportStream:
 
         `content`: whole packets; what does not begin as one is ignored.
 
-        Returns `pictures`: `is_whole` is False for those that miss a packet; their `data` is empty.
+        Returns
+        -------
+        pictures : list of AccessUnit
+            `is_whole` is False for those that miss a packet; their `data` is empty.
         """
         done: list[AccessUnit] = []
         for at in range(0, len(content) - PACKET_BYTES + 1, PACKET_BYTES):

@@ -75,7 +75,10 @@ class FrameCounter:
 
         `pts`: its time, in ticks of its stream.
 
-        Returns `index`: greater than that of the picture before.
+        Returns
+        -------
+        index : int
+            Greater than that of the picture before.
         """
         if self.first_pts is None and pts is not None:
             self.first_pts = min(pts, *self._pending[:1])

@@ -234,8 +234,11 @@ def read_vehicle_log(path: str | Path) -> VehicleLog:
     text form `.log`). Raises `SourceError` if the file cannot be read or holds neither depth nor
     heading; one line that names the file, the value and the remedy.
 
-    Returns `log`: of a file that is cut short or damaged in places, what is readable; `log.notes`
-    says what is not.
+    Returns
+    -------
+    log : VehicleLog
+        Of a file that is cut short or damaged in places, what is readable; `log.notes` says what is
+        not.
     """
     source = Path(path)
     refuse_special(source)

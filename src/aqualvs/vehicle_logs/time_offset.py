@@ -339,8 +339,10 @@ def dive_start_utc(video: str | Path) -> float | None:
 
     `video`: a video file.
 
-    Returns `start_utc_s`: None where the container does not state it, or states the zero of its
-    calendar.
+    Returns
+    -------
+    start_utc_s : float or None
+        None where the container does not state it, or states the zero of its calendar.
     """
     import av
 

@@ -312,7 +312,10 @@ def result_blocks(
 
     `blocks`: of frames with the scans of the lost ones right before, see `with_losses`.
 
-    Yields `found`: of one block; scans of lost frames before it come by themselves.
+    Yields
+    ------
+    found : list of FrameResult
+        Of one block; scans of lost frames before it come by themselves.
     """
     for block in blocks:
         (before, _), *others = block

@@ -95,7 +95,7 @@ def nothing_known(board: Board) -> CornerGrid:
 def predict(pixels: FloatArray, known: BoolArray) -> PredictedCorners:
     """Fit an affine map to the known neighbours of every grid point, without the point itself.
 
-    `pixels`, shape (rows, columns, 2): corners in `image`. `known`, shape (rows, columns): True for
+    `pixels`, shape (rows, columns, 2): corners in `image`. `known`, shape (rows, columns): true for
     known corners; others are ignored, even if NaN.
     """
     rows, columns = known.shape

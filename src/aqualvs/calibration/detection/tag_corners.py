@@ -464,9 +464,16 @@ class TagFit:
 def refine_tags(image: GreyImage, ids: IntArray, quads: FloatArray, family: str) -> TagFit:
     """Refine the corners of markers by a fit to the picture.
 
-    `image`, shape (height, width): grey picture. `ids`, shape (M,): numbers of the markers in their
-    dictionary. `quads`, shape (M, 4, 2): approximate places of their corners, in OpenCV's order,
-    pixels. `family`: name of the dictionary.
+    Parameters
+    ----------
+    image : uint8 array, shape (height, width)
+        Grey picture.
+    ids : int array, shape (M,)
+        Numbers of the markers in their dictionary.
+    quads : array, shape (M, 4, 2)
+        Approximate places of their corners, in OpenCV's order, pixels.
+    family : str
+        Name of the dictionary.
     """
     image = np.ascontiguousarray(image)
     pixels, sigma = np.full((len(ids), 4, 2), np.nan), np.full((len(ids), 4), np.nan)

@@ -39,9 +39,16 @@ class CameraCovariance:
     ) -> "CameraCovariance":
         """Return the uncertain numbers.
 
-        `rig`: before the calibration. `given`: of the rig. `n_medium`: index of the medium in the
-        pictures; None for the rig's own water. `sigma_medium`: its standard deviation, if it is not
-        the rig's water.
+        Parameters
+        ----------
+        rig : Rig
+            Before the calibration.
+        given : RigUncertainty
+            Of the rig.
+        n_medium : float or None
+            Index of the medium in the pictures; None for the rig's own water.
+        sigma_medium : float
+            Its standard deviation, if it is not the rig's water.
         """
         # Earlier knowledge of the lasers is replaced.
         given = given.only([name for name in given.names if ":" not in name])

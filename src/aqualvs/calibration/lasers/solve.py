@@ -82,8 +82,16 @@ def choose_sheets(
 ) -> tuple[SolvedLasers, list[str]]:
     """Choose plane or bent sheet for every laser that has a window.
 
-    `flat`: with all lasers as planes. `rig`: in the medium of the pictures. `lasers`: with their
-    windows, and the planes of `flat`. `solve_with`: solves again with given initial sheets.
+    Parameters
+    ----------
+    flat : SolvedLasers
+        With all lasers as planes.
+    rig : Rig
+        In the medium of the pictures.
+    lasers : sequence of Laser
+        With their windows, and the planes of `flat`.
+    solve_with : callable
+        Solves again with given initial sheets.
 
     Returns
     -------

@@ -210,9 +210,21 @@ def place_stripes(
 ) -> PlacedStripes:
     """Find the surface and place of every stripe point (paper, Eq. 34).
 
-    `camera`: looking into the medium of the picture. `stripes`: of the picture. `dome_from_target`:
-    pose of the target in it. `surfaces`: of the target. Returns a `PlacedStripes`: only points that
-    lie on a surface and not near its edge to another.
+    Parameters
+    ----------
+    camera : Camera
+        Looking into the medium of the picture.
+    stripes : StripePoints
+        Of the picture.
+    dome_from_target : SE3
+        Pose of the target in it.
+    surfaces : TargetSurfaces
+        Of the target.
+
+    Returns
+    -------
+    PlacedStripes
+        Only points that lie on a surface and not near its edge to another.
     """
     rays = camera.rays(stripes.pixels)
     target_from_dome = dome_from_target.inverse()
@@ -373,9 +385,16 @@ def points_on(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the points where pixels meet their surfaces, and the normals there, (N, 3) each.
 
-    `camera`: looking into the medium of the picture. `pixels`, shape (N, 2): of the picture.
-    `surface`, shape (N,): index into `planes`. `planes`: the target's surfaces in `dome`; their
-    normals may have any length.
+    Parameters
+    ----------
+    camera : Camera
+        Looking into the medium of the picture.
+    pixels : array, shape (N, 2)
+        Of the picture.
+    surface : int array, shape (N,)
+        Index into `planes`.
+    planes : sequence of Plane
+        The target's surfaces in `dome`; their normals may have any length.
     """
     rays = camera.rays(pixels)
     normals = np.stack([plane.normal for plane in planes])[surface]

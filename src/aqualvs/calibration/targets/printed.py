@@ -406,9 +406,16 @@ def best_paper(word: str, width: float, height: float, what: str) -> Paper:
 def sheet(paper: Paper, rectangles: FloatArray, size: tuple[float, float], words: str) -> PdfPage:
     """Return a page with a print in its middle, a ruler to check the scale, and a caption.
 
-    `paper`: with room for the print. `rectangles`, shape (N, 4): x, y, width, height of the black
-    areas, from the print's top left, millimetres. `size`: width and height of the print, light
-    border included, in millimetres. `words`: caption, in small print.
+    Parameters
+    ----------
+    paper : Paper
+        With room for the print.
+    rectangles : array, shape (N, 4)
+        x, y, width, height of the black areas, from the print's top left, millimetres.
+    size : (float, float)
+        Width and height of the print, light border included, in millimetres.
+    words : str
+        Caption, in small print.
     """
     width, height = paper.page_mm(*size)
     left, top = 0.5 * (width - size[0]), _PRINT.edge_mm

@@ -381,14 +381,17 @@ def _known_dictionary(name: str, key: str, source: Path) -> str:
 def load_box(path: str | Path) -> tuple[MarkerSet, float | None]:
     """Load a `box.yaml`: markers on planes, in the box's own frame.
 
-    Raises `CalibrationError`: one line that names the file, the value and the remedy.
-
     Returns
     -------
     markers : MarkerSet
         In `box`; every marker lies on one of the planes.
     n_nominal : float or None
         Stated index of the medium of the pictures.
+
+    Raises
+    ------
+    CalibrationError
+        One line that names the file, the value and the remedy.
     """
     source = Path(path)
     content = read_mapping(source, "a box.yaml")

@@ -252,9 +252,16 @@ def first_state(
 ) -> IndexState:
     """Return the state before any frame.
 
-    `time`: in seconds. `n`, `sigma`: initial guess of the index, and its standard deviation.
-    `pose_sigmas`, shape (6,): of the target's place: turn (radians) and shift (metres). `camera`,
-    shape (C, C): covariance of the camera's numbers.
+    Parameters
+    ----------
+    time : float
+        In seconds.
+    n, sigma : float
+        Initial guess of the index, and its standard deviation.
+    pose_sigmas : array, shape (6,)
+        Of the target's place: turn (radians) and shift (metres).
+    camera : array, shape (C, C)
+        Covariance of the camera's numbers.
     """
     size = FIRST_CAMERA + len(camera)
     mean, covariance = np.zeros(size), np.zeros((size, size))

@@ -198,9 +198,16 @@ class StickCommander:
 class GuidedCommander:
     """Converter to speeds in the body's axes, for a vehicle that knows its position.
 
-    `dialect`: pymavlink's messages. `target`: system id of the vehicle. `speed`: what an effort of
-    1 forward, right or down asks for, in m/s. `turning_rate`: what an effort of 1 in yaw asks for,
-    in rad/s.
+    Parameters
+    ----------
+    dialect : module
+        pymavlink's messages.
+    target : int
+        System id of the vehicle.
+    speed : float
+        What an effort of 1 forward, right or down asks for, in m/s.
+    turning_rate : float
+        What an effort of 1 in yaw asks for, in rad/s.
     """
 
     def __init__(self, dialect: Any, *, target: int, speed: float, turning_rate: float) -> None:

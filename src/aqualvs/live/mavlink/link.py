@@ -207,8 +207,11 @@ class MavlinkLink:
         `names`: as ArduPilot calls them, such as `RC4_DZ`. `timeout_s`: how long to ask and wait,
         in seconds.
 
-        Returns `parameters`: in the autopilot's units. A parameter that the autopilot does not
-        have, or did not answer in time, is left out.
+        Returns
+        -------
+        parameters : dict of str to float
+            In the autopilot's units. A parameter that the autopilot does not have, or did not
+            answer in time, is left out.
         """
         wanted = list(dict.fromkeys(names))
         with self._receiving:

@@ -37,9 +37,21 @@ _log = logging.getLogger(__name__)
 class Ros1Node:
     """ROS 1 node that publishes topics; registers with roscore whenever that is there.
 
-    `name`: full name, such as `/aqualvs`. `topics`: type of each topic by its full name.
-    `master_uri`: where roscore is. `environment`: `ROS_HOSTNAME` or `ROS_IP`: the name that
-    subscribers reach this machine by. Raises `OptionError` if `master_uri` is no address.
+    Parameters
+    ----------
+    name : str
+        Full name, such as `/aqualvs`.
+    topics : mapping
+        Type of each topic by its full name.
+    master_uri : str
+        Where roscore is.
+    environment : mapping
+        `ROS_HOSTNAME` or `ROS_IP`: the name that subscribers reach this machine by.
+
+    Raises
+    ------
+    OptionError
+        If `master_uri` is no address.
     """
 
     def __init__(

@@ -30,9 +30,16 @@ _LEVELS = 256
 class ThresholdDetector:
     """Detector of the bright pixels on every search line of one direction, inside its band.
 
-    `axis`: direction of the search lines. `size_px`: image width and height. `lowest`, `highest`,
-    shape (n_lines,): first and last position of interest on each line (an empty interval skips the
-    line). `options`: options.
+    Parameters
+    ----------
+    axis : SearchAxis
+        Direction of the search lines.
+    size_px : (int, int)
+        Image width and height.
+    lowest, highest : int array, shape (n_lines,)
+        First and last position of interest on each line (an empty interval skips the line).
+    options : ThresholdOptions
+        Options.
     """
 
     def __init__(
@@ -55,8 +62,11 @@ class ThresholdDetector:
 
         `lines`, shape (n_lines, length): luma, with search lines as rows.
 
-        Returns `found`: position is the middle of a run, width the number of its pixels, height its
-        brightest value.
+        Returns
+        -------
+        found : Returns
+            Position is the middle of a run, width the number of its pixels, height its brightest
+            value.
         """
         np.multiply(lines, self._in_band, out=self._lines[:, :-1])
         flat = self._lines.ravel()

@@ -264,8 +264,11 @@ def laser_frame(plane: Plane) -> SE3:
 
     `plane`: in `dome`.
 
-    Returns a `SE3`: its origin is the foot of the perpendicular from the dome's centre; points on
-    the plane have z = 0 in `laser`.
+    Returns
+    -------
+    SE3
+        Its origin is the foot of the perpendicular from the dome's centre; points on the plane
+        have z = 0 in `laser`.
     """
     e_z = plane.normal
     # A forward axis whose projection into the laser plane is shorter has no direction worth

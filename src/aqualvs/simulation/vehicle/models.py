@@ -99,8 +99,11 @@ class StickInput:
 
         `x`, `y`, `z`, `r`: as in MANUAL_CONTROL: z from 0 (down) over 500 to 1000 (up).
 
-        Returns `forward`, `right`, `down`, `turn`: shares of the thrusters' motor input, of the
-        greatest rate of descent and of the greatest turning rate.
+        Returns
+        -------
+        forward, right, down, turn : float
+            Shares of the thrusters' motor input, of the greatest rate of descent and of the
+            greatest turning rate.
         """
         yaw_trim, *level = self.trims
         forward, right = (
