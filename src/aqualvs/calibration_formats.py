@@ -66,8 +66,19 @@ def recognised(text: str) -> CalibrationFormat | None:
 def refuse_foreign(text: str, path: Path, wanted: str, error: type[AqualvsError]) -> None:
     """Refuse the calibration file of another program, with the command that converts it.
 
-    `text`: content of the file. `wanted`: what was expected, such as "a rig file". `error`:
-    exception to raise. Raises `AqualvsError` of type `error`, one line.
+    Parameters
+    ----------
+    text : str
+        Content of the file.
+    wanted : str
+        What was expected, such as "a rig file".
+    error : type
+        Exception to raise.
+
+    Raises
+    ------
+    AqualvsError
+        Of type `error`, one line.
     """
     found = recognised(text)
     if found is None:

@@ -95,9 +95,19 @@ FrameOutput = tuple[Rig, Scan, dict[SearchAxis, StripePeaks]]
 class RunMcap(Closing):
     """Writer of `dive.mcap` during a run, or of nothing; a context manager.
 
-    `rig`: for frames that were lost. `options`: that the run measures with. `wanted`: false makes
-    it measure frames and nothing else. Raises `OutputError`: from every method, if the file cannot
-    be written.
+    Parameters
+    ----------
+    rig : Rig
+        For frames that were lost.
+    options : ScannerOptions
+        That the run measures with.
+    wanted : bool
+        False makes it measure frames and nothing else.
+
+    Raises
+    ------
+    OutputError
+        From every method, if the file cannot be written.
     """
 
     def __init__(self, folder: Path, rig: Rig, options: ScannerOptions, *, wanted: bool) -> None:
@@ -235,8 +245,17 @@ def _measured(scanner: FrameScanner, frame: Frame) -> FrameOutput:
 class RunOverlay(Closing):
     """Writer of `overlay.mp4` during a run, or of nothing; a context manager.
 
-    `source`: gives size and rate of the video. `wanted`: false makes `write` do nothing. Raises
-    `OutputError`: from every method, if the video cannot be written.
+    Parameters
+    ----------
+    source : FrameSource
+        Gives size and rate of the video.
+    wanted : bool
+        False makes `write` do nothing.
+
+    Raises
+    ------
+    OutputError
+        From every method, if the video cannot be written.
     """
 
     def __init__(self, folder: Path, rig: Rig, source: FrameSource, *, wanted: bool) -> None:

@@ -65,8 +65,14 @@ def write_manifest(
 def read_valid_manifest(folder: Path, key: str, place: Path | None = None) -> dict[str, Any] | None:
     """Return the facts of finished work, None unless it is there, made for `key`, and intact.
 
-    `folder`: with the seal. `key`: as in `write_manifest`. `place`: where the files are, if not in
-    `folder`.
+    Parameters
+    ----------
+    folder : Path
+        With the seal.
+    key : str
+        As in `write_manifest`.
+    place : Path or None
+        Where the files are, if not in `folder`.
     """
     content = read_manifest(folder)
     if content is None or content["key"] != key:
@@ -219,8 +225,17 @@ def drop_dive(dataset: Path, name: str) -> None:
 def put_net(dataset: Path, name: str, folder: Path) -> None:
     """Put the state of a dive's net into the data set, in place of what is there of this dive.
 
-    `name`: of the dive. `folder`: with `net.csv` and `holes.csv`. Raises `OSError` as the system
-    says it.
+    Parameters
+    ----------
+    name : str
+        Of the dive.
+    folder : Path
+        With `net.csv` and `holes.csv`.
+
+    Raises
+    ------
+    OSError
+        As the system says it.
     """
     for table in _OF_NET:
         _put_table(dataset, name, folder / table, null_words=True)

@@ -95,9 +95,17 @@ class Workers(Protocol):
 class DaskWorkers(Closing):
     """Workers of a Dask scheduler; a context manager.
 
-    `n_workers`: processes on this machine, each with one thread; None for one per core.
-    `scheduler`: address of a scheduler whose workers are used instead. Raises `OptionError` if
-    `distributed` is missing, or the scheduler does not answer.
+    Parameters
+    ----------
+    n_workers : int or None
+        Processes on this machine, each with one thread; None for one per core.
+    scheduler : str or None
+        Address of a scheduler whose workers are used instead.
+
+    Raises
+    ------
+    OptionError
+        If `distributed` is missing, or the scheduler does not answer.
     """
 
     def __init__(self, n_workers: int | None = None, scheduler: str | None = None) -> None:
@@ -251,7 +259,12 @@ NET = "net"
 def with_net(work: DiveWork, key: str, facts: Mapping[str, Any]) -> dict[str, Any]:
     """Return a finished dive's facts with the condition of its net, evaluated now if it is wanted.
 
-    `key`: of the dive's result, `DiveProbe.key`. `facts`: from `join_dive`.
+    Parameters
+    ----------
+    key : str
+        Of the dive's result, `DiveProbe.key`.
+    facts : mapping
+        From `join_dive`.
 
     Returns
     -------
@@ -271,7 +284,12 @@ def with_net(work: DiveWork, key: str, facts: Mapping[str, Any]) -> dict[str, An
 def known_net(home: Path, key: str) -> dict[str, Any]:
     """Return the stored condition of a dive's net, as from `with_net`; empty if there is none.
 
-    `home`: of the dive. `key`: of its result; what was told of another does not count.
+    Parameters
+    ----------
+    home : Path
+        Of the dive.
+    key : str
+        Of its result; what was told of another does not count.
     """
     found = read_manifest(home / NET)
     if found is None or not str(found["key"]).startswith(f"{key}-"):
@@ -376,8 +394,12 @@ class Steps:
 class Scheduler:
     """Scheduler that measures many dives with many processes.
 
-    `works`: the dives with the sizes of their sources in bytes, in the order in which they are
-    begun. `steps`: in place of the real ones.
+    Parameters
+    ----------
+    works : sequence of (DiveWork, int)
+        The dives with the sizes of their sources in bytes, in the order in which they are begun.
+    steps : Steps, optional
+        In place of the real ones.
     """
 
     def __init__(

@@ -36,8 +36,12 @@ def range_steps(ranges: ArrayLike) -> list[float | None]:
 def range_svg(steps: Sequence[float | None], low: float, high: float) -> str:
     """Return the steps as a line in SVG; without a posture there is no line.
 
-    `steps`: from `range_steps`. `low`, `high`: ranges at the picture's lower and upper edge, in
-    metres.
+    Parameters
+    ----------
+    steps : sequence of float or None
+        From `range_steps`.
+    low, high : float
+        Ranges at the picture's lower and upper edge, in metres.
     """
     if not steps or not high > low:
         return ""
@@ -75,8 +79,17 @@ _EXAMPLES = {
 def write_summary(folder: Path, records: Sequence[DiveRecord]) -> Path:
     """Write `summary.html`.
 
-    `folder`: of the batch; reports are in `dives/NAME` below it. `records`: in the order of the
-    page. Raises `OutputError` if the page cannot be written.
+    Parameters
+    ----------
+    folder : Path
+        Of the batch; reports are in `dives/NAME` below it.
+    records : sequence of DiveRecord
+        In the order of the page.
+
+    Raises
+    ------
+    OutputError
+        If the page cannot be written.
     """
     path = folder / SUMMARY_HTML
     text = _page(folder, records)

@@ -323,9 +323,17 @@ def all_missed(found: Iterable[DetectedTargets]) -> dict[str, str]:
 def detect_targets(pictures: Sequence[Picture], detect: Detect, target: str) -> DetectedTargets:
     """Find a target in every picture.
 
-    `pictures`: files or pixels; pixels are named by their number. `target`: name of the target in
-    messages, such as "board.yaml". Raises `CalibrationError` if the target is in none of the
-    pictures, or they differ in size.
+    Parameters
+    ----------
+    pictures : sequence of Picture
+        Files or pixels; pixels are named by their number.
+    target : str
+        Name of the target in messages, such as "board.yaml".
+
+    Raises
+    ------
+    CalibrationError
+        If the target is in none of the pictures, or they differ in size.
     """
     # Greatest useful number of threads on small pictures.
     threads = 4

@@ -83,9 +83,19 @@ class _Warp(NamedTuple):
 def calibrate_shutter(source: FrameSource, rig: Rig) -> ShutterCalibration:
     """Estimate the readout of a rolling shutter.
 
-    `source`: a dive in which the vehicle turns before a flat target. `rig`: with lasers; its own
-    readout is not used. Raises `CalibrationError` if the dive shows too few postures, or too little
-    motion. Raises `SourceError` if the pictures do not fit the rig, or cannot be read.
+    Parameters
+    ----------
+    source : FrameSource
+        A dive in which the vehicle turns before a flat target.
+    rig : Rig
+        With lasers; its own readout is not used.
+
+    Raises
+    ------
+    CalibrationError
+        If the dive shows too few postures, or too little motion.
+    SourceError
+        If the pictures do not fit the rig, or cannot be read.
     """
     check_fits(source, rig)
     nominal = Shutter(kind=ShutterKind.ROLLING, readout=_NOMINAL)

@@ -48,9 +48,19 @@ class ForeignCamera:
 def opencv_lens(core: Sequence[float], distortion: Sequence[float], *, fisheye: bool) -> Lens:
     """Return the lens of OpenCV's coefficients, if aqualvs has all of them.
 
-    `core`: fx, fy, cx, cy. `distortion`: in OpenCV's order. Zeros beyond k6, of a thin prism or a
-    tilt, are dropped. `fisheye`: whether they are those of `cv2.fisheye`. Raises `RigError` if
-    there are others, or a value is impossible.
+    Parameters
+    ----------
+    core : sequence of float
+        fx, fy, cx, cy.
+    distortion : sequence of float
+        In OpenCV's order. Zeros beyond k6, of a thin prism or a tilt, are dropped.
+    fisheye : bool
+        Whether they are those of `cv2.fisheye`.
+
+    Raises
+    ------
+    RigError
+        If there are others, or a value is impossible.
     """
     values = tuple(map(float, distortion))
     n_opencv = 8
@@ -85,8 +95,19 @@ def rig_of_camera(
 
     The camera looks along the dome's y axis: other programs do not know a frame of the vehicle.
 
-    `camera`: with the size of its pictures. `source`: name of the file in messages. `solved_from`:
-    as `Rig.solved_from`. Raises `RigError` if such a rig is impossible.
+    Parameters
+    ----------
+    camera : ForeignCamera
+        With the size of its pictures.
+    source : str
+        Name of the file in messages.
+    solved_from : dict, optional
+        As `Rig.solved_from`.
+
+    Raises
+    ------
+    RigError
+        If such a rig is impossible.
     """
     if camera.size_px is None:
         raise RigError(

@@ -66,9 +66,17 @@ def read_camera(
 ) -> ForeignCamera:
     """Read a camera from the file of another program.
 
-    `camera`: name of the camera, where a file of Kalibr or COLMAP holds several. `model`: "opencv"
-    or "fisheye", where a FileStorage of OpenCV does not say it. Raises `RigError`: one line that
-    names the file, the value and the remedy.
+    Parameters
+    ----------
+    camera : str, optional
+        Name of the camera, where a file of Kalibr or COLMAP holds several.
+    model : str, optional
+        "opencv" or "fisheye", where a FileStorage of OpenCV does not say it.
+
+    Raises
+    ------
+    RigError
+        One line that names the file, the value and the remedy.
     """
     found, text = format_of(Path(path))
     with _naming(path):
@@ -100,8 +108,17 @@ def read_board(path: str | Path) -> Board:
 def camera_text(camera: ForeignCamera, to: str, *, suffix: str = "") -> str:
     """Return the text of a camera's file.
 
-    `to`: one of `EXPORTS`. `suffix`: of the file; .xml and .json choose the form of a FileStorage.
-    Raises `RigError` if the format cannot hold the camera.
+    Parameters
+    ----------
+    to : str
+        One of `EXPORTS`.
+    suffix : str
+        Of the file; .xml and .json choose the form of a FileStorage.
+
+    Raises
+    ------
+    RigError
+        If the format cannot hold the camera.
     """
     if to == "ros":
         return ros_text(camera)

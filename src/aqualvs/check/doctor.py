@@ -64,8 +64,12 @@ _MODES = {
 def autopilot(address: str, vehicle: VehicleSetup, rig: Path | None = None) -> Iterator[Finding]:
     """Wait for the heartbeat of an autopilot, listen for a while, and read its parameters.
 
-    `address`: as in `parse_address`. `rig`: whose working range the autopilot's rangefinder should
-    take.
+    Parameters
+    ----------
+    address : str
+        As in `parse_address`.
+    rig : Path or None
+        Whose working range the autopilot's rangefinder should take.
     """
     working_range = None if rig is None else load_rig(rig).working_range
     with contextlib.closing(MavlinkLink(address, vehicle.link)) as link:

@@ -60,7 +60,14 @@ def check_solved(
 ) -> Iterator[Finding]:
     """Return what is worth saying about how a rig was calibrated.
 
-    `steps`: as `solved_steps` gives them. `uncertainty`: of the rig. `now`: with a time zone.
+    Parameters
+    ----------
+    steps : dict of SolvedStep
+        As `solved_steps` gives them.
+    uncertainty : RigUncertainty
+        Of the rig.
+    now : datetime
+        With a time zone.
     """
     for name, step in steps.items():
         yield _told(name, step, now)

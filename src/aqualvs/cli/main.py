@@ -255,7 +255,10 @@ def _root(
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line.
 
-    `arguments`: without the program's name; None takes them from the process.
+    Parameters
+    ----------
+    arguments : sequence of str or None
+        Without the program's name; None takes them from the process.
 
     Returns
     -------

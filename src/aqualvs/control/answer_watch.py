@@ -168,7 +168,12 @@ class AnswerWatch:
     def see(self, now_s: float, posture: Posture, state: VehicleState) -> LimitReason | None:
         """Add a new posture; return why it cannot be used, None if it can.
 
-        `posture`: of a frame that has not been seen before. `state`: as the vehicle reports it.
+        Parameters
+        ----------
+        posture : Posture
+            Of a frame that has not been seen before.
+        state : VehicleState
+            As the vehicle reports it.
         """
         if not all(map(math.isfinite, (now_s, posture.range, posture.pitch, posture.yaw))):
             return None

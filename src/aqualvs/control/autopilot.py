@@ -53,8 +53,17 @@ class Decision:
 class NetPilot:
     """Autopilot that holds and follows by the measured posture.
 
-    `mission`: what to do. `controller`: made for the vehicle. Raises `OptionError` if the mission
-    moves sideways and the vehicle cannot.
+    Parameters
+    ----------
+    mission : Mission
+        What to do.
+    controller : RangeYawController
+        Made for the vehicle.
+
+    Raises
+    ------
+    OptionError
+        If the mission moves sideways and the vehicle cannot.
     """
 
     def __init__(

@@ -210,7 +210,12 @@ class SwellFilter:
     At the period H is 1, far from it 0. Its memory is that of a damped pendulum: bounded by its
     input, so that it does not wind up.
 
-    `period`: in seconds. `damping`: zeta; half of the width of the band over its middle.
+    Parameters
+    ----------
+    period : float
+        In seconds.
+    damping : float
+        zeta; half of the width of the band over its middle.
     """
 
     def __init__(self, period: float, damping: float) -> None:
@@ -245,9 +250,14 @@ class SwellFilter:
 class Ramp:
     """Setpoint that follows a goal with bounded speed and acceleration, and stops on it.
 
-    `speed`, `acceleration`: greatest, per second and per second squared. `lag`: time constant in
-    seconds with which a measurement follows, at best. `falling`: greatest speed towards lower
-    values, where that is less.
+    Parameters
+    ----------
+    speed, acceleration : float
+        Greatest, per second and per second squared.
+    lag : float
+        Time constant in seconds with which a measurement follows, at best.
+    falling : float
+        Greatest speed towards lower values, where that is less.
 
     Attributes
     ----------
@@ -403,8 +413,14 @@ class RangeYawController:
     def engage(self, time_s: float, range: float, yaw: float, effort: Effort) -> None:
         """Take over from a human pilot without a jump.
 
-        `time_s`: of the last frame. `range`, `yaw`: its posture, in metres and radians. `effort`:
-        what the vehicle does now.
+        Parameters
+        ----------
+        time_s : float
+            Of the last frame.
+        range, yaw : float
+            Its posture, in metres and radians.
+        effort : Effort
+            What the vehicle does now.
         """
         vehicle = self.gains.vehicle
         forward, _ = vehicle.thrust.forces(effort.forward, effort.right)

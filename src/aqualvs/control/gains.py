@@ -117,8 +117,12 @@ class DeadBandCrossing:
     is owed is taken off the thrust that follows on the side in force: so the mean thrust is the one
     asked for, and noise about zero neither crosses nor pushes.
 
-    `impulse`: share of the full thrust, times seconds. `great`: share of the full thrust that
-    crosses at once.
+    Parameters
+    ----------
+    impulse : float
+        Share of the full thrust, times seconds.
+    great : float
+        Share of the full thrust that crosses at once.
     """
 
     def __init__(self, thrust: ThrustMap, impulse: float, great: float) -> None:

@@ -61,9 +61,14 @@ class Mission(Protocol):
     def update(self, now_s: float, posture: Posture | None, state: VehicleState) -> Guidance:
         """Return the present guidance.
 
-        `now_s`: monotonic, in seconds. Only steps forward of up to a second count as time spent.
-        `posture`: the present one; None where there is none. While disengaged there are no updates.
-        `state`: depth and heading are used where they are known.
+        Parameters
+        ----------
+        now_s : float
+            Monotonic, in seconds. Only steps forward of up to a second count as time spent.
+        posture : Posture or None
+            The present one; None where there is none. While disengaged there are no updates.
+        state : VehicleState
+            Depth and heading are used where they are known.
         """
 
     def restart(self) -> None:
@@ -135,9 +140,14 @@ class LossWatch:
 class HoldMission:
     """Hold a range and yaw, for some time or for good; after that time it holds on.
 
-    `setpoint`: kept in `setpoint`, which may be changed at any time. `duration`: seconds with the
-    target after which it is `Stage.OVER`; endless if left out. `loss`: what to do without the
-    target.
+    Parameters
+    ----------
+    setpoint : Setpoint or None
+        Kept in `setpoint`, which may be changed at any time.
+    duration : float, optional
+        Seconds with the target after which it is `Stage.OVER`; endless if left out.
+    loss : LossOptions, optional
+        What to do without the target.
     """
 
     def __init__(
@@ -366,8 +376,19 @@ class SurveyMission:
     The vehicle's own depth hold keeps the depth on the way; between legs it is asked to sink or
     rise, holding range and yaw. Without a known depth, changes wait.
 
-    `setpoint`: range and yaw on the way. `options`: the lawn. `loss`: what to do without the
-    target.
+    Parameters
+    ----------
+    setpoint : Setpoint
+        Range and yaw on the way.
+    options : SurveyOptions
+        The lawn.
+    loss : LossOptions, optional
+        What to do without the target.
+
+    Attributes
+    ----------
+    i_leg : int
+        The leg gone now, or whose depth is sought; counts from 0.
     """
 
     def __init__(

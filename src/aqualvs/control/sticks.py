@@ -81,8 +81,12 @@ class StickShaping:
         An effort of 1 is a full stick, one of 0 the middle of the dead zone, and what is between
         is in proportion to what the vehicle does. Pulses are whole microseconds.
 
-        `effort`: of finite parts; limited to full deflection. `keeps_place`: whether the mode is
-        POSHOLD, whose level sticks have a dead zone.
+        Parameters
+        ----------
+        effort : Effort
+            Of finite parts; limited to full deflection.
+        keeps_place : bool
+            Whether the mode is POSHOLD, whose level sticks have a dead zone.
         """
         level = self.throttle_dead_zone * self.gain * 2.0 if keeps_place else 0.0
         return Sticks(

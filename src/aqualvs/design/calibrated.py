@@ -42,7 +42,12 @@ _BOARD = _BoardOptions()
 def camera_errors(design: Design, ranges: Sequence[float]) -> dict[str, FloatArray]:
     """Return the posture errors by the camera's tolerances after a calibration of the lasers.
 
-    `design`: with the final tilts of its lasers. `ranges`: walls square ahead, metres.
+    Parameters
+    ----------
+    design : Design
+        With the final tilts of its lasers.
+    ranges : sequence of float
+        Walls square ahead, metres.
 
     Returns
     -------
@@ -91,7 +96,10 @@ def lasers_by(believed: Rig, true: Rig) -> Rig | None:
     A calibration without noise: the assumed camera gives the poses of boards in the working range,
     and the stripes on them the lasers.
 
-    `believed`: rig whose camera is assumed.
+    Parameters
+    ----------
+    believed : Rig
+        Rig whose camera is assumed.
 
     Returns
     -------
@@ -216,7 +224,12 @@ def offset_costs(design: Design, ranges: Sequence[float]) -> tuple[OffsetCost, .
 
     Among them are the design's own offset and its centring tolerance. None without a dome.
 
-    `design`: with the final tilts of its lasers. `ranges`: walls square ahead, metres.
+    Parameters
+    ----------
+    design : Design
+        With the final tilts of its lasers.
+    ranges : sequence of float
+        Walls square ahead, metres.
     """
     dome = design.rig.dome
     if dome is None:

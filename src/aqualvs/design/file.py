@@ -240,8 +240,19 @@ def merged_content(content: Mapping[str, Any], given: Mapping[str, Any]) -> dict
 def design_from(content: object, *, name: str, folder: Path) -> Design:
     """Return the design that the content of a design file describes.
 
-    `content`: content of the YAML file. `name`: name in messages. `folder`: folder of a rig file
-    that it names. Raises `OptionError, RigError`: one line: file, place, value, remedy.
+    Parameters
+    ----------
+    content : object
+        Content of the YAML file.
+    name : str
+        Name in messages.
+    folder : Path
+        Folder of a rig file that it names.
+
+    Raises
+    ------
+    OptionError, RigError
+        One line: file, place, value, remedy.
     """
     file = parse_settings(content, DesignFile, KEY, VERSION, name)
     try:

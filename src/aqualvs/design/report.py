@@ -290,8 +290,17 @@ _N_RANGES, _N_CAMERA, _N_ALONG = 60, 5, 40
 def draw_figures(design: Design, out: Path) -> list[Path]:
     """Write `errors.png` and `picture.png`.
 
-    `design`: with the final tilts of its lasers. `out`: folder that exists. Raises `OSError` if a
-    picture cannot be written.
+    Parameters
+    ----------
+    design : Design
+        With the final tilts of its lasers.
+    out : Path
+        Folder that exists.
+
+    Raises
+    ------
+    OSError
+        If a picture cannot be written.
     """
     from matplotlib import rc_context
 

@@ -122,9 +122,17 @@ def tangential(position: Sequence[float]) -> float:
 def mount_of_laser(laser: Laser, rig: Rig, fan: float) -> Mount:
     """Return a mount for a laser of a rig, with default values of what its plane leaves open.
 
-    `laser`: behind a window the plane that fits its light best is used. `fan`: full opening,
-    radians. Raises `RigError` if the laser's sheet is square to the view, so that it draws no
-    stripe.
+    Parameters
+    ----------
+    laser : Laser
+        Behind a window the plane that fits its light best is used.
+    fan : float
+        Full opening, radians.
+
+    Raises
+    ------
+    RigError
+        If the laser's sheet is square to the view, so that it draws no stripe.
     """
     sheet = sheet_in(laser, rig.n_air, rig.n_water)
     plane = sheet.best_plane(rig.camera(), rig.working_range)

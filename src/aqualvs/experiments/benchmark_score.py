@@ -149,7 +149,10 @@ def score(frames: FrameAnswers) -> Score:
 def bars_against(frames: FrameAnswers, clear: FrameAnswers) -> FloatArray:
     """Return how much longer error bars are than those of the same frames in clear water.
 
-    `frames`, `clear`: frame by frame the same course before the same target.
+    Parameters
+    ----------
+    frames, clear : FrameAnswers
+        Frame by frame the same course before the same target.
 
     Returns
     -------

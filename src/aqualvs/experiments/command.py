@@ -64,7 +64,12 @@ TYPICAL_S: Mapping[str, float] = {
 class TimeLeft:
     """Guess of the time that is left, from what the experiments so far took.
 
-    `names`: experiments to come. `now`: clock in seconds.
+    Parameters
+    ----------
+    names : sequence of str
+        Experiments to come.
+    now : callable
+        Clock in seconds.
     """
 
     def __init__(self, names: Sequence[str], now: Callable[[], float] = time.monotonic) -> None:

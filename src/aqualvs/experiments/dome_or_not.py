@@ -146,7 +146,14 @@ def level_laser(rig: Rig) -> int:
 def distances(measured: MeasuredDive, rig: Rig, laser: int) -> Distances:
     """Return the distances of a wall that is square to the vehicle, from one laser's stripe.
 
-    `measured`: with the dome model. `rig`: as the scanner believed it. `laser`: index of the laser.
+    Parameters
+    ----------
+    measured : MeasuredDive
+        With the dome model.
+    rig : Rig
+        As the scanner believed it.
+    laser : int
+        Index of the laser.
     """
     rows = []
     for scan, truth in zip(measured.scans, measured.truth[:, 0], strict=True):

@@ -101,8 +101,14 @@ def drawn(
 ) -> ExperimentFigure:
     """Return a picture of a page's width.
 
-    `name`, `caption`: as in `ExperimentFigure`. `height_in`: height in inches. `draw`: fills the
-    figure.
+    Parameters
+    ----------
+    name, caption : str
+        As in `ExperimentFigure`.
+    height_in : float
+        Height in inches.
+    draw : callable
+        Fills the figure.
     """
     with new_figure(height_in) as figure:
         draw(figure)

@@ -124,8 +124,17 @@ class MeasuredDive:
 class Laboratory:
     """Simulated tank that renders dives and measures them; repeated calls reuse the results.
 
-    `work`: folder for the dives; kept, so that another run finds them. `tick`: called with the
-    number of frames rendered since the last call.
+    Parameters
+    ----------
+    work : Path
+        Folder for the dives; kept, so that another run finds them.
+    tick : callable, optional
+        Called with the number of frames rendered since the last call.
+
+    Attributes
+    ----------
+    frame_s : list of float
+        How long the scanner took for each frame that it measured with its own options, in seconds.
     """
 
     def __init__(self, work: Path, tick: Callable[[int], None] | None = None) -> None:
@@ -161,8 +170,14 @@ class Laboratory:
     ) -> RenderedDive:
         """Return a dive with its truth, rendered where it has not been yet.
 
-        `scenario`: its name, with a digest of everything that shapes the pictures, names the
-        folder. `rig`: `self.rig` by default. `recording`, `point_frames`: as in `simulate_dive`.
+        Parameters
+        ----------
+        scenario : Scenario
+            Its name, with a digest of everything that shapes the pictures, names the folder.
+        rig : Rig, optional
+            `self.rig` by default.
+        recording, point_frames
+            As in `simulate_dive`.
         """
         rig = rig or self.rig
         facts = {

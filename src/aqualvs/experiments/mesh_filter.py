@@ -48,8 +48,12 @@ def papers_pixels(
     The paper divides its picture by hand into one area for each laser; here our own classification
     does it, which is better than such areas.
 
-    `options`: of the filter; by default those of section 5.2. `level`: of the threshold, in grey
-    levels.
+    Parameters
+    ----------
+    options : MeshFilterOptions
+        Of the filter; by default those of section 5.2.
+    level : int, optional
+        Of the threshold, in grey levels.
     """
     detector = ThresholdOptions() if level is None else ThresholdOptions(level=level)
     scans = laboratory.measure(dive, ScannerOptions(detector=detector)).scans
@@ -132,7 +136,10 @@ def judge_pixels(pixels: FloatArray, laser: IntArray, truth: LitTruth) -> Judged
     A point counts as what the nearest true point within 9 px is; a true point of the net is found
     where such a point lies within 3 px.
 
-    `pixels`, shape (N, 2). `laser`, shape (N,).
+    Parameters
+    ----------
+    pixels : array, shape (N, 2)
+    laser : int array, shape (N,)
 
     Returns
     -------
@@ -165,7 +172,10 @@ def judge_reflections(found: FilteredPeaks, truth: LitTruth) -> Judged:
     one laser and the net, no more than 6 px from one to the next; it is found if pixels of
     reflections that are said to lie on the net lie within 3 px of more than half of its points.
 
-    `found`: all pixels of the frame, and which of them are said to lie on the net.
+    Parameters
+    ----------
+    found : FilteredPeaks
+        All pixels of the frame, and which of them are said to lie on the net.
 
     Returns
     -------

@@ -166,7 +166,12 @@ def _simulate_calibration(
 def calibration_commands(files: CalibrationFiles, out: Path, n_lasers: int) -> list[list[str]]:
     """Return the arguments of `aqualvs` that calibrate from a simulated set, in turn.
 
-    `out`: folder in which `rig.yaml` and `run` are to be written. `n_lasers`: lasers of the rig.
+    Parameters
+    ----------
+    out : Path
+        Folder in which `rig.yaml` and `run` are to be written.
+    n_lasers : int
+        Lasers of the rig.
     """
     rig = str(out / "rig.yaml")
     update = ["--rig", rig, "-o", rig]

@@ -234,7 +234,12 @@ def _seen_again(view: View, name: str, rng: np.random.Generator) -> View:
 def follow(rig: Rig, taken: Cruise) -> tuple[Numbers, list[IndexStep]]:
     """Estimate the index frame by frame, ours and the paper's way.
 
-    `rig`: as calibrated, with its covariance. `taken`: begins in air.
+    Parameters
+    ----------
+    rig : Rig
+        As calibrated, with its covariance.
+    taken : Cruise
+        Begins in air.
 
     Returns
     -------

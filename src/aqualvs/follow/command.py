@@ -48,8 +48,12 @@ from aqualvs.terminal import StopSignals
 class LoopPage:
     """Page that shows a loop step by step, in real time at most.
 
-    `page`: closed with this. `holder`: where the page puts the setpoint; a mission that holds
-    follows it.
+    Parameters
+    ----------
+    page : Output
+        Closed with this.
+    holder : SetpointHolder
+        Where the page puts the setpoint; a mission that holds follows it.
     """
 
     def __init__(self, page: Output, rig: Rig, loop: SimulatedLoop, holder: SetpointHolder) -> None:
@@ -138,8 +142,12 @@ class LoopPage:
 class RunWatch:
     """Called before each frame; returns whether to go on.
 
-    `seconds`: of the whole run. `slow`: whether a simulated second takes seconds, so that progress
-    is printed.
+    Parameters
+    ----------
+    seconds : float
+        Of the whole run.
+    slow : bool
+        Whether a simulated second takes seconds, so that progress is printed.
     """
 
     def __init__(

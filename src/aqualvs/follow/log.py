@@ -256,8 +256,14 @@ def step_measures(
 ) -> StepMeasures:
     """Return settling time and overshoot of a step.
 
-    `time_s`, `ranges`, shape (n,): true ranges, or their mean over several runs. `step_s`: when the
-    setpoint changed. `before`, `after`: setpoints in metres.
+    Parameters
+    ----------
+    time_s, ranges : array, shape (n,)
+        True ranges, or their mean over several runs.
+    step_s : float
+        When the setpoint changed.
+    before, after : float
+        Setpoints in metres.
     """
     later = time_s > step_s
     share = (ranges[later] - before) / (after - before)

@@ -28,7 +28,15 @@ from aqualvs.simulation.vehicle.vehicle import SimulatedVehicle
 class SimulatedLink:
     """Link to a simulated vehicle, in its own time.
 
-    `vehicle`: its latency is that of the wire.
+    Parameters
+    ----------
+    vehicle : SimulatedVehicle
+        Its latency is that of the wire.
+
+    Attributes
+    ----------
+    effort : Effort
+        The last that was sent.
     """
 
     def __init__(self, vehicle: SimulatedVehicle) -> None:
@@ -148,7 +156,16 @@ class _Sight:
 class SimulatedLoop:
     """A vehicle before a net that it sees with lasers and steers by.
 
-    `steering`: engaged at the start.
+    Parameters
+    ----------
+    steering : NetPilot
+        Engaged at the start.
+
+    Attributes
+    ----------
+    on_step : callable or None
+        Called after every step of the pilot with the time, the frame's time, what was measured,
+        the decision and the vehicle's state.
     """
 
     def __init__(

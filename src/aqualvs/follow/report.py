@@ -43,8 +43,17 @@ FIGURE_FILES = ("figure_22.png", "figure_23.png")
 def draw_follow_figures(log: LoopLog, out: Path) -> list[Path]:
     """Write `figure_22.png` and `figure_23.png`.
 
-    `log`: with at least one row. `out`: folder that exists. Raises `OSError` if a picture cannot be
-    written.
+    Parameters
+    ----------
+    log : LoopLog
+        With at least one row.
+    out : Path
+        Folder that exists.
+
+    Raises
+    ------
+    OSError
+        If a picture cannot be written.
     """
     return save_figures(drawn_follow_figures(log), out, dpi=160)
 

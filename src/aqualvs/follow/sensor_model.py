@@ -161,8 +161,14 @@ class PostureNoise:
 class SampledSensor:
     """Sensor that gives the true posture with noise.
 
-    `rng`: source of the noise. `blind`: periods without sight. `working_range`: outside of it
-    nothing is measured, in metres.
+    Parameters
+    ----------
+    rng : Generator
+        Source of the noise.
+    blind : sequence of Blind
+        Periods without sight.
+    working_range : (float, float)
+        Outside of it nothing is measured, in metres.
     """
 
     def __init__(

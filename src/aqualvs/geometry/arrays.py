@@ -13,8 +13,10 @@ IntArray: TypeAlias = NDArray[np.int64]
 def as_vectors(values: ArrayLike, size: int, name: str) -> FloatArray:
     """Return `values` as a contiguous float64 array of shape (..., size).
 
-    Raises `ValueError` if the last axis does not have length `size`; the message names `name` and
-    the shape.
+    Raises
+    ------
+    ValueError
+        If the last axis does not have length `size`; the message names `name` and the shape.
     """
     array = np.ascontiguousarray(values, dtype=np.float64)
     if array.ndim == 0 or array.shape[-1] != size:

@@ -36,7 +36,10 @@ _absent: dict[str, dict[str, Any]] = {}
 def load_lightly(compiled: Any) -> None:
     """Have a compiled function load its machine code without what only compiling needs.
 
-    `compiled`: what `numba.njit` returned.
+    Parameters
+    ----------
+    compiled : Any
+        What `numba.njit` returned.
     """
     cache = getattr(compiled, "_cache", None)
     if _IS_KNOWN and all(hasattr(cache, name) for name in _OF_CACHES):

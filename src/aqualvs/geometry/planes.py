@@ -34,7 +34,10 @@ class Plane:
     def from_normal(cls, normal: ArrayLike, offset: float) -> "Plane":
         """Make a plane from a normal of any length; `offset` belongs to the normal as given.
 
-        Raises `ValueError` if the normal is zero or not finite.
+        Raises
+        ------
+        ValueError
+            If the normal is zero or not finite.
         """
         vector = as_vectors(normal, 3, "normal")
         length = float(np.linalg.norm(vector))
@@ -74,7 +77,10 @@ def upright_axes(normal: FloatArray) -> FloatArray:
 
     They are horizontal to the right, along the normal, and up the plane.
 
-    `normal`, shape (3,): unit normal that points away from the vehicle; not vertical.
+    Parameters
+    ----------
+    normal : array, shape (3,)
+        Unit normal that points away from the vehicle; not vertical.
     """
     right = np.cross(normal, (0.0, 0.0, 1.0))
     right /= max(float(np.linalg.norm(right)), 1e-9)

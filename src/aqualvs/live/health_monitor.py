@@ -132,7 +132,11 @@ class FrozenPicture:
     def update(self, time_s: float, luma: ImagePlane) -> float:
         """Return for how long the picture has stood still at most, in seconds; 0 for a live one.
 
-        `time_s`: by the stream's clock. `luma`, shape (height, width).
+        Parameters
+        ----------
+        time_s : float
+            By the stream's clock.
+        luma : uint8 array, shape (height, width)
         """
         cells, reduced = _cell_means(luma), _reduced(luma)
         height, width = luma.shape
@@ -300,7 +304,15 @@ _VERDICT_EVERY_S, _TIMEOUT_S = 5.0, 3.0
 class DriftWatch:
     """Detector of lasers that moved: tests every few seconds, in a thread of its own.
 
-    `rig`: with one laser, or without a dome, there is nothing to watch.
+    Parameters
+    ----------
+    rig : Rig
+        With one laser, or without a dome, there is nothing to watch.
+
+    Attributes
+    ----------
+    off : dict
+        Number of the laser to what is wrong with it; empty where nothing is.
     """
 
     def __init__(self, rig: Rig) -> None:

@@ -88,8 +88,17 @@ def load_vehicle(path: Path) -> VehicleSetup:
 def vehicle_setup(file: Path | None, peers: Sequence[str] | None, key: Path | None) -> VehicleSetup:
     """Return who the vehicle is and how it is steered.
 
-    `peers`: `--mavlink-peer`; instead of those of the file. `key`: `--mavlink-key`; instead of the
-    file's. Raises `OptionError` if a file cannot be used, or a peer is no address.
+    Parameters
+    ----------
+    peers : sequence of str or None
+        `--mavlink-peer`; instead of those of the file.
+    key : Path or None
+        `--mavlink-key`; instead of the file's.
+
+    Raises
+    ------
+    OptionError
+        If a file cannot be used, or a peer is no address.
     """
     setup = VehicleSetup() if file is None else load_vehicle(file)
     link = setup.link

@@ -29,7 +29,15 @@ class Watchdog:
     Neither a frame that takes seconds to measure nor a controller that hangs must leave thrust
     standing; the vehicle's own fail-safe comes later, and does not act while others send it sticks.
 
-    `timeout_s`: time that an effort may stay in force.
+    Parameters
+    ----------
+    timeout_s : float
+        Time that an effort may stay in force.
+
+    Attributes
+    ----------
+    n_barks : int
+        How often it had to act.
     """
 
     def __init__(self, vehicle: VehicleLink, timeout_s: float) -> None:
@@ -154,8 +162,14 @@ class Pilot:
     sticks, disarming and a silent vehicle end that until `engage` is called again. Then neutral
     goes out a few times, and nothing more: further sticks of ours would be in the pilot's way.
 
-    `steering`: mission, controller and safety gate. `vehicle`: closed with this output. `holder`:
-    where the page puts the setpoint; a mission that holds follows it.
+    Parameters
+    ----------
+    steering : NetPilot
+        Mission, controller and safety gate.
+    vehicle : VehicleLink
+        Closed with this output.
+    holder : SetpointHolder or None
+        Where the page puts the setpoint; a mission that holds follows it.
     """
 
     name = "pilot"

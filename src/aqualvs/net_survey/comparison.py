@@ -325,7 +325,12 @@ class Comparison:
 def compare(surveys: Sequence[Survey], cell: float) -> Comparison:
     """Compare dives along the same net.
 
-    `surveys`: of two dates or more. `cell`: side of the cells in metres.
+    Parameters
+    ----------
+    surveys : sequence
+        Of two dates or more.
+    cell : float
+        Side of the cells in metres.
     """
     ordered = sorted(surveys, key=lambda one: (one.date, one.name))
     dates = sorted({one.date for one in ordered})

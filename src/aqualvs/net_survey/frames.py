@@ -209,9 +209,14 @@ class Raster:
 def spread_over(outline: FloatArray, side: float, share: float = 1.0) -> FloatArray:
     """Return places (K, n, 2) that fill outlines (K, 4, 2) evenly.
 
-    `outline`, shape (K, 4, 2): corners in turn, beginning with an edge along the way. `side`:
-    places are no farther apart than this, unless the outline is very large. `share`: of the width
-    across the way, about the middle.
+    Parameters
+    ----------
+    outline : array, shape (K, 4, 2)
+        Corners in turn, beginning with an edge along the way.
+    side : float
+        Places are no farther apart than this, unless the outline is very large.
+    share : float
+        Of the width across the way, about the middle.
     """
     if not len(outline):
         return np.empty((0, 1, 2))

@@ -101,8 +101,12 @@ class WallHistory:
     def variance_of(self, value: float, of_stretches: FloatArray, place: float) -> Growth:
         """Return a sum with its standard deviation.
 
-        `of_stretches`, shape (K,): factors of the stretches times their sigmas. `place`: variance
-        for the places.
+        Parameters
+        ----------
+        of_stretches : array, shape (K,)
+            Factors of the stretches times their sigmas.
+        place : float
+            Variance for the places.
         """
         own = (1.0 - COMMON) * float(of_stretches @ of_stretches)
         of_dives = np.bincount(self.dive, of_stretches)
@@ -115,7 +119,12 @@ def history(
 ) -> WallHistory:
     """Lay dives, already shifted, over cells.
 
-    `shifts`: what each shift leaves open is in its sigma. `cell`: side of a cell in metres.
+    Parameters
+    ----------
+    shifts : sequence
+        What each shift leaves open is in its sigma.
+    cell : float
+        Side of a cell in metres.
     """
     dates = sorted({one.survey.date for one in placed})
     corners = np.concatenate([one.outline.reshape(-1, 2) for one in placed])

@@ -105,7 +105,16 @@ class _Seen:
 class NetCondition:
     """Accumulator of the condition of a net over a dive.
 
-    `rig`: rig of the scans.
+    Parameters
+    ----------
+    rig : Rig
+        Rig of the scans.
+
+    Attributes
+    ----------
+    stretches : list of NetStretch
+        Completed stretches. Where the net's lattice is found only later, the places of earlier
+        stretches and the holes in them are filled in then.
     """
 
     def __init__(self, rig: Rig, options: NetConditionOptions | None = None) -> None:
@@ -137,9 +146,12 @@ class NetCondition:
     def add(self, scan: Scan, velocity: FloatArray | None = None) -> NetStretch | None:
         """Add a scan; return the stretch that it completes, if any.
 
-        `scan`: in the order of time. Frames without a posture, or without a net, are skipped.
-        `velocity`, shape (2,): of the vehicle along the net, right and up in m/s, if another sensor
-        measures it.
+        Parameters
+        ----------
+        scan : Scan
+            In the order of time. Frames without a posture, or without a net, are skipped.
+        velocity : array, shape (2,), optional
+            Of the vehicle along the net, right and up in m/s, if another sensor measures it.
         """
         finished = None
         if self._signals and scan.time_s - self._signals[0].time_s >= self._length_s():

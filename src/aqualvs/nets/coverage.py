@@ -134,8 +134,12 @@ class Twine:
 def measure_twine(kinds: Sequence[DashKind], known: float | None = None) -> Twine | None:
     """Fit twine and sheet to the dashes of several kinds; None without any.
 
-    `kinds`: the more different their angles and slants, the better. `known`: known diameter of the
-    bare twine in metres: then the halo is measured.
+    Parameters
+    ----------
+    kinds : sequence of DashKind
+        The more different their angles and slants, the better.
+    known : float, optional
+        Known diameter of the bare twine in metres: then the halo is measured.
     """
     if not kinds:
         return None

@@ -316,7 +316,12 @@ class NetView:
 def find_dashes(signal: NetSignal, usable: BoolArray | None = None) -> NetView:
     """Cut the lasers' lines into dashes and gaps.
 
-    `signal`: of one frame. `usable`, shape (L, J): search lines to use; the others count as hidden.
+    Parameters
+    ----------
+    signal : NetSignal
+        Of one frame.
+    usable : bool array, shape (L, J), optional
+        Search lines to use; the others count as hidden.
     """
     state = signal.state if usable is None else np.where(usable, signal.state, LineState.HIDDEN)
     n_lasers, n_lines = state.shape

@@ -140,8 +140,12 @@ def looks_say(
 ) -> FloatArray:
     """Return the log-likelihood of a hole over sound net for every crossing (N,).
 
-    `laser`, `family`, `missed`, `run`: as in `Strands`. `here`, shape (N,): number of the piece of
-    the laser's line.
+    Parameters
+    ----------
+    laser, family, missed, run
+        As in `Strands`.
+    here : array, shape (N,)
+        Number of the piece of the laser's line.
     """
     share = np.maximum(_missed_share(laser, family, missed, run), _missed_here(laser, here, missed))
     dark = np.where(share < _EVIDENCE.too_many, -np.log(_EVIDENCE.dark + share), 0.0)
@@ -225,8 +229,14 @@ class Disc:
 def find_discs(place: FloatArray, weight: FloatArray, bar: float) -> list[Disc]:
     """Find discs in which strands are missing, the most certain first.
 
-    `place`, shape (N, 2): places of the looks, in metres. `weight`, shape (N,): log-likelihood of a
-    hole there over sound net. `bar`: length of the net's bars, in metres.
+    Parameters
+    ----------
+    place : array, shape (N, 2)
+        Places of the looks, in metres.
+    weight : array, shape (N,)
+        Log-likelihood of a hole there over sound net.
+    bar : float
+        Length of the net's bars, in metres.
     """
     weight = weight.copy()
     found: list[Disc] = []
@@ -334,8 +344,14 @@ class Strands:
 def predicted_strands(lattice: NetLattice, view: NetView, place: FloatArray) -> Strands:
     """Return the predicted crossings of a frame's lines with strands, each seen or missed.
 
-    `lattice`: of the net. `view`: dashes and gaps of the frame. `place`, shape (2,): place of the
-    lattice in `net` (`Shift.place`), in metres.
+    Parameters
+    ----------
+    lattice : NetLattice
+        Of the net.
+    view : NetView
+        Dashes and gaps of the frame.
+    place : array, shape (2,)
+        Place of the lattice in `net` (`Shift.place`), in metres.
     """
     gaps = view.gaps
     # Least share of light behind the net seen through a hole, relative to elsewhere.

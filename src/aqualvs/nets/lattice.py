@@ -91,8 +91,12 @@ def find_lattice(
 ) -> NetLattice | None:
     """Find the lattice of the net in some frames, or None where none is visible.
 
-    `frames`: the net may have moved between them in its plane, but not turned. `before`: lattice of
-    neighbouring frames; tried first.
+    Parameters
+    ----------
+    frames : sequence of Crossings
+        The net may have moved between them in its plane, but not turned.
+    before : NetLattice, optional
+        Lattice of neighbouring frames; tried first.
     """
     chosen = _choose(frames)
     if not chosen:
@@ -266,8 +270,12 @@ class LatticeFitter:
     ) -> LatticeShift | None:
         """Find the place of the lattice in a frame; None if its crossings do not determine it.
 
-        `expected`, shape (2,): expected place of the lattice; it selects one of many equivalent
-        shifts. `precision`, shape (2, 2): inverse of the covariance of the expected place.
+        Parameters
+        ----------
+        expected : array, shape (2,), optional
+            Expected place of the lattice; it selects one of many equivalent shifts.
+        precision : array, shape (2, 2), optional
+            Inverse of the covariance of the expected place.
         """
         if len(crossings.place) < _TRACK.min_crossings:
             return None
@@ -296,8 +304,12 @@ class LatticeFitter:
         A single frame may be off, and from frame to frame the net may move by nearly half a mesh:
         several frames together separate the two.
 
-        `crossings`: of the frames; the velocity changes little meanwhile. `times_s`, shape (n,):
-        their times.
+        Parameters
+        ----------
+        crossings : sequence of Crossings
+            Of the frames; the velocity changes little meanwhile.
+        times_s : array, shape (n,)
+            Their times.
         """
         usable = [i for i, one in enumerate(crossings) if len(one.place) >= _TRACK.min_crossings]
         if len(usable) < _TRACK.min_frames:
@@ -455,9 +467,14 @@ class NetTrack:
     ) -> LatticeShift | None:
         """Add the next frame; return None where it does not determine the place of the net.
 
-        `fitter`: with the stretch's lattice. `velocity`, shape (2,): of the vehicle along the net,
-        right and up, if another sensor measures it. `start`: place and velocity common to this
-        frame and the next, where the track begins.
+        Parameters
+        ----------
+        fitter : LatticeFitter
+            With the stretch's lattice.
+        velocity : array, shape (2,), optional
+            Of the vehicle along the net, right and up, if another sensor measures it.
+        start : TrackStart, optional
+            Place and velocity common to this frame and the next, where the track begins.
         """
         state, covariance = self._ahead(time_s, velocity)
         if self._origin is None or covariance[:2, :2].trace() > _TRACK.lost**2:

@@ -72,8 +72,12 @@ class NetSignal:
 def net_from_dome(normal_in_dome: FloatArray, distance: float) -> SE3:
     """Return the transform into `net`: x right and y up in the plane, z towards the vehicle.
 
-    `normal_in_dome`, shape (3,): unit normal of the target plane, away from the vehicle.
-    `distance`: of the dome's centre from the plane, in metres.
+    Parameters
+    ----------
+    normal_in_dome : array, shape (3,)
+        Unit normal of the target plane, away from the vehicle.
+    distance : float
+        Of the dome's centre from the plane, in metres.
     """
     n = np.asarray(normal_in_dome, np.float64)
     up = np.array([0.0, 0.0, 1.0]) - n[2] * n

@@ -40,8 +40,17 @@ _STYLE: dict[Any, Any] = {
 def draw_map(wall: UnrolledNet, paths: Sequence[Path]) -> None:
     """Draw the map of a net.
 
-    `wall`: net to draw; without a stretch the picture says so. `paths`: files to write; the suffix
-    (`.png`, `.svg`, `.pdf`) selects the format. Raises `OSError` if a file cannot be written.
+    Parameters
+    ----------
+    wall : UnrolledNet
+        Net to draw; without a stretch the picture says so.
+    paths : sequence of Path
+        Files to write; the suffix (`.png`, `.svg`, `.pdf`) selects the format.
+
+    Raises
+    ------
+    OSError
+        If a file cannot be written.
     """
     import matplotlib as mpl
 

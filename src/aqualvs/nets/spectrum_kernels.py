@@ -146,8 +146,14 @@ def off_crests(
 ) -> tuple[BoolArray, IntArray, FloatArray, FloatArray, IntArray, IntArray]:
     """Remove the crossings and the pieces of spans on the crests of a wave.
 
-    `place`, `start`, `begin`, `end`, `span_start`: as `Spectrum`. `phase`, shape (F,): of the
-    crests in each frame. `qx`, `qy`: the wave.
+    Parameters
+    ----------
+    place, start, begin, end, span_start
+        As `Spectrum`.
+    phase : array, shape (F,)
+        Of the crests in each frame.
+    qx, qy : float
+        The wave.
 
     Returns
     -------
@@ -322,8 +328,12 @@ def shell_gain(
 ) -> float:
     """Return the gain from the waves of a honeycomb that are longer than those of its bars' lines.
 
-    `place`, `start`, `begin`, `end`, `expected`, `span_start`: as for `comb_power`. `basis`, shape
-    (2, 2): two waves of the first shell.
+    Parameters
+    ----------
+    place, start, begin, end, expected, span_start
+        As for `comb_power`.
+    basis : array, shape (2, 2)
+        Two waves of the first shell.
     """
     per_frame = place.shape[0] / (start.shape[0] - 1)
     gain, power = 0.0, np.empty(2)
@@ -427,8 +437,14 @@ def miscount(
 ) -> float:
     """Return the penalty for the numbers of crossings that the lasers have seen.
 
-    `lines`, `laser`, `seen`, `lit`, `n_frames`: as attributes of `Spectrum`. `families`, shape (F,
-    2): waves of the strands. `density`: share of each family's lines that exists.
+    Parameters
+    ----------
+    lines, laser, seen, lit, n_frames
+        As attributes of `Spectrum`.
+    families : array, shape (F, 2)
+        Waves of the strands.
+    density : float
+        Share of each family's lines that exists.
     """
     expected = np.zeros(len(seen))
     for i in range(len(lines)):

@@ -160,8 +160,12 @@ def _path(nodes: FloatArray, stretches: Sequence[NetStretch]) -> list[FloatArray
 def bands(nodes: FloatArray, half: FloatArray) -> list[FloatArray]:
     """Return the outlines of the areas that a picture passes over from node to node.
 
-    `nodes`, shape (n + 1, 2): places of the picture's middle, in turn. `half`, shape (n, 2): half
-    its width and height on the way from each to the next.
+    Parameters
+    ----------
+    nodes : array, shape (n + 1, 2)
+        Places of the picture's middle, in turn.
+    half : array, shape (n, 2)
+        Half its width and height on the way from each to the next.
 
     Returns
     -------
@@ -259,9 +263,19 @@ def write_table(path: Path, columns: Sequence[str], rows: Sequence[Mapping[str, 
 def write_geojson(path: Path, wall: UnrolledNet, facts: Mapping[str, Any]) -> None:
     """Write stretches (Polygon) and holes (Point) in the plane of the unrolled net.
 
-    `path`: a FeatureCollection as in RFC 7946, but for its coordinates: they are local. `wall`:
-    what to write; properties are the columns of the tables. `facts`: what else belongs to it, for
-    the foreign member `aqualvs_net`. Raises `OSError` as the system says it.
+    Parameters
+    ----------
+    path : Path
+        A FeatureCollection as in RFC 7946, but for its coordinates: they are local.
+    wall : UnrolledNet
+        What to write; properties are the columns of the tables.
+    facts : mapping
+        What else belongs to it, for the foreign member `aqualvs_net`.
+
+    Raises
+    ------
+    OSError
+        As the system says it.
     """
     content = {
         "type": "FeatureCollection",
@@ -369,8 +383,14 @@ def _corners(places: FloatArray) -> list[list[float]]:
 def net_dict(wall: UnrolledNet, area: float, n_frames: int, n_net_frames: int) -> dict[str, Any]:
     """Return the numbers that sum a dive up; None where not measured.
 
-    `wall`: what was found. `area`: looked at for holes, in square metres. `n_frames`,
-    `n_net_frames`: frames of the dive, and those with a posture to a net.
+    Parameters
+    ----------
+    wall : UnrolledNet
+        What was found.
+    area : float
+        Looked at for holes, in square metres.
+    n_frames, n_net_frames : int
+        Frames of the dive, and those with a posture to a net.
     """
     stretches = wall.stretches
     solidity = _mean(stretches, lambda one: one.solidity)

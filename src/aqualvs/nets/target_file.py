@@ -272,8 +272,14 @@ def net_check(target: str, rig: Rig) -> NetCheck | None:
 def bar_of(scan: Scan, planes: Sequence[Plane], said: NetFacts) -> float | None:
     """Return the likely bar from the distances between strands in one frame, in metres.
 
-    `scan`: its points labelled net are used. `planes`: of the lasers, in `dome`. `said`: its shape
-    of mesh is taken as given.
+    Parameters
+    ----------
+    scan : Scan
+        Its points labelled net are used.
+    planes : sequence of Plane
+        Of the lasers, in `dome`.
+    said : NetFacts
+        Its shape of mesh is taken as given.
     """
     min_lasers = 2
     posture = scan.posture

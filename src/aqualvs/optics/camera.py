@@ -298,7 +298,10 @@ class _CompiledCamera:
     def rays(self, pixels: ArrayLike) -> Rays:
         """Trace pixels into the outer medium.
 
-        `pixels`, shape (..., 2): in `image`, in pixels.
+        Parameters
+        ----------
+        pixels : array, shape (..., 2)
+            In `image`, in pixels.
 
         Returns
         -------
@@ -322,7 +325,10 @@ class _CompiledCamera:
     def project(self, points_in_dome: ArrayLike) -> tuple[FloatArray, BoolArray]:
         """Project points of the outer medium.
 
-        `points_in_dome`, shape (..., 3): in metres.
+        Parameters
+        ----------
+        points_in_dome : array, shape (..., 3)
+            In metres.
 
         Returns
         -------

@@ -197,8 +197,10 @@ class Lens:
     def pixels(self, directions_in_cam: ArrayLike) -> tuple[FloatArray, BoolArray]:
         """Return the pixels that directions are seen at.
 
-        `directions_in_cam`, shape (..., 3): directions away from the camera, of any length: points
-        in `cam` will do.
+        Parameters
+        ----------
+        directions_in_cam : array, shape (..., 3)
+            Directions away from the camera, of any length: points in `cam` will do.
 
         Returns
         -------

@@ -89,8 +89,21 @@ class _Lattice(NamedTuple):
 class PostureErrors:
     """Propagation of the uncertainty of one rig to range, pitch and yaw.
 
-    `rig`: with lasers. `camera`: of the rig, behind its dome or bare. `uncertainty`: numbers that
-    it does not name are exact.
+    Parameters
+    ----------
+    rig : Rig
+        With lasers.
+    camera : Camera
+        Of the rig, behind its dome or bare.
+    uncertainty : RigUncertainty
+        Numbers that it does not name are exact.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Numbers of the rig that have an uncertainty, P of them.
+    covariance : array, shape (P, P)
+        Theirs.
     """
 
     def __init__(self, rig: Rig, camera: Camera, uncertainty: RigUncertainty) -> None:

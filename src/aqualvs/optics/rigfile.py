@@ -230,9 +230,19 @@ def rig_from_mapping(
 ) -> Rig:
     """Make a rig from the content of a rig file.
 
-    `mapping`: as `rig_to_mapping` gives it, or as YAML reads it. `source_name`: name of the file in
-    messages. `need_lasers`: as in `load_rig`. Raises `RigError`: one line that names the file, the
-    place in it, the value and the remedy.
+    Parameters
+    ----------
+    mapping : mapping
+        As `rig_to_mapping` gives it, or as YAML reads it.
+    source_name : str
+        Name of the file in messages.
+    need_lasers : bool
+        As in `load_rig`.
+
+    Raises
+    ------
+    RigError
+        One line that names the file, the place in it, the value and the remedy.
     """
     file = parse_rig(mapping, source_name)
     try:

@@ -123,9 +123,19 @@ def rig_exact(rig: Rig) -> str:
 def rig_from_record(text: str, exact: str, source_name: str) -> Rig:
     """Return the rig of a recording, to the last bit.
 
-    `text`, `exact`: from `rig_yaml` and `rig_exact`. `source_name`: how messages call the
-    recording. Raises `RigError` if the text holds no rig. Raises `ValueError` if the numbers do not
-    belong to it.
+    Parameters
+    ----------
+    text, exact : str
+        From `rig_yaml` and `rig_exact`.
+    source_name : str
+        How messages call the recording.
+
+    Raises
+    ------
+    RigError
+        If the text holds no rig.
+    ValueError
+        If the numbers do not belong to it.
     """
     content = parse_yaml(text, source_name, RigError)
     rig = rig_from_mapping(content, source_name=source_name, need_lasers=False)

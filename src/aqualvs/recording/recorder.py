@@ -142,9 +142,18 @@ _TIMEOUT_S = 4.0
 class Recorder:
     """Writer of samples by a thread of its own, to a file that is readable at any time.
 
-    `path`: must not exist. `open_file`: as in `GrowingFile`; for tests. Raises `OutputError` if the
-    file exists or cannot be begun. `health` reports later faults: what does not fit on the disk
-    waits, as far as memory is granted, and is tried again.
+    Parameters
+    ----------
+    path : Path
+        Must not exist.
+    open_file : callable, optional
+        As in `GrowingFile`; for tests.
+
+    Raises
+    ------
+    OutputError
+        If the file exists or cannot be begun. `health` reports later faults: what does not fit
+        on the disk waits, as far as memory is granted, and is tried again.
     """
 
     name = "recorder"
@@ -320,13 +329,20 @@ class RecorderSwitch:
     def start(self, path: Path | None = None) -> Path:
         """Begin to record, if that is not yet so.
 
-        `path`: file to write, which must not exist; None names it by the time (UTC). Raises
-        `OutputError` if it cannot be begun.
+        Parameters
+        ----------
+        path : Path or None
+            File to write, which must not exist; None names it by the time (UTC).
 
         Returns
         -------
         path : Path
             File that is being written.
+
+        Raises
+        ------
+        OutputError
+            If it cannot be begun.
         """
         with self._lock:
             if self._recorder is None:

@@ -202,8 +202,12 @@ class RerunLog(Closing):
 def plane_sigma(posture: Posture, places: FloatArray) -> FloatArray:
     """Return the standard deviation of the target's place along its normal, in metres.
 
-    `posture`: its total covariance counts. `places`, shape (N, 2): on the target, in metres from
-    the foot of the perpendicular: to the right and up.
+    Parameters
+    ----------
+    posture : Posture
+        Its total covariance counts.
+    places : array, shape (N, 2)
+        On the target, in metres from the foot of the perpendicular: to the right and up.
     """
     normal, axes = posture.normal_in_dome, upright_axes(posture.normal_in_dome)
     steep = np.array([math.tan(posture.yaw), 1.0, math.tan(posture.pitch)])

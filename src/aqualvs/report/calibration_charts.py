@@ -195,8 +195,12 @@ class _Scale:
 def residual_view(found: ResidualMap, names: Sequence[str], *, n_vectors: int = N_VECTORS) -> Raw:
     """Return a map's charts: vectors, coverage, histogram, each with its words.
 
-    `names`: names of the views that `found.view_index` counts. `n_vectors`: draw at most so many
-    points; outliers go first, the others are a random choice.
+    Parameters
+    ----------
+    names : sequence of str
+        Names of the views that `found.view_index` counts.
+    n_vectors : int
+        Draw at most so many points; outliers go first, the others are a random choice.
     """
     points = _finite(found)
     side = "".join(

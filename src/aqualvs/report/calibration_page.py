@@ -251,12 +251,20 @@ def _expectation_text(rows: Sequence[ExpectedError]) -> str:
 def write_page(page: CalibrationPage, path: Path) -> Path:
     """Write the report of a calibration.
 
-    `path`: the file to write. Raises `OutputError` if the page cannot be written.
+    Parameters
+    ----------
+    path : Path
+        The file to write.
 
     Returns
     -------
     path : Path
         The page. It carries all it needs and asks no network.
+
+    Raises
+    ------
+    OutputError
+        If the page cannot be written.
     """
     # Names of files that are no Unicode reach Python as surrogates, which UTF-8 refuses.
     data = page_html(page).encode("utf-8", errors="replace")

@@ -46,7 +46,10 @@ def rounded(values: ArrayLike, digits: int) -> list[Any]:
 def thin(values: FloatArray, limit: int) -> IntArray:
     """Return at most `limit` rows of a series, the least and greatest of every bucket.
 
-    `values`, shape (N,): NaN rows are never chosen.
+    Parameters
+    ----------
+    values : array, shape (N,)
+        NaN rows are never chosen.
 
     Returns
     -------
@@ -95,8 +98,12 @@ def stretches(track: Track) -> list[Stretch]:
 def merged(found: list[Stretch], track: Track, columns: int) -> list[Stretch]:
     """Return stretches joined across gaps too narrow to see, so that about `columns` remain.
 
-    `found`: in order. `columns`: a gap is too narrow below this fraction of the dive: a column of
-    the screen.
+    Parameters
+    ----------
+    found : list of Stretch
+        In order.
+    columns : int
+        A gap is too narrow below this fraction of the dive: a column of the screen.
     """
     least = float(track.time_s[-1] - track.time_s[0]) / columns
     joined: list[Stretch] = []

@@ -114,8 +114,14 @@ def make_picture(image: ImagePlane, points: FramePoints | None) -> SampleFrame:
 def make_crop(image: ImagePlane, middle: tuple[float, float], diameter: float) -> SampleFrame:
     """Cut the surroundings of a place out of a picture, with a ring around the place.
 
-    `image`, shape (height, width, 3): BGR. `middle`: column and row. `diameter`: of the ring, in
-    pixels.
+    Parameters
+    ----------
+    image : uint8 array, shape (height, width, 3)
+        BGR.
+    middle : (float, float)
+        Column and row.
+    diameter : float
+        Of the ring, in pixels.
     """
     # Pictures of holes: least side and size on the page in pixels, and hole diameters across.
     px = 160

@@ -61,8 +61,14 @@ def contents_of(body: str) -> "Raw":
 def page(template: str, texts: Mapping[str, str], parts: Mapping[str, str]) -> str:
     """Fill a template.
 
-    `template`: name of a file in `assets`. `texts`: plain texts by name, which are escaped.
-    `parts`: HTML by name.
+    Parameters
+    ----------
+    template : str
+        Name of a file in `assets`.
+    texts : mapping
+        Plain texts by name, which are escaped.
+    parts : mapping
+        HTML by name.
     """
     html = {name: Raw(part) for name, part in parts.items()}
     return _templates().get_template(template).render(**texts, **html)

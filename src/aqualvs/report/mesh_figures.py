@@ -96,8 +96,17 @@ FIGURES = ("figure_13", "figure_14", "laser_plane_image")
 def draw_figures(reflections: Reflections, options: MeshFilterOptions, out: Path) -> list[Path]:
     """Write `figure_13.png`, `figure_14.png` and `laser_plane_image.png`.
 
-    `options`: of the paper's filter. `out`: folder that exists. Raises `OSError` if a picture
-    cannot be written.
+    Parameters
+    ----------
+    options : MeshFilterOptions
+        Of the paper's filter.
+    out : Path
+        Folder that exists.
+
+    Raises
+    ------
+    OSError
+        If a picture cannot be written.
     """
     return save_figures(drawn_figures(reflections, options), out, dpi=220)
 

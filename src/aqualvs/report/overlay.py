@@ -30,8 +30,14 @@ def draw_overlay(
 ) -> ImagePlane:
     """Draw the stripe points, the posture with its sigma or the refusal, and the lasers' names.
 
-    `image`, shape (height, width, 3): BGR; left as it is. `points`: target points are drawn full in
-    their laser's colour, all others as faint crosses. `rig`: gives the lasers' names.
+    Parameters
+    ----------
+    image : uint8 array, shape (height, width, 3)
+        BGR; left as it is.
+    points : ScanPoints
+        Target points are drawn full in their laser's colour, all others as faint crosses.
+    rig : Rig
+        Gives the lasers' names.
 
     Returns
     -------
@@ -111,8 +117,19 @@ def draw_legend(image: ImagePlane, names: list[str]) -> None:
 class OverlayWriter(Closing):
     """Write pictures to an MP4 that stays readable if the program dies before `close`.
 
-    `path`: written anew. `size`: width and height of the pictures; an odd one is padded to even, as
-    H.264 needs. `fps`: frames per second. Raises `OutputError` if the file cannot be written.
+    Parameters
+    ----------
+    path : Path
+        Written anew.
+    size : (int, int)
+        Width and height of the pictures; an odd one is padded to even, as H.264 needs.
+    fps : float
+        Frames per second.
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written.
     """
 
     def __init__(self, path: Path, size: tuple[int, int], fps: float) -> None:

@@ -130,13 +130,20 @@ def _first_field(frame: FloatArray, field: "_Words") -> Field | None:
 def read_truth(path: Path, track: Track) -> FloatArray:
     """Read truth onto the frames of a track.
 
-    `path`: as `aqualvs.results.summary.read_truth` takes it. Raises `SourceError` if the file
-    cannot be read or shares no frame with the track.
+    Parameters
+    ----------
+    path : Path
+        As `aqualvs.results.summary.read_truth` takes it.
 
     Returns
     -------
     truth : array, shape (N, 3)
         As `Track.posture`; NaN where the file has no such frame.
+
+    Raises
+    ------
+    SourceError
+        If the file cannot be read or shares no frame with the track.
     """
     rows = truth_by_frame(path)
     values = np.array([*rows.values()], dtype=np.float64).reshape(-1, 3)

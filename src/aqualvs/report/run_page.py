@@ -423,8 +423,12 @@ def _picture_view(
 ) -> str:
     """Return the sample frames.
 
-    `captions`: row to (heading, posture or refusal in words, whether there is a posture).
-    `missing`: why pictures are absent.
+    Parameters
+    ----------
+    captions : mapping
+        Row to (heading, posture or refusal in words, whether there is a posture).
+    missing : str
+        Why pictures are absent.
     """
     shots = "\n".join(
         f"<figure>{_image(pictures.get(row), missing, heading)}"

@@ -36,8 +36,17 @@ class AppendFile:
     What has been appended survives the death of the process, though not a loss of power. A piece
     that does not fit on the disk is taken back.
 
-    `path`: created, or overwritten. `exclusive`: whether to raise `FileExistsError` where there is
-    a file. Raises `OSError`: from the constructor and from `append`, as the system says it.
+    Parameters
+    ----------
+    path : Path
+        Created, or overwritten.
+    exclusive : bool
+        Whether to raise `FileExistsError` where there is a file.
+
+    Raises
+    ------
+    OSError
+        From the constructor and from `append`, as the system says it.
     """
 
     def __init__(self, path: Path, *, exclusive: bool = False) -> None:

@@ -65,9 +65,17 @@ _N_NUMBERS = len(POSTURE_COLUMNS) - POSTURE_COLUMNS.index("range_m")
 class PostureCsv(Closing):
     """Writer of `posture.csv`, row by row as `AppendFile` does it.
 
-    `path`: created, or overwritten. `shutter`: of the camera; of an interlaced one, each row ends
-    with the field, "top" or "bottom". Raises `OSError`: from the constructor and from `write`, as
-    the system says it.
+    Parameters
+    ----------
+    path : Path
+        Created, or overwritten.
+    shutter : Shutter
+        Of the camera; of an interlaced one, each row ends with the field, "top" or "bottom".
+
+    Raises
+    ------
+    OSError
+        From the constructor and from `write`, as the system says it.
     """
 
     def __init__(self, path: Path, shutter: Shutter = AT_ONCE) -> None:

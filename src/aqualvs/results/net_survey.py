@@ -60,8 +60,17 @@ class NetResult:
 class NetPass:
     """Evaluation of a dive's net, scan by scan, and the writer of its files.
 
-    `rig`: that the scans were made with. `request`: what to find out; its log is read at once.
-    Raises `AqualvsError` if the log cannot be read.
+    Parameters
+    ----------
+    rig : Rig
+        That the scans were made with.
+    request : NetRequest
+        What to find out; its log is read at once.
+
+    Raises
+    ------
+    AqualvsError
+        If the log cannot be read.
     """
 
     def __init__(self, rig: Rig, request: NetRequest) -> None:
@@ -88,8 +97,17 @@ class NetPass:
     def write(self, folder: Path, video: Path | None = None) -> NetResult:
         """Finish, write the files of `NET_FILES` and return the result.
 
-        `folder`: that exists. `video`: of the dive; its clock may help to lay the log on it. Raises
-        `OutputError` if a file cannot be written.
+        Parameters
+        ----------
+        folder : Path
+            That exists.
+        video : Path or None
+            Of the dive; its clock may help to lay the log on it.
+
+        Raises
+        ------
+        OutputError
+            If a file cannot be written.
         """
         from aqualvs.nets.places import DivePostures, lay_log, place_net
         from aqualvs.nets.tables import net_dict, net_lines, unroll

@@ -50,8 +50,17 @@ _LABEL_NAMES = pa.array(LABELS, pa.string())
 class PointsStream:
     """Writer of `points.arrows`, a few frames at a time as `AppendFile` does it.
 
-    `path`: created, or overwritten. `exclusive`: as for `AppendFile`. Raises `OSError`: from the
-    constructor and from `write`, as the system says it.
+    Parameters
+    ----------
+    path : Path
+        Created, or overwritten.
+    exclusive : bool
+        As for `AppendFile`.
+
+    Raises
+    ------
+    OSError
+        From the constructor and from `write`, as the system says it.
     """
 
     def __init__(self, path: Path, *, exclusive: bool = False) -> None:
@@ -269,13 +278,20 @@ class PointsExport:
 def export_points(points_stream: Path, points_parquet: Path, points_ply: Path) -> int:
     """Write the points of a journal as `PointsExport` does it.
 
-    `points_stream`: may lack its end; what follows the last whole batch is left out. Raises
-    `OSError` as the system says it, a full disk for example; the journal is left as it is.
+    Parameters
+    ----------
+    points_stream : Path
+        May lack its end; what follows the last whole batch is left out.
 
     Returns
     -------
     n_points : int
         Points in `points_parquet`.
+
+    Raises
+    ------
+    OSError
+        As the system says it, a full disk for example; the journal is left as it is.
     """
     return export_batches(read_points_stream(points_stream), points_parquet, points_ply)
 

@@ -59,8 +59,17 @@ class TruthComparison:
 def compare_with_truth(posture_csv: Path, truth_csv: Path) -> TruthComparison:
     """Compare the valid postures of a run with the truth of the same frames.
 
-    `posture_csv`: as a run writes it. `truth_csv`: as `read_truth` takes it. Raises `SourceError`
-    if a file cannot be read, lacks a column, or no frame is in both.
+    Parameters
+    ----------
+    posture_csv : Path
+        As a run writes it.
+    truth_csv : Path
+        As `read_truth` takes it.
+
+    Raises
+    ------
+    SourceError
+        If a file cannot be read, lacks a column, or no frame is in both.
     """
     in_fields, of_fields = (_has_fields(path) for path in (posture_csv, truth_csv))
     if of_fields and not in_fields:

@@ -229,7 +229,13 @@ class Explanation:
 def explain(stripes: SeenStripes, sheets: Sequence[Sheet], laser: int | None) -> Explanation:
     """Fit a plane to every frame, and a step of one laser, or of none, to all of them.
 
-    `sheets`: one for each laser, as the rig has them. `laser`: the one that may have moved.
+    Parameters
+    ----------
+    stripes : SeenStripes
+    sheets : sequence of Sheet
+        One for each laser, as the rig has them.
+    laser : int or None
+        The one that may have moved.
     """
     step = np.zeros(3)
     view = _View.of(stripes, sheets)
@@ -475,8 +481,11 @@ class AgreementVerdict:
 class LaserAgreement:
     """Monitor of the agreement of a rig's lasers over a dive.
 
-    `rig`: the rig of the scans. Its uncertainty counts: a disagreement within the uncertainty of
-    the calibration is no fault.
+    Parameters
+    ----------
+    rig : Rig
+        The rig of the scans. Its uncertainty counts: a disagreement within the uncertainty of the
+        calibration is no fault.
     """
 
     def __init__(self, rig: Rig) -> None:

@@ -104,8 +104,14 @@ NOT_TESTED = AssignmentOutcome(Verdict.CLEAR)
 class AssignmentTest:
     """Tests surfaces of one rig against rival assignments.
 
-    `laser_bands`: one for each laser. `triangulator`: of the same rig. `searched`: nearest and
-    farthest plane that is considered, in metres.
+    Parameters
+    ----------
+    laser_bands : sequence of LaserBand
+        One for each laser.
+    triangulator : Triangulator
+        Of the same rig.
+    searched : (float, float)
+        Nearest and farthest plane that is considered, in metres.
     """
 
     def __init__(
@@ -127,8 +133,14 @@ class AssignmentTest:
     ) -> bool:
         """Return whether a surface is so small, and seen so unevenly, that it may be chance.
 
-        `candidates`, `subsegments`: as in `test`. `surfaces`: all that were found: light on the
-        others does not speak against this one. `target`: the one to judge.
+        Parameters
+        ----------
+        candidates, subsegments
+            As in `test`.
+        surfaces : sequence of Surface
+            All that were found: light on the others does not speak against this one.
+        target : Surface
+            The one to judge.
         """
         # A fish before a wall that is out of range: the wall is no target, and the fish is none.
         outweighed = not target.is_mesh and any(
@@ -150,8 +162,12 @@ class AssignmentTest:
         a fish shows few lasers and long stripes, and specks that share a plane by chance have
         little light.
 
-        `candidates`, `subsegments`, `surfaces`: as in `is_by_chance`. `target`: the one that was
-        chosen.
+        Parameters
+        ----------
+        candidates, subsegments, surfaces
+            As in `is_by_chance`.
+        target : Surface
+            The one that was chosen.
 
         Returns
         -------
@@ -184,7 +200,10 @@ class AssignmentTest:
         Its light lies loose before the target, in short pieces. Where something is seen behind the
         target, that is no wall behind a net.
 
-        `candidates`, `subsegments`, `surfaces`, `target`: as in `is_by_chance`.
+        Parameters
+        ----------
+        candidates, subsegments, surfaces, target
+            As in `is_by_chance`.
         """
         if target.is_mesh or any(one.plane.offset > target.plane.offset for one in surfaces):
             return False
@@ -254,7 +273,14 @@ class AssignmentTest:
         test without being a plane, while the third laser, which should be seen there, lights the
         net elsewhere. Other light behind a net is normal; light nearer than the net is not.
 
-        `subsegments`: C of them. `surfaces`: all that were found. `target`: the one to judge.
+        Parameters
+        ----------
+        subsegments : Subsegments
+            C of them.
+        surfaces : sequence of Surface
+            All that were found.
+        target : Surface
+            The one to judge.
         """
         if not target.is_mesh:
             return None
@@ -271,7 +297,14 @@ class AssignmentTest:
     ) -> AssignmentOutcome:
         """Test a surface.
 
-        `candidates`: N of them. `subsegments`: C of them. `surface`: the one to test.
+        Parameters
+        ----------
+        candidates : Candidates
+            N of them.
+        subsegments : Subsegments
+            C of them.
+        surface : Surface
+            The one to test.
         """
         n_lasers = len(self._along_x)
         if n_lasers < 2:
@@ -325,7 +358,12 @@ def _is_nearer(one: Surface, target: Surface, subsegments: Subsegments) -> bool:
 def inflate_for_rival(found: Measurement, outcome: AssignmentOutcome) -> Measurement:
     """Return a measurement with its covariance widened by a near rival.
 
-    `found`: of the surface that was tested. `outcome`: of the test.
+    Parameters
+    ----------
+    found : Measurement
+        Of the surface that was tested.
+    outcome : AssignmentOutcome
+        Of the test.
     """
     posture, other = found.posture, outcome.other
     if outcome.verdict is not Verdict.NEAR or other is None or isinstance(posture, Refusal):

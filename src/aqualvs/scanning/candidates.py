@@ -435,9 +435,14 @@ class Candidates:
         A strand is lit where it crosses the laser sheet, brightest in the sheet's middle; the
         centroid of that light lies on the sheet, regardless of the strand's direction.
 
-        `index`, shape (N,): group of each candidate, 0 to n - 1, or -1 to leave it out; no group is
-        empty. `n`: number of groups. `normal`, shape (3,): approximate normal of the surface;
-        spread is measured along it.
+        Parameters
+        ----------
+        index : int array, shape (N,)
+            Group of each candidate, 0 to n - 1, or -1 to leave it out; no group is empty.
+        n : int
+            Number of groups.
+        normal : array, shape (3,)
+            Approximate normal of the surface; spread is measured along it.
         """
         seen = Observations(
             points=np.zeros((n, 3)),
@@ -501,8 +506,14 @@ def find_candidates(
 ) -> Candidates:
     """Link each laser's peaks to segments and triangulate them.
 
-    `peaks`: as `FrameDetector.detect` gives them. `laser_bands`: one for each laser.
-    `triangulator`: of the same rig.
+    Parameters
+    ----------
+    peaks : mapping of SearchAxis to StripePeaks
+        As `FrameDetector.detect` gives them.
+    laser_bands : sequence of LaserBand
+        One for each laser.
+    triangulator : Triangulator
+        Of the same rig.
 
     Returns
     -------

@@ -53,8 +53,14 @@ class SearchLines:
     the pixel grid. All means are of two bytes and rounded up, for which processors have an
     instruction.
 
-    `size_px`: image width and height. `axis`: direction of the search lines. `line_px`: pixels
-    across a search line, 1 or 2.
+    Parameters
+    ----------
+    size_px : (int, int)
+        Image width and height.
+    axis : SearchAxis
+        Direction of the search lines.
+    line_px : int
+        Pixels across a search line, 1 or 2.
     """
 
     def __init__(self, size_px: tuple[int, int], axis: SearchAxis, line_px: int) -> None:
@@ -68,7 +74,10 @@ class SearchLines:
     def of(self, luma: U8Array) -> U8Array:
         """Return the search lines of a picture.
 
-        `luma`, shape (height, width): Contiguous.
+        Parameters
+        ----------
+        luma : uint8 array, shape (height, width)
+            Contiguous.
 
         Returns
         -------
@@ -243,13 +252,20 @@ class FrameDetector:
     def detect(self, frame: Frame) -> dict[SearchAxis, StripePeaks]:
         """Find the peaks of every search direction.
 
-        `frame`: of the size the detector was made for. Raises `ValueError` if the frame has another
-        size, or is not of 8 bits.
+        Parameters
+        ----------
+        frame : Frame
+            Of the size the detector was made for.
 
         Returns
         -------
         dict of SearchAxis to Returns
             Copies: they stay valid after the next call.
+
+        Raises
+        ------
+        ValueError
+            If the frame has another size, or is not of 8 bits.
         """
         if frame.luma.dtype != np.uint8:
             raise ValueError(f"frame holds {frame.luma.dtype} but expected uint8")

@@ -135,7 +135,11 @@ def channel_image(frame: Frame, colour: LaserColour) -> ImagePlane:
     This is luma for green, of which luma mostly consists. A blue line raises luma by a ninth of
     what it raises blue, a red one by a third, so blue and red are made of luma and chroma.
 
-    `frame`: luma itself is returned where the frame has no chroma.
+    Parameters
+    ----------
+    frame : Frame
+        Luma itself is returned where the frame has no chroma.
+    colour : LaserColour
 
     Returns
     -------
@@ -193,8 +197,12 @@ def learn_paint(table: FloatArray, n_possible: float) -> Paint | None:
 
     An example is twine in the sun.
 
-    `table`, shape (10, N): measures of a sample of peaks, rows as `stripe` names them.
-    `n_possible`: peaks that the lasers can make in the sample.
+    Parameters
+    ----------
+    table : array, shape (10, N)
+        Measures of a sample of peaks, rows as `stripe` names them.
+    n_possible : float
+        Peaks that the lasers can make in the sample.
 
     Returns
     -------
@@ -213,8 +221,13 @@ def learn_paint(table: FloatArray, n_possible: float) -> Paint | None:
 def learn_colour(table: FloatArray, colour: LaserColour, paint: Paint | None) -> LineColour | None:
     """Learn the chroma step of the laser lines from a frame's peaks.
 
-    `table`, shape (10, N): measures of peaks, rows as `stripe` names them. `paint`: colour of most
-    of the peaks: then lines are the peaks that differ from it.
+    Parameters
+    ----------
+    table : array, shape (10, N)
+        Measures of peaks, rows as `stripe` names them.
+    colour : LaserColour
+    paint : Paint or None
+        Colour of most of the peaks: then lines are the peaks that differ from it.
 
     Returns
     -------
@@ -275,7 +288,10 @@ def laser_likelihood(
 def useful_height(height: FloatArray, likelihood: FloatArray) -> int:
     """Return the height up to which hardly any peak is clearly laser light, in grey levels.
 
-    `height`, `likelihood`, shape (N,): of a sample of peaks.
+    Parameters
+    ----------
+    height, likelihood : array, shape (N,)
+        Of a sample of peaks.
     """
     return int(_useful_height(height, likelihood))
 

@@ -35,8 +35,14 @@ def is_continuation(
 ) -> bool:
     """Return whether one surface continues, side by side, as another one.
 
-    `plane`: of the first. `first`, `second`, shape (C,): subsegments on them. `subsegments`: C of
-    them.
+    Parameters
+    ----------
+    plane : Plane
+        Of the first.
+    first, second : bool array, shape (C,)
+        Subsegments on them.
+    subsegments : Subsegments
+        C of them.
     """
     packed = np.append(plane.normal, plane.offset)
     turns, at_random, met = _turns(subsegments, first, second, packed)
@@ -48,7 +54,12 @@ def is_continuation(
 def seen_through(first: BoolArray, second: BoolArray, subsegments: Subsegments) -> bool:
     """Return whether one surface is seen through the gaps of another.
 
-    `first`, `second`, shape (C,): subsegments on them. `subsegments`: C of them.
+    Parameters
+    ----------
+    first, second : bool array, shape (C,)
+        Subsegments on them.
+    subsegments : Subsegments
+        C of them.
     """
     turns, at_random, _ = _turns(subsegments, first, second, np.zeros(4))
     return bool(turns >= _ENOUGH_TURNS and turns >= _MIN_TURNS * at_random)
@@ -88,8 +99,14 @@ def merged_plane(
 ) -> Plane:
     """Return the plane of a net in several pieces: that of the main one, else the mean.
 
-    `planes`: of the pieces. `members`, each of shape (C,): subsegments on them. `subsegments`: C of
-    them.
+    Parameters
+    ----------
+    planes : sequence of Plane
+        Of the pieces.
+    members : sequence of bool array, shape (C,)
+        Subsegments on them.
+    subsegments : Subsegments
+        C of them.
     """
     sampling_weight = np.array([subsegments.table[WEIGHT] @ mine for mine in members])
     main = int(np.argmax(sampling_weight))
@@ -110,8 +127,12 @@ def fit_mean(points: FloatArray, start: Plane) -> PlaneFit | None:
 
     The scatter about the plane is due to the folds, and gives the covariance.
 
-    `points`, shape (N, 3): of the strands, in `dome`, metres. `start`: a first guess: tells
-    outliers.
+    Parameters
+    ----------
+    points : array, shape (N, 3)
+        Of the strands, in `dome`, metres.
+    start : Plane
+        A first guess: tells outliers.
 
     Returns
     -------
@@ -170,7 +191,12 @@ def _distances(points: FloatArray, m: FloatArray, off: FloatArray) -> None:
 def inflate_covariance(posture: Posture, other: Posture, share: float) -> Posture:
     """Return a posture with its covariance inflated by its difference from another one.
 
-    `posture`, `other`: both estimates. `share`: share of the light that supports the other one.
+    Parameters
+    ----------
+    posture, other : Posture
+        Both estimates.
+    share : float
+        Share of the light that supports the other one.
     """
     apart = _apart(posture, other)
     return replace(posture, covariance=posture.covariance + share * np.outer(apart, apart))

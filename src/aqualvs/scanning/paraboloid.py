@@ -410,8 +410,14 @@ _HINT = 2.0
 def shows_curvature(seen: Observations, weights: FloatArray, plane: Plane) -> bool:
     """Return whether the residuals of a plane fit look bent: a cheap test before a patch fit.
 
-    `seen`: those that the plane was fitted to, M of them. `weights`, shape (M,): their weights in
-    that fit. `plane`: the fit.
+    Parameters
+    ----------
+    seen : Observations
+        Those that the plane was fitted to, M of them.
+    weights : array, shape (M,)
+        Their weights in that fit.
+    plane : Plane
+        The fit.
     """
     flat = packed_plane(plane)
     hint = curvature_hint(seen.points, seen.sensitivity, seen.sigma_px, weights, flat)
@@ -451,7 +457,12 @@ def refit_at_nearest(fit: PatchFit, seen: Observations, shared: SharedError) -> 
 
     p and r are then the curvatures of the net at that point. The covariance is widened.
 
-    `fit`: from `fit_patch`. `seen`, `shared`: as there.
+    Parameters
+    ----------
+    fit : PatchFit
+        From `fit_patch`.
+    seen, shared
+        As there.
 
     Returns
     -------

@@ -210,8 +210,12 @@ def nearest_in_view(m: FloatArray, points: FloatArray) -> bool:
 
     Farther out a paraboloid does not describe the net.
 
-    `m`, shape (3,): from `nearest_tangent`. `points`, shape (N, 3): visible points of the net, in
-    `dome`.
+    Parameters
+    ----------
+    m : array, shape (3,)
+        From `nearest_tangent`.
+    points : array, shape (N, 3)
+        Visible points of the net, in `dome`.
     """
     foot = m / float(m @ m)
     low, high = points.min(axis=0), points.max(axis=0)
@@ -244,7 +248,13 @@ def tangent_covariance(fit: PatchFit, m: FloatArray) -> FloatArray:
 def fitted_patch(patch: Patch, m: FloatArray, points: FloatArray) -> FittedSurface:
     """Return a patch as fitted to points (N, 3); the posture is that of its tangent.
 
-    `m`, shape (3,): from `nearest_tangent`. `points`, shape (N, 3): in `dome`, metres.
+    Parameters
+    ----------
+    patch : Patch
+    m : array, shape (3,)
+        From `nearest_tangent`.
+    points : array, shape (N, 3)
+        In `dome`, metres.
     """
     packed, terms = patch.packed(), np.empty((len(points), len(FLAT)))
     by_plane, by_terms = np.empty((3, 3)), np.empty((3, len(FLAT)))

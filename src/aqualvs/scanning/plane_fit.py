@@ -56,9 +56,13 @@ def twine_share(height: FloatArray) -> FloatArray:
 def shared_error(glow: FloatArray, twine: FloatArray | None = None) -> SharedError:
     """Return the errors that points on a solid surface or on a net share.
 
-    `glow`, shape (N,): difference between the flanks of the stripe, over its height. `twine`, shape
-    (N,): shift of the light on twine in pixels, with the sign that brings the point nearer. All
-    stripes share it, and as much again those of one laser. None on something solid.
+    Parameters
+    ----------
+    glow : array, shape (N,)
+        Difference between the flanks of the stripe, over its height.
+    twine : array, shape (N,), optional
+        Shift of the light on twine in pixels, with the sign that brings the point nearer. All
+        stripes share it, and as much again those of one laser. None on something solid.
     """
     if twine is None:
         return SharedError(np.full(len(glow), SHARED_ERROR_PX), GLOW_PX * glow[None])
@@ -85,9 +89,14 @@ class PlaneFit:
 def fit_pseudo_inverse(points: FloatArray, n_groups: int, covariance: FloatArray) -> PlaneFit:
     """Fit m·X = 1 by the left pseudo-inverse (paper, Eq. 24): equal weights, outliers included.
 
-    `points`, shape (N, 3): in `dome`, metres; N >= 3 and not collinear. `n_groups`: number of
-    weights to return, all 1. `covariance`, shape (3, 3): covariance to return: the pseudo-inverse
-    itself gives none.
+    Parameters
+    ----------
+    points : array, shape (N, 3)
+        In `dome`, metres; N >= 3 and not collinear.
+    n_groups : int
+        Number of weights to return, all 1.
+    covariance : array, shape (3, 3)
+        Covariance to return: the pseudo-inverse itself gives none.
     """
     m = np.asarray(np.linalg.lstsq(points, np.ones(len(points)))[0], dtype=np.float64)
     residual = (points @ m - 1.0) / np.linalg.norm(m)
@@ -339,8 +348,12 @@ def _expected_square(matrix: FloatArray, residual: FloatArray) -> float:
     Errors that are normal with variance t have a marginal likelihood (Rasmussen and Williams 2006,
     Eq. 2.30); it is weighed with the prior of t.
 
-    `matrix`, shape (K, K): information of the frame on the K errors; lower half. `residual`, shape
-    (K,): the same times their estimate.
+    Parameters
+    ----------
+    matrix : array, shape (K, K)
+        Information of the frame on the K errors; lower half.
+    residual : array, shape (K,)
+        The same times their estimate.
     """
     # By this factor pictures differ in that: standard deviation of its logarithm. Rendered walls
     # have 0.01 to 0.06 px, most where compression is strong.

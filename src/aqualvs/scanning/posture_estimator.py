@@ -243,8 +243,14 @@ class Measurement:
 class PostureEstimator:
     """Estimator of postures to surfaces with one rig.
 
-    `rig`: lasers, working range and camera axis. `laser_bands`: one for each laser. `fit`: method
-    of the plane fit.
+    Parameters
+    ----------
+    rig : Rig
+        Lasers, working range and camera axis.
+    laser_bands : sequence of LaserBand
+        One for each laser.
+    fit : FitMethod
+        Method of the plane fit.
     """
 
     def __init__(self, rig: Rig, laser_bands: Sequence[LaserBand], fit: FitMethod) -> None:
@@ -264,8 +270,14 @@ class PostureEstimator:
     ) -> Measurement:
         """Measure the posture to a surface.
 
-        `candidates`: N of them. `subsegments`: those of the candidates. `target`: surface that the
-        posture is measured to.
+        Parameters
+        ----------
+        candidates : Candidates
+            N of them.
+        subsegments : Subsegments
+            Those of the candidates.
+        target : Surface
+            Surface that the posture is measured to.
         """
         # On a net a component is one strand, whose light has one centre; on a wall a subsegment is
         # long enough for independent errors.

@@ -29,8 +29,12 @@ def has_much_beside(off: FloatArray, much: float = MUCH) -> bool:
 
     Where stripes cross, wrong candidates lie there as well.
 
-    `off`, shape (N,): distances of the candidates from the plane, as shares of the range. `much`:
-    light beside the plane over light on it.
+    Parameters
+    ----------
+    off : array, shape (N,)
+        Distances of the candidates from the plane, as shares of the range.
+    much : float
+        Light beside the plane over light on it.
     """
     on_it, near = np.count_nonzero(off < _ON_IT), np.count_nonzero(off < _BESIDE)
     return bool(near - on_it > much * on_it)

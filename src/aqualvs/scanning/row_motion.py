@@ -56,7 +56,10 @@ _BY_BLUR = (Reason.NO_STRIPES, Reason.TOO_FEW_POINTS, Reason.ONE_LASER, Reason.N
 class RowMotion:
     """Motion during the pictures of one rig, from row to row and during the exposure.
 
-    `rig`: with a shutter that `needs_neighbours`.
+    Parameters
+    ----------
+    rig : Rig
+        With a shutter that `needs_neighbours`.
     """
 
     def __init__(self, rig: Rig) -> None:
@@ -66,8 +69,14 @@ class RowMotion:
     def stilled(self, candidates: Candidates, on_target: BoolArray, plane: Plane) -> Candidates:
         """Return candidates without the motion that one frame shows.
 
-        `candidates`: N of them. `on_target`, shape (N,): candidates on the target. `plane`: of the
-        target, roughly.
+        Parameters
+        ----------
+        candidates : Candidates
+            N of them.
+        on_target : bool array, shape (N,)
+            Candidates on the target.
+        plane : Plane
+            Of the target, roughly.
         """
         seen = np.flatnonzero(on_target)
         seen = seen[:: -(-len(seen) // _ENOUGH)]
@@ -121,9 +130,13 @@ class RowMotion:
         Points move as the target does if it turns about the dome's centre: how it slides along
         itself, or rolls, no posture tells. Their pixels stay as seen.
 
-        `scan`: as the scanner measured it; without a posture, its reason is `BLURRED` where the
-        frames beside it say so. `beside`: scans just before and after, as measured; in a live run,
-        those before alone.
+        Parameters
+        ----------
+        scan : Scan
+            As the scanner measured it; without a posture, its reason is `BLURRED` where the frames
+            beside it say so.
+        beside : sequence of Scan
+            Scans just before and after, as measured; in a live run, those before alone.
         """
         posture = scan.posture
         if isinstance(posture, Refusal):
@@ -209,8 +222,12 @@ def _fit_rates(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the plane m·X = 1 at time 0 and the rate of m, from points (N, 3) at their times.
 
-    `points`, `sigma`, `times`, shapes (N, 3), (N,), (N,): in `dome` (m); standard deviations of
-    m·X; seconds. `m`, shape (3,): a first m.
+    Parameters
+    ----------
+    points, sigma, times : array, shape (N, 3), (N,), (N,)
+        In `dome` (m); standard deviations of m·X; seconds.
+    m : array, shape (3,)
+        A first m.
     """
     prior, both = np.zeros((6, 6)), np.concatenate([m, np.zeros(3)])
     scaled = _by_m(m) / _RATES[:, None]
@@ -313,7 +330,12 @@ def motion_beside(scan: Scan, beside: Sequence[Scan]) -> tuple[FloatArray, Float
 
     It is the rates of range, pitch and yaw, then their accelerations.
 
-    `scan`: as the scanner measured it, with a posture. `beside`: as in `RowMotion.correct`.
+    Parameters
+    ----------
+    scan : Scan
+        As the scanner measured it, with a posture.
+    beside : sequence of Scan
+        As in `RowMotion.correct`.
     """
     posture = scan.posture
     if not isinstance(posture, Posture) or posture.by_motion is None:

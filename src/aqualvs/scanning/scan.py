@@ -51,7 +51,9 @@ class Frame:
 def planes_of_image(image: ImagePlane) -> Planes:
     """Return luma and chroma of an image, grey or BGR, as OpenCV reads it.
 
-    `image`, shape (height, width) or (height, width, 3).
+    Parameters
+    ----------
+    image : uint8 array, shape (height, width) or (height, width, 3)
 
     Returns
     -------

@@ -126,7 +126,10 @@ def component_shapes(
 ) -> ComponentShapes:
     """Describe the components of N candidates.
 
-    `component`, `line`, `points`, `sensitivity`, `width`, `height`: as in `Candidates`.
+    Parameters
+    ----------
+    component, line, points, sensitivity, width, height
+        As in `Candidates`.
 
     Returns
     -------
@@ -318,7 +321,12 @@ class Segments:
 def link_segments(peaks: StripePeaks, search: LaserBand) -> Segments:
     """Group the peaks inside a laser's band; segments of another laser's direction are dropped.
 
-    `peaks`: of the search direction of `search`. `search`: band and slopes of the laser.
+    Parameters
+    ----------
+    peaks : StripePeaks
+        Of the search direction of `search`.
+    search : LaserBand
+        Band and slopes of the laser.
 
     Returns
     -------
@@ -342,7 +350,10 @@ def link_segments(peaks: StripePeaks, search: LaserBand) -> Segments:
 def in_a_row(line: IntArray, position: FloatArray) -> BoolArray:
     """Mark the peaks (N,) of segments of at least `SUBSEGMENT_LINES`, of any direction.
 
-    `line`, `position`: as in `StripePeaks`.
+    Parameters
+    ----------
+    line, position
+        As in `StripePeaks`.
     """
     n = line.shape[0]
     n_lines = line[n - 1] + 1 if n else 0

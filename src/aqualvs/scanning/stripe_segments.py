@@ -130,7 +130,12 @@ class PictureRows(NamedTuple):
 def picture_rows(frame: Frame, search: LaserBand, colour: LaserColour) -> PictureRows:
     """Return a picture as the rows of a search, light smoothed along the stripes.
 
-    `search`: of the whole picture.
+    Parameters
+    ----------
+    frame : Frame
+    search : LaserBand
+        Of the whole picture.
+    colour : LaserColour
     """
     light = _rows(channel_image(frame, colour), search)
     # In wide pictures, a stripe of a pixel or two is smoothed across as well.
@@ -161,7 +166,11 @@ def _rows(image: ImagePlane | Rows, search: LaserBand) -> Rows:
 def find_segments(frame: Frame, search: LaserBand) -> StripeSegments:
     """Find and measure all pieces, of whatever colour, along one search direction.
 
-    `search`: of the whole picture, with the colour of the laser.
+    Parameters
+    ----------
+    frame : Frame
+    search : LaserBand
+        Of the whole picture, with the colour of the laser.
     """
     rows = picture_rows(frame, search, search.colour)
     peaks = _peaks(rows.intensity_weight, search, frame.luma.shape[1])
@@ -312,9 +321,14 @@ def _sum_above_flanks(row: Rows, low: int, high: int) -> float:
 def general_evidence(table: FloatArray, width_px: int, *, has_colour: bool) -> FloatArray:
     """Return the evidence that separates lines from other things in any picture, one row a piece.
 
-    `table`, shape (12, P): measures of pieces. `width_px`: of the picture: stripes are about as
-    thin for it in every camera. `has_colour`: whether the picture has chroma; else every piece
-    counts as of the laser's colour.
+    Parameters
+    ----------
+    table : array, shape (12, P)
+        Measures of pieces.
+    width_px : int
+        Of the picture: stripes are about as thin for it in every camera.
+    has_colour : bool
+        Whether the picture has chroma; else every piece counts as of the laser's colour.
 
     Returns
     -------
@@ -452,8 +466,14 @@ def place_evidence(table: FloatArray, log_odds: FloatArray, width_px: int) -> Fl
     none is known: each piece that is certain makes that less likely, as in a Dirichlet process.
     Where few are certain, or where lines and other things lie alike, this tells little.
 
-    `table`, shape (12, P): measures of all pieces of one picture. `log_odds`, shape (P,): that each
-    is a line, by its shape and colour. `width_px`: of the picture.
+    Parameters
+    ----------
+    table : array, shape (12, P)
+        Measures of all pieces of one picture.
+    log_odds : array, shape (P,)
+        That each is a line, by its shape and colour.
+    width_px : int
+        Of the picture.
 
     Returns
     -------

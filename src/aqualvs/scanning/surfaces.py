@@ -69,7 +69,12 @@ def _cell(coordinate: float) -> int:
 def number_cells(pixels: FloatArray, cell: IntArray) -> tuple[int, int]:
     """Write the number of the cell in which each of N candidates lies.
 
-    `pixels`, shape (N, 2): in `image`. `cell`, shape (N,): written.
+    Parameters
+    ----------
+    pixels : array, shape (N, 2)
+        In `image`.
+    cell : int array, shape (N,)
+        Written.
 
     Returns
     -------
@@ -100,8 +105,12 @@ def mark_cells(middle: int, n_columns: int, lit: U8Array) -> None:
 def lit_cells(cell: IntArray, explained: BoolArray, n_cells: int, n_columns: int) -> U8Array:
     """Mark the cells in and around which explained candidates lie, with nonzero values.
 
-    `cell`, `n_cells`, `n_columns`: from `number_cells`. `explained`, shape (N,): candidates that
-    lie on a surface.
+    Parameters
+    ----------
+    cell, n_cells, n_columns
+        From `number_cells`.
+    explained : bool array, shape (N,)
+        Candidates that lie on a surface.
     """
     lit = np.zeros(n_cells, np.uint8)
     for i in range(cell.shape[0]):
@@ -399,7 +408,12 @@ def find_surfaces(
 def surface_on(plane: Plane, subsegments: Subsegments, n_lasers: int, focal_px: float) -> Surface:
     """Return the surface of all subsegments on a plane, even if other surfaces explain their light.
 
-    `plane`: in `dome`, offset > 0. `subsegments`, `n_lasers`, `focal_px`: as in `find_surfaces`.
+    Parameters
+    ----------
+    plane : Plane
+        In `dome`, offset > 0.
+    subsegments, n_lasers, focal_px
+        As in `find_surfaces`.
     """
     packed, members = np.append(plane.normal, plane.offset), np.zeros(len(subsegments), np.bool_)
     sums = np.empty(3)

@@ -35,8 +35,12 @@ class Triangulation:
 class Triangulator:
     """Triangulation of pixels with a rig's laser sheets (paper, Eq. 17-21, for planes).
 
-    `rig`: lasers, with the indices of air and water for those behind windows. `camera`: of the rig,
-    behind its dome or bare.
+    Parameters
+    ----------
+    rig : Rig
+        Lasers, with the indices of air and water for those behind windows.
+    camera : Camera
+        Of the rig, behind its dome or bare.
     """
 
     def __init__(self, rig: Rig, camera: Camera) -> None:

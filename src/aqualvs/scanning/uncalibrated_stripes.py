@@ -84,8 +84,11 @@ def find_stripes(
 ) -> StripePixels:
     """Find the lines of lasers: thin, long, of the lasers' colour, and similar to each other.
 
-    `image`, shape (height, width) or (height, width, 3): grey, or BGR as OpenCV reads it. In a grey
-    picture every thin bright line counts.
+    Parameters
+    ----------
+    image : uint8 array, shape (height, width) or (height, width, 3), or Frame
+        Grey, or BGR as OpenCV reads it. In a grey picture every thin bright line counts.
+    options : UncalibratedStripeOptions, optional
 
     Returns
     -------
@@ -117,7 +120,11 @@ def find_stripes(
 def find_all_segments(frame: Frame, options: UncalibratedStripeOptions) -> list[StripeSegments]:
     """Find pieces of stripes along both search directions, lines of lasers and others.
 
-    `options`: the wavelength says in which channel lines are brightest.
+    Parameters
+    ----------
+    frame : Frame
+    options : UncalibratedStripeOptions
+        The wavelength says in which channel lines are brightest.
     """
     size_px = frame.luma.shape[1], frame.luma.shape[0]
     colour = LaserColour.of(options.wavelength_nm)
@@ -459,7 +466,11 @@ def extended(segments: StripeSegments, keep: BoolArray) -> list[IntArray]:
 
     A piece ends at a kink or a gap; a few peaks beyond may still belong to the line.
 
-    `keep`, shape (P,): which pieces are lines.
+    Parameters
+    ----------
+    segments : StripeSegments
+    keep : bool array, shape (P,)
+        Which pieces are lines.
     """
     peaks = segments.peaks
     first_of = np.searchsorted(peaks.line, np.arange(len(segments.search.lowest) + 1))

@@ -108,8 +108,14 @@ def visible_points(lit: LitPoints, label: int, contrast: NDArray[np.float32]) ->
     row if it is rather upright. A point is visible if the contrast at its pixel, or at one beside
     it, reaches `CONTRAST_LIMIT`.
 
-    `lit`: of the frame. `label`: `SurfaceKind` of the target. `contrast`, shape (height, width):
-    from `stripe_contrast`.
+    Parameters
+    ----------
+    lit : LitPoints
+        Of the frame.
+    label : int
+        `SurfaceKind` of the target.
+    contrast : array, shape (height, width)
+        From `stripe_contrast`.
 
     Returns
     -------
@@ -263,9 +269,19 @@ def render_benchmark_dive(
 ) -> None:
     """Write `dive.mp4`, `truth.csv` and `rig.yaml` into a new or existing folder.
 
-    `renderer`: for `benchmark_rig()`, with any shutter; of an interlaced one each field is a frame.
-    `folder`: files of the same names in it are replaced. `tick`: called with 1 after every frame.
-    Raises `OSError, OutputError` if the folder or a file cannot be written.
+    Parameters
+    ----------
+    renderer : Renderer
+        For `benchmark_rig()`, with any shutter; of an interlaced one each field is a frame.
+    folder : Path
+        Files of the same names in it are replaced.
+    tick : callable
+        Called with 1 after every frame.
+
+    Raises
+    ------
+    OSError, OutputError
+        If the folder or a file cannot be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
     save_rig(with_exact_numbers(renderer.rig), folder / "rig.yaml")

@@ -77,8 +77,14 @@ def board_on_rail(
 
     Every second one is off square, and rolled, by up to 1.5 degrees; all are slightly shifted.
 
-    `size`: width and height of the board's squares, in metres. `distances`, shape (N,): of the
-    board's middle, in metres. `rng`: random number generator.
+    Parameters
+    ----------
+    size : (float, float)
+        Width and height of the board's squares, in metres.
+    distances : array, shape (N,)
+        Of the board's middle, in metres.
+    rng : Generator
+        Random number generator.
 
     Returns
     -------
@@ -115,8 +121,14 @@ def vehicle_in_box(count: int, rng: np.random.Generator) -> list[SE3]:
 def plate_in_view(rig: Rig, size: Size, far: float) -> SE3:
     """Return `dome_from_plate` of a plate in the quarter of the view farthest from the lasers.
 
-    `rig`: in its water. `size`: width and height of the plate, in metres. `far`: distance of its
-    middle from the dome's outside, in metres.
+    Parameters
+    ----------
+    rig : Rig
+        In its water.
+    size : (float, float)
+        Width and height of the plate, in metres.
+    far : float
+        Distance of its middle from the dome's outside, in metres.
     """
     turn = rotation_from_rotvec(np.deg2rad([3.0, 1.0, 6.0])) @ DOME_FROM_CAM_NOMINAL
     rays = rig.camera().rays(np.array(_QUARTERS) * rig.size_px - 0.5)
@@ -210,8 +222,14 @@ def squares_size(board: CharucoPrint) -> tuple[float, float]:
 def ground(dome_from_ground: SE3, *, cell: float = 6e-3, shift: int = 0) -> Panel:
     """Return a large mottled panel to stand behind everything, placed by its middle.
 
-    `dome_from_ground`: x to the right, y down. `cell`: side of its 800 x 600 cells, in metres.
-    `shift`: offset in the noise.
+    Parameters
+    ----------
+    dome_from_ground : SE3
+        x to the right, y down.
+    cell : float
+        Side of its 800 x 600 cells, in metres.
+    shift : int
+        Offset in the noise.
     """
     texture = Texture(mottled((600, 800), 0.26, 0.45, scale=1.6, shift=shift), cell)
     width, height = texture.size

@@ -55,8 +55,17 @@ def vehicle_attitude(dome_from_scene: SE3) -> tuple[float, float, float]:
 def write_vehicle_log(scenario: Scenario, path: Path) -> None:
     """Write depth and attitude of the vehicle, ten times a second, with the noise of sensors.
 
-    `scenario`: with a net or a wall as its target. `path`: a CSV file with `LOG_COLUMNS`, on its
-    own clock (`LEAD_S`). Raises `OSError`: error of the system.
+    Parameters
+    ----------
+    scenario : Scenario
+        With a net or a wall as its target.
+    path : Path
+        A CSV file with `LOG_COLUMNS`, on its own clock (`LEAD_S`).
+
+    Raises
+    ------
+    OSError
+        Error of the system.
     """
     rng = np.random.default_rng([scenario.seed, 23])
     rate_hz = 10.0
@@ -75,9 +84,18 @@ def write_vehicle_log(scenario: Scenario, path: Path) -> None:
 def write_hole_truth(scenario: Scenario, path: Path) -> None:
     """Write the places of the holes in a scenario's nets.
 
-    `scenario`: with nets. `path`: a CSV file with `HOLE_COLUMNS`: right and up of the vehicle's
-    foot on the net in the first frame, diameter, depth and bearing, and the time at which the
-    vehicle's foot is nearest. Raises `OSError`: error of the system.
+    Parameters
+    ----------
+    scenario : Scenario
+        With nets.
+    path : Path
+        A CSV file with `HOLE_COLUMNS`: right and up of the vehicle's foot on the net in the first
+        frame, diameter, depth and bearing, and the time at which the vehicle's foot is nearest.
+
+    Raises
+    ------
+    OSError
+        Error of the system.
     """
     times = np.array(list(scenario.times()))
     feet = np.array([_foot(scenario, t) for t in times])

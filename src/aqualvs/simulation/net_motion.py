@@ -85,7 +85,12 @@ class NetWall:
         Range, pitch and yaw are those of the tangent plane at the nearest point, which is the
         net itself if it is flat.
 
-        `world_from_dome`: pose of the dome's axes (right, forward, up). `time_s`: time in seconds.
+        Parameters
+        ----------
+        world_from_dome : SE3
+            Pose of the dome's axes (right, forward, up).
+        time_s : float
+            Time in seconds.
         """
         net = self.world_from_net(time_s)
         centre = (world_from_dome.translation - net.translation) @ net.rotation
@@ -98,8 +103,14 @@ class NetWall:
     def clearance(self, world_from_body: SE3, half_size: Sequence[float], time_s: float) -> float:
         """Return the least distance between net and hull, in metres; negative is a collision.
 
-        `world_from_body`: pose of the vehicle. `half_size`: half length, width and height of the
-        hull, a box about the body's origin, in metres. `time_s`: time in seconds.
+        Parameters
+        ----------
+        world_from_body : SE3
+            Pose of the vehicle.
+        half_size : (float, float, float)
+            Half length, width and height of the hull, a box about the body's origin, in metres.
+        time_s : float
+            Time in seconds.
         """
         net = self.world_from_net(time_s)
         # Across the net's upright only.

@@ -236,8 +236,14 @@ class Renderer:
         Truth and marine snow are those of the middle. Each field of an interlaced picture has its
         own blur and noise, as if the other one did not exist.
 
-        `scene_at`: scene at any time from the first row to the last. `t`: in seconds. `rng`:
-        without it the picture has no noise.
+        Parameters
+        ----------
+        scene_at : callable
+            Scene at any time from the first row to the last.
+        t : float
+            In seconds.
+        rng : Generator, optional
+            Without it the picture has no noise.
         """
         scene, shutter = scene_at(t), self.rig.shutter
         if shutter.instant:
@@ -295,8 +301,14 @@ class Renderer:
     ) -> NDArray[np.float32]:
         """Return the radiance at the lens at time `t`, before blur, noise and saturation.
 
-        `scene`: at time `t`. `t`: in seconds. `where`, shape (height, width): pixels to be traced;
-        others may lack all light except that of marine snow.
+        Parameters
+        ----------
+        scene : Scene
+            At time `t`.
+        t : float
+            In seconds.
+        where : bool array, shape (height, width), optional
+            Pixels to be traced; others may lack all light except that of marine snow.
 
         Returns
         -------

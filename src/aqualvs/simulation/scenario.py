@@ -77,7 +77,10 @@ def random_bubbles(
 ) -> tuple[Bubble, ...]:
     """Return bubbles that rise through the view at some time of the dive.
 
-    `rng`, `count`, `duration`, `behind`: as for `random_fish`.
+    Parameters
+    ----------
+    rng, count, duration, behind
+        As for `random_fish`.
     """
     return tuple(_bubble(rng, duration, behind) for _ in range(count))
 

@@ -164,9 +164,19 @@ def charuco_texture(board: CharucoPrint) -> Texture:
 def marker_texture(ground: FloatArray, cell: float, prints: MarkerPrint) -> Texture:
     """Return a ground with markers on it, each in a ring of white paper.
 
-    `ground`, shape (rows, columns): albedo of the ground under the markers; not changed. `cell`:
-    side of a cell, in metres. `prints`: markers to put on it. Raises `OptionError` if a marker's
-    side is no multiple of its cells, or it does not lie on the ground.
+    Parameters
+    ----------
+    ground : array, shape (rows, columns)
+        Albedo of the ground under the markers; not changed.
+    cell : float
+        Side of a cell, in metres.
+    prints : MarkerPrint
+        Markers to put on it.
+
+    Raises
+    ------
+    OptionError
+        If a marker's side is no multiple of its cells, or it does not lie on the ground.
     """
     book = _dictionary(prints.dictionary)
     n_cells = book.markerSize + 2 * _FRAME

@@ -201,7 +201,11 @@ def _lossy_codec() -> str:
 def jpeg(image: NDArray[np.uint8], quality: int) -> bytes:
     """Return an RGB picture as a JPEG file with chroma at half resolution (4:2:0).
 
-    `image`, shape (height, width, 3). `quality`: 1 to 100; larger is better.
+    Parameters
+    ----------
+    image : uint8 array, shape (height, width, 3)
+    quality : int
+        1 to 100; larger is better.
     """
     how = [cv2.IMWRITE_JPEG_QUALITY, quality]
     how += [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420]

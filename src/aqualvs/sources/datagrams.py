@@ -203,7 +203,12 @@ def transport_content(datagram: bytes) -> bytes | None:
 class DatagramQueue:
     """Queue of datagrams of one kind, until another kind arrives.
 
-    `closed`: set when the feed ends. `reception`: told of what cannot be used.
+    Parameters
+    ----------
+    closed : Event
+        Set when the feed ends.
+    reception : Reception
+        Told of what cannot be used.
     """
 
     def __init__(self, datagrams: Datagrams, closed: threading.Event, reception: Reception) -> None:

@@ -116,7 +116,12 @@ def frames_in(span: Span, shutter: Shutter) -> tuple[int, int]:
 class FieldSource(Closing):
     """Source of the fields of another source's pictures; satisfies `FrameSource`.
 
-    `pictures`: closed with this one. `shutter`: interlaced.
+    Parameters
+    ----------
+    pictures : FrameSource
+        Closed with this one.
+    shutter : Shutter
+        Interlaced.
 
     Attributes
     ----------

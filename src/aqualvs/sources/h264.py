@@ -51,8 +51,12 @@ _CODECS = {
 def unit_reader(codec: str, extradata: bytes) -> UnitReader | None:
     """Return the function that reads a stream's packets; None for a codec without such units.
 
-    `codec`: as FFmpeg names it. `extradata`: of the stream; states whether units begin with their
-    length or with a start code.
+    Parameters
+    ----------
+    codec : str
+        As FFmpeg names it.
+    extradata : bytes
+        Of the stream; states whether units begin with their length or with a start code.
     """
     found = _CODECS.get(codec)
     if found is None:
@@ -142,7 +146,10 @@ class FrameNumbers:
     def is_gap_before(self, data: bytes) -> bool:
         """Return whether a reference picture is missing before this one.
 
-        `data`: all units of a picture, as a byte stream (annex B).
+        Parameters
+        ----------
+        data : bytes
+            All units of a picture, as a byte stream (annex B).
 
         Returns
         -------

@@ -71,7 +71,10 @@ class ImageMessage:
 def planes_of_message(message: ImageMessage) -> Planes | None:
     """Return luma and chroma of a picture, or None if it cannot be decoded.
 
-    `message`: not of a video.
+    Parameters
+    ----------
+    message : ImageMessage
+        Not of a video.
 
     Returns
     -------
@@ -164,7 +167,10 @@ _DATA = {"foxglove.CompressedImage": 2, "foxglove.CompressedVideo": 3}
 def kind_of_schema(name: str) -> str | None:
     """Return the kind of image of a schema, or None.
 
-    `name`: `sensor_msgs/msg/Image`, `foxglove.CompressedVideo` and the like.
+    Parameters
+    ----------
+    name : str
+        `sensor_msgs/msg/Image`, `foxglove.CompressedVideo` and the like.
 
     Returns
     -------
@@ -323,9 +329,19 @@ class ImageTopic:
 def choose_topic(where: str, topics: list[ImageTopic], wanted: str | None) -> ImageTopic:
     """Return the topic wanted, or the only one.
 
-    `where`: for messages. `topics`: with images. Raises `SourceError` if there are no images at
-    all. Raises `OptionError` if several topics have images and none is named, or the one named has
-    none.
+    Parameters
+    ----------
+    where : str
+        For messages.
+    topics : list of ImageTopic
+        With images.
+
+    Raises
+    ------
+    SourceError
+        If there are no images at all.
+    OptionError
+        If several topics have images and none is named, or the one named has none.
     """
     listed = ", ".join(sorted(topic.name for topic in topics))
     if not topics:

@@ -67,9 +67,17 @@ IMAGE_SUFFIXES = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".
 class ImageSource(Closing):
     """Source of images as frames, in natural order of their names (`img2` before `img10`).
 
-    `paths`: a folder, or the images themselves (taken in the order given). `fps`: images have no
-    clock: `Frame.time_s` is the index divided by this. Raises `SourceError` if there is no image,
-    or the first one cannot be read.
+    Parameters
+    ----------
+    paths : Path or sequence of Path
+        A folder, or the images themselves (taken in the order given).
+    fps : float
+        Images have no clock: `Frame.time_s` is the index divided by this.
+
+    Raises
+    ------
+    SourceError
+        If there is no image, or the first one cannot be read.
     """
 
     def __init__(self, paths: Path | Sequence[Path], *, fps: float = 1.0) -> None:
@@ -134,7 +142,10 @@ def natural_key(path: Path | str) -> list[tuple[int, str]]:
 def read_image(path: Path, how: int = cv2.IMREAD_ANYCOLOR) -> ImagePlane | None:
     """Return an image, or None if it cannot be decoded.
 
-    `how`: OpenCV's flag; the default returns grey images as grey.
+    Parameters
+    ----------
+    how : int
+        OpenCV's flag; the default returns grey images as grey.
 
     Returns
     -------

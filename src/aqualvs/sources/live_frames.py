@@ -38,7 +38,10 @@ class Unwrapper:
     def __call__(self, value: int) -> int:
         """Return the value on an endless line, nearest to the one before.
 
-        `value`: as received; may lie a little before the last one.
+        Parameters
+        ----------
+        value : int
+            As received; may lie a little before the last one.
 
         Returns
         -------
@@ -80,8 +83,12 @@ class StreamClock:
     def time_of(self, ticks: int | None, arrival: float) -> float:
         """Return the time of a picture.
 
-        `ticks`: by the stream's clock; None where it has none, then the arrival counts. `arrival`:
-        seconds on this machine's monotonic clock.
+        Parameters
+        ----------
+        ticks : int or None
+            By the stream's clock; None where it has none, then the arrival counts.
+        arrival : float
+            Seconds on this machine's monotonic clock.
 
         Returns
         -------
@@ -114,7 +121,12 @@ _SILENT_S = 0.5
 class Reception:
     """Log of what arrived and when; written by the source, read from another thread.
 
-    `name`: of the part. `content`: what arrives, such as "RTP H.264"; may be set later.
+    Parameters
+    ----------
+    name : str
+        Of the part.
+    content : str
+        What arrives, such as "RTP H.264"; may be set later.
     """
 
     def __init__(self, name: str, content: str = "") -> None:
@@ -153,7 +165,12 @@ class Reception:
     def deliver(self, size_px: tuple[int, int], n_lost: int) -> None:
         """Note a frame that goes out.
 
-        `size_px`: width and height. `n_lost`: frames lost before it.
+        Parameters
+        ----------
+        size_px : (int, int)
+            Width and height.
+        n_lost : int
+            Frames lost before it.
         """
         now = time.monotonic()
         with self._lock:
@@ -279,7 +296,10 @@ class LiveDecoder:
     def decode(self, packet: "Packet[VideoStream]") -> list[VideoFrame]:
         """Return the sound pictures that a packet completes.
 
-        `packet`: a whole picture.
+        Parameters
+        ----------
+        packet : Packet
+            A whole picture.
 
         Returns
         -------
@@ -332,8 +352,14 @@ class LiveFrames:
     def connect(self, codec: VideoCodecContext, tick: float, *, hears_losses: bool) -> None:
         """Begin with a new decoder; pictures in the old one are lost.
 
-        `codec`: not yet opened. `tick`: unit of the packets' time, in seconds. `hears_losses`: as
-        for `LiveDecoder`.
+        Parameters
+        ----------
+        codec : VideoCodecContext
+            Not yet opened.
+        tick : float
+            Unit of the packets' time, in seconds.
+        hears_losses : bool
+            As for `LiveDecoder`.
         """
         self._decoder = LiveDecoder(codec, hears_losses=hears_losses)
         self._frame_counter.restart()
@@ -361,7 +387,10 @@ class LiveFrames:
     def feed(self, packet: "Packet[VideoStream]") -> Iterator[Frame]:
         """Yield the frames that a packet completes.
 
-        `packet`: a whole picture; `pts` in ticks, None where the stream has no clock.
+        Parameters
+        ----------
+        packet : Packet
+            A whole picture; `pts` in ticks, None where the stream has no clock.
 
         Yields
         ------

@@ -146,8 +146,12 @@ def statistics(
 ) -> bytes:
     """Return the counts of a file; of the same length for the same channels.
 
-    `times_ns`: of the first and the last message. `counts`: number of messages of every channel,
-    also of those without.
+    Parameters
+    ----------
+    times_ns : (int, int)
+        Of the first and the last message.
+    counts : mapping
+        Number of messages of every channel, also of those without.
     """
     of_channel = b"".join(struct.pack("<HQ", *item) for item in counts.items())
     numbers = struct.pack(

@@ -29,8 +29,18 @@ if TYPE_CHECKING:
 class PacedFeed:
     """Recording as a feed: its frames by their own clock, or as fast as they are taken.
 
-    `source`: closed at the end. `realtime`: whether each frame waits for its time. A consumer that
-    is late is not made later: frames that are due come at once.
+    Parameters
+    ----------
+    source : FrameSource
+        Closed at the end.
+    realtime : bool
+        Whether each frame waits for its time. A consumer that is late is not made later: frames
+        that are due come at once.
+
+    Attributes
+    ----------
+    name : str
+        Of the source.
     """
 
     def __init__(self, source: FrameSource, *, realtime: bool) -> None:

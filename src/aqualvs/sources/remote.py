@@ -31,7 +31,17 @@ class Connection:
     FFmpeg waits without end where a network is silent, and can't be woken. So the thread is not
     joined: it ends by itself when FFmpeg's time runs out, and closes what it opened.
 
-    `opener`: returns an open container, or raises what PyAV raises; its timeouts must be set.
+    Parameters
+    ----------
+    opener : callable
+        Returns an open container, or raises what PyAV raises; its timeouts must be set.
+
+    Attributes
+    ----------
+    reason : str
+        Why the connection ended, in a few words; empty for a plain end.
+    fault : Exception or None
+        What PyAV raised when opening.
     """
 
     def __init__(self, opener: Opener) -> None:
@@ -103,8 +113,14 @@ _PROBE = {"fpsprobesize": "0", "analyzeduration": "1000000"}
 class RemoteFeed:
     """Feed of a container that FFmpeg opens, and reopens; satisfies `Feed`.
 
-    `name`: how health and messages call it. `opener`: opens the container; must not wait without
-    end. `content`: what arrives, for health.
+    Parameters
+    ----------
+    name : str
+        How health and messages call it.
+    opener : callable
+        Opens the container; must not wait without end.
+    content : str
+        What arrives, for health.
     """
 
     def __init__(self, name: str, opener: Opener, *, content: str = "") -> None:

@@ -328,7 +328,10 @@ class TransportStream:
     def push(self, content: bytes) -> list[AccessUnit]:
         """Return the pictures that some packets complete.
 
-        `content`: whole packets; what does not begin as one is ignored.
+        Parameters
+        ----------
+        content : bytes
+            Whole packets; what does not begin as one is ignored.
 
         Returns
         -------

@@ -86,9 +86,17 @@ class VideoSpans:
 def video_spans(path: Path, n_min: int, margin: int = 0) -> VideoSpans:
     """Read a video's packets, without decoding them, and find where it may be cut.
 
-    `n_min`: frames that a part has at least, but for the last. `margin`: frames that a part holds
-    at least of those beside it. Raises `av.error.FFmpegError, OSError` as FFmpeg says it, if the
-    file cannot be opened.
+    Parameters
+    ----------
+    n_min : int
+        Frames that a part has at least, but for the last.
+    margin : int
+        Frames that a part holds at least of those beside it.
+
+    Raises
+    ------
+    av.error.FFmpegError, OSError
+        As FFmpeg says it, if the file cannot be opened.
     """
     with av.open(str(path), timeout=_TIMEOUT_S) as container:
         stream = container.streams.video[0]
@@ -106,8 +114,14 @@ def video_spans(path: Path, n_min: int, margin: int = 0) -> VideoSpans:
 def image_spans(sizes: Sequence[int], n_min: int, margin: int = 0) -> tuple[Span, ...]:
     """Cut a folder of images into parts.
 
-    `sizes`: of the files, in bytes, in their order. `n_min`: images that a part has, but for the
-    last. `margin`: as in `video_spans`.
+    Parameters
+    ----------
+    sizes : sequence of int
+        Of the files, in bytes, in their order.
+    n_min : int
+        Images that a part has, but for the last.
+    margin : int
+        As in `video_spans`.
     """
     edges = [*range(0, len(sizes), n_min), len(sizes)]
     found = []

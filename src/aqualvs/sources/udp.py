@@ -217,7 +217,12 @@ def decoded(frames: LiveFrames, picture: AccessUnit) -> Iterator[Frame]:
 def decoder_of(codec: str, parameter_sets: bytes = b"") -> VideoCodecContext:
     """Return a decoder, not yet opened.
 
-    `codec`: FFmpeg's name. `parameter_sets`: SPS and PPS as a byte stream, or nothing.
+    Parameters
+    ----------
+    codec : str
+        FFmpeg's name.
+    parameter_sets : bytes
+        SPS and PPS as a byte stream, or nothing.
     """
     found = cast("VideoCodecContext", av.CodecContext.create(codec, "r"))
     if parameter_sets:
@@ -228,7 +233,12 @@ def decoder_of(codec: str, parameter_sets: bytes = b"") -> VideoCodecContext:
 def packet_of(data: bytes, ticks: int) -> "Packet[VideoStream]":
     """Return a packet of a stream with the clock of video in RTP.
 
-    `data`: one picture as a byte stream. `ticks`: 90 kHz.
+    Parameters
+    ----------
+    data : bytes
+        One picture as a byte stream.
+    ticks : int
+        90 kHz.
     """
     packet = packet_with(data)
     packet.pts, packet.time_base = ticks, Fraction(1, TICKS_HZ)

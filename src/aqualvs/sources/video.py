@@ -29,7 +29,10 @@ from aqualvs.sources.spans import promised_duration
 class FrameCounter:
     """Numbers of pictures by the packets that announced them; lost ones leave a gap.
 
-    `counts_packets`: whether each packet shows a picture.
+    Parameters
+    ----------
+    counts_packets : bool
+        Whether each packet shows a picture.
 
     Attributes
     ----------
@@ -73,7 +76,10 @@ class FrameCounter:
     def number(self, pts: int | None) -> int:
         """Return the number of a picture, counting those lost before it.
 
-        `pts`: its time, in ticks of its stream.
+        Parameters
+        ----------
+        pts : int or None
+            Its time, in ticks of its stream.
 
         Returns
         -------

@@ -54,8 +54,12 @@ def rates_of(angle: Signal, start_s: float, end_s: float) -> Rates:
 def without_outliers(angle: ArrayLike, valid: ArrayLike) -> BoolArray:
     """Return which valid samples are not far from their neighbours.
 
-    `angle`, shape (n,): radians, in the order of time. `valid`, shape (n,): samples that count at
-    all.
+    Parameters
+    ----------
+    angle : array, shape (n,)
+        Radians, in the order of time.
+    valid : bool array, shape (n,)
+        Samples that count at all.
     """
     values, kept = np.asarray(angle, float), np.array(valid, bool)
     kept &= np.isfinite(values)

@@ -230,15 +230,23 @@ _OTHERS = {
 def read_vehicle_log(path: str | Path) -> VehicleLog:
     """Read a vehicle's log; the content determines the format, not the name.
 
-    `path`: CSV table, MAVLink telemetry log (`.tlog`) or ArduPilot dataflash log (`.BIN`, or its
-    text form `.log`). Raises `SourceError` if the file cannot be read or holds neither depth nor
-    heading; one line that names the file, the value and the remedy.
+    Parameters
+    ----------
+    path : str or Path
+        CSV table, MAVLink telemetry log (`.tlog`) or ArduPilot dataflash log (`.BIN`, or its text
+        form `.log`).
 
     Returns
     -------
     log : VehicleLog
         Of a file that is cut short or damaged in places, what is readable; `log.notes` says what is
         not.
+
+    Raises
+    ------
+    SourceError
+        If the file cannot be read or holds neither depth nor heading; one line that names the
+        file, the value and the remedy.
     """
     source = Path(path)
     refuse_special(source)

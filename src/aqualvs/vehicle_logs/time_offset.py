@@ -337,7 +337,10 @@ def dive_start_utc(video: str | Path) -> float | None:
 
     Only the container's `creation_time` counts; times of the file change when it is copied.
 
-    `video`: a video file.
+    Parameters
+    ----------
+    video : str or Path
+        A video file.
 
     Returns
     -------
@@ -378,8 +381,14 @@ def offset_from_clocks(
 ) -> TimeOffset | OffsetRefusal:
     """Return the offset that the clocks of dive and log give.
 
-    `log`: with `start_utc_s`. `dive_start_utc_s`: UTC of dive time 0. `sigma_s`: how far to trust
-    it.
+    Parameters
+    ----------
+    log : VehicleLog
+        With `start_utc_s`.
+    dive_start_utc_s : float or None
+        UTC of dive time 0.
+    sigma_s : float
+        How far to trust it.
     """
     if log.start_utc_s is None or log.start_utc_sigma_s is None:
         return OffsetRefusal(f"{log.name} does not know the time of day")

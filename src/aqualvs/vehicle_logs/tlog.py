@@ -51,9 +51,13 @@ def choose_depth(
 ) -> tuple[Candidate | None, str | None]:
     """Return the first candidate that is there and moves, and a note where one does not.
 
-    `candidates`: the best first. `pressure_depth`: depth by the outer pressure alone, up to a
-    constant. An estimate that stands still while the pressure changes is the estimate of a filter
-    without origin, not a depth.
+    Parameters
+    ----------
+    candidates : sequence of Candidate
+        The best first.
+    pressure_depth : Signal or None
+        Depth by the outer pressure alone, up to a constant. An estimate that stands still
+        while the pressure changes is the estimate of a filter without origin, not a depth.
     """
     dived = 0.0 if pressure_depth is None else _span(pressure_depth)
     note = None

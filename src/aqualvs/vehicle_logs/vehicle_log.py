@@ -82,7 +82,10 @@ class Signal:
     def at(self, time_s: ArrayLike) -> tuple[FloatArray, BoolArray]:
         """Return the values at other times.
 
-        `time_s`, shape (m,): log time, in any order.
+        Parameters
+        ----------
+        time_s : array, shape (m,)
+            Log time, in any order.
 
         Returns
         -------
@@ -345,9 +348,12 @@ class VehiclePlaces:
 def ned_from_dome_of(heading: ArrayLike, pitch: ArrayLike, roll: ArrayLike) -> FloatArray:
     """Return rotations from `dome` (right, forward, up) to north, east, down.
 
-    `heading`, `pitch`, `roll`, shape (n,): of the vehicle, radians, as MAVLink's ATTITUDE: heading
-    clockwise from north, pitch positive with the nose up, roll positive with the right side down;
-    applied in the order roll, pitch, heading.
+    Parameters
+    ----------
+    heading, pitch, roll : array, shape (n,)
+        Of the vehicle, radians, as MAVLink's ATTITUDE: heading clockwise from north, pitch positive
+        with the nose up, roll positive with the right side down; applied in the order roll, pitch,
+        heading.
 
     Returns
     -------

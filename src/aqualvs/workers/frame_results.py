@@ -219,7 +219,15 @@ class FrameResult:
 class FrameProcessor:
     """Measurement of frames, with the dome and without.
 
-    `scanner`: for the same rig.
+    Parameters
+    ----------
+    scanner : FrameScanner
+        For the same rig.
+
+    Attributes
+    ----------
+    block_length : int
+        How many frames it is best given at a time.
     """
 
     def __init__(self, rig: Rig, scanner: FrameScanner) -> None:
@@ -310,7 +318,10 @@ def result_blocks(
 ) -> Generator[list[FrameResult], None, None]:
     """Yield the results of frames, and scans of lost ones, in the order of the dive.
 
-    `blocks`: of frames with the scans of the lost ones right before, see `with_losses`.
+    Parameters
+    ----------
+    blocks : iterator of list
+        Of frames with the scans of the lost ones right before, see `with_losses`.
 
     Yields
     ------

@@ -163,8 +163,19 @@ class SharedMemory:
 
     It lies in no folder: none has to have room for it, and nothing is left behind.
 
-    `file`: Descriptor of a file in memory; stays open until `seal`. Raises `OSError` if the memory
-    is not available.
+    Parameters
+    ----------
+    file : int
+        Descriptor of a file in memory; stays open until `seal`.
+
+    Attributes
+    ----------
+    slots : uint8 array, shape (n_slots, n_bytes)
+
+    Raises
+    ------
+    OSError
+        If the memory is not available.
     """
 
     def __init__(self, file: int) -> None:
@@ -391,7 +402,17 @@ class _Worker:
 class WorkerPool(Closing):
     """Pool of processes that measure the parts of a dive; a context manager that ends them.
 
-    `n_processes`: there are no more than parts.
+    Parameters
+    ----------
+    n_processes : int
+        There are no more than parts.
+
+    Attributes
+    ----------
+    next_frame : int
+        The first frame of which nothing has come yet.
+    is_done : bool
+        Whether all has come.
     """
 
     def __init__(self, work: PoolJob, n_processes: int) -> None:

@@ -223,8 +223,14 @@ def _lost(index: int, time_s: float, n_water: float) -> Scan:
 class DiveProcessor(Closing):
     """Measurement of a dive's frames; a context manager, within which processes are at work.
 
-    `source`: open, and not yet read from. `window`: of the frames to measure. `work`: how processes
-    may share the dive; None has this process measure it.
+    Parameters
+    ----------
+    source : FrameSource or Replay
+        Open, and not yet read from.
+    window : FrameWindow
+        Of the frames to measure.
+    work : PoolJob or None
+        How processes may share the dive; None has this process measure it.
     """
 
     def __init__(
@@ -249,9 +255,17 @@ class DiveProcessor(Closing):
 
         Those of a rolling shutter are corrected.
 
-        `scanner`: for what this process measures. `one_by_one`: whether nothing may be measured
-        before what was found in the frame before is yielded. Raises `SourceError`: from the source,
-        at the end of what it has.
+        Parameters
+        ----------
+        scanner : FrameScanner
+            For what this process measures.
+        one_by_one : bool
+            Whether nothing may be measured before what was found in the frame before is yielded.
+
+        Raises
+        ------
+        SourceError
+            From the source, at the end of what it has.
         """
         return corrected_rows(self._measured(scanner, one_by_one=one_by_one), self._rig)
 
@@ -308,9 +322,24 @@ _FIRST_FRAMES, _EVERY_S = 5, 0.4
 class WaterFollowingScanner:
     """Scanner that measures each frame in the water as tracked by the index target.
 
-    `rig`: in the water to begin with. `target`: markers on the vehicle (target.yaml). `water`:
-    temperature and salinity, if given, are a prior. Raises `CalibrationError` if the target's file
-    cannot be used, `OptionError` if the rig has no housing.
+    Parameters
+    ----------
+    rig : Rig
+        In the water to begin with.
+    target : Path
+        Markers on the vehicle (target.yaml).
+    water : Water
+        Temperature and salinity, if given, are a prior.
+
+    Attributes
+    ----------
+    scanner : Scanner
+        For the water as it is known.
+
+    Raises
+    ------
+    CalibrationError
+        If the target's file cannot be used.
     """
 
     def __init__(self, rig: Rig, options: ScannerOptions, target: Path, water: Water) -> None:

@@ -153,9 +153,14 @@ def bend_is_significant(
     From the derivatives at the solution, without solving again: Rao's score, in Wald's test with
     the covariance by views.
 
-    `bundle`: with points on a flat board, or one bent by terms of lower degree. `degree`: of the
-    terms in question, one of `BEND_DEGREES`. `n_solved`: number of the terms up to that degree that
-    the points include already.
+    Parameters
+    ----------
+    bundle : Bundle
+        With points on a flat board, or one bent by terms of lower degree.
+    degree : int
+        Of the terms in question, one of `BEND_DEGREES`.
+    n_solved : int
+        Number of the terms up to that degree that the points include already.
     """
     bend = BoardBend.flat([target.view for target in bundle.views], degree)
     n, n_terms = len(bundle.views), len(bend.exponents) - n_solved
@@ -179,8 +184,14 @@ def bend_is_significant(
 def fit_bend(flat: Bundle, start: BundleState, degree: int) -> BentFit | None:
     """Solve a bundle together with a bend that its boards share.
 
-    `flat`: of views whose poses are free, with the points of the flat board. `start`: initial
-    guess. `degree`: of the polynomial, one of `BEND_DEGREES`.
+    Parameters
+    ----------
+    flat : Bundle
+        Of views whose poses are free, with the points of the flat board.
+    start : BundleState
+        Initial guess.
+    degree : int
+        Of the polynomial, one of `BEND_DEGREES`.
 
     Returns
     -------
@@ -391,8 +402,12 @@ def _bundle(lens: Lens, size_px: tuple[int, int], views: Sequence[View]) -> Bund
 def direction_sigma_px(lens: Lens, covariance: FloatArray, pixels: FloatArray) -> FloatArray:
     """Return the uncertainty (N,) of the pixels of fixed directions, in pixels.
 
-    `covariance`, shape (P, P): of its parameters. `pixels`, shape (N, 2): places; the result is NaN
-    where the lens model does not hold.
+    Parameters
+    ----------
+    covariance : array, shape (P, P)
+        Of its parameters.
+    pixels : array, shape (N, 2)
+        Places; the result is NaN where the lens model does not hold.
     """
     directions, _ = lens.directions(pixels)
     _, _, _, by_number = lens.pixels_with_parameter_jacobian(directions)

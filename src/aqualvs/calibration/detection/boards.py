@@ -40,9 +40,14 @@ def read_markers(
 ) -> Markers:
     """Read markers in a picture, by contour, to about half a pixel.
 
-    `image`, shape (height, width): grey picture. `n_first`: read only the first `n_first` markers
-    of the dictionary, which is faster. `window_px`: odd width of the only local threshold; None
-    tries several.
+    Parameters
+    ----------
+    image : uint8 array, shape (height, width)
+        Grey picture.
+    n_first : int or None
+        Read only the first `n_first` markers of the dictionary, which is faster.
+    window_px : int or None
+        Odd width of the only local threshold; None tries several.
     """
     parameters = cv2.aruco.DetectorParameters()
     # Widest window of the local threshold, as a share of the picture's width.
@@ -95,8 +100,12 @@ def nothing_known(board: Board) -> CornerGrid:
 def predict(pixels: FloatArray, known: BoolArray) -> PredictedCorners:
     """Fit an affine map to the known neighbours of every grid point, without the point itself.
 
-    `pixels`, shape (rows, columns, 2): corners in `image`. `known`, shape (rows, columns): true for
-    known corners; others are ignored, even if NaN.
+    Parameters
+    ----------
+    pixels : array, shape (rows, columns, 2)
+        Corners in `image`.
+    known : bool array, shape (rows, columns)
+        True for known corners; others are ignored, even if NaN.
     """
     rows, columns = known.shape
     # Greatest distance, in squares, of the neighbours that predict a corner.
@@ -140,8 +149,12 @@ def _spread_both_ways(normal: FloatArray) -> BoolArray:
 def misfits(pixels: FloatArray, known: BoolArray, *, share: float) -> BoolArray:
     """Return the mask of known points that contradict their neighbours.
 
-    `pixels`, `known`: as in `predict`. `share`: allowed distance from the prediction, in sides of a
-    square.
+    Parameters
+    ----------
+    pixels, known
+        As in `predict`.
+    share : float
+        Allowed distance from the prediction, in sides of a square.
     """
     from_neighbours = predict(pixels, known)
     side = np.sqrt(np.min(np.sum(np.square(from_neighbours.axes), axis=-2), axis=-1))

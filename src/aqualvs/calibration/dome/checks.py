@@ -259,14 +259,20 @@ def check_shared_errors(
 ) -> list[str]:
     """Compare the distances as a whole with the pictures.
 
-    `covariance`, shape (P, P): of the solved numbers, with the uncertainty of considered ones
-    propagated. Raises `CalibrationError` if the shared error of the distances is too large for a
-    good rig.
+    Parameters
+    ----------
+    covariance : array, shape (P, P)
+        Of the solved numbers, with the uncertainty of considered ones propagated.
 
     Returns
     -------
     list of str
         Warnings, in plain words.
+
+    Raises
+    ------
+    CalibrationError
+        If the shared error of the distances is too large for a good rig.
     """
     blocks = distance_blocks(problem, solution)
     if len(blocks) < 2:

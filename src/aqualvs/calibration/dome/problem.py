@@ -283,9 +283,17 @@ def dome_problem(
 ) -> DomeProblem:
     """Return the problem with starting poses.
 
-    `rig`: initial guess; its lens lies inside the dome, or behind the flat port. `known`: of the
-    rig beforehand: intrinsics from the camera's calibration. Raises `CalibrationError` if no view
-    has a starting pose.
+    Parameters
+    ----------
+    rig : Rig
+        Initial guess; its lens lies inside the dome, or behind the flat port.
+    known : RigUncertainty
+        Of the rig beforehand: intrinsics from the camera's calibration.
+
+    Raises
+    ------
+    CalibrationError
+        If no view has a starting pose.
     """
     shots, poses, left_out = _started(rig, sets)
     boards = [i for i, shot in enumerate(shots) if shot.kind is PoseKind.DISTANCE]
@@ -392,7 +400,12 @@ def with_board_tilt_as_found(
 ) -> tuple[DomeProblem, Solution[BundleState]]:
     """Solve with a finer scale of the boards' tilt as long as they agree that closely.
 
-    `problem`, `solution`: solved with `sigma`. `sigma`: scale of the tilt, in radians.
+    Parameters
+    ----------
+    problem, solution
+        Solved with `sigma`.
+    sigma : float
+        Scale of the tilt, in radians.
 
     Returns
     -------

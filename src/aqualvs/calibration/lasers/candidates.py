@@ -47,8 +47,14 @@ class StripeLine:
 def lines_on_patch(pooled: PooledStripes, members: IntArray, patch: int) -> list[StripeLine]:
     """Find the straight stripes among points of one surface.
 
-    `pooled`: points of all patches. `members`, shape (M,): indices of the points on the surface.
-    `patch`: index of the surface.
+    Parameters
+    ----------
+    pooled : PooledStripes
+        Points of all patches.
+    members : int array, shape (M,)
+        Indices of the points on the surface.
+    patch : int
+        Index of the surface.
 
     Returns
     -------
@@ -285,8 +291,14 @@ def find_candidates(
 ) -> list[PlaneCandidate]:
     """Find planes of straight stripes, the best first; no line is used twice.
 
-    `pooled`: points of all views. `lines`: straight stripes of all surfaces. `tolerance_px`:
-    greatest distance of a stripe from its plane.
+    Parameters
+    ----------
+    pooled : PooledStripes
+        Points of all views.
+    lines : sequence of StripeLine
+        Straight stripes of all surfaces.
+    tolerance_px : float
+        Greatest distance of a stripe from its plane.
 
     Returns
     -------

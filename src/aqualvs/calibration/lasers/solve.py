@@ -51,8 +51,14 @@ class _Fit:
 def start_sheets(rig: Rig, lasers: Sequence[Laser], *, bent: bool) -> tuple[Sheet, ...]:
     """Return the initial sheets: planes, or bent ones for lasers with a window.
 
-    `rig`: in the medium of the pictures. `lasers`: `plane` fits the light in that medium. `bent`:
-    whether sheets behind windows are bent.
+    Parameters
+    ----------
+    rig : Rig
+        In the medium of the pictures.
+    lasers : sequence of Laser
+        `plane` fits the light in that medium.
+    bent : bool
+        Whether sheets behind windows are bent.
     """
     sheets = []
     for laser in lasers:
@@ -200,9 +206,14 @@ def solve_lasers(
 ) -> tuple[SolvedLasers, list[str]]:
     """Solve lasers as planes, again with points assigned by those planes, then their sheets.
 
-    `lasers`: `plane` fits the light in the medium of the pictures roughly. `laser_of`, shape (N,):
-    index of the laser of each stripe point of all views; -1 for none. `loose`: as
-    `LaserOptions.loose`.
+    Parameters
+    ----------
+    lasers : sequence of Laser
+        `plane` fits the light in the medium of the pictures roughly.
+    laser_of : int array, shape (N,)
+        Index of the laser of each stripe point of all views; -1 for none.
+    loose : bool or None
+        As `LaserOptions.loose`.
 
     Returns
     -------
@@ -276,7 +287,14 @@ def free_text(
 ) -> str:
     """Return the remedy for a parameter that the pictures do not determine.
 
-    `names`: of the lasers. `views`: the pictures. `parameter`: its column.
+    Parameters
+    ----------
+    names : sequence of str
+        Of the lasers.
+    views : sequence of PlacedView
+        The pictures.
+    parameter : int
+        Its column.
     """
     for i, name in enumerate(names):
         if parameter in problem.laser_columns(i):

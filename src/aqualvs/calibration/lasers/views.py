@@ -44,9 +44,19 @@ class SpatialPose:
 def spatial_pose(camera: Camera, view: View, start: SE3) -> SpatialPose:
     """Minimise the paper's V (Eq. 32-33).
 
-    `camera`: looking into the medium of the picture. `view`: inlier corners; this cost is not
-    robust. `start`: `dome_from_target` near the solution. Raises `CalibrationError` if fewer than
-    three corners have rays (the paper's minimum).
+    Parameters
+    ----------
+    camera : Camera
+        Looking into the medium of the picture.
+    view : View
+        Inlier corners; this cost is not robust.
+    start : SE3
+        `dome_from_target` near the solution.
+
+    Raises
+    ------
+    CalibrationError
+        If fewer than three corners have rays (the paper's minimum).
     """
     rays = camera.rays(view.pixels)
     n = int(np.count_nonzero(rays.valid))
@@ -114,15 +124,25 @@ def place_views(
 ) -> tuple[list[PlacedView], dict[str, str]]:
     """Find the pose of every picture, and its stripes on the surfaces.
 
-    `camera`: looking into the medium of the pictures. `views`: one for each picture. `surfaces`: of
-    the target. If it has several, markers must be seen on at least two. Raises `CalibrationError`
-    if no picture can be used.
+    Parameters
+    ----------
+    camera : Camera
+        Looking into the medium of the pictures.
+    views : sequence of LaserView
+        One for each picture.
+    surfaces : TargetSurfaces
+        Of the target. If it has several, markers must be seen on at least two.
 
     Returns
     -------
     placed : list of PlacedView
     left_out : dict
         Names of the pictures that could not be used, with the reason.
+
+    Raises
+    ------
+    CalibrationError
+        If no picture can be used.
     """
     found: list[PlacedView] = []
     left_out: dict[str, str] = {}

@@ -108,8 +108,14 @@ _ROTATION = POSE_PARAMETERS[3:]
 def rig_prior(start: Rig, rig: Rig, free: Sequence[str], priors: RigUncertainty) -> list[Block]:
     """Return the deviation of a rig from its prior, in sigmas.
 
-    `start`, `rig`: mean of the prior, and the present rig. `free`: numbers of the columns 0, 1, ...
-    of the solve. `priors`: uncertainty of `start`; numbers that it does not name have no prior.
+    Parameters
+    ----------
+    start, rig : Rig
+        Mean of the prior, and the present rig.
+    free : sequence of str
+        Numbers of the columns 0, 1, ... of the solve.
+    priors : RigUncertainty
+        Uncertainty of `start`; numbers that it does not name have no prior.
     """
     known = [name for name in free if name in priors.names]
     if not known:
@@ -123,9 +129,14 @@ def media_prior(
 ) -> list[Block]:
     """Return the deviation of media from their priors, in sigmas.
 
-    `start`, `media`, shape (M,): indices of the free media: prior means, and present values.
-    `sigma`, shape (M,): standard deviations of the prior; infinite where there is none. `columns`,
-    shape (M,): of the media in the solve.
+    Parameters
+    ----------
+    start, media : array, shape (M,)
+        Indices of the free media: prior means, and present values.
+    sigma : array, shape (M,)
+        Standard deviations of the prior; infinite where there is none.
+    columns : int array, shape (M,)
+        Of the media in the solve.
     """
     bounded = np.isfinite(sigma)
     if not bounded.any():
@@ -157,8 +168,13 @@ def _prior(columns: IntArray, moved: FloatArray, whiten: FloatArray) -> Block:
 def moved_target(pose: SE3, middle: FloatArray, step: FloatArray) -> SE3:
     """Return `dome_from_target` turned about a point of the target, then shifted.
 
-    `middle`, shape (3,): centre of the turn, in the target's frame. `step`, shape (6,): rotation
-    vector (radians) and shift (metres), both in `dome`.
+    Parameters
+    ----------
+    pose : SE3
+    middle : array, shape (3,)
+        Centre of the turn, in the target's frame.
+    step : array, shape (6,)
+        Rotation vector (radians) and shift (metres), both in `dome`.
     """
     return _moved(pose, middle, rotation_from_rotvec(step[:3]), step[3:])
 
@@ -181,8 +197,12 @@ def _moved(pose: SE3, middle: FloatArray, turn: FloatArray, shift: FloatArray) -
 def point_by_pose(points_in_dome: FloatArray, centre: FloatArray) -> FloatArray:
     """Return the derivative (N, 3, 6) of points by the step of `moved_target` at zero.
 
-    `points_in_dome`, shape (N, 3): points of the target. `centre`, shape (3,): centre of the turn,
-    in `dome`.
+    Parameters
+    ----------
+    points_in_dome : array, shape (N, 3)
+        Points of the target.
+    centre : array, shape (3,)
+        Centre of the turn, in `dome`.
     """
     by_pose = np.zeros((len(points_in_dome), 3, 6))
     by_pose[:, :, :3] = -skew(points_in_dome - centre)
@@ -210,8 +230,12 @@ class PosedView:
 def corner_blocks(camera: Camera, shared: Sequence[str], views: Sequence[PosedView]) -> list[Block]:
     """Return one block a view, for views of one medium.
 
-    `camera`: looking into that medium. `shared`: the camera's numbers that are solved for, named as
-    by `parameter_names`.
+    Parameters
+    ----------
+    camera : Camera
+        Looking into that medium.
+    shared : sequence of str
+        The camera's numbers that are solved for, named as by `parameter_names`.
     """
     if not views:
         return []

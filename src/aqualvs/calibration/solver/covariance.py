@@ -44,8 +44,11 @@ _UNITS = {
 def spread_of(normals: FloatArray, distances: FloatArray) -> tuple[float, float]:
     """Return the spread of boards in direction (radians, largest) and distance (share).
 
-    `normals`, shape (V, 3): unit normals of the boards, in any common frame. `distances`, shape
-    (V,).
+    Parameters
+    ----------
+    normals : array, shape (V, 3)
+        Unit normals of the boards, in any common frame.
+    distances : array, shape (V,)
     """
     cosines = np.clip(np.abs(normals @ normals.T), 0.0, 1.0)
     return float(np.arccos(cosines.min())), float(np.ptp(distances) / np.median(distances))
@@ -150,8 +153,13 @@ def observability(
 
     All else is marginalised, with its priors: poses, the lens, the intrinsics.
 
-    `uncertainty`: after the solve, with the uncertainty of considered numbers propagated. `names`:
-    numbers to judge, with priors independent of those of others; those without a prior are skipped.
+    Parameters
+    ----------
+    uncertainty : RigUncertainty
+        After the solve, with the uncertainty of considered numbers propagated.
+    names : sequence of str
+        Numbers to judge, with priors independent of those of others; those without a prior are
+        skipped.
     """
     names = [name for name in names if name in bundle.free and name in bundle.priors.names]
     if not names:
@@ -186,7 +194,12 @@ def consider_covariance(
 ) -> tuple[tuple[str, ...], FloatArray]:
     """Return the joint covariance of solved and considered numbers.
 
-    `bundle`: the problem. `considered`: of numbers that the bundle does not solve for.
+    Parameters
+    ----------
+    bundle : Bundle
+        The problem.
+    considered : RigUncertainty
+        Of numbers that the bundle does not solve for.
 
     Returns
     -------
@@ -247,8 +260,12 @@ class ViewCovariance:
 def shared_covariance(bundle: Bundle, solution: Solution[BundleState]) -> ViewCovariance:
     """Estimate the covariance of the parameters that a bundle's views share, by `view_covariance`.
 
-    `bundle`: without priors, and with free poses that have none either. `solution`: of it; columns
-    beyond those of the bundle are shared, too, and come last.
+    Parameters
+    ----------
+    bundle : Bundle
+        Without priors, and with free poses that have none either.
+    solution : Solution
+        Of it; columns beyond those of the bundle are shared, too, and come last.
     """
     n = len(bundle.views)
     beyond = np.arange(bundle.n_parameters, len(solution.covariance))
@@ -323,9 +340,12 @@ def _root(covariance: FloatArray) -> FloatArray:
 def _spread(own: Sequence[FloatArray], scores: Sequence[FloatArray]) -> tuple[FloatArray, float]:
     """Return the covariance (S, S) of the parameters in units of that by corners, and its mean.
 
-    `own`, each of shape (S, S): information of each view; they add up to the unit matrix. `scores`,
-    each of shape (S,): its score; of covariance own (1 - own) if the errors of corners are
-    independent.
+    Parameters
+    ----------
+    own : sequence of array, shape (S, S)
+        Information of each view; they add up to the unit matrix.
+    scores : sequence of array, shape (S,)
+        Its score; of covariance own (1 - own) if the errors of corners are independent.
     """
     n, size = len(own), len(own[0])
     corrected, expected = np.zeros((n, size)), 0.0

@@ -180,8 +180,17 @@ def match_poses(
 ) -> tuple[tuple[BoardPose, ...], tuple[str, ...]]:
     """Return the pose of each picture, in the pictures' order, and remarks.
 
-    `poses`: rows of the file. `source`: the file, for messages. Raises `CalibrationError` if a
-    picture has no row.
+    Parameters
+    ----------
+    poses : sequence of BoardPose
+        Rows of the file.
+    source : Path
+        The file, for messages.
+
+    Raises
+    ------
+    CalibrationError
+        If a picture has no row.
     """
     by_name = {pose.name: pose for pose in poses}
     for name in names:

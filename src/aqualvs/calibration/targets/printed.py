@@ -210,8 +210,14 @@ def board_rectangles(board: Board) -> FloatArray:
 def marker_rectangles(family: str, number: int, corner: FloatArray, size: float) -> FloatArray:
     """Return x, y, width, height (N, 4) of a marker's black areas.
 
-    `family`: name of the dictionary. `corner`, shape (2,): the marker's top-left corner, in the
-    unit of `size`. `size`: side of the marker.
+    Parameters
+    ----------
+    family : str
+        Name of the dictionary.
+    corner : array, shape (2,)
+        The marker's top-left corner, in the unit of `size`.
+    size : float
+        Side of the marker.
     """
     cells = marker_cells(family, number)[1:-1, 1:-1]
     cell = size / len(cells)

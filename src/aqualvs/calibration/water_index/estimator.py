@@ -168,9 +168,13 @@ class IndexEstimator:
     def add(self, time: float, view: View) -> IndexReading:
         """Add a frame and return the reading after it.
 
-        `time`: in seconds; frames older than the last one are refused. `view`: points of the target
-        in `dome` (metres) and their pixels. Corners that are missing, NaN or wrong do no harm if
-        most are right.
+        Parameters
+        ----------
+        time : float
+            In seconds; frames older than the last one are refused.
+        view : View
+            Points of the target in `dome` (metres) and their pixels. Corners that are missing,
+            NaN or wrong do no harm if most are right.
         """
         known = () if self._state is None else self._state.ids
         frame = FrameCorners.of(time, view, known)

@@ -312,8 +312,14 @@ class Update:
 def compare(model: IndexModel, state: IndexState, frame: FrameCorners, noise: float) -> Innovation:
     """Return the innovation of a frame: its difference from the prediction by a state.
 
-    `state`: at the frame's time, with entries for its corners. `frame`: at least one corner.
-    `noise`: standard deviation of a coordinate, in pixels.
+    Parameters
+    ----------
+    state : IndexState
+        At the frame's time, with entries for its corners.
+    frame : FrameCorners
+        At least one corner.
+    noise : float
+        Standard deviation of a coordinate, in pixels.
     """
     line, moved = model.line(state, frame), 0.0
     if abs(median_shift(line)) > LINEAR:
@@ -335,8 +341,14 @@ def compare(model: IndexModel, state: IndexState, frame: FrameCorners, noise: fl
 def believe(model: IndexModel, state: IndexState, frame: FrameCorners, noise: float) -> Update:
     """Return the state updated by a frame whose corners fit it.
 
-    `state`: at the frame's time, with entries for its corners. `frame`: at least one corner, all of
-    them visible. `noise`: standard deviation of a coordinate, in pixels.
+    Parameters
+    ----------
+    state : IndexState
+        At the frame's time, with entries for its corners.
+    frame : FrameCorners
+        At least one corner, all of them visible.
+    noise : float
+        Standard deviation of a coordinate, in pixels.
     """
     state = state.with_slopes_near()
     state = model.settled(state, model.line(state, frame), frame)

@@ -199,8 +199,14 @@ class IndexState:
         The error of a detector depends on the place of a corner within its pixel: after a motion of
         the picture by a good part of a pixel, new errors replace the old ones.
 
-        `ids`: corners of a picture, all known. `pixels`, shape (M, 2): their predicted places.
-        `sigma_px`: standard deviation of the errors.
+        Parameters
+        ----------
+        ids : tuple of int
+            Corners of a picture, all known.
+        pixels : array, shape (M, 2)
+            Their predicted places.
+        sigma_px : float
+            Standard deviation of the errors.
         """
         rows = [self.ids.index(i) for i in ids]
         moved = pixels - self.seen_at[rows]

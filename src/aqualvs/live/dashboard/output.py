@@ -56,7 +56,12 @@ def _resized(plane: ImagePlane, size: tuple[int, int]) -> ImagePlane:
 class Dashboard:
     """Output to the open pages; costs next to nothing while there is none.
 
-    `server`: Owned from here on. `vehicle`: returns what the autopilot tells of depth and heading.
+    Parameters
+    ----------
+    server : DashboardServer
+        Owned from here on.
+    vehicle : callable or None
+        Returns what the autopilot tells of depth and heading.
     """
 
     name = "dashboard"

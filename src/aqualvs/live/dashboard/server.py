@@ -274,8 +274,20 @@ _log = logging.getLogger(__name__)
 class DashboardServer:
     """Server of page and data until it is closed.
 
-    `host`, `port`: where to listen; port 0 takes any that is free. Raises `OptionError` if the
-    address cannot be listened to.
+    Parameters
+    ----------
+    host, port
+        Where to listen; port 0 takes any that is free.
+
+    Attributes
+    ----------
+    port : int
+        Where it listens.
+
+    Raises
+    ------
+    OptionError
+        If the address cannot be listened to.
     """
 
     def __init__(self, host: str, port: int, access: Access, rig: Rig, controls: Controls) -> None:

@@ -65,8 +65,12 @@ _KEPT = 200
 class PilotSticks:
     """Detector of movements of the pilot's sticks.
 
-    `own`: system and component in whose name we send sticks ourselves. `dead_band`: deflection, as
-    a share of the full one, that counts as centred.
+    Parameters
+    ----------
+    own : (int, int)
+        System and component in whose name we send sticks ourselves.
+    dead_band : float
+        Deflection, as a share of the full one, that counts as centred.
     """
 
     def __init__(self, link: MavlinkLink, *, own: tuple[int, int], dead_band: float) -> None:
@@ -279,9 +283,17 @@ class ArduSubOptions:
 class ArduSubLink:
     """A vehicle with ArduSub, as `aqualvs.control.vehicle.VehicleLink`.
 
-    `link`: address as in `parse_address`, or a link that others use too; such a one is not closed
-    here. `advises`: whether settings of the vehicle that are not safe are logged. Raises
-    `OptionError` if the address makes no sense, or pymavlink is not installed.
+    Parameters
+    ----------
+    link : str or MavlinkLink
+        Address as in `parse_address`, or a link that others use too; such a one is not closed here.
+    advises : bool
+        Whether settings of the vehicle that are not safe are logged.
+
+    Raises
+    ------
+    OptionError
+        If the address makes no sense, or pymavlink is not installed.
     """
 
     def __init__(

@@ -92,8 +92,10 @@ class MavlinkLink:
     A system id belongs to the address where it was heard first, until it has been silent there for
     five seconds; what others send in its name is left out (see `PeerTable`).
 
-    `url`: see `parse_address`. Raises `OptionError` if the address makes no sense, or pymavlink is
-    not installed.
+    Parameters
+    ----------
+    url : str
+        See `parse_address`.
 
     Attributes
     ----------
@@ -101,6 +103,11 @@ class MavlinkLink:
         System id of the vehicle, and our own.
     dialect : module
         pymavlink's messages and constants (ardupilotmega, which holds all common ones).
+
+    Raises
+    ------
+    OptionError
+        If the address makes no sense, or pymavlink is not installed.
     """
 
     def __init__(self, url: str, options: LinkOptions | None = None) -> None:
@@ -204,8 +211,12 @@ class MavlinkLink:
     def read_parameters(self, names: Iterable[str], *, timeout_s: float = 3.0) -> dict[str, float]:
         """Ask the autopilot for parameters and wait for the answers.
 
-        `names`: as ArduPilot calls them, such as `RC4_DZ`. `timeout_s`: how long to ask and wait,
-        in seconds.
+        Parameters
+        ----------
+        names : iterable of str
+            As ArduPilot calls them, such as `RC4_DZ`.
+        timeout_s : float
+            How long to ask and wait, in seconds.
 
         Returns
         -------

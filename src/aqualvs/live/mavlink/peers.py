@@ -63,7 +63,12 @@ def load_key(path: Path) -> bytes:
 class Signer:
     """Signer of what one connection sends; checks the signatures of what it receives.
 
-    `dialect`: pymavlink's messages. `key`: 32 of them.
+    Parameters
+    ----------
+    dialect : module
+        pymavlink's messages.
+    key : bytes
+        32 of them.
     """
 
     def __init__(self, dialect: Any, key: bytes) -> None:
@@ -168,8 +173,14 @@ class _Contest:
 class PeerTable:
     """Table of the senders on a connection, kept apart by address.
 
-    `make_parser`: returns a new parser of pymavlink. `errors`: those that a parser raises for bad
-    data. `system`: system id of the vehicle.
+    Parameters
+    ----------
+    make_parser : callable
+        Returns a new parser of pymavlink.
+    errors : tuple of exception types
+        Those that a parser raises for bad data.
+    system : int
+        System id of the vehicle.
     """
 
     def __init__(

@@ -17,7 +17,9 @@ _WRITE_S = 0.1
 def check_speed(address: SerialAddress) -> None:
     """Raise if pyserial is missing, or there is no such speed.
 
-    Raises `OptionError`.
+    Raises
+    ------
+    OptionError
     """
     try:
         from serial import Serial

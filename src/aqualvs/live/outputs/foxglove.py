@@ -96,7 +96,12 @@ def laser_lines(
 ) -> list[FloatArray]:
     """Return the ends, shape (2, 3), of the line that each laser was seen to draw on the target.
 
-    `normal`, shape (3,): of the target. `points`: only the posture's inliers count.
+    Parameters
+    ----------
+    normal : array, shape (3,)
+        Of the target.
+    points : ScanPoints
+        Only the posture's inliers count.
     """
     found = []
     for i, laser in enumerate(lasers):

@@ -45,9 +45,17 @@ range in mm/s. NaN where the filter has no value."""
 class MavlinkOutput:
     """Output by `DISTANCE_SENSOR` and `NAMED_VALUE_FLOAT`; the link sends the heartbeat.
 
-    `link`: address as in `parse_address`, or a link that others use too; such a one is not closed
-    here. `options`: where the link is made here. Raises `OptionError` if the address makes no
-    sense, or pymavlink is not installed.
+    Parameters
+    ----------
+    link : str or MavlinkLink
+        Address as in `parse_address`, or a link that others use too; such a one is not closed here.
+    options : LinkOptions, optional
+        Where the link is made here.
+
+    Raises
+    ------
+    OptionError
+        If the address makes no sense, or pymavlink is not installed.
     """
 
     inline = True

@@ -20,9 +20,22 @@ _CHECK_EVERY_S, _REACH_S = 1.0, 0.3
 class RerunOutput:
     """Output to Rerun; a viewer that is absent or leaves is looked for once a second.
 
-    `where`: `viewer` to open one, HOST:PORT of one that is open, or a file that ends in `.rrd`.
-    Raises `OptionError` if rerun-sdk is not installed, or `where` is none of these. Raises
-    `OutputError` if the file exists or cannot be written.
+    Parameters
+    ----------
+    where : str
+        `viewer` to open one, HOST:PORT of one that is open, or a file that ends in `.rrd`.
+
+    Attributes
+    ----------
+    name, inline, keeps_all
+        As in `Output`; a file gets all samples.
+
+    Raises
+    ------
+    OptionError
+        If rerun-sdk is not installed, or `where` is none of these.
+    OutputError
+        If the file exists or cannot be written.
     """
 
     name = "rerun"

@@ -77,8 +77,12 @@ def plane_pose(distance: float, pitch: float, yaw: float, covariance: FloatArray
     normal the covariance has `UNOBSERVABLE_VARIANCE`, so that an estimator that takes the pose for
     that of a fixed mark learns nothing from it there.
 
-    `distance`, `pitch`, `yaw`: range and angles as in `Posture`, in metres and radians.
-    `covariance`, shape (3, 3): of (range, pitch, yaw).
+    Parameters
+    ----------
+    distance, pitch, yaw : float
+        Range and angles as in `Posture`, in metres and radians.
+    covariance : array, shape (3, 3)
+        Of (range, pitch, yaw).
     """
     turn = flu_angles(pitch, yaw)
     rotation = _rotation(*turn)

@@ -60,7 +60,10 @@ class ThresholdDetector:
     def detect(self, lines: NDArray[np.uint8]) -> StripePeaks:
         """Find the runs of bright pixels of one frame; colour is ignored.
 
-        `lines`, shape (n_lines, length): luma, with search lines as rows.
+        Parameters
+        ----------
+        lines : uint8 array, shape (n_lines, length)
+            Luma, with search lines as rows.
 
         Returns
         -------
@@ -101,7 +104,10 @@ def pixels_of_peaks(position: FloatArray, width: FloatArray) -> tuple[IntArray, 
     A peak of the threshold detector gives its bright pixels, each once; a sub-pixel one those
     above half its height, at least one.
 
-    `position`, `width`, shape (N,): as in `StripePeaks`.
+    Parameters
+    ----------
+    position, width : array, shape (N,)
+        As in `StripePeaks`.
 
     Returns
     -------
@@ -196,9 +202,15 @@ class PaperFilter:
     def apply(self, pixels: FloatArray, width: FloatArray, laser: IntArray) -> FilteredPeaks:
         """Triangulate the peaks, and filter the points of each laser.
 
-        `pixels`, shape (N, 2): centres of the peaks in `image`. `width`, shape (N,): as in
-        `StripePeaks`. `laser`, shape (N,): index of the laser that made each peak. The paper
-        divides its picture by hand into one area for each laser.
+        Parameters
+        ----------
+        pixels : array, shape (N, 2)
+            Centres of the peaks in `image`.
+        width : array, shape (N,)
+            As in `StripePeaks`.
+        laser : int array, shape (N,)
+            Index of the laser that made each peak. The paper divides its picture by hand into
+            one area for each laser.
         """
         source, each = self._places(pixels, width, laser)
         of_laser = laser[source]

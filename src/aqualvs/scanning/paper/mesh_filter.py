@@ -186,8 +186,10 @@ _ROUNDING = 1e-9
 class MeshFilterOptions:
     """Parameters of the mesh filter, in metres; defaults from section 5.2 of the paper.
 
-    Raises `OptionError` if a length is not positive, r_min is not below r_max, or rd_theta is not
-    below r_max.
+    Raises
+    ------
+    OptionError
+        If a length is not positive, r_min is not below r_max, or rd_theta is not below r_max.
     """
 
     rd_theta: float = 10e-3  # Size of a thread's reflection along the stripe.
@@ -218,9 +220,15 @@ class MeshFilterOptions:
     ) -> "MeshFilterOptions":
         """Make options from a thread's diameter and its angle to the laser plane.
 
-        `d_theta`: thread diameter in metres. `theta_lt`: angle in radians, as the paper uses it:
-        rd_theta = d_theta / cos(theta_lt). The paper's 2 mm thread with a reflection of 10 mm has
-        acos(2/10), 78 degrees. `dd`, `r_min`, `r_max`: as the attributes.
+        Parameters
+        ----------
+        d_theta : float
+            Thread diameter in metres.
+        theta_lt : float
+            Angle in radians, as the paper uses it: rd_theta = d_theta / cos(theta_lt). The
+            paper's 2 mm thread with a reflection of 10 mm has acos(2/10), 78 degrees.
+        dd, r_min, r_max : float
+            As the attributes.
         """
         return cls(rd_theta=d_theta / math.cos(theta_lt), dd=dd, r_min=r_min, r_max=r_max)
 
@@ -262,7 +270,10 @@ def laser_frame(plane: Plane) -> SE3:
     e_x = e_y x e_z. A plane square to the forward axis has no such projection: there e_y is the
     dome's z axis, so that e_x points right or left as the normal points forward or back.
 
-    `plane`: in `dome`.
+    Parameters
+    ----------
+    plane : Plane
+        In `dome`.
 
     Returns
     -------

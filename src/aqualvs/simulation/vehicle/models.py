@@ -97,7 +97,10 @@ class StickInput:
     def asked(self, x: int, y: int, z: int, r: int) -> tuple[float, float, float, float]:
         """Return the request of stick positions in depth hold.
 
-        `x`, `y`, `z`, `r`: as in MANUAL_CONTROL: z from 0 (down) over 500 to 1000 (up).
+        Parameters
+        ----------
+        x, y, z, r : int
+            As in MANUAL_CONTROL: z from 0 (down) over 500 to 1000 (up).
 
         Returns
         -------

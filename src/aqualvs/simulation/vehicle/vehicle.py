@@ -85,7 +85,12 @@ class Telemetry:
 class Reading:
     """Readings of one sensor over time.
 
-    `sensor`: its errors. `rng`: source of its noise.
+    Parameters
+    ----------
+    sensor : SensorErrors
+        Its errors.
+    rng : Generator
+        Source of its noise.
     """
 
     def __init__(self, sensor: SensorErrors, rng: np.random.Generator) -> None:
@@ -137,8 +142,12 @@ class StickPositions(Protocol):
 def level_pose(position: FloatArray, heading: float) -> SE3:
     """Return world_from_body of a level vehicle.
 
-    `position`, shape (3,): North, east, down, in metres. `heading`: clockwise from north, in
-    radians.
+    Parameters
+    ----------
+    position : array, shape (3,)
+        North, east, down, in metres.
+    heading : float
+        Clockwise from north, in radians.
     """
     c, s = math.cos(heading), math.sin(heading)
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

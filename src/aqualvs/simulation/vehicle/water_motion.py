@@ -214,8 +214,12 @@ _GAUSS_WEIGHT = (5.0 / 18.0, 8.0 / 18.0, 5.0 / 18.0)
 def tether_force(stream: Vec, velocity: Vec, flow: Flow) -> Vec:
     """Return the force of the tether on the vehicle, in the world, in newtons.
 
-    `stream`, `velocity`: of the water without waves, and of the vehicle, in the world, in m/s.
-    `flow`: with the tether.
+    Parameters
+    ----------
+    stream, velocity : (float, float, float)
+        Of the water without waves, and of the vehicle, in the world, in m/s.
+    flow : Flow
+        With the tether.
     """
     north, east = 0.0, 0.0
     for i in range(3):
