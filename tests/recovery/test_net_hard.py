@@ -109,6 +109,8 @@ def test_folds_are_net_and_move_a_posture_little() -> None:
         (0.6, 0.03, 0.06, 0.022),
         # One laser alone shows a flank.
         (0.8, 0.024, 0.045, 0.025),
+        # A steep plane holds all strands of one laser, and those of the others beside them.
+        (0.7, 0.03, 0.06, 0.0215),
     ],
 )
 def test_a_net_that_is_all_folds_is_measured_by_all_of_its_light(
