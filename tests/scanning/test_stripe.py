@@ -107,9 +107,9 @@ def test_centre_width_and_height_of_a_clean_stripe(sigma: float) -> None:
     np.testing.assert_array_equal(found.likelihood, 1.0)
 
 
-@pytest.mark.parametrize("width", [2.0, 2.5, 3.0])
+@pytest.mark.parametrize("width", [1.2, 1.5, 2.0, 2.5, 3.0])
 def test_a_narrow_stripe_is_not_drawn_to_the_pixel_grid(width: float) -> None:
-    """Sums over whole pixels draw it by 0.06 to 0.09 px."""
+    """Sums over whole pixels draw it by 0.06 to 0.25 px, straight lines the narrowest by 0.1."""
     found = detect(as_image(40.0 + gaussian(CENTRES, sigma=width / FWHM)))
     assert np.abs(found.position - CENTRES).max() < 0.025
 

@@ -102,6 +102,8 @@ def _peaks_of_run(
             continue
         nodes = [(left, 0.0), *((i, row[i] - level) for i in range(a + 1, b)), (right, 0.0)]
         centre = centroid_of(nodes)
+        if right - left < 2.0 and row[peak] < 250:
+            centre = gaussian_peak(row, peak, background[peak])
         height = row[peak] - background[peak]
         found.append(Peak(x, centre, height, right - left, row[peak]))
     return found
@@ -115,6 +117,13 @@ def centroid_of(nodes: list[tuple[float, float]]) -> float:
         middle = (x0 + x1) / 2 * (y0 + y1) / 2
         moment += (x1 - x0) * (x0 * y0 + 4 * middle + x1 * y1) / 6
     return moment / area
+
+
+def gaussian_peak(row: list[int], peak: int, base: int) -> float:
+    """Return the vertex of the parabola through the logarithms of three heights."""
+    heights = [max(row[peak + k] - base, 0.5) for k in (-1, 0, 1)]
+    curve = np.polynomial.Polynomial.fit([-1, 0, 1], np.log(heights), 2).convert()
+    return float(peak - curve.coef[1] / (2.0 * curve.coef[2]))
 
 
 def find(
