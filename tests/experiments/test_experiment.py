@@ -15,6 +15,7 @@ from aqualvs.report.figure_style import STYLE
 from aqualvs.simulation import dive
 from aqualvs.simulation.render import Renderer
 from camera_cases import half_size_rig
+from dome_cases import leave_bare_lenses_out
 
 N_FRAMES = 5
 # Bars for full pictures and whole dives; all others are reached by these, too.
@@ -46,6 +47,7 @@ def laboratory(tmp_path_factory):
         # One ray for each pixel: rendering would be most of the time.
         for module in (dive, growth_and_sun, sensor_model):
             patch.setattr(module, "Renderer", partial(Renderer, samples=1))
+        leave_bare_lenses_out(patch)
         yield BriefLaboratory(tmp_path_factory.mktemp("tank"))
 
 
