@@ -2,7 +2,6 @@
 
 import gc
 import os
-import sys
 from pathlib import Path
 
 import pytest
@@ -57,6 +56,14 @@ def samples() -> Path:
     return folder
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    """Have the processes of one run compile each kernel once, those of collecting among them."""
+    if hasattr(config, "workerinput"):
+        from kernel_locks import compile_one_at_a_time
+
+        compile_one_at_a_time()
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put long files first: of several processes, none is left with one at the end."""
     long = [ROOT / "tests" / name for name in LONG]
@@ -74,10 +81,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 def pytest_collection_finish() -> None:
     """Free memory as usual from here, without searching what was collected again and again."""
-    if "numba" in sys.modules:
-        from kernel_locks import compile_one_at_a_time
-
-        compile_one_at_a_time()
     gc.freeze()
     # As the command line does it.
     gc.set_threshold(50_000, 20, 50)

@@ -5,6 +5,7 @@ import re
 import signal
 import subprocess
 import sys
+from functools import partial
 
 import av
 import pytest
@@ -14,13 +15,21 @@ from aqualvs.cli.main import main
 from aqualvs.experiments.simulate import CALIBRATION
 from aqualvs.optics.rigfile import load_rig, save_rig
 from aqualvs.optics.shutter import AT_ONCE
+from aqualvs.simulation import dive as dive_of
 from aqualvs.simulation.calibration_set import SetSize
 from aqualvs.simulation.cameras import list_cameras
+from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenarios import list_scenarios
 from aqualvs.sources import open_source
 from panel_cases import small_rig
 from shell_cases import rig_file
 from waiting import TIMEOUT_S, until
+
+
+@pytest.fixture(autouse=True)
+def one_ray_a_pixel(monkeypatch):
+    """What is tested is what is written; the pictures of processes have all rays."""
+    monkeypatch.setattr(dive_of, "Renderer", partial(Renderer, samples=1))
 
 
 def test_the_list_names_every_scenario(capsys):

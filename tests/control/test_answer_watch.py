@@ -1,7 +1,9 @@
 """Postures that do not answer: frozen ones, and a vehicle that moves unseen."""
 
 import math
+from copy import deepcopy
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from aqualvs.control.safety import NO_BRAKE, LimitReason
 from aqualvs.control.vehicle import NEUTRAL, Effort, Setpoint
 from aqualvs.errors import OptionError
 from aqualvs.follow.case import SimCase, sea, vehicle_model
+from aqualvs.follow.loop import SimulatedLoop
 from aqualvs.follow.sensor_model import Blind, LossOfSight, SampledSensor
 from aqualvs.geometry.transforms import SE3
 from aqualvs.scanning.posture import Posture, Reason, Refusal
@@ -131,7 +134,8 @@ def test_a_way_along_a_curved_net_is_an_answer(turned_deg_s: float, receding_m_s
         watch.done(now_s, HELD)
 
 
-FREEZE_S = 14.0
+# The setpoint changes after the first, at most 2.25 s before the second.
+SAME_S, FREEZE_S = 11.7, 14.0
 
 
 class NoticingSensor(SampledSensor):
@@ -144,6 +148,26 @@ class NoticingSensor(SampledSensor):
         if time_s < self.noticed_s:
             return seen
         return Refusal(Reason.FROZEN, still_s=time_s - FREEZE_S)
+
+
+@cache
+def held(
+    name: str, before: float, seed: int, waves: float
+) -> tuple[SimulatedLoop, HoldMission, NoticingSensor]:
+    """A loop that has held a range for as long as all frozen ones do alike."""
+    mission = HoldMission(Setpoint(before))
+    model = vehicle_model(name)
+    case = SimCase(
+        model=model,
+        gains=load_gains(model.name),
+        water=sea(current=0.0, waves=waves, seed=seed),
+        start_range=before,
+        seed=seed,
+    )
+    eye = NoticingSensor(case.net, np.random.default_rng(seed))
+    loop = case.loop(eye, mission)
+    loop.run(SAME_S)
+    return loop, mission, eye
 
 
 def frozen_hold(
@@ -160,19 +184,10 @@ def frozen_hold(
 
     Return the time from the freeze to neutral that stays, the nearest range and the decisions.
     """
-    mission = HoldMission(Setpoint(before))
-    model = vehicle_model(name)
-    case = SimCase(
-        model=model,
-        gains=load_gains(model.name),
-        water=sea(current=0.0, waves=waves, seed=seed),
-        start_range=before,
-        seed=seed,
-    )
-    blind = (Blind(FREEZE_S, math.inf, loss),)
-    eye = NoticingSensor(case.net, np.random.default_rng(seed), blind=blind)
+    loop, mission, eye = deepcopy(held(name, before, seed, waves))
+    eye._blind = (Blind(FREEZE_S, math.inf, loss),)
     eye.noticed_s = FREEZE_S + noticed_s
-    loop, decisions = case.loop(eye, mission), []
+    decisions = []
 
     def keep(now_s: float, *step: object) -> None:
         if now_s > FREEZE_S:

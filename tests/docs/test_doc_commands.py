@@ -28,6 +28,7 @@ from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenario import Scenario
 from aqualvs.simulation.scenarios import load_scenario
 from doc_blocks import PAGES, Command, all_commands, commands
+from dome_cases import leave_bare_lenses_out
 from panel_cases import small_rig
 from ports import free_port
 from repository import ROOT
@@ -122,6 +123,7 @@ def world(tmp_path_factory):
         patch.setattr(dive, "Renderer", partial(Renderer, samples=1))
         patch.setattr(simulate, "load_scenario", few_frames)
         patch.setattr(simulate, "example_rig", small_rig)
+        leave_bare_lenses_out(patch)
         for command in {arguments_of(c): c for page in IN_ORDER for c in commands(page)}.values():
             run(command, folder)
     named = {path for page in IN_ORDER for path in files_named(page)}

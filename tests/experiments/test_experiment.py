@@ -1,18 +1,21 @@
 """Every experiment of the catalogue runs, in small pictures and on a few frames of its dives."""
 
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import cached_property, partial, partialmethod
 
 import pytest
 
-from aqualvs.experiments import ablation_stages, growth_and_sun, page
+from aqualvs.experiments import ablation_stages, growth_and_sun, page, sea
 from aqualvs.experiments.experiment import MODULES, experiment
 from aqualvs.experiments.laboratory import Laboratory
 from aqualvs.experiments.page import save_outcome
+from aqualvs.follow import sensor_model
+from aqualvs.follow.case import Trials
 from aqualvs.report.figure_style import STYLE
 from aqualvs.simulation import dive
 from aqualvs.simulation.render import Renderer
 from camera_cases import half_size_rig
+from dome_cases import leave_bare_lenses_out
 
 N_FRAMES = 5
 # Bars for full pictures and whole dives; all others are reached by these, too.
@@ -42,8 +45,9 @@ def laboratory(tmp_path_factory):
     """Dives and the calibration are made once, as `reproduce` does it."""
     with pytest.MonkeyPatch.context() as patch:
         # One ray for each pixel: rendering would be most of the time.
-        for module in (dive, growth_and_sun):
+        for module in (dive, growth_and_sun, sensor_model):
             patch.setattr(module, "Renderer", partial(Renderer, samples=1))
+        leave_bare_lenses_out(patch)
         yield BriefLaboratory(tmp_path_factory.mktemp("tank"))
 
 
@@ -54,8 +58,18 @@ def plain_figures(monkeypatch):
     monkeypatch.setattr(page, "STYLE", {**STYLE, "savefig.dpi": 60})
 
 
+@pytest.fixture
+def brief_loops(monkeypatch):
+    """A shorter way along the net: test_closed_loop.py goes the same one for a minute."""
+    monkeypatch.setattr(Trials, "follow", partialmethod(Trials.follow, 40.0))
+    # A picture every two seconds of a dive at sea.
+    monkeypatch.setattr(sea, "_SETUP", sea._SETUP._replace(every=50))
+
+
 @pytest.mark.parametrize("name", MODULES)
-def test_an_experiment_gives_its_results(laboratory, plain_figures, tmp_path, monkeypatch, name):
+def test_an_experiment_gives_its_results(
+    laboratory, plain_figures, brief_loops, tmp_path, monkeypatch, name
+):
     monkeypatch.setattr(growth_and_sun, "_SHOWN", N_FRAMES // 2)
     # Every fourth set of parameters that is tried.
     few = {kind: sets[::4] for kind, sets in ablation_stages._KINDS.items()}

@@ -6,18 +6,22 @@ import subprocess
 import sys
 import threading
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from aqualvs.control.gains_file import load_gains
 from aqualvs.control.missions import HoldMission
 from aqualvs.control.vehicle import Setpoint, SetpointHolder
+from aqualvs.follow import sensor_model
 from aqualvs.follow.case import SimCase, vehicle_model
 from aqualvs.follow.command import FOLLOW_CSV, LoopPage
 from aqualvs.follow.loop import RangeSensor
 from aqualvs.follow.sensor_model import RenderedSensor, SampledSensor
 from aqualvs.simulation.cameras import IDEAL, simulated_camera
+from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenarios import example_rig
 from aqualvs.sources.base import State
 from browser import open_page
@@ -26,6 +30,12 @@ from live_cases import Collector
 # A vehicle takes seconds to its setpoint; a busy machine more.
 TIMEOUT_S = 120.0
 HELD = Setpoint(0.6)
+
+
+@pytest.fixture(autouse=True)
+def one_ray_a_pixel(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rendering would be most of the time."""
+    monkeypatch.setattr(sensor_model, "Renderer", partial(Renderer, samples=1))
 
 
 def shown(

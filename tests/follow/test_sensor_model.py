@@ -1,6 +1,7 @@
 """Rendered pictures of a moving vehicle, as its camera's shutter takes them."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import pytest
 from aqualvs.control.missions import HoldMission
 from aqualvs.control.vehicle import Setpoint
 from aqualvs.errors import OptionError
+from aqualvs.follow import sensor_model
 from aqualvs.follow.case import SimCase, tuned_gains, vehicle_model
 from aqualvs.follow.command import Aim, SimRequest
 from aqualvs.follow.loop import Timing
@@ -15,11 +17,18 @@ from aqualvs.follow.sensor_model import RenderedSensor, SampledSensor
 from aqualvs.geometry.transforms import SE3
 from aqualvs.optics.shutter import AT_ONCE, Shutter, ShutterKind
 from aqualvs.simulation.net_motion import NetWall
+from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenarios import example_rig
 from aqualvs.simulation.scene import Scene, Wall
 
 _WALL = Scene(dome_from_scene=SE3.identity(), walls=(Wall(),), target="wall")
 _SPEED = 0.5
+
+
+@pytest.fixture(autouse=True)
+def one_ray_a_pixel(monkeypatch):
+    """What is tested is when a picture is taken; its stripes are as wide."""
+    monkeypatch.setattr(sensor_model, "Renderer", partial(Renderer, samples=1))
 
 
 def seen_ranges(shutter, times):

@@ -38,24 +38,24 @@ import numpy as np
 from aqualvs.geometry.compiled import kernel
 
 @kernel
-def middle(x):
-    return np.median(np.abs(x))
+def largest(x):
+    return np.max(np.abs(x))
 
 @kernel
 def doubled(x):
     if len(x) < 2:
         raise ValueError("too short")
-    return 2.0 * middle(np.sort(x)) + np.empty(3).size
+    return 2.0 * largest(x + 1.0) + np.empty(3).size
 
 x = np.array([3.0, -1.0, 2.0])
-middle(x)
+largest(x)
 said = ""
 try:
     doubled(x[:1])
 except ValueError as fault:
     said = str(fault).replace(" ", "_")
-hits = [sum(one.stats.cache_hits.values()) for one in (middle, doubled)]
-print(middle(x), doubled(x), said, *hits, "numba.np.arraymath" in sys.modules)
+hits = [sum(one.stats.cache_hits.values()) for one in (largest, doubled)]
+print(largest(x), doubled(x), said, *hits, "numba.np.arraymath" in sys.modules)
 """
 
 
@@ -154,7 +154,7 @@ def test_cached_kernels_follow_their_callees(tmp_path: Path) -> None:
 
 def test_cached_kernels_load_without_what_only_compiling_needs(tmp_path: Path) -> None:
     (tmp_path / "allocating.py").write_text(ALLOCATING)
-    found = ["2.0", "7.0", "too_short"]
+    found = ["3.0", "11.0", "too_short"]
     assert run_caller(tmp_path, "allocating.py") == [*found, "0", "0", "True"]
     assert run_caller(tmp_path, "allocating.py") == [*found, "1", "1", "False"]
     for path in (tmp_path / "cache").rglob("*doubled*"):

@@ -170,7 +170,7 @@ def _lit(pose: SE3, surface: Plane, sheet: Sheet, spacing: float) -> tuple[Float
     points = start + steps[:, None] * direction
     up = np.zeros_like(points)
     # A bent sheet lies millimetres away from its plane: Newton's method within the surface.
-    for _ in range(20):
+    for _ in range(2 if sheet.is_plane else 20):
         gradient = sheet.gradient(points)
         up = gradient - (gradient @ surface.normal)[:, None] * surface.normal
         up /= np.sum(up * gradient, axis=1, keepdims=True)

@@ -70,17 +70,20 @@ def picture(cells, h, size, *, blur=0.7, gamma=1.25, noise=1.0, seed=0, light=18
     `light` and `dark` are grey levels after gamma; what surrounds the target lies between.
     """
     width, height = size
-    fine = (np.arange(_FINE * max(size)) + 0.5) / _FINE - 0.5
-    x, y = np.meshgrid(fine[: _FINE * width], fine[: _FINE * height])
-    place = np.linalg.inv(h) @ np.stack([x.ravel(), y.ravel(), np.ones(x.size)])
-    column, row = np.floor(place[:2] / place[2]).astype(int)
-    inside = (column >= 0) & (row >= 0) & (column < cells.shape[1]) & (row < cells.shape[0])
-    tone = np.full(x.size, 0.4)
-    tone[inside] = cells[row[inside], column[inside]]
     low, high = (dark / 255.0) ** gamma, (light / 255.0) ** gamma
-    linear = (low + (high - low) * tone).reshape(x.shape)
+    # Middles of cells and of fine pixels are at whole numbers.
+    cell = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
+    off = 0.5 * (_FINE - 1)
+    fine = np.array([[_FINE, 0.0, off], [0.0, _FINE, off], [0.0, 0.0, 1.0]])
+    linear = cv2.warpPerspective(
+        (low + (high - low) * cells).astype(np.float32),
+        fine @ h @ cell,
+        (_FINE * width, _FINE * height),
+        flags=cv2.INTER_NEAREST,
+        borderValue=low + (high - low) * 0.4,
+    )
     linear = cv2.GaussianBlur(linear, (0, 0), blur * _FINE)
-    coarse = linear.reshape(height, _FINE, width, _FINE).mean(axis=(1, 3))
+    coarse = cv2.resize(linear, size, interpolation=cv2.INTER_AREA).astype(float)
     grey = 255.0 * coarse ** (1.0 / gamma)
     grey += noise * np.random.default_rng(seed).normal(size=grey.shape)
     return np.rint(np.clip(grey, 0, 255)).astype(np.uint8)

@@ -18,8 +18,10 @@ FPS = 25.0
 
 def noisy(luma: ImagePlane, rng: np.random.Generator) -> ImagePlane:
     """A picture with shot and read noise of a small camera."""
-    sigma = np.sqrt(0.1 * np.maximum(luma.astype(np.float32) - 16.0, 0.0) + 1.0)
-    return np.clip(luma + sigma * rng.normal(size=luma.shape), 0, 255).astype(np.uint8)
+    light = luma.astype(np.float32)
+    sigma = np.sqrt(np.float32(0.1) * np.maximum(light - 16.0, 0.0) + 1.0)
+    noise = rng.standard_normal(luma.shape, np.float32)
+    return np.clip(light + sigma * noise, 0, 255).astype(np.uint8)
 
 
 def hovering(n: int, seed: int = 1) -> Iterator[ImagePlane]:

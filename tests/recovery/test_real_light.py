@@ -7,6 +7,7 @@ than those of rendered pictures: the board itself may be a millimetre or a degre
 import hashlib
 import math
 from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +17,11 @@ import pytest
 from scipy.special import chdtri
 
 import real_wall as wall
-from aqualvs.calibrate import lasers
+from aqualvs.calibrate import common, lasers
 from aqualvs.calibration.detection.detection import detect_board
 from aqualvs.optics.rigfile import load_rig
 from aqualvs.scanning.uncalibrated_stripes import find_stripes as find_stripes
+from aqualvs.sources.images import read_image
 from laser_cases import laser_error
 from repository import ROOT
 from whole import WHOLE
@@ -116,11 +118,12 @@ LEFT_OUT = [f"image{i}" for i in (range(1, 10) if WHOLE else (3, 7, 8))]
 
 @pytest.fixture(scope="module")
 def work(tmp_path_factory) -> Iterator[Path]:
-    """Folder of the calibrations from the set; detection works once on each of its pictures.
+    """Folder of the calibrations from the set; each of its pictures is read and searched once.
 
     Each is among the others eight times; what is found in it is the same each time.
     """
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(common, "read_image", cache(read_image))
         for function in (detect_board, find_stripes):
             patch.setattr(lasers, function.__name__, once_for_each_picture(function))
         yield tmp_path_factory.mktemp("real")

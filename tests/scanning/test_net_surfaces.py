@@ -12,7 +12,9 @@ from aqualvs.scanning.net_surfaces import (
     is_continuation,
     merged_plane,
     seen_through,
+    share_near,
 )
+from aqualvs.scanning.patch import packed_plane
 from aqualvs.scanning.posture import Posture
 from aqualvs.scanning.region_growing import grow_region
 
@@ -172,8 +174,14 @@ def wavy(n: int = 60) -> FloatArray:
     return np.stack([x, RANGE + 0.01 * np.sign(np.sin(40.0 * x)), z], axis=-1)
 
 
+def in_turn(n: int) -> IntArray:
+    """Return lasers of strands, each of three in turn."""
+    return np.arange(n) % 3
+
+
 def test_the_mean_plane_of_folds_is_as_uncertain_as_they_are_few() -> None:
-    few, many = fit_mean(wavy(60), FLAT), fit_mean(wavy(240), FLAT)
+    few = fit_mean(wavy(60), in_turn(60), FLAT)
+    many = fit_mean(wavy(240), in_turn(240), FLAT)
     assert few is not None
     assert many is not None
     assert 1.0 / np.linalg.norm(few.m) == pytest.approx(RANGE, abs=4e-3)
@@ -185,19 +193,48 @@ def test_the_mean_plane_of_folds_is_as_uncertain_as_they_are_few() -> None:
 
 def test_a_few_strands_elsewhere_do_not_move_the_mean_plane() -> None:
     points = wavy()
-    clean = fit_mean(points, FLAT)
+    clean = fit_mean(points, in_turn(60), FLAT)
     elsewhere = points[:4] + np.array([0.0, 0.2, 0.0])
-    spoilt = fit_mean(np.vstack([points, elsewhere]), FLAT)
+    spoilt = fit_mean(np.vstack([points, elsewhere]), in_turn(64), FLAT)
     assert clean is not None
     assert spoilt is not None
     np.testing.assert_allclose(spoilt.m, clean.m, atol=2e-3)
     assert np.all(spoilt.weights[-4:] == 0.0)
 
 
+def steep_plane_through_one_laser() -> tuple[FloatArray, IntArray, Plane]:
+    """Return folded strands on three stripes of a plane, and another plane that holds one stripe.
+
+    The second stripe has most strands, and those of the others near their crossing are on both.
+    """
+    s = np.linspace(-0.2, 0.2, 30)
+    along = np.concatenate([s[::3], s, s[::3]])
+    angle = np.deg2rad(np.repeat([0.0, 60.0, 120.0], [10, 30, 10]))
+    fold = 0.005 * np.sign(np.sin(50.0 * along + angle))
+    x, z = along * np.cos(angle), along * np.sin(angle)
+    laser = np.repeat([0, 1, 2], [10, 30, 10])
+    # The plane that holds the second stripe shows its noise alone.
+    fold[laser == 1] = np.random.default_rng(5).normal(0.0, 3e-4, 30)
+    across = np.array([-np.sin(angle[15]), 0.0, np.cos(angle[15])])
+    normal = np.array([0.0, 1.0, 0.0]) + np.tan(np.deg2rad(40.0)) * across
+    length = float(np.linalg.norm(normal))
+    points = np.stack([x, RANGE + fold, z], axis=-1)
+    return points, laser, Plane(normal / length, RANGE / length)
+
+
+def test_a_plane_through_one_laser_s_strands_is_not_the_mean_plane() -> None:
+    points, laser, steep = steep_plane_through_one_laser()
+    assert np.mean(np.abs(points @ steep.normal - steep.offset) < 3e-3) > 0.6
+    assert share_near(points, laser, packed_plane(steep), 3e-3) < 0.3
+    mean = fit_mean(points, laser, steep)
+    assert mean is not None
+    np.testing.assert_allclose(mean.m * RANGE, [0.0, 1.0, 0.0], atol=0.02)
+
+
 def test_points_on_a_line_have_no_mean_plane() -> None:
     s = np.linspace(-0.2, 0.2, 20)
     line = np.stack([s, np.full(20, RANGE), np.zeros(20)], axis=-1)
-    assert fit_mean(line, FLAT) is None
+    assert fit_mean(line, in_turn(20), FLAT) is None
 
 
 def posture(distance: float, yaw: float) -> Posture:

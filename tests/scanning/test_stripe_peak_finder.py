@@ -1,5 +1,6 @@
 """`PeakFinder` against a slow reference in plain Python, on random pictures."""
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -99,11 +100,30 @@ def _peaks_of_run(
         right = b - (level - row[b]) / (row[b - 1] - row[b])
         if right - left > reach:
             continue
-        over = [(i, row[i] - level) for i in range(a + 1, b)]
-        centre = sum(i * value for i, value in over) / sum(value for _, value in over)
+        nodes = [(left, 0.0), *((i, row[i] - level) for i in range(a + 1, b)), (right, 0.0)]
+        centre = centroid_of(nodes)
+        if right - left < 2.0 and row[peak] < 250:
+            centre = gaussian_peak(row, peak, background[peak])
         height = row[peak] - background[peak]
         found.append(Peak(x, centre, height, right - left, row[peak]))
     return found
+
+
+def centroid_of(nodes: list[tuple[float, float]]) -> float:
+    """Return the centroid below a line through nodes (x, y), by Simpson's rule: exact for it."""
+    area, moment = 0.0, 0.0
+    for (x0, y0), (x1, y1) in pairwise(nodes):
+        area += (x1 - x0) * (y0 + y1) / 2
+        middle = (x0 + x1) / 2 * (y0 + y1) / 2
+        moment += (x1 - x0) * (x0 * y0 + 4 * middle + x1 * y1) / 6
+    return moment / area
+
+
+def gaussian_peak(row: list[int], peak: int, base: int) -> float:
+    """Return the vertex of the parabola through the logarithms of three heights."""
+    heights = [max(row[peak + k] - base, 0.5) for k in (-1, 0, 1)]
+    curve = np.polynomial.Polynomial.fit([-1, 0, 1], np.log(heights), 2).convert()
+    return float(peak - curve.coef[1] / (2.0 * curve.coef[2]))
 
 
 def find(

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -386,6 +387,8 @@ def _page(before: Rig, done: LasersResult, request: LasersRequest) -> Calibratio
     target = request.box or request.board
     assert target is not None
     used = {one.name for one in result.views}
+    seen = zip(done.views, found.pictures, strict=True)
+    shown = (pair for pair in seen if pair[0].view.name in used)
     rows = [
         ViewRow(
             name=one.name,
@@ -434,11 +437,8 @@ def _page(before: Rig, done: LasersResult, request: LasersRequest) -> Calibratio
             ),
         ),
         views=(*rows, *missed_rows(found.missed)),
-        pictures=tuple(
-            _shot(view, picture)
-            for view, picture in zip(done.views, found.pictures, strict=True)
-            if view.view.name in used
-        )[:_SHOTS],
+        # Only these are read again.
+        pictures=tuple(_shot(view, picture) for view, picture in islice(shown, _SHOTS)),
         facts=facts(("rig before", str(request.rig)), ("target", str(target))),
     )
 

@@ -5,6 +5,7 @@ pictures: it compares postures, efforts and the autopilot's reports.
 """
 
 import math
+from bisect import bisect_left
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -12,6 +13,7 @@ from statistics import fmean, median
 from typing import NamedTuple
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from aqualvs.control.gains import VehicleFacts
 from aqualvs.control.safety import NO_BRAKE, Brake, LimitReason
@@ -150,7 +152,8 @@ class AnswerWatch:
 
     def restart(self) -> None:
         """Begin to compare anew: nothing was done and nothing seen yet."""
-        self._moments: deque[_Moment] = deque()
+        # In the order of their times.
+        self._moments: list[_Moment] = []
         self._now_s = math.nan
         self._effort = NEUTRAL
         self._balance, self._thrust_s = 0.0, 0.0
@@ -199,8 +202,7 @@ class AnswerWatch:
             math.nan if state.pitch is None else state.pitch,
         )
         self._moments.append(moment)
-        while now_s - self._moments[0].time_s > self.limits.long_window_s + _GAP_S:
-            self._moments.popleft()
+        del self._moments[: self._first_within(self.limits.long_window_s + _GAP_S)]
         stands = self._has_stopped() or self._is_unanswered() or self._does_not_follow()
         return LimitReason.NO_ANSWER if stands else None
 
@@ -251,6 +253,11 @@ class AnswerWatch:
         self._still_s = now_s - self._same_s
         return self._frozen
 
+    def _first_within(self, period_s: float) -> int:
+        """Return the index of the first moment that is no older than a period before now."""
+        now_s = self._now_s
+        return bisect_left(self._moments, True, key=lambda m: now_s - m.time_s <= period_s)
+
     def _go_on(self, now_s: float, yaw: float, state: VehicleState) -> float:
         """Let the efforts act until now; return their acceleration towards the target."""
         step = now_s - self._now_s
@@ -292,10 +299,11 @@ class AnswerWatch:
         begin_s = self._now_s - _STOP_S
         if self._moments[0].time_s > begin_s - _LINE_S:
             return False
-        line = [m for m in self._moments if begin_s - _LINE_S <= m.time_s < begin_s]
+        first = bisect_left(self._moments, begin_s - _LINE_S, key=_time_of)
+        line = self._moments[first : bisect_left(self._moments, begin_s, first, key=_time_of)]
         if len(line) < _N_LINE or len(self._moments) < 2 * _N_STOPPED:
             return False
-        *_, c, b, a, third, second, last = self._moments
+        c, b, a, third, second, last = self._moments[-2 * _N_STOPPED :]
         late = (third, second, last)
         # Without the way by the efforts the approach is even.
         at = line[-1]
@@ -329,15 +337,17 @@ class AnswerWatch:
         """Return whether efforts or the heading promise a motion that is not seen."""
         limits, last = self.limits, self._moments[-1]
         for window_s in (limits.window_s, limits.long_window_s):
-            lately = [m for m in self._moments if last.time_s - m.time_s <= window_s]
-            before = [m for m in self._moments if 0.0 < lately[0].time_s - m.time_s <= _GAP_S]
-            if not before or last.time_s - before[0].time_s < window_s:
+            first = self._first_within(window_s)
+            lately = self._moments[first:]
+            gap = (m for m in self._moments[:first] if lately[0].time_s - m.time_s <= _GAP_S)
+            before = next(gap, None)
+            if before is None or last.time_s - before.time_s < window_s:
                 return False
             turned = window_s == limits.window_s
             turned = turned and abs(last.heading - lately[0].heading) >= limits.turned
             promises = self._thrust_s > _BALANCED_S
             promised = limits.promised + 0.5 * self._change * window_s**2
-            promises = promises and self._way_of(before[0], lately) > promised
+            promises = promises and self._way_of(before, lately) > promised
             if (turned or promises) and _stands_still(lately):
                 self._still_s, self._blind_s = 0.0, window_s
                 return True
@@ -360,25 +370,23 @@ class AnswerWatch:
 
     def _does_not_follow(self) -> bool:
         """Return whether the autopilot pitches or turns to and fro, and the posture does not."""
-        now_s, limits = self._now_s, self.limits
-        if now_s - self._moments[0].time_s < _ATTITUDE_S + _LATE_S:
+        limits = self.limits
+        if self._now_s - self._moments[0].time_s < _ATTITUDE_S + _LATE_S:
             return False
-        lately = [m for m in self._moments if now_s - m.time_s <= _STILL_S]
+        lately = self._moments[self._first_within(_STILL_S) :]
         if not _stands_still(lately) or _swing([m.pitch for m in lately], lately) > _STILL_ANGLE:
             return False
-        moments = [m for m in self._moments if now_s - m.time_s <= _ATTITUDE_S + _LATE_S]
-        n = sum(now_s - m.time_s <= _ATTITUDE_S for m in moments)
+        moments = self._moments[self._first_within(_ATTITUDE_S + _LATE_S) :]
+        n = len(self._moments) - self._first_within(_ATTITUDE_S)
         if n < _N_ATTITUDE:
             return False
-        pitch = _about_line(np.array([m.pitch for m in moments[-n:]]))
-        yaw = _about_line(np.array([m.yaw for m in moments[-n:]]))
-        attitude = np.array([m.attitude for m in moments])
-        heading = np.array([m.heading for m in moments])
+        pitch, attitude = [m.pitch for m in moments], [m.attitude for m in moments]
+        yaw, heading = [m.yaw for m in moments], [m.heading for m in moments]
         # A posture that follows one of them is live, however the net moves the other.
         follows = [
-            _share(seen, told) >= limits.follows
-            for seen, told in ((pitch, _delayed(attitude, n)), (yaw, _delayed(heading, n)))
-            if _least_swing(told) > limits.swung
+            _share(_about_lines(seen[-n:], n)[0], about) >= limits.follows
+            for seen, told in ((pitch, attitude), (yaw, heading))
+            if _least_swing(about := _about_lines(told, n)) > limits.swung
         ]
         if not follows or any(follows):
             return False
@@ -409,24 +417,28 @@ def _swing(values: list[float], moments: Sequence[_Moment]) -> float:
     return max(means) - min(means)
 
 
-def _about_line(values: FloatArray) -> FloatArray:
-    """Return values without their mean and even change."""
-    ramp = np.linspace(-1.0, 1.0, len(values))
-    values = values - values.mean()
-    return values - ramp * (ramp @ values) / (ramp @ ramp)
+def _time_of(moment: _Moment) -> float:
+    """Return the time of a moment."""
+    return moment.time_s
 
 
-def _delayed(told: FloatArray, n: int) -> list[FloatArray]:
-    """Return what the autopilot told, about a line, for each delay of the postures."""
-    return [_about_line(told[k : k + n]) for k in range(len(told) - n + 1)]
+def _about_lines(values: list[float], n: int) -> FloatArray:
+    """Return each `n` values in a row, without their mean and even change."""
+    ramp = np.linspace(-1.0, 1.0, n)
+    rows = sliding_window_view(np.array(values), n)
+    rows = rows - rows.mean(axis=1, keepdims=True)
+    slopes = np.array([ramp @ row for row in rows])
+    rest: FloatArray = rows - ramp * slopes[:, None] / (ramp @ ramp)
+    return rest
 
 
-def _least_swing(told: list[FloatArray]) -> float:
+def _least_swing(told: FloatArray) -> float:
     """Return the least standard deviation over the delays; NaN where it told nothing."""
-    return min(float(one.std()) for one in told)
+    least: float = min(told.std(axis=1).tolist())
+    return least
 
 
-def _share(seen: FloatArray, told: list[FloatArray]) -> float:
+def _share(seen: FloatArray, told: FloatArray) -> float:
     """Return the greatest share of what the autopilot told that is seen, over the delays."""
     return max(abs(float(seen @ one)) / float(one @ one) for one in told)
 

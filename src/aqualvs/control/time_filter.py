@@ -238,7 +238,7 @@ class _Motion:
         if not dt > 0.0:
             return track
         move = np.eye(6)
-        move[:3, 3:] = dt * np.eye(3)
+        move[0, 3] = move[1, 4] = move[2, 5] = dt
         cov = move @ track.cov @ move.T
         noise = self._noise.copy()
         noise[0, 0] *= _manoeuvre_factor(track.surprise)
@@ -258,21 +258,23 @@ class _Motion:
         ahead = self.forecast(track, time_s)
         innovation = measured - ahead.state[:3]
         of_innovation = ahead.cov[:3, :3] + cov
-        used = np.ones(3, np.bool_)
-        if innovation @ np.linalg.inv(of_innovation) @ innovation > self._gate:
+        inverse = np.linalg.inv(of_innovation)
+        at, of_used, n_left_out = [0, 1, 2], cov, (0, 0)
+        if innovation @ inverse @ innovation > self._gate:
             used = innovation**2 <= self._gate_alone * np.diag(of_innovation)
             if not used[0] or used.all() or time_s - track.time_s > fresh_s:
                 return None
-        at = np.flatnonzero(used)
-        gain = ahead.cov[:, at] @ np.linalg.inv(of_innovation[np.ix_(at, at)])
+            at = np.flatnonzero(used).tolist()
+            inverse = np.linalg.inv(of_innovation[np.ix_(at, at)])
+            of_used = cov[np.ix_(at, at)]
+            pitch, yaw = ahead.n_left_out
+            n_left_out = (0 if used[1] else pitch + 1, 0 if used[2] else yaw + 1)
+        gain = ahead.cov[:, at] @ inverse
         # Joseph's form stays positive whatever rounding does.
         keep = np.eye(6)
         keep[:, at] -= gain
-        after = keep @ ahead.cov @ keep.T + gain @ cov[np.ix_(at, at)] @ gain.T
+        after = keep @ ahead.cov @ keep.T + gain @ of_used @ gain.T
         state = ahead.state + gain @ innovation[at]
-        out_pitch, out_yaw = (
-            0 if one else n + 1 for one, n in zip(used[1:], ahead.n_left_out, strict=True)
-        )
         # The mean is over about two and a half frames.
         surprise = float(innovation[0] ** 2 / of_innovation[0, 0])
         updated = replace(
@@ -281,7 +283,7 @@ class _Motion:
             state=state,
             cov=0.5 * (after + after.T),
             n_measurements=track.n_measurements + 1,
-            n_left_out=(out_pitch, out_yaw),
+            n_left_out=n_left_out,
         )
         return self._angles_begun(updated, measured, cov)
 

@@ -8,6 +8,8 @@ direction in `cam`, "distorted" ones are those after the distortion: (u - cx)/fx
 import math
 from typing import NamedTuple, TypeAlias
 
+import numpy as np
+
 from aqualvs.geometry.compiled import inline_kernel, inner_kernel, kernel
 
 Vector: TypeAlias = tuple[float, float, float]
@@ -261,12 +263,16 @@ def opencv_limits(lens: LensParams) -> tuple[float, float]:
     return limit, between_spokes * widest
 
 
+# Of steps of a quarter of a degree, here for they are the same on every spoke of every lens.
+_TANGENTS = np.array([math.tan(i_step * math.pi / 720.0) for i_step in range(360)])
+
+
 @inline_kernel
 def _limit_on_spoke(lens: LensParams, ex: float, ey: float, limit: float) -> float:
     """Return the squared radius of the first sign change along (ex, ey), at most `limit`."""
     inside = 0.0
     for i_step in range(1, 360):
-        outside = math.tan(i_step * math.pi / 720.0)
+        outside = _TANGENTS[i_step]
         last = outside * outside >= limit
         if last:
             outside = math.sqrt(limit)

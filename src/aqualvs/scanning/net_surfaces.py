@@ -19,6 +19,7 @@ from aqualvs.geometry.compiled import borrowing_kernel, inner_kernel, kernel
 from aqualvs.geometry.linear_algebra import invert_symmetric, median_of, solve_symmetric
 from aqualvs.geometry.planes import Plane
 from aqualvs.scanning.candidates import Subsegments
+from aqualvs.scanning.patch import height_over
 from aqualvs.scanning.plane_fit import TUKEY, PlaneFit, normal_equations
 from aqualvs.scanning.plane_search import WEIGHT, X, Z
 from aqualvs.scanning.posture import Posture
@@ -122,14 +123,41 @@ def merged_plane(
     return Plane(m / length, 1.0 / length)
 
 
-def fit_mean(points: FloatArray, start: Plane) -> PlaneFit | None:
+@borrowing_kernel
+def share_near(points: FloatArray, laser: IntArray, patch: FloatArray, near: float) -> float:
+    """Return the share of a laser's strands that are nearer to a surface than `near`, in metres.
+
+    It is that of the second best laser: a line and one point share a plane, so that a plane may
+    hold all strands of one laser by chance, and those of the others beside them.
+
+    Parameters
+    ----------
+    points : array, shape (N, 3), laser : int array, shape (N,)
+        Of the strands.
+    patch : array, shape (16,)
+        As `Patch.packed` gives it.
+    """
+    best, second = 0.0, 0.0
+    for k in range(laser.max() + 1):
+        n, on = 0, 0
+        for i in range(laser.shape[0]):
+            if laser[i] == k:
+                n += 1
+                x, y, z = points[i, 0], points[i, 1], points[i, 2]
+                on += abs(height_over(patch, x, y, z)) < near
+        share = on / max(n, 1)
+        best, second = max(best, share), max(min(best, share), second)
+    return second
+
+
+def fit_mean(points: FloatArray, laser: IntArray, start: Plane) -> PlaneFit | None:
     """Fit m·X = 1 to the strands of a folded net, with equal weights.
 
     The scatter about the plane is due to the folds, and gives the covariance.
 
     Parameters
     ----------
-    points : array, shape (N, 3)
+    points : array, shape (N, 3), laser : int array, shape (N,)
         Of the strands, in `dome`, metres.
     start : Plane
         A first guess: tells outliers.
@@ -142,13 +170,17 @@ def fit_mean(points: FloatArray, start: Plane) -> PlaneFit | None:
     if len(points) <= 3:
         return None
     m, weights, covariance = start.normal / start.offset, np.empty(len(points)), np.empty((3, 3))
-    rms = _fit_mean(points, m, weights, covariance)
+    rms = _fit_mean(points, laser, m, weights, covariance)
     return PlaneFit(m, covariance, weights, rms) if np.isfinite(rms) else None
 
 
 @kernel
 def _fit_mean(
-    points: FloatArray, m: FloatArray, weights: FloatArray, covariance: FloatArray
+    points: FloatArray,
+    laser: IntArray,
+    m: FloatArray,
+    weights: FloatArray,
+    covariance: FloatArray,
 ) -> float:
     """Refine m in place, write weights and covariance; return the rms, NaN if undetermined."""
     n, one = points.shape[0], np.empty(points.shape[0])
@@ -159,9 +191,7 @@ def _fit_mean(
     exact = 1e-9
     for _ in range(iterations):
         _distances(points, m, off)
-        for i in range(n):
-            weights[i] = abs(off[i])
-        cut = TUKEY * 1.4826 * max(median_of(weights), exact)
+        cut = TUKEY * 1.4826 * max(_usual_distance(off, laser), exact)
         for i in range(n):
             weights[i] = max(1.0 - (off[i] / cut) ** 2, 0.0) ** 2
         normal_equations(points, one, weights, normal, right)
@@ -179,6 +209,22 @@ def _fit_mean(
         for k in range(3):
             covariance[j, k] *= factor
     return float(np.sqrt(square / weight / (m[0] * m[0] + m[1] * m[1] + m[2] * m[2])))
+
+
+@inner_kernel
+def _usual_distance(off: FloatArray, laser: IntArray) -> float:
+    """Return the median distance of the second best laser's strands, as `share_near` explains."""
+    best, second, mine = np.inf, np.inf, np.empty(off.shape[0])
+    for k in range(laser.max() + 1):
+        n = 0
+        for i in range(off.shape[0]):
+            if laser[i] == k:
+                mine[n] = abs(off[i])
+                n += 1
+        if n > 0:
+            median = median_of(mine[:n])
+            best, second = min(best, median), min(max(best, median), second)
+    return second if second < np.inf else best
 
 
 @inner_kernel

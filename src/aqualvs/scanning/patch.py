@@ -51,15 +51,6 @@ def heights_over(points: FloatArray, patch: FloatArray, off: FloatArray) -> None
 
 
 @borrowing_kernel
-def share_near(points: FloatArray, patch: FloatArray, gate: float) -> float:
-    """Return the share of points (N, 3) less than `gate` metres off a patch (16,)."""
-    n = 0
-    for i in range(points.shape[0]):
-        n += abs(height_over(patch, points[i, 0], points[i, 1], points[i, 2])) < gate
-    return float(n / points.shape[0])
-
-
-@borrowing_kernel
 def write_tangent(patch: FloatArray, m: FloatArray) -> bool:
     """Write m = n/d of the tangent plane at the point nearest to the origin; False without one."""
     a, b, c, p, q, r = patch[10], patch[11], patch[12], patch[13], patch[14], patch[15]

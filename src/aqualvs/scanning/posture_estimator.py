@@ -31,6 +31,7 @@ from aqualvs.scanning.net_surfaces import (
     fit_mean,
     inflate_covariance,
     mark_beside,
+    share_near,
 )
 from aqualvs.scanning.paraboloid import MIN_BEND, fit_patch, refit_at_nearest, shows_curvature
 from aqualvs.scanning.patch import (
@@ -40,7 +41,6 @@ from aqualvs.scanning.patch import (
     nearest_in_view,
     nearest_tangent,
     packed_plane,
-    share_near,
     tangent_covariance,
 )
 from aqualvs.scanning.plane_fit import (
@@ -343,14 +343,16 @@ class PostureEstimator:
             best = _inflate_covariance(flat, curved, 1.0)
         patch = packed_plane(plane) if best.patch is None else best.patch.packed()
         net_mask = self._grow_net_mask(candidates, best.inliers, plane, patch)
-        folded = self._mean_plane_of_folds(candidates, net_mask, off, plane, patch, best)
-        if folded is None or not folded.folded:
+        seen = self._beside(candidates, net_mask, off, plane)
+        share = _share_on(seen, patch, plane)
+        if share < _WHOLE_SHARE:
             is_curved = best is curved
-            best = self._or_mean_plane(
-                candidates, net_mask, plane, patch, folded or best, is_curved
+            folded = self._mean_plane_of_folds(
+                candidates, net_mask, seen, share, plane, patch, best
             )
-        else:
-            best = folded
+            best = folded or best
+            if not best.folded:
+                best = self._or_mean_plane(candidates, net_mask, plane, patch, best, is_curved)
         return replace(best, net_mask=net_mask)
 
     def _measure_folds(
@@ -364,10 +366,13 @@ class PostureEstimator:
         off = np.empty(len(candidates))
         distances_off(candidates.points, plane.normal, plane.offset, off)
         inliers = (seen.group >= 0) & (fit.weights[seen.group] > 0.0)
-        net_mask = self._grow_net_mask(candidates, inliers, plane, packed_plane(plane))
-        folded = self._mean_plane_of_folds(
-            candidates, net_mask, off, plane, packed_plane(plane), None
-        )
+        patch = packed_plane(plane)
+        net_mask = self._grow_net_mask(candidates, inliers, plane, patch)
+        seen = self._beside(candidates, net_mask, off, plane)
+        share = _share_on(seen, patch, plane)
+        if share >= _FOLDED_STRANDS:
+            return None
+        folded = self._mean_plane_of_folds(candidates, net_mask, seen, share, plane, patch, None)
         if folded is None:
             return None
         for index in range(len(self._planes)):
@@ -400,7 +405,8 @@ class PostureEstimator:
         self,
         candidates: Candidates,
         net_mask: BoolArray,
-        off: FloatArray,
+        seen: "_Observed",
+        share: float,
         plane: Plane,
         patch: FloatArray,
         best: Measurement | None,
@@ -408,22 +414,19 @@ class PostureEstimator:
         """Return the posture to the mean plane of a net most of whose light is off the surface.
 
         A surface on one flank of a fold explains little of the light that lies about it, or the
-        mean plane of all that light contradicts it. `best` is the posture to the surface, if any:
-        where it is the main part of the net it is returned, widened as far as the two disagree.
+        mean plane of all that light contradicts it. `seen` are the strands about the surface,
+        `share` is that of those on it. `best` is the posture to the surface, if any: where it is
+        the main part of the net it is returned, widened as far as the two disagree.
         """
-        seen = self._beside(candidates, net_mask, off, plane)
-        if len(seen.observations.laser) < _MIN_FOLDED:
-            return None
-        near = _NEAR_SHARE * plane.offset
-        strands = share_near(seen.observations.points, patch, near)
-        few = strands < _FOLDED_STRANDS
-        if strands >= _WHOLE_SHARE or (best is None and not few):
-            return None
         intensity_share = intensity_share_near(
-            seen.group, candidates.confidence, seen.observations.points, patch, near
+            seen.group,
+            candidates.confidence,
+            seen.observations.points,
+            patch,
+            _NEAR_SHARE * plane.offset,
         )
-        if not few:
-            return best and self._widened(best, seen, plane, intensity_share)
+        if best and share >= _FOLDED_STRANDS:
+            return self._widened(best, seen, plane, intensity_share)
         mean = self._settled(candidates, net_mask, seen, self._mean_plane(candidates, seen, plane))
         if mean is None or best is None or intensity_share < _FOLDED_INTENSITY:
             return mean
@@ -437,7 +440,7 @@ class PostureEstimator:
         self, best: Measurement, seen: "_Observed", plane: Plane, intensity_share: float
     ) -> Measurement:
         """Widen a posture by the mean plane of the light near it; `intensity_share` is its own."""
-        fit = fit_mean(seen.observations.points, plane)
+        fit = fit_mean(seen.observations.points, seen.observations.laser, plane)
         if fit is None:
             return best
         return _disputed(best, posture_of(fit, 0.0, 0, self._axis_in_dome), intensity_share)
@@ -482,7 +485,7 @@ class PostureEstimator:
         self, candidates: Candidates, seen: "_Observed", plane: Plane
     ) -> Measurement | None:
         """Measure the posture to the mean plane of a folded net."""
-        fit = fit_mean(seen.observations.points, plane)
+        fit = fit_mean(seen.observations.points, seen.observations.laser, plane)
         found = None if fit is None else self._posture_of_fit(candidates, seen, fit, of_all=True)
         return None if found is None else replace(found, folded=True)
 
@@ -499,9 +502,7 @@ class PostureEstimator:
         seen = self._observe(
             candidates, candidates.component, _SHORTEST_STRAND, net_mask, plane.normal
         )
-        if len(seen.observations.laser) < _MIN_FOLDED:
-            return best
-        share = share_near(seen.observations.points, patch, _NEAR_SHARE * plane.offset)
+        share = _share_on(seen, patch, plane)
         if share >= _MAIN_SHARE and (share >= _WHOLE_SHARE or is_curved):
             return best
         mean = self._mean_plane(candidates, seen, plane)
@@ -622,6 +623,14 @@ class _Observed(NamedTuple):
     group: IntArray
     n_candidates: int
     observations: Observations
+
+
+def _share_on(seen: _Observed, patch: FloatArray, plane: Plane) -> float:
+    """Return the share of a net's strands on its surface; 1 where few strands show no folds."""
+    if len(seen.observations.laser) < _MIN_FOLDED:
+        return 1.0
+    strands = seen.observations
+    return share_near(strands.points, strands.laser, patch, _NEAR_SHARE * plane.offset)
 
 
 def _plane_of(fit: PlaneFit) -> Plane:

@@ -3,10 +3,11 @@
 A peak ("return") is a run of pixels above the local background with one maximum. The background on
 one side is the least pixel within reach; the higher of the two sides counts, so that a step edge (a
 box before a dark wall) has no contrast, and a stripe that runs along the search line has none
-either. The centre is the centroid of the pixels above half height, which keeps its place when the
-top saturates.
+either. The centre is the centroid of the profile above half height, which keeps its place when the
+top saturates; of a stripe narrower than two pixels, the peak of a Gaussian through three pixels.
 """
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
@@ -24,6 +25,10 @@ _WORD = 8
 _NOTHING, _MARKED, _UNMARKED = np.uint64(0), np.uint64(1), np.uint64(0)
 _EACH_BYTE, _BYTE_NUMBERS = np.uint64(0x0101010101010101), np.uint64(0x0001020304050607)
 _BRIGHT = np.uint8(255)
+# The profile of a stripe narrower than this is not straight between pixels: straight lines draw its
+# centroid to the grid by up to 0.05 px, at half of this width by 0.15 px. Noise moves both centres
+# alike at this width. A saturated pixel, at least this bright, has not a Gaussian's height.
+_NARROW_PX, _WHITE = 2.0, 250
 # Bytes that compiled loops work on at a time, or a multiple of them.
 _VECTOR = 128
 # Luma of flanks that are dark; black is 16.
@@ -368,11 +373,16 @@ def _measure_run(
         low = start
         if a < 0:
             continue
-        width = _width(row, a, b, level)
+        crossings = _crossings(row, a, b, level)
+        width = (b - crossings[1]) - (a + crossings[0])
         if width > reach_px:
             continue
         line[n] = x
-        table[POSITION, n] = _centroid(row, a, b, level)
+        table[POSITION, n] = (
+            _gaussian_peak(row, peak, level - np.int64(row[peak]))
+            if width < _NARROW_PX and row[peak] < _WHITE
+            else _centroid(row, a, b, level, crossings)
+        )
         table[HEIGHT, n] = 2 * np.int64(row[peak]) - level
         table[WIDTH, n], table[TOP, n] = width, row[peak]
         table[PULL, n] = _pull(row, peak, width, table[HEIGHT, n])
@@ -429,24 +439,49 @@ def _feet(row: U8Array, peak: int, low: int, high: int, level: np.int64) -> tupl
 
 
 @inline_borrowing_kernel
-def _width(row: U8Array, a: int, b: int, level: np.int64) -> float:
-    """Return the full width at half height."""
+def _crossings(row: U8Array, a: int, b: int, level: np.int64) -> tuple[float, float]:
+    """Return where the profile crosses half height, in pixels after `a` and before `b`."""
     below, above = 2 * np.int64(row[a]) - level, 2 * np.int64(row[a + 1]) - level
     rise = -below / (above - below)
     below, above = 2 * np.int64(row[b]) - level, 2 * np.int64(row[b - 1]) - level
-    fall = -below / (above - below)
-    return b - ((a + rise) + fall)
+    return rise, -below / (above - below)
 
 
 @inline_borrowing_kernel
-def _centroid(row: U8Array, a: int, b: int, level: np.int64) -> float:
-    """Return the centroid of the profile above half height, between the feet."""
+def _centroid(
+    row: U8Array, a: int, b: int, level: np.int64, crossings: tuple[float, float]
+) -> float:
+    """Return the centroid of the profile above half height, between its `crossings`.
+
+    The profile is a straight line from pixel to pixel. Sums over whole pixels alone would draw the
+    centroid of a stripe that is two pixels wide by up to 0.09 px to the grid; this one, by 0.01 px.
+    """
     total, moment = np.int64(0), np.int64(0)
     for k in range(1, b - a):
         value = 2 * np.int64(row[a + k]) - level
         total += value
         moment += value * k
-    return a + moment / total
+    # Half of the first and of the last pixel lies beyond the polygon; triangles take their place.
+    first, last = 2 * np.int64(row[a + 1]) - level, 2 * np.int64(row[b - 1]) - level
+    rise, fall = 1.0 - crossings[0], 1.0 - crossings[1]
+    end = b - a - 1
+    area = total - 0.5 * ((1.0 - rise) * first + (1.0 - fall) * last)
+    moments = moment - first * (1.0 / 3.0) - last * (0.5 * end + 1.0 / 6.0)
+    moments += 0.5 * (rise * first * (1.0 - rise / 3.0) + fall * last * (end + fall / 3.0))
+    return a + moments / area
+
+
+@inline_borrowing_kernel
+def _gaussian_peak(row: U8Array, peak: int, base: np.int64) -> float:
+    """Return the peak of a Gaussian through the highest pixel and its two neighbours.
+
+    Source: Fisher and Naidu, "A comparison of algorithms for subpixel peak detection", 1996.
+    """
+    # Rounding hides half a grey level.
+    before = math.log(max(np.int64(row[peak - 1]) - base, 0.5))
+    top = math.log(np.int64(row[peak]) - base)
+    after = math.log(max(np.int64(row[peak + 1]) - base, 0.5))
+    return peak + 0.5 * (before - after) / (before - 2.0 * top + after)
 
 
 @inline_borrowing_kernel

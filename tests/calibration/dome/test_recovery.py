@@ -182,9 +182,10 @@ def test_dome_of_the_sample(
         rows = {row["file"]: row for row in csv.DictReader(file)}
     given = [_given(rows[view.name], kind) for view in views]
     nominal = replace(guessed(truth, rotation_known=kind == "unknown"), lens=intrinsics.lens)
-    found = dome(
-        nominal, [BoardSet(name="air", views=views, poses=given)], known=intrinsics.uncertainty
-    )
+    # With poses or without, the pictures that a bare lens does not explain are the same.
+    bare = kind == "exact" or WHOLE
+    sets = [BoardSet(name="air", views=views, poses=given)]
+    found = dome(nominal, sets, None if bare else QUICK, known=intrinsics.uncertainty)
     assert 1e3 * lens_error(found, truth) < lens_mm
     turn = found.rig.dome_from_cam.rotation @ truth.dome_from_cam.rotation.T
     assert np.rad2deg(np.linalg.norm(rotvec_from_rotation(turn))) <= rotation_deg
@@ -192,5 +193,6 @@ def test_dome_of_the_sample(
     assert max(map(abs, errors.values())) < 3.0
     assert not found.left_out
     assert found.rms_px < 0.1
-    assert found.cross_validation is not None
-    assert found.cross_validation.dome_is_better
+    if bare:
+        assert found.cross_validation is not None
+        assert found.cross_validation.dome_is_better
