@@ -6,7 +6,7 @@ yaw under control before a net.
 
 import math
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -136,6 +136,21 @@ CONTROL = Experiment(
 )
 
 
+class _Setup(NamedTuple):
+    """Descent along the net in m and m/s, and the bars."""
+
+    seconds: float = 40.0
+    every: int = 10
+    range: float = 0.6
+    descent: float = 0.08
+    bar_percent: float = 0.5
+    bar_deg: float = 0.5
+    bar_valid: float = 90.0
+
+
+_SETUP = _Setup()
+
+
 class _Descent:
     """A mission: sink at a constant speed, holding range and yaw."""
 
@@ -151,10 +166,9 @@ class _Descent:
         state: VehicleState,  # noqa: ARG002
     ) -> Guidance:
         """Return range, yaw and descent; nothing without the net."""
-        descent = 0.08
         if posture is None:
             return Guidance(setpoint=None, stage=Stage.WAITING)
-        return Guidance(setpoint=self._setpoint, down=descent, stage=Stage.CHANGING_DEPTH)
+        return Guidance(setpoint=self._setpoint, down=_SETUP.descent, stage=Stage.CHANGING_DEPTH)
 
     def restart(self) -> None:
         """Do nothing: no state is kept."""
@@ -177,8 +191,7 @@ class _Watched:
 
     def look(self, world_from_dome: SE3, time_s: float) -> Posture | Refusal | None:
         """Return the sampled posture."""
-        every = 10
-        if self.n_looks % every == 0:
+        if self.n_looks % _SETUP.every == 0:
             posture = self.rendered.look(world_from_dome, time_s)
             truth = self.net.posture_at(world_from_dome, time_s)
             self.seen.append((time_s, posture, truth))
@@ -188,9 +201,6 @@ class _Watched:
 
 
 def _run_sea(laboratory: Laboratory) -> ExperimentResult:
-    bar_percent = 0.5
-    bar_deg = 0.5
-    bar_valid = 90.0
     sensor, log = _dive(laboratory)
     time_s = np.array([t for t, _, _ in sensor.seen])
     valid = np.array([bool(posture) for _, posture, _ in sensor.seen])
@@ -207,15 +217,17 @@ def _run_sea(laboratory: Laboratory) -> ExperimentResult:
             ExperimentRow(
                 what="pictures with a posture (%)",
                 ours=f"{share:.0f} of {len(valid)}",
-                bar=f">= {bar_valid:g}",
-                met=share >= bar_valid,
+                bar=f">= {_SETUP.bar_valid:g}",
+                met=share >= _SETUP.bar_valid,
             ),
-            ExperimentRow.at_most("rms error of the range (%)", rms[0], bar_percent, digits=3),
+            ExperimentRow.at_most(
+                "rms error of the range (%)", rms[0], _SETUP.bar_percent, digits=3
+            ),
             ExperimentRow(
                 what="rms error of pitch, yaw (degrees)",
                 ours=f"{rms[1]:.3f}, {rms[2]:.3f}",
-                bar=f"<= {bar_deg}",
-                met=bool(rms[1:].max() <= bar_deg),
+                bar=f"<= {_SETUP.bar_deg}",
+                met=bool(rms[1:].max() <= _SETUP.bar_deg),
             ),
             ExperimentRow(
                 what="correlation of heading and target yaw",
@@ -247,8 +259,6 @@ def _run_sea(laboratory: Laboratory) -> ExperimentResult:
 
 
 def _dive(laboratory: Laboratory) -> tuple[_Watched, LoopLog]:
-    seconds = 40.0
-    range = 0.6
     net = NetWall(curvature=-1.0 / 20.0, sway=0.04, sway_period=9.0, rock=math.radians(3.0))
     model = vehicle_model("bluerov2")
     sea_seed = 22
@@ -257,7 +267,7 @@ def _dive(laboratory: Laboratory) -> tuple[_Watched, LoopLog]:
         gains=load_gains(model.name),
         water=sea(current=0.15, waves=0.1, seed=sea_seed),
         net=net,
-        start_range=range,
+        start_range=_SETUP.range,
         seed=sea_seed,
     )
     scene = Scene(
@@ -271,8 +281,8 @@ def _dive(laboratory: Laboratory) -> tuple[_Watched, LoopLog]:
         RenderedSensor(net, laboratory.rig, np.random.default_rng([sea_seed, 2]), scene),
         laboratory,
     )
-    loop = case.loop(sensor, _Descent(Setpoint(range)))
-    return sensor, loop.run(seconds)
+    loop = case.loop(sensor, _Descent(Setpoint(_SETUP.range)))
+    return sensor, loop.run(_SETUP.seconds)
 
 
 def _errors(sensor: _Watched) -> FloatArray:

@@ -176,11 +176,7 @@ def fit_mean(points: FloatArray, laser: IntArray, start: Plane) -> PlaneFit | No
 
 @kernel
 def _fit_mean(
-    points: FloatArray,
-    laser: IntArray,
-    m: FloatArray,
-    weights: FloatArray,
-    covariance: FloatArray,
+    points: FloatArray, laser: IntArray, m: FloatArray, weights: FloatArray, covariance: FloatArray
 ) -> float:
     """Refine m in place, write weights and covariance; return the rms, NaN if undetermined."""
     n, one = points.shape[0], np.empty(points.shape[0])

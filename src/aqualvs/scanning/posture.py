@@ -136,24 +136,7 @@ class Posture:
 
         The expected error of the posture, for use outside of the package.
         """
-        total: FloatArray = self.covariance + self.rig_covariance
-        return total
-
-
-def posture_from_fit(fit: PlaneFit, points: FloatArray, camera_axis_in_dome: FloatArray) -> Posture:
-    """Convert a plane fit to a posture (paper, Eq. 23-26), without validation.
-
-    Parameters
-    ----------
-    fit : PlaneFit
-        Of the target.
-    points : array, shape (N, 3)
-        The inliers of the fit, in `dome`, metres.
-    camera_axis_in_dome : array, shape (3,)
-        Unit vector along which the camera looks.
-    """
-    n_points, nearest = count_inliers(points, np.ones(len(points)))
-    return posture_of(fit, nearest, n_points, camera_axis_in_dome)
+        return self.covariance + self.rig_covariance
 
 
 def posture_of(
@@ -181,14 +164,8 @@ def validate(
 ) -> Posture | Refusal:
     """Return the posture if a pilot may rely on it, else a refusal.
 
-    Parameters
-    ----------
-    posture : Posture
-        As measured.
-    working_range : (float, float)
-        Nearest and farthest range that is accepted, in metres.
-    max_rms_share : float
-        Largest scatter of the points about the surface, as a share of the range.
+    `posture`: as measured. `working_range`: nearest and farthest range that is accepted, in metres.
+    `max_rms_share`: largest scatter of the points about the surface, as a share of the range.
     """
     near, far = working_range
     distance = posture.range

@@ -179,12 +179,7 @@ class PeakFinder:
         self._scratch = _Workspace(padded, minima, spare, background, above, words)
 
     def find(
-        self,
-        image: SearchImage,
-        min_contrast: int,
-        every: int,
-        line: IntArray,
-        table: FloatArray,
+        self, image: SearchImage, min_contrast: int, every: int, line: IntArray, table: FloatArray
     ) -> int:
         """Find the peaks of one frame, and return their number.
 
@@ -478,9 +473,9 @@ def _gaussian_peak(row: U8Array, peak: int, base: np.int64) -> float:
     Source: Fisher and Naidu, "A comparison of algorithms for subpixel peak detection", 1996.
     """
     # Rounding hides half a grey level.
-    before = math.log(max(np.int64(row[peak - 1]) - base, 0.5))
+    before = math.log(max(float(np.int64(row[peak - 1]) - base), 0.5))
     top = math.log(np.int64(row[peak]) - base)
-    after = math.log(max(np.int64(row[peak + 1]) - base, 0.5))
+    after = math.log(max(float(np.int64(row[peak + 1]) - base), 0.5))
     return peak + 0.5 * (before - after) / (before - 2.0 * top + after)
 
 
