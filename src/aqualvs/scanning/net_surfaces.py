@@ -15,7 +15,12 @@ from typing import NamedTuple
 import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import borrowing_kernel, inner_kernel, kernel
+from aqualvs.geometry.compiled import (
+    borrowing_kernel,
+    inline_borrowing_kernel,
+    inner_kernel,
+    kernel,
+)
 from aqualvs.geometry.linear_algebra import invert_symmetric, median_of, solve_symmetric
 from aqualvs.geometry.planes import Plane
 from aqualvs.scanning.candidates import Subsegments
@@ -138,7 +143,7 @@ def share_near(points: FloatArray, laser: IntArray, patch: FloatArray, near: flo
         As `Patch.packed` gives it.
     """
     best, second = 0.0, 0.0
-    for k in range(laser.max() + 1):
+    for k in range(_n_lasers(laser)):
         n, on = 0, 0
         for i in range(laser.shape[0]):
             if laser[i] == k:
@@ -148,6 +153,15 @@ def share_near(points: FloatArray, laser: IntArray, patch: FloatArray, near: flo
         share = on / max(n, 1)
         best, second = max(best, share), max(min(best, share), second)
     return second
+
+
+@inline_borrowing_kernel
+def _n_lasers(laser: IntArray) -> int:
+    """Return the number of lasers up to the last one; `max` of an array would create one."""
+    n = 0
+    for one in laser:
+        n = max(n, one + 1)
+    return n
 
 
 def fit_mean(points: FloatArray, laser: IntArray, start: Plane) -> PlaneFit | None:
@@ -211,7 +225,7 @@ def _fit_mean(
 def _usual_distance(off: FloatArray, laser: IntArray) -> float:
     """Return the median distance of the second best laser's strands, as `share_near` explains."""
     best, second, mine = np.inf, np.inf, np.empty(off.shape[0])
-    for k in range(laser.max() + 1):
+    for k in range(_n_lasers(laser)):
         n = 0
         for i in range(off.shape[0]):
             if laser[i] == k:
