@@ -11,6 +11,13 @@ from aqualvs.geometry.planes import Plane
 from aqualvs.scanner import Scanner, ScannerOptions
 from aqualvs.scanning import assignment
 from aqualvs.scanning.assignment import NOT_TESTED, AssignmentOutcome, Verdict, inflate_for_rival
+from aqualvs.scanning.assignment_kernels import (
+    FREEDOM,
+    INTENSITY_WEIGHT,
+    N_FACTS,
+    PER_LASER,
+    VARIANCE,
+)
 from aqualvs.scanning.candidates import find_candidates
 from aqualvs.scanning.laser_bands import SearchAxis, plan_bands
 from aqualvs.scanning.posture import Posture, Reason, Refusal
@@ -123,6 +130,22 @@ def posture(distance: float, yaw: float) -> Posture:
         n_points=100,
         rms=1e-3,
     )
+
+
+def test_two_bright_stripes_do_not_outweigh_three_that_are_left_over() -> None:
+    """A plane of two lasers leaves over 1.6 stripes of five lasers, not one of its brighter two."""
+    five = facts(light=277.0, n_lasers=5, freedom=7.0)
+    two = facts(light=189.0, n_lasers=2, freedom=1.0)
+    planes = np.array([[0.0, 1.0, 0.0, 0.67], [0.0, 0.94, -0.34, 0.37]])
+    assert assignment._verdict(planes, np.array([five, two])) == NOT_TESTED
+    assert assignment._log_odds(five, two) == -assignment._log_odds(two, five)
+
+
+def facts(*, light: float, n_lasers: int, freedom: float) -> FloatArray:
+    found = np.zeros(N_FACTS)
+    found[[INTENSITY_WEIGHT, PER_LASER]] = light, light / n_lasers
+    found[[VARIANCE, FREEDOM]] = 0.08, freedom
+    return found
 
 
 def test_a_near_rival_widens_and_a_far_one_does_not() -> None:

@@ -404,17 +404,16 @@ def _plane(packed: FloatArray) -> Plane:
 
 def _log_odds(one: FloatArray, other: FloatArray) -> float:
     """Return the log-odds of one hypothesis against another."""
-    per_laser = max(one[PER_LASER], other[PER_LASER], 1e-9)
-    intensity_share = (
-        _ODDS.foreign_stripe * (one[INTENSITY_WEIGHT] - other[INTENSITY_WEIGHT]) / per_laser
-    )
+    # What the other leaves over are stripes of the one that explains more light.
+    more = one if one[INTENSITY_WEIGHT] > other[INTENSITY_WEIGHT] else other
+    foreign = (one[INTENSITY_WEIGHT] - other[INTENSITY_WEIGHT]) / max(more[PER_LASER], 1e-9)
     dark = _ODDS.dark_laser * (other[DARK] - one[DARK])
     freedom = min(one[FREEDOM], other[FREEDOM], _ODDS.max_freedom)
     residuals = 0.0
     if freedom > 0.0:
         residuals = 0.5 * freedom * math.log(other[VARIANCE] / one[VARIANCE])
     return float(
-        intensity_share
+        _ODDS.foreign_stripe * foreign
         + dark
         + min(max(residuals, -_ODDS.max_by_residuals), _ODDS.max_by_residuals)
     )
