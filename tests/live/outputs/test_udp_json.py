@@ -86,6 +86,14 @@ def test_values_are_those_of_the_csv(make: Callable[[], LiveSample]) -> None:
             assert value is None, name
 
 
+def test_a_sigma_that_is_a_whole_number_is_no_integer() -> None:
+    """Receivers with static types read each key as one type."""
+    exact = with_posture(replace(measured(), rig_covariance=np.zeros((3, 3))))
+    found = decoded(exact)
+    assert type(found["sigma_range_rig_m"]) is float
+    assert type(found["n_points"]) is int
+
+
 def test_what_is_live_comes_along() -> None:
     health = Health(rate_hz=24.98, n_frames=3)
     fields = decoded(replace(first_sample(), health=health))

@@ -69,7 +69,9 @@ def json_fields(sample: LiveSample) -> dict[str, Value]:
     if refusal is not None:
         fields["reason"], fields["detail"] = refusal.reason.value, refusal.detail or None
     cells = posture_cells(scan)
-    fields |= {key: _number(cells[key]) for key in _POSTURE_KEYS}
+    fields |= {
+        key: _number(cells[key], int if key == "n_points" else float) for key in _POSTURE_KEYS
+    }
     fields["n_water"] = _fixed(scan.n_water, 6)
     fields |= _filtered_fields(sample.filtered)
     fields["rate_hz"] = _fixed(sample.health.rate_hz, 3)
@@ -78,11 +80,9 @@ def json_fields(sample: LiveSample) -> dict[str, Value]:
     return fields
 
 
-def _number(cell: str) -> Value:
-    """Return the number in a cell of `posture.csv`."""
-    if cell.isdecimal():
-        return int(cell)
-    return float(cell) if cell and math.isfinite(float(cell)) else None
+def _number(cell: str, kind: type[int] | type[float] = float) -> Value:
+    """Return the number in a cell of `posture.csv`; None where there is none."""
+    return kind(cell) if cell and math.isfinite(float(cell)) else None
 
 
 def _filtered_fields(filtered: FilteredPosture | None) -> dict[str, Value]:
