@@ -146,8 +146,18 @@ def validated(
 ) -> AnyPart:
     """Return the content of a file as its schema.
 
-    `source`: how messages call the file. Raises `error` with one line: source, place, value,
-    remedy.
+    Parameters
+    ----------
+    kind : type
+        What the file may hold.
+    content : object
+        As read from YAML.
+    source : object
+        How messages call the file.
+    error : type
+        What is raised on a fault, with one line: source, place, value, remedy.
+    words : SchemaWords, optional
+        Of messages on this kind of file.
     """
     try:
         return kind.model_validate(content)
@@ -159,9 +169,19 @@ def validated(
 def load_settings(path: Path, kind: type[AnyPart], key: str, version: int) -> AnyPart:
     """Return the content of a file, checked key by key.
 
-    `kind`: what the file may hold. `key`: first key of such a file, whose value is the version of
-    its format. `version`: version that is read. Raises `OptionError`: one line: file, place, value,
-    remedy.
+    Parameters
+    ----------
+    kind : type
+        What the file may hold.
+    key : str
+        First key of such a file, whose value is the version of its format.
+    version : int
+        Version that is read.
+
+    Raises
+    ------
+    OptionError
+        One line: file, place, value, remedy.
     """
     content = read_yaml(path, f"a file that begins with '{key}: {version}'", OptionError)
     return parse_settings(content, kind, key, version, str(path))

@@ -263,7 +263,7 @@ def opencv_limits(lens: LensParams) -> tuple[float, float]:
     return limit, between_spokes * widest
 
 
-# Of steps of a quarter of a degree, here for they are the same on every spoke of every lens.
+# Tangents of the steps, a quarter of a degree each: every spoke of every lens has the same.
 _TANGENTS = np.array([math.tan(i_step * math.pi / 720.0) for i_step in range(360)])
 
 

@@ -164,8 +164,14 @@ def validate(
 ) -> Posture | Refusal:
     """Return the posture if a pilot may rely on it, else a refusal.
 
-    `posture`: as measured. `working_range`: nearest and farthest range that is accepted, in metres.
-    `max_rms_share`: largest scatter of the points about the surface, as a share of the range.
+    Parameters
+    ----------
+    posture : Posture
+        As measured.
+    working_range : (float, float)
+        Nearest and farthest range that is accepted, in metres.
+    max_rms_share : float
+        Largest scatter of the points about the surface, as a share of the range.
     """
     near, far = working_range
     distance = posture.range
