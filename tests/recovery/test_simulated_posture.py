@@ -126,6 +126,29 @@ def test_a_wide_picture(name: str, t: float, rig_name: str) -> None:
     assert np.hypot(pitch, yaw) < (0.2 if name == "wall_yaw" else 1.5)
 
 
+def test_a_net_whose_stripes_lost_their_colour() -> None:
+    # As H.264 at low bit rates, which drops the chroma of dashes a few pixels long.
+    renderer, scanner = equipment(SMALL)
+    picture = renderer.render(
+        load_scenario("net_diamond").scene_at(2.0), 2.0, np.random.default_rng(7)
+    )
+    luma, chroma = planes_of_image(cv2.cvtColor(picture.image, cv2.COLOR_RGB2BGR))
+    assert chroma is not None
+    flat = (np.full_like(chroma[0], 128), np.full_like(chroma[1], 128))
+    posture, grey = (scanner.process(Frame(0, 2.0, luma, seen)).posture for seen in (flat, None))
+    truth = visible_fit(picture.lit, SurfaceKind.NET)
+    assert truth is not None
+    share, pitch, yaw = errors(Shot(posture, truth[0], np.inf))
+    assert abs(share) < 0.002
+    assert np.hypot(pitch, yaw) < 0.3
+    # Colour tells nothing, for or against: the result is about that of a grey picture.
+    assert posture
+    assert grey
+    ratio = np.diag(posture.covariance) / np.diag(grey.covariance)
+    assert np.all(ratio < 1.4)
+    assert np.all(ratio > 0.6)
+
+
 def test_the_wall_behind_a_net_is_never_the_target() -> None:
     clutter = [shoot(name, t) for name, t in NETS if name == "net_clutter"]
     assert all(shot.behind == pytest.approx(0.45) for shot in clutter)

@@ -284,6 +284,23 @@ def test_lines_are_no_paint_however_many_peaks_they_make() -> None:
     assert learn_paint(mixed, 1900.0) is None
 
 
+def white_dashes(length: int) -> U8:
+    """Level stripes on twine, without colour: bars of which pieces of some columns are seen."""
+    bars = [Bar(y, (1.0, 1.0, 1.0), 80.0) for y in (60.0, 120.0, 180.0)]
+    dark, lit = picture(noise=1.0), picture(*bars, noise=1.0)
+    return np.where((np.arange(WIDTH) % 12 < length)[:, None], lit, dark)
+
+
+def test_dashes_without_any_colour_are_not_ruled_out() -> None:
+    # The codec gave them the chroma of the water around.
+    found = detect(white_dashes(3))
+    on_bars = np.min(np.abs(found.position[:, None] - [60.0, 120.0, 180.0]), axis=1) < 1.5
+    assert np.count_nonzero(on_bars) > 0.9 * 3 * WIDTH / 4
+    assert np.all(found.likelihood[on_bars] == 1.0)
+    # Long ones would have kept their colour.
+    assert np.all(detect(white_dashes(12)).likelihood < 0.5)
+
+
 def test_an_overexposed_line_shows_less_of_its_colour() -> None:
     # As on rendered stripes: of 0.24 levels of chroma at 170 of luma, 0.13 are left at 220.
     table = np.hstack(

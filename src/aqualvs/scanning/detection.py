@@ -4,6 +4,7 @@
 peaks in them within the lasers' bands.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
@@ -11,13 +12,14 @@ from typing import TYPE_CHECKING, NamedTuple
 import cv2
 import numpy as np
 
-from aqualvs.geometry.arrays import FloatArray, IntArray
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import inline_kernel, inner_kernel, kernel
 from aqualvs.geometry.linear_algebra import at_rows, element_at, where
 from aqualvs.optics.shutter import FIRST_ROW, Field
 from aqualvs.scanning.laser_bands import LaserBand, SearchAxis
 from aqualvs.scanning.laser_colour import (
     HIGHEST_USEFUL,
+    RATIO_LEAST,
     Paint,
     channel_image,
     expected_colour,
@@ -33,6 +35,8 @@ from aqualvs.scanning.stripe import (
     N_MEASURES,
     POSITION,
     PULL,
+    STEP_U,
+    STEP_V,
     PeakFinder,
     SearchImage,
     StripeOptions,
@@ -156,6 +160,26 @@ class _SearchOptions(NamedTuple):
 
 
 _SEARCH = _SearchOptions()
+
+
+class _DashOptions(NamedTuple):
+    """Stripes on thin twine whose chroma the codec dropped.
+
+    Tuned on rendered dives of nets as H.264 at 640x480.
+    """
+
+    # Least height of the peaks, which stripes reach and most paint does not; the least number of
+    # them, and the largest ratio to what the lasers can make; the largest share of them that shows
+    # as much of the lasers' colour as the weakest line; and the largest share that is longer than a
+    # dash: of such stripes codecs keep the chroma.
+    tall: float = 32.0
+    min_tall: int = 48
+    crowd: float = 1.5
+    max_coloured: float = 0.05
+    max_long: float = 0.5
+
+
+_DASH = _DashOptions()
 
 _NO_CHROMA = np.empty((0, 0), np.uint8)
 
@@ -298,7 +322,7 @@ class FrameDetector:
         _, sample, _ = self._find(images, options.min_contrast, _SEARCH.sample_every)
         contrast, paint = self._survey(sample, frame.chroma is not None)
         line, table, ends = self._find(images, max(contrast, options.min_contrast))
-        if frame.chroma is None:
+        if frame.chroma is None or are_colourless_dashes(line, table, ends, self._n_possible):
             likelihood = np.ones(len(line))
         else:
             likelihood = self._likelihood(table, paint, self._n_possible)
@@ -384,6 +408,39 @@ class FrameDetector:
 
 
 @kernel
+def are_colourless_dashes(
+    line: IntArray, table: FloatArray, ends: IntArray, n_possible: float
+) -> bool:
+    """Return whether a frame's tall peaks are short stripes, and hardly any has a laser's colour.
+
+    A codec drops the chroma of stripes that are a few pixels long, as on thin twine at low bit
+    rates. Then colour is no evidence, as in a grey picture. Twine in white light makes long peaks.
+
+    Parameters
+    ----------
+    line, table, ends
+        As in `select_peaks`.
+    n_possible : float
+        Peaks that the lasers can make. Where many more are tall, most are something else.
+    """
+    tall, n_coloured = np.empty(line.shape[0], np.bool_), 0
+    for i in range(line.shape[0]):
+        height = table[HEIGHT, i]
+        tall[i] = height >= _DASH.tall
+        step = math.hypot(table[STEP_U, i], table[STEP_V, i])
+        n_coloured += tall[i] and step > RATIO_LEAST * height
+    n_tall, n_long = where(tall).shape[0], 0
+    if not _DASH.min_tall <= n_tall <= _DASH.crowd * n_possible:
+        return False
+    if n_coloured > _DASH.max_coloured * n_tall:
+        return False
+    for k in range(ends.shape[0] - 1):
+        rows = _marked(tall, ends[k], ends[k + 1])
+        n_long += where(_are_long(line, table, rows)).shape[0]
+    return bool(n_long <= _DASH.max_long * n_tall)
+
+
+@kernel
 def select_peaks(
     line: IntArray,
     table: FloatArray,
@@ -412,15 +469,29 @@ def select_peaks(
         keep[i] = likelihood[i] >= min_likelihood
     bright = min_share * element_at(at_rows(table[HEIGHT], where(keep)), _SEARCH.bright_quantile)
     for k in range(ends.shape[0] - 1):
-        rows = where(keep[ends[k] : ends[k + 1]])
-        its_line = np.empty(rows.shape[0], np.int64)
-        for i in range(rows.shape[0]):
-            rows[i] += ends[k]
-            its_line[i] = line[rows[i]]
-        long = in_a_row(its_line, at_rows(table[POSITION], rows))
+        rows = _marked(keep, ends[k], ends[k + 1])
+        long = _are_long(line, table, rows)
         for i in range(rows.shape[0]):
             keep[rows[i]] = long[i] or table[HEIGHT, rows[i]] >= bright
     return where(keep)
+
+
+@inner_kernel
+def _marked(marks: BoolArray, start: int, end: int) -> IntArray:
+    """Return the rows from `start` to before `end` that are marked."""
+    rows = where(marks[start:end])
+    for i in range(rows.shape[0]):
+        rows[i] += start
+    return rows
+
+
+@inner_kernel
+def _are_long(line: IntArray, table: FloatArray, rows: IntArray) -> BoolArray:
+    """Mark those of some peaks of one direction that are of many in a row."""
+    its_line = np.empty(rows.shape[0], np.int64)
+    for i in range(rows.shape[0]):
+        its_line[i] = line[rows[i]]
+    return in_a_row(its_line, at_rows(table[POSITION], rows))
 
 
 def _in_picture(peaks: StripePeaks, field: Field) -> StripePeaks:
