@@ -268,6 +268,36 @@ def slanted_strands(points: FloatArray) -> BoolArray:
     return lit
 
 
+def test_a_net_with_little_light_that_one_laser_misses_is_chance() -> None:
+    """In caustics, strands make such planes: with less than a quarter of the light, two lasers."""
+    rig = example_rig()
+    net = Plane.from_normal((0.1, 1.0, 0.0), 0.5)
+    laser_bands, triangulator = plan_bands(rig, rig.camera()), Triangulator(rig, rig.camera())
+    test = assignment.AssignmentTest(laser_bands, triangulator, rig.working_range)
+    elsewhere = [((0.4, 1.0, 0.2), 0.7), ((-0.3, 1.0, 0.2), 0.8), ((0.1, 1.0, 0.2), 0.4)]
+    loose = [
+        peaks_of(replace(rig, lasers=(laser,)), [(Plane.from_normal(*plane), slanted_strands)], 0.1)
+        for laser, plane in zip(rig.lasers, elsewhere, strict=True)
+    ]
+
+    def is_chance(n_lasers: int, one_strand_of: int) -> bool:
+        def few(points: FloatArray) -> BoolArray:
+            number = (points[:, 0] + 0.4 * points[:, 2]) // 0.03
+            lit: BoolArray = slanted_strands(points) & (number % one_strand_of == 0)
+            return lit
+
+        of_net = peaks_of(replace(rig, lasers=rig.lasers[:n_lasers]), [(net, few)], 0.1)
+        candidates = find_candidates(joined([of_net, *loose]), laser_bands, triangulator)
+        subsegments = candidates.subsegments()
+        seen = surface_on(net, subsegments, len(rig.lasers), 850.0)
+        return test.is_by_chance(candidates, subsegments, [seen], replace(seen, is_mesh=True))
+
+    # A sixth of the light, a quarter, and a fifth.
+    assert is_chance(2, 3)
+    assert not is_chance(2, 2)
+    assert not is_chance(3, 3)
+
+
 def test_a_net_before_a_wall_is_not_overlooked(monkeypatch: pytest.MonkeyPatch) -> None:
     rig = example_rig()
     net, wall = Plane.from_normal((0.1, 1.0, 0.0), 0.4), Plane.from_normal((0.0, 1.0, 0.1), 0.8)

@@ -67,7 +67,8 @@ class _AssignmentOptions(NamedTuple):
     # stripes are nowhere seen over this share of their way through the picture, must be seen
     # evenly: caustics and fish are not. This share of the lasers may be faint. Found on rendered
     # dives: planes through caustics have up to 0.14 of the light, most below 0.1; nets come down to
-    # 0.15, folded ones to 0.14.
+    # 0.15, folded ones to 0.14. Where as many lasers are dark, twice that share is small: of nets
+    # with less light than that, none shows less than nine search lines of any laser.
     small_share: float = 0.12
     short_way: float = 0.15
     may_be_faint: float = 0.25
@@ -247,19 +248,19 @@ class AssignmentTest:
             subsegments.intensity_weight,
             surface.inlier_weight,
         )
-        if intensity_share < _ODDS.small_share or surface.is_mesh:
-            return intensity_share < _ODDS.small_share
-        return self._seen_of(surface, subsegments)[0] < _ODDS.short_way
+        way, _, dark = self._seen_of(surface, subsegments)
+        small = _ODDS.small_share * (2.0 if dark > _ODDS.may_be_faint else 1.0)
+        return intensity_share < small or (not surface.is_mesh and way < _ODDS.short_way)
 
     def _is_faint(self, surface: Surface, subsegments: Subsegments) -> bool:
         """Return whether a laser that should be seen on a surface is faint there, or missing."""
         return self._seen_of(surface, subsegments)[1] > _ODDS.may_be_faint
 
-    def _seen_of(self, surface: Surface, subsegments: Subsegments) -> tuple[float, float]:
-        """Return the share of its best stripe that a surface shows, and that of faint lasers."""
+    def _seen_of(self, surface: Surface, subsegments: Subsegments) -> tuple[float, float, float]:
+        """Return the share of its best stripe that a surface shows, and of faint, dark lasers."""
         packed = np.empty(4)
         packed[:3], packed[3] = surface.plane.normal, surface.plane.offset
-        seen: tuple[float, float] = seen_of(
+        seen: tuple[float, float, float] = seen_of(
             packed, surface.members, subsegments.n_lines, subsegments.laser, self._bands
         )
         return seen

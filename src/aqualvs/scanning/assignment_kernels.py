@@ -600,8 +600,8 @@ def loose_share_before(
 @kernel
 def seen_of(
     plane: FloatArray, members: BoolArray, n_lines: IntArray, laser: IntArray, bands: FloatArray
-) -> tuple[float, float]:
-    """Return the share of its best stripe that a surface shows, and the share of faint lasers.
+) -> tuple[float, float, float]:
+    """Return the share of its best stripe that a surface shows; shares of faint and dark lasers.
 
     Parameters
     ----------
@@ -620,7 +620,7 @@ def seen_of(
     for c in range(laser.shape[0]):
         if members[c]:
             way[laser[c]] += n_lines[c]
-    most, asked, faint = 0.0, 0, 0
+    most, asked, faint, dark = 0.0, 0, 0, 0
     for i in range(n_lasers):
         cells = np.count_nonzero(expected[i])
         way[i] = way[i] / (CELL_LINES * cells) if cells >= _EVIDENCE.min_cells else np.nan
@@ -630,7 +630,8 @@ def seen_of(
         if way[i] == way[i]:
             asked += 1
             faint += way[i] < _EVIDENCE.faint * most
-    return most, faint / max(asked, 1)
+            dark += way[i] == 0.0
+    return most, faint / max(asked, 1), dark / max(asked, 1)
 
 
 @inner_borrowing_kernel
