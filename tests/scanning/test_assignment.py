@@ -27,7 +27,7 @@ from aqualvs.scanning.surfaces import Surface, TargetKind, surface_on
 from aqualvs.scanning.triangulate import Triangulator
 from aqualvs.simulation.scenarios import example_rig
 from fan_cases import Fan, Stage, Trouble, fan_rig, miscalibrated
-from scanning_cases import everywhere, peaks_of, strands
+from scanning_cases import Lit, everywhere, peaks_of, strands
 
 FAN = Fan()
 FAR_FAN = Fan(baseline=(0.2, 0.0, 0.02), aim_deg=-10.0)
@@ -268,34 +268,50 @@ def slanted_strands(points: FloatArray) -> BoolArray:
     return lit
 
 
-def test_a_net_with_little_light_that_one_laser_misses_is_chance() -> None:
-    """In caustics, strands make such planes: with less than a quarter of the light, two lasers."""
+def test_strands_that_make_a_plane_by_chance_are_no_net() -> None:
+    """In daylight without lasers: few pieces of strands, or strands along two of the sheets."""
     rig = example_rig()
     net = Plane.from_normal((0.1, 1.0, 0.0), 0.5)
     laser_bands, triangulator = plan_bands(rig, rig.camera()), Triangulator(rig, rig.camera())
     test = assignment.AssignmentTest(laser_bands, triangulator, rig.working_range)
     elsewhere = [((0.4, 1.0, 0.2), 0.7), ((-0.3, 1.0, 0.2), 0.8), ((0.1, 1.0, 0.2), 0.4)]
+    elsewhere += [((-0.2, 1.0, -0.3), 0.6), ((0.3, 1.0, -0.2), 0.9), ((0.0, 1.0, 0.3), 0.7)]
     loose = [
         peaks_of(replace(rig, lasers=(laser,)), [(Plane.from_normal(*plane), slanted_strands)], 0.1)
-        for laser, plane in zip(rig.lasers, elsewhere, strict=True)
+        for laser, plane in zip(2 * rig.lasers, elsewhere, strict=True)
     ]
 
-    def is_chance(n_lasers: int, one_strand_of: int) -> bool:
-        def few(points: FloatArray) -> BoolArray:
-            number = (points[:, 0] + 0.4 * points[:, 2]) // 0.03
-            lit: BoolArray = slanted_strands(points) & (number % one_strand_of == 0)
-            return lit
+    def is_chance(*strands_of: int | None) -> bool:
+        """Whether each laser's light on every so many strands is; None: on all its way."""
 
-        of_net = peaks_of(replace(rig, lasers=rig.lasers[:n_lasers]), [(net, few)], 0.1)
-        candidates = find_candidates(joined([of_net, *loose]), laser_bands, triangulator)
+        def seen_on(one_of: int | None) -> Lit:
+            def lit(points: FloatArray) -> BoolArray:
+                number = (points[:, 0] + 0.4 * points[:, 2]) // 0.03
+                on: BoolArray = slanted_strands(points) & (number % one_of == 0)
+                return on
+
+            return everywhere if one_of is None else lit
+
+        of_net = [
+            peaks_of(replace(rig, lasers=(laser,)), [(net, seen_on(one_of))], 0.1)
+            for laser, one_of in zip(rig.lasers, strands_of, strict=False)
+        ]
+        candidates = find_candidates(joined([*of_net, *loose]), laser_bands, triangulator)
         subsegments = candidates.subsegments()
         seen = surface_on(net, subsegments, len(rig.lasers), 850.0)
-        return test.is_by_chance(candidates, subsegments, [seen], replace(seen, is_mesh=True))
+        target = replace(seen, is_mesh=True)
+        return test.is_by_chance(candidates, subsegments, [target], target)
 
-    # A sixth of the light, a quarter, and a fifth.
-    assert is_chance(2, 3)
+    # A third of the light, and an eighth of it on few strands.
+    assert not is_chance(1, 1, 1)
+    assert is_chance(3, 3, 3)
+    # A dark laser: on strands across the stripes, and along one of them.
+    assert not is_chance(1, 1)
     assert not is_chance(2, 2)
-    assert not is_chance(3, 3)
+    assert is_chance(None, 1)
+    assert not is_chance(None, 1, 1)
+    # With most of the light it is what is seen.
+    assert not is_chance(None, None)
 
 
 def test_a_net_before_a_wall_is_not_overlooked(monkeypatch: pytest.MonkeyPatch) -> None:

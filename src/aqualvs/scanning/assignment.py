@@ -67,11 +67,17 @@ class _AssignmentOptions(NamedTuple):
     # stripes are nowhere seen over this share of their way through the picture, must be seen
     # evenly: caustics and fish are not. This share of the lasers may be faint. Found on rendered
     # dives: planes through caustics have up to 0.14 of the light, most below 0.1; nets come down to
-    # 0.15, folded ones to 0.14. Where as many lasers are dark, twice that share is small: of nets
-    # with less light than that, none shows less than nine search lines of any laser.
+    # 0.15, folded ones to 0.14.
     small_share: float = 0.12
     short_way: float = 0.15
     may_be_faint: float = 0.25
+    # With so little light, stripes must be seen over this share of their way at least: 0.12 to 0.25
+    # on nets, 0.05 to 0.09 where strands in daylight make a plane by chance.
+    least_way: float = 0.1
+    # A net with less than this share of the light, on which a laser is dark, may not show another
+    # one over more than this share of its way: that is a strand along its sheet.
+    most_share: float = 0.5
+    along_way: float = 0.24
 
 
 _ODDS = _AssignmentOptions()
@@ -143,12 +149,17 @@ class AssignmentTest:
         target : Surface
             The one to judge.
         """
+        share = self._light_share(candidates, subsegments, surfaces, target)
+        way, faint, dark = self._seen_of(target, subsegments)
+        if target.is_mesh and dark > _ODDS.may_be_faint and way > _ODDS.along_way:
+            return share < _ODDS.most_share
+        if share < _ODDS.small_share and way < _ODDS.least_way:
+            return True
         # A fish before a wall that is out of range: the wall is no target, and the fish is none.
         outweighed = not target.is_mesh and any(
             one.inlier_weight > target.inlier_weight for one in surfaces
         )
-        small = outweighed or self._is_small(candidates, subsegments, surfaces, target)
-        return small and self._is_faint(target, subsegments)
+        return (outweighed or _is_small(target, share, way)) and faint > _ODDS.may_be_faint
 
     def overlooked(
         self,
@@ -182,8 +193,9 @@ class AssignmentTest:
             # Only broken stripes have an extent.
             if one is target or one.extent <= 0.0 or not _is_nearer(one, target, subsegments):
                 continue
-            small = self._is_small(candidates, subsegments, surfaces, one)
-            if small or self._is_faint(one, subsegments):
+            share = self._light_share(candidates, subsegments, surfaces, one)
+            way, faint, _ = self._seen_of(one, subsegments)
+            if _is_small(one, share, way) or faint > _ODDS.may_be_faint:
                 continue
             is_net = one.is_mesh or seen_through(one.members, target.members, subsegments)
             return replace(one, is_mesh=is_net)
@@ -226,20 +238,20 @@ class AssignmentTest:
         max_loose_share = 0.3
         return bool(share > max_loose_share)
 
-    def _is_small(
+    def _light_share(
         self,
         candidates: Candidates,
         subsegments: Subsegments,
         surfaces: Sequence[Surface],
         surface: Surface,
-    ) -> bool:
-        """Return whether a surface has little light of its own, or, if no mesh, short stripes."""
+    ) -> float:
+        """Return a surface's share of the light that no other surface explains."""
         others = np.zeros(len(subsegments), np.bool_)
         for one in surfaces:
             if one is not surface:
                 others |= one.members
         # A plane needs two lasers: the surplus of one is no evidence for it.
-        intensity_share = exclusive_share(
+        share: float = exclusive_share(
             candidates.source,
             candidates.confidence,
             subsegments.of_candidate,
@@ -248,9 +260,7 @@ class AssignmentTest:
             subsegments.intensity_weight,
             surface.inlier_weight,
         )
-        way, _, dark = self._seen_of(surface, subsegments)
-        small = _ODDS.small_share * (2.0 if dark > _ODDS.may_be_faint else 1.0)
-        return intensity_share < small or (not surface.is_mesh and way < _ODDS.short_way)
+        return share
 
     def _is_faint(self, surface: Surface, subsegments: Subsegments) -> bool:
         """Return whether a laser that should be seen on a surface is faint there, or missing."""
@@ -345,6 +355,11 @@ class AssignmentTest:
             facts,
         )
         return _verdict(planes[: n + 1], facts[: n + 1])
+
+
+def _is_small(surface: Surface, share: float, way: float) -> bool:
+    """Return whether a surface has little light of its own, or, if no mesh, short stripes."""
+    return share < _ODDS.small_share or (not surface.is_mesh and way < _ODDS.short_way)
 
 
 def _is_nearer(one: Surface, target: Surface, subsegments: Subsegments) -> bool:
