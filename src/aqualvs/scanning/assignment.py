@@ -75,8 +75,9 @@ class _AssignmentOptions(NamedTuple):
     # on nets, 0.05 to 0.09 where strands in daylight make a plane by chance.
     least_way: float = 0.1
     # A net with less than this share of the light, on which a laser is dark, may not show another
-    # one over more than this share of its way: that is a strand along its sheet.
-    most_share: float = 0.5
+    # one over more than this share of its way: that is a strand along its sheet. Where a laser has
+    # moved, the other two have more of the light.
+    most_share: float = 0.3
     along_way: float = 0.24
 
 
