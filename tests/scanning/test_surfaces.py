@@ -12,7 +12,7 @@ from aqualvs.optics.rig import Rig
 from aqualvs.scanning.candidates import Candidates, find_candidates
 from aqualvs.scanning.laser_bands import SearchAxis, plan_bands
 from aqualvs.scanning.stripe import StripePeaks
-from aqualvs.scanning.surfaces import Surface, TargetKind, choose_target, find_surfaces
+from aqualvs.scanning.surfaces import Surface, TargetKind, choose_target, find_surfaces, surface_on
 from aqualvs.scanning.triangulate import Triangulator
 from aqualvs.simulation.scenarios import bluerov2_rig, example_rig
 from scanning_cases import Lit, everywhere, peaks_of, strands
@@ -272,3 +272,22 @@ def test_specks_on_a_plane_are_no_net_before_a_wall_of_light() -> None:
     near = replace(surface(0.45, 190.0, True, extent=350.0), sampling_weight=400.0)
     assert choose([wall, sparse], TargetKind.AUTO) is sparse
     assert choose([wall, near], TargetKind.AUTO) is near
+
+
+def test_light_far_behind_a_plane_is_not_on_it_however_far_a_pixel_moves_it() -> None:
+    """Read as the wrong laser's, a neighbour's light lies where rays are parallel to the sheet."""
+    wall = plane(0.5)
+    rig, camera = example_rig(), example_rig().camera()
+    subsegments = find_candidates(
+        peaks_of(rig, [(wall, everywhere)], NOISE_PX),
+        plan_bands(rig, camera),
+        Triangulator(rig, camera),
+    ).subsegments()
+    last = len(subsegments) - 1
+    table = subsegments.table.copy()
+    place = table[:3, last].copy()
+    # At 20 m, where a pixel is worth a kilometre.
+    table[:3, last], table[3:6, last] = 40.0 * place, 40.0**2 * place
+    far = replace(subsegments, table=table)
+    assert surface_on(wall, subsegments, len(rig.lasers), 850.0).members[last]
+    assert not surface_on(wall, far, len(rig.lasers), 850.0).members[last]

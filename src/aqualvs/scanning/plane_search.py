@@ -52,11 +52,13 @@ MAX_TO_SECOND = 3.0
 @inline_kernel
 def squared_gate(per_px: float, offset: float) -> float:
     """Return the square of the largest distance (m) at which a subsegment belongs to a plane."""
-    # Distance of a subsegment from a plane: this share of the range, and this shift of the stripe.
-    gate_range_share = 0.003
+    # Distance of a subsegment from a plane: this share of the range, and this shift of the stripe,
+    # up to the second share. Where the line of sight is nearly parallel to the sheet, light read as
+    # the wrong laser's lies far away, and a pixel moves it so far that it would be on any plane.
+    gate_range_share, max_range_share = 0.003, 0.25
     gate_px = 1.0
     by_range = gate_range_share * offset
-    by_pixel = gate_px * per_px
+    by_pixel = min(gate_px * abs(per_px), max_range_share * offset)
     return by_range * by_range + by_pixel * by_pixel
 
 
