@@ -50,6 +50,7 @@ import math
 from typing import NamedTuple
 
 from aqualvs.geometry.compiled import inline_kernel, inner_kernel
+from aqualvs.geometry.linear_algebra import cross, dot
 from aqualvs.optics.dome import DomeParams
 from aqualvs.optics.flat_port import FlatParams
 from aqualvs.optics.lens_kernels import Vector
@@ -72,18 +73,6 @@ def perpendicular(a: Vector) -> Vector:
         return 0.0, -a[2] / length, a[1] / length
     length = math.sqrt(a[0] * a[0] + a[1] * a[1])
     return -a[1] / length, a[0] / length, 0.0
-
-
-@inline_kernel
-def cross(a: Vector, b: Vector) -> Vector:
-    """Return a x b."""
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-
-
-@inline_kernel
-def dot(a: Vector, b: Vector) -> float:
-    """Return a . b."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @inline_kernel

@@ -12,6 +12,7 @@ import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.geometry.compiled import chosen_by_class, inline_kernel, kernel
+from aqualvs.geometry.linear_algebra import cross, dot
 from aqualvs.optics.camera import BareParams, CameraParams, dome_from_cam
 from aqualvs.optics.dome import DomeParams
 from aqualvs.optics.flat_port import FLAT_PARAMETERS, FlatParams
@@ -22,8 +23,6 @@ from aqualvs.optics.port_projection import (
     across_axis,
     back_derivative,
     blend,
-    cross,
-    dot,
     flat_derivative,
     height_and_reach,
     is_in_front,
