@@ -6,8 +6,6 @@ and the lasers with them: stripes on a wall are then found where a board would b
 its offset is neglected or known.
 """
 
-import functools
-import pickle
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -107,8 +105,8 @@ def lasers_by(believed: Rig, true: Rig) -> Rig | None:
         None if the boards, or the stripes on them, cannot be used.
     """
     lit: list[list[FloatArray]] = [[] for _ in true.lasers]
-    boards = _boards(true.working_range)
-    for board, found in zip(boards, _all_found(believed, true), strict=True):
+    for board in _boards(true.working_range):
+        found = _found(believed, true, board)
         if found is None:
             continue
         for points, laser in zip(lit, true.lasers, strict=True):
@@ -133,21 +131,6 @@ def _boards(working_range: tuple[float, float]) -> Iterator[SE3]:
         middle = np.array([0.0, near * (far / near) ** share, 0.0])
         for lean in leans:
             yield SE3(rotation_from_rotvec(lean), middle)
-
-
-def _all_found(believed: Rig, true: Rig) -> tuple[SE3 | None, ...]:
-    """Return the poses of all boards as the assumed camera finds them, None where it does not.
-
-    Lasers have no part in it: a design and the same one tilted differently share the poses.
-    """
-    alike = (replace(rig, name="", lasers=(), solved_from={}) for rig in (believed, true))
-    return _found_by(pickle.dumps(tuple(alike)))
-
-
-@functools.lru_cache(maxsize=64)
-def _found_by(rigs: bytes) -> tuple[SE3 | None, ...]:
-    believed, true = pickle.loads(rigs)
-    return tuple(_found(believed, true, board) for board in _boards(true.working_range))
 
 
 def _found(believed: Rig, true: Rig, board: SE3) -> SE3 | None:
