@@ -1,11 +1,32 @@
-"""Words and colours that the report and the overlay share.
+"""Words and colours that several outputs share: pages, pictures and messages.
 
 Colours are those of Okabe and Ito (https://jfly.uni-koeln.de/color/), which remain distinct under
 the common forms of colour blindness.
 """
 
+from dataclasses import dataclass
+from enum import StrEnum
+
 from aqualvs.scanning.posture import Reason
 from aqualvs.scanning.scan import Label
+
+
+class Severity(StrEnum):
+    """Severity of a finding."""
+
+    OK = "ok"
+    WARN = "warn"
+    BAD = "bad"
+    """It does not work as it is."""
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing found about a rig, the machine or the vehicle."""
+
+    severity: Severity
+    sentence: str  # What was found, with the value, and the remedy where one is needed.
+
 
 REASON_WORDS: dict[str, str] = {
     Reason.NO_STRIPES: "no stripes seen",

@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 
 from aqualvs.check.doctor import autopilot
-from aqualvs.check.finding import Severity
 from aqualvs.demo import bundled_dive
 from aqualvs.live.mavlink.ardusub import ArduSubOptions
 from aqualvs.live.options import VehicleSetup
+from aqualvs.text import Severity
 from live_cases import demo_rig
 
 pytest.importorskip("pymavlink")

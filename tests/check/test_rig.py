@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from aqualvs.check.finding import Finding, Severity, index_sigma
+from aqualvs.check.finding import index_sigma
 from aqualvs.check.rig import check_rig, field_of_view, run_check
 from aqualvs.errors import RigError
 from aqualvs.geometry import SE3, Plane, rotation_from_rotvec
@@ -26,6 +26,7 @@ from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Laser, Rig, RigUncertainty
 from aqualvs.optics.rigfile import save_rig
 from aqualvs.optics.sheet import Sheet, sheets_of
 from aqualvs.simulation.scenarios import bluerov2_rig, example_rig, flat_port_rig
+from aqualvs.text import Finding, Severity
 
 
 def pinhole(*lasers: Laser) -> Rig:

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from aqualvs.check.finding import Severity
 from aqualvs.check.rig import age_text, check_rig, run_check
 from aqualvs.errors import RigError
 from aqualvs.optics.rig import Rig, RigUncertainty
 from aqualvs.optics.rigfile import save_rig
 from aqualvs.optics.solved import SolvedStep, with_step, with_uncertainty
 from aqualvs.simulation.scenarios import example_rig
+from aqualvs.text import Severity
 
 NOW = datetime(2026, 5, 20, 12, 0, tzinfo=UTC)
 GOOD = {

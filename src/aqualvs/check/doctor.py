@@ -20,7 +20,7 @@ from pathlib import Path
 from rich.console import Console
 
 from aqualvs import __version__
-from aqualvs.check.finding import Finding, Severity, findings_table, shutter_finding
+from aqualvs.check.finding import findings_table, shutter_finding
 from aqualvs.control.vehicle import Mode, VehicleState
 from aqualvs.demo import bundled_dive
 from aqualvs.errors import AqualvsError
@@ -28,8 +28,6 @@ from aqualvs.live.mavlink.ardusub import ArduSubLink, ArduSubOptions
 from aqualvs.live.mavlink.ardusub_parameters import (
     FOR_DISTANCE,
     FOR_STICKS,
-    Advice,
-    Weight,
     advise_on_distance,
     advise_on_fail_safe,
     advise_on_speed,
@@ -47,10 +45,10 @@ from aqualvs.sources.base import State
 from aqualvs.sources.fields import FieldEvidence, frames_of
 from aqualvs.sources.opening import is_address
 from aqualvs.sources.video import sampled_pictures
+from aqualvs.text import Finding, Severity
 
 _HEARTBEAT_S, _LISTEN_S = 6.0, 3.0
 _SUBMARINE = 12
-_SEVERITY = {Weight.FINE: Severity.OK, Weight.CARE: Severity.WARN, Weight.BROKEN: Severity.BAD}
 _MODES = {
     Mode.OURS: "follow engages in it",
     Mode.PILOT: "follow does not engage in it; choose {own}",
@@ -117,15 +115,9 @@ def _ardusub(
             "ground station (docs/ardusub.md lists them)",
         )
         return
-    advice = [advise_on_station(told, steering.ground_station)]
-    advice += advise_on_fail_safe(told) + advise_on_speed(told)
-    advice += advise_on_distance(told, working_range)
-    for one in advice:
-        yield _finding(one)
-
-
-def _finding(advice: Advice) -> Finding:
-    return Finding(_SEVERITY[advice.weight], advice.text)
+    yield advise_on_station(told, steering.ground_station)
+    yield from advise_on_fail_safe(told) + advise_on_speed(told)
+    yield from advise_on_distance(told, working_range)
 
 
 def _mode(state: VehicleState, own_modes: tuple[str, ...]) -> Finding:

@@ -7,8 +7,6 @@ index.
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from enum import StrEnum
 
 import numpy as np
 from rich.table import Table
@@ -24,23 +22,7 @@ from aqualvs.optics.expected_error import (
 )
 from aqualvs.optics.rig import Rig, RigUncertainty
 from aqualvs.optics.shutter import ShutterKind
-
-
-class Severity(StrEnum):
-    """Severity of a finding."""
-
-    OK = "ok"
-    WARN = "warn"
-    BAD = "bad"
-    """Makes the rig useless as it is."""
-
-
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """One thing found about a rig."""
-
-    severity: Severity
-    sentence: str  # What was found, with the value, and the remedy where one is needed.
+from aqualvs.text import Finding, Severity
 
 
 def findings_table(findings: Sequence[Finding]) -> Table:

@@ -15,8 +15,6 @@ import numpy as np
 from rich.console import Console
 
 from aqualvs.check.finding import (
-    Finding,
-    Severity,
     check_errors,
     count_text,
     error_table,
@@ -43,6 +41,7 @@ from aqualvs.optics.solved import (
     rig_uncertainty,
     solved_steps,
 )
+from aqualvs.text import Finding, Severity
 
 SURFACES = "surfaces"
 """Extra of the step `lasers`: the surfaces that lasers were seen on, or how many there were."""

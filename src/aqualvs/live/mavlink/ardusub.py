@@ -43,12 +43,12 @@ from aqualvs.live.mavlink.ardusub_parameters import (
     PILOT_TIMEOUT,
     ParameterWatch,
     StationRange,
-    Weight,
     advise_on_fail_safe,
     advise_on_station,
 )
 from aqualvs.live.mavlink.link import MAV_COMP_ID_ONBOARD_COMPUTER, MavlinkLink, Received
 from aqualvs.scanning.scan import GyroRates
+from aqualvs.text import Severity
 from aqualvs.vehicle_logs.tlog import SUB_MODES
 
 FRESH_S = 1.0
@@ -427,8 +427,8 @@ class ArduSubLink:
         self._advised = True
         advice = advise_on_station(parameters, self.options.ground_station)
         for one in (advice, *advise_on_fail_safe(parameters)):
-            if one.weight is not Weight.FINE:
-                _log.warning("%s: %s", self.name, one.text)
+            if one.severity is not Severity.OK:
+                _log.warning("%s: %s", self.name, one.sentence)
 
     def _mode(self, beat: Received, parameters: dict[str, float]) -> tuple[Mode, str]:
         heard = beat.message
@@ -441,7 +441,7 @@ class ArduSubLink:
             return Mode.CONFLICT, f"{name}; {self.link.conflict}"
         if self._is_ignored(parameters):
             advice = advise_on_station(parameters, self.options.ground_station)
-            return Mode.IGNORED, f"{name}; {advice.text}"
+            return Mode.IGNORED, f"{name}; {advice.sentence}"
         if not self._is_supervised():
             return Mode.NO_STATION, f"{name}; {self._missing_station()}"
         return Mode.OURS, name

@@ -6,10 +6,9 @@ Names and meanings are those of ArduSub's `Parameters.cpp`, `GCS.cpp` (MAV_), an
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
-from enum import StrEnum
 
 from aqualvs.live.mavlink.link import MavlinkLink
+from aqualvs.text import Finding, Severity
 
 STATION = ("MAV_GCS_SYSID", "SYSID_MYGCS")
 STATION_HIGH = "MAV_GCS_SYSID_HI"
@@ -30,24 +29,6 @@ _MAVLINK_RANGEFINDER, _FORWARD = 10, 0
 # The rate of descent is controlled by the depth: half or twice the rate still works.
 _CLIMB_RATE_RATIO = 2.0
 _ASK_EVERY_S, _ASK_SELDOM_S, _ROUNDS = 1.0, 30.0, 5
-
-
-class Weight(StrEnum):
-    """Importance of an advice."""
-
-    FINE = "fine"
-    CARE = "care"
-    """It works, but not as well, or not as safely."""
-    BROKEN = "broken"
-    """It does not work."""
-
-
-@dataclass(frozen=True, slots=True)
-class Advice:
-    """Advice on a setting of the vehicle."""
-
-    weight: Weight
-    text: str  # One line: name, value, meaning, and what to set.
 
 
 class StationRange:
@@ -108,29 +89,29 @@ class ParameterWatch:
         return self._n_asked >= _ROUNDS
 
 
-def advise_on_station(parameters: Mapping[str, float], station: int) -> Advice:
+def advise_on_station(parameters: Mapping[str, float], station: int) -> Finding:
     """Advise whether the vehicle obeys sticks that are sent in a ground station's name."""
     obeyed = StationRange(parameters)
     if not obeyed.known:
-        return Advice(
-            Weight.CARE,
+        return Finding(
+            Severity.WARN,
             f"{' or '.join(STATION)} is not told: whether the vehicle obeys sticks of ground "
             f"station {station} is unknown; look it up in the ground station",
         )
     if station in obeyed:
-        return Advice(
-            Weight.FINE,
+        return Finding(
+            Severity.OK,
             f"{obeyed.name} {obeyed}: sticks in the name of ground station {station} are obeyed",
         )
-    return Advice(
-        Weight.BROKEN,
+    return Finding(
+        Severity.BAD,
         f"{obeyed.name} {obeyed}: every stick in the name of ground station {station} is ignored, "
         f"the pilot's too; set {obeyed.name} {station}, or ground_station {obeyed} in the vehicle "
         "file",
     )
 
 
-def advise_on_fail_safe(parameters: Mapping[str, float]) -> list[Advice]:
+def advise_on_fail_safe(parameters: Mapping[str, float]) -> list[Finding]:
     """Advise on the effect of the pilot-input fail-safe when efforts end."""
     # A last effort that stays in force longer than this moves the vehicle far.
     longest_timeout_s = 1.0
@@ -138,40 +119,42 @@ def advise_on_fail_safe(parameters: Mapping[str, float]) -> list[Advice]:
     action, timeout_s = parameters.get(PILOT_INPUT), parameters.get(PILOT_TIMEOUT)
     found = []
     if action is None:
-        found.append(Advice(Weight.CARE, f"{PILOT_INPUT} is not told; see that it is 1 or 2"))
+        found.append(Finding(Severity.WARN, f"{PILOT_INPUT} is not told; see that it is 1 or 2"))
     elif round(action) == disabled:
         found.append(
-            Advice(
-                Weight.BROKEN,
+            Finding(
+                Severity.BAD,
                 f"{PILOT_INPUT} 0 (off): if follow is killed its last effort stands for ever; set "
                 f"{PILOT_INPUT} 1",
             )
         )
     elif round(action) == disarm:
         found.append(
-            Advice(
-                Weight.CARE,
+            Finding(
+                Severity.WARN,
                 f"{PILOT_INPUT} 2 (disarm): without a joystick that sends, the vehicle disarms "
                 f"{_seconds(timeout_s)} after Enter gives it back, and sinks if it is heavy; set "
                 f"{PILOT_INPUT} 1, or leave the joystick on",
             )
         )
     else:
-        found.append(Advice(Weight.FINE, f"{PILOT_INPUT} 1 (warn): sticks go neutral, armed"))
+        found.append(Finding(Severity.OK, f"{PILOT_INPUT} 1 (warn): sticks go neutral, armed"))
     if timeout_s is None:
-        found.append(Advice(Weight.CARE, f"{PILOT_TIMEOUT} is not told; see that it is 0.5 to 1"))
+        found.append(
+            Finding(Severity.WARN, f"{PILOT_TIMEOUT} is not told; see that it is 0.5 to 1")
+        )
     elif timeout_s > longest_timeout_s:
         found.append(
-            Advice(
-                Weight.CARE,
+            Finding(
+                Severity.WARN,
                 f"{PILOT_TIMEOUT} {timeout_s:g} s: if follow is killed its last effort stands for "
                 f"so long; set {PILOT_TIMEOUT} 1",
             )
         )
     else:
         found.append(
-            Advice(
-                Weight.FINE,
+            Finding(
+                Severity.OK,
                 f"{PILOT_TIMEOUT} {timeout_s:g} s: so long a last effort stands if follow is "
                 "killed",
             )
@@ -179,11 +162,13 @@ def advise_on_fail_safe(parameters: Mapping[str, float]) -> list[Advice]:
     return found
 
 
-def advise_on_speed(parameters: Mapping[str, float]) -> list[Advice]:
+def advise_on_speed(parameters: Mapping[str, float]) -> list[Finding]:
     """Advise on the climb rate of a full vertical stick, compared with the gains' assumption."""
     up = parameters.get(SPEED_UP)
     if up is None:
-        return [Advice(Weight.CARE, f"{SPEED_UP} is not told: plans that change the depth are off")]
+        return [
+            Finding(Severity.WARN, f"{SPEED_UP} is not told: plans that change the depth are off")
+        ]
     down = parameters.get(SPEED_DOWN, 0.0)
     if down == 0.0:
         # ArduSub takes 0 for the speed upwards (get_pilot_speed_dn).
@@ -198,18 +183,20 @@ def advise_on_speed(parameters: Mapping[str, float]) -> list[Advice]:
 
 def advise_on_distance(
     parameters: Mapping[str, float], working_range: tuple[float, float] | None = None
-) -> list[Advice]:
+) -> list[Finding]:
     """Advise on the vehicle's use of `DISTANCE_SENSOR`.
 
     `working_range`: of the rig, in metres.
     """
     kind = parameters.get(RANGE_TYPE)
     if kind is None:
-        return [Advice(Weight.CARE, f"{RANGE_TYPE} is not told; set 10 (MAVLink) for the distance")]
+        return [
+            Finding(Severity.WARN, f"{RANGE_TYPE} is not told; set 10 (MAVLink) for the distance")
+        ]
     if round(kind) != _MAVLINK_RANGEFINDER:
         return [
-            Advice(
-                Weight.CARE,
+            Finding(
+                Severity.WARN,
                 f"{RANGE_TYPE} {kind:.0f}: the distance to the net is not taken in; set "
                 f"{RANGE_TYPE} 10 (MAVLink) and {RANGE_ORIENT} 0, and start the autopilot anew",
             )
@@ -218,23 +205,23 @@ def advise_on_distance(
     if orient is None or round(orient) != _FORWARD:
         told = "is not told" if orient is None else f"{orient:.0f}"
         return [
-            Advice(
-                Weight.CARE,
+            Finding(
+                Severity.WARN,
                 f"{RANGE_ORIENT} {told}: ours looks forward, and others are left out; set "
                 f"{RANGE_ORIENT} 0",
             )
         ]
     text = f"{RANGE_TYPE} 10, {RANGE_ORIENT} 0: the distance to the net is taken in"
-    return [Advice(Weight.FINE, text), *_limits_advice(parameters, working_range)]
+    return [Finding(Severity.OK, text), *_limits_advice(parameters, working_range)]
 
 
-def _climb_advice(setting: str, told: float) -> Advice:
+def _climb_advice(setting: str, told: float) -> Finding:
     speed = 0.01 * told
     means = f"{setting}: a full stick asks for {speed:.2g} m/s times the pilot gain"
     if FULL_CLIMB_RATE / _CLIMB_RATE_RATIO <= speed <= FULL_CLIMB_RATE * _CLIMB_RATE_RATIO:
-        return Advice(Weight.FINE, means)
-    return Advice(
-        Weight.CARE,
+        return Finding(Severity.OK, means)
+    return Finding(
+        Severity.WARN,
         f"{means}, but gains take {FULL_CLIMB_RATE:g} m/s: follow changes the depth at another "
         f"speed than planned; set {SPEED_UP} and {SPEED_DOWN} {100.0 * FULL_CLIMB_RATE:.0f}",
     )
@@ -242,19 +229,19 @@ def _climb_advice(setting: str, told: float) -> Advice:
 
 def _limits_advice(
     parameters: Mapping[str, float], working_range: tuple[float, float] | None
-) -> list[Advice]:
+) -> list[Finding]:
     near, far = _first(parameters, RANGE_NEAR), _first(parameters, RANGE_FAR)
     if near is None or far is None:
         return []
     (near_name, least), (far_name, most) = near, far
     means = f"{near_name}, {far_name}: {least:g} to {most:g} m count"
     if working_range is None:
-        return [Advice(Weight.FINE, f"{means}; the rig's working range must lie within")]
+        return [Finding(Severity.OK, f"{means}; the rig's working range must lie within")]
     if least <= working_range[0] and most >= working_range[1]:
-        return [Advice(Weight.FINE, means)]
+        return [Finding(Severity.OK, means)]
     wanted = f"{working_range[0]:g} to {working_range[1]:g} m"
     return [
-        Advice(Weight.CARE, f"{means}, but the rig measures {wanted}; set them to enclose that")
+        Finding(Severity.WARN, f"{means}, but the rig measures {wanted}; set them to enclose that")
     ]
 
 
