@@ -63,7 +63,7 @@ def predict(design: Design, ranges: Sequence[float] | FloatArray | None = None) 
     walls = design.ranges if ranges is None else np.asarray(ranges, np.float64)
     camera = design.rig.camera()
     stripes = see_stripes(camera, design.mounts, walls, index_step(camera, design.tolerances))
-    solid, mesh = wall_sums(stripes, design.noise), net_sums(stripes, design)
+    solid, mesh = wall_parts(stripes, design.noise).total(), net_sums(stripes, design)
     return PredictedErrors(
         ranges=walls,
         stripes=stripes,
@@ -119,11 +119,6 @@ def net_share(stripes: Stripes, design: Design) -> FloatArray:
     """Return the strands of the design's net for every point on a wall, (K, W)."""
     strands = stripes.length * design.net.strands_per_metre
     return np.minimum(strands / np.maximum(stripes.lines, 1.0), 1.0)
-
-
-def wall_sums(stripes: Stripes, noise: Noise) -> Sums:
-    """Return the sums of all stripes on a wall."""
-    return wall_parts(stripes, noise).total()
 
 
 def net_sums(stripes: Stripes, design: Design) -> Sums:

@@ -275,14 +275,10 @@ def net_dive(laboratory: Laboratory) -> RenderedDive:
     return laboratory.dive(net_before_wall(), point_frames=_JUDGED)
 
 
-def truth_of(dive: RenderedDive) -> list[tuple[int, LitTruth]]:
-    """Return the frames whose true points are known, with these."""
-    return [(i, LitTruth.read(dive.folder / f"points_{i:04d}.npz")) for i in _JUDGED]
-
-
 def _run(laboratory: Laboratory) -> ExperimentResult:
     dive = net_dive(laboratory)
-    measured, frames, truth = laboratory.measure(dive), frames_of(dive), truth_of(dive)
+    measured, frames = laboratory.measure(dive), frames_of(dive)
+    truth = [(i, LitTruth.read(dive.folder / f"points_{i:04d}.npz")) for i in _JUDGED]
     papers = papers_pixels(laboratory, dive, MeshFilterOptions())
     adaptive = adaptive_pixels(measured.scans, dive.rig)
     mine = mean_judged([judge(measured.scans[i].points, lit) for i, lit in truth])

@@ -40,24 +40,6 @@ _MIN_DEPTH, _MIN_RANGE, _MIN_ANGLE = 0.2, 0.1, 6.0
 FIGURE_FILES = ("figure_22.png", "figure_23.png")
 
 
-def draw_follow_figures(log: LoopLog, out: Path) -> list[Path]:
-    """Write `figure_22.png` and `figure_23.png`.
-
-    Parameters
-    ----------
-    log : LoopLog
-        With at least one row.
-    out : Path
-        Folder that exists.
-
-    Raises
-    ------
-    OSError
-        If a picture cannot be written.
-    """
-    return save_figures(drawn_follow_figures(log), out, dpi=160)
-
-
 def drawn_follow_figures(log: LoopLog) -> "dict[str, Figure]":
     """Return the same pictures by name, not yet written."""
     from matplotlib import rc_context
@@ -274,7 +256,7 @@ def write_report(log: LoopLog, facts: RunFacts, out: Path) -> Path:
     Raises `OutputError` if something cannot be written.
     """
     with writing(out):
-        figures = draw_follow_figures(log, out)
+        figures = save_figures(drawn_follow_figures(log), out, dpi=160)
     path = out / PAGE
     with writing(path):
         replace_text(path, _page(log, facts, figures))

@@ -76,7 +76,8 @@ def common_frame(surveys: Sequence[Survey]) -> tuple[WallFrame | None, str]:
         return WallFrame(True, abs(radius), float(np.sign(radius))), ""
     facing = np.array([_facing(one) for one in known])
     off = np.angle(np.exp(1j * (facing - facing[0])))
-    if np.all(np.isfinite(facing)) and np.ptp(off) < _SAME_SIDE and not _untracked(known):
+    tracked = all(one.stretches.placed.all() for one in known)
+    if np.all(np.isfinite(facing)) and np.ptp(off) < _SAME_SIDE and tracked:
         return WallFrame(False), ""
     return None, (
         "the net shows no roundness (its bearing does not grow along the way), and the dives do "
@@ -131,10 +132,6 @@ def _facing(survey: Survey) -> float:
     mean = np.exp(1j * known).mean()
     off = np.angle(np.exp(1j * known) / mean)
     return float(np.angle(mean)) if np.std(off) < _FLAT_SPREAD else np.nan
-
-
-def _untracked(surveys: Sequence[Survey]) -> bool:
-    return any(not one.stretches.placed.all() for one in surveys)
 
 
 def _bearing_noise(survey: Survey, rows: IntArray, frame: WallFrame) -> float:

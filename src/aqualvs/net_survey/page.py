@@ -341,12 +341,9 @@ def _sentence(words: str) -> str:
 
 def _paragraph(line: str) -> str:
     style = ' style="margin-left: 1.5em"' if line.startswith("  ") else ""
-    return f"<p{style}>{_typeset(line.strip())}</p>"
-
-
-def _typeset(words: str) -> str:
-    """Return a line of the summary as HTML: minus signs, but the hyphens of dates stay."""
-    return escape(_MINUS.sub("\u2212", words.replace("->", "\u2192")))
+    # Minus signs, but the hyphens of dates stay.
+    words = escape(_MINUS.sub("\u2212", line.strip().replace("->", "\u2192")))
+    return f"<p{style}>{words}</p>"
 
 
 def _holes(result: Comparison) -> str:

@@ -154,7 +154,8 @@ def _where_lines(wall: OnWall) -> Iterator[str]:
         for word, sign in (("more", 1.0), ("less", -1.0))
     ]
     yield f"  beyond chance {' and '.join(counts)} of {n} cells"
-    yield f"  most at {_extreme(wall, max(wall.cells, key=lambda one: one.per_day.value))}"
+    worst = max(wall.cells, key=lambda one: one.per_day.value)
+    yield f"  most at {_where(wall, worst)}: {rate_text(worst.per_day)}"
     apart = [one for one in wall.cells if one.apart]
     if apart:
         most = max(apart, key=lambda one: abs(one.excess.z))
@@ -169,10 +170,6 @@ def _where_lines(wall: OnWall) -> Iterator[str]:
 
 def _size(growth: Growth) -> Growth:
     return Growth(abs(growth.value), growth.sigma)
-
-
-def _extreme(wall: OnWall, cell: CellChange) -> str:
-    return f"{_where(wall, cell)}: {rate_text(cell.per_day)}"
 
 
 def _where(wall: OnWall, cell: CellChange) -> str:

@@ -13,7 +13,7 @@ from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.nets.coverage import RegisteredView, Twine, dash_kinds, measure_solidity, measure_twine
 from aqualvs.nets.dashes import NetView, crossings_of, find_dashes
-from aqualvs.nets.holes import Hole, HoleMap, merge_holes
+from aqualvs.nets.holes import Hole, HoleMap
 from aqualvs.nets.lattice import (
     START_FRAMES,
     START_S,
@@ -136,7 +136,7 @@ class NetCondition:
     @property
     def holes(self) -> list[Hole]:
         """Holes found so far, in the order in which they were passed."""
-        return merge_holes(self._map.holes)
+        return sorted(self._map.holes, key=lambda hole: (hole.time_s, hole.frame))
 
     @property
     def area(self) -> float:

@@ -320,8 +320,3 @@ def _same(one: Hole, other: Hole) -> bool:
     """Return whether two holes on one map overlap by half."""
     apart = float(np.hypot(*(one.place - other.place)))
     return one.piece == other.piece and apart < 0.25 * (one.diameter + other.diameter)
-
-
-def merge_holes(holes: Sequence[Hole]) -> list[Hole]:
-    """Return holes in the order in which the vehicle passed them."""
-    return sorted(holes, key=lambda hole: (hole.time_s, hole.frame))

@@ -133,13 +133,9 @@ def _gap_warnings(track: Track) -> Iterator[str]:
     max_gaps = 3
     for length, start, found in long[:max_gaps]:
         words = stretch_text(found, track)
-        yield f"No posture for {clock(length)} from {_moment(start)} on: {words}."
+        yield f"No posture for {clock(length)} from {clock(start)} on: {words}."
     if len(long) > max_gaps:
         yield f"{len(long) - max_gaps} more gaps longer than {long_gap_s:g} s."
-
-
-def _moment(seconds: float) -> str:
-    return f"{seconds:.1f} s" if seconds < 60.0 else clock(seconds)
 
 
 def _range_warnings(track: Track, working_range: tuple[float, float] | None) -> Iterator[str]:

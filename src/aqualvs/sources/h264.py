@@ -63,7 +63,7 @@ def unit_reader(codec: str, extradata: bytes) -> UnitReader | None:
         return None
     if extradata[:1] == b"\x01" and len(extradata) > found.length_at:
         n_length = (extradata[found.length_at] & 3) + 1
-        return lambda packet: _units(found, _by_length(packet, n_length))
+        return lambda packet: _units(found, (packet[i] for i in _after_lengths(packet, n_length)))
     return lambda packet: _units(found, _by_start_code(bytes(packet)))
 
 
@@ -76,11 +76,6 @@ def _units(codec: _Codec, heads: Iterator[int]) -> Units:
         elif kind in codec.slices:
             return Units(kind in codec.refresh, bool(sets), sets == codec.parameter_sets)
     return Units(False, bool(sets), False)
-
-
-def _by_length(packet: memoryview, n_length: int) -> Iterator[int]:
-    """Yield the first byte of each unit."""
-    return (packet[at] for at in _after_lengths(packet, n_length))
 
 
 def _after_lengths(packet: bytes | memoryview, n_length: int) -> Iterator[int]:

@@ -11,7 +11,7 @@ compass's drift are slower.
 
 import datetime
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -114,7 +114,8 @@ def find_time_offset(
     if not found and start is not None:
         near = np.abs(scores.offset_s - start.offset_s) <= _START_SIGMAS * start.sigma_s + _LOBE_S
         where = f" within {_START_SIGMAS * start.sigma_s:.0f} s of what the clocks say"
-        found = _clear_peak(channels, _only(scores, near), where)
+        nearby = replace(scores, overlap_s=np.where(near, scores.overlap_s, 0.0))
+        found = _clear_peak(channels, nearby, where)
     if isinstance(found, OffsetRefusal):
         return found
     refined = _refine(channels, found)
@@ -184,10 +185,6 @@ def _clear_peak(
         f"offsets of {best:.2f} s and {rival:.2f} s explain the motion almost equally well{where} "
         f"({margin:.1f} sigma apart); give the offset yourself"
     )
-
-
-def _only(scores: OffsetScores, near: BoolArray) -> OffsetScores:
-    return OffsetScores(scores.offset_s, scores.score, np.where(near, scores.overlap_s, 0.0))
 
 
 def _peaks(scores: OffsetScores, allowed: BoolArray) -> list[float]:

@@ -32,11 +32,6 @@ BOARD_POSES = "board poses"
 """Group of the priors on a board's pose on its surface."""
 
 
-def stripes_group(i_laser: int) -> str:
-    """Return the name of the group of residuals of a laser."""
-    return f"stripes of laser {i_laser}"
-
-
 @dataclass(frozen=True, slots=True)
 class BoardPosePrior:
     """Standard deviations of a board's pose on the surface of the stripes."""
@@ -217,7 +212,7 @@ class LaserProblem:
         ]
         unit = group.gain * group.sigma_px
         return Block(
-            stripes_group(group.laser),
+            f"stripes of laser {group.laser}",
             np.concatenate(columns),
             (lit.distance / unit)[:, None],
             (slopes / unit[:, None])[:, None, :],
