@@ -9,7 +9,7 @@ for the class of port that it is called with. A scan projects no points, so the 
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -155,19 +155,7 @@ def rays_all(
         store_rays(start, count, w, origins, directions, valid)
 
 
-class HasParameters(Protocol):
-    """A camera's lens and packed numbers, which determine the names of its parameters."""
-
-    @property
-    def lens(self) -> Lens:
-        """Intrinsics."""
-
-    @property
-    def params(self) -> CameraParams:
-        """Packed numbers for compiled kernels."""
-
-
-def parameter_names(camera: HasParameters) -> tuple[str, ...]:
+def parameter_names(camera: "Camera") -> tuple[str, ...]:
     """Return the names of a camera's parameters, in the order of every parameter Jacobian.
 
     `POSE_PARAMETERS`, then `DOME_PARAMETERS` behind a dome or `FLAT_PARAMETERS` behind a flat port,
@@ -177,7 +165,7 @@ def parameter_names(camera: HasParameters) -> tuple[str, ...]:
     return POSE_PARAMETERS + camera.params.port.names + camera.lens.parameter_names
 
 
-def named_step(camera: HasParameters, step: ArrayLike) -> dict[str, float]:
+def named_step(camera: "Camera", step: ArrayLike) -> dict[str, float]:
     """Return `step` (P,) by parameter name."""
     names = parameter_names(camera)
     values: Sequence[float] = as_vectors(step, len(names), "step").tolist()
@@ -228,51 +216,12 @@ def _checked_pose(pose: SE3) -> tuple[FloatArray, FloatArray]:
     return rotation, centre
 
 
-class Camera(Protocol):
-    """Interface of a camera. Frames: `image` and `dome`."""
-
-    @property
-    def size_px(self) -> tuple[int, int]:
-        """Image width and height."""
-
-    @property
-    def lens(self) -> Lens:
-        """Intrinsics."""
-
-    @property
-    def dome_from_cam(self) -> SE3:
-        """Pose; the translation is the lens position L."""
-
-    @property
-    def params(self) -> CameraParams:
-        """Packed numbers for compiled kernels."""
-
-    def rays(self, pixels: ArrayLike) -> Rays:
-        """Return the rays in `dome` that pixels (..., 2) see."""
-
-    def project(self, points_in_dome: ArrayLike) -> tuple[FloatArray, BoolArray]:
-        """Return pixels (..., 2) of points (..., 3) and whether they can be seen."""
-
-    def project_with_jacobian(
-        self, points_in_dome: ArrayLike
-    ) -> tuple[FloatArray, BoolArray, FloatArray]:
-        """Return `project` and the derivatives (..., 2, 3) by the point."""
-
-    def project_with_parameter_jacobian(
-        self, points_in_dome: ArrayLike
-    ) -> tuple[FloatArray, BoolArray, FloatArray, FloatArray]:
-        """Return `project_with_jacobian` and the derivatives (..., 2, P) by the parameters."""
-
-    def inside_image(self, pixels: ArrayLike) -> BoolArray:
-        """Return which pixels (..., 2) lie in the picture, edges of border pixels included."""
-
-    def moved_by(self, step: ArrayLike) -> "Camera":
-        """Return the camera with `step` (P,) added to its parameters, see `parameter_names`."""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _CompiledCamera:
-    """A camera computed by compiled kernels from the numbers in `params`."""
+class Camera:
+    """Any camera, computed by compiled kernels from the numbers in `params`.
+
+    Frames: `image` and `dome`.
+    """
 
     size_px: tuple[int, int]  # Image width and height.
     lens: Lens  # Intrinsics, calibrated in air without the housing.
@@ -398,6 +347,20 @@ class _CompiledCamera:
         )
         return pixels, valid, by_point
 
+    def moved_by(self, step: ArrayLike) -> Self:
+        """Return the camera with `step` (P,) added to its parameters, see `parameter_names`."""
+        values = named_step(self, step)
+        return replace(
+            self,
+            lens=moved_lens(self.lens, values),
+            dome_from_cam=moved_pose(self.dome_from_cam, values),
+            **self._moved_medium(values),
+        )
+
+    def _moved_medium(self, _values: dict[str, float]) -> dict[str, Any]:
+        """Return the changed fields of housing and media."""
+        return {}
+
     def inside_image(self, pixels: ArrayLike) -> BoolArray:
         """Return which pixels (..., 2) lie in the picture; NaN does not.
 
@@ -409,7 +372,7 @@ class _CompiledCamera:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class BareCamera(_CompiledCamera):
+class BareCamera(Camera):
     """A camera without a dome: the lens itself in the outer medium.
 
     Raises `RigError` if the size is not positive or the pose is not one finite rigid transform.
@@ -418,18 +381,9 @@ class BareCamera(_CompiledCamera):
     def __post_init__(self) -> None:
         self._pack(None, 1.0, 1.0)
 
-    def moved_by(self, step: ArrayLike) -> "BareCamera":
-        """Return the camera with `step` (P,) added to its parameters, see `parameter_names`."""
-        values = named_step(self, step)
-        return replace(
-            self,
-            lens=moved_lens(self.lens, values),
-            dome_from_cam=moved_pose(self.dome_from_cam, values),
-        )
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class HousedCamera(_CompiledCamera):
+class HousedCamera(Camera):
     """A camera behind a dome or a flat port.
 
     Raises `RigError` if the lens lies outside the inner sphere of a dome, an index or the size is
@@ -444,14 +398,9 @@ class HousedCamera(_CompiledCamera):
     def __post_init__(self) -> None:
         self._pack(self.housing, self.n_air, self.n_water)
 
-    def moved_by(self, step: ArrayLike) -> "HousedCamera":
-        """Return the camera with `step` (P,) added to its parameters, see `parameter_names`."""
-        values = named_step(self, step)
-        return replace(
-            self,
-            lens=moved_lens(self.lens, values),
-            dome_from_cam=moved_pose(self.dome_from_cam, values),
-            housing=self.housing.moved_by(values),
-            n_air=self.n_air + values["n_air"],
-            n_water=self.n_water + values["n_water"],
-        )
+    def _moved_medium(self, values: dict[str, float]) -> dict[str, Any]:
+        return {
+            "housing": self.housing.moved_by(values),
+            "n_air": self.n_air + values["n_air"],
+            "n_water": self.n_water + values["n_water"],
+        }
