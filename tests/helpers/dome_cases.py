@@ -11,6 +11,7 @@ from aqualvs.calibrate import dome
 from aqualvs.calibration.dome.problem import BoardSet, DomeOptions
 from aqualvs.calibration.solver.bundle import rig_difference
 from aqualvs.calibration.solver.result import DomeCalibration
+from aqualvs.calibration.targets.pose_files import BoardPose
 from aqualvs.calibration.targets.targets import View
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec, rotvec_from_rotation
@@ -31,11 +32,12 @@ def leave_bare_lenses_out(patch: pytest.MonkeyPatch) -> None:
 
 
 @dataclass(frozen=True)
-class Given:
+class Given(BoardPose):
     """What was measured of a board's pose."""
 
-    dome_from_board: SE3 | None = None
+    name: str = ""
     distance: float | None = None
+    dome_from_board: SE3 | None = None
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,6 @@ Cross-validation: the dome's prediction of unused corners against that of a bare
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from typing import Protocol
 
 import numpy as np
 
@@ -40,6 +39,7 @@ from aqualvs.calibration.solver.initial_pose import (
 )
 from aqualvs.calibration.solver.least_squares import Solution, solve
 from aqualvs.calibration.solver.result import CrossValidation, rms_px
+from aqualvs.calibration.targets.pose_files import BoardPose
 from aqualvs.calibration.targets.targets import View, check_enough
 from aqualvs.errors import CalibrationError
 from aqualvs.geometry.arrays import FloatArray
@@ -47,18 +47,6 @@ from aqualvs.geometry.transforms import SE3
 from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import Rig, RigUncertainty, combined
 from aqualvs.optics.water import N_AIR
-
-
-class GivenPose(Protocol):
-    """Measurements of a board's pose: the whole pose, its distance, or nothing."""
-
-    @property
-    def dome_from_board(self) -> SE3 | None:
-        """The whole pose, or None."""
-
-    @property
-    def distance(self) -> float | None:
-        """Distance along the dome's y axis to the board's plane, in metres, or None."""
 
 
 class PoseKind(StrEnum):
@@ -69,7 +57,7 @@ class PoseKind(StrEnum):
     UNKNOWN = "unknown"
 
 
-def kind_of(given: GivenPose | None) -> PoseKind:
+def kind_of(given: BoardPose | None) -> PoseKind:
     """Return the kind of knowledge of a pose."""
     if given is None:
         return PoseKind.UNKNOWN
@@ -85,7 +73,7 @@ class BoardSet:
     name: str  # For messages: "air", "pool", a folder.
     views: tuple[View, ...]  # One for each picture.
     # Measurements of each view's board; empty if nothing is known of any.
-    poses: Sequence[GivenPose | None] = ()
+    poses: Sequence[BoardPose | None] = ()
     # Index outside the dome (vacuum = 1).
     n_medium: float = N_AIR
     # Its standard deviation; 0 takes it as exact.
@@ -95,7 +83,7 @@ class BoardSet:
         if self.poses and len(self.poses) != len(self.views):
             raise ValueError(f"{len(self.poses)} poses given for {len(self.views)} views")
 
-    def given(self, i_view: int) -> GivenPose | None:
+    def given(self, i_view: int) -> BoardPose | None:
         """Return the measurements of a view's board."""
         return self.poses[i_view] if self.poses else None
 
@@ -182,7 +170,7 @@ class Shot:
     label: str
     view: View
     i_set: int
-    given: GivenPose | None
+    given: BoardPose | None
 
     @property
     def kind(self) -> PoseKind:
