@@ -19,7 +19,7 @@ import math
 import re
 import unicodedata
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
@@ -127,18 +127,18 @@ _KEYS = ("dive", "rig", "name", *_NUMBERS, "log", "log_offset_s")
 
 
 @dataclass(frozen=True, slots=True)
-class ListedDive:
-    """A dive as the user names it."""
+class Dive:
+    """A dive as the user names it, or as `find_dives` completes it, with absolute paths."""
 
-    source: Path
-    rig: Path | None = None  # None where the list does not say.
-    name: str = ""  # Empty where the list does not say.
-    water: Water = field(default_factory=Water)  # Nothing where the list does not say.
+    source: Path  # Video, folder of images or recording.
+    rig: Path | None = None  # None where it is not said, or for a recording, which has its own.
+    name: str = ""  # As the user calls it; empty if it shall be named after its file.
+    water: Water = field(default_factory=Water)  # What the user says about the water of this dive.
     log: Path | None = None  # The vehicle's, where the list says it.
     log_offset_s: float | None = None  # Its clock minus the dive's, where the list says it.
 
 
-def read_list(path: Path) -> list[ListedDive]:
+def read_list(path: Path) -> list[Dive]:
     """Read a list of dives.
 
     Raises `OptionError` if it cannot be read, a row has no dive, or what it says is not understood.
@@ -169,14 +169,14 @@ def _yaml_rows(text: str, path: Path) -> Iterable[Mapping[str, Any]]:
     return content
 
 
-def _listed(row: Mapping[str, Any], path: Path, number: int) -> ListedDive:
+def _listed(row: Mapping[str, Any], path: Path, number: int) -> Dive:
     unknown = sorted(str(key) for key in set(row) - set(_KEYS))
     if unknown:
         raise OptionError(f"{path}: unknown key {unknown[0]!r}; known are {', '.join(_KEYS)}")
     if "dive" not in row:
         raise OptionError(f"{path}: row {number} names no dive; fill in the column 'dive'")
     rig, log = row.get("rig"), row.get("log")
-    return ListedDive(
+    return Dive(
         source=path.parent / str(row["dive"]).strip(),
         rig=None if rig is None else path.parent / str(rig).strip(),
         name=str(row.get("name", "")).strip(),
@@ -231,18 +231,6 @@ RIG_YAML = "rig.yaml"
 _RECORDING = ".mcap"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Dive:
-    """A dive to be measured."""
-
-    source: Path  # Video, folder of images or recording; absolute.
-    rig: Path | None  # Absolute; None for a recording, which has its own.
-    name: str = ""  # As the user calls it; empty if it shall be named after its file.
-    water: Water = field(default_factory=Water)  # What the user says about the water of this dive.
-    log: Path | None = None  # The vehicle's; absolute.
-    log_offset_s: float | None = None  # Its clock minus the dive's, where it is known.
-
-
 def find_dives(
     wanted: Sequence[str], *, rig: Path | None, water: Water, out: Path | None = None
 ) -> list[Dive]:
@@ -273,28 +261,27 @@ def find_dives(
     found: dict[Path, Dive] = {}
     for listed in _found_dives(wanted, out):
         source = listed.source.resolve()
-        dive = Dive(
+        dive = replace(
+            listed,
             source=source,
             rig=_rig_of(source, listed.rig or rig),
-            name=listed.name,
             water=listed.water if listed.water != Water() else water,
             log=_log_of(source, listed.log),
-            log_offset_s=listed.log_offset_s,
         )
         if found.setdefault(source, dive) != dive:
             raise OptionError(f"{source}: given twice, with different words; name it once")
     return list(found.values())
 
 
-def _found_dives(wanted: Iterable[str], out: Path | None) -> Iterator[ListedDive]:
+def _found_dives(wanted: Iterable[str], out: Path | None) -> Iterator[Dive]:
     for text in wanted:
         for path in _expanded(text):
             if path.suffix.lower() in LIST_SUFFIXES and path.is_file():
                 yield from read_list(path)
             elif path.is_dir():
-                yield from (ListedDive(inner) for inner in _dives_in(path, out))
+                yield from (Dive(inner) for inner in _dives_in(path, out))
             elif path.exists():
-                yield ListedDive(path)
+                yield Dive(path)
             else:
                 raise SourceError(f"{path}: no such file or folder; check the path")
 
