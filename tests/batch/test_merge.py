@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import yaml
 
-from aqualvs.batch.dataset import holds_dive, read_manifest
+from aqualvs.batch.dataset import OF_DIVE, holds, read_manifest
 from aqualvs.batch.dives import DiveState
 from aqualvs.batch.scheduler import Scheduler, WorkersLostError, look
 from aqualvs.optics.rigfile import load_rig, save_rig
@@ -232,7 +232,7 @@ def test_a_fault_of_ours_fails_the_dive_alone(tmp_path, dive):
     assert sorted(record.state for record in records.values()) == ["failed", "finished"]
     failed = next(name for name, r in records.items() if r.state is DiveState.FAILED)
     assert records[failed].words == "ZeroDivisionError: oops"
-    assert not holds_dive(works[0].dataset, failed)
+    assert not holds(works[0].dataset, failed, OF_DIVE)
 
 
 def test_a_seal_tells_what_the_work_cost(tmp_path, dive):

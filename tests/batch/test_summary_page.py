@@ -7,7 +7,7 @@ import pytest
 from pyarrow import dataset as arrow_dataset
 from pyarrow import parquet
 
-from aqualvs.batch.dataset import drop_dive, holds_dive, put_dive, write_dives
+from aqualvs.batch.dataset import OF_DIVE, drop, holds, put_dive, write_dives
 from aqualvs.batch.dives import DiveRecord, DiveState
 from aqualvs.batch.summary_page import range_steps, range_svg, write_summary
 from aqualvs.results.folder import PostureCsv
@@ -128,9 +128,9 @@ def test_points_are_not_stored_twice(dataset):
 
 def test_a_dive_can_be_taken_out(tmp_path, dataset):
     put_dive(tmp_path, "april", dataset.parent / "april")
-    assert holds_dive(tmp_path, "april")
-    drop_dive(tmp_path, "april")
-    assert not holds_dive(tmp_path, "april")
+    assert holds(tmp_path, "april", OF_DIVE)
+    drop(tmp_path, "april", OF_DIVE)
+    assert not holds(tmp_path, "april", OF_DIVE)
     assert not list(tmp_path.rglob("*.parquet"))
 
 

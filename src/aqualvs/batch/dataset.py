@@ -168,7 +168,8 @@ _TYPES = dict.fromkeys(_COUNTS, pa.int32()) | {
     **dict.fromkeys(("reason", "mesh", "placed_by"), pa.string()),
     "valid": pa.bool_(),
 }
-_OF_NET = (NET_CSV, HOLES_CSV)
+OF_DIVE, OF_NET = (POSTURE_CSV, POINTS_PARQUET), (NET_CSV, HOLES_CSV)
+"""Files of a run that are tables of the data set: of its dive, and of its net."""
 DIVES_SCHEMA = pa.schema(
     [
         *((name, pa.string()) for name in ("dive", "source", "rig", "rig_file", "state", "words")),
@@ -212,16 +213,6 @@ def put_dive(dataset: Path, name: str, run_folder: Path) -> None:
             shutil.copyfile(run_folder / POINTS_PARQUET, draft)
 
 
-def holds_dive(dataset: Path, name: str) -> bool:
-    """Return whether both partitions of a dive are there."""
-    return _holds(dataset, name, (POSTURE_CSV, POINTS_PARQUET))
-
-
-def drop_dive(dataset: Path, name: str) -> None:
-    """Remove the partitions of a dive, if they are there."""
-    _drop(dataset, name, (POSTURE_CSV, POINTS_PARQUET, *_OF_NET))
-
-
 def put_net(dataset: Path, name: str, folder: Path) -> None:
     """Put the state of a dive's net into the data set, in place of what is there of this dive.
 
@@ -237,18 +228,8 @@ def put_net(dataset: Path, name: str, folder: Path) -> None:
     OSError
         As the system says it.
     """
-    for table in _OF_NET:
+    for table in OF_NET:
         _put_table(dataset, name, folder / table, null_words=True)
-
-
-def holds_net(dataset: Path, name: str) -> bool:
-    """Return whether both partitions of a dive's net are there."""
-    return _holds(dataset, name, _OF_NET)
-
-
-def drop_net(dataset: Path, name: str) -> None:
-    """Remove the partitions of a dive's net, if they are there."""
-    _drop(dataset, name, _OF_NET)
 
 
 def write_dives(dataset: Path, rows: Iterable[Mapping[str, Any]]) -> None:
@@ -283,11 +264,13 @@ def _put_table(dataset: Path, name: str, path: Path, *, null_words: bool) -> Non
         parquet.write_table(_table(path, null_words=null_words), draft, compression="zstd")
 
 
-def _holds(dataset: Path, name: str, tables: Iterable[str]) -> bool:
+def holds(dataset: Path, name: str, tables: Iterable[str]) -> bool:
+    """Return whether all these partitions of a dive are there."""
     return all(_partition(dataset, name, table).is_file() for table in tables)
 
 
-def _drop(dataset: Path, name: str, tables: Iterable[str]) -> None:
+def drop(dataset: Path, name: str, tables: Iterable[str]) -> None:
+    """Remove these partitions of a dive, if they are there."""
     for table in tables:
         shutil.rmtree(_partition(dataset, name, table).parent, ignore_errors=True)
 

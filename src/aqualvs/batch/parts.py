@@ -17,10 +17,12 @@ from typing import Any
 import cv2
 
 from aqualvs.batch.dataset import (
+    OF_DIVE,
+    OF_NET,
     clear,
     drafted,
-    drop_net,
-    holds_dive,
+    drop,
+    holds,
     put_dive,
     read_valid_manifest,
     scratch,
@@ -266,7 +268,7 @@ def finished_dive(work: DiveWork, probe: DiveProbe) -> dict[str, Any] | None:
     facts = read_valid_manifest(work.home / JOINED, probe.key, out)
     if facts is None or (work.request.report and not (out / REPORT_HTML).exists()):
         return None
-    return facts if holds_dive(work.dataset, work.name) else None
+    return facts if holds(work.dataset, work.name, OF_DIVE) else None
 
 
 def join_dive(work: DiveWork, probe: DiveProbe, results: Sequence[PieceResult]) -> dict[str, Any]:
@@ -303,7 +305,7 @@ def join_dive(work: DiveWork, probe: DiveProbe, results: Sequence[PieceResult]) 
         names = _replace_run(draft, out)
         put_dive(work.dataset, work.name, out)
         # That of an older result; its files in the dive's folder are gone already.
-        drop_net(work.dataset, work.name)
+        drop(work.dataset, work.name, OF_NET)
         (home / JOINED).mkdir(parents=True, exist_ok=True)
         cpu_s = sum(result.cpu_s for result in results) + time.process_time() - began_s
         peak = max(peak_bytes(), *(result.peak_bytes for result in results))

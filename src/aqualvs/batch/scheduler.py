@@ -20,8 +20,10 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from aqualvs.batch.dataset import (
-    drop_dive,
-    holds_net,
+    OF_DIVE,
+    OF_NET,
+    drop,
+    holds,
     put_net,
     read_manifest,
     read_valid_manifest,
@@ -76,20 +78,6 @@ class WorkersLostError(Exception):
 
 class WorkersGoneError(AqualvsError):
     """There is no worker left, and none has come for minutes."""
-
-
-class Workers(Protocol):
-    """Pool of processes that take tasks."""
-
-    @property
-    def n_slots(self) -> int:
-        """Tasks that can be under way at a time."""
-
-    def submit(self, token: object, function: Callable[..., Any], *arguments: object) -> None:
-        """Have a task done."""
-
-    def next_done(self, timeout_s: float) -> FinishedTask | None:
-        """Return a task that has ended; None if none does within the time."""
 
 
 class DaskWorkers(Closing):
@@ -301,7 +289,7 @@ def _state(work: DiveWork, key: str, request: NetRequest) -> dict[str, Any]:
     """Return the summary of a net's state: the one that is there, or a new one."""
     out, home = work.request.out, work.home / NET
     found = read_valid_manifest(home, key, out)
-    if found is not None and holds_net(work.dataset, work.name):
+    if found is not None and holds(work.dataset, work.name, OF_NET):
         return found
     dive = StoredDive(out)
     net = dive.net_pass(request)
@@ -405,7 +393,7 @@ class Scheduler:
     def __init__(
         self,
         works: Sequence[tuple[DiveWork, int]],
-        workers: Workers,
+        workers: DaskWorkers,
         observer: BatchObserver,
         steps: Steps | None = None,
     ) -> None:
@@ -521,7 +509,7 @@ class Scheduler:
             return self._begin(dive)
         foreseen = isinstance(error, AqualvsError | WorkersLostError)
         words = str(error) if foreseen else f"{type(error).__name__}: {error}"
-        drop_dive(dive.work.dataset, dive.work.name)
+        drop(dive.work.dataset, dive.work.name, (*OF_DIVE, *OF_NET))
         return self._end(dive, _record(dive, DiveState.FAILED, words))
 
     def _as_whole(self, dive: _Dive, why: str) -> None:
