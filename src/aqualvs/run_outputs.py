@@ -14,7 +14,7 @@ import time
 from array import array
 from collections import deque
 from collections.abc import Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -56,8 +56,6 @@ from aqualvs.workers.frame_results import FrameResult, FrameScanner
 from aqualvs.workers.run_frames import Replay, WaterFollowingScanner
 
 if TYPE_CHECKING:
-    from aqualvs.recording import Recording
-    from aqualvs.recording.rerun_log import RerunLog
     from aqualvs.recording.sample import LiveSample
 
 
@@ -93,7 +91,7 @@ FrameOutput = tuple[Rig, Scan, dict[SearchAxis, StripePeaks]]
 
 
 class RunMcap(Closing):
-    """Writer of `dive.mcap` during a run, or of nothing; a context manager.
+    """Writer of `dive.mcap` during a run; a context manager.
 
     Parameters
     ----------
@@ -101,8 +99,6 @@ class RunMcap(Closing):
         For frames that were lost.
     options : ScannerOptions
         That the run measures with.
-    wanted : bool
-        False makes it measure frames and nothing else.
 
     Raises
     ------
@@ -110,20 +106,19 @@ class RunMcap(Closing):
         From every method, if the file cannot be written.
     """
 
-    def __init__(self, folder: Path, rig: Rig, options: ScannerOptions, *, wanted: bool) -> None:
+    def __init__(self, folder: Path, rig: Rig, options: ScannerOptions) -> None:
+        # Few runs write one.
+        from aqualvs.recording import RecorderOptions, Recording
+
         self._path, self._rig = folder / DIVE_MCAP, rig
         self._began_ns = time.time_ns()
-        self._recording: Recording | None = None
         # A rolling shutter's scans are written a few frames after their stripes are measured.
         self._waiting: deque[tuple[Rig, dict[SearchAxis, StripePeaks]]] = deque()
-        if wanted:
-            with writing(self._path):
-                self._recording = _recording(self._path, options)
+        with writing(self._path):
+            self._recording = Recording(self._path, RecorderOptions(scanner=options))
 
     def recorded(self, scanner: FrameScanner) -> FrameScanner:
         """Return a scanner that measures as this one does, and keeps the stripes for `write`."""
-        if self._recording is None:
-            return scanner
         return _RecordedScanner(scanner, self._waiting)
 
     def write(self, scan: Scan, *, is_lost: bool) -> None:
@@ -131,17 +126,14 @@ class RunMcap(Closing):
 
         A frame that was lost has none.
         """
-        if self._recording is None:
-            return
         rig, peaks = (self._rig, {}) if is_lost else self._waiting.popleft()
         with writing(self._path):
             self._recording.write(_sample(self._began_ns, rig, scan, peaks))
 
     def close(self) -> None:
         """Close the file; readable in any case."""
-        if self._recording is not None:
-            with writing(self._path):
-                self._recording.close()
+        with writing(self._path):
+            self._recording.close()
 
 
 class _RecordedScanner:
@@ -183,38 +175,27 @@ def _sample(
 
 
 class RunRerun(Closing):
-    """Writer of a file of Rerun during a run, or of nothing; a context manager.
+    """Writer of a file of Rerun during a run; a context manager.
 
     Raises `OutputError` if the file cannot be written. Raises `OptionError` if rerun-sdk is not
     installed.
     """
 
-    def __init__(self, path: Path | None, rig: Rig) -> None:
-        self._rig = rig
-        self._log: RerunLog | None = None
-        if path is not None:
-            from aqualvs.recording import rerun_log
+    def __init__(self, path: Path, rig: Rig) -> None:
+        from aqualvs.recording import rerun_log
 
-            self._log = rerun_log.RerunLog()
-            with writing(path):
-                self._log.save(path)
+        self._rig = rig
+        self._log = rerun_log.RerunLog()
+        with writing(path):
+            self._log.save(path)
 
     def write(self, frame: Frame | None, scan: Scan) -> None:
         """Log the result of a frame."""
-        if self._log is not None:
-            self._log.write(_sample(0, self._rig, scan, {}, frame))
+        self._log.write(_sample(0, self._rig, scan, {}, frame))
 
     def close(self) -> None:
         """Finish the file."""
-        if self._log is not None:
-            self._log.close()
-
-
-def _recording(path: Path, options: ScannerOptions) -> "Recording":
-    """Open a recording; its modules are imported here and above, as few runs write one."""
-    from aqualvs.recording import RecorderOptions, Recording
-
-    return Recording(path, RecorderOptions(scanner=options))
+        self._log.close()
 
 
 def check_source_stays(folder: Path, source: str) -> None:
@@ -243,34 +224,21 @@ def _measured(scanner: FrameScanner, frame: Frame) -> FrameOutput:
 
 
 class RunOverlay(Closing):
-    """Writer of `overlay.mp4` during a run, or of nothing; a context manager.
+    """Writer of `overlay.mp4` during a run; a context manager.
 
-    Parameters
-    ----------
-    source : FrameSource
-        Gives size and rate of the video.
-    wanted : bool
-        False makes `write` do nothing.
-
-    Raises
-    ------
-    OutputError
-        From every method, if the video cannot be written.
+    `source`: gives size and rate of the video. Raises `OutputError` from every method, if the video
+    cannot be written.
     """
 
-    def __init__(self, folder: Path, rig: Rig, source: FrameSource, *, wanted: bool) -> None:
+    def __init__(self, folder: Path, rig: Rig, source: FrameSource) -> None:
         self._path = folder / OVERLAY_MP4
         self._rig = rig
-        self._writer: OverlayWriter | None = None
         fps_without_clock = 25.0
-        if wanted:
-            fps = source.fps or fps_without_clock
-            self._writer = OverlayWriter(self._path, source.size_px, fps)
+        fps = source.fps or fps_without_clock
+        self._writer = OverlayWriter(self._path, source.size_px, fps)
 
     def write(self, frame: Frame | None, scan: Scan) -> None:
         """Append a picture; a lost frame gives a black one, so that frames keep their number."""
-        if self._writer is None:
-            return
         width, height = self._rig.size_px
         image = np.zeros((height, width, 3), np.uint8)
         if frame is not None:
@@ -281,9 +249,8 @@ class RunOverlay(Closing):
 
     def close(self) -> None:
         """Finish the video."""
-        if self._writer is not None:
-            with writing(self._path):
-                self._writer.close()
+        with writing(self._path):
+            self._writer.close()
 
 
 class RunBareLens(Closing):
@@ -329,15 +296,18 @@ class RunBareLens(Closing):
 
 
 class RunWriters:
-    """The folder's files, the overlay, the recording and the state of the net, as one."""
+    """The folder's files, the overlay, the recording and the state of the net, as one.
+
+    `outputs` and `bare_lens` are written in any case, the others where they are wanted.
+    """
 
     def __init__(
         self,
         outputs: RunOutputs,
-        overlay: RunOverlay,
+        overlay: RunOverlay | None,
         bare_lens: RunBareLens,
-        mcap: RunMcap,
-        rerun: RunRerun,
+        mcap: RunMcap | None,
+        rerun: RunRerun | None,
         net: RunNet,
     ) -> None:
         self._outputs, self._overlay, self._bare_lens = outputs, overlay, bare_lens
@@ -345,16 +315,19 @@ class RunWriters:
 
     def recorded(self, scanner: FrameScanner) -> FrameScanner:
         """Return the scanner to measure with, which records its results if requested."""
-        return self._mcap.recorded(scanner)
+        return scanner if self._mcap is None else self._mcap.recorded(scanner)
 
     def write(self, *found: FrameResult) -> None:
         """Write the results of frames, and scans of lost ones, in their order."""
         self._outputs.write(*(measured.scan for measured in found))
         self._bare_lens.write(*found)
         for measured in found:
-            self._overlay.write(measured.frame, measured.scan)
-            self._rerun.write(measured.frame, measured.scan)
-            self._mcap.write(measured.scan, is_lost=measured.is_lost)
+            if self._overlay is not None:
+                self._overlay.write(measured.frame, measured.scan)
+            if self._rerun is not None:
+                self._rerun.write(measured.frame, measured.scan)
+            if self._mcap is not None:
+                self._mcap.write(measured.scan, is_lost=measured.is_lost)
             if not measured.is_lost:
                 self._net.add(measured.scan)
 
@@ -406,10 +379,10 @@ def writers(
     )
     with (
         outputs,
-        RunOverlay(request.out, rig, source, wanted=request.overlay) as overlay,
+        RunOverlay(request.out, rig, source) if request.overlay else nullcontext() as overlay,
         RunBareLens(request.out, rig) as bare_lens,
-        RunMcap(request.out, rig, request.scanner, wanted=request.mcap) as mcap,
-        RunRerun(request.rerun, rig) as rerun,
+        RunMcap(request.out, rig, request.scanner) if request.mcap else nullcontext() as mcap,
+        RunRerun(request.rerun, rig) if request.rerun else nullcontext() as rerun,
     ):
         yield RunWriters(outputs, overlay, bare_lens, mcap, rerun, net)
 
