@@ -10,7 +10,7 @@ import socket
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol, TypeAlias
+from typing import Literal, TypeAlias
 
 from aqualvs.errors import OptionError
 from aqualvs.live.mavlink.peers import Peer
@@ -159,49 +159,49 @@ _SEND_BUFFER = 16_384
 _NOT_NOW = (errno.EAGAIN, errno.EWOULDBLOCK, errno.ENOBUFS, errno.EINTR)
 
 
-class Port(Protocol):
+class Port:
     """Open connection to a peer; its faults are raised as OSError."""
 
-    @property
-    def many(self) -> bool:
-        """Whether there may be several senders, kept apart by their addresses."""
-
-    @property
-    def whole(self) -> bool:
-        """Whether each read returns a datagram."""
-
-    @property
-    def refused_s(self) -> float | None:
-        """Time of the peer's refusal because its port is closed (`time.monotonic`), if any."""
+    many = False  # Whether there may be several senders, kept apart by their addresses.
+    whole = False  # Whether each read returns a datagram.
+    # Time of the peer's refusal because its port is closed (`time.monotonic`), if any.
+    refused_s: float | None = None
 
     @property
     def unsent(self) -> bool:
         """Whether the end of a message waits for room."""
+        return False
 
     @property
     def lag_s(self) -> float:
         """Time that the driver needs to send its buffered data."""
+        return 0.0
 
     def fileno(self) -> int:
         """Return the number to wait on."""
+        raise NotImplementedError
 
     def read(self) -> tuple[bytes, Peer]:
         """Return the received data, possibly empty, and their sender."""
+        raise NotImplementedError
 
     def write(self, frames: bytes, peer: Peer, /) -> bool:
         """Send all of it, or nothing if there is no room; return whether it was sent.
 
         Where there is only one peer, its address is left empty.
         """
+        raise NotImplementedError
 
     def write_all(self, frames: bytes, heard: Sequence[Peer], /) -> bool:
         """Send to all known peers, where the port has no address of its own."""
+        raise NotImplementedError
 
     def flush(self) -> None:
         """Send waiting data, as far as there is room."""
 
     def close(self) -> None:
         """Free the port at once; waiting data are lost."""
+        raise NotImplementedError
 
 
 def open_port(address: Address) -> Port:
@@ -252,23 +252,17 @@ def find_host(host: str, port: int, flags: int) -> tuple[int, tuple[object, ...]
     return family, where
 
 
-class UdpPort:
+class UdpPort(Port):
     """Common base of UDP ports: a datagram goes at once or not at all."""
 
-    unsent = False
-    lag_s = 0.0
     whole = True
 
     def __init__(self, made: socket.socket) -> None:
         self._socket = made
-        self.refused_s: float | None = None
 
     def fileno(self) -> int:
         """Return the number of the socket."""
         return self._socket.fileno()
-
-    def flush(self) -> None:
-        """Do nothing: nothing ever waits."""
 
     def close(self) -> None:
         """Free the socket."""
@@ -307,8 +301,6 @@ class UdpPort:
 
 class _UdpSender(UdpPort):
     """Port that sends to one address and hears only that."""
-
-    many = False
 
     def __init__(self, address: NetAddress) -> None:
         made, where = _open_udp(address, passive=False)
@@ -390,11 +382,8 @@ class _UdpListener(UdpPort):
         return any(sent)
 
 
-class StreamPort:
+class StreamPort(Port):
     """Common base of TCP and serial ports: the rest of a partly sent message goes first."""
-
-    refused_s: float | None = None
-    many = whole = False
 
     def __init__(self) -> None:
         self._rest = b""
@@ -404,11 +393,6 @@ class StreamPort:
     def unsent(self) -> bool:
         """Whether the end of a message waits for room."""
         return bool(self._rest)
-
-    @property
-    def lag_s(self) -> float:
-        """Time that the driver needs to send its buffered data."""
-        return 0.0
 
     def read(self) -> tuple[bytes, Peer]:
         """Return the received data, possibly empty, and their sender, the only peer."""
