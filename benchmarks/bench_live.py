@@ -22,12 +22,12 @@ import numpy as np
 from aqualvs.control.time_filter import PostureFilter
 from aqualvs.control.vehicle import SetpointHolder
 from aqualvs.live.command import SWITCH_S
-from aqualvs.live.dashboard.access import Access, Controls, NoRecorder
+from aqualvs.live.dashboard.access import Access, Controls, RecordButton
 from aqualvs.live.dashboard.output import Dashboard
 from aqualvs.live.dashboard.server import DashboardServer
 from aqualvs.live.outputs.base import Output
 from aqualvs.live.outputs.mavlink import MavlinkOutput
-from aqualvs.live.runner import FixedScanner, LiveRunner, warm_up
+from aqualvs.live.runner import LiveRunner, ScannerSupply, warm_up
 from aqualvs.optics.rig import Rig
 from aqualvs.recording.sample import LiveSample
 from aqualvs.scanner import Scanner
@@ -136,7 +136,7 @@ def measure(rig: Rig, dive: Path) -> tuple[Clock, list[float]]:
     """Play the dive; returns the clock and the packets' delays in ms."""
     scanner = Scanner(rig)
     warm_up(scanner)
-    controls = Controls(SetpointHolder(rig.working_range), NoRecorder())
+    controls = Controls(SetpointHolder(rig.working_range), RecordButton())
     server = DashboardServer("127.0.0.1", 0, Access("127.0.0.1", "unused"), rig, controls)
     clock = Clock()
     with script(_PEER) as peer, script(_WATCHER, str(server.port)) as viewer:
@@ -147,7 +147,7 @@ def measure(rig: Rig, dive: Path) -> tuple[Clock, list[float]]:
         ]
         line_of(viewer)
         feed = open_feed(dive, realtime=True)
-        LiveRunner(feed, FixedScanner(scanner), outputs, posture_filter=PostureFilter()).run(
+        LiveRunner(feed, ScannerSupply(scanner), outputs, posture_filter=PostureFilter()).run(
             lambda: False
         )
         arrived = json.loads(line_of(peer))

@@ -357,7 +357,7 @@ def test_memory_and_handles_stay_flat_over_a_long_run(tmp_path: Path) -> None:
     n_frames = int(os.environ.get("AQUALVS_SOAK_FRAMES", "1000"))
     from aqualvs.control.time_filter import PostureFilter
     from aqualvs.live.outputs.udp_json import UdpJsonOutput
-    from aqualvs.live.runner import FixedScanner, LiveOptions, LiveRunner
+    from aqualvs.live.runner import LiveOptions, LiveRunner, ScannerSupply
     from aqualvs.recording import RecorderSwitch
     from live_cases import Collector, ScriptedFeed, demo_scanner, renumbered
 
@@ -386,7 +386,7 @@ def test_memory_and_handles_stay_flat_over_a_long_run(tmp_path: Path) -> None:
     switch.start()
     outputs = [Looks(), UdpJsonOutput("127.0.0.1:9"), switch]
     LiveRunner(
-        feed, FixedScanner(demo_scanner()), outputs, LiveOptions(keep_every=True), PostureFilter()
+        feed, ScannerSupply(demo_scanner()), outputs, LiveOptions(keep_every=True), PostureFilter()
     ).run(lambda: False)
     memory, handles = np.array(sizes).T
     assert len(memory) == 8

@@ -29,7 +29,7 @@ from aqualvs.live.options import VehicleSetup, serve_page
 from aqualvs.live.outputs.base import Output
 from aqualvs.live.outputs.mavlink import MavlinkOutput
 from aqualvs.live.pilot import Pilot, PilotReport
-from aqualvs.live.runner import FixedScanner, LiveRunner, warm_up
+from aqualvs.live.runner import LiveRunner, ScannerSupply, warm_up
 from aqualvs.recording import RecorderSwitch
 from aqualvs.recording.sample import LiveSample
 from aqualvs.results.files import Claim
@@ -180,7 +180,7 @@ def _runner(
         if request.dashboard is not None:
             page = (request.dashboard, request.token, scanner.rig, holder, recorder, echo)
             outputs.append(serve_page(*page, lambda: pilot.latest.state if pilot.latest else None))
-        runner = LiveRunner(feed, FixedScanner(scanner), outputs, posture_filter=PostureFilter())
+        runner = LiveRunner(feed, ScannerSupply(scanner), outputs, posture_filter=PostureFilter())
         undo.pop_all()
     return runner
 

@@ -19,7 +19,7 @@ from aqualvs.control.vehicle import SetpointHolder
 from aqualvs.errors import OptionError
 from aqualvs.live.options import OutputRequest, make_outputs, serve_page, vehicle_reader
 from aqualvs.live.outputs.base import Output
-from aqualvs.live.runner import FixedScanner, LiveOptions, LiveRunner, ScannerSupply, warm_up
+from aqualvs.live.runner import LiveOptions, LiveRunner, ScannerSupply, warm_up
 from aqualvs.optics.rig import Rig
 from aqualvs.recording import PictureFormat, RecorderOptions, RecorderSwitch
 from aqualvs.recording.sample import LiveSample
@@ -37,7 +37,7 @@ from aqualvs.workers.run_frames import WaterFollowingScanner
 _TIMEOUT_S = 3.0
 
 
-class WaterFollower:
+class WaterFollower(ScannerSupply):
     """Provider of the scanner for the present water; a thread reads the target.
 
     `following`: looks at the target; used by the thread alone from here on.
@@ -46,19 +46,9 @@ class WaterFollower:
     def __init__(self, following: WaterFollowingScanner) -> None:
         self._following = following
         self._frames: queue.Queue[Frame | None] = queue.Queue(1)
-        self._scanner, self._sigma = following.scanner, following.sigma_n_water
+        super().__init__(following.scanner, following.sigma_n_water)
         self._thread = threading.Thread(target=self._look, name="water", daemon=True)
         self._thread.start()
-
-    @property
-    def scanner(self) -> Scanner:
-        """The one to use for the next frame."""
-        return self._scanner
-
-    @property
-    def sigma_n_water(self) -> float:
-        """Standard deviation of its index; NaN until the target has been seen."""
-        return self._sigma
 
     def offer(self, frame: Frame) -> None:
         """Pass on a frame for reading the target, when one is due and the thread is idle."""
@@ -77,8 +67,8 @@ class WaterFollower:
     def _look(self) -> None:
         while (frame := self._frames.get()) is not None:
             self._following.look(frame)
-            self._scanner = self._following.scanner
-            self._sigma = self._following.sigma_n_water
+            self.scanner = self._following.scanner
+            self.sigma_n_water = self._following.sigma_n_water
 
 
 _SCREEN_EVERY_S, _LOG_EVERY_S = 0.2, 10.0
@@ -269,7 +259,7 @@ def _provider(request: LiveRequest, rig: Rig) -> ScannerSupply:
     if request.index_target is None:
         scanner = Scanner(rig, request.scanner)
         warm_up(scanner)
-        return FixedScanner(scanner)
+        return ScannerSupply(scanner)
     following = WaterFollowingScanner(rig, request.scanner, request.index_target, request.water)
     warm_up(following.scanner)
     return WaterFollower(following)

@@ -224,7 +224,7 @@ def serve_page(
         cannot be used.
     """
     try:
-        from aqualvs.live.dashboard.access import Controls, NoRecorder, make_access, token_fault
+        from aqualvs.live.dashboard.access import Controls, RecordButton, make_access, token_fault
         from aqualvs.live.dashboard.output import Dashboard, SwitchButton
         from aqualvs.live.dashboard.server import DashboardServer
     except ImportError as lack:
@@ -236,7 +236,7 @@ def serve_page(
     if fault:
         raise OptionError(fault)
     access = make_access(host, token, embedders)
-    controls = Controls(holder, NoRecorder() if recorder is None else SwitchButton(recorder))
+    controls = Controls(holder, RecordButton() if recorder is None else SwitchButton(recorder))
     server = DashboardServer(host, port, access, rig, controls)
     shown = f"[{host}]" if ":" in host else host
     echo(f"dashboard: http://{shown}:{server.port}/#token={access.token}")

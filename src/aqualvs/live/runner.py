@@ -11,12 +11,13 @@ Only its owner ends the loop; faults of frames and outputs do not.
 """
 
 import logging
+import math
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Protocol, Self
+from typing import Self
 
 import cv2
 import numpy as np
@@ -307,36 +308,18 @@ class FrameReader:
 _SILENT_EVERY_S, _LOOK_EVERY_S, _HEALTH_EVERY_S = 0.1, 0.05, 0.1
 
 
-class ScannerSupply(Protocol):
-    """Provider of the scanner, which changes as the water's index is tracked."""
+class ScannerSupply:
+    """Provider of the scanner for the next frame: always the same, but for subclasses."""
 
-    @property
-    def scanner(self) -> Scanner:
-        """The one to use for the next frame."""
-
-    @property
-    def sigma_n_water(self) -> float:
-        """Standard deviation of its index; NaN where it is not measured."""
+    def __init__(self, scanner: Scanner, sigma_n_water: float = math.nan) -> None:
+        self.scanner = scanner
+        self.sigma_n_water = sigma_n_water  # Of its index; NaN where that is not measured.
 
     def offer(self, frame: Frame) -> None:
         """Look at a frame if it is of use; returns at once."""
 
     def close(self) -> None:
         """Stop looking."""
-
-
-class FixedScanner:
-    """Provider of always the same scanner."""
-
-    def __init__(self, scanner: Scanner) -> None:
-        self.scanner = scanner
-        self.sigma_n_water = float("nan")
-
-    def offer(self, frame: Frame) -> None:
-        """Do nothing: there is nothing to learn."""
-
-    def close(self) -> None:
-        """Do nothing."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

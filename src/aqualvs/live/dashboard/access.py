@@ -15,7 +15,7 @@ from collections import Counter, OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import count
-from typing import Annotated, Any, ClassVar, Literal, Protocol
+from typing import Annotated, Any, ClassVar, Literal
 from urllib.parse import urlsplit
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
@@ -75,11 +75,12 @@ def parse_message(text: str) -> Message:
     return _ADAPTER.validate_json(text)
 
 
-class RecordButton(Protocol):
-    """Interface of a recorder for the page."""
+class RecordButton:
+    """Record button of the page; this one is of a run that can record nothing."""
 
     def start(self) -> None:
         """Begin a recording; does nothing while one is under way."""
+        raise OptionError("record: this run records nothing; start it with --record FOLDER")
 
     def stop(self) -> None:
         """End it; does nothing where there is none."""
@@ -89,20 +90,6 @@ class RecordButton(Protocol):
 
         Also, as far as known, `seconds` of the recording, `free_bytes` of the disk and `left_s`.
         """
-
-
-class NoRecorder:
-    """Record button where nothing can be recorded."""
-
-    def start(self) -> None:
-        """Refuse."""
-        raise OptionError("record: this run records nothing; start it with --record FOLDER")
-
-    def stop(self) -> None:
-        """Do nothing."""
-
-    def to_dict(self) -> Mapping[str, Any]:
-        """Return that nothing is recorded."""
         return {"on": False, "words": ""}
 
 

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from aqualvs.control.vehicle import VehicleState
-from aqualvs.live.dashboard.access import Controls
+from aqualvs.live.dashboard.access import Controls, RecordButton
 from aqualvs.live.dashboard.server import DashboardServer, page_state
 from aqualvs.recording import RecorderSwitch
 from aqualvs.recording.sample import LiveSample
@@ -103,7 +103,7 @@ class Dashboard:
         self._server.close()
 
 
-class SwitchButton:
+class SwitchButton(RecordButton):
     """The page's record button on a recorder's switch."""
 
     def __init__(self, switch: RecorderSwitch) -> None:
