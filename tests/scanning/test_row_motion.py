@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from aqualvs.geometry.transforms import SE3
+from aqualvs.optics.rig_covariance import posture_by_plane
 from aqualvs.optics.shutter import AT_ONCE, Shutter, ShutterKind
 from aqualvs.scanner import Scanner
 from aqualvs.scanning import row_motion
@@ -159,7 +160,7 @@ def test_a_posture_is_that_of_a_vehicle_that_brakes():
         points = rays / np.sum(rays * np.repeat(shown, 3, axis=0), axis=1)[:, None]
         fit = np.linalg.solve(points.T @ points, points.T)
         m = fit.sum(axis=1)
-        by_m = row_motion._by_m(m)
+        by_m = posture_by_plane(m)
         by_motion = [
             by_m @ fit @ (points * share) @ np.linalg.inv(by_m)
             for share in (times, 0.5 * (times**2 + exposure**2 / 12.0))

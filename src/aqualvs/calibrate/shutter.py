@@ -191,8 +191,7 @@ def _warp(scan: Scan, height: int) -> _Warp | None:
         return None
     seen = points.points_in_dome[points.used]
     m = posture.normal_in_dome / posture.range
-    by_m = np.empty((3, 3))
-    posture_by_plane(m, by_m)
+    by_m = posture_by_plane(m)
     sigma = points.sigma[points.used] * np.linalg.norm(m)
     shares = (points.pixels[points.used, 1] + 0.5) / height - 0.5
     # Residuals of m·X, and their derivatives by the rates, for a readout of one second.

@@ -7,9 +7,14 @@ several machines, or by several processes, would not equal the same dive measure
 """
 
 import functools
+import os
 import types
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, TypeVar, cast
+
+# Numba prepares colours for every error that it might report: where colorama is installed, as on
+# Windows, that is a twentieth of its compiling.
+os.environ.setdefault("NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING", "1")
 
 import numba
 import numpy as np
@@ -64,6 +69,15 @@ def inline_kernel(function: F) -> F:
 def inline_borrowing_kernel(function: F) -> F:
     """Compile an `inline_kernel` that borrowing kernels call."""
     return _inner(function, forceinline=True, _nrt=False)
+
+
+def python_of(kernel: Callable[..., Any]) -> Callable[..., Any]:
+    """Return the Python function that a kernel is compiled from.
+
+    It takes numbers of NumPy, and arrays where it has no branches, and need not be compiled.
+    """
+    function: Callable[..., Any] = cast(Any, kernel).py_func
+    return function
 
 
 def chosen_by_class(kernels: Mapping[type, Callable[..., Any]]) -> Callable[..., Any]:

@@ -10,7 +10,8 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from aqualvs.geometry.compiled import inline_kernel, inner_kernel, kernel
+from aqualvs.geometry.arrays import BoolArray, FloatArray
+from aqualvs.geometry.compiled import inline_kernel, inner_kernel, python_of
 
 Vector: TypeAlias = tuple[float, float, float]
 """A vector as scalar kernels take and return it."""
@@ -85,24 +86,24 @@ def fisheye_undistort(lens: LensParams, radius: float) -> tuple[bool, float, flo
     return True, theta, slope
 
 
-@kernel
 def fisheye_limits(lens: LensParams) -> tuple[float, float]:
     """Return `LensParams.limit`, at most pi, and `limit_distorted`."""
+    distort = python_of(fisheye_distort)
     inside, outside = 0.0, math.pi
     for i_step in range(1, 1025):
         outside = math.pi * i_step / 1024.0
-        if not fisheye_distort(lens, outside)[1] > 0.0:
+        if not distort(lens, outside)[1] > 0.0:
             break
         inside = outside
     while outside - inside > 1e-15:
         middle = 0.5 * (inside + outside)
         if not inside < middle < outside:
             break
-        if fisheye_distort(lens, middle)[1] > 0.0:
+        if distort(lens, middle)[1] > 0.0:
             inside = middle
         else:
             outside = middle
-    widest, _ = fisheye_distort(lens, inside)
+    widest, _ = distort(lens, inside)
     return inside, widest * widest
 
 
@@ -233,14 +234,6 @@ def opencv_undistort_guarded(lens: LensParams, xd: float, yd: float) -> tuple[bo
     return residual <= solved, x, y
 
 
-@inline_kernel
-def _determinant(lens: LensParams, x: float, y: float) -> float:
-    _, _, j_xx, j_xy, j_yy = opencv_distort(lens, x, y)
-    # Beyond two sign changes the determinant is positive again, the trace is not.
-    return j_xx * j_yy - j_xy * j_xy if j_xx + j_yy > 0.0 else -1.0
-
-
-@kernel
 def opencv_limits(lens: LensParams) -> tuple[float, float]:
     """Return `LensParams.limit` and `limit_distorted`.
 
@@ -248,15 +241,17 @@ def opencv_limits(lens: LensParams) -> tuple[float, float]:
     Jacobian determinant, searched along spokes in steps of a quarter of a degree and by halving.
     """
     limit = math.inf
-    for i_spoke in range(_SPOKES):
-        phi = 2.0 * math.pi * i_spoke / _SPOKES
-        limit = min(limit, _limit_on_spoke(lens, math.cos(phi), math.sin(phi), limit))
+    spokes = [2.0 * math.pi * i_spoke / _SPOKES for i_spoke in range(_SPOKES)]
+    # Beyond the limit the model may have poles.
+    with np.errstate(all="ignore"):
+        for phi in spokes:
+            limit = min(limit, _limit_on_spoke(lens, math.cos(phi), math.sin(phi), limit))
     if limit == math.inf:
         return limit, limit
-    widest = 0.0
-    for i_spoke in range(_SPOKES):
-        phi, radius = 2.0 * math.pi * i_spoke / _SPOKES, math.sqrt(limit)
-        xd, yd, _, _, _ = opencv_distort(lens, radius * math.cos(phi), radius * math.sin(phi))
+    widest, radius = 0.0, math.sqrt(limit)
+    for phi in spokes:
+        x, y = radius * math.cos(phi), radius * math.sin(phi)
+        xd, yd, _, _, _ = python_of(opencv_distort)(lens, x, y)
         widest = max(widest, xd * xd + yd * yd)
     # The distorted radius between two spokes may exceed that on both, by tangential terms.
     between_spokes = 1.02
@@ -267,28 +262,30 @@ def opencv_limits(lens: LensParams) -> tuple[float, float]:
 _TANGENTS = np.array([math.tan(i_step * math.pi / 720.0) for i_step in range(360)])
 
 
-@inline_kernel
 def _limit_on_spoke(lens: LensParams, ex: float, ey: float, limit: float) -> float:
     """Return the squared radius of the first sign change along (ex, ey), at most `limit`."""
-    inside = 0.0
-    for i_step in range(1, 360):
-        outside = _TANGENTS[i_step]
-        last = outside * outside >= limit
-        if last:
-            outside = math.sqrt(limit)
-        if _determinant(lens, outside * ex, outside * ey) > 0.0:
-            inside = outside
-            if last:
-                return limit
-            continue
-        for _ in range(60):
-            middle = 0.5 * (inside + outside)
-            if _determinant(lens, middle * ex, middle * ey) > 0.0:
-                inside = middle
-            else:
-                outside = middle
-        return inside * inside
-    return math.inf
+    radii = _TANGENTS[limit > _TANGENTS * _TANGENTS]
+    if limit < math.inf:
+        radii = np.append(radii, math.sqrt(limit))
+    beyond = np.flatnonzero(~_is_monotone(lens, radii[1:] * ex, radii[1:] * ey))
+    if not len(beyond):
+        return limit
+    inside, outside = radii[beyond[0]], radii[beyond[0] + 1]
+    for _ in range(60):
+        middle = 0.5 * (inside + outside)
+        if _is_monotone(lens, middle * ex, middle * ey):
+            inside = middle
+        else:
+            outside = middle
+    return float(inside * inside)
+
+
+def _is_monotone(lens: LensParams, x: FloatArray, y: FloatArray) -> BoolArray:
+    """Return where the Jacobian is positive definite."""
+    _, _, j_xx, j_xy, j_yy = python_of(opencv_distort)(lens, x, y)
+    # Beyond two sign changes the determinant is positive again, the trace is not.
+    monotone: BoolArray = (j_xx * j_yy - j_xy * j_xy > 0.0) & (j_xx + j_yy > 0.0)
+    return monotone
 
 
 @inline_kernel

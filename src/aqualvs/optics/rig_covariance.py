@@ -13,6 +13,7 @@ Errors of a rig are smooth over the picture: derivatives of rays are taken once 
 of pixels, and a few pixels represent each stripe.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -44,10 +45,8 @@ class FittedSurface(NamedTuple):
 
 def fitted_plane(m: FloatArray, points: FloatArray) -> FittedSurface:
     """Return the plane m·X = 1 as it is fitted to points (N, 3)."""
-    posture = np.empty((3, 3))
-    posture_by_plane(m, posture)
     # A point that moves along m makes m shorter.
-    return FittedSurface(points, np.zeros(3), m, np.zeros((3, 3)), -posture)
+    return FittedSurface(points, np.zeros(3), m, np.zeros((3, 3)), -posture_by_plane(m))
 
 
 class StripeSums(NamedTuple):
@@ -425,13 +424,10 @@ def _write_slopes(
         slopes[moves.column[k]] -= ratio * (ahead - behind) / moves.step[k]
 
 
-@kernel
-def posture_by_plane(m: FloatArray, out: FloatArray) -> None:
-    """Write the derivatives (3, 3) of (range, pitch, yaw) by m (paper, Eq. 25-26)."""
-    x, y, z = m[0], m[1], m[2]
+def posture_by_plane(m: FloatArray) -> FloatArray:
+    """Return the derivatives (3, 3) of (range, pitch, yaw) by m (paper, Eq. 25-26)."""
+    x, y, z = m.tolist()
     yz, xy, square = y * y + z * z, x * x + y * y, x * x + y * y + z * z
-    out[:] = 0.0
-    for k in range(3):
-        out[0, k] = -m[k] / (np.sqrt(square) * square)
-    out[1, 1], out[1, 2] = -z / yz, y / yz
-    out[2, 0], out[2, 1] = y / xy, -x / xy
+    cube = math.sqrt(square) * square
+    by_range = [-x / cube, -y / cube, -z / cube]
+    return np.array([by_range, [0.0, -z / yz, y / yz], [y / xy, -x / xy, 0.0]])

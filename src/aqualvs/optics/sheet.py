@@ -418,8 +418,7 @@ class Sheet:
             By `parameter_names`, at the step zero of `moved_by`.
         """
         p = as_vectors(points, 3, "points").reshape(-1, 3)
-        parts = np.empty((len(p), 12))
-        differentials(self._row, p, parts)
+        parts = self._differentials(p)
         f, (by_v, by_slant, by_height, by_h, by_s, by_rho, by_k) = parts[:, 0], parts[:, 1:8].T
         height, beside = parts[:, 8], parts[:, 9:]
         normal, face, slant = self._row[NORMAL:OFFSET], self._row[FACE:SOURCE], self._row[SLANT]
@@ -453,6 +452,19 @@ class Sheet:
                 )
             columns.append(-by_k * self._row[RATIO] / self.n_water)
         return f, by_point, np.stack(columns, axis=-1)
+
+    def _differentials(self, points: FloatArray) -> FloatArray:
+        """Return what `differential` returns, shape (N, 12), for points (N, 3)."""
+        parts = np.zeros((len(points), 12))
+        if self.window is not None:
+            differentials(self._row, points, parts)
+            return parts
+        # A plane: no refraction.
+        normal, face = self._row[NORMAL:OFFSET], self._row[FACE:SOURCE]
+        from_source = points - self._row[SOURCE:DEPTH]
+        parts[:, 0], parts[:, 1], parts[:, 8] = from_source @ normal, 1.0, from_source @ face
+        parts[:, 9:] = from_source - parts[:, 8, None] * face
+        return parts
 
     def moved_by(self, step: ArrayLike) -> "Sheet":
         """Return the sheet with `step` (P,) added to the parameters `parameter_names`.

@@ -24,8 +24,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import inner_kernel, kernel
-from aqualvs.geometry.linear_algebra import at_rows, median_of
 from aqualvs.geometry.planes import Rays
 from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import LASER_PARAMETERS, Rig
@@ -67,92 +65,38 @@ def bin_stripes(
     array, shape (L, N_BINS, 2)
         In `image`; NaN where a bin shows no stripe, or too much beside it.
     """
-    middle = np.full((len(along_x), N_BINS, 2), np.nan)
-    _bin_stripes(
-        points.laser,
-        points.pixels,
-        points.points_in_dome,
-        points.intensity,
-        points.width,
-        m,
-        along_x,
-        float(size_px[0]),
-        float(size_px[1]),
-        middle,
-    )
-    return middle
-
-
-@kernel
-def _bin_stripes(
-    laser: NDArray[np.int8],
-    pixels: FloatArray,
-    points: FloatArray,
-    intensity: FloatArray,
-    width: FloatArray,
-    m: FloatArray,
-    along_x: IntArray,
-    size_x: float,
-    size_y: float,
-    middle: FloatArray,
-) -> None:
-    n = laser.shape[0]
-    n_cells = middle.shape[0] * N_BINS
-    cell, off = np.empty(n, np.int64), np.empty(n)
-    start = np.zeros(n_cells + 1, np.int64)
+    laser, n_cells = points.laser.astype(np.int64), len(along_x) * N_BINS
+    x, y, place = points.pixels[:, 0], points.pixels[:, 1], points.points_in_dome
+    share = np.where(along_x[laser] == 1, y / size_px[1], x / size_px[0])
+    piece = np.clip((share * N_BINS).astype(np.int64), 0, N_BINS - 1)
+    off = m[0] * place[:, 0] + m[1] * place[:, 1] + m[2] * place[:, 2] - 1.0
     # Points farther from the target's plane than this share of the range belong to something else:
     # two degrees of a laser are a quarter of the range at worst.
     gate = 0.4
-    for i in range(n):
-        a = laser[i]
-        off[i] = m[0] * points[i, 0] + m[1] * points[i, 1] + m[2] * points[i, 2] - 1.0
-        share = pixels[i, 1] / size_y if along_x[a] else pixels[i, 0] / size_x
-        piece = min(max(int(share * N_BINS), 0), N_BINS - 1)
-        cell[i] = a * N_BINS + piece if abs(off[i]) < gate else -1
-        if cell[i] >= 0:
-            start[cell[i] + 1] += 1
-    for c in range(n_cells):
-        start[c + 1] += start[c]
-    order, fill = np.empty(start[n_cells], np.int64), np.empty(n_cells, np.int64)
-    for c in range(n_cells):
-        fill[c] = start[c]
-    for i in range(n):
-        if cell[i] >= 0:
-            order[fill[cell[i]]] = i
-            fill[cell[i]] += 1
-    for c in range(n_cells):
-        rows = order[start[c] : start[c + 1]]
-        if rows.shape[0] >= _MIN_POINTS:
-            _middle(rows, off, pixels, intensity, width, middle[c // N_BINS, c % N_BINS])
+    rows = np.flatnonzero(np.abs(off) < gate)
+    cell, off = (laser * N_BINS + piece)[rows], off[rows]
+    n = np.bincount(cell, minlength=n_cells)
+    apart = np.abs(off - _medians(off, cell, n)[cell])
+    near = apart < np.clip(_SCATTER * _medians(apart, cell, n), _NEAR, _FAR)[cell]
+    rows, cell = rows[near], cell[near]
+    n_near = np.bincount(cell, minlength=n_cells)
+    # The middle of the light of the points that lie together.
+    brightness = points.intensity[rows] * points.width[rows]
+    sums = [np.bincount(cell, brightness * at, n_cells) for at in (1.0, x[rows], y[rows])]
+    seen = (n_near >= _MIN_POINTS) & (n_near >= _MIN_SHARE * n)
+    middle = np.full((n_cells, 2), np.nan)
+    for k in range(2):
+        middle[seen, k] = sums[1 + k][seen] / sums[0][seen]
+    return middle.reshape(len(along_x), N_BINS, 2)
 
 
-@inner_kernel
-def _middle(
-    rows: IntArray,
-    off: FloatArray,
-    pixels: FloatArray,
-    intensity: FloatArray,
-    width: FloatArray,
-    out: FloatArray,
-) -> None:
-    """Write the middle of the light of the points that lie together."""
-    values = at_rows(off, rows)
-    median = median_of(values)
-    for k in range(values.shape[0]):
-        values[k] = abs(values[k] - median)
-    near_by = min(max(_SCATTER * median_of(values), _NEAR), _FAR)
-    total, x, y = 0.0, 0.0, 0.0
-    near = 0
-    for k in range(rows.shape[0]):
-        i = rows[k]
-        if abs(off[i] - median) < near_by:
-            brightness = intensity[i] * width[i]
-            near += 1
-            total += brightness
-            x += brightness * pixels[i, 0]
-            y += brightness * pixels[i, 1]
-    if near >= _MIN_POINTS and near >= _MIN_SHARE * rows.shape[0]:
-        out[0], out[1] = x / total, y / total
+def _medians(values: FloatArray, group: IntArray, n: IntArray) -> FloatArray:
+    """Return the median of each group, NaN for none; `n` are the numbers of its values."""
+    found = np.full(len(n), np.nan)
+    ordered, filled = values[np.lexsort((values, group))], n > 0
+    first, n_filled = (np.cumsum(n) - n)[filled], n[filled]
+    found[filled] = (ordered[first + (n_filled - 1) // 2] + ordered[first + n_filled // 2]) / 2.0
+    return found
 
 
 CUT = 4.0

@@ -72,7 +72,7 @@ def fit_over(
     inside : bool array, shape (M,)
         Initial observations, unless `gates` selects them; then those of the grown fit.
     patch : array, shape (16,)
-        The base, as `write_flat` writes it; completed by the coefficients.
+        The base, as `packed_plane` gives it; completed by the coefficients.
     covariance : array, shape (6, 6), weights : array, shape (M,)
         Written.
 

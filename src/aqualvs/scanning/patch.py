@@ -4,6 +4,7 @@ For kernels a patch is 16 numbers: normal and offset of its base, the two unit v
 v, and the coefficients a, b, c, p, q, r of the height.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,19 +19,6 @@ NORMAL, OFFSET, RIGHT, UP, COEFFICIENTS, PACKED = 0, 3, 4, 7, 10, 16
 
 SIGMA_CURVATURE, SIGMA_TWIST = 2.0, 0.5
 """Prior standard deviations of the curvatures of nets, in 1/m: radius of a metre, little twist."""
-
-
-@borrowing_kernel
-def write_flat(normal: FloatArray, offset: float, patch: FloatArray) -> None:
-    """Write a plane as a patch (16,): u to the right, v upward."""
-    a, b, c = normal[0], normal[1], normal[2]
-    level = np.sqrt(a * a + b * b)
-    right, ahead = b / level, -a / level
-    patch[0], patch[1], patch[2], patch[OFFSET] = a, b, c, offset
-    patch[4], patch[5], patch[6] = right, ahead, 0.0
-    patch[7], patch[8], patch[9] = ahead * c, -right * c, right * b - ahead * a
-    for k in range(COEFFICIENTS, PACKED):
-        patch[k] = 0.0
 
 
 @inline_borrowing_kernel
@@ -191,8 +179,13 @@ def flat_patch(plane: Plane) -> Patch:
 
 def packed_plane(plane: Plane) -> FloatArray:
     """Return `flat_patch(plane).packed()`."""
-    packed = np.empty(PACKED)
-    write_flat(plane.normal, plane.offset, packed)
+    a, b, c = plane.normal.tolist()
+    level = math.sqrt(a * a + b * b)
+    right, ahead = b / level, -a / level
+    packed = np.zeros(PACKED)
+    packed[:RIGHT] = a, b, c, plane.offset
+    packed[RIGHT:UP] = right, ahead, 0.0
+    packed[UP:COEFFICIENTS] = ahead * c, -right * c, right * b - ahead * a
     return packed
 
 
@@ -248,9 +241,8 @@ def fitted_patch(patch: Patch, m: FloatArray, points: FloatArray) -> FittedSurfa
         In `dome`, metres.
     """
     packed, terms = patch.packed(), np.empty((len(points), len(FLAT)))
-    by_plane, by_terms = np.empty((3, 3)), np.empty((3, len(FLAT)))
+    by_terms = np.empty((3, len(FLAT)))
     write_terms(points, packed, terms)
-    posture_by_plane(m, by_plane)
     if not tangent_jacobian(packed, _ALIKE, m, by_terms):
         by_terms[:] = np.nan
     _, b, c, p, q, r = patch.coefficients.tolist()
@@ -258,7 +250,7 @@ def fitted_patch(patch: Patch, m: FloatArray, points: FloatArray) -> FittedSurfa
     across = np.outer(right, up)
     bend = p * np.outer(right, right) + q * (across + across.T) + r * np.outer(up, up)
     normal = patch.base.normal - b * right - c * up
-    return FittedSurface(terms, CURVATURE_PRIOR, normal, -bend, by_plane @ by_terms)
+    return FittedSurface(terms, CURVATURE_PRIOR, normal, -bend, posture_by_plane(m) @ by_terms)
 
 
 @kernel

@@ -155,7 +155,9 @@ def fit_robust(
 def plane_of_all(points: FloatArray, m: FloatArray) -> bool:
     """Write the m of m·X = 1 that best fits points (N, 3), unweighted; False if undetermined."""
     normal, right, inverse = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
-    one = np.ones(points.shape[0])
+    one = np.empty(points.shape[0])
+    for i in range(points.shape[0]):
+        one[i] = 1.0
     normal_equations(points, one, one, normal, right)
     return solve_symmetric(normal, right, inverse, m)
 
@@ -177,7 +179,7 @@ def _normalised_residuals(
         z[i] = (value - 1.0) / sigma[i]
 
 
-@kernel
+@inner_kernel
 def normal_equations(
     points: FloatArray,
     sigma: FloatArray,

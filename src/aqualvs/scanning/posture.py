@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray
-from aqualvs.geometry.compiled import borrowing_kernel, kernel
+from aqualvs.geometry.compiled import borrowing_kernel
 from aqualvs.optics.rig_covariance import posture_by_plane
 from aqualvs.scanning.plane_fit import PlaneFit
 
@@ -143,15 +143,17 @@ def posture_of(
     fit: PlaneFit, nearest: float, n_points: int, camera_axis_in_dome: FloatArray
 ) -> Posture:
     """Convert a plane fit to a posture, given the number of points and the nearest distance."""
-    covariance, normal = np.empty((3, 3)), np.empty(3)
-    approach = _carry_over(fit.m, fit.covariance, camera_axis_in_dome, covariance, normal)
+    jacobian = posture_by_plane(fit.m)
+    x, y, z = fit.m.tolist()
+    along_x, along_y, along_z = camera_axis_in_dome.tolist()
+    approach = x * along_x + y * along_y + z * along_z
     distance, pitch, yaw = range_pitch_yaw(fit.m)
     return Posture(
         range=distance,
         pitch=pitch,
         yaw=yaw,
-        covariance=covariance,
-        normal_in_dome=normal,
+        covariance=np.einsum("ik,kn,jn->ij", jacobian, fit.covariance, jacobian),
+        normal_in_dome=fit.m / math.sqrt(x * x + y * y + z * z),
         slant_range=1.0 / approach if approach > 0.0 else float("inf"),
         nearest=nearest,
         n_points=n_points,
@@ -208,28 +210,6 @@ def range_pitch_yaw(m: FloatArray) -> tuple[float, float, float]:
     """Return range (m), pitch and yaw (rad) of m·X = 1 (paper, Eq. 25-26 as arctangents)."""
     x, y, z = m.tolist()
     return 1.0 / math.hypot(x, y, z), math.atan2(z, y), math.atan2(x, y)
-
-
-@kernel
-def _carry_over(
-    m: FloatArray,
-    covariance: FloatArray,
-    axis: FloatArray,
-    out_covariance: FloatArray,
-    out_normal: FloatArray,
-) -> float:
-    """Write the covariance of (range, pitch, yaw) and the unit normal; return m along the axis."""
-    jacobian, length = np.empty((3, 3)), np.sqrt(m[0] * m[0] + m[1] * m[1] + m[2] * m[2])
-    posture_by_plane(m, jacobian)
-    for k in range(3):
-        out_normal[k] = m[k] / length
-    for i in range(3):
-        for j in range(3):
-            out_covariance[i, j] = 0.0
-            for k in range(3):
-                for n in range(3):
-                    out_covariance[i, j] += jacobian[i, k] * covariance[k, n] * jacobian[j, n]
-    return float(m[0] * axis[0] + m[1] * axis[1] + m[2] * axis[2])
 
 
 @borrowing_kernel

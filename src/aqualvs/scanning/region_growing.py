@@ -168,7 +168,7 @@ def grow_region(
     _settle(component, source, cost, taken, on_net)
 
 
-@kernel
+@inner_kernel
 def _describe(
     points: FloatArray,
     line: IntArray,

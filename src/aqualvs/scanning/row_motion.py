@@ -114,10 +114,10 @@ class RowMotion:
         times, terms = self._times(seen.pixels), np.ascontiguousarray(surface.terms)
         _sum_up(terms, weights, seen.points, still.points, times, spread, m, matrix, moved)
         scale = float(np.linalg.norm(surface.normal) / np.linalg.norm(m))
-        by_m = _by_m(m)
+        by_m = posture_by_plane(m)
         m_moved = -scale * np.linalg.solve(by_m, surface.posture @ np.linalg.solve(matrix, moved))
         m = m + m_moved[:, 6]
-        by_m = _by_m(m)
+        by_m = posture_by_plane(m)
         to_m = np.linalg.inv(by_m)
         by_motion = np.empty((3, 6))
         by_motion[:, :3] = by_m @ m_moved[:, :3] @ to_m
@@ -230,7 +230,7 @@ def _fit_rates(
         A first m.
     """
     prior, both = np.zeros((6, 6)), np.concatenate([m, np.zeros(3)])
-    scaled = _by_m(m) / _RATES[:, None]
+    scaled = posture_by_plane(m) / _RATES[:, None]
     prior[3:, 3:] = scaled.T @ scaled
     share = min(_INDEPENDENT / max(len(points), 1), 1.0)
     if not _reweight(points, sigma, times, prior, share, both):
@@ -457,7 +457,7 @@ def _with_gyros(
     """Return a motion and its covariance as gyros change them."""
     m = posture.normal_in_dome / posture.range
     # A target that stands still turns against the vehicle; its distance does not change by that.
-    by_turning = (_by_m(m) @ np.cross(m, np.eye(3)).T)[1:]
+    by_turning = (posture_by_plane(m) @ np.cross(m, np.eye(3)).T)[1:]
     angles = slice(1, 3)
     off = by_turning @ turning.rates - motion[angles]
     expected = covariance[angles, angles] + turning.sigma**2 * by_turning @ by_turning.T
@@ -480,7 +480,7 @@ def _at_middle(
     nearer by 0.03 %.
     """
     exposed = posture.normal_in_dome / posture.range
-    by_m = _by_m(exposed)
+    by_m = posture_by_plane(exposed)
     to_m = np.linalg.inv(by_m)
     m_by_rate, m_by_acceleration = (
         to_m @ one @ by_m for one in (by_motion[:, :3], by_motion[:, 3:])
@@ -566,10 +566,3 @@ def _move_back(
             across += points[i, k] * turned[k]
         for k in range(3):
             moved[i, k] = points[i, k] - times[i] * (ahead * turned[k] - across * normal[k])
-
-
-def _by_m(m: FloatArray) -> FloatArray:
-    """Return the derivatives (3, 3) of range, pitch and yaw by m."""
-    by_m = np.empty((3, 3))
-    posture_by_plane(m, by_m)
-    return by_m

@@ -565,7 +565,9 @@ def _join(line: IntArray, position: FloatArray, first: IntArray, last: IntArray)
     `first` and `last` are the peaks at the segments' ends; segments are ordered by the first.
     """
     n = first.shape[0]
-    root = np.arange(n)
+    root = np.empty(n, np.int64)
+    for s in range(n):
+        root[s] = s
     # A segment that begins this near to another one's end belongs to the same component.
     join_lines = 4
     join_px = 4.0
