@@ -376,6 +376,18 @@ def test_a_truth_that_cannot_be_used_is_said(tmp_path, content, words):
     assert str(truth) in str(fault.value)
 
 
+def test_a_dive_without_any_posture_is_compared_too(tmp_path):
+    posture = write_csv(
+        tmp_path / "posture.csv", "frame,valid,range_m,pitch_deg,yaw_deg", "0,0,,,", "1,0,,,"
+    )
+    truth = write_csv(
+        tmp_path / "truth.csv", "frame,range_m,pitch_deg,yaw_deg", "0,0.5,0,0", "1,0.6,0,0"
+    )
+    found = compare_with_truth(posture, truth)
+    assert (found.n_compared, found.n_missed) == (0, 2)
+    assert found.lines() == ["against the truth: no posture in its 2 frames"]
+
+
 def test_a_run_compares_with_its_truth(request_for, dive, tmp_path):
     lines = [f"{i},{10 * luma_level(i)},3.0,-7.0" for i in range(8)]
     truth = write_csv(tmp_path / "truth.csv", "frame,range_mm,pitch_deg,yaw_deg", *lines)

@@ -40,6 +40,7 @@ class TruthComparison:
 
     n_compared: int  # Frames with a posture and a truth.
     n_missed: int  # Frames with a truth but without a posture.
+    # NaN where no frame is compared.
     range_percent: Deviation  # Of the range, in percent of the true range.
     # In degrees.
     pitch_deg: Deviation
@@ -47,6 +48,8 @@ class TruthComparison:
 
     def lines(self) -> list[str]:
         """Return the comparison as lines of text."""
+        if not self.n_compared:
+            return [f"against the truth: no posture in its {self.n_missed} frames"]
         return [
             f"against the truth in {self.n_compared} frames "
             f"({self.n_missed} with truth but without posture):",
@@ -79,18 +82,19 @@ def compare_with_truth(posture_csv: Path, truth_csv: Path) -> TruthComparison:
         )
     measured = read_truth(posture_csv)
     truth = read_truth(truth_csv)
-    common = sorted(measured.keys() & truth.keys())
-    if not common:
+    known = truth.keys() & _frames(posture_csv)
+    if not known:
         raise SourceError(
-            f"{truth_csv}: none of its {len(truth)} frames has a posture in {posture_csv}; "
+            f"{truth_csv}: none of its {len(truth)} frames is in {posture_csv}; "
             "give the truth of this dive"
         )
-    got = np.array([measured[frame] for frame in common])
-    true = np.array([truth[frame] for frame in common])
+    common = sorted(measured.keys() & known)
+    got = np.array([measured[frame] for frame in common]).reshape(-1, 3)
+    true = np.array([truth[frame] for frame in common]).reshape(-1, 3)
     error = got - true
     return TruthComparison(
         n_compared=len(common),
-        n_missed=len(truth.keys() & _frames(posture_csv)) - len(common),
+        n_missed=len(known) - len(common),
         range_percent=_deviation(100 * error[:, 0] / true[:, 0]),
         pitch_deg=_deviation(error[:, 1]),
         yaw_deg=_deviation(error[:, 2]),
@@ -164,6 +168,8 @@ def _number(text: str | None) -> float:
 
 
 def _deviation(values: FloatArray) -> Deviation:
+    if not len(values):
+        return Deviation(rms=math.nan, max=math.nan)
     return Deviation(rms=float(np.sqrt(np.mean(values**2))), max=float(np.abs(values).max()))
 
 
