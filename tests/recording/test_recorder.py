@@ -501,6 +501,18 @@ def test_a_file_without_its_end_is_read_as_far_as_it_goes(tmp_path, samples):
     assert n == 2 * (len(chunks) - 1)
 
 
+@pytest.mark.parametrize("length", [1 << 62, (1 << 64) - 1])
+def test_a_length_beyond_any_file_ends_what_is_read(tmp_path, samples, length):
+    """Records that programs add for themselves are skipped, by the length that they say."""
+    path = recorded(tmp_path / "dive.mcap", samples[:3])
+    damaged = bytearray(path.read_bytes())
+    # The footer's content, of 20 bytes, is before the magic at the end.
+    start = int.from_bytes(damaged[-28:-20], "little")
+    damaged[start : start + 9] = b"\x80" + length.to_bytes(8, "little")
+    path.write_bytes(damaged)
+    assert len(list(DiveRecording(path).frames(with_pictures=False))) == 3
+
+
 def test_cdr_is_that_of_rosbags():
     """All alignments, empty sequences among them."""
     store = get_typestore(Stores.EMPTY)

@@ -398,7 +398,11 @@ def _records(file: BinaryIO, at: int) -> Iterator[tuple[int, bytes]]:
 
 def _record_head(file: BinaryIO, at: int) -> tuple[int, int] | None:
     """Return kind and length of a record; None where there is none."""
-    file.seek(at)
+    try:
+        file.seek(at)
+    except (OSError, OverflowError):
+        # A skipped record's damaged length leads beyond what a file can hold.
+        return None
     head = file.read(HEAD_BYTES)
     if len(head) < HEAD_BYTES or head[0] == 0:
         return None
