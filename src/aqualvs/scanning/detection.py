@@ -168,11 +168,10 @@ class _DashOptions(NamedTuple):
     Tuned on rendered dives of nets as H.264 at 640x480.
     """
 
-    # Least height of the peaks, which stripes reach and most paint does not; the least number of
-    # them, and the largest ratio to what the lasers can make; the largest share of them that shows
-    # as much of the lasers' colour as the weakest line; and the largest share that is longer than a
-    # dash: of such stripes codecs keep the chroma.
-    tall: float = 32.0
+    # Least number of tall peaks, those that are always used, and the largest ratio of it to what
+    # the lasers can make; the largest share of them that shows as much of the lasers' colour as the
+    # weakest line; and the largest share that is longer than a dash: of such stripes codecs keep
+    # the chroma.
     min_tall: int = 48
     crowd: float = 1.5
     max_coloured: float = 0.05
@@ -426,7 +425,7 @@ def are_colourless_dashes(
     tall, n_coloured = np.empty(line.shape[0], np.bool_), 0
     for i in range(line.shape[0]):
         height = table[HEIGHT, i]
-        tall[i] = height >= _DASH.tall
+        tall[i] = height >= HIGHEST_USEFUL
         step = math.hypot(table[STEP_U, i], table[STEP_V, i])
         n_coloured += tall[i] and step > RATIO_LEAST * height
     n_tall, n_long = where(tall).shape[0], 0
