@@ -82,7 +82,8 @@ class Case:
 def fault_of(case: Case, folder: Path) -> str:
     """Run a case in a process of its own; return what is wrong, "" if nothing is."""
     folder.mkdir(parents=True, exist_ok=True)
-    out, err = folder / "stdout", folder / "stderr"
+    # Beside the folder: a pattern such as `*` finds no file in it.
+    out, err = (folder.with_name(f"{folder.name} {one}") for one in ("stdout", "stderr"))
     sys.stdout.flush()
     sys.stderr.flush()
     with warnings.catch_warnings():

@@ -5,6 +5,7 @@ fisheye model (`fisheye`; Kannala and Brandt 2006). "Normalised" coordinates are
 direction in `cam`, "distorted" ones are those after the distortion: (u - cx)/fx and (v - cy)/fy.
 """
 
+import functools
 import math
 from typing import NamedTuple, TypeAlias
 
@@ -115,7 +116,12 @@ ROUNDS = 2
 _HALVINGS_AT_MOST = 40
 # Residual, in distorted coordinates near 1, at which a guarded solution counts: some roundings.
 _RESIDUAL_SOLVED = 1e-14
-_SPOKES = 32
+# Of the search for the limit of a distortion: directions (x, y) from the image centre; tangents of
+# the first steps, a quarter of a degree each; parts into which the step that holds it is divided.
+_PHI = 2.0 * np.pi * np.arange(32) / 32
+_SPOKES = np.array([np.cos(_PHI), np.sin(_PHI)])
+_TANGENTS = np.tan(np.arange(360) * np.pi / 720.0)
+_DIVISIONS = 64
 
 
 @inline_kernel
@@ -238,53 +244,38 @@ def opencv_limits(lens: LensParams) -> tuple[float, float]:
     """Return `LensParams.limit` and `limit_distorted`.
 
     The first is the squared radius of the largest disc round the image centre with a positive
-    Jacobian determinant, searched along spokes in steps of a quarter of a degree and by halving.
+    Jacobian determinant, searched along spokes in steps of a quarter of a degree, then finer ones.
     """
-    limit = math.inf
-    spokes = [2.0 * math.pi * i_spoke / _SPOKES for i_spoke in range(_SPOKES)]
-    # Beyond the limit the model may have poles.
-    with np.errstate(all="ignore"):
-        for phi in spokes:
-            limit = min(limit, _limit_on_spoke(lens, math.cos(phi), math.sin(phi), limit))
-    if limit == math.inf:
-        return limit, limit
-    widest, radius = 0.0, math.sqrt(limit)
-    for phi in spokes:
-        x, y = radius * math.cos(phi), radius * math.sin(phi)
-        xd, yd, _, _, _ = python_of(opencv_distort)(lens, x, y)
-        widest = max(widest, xd * xd + yd * yd)
+    # Calibrations move a lens in each step, most of them without its distortion.
+    return _limits_of_distortion(lens._replace(fx=1.0, fy=1.0, cx=0.0, cy=0.0))
+
+
+@functools.lru_cache(maxsize=64)
+def _limits_of_distortion(lens: LensParams) -> tuple[float, float]:
+    radii, spokes = _TANGENTS, _SPOKES
+    # Each search divides the step that holds the limit; the last one, between neighbouring numbers.
+    while True:
+        monotone = _is_monotone(lens, spokes[:, :, None] * radii[1:])
+        if monotone.all():
+            return math.inf, math.inf
+        first = int(np.argmin(monotone.all(axis=0)))
+        inside, outside = radii[first : first + 2].tolist()
+        if not inside < 0.5 * (inside + outside) < outside:
+            break
+        radii, spokes = np.linspace(inside, outside, _DIVISIONS + 1), spokes[:, ~monotone[:, first]]
+    xd, yd, _, _, _ = python_of(opencv_distort)(lens, *(inside * _SPOKES))
     # The distorted radius between two spokes may exceed that on both, by tangential terms.
     between_spokes = 1.02
-    return limit, between_spokes * widest
+    return inside * inside, between_spokes * float((xd * xd + yd * yd).max())
 
 
-# Tangents of the steps, a quarter of a degree each: every spoke of every lens has the same.
-_TANGENTS = np.array([math.tan(i_step * math.pi / 720.0) for i_step in range(360)])
-
-
-def _limit_on_spoke(lens: LensParams, ex: float, ey: float, limit: float) -> float:
-    """Return the squared radius of the first sign change along (ex, ey), at most `limit`."""
-    radii = _TANGENTS[limit > _TANGENTS * _TANGENTS]
-    if limit < math.inf:
-        radii = np.append(radii, math.sqrt(limit))
-    beyond = np.flatnonzero(~_is_monotone(lens, radii[1:] * ex, radii[1:] * ey))
-    if not len(beyond):
-        return limit
-    inside, outside = radii[beyond[0]], radii[beyond[0] + 1]
-    for _ in range(60):
-        middle = 0.5 * (inside + outside)
-        if _is_monotone(lens, middle * ex, middle * ey):
-            inside = middle
-        else:
-            outside = middle
-    return float(inside * inside)
-
-
-def _is_monotone(lens: LensParams, x: FloatArray, y: FloatArray) -> BoolArray:
-    """Return where the Jacobian is positive definite."""
-    _, _, j_xx, j_xy, j_yy = python_of(opencv_distort)(lens, x, y)
-    # Beyond two sign changes the determinant is positive again, the trace is not.
-    monotone: BoolArray = (j_xx * j_yy - j_xy * j_xy > 0.0) & (j_xx + j_yy > 0.0)
+def _is_monotone(lens: LensParams, points: FloatArray) -> BoolArray:
+    """Return where the Jacobian is positive definite at points (2, ...)."""
+    # Beyond the limit the model may have poles.
+    with np.errstate(all="ignore"):
+        _, _, j_xx, j_xy, j_yy = python_of(opencv_distort)(lens, *points)
+        # Beyond two sign changes the determinant is positive again, the trace is not.
+        monotone: BoolArray = (j_xx * j_yy - j_xy * j_xy > 0.0) & (j_xx + j_yy > 0.0)
     return monotone
 
 
