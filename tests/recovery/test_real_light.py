@@ -81,6 +81,19 @@ def test_compression_moves_a_posture_little(measured, picture: str, fmt: str) ->
 
 
 @pytest.mark.parametrize("picture", PICTURES)
+def test_a_camera_may_sharpen_until_the_wall_between_lines_stands_out(tmp_path, picture) -> None:
+    """Sharpening darkens the flanks of lines; thousands of wide specks of wall lie between them."""
+    image = cv2.imread(str(PHOTOGRAPHS / f"{picture}.jpg"))
+    board = wall.board_pose(image, wall.intrinsics(CROP))
+    sharp = cv2.addWeighted(image, 2.5, cv2.GaussianBlur(image, (0, 0), 3.0), -1.5, 0.0)
+    source = wall.make_source(sharp, tmp_path, "png")
+    rows = wall.measure(source, PHOTOGRAPHS / "rig.yaml", tmp_path / "out")
+    result = wall.compare(picture, "png", rows, board)
+    assert result.valid, result.reason
+    assert abs(result.range_error_mm) < 10.0
+
+
+@pytest.mark.parametrize("picture", PICTURES)
 def test_nothing_is_found_where_no_laser_shines(picture: str) -> None:
     """The left half of a photograph: chessboard, its paper's edge, blue tape, no line."""
     image = cv2.imread(str(PHOTOGRAPHS / f"{picture}.jpg"))
