@@ -208,3 +208,11 @@ def test_without_its_dome_the_camera_has_other_bands() -> None:
     with_dome = plan_bands(rig, rig.camera())
     without = plan_bands(rig, rig.bare_camera())
     assert any(np.any(a.lowest != b.lowest) for a, b in zip(with_dome, without, strict=True))
+
+
+@pytest.mark.parametrize("field", [None, "top", "bottom"])
+def test_positions_on_the_columns_of_a_field_are_two_pixels_apart(field) -> None:
+    rig = example_rig()
+    for search in plan_bands(rig, rig.camera(), field):
+        doubled = field is not None and search.axis is SearchAxis.ALONG_Y
+        assert search.position_px == (2.0 if doubled else 1.0)

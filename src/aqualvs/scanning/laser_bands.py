@@ -51,6 +51,8 @@ class LaserBand:
     # Of the lines from the middle of the pixels that each stands for; 0 but for the rows of a
     # field.
     shift_px: float = 0.0
+    # Pixels from one position to the next; 2 along the columns of a field.
+    position_px: float = 1.0
 
     @property
     def visible(self) -> bool:
@@ -117,7 +119,9 @@ def _plan_band(
     rise, run = _stripe_directions(points)
     length, n_pixels = camera.size_px if along_x else camera.size_px[::-1]
     lowest, highest = _band_limits(in_band, n_pixels // line_px, length)
-    return LaserBand(axis, line_px, lowest, highest, *_slope_bounds(rise, run), colour, shift_px)
+    position_px = 1.0 if along_x or field is None else 2.0
+    slopes = _slope_bounds(rise, run)
+    return LaserBand(axis, line_px, lowest, highest, *slopes, colour, shift_px, position_px)
 
 
 def _points_on_grid(

@@ -53,20 +53,25 @@ def twine_share(height: FloatArray) -> FloatArray:
     return np.hypot(TWINE_SHARE, TWINE_LEVELS / height)
 
 
-def shared_error(glow: FloatArray, twine: FloatArray | None = None) -> SharedError:
+def shared_error(
+    glow: FloatArray, position_px: FloatArray, twine: FloatArray | None = None
+) -> SharedError:
     """Return the errors that points on a solid surface or on a net share.
 
     Parameters
     ----------
     glow : array, shape (N,)
         Difference between the flanks of the stripe, over its height.
+    position_px : array, shape (N,)
+        Pixels from one position of the search line to the next; 2 along the columns of a field.
     twine : array, shape (N,), optional
         Shift of the light on twine in pixels, with the sign that brings the point nearer. All
         stripes share it, and as much again those of one laser. None on something solid.
     """
+    own = SHARED_ERROR_PX * position_px
     if twine is None:
-        return SharedError(np.full(len(glow), SHARED_ERROR_PX), GLOW_PX * glow[None])
-    return SharedError(np.hypot(SHARED_ERROR_PX, twine), np.stack([GLOW_PX * glow, twine]))
+        return SharedError(own, GLOW_PX * glow[None])
+    return SharedError(np.hypot(own, twine), np.stack([GLOW_PX * glow, twine]))
 
 
 TUKEY = 4.685

@@ -256,6 +256,7 @@ class PostureEstimator:
     def __init__(self, rig: Rig, laser_bands: Sequence[LaserBand], fit: FitMethod) -> None:
         self._fit_method = fit
         self._n_lines = np.array([len(search.lowest) for search in laser_bands])
+        self._position_px = np.array([search.position_px for search in laser_bands])
         self._working_range = rig.working_range
         sheets = np.array([one.packed() for one in sheets_of(rig)]).reshape(-1, COLUMNS)
         self._planes = np.ascontiguousarray(sheets[:, START : START + 4])
@@ -529,7 +530,7 @@ class PostureEstimator:
         seen = self._observe(candidates, candidates.component, _SHORTEST_STRAND, near, plane.normal)
         if not len(seen.observations.laser):
             return None
-        shared = _shared_error(seen.observations, plane.normal, on_twine=True)
+        shared = self._shared_error(seen.observations, plane.normal, on_twine=True)
         fit = fit_patch(seen.observations, plane, shared, min_bend)
         fit = fit and refit_at_nearest(fit, seen.observations, shared)
         m = None if fit is None else nearest_tangent(fit.patch)
@@ -579,12 +580,23 @@ class PostureEstimator:
             observations.laser,
             along,
             target.plane.normal / target.plane.offset,
-            _shared_error(observations, target.plane.normal, on_twine=target.is_mesh),
+            self._shared_error(observations, target.plane.normal, on_twine=target.is_mesh),
         )
         if robust is None or self._fit_method is FitMethod.ROBUST:
             return robust
         points = candidates.points[seen.group >= 0]
         return fit_pseudo_inverse(points, len(observations.laser), robust.covariance)
+
+    def _shared_error(
+        self, seen: Observations, normal: FloatArray, *, on_twine: bool
+    ) -> SharedError:
+        """Return the errors that observations of a surface share, given its approximate normal."""
+        position_px = self._position_px[seen.laser]
+        if not on_twine:
+            return shared_error(seen.glow, position_px)
+        nearer = -np.sign(seen.sensitivity @ normal)
+        twine = nearer * twine_share(seen.height) * seen.width
+        return shared_error(seen.glow, position_px, twine)
 
     def _posture_of_fit(
         self, candidates: Candidates, seen: "_Observed", fit: PlaneFit, *, of_all: bool = False
@@ -636,14 +648,6 @@ def _share_on(seen: _Observed, patch: FloatArray, plane: Plane) -> float:
 def _plane_of(fit: PlaneFit) -> Plane:
     distance = 1.0 / math.hypot(*fit.m.tolist())
     return Plane(fit.m * distance, distance)
-
-
-def _shared_error(seen: Observations, normal: FloatArray, *, on_twine: bool) -> SharedError:
-    """Return the errors that observations of a surface share, given its approximate normal."""
-    if not on_twine:
-        return shared_error(seen.glow)
-    nearer = -np.sign(seen.sensitivity @ normal)
-    return shared_error(seen.glow, nearer * twine_share(seen.height) * seen.width)
 
 
 def _disputed(found: Measurement, other: Posture, intensity_share: float) -> Measurement:
