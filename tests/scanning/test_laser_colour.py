@@ -301,6 +301,19 @@ def test_dashes_without_any_colour_are_not_ruled_out() -> None:
     assert np.all(detect(white_dashes(12)).likelihood < 0.5)
 
 
+@pytest.mark.parametrize(("green_share", "is_colour_evidence"), [(0.12, False), (0.4, True)])
+def test_some_dashes_may_have_kept_their_colour(green_share, is_colour_evidence) -> None:
+    bars = [Bar(y, (0.1, 1.0, 0.3), 80.0) for y in (60.0, 120.0, 180.0)]
+    green = np.where((np.arange(WIDTH) % 12 < 3)[:, None], picture(*bars), picture())
+    image = white_dashes(3)
+    n_green = round(green_share * WIDTH)
+    image[:, :n_green] = green[:, :n_green]
+    found = detect(image)
+    white = found.likelihood[(found.line > n_green + 12) & (found.height > 60.0)]
+    assert len(white) > 0.4 * 3 * WIDTH / 4
+    assert np.mean(white < 0.5) == (1.0 if is_colour_evidence else 0.0)
+
+
 def test_an_overexposed_line_shows_less_of_its_colour() -> None:
     # As on rendered stripes: of 0.24 levels of chroma at 170 of luma, 0.13 are left at 220.
     table = np.hstack(

@@ -189,8 +189,9 @@ def places_along(line: FloatArray, laser: IntArray, n_lines: IntArray, along: Fl
 MIN_LINES = 30
 """Least number of stripe points of a posture."""
 
-# Least search lines of the light on a strand; less is a fragment, off the strand's middle.
-_SHORTEST_STRAND = 3
+# Least search lines of the light on a strand; less is a fragment, off the strand's middle. Rows of
+# a field are two pixels apart: of thin twine across them few show more than two.
+_SHORTEST_STRAND, _SHORTEST_IN_FIELD = 3, 2
 # A net bends out of the plane that touches it by at most this share of the range.
 _DEEPEST_BEND = 0.15
 _FEW_STRANDS, _STRONG_BEND = 36, 0.02
@@ -263,6 +264,8 @@ class PostureEstimator:
         # A kernel that is given None is compiled without the code for bent sheets.
         self._bent = sheets if sheets[:, WINDOWED].any() else None
         self._focal_px = rig.focal_px
+        in_fields = rig.shutter.field_of(0) is not None
+        self._shortest_strand = _SHORTEST_IN_FIELD if in_fields else _SHORTEST_STRAND
         self._line_px = max((search.line_px for search in laser_bands), default=1)
         self._axis_in_dome = rig.dome_from_cam.rotate([0.0, 0.0, 1.0])
 
@@ -286,7 +289,7 @@ class PostureEstimator:
         # The light on a strand has no flanks of its own.
         candidates = candidates if mesh else candidates.without_pull()
         unit, min_lines = (
-            (candidates.component, _SHORTEST_STRAND) if mesh else (candidates.subsegment, 1)
+            (candidates.component, self._shortest_strand) if mesh else (candidates.subsegment, 1)
         )
         on_target = target.members[subsegments.of_candidate]
         seen = self._observe(candidates, unit, min_lines, on_target, target.plane.normal)
@@ -453,7 +456,7 @@ class PostureEstimator:
         beside = np.empty(len(candidates), np.bool_)
         mark_beside(candidates.source, net_mask, off, _BESIDE_SHARE, beside)
         return self._observe(
-            candidates, candidates.component, _SHORTEST_STRAND, beside, plane.normal
+            candidates, candidates.component, self._shortest_strand, beside, plane.normal
         )
 
     def _settled(
@@ -501,7 +504,7 @@ class PostureEstimator:
     ) -> Measurement:
         """Return the measurement, widened or replaced by the mean plane if the net is folds."""
         seen = self._observe(
-            candidates, candidates.component, _SHORTEST_STRAND, net_mask, plane.normal
+            candidates, candidates.component, self._shortest_strand, net_mask, plane.normal
         )
         share = _share_on(seen, patch, plane)
         if share >= _MAIN_SHARE and (share >= _WHOLE_SHARE or is_curved):
@@ -527,7 +530,9 @@ class PostureEstimator:
     ) -> Measurement | None:
         """Measure the posture to a curved net; None where a plane is as good."""
         near = off < _DEEPEST_BEND
-        seen = self._observe(candidates, candidates.component, _SHORTEST_STRAND, near, plane.normal)
+        seen = self._observe(
+            candidates, candidates.component, self._shortest_strand, near, plane.normal
+        )
         if not len(seen.observations.laser):
             return None
         shared = self._shared_error(seen.observations, plane.normal, on_twine=True)
