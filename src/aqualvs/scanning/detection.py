@@ -411,7 +411,7 @@ class FrameDetector:
 def are_colourless_dashes(
     line: IntArray, table: FloatArray, ends: IntArray, n_possible: float
 ) -> bool:
-    """Return whether a frame's tall peaks are short stripes, and hardly any has a laser's colour.
+    """Return whether a frame's tall peaks are short stripes, and few have a laser's colour.
 
     A codec drops the chroma of stripes that are a few pixels long, as on thin twine at low bit
     rates. Then colour is no evidence, as in a grey picture. Twine in white light makes long peaks.
