@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from aqualvs.errors import OptionError
 from aqualvs.simulation.scenario import Course, Trajectory, dome_from_target
+from aqualvs.simulation.scenarios import load_scenario
 
 
 @given(
@@ -55,3 +56,17 @@ def test_sway_rides_on_top():
     assert course.at(1.0, 10.0) == pytest.approx(0.6)
     pose = Trajectory(distance=course).pose_at(1.0, 10.0)
     assert pose.translation[1] == pytest.approx(0.6)
+
+
+def test_the_motion_goes_on_in_rows_that_are_exposed_before_the_dive_begins():
+    steady = Course(values=(0.4, 0.6))
+    assert steady.at(-0.01, 2.0) == pytest.approx(0.399)
+    assert steady.at(2.01, 2.0) == pytest.approx(0.601)
+    assert steady.at(99.0, 2.0) == steady.at(2.1, 2.0)
+
+
+def test_an_empty_file_is_no_scenario(tmp_path):
+    path = tmp_path / "empty.yaml"
+    path.write_text("\n")
+    with pytest.raises(OptionError, match=r"empty\.yaml: an empty scenario"):
+        load_scenario(path)

@@ -155,7 +155,10 @@ class Course:
 
     def at(self, t: float, duration: float) -> float:
         """Return the value at time `t` of a dive of `duration` seconds."""
-        share = min(max(t / duration, 0.0), 1.0) if duration > 0.0 else 0.0
+        # Rows of the first and the last picture of a rolling shutter are exposed beyond the dive.
+        beyond_s = 0.1
+        during = min(max(t, -beyond_s), duration + beyond_s)
+        share = during / duration if duration > 0.0 else 0.0
         value = self._base(share)
         return value + self.sway * float(np.sin(2.0 * np.pi * t / self.period))
 
@@ -165,7 +168,7 @@ class Course:
             return float(self.values[0])
         if self.mode == "steps":
             # The small addition keeps frame times such as 0.4 s after a step despite rounding.
-            return float(self.values[min(int(share * n + 1e-9), n - 1)])
+            return float(self.values[min(max(int(share * n + 1e-9), 0), n - 1)])
         return float(_smooth(tuple(self.values))(share))
 
 
@@ -397,6 +400,8 @@ def read_scenario(path: Path) -> Scenario:
     no sense; the message names the file, the key and the remedy.
     """
     content = read_yaml(path, "a scenario file, or the name of a built-in scenario", OptionError)
+    if not content:
+        raise OptionError(f"{path}: an empty scenario; give it a wall, `walls: [{{}}]`, or a net")
     return parse_scenario(content, path.stem, str(path))
 
 
