@@ -93,7 +93,7 @@ class Diver:
             laser,
             np.zeros(n),
             np.linalg.lstsq(points, np.ones(n))[0],
-            shared_error(np.zeros(n), np.ones(n)),
+            shared_error(np.zeros(n)),
         )
         posture: Posture | Refusal = Refusal(Reason.COLLINEAR)
         if fit is not None:

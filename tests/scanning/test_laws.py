@@ -183,7 +183,7 @@ def fit(
     along: FloatArray,
     start: FloatArray,
 ) -> PlaneFit:
-    shared = shared_error(np.zeros(len(points)), np.ones(len(points)))
+    shared = shared_error(np.zeros(len(points)))
     found = fit_robust(
         points, per_px, np.full(len(points), 0.3), laser, along, start=start, shared=shared
     )

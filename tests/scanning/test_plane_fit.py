@@ -73,7 +73,7 @@ def test_an_exact_plane_is_found_from_a_rough_start(m: FloatArray) -> None:
     points, per_px, laser = stripes(m)
     start = FORWARD / 0.6
     along = np.tile(ALONG, 3)
-    shared = shared_error(np.zeros(len(points)), np.ones(len(points)))
+    shared = shared_error(np.zeros(len(points)))
     found = fit_robust(
         points, per_px, np.full(len(points), 0.2), laser, along, start=start, shared=shared
     )

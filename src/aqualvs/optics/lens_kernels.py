@@ -246,7 +246,7 @@ def opencv_limits(lens: LensParams) -> tuple[float, float]:
     The first is the squared radius of the largest disc round the image centre with a positive
     Jacobian determinant, searched along spokes in steps of a quarter of a degree, then finer ones.
     """
-    # Calibrations move a lens in each step, most of them without its distortion.
+    # Calibrations of lasers and derivatives by a rig's numbers make many lenses of one distortion.
     return _limits_of_distortion(lens._replace(fx=1.0, fy=1.0, cx=0.0, cy=0.0))
 
 

@@ -54,7 +54,7 @@ def twine_share(height: FloatArray) -> FloatArray:
 
 
 def shared_error(
-    glow: FloatArray, position_px: FloatArray, twine: FloatArray | None = None
+    glow: FloatArray, twine: FloatArray | None = None, position_px: FloatArray | float = 1.0
 ) -> SharedError:
     """Return the errors that points on a solid surface or on a net share.
 
@@ -62,13 +62,13 @@ def shared_error(
     ----------
     glow : array, shape (N,)
         Difference between the flanks of the stripe, over its height.
-    position_px : array, shape (N,)
-        Pixels from one position of the search line to the next; 2 along the columns of a field.
     twine : array, shape (N,), optional
         Shift of the light on twine in pixels, with the sign that brings the point nearer. All
         stripes share it, and as much again those of one laser. None on something solid.
+    position_px : float or array, shape (N,)
+        Pixels from one position of the search line to the next; 2 along the columns of a field.
     """
-    own = SHARED_ERROR_PX * position_px
+    own = np.full(len(glow), SHARED_ERROR_PX) * position_px
     if twine is None:
         return SharedError(own, GLOW_PX * glow[None])
     return SharedError(np.hypot(own, twine), np.stack([GLOW_PX * glow, twine]))

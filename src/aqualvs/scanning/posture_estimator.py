@@ -598,10 +598,10 @@ class PostureEstimator:
         """Return the errors that observations of a surface share, given its approximate normal."""
         position_px = self._position_px[seen.laser]
         if not on_twine:
-            return shared_error(seen.glow, position_px)
+            return shared_error(seen.glow, None, position_px)
         nearer = -np.sign(seen.sensitivity @ normal)
         twine = nearer * twine_share(seen.height) * seen.width
-        return shared_error(seen.glow, position_px, twine)
+        return shared_error(seen.glow, twine, position_px)
 
     def _posture_of_fit(
         self, candidates: Candidates, seen: "_Observed", fit: PlaneFit, *, of_all: bool = False

@@ -233,7 +233,7 @@ def _find_plane(
     start = np.zeros(n_lasers + 1, np.int64)
     for k in range(n):
         c = rows[k]
-        for j in range(N_ROWS):
+        for j in range(WEIGHT):
             some[j, k] = table[j, c]
         some[WEIGHT, k] = weight[c]
         its_laser[k] = laser[c]

@@ -87,7 +87,7 @@ class BareLensComparison:
         n, start = len(points), np.empty(3)
         if not plane_of_all(points, start):
             return None
-        shared = shared_error(np.zeros(n), np.ones(n))
+        shared = shared_error(np.zeros(n))
         return fit_robust(points, sensitivity, np.ones(n), laser, np.zeros(n), start, shared)
 
 
