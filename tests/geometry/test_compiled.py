@@ -5,10 +5,15 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numba
 import numpy as np
 import pytest
 
+from aqualvs.demo import bundled_dive
 from aqualvs.geometry.compiled import inline_kernel, kernel
+from aqualvs.optics.rigfile import load_rig
+from aqualvs.scanner import Scanner
+from aqualvs.sources import open_source
 
 CALLEE = """
 from aqualvs.geometry.compiled import inline_kernel
@@ -191,3 +196,23 @@ def test_code_on_disk_for_a_class_that_is_gone_is_compiled_anew(tmp_path: Path) 
         (tmp_path / "pair.py").write_text(PAIR.format(name=name))
         assert run_caller(tmp_path, "of_pair.py") == ["1.0"]
     assert list((tmp_path / "cache").rglob("of_pair.half*.nbi"))
+
+
+def test_no_kernel_of_a_scan_is_compiled_for_one_number() -> None:
+    """A count that begins at a literal 0 compiles what it is passed to for 0 and for any number."""
+    scanner = Scanner(load_rig(str(bundled_dive() / "rig.yaml")))
+    with open_source(str(bundled_dive() / "dive.mp4")) as source:
+        assert scanner.process(next(iter(source))).posture
+    on_disk = [
+        (name, key[0])
+        for module, content in list(sys.modules.items())
+        if module.startswith("aqualvs.scanning.")
+        for name, value in vars(content).items()
+        if hasattr(value, "_for_kernels")
+        for key in value._for_kernels._cache._cache_file._load_index()
+    ]
+    assert len(on_disk) > 100
+    for name, types in on_disk:
+        assert not any(isinstance(one, numba.types.Literal) for one in types), (
+            f"{name} is on disk for {types}; if by an older version, delete the folders __pycache__"
+        )

@@ -13,7 +13,7 @@ from aqualvs.geometry.compiled import (
     inner_kernel,
     kernel,
 )
-from aqualvs.geometry.linear_algebra import solve_symmetric
+from aqualvs.geometry.linear_algebra import solve_symmetric, where
 from aqualvs.scanning.plane_search import (
     JX,
     JY,
@@ -622,7 +622,7 @@ def seen_of(
             way[laser[c]] += n_lines[c]
     most, asked, faint, dark = 0.0, 0, 0, 0
     for i in range(n_lasers):
-        cells = np.count_nonzero(expected[i])
+        cells = where(expected[i]).shape[0]
         way[i] = way[i] / (CELL_LINES * cells) if cells >= _EVIDENCE.min_cells else np.nan
         if way[i] > most:
             most = way[i]

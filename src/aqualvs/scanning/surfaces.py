@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import (
+    ZERO,
     borrowing_kernel,
     inline_borrowing_kernel,
     inner_borrowing_kernel,
@@ -180,7 +181,7 @@ def search_surfaces(
     min_subsegments = 6
     # Planes through noise hold up to a hundredth of the light in the frame, all candidates counted.
     min_share = 0.03
-    weight, found = table[WEIGHT], 0
+    weight, found = table[WEIGHT], ZERO
     while found < MAX_SURFACES:
         rows, left = where(free), 0
         for k in range(rows.shape[0]):
