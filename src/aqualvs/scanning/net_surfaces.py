@@ -5,9 +5,11 @@ only surface through which another one is seen: along a stripe, light on it alte
 behind it (`seen_through`). The flanks of a fold, which are found as planes of their own, lie side
 by side, and the one begins where the other ends (`is_continuation`); `merged_plane` gives their
 plane. For a net that is mostly folds `fit_mean` fits the mean plane, and `inflate_covariance`
-widens the covariance of a posture that disagrees with it.
+widens the covariance of a posture that disagrees with another one, such as that to the plane of all
+strands (`fit_all`).
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -186,6 +188,29 @@ def fit_mean(points: FloatArray, laser: IntArray, start: Plane) -> PlaneFit | No
     m, weights, covariance = start.normal / start.offset, np.empty(len(points)), np.empty((3, 3))
     rms = _fit_mean(points, laser, m, weights, covariance)
     return PlaneFit(m, covariance, weights, rms) if np.isfinite(rms) else None
+
+
+def fit_all(points: FloatArray) -> PlaneFit | None:
+    """Fit m·X = 1 to all strands of a net by least squares; their scatter gives the covariance.
+
+    Parameters
+    ----------
+    points : array, shape (N, 3)
+        Of the strands, in `dome`, metres.
+
+    Returns
+    -------
+    PlaneFit or None
+        None where the points do not determine a plane.
+    """
+    n = len(points)
+    if n <= 3 or np.linalg.matrix_rank(points) < 3:
+        return None
+    m = np.asarray(np.linalg.lstsq(points, np.ones(n))[0], np.float64)
+    square = float(np.mean((points @ m - 1.0) ** 2))
+    inverse = np.asarray(np.linalg.inv(points.T @ points), np.float64)
+    rms = math.sqrt(square) / float(np.linalg.norm(m))
+    return PlaneFit(m, square / (1.0 - 3.0 / n) * inverse, np.ones(n), rms)
 
 
 @kernel

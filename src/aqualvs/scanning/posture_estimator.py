@@ -28,6 +28,7 @@ from aqualvs.scanning.laser_bands import LaserBand
 from aqualvs.scanning.net_surfaces import (
     disagreement,
     distances_off,
+    fit_all,
     fit_mean,
     inflate_covariance,
     mark_beside,
@@ -196,7 +197,7 @@ _SHORTEST_STRAND, _SHORTEST_IN_FIELD = 3, 2
 _DEEPEST_BEND = 0.15
 _FEW_STRANDS, _STRONG_BEND = 36, 0.02
 # With less than this share of a net's light on the surface, the net's mean plane replaces it. Up to
-# the greater share, the mean plane inflates the covariance.
+# the greater share, the plane of all its strands inflates the covariance.
 _MAIN_SHARE, _WHOLE_SHARE = 0.4, 0.9
 # Fewer strands do not show that a net is folded.
 _MIN_FOLDED = 12
@@ -204,9 +205,9 @@ _MIN_FOLDED = 12
 _FOLDED_RMS_SHARE = 0.04
 _NEAR_SHARE = 0.005
 # Light this near the plane (share of the range) may be the net's if nothing else explains it. A net
-# of which fewer strands than the second share lie on the surface, and less light than the third, is
-# mostly folds. Flat nets in strong sun and those with growth come down to 0.36 of the strands, and
-# to 0.31 of the light; folded ones reach 0.46 and 0.62.
+# is mostly folds if at most the second share of its strands, and less than the third of its light,
+# lie on the surface. Flat nets in strong sun and those with growth come down to 0.36 of the strands
+# and to 0.31 of the light; folded ones reach 0.5 and 0.62.
 _BESIDE_SHARE, _FOLDED_STRANDS, _FOLDED_INTENSITY = 0.06, 0.5, 0.47
 # Square of the distance between two postures, over the covariance of the one: its expected value if
 # only chance parts them, and what chance exceeds once in 1000 times (chi-squared, 3 values).
@@ -429,25 +430,48 @@ class PostureEstimator:
             patch,
             _NEAR_SHARE * plane.offset,
         )
-        if best and share >= _FOLDED_STRANDS:
+        if best and share > _FOLDED_STRANDS:
             return self._widened(best, seen, plane, intensity_share)
-        mean = self._settled(candidates, net_mask, seen, self._mean_plane(candidates, seen, plane))
-        if mean is None or best is None or intensity_share < _FOLDED_INTENSITY:
-            return mean
-        one, other = best.posture, mean.posture
-        if not (one and other):
+        mean = self._settled(candidates, net_mask, self._mean_plane(candidates, seen, plane))
+        if mean is None:
             return None
-        contradicts = disagreement(one, other) > _CONTRADICTS
-        return mean if contradicts else _disputed(best, other, intensity_share)
+        one, other = best.posture if best else None, mean.found.posture
+        if best and intensity_share >= _FOLDED_INTENSITY:
+            if not (one and other):
+                return None
+            if disagreement(one, other) <= _CONTRADICTS:
+                return self._widened_by_all(best, seen, intensity_share, folded=True)
+        return self._widened_by_all(mean.found, mean.seen, mean.share, folded=True)
 
     def _widened(
         self, best: Measurement, seen: "_Observed", plane: Plane, intensity_share: float
     ) -> Measurement:
         """Widen a posture by the mean plane of the light near it; `intensity_share` is its own."""
         fit = fit_mean(seen.observations.points, seen.observations.laser, plane)
-        if fit is None:
+        if fit is None or not isinstance(best.posture, Posture):
             return best
-        return _disputed(best, posture_of(fit, 0.0, 0, self._axis_in_dome), intensity_share)
+        mean = posture_of(fit, 0.0, 0, self._axis_in_dome)
+        # Of the difference, what the scatter of the strands does not explain.
+        excess = 1.0 - _EXPECTED / max(disagreement(best.posture, mean), _EXPECTED)
+        share = (1.0 - intensity_share) * excess
+        return replace(best, posture=inflate_covariance(best.posture, mean, share))
+
+    def _widened_by_all(
+        self, found: Measurement, seen: "_Observed", share: float, *, folded: bool = False
+    ) -> Measurement:
+        """Widen a posture, which a share of a net's light supports, by the plane of all strands.
+
+        The plane of all strands of a folded net is uncertain itself, and adds its own covariance.
+        """
+        fit = fit_all(seen.observations.points)
+        if fit is None or not isinstance(found.posture, Posture):
+            return found
+        other = posture_of(fit, 0.0, 0, self._axis_in_dome)
+        posture = inflate_covariance(found.posture, other, 1.0 - share)
+        if folded:
+            covariance = posture.covariance + (1.0 - share) * other.covariance
+            posture = replace(posture, covariance=covariance)
+        return replace(found, posture=posture)
 
     def _beside(
         self, candidates: Candidates, net_mask: BoolArray, off: FloatArray, plane: Plane
@@ -460,12 +484,8 @@ class PostureEstimator:
         )
 
     def _settled(
-        self,
-        candidates: Candidates,
-        net_mask: BoolArray,
-        seen: "_Observed",
-        mean: Measurement | None,
-    ) -> Measurement | None:
+        self, candidates: Candidates, net_mask: BoolArray, mean: "_MeanPlane | None"
+    ) -> "_MeanPlane | None":
         """Measure a mean plane again from the light about it.
 
         The light near one flank is more of that side than of the other: the selection is repeated
@@ -475,23 +495,27 @@ class PostureEstimator:
         # The light about a mean plane is selected at most this many times more.
         max_selections = 5
         for _ in range(max_selections):
-            if mean is None or not isinstance(mean.posture, Posture):
+            if mean is None or not isinstance(mean.found.posture, Posture):
                 break
-            plane = Plane(mean.posture.normal_in_dome, mean.posture.range)
+            plane = Plane(mean.found.posture.normal_in_dome, mean.found.posture.range)
             distances_off(candidates.points, plane.normal, plane.offset, off)
-            other = self._beside(candidates, net_mask, off, plane)
-            if np.array_equal(other.group >= 0, seen.group >= 0):
+            seen = self._beside(candidates, net_mask, off, plane)
+            if np.array_equal(seen.group >= 0, mean.seen.group >= 0):
                 break
-            seen, mean = other, self._mean_plane(candidates, other, plane)
+            mean = self._mean_plane(candidates, seen, plane)
         return mean
 
     def _mean_plane(
         self, candidates: Candidates, seen: "_Observed", plane: Plane
-    ) -> Measurement | None:
+    ) -> "_MeanPlane | None":
         """Measure the posture to the mean plane of a folded net."""
         fit = fit_mean(seen.observations.points, seen.observations.laser, plane)
-        found = None if fit is None else self._posture_of_fit(candidates, seen, fit, of_all=True)
-        return None if found is None else replace(found, folded=True)
+        if fit is None:
+            return None
+        found = self._posture_of_fit(candidates, seen, fit, of_all=True)
+        if found is None:
+            return None
+        return _MeanPlane(replace(found, folded=True), seen, float(np.mean(fit.weights)))
 
     def _or_mean_plane(
         self,
@@ -507,12 +531,15 @@ class PostureEstimator:
             candidates, candidates.component, self._shortest_strand, net_mask, plane.normal
         )
         share = _share_on(seen, patch, plane)
-        if share >= _MAIN_SHARE and (share >= _WHOLE_SHARE or is_curved):
-            return best
+        if share >= _MAIN_SHARE:
+            is_whole = is_curved or share >= _WHOLE_SHARE
+            return best if is_whole else self._widened_by_all(best, seen, share)
         mean = self._mean_plane(candidates, seen, plane)
-        if mean is None:
-            return best
-        return mean if share < _MAIN_SHARE else _inflate_covariance(best, mean, 1.0 - share)
+        return (
+            best
+            if mean is None
+            else self._widened_by_all(mean.found, seen, mean.share, folded=True)
+        )
 
     def _is_observable(self, candidates: Candidates, curved: Measurement) -> bool:
         """Return whether the posture to a curved net may be relied on."""
@@ -642,6 +669,14 @@ class _Observed(NamedTuple):
     observations: Observations
 
 
+class _MeanPlane(NamedTuple):
+    """Mean plane of a folded net, the strands it is fitted to, and the share that it explains."""
+
+    found: Measurement
+    seen: _Observed
+    share: float
+
+
 def _share_on(seen: _Observed, patch: FloatArray, plane: Plane) -> float:
     """Return the share of a net's strands on its surface; 1 where few strands show no folds."""
     if len(seen.observations.laser) < _MIN_FOLDED:
@@ -653,19 +688,6 @@ def _share_on(seen: _Observed, patch: FloatArray, plane: Plane) -> float:
 def _plane_of(fit: PlaneFit) -> Plane:
     distance = 1.0 / math.hypot(*fit.m.tolist())
     return Plane(fit.m * distance, distance)
-
-
-def _disputed(found: Measurement, other: Posture, intensity_share: float) -> Measurement:
-    """Widen a posture by another one's difference that the other's scatter does not explain."""
-    if isinstance(found.posture, Refusal):
-        return found
-    apart = disagreement(found.posture, other)
-    if apart <= _EXPECTED:
-        return found
-    excess = 1.0 - _EXPECTED / apart
-    return replace(
-        found, posture=inflate_covariance(found.posture, other, (1.0 - intensity_share) * excess)
-    )
 
 
 def _inflate_covariance(found: Measurement, other: Measurement, share: float) -> Measurement:
