@@ -7,6 +7,7 @@ from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.scanning.candidates import Subsegments
 from aqualvs.scanning.net_surfaces import (
+    fit_all,
     fit_mean,
     inflate_covariance,
     is_continuation,
@@ -191,6 +192,20 @@ def test_the_mean_plane_of_folds_is_as_uncertain_as_they_are_few() -> None:
     assert 8e-3 < few.rms < 11e-3
 
 
+def test_errors_of_the_plane_of_all_strands_are_as_large_as_its_covariance_says() -> None:
+    rng, n = np.random.default_rng(6), 400
+    scores = np.empty((n, 3))
+    for i in range(n):
+        x, z = rng.uniform(-0.2, 0.2, (2, 30))
+        found = fit_all(np.stack([x, RANGE + rng.normal(0.0, 0.005, 30), z], axis=-1))
+        assert found is not None
+        error = found.m - FLAT.normal / RANGE
+        scores[i] = error / np.sqrt(np.diag(found.covariance))
+    # A root mean square of 400 is known within 3.5 %; that of Student's t with 27 degrees of
+    # freedom is 1.04.
+    np.testing.assert_allclose(np.sqrt(np.mean(scores**2, axis=0)), 1.04, atol=0.12)
+
+
 def test_a_few_strands_elsewhere_do_not_move_the_mean_plane() -> None:
     points = wavy()
     clean = fit_mean(points, in_turn(60), FLAT)
@@ -235,6 +250,7 @@ def test_points_on_a_line_have_no_mean_plane() -> None:
     s = np.linspace(-0.2, 0.2, 20)
     line = np.stack([s, np.full(20, RANGE), np.zeros(20)], axis=-1)
     assert fit_mean(line, in_turn(20), FLAT) is None
+    assert fit_all(line) is None
 
 
 def posture(distance: float, yaw: float) -> Posture:
