@@ -80,10 +80,10 @@ def protobuf_stamp(i):
     return protobuf(n1=seconds, n2=nanoseconds)
 
 
-def write_mcap(path, topics, *, finish=True):
+def write_mcap(path, topics, *, finish=True, **options):
     """Write topics: name, schema name, schema encoding and text, message encoding, messages."""
     with path.open("wb") as stream:
-        writer = mcap_writer.Writer(stream, chunk_size=20_000)
+        writer = mcap_writer.Writer(stream, chunk_size=20_000, **options)
         writer.start()
         for name, schema, (kind, text), encoding, messages in topics:
             schema_id = writer.register_schema(schema, kind, text)
@@ -500,6 +500,17 @@ def test_a_chunk_larger_than_it_claims_is_damaged(codec):
         decompressed(codec, packed, 1_000)
     with pytest.raises(ValueError, match="1099511627776"):
         decompressed(codec, packed, 1 << 40)
+
+
+def test_a_record_in_a_chunk_that_is_longer_than_any_file_is_damaged(tmp_path):
+    plain = mcap_writer.CompressionType.NONE
+    path = write_mcap(tmp_path / "long.mcap", [compressed_image(6)], compression=plain)
+    data = bytearray(path.read_bytes())
+    # Before a message's data stand 22 bytes of numbers and times, and before them its length.
+    data[data.index(compressed_image(6)[-1][3]) - 23] = 0x80
+    path.write_bytes(data)
+    with pytest.raises(SourceError, match="damaged"), open_source(path) as source:
+        list(source)
 
 
 def test_empty_messages_of_ros_2_are_left_out(tmp_path):

@@ -356,7 +356,9 @@ def _mcap_faults() -> tuple[type[Exception], ...]:
     from mcap.exceptions import McapError
     from pyarrow import ArrowException
 
-    return (McapError, ArrowException, struct.error, OSError, EOFError, ValueError, LookupError)
+    faults = (McapError, ArrowException, struct.error, OSError, EOFError, ValueError, LookupError)
+    # Lengths that no file can hold.
+    return (*faults, OverflowError)
 
 
 class _Bounded:
