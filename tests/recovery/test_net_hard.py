@@ -162,8 +162,8 @@ def test_errors_on_random_folds_are_as_large_as_stated() -> None:
         if isinstance(shot.scan.posture, Posture):
             scores.append(shot.error() / np.sqrt(np.diag(shot.posture.covariance)))
     assert len(scores) >= 0.85 * n
-    # By the planes of flanks alone a third of them, some by 30 sigmas. Folds as steep as high can
-    # still hide all but one row of flanks.
+    # By the planes of flanks alone one in six, some by 30 sigmas. In steep folds all lasers may
+    # agree on one row of flanks.
     beyond = np.abs(scores).max(axis=1) > 4.0
     assert np.count_nonzero(beyond) <= n // 15
     # Of a normal distribution: 0.67.

@@ -204,9 +204,10 @@ def fit_all(points: FloatArray) -> PlaneFit | None:
         None where the points do not determine a plane.
     """
     n = len(points)
-    if n <= 3 or np.linalg.matrix_rank(points) < 3:
+    solution, _, rank, _ = np.linalg.lstsq(points, np.ones(n))
+    if n <= 3 or rank < 3:
         return None
-    m = np.asarray(np.linalg.lstsq(points, np.ones(n))[0], np.float64)
+    m = np.asarray(solution, np.float64)
     square = float(np.mean((points @ m - 1.0) ** 2))
     inverse = np.asarray(np.linalg.inv(points.T @ points), np.float64)
     rms = math.sqrt(square) / float(np.linalg.norm(m))

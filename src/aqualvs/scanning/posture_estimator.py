@@ -535,11 +535,9 @@ class PostureEstimator:
             is_whole = is_curved or share >= _WHOLE_SHARE
             return best if is_whole else self._widened_by_all(best, seen, share)
         mean = self._mean_plane(candidates, seen, plane)
-        return (
-            best
-            if mean is None
-            else self._widened_by_all(mean.found, seen, mean.share, folded=True)
-        )
+        if mean is None:
+            return best
+        return self._widened_by_all(mean.found, seen, mean.share, folded=True)
 
     def _is_observable(self, candidates: Candidates, curved: Measurement) -> bool:
         """Return whether the posture to a curved net may be relied on."""
