@@ -1,6 +1,7 @@
 import re
 import shutil
 import subprocess
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -187,6 +188,12 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="file"):
         print_board(BoardRequest(kind="charuco", out=tmp_path / "file" / "t"), print)
+
+
+@pytest.mark.parametrize("out", ["/", ".", ".."])
+def test_a_place_without_a_name_is_refused(out):
+    with pytest.raises(OptionError, match="names no file; give one"):
+        print_board(BoardRequest(kind="charuco", out=Path(out)), print)
 
 
 def test_words_are_escaped_and_bytes_repeat():

@@ -77,10 +77,12 @@ class BoardRequest:
 def print_board(request: BoardRequest, echo: Echo) -> None:
     """Write the PDF and the yaml of a target.
 
-    Raises `OptionError` if the target is impossible, or does not fit the paper. Raises
-    `OutputError` if a file cannot be written.
+    Raises `OptionError` if the target is impossible or does not fit the paper, or the files have no
+    name. Raises `OutputError` if a file cannot be written.
     """
     out = request.out.with_suffix("") if request.out.suffix == ".pdf" else request.out
+    if out.name in ("", ".."):
+        raise OptionError(f"--out: {out} names no file; give one, such as {out / 'board'}")
     pdf, yaml = out.with_name(f"{out.name}.pdf"), out.with_name(f"{out.name}.yaml")
     with Claim("board", [pdf, yaml], overwrite=request.overwrite):
         try:
