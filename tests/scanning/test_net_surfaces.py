@@ -7,7 +7,6 @@ from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.scanning.candidates import Subsegments
 from aqualvs.scanning.net_surfaces import (
-    fit_all,
     fit_mean,
     inflate_covariance,
     is_continuation,
@@ -197,7 +196,8 @@ def test_errors_of_the_plane_of_all_strands_are_as_large_as_its_covariance_says(
     scores = np.empty((n, 3))
     for i in range(n):
         x, z = rng.uniform(-0.2, 0.2, (2, 30))
-        found = fit_all(np.stack([x, RANGE + rng.normal(0.0, 0.005, 30), z], axis=-1))
+        points = np.stack([x, RANGE + rng.normal(0.0, 0.005, 30), z], axis=-1)
+        found = fit_mean(points, in_turn(30), FLAT, reject=False)
         assert found is not None
         error = found.m - FLAT.normal / RANGE
         scores[i] = error / np.sqrt(np.diag(found.covariance))
@@ -250,7 +250,7 @@ def test_points_on_a_line_have_no_mean_plane() -> None:
     s = np.linspace(-0.2, 0.2, 20)
     line = np.stack([s, np.full(20, RANGE), np.zeros(20)], axis=-1)
     assert fit_mean(line, in_turn(20), FLAT) is None
-    assert fit_all(line) is None
+    assert fit_mean(line, in_turn(20), FLAT, reject=False) is None
 
 
 def posture(distance: float, yaw: float) -> Posture:

@@ -6,10 +6,9 @@ behind it (`seen_through`). The flanks of a fold, which are found as planes of t
 by side, and the one begins where the other ends (`is_continuation`); `merged_plane` gives their
 plane. For a net that is mostly folds `fit_mean` fits the mean plane, and `inflate_covariance`
 widens the covariance of a posture that disagrees with another one, such as that to the plane of all
-strands (`fit_all`).
+strands.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -166,7 +165,9 @@ def _n_lasers(laser: IntArray) -> int:
     return n
 
 
-def fit_mean(points: FloatArray, laser: IntArray, start: Plane) -> PlaneFit | None:
+def fit_mean(
+    points: FloatArray, laser: IntArray, start: Plane, *, reject: bool = True
+) -> PlaneFit | None:
     """Fit m·X = 1 to the strands of a folded net, with equal weights.
 
     The scatter about the plane is due to the folds, and gives the covariance.
@@ -177,6 +178,8 @@ def fit_mean(points: FloatArray, laser: IntArray, start: Plane) -> PlaneFit | No
         Of the strands, in `dome`, metres.
     start : Plane
         A first guess: tells outliers.
+    reject : bool
+        Whether strands count less the farther they lie off; else all count alike.
 
     Returns
     -------
@@ -186,37 +189,18 @@ def fit_mean(points: FloatArray, laser: IntArray, start: Plane) -> PlaneFit | No
     if len(points) <= 3:
         return None
     m, weights, covariance = start.normal / start.offset, np.empty(len(points)), np.empty((3, 3))
-    rms = _fit_mean(points, laser, m, weights, covariance)
+    rms = _fit_mean(points, laser, reject, m, weights, covariance)
     return PlaneFit(m, covariance, weights, rms) if np.isfinite(rms) else None
-
-
-def fit_all(points: FloatArray) -> PlaneFit | None:
-    """Fit m·X = 1 to all strands of a net by least squares; their scatter gives the covariance.
-
-    Parameters
-    ----------
-    points : array, shape (N, 3)
-        Of the strands, in `dome`, metres.
-
-    Returns
-    -------
-    PlaneFit or None
-        None where the points do not determine a plane.
-    """
-    n = len(points)
-    solution, _, rank, _ = np.linalg.lstsq(points, np.ones(n))
-    if n <= 3 or rank < 3:
-        return None
-    m = np.asarray(solution, np.float64)
-    square = float(np.mean((points @ m - 1.0) ** 2))
-    inverse = np.asarray(np.linalg.inv(points.T @ points), np.float64)
-    rms = math.sqrt(square) / float(np.linalg.norm(m))
-    return PlaneFit(m, square / (1.0 - 3.0 / n) * inverse, np.ones(n), rms)
 
 
 @kernel
 def _fit_mean(
-    points: FloatArray, laser: IntArray, m: FloatArray, weights: FloatArray, covariance: FloatArray
+    points: FloatArray,
+    laser: IntArray,
+    reject: bool,
+    m: FloatArray,
+    weights: FloatArray,
+    covariance: FloatArray,
 ) -> float:
     """Refine m in place, write weights and covariance; return the rms, NaN if undetermined."""
     n, one = points.shape[0], np.empty(points.shape[0])
@@ -227,7 +211,8 @@ def _fit_mean(
     exact = 1e-9
     for _ in range(iterations):
         _distances(points, m, off)
-        cut = TUKEY * 1.4826 * max(_usual_distance(off, laser), exact)
+        usual = max(_usual_distance(off, laser), exact) if reject else np.inf
+        cut = TUKEY * 1.4826 * usual
         for i in range(n):
             weights[i] = max(1.0 - (off[i] / cut) ** 2, 0.0) ** 2
         normal_equations(points, one, weights, normal, right)

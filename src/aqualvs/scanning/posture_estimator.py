@@ -28,7 +28,6 @@ from aqualvs.scanning.laser_bands import LaserBand
 from aqualvs.scanning.net_surfaces import (
     disagreement,
     distances_off,
-    fit_all,
     fit_mean,
     inflate_covariance,
     mark_beside,
@@ -265,7 +264,7 @@ class PostureEstimator:
         # A kernel that is given None is compiled without the code for bent sheets.
         self._bent = sheets if sheets[:, WINDOWED].any() else None
         self._focal_px = rig.focal_px
-        in_fields = rig.shutter.field_of(0) is not None
+        in_fields = rig.shutter.is_interlaced
         self._shortest_strand = _SHORTEST_IN_FIELD if in_fields else _SHORTEST_STRAND
         self._line_px = max((search.line_px for search in laser_bands), default=1)
         self._axis_in_dome = rig.dome_from_cam.rotate([0.0, 0.0, 1.0])
@@ -435,8 +434,8 @@ class PostureEstimator:
         mean = self._settled(candidates, net_mask, self._mean_plane(candidates, seen, plane))
         if mean is None:
             return None
-        one, other = best.posture if best else None, mean.found.posture
         if best and intensity_share >= _FOLDED_INTENSITY:
+            one, other = best.posture, mean.found.posture
             if not (one and other):
                 return None
             if disagreement(one, other) <= _CONTRADICTS:
@@ -463,8 +462,11 @@ class PostureEstimator:
 
         The plane of all strands of a folded net is uncertain itself, and adds its own covariance.
         """
-        fit = fit_all(seen.observations.points)
-        if fit is None or not isinstance(found.posture, Posture):
+        if not isinstance(found.posture, Posture):
+            return found
+        plane = Plane(found.posture.normal_in_dome, found.posture.range)
+        fit = fit_mean(seen.observations.points, seen.observations.laser, plane, reject=False)
+        if fit is None:
             return found
         other = posture_of(fit, 0.0, 0, self._axis_in_dome)
         posture = inflate_covariance(found.posture, other, 1.0 - share)
@@ -623,7 +625,7 @@ class PostureEstimator:
         """Return the errors that observations of a surface share, given its approximate normal."""
         position_px = self._position_px[seen.laser]
         if not on_twine:
-            return shared_error(seen.glow, None, position_px)
+            return shared_error(seen.glow, position_px=position_px)
         nearer = -np.sign(seen.sensitivity @ normal)
         twine = nearer * twine_share(seen.height) * seen.width
         return shared_error(seen.glow, twine, position_px)

@@ -418,7 +418,6 @@ def parse_scenario(content: Any, name: str, source: str) -> Scenario:
 
     Raises `OptionError` if a key is unknown or a value makes no sense.
     """
-    content = {} if content is None else content
     return validated(ScenarioFile, content, f"scenario {source}", OptionError).scenario(name)
 
 
