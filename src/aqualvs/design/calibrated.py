@@ -143,9 +143,10 @@ def _found(believed: Rig, true: Rig, board: SE3) -> SE3 | None:
     seen = valid & camera.inside_image(pixels)
     view = View("board", np.flatnonzero(seen), corners[seen], pixels[seen])
     try:
-        return target_pose(believed.camera(), view, max_rms_px=np.inf).dome_from_target
+        pose = target_pose(believed.camera(), view, start=board, max_rms_px=np.inf)
     except CalibrationError:
         return None
+    return pose.dome_from_target
 
 
 def _stripe_on(board: SE3, found: SE3, laser: Laser, believed: Rig, true: Rig) -> FloatArray:

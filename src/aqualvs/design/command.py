@@ -40,6 +40,7 @@ from aqualvs.design.report import (
 )
 from aqualvs.design.settings import Design
 from aqualvs.errors import OptionError
+from aqualvs.geometry.arrays import FloatArray
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.rigfile import load_rig, save_rig
 from aqualvs.results.files import Claim, writing
@@ -84,14 +85,18 @@ def design_and_tell(request: DesignRequest) -> None:
             turned = [replace(m, free_stripe=m.free_stripe or m.free_tilt) for m in design.mounts]
             design = design.with_mounts(turned)
         best = best_angles(design) if request.tilt else design
-        first, fine = verdict(best)
+        ranges = shown_ranges(best.rig.working_range)
+        by_camera = camera_errors(best, ranges)
+        first, fine = verdict(best, by_camera)
         told.console.print(first, style="bold", markup=False, highlight=False, soft_wrap=True)
         told(*summary(best))
         if request.rig is not None and request.tilt:
-            _tell_errors(told, design, "As it is: one sigma on a wall or net square ahead")
+            title = "As it is: one sigma on a wall or net square ahead"
+            _tell_errors(told, design, camera_errors(design, ranges), title)
             error, better = score(design).error, score(best).error
             told(f"Tilted best, its errors are {better / error:.0%} of that.")
-        _tell_errors(told, best, "Expected error: one sigma on a wall or net square ahead")
+        title = "Expected error: one sigma on a wall or net square ahead"
+        _tell_errors(told, best, by_camera, title)
         costs = offset_costs(best, best.rig.working_range)
         if costs:
             words = centring_text(best, costs, best.rig.working_range)
@@ -101,7 +106,7 @@ def design_and_tell(request: DesignRequest) -> None:
         if request.out is not None:
             with writing(request.out):
                 save_rig(designed_rig(best), request.out / RIG_YAML)
-                pictures = draw_figures(best, request.out)
+                pictures = draw_figures(best, by_camera, request.out)
                 page = request.out / DESIGN_HTML
                 write_page(page, best.rig.name, first, told.parts, pictures, fine=fine)
             for path in (request.out / RIG_YAML, *pictures, page):
@@ -127,14 +132,16 @@ class _Telling:
         self.console.print(sentence, markup=False, highlight=False, soft_wrap=True)
 
 
-def _tell_errors(told: _Telling, design: Design, title: str) -> None:
+def _tell_errors(
+    told: _Telling, design: Design, by_camera: Mapping[str, FloatArray], title: str
+) -> None:
     """Tell the places of the lasers, their errors, and the part of each tolerance."""
     # Number of ranges at which stripes are checked to be in the picture.
     n_seen = 181
     closely = predict(design, np.geomspace(*design.rig.working_range, n_seen))
     ranges = shown_ranges(design.rig.working_range)
     found = predict(design, ranges)
-    causes = {**camera_errors(design, ranges), **found.systematic}
+    causes = {**by_camera, **found.systematic}
     told(lasers_table(design, closely), *findings(design, closely))
     told(error_table(found, together(causes), title))
     middle = int(np.argmin(np.abs(found.ranges - math.sqrt(math.prod(design.rig.working_range)))))

@@ -15,7 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from aqualvs.check.finding import escaped, shutter_finding
-from aqualvs.design.calibrated import INDEX_ERROR, OffsetCost, camera_errors
+from aqualvs.design.calibrated import INDEX_ERROR, OffsetCost
 from aqualvs.design.changes import Change
 from aqualvs.design.judge import PredictedErrors, predict, together
 from aqualvs.design.settings import Design, Mount
@@ -66,17 +66,18 @@ def summary(design: Design) -> list[str]:
     ]
 
 
-def verdict(design: Design) -> tuple[str, bool]:
+def verdict(design: Design, by_camera: Mapping[str, FloatArray]) -> tuple[str, bool]:
     """Return in one line whether a design meets its goals, and whether it does.
 
-    Of a single frame on the net, noise and tolerances together, at the worst range.
+    Of a single frame on the net, noise and tolerances together, at the worst range. `by_camera` is
+    from `camera_errors`, at `shown_ranges`.
     """
     ranges = shown_ranges(design.rig.working_range)
     told, goals = predict(design, ranges), design.goals
     near, far = (f"{1e3 * wall:.0f}" for wall in design.rig.working_range)
     if not told.valid.all():
         return f"No: between {near} and {far} mm there are ranges without a posture.", False
-    systematic = np.hypot(told.systematic_total, together(camera_errors(design, ranges)))
+    systematic = np.hypot(told.systematic_total, together(by_camera))
     sigma = np.hypot(told.net, systematic)
     share, angle = sigma[:, 0] / ranges, sigma[:, 1:].max(axis=1)
     worst, tilted = int(share.argmax()), int(angle.argmax())
@@ -283,17 +284,18 @@ def _table(title: str, first: str = "", right: bool = False) -> Table:
 
 ERRORS_PNG, PICTURE_PNG, DESIGN_HTML = "errors.png", "picture.png", "design.html"
 
-# Errors by the camera's tolerances change little with range.
-_N_RANGES, _N_CAMERA, _N_ALONG = 60, 5, 40
+_N_RANGES, _N_ALONG = 60, 40
 
 
-def draw_figures(design: Design, out: Path) -> list[Path]:
+def draw_figures(design: Design, by_camera: Mapping[str, FloatArray], out: Path) -> list[Path]:
     """Write `errors.png` and `picture.png`.
 
     Parameters
     ----------
     design : Design
         With the final tilts of its lasers.
+    by_camera : mapping from cause to array
+        From `camera_errors`, at `shown_ranges`; it changes little with range.
     out : Path
         Folder that exists.
 
@@ -304,12 +306,11 @@ def draw_figures(design: Design, out: Path) -> list[Path]:
     """
     from matplotlib import rc_context
 
-    written = []
+    written = [out / ERRORS_PNG, out / PICTURE_PNG]
     dpi = 160
     with rc_context(STYLE):
-        for name, draw in ((ERRORS_PNG, _errors), (PICTURE_PNG, _picture)):
-            draw(design).savefig(out / name, dpi=dpi)
-            written.append(out / name)
+        _errors(design, by_camera).savefig(written[0], dpi=dpi)
+        _picture(design).savefig(written[1], dpi=dpi)
     return written
 
 
@@ -380,13 +381,12 @@ def _as_html(table: Table) -> str:
     return html.table(head, zip(*cells, strict=True), texts=min(right))
 
 
-def _errors(design: Design) -> "Figure":
+def _errors(design: Design, by_camera: Mapping[str, FloatArray]) -> "Figure":
     """Draw the range error in per cent, and pitch and yaw errors in degrees, over range."""
     ranges = np.geomspace(*design.rig.working_range, _N_RANGES)
     told = predict(design, ranges)
-    few = np.geomspace(*design.rig.working_range, _N_CAMERA)
-    camera = together(camera_errors(design, few.tolist()))
-    camera = np.stack([np.interp(ranges, few, column) for column in camera.T], axis=-1)
+    few = shown_ranges(design.rig.working_range)
+    camera = np.stack([np.interp(ranges, few, by) for by in together(by_camera).T], axis=-1)
     systematic = np.hypot(told.systematic_total, camera)
     figure = new_canvas(7.2, 2.9)
     panels = figure.subplots(1, 3, sharex=True)

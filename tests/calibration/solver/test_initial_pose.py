@@ -92,6 +92,22 @@ def test_far_small_targets_are_ambiguous_and_near_ones_are_not() -> None:
     assert far.ambiguous
 
 
+@pytest.mark.parametrize("where", CAMERAS)
+def test_a_start_that_is_known_roughly_ends_where_none_does(where: str) -> None:
+    camera, rng = CAMERAS[where], np.random.default_rng(7)
+    pose = _placed(camera, BOARD, rng)
+    view = see(camera, pose, BOARD, rng)
+    near = SE3(rotation_from_rotvec([0.05, -0.04, 0.03]), np.array([0.02, 0.03, -0.01])) @ pose
+    found, without = target_pose(camera, view, start=near), target_pose(camera, view)
+    off = pose_difference(without.dome_from_target, found.dome_from_target, view.middle)
+    # A step shorter than a fiftieth of a sigma ends the search.
+    assert off @ np.linalg.solve(without.covariance, off) < 0.05**2
+    # Of a start that is far off, nothing is left.
+    lost = target_pose(camera, view, start=SE3(pose.rotation, -pose.translation))
+    off = pose_difference(without.dome_from_target, lost.dome_from_target, view.middle)
+    assert off @ np.linalg.solve(without.covariance, off) < 0.05**2
+
+
 def test_too_few_points_are_refused() -> None:
     camera, rng = CAMERAS["bare"], np.random.default_rng(4)
     view = see(camera, _placed(camera, BOARD, rng), BOARD, rng, at_most=3)

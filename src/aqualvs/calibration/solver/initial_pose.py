@@ -73,9 +73,14 @@ class TargetPose:
 
 
 def target_pose(
-    camera: Camera, view: View, *, sigma_px: float = 0.1, max_rms_px: float = MAX_RMS_PX
+    camera: Camera,
+    view: View,
+    *,
+    start: SE3 | None = None,
+    sigma_px: float = 0.1,
+    max_rms_px: float = MAX_RMS_PX,
 ) -> TargetPose:
-    """Find the pose of a target without an initial guess.
+    """Find the pose of a target, by default without an initial guess.
 
     Parameters
     ----------
@@ -83,6 +88,8 @@ def target_pose(
         Bare or behind a dome, looking into the medium of the picture.
     view : View
         At least four points that are not on one line; up to about a third may be wrong.
+    start : SE3, optional
+        Pose to begin from, where it is known roughly: no other is tried unless it fails.
     sigma_px : float
         Nominal noise of a corner; counts if a view has few points.
     max_rms_px : float
@@ -95,11 +102,12 @@ def target_pose(
     """
     rays = camera.rays(view.pixels)
     _check(view, rays)
-    best, rival = _best_two(camera, view, closed_form_poses(view, rays), sigma_px)
+    starts = closed_form_poses(view, rays) if start is None else iter([start])
+    best, rival = _best_two(camera, view, starts, sigma_px)
     if best is None or _doubtful(best, sigma_px, max_rms_px):
-        start = _start_despite_outliers(camera, view, rays)
-        if start is not None:
-            again, second = _best_two(camera, view, iter([start]), sigma_px)
+        robust = _start_despite_outliers(camera, view, rays)
+        if robust is not None:
+            again, second = _best_two(camera, view, iter([robust]), sigma_px)
             if again is not None and (best is None or _better(again, best)):
                 best, rival = again, second
     if best is None or _rms_px(best, sigma_px) > max_rms_px or _believed(best) < _POSE.min_points:
