@@ -99,36 +99,27 @@ def near(season, tmp_path_factory):
     return results(out)
 
 
-def test_workers_of_a_scheduler_give_what_those_of_this_machine_give(
-    scheduler, season, near, tmp_path, capsys
+def test_workers_may_come_and_go_and_give_what_those_of_this_machine_give(
+    scheduler, season, near, tmp_path
 ):
     address, worker = scheduler
-    worker("one")
-    worker("two")
-    assert batch(season, tmp_path / "far", "--scheduler", address) == 0
-    assert "2 finished" in capsys.readouterr().out
-    far = results(tmp_path / "far")
-    assert [name for name in near if far[name] != near[name]] == []
-
-
-def test_a_worker_may_go_and_another_come(scheduler, season, near, tmp_path):
-    address, worker = scheduler
     first = worker("one")
-    out = tmp_path / "out"
+    worker("two")
+    out, said = tmp_path / "out", tmp_path / "said.txt"
     command = [sys.executable, "-m", "aqualvs", "batch", str(season), "-o", str(out)]
     command += ["--no-report", "--net", "--scheduler", address]
     with begun(command, tmp_path) as process:
         deadline = time.monotonic() + TIMEOUT_S
         while not list((out / ".batch" / "dives").glob("*/survey")):
             assert time.monotonic() < deadline
-            assert process.poll() is None, (tmp_path / "said.txt").read_text()
+            assert process.poll() is None, said.read_text()
             time.sleep(0.02)
         os.kill(first.pid, signal.SIGKILL)
-        worker("two")
-        assert process.wait(timeout=TIMEOUT_S) == 0, (tmp_path / "said.txt").read_text()
-    assert "2 finished" in (tmp_path / "said.txt").read_text()
-    found = results(out)
-    assert [name for name in near if found[name] != near[name]] == []
+        worker("three")
+        assert process.wait(timeout=TIMEOUT_S) == 0, said.read_text()
+    assert "2 finished" in said.read_text()
+    far = results(out)
+    assert [name for name in near if far[name] != near[name]] == []
 
 
 def test_a_scheduler_without_workers_is_said(scheduler, season, tmp_path, capsys):

@@ -164,6 +164,16 @@ def test_exact_data_are_solved_exactly() -> None:
     np.testing.assert_allclose(found.state, [2.0, 3.0], atol=1e-8)
 
 
+def test_a_minimum_that_rounding_ends_is_one() -> None:
+    """Steps that no longer lower the cost are short at any damping, and say nothing of it."""
+    for seed in range(40):
+        x, y = _line(seed, 0.0)
+        found = solve(Linear((x,), (y + 0.1 * x[:, None] ** 2,)), np.array([2.0, 3.0]))
+        assert found.converged
+        # Some ten steps, and once in a while ten shorter ones that rounding asks for.
+        assert found.n_iterations < 40
+
+
 @settings(max_examples=50)
 @given(st.sampled_from(list(RobustLoss)), st.floats(0.0, 100.0))
 def test_weights_are_slopes_of_the_losses(loss: RobustLoss, length: float) -> None:

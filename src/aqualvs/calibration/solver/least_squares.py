@@ -285,7 +285,8 @@ class _DescentOptions(NamedTuple):
     damping_start: float = 1e-4
     damping_least: float = 1e-12
     damping_limit: float = 1e10
-    free: float = 1e-3
+    # Damping up to which a step is almost Newton's.
+    free: float = 1e-2
     # Convergence: steps shorter than this, in sigmas, or a relative decrease of the cost below
     # rounding. The noise can be estimated before that.
     small_step: float = 2e-2
@@ -430,17 +431,24 @@ class _Run(Generic[State]):
     def descend(self, small_step: float) -> None:
         """Iterate towards the minimum at the present scales and inliers, until steps are small."""
         self.converged = not self.problem.n_parameters
+        # Where an earlier descent ended, rounding may have raised it.
+        self.damping = min(self.damping, _DESCENT.damping_start)
         here = self._cost(self.blocks)
         max_iterations = 60
         for _ in range(max_iterations):
             if self.converged:
                 return
             equations = self._equations()
-            there, step = self._lower(equations, here)
-            in_sigmas = float(np.sqrt(step @ equations.information @ step))
-            little = here - there <= _DESCENT.small_fall * here and in_sigmas < 1.0
             # A damped step is always short: it is no sign of convergence.
             free = self.damping <= _DESCENT.free
+            step = self._damped_step(equations)
+            in_sigmas = float(np.sqrt(step @ equations.information @ step))
+            there = self._lower(equations, step, here)
+            if there is None:
+                # No decrease beyond rounding: the remaining gradient means nothing.
+                self.damping, self.converged = _DESCENT.damping_start, True
+                return
+            little = here - there <= _DESCENT.small_fall * here and in_sigmas < 1.0
             self.converged = free and (in_sigmas < small_step or little)
             here = there
 
@@ -474,22 +482,26 @@ class _Run(Generic[State]):
             n_iterations=self.n_iterations,
         )
 
-    def _lower(self, equations: NormalEquations, here: float) -> tuple[float, FloatArray]:
-        """Take the longest step that lowers the cost; return the cost there and the step."""
+    def _damped_step(self, equations: NormalEquations) -> FloatArray:
         diagonal = np.diag(equations.information)
+        damped = equations.information + np.diag(self.damping * diagonal)
+        return _solve(damped, -equations.gradient)
+
+    def _lower(self, equations: NormalEquations, step: FloatArray, here: float) -> float | None:
+        """Take the step, or a shorter one that does not raise the cost; return the cost there.
+
+        None if there is no such step.
+        """
         while self.damping < _DESCENT.damping_limit:
             self.n_iterations += 1
-            damped = equations.information + np.diag(self.damping * diagonal)
-            step = _solve(damped, -equations.gradient)
             trial = self._try(step)
             if trial is not None and trial[2] <= here:
                 self.state, self.blocks, there = trial
                 self.damping = max(self.damping * 0.1, _DESCENT.damping_least)
-                return there, step
+                return there
             self.damping *= 10.0
-        # No decrease beyond rounding: the remaining gradient means nothing.
-        self.damping = _DESCENT.damping_start
-        return here, np.zeros(self.problem.n_parameters)
+            step = self._damped_step(equations)
+        return None
 
     def _try(self, step: FloatArray) -> tuple[State, tuple[Block, ...], float] | None:
         try:
