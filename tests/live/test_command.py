@@ -352,9 +352,9 @@ def test_a_video_that_is_cut_short_is_told_in_one_line(rig_file: Path, tmp_path:
 def test_memory_and_handles_stay_flat_over_a_long_run(tmp_path: Path) -> None:
     """As fast as they go, every frame through every cheap output, JSON and recorder included.
 
-    1000 frames; AQUALVS_SOAK_FRAMES=90000 makes it an hour of a stream of 25 frames a second.
+    600 frames; AQUALVS_SOAK_FRAMES=90000 makes it an hour of a stream of 25 frames a second.
     """
-    n_frames = int(os.environ.get("AQUALVS_SOAK_FRAMES", "1000"))
+    n_frames = int(os.environ.get("AQUALVS_SOAK_FRAMES", "600"))
     from aqualvs.control.time_filter import PostureFilter
     from aqualvs.live.outputs.udp_json import UdpJsonOutput
     from aqualvs.live.runner import LiveOptions, LiveRunner, ScannerSupply
