@@ -128,6 +128,10 @@ class Strand(NamedTuple):
     growth: float  # Thickness of the growth there, as a fraction of the twine's radius.
 
 
+NO_STRAND = Strand(np.inf, (0.0, 0.0, 0.0), 0.0, 0.0, 0.0)
+"""That of a ray that meets none."""
+
+
 def pack_net(net: Net, dome_from_scene: SE3) -> FloatArray:
     """Return one row of the net table, shape (N_COLUMNS,), everything in `dome`."""
     row = np.zeros(NET_COLUMNS)
@@ -377,7 +381,7 @@ def meet_net(
     o: Vec, d: Vec, nets: FloatArray, i: int, holes: FloatArray, folds: FloatArray, tiles: Tiles
 ) -> Strand:
     """Return the first strand of net i that a ray meets."""
-    found = Strand(np.inf, (0.0, 0.0, 0.0), 0.0, 0.0, 0.0)
+    found = NO_STRAND
     t = 0.0
     # Greatest number of layers of a folded net along a ray.
     max_layers = 5
@@ -403,7 +407,7 @@ def _meet_layer(
     tiles: Tiles,
 ) -> Strand:
     """Return the first strand that a ray meets where it crosses the net at `t`."""
-    best = Strand(np.inf, (0.0, 0.0, 0.0), 0.0, 0.0, 0.0)
+    best = NO_STRAND
     eu, ev, out = row3(nets, i, AXIS_U), row3(nets, i, AXIS_V), row3(nets, i, NORMAL)
     rel = minus(along(o, d, t), row3(nets, i, ORIGIN))
     u, v = dot(rel, eu), dot(rel, ev)
