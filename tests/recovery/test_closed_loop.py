@@ -6,7 +6,7 @@ rendered pictures at full length.
 
 import math
 import os
-from functools import cache, partial
+from functools import cache
 
 import numpy as np
 import pytest
@@ -28,7 +28,7 @@ from aqualvs.follow.case import (
 )
 from aqualvs.follow.log import effort_measures, hold_measures, step_measures
 from aqualvs.follow.sensor_model import SampledSensor
-from aqualvs.simulation.render import Renderer
+from quick_pictures import QuickRenderer
 from whole import WHOLE
 
 N_RUNS = int(os.environ.get("AQUALVS_LOOP_RUNS", "0"))
@@ -153,10 +153,10 @@ def test_a_rendered_loop_takes_hold(name: str, monkeypatch: pytest.MonkeyPatch) 
     """Through pictures and scanner: hold for some seconds, or for as long as it is judged by."""
     if not RENDERED:
         # Rendering is most of the time, and the pictures of both vehicles are alike.
-        monkeypatch.setattr(sensor_model, "Renderer", partial(Renderer, samples=1))
+        monkeypatch.setattr(sensor_model, "Renderer", QuickRenderer)
     run = trials(name, 1, rendered=True)
     if not RENDERED:
-        log = run.begin(2.0 if name == "bluerov2" else 0.8)
+        log = run.begin(1.4 if name == "bluerov2" else 0.8)
         error = log.column("range") - RANGE
         # From rest in the current: pushed off by less than 0.1 m, and seen in every frame.
         assert np.abs(error).max() < 0.1
