@@ -16,6 +16,7 @@ from aqualvs.simulation import dive
 from aqualvs.simulation.render import Renderer
 from camera_cases import half_size_rig
 from dome_cases import leave_bare_lenses_out
+from whole import WHOLE
 
 N_FRAMES = 5
 # Bars for full pictures and whole dives; all others are reached by these, too.
@@ -69,6 +70,8 @@ def brief_loops(monkeypatch):
 @pytest.fixture
 def few_waters(monkeypatch):
     """The freshest water, a middle one and the saltiest; three places of the lens."""
+    if WHOLE:
+        return
     few = water_index.WATERS[:1] + water_index.WATERS[3::2]
     monkeypatch.setattr(water_index, "cruise", partial(water_index.cruise, waters=few))
     few_mm = (0.0, 4.0, 41.7)
