@@ -2,13 +2,14 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cache
 from typing import TypeAlias
 
 import numpy as np
 import pytest
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray
-from aqualvs.geometry.planes import Plane
+from aqualvs.geometry.planes import Plane, Rays
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.sheet import sheets_of
 from aqualvs.scanner import Scanner, ScannerOptions
@@ -52,20 +53,28 @@ def upright_strands(points: FloatArray) -> BoolArray:
     return twine
 
 
+@cache
+def rays_of(size_px: tuple[int, int]) -> Rays:
+    """Rays of all pixels; the rigs with pictures of one size differ in their lasers alone."""
+    (rig,) = (one for one in (example_rig(), bluerov2_rig()) if one.size_px == size_px)
+    columns, rows = map(np.arange, size_px)
+    return rig.camera().rays(np.stack(np.meshgrid(columns, rows), axis=-1))
+
+
 def light_on(rig: Rig, targets: Sequence[tuple[Plane, Lit]], lasers: Sequence[int]) -> FloatArray:
     """Light of the lasers on the first target that each pixel meets, nearest first."""
-    width, height = rig.size_px
-    rays = rig.camera().rays(np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1))
-    light = np.zeros((height, width))
-    open_ = np.ones((height, width), np.bool_)
+    rays, sheets = rays_of(rig.size_px), sheets_of(rig)
+    light = np.zeros(rig.size_px[::-1])
+    open_ = np.ones(light.shape, np.bool_)
     for target, lit in targets:
         points, valid = target.intersect(rays)
         points = np.where(valid[..., None], points, 0.0)
         here = open_ & valid & lit(points)
         open_ &= ~here
-        px_per_m = max(rig.lens.fx, rig.lens.fy) / np.linalg.norm(points[here], axis=-1)
+        met = points[here]
+        px_per_m = max(rig.lens.fx, rig.lens.fy) / np.sqrt(np.einsum("ij,ij->i", met, met))
         for i in lasers:
-            off = sheets_of(rig)[i].signed_distance(points[here]) * px_per_m
+            off = sheets[i].signed_distance(met) * px_per_m
             light[here] += 130.0 * np.exp(-0.5 * (off / SIGMA_PX) ** 2)
     return light
 

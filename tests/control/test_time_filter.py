@@ -13,6 +13,7 @@ from aqualvs.control.time_filter import FilteredPosture, PostureFilter, PostureF
 from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.scanning.posture import Posture, Reason, Refusal
+from whole import WHOLE
 
 NOTHING = Refusal(Reason.NO_STRIPES)
 # As dives show it: 1 mm, 0.3 and 0.2 degrees, range and yaw correlated.
@@ -94,7 +95,7 @@ def test_covariance_is_that_of_the_errors() -> None:
     rng = np.random.default_rng(1)
     # The gate would cut the tail that the statistic counts.
     options = PostureFilterOptions(gate_probability=1.0 - 1e-12)
-    n_runs, errors = 200, []
+    n_runs, errors = 200 if WHOLE else 60, []
     for _ in range(n_runs):
         motion = dive(rng, options)
         found = run(PostureFilter(options), motion)

@@ -5,7 +5,7 @@ from functools import cached_property, partial, partialmethod
 
 import pytest
 
-from aqualvs.experiments import ablation_stages, growth_and_sun, page, sea
+from aqualvs.experiments import ablation_stages, growth_and_sun, page, sea, water_index
 from aqualvs.experiments.experiment import MODULES, experiment
 from aqualvs.experiments.laboratory import Laboratory
 from aqualvs.experiments.page import save_outcome
@@ -16,6 +16,7 @@ from aqualvs.simulation import dive
 from aqualvs.simulation.render import Renderer
 from camera_cases import half_size_rig
 from dome_cases import leave_bare_lenses_out
+from whole import WHOLE
 
 N_FRAMES = 5
 # Bars for full pictures and whole dives; all others are reached by these, too.
@@ -66,9 +67,20 @@ def brief_loops(monkeypatch):
     monkeypatch.setattr(sea, "_SETUP", sea._SETUP._replace(every=50))
 
 
+@pytest.fixture
+def few_waters(monkeypatch):
+    """The freshest water, a middle one and the saltiest; three places of the lens."""
+    if WHOLE:
+        return
+    few = water_index.WATERS[:1] + water_index.WATERS[3::2]
+    monkeypatch.setattr(water_index, "cruise", partial(water_index.cruise, waters=few))
+    few_mm = (0.0, 4.0, 41.7)
+    monkeypatch.setattr(water_index, "decentred", partial(water_index.decentred, lens_mm=few_mm))
+
+
 @pytest.mark.parametrize("name", MODULES)
 def test_an_experiment_gives_its_results(
-    laboratory, plain_figures, brief_loops, tmp_path, monkeypatch, name
+    laboratory, plain_figures, brief_loops, few_waters, tmp_path, monkeypatch, name
 ):
     monkeypatch.setattr(growth_and_sun, "_SHOWN", N_FRAMES // 2)
     # Every fourth set of parameters that is tried.

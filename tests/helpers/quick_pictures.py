@@ -9,8 +9,9 @@ from aqualvs.geometry.arrays import BoolArray
 from aqualvs.optics.rig import Rig
 from aqualvs.scanner import Scanner
 from aqualvs.scanning.scan import Scan
+from aqualvs.simulation.cameras import IDEAL, SimulatedCamera
 from aqualvs.simulation.lasers import NORMAL
-from aqualvs.simulation.render import RenderedFrame, Renderer
+from aqualvs.simulation.render import RenderedFrame, Renderer, SceneAt
 from aqualvs.simulation.scene import Scene
 from aqualvs.simulation.surfaces import pack_surfaces
 from aqualvs.simulation.truth import beams_of, cast
@@ -35,11 +36,18 @@ class QuickRenderer:
         The sides of its pictures must be divisible by three.
     halo_px : int
         Width of what is traced around a pixel that shows where a sheet meets a surface.
+    threads : int
+        As of a `Renderer`.
+    camera : SimulatedCamera
+        As of a `Renderer`.
     """
 
-    def __init__(self, rig: Rig, halo_px: int = 11) -> None:
+    def __init__(
+        self, rig: Rig, halo_px: int = 11, *, threads: int = 1, camera: SimulatedCamera = IDEAL
+    ) -> None:
         self.rig, self._halo = rig, np.ones((halo_px, halo_px), np.uint8)
-        self._full, self._coarse = Renderer(rig), Renderer(_coarse(rig), samples=1)
+        self._full = Renderer(rig, threads=threads, camera=camera)
+        self._coarse = Renderer(_coarse(rig), samples=1, camera=camera)
         self._beams = beams_of(rig, self._full.sources)
 
     def render(self, scene: Scene, t: float, rng: np.random.Generator) -> RenderedFrame:
@@ -50,9 +58,14 @@ class QuickRenderer:
         dim = cv2.resize(
             self._coarse.radiance(plain, t), self.rig.size_px, interpolation=cv2.INTER_LINEAR
         )
-        light[~lit] += dim[~lit]
+        light += np.where(lit[..., None], np.float32(0.0), dim)
         image = self._full.camera.picture(light, scene.water, scene.sensor, t, rng)
         return RenderedFrame(image, self._full.lit_points(scene, t))
+
+    def take(self, scene_at: SceneAt, t: float, rng: np.random.Generator) -> RenderedFrame:
+        """Return the picture at time `t` and its truth, as `Renderer.take` of a global shutter."""
+        assert self.rig.shutter.instant
+        return self.render(scene_at(t), t, rng)
 
     def lit(self, scene: Scene, t: float) -> BoolArray:
         """Mark the pixels (height, width) that can show what the lasers' sheets meet."""

@@ -34,18 +34,23 @@ CROP = (100, 60, 1400, 1070)
 FORMATS = wall.FORMATS if WHOLE else ("png", "jpg80", "crf28")
 
 
+@cache
+def board_of(picture: str) -> wall.BoardPose:
+    """Posture of the chessboard in one of the repository's photographs."""
+    return wall.board_pose(cv2.imread(str(PHOTOGRAPHS / f"{picture}.jpg")), wall.intrinsics(CROP))
+
+
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory) -> dict[tuple[str, str], Any]:
     """The repository's photographs in all formats, by the rig that is stored beside them."""
     results = {}
     for picture in PICTURES:
         image = cv2.imread(str(PHOTOGRAPHS / f"{picture}.jpg"))
-        board = wall.board_pose(image, wall.intrinsics(CROP))
         folder = tmp_path_factory.mktemp(picture)
         for fmt in FORMATS:
             source = wall.make_source(image, folder, fmt)
             rows = wall.measure(source, PHOTOGRAPHS / "rig.yaml", folder / f"out_{fmt}")
-            results[picture, fmt] = wall.compare(picture, fmt, rows, board)
+            results[picture, fmt] = wall.compare(picture, fmt, rows, board_of(picture))
     return results
 
 
@@ -84,11 +89,10 @@ def test_compression_moves_a_posture_little(measured, picture: str, fmt: str) ->
 def test_a_camera_may_sharpen_until_the_wall_between_lines_stands_out(tmp_path, picture) -> None:
     """Sharpening darkens the flanks of lines; thousands of wide specks of wall lie between them."""
     image = cv2.imread(str(PHOTOGRAPHS / f"{picture}.jpg"))
-    board = wall.board_pose(image, wall.intrinsics(CROP))
     sharp = cv2.addWeighted(image, 2.5, cv2.GaussianBlur(image, (0, 0), 3.0), -1.5, 0.0)
     source = wall.make_source(sharp, tmp_path, "png")
     rows = wall.measure(source, PHOTOGRAPHS / "rig.yaml", tmp_path / "out")
-    result = wall.compare(picture, "png", rows, board)
+    result = wall.compare(picture, "png", rows, board_of(picture))
     assert result.valid, result.reason
     assert abs(result.range_error_mm) < 10.0
 

@@ -29,6 +29,8 @@ from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenarios import example_rig, load_scenario
 from aqualvs.sources import open_source
 from camera_cases import REAL
+from quick_pictures import QuickRenderer
+from whole import WHOLE
 
 _TRUTH = ("visible_fit_range_mm", "visible_fit_pitch_deg", "visible_fit_yaw_deg")
 # Three frames over each dive of four seconds: a wall at 600 mm that turns, a net at 350 to 515 mm.
@@ -49,7 +51,10 @@ def measured(dive: str, camera: str, pixels: float = 1.0) -> FrameResult:
     """Measure a dive with the example rig, or with one of fewer pixels each way."""
     rig = _scaled(example_rig(), pixels)
     scenario = replace(load_scenario(dive), fps=_FPS[dive])
-    with TemporaryDirectory() as folder:
+    with TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
+        if not WHOLE:
+            # All light as it is; what it does not reach is coarse.
+            patch.setattr(dive_of, "Renderer", QuickRenderer)
         files = simulate_dive(
             scenario, rig, Path(folder), camera=simulated_camera(camera), threads=2
         )

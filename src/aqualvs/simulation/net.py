@@ -107,10 +107,12 @@ _TWINE = _TwineLook()
 class _FoldSteps(NamedTuple):
     """Search along a ray for a folded net."""
 
-    # Least step along a ray towards a folded net, and number of bisections of the last step.
+    # Least step along a ray towards a folded net, and number of bisections of the last step, and of
+    # the secants that guess where they end.
     step: float = 1e-3
     max_steps: int = 200
     halvings: int = 16
+    secants: int = 3
 
 
 _STEPS = _FoldSteps()
@@ -124,6 +126,10 @@ class Strand(NamedTuple):
     along: float  # Position along the strand, in metres.
     across: float  # Lateral position on the strand, -1 to 1 of its radius.
     growth: float  # Thickness of the growth there, as a fraction of the twine's radius.
+
+
+NO_STRAND = Strand(np.inf, (0.0, 0.0, 0.0), 0.0, 0.0, 0.0)
+"""That of a ray that meets none."""
 
 
 def pack_net(net: Net, dome_from_scene: SE3) -> FloatArray:
@@ -209,7 +215,7 @@ def _next_crossing(
         step = max(share * abs(side), _STEPS.step)
         now = _behind(o, d, t + step, nets, i, folds)
         if side * now <= 0.0:
-            return _halved(o, d, t, t + step, side, nets, i, folds)
+            return _halved(o, d, t, t + step, side, now, nets, i, folds)
         t, side = t + step, now
     return np.inf
 
@@ -221,11 +227,27 @@ def _halved(
     before: float,
     after: float,
     side: float,
+    other: float,
     nets: FloatArray,
     i: int,
     folds: FloatArray,
 ) -> float:
-    """Return by bisection where a ray changes sides of the net between two places."""
+    """Return by bisection where a ray changes sides of the net between two places.
+
+    Bisection follows a secant's guess. Where the two places that it ends with lie on either side
+    of the net, they are those that it finds on its own.
+    """
+    guess = _guessed(o, d, before, after, side, other, nets, i, folds)
+    low, high = before, after
+    for _ in range(_STEPS.halvings):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if middle < guess else (low, middle)
+    if (
+        side * _behind(o, d, low, nets, i, folds)
+        > 0.0
+        >= side * _behind(o, d, high, nets, i, folds)
+    ):
+        return high
     for _ in range(_STEPS.halvings):
         middle = 0.5 * (before + after)
         if side * _behind(o, d, middle, nets, i, folds) > 0.0:
@@ -233,6 +255,32 @@ def _halved(
         else:
             after = middle
     return after
+
+
+@inline_borrowing_kernel
+def _guessed(
+    o: Vec,
+    d: Vec,
+    before: float,
+    after: float,
+    side: float,
+    other: float,
+    nets: FloatArray,
+    i: int,
+    folds: FloatArray,
+) -> float:
+    """Return by secants where a ray changes sides, from its distances behind the net."""
+    middle = before
+    for _ in range(_STEPS.secants):
+        if side == other:
+            break
+        middle = before + (after - before) * side / (side - other)
+        now = _behind(o, d, middle, nets, i, folds)
+        # The two latest places are kept.
+        before, side, after, other = after, other, middle, now
+    if side == other:
+        return middle
+    return before + (after - before) * side / (side - other)
 
 
 @inline_borrowing_kernel
@@ -333,7 +381,7 @@ def meet_net(
     o: Vec, d: Vec, nets: FloatArray, i: int, holes: FloatArray, folds: FloatArray, tiles: Tiles
 ) -> Strand:
     """Return the first strand of net i that a ray meets."""
-    found = Strand(np.inf, (0.0, 0.0, 0.0), 0.0, 0.0, 0.0)
+    found = NO_STRAND
     t = 0.0
     # Greatest number of layers of a folded net along a ray.
     max_layers = 5
@@ -359,7 +407,7 @@ def _meet_layer(
     tiles: Tiles,
 ) -> Strand:
     """Return the first strand that a ray meets where it crosses the net at `t`."""
-    best = Strand(np.inf, (0.0, 0.0, 0.0), 0.0, 0.0, 0.0)
+    best = NO_STRAND
     eu, ev, out = row3(nets, i, AXIS_U), row3(nets, i, AXIS_V), row3(nets, i, NORMAL)
     rel = minus(along(o, d, t), row3(nets, i, ORIGIN))
     u, v = dot(rel, eu), dot(rel, ev)

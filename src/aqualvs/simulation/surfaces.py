@@ -10,7 +10,7 @@ from aqualvs.geometry.linear_algebra import Vec, along, combine, dot, minus, row
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
 from aqualvs.simulation.net import FOLD_COLUMNS as FOLD_COLUMNS
 from aqualvs.simulation.net import NET_COLUMNS as NET_COLUMNS
-from aqualvs.simulation.net import meet_net, pack_fold, pack_net, strand_albedo
+from aqualvs.simulation.net import NO_STRAND, Strand, meet_net, pack_fold, pack_net, strand_albedo
 from aqualvs.simulation.scene import Box, Fish, Scene, Wall
 from aqualvs.simulation.textures import Tiles, noise_tiles, sample
 
@@ -54,6 +54,7 @@ class Hit(NamedTuple):
     # Unit normal towards the ray's origin; only set for nets and boxes, whose intersection gives
     # it.
     normal: Vec
+    strand: Strand  # Where the surface is a net.
 
 
 def pack_surfaces(scene: Scene, t: float) -> Surfaces:
@@ -187,7 +188,7 @@ def meet_box(o: Vec, d: Vec, boxes: FloatArray, i: int) -> tuple[float, Vec]:
 @inline_borrowing_kernel
 def first_hit(o: Vec, d: Vec, s: Surfaces, members: IntArray, first: int, last: int) -> Hit:
     """Return the first opaque surface on a ray, with the ellipsoids members[first:last]."""
-    t, kind, index, normal = np.inf, NONE, 0, (0.0, 0.0, 0.0)
+    t, kind, index, normal, met = np.inf, NONE, 0, (0.0, 0.0, 0.0), NO_STRAND
     for i in range(s.walls.shape[0]):
         reach = meet_wall(o, d, s.walls, i)
         if reach < t:
@@ -195,7 +196,7 @@ def first_hit(o: Vec, d: Vec, s: Surfaces, members: IntArray, first: int, last: 
     for i in range(s.nets.shape[0]):
         strand = meet_net(o, d, s.nets, i, s.holes, s.folds, s.tiles)
         if strand.t < t:
-            t, kind, index, normal = strand.t, NET, i, strand.normal
+            t, kind, index, normal, met = strand.t, NET, i, strand.normal, strand
     for i in range(s.boxes.shape[0]):
         reach, face = meet_box(o, d, s.boxes, i)
         if reach < t:
@@ -205,7 +206,7 @@ def first_hit(o: Vec, d: Vec, s: Surfaces, members: IntArray, first: int, last: 
         reach = meet_ellipsoid(o, d, s.ellipsoids, i)
         if reach < t:
             t, kind, index = reach, FISH, i
-    return Hit(t, kind, index, normal)
+    return Hit(t, kind, index, normal, met)
 
 
 @inline_borrowing_kernel
@@ -232,8 +233,7 @@ def normal_and_albedo(o: Vec, d: Vec, hit: Hit, s: Surfaces) -> tuple[Vec, Vec]:
         facing = -1.0 if dot(normal, d) > 0.0 else 1.0
         return scaled(normal, facing), _wall_albedo(along(o, d, hit.t), s.walls, hit.row, s.tiles)
     if hit.kind == NET:
-        strand = meet_net(o, d, s.nets, hit.row, s.holes, s.folds, s.tiles)
-        return hit.normal, strand_albedo(strand, s.nets, hit.row, s.tiles)
+        return hit.normal, strand_albedo(hit.strand, s.nets, hit.row, s.tiles)
     if hit.kind == FISH:
         return _fish_skin(along(o, d, hit.t), s.ellipsoids, hit.row, s.tiles)
     p = along(o, d, hit.t)
