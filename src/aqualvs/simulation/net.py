@@ -234,8 +234,8 @@ def _halved(
 ) -> float:
     """Return by bisection where a ray changes sides of the net between two places.
 
-    Bisection follows a secant's guess. Where the two places that it ends with lie on either side
-    of the net, they are those that it finds on its own.
+    Bisection follows a guess, which saves most heights of the net; it is done in full where the
+    two places that it ends with do not lie on either side of the net.
     """
     guess = _guessed(o, d, before, after, side, other, nets, i, folds)
     low, high = before, after
