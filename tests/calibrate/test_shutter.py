@@ -16,9 +16,10 @@ from aqualvs.simulation.scenario import dome_from_target
 from aqualvs.simulation.scenarios import example_rig
 from aqualvs.simulation.scene import Scene, Wall
 from aqualvs.sources.images import ImageSource
+from whole import WHOLE
 
 FPS = 25.0
-N = 80
+N = 80 if WHOLE else 64
 
 
 def rig_with(shutter):

@@ -32,8 +32,9 @@ from aqualvs.simulation.truth import visible_fit
 from quick_pictures import QuickRenderer
 from whole import WHOLE
 
-# More than a rig has numbers.
-N_DRAWS = 60 if WHOLE else 40
+# More than a rig has numbers; more of a net, whose posture follows them less evenly.
+N_DRAWS = 60 if WHOLE else 27
+N_OF_NET = 60 if WHOLE else 40
 WINDOW = Window(Plane.from_normal([-0.3, 0.95, 0.1], 0.05), np.array([-0.15, 0.0, 0.0]))
 
 
@@ -101,18 +102,22 @@ def test_the_jacobian_is_that_of_the_whole_scanner(rig: Rig) -> None:
 
 
 @pytest.mark.parametrize(
-    ("rig", "scenario"),
-    [(example_rig(), "wall_yaw"), (example_rig(), "net_diamond"), (bluerov2_rig(), "wall_yaw")],
+    ("rig", "scenario", "n_draws"),
+    [
+        (example_rig(), "wall_yaw", N_DRAWS),
+        (example_rig(), "net_diamond", N_OF_NET),
+        (bluerov2_rig(), "wall_yaw", N_DRAWS),
+    ],
     ids=["wall", "net", "wide"],
 )
-def test_errors_over_the_total_sigma_are_of_size_one(rig: Rig, scenario: str) -> None:
+def test_errors_over_the_total_sigma_are_of_size_one(rig: Rig, scenario: str, n_draws: int) -> None:
     """Rigs drawn from the covariance measure what the true rig has seen."""
     uncertainty, rng = calibrated(rig), np.random.default_rng(1)
     times = (0.5, 1.5, 2.5)
     views = [seen(rig.name, scenario, t) for t in times]
     sigma = np.array([*uncertainty.sigmas.values()])
     # Draws whose own second moments are exactly those of the covariance: fewer do.
-    draws = np.linalg.qr(rng.normal(size=(N_DRAWS, len(sigma))))[0] * np.sqrt(N_DRAWS)
+    draws = np.linalg.qr(rng.normal(size=(n_draws, len(sigma))))[0] * np.sqrt(n_draws)
     z = []
     for draw in draws:
         moved = rig_moved_by(rig, uncertainty.names, sigma * draw)

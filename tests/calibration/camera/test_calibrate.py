@@ -14,6 +14,7 @@ from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
 from aqualvs.optics.camera import BareCamera
 from aqualvs.optics.lens import Lens, LensModel
 from dome_cases import board_points, see
+from whole import WHOLE
 
 SIZE = (720, 576)
 FOUR = (-0.126, 0.0827, 6.2e-4, -4.5e-4)
@@ -66,12 +67,12 @@ def _normalised(found: CameraCalibration, true: Lens) -> np.ndarray:
 
 def test_recovers_the_intrinsics_and_their_uncertainty() -> None:
     errors, noise = [], []
-    for seed in range(8):
+    for seed in range(8 if WHOLE else 5):
         found = camera(_shots(seed=seed), SIZE)
         assert len(found.lens.distortion) == 4
         errors.append(_normalised(found, LENS))
         noise.append(found.noise_px)
-    # 64 normalised errors, correlated in places: 1 ± 0.12.
+    # 40 normalised errors, correlated in places: 1 ± 0.15.
     assert 0.7 < np.sqrt(np.mean(np.square(errors))) < 1.35
     assert np.mean(noise) == pytest.approx(0.1, rel=0.04)
 
@@ -114,7 +115,7 @@ def test_superfluous_coefficients_promise_nothing(distortion: tuple[float, ...])
 def test_takes_the_rational_model_for_a_wide_lens() -> None:
     rational = (5.2, 1.9, 1e-4, -2e-4, 0.03, 5.5, 3.4, 0.36)
     true = Lens(fx=330.0, fy=332.0, cx=362.0, cy=290.0, distortion=rational)
-    found = camera(_shots(true, seed=1, n=20, noise_px=0.05, distance=(0.1, 0.25)), SIZE)
+    found = camera(_shots(true, seed=1, noise_px=0.05, distance=(0.1, 0.25)), SIZE)
     assert len(found.lens.distortion) == 8
     assert found.noise_px == pytest.approx(0.05, rel=0.1)
 

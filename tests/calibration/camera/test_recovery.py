@@ -120,9 +120,13 @@ def test_few_views_promise_no_more_than_they_hold() -> None:
     assert _rms(errors) < 1.4
 
 
-@pytest.mark.parametrize(
-    "bend", [(0.9e-3, 0.2e-3, -0.4e-3, 0.0), (-0.2e-3, 0.1e-3, 0.0, 1e-3), (0.2e-3, 0.0, 0.0, 0.0)]
-)
+# One of third degree, and a slight one.
+BENDS = [(-0.2e-3, 0.1e-3, 0.0, 1e-3), (0.2e-3, 0.0, 0.0, 0.0)]
+if WHOLE:
+    BENDS.append((0.9e-3, 0.2e-3, -0.4e-3, 0.0))
+
+
+@pytest.mark.parametrize("bend", BENDS)
 def test_a_bent_board_is_recognised_and_solved_for(bend: tuple[float, ...]) -> None:
     bent = _bent(np.array(bend))
     plane = np.column_stack([bent[:, :2], np.ones(len(bent))])
@@ -141,7 +145,7 @@ def test_a_bent_board_is_recognised_and_solved_for(bend: tuple[float, ...]) -> N
 
 def test_a_flat_board_is_left_flat() -> None:
     """Also where views share errors, which a bend that is common to all could seem to explain."""
-    for seed in range(5 if WHOLE else 3):
+    for seed in range(5 if WHOLE else 2):
         for shoot in (_clean, _moved):
             found = camera(shoot(seed), SIZE)
             assert found.bend_height == 0.0

@@ -27,6 +27,7 @@ from dome_cases import (
     normalised_errors,
     rail,
 )
+from whole import WHOLE
 
 PAPER = example_rig()
 QUICK = DomeOptions(check_cross_validation=False)
@@ -47,10 +48,21 @@ def _rail(kind: str = "distance", rig: Rig = PAPER, n: float = AIR, seed: int = 
     return rail(rig, n, kind, np.random.default_rng(seed))
 
 
+# What is given of the boards, and how far the lens may be off, mm.
+GIVEN = [("exact", 0.1), ("distance", 0.6), ("unknown", 1.5)]
+RIGS = [PAPER, bluerov2_rig()]
+
+
 @pytest.mark.parametrize(
-    ("kind", "limit_mm"), [("exact", 0.1), ("distance", 0.6), ("unknown", 1.5)]
+    ("kind", "limit_mm", "rig"),
+    [
+        (*given, rig)
+        for i, given in enumerate(GIVEN)
+        for k, rig in enumerate(RIGS)
+        # Rigs in turn: what is given matters more than who is asked.
+        if WHOLE or i % 2 == k
+    ],
 )
-@pytest.mark.parametrize("rig", [PAPER, bluerov2_rig()])
 def test_finds_lens_and_rotation(kind: str, limit_mm: float, rig: Rig) -> None:
     shoot = _rail(kind, rig)
     found = _solve([shoot.as_set()], rig, rotation_known=kind == "unknown")
@@ -144,10 +156,20 @@ def test_camera_may_be_turned_and_boards_stand_on_a_side() -> None:
     assert np.rad2deg(np.linalg.norm(rotvec_from_rotation(off))) < 0.5
 
 
+# Before and behind the centre, and aside.
+PLACES_MM = [(0.0, -43.0, 0.0), (0.0, 43.0, 0.0), (-28.0, -12.0, -33.0), (40.0, -19.0, -7.0)]
+
+
 @pytest.mark.parametrize(
-    "lens_mm", [(0.0, -43.0, 0.0), (0.0, 43.0, 0.0), (-28.0, -12.0, -33.0), (40.0, -19.0, -7.0)]
+    ("lens_mm", "n"),
+    [
+        (place, n)
+        for i, place in enumerate(PLACES_MM)
+        for k, n in enumerate((AIR, WATER))
+        # Media in turn.
+        if WHOLE or i % 2 == k
+    ],
 )
-@pytest.mark.parametrize("n", [AIR, WATER])
 def test_starts_from_any_place_of_the_lens(lens_mm: tuple[float, float, float], n: float) -> None:
     rig = bluerov2_rig()
     shoot = _rail("unknown", rig, n)
@@ -344,8 +366,16 @@ def test_refuses_poses_that_do_not_fit(change: Callable[[SE3], SE3], message: st
         _solve([_poses(change).as_set()])
 
 
-@pytest.mark.parametrize("kind", ["exact", "distance", "unknown"])
-@pytest.mark.parametrize("taken", [AIR, WATER])
+@pytest.mark.parametrize(
+    ("kind", "taken"),
+    [
+        (kind, taken)
+        for i, (kind, _) in enumerate(GIVEN)
+        for k, taken in enumerate((AIR, WATER))
+        # Media in turn.
+        if WHOLE or i % 2 == k
+    ],
+)
 def test_refuses_the_wrong_medium(kind: str, taken: float) -> None:
     shoot = _rail(kind, n=taken)
     stated, sigma = (WATER, 5e-4) if taken == AIR else (AIR, 0.0)

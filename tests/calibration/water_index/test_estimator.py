@@ -104,10 +104,10 @@ def spread(errors: Sequence[float]) -> float:
     return float(np.sqrt(np.mean(np.square(errors))))
 
 
-def test_normalised_errors_of_a_hundred_vehicles() -> None:
+def test_normalised_errors_of_many_vehicles() -> None:
     alone, with_prior, by_camera = [], [], []
     names = CAMERA.names
-    for seed in range(200 if WHOLE else 100):
+    for seed in range(200 if WHOLE else 60):
         vehicle = Vehicle(np.random.default_rng(seed), uncertainty=CAMERA)
         n = vehicle.rng.uniform(1.331, 1.345)
         prior = IndexPrior(n + 3e-3 * vehicle.rng.normal(), 3e-3)
@@ -122,7 +122,7 @@ def test_normalised_errors_of_a_hundred_vehicles() -> None:
         left = result.uncertainty.covariance[-1, -1] - reach @ c @ reach
         by_camera.append((result.n - n + reach @ vehicle.errors) / np.sqrt(left))
         assert result.uncertainty.names == (*names, N_WATER)
-    # 100 samples know a standard deviation to 7 %; the bar is 0.8 to 1.25.
+    # 60 samples know a standard deviation to 9 %; the bar is 0.8 to 1.25.
     assert 0.8 < spread(alone) < 1.25
     assert 0.8 < spread(with_prior) < 1.25
     assert 0.8 < spread(by_camera) < 1.25

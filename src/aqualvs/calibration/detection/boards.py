@@ -111,8 +111,10 @@ def predict(pixels: FloatArray, known: BoolArray) -> PredictedCorners:
     # Greatest distance, in squares, of the neighbours that predict a corner.
     reach = 2
     weight = np.pad(known.astype(np.float64), reach)
-    values = np.pad(np.where(known[..., None], pixels, 0.0), ((reach,) * 2, (reach,) * 2, (0, 0)))
-    normal, right = np.zeros((rows, columns, 3, 3)), np.zeros((rows, columns, 3, 2))
+    values = np.where(known, np.moveaxis(pixels, -1, 0), 0.0)
+    values = np.pad(values, ((0, 0), (reach,) * 2, (reach,) * 2))
+    # The grid is the last two axes of all sums, which makes them ten times as fast.
+    normal, right = np.zeros((3, 3, rows, columns)), np.zeros((3, 2, rows, columns))
     count = np.zeros((rows, columns), dtype=np.int64)
     # Nearer neighbours get more weight, because the map is affine only locally.
     fall = 0.7
@@ -120,12 +122,13 @@ def predict(pixels: FloatArray, known: BoolArray) -> PredictedCorners:
         for dx in range(-reach, reach + 1):
             if dx == dy == 0:
                 continue
-            here = np.s_[reach + dy : reach + dy + rows, reach + dx : reach + dx + columns]
+            here = np.s_[..., reach + dy : reach + dy + rows, reach + dx : reach + dx + columns]
             basis = np.array([1.0, dx, dy])
             share = weight[here] * np.exp(-fall * (dx * dx + dy * dy))
-            normal += share[..., None, None] * np.outer(basis, basis)
-            right += share[..., None, None] * (basis[:, None] * values[here][..., None, :])
+            normal += np.outer(basis, basis)[..., None, None] * share
+            right += basis[:, None, None, None] * (share * values[here])
             count += weight[here] > 0.0
+    normal, right = (np.moveaxis(sums, (0, 1), (-2, -1)) for sums in (normal, right))
     # An affine map needs three neighbours; a fourth guards it.
     min_neighbours = 4
     valid = (count >= min_neighbours) & _spread_both_ways(normal)
@@ -156,11 +159,26 @@ def misfits(pixels: FloatArray, known: BoolArray, *, share: float) -> BoolArray:
     share : float
         Allowed distance from the prediction, in sides of a square.
     """
-    from_neighbours = predict(pixels, known)
+    return _odd(pixels, known, predict(pixels, known), share)
+
+
+def _odd(
+    pixels: FloatArray, known: BoolArray, from_neighbours: PredictedCorners, share: float
+) -> BoolArray:
     side = np.sqrt(np.min(np.sum(np.square(from_neighbours.axes), axis=-2), axis=-1))
     distance = np.linalg.norm(pixels - from_neighbours.pixels, axis=-1)
     odd: BoolArray = known & from_neighbours.valid & (distance > share * side)
     return odd
+
+
+def _without_misfits(pixels: FloatArray, known: BoolArray) -> tuple[BoolArray, PredictedCorners]:
+    """Return the known points that fit their neighbours, and what those points predict."""
+    expected = predict(pixels, known)
+    odd = _odd(pixels, known, expected, _MISFIT_SHARE)
+    if not odd.any():
+        return known, expected
+    left = known & ~odd
+    return left, predict(pixels, left)
 
 
 # OpenCV's finders look at every pixel; above this size a smaller picture finds the same board.
@@ -449,11 +467,10 @@ def _grow(image: GreyImage, board: Board, seeds: Seeds) -> CornerGrid:
     fits = _refine(image, board, seeds.pixels, seeds.axes, light[seeds.corners])
     pixels.reshape(-1, 2)[seeds.corners] = fits.pixels
     known.reshape(-1)[seeds.corners] = fits.valid
-    known &= ~misfits(pixels, known, share=_MISFIT_SHARE)
+    known, expected = _without_misfits(pixels, known)
     # A corner that the picture did not confirm is tried again when more neighbours are known.
     max_tries = 3
     while True:
-        expected = predict(pixels, known)
         new = ~known & expected.valid & (tries < max_tries) & _inside(expected.pixels, image)
         if not np.any(new):
             break
@@ -462,7 +479,7 @@ def _grow(image: GreyImage, board: Board, seeds: Seeds) -> CornerGrid:
             image, board, expected.pixels[new], expected.axes[new], light.reshape(shape)[new]
         )
         pixels[new], known[new] = fits.pixels, fits.valid
-        known &= ~misfits(pixels, known, share=_MISFIT_SHARE)
+        known, expected = _without_misfits(pixels, known)
     return CornerGrid(pixels, known)
 
 

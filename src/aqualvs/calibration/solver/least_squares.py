@@ -178,17 +178,15 @@ def freedoms(
 
 
 def believed(
-    blocks: Sequence[Block], scales: Sequence[float], freedom: Sequence[float]
+    blocks: Sequence[Block], scales: Sequence[float], largest: Sequence[float]
 ) -> list[BoolArray]:
-    """Return the inliers of every block."""
+    """Return the inliers of every block; `largest` as from `largest_scales`."""
     # Residuals longer than this, in scales, are outliers: 4e-6 of good corners.
     reject = 5.0
     return [
         # NaN compares false.
-        block.lengths < reject * min(scale, _largest_scale(block, free))
-        if block.scaled
-        else block.seen
-        for block, scale, free in zip(blocks, scales, freedom, strict=True)
+        block.lengths < reject * min(scale, limit) if block.scaled else block.seen
+        for block, scale, limit in zip(blocks, scales, largest, strict=True)
     ]
 
 
@@ -197,10 +195,12 @@ def group_scales(
     inliers: Sequence[BoolArray],
     scales: Sequence[float],
     freedom: Sequence[float],
+    largest: Sequence[float],
 ) -> dict[str, float]:
     """Return the typical scale of every group: the median of its blocks' own scales.
 
-    Blocks are weighted by their degrees of freedom. A few bad ones do not count.
+    Blocks are weighted by their degrees of freedom. A few bad ones do not count. `largest` as from
+    `largest_scales`.
     """
     typical = {}
     for group in {b.group for b in blocks if b.scaled}:
@@ -212,10 +212,8 @@ def group_scales(
         by_itself = [_squares(blocks[i], inliers[i], scales[i]) / freedom[i] for i in useful]
         weights = np.array([freedom[i] for i in useful])
         scale = float(np.sqrt(_weighted_median(np.array(by_itself), weights)))
-        largest = _weighted_median(
-            np.array([_largest_scale(blocks[i], freedom[i]) for i in useful]), weights
-        )
-        typical[group] = max(min(scale, largest), _TINY)
+        limit = _weighted_median(np.array([largest[i] for i in useful]), weights)
+        typical[group] = max(min(scale, limit), _TINY)
     return typical
 
 
@@ -224,28 +222,39 @@ def block_scales(
     inliers: Sequence[BoolArray],
     scales: Sequence[float],
     freedom: Sequence[float],
+    largest: Sequence[float],
     typical: dict[str, float],
 ) -> list[float]:
-    """Return the scale of every block: from its own residuals, shrunk towards its group's."""
+    """Return the scale of every block: from its own residuals, shrunk towards its group's.
+
+    `largest` as from `largest_scales`.
+    """
     found = []
     # Weight of the group's noise in that of a block, as a number of values.
     group_freedom = 10.0
-    for block, inside, scale, free in zip(blocks, inliers, scales, freedom, strict=True):
+    each = zip(blocks, inliers, scales, freedom, largest, strict=True)
+    for block, inside, scale, free, limit in each:
         if not block.scaled:
             found.append(1.0)
             continue
         prior = typical[block.group]
         squares = _squares(block, inside, scale) + group_freedom * prior**2
         tempered = float(np.sqrt(squares / (max(free, 0.0) + group_freedom)))
-        found.append(min(tempered, max(_largest_scale(block, free), prior)))
+        found.append(min(tempered, max(limit, prior)))
     return found
 
 
-def _largest_scale(block: Block, freedom: float) -> float:
-    """Return the upper limit of a block's scale from the median of its residuals.
+def largest_scales(blocks: Sequence[Block], freedom: Sequence[float]) -> list[float]:
+    """Return the upper limit of every block's scale from the median of its residuals.
 
-    Many outliers would raise the scale that accepts them; the limit prevents that.
+    Many outliers would raise the scale that accepts them; the limit prevents that. Blocks that are
+    not scaled have none.
     """
+    pairs = zip(blocks, freedom, strict=True)
+    return [_largest_scale(block, free) if block.scaled else float("inf") for block, free in pairs]
+
+
+def _largest_scale(block: Block, freedom: float) -> float:
     values = block.values(block.seen)
     if freedom <= _MIN_FREEDOM or not values:
         return float("inf")
@@ -457,10 +466,12 @@ class _Run(Generic[State]):
         before = self.scales, self.inliers
         equations = self._equations()
         freedom = freedoms(self.blocks, self.inliers, equations, inverse(equations.information))
+        largest = largest_scales(self.blocks, freedom)
         if self.reject:
-            self.inliers = believed(self.blocks, self.scales, freedom)
-        self.typical = group_scales(self.blocks, self.inliers, self.scales, freedom)
-        self.scales = block_scales(self.blocks, self.inliers, self.scales, freedom, self.typical)
+            self.inliers = believed(self.blocks, self.scales, largest)
+        now = self.blocks, self.inliers, self.scales, freedom, largest
+        self.typical = group_scales(*now)
+        self.scales = block_scales(*now, self.typical)
         same = all(np.array_equal(a, b) for a, b in zip(before[1], self.inliers, strict=True))
         # Relative change of a noise scale that does not affect the solution.
         same_scale = 5e-3
