@@ -21,7 +21,6 @@ from rig_from_sample_truth import load_truth
 from whole import WHOLE
 
 FPS = 25.0
-N_DRAWS = 60 if WHOLE else 40
 
 
 def sample_rig(folder: Path) -> Rig:
@@ -62,7 +61,7 @@ def test_normalised_errors_over_uncertain_rigs_and_places(
     points, options = target_points(), IndexOptions()
     uncertainty = RigUncertainty.independent(sigmas)
     errors = []
-    for _ in range(N_DRAWS):
+    for _ in range(60):
         true = rig_moved_by(rig, tuple(sigmas), rng.normal(0.0, list(sigmas.values())))
         turn = rng.normal(0.0, options.sigma_turn, 3)
         shift = rng.normal(0.0, options.sigma_place, 3)
@@ -77,10 +76,9 @@ def test_normalised_errors_over_uncertain_rigs_and_places(
         shots = [(t, View(v.name, v.ids, points, v.pixels)) for t, v in shots]
         last = water(rig, shots, uncertainty=uncertainty)
         errors.append((last.n - n) / last.sigma)
-    # 40 samples know a standard deviation to 11 %, 60 to 9 %, and a mean to 0.16 and 0.13.
-    allowed = 2.2 / np.sqrt(2.0 * N_DRAWS)
-    assert 1.0 - allowed < np.std(errors) < 1.0 + 1.25 * allowed
-    assert abs(np.mean(errors)) < 2.7 / np.sqrt(N_DRAWS)
+    # 60 samples know a standard deviation to 9 %; the bar is 0.8 to 1.25.
+    assert 0.8 < np.std(errors) < 1.25
+    assert abs(np.mean(errors)) < 0.35
 
 
 def test_a_plate_behind_a_flat_port_gives_the_index() -> None:
