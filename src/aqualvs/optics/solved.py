@@ -187,17 +187,12 @@ def rig_numbers(rig: Rig) -> dict[str, float]:
 
     The rotation is the rig file's: a vector that is applied after the nominal mounting.
     """
-    turn = rotvec_from_rotation(rig.dome_from_cam.rotation @ DOME_FROM_CAM_NOMINAL.T)
-    return {**unturned_numbers(rig), **dict(zip(POSE_PARAMETERS[3:], turn.tolist(), strict=True))}
-
-
-def unturned_numbers(rig: Rig) -> dict[str, float]:
-    """Return what `rig_numbers` returns, without the rotation."""
-    lens, place = rig.lens, rig.dome_from_cam.translation.tolist()
+    lens, turn = rig.lens, rig.dome_from_cam.rotation @ DOME_FROM_CAM_NOMINAL.T
+    pose = [*rig.dome_from_cam.translation.tolist(), *rotvec_from_rotation(turn).tolist()]
     intrinsics = (lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion)
     return {
         **dict(zip(lens.parameter_names, intrinsics, strict=True)),
-        **dict(zip(POSE_PARAMETERS[:3], place, strict=True)),
+        **dict(zip(POSE_PARAMETERS, pose, strict=True)),
         **({} if rig.housing is None else rig.housing.numbers()),
         "n_air": rig.n_air,
         "n_water": rig.n_water,

@@ -22,7 +22,7 @@ from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec, rotvec_from_rotation, skew
 from aqualvs.optics.camera import POSE_PARAMETERS, Camera, parameter_names
 from aqualvs.optics.rig import Rig, RigUncertainty, rig_moved_by
-from aqualvs.optics.solved import unturned_numbers
+from aqualvs.optics.solved import rig_numbers
 
 DISTANCES = "distances"
 TILTS = "tilts"
@@ -147,12 +147,10 @@ def media_prior(
 
 def rig_difference(start: Rig, rig: Rig, names: Sequence[str]) -> FloatArray:
     """Return the step (P,) of `rig_moved_by` that leads from `start` to `rig`, by named numbers."""
-    a, b = unturned_numbers(start), unturned_numbers(rig)
-    off = {name: b[name] - a[name] for name in names if name not in _ROTATION}
-    if len(off) < len(names):
-        turn = rotvec_from_rotation(rig.dome_from_cam.rotation @ start.dome_from_cam.rotation.T)
-        off |= zip(_ROTATION, turn.tolist(), strict=True)
-    return np.array([off[name] for name in names])
+    a, b = rig_numbers(start), rig_numbers(rig)
+    turn = rotvec_from_rotation(rig.dome_from_cam.rotation @ start.dome_from_cam.rotation.T)
+    rotation = dict(zip(_ROTATION, turn, strict=True))
+    return np.array([rotation[n] if n in rotation else b[n] - a[n] for n in names])
 
 
 def _whiten(covariance: FloatArray) -> FloatArray:
