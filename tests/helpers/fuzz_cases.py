@@ -353,16 +353,21 @@ class Bench:
         from aqualvs.batch.dives import read_list
         from aqualvs.calibration.targets.pose_files import load_poses
         from aqualvs.design.file import EXAMPLE
+        from aqualvs.simulation.render import Renderer
         from aqualvs.simulation.scenario import read_scenario
-        from aqualvs.simulation.scenarios import example_rig
+        from aqualvs.simulation.scenarios import example_rig, load_scenario
         from aqualvs.sources import open_source
         from aqualvs.sources.udp import read_sdp
         from aqualvs.vehicle_logs import read_vehicle_log
+        from panel_cases import small_rig
         from shell_cases import rig_file, wall_picture, write_video
 
         home = self.home
         # A thread of OpenCV would not be in the copies of this process.
         cv2.setNumThreads(1)
+        # A case that had to compile the renderer would be taken for one that hangs.
+        scene = load_scenario("net_clutter").scene_at(0.0)
+        Renderer(small_rig(), samples=1).render(scene, 0.0, np.random.default_rng(0))
         home.mkdir(parents=True, exist_ok=True)
         rig = rig_file(home)
         wall = wall_picture(example_rig())
