@@ -45,9 +45,9 @@ def test_the_odd_one_out_is_told_from_its_neighbours():
     pixels = _plain()
     known = np.ones(pixels.shape[:2], dtype=bool)
     pixels[2, 2] += [8.0, 0.0]
-    odd = misfits(pixels, known, share=0.2)
+    odd = misfits(pixels, known, predict(pixels, known), share=0.2)
     assert np.argwhere(odd).tolist() == [[2, 2]]
-    assert not misfits(pixels, known, share=0.6).any()
+    assert not misfits(pixels, known, predict(pixels, known), share=0.6).any()
 
 
 def test_nothing_known_has_the_boards_shape():

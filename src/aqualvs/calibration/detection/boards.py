@@ -149,36 +149,34 @@ def _spread_both_ways(normal: FloatArray) -> BoolArray:
     return wide
 
 
-def misfits(pixels: FloatArray, known: BoolArray, *, share: float) -> BoolArray:
+def misfits(
+    pixels: FloatArray, known: BoolArray, expected: PredictedCorners, *, share: float
+) -> BoolArray:
     """Return the mask of known points that contradict their neighbours.
 
     Parameters
     ----------
     pixels, known
         As in `predict`.
+    expected : PredictedCorners
+        What `predict` returns for them.
     share : float
         Allowed distance from the prediction, in sides of a square.
     """
-    return _odd(pixels, known, predict(pixels, known), share)
-
-
-def _odd(
-    pixels: FloatArray, known: BoolArray, from_neighbours: PredictedCorners, share: float
-) -> BoolArray:
-    side = np.sqrt(np.min(np.sum(np.square(from_neighbours.axes), axis=-2), axis=-1))
-    distance = np.linalg.norm(pixels - from_neighbours.pixels, axis=-1)
-    odd: BoolArray = known & from_neighbours.valid & (distance > share * side)
+    side = np.sqrt(np.min(np.sum(np.square(expected.axes), axis=-2), axis=-1))
+    distance = np.linalg.norm(pixels - expected.pixels, axis=-1)
+    odd: BoolArray = known & expected.valid & (distance > share * side)
     return odd
 
 
 def _without_misfits(pixels: FloatArray, known: BoolArray) -> tuple[BoolArray, PredictedCorners]:
     """Return the known points that fit their neighbours, and what those points predict."""
     expected = predict(pixels, known)
-    odd = _odd(pixels, known, expected, _MISFIT_SHARE)
-    if not odd.any():
-        return known, expected
-    left = known & ~odd
-    return left, predict(pixels, left)
+    odd = misfits(pixels, known, expected, share=_MISFIT_SHARE)
+    if odd.any():
+        known = known & ~odd
+        expected = predict(pixels, known)
+    return known, expected
 
 
 # OpenCV's finders look at every pixel; above this size a smaller picture finds the same board.
@@ -305,7 +303,7 @@ def _borne_out(image: GreyImage, rough: FloatArray) -> _Attempt:
             image, starts[tried], expected.axes[tried], light[tried], margin=1.0, bits_from=1.0
         )
         pixels[tried], seen[tried] = fits.pixels, fits.valid
-        seen &= ~misfits(pixels, seen, share=_MISFIT_SHARE)
+        seen, _ = _without_misfits(pixels, seen)
     # The middle first: it wins ties.
     shifts = sorted(np.ndindex(3, 3), key=lambda s: abs(s[0] - 1) + abs(s[1] - 1))
     dy, dx = max(shifts, key=lambda s: np.count_nonzero(seen[s[0] :, s[1] :][:rows, :columns]))
