@@ -16,7 +16,6 @@ from net_cases import NetCamera
 from net_dives import Dive, passed_holes, random_dive, true_solidity
 from quick_pictures import quick_scans
 from rig_from_sample_truth import load_truth
-from whole import WHOLE
 
 RIG = example_rig()
 # Dives that are rendered: seed and difficulty; one of each shape, with twine near 3 mm (what
@@ -89,9 +88,7 @@ def test_holes_of_three_meshes_are_found_and_no_others() -> None:
     # strands in every frame, 1 % always.
     camera = NetCamera(RIG, missed=0.05, dark=0.01)
     found, passed, false, area = 0, 0, 0, 0.0
-    # Every other net has holes.
-    seeds = range(6 if WHOLE else 4)
-    for seed in seeds:
+    for seed in range(6):
         rng = np.random.default_rng([33, seed])
         bars = (3.0, 7.0) if seed % 2 else None
         dive = random_dive(rng, "hard", seconds=5.0, fps=8.0, speed=(0.1, 0.15), hole_bars=bars)
@@ -109,10 +106,10 @@ def test_holes_of_three_meshes_are_found_and_no_others() -> None:
         for middle, radius in passed_holes(dive, RIG):
             passed += 1
             found += any(np.hypot(*(place - middle)) < radius + near for place in places)
-    assert passed >= len(seeds) // 3
+    assert passed >= 2
     assert found == passed
     assert false == 0
-    assert area > len(seeds) / 6.0
+    assert area > 1.0
 
 
 @pytest.mark.samples

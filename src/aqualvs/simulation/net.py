@@ -107,12 +107,10 @@ _TWINE = _TwineLook()
 class _FoldSteps(NamedTuple):
     """Search along a ray for a folded net."""
 
-    # Least step along a ray towards a folded net, and number of bisections of the last step, and of
-    # the secants that guess where they end.
+    # Least step along a ray towards a folded net, and number of bisections of the last step.
     step: float = 1e-3
     max_steps: int = 200
     halvings: int = 16
-    secants: int = 3
 
 
 _STEPS = _FoldSteps()
@@ -215,7 +213,7 @@ def _next_crossing(
         step = max(share * abs(side), _STEPS.step)
         now = _behind(o, d, t + step, nets, i, folds)
         if side * now <= 0.0:
-            return _halved(o, d, t, t + step, side, now, nets, i, folds)
+            return _halved(o, d, t, t + step, side, nets, i, folds)
         t, side = t + step, now
     return np.inf
 
@@ -227,27 +225,11 @@ def _halved(
     before: float,
     after: float,
     side: float,
-    other: float,
     nets: FloatArray,
     i: int,
     folds: FloatArray,
 ) -> float:
-    """Return by bisection where a ray changes sides of the net between two places.
-
-    Bisection follows a guess, which saves most heights of the net; it is done in full where the
-    two places that it ends with do not lie on either side of the net.
-    """
-    guess = _guessed(o, d, before, after, side, other, nets, i, folds)
-    low, high = before, after
-    for _ in range(_STEPS.halvings):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if middle < guess else (low, middle)
-    if (
-        side * _behind(o, d, low, nets, i, folds)
-        > 0.0
-        >= side * _behind(o, d, high, nets, i, folds)
-    ):
-        return high
+    """Return by bisection where a ray changes sides of the net between two places."""
     for _ in range(_STEPS.halvings):
         middle = 0.5 * (before + after)
         if side * _behind(o, d, middle, nets, i, folds) > 0.0:
@@ -255,32 +237,6 @@ def _halved(
         else:
             after = middle
     return after
-
-
-@inline_borrowing_kernel
-def _guessed(
-    o: Vec,
-    d: Vec,
-    before: float,
-    after: float,
-    side: float,
-    other: float,
-    nets: FloatArray,
-    i: int,
-    folds: FloatArray,
-) -> float:
-    """Return by secants where a ray changes sides, from its distances behind the net."""
-    middle = before
-    for _ in range(_STEPS.secants):
-        if side == other:
-            break
-        middle = before + (after - before) * side / (side - other)
-        now = _behind(o, d, middle, nets, i, folds)
-        # The two latest places are kept.
-        before, side, after, other = after, other, middle, now
-    if side == other:
-        return middle
-    return before + (after - before) * side / (side - other)
 
 
 @inline_borrowing_kernel
