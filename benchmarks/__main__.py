@@ -22,6 +22,7 @@ from rich.console import Console
 from rich.table import Table
 
 from aqualvs.errors import AqualvsError
+from aqualvs.geometry.compiled import compiled_at_once
 
 # Minutes each, most of it spent on accuracy or on playing in real time.
 _SLOW = frozenset(
@@ -45,7 +46,8 @@ def names(words: Sequence[str], *, quick: bool = False) -> list[str]:
 def rows_of(module: ModuleType, group: str, *, quick: bool) -> list[Row]:
     """Run one benchmark; ValueError where a row lacks a key."""
     can_be_quick = "quick" in inspect.signature(module.run).parameters
-    found = module.run(quick=quick) if can_be_quick else module.run()
+    with compiled_at_once():
+        found = module.run(quick=quick) if can_be_quick else module.run()
     return [row_of(group, one) for one in found]
 
 

@@ -7,7 +7,7 @@ compiled, not when a machine is different.
 
 import itertools
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -17,6 +17,7 @@ from benchmarks.bench_optics import CAMERA
 
 from aqualvs.demo import bundled_dive
 from aqualvs.geometry import Plane
+from aqualvs.geometry.compiled import compiled_at_once
 from aqualvs.optics.camera import rays_all
 from aqualvs.optics.projection import project_all
 from aqualvs.optics.rigfile import load_rig
@@ -27,6 +28,12 @@ from aqualvs.scanning.row_motion import RowMotion
 from aqualvs.sources import open_source
 
 Pair = tuple[Callable[[], object], Callable[[], object]]
+
+
+@pytest.fixture(autouse=True)
+def _compiled() -> Iterator[None]:
+    with compiled_at_once():
+        yield
 
 
 def times_faster(ours: Callable[[], object], plain: Callable[[], object], rounds: int = 7) -> float:

@@ -59,7 +59,7 @@ class StopSignals(Closing):
 
 Tick: TypeAlias = Callable[[int], None]
 
-FIRST_RUN = "the first run on a machine compiles for a minute or two"
+FIRST_RUN = "slower on a new machine, which compiles for a minute or so"
 """Said until the first frame is done; compiled code is kept for the next run."""
 
 _HIDDEN: ContextVar[bool] = ContextVar("hidden", default=False)

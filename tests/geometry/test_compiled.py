@@ -11,7 +11,7 @@ import pytest
 
 import aqualvs
 from aqualvs.demo import bundled_dive
-from aqualvs.geometry.compiled import inline_kernel, kernel
+from aqualvs.geometry.compiled import compiled_at_once, inline_kernel, kernel
 from aqualvs.optics.rigfile import load_rig
 from aqualvs.scanner import Scanner
 from aqualvs.sources import open_source
@@ -88,9 +88,9 @@ def _quotients(a, out):
         out[i] = 1.0 - _quotient(a[i], 3.0) * a[i]
 
 
-def run_caller(folder: Path, name: str = "caller.py") -> list[str]:
+def run_caller(folder: Path, name: str = "caller.py", *arguments: str) -> list[str]:
     environment = os.environ | {"NUMBA_CACHE_DIR": str(folder / "cache")}
-    command = [sys.executable, name]
+    command = [sys.executable, name, *arguments]
     done = subprocess.run(
         command, cwd=folder, env=environment, capture_output=True, text=True, check=True
     )
@@ -175,6 +175,72 @@ def test_cached_kernels_load_without_what_only_compiling_needs(tmp_path: Path) -
     assert run_caller(tmp_path, "allocating.py") == [*found, "1", "1", "False"]
 
 
+LAZY = """
+import sys
+import numpy as np
+from aqualvs.geometry.compiled import compiled_at_once, inner_kernel, lazy_kernel
+
+@inner_kernel
+def inverse(x):
+    return 1.0 / x
+
+@lazy_kernel
+def add(total, x):
+    total[0] += 1.0
+    total[0] += inverse(x)
+    return total[0], total[0] > 1.0
+
+@lazy_kernel
+def count(n):
+    total = 0
+    for i in range(n):
+        total += i
+    return total
+
+def n_compiled(kernel):
+    return len(kernel._compiled.signatures)
+
+total = np.zeros(1)
+if "at_once" in sys.argv:
+    with compiled_at_once():
+        add(total, 1.0)
+    print(n_compiled(add), n_compiled(count))
+else:
+    found = add(total, np.float64(2.0))
+    print(*found, *(type(one).__name__ for one in found), n_compiled(add))
+    # Python cannot divide by zero: the call is done once, by compiled code.
+    total[0] = 4.0
+    print(*add(total, 0.0), n_compiled(add))
+    print(*((count(1_000_000), n_compiled(count)) for _ in range(2)))
+"""
+
+
+def test_a_lazy_kernel_is_compiled_when_python_has_run_it_for_a_while(tmp_path: Path) -> None:
+    (tmp_path / "lazy.py").write_text(LAZY)
+    by_python, compiled = ["1.5", "True", "float", "bool"], ["inf", "True"]
+    counted = ["(499999500000,", "1)"]
+    at_first = [*by_python, "0", *compiled, "1", "(499999500000,", "0)", *counted]
+    assert run_caller(tmp_path, "lazy.py") == at_first
+    # The next process finds the code on disk.
+    assert run_caller(tmp_path, "lazy.py") == [*by_python, "1", *compiled, "1", *counted, *counted]
+
+
+def test_lazy_kernels_can_be_compiled_at_once(tmp_path: Path) -> None:
+    (tmp_path / "lazy.py").write_text(LAZY)
+    assert run_caller(tmp_path, "lazy.py", "at_once") == ["1", "0"]
+
+
+def test_lazy_kernels_of_a_module_are_compiled_by_one_process_at_a_time(tmp_path: Path) -> None:
+    fcntl = pytest.importorskip("fcntl", reason="Windows has no such locks")
+    path = tmp_path / "lazy.py"
+    path.write_text(LAZY)
+    with path.open("rb") as source:
+        fcntl.flock(source, fcntl.LOCK_EX)
+        said = run_caller(tmp_path, "lazy.py")
+    assert said[-4:] == ["(499999500000,", "0)"] * 2
+    assert run_caller(tmp_path, "lazy.py")[-2:] == ["(499999500000,", "1)"]
+
+
 PAIR = """
 from typing import NamedTuple
 
@@ -207,7 +273,7 @@ def test_code_on_disk_for_a_class_that_is_gone_is_compiled_anew(tmp_path: Path) 
 def test_no_kernel_of_a_scan_is_compiled_for_one_number() -> None:
     """A count that begins at a literal 0 compiles what it is passed to for 0 and for any number."""
     scanner = Scanner(load_rig(str(bundled_dive() / "rig.yaml")))
-    with open_source(str(bundled_dive() / "dive.mp4")) as source:
+    with open_source(str(bundled_dive() / "dive.mp4")) as source, compiled_at_once():
         assert scanner.process(next(iter(source))).posture
     kernels = {
         name: value._for_kernels._cache._cache_file

@@ -6,10 +6,14 @@ arrays lie in memory, and on which of its callers a kernel was compiled for: a d
 several machines, or by several processes, would not equal the same dive measured by one.
 """
 
+import contextlib
 import functools
 import os
+import threading
+import time
 import types
 from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
 from typing import Any, TypeVar, cast
 
 # Numba prepares colours for every error that it might report: where colorama is installed, as on
@@ -19,6 +23,7 @@ os.environ.setdefault("NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING", "1")
 import numba
 import numpy as np
 from numba.extending import overload, typeof_impl
+from numpy.typing import NDArray
 
 # What `kernel_loading` uses of Numba is private: no other version than those tested is trusted.
 _LOADS_LIGHTLY = numba.__version__.startswith("0.68.")
@@ -44,6 +49,34 @@ def borrowing_kernel(function: F) -> F:
     looked at, can take longer than the work itself. Compilation fails where an array is created.
     """
     return _compiled(function, _nrt=False)
+
+
+def lazy_kernel(function: F) -> F:
+    """Compile a batch kernel once Python has run it for a while; most first runs need no more.
+
+    Compiling what measures a few hundred candidates takes as long as Python needs for a hundred
+    frames of them. Both give the same bits for kernels that keep to loops, to arithmetic of 64-bit
+    numbers (NumPy's narrower integers wrap around where compiled code widens them), and to
+    functions that round alike (`squared` and `hypot` of `linear_algebra`, not `x**2` and
+    `math.hypot`).
+    """
+    return cast(F, _LazyKernel(function, {}))
+
+
+def lazy_borrowing_kernel(function: F) -> F:
+    """Compile a `borrowing_kernel` when its calls have taken a while, as a `lazy_kernel`."""
+    return cast(F, _LazyKernel(function, {"_nrt": False}))
+
+
+@contextlib.contextmanager
+def compiled_at_once() -> Iterator[None]:
+    """Have this thread compile lazy kernels when first called, before work that must not wait."""
+    before = _interpreter.is_allowed
+    _interpreter.is_allowed = False
+    try:
+        yield
+    finally:
+        _interpreter.is_allowed = before
 
 
 def inner_kernel(function: F) -> F:
@@ -112,6 +145,127 @@ def _compiled(function: F, **options: object) -> F:
     return cast(F, compiled)
 
 
+class _Interpreter(threading.local):
+    """State of a thread: whether Python may run lazy kernels, and whether it runs one now.
+
+    All that a kernel calls is run by the same means.
+    """
+
+    is_allowed = True
+    runs = False
+
+
+_interpreter = _Interpreter()
+
+_LAZY_S_PER_BYTE = 1e-4
+"""CPU time for which Python runs a lazy kernel in a process, for each byte of Python's code for it
+and its callees: a quarter of what compiling takes (3 kB and 1.2 s in the median of 22 kernels)."""
+
+
+class _LazyKernel:
+    """A function that Python runs for a while before it is compiled, unless its code is on disk."""
+
+    def __init__(self, function: Callable[..., Any], options: Mapping[str, object]) -> None:
+        functools.update_wrapper(self, function)
+        self.py_func = function
+        self._compiled = _compiled(function, **options)
+        self._stands_for = (self._compiled,)
+        self._run = self._run_first
+        self._left_s = 0.0
+
+    def __call__(self, *arguments: Any) -> Any:
+        return self._run(*arguments)
+
+    def _run_first(self, *arguments: Any) -> Any:
+        file = _cache_file(self._compiled)
+        if file is None or file._load_index():
+            self._run = self._compiled
+        else:
+            self._left_s = _LAZY_S_PER_BYTE * _n_bytes(self.py_func, set())
+            self._run = self._interpret
+        return self._run(*arguments)
+
+    def _interpret(self, *arguments: Any) -> Any:
+        if _interpreter.runs:
+            return self.py_func(*arguments)
+        if self._left_s > 0.0 and _interpreter.is_allowed:
+            return self._run_by_python(arguments)
+        with _turn_to_compile(self.py_func) as has_turn:
+            if has_turn or not _interpreter.is_allowed:
+                self._run = self._compiled
+                return self._run(*arguments)
+        return self._run_by_python(arguments)
+
+    def _run_by_python(self, arguments: tuple[Any, ...]) -> Any:
+        started = time.thread_time()
+        written = [(array, array.copy()) for array in _arrays(arguments) if array.flags.writeable]
+        _interpreter.runs = True
+        try:
+            with np.errstate(all="ignore"):
+                return _native(self.py_func(*arguments))
+        except Exception:
+            # Compiled code goes on where Python raises, as in dividing one of its own numbers by
+            # zero.
+            for array, before in written:
+                array[...] = before
+        finally:
+            _interpreter.runs = False
+            self._left_s -= time.thread_time() - started
+        return self._compiled(*arguments)
+
+
+@contextlib.contextmanager
+def _turn_to_compile(function: Callable[..., Any]) -> Iterator[bool]:
+    """Yield whether no other process is compiling a kernel of the same module.
+
+    The processes that share a dive want the same kernels at the same time. So each compiles others,
+    and finds the rest on disk later.
+    """
+    has_turn = True
+    with contextlib.ExitStack() as stack:
+        try:
+            import fcntl
+
+            source = stack.enter_context(Path(function.__code__.co_filename).open("rb"))
+            fcntl.flock(source, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            has_turn = False
+        except (ImportError, OSError):
+            # Without locks, as on Windows, each process compiles for itself.
+            pass
+        yield has_turn
+
+
+def _n_bytes(function: Callable[..., Any], counted: set[Callable[..., Any]]) -> int:
+    """Return the length of Python's code for a kernel and for the kernels that it calls."""
+    if function in counted:
+        return 0
+    counted.add(function)
+    code = function.__code__
+    named: Iterator[Any] = (function.__globals__.get(name) for name in code.co_names)
+    callees = [one.py_func for one in named if hasattr(one, "py_func")]
+    return len(code.co_code) + sum(_n_bytes(callee, counted) for callee in callees)
+
+
+def _arrays(arguments: tuple[Any, ...]) -> Iterator[NDArray[Any]]:
+    """Yield the arrays among arguments and in tuples of them."""
+    for one in arguments:
+        if isinstance(one, np.ndarray):
+            yield one
+        elif isinstance(one, tuple):
+            yield from _arrays(one)
+
+
+def _native(result: Any) -> Any:
+    """Return what a kernel returned with Python's numbers, as compiled code gives them."""
+    if isinstance(result, np.generic):
+        return result.item()
+    if isinstance(result, tuple):
+        items = map(_native, result)
+        return type(result)(*items) if hasattr(result, "_fields") else tuple(items)
+    return result
+
+
 class _InnerKernel:
     """A function that is compiled once for kernels, and once more if Python calls it."""
 
@@ -123,7 +277,8 @@ class _InnerKernel:
         self._stands_for = (self._for_kernels,)
 
     def __call__(self, *arguments: Any) -> Any:
-        return self._for_python(*arguments)
+        run = self.py_func if _interpreter.runs else self._for_python
+        return run(*arguments)
 
     @functools.cached_property
     def _for_python(self) -> Callable[..., Any]:
@@ -142,11 +297,13 @@ class _InnerKernel:
         return _compiled(own, **self._options)
 
 
-def _type_of_inner(inner: _InnerKernel, _: object) -> Any:
-    return numba.typeof(inner._for_kernels)
+def _type_of(wrapped: _InnerKernel | _LazyKernel, _: object) -> Any:
+    (compiled,) = wrapped._stands_for
+    return numba.typeof(compiled)
 
 
-typeof_impl.register(_InnerKernel)(_type_of_inner)
+typeof_impl.register(_InnerKernel)(_type_of)
+typeof_impl.register(_LazyKernel)(_type_of)
 
 
 def _inner(function: F, **options: object) -> F:

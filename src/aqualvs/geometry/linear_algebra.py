@@ -16,10 +16,22 @@ from aqualvs.geometry.compiled import (
     inline_kernel,
     inner_borrowing_kernel,
     inner_kernel,
-    kernel,
+    lazy_kernel,
 )
 
 Vec: TypeAlias = tuple[float, float, float]
+
+
+@inline_borrowing_kernel
+def squared(x: float) -> float:
+    """Return x * x. Python rounds `x**2` otherwise, because it calls `pow`."""
+    return x * x
+
+
+@inline_borrowing_kernel
+def hypot(x: float, y: float) -> float:
+    """Return the length of (x, y). Python and compiled code round `math.hypot` differently."""
+    return math.sqrt(x * x + y * y)
 
 
 @inline_borrowing_kernel
@@ -168,7 +180,7 @@ def inverse_of(factor: FloatArray) -> FloatArray:
 _N_BINS = 256
 
 
-@kernel
+@lazy_kernel
 def element_at(values: FloatArray, share: float) -> float:
     """Return the element below which a share of the values lie; 0 if there are no values.
 

@@ -24,6 +24,7 @@ import numpy as np
 
 from aqualvs.control.time_filter import PostureFilter
 from aqualvs.errors import AqualvsError
+from aqualvs.geometry.compiled import compiled_at_once
 from aqualvs.live.health_monitor import FrozenOptions, FrozenPicture, HealthMonitor
 from aqualvs.live.outputs.base import HearsVehicle, Output
 from aqualvs.optics.expected_error import see_stripe
@@ -42,15 +43,16 @@ from aqualvs.sources.fields import frames_of, size_of_frames
 
 
 def warm_up(scanner: Scanner) -> Scan:
-    """Let a scanner measure made-up pictures, which loads its compiled kernels.
+    """Let a scanner measure made-up pictures, which compiles or loads its kernels.
 
     Returns the scan of a wall in the middle of the working range, square to the vehicle.
     """
     rounds = 2
     picture = wall_frame(scanner.rig)
-    for _ in range(rounds):
-        for frame in frames_of([picture], scanner.rig.shutter):
-            scan = scanner.process(frame)
+    with compiled_at_once():
+        for _ in range(rounds):
+            for frame in frames_of([picture], scanner.rig.shutter):
+                scan = scanner.process(frame)
     return scan
 
 

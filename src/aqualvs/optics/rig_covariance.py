@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray, IntArray
-from aqualvs.geometry.compiled import inner_kernel, kernel
+from aqualvs.geometry.compiled import inner_kernel, lazy_kernel
 from aqualvs.geometry.linear_algebra import factorise, solve_factorised
 from aqualvs.optics.camera import Camera, parameter_names
 from aqualvs.optics.rig import Rig, RigUncertainty
@@ -299,7 +299,7 @@ def _sum_up(
     return StripeSums(mean_pixels[:n], mean_points[:n], owner[:n], pulls[:n], matrix)
 
 
-@kernel
+@lazy_kernel
 def _propagate(
     terms: FloatArray,
     prior: FloatArray,

@@ -11,9 +11,9 @@ from aqualvs.geometry.compiled import (
     inline_borrowing_kernel,
     inner_borrowing_kernel,
     inner_kernel,
-    kernel,
+    lazy_kernel,
 )
-from aqualvs.geometry.linear_algebra import solve_symmetric, where
+from aqualvs.geometry.linear_algebra import solve_symmetric, squared, where
 from aqualvs.scanning.plane_search import (
     JX,
     JY,
@@ -61,7 +61,7 @@ _EVIDENCE = _EvidenceOptions()
 _XX, _XY, _XZ, _YY, _YZ, _ZZ, _SX, _SY, _SZ, _N, _SJX, _SJY, _SJZ, _N_SUMS = range(14)
 
 
-@kernel
+@lazy_kernel
 def find_rivals(
     source: IntArray,
     laser: IntArray,
@@ -176,7 +176,7 @@ def _choose_seeds(sums: FloatArray, place: FloatArray) -> IntArray:
             for k in range(n):
                 square = 0.0
                 for j in range(3):
-                    square += (place[i, j] - place[seeds[k], j]) ** 2
+                    square += squared(place[i, j] - place[seeds[k], j])
                 apart = min(apart, np.sqrt(square))
             value *= 1.0 if n == 0 else apart
             if value > most:
@@ -339,7 +339,7 @@ def _refine_rivals(
     return kept
 
 
-@kernel
+@lazy_kernel
 def judge_planes(
     planes: FloatArray,
     table: FloatArray,
@@ -470,7 +470,7 @@ def _variance(
                     total += n_lines[c] * residual / per_px
                     lines += n_lines[c]
             if lines >= min_lines:
-                square += (total / lines) ** 2
+                square += squared(total / lines)
                 n += 1
         begin = end
     freedom = n - 3.0
@@ -499,7 +499,7 @@ def _mark_expected(plane: FloatArray, bands: FloatArray, expected: BoolArray) ->
             expected[i, cell] = found
 
 
-@kernel
+@lazy_kernel
 def exclusive_share(
     source: IntArray,
     confidence: FloatArray,
@@ -542,7 +542,7 @@ def exclusive_share(
     return on / max(total, 1e-12) * (inlier_weight / of_members)
 
 
-@kernel
+@lazy_kernel
 def loose_share_before(
     source: IntArray,
     confidence: FloatArray,
@@ -597,7 +597,7 @@ def loose_share_before(
     return loose / max(of_surface, 1e-12)
 
 
-@kernel
+@lazy_kernel
 def seen_of(
     plane: FloatArray, members: BoolArray, n_lines: IntArray, laser: IntArray, bands: FloatArray
 ) -> tuple[float, float, float]:

@@ -14,12 +14,13 @@ import numpy as np
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import (
     ZERO,
-    borrowing_kernel,
     inline_borrowing_kernel,
     inner_kernel,
     kernel,
+    lazy_borrowing_kernel,
+    lazy_kernel,
 )
-from aqualvs.geometry.linear_algebra import element_at, median_of
+from aqualvs.geometry.linear_algebra import element_at, median_of, squared
 from aqualvs.scanning.laser_bands import LaserBand, SearchAxis
 from aqualvs.scanning.segments import (
     ComponentShapes,
@@ -45,7 +46,7 @@ _FLOOR_PX = 0.1
 _FLANK_NOISE = 1.35  # 0.45 (geometry of two flanks) times 3 grey levels
 
 
-@kernel
+@lazy_kernel
 def append_candidates(
     line: IntArray,
     position: FloatArray,
@@ -126,7 +127,7 @@ _SUBSEGMENT_FLOOR_PX = 0.08
 _SPREAD_SHARE = 0.12
 
 
-@borrowing_kernel
+@lazy_borrowing_kernel
 def count_subsegments(subsegment: IntArray) -> int:
     """Count subsegments whose numbers ascend."""
     n = 0
@@ -135,7 +136,7 @@ def count_subsegments(subsegment: IntArray) -> int:
     return n
 
 
-@kernel
+@lazy_kernel
 def summarise_subsegments(
     subsegment: IntArray,
     line: IntArray,
@@ -283,7 +284,7 @@ def summarise(
             centroid[c, k] += intensity_weight * points[i, k]
             mean_sensitivity[c, k] += intensity_weight * sensitivity[i, k]
         # Error of a weighted mean of independent positions.
-        group_sigma_px[c] += (intensity_weight * sigma_px[i]) ** 2
+        group_sigma_px[c] += squared(intensity_weight * sigma_px[i])
         group_glow[c] += intensity_weight * flank_difference(pull[i], width[i])
         group_width[c] += intensity_weight * width[i]
         group_height[c] += intensity_weight * height[i]
@@ -314,8 +315,8 @@ def summarise(
         for k in range(3):
             per_px += normal[k] * mean_sensitivity[c, k]
         scatter = spread[c] / (total[c] * per_px * per_px)
-        variance = group_sigma_px[c] + _SPREAD_SHARE**2 * scatter
-        group_sigma_px[c] = np.sqrt(variance + _SUBSEGMENT_FLOOR_PX**2)
+        variance = group_sigma_px[c] + squared(_SPREAD_SHARE) * scatter
+        group_sigma_px[c] = np.sqrt(variance + squared(_SUBSEGMENT_FLOOR_PX))
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,7 +4,6 @@
 peaks in them within the lasers' bands.
 """
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
@@ -13,8 +12,8 @@ import cv2
 import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import inline_kernel, inner_kernel, kernel
-from aqualvs.geometry.linear_algebra import at_rows, element_at, where
+from aqualvs.geometry.compiled import inline_kernel, inner_kernel, kernel, lazy_kernel
+from aqualvs.geometry.linear_algebra import at_rows, element_at, hypot, where
 from aqualvs.optics.shutter import FIRST_ROW, Field
 from aqualvs.scanning.laser_bands import LaserBand, SearchAxis
 from aqualvs.scanning.laser_colour import (
@@ -407,7 +406,7 @@ class FrameDetector:
         return np.asarray(np.max(found, axis=0), np.float64) if len(found) > 1 else found[0]
 
 
-@kernel
+@lazy_kernel
 def are_colourless_dashes(
     line: IntArray, table: FloatArray, ends: IntArray, n_possible: float
 ) -> bool:
@@ -427,7 +426,7 @@ def are_colourless_dashes(
     for i in range(line.shape[0]):
         height = table[HEIGHT, i]
         tall[i] = height >= HIGHEST_USEFUL
-        step = math.hypot(table[STEP_U, i], table[STEP_V, i])
+        step = hypot(table[STEP_U, i], table[STEP_V, i])
         n_coloured += tall[i] and step > RATIO_LEAST * height
     n_tall, n_long = where(tall).shape[0], 0
     if not _DASH.min_tall <= n_tall <= _DASH.crowd * n_possible:
@@ -440,7 +439,7 @@ def are_colourless_dashes(
     return bool(n_long <= _DASH.max_long * n_tall)
 
 
-@kernel
+@lazy_kernel
 def select_peaks(
     line: IntArray,
     table: FloatArray,

@@ -11,7 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import borrowing_kernel, inner_borrowing_kernel, inner_kernel, kernel
+from aqualvs.geometry.compiled import (
+    inner_borrowing_kernel,
+    inner_kernel,
+    lazy_borrowing_kernel,
+    lazy_kernel,
+)
 from aqualvs.geometry.linear_algebra import element_at
 from aqualvs.geometry.planes import Plane
 from aqualvs.scanning.candidates import Candidates, Subsegments
@@ -30,7 +35,7 @@ _CLUTTER, _AMBIGUOUS = np.uint8(Label.CLUTTER), np.uint8(Label.AMBIGUOUS)
 _OUT_OF_RANGE = np.uint8(Label.OUT_OF_RANGE)
 
 
-@kernel
+@lazy_kernel
 def label_other(
     members: BoolArray,
     is_mesh: bool,
@@ -86,7 +91,7 @@ def label_other(
             explained[i] = True
 
 
-@kernel
+@lazy_kernel
 def label_target(
     members: BoolArray,
     is_mesh: bool,
@@ -169,7 +174,7 @@ def _n_sources(source: IntArray) -> int:
     return n
 
 
-@kernel
+@lazy_kernel
 def label_loose(
     source: IntArray,
     component: IntArray,
@@ -256,7 +261,7 @@ def _kind_of(
     return _OUT_OF_RANGE if outside else _CLUTTER
 
 
-@borrowing_kernel
+@lazy_borrowing_kernel
 def copy_points(
     rows: IntArray,
     laser: IntArray,

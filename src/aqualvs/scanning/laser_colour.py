@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aqualvs.geometry.arrays import FloatArray, IntArray
-from aqualvs.geometry.compiled import inline_kernel, inner_kernel, kernel
-from aqualvs.geometry.linear_algebra import at_rows, element_at, sum_of, where
+from aqualvs.geometry.compiled import inline_kernel, inner_kernel, kernel, lazy_kernel
+from aqualvs.geometry.linear_algebra import at_rows, element_at, hypot, squared, sum_of, where
 from aqualvs.scanning.scan import Frame, ImagePlane
 from aqualvs.scanning.stripe import HEIGHT, IMBALANCE, STEP_U, STEP_V, TINT_U, TINT_V, TOP, WIDTH
 
@@ -301,7 +301,7 @@ def _kind_of(height: float) -> int:
     return int(_KIND_OF_HEIGHT[min(int(height), 255)])
 
 
-@kernel
+@lazy_kernel
 def _noise(table: FloatArray) -> float:
     """Return the standard deviation of a step, from how the two flanks of peaks differ.
 
@@ -328,7 +328,7 @@ def _beyond_paint(
     """
     u, v, height = left * table[STEP_U, i], left * table[STEP_V, i], table[HEIGHT, i]
     tint_u, tint_v = height * table[TINT_U, i], height * table[TINT_V, i]
-    size = math.sqrt(tint_u**2 + tint_v**2)
+    size = hypot(tint_u, tint_v)
     if size < 1e-9:
         return u, v
     share = (u * tint_u + v * tint_v) / (size * size)
@@ -336,7 +336,7 @@ def _beyond_paint(
     return u - share * tint_u, v - share * tint_v
 
 
-@kernel
+@lazy_kernel
 def _learn(table: FloatArray, u: float, v: float) -> tuple[float, float, float, float]:
     """Return direction, ratio and noise of the frame's best stripes; a ratio of 0 if unknown."""
     sigma = _noise(table)
@@ -350,7 +350,7 @@ def _learn(table: FloatArray, u: float, v: float) -> tuple[float, float, float, 
         of_u, of_v = _shown(table, best)
         line_u, line_v, is_one_colour = _middle(of_u, of_v)
         if is_one_colour:
-            size = math.hypot(line_u, line_v)
+            size = hypot(line_u, line_v)
             line_u, line_v = line_u / size, line_v / size
             for k in range(best.shape[0]):
                 of_u[k] = line_u * of_u[k] + line_v * of_v[k]
@@ -376,12 +376,12 @@ def _middle(of_u: FloatArray, of_v: FloatArray) -> tuple[float, float, bool]:
     u, v = element_at(of_u, 0.5), element_at(of_v, 0.5)
     apart = np.empty(of_u.shape[0])
     for k in range(of_u.shape[0]):
-        apart[k] = (of_u[k] - u) ** 2 + (of_v[k] - v) ** 2
-    squared = element_at(apart, 0.5)
-    return u, v, squared <= _LEARN.max_scatter**2 * (u**2 + v**2)
+        apart[k] = squared(of_u[k] - u) + squared(of_v[k] - v)
+    usual = element_at(apart, 0.5)
+    return u, v, usual <= squared(_LEARN.max_scatter) * (squared(u) + squared(v))
 
 
-@kernel
+@lazy_kernel
 def _learn_paint(table: FloatArray, n_min: float) -> tuple[float, float, float, float, float, int]:
     """Return the fields of a `Paint`, its spread across the flanks' tint, and the number near it.
 
@@ -412,23 +412,25 @@ def _learn_paint(table: FloatArray, n_min: float) -> tuple[float, float, float, 
             near_u[k], near_v[k] = abs(near_u[k] - u), abs(near_v[k] - v)
         seen_u = _PAINT.mad_to_sigma * element_at(near_u[:n_near], 0.5)
         seen_v = _PAINT.mad_to_sigma * element_at(near_v[:n_near], 0.5)
-        spread_u = math.sqrt(max(seen_u**2 - noise**2, _PAINT.min_spread**2))
-        spread_v = math.sqrt(max(seen_v**2 - noise**2, _PAINT.min_spread**2))
-        var_u, var_v = spread_u**2 + noise**2, spread_v**2 + noise**2
+        spread_u = math.sqrt(max(squared(seen_u) - squared(noise), squared(_PAINT.min_spread)))
+        spread_v = math.sqrt(max(squared(seen_v) - squared(noise), squared(_PAINT.min_spread)))
+        var_u, var_v = squared(spread_u) + squared(noise), squared(spread_v) + squared(noise)
         n_near = 0
         for k in range(n):
-            if (of_u[k] - u) ** 2 / var_u + (of_v[k] - v) ** 2 / var_v < _PAINT.of_crowd**2:
+            if squared(of_u[k] - u) / var_u + squared(of_v[k] - v) / var_v < squared(
+                _PAINT.of_crowd
+            ):
                 near_u[n_near], near_v[n_near] = of_u[k], of_v[k]
                 n_near += 1
     tint_u, tint_v = element_at(tint_of_u, 0.5), element_at(tint_of_v, 0.5)
-    size = math.hypot(tint_u, tint_v)
-    across = math.hypot(spread_u, spread_v)
+    size = hypot(tint_u, tint_v)
+    across = hypot(spread_u, spread_v)
     if size > _PAINT.min_spread:
-        across = math.hypot(tint_v * spread_u, tint_u * spread_v) / size
+        across = hypot(tint_v * spread_u, tint_u * spread_v) / size
     return u, v, spread_u, spread_v, across, n_near
 
 
-@kernel
+@lazy_kernel
 def _learn_beside_paint(
     table: FloatArray,
     u: float,
@@ -445,14 +447,19 @@ def _learn_beside_paint(
         height, step_u, step_v = table[HEIGHT, i], table[STEP_U, i], table[STEP_V, i]
         if height >= _PAINT.tall and _is_near(step_u, step_v, u, v):
             off_u, off_v = step_u - paint_u * height, step_v - paint_v * height
-            var_u, var_v = (spread_u * height) ** 2 + sigma**2, (spread_v * height) ** 2 + sigma**2
-            is_clear[i] = off_u**2 / var_u + off_v**2 / var_v > _PAINT.clear_of_paint**2
+            var_u, var_v = (
+                squared(spread_u * height) + squared(sigma),
+                squared(spread_v * height) + squared(sigma),
+            )
+            is_clear[i] = squared(off_u) / var_u + squared(off_v) / var_v > squared(
+                _PAINT.clear_of_paint
+            )
     best = where(is_clear)
     if best.shape[0] < _LEARN.min_learned:
         return u, v, 0.0, sigma, 1.0, 1.0
     of_u, of_v = _shown(table, best)
     line_u, line_v, is_one_colour = _middle(of_u, of_v)
-    size = math.hypot(line_u, line_v)
+    size = hypot(line_u, line_v)
     if size > _RATIO_MOST or not is_one_colour:
         return u, v, 0.0, sigma, 1.0, 1.0
     line_u, line_v = line_u / size, line_v / size
@@ -469,7 +476,9 @@ def _learn_beside_paint(
 def _is_near(step_u: float, step_v: float, u: float, v: float) -> bool:
     """Return whether a chroma step is within the widest angle of a direction."""
     along = u * step_u + v * step_v
-    return along > 0.0 and along**2 > _LEARN.min_cosine**2 * (step_u**2 + step_v**2)
+    return along > 0.0 and squared(along) > squared(_LEARN.min_cosine) * (
+        squared(step_u) + squared(step_v)
+    )
 
 
 @inline_kernel
@@ -494,7 +503,7 @@ def _best_stripes(
         height = table[HEIGHT, i]
         if height >= _LEARN.min_height and _is_near(table[STEP_U, i], table[STEP_V, i], u, v):
             beyond_u, beyond_v = _beyond_paint(table, i, 1.0, tint_share, np.inf)
-            size = math.sqrt(beyond_u**2 + beyond_v**2)
+            size = hypot(beyond_u, beyond_v)
             share[i] = size / (height * _colour_left(table[TOP, i])) if size > least else 0.0
     chosen = np.empty(table.shape[1], np.bool_)
     for i in range(table.shape[1]):
@@ -505,7 +514,7 @@ def _best_stripes(
     return where(chosen)
 
 
-@kernel
+@lazy_kernel
 def _useful_height(height: FloatArray, likelihood: FloatArray) -> float:
     lines, peaks = np.zeros(_N_KINDS), np.zeros(_N_KINDS)
     # Heights at which so few of a sample's peaks, or at most this share, are clearly lines are
@@ -548,7 +557,7 @@ def _weigh(
         full = ratio * height
         line = full * _colour_left(table[TOP, i])
         step_u, step_v = table[STEP_U, i], table[STEP_V, i]
-        size = math.sqrt(step_u**2 + step_v**2)
+        size = hypot(step_u, step_v)
         # A step is the largest of three, so its mean is not zero for noise alone.
         left = (
             max(
@@ -561,20 +570,25 @@ def _weigh(
         along, across = u * step_u + v * step_v, v * step_u - u * step_v
         # More of the colour than expected is no evidence against a line.
         off_line = min(along - line, 0.0)
-        var_along = sigma**2 + (along_spread * full) ** 2
-        var_across = sigma**2 + (across_spread * full) ** 2
+        var_along = squared(sigma) + squared(along_spread * full)
+        var_across = squared(sigma) + squared(across_spread * full)
         if spread_u > 0.0:
             off_u, off_v = step_u - paint_u * height, step_v - paint_v * height
-            var_u, var_v = sigma**2 + (spread_u * height) ** 2, sigma**2 + (spread_v * height) ** 2
+            var_u, var_v = (
+                squared(sigma) + squared(spread_u * height),
+                squared(sigma) + squared(spread_v * height),
+            )
             # Where both explanations hold, the narrower one has the higher density.
-            off_paint = off_u**2 / var_u + off_v**2 / var_v
+            off_paint = squared(off_u) / var_u + squared(off_v) / var_v
             off_paint -= math.log(var_along * var_across / (var_u * var_v))
         else:
             beyond_u, beyond_v = _beyond_paint(
                 table, i, left, _LIKELIHOOD.tint_share, _LIKELIHOOD.paint_share * line
             )
-            off_paint = (beyond_u**2 + beyond_v**2) / (sigma**2 + (_RATIO_OF_PAINT * height) ** 2)
-        log_odds = 0.5 * (off_paint - off_line**2 / var_along - across**2 / var_across)
+            off_paint = (squared(beyond_u) + squared(beyond_v)) / (
+                squared(sigma) + squared(_RATIO_OF_PAINT * height)
+            )
+        log_odds = 0.5 * (off_paint - squared(off_line) / var_along - squared(across) / var_across)
         if size > _LEARN.clear_sigmas * sigma and along < _LEARN.min_cosine * left * size:
             # Light of another colour.
             log_odds = -_LIKELIHOOD.max_log_odds

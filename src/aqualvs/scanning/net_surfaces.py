@@ -17,12 +17,12 @@ import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import (
-    borrowing_kernel,
     inline_borrowing_kernel,
     inner_kernel,
-    kernel,
+    lazy_borrowing_kernel,
+    lazy_kernel,
 )
-from aqualvs.geometry.linear_algebra import invert_symmetric, median_of, solve_symmetric
+from aqualvs.geometry.linear_algebra import invert_symmetric, median_of, solve_symmetric, squared
 from aqualvs.geometry.planes import Plane
 from aqualvs.scanning.candidates import Subsegments
 from aqualvs.scanning.patch import height_over
@@ -129,7 +129,7 @@ def merged_plane(
     return Plane(m / length, 1.0 / length)
 
 
-@borrowing_kernel
+@lazy_borrowing_kernel
 def share_near(points: FloatArray, laser: IntArray, patch: FloatArray, near: float) -> float:
     """Return the share of a laser's strands that are nearer to a surface than `near`, in metres.
 
@@ -193,7 +193,7 @@ def fit_mean(
     return PlaneFit(m, covariance, weights, rms) if np.isfinite(rms) else None
 
 
-@kernel
+@lazy_kernel
 def _fit_mean(
     points: FloatArray,
     laser: IntArray,
@@ -214,7 +214,7 @@ def _fit_mean(
         usual = max(_usual_distance(off, laser), exact) if reject else np.inf
         cut = TUKEY * 1.4826 * usual
         for i in range(n):
-            weights[i] = max(1.0 - (off[i] / cut) ** 2, 0.0) ** 2
+            weights[i] = squared(max(1.0 - squared(off[i] / cut), 0.0))
         normal_equations(points, one, weights, normal, right)
         if not solve_symmetric(normal, right, inverse, m):
             return np.nan
@@ -274,7 +274,7 @@ def disagreement(posture: Posture, other: Posture) -> float:
     return _squared_distance(_apart(posture, other), other.covariance)
 
 
-@kernel
+@lazy_kernel
 def _squared_distance(apart: FloatArray, covariance: FloatArray) -> float:
     """Return the square of a difference over a covariance; infinite if that is singular."""
     solved = np.empty(3)
@@ -359,7 +359,7 @@ def describe_pattern(
     return StripePattern(is_mesh, is_gappy, is_unbroken, extent, on_strands)
 
 
-@kernel
+@lazy_kernel
 def _describe(
     table: FloatArray,
     intensity_weight: FloatArray,
@@ -443,7 +443,7 @@ def _describe_stripe(
     curved_weight = 0.21
     for k in range(n):
         c = order[k]
-        distance[k] = np.sqrt(table[0, c] ** 2 + table[1, c] ** 2 + table[2, c] ** 2)
+        distance[k] = np.sqrt(squared(table[0, c]) + squared(table[1, c]) + squared(table[2, c]))
         gap = first_line[c] - end
         if gap >= _MIN_GAP_LINES:
             lit[n_intervals] = end - begin
@@ -494,7 +494,7 @@ def _extent(n_lines: IntArray, first_line: IntArray, last_line: IntArray, order:
     return float(end - begin + 1)
 
 
-@borrowing_kernel
+@lazy_borrowing_kernel
 def distances_off(points: FloatArray, normal: FloatArray, offset: float, off: FloatArray) -> None:
     """Write the distances of points (N, 3) from a plane, as shares of its own."""
     nx, ny, nz = normal[0] / offset, normal[1] / offset, normal[2] / offset
@@ -502,7 +502,7 @@ def distances_off(points: FloatArray, normal: FloatArray, offset: float, off: Fl
         off[i] = abs(nx * points[i, 0] + ny * points[i, 1] + nz * points[i, 2] - 1.0)
 
 
-@kernel
+@lazy_kernel
 def mark_beside(
     source: IntArray, net_mask: BoolArray, off: FloatArray, most: float, beside: BoolArray
 ) -> None:

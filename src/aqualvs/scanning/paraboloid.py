@@ -15,8 +15,14 @@ from typing import NamedTuple
 import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import ZERO, inner_borrowing_kernel, inner_kernel, kernel
-from aqualvs.geometry.linear_algebra import factorise, inverse_of, median_of, solve_factorised
+from aqualvs.geometry.compiled import ZERO, inner_borrowing_kernel, inner_kernel, lazy_kernel
+from aqualvs.geometry.linear_algebra import (
+    factorise,
+    inverse_of,
+    median_of,
+    solve_factorised,
+    squared,
+)
 from aqualvs.geometry.planes import Plane
 from aqualvs.scanning.candidates import Observations
 from aqualvs.scanning.patch import (
@@ -42,7 +48,7 @@ MIN_PIECES = 12
 """Least number of observations of a patch."""
 
 
-@kernel
+@lazy_kernel
 def fit_over(
     points: FloatArray,
     sensitivity: FloatArray,
@@ -100,7 +106,7 @@ def fit_over(
     scale, rms, inverse = reweight(terms, height, sigma, inside, coefficients, weights)
     for j in range(N):
         for k in range(N):
-            covariance[j, k] = inverse[j, k] * max(scale, 1.0) ** 2
+            covariance[j, k] = inverse[j, k] * squared(max(scale, 1.0))
     for i in range(n):
         pull[i] = weights[i] * per_px[i] / (sigma[i] * sigma[i])
     add_shared(terms, pull, line, laser, shared, inverse, covariance)
@@ -146,7 +152,7 @@ def _asked_for(
     return bool(n_inside >= more_intensity * n_on_plane or less)
 
 
-@kernel
+@lazy_kernel
 def curvature_hint(
     points: FloatArray,
     sensitivity: FloatArray,
@@ -215,8 +221,8 @@ def _solve(
     right = np.zeros(N)
     factor[:] = 0.0
     for k in (3, 5):
-        factor[k, k] = 1.0 / SIGMA_CURVATURE**2
-    factor[4, 4] = 1.0 / SIGMA_TWIST**2
+        factor[k, k] = 1.0 / squared(SIGMA_CURVATURE)
+    factor[4, 4] = 1.0 / squared(SIGMA_TWIST)
     for i in range(terms.shape[0]):
         w = weight[i]
         if w == 0.0:
@@ -332,7 +338,7 @@ def reweight(
                 n_inside += 1
         scale = max(1.4826 * median_of(weight[:n_inside]), 0.1)
         for i in range(n):
-            rest = max(1.0 - (z[i] / (TUKEY * scale)) ** 2, 0.0)
+            rest = max(1.0 - squared(z[i] / (TUKEY * scale)), 0.0)
             weights[i] = rest * rest if inside[i] else 0.0
             weight[i] = weights[i] / (sigma[i] * sigma[i])
         if not _solve(terms, height, weight, factor, coefficients):

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray, IntArray
-from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel, kernel
+from aqualvs.geometry.compiled import inline_borrowing_kernel, lazy_borrowing_kernel, lazy_kernel
 from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig_covariance import FittedSurface, posture_by_plane
 
@@ -31,14 +31,14 @@ def height_over(patch: FloatArray, x: float, y: float, z: float) -> float:
     return float(patch[0] * x + patch[1] * y + patch[2] * z - patch[OFFSET] - height)
 
 
-@borrowing_kernel
+@lazy_borrowing_kernel
 def heights_over(points: FloatArray, patch: FloatArray, off: FloatArray) -> None:
     """Write the distances of points (N, 3) behind a patch (16,)."""
     for i in range(points.shape[0]):
         off[i] = height_over(patch, points[i, 0], points[i, 1], points[i, 2])
 
 
-@borrowing_kernel
+@lazy_borrowing_kernel
 def write_tangent(patch: FloatArray, m: FloatArray) -> bool:
     """Write m = n/d of the tangent plane at the point nearest to the origin; False without one."""
     a, b, c, p, q, r = patch[10], patch[11], patch[12], patch[13], patch[14], patch[15]
@@ -69,7 +69,7 @@ def write_tangent(patch: FloatArray, m: FloatArray) -> bool:
     return True
 
 
-@kernel
+@lazy_kernel
 def tangent_jacobian(patch: FloatArray, sigma: FloatArray, m: FloatArray, out: FloatArray) -> bool:
     """Write the derivatives (3, 6) of m by the coefficients, by differences; False if undefined.
 
@@ -87,7 +87,7 @@ def tangent_jacobian(patch: FloatArray, sigma: FloatArray, m: FloatArray, out: F
     return True
 
 
-@kernel
+@lazy_kernel
 def carry_to_tangent(
     patch: FloatArray, covariance: FloatArray, m: FloatArray, out: FloatArray
 ) -> None:
@@ -108,7 +108,7 @@ def carry_to_tangent(
             out[i, j] = total
 
 
-@borrowing_kernel
+@lazy_borrowing_kernel
 def write_terms(points: FloatArray, patch: FloatArray, terms: FloatArray) -> None:
     """Write the factors (N, 6) of a patch's coefficients at points (N, 3)."""
     for i in range(points.shape[0]):
@@ -253,7 +253,7 @@ def fitted_patch(patch: Patch, m: FloatArray, points: FloatArray) -> FittedSurfa
     return FittedSurface(terms, CURVATURE_PRIOR, normal, -bend, posture_by_plane(m) @ by_terms)
 
 
-@kernel
+@lazy_kernel
 def intensity_share_near(
     group: IntArray, confidence: FloatArray, points: FloatArray, patch: FloatArray, near: float
 ) -> float:

@@ -7,13 +7,14 @@ from typing import NamedTuple
 import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import inner_kernel, kernel
+from aqualvs.geometry.compiled import inner_kernel, lazy_kernel
 from aqualvs.geometry.linear_algebra import (
     factorise,
     invert_symmetric,
     median_of,
     solve_factorised,
     solve_symmetric,
+    squared,
 )
 
 SHARED_ERROR_PX = 0.015
@@ -156,7 +157,7 @@ def fit_robust(
     return PlaneFit(m, covariance, weights, rms)
 
 
-@kernel
+@lazy_kernel
 def plane_of_all(points: FloatArray, m: FloatArray) -> bool:
     """Write the m of m·X = 1 that best fits points (N, 3), unweighted; False if undetermined."""
     normal, right, inverse = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
@@ -203,7 +204,7 @@ def normal_equations(
                 normal[j, k] += w * points[i, j] * points[i, k]
 
 
-@kernel
+@lazy_kernel
 def _fit(
     points: FloatArray,
     sensitivity: FloatArray,
@@ -282,15 +283,15 @@ def _huber_factor(z: FloatArray, cut: float) -> float:
     scatter = 0.0
     slope = 0.0
     for i in range(n):
-        u = (z[i] / cut) ** 2
+        u = squared(z[i] / cut)
         if u < 1.0:
-            scatter += (z[i] * (1.0 - u) ** 2) ** 2
+            scatter += squared(z[i] * squared(1.0 - u))
             slope += (1.0 - u) * (1.0 - 5.0 * u)
     slope /= n
     if not slope > 0.0:
         return np.inf
     correction = 1.0 + 3.0 / n * (1.0 - slope) / slope
-    return float(correction**2 * scatter / (n - 3) / slope**2)
+    return float(squared(correction) * scatter / (n - 3) / squared(slope))
 
 
 @inner_kernel
@@ -378,7 +379,7 @@ def _expected_square(matrix: FloatArray, residual: FloatArray) -> float:
         if not factorise(lower, 0.0, 0.0, lower):
             continue
         solve_factorised(lower, residual, solved)
-        total = -((math.log(t) / spread) ** 2) - n_modes * math.log(t)
+        total = -(squared(math.log(t) / spread)) - n_modes * math.log(t)
         for a in range(n_modes):
             total += residual[a] * solved[a] - 2.0 * math.log(lower[a, a])
         log_weight[f] = 0.5 * total
@@ -420,7 +421,7 @@ def _weighted_rms(off: FloatArray, weights: FloatArray, m: FloatArray) -> float:
     return float(np.sqrt(total / weight) / length)
 
 
-@kernel
+@lazy_kernel
 def mark_inliers(
     group: IntArray,
     laser: IntArray,
@@ -473,7 +474,7 @@ def mark_inliers(
     return n, np.sqrt(square), second
 
 
-@kernel
+@lazy_kernel
 def weigh_candidates(
     group: IntArray,
     m: FloatArray,

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray
-from aqualvs.geometry.compiled import borrowing_kernel
+from aqualvs.geometry.compiled import lazy_borrowing_kernel
 from aqualvs.optics.rig_covariance import posture_by_plane
 from aqualvs.scanning.plane_fit import PlaneFit
 
@@ -212,7 +212,7 @@ def range_pitch_yaw(m: FloatArray) -> tuple[float, float, float]:
     return 1.0 / math.hypot(x, y, z), math.atan2(z, y), math.atan2(x, y)
 
 
-@borrowing_kernel
+@lazy_borrowing_kernel
 def count_inliers(points: FloatArray, weights: FloatArray) -> tuple[int, float]:
     """Return the number of points (N, 3) with a weight, and the least distance from the origin."""
     n, square = 0, np.inf

@@ -15,10 +15,10 @@ import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import (
-    borrowing_kernel,
     inline_borrowing_kernel,
     inner_kernel,
     kernel,
+    lazy_borrowing_kernel,
 )
 from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig import Rig
@@ -176,7 +176,7 @@ def in_crossing(
     return False
 
 
-@borrowing_kernel
+@lazy_borrowing_kernel
 def places_along(line: FloatArray, laser: IntArray, n_lines: IntArray, along: FloatArray) -> None:
     """Write places along the stripes, from -1 at one image border to 1 at the other.
 

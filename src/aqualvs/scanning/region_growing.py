@@ -14,8 +14,8 @@ no such neighbours, or are farther off than the right candidate of the same ligh
 import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import inner_kernel, kernel
-from aqualvs.geometry.linear_algebra import median_of, order_of
+from aqualvs.geometry.compiled import inner_kernel, lazy_kernel
+from aqualvs.geometry.linear_algebra import median_of, order_of, squared
 from aqualvs.scanning.net_surfaces import LONGEST_INTERVAL
 
 # Limits of light on a plane, and of light beside it, as shares of the range.
@@ -112,7 +112,7 @@ _LONELY_SHARE = 0.015
 _MAX_TRIED = 2
 
 
-@kernel
+@lazy_kernel
 def grow_region(
     points: FloatArray,
     line: IntArray,
@@ -202,7 +202,7 @@ def _describe(
         for k in (HEIGHT, LINE, CONFIDENCE, ON_NET, TAKEN):
             facts[k, s] /= facts[LINES, s]
         for k in range(3):
-            facts[SIZE, s] += (points[first[s], k] - points[last[s], k]) ** 2
+            facts[SIZE, s] += squared(points[first[s], k] - points[last[s], k])
         facts[SIZE, s] = np.sqrt(facts[SIZE, s])
 
 

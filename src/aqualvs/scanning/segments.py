@@ -23,7 +23,7 @@ from aqualvs.geometry.compiled import (
     inline_borrowing_kernel,
     inner_borrowing_kernel,
     inner_kernel,
-    kernel,
+    lazy_kernel,
 )
 from aqualvs.geometry.linear_algebra import solve_symmetric
 from aqualvs.scanning.laser_bands import SLOPE_CELL, LaserBand
@@ -141,7 +141,7 @@ def component_shapes(
     )
 
 
-@kernel
+@lazy_kernel
 def describe_components(
     component: IntArray,
     line: IntArray,
@@ -369,7 +369,7 @@ def in_a_row(line: IntArray, position: FloatArray) -> BoolArray:
     return long
 
 
-@kernel
+@lazy_kernel
 def segment_peaks(
     line: IntArray,
     position: FloatArray,

@@ -21,11 +21,11 @@ from numpy.typing import NDArray
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import (
     ZERO,
-    borrowing_kernel,
     inline_borrowing_kernel,
     inner_borrowing_kernel,
     inner_kernel,
-    kernel,
+    lazy_borrowing_kernel,
+    lazy_kernel,
 )
 from aqualvs.geometry.linear_algebra import sum_of, where
 from aqualvs.geometry.planes import Plane
@@ -134,7 +134,7 @@ LINES, INLIER_WEIGHT, SAMPLING_WEIGHT = range(3)
 """Sums over a surface: search lines on it, light, and sampling weight."""
 
 
-@kernel
+@lazy_kernel
 def search_surfaces(
     table: FloatArray,
     intensity_weight: FloatArray,
@@ -271,7 +271,7 @@ def _collect(
     return n
 
 
-@kernel
+@lazy_kernel
 def collect_surface(
     table: FloatArray,
     n_lines: IntArray,
@@ -305,7 +305,7 @@ def collect_surface(
     sums[SAMPLING_WEIGHT] = on_two(by_laser[SAMPLING_WEIGHT])
 
 
-@borrowing_kernel
+@lazy_borrowing_kernel
 def on_two(weight: FloatArray) -> float:
     """Sum over the lasers, the first of them with at most three times the second's share."""
     total, first, second = 0.0, 0.0, 0.0

@@ -9,6 +9,7 @@ from aqualvs.geometry.compiled import (
     borrowing_kernel,
     inline_borrowing_kernel,
     inner_borrowing_kernel,
+    lazy_borrowing_kernel,
 )
 from aqualvs.optics.camera import Camera, rays_all
 from aqualvs.optics.rig import Rig
@@ -131,7 +132,7 @@ def _intersect(
     return all_valid
 
 
-@borrowing_kernel
+@lazy_borrowing_kernel
 def _place_rays(
     pixels: FloatArray, along_x: IntArray, group: IntArray, rays_px: FloatArray, owner: IntArray
 ) -> int:

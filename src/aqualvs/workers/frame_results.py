@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from aqualvs.errors import AqualvsError
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import borrowing_kernel
+from aqualvs.geometry.compiled import lazy_borrowing_kernel
 from aqualvs.optics.rig import Rig
 from aqualvs.scanner import Scanner
 from aqualvs.scanning.laser_bands import plan_bands
@@ -91,7 +91,7 @@ class BareLensComparison:
         return fit_robust(points, sensitivity, np.ones(n), laser, np.zeros(n), start, shared)
 
 
-@borrowing_kernel
+@lazy_borrowing_kernel
 def _pick(
     used: BoolArray,
     laser: NDArray[np.int8],
