@@ -4,12 +4,15 @@ A laser sheet, limited to the working range, is seen only in a band of the image
 the rig. The band replaces the hand-drawn areas of the paper (section 3.1).
 """
 
+import functools
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.geometry.planes import Rays
 from aqualvs.geometry.transforms import rotation_from_rotvec
 from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import Rig
@@ -90,8 +93,12 @@ def plan_bands(rig: Rig, camera: Camera, field: Field | None = None) -> tuple[La
     tuple of LaserBand
         In the order of `rig.lasers`.
     """
+    # All lasers are seen along the rays of the same pixels.
+    rays = functools.cache(functools.partial(_rays_on_grid, camera))
     return tuple(
-        _plan_band(sheet, LaserColour.of(laser.wavelength_nm), rig.working_range, camera, field)
+        _plan_band(
+            sheet, LaserColour.of(laser.wavelength_nm), rig.working_range, camera, field, rays
+        )
         for sheet, laser in zip(sheets_of(rig), rig.lasers, strict=True)
     )
 
@@ -102,9 +109,11 @@ def _plan_band(
     working_range: tuple[float, float],
     camera: Camera,
     field: Field | None,
+    rays: Callable[[tuple[int, int]], Rays],
 ) -> LaserBand:
-    points, in_band = _points_on_grid(sheet, working_range, camera, (SLOPE_CELL, SLOPE_CELL))
-    rise, run = _stripe_directions(points)
+    fine = (SLOPE_CELL, SLOPE_CELL)
+    points, in_band = _points_on_grid(sheet, working_range, rays(fine))
+    rise, run = _stripe_directions(points, _target_normals()[:1])
     axis = _search_axis(rise[0], run[0], in_band)
     along_x = axis is SearchAxis.ALONG_X
     line_px, shift_px = pixels_per_line(camera.size_px), 0.0
@@ -112,11 +121,12 @@ def _plan_band(
         line_px, shift_px = 2, FIRST_ROW[field] - 0.5
     wide = SLOPE_CELL * line_px
     steps = (SLOPE_CELL, wide) if along_x else (wide, SLOPE_CELL)
-    points, in_band = _points_on_grid(sheet, working_range, camera, steps)
+    if steps != fine:
+        points, in_band = _points_on_grid(sheet, working_range, rays(steps))
     if along_x:
         points, in_band = points.swapaxes(0, 1), in_band.T
     # Seen with search lines as columns, the change along a line is the rise.
-    rise, run = _stripe_directions(points)
+    rise, run = _stripe_directions(points, _target_normals())
     length, n_pixels = camera.size_px if along_x else camera.size_px[::-1]
     lowest, highest = _band_limits(in_band, n_pixels // line_px, length)
     position_px = 1.0 if along_x or field is None else 2.0
@@ -124,14 +134,19 @@ def _plan_band(
     return LaserBand(axis, line_px, lowest, highest, *slopes, colour, shift_px, position_px)
 
 
-def _points_on_grid(
-    sheet: Sheet, working_range: tuple[float, float], camera: Camera, steps: tuple[int, int]
-) -> tuple[FloatArray, BoolArray]:
-    """Return points on the sheet that a grid of pixels sees, and a mask of those in range."""
+def _rays_on_grid(camera: Camera, steps: tuple[int, int]) -> Rays:
+    """Return the rays of a grid of pixels, rows first: steps along x and y, in pixels."""
     width, height = camera.size_px
     x = np.arange(0, width + steps[0], steps[0], dtype=np.float64)
     y = np.arange(0, height + steps[1], steps[1], dtype=np.float64)
-    points, valid = sheet.intersect(camera.rays(np.stack(np.meshgrid(x, y), axis=-1)))
+    return camera.rays(np.stack(np.meshgrid(x, y), axis=-1))
+
+
+def _points_on_grid(
+    sheet: Sheet, working_range: tuple[float, float], rays: Rays
+) -> tuple[FloatArray, BoolArray]:
+    """Return points on the sheet that a grid of rays meets, and a mask of those in range."""
+    points, valid = sheet.intersect(rays)
     distance = np.linalg.norm(points, axis=-1)
     near, far = search_range(working_range)
     # Factor on the far range: off the axis, points of a target there are farther by up to this
@@ -143,18 +158,23 @@ def _points_on_grid(
     return points, in_band
 
 
-def _stripe_directions(points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the stripe direction (rise along the rows, run along the columns) for several targets.
-
-    The stripe of a target n·X = d is the contour line of n·X over the image; square first.
-    """
+@functools.cache
+def _target_normals() -> FloatArray:
+    """Return the normals (5, 3) of targets that bound a stripe's direction; square first."""
     tilts = [np.zeros(3)]
     # Largest angle of a target from square to the vehicle; it bounds the stripe's direction.
     max_target_tilt = np.deg2rad(45.0)
     for sign in (-1.0, 1.0):
         tilts += [np.array([sign * max_target_tilt, 0.0, 0.0])]
         tilts += [np.array([0.0, 0.0, sign * max_target_tilt])]
-    normals = np.stack([rotation_from_rotvec(tilt) @ np.array([0.0, 1.0, 0.0]) for tilt in tilts])
+    return np.stack([rotation_from_rotvec(tilt) @ np.array([0.0, 1.0, 0.0]) for tilt in tilts])
+
+
+def _stripe_directions(points: FloatArray, normals: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the stripe direction (rise along the rows, run along the columns) for several targets.
+
+    The stripe of a target n·X = d is the contour line of n·X over the image.
+    """
     with np.errstate(invalid="ignore"):
         height = np.einsum("nk,vuk->nvu", normals, points)
         along_y, along_x = np.gradient(height, axis=(1, 2))
