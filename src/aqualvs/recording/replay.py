@@ -1,5 +1,6 @@
 """A recorded dive, frame by frame, with the stripes that the scanner detected."""
 
+import functools
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -54,8 +55,6 @@ class DiveRecording:
         As the dive was measured; likewise.
     n_frames : int or None
         None where a torn file does not say.
-    fps : float or None
-        Mean rate.
 
     Raises
     ------
@@ -80,7 +79,21 @@ class DiveRecording:
             raise SourceError(f"{path}: holds no stripes; give a recording of aqualvs, or a video")
         self.n_frames = self._file.count(STRIPES.name)  # None where a torn file does not say.
         self.has_pictures = next(self._file.messages([PICTURE.name]), None) is not None
-        self.fps = self._mean_rate()  # Mean rate.
+
+    @functools.cached_property
+    def fps(self) -> float | None:
+        """Frames per second over the first few of them, which are read when it is asked for.
+
+        Raises `SourceError` if a message cannot be understood.
+        """
+        first = last = None
+        for n, frame in enumerate(self.frames(with_pictures=False)):
+            first, last = first or frame, frame
+            if n == 50:
+                break
+        if first is None or last is None or last.time_s <= first.time_s:
+            return None
+        return (last.index - first.index) / (last.time_s - first.time_s)
 
     def need_rig(self) -> Rig:
         """Return the rig.
@@ -135,17 +148,6 @@ class DiveRecording:
                 "was it written by a later version?"
             ) from fault
         return RecordedFrame(index, time_s, n_water, peaks, refusal, turning, picture)
-
-    def _mean_rate(self) -> float | None:
-        """Return frames per second over the first few of them."""
-        first = last = None
-        for n, frame in enumerate(self.frames(with_pictures=False)):
-            first, last = first or frame, frame
-            if n == 50:
-                break
-        if first is None or last is None or last.time_s <= first.time_s:
-            return None
-        return (last.index - first.index) / (last.time_s - first.time_s)
 
 
 def is_recording(path: Path) -> bool:
