@@ -6,6 +6,7 @@ the common forms of colour blindness.
 
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Self
 
 from aqualvs.scanning.posture import Reason
 from aqualvs.scanning.scan import Label
@@ -26,6 +27,21 @@ class Finding:
 
     severity: Severity
     sentence: str  # What was found, with the value, and the remedy where one is needed.
+
+    @classmethod
+    def ok(cls, sentence: str) -> Self:
+        """Return a finding that nothing is wrong."""
+        return cls(Severity.OK, sentence)
+
+    @classmethod
+    def warn(cls, sentence: str) -> Self:
+        """Return a warning."""
+        return cls(Severity.WARN, sentence)
+
+    @classmethod
+    def bad(cls, sentence: str) -> Self:
+        """Return a finding of what does not work as it is."""
+        return cls(Severity.BAD, sentence)
 
 
 REASON_WORDS: dict[str, str] = {

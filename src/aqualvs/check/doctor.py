@@ -76,17 +76,16 @@ def autopilot(address: str, vehicle: VehicleSetup, rig: Path | None = None) -> I
             time.sleep(0.05)
         heard, health = link.autopilot(), link.health()
         if heard is None:
-            yield Finding(
-                Severity.BAD,
+            yield Finding.bad(
                 f"{address}: no heartbeat of an autopilot in {_HEARTBEAT_S:.0f} s "
                 f"({health.detail}); add this machine as an endpoint in BlueOS, or check address "
-                "and port",
+                "and port"
             )
             return
-        severity = Severity.OK if health.state is State.OK else Severity.WARN
-        yield Finding(severity, f"{address}: {health.detail}")
+        answered = Finding.ok if health.state is State.OK else Finding.warn
+        yield answered(f"{address}: {health.detail}")
         if heard.message.type != _SUBMARINE:
-            yield Finding(Severity.WARN, "not ArduSub: live sends to it, follow cannot steer it")
+            yield Finding.warn("not ArduSub: live sends to it, follow cannot steer it")
             return
         yield from _ardusub(link, vehicle, working_range)
 
@@ -109,14 +108,14 @@ def _ardusub(
     yield _attitude(attitude_hz)
     yield _channels(channels_hz)
     if not told:
-        yield Finding(
-            Severity.WARN,
+        yield Finding.warn(
             "no parameter is told: the vehicle does not answer us; look its settings up in the "
-            "ground station (docs/ardusub.md lists them)",
+            "ground station (docs/ardusub.md lists them)"
         )
         return
     yield advise_on_station(told, steering.ground_station)
-    yield from advise_on_fail_safe(told) + advise_on_speed(told)
+    yield from advise_on_fail_safe(told)
+    yield from advise_on_speed(told)
     yield from advise_on_distance(told, working_range)
 
 
@@ -133,13 +132,12 @@ def _station(link: MavlinkLink, steering: ArduSubOptions) -> Finding:
     station = steering.ground_station
     beat = link.latest("HEARTBEAT", system=station)
     if beat is not None and beat.age_s < _LISTEN_S:
-        return Finding(Severity.OK, f"ground station {station} is heard")
+        return Finding.ok(f"ground station {station} is heard")
     if steering.station_timeout_s is None:
-        return Finding(Severity.OK, f"ground station {station} is not heard, and need not be")
-    return Finding(
-        Severity.WARN,
+        return Finding.ok(f"ground station {station} is not heard, and need not be")
+    return Finding.warn(
         f"ground station {station} is not heard: follow does not engage; let the router forward "
-        "its heartbeat, or set ground_station in the vehicle file",
+        "its heartbeat, or set ground_station in the vehicle file"
     )
 
 
@@ -148,11 +146,10 @@ def _attitude(rate_hz: float) -> Finding:
     enough_hz = 10.0
     words = f"ATTITUDE {rate_hz:.0f} Hz"
     if rate_hz >= enough_hz:
-        return Finding(Severity.OK, f"{words}: follow hears the vehicle between its heartbeats")
-    return Finding(
-        Severity.WARN,
+        return Finding.ok(f"{words}: follow hears the vehicle between its heartbeats")
+    return Finding.warn(
         f"{words}: follow takes the vehicle for silent between its heartbeats; set MAV1_EXTRA1 "
-        f"{enough_hz:.0f} (before 4.7: SR0_EXTRA1; the number is that of the autopilot's port)",
+        f"{enough_hz:.0f} (before 4.7: SR0_EXTRA1; the number is that of the autopilot's port)"
     )
 
 
@@ -161,14 +158,11 @@ def _channels(rate_hz: float) -> Finding:
     enough_hz = 5.0
     words = f"RC_CHANNELS {rate_hz:.0f} Hz"
     if rate_hz >= enough_hz:
-        return Finding(
-            Severity.OK, f"{words}: follow sees the pilot's sticks, and whether ours are obeyed"
-        )
-    return Finding(
-        Severity.WARN,
+        return Finding.ok(f"{words}: follow sees the pilot's sticks, and whether ours are obeyed")
+    return Finding.warn(
         f"{words}: follow sees the pilot's sticks late or not at all, and not whether ours are "
         "obeyed; set MAV1_RC_CHAN 10 (before 4.7: SR0_RC_CHAN; the number is that of the "
-        "autopilot's port)",
+        "autopilot's port)"
     )
 
 
@@ -225,7 +219,7 @@ def _guarded(look: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:
     try:
         yield from look()
     except AqualvsError as fault:
-        yield Finding(Severity.BAD, str(fault))
+        yield Finding.bad(str(fault))
 
 
 def _machine() -> Iterator[Finding]:
@@ -235,22 +229,19 @@ def _machine() -> Iterator[Finding]:
     free_gb = shutil.disk_usage(Path.cwd()).free / 1e9
     min_free_gb = 2.0
     if free_gb < min_free_gb:
-        yield Finding(
-            Severity.WARN, f"only {free_gb:.1f} GB free here; recordings need about 1 GB an hour"
-        )
+        yield Finding.warn(f"only {free_gb:.1f} GB free here; recordings need about 1 GB an hour")
 
 
 def _packages() -> Iterator[Finding]:
     for extra, (packages, purpose) in _EXTRAS.items():
         missing = [name for name in packages if not _installed(name)]
         if missing:
-            yield Finding(
-                Severity.WARN,
-                f"{purpose}: {', '.join(missing)} missing; pip install 'aqualvs[{extra}]'",
+            yield Finding.warn(
+                f"{purpose}: {', '.join(missing)} missing; pip install 'aqualvs[{extra}]'"
             )
         else:
             told = ", ".join(f"{name} {importlib.metadata.version(name)}" for name in packages)
-            yield Finding(Severity.OK, f"{purpose}: {told}")
+            yield Finding.ok(f"{purpose}: {told}")
 
 
 def _installed(package: str) -> bool:
@@ -267,7 +258,7 @@ def _pipeline() -> Iterator[Finding]:
         rig = load_rig(folder / "rig.yaml")
         with open_source(folder / "dive.mp4") as source:
             frames = list(itertools.islice(source, _N_FRAMES))
-        yield Finding(Severity.OK, f"H.264 decoded: {len(frames)} frames of the bundled dive")
+        yield Finding.ok(f"H.264 decoded: {len(frames)} frames of the bundled dive")
         yield _speed(rig, frames)
 
 
@@ -288,16 +279,16 @@ def _speed(rig: Rig, frames: list[Frame]) -> Finding:
         f"{width}x{height} px, first after {ready_s:.1f} s"
     )
     if n_valid < 0.9 * len(frames):
-        return Finding(Severity.BAD, f"{words}; the installation is broken, install aqualvs again")
+        return Finding.bad(f"{words}; the installation is broken, install aqualvs again")
     if middle > 0.5 / _FRAME_RATE:
-        return Finding(Severity.WARN, f"{words}; too slow for {_FRAME_RATE:.0f} frames a second")
-    return Finding(Severity.OK, words)
+        return Finding.warn(f"{words}; too slow for {_FRAME_RATE:.0f} frames a second")
+    return Finding.ok(words)
 
 
 def _rig_file(path: Path) -> Iterator[Finding]:
     rig = load_rig(path)
     size = "x".join(map(str, rig.size_px))
-    yield Finding(Severity.OK, f"rig {rig.name!r}: {size} px, lasers: {len(rig.lasers)}")
+    yield Finding.ok(f"rig {rig.name!r}: {size} px, lasers: {len(rig.lasers)}")
     shutter = shutter_finding(rig)
     if shutter is not None:
         yield shutter
@@ -308,10 +299,9 @@ def _stream(where: str, rig_file: Path | None) -> Iterator[Finding]:
     rig = None if rig_file is None else load_rig(rig_file)
     frames, span_s, health = _received(where)
     if not frames:
-        yield Finding(
-            Severity.BAD,
+        yield Finding.bad(
             f"{where}: no picture in {_STREAM_S:.0f} s ({health}); is the sender on, its address "
-            "this machine's, the port open in the firewall?",
+            "this machine's, the port open in the firewall?"
         )
         return
     height, width = frames[-1].luma.shape
@@ -338,7 +328,7 @@ def _fields(where: str, shutter: Shutter, frames: list[Frame]) -> Iterator[Findi
     fps = (frames[-1].index - frames[0].index) / span_s if span_s > 0.0 else None
     wrong = FieldEvidence.of(groups, first_field).contradiction(shutter, fps)
     if wrong:
-        yield Finding(Severity.WARN, f"{where}: {wrong}")
+        yield Finding.warn(f"{where}: {wrong}")
 
 
 def _received(where: str) -> tuple[list[Frame], float, str]:
@@ -367,10 +357,9 @@ def _fit(rig: Rig, frames: list[Frame]) -> Finding:
     height, width = frames[-1].luma.shape
     if (width, height) != rig.size_px:
         need = "x".join(map(str, rig.size_px))
-        return Finding(
-            Severity.BAD,
+        return Finding.bad(
             f"the rig {rig.name!r} has pictures of {need} px; set the camera to that mode, or "
-            "calibrate in this one",
+            "calibrate in this one"
         )
     scanner = Scanner(rig)
     frames = list(frames_of(frames, rig.shutter))
@@ -378,5 +367,5 @@ def _fit(rig: Rig, frames: list[Frame]) -> Finding:
     words = f"posture in {n_valid} of {len(frames)} frames with the rig {rig.name!r}"
     if not n_valid:
         reason = scanner.process(frames[-1]).posture
-        return Finding(Severity.WARN, f"{words}: {getattr(reason, 'detail', '')}")
-    return Finding(Severity.OK, words)
+        return Finding.warn(f"{words}: {getattr(reason, 'detail', '')}")
+    return Finding.ok(words)

@@ -61,9 +61,7 @@ def check_errors(errors: Sequence[ExpectedError]) -> Iterator[Finding]:
     for expected in errors:
         place = f"At {expected.wall_range * 1e3:.0f} mm"
         if not expected.valid:
-            yield Finding(
-                Severity.WARN, f"{place} the stripes in the picture do not determine a plane."
-            )
+            yield Finding.warn(f"{place} the stripes in the picture do not determine a plane.")
             continue
         yield _noise_finding(expected, place)
         yield _calibration_finding(expected, place)
@@ -76,10 +74,8 @@ def _noise_finding(expected: ExpectedError, place: str) -> Finding:
         f"range, {pitch:.2g} degrees in pitch and {yaw:.2g} in yaw"
     )
     if range_mm > 0.01e3 * expected.wall_range or max(pitch, yaw) > 1.0:
-        return Finding(
-            Severity.WARN, f"{sentence}; put the lasers farther from the camera or across."
-        )
-    return Finding(Severity.OK, f"{sentence}.")
+        return Finding.warn(f"{sentence}; put the lasers farther from the camera or across.")
+    return Finding.ok(f"{sentence}.")
 
 
 def _calibration_finding(expected: ExpectedError, place: str) -> Finding:
@@ -92,12 +88,11 @@ def _calibration_finding(expected: ExpectedError, place: str) -> Finding:
     # Systematic errors that a user should know of before the dive.
     large_share, large_angle_deg = 0.005, 0.5
     if share > large_share or max(pitch, yaw) > large_angle_deg:
-        return Finding(
-            Severity.WARN,
+        return Finding.warn(
             f"{sentence}, more than {large_share:.1%} or {large_angle_deg} degrees; calibrate "
-            "what is only assumed, or again with more pictures, nearer and farther ones.",
+            "what is only assumed, or again with more pictures, nearer and farther ones."
         )
-    return Finding(Severity.OK, f"{sentence}.")
+    return Finding.ok(f"{sentence}.")
 
 
 def sensitivity_table(rig: Rig, errors: Sequence[ExpectedError]) -> Table:
@@ -184,22 +179,20 @@ def shutter_finding(rig: Rig) -> Finding | None:
         pixels = rig.focal_px * _TURN * shutter.exposure
         blur = f"an exposure of {1e3 * shutter.exposure:g} ms blurs a net over {pixels:.1f} px"
     if shutter.kind is ShutterKind.GLOBAL:
-        return Finding(Severity.OK, f"The shutter exposes all rows at once. {rates} {blur}.")
+        return Finding.ok(f"The shutter exposes all rows at once. {rates} {blur}.")
     blur = f"; {blur}" if blur else ""
     apart = 1e3 * abs(shutter.readout)
     if shutter.is_interlaced:
-        return Finding(
-            Severity.OK,
+        return Finding.ok(
             f"The video is interlaced, its fields {apart:g} ms apart. {rates} the target moves by "
             f"{_SPEED * apart:.1f} mm and {math.degrees(_TURN) * shutter.readout:.2f} degrees "
             f"({rig.focal_px * _TURN * shutter.readout:.1f} px) between them{blur}. Each field is "
-            "measured by itself: twice as many postures, each of half the rows.",
+            "measured by itself: twice as many postures, each of half the rows."
         )
     order = "first row to the last" if shutter.readout > 0.0 else "last row to the first"
-    return Finding(
-        Severity.OK,
+    return Finding.ok(
         f"The shutter rolls, {apart:g} ms from the {order}. {rates} "
-        f"{_rolling_error(rig)}{blur}. The frames beside it correct that.",
+        f"{_rolling_error(rig)}{blur}. The frames beside it correct that."
     )
 
 

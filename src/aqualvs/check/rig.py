@@ -97,46 +97,40 @@ def _told(name: str, step: SolvedStep, now: datetime) -> Finding:
     # Good pictures leave 0.05 to 0.2 px for corners, 0.1 to 0.3 for stripes.
     large_rms_px = 1.0
     if step.rms_px > large_rms_px:
-        return Finding(
-            Severity.WARN,
+        return Finding.warn(
             f"{sentence}: good pictures leave 0.3 px or less; check the board's square size and "
-            "the medium, and calibrate again.",
+            "the medium, and calibrate again."
         )
-    return Finding(Severity.OK, f"{sentence}.")
+    return Finding.ok(f"{sentence}.")
 
 
 def _doubts(name: str, step: SolvedStep, now: datetime) -> Iterator[Finding]:
     days, old_days = (now - step.date).days, 365
     if days < -1:
-        yield Finding(
-            Severity.WARN,
+        yield Finding.warn(
             f"The date of solved_from.{name}, {step.date:%Y-%m-%d}, is yet to come; set the clock "
-            "of the computer that calibrates.",
+            "of the computer that calibrates."
         )
     if days > old_days:
-        yield Finding(
-            Severity.WARN,
+        yield Finding.warn(
             f"The calibration of the {name} is more than a year old; take one picture of a known "
-            "target, or calibrate again.",
+            "target, or calibrate again."
         )
     if step.rms_px <= 0.0 and step.points > 0:
-        yield Finding(
-            Severity.WARN,
-            f"solved_from.{name}.rms_px is {step.rms_px:g}: no real picture fits that well.",
+        yield Finding.warn(
+            f"solved_from.{name}.rms_px is {step.rms_px:g}: no real picture fits that well."
         )
     if step.pictures < _FEW_PICTURES.get(name, 1):
-        yield Finding(
-            Severity.WARN,
+        yield Finding.warn(
             f"The calibration of the {name} rests on {count_text(step.pictures, 'picture')}; take "
-            f"at least {_FEW_PICTURES.get(name, 1)}, at different tilts and distances.",
+            f"at least {_FEW_PICTURES.get(name, 1)}, at different tilts and distances."
         )
     surfaces = step.extras.get(SURFACES)
     count = len(surfaces) if isinstance(surfaces, list) else surfaces
     if isinstance(count, int | float) and count < 2:
-        yield Finding(
-            Severity.WARN,
+        yield Finding.warn(
             "The lasers were seen on one surface only, and any plane through such a line fits it; "
-            "show their stripes at two distances at least.",
+            "show their stripes at two distances at least."
         )
 
 
@@ -146,38 +140,34 @@ def _out_of_order(steps: dict[str, SolvedStep]) -> Iterator[Finding]:
     for before, after in itertools.pairwise(chain):
         if steps[before].date > steps[after].date:
             verb = "were" if after == "lasers" else "was"
-            yield Finding(
-                Severity.WARN,
+            yield Finding.warn(
                 f"The {before} was calibrated after the {after}, which {verb} found with the "
-                f"{before} as it was before; run 'aqualvs calibrate {after}' again.",
+                f"{before} as it was before; run 'aqualvs calibrate {after}' again."
             )
 
 
 def _assumed(rig: Rig, steps: dict[str, SolvedStep]) -> Iterator[Finding]:
     """Yield findings on numbers without a stated uncertainty, and on what is assumed for them."""
     if is_exact(rig):
-        yield Finding(
-            Severity.OK,
+        yield Finding.ok(
             "The rig's numbers count as exact (solved_from.uncertainty), as those of a simulated "
-            "dive are; take that out for a rig that was built.",
+            "dive are; take that out for a rig that was built."
         )
     alike: dict[str, list[str]] = {}
     for one in assumptions(rig):
         alike.setdefault(one.words, []).append(f"the {one.what}")
     for words, what in alike.items():
         verb = "is" if len(what) == 1 else "are"
-        yield Finding(
-            Severity.OK,
+        yield Finding.ok(
             f"How well {', '.join(what)} {verb} known is not written down; assumed (one sigma): "
-            f"{words}. 'aqualvs calibrate' finds it out.",
+            f"{words}. 'aqualvs calibrate' finds it out."
         )
     for name, step in steps.items():
         numbers = step.extras.get(ASSUMED)
         if isinstance(numbers, list) and numbers:
-            yield Finding(
-                Severity.OK,
+            yield Finding.ok(
                 f"The calibration of the {name} assumed how well {', '.join(map(str, numbers))} "
-                "are known: they were written by hand.",
+                "are known: they were written by hand."
             )
 
 
@@ -223,7 +213,7 @@ def _largest(uncertainty: RigUncertainty, names: tuple[str, ...]) -> float:
 
 
 def _warning(fact: str, remedy: str) -> Finding:
-    return Finding(Severity.WARN, f"{fact} (one sigma); {remedy}, and calibrate again.")
+    return Finding.warn(f"{fact} (one sigma); {remedy}, and calibrate again.")
 
 
 def field_of_view(camera: Camera) -> tuple[float, float]:
@@ -300,43 +290,38 @@ def _check_lens(rig: Rig) -> Iterator[Finding]:
     distance, port = float(np.linalg.norm(rig.dome_from_cam.translation)), rig.flat_port
     if port is not None:
         tilt = math.degrees(math.acos(math.cos(port.tilt_x) * math.cos(port.tilt_y)))
-        yield Finding(
-            Severity.OK,
+        yield Finding.ok(
             f"The lens looks through a flat port, {port.distance * 1e3:g} mm ahead, "
-            f"{port.thickness * 1e3:g} mm thick and tilted by {tilt:.1f} degrees.",
+            f"{port.thickness * 1e3:g} mm thick and tilted by {tilt:.1f} degrees."
         )
     elif rig.dome is None and _in_air(rig):
-        yield Finding(Severity.OK, "There is no dome and no water: rays start at the lens, in air.")
+        yield Finding.ok("There is no dome and no water: rays start at the lens, in air.")
     elif rig.dome is None:
-        yield Finding(Severity.WARN, "There is no dome: rays start at the lens, in the water.")
+        yield Finding.warn("There is no dome: rays start at the lens, in the water.")
     else:
         gap = rig.dome.inner_radius - distance
         if gap <= 0.0:
-            yield Finding(
-                Severity.BAD,
+            yield Finding.bad(
                 f"The lens lies {distance * 1e3:.1f} mm from the dome's centre, outside the inner "
-                f"radius of {rig.dome.inner_radius * 1e3:g} mm; correct camera.position_mm.",
+                f"radius of {rig.dome.inner_radius * 1e3:g} mm; correct camera.position_mm."
             )
         else:
-            yield Finding(
-                Severity.OK,
+            yield Finding.ok(
                 f"The lens lies {distance * 1e3:.1f} mm from the dome's centre, "
-                f"{gap * 1e3:.1f} mm inside the dome.",
+                f"{gap * 1e3:.1f} mm inside the dome."
             )
     width, height = rig.size_px
     across, down = (rig.lens.cx + 0.5) / width, (rig.lens.cy + 0.5) / height
     if not (0.25 < across < 0.75 and 0.25 < down < 0.75):
-        yield Finding(
-            Severity.WARN,
+        yield Finding.warn(
             f"The image centre ({rig.lens.cx:.0f}, {rig.lens.cy:.0f}) px is far from the middle of "
-            f"a {width}x{height} picture; was the camera calibrated at this size?",
+            f"a {width}x{height} picture; was the camera calibrated at this size?"
         )
     ratio = rig.lens.fx / rig.lens.fy
     if not 0.8 < ratio < 1.25:
-        yield Finding(
-            Severity.WARN,
+        yield Finding.warn(
             f"The focal lengths {rig.lens.fx:.0f} and {rig.lens.fy:.0f} px differ by more than "
-            "pixels usually do; was the camera calibrated at this size?",
+            "pixels usually do; was the camera calibrated at this size?"
         )
 
 
@@ -344,31 +329,27 @@ def _check_view(rig: Rig, camera: Camera) -> Iterator[Finding]:
     axis = rig.dome_from_cam.rotation[:, 2]
     off = math.degrees(math.acos(min(max(float(axis[1]), -1.0), 1.0)))
     if off >= 90.0:
-        yield Finding(
-            Severity.BAD,
+        yield Finding.bad(
             f"The camera looks {off:.0f} degrees away from forward (the dome's y axis); correct "
-            "camera.rotation_deg.",
+            "camera.rotation_deg."
         )
     elif off > 30.0:
-        yield Finding(
-            Severity.WARN,
+        yield Finding.warn(
             f"The camera looks {off:.0f} degrees away from forward (the dome's y axis); posture is "
-            "measured against the dome's axes.",
+            "measured against the dome's axes."
         )
     across, down = (math.degrees(angle) for angle in field_of_view(camera))
     blind = blind_fraction(camera)
     if math.isnan(across) or math.isnan(down) or blind > 0.0:
-        yield Finding(
-            Severity.WARN,
+        yield Finding.warn(
             f"{blind:.0%} of the picture sees no water: the lens model ends or "
             + ("light misses the flat port " if rig.flat_port else "the dome reflects ")
-            + f"there; check camera.distortion and the {'port' if rig.flat_port else 'dome'}.",
+            + f"there; check camera.distortion and the {'port' if rig.flat_port else 'dome'}."
         )
     else:
-        yield Finding(
-            Severity.OK,
+        yield Finding.ok(
             f"The field of view in {'air' if _in_air(rig) else 'the water'} is {across:.0f} by "
-            f"{down:.0f} degrees.",
+            f"{down:.0f} degrees."
         )
 
 
@@ -380,16 +361,15 @@ def _in_air(rig: Rig) -> bool:
 def _check_water(rig: Rig) -> Finding:
     n = rig.n_water
     if 1.32 <= n <= 1.36:
-        return Finding(Severity.OK, f"The water's index {n:.4f} is that of {_water_name(n)}.")
+        return Finding.ok(f"The water's index {n:.4f} is that of {_water_name(n)}.")
     if _in_air(rig):
         return Finding(
             Severity.OK if rig.housing is None else Severity.WARN,
             f"The water's index {n:.4f} is that of air: this rig is for the bench.",
         )
-    return Finding(
-        Severity.BAD,
+    return Finding.bad(
         f"The water's index {n:.4f} is not that of water, which has 1.330 to 1.345 for green "
-        "light; correct water.n, or give temperature_c and salinity_permille.",
+        "light; correct water.n, or give temperature_c and salinity_permille."
     )
 
 
@@ -403,36 +383,30 @@ def _water_name(n: float) -> str:
 def _check_index(rig: Rig) -> Finding:
     sigma = index_sigma(rig)
     if rig.flat_port is not None:
-        return Finding(
-            Severity.OK,
+        return Finding.ok(
             f"A flat port shows the water's index: one picture of a known target gives it to "
-            f"{sigma:.1g}.",
+            f"{sigma:.1g}."
         )
     if sigma < 5e-4:
-        return Finding(
-            Severity.OK,
+        return Finding.ok(
             f"The lens is far enough from the dome's centre to see the water's index: one picture "
-            f"of a known target gives it to {sigma:.1g}.",
+            f"of a known target gives it to {sigma:.1g}."
         )
     if rig.dome is None:
-        return Finding(Severity.OK, "Without a dome the water's index does not enter.")
+        return Finding.ok("Without a dome the water's index does not enter.")
     seen = "not at all" if sigma > 0.1 else f"only to {sigma:.1g}"
-    return Finding(
-        Severity.OK,
+    return Finding.ok(
         f"This lens, so near the dome's centre, can see the water's index {seen}; give it by "
-        "temperature and salinity. It matters as little to the range.",
+        "temperature and salinity. It matters as little to the range."
     )
 
 
 def _check_lasers(rig: Rig, camera: Camera) -> Iterator[Finding]:
     if not rig.lasers:
-        yield Finding(
-            Severity.BAD, "There are no lasers; run 'aqualvs calibrate lasers' or write them."
-        )
+        yield Finding.bad("There are no lasers; run 'aqualvs calibrate lasers' or write them.")
     if len(rig.lasers) == 1:
-        yield Finding(
-            Severity.WARN,
-            "One laser draws one line on a target: points, but no pitch and yaw; add a second.",
+        yield Finding.warn(
+            "One laser draws one line on a target: points, but no pitch and yaw; add a second."
         )
     for laser in rig.lasers:
         yield _check_laser(rig, camera, laser)
@@ -446,20 +420,18 @@ def _check_laser(rig: Rig, camera: Camera, laser: Laser) -> Finding:
     views = [see_stripe(camera, sheet, float(wall)) for wall in walls]
     seen = np.array([view.visible for view in views])
     if not seen.any():
-        return Finding(
-            Severity.BAD,
+        return Finding.bad(
             f"Laser '{laser.name}' never crosses the picture between {near * 1e3:.0f} and "
-            f"{far * 1e3:.0f} mm; check the sign of its offset_mm and its normal.",
+            f"{far * 1e3:.0f} mm; check the sign of its offset_mm and its normal."
         )
     picked = [i for i in (0, n_ranges // 2, n_ranges - 1) if seen[i]] or [int(np.argmax(seen))]
     places = ", ".join(_place(float(walls[i]), views[i]) for i in picked)
     if seen.all():
-        return Finding(Severity.OK, f"Laser '{laser.name}' crosses the picture {places}.")
-    return Finding(
-        Severity.WARN,
+        return Finding.ok(f"Laser '{laser.name}' crosses the picture {places}.")
+    return Finding.warn(
         f"Laser '{laser.name}' is in the picture only from {walls[seen][0] * 1e3:.0f} to "
         f"{walls[seen][-1] * 1e3:.0f} mm of the working range {near * 1e3:.0f} to "
-        f"{far * 1e3:.0f} mm: {places}.",
+        f"{far * 1e3:.0f} mm: {places}."
     )
 
 
@@ -474,16 +446,15 @@ def _check_pair(a: Laser, b: Laser) -> Finding:
     pair = f"Lasers '{a.name}' and '{b.name}'"
     apart = abs(a.plane.offset - math.copysign(1.0, cosine) * b.plane.offset)
     if angle < 1.0 and apart < 5e-3:
-        return Finding(
-            Severity.BAD, f"{pair} lie in one plane, so the two draw one line; check their normals."
+        return Finding.bad(
+            f"{pair} lie in one plane, so the two draw one line; check their normals."
         )
     if angle < 15.0:
-        return Finding(
-            Severity.WARN,
+        return Finding.warn(
             f"{pair} meet at {angle:.0f} degrees only: tilt across their stripes is told by the "
-            "distance between them alone.",
+            "distance between them alone."
         )
-    return Finding(Severity.OK, f"{pair} meet at {angle:.0f} degrees.")
+    return Finding.ok(f"{pair} meet at {angle:.0f} degrees.")
 
 
 def _verdict(findings: Sequence[Finding]) -> str:

@@ -5,10 +5,10 @@ Names and meanings are those of ArduSub's `Parameters.cpp`, `GCS.cpp` (MAV_), an
 """
 
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 from aqualvs.live.mavlink.link import MavlinkLink
-from aqualvs.text import Finding, Severity
+from aqualvs.text import Finding
 
 STATION = ("MAV_GCS_SYSID", "SYSID_MYGCS")
 STATION_HIGH = "MAV_GCS_SYSID_HI"
@@ -93,156 +93,122 @@ def advise_on_station(parameters: Mapping[str, float], station: int) -> Finding:
     """Advise whether the vehicle obeys sticks that are sent in a ground station's name."""
     obeyed = StationRange(parameters)
     if not obeyed.known:
-        return Finding(
-            Severity.WARN,
+        return Finding.warn(
             f"{' or '.join(STATION)} is not told: whether the vehicle obeys sticks of ground "
-            f"station {station} is unknown; look it up in the ground station",
+            f"station {station} is unknown; look it up in the ground station"
         )
     if station in obeyed:
-        return Finding(
-            Severity.OK,
-            f"{obeyed.name} {obeyed}: sticks in the name of ground station {station} are obeyed",
+        return Finding.ok(
+            f"{obeyed.name} {obeyed}: sticks in the name of ground station {station} are obeyed"
         )
-    return Finding(
-        Severity.BAD,
+    return Finding.bad(
         f"{obeyed.name} {obeyed}: every stick in the name of ground station {station} is ignored, "
         f"the pilot's too; set {obeyed.name} {station}, or ground_station {obeyed} in the vehicle "
-        "file",
+        "file"
     )
 
 
-def advise_on_fail_safe(parameters: Mapping[str, float]) -> list[Finding]:
+def advise_on_fail_safe(parameters: Mapping[str, float]) -> Iterator[Finding]:
     """Advise on the effect of the pilot-input fail-safe when efforts end."""
     # A last effort that stays in force longer than this moves the vehicle far.
     longest_timeout_s = 1.0
     disabled, disarm = 0, 2
     action, timeout_s = parameters.get(PILOT_INPUT), parameters.get(PILOT_TIMEOUT)
-    found = []
     if action is None:
-        found.append(Finding(Severity.WARN, f"{PILOT_INPUT} is not told; see that it is 1 or 2"))
+        yield Finding.warn(f"{PILOT_INPUT} is not told; see that it is 1 or 2")
     elif round(action) == disabled:
-        found.append(
-            Finding(
-                Severity.BAD,
-                f"{PILOT_INPUT} 0 (off): if follow is killed its last effort stands for ever; set "
-                f"{PILOT_INPUT} 1",
-            )
+        yield Finding.bad(
+            f"{PILOT_INPUT} 0 (off): if follow is killed its last effort stands for ever; set "
+            f"{PILOT_INPUT} 1"
         )
     elif round(action) == disarm:
-        found.append(
-            Finding(
-                Severity.WARN,
-                f"{PILOT_INPUT} 2 (disarm): without a joystick that sends, the vehicle disarms "
-                f"{_seconds(timeout_s)} after Enter gives it back, and sinks if it is heavy; set "
-                f"{PILOT_INPUT} 1, or leave the joystick on",
-            )
+        yield Finding.warn(
+            f"{PILOT_INPUT} 2 (disarm): without a joystick that sends, the vehicle disarms "
+            f"{_seconds(timeout_s)} after Enter gives it back, and sinks if it is heavy; set "
+            f"{PILOT_INPUT} 1, or leave the joystick on"
         )
     else:
-        found.append(Finding(Severity.OK, f"{PILOT_INPUT} 1 (warn): sticks go neutral, armed"))
+        yield Finding.ok(f"{PILOT_INPUT} 1 (warn): sticks go neutral, armed")
     if timeout_s is None:
-        found.append(
-            Finding(Severity.WARN, f"{PILOT_TIMEOUT} is not told; see that it is 0.5 to 1")
-        )
+        yield Finding.warn(f"{PILOT_TIMEOUT} is not told; see that it is 0.5 to 1")
     elif timeout_s > longest_timeout_s:
-        found.append(
-            Finding(
-                Severity.WARN,
-                f"{PILOT_TIMEOUT} {timeout_s:g} s: if follow is killed its last effort stands for "
-                f"so long; set {PILOT_TIMEOUT} 1",
-            )
+        yield Finding.warn(
+            f"{PILOT_TIMEOUT} {timeout_s:g} s: if follow is killed its last effort stands for "
+            f"so long; set {PILOT_TIMEOUT} 1"
         )
     else:
-        found.append(
-            Finding(
-                Severity.OK,
-                f"{PILOT_TIMEOUT} {timeout_s:g} s: so long a last effort stands if follow is "
-                "killed",
-            )
+        yield Finding.ok(
+            f"{PILOT_TIMEOUT} {timeout_s:g} s: so long a last effort stands if follow is killed"
         )
-    return found
 
 
-def advise_on_speed(parameters: Mapping[str, float]) -> list[Finding]:
+def advise_on_speed(parameters: Mapping[str, float]) -> Iterator[Finding]:
     """Advise on the climb rate of a full vertical stick, compared with the gains' assumption."""
-    up = parameters.get(SPEED_UP)
+    up, down = parameters.get(SPEED_UP), parameters.get(SPEED_DOWN, 0.0)
     if up is None:
-        return [
-            Finding(Severity.WARN, f"{SPEED_UP} is not told: plans that change the depth are off")
-        ]
-    down = parameters.get(SPEED_DOWN, 0.0)
-    if down == 0.0:
+        yield Finding.warn(f"{SPEED_UP} is not told: plans that change the depth are off")
+    elif down == 0.0:
         # ArduSub takes 0 for the speed upwards (get_pilot_speed_dn).
         same = "0" if SPEED_DOWN in parameters else "is not told"
-        both = f"{SPEED_UP} {up:.0f} ({SPEED_DOWN} {same}: as much downwards)"
-        return [_climb_advice(both, up)]
-    return [
-        _climb_advice(f"{name} {speed:.0f}", speed)
-        for name, speed in ((SPEED_UP, up), (SPEED_DOWN, down))
-    ]
+        yield _climb_advice(f"{SPEED_UP} {up:.0f} ({SPEED_DOWN} {same}: as much downwards)", up)
+    else:
+        yield _climb_advice(f"{SPEED_UP} {up:.0f}", up)
+        yield _climb_advice(f"{SPEED_DOWN} {down:.0f}", down)
 
 
 def advise_on_distance(
-    parameters: Mapping[str, float], working_range: tuple[float, float] | None = None
-) -> list[Finding]:
+    parameters: Mapping[str, float], working_range: tuple[float, float] | None
+) -> Iterator[Finding]:
     """Advise on the vehicle's use of `DISTANCE_SENSOR`.
 
     `working_range`: of the rig, in metres.
     """
-    kind = parameters.get(RANGE_TYPE)
+    kind, orient = parameters.get(RANGE_TYPE), parameters.get(RANGE_ORIENT)
     if kind is None:
-        return [
-            Finding(Severity.WARN, f"{RANGE_TYPE} is not told; set 10 (MAVLink) for the distance")
-        ]
-    if round(kind) != _MAVLINK_RANGEFINDER:
-        return [
-            Finding(
-                Severity.WARN,
-                f"{RANGE_TYPE} {kind:.0f}: the distance to the net is not taken in; set "
-                f"{RANGE_TYPE} 10 (MAVLink) and {RANGE_ORIENT} 0, and start the autopilot anew",
-            )
-        ]
-    orient = parameters.get(RANGE_ORIENT)
-    if orient is None or round(orient) != _FORWARD:
+        yield Finding.warn(f"{RANGE_TYPE} is not told; set 10 (MAVLink) for the distance")
+    elif round(kind) != _MAVLINK_RANGEFINDER:
+        yield Finding.warn(
+            f"{RANGE_TYPE} {kind:.0f}: the distance to the net is not taken in; set "
+            f"{RANGE_TYPE} 10 (MAVLink) and {RANGE_ORIENT} 0, and start the autopilot anew"
+        )
+    elif orient is None or round(orient) != _FORWARD:
         told = "is not told" if orient is None else f"{orient:.0f}"
-        return [
-            Finding(
-                Severity.WARN,
-                f"{RANGE_ORIENT} {told}: ours looks forward, and others are left out; set "
-                f"{RANGE_ORIENT} 0",
-            )
-        ]
-    text = f"{RANGE_TYPE} 10, {RANGE_ORIENT} 0: the distance to the net is taken in"
-    return [Finding(Severity.OK, text), *_limits_advice(parameters, working_range)]
+        yield Finding.warn(
+            f"{RANGE_ORIENT} {told}: ours looks forward, and others are left out; set "
+            f"{RANGE_ORIENT} 0"
+        )
+    else:
+        text = f"{RANGE_TYPE} 10, {RANGE_ORIENT} 0: the distance to the net is taken in"
+        yield Finding.ok(text)
+        yield from _limits_advice(parameters, working_range)
 
 
 def _climb_advice(setting: str, told: float) -> Finding:
     speed = 0.01 * told
     means = f"{setting}: a full stick asks for {speed:.2g} m/s times the pilot gain"
     if FULL_CLIMB_RATE / _CLIMB_RATE_RATIO <= speed <= FULL_CLIMB_RATE * _CLIMB_RATE_RATIO:
-        return Finding(Severity.OK, means)
-    return Finding(
-        Severity.WARN,
+        return Finding.ok(means)
+    return Finding.warn(
         f"{means}, but gains take {FULL_CLIMB_RATE:g} m/s: follow changes the depth at another "
-        f"speed than planned; set {SPEED_UP} and {SPEED_DOWN} {100.0 * FULL_CLIMB_RATE:.0f}",
+        f"speed than planned; set {SPEED_UP} and {SPEED_DOWN} {100.0 * FULL_CLIMB_RATE:.0f}"
     )
 
 
 def _limits_advice(
     parameters: Mapping[str, float], working_range: tuple[float, float] | None
-) -> list[Finding]:
+) -> Iterator[Finding]:
     near, far = _first(parameters, RANGE_NEAR), _first(parameters, RANGE_FAR)
     if near is None or far is None:
-        return []
+        return
     (near_name, least), (far_name, most) = near, far
     means = f"{near_name}, {far_name}: {least:g} to {most:g} m count"
     if working_range is None:
-        return [Finding(Severity.OK, f"{means}; the rig's working range must lie within")]
-    if least <= working_range[0] and most >= working_range[1]:
-        return [Finding(Severity.OK, means)]
-    wanted = f"{working_range[0]:g} to {working_range[1]:g} m"
-    return [
-        Finding(Severity.WARN, f"{means}, but the rig measures {wanted}; set them to enclose that")
-    ]
+        yield Finding.ok(f"{means}; the rig's working range must lie within")
+    elif least <= working_range[0] and most >= working_range[1]:
+        yield Finding.ok(means)
+    else:
+        wanted = f"{working_range[0]:g} to {working_range[1]:g} m"
+        yield Finding.warn(f"{means}, but the rig measures {wanted}; set them to enclose that")
 
 
 def _first(
