@@ -114,7 +114,7 @@ def lasers_by(believed: Rig, true: Rig) -> Rig | None:
     if any(sum(map(len, points)) < _BOARD.min_points for points in lit):
         return None
     lasers = (
-        replace(laser, plane=_fitted(np.concatenate(points)), window=None)
+        replace(laser, plane=Plane.fitted(np.concatenate(points)), window=None)
         for laser, points in zip(true.lasers, lit, strict=True)
     )
     return replace(believed, lasers=tuple(lasers))
@@ -169,13 +169,6 @@ def _stripe_on(board: SE3, found: SE3, laser: Laser, believed: Rig, true: Rig) -
     surface = Plane(normal, float(normal @ found.translation))
     placed, met = surface.intersect(believed.camera().rays(pixels[seen]))
     return placed[met]
-
-
-def _fitted(points: FloatArray) -> Plane:
-    """Return the plane with the least squared distances from points."""
-    middle = points.mean(axis=0)
-    normal = np.linalg.svd(points - middle)[2][-1]
-    return Plane(normal, float(normal @ middle))
 
 
 INDEX_ERROR = 0.005

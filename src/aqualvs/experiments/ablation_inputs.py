@@ -7,9 +7,9 @@ qualities against uncompressed pictures.
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from aqualvs.experiments.experiment import (
     DataColumns,
@@ -19,14 +19,7 @@ from aqualvs.experiments.experiment import (
     ExperimentRow,
 )
 from aqualvs.experiments.growth_and_sun import scene
-from aqualvs.experiments.laboratory import (
-    Laboratory,
-    RenderedDive,
-    Variant,
-    drawn,
-    findings,
-    series,
-)
+from aqualvs.experiments.laboratory import Laboratory, RenderedDive, Variant, compared
 from aqualvs.experiments.tank import wall_dive
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.planes import Plane
@@ -37,9 +30,6 @@ from aqualvs.report.figure_style import BLUE, GREEN, GREY, ORANGE, new_figure
 from aqualvs.simulation.lasers import LaserSource, default_sources
 from aqualvs.simulation.scenario import Scenario, parse_scenario
 from aqualvs.simulation.video import Compression
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 def _run_video(laboratory: Laboratory) -> ExperimentResult:
@@ -54,19 +44,13 @@ def _run_video(laboratory: Laboratory) -> ExperimentResult:
         variants.append(_variant(laboratory, dive, f"H.264 crf {crf}", ours=crf == default))
     first, last = variants[1], variants[-1]
     at_last = f"it is {last.rms[0]:.3f} %" if last.valid_percent else "no frame has a posture"
-    return ExperimentResult(
+    return compared(
+        "ablation_video",
+        "Root mean square errors on a clear net from the same pictures, uncompressed and coded "
+        "ever more coarsely.",
+        variants,
         sentence=f"Against uncompressed pictures H.264 of good quality changes the range error "
         f"from {variants[0].rms[0]:.3f} to {first.rms[0]:.3f} %; at {last.name} {at_last}.",
-        findings=findings(variants),
-        pictures=(
-            ExperimentFigure(
-                name="ablation_video",
-                caption="Root mean square errors on a clear net from the same pictures, "
-                "uncompressed and coded ever more coarsely.",
-                figure=drawn(variants),
-            ),
-        ),
-        series=(series("ablation_video", variants),),
     )
 
 
@@ -112,29 +96,21 @@ def _run_sheets(laboratory: Laboratory) -> ExperimentResult:
         Variant("planes that fit them best", (laboratory.measure(dive, rig=flat),)),
     ]
     off = _off_plane_mm(bent)
-    return ExperimentResult(
+    return compared(
+        "ablation_sheets",
+        "Root mean square errors before a wall with lasers behind tilted windows.",
+        variants,
         sentence=f"Behind windows tilted by 12 to 25 degrees the light leaves its best plane by up "
         f"to {max(off):.1f} mm; taking it for planes costs {variants[1].rms[0]:.2f} % of the "
         f"range instead of {variants[0].rms[0]:.3f} %.",
-        findings=(
-            *findings(variants),
-            *(
-                ExperimentRow(
-                    what=f"laser behind a window tilted by {tilt:g} degrees: farthest from its "
-                    "best plane in the working range (mm)",
-                    ours=f"{mm:.1f}",
-                )
-                for tilt, mm in zip(_TILTS_DEG, off, strict=True)
-            ),
-        ),
-        pictures=(
-            ExperimentFigure(
-                name="ablation_sheets",
-                caption="Root mean square errors before a wall with lasers behind tilted windows.",
-                figure=drawn(variants),
-            ),
-        ),
-        series=(series("ablation_sheets", variants),),
+        more_findings=[
+            ExperimentRow(
+                what=f"laser behind a window tilted by {tilt:g} degrees: farthest from its best "
+                "plane in the working range (mm)",
+                ours=f"{mm:.1f}",
+            )
+            for tilt, mm in zip(_TILTS_DEG, off, strict=True)
+        ],
         notes=("The planes are the best that any calibration could find for such sheets.",),
     )
 
@@ -283,7 +259,7 @@ def _slope(steps: Sequence[float], percent: FloatArray) -> float:
     return float(abs(np.polyfit(np.array(steps)[told], percent[told], 1)[0]))
 
 
-def _drawn(index: FloatArray, lens: FloatArray) -> "Figure":
+def _drawn(index: FloatArray, lens: FloatArray) -> Figure:
     with new_figure(2.7) as figure:
         left, right = figure.subplots(1, 2)
         left.plot(_INDEX_STEPS, index, ".-", color=BLUE)

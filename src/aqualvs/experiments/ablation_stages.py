@@ -20,15 +20,7 @@ from aqualvs.experiments.experiment import (
     ExperimentRow,
 )
 from aqualvs.experiments.growth_and_sun import scene
-from aqualvs.experiments.laboratory import (
-    Laboratory,
-    RenderedDive,
-    Variant,
-    drawn,
-    findings,
-    series,
-    told,
-)
+from aqualvs.experiments.laboratory import Laboratory, RenderedDive, Variant, compared, drawn, told
 from aqualvs.experiments.mesh_filter import (
     Judged,
     LitTruth,
@@ -56,17 +48,11 @@ def _run_stripes(laboratory: Laboratory) -> ExperimentResult:
         where: laboratory.dive(scene(name)) for name, where in _NETS.items()
     }
     variants = [one for where, dive in dives.items() for one in _variants(laboratory, dive, where)]
-    return ExperimentResult(
+    return compared(
+        "ablation_stripes",
+        "Root mean square errors with the sub-pixel detector and with thresholds.",
+        variants,
         sentence=_sentence(variants, list(dives)),
-        findings=findings(variants),
-        pictures=(
-            ExperimentFigure(
-                name="ablation_stripes",
-                caption="Root mean square errors with the sub-pixel detector and with thresholds.",
-                figure=drawn(variants),
-            ),
-        ),
-        series=(series("ablation_stripes", variants),),
         notes=(
             "Everything behind the detector is the same: filter, target and robust fit. Where a "
             "threshold suits a scene it is as exact as the sub-pixel detector: a stripe has many "
@@ -135,19 +121,13 @@ def _run_fits(laboratory: Laboratory) -> ExperimentResult:
         for fit, method in _FITS.items()
     ]
     times = [b.rms[0] / a.rms[0] for a, b in zip(variants[::2], variants[1::2], strict=True)]
-    return ExperimentResult(
+    return compared(
+        "ablation_fits",
+        "Root mean square errors with the robust fit and with the pseudo-inverse of Eq. 24, on the "
+        "same points of the target.",
+        variants,
         sentence="Fitted by the paper's pseudo-inverse to the same target points, the range error "
         f"is {told(times)} times that of the robust fit on {', '.join(dives)}.",
-        findings=findings(variants),
-        pictures=(
-            ExperimentFigure(
-                name="ablation_fits",
-                caption="Root mean square errors with the robust fit and with the pseudo-inverse "
-                "of Eq. 24, on the same points of the target.",
-                figure=drawn(variants),
-            ),
-        ),
-        series=(series("ablation_fits", variants),),
         notes=(
             "The points are those that our own search has assigned to the target; it has removed "
             "what the pseudo-inverse would suffer from most.",

@@ -4,9 +4,11 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from aqualvs.calibrate.common import picture_paths, read_grey
 from aqualvs.calibration.camera.calibrate import CameraCalibration, camera
@@ -33,11 +35,6 @@ from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig
 from aqualvs.optics.rigfile import load_rig
 from aqualvs.optics.solved import rig_numbers
 from aqualvs.report.figure_style import BLUE, DARK, GREY, ORANGE, PALE
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
 
 _LENS, _TURN = ("lens_x", "lens_y", "lens_z"), ("rotation_x", "rotation_y", "rotation_z")
 _PLANE = ("fx", "fy", "cx", "cy")
@@ -285,13 +282,13 @@ _RESIDUALS_CAPTION = (
 )
 
 
-def _draw_boards(figure: "Figure", solved: SolvedDome) -> None:
+def _draw_boards(figure: Figure, solved: SolvedDome) -> None:
     side, picture = figure.subplots(1, 2, width_ratios=(1.25, 1.0))
     _draw_side(side, solved)
     _draw_picture(picture, solved)
 
 
-def _draw_side(axes: "Axes", solved: SolvedDome) -> None:
+def _draw_side(axes: Axes, solved: SolvedDome) -> None:
     """Draw boards, dome and lens in the dome's y-z plane, in millimetres."""
     for fit in solved.dome.views:
         x, y = fit.view.points[:, 0], fit.view.points[:, 1]
@@ -314,7 +311,7 @@ def _draw_side(axes: "Axes", solved: SolvedDome) -> None:
     axes.set_title("boards carried away from the dome")
 
 
-def _draw_picture(axes: "Axes", solved: SolvedDome) -> None:
+def _draw_picture(axes: Axes, solved: SolvedDome) -> None:
     fit = solved.dome.views[len(solved.dome.views) // 3]
     axes.imshow(read_grey(solved.folder / fit.view.name), cmap="gray", vmin=0, vmax=255)
     found, said = fit.view.pixels, fit.view.pixels - fit.residuals
@@ -327,7 +324,7 @@ def _draw_picture(axes: "Axes", solved: SolvedDome) -> None:
     axes.set_xlabel("orange rings: found; blue dots: predicted")
 
 
-def _draw_residuals(figure: "Figure", solved: SolvedDome) -> None:
+def _draw_residuals(figure: Figure, solved: SolvedDome) -> None:
     after = [fit.residuals for fit in solved.dome.views]
     before = start_residuals(solved)
     pixels = np.concatenate([fit.view.pixels for fit in solved.dome.views])
@@ -340,7 +337,7 @@ def _draw_residuals(figure: "Figure", solved: SolvedDome) -> None:
 
 
 def _draw_arrows(
-    axes: "Axes", pixels: FloatArray, residuals: FloatArray, size_px: tuple[int, int]
+    axes: Axes, pixels: FloatArray, residuals: FloatArray, size_px: tuple[int, int]
 ) -> None:
     """Draw a share of the residuals, all from corners, so long that they can be seen."""
     fine = np.flatnonzero(np.isfinite(residuals).all(axis=1))

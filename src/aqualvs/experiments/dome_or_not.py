@@ -1,9 +1,11 @@
 """Gain of the dome model from 300 to 1250 mm, where the paper has figures 19 and 20."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from aqualvs.experiments.experiment import (
     DataColumns,
@@ -19,11 +21,6 @@ from aqualvs.geometry.planes import Plane, Rays
 from aqualvs.optics.rig import Rig
 from aqualvs.report.figure_style import GREEN, OURS, PAPER, TRUTH, new_figure
 from aqualvs.scanning.scan import Label, ScanPoints
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
 
 PLACES_MM = (*range(300, 1201, 100), 1250, *range(1150, 300, -100))
 """Away in steps of 100 mm, and back between them (paper, section 5.4)."""
@@ -231,7 +228,7 @@ def _series(found: Distances) -> DataColumns:
     return DataColumns(name="dome_or_not", columns=columns)
 
 
-def _distances_drawn(found: Distances) -> "Figure":
+def _distances_drawn(found: Distances) -> Figure:
     with new_figure(3.1) as figure:
         for axes, pick, name in zip(
             figure.subplots(1, 2, sharey=True), (0, 3), ("leftmost point", "average"), strict=True
@@ -253,7 +250,7 @@ def _distances_drawn(found: Distances) -> "Figure":
     return figure
 
 
-def _errors_drawn(found: Distances) -> "Figure":
+def _errors_drawn(found: Distances) -> Figure:
     with new_figure(4.2) as figure:
         grid = figure.subplots(2, 2, sharex=True, sharey="row", height_ratios=(1.4, 1.0))
         for column, (pick, name) in enumerate(((0, "leftmost point"), (3, "average"))):
@@ -273,7 +270,7 @@ def _errors_drawn(found: Distances) -> "Figure":
 
 
 def _errors(
-    axes: "Axes", found: Distances, which: FloatArray, pick: int, colour: str, label: str
+    axes: Axes, found: Distances, which: FloatArray, pick: int, colour: str, label: str
 ) -> None:
     order = np.argsort(found.true)
     at = 1e3 * found.true

@@ -10,13 +10,13 @@ from importlib import import_module
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Self, TypeAlias
 
+from matplotlib.figure import Figure
+
 from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.report.figure_style import new_figure
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from aqualvs.experiments.laboratory import Laboratory
 
 
@@ -60,7 +60,7 @@ class ExperimentFigure:
 
     name: str  # Stem of its files, such as `figure_15`.
     caption: str  # What it shows and which figure of the paper it stands beside.
-    figure: "Figure"  # From `figure_style.new_figure`.
+    figure: Figure  # From `figure_style.new_figure`.
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -97,7 +97,7 @@ class Experiment:
 
 
 def drawn(
-    name: str, caption: str, height_in: float, draw: "Callable[[Figure], None]"
+    name: str, caption: str, height_in: float, draw: Callable[[Figure], None]
 ) -> ExperimentFigure:
     """Return a picture of a page's width.
 

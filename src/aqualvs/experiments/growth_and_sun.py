@@ -7,9 +7,10 @@ more, so that the frames from which a posture can be asked for are known.
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from aqualvs.experiments.experiment import (
     DataColumns,
@@ -29,10 +30,6 @@ from aqualvs.scanning.stripe import ThresholdOptions
 from aqualvs.simulation.benchmark import CONTRAST_LIMIT, VISIBLE_LIMIT, render_with_visible
 from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenario import Scenario, parse_scenario
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
 
 _FILE = "visible.csv"
 ENOUGH = VISIBLE_LIMIT
@@ -222,7 +219,7 @@ def _series(name: str, one: MeasuredScene) -> DataColumns:
     return DataColumns(name=f"failures_{name}", columns=columns)
 
 
-def _drawn(seen: Mapping[str, MeasuredScene]) -> "Figure":
+def _drawn(seen: Mapping[str, MeasuredScene]) -> Figure:
     with new_figure(5.6) as figure:
         grid = figure.subplots(3, 3, height_ratios=(1.6, 1.0, 1.0), sharey="row")
         for column, (name, one) in enumerate(seen.items()):

@@ -12,14 +12,21 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from aqualvs.calibrate.camera import CameraRequest, run_camera
 from aqualvs.calibrate.dome import DomeRequest, run_dome
 from aqualvs.calibrate.lasers import LasersRequest, run_lasers
-from aqualvs.experiments.experiment import DataColumns, ExperimentRow
+from aqualvs.experiments.experiment import (
+    DataColumns,
+    ExperimentFigure,
+    ExperimentResult,
+    ExperimentRow,
+)
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.rigfile import load_rig, rig_to_mapping, save_rig
@@ -34,11 +41,6 @@ from aqualvs.simulation.scenario import Scenario
 from aqualvs.simulation.scenarios import example_rig
 from aqualvs.simulation.video import Compression
 from aqualvs.sources import open_source
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
 
 _VIDEO, _TRUTH, _RIG, _READY = "dive.mp4", "truth.csv", "rig.yaml", "ready.json"
 
@@ -130,11 +132,6 @@ class Laboratory:
         Folder for the dives; kept, so that another run finds them.
     tick : callable, optional
         Called with the number of frames rendered since the last call.
-
-    Attributes
-    ----------
-    frame_s : list of float
-        How long the scanner took for each frame that it measured with its own options, in seconds.
     """
 
     def __init__(self, work: Path, tick: Callable[[int], None] | None = None) -> None:
@@ -297,7 +294,7 @@ def series(name: str, variants: Sequence[Variant]) -> DataColumns:
     return DataColumns(name=name, columns=columns)
 
 
-def drawn(variants: Sequence[Variant]) -> "Figure":
+def drawn(variants: Sequence[Variant]) -> Figure:
     """Draw rms errors as bars on a logarithmic scale, and the share of frames with a posture."""
     names = [one.name for one in variants]
     rms = np.array([one.rms for one in variants])
@@ -318,7 +315,30 @@ def drawn(variants: Sequence[Variant]) -> "Figure":
     return figure
 
 
-def _bars(axes: "Axes", variants: Sequence[Variant], values: FloatArray, name: str) -> None:
+def compared(
+    name: str,
+    caption: str,
+    variants: Sequence[Variant],
+    *,
+    sentence: str,
+    more_findings: Sequence[ExperimentRow] = (),
+    notes: tuple[str, ...] = (),
+) -> ExperimentResult:
+    """Return the outcome of a comparison: a row for each variant, a picture of all, its numbers.
+
+    `name` is that of the picture and of its series, `caption` what the picture shows; the others
+    are as in `ExperimentResult`.
+    """
+    return ExperimentResult(
+        sentence=sentence,
+        findings=(*findings(variants), *more_findings),
+        pictures=(ExperimentFigure(name=name, caption=caption, figure=drawn(variants)),),
+        series=(series(name, variants),),
+        notes=notes,
+    )
+
+
+def _bars(axes: Axes, variants: Sequence[Variant], values: FloatArray, name: str) -> None:
     colours = [OURS if one.ours else GREY for one in variants]
     shown = np.where(np.isfinite(values), values, 0.0)
     axes.barh(range(len(values)), shown, height=0.6, color=colours)

@@ -3,9 +3,11 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from aqualvs.calibrate.common import picture_paths, read_colour, read_grey
 from aqualvs.calibration.detection.detection import detect_markers
@@ -31,10 +33,6 @@ from aqualvs.optics.solved import rig_uncertainty, with_uncertainty
 from aqualvs.report.figure_style import GREEN, GREY, OURS, PAPER, PURPLE, TRUTH
 from aqualvs.scanning.uncalibrated_stripes import find_stripes as find_stripes
 from aqualvs.text import laser_colour
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 
 class _Setup(NamedTuple):
@@ -274,7 +272,7 @@ _LEFT = (
 
 
 def _draw_box(
-    figure: "Figure",
+    figure: Figure,
     laboratory: Laboratory,
     result: LaserCalibration,
     view: LaserView,
@@ -309,7 +307,7 @@ def _draw_box(
     figure.legend(*angles.get_legend_handles_labels(), loc="outside upper right", ncols=2)
 
 
-def _draw_errors(axes: "Axes", names: Sequence[str], table: FloatArray, title: str) -> None:
+def _draw_errors(axes: Axes, names: Sequence[str], table: FloatArray, title: str) -> None:
     """Draw found, sigma and the paper's (K, 3) for every laser."""
     place = np.arange(len(names))
     axes.errorbar(
@@ -339,7 +337,7 @@ def _lasers_of(laboratory: Laboratory, result: LaserCalibration, view: LaserView
     return np.where(np.min(off, axis=0) < _SETUP.near_wall, nearest, -1)
 
 
-def _draw_left(figure: "Figure", left: Remaining) -> None:
+def _draw_left(figure: Figure, left: Remaining) -> None:
     ranges, angles = figure.subplots(1, 2)
     share = np.column_stack([left.percent, 100.0 * left.sigmas[:, 0] / left.ranges])
     _draw_band(ranges, left.ranges, share, OURS, "range")
@@ -357,7 +355,7 @@ def _draw_left(figure: "Figure", left: Remaining) -> None:
         axes.legend(loc="upper left", bbox_to_anchor=(0.0, 0.92), ncols=2)
 
 
-def _draw_band(axes: "Axes", ranges: FloatArray, table: FloatArray, colour: str, name: str) -> None:
+def _draw_band(axes: Axes, ranges: FloatArray, table: FloatArray, colour: str, name: str) -> None:
     """Draw errors and sigmas (W, 2) over the distance."""
     error, sigma = table.T
     axes.fill_between(

@@ -8,10 +8,11 @@ pixel, as in the paper.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
+from matplotlib.figure import Figure
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
@@ -35,9 +36,6 @@ from aqualvs.scanning.paper.mesh_filter import MeshFilterOptions, laser_frame
 from aqualvs.scanning.scan import Frame, Label, Scan, ScanPoints
 from aqualvs.scanning.stripe import ThresholdOptions
 from aqualvs.simulation.scenario import Scenario, parse_scenario
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 def papers_pixels(
@@ -396,7 +394,7 @@ def _in_laser(points_in_dome: FloatArray, rig: Rig, laser: int) -> FloatArray:
     return np.ascontiguousarray(frame.apply(points_in_dome)[:, :2])
 
 
-def _seen(frame: Frame) -> "Figure":
+def _seen(frame: Frame) -> Figure:
     from aqualvs.sources.base import bgr_of
 
     with new_figure(2.9) as figure:
@@ -413,7 +411,7 @@ def _seen(frame: Frame) -> "Figure":
     return figure
 
 
-def _filtered(papers: FilteredPeaks, scan: Scan, rig: Rig, laser: int) -> "Figure":
+def _filtered(papers: FilteredPeaks, scan: Scan, rig: Rig, laser: int) -> Figure:
     own, bright = scan.points.laser == laser, papers.laser == laser
     columns = (
         (scan.points.points_in_dome[own], np.asarray(scan.points.label[own] == Label.NET)),

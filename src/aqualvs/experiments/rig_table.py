@@ -1,9 +1,10 @@
 """The rig of the experiments beside the paper's; table 1, and in place of figures 1 and 2."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from aqualvs.errors import RigError
 from aqualvs.experiments.experiment import (
@@ -24,11 +25,6 @@ from aqualvs.scanning.laser_bands import SearchAxis, plan_bands
 from aqualvs.simulation.scenario import Scenario, parse_scenario
 from aqualvs.sources.base import bgr_of
 from aqualvs.text import laser_colour
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
 
 _FAR = 1.0
 
@@ -178,7 +174,7 @@ def _series(traced: Bending) -> DataColumns:
     return DataColumns(name="rays", columns=columns)
 
 
-def _draw(figure: "Figure", laboratory: Laboratory, traced: Bending) -> None:
+def _draw(figure: Figure, laboratory: Laboratory, traced: Bending) -> None:
     view, section = figure.subplots(1, 2, width_ratios=(1.2, 1.0))
     rig = laboratory.rig
     frame = frames_of(laboratory.dive(one_frame()))[0]
@@ -193,7 +189,7 @@ def _draw(figure: "Figure", laboratory: Laboratory, traced: Bending) -> None:
     _draw_section(section, rig, traced)
 
 
-def _draw_stripes(axes: "Axes", rig: Rig, sheet: Sheet, i: int) -> None:
+def _draw_stripes(axes: Axes, rig: Rig, sheet: Sheet, i: int) -> None:
     """Draw where a laser's stripe lies on walls square ahead, the middle of them full."""
     # Walls whose stripes are drawn, metres.
     walls = (0.3, 0.52, 1.0)
@@ -209,7 +205,7 @@ def _draw_stripes(axes: "Axes", rig: Rig, sheet: Sheet, i: int) -> None:
         )
 
 
-def _draw_section(axes: "Axes", rig: Rig, traced: Bending) -> None:
+def _draw_section(axes: Axes, rig: Rig, traced: Bending) -> None:
     """Draw the dome's y-z plane, in millimetres; rays are seen along x."""
     assert rig.dome is not None
     angle = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 120)

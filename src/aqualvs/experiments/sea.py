@@ -6,9 +6,10 @@ yaw under control before a net.
 
 import math
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from aqualvs.control.gains_file import load_gains
 from aqualvs.control.missions import Guidance, Stage
@@ -31,10 +32,6 @@ from aqualvs.report.figure_style import BLUE, DARK, GREY, ORANGE, new_figure
 from aqualvs.scanning.posture import Posture, Refusal
 from aqualvs.simulation.net_motion import NetPosture, NetWall
 from aqualvs.simulation.scene import Net, Scene
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
 
 _VEHICLES = {"bluerov2": "BlueROV2", "bluerov2-heavy": "BlueROV2 Heavy"}
 _COLUMNS = ("range", "measured_range", "wanted_range", "forward")
@@ -203,10 +200,11 @@ class _Watched:
 def _run_sea(laboratory: Laboratory) -> ExperimentResult:
     sensor, log = _dive(laboratory)
     time_s = np.array([t for t, _, _ in sensor.seen])
-    valid = np.array([bool(posture) for _, posture, _ in sensor.seen])
-    errors = _errors(sensor)
-    found = errors[valid]
-    rms = np.sqrt(np.mean(found**2, axis=0))
+    measured, truth = _postures(sensor)
+    valid = np.isfinite(measured[:, 0])
+    errors = (measured - truth)[valid]
+    errors[:, 0] *= 100.0 / truth[valid, 0]
+    rms = np.sqrt(np.mean(errors**2, axis=0))
     share = 100.0 * float(valid.mean())
     depth = log.column("depth")
     return ExperimentResult(
@@ -240,10 +238,10 @@ def _run_sea(laboratory: Laboratory) -> ExperimentResult:
                 name="figure_22",
                 caption="Depth, range, heading and yaw of the net over the dive, beside figure "
                 "22. Dots: measured in rendered pictures; lines: truth.",
-                figure=_drawn(sensor, log, valid),
+                figure=_drawn(log, time_s, measured),
             ),
         ),
-        series=(_sea_series(sensor, time_s),),
+        series=(_sea_series(time_s, measured, truth),),
         notes=(
             "A simulated BlueROV2 in a current of 0.15 m/s and waves of 0.1 m before a net of a "
             "cage of 20 m radius that sways and rocks. It is steered by postures with sampled "
@@ -285,63 +283,50 @@ def _dive(laboratory: Laboratory) -> tuple[_Watched, LoopLog]:
     return sensor, loop.run(_SETUP.seconds)
 
 
-def _errors(sensor: _Watched) -> FloatArray:
-    """Return errors of range in percent, pitch and yaw in degrees; NaN where refused."""
-    rows = np.full((len(sensor.seen), 3), np.nan)
-    for i, (_, posture, truth) in enumerate(sensor.seen):
-        if isinstance(posture, Posture):
-            rows[i] = (
-                100.0 * (posture.range / truth.range - 1.0),
-                math.degrees(posture.pitch - truth.pitch),
-                math.degrees(posture.yaw - truth.yaw),
-            )
-    return rows
-
-
 def _correlation(log: LoopLog) -> float:
     heading = np.unwrap(log.column("heading"))
     return float(np.corrcoef(heading, log.column("yaw"))[0, 1])
 
 
-def _measured(sensor: _Watched) -> FloatArray:
-    """Return range (m), pitch and yaw (deg) measured, NaN where refused; shape (N, 3)."""
-    return np.array(
-        [
-            (p.range, math.degrees(p.pitch), math.degrees(p.yaw))
-            if isinstance(p, Posture)
-            else (math.nan,) * 3
-            for _, p, _ in sensor.seen
-        ]
-    )
+def _postures(sensor: _Watched) -> tuple[FloatArray, FloatArray]:
+    """Return what was measured, NaN where refused, and the truth; shape (N, 3) each.
+
+    Range in metres, pitch and yaw in degrees.
+    """
+    found, true = [], []
+    for _, posture, truth in sensor.seen:
+        if isinstance(posture, Posture):
+            found.append((posture.range, posture.pitch, posture.yaw))
+        else:
+            found.append((math.nan,) * 3)
+        true.append((truth.range, truth.pitch, truth.yaw))
+    scale = np.array([1.0, 180.0 / math.pi, 180.0 / math.pi])
+    return scale * np.array(found), scale * np.array(true)
 
 
-def _sea_series(sensor: _Watched, time_s: FloatArray) -> DataColumns:
-    measured = _measured(sensor)
-    truth = [(t.range, math.degrees(t.pitch), math.degrees(t.yaw)) for _, _, t in sensor.seen]
-    names = ("range_m", "pitch_deg", "yaw_deg")
+def _sea_series(time_s: FloatArray, measured: FloatArray, truth: FloatArray) -> DataColumns:
     columns: dict[str, FloatArray] = {"time_s": time_s}
-    for k, name in enumerate(names):
-        columns[f"true_{name}"] = np.array(truth)[:, k]
+    for k, name in enumerate(("range_m", "pitch_deg", "yaw_deg")):
+        columns[f"true_{name}"] = truth[:, k]
         columns[name] = measured[:, k]
     return DataColumns(name="sea", columns=columns)
 
 
-def _drawn(sensor: _Watched, log: LoopLog, valid: FloatArray) -> "Figure":
-    time_s, seen_s = log.column("time_s"), np.array([t for t, _, _ in sensor.seen])
-    measured = _measured(sensor)
+def _drawn(log: LoopLog, seen_s: FloatArray, measured: FloatArray) -> Figure:
+    time_s = log.column("time_s")
     with new_figure(5.0) as figure:
         depth, ranges, angles = figure.subplots(3, 1, sharex=True)
         depth.plot(time_s, log.column("depth"), color=BLUE)
         depth.invert_yaxis()
         depth.set_ylabel("depth (m)")
         ranges.plot(time_s, log.column("range"), color=DARK, alpha=0.5, label="true")
-        ranges.plot(seen_s[valid], measured[valid, 0], ".", color=BLUE, label="measured")
+        ranges.plot(seen_s, measured[:, 0], ".", color=BLUE, label="measured")
         ranges.set_ylabel("range (m)")
         ranges.legend(loc="upper right", ncols=2)
         heading = np.degrees(np.unwrap(log.column("heading")))
         angles.plot(time_s, heading - heading[0], color=ORANGE, label="heading, from its start")
         angles.plot(time_s, np.degrees(log.column("yaw")), color=DARK, alpha=0.5, label="true yaw")
-        angles.plot(seen_s[valid], measured[valid, 2], ".", color=BLUE, label="measured yaw")
+        angles.plot(seen_s, measured[:, 2], ".", color=BLUE, label="measured yaw")
         angles.axhline(0.0, color=GREY, linewidth=0.6)
         angles.set_ylabel("angle (degrees)")
         angles.set_xlabel("time (s)")

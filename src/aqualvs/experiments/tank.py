@@ -4,9 +4,11 @@ Figure 15 is the distance to the wall; figures 16 and 17 are pitch and yaw.
 """
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from aqualvs.experiments.experiment import (
     DataColumns,
@@ -19,11 +21,6 @@ from aqualvs.experiments.laboratory import Laboratory, MeasuredDive, RenderedDiv
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.report.figure_style import DARK, GREY, OURS, PAPER, TRUTH, new_figure
 from aqualvs.simulation.scenario import Scenario, parse_scenario
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
 
 _ANGLES = {"pitch": (1, 16), "yaw": (2, 17)}
 """Column of the posture, and the paper's figure."""
@@ -127,7 +124,7 @@ def _series(name: str, measured: MeasuredDive) -> DataColumns:
     )
 
 
-def _drawn(measured: MeasuredDive, name: str) -> "Figure":
+def _drawn(measured: MeasuredDive, name: str) -> Figure:
     column = _ANGLES[name][0]
     degrees = np.degrees(np.column_stack([a[:, column] for a in (measured.truth, measured.values)]))
     with new_figure(3.4, "column") as figure:
@@ -270,7 +267,7 @@ def _distance_series(calibrated: MeasuredDive, true: MeasuredDive) -> DataColumn
     )
 
 
-def _distance_drawn(calibrated: MeasuredDive, true: MeasuredDive) -> "Figure":
+def _distance_drawn(calibrated: MeasuredDive, true: MeasuredDive) -> Figure:
     with new_figure(2.7) as figure:
         left, right = figure.subplots(1, 2, width_ratios=(1.0, 1.25))
         left.axhspan(
@@ -297,7 +294,7 @@ def _distance_drawn(calibrated: MeasuredDive, true: MeasuredDive) -> "Figure":
     return figure
 
 
-def _dots(axes: "Axes", measured: MeasuredDive, colour: str, label: str, aside_mm: float) -> None:
+def _dots(axes: Axes, measured: MeasuredDive, colour: str, label: str, aside_mm: float) -> None:
     """Draw the frames of a place side by side, so that they can be told apart."""
     at = 1e3 * measured.truth[:, 0] + aside_mm + _fanned(measured.truth[:, 0])
     bars = 200.0 * measured.sigmas[:, 0] / measured.truth[:, 0]

@@ -6,9 +6,11 @@ the lens in the dome.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from aqualvs.calibration.detection.detection import detect_markers
@@ -35,10 +37,6 @@ from aqualvs.report.figure_style import BLUE, GREY, OURS, PAPER, TRUTH
 from aqualvs.simulation import calibration_targets as targets
 from aqualvs.simulation.calibration_targets import plate_in_view
 from aqualvs.simulation.panels import PanelRenderer, PanelScene, RoomLight
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-    from numpy.typing import NDArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +81,7 @@ def index_picture(wet: Numbers, n_each: int) -> ExperimentFigure:
 
 
 def target_picture(
-    example: "NDArray[np.uint8]", spread: Decentred, largest_sigma: float
+    example: NDArray[np.uint8], spread: Decentred, largest_sigma: float
 ) -> ExperimentFigure:
     """Return the target in view, and the standard deviation by the lens's place."""
     return drawn(
@@ -95,7 +93,7 @@ def target_picture(
     )
 
 
-def _draw_numbers(figure: "Figure", wet: Numbers, n_each: int) -> None:
+def _draw_numbers(figure: Figure, wet: Numbers, n_each: int) -> None:
     number = np.arange(1, len(wet.truth) + 1)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(1.5, 1.0))
     upper.step(number, wet.truth, where="mid", color=TRUTH, linewidth=0.9, label="truth")
@@ -115,7 +113,7 @@ def _draw_numbers(figure: "Figure", wet: Numbers, n_each: int) -> None:
 
 
 def _draw_target(
-    figure: "Figure", example: "NDArray[np.uint8]", spread: Decentred, largest_sigma: float
+    figure: Figure, example: NDArray[np.uint8], spread: Decentred, largest_sigma: float
 ) -> None:
     picture, chart = figure.subplots(1, 2, width_ratios=(1.0, 1.25))
     picture.imshow(example)
@@ -169,7 +167,7 @@ class Cruise:
 
     views: list[View]  # Points where the target's file puts them, pixels where they were found.
     n_true: FloatArray  # Shape (F,): index of the medium in each.
-    example: "NDArray[np.uint8]"  # Shape (height, width, 3): the last picture.
+    example: NDArray[np.uint8]  # Shape (height, width, 3): the last picture.
 
 
 def cruise(laboratory: Laboratory, waters: Sequence[float] = WATERS) -> Cruise:
@@ -217,7 +215,7 @@ def _scene(plate: targets.Marked, i: int) -> PanelScene:
     return PanelScene(panels=[plate.panel, behind], light=_ROOM)
 
 
-def _found(picture: "NDArray[np.uint8]", markers: MarkerSet, name: str) -> View:
+def _found(picture: NDArray[np.uint8], markers: MarkerSet, name: str) -> View:
     # Weighted as OpenCV makes grey of colours.
     grey = np.asarray(np.rint(picture @ np.array([0.299, 0.587, 0.114])), np.uint8)
     view = detect_markers(grey, markers, name)
@@ -265,7 +263,7 @@ def paper_index(rig: Rig, view: View) -> float:
     Corners are traced to the target's plane, and the index is sought that brings them nearest to
     where they are known to be (paper, section 2.2).
     """
-    plane = _plane_through(view.points)
+    plane = Plane.fitted(view.points)
 
     def cost(n: float) -> float:
         rays = rig.in_water(n).camera().rays(view.pixels)
@@ -275,12 +273,6 @@ def paper_index(rig: Rig, view: View) -> float:
 
     found = minimize_scalar(cost, bounds=(1.0, 1.5), method="bounded", options={"xatol": 1e-7})
     return float(found.x)
-
-
-def _plane_through(points: FloatArray) -> Plane:
-    middle = points.mean(axis=0)
-    normal = np.linalg.svd(points - middle)[2][2]
-    return Plane.from_normal(normal, float(normal @ middle))
 
 
 def decentred(rig: Rig, lens_mm: Sequence[float] = _SETUP.decentred_mm) -> Decentred:

@@ -45,6 +45,13 @@ class Plane:
             raise ValueError(f"plane normal {vector.tolist()} has no direction")
         return cls(vector / length, float(offset) / length)
 
+    @classmethod
+    def fitted(cls, points: FloatArray) -> "Plane":
+        """Return the plane with the least squared distances from points (N, 3)."""
+        middle = points.mean(axis=0)
+        normal = np.linalg.svd(points - middle, full_matrices=False)[2][-1]
+        return cls(normal, float(normal @ middle))
+
     def signed_distance(self, points: FloatArray) -> FloatArray:
         """Return normal·X - offset for points of shape (..., 3)."""
         return points @ self.normal - self.offset

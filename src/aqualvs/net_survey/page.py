@@ -1,7 +1,6 @@
 """`net_change.html` and its map: the changes of a net on one page, without a network.
 
-The map shows growth by colour and holes by what became of them. Matplotlib is imported only when a
-map is drawn; no display is needed.
+The map shows growth by colour and holes by what became of them.
 """
 
 import math
@@ -9,9 +8,16 @@ import re
 from collections.abc import Mapping
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch, Rectangle
 
 from aqualvs import __version__
 from aqualvs.geometry.arrays import FloatArray, IntArray
@@ -33,12 +39,6 @@ from aqualvs.report.html import Card
 from aqualvs.results.files import replace_text
 from aqualvs.results.run_request import now
 from aqualvs.text import signed
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.figure import Figure
-
 
 _WEEK = 7.0
 # From green (less) over white to brown (more); told apart by colour-blind eyes.
@@ -72,17 +72,13 @@ def draw_change(result: Comparison, path: Path) -> None:
 
     Raises `OSError` as the system says it.
     """
-    import matplotlib as mpl
-
     dpi = 200
-    with mpl.rc_context(_STYLE):
+    with rc_context(_STYLE):
         figure = _dates(result) if result.wall is None else _map(result.wall)
         figure.savefig(path, dpi=dpi)
 
 
-def _map(wall: OnWall) -> "Figure":
-    from matplotlib.figure import Figure
-
+def _map(wall: OnWall) -> Figure:
     raster = wall.history.raster
     columns = _columns(wall)
     low = raster.low[1] - 0.3 * raster.size[1]
@@ -127,18 +123,13 @@ def _columns(wall: OnWall) -> IntArray:
     return np.asarray((seen[(widest + 1) % len(seen)] + np.arange(count)) % n)
 
 
-def _shades(wall: OnWall) -> "ScalarMappable":
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import Normalize
-
+def _shades(wall: OnWall) -> ScalarMappable:
     rates = [abs(100.0 * _WEEK * one.per_day.value) for one in wall.cells]
     most = max(float(np.quantile(rates, 0.98)) if rates else 0.0, _MIN_SCALE)
     return ScalarMappable(Normalize(-most, most), _COLOURS)
 
 
-def _cells(axes: "Axes", wall: OnWall, columns: IntArray, shades: "ScalarMappable") -> None:
-    from matplotlib.patches import Rectangle
-
+def _cells(axes: Axes, wall: OnWall, columns: IntArray, shades: ScalarMappable) -> None:
     raster, told = wall.history.raster, {one.cell: one for one in wall.cells}
     known = np.asarray(wall.history.known.any(axis=1))
     axes.set_facecolor(_SEA)
@@ -161,7 +152,7 @@ def _cells(axes: "Axes", wall: OnWall, columns: IntArray, shades: "ScalarMappabl
                 axes.plot(*middle, ".", color=DARK, markersize=2.2)
 
 
-def _sites(axes: "Axes", wall: OnWall, columns: IntArray) -> None:
+def _sites(axes: Axes, wall: OnWall, columns: IntArray) -> None:
     low, high = axes.get_xlim()
     many = len(wall.sites) > _LABELLED
     for site in sorted(wall.sites, key=lambda one: one.state is not HoleState.SAME):
@@ -201,7 +192,7 @@ def _drawn(place: FloatArray, wall: OnWall, columns: IntArray) -> float:
     return size * float(np.mod(at - columns[0] + 0.5, raster.shape[0]) - 0.5)
 
 
-def _axis(axes: "Axes", wall: OnWall, columns: IntArray, *, last: bool) -> None:
+def _axis(axes: Axes, wall: OnWall, columns: IntArray, *, last: bool) -> None:
     raster, frame = wall.history.raster, wall.frame
     axes.set_ylabel("depth, m")
     axes.set_aspect("equal")
@@ -229,10 +220,7 @@ def _title(wall: OnWall) -> str:
     return f"{words}\n{rate_text(wall.growth)}: {verdict(wall.growth)}"
 
 
-def _legend(figure: "Figure", wall: OnWall) -> None:
-    from matplotlib.lines import Line2D
-    from matplotlib.patches import Patch
-
+def _legend(figure: Figure, wall: OnWall) -> None:
     states = {one.state for one in wall.sites}
     shown: dict[str, Line2D | Patch] = {
         _NAMES[state]: Line2D(
@@ -258,9 +246,7 @@ def _legend(figure: "Figure", wall: OnWall) -> None:
         )
 
 
-def _dates(result: Comparison) -> "Figure":
-    from matplotlib.figure import Figure
-
+def _dates(result: Comparison) -> Figure:
     figure = Figure(figsize=(8.0, 4.0), facecolor="white", layout="constrained")
     axes = figure.subplots()
     known = [(d, one) for d, one in zip(result.dates, result.whole, strict=True) if one]

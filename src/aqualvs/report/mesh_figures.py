@@ -3,17 +3,20 @@
 The print-ready pictures follow figures 9, 13 and 14 of the paper (Constantinou, Georgiades and
 Loizou, Robotics 2021, 10, 126): what a laser lit in one frame (13), what each mesh filter keeps of
 it (14), and the laser-plane image (Eq. 41-42) with the structuring elements (9) to scale.
-
-Matplotlib is imported when a picture is drawn, with its Agg canvas only: no display is needed.
 """
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
+from matplotlib.patches import Annulus, Circle, Rectangle
 from pyarrow import parquet
 
 from aqualvs.errors import OptionError, SourceError
@@ -35,11 +38,6 @@ from aqualvs.scanning.paper.mesh_filter import (
     structuring_elements,
 )
 from aqualvs.scanning.scan import Label
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
 
 _ZONE = "#e8f3ea"
 
@@ -111,10 +109,8 @@ def draw_figures(reflections: Reflections, options: MeshFilterOptions, out: Path
     return save_figures(drawn_figures(reflections, options), out, dpi=220)
 
 
-def drawn_figures(reflections: Reflections, options: MeshFilterOptions) -> "dict[str, Figure]":
+def drawn_figures(reflections: Reflections, options: MeshFilterOptions) -> dict[str, Figure]:
     """Return the same pictures by name, not yet written."""
-    from matplotlib import rc_context
-
     with rc_context(STYLE):
         return {
             "figure_13": _all_reflections(reflections, options),
@@ -123,11 +119,11 @@ def drawn_figures(reflections: Reflections, options: MeshFilterOptions) -> "dict
         }
 
 
-def _dots(axes: "Axes", xy: FloatArray, size: float, colour: str, label: str = "") -> None:
+def _dots(axes: Axes, xy: FloatArray, size: float, colour: str, label: str = "") -> None:
     axes.scatter(xy[:, 0], xy[:, 1], s=size, color=colour, linewidths=0, label=label, zorder=3)
 
 
-def _all_reflections(r: Reflections, _: MeshFilterOptions) -> "Figure":
+def _all_reflections(r: Reflections, _: MeshFilterOptions) -> Figure:
     """Draw figure 13: all points that the laser lit, and the zone in which they are accepted."""
     xy = 1e3 * r.in_laser
     low, high = _span(xy, 0.08)
@@ -150,7 +146,7 @@ def _all_reflections(r: Reflections, _: MeshFilterOptions) -> "Figure":
     return figure
 
 
-def _filtered(r: Reflections, options: MeshFilterOptions) -> "Figure":
+def _filtered(r: Reflections, options: MeshFilterOptions) -> Figure:
     """Draw figure 14 for both filters side by side."""
     xy = 1e3 * r.in_laser[r.usable]
     low, high = _span(xy, 0.06)
@@ -185,7 +181,7 @@ def _filtered(r: Reflections, options: MeshFilterOptions) -> "Figure":
     return figure
 
 
-def _binary_image(r: Reflections, options: MeshFilterOptions) -> "Figure":
+def _binary_image(r: Reflections, options: MeshFilterOptions) -> Figure:
     """Draw the laser-plane image (Eq. 41-42) with the structuring elements (figure 9) to scale."""
     figure = new_canvas(7.2, 4.0)
     left, right = figure.subplots(1, 2)
@@ -216,12 +212,10 @@ def _square(low: FloatArray, high: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _cells(
-    axes: "Axes", lit: BoolArray, corner: FloatArray, dd: float, middle: FloatArray, reach: float
+    axes: Axes, lit: BoolArray, corner: FloatArray, dd: float, middle: FloatArray, reach: float
 ) -> None:
     """Draw the lit cells around a place to scale."""
     extent = (corner[0], corner[0] + dd * lit.shape[0], corner[1], corner[1] + dd * lit.shape[1])
-    from matplotlib.colors import ListedColormap
-
     axes.imshow(
         lit.T,
         origin="lower",
@@ -235,11 +229,9 @@ def _cells(
 
 
 def _rings(
-    axes: "Axes", options: MeshFilterOptions, middle: FloatArray, cells: Any, corner: FloatArray
+    axes: Axes, options: MeshFilterOptions, middle: FloatArray, cells: Any, corner: FloatArray
 ) -> None:
     """Draw the regions A, B and C as circles, and count the lit cells in each of them."""
-    from matplotlib.patches import Circle
-
     half, dd = 1e3 * options.rd_theta / 2.0, 1e3 * options.dd
     outer = {"A": half, "B": max(1e3 * options.r_min - half, half), "C": 1e3 * options.r_max + half}
     at = np.rint((middle - corner) / dd - 0.5).astype(np.int64)
@@ -278,10 +270,8 @@ def _typical(r: Reflections, corner: FloatArray, dd: float) -> FloatArray:
     return corner + dd * (np.floor((place - corner) / dd) + 0.5)
 
 
-def _zone(axes: "Axes", r: Reflections) -> None:
+def _zone(axes: Axes, r: Reflections) -> None:
     """Shade where the laser's plane lies in the operational range, about the dome's foot."""
-    from matplotlib.patches import Annulus
-
     near, far = (float(np.sqrt(max(d * d - r.offset**2, 0.0))) for d in r.working_range)
     if not np.isfinite(far):
         return
@@ -291,7 +281,7 @@ def _zone(axes: "Axes", r: Reflections) -> None:
     axes.add_patch(ring)
 
 
-def _plane_axes(axes: "Axes", low: FloatArray, high: FloatArray) -> None:
+def _plane_axes(axes: Axes, low: FloatArray, high: FloatArray) -> None:
     axes.set_xlim(float(low[0]), float(high[0]))
     axes.set_ylim(float(low[1]), float(high[1]))
     axes.set_aspect("equal")
@@ -323,8 +313,6 @@ def _detail(net: FloatArray, others: FloatArray) -> tuple[FloatArray, FloatArray
 
 
 def _box(low: FloatArray, high: FloatArray) -> Any:
-    from matplotlib.patches import Rectangle
-
     width, height = (high - low).tolist()
     return Rectangle(
         (float(low[0]), float(low[1])), width, height, fill=False, edgecolor=DARK, linewidth=0.8
