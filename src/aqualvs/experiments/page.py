@@ -24,13 +24,13 @@ import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cache
-from html import escape
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib import rc_context
 
 from aqualvs import __version__
 from aqualvs.experiments.experiment import (
@@ -188,12 +188,10 @@ def _record(content: Mapping[str, Any]) -> Record:
 
 
 def _save_picture(name: str, picture: ExperimentFigure, folder: Path) -> PrintedFigure:
-    import matplotlib as mpl
-
     stem = f"{name}_{picture.name}"
     place = folder / FIGURES
     # The salt keeps the identifiers inside an SVG the same from run to run.
-    with writing(place), mpl.rc_context({**STYLE, "svg.hashsalt": stem}):
+    with writing(place), rc_context({**STYLE, "svg.hashsalt": stem}):
         place.mkdir(parents=True, exist_ok=True)
         for kind, metadata in _FORMATS.items():
             picture.figure.savefig(place / f"{stem}.{kind}", metadata=dict(metadata))
@@ -239,11 +237,9 @@ FRAME = "a frame"
 """Among the times: what the scanner takes for one frame (median); no experiment has this name."""
 
 
-_DASH = "–"
 # A drawing with more marks than this weighs more than its picture, and opens slower.
 _LARGEST_SVG = 250_000
 _PX_PER_INCH = 125
-_HEAD = ("quantity", "paper", "ours", "bar", "met")
 
 
 def write_page(records: Sequence[Record], seconds: Mapping[str, float], folder: Path) -> Path:
@@ -264,24 +260,19 @@ def page_html(records: Sequence[Record], seconds: Mapping[str, float], folder: P
 
     Raises `OSError` if a figure cannot be read.
     """
-    return html.page(
-        "reproduce.html",
-        {
-            "title": "The paper’s experiments, beside ours",
-            "version": __version__,
-            "doi": DOI,
-            "results": RESULTS,
-        },
-        {
-            "cards": html.cards(_cards(records, seconds)),
-            "warnings": _notice(records),
-            "bars": _bars(records),
-            "contents": _contents(records),
-            "sections": "\n".join(
-                _section(record, seconds.get(record.name), folder) for record in records
-            ),
-        },
-    )
+    content = {
+        "title": "The paper’s experiments, beside ours",
+        "version": __version__,
+        "doi": DOI,
+        "results": RESULTS,
+        "records": records,
+        "times": {name: duration(seconds[name]) for name in seconds},
+        "with_bar": _with_bar(records),
+        "bar_text": _bar_text,
+        "picture": lambda printed: _picture(printed, folder),
+    }
+    parts = {"cards": html.cards(_cards(records, seconds)), "warnings": _notice(records)}
+    return html.page("reproduce.html", content, parts)
 
 
 def _cards(records: Sequence[Record], seconds: Mapping[str, float]) -> Iterator[Card]:
@@ -300,7 +291,7 @@ def _cards(records: Sequence[Record], seconds: Mapping[str, float]) -> Iterator[
 def _notice(records: Sequence[Record]) -> str:
     said = [f"{record.name} failed: {record.failure}" for record in records if record.failure]
     said += [
-        f"{record.name}: {finding.what}: {finding.ours}, bar {_said(finding.bar)}"
+        f"{record.name}: {finding.what}: {finding.ours}, bar {_bar_text(finding.bar)}"
         for record, finding in _with_bar(records)
         if not finding.met
     ]
@@ -316,105 +307,19 @@ def _with_bar(records: Sequence[Record]) -> list[tuple[Record, ExperimentRow]]:
     ]
 
 
-def _bars(records: Sequence[Record]) -> str:
-    rows = [(html.Raw(_link(record)), *_cells(finding)) for record, finding in _with_bar(records)]
-    if not rows:
-        return '<p class="note">None of these experiments has a bar to meet.</p>'
-    return html.table(("experiment", *_HEAD), rows, tail=len(_HEAD))
-
-
-def _contents(records: Sequence[Record]) -> str:
-    rows = [
-        (
-            html.Raw(_link(record)),
-            record.paper or "ours",
-            record.sentence or f"failed: {record.failure}",
-        )
-        for record in records
-    ]
-    return html.table(("experiment", "paper", "result"), rows, texts=3)
-
-
-def _link(record: Record) -> str:
-    return f'<a href="#{escape(record.name)}">{escape(record.title)}</a>'
-
-
-def _section(record: Record, seconds: float | None, folder: Path) -> str:
-    parts = [f'<p class="sub">{" · ".join(_origin(record, seconds))}</p>']
-    if record.about:
-        parts.append(f'<p class="lead">{escape(record.about)}</p>')
-    if record.failure:
-        parts.append(
-            f'<div class="notice warn"><p><b>Failed.</b> {escape(record.failure)}</p></div>'
-        )
-    if record.sentence:
-        parts.append(f'<p class="sentence">{escape(record.sentence)}</p>')
-    parts += [_figure(picture, folder) for picture in record.pictures]
-    if record.findings:
-        rows = map(_cells, record.findings)
-        parts.append(html.table(_HEAD, rows, tail=len(_HEAD) - 1))
-    if record.notes:
-        notes = "".join(f"<li>{escape(note)}</li>" for note in record.notes)
-        parts.append(f'<ul class="notes">{notes}</ul>')
-    if record.series:
-        files = ", ".join(_file_link(f"{SERIES}/{name}", name) for name in record.series)
-        parts.append(f'<p class="note files">Numbers: {files}</p>')
-    body = "\n".join(parts)
-    return (
-        f'<section id="{escape(record.name)}">\n<h2>{escape(record.title)}</h2>\n{body}\n</section>'
-    )
-
-
-def _origin(record: Record, seconds: float | None) -> Iterator[str]:
-    yield f"Paper: {escape(record.paper)}" if record.paper else "An ablation of ours"
-    if seconds is not None:
-        yield duration(seconds)
-    yield f"<code>aqualvs reproduce {escape(record.name)}</code>"
-
-
-def _cells(finding: ExperimentRow) -> tuple[str, ...]:
-    return (
-        finding.what,
-        finding.paper or _DASH,
-        html.Raw(f"<b>{escape(finding.ours)}</b>"),
-        _said(finding.bar) or _DASH,
-        _mark(finding.met),
-    )
-
-
-def _said(bar: str) -> str:
+def _bar_text(bar: str) -> str:
     # The number stays on the line of its sign.
     return bar.replace("<= ", "≤\u00a0").replace(">= ", "≥\u00a0")
 
 
-def _mark(met: bool | None) -> str:
-    if met is None:
-        return _DASH
-    words, kind = ("✓ yes", "met") if met else ("✗ no", "missed")
-    return html.Raw(f'<span class="{kind}">{words}</span>')
-
-
-def _figure(picture: PrintedFigure, folder: Path) -> str:
-    stem = folder / FIGURES / picture.file
+def _picture(printed: PrintedFigure, folder: Path) -> tuple[str, str]:
+    """Return a figure as an address, and the width of its drawing as a style."""
+    stem = folder / FIGURES / printed.file
     drawing = stem.with_name(f"{stem.name}.svg")
+    width = f"max-width: {_PX_PER_INCH * printed.width_in:.0f}px"
     if drawing.stat().st_size <= _LARGEST_SVG:
-        kind, data = "svg+xml", drawing.read_bytes()
-    else:
-        kind, data = "png", stem.with_name(f"{stem.name}.png").read_bytes()
-    files = " ".join(
-        _file_link(f"{FIGURES}/{picture.file}.{suffix}", suffix.upper())
-        for suffix in ("pdf", "png", "svg")
-    )
-    caption = escape(picture.caption)
-    width = f'style="max-width: {_PX_PER_INCH * picture.width_in:.0f}px"'
-    return (
-        f'<figure><img {width} src="{html.data_url(data, kind)}" alt="{caption}">'
-        f'<figcaption>{caption} <span class="files">{files}</span></figcaption></figure>'
-    )
-
-
-def _file_link(path: str, words: str) -> str:
-    return f'<a href="{escape(path)}">{escape(words)}</a>'
+        return html.data_url(drawing.read_bytes(), "svg+xml"), width
+    return html.data_url(stem.with_name(f"{stem.name}.png").read_bytes(), "png"), width
 
 
 def duration(seconds: float) -> str:

@@ -58,20 +58,20 @@ def contents_of(body: str) -> "Raw":
     return Raw(f'<nav aria-label="Contents"><ul class="contents">{items}</ul></nav>')
 
 
-def page(template: str, texts: Mapping[str, str], parts: Mapping[str, str]) -> str:
+def page(template: str, content: Mapping[str, object], parts: Mapping[str, str]) -> str:
     """Fill a template.
 
     Parameters
     ----------
     template : str
         Name of a file in `assets`.
-    texts : mapping
-        Plain texts by name, which are escaped.
+    content : mapping
+        Texts, which are escaped, and whatever else the template takes, by name.
     parts : mapping
         HTML by name.
     """
     html = {name: Raw(part) for name, part in parts.items()}
-    return _templates().get_template(template).render(**texts, **html)
+    return _templates().get_template(template).render(**content, **html)
 
 
 class Raw(str):
