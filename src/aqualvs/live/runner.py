@@ -176,15 +176,8 @@ class Arrival:
 class Mailbox:
     """Room for one picture: the latest, or both its fields.
 
-    Parameters
-    ----------
-    keep_every : bool
-        Let the writer wait until its frame has been taken, instead of replacing one that has not.
-
-    Attributes
-    ----------
-    n_dropped : int
-        Frames that were replaced by a newer one before they were taken.
+    `keep_every`: let the writer wait until its frame has been taken, instead of replacing one that
+    has not.
     """
 
     def __init__(self, *, keep_every: bool = False) -> None:
@@ -237,17 +230,7 @@ def _are_one_picture(first: Frame, second: Frame) -> bool:
 class FrameReader:
     """Reader of a feed in a thread of its own; a context manager.
 
-    Parameters
-    ----------
-    mailbox : Mailbox
-        Closed when the feed ends.
-
-    Attributes
-    ----------
-    n_lost : int
-        Frames that the feed could not decode, by the gaps in their numbers.
-    fault : AqualvsError or None
-        What ended the feed, if it did not end by itself.
+    `mailbox`: closed when the feed ends.
     """
 
     def __init__(self, feed: Feed, mailbox: Mailbox) -> None:

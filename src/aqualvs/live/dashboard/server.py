@@ -47,7 +47,7 @@ from aqualvs.recording.sample import LiveSample
 from aqualvs.results.folder import posture_cells
 from aqualvs.scanning.posture import Refusal, deviations
 from aqualvs.scanning.scan import Label, ScanPoints
-from aqualvs.sources.base import Health, PartHealth
+from aqualvs.sources.base import Health
 from aqualvs.text import laser_colour
 
 
@@ -148,14 +148,10 @@ def _health(health: Health) -> dict[str, Any]:
         "delays_ms": {
             d.name: [round(1e3 * d.median_s, 2), round(1e3 * d.p99_s, 2)] for d in health.delays
         },
-        "source": _part(health.source),
-        "lasers": [_part(part) for part in health.lasers],
-        "outputs": [_part(part) for part in health.outputs],
+        "source": asdict(health.source),
+        "lasers": [asdict(part) for part in health.lasers],
+        "outputs": [asdict(part) for part in health.outputs],
     }
-
-
-def _part(part: PartHealth) -> dict[str, Any]:
-    return asdict(part)
 
 
 def _without_nan(value: Any) -> Any:
@@ -279,11 +275,6 @@ class DashboardServer:
     host, port
         Where to listen; port 0 takes any that is free.
 
-    Attributes
-    ----------
-    port : int
-        Where it listens.
-
     Raises
     ------
     OptionError
@@ -310,7 +301,9 @@ class DashboardServer:
                 timeout_graceful_shutdown=1,
             )
         )
-        self._thread = threading.Thread(target=self._serve, name="dashboard", daemon=True)
+        self._thread = threading.Thread(
+            target=lambda: asyncio.run(self._serve()), name="dashboard", daemon=True
+        )
         self._thread.start()
         if not self._started():
             raise OptionError(f"dashboard: {host}:{self.port} did not start; try another port")
@@ -334,10 +327,7 @@ class DashboardServer:
             time.sleep(0.01)
         return False
 
-    def _serve(self) -> None:
-        asyncio.run(self._serve_in_loop())
-
-    async def _serve_in_loop(self) -> None:
+    async def _serve(self) -> None:
         self._loop = asyncio.get_running_loop()
         await self._server.serve(sockets=[self._socket])
 

@@ -170,17 +170,12 @@ class StickCommander:
         would take the two for one.
     target : int
         System id of the vehicle.
-
-    Attributes
-    ----------
-    shaping : StickShaping
-        The vehicle's conversion of sticks; ArduSub's default until it has reported its own.
-    keeps_place : bool
-        Whether its mode is POSHOLD.
     """
 
     def __init__(self, dialect: Any, packer: Any, *, target: int) -> None:
-        self.shaping, self.keeps_place = StickShaping(), False
+        # How the vehicle converts sticks; ArduSub's default until it has reported its own.
+        self.shaping = StickShaping()
+        self.keeps_place = False  # Whether its mode is POSHOLD.
         self._message = dialect.MAVLink_manual_control_message(target, 0, 0, MIDDLE, 0, 0)
         self._packer = packer
 

@@ -97,13 +97,6 @@ class MavlinkLink:
     url : str
         See `parse_address`.
 
-    Attributes
-    ----------
-    system : int
-        System id of the vehicle, and our own.
-    dialect : module
-        pymavlink's messages and constants (ardupilotmega, which holds all common ones).
-
     Raises
     ------
     OptionError
@@ -113,8 +106,9 @@ class MavlinkLink:
     def __init__(self, url: str, options: LinkOptions | None = None) -> None:
         options = options or LinkOptions()
         self.url = url
-        self.system = system = options.system
+        self.system = system = options.system  # Of the vehicle, and our own.
         self._autopilot_ids = (system, _AUTOPILOT_COMPONENT)
+        # Messages and constants of ardupilotmega, which holds all common ones.
         self.dialect: Any = _dialect()
         self._address = parse_address(url)
         check_address(self._address)

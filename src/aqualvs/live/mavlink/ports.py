@@ -257,8 +257,8 @@ class UdpPort(Port):
 
     whole = True
 
-    def __init__(self, made: socket.socket) -> None:
-        self._socket = made
+    def __init__(self, made: socket.socket, where: Peer = ()) -> None:
+        self._socket, self._where = made, where
 
     def fileno(self) -> int:
         """Return the number of the socket."""
@@ -267,6 +267,26 @@ class UdpPort(Port):
     def close(self) -> None:
         """Free the socket."""
         self._socket.close()
+
+    def read(self) -> tuple[bytes, Peer]:
+        """Return a datagram and its sender; empty if none has come."""
+        datagram = 65_535
+        try:
+            return self._socket.recvfrom(datagram)
+        except (ConnectionRefusedError, ConnectionResetError):
+            self.refused_s = time.monotonic()
+        except OSError as fault:
+            if fault.errno not in _NOT_NOW:
+                raise
+        return b"", ()
+
+    def write(self, frames: bytes, peer: Peer, /) -> bool:
+        """Send a datagram to one peer; return whether it was sent."""
+        return self.sent(frames, peer)
+
+    def write_all(self, frames: bytes, _heard: Sequence[Peer], /) -> bool:
+        """Send to the port's own address."""
+        return self.sent(frames, self._where)
 
     def sent(self, frames: bytes, where: Peer) -> bool:
         """Send a datagram to an address, or to the connected peer if that is empty."""
@@ -287,17 +307,6 @@ class UdpPort(Port):
                 return True
         return False
 
-    def _received(self) -> tuple[bytes, Peer]:
-        datagram = 65_535
-        try:
-            return self._socket.recvfrom(datagram)
-        except (ConnectionRefusedError, ConnectionResetError):
-            self.refused_s = time.monotonic()
-        except OSError as fault:
-            if fault.errno not in _NOT_NOW:
-                raise
-        return b"", ()
-
 
 class _UdpSender(UdpPort):
     """Port that sends to one address and hears only that."""
@@ -313,13 +322,7 @@ class _UdpSender(UdpPort):
             raise
 
     def read(self) -> tuple[bytes, Peer]:
-        return self._received()[0], ()
-
-    def write(self, frames: bytes, _peer: Peer, /) -> bool:
-        return self.sent(frames, ())
-
-    def write_all(self, frames: bytes, _heard: Sequence[Peer], /) -> bool:
-        return self.sent(frames, ())
+        return super().read()[0], ()
 
 
 class _UdpBroadcaster(UdpPort):
@@ -328,8 +331,8 @@ class _UdpBroadcaster(UdpPort):
     many = True
 
     def __init__(self, address: NetAddress) -> None:
-        made, self._where = _open_udp(address, passive=False)
-        super().__init__(made)
+        made, where = _open_udp(address, passive=False)
+        super().__init__(made, where)
         try:
             made.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
             # Bound, so that it can be read before the first datagram goes out.
@@ -337,15 +340,6 @@ class _UdpBroadcaster(UdpPort):
         except OSError:
             made.close()
             raise
-
-    def read(self) -> tuple[bytes, Peer]:
-        return self._received()
-
-    def write(self, frames: bytes, peer: Peer, /) -> bool:
-        return self.sent(frames, peer)
-
-    def write_all(self, frames: bytes, _heard: Sequence[Peer], /) -> bool:
-        return self.sent(frames, self._where)
 
 
 class _UdpListener(UdpPort):
@@ -366,9 +360,6 @@ class _UdpListener(UdpPort):
                     f"{address.host} is no address of this computer; to send there use udpout:",
                 ) from fault
             raise
-
-    def read(self) -> tuple[bytes, Peer]:
-        return self._received()
 
     def write(self, frames: bytes, peer: Peer, /) -> bool:
         """Send to one peer; one that cannot be reached must not keep it from the others."""

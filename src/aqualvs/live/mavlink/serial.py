@@ -15,12 +15,7 @@ _WRITE_S = 0.1
 
 
 def check_speed(address: SerialAddress) -> None:
-    """Raise if pyserial is missing, or there is no such speed.
-
-    Raises
-    ------
-    OptionError
-    """
+    """Raise `OptionError` if pyserial is missing, or there is no such speed."""
     try:
         from serial import Serial
     except ImportError as fault:

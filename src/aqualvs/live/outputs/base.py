@@ -13,30 +13,25 @@ class Output(Protocol):
 
     Made by its constructor without waiting for a peer; a peer that is absent, leaves or returns is
     reported by `health` and raises no exception.
-
-    Attributes
-    ----------
-    name : str
-        How health and messages call it.
-    inline : bool
-        Whether `send` never waits (a datagram), so that it may run between two frames. Others get
-        a thread of their own.
-    keeps_all : bool
-        Whether samples may wait in a queue for their turn (a recorder). For others a newer sample
-        replaces one that is still waiting.
     """
 
     @property
     def name(self) -> str:
-        """Name of the output in health reports and messages."""
+        """Name in health reports and messages."""
 
     @property
     def inline(self) -> bool:
-        """Whether `send` never waits."""
+        """Whether `send` never waits (a datagram), so that it may run between two frames.
+
+        Others get a thread of their own.
+        """
 
     @property
     def keeps_all(self) -> bool:
-        """Whether samples may wait in a queue for their turn."""
+        """Whether samples may wait in a queue for their turn (a recorder).
+
+        For others a newer sample replaces one that is still waiting.
+        """
 
     def send(self, sample: LiveSample) -> None:
         """Send one sample.

@@ -29,18 +29,7 @@ from aqualvs.sources.base import PartHealth, State
 
 if TYPE_CHECKING:
     from foxglove import Channel
-    from foxglove.messages import (
-        CubePrimitive,
-        FrameTransform,
-        FrameTransforms,
-        LinePrimitive,
-        Pose,
-        Quaternion,
-        SceneUpdate,
-        TextPrimitive,
-        Timestamp,
-        Vector3,
-    )
+    from foxglove import messages as sdk
     from foxglove.websocket import ChannelView, Client
 
 
@@ -53,7 +42,7 @@ _GREEN, _BLUE = (0.1, 1.0, 0.3, 1.0), (0.2, 0.6, 1.0, 0.25)
 _LINE_PX = 2.0
 
 
-def transforms(rig: Rig, stamp_ns: int) -> "FrameTransforms":
+def transforms(rig: Rig, stamp_ns: int) -> "sdk.FrameTransforms":
     """Return where dome and camera are on the vehicle."""
     from foxglove.messages import FrameTransforms
 
@@ -66,7 +55,7 @@ def transforms(rig: Rig, stamp_ns: int) -> "FrameTransforms":
     )
 
 
-def scene(rig: Rig, scan: Scan, stamp_ns: int) -> "SceneUpdate":
+def scene(rig: Rig, scan: Scan, stamp_ns: int) -> "sdk.SceneUpdate":
     """Return the target's plane with the lasers' lines on it; nothing without a posture.
 
     What was drawn before vanishes by itself after half a second.
@@ -113,7 +102,7 @@ def laser_lines(
     return found
 
 
-def _plate(posture: Posture) -> "CubePrimitive":
+def _plate(posture: Posture) -> "sdk.CubePrimitive":
     """Return the target as a thin square about the foot of the perpendicular."""
     from foxglove.messages import Color, CubePrimitive, Vector3
 
@@ -125,7 +114,7 @@ def _plate(posture: Posture) -> "CubePrimitive":
     )
 
 
-def _caption(posture: Posture) -> "TextPrimitive":
+def _caption(posture: Posture) -> "sdk.TextPrimitive":
     from foxglove.messages import Color, TextPrimitive
 
     return TextPrimitive(
@@ -138,7 +127,7 @@ def _caption(posture: Posture) -> "TextPrimitive":
     )
 
 
-def _line(ends: FloatArray) -> "LinePrimitive":
+def _line(ends: FloatArray) -> "sdk.LinePrimitive":
     from foxglove.messages import Color, LinePrimitive, LinePrimitiveLineType, Point3
 
     return LinePrimitive(
@@ -153,7 +142,7 @@ def _line(ends: FloatArray) -> "LinePrimitive":
 
 def _transform(
     parent: str, child: str, rotation: FloatArray, origin: FloatArray, stamp_ns: int
-) -> "FrameTransform":
+) -> "sdk.FrameTransform":
     from foxglove.messages import FrameTransform
 
     return FrameTransform(
@@ -165,27 +154,27 @@ def _transform(
     )
 
 
-def _pose(rotation: FloatArray, origin: FloatArray) -> "Pose":
+def _pose(rotation: FloatArray, origin: FloatArray) -> "sdk.Pose":
     from foxglove.messages import Pose
 
     return Pose(position=_vector(origin), orientation=_turn(rotation))
 
 
-def _vector(values: FloatArray) -> "Vector3":
+def _vector(values: FloatArray) -> "sdk.Vector3":
     from foxglove.messages import Vector3
 
     x, y, z = values.tolist()
     return Vector3(x=x, y=y, z=z)
 
 
-def _turn(rotation: FloatArray) -> "Quaternion":
+def _turn(rotation: FloatArray) -> "sdk.Quaternion":
     from foxglove.messages import Quaternion
 
     x, y, z, w = quaternion_from_rotation(rotation)
     return Quaternion(x=x, y=y, z=z, w=w)
 
 
-def _stamp(stamp_ns: int) -> "Timestamp":
+def _stamp(stamp_ns: int) -> "sdk.Timestamp":
     from foxglove.messages import Timestamp
 
     return Timestamp(sec=stamp_ns // 10**9, nsec=stamp_ns % 10**9)

@@ -25,11 +25,6 @@ class RerunOutput:
     where : str
         `viewer` to open one, HOST:PORT of one that is open, or a file that ends in `.rrd`.
 
-    Attributes
-    ----------
-    name, inline, keeps_all
-        As in `Output`; a file gets all samples.
-
     Raises
     ------
     OptionError
