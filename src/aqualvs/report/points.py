@@ -12,15 +12,13 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
-from pyarrow import parquet
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.report.run_data import Track
-from aqualvs.results.points import read_points_stream
+from aqualvs.results.points import plain_column, points_file, stored_batches
 from aqualvs.scanning.scan import Label
 
 _BATCH = 1 << 16
-_LABEL_OF_NAME = {label.name.lower(): int(label) for label in Label}
 _NEEDED = ("frame", "laser", "u_px", "v_px", "x_m", "y_m", "z_m", "label", "used")
 _OPTIONAL = ("quality",)
 _NONE = np.empty(0, np.int64)
@@ -140,15 +138,8 @@ def _empty(track: Track) -> PointSummary:
 
 def _batches(run_dir: Path) -> Iterator[dict[str, NDArray[Any]]]:
     """Yield batches as arrays by column, labels as numbers."""
-    path, points_stream = run_dir / "points.parquet", run_dir / "points.arrows"
-    if path.exists() or not points_stream.exists():
-        with parquet.ParquetFile(path.absolute(), pre_buffer=False) as file:
-            names = [name for name in (*_NEEDED, *_OPTIONAL) if name in file.schema_arrow.names]
-            # One batch at a time, on one thread, keeps memory flat however long the dive.
-            batches = file.iter_batches(batch_size=_BATCH, columns=names, use_threads=False)
-            yield from map(_columns, batches)
-    else:
-        yield from map(_columns, read_points_stream(points_stream))
+    path = points_file(run_dir)
+    yield from map(_columns, stored_batches(path, _BATCH, (*_NEEDED, *_OPTIONAL)))
 
 
 def _columns(batch: Any) -> dict[str, NDArray[Any]]:
@@ -158,25 +149,9 @@ def _columns(batch: Any) -> dict[str, NDArray[Any]]:
     """
     present = [name for name in _OPTIONAL if name in batch.schema.names]
     return {
-        name: _label_codes(batch.column(name)) if name == "label" else _plain(batch.column(name))
+        name: plain_column(batch.column(name), labels=name == "label")
         for name in (*_NEEDED, *present)
     }
-
-
-def _plain(column: Any) -> NDArray[Any]:
-    array: NDArray[Any] = column.to_numpy(zero_copy_only=False)
-    return array
-
-
-def _label_codes(column: Any) -> NDArray[Any]:
-    """Return `Label` values of a column of names; a name unknown here counts as clutter."""
-    if pa.types.is_integer(column.type):
-        return _plain(column)
-    coded = column if pa.types.is_dictionary(column.type) else column.dictionary_encode()
-    names = coded.dictionary.to_pylist()
-    table = np.array([_LABEL_OF_NAME.get(name, int(Label.CLUTTER)) for name in names] or [0])
-    codes: NDArray[Any] = table[coded.indices.to_numpy(zero_copy_only=False)]
-    return codes
 
 
 def _add(
@@ -241,9 +216,7 @@ def _add_residuals(
     rows = slice(first, first + len(squares))
     summary.squares_mm2[rows] += squares
     summary.n_squares[rows] += np.bincount(row - first)
-    step = RESIDUAL_EDGES_MM[1] - RESIDUAL_EDGES_MM[0]
-    place = np.clip((off_mm - RESIDUAL_EDGES_MM[0]) / step, 0, summary.residual.shape[1] - 1)
-    _count_cells(summary.residual, laser[known], place.astype(np.int64))
+    _count(summary.residual, RESIDUAL_EDGES_MM, laser[known], off_mm)
 
 
 def _count_cells(counts: IntArray, i: IntArray, j: IntArray) -> None:
@@ -296,11 +269,8 @@ def _count(histogram: IntArray, edges: FloatArray, laser: IntArray, values: Floa
     finite = np.isfinite(values)
     if not finite.all():
         laser, values = laser[finite], values[finite]
-    n_lasers, n_bins = histogram.shape
-    step = edges[1] - edges[0]
-    bins = ((values - edges[0]) / step).clip(0, n_bins - 1).astype(np.int64)
-    counted = np.bincount(laser * n_bins + bins, minlength=histogram.size)
-    histogram += counted.reshape(n_lasers, n_bins)
+    bins = ((values - edges[0]) / (edges[1] - edges[0])).clip(0, histogram.shape[1] - 1)
+    _count_cells(histogram, laser, bins.astype(np.int64))
 
 
 def _grow_cloud(

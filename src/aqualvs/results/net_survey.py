@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
-from pyarrow import parquet
 
 from aqualvs import __version__
 from aqualvs.errors import SourceError
@@ -33,12 +32,10 @@ from aqualvs.results.folder import (
     NET_GEOJSON,
     NET_MAP_PNG,
     NET_MAP_SVG,
-    POINTS_PARQUET,
-    POINTS_STREAM,
     POSTURE_CSV,
     check_run_files,
 )
-from aqualvs.results.points import LABELS, POINTS_SCHEMA, read_points_stream
+from aqualvs.results.points import POINTS_SCHEMA, plain_column, points_file, stored_batches
 from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.scan import Label, Scan, ScanPoints
 
@@ -165,7 +162,6 @@ def _is_net(scan: Scan) -> bool:
 
 
 _BATCH = 1 << 15
-_CODE = {name: code for code, name in enumerate(LABELS)}
 _SIGMAS = ("sigma_range_m", "sigma_pitch_deg", "sigma_yaw_deg")
 _RIG_SIGMAS = ("sigma_range_rig_m", "sigma_pitch_rig_deg", "sigma_yaw_rig_deg")
 
@@ -320,18 +316,19 @@ def _pieces(run_folder: Path) -> Iterator[tuple[int, Columns]]:
 
 
 def _batches(run_folder: Path) -> Iterator[Columns]:
-    path, points_stream = run_folder / POINTS_PARQUET, run_folder / POINTS_STREAM
-    if not path.exists() and points_stream.exists():
-        path = points_stream
+    path = points_file(run_folder)
     try:
-        for batch in _arrow_batches(path):
+        for batch in stored_batches(path, _BATCH):
             missing = [name for name in POINTS_SCHEMA.names if name not in batch.schema.names]
             if missing:
                 raise SourceError(
                     f"{path}: has no column {' and no '.join(missing)}, as runs of older versions; "
                     "run the dive again with this version"
                 )
-            yield {name: _plain(name, batch.column(name)) for name in POINTS_SCHEMA.names}
+            yield {
+                name: plain_column(batch.column(name), labels=name == "label")
+                for name in POINTS_SCHEMA.names
+            }
     except FileNotFoundError:
         raise SourceError(
             f"{path}: no such file; give the folder of a run, or run the dive again"
@@ -339,27 +336,6 @@ def _batches(run_folder: Path) -> Iterator[Columns]:
     except (pa.ArrowInvalid, OSError) as fault:
         line = str(fault).splitlines()[0]
         raise SourceError(f"{path}: cannot be read ({line}); run the dive again") from fault
-
-
-def _arrow_batches(path: Path) -> Iterator[Any]:
-    if path.name == POINTS_STREAM:
-        yield from read_points_stream(path)
-        return
-    with parquet.ParquetFile(path.absolute(), pre_buffer=False) as file:
-        # One batch at a time, on one thread, keeps memory flat however long the dive; the empty
-        # one before them shows the columns of a file without rows.
-        yield pa.RecordBatch.from_pylist([], schema=file.schema_arrow)
-        yield from file.iter_batches(batch_size=_BATCH, use_threads=False)
-
-
-def _plain(name: str, column: Any) -> NDArray[Any]:
-    """Return a column as an array, labels as `Label` values."""
-    if name != "label":
-        return np.asarray(column.to_numpy(zero_copy_only=False))
-    coded = column if pa.types.is_dictionary(column.type) else column.dictionary_encode()
-    names = coded.dictionary.to_pylist()
-    table = np.array([_CODE.get(one, int(Label.CLUTTER)) for one in names] or [0], np.uint8)
-    return np.asarray(table[coded.indices.to_numpy(zero_copy_only=False)])
 
 
 def _scan_points(parts: list[Columns]) -> ScanPoints:

@@ -9,7 +9,7 @@ import contextlib
 import io
 import itertools
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Self
@@ -151,6 +151,45 @@ def read_points_stream(path: Path) -> Iterator[Any]:
             yield from pa.ipc.open_stream(file)
         except (pa.ArrowInvalid, OSError):
             return
+
+
+def points_file(run_folder: Path) -> Path:
+    """Return the file with the points of a run: the journal of one that was killed."""
+    points_stream = run_folder / "points.arrows"
+    path = run_folder / "points.parquet"
+    return path if path.exists() or not points_stream.exists() else points_stream
+
+
+def stored_batches(path: Path, rows: int, columns: Sequence[str] | None = None) -> Iterator[Any]:
+    """Yield the record batches of `points_file`, the first without rows.
+
+    Parameters
+    ----------
+    rows : int
+        Of a batch of a Parquet file, at most: memory stays flat however long the dive.
+    columns : sequence of str, optional
+        Those of a Parquet file that are read if they are there; all of them if left out.
+    """
+    if path.suffix == ".arrows":
+        yield from read_points_stream(path)
+        return
+    with parquet.ParquetFile(path.absolute(), pre_buffer=False) as file:
+        schema = file.schema_arrow
+        names = [name for name in schema.names if columns is None or name in columns]
+        # It shows the columns of a file without rows.
+        yield pa.RecordBatch.from_pylist([], schema=pa.schema(map(schema.field, names)))
+        yield from file.iter_batches(batch_size=rows, columns=names, use_threads=False)
+
+
+def plain_column(column: Any, *, labels: bool) -> NDArray[Any]:
+    """Return a column as an array; names of labels as `Label` values, unknown ones as clutter."""
+    if not labels or pa.types.is_integer(column.type):
+        return np.asarray(column.to_numpy(zero_copy_only=False))
+    coded = column if pa.types.is_dictionary(column.type) else column.dictionary_encode()
+    known = {name: code for code, name in enumerate(LABELS)}
+    codes = [known.get(name, int(Label.CLUTTER)) for name in coded.dictionary.to_pylist()]
+    table = np.array(codes or [0], np.uint8)
+    return np.asarray(table[coded.indices.to_numpy(zero_copy_only=False)])
 
 
 def check_idle(path: Path) -> None:
