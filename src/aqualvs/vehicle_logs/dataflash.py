@@ -426,15 +426,11 @@ def _armed(tables: _Tables, begin: float) -> tuple[Signal | None, str]:
     signal = Signal.from_samples(times - begin, (state > 0.0).astype(float), Interpolation.HELD)
     if signal is None:
         return None, ""
+    times, values = signal.time_s, signal.values
     end = max(float(t["time_s"][-1]) for t in tables.values()) - begin
-    if end > signal.time_s[-1]:
-        signal = Signal(
-            np.append(signal.time_s, end),
-            np.append(signal.values, signal.values[-1]),
-            signal.interpolation,
-            np.inf,
-        )
-    return Signal(signal.time_s, signal.values, signal.interpolation, np.inf), where
+    if end > times[-1]:
+        times, values = np.append(times, end), np.append(values, values[-1])
+    return Signal(times, values, signal.interpolation, np.inf), where
 
 
 def _modes(tables: _Tables, begin: float) -> tuple[tuple[float, str], ...]:

@@ -8,7 +8,7 @@ chain from header to header, and checks and decodes wanted frames only, all of o
 import re
 from collections import defaultdict
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -253,9 +253,5 @@ def _merge(tables: dict[str, Table], name: str, table: Table) -> None:
         tables[name] = table
         return
     order = np.argsort(np.concatenate([known.at, table.at]), kind="stable")
-    tables[name] = Table(
-        np.concatenate([known.at, table.at])[order],
-        np.concatenate([known.received_us, table.received_us])[order],
-        np.concatenate([known.source, table.source])[order],
-        np.concatenate([known.payload, table.payload])[order],
-    )
+    pairs = ((getattr(one, f.name) for one in (known, table)) for f in fields(Table))
+    tables[name] = Table(*(np.concatenate([*pair])[order] for pair in pairs))

@@ -7,7 +7,6 @@ logged. Other columns are ignored, unless they look like one of these in another
 """
 
 import csv
-import datetime
 import difflib
 import math
 from collections.abc import Callable
@@ -26,7 +25,14 @@ from aqualvs.vehicle_logs.dataflash import (
 )
 from aqualvs.vehicle_logs.mavlink_frames import looks_like_frames
 from aqualvs.vehicle_logs.tlog import read_tlog
-from aqualvs.vehicle_logs.vehicle_log import Interpolation, Signal, VehicleLog, bearing_of, wrap
+from aqualvs.vehicle_logs.vehicle_log import (
+    Interpolation,
+    Signal,
+    VehicleLog,
+    bearing_of,
+    utc_seconds,
+    wrap,
+)
 
 TIME_COLUMNS = ("time_s", "time")
 VALUE_COLUMNS = ("depth_m", "heading_deg", "roll_deg", "pitch_deg")
@@ -132,7 +138,13 @@ def _table(
 
 def _number(name: str, cell: str, path: Path, line: int) -> float:
     if name == "time":
-        return _utc(cell, path, line)
+        try:
+            return utc_seconds(cell)
+        except ValueError:
+            raise SourceError(
+                f"{path}: line {line}: time is {cell!r}; write UTC as 2026-05-31T12:00:00.250Z, "
+                "or give seconds in a column time_s"
+            ) from None
     if not cell:
         if name == "time_s":
             raise SourceError(f"{path}: line {line} has no time_s; write one in every row")
@@ -151,19 +163,6 @@ def _number(name: str, cell: str, path: Path, line: int) -> float:
             f"{path}: line {line}: {name} is {cell!r}; write the value in {unit}, or leave it empty"
         )
     return value
-
-
-def _utc(cell: str, path: Path, line: int) -> float:
-    try:
-        stamp = datetime.datetime.fromisoformat(cell)
-    except ValueError:
-        raise SourceError(
-            f"{path}: line {line}: time is {cell!r}; write UTC as 2026-05-31T12:00:00.250Z, "
-            "or give seconds in a column time_s"
-        ) from None
-    if stamp.tzinfo is None:
-        stamp = stamp.replace(tzinfo=datetime.UTC)
-    return stamp.timestamp()
 
 
 def _check_times(time_s: FloatArray, lines: list[int], path: Path) -> None:

@@ -9,7 +9,7 @@ compass's drift are slower.
 `offset_from_clocks` compares the log's UTC with the time that a video's container states.
 """
 
-import datetime
+import contextlib
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -29,7 +29,7 @@ from aqualvs.vehicle_logs.motion import (
     scores_of,
     without_outliers,
 )
-from aqualvs.vehicle_logs.vehicle_log import Signal, VehicleLog
+from aqualvs.vehicle_logs.vehicle_log import FIRST_BELIEVED_UTC_S, Signal, VehicleLog, utc_seconds
 
 _LOBE_S = 1.0
 """Offsets within this of the best one belong to the same peak and are no rivals."""
@@ -352,25 +352,11 @@ def dive_start_utc(video: str | Path) -> float | None:
             stamps += [stream.metadata.get("creation_time") for stream in container.streams.video]
     except (av.error.FFmpegError, OSError):
         return None
-    for stamp in stamps:
-        seconds = _seconds(stamp) if stamp else None
-        # Cameras without a clock write the zero of their calendar: 1904, 1970 or 1980.
-        if seconds is not None and seconds > _FIRST_BELIEVED:
-            return seconds
+    for stamp in filter(None, stamps):
+        with contextlib.suppress(ValueError):
+            if utc_seconds(stamp) > FIRST_BELIEVED_UTC_S:
+                return utc_seconds(stamp)
     return None
-
-
-_FIRST_BELIEVED = datetime.datetime(1990, 1, 1, tzinfo=datetime.UTC).timestamp()
-
-
-def _seconds(stamp: str) -> float | None:
-    try:
-        moment = datetime.datetime.fromisoformat(stamp)
-    except ValueError:
-        return None
-    if moment.tzinfo is None:
-        moment = moment.replace(tzinfo=datetime.UTC)
-    return moment.timestamp()
 
 
 def offset_from_clocks(

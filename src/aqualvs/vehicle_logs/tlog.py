@@ -14,7 +14,6 @@ Messages read for each signal, with reasons:
 `TelemetryClock` puts all messages on the autopilot's clock, through reboots, and places it in UTC.
 """
 
-import datetime
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +23,13 @@ import numpy as np
 from aqualvs.errors import SourceError
 from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.vehicle_logs.mavlink_frames import SelectedMessages, Table, read_frames
-from aqualvs.vehicle_logs.vehicle_log import Interpolation, Signal, VehicleLog, bearing_of
+from aqualvs.vehicle_logs.vehicle_log import (
+    FIRST_BELIEVED_UTC_S,
+    Interpolation,
+    Signal,
+    VehicleLog,
+    bearing_of,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +87,6 @@ def _span(depth: Signal) -> float:
 
 
 _BOOT = "time_boot_ms"
-_FIRST_BELIEVED = datetime.datetime(1990, 1, 1, tzinfo=datetime.UTC).timestamp()
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,7 +152,7 @@ def _with_utc(
     # Clocks set by the network are more accurate than this.
     utc_sigma_s = 2.0
     start, sigma = float(np.median(least)), utc_sigma_s
-    if start < _FIRST_BELIEVED:
+    if start < FIRST_BELIEVED_UTC_S:
         return TelemetryClock(table.at, log_s, boot_at, boot_s, None, None, notes)
     steps = np.diff(least)
     clock_step_s = 1.0
@@ -329,9 +333,8 @@ def _armed_and_modes(
     changed = np.flatnonzero(np.diff(number, prepend=-1))
     ardupilot, submarine = 3, 12
     is_sub = (beat["autopilot"] == ardupilot) & (beat["type"] == submarine)
-    modes = tuple((float(times[i]), _mode_name(int(number[i]), bool(is_sub[i]))) for i in changed)
-    return Signal.from_samples(times, armed, Interpolation.HELD), modes
-
-
-def _mode_name(number: int, is_sub: bool) -> str:
-    return SUB_MODES.get(number, f"mode {number}") if is_sub else f"mode {number}"
+    modes = []
+    for i in changed.tolist():
+        name = f"mode {number[i]}"
+        modes.append((float(times[i]), SUB_MODES.get(number[i], name) if is_sub[i] else name))
+    return Signal.from_samples(times, armed, Interpolation.HELD), tuple(modes)

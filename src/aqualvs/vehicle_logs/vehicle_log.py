@@ -5,11 +5,12 @@
 - `Places`: depth, heading and the net's bearing at dive times.
 """
 
+import datetime
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Self, TypeAlias
+from typing import Any, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -138,6 +139,21 @@ def usual_gap(time_s: FloatArray) -> float:
     return max(gap_steps * usual, shortest_gap_s)
 
 
+def utc_seconds(text: str) -> float:
+    """Return a time in ISO 8601 as seconds since 1970; UTC where it has no zone.
+
+    Raises `ValueError` if it is none.
+    """
+    moment = datetime.datetime.fromisoformat(text)
+    if moment.tzinfo is None:
+        moment = moment.replace(tzinfo=datetime.UTC)
+    return moment.timestamp()
+
+
+FIRST_BELIEVED_UTC_S = utc_seconds("1990-01-01")
+"""Clocks that were never set begin before: in 1904, 1970 or 1980."""
+
+
 def wrap(angle: FloatArray) -> FloatArray:
     """Return angles as their equals in (-pi, pi]."""
     return math.pi - np.mod(math.pi - angle, _TURN)
@@ -198,14 +214,8 @@ class VehicleLog:
     @property
     def signals(self) -> dict[str, Signal]:
         """The continuous signals that the log has, by name."""
-        named = {
-            "depth": self.depth,
-            "heading": self.heading,
-            "roll": self.roll,
-            "pitch": self.pitch,
-            "velocity_ned": self.velocity_ned,
-        }
-        return {name: signal for name, signal in named.items() if signal is not None}
+        names = ("depth", "heading", "roll", "pitch", "velocity_ned")
+        return {name: getattr(self, name) for name in names if getattr(self, name) is not None}
 
     @property
     def span_s(self) -> tuple[float, float]:
@@ -224,27 +234,13 @@ class VehicleLog:
         `time_s`, shape (n,): log time, in any order.
         """
         times = np.atleast_1d(np.asarray(time_s, float))
-        depth, depth_valid = _at(self.depth, times)
-        heading, heading_valid = _at(self.heading, times)
-        roll, roll_valid = _at(self.roll, times)
-        pitch, pitch_valid = _at(self.pitch, times)
-        return LoggedStates(
-            time_s=times,
-            depth=depth,
-            heading=heading,
-            roll=roll,
-            pitch=pitch,
-            depth_valid=depth_valid,
-            heading_valid=heading_valid,
-            roll_valid=roll_valid,
-            pitch_valid=pitch_valid,
-        )
-
-
-def _at(signal: Signal | None, times: FloatArray) -> tuple[FloatArray, BoolArray]:
-    if signal is None:
-        return np.full(len(times), np.nan), np.zeros(len(times), bool)
-    return signal.at(times)
+        nothing = np.full(len(times), np.nan), np.zeros(len(times), bool)
+        found: dict[str, Any] = {}
+        for name in ("depth", "heading", "roll", "pitch"):
+            signal = self.signals.get(name)
+            values, valid = nothing if signal is None else signal.at(times)
+            found |= {name: values, f"{name}_valid": valid}
+        return LoggedStates(time_s=times, **found)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
