@@ -4,7 +4,6 @@ The range over each dive is shown as a sparkline.
 """
 
 from collections.abc import Iterator, Sequence
-from html import escape
 from pathlib import Path
 from urllib.parse import quote
 
@@ -13,11 +12,9 @@ from numpy.typing import ArrayLike
 
 from aqualvs import __version__
 from aqualvs.batch.dives import DiveRecord, DiveState
-from aqualvs.errors import OutputError
 from aqualvs.report import html
 from aqualvs.report.html import Card
-from aqualvs.results.files import replace_text
-from aqualvs.results.folder import NET_MAP_PNG, REPORT_HTML
+from aqualvs.results.files import replace_text, writing
 from aqualvs.results.run_request import now
 from aqualvs.text import clock
 
@@ -65,8 +62,6 @@ def range_svg(steps: Sequence[float | None], low: float, high: float) -> str:
 
 SUMMARY_HTML = "summary.html"
 
-_HEAD = ("dive", "state", "duration", "frames", "posture", "range, m", "from – to, m", "over time")
-_NET = "net"
 # What a reader of the data set types first.
 _EXAMPLES = {
     "DuckDB": "SELECT dive, avg(range_m) FROM read_parquet('dataset/posture/**/*.parquet', "
@@ -93,12 +88,8 @@ def write_summary(folder: Path, records: Sequence[DiveRecord]) -> Path:
     """
     path = folder / SUMMARY_HTML
     text = _page(folder, records)
-    try:
+    with writing(path):
         replace_text(path, text)
-    except OSError as fault:
-        raise OutputError(
-            f"{path}: cannot be written ({fault.strerror}); free the disk or choose another folder"
-        ) from fault
     return path
 
 
@@ -107,21 +98,20 @@ def _page(folder: Path, records: Sequence[DiveRecord]) -> str:
     low, high = (min(ranges), max(ranges)) if ranges else (0.0, 0.0)
     lead = "Ranges over time share one scale"
     lead += f", {low:.2f} to {high:.2f} m; a gap is a stretch without a posture." if ranges else "."
-    texts = {
+    content = {
         "title": folder.resolve().name,
         "subtitle": _rigs(records),
         "lead": lead,
         "footer": f"Written {html.moment(now())} by aqualvs {__version__}.",
+        "records": records,
+        "with_net": any(record.net for record in records),
+        "clock": clock,
+        "address": lambda record, file: _address(folder, record, file),
+        "range_svg": lambda steps: html.Raw(range_svg(steps, low, high)),
+        "examples": _EXAMPLES,
     }
-    parts = {
-        "cards": html.cards(_cards(records)),
-        "warnings": html.notice(list(_notes(records))),
-        "table": _table(folder, records, low, high),
-        "dataset": "".join(
-            f"<h3>{name}</h3><pre>{escape(code)}</pre>" for name, code in _EXAMPLES.items()
-        ),
-    }
-    return html.page("summary.html", texts, parts)
+    parts = {"cards": html.cards(_cards(records)), "warnings": html.notice(list(_notes(records)))}
+    return html.page("summary.html", content, parts)
 
 
 _ENDS = ("range_min_m", "range_max_m")
@@ -172,60 +162,7 @@ def _notes_on(record: DiveRecord) -> Iterator[str]:
         yield f"{record.name}: the net has {found} of {largest:.0f} mm"
 
 
-def _table(folder: Path, records: Sequence[DiveRecord], low: float, high: float) -> str:
-    kinds = ["", "", *[' class="n"'] * 2, "", *[' class="n"'] * 2, ""]
-    titles = list(_HEAD)
-    with_net = any(record.net for record in records)
-    if with_net:
-        kinds, titles = [*kinds, ""], [*titles, _NET]
-    head = "".join(f"<th{kind}>{cell}</th>" for kind, cell in zip(kinds, titles, strict=True))
-    rows = []
-    for record in records:
-        found = _cells(folder, record, low, high)
-        cells = zip(kinds, [*found, _net(folder, record)] if with_net else found, strict=True)
-        bad = ' class="bad"' if record.state is not DiveState.FINISHED else ""
-        rows.append(f"<tr{bad}>{''.join(f'<td{kind}>{cell}</td>' for kind, cell in cells)}</tr>")
-    body = "\n".join(rows)
-    return f'<div class="scroll"><table><thead><tr>{head}</tr></thead>\n{body}</table></div>'
-
-
-def _cells(folder: Path, record: DiveRecord, low: float, high: float) -> list[str]:
-    """Return the cells of a dive's row as HTML."""
-    why = f'<div class="why">{escape(record.words)}</div>' if record.words else ""
-    head = [_link(folder, record), f"{record.state.value}{why}"]
-    if not record.facts:
-        return [*head, *[""] * (len(_HEAD) - len(head))]
-    summary, share = record.summary, record.summary.get("valid_share", 0.0)
-    low_share = 0.8
-    low_class = ' class="low"' if share < low_share else ""
-    ends = [summary.get(key) for key in _ENDS]
-    return [
-        *head,
-        clock(record.facts["duration_s"]),
-        f"{record.facts['n_frames']:,}",
-        f'<span class="share"><span class="bar"><i{low_class} style="width:{100 * share:.0f}%">'
-        f"</i></span>{100 * share:.1f} %</span>",
-        f"{summary['range_median_m']:.3f}" if "range_median_m" in summary else "",
-        "" if None in ends else f"{ends[0]:.3f} – {ends[1]:.3f}",
-        range_svg(record.facts["range_steps"], low, high),
-    ]
-
-
-def _link(folder: Path, record: DiveRecord) -> str:
-    return _linked(folder, record, REPORT_HTML, record.name, record.source)
-
-
-def _net(folder: Path, record: DiveRecord) -> str:
-    """Return the condition of a dive's net, with a link to its map."""
-    if not record.net:
-        return ""
-    return _linked(folder, record, NET_MAP_PNG, record.net_text(), "map of the net")
-
-
-def _linked(folder: Path, record: DiveRecord, file: str, words: str, title: str) -> str:
-    """Return words that lead to a file of a dive, if it is there."""
-    words, title = escape(words), escape(title, quote=True)
+def _address(folder: Path, record: DiveRecord, file: str) -> str:
+    """Return the address of a file of a dive; empty if it is not there."""
     place = Path("dives") / record.name / file
-    if not (folder / place).is_file():
-        return f'<span title="{title}">{words}</span>'
-    return f'<a href="{quote(place.as_posix())}" title="{title}">{words}</a>'
+    return quote(place.as_posix()) if (folder / place).is_file() else ""

@@ -5,6 +5,7 @@ import contextlib
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from html import escape
 from pathlib import Path
 
 import av
@@ -15,6 +16,7 @@ from av.video.frame import VideoFrame
 
 from aqualvs.geometry.arrays import IntArray
 from aqualvs.optics.shutter import FIRST_ROW
+from aqualvs.report import html
 from aqualvs.report.charts import stretches
 from aqualvs.report.overlay import draw_points
 from aqualvs.report.points import FramePoints
@@ -48,6 +50,14 @@ class SampleFrame:
     size_px: tuple[int, int]  # Width and height as embedded.
     # Share of the target points that lie on a saturated pixel; NaN without target points.
     saturated: float = float("nan")
+
+    def tag(self, words: str) -> html.Raw:
+        """Return the picture as HTML, with words for those who cannot see it."""
+        width, height = self.size_px
+        return html.Raw(
+            f'<img src="data:image/jpeg;base64,{self.jpeg_base64}" width="{width}" '
+            f'height="{height}" alt="{escape(words)}">'
+        )
 
 
 def choose_pictures(track: Track, source: Path | None = None) -> list[int]:

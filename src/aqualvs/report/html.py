@@ -31,6 +31,7 @@ def _templates() -> "Environment":
     templates.globals["asset"] = lambda name: Raw(asset(name))
     templates.globals["packed"] = packed
     templates.globals["contents_of"] = contents_of
+    templates.globals["laser_legend"] = laser_legend
     return templates
 
 
@@ -118,7 +119,7 @@ def text(value: object) -> str:
 
 def table(
     head: Sequence[str], rows: Iterable[Sequence[str]], *, texts: int = 1, tail: int = 0
-) -> str:
+) -> "Raw":
     """Return a table of numbers (to the right) between text columns.
 
     The first `texts` and the last `tail` columns are text. Cells are escaped, except those that
@@ -132,17 +133,17 @@ def table(
         + "</tr>\n"
         for row in rows
     )
-    return f'<div class="scroll"><table><thead><tr>{top}</tr></thead>\n{body}</table></div>'
+    return Raw(f'<div class="scroll"><table><thead><tr>{top}</tr></thead>\n{body}</table></div>')
 
 
 def _cell(cell: str) -> str:
     return cell if isinstance(cell, Raw) else escape(cell)
 
 
-def fact_table(rows: Iterable[tuple[str, str]]) -> str:
+def fact_table(rows: Iterable[tuple[str, str]]) -> "Raw":
     """Return names and values as a table."""
     body = "".join(f"<tr><td>{escape(k)}</td><td>{escape(v)}</td></tr>\n" for k, v in rows)
-    return f'<div class="scroll"><table class="facts">{body}</table></div>'
+    return Raw(f'<div class="scroll"><table class="facts">{body}</table></div>')
 
 
 def cards(items: Iterable[Card]) -> str:
@@ -168,7 +169,7 @@ def swatch(index: int) -> str:
     return f'<span class="swatch" style="background:{laser_colour(index)}"></span>'
 
 
-def laser_legend(names: list[str]) -> str:
+def laser_legend(names: list[str]) -> "Raw":
     """Return the lasers' names beside their colours."""
     items = "".join(f"<li>{swatch(i)}{escape(name)}</li>" for i, name in enumerate(names))
-    return f'<ul class="legend">{items}</ul>'
+    return Raw(f'<ul class="legend">{items}</ul>')

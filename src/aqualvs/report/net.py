@@ -175,7 +175,7 @@ def _holes(net: NetTables, crops: Mapping[str, SampleFrame]) -> str:
 
 def _crop(row: Row, picture: SampleFrame) -> str:
     """Return the picture of a hole and the way back to it."""
-    name, (width, height) = f"Hole {text(row['hole'])}", picture.size_px
+    name = f"Hole {row['hole']}"
     size = f"{_cell(row, 'diameter_mm', 0)} ± {_cell(row, 'sigma_diameter_mm', 0)} mm"
     values = (
         ("depth {} m", _cell(row, "depth_m", 2)),
@@ -186,9 +186,8 @@ def _crop(row: Row, picture: SampleFrame) -> str:
     )
     way = ", ".join(words.format(value) for words, value in values if value != _NONE)
     return (
-        f'<figure><img src="data:image/jpeg;base64,{picture.jpeg_base64}" width="{width}" '
-        f'height="{height}" alt="{name} with its surroundings">'
-        f"<figcaption><b>{name}: {size}</b><br>{way}</figcaption></figure>"
+        f"<figure>{picture.tag(f'{name} with its surroundings')}"
+        f"<figcaption><b>{text(name)}: {size}</b><br>{way}</figcaption></figure>"
     )
 
 

@@ -124,7 +124,7 @@ def gather(run_dir: Path, truth: Path | None) -> Material:
     bare, no_bare = read_bare(run_dir, track)
     told = warnings_of(track, points, pictures, run, working_range_m(rig), names)
     return Material(
-        title=_title(run_dir, run),
+        title=Path(_source_name(run)).stem or run_dir.resolve().name,
         run=run,
         track=track,
         truth=None if truth is None else read_truth(truth, track),
@@ -167,11 +167,6 @@ def _lasers(rig: Mapping[str, Any], points: PointSummary | None) -> list[LaserFa
     known = lasers_of(rig)[:MAX_LASERS]
     seen = points.n_lasers if points is not None else 0
     return known + [LaserFacts.unknown(i) for i in range(len(known), seen)]
-
-
-def _title(run_dir: Path, run: Mapping[str, Any]) -> str:
-    path = _source_name(run)
-    return Path(path).stem if path else run_dir.resolve().name
 
 
 def _source_name(run: Mapping[str, Any]) -> str:
@@ -246,7 +241,7 @@ def write_report(run_dir: Path, *, truth: Path | None = None, out: Path | None =
         If the page cannot be written.
     """
     material = gather(run_dir, truth)
-    text = html.page("report.html", _texts(material), _parts(material))
+    text = html.page("report.html", _content(material), _parts(material))
     path = out or run_dir / "report.html"
     try:
         replace_text(path, text)
@@ -258,32 +253,47 @@ def write_report(run_dir: Path, *, truth: Path | None = None, out: Path | None =
     return path
 
 
-def _texts(m: Material) -> dict[str, str]:
+def _content(m: Material) -> dict[str, object]:
+    """Return what the page shows, in its order."""
+    housing = housing_name(m.rig)
+    # Of the rig's frame, roughly: the lens lies within its dome.
+    origin = "dome" if housing == "dome" else "lens"
+    known = [index for index, laser in enumerate(m.lasers) if laser.known]
     return {
         "title": m.title,
         "subtitle": _subtitle(m.run),
         "posture_lead": _posture_lead(m.track, m.truth),
+        "truth": None if m.truth is None else _errors_table(m.track, m.truth),
+        "planes": [] if m.points is None else known,
+        "no_planes": _why_no_planes(m.points, known),
+        "labels": [(LABEL_COLOURS[label], _MARKS[label], LABEL_WORDS[label]) for label in Label],
+        "cloud_points": _cloud_amount(m.points),
+        "cloud_of_frames": bool(known),
+        "origin": origin,
+        "shots": _shots(m),
+        "no_pictures": m.no_pictures,
+        "has_pictures": bool(m.pictures),
+        "names": m.names,
+        "frames": _frame_counts(m.track),
+        "points": None if m.points is None else _laser_counts(m.points, m.names),
+        "quality_charts": [] if m.points is None else _quality_places(m.points),
+        "housing": housing,
+        "bare": None if m.bare is None else _bare_ranges(m.track, m.bare),
+        "bare_errors": None
+        if m.bare is None or m.truth is None
+        else _both_errors(m.track.posture, m.bare, m.truth, housing),
+        "lasers": _laser_rows(m.lasers, "dome's centre" if origin == "dome" else "origin"),
+        "facts": _fact_blocks(m.run),
         "footer": _footer(m.run, m.track),
     }
 
 
 def _parts(m: Material) -> dict[str, str]:
-    """Return the parts of the page, in its order, and the numbers that its script draws."""
-    planes_known = any(laser.known for laser in m.lasers)
-    housing = housing_name(m.rig)
-    # Of the rig's frame, roughly: the lens lies within its dome.
-    origin = "dome" if housing == "dome" else "lens"
+    """Return the parts that are HTML already, and the numbers that the page's script draws."""
     return {
         "cards": html.cards([*headline(m.track), *net_cards(m.net)]),
         "warnings": html.notice(m.warnings),
-        "truth": _truth_view(m.track, m.truth),
         "net": net_view(m.net, m.crops),
-        "planes": _plane_view(m.lasers, m.points is not None),
-        "cloud": _cloud_view(m.points, planes_known, origin),
-        "pictures": _picture_view(_captions(m), m.pictures, m.no_pictures, m.names),
-        "quality": _quality_view(m.track, m.points, m.names),
-        "bare": _bare_view(m.track, m.bare, m.truth, housing),
-        "rig": _rig_view(m.run, m.lasers, origin),
         "data": html.embedded_json(_data(m)),
     }
 
@@ -303,18 +313,6 @@ def _data(m: Material) -> dict[str, Any]:
     if m.bare is not None:
         data["bare"] = charts.bare_chart(m.track, m.bare, m.truth)
     return data
-
-
-def _captions(m: Material) -> dict[int, tuple[str, str, bool]]:
-    track = m.track
-    return {
-        row: (
-            f"Frame {track.frame[row]}, {clock(float(track.time_s[row]))}",
-            charts.posture_text(track, row),
-            bool(track.valid[row]),
-        )
-        for row in m.picture_rows
-    }
 
 
 _MARKS = ("●", "■", "▲", "★", "□", "✕", "◆", "○")
@@ -344,13 +342,11 @@ def _posture_lead(track: Track, truth: FloatArray | None) -> str:
     return words
 
 
-def _truth_view(track: Track, truth: FloatArray | None) -> str:
-    """Return the errors against truth and the place of their chart; nothing without truth."""
-    if truth is None:
-        return ""
+def _errors_table(track: Track, truth: FloatArray) -> tuple[int, str]:
+    """Return the number of frames with both a posture and truth, and the table of the errors."""
     rms, worst, count = errors_against(truth, track.posture)
     if not count:
-        return '<p class="note">No frame has both a posture and truth.</p>'
+        return 0, ""
     scale = (1e3, 1.0, 1.0)
     rows = [
         (f"{name}, {unit}", f"{s * r:.{digits}f}", f"{s * w:.{digits}f}")
@@ -362,146 +358,75 @@ def _truth_view(track: Track, truth: FloatArray | None) -> str:
     relative = 100.0 * relative[np.isfinite(relative)]
     share = f"{np.sqrt((relative**2).mean()):.3f}", f"{relative.max():.3f}"
     rows.insert(1, ("range, %", *share))
-    heading = f"<h3>Error against truth, {count} frames</h3>"
-    return (
-        heading
-        + html.table(("", "rms", "max"), rows)
-        + '<p class="note">Bands: one standard deviation, as the run states it.</p>\n'
-        '<div class="chart" id="chart-error"></div>'
-    )
+    return count, html.table(("", "rms", "max"), rows)
 
 
-def _plane_view(lasers: list[LaserFacts], has_points: bool) -> str:
-    """Return the slider and a place for each laser's chart, or why there is none."""
-    if not has_points:
-        return '<p class="note">The run left no points.</p>'
-    known = [index for index, laser in enumerate(lasers) if laser.known]
-    if not known:
-        return '<p class="note">The laser planes are unknown, so there is no such view.</p>'
-    places = "\n".join(f'<div class="chart" id="chart-plane-{index}"></div>' for index in known)
-    return (
-        '<p class="lead">Each laser’s points in its own plane, seen from the side to which its '
-        "normal points: y leads forward, away from the camera. The dotted line is the target plane "
-        "of the posture.</p>\n"
-        '<div class="controls"><button type="button" id="plane-back" aria-label="previous frame">'
-        '‹</button><input type="range" id="plane-slider" min="0" max="0" step="1" '
-        'aria-label="sample frame"><button type="button" id="plane-next" aria-label="next frame">'
-        f'›</button></div>\n<p id="plane-words"></p>\n{_label_legend()}\n'
-        f'<div class="grid" id="plane-grid">{places}</div>'
-    )
+def _why_no_planes(points: PointSummary | None, known: list[int]) -> str:
+    if points is None:
+        return "The run left no points."
+    return "" if known else "The laser planes are unknown, so there is no such view."
 
 
-def _cloud_view(points: PointSummary | None, planes_known: bool, origin: str) -> str:
-    """Return the place of the cloud, or why there is none."""
+def _cloud_amount(points: PointSummary | None) -> str:
+    """Return how many points the cloud shows; empty without any."""
     if points is None or not len(points.cloud_in_target):
-        return '<p class="note">The run left no points on the target.</p>'
-    total = int(points.on_target.sum())
-    shown = len(points.cloud_in_target)
-    amount = f"All {total:,}" if shown == total else f"A random {shown:,} of {total:,}"
-    buttons = ""
-    if planes_known:
-        buttons = (
-            '<div class="controls"><button type="button" data-cloud="dive">whole dive</button>'
-            '<button type="button" data-cloud="frame">the frame chosen above</button></div>'
+        return ""
+    total, shown = int(points.on_target.sum()), len(points.cloud_in_target)
+    return f"All {total:,}" if shown == total else f"A random {shown:,} of {total:,}"
+
+
+def _shots(m: Material) -> list[tuple[str, str, bool, SampleFrame | None]]:
+    """Return the sample frames: heading, posture or refusal in words, which of both, picture."""
+    track = m.track
+    return [
+        (
+            f"Frame {track.frame[row]}, {clock(float(track.time_s[row]))}",
+            charts.posture_text(track, row),
+            bool(track.valid[row]),
+            m.pictures.get(row),
         )
-    return (
-        f'<p class="lead">{amount} points on the target. The whole dive is drawn relative to the '
-        "target, so that all frames coincide: the origin is the point of the target plane nearest "
-        f"to the {origin}, and the black line spans the positions of the {origin}. A single frame "
-        f"is drawn relative to the {origin} (the hemisphere). Drag to turn, scroll or pinch to "
-        "zoom.</p>\n"
-        f'{buttons}<div class="chart screen" id="chart-cloud"></div>'
-        '<img class="paper" id="cloud-paper" alt="the same view, for paper">'
-    )
+        for row in m.picture_rows
+    ]
 
 
-def _picture_view(
-    captions: Mapping[int, tuple[str, str, bool]],
-    pictures: Mapping[int, SampleFrame],
-    missing: str,
-    names: list[str],
-) -> str:
-    """Return the sample frames.
-
-    Parameters
-    ----------
-    captions : mapping
-        Row to (heading, posture or refusal in words, whether there is a posture).
-    missing : str
-        Why pictures are absent.
-    """
-    shots = "\n".join(
-        f"<figure>{_image(pictures.get(row), missing, heading)}"
-        f"<figcaption><b>{escape(heading)}</b><br>"
-        f"{_verdict(words, fine)}</figcaption></figure>"
-        for row, (heading, words, fine) in captions.items()
-    )
-    lead = "Full marks: points on the target. Faint crosses: points that were rejected."
-    if not pictures:
-        return f'<p class="lead">{escape(missing)}</p>\n<div class="shots">{shots}</div>'
-    return (
-        f'<p class="lead">{lead}</p>\n{html.laser_legend(names)}\n<div class="shots">{shots}</div>'
-    )
-
-
-def _quality_view(track: Track, points: PointSummary | None, names: list[str]) -> str:
-    """Return the tables and the places of the charts on data quality."""
+def _frame_counts(track: Track) -> str:
+    """Return the table of the frames with a posture, and of the refusals by reason."""
     counted = [("with a posture", int(track.valid.sum())), *charts.reason_counts(track)]
     rows = [(words, f"{count:,}", f"{100 * count / len(track):.1f} %") for words, count in counted]
-    reasons = f"<div><h3>Frames</h3>{html.table(('', 'frames', 'share'), rows)}</div>"
-    if points is None:
-        return reasons
-    lasers = f"<div><h3>Points</h3>{_laser_counts(points, names)}</div>"
+    return html.table(("", "frames", "share"), rows)
+
+
+def _quality_places(points: PointSummary) -> list[tuple[str, str]]:
+    """Return the charts on the quality of the points that there are: identifier and title."""
     places = [
         ("chart-counts", "Target points per frame and laser", points.on_target.any()),
         ("chart-rms", "Residuals over time", points.n_squares.any()),
         ("chart-residual", "Residuals by laser", points.residual.any()),
         ("chart-quality", "Stripe quality of target points", points.quality.any()),
     ]
-    shown = "\n".join(
-        f'<div><h3>{title}</h3><div class="chart" id="{name}"></div></div>'
-        for name, title, known in places
-        if known
-    )
-    return f'{reasons}{lasers}\n{html.laser_legend(names)}<div class="grid two">{shown}</div>'
+    return [(name, title) for name, title, known in places if known]
 
 
-def _bare_view(
-    track: Track, bare: FloatArray | None, truth: FloatArray | None, housing: str
-) -> str:
-    """Return the section on what ignoring the housing costs; nothing without the comparison."""
-    if bare is None:
-        return ""
+def _bare_ranges(track: Track, bare: FloatArray) -> tuple[int, str]:
+    """Return the number of frames with a posture both ways, and the table of their ranges."""
     percent = 100.0 * (bare[:, 0] / track.posture[:, 0] - 1.0)
     percent = percent[np.isfinite(percent)]
     if not len(percent):
-        words = '<p class="note">No frame has a posture both ways.</p>'
-        return f'<section id="bare"><h2>With and without the {housing}</h2>{words}</section>'
-    low, middle, high = percent.min(), np.median(percent), percent.max()
-    rows = [
-        (
-            "range without the dome, relative to with it",
-            *(signed(f"{v:+.2f} %") for v in (low, middle, high)),
-        )
-    ]
-    text = html.table(("", "min", "median", "max"), rows)
-    if truth is not None:
-        text += _both_errors(track.posture, bare, truth, housing)
-    return (
-        f'<section id="bare"><h2>With and without the {housing}</h2>\n<p class="lead">The same '
-        f"stripe pixels, read once through the {housing}’s refraction and once as if the camera "
-        "looked "
-        f"straight into the water ({len(percent)} frames).</p>\n"
-        f'<div class="chart" id="chart-bare"></div>\n{text}\n</section>'
-    )
+        return 0, ""
+    cells = (signed(f"{v:+.2f} %") for v in (percent.min(), np.median(percent), percent.max()))
+    row = ("range without the dome, relative to with it", *cells)
+    return len(percent), html.table(("", "min", "median", "max"), [row])
 
 
-def _rig_view(run: Mapping[str, Any], lasers: list[LaserFacts], origin: str) -> str:
-    """Return lasers, rig, options and versions as tables."""
-    centre = "dome's centre" if origin == "dome" else "origin"
+def _laser_rows(lasers: list[LaserFacts], centre: str) -> str:
+    if not lasers:
+        return ""
     head = ("laser", "normal x", "normal y", "normal z", f"offset from the {centre}, mm")
-    rows = [_laser_row(i, laser) for i, laser in enumerate(lasers)]
-    lasers_table = html.table(head, rows) if rows else ""
+    return html.table(head, [_laser_row(i, laser) for i, laser in enumerate(lasers)])
+
+
+def _fact_blocks(run: Mapping[str, Any]) -> list[tuple[str, html.Raw]]:
+    """Return rig, options and versions as tables with their titles."""
     blocks = []
     for title, key, skip in (
         ("Rig", "rig", ("lasers", "solved_from", "points", "history")),
@@ -512,35 +437,8 @@ def _rig_view(run: Mapping[str, Any], lasers: list[LaserFacts], origin: str) -> 
     ):
         content = run.get(key)
         if isinstance(content, dict) and content:
-            blocks.append(f"<div><h3>{title}</h3>{html.fact_table(facts(content, skip))}</div>")
-    if not lasers and not blocks:
-        return '<p class="note">run.yaml does not say.</p>'
-    columns = "\n".join(blocks)
-    return f'{lasers_table}<div class="facts-columns">{columns}</div>'
-
-
-def _verdict(words: str, fine: bool) -> str:
-    kind = "" if fine else ' class="refused"'
-    return f"<span{kind}>{escape(words)}</span>"
-
-
-def _label_legend() -> str:
-    items = "".join(
-        f'<li><span class="mark" style="color:{LABEL_COLOURS[label]}">{_MARKS[label]}</span>'
-        f"{LABEL_WORDS[label]}</li>"
-        for label in Label
-    )
-    return f'<ul class="legend">{items}</ul>'
-
-
-def _image(picture: SampleFrame | None, missing: str, heading: str) -> str:
-    if picture is None:
-        return f'<div class="missing">{escape(missing)}</div>'
-    width, height = picture.size_px
-    return (
-        f'<img src="data:image/jpeg;base64,{picture.jpeg_base64}" width="{width}" '
-        f'height="{height}" alt="{escape(heading)}">'
-    )
+            blocks.append((title, html.fact_table(facts(content, skip))))
+    return blocks
 
 
 def _laser_counts(points: PointSummary, names: list[str]) -> str:
