@@ -118,6 +118,11 @@ def hole_count(n_holes: int) -> str:
     return "no hole" if not n_holes else "1 hole" if n_holes == 1 else f"{n_holes} holes"
 
 
+def sentence(words: str) -> str:
+    """Return words with a capital letter and a full stop."""
+    return f"{words[:1].upper()}{words[1:]}."
+
+
 def signed(text: str) -> str:
     """Return text with a true minus sign before its negative numbers."""
     return text.replace("-", "−")

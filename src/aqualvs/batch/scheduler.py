@@ -264,7 +264,9 @@ def with_net(work: DiveWork, key: str, facts: Mapping[str, Any]) -> dict[str, An
     if request is None:
         return dict(facts) | known_net(work.home, key)
     try:
-        return dict(facts) | {"net": _state(work, f"{key}-{_digest(request)}", request)}
+        # All that a net's state depends on besides the dive's result.
+        others = digest(asdict(request) | {"log": content_digest(request.log)})
+        return dict(facts) | {"net": _state(work, f"{key}-{others}", request)}
     except AqualvsError as fault:
         return dict(facts) | {"net_fault": str(fault)}
 
@@ -305,11 +307,6 @@ def _state(work: DiveWork, key: str, request: NetRequest) -> dict[str, Any]:
         home.mkdir(parents=True, exist_ok=True)
         write_manifest(home, key, result.summary, NET_FILES, out)
     return result.summary
-
-
-def _digest(request: NetRequest) -> str:
-    """Return a short text of all that a net's state depends on besides the dive's result."""
-    return digest(asdict(request) | {"log": content_digest(request.log)})
 
 
 # Tasks handed over for each that can be under way, so that no process waits for the next.

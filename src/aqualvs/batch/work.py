@@ -145,7 +145,7 @@ def probe(work: DiveWork) -> DiveProbe:
         margin = REACH if dive.rig.shutter.needs_neighbours else 0
         stat = _stat_key(Path(work.request.source))
         stat |= {"frames": work.piece_frames, "margin": margin}
-        content = _remembered(work, stat) or _remember(
+        content = read_valid_manifest(work.home / _MEMORY, digest(stat)) or _remember(
             work, stat, _content(dive, work.piece_frames, margin)
         )
     spans = tuple(Span(**{**span, "kind": SpanKind(span["kind"])}) for span in content["spans"])
@@ -208,10 +208,6 @@ def _stat_key(path: Path) -> dict[str, Any]:
     found = [path, *(path.iterdir() if path.is_dir() else ())]
     latest = max(one.stat().st_mtime_ns for one in found)
     return {"path": str(path), "size": size_of(path), "n_files": len(found), "mtime_ns": latest}
-
-
-def _remembered(work: DiveWork, stat: Mapping[str, Any]) -> dict[str, Any] | None:
-    return read_valid_manifest(work.home / _MEMORY, digest(stat))
 
 
 def _remember(work: DiveWork, stat: Mapping[str, Any], content: dict[str, Any]) -> dict[str, Any]:

@@ -21,7 +21,6 @@ from aqualvs.calibrate.common import (
     load_nominal,
     named,
     picture_paths,
-    residuals_of,
     summary,
 )
 from aqualvs.calibration.camera.calibrate import CameraCalibration
@@ -97,7 +96,7 @@ def calibrate_camera(
     return Calibration(
         rig=_rig(result, known),
         uncertainty=result.uncertainty,
-        residuals_px=residuals_of(result.views),
+        residuals_px={view.label: view.residuals for view in result.views},
         left_out={**found.missed, **result.left_out},
         notes=(*found.notes, *result.findings),
         solution=result,

@@ -6,7 +6,7 @@ The nominal rig (`load_nominal`) is known before any calibration: name, picture 
 """
 
 import glob
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -310,16 +310,6 @@ def _meant(argument: str) -> list[Path]:
     raise CalibrationError(f"{path}: no such picture or folder; check the path")
 
 
-def residuals_of(views: Iterable[ViewFit]) -> dict[str, FloatArray]:
-    """Return the residuals of fitted views, by the names of their pictures."""
-    return {view.label: view.residuals for view in views}
-
-
-def all_missed(found: Iterable[DetectedTargets]) -> dict[str, str]:
-    """Return the pictures of several sets in which no target was found, with the reasons."""
-    return {name: why for one in found for name, why in one.missed.items()}
-
-
 def detect_targets(pictures: Sequence[Picture], detect: Detect, target: str) -> DetectedTargets:
     """Find a target in every picture.
 
@@ -348,7 +338,7 @@ def detect_targets(pictures: Sequence[Picture], detect: Detect, target: str) -> 
             tick(1)
             return found, (image.shape[1], image.shape[0])
 
-        names = [_name_of(picture, i) for i, picture in enumerate(pictures)]
+        names = [named(picture, f"picture {i}") for i, picture in enumerate(pictures)]
         results = list(pool.map(look, names, pictures))
     if not results:
         raise CalibrationError("no pictures given; name pictures, a folder, or a pattern")
@@ -375,12 +365,8 @@ def detect_targets(pictures: Sequence[Picture], detect: Detect, target: str) -> 
 
 
 def named(target: object, what: str) -> str:
-    """Return the name of a target's file for messages; `what` it is if it was given itself."""
+    """Return the name of a file for messages; `what` it is if its content was given itself."""
     return Path(target).name if isinstance(target, str | Path) else what
-
-
-def _name_of(picture: Picture, i: int) -> str:
-    return Path(picture).name if isinstance(picture, str | Path) else f"picture {i}"
 
 
 def read_grey(picture: Picture) -> Image:

@@ -10,7 +10,6 @@ from aqualvs.calibrate.common import (
     DetectedTargets,
     Echo,
     Picture,
-    all_missed,
     check_same_size,
     corner_residuals,
     corner_rows,
@@ -19,7 +18,6 @@ from aqualvs.calibrate.common import (
     medium_index,
     named,
     picture_paths,
-    residuals_of,
     summary,
 )
 from aqualvs.calibration.detection.detection import detect_board
@@ -134,11 +132,12 @@ def calibrate_dome(
         known = merged(known, given)
     result = solve_dome(before, [one for _, one in sets], options or DomeOptions(), known)
     found = tuple(one for one, _ in sets)
+    missed = {name: why for one in found for name, why in one.missed.items()}
     return Calibration(
         rig=_noted(before, result),
         uncertainty=result.uncertainty,
-        residuals_px=residuals_of(result.views),
-        left_out={**all_missed(found), **result.left_out},
+        residuals_px={view.label: view.residuals for view in result.views},
+        left_out=missed | result.left_out,
         notes=(*(note for one in found for note in one.notes), *result.findings),
         solution=result,
         found=found,

@@ -281,7 +281,10 @@ def _target(
         markers, n_nominal = (box, None) if isinstance(box, MarkerSet) else load_box(box)
         name = named(box, "the box")
         surfaces = box_surfaces(markers.planes, markers.points())
-        default = rig.n_water if n_nominal is None else _nearer(n_nominal, rig)
+        default = rig.n_water
+        if n_nominal is not None:
+            # Air or the rig's own water, whichever is nearer to what the box's file says.
+            default = min((rig.n_air, rig.n_water), key=lambda n: abs(n - n_nominal))
         found = detect_targets(
             pictures, lambda one, image: detect_markers(image, markers, one), name
         )
@@ -292,11 +295,6 @@ def _target(
     found = detect_targets(pictures, lambda one, image: detect_board(image, pattern, one), name)
     n_medium = medium_index(medium, rig, rig.n_water)
     return _Target(name, board_surface(thickness=board_offset), found, n_medium)
-
-
-def _nearer(n_nominal: float, rig: Rig) -> float:
-    """Return air or the rig's own water, whichever is nearer to the index in the box's file."""
-    return min((rig.n_air, rig.n_water), key=lambda n: abs(n - n_nominal))
 
 
 def _stripes(picture: Picture, name: str, wavelength_nm: float | None) -> StripePoints:
@@ -327,20 +325,16 @@ def _noted(before: Rig, result: LaserCalibration, target: _Target) -> Rig:
 
 
 def _with_names(rig: Rig, names: Sequence[str]) -> Rig:
+    """Return the rig with its lasers renamed, in its uncertainty too."""
     lasers = rig.lasers
     if len(names) != len(lasers) or len(set(names)) != len(names):
         raise OptionError(
             f"--names {','.join(names)}: {len(names)} for {len(lasers)} lasers; give each a name "
             "of its own"
         )
-    return _renamed(rig, names)
-
-
-def _renamed(rig: Rig, names: Sequence[str]) -> Rig:
-    """Return the rig with its lasers renamed, in its uncertainty too."""
     uncertainty = rig_uncertainty(rig)
-    new = {laser.name: name for laser, name in zip(rig.lasers, names, strict=True)}
-    lasers = tuple(replace(laser, name=new[laser.name]) for laser in rig.lasers)
+    new = {laser.name: name for laser, name in zip(lasers, names, strict=True)}
+    lasers = tuple(replace(laser, name=new[laser.name]) for laser in lasers)
     called = tuple(
         f"{new[owner]}:{what}" if colon else name
         for name in uncertainty.names

@@ -47,18 +47,12 @@ def format_of(path: Path) -> tuple[CalibrationFormat, str]:
     text = read_text(path, _WHAT, RigError)
     found = recognised(text)
     if found is None:
-        is_rig = "aqualvs_rig" in text
-        raise RigError(
-            f"{path}: is a rig file already; give it to --rig"
-            if is_rig
-            else f"{path}: is no calibration that is known; give {', '.join(_known())}"
-        )
+        if "aqualvs_rig" in text:
+            raise RigError(f"{path}: is a rig file already; give it to --rig")
+        *most, last = FORMAT_TEXTS.values()
+        known = f"{', '.join(most)}, or {last}"
+        raise RigError(f"{path}: is no calibration that is known; give {known}")
     return found, text
-
-
-def _known() -> list[str]:
-    texts = [*FORMAT_TEXTS.values()]
-    return [*texts[:-1], f"or {texts[-1]}"]
 
 
 def read_camera(

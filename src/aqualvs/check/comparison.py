@@ -34,6 +34,7 @@ from aqualvs.optics.rig import (
 from aqualvs.optics.rigfile import dated_copies, load_rig
 from aqualvs.optics.sheet import sheet_in
 from aqualvs.optics.solved import file_parameter_name, rig_numbers, rig_uncertainty, solved_steps
+from aqualvs.text import sentence
 
 SIGNIFICANT = 5.0
 """Sigmas from which on a change is no chance."""
@@ -279,12 +280,12 @@ def run_compare(new: Path, old: Path, console: Console | None = None) -> int:
     parts = compared_parts(new_rig, old_rig, difference)
     console.print(verdict(parts), style="bold", markup=False, highlight=False)
     if not all(part.is_same for part in parts):
-        for sentence in consequence(new_rig, old_rig):
-            console.print(sentence, markup=False, highlight=False)
+        for line in consequence(new_rig, old_rig):
+            console.print(line, markup=False, highlight=False)
     console.print(_table(new_rig, old_rig, difference))
     known = {new: bool(new_uncertainty.names), old: bool(old_uncertainty.names)}
-    for sentence in (*_limits(known), *_mismatches(new_rig, old_rig)):
-        console.print(sentence, markup=False, highlight=False)
+    for line in (*_limits(known), *_mismatches(new_rig, old_rig)):
+        console.print(line, markup=False, highlight=False)
     return 0
 
 
@@ -310,7 +311,7 @@ def verdict(parts: list[ComparedPart]) -> str:
         told.append(f"{'not changed at all' if told else 'nothing has changed'}: {', '.join(same)}")
     if not moved and stayed:
         told.insert(0, "nothing has moved that matters")
-    return _capital("; ".join(told) + ".")
+    return sentence("; ".join(told))
 
 
 def consequence(new: Rig, old: Rig) -> Iterator[str]:
@@ -560,7 +561,3 @@ def _tilt_sigma(laser: Laser, difference: RigDifference) -> float:
 def _degrees(angle: float) -> str:
     # Adding zero turns -0.0 into 0.0.
     return f"{round(math.degrees(angle), 2) + 0.0:+.2f}"
-
-
-def _capital(text: str) -> str:
-    return text[:1].upper() + text[1:]

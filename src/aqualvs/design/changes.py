@@ -225,10 +225,6 @@ def _turned(design: Design) -> Design | None:
     return _moved(design, lambda mount: replace(mount, free_stripe=True))
 
 
-def _crossing(design: Design) -> Design | None:
-    return replace(design, avoid_crossings=False) if design.avoid_crossings else None
-
-
 def _centred(design: Design) -> Design | None:
     pose = design.rig.dome_from_cam
     if design.rig.dome is None or float(np.linalg.norm(pose.translation)) < 1e-4:
@@ -269,7 +265,9 @@ _CHANGES: dict[str, Callable[[Design], Design | None]] = {
     "focal length 20 % shorter": _longer_lens(0.8),
     "one more laser": _one_more,
     "stripes turned to their best directions": _turned,
-    "stripes may cross": _crossing,
+    "stripes may cross": lambda design: (
+        replace(design, avoid_crossings=False) if design.avoid_crossings else None
+    ),
     "fan of 90 degrees": lambda design: _moved(
         design, lambda mount: replace(mount, fan=math.radians(90.0))
     ),

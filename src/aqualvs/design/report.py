@@ -407,17 +407,11 @@ def _errors(design: Design, by_camera: Mapping[str, FloatArray]) -> "Figure":
         axes.set_yscale("log")
         axes.set_title(f"one sigma of {title}", fontsize=9.0)
         axes.set_xlabel("range (mm)")
-        axes.yaxis.set_major_formatter(_plain())
+        axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
         axes.grid(True, which="both")
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4)
     return figure
-
-
-def _plain() -> Any:
-    from matplotlib.ticker import FuncFormatter
-
-    return FuncFormatter(lambda value, _: f"{value:g}")
 
 
 def _picture(design: Design) -> "Figure":

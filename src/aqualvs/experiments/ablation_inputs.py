@@ -178,7 +178,8 @@ _WATERS = 0.007
 
 def _run_beliefs(laboratory: Laboratory) -> ExperimentResult:
     dive = wall_dive(laboratory)
-    index = np.array([_worst(laboratory, dive, _with_index(dive.rig, d)) for d in _INDEX_STEPS])
+    waters = [dive.rig.in_water(dive.rig.n_water + step) for step in _INDEX_STEPS]
+    index = np.array([_worst(laboratory, dive, rig) for rig in waters])
     lens = np.array(
         [
             [_worst(laboratory, dive, _with_lens(dive.rig, axis, mm)) for mm in _LENS_STEPS_MM]
@@ -234,10 +235,6 @@ def _run_beliefs(laboratory: Laboratory) -> ExperimentResult:
             "was refused.",
         ),
     )
-
-
-def _with_index(rig: Rig, step: float) -> Rig:
-    return rig.in_water(rig.n_water + step)
 
 
 def _with_lens(rig: Rig, axis: int, step_mm: float) -> Rig:

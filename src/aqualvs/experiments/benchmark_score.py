@@ -297,10 +297,7 @@ def write_scores(scores: Scores, folder: Path) -> list[Path]:
     with table.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, fieldnames=list(records[0]))
         writer.writeheader()
-        writer.writerows(
-            {key: "" if value is None else value for key, value in record.items()}
-            for record in records
-        )
+        writer.writerows(records)
     bars = [_without_nan(asdict(bar)) for bar in scores.bars]
     content = {"set": scores.title, "scores": records, "error_bars_against_clear": bars}
     data.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")

@@ -89,17 +89,8 @@ def solve_from_pictures(laboratory: Laboratory) -> SolvedDome:
     files = calibration_pictures(laboratory)
     truth = load_rig(files.rig)
     lens = camera(board_views(files.camera, files.board, _SETUP.seed + 1), truth.size_px)
-    start = Rig(
-        name=truth.name,
-        size_px=truth.size_px,
-        lens=lens.lens,
-        dome_from_cam=SE3(DOME_FROM_CAM_NOMINAL.copy(), np.zeros(3)),
-        housing=truth.dome,
-        n_air=truth.n_air,
-        n_water=truth.n_water,
-        lasers=(),
-        working_range=truth.working_range,
-    )
+    ahead = SE3(DOME_FROM_CAM_NOMINAL.copy(), np.zeros(3))
+    start = replace(truth, lens=lens.lens, dome_from_cam=ahead, lasers=(), solved_from={})
     views = board_views(files.dome, files.rail_board, _SETUP.seed + 2)
     assert files.poses is not None
     rows = read_with_errors(load_poses(files.poses))

@@ -25,11 +25,11 @@ from aqualvs.report.figure_style import BLUE, GREEN, ORANGE, new_figure
 from aqualvs.scanner import ScannerOptions
 from aqualvs.scanning.paper.mesh_filter import MeshFilterOptions
 from aqualvs.scanning.posture_estimator import FitMethod
-from aqualvs.scanning.scan import Frame
 from aqualvs.scanning.stripe import ThresholdOptions
 from aqualvs.simulation.benchmark import CONTRAST_LIMIT, VISIBLE_LIMIT, render_with_visible
 from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenario import Scenario, parse_scenario
+from aqualvs.sources.base import bgr_of
 
 _FILE = "visible.csv"
 ENOUGH = VISIBLE_LIMIT
@@ -224,7 +224,8 @@ def _drawn(seen: Mapping[str, MeasuredScene]) -> Figure:
         grid = figure.subplots(3, 3, height_ratios=(1.6, 1.0, 1.0), sharey="row")
         for column, (name, one) in enumerate(seen.items()):
             picture, *errors = grid[:, column]
-            picture.imshow(_colours(frames_of(one.dive)[_SHOWN]), interpolation="nearest")
+            colours = bgr_of(frames_of(one.dive)[_SHOWN])[..., ::-1]
+            picture.imshow(colours, interpolation="nearest")
             picture.set_title(name, loc="left")
             picture.set_axis_off()
             degrees = np.degrees(one.ours.errors[:, 2])
@@ -247,12 +248,6 @@ def _drawn(seen: Mapping[str, MeasuredScene]) -> Figure:
         grid[2, 0].set_ylabel("yaw error (degrees)")
         figure.align_ylabels(grid[1:, 0])
     return figure
-
-
-def _colours(frame: Frame) -> Any:
-    from aqualvs.sources.base import bgr_of
-
-    return bgr_of(frame)[..., ::-1]
 
 
 EXPERIMENT = Experiment(

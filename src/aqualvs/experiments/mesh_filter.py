@@ -36,6 +36,7 @@ from aqualvs.scanning.paper.mesh_filter import MeshFilterOptions, laser_frame
 from aqualvs.scanning.scan import Frame, Label, Scan, ScanPoints
 from aqualvs.scanning.stripe import ThresholdOptions
 from aqualvs.simulation.scenario import Scenario, parse_scenario
+from aqualvs.sources.base import bgr_of
 
 
 def papers_pixels(
@@ -395,8 +396,6 @@ def _in_laser(points_in_dome: FloatArray, rig: Rig, laser: int) -> FloatArray:
 
 
 def _seen(frame: Frame) -> Figure:
-    from aqualvs.sources.base import bgr_of
-
     with new_figure(2.9) as figure:
         left, right = figure.subplots(1, 2)
         left.imshow(bgr_of(frame)[..., ::-1], interpolation="nearest")

@@ -34,7 +34,6 @@ from matplotlib import rc_context
 
 from aqualvs import __version__
 from aqualvs.experiments.experiment import (
-    Column,
     DataColumns,
     Experiment,
     ExperimentFigure,
@@ -201,8 +200,9 @@ def _save_picture(name: str, picture: ExperimentFigure, folder: Path) -> Printed
 
 def _save_series(name: str, series: DataColumns, folder: Path) -> str:
     file = f"{name}_{series.name}.csv"
-    columns = [[_cell(value) for value in _plain(column)] for column in series.columns.values()]
-    rows = list(zip(*columns, strict=True))
+    # Python's own numbers, which know whole ones from others.
+    plain = (np.asarray(column).tolist() for column in series.columns.values())
+    rows = list(zip(*([_cell(value) for value in column] for column in plain), strict=True))
     path = folder / SERIES / file
     with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -211,10 +211,6 @@ def _save_series(name: str, series: DataColumns, folder: Path) -> str:
             table.writerow(series.columns)
             table.writerows(rows)
     return file
-
-
-def _plain(column: Column) -> list[Any]:
-    return column if isinstance(column, list) else np.asarray(column).tolist()
 
 
 def _cell(value: str | int | float) -> str:

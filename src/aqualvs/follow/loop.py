@@ -28,15 +28,7 @@ from aqualvs.simulation.vehicle.vehicle import SimulatedVehicle
 class SimulatedLink:
     """Link to a simulated vehicle, in its own time.
 
-    Parameters
-    ----------
-    vehicle : SimulatedVehicle
-        Its latency is that of the wire.
-
-    Attributes
-    ----------
-    effort : Effort
-        The last that was sent.
+    `vehicle`: its latency is that of the wire.
     """
 
     def __init__(self, vehicle: SimulatedVehicle) -> None:
@@ -156,16 +148,7 @@ class _Sight:
 class SimulatedLoop:
     """A vehicle before a net that it sees with lasers and steers by.
 
-    Parameters
-    ----------
-    steering : NetPilot
-        Engaged at the start.
-
-    Attributes
-    ----------
-    on_step : callable or None
-        Called after every step of the pilot with the time, the frame's time, what was measured,
-        the decision and the vehicle's state.
+    `steering`: engaged at the start.
     """
 
     def __init__(
@@ -214,7 +197,9 @@ class SimulatedLoop:
             If the pilot may not begin.
         """
         if not self.log.rows:
-            self._engage()
+            refused = self.steering.engage(0.0, self.link.state())
+            if refused is not None:
+                raise OptionError(f"simulated loop: not engaged: {refused.words}")
         frame = len(self.log.rows)
         while frame / self.timing.fps <= seconds:
             now_s = frame / self.timing.fps
@@ -224,11 +209,6 @@ class SimulatedLoop:
             self._expose(now_s)
             frame += 1
         return self.log
-
-    def _engage(self) -> None:
-        refused = self.steering.engage(0.0, self.link.state())
-        if refused is not None:
-            raise OptionError(f"simulated loop: not engaged: {refused.words}")
 
     def _pass_time(self, until_s: float) -> None:
         """Let everything happen that happens until then."""

@@ -115,13 +115,6 @@ class FrozenPicture:
     earlier: the 80 % quantile of the displacements of patches across their edges. What an encoder
     improves moves no edge. A vehicle slows down little by little, and one that turns round moves
     again soon; a picture whose motion ends at once, and does not return, has stopped itself.
-
-    Attributes
-    ----------
-    change : float
-        Of the last picture, in grey levels; NaN where there was nothing to compare.
-    motion : float
-        Of the last picture, in pixels of the reduced one; NaN likewise.
     """
 
     def __init__(self, options: FrozenOptions | None = None) -> None:
@@ -153,6 +146,8 @@ class FrozenPicture:
         self._kept: deque[_Kept] = deque()
         self._span_s = self.options.span_s - _EPS_S
         self._motions: deque[tuple[float, float]] = deque()
+        # Of the last picture, in grey levels, and in pixels of the reduced one; NaN where there was
+        # nothing to compare.
         self.change = self.motion = math.nan
         self._go_on()
 
@@ -304,15 +299,7 @@ _VERDICT_EVERY_S, _TIMEOUT_S = 5.0, 3.0
 class DriftWatch:
     """Detector of lasers that moved: tests every few seconds, in a thread of its own.
 
-    Parameters
-    ----------
-    rig : Rig
-        With one laser, or without a dome, there is nothing to watch.
-
-    Attributes
-    ----------
-    off : dict
-        Number of the laser to what is wrong with it; empty where nothing is.
+    `rig`: with one laser, or without a dome, there is nothing to watch.
     """
 
     def __init__(self, rig: Rig) -> None:
@@ -449,7 +436,7 @@ class HealthMonitor:
             n_lost=n_lost,
             delays=self._delays(),
             source=source,
-            lasers=self._laser_health(),
+            lasers=tuple(map(self._laser_health, range(len(self._names)))),
             outputs=tuple(outputs),
             quality=_mean([p.quality for p in recent]),
             n_water=n_water,
@@ -475,10 +462,7 @@ class HealthMonitor:
             for name, m, w in zip(STAGES, middle, worst, strict=True)
         )
 
-    def _laser_health(self) -> tuple[PartHealth, ...]:
-        return tuple(self._one_laser(i) for i in range(len(self._names)))
-
-    def _one_laser(self, i: int) -> PartHealth:
+    def _laser_health(self, i: int) -> PartHealth:
         name = self._names[i]
         if not self._valid_ns:
             return PartHealth(name, State.OFF, "not seen yet")

@@ -29,15 +29,7 @@ class Watchdog:
     Neither a frame that takes seconds to measure nor a controller that hangs must leave thrust
     standing; the vehicle's own fail-safe comes later, and does not act while others send it sticks.
 
-    Parameters
-    ----------
-    timeout_s : float
-        Time that an effort may stay in force.
-
-    Attributes
-    ----------
-    n_barks : int
-        How often it had to act.
+    `timeout_s`: time that an effort may stay in force.
     """
 
     def __init__(self, vehicle: VehicleLink, timeout_s: float) -> None:
@@ -210,7 +202,8 @@ class Pilot:
         their centre.
         """
         with self._stepping:
-            if self._takes_setpoint() and not self._setpoint_known():
+            holds = isinstance(self._steering.mission, HoldMission)
+            if holds and self._holder is not None and self._holder.setpoint is None:
                 raise OptionError(f"pilot: {LimitReason.NO_SETPOINT.words}; choose one first")
             refused, state = self._begin()
             if refused is not None:
@@ -343,12 +336,6 @@ class Pilot:
         if self._goodbyes > 0:
             self._goodbyes -= 1
             self._send(NEUTRAL)
-
-    def _takes_setpoint(self) -> bool:
-        return self._holder is not None and isinstance(self._steering.mission, HoldMission)
-
-    def _setpoint_known(self) -> bool:
-        return self._holder is not None and self._holder.setpoint is not None
 
     def _tell(self, report: PilotReport) -> None:
         """Log changes."""

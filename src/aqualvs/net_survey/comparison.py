@@ -103,7 +103,8 @@ def find_sites(
     `shifts`: what each shift leaves open is in its sigma.
     """
     dates = sorted({one.survey.date for one in placed})
-    parts = [(i, k) for i, one in enumerate(placed) for k in _known(one)]
+    known = [np.flatnonzero(np.isfinite(one.holes).all(axis=1)) for one in placed]
+    parts = [(i, k) for i, holes in enumerate(known) for k in holes.tolist()]
     if not parts:
         return []
     place = np.array([placed[i].holes[k] for i, k in parts])
@@ -116,10 +117,6 @@ def find_sites(
         _site(np.flatnonzero(group == g), parts, (place, sigma), placed, dates, visits)
         for g in dict.fromkeys(group)
     ]
-
-
-def _known(one: PlacedSurvey) -> IntArray:
-    return np.flatnonzero(np.isfinite(one.holes).all(axis=1))
 
 
 def _groups(

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from datetime import date
 
 import numpy as np
-from scipy import sparse
+from scipy import sparse, stats
 from scipy.special import ndtr
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
@@ -302,7 +302,7 @@ def _wall_factors(wall: WallHistory) -> FloatArray:
 def _cell(wall: WallHistory, cell: int, of_wall: tuple[Growth, FloatArray, float]) -> CellChange:
     dates = np.flatnonzero(wall.known[cell])
     first, last = int(dates[0]), int(dates[-1])
-    single = [_on(wall, cell, int(v)) for v in dates]
+    single = [_sum(wall, cell, np.array([visit]), np.ones(1)) for visit in dates]
     weights = np.array([one.sigma for one in single]) ** -2
     off = wall.days[dates] - weights @ wall.days[dates] / weights.sum()
     rate = weights * off / (weights @ off**2)
@@ -320,10 +320,6 @@ def _cell(wall: WallHistory, cell: int, of_wall: tuple[Growth, FloatArray, float
         excess=wall.variance_of(per_day - growth.value, of_stretches - whole, own_place + place),
         seen=(float(wall.seen[cell, first]), float(wall.seen[cell, last])),
     )
-
-
-def _on(wall: WallHistory, cell: int, visit: int) -> Growth:
-    return _sum(wall, cell, np.array([visit]), np.ones(1))
 
 
 def _sum(wall: WallHistory, cell: int, dates: IntArray, factors: FloatArray) -> Growth:
@@ -345,10 +341,4 @@ def _parts(
 
 def _discoveries(z: FloatArray) -> BoolArray:
     """Mark what is beyond chance among many, at most a share `FALSE_SHARE` of it falsely."""
-    if not len(z):
-        return np.zeros(0, np.bool_)
-    chance = 2.0 * ndtr(-np.abs(z))
-    order = np.sort(chance)
-    below = order <= FALSE_SHARE * np.arange(1, len(z) + 1) / len(z)
-    limit = order[np.flatnonzero(below)[-1]] if below.any() else -1.0
-    return np.asarray(chance <= limit)
+    return np.asarray(stats.false_discovery_control(2.0 * ndtr(-np.abs(z))) <= FALSE_SHARE)

@@ -38,7 +38,7 @@ from aqualvs.report.figure_style import DARK, PALE, STYLE
 from aqualvs.report.html import Card
 from aqualvs.results.files import replace_text
 from aqualvs.results.run_request import now
-from aqualvs.text import signed
+from aqualvs.text import sentence, signed
 
 _WEEK = 7.0
 # From green (less) over white to brown (more); told apart by colour-blind eyes.
@@ -291,7 +291,7 @@ def write_page(path: Path, picture: Path, result: Comparison, origins: Mapping[s
     }
     parts = {
         "cards": html.cards(_cards(result)),
-        "warnings": html.notice([_sentence(one) for one in result.warnings]),
+        "warnings": html.notice([sentence(one) for one in result.warnings]),
         "sentences": "\n".join(_paragraph(line) for line in lines),
         "picture": html.data_url(picture.read_bytes(), "png"),
         "holes": _holes(result),
@@ -319,10 +319,6 @@ def _cards(result: Comparison) -> list[Card]:
     gone = counts.get(HoleState.GONE, 0)
     found.append(Card("Holes gone", str(gone), f"{unseen} more were not passed this time"))
     return found
-
-
-def _sentence(words: str) -> str:
-    return words[:1].upper() + words[1:] + "."
 
 
 def _paragraph(line: str) -> str:

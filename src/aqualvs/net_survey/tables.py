@@ -160,16 +160,13 @@ def _where_lines(wall: OnWall) -> Iterator[str]:
     if apart:
         most = max(apart, key=lambda one: abs(one.excess.z))
         words = "faster" if most.excess.value > 0.0 else "slower"
+        size = Growth(abs(most.excess.value), most.excess.sigma)
         yield (
             f"  {len(apart)} cells differ from the rest of the wall; surest at "
-            f"{_where(wall, most)}, {words} by {rate_text(_size(most.excess)).lstrip('+')}"
+            f"{_where(wall, most)}, {words} by {rate_text(size).lstrip('+')}"
         )
     elif n > 1:
         yield "  no cell differs from the rest of the wall beyond chance"
-
-
-def _size(growth: Growth) -> Growth:
-    return Growth(abs(growth.value), growth.sigma)
 
 
 def _where(wall: OnWall, cell: CellChange) -> str:

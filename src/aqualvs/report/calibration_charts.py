@@ -353,7 +353,8 @@ def _view_groups(
 
 def _outliers(rows: IntArray, starts: FloatArray, vectors: FloatArray) -> Iterator[str]:
     if len(rows):
-        crosses = "".join(_cross(x, y) for x, y in starts[rows].tolist())
+        corners = (starts[rows] - 4.0).tolist()
+        crosses = "".join(f"M{draw.num(x)} {draw.num(y)}l8 8m0 -8l-8 8" for x, y in corners)
         yield (
             f'<path d="{crosses}{_vector_path(starts[rows], vectors[rows])}" fill="none" '
             f'stroke="{draw.OUTLIER}" stroke-width="1.5"/>'
@@ -365,11 +366,6 @@ def _vector_path(starts: FloatArray, vectors: FloatArray) -> str:
         f"M{draw.num(x)} {draw.num(y)}l{draw.num(dx)} {draw.num(dy)}"
         for (x, y), (dx, dy) in zip(starts.tolist(), vectors.tolist(), strict=True)
     )
-
-
-def _cross(x: float, y: float) -> str:
-    corner = f"M{draw.num(x - 4)} {draw.num(y - 4)}"
-    return f"{corner}l8 8m0 -8l-8 8"
 
 
 def _scale_bar(scale: _Scale) -> Iterator[str]:

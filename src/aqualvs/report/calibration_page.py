@@ -59,7 +59,7 @@ def view_table(views: Sequence[ViewRow]) -> Raw:
 
 def parameter_table(rows: Sequence[ParameterRow]) -> Raw:
     """Return values with their sigmas and, where it is known, what they were before."""
-    changed = any(_known(row.before) for row in rows)
+    changed = any(row.before is not None and math.isfinite(row.before) for row in rows)
     head = ["parameter", "value", "± σ", "unit"]
     head += ["before", "change", "change in σ"] if changed else []
     cells = []
@@ -104,10 +104,6 @@ def laser_tables(rows: Sequence[LaserRow]) -> Raw:
         '<p class="lead">Plane n·X = offset, in the frame of the dome (x right, y forward, z up).'
         f"</p>{table(planes, plane_cells, tail=1 + moved)}{table(quality, quality_cells, tail=1)}"
     )
-
-
-def _known(value: float | None) -> bool:
-    return value is not None and math.isfinite(value)
 
 
 def _marked(text: str, wrong: bool) -> str:

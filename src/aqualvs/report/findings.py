@@ -11,7 +11,7 @@ from aqualvs.report.frames import SampleFrame
 from aqualvs.report.html import Card
 from aqualvs.report.points import PointSummary
 from aqualvs.report.run_data import Track
-from aqualvs.text import clock, signed
+from aqualvs.text import clock, sentence, signed
 
 
 def headline(track: Track) -> list[Card]:
@@ -120,7 +120,7 @@ def _summary_text(run: Mapping[str, Any], name: str) -> Iterator[str]:
     found = summary.get(name) if isinstance(summary, dict) else None
     words = found.get("words") if isinstance(found, dict) else None
     if isinstance(words, str) and words:
-        yield f"{words[0].upper()}{words[1:]}."
+        yield sentence(words)
 
 
 def _gap_warnings(track: Track) -> Iterator[str]:
@@ -201,4 +201,4 @@ def _own_warnings(run: Mapping[str, Any]) -> Iterator[str]:
     for place in (run, summary if isinstance(summary, dict) else {}):
         found = place.get("warnings")
         if isinstance(found, list):
-            yield from (f"{text[:1].upper()}{text[1:]}." for text in map(str, found))
+            yield from (sentence(str(words)) for words in found)

@@ -373,7 +373,8 @@ def figures(
         shown = (_read(points, one, facts[one[1]], run, options) for one in chosen)
         reflections = max(shown, key=_worth)
     except (pa.ArrowInvalid, OSError, KeyError) as fault:
-        raise SourceError(f"{points}: cannot be read ({_line(fault)}); run again") from fault
+        why = " ".join(str(fault).split())
+        raise SourceError(f"{points}: cannot be read ({why}); run again") from fault
     files = [out / f"{name}.png" for name in FIGURES]
     with Claim("figures", files, overwrite=overwrite), writing(out):
         written = draw_figures(reflections, options, out)
@@ -532,7 +533,3 @@ def _summary(r: Reflections) -> list[str]:
         f"net by the adaptive filter: {int(r.adaptive.sum())}; by the paper's: "
         f"{int(r.paper.sum())}, {both} of them the same",
     ]
-
-
-def _line(fault: BaseException) -> str:
-    return " ".join(str(fault).split())

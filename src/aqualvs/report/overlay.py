@@ -65,7 +65,7 @@ def draw_points(
         Points that entered the posture: dots; others are faint crosses.
     """
     drawn = np.array(image, dtype=np.uint8)
-    scale = _mark_scale(drawn)
+    scale = max(1, round(int(drawn.shape[0]) / 800))
     finite = np.isfinite(pixels).all(axis=1)
     cross = ((-2, -2), (-1, -1), (1, 1), (2, 2), (-2, 2), (-1, 1), (1, -1), (2, -2))
     faint = 0.45
@@ -179,10 +179,6 @@ def _video_stream(container: OutputContainer, size: tuple[int, int], fps: float)
     if codec == "libx264":
         stream.options = {"preset": "veryfast", "crf": "20", "tune": "zerolatency"}
     return stream
-
-
-def _mark_scale(image: ImagePlane) -> int:
-    return max(1, round(int(image.shape[0]) / 800))
 
 
 def _font_size(image: ImagePlane) -> float:

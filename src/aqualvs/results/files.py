@@ -61,13 +61,11 @@ class AppendFile:
                 # A disk that fills up takes a part; the next attempt raises the reason.
                 rest = rest[self._file.write(rest) :]
         except OSError:
-            self._take_back()
+            # What was written of the piece is taken back.
+            if os.fstat(self._file.fileno()).st_size > self._n_bytes:
+                self._file.truncate(self._n_bytes)
             raise
         self._n_bytes += len(piece)
-
-    def _take_back(self) -> None:
-        if os.fstat(self._file.fileno()).st_size > self._n_bytes:
-            self._file.truncate(self._n_bytes)
 
     def lock(self) -> None:
         """Mark the file as being written until it is closed, also by the death of the process."""

@@ -115,7 +115,12 @@ def posture_row(scan: Scan) -> str:
     if not isinstance(posture, Posture):
         return f"{head},0,{posture.reason.value},{',' * (_N_NUMBERS - 1)}\n"
     return (
-        f"{head},1,,{_numbers(posture)},{scan.n_water:.6f},{_curvature(posture)},{_rig(posture)}\n"
+        f"{head},1,,"
+        f"{posture.range:.6f},{math.degrees(posture.pitch):.5f},{math.degrees(posture.yaw):.5f},"
+        f"{_sigmas(posture.covariance)},"
+        f"{posture.slant_range:.6f},{posture.nearest:.6f},{posture.n_points},"
+        f"{scan.n_water:.6f},{_curvature(posture)},"
+        f"{_sigmas(posture.rig_covariance)},{_sigmas(posture.total_covariance)}\n"
     )
 
 
@@ -125,20 +130,8 @@ def _curvature(posture: Posture) -> str:
     return ",".join(f"{value:.4g}" for value in (*posture.curvature, *posture.sigma_curvature))
 
 
-def _rig(posture: Posture) -> str:
-    return f"{_sigmas(posture.rig_covariance)},{_sigmas(posture.total_covariance)}"
-
-
 def _sigmas(covariance: FloatArray) -> str:
     return ",".join(f"{sigma:.4g}" for sigma in deviations(covariance))
-
-
-def _numbers(posture: Posture) -> str:
-    return (
-        f"{posture.range:.6f},{math.degrees(posture.pitch):.5f},{math.degrees(posture.yaw):.5f},"
-        f"{_sigmas(posture.covariance)},"
-        f"{posture.slant_range:.6f},{posture.nearest:.6f},{posture.n_points}"
-    )
 
 
 POSTURE_CSV = "posture.csv"
@@ -189,13 +182,6 @@ class RunOutputs:
         To which the frames are added; its monitors are those of the run.
     shutter : Shutter
         Of the camera.
-
-    Attributes
-    ----------
-    status : Status
-        What `run.yaml` will say if the run ends without a fault; set it before the end.
-    summary : RunSummary
-        So far.
 
     Raises
     ------

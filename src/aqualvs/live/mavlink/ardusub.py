@@ -83,11 +83,9 @@ class PilotSticks:
 
     def moved(self) -> bool:
         """Return whether the pilot's sticks are off their centre."""
-        return self._joystick_moved() or self._channels_moved()
-
-    def _joystick_moved(self) -> bool:
         # A sender whose sticks are centred must not hide another whose sticks move.
-        return any(self._moves(found) for found in self._link.every("MANUAL_CONTROL"))
+        joysticks = self._link.every("MANUAL_CONTROL")
+        return any(map(self._moves, joysticks)) or self._channels_moved()
 
     def _moves(self, found: Received) -> bool:
         if found.age_s > FRESH_S or (found.system, found.component) == self._own:
@@ -104,12 +102,9 @@ class PilotSticks:
         # The thread that sends may add while this one reads.
         ours = [s for at, s in self._sent.copy() if since <= at <= found.received_ns]
         told = found.message
-        if self._beyond(told, _FORWARD, [s.x for s in ours]):
-            return True
-        if self._beyond(told, _LATERAL, [s.y for s in ours]):
-            return True
-        if self._beyond(told, _YAW, [s.r for s in ours]):
-            return True
+        for channel, axis in ((_FORWARD, "x"), (_LATERAL, "y"), (_YAW, "r")):
+            if self._beyond(told, channel, [getattr(sticks, axis) for sticks in ours]):
+                return True
         # JS_THR_GAIN scales the vertical by up to 4: while we use that axis, it shows nothing.
         vertical_is_ours = any(s.z != MIDDLE for s in ours)
         return not vertical_is_ours and self._beyond(told, _VERTICAL, [])

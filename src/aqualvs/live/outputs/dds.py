@@ -93,9 +93,7 @@ def dds_types(distro: str) -> Ros2Types:
             members.pop("variance", None)
         classes[name] = make_idl_struct(f"{short}_", f"{package}.{kind}.dds_.{short}_", members)
     classes[TYPE_NAMES[PublishedTopic.CLOUD]].serialize = _serialize_cloud
-    return Ros2Types(
-        classes=classes, range_has_variance=with_variance, octet=int, octets=_unchanged
-    )
+    return Ros2Types(classes=classes, range_has_variance=with_variance, octet=int, octets=bytes)
 
 
 def _member(text: str, classes: Mapping[str, Any]) -> tuple[str, Any]:
@@ -108,10 +106,6 @@ def _member(text: str, classes: Mapping[str, Any]) -> tuple[str, Any]:
     if not bracket:
         return name, single
     return name, types.array[single, int(length)] if length else types.sequence[single]
-
-
-def _unchanged(data: bytes) -> bytes:
-    return data
 
 
 def _serialize_cloud(
@@ -199,7 +193,8 @@ class DdsOutput:
     ) -> None:
         self._options = options or RosOptions()
         self._domain_id = domain_of_this_machine() if domain_id is None else domain_id
-        _check_domain(self._domain_id)
+        if not 0 <= self._domain_id <= _MAX_DOMAIN:
+            raise OptionError(f"ROS domain {self._domain_id}: must be 0 to {_MAX_DOMAIN}")
         self._types = dds_types(distro or distro_of_this_machine())
         self._maker = MessageMaker(self._options)
         self._link: _Link | None = None
@@ -302,11 +297,6 @@ def stays_on_this_machine(environment: Mapping[str, str] = os.environ) -> bool:
         or environment.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper() == "LOCALHOST"
     )
     return local and not environment.get("CYCLONEDDS_URI")
-
-
-def _check_domain(domain_id: int) -> None:
-    if not 0 <= domain_id <= _MAX_DOMAIN:
-        raise OptionError(f"ROS domain {domain_id}: must be 0 to {_MAX_DOMAIN}")
 
 
 def _join(domain_id: int, options: RosOptions, types: Ros2Types) -> _Link:
