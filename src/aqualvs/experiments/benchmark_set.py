@@ -20,6 +20,7 @@ from aqualvs import __version__
 from aqualvs.errors import OptionError, SourceError
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.results.files import Claim, writing
+from aqualvs.results.summary import RANGE_UNITS, Row, range_column
 from aqualvs.simulation.benchmark import (
     BENCHMARK_NAME,
     CONTRAST_LIMIT,
@@ -124,7 +125,7 @@ def read_dive(path: Path, name: str, level: str) -> DiveTruth:
     )
 
 
-def read_rows(path: Path, needed: tuple[str, ...]) -> list[dict[str, str | None]]:
+def read_rows(path: Path, needed: tuple[str, ...]) -> list[Row]:
     """Return the rows of a CSV file with a header, its names without space around them.
 
     Raises `SourceError` if it cannot be read, holds no row, or lacks a column.
@@ -285,12 +286,8 @@ _ANSWER = ("pitch_deg", "yaw_deg")
 _SIGMAS = ("sigma_pitch_deg", "sigma_yaw_deg")
 # What our own runs claim in all, next to what a frame's noise makes of it.
 _TOTALS = ("sigma_range_total_m", "sigma_pitch_total_deg", "sigma_yaw_total_deg")
-# Names and units of the range, and of its sigma.
-_RANGES = {"range_m": 1.0, "range_mm": 1e-3}
 _YES, _NO = {"1", "true", "yes"}, {"0", "false", "no"}
 _RUN_FILE = "posture.csv"
-
-Row = dict[str, str | None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -372,7 +369,7 @@ def _from_file(path: Path, benchmark: BenchmarkSet) -> dict[str, Answers]:
 
 def _answers(path: Path, rows: list[tuple[int, Row]], dive: DiveTruth) -> Answers:
     """Put the rows of a dive into the order of its truth; frames without a row have no answer."""
-    range_column = _range_column(path, rows[0][1])
+    own_range = range_column(path, rows[0][1])
     places = {int(frame): k for k, frame in enumerate(dive.frames)}
     found = _nothing(len(places))
     answered: set[int] = set()
@@ -383,22 +380,15 @@ def _answers(path: Path, rows: list[tuple[int, Row]], dive: DiveTruth) -> Answer
                 f"{path}: line {i + 2}: frame {row['frame']} is there twice; give one row a frame"
             )
         answered.add(place)
-        unit = _RANGES[range_column]
-        numbers = [cell(path, i, row, column) for column in (range_column, *_ANSWER)]
-        own = (f"sigma_{range_column}", *_SIGMAS)
+        unit = RANGE_UNITS[own_range]
+        numbers = [cell(path, i, row, column) for column in (own_range, *_ANSWER)]
+        own = (f"sigma_{own_range}", *_SIGMAS)
         claimed = _TOTALS if set(_TOTALS) <= row.keys() and unit == 1.0 else own
         sigmas = [cell(path, i, row, column) for column in claimed]
         found.valid[place] = _valid(path, i, row, numbers[0])
         found.posture[place] = [numbers[0] * unit, *numbers[1:]]
         found.sigma[place] = [sigmas[0] * unit, *sigmas[1:]]
     return found
-
-
-def _range_column(path: Path, row: Row) -> str:
-    for name in _RANGES:
-        if name in row:
-            return name
-    raise SourceError(f"{path}: no column range_m or range_mm; name it in the first line")
 
 
 def _place(path: Path, i: int, row: Row, places: dict[int, int], dive: str) -> int:

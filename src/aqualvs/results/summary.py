@@ -8,7 +8,7 @@ from array import array
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,12 @@ from aqualvs.scanning.agreement import LaserAgreement
 from aqualvs.scanning.posture import Posture
 from aqualvs.scanning.scan import Scan
 
-_RANGE_UNITS = {"range_m": 1.0, "range_mm": 1e-3}
+Row: TypeAlias = dict[str, str | None]
+
+RANGE_UNITS = {"range_m": 1.0, "range_mm": 1e-3}
+"""Names of a column of ranges, and their units in metres."""
+
+_ANGLES = ("pitch_deg", "yaw_deg")
 _AGREEMENT = "agreement_"
 """Begin of the names of the agreement's arrays in a stored summary."""
 _LIT_PLANE = ("visible_fit_range_mm", "visible_fit_pitch_deg", "visible_fit_yaw_deg")
@@ -74,15 +79,17 @@ def compare_with_truth(posture_csv: Path, truth_csv: Path) -> TruthComparison:
     SourceError
         If a file cannot be read, lacks a column, or no frame is in both.
     """
-    in_fields, of_fields = (_has_fields(path) for path in (posture_csv, truth_csv))
+    measured_rows, true_rows = _rows(posture_csv), _rows(truth_csv)
+    in_fields, of_fields = ("field" in rows[0] for rows in (measured_rows, true_rows))
     if of_fields and not in_fields:
         raise SourceError(
             f"{truth_csv}: of the fields of an interlaced camera, but the run took whole pictures; "
             "set camera.shutter in the rig file to kind: interlaced"
         )
-    measured = read_truth(posture_csv)
-    truth = read_truth(truth_csv)
-    known = truth.keys() & _frames(posture_csv)
+    measured = _postures(posture_csv, measured_rows)
+    truth = _postures(truth_csv, true_rows)
+    frames = {_number(row["frame"]) for row in measured_rows}
+    known = {frame for frame in truth if frame in frames}
     if not known:
         raise SourceError(
             f"{truth_csv}: none of its {len(truth)} frames is in {posture_csv}; "
@@ -110,52 +117,48 @@ def read_truth(path: Path) -> dict[int, tuple[float, float, float]]:
     before the net's own plane. Other columns are ignored. Raises `SourceError` if the file cannot
     be read or lacks a column.
     """
-    rows = _rows(path)
-    range_column = _range_column(path, rows)
-    unit = _RANGE_UNITS[range_column]
+    return _postures(path, _rows(path))
+
+
+def _postures(path: Path, rows: list[Row]) -> dict[int, tuple[float, float, float]]:
+    """Return what `read_truth` reads, from rows of a file."""
+    own_column = range_column(path, rows[0])
     found = {}
     for row in rows:
         frame = _number(row["frame"])
         lit = [_number(row.get(name)) for name in _LIT_PLANE]
-        values = [_number(row[name]) for name in (range_column, "pitch_deg", "yaw_deg")]
+        values, unit = [_number(row[name]) for name in (own_column, *_ANGLES)], own_column
         if all(map(math.isfinite, lit)):
-            values, scale = lit, _RANGE_UNITS["range_mm"]
-        else:
-            scale = unit
+            values, unit = lit, "range_mm"
         if all(map(math.isfinite, [frame, *values])):
-            found[int(frame)] = (values[0] * scale, values[1], values[2])
+            found[int(frame)] = (values[0] * RANGE_UNITS[unit], values[1], values[2])
     return found
 
 
-def _has_fields(path: Path) -> bool:
-    return any("field" in row for row in _rows(path)[:1])
-
-
-def _frames(path: Path) -> set[int]:
-    numbers = (_number(row["frame"]) for row in _rows(path))
-    return {int(number) for number in numbers if math.isfinite(number)}
-
-
-def _rows(path: Path) -> list[dict[str, str | None]]:
+def _rows(path: Path) -> list[Row]:
+    """Return the rows of a file that has the columns of `read_truth`, at least one."""
     try:
         with path.open(newline="", encoding="utf-8") as file:
-            return list(csv.DictReader(file))
+            rows = list(csv.DictReader(file))
     except OSError as fault:
         raise SourceError(f"{path}: cannot be read ({fault.strerror}); check the path") from fault
     except (UnicodeDecodeError, csv.Error) as fault:
         raise SourceError(f"{path}: not a CSV file; check the path") from fault
-
-
-def _range_column(path: Path, rows: list[dict[str, str | None]]) -> str:
-    """Return the range column, after a check that the others are there as well."""
     if not rows:
         raise SourceError(f"{path}: holds no rows; give a CSV with one row for every frame")
-    columns = rows[0].keys()
-    for name in ("frame", "pitch_deg", "yaw_deg"):
-        if name not in columns:
+    for name in ("frame", *_ANGLES):
+        if name not in rows[0]:
             raise SourceError(f"{path}: no column {name}; name it in the first line")
-    for name in _RANGE_UNITS:
-        if name in columns:
+    return rows
+
+
+def range_column(path: Path, row: Row) -> str:
+    """Return which of `RANGE_UNITS` a row of a file has.
+
+    Raises `SourceError` if it has none.
+    """
+    for name in RANGE_UNITS:
+        if name in row:
             return name
     raise SourceError(f"{path}: no column range_m or range_mm; name it in the first line")
 
