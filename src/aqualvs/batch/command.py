@@ -1,6 +1,7 @@
 """`aqualvs batch`: many dives measured on one machine or on many."""
 
 import json
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
@@ -73,7 +74,8 @@ def batch(request: BatchRequest, echo: Callable[[str], object]) -> int:
     if is_locked(lock):
         raise OutputError(f"{request.out}: another batch is under way here; wait for its end")
     with writing(lock):
-        held = _locked(lock)
+        held = AppendFile(lock)
+        held.lock()
     with closing(held):
         with writing(request.out):
             works = _works(request, dives)
@@ -88,7 +90,11 @@ def batch(request: BatchRequest, echo: Callable[[str], object]) -> int:
             found = Scheduler(sized, workers, progress).run(lambda: stop.caught is not None)
         records = _all_records(request.out, found)
         with writing(request.out):
-            _tidy(request.out / HOME)
+            for left in list((request.out / HOME).rglob("*.part")):
+                # Processes that were killed left it.
+                clear(left)
+                if left.is_file():
+                    left.unlink(missing_ok=True)
             (request.out / DATASET).mkdir(exist_ok=True)
             write_dives(request.out / DATASET, [record.row() for record in records])
         for line in _summary_lines(
@@ -111,12 +117,6 @@ def _check(request: BatchRequest) -> None:
         raise OptionError("--workers: the scheduler has its own workers; leave one of them out")
     if request.n_workers is not None and request.n_workers < 1:
         raise OptionError(f"--workers {request.n_workers}: give at least 1")
-
-
-def _locked(path: Path) -> AppendFile:
-    file = AppendFile(path)
-    file.lock()
-    return file
 
 
 def _works(request: BatchRequest, dives: Sequence[Dive]) -> list[DiveWork]:
@@ -163,14 +163,6 @@ def _known_names(out: Path) -> dict[str, str]:
     return {str(key): str(value) for key, value in found.items()}
 
 
-def _tidy(home: Path) -> None:
-    """Remove what processes left that were killed."""
-    for path in list(home.rglob("*.part")):
-        clear(path)
-        if path.is_file():
-            path.unlink(missing_ok=True)
-
-
 def _all_records(out: Path, found: Mapping[str, DiveRecord]) -> list[DiveRecord]:
     """Return how all dives of the folder stand, those of earlier batches too, by name."""
     records = dict(found)
@@ -185,9 +177,7 @@ def _all_records(out: Path, found: Mapping[str, DiveRecord]) -> list[DiveRecord]
 def _summary_lines(
     request: BatchRequest, found: Mapping[str, DiveRecord], stopped_by: str
 ) -> list[str]:
-    counts: dict[DiveState, int] = {}
-    for record in found.values():
-        counts[record.state] = counts.get(record.state, 0) + 1
+    counts = Counter(record.state for record in found.values())
     lines = [f"{len(found)} dives: " + ", ".join(f"{n} {s.value}" for s, n in counts.items())]
     if stopped_by:
         lines.append(

@@ -135,12 +135,8 @@ def _publish(draft: Path, folder: Path) -> None:
     try:
         os.rename(draft, folder)
     except OSError:
-        our_manifest, their_manifest = read_manifest(draft), read_manifest(folder)
-        if (
-            our_manifest is not None
-            and their_manifest is not None
-            and (read_valid_manifest(folder, our_manifest["key"]) is not None)
-        ):
+        ours = read_manifest(draft)
+        if ours is not None and read_valid_manifest(folder, ours["key"]) is not None:
             return
         clear(folder)
         os.rename(draft, folder)

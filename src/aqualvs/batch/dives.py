@@ -187,12 +187,8 @@ def _listed(row: Mapping[str, Any], path: Path, number: int) -> Dive:
 
 
 def _water(row: Mapping[str, Any], path: Path, number: int) -> Water:
-    values = {key: _number(row, key, path, number) for key in _NUMBERS}
-    return Water(
-        n_water=values["water_n"],
-        temperature_c=values["temperature_c"],
-        salinity=values["salinity"],
-    )
+    n_water, temperature_c, salinity = (_number(row, key, path, number) for key in _NUMBERS)
+    return Water(n_water=n_water, temperature_c=temperature_c, salinity=salinity)
 
 
 def _number(row: Mapping[str, Any], key: str, path: Path, number: int) -> float | None:
@@ -209,20 +205,8 @@ def _number(row: Mapping[str, Any], key: str, path: Path, number: int) -> float 
 
 VIDEO_SUFFIXES = frozenset(
     [
-        ".avi",
-        ".h264",
-        ".h265",
-        ".m2ts",
-        ".m4v",
-        ".mkv",
-        ".mov",
-        ".mp4",
-        ".mpeg",
-        ".mpg",
-        ".mts",
-        ".ts",
-        ".webm",
-        ".wmv",
+        *(".avi", ".h264", ".h265", ".m2ts", ".m4v", ".mkv", ".mov"),
+        *(".mp4", ".mpeg", ".mpg", ".mts", ".ts", ".webm", ".wmv"),
     ]
 )
 """Files that are dives when a folder is given; a file that is named may have any suffix."""

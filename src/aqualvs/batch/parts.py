@@ -99,15 +99,8 @@ def piece_folder(work: DiveWork, probe: DiveProbe, number: int) -> Path:
 def piece_key(probe: DiveProbe, number: int) -> str:
     """Return what a piece is made from, as a short text."""
     span = probe.spans[number]
-    return digest(
-        {
-            "dive": probe.key,
-            "kind": span.kind,
-            "first": span.first,
-            "stop": span.stop,
-            "lead": span.lead,
-        }
-    )
+    of_span = {"kind": span.kind, "first": span.first, "stop": span.stop, "lead": span.lead}
+    return digest({"dive": probe.key, **of_span})
 
 
 def measure_piece(work: DiveWork, probe: DiveProbe, number: int) -> PieceResult:

@@ -461,20 +461,14 @@ class Scheduler:
         elif task.piece is not None:
             self._measured(task.dive, task.piece, outcome.value)
         else:
-            self._end(
-                task.dive,
-                DiveRecord.of(
-                    task.dive.work.name, task.dive.work.request.source, outcome.value, reused=False
-                ),
-            )
+            self._finish(task.dive, outcome.value, reused=False)
 
     def _probed(self, dive: _Dive, found: DiveProbe, facts: dict[str, Any] | None) -> None:
         self._expect(dive, found.n_bytes)
         if facts is None:
             self._measure(dive, found)
-            return
-        work = dive.work
-        self._end(dive, DiveRecord.of(work.name, work.request.source, facts, reused=True))
+        else:
+            self._finish(dive, facts, reused=True)
 
     def _measured(self, dive: _Dive, piece: int, result: PieceResult) -> None:
         found = dive.probe
@@ -517,6 +511,10 @@ class Scheduler:
         dive.results.clear()
         self._expect(dive, dive.probe.n_bytes)
         self._measure(dive, dive.probe.in_one_piece(why))
+
+    def _finish(self, dive: _Dive, facts: Mapping[str, Any], *, reused: bool) -> None:
+        work = dive.work
+        self._end(dive, DiveRecord.of(work.name, work.request.source, facts, reused=reused))
 
     def _end(self, dive: _Dive, record: DiveRecord) -> None:
         dive.is_done = True
