@@ -21,7 +21,7 @@ from aqualvs.errors import OutputError, SourceError
 from aqualvs.report import html
 from aqualvs.report.charts import breaks, merged, stretches, thin
 from aqualvs.report.frames import choose_pictures, choose_samples, decode_frames
-from aqualvs.report.html import embedded_json
+from aqualvs.report.html import Raw, embedded_json
 from aqualvs.report.html import page as filled_page
 from aqualvs.report.overlay import OverlayWriter
 from aqualvs.report.points import summarize_points
@@ -578,11 +578,11 @@ def test_a_report_that_cannot_be_written_leaves_the_old_one(
 
 
 def test_a_page_escapes_its_texts_and_misses_none() -> None:
-    texts = {"title": "<b>&", "subtitle": '"<i>"'}
-    parts = {"cards": "", "warnings": "", "facts": "<table></table>"}
-    html = filled_page("follow.html", texts, {**parts, "figures": ""})
+    texts = {"title": "<b>&", "subtitle": '"<i>"', "cards": "", "warnings": ""}
+    content = {**texts, "facts": Raw("<table></table>")}
+    html = filled_page("follow.html", {**content, "figures": []})
     assert "<title>&lt;b&gt;&amp; – aqualvs follow</title>" in html
     assert '<p class="sub">&#34;&lt;i&gt;&#34;</p>' in html
     assert "<table></table>" in html
     with pytest.raises(UndefinedError, match="figures"):
-        filled_page("follow.html", texts, parts)
+        filled_page("follow.html", content)

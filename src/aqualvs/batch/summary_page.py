@@ -101,6 +101,8 @@ def _page(folder: Path, records: Sequence[DiveRecord]) -> str:
     content = {
         "title": folder.resolve().name,
         "subtitle": _rigs(records),
+        "cards": html.cards(_cards(records)),
+        "warnings": html.notice(list(_notes(records))),
         "lead": lead,
         "footer": f"Written {html.moment(now())} by aqualvs {__version__}.",
         "records": records,
@@ -110,8 +112,7 @@ def _page(folder: Path, records: Sequence[DiveRecord]) -> str:
         "range_svg": lambda steps: html.Raw(range_svg(steps, low, high)),
         "examples": _EXAMPLES,
     }
-    parts = {"cards": html.cards(_cards(records)), "warnings": html.notice(list(_notes(records)))}
-    return html.page("summary.html", content, parts)
+    return html.page("summary.html", content)
 
 
 _ENDS = ("range_min_m", "range_max_m")

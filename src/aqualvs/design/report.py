@@ -21,7 +21,7 @@ from aqualvs.design.judge import PredictedErrors, predict, together
 from aqualvs.design.settings import Design, Mount
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.report import html
-from aqualvs.report.figure_style import BLUE, DARK, GREY, ORANGE, STYLE, new_canvas
+from aqualvs.report.figure_style import BLUE, DARK, GREY, ORANGE, STYLE, new_canvas, save_figures
 from aqualvs.results.files import replace_text
 
 if TYPE_CHECKING:
@@ -306,12 +306,9 @@ def draw_figures(design: Design, by_camera: Mapping[str, FloatArray], out: Path)
     """
     from matplotlib import rc_context
 
-    written = [out / ERRORS_PNG, out / PICTURE_PNG]
-    dpi = 160
     with rc_context(STYLE):
-        _errors(design, by_camera).savefig(written[0], dpi=dpi)
-        _picture(design).savefig(written[1], dpi=dpi)
-    return written
+        figures = {"errors": _errors(design, by_camera), "picture": _picture(design)}
+        return save_figures(figures, out, dpi=160)
 
 
 _FIGURES = {
@@ -335,33 +332,31 @@ def write_page(
     met. Sentences among `parts` belong to the table before them. Raises `OSError` as the system
     says it.
     """
-    figures = "".join(
-        f'<figure><img src="{html.data_url(one.read_bytes(), "png")}" alt="{_FIGURES[one.name]}">'
-        f"<figcaption>{_FIGURES[one.name]}.</figcaption></figure>"
-        for one in pictures
-    )
-    sections, number = [f'<section id="figures"><h2>Figures</h2>{figures}</section>'], 0
-    lead = []
+    lead: list[str] = []
+    sections: list[tuple[str, html.Raw, list[str]]] = []
     for part in parts:
         if isinstance(part, Table):
-            number += 1
-            title = html.text(part.title or "")
-            sections.append(
-                f'<section id="table-{number}"><h2>{title}</h2>{_as_html(part)}</section>'
-            )
-        elif number:
-            sections[-1] = sections[-1].replace("</section>", f"<p>{html.text(part)}</p></section>")
+            sections.append((str(part.title or ""), _as_html(part), []))
         else:
-            lead.append(f'<p class="lead">{html.text(part)}</p>')
-    texts = {"title": name, "subtitle": "predicted before it is built", "verdict": first}
-    made = {"lead": "".join(lead), "tables": "\n".join(sections), "kind": "" if fine else " warn"}
-    replace_text(path, html.page("design.html", texts, made))
+            (sections[-1][2] if sections else lead).append(part)
+    content = {
+        "title": name,
+        "subtitle": "predicted before it is built",
+        "verdict": first,
+        "fine": fine,
+        "lead": lead,
+        "figures": [
+            (html.data_url(one.read_bytes(), "png"), _FIGURES[one.name]) for one in pictures
+        ],
+        "tables": sections,
+    }
+    replace_text(path, html.page("design.html", content))
 
 
 _LEADING_MINUS = re.compile(r"^-(?=\d)")
 
 
-def _as_html(table: Table) -> str:
+def _as_html(table: Table) -> html.Raw:
     """Return a table of the terminal as one of a page."""
 
     def plain(cell: Any) -> str:

@@ -266,9 +266,10 @@ def page_html(records: Sequence[Record], seconds: Mapping[str, float], folder: P
         "with_bar": _with_bar(records),
         "bar_text": _bar_text,
         "picture": lambda printed: _picture(printed, folder),
+        "cards": html.cards(_cards(records, seconds)),
+        "warnings": _notice(records),
     }
-    parts = {"cards": html.cards(_cards(records, seconds)), "warnings": _notice(records)}
-    return html.page("reproduce.html", content, parts)
+    return html.page("reproduce.html", content)
 
 
 def _cards(records: Sequence[Record], seconds: Mapping[str, float]) -> Iterator[Card]:

@@ -8,7 +8,6 @@ is needed.
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -264,21 +263,18 @@ def write_report(log: LoopLog, facts: RunFacts, out: Path) -> Path:
 
 
 def _page(log: LoopLog, facts: RunFacts, figures: Sequence[Path]) -> str:
-    texts = {"title": "Hold and follow, simulated", "subtitle": facts.words}
-    shown = "\n".join(
-        f'<figure><img src="{html.data_url(figure.read_bytes(), "png")}" '
-        f'alt="{escape(_CAPTIONS[figure.name])}">'
-        f"<figcaption>{escape(_CAPTIONS[figure.name])}</figcaption></figure>"
-        for figure in figures
-    )
     cards, warnings = _headline(log)
-    parts = {
+    content = {
+        "title": "Hold and follow, simulated",
+        "subtitle": facts.words,
         "cards": html.cards(cards),
         "warnings": html.notice(warnings),
         "facts": html.fact_table(summary(log)),
-        "figures": shown,
+        "figures": [
+            (html.data_url(one.read_bytes(), "png"), _CAPTIONS[one.name]) for one in figures
+        ],
     }
-    return html.page("follow.html", texts, parts)
+    return html.page("follow.html", content)
 
 
 _CAPTIONS = {

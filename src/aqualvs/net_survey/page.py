@@ -6,7 +6,6 @@ The map shows growth by colour and holes by what became of them.
 import math
 import re
 from collections.abc import Mapping
-from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -284,21 +283,20 @@ def write_page(path: Path, picture: Path, result: Comparison, origins: Mapping[s
     """
     first, last = result.dates[0], result.dates[-1]
     lines = [line for line in summary_lines(result) if not line.startswith("warning: ")]
-    texts = {
+    content = {
         "title": f"The net from {first} to {last}",
         "subtitle": f"{len(result.surveys)} dives on {len(result.dates)} dates",
         "footer": f"Written {html.moment(now())} by aqualvs {__version__}.",
-    }
-    parts = {
         "cards": html.cards(_cards(result)),
         "warnings": html.notice([sentence(one) for one in result.warnings]),
-        "sentences": "\n".join(_paragraph(line) for line in lines),
+        # Minus signs, but the hyphens of dates stay.
+        "sentences": [_MINUS.sub("\u2212", line.replace("->", "\u2192")) for line in lines],
         "picture": html.data_url(picture.read_bytes(), "png"),
         "holes": _holes(result),
         "dates": _table_of_dates(result),
         "dives": _dives(result, origins),
     }
-    replace_text(path, html.page("net_change.html", texts, parts))
+    replace_text(path, html.page("net_change.html", content))
 
 
 def _cards(result: Comparison) -> list[Card]:
@@ -321,22 +319,15 @@ def _cards(result: Comparison) -> list[Card]:
     return found
 
 
-def _paragraph(line: str) -> str:
-    style = ' style="margin-left: 1.5em"' if line.startswith("  ") else ""
-    # Minus signs, but the hyphens of dates stay.
-    words = escape(_MINUS.sub("\u2212", line.strip().replace("->", "\u2192")))
-    return f"<p{style}>{words}</p>"
-
-
-def _holes(result: Comparison) -> str:
+def _holes(result: Comparison) -> html.Raw:
     wall = result.wall
     if wall is None:
-        return (
+        return html.Raw(
             '<p class="note">Places are not compared, so no hole can be found again. All are in '
             "holes_change.csv.</p>"
         )
     if not wall.sites:
-        return "<p>None was found on any date.</p>"
+        return html.Raw("<p>None was found on any date.</p>")
     rows = [_hole_row(one, wall) for some in by_state(wall.sites).values() for one in some]
     head = (
         "what became of it",
@@ -347,11 +338,7 @@ def _holes(result: Comparison) -> str:
         "looked at before",
         "looked at now",
     )
-    table = html.table(head, rows, texts=2)
-    long = 30
-    if len(rows) <= long:
-        return table
-    return f"<details><summary>All {len(rows)} holes</summary>{table}</details>"
+    return html.folded(html.table(head, rows, texts=2), len(rows), "holes", longest=30)
 
 
 def _hole_row(one: Site, wall: OnWall) -> tuple[str, ...]:
@@ -368,7 +355,7 @@ def _hole_row(one: Site, wall: OnWall) -> tuple[str, ...]:
     )
 
 
-def _table_of_dates(result: Comparison) -> str:
+def _table_of_dates(result: Comparison) -> html.Raw:
     wall = result.wall
     on_wall: dict[object, Growth | None] = {}
     if wall is not None:
@@ -385,7 +372,7 @@ def _share(one: Growth | None) -> str:
     return _NONE if one is None else f"{100.0 * one.value:.1f} ± {100.0 * one.sigma:.1f} %"
 
 
-def _dives(result: Comparison, origins: Mapping[str, str]) -> str:
+def _dives(result: Comparison, origins: Mapping[str, str]) -> html.Raw:
     shifts = {}
     if result.wall is not None:
         wall = result.wall

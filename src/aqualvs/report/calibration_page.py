@@ -1,13 +1,14 @@
 """Report of a calibration: one static HTML page that opens anywhere and prints well.
 
-The commands fill a `calibration_material.Page`; the tables and sections here escape all of its
+The commands fill a `CalibrationPage`; the tables and sections here escape all of its
 text. Unknown values are shown as a dash. There are no scripts and no requests to a network.
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from html import escape
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +16,14 @@ from aqualvs.optics.expected_error import ExpectedError, in_mm_and_degrees
 from aqualvs.report import html
 from aqualvs.report import svg as draw
 from aqualvs.report.calibration_charts import N_VECTORS, picture_view, residual_view
-from aqualvs.report.calibration_material import CalibrationPage, LaserRow, ParameterRow, ViewRow
+from aqualvs.report.calibration_material import (
+    CalibrationPage,
+    LaserRow,
+    ParameterRow,
+    ResidualMap,
+    Series,
+    ViewRow,
+)
 from aqualvs.report.html import Raw, swatch, table
 from aqualvs.report.svg import line_chart
 from aqualvs.results.files import writing
@@ -271,66 +279,43 @@ def write_page(page: CalibrationPage, path: Path) -> Path:
 
 def page_html(page: CalibrationPage) -> str:
     """Return the report of a calibration as HTML."""
-    return html.page(
-        "calibration.html",
-        {"title": page.title, "subtitle": page.subtitle},
-        {
-            "summary": _summary(page),
-            "sections": "\n".join(
-                f'<section id="{name}">\n<h2>{heading}</h2>\n{body}\n</section>'
-                for name, heading, body in _sections(page)
-            ),
-        },
-    )
+    names = [view.name for view in page.views]
+    sections: list[tuple[str, str, Callable[[Any], str], Any]] = [
+        ("expectations", "What it means on a target", expectation_view, page.expectations),
+        ("parameters", "Parameters", parameter_table, page.parameters),
+        ("lasers", "Lasers", laser_tables, page.lasers),
+        ("series", "Charts", _charts, page.series),
+        ("residuals", "Residuals", lambda maps: _residuals(maps, names), page.residual_maps),
+        ("views", "Views", view_table, page.views),
+        ("pictures", "Pictures", picture_view, page.pictures),
+        ("facts", "Command, files and versions", html.fact_table, page.facts),
+    ]
+    content = {
+        "title": page.title,
+        "subtitle": page.subtitle,
+        "cards": html.cards(page.cards),
+        "warnings": html.notice(page.warnings),
+        "words": page.words,
+        "parts": [
+            (name, heading, Raw(view(part))) for name, heading, view, part in sections if part
+        ],
+    }
+    return html.page("calibration.html", content)
 
 
-def _summary(page: CalibrationPage) -> str:
-    parts = [html.notice(page.warnings)]
-    if page.cards:
-        parts.insert(0, f'<div class="cards">{html.cards(page.cards)}</div>')
-    if page.words:
-        items = "".join(f"<li>{escape(words)}</li>" for words in page.words)
-        parts.append(
-            f'<section id="findings"><h2>Findings</h2><ul class="findings">{items}</ul></section>'
-        )
-    return "\n".join(parts)
-
-
-def _sections(page: CalibrationPage) -> Iterator[tuple[str, str, str]]:
-    """Yield name, heading and content of the parts that are not empty."""
-    if page.expectations:
-        body = expectation_view(page.expectations)
-        yield "expectations", "What it means on a target", body
-    if page.parameters:
-        yield "parameters", "Parameters", parameter_table(page.parameters)
-    if page.lasers:
-        yield "lasers", "Lasers", laser_tables(page.lasers)
-    if page.series:
-        yield "series", "Charts", _series(page)
-    if page.residual_maps:
-        yield "residuals", "Residuals", _residuals(page)
-    if page.views:
-        yield "views", "Views", view_table(page.views)
-    if page.pictures:
-        yield "pictures", "Pictures", picture_view(page.pictures)
-    if page.facts:
-        yield "facts", "Command, files and versions", html.fact_table(page.facts)
-
-
-def _series(page: CalibrationPage) -> str:
+def _charts(found: Sequence[Series]) -> str:
     return "\n".join(
         f'<div class="whole"><h3>{escape(series.title)}</h3>{line_chart(series)}</div>'
-        for series in page.series
+        for series in found
     )
 
 
-def _residuals(page: CalibrationPage) -> str:
-    names = [view.name for view in page.views]
+def _residuals(maps: Sequence[ResidualMap], names: Sequence[str]) -> str:
     # Vectors of all maps together; with them and the pictures' share a page stays below 1 MB.
     all_vectors = 7500
-    share = min(N_VECTORS, all_vectors // len(page.residual_maps))
+    share = min(N_VECTORS, all_vectors // len(maps))
     return "\n".join(
         f'<div class="whole"><h3>{escape(found.title)}</h3>'
         f"{residual_view(found, names, n_vectors=share)}</div>"
-        for found in page.residual_maps
+        for found in maps
     )

@@ -59,7 +59,7 @@ def contents_of(body: str) -> "Raw":
     return Raw(f'<nav aria-label="Contents"><ul class="contents">{items}</ul></nav>')
 
 
-def page(template: str, content: Mapping[str, object], parts: Mapping[str, str]) -> str:
+def page(template: str, content: Mapping[str, object]) -> str:
     """Fill a template.
 
     Parameters
@@ -67,12 +67,9 @@ def page(template: str, content: Mapping[str, object], parts: Mapping[str, str])
     template : str
         Name of a file in `assets`.
     content : mapping
-        Texts, which are escaped, and whatever else the template takes, by name.
-    parts : mapping
-        HTML by name.
+        What the template takes, by name; texts are escaped unless they are `Raw`.
     """
-    html = {name: Raw(part) for name, part in parts.items()}
-    return _templates().get_template(template).render(**content, **html)
+    return _templates().get_template(template).render(content)
 
 
 class Raw(str):
@@ -93,13 +90,13 @@ class Card:
     note: str
 
 
-def embedded_json(data: object) -> str:
+def embedded_json(data: object) -> "Raw":
     """Return JSON that is safe inside a script element.
 
     Raises `ValueError` if a number is not finite; JSON has no word for it.
     """
     text = json.dumps(data, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
-    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+    return Raw(text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026"))
 
 
 def data_url(data: bytes, kind: str) -> str:
@@ -140,33 +137,41 @@ def _cell(cell: str) -> str:
     return cell if isinstance(cell, Raw) else escape(cell)
 
 
+def folded(content: "Raw", n_rows: int, name: str, *, longest: int) -> "Raw":
+    """Return a table, folded away where it has more than the longest number of rows."""
+    if n_rows <= longest:
+        return content
+    return Raw(f"<details><summary>All {n_rows} {name}</summary>{content}</details>")
+
+
 def fact_table(rows: Iterable[tuple[str, str]]) -> "Raw":
     """Return names and values as a table."""
     body = "".join(f"<tr><td>{escape(k)}</td><td>{escape(v)}</td></tr>\n" for k, v in rows)
     return Raw(f'<div class="scroll"><table class="facts">{body}</table></div>')
 
 
-def cards(items: Iterable[Card]) -> str:
+def cards(items: Iterable[Card]) -> "Raw":
     """Return the cards of the headline."""
-    return "\n".join(
+    shown = (
         f'<div class="card"><div class="name">{escape(card.name)}</div>'
         f'<div class="value">{escape(card.value)}</div>'
         f'<div class="note">{escape(card.note)}</div></div>'
         for card in items
     )
+    return Raw("\n".join(shown))
 
 
-def notice(warnings: Sequence[str]) -> str:
+def notice(warnings: Sequence[str]) -> "Raw":
     """Return the box of warnings, or the all-clear."""
     if not warnings:
-        return '<div class="notice"><p>No warnings.</p></div>'
+        return Raw('<div class="notice"><p>No warnings.</p></div>')
     items = "".join(f"<li>{escape(text)}</li>" for text in warnings)
-    return f'<div class="notice warn"><p><b>Please note</b></p><ul>{items}</ul></div>'
+    return Raw(f'<div class="notice warn"><p><b>Please note</b></p><ul>{items}</ul></div>')
 
 
-def swatch(index: int) -> str:
+def swatch(index: int) -> "Raw":
     """Return a patch in the colour of laser `index`."""
-    return f'<span class="swatch" style="background:{laser_colour(index)}"></span>'
+    return Raw(f'<span class="swatch" style="background:{laser_colour(index)}"></span>')
 
 
 def laser_legend(names: list[str]) -> "Raw":

@@ -10,7 +10,7 @@ from types import MappingProxyType
 from typing import Any, TypeAlias
 
 from aqualvs.report.frames import SampleFrame
-from aqualvs.report.html import Card, Raw, table, text
+from aqualvs.report.html import Card, Raw, folded, table, text
 from aqualvs.results.files import read_json
 from aqualvs.results.folder import HOLES_CSV, NET_CSV, NET_GEOJSON, NET_MAP_PNG
 from aqualvs.text import clock, signed
@@ -170,7 +170,8 @@ def _holes(net: NetTables, crops: Mapping[str, SampleFrame]) -> str:
     ]
     shown = "\n".join(_crop(row, crops[row["hole"]]) for row in net.holes if row["hole"] in crops)
     pictures = f'<div class="crops">{shown}</div>' if shown else ""
-    return f"<h3>Holes</h3>{pictures}{_folded(table(names, rows), len(rows), 'holes')}"
+    found = folded(table(names, rows), len(rows), "holes", longest=_LONG_TABLE)
+    return f"<h3>Holes</h3>{pictures}{found}"
 
 
 def _crop(row: Row, picture: SampleFrame) -> str:
@@ -213,14 +214,8 @@ def _stretches(net: NetTables) -> str:
         )
         for row in net.stretches
     ]
-    return f"<h3>Stretches</h3>{_folded(table(names, rows), len(rows), 'stretches')}"
-
-
-def _folded(content: str, n_rows: int, name: str) -> str:
-    """Return a table, folded away where it is long."""
-    if n_rows <= _LONG_TABLE:
-        return content
-    return f"<details><summary>All {n_rows} {name}</summary>{content}</details>"
+    shown = folded(table(names, rows), len(rows), "stretches", longest=_LONG_TABLE)
+    return f"<h3>Stretches</h3>{shown}"
 
 
 def _log(net: NetTables) -> str:

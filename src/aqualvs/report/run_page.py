@@ -241,7 +241,7 @@ def write_report(run_dir: Path, *, truth: Path | None = None, out: Path | None =
         If the page cannot be written.
     """
     material = gather(run_dir, truth)
-    text = html.page("report.html", _content(material), _parts(material))
+    text = html.page("report.html", _content(material))
     path = out or run_dir / "report.html"
     try:
         replace_text(path, text)
@@ -254,7 +254,7 @@ def write_report(run_dir: Path, *, truth: Path | None = None, out: Path | None =
 
 
 def _content(m: Material) -> dict[str, object]:
-    """Return what the page shows, in its order."""
+    """Return what the page shows, in its order, and the numbers that its script draws."""
     housing = housing_name(m.rig)
     # Of the rig's frame, roughly: the lens lies within its dome.
     origin = "dome" if housing == "dome" else "lens"
@@ -262,8 +262,11 @@ def _content(m: Material) -> dict[str, object]:
     return {
         "title": m.title,
         "subtitle": _subtitle(m.run),
+        "cards": html.cards([*headline(m.track), *net_cards(m.net)]),
+        "warnings": html.notice(m.warnings),
         "posture_lead": _posture_lead(m.track, m.truth),
         "truth": None if m.truth is None else _errors_table(m.track, m.truth),
+        "net": html.Raw(net_view(m.net, m.crops)),
         "planes": [] if m.points is None else known,
         "no_planes": _why_no_planes(m.points, known),
         "labels": [(LABEL_COLOURS[label], _MARKS[label], LABEL_WORDS[label]) for label in Label],
@@ -285,15 +288,6 @@ def _content(m: Material) -> dict[str, object]:
         "lasers": _laser_rows(m.lasers, "dome's centre" if origin == "dome" else "origin"),
         "facts": _fact_blocks(m.run),
         "footer": _footer(m.run, m.track),
-    }
-
-
-def _parts(m: Material) -> dict[str, str]:
-    """Return the parts that are HTML already, and the numbers that the page's script draws."""
-    return {
-        "cards": html.cards([*headline(m.track), *net_cards(m.net)]),
-        "warnings": html.notice(m.warnings),
-        "net": net_view(m.net, m.crops),
         "data": html.embedded_json(_data(m)),
     }
 
