@@ -19,7 +19,7 @@ from aqualvs.design.calibrated import INDEX_ERROR, OffsetCost
 from aqualvs.design.changes import Change
 from aqualvs.design.judge import PredictedErrors, predict, together
 from aqualvs.design.settings import Design, Mount
-from aqualvs.geometry.arrays import BoolArray, FloatArray
+from aqualvs.geometry.arrays import BoolArray, FloatArray, runs_of
 from aqualvs.report import html
 from aqualvs.report.figure_style import BLUE, DARK, GREY, ORANGE, STYLE, new_canvas, save_figures
 from aqualvs.results.files import replace_text
@@ -116,10 +116,7 @@ def _angle(angle: float) -> str:
 
 def _interval(ranges: FloatArray, visible: BoolArray) -> str:
     """Return the intervals of range at which a stripe is in the picture."""
-    pieces = []
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], visible, [False]]).astype(int)))
-    for first, last in edges.reshape(-1, 2):
-        pieces.append(f"{ranges[first] * 1e3:.0f}-{ranges[last - 1] * 1e3:.0f}")
+    pieces = [f"{near * 1e3:.0f}-{far * 1e3:.0f}" for near, far in ranges[runs_of(visible)]]
     return ", ".join(pieces) or "nowhere"
 
 

@@ -28,7 +28,7 @@ from aqualvs.experiments.benchmark_set import (
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.nets.target_file import target_dict
 from aqualvs.pipeline import run
-from aqualvs.results.files import Claim, writing
+from aqualvs.results.files import Claim, without_nan, writing
 from aqualvs.results.folder import POSTURE_BARE_CSV
 from aqualvs.results.run_request import RunRequest, scanner_options
 from aqualvs.scanning.surfaces import TargetKind
@@ -110,12 +110,8 @@ def compare(truth: DiveTruth, answers: Answers) -> FrameAnswers:
 
 def pooled(parts: Sequence[FrameAnswers]) -> FrameAnswers:
     """Return the frames of several dives as one."""
-    return FrameAnswers(
-        np.concatenate([part.valid for part in parts]),
-        np.concatenate([part.n_visible for part in parts]),
-        np.concatenate([part.error for part in parts]),
-        np.concatenate([part.sigma for part in parts]),
-    )
+    names = FrameAnswers.__dataclass_fields__
+    return FrameAnswers(*(np.concatenate([getattr(part, n) for part in parts]) for n in names))
 
 
 def score(frames: FrameAnswers) -> Score:
@@ -298,7 +294,7 @@ def write_scores(scores: Scores, folder: Path) -> list[Path]:
         writer = csv.DictWriter(file, fieldnames=list(records[0]))
         writer.writeheader()
         writer.writerows(records)
-    bars = [_without_nan(asdict(bar)) for bar in scores.bars]
+    bars = [without_nan(asdict(bar)) for bar in scores.bars]
     content = {"set": scores.title, "scores": records, "error_bars_against_clear": bars}
     data.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
     text.write_text(markdown(scores, dives=True), encoding="utf-8")
@@ -313,14 +309,8 @@ def _record(entry: Entry) -> dict[str, Any]:
             flat |= {f"{key}_{kind}": number for kind, number in value.items()}
         else:
             flat[key] = value
-    return _without_nan(flat)
-
-
-def _without_nan(record: dict[str, Any]) -> dict[str, Any]:
-    return {
-        key: None if isinstance(value, float) and math.isnan(value) else value
-        for key, value in record.items()
-    }
+    found: dict[str, Any] = without_nan(flat)
+    return found
 
 
 def _rows(scores: Scores, *, dives: bool) -> list[tuple[str, ...]]:

@@ -6,7 +6,7 @@ is needed.
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -21,7 +21,7 @@ from aqualvs.follow.log import (
     safety_measures,
     thruster_measures,
 )
-from aqualvs.geometry.arrays import BoolArray, FloatArray
+from aqualvs.geometry.arrays import FloatArray, runs_of
 from aqualvs.report import html
 from aqualvs.report.figure_style import BLUE, DARK, GREY, ORANGE, STYLE, new_canvas, save_figures
 from aqualvs.results.files import replace_text, writing
@@ -127,7 +127,7 @@ def _finish(axes: "list[Axes]", log: LoopLog, time_s: FloatArray) -> None:
     step_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
     for one in axes:
         for here, colour in ((lost, _LOST), (guarded, _GUARDED)):
-            for start, end in _stretches(here):
+            for start, end in runs_of(here):
                 one.axvspan(time_s[start], time_s[end] + step_s, color=colour, linewidth=0)
         one.set_xlim(float(time_s[0]), float(time_s[-1]))
     notes = [
@@ -139,12 +139,6 @@ def _finish(axes: "list[Axes]", log: LoopLog, time_s: FloatArray) -> None:
 
 
 _COLOURS = {_LOST: "red", _GUARDED: "yellow"}
-
-
-def _stretches(here: BoolArray) -> Iterator[tuple[int, int]]:
-    """Yield first and last index of each run of True."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], here, [False]]).astype(np.int8)))
-    yield from zip(edges[::2].tolist(), (edges[1::2] - 1).tolist(), strict=True)
 
 
 PAGE = "follow.html"

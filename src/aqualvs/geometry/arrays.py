@@ -22,3 +22,9 @@ def as_vectors(values: ArrayLike, size: int, name: str) -> FloatArray:
     if array.ndim == 0 or array.shape[-1] != size:
         raise ValueError(f"{name} has shape {array.shape} but expected (..., {size})")
     return array
+
+
+def runs_of(mask: BoolArray) -> IntArray:
+    """Return first and last index of each run of True in a mask (N,), shape (K, 2)."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
+    return np.asarray(edges.reshape(-1, 2) - np.array([0, 1]))

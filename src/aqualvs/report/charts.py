@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray, runs_of
 from aqualvs.report.points import (
     QUALITY_EDGES,
     RESIDUAL_EDGES_MM,
@@ -91,8 +91,7 @@ def interruptions(track: Track) -> BoolArray:
 
 def stretches(track: Track) -> list[Stretch]:
     """Return every stretch without a posture, in order."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], (~track.valid).astype(np.int8), [0]])))
-    return [Stretch(int(a), int(b) - 1) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+    return [Stretch(first, last) for first, last in runs_of(~track.valid).tolist()]
 
 
 def merged(found: list[Stretch], track: Track, columns: int) -> list[Stretch]:

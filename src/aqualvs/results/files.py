@@ -13,6 +13,7 @@ dated copy.
 import contextlib
 import errno
 import json
+import math
 import os
 import uuid
 import zlib
@@ -152,6 +153,17 @@ def read_json(path: Path) -> Any:
         return json.loads(path.read_text(encoding="utf-8"))
     except RecursionError as fault:
         raise ValueError("nested too deeply") from fault
+
+
+def without_nan(value: Any) -> Any:
+    """Return the same with null in place of NaN, which JSON does not have."""
+    if isinstance(value, dict):
+        return {key: without_nan(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [without_nan(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
 
 
 def explain(path: Path, fault: OSError) -> str:

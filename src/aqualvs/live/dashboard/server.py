@@ -44,6 +44,7 @@ from aqualvs.live.dashboard.access import (
 )
 from aqualvs.optics.rig import Rig
 from aqualvs.recording.sample import LiveSample
+from aqualvs.results.files import without_nan
 from aqualvs.results.folder import posture_cells
 from aqualvs.scanning.posture import Refusal, deviations
 from aqualvs.scanning.scan import Label, ScanPoints
@@ -77,7 +78,7 @@ def page_state(
         "health": _health(sample.health),
         "points": _points(sample.scan.points),
     }
-    return json.dumps(_without_nan(found), separators=(",", ":"))
+    return json.dumps(without_nan(found), separators=(",", ":"))
 
 
 def rig_state(rig: Rig, *, may_command: bool, holds: bool) -> str:
@@ -152,17 +153,6 @@ def _health(health: Health) -> dict[str, Any]:
         "lasers": [asdict(part) for part in health.lasers],
         "outputs": [asdict(part) for part in health.outputs],
     }
-
-
-def _without_nan(value: Any) -> Any:
-    """Return the same with null in place of NaN, which JSON does not have."""
-    if isinstance(value, dict):
-        return {key: _without_nan(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_without_nan(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
 
 
 @dataclass(slots=True, eq=False)
