@@ -166,6 +166,8 @@ _TYPES = dict.fromkeys(_COUNTS, pa.int32()) | {
 }
 OF_DIVE, OF_NET = (POSTURE_CSV, POINTS_PARQUET), (NET_CSV, HOLES_CSV)
 """Files of a run that are tables of the data set: of its dive, and of its net."""
+NET_FACTS = ("area_m2", "bar_mm", "twine_mm", "solidity", "fouling", "largest_hole_mm")
+"""Numbers of a net's condition that are columns of `dives.parquet`, behind `net_`."""
 DIVES_SCHEMA = pa.schema(
     [
         *((name, pa.string()) for name in ("dive", "source", "rig", "rig_file", "state", "words")),
@@ -176,17 +178,7 @@ DIVES_SCHEMA = pa.schema(
         ),
         ("lasers", pa.string()),
         ("net_holes", pa.int64()),
-        *(
-            (name, pa.float64())
-            for name in (
-                "net_area_m2",
-                "net_bar_mm",
-                "net_twine_mm",
-                "net_solidity",
-                "net_fouling",
-                "net_largest_hole_mm",
-            )
-        ),
+        *((f"net_{name}", pa.float64()) for name in NET_FACTS),
     ]
 )
 """Columns of `dives.parquet`; `state` is finished, incomplete or failed, `words` says why.

@@ -24,6 +24,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
+from aqualvs.batch.dataset import NET_FACTS
 from aqualvs.errors import OptionError, RigError, SourceError
 from aqualvs.recording import is_recording
 from aqualvs.results.folder import RUN_YAML
@@ -337,9 +338,6 @@ def _rig_of(source: Path, given: Path | None) -> Path | None:
     )
 
 
-_OF_NET = ("area_m2", "bar_mm", "twine_mm", "solidity", "fouling", "largest_hole_mm")
-
-
 class DiveState(StrEnum):
     """Status of a dive; the value is that of `state` in `dives.parquet`."""
 
@@ -431,5 +429,5 @@ class DiveRecord:
             **{name: self.facts.get(name) for name in kept},
             **{name: self.summary.get(name) for name in ranges},
             "net_holes": self.net.get("n_holes"),
-            **{f"net_{name}": self.net.get(name) for name in _OF_NET},
+            **{f"net_{name}": self.net.get(name) for name in NET_FACTS},
         }

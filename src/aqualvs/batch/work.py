@@ -133,26 +133,24 @@ def probe(work: DiveWork) -> DiveProbe:
     Raises `AqualvsError` if the dive or its rig cannot be used.
     """
     with open_dive(work.request) as dive:
-        found = DiveProbe(
-            source_key="",
-            result_key=result_key(dive),
-            spans=(),
-            why_whole="",
-            n_bytes=0,
-            n_frames=dive.source.n_frames,
-            source=source_dict(dive.source),
-        )
+        key = result_key(dive)
         margin = REACH if dive.rig.shutter.needs_neighbours else 0
         stat = _stat_key(Path(work.request.source))
         stat |= {"frames": work.piece_frames, "margin": margin}
         content = read_valid_manifest(work.home / _MEMORY, digest(stat)) or _remember(
             work, stat, _content(dive, work.piece_frames, margin)
         )
-    spans = tuple(Span(**{**span, "kind": SpanKind(span["kind"])}) for span in content["spans"])
-    found = replace(
-        found, source_key=content["source_key"], spans=spans, n_bytes=content["n_bytes"]
-    )
-    why = content["why_whole"]
+        spans = [Span(**{**span, "kind": SpanKind(span["kind"])}) for span in content["spans"]]
+        found = DiveProbe(
+            source_key=content["source_key"],
+            result_key=key,
+            spans=tuple(spans),
+            why_whole=content["why_whole"],
+            n_bytes=content["n_bytes"],
+            n_frames=dive.source.n_frames,
+            source=source_dict(dive.source),
+        )
+    why = found.why_whole
     if work.request.index_target is not None:
         why = "the water is followed from frame to frame"
     return found.in_one_piece(why) if why or not spans else found
