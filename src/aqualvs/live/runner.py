@@ -407,15 +407,9 @@ class LiveRunner:
         if frame.field == shutter.first_field:
             # It waited for the second field, with which it came.
             age_ns = round(1e9 * shutter.readout)
-        return self._sample(
-            scanner.rig,
-            scan,
-            peaks,
-            frame,
-            arrival.utc_ns - age_ns,
-            Instants(arrival.arrived_ns - age_ns, taken_ns, time.monotonic_ns()),
-            scan.time_s,
-        )
+        utc_ns = arrival.utc_ns - age_ns
+        instants = Instants(arrival.arrived_ns - age_ns, taken_ns, time.monotonic_ns())
+        return self._sample(scanner.rig, scan, peaks, frame, utc_ns, instants, scan.time_s)
 
     def _scan(
         self, scanner: Scanner, arrival: Arrival
@@ -429,22 +423,20 @@ class LiveRunner:
             refusal = Refusal(
                 Reason.WRONG_SIZE, f"{what} of {width}x{height} px, but the rig has {need} px"
             )
-            return {}, Scan(frame.index, frame.time_s, refusal, ScanPoints.none(), rig.n_water)
-        still_s = self._still_s(frame)
-        if still_s > 0.0:
+        elif (still_s := self._still_s(frame)) > 0.0:
             refusal = Refusal(Reason.FROZEN, f"the same picture for {still_s:.1f} s", still_s)
-            return {}, Scan(frame.index, frame.time_s, refusal, ScanPoints.none(), rig.n_water)
-        try:
-            peaks = scanner.detect(frame)
-            scan = scanner.measure(frame.index, frame.time_s, peaks)
-            return peaks, self._at_middle(scan, rig, arrival.arrived_ns)
-        except Exception as fault:
-            # One bad frame must not end a dive.
-            if str(fault) != self._trouble:
-                _log.exception("frame %d could not be measured", frame.index)
-                self._trouble = str(fault)
-            refusal = Refusal(Reason.CORRUPT_FRAME, f"could not be measured: {fault}")
-            return {}, Scan(frame.index, frame.time_s, refusal, ScanPoints.none(), rig.n_water)
+        else:
+            try:
+                peaks = scanner.detect(frame)
+                scan = scanner.measure(frame.index, frame.time_s, peaks)
+                return peaks, self._at_middle(scan, rig, arrival.arrived_ns)
+            except Exception as fault:
+                # One bad frame must not end a dive.
+                if str(fault) != self._trouble:
+                    _log.exception("frame %d could not be measured", frame.index)
+                    self._trouble = str(fault)
+                refusal = Refusal(Reason.CORRUPT_FRAME, f"could not be measured: {fault}")
+        return {}, Scan(frame.index, frame.time_s, refusal, ScanPoints.none(), rig.n_water)
 
     def _still_s(self, frame: Frame) -> float:
         """Return how long the picture has been the same; fields are compared with their like."""

@@ -248,7 +248,8 @@ class PeerTable:
         except self._errors:
             _reset(parser)
             return []
-        messages = [message for message in found if _is_valid(message)]
+        invalid = ("BAD_DATA", "UNKNOWN")
+        messages = [message for message in found if not message.get_type().startswith(invalid)]
         if messages or not whole:
             self._remember(peer, parser)
         return messages
@@ -261,7 +262,9 @@ class PeerTable:
         system: int = message.get_srcSystem()
         kind = message.get_type()
         with self._lock:
-            if kind == "HEARTBEAT" and self._may_bind(system, message):
+            is_beat = kind == "HEARTBEAT"
+            # Where the vehicle is, its autopilot alone says.
+            if is_beat and (system != self._system or message.autopilot != _NO_AUTOPILOT):
                 self._bind(peer, system, message)
             home = self._homes.get(system)
         if kind == "MANUAL_CONTROL" and system != self._system:
@@ -269,10 +272,6 @@ class PeerTable:
         if home is None:
             return system != self._system
         return home.peer == peer
-
-    def _may_bind(self, system: int, message: Any) -> bool:
-        """Return whether a heartbeat says where a system is; the vehicle's autopilot alone does."""
-        return system != self._system or bool(message.autopilot != _NO_AUTOPILOT)
 
     def _bind(self, peer: Peer, system: int, message: Any) -> None:
         now_s = time.monotonic()
@@ -327,11 +326,6 @@ def _reset(parser: Any) -> None:
     """Let a parser begin a new message."""
     # The parser computes the length of a message again as soon as it has three bytes.
     parser.buf, parser.buf_index = bytearray(), 0
-
-
-def _is_valid(message: Any) -> bool:
-    kind = message.get_type()
-    return kind != "BAD_DATA" and not kind.startswith("UNKNOWN")
 
 
 def _claim(message: Any) -> _Claim:

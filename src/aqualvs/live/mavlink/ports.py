@@ -280,15 +280,11 @@ class UdpPort(Port):
                 raise
         return b"", ()
 
-    def write(self, frames: bytes, peer: Peer, /) -> bool:
-        """Send a datagram to one peer; return whether it was sent."""
-        return self.sent(frames, peer)
-
     def write_all(self, frames: bytes, _heard: Sequence[Peer], /) -> bool:
         """Send to the port's own address."""
-        return self.sent(frames, self._where)
+        return self.write(frames, self._where)
 
-    def sent(self, frames: bytes, where: Peer) -> bool:
+    def write(self, frames: bytes, where: Peer, /) -> bool:
         """Send a datagram to an address, or to the connected peer if that is empty."""
         # A refusal belongs to an earlier datagram; this one has not been tried yet.
         for _ in range(2):
@@ -364,7 +360,7 @@ class _UdpListener(UdpPort):
     def write(self, frames: bytes, peer: Peer, /) -> bool:
         """Send to one peer; one that cannot be reached must not keep it from the others."""
         try:
-            return self.sent(frames, peer)
+            return super().write(frames, peer)
         except OSError:
             return False
 

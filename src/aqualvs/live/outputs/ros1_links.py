@@ -113,9 +113,14 @@ def to_ros1(message: Message, seq: int) -> bytes:
     """
     match message:
         case PoseMessage():
-            return _pose(message, seq)
+            numbers = (*message.position, *message.quaternion, *message.covariance)
+            content = struct.pack("<43d", *numbers)
+            return _header(seq, message.stamp_ns, message.frame_id) + content
         case RangeMessage():
-            return _range(message, seq)
+            infrared, view = 1, message.field_of_view
+            ranges = message.min_range, message.max_range, message.range
+            content = struct.pack("<B4f", infrared, view, *ranges)
+            return _header(seq, message.stamp_ns, message.frame_id) + content
         case CloudMessage():
             return _cloud(message, seq)
         case DiagnosticsMessage():
@@ -131,18 +136,6 @@ def text(value: str) -> bytes:
 def _header(seq: int, stamp_ns: int, frame_id: str) -> bytes:
     secs, nsecs = divmod(stamp_ns, 10**9)
     return struct.pack("<III", seq & 0xFFFFFFFF, secs, nsecs) + text(frame_id)
-
-
-def _pose(message: PoseMessage, seq: int) -> bytes:
-    numbers = (*message.position, *message.quaternion, *message.covariance)
-    return _header(seq, message.stamp_ns, message.frame_id) + struct.pack("<43d", *numbers)
-
-
-def _range(message: RangeMessage, seq: int) -> bytes:
-    infrared = 1
-    return _header(seq, message.stamp_ns, message.frame_id) + struct.pack(
-        "<B4f", infrared, message.field_of_view, message.min_range, message.max_range, message.range
-    )
 
 
 _FIELDS = struct.pack("<I", len(POINT_FIELDS)) + b"".join(

@@ -75,7 +75,9 @@ def json_fields(sample: LiveSample) -> dict[str, Value]:
     fields["n_water"] = _fixed(scan.n_water, 6)
     fields |= _filtered_fields(sample.filtered)
     fields["rate_hz"] = _fixed(sample.health.rate_hz, 3)
-    fields["delay_s"] = _delay_s(sample)
+    # From the decoded frame to its posture.
+    delay_s = 1e-9 * (sample.instants.scanned_ns - sample.instants.arrived_ns)
+    fields["delay_s"] = None if sample.frame is None else _fixed(delay_s, 6)
     fields["state"] = sample.health.state.value
     return fields
 
@@ -107,13 +109,6 @@ def _filtered_fields(filtered: FilteredPosture | None) -> dict[str, Value]:
             strict=True,
         )
     )
-
-
-def _delay_s(sample: LiveSample) -> Value:
-    """Return the time from the decoded frame to its posture, None where there is no frame."""
-    if sample.frame is None:
-        return None
-    return _fixed(1e-9 * (sample.instants.scanned_ns - sample.instants.arrived_ns), 6)
 
 
 def _sigmas(covariance: FloatArray) -> list[Value]:
@@ -199,7 +194,7 @@ class _Receiver:
         """Send a line or drop it."""
         try:
             port = self._opened()
-            sent = port is not None and port.sent(line, ())
+            sent = port is not None and port.write(line, ())
         except OSError as fault:
             self._trouble = fault.strerror or str(fault)
             self._drop_port()
