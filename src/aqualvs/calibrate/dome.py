@@ -160,7 +160,13 @@ def run_dome(request: DomeRequest, echo: Echo) -> None:
         water_pictures=picture_paths(request.water_images) if request.water_images else (),
         water_board=request.water_board,
         water_poses=request.water_poses,
-        options=_options(request),
+        options=DomeOptions(
+            inner_radius_sigma=request.radius_tolerance_mm / 1e3,
+            thickness_sigma=request.thickness_tolerance_mm / 1e3,
+            n_acrylic_sigma=request.acrylic_tolerance,
+            distance_sigma=request.distance_sigma_mm / 1e3,
+            refine_intrinsics=request.refine_intrinsics,
+        ),
     )
     for line in summary(done):
         echo(line)
@@ -194,16 +200,6 @@ def _with_housing(rig: Rig, request: DomeRequest) -> Rig:
     for name, value in wanted.items():
         now[name] = value if name == index else value / 1e3
     return replace(rig, housing=type(old)(*now.values()))
-
-
-def _options(request: DomeRequest) -> DomeOptions:
-    return DomeOptions(
-        inner_radius_sigma=request.radius_tolerance_mm / 1e3,
-        thickness_sigma=request.thickness_tolerance_mm / 1e3,
-        n_acrylic_sigma=request.acrylic_tolerance,
-        distance_sigma=request.distance_sigma_mm / 1e3,
-        refine_intrinsics=request.refine_intrinsics,
-    )
 
 
 def _board_set(

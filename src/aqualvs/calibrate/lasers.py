@@ -223,9 +223,8 @@ def run_lasers(request: LasersRequest, echo: Echo) -> None:
         echo(f"note: {warning}")
     for figures, laser in zip(done.solution.lasers, done.rig.lasers, strict=True):
         echo(_words(figures, laser))
-    finish(
-        done.rig, _page(before, done, request), request.out, "lasers", echo, comments_of=request.rig
-    )
+    page = _page(before, done, request)
+    finish(done.rig, page, request.out, "lasers", echo, comments_of=request.rig)
 
 
 def _known(rig: Rig, *, refine: bool, elsewhere: bool) -> RigUncertainty:

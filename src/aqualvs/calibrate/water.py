@@ -129,7 +129,8 @@ def run_water(request: WaterRequest, echo: Echo) -> None:
     """
     check_rig_place(request.out)
     rig = load_rig(request.rig, need_lasers=False)
-    prior = _prior(request, rig)
+    water = Water(temperature_c=request.temperature_c, salinity=request.salinity).seawater
+    prior = None if water is None else IndexPrior.seawater(*water, n_air=rig.n_air)
     with _source(request) as source:
         done = calibrate_water(
             source,
@@ -142,14 +143,8 @@ def run_water(request: WaterRequest, echo: Echo) -> None:
     echo(f"index {result.n:.5f} ± {result.sigma:.5f} from {len(result.readings)} pictures")
     for line in done.notes:
         echo(line)
-    finish(
-        done.rig,
-        _page(done.rig, result, prior, request),
-        request.out,
-        "water",
-        echo,
-        comments_of=request.rig,
-    )
+    page = _page(done.rig, result, prior, request)
+    finish(done.rig, page, request.out, "water", echo, comments_of=request.rig)
 
 
 def _found_in(
@@ -184,11 +179,6 @@ def _check(result: WaterCalibration) -> None:
             f"{' '.join(result.remarks) or 'the lens is too near the centre of the dome'}; or give "
             "--temperature-c and --salinity"
         )
-
-
-def _prior(request: WaterRequest, rig: Rig) -> IndexPrior | None:
-    seawater = Water(temperature_c=request.temperature_c, salinity=request.salinity).seawater
-    return None if seawater is None else IndexPrior.seawater(*seawater, n_air=rig.n_air)
 
 
 def _source(request: WaterRequest) -> FrameSource:

@@ -114,14 +114,11 @@ def camera_text(camera: ForeignCamera, to: str, *, suffix: str = "") -> str:
     RigError
         If the format cannot hold the camera.
     """
-    if to == "ros":
-        return ros_text(camera)
+    writers = {"ros": ros_text, "kalibr": kalibr_text, "mrcal": mrcal_text}
+    if to in writers:
+        return writers[to](camera)
     if to == "opencv":
         return opencv_text(camera, suffix)
-    if to == "kalibr":
-        return kalibr_text(camera)
-    if to == "mrcal":
-        return mrcal_text(camera)
     if to in EXPORTS:
         return colmap_text(camera, refractive=to == "colmap-underwater")
     raise RigError(f"{to!r} is no format; use one of {', '.join(EXPORTS)}")

@@ -369,7 +369,11 @@ def calibration_pictures(laboratory: Laboratory) -> CalibrationFiles:
         files = simulate_calibration(
             laboratory.rig, folder, size=_SIZE, progress=laboratory.rendered
         )
-        _note_files(files, folder)
+        noted = {
+            name: str(value.relative_to(folder)) if isinstance(value, Path) else value
+            for name, value in asdict(files).items()
+        }
+        (folder / _RIG_READY).write_text(json.dumps(noted), encoding="utf-8")
     return _noted_files(folder)
 
 
@@ -391,14 +395,6 @@ def rig_without_lasers(laboratory: Laboratory) -> Rig:
     calibrated_rig(laboratory)
     draft = laboratory.folder("calibration") / _DRAFT
     return load_rig(draft, need_lasers=False).in_water(laboratory.rig.n_water)
-
-
-def _note_files(files: CalibrationFiles, folder: Path) -> None:
-    noted = {
-        name: str(value.relative_to(folder)) if isinstance(value, Path) else value
-        for name, value in asdict(files).items()
-    }
-    (folder / _RIG_READY).write_text(json.dumps(noted), encoding="utf-8")
 
 
 def _noted_files(folder: Path) -> CalibrationFiles:

@@ -206,7 +206,7 @@ def _run_sea(laboratory: Laboratory) -> ExperimentResult:
     errors[:, 0] *= 100.0 / truth[valid, 0]
     rms = np.sqrt(np.mean(errors**2, axis=0))
     share = 100.0 * float(valid.mean())
-    depth = log.column("depth")
+    depth, heading = log.column("depth"), np.unwrap(log.column("heading"))
     return ExperimentResult(
         sentence=f"Sinking from {depth[0]:.1f} to {depth[-1]:.1f} m along a net that moves, range "
         f"is told within {rms[0]:.2f} % and yaw within {rms[2]:.2f} degrees (rms) in {share:.0f} % "
@@ -230,7 +230,7 @@ def _run_sea(laboratory: Laboratory) -> ExperimentResult:
             ExperimentRow(
                 what="correlation of heading and target yaw",
                 paper="some",
-                ours=f"{_correlation(log):+.2f}",
+                ours=f"{np.corrcoef(heading, log.column('yaw'))[0, 1]:+.2f}",
             ),
         ),
         pictures=(
@@ -281,11 +281,6 @@ def _dive(laboratory: Laboratory) -> tuple[_Watched, LoopLog]:
     )
     loop = case.loop(sensor, _Descent(Setpoint(_SETUP.range)))
     return sensor, loop.run(_SETUP.seconds)
-
-
-def _correlation(log: LoopLog) -> float:
-    heading = np.unwrap(log.column("heading"))
-    return float(np.corrcoef(heading, log.column("yaw"))[0, 1])
 
 
 def _postures(sensor: _Watched) -> tuple[FloatArray, FloatArray]:

@@ -25,7 +25,6 @@ from aqualvs.simulation.dive import (
     write_hole_truth,
     write_vehicle_log,
 )
-from aqualvs.simulation.scenario import Scenario
 from aqualvs.simulation.scenarios import example_rig, list_scenarios, load_scenario
 from aqualvs.terminal import StopSignals, Tick, progress
 
@@ -77,8 +76,10 @@ def simulate(
     claim = Claim("simulate", [out / name for name in _FILES], overwrite=overwrite)
     video, truth = out / "dive.mp4", out / "truth.csv"
     with claim, writing(out), StopSignals() as stop, progress(scenario, course.n_frames) as tick:
-        _write_net_truth(course, out)
         out.mkdir(parents=True, exist_ok=True)
+        if course.nets:
+            write_vehicle_log(course, out / _LOG)
+            write_hole_truth(course, out / _HOLES)
         save_rig(with_exact_numbers(rig), out / "rig.yaml")
         stopped = None
         try:
@@ -117,14 +118,6 @@ def _stopping(
             raise _StoppedError(stop.caught.name, n_done, n_all, unit)
 
     return after
-
-
-def _write_net_truth(course: Scenario, out: Path) -> None:
-    """Write the vehicle's log and the true holes beside a dive along a net."""
-    if course.nets:
-        out.mkdir(parents=True, exist_ok=True)
-        write_vehicle_log(course, out / _LOG)
-        write_hole_truth(course, out / _HOLES)
 
 
 def _simulate_calibration(

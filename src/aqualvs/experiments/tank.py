@@ -200,10 +200,13 @@ def _run_distance(laboratory: Laboratory) -> ExperimentResult:
     true = laboratory.measure(dive)
     worst, worst_true = _largest(calibrated), _largest(true)
     valid = bool(calibrated.valid.all())
+    place = np.round(1e3 * calibrated.truth[:, 0])
+    spread = max(np.nanstd(calibrated.range_percent[place == p]) for p in np.unique(place))
+    *most, farthest = PLACES_MM
     return ExperimentResult(
-        sentence=f"At {_listed(PLACES_MM)} mm every distance is within {worst:.3f} % of the truth "
-        f"({worst_true:.3f} % with the rig known exactly), where the paper has "
-        f"{_DISTANCES.paper_percent} %.",
+        sentence=f"At {', '.join(map(str, most))} and {farthest} mm every distance is within "
+        f"{worst:.3f} % of the truth ({worst_true:.3f} % with the rig known exactly), where the "
+        f"paper has {_DISTANCES.paper_percent} %.",
         findings=(
             ExperimentRow.at_most(
                 "largest error of the distance, rig calibrated from pictures (%)",
@@ -216,9 +219,7 @@ def _run_distance(laboratory: Laboratory) -> ExperimentResult:
             ExperimentRow(
                 what="largest error of the distance, true rig (%)", ours=f"{worst_true:.3f}"
             ),
-            ExperimentRow(
-                what="spread between frames at one place (%)", ours=f"{_spread(calibrated):.4f}"
-            ),
+            ExperimentRow(what="spread between frames at one place (%)", ours=f"{spread:.4f}"),
             ExperimentRow(
                 what="frames with a posture",
                 ours=f"{np.count_nonzero(calibrated.valid)} of {len(calibrated.scans)}",
@@ -243,16 +244,6 @@ def _run_distance(laboratory: Laboratory) -> ExperimentResult:
 
 def _largest(measured: MeasuredDive) -> float:
     return float(np.nanmax(np.abs(measured.range_percent)))
-
-
-def _spread(measured: MeasuredDive) -> float:
-    """Return the largest standard deviation between the frames of one place."""
-    place = np.round(1e3 * measured.truth[:, 0])
-    return max(float(np.nanstd(measured.range_percent[place == p])) for p in np.unique(place))
-
-
-def _listed(values: tuple[int, ...]) -> str:
-    return ", ".join(map(str, values[:-1])) + f" and {values[-1]}"
 
 
 def _distance_series(calibrated: MeasuredDive, true: MeasuredDive) -> DataColumns:

@@ -182,14 +182,15 @@ def cruise(laboratory: Laboratory, waters: Sequence[float] = WATERS) -> Cruise:
     truly = targets.moved(plate, _out_of_place(plate))
     media = (rig.n_air, *waters)
     rng = np.random.default_rng(_SETUP.seed)
-    views, picture = [], np.zeros((1, 1, 3), np.uint8)
+    views: list[View] = []
+    picture = np.zeros((1, 1, 3), np.uint8)
     for i, n in enumerate(media):
         picture = PanelRenderer(rig.in_water(n).camera()).render(_scene(truly, i), rng)
         laboratory.rendered(i, len(media))
         found = _found(picture, markers, f"picture_{i}")
-        views += [
-            _seen_again(found, f"frame_{_SETUP.frames * i + k}", rng) for k in range(_SETUP.frames)
-        ]
+        for _ in range(_SETUP.frames):
+            noise = rng.normal(0.0, _SETUP.corner_px, found.pixels.shape)
+            views.append(replace(found, name=f"frame_{len(views)}", pixels=found.pixels + noise))
     return Cruise(views, np.repeat(media, _SETUP.frames), picture)
 
 
@@ -222,11 +223,6 @@ def _found(picture: NDArray[np.uint8], markers: MarkerSet, name: str) -> View:
     if isinstance(view, str):
         raise CalibrationError(f"{name}: {view}")
     return view
-
-
-def _seen_again(view: View, name: str, rng: np.random.Generator) -> View:
-    noise = rng.normal(0.0, _SETUP.corner_px, view.pixels.shape)
-    return replace(view, name=name, pixels=view.pixels + noise)
 
 
 def follow(rig: Rig, taken: Cruise) -> tuple[Numbers, list[IndexStep]]:

@@ -171,22 +171,17 @@ class RunWatch:
         if now_s - self._told_s >= tell_every_s:
             self._told_s = now_s
             self._tell(f"simulated {now_s:.0f} of {self._seconds:g} s")
-        if not self._loop.steering.engaged:
-            self._tell(f"at {now_s:.1f} s: {self._last_text()}; here a pilot takes over")
+        steering, rows = self._loop.steering, self._loop.log.rows
+        if not steering.engaged:
+            reason = steering.gate.latched
+            words = "disengaged" if reason is None else reason.words
+            self._tell(f"at {now_s:.1f} s: {words}; here a pilot takes over")
             return False
-        if self._over_s == math.inf and self._is_over():
+        if self._over_s == math.inf and rows and rows[-1].stage == Stage.OVER.value:
             self._over_s = now_s
             self._tell(f"at {now_s:.1f} s: {LimitReason.MISSION_OVER.words}")
         stopped = self._stop.caught is not None and now_s >= min_s
         return not stopped and now_s < self._over_s + holds_on_s
-
-    def _is_over(self) -> bool:
-        rows = self._loop.log.rows
-        return bool(rows) and rows[-1].stage == Stage.OVER.value
-
-    def _last_text(self) -> str:
-        reason = self._loop.steering.gate.latched
-        return "disengaged" if reason is None else reason.words
 
 
 FOLLOW_CSV, TRUTH_CSV = "follow.csv", "truth.csv"

@@ -277,23 +277,20 @@ def step_measures(
 
 def safety_measures(log: LoopLog) -> SafetyMeasures:
     """Return the safety measures of a whole run."""
+    seen_s = _last_seen_s(log)
+    lost = log.rows[-1].time_s - seen_s > LOST_AFTER_S
     return SafetyMeasures(
         min_clearance=float(log.column("clearance").min()),
         n_blind=log.n_blind,
         neutral_late=max(log.blind_thrust_s, default=0.0),
         stable=_is_stable(log),
-        lost_s=_lost_s(log),
+        lost_s=seen_s if lost else math.inf,
         greatest_tilt=float(log.column("tilt").max()),
     )
 
 
-def _lost_s(log: LoopLog) -> float:
-    """Return when the last valid posture was exposed, if more than that is missing at the end."""
-    last_s = _last_seen_s(log)
-    return last_s if log.rows[-1].time_s - last_s > LOST_AFTER_S else math.inf
-
-
 def _last_seen_s(log: LoopLog) -> float:
+    """Return when the last valid posture was exposed."""
     seen = np.flatnonzero(np.isfinite(log.column("measured_range")))
     return float(log.column("time_s")[seen[-1]]) if len(seen) else 0.0
 

@@ -13,7 +13,7 @@ import numpy as np
 from aqualvs.control.controller import RangeYawController
 from aqualvs.control.gains import ControlGains
 from aqualvs.control.gains_file import gains_text, save_gains
-from aqualvs.control.tune import Margins, Tuned, TuneOptions, shaping_of_model, tune
+from aqualvs.control.tune import Tuned, TuneOptions, shaping_of_model, tune
 from aqualvs.control.vehicle import Setpoint
 from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import FloatArray
@@ -147,7 +147,9 @@ def report(model: VehicleModel, tuned: Tuned, options: TuneOptions) -> list[str]
         ("yaw", most, "worst", tuned.yaw_late),
     )
     lines += [
-        f"  {axis:5} {1e3 * delay:4.0f} ms, {which:9}  {_row(one)}"
+        f"  {axis:5} {1e3 * delay:4.0f} ms, {which:9}  {one.crossover:5.2f} rad/s  "
+        f"{math.degrees(one.phase):4.0f}°  {one.gain:5.2f}  {1e3 * one.delay:4.0f} ms  "
+        f"{one.modulus:.2f}"
         for axis, delay, which, one in rows
     ]
     for delay in (usual, most):
@@ -158,10 +160,3 @@ def report(model: VehicleModel, tuned: Tuned, options: TuneOptions) -> list[str]
             f"overshoot {100.0 * answer.overshoot:.1f} %, within 5 % after {answer.settling:.1f} s"
         )
     return lines
-
-
-def _row(one: Margins) -> str:
-    return (
-        f"{one.crossover:5.2f} rad/s  {math.degrees(one.phase):4.0f}°  {one.gain:5.2f}  "
-        f"{1e3 * one.delay:4.0f} ms  {one.modulus:.2f}"
-    )

@@ -33,8 +33,11 @@ _TITLES = {
 
 def summary_lines(result: Comparison) -> list[str]:
     """Return the whole comparison in lines."""
-    lines = [_span_line(result)]
-    wall = result.wall
+    first, last, wall = result.dates[0], result.dates[-1], result.wall
+    lines = [
+        f"{len(result.surveys)} dives on {len(result.dates)} dates, {first} to {last} "
+        f"({(last - first).days} days)"
+    ]
     if wall is None:
         lines += [_whole_line(result), _hole_counts(result)]
     else:
@@ -89,14 +92,6 @@ def size_text(site: Site) -> str:
     sizes = [f"{1e3 * size:.0f}" for size in last]
     sigma = 1e3 * float(site.sigma_sizes[known][-1])
     return f"{' -> '.join(sizes)} mm (± {sigma:.0f} mm)"
-
-
-def _span_line(result: Comparison) -> str:
-    days = (result.dates[-1] - result.dates[0]).days
-    return (
-        f"{len(result.surveys)} dives on {len(result.dates)} dates, {result.dates[0]} to "
-        f"{result.dates[-1]} ({days} days)"
-    )
 
 
 def _whole_line(result: Comparison) -> str:

@@ -50,7 +50,9 @@ def _figure(shot: PictureShot, index: int, count: int) -> str:
     for layer, overlay in enumerate(shot.points):
         name = f"marks-{index}-{layer}"
         body.append(_marks(overlay, name, scale, width / 640.0, limit))
-    picture = draw.svg(width, height, body, alt=_alt(shot), kind="picture")
+    shown = ", ".join(overlay.label for overlay in shot.points if overlay.label)
+    alt = f"{shot.caption}; drawn over it: {shown}" if shown else shot.caption
+    picture = draw.svg(width, height, body, alt=alt, kind="picture")
     return (
         f"<figure>{picture}<figcaption>{escape(shot.caption)}</figcaption>"
         f"{_legend(shot.points)}</figure>"
@@ -108,11 +110,6 @@ def _path(places: FloatArray, kind: MarkKind, size: float) -> str:
         shape = (-size, 0.0, f"a{s} {s} 0 1 0 {d} 0a{s} {s} 0 1 0 -{d} 0")
     dx, dy, rest = shape
     return "".join(f"M{draw.num(x + dx)} {draw.num(y + dy)}{rest}" for x, y in places.tolist())
-
-
-def _alt(shot: PictureShot) -> str:
-    shown = ", ".join(overlay.label for overlay in shot.points if overlay.label)
-    return f"{shot.caption}; drawn over it: {shown}" if shown else shot.caption
 
 
 def _legend(points: Sequence[Overlay]) -> str:

@@ -18,12 +18,15 @@ def headline(track: Track) -> list[Card]:
     """Return the numbers at the top of the report."""
     share = float(track.valid.mean())
     valid = f"{int(track.valid.sum())} of {len(track)} frames"
+    seconds, rate = duration_s(track), f"{len(track)} frames"
+    if len(track) > 1 and seconds > 0.0:
+        rate += f", {(len(track) - 1) / seconds:.3g} per second"
     cards = [
         _posture_card("Range", "mm", 0, track, scale=1e3, digits=1),
         _posture_card("Pitch", "°", 1, track, scale=1.0, digits=2),
         _posture_card("Yaw", "°", 2, track, scale=1.0, digits=2),
         Card("Frames with a posture", f"{100 * share:.1f} %", valid),
-        Card("Duration", clock(duration_s(track)), _rate_text(track)),
+        Card("Duration", clock(seconds), rate),
     ]
     water = track.n_water[np.isfinite(track.n_water)]
     if len(water):
@@ -94,12 +97,6 @@ def _posture_card(
         note += f"{np.median(total):.{digits}f}{gap}{unit} with the rig's uncertainty"
     value = f"{np.median(values):{sign}.{digits}f}{gap}{unit}"
     return Card(name, signed(value), signed(f"median; {note}"))
-
-
-def _rate_text(track: Track) -> str:
-    if len(track) < 2 or not duration_s(track) > 0.0:
-        return f"{len(track)} frames"
-    return f"{len(track)} frames, {(len(track) - 1) / duration_s(track):.3g} per second"
 
 
 def _status_warnings(run: Mapping[str, Any], track: Track) -> Iterator[str]:

@@ -12,7 +12,6 @@ import av
 import cv2
 import numpy as np
 from av.container import InputContainer
-from av.video.frame import VideoFrame
 
 from aqualvs.geometry.arrays import IntArray
 from aqualvs.optics.shutter import FIRST_ROW
@@ -224,7 +223,8 @@ def _from_video(source: Path, track: Track, rows: list[int]) -> dict[int, ImageP
         for row in rows:
             wanted = start + _picture_of(track, row)[1]
             _seek(container, wanted)
-            found = _frame_at(container, wanted - half)
+            decoded = (one for one in container.decode(video=0) if one.time is not None)
+            found = next((one for one in decoded if one.time >= wanted - half), None)
             if found is not None and abs((found.time or 0.0) - wanted) <= 2.0 * half:
                 image = np.asarray(found.to_ndarray(format="bgr24"), dtype=np.uint8)
                 pictures[row] = _shown(image, track, row)
@@ -270,13 +270,6 @@ def _seek(container: InputContainer, time_s: float) -> None:
     stream = container.streams.video[0]
     base = stream.time_base or Fraction(1, 90_000)
     container.seek(round(time_s / base), stream=stream, backward=True)
-
-
-def _frame_at(container: InputContainer, earliest: float) -> VideoFrame | None:
-    for frame in container.decode(video=0):
-        if frame.time is not None and frame.time >= earliest:
-            return frame
-    return None
 
 
 def _step_s(track: Track) -> float:

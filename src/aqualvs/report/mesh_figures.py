@@ -194,7 +194,9 @@ def _binary_image(r: Reflections, options: MeshFilterOptions) -> Figure:
     cells = np.unique(image.cells, axis=0)
     centres = corner + dd * (cells + 0.5)
     left.scatter(centres[:, 0], centres[:, 1], s=1.2, marker="s", color=DARK, linewidths=0)
-    _plane_axes(left, *_square(*_span(centres, 0.06)))
+    low, high = _span(centres, 0.06)
+    half, middle = 0.5 * np.max(high - low), 0.5 * (low + high)
+    _plane_axes(left, middle - half, middle + half)
     columns, rows = image.lit.shape
     left.set_title(f"(a) Im: {columns} x {rows} cells of {dd:.3g} mm, {len(cells)} lit")
     middle = _typical(r, corner, dd)
@@ -203,12 +205,6 @@ def _binary_image(r: Reflections, options: MeshFilterOptions) -> Figure:
     _cells(right, image.lit, corner, dd, middle, reach)
     _rings(right, options, middle, cells, corner)
     return figure
-
-
-def _square(low: FloatArray, high: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return a square window about a window."""
-    half, middle = 0.5 * np.max(high - low), 0.5 * (low + high)
-    return middle - half, middle + half
 
 
 def _cells(
@@ -480,7 +476,8 @@ def _read(
 ) -> Reflections:
     plane = Plane(laser.normal, laser.offset)
     near, far = working_range_m(run["rig"]) or (0.0, np.inf)
-    every_pixel = _every_pixel(run)
+    detector = ((run.get("options") or {}).get("scanner") or {}).get("detector") or {}
+    every_pixel = detector.get("kind") == "threshold"
     table = parquet.read_table(
         points.absolute(),
         columns=list(_PIXEL_COLUMNS if every_pixel else _COLUMNS),
@@ -504,11 +501,6 @@ def _read(
         paper=judged.paper,
         every_pixel=every_pixel,
     )
-
-
-def _every_pixel(run: Mapping[str, Any]) -> bool:
-    detector = ((run.get("options") or {}).get("scanner") or {}).get("detector") or {}
-    return bool(detector.get("kind") == "threshold")
 
 
 def _pixels(table: Any, laser: int, run: Mapping[str, Any], options: MeshFilterOptions) -> _Judged:

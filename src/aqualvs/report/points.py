@@ -251,17 +251,10 @@ def _keep_samples(
             np.stack([axis[mine] for axis in xyz], axis=-1),
         )
         old = summary.samples.get(sample)
-        summary.samples[sample] = new if old is None else _joined(old, new)
-
-
-def _joined(first: FramePoints, second: FramePoints) -> FramePoints:
-    return FramePoints(
-        np.concatenate([first.laser, second.laser]),
-        np.concatenate([first.label, second.label]),
-        np.concatenate([first.used, second.used]),
-        np.concatenate([first.pixels, second.pixels]),
-        np.concatenate([first.points_in_dome, second.points_in_dome]),
-    )
+        if old is not None:
+            names = new.__dataclass_fields__
+            new = FramePoints(*(np.concatenate([getattr(p, n) for p in (old, new)]) for n in names))
+        summary.samples[sample] = new
 
 
 def _count(histogram: IntArray, edges: FloatArray, laser: IntArray, values: FloatArray) -> None:

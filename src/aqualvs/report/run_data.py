@@ -23,25 +23,12 @@ from aqualvs.results.folder import POSTURE_BARE_CSV
 from aqualvs.results.run_request import read_run_yaml
 from aqualvs.results.summary import read_truth as truth_by_frame
 
-_NUMBERS = (
-    "frame",
-    "time_s",
-    "range_m",
-    "pitch_deg",
-    "yaw_deg",
-    "sigma_range_m",
-    "sigma_pitch_deg",
-    "sigma_yaw_deg",
-    "sigma_range_total_m",
-    "sigma_pitch_total_deg",
-    "sigma_yaw_total_deg",
-    "n_points",
-    "n_water",
-)
-_TOTALS = tuple(name for name in _NUMBERS if "_total_" in name)
-_TRUE = ("true", "1", "yes")
 POSTURE = ("range_m", "pitch_deg", "yaw_deg")
 """The three columns of a posture, in the order of every (N, 3) array of the report."""
+_SIGMAS = tuple(f"sigma_{name}" for name in POSTURE)
+_TOTALS = ("sigma_range_total_m", "sigma_pitch_total_deg", "sigma_yaw_total_deg")
+_NUMBERS = ("frame", "time_s", *POSTURE, *_SIGMAS, *_TOTALS, "n_points", "n_water")
+_TRUE = ("true", "1", "yes")
 
 
 class NoFrameError(SourceError):
@@ -97,7 +84,7 @@ def read_track(path: Path) -> Track:
     columns, texts = _read_columns(path, _NUMBERS, ("valid", "reason", "field"))
     order = np.argsort(columns["frame"], kind="stable")
     posture = np.stack([columns[name] for name in POSTURE], axis=-1)[order]
-    sigma = np.stack([columns[f"sigma_{name}"] for name in POSTURE], axis=-1)[order]
+    sigma = np.stack([columns[name] for name in _SIGMAS], axis=-1)[order]
     total = np.stack([columns[name] for name in _TOTALS], axis=-1)[order]
     total = np.where(np.isfinite(total), total, sigma)
     words, (reasons, reason) = texts["valid"], texts["reason"]

@@ -416,7 +416,15 @@ def _laser_rows(lasers: list[LaserFacts], centre: str) -> str:
     if not lasers:
         return ""
     head = ("laser", "normal x", "normal y", "normal z", f"offset from the {centre}, mm")
-    return html.table(head, [_laser_row(i, laser) for i, laser in enumerate(lasers)])
+    rows = []
+    for index, laser in enumerate(lasers):
+        bent = " (bent sheet; the plane that fits it)" if laser.bent else ""
+        cells = ["–"] * 4
+        if np.isfinite(laser.offset):
+            cells = [signed(f"{v:+.5f}") for v in laser.normal]
+            cells.append(signed(f"{1e3 * laser.offset:.2f}"))
+        rows.append((html.Raw(html.swatch(index) + escape(laser.name + bent)), *cells))
+    return html.table(head, rows)
 
 
 def _fact_blocks(run: Mapping[str, Any]) -> list[tuple[str, html.Raw]]:
@@ -453,14 +461,6 @@ def _both_errors(housed: FloatArray, bare: FloatArray, truth: FloatArray, housin
         if count:
             rows.append((name, f"{1e3 * rms[0]:.2f} mm", f"{1e3 * worst[0]:.2f} mm", f"{count}"))
     return html.table(("range error against truth", "rms", "max", "frames"), rows)
-
-
-def _laser_row(index: int, laser: LaserFacts) -> tuple[str, ...]:
-    bent = " (bent sheet; the plane that fits it)" if laser.bent else ""
-    name = html.Raw(html.swatch(index) + escape(laser.name + bent))
-    if not np.isfinite(laser.offset):
-        return name, "–", "–", "–", "–"
-    return name, *(signed(f"{v:+.5f}") for v in laser.normal), signed(f"{1e3 * laser.offset:.2f}")
 
 
 def _footer(run: Mapping[str, Any], track: Track) -> str:

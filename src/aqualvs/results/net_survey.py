@@ -1,6 +1,6 @@
 """The net's condition over a dive: evaluation scan by scan, its files, and scans of a stored run.
 
-`NetPass` takes scans one by one and writes the files. `stored_scans` reads the scans of a run back
+`NetPass` takes scans one by one and writes the files. `read_run` reads the scans of a run back
 from `posture.csv` and its points.
 
 Modules that evaluate and draw are imported where they are used, because every run imports this
@@ -241,7 +241,9 @@ def _posture_rows(path: Path) -> Iterator[dict[str, str]]:
 
 def _posture(row: dict[str, str]) -> Posture | Refusal:
     if row["valid"] != "1":
-        return Refusal(_reason(row["reason"]))
+        # A reason that this version does not know is no target.
+        known = row["reason"] in set(Reason)
+        return Refusal(Reason(row["reason"]) if known else Reason.NO_TARGET)
     pitch, yaw = math.radians(float(row["pitch_deg"])), math.radians(float(row["yaw_deg"]))
     normal = np.array([math.tan(yaw), 1.0, math.tan(pitch)])
     return Posture(
@@ -277,11 +279,6 @@ def _pair(row: dict[str, str], name: str) -> tuple[float, float] | None:
 
 def _number(text: str | None) -> float:
     return float(text) if text else math.nan
-
-
-def _reason(text: str) -> Reason:
-    """Return the reason of a refusal; one that this version does not know is no target."""
-    return Reason(text) if text in set(Reason) else Reason.NO_TARGET
 
 
 class _Points:

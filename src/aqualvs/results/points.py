@@ -375,10 +375,5 @@ def _ply_header(n_vertices: int) -> bytes:
     return ("\n".join(lines) + "\n").encode("ascii")
 
 
-def _laser_rgb() -> NDArray[np.uint8]:
-    """Return red, green, blue of every laser that an int8 can number, shape (128, 3)."""
-    n_lasers = 128
-    return np.array([bgr(laser_colour(i))[::-1] for i in range(n_lasers)], np.uint8)
-
-
-_LASER_RGB = _laser_rgb()
+_LASER_RGB = np.array([bgr(laser_colour(i))[::-1] for i in range(128)], np.uint8)
+"""Red, green, blue of every laser that an int8 can number, shape (128, 3)."""

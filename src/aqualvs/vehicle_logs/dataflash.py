@@ -227,22 +227,18 @@ def _sound(
     kept: dict[str, dict[str, FloatArray]] = {}
     n_bogus = 0
     for name, table in tables.items():
-        times = _seconds(table)
-        if times is None:
+        # ArduSub before 3.4 wrote milliseconds.
+        units = {"TimeUS": 1e-6, "TimeMS": 1e-3}
+        unit = next((name for name in units if name in table), None)
+        if unit is None:
             continue
+        times = table[unit] * units[unit]
         sound = _believable(times)
         n_bogus += int(np.count_nonzero(~sound))
         if sound.any():
             kept[name] = {column: values[sound] for column, values in table.items()}
             kept[name]["time_s"] = times[sound]
     return Records(kept, n_records, tuple(skipped), n_bogus)
-
-
-def _seconds(table: Mapping[str, FloatArray]) -> FloatArray | None:
-    if "TimeUS" in table:
-        return table["TimeUS"] * 1e-6
-    # ArduSub before 3.4 wrote milliseconds.
-    return table["TimeMS"] * 1e-3 if "TimeMS" in table else None
 
 
 def _believable(times: FloatArray) -> BoolArray:

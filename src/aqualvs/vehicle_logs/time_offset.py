@@ -256,7 +256,12 @@ def _refine(channels: tuple[Channel, ...], start_s: float) -> TimeOffset:
     matches = [match_at(channel, offset) for channel in channels]
     best = max(match.correlation for match in matches)
     shared_s = STEP_S * max(np.count_nonzero(match.predicted) for match in matches)
-    return TimeOffset(offset, _sigma(channels, offset), best, _words(matches, channels, shared_s))
+    parts = [
+        f"{channel.name} (correlation {match.correlation:.2f}, share {match.gain:.2f})"
+        for channel, match in zip(channels, matches, strict=True)
+    ]
+    words = f"motion over {shared_s:.0f} s: {' and '.join(parts)}"
+    return TimeOffset(offset, _sigma(channels, offset), best, words)
 
 
 def _weights(channels: tuple[Channel, ...], offset_s: float) -> list[FloatArray]:
@@ -305,14 +310,6 @@ def _sigma(channels: tuple[Channel, ...], offset_s: float) -> float:
     fall = float(earlier.sum() - later.sum()) / (2.0 * probe_s)
     slope = fall if fall > 0.0 else float(stiffness.sum())
     return math.sqrt(float(sums @ sums)) / slope
-
-
-def _words(matches: list[Match], channels: tuple[Channel, ...], shared_s: float) -> str:
-    parts = [
-        f"{channel.name} (correlation {match.correlation:.2f}, share {match.gain:.2f})"
-        for channel, match in zip(channels, matches, strict=True)
-    ]
-    return f"motion over {shared_s:.0f} s: {' and '.join(parts)}"
 
 
 def _compared(found: TimeOffset, start: TimeOffset) -> TimeOffset:
