@@ -160,6 +160,16 @@ class Entries:
     content: Mapping[Any, Any]
     place: str = ""  # Where it is in the file, such as "cam0."; empty at the top.
 
+    @classmethod
+    def top(cls, content: object) -> "Entries":
+        """Return the mapping that a whole file holds.
+
+        Raises `RigError` if it holds none.
+        """
+        if not isinstance(content, Mapping):
+            raise RigError("holds no keys and values; give the whole file")
+        return cls(content)
+
     def first(self, keys: Sequence[str]) -> str:
         """Return the first of some keys that there is.
 

@@ -27,16 +27,14 @@ def read_kalibr(text: str, source: str, *, name: str | None = None) -> ForeignCa
     `name`: key of the camera, such as "cam0"; needed where there are several. Raises `RigError`
     with one line without the file's name, but for faults of the YAML.
     """
-    content = parse_yaml(text, source, RigError)
-    if not isinstance(content, Mapping):
-        raise RigError("holds no keys and values; give the whole file")
+    top = Entries.top(parse_yaml(text, source, RigError))
     cameras = [
         str(key)
-        for key, value in content.items()
+        for key, value in top.content.items()
         if isinstance(value, Mapping) and "camera_model" in value
     ]
     chosen = one_of(cameras, name)
-    camera = Entries(content).part(chosen)
+    camera = top.part(chosen)
     model = camera.word("camera_model")
     if model != "pinhole":
         raise RigError(
@@ -106,10 +104,7 @@ def read_kalibr_target(text: str, source: str) -> Board:
     Raises `RigError` with one line without the file's name, but for faults of the YAML; also for
     targets that aqualvs does not find in pictures.
     """
-    content = parse_yaml(text, source, RigError)
-    if not isinstance(content, Mapping):
-        raise RigError("holds no keys and values; give the whole file")
-    target = Entries(content)
+    target = Entries.top(parse_yaml(text, source, RigError))
     kind = target.word("target_type")
     if kind == "aprilgrid":
         raise RigError(

@@ -36,7 +36,7 @@ def read_ros(text: str, source: str) -> ForeignCamera:
     """
     # `ros2 topic echo` ends each message with this line.
     content = parse_yaml(re.sub(r"(?:^---\s*)+\Z", "", text, flags=re.MULTILINE), source, RigError)
-    entries = _top(content)
+    entries = Entries.top(content)
     _check_whole_picture(entries)
     model = entries.word("distortion_model") or "plumb_bob"
     if model not in _ROS_MODELS:
@@ -58,12 +58,6 @@ def read_ros(text: str, source: str) -> ForeignCamera:
             entries.core("camera_matrix", "k", "K"), distortion, fisheye=model == _FISHEYE
         ),
     )
-
-
-def _top(content: object) -> Entries:
-    if not isinstance(content, Mapping):
-        raise RigError("holds no keys and values; give the whole file")
-    return Entries(content)
 
 
 def _check_whole_picture(entries: Entries) -> None:
@@ -128,13 +122,8 @@ def _matrix(lens: Lens) -> Any:
 # Names that OpenCV's own samples and applications, and users of FileStorage, give.
 _MATRIX = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "mtx", "intrinsic_matrix")
 _DISTORTION = (
-    "distortion_coefficients",
-    "Distortion_Coefficients",
-    "distCoeffs",
-    "dist_coeffs",
-    "distortion",
-    "dist",
-    "D",
+    *("distortion_coefficients", "Distortion_Coefficients", "distCoeffs", "dist_coeffs"),
+    *("distortion", "dist", "D"),
 )
 _SIZES = ("image_size", "imageSize", "cameraResolution", "resolution")
 
@@ -170,10 +159,10 @@ def read_opencv(text: str, source: str, *, model: str | None = None) -> ForeignC
 def _storage(text: str, source: str) -> Entries:
     """Return the content of a FileStorage as plain values; matrices have rows, cols and data."""
     if "<opencv_storage>" in text:
-        return _top(_xml(text))
+        return Entries.top(_xml(text))
     # YAML 1.0 has a header that newer YAML does not know, and matrices have a tag of OpenCV.
     plain = re.sub(r"\A%YAML[: ]1\.\d[^\n]*\n", "", text)
-    return _top(parse_yaml(plain.replace("!!opencv-matrix", ""), source, RigError))
+    return Entries.top(parse_yaml(plain.replace("!!opencv-matrix", ""), source, RigError))
 
 
 def _xml(text: str) -> dict[str, Any]:
@@ -209,13 +198,7 @@ def opencv_text(camera: ForeignCamera, suffix: str) -> str:
     return storage.releaseAndGetString()
 
 
-_COUNTS = {
-    "LENSMODEL_PINHOLE": 0,
-    "LENSMODEL_OPENCV4": 4,
-    "LENSMODEL_OPENCV5": 5,
-    "LENSMODEL_OPENCV8": 8,
-    "LENSMODEL_OPENCV12": 12,
-}
+_COUNTS = {"LENSMODEL_PINHOLE": 0} | {f"LENSMODEL_OPENCV{n}": n for n in (4, 5, 8, 12)}
 
 
 def read_mrcal(text: str, source: str) -> ForeignCamera:
@@ -230,9 +213,7 @@ def read_mrcal(text: str, source: str) -> ForeignCamera:
             content = ast.literal_eval(text.strip())
     except (ValueError, SyntaxError, TypeError, MemoryError, RecursionError):
         raise RigError("is no Python literal, as a cameramodel is; mend it") from None
-    if not isinstance(content, Mapping):
-        raise RigError("holds no keys and values; give the whole file")
-    entries = Entries(content)
+    entries = Entries.top(content)
     model = entries.word("lensmodel", "lens_model")
     if model not in _COUNTS:
         raise RigError(
