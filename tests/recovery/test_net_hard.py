@@ -112,9 +112,9 @@ def test_folds_are_net_and_move_a_posture_little() -> None:
             found.append(shot.recall(np.abs(shot.in_scene @ way - 0.03) < 0.025))
             all_of_it.append(shot.recall())
             assert shot.precision() > 0.98
-    # Measured with eight seeds of the noise: 0.67 to 0.87 and 0.81 to 0.94, for the last fold may be
-    # followed or not, and one bit of its pose decides. Without following the net into its folds it
-    # is 0.19 and 0.61.
+    # Measured with eight seeds of the noise: 0.67 to 0.87 and 0.81 to 0.94, for the last fold may
+    # be followed or not, and one bit of its pose decides. Without following the net into its folds
+    # it is 0.19 and 0.61.
     assert np.mean(found) > 0.6
     assert np.mean(all_of_it) > 0.77
 
