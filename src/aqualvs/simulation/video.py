@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from av.container import OutputContainer
 from av.video.stream import VideoStream
+from llvmlite.binding import get_host_cpu_features
 from numpy.typing import NDArray
 
 from aqualvs.closing import Closing
@@ -113,9 +114,19 @@ class VideoWriter(Closing):
             stream.options = {"crf": str(recording.crf), "preset": "veryfast"}
         else:
             stream.bit_rate = recording.bit_rate or _FALLBACK_BIT_RATE
-        if self._first_field is not None and codec == "libx264":
-            order = "tff=1" if self._first_field == "top" else "bff=1"
-            stream.options = {**stream.options, "flags": "+ilme+ildct", "x264-params": order}
+        if codec == "libx264":
+            stream.options |= self._x264_options()
+
+    def _x264_options(self) -> dict[str, str]:
+        params = []
+        if get_host_cpu_features().get("avx512f", False):
+            # With AVX-512 the x264 of 2025 makes another file of the same pictures each time, even
+            # in one thread, unless `mbtree=0`.
+            params.append("asm=AVX2")
+        if self._first_field is not None:
+            params.append("tff=1" if self._first_field == "top" else "bff=1")
+        options = {"flags": "+ilme+ildct"} if self._first_field is not None else {}
+        return options | {"x264-params": ":".join(params)}
 
     def write(self, image: NDArray[np.uint8]) -> None:
         """Append one frame, uint8 RGB of shape (height, width, 3).
