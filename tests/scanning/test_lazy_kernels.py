@@ -2,7 +2,6 @@
 
 import dataclasses
 import dis
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -20,21 +19,10 @@ from aqualvs.scanning.scan import Frame, Scan
 from aqualvs.scanning.surfaces import TargetKind
 from aqualvs.simulation.scenarios import example_rig
 from aqualvs.sources import open_source
+from lazy_cases import lazy_kernels
 from whole import WHOLE
 
 N_NETS = 30 if WHOLE else 6
-
-
-def lazy_kernels() -> list[_LazyKernel]:
-    modules = [one for name, one in sys.modules.items() if name.startswith("aqualvs.")]
-    found = {
-        id(value): value
-        for module in modules
-        for value in vars(module).values()
-        if isinstance(value, _LazyKernel)
-    }
-    assert len(found) > 40
-    return list(found.values())
 
 
 @pytest.fixture
