@@ -223,6 +223,10 @@ def test_bare_lens_is_compared(tmp_path: Path) -> None:
     worst = 200.0 * dive.range_m[frames].max()
     assert f"without it {200.0 * np.sqrt((dive.range_m[frames] ** 2).mean()):.2f} mm" in words
     assert f"{worst:.2f} mm" in words
+    run_yaml = dive.folder / "run.yaml"
+    run_yaml.write_text(run_yaml.read_text().replace(" dome:", " flat:"))
+    words = " ".join(visible(write_report(dive.folder).read_text()).split())
+    assert "range without the flat port, relative to with it" in words
     assert len(data_of(page)["bare"]["bare"]["x"]) == len(frames)
 
 

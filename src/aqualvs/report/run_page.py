@@ -281,7 +281,7 @@ def _content(m: Material) -> dict[str, object]:
         "points": None if m.points is None else _laser_counts(m.points, m.names),
         "quality_charts": [] if m.points is None else _quality_places(m.points),
         "housing": housing,
-        "bare": None if m.bare is None else _bare_ranges(m.track, m.bare),
+        "bare": None if m.bare is None else _bare_ranges(m.track, m.bare, housing),
         "bare_errors": None
         if m.bare is None or m.truth is None
         else _both_errors(m.track.posture, m.bare, m.truth, housing),
@@ -401,14 +401,14 @@ def _quality_places(points: PointSummary) -> list[tuple[str, str]]:
     return [(name, title) for name, title, known in places if known]
 
 
-def _bare_ranges(track: Track, bare: FloatArray) -> tuple[int, str]:
+def _bare_ranges(track: Track, bare: FloatArray, housing: str) -> tuple[int, str]:
     """Return the number of frames with a posture both ways, and the table of their ranges."""
     percent = 100.0 * (bare[:, 0] / track.posture[:, 0] - 1.0)
     percent = percent[np.isfinite(percent)]
     if not len(percent):
         return 0, ""
     cells = (signed(f"{v:+.2f} %") for v in (percent.min(), np.median(percent), percent.max()))
-    row = ("range without the dome, relative to with it", *cells)
+    row = (f"range without the {housing}, relative to with it", *cells)
     return len(percent), html.table(("", "min", "median", "max"), [row])
 
 
