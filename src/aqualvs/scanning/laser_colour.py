@@ -417,9 +417,8 @@ def _learn_paint(table: FloatArray, n_min: float) -> tuple[float, float, float, 
         var_u, var_v = squared(spread_u) + squared(noise), squared(spread_v) + squared(noise)
         n_near = 0
         for k in range(n):
-            if squared(of_u[k] - u) / var_u + squared(of_v[k] - v) / var_v < squared(
-                _PAINT.of_crowd
-            ):
+            off = squared(of_u[k] - u) / var_u + squared(of_v[k] - v) / var_v
+            if off < squared(_PAINT.of_crowd):
                 near_u[n_near], near_v[n_near] = of_u[k], of_v[k]
                 n_near += 1
     tint_u, tint_v = element_at(tint_of_u, 0.5), element_at(tint_of_v, 0.5)
@@ -447,13 +446,10 @@ def _learn_beside_paint(
         height, step_u, step_v = table[HEIGHT, i], table[STEP_U, i], table[STEP_V, i]
         if height >= _PAINT.tall and _is_near(step_u, step_v, u, v):
             off_u, off_v = step_u - paint_u * height, step_v - paint_v * height
-            var_u, var_v = (
-                squared(spread_u * height) + squared(sigma),
-                squared(spread_v * height) + squared(sigma),
-            )
-            is_clear[i] = squared(off_u) / var_u + squared(off_v) / var_v > squared(
-                _PAINT.clear_of_paint
-            )
+            var_u = squared(spread_u * height) + squared(sigma)
+            var_v = squared(spread_v * height) + squared(sigma)
+            off = squared(off_u) / var_u + squared(off_v) / var_v
+            is_clear[i] = off > squared(_PAINT.clear_of_paint)
     best = where(is_clear)
     if best.shape[0] < _LEARN.min_learned:
         return u, v, 0.0, sigma, 1.0, 1.0
@@ -476,9 +472,8 @@ def _learn_beside_paint(
 def _is_near(step_u: float, step_v: float, u: float, v: float) -> bool:
     """Return whether a chroma step is within the widest angle of a direction."""
     along = u * step_u + v * step_v
-    return along > 0.0 and squared(along) > squared(_LEARN.min_cosine) * (
-        squared(step_u) + squared(step_v)
-    )
+    size = squared(step_u) + squared(step_v)
+    return along > 0.0 and squared(along) > squared(_LEARN.min_cosine) * size
 
 
 @inline_kernel
@@ -574,10 +569,8 @@ def _weigh(
         var_across = squared(sigma) + squared(across_spread * full)
         if spread_u > 0.0:
             off_u, off_v = step_u - paint_u * height, step_v - paint_v * height
-            var_u, var_v = (
-                squared(sigma) + squared(spread_u * height),
-                squared(sigma) + squared(spread_v * height),
-            )
+            var_u = squared(sigma) + squared(spread_u * height)
+            var_v = squared(sigma) + squared(spread_v * height)
             # Where both explanations hold, the narrower one has the higher density.
             off_paint = squared(off_u) / var_u + squared(off_v) / var_v
             off_paint -= math.log(var_along * var_across / (var_u * var_v))

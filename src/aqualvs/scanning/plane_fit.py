@@ -379,7 +379,7 @@ def _expected_square(matrix: FloatArray, residual: FloatArray) -> float:
         if not factorise(lower, 0.0, 0.0, lower):
             continue
         solve_factorised(lower, residual, solved)
-        total = -(squared(math.log(t) / spread)) - n_modes * math.log(t)
+        total = -squared(math.log(t) / spread) - n_modes * math.log(t)
         for a in range(n_modes):
             total += residual[a] * solved[a] - 2.0 * math.log(lower[a, a])
         log_weight[f] = 0.5 * total
