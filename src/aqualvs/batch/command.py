@@ -90,11 +90,7 @@ def batch(request: BatchRequest, echo: Callable[[str], object]) -> int:
             found = Scheduler(sized, workers, progress).run(lambda: stop.caught is not None)
         records = _all_records(request.out, found)
         with writing(request.out):
-            for left in list((request.out / HOME).rglob("*.part")):
-                # Processes that were killed left it.
-                clear(left)
-                if left.is_file():
-                    left.unlink(missing_ok=True)
+            _tidy(request.out / HOME)
             (request.out / DATASET).mkdir(exist_ok=True)
             write_dives(request.out / DATASET, [record.row() for record in records])
         for line in _summary_lines(
@@ -161,6 +157,14 @@ def _known_names(out: Path) -> dict[str, str]:
     except (OSError, ValueError):
         return {}
     return {str(key): str(value) for key, value in found.items()}
+
+
+def _tidy(home: Path) -> None:
+    """Remove what processes left that were killed."""
+    for path in list(home.rglob("*.part")):
+        clear(path)
+        if path.is_file():
+            path.unlink(missing_ok=True)
 
 
 def _all_records(out: Path, found: Mapping[str, DiveRecord]) -> list[DiveRecord]:

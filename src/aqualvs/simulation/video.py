@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 from av.container import OutputContainer
 from av.video.stream import VideoStream
-from llvmlite.binding import get_host_cpu_features
 from numpy.typing import NDArray
 
 from aqualvs.closing import Closing
@@ -53,6 +52,8 @@ class Compression:
 # Lossy encoders, in the order of preference.
 _LOSSY = ("libx264", "libopenh264", "mpeg4")
 _FALLBACK_BIT_RATE = 6_000_000
+# OpenCV's CPU_AVX512_SKX, all that x264 asks for, which its Python module does not name.
+_AVX_512 = 256
 _CODECS = {"lossless": "libx264rgb", "mjpeg": "mjpeg"}
 
 
@@ -118,14 +119,15 @@ class VideoWriter(Closing):
             stream.options |= self._x264_options()
 
     def _x264_options(self) -> dict[str, str]:
+        options: dict[str, str] = {}
         params = []
-        if get_host_cpu_features().get("avx512f", False):
-            # With AVX-512 the x264 of 2025 makes another file of the same pictures each time, even
-            # in one thread, unless `mbtree=0`.
+        if cv2.checkHardwareSupport(_AVX_512):
+            # With it the x264 of 2025 makes another file of the same pictures each time, even in
+            # one thread, unless `mbtree=0`.
             params.append("asm=AVX2")
         if self._first_field is not None:
+            options["flags"] = "+ilme+ildct"
             params.append("tff=1" if self._first_field == "top" else "bff=1")
-        options = {"flags": "+ilme+ildct"} if self._first_field is not None else {}
         return options | {"x264-params": ":".join(params)}
 
     def write(self, image: NDArray[np.uint8]) -> None:

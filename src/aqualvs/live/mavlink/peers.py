@@ -262,9 +262,7 @@ class PeerTable:
         system: int = message.get_srcSystem()
         kind = message.get_type()
         with self._lock:
-            is_beat = kind == "HEARTBEAT"
-            # Where the vehicle is, its autopilot alone says.
-            if is_beat and (system != self._system or message.autopilot != _NO_AUTOPILOT):
+            if kind == "HEARTBEAT" and self._may_bind(system, message):
                 self._bind(peer, system, message)
             home = self._homes.get(system)
         if kind == "MANUAL_CONTROL" and system != self._system:
@@ -272,6 +270,10 @@ class PeerTable:
         if home is None:
             return system != self._system
         return home.peer == peer
+
+    def _may_bind(self, system: int, message: Any) -> bool:
+        """Return whether a heartbeat says where a system is; the vehicle's autopilot alone does."""
+        return system != self._system or bool(message.autopilot != _NO_AUTOPILOT)
 
     def _bind(self, peer: Peer, system: int, message: Any) -> None:
         now_s = time.monotonic()
