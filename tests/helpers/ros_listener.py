@@ -15,7 +15,7 @@ import numpy as np
 
 from aqualvs.live.outputs.base import Output
 from aqualvs.live.outputs.ros_messages import POINT_TYPE
-from aqualvs.recording.sample import LiveSample
+from aqualvs.recording.sample import Instants, LiveSample
 from waiting import TIMEOUT_S
 
 
@@ -131,9 +131,15 @@ def expected_points(sample: LiveSample) -> np.ndarray:
 
 
 def send_now(output: Output, sample: LiveSample) -> float:
-    """Send a sample as of now; returns how long that took, in seconds."""
+    """Send a sample as of now; returns how long that took, in seconds.
+
+    Its instants are of now, too: by them diagnostics are repeated, of which a subscriber by best
+    effort may lose the first.
+    """
+    now = time.monotonic_ns()
+    of_now = replace(sample, utc_ns=time.time_ns(), instants=Instants(now, now, now))
     began = time.perf_counter()
-    output.send(replace(sample, utc_ns=time.time_ns()))
+    output.send(of_now)
     return time.perf_counter() - began
 
 
