@@ -39,33 +39,6 @@ def later(x):
 print(int(twice(1)), sum(twice.stats.cache_hits.values()))
 """
 
-ALLOCATING = """
-import sys
-import numpy as np
-from aqualvs.geometry.compiled import kernel
-
-@kernel
-def largest(x):
-    return np.max(np.abs(x))
-
-@kernel
-def doubled(x):
-    if len(x) < 2:
-        raise ValueError("too short")
-    return 2.0 * largest(x + 1.0) + np.empty(3).size
-
-x = np.array([3.0, -1.0, 2.0])
-largest(x)
-said = ""
-try:
-    doubled(x[:1])
-except ValueError as fault:
-    said = str(fault).replace(" ", "_")
-hits = [sum(one.stats.cache_hits.values()) for one in (largest, doubled)]
-print(largest(x), doubled(x), said, *hits, "numba.np.arraymath" in sys.modules)
-"""
-
-
 TERMS = np.random.default_rng(0).uniform(-1.0, 1.0, (2, 1001))
 
 
@@ -161,18 +134,6 @@ def test_cached_kernels_follow_their_callees(tmp_path: Path) -> None:
     assert run_caller(tmp_path) == ["3", "1"]
     (tmp_path / "callee.py").write_text(CALLEE.format(increment=1000))
     assert run_caller(tmp_path) == ["2001", "0"]
-
-
-def test_cached_kernels_load_without_what_only_compiling_needs(tmp_path: Path) -> None:
-    (tmp_path / "allocating.py").write_text(ALLOCATING)
-    found = ["3.0", "11.0", "too_short"]
-    assert run_caller(tmp_path, "allocating.py") == [*found, "0", "0", "True"]
-    assert run_caller(tmp_path, "allocating.py") == [*found, "1", "1", "False"]
-    for path in (tmp_path / "cache").rglob("*doubled*"):
-        path.unlink()
-    # The first is loaded; the second, which inlines it, is compiled, and loaded the next time.
-    assert run_caller(tmp_path, "allocating.py") == [*found, "1", "0", "True"]
-    assert run_caller(tmp_path, "allocating.py") == [*found, "1", "1", "False"]
 
 
 LAZY = """

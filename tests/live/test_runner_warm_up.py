@@ -34,7 +34,7 @@ def test_no_kernel_is_compiled_before_a_net(monkeypatch: pytest.MonkeyPatch) -> 
     def noting(kernel: _LazyKernel) -> Callable[..., Any]:
         def run(*arguments: Any) -> Any:
             called.add(kernel.py_func.__qualname__)
-            return kernel._stands_for[0](*arguments)
+            return kernel._compiled(*arguments)
 
         return run
 

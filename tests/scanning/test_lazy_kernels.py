@@ -29,9 +29,11 @@ N_NETS = 30 if WHOLE else 6
 def run_by(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
     """Have every lazy kernel run by Python or by compiled code, and none change over."""
 
+    compiled_of: dict[int, Any] = {}
+
     def choose(means: str) -> None:
         for kernel in lazy_kernels():
-            compiled = kernel._stands_for[0]
+            compiled = compiled_of.setdefault(id(kernel), kernel._compiled)
             by_python = means == "python"
             monkeypatch.setattr(kernel, "_run", kernel._interpret if by_python else compiled)
             monkeypatch.setattr(kernel, "_left_s", np.inf)

@@ -25,11 +25,6 @@ import numpy as np
 from numba.extending import overload, typeof_impl
 from numpy.typing import NDArray
 
-# What `kernel_loading` uses of Numba is private: no other version than those tested is trusted.
-_LOADS_LIGHTLY = numba.__version__.startswith("0.68.")
-if _LOADS_LIGHTLY:
-    from aqualvs.geometry.kernel_loading import load_lightly
-
 ZERO = cast(int, np.int64(0))
 """Initial value of a count that kernels pass on and get back; they would be compiled once more for
 a literal 0."""
@@ -139,9 +134,7 @@ _OPTIONS = {"error_model": "numpy", "nogil": True, "fastmath": False, "no_cfunc_
 def _compiled(function: F, **options: object) -> F:
     options = {**_OPTIONS, **options}
     compiled = numba.njit(cache=True, **options)(function)
-    _depend_on_callees(compiled, function, repr(sorted(options.items())))
-    if _LOADS_LIGHTLY:
-        load_lightly(compiled)
+    _depend_on_callees(compiled, repr(sorted(options.items())))
     return cast(F, compiled)
 
 
@@ -168,13 +161,17 @@ class _LazyKernel:
     def __init__(self, function: Callable[..., Any], options: Mapping[str, object]) -> None:
         functools.update_wrapper(self, function)
         self.py_func = function
-        self._compiled = _compiled(function, **options)
-        self._stands_for = (self._compiled,)
+        self._options = options
         self._run = self._run_first
         self._left_s = 0.0
 
     def __call__(self, *arguments: Any) -> Any:
         return self._run(*arguments)
+
+    # Most programs call few of the kernels that they import.
+    @functools.cached_property
+    def _compiled(self) -> Callable[..., Any]:
+        return _compiled(self.py_func, **self._options)
 
     def _run_first(self, *arguments: Any) -> Any:
         file = _cache_file(self._compiled)
@@ -273,12 +270,15 @@ class _InnerKernel:
         functools.update_wrapper(self, function)
         self.py_func = function
         self._options = options
-        self._for_kernels = _compiled(function, no_cpython_wrapper=True, **options)
-        self._stands_for = (self._for_kernels,)
 
     def __call__(self, *arguments: Any) -> Any:
         run = self.py_func if _interpreter.runs else self._for_python
         return run(*arguments)
+
+    # Kernels that are on disk contain it.
+    @functools.cached_property
+    def _for_kernels(self) -> Callable[..., Any]:
+        return _compiled(self.py_func, no_cpython_wrapper=True, **self._options)
 
     @functools.cached_property
     def _for_python(self) -> Callable[..., Any]:
@@ -297,20 +297,23 @@ class _InnerKernel:
         return _compiled(own, **self._options)
 
 
-def _type_of(wrapped: _InnerKernel | _LazyKernel, _: object) -> Any:
-    (compiled,) = wrapped._stands_for
-    return numba.typeof(compiled)
+def _type_of_inner(inner: _InnerKernel, _: object) -> Any:
+    return numba.typeof(inner._for_kernels)
 
 
-typeof_impl.register(_InnerKernel)(_type_of)
-typeof_impl.register(_LazyKernel)(_type_of)
+def _type_of_lazy(lazy: _LazyKernel, _: object) -> Any:
+    return numba.typeof(lazy._compiled)
+
+
+typeof_impl.register(_InnerKernel)(_type_of_inner)
+typeof_impl.register(_LazyKernel)(_type_of_lazy)
 
 
 def _inner(function: F, **options: object) -> F:
     return cast(F, _InnerKernel(function, options))
 
 
-def _depend_on_callees(compiled: Any, function: Callable[..., Any], options: str) -> None:
+def _depend_on_callees(compiled: Any, options: str) -> None:
     """Make machine code on disk depend on its options and the files of kernels that it may call.
 
     Numba compares only the stamp of the function's own file, so a change in an inlined kernel of
@@ -320,10 +323,34 @@ def _depend_on_callees(compiled: Any, function: Callable[..., Any], options: str
     own = _cache_file(compiled)
     if own is None:
         return
-    files = (file for value in function.__globals__.values() for file in _cache_files(value))
-    stamps = {stamp for file in files for stamp in file._source_stamp}
-    own._source_stamp = tuple(sorted(stamps | {own._source_stamp, options}, key=repr))
+    files = sorted(_files_of_kernels(compiled.py_func))
+    own._source_stamp = (*own._source_stamp, options, *map(_stamp_of, files))
     own._load_index = _forgiving(own._load_index)
+
+
+def _files_of_kernels(function: Callable[..., Any]) -> frozenset[str]:
+    """Return the files of the kernels that a kernel's module has or has imported, and of theirs."""
+    path = function.__code__.co_filename
+    if path not in _files:
+        named = list(function.__globals__.values())
+        kernels = [one for value in named for one in getattr(value, "_stands_for", (value,))]
+        others = {
+            one.py_func.__code__.co_filename: one.py_func
+            for one in kernels
+            if hasattr(one, "py_func")
+        }
+        others.pop(path, None)
+        _files[path] = frozenset({path}.union(*map(_files_of_kernels, others.values())))
+    return _files[path]
+
+
+_files: dict[str, frozenset[str]] = {}
+
+
+@functools.cache
+def _stamp_of(path: str) -> tuple[int, int]:
+    status = os.stat(path)
+    return status.st_mtime_ns, status.st_size
 
 
 def _forgiving(load_index: Callable[[], Any]) -> Callable[[], Any]:
@@ -340,14 +367,6 @@ def _forgiving(load_index: Callable[[], Any]) -> Callable[[], Any]:
             return {}
 
     return load
-
-
-def _cache_files(value: Any) -> Iterator[Any]:
-    """Yield Numba's records of the caches of all compiled functions that a global stands for."""
-    for compiled in getattr(value, "_stands_for", (value,)):
-        file = _cache_file(compiled)
-        if file is not None:
-            yield file
 
 
 def _cache_file(compiled: Any) -> Any:
