@@ -25,17 +25,19 @@ import real_lines
 from aqualvs.scanning.laser_bands import SearchAxis
 from aqualvs.scanning.laser_colour import WHITE
 from aqualvs.scanning.scan import Frame, planes_of_image
-from aqualvs.scanning.stripe_segments import ACROSS as ACROSS
-from aqualvs.scanning.stripe_segments import ALONG as ALONG
-from aqualvs.scanning.stripe_segments import HALO as HALO
-from aqualvs.scanning.stripe_segments import LENGTH as LENGTH
-from aqualvs.scanning.stripe_segments import TOP as TOP
-from aqualvs.scanning.stripe_segments import Weights as Weights
-from aqualvs.scanning.stripe_segments import general_evidence as general_evidence
-from aqualvs.scanning.stripe_segments import learn_lines as learn_lines
-from aqualvs.scanning.stripe_segments import line_log_odds as line_log_odds
-from aqualvs.scanning.stripe_segments import own_evidence as own_evidence
-from aqualvs.scanning.uncalibrated_stripes import find_all_segments as find_all_segments
+from aqualvs.scanning.stripe_segments import (
+    ACROSS,
+    ALONG,
+    HALO,
+    LENGTH,
+    TOP,
+    Weights,
+    general_evidence,
+    learn_lines,
+    line_log_odds,
+    own_evidence,
+)
+from aqualvs.scanning.uncalibrated_stripes import find_all_segments
 
 Array = NDArray[np.float64]
 

@@ -34,10 +34,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from aqualvs.scanning.scan import Frame
-from aqualvs.scanning.uncalibrated_stripes import (
-    UncalibratedStripeOptions as UncalibratedStripeOptions,
-)
-from aqualvs.scanning.uncalibrated_stripes import find_stripes as find_stripes
+from aqualvs.scanning.uncalibrated_stripes import UncalibratedStripeOptions, find_stripes
 from aqualvs.sources import open_source
 
 Image = NDArray[np.uint8]

@@ -9,10 +9,17 @@ from numpy.typing import NDArray
 from aqualvs.scanning.laser_bands import LaserBand, SearchAxis
 from aqualvs.scanning.laser_colour import LaserColour
 from aqualvs.scanning.stripe import StripePeaks
-from aqualvs.scanning.stripe_segments import FIRST_X, FIRST_Y, LAST_X, LAST_Y, LENGTH, WIDTH
-from aqualvs.scanning.stripe_segments import StripeSegments as StripeSegments
-from aqualvs.scanning.stripe_segments import place_evidence as place_evidence
-from aqualvs.scanning.uncalibrated_stripes import continued as continued
+from aqualvs.scanning.stripe_segments import (
+    FIRST_X,
+    FIRST_Y,
+    LAST_X,
+    LAST_Y,
+    LENGTH,
+    WIDTH,
+    StripeSegments,
+    place_evidence,
+)
+from aqualvs.scanning.uncalibrated_stripes import continued
 
 SIZE = (320, 240)
 # x of the first and of the last peak, y of the first, and slope.

@@ -7,11 +7,11 @@ from numpy.typing import NDArray
 
 from aqualvs.errors import OptionError
 from aqualvs.scanning.scan import Frame
-from aqualvs.scanning.uncalibrated_stripes import StripePixels as StripePixels
 from aqualvs.scanning.uncalibrated_stripes import (
-    UncalibratedStripeOptions as UncalibratedStripeOptions,
+    StripePixels,
+    UncalibratedStripeOptions,
+    find_stripes,
 )
-from aqualvs.scanning.uncalibrated_stripes import find_stripes as find_stripes
 
 SIZE = (360, 240)
 

@@ -65,10 +65,7 @@ from aqualvs.report.calibration_material import (
     residual_map,
 )
 from aqualvs.report.html import Card
-from aqualvs.scanning.uncalibrated_stripes import (
-    UncalibratedStripeOptions as UncalibratedStripeOptions,
-)
-from aqualvs.scanning.uncalibrated_stripes import find_stripes as find_stripes
+from aqualvs.scanning.uncalibrated_stripes import UncalibratedStripeOptions, find_stripes
 from aqualvs.text import laser_colour
 
 _DEG = 180.0 / math.pi

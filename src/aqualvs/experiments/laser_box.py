@@ -31,7 +31,7 @@ from aqualvs.optics.expected_error import WallView, expected_posture_errors
 from aqualvs.optics.rig import Laser, Rig, merged
 from aqualvs.optics.solved import rig_uncertainty, with_uncertainty
 from aqualvs.report.figure_style import GREEN, GREY, OURS, PAPER, PURPLE, TRUTH
-from aqualvs.scanning.uncalibrated_stripes import find_stripes as find_stripes
+from aqualvs.scanning.uncalibrated_stripes import find_stripes
 from aqualvs.text import laser_colour
 
 

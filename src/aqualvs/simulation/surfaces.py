@@ -8,9 +8,16 @@ from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.compiled import inline_borrowing_kernel
 from aqualvs.geometry.linear_algebra import Vec, along, combine, dot, minus, row3, scaled, unit
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
-from aqualvs.simulation.net import FOLD_COLUMNS as FOLD_COLUMNS
-from aqualvs.simulation.net import NET_COLUMNS as NET_COLUMNS
-from aqualvs.simulation.net import NO_STRAND, Strand, meet_net, pack_fold, pack_net, strand_albedo
+from aqualvs.simulation.net import (
+    FOLD_COLUMNS,
+    NET_COLUMNS,
+    NO_STRAND,
+    Strand,
+    meet_net,
+    pack_fold,
+    pack_net,
+    strand_albedo,
+)
 from aqualvs.simulation.scene import Box, Fish, Scene, Wall
 from aqualvs.simulation.textures import Tiles, noise_tiles, sample
 

@@ -13,7 +13,7 @@ from aqualvs.calibration.lasers.views import LaserView
 from aqualvs.calibration.targets.target_files import load_box
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.optics.rig import LASER_PARAMETERS, Rig, RigUncertainty, rig_moved_by, tangent_basis
-from aqualvs.scanning.uncalibrated_stripes import find_stripes as find_stripes
+from aqualvs.scanning.uncalibrated_stripes import find_stripes
 from aqualvs.simulation.scenarios import example_rig
 from laser_cases import (
     Noise,
