@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 import real_lines
+from aqualvs.calibrate.uncalibrated_stripes import find_all_segments
 from aqualvs.scanning.laser_bands import SearchAxis
 from aqualvs.scanning.laser_colour import WHITE
 from aqualvs.scanning.scan import Frame, planes_of_image
@@ -37,7 +38,6 @@ from aqualvs.scanning.stripe_segments import (
     line_log_odds,
     own_evidence,
 )
-from aqualvs.scanning.uncalibrated_stripes import find_all_segments
 
 Array = NDArray[np.float64]
 

@@ -33,8 +33,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from aqualvs.calibrate.uncalibrated_stripes import UncalibratedStripeOptions, find_stripes
 from aqualvs.scanning.scan import Frame
-from aqualvs.scanning.uncalibrated_stripes import UncalibratedStripeOptions, find_stripes
 from aqualvs.sources import open_source
 
 Image = NDArray[np.uint8]

@@ -18,9 +18,9 @@ from scipy.special import chdtri
 
 import real_wall as wall
 from aqualvs.calibrate import common, lasers
+from aqualvs.calibrate.uncalibrated_stripes import find_stripes
 from aqualvs.calibration.detection.detection import detect_board
 from aqualvs.optics.rigfile import load_rig
-from aqualvs.scanning.uncalibrated_stripes import find_stripes
 from aqualvs.sources.images import read_image
 from laser_cases import laser_error
 from repository import ROOT

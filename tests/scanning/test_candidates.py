@@ -8,6 +8,7 @@ from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig import Rig
 from aqualvs.scanning.candidates import Candidates, find_candidates
 from aqualvs.scanning.laser_bands import SearchAxis, plan_bands
+from aqualvs.scanning.observations import average_groups
 from aqualvs.scanning.stripe import StripePeaks
 from aqualvs.scanning.triangulate import Triangulator
 from aqualvs.simulation.scenarios import bluerov2_rig, example_rig
@@ -133,7 +134,7 @@ def test_observations_are_weighed_by_light() -> None:
     light = np.linspace(10.0, 100.0, len(mine))
     shaded = replace(mine, height=light)
     index = np.zeros(len(mine), np.int64)
-    seen = shaded.observations(index, 1, WALL.normal)
+    seen = average_groups(shaded, index, 1, WALL.normal)
     weight = light * mine.width
     expected = np.average(mine.points, axis=0, weights=weight)
     np.testing.assert_allclose(seen.points[0], expected, atol=1e-12)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from aqualvs.geometry.planes import Plane
-from aqualvs.scanning.candidates import Observations
+from aqualvs.scanning.observations import Observations
 from aqualvs.scanning.paraboloid import fit_patch, shows_curvature
 from aqualvs.scanning.patch import FLAT, Patch, flat_patch, nearest_tangent, tangent_covariance
 from aqualvs.scanning.plane_fit import SharedError

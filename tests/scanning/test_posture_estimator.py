@@ -7,8 +7,7 @@ import pytest
 
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.sheet import sheets_of
-from aqualvs.scanning.laser_bands import plan_bands
-from aqualvs.scanning.posture_estimator import FitMethod, PostureEstimator, in_crossing
+from aqualvs.scanning.observations import StripeObserver, in_crossing
 from aqualvs.simulation.scenarios import example_rig
 from windowed_cases import windowed
 
@@ -19,7 +18,7 @@ from windowed_cases import windowed
 def test_a_crossing_zone_follows_the_other_sheet(make_rig: Callable[[], Rig]) -> None:
     rig = make_rig()
     camera, sheets = rig.camera(), sheets_of(rig)
-    processor = PostureEstimator(rig, plan_bands(rig, camera), FitMethod.ROBUST)
+    observer = StripeObserver(rig)
     pixels = np.random.default_rng(1).uniform([0, 0], rig.size_px, (20000, 2))
     points, valid = sheets[0].intersect(camera.rays(pixels))
     points = points[valid & (np.linalg.norm(points, axis=1) < 1.2)]
@@ -29,7 +28,7 @@ def test_a_crossing_zone_follows_the_other_sheet(make_rig: Callable[[], Rig]) ->
     expected = np.abs(off_px) < 1.2 * 6.0 + 2.0
     found = np.array(
         [
-            in_crossing(points, i, 0, processor._planes, processor._bent, width, rig.focal_px)
+            in_crossing(points, i, 0, observer.planes, observer.bent, width, rig.focal_px)
             for i in range(len(points))
         ]
     )

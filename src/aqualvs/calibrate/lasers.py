@@ -24,6 +24,7 @@ from aqualvs.calibrate.common import (
     picture_paths,
     read_colour,
 )
+from aqualvs.calibrate.uncalibrated_stripes import UncalibratedStripeOptions, find_stripes
 from aqualvs.calibration.detection.detection import detect_board, detect_markers
 from aqualvs.calibration.lasers.calibrate import LaserOptions
 from aqualvs.calibration.lasers.calibrate import calibrate_lasers as solve_lasers
@@ -65,7 +66,6 @@ from aqualvs.report.calibration_material import (
     residual_map,
 )
 from aqualvs.report.html import Card
-from aqualvs.scanning.uncalibrated_stripes import UncalibratedStripeOptions, find_stripes
 from aqualvs.text import laser_colour
 
 _DEG = 180.0 / math.pi

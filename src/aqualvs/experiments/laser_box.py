@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from aqualvs.calibrate.common import picture_paths, read_colour, read_grey
+from aqualvs.calibrate.uncalibrated_stripes import find_stripes
 from aqualvs.calibration.detection.detection import detect_markers
 from aqualvs.calibration.lasers.calibrate import LaserOptions, calibrate_lasers
 from aqualvs.calibration.lasers.checks import LaserCalibration, LaserFigures, like
@@ -31,7 +32,6 @@ from aqualvs.optics.expected_error import WallView, expected_posture_errors
 from aqualvs.optics.rig import Laser, Rig, merged
 from aqualvs.optics.solved import rig_uncertainty, with_uncertainty
 from aqualvs.report.figure_style import GREEN, GREY, OURS, PAPER, PURPLE, TRUTH
-from aqualvs.scanning.uncalibrated_stripes import find_stripes
 from aqualvs.text import laser_colour
 
 

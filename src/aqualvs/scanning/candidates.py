@@ -2,8 +2,7 @@
 
 `find_candidates` links each laser's peaks (`StripePeaks`) to segments and triangulates them; the
 result, `Candidates`, holds the candidate correspondences of peaks and lasers. `Subsegments`
-summarises them by subsegments, the units that agree with a surface or do not;
-`Candidates.observations` averages any groups of them, weighted by intensity.
+summarises them by subsegments, the units that agree with a surface or do not.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,11 +15,10 @@ from aqualvs.geometry.compiled import (
     ZERO,
     inline_borrowing_kernel,
     inner_kernel,
-    kernel,
     lazy_borrowing_kernel,
     lazy_kernel,
 )
-from aqualvs.geometry.linear_algebra import element_at, median_of, squared
+from aqualvs.geometry.linear_algebra import element_at, median_of
 from aqualvs.scanning.laser_bands import LaserBand, SearchAxis
 from aqualvs.scanning.segments import (
     ComponentShapes,
@@ -30,7 +28,7 @@ from aqualvs.scanning.segments import (
     run_end,
     segment_peaks,
 )
-from aqualvs.scanning.stripe import StripePeaks, flank_difference
+from aqualvs.scanning.stripe import StripePeaks
 from aqualvs.scanning.triangulate import Triangulator
 
 SOURCE, LASER, LINE, COMPONENT, SUBSEGMENT, ALONG_X = range(6)
@@ -120,13 +118,6 @@ def append_candidates(
     return begin + n
 
 
-# Position noise of a subsegment's centroid beyond that: a floor that neighbouring peaks share, and
-# a share of the spread, because a strand's light may be cut off on one side by a knot or the
-# border.
-_SUBSEGMENT_FLOOR_PX = 0.08
-_SPREAD_SHARE = 0.12
-
-
 @lazy_borrowing_kernel
 def count_subsegments(subsegment: IntArray) -> int:
     """Count subsegments whose numbers ascend."""
@@ -160,7 +151,7 @@ def summarise_subsegments(
         As in `Candidates`.
     index : int array, shape (N,)
         Written: row of each candidate's subsegment.
-    table : array, shape (7, C), light : array, shape (C,)
+    table : array, shape (7, C), intensity_weight : array, shape (C,)
         Written, as in `Subsegments`.
     facts : int array, shape (4, C)
         Written: (n_lines, first_line, last_line, laser).
@@ -248,75 +239,6 @@ def _write_sampling_weights(
         if is_curved(shapes, s):
             sampling_weight[c] *= curved_weight
         begin += n_lines[c]
-
-
-@kernel
-def summarise(
-    index: IntArray,
-    laser: IntArray,
-    line: IntArray,
-    height: FloatArray,
-    width: FloatArray,
-    points: FloatArray,
-    sensitivity: FloatArray,
-    sigma_px: FloatArray,
-    pull: FloatArray,
-    normal: FloatArray,
-    centroid: FloatArray,
-    mean_sensitivity: FloatArray,
-    group_sigma_px: FloatArray,
-    group_glow: FloatArray,
-    group_width: FloatArray,
-    group_height: FloatArray,
-    group_line: FloatArray,
-    group_laser: IntArray,
-) -> None:
-    """Write the centroids, mean sensitivities, position errors and other means of groups."""
-    n = group_sigma_px.shape[0]
-    total, spread = np.zeros(n), np.zeros(n)
-    for i in range(index.shape[0]):
-        c = index[i]
-        if c < 0:
-            continue
-        intensity_weight = height[i] * width[i]
-        total[c] += intensity_weight
-        for k in range(3):
-            centroid[c, k] += intensity_weight * points[i, k]
-            mean_sensitivity[c, k] += intensity_weight * sensitivity[i, k]
-        # Error of a weighted mean of independent positions.
-        group_sigma_px[c] += squared(intensity_weight * sigma_px[i])
-        group_glow[c] += intensity_weight * flank_difference(pull[i], width[i])
-        group_width[c] += intensity_weight * width[i]
-        group_height[c] += intensity_weight * height[i]
-        group_line[c] += intensity_weight * line[i]
-        group_laser[c] = laser[i]
-    middle = np.empty(n)
-    for c in range(n):
-        share = 1.0 / total[c]
-        middle[c] = 0.0
-        for k in range(3):
-            centroid[c, k] *= share
-            mean_sensitivity[c, k] *= share
-            middle[c] += normal[k] * centroid[c, k]
-        group_sigma_px[c] *= share * share
-        group_glow[c] *= share
-        group_width[c] *= share
-        group_height[c] *= share
-        group_line[c] *= share
-    for i in range(index.shape[0]):
-        c = index[i]
-        if c >= 0:
-            off = -middle[c]
-            for k in range(3):
-                off += normal[k] * points[i, k]
-            spread[c] += height[i] * width[i] * off * off
-    for c in range(n):
-        per_px = 0.0
-        for k in range(3):
-            per_px += normal[k] * mean_sensitivity[c, k]
-        scatter = spread[c] / (total[c] * per_px * per_px)
-        variance = group_sigma_px[c] + squared(_SPREAD_SHARE) * scatter
-        group_sigma_px[c] = np.sqrt(variance + squared(_SUBSEGMENT_FLOOR_PX))
 
 
 @dataclass(frozen=True, slots=True)
@@ -429,75 +351,6 @@ class Candidates:
             object.__setattr__(self, "_shapes", found)
             return found
         return self._shapes
-
-    def observations(self, index: IntArray, n: int, normal: FloatArray) -> "Observations":
-        """Average groups of candidates, weighted by intensity.
-
-        A strand is lit where it crosses the laser sheet, brightest in the sheet's middle; the
-        centroid of that light lies on the sheet, regardless of the strand's direction.
-
-        Parameters
-        ----------
-        index : int array, shape (N,)
-            Group of each candidate, 0 to n - 1, or -1 to leave it out; no group is empty.
-        n : int
-            Number of groups.
-        normal : array, shape (3,)
-            Approximate normal of the surface; spread is measured along it.
-        """
-        seen = Observations(
-            points=np.zeros((n, 3)),
-            sensitivity=np.zeros((n, 3)),
-            sigma_px=np.zeros(n),
-            glow=np.zeros(n),
-            width=np.zeros(n),
-            height=np.zeros(n),
-            line=np.zeros(n),
-            laser=np.empty(n, np.int64),
-        )
-        summarise(
-            index,
-            self.laser,
-            self.line,
-            self.height,
-            self.width,
-            self.points,
-            self.sensitivity,
-            self.sigma_px,
-            self.pull,
-            normal,
-            seen.points,
-            seen.sensitivity,
-            seen.sigma_px,
-            seen.glow,
-            seen.width,
-            seen.height,
-            seen.line,
-            seen.laser,
-        )
-        return seen
-
-
-@dataclass(frozen=True, slots=True)
-class Observations:
-    """Independent observations of a surface: centroids of M pieces of stripe."""
-
-    # Shape (M, 3): centroid in `dome` (m) and its derivative by the stripe's position (m/px).
-    points: FloatArray
-    sensitivity: FloatArray
-    # Shape (M,): standard deviation of that position.
-    sigma_px: FloatArray
-    # Shape (M,): mean difference between the flanks of its peaks, as a share of their height,
-    # positive where the background is brighter at greater positions.
-    glow: FloatArray
-    # Shape (M,): of its peaks, means: full width at half height along the search line, in pixels;
-    # height above the background, in grey levels.
-    width: FloatArray
-    height: FloatArray
-    # Shape (M,): mean search line.
-    line: FloatArray
-    # Shape (M,): index of the laser.
-    laser: IntArray
 
 
 def find_candidates(

@@ -24,7 +24,7 @@ from aqualvs.geometry.linear_algebra import (
     squared,
 )
 from aqualvs.geometry.planes import Plane
-from aqualvs.scanning.candidates import Observations
+from aqualvs.scanning.observations import Observations
 from aqualvs.scanning.patch import (
     COEFFICIENTS,
     NORMAL,

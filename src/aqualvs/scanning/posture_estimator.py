@@ -14,16 +14,10 @@ from typing import NamedTuple
 import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import (
-    inline_borrowing_kernel,
-    inner_kernel,
-    kernel,
-    lazy_borrowing_kernel,
-)
+from aqualvs.geometry.compiled import lazy_borrowing_kernel
 from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig import Rig
-from aqualvs.optics.sheet import COLUMNS, START, WINDOWED, sheet_distance, sheets_of
-from aqualvs.scanning.candidates import Candidates, Observations, Subsegments
+from aqualvs.scanning.candidates import Candidates, Subsegments
 from aqualvs.scanning.laser_bands import LaserBand
 from aqualvs.scanning.net_surfaces import (
     disagreement,
@@ -33,6 +27,7 @@ from aqualvs.scanning.net_surfaces import (
     mark_beside,
     share_near,
 )
+from aqualvs.scanning.observations import Observations, Observed, StripeObserver
 from aqualvs.scanning.paraboloid import MIN_BEND, fit_patch, refit_at_nearest, shows_curvature
 from aqualvs.scanning.patch import (
     Patch,
@@ -56,124 +51,6 @@ from aqualvs.scanning.plane_fit import (
 from aqualvs.scanning.posture import MAX_RMS_SHARE, Posture, Reason, Refusal, posture_of, validate
 from aqualvs.scanning.region_growing import SOME, grow_region, has_much_beside
 from aqualvs.scanning.surfaces import Surface
-
-
-@kernel
-def select_units(
-    points: FloatArray,
-    laser: IntArray,
-    width: FloatArray,
-    unit: IntArray,
-    min_lines: int,
-    on_target: BoolArray,
-    planes: FloatArray,
-    bent: FloatArray | None,
-    focal_px: float,
-    group: IntArray,
-) -> tuple[int, int]:
-    """Assign numbers to pieces of stripe on the target, -1 to candidates elsewhere or in crossings.
-
-    A piece is used as a whole: the centre of a part of a strand's light would be off the sheet.
-
-    Parameters
-    ----------
-    points, laser, width
-        Of N candidates.
-    unit : int array, shape (N,)
-        Number of each candidate's piece: its component or its subsegment.
-    min_lines : int
-        Shorter pieces are left out.
-    on_target : bool array, shape (N,)
-        Candidates on the target.
-    planes : array, shape (n_lasers, 4)
-        The lasers' sheets, normal and offset.
-    bent : array, shape (n_lasers, COLUMNS), or None
-        The sheets, if windows bend any of them.
-    focal_px : float
-        Pixels per radian, roughly.
-    group : int array, shape (N,)
-        Written.
-
-    Returns
-    -------
-    n_groups, n_candidates : int
-        Number of groups, and of candidates in them.
-    """
-    number = _units_on(unit, min_lines, on_target)
-    mean_width = _mean_widths(laser, width, unit, number, planes.shape[0])
-    n_groups = 0
-    n_candidates = 0
-    for i in range(unit.shape[0]):
-        group[i] = -1
-        p = unit[i]
-        if number[p] == -1 or in_crossing(points, i, laser[i], planes, bent, mean_width, focal_px):
-            continue
-        if number[p] == -2:
-            number[p] = n_groups
-            n_groups += 1
-        group[i] = number[p]
-        n_candidates += 1
-    return n_groups, n_candidates
-
-
-@inner_kernel
-def _units_on(unit: IntArray, min_lines: int, on_target: BoolArray) -> IntArray:
-    """Return -2 for each piece on the target that is long enough, -1 for others."""
-    n_planes = 0
-    for i in range(unit.shape[0]):
-        n_planes = max(n_planes, unit[i] + 1)
-    number, lines = np.full(n_planes, -1), np.zeros(n_planes, np.int64)
-    for i in range(unit.shape[0]):
-        lines[unit[i]] += 1
-        if on_target[i]:
-            number[unit[i]] = -2
-    for p in range(n_planes):
-        if lines[p] < min_lines:
-            number[p] = -1
-    return number
-
-
-@inner_kernel
-def _mean_widths(
-    laser: IntArray, width: FloatArray, unit: IntArray, number: IntArray, n_lasers: int
-) -> FloatArray:
-    """Return each laser's mean stripe width; single widths are inflated by the crossing itself."""
-    total, count = np.zeros(n_lasers), np.zeros(n_lasers)
-    for i in range(unit.shape[0]):
-        if number[unit[i]] != -1:
-            total[laser[i]] += width[i]
-            count[laser[i]] += 1.0
-    for index in range(n_lasers):
-        total[index] = total[index] / count[index] if count[index] > 0.0 else -1.0
-    return total
-
-
-@inline_borrowing_kernel
-def in_crossing(
-    points: FloatArray,
-    i: int,
-    own: int,
-    planes: FloatArray,
-    bent: FloatArray | None,
-    mean_width: FloatArray,
-    focal_px: float,
-) -> bool:
-    """Return whether another laser's stripe crosses the target here (paper, section 3.1)."""
-    x, y, z = points[i, 0], points[i, 1], points[i, 2]
-    m_per_px = np.sqrt(x * x + y * y + z * z) / focal_px
-    # Reach of a crossing: this many full widths of the stripes, and this many pixels more.
-    crossing_widths = 1.2
-    crossing_px = 2.0
-    for b in range(planes.shape[0]):
-        if b == own or mean_width[b] < 0.0:
-            continue
-        gap = planes[b, 0] * x + planes[b, 1] * y + planes[b, 2] * z - planes[b, 3]
-        if bent is not None:
-            gap = sheet_distance(bent[b], x, y, z)
-        wide = max(mean_width[b], mean_width[own])
-        if abs(gap) < (crossing_widths * wide + crossing_px) * m_per_px:
-            return True
-    return False
 
 
 @lazy_borrowing_kernel
@@ -259,10 +136,8 @@ class PostureEstimator:
         self._n_lines = np.array([len(search.lowest) for search in laser_bands])
         self._position_px = np.array([search.position_px for search in laser_bands])
         self._working_range = rig.working_range
-        sheets = np.array([one.packed() for one in sheets_of(rig)]).reshape(-1, COLUMNS)
-        self._planes = np.ascontiguousarray(sheets[:, START : START + 4])
-        # A kernel that is given None is compiled without the code for bent sheets.
-        self._bent = sheets if sheets[:, WINDOWED].any() else None
+        self._n_lasers = len(rig.lasers)
+        self._observer = StripeObserver(rig)
         self._focal_px = rig.focal_px
         in_fields = rig.shutter.is_interlaced
         self._shortest_strand = _SHORTEST_IN_FIELD if in_fields else _SHORTEST_STRAND
@@ -292,7 +167,7 @@ class PostureEstimator:
             (candidates.component, self._shortest_strand) if mesh else (candidates.subsegment, 1)
         )
         on_target = target.members[subsegments.of_candidate]
-        seen = self._observe(candidates, unit, min_lines, on_target, target.plane.normal)
+        seen = self._observer.observe(candidates, unit, min_lines, on_target, target.plane.normal)
         if seen.n_candidates < MIN_LINES:
             detail = f"only {seen.n_candidates} stripe points outside crossings"
             return _refused(candidates, Refusal(Reason.TOO_FEW_POINTS, detail))
@@ -326,7 +201,7 @@ class PostureEstimator:
     def _measure_net(
         self,
         candidates: Candidates,
-        seen: "_Observed",
+        seen: Observed,
         fit: PlaneFit,
         flat: Measurement,
         target: Surface,
@@ -360,7 +235,7 @@ class PostureEstimator:
         return replace(best, net_mask=net_mask)
 
     def _measure_folds(
-        self, candidates: Candidates, seen: "_Observed", fit: PlaneFit
+        self, candidates: Candidates, seen: Observed, fit: PlaneFit
     ) -> Measurement | None:
         """Measure the posture to the mean plane of a net of which one laser alone fits a plane.
 
@@ -379,7 +254,7 @@ class PostureEstimator:
         folded = self._mean_plane_of_folds(candidates, net_mask, seen, share, plane, patch, None)
         if folded is None:
             return None
-        for index in range(len(self._planes)):
+        for index in range(self._n_lasers):
             mine = folded.inliers & (candidates.laser == index)
             if len(np.unique(candidates.component[mine])) < _MIN_OBSERVATIONS:
                 return None
@@ -409,7 +284,7 @@ class PostureEstimator:
         self,
         candidates: Candidates,
         net_mask: BoolArray,
-        seen: "_Observed",
+        seen: Observed,
         share: float,
         plane: Plane,
         patch: FloatArray,
@@ -443,7 +318,7 @@ class PostureEstimator:
         return self._widened_by_all(mean.found, mean.seen, mean.share, folded=True)
 
     def _widened(
-        self, best: Measurement, seen: "_Observed", plane: Plane, intensity_share: float
+        self, best: Measurement, seen: Observed, plane: Plane, intensity_share: float
     ) -> Measurement:
         """Widen a posture by the mean plane of the light near it; `intensity_share` is its own."""
         fit = fit_mean(seen.observations.points, seen.observations.laser, plane)
@@ -456,7 +331,7 @@ class PostureEstimator:
         return replace(best, posture=inflate_covariance(best.posture, mean, share))
 
     def _widened_by_all(
-        self, found: Measurement, seen: "_Observed", share: float, *, folded: bool = False
+        self, found: Measurement, seen: Observed, share: float, *, folded: bool = False
     ) -> Measurement:
         """Widen a posture, which a share of a net's light supports, by the plane of all strands.
 
@@ -477,11 +352,11 @@ class PostureEstimator:
 
     def _beside(
         self, candidates: Candidates, net_mask: BoolArray, off: FloatArray, plane: Plane
-    ) -> "_Observed":
+    ) -> Observed:
         """Average the pieces of stripe of a net, and those near a plane that may be the net's."""
         beside = np.empty(len(candidates), np.bool_)
         mark_beside(candidates.source, net_mask, off, _BESIDE_SHARE, beside)
-        return self._observe(
+        return self._observer.observe(
             candidates, candidates.component, self._shortest_strand, beside, plane.normal
         )
 
@@ -508,7 +383,7 @@ class PostureEstimator:
         return mean
 
     def _mean_plane(
-        self, candidates: Candidates, seen: "_Observed", plane: Plane
+        self, candidates: Candidates, seen: Observed, plane: Plane
     ) -> "_MeanPlane | None":
         """Measure the posture to the mean plane of a folded net."""
         fit = fit_mean(seen.observations.points, seen.observations.laser, plane)
@@ -529,7 +404,7 @@ class PostureEstimator:
         is_curved: bool,
     ) -> Measurement:
         """Return the measurement, widened or replaced by the mean plane if the net is folds."""
-        seen = self._observe(
+        seen = self._observer.observe(
             candidates, candidates.component, self._shortest_strand, net_mask, plane.normal
         )
         share = _share_on(seen, patch, plane)
@@ -557,7 +432,7 @@ class PostureEstimator:
     ) -> Measurement | None:
         """Measure the posture to a curved net; None where a plane is as good."""
         near = off < _DEEPEST_BEND
-        seen = self._observe(
+        seen = self._observer.observe(
             candidates, candidates.component, self._shortest_strand, near, plane.normal
         )
         if not len(seen.observations.laser):
@@ -577,31 +452,7 @@ class PostureEstimator:
         bent = replace(found.posture, curvature=tuple(along), sigma_curvature=tuple(sigma))
         return replace(found, posture=bent, patch=fit.patch)
 
-    def _observe(
-        self,
-        candidates: Candidates,
-        unit: IntArray,
-        min_lines: int,
-        on_target: BoolArray,
-        normal: FloatArray,
-    ) -> "_Observed":
-        """Average the pieces of stripe on a target, those in crossings left out."""
-        group = np.empty(len(candidates), np.int64)
-        n_groups, n_candidates = select_units(
-            candidates.points,
-            candidates.laser,
-            candidates.width,
-            unit,
-            min_lines,
-            on_target,
-            self._planes,
-            self._bent,
-            self._focal_px,
-            group,
-        )
-        return _Observed(group, n_candidates, candidates.observations(group, n_groups, normal))
-
-    def _fit(self, candidates: Candidates, seen: "_Observed", target: Surface) -> PlaneFit | None:
+    def _fit(self, candidates: Candidates, seen: Observed, target: Surface) -> PlaneFit | None:
         observations = seen.observations
         along = np.empty(len(observations.line))
         places_along(observations.line, observations.laser, self._n_lines, along)
@@ -631,7 +482,7 @@ class PostureEstimator:
         return shared_error(seen.glow, twine, position_px)
 
     def _posture_of_fit(
-        self, candidates: Candidates, seen: "_Observed", fit: PlaneFit, *, of_all: bool = False
+        self, candidates: Candidates, seen: Observed, fit: PlaneFit, *, of_all: bool = False
     ) -> Measurement | None:
         """Return the posture of a fit; None unless a second laser determines the plane's angles.
 
@@ -661,23 +512,15 @@ class PostureEstimator:
         return Measurement(posture, inliers, weights=weights)
 
 
-class _Observed(NamedTuple):
-    """Pieces of stripe on a surface; each candidate's piece (-1: none), number of candidates."""
-
-    group: IntArray
-    n_candidates: int
-    observations: Observations
-
-
 class _MeanPlane(NamedTuple):
     """Mean plane of a folded net, the strands it is fitted to, and the share that it explains."""
 
     found: Measurement
-    seen: _Observed
+    seen: Observed
     share: float
 
 
-def _share_on(seen: _Observed, patch: FloatArray, plane: Plane) -> float:
+def _share_on(seen: Observed, patch: FloatArray, plane: Plane) -> float:
     """Return the share of a net's strands on its surface; 1 where few strands show no folds."""
     if len(seen.observations.laser) < _MIN_FOLDED:
         return 1.0

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from aqualvs.calibrate.uncalibrated_stripes import find_stripes
 from aqualvs.calibration.detection.detection import detect_markers
 from aqualvs.calibration.lasers.calibrate import LaserOptions, calibrate_lasers
 from aqualvs.calibration.lasers.stripes_on_planes import StripePoints, board_surface, box_surfaces
@@ -13,7 +14,6 @@ from aqualvs.calibration.lasers.views import LaserView
 from aqualvs.calibration.targets.target_files import load_box
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.optics.rig import LASER_PARAMETERS, Rig, RigUncertainty, rig_moved_by, tangent_basis
-from aqualvs.scanning.uncalibrated_stripes import find_stripes
 from aqualvs.simulation.scenarios import example_rig
 from laser_cases import (
     Noise,

@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from aqualvs.errors import OptionError
-from aqualvs.scanning.scan import Frame
-from aqualvs.scanning.uncalibrated_stripes import (
+from aqualvs.calibrate.uncalibrated_stripes import (
     StripePixels,
     UncalibratedStripeOptions,
     find_stripes,
 )
+from aqualvs.errors import OptionError
+from aqualvs.scanning.scan import Frame
 
 SIZE = (360, 240)
 

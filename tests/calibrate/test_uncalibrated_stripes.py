@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from aqualvs.calibrate.uncalibrated_stripes import continued
 from aqualvs.scanning.laser_bands import LaserBand, SearchAxis
 from aqualvs.scanning.laser_colour import LaserColour
 from aqualvs.scanning.stripe import StripePeaks
@@ -19,7 +20,6 @@ from aqualvs.scanning.stripe_segments import (
     StripeSegments,
     place_evidence,
 )
-from aqualvs.scanning.uncalibrated_stripes import continued
 
 SIZE = (320, 240)
 # x of the first and of the last peak, y of the first, and slope.

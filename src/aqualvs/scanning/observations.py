@@ -1,0 +1,348 @@
+"""Observations: the pieces of stripe on a surface, averaged outside crossings.
+
+`observe` selects the pieces of stripe on a target, components or subsegments, leaves out where the
+stripe of another laser crosses them, and averages the rest of each, weighted by intensity.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.geometry.compiled import inline_borrowing_kernel, inner_kernel, kernel
+from aqualvs.geometry.linear_algebra import squared
+from aqualvs.optics.rig import Rig
+from aqualvs.optics.sheet import COLUMNS, START, WINDOWED, sheet_distance, sheets_of
+from aqualvs.scanning.candidates import Candidates
+from aqualvs.scanning.stripe import flank_difference
+
+# Position noise of a subsegment's centroid beyond that: a floor that neighbouring peaks share, and
+# a share of the spread, because a strand's light may be cut off on one side by a knot or the
+# border.
+_SUBSEGMENT_FLOOR_PX = 0.08
+_SPREAD_SHARE = 0.12
+
+
+@dataclass(frozen=True, slots=True)
+class Observations:
+    """Independent observations of a surface: centroids of M pieces of stripe."""
+
+    # Shape (M, 3): centroid in `dome` (m) and its derivative by the stripe's position (m/px).
+    points: FloatArray
+    sensitivity: FloatArray
+    # Shape (M,): standard deviation of that position.
+    sigma_px: FloatArray
+    # Shape (M,): mean difference between the flanks of its peaks, as a share of their height,
+    # positive where the background is brighter at greater positions.
+    glow: FloatArray
+    # Shape (M,): of its peaks, means: full width at half height along the search line, in pixels;
+    # height above the background, in grey levels.
+    width: FloatArray
+    height: FloatArray
+    # Shape (M,): mean search line.
+    line: FloatArray
+    # Shape (M,): index of the laser.
+    laser: IntArray
+
+
+class Observed(NamedTuple):
+    """What a frame shows of one surface."""
+
+    group: IntArray  # Shape (N,): each candidate's piece of stripe; -1 for those in none.
+    n_candidates: int  # In pieces.
+    observations: Observations  # Of the pieces.
+
+
+class StripeObserver:
+    """Selection and averaging of the pieces of stripe on surfaces before one rig.
+
+    Parameters
+    ----------
+    rig : Rig
+        Its lasers and focal length.
+    """
+
+    def __init__(self, rig: Rig) -> None:
+        sheets = np.array([one.packed() for one in sheets_of(rig)]).reshape(-1, COLUMNS)
+        self.planes = np.ascontiguousarray(sheets[:, START : START + 4])
+        # A kernel that is given None is compiled without the code for bent sheets.
+        self.bent = sheets if sheets[:, WINDOWED].any() else None
+        self._focal_px = rig.focal_px
+
+    def observe(
+        self,
+        candidates: Candidates,
+        unit: IntArray,
+        min_lines: int,
+        on_target: BoolArray,
+        normal: FloatArray,
+    ) -> Observed:
+        """Average the pieces of stripe on a target, those in crossings left out.
+
+        Parameters
+        ----------
+        candidates : Candidates
+            N of them.
+        unit : int array, shape (N,)
+            Number of each candidate's piece: its component or its subsegment.
+        min_lines : int
+            Shorter pieces are left out.
+        on_target : bool array, shape (N,)
+            Candidates on the target.
+        normal : array, shape (3,)
+            Approximate normal of the surface; spread is measured along it.
+        """
+        group = np.empty(len(candidates), np.int64)
+        n, n_candidates = select_units(
+            candidates.points,
+            candidates.laser,
+            candidates.width,
+            unit,
+            min_lines,
+            on_target,
+            self.planes,
+            self.bent,
+            self._focal_px,
+            group,
+        )
+        return Observed(group, n_candidates, average_groups(candidates, group, n, normal))
+
+
+def average_groups(
+    candidates: Candidates, group: IntArray, n_groups: int, normal: FloatArray
+) -> Observations:
+    """Average groups of candidates, weighted by intensity.
+
+    A strand is lit where it crosses the laser sheet, brightest in the sheet's middle; the centroid
+    of that light lies on the sheet, regardless of the strand's direction.
+
+    Parameters
+    ----------
+    candidates : Candidates
+        N of them.
+    group : int array, shape (N,)
+        Group of each candidate, 0 to `n_groups` - 1, or -1 to leave it out; no group is empty.
+    n_groups : int
+        Number of groups.
+    normal : array, shape (3,)
+        Approximate normal of the surface; spread is measured along it.
+    """
+    seen = Observations(
+        points=np.zeros((n_groups, 3)),
+        sensitivity=np.zeros((n_groups, 3)),
+        sigma_px=np.zeros(n_groups),
+        glow=np.zeros(n_groups),
+        width=np.zeros(n_groups),
+        height=np.zeros(n_groups),
+        line=np.zeros(n_groups),
+        laser=np.empty(n_groups, np.int64),
+    )
+    summarise(
+        group,
+        candidates.laser,
+        candidates.line,
+        candidates.height,
+        candidates.width,
+        candidates.points,
+        candidates.sensitivity,
+        candidates.sigma_px,
+        candidates.pull,
+        normal,
+        seen.points,
+        seen.sensitivity,
+        seen.sigma_px,
+        seen.glow,
+        seen.width,
+        seen.height,
+        seen.line,
+        seen.laser,
+    )
+    return seen
+
+
+@kernel
+def select_units(
+    points: FloatArray,
+    laser: IntArray,
+    width: FloatArray,
+    unit: IntArray,
+    min_lines: int,
+    on_target: BoolArray,
+    planes: FloatArray,
+    bent: FloatArray | None,
+    focal_px: float,
+    group: IntArray,
+) -> tuple[int, int]:
+    """Assign numbers to pieces of stripe on the target, -1 to candidates elsewhere or in crossings.
+
+    A piece is used as a whole: the centre of a part of a strand's light would be off the sheet.
+
+    Parameters
+    ----------
+    points, laser, width
+        Of N candidates.
+    unit : int array, shape (N,)
+        Number of each candidate's piece: its component or its subsegment.
+    min_lines : int
+        Shorter pieces are left out.
+    on_target : bool array, shape (N,)
+        Candidates on the target.
+    planes : array, shape (n_lasers, 4)
+        The lasers' sheets, normal and offset.
+    bent : array, shape (n_lasers, COLUMNS), or None
+        The sheets, if windows bend any of them.
+    focal_px : float
+        Pixels per radian, roughly.
+    group : int array, shape (N,)
+        Written.
+
+    Returns
+    -------
+    n_groups, n_candidates : int
+        Number of groups, and of candidates in them.
+    """
+    number = _units_on(unit, min_lines, on_target)
+    mean_width = _mean_widths(laser, width, unit, number, planes.shape[0])
+    n_groups = 0
+    n_candidates = 0
+    for i in range(unit.shape[0]):
+        group[i] = -1
+        p = unit[i]
+        if number[p] == -1 or in_crossing(points, i, laser[i], planes, bent, mean_width, focal_px):
+            continue
+        if number[p] == -2:
+            number[p] = n_groups
+            n_groups += 1
+        group[i] = number[p]
+        n_candidates += 1
+    return n_groups, n_candidates
+
+
+@inner_kernel
+def _units_on(unit: IntArray, min_lines: int, on_target: BoolArray) -> IntArray:
+    """Return -2 for each piece on the target that is long enough, -1 for others."""
+    n_planes = 0
+    for i in range(unit.shape[0]):
+        n_planes = max(n_planes, unit[i] + 1)
+    number, lines = np.full(n_planes, -1), np.zeros(n_planes, np.int64)
+    for i in range(unit.shape[0]):
+        lines[unit[i]] += 1
+        if on_target[i]:
+            number[unit[i]] = -2
+    for p in range(n_planes):
+        if lines[p] < min_lines:
+            number[p] = -1
+    return number
+
+
+@inner_kernel
+def _mean_widths(
+    laser: IntArray, width: FloatArray, unit: IntArray, number: IntArray, n_lasers: int
+) -> FloatArray:
+    """Return each laser's mean stripe width; single widths are inflated by the crossing itself."""
+    total, count = np.zeros(n_lasers), np.zeros(n_lasers)
+    for i in range(unit.shape[0]):
+        if number[unit[i]] != -1:
+            total[laser[i]] += width[i]
+            count[laser[i]] += 1.0
+    for index in range(n_lasers):
+        total[index] = total[index] / count[index] if count[index] > 0.0 else -1.0
+    return total
+
+
+@inline_borrowing_kernel
+def in_crossing(
+    points: FloatArray,
+    i: int,
+    own: int,
+    planes: FloatArray,
+    bent: FloatArray | None,
+    mean_width: FloatArray,
+    focal_px: float,
+) -> bool:
+    """Return whether another laser's stripe crosses the target here (paper, section 3.1)."""
+    x, y, z = points[i, 0], points[i, 1], points[i, 2]
+    m_per_px = np.sqrt(x * x + y * y + z * z) / focal_px
+    # Reach of a crossing: this many full widths of the stripes, and this many pixels more.
+    crossing_widths = 1.2
+    crossing_px = 2.0
+    for b in range(planes.shape[0]):
+        if b == own or mean_width[b] < 0.0:
+            continue
+        gap = planes[b, 0] * x + planes[b, 1] * y + planes[b, 2] * z - planes[b, 3]
+        if bent is not None:
+            gap = sheet_distance(bent[b], x, y, z)
+        wide = max(mean_width[b], mean_width[own])
+        if abs(gap) < (crossing_widths * wide + crossing_px) * m_per_px:
+            return True
+    return False
+
+
+@kernel
+def summarise(
+    index: IntArray,
+    laser: IntArray,
+    line: IntArray,
+    height: FloatArray,
+    width: FloatArray,
+    points: FloatArray,
+    sensitivity: FloatArray,
+    sigma_px: FloatArray,
+    pull: FloatArray,
+    normal: FloatArray,
+    centroid: FloatArray,
+    mean_sensitivity: FloatArray,
+    group_sigma_px: FloatArray,
+    group_glow: FloatArray,
+    group_width: FloatArray,
+    group_height: FloatArray,
+    group_line: FloatArray,
+    group_laser: IntArray,
+) -> None:
+    """Write the centroids, mean sensitivities, position errors and other means of groups."""
+    n = group_sigma_px.shape[0]
+    total, spread = np.zeros(n), np.zeros(n)
+    for i in range(index.shape[0]):
+        c = index[i]
+        if c < 0:
+            continue
+        intensity_weight = height[i] * width[i]
+        total[c] += intensity_weight
+        for k in range(3):
+            centroid[c, k] += intensity_weight * points[i, k]
+            mean_sensitivity[c, k] += intensity_weight * sensitivity[i, k]
+        # Error of a weighted mean of independent positions.
+        group_sigma_px[c] += squared(intensity_weight * sigma_px[i])
+        group_glow[c] += intensity_weight * flank_difference(pull[i], width[i])
+        group_width[c] += intensity_weight * width[i]
+        group_height[c] += intensity_weight * height[i]
+        group_line[c] += intensity_weight * line[i]
+        group_laser[c] = laser[i]
+    middle = np.empty(n)
+    for c in range(n):
+        share = 1.0 / total[c]
+        middle[c] = 0.0
+        for k in range(3):
+            centroid[c, k] *= share
+            mean_sensitivity[c, k] *= share
+            middle[c] += normal[k] * centroid[c, k]
+        group_sigma_px[c] *= share * share
+        group_glow[c] *= share
+        group_width[c] *= share
+        group_height[c] *= share
+        group_line[c] *= share
+    for i in range(index.shape[0]):
+        c = index[i]
+        if c >= 0:
+            off = -middle[c]
+            for k in range(3):
+                off += normal[k] * points[i, k]
+            spread[c] += height[i] * width[i] * off * off
+    for c in range(n):
+        per_px = 0.0
+        for k in range(3):
+            per_px += normal[k] * mean_sensitivity[c, k]
+        scatter = spread[c] / (total[c] * per_px * per_px)
+        variance = group_sigma_px[c] + squared(_SPREAD_SHARE) * scatter
+        group_sigma_px[c] = np.sqrt(variance + squared(_SUBSEGMENT_FLOOR_PX))
