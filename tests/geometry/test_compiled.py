@@ -136,6 +136,31 @@ def test_cached_kernels_follow_their_callees(tmp_path: Path) -> None:
     assert run_caller(tmp_path) == ["2001", "0"]
 
 
+EDITING = """
+import sys
+from pathlib import Path
+from aqualvs.geometry.compiled import compiled_at_once, lazy_kernel
+from callee import step
+
+@lazy_kernel
+def twice(x):
+    return step(step(x))
+
+if len(sys.argv) > 1:
+    path = Path("callee.py")
+    path.write_text(path.read_text().replace("+ 1", "+ 1000"))
+with compiled_at_once():
+    print(int(twice(1)))
+"""
+
+
+def test_code_from_before_an_edit_is_not_kept_as_that_from_after(tmp_path: Path) -> None:
+    (tmp_path / "editing.py").write_text(EDITING)
+    (tmp_path / "callee.py").write_text(CALLEE.format(increment=1))
+    assert run_caller(tmp_path, "editing.py", "edit") == ["3"]
+    assert run_caller(tmp_path, "editing.py") == ["2001"]
+
+
 LAZY = """
 import sys
 import numpy as np

@@ -132,6 +132,11 @@ class Laboratory:
         Folder for the dives; kept, so that another run finds them.
     tick : callable, optional
         Called with the number of frames rendered since the last call.
+
+    Attributes
+    ----------
+    frame_s : list of float
+        Seconds that the scanner took for each frame that it measured with its default options.
     """
 
     def __init__(self, work: Path, tick: Callable[[int], None] | None = None) -> None:

@@ -162,6 +162,7 @@ class _LazyKernel:
         functools.update_wrapper(self, function)
         self.py_func = function
         self._options = options
+        _stamp_of(function.__code__.co_filename)
         self._run = self._run_first
         self._left_s = 0.0
 
@@ -270,6 +271,7 @@ class _InnerKernel:
         functools.update_wrapper(self, function)
         self.py_func = function
         self._options = options
+        _stamp_of(function.__code__.co_filename)
 
     def __call__(self, *arguments: Any) -> Any:
         run = self.py_func if _interpreter.runs else self._for_python
@@ -324,7 +326,7 @@ def _depend_on_callees(compiled: Any, options: str) -> None:
     if own is None:
         return
     files = sorted(_files_of_kernels(compiled.py_func))
-    own._source_stamp = (*own._source_stamp, options, *map(_stamp_of, files))
+    own._source_stamp = (options, *map(_stamp_of, files))
     own._load_index = _forgiving(own._load_index)
 
 
@@ -349,6 +351,10 @@ _files: dict[str, frozenset[str]] = {}
 
 @functools.cache
 def _stamp_of(path: str) -> tuple[int, int]:
+    """Return the stamp of a file as it was when its first kernel was imported.
+
+    It may be edited before a kernel is compiled, from the code of before.
+    """
     status = os.stat(path)
     return status.st_mtime_ns, status.st_size
 
