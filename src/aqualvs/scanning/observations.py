@@ -17,9 +17,9 @@ from aqualvs.optics.sheet import COLUMNS, START, WINDOWED, sheet_distance, sheet
 from aqualvs.scanning.candidates import Candidates
 from aqualvs.scanning.stripe import flank_difference
 
-# Position noise of a subsegment's centroid beyond that: a floor that neighbouring peaks share, and
-# a share of the spread, because a strand's light may be cut off on one side by a knot or the
-# border.
+# Position noise of a piece's centroid beyond that of its peaks: a floor that neighbouring peaks
+# share, and a share of the spread, because a strand's light may be cut off on one side by a knot or
+# the border.
 _SUBSEGMENT_FLOOR_PX = 0.08
 _SPREAD_SHARE = 0.12
 
