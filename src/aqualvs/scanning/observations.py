@@ -182,12 +182,8 @@ def select_units(
     ----------
     points, laser, width
         Of N candidates.
-    unit : int array, shape (N,)
-        Number of each candidate's piece: its component or its subsegment.
-    min_lines : int
-        Shorter pieces are left out.
-    on_target : bool array, shape (N,)
-        Candidates on the target.
+    unit, min_lines, on_target
+        As in `StripeObserver.observe`.
     planes : array, shape (n_lasers, 4)
         The lasers' sheets, normal and offset.
     bent : array, shape (n_lasers, COLUMNS), or None
