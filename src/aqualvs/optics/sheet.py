@@ -564,3 +564,12 @@ def packed_sheets(rig: Rig, camera: Camera) -> FloatArray:
     """
     rows = [s.packed(s.best_plane(camera, rig.working_range)) for s in sheets_of(rig)]
     return np.array(rows).reshape(-1, COLUMNS)
+
+
+def planes_and_bent(sheets: FloatArray) -> tuple[FloatArray, FloatArray | None]:
+    """Return the planes of packed sheets, and the sheets if windows bend any of them.
+
+    A kernel that is given None is compiled without the code for bent sheets.
+    """
+    planes = np.ascontiguousarray(sheets[:, START : START + 4])
+    return planes, sheets if sheets[:, WINDOWED].any() else None

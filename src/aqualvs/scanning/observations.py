@@ -13,7 +13,7 @@ from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import inline_borrowing_kernel, inner_kernel, kernel
 from aqualvs.geometry.linear_algebra import squared
 from aqualvs.optics.rig import Rig
-from aqualvs.optics.sheet import COLUMNS, START, WINDOWED, sheet_distance, sheets_of
+from aqualvs.optics.sheet import COLUMNS, planes_and_bent, sheet_distance, sheets_of
 from aqualvs.scanning.candidates import Candidates
 from aqualvs.scanning.stripe import flank_difference
 
@@ -65,9 +65,7 @@ class StripeObserver:
 
     def __init__(self, rig: Rig) -> None:
         sheets = np.array([one.packed() for one in sheets_of(rig)]).reshape(-1, COLUMNS)
-        self.planes = np.ascontiguousarray(sheets[:, START : START + 4])
-        # A kernel that is given None is compiled without the code for bent sheets.
-        self.bent = sheets if sheets[:, WINDOWED].any() else None
+        self.planes, self.bent = planes_and_bent(sheets)
         self._focal_px = rig.focal_px
 
     def observe(

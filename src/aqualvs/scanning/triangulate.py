@@ -13,7 +13,7 @@ from aqualvs.geometry.compiled import (
 )
 from aqualvs.optics.camera import Camera, rays_all
 from aqualvs.optics.rig import Rig
-from aqualvs.optics.sheet import START, WINDOWED, meet_sheet, packed_sheets
+from aqualvs.optics.sheet import WINDOWED, meet_sheet, packed_sheets, planes_and_bent
 
 # Step of the one-sided difference, in pixels; the second derivative of a point by the pixel is
 # about 1e-2 of the first, so the error stays below 1 % of a sensitivity.
@@ -46,10 +46,7 @@ class Triangulator:
 
     def __init__(self, rig: Rig, camera: Camera) -> None:
         self._camera = camera
-        sheets = packed_sheets(rig, camera)
-        self._planes = np.ascontiguousarray(sheets[:, START : START + 4])
-        # A kernel that is given None is compiled without the code for bent sheets.
-        self._bent = sheets if sheets[:, WINDOWED].any() else None
+        self._planes, self._bent = planes_and_bent(packed_sheets(rig, camera))
 
     def triangulate(
         self, pixels: FloatArray, along_x: IntArray, laser: IntArray, group: IntArray | None = None
