@@ -102,17 +102,15 @@ def _cost() -> list[dict[str, Any]]:
     candidates = find_candidates(peaks, laser_bands, Triangulator(rig, camera))
     rows = []
     for n in (500, 1000, 2000, 4000):
-        some = candidates.where(np.arange(len(candidates)) % max(len(candidates) / n, 1.0) < 1.0)
+        some = candidates.where(np.arange(candidates.n) % max(candidates.n / n, 1.0) < 1.0)
         value = _label_ms(some, laser_bands)
-        rows.append(
-            _row(f"labels, {len(some)} readings", value, "ms", _TARGET_MS, _TARGET_MS / value)
-        )
+        rows.append(_row(f"labels, {some.n} readings", value, "ms", _TARGET_MS, _TARGET_MS / value))
     return rows
 
 
 def _label_ms(candidates: Candidates, laser_bands: Any) -> float:
     rig = example_rig()
-    subsegments = candidates.subsegments()
+    subsegments, shapes = candidates.subsegments()
     reach = search_range(rig.working_range)
     surfaces = find_surfaces(subsegments, candidates.pixels, 3, reach, rig.focal_px)
     target = choose_target(surfaces, TargetKind.AUTO, rig.working_range)
@@ -123,7 +121,9 @@ def _label_ms(candidates: Candidates, laser_bands: Any) -> float:
     times = []
     for _ in range(100):
         start = time.perf_counter()
-        label_candidates(candidates, subsegments, surfaces, target, found, rig.working_range)
+        label_candidates(
+            candidates, subsegments, shapes, surfaces, target, found, rig.working_range
+        )
         times.append(time.perf_counter() - start)
     return float(np.median(times)) * 1e3
 

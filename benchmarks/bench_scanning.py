@@ -197,7 +197,7 @@ def stage_rows(case: Case, name: str) -> list[dict[str, Any]]:
     candidates = find_candidates(peaks, laser_bands, triangulator)
 
     def surfaces() -> tuple[Subsegments, Any]:
-        subsegments = candidates.subsegments()
+        subsegments, _ = candidates.subsegments()
         found = find_surfaces(
             subsegments, candidates.pixels, len(rig.lasers), (0.8 * near, 1.2 * far), rig.focal_px
         )

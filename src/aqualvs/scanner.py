@@ -26,6 +26,7 @@ from aqualvs.scanning.patch import Patch, fitted_patch
 from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.posture_estimator import MIN_LINES, FitMethod, Measurement, PostureEstimator
 from aqualvs.scanning.scan import Frame, Scan, ScanPoints
+from aqualvs.scanning.segments import ComponentShapes
 from aqualvs.scanning.stripe import StripeOptions, StripePeaks
 from aqualvs.scanning.surfaces import (
     MIN_LINES_PER_LASER,
@@ -73,6 +74,7 @@ class _Stripes(NamedTuple):
 
     candidates: Candidates
     subsegments: Subsegments
+    shapes: ComponentShapes  # Of the candidates' components.
     assignment: AssignmentTest
 
 
@@ -181,7 +183,7 @@ class Scanner:
         found, points, listed = self._estimate(candidates, view.assignment)
         if self._paper_filter is not None:
             # The paper's filter needs the laser of each peak, which is known by now.
-            kept = np.zeros(len(candidates), np.bool_)
+            kept = np.zeros(candidates.n, np.bool_)
             kept[listed] = _on_mesh(self._paper_filter, points)
             candidates = candidates.where(kept)
             found, points, _ = self._estimate(candidates, view.assignment)
@@ -225,7 +227,7 @@ class Scanner:
     ) -> tuple[Measurement, ScanPoints, IntArray]:
         """Return the posture, the labelled points, and the rows of their candidates."""
         # Planes that several lasers agree on.
-        subsegments = candidates.subsegments()
+        subsegments, shapes = candidates.subsegments()
         surfaces = find_surfaces(
             subsegments,
             candidates.pixels,
@@ -234,12 +236,18 @@ class Scanner:
             self.rig.focal_px,
         )
         # The one that is the target, and the posture from its points outside crossing zones.
-        stripes = _Stripes(candidates, subsegments, assignment)
+        stripes = _Stripes(candidates, subsegments, shapes, assignment)
         choice = self._choose(stripes, surfaces)
         found = self._measured(stripes, choice)
         # What every point lies on.
         points, listed = label_candidates(
-            candidates, subsegments, choice.surfaces, choice.target, found, self.rig.working_range
+            candidates,
+            subsegments,
+            shapes,
+            choice.surfaces,
+            choice.target,
+            found,
+            self.rig.working_range,
         )
         return found, points, listed
 
@@ -250,7 +258,7 @@ class Scanner:
         if target is None:
             return _Choice(surfaces)
         # The same peaks, read as other lasers', may give a plane that is as good or better.
-        candidates, subsegments, assignment = stripes
+        candidates, subsegments, _, assignment = stripes
         tested = assignment.test(candidates, subsegments, target)
         if tested.verdict is Verdict.RIVAL and tested.other is not None:
             surfaces = self._with_rival(surfaces, target, tested.other, subsegments)
@@ -265,7 +273,7 @@ class Scanner:
         target = choose_target(surfaces, kind, self.rig.working_range)
         if target is None or kind is not TargetKind.AUTO:
             return surfaces, target, None
-        candidates, subsegments, assignment = stripes
+        candidates, subsegments, _, assignment = stripes
         before = assignment.overlooked(candidates, subsegments, surfaces, target)
         if before is None or not before.is_mesh:
             return surfaces, target, before
@@ -274,7 +282,7 @@ class Scanner:
 
     def _measured(self, stripes: _Stripes, choice: _Choice) -> Measurement:
         """Return the posture to the target, or why there is none."""
-        candidates, subsegments, assignment = stripes
+        candidates, subsegments, _, assignment = stripes
         surfaces, target, _, tested = choice
         if target is None:
             return _refused(candidates, _no_target(candidates, surfaces, self.options.target))
@@ -290,7 +298,7 @@ class Scanner:
 
     def _doubt(self, stripes: _Stripes, choice: _Choice, target: Surface) -> Refusal | None:
         """Return why a target is not to be trusted, None if it is."""
-        candidates, subsegments, assignment = stripes
+        candidates, subsegments, _, assignment = stripes
         if choice.before is not None:
             return _ambiguous(target.plane, choice.before.plane)
         if assignment.is_by_chance(candidates, subsegments, choice.surfaces, target):
@@ -299,7 +307,7 @@ class Scanner:
         if choice.tested.verdict is Verdict.AMBIGUOUS and choice.tested.other is not None:
             return _ambiguous(target.plane, choice.tested.other)
         if self.options.target is TargetKind.AUTO and assignment.may_hide_net(
-            candidates, subsegments, choice.surfaces, target
+            candidates, subsegments, stripes.shapes, choice.surfaces, target
         ):
             detail = (
                 f"much light before the surface at {target.plane.offset:.3f} m shares no plane, "
@@ -365,7 +373,7 @@ def _on_mesh(paper_filter: "PaperFilter", points: ScanPoints) -> BoolArray:
 
 
 def _refused(candidates: Candidates, refusal: Refusal) -> Measurement:
-    return Measurement(refusal, np.zeros(len(candidates), np.bool_))
+    return Measurement(refusal, np.zeros(candidates.n, np.bool_))
 
 
 def _ambiguous(one: Plane, other: Plane) -> Refusal:

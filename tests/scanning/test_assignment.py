@@ -237,7 +237,7 @@ def test_a_net_that_lacks_a_laser_is_outweighed_by_a_nearer_one(
     def nearer_net(
         parts: list[dict[SearchAxis, StripePeaks]], *, share: float = 1.0, mesh: bool = True
     ) -> bool:
-        subsegments = find_candidates(joined(parts), laser_bands, triangulator).subsegments()
+        subsegments, _ = find_candidates(joined(parts), laser_bands, triangulator).subsegments()
         target, other = (
             surface_on(one, subsegments, len(rig.lasers), 850.0) for one in (far, near)
         )
@@ -253,7 +253,7 @@ def test_a_net_that_lacks_a_laser_is_outweighed_by_a_nearer_one(
     net_mask = peaks_of(rig, [(far, strands)], 0.1)
     assert not nearer_net([parts[0], net_mask])
     scanner, peaks = Scanner(rig), joined(parts)
-    subsegments = find_candidates(peaks, laser_bands, triangulator).subsegments()
+    subsegments, _ = find_candidates(peaks, laser_bands, triangulator).subsegments()
     other = surface_on(near, subsegments, len(rig.lasers), 850.0)
     assert scanner.measure(0, 0.0, peaks).posture
     monkeypatch.setattr(assignment.AssignmentTest, "nearer_net", lambda *_: other)
@@ -297,7 +297,7 @@ def test_strands_that_make_a_plane_by_chance_are_no_net() -> None:
             for laser, one_of in zip(rig.lasers, strands_of, strict=False)
         ]
         candidates = find_candidates(joined([*of_net, *loose]), laser_bands, triangulator)
-        subsegments = candidates.subsegments()
+        subsegments, _ = candidates.subsegments()
         seen = surface_on(net, subsegments, len(rig.lasers), 850.0)
         target = replace(seen, is_mesh=True)
         return test.is_by_chance(candidates, subsegments, [target], target)
@@ -326,7 +326,7 @@ def test_a_net_before_a_wall_is_not_overlooked(monkeypatch: pytest.MonkeyPatch) 
         part: dict[SearchAxis, StripePeaks], *, mesh: bool = True, wall_is_mesh: bool = False
     ) -> Surface | None:
         candidates = find_candidates(joined([part, behind]), laser_bands, triangulator)
-        subsegments = candidates.subsegments()
+        subsegments, _ = candidates.subsegments()
         near, far = (surface_on(one, subsegments, len(rig.lasers), 850.0) for one in (net, wall))
         near, far = replace(near, is_mesh=mesh), replace(far, is_mesh=wall_is_mesh)
         assert test.overlooked(candidates, subsegments, [far, near], near) is None

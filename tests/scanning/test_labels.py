@@ -13,6 +13,7 @@ from aqualvs.scanning.laser_bands import SearchAxis, plan_bands
 from aqualvs.scanning.posture import Reason, Refusal
 from aqualvs.scanning.posture_estimator import Measurement
 from aqualvs.scanning.scan import Label, ScanPoints
+from aqualvs.scanning.segments import ComponentShapes
 from aqualvs.scanning.stripe import StripePeaks
 from aqualvs.scanning.surfaces import Surface, find_surfaces
 from aqualvs.scanning.triangulate import Triangulator
@@ -30,6 +31,7 @@ class Labelled(NamedTuple):
     peaks: dict[SearchAxis, StripePeaks]
     candidates: Candidates
     subsegments: Subsegments
+    shapes: ComponentShapes
     surfaces: list[Surface]
     points: ScanPoints
 
@@ -40,18 +42,18 @@ def label(targets: Sequence[tuple[Plane, Lit]], posture_to: Plane | None) -> Lab
     camera = rig.camera()
     peaks = peaks_of(rig, targets, 0.1)
     candidates = find_candidates(peaks, plan_bands(rig, camera), Triangulator(rig, camera))
-    subsegments = candidates.subsegments()
+    subsegments, shapes = candidates.subsegments()
     surfaces = find_surfaces(subsegments, candidates.pixels, 3, rig.working_range, 850.0)
     target = None
-    in_posture = np.zeros(len(candidates), np.bool_)
+    in_posture = np.zeros(candidates.n, np.bool_)
     if posture_to is not None:
         offsets = [abs(one.plane.offset - posture_to.offset) for one in surfaces]
         target = surfaces[int(np.argmin(offsets))]
         in_posture = target.members[subsegments.of_candidate]
     points, _ = label_candidates(
-        candidates, subsegments, surfaces, target, Measurement(NONE, in_posture), RANGE
+        candidates, subsegments, shapes, surfaces, target, Measurement(NONE, in_posture), RANGE
     )
-    return Labelled(peaks, candidates, subsegments, surfaces, points)
+    return Labelled(peaks, candidates, subsegments, shapes, surfaces, points)
 
 
 def all_pixels(peaks: dict[SearchAxis, StripePeaks]) -> FloatArray:
@@ -126,6 +128,7 @@ def test_what_the_posture_left_out_of_its_target_is_still_on_it() -> None:
     points, _ = label_candidates(
         found.candidates,
         found.subsegments,
+        found.shapes,
         found.surfaces,
         target,
         Measurement(NONE, on_it & ~left_out),
@@ -143,12 +146,13 @@ def test_short_pieces_that_nothing_explains_are_clutter_or_ambiguous() -> None:
     points, _ = label_candidates(
         found.candidates,
         found.subsegments,
+        found.shapes,
         [],
         None,
-        Measurement(NONE, np.zeros(len(found.candidates), np.bool_)),
+        Measurement(NONE, np.zeros(found.candidates.n, np.bool_)),
         SHORT,
     )
-    assert len(points) == len(found.candidates)
+    assert len(points) == found.candidates.n
     several = times_seen(points) > 1
     assert np.all(points.label[several] == Label.AMBIGUOUS)
     distance = np.linalg.norm(points.points_in_dome, axis=1)

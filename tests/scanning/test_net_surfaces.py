@@ -5,7 +5,7 @@ import pytest
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.planes import Plane
-from aqualvs.scanning.candidates import Subsegments
+from aqualvs.scanning.candidates import Candidates, Subsegments
 from aqualvs.scanning.net_surfaces import (
     fit_mean,
     inflate_covariance,
@@ -43,18 +43,23 @@ class Stripes:
     def followed(self, on_net: BoolArray) -> BoolArray:
         """Which strands are on the net in the end, shape of the heights."""
         marked = on_net.ravel()[self.component]
-        grow_region(
-            self.points,
-            self.line,
-            self.laser,
-            self.component,
-            self.confidence,
+        n = len(marked)
+        candidates = Candidates(
             self.source,
-            self.height,
-            RANGE,
-            M_PER_LINE,
-            marked,
+            self.laser,
+            self.line,
+            self.component,
+            subsegment=self.component,
+            pixels=np.zeros((n, 2)),
+            height=np.zeros(n),
+            width=np.zeros(n),
+            sigma_px=np.zeros(n),
+            confidence=self.confidence,
+            pull=np.zeros(n),
+            points=self.points,
+            sensitivity=np.zeros((n, 3)),
         )
+        grow_region(candidates, self.height, RANGE, M_PER_LINE, marked)
         return marked[::LINES].reshape(on_net.shape)
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray
-from aqualvs.scanning.segments import ComponentShapes, component_shapes
+from aqualvs.scanning.segments import ComponentShapes, describe_components
 
 _PX = 0.7e-3  # a pixel on the target, in metres
 
@@ -16,9 +16,10 @@ def shapes_of(*depths: FloatArray, width: float = 5.0, height: float = 100.0) ->
     n = len(line)
     points = np.stack([_PX * line, 0.5 + _PX * depth, np.zeros(n)], axis=-1)
     sensitivity = np.tile([0.0, _PX, 0.0], (n, 1))
-    return component_shapes(
+    table = describe_components(
         component, line, points, sensitivity, np.full(n, width), np.full(n, height)
     )
+    return ComponentShapes(*table)
 
 
 def test_a_straight_stretch_is_straight_however_it_slants() -> None:
@@ -57,5 +58,4 @@ def test_a_bright_spot_is_round_and_a_dim_or_long_one_is_not() -> None:
 def test_nothing_has_no_shapes() -> None:
     nothing, vectors = np.empty(0), np.empty((0, 3))
     index = np.empty(0, np.int64)
-    shapes = component_shapes(index, index, vectors, vectors, nothing, nothing)
-    assert len(shapes.n_lines) == 0
+    assert describe_components(index, index, vectors, vectors, nothing, nothing).shape[1] == 0

@@ -47,7 +47,7 @@ def surfaces_of(
     candidates = find_candidates(
         peaks_of(rig, targets, noise_px), plan_bands(rig, camera), Triangulator(rig, camera)
     )
-    subsegments = candidates.subsegments()
+    subsegments, _ = candidates.subsegments()
     found = find_surfaces(
         subsegments,
         candidates.pixels,
@@ -140,7 +140,7 @@ def test_one_laser_gives_no_surface() -> None:
     rig = example_rig()
     single = replace(rig, lasers=rig.lasers[:1])
     found, candidates, _ = surfaces_of(single, [(plane(0.5), everywhere)])
-    assert len(candidates) > 300
+    assert candidates.n > 300
     assert found == []
     assert choose(found, TargetKind.AUTO) is None
 
@@ -158,7 +158,7 @@ def test_nothing_gives_no_surface() -> None:
         return np.zeros(len(points), np.bool_)
 
     found, candidates, _ = surfaces_of(example_rig(), [(plane(0.5), nowhere)])
-    assert len(candidates) == 0
+    assert candidates.n == 0
     assert found == []
 
 
@@ -202,10 +202,10 @@ def test_scattered_light_gives_no_surface_worth_a_target() -> None:
         )
     camera = rig.camera()
     candidates = find_candidates(peaks, plan_bands(rig, camera), Triangulator(rig, camera))
-    subsegments = candidates.subsegments()
+    subsegments, _ = candidates.subsegments()
     found = find_surfaces(subsegments, candidates.pixels, 3, rig.working_range, 850.0)
     # Chance puts some specks on a plane, never a fifth of them.
-    assert all(surface.n_lines < 0.2 * len(candidates) for surface in found)
+    assert all(surface.n_lines < 0.2 * candidates.n for surface in found)
 
 
 def choose(
@@ -282,12 +282,12 @@ def test_light_far_behind_a_plane_is_not_on_it_however_far_a_pixel_moves_it() ->
         peaks_of(rig, [(wall, everywhere)], NOISE_PX),
         plan_bands(rig, camera),
         Triangulator(rig, camera),
-    ).subsegments()
-    last = len(subsegments) - 1
+    ).subsegments()[0]
+    last = subsegments.n - 1
     table = subsegments.table.copy()
     place = table[:3, last].copy()
     # At 20 m, where a pixel is worth a kilometre.
     table[:3, last], table[3:6, last] = 40.0 * place, 40.0**2 * place
-    far = replace(subsegments, table=table)
+    far = subsegments._replace(table=table)
     assert surface_on(wall, subsegments, len(rig.lasers), 850.0).members[last]
     assert not surface_on(wall, far, len(rig.lasers), 850.0).members[last]

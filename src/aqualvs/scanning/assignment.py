@@ -47,6 +47,7 @@ from aqualvs.scanning.net_surfaces import inflate_covariance, seen_through
 from aqualvs.scanning.plane_search import WEIGHT, X, Z
 from aqualvs.scanning.posture import Refusal, range_pitch_yaw
 from aqualvs.scanning.posture_estimator import Measurement
+from aqualvs.scanning.segments import ComponentShapes
 from aqualvs.scanning.surfaces import Surface
 from aqualvs.scanning.triangulate import Triangulator
 
@@ -206,6 +207,7 @@ class AssignmentTest:
         self,
         candidates: Candidates,
         subsegments: Subsegments,
+        shapes: ComponentShapes,
         surfaces: Sequence[Surface],
         target: Surface,
     ) -> bool:
@@ -218,15 +220,15 @@ class AssignmentTest:
         ----------
         candidates, subsegments, surfaces, target
             As in `is_by_chance`.
+        shapes : ComponentShapes
+            Of the candidates' components.
         """
         if target.is_mesh or any(one.plane.offset > target.plane.offset for one in surfaces):
             return False
         share = loose_share_before(
-            candidates.source,
-            candidates.confidence,
-            candidates.points,
-            candidates.shapes().n_lines[candidates.component],
+            candidates,
             subsegments.of_candidate,
+            shapes.n_lines,
             target.members,
             np.any([one.members for one in surfaces], axis=0),
             np.append(target.plane.normal, target.plane.offset),
@@ -247,7 +249,7 @@ class AssignmentTest:
         surface: Surface,
     ) -> float:
         """Return a surface's share of the light that no other surface explains."""
-        others = np.zeros(len(subsegments), np.bool_)
+        others = np.zeros(subsegments.n, np.bool_)
         for one in surfaces:
             if one is not surface:
                 others |= one.members
@@ -255,10 +257,9 @@ class AssignmentTest:
         share: float = exclusive_share(
             candidates.source,
             candidates.confidence,
-            subsegments.of_candidate,
+            subsegments,
             surface.members,
             others,
-            subsegments.intensity_weight,
             surface.inlier_weight,
         )
         return share
@@ -272,7 +273,7 @@ class AssignmentTest:
         packed = np.empty(4)
         packed[:3], packed[3] = surface.plane.normal, surface.plane.offset
         seen: tuple[float, float, float] = seen_of(
-            packed, surface.members, subsegments.n_lines, subsegments.laser, self._bands
+            packed, surface.members, subsegments, self._bands
         )
         return seen
 
@@ -327,34 +328,17 @@ class AssignmentTest:
         facts = np.empty((n_rivals + 1, N_FACTS))
         planes[0, :3], planes[0, 3] = surface.plane.normal, surface.plane.offset
         n = find_rivals(
-            candidates.source,
-            candidates.laser,
-            candidates.confidence,
-            candidates.points,
-            candidates.sensitivity,
+            candidates,
             subsegments.of_candidate,
-            surface.members,
             subsegments.table,
+            surface.members,
             *self._searched,
             n_lasers,
             planes,
         )
         if n == 0:
             return NOT_TESTED
-        judge_planes(
-            planes[: n + 1],
-            subsegments.table,
-            subsegments.n_lines,
-            subsegments.first_line,
-            subsegments.last_line,
-            subsegments.laser,
-            candidates.source,
-            candidates.confidence,
-            subsegments.of_candidate,
-            self._along_x,
-            self._bands,
-            facts,
-        )
+        judge_planes(planes[: n + 1], candidates, subsegments, self._along_x, self._bands, facts)
         return _verdict(planes[: n + 1], facts[: n + 1])
 
 

@@ -14,6 +14,7 @@ from aqualvs.geometry.compiled import (
     lazy_kernel,
 )
 from aqualvs.geometry.linear_algebra import solve_symmetric, squared, where
+from aqualvs.scanning.candidates import Candidates, Subsegments
 from aqualvs.scanning.plane_search import (
     JX,
     JY,
@@ -63,14 +64,10 @@ _XX, _XY, _XZ, _YY, _YZ, _ZZ, _SX, _SY, _SZ, _N, _SJX, _SJY, _SJZ, _N_SUMS = ran
 
 @lazy_kernel
 def find_rivals(
-    source: IntArray,
-    laser: IntArray,
-    confidence: FloatArray,
-    points: FloatArray,
-    sensitivity: FloatArray,
-    subsegment_index: IntArray,
-    members: BoolArray,
+    candidates: Candidates,
+    of_candidate: IntArray,
     table: FloatArray,
+    members: BoolArray,
     nearest: float,
     farthest: float,
     n_lasers: int,
@@ -80,14 +77,13 @@ def find_rivals(
 
     Parameters
     ----------
-    source, laser, confidence, points, sensitivity
-        As in `Candidates`, N of them.
-    subsegment_index : int array, shape (N,)
-        Row of each candidate's subsegment.
-    members : bool array, shape (C,)
-        Subsegments on the surface.
+    candidates : Candidates
+        N of them.
+    of_candidate : int array, shape (N,)
     table : array, shape (7, C)
         As in `Subsegments`.
+    members : bool array, shape (C,)
+        Subsegments on the surface.
     nearest, farthest : float
         Limits of the planes that are considered, in metres.
     n_lasers : int
@@ -97,7 +93,7 @@ def find_rivals(
     """
     sums = np.zeros((n_lasers, n_lasers, _N_SUMS))
     place = np.zeros((n_lasers, 3))
-    _sum_candidates(source, laser, confidence, points, sensitivity, subsegment_index, members, sums)
+    _sum_candidates(candidates, of_candidate, members, sums)
     total, other = 0.0, 0.0
     for i in range(n_lasers):
         own = sums[i, i, _N]
@@ -123,28 +119,20 @@ def find_rivals(
 
 @inner_kernel
 def _sum_candidates(
-    source: IntArray,
-    laser: IntArray,
-    confidence: FloatArray,
-    points: FloatArray,
-    sensitivity: FloatArray,
-    subsegment_index: IntArray,
-    members: BoolArray,
-    sums: FloatArray,
+    candidates: Candidates, of_candidate: IntArray, members: BoolArray, sums: FloatArray
 ) -> None:
     """Sum the moments of each laser's peaks on the surface, read as each laser's."""
-    last = 0
+    source, laser, points = candidates.source, candidates.laser, candidates.points
+    sensitivity = candidates.sensitivity
+    owner = np.full(_n_sources(source), -1)
     for i in range(source.shape[0]):
-        last = max(last, source[i])
-    owner = np.full(last + 1, -1)
-    for i in range(source.shape[0]):
-        if members[subsegment_index[i]]:
+        if members[of_candidate[i]]:
             owner[source[i]] = laser[i]
     for i in range(source.shape[0]):
         own = owner[source[i]]
         if own < 0:
             continue
-        w, row = confidence[i], sums[own, laser[i]]
+        w, row = candidates.confidence[i], sums[own, laser[i]]
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         row[_XX] += w * x * x
         row[_XY] += w * x * y
@@ -159,6 +147,15 @@ def _sum_candidates(
         row[_SJX] += w * sensitivity[i, 0]
         row[_SJY] += w * sensitivity[i, 1]
         row[_SJZ] += w * sensitivity[i, 2]
+
+
+@inner_borrowing_kernel
+def _n_sources(source: IntArray) -> int:
+    """Return the number of peaks up to the last one that has a candidate; at least 1."""
+    last = 0
+    for i in range(source.shape[0]):
+        last = max(last, source[i])
+    return last + 1
 
 
 @inner_kernel
@@ -342,14 +339,8 @@ def _refine_rivals(
 @lazy_kernel
 def judge_planes(
     planes: FloatArray,
-    table: FloatArray,
-    n_lines: IntArray,
-    first_line: IntArray,
-    last_line: IntArray,
-    laser: IntArray,
-    source: IntArray,
-    confidence: FloatArray,
-    subsegment_index: IntArray,
+    candidates: Candidates,
+    subsegments: Subsegments,
     along_x: BoolArray,
     bands: FloatArray,
     facts: FloatArray,
@@ -360,12 +351,10 @@ def judge_planes(
     ----------
     planes : array, shape (P, 4)
         Normals and offsets.
-    table, n_lines, first_line, last_line, laser
-        As in `Subsegments`, C of them.
-    source, confidence
-        As in `Candidates`, N of them.
-    subsegment_index : int array, shape (N,)
-        Row of each candidate's subsegment.
+    candidates : Candidates
+        N of them.
+    subsegments : Subsegments
+        C of them.
     along_x : bool array, shape (n_lasers,)
         Whether each laser's search lines run along x.
     bands : array, shape (n_lasers, cells, samples, 4)
@@ -374,20 +363,14 @@ def judge_planes(
         Written, see `INTENSITY_WEIGHT`.
     """
     n_lasers, n_cells = bands.shape[0], bands.shape[1]
-    last = 0
-    for i in range(source.shape[0]):
-        last = max(last, source[i])
-    seen = np.empty(last + 1, np.int64)
-    seen[:] = -1
-    near = np.empty(laser.shape[0])
+    seen = np.full(_n_sources(candidates.source), -1)
+    near = np.empty(subsegments.laser.shape[0])
     lit, expected = np.empty((n_lasers, n_cells), np.bool_), np.empty((n_lasers, n_cells), np.bool_)
     for k in range(planes.shape[0]):
         plane, found = planes[k], facts[k]
-        _mark_lit_cells(plane, table, first_line, last_line, laser, near, lit)
-        found[INTENSITY_WEIGHT] = _intensity_on(k, near, source, confidence, subsegment_index, seen)
-        found[VARIANCE], found[FREEDOM], n_lit = _variance(
-            plane, table, n_lines, first_line, laser, near, n_lasers
-        )
+        _mark_lit_cells(plane, subsegments, near, lit)
+        found[INTENSITY_WEIGHT] = _intensity_on(k, near, candidates, subsegments.of_candidate, seen)
+        found[VARIANCE], found[FREEDOM], n_lit = _variance(plane, subsegments, near, n_lasers)
         found[PER_LASER] = found[INTENSITY_WEIGHT] / max(n_lit, 1)
         _mark_expected(plane, bands, expected)
         found[DARK] = _dark_lasers(lit, expected, along_x)
@@ -395,15 +378,10 @@ def judge_planes(
 
 @inner_borrowing_kernel
 def _mark_lit_cells(
-    plane: FloatArray,
-    table: FloatArray,
-    first_line: IntArray,
-    last_line: IntArray,
-    laser: IntArray,
-    near: FloatArray,
-    lit: BoolArray,
+    plane: FloatArray, subsegments: Subsegments, near: FloatArray, lit: BoolArray
 ) -> None:
     """Write how near each subsegment is to a plane, 0 to 1; mark the cells with light near it."""
+    table, laser = subsegments.table, subsegments.laser
     lit[:] = False
     x, y, z, offset = plane[0], plane[1], plane[2], plane[3]
     for c in range(laser.shape[0]):
@@ -412,40 +390,32 @@ def _mark_lit_cells(
         gate = _EVIDENCE.wide * _EVIDENCE.wide * squared_gate(per_px, offset)
         near[c] = max(1.0 - residual * residual / gate, 0.0)
         if near[c] > 0.0:
-            for cell in range(first_line[c] // CELL_LINES, last_line[c] // CELL_LINES + 1):
+            first, last = subsegments.first_line[c], subsegments.last_line[c]
+            for cell in range(first // CELL_LINES, last // CELL_LINES + 1):
                 lit[laser[c], cell] = True
 
 
 @inner_borrowing_kernel
 def _intensity_on(
-    number: int,
-    near: FloatArray,
-    source: IntArray,
-    confidence: FloatArray,
-    subsegment_index: IntArray,
-    seen: IntArray,
+    number: int, near: FloatArray, candidates: Candidates, of_candidate: IntArray, seen: IntArray
 ) -> float:
     """Sum the confidence of the peaks on a plane, each counted once, weighted by its distance."""
-    total = 0.0
+    source, total = candidates.source, 0.0
     for i in range(source.shape[0]):
-        share = near[subsegment_index[i]]
+        share = near[of_candidate[i]]
         if share > 0.0 and seen[source[i]] != number:
             seen[source[i]] = number
-            total += confidence[i] * share
+            total += candidates.confidence[i] * share
     return total
 
 
 @inner_borrowing_kernel
 def _variance(
-    plane: FloatArray,
-    table: FloatArray,
-    n_lines: IntArray,
-    first_line: IntArray,
-    laser: IntArray,
-    near: FloatArray,
-    n_lasers: int,
+    plane: FloatArray, subsegments: Subsegments, near: FloatArray, n_lasers: int
 ) -> tuple[float, float, int]:
     """Return variance (px²) of half stripes about a plane, degrees of freedom, lasers seen."""
+    table, n_lines, laser = subsegments.table, subsegments.n_lines, subsegments.laser
+    first_line = subsegments.first_line
     x, y, z, offset = plane[0], plane[1], plane[2], plane[3]
     square, n, n_lit = 0.0, 0, 0
     begin = 0
@@ -503,10 +473,9 @@ def _mark_expected(plane: FloatArray, bands: FloatArray, expected: BoolArray) ->
 def exclusive_share(
     source: IntArray,
     confidence: FloatArray,
-    subsegment_index: IntArray,
+    subsegments: Subsegments,
     members: BoolArray,
     others: BoolArray,
-    subsegment_light: FloatArray,
     inlier_weight: float,
 ) -> float:
     """Return the share of the light on a surface, without light on other surfaces.
@@ -515,40 +484,34 @@ def exclusive_share(
     ----------
     source, confidence
         As in `Candidates`, N of them.
-    subsegment_index : int array, shape (N,)
-        Row of each candidate's subsegment.
+    subsegments : Subsegments
+        C of them.
     members, others : bool array, shape (C,)
         Subsegments on the surface, and on other surfaces.
-    subsegment_light : array, shape (C,)
-        Of each subsegment.
     inlier_weight : float
         The part of the surface's light that counts.
     """
-    last = 0
+    n = _n_sources(source)
+    intensity_weight, owner = np.zeros(n), np.zeros(n, np.int64)
     for i in range(source.shape[0]):
-        last = max(last, source[i])
-    intensity_weight, owner = np.zeros(last + 1), np.zeros(last + 1, np.int64)
-    for i in range(source.shape[0]):
-        c, r = subsegment_index[i], source[i]
+        c, r = subsegments.of_candidate[i], source[i]
         intensity_weight[r] = confidence[i]
         owner[r] = max(owner[r], 2 if members[c] else int(others[c]))
     total, on = 0.0, 0.0
-    for r in range(last + 1):
+    for r in range(n):
         total += intensity_weight[r] if owner[r] != 1 else 0.0
         on += intensity_weight[r] if owner[r] == 2 else 0.0
     of_members = 0.0
     for c in range(members.shape[0]):
-        of_members += subsegment_light[c] if members[c] else 0.0
+        of_members += subsegments.intensity_weight[c] if members[c] else 0.0
     return on / max(total, 1e-12) * (inlier_weight / of_members)
 
 
 @lazy_kernel
 def loose_share_before(
-    source: IntArray,
-    confidence: FloatArray,
-    points: FloatArray,
+    candidates: Candidates,
+    of_candidate: IntArray,
     n_lines: FloatArray,
-    subsegment_index: IntArray,
     members: BoolArray,
     explained: BoolArray,
     plane: FloatArray,
@@ -558,12 +521,12 @@ def loose_share_before(
 
     Parameters
     ----------
-    source, confidence, points
-        As in `Candidates`, N of them.
-    n_lines : array, shape (N,)
-        Search lines of each candidate's component.
-    subsegment_index : int array, shape (N,)
-        Row of each candidate's subsegment.
+    candidates : Candidates
+        N of them.
+    of_candidate : int array, shape (N,)
+        Row of each one's subsegment.
+    n_lines : array, shape (S,)
+        Search lines of each component.
     members, explained : bool array, shape (C,)
         Subsegments on the surface, and on any surface.
     plane : array, shape (4,)
@@ -571,27 +534,25 @@ def loose_share_before(
     nearest : float
         Least distance along the forward axis, in metres.
     """
-    last = 0
+    source, points, n = candidates.source, candidates.points, _n_sources(candidates.source)
+    intensity_weight = np.zeros(n)
+    own, bound, before = np.zeros((3, n), np.bool_)
     for i in range(source.shape[0]):
-        last = max(last, source[i])
-    intensity_weight = np.zeros(last + 1)
-    own, bound, before = np.zeros((3, last + 1), np.bool_)
-    for i in range(source.shape[0]):
-        c, r = subsegment_index[i], source[i]
+        c, r = of_candidate[i], source[i]
         off = -plane[3]
         for k in range(3):
             off += plane[k] * points[i, k]
-        intensity_weight[r] = confidence[i]
+        intensity_weight[r] = candidates.confidence[i]
         own[r] |= members[c]
         # However it is read: one peak has a candidate for each laser.
         bound[r] |= (
             explained[c]
-            or n_lines[i] >= _EVIDENCE.long_piece
+            or n_lines[candidates.component[i]] >= _EVIDENCE.long_piece
             or abs(off) < _EVIDENCE.on_plane * plane[3]
         )
         before[r] |= off < -_EVIDENCE.before * plane[3] and points[i, 1] > nearest
     of_surface, loose = 0.0, 0.0
-    for r in range(last + 1):
+    for r in range(n):
         of_surface += intensity_weight[r] if own[r] else 0.0
         loose += intensity_weight[r] if before[r] and not bound[r] else 0.0
     return loose / max(of_surface, 1e-12)
@@ -599,7 +560,7 @@ def loose_share_before(
 
 @lazy_kernel
 def seen_of(
-    plane: FloatArray, members: BoolArray, n_lines: IntArray, laser: IntArray, bands: FloatArray
+    plane: FloatArray, members: BoolArray, subsegments: Subsegments, bands: FloatArray
 ) -> tuple[float, float, float]:
     """Return the share of its best stripe that a surface shows; shares of faint and dark lasers.
 
@@ -609,17 +570,18 @@ def seen_of(
         Normal and offset.
     members : bool array, shape (C,)
         Subsegments on the surface.
-    n_lines, laser
-        As in `Subsegments`.
+    subsegments : Subsegments
+        C of them.
     bands
         As in `judge_planes`.
     """
+    laser = subsegments.laser
     n_lasers, n_cells = bands.shape[0], bands.shape[1]
     expected, way = np.empty((n_lasers, n_cells), np.bool_), np.zeros(n_lasers)
     _mark_expected(plane, bands, expected)
     for c in range(laser.shape[0]):
         if members[c]:
-            way[laser[c]] += n_lines[c]
+            way[laser[c]] += subsegments.n_lines[c]
     most, asked, faint, dark = 0.0, 0, 0, 0
     for i in range(n_lasers):
         cells = where(expected[i]).shape[0]

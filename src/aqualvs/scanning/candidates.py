@@ -6,7 +6,7 @@ summarises them by subsegments, the units that agree with a surface or do not.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,7 +22,6 @@ from aqualvs.geometry.linear_algebra import element_at, median_of
 from aqualvs.scanning.laser_bands import LaserBand, SearchAxis
 from aqualvs.scanning.segments import (
     ComponentShapes,
-    component_shapes,
     describe_components,
     is_curved,
     run_end,
@@ -42,6 +41,86 @@ N_MEASURES = 5
 # the two flanks of a stripe of given width and height.
 _FLOOR_PX = 0.1
 _FLANK_NOISE = 1.35  # 0.45 (geometry of two flanks) times 3 grey levels
+
+
+FORWARD: FloatArray = np.array([0.0, 1.0, 0.0])
+"""The vehicle's forward axis in `dome`: the normal of a target that is square to it."""
+
+
+class Subsegments(NamedTuple):
+    """Subsegments of stripes, C of them, ordered by laser."""
+
+    # Shape (N,): row of the subsegment that each candidate belongs to; ascending.
+    of_candidate: IntArray
+    # Shape (7, C): rows as `plane_search` names them: centroid in `dome` (m), mean derivative of
+    # the points by the stripe's position (m/px), and sampling weight: its light, but a long
+    # component weighs no more than a few strands, because it may follow one strand off the sheet's
+    # middle.
+    table: FloatArray
+    # Shape (C,): search lines in it, each weighted by the confidence that its peak is laser light.
+    intensity_weight: FloatArray
+    # Shape (C,): search lines in it.
+    n_lines: IntArray
+    # Shape (C,): its extent in search lines; separates lit from dark intervals.
+    first_line: IntArray
+    last_line: IntArray
+    # Shape (C,): index of the laser; ascending.
+    laser: IntArray
+
+    @property
+    def n(self) -> int:
+        """Number of subsegments."""
+        return len(self.laser)
+
+
+class Candidates(NamedTuple):
+    """Triangulated candidates, N of them, ordered by laser, segment and subsegment."""
+
+    source: IntArray  # Shape (N,): number of the peak; equal for all candidates of one peak.
+    laser: IntArray  # Shape (N,): index of the laser that the peak is read as.
+    line: IntArray  # Shape (N,): search line.
+    # Shape (N,): numbers of the component (connected segments) and the subsegment; those of the
+    # subsegments ascend.
+    component: IntArray
+    subsegment: IntArray
+    # Shape (N, 2): in `image`.
+    pixels: FloatArray
+    # Shape (N,): of the peak: grey levels, pixels.
+    height: FloatArray
+    width: FloatArray
+    # Shape (N,): standard deviation of the position along the search line.
+    sigma_px: FloatArray
+    # Shape (N,): confidence that the peak is laser light, from its height as a share of the frame's
+    # best and its likelihood; 0 to 1.
+    confidence: FloatArray
+    # Shape (N,): shift of the position by an uneven background, in pixels, as in `StripePeaks`.
+    pull: FloatArray
+    # Shape (N, 3): in `dome`, metres.
+    points: FloatArray
+    # Shape (N, 3): derivative of the point by the position, m/px.
+    sensitivity: FloatArray
+
+    @property
+    def n(self) -> int:
+        """Number of candidates."""
+        return len(self.source)
+
+    def where(self, mask: BoolArray) -> "Candidates":
+        """Return the candidates that a mask of shape (N,) selects."""
+        return Candidates._make(column[mask] for column in self)
+
+    def without_pull(self) -> "Candidates":
+        """Return the candidates with their points moved back by `pull`."""
+        return self._replace(points=self.points - self.pull[:, None] * self.sensitivity)
+
+    def subsegments(self) -> tuple[Subsegments, ComponentShapes]:
+        """Summarise the subsegments by their centroids; describe the components by their shapes."""
+        n = count_subsegments(self.subsegment)
+        of_candidate, facts = np.empty(self.n, np.int64), np.empty((4, n), np.int64)
+        table, intensity_weight = np.empty((7, n)), np.empty(n)
+        shapes = summarise_subsegments(self, of_candidate, table, intensity_weight, facts)
+        found = Subsegments(of_candidate, table, intensity_weight, *facts)
+        return found, ComponentShapes(*shapes)
 
 
 @lazy_kernel
@@ -129,29 +208,21 @@ def count_subsegments(subsegment: IntArray) -> int:
 
 @lazy_kernel
 def summarise_subsegments(
-    subsegment: IntArray,
-    line: IntArray,
-    laser: IntArray,
-    component: IntArray,
-    confidence: FloatArray,
-    height: FloatArray,
-    width: FloatArray,
-    points: FloatArray,
-    sensitivity: FloatArray,
-    index: IntArray,
+    candidates: Candidates,
+    of_candidate: IntArray,
     table: FloatArray,
     intensity_weight: FloatArray,
     facts: IntArray,
 ) -> FloatArray:
-    """Summarise N candidates in C subsegments, whose numbers ascend.
+    """Summarise N candidates in C subsegments.
 
     Parameters
     ----------
-    subsegment, line, laser, component, confidence, height, width, points, sensitivity
-        As in `Candidates`.
-    index : int array, shape (N,)
-        Written: row of each candidate's subsegment.
-    table : array, shape (7, C), intensity_weight : array, shape (C,)
+    candidates : Candidates
+        N of them.
+    of_candidate : int array, shape (N,)
+    table : array, shape (7, C)
+    intensity_weight : array, shape (C,)
         Written, as in `Subsegments`.
     facts : int array, shape (4, C)
         Written: (n_lines, first_line, last_line, laser).
@@ -161,39 +232,40 @@ def summarise_subsegments(
     array, shape (6, S)
         The components as described by `describe_components`.
     """
-    begin = ZERO
+    line, begin = candidates.line, ZERO
     for c in range(intensity_weight.shape[0]):
-        end = run_end(subsegment, begin)
+        end = run_end(candidates.subsegment, begin)
         for i in range(begin, end):
-            index[i] = c
+            of_candidate[i] = c
         facts[0, c], facts[1, c], facts[2, c] = end - begin, line[begin], line[end - 1]
-        facts[3, c] = laser[begin]
+        facts[3, c] = candidates.laser[begin]
         total = 0.0
         for i in range(begin, end):
-            total += confidence[i]
+            total += candidates.confidence[i]
         intensity_weight[c] = total
-        _write_centroid(height, width, points, sensitivity, begin, end, table, c)
+        _write_centroid(candidates, begin, end, table, c)
         begin = end
-    shapes = describe_components(component, line, points, sensitivity, width, height)
-    _write_sampling_weights(facts[0], component, intensity_weight, shapes, table[6])
+    shapes = describe_components(
+        candidates.component,
+        line,
+        candidates.points,
+        candidates.sensitivity,
+        candidates.width,
+        candidates.height,
+    )
+    _write_sampling_weights(facts[0], candidates.component, intensity_weight, shapes, table[6])
     return shapes
 
 
 @inline_borrowing_kernel
 def _write_centroid(
-    height: FloatArray,
-    width: FloatArray,
-    points: FloatArray,
-    sensitivity: FloatArray,
-    begin: int,
-    end: int,
-    table: FloatArray,
-    c: int,
+    candidates: Candidates, begin: int, end: int, table: FloatArray, c: int
 ) -> None:
     """Write the mean point and sensitivity of a subsegment, weighted by the light in each peak."""
+    points, sensitivity = candidates.points, candidates.sensitivity
     total, x, y, z, jx, jy, jz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(begin, end):
-        intensity_weight = height[i] * width[i]
+        intensity_weight = candidates.height[i] * candidates.width[i]
         total += intensity_weight
         x += intensity_weight * points[i, 0]
         y += intensity_weight * points[i, 1]
@@ -241,116 +313,11 @@ def _write_sampling_weights(
         begin += n_lines[c]
 
 
-@dataclass(frozen=True, slots=True)
-class Subsegments:
-    """Subsegments of stripes, C of them, ordered by laser."""
-
-    # Shape (N,): row of the subsegment that each candidate belongs to; ascending.
-    of_candidate: IntArray
-    # Shape (7, C): rows as `plane_search` names them: centroid in `dome` (m), mean derivative of
-    # the points by the stripe's position (m/px), and sampling weight: its light, but a long
-    # component weighs no more than a few strands, because it may follow one strand off the sheet's
-    # middle.
-    table: FloatArray
-    # Shape (C,): search lines in it, each weighted by the confidence that its peak is laser light.
-    intensity_weight: FloatArray
-    # Shape (C,): search lines in it.
-    n_lines: IntArray
-    # Shape (C,): its extent in search lines; separates lit from dark intervals.
-    first_line: IntArray
-    last_line: IntArray
-    # Shape (C,): index of the laser; ascending.
-    laser: IntArray
-
-    def __len__(self) -> int:
-        """Return the number of subsegments."""
-        return len(self.laser)
-
-
 # The best peaks of a frame are those from this quantile on.
 _BEST_SHARE = 0.95
 _AXES = (SearchAxis.ALONG_X, SearchAxis.ALONG_Y)
 _NOTHING = np.empty(0)
 _NO_PEAKS = StripePeaks(np.empty(0, np.int64), _NOTHING, _NOTHING, _NOTHING, _NOTHING, _NOTHING)
-
-FORWARD: FloatArray = np.array([0.0, 1.0, 0.0])
-"""The vehicle's forward axis in `dome`: the normal of a target that is square to it."""
-
-
-@dataclass(frozen=True, slots=True)
-class Candidates:
-    """Triangulated candidates, N of them, ordered by laser, segment and subsegment."""
-
-    source: IntArray  # Shape (N,): number of the peak; equal for all candidates of one peak.
-    laser: IntArray  # Shape (N,): index of the laser that the peak is read as.
-    line: IntArray  # Shape (N,): search line.
-    # Shape (N,): numbers of the component (connected segments) and the subsegment; those of the
-    # subsegments ascend.
-    component: IntArray
-    subsegment: IntArray
-    # Shape (N, 2): in `image`.
-    pixels: FloatArray
-    # Shape (N,): of the peak: grey levels, pixels.
-    height: FloatArray
-    width: FloatArray
-    # Shape (N,): standard deviation of the position along the search line.
-    sigma_px: FloatArray
-    # Shape (N,): confidence that the peak is laser light, from its height as a share of the frame's
-    # best and its likelihood; 0 to 1.
-    confidence: FloatArray
-    # Shape (N,): shift of the position by an uneven background, in pixels, as in `StripePeaks`.
-    pull: FloatArray
-    # Shape (N, 3): in `dome`, metres.
-    points: FloatArray
-    # Shape (N, 3): derivative of the point by the position, m/px.
-    sensitivity: FloatArray
-    # Cached: used by the search for surfaces and by the labels.
-    _shapes: ComponentShapes | None = field(default=None, init=False, repr=False, compare=False)
-
-    def __len__(self) -> int:
-        """Return the number of candidates."""
-        return len(self.source)
-
-    def where(self, mask: BoolArray) -> "Candidates":
-        """Return the candidates that a mask of shape (N,) selects."""
-        return Candidates(*(getattr(self, item.name)[mask] for item in fields(self) if item.init))
-
-    def without_pull(self) -> "Candidates":
-        """Return the candidates with their points moved back by `pull`."""
-        return replace(self, points=self.points - self.pull[:, None] * self.sensitivity)
-
-    def subsegments(self) -> Subsegments:
-        """Summarise the subsegments by their centroids."""
-        n = count_subsegments(self.subsegment)
-        of_candidate, facts = np.empty(len(self), np.int64), np.empty((4, n), np.int64)
-        table, intensity_weight = np.empty((7, n)), np.empty(n)
-        shapes = summarise_subsegments(
-            self.subsegment,
-            self.line,
-            self.laser,
-            self.component,
-            self.confidence,
-            self.height,
-            self.width,
-            self.points,
-            self.sensitivity,
-            of_candidate,
-            table,
-            intensity_weight,
-            facts,
-        )
-        object.__setattr__(self, "_shapes", ComponentShapes(*shapes))
-        return Subsegments(of_candidate, table, intensity_weight, *facts)
-
-    def shapes(self) -> ComponentShapes:
-        """Describe the shape of every component."""
-        if self._shapes is None:
-            found = component_shapes(
-                self.component, self.line, self.points, self.sensitivity, self.width, self.height
-            )
-            object.__setattr__(self, "_shapes", found)
-            return found
-        return self._shapes
 
 
 def find_candidates(

@@ -37,12 +37,11 @@ _OUT_OF_RANGE = np.uint8(Label.OUT_OF_RANGE)
 
 @lazy_kernel
 def label_other(
+    candidates: Candidates,
+    of_candidate: IntArray,
+    shapes: ComponentShapes,
     members: BoolArray,
     is_mesh: bool,
-    subsegment_index: IntArray,
-    component: IntArray,
-    points: FloatArray,
-    shapes: ComponentShapes,
     target: FloatArray,
     explained: BoolArray,
     label: NDArray[np.uint8],
@@ -51,25 +50,30 @@ def label_other(
 
     Parameters
     ----------
+    candidates : Candidates
+        N of them.
+    of_candidate : int array, shape (N,)
+        Row of each one's subsegment.
+    shapes : ComponentShapes
+        Of their components.
     members : bool array, shape (C,)
         Subsegments on the surface.
     is_mesh : bool
         As in `Surface`.
-    subsegment_index, component : int array, shape (N,), points : array, shape (N, 3), shapes
-        Of the candidates.
     target : array, shape (16,)
         The target as `Patch.packed` gives it; empty where there is none.
     explained : bool array, shape (N,), label : uint8 array, shape (N,)
         Completed in place.
     """
+    points = candidates.points
     n, n_bent, n_behind = 0, 0, 0
     # Distances nearest to the target on either side: they decide if half of them lie behind it.
     nearest_before, nearest_behind = -np.inf, np.inf
     for i in range(points.shape[0]):
-        if not members[subsegment_index[i]]:
+        if not members[of_candidate[i]]:
             continue
         n += 1
-        n_bent += is_bent(shapes, component[i])
+        n_bent += is_bent(shapes, candidates.component[i])
         if target.shape[0]:
             behind = height_over(target, points[i, 0], points[i, 1], points[i, 2])
             if behind > 0.0:
@@ -86,19 +90,17 @@ def label_other(
     if not is_behind:
         kind = _NET if is_mesh else _FISH if n_bent > mostly * n else _SOLID
     for i in range(points.shape[0]):
-        if members[subsegment_index[i]]:
+        if members[of_candidate[i]]:
             label[i] = kind
             explained[i] = True
 
 
 @lazy_kernel
 def label_target(
+    candidates: Candidates,
+    of_candidate: IntArray,
     members: BoolArray,
     is_mesh: bool,
-    subsegment_index: IntArray,
-    source: IntArray,
-    points: FloatArray,
-    sensitivity: FloatArray,
     target: FloatArray,
     inliers: BoolArray,
     net_mask: BoolArray,
@@ -109,12 +111,14 @@ def label_target(
 
     Parameters
     ----------
+    candidates : Candidates
+        N of them.
+    of_candidate : int array, shape (N,)
+        Row of each one's subsegment.
     members : bool array, shape (C,)
         Subsegments on the target.
     is_mesh : bool
         As in `Surface`.
-    subsegment_index, source : int array, shape (N,), points, sensitivity : array, shape (N, 3)
-        Of the candidates.
     target : array, shape (16,)
         As `Patch.packed` gives it.
     inliers, net_mask : bool array, shape (N,)
@@ -124,22 +128,16 @@ def label_target(
     label : uint8 array, shape (N,)
         Completed in place.
     """
+    source = candidates.source
     n = source.shape[0]
     on_target = np.empty(n, np.bool_)
     for i in range(n):
-        on_target[i] = members[subsegment_index[i]]
+        on_target[i] = members[of_candidate[i]]
     if is_mesh:
         taken = _of_same_peak(source, explained, explained)
         n_subsegments = members.shape[0]
         recruit_candidates(
-            points,
-            sensitivity,
-            subsegment_index,
-            n_subsegments,
-            target,
-            explained,
-            taken,
-            on_target,
+            candidates, of_candidate, n_subsegments, target, explained, taken, on_target
         )
     for i in range(n):
         on_target[i] |= inliers[i]
@@ -176,11 +174,7 @@ def _n_sources(source: IntArray) -> int:
 
 @lazy_kernel
 def label_loose(
-    source: IntArray,
-    component: IntArray,
-    pixels: FloatArray,
-    points: FloatArray,
-    height: FloatArray,
+    candidates: Candidates,
     shapes: ComponentShapes,
     target: FloatArray,
     working_range: tuple[float, float],
@@ -192,8 +186,10 @@ def label_loose(
 
     Parameters
     ----------
-    source, component, pixels, points, height, shapes
-        Of N candidates.
+    candidates : Candidates
+        N of them.
+    shapes : ComponentShapes
+        Of their components.
     target : array, shape (16,)
         As `Patch.packed` gives it; empty where there is none.
     working_range : (float, float)
@@ -205,7 +201,8 @@ def label_loose(
     rows : int array, shape (N,)
         Written.
     """
-    n = _list_kept(source, pixels, explained, rows)
+    source = candidates.source
+    n = _list_kept(source, candidates.pixels, explained, rows)
     candidates_of = np.zeros(_n_sources(source), np.int64)
     for k in range(n):
         candidates_of[source[rows[k]]] += 1
@@ -216,12 +213,13 @@ def label_loose(
         i = rows[k]
         if explained[i]:
             continue
-        s = component[i]
+        s = candidates.component[i]
         label[i] = _AMBIGUOUS
         if candidates_of[source[i]] == 1:
-            label[i] = _kind_of(points, i, is_straight(shapes, s), target, working_range)
+            straight = is_straight(shapes, s)
+            label[i] = _kind_of(candidates.points, i, straight, target, working_range)
         if is_round(shapes, s, 0.0) and bright != bright:
-            bright = element_at(height, bright_share)
+            bright = element_at(candidates.height, bright_share)
         if is_round(shapes, s, bright):
             label[i] = _BUBBLE
         elif is_bent(shapes, s):
@@ -263,14 +261,8 @@ def _kind_of(
 
 @lazy_borrowing_kernel
 def copy_points(
+    candidates: Candidates,
     rows: IntArray,
-    laser: IntArray,
-    pixels: FloatArray,
-    points: FloatArray,
-    sensitivity: FloatArray,
-    sigma_px: FloatArray,
-    height: FloatArray,
-    width: FloatArray,
     label: NDArray[np.uint8],
     used: BoolArray,
     out_laser: NDArray[np.int8],
@@ -286,16 +278,17 @@ def copy_points(
     """
     # Position error of the best peaks: quality 1.
     best_sigma_px = 0.1
+    pixels, sensitivity, sigma_px = candidates.pixels, candidates.sensitivity, candidates.sigma_px
     for k in range(rows.shape[0]):
         i = rows[k]
-        out_laser[k], out_label[k], out_used[k] = laser[i], label[i], used[i]
+        out_laser[k], out_label[k], out_used[k] = candidates.laser[i], label[i], used[i]
         out_pixels[k, 0], out_pixels[k, 1] = pixels[i, 0], pixels[i, 1]
         square = 0.0
         for axis in range(3):
-            out_points[k, axis] = points[i, axis]
+            out_points[k, axis] = candidates.points[i, axis]
             square += sensitivity[i, axis] * sensitivity[i, axis]
         out_measures[0, k] = sigma_px[i] * np.sqrt(square)
-        out_measures[1, k], out_measures[2, k] = height[i], width[i]
+        out_measures[1, k], out_measures[2, k] = candidates.height[i], candidates.width[i]
         out_measures[3, k] = min(best_sigma_px / sigma_px[i], 1.0)
 
 
@@ -306,6 +299,7 @@ _NOTHING, _NOWHERE = np.empty(0), np.empty(0, np.bool_)
 def label_candidates(
     candidates: Candidates,
     subsegments: Subsegments,
+    shapes: ComponentShapes,
     surfaces: Sequence[Surface],
     target: Surface | None,
     found: Measurement,
@@ -319,6 +313,8 @@ def label_candidates(
         N of them.
     subsegments : Subsegments
         Those of the candidates.
+    shapes : ComponentShapes
+        Of the candidates' components.
     surfaces : sequence of Surface
         All that were found.
     target : Surface or None
@@ -337,30 +333,27 @@ def label_candidates(
     listed : int array, shape (P,)
         Row of each point's candidate.
     """
-    n, shapes = len(candidates), candidates.shapes()
+    n, of_candidate = candidates.n, subsegments.of_candidate
     label, explained = np.empty(n, np.uint8), np.zeros(n, np.bool_)
     facing = _facing(target, found)
     for surface in surfaces:
         if surface is not target:
             label_other(
+                candidates,
+                of_candidate,
+                shapes,
                 surface.members,
                 surface.is_mesh,
-                subsegments.of_candidate,
-                candidates.component,
-                candidates.points,
-                shapes,
                 facing,
                 explained,
                 label,
             )
     if target is not None:
         label_target(
+            candidates,
+            of_candidate,
             target.members,
             target.is_mesh,
-            subsegments.of_candidate,
-            candidates.source,
-            candidates.points,
-            candidates.sensitivity,
             facing,
             found.inliers,
             _NOWHERE if found.net_mask is None else found.net_mask,
@@ -368,19 +361,7 @@ def label_candidates(
             label,
         )
     rows = np.empty(n, np.int64)
-    n_listed = label_loose(
-        candidates.source,
-        candidates.component,
-        candidates.pixels,
-        candidates.points,
-        candidates.height,
-        shapes,
-        facing,
-        working_range,
-        explained,
-        label,
-        rows,
-    )
+    n_listed = label_loose(candidates, shapes, facing, working_range, explained, label, rows)
     listed = rows[:n_listed]
     return _scan_points(candidates, label, found.inliers, listed), listed
 
@@ -415,14 +396,8 @@ def _scan_points(
         used=np.empty(n, np.bool_),
     )
     copy_points(
+        candidates,
         rows,
-        candidates.laser,
-        candidates.pixels,
-        candidates.points,
-        candidates.sensitivity,
-        candidates.sigma_px,
-        candidates.height,
-        candidates.width,
         label,
         used,
         found.laser,

@@ -345,28 +345,14 @@ def describe_pattern(
     """
     on_strands = np.zeros(n_lasers)
     is_mesh, is_gappy, is_unbroken, extent = _describe(
-        subsegments.table,
-        subsegments.intensity_weight,
-        subsegments.n_lines,
-        subsegments.first_line,
-        subsegments.last_line,
-        subsegments.laser,
-        members,
-        min_lines,
-        focal_px,
-        on_strands,
+        subsegments, members, min_lines, focal_px, on_strands
     )
     return StripePattern(is_mesh, is_gappy, is_unbroken, extent, on_strands)
 
 
 @lazy_kernel
 def _describe(
-    table: FloatArray,
-    intensity_weight: FloatArray,
-    n_lines: IntArray,
-    first_line: IntArray,
-    last_line: IntArray,
-    laser: IntArray,
+    subsegments: Subsegments,
     members: BoolArray,
     min_lines: int,
     focal_px: float,
@@ -379,12 +365,12 @@ def _describe(
     # of a net are longer than the lit strands; a wall behind a net is lit between short shadows.
     mesh_duty = 0.6
     for index in range(on_strands.shape[0]):
-        order, n_mine = _in_order(first_line, n_lines, laser, members, index)
+        order, n_mine = _in_order(subsegments, members, index)
         if n_mine < min_lines:
             continue
         asked += 1
         n, duty, length, extent, on_strands[index], share = _describe_stripe(
-            table, intensity_weight, n_lines, first_line, last_line, order, focal_px
+            subsegments, order, focal_px
         )
         n_intervals += n
         unbroken += share >= _UNBROKEN_SHARE
@@ -400,13 +386,12 @@ def _describe(
 
 
 @inner_kernel
-def _in_order(
-    first_line: IntArray, n_lines: IntArray, laser: IntArray, members: BoolArray, index: int
-) -> tuple[IntArray, int]:
+def _in_order(subsegments: Subsegments, members: BoolArray, index: int) -> tuple[IntArray, int]:
     """Return a laser's subsegments on a surface, in order along the stripe, and their lines."""
+    first_line = subsegments.first_line
     order, n, total = np.empty(members.shape[0], np.int64), 0, 0
     for c in range(members.shape[0]):
-        if not members[c] or laser[c] != index:
+        if not members[c] or subsegments.laser[c] != index:
             continue
         # Subsegments come almost in order.
         at = n
@@ -415,25 +400,21 @@ def _in_order(
             at -= 1
         order[at] = c
         n += 1
-        total += n_lines[c]
+        total += subsegments.n_lines[c]
     return order[:n], total
 
 
 @inner_kernel
 def _describe_stripe(
-    table: FloatArray,
-    intensity_weight: FloatArray,
-    n_lines: IntArray,
-    first_line: IntArray,
-    last_line: IntArray,
-    order: IntArray,
-    focal_px: float,
+    subsegments: Subsegments, order: IntArray, focal_px: float
 ) -> tuple[int, float, float, float, float, float]:
     """Return number, duty, typical length (m), extent and light on strands of a laser's intervals.
 
     The last value is the share of the lit search lines in intervals much longer than a strand's
     light. Medians are used, so that parts hidden by a fish or a box do not count.
     """
+    table, intensity_weight = subsegments.table, subsegments.intensity_weight
+    first_line, last_line = subsegments.first_line, subsegments.last_line
     n = order.shape[0]
     lit, dark, distance, bright = np.empty(n), np.empty(n), np.empty(n), np.zeros(n)
     n_intervals = 0
@@ -453,7 +434,7 @@ def _describe_stripe(
         end = max(end, last_line[c] + 1)
         if table[WEIGHT, c] > curved_weight * intensity_weight[c]:
             bright[n_intervals] += intensity_weight[c]
-    extent = _extent(n_lines, first_line, last_line, order)
+    extent = _extent(subsegments, order)
     gap = median_of(dark[:n_intervals]) if n_intervals else 0.0
     lit[n_intervals] = end - begin
     n_intervals += 1
@@ -474,9 +455,9 @@ def _describe_stripe(
 
 
 @inner_kernel
-def _extent(n_lines: IntArray, first_line: IntArray, last_line: IntArray, order: IntArray) -> float:
-    """Search lines between the 10 % and the 90 % point of one laser's light."""
-    total = 0
+def _extent(subsegments: Subsegments, order: IntArray) -> float:
+    """Return the search lines between the 10 % and the 90 % point of one laser's light."""
+    n_lines, total = subsegments.n_lines, 0
     for k in range(order.shape[0]):
         total += n_lines[order[k]]
     seen = 0
@@ -487,9 +468,9 @@ def _extent(n_lines: IntArray, first_line: IntArray, last_line: IntArray, order:
     for k in range(order.shape[0]):
         c = order[k]
         if seen <= stragglers * total:
-            begin = first_line[c]
+            begin = subsegments.first_line[c]
         if seen < (1.0 - stragglers) * total:
-            end = last_line[c]
+            end = subsegments.last_line[c]
         seen += n_lines[c]
     return float(end - begin + 1)
 

@@ -4,7 +4,6 @@
 stripe of another laser crosses them, and averages the rest of each, weighted by intensity.
 """
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -24,8 +23,7 @@ _SUBSEGMENT_FLOOR_PX = 0.08
 _SPREAD_SHARE = 0.12
 
 
-@dataclass(frozen=True, slots=True)
-class Observations:
+class Observations(NamedTuple):
     """Independent observations of a surface: centroids of M pieces of stripe."""
 
     # Shape (M, 3): centroid in `dome` (m) and its derivative by the stripe's position (m/px).
@@ -44,6 +42,11 @@ class Observations:
     line: FloatArray
     # Shape (M,): index of the laser.
     laser: IntArray
+
+    @property
+    def n(self) -> int:
+        """Number of observations."""
+        return len(self.laser)
 
 
 class Observed(NamedTuple):
@@ -91,79 +94,45 @@ class StripeObserver:
         normal : array, shape (3,)
             Approximate normal of the surface; spread is measured along it.
         """
-        group = np.empty(len(candidates), np.int64)
-        n, n_candidates = select_units(
-            candidates.points,
-            candidates.laser,
-            candidates.width,
-            unit,
-            min_lines,
-            on_target,
-            self.planes,
-            self.bent,
-            self._focal_px,
-            group,
+        return observe(
+            candidates, unit, min_lines, on_target, normal, self.planes, self.bent, self._focal_px
         )
-        return Observed(group, n_candidates, average_groups(candidates, group, n, normal))
-
-
-def average_groups(
-    candidates: Candidates, group: IntArray, n_groups: int, normal: FloatArray
-) -> Observations:
-    """Average groups of candidates, weighted by intensity.
-
-    A strand is lit where it crosses the laser sheet, brightest in the sheet's middle; the centroid
-    of that light lies on the sheet, regardless of the strand's direction.
-
-    Parameters
-    ----------
-    candidates : Candidates
-        N of them.
-    group : int array, shape (N,)
-        Group of each candidate, 0 to `n_groups` - 1, or -1 to leave it out; no group is empty.
-    n_groups : int
-        Number of groups.
-    normal : array, shape (3,)
-        Approximate normal of the surface; spread is measured along it.
-    """
-    seen = Observations(
-        points=np.zeros((n_groups, 3)),
-        sensitivity=np.zeros((n_groups, 3)),
-        sigma_px=np.zeros(n_groups),
-        glow=np.zeros(n_groups),
-        width=np.zeros(n_groups),
-        height=np.zeros(n_groups),
-        line=np.zeros(n_groups),
-        laser=np.empty(n_groups, np.int64),
-    )
-    summarise(
-        group,
-        candidates.laser,
-        candidates.line,
-        candidates.height,
-        candidates.width,
-        candidates.points,
-        candidates.sensitivity,
-        candidates.sigma_px,
-        candidates.pull,
-        normal,
-        seen.points,
-        seen.sensitivity,
-        seen.sigma_px,
-        seen.glow,
-        seen.width,
-        seen.height,
-        seen.line,
-        seen.laser,
-    )
-    return seen
 
 
 @kernel
-def select_units(
-    points: FloatArray,
-    laser: IntArray,
-    width: FloatArray,
+def observe(
+    candidates: Candidates,
+    unit: IntArray,
+    min_lines: int,
+    on_target: BoolArray,
+    normal: FloatArray,
+    planes: FloatArray,
+    bent: FloatArray | None,
+    focal_px: float,
+) -> Observed:
+    """Average the pieces of stripe on a target, those in crossings left out.
+
+    Parameters
+    ----------
+    candidates, unit, min_lines, on_target, normal
+        As in `StripeObserver.observe`.
+    planes : array, shape (n_lasers, 4)
+        The lasers' sheets, normal and offset.
+    bent : array, shape (n_lasers, COLUMNS), or None
+        The sheets, if windows bend any of them.
+    focal_px : float
+        Pixels per radian, roughly.
+    """
+    group = np.empty(unit.shape[0], np.int64)
+    n, n_candidates = _select_units(
+        candidates, unit, min_lines, on_target, planes, bent, focal_px, group
+    )
+    return Observed(group, n_candidates, average_groups(candidates, group, n, normal))
+
+
+@inner_kernel
+def _select_units(
+    candidates: Candidates,
     unit: IntArray,
     min_lines: int,
     on_target: BoolArray,
@@ -175,29 +144,11 @@ def select_units(
     """Assign numbers to pieces of stripe on the target, -1 to candidates elsewhere or in crossings.
 
     A piece is used as a whole: the centre of a part of a strand's light would be off the sheet.
-
-    Parameters
-    ----------
-    points, laser, width
-        Of N candidates.
-    unit, min_lines, on_target
-        As in `StripeObserver.observe`.
-    planes : array, shape (n_lasers, 4)
-        The lasers' sheets, normal and offset.
-    bent : array, shape (n_lasers, COLUMNS), or None
-        The sheets, if windows bend any of them.
-    focal_px : float
-        Pixels per radian, roughly.
-    group : int array, shape (N,)
-        Written.
-
-    Returns
-    -------
-    n_groups, n_candidates : int
-        Number of groups, and of candidates in them.
+    Return the number of groups, and of candidates in them.
     """
+    points, laser = candidates.points, candidates.laser
     number = _units_on(unit, min_lines, on_target)
-    mean_width = _mean_widths(laser, width, unit, number, planes.shape[0])
+    mean_width = _mean_widths(laser, candidates.width, unit, number, planes.shape[0])
     n_groups = 0
     n_candidates = 0
     for i in range(unit.shape[0]):
@@ -274,60 +225,68 @@ def in_crossing(
 
 
 @kernel
-def summarise(
-    index: IntArray,
-    laser: IntArray,
-    line: IntArray,
-    height: FloatArray,
-    width: FloatArray,
-    points: FloatArray,
-    sensitivity: FloatArray,
-    sigma_px: FloatArray,
-    pull: FloatArray,
-    normal: FloatArray,
-    centroid: FloatArray,
-    mean_sensitivity: FloatArray,
-    group_sigma_px: FloatArray,
-    group_glow: FloatArray,
-    group_width: FloatArray,
-    group_height: FloatArray,
-    group_line: FloatArray,
-    group_laser: IntArray,
-) -> None:
-    """Write the centroids, mean sensitivities, position errors and other means of groups."""
-    n = group_sigma_px.shape[0]
+def average_groups(
+    candidates: Candidates, group: IntArray, n: int, normal: FloatArray
+) -> Observations:
+    """Average groups of candidates, weighted by intensity.
+
+    A strand is lit where it crosses the laser sheet, brightest in the sheet's middle; the centroid
+    of that light lies on the sheet, regardless of the strand's direction.
+
+    Parameters
+    ----------
+    candidates : Candidates
+        N of them.
+    group : int array, shape (N,)
+        Group of each candidate, 0 to `n` - 1, or -1 to leave it out; no group is empty.
+    n : int
+        Number of groups.
+    normal : array, shape (3,)
+        Approximate normal of the surface; spread is measured along it.
+    """
+    height, width, points = candidates.height, candidates.width, candidates.points
+    seen = Observations(
+        np.zeros((n, 3)),
+        np.zeros((n, 3)),
+        np.zeros(n),
+        np.zeros(n),
+        np.zeros(n),
+        np.zeros(n),
+        np.zeros(n),
+        np.empty(n, np.int64),
+    )
     total, spread = np.zeros(n), np.zeros(n)
-    for i in range(index.shape[0]):
-        c = index[i]
+    for i in range(group.shape[0]):
+        c = group[i]
         if c < 0:
             continue
         intensity_weight = height[i] * width[i]
         total[c] += intensity_weight
         for k in range(3):
-            centroid[c, k] += intensity_weight * points[i, k]
-            mean_sensitivity[c, k] += intensity_weight * sensitivity[i, k]
+            seen.points[c, k] += intensity_weight * points[i, k]
+            seen.sensitivity[c, k] += intensity_weight * candidates.sensitivity[i, k]
         # Error of a weighted mean of independent positions.
-        group_sigma_px[c] += squared(intensity_weight * sigma_px[i])
-        group_glow[c] += intensity_weight * flank_difference(pull[i], width[i])
-        group_width[c] += intensity_weight * width[i]
-        group_height[c] += intensity_weight * height[i]
-        group_line[c] += intensity_weight * line[i]
-        group_laser[c] = laser[i]
+        seen.sigma_px[c] += squared(intensity_weight * candidates.sigma_px[i])
+        seen.glow[c] += intensity_weight * flank_difference(candidates.pull[i], width[i])
+        seen.width[c] += intensity_weight * width[i]
+        seen.height[c] += intensity_weight * height[i]
+        seen.line[c] += intensity_weight * candidates.line[i]
+        seen.laser[c] = candidates.laser[i]
     middle = np.empty(n)
     for c in range(n):
         share = 1.0 / total[c]
         middle[c] = 0.0
         for k in range(3):
-            centroid[c, k] *= share
-            mean_sensitivity[c, k] *= share
-            middle[c] += normal[k] * centroid[c, k]
-        group_sigma_px[c] *= share * share
-        group_glow[c] *= share
-        group_width[c] *= share
-        group_height[c] *= share
-        group_line[c] *= share
-    for i in range(index.shape[0]):
-        c = index[i]
+            seen.points[c, k] *= share
+            seen.sensitivity[c, k] *= share
+            middle[c] += normal[k] * seen.points[c, k]
+        seen.sigma_px[c] *= share * share
+        seen.glow[c] *= share
+        seen.width[c] *= share
+        seen.height[c] *= share
+        seen.line[c] *= share
+    for i in range(group.shape[0]):
+        c = group[i]
         if c >= 0:
             off = -middle[c]
             for k in range(3):
@@ -336,7 +295,8 @@ def summarise(
     for c in range(n):
         per_px = 0.0
         for k in range(3):
-            per_px += normal[k] * mean_sensitivity[c, k]
+            per_px += normal[k] * seen.sensitivity[c, k]
         scatter = spread[c] / (total[c] * per_px * per_px)
-        variance = group_sigma_px[c] + squared(_SPREAD_SHARE) * scatter
-        group_sigma_px[c] = np.sqrt(variance + squared(_SUBSEGMENT_FLOOR_PX))
+        variance = seen.sigma_px[c] + squared(_SPREAD_SHARE) * scatter
+        seen.sigma_px[c] = np.sqrt(variance + squared(_SUBSEGMENT_FLOOR_PX))
+    return seen

@@ -50,11 +50,7 @@ MIN_PIECES = 12
 
 @lazy_kernel
 def fit_over(
-    points: FloatArray,
-    sensitivity: FloatArray,
-    sigma_px: FloatArray,
-    line: FloatArray,
-    laser: IntArray,
+    seen: Observations,
     gates: float,
     shared: SharedError,
     min_bend: float,
@@ -67,8 +63,8 @@ def fit_over(
 
     Parameters
     ----------
-    points, sensitivity, sigma_px, line, laser
-        Of M observations.
+    seen : Observations
+        M of them.
     gates : float
         The fit begins with observations within this many gates of the base; 0: with `inside`.
     shared : SharedError
@@ -89,16 +85,16 @@ def fit_over(
     rms : float
         Weighted root mean square distance from the patch, in metres.
     """
-    n, coefficients = line.shape[0], patch[COEFFICIENTS:]
+    n, coefficients = seen.line.shape[0], patch[COEFFICIENTS:]
     terms, height, per_px = np.empty((n, N)), np.empty(n), np.empty(n)
-    over_plane(points, sensitivity, patch, terms, height, per_px)
+    over_plane(seen.points, seen.sensitivity, patch, terms, height, per_px)
     gate, sigma, pull = np.empty(n), np.empty(n), np.empty(n)
     by_range = GATE_SHARE * patch[OFFSET]
     n_on_plane = ZERO
     for i in range(n):
         by_pixel = GATE_PX * abs(per_px[i])
         gate[i] = np.sqrt(by_range * by_range + by_pixel * by_pixel)
-        sigma[i] = abs(per_px[i]) * sigma_px[i]
+        sigma[i] = abs(per_px[i]) * seen.sigma_px[i]
         n_on_plane += abs(height[i]) < gate[i]
         inside[i] = abs(height[i]) < gates * gate[i] if gates > 0.0 else inside[i]
     if not grow(terms, height, gate, inside, coefficients):
@@ -109,7 +105,7 @@ def fit_over(
             covariance[j, k] = inverse[j, k] * squared(max(scale, 1.0))
     for i in range(n):
         pull[i] = weights[i] * per_px[i] / (sigma[i] * sigma[i])
-    add_shared(terms, pull, line, laser, shared, inverse, covariance)
+    add_shared(terms, pull, seen.line, seen.laser, shared, inverse, covariance)
     enough = min_bend * patch[OFFSET]
     asked = _asked_for(terms, height, inside, coefficients, covariance, n_on_plane, enough, rms)
     return True, asked, rms
@@ -153,22 +149,16 @@ def _asked_for(
 
 
 @lazy_kernel
-def curvature_hint(
-    points: FloatArray,
-    sensitivity: FloatArray,
-    sigma_px: FloatArray,
-    weights: FloatArray,
-    patch: FloatArray,
-) -> float:
+def curvature_hint(seen: Observations, weights: FloatArray, patch: FloatArray) -> float:
     """Return the strongest curvature that M observations show over a patch's base, over its sigma.
 
     0 for too few.
     """
     n = weights.shape[0]
     terms, height, per_px = np.empty((n, N)), np.empty(n), np.empty(n)
-    over_plane(points, sensitivity, patch, terms, height, per_px)
+    over_plane(seen.points, seen.sensitivity, patch, terms, height, per_px)
     for i in range(n):
-        per_px[i] = abs(per_px[i]) * sigma_px[i]
+        per_px[i] = abs(per_px[i]) * seen.sigma_px[i]
     return curvature_in_sigmas(terms, height, per_px, weights)
 
 
@@ -426,8 +416,7 @@ def shows_curvature(seen: Observations, weights: FloatArray, plane: Plane) -> bo
         The fit.
     """
     flat = packed_plane(plane)
-    hint = curvature_hint(seen.points, seen.sensitivity, seen.sigma_px, weights, flat)
-    return bool(hint > _HINT)
+    return bool(curvature_hint(seen, weights, flat) > _HINT)
 
 
 def fit_patch(
@@ -502,22 +491,12 @@ def _fit_over(
     min_bend: float = MIN_BEND,
 ) -> _Attempt | None:
     """Fit a patch over a plane, grown from given observations or from those within some gates."""
-    n = len(seen.line)
+    n = seen.n
     inside = np.empty(n, np.bool_) if isinstance(start, float) else start.copy()
     patch, covariance, weights = packed_plane(plane), np.empty((N, N)), np.empty(n)
+    gates = start if isinstance(start, float) else 0.0
     found, asked_for, rms = fit_over(
-        seen.points,
-        seen.sensitivity,
-        seen.sigma_px,
-        seen.line,
-        seen.laser,
-        start if isinstance(start, float) else 0.0,
-        shared,
-        min_bend,
-        inside,
-        patch,
-        covariance,
-        weights,
+        seen, gates, shared, min_bend, inside, patch, covariance, weights
     )
     if not found:
         return None

@@ -262,7 +262,7 @@ def intensity_share_near(
     Parameters
     ----------
     group : int array, shape (N,)
-        From `select_units`.
+        As in `Observed`.
     confidence : array, shape (N,)
         Of the candidates.
     points : array, shape (M, 3)

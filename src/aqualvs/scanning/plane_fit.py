@@ -72,7 +72,7 @@ def shared_error(
     own = np.full(len(glow), SHARED_ERROR_PX) * position_px
     if twine is None:
         return SharedError(own, GLOW_PX * glow[None])
-    return SharedError(np.hypot(own, twine), np.stack([GLOW_PX * glow, twine]))
+    return SharedError(np.hypot(own, twine), np.array([GLOW_PX * glow, twine]))
 
 
 TUKEY = 4.685
@@ -435,7 +435,7 @@ def mark_inliers(
     Parameters
     ----------
     group : int array, shape (N,)
-        From `select_units`.
+        As in `Observed`.
     laser : int array, shape (M,), weights : array, shape (M,)
         Of the observations.
     of_all : bool
@@ -489,7 +489,7 @@ def weigh_candidates(
     Parameters
     ----------
     group : int array, shape (N,)
-        From `select_units`.
+        As in `Observed`.
     m : array, shape (3,)
         Of the plane.
     sensitivity, sigma_px, fit_weights : array, shape (M, 3), (M,), (M,)

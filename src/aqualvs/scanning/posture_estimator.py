@@ -193,9 +193,7 @@ class PostureEstimator:
         max_rms_share = _FOLDED_RMS_SHARE if found.folded else MAX_RMS_SHARE
         posture = validate(found.posture, self._working_range, max_rms_share)
         if isinstance(posture, Refusal):
-            return Measurement(
-                posture, np.zeros(len(candidates), np.bool_), net_mask=found.net_mask
-            )
+            return Measurement(posture, np.zeros(candidates.n, np.bool_), net_mask=found.net_mask)
         return found
 
     def _measure_net(
@@ -208,10 +206,10 @@ class PostureEstimator:
     ) -> Measurement:
         """Measure the posture to a net, which may bend or fold, and find its visible part."""
         plane = _plane_of(fit)
-        off = np.empty(len(candidates))
+        off = np.empty(candidates.n)
         distances_off(candidates.points, plane.normal, plane.offset, off)
         # With few strands only a strong bend is accepted.
-        few = len(seen.observations.laser) < _FEW_STRANDS and has_much_beside(off, SOME)
+        few = seen.observations.n < _FEW_STRANDS and has_much_beside(off, SOME)
         bends = target.n_planes > 1 or has_much_beside(off)
         bends = bends or shows_curvature(seen.observations, fit.weights, plane)
         least = MIN_BEND if bends else few * _STRONG_BEND
@@ -242,7 +240,7 @@ class PostureEstimator:
         Such a plane may stand anywhere: its mean plane counts if every laser confirms it.
         """
         plane = _plane_of(fit)
-        off = np.empty(len(candidates))
+        off = np.empty(candidates.n)
         distances_off(candidates.points, plane.normal, plane.offset, off)
         inliers = (seen.group >= 0) & (fit.weights[seen.group] > 0.0)
         patch = packed_plane(plane)
@@ -264,15 +262,10 @@ class PostureEstimator:
         self, candidates: Candidates, inliers: BoolArray, plane: Plane, patch: FloatArray
     ) -> BoolArray:
         """Mark the visible part of a net, also where its folds leave the surface."""
-        net_mask, height = inliers.copy(), np.empty(len(candidates))
+        net_mask, height = inliers.copy(), np.empty(candidates.n)
         heights_over(candidates.points, patch, height)
         grow_region(
-            candidates.points,
-            candidates.line,
-            candidates.laser,
-            candidates.component,
-            candidates.confidence,
-            candidates.source,
+            candidates,
             height,
             plane.offset,
             plane.offset * self._line_px / self._focal_px,
@@ -354,7 +347,7 @@ class PostureEstimator:
         self, candidates: Candidates, net_mask: BoolArray, off: FloatArray, plane: Plane
     ) -> Observed:
         """Average the pieces of stripe of a net, and those near a plane that may be the net's."""
-        beside = np.empty(len(candidates), np.bool_)
+        beside = np.empty(candidates.n, np.bool_)
         mark_beside(candidates.source, net_mask, off, _BESIDE_SHARE, beside)
         return self._observer.observe(
             candidates, candidates.component, self._shortest_strand, beside, plane.normal
@@ -368,7 +361,7 @@ class PostureEstimator:
         The light near one flank is more of that side than of the other: the selection is repeated
         about the mean plane until it holds the same pieces.
         """
-        off = np.empty(len(candidates))
+        off = np.empty(candidates.n)
         # The light about a mean plane is selected at most this many times more.
         max_selections = 5
         for _ in range(max_selections):
@@ -435,7 +428,7 @@ class PostureEstimator:
         seen = self._observer.observe(
             candidates, candidates.component, self._shortest_strand, near, plane.normal
         )
-        if not len(seen.observations.laser):
+        if not seen.observations.n:
             return None
         shared = self._shared_error(seen.observations, plane.normal, on_twine=True)
         fit = fit_patch(seen.observations, plane, shared, min_bend)
@@ -454,7 +447,7 @@ class PostureEstimator:
 
     def _fit(self, candidates: Candidates, seen: Observed, target: Surface) -> PlaneFit | None:
         observations = seen.observations
-        along = np.empty(len(observations.line))
+        along = np.empty(observations.n)
         places_along(observations.line, observations.laser, self._n_lines, along)
         robust = fit_robust(
             observations.points,
@@ -468,7 +461,7 @@ class PostureEstimator:
         if robust is None or self._fit_method is FitMethod.ROBUST:
             return robust
         points = candidates.points[seen.group >= 0]
-        return fit_pseudo_inverse(points, len(observations.laser), robust.covariance)
+        return fit_pseudo_inverse(points, observations.n, robust.covariance)
 
     def _shared_error(
         self, seen: Observations, normal: FloatArray, *, on_twine: bool
@@ -489,14 +482,14 @@ class PostureEstimator:
         A line and one point always share a plane: an error of a single piece would not show.
         With `of_all`, pieces that the fit has rejected count too.
         """
-        inliers = np.empty(len(candidates), np.bool_)
+        inliers = np.empty(candidates.n, np.bool_)
         laser = seen.observations.laser
         n_points, nearest, second = mark_inliers(
             seen.group, laser, fit.weights, of_all, candidates.points, inliers
         )
         if second < _MIN_OBSERVATIONS:
             return None
-        weights, observations = np.empty(len(candidates)), seen.observations
+        weights, observations = np.empty(candidates.n), seen.observations
         # The mean plane of folds and the pseudo-inverse do not use the errors.
         alike = of_all or self._fit_method is FitMethod.PSEUDO_INVERSE
         weigh_candidates(
@@ -522,7 +515,7 @@ class _MeanPlane(NamedTuple):
 
 def _share_on(seen: Observed, patch: FloatArray, plane: Plane) -> float:
     """Return the share of a net's strands on its surface; 1 where few strands show no folds."""
-    if len(seen.observations.laser) < _MIN_FOLDED:
+    if seen.observations.n < _MIN_FOLDED:
         return 1.0
     strands = seen.observations
     return share_near(strands.points, strands.laser, patch, _NEAR_SHARE * plane.offset)
@@ -540,4 +533,4 @@ def _inflate_covariance(found: Measurement, other: Measurement, share: float) ->
 
 
 def _refused(candidates: Candidates, refusal: Refusal) -> Measurement:
-    return Measurement(refusal, np.zeros(len(candidates), np.bool_))
+    return Measurement(refusal, np.zeros(candidates.n, np.bool_))

@@ -16,6 +16,7 @@ import numpy as np
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import inner_kernel, lazy_kernel
 from aqualvs.geometry.linear_algebra import median_of, order_of, squared
+from aqualvs.scanning.candidates import Candidates
 from aqualvs.scanning.net_surfaces import LONGEST_INTERVAL
 
 # Limits of light on a plane, and of light beside it, as shares of the range.
@@ -42,9 +43,8 @@ def has_much_beside(off: FloatArray, much: float = MUCH) -> bool:
 
 @inner_kernel
 def recruit_candidates(
-    points: FloatArray,
-    sensitivity: FloatArray,
-    subsegment_index: IntArray,
+    candidates: Candidates,
+    of_candidate: IntArray,
     n_subsegments: int,
     patch: FloatArray,
     other: BoolArray,
@@ -55,10 +55,10 @@ def recruit_candidates(
 
     Parameters
     ----------
-    points, sensitivity : array, shape (N, 3)
-        Of the candidates, in `dome`: metres, and m/px.
-    subsegment_index : int array, shape (N,)
-        Subsegment of each candidate, below `n_subsegments`.
+    candidates : Candidates
+        N of them.
+    of_candidate : int array, shape (N,)
+        Subsegment of each one, below `n_subsegments`.
     patch : array, shape (16,)
         The target as `Patch.packed` gives it.
     other : bool array, shape (N,)
@@ -68,6 +68,7 @@ def recruit_candidates(
     on_target : bool array, shape (N,)
         Candidates on the target; completed in place.
     """
+    points, sensitivity = candidates.points, candidates.sensitivity
     n = points.shape[0]
     near = np.zeros(n, np.bool_)
     n_near, n_all = np.zeros(n_subsegments), np.zeros(n_subsegments)
@@ -89,12 +90,12 @@ def recruit_candidates(
         off -= 0.5 * (patch[13] * u * u + patch[15] * v * v) + patch[14] * u * v
         by_pixel = near_px * per_px
         near[i] = off * off < by_range * by_range + by_pixel * by_pixel
-        n_all[subsegment_index[i]] += 1.0
-        n_near[subsegment_index[i]] += near[i]
+        n_all[of_candidate[i]] += 1.0
+        n_near[of_candidate[i]] += near[i]
     # Share of a piece that must be near.
     most = 0.5
     for i in range(n):
-        c = subsegment_index[i]
+        c = of_candidate[i]
         if near[i] and n_near[c] >= most * n_all[c] and (other[i] or not taken[i]):
             on_target[i] = True
 
@@ -114,12 +115,7 @@ _MAX_TRIED = 2
 
 @lazy_kernel
 def grow_region(
-    points: FloatArray,
-    line: IntArray,
-    laser: IntArray,
-    component: IntArray,
-    confidence: FloatArray,
-    source: IntArray,
+    candidates: Candidates,
     height: FloatArray,
     distance: float,
     m_per_line: float,
@@ -129,14 +125,8 @@ def grow_region(
 
     Parameters
     ----------
-    points : array, shape (N, 3)
-        Of the candidates, in `dome`, metres.
-    line, laser, component : int array, shape (N,)
-        As in `Candidates`.
-    confidence : array, shape (N,)
-        As in `Candidates`.
-    source : int array, shape (N,)
-        Number of the peak that is read.
+    candidates : Candidates
+        N of them.
     height : array, shape (N,)
         By how much the candidates lie behind the net's surface, in metres.
     distance : float
@@ -146,6 +136,7 @@ def grow_region(
     on_net : bool array, shape (N,)
         Candidates on the net; completed in place.
     """
+    component, source = candidates.component, candidates.source
     n_components = 0
     n_sources = 0
     for i in range(component.shape[0]):
@@ -155,7 +146,7 @@ def grow_region(
     for i in range(component.shape[0]):
         taken[source[i]] |= on_net[i]
     facts = np.zeros((_N_FACTS, n_components))
-    _describe(points, line, laser, component, confidence, source, height, on_net, taken, facts)
+    _describe(candidates, height, on_net, taken, facts)
     order, dimmest = _listed(facts, distance)
     usual = _drop_between(order, facts)
     # Largest distance to the next strand: a share of the range, and in usual distances.
@@ -170,29 +161,25 @@ def grow_region(
 
 @inner_kernel
 def _describe(
-    points: FloatArray,
-    line: IntArray,
-    laser: IntArray,
-    component: IntArray,
-    confidence: FloatArray,
-    source: IntArray,
+    candidates: Candidates,
     height: FloatArray,
     on_net: BoolArray,
     taken: BoolArray,
     facts: FloatArray,
 ) -> None:
     """Write the table of the components of light."""
+    component, points = candidates.component, candidates.points
     n_components = facts.shape[1]
     first, last = np.full(n_components, -1), np.full(n_components, -1)
     for i in range(component.shape[0]):
         s = component[i]
         facts[LINES, s] += 1.0
         facts[HEIGHT, s] += height[i]
-        facts[LINE, s] += line[i]
-        facts[CONFIDENCE, s] += confidence[i]
+        facts[LINE, s] += candidates.line[i]
+        facts[CONFIDENCE, s] += candidates.confidence[i]
         facts[ON_NET, s] += on_net[i]
-        facts[TAKEN, s] += taken[source[i]] and not on_net[i]
-        facts[LASER, s] = laser[i]
+        facts[TAKEN, s] += taken[candidates.source[i]] and not on_net[i]
+        facts[LASER, s] = candidates.laser[i]
         if first[s] < 0:
             first[s] = i
         last[s] = i

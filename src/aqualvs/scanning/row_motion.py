@@ -83,7 +83,7 @@ class RowMotion:
         times, m = self._times(candidates.pixels), plane.normal / plane.offset
         sigma = np.abs(candidates.sensitivity[seen] @ m) * candidates.sigma_px[seen] + 1e-12
         m, m_rate = _fit_rates(candidates.points[seen], sigma, times[seen], m)
-        return replace(candidates, points=_moved_back(candidates.points, times, m, m_rate))
+        return candidates._replace(points=_moved_back(candidates.points, times, m, m_rate))
 
     def as_exposed(
         self,

@@ -116,31 +116,6 @@ def is_round(shapes: ComponentShapes, s: int, bright: float) -> bool:
     return bool(spot and small and shapes.height[s] >= _GLINT_SHARE * bright)
 
 
-def component_shapes(
-    component: IntArray,
-    line: IntArray,
-    points: FloatArray,
-    sensitivity: FloatArray,
-    width: FloatArray,
-    height: FloatArray,
-) -> ComponentShapes:
-    """Describe the components of N candidates.
-
-    Parameters
-    ----------
-    component, line, points, sensitivity, width, height
-        As in `Candidates`.
-
-    Returns
-    -------
-    ComponentShapes
-        S rows, one more than the highest component number.
-    """
-    return ComponentShapes(
-        *describe_components(component, line, points, sensitivity, width, height)
-    )
-
-
 @lazy_kernel
 def describe_components(
     component: IntArray,
@@ -150,7 +125,18 @@ def describe_components(
     width: FloatArray,
     height: FloatArray,
 ) -> FloatArray:
-    """Return the fields of `ComponentShapes` as a table, shape (6, S)."""
+    """Describe the components of N candidates.
+
+    Parameters
+    ----------
+    component, line, points, sensitivity, width, height
+        As in `Candidates`.
+
+    Returns
+    -------
+    array, shape (6, S)
+        The fields of `ComponentShapes`; S is one more than the highest component number.
+    """
     n = 0
     for i in range(component.shape[0]):
         n = max(n, component[i] + 1)

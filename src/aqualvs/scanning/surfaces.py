@@ -136,11 +136,7 @@ LINES, INLIER_WEIGHT, SAMPLING_WEIGHT = range(3)
 
 @lazy_kernel
 def search_surfaces(
-    table: FloatArray,
-    intensity_weight: FloatArray,
-    n_lines: IntArray,
-    laser: IntArray,
-    subsegment_index: IntArray,
+    subsegments: Subsegments,
     pixels: FloatArray,
     n_lasers: int,
     nearest: float,
@@ -153,10 +149,8 @@ def search_surfaces(
 
     Parameters
     ----------
-    table, intensity_weight, n_lines, laser
-        As in `Subsegments`, C of them.
-    subsegment_index : int array, shape (N,)
-        Row of each candidate's subsegment.
+    subsegments : Subsegments
+        C of them.
     pixels : array, shape (N, 2)
         Each candidate's place in the image.
     n_lasers : int
@@ -171,6 +165,11 @@ def search_surfaces(
         Written: search lines, light and sampling weight of each. Light and weight of the best laser
         count up to three times those of the second.
     """
+    table, laser, intensity_weight = (
+        subsegments.table,
+        subsegments.laser,
+        subsegments.intensity_weight,
+    )
     free = np.empty(laser.shape[0], np.bool_)
     for c in range(laser.shape[0]):
         free[c] = True
@@ -185,14 +184,14 @@ def search_surfaces(
     while found < MAX_SURFACES:
         rows, left = where(free), 0
         for k in range(rows.shape[0]):
-            left += n_lines[rows[k]]
+            left += subsegments.n_lines[rows[k]]
         if left < enough or rows.shape[0] < min_subsegments:
             return found
         plane, mine = planes[found], members[found]
         if not _find_plane(table, weight, laser, rows, n_lasers, nearest, farthest, found, plane):
             return found
         by_laser, supporting = np.zeros((3, n_lasers)), 0
-        n = _collect(table, rows, plane, n_lines, intensity_weight, laser, mine, by_laser)
+        n = _collect(subsegments, rows, plane, mine, by_laser)
         for i in range(n_lasers):
             supporting += by_laser[LINES, i] >= MIN_LINES_PER_LASER
         sums[found, LINES] = sum_of(by_laser[LINES])
@@ -211,7 +210,7 @@ def search_surfaces(
         enough = max(enough, WORTH_SHARE * sums[found, LINES])
         if n_cells == 0:
             n_cells, n_columns = number_cells(pixels, cell)
-        _claim_peaks(subsegment_index, cell, n_cells, n_columns, mine, free)
+        _claim_peaks(subsegments.of_candidate, cell, n_cells, n_columns, mine, free)
         found += 1
     return MAX_SURFACES
 
@@ -246,17 +245,14 @@ def _find_plane(
 
 @inner_borrowing_kernel
 def _collect(
-    table: FloatArray,
+    subsegments: Subsegments,
     rows: IntArray,
     plane: FloatArray,
-    n_lines: IntArray,
-    intensity_weight: FloatArray,
-    laser: IntArray,
     members: BoolArray,
     by_laser: FloatArray,
 ) -> int:
     """Mark the subsegments on the plane; return their number, and sums for each laser."""
-    n = 0
+    table, laser, n = subsegments.table, subsegments.laser, 0
     nx, ny, nz, offset = plane[0], plane[1], plane[2], plane[3]
     for k in range(rows.shape[0]):
         c = rows[k]
@@ -264,8 +260,8 @@ def _collect(
         per_px = nx * table[JX, c] + ny * table[JY, c] + nz * table[JZ, c]
         if residual * residual < squared_gate(per_px, offset):
             members[c] = True
-            by_laser[LINES, laser[c]] += n_lines[c]
-            by_laser[INLIER_WEIGHT, laser[c]] += intensity_weight[c]
+            by_laser[LINES, laser[c]] += subsegments.n_lines[c]
+            by_laser[INLIER_WEIGHT, laser[c]] += subsegments.intensity_weight[c]
             by_laser[SAMPLING_WEIGHT, laser[c]] += table[WEIGHT, c]
             n += 1
     return n
@@ -273,21 +269,14 @@ def _collect(
 
 @lazy_kernel
 def collect_surface(
-    table: FloatArray,
-    n_lines: IntArray,
-    intensity_weight: FloatArray,
-    laser: IntArray,
-    n_lasers: int,
-    plane: FloatArray,
-    members: BoolArray,
-    sums: FloatArray,
+    subsegments: Subsegments, n_lasers: int, plane: FloatArray, members: BoolArray, sums: FloatArray
 ) -> None:
     """Mark the subsegments on a plane; write the sums of its surface as `search_surfaces` does.
 
     Parameters
     ----------
-    table, n_lines, intensity_weight, laser
-        As in `Subsegments`, C of them.
+    subsegments : Subsegments
+        C of them.
     n_lasers : int
         Lasers of the rig.
     plane : array, shape (4,)
@@ -298,8 +287,8 @@ def collect_surface(
         Written: search lines, light and sampling weight.
     """
     by_laser = np.zeros((3, n_lasers))
-    rows = np.arange(laser.shape[0])
-    _collect(table, rows, plane, n_lines, intensity_weight, laser, members, by_laser)
+    rows = np.arange(subsegments.laser.shape[0])
+    _collect(subsegments, rows, plane, members, by_laser)
     sums[LINES] = sum_of(by_laser[LINES])
     sums[INLIER_WEIGHT] = on_two(by_laser[INLIER_WEIGHT])
     sums[SAMPLING_WEIGHT] = on_two(by_laser[SAMPLING_WEIGHT])
@@ -395,20 +384,8 @@ def find_surfaces(
         Deterministic: the same subsegments give the same surfaces.
     """
     planes, sums = np.empty((MAX_SURFACES, 4)), np.empty((MAX_SURFACES, 3))
-    members = np.zeros((MAX_SURFACES, len(subsegments)), np.bool_)
-    n = search_surfaces(
-        subsegments.table,
-        subsegments.intensity_weight,
-        subsegments.n_lines,
-        subsegments.laser,
-        subsegments.of_candidate,
-        pixels,
-        n_lasers,
-        *working_range,
-        planes,
-        members,
-        sums,
-    )
+    members = np.zeros((MAX_SURFACES, subsegments.n), np.bool_)
+    n = search_surfaces(subsegments, pixels, n_lasers, *working_range, planes, members, sums)
     surfaces = [
         _describe(subsegments, planes[i], members[i], sums[i], n_lasers, focal_px) for i in range(n)
     ]
@@ -431,18 +408,9 @@ def surface_on(plane: Plane, subsegments: Subsegments, n_lasers: int, focal_px: 
     subsegments, n_lasers, focal_px
         As in `find_surfaces`.
     """
-    packed, members = np.append(plane.normal, plane.offset), np.zeros(len(subsegments), np.bool_)
+    packed, members = np.append(plane.normal, plane.offset), np.zeros(subsegments.n, np.bool_)
     sums = np.empty(3)
-    collect_surface(
-        subsegments.table,
-        subsegments.n_lines,
-        subsegments.intensity_weight,
-        subsegments.laser,
-        n_lasers,
-        packed,
-        members,
-        sums,
-    )
+    collect_surface(subsegments, n_lasers, packed, members, sums)
     return _describe(subsegments, packed, members, sums, n_lasers, focal_px)
 
 
