@@ -85,6 +85,15 @@ class _Lattice(NamedTuple):
     scale: FloatArray
 
 
+class _RigErrors(NamedTuple):
+    """The uncertain parameters of a rig, P of them, and what their changes move."""
+
+    lattice: _Lattice
+    moves: _SheetMoves
+    camera_columns: IntArray  # Which of the parameters are the camera's.
+    covariance: FloatArray  # Shape (P, P): of the parameters.
+
+
 class PostureErrors:
     """Propagation of the uncertainty of one rig to range, pitch and yaw.
 
@@ -115,13 +124,15 @@ class PostureErrors:
         steps = {name: min(step_share * sigmas[name], largest_step) for name in self.names}
         self._camera = camera
         self._n_lasers = len(rig.lasers)
-        self._moves = _sheet_moves(rig, camera, steps)
         own = parameter_names(camera)
-        self._camera_columns = np.array(
-            [i for i, name in enumerate(self.names) if name in own], np.int64
-        )
+        columns = np.array([i for i, name in enumerate(self.names) if name in own], np.int64)
         self._camera_steps = [(own.index(name), steps[name]) for name in self.names if name in own]
-        self._lattice = self._derivatives_on_lattice()
+        self._rig_errors = _RigErrors(
+            self._derivatives_on_lattice(),
+            _sheet_moves(rig, camera, steps),
+            columns,
+            self.covariance,
+        )
 
     def propagate(
         self,
@@ -151,26 +162,18 @@ class PostureErrors:
         covariance : array, shape (3, 3)
             Both are NaN where the points do not determine the surface.
         """
-        n, moves = len(self.names), self._moves
+        n = len(self.names)
         jacobian, covariance = np.empty((3, n)), np.zeros((3, 3))
         if n:
             _propagate(
-                *surface,
+                surface,
                 pixels,
                 laser,
                 points,
                 weights,
                 self._n_lasers,
                 each or max(_MIN_BINS, -(-_BINS // max(self._n_lasers, 1))),
-                *self._lattice,
-                moves.sheets,
-                moves.first,
-                moves.column,
-                moves.ahead,
-                moves.behind,
-                moves.step,
-                self._camera_columns,
-                self.covariance,
+                self._rig_errors,
                 jacobian,
                 covariance,
             )
@@ -301,27 +304,14 @@ def _sum_up(
 
 @lazy_kernel
 def _propagate(
-    terms: FloatArray,
-    prior: FloatArray,
-    normal: FloatArray,
-    bend: FloatArray,
-    posture: FloatArray,
+    surface: FittedSurface,
     pixels: FloatArray,
     laser: IntArray,
     points: FloatArray,
     weights: FloatArray,
     n_lasers: int,
     each: int,
-    table: FloatArray,
-    scale: FloatArray,
-    sheets: FloatArray,
-    first: IntArray,
-    column: IntArray,
-    ahead: FloatArray,
-    behind: FloatArray,
-    step: FloatArray,
-    camera_columns: IntArray,
-    rig_covariance: FloatArray,
+    rig_errors: _RigErrors,
     jacobian: FloatArray,
     covariance: FloatArray,
 ) -> None:
@@ -329,29 +319,18 @@ def _propagate(
 
     Parameters
     ----------
-    terms, prior, normal, bend, posture
-        As in `FittedSurface`.
-    pixels, laser, points, weights
+    surface, pixels, laser, points, weights
         As in `PostureErrors.propagate`.
     n_lasers, each : int
         Number of lasers, and the largest number of short segments for each.
-    table, scale
-        As in `_Lattice`.
-    sheets, first, column, ahead, behind, step
-        As in `_SheetMoves`.
-    camera_columns : int array
-        Which of the P parameters are the camera's.
-    rig_covariance : array, shape (P, P)
-        Covariance of the parameters.
+    rig_errors : _RigErrors
+        With P parameters.
     jacobian : array, shape (3, P), covariance : array, shape (3, 3)
         Written; the second zero at first.
     """
-    # Bundled here: every call from outside with a named tuple would keep some memory for good.
-    sums = _sum_up(pixels, laser, points, weights, terms, prior, n_lasers, each)
-    lattice = _Lattice(table, scale)
-    moves = _SheetMoves(sheets, first, column, ahead, behind, step)
-    n, n_terms = jacobian.shape[1], terms.shape[1]
-    factor, gain, slopes = np.empty((n_terms, n_terms)), posture.copy(), np.empty(n)
+    sums = _sum_up(pixels, laser, points, weights, surface.terms, surface.prior, n_lasers, each)
+    n, n_terms = jacobian.shape[1], surface.terms.shape[1]
+    factor, gain, slopes = np.empty((n_terms, n_terms)), surface.posture.copy(), np.empty(n)
     scratch = np.empty(15)
     if not factorise(sums.matrix, 0.0, _MIN_PIVOT, factor):
         jacobian[:] = np.nan
@@ -361,7 +340,7 @@ def _propagate(
     for i in range(3):
         solve_factorised(factor, gain[i], gain[i])
     for b in range(sums.laser.shape[0]):
-        _write_slopes(normal, bend, sums, b, lattice, moves, camera_columns, scratch, slopes)
+        _write_slopes(surface, sums, b, rig_errors, scratch, slopes)
         for i in range(3):
             pull = 0.0
             for j in range(n_terms):
@@ -372,24 +351,23 @@ def _propagate(
         for p in range(n):
             passed = 0.0
             for k in range(n):
-                passed += jacobian[i, k] * rig_covariance[k, p]
+                passed += jacobian[i, k] * rig_errors.covariance[k, p]
             for j in range(3):
                 covariance[i, j] += passed * jacobian[j, p]
 
 
 @inner_kernel
 def _write_slopes(
-    normal: FloatArray,
-    bend: FloatArray,
+    surface: FittedSurface,
     sums: StripeSums,
     b: int,
-    lattice: _Lattice,
-    moves: _SheetMoves,
-    camera_columns: IntArray,
+    rig_errors: _RigErrors,
     scratch: FloatArray,
     slopes: FloatArray,
 ) -> None:
     """Write by how much each parameter moves one stretch of stripe off the surface, s·dX."""
+    normal, bend, lattice = surface.normal, surface.bend, rig_errors.lattice
+    moves, camera_columns = rig_errors.moves, rig_errors.camera_columns
     table, own = lattice.table, sums.laser[b]
     place_x = min(max(sums.pixels[b, 0] * lattice.scale[0], 0.0), table.shape[1] - 1.0)
     place_y = min(max(sums.pixels[b, 1] * lattice.scale[1], 0.0), table.shape[0] - 1.0)

@@ -240,7 +240,7 @@ def learn_colour(table: FloatArray, colour: LaserColour, paint: Paint | None) ->
         every = 1 + table.shape[1] // enough
         found = LineColour(*_learn(table[:, ::every], *colour.value))
     else:
-        found = LineColour(*_learn_beside_paint(table, *colour.value, *paint), paint)
+        found = LineColour(*_learn_beside_paint(table, *colour.value, paint), paint)
     return found if found.ratio > 0.0 else None
 
 
@@ -279,9 +279,8 @@ def laser_likelihood(
     """
     likelihood = np.empty(table.shape[1])
     # Spreads of 0: unknown.
-    no_paint = (0.0, 0.0, 0.0, 0.0)
-    paint = line.paint or no_paint
-    _weigh(table, *line[:6], *paint, widest_white_px, n_possible, likelihood)
+    no_paint = Paint(0.0, 0.0, 0.0, 0.0)
+    _weigh(table, line[:6], line.paint or no_paint, widest_white_px, n_possible, likelihood)
     return likelihood
 
 
@@ -431,15 +430,10 @@ def _learn_paint(table: FloatArray, n_min: float) -> tuple[float, float, float, 
 
 @lazy_kernel
 def _learn_beside_paint(
-    table: FloatArray,
-    u: float,
-    v: float,
-    paint_u: float,
-    paint_v: float,
-    spread_u: float,
-    spread_v: float,
+    table: FloatArray, u: float, v: float, paint: Paint
 ) -> tuple[float, float, float, float, float, float]:
     """Return direction, ratio, noise and spreads of non-paint peaks; a ratio of 0 if unknown."""
+    paint_u, paint_v, spread_u, spread_v = paint
     sigma = _noise(table)
     is_clear = np.zeros(table.shape[1], np.bool_)
     for i in range(table.shape[1]):
@@ -530,21 +524,15 @@ def _useful_height(height: FloatArray, likelihood: FloatArray) -> float:
 @kernel
 def _weigh(
     table: FloatArray,
-    u: float,
-    v: float,
-    ratio: float,
-    sigma: float,
-    along_spread: float,
-    across_spread: float,
-    paint_u: float,
-    paint_v: float,
-    spread_u: float,
-    spread_v: float,
+    line_colour: tuple[float, float, float, float, float, float],
+    paint: Paint,
     widest_white_px: float,
     n_possible: float,
     likelihood: FloatArray,
 ) -> None:
-    """Write the likelihood of each peak, given a line's chroma for each level of height."""
+    """Write the likelihood of each peak, given the first fields of a `LineColour`."""
+    u, v, ratio, sigma, along_spread, across_spread = line_colour
+    paint_u, paint_v, spread_u, spread_v = paint
     n = table.shape[1]
     odds, kind = np.empty(n), np.empty(n, np.int64)
     for i in range(n):
