@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import inner_kernel, kernel
@@ -34,27 +35,29 @@ class _DashOptions(NamedTuple):
 _DASH = _DashOptions()
 
 
+class _LaserLines(NamedTuple):
+    """The lasers' lines on a net in one frame, L of them, over J search lines."""
+
+    # Shape (L, J): `LineState` values.
+    state: NDArray[np.uint8]
+    # Shape (L, J): as in `NetSignal`.
+    along: FloatArray
+    step: FloatArray
+    height: FloatArray
+    width: FloatArray
+    beyond: BoolArray
+
+
 @kernel
 def cut_lines(
-    state: IntArray,
-    along: FloatArray,
-    step: FloatArray,
-    height: FloatArray,
-    width: FloatArray,
-    beyond: BoolArray,
-    dash: FloatArray,
-    gap: FloatArray,
-    span: FloatArray,
-    usual: FloatArray,
+    lines: _LaserLines, dash: FloatArray, gap: FloatArray, span: FloatArray, usual: FloatArray
 ) -> tuple[int, int, int]:
     """Cut the lines into dashes, gaps and spans; return their numbers.
 
     Parameters
     ----------
-    state : uint8 array, shape (L, J)
-        `LineState` values.
-    along, step, height, width, beyond : arrays, shape (L, J)
-        As in `NetSignal`.
+    lines : _LaserLines
+        L of them.
     dash : array, shape (N, 6)
         Rows laser, whole, middle, length, height, width as in `Dashes`; written.
     gap : array, shape (K, 8)
@@ -64,14 +67,14 @@ def cut_lines(
     usual : array, shape (L, 2)
         `step` and `beyond` as in `NetView`; written.
     """
+    state, n, k, m = lines.state, 0, 0, 0
     n_lasers, n_lines = state.shape
-    n, k, m = 0, 0, 0
     for i in range(n_lasers):
-        steps = step[i][step[i] > 0.0]
+        steps = lines.step[i][lines.step[i] > 0.0]
         usual[i, 0] = np.median(steps) if len(steps) else 0.0
         n_dark, n_beyond = 0, 0
         # Gaps and dashes ascend along the line, regardless of the order of the search lines.
-        back = _descends(along[i])
+        back = _descends(lines.along[i])
         begin = 0
         while begin < n_lines:
             end = begin
@@ -79,16 +82,14 @@ def cut_lines(
                 j = _turned(end, n_lines, back)
                 dark = state[i, j] == 1
                 n_dark += dark
-                n_beyond += dark and beyond[i, j]
+                n_beyond += dark and lines.beyond[i, j]
                 end += 1
             if end == begin:
                 begin += 1
                 continue
             span[m, 0] = i
-            span[m, 1], span[m, 2] = _ends(i, begin, end - 1, back, along, step)
-            n, k = _cut_span(
-                i, begin, end, back, state, along, step, height, width, beyond, dash, n, gap, k
-            )
+            span[m, 1], span[m, 2] = _ends(lines, i, begin, end - 1, back)
+            n, k = _cut_span(lines, i, begin, end, back, dash, n, gap, k)
             m += 1
             begin = end
         usual[i, 1] = n_beyond / max(n_dark, 1)
@@ -97,23 +98,18 @@ def cut_lines(
 
 @inner_kernel
 def _cut_span(
+    lines: _LaserLines,
     i: int,
     begin: int,
     end: int,
     back: bool,
-    state: IntArray,
-    along: FloatArray,
-    step: FloatArray,
-    height: FloatArray,
-    width: FloatArray,
-    beyond: BoolArray,
     dash: FloatArray,
     n: int,
     gap: FloatArray,
     k: int,
 ) -> tuple[int, int]:
     """Append the dashes and gaps of one span; return the new counts."""
-    n_lines = state.shape[1]
+    state, height, n_lines = lines.state, lines.height, lines.state.shape[1]
     brightest = height[i].max()
     j, dark_from, before = begin, begin, -1
     while j < end:
@@ -139,33 +135,33 @@ def _cut_span(
         for a in range(first, last + 1):
             b = _turned(a, n_lines, back)
             if height[i, b] >= _DASH.bright * peak:
-                wide += width[i, b]
+                wide += lines.width[i, b]
                 n_bright += 1
-        length = _length_above(i, first, last, back, _DASH.level * peak, step, height)
-        low, high = _ends(i, first, last, back, along, step)
+        length = _length_above(lines, i, first, last, back, _DASH.level * peak)
+        low, high = _ends(lines, i, first, last, back)
         dash[n, 0], dash[n, 1] = i, 1.0 if first > begin and last < end - 1 else 0.0
         dash[n, 2], dash[n, 3] = 0.5 * (low + high), length
         dash[n, 4], dash[n, 5] = peak, wide / n_bright
         if first > dark_from:
-            _put_gap(i, dark_from, first - 1, back, along, step, beyond, gap, k, dash, before, n)
+            _put_gap(lines, i, dark_from, first - 1, back, gap, k, dash, before, n)
             k += 1
         dark_from, before = last + 1, n
         n += 1
     if end > dark_from:
-        _put_gap(i, dark_from, end - 1, back, along, step, beyond, gap, k, dash, before, -1)
+        _put_gap(lines, i, dark_from, end - 1, back, gap, k, dash, before, -1)
         k += 1
     return n, k
 
 
 @inner_kernel
 def _length_above(
-    i: int, first: int, last: int, back: bool, level: float, step: FloatArray, height: FloatArray
+    lines: _LaserLines, i: int, first: int, last: int, back: bool, level: float
 ) -> float:
     """Return the metres of a run of search lines above a level, by linear interpolation.
 
     Outside the run it is dark; bridged lines are as bright as the one before.
     """
-    n_lines = step.shape[1]
+    step, height, n_lines = lines.step, lines.height, lines.step.shape[1]
     length, before = 0.0, 0.0
     for a in range(first, last + 1):
         b = _turned(a, n_lines, back)
@@ -185,13 +181,11 @@ def _length_above(
 
 @inner_kernel
 def _put_gap(
+    lines: _LaserLines,
     i: int,
     first: int,
     last: int,
     back: bool,
-    along: FloatArray,
-    step: FloatArray,
-    beyond: BoolArray,
     gap: FloatArray,
     k: int,
     dash: FloatArray,
@@ -201,9 +195,9 @@ def _put_gap(
     """Write gap k between two dashes by their rows; -1 where the span ends."""
     seen = 0
     for a in range(first, last + 1):
-        seen += beyond[i, _turned(a, along.shape[1], back)]
+        seen += lines.beyond[i, _turned(a, lines.beyond.shape[1], back)]
     gap[k, 0] = i
-    gap[k, 1], gap[k, 2] = _ends(i, first, last, back, along, step)
+    gap[k, 1], gap[k, 2] = _ends(lines, i, first, last, back)
     gap[k, 3] = dash[before, 2] if before >= 0 else gap[k, 1]
     gap[k, 4] = dash[behind, 2] if behind >= 0 else gap[k, 2]
     gap[k, 5], gap[k, 6] = 1.0 if before >= 0 else 0.0, 1.0 if behind >= 0 else 0.0
@@ -211,10 +205,9 @@ def _put_gap(
 
 
 @inner_kernel
-def _ends(
-    i: int, first: int, last: int, back: bool, along: FloatArray, step: FloatArray
-) -> tuple[float, float]:
+def _ends(lines: _LaserLines, i: int, first: int, last: int, back: bool) -> tuple[float, float]:
     """Return both ends of a run of search lines on the laser's line, ascending."""
+    along, step = lines.along, lines.step
     a, b = _turned(first, along.shape[1], back), _turned(last, along.shape[1], back)
     return along[i, a] - 0.5 * step[i, a], along[i, b] + 0.5 * step[i, b]
 
@@ -328,18 +321,15 @@ def find_dashes(signal: NetSignal, usable: BoolArray | None = None) -> NetView:
     most = n_lasers * n_lines
     dash, gap, span = np.empty((most, 6)), np.empty((2 * most, 8)), np.empty((most, 3))
     usual = np.empty((n_lasers, 2))
-    n, k, m = cut_lines(
+    lines = _LaserLines(
         np.ascontiguousarray(state, np.uint8),
         signal.along,
         signal.step,
         signal.height,
         signal.width,
         signal.beyond,
-        dash,
-        gap,
-        span,
-        usual,
     )
+    n, k, m = cut_lines(lines, dash, gap, span, usual)
     laser, along = dash[:n, 0].astype(np.int64), dash[:n, 2].copy()
     return NetView(
         index=signal.index,
