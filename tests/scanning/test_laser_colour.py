@@ -19,7 +19,7 @@ from aqualvs.scanning.laser_colour import (
     learn_paint,
     useful_height,
 )
-from aqualvs.scanning.scan import Frame, planes_of_image
+from aqualvs.scanning.scan import Frame, colour_of, planes_of_image
 from aqualvs.scanning.stripe import N_MEASURES, StripeOptions, StripePeaks
 
 U8 = NDArray[np.uint8]
@@ -69,6 +69,12 @@ def picture(
 def detect(image: U8, wavelength: float = 532.0, *, min_likelihood: float = 0.0) -> StripePeaks:
     """All returns of a picture, however likely."""
     frame = Frame(0, 0.0, *planes_of_image(image))
+    return detect_in(frame, wavelength, min_likelihood=min_likelihood)
+
+
+def detect_in(
+    frame: Frame, wavelength: float = 532.0, *, min_likelihood: float = 0.0
+) -> StripePeaks:
     free = np.zeros((-(-HEIGHT // 8), -(-WIDTH // 8)))
     search = LaserBand(
         SearchAxis.ALONG_Y,
@@ -287,8 +293,31 @@ def test_lines_are_no_paint_however_many_peaks_they_make() -> None:
 def white_dashes(length: int) -> U8:
     """Level stripes on twine, without colour: bars of which pieces of some columns are seen."""
     bars = [Bar(y, (1.0, 1.0, 1.0), 80.0) for y in (60.0, 120.0, 180.0)]
-    dark, lit = picture(noise=1.0), picture(*bars, noise=1.0)
+    dark, lit = picture(noise=1.5), picture(*bars, noise=1.5)
     return np.where((np.arange(WIDTH) % 12 < length)[:, None], lit, dark)
+
+
+@pytest.mark.parametrize("rounding", [0, 1])
+def test_a_monochrome_camera_that_is_coded_as_colour_is_grey(rounding: int) -> None:
+    image = picture(Bar(60.0, (1.0, 1.0, 1.0), 80.0), Bar(140.0, (1.0, 1.0, 1.0), 60.0))[..., 1]
+    rng = np.random.default_rng(3)
+
+    def coded(off: int) -> Frame:
+        """As H.264 codes it: neutral chroma, but for rounding."""
+        shape = (2, HEIGHT // 2, WIDTH // 2)
+        u, v = (128 + rng.integers(-off, off, shape, endpoint=True)).astype(np.uint8)
+        return Frame(0, 0.0, image, (u, v))
+
+    assert colour_of(coded(rounding)) is None
+    neutral, grey = (detect_in(one) for one in (coded(rounding), Frame(0, 0.0, image)))
+    np.testing.assert_array_equal(neutral.position, grey.position)
+    assert np.all(neutral.likelihood == 1.0)
+    # A colour camera sees colours somewhere, in the picture or in its noise.
+    assert colour_of(coded(2)) is not None
+    one_leaf = coded(0)
+    assert one_leaf.chroma is not None
+    one_leaf.chroma[0][7, 5] = 120
+    assert colour_of(one_leaf) is one_leaf.chroma
 
 
 def test_dashes_without_any_colour_are_not_ruled_out() -> None:

@@ -48,6 +48,25 @@ class Frame:
     is_interlaced: bool = False
 
 
+def colour_of(frame: Frame) -> tuple[ImagePlane, ImagePlane] | None:
+    """Return the chroma of a frame; None if it is neutral all over the picture.
+
+    The pictures of a monochrome camera are often coded as colour, and say as little about colour as
+    those of a grey source. The noise of a colour camera is more than rounding.
+    """
+    neutral, rounding = 128, 1
+    # A few rows tell of nearly every colour camera.
+    row_step = 16
+    if frame.chroma is None:
+        return None
+    for rows in (slice(None, None, row_step), slice(None)):
+        for plane in frame.chroma:
+            some = plane[rows]
+            if some.min() < neutral - rounding or some.max() > neutral + rounding:
+                return frame.chroma
+    return None
+
+
 def planes_of_image(image: ImagePlane) -> Planes:
     """Return luma and chroma of an image, grey or BGR, as OpenCV reads it.
 
