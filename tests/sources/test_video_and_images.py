@@ -10,11 +10,13 @@ import cv2
 import numpy as np
 import pytest
 from av.video.frame import VideoFrame
+from PIL import Image
 
 from aqualvs.errors import OptionError, SourceError
 from aqualvs.scanning.scan import planes_of_image
 from aqualvs.sources import ImageSource, VideoSource, open_source
 from aqualvs.sources.base import planes_of
+from aqualvs.sources.images import read_image
 from shell_cases import (
     all_key_frames,
     cut_after,
@@ -285,6 +287,19 @@ def test_one_image_is_a_source(tmp_path):
     write_images(tmp_path, ["a.png"])
     with open_source(tmp_path / "a.png") as source:
         assert [f.index for f in source] == [0]
+
+
+def test_an_image_is_read_as_the_sensor_read_it_out(tmp_path):
+    """A camera that hangs upside down may say so; its video is not turned either."""
+    image = np.repeat(np.arange(0, 240, 2, np.uint8)[:, None], 80, axis=1)
+    exif = Image.Exif()
+    exif[0x0112] = 3  # Orientation: turned by 180 degrees.
+    Image.fromarray(image).save(tmp_path / "upside_down.jpg", exif=exif, quality=95)
+    with open_source(tmp_path) as source:
+        (frame,) = source
+    assert frame.luma[:20].mean() < 40 < 200 < frame.luma[-20:].mean()
+    for how in (cv2.IMREAD_GRAYSCALE, cv2.IMREAD_COLOR):
+        assert read_image(tmp_path / "upside_down.jpg", how)[0, 0].max() < 20
 
 
 @pytest.mark.parametrize("size", [(6, 4), (7, 5), (7, 4), (6, 5)])

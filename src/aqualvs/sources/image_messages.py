@@ -105,7 +105,8 @@ def _decompressed(data: bytes) -> Planes | None:
     try:
         with quiet_decoders():
             pixels = np.frombuffer(data, np.uint8)
-            image = cv2.imdecode(pixels, cv2.IMREAD_ANYCOLOR) if data else None
+            flags = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
+            image = cv2.imdecode(pixels, flags) if data else None
     except cv2.error:
         image = None
     return None if image is None else planes_of_image(cast("ImagePlane", image))

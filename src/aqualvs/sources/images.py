@@ -140,7 +140,10 @@ def natural_key(path: Path | str) -> list[tuple[int, str]]:
 
 
 def read_image(path: Path, how: int = cv2.IMREAD_ANYCOLOR) -> ImagePlane | None:
-    """Return an image, or None if it cannot be decoded.
+    """Return an image as the camera read it out, or None if it cannot be decoded.
+
+    What a file says about how to turn it for a viewer (EXIF) is ignored, as decoders of video do: a
+    camera model holds for the sensor.
 
     Parameters
     ----------
@@ -155,7 +158,8 @@ def read_image(path: Path, how: int = cv2.IMREAD_ANYCOLOR) -> ImagePlane | None:
     """
     try:
         with quiet_decoders():
-            image = cv2.imread(str(path), how) if path.is_file() else None
+            flags = how | cv2.IMREAD_IGNORE_ORIENTATION
+            image = cv2.imread(str(path), flags) if path.is_file() else None
     except cv2.error:
         return None
     return cast("ImagePlane | None", image)
