@@ -165,11 +165,8 @@ def search_surfaces(
         Written: search lines, light and sampling weight of each. Light and weight of the best laser
         count up to three times those of the second.
     """
-    table, laser, intensity_weight = (
-        subsegments.table,
-        subsegments.laser,
-        subsegments.intensity_weight,
-    )
+    table, laser = subsegments.table, subsegments.laser
+    intensity_weight = subsegments.intensity_weight
     free = np.empty(laser.shape[0], np.bool_)
     for c in range(laser.shape[0]):
         free[c] = True
