@@ -301,6 +301,15 @@ def where(chosen: BoolArray) -> IntArray:
     return rows
 
 
+@inner_borrowing_kernel
+def n_bins(numbers: IntArray) -> int:
+    """Return how many bins `numpy.bincount` has: one more than the highest of some numbers."""
+    n = 0
+    for i in range(numbers.shape[0]):
+        n = max(n, numbers[i] + 1)
+    return n
+
+
 @inner_kernel
 def at_rows(values: FloatArray, rows: IntArray) -> FloatArray:
     """Return the values of some rows; takes less time to compile than an array of indices."""

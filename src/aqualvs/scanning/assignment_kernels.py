@@ -13,7 +13,7 @@ from aqualvs.geometry.compiled import (
     inner_kernel,
     lazy_kernel,
 )
-from aqualvs.geometry.linear_algebra import solve_symmetric, squared, where
+from aqualvs.geometry.linear_algebra import n_bins, solve_symmetric, squared, where
 from aqualvs.scanning.candidates import Candidates, Subsegments
 from aqualvs.scanning.plane_search import (
     JX,
@@ -124,7 +124,7 @@ def _sum_candidates(
     """Sum the moments of each laser's peaks on the surface, read as each laser's."""
     source, laser, points = candidates.source, candidates.laser, candidates.points
     sensitivity = candidates.sensitivity
-    owner = np.full(_n_sources(source), -1)
+    owner = np.full(n_bins(source), -1)
     for i in range(source.shape[0]):
         if members[of_candidate[i]]:
             owner[source[i]] = laser[i]
@@ -147,15 +147,6 @@ def _sum_candidates(
         row[_SJX] += w * sensitivity[i, 0]
         row[_SJY] += w * sensitivity[i, 1]
         row[_SJZ] += w * sensitivity[i, 2]
-
-
-@inner_borrowing_kernel
-def _n_sources(source: IntArray) -> int:
-    """Return the number of peaks up to the last one that has a candidate; at least 1."""
-    last = 0
-    for i in range(source.shape[0]):
-        last = max(last, source[i])
-    return last + 1
 
 
 @inner_kernel
@@ -363,7 +354,7 @@ def judge_planes(
         Written, see `INTENSITY_WEIGHT`.
     """
     n_lasers, n_cells = bands.shape[0], bands.shape[1]
-    seen = np.full(_n_sources(candidates.source), -1)
+    seen = np.full(n_bins(candidates.source), -1)
     near = np.empty(subsegments.laser.shape[0])
     lit, expected = np.empty((n_lasers, n_cells), np.bool_), np.empty((n_lasers, n_cells), np.bool_)
     for k in range(planes.shape[0]):
@@ -491,7 +482,7 @@ def exclusive_share(
     inlier_weight : float
         The part of the surface's light that counts.
     """
-    n = _n_sources(source)
+    n = n_bins(source)
     intensity_weight, owner = np.zeros(n), np.zeros(n, np.int64)
     for i in range(source.shape[0]):
         c, r = subsegments.of_candidate[i], source[i]
@@ -534,7 +525,7 @@ def loose_share_before(
     nearest : float
         Least distance along the forward axis, in metres.
     """
-    source, points, n = candidates.source, candidates.points, _n_sources(candidates.source)
+    source, points, n = candidates.source, candidates.points, n_bins(candidates.source)
     intensity_weight = np.zeros(n)
     own, bound, before = np.zeros((3, n), np.bool_)
     for i in range(source.shape[0]):

@@ -17,7 +17,7 @@ from aqualvs.geometry.compiled import (
     lazy_borrowing_kernel,
     lazy_kernel,
 )
-from aqualvs.geometry.linear_algebra import element_at
+from aqualvs.geometry.linear_algebra import element_at, n_bins
 from aqualvs.geometry.planes import Plane
 from aqualvs.scanning.candidates import Candidates, Subsegments
 from aqualvs.scanning.patch import height_over, packed_plane
@@ -154,7 +154,7 @@ def label_target(
 @inner_kernel
 def _of_same_peak(source: IntArray, one: BoolArray, other: BoolArray) -> BoolArray:
     """Mark every candidate of the peaks that have a candidate marked in one of two ways."""
-    known = np.zeros(_n_sources(source), np.bool_)
+    known = np.zeros(n_bins(source), np.bool_)
     for i in range(source.shape[0]):
         if one[i] or other[i]:
             known[source[i]] = True
@@ -162,14 +162,6 @@ def _of_same_peak(source: IntArray, one: BoolArray, other: BoolArray) -> BoolArr
     for i in range(source.shape[0]):
         same[i] = known[source[i]]
     return same
-
-
-@inner_borrowing_kernel
-def _n_sources(source: IntArray) -> int:
-    n = 0
-    for i in range(source.shape[0]):
-        n = max(n, source[i] + 1)
-    return n
 
 
 @lazy_kernel
@@ -203,7 +195,7 @@ def label_loose(
     """
     source = candidates.source
     n = _list_kept(source, candidates.pixels, explained, rows)
-    candidates_of = np.zeros(_n_sources(source), np.int64)
+    candidates_of = np.zeros(n_bins(source), np.int64)
     for k in range(n):
         candidates_of[source[rows[k]]] += 1
     bright = np.nan

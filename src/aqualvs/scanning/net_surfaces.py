@@ -16,13 +16,14 @@ from typing import NamedTuple
 import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
-from aqualvs.geometry.compiled import (
-    inline_borrowing_kernel,
-    inner_kernel,
-    lazy_borrowing_kernel,
-    lazy_kernel,
+from aqualvs.geometry.compiled import inner_kernel, lazy_borrowing_kernel, lazy_kernel
+from aqualvs.geometry.linear_algebra import (
+    invert_symmetric,
+    median_of,
+    n_bins,
+    solve_symmetric,
+    squared,
 )
-from aqualvs.geometry.linear_algebra import invert_symmetric, median_of, solve_symmetric, squared
 from aqualvs.geometry.planes import Plane
 from aqualvs.scanning.candidates import Subsegments
 from aqualvs.scanning.patch import height_over
@@ -144,7 +145,7 @@ def share_near(points: FloatArray, laser: IntArray, patch: FloatArray, near: flo
         As `Patch.packed` gives it.
     """
     best, second = 0.0, 0.0
-    for k in range(_n_lasers(laser)):
+    for k in range(n_bins(laser)):
         n, on = 0, 0
         for i in range(laser.shape[0]):
             if laser[i] == k:
@@ -154,15 +155,6 @@ def share_near(points: FloatArray, laser: IntArray, patch: FloatArray, near: flo
         share = on / max(n, 1)
         best, second = max(best, share), max(min(best, share), second)
     return second
-
-
-@inline_borrowing_kernel
-def _n_lasers(laser: IntArray) -> int:
-    """Return the number of lasers up to the last one; `max` of an array would create one."""
-    n = 0
-    for one in laser:
-        n = max(n, one + 1)
-    return n
 
 
 def fit_mean(
@@ -236,7 +228,7 @@ def _fit_mean(
 def _usual_distance(off: FloatArray, laser: IntArray) -> float:
     """Return the median distance of the second best laser's strands, as `share_near` explains."""
     best, second, mine = np.inf, np.inf, np.empty(off.shape[0])
-    for k in range(_n_lasers(laser)):
+    for k in range(n_bins(laser)):
         n = 0
         for i in range(off.shape[0]):
             if laser[i] == k:
@@ -502,10 +494,7 @@ def mark_beside(
     beside : bool array, shape (N,)
         Written.
     """
-    last = 0
-    for i in range(source.shape[0]):
-        last = max(last, source[i])
-    explained = np.zeros(last + 1, np.bool_)
+    explained = np.zeros(n_bins(source), np.bool_)
     for i in range(source.shape[0]):
         if net_mask[i]:
             explained[source[i]] = True

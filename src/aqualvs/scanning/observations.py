@@ -10,7 +10,7 @@ import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import inline_borrowing_kernel, inner_kernel, kernel
-from aqualvs.geometry.linear_algebra import squared
+from aqualvs.geometry.linear_algebra import n_bins, squared
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.sheet import COLUMNS, planes_and_bent, sheet_distance, sheets_of
 from aqualvs.scanning.candidates import Candidates
@@ -94,13 +94,13 @@ class StripeObserver:
         normal : array, shape (3,)
             Approximate normal of the surface; spread is measured along it.
         """
-        return observe(
+        return _observe(
             candidates, unit, min_lines, on_target, normal, self.planes, self.bent, self._focal_px
         )
 
 
 @kernel
-def observe(
+def _observe(
     candidates: Candidates,
     unit: IntArray,
     min_lines: int,
@@ -110,19 +110,7 @@ def observe(
     bent: FloatArray | None,
     focal_px: float,
 ) -> Observed:
-    """Average the pieces of stripe on a target, those in crossings left out.
-
-    Parameters
-    ----------
-    candidates, unit, min_lines, on_target, normal
-        As in `StripeObserver.observe`.
-    planes : array, shape (n_lasers, 4)
-        The lasers' sheets, normal and offset.
-    bent : array, shape (n_lasers, COLUMNS), or None
-        The sheets, if windows bend any of them.
-    focal_px : float
-        Pixels per radian, roughly.
-    """
+    """Average the pieces of stripe on a target, given the lasers' sheets."""
     group = np.empty(unit.shape[0], np.int64)
     n, n_candidates = _select_units(
         candidates, unit, min_lines, on_target, planes, bent, focal_px, group
@@ -167,9 +155,7 @@ def _select_units(
 @inner_kernel
 def _units_on(unit: IntArray, min_lines: int, on_target: BoolArray) -> IntArray:
     """Return -2 for each piece on the target that is long enough, -1 for others."""
-    n_planes = 0
-    for i in range(unit.shape[0]):
-        n_planes = max(n_planes, unit[i] + 1)
+    n_planes = n_bins(unit)
     number, lines = np.full(n_planes, -1), np.zeros(n_planes, np.int64)
     for i in range(unit.shape[0]):
         lines[unit[i]] += 1
@@ -224,7 +210,7 @@ def in_crossing(
     return False
 
 
-@kernel
+@inner_kernel
 def average_groups(
     candidates: Candidates, group: IntArray, n: int, normal: FloatArray
 ) -> Observations:

@@ -20,6 +20,7 @@ from aqualvs.geometry.linear_algebra import (
     factorise,
     inverse_of,
     median_of,
+    n_bins,
     solve_factorised,
     squared,
 )
@@ -370,10 +371,7 @@ def add_shared(
     covariance : array, shape (6, 6)
         Completed in place.
     """
-    n_lasers = 0
-    for i in range(laser.shape[0]):
-        n_lasers = max(n_lasers, laser[i] + 1)
-    for index in range(n_lasers):
+    for index in range(n_bins(laser)):
         low, high = np.inf, -np.inf
         for i in range(laser.shape[0]):
             if laser[i] == index:

@@ -12,6 +12,7 @@ from aqualvs.geometry.linear_algebra import (
     factorise,
     invert_symmetric,
     median_of,
+    n_bins,
     solve_factorised,
     solve_symmetric,
     squared,
@@ -311,9 +312,7 @@ def _add_own_errors(
 
     `off` is m·X - 1; `factor` is that of the points' variances.
     """
-    n_modes = 0
-    for i in range(laser.shape[0]):
-        n_modes = max(n_modes, 2 * (laser[i] + 1))
+    n_modes = 2 * n_bins(laser)
     pull, residual = np.zeros((n_modes, 3)), np.zeros(n_modes)
     matrix = np.zeros((n_modes, n_modes))
     for i in range(points.shape[0]):
@@ -461,9 +460,7 @@ def mark_inliers(
             n += 1
             x, y, z = points[i, 0], points[i, 1], points[i, 2]
             square = min(square, x * x + y * y + z * z)
-    n_lasers = 0
-    for k in range(laser.shape[0]):
-        n_lasers = max(n_lasers, laser[k] + 1)
+    n_lasers = n_bins(laser)
     observations = np.zeros(n_lasers, np.int64)
     for k in range(laser.shape[0]):
         observations[laser[k]] += of_all or weights[k] > 0.0

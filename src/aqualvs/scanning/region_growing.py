@@ -15,7 +15,7 @@ import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import inner_kernel, lazy_kernel
-from aqualvs.geometry.linear_algebra import median_of, order_of, squared
+from aqualvs.geometry.linear_algebra import median_of, n_bins, order_of, squared
 from aqualvs.scanning.candidates import Candidates
 from aqualvs.scanning.net_surfaces import LONGEST_INTERVAL
 
@@ -137,12 +137,8 @@ def grow_region(
         Candidates on the net; completed in place.
     """
     component, source = candidates.component, candidates.source
-    n_components = 0
-    n_sources = 0
-    for i in range(component.shape[0]):
-        n_components = max(n_components, component[i] + 1)
-        n_sources = max(n_sources, source[i] + 1)
-    taken = np.zeros(n_sources, np.bool_)
+    n_components = n_bins(component)
+    taken = np.zeros(n_bins(source), np.bool_)
     for i in range(component.shape[0]):
         taken[source[i]] |= on_net[i]
     facts = np.zeros((_N_FACTS, n_components))

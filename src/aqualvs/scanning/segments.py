@@ -25,7 +25,7 @@ from aqualvs.geometry.compiled import (
     inner_kernel,
     lazy_kernel,
 )
-from aqualvs.geometry.linear_algebra import solve_symmetric
+from aqualvs.geometry.linear_algebra import n_bins, solve_symmetric
 from aqualvs.scanning.laser_bands import SLOPE_CELL, LaserBand
 from aqualvs.scanning.stripe import StripePeaks
 
@@ -137,9 +137,7 @@ def describe_components(
     array, shape (6, S)
         The fields of `ComponentShapes`; S is one more than the highest component number.
     """
-    n = 0
-    for i in range(component.shape[0]):
-        n = max(n, component[i] + 1)
+    n = n_bins(component)
     table = np.zeros((6, n))
     shapes = ComponentShapes(table[0], table[1], table[2], table[3], table[4], table[5])
     first, last = np.full(n, -1), np.full(n, -1)
