@@ -433,6 +433,8 @@ def test_an_impossible_reach_is_refused(value: float) -> None:
 @pytest.mark.parametrize("reach_px", [8, 9, 16, 17, 33, 64, 86])
 def test_the_background_is_the_higher_of_the_least_pixels_on_either_side(reach_px: int) -> None:
     rng, length = np.random.default_rng(reach_px), 301
+    # In pairs of pixels.
+    reach = (reach_px - 1) // 2
     picture = rng.integers(40, 90, (60, length), np.uint8)
     peak = rng.integers(reach_px, length - reach_px, len(picture))
     picture[np.arange(len(picture)), peak] = 200
@@ -441,8 +443,8 @@ def test_the_background_is_the_higher_of_the_least_pixels_on_either_side(reach_p
     line, table = np.empty(100, np.int64), np.empty((N_MEASURES, 100))
     n = finder.find(SearchImage(picture, no_chroma, no_chroma, 1, True), 100, 1, line, table)
     expected = [
-        200 - max(row[p - reach_px + 1 : p + 1].min(), row[p : p + reach_px].min())
-        for row, p in zip(picture, peak, strict=True)
+        200 - max(row[k - 2 * reach : k].min(), row[k + 2 : k + 2 + 2 * reach].min())
+        for row, k in zip(picture, peak // 2 * 2, strict=True)
     ]
     assert line[:n].tolist() == list(range(len(picture)))
     assert table[HEIGHT, :n].tolist() == expected

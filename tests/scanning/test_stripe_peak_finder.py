@@ -39,11 +39,13 @@ class Peak(NamedTuple):
 
 
 def background_of(row: list[int], reach: int) -> list[int]:
-    """The higher of the least values of `reach` pixels to either side, the pixel's own included."""
-    return [
-        max(min(row[max(i - reach + 1, 0) : i + 1]), min(row[i : i + reach]))
-        for i in range(len(row))
+    """The higher of the least values of pairs of pixels to either side; white beyond the row."""
+    least, half = [min(row[i : i + 2]) for i in range(0, len(row), 2)], max((reach - 1) // 2, 1)
+    of_pair = [
+        max(min(least[max(k - half, 0) : k], default=255), min(least[k + 1 :][:half], default=255))
+        for k in range(len(least))
     ]
+    return [of_pair[i // 2] for i in range(len(row))]
 
 
 def segments(run: list[int], base: int) -> list[tuple[int, int]]:
@@ -66,7 +68,8 @@ def segments(run: list[int], base: int) -> list[tuple[int, int]]:
 
 def peaks_of(row: list[int], x: int, low: int, high: int, contrast: int, reach: int) -> list[Peak]:
     n, background = len(row), background_of(row, reach)
-    first, end = max(low - reach, 0), min(high + reach + 1, n)
+    # Whole pairs of pixels.
+    first, end = max(low - reach, 0) // 2 * 2, min(min(high + reach, n - 1) // 2 * 2 + 2, n)
     above = [first <= i < end and row[i] - background[i] >= contrast for i in range(n)] + [False]
     found, i = [], first
     while i < end:

@@ -20,10 +20,10 @@ from aqualvs.geometry.compiled import ZERO, borrowing_kernel, inline_borrowing_k
 
 U8Array: TypeAlias = NDArray[np.uint8]
 
-# Marks of pixels, bytes of 0 or 1, are read eight at a time.
+# Marks, bytes of 0 or 1, are read eight at a time.
 _WORD = 8
-_NOTHING, _MARKED, _UNMARKED = np.uint64(0), np.uint64(1), np.uint64(0)
-_EACH_BYTE, _BYTE_NUMBERS = np.uint64(0x0101010101010101), np.uint64(0x0001020304050607)
+_NOTHING, _ALL_BITS = np.uint64(0), np.uint64(0xFFFFFFFFFFFFFFFF)
+_BYTE_NUMBERS = np.uint64(0x0001020304050607)
 _BRIGHT = np.uint8(255)
 # The profile of a stripe narrower than this is not straight between pixels: straight lines draw its
 # centroid to the grid by up to 0.05 px, at half of this width by 0.15 px. Noise moves both centres
@@ -136,9 +136,11 @@ class SearchImage(NamedTuple):
 
 
 class _Workspace(NamedTuple):
-    """Buffers of one search line: pixels with margins, sliding minima, marks above background."""
+    """Buffers of one search line, by pairs of pixels: extremes, minima, marks above background."""
 
-    padded: U8Array
+    # With margins.
+    least: U8Array
+    most: U8Array
     minima: U8Array
     spare: U8Array
     background: U8Array
@@ -172,11 +174,11 @@ class PeakFinder:
         self._lowest, self._highest = lowest, highest
         self._reach_px, self._directions = reach_px, directions
         # Lines are worked on in whole vectors, whatever stands after their last pixel.
-        padded, minima, spare = np.full((3, length + 2 * reach_px + _VECTOR), 255, np.uint8)
-        # There is room for a gap and a mark after the last pixel.
-        background, above = np.zeros((2, (length + _VECTOR) // _WORD * _WORD + 3 * _WORD), np.uint8)
-        words = above.view(np.uint64)
-        self._scratch = _Workspace(padded, minima, spare, background, above, words)
+        pairs = (length + 1) // 2
+        margins = np.full((4, pairs + 2 * reach_px + _VECTOR), 255, np.uint8)
+        # There is room for a gap and a mark after the last pair.
+        background, above = np.zeros((2, (pairs + _VECTOR) // _WORD * _WORD + 3 * _WORD), np.uint8)
+        self._scratch = _Workspace(*margins, background, above, above.view(np.uint64))
 
     def find(
         self, image: SearchImage, min_contrast: int, every: int, line: IntArray, table: FloatArray
@@ -237,71 +239,107 @@ def _find_peaks(
             continue
         row = image.lines[x]
         # Runs reach over the band's limits.
-        first = max(lowest[x] - reach_px, 0)
-        end = min(highest[x] + reach_px + 1, row.shape[0])
-        _mark_above(row, first, end, min_contrast, reach_px, scratch)
-        start = _next_with(_MARKED, scratch.words, ZERO)
-        while start < end - first:
-            stop = _next_with(_UNMARKED, scratch.words, start)
-            if first + start <= highest[x] and first + stop > lowest[x]:
-                run = (start, stop)
+        first = max(lowest[x] - reach_px, 0) >> 1
+        end = (min(highest[x] + reach_px, row.shape[0] - 1) >> 1) + 1
+        _mark_above(row, first, end, min_contrast, max((reach_px - 1) >> 1, 1), scratch)
+        pair = _next_marked(scratch.words, ZERO)
+        while pair < end - first:
+            run = _run_in(row, 2 * first, pair, 2 * end, min_contrast, scratch.background)
+            if run[0] <= highest[x] and run[1] > lowest[x]:
                 n = _measure_run(
-                    image, x, first, run, scratch, reach_px, directions, line, table, n
+                    image, x, 2 * first, run, scratch, reach_px, directions, line, table, n
                 )
                 if n == line.shape[0]:
                     return n
-            start = _next_with(_MARKED, scratch.words, stop)
+            # The pixel after a run is not above the background.
+            pair = _next_marked(scratch.words, ((run[1] + 1) >> 1) - first)
     return n
 
 
 @inline_borrowing_kernel
+def _run_in(
+    row: U8Array, first: int, pair: int, end: int, min_contrast: int, background: U8Array
+) -> tuple[int, int]:
+    """Return the run [start, stop) of pixels above the background that begins in a marked pair.
+
+    Pairs count from position `first` on; the run stops at `end` at the latest.
+    """
+    start, end = first + 2 * pair, min(end, row.shape[0])
+    start += row[start] < background[pair] + min_contrast
+    stop = start + 1
+    while stop < end and row[stop] >= background[(stop - first) >> 1] + min_contrast:
+        stop += 1
+    return start, stop
+
+
+@inline_borrowing_kernel
 def _mark_above(
-    row: U8Array, first: int, end: int, min_contrast: int, reach_px: int, scratch: _Workspace
+    row: U8Array, first: int, end: int, min_contrast: int, reach: int, scratch: _Workspace
 ) -> None:
-    """Mark the pixels [first, end) that stand above the background; index 0 is `first`."""
+    """Mark the pairs of pixels [first, end) that stand above the background; index 0 is `first`.
+
+    The background of a pair is the higher of the least values of `reach` pairs to either side. The
+    pair itself does not count: of its pixels only one may belong to a step edge's bright side.
+    """
     n = end - first
     # Slices from 0 on: LLVM sees that no index is negative, and uses vector instructions.
-    padded = scratch.padded[: n + 2 * reach_px]
+    least, most = scratch.least[: n + 2 * reach], scratch.most[: n + 2 * reach]
     # Pixels beyond the border count as bright: one flank is not visible there, so no peak is found.
-    seen, ahead = min(reach_px, first), min(reach_px, row.shape[0] - end)
-    padded[: reach_px - seen] = _BRIGHT
-    _copy(row[first - seen : end + ahead], padded[reach_px - seen :])
-    padded[reach_px + n + ahead :] = _BRIGHT
-    # Minima over windows that grow towards `reach_px`: four times as wide each time.
-    here, there = scratch.padded, scratch.minima
+    seen, ahead = min(reach, first), min(reach, ((row.shape[0] + 1) >> 1) - end)
+    least[: reach - seen] = _BRIGHT
+    _pair(
+        row[2 * (first - seen) : 2 * (end + ahead)],
+        least[reach - seen : reach + n + ahead],
+        most[reach - seen : reach + n + ahead],
+    )
+    least[reach + n + ahead :] = _BRIGHT
+    # Minima over windows that grow towards `reach`: four times as wide each time.
+    here, there = scratch.least, scratch.minima
     span = 1
-    while 2 * span < reach_px:
-        grown = min(4 * span, reach_px)
+    while 2 * span < reach:
+        grown = min(4 * span, reach)
         last = grown - span
         _least_of_four(
             here,
             here[min(span, last) :],
             here[min(2 * span, last) :],
             here[last:],
-            _whole_vectors(n + 2 * reach_px - grown + 1),
+            _whole_vectors(n + 2 * reach - grown + 1),
             there,
         )
         here, there = there, here if span > 1 else scratch.spare
         span = grown
-    # The last step is taken here, for the windows before and behind a pixel.
-    near_before, near_behind = here[1:], here[reach_px:]
-    far_before, far_behind = here[1 + reach_px - span :], here[2 * reach_px - span :]
-    pixels, background, above = scratch.padded[reach_px:], scratch.background, scratch.above
-    least = np.uint8(min_contrast)
+    # The last step is taken here, for the windows before and behind a pair.
+    near_before, near_behind = here, here[reach + 1 :]
+    far_before, far_behind = here[reach - span :], here[2 * reach + 1 - span :]
+    pairs, background, above = scratch.most[reach:], scratch.background, scratch.above
+    enough = np.uint8(min_contrast)
     for i in range(_whole_vectors(n)):
         before = near_before[i] if near_before[i] < far_before[i] else far_before[i]
         behind = near_behind[i] if near_behind[i] < far_behind[i] else far_behind[i]
         base = before if before > behind else behind
         background[i] = base
-        above[i] = np.uint8(np.uint8(pixels[i] - base) >= least)
+        base = base if base < pairs[i] else pairs[i]
+        above[i] = np.uint8(np.uint8(pairs[i] - base) >= enough)
     # A gap, then a mark that ends the search for the next run.
     above[n : n + _WORD] = np.uint8(0)
     above[n + _WORD] = np.uint8(1)
 
 
 @inline_borrowing_kernel
+def _pair(row: U8Array, least: U8Array, most: U8Array) -> None:
+    """Write the lesser and the greater of each pair of pixels; an odd last one is both."""
+    for i in range(row.shape[0] >> 1):
+        one, other = row[2 * i], row[2 * i + 1]
+        least[i] = one if one < other else other
+        most[i] = other if one < other else one
+    if row.shape[0] & 1:
+        least[row.shape[0] >> 1] = most[row.shape[0] >> 1] = row[row.shape[0] - 1]
+
+
+@inline_borrowing_kernel
 def _whole_vectors(n: int) -> int:
-    """Round a number of pixels up: what remains after the last vector is slow, one by one."""
+    """Round a number of pairs up: what remains after the last vector is slow, one by one."""
     return (n + _VECTOR - 1) // _VECTOR * _VECTOR
 
 
@@ -316,21 +354,13 @@ def _least_of_four(
 
 
 @inline_borrowing_kernel
-def _copy(source: U8Array, out: U8Array) -> None:
-    for i in range(source.shape[0]):
-        out[i] = source[i]
-
-
-@inline_borrowing_kernel
-def _next_with(mark: np.uint64, words: NDArray[np.uint64], at: int) -> int:
-    """Return the first pixel from `at` on that has the mark (0 or 1); there must be one."""
-    # Bytes of the word that have the mark become 1; others, and those before `at`, become 0.
-    other = _EACH_BYTE * (np.uint64(1) - mark)
+def _next_marked(words: NDArray[np.uint64], at: int) -> int:
+    """Return the first mark from `at` on; there must be one."""
     index = at >> 3
-    found = (words[index] ^ other) & (_EACH_BYTE << np.uint64(8 * (at & 7)))
+    found = words[index] & (_ALL_BITS << np.uint64(8 * (at & 7)))
     while found == _NOTHING:
         index += 1
-        found = words[index] ^ other
+        found = words[index]
     # A product with the lowest of these bits shifts the number of its byte to the top.
     lowest = found & (~found + np.uint64(1))
     return (index << 3) + int((lowest * _BYTE_NUMBERS) >> np.uint64(56))
@@ -349,13 +379,13 @@ def _measure_run(
     table: FloatArray,
     n: int,
 ) -> int:
-    """Append the peaks of a run of search line `x`; return their new number.
+    """Append the peaks of a run [start, end) of search line `x`; return their new number.
 
-    The run [start, end) and the background count from position `first` on.
+    The background counts pairs from position `first` on.
     """
     row, background = image.lines[x], scratch.background
-    start, end = first + run[0], first + run[1]
-    base = np.int64(background[run[0]])
+    start, end = run
+    base = np.int64(background[(start - first) >> 1])
     low = max(start - reach_px, 0)
     # Outside the run the profile may still fall towards half height.
     high = min(end + reach_px, row.shape[0]) - 1
@@ -363,7 +393,7 @@ def _measure_run(
         peak, start = _next_peak(row, start, end, base)
         last = high if start >= end else start
         # Doubled grey levels, so that half a level is a whole number.
-        level = np.int64(row[peak]) + np.int64(background[peak - first])
+        level = np.int64(row[peak]) + np.int64(background[(peak - first) >> 1])
         a, b = _feet(row, peak, low, last, level)
         low = start
         if a < 0:
@@ -510,11 +540,11 @@ def _measure_chroma(
     The peak's chroma is that of its middle or of an edge, whichever is more of the laser's colour:
     a saturated core is white.
     """
-    row, chroma_line = image.lines[x], (x * image.line_px) >> 1
+    row, around = image.lines[x], _chroma_lines(image, x)
     edge, flank = int(0.5 * width) + 1, int(width) + _FLANK_PX
     before, after = max(peak - flank, 0), min(peak + flank, row.shape[0] - 1)
-    u_before, v_before = _chroma(image, chroma_line, before)
-    u_after, v_after = _chroma(image, chroma_line, after)
+    u_before, v_before = _chroma(image, around, before)
+    u_after, v_after = _chroma(image, around, after)
     # Where one flank is much brighter, another stripe lies there.
     difference = np.int64(row[before]) - np.int64(row[after])
     weight = 0.5
@@ -525,7 +555,7 @@ def _measure_chroma(
     luma = weight * row[before] + (1.0 - weight) * row[after]
     best = -np.inf
     for offset in (0, -edge, edge):
-        u, v = _chroma(image, chroma_line, peak + offset)
+        u, v = _chroma(image, around, peak + offset)
         u, v = u - u_flank, v - v_flank
         for k in range(directions.shape[0]):
             along_u, along_v = directions[k, 0], directions[k, 1]
@@ -545,15 +575,25 @@ def _measure_chroma(
 
 
 @inline_borrowing_kernel
-def _chroma(image: SearchImage, chroma_line: int, position: int) -> tuple[float, float]:
+def _chroma_lines(image: SearchImage, x: int) -> tuple[int, int, int]:
+    """Return the line of chroma of search line `x` and its neighbours, within the picture."""
+    last = (image.u.shape[0] if image.along_x else image.u.shape[1]) - 1
+    line = min((x * image.line_px) >> 1, last)
+    return max(line - 1, 0), line, min(line + 1, last)
+
+
+@inline_borrowing_kernel
+def _chroma(image: SearchImage, lines: tuple[int, int, int], position: int) -> tuple[float, float]:
     """Return U and V at a position of a search line, the mean over neighbours along the stripe."""
     u, v = image.u, image.v
-    n_lines, length = u.shape if image.along_x else (u.shape[1], u.shape[0])
-    p = min(max(position >> 1, 0), length - 1)
-    total_u, total_v = np.int64(0), np.int64(0)
-    for offset in range(-1, 2):
-        line = min(max(chroma_line + offset, 0), n_lines - 1)
-        y, x = (line, p) if image.along_x else (p, line)
-        total_u += np.int64(u[y, x])
-        total_v += np.int64(v[y, x])
+    one, two, three = lines
+    p = max(position >> 1, 0)
+    if image.along_x:
+        p = min(p, u.shape[1] - 1)
+        total_u = np.int64(u[one, p]) + np.int64(u[two, p]) + np.int64(u[three, p])
+        total_v = np.int64(v[one, p]) + np.int64(v[two, p]) + np.int64(v[three, p])
+    else:
+        p = min(p, u.shape[0] - 1)
+        total_u = np.int64(u[p, one]) + np.int64(u[p, two]) + np.int64(u[p, three])
+        total_v = np.int64(v[p, one]) + np.int64(v[p, two]) + np.int64(v[p, three])
     return total_u * _THIRD, total_v * _THIRD
