@@ -251,6 +251,16 @@ def test_heights_at_which_hardly_any_peak_is_a_line_are_not_worth_a_look() -> No
     assert useful_height(np.empty(0), np.empty(0)) <= 32
 
 
+def test_a_few_likely_peaks_do_not_bring_in_the_noise_above_them() -> None:
+    height = np.repeat([9.0, 13.0, 18.0, 27.0], [48, 65, 120, 85])
+    likelihood = np.full(len(height), 0.01)
+    likelihood[:5] = 1.0
+    assert useful_height(height, likelihood) == 32
+    # All of the light above them counts.
+    likelihood[48:] = 1.0
+    assert useful_height(height, likelihood) == 8
+
+
 def peaks(
     n: int, u: float, v: float, spread: tuple[float, float], *, top: float = 150.0, seed: int = 1
 ) -> FloatArray:

@@ -236,11 +236,12 @@ def learn_colour(table: FloatArray, colour: LaserColour, paint: Paint | None) ->
     """
     # Number of peaks that is enough to learn from.
     enough = 2500
-    if paint is None:
-        every = 1 + table.shape[1] // enough
-        found = LineColour(*_learn(table[:, ::every], *colour.value))
-    else:
-        found = LineColour(*_learn_beside_paint(table, *colour.value, paint), paint)
+    sample = table[:, :: 1 + table.shape[1] // enough]
+    found = (
+        LineColour(*_learn(sample, *colour.value))
+        if paint is None
+        else LineColour(*_learn_beside_paint(sample, *colour.value, paint), paint)
+    )
     return found if found.ratio > 0.0 else None
 
 
@@ -506,19 +507,27 @@ def _best_stripes(
 @lazy_kernel
 def _useful_height(height: FloatArray, likelihood: FloatArray) -> float:
     lines, peaks = np.zeros(_N_KINDS), np.zeros(_N_KINDS)
-    # Heights at which so few of a sample's peaks, or at most this share, are clearly lines are
-    # skipped.
-    few_lines, useful_share, clearly = 4, 0.05, 0.8
+    clearly = 0.8
     for i in range(height.shape[0]):
         kind = _kind_of(height[i])
         peaks[kind] += 1.0
         lines[kind] += likelihood[i] > clearly
-    n_useless = 0
-    while n_useless < _N_KINDS and (
-        lines[n_useless] < few_lines or lines[n_useless] <= useful_share * peaks[n_useless]
-    ):
-        n_useless += 1
-    return float(min(math.ceil(2.0 ** (n_useless / _KINDS_PER_OCTAVE)), HIGHEST_USEFUL))
+    useful, kind = HIGHEST_USEFUL, _kind_of(HIGHEST_USEFUL) - 1
+    # Of all peaks from a height on, and of those of about that height.
+    all_lines, all_peaks = 0.0, 0.0
+    while kind >= 0:
+        all_lines, all_peaks = all_lines + lines[kind], all_peaks + peaks[kind]
+        if _are_useful(lines[kind], peaks[kind]) and _are_useful(all_lines, all_peaks):
+            useful = math.ceil(2.0 ** (kind / _KINDS_PER_OCTAVE))
+        kind -= 1
+    return float(useful)
+
+
+@inline_kernel
+def _are_useful(lines: float, peaks: float) -> bool:
+    # Peaks of a sample of which so few, or at most this share, are clearly lines are skipped.
+    few_lines, useful_share = 4.0, 0.05
+    return bool(lines >= few_lines and lines > useful_share * peaks)
 
 
 @kernel
