@@ -175,10 +175,11 @@ class PeakFinder:
         self._reach_px, self._directions = reach_px, directions
         # Lines are worked on in whole vectors, whatever stands after their last pixel.
         pairs = (length + 1) // 2
-        margins = np.full((4, pairs + 2 * reach_px + _VECTOR), 255, np.uint8)
+        least, most, minima, spare = np.full((4, pairs + 2 * reach_px + _VECTOR), 255, np.uint8)
         # There is room for a gap and a mark after the last pair.
         background, above = np.zeros((2, (pairs + _VECTOR) // _WORD * _WORD + 3 * _WORD), np.uint8)
-        self._scratch = _Workspace(*margins, background, above, above.view(np.uint64))
+        words = above.view(np.uint64)
+        self._scratch = _Workspace(least, most, minima, spare, background, above, words)
 
     def find(
         self, image: SearchImage, min_contrast: int, every: int, line: IntArray, table: FloatArray
