@@ -274,6 +274,16 @@ def test_specks_on_a_plane_are_no_net_before_a_wall_of_light() -> None:
     assert choose([wall, near], TargetKind.AUTO) is near
 
 
+def test_a_few_intervals_beside_a_net_are_no_net() -> None:
+    """With too few intervals on each laser to be seen as broken, a mesh has no extent."""
+    wall, net = surface(0.96, 1066.0, False, extent=0.0), surface(0.51, 330.0, False, extent=1373.0)
+    few = surface(0.31, 150.0, True, extent=0.0)
+    assert choose([wall, net, few], TargetKind.AUTO) is wall
+    # Of a net far away no more is seen.
+    behind = surface(1.2, 200.0, False, extent=0.0)
+    assert choose([few, behind], TargetKind.AUTO) is few
+
+
 def test_light_far_behind_a_plane_is_not_on_it_however_far_a_pixel_moves_it() -> None:
     """Read as the wrong laser's, a neighbour's light lies where rays are parallel to the sheet."""
     wall = plane(0.5)

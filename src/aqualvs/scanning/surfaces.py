@@ -548,18 +548,20 @@ def choose_target(
     surfaces = [one for one in surfaces if near <= one.plane.offset <= far] or surfaces
     most = max((surface.sampling_weight for surface in surfaces), default=0.0)
     lines = max((surface.n_lines for surface in surfaces), default=0)
-    # Unbroken stripes have no extent; their number of search lines serves as one.
-    reach = max((max(surface.extent, surface.n_lines) for surface in surfaces), default=0.0)
+    reach = max((_reach(surface) for surface in surfaces), default=0.0)
     # Specks that share a plane by chance have less than these shares of the search lines of the
     # surface that has most, and of the extent of the one that reaches farthest; a sparse net
-    # reaches far.
+    # reaches far. Stripes without extent have too few intervals to be seen as broken.
     lines_share, reach_share = 0.1, 0.5
     meshes = [
         one
         for one in surfaces
         if one.is_mesh
         and one.sampling_weight >= WORTH_SHARE * most
-        and (one.n_lines >= lines_share * lines or one.extent >= reach_share * reach)
+        and (
+            (one.extent > 0.0 and one.n_lines >= lines_share * lines)
+            or _reach(one) >= reach_share * reach
+        )
     ]
     solids = [one for one in surfaces if not one.is_mesh]
     solid = max(solids, key=lambda surface: surface.inlier_weight, default=None)
@@ -567,6 +569,11 @@ def choose_target(
     if kind is TargetKind.NET:
         return net
     return solid if kind is TargetKind.SOLID or net is None else net
+
+
+def _reach(surface: Surface) -> float:
+    """Return the extent of a surface; unbroken stripes have none, so their search lines serve."""
+    return max(surface.extent, surface.n_lines)
 
 
 def _nearest_far_reaching(meshes: Sequence[Surface]) -> Surface | None:
