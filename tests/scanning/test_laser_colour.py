@@ -19,7 +19,7 @@ from aqualvs.scanning.laser_colour import (
     learn_paint,
     useful_height,
 )
-from aqualvs.scanning.scan import Frame, colour_of, planes_of_image
+from aqualvs.scanning.scan import Frame, planes_of_image, without_neutral_chroma
 from aqualvs.scanning.stripe import N_MEASURES, StripeOptions, StripePeaks
 
 U8 = NDArray[np.uint8]
@@ -318,16 +318,20 @@ def test_a_monochrome_camera_that_is_coded_as_colour_is_grey(rounding: int) -> N
         u, v = (128 + rng.integers(-off, off, shape, endpoint=True)).astype(np.uint8)
         return Frame(0, 0.0, image, (u, v))
 
-    assert colour_of(coded(rounding)) is None
-    neutral, grey = (detect_in(one) for one in (coded(rounding), Frame(0, 0.0, image)))
-    np.testing.assert_array_equal(neutral.position, grey.position)
-    assert np.all(neutral.likelihood == 1.0)
+    assert without_neutral_chroma(coded(rounding)).chroma is None
+    # The picture of a red or blue laser is not made with the rounding either.
+    for wavelength in (450.0, 532.0, 650.0):
+        both = coded(rounding), Frame(0, 0.0, image)
+        neutral, grey = (detect_in(one, wavelength) for one in both)
+        np.testing.assert_array_equal(neutral.position, grey.position)
+        assert np.all(neutral.likelihood == 1.0)
     # A colour camera sees colours somewhere, in the picture or in its noise.
-    assert colour_of(coded(2)) is not None
+    coloured = coded(2)
+    assert without_neutral_chroma(coloured) is coloured
     one_leaf = coded(0)
     assert one_leaf.chroma is not None
     one_leaf.chroma[0][7, 5] = 120
-    assert colour_of(one_leaf) is one_leaf.chroma
+    assert without_neutral_chroma(one_leaf) is one_leaf
 
 
 def test_dashes_without_any_colour_are_not_ruled_out() -> None:

@@ -23,7 +23,7 @@ from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import kernel
 from aqualvs.scanning.laser_bands import SLOPE_CELL, LaserBand, SearchAxis, pixels_per_line
 from aqualvs.scanning.laser_colour import LaserColour
-from aqualvs.scanning.scan import Frame, ImagePlane, colour_of, planes_of_image
+from aqualvs.scanning.scan import Frame, ImagePlane, planes_of_image, without_neutral_chroma
 from aqualvs.scanning.stripe import StripePeaks
 from aqualvs.scanning.stripe_segments import (
     LENGTH,
@@ -98,7 +98,7 @@ def find_stripes(
     """
     options = options or UncalibratedStripeOptions()
     frame = image if isinstance(image, Frame) else Frame(0, 0.0, *planes_of_image(image))
-    frame = replace(frame, chroma=colour_of(frame))
+    frame = without_neutral_chroma(frame)
     width = frame.luma.shape[1]
     found = find_all_segments(frame, options)
     table = np.concatenate([segments.table for segments in found], axis=1)

@@ -27,7 +27,7 @@ from aqualvs.scanning.laser_colour import (
     learn_paint,
     useful_height,
 )
-from aqualvs.scanning.scan import Frame, colour_of
+from aqualvs.scanning.scan import Frame, without_neutral_chroma
 from aqualvs.scanning.segments import in_a_row
 from aqualvs.scanning.stripe import (
     HEIGHT,
@@ -310,9 +310,9 @@ class FrameDetector:
         return found
 
     def _find_stripes(self, frame: Frame, options: StripeOptions) -> dict[SearchAxis, StripePeaks]:
-        luma = self._brightest(frame)
-        chroma = colour_of(frame)
-        planes = chroma or (_NO_CHROMA, _NO_CHROMA)
+        frame = without_neutral_chroma(frame)
+        luma, has_colour = self._brightest(frame), frame.chroma is not None
+        planes = frame.chroma or (_NO_CHROMA, _NO_CHROMA)
         u, v = (_plain(plane, out) for plane, out in zip(planes, self._chroma, strict=True))
         images = {
             axis: SearchImage(lines.of(luma), u, v, self._line_px[axis], axis is SearchAxis.ALONG_X)
@@ -320,9 +320,9 @@ class FrameDetector:
         }
         # A sample of the search lines gives the least useful height of peaks.
         _, sample, _ = self._find(images, options.min_contrast, _SEARCH.sample_every)
-        contrast, paint = self._survey(sample, chroma is not None)
+        contrast, paint = self._survey(sample, has_colour)
         line, table, ends = self._find(images, max(contrast, options.min_contrast))
-        if chroma is None or are_colourless_dashes(line, table, ends, self._n_possible):
+        if not has_colour or are_colourless_dashes(line, table, ends, self._n_possible):
             likelihood = np.ones(len(line))
         else:
             likelihood = self._likelihood(table, paint, self._n_possible)

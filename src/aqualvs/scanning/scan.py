@@ -1,6 +1,6 @@
 """Data types at the scanner's interface: frames in, stripe points and scans out."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import TypeAlias
 
@@ -48,8 +48,8 @@ class Frame:
     is_interlaced: bool = False
 
 
-def colour_of(frame: Frame) -> tuple[ImagePlane, ImagePlane] | None:
-    """Return the chroma of a frame; None if it is neutral all over the picture.
+def without_neutral_chroma(frame: Frame) -> Frame:
+    """Return a frame without its chroma if that is neutral all over the picture.
 
     The pictures of a monochrome camera are often coded as colour, and say as little about colour as
     those of a grey source. The noise of a colour camera is more than rounding.
@@ -57,14 +57,12 @@ def colour_of(frame: Frame) -> tuple[ImagePlane, ImagePlane] | None:
     neutral, rounding = 128, 1
     # A few rows tell of nearly every colour camera.
     row_step = 16
-    if frame.chroma is None:
-        return None
     for rows in (slice(None, None, row_step), slice(None)):
-        for plane in frame.chroma:
+        for plane in frame.chroma or ():
             some = plane[rows]
             if some.min() < neutral - rounding or some.max() > neutral + rounding:
-                return frame.chroma
-    return None
+                return frame
+    return replace(frame, chroma=None)
 
 
 def planes_of_image(image: ImagePlane) -> Planes:
