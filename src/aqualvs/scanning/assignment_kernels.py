@@ -49,9 +49,8 @@ class _EvidenceOptions(NamedTuple):
     dark_share: float = 0.25
     # A laser is faint with this share of the best one's way through the picture.
     faint: float = 0.4
-    # Light is on a plane within the first of these shares of its distance, before it from the
-    # second on; pieces of stripe this long are those of walls and fish, not the light on strands.
-    on_plane: float = 0.02
+    # Light is before a plane from this share of its distance on; pieces of stripe this long are
+    # those of walls and fish, not the light on strands.
     before: float = 0.03
     long_piece: float = 24.0
 
@@ -510,6 +509,9 @@ def loose_share_before(
 ) -> float:
     """Return the light in short pieces before a surface that none explains, over its own light.
 
+    Light that another laser may have made at or behind the surface is not counted: with many lasers
+    that is nearly all noise.
+
     Parameters
     ----------
     candidates : Candidates
@@ -527,7 +529,7 @@ def loose_share_before(
     """
     source, points, n = candidates.source, candidates.points, n_bins(candidates.source)
     intensity_weight = np.zeros(n)
-    own, bound, before = np.zeros((3, n), np.bool_)
+    own, bound = np.zeros((2, n), np.bool_)
     for i in range(source.shape[0]):
         c, r = of_candidate[i], source[i]
         off = -plane[3]
@@ -539,13 +541,13 @@ def loose_share_before(
         bound[r] |= (
             explained[c]
             or n_lines[candidates.component[i]] >= _EVIDENCE.long_piece
-            or abs(off) < _EVIDENCE.on_plane * plane[3]
+            or off > -_EVIDENCE.before * plane[3]
+            or points[i, 1] <= nearest
         )
-        before[r] |= off < -_EVIDENCE.before * plane[3] and points[i, 1] > nearest
     of_surface, loose = 0.0, 0.0
     for r in range(n):
         of_surface += intensity_weight[r] if own[r] else 0.0
-        loose += intensity_weight[r] if before[r] and not bound[r] else 0.0
+        loose += 0.0 if bound[r] else intensity_weight[r]
     return loose / max(of_surface, 1e-12)
 
 
