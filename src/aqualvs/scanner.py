@@ -69,6 +69,10 @@ class ScannerOptions:
     fit: FitMethod = FitMethod.ROBUST
 
 
+# A better plane is tested in its turn, up to so many times.
+_MAX_RIVALS = 3
+
+
 class _Stripes(NamedTuple):
     """What a frame shows of the lasers, and the test of how its peaks are assigned to them."""
 
@@ -260,9 +264,14 @@ class Scanner:
         # The same peaks, read as other lasers', may give a plane that is as good or better.
         candidates, subsegments, _, assignment = stripes
         tested = assignment.test(candidates, subsegments, target)
-        if tested.verdict is Verdict.RIVAL and tested.other is not None:
+        for _ in range(_MAX_RIVALS):
+            if tested.verdict is not Verdict.RIVAL or tested.other is None:
+                break
             surfaces = self._with_rival(surfaces, target, tested.other, subsegments)
             surfaces, target, before = self._preferred(stripes, surfaces)
+            if target is None:
+                return _Choice(surfaces)
+            tested = assignment.test(candidates, subsegments, target)
         return _Choice(surfaces, target, before, tested)
 
     def _preferred(

@@ -148,6 +148,27 @@ def facts(*, light: float, n_lasers: int, freedom: float) -> FloatArray:
     return found
 
 
+def test_a_better_plane_is_tested_in_its_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the search missed the wall, its first rival may be read as other lasers' as well."""
+    rig = example_rig()
+    wall = Plane.from_normal((0.0, 1.0, 0.1), 0.6)
+    missed = Plane.from_normal((0.0, 1.0, 0.1), 0.604)
+    tested: list[float] = []
+
+    def outcome(_: object, *arguments: object) -> AssignmentOutcome:
+        target = arguments[-1]
+        assert isinstance(target, Surface)
+        tested.append(target.plane.offset)
+        other = (missed, wall, None)[len(tested) - 1]
+        return NOT_TESTED if other is None else AssignmentOutcome(Verdict.RIVAL, other)
+
+    monkeypatch.setattr(assignment.AssignmentTest, "test", outcome)
+    posture = Scanner(rig).measure(0, 0.0, peaks_of(rig, [(wall, everywhere)], 0.1)).posture
+    assert tested[1:] == [missed.offset, wall.offset]
+    assert isinstance(posture, Posture)
+    assert posture.range == pytest.approx(wall.offset, rel=1e-3)
+
+
 def test_a_near_rival_widens_and_a_far_one_does_not() -> None:
     found = Measurement(posture(0.6, 0.0), np.ones(1, np.bool_))
     other = Plane.from_normal((np.tan(0.02), 1.0, 0.0), 0.606 / np.cos(0.02))
