@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.posture_estimator import FitMethod
 from aqualvs.scanning.scan import Frame, Label, Scan, planes_of_image
 from aqualvs.scanning.stripe import ThresholdOptions
-from aqualvs.scanning.surfaces import TargetKind
+from aqualvs.scanning.surfaces import Surface, TargetKind, find_surfaces
 from aqualvs.simulation.scenarios import bluerov2_rig, example_rig
 from scanning_cases import peaks_of
 from scanning_cases import strands as broken
@@ -379,6 +379,32 @@ def test_the_paper_s_mesh_filter_takes_a_wall_away_and_leaves_a_net(rig: Rig) ->
         for range in (0.42, 0.44, 0.46, 0.48, 0.5)
     ]
     assert np.median(kept) > 60
+
+
+@pytest.mark.parametrize("is_unbroken", [True, False])
+def test_a_wall_whose_lines_look_broken_is_measured_as_one(
+    is_unbroken: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Noise breaks dim lines like twine; too few strands are left for a net's posture."""
+
+    def broken_surfaces(*arguments: Any) -> list[Surface]:
+        found = find_surfaces(*arguments)
+        return [replace(one, is_mesh=True, is_unbroken=is_unbroken) for one in found]
+
+    monkeypatch.setattr("aqualvs.scanner.find_surfaces", broken_surfaces)
+    rig = example_rig()
+    peaks = peaks_of(rig, [(plane(0.6, 4.0), everywhere)], 0.05)
+    scan = Scanner(rig).measure(0, 0.0, peaks)
+    if is_unbroken:
+        assert isinstance(scan.posture, Posture)
+        assert scan.posture.range == pytest.approx(0.6, rel=1e-3)
+        assert np.mean(scan.points.label == Label.SOLID) > 0.9
+    else:
+        assert isinstance(scan.posture, Refusal)
+        assert scan.posture.reason is Reason.COLLINEAR
+    # Who asks for a net gets none.
+    wanted = Scanner(rig, ScannerOptions(target=TargetKind.NET)).measure(0, 0.0, peaks)
+    assert not wanted.posture
 
 
 def test_without_its_dome_the_camera_reads_another_posture() -> None:

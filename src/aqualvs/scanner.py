@@ -243,6 +243,9 @@ class Scanner:
         stripes = _Stripes(candidates, subsegments, shapes, assignment)
         choice = self._choose(stripes, surfaces)
         found = self._measured(stripes, choice)
+        if self.options.target is TargetKind.AUTO and _may_be_solid(choice.target, found):
+            choice = _with_solid_target(choice)
+            found = self._measured(stripes, choice)
         # What every point lies on.
         points, listed = label_candidates(
             candidates,
@@ -374,6 +377,23 @@ def _fitted(
         return fitted_plane(m, points), weights
     # Heights over a patch are in metres; m·X is relative to the range.
     return fitted_patch(patch, m, points), weights / posture.range**2
+
+
+def _may_be_solid(target: Surface | None, found: Measurement) -> bool:
+    """Return whether a net's strands are too few for its posture and its lines are a wall's.
+
+    Noise breaks the lines of a dim picture as twine does.
+    """
+    too_little = (Reason.ONE_LASER, Reason.COLLINEAR, Reason.TOO_FEW_POINTS)
+    refused = isinstance(found.posture, Refusal) and found.posture.reason in too_little
+    return refused and target is not None and target.is_mesh and target.is_unbroken
+
+
+def _with_solid_target(choice: _Choice) -> _Choice:
+    assert choice.target is not None
+    solid = replace(choice.target, is_mesh=False)
+    surfaces = [solid if one is choice.target else one for one in choice.surfaces]
+    return choice._replace(surfaces=surfaces, target=solid)
 
 
 def _on_mesh(paper_filter: "PaperFilter", points: ScanPoints) -> BoolArray:

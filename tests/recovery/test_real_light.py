@@ -111,6 +111,27 @@ def test_a_monochrome_camera_measures_as_well(tmp_path, fmt: str) -> None:
     assert abs(result.pitch_error_deg) < 1.0
 
 
+@pytest.mark.parametrize(("light", "noise"), [(0.5, 4.0), (0.35, 5.0), (0.3, 4.0)])
+@pytest.mark.parametrize("picture", PICTURES)
+def test_lines_that_noise_nearly_hides_are_measured(
+    tmp_path, picture: str, light: float, noise: float
+) -> None:
+    """Specks of noise are no net before the wall, nor are lines in pieces one."""
+    image = light * cv2.imread(str(PHOTOGRAPHS / f"{picture}.jpg"))
+    for seed in range(3):
+        speckled = image + np.random.default_rng(seed).normal(0.0, noise, image.shape)
+        dim = np.clip(np.rint(speckled), 0, 255).astype(np.uint8)
+        folder = tmp_path / str(seed)
+        folder.mkdir()
+        source = wall.make_source(dim, folder, "png")
+        rows = wall.measure(source, PHOTOGRAPHS / "rig.yaml", folder / "out")
+        result = wall.compare(picture, "png", rows, board_of(picture))
+        assert result.valid, result.reason
+        assert abs(result.range_error_mm) < 10.0
+        assert abs(result.yaw_error_deg) < 2.0
+        assert abs(result.pitch_error_deg) < 1.0
+
+
 @pytest.mark.parametrize("picture", PICTURES)
 def test_nothing_is_found_where_no_laser_shines(picture: str) -> None:
     """The left half of a photograph: chessboard, its paper's edge, blue tape, no line."""
