@@ -302,7 +302,7 @@ def test_strands_that_make_a_plane_by_chance_are_no_net() -> None:
         for laser, plane in zip(2 * rig.lasers, elsewhere, strict=True)
     ]
 
-    def is_chance(*strands_of: int | None) -> bool:
+    def is_chance(*strands_of: int | None, net: Plane = net) -> bool:
         """Whether each laser's light on every so many strands is; None: on all its way."""
 
         def seen_on(one_of: int | None) -> Lit:
@@ -333,6 +333,10 @@ def test_strands_that_make_a_plane_by_chance_are_no_net() -> None:
     assert not is_chance(None, 1, 1)
     # With most of the light it is what is seen.
     assert not is_chance(None, None)
+    # Planes by chance are steep: the same light is one there.
+    steep = Plane.from_normal((0.7, 1.0, 0.7), 0.5)
+    assert not is_chance(1, 1, net=steep)
+    assert is_chance(2, 2, net=steep)
 
 
 def test_a_net_before_a_wall_is_not_overlooked(monkeypatch: pytest.MonkeyPatch) -> None:
