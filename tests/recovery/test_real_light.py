@@ -140,6 +140,18 @@ def test_nothing_is_found_where_no_laser_shines(picture: str) -> None:
     assert len(find_stripes(np.ascontiguousarray(image[:, :700]))) == 0
 
 
+@pytest.mark.parametrize("picture", PICTURES)
+def test_lines_that_lie_close_to_each_other_are_found(picture: str) -> None:
+    """As in pictures 640 pixels wide: the next line, 18 px away, is no halo of the wrong colour."""
+    image = cv2.imread(str(PHOTOGRAPHS / f"{picture}.jpg"))
+    # In a picture of the camera's size: how long and thin lines are is judged by its width.
+    width, height = wall.SIZE_PX
+    rows, columns = height - image.shape[0], width - image.shape[1]
+    whole = cv2.copyMakeBorder(image, 0, rows, 0, columns, cv2.BORDER_CONSTANT, value=(99, 99, 99))
+    small = cv2.resize(whole, (640, 360), interpolation=cv2.INTER_AREA)
+    assert len(find_stripes(small)) > 0.5 * 15 * 640 / width * image.shape[0]
+
+
 def test_two_photographs_of_fifteen_lines_are_too_few(tmp_path) -> None:
     """Two boards do not tell which of 15 lines belong together; nothing is written."""
     pictures = sorted(PHOTOGRAPHS.glob("*.jpg"))

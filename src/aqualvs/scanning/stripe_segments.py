@@ -272,6 +272,13 @@ def _measure(
     # The halo is summed up to so many pixels beyond them: codecs keep chroma in blocks of 16
     # pixels.
     halo_px = 6
+    # Another stripe beside a peak ends its halo: a piece over this share of the search lines, which
+    # noise and a line in pieces do not reach.
+    long_share = 0.1
+    is_long = np.zeros(line.shape[0], np.bool_)
+    for k in range(start.shape[0] - 1):
+        for i in order[start[k] : start[k + 1]]:
+            is_long[i] = start[k + 1] - start[k] >= long_share * light.shape[0]
     for k in range(start.shape[0] - 1):
         members = order[start[k] : start[k + 1]]
         n = members.shape[0]
@@ -289,7 +296,9 @@ def _measure(
                 total += _sum_above_flanks(light[x], low, high)
                 total_along += _sum_above_flanks(along[x], low, high)
                 total_across += _sum_above_flanks(across[x], low, high)
-                low, high = max(low - halo_px, 1), min(high + halo_px, light.shape[1] - 2)
+                before, after = _middles(line, position, is_long, members[i])
+                low = min(max(low - halo_px, before, 1), low)
+                high = max(min(high + halo_px, after, light.shape[1] - 2), high)
                 halo += _sum_above_flanks(along[x], low, high)
         total = max(total, 1.0)
         first, last = members[0], members[n - 1]
@@ -305,6 +314,23 @@ def _measure(
         table[x, k], table[y, k] = begin, position[first]
         x, y = (LAST_Y, LAST_X) if along_x else (LAST_X, LAST_Y)
         table[x, k], table[y, k] = end, position[last]
+
+
+@inner_kernel
+def _middles(line: IntArray, position: FloatArray, is_long: BoolArray, i: int) -> tuple[int, int]:
+    """Return the middles between a peak and those of long pieces beside it on its search line."""
+    before, after = 0, 1 << 30
+    k = i - 1
+    while k >= 0 and line[k] == line[i] and not is_long[k]:
+        k -= 1
+    if k >= 0 and line[k] == line[i]:
+        before = int(np.ceil(0.5 * (position[k] + position[i])))
+    k = i + 1
+    while k < line.shape[0] and line[k] == line[i] and not is_long[k]:
+        k += 1
+    if k < line.shape[0] and line[k] == line[i]:
+        after = int(0.5 * (position[k] + position[i]))
+    return before, after
 
 
 @inner_kernel
