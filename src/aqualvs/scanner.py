@@ -243,8 +243,10 @@ class Scanner:
         stripes = _Stripes(candidates, subsegments, shapes, assignment)
         choice = self._choose(stripes, surfaces)
         found = self._measured(stripes, choice)
-        if self.options.target is TargetKind.AUTO and _may_be_solid(choice.target, found):
-            choice = _with_solid_target(choice)
+        solid = _as_solid(choice.target, found)
+        if self.options.target is TargetKind.AUTO and solid is not None:
+            surfaces = _with_changed(choice.surfaces, solid)
+            choice = choice._replace(surfaces=surfaces, target=solid)
             found = self._measured(stripes, choice)
         # What every point lies on.
         points, listed = label_candidates(
@@ -260,22 +262,22 @@ class Scanner:
 
     def _choose(self, stripes: _Stripes, surfaces: list[Surface]) -> _Choice:
         """Choose the target among the surfaces of the requested kind."""
-        surfaces = as_requested_kind(surfaces, self.options.target)
+        choice = self._tested(stripes, as_requested_kind(surfaces, self.options.target))
+        for _ in range(_MAX_RIVALS):
+            surfaces, target, _, (verdict, other, _) = choice
+            if target is None or verdict is not Verdict.RIVAL or other is None:
+                break
+            surfaces = self._with_rival(surfaces, target, other, stripes.subsegments)
+            choice = self._tested(stripes, surfaces)
+        return choice
+
+    def _tested(self, stripes: _Stripes, surfaces: list[Surface]) -> _Choice:
+        """Choose the target, and test whether its peaks are as well read as other lasers'."""
         surfaces, target, before = self._preferred(stripes, surfaces)
         if target is None:
             return _Choice(surfaces)
-        # The same peaks, read as other lasers', may give a plane that is as good or better.
         candidates, subsegments, _, assignment = stripes
-        tested = assignment.test(candidates, subsegments, target)
-        for _ in range(_MAX_RIVALS):
-            if tested.verdict is not Verdict.RIVAL or tested.other is None:
-                break
-            surfaces = self._with_rival(surfaces, target, tested.other, subsegments)
-            surfaces, target, before = self._preferred(stripes, surfaces)
-            if target is None:
-                return _Choice(surfaces)
-            tested = assignment.test(candidates, subsegments, target)
-        return _Choice(surfaces, target, before, tested)
+        return _Choice(surfaces, target, before, assignment.test(candidates, subsegments, target))
 
     def _preferred(
         self, stripes: _Stripes, surfaces: list[Surface]
@@ -289,8 +291,7 @@ class Scanner:
         before = assignment.overlooked(candidates, subsegments, surfaces, target)
         if before is None or not before.is_mesh:
             return surfaces, target, before
-        surfaces = [before if one.members is before.members else one for one in surfaces]
-        return surfaces, before, None
+        return _with_changed(surfaces, before), before, None
 
     def _measured(self, stripes: _Stripes, choice: _Choice) -> Measurement:
         """Return the posture to the target, or why there is none."""
@@ -379,21 +380,21 @@ def _fitted(
     return fitted_patch(patch, m, points), weights / posture.range**2
 
 
-def _may_be_solid(target: Surface | None, found: Measurement) -> bool:
-    """Return whether a net's strands are too few for its posture and its lines are a wall's.
+def _with_changed(surfaces: list[Surface], changed: Surface) -> list[Surface]:
+    """Return the surfaces with one of them replaced by its changed copy."""
+    return [changed if one.members is changed.members else one for one in surfaces]
+
+
+def _as_solid(target: Surface | None, found: Measurement) -> Surface | None:
+    """Return a net as solid if its strands are too few for a posture and its lines are a wall's.
 
     Noise breaks the lines of a dim picture as twine does.
     """
     too_little = (Reason.ONE_LASER, Reason.COLLINEAR, Reason.TOO_FEW_POINTS)
-    refused = isinstance(found.posture, Refusal) and found.posture.reason in too_little
-    return refused and target is not None and target.is_mesh and target.is_unbroken
-
-
-def _with_solid_target(choice: _Choice) -> _Choice:
-    assert choice.target is not None
-    solid = replace(choice.target, is_mesh=False)
-    surfaces = [solid if one is choice.target else one for one in choice.surfaces]
-    return choice._replace(surfaces=surfaces, target=solid)
+    if target is None or found.posture or found.posture.reason not in too_little:
+        return None
+    (solid,) = as_requested_kind([target], TargetKind.SOLID)
+    return solid if target.is_mesh and not solid.is_mesh else None
 
 
 def _on_mesh(paper_filter: "PaperFilter", points: ScanPoints) -> BoolArray:

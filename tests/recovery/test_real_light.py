@@ -40,6 +40,23 @@ def board_of(picture: str) -> wall.BoardPose:
     return wall.board_pose(cv2.imread(str(PHOTOGRAPHS / f"{picture}.jpg")), wall.intrinsics(CROP))
 
 
+def measured_as(fmt: str, image: np.ndarray, picture: str, folder: Path) -> wall.FrameResult:
+    """Measure a changed photograph with the rig of all, and compare it with its board."""
+    folder.mkdir(exist_ok=True)
+    rows = wall.measure(
+        wall.make_source(image, folder, fmt), PHOTOGRAPHS / "rig.yaml", folder / "out"
+    )
+    return wall.compare(picture, fmt, rows, board_of(picture))
+
+
+def assert_on_board(result: wall.FrameResult) -> None:
+    assert result.valid, result.reason
+    # The paper may be a degree off the wall, and the lines are 0.2 m beside it.
+    assert abs(result.range_error_mm) < 10.0
+    assert abs(result.yaw_error_deg) < 2.0
+    assert abs(result.pitch_error_deg) < 1.0
+
+
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory) -> dict[tuple[str, str], Any]:
     """The repository's photographs in all formats, by the rig that is stored beside them."""
@@ -57,12 +74,7 @@ def measured(tmp_path_factory) -> dict[tuple[str, str], Any]:
 @pytest.mark.parametrize("fmt", FORMATS)
 @pytest.mark.parametrize("picture", PICTURES)
 def test_a_photograph_gives_the_boards_plane(measured, picture: str, fmt: str) -> None:
-    result = measured[picture, fmt]
-    assert result.valid, result.reason
-    # The paper may be a degree off the wall, and the lines are 0.2 m beside it.
-    assert abs(result.range_error_mm) < 10.0
-    assert abs(result.yaw_error_deg) < 2.0
-    assert abs(result.pitch_error_deg) < 1.0
+    assert_on_board(measured[picture, fmt])
 
 
 @pytest.mark.parametrize("picture", PICTURES)
@@ -90,9 +102,7 @@ def test_a_camera_may_sharpen_until_the_wall_between_lines_stands_out(tmp_path, 
     """Sharpening darkens the flanks of lines; thousands of wide specks of wall lie between them."""
     image = cv2.imread(str(PHOTOGRAPHS / f"{picture}.jpg"))
     sharp = cv2.addWeighted(image, 2.5, cv2.GaussianBlur(image, (0, 0), 3.0), -1.5, 0.0)
-    source = wall.make_source(sharp, tmp_path, "png")
-    rows = wall.measure(source, PHOTOGRAPHS / "rig.yaml", tmp_path / "out")
-    result = wall.compare(picture, "png", rows, board_of(picture))
+    result = measured_as("png", sharp, picture, tmp_path)
     assert result.valid, result.reason
     assert abs(result.range_error_mm) < 10.0
 
@@ -102,13 +112,8 @@ def test_a_monochrome_camera_measures_as_well(tmp_path, fmt: str) -> None:
     """Such cameras are often coded as colour, with the same value in all three channels."""
     picture = PICTURES[0]
     grey = cv2.imread(str(PHOTOGRAPHS / f"{picture}.jpg"), cv2.IMREAD_GRAYSCALE)
-    source = wall.make_source(cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR), tmp_path, fmt)
-    rows = wall.measure(source, PHOTOGRAPHS / "rig.yaml", tmp_path / "out")
-    result = wall.compare(picture, fmt, rows, board_of(picture))
-    assert result.valid, result.reason
-    assert abs(result.range_error_mm) < 10.0
-    assert abs(result.yaw_error_deg) < 2.0
-    assert abs(result.pitch_error_deg) < 1.0
+    image = cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR)
+    assert_on_board(measured_as(fmt, image, picture, tmp_path))
 
 
 @pytest.mark.parametrize(("light", "noise"), [(0.5, 4.0), (0.35, 5.0), (0.3, 4.0)])
@@ -121,15 +126,7 @@ def test_lines_that_noise_nearly_hides_are_measured(
     for seed in range(3):
         speckled = image + np.random.default_rng(seed).normal(0.0, noise, image.shape)
         dim = np.clip(np.rint(speckled), 0, 255).astype(np.uint8)
-        folder = tmp_path / str(seed)
-        folder.mkdir()
-        source = wall.make_source(dim, folder, "png")
-        rows = wall.measure(source, PHOTOGRAPHS / "rig.yaml", folder / "out")
-        result = wall.compare(picture, "png", rows, board_of(picture))
-        assert result.valid, result.reason
-        assert abs(result.range_error_mm) < 10.0
-        assert abs(result.yaw_error_deg) < 2.0
-        assert abs(result.pitch_error_deg) < 1.0
+        assert_on_board(measured_as("png", dim, picture, tmp_path / str(seed)))
 
 
 @pytest.mark.parametrize("picture", PICTURES)

@@ -512,14 +512,13 @@ def _useful_height(height: FloatArray, likelihood: FloatArray) -> float:
         kind = _kind_of(height[i])
         peaks[kind] += 1.0
         lines[kind] += likelihood[i] > clearly
-    useful, kind = HIGHEST_USEFUL, _kind_of(HIGHEST_USEFUL) - 1
+    useful = HIGHEST_USEFUL
     # Of all peaks from a height on, and of those of about that height.
     all_lines, all_peaks = 0.0, 0.0
-    while kind >= 0:
+    for kind in range(_kind_of(HIGHEST_USEFUL) - 1, -1, -1):
         all_lines, all_peaks = all_lines + lines[kind], all_peaks + peaks[kind]
         if _are_useful(lines[kind], peaks[kind]) and _are_useful(all_lines, all_peaks):
             useful = math.ceil(2.0 ** (kind / _KINDS_PER_OCTAVE))
-        kind -= 1
     return float(useful)
 
 

@@ -176,8 +176,8 @@ class PeakFinder:
         # Lines are worked on in whole vectors, whatever stands after their last pixel.
         pairs = (length + 1) // 2
         least, most, minima, spare = np.full((4, pairs + 2 * reach_px + _VECTOR), 255, np.uint8)
-        # There is room for a gap and a mark after the last pair.
-        background, above = np.zeros((2, (pairs + _VECTOR) // _WORD * _WORD + 3 * _WORD), np.uint8)
+        # There is room for a mark after the last pair, in whole words.
+        background, above = np.zeros((2, (pairs + _VECTOR) // _WORD * _WORD + _WORD), np.uint8)
         words = above.view(np.uint64)
         self._scratch = _Workspace(least, most, minima, spare, background, above, words)
 
@@ -322,9 +322,8 @@ def _mark_above(
         background[i] = base
         base = base if base < pairs[i] else pairs[i]
         above[i] = np.uint8(np.uint8(pairs[i] - base) >= enough)
-    # A gap, then a mark that ends the search for the next run.
-    above[n : n + _WORD] = np.uint8(0)
-    above[n + _WORD] = np.uint8(1)
+    # A mark that ends the search for the next run.
+    above[n] = np.uint8(1)
 
 
 @inline_borrowing_kernel
@@ -541,11 +540,11 @@ def _measure_chroma(
     The peak's chroma is that of its middle or of an edge, whichever is more of the laser's colour:
     a saturated core is white.
     """
-    row, around = image.lines[x], _chroma_lines(image, x)
+    row, chroma_line = image.lines[x], (x * image.line_px) >> 1
     edge, flank = int(0.5 * width) + 1, int(width) + _FLANK_PX
     before, after = max(peak - flank, 0), min(peak + flank, row.shape[0] - 1)
-    u_before, v_before = _chroma(image, around, before)
-    u_after, v_after = _chroma(image, around, after)
+    u_before, v_before = _chroma(image, chroma_line, before)
+    u_after, v_after = _chroma(image, chroma_line, after)
     # Where one flank is much brighter, another stripe lies there.
     difference = np.int64(row[before]) - np.int64(row[after])
     weight = 0.5
@@ -556,7 +555,7 @@ def _measure_chroma(
     luma = weight * row[before] + (1.0 - weight) * row[after]
     best = -np.inf
     for offset in (0, -edge, edge):
-        u, v = _chroma(image, around, peak + offset)
+        u, v = _chroma(image, chroma_line, peak + offset)
         u, v = u - u_flank, v - v_flank
         for k in range(directions.shape[0]):
             along_u, along_v = directions[k, 0], directions[k, 1]
@@ -576,25 +575,15 @@ def _measure_chroma(
 
 
 @inline_borrowing_kernel
-def _chroma_lines(image: SearchImage, x: int) -> tuple[int, int, int]:
-    """Return the line of chroma of search line `x` and its neighbours, within the picture."""
-    last = (image.u.shape[0] if image.along_x else image.u.shape[1]) - 1
-    line = min((x * image.line_px) >> 1, last)
-    return max(line - 1, 0), line, min(line + 1, last)
-
-
-@inline_borrowing_kernel
-def _chroma(image: SearchImage, lines: tuple[int, int, int], position: int) -> tuple[float, float]:
+def _chroma(image: SearchImage, chroma_line: int, position: int) -> tuple[float, float]:
     """Return U and V at a position of a search line, the mean over neighbours along the stripe."""
     u, v = image.u, image.v
-    one, two, three = lines
-    p = max(position >> 1, 0)
-    if image.along_x:
-        p = min(p, u.shape[1] - 1)
-        total_u = np.int64(u[one, p]) + np.int64(u[two, p]) + np.int64(u[three, p])
-        total_v = np.int64(v[one, p]) + np.int64(v[two, p]) + np.int64(v[three, p])
-    else:
-        p = min(p, u.shape[0] - 1)
-        total_u = np.int64(u[p, one]) + np.int64(u[p, two]) + np.int64(u[p, three])
-        total_v = np.int64(v[p, one]) + np.int64(v[p, two]) + np.int64(v[p, three])
+    n_lines, length = u.shape if image.along_x else (u.shape[1], u.shape[0])
+    p = min(max(position >> 1, 0), length - 1)
+    total_u, total_v = np.int64(0), np.int64(0)
+    for offset in range(-1, 2):
+        line = min(max(chroma_line + offset, 0), n_lines - 1)
+        y, x = (line, p) if image.along_x else (p, line)
+        total_u += np.int64(u[y, x])
+        total_v += np.int64(v[y, x])
     return total_u * _THIRD, total_v * _THIRD

@@ -296,9 +296,10 @@ def _measure(
                 total += _sum_above_flanks(light[x], low, high)
                 total_along += _sum_above_flanks(along[x], low, high)
                 total_across += _sum_above_flanks(across[x], low, high)
-                before, after = _middles(line, position, is_long, members[i])
-                low = min(max(low - halo_px, before, 1), low)
-                high = max(min(high + halo_px, after, light.shape[1] - 2), high)
+                before = _middle(line, position, is_long, members[i], -1)
+                after = _middle(line, position, is_long, members[i], 1)
+                low = min(int(np.ceil(max(low - halo_px, before, 1.0))), low)
+                high = max(int(min(high + halo_px, after, light.shape[1] - 2.0)), high)
                 halo += _sum_above_flanks(along[x], low, high)
         total = max(total, 1.0)
         first, last = members[0], members[n - 1]
@@ -317,20 +318,14 @@ def _measure(
 
 
 @inner_kernel
-def _middles(line: IntArray, position: FloatArray, is_long: BoolArray, i: int) -> tuple[int, int]:
-    """Return the middles between a peak and those of long pieces beside it on its search line."""
-    before, after = 0, 1 << 30
-    k = i - 1
-    while k >= 0 and line[k] == line[i] and not is_long[k]:
-        k -= 1
-    if k >= 0 and line[k] == line[i]:
-        before = int(np.ceil(0.5 * (position[k] + position[i])))
-    k = i + 1
-    while k < line.shape[0] and line[k] == line[i] and not is_long[k]:
-        k += 1
-    if k < line.shape[0] and line[k] == line[i]:
-        after = int(0.5 * (position[k] + position[i]))
-    return before, after
+def _middle(line: IntArray, position: FloatArray, is_long: BoolArray, i: int, step: int) -> float:
+    """Return the middle between a peak and the next long piece on one side, `step` -1 or 1."""
+    k = i + step
+    while 0 <= k < line.shape[0] and line[k] == line[i]:
+        if is_long[k]:
+            return float(0.5 * (position[k] + position[i]))
+        k += step
+    return step * np.inf
 
 
 @inner_kernel
