@@ -296,8 +296,7 @@ def _measure(
                 total += _sum_above_flanks(light[x], low, high)
                 total_along += _sum_above_flanks(along[x], low, high)
                 total_across += _sum_above_flanks(across[x], low, high)
-                before = _middle(line, position, is_long, members[i], -1)
-                after = _middle(line, position, is_long, members[i], 1)
+                before, after = _middles(line, position, is_long, members[i])
                 low = min(int(np.ceil(max(low - halo_px, before, 1.0))), low)
                 high = max(int(min(high + halo_px, after, light.shape[1] - 2.0)), high)
                 halo += _sum_above_flanks(along[x], low, high)
@@ -318,14 +317,24 @@ def _measure(
 
 
 @inner_kernel
-def _middle(line: IntArray, position: FloatArray, is_long: BoolArray, i: int, step: int) -> float:
-    """Return the middle between a peak and the next long piece on one side, `step` -1 or 1."""
-    k = i + step
-    while 0 <= k < line.shape[0] and line[k] == line[i]:
+def _middles(
+    line: IntArray, position: FloatArray, is_long: BoolArray, i: int
+) -> tuple[float, float]:
+    """Return the middles between a peak and the next long pieces before and after it."""
+    before, after = -np.inf, np.inf
+    k = i - 1
+    while k >= 0 and line[k] == line[i]:
         if is_long[k]:
-            return float(0.5 * (position[k] + position[i]))
-        k += step
-    return step * np.inf
+            before = 0.5 * (position[k] + position[i])
+            break
+        k -= 1
+    k = i + 1
+    while k < line.shape[0] and line[k] == line[i]:
+        if is_long[k]:
+            after = 0.5 * (position[k] + position[i])
+            break
+        k += 1
+    return before, after
 
 
 @inner_kernel
