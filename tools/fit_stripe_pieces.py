@@ -3,9 +3,10 @@
     python tools/fit_stripe_pieces.py ../shared/samples/real-laser-lines
 
 Pieces that lie on the lines of real_lines.csv, or on those that pairs with and without laser show,
-are lines; what lies beside them, and all that is found in pictures without laser and in the halves
-without line of tests/data/real-wall, is none. Every line is also shown once as paint: of the same
-shape, without colour. A picture's lines count as much as what else is in it, however many they are.
+are lines; what lies beside them, what is found as a line of another colour, and all that is found
+in pictures without laser and in the halves without line of tests/data/real-wall, is none. Every
+line is also shown once as paint: of the same shape, without colour. A picture's lines count as much
+as what else is in it, however many they are. Each picture is also used out of focus, and moved.
 
 Printed is what weights fitted to one half of the pictures find in the other half, as real_lines.py
 scores it, and the other way round; then the weights fitted to all. The halves share no scene.
@@ -48,6 +49,8 @@ WITHOUT_LINE_PX = 700
 LINE, OTHER, NEAR_PX, NEAR_WIDE_PX = 0.7, 0.3, 1.5, 4.0
 # Where lines of the dark pictures were traced: beyond, nobody says what is none (x, x, y in px).
 TRACED_DARK = (760.0, 1480.0, 180.0)
+# Weight of a picture out of focus, or moved: together they count as much as pictures as they are.
+WORSE_WEIGHT = 0.5
 # Paint's share of the weight of lines, and how its chroma for each level spreads about none: along
 # the colour and across it, and beside the paint.
 PAINT_WEIGHT, PAINT_SPREAD = 0.1, (0.03, 0.05, 0.05)
@@ -99,8 +102,8 @@ def samples(folder: Path, formats: list[str]) -> Iterator[Sample]:
         both = [real_lines.GREEN_NM, real_lines.RED_NM]
         for fmt in formats:
             given = real_lines.encoded(image, fmt)
-            for nm in both if lines is None else [own]:
-                yield _sample(name, fmt, given, nm, lines)
+            for nm in both:
+                yield _sample(name, fmt, given, nm, lines if nm == own else None)
 
 
 def _sample(
@@ -160,10 +163,11 @@ def _rows(sample: Sample, evidence: Callable[[Array], Array]) -> tuple[Array, Ar
     for row, spread in zip((ALONG, ACROSS, HALO), PAINT_SPREAD, strict=True):
         paint[row] = rng.normal(0.0, spread, paint.shape[1])
     of_paint = PAINT_WEIGHT * paint[LENGTH] / max(of_lines, 1.0)
+    picture = WORSE_WEIGHT if "-" in sample.format else 1.0
     return (
         np.concatenate([evidence(table), evidence(paint)]),
         np.concatenate([is_line, np.zeros(paint.shape[1])]),
-        np.concatenate([weight, of_paint]),
+        picture * np.concatenate([weight, of_paint]),
     )
 
 
@@ -212,7 +216,9 @@ def main() -> int:
     """Fit to one half of the pictures and to the other, then to all."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
     parser.add_argument("samples", type=Path, help="folder of the photographs")
-    parser.add_argument("--formats", default="png,jpg80,crf23", help="such as png,jpg80")
+    states = ("", "soft-", "moved-")
+    default = ",".join(state + fmt for state in states for fmt in real_lines.FORMATS)
+    parser.add_argument("--formats", default=default, help="such as png,soft-jpg80")
     given = parser.parse_args()
     found = list(samples(given.samples, given.formats.split(",")))
     for first_half in (False, True):

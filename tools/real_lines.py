@@ -52,6 +52,8 @@ RED_NM, GREEN_NM = 650.0, 532.0
 _LUMA, _V = (0.114, 0.587, 0.299), (-0.081, -0.419, 0.5)
 _BLUR_ALONG_PX, _AROUND_PX, _MAX_NOISE = 2.0, (21, 61), 8.0
 _MIN_RED, _MIN_LUMA, _MIN_CLEAR = 1.0, 3.0, 4.0
+# Blur of a picture out of focus, and the way of a moved one, as shares of its width.
+_SOFT_SIGMA, _WAY = 1.0 / 900.0, 1.0 / 245.0
 # Drawing: pictures darker than this on average are brightened; space around lines, in widths;
 # width of a sheet in pixels.
 _DARK, _MARGIN, _SHEET_WIDTH = 40.0, 0.02, 1440
@@ -102,7 +104,12 @@ def read_image(path: Path) -> Image:
 
 
 def encoded(image: Image, fmt: str) -> Image | Frame:
-    """Return a picture as it is after JPEG (BGR) or H.264 (a decoded frame)."""
+    """Return a picture as it is after JPEG (BGR) or H.264 (a decoded frame).
+
+    Before a format, `soft-` puts the picture out of focus, and `moved-` moves the camera sideways.
+    """
+    state, _, fmt = fmt.rpartition("-")
+    image = _worsened(image, state)
     if fmt == "png":
         return image
     if fmt.startswith("jpg"):
@@ -115,6 +122,16 @@ def encoded(image: Image, fmt: str) -> Image | Frame:
         _write_video(image, path, int(fmt.removeprefix("crf")))
         with open_source(str(path)) as source:
             return next(iter(source))
+
+
+def _worsened(image: Image, state: str) -> Image:
+    """Return a picture out of focus (`soft`), moved while it was taken (`moved`), or as it is."""
+    width = image.shape[1]
+    if state == "soft":
+        return np.asarray(cv2.GaussianBlur(image, (0, 0), _SOFT_SIGMA * width), np.uint8)
+    if state == "moved":
+        return np.asarray(cv2.blur(image, (round(_WAY * width) | 1, 1)), np.uint8)
+    return image
 
 
 def _write_video(image: Image, path: Path, crf: int) -> None:

@@ -68,7 +68,7 @@ class _EvidenceOptions(NamedTuple):
     # the picture's width are certain; without laser, long pieces of its colour are rare. Pieces
     # with less chroma for each level than any camera's lines, on themselves or beside them, are not
     # certain: a highlight on steel, for example.
-    certain: float = 2.4
+    certain: float = 2.8
     certain_share: float = 0.08
     certain_if_long: float = 1.0
     long_share: float = 0.2
@@ -92,14 +92,14 @@ class Weights(NamedTuple):
 WEIGHTS = Weights(
     np.concatenate(
         [
-            [-5.75, -0.455, 0.816, 0.1, -0.348, 0.432, -1.11, -0.756],
-            [7.42, -1.46, 0.991, 1.68, -0.409, -2.77],
+            [-6.3, -0.174, 0.977, -0.23, -0.039, 0.0799, -1.22, -0.953],
+            [7.57, -0.0619, 3.89, 1.58, -0.606, -0.379],
         ]
     ),
     np.concatenate(
         [
-            [-5.22, -0.227, 0.704, -0.118, -0.521, 0.405, -0.874, -0.712],
-            [8.74, -1.67, 1.06, 1.57, -0.221, -2.31, 0.00636, -0.47, 2.19],
+            [-5.52, 0.148, 0.767, -0.412, -0.212, 0.169, -0.869, -0.825],
+            [9.56, -2.43, 0.364, 1.44, 0.0647, 0.256, -0.207, -0.662, 1.25],
         ]
     ),
 )
