@@ -18,7 +18,7 @@ from scipy.special import chdtri
 
 import real_wall as wall
 from aqualvs.calibrate import common, lasers
-from aqualvs.calibrate.uncalibrated_stripes import find_stripes
+from aqualvs.calibrate.uncalibrated_stripes import UncalibratedStripeOptions, find_stripes
 from aqualvs.calibration.detection.detection import detect_board
 from aqualvs.optics.rigfile import load_rig
 from aqualvs.sources.images import read_image
@@ -137,16 +137,39 @@ def test_nothing_is_found_where_no_laser_shines(picture: str) -> None:
     assert len(find_stripes(np.ascontiguousarray(image[:, :700]))) == 0
 
 
+def in_whole_picture(photograph: np.ndarray) -> np.ndarray:
+    """Return a photograph in a picture of its camera's size, whose width scales lines."""
+    width, height = wall.SIZE_PX
+    rows, columns = height - photograph.shape[0], width - photograph.shape[1]
+    border = cv2.BORDER_CONSTANT
+    return cv2.copyMakeBorder(photograph, 0, rows, 0, columns, border, value=(99, 99, 99))
+
+
 @pytest.mark.parametrize("picture", PICTURES)
 def test_lines_that_lie_close_to_each_other_are_found(picture: str) -> None:
     """As in pictures 640 pixels wide: the next line, 18 px away, is no halo of the wrong colour."""
     image = cv2.imread(str(PHOTOGRAPHS / f"{picture}.jpg"))
-    # In a picture of the camera's size: how long and thin lines are is judged by its width.
-    width, height = wall.SIZE_PX
-    rows, columns = height - image.shape[0], width - image.shape[1]
-    whole = cv2.copyMakeBorder(image, 0, rows, 0, columns, cv2.BORDER_CONSTANT, value=(99, 99, 99))
-    small = cv2.resize(whole, (640, 360), interpolation=cv2.INTER_AREA)
-    assert len(find_stripes(small)) > 0.5 * 15 * 640 / width * image.shape[0]
+    small = cv2.resize(in_whole_picture(image), (640, 360), interpolation=cv2.INTER_AREA)
+    assert len(find_stripes(small)) > 0.5 * 15 * 640 / wall.SIZE_PX[0] * image.shape[0]
+
+
+BLURRED: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "out of focus": lambda image: cv2.GaussianBlur(image, (0, 0), 2.5),
+    "moved across": lambda image: cv2.blur(image, (9, 1)),
+    "moved along": lambda image: cv2.blur(image, (1, 25)),
+}
+
+
+@pytest.mark.parametrize("blurred", BLURRED.values(), ids=BLURRED.keys())
+@pytest.mark.parametrize("picture", PICTURES)
+def test_blurred_lines_are_found(tmp_path, picture: str, blurred) -> None:
+    """They are some 8 grey levels high and 7 px wide, and as long and coloured as sharp ones."""
+    image = cv2.imread(str(PHOTOGRAPHS / f"{picture}.jpg"))
+    assert_on_board(measured_as("crf23", blurred(image), picture, tmp_path))
+    whole = in_whole_picture(image)
+    assert len(find_stripes(blurred(whole))) > 0.9 * len(find_stripes(whole))
+    red = UncalibratedStripeOptions(wavelength_nm=650.0)
+    assert len(find_stripes(blurred(whole), red)) == 0
 
 
 def test_two_photographs_of_fifteen_lines_are_too_few(tmp_path) -> None:
