@@ -10,10 +10,12 @@ import pytest
 import real_lines
 from whole import WHOLE
 
-# JPEG lies between the pictures as they are and H.264.
-FORMATS = ("png", "jpg80", "crf23") if WHOLE else ("png", "crf23")
-# Pairs of ten of which the red line is found; 10, 10 and 9 are reached.
-MIN_PAIRS = {"png": 9, "jpg80": 9, "crf23": 8}
+# JPEG lies between the pictures as they are and H.264, and moved ones are like those out of focus.
+SHARP = ("png", "jpg80", "crf23") if WHOLE else ("png", "crf23")
+BLURRED = ("soft-png", "soft-crf23", "moved-png", "moved-crf23") if WHOLE else ("soft-crf23",)
+FORMATS = SHARP + BLURRED
+# Pairs of ten of which the red line is found; 9, 10 and 9 are reached, and 9, 6, 9 and 9.
+MIN_PAIRS = {"png": 9, "jpg80": 9, "crf23": 8, "soft-crf23": 5}
 
 
 @pytest.fixture(scope="module")
@@ -33,9 +35,11 @@ def test_green_lines_without_a_rig(line_scores, fmt: str) -> None:
         s for s in line_scores[fmt] if s.picture.startswith("green15-dark") and s.group == "line"
     ]
     assert (len(bright), len(dark)) == (4, 3)
-    assert {s.picture: s.found for s in bright if s.found < 0.95} == {}
-    assert {s.picture: s.weakest for s in bright if s.weakest < 0.95} == {}
-    assert {s.picture: s.found for s in dark if s.found < 0.85} == {}
+    # Blur costs a line some of its length: 0.78 of the weakest is left, or more.
+    least, weakest, least_dark = (0.9, 0.7, 0.7) if fmt in BLURRED else (0.95, 0.95, 0.85)
+    assert {s.picture: s.found for s in bright if s.found < least} == {}
+    assert {s.picture: s.weakest for s in bright if s.weakest < weakest} == {}
+    assert {s.picture: s.found for s in dark if s.found < least_dark} == {}
 
 
 @pytest.mark.samples
@@ -52,4 +56,4 @@ def test_red_lines_of_pairs(line_scores, fmt: str) -> None:
     """Compression takes what colour a line of a pixel has left."""
     pairs = [s for s in line_scores[fmt] if s.group == "pair"]
     assert len(pairs) == 10
-    assert sum(s.found >= 0.9 for s in pairs) >= MIN_PAIRS[fmt]
+    assert sum(s.found >= 0.9 for s in pairs) >= MIN_PAIRS.get(fmt, 8)
