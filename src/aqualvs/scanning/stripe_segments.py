@@ -65,12 +65,13 @@ class _EvidenceOptions(NamedTuple):
     max_one_sided: float = 3.0
     halo_expected: float = 0.3
     # Pieces of more than these log odds, by the general statistics of lines, and of this share of
-    # the picture's width are certain; without laser, long pieces of its colour are rare. Pieces
-    # with less chroma for each level than any camera's lines, on themselves or beside them, are not
-    # certain: a highlight on steel, for example.
-    certain: float = 2.8
+    # the picture's width are certain. Without laser, long pieces of its colour are rare: those of
+    # rendered caustics have up to 3.0, longer gaps between lines of another colour up to 1.3.
+    # Pieces with less chroma for each level than any camera's lines, on themselves or beside them,
+    # are not certain: a highlight on steel, for example.
+    certain: float = 3.2
     certain_share: float = 0.08
-    certain_if_long: float = 1.0
+    certain_if_long: float = 1.4
     long_share: float = 0.2
     # Dashes in a row: largest gap as a share of the picture's width; largest deviation from the
     # direction of a piece in pixels, and as a share of the gap.
@@ -85,21 +86,21 @@ _EVIDENCE = _EvidenceOptions()
 class Weights(NamedTuple):
     """Weights of the evidence, as log odds."""
 
-    general: FloatArray  # Shape (14,): weights of what `general_evidence` returns.
-    own: FloatArray  # Shape (17,): weights of what `own_evidence` returns.
+    general: FloatArray  # Shape (15,): weights of what `general_evidence` returns.
+    own: FloatArray  # Shape (18,): weights of what `own_evidence` returns.
 
 
 WEIGHTS = Weights(
     np.concatenate(
         [
-            [-6.3, -0.174, 0.977, -0.23, -0.039, 0.0799, -1.22, -0.953],
-            [7.57, -0.0619, 3.89, 1.58, -0.606, -0.379],
+            [-5.32, -1.41, 0.834, 0.189, -0.0757, 0.121, -1.5, -1.01],
+            [7.99, 5.92, 0.83, 3.04, 1.09, -0.535, -0.0397],
         ]
     ),
     np.concatenate(
         [
-            [-5.52, 0.148, 0.767, -0.412, -0.212, 0.169, -0.869, -0.825],
-            [9.56, -2.43, 0.364, 1.44, 0.0647, 0.256, -0.207, -0.662, 1.25],
+            [-3.82, -1.37, 0.57, 0.235, -0.185, 0.234, -1.29, -0.867],
+            [9.35, 8.12, 0.773, 0.78, 0.756, 0.241, 0.602, -0.208, -0.778, 0.677],
         ]
     ),
 )
@@ -362,7 +363,7 @@ def general_evidence(table: FloatArray, width_px: int, *, has_colour: bool) -> F
 
     Returns
     -------
-    array, shape (P, 14)
+    array, shape (P, 15)
     """
     length = np.log(32.0 * table[LENGTH] / width_px + 0.1)
     slimness = np.log(table[LENGTH] / table[WIDTH] + 0.5)
@@ -378,6 +379,7 @@ def general_evidence(table: FloatArray, width_px: int, *, has_colour: bool) -> F
         )
         most, across = np.maximum(table[ALONG], table[HALO]), table[ACROSS]
     levels = np.maximum(np.maximum(along, halo), 0.0) * table[HEIGHT]
+    as_expected = np.clip(halo, 0.0, _EVIDENCE.halo_expected)
     # More chroma for each level than this is coloured paint, or the halo of another thing; and the
     # logarithm of that excess is clipped.
     painted_ratio, max_excess = 1.5, 3.0
@@ -393,7 +395,9 @@ def general_evidence(table: FloatArray, width_px: int, *, has_colour: bool) -> F
             length * height,
             width,
             np.minimum(table[ONE_SIDED], _EVIDENCE.max_one_sided),
-            np.clip(halo, 0.0, _EVIDENCE.halo_expected),
+            as_expected,
+            # Noise hides the colour of a short piece, not that of a long one.
+            as_expected * length,
             np.clip(halo, _EVIDENCE.min_ratio, 0.0),
             np.clip(along, _EVIDENCE.min_ratio, 0.0),
             np.log1p(levels / chroma_noise),
@@ -469,7 +473,7 @@ def own_evidence(
 
     Returns
     -------
-    array, shape (P, 17)
+    array, shape (P, 18)
     """
     general = general_evidence(table, width_px, has_colour=has_colour)
     off_across = np.zeros(table.shape[1])
