@@ -14,7 +14,7 @@ from whole import WHOLE
 SHARP = ("png", "jpg80", "crf23") if WHOLE else ("png", "crf23")
 BLURRED = ("soft-png", "soft-crf23", "moved-png", "moved-crf23") if WHOLE else ("soft-crf23",)
 FORMATS = SHARP + BLURRED
-# Pairs of ten of which the red line is found; 9, 10 and 9 are reached, and 9, 6, 9 and 9.
+# Pairs of ten of which the red line is found; 9, 10 and 9 are reached, and 9, 7, 9 and 9.
 MIN_PAIRS = {"png": 9, "jpg80": 9, "crf23": 8, "soft-crf23": 5}
 
 
