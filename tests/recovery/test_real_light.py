@@ -129,6 +129,15 @@ def test_lines_that_noise_nearly_hides_are_measured(
         assert_on_board(measured_as("png", dim, picture, tmp_path / str(seed)))
 
 
+@pytest.mark.parametrize("fmt", ["png", "crf23"])
+@pytest.mark.parametrize("picture", PICTURES)
+def test_faint_lines_of_a_quiet_picture_are_measured(tmp_path, picture: str, fmt: str) -> None:
+    """As far off in turbid water: 3 to 6 grey levels high, but nothing else is as high."""
+    image = cv2.imread(str(PHOTOGRAPHS / f"{picture}.jpg"))
+    veiled = np.rint(0.25 * cv2.GaussianBlur(image, (0, 0), 1.5) + 60.0).astype(np.uint8)
+    assert_on_board(measured_as(fmt, veiled, picture, tmp_path))
+
+
 @pytest.mark.parametrize("picture", PICTURES)
 def test_nothing_is_found_where_no_laser_shines(picture: str) -> None:
     """The left half of a photograph: chessboard, its paper's edge, blue tape, no line."""

@@ -151,6 +151,8 @@ class _SearchOptions(NamedTuple):
     # number that the lasers can make.
     sample_every: int = 48
     max_peaks: float = 2.0
+    # A picture is quiet with fewer than this many times the number that the lasers can make.
+    quiet: float = 0.25
     # Quantile of the height of a frame's bright peaks.
     bright_quantile: float = 0.9
     cache_line: int = 8
@@ -319,9 +321,9 @@ class FrameDetector:
             for axis, lines in self._lines.items()
         }
         # A sample of the search lines gives the least useful height of peaks.
-        _, sample, _ = self._find(images, options.min_contrast, _SEARCH.sample_every)
+        least, sample = self._sample(images, options.min_contrast, has_colour)
         contrast, paint = self._survey(sample, has_colour)
-        line, table, ends = self._find(images, max(contrast, options.min_contrast))
+        line, table, ends = self._find(images, max(contrast, least))
         if not has_colour or are_colourless_dashes(line, table, ends, self._n_possible):
             likelihood = np.ones(len(line))
         else:
@@ -373,6 +375,21 @@ class FrameDetector:
             )
             ends.append(ends[-1] + n)
         return self._line[: ends[-1]], self._table[:, : ends[-1]], np.array(ends)
+
+    def _sample(
+        self, images: Mapping[SearchAxis, SearchImage], min_contrast: int, has_colour: bool
+    ) -> tuple[int, FloatArray]:
+        """Return the least height of peaks, and those on a sample of the search lines.
+
+        In a quiet picture it is half of `min_contrast`: lines far off or out of focus stand out,
+        too. Only colour tells them from the faint texture of such a picture.
+        """
+        _, sample, _ = self._find(images, min_contrast, _SEARCH.sample_every)
+        n_possible = self._n_possible / _SEARCH.sample_every
+        if not has_colour or sample.shape[1] >= _SEARCH.quiet * n_possible:
+            return min_contrast, sample
+        least = (min_contrast + 1) // 2
+        return least, self._find(images, least, _SEARCH.sample_every)[1]
 
     def _survey(self, sample: FloatArray, has_colour: bool) -> tuple[int, Paint | None]:
         """Return the least useful height of peaks, and the paint.

@@ -50,7 +50,7 @@ class StripeOptions:
     """Options of the sub-pixel detector."""
 
     # Smallest height of a peak above its background, in grey levels; raised where hardly any return
-    # of that height is laser light.
+    # of that height is laser light, halved where hardly anything in a colour picture is as high.
     min_contrast: int = 6
     # Reach of the search for the background on each side, as a share of the image width; must
     # exceed the width of the widest stripe.
