@@ -138,6 +138,15 @@ def test_faint_lines_of_a_quiet_picture_are_measured(tmp_path, picture: str, fmt
     assert_on_board(measured_as(fmt, veiled, picture, tmp_path))
 
 
+def test_a_pale_picture_is_measured_without_the_colour_that_the_codec_dropped(tmp_path) -> None:
+    """A flat picture profile and H.264 leave the lines their height, and hardly any chroma."""
+    picture = PICTURES[1]
+    image = cv2.imread(str(PHOTOGRAPHS / f"{picture}.jpg"))
+    grey = cv2.cvtColor(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), cv2.COLOR_GRAY2BGR)
+    pale = cv2.addWeighted(image, 0.4, grey, 0.6, 0.0)
+    assert_on_board(measured_as("crf23", pale, picture, tmp_path))
+
+
 @pytest.mark.parametrize("picture", PICTURES)
 def test_nothing_is_found_where_no_laser_shines(picture: str) -> None:
     """The left half of a photograph: chessboard, its paper's edge, blue tape, no line."""

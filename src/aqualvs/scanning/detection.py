@@ -151,7 +151,7 @@ class _SearchOptions(NamedTuple):
     # number that the lasers can make.
     sample_every: int = 48
     max_peaks: float = 2.0
-    # A picture is quiet with fewer than this many times the number that the lasers can make.
+    # A picture is quiet if its peaks are fewer than this many times that number.
     quiet: float = 0.25
     # Quantile of the height of a frame's bright peaks.
     bright_quantile: float = 0.9
@@ -401,7 +401,8 @@ class FrameDetector:
         heights = np.sort(sample[HEIGHT])
         n = len(heights)
         crowded = round(min(float(heights[n - 1 - int(most)]), HIGHEST_USEFUL)) if n > most else 0
-        if not has_colour:
+        # Few peaks need no colour to be told apart; codecs drop that of thin lines.
+        if not has_colour or n <= n_possible:
             return crowded, None
         paint = learn_paint(sample, n_possible)
         likelihood = self._likelihood(sample, paint, n_possible)
