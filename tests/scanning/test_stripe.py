@@ -178,6 +178,15 @@ def test_noise_alone_stays_below_the_least_contrast() -> None:
     assert len(detect(image, options=StripeOptions(reach_share=0.15, min_contrast=18))) == 0
 
 
+def test_in_a_quiet_picture_fainter_green_is_found_but_no_fainter_white() -> None:
+    """Nothing else is as high; without colour a stripe may as well be texture."""
+    image = as_image(40.0 + gaussian(CENTRES, height=4.4))
+    found = detect(image, green_chroma(as_image(40.0 + gaussian(CENTRES)), fall=20.0))
+    assert len(found) > 0.9 * len(CENTRES)
+    assert np.abs(found.position - CENTRES[found.line]).max() < 0.6
+    assert len(detect(image)) == 0
+
+
 @pytest.mark.parametrize("places", [(60.0, 80.3), (50.2, 70.6, 131.4), (40.0, 60.0, 80.5, 100.7)])
 def test_several_returns_on_one_line(places: Sequence[float]) -> None:
     n = 24
