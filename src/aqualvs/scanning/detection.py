@@ -321,9 +321,8 @@ class FrameDetector:
             for axis, lines in self._lines.items()
         }
         # A sample of the search lines gives the least useful height of peaks.
-        least, sample = self._sample(images, options.min_contrast, has_colour)
-        contrast, paint = self._survey(sample, has_colour)
-        line, table, ends = self._find(images, max(contrast, least))
+        contrast, paint = self._survey(images, options.min_contrast, has_colour)
+        line, table, ends = self._find(images, contrast)
         if not has_colour or are_colourless_dashes(line, table, ends, self._n_possible):
             likelihood = np.ones(len(line))
         else:
@@ -376,37 +375,31 @@ class FrameDetector:
             ends.append(ends[-1] + n)
         return self._line[: ends[-1]], self._table[:, : ends[-1]], np.array(ends)
 
-    def _sample(
-        self, images: Mapping[SearchAxis, SearchImage], min_contrast: int, has_colour: bool
-    ) -> tuple[int, FloatArray]:
-        """Return the least height of peaks, and those on a sample of the search lines.
-
-        In a quiet picture it is half of `min_contrast`: lines far off or out of focus stand out,
-        too. Only colour tells them from the faint texture of such a picture.
-        """
-        _, sample, _ = self._find(images, min_contrast, _SEARCH.sample_every)
-        n_possible = self._n_possible / _SEARCH.sample_every
-        if not has_colour or sample.shape[1] >= _SEARCH.quiet * n_possible:
-            return min_contrast, sample
-        least = (min_contrast + 1) // 2
-        return least, self._find(images, least, _SEARCH.sample_every)[1]
-
-    def _survey(self, sample: FloatArray, has_colour: bool) -> tuple[int, Paint | None]:
+    def _survey(
+        self, images: Mapping[SearchAxis, SearchImage], least: int, has_colour: bool
+    ) -> tuple[int, Paint | None]:
         """Return the least useful height of peaks, and the paint.
 
-        Above that height there are not many more peaks than the lasers can make.
+        In a quiet picture `least` is halved: lines far off or out of focus stand out there, too,
+        and only colour tells them from its faint texture. Above the returned height there are not
+        many more peaks than the lasers can make.
         """
         n_possible = self._n_possible / _SEARCH.sample_every
+        _, sample, _ = self._find(images, least, _SEARCH.sample_every)
+        if has_colour and sample.shape[1] < _SEARCH.quiet * n_possible:
+            least = (least + 1) // 2
+            _, sample, _ = self._find(images, least, _SEARCH.sample_every)
         most = _SEARCH.max_peaks * n_possible
         heights = np.sort(sample[HEIGHT])
         n = len(heights)
-        crowded = round(min(float(heights[n - 1 - int(most)]), HIGHEST_USEFUL)) if n > most else 0
+        if n > most:
+            least = max(least, round(min(float(heights[n - 1 - int(most)]), HIGHEST_USEFUL)))
         # Few peaks need no colour to be told apart; codecs drop that of thin lines.
         if not has_colour or n <= n_possible:
-            return crowded, None
+            return least, None
         paint = learn_paint(sample, n_possible)
         likelihood = self._likelihood(sample, paint, n_possible)
-        return max(useful_height(sample[HEIGHT], likelihood), crowded), paint
+        return max(least, useful_height(sample[HEIGHT], likelihood)), paint
 
     def _likelihood(self, table: FloatArray, paint: Paint | None, n_possible: float) -> FloatArray:
         """Return the likelihood that each peak is laser light of any of the colours.
