@@ -99,10 +99,9 @@ def samples(folder: Path, formats: list[str]) -> Iterator[Sample]:
         elif name in traced:
             lines = np.concatenate([real_lines.walk(polyline) for _, polyline in traced[name]])
         own = real_lines.RED_NM if name.startswith("red") else real_lines.GREEN_NM
-        both = [real_lines.GREEN_NM, real_lines.RED_NM]
         for fmt in formats:
             given = real_lines.encoded(image, fmt)
-            for nm in both:
+            for nm in (real_lines.GREEN_NM, real_lines.RED_NM):
                 yield _sample(name, fmt, given, nm, lines if nm == own else None)
 
 

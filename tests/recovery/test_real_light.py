@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from scipy.special import chdtri
 
+import real_lines
 import real_wall as wall
 from aqualvs.calibrate import common, lasers
 from aqualvs.calibrate.uncalibrated_stripes import UncalibratedStripeOptions, find_stripes
@@ -34,10 +35,19 @@ CROP = (100, 60, 1400, 1070)
 FORMATS = wall.FORMATS if WHOLE else ("png", "jpg80", "crf28")
 
 
+def photograph(picture: str) -> np.ndarray:
+    return real_lines.read_image(PHOTOGRAPHS / f"{picture}.jpg")
+
+
+def without_colour(image: np.ndarray) -> np.ndarray:
+    """Return a picture with the same value in all three channels."""
+    return cv2.cvtColor(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), cv2.COLOR_GRAY2BGR)
+
+
 @cache
 def board_of(picture: str) -> wall.BoardPose:
     """Posture of the chessboard in one of the repository's photographs."""
-    return wall.board_pose(cv2.imread(str(PHOTOGRAPHS / f"{picture}.jpg")), wall.intrinsics(CROP))
+    return wall.board_pose(photograph(picture), wall.intrinsics(CROP))
 
 
 def measured_as(fmt: str, image: np.ndarray, picture: str, folder: Path) -> wall.FrameResult:
@@ -62,12 +72,10 @@ def measured(tmp_path_factory) -> dict[tuple[str, str], Any]:
     """The repository's photographs in all formats, by the rig that is stored beside them."""
     results = {}
     for picture in PICTURES:
-        image = cv2.imread(str(PHOTOGRAPHS / f"{picture}.jpg"))
         folder = tmp_path_factory.mktemp(picture)
         for fmt in FORMATS:
-            source = wall.make_source(image, folder, fmt)
-            rows = wall.measure(source, PHOTOGRAPHS / "rig.yaml", folder / f"out_{fmt}")
-            results[picture, fmt] = wall.compare(picture, fmt, rows, board_of(picture))
+            image = photograph(picture)
+            results[picture, fmt] = measured_as(fmt, image, picture, folder / fmt)
     return results
 
 
@@ -100,7 +108,7 @@ def test_compression_moves_a_posture_little(measured, picture: str, fmt: str) ->
 @pytest.mark.parametrize("picture", PICTURES)
 def test_a_camera_may_sharpen_until_the_wall_between_lines_stands_out(tmp_path, picture) -> None:
     """Sharpening darkens the flanks of lines; thousands of wide specks of wall lie between them."""
-    image = cv2.imread(str(PHOTOGRAPHS / f"{picture}.jpg"))
+    image = photograph(picture)
     sharp = cv2.addWeighted(image, 2.5, cv2.GaussianBlur(image, (0, 0), 3.0), -1.5, 0.0)
     result = measured_as("png", sharp, picture, tmp_path)
     assert result.valid, result.reason
@@ -111,9 +119,7 @@ def test_a_camera_may_sharpen_until_the_wall_between_lines_stands_out(tmp_path, 
 def test_a_monochrome_camera_measures_as_well(tmp_path, fmt: str) -> None:
     """Such cameras are often coded as colour, with the same value in all three channels."""
     picture = PICTURES[0]
-    grey = cv2.imread(str(PHOTOGRAPHS / f"{picture}.jpg"), cv2.IMREAD_GRAYSCALE)
-    image = cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR)
-    assert_on_board(measured_as(fmt, image, picture, tmp_path))
+    assert_on_board(measured_as(fmt, without_colour(photograph(picture)), picture, tmp_path))
 
 
 @pytest.mark.parametrize(("light", "noise"), [(0.5, 4.0), (0.35, 5.0), (0.3, 4.0)])
@@ -122,7 +128,7 @@ def test_lines_that_noise_nearly_hides_are_measured(
     tmp_path, picture: str, light: float, noise: float
 ) -> None:
     """Specks of noise are no net before the wall, nor are lines in pieces one."""
-    image = light * cv2.imread(str(PHOTOGRAPHS / f"{picture}.jpg"))
+    image = light * photograph(picture)
     for seed in range(3):
         speckled = image + np.random.default_rng(seed).normal(0.0, noise, image.shape)
         dim = np.clip(np.rint(speckled), 0, 255).astype(np.uint8)
@@ -133,7 +139,7 @@ def test_lines_that_noise_nearly_hides_are_measured(
 @pytest.mark.parametrize("picture", PICTURES)
 def test_faint_lines_of_a_quiet_picture_are_measured(tmp_path, picture: str, fmt: str) -> None:
     """As far off in turbid water: 3 to 6 grey levels high, but nothing else is as high."""
-    image = cv2.imread(str(PHOTOGRAPHS / f"{picture}.jpg"))
+    image = photograph(picture)
     veiled = np.rint(0.25 * cv2.GaussianBlur(image, (0, 0), 1.5) + 60.0).astype(np.uint8)
     assert_on_board(measured_as(fmt, veiled, picture, tmp_path))
 
@@ -141,32 +147,31 @@ def test_faint_lines_of_a_quiet_picture_are_measured(tmp_path, picture: str, fmt
 def test_a_pale_picture_is_measured_without_the_colour_that_the_codec_dropped(tmp_path) -> None:
     """A flat picture profile and H.264 leave the lines their height, and hardly any chroma."""
     picture = PICTURES[1]
-    image = cv2.imread(str(PHOTOGRAPHS / f"{picture}.jpg"))
-    grey = cv2.cvtColor(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), cv2.COLOR_GRAY2BGR)
-    pale = cv2.addWeighted(image, 0.4, grey, 0.6, 0.0)
+    image = photograph(picture)
+    pale = cv2.addWeighted(image, 0.4, without_colour(image), 0.6, 0.0)
     assert_on_board(measured_as("crf23", pale, picture, tmp_path))
 
 
 @pytest.mark.parametrize("picture", PICTURES)
 def test_nothing_is_found_where_no_laser_shines(picture: str) -> None:
     """The left half of a photograph: chessboard, its paper's edge, blue tape, no line."""
-    image = cv2.imread(str(PHOTOGRAPHS / f"{picture}.jpg"))
+    image = photograph(picture)
     assert len(find_stripes(image)) > 1000
     assert len(find_stripes(np.ascontiguousarray(image[:, :700]))) == 0
 
 
-def in_whole_picture(photograph: np.ndarray) -> np.ndarray:
+def in_whole_picture(image: np.ndarray) -> np.ndarray:
     """Return a photograph in a picture of its camera's size, whose width scales lines."""
     width, height = wall.SIZE_PX
-    rows, columns = height - photograph.shape[0], width - photograph.shape[1]
+    rows, columns = height - image.shape[0], width - image.shape[1]
     border = cv2.BORDER_CONSTANT
-    return cv2.copyMakeBorder(photograph, 0, rows, 0, columns, border, value=(99, 99, 99))
+    return cv2.copyMakeBorder(image, 0, rows, 0, columns, border, value=(99, 99, 99))
 
 
 @pytest.mark.parametrize("picture", PICTURES)
 def test_lines_that_lie_close_to_each_other_are_found(picture: str) -> None:
     """As in pictures 640 pixels wide: the next line, 18 px away, is no halo of the wrong colour."""
-    image = cv2.imread(str(PHOTOGRAPHS / f"{picture}.jpg"))
+    image = photograph(picture)
     small = cv2.resize(in_whole_picture(image), (640, 360), interpolation=cv2.INTER_AREA)
     assert len(find_stripes(small)) > 0.5 * 15 * 640 / wall.SIZE_PX[0] * image.shape[0]
 
@@ -182,7 +187,7 @@ BLURRED: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 @pytest.mark.parametrize("picture", PICTURES)
 def test_blurred_lines_are_found(tmp_path, picture: str, blurred) -> None:
     """They are some 8 grey levels high and 7 px wide, and as long and coloured as sharp ones."""
-    image = cv2.imread(str(PHOTOGRAPHS / f"{picture}.jpg"))
+    image = photograph(picture)
     assert_on_board(measured_as("crf23", blurred(image), picture, tmp_path))
     whole = in_whole_picture(image)
     assert len(find_stripes(blurred(whole))) > 0.9 * len(find_stripes(whole))
