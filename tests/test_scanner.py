@@ -419,7 +419,7 @@ def test_a_shift_of_the_light_on_twine_is_in_the_sigma_of_the_range() -> None:
     peaks = peaks_of(rig, [(plane(0.5), broken)], 0.05)
     variances = []
     for width in (5.0, 1e-3):
-        wide = {a: replace(part, width=np.full(len(part), width)) for a, part in peaks.items()}
+        wide = {a: part._replace(width=np.full(part.n, width)) for a, part in peaks.items()}
         found = Scanner(rig).measure(0, 0.0, wide).posture
         assert isinstance(found, Posture)
         variances.append(found.covariance[0, 0])

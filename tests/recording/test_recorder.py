@@ -176,20 +176,20 @@ def test_stripes_come_back_bit_for_bit(tmp_path, samples):
         assert frame.n_water == sample.scan.n_water
         assert list(frame.peaks) == list(sample.peaks)
         for axis, stripes in sample.peaks.items():
-            for name in stripes.__slots__:
+            for name in stripes._fields:
                 assert same_bits(getattr(frame.peaks[axis], name), getattr(stripes, name))
 
 
 def test_a_direction_without_stripes_stays_one(tmp_path, samples):
     sample = samples[0]
     empty = {
-        axis: type(found)(*(getattr(found, name)[:0] for name in found.__slots__))
+        axis: type(found)(*(getattr(found, name)[:0] for name in found._fields))
         for axis, found in sample.peaks.items()
     }
     path = recorded(tmp_path / "dive.mcap", [replace(sample, peaks=empty)])
     (frame,) = DiveRecording(path).frames(with_pictures=False)
     assert list(frame.peaks) == list(empty)
-    assert [len(found) for found in frame.peaks.values()] == [0] * len(empty)
+    assert [found.n for found in frame.peaks.values()] == [0] * len(empty)
     (message,) = decoded(path)[STRIPES.name]
     assert [len(part.position) for part in message.returns] == [0] * len(empty)
 

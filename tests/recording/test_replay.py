@@ -96,13 +96,15 @@ def test_stripes_of_recordings_before_pulls_were_measured_have_none():
     assert len(peaks) == 2
     for axis, found in peaks.items():
         np.testing.assert_array_equal(found.pull, pulls[axis])
-        assert np.count_nonzero(found.pull) > 0.5 * len(found)
+        assert np.count_nonzero(found.pull) > 0.5 * found.n
     # Their number, aligned to 8 bytes, the numbers, and no gyros (4 bytes).
-    *_, old, _, turning = stripes_of(message[: -8 * (1 + sum(map(len, peaks.values()))) - 4])
+    *_, old, _, turning = stripes_of(
+        message[: -8 * (1 + sum(found.n for found in peaks.values())) - 4]
+    )
     assert turning is None
     for axis, found in old.items():
         np.testing.assert_array_equal(found.position, peaks[axis].position)
-        np.testing.assert_array_equal(found.pull, np.zeros(len(found)))
+        np.testing.assert_array_equal(found.pull, np.zeros(found.n))
 
 
 def test_gyros_are_recorded_and_used_again(demo, tmp_path):

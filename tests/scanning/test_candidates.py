@@ -25,7 +25,7 @@ def test_every_return_is_read_as_the_laser_that_made_it() -> None:
     rig = example_rig()
     peaks = peaks_of(rig, [(TILTED, everywhere)])
     candidates = read(rig, peaks)
-    n_peaks = sum(len(found) for found in peaks.values())
+    n_peaks = sum(found.n for found in peaks.values())
     on_target = np.abs(TILTED.signed_distance(candidates.points)) < 1e-6
     # Exact positions, interpolated between projections half a pixel apart.
     assert len(np.unique(candidates.source[on_target])) == n_peaks
@@ -74,7 +74,7 @@ def test_sources_tell_returns_of_both_searches_apart() -> None:
     for source in np.unique(candidates.source)[::25]:
         same = candidates.pixels[candidates.source == source]
         assert np.ptp(same, axis=0).max() == 0.0
-    assert len(np.unique(candidates.source)) <= sum(len(found) for found in peaks.values())
+    assert len(np.unique(candidates.source)) <= sum(found.n for found in peaks.values())
 
 
 def test_groups_of_different_lasers_differ_and_chunks_ascend() -> None:

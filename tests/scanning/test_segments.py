@@ -131,7 +131,7 @@ def test_a_long_segment_in_a_wrong_direction_is_dropped_and_a_dash_is_kept() -> 
     assert np.count_nonzero(kept < 60.0) == 80
     np.testing.assert_allclose(np.sort(kept[kept > 60.0]), dash[1])
     # Where a laser may run so, the same stripe stays.
-    assert len(link_segments(peaks, search_for()).order) == len(peaks)
+    assert len(link_segments(peaks, search_for()).order) == peaks.n
 
 
 def test_a_dash_is_one_chunk() -> None:

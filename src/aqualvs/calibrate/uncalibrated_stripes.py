@@ -478,7 +478,7 @@ def extended(segments: StripeSegments, keep: BoolArray) -> list[IntArray]:
     chains = [
         segments.order[segments.start[k] : segments.start[k + 1]] for k in np.flatnonzero(keep)
     ]
-    used = np.zeros(len(peaks), bool)
+    used = np.zeros(peaks.n, bool)
     for chain in chains:
         used[chain] = True
     longer = []

@@ -6,7 +6,7 @@ everywhere outside the library. Numbers that do not exist are NaN.
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -112,10 +112,10 @@ def stripes_of(
         likelihood = np.where(np.isnan(likelihood), 1.0, np.minimum(likelihood, 1.0))
         peaks[axis] = StripePeaks(line, position, height, width, likelihood, np.zeros(len(line)))
     if not of.at_end:
-        ends = np.cumsum([len(found) for found in peaks.values()])
+        ends = np.cumsum([found.n for found in peaks.values()])
         pulls = np.split(of.array("f8"), ends[:-1])
         peaks = {
-            axis: replace(found, pull=pull)
+            axis: found._replace(pull=pull)
             for (axis, found), pull in zip(peaks.items(), pulls, strict=False)
         }
     gyros = np.empty(0) if of.at_end else of.array("f8")

@@ -19,7 +19,7 @@ from aqualvs.geometry.compiled import (
     lazy_kernel,
 )
 from aqualvs.geometry.linear_algebra import element_at, median_of
-from aqualvs.scanning.laser_bands import LaserBand, SearchAxis
+from aqualvs.scanning.laser_bands import BandLines, LaserBand, SearchAxis
 from aqualvs.scanning.segments import (
     ComponentShapes,
     describe_components,
@@ -123,36 +123,32 @@ class Candidates(NamedTuple):
         return found, ComponentShapes(*shapes)
 
 
+class CandidateTables(NamedTuple):
+    """Columns of candidates as kernels write them."""
+
+    numbers: IntArray  # Shape (6, N): rows as `SOURCE` and the others.
+    measures: FloatArray  # Shape (5, N): rows as `HEIGHT` and the others.
+    pixels: FloatArray  # Shape (N, 2): in `image`.
+
+
 @lazy_kernel
 def append_candidates(
-    line: IntArray,
-    position: FloatArray,
-    height: FloatArray,
-    width: FloatArray,
-    likelihood: FloatArray,
-    pull: FloatArray,
-    lowest: IntArray,
-    highest: IntArray,
-    slope_low: FloatArray,
-    slope_high: FloatArray,
+    peaks: StripePeaks,
+    band: BandLines,
     laser: int,
     along_x: int,
-    line_px: int,
-    shift_px: float,
     best_height: float,
     begin: int,
-    numbers: IntArray,
-    measures: FloatArray,
-    pixels: FloatArray,
+    tables: CandidateTables,
 ) -> int:
     """Append one laser's candidates to the tables from column `begin` on; return their end.
 
     Parameters
     ----------
-    line, position, height, width, likelihood, pull
-        As in `StripePeaks`, of the laser's search direction.
-    lowest, highest, slope_low, slope_high, line_px, shift_px
-        As in the laser's `LaserBand`.
+    peaks : StripePeaks
+        Of the laser's search direction.
+    band : BandLines
+        The laser's.
     laser : int
         Its index.
     along_x : int
@@ -161,13 +157,13 @@ def append_candidates(
         Of the frame's best peaks.
     begin : int
         Number of candidates of other lasers.
-    numbers : int array, shape (6, N), measures : array, shape (5, N)
-        Written, see `SOURCE` and `HEIGHT`.
-    pixels : array, shape (N, 2)
+    tables : CandidateTables
         Written.
     """
+    numbers, measures, pixels = tables
+    line, height, width = peaks.line, peaks.height, peaks.width
     found = np.empty((3, line.shape[0]), np.int64)
-    n = segment_peaks(line, position, lowest, highest, slope_low, slope_high, found)
+    n = segment_peaks(peaks, band, found)
     # Components and subsegments of different lasers must have different numbers.
     first_component, first_subsegment = 0, 0
     for i in range(begin):
@@ -189,11 +185,11 @@ def append_candidates(
         measures[WIDTH, i] = width[r]
         flank = _FLANK_NOISE * width[r] / height[r]
         measures[SIGMA_PX, i] = np.sqrt(_FLOOR_PX * _FLOOR_PX + flank * flank)
-        measures[PULL, i] = pull[r]
-        measures[CONFIDENCE, i] = np.sqrt(min(height[r] * height_share, 1.0) * likelihood[r])
+        measures[PULL, i] = peaks.pull[r]
+        measures[CONFIDENCE, i] = np.sqrt(min(height[r] * height_share, 1.0) * peaks.likelihood[r])
         # The middle of a search line that is several pixels wide.
-        pixels[i, across] = (line[r] + 0.5) * line_px - 0.5 + shift_px
-        pixels[i, along] = position[r]
+        pixels[i, across] = (line[r] + 0.5) * band.line_px - 0.5 + band.shift_px
+        pixels[i, along] = peaks.position[r]
     return begin + n
 
 
@@ -343,37 +339,20 @@ def find_candidates(
     """
     along_x, along_y = (peaks.get(axis, _NO_PEAKS) for axis in _AXES)
     by_search = [along_x if one.axis is SearchAxis.ALONG_X else along_y for one in laser_bands]
-    capacity = sum(map(len, by_search))
-    numbers, measures = np.empty((N_NUMBERS, capacity), np.int64), np.empty((N_MEASURES, capacity))
-    pixels = np.empty((capacity, 2))
+    capacity = sum(found.n for found in by_search)
+    tables = CandidateTables(
+        np.empty((N_NUMBERS, capacity), np.int64),
+        np.empty((N_MEASURES, capacity)),
+        np.empty((capacity, 2)),
+    )
     best_height = element_at(np.concatenate((along_x.height, along_y.height)), _BEST_SHARE)
     n = 0
     for i, (search, found) in enumerate(zip(laser_bands, by_search, strict=True)):
-        n = append_candidates(
-            found.line,
-            found.position,
-            found.height,
-            found.width,
-            found.likelihood,
-            found.pull,
-            search.lowest,
-            search.highest,
-            search.slope_low,
-            search.slope_high,
-            i,
-            found is along_x,
-            search.line_px,
-            search.shift_px,
-            best_height,
-            n,
-            numbers,
-            measures,
-            pixels,
-        )
+        n = append_candidates(found, search.lines, i, found is along_x, best_height, n, tables)
     points, sensitivity, valid = np.empty((n, 3)), np.empty((n, 3)), np.empty(n, np.bool_)
-    source, laser, line, component, subsegment, along = numbers[:, :n]
-    height, width, sigma_px, confidence, pull = measures[:, :n]
-    pixels = pixels[:n]
+    source, laser, line, component, subsegment, along = tables.numbers[:, :n]
+    height, width, sigma_px, confidence, pull = tables.measures[:, :n]
+    pixels = tables.pixels[:n]
     all_valid = triangulator.triangulate_into(
         pixels, along, laser, subsegment, points, sensitivity, valid
     )

@@ -5,7 +5,6 @@ peaks in them within the lasers' bands.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import cv2
@@ -508,7 +507,7 @@ def _are_long(line: IntArray, table: FloatArray, rows: IntArray) -> BoolArray:
 def _in_picture(peaks: StripePeaks, field: Field) -> StripePeaks:
     """Return peaks of columns of a field with positions and widths in pixels of the picture."""
     position = 2.0 * peaks.position + FIRST_ROW[field]
-    return replace(peaks, position=position, width=2.0 * peaks.width)
+    return peaks._replace(position=position, width=2.0 * peaks.width)
 
 
 def _plain(plane: U8Array, copy: U8Array) -> U8Array:

@@ -8,6 +8,7 @@ import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
+from typing import NamedTuple
 
 import numpy as np
 
@@ -33,6 +34,17 @@ class SearchAxis(Enum):
     """Search lines are rows; for stripes that run more vertical than horizontal."""
 
 
+class BandLines(NamedTuple):
+    """The search lines of a laser's band, for kernels; attributes as in `LaserBand`."""
+
+    lowest: IntArray
+    highest: IntArray
+    slope_low: FloatArray
+    slope_high: FloatArray
+    line_px: int
+    shift_px: float
+
+
 @dataclass(frozen=True, slots=True)
 class LaserBand:
     """The search band of one laser in the image."""
@@ -56,6 +68,13 @@ class LaserBand:
     shift_px: float = 0.0
     # Pixels from one position to the next; 2 along the columns of a field.
     position_px: float = 1.0
+
+    @property
+    def lines(self) -> BandLines:
+        """What kernels use of the band."""
+        return BandLines(
+            self.lowest, self.highest, self.slope_low, self.slope_high, self.line_px, self.shift_px
+        )
 
     @property
     def visible(self) -> bool:

@@ -26,7 +26,7 @@ from aqualvs.geometry.compiled import (
     lazy_kernel,
 )
 from aqualvs.geometry.linear_algebra import n_bins, solve_symmetric
-from aqualvs.scanning.laser_bands import SLOPE_CELL, LaserBand
+from aqualvs.scanning.laser_bands import SLOPE_CELL, BandLines, LaserBand
 from aqualvs.scanning.stripe import StripePeaks
 
 # Least height of a bend over its chord, beyond errors of the lens.
@@ -316,16 +316,8 @@ def link_segments(peaks: StripePeaks, search: LaserBand) -> Segments:
     -------
     Segments
     """
-    numbers = np.empty((3, len(peaks)), np.int64)
-    n = segment_peaks(
-        peaks.line,
-        peaks.position,
-        search.lowest,
-        search.highest,
-        search.slope_low,
-        search.slope_high,
-        numbers,
-    )
+    numbers = np.empty((3, peaks.n), np.int64)
+    n = segment_peaks(peaks, search.lines, numbers)
     order, component, subsegment = numbers[:, :n]
     return Segments(order, component, subsegment)
 
@@ -354,23 +346,15 @@ def in_a_row(line: IntArray, position: FloatArray) -> BoolArray:
 
 
 @lazy_kernel
-def segment_peaks(
-    line: IntArray,
-    position: FloatArray,
-    lowest: IntArray,
-    highest: IntArray,
-    slope_low: FloatArray,
-    slope_high: FloatArray,
-    numbers: IntArray,
-) -> int:
+def segment_peaks(peaks: StripePeaks, band: BandLines, numbers: IntArray) -> int:
     """Write the rows of `Segments`, shape (3, N); return the number kept."""
-    n = line.shape[0]
+    line, position, n = peaks.line, peaks.position, peaks.line.shape[0]
     segment_of = np.empty(n, np.int64)
     # First and last return of each segment, and their number.
     first, last, count = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, np.int64)
-    n_segments = _link(line, position, lowest, highest, segment_of, first, last, count)
+    n_segments = _link(line, position, band.lowest, band.highest, segment_of, first, last, count)
     start = _sort(segment_of, count[:n_segments], numbers)
-    n_kept = _drop_foreign(line, position, slope_low, slope_high, start, first, last, numbers)
+    n_kept = _drop_foreign(peaks, band, start, first, last, numbers)
     root = _join(line, position, first[:n_kept], last[:n_kept])
     order, component = numbers[0], numbers[1]
     n = 0
@@ -472,10 +456,8 @@ def _sort(segment_of: IntArray, count: IntArray, numbers: IntArray) -> IntArray:
 
 @inner_kernel
 def _drop_foreign(
-    line: IntArray,
-    position: FloatArray,
-    slope_low: FloatArray,
-    slope_high: FloatArray,
+    peaks: StripePeaks,
+    band: BandLines,
     start: IntArray,
     first: IntArray,
     last: IntArray,
@@ -490,7 +472,7 @@ def _drop_foreign(
         begin, size = start[s], start[s + 1] - start[s]
         if size >= long_segment:
             members = order[begin : begin + size]
-            if not _direction_possible(line, position, members, slope_low, slope_high):
+            if not _direction_possible(peaks, members, band):
                 continue
             n_planes = (size + SUBSEGMENT_LINES - 1) // SUBSEGMENT_LINES
             for k in range(size):
@@ -510,15 +492,9 @@ def _drop_foreign(
 
 
 @inner_kernel
-def _direction_possible(
-    line: IntArray,
-    position: FloatArray,
-    members: IntArray,
-    slope_low: FloatArray,
-    slope_high: FloatArray,
-) -> bool:
+def _direction_possible(peaks: StripePeaks, members: IntArray, band: BandLines) -> bool:
     """Return whether the direction of a long segment is possible for its laser's stripe."""
-    n = members.shape[0]
+    line, position, n = peaks.line, peaks.position, members.shape[0]
     mean_line = 0.0
     mean_position = 0.0
     for k in range(n):
@@ -537,8 +513,8 @@ def _direction_possible(
     column = int(mean_line) // SLOPE_CELL
     # Tolerance of a segment's direction beyond the bounds for a plane target; covers curvature.
     slope_margin = 0.15
-    low = slope_low[row, column] - slope_margin
-    high = slope_high[row, column] + slope_margin
+    low = band.slope_low[row, column] - slope_margin
+    high = band.slope_high[row, column] + slope_margin
     return bool(low <= slope <= high)
 
 

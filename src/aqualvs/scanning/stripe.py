@@ -96,8 +96,7 @@ class ThresholdOptions:
             raise OptionError(f"threshold level is {self.level}; use 1 to 255 grey levels")
 
 
-@dataclass(frozen=True, slots=True)
-class StripePeaks:
+class StripePeaks(NamedTuple):
     """Stripe peaks of one search direction, ordered by search line, then by position."""
 
     # Shape (N,): search line: x for searches along y, y for searches along x.
@@ -115,8 +114,9 @@ class StripePeaks:
     # between the flanks; in pixels. 0 where it is not measured.
     pull: FloatArray
 
-    def __len__(self) -> int:
-        """Return the number of peaks."""
+    @property
+    def n(self) -> int:
+        """Number of peaks."""
         return len(self.line)
 
 

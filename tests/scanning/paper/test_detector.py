@@ -55,7 +55,7 @@ def test_runs_come_in_order_with_middle_width_and_peak() -> None:
     np.testing.assert_array_equal(found.width, [4.0, 1.0, 3.0])
     np.testing.assert_array_equal(found.height, [200.0, 141.0, 255.0])
     np.testing.assert_array_equal(found.likelihood, np.ones(3))
-    assert len(found) == 3
+    assert found.n == 3
 
 
 def test_the_level_itself_is_bright_and_one_below_is_not() -> None:
@@ -110,7 +110,7 @@ def test_where_there_are_too_many_the_lowest_level_that_suits_is_used(lines: U8,
 def test_a_white_picture_has_no_returns() -> None:
     white = np.full((64, 64), 255, np.uint8)
     detector = full_detector((64, 64), ThresholdOptions(max_pixels=4000))
-    assert len(detector.detect(Frame(0, 0.0, white))[SearchAxis.ALONG_Y]) == 0
+    assert detector.detect(Frame(0, 0.0, white))[SearchAxis.ALONG_Y].n == 0
 
 
 def test_a_sub_pixel_return_has_the_pixels_above_half_its_height() -> None:
@@ -132,7 +132,7 @@ def test_a_second_frame_is_not_mixed_with_the_first() -> None:
     bright[30] = 255
     first = detector.detect(Frame(0, 0.0, bright))[SearchAxis.ALONG_Y]
     dark = np.full((64, n), 20, np.uint8)
-    assert len(detector.detect(Frame(1, 0.0, dark))[SearchAxis.ALONG_Y]) == 0
+    assert detector.detect(Frame(1, 0.0, dark))[SearchAxis.ALONG_Y].n == 0
     np.testing.assert_array_equal(first.position, np.full(n, 30.0))
 
 
