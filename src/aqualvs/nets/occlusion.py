@@ -4,7 +4,6 @@ Only the stripes on an object are seen, not its outline; it is taken to be half 
 long. Too large an occlusion costs looks at the net, too small a one would turn fish into holes.
 """
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -40,8 +39,7 @@ class _OcclusionOptions(NamedTuple):
 _HIDDEN = _OcclusionOptions()
 
 
-@dataclass(frozen=True, slots=True)
-class LaserLines:
+class LaserLines(NamedTuple):
     """The lasers' lines across the net's plane; L lasers, J search lines."""
 
     # Shape (L, 2): a place on every line in `net` and its unit direction.
@@ -119,10 +117,7 @@ def hidden_lines(
         line_px,
         eye,
         sources,
-        lines.origin,
-        lines.direction,
-        lines.along,
-        lines.position,
+        lines,
         hidden,
     )
     return hidden
@@ -139,15 +134,7 @@ def light_beyond(
     behind = points.label == Label.BACKGROUND
     behind &= in_net[:, 2] < -off
     if behind.any():
-        _mark_beyond(
-            points.laser[behind].astype(np.int64),
-            in_net[behind],
-            sources,
-            lines.origin,
-            lines.direction,
-            lines.along,
-            beyond,
-        )
+        _mark_beyond(points.laser[behind].astype(np.int64), in_net[behind], sources, lines, beyond)
     return beyond
 
 
@@ -197,10 +184,7 @@ def _hide(
     line_px: IntArray,
     eye: FloatArray,
     sources: FloatArray,
-    origin: FloatArray,
-    direction: FloatArray,
-    along: FloatArray,
-    expected: FloatArray,
+    lines: LaserLines,
     hidden: BoolArray,
 ) -> None:
     """Mark the places hidden by objects; their light is sorted by object and search line."""
@@ -211,12 +195,10 @@ def _hide(
             continue
         i = laser[first]
         if k - first < _HIDDEN.large_lines:
-            _hide_beside(row[first:k], position[first:k], line_px[i], expected[i], hidden[i])
+            _hide_beside(row[first:k], position[first:k], line_px[i], lines.position[i], hidden[i])
         else:
-            _hide_behind(in_net[first:k], eye, origin, direction, along, hidden)
-            _hide_in_shadow(
-                in_net[first:k], sources[i], origin[i], direction[i], along[i], hidden[i]
-            )
+            _hide_behind(in_net[first:k], eye, lines, hidden)
+            _hide_in_shadow(in_net[first:k], sources[i], lines, i, hidden[i])
         first = k
 
 
@@ -250,15 +232,9 @@ def _cast(point: FloatArray, source: FloatArray) -> tuple[float, float]:
 
 
 @inner_kernel
-def _hide_behind(
-    in_net: FloatArray,
-    eye: FloatArray,
-    origin: FloatArray,
-    direction: FloatArray,
-    along: FloatArray,
-    hidden: BoolArray,
-) -> None:
+def _hide_behind(in_net: FloatArray, eye: FloatArray, lines: LaserLines, hidden: BoolArray) -> None:
     """Mark the places that a large object hides from the camera."""
+    origin, direction, along = lines.origin, lines.direction, lines.along
     n = len(in_net)
     on_net = np.empty((n, 2))
     for k in range(n):
@@ -282,14 +258,10 @@ def _hide_behind(
 
 @inner_kernel
 def _hide_in_shadow(
-    in_net: FloatArray,
-    source: FloatArray,
-    origin: FloatArray,
-    direction: FloatArray,
-    along: FloatArray,
-    hidden: BoolArray,
+    in_net: FloatArray, source: FloatArray, lines: LaserLines, i: int, hidden: BoolArray
 ) -> None:
-    """Mark the places in the shadow of a large object in its own laser's light."""
+    """Mark the places of line `i` in the shadow of a large object in its own laser's light."""
+    origin, direction, along = lines.origin[i], lines.direction[i], lines.along[i]
     low, high = np.inf, -np.inf
     for k in range(len(in_net)):
         x, y = _cast(in_net[k], source)
@@ -305,14 +277,9 @@ def _hide_in_shadow(
 
 @kernel
 def _mark_beyond(
-    laser: IntArray,
-    in_net: FloatArray,
-    sources: FloatArray,
-    origin: FloatArray,
-    direction: FloatArray,
-    along: FloatArray,
-    beyond: BoolArray,
+    laser: IntArray, in_net: FloatArray, sources: FloatArray, lines: LaserLines, beyond: BoolArray
 ) -> None:
+    origin, direction, along = lines.origin, lines.direction, lines.along
     # Search lines to each side of light beyond the net that it represents.
     spread_lines = 2
     for i in range(along.shape[0]):

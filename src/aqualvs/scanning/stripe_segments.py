@@ -178,18 +178,8 @@ def find_segments(frame: Frame, search: LaserBand) -> StripeSegments:
     order, start = _smooth_chains(peaks, search)
     n_measures = 12
     table = np.empty((n_measures, len(start) - 1))
-    _measure(
-        *rows,
-        peaks.line,
-        peaks.position,
-        peaks.height,
-        peaks.width,
-        order,
-        start,
-        search.line_px,
-        search.axis is SearchAxis.ALONG_X,
-        table,
-    )
+    along_x = search.axis is SearchAxis.ALONG_X
+    _measure(rows, peaks, order, start, search.line_px, along_x, table)
     return StripeSegments(search, peaks, order, start, table)
 
 
@@ -255,13 +245,8 @@ def _height_steps(height: FloatArray, ends: BoolArray) -> IntArray:
 
 @kernel
 def _measure(
-    light: Rows,
-    along: Rows,
-    across: Rows,
-    line: IntArray,
-    position: FloatArray,
-    height: FloatArray,
-    width: FloatArray,
+    rows: PictureRows,
+    peaks: StripePeaks,
     order: IntArray,
     start: IntArray,
     line_px: int,
@@ -269,6 +254,8 @@ def _measure(
     table: FloatArray,
 ) -> None:
     """Write the measures of all pieces."""
+    light, along, across = rows
+    line, position, width = peaks.line, peaks.position, peaks.width
     has_colour = along.shape[0] > 0
     # The halo is summed up to so many pixels beyond them: codecs keep chroma in blocks of 16
     # pixels.
@@ -297,7 +284,7 @@ def _measure(
                 total += _sum_above_flanks(light[x], low, high)
                 total_along += _sum_above_flanks(along[x], low, high)
                 total_across += _sum_above_flanks(across[x], low, high)
-                before, after = _middles(line, position, is_long, members[i])
+                before, after = _middles(peaks, is_long, members[i])
                 low = min(int(np.ceil(max(low - halo_px, before, 1.0))), low)
                 high = max(int(min(high + halo_px, after, light.shape[1] - 2.0)), high)
                 halo += _sum_above_flanks(along[x], low, high)
@@ -305,7 +292,7 @@ def _measure(
         first, last = members[0], members[n - 1]
         begin, end = line_px * (line[first] + 0.5) - 0.5, line_px * (line[last] + 0.5) - 0.5
         table[LENGTH, k] = np.hypot(end - begin, position[last] - position[first])
-        table[HEIGHT, k] = np.median(height[members])
+        table[HEIGHT, k] = np.median(peaks.height[members])
         table[WIDTH, k] = np.median(width[members])
         table[TOP, k] = np.median(tops)
         table[ONE_SIDED, k] = np.median(one_sided) / max(np.median(above), 1.0)
@@ -318,10 +305,9 @@ def _measure(
 
 
 @inner_kernel
-def _middles(
-    line: IntArray, position: FloatArray, is_long: BoolArray, i: int
-) -> tuple[float, float]:
+def _middles(peaks: StripePeaks, is_long: BoolArray, i: int) -> tuple[float, float]:
     """Return the middles between a peak and the next long pieces before and after it."""
+    line, position = peaks.line, peaks.position
     before, after = -np.inf, np.inf
     k = i - 1
     while k >= 0 and line[k] == line[i]:
