@@ -6,6 +6,7 @@ from aqualvs.calibration.detection.boards import read_markers
 from aqualvs.calibration.detection.detection import detect_markers
 from aqualvs.calibration.detection.tag_corners import (
     N_UNKNOWNS,
+    TagWindow,
     _coverage,
     marker_cells,
     refine_tags,
@@ -101,8 +102,8 @@ def test_derivatives_are_those_of_the_grey_value():
     def sums(values):
         normal, gradient = np.zeros((N_UNKNOWNS, N_UNKNOWNS)), np.zeros(N_UNKNOWNS)
         residuals = np.zeros(image.shape)
-        weights, corner = np.ones(image.shape), np.zeros(2)
-        tag_sums(image, corner, weights, cells, 1.1, values, normal, gradient, residuals, 1)
+        window = TagWindow(image, np.zeros(2), np.ones(image.shape), cells, 1.1, 1)
+        tag_sums(window, values, normal, gradient, residuals)
         return normal, residuals
 
     normal, residuals = sums(unknowns)

@@ -211,69 +211,58 @@ def _pixel_to_marker(unknowns: FloatArray, x: float, y: float) -> tuple[float, f
     return q_0, q_1
 
 
+class TagWindow(NamedTuple):
+    """Pixels around a marker, and what the marker looks like."""
+
+    image: U8Array  # Shape (height, width): grey picture.
+    corner: FloatArray  # Shape (2,): column and row of the window's first pixel.
+    weights: FloatArray  # Shape (rows, columns): of each pixel of the window; 0 leaves it out.
+    # Shape (n + 2, n + 2): the marker's cells, 1 where light, and a light ring around them.
+    cells: FloatArray
+    reach: float  # Largest q of the pixels that count; 1 is the marker's edge.
+    every: int  # Subsampling: 1 takes all pixels, 2 those of one colour of a chessboard.
+
+
 @inner_kernel
 def tag_sums(
-    image: U8Array,
-    corner: FloatArray,
-    weights: FloatArray,
-    cells: FloatArray,
-    reach: float,
+    window: TagWindow,
     unknowns: FloatArray,
     normal: FloatArray,
     gradient: FloatArray,
     residuals: FloatArray,
-    every: int,
 ) -> float:
     """Sum the weighted squares of a window's residuals, their normal matrix and gradient.
 
     Parameters
     ----------
-    image : uint8 array, shape (height, width)
-        Grey picture.
-    corner : array, shape (2,)
-        Column and row of the window's first pixel.
-    weights : array, shape (rows, columns)
-        Weight of each pixel of the window; 0 leaves it out.
-    cells : array, shape (n + 2, n + 2)
-        The marker's cells, 1 where light, and a light ring around them.
-    reach : float
-        Largest q of the pixels that count; 1 is the marker's edge.
+    window : TagWindow
     unknowns : array, shape (22,)
         Values of the unknowns.
     normal, gradient : array, shape (22, 22) and (22,)
         Written; of `normal` the lower half.
     residuals : array, shape (rows, columns)
         Written: picture minus model; NaN outside the marker.
-    every : int
-        Subsampling: 1 takes all pixels, 2 takes those of one colour of a chessboard.
 
     Returns
     -------
     squares : float
         Weighted sum.
     """
-    row = np.empty(N_UNKNOWNS)
     normal[:, :] = 0.0
     gradient[:] = 0.0
-    return _sums(
-        image, corner, weights, cells, reach, unknowns, normal, gradient, residuals, every, row
-    )
+    return _sums(window, unknowns, normal, gradient, residuals, np.empty(N_UNKNOWNS))
 
 
 @inner_borrowing_kernel
 def _sums(
-    image: U8Array,
-    corner: FloatArray,
-    weights: FloatArray,
-    cells: FloatArray,
-    reach: float,
+    window: TagWindow,
     unknowns: FloatArray,
     normal: FloatArray,
     gradient: FloatArray,
     residuals: FloatArray,
-    every: int,
     row: FloatArray,
 ) -> float:
+    image, corner, weights, cells, reach, every = window
     squares = 0.0
     rows, columns = weights.shape
     for i_row in range(rows):
@@ -320,24 +309,18 @@ _LOG_GAMMA = (math.log(0.5), math.log(5.0))
 
 @kernel
 def descend(
-    image: U8Array,
-    corner: FloatArray,
-    weights: FloatArray,
-    cells: FloatArray,
-    reach: float,
+    window: TagWindow,
     prior: FloatArray,
     unknowns: FloatArray,
     residuals: FloatArray,
     covariance: FloatArray,
     n_steps: int,
-    every: int,
 ) -> bool:
     """Improve `unknowns` (22,) in place; return False if the pixels do not determine them.
 
     Parameters
     ----------
-    image, corner, weights, cells, reach
-        As in `tag_sums`.
+    window : TagWindow
     prior : array, shape (2, 22)
         Expected values, and their weight in the sum of squares.
     unknowns : array, shape (22,)
@@ -348,16 +331,13 @@ def descend(
         Written: the inverse of the normal matrix; times the noise variance it is the covariance.
     n_steps : int
         Greatest number of steps.
-    every : int
-        As in `tag_sums`.
     """
     normal, gradient = np.empty((N_UNKNOWNS, N_UNKNOWNS)), np.empty(N_UNKNOWNS)
     new_normal, new_gradient = np.empty((N_UNKNOWNS, N_UNKNOWNS)), np.empty(N_UNKNOWNS)
     lower, step = np.zeros((N_UNKNOWNS, N_UNKNOWNS)), np.empty(N_UNKNOWNS)
     new_residuals = np.empty_like(residuals)
-    squares = tag_sums(
-        image, corner, weights, cells, reach, unknowns, normal, gradient, residuals, every
-    ) + _add_prior(prior, unknowns, normal, gradient)
+    squares = tag_sums(window, unknowns, normal, gradient, residuals)
+    squares += _add_prior(prior, unknowns, normal, gradient)
     damping = 1e-3
     for _ in range(n_steps):
         if not factorise(normal, damping, MIN_PIVOT, lower):
@@ -367,18 +347,8 @@ def descend(
         tried = unknowns + step
         tried[BLUR] = min(max(tried[BLUR], _LOG_BLUR[0]), _LOG_BLUR[1])
         tried[GAMMA] = min(max(tried[GAMMA], _LOG_GAMMA[0]), _LOG_GAMMA[1])
-        new_squares = tag_sums(
-            image,
-            corner,
-            weights,
-            cells,
-            reach,
-            tried,
-            new_normal,
-            new_gradient,
-            new_residuals,
-            every,
-        ) + _add_prior(prior, tried, new_normal, new_gradient)
+        new_squares = tag_sums(window, tried, new_normal, new_gradient, new_residuals)
+        new_squares += _add_prior(prior, tried, new_normal, new_gradient)
         if not new_squares <= squares:
             damping = 10.0 * max(damping, 1e-3)
             continue
@@ -512,19 +482,8 @@ def _fit(
         prior = _prior(side, unknowns[CONTRAST], noise)
         # Half of the pixels suffice to find polluted ones; all of them place the corners.
         every = 2 if i < _FIT.n_robust_rounds else 1
-        if not descend(
-            image,
-            corner,
-            weights,
-            cells,
-            reach,
-            prior,
-            unknowns,
-            residuals,
-            covariance,
-            _FIT.steps,
-            every,
-        ):
+        window = TagWindow(image, corner, weights, cells, reach, every)
+        if not descend(window, prior, unknowns, residuals, covariance, _FIT.steps):
             return None
         if not unknowns[CONTRAST] > _FIT.min_contrast:
             return None
