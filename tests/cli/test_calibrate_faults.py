@@ -63,6 +63,16 @@ def test_a_board_that_all_pictures_show_alike(folder, capsys, tmp_path):
     assert not out.exists()
 
 
+def test_pictures_without_the_board_are_counted_in_a_refusal(folder, capsys, tmp_path):
+    for path in sorted(folder.glob("view_*.png")):
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    cv2.imwrite(str(tmp_path / "blank.png"), np.full(SIZE[::-1], 90, np.uint8))
+    board = folder / "board.yaml"
+    said = fault(capsys, "camera", tmp_path, "--board", board, "-o", tmp_path / "rig.yaml")
+    assert "tilt" in said
+    assert "; 1 of 5 pictures could not be used (blank.png: no " in said
+
+
 def test_a_board_of_another_dictionary(folder, capsys, tmp_path):
     said = fault(
         capsys, "camera", folder, "--board", folder / "other.yaml", "-o", tmp_path / "rig.yaml"

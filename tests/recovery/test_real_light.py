@@ -21,6 +21,8 @@ import real_wall as wall
 from aqualvs.calibrate import common, lasers
 from aqualvs.calibrate.uncalibrated_stripes import UncalibratedStripeOptions, find_stripes
 from aqualvs.calibration.detection.detection import detect_board
+from aqualvs.calibration.targets.target_files import load_board
+from aqualvs.calibration.targets.targets import View
 from aqualvs.optics.rigfile import load_rig
 from aqualvs.sources.images import read_image
 from laser_cases import laser_error
@@ -150,6 +152,35 @@ def test_a_pale_picture_is_measured_without_the_colour_that_the_codec_dropped(tm
     image = photograph(picture)
     pale = cv2.addWeighted(image, 0.4, without_colour(image), 0.6, 0.0)
     assert_on_board(measured_as("crf23", pale, picture, tmp_path))
+
+
+def lamp(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    return 0.12 + 1.5 * np.exp(-((x - 190.0) ** 2 + (y - 340.0) ** 2) / (2.0 * 220.0**2))
+
+
+def shadow(x: np.ndarray, _: np.ndarray) -> np.ndarray:
+    return 0.25 + 0.75 / (1.0 + np.exp((x - 410.0) / 8.0))
+
+
+def flicker(_: np.ndarray, y: np.ndarray) -> np.ndarray:
+    return 0.78 + 0.22 * np.sin(y / 22.0)
+
+
+@pytest.mark.parametrize("light", [lamp, shadow, flicker])
+@pytest.mark.parametrize("picture", PICTURES)
+def test_the_board_is_found_in_uneven_light(picture: str, light) -> None:
+    board, image = load_board(PHOTOGRAPHS / "board.yaml"), photograph(picture)
+    share = light(*np.meshgrid(np.arange(CROP[2]), np.arange(CROP[3])))
+    found, expected = (
+        detect_board(cv2.cvtColor(one, cv2.COLOR_BGR2GRAY), board, picture)
+        for one in (np.rint(share[..., None] * image).clip(0, 255).astype(np.uint8), image)
+    )
+    assert isinstance(found, View)
+    assert isinstance(expected, View)
+    # A shadow's edge hides corners, and pulls those beside it.
+    assert len(found) >= 0.8 * len(expected)
+    index = [expected.ids.tolist().index(number) for number in found.ids]
+    assert np.median(np.abs(found.pixels - expected.pixels[index])) < 0.05
 
 
 @pytest.mark.parametrize("picture", PICTURES)

@@ -16,6 +16,7 @@ from aqualvs.calibrate.common import (
     Picture,
     corner_residuals,
     corner_rows,
+    counting_missed,
     detect_targets,
     finish,
     load_nominal,
@@ -90,9 +91,10 @@ def calibrate_camera(
         pictures, lambda name, image: detect_board(image, pattern, name), named(board, "the board")
     )
     _check_size(found, known, nominal)
-    result = solve_camera(
-        found.views, found.size_px, model=LensModel(model), n_coefficients=n_coefficients
-    )
+    with counting_missed(found):
+        result = solve_camera(
+            found.views, found.size_px, model=LensModel(model), n_coefficients=n_coefficients
+        )
     return Calibration(
         rig=_rig(result, known),
         uncertainty=result.uncertainty,

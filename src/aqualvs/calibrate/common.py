@@ -5,8 +5,9 @@ The nominal rig (`load_nominal`) is known before any calibration: name, picture 
 `calibrate_water` return; the commands of `aqualvs calibrate` write it down.
 """
 
+import contextlib
 import glob
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -362,6 +363,22 @@ def detect_targets(pictures: Sequence[Picture], detect: Detect, target: str) -> 
     return DetectedTargets(
         tuple(view for _, view in found), tuple(one for one, _ in found), size_px, missed
     )
+
+
+@contextlib.contextmanager
+def counting_missed(*sets: DetectedTargets) -> Iterator[None]:
+    """Add to a refusal how many pictures the solve did without, with the reason for one of them."""
+    try:
+        yield
+    except CalibrationError as fault:
+        missed = [reason for found in sets for reason in found.missed.items()]
+        if not missed:
+            raise
+        n_pictures = len(missed) + sum(len(found.views) for found in sets)
+        name, why = missed[0]
+        raise CalibrationError(
+            f"{fault}; {len(missed)} of {n_pictures} pictures could not be used ({name}: {why})"
+        ) from fault
 
 
 def named(target: object, what: str) -> str:

@@ -13,6 +13,7 @@ from aqualvs.calibrate.common import (
     check_same_size,
     corner_residuals,
     corner_rows,
+    counting_missed,
     detect_targets,
     finish,
     medium_index,
@@ -130,8 +131,9 @@ def calibrate_dome(
         # Intrinsics that were written by hand are not exact either.
         given = completed_uncertainty(before).only(before.lens.parameter_names)
         known = merged(known, given)
-    result = solve_dome(before, [one for _, one in sets], options or DomeOptions(), known)
     found = tuple(one for one, _ in sets)
+    with counting_missed(*found):
+        result = solve_dome(before, [one for _, one in sets], options or DomeOptions(), known)
     missed = {name: why for one in found for name, why in one.missed.items()}
     return Calibration(
         rig=_noted(before, result),

@@ -17,6 +17,7 @@ from aqualvs.calibrate.common import (
     Picture,
     check_same_size,
     common_wavelength,
+    counting_missed,
     detect_targets,
     finish,
     medium_index,
@@ -169,17 +170,18 @@ def calibrate_lasers(
     in_air = abs(seen.n_medium - before.n_air) < 1e-3
     elsewhere = in_air or medium is not None
     expected = len(names) if n_lasers is None and names is not None else n_lasers
-    result = solve_lasers(
-        before,
-        views,
-        seen.surfaces,
-        options=LaserOptions(
-            n_lasers=_noted_count(before) if expected is None else expected,
-            n_medium=seen.n_medium if elsewhere else None,
-            refine=refine,
-        ),
-        uncertainty=_known(before, refine=refine, elsewhere=elsewhere),
-    )
+    with counting_missed(seen.found):
+        result = solve_lasers(
+            before,
+            views,
+            seen.surfaces,
+            options=LaserOptions(
+                n_lasers=_noted_count(before) if expected is None else expected,
+                n_medium=seen.n_medium if elsewhere else None,
+                refine=refine,
+            ),
+            uncertainty=_known(before, refine=refine, elsewhere=elsewhere),
+        )
     if len(result.lasers) != len(before.lasers):
         result = replace(result, rig=_coloured(result.rig, colour_nm))
     solved = _noted(before, result, seen)

@@ -172,7 +172,9 @@ def test_other_finders_are_tried_after_a_wrong_grid(monkeypatch):
     view = detect_board(image, board, "a.png")
     assert isinstance(view, View)
     assert _errors(view, truth).max() < _FARTHEST_PX
-    assert view.notes == ("board found at a later try (OpenCV's findChessboardCorners)",)
+    assert view.notes == (
+        "board found at a later try (OpenCV's findChessboardCornersSB, in even light)",
+    )
 
 
 def test_a_small_blurred_chessboard_is_found_whole():

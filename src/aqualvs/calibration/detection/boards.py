@@ -186,6 +186,15 @@ _MISFIT_SHARE = 0.12
 _Finder = Callable[[GreyImage, tuple[int, int]], tuple[bool, cv2.typing.MatLike]]
 
 
+def _in_even_light(image: GreyImage) -> GreyImage:
+    """Divide by the mean around every pixel: lamps, shadows and flicker light a board unevenly."""
+    # Width of the mean, as a share of the picture's, and the grey level that it becomes.
+    around, level = 1.0 / 30.0, 110.0
+    width = 2 * round(0.5 * around * image.shape[1]) + 1
+    mean = cv2.boxFilter(image, cv2.CV_32F, (width, width), borderType=cv2.BORDER_REFLECT)
+    return np.asarray(np.clip(level * (image + 1.0) / (mean + 1.0), 0.0, 255.0), np.uint8)
+
+
 def _sectors(flags: int) -> _Finder:
     return lambda image, grid: cv2.findChessboardCornersSB(image, grid, flags=flags)
 
@@ -197,6 +206,10 @@ def _quads(flags: int) -> _Finder:
 # In the order of use; the first is the best and the fastest.
 _FINDERS: tuple[tuple[str, _Finder], ...] = (
     ("findChessboardCornersSB", _sectors(cv2.CALIB_CB_NORMALIZE_IMAGE)),
+    (
+        "findChessboardCornersSB, in even light",
+        lambda image, grid: cv2.findChessboardCornersSB(_in_even_light(image), grid),
+    ),
     ("findChessboardCorners", _quads(cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE)),
     (
         "findChessboardCornersSB, exhaustive",
