@@ -169,7 +169,7 @@ def _channels(rate_hz: float) -> Finding:
 _EXTRAS = {
     "dashboard": (("starlette", "uvicorn", "websockets"), "the pilot's page"),
     "mavlink": (("pymavlink", "pyserial"), "MAVLink, .tlog and .BIN logs"),
-    "bags": (("mcap", "rosbags"), "ROS bags as source"),
+    "bags": (("mcap", "rosbags"), "ROS bags as source, ROS 1 live"),
     "foxglove": (("foxglove-sdk",), "Foxglove live"),
     "rerun": (("rerun-sdk",), "--rerun"),
     "dds": (("cyclonedds",), "ROS 2 without ROS"),

@@ -7,6 +7,7 @@ import signal
 import socket
 import struct
 import subprocess
+import sys
 import threading
 import time
 import xmlrpc.client
@@ -355,7 +356,7 @@ def test_handshake(publish: Publish) -> None:
         "callerid": "/test",
     }
     assert POSE_MD5.encode() in shake_hands(output, **sound)
-    assert b"message_definition=Header header\n" in shake_hands(output, **sound)
+    assert b"message_definition=std_msgs/Header header\n" in shake_hands(output, **sound)
     # Tools that take any type ask for a star.
     assert POSE_MD5.encode() in shake_hands(output, **{**sound, "md5sum": "*", "type": "*"})
 
@@ -411,6 +412,12 @@ def test_calls_that_are_not_understood(publish: Publish) -> None:
 def test_wrong_master(uri: str) -> None:
     with pytest.raises(OptionError, match="ROS_MASTER_URI"):
         master_host(uri)
+
+
+def test_without_rosbags(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "rosbags.typesys", None)
+    with pytest.raises(OptionError, match=r"pip install 'aqualvs\[bags\]'"):
+        Ros1Output()
 
 
 def test_wrong_node_name() -> None:

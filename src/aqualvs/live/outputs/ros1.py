@@ -1,11 +1,12 @@
-"""ROS 1 output: posture, range, cloud and diagnostics as topics of a node in plain Python.
+"""ROS 1 output: posture, range, cloud and diagnostics as topics of a node (extra `bags`).
 
 The node registers with roscore and serves its subscribers itself. `rospy` would tie us to the
 Python of a ROS release (3.8 on Noetic), waits for roscore without end when it starts, never
 reconnects after roscore was restarted, and can be started once in a process. The protocol of a
-publisher is small (http://wiki.ros.org/ROS/Slave_API, Master_API).
+publisher is small (http://wiki.ros.org/ROS/Slave_API, Master_API); messages are those of rosbags.
 """
 
+import functools
 import http.client
 import logging
 import os
@@ -17,14 +18,20 @@ import xmlrpc.client
 import xmlrpc.server
 from collections import Counter
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
+import numpy as np
+
 from aqualvs.errors import OptionError
-from aqualvs.live.outputs.ros1_links import ROS1_TYPES, Ros1Links, Ros1Type, to_ros1
+from aqualvs.live.outputs.ros1_links import Ros1Links, Ros1Type
+from aqualvs.live.outputs.ros2_messages import TYPE_NAMES, Ros2Types, to_ros2
 from aqualvs.live.outputs.ros_messages import MessageMaker, PublishedTopic, RosOptions
 from aqualvs.recording.sample import LiveSample
 from aqualvs.sources.base import PartHealth, State
+
+if TYPE_CHECKING:
+    from rosbags.typesys.store import Typestore
 
 DEFAULT_MASTER = "http://localhost:11311"
 _TIMEOUT_S = 3.0
@@ -298,7 +305,7 @@ class Ros1Output:
     Raises
     ------
     OptionError
-        If the address of roscore or the node's name is none.
+        If the address of roscore or the node's name is none, or rosbags is not installed.
     """
 
     name = "ros1"
@@ -319,10 +326,12 @@ class Ros1Output:
         master = master_uri or environment.get("ROS_MASTER_URI") or DEFAULT_MASTER
         self._names = {topic: options.topic_name(topic) for topic in PublishedTopic}
         self._topics = {name: topic for topic, name in self._names.items()}
+        self._store = ros1_store()
+        self._types = ros1_types(self._store)
         self._maker = MessageMaker(options)
         self._n_sent: Counter[PublishedTopic] = Counter()
         self._closed = False
-        types = {self._names[topic]: kind for topic, kind in ROS1_TYPES.items()}
+        types = {name: ros1_type(self._store, topic) for topic, name in self._names.items()}
         self._node = Ros1Node(f"/{node_name}", types, master, environment)
 
     @property
@@ -334,7 +343,10 @@ class Ros1Output:
         """Hand a sample's messages to the subscribers that are connected; returns at once."""
         wanted = {self._topics[name] for name in self._node.links.listeners()}
         for topic, message in self._maker.messages(sample, wanted):
-            self._node.links.publish(self._names[topic], to_ros1(message, self._n_sent[topic]))
+            made = to_ros2(self._types, message)
+            made.header.seq = self._n_sent[topic] % 2**32
+            body = self._store.serialize_ros1(made, TYPE_NAMES[topic])
+            self._node.links.publish(self._names[topic], body)
             self._n_sent[topic] += 1
 
     def health(self) -> PartHealth:
@@ -354,3 +366,35 @@ class Ros1Output:
         if not self._closed:
             self._closed = True
             self._node.close()
+
+
+def ros1_store() -> "Typestore":
+    """Return the messages of ROS 1.
+
+    Raises `OptionError` if rosbags is not installed.
+    """
+    try:
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError as fault:
+        raise OptionError(
+            "ROS 1 needs rosbags; install it with: pip install 'aqualvs[bags]'"
+        ) from fault
+    return get_typestore(Stores.ROS1_NOETIC)
+
+
+def ros1_types(store: "Typestore") -> Ros2Types:
+    """Return the message classes; headers get the number of their message when it is sent."""
+    header = functools.partial(store.types["std_msgs/msg/Header"], seq=0)
+    return Ros2Types(
+        classes={**store.types, "std_msgs/msg/Header": header},
+        range_has_variance=False,
+        octet=int,
+        octets=functools.partial(np.frombuffer, dtype=np.uint8),
+    )
+
+
+def ros1_type(store: "Typestore", topic: PublishedTopic) -> Ros1Type:
+    """Return the type of a topic."""
+    name = TYPE_NAMES[topic]
+    definition, md5sum = store.generate_msgdef(name)
+    return Ros1Type(name.replace("/msg/", "/"), md5sum, definition)

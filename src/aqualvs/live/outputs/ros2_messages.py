@@ -1,4 +1,4 @@
-"""Messages in the form of ROS 2, as classes of rclpy or of DDS: both take the same fields."""
+"""Messages in the form of ROS 2, as classes of rclpy, rosbags or DDS: all take the same fields."""
 
 import os
 from collections.abc import Callable
@@ -92,9 +92,7 @@ def _pose(types: Ros2Types, message: PoseMessage) -> Any:
         TYPE_NAMES[PublishedTopic.POSTURE],
         header=_header(types, message.stamp_ns, message.frame_id),
         pose=types.make(
-            "geometry_msgs/msg/PoseWithCovariance",
-            pose=pose,
-            covariance=message.covariance.tolist(),
+            "geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=message.covariance
         ),
     )
 
