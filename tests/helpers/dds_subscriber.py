@@ -1,6 +1,6 @@
 """A ROS 2 subscriber in a process of its own: one line of JSON for each message.
 
-Its types are made of the message definitions that rosbags holds, not of those under test.
+Its types are made here of the definitions that rosbags holds, whose hashes the tests pin.
 
 usage: dds_subscriber.py DOMAIN STORE RELIABILITY NAMESPACE
 """

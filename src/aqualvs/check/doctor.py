@@ -172,7 +172,7 @@ _EXTRAS = {
     "bags": (("mcap", "rosbags"), "ROS bags as source, ROS 1 live"),
     "foxglove": (("foxglove-sdk",), "Foxglove live"),
     "rerun": (("rerun-sdk",), "--rerun"),
-    "dds": (("cyclonedds",), "ROS 2 without ROS"),
+    "dds": (("cyclonedds", "rosbags"), "ROS 2 without ROS"),
     "batch": (("distributed",), "aqualvs batch"),
 }
 """Extra, the packages it brings, what they are for."""

@@ -275,8 +275,9 @@ def test_stays_on_this_machine(environment: dict[str, str], local: bool) -> None
     assert stays_on_this_machine(environment) is local
 
 
-def test_without_cyclonedds(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("missing", ["cyclonedds.idl", "rosbags.typesys"])
+def test_without_a_package(missing: str, monkeypatch: pytest.MonkeyPatch) -> None:
     types_module.dds_types.cache_clear()
-    monkeypatch.setitem(sys.modules, "cyclonedds.idl", None)
+    monkeypatch.setitem(sys.modules, missing, None)
     with pytest.raises(OptionError, match=r"pip install 'aqualvs\[dds\]'"):
         DdsOutput()

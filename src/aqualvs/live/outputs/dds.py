@@ -1,18 +1,18 @@
 """ROS 2 topics without ROS: a publisher by Cyclone DDS, compatible with subscribers of ROS 2.
 
-The messages are types of Cyclone DDS. Names of the types, and names, order and types of their
-members are those that ROS 2 uses (plain CDR, all types final), so that its subscribers match and
-read them.
+The messages are types of Cyclone DDS with the names and members that rosbags knows of ROS 2, and
+its encoding (plain CDR, all types final), so that subscribers of ROS 2 match and read them.
 """
 
 import functools
 import importlib
 import os
-import struct
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from aqualvs.errors import OptionError
 from aqualvs.live.outputs.ros2_messages import (
@@ -26,41 +26,8 @@ from aqualvs.live.outputs.ros_messages import MessageMaker, PublishedTopic, RosO
 from aqualvs.recording.sample import LiveSample
 from aqualvs.sources.base import PartHealth, State
 
-_TIME, _HEADER = "builtin_interfaces/msg/Time", "std_msgs/msg/Header"
-_POINT, _QUATERNION = "geometry_msgs/msg/Point", "geometry_msgs/msg/Quaternion"
-_POSE, _POSE_COV = "geometry_msgs/msg/Pose", "geometry_msgs/msg/PoseWithCovariance"
-_FIELD = "sensor_msgs/msg/PointField"
-_STATUS, _PAIR = "diagnostic_msgs/msg/DiagnosticStatus", "diagnostic_msgs/msg/KeyValue"
-
-# Ordered so that every type comes after its parts.
-_DEFINITIONS = {
-    _TIME: "int32 sec, uint32 nanosec",
-    _HEADER: f"{_TIME} stamp, string frame_id",
-    _POINT: "float64 x, float64 y, float64 z",
-    _QUATERNION: "float64 x, float64 y, float64 z, float64 w",
-    _POSE: f"{_POINT} position, {_QUATERNION} orientation",
-    _POSE_COV: f"{_POSE} pose, float64[36] covariance",
-    TYPE_NAMES[PublishedTopic.POSTURE]: f"{_HEADER} header, {_POSE_COV} pose",
-    TYPE_NAMES[PublishedTopic.RANGE]: (
-        f"{_HEADER} header, uint8 radiation_type, float32 field_of_view, "
-        "float32 min_range, float32 max_range, float32 range, float32 variance"
-    ),
-    _FIELD: "string name, uint32 offset, uint8 datatype, uint32 count",
-    TYPE_NAMES[PublishedTopic.CLOUD]: (
-        f"{_HEADER} header, uint32 height, uint32 width, {_FIELD}[] fields, bool is_bigendian, "
-        "uint32 point_step, uint32 row_step, uint8[] data, bool is_dense"
-    ),
-    _PAIR: "string key, string value",
-    _STATUS: f"uint8 level, string name, string message, string hardware_id, {_PAIR}[] values",
-    TYPE_NAMES[PublishedTopic.DIAGNOSTICS]: f"{_HEADER} header, {_STATUS}[] status",
-}
-
-_HASHES = {
-    PublishedTopic.POSTURE: "26432f9803e43727d3c8f668d1fdb3c630f548af631e2f4e31382371bfea3b6e",
-    PublishedTopic.RANGE: "b42b62562e93cbfe9d42b82fe5994dfa3d63d7d5c90a317981703f7388adff3a",
-    PublishedTopic.CLOUD: "9198cabf7da3796ae6fe19c4cb3bdd3525492988c70522628af5daa124bae2b5",
-    PublishedTopic.DIAGNOSTICS: "5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e",
-}
+if TYPE_CHECKING:
+    from rosbags.typesys.store import Typestore
 
 
 def type_hash(topic: PublishedTopic) -> bytes:
@@ -68,63 +35,59 @@ def type_hash(topic: PublishedTopic) -> bytes:
 
     Subscribers match without it, but warn (ROS REP-2016).
     """
-    kind = PublishedTopic.POSTURE if topic is PublishedTopic.FILTERED else topic
-    return f"typehash=RIHS01_{_HASHES[kind]};".encode()
+    from rosbags.typesys import Stores, get_typestore
+
+    return f"typehash={get_typestore(Stores.ROS2_JAZZY).hash_rihs01(TYPE_NAMES[topic])};".encode()
 
 
 @functools.cache
 def dds_types(distro: str) -> Ros2Types:
-    """Return the types as a release of ROS 2 has them.
+    """Return the types as a release of ROS 2 has them: published ones of DDS, parts of rosbags.
 
-    Raises `OptionError` if cyclonedds is not installed.
+    Raises `OptionError` if cyclonedds or rosbags is not installed.
     """
     try:
         from cyclonedds.idl import make_idl_struct
+        from rosbags.interfaces import Nodetype
+        from rosbags.typesys import Stores, get_typestore
     except ImportError as fault:
         raise OptionError(
-            "ROS 2 by DDS needs Cyclone DDS; install it with: pip install 'aqualvs[dds]'"
+            "ROS 2 by DDS needs Cyclone DDS and rosbags; "
+            "install them with: pip install 'aqualvs[dds]'"
         ) from fault
     with_variance = range_has_variance(distro)
-    classes: dict[str, Any] = {}
-    for name, text in _DEFINITIONS.items():
-        package, kind, short = name.split("/")
-        members = dict(_member(part, classes) for part in text.split(", "))
-        if not with_variance:
-            members.pop("variance", None)
-        classes[name] = make_idl_struct(f"{short}_", f"{package}.{kind}.dds_.{short}_", members)
-    classes[TYPE_NAMES[PublishedTopic.CLOUD]].serialize = _serialize_cloud
-    return Ros2Types(classes=classes, range_has_variance=with_variance, octet=int, octets=bytes)
-
-
-def _member(text: str, classes: Mapping[str, Any]) -> tuple[str, Any]:
-    """Return name and type of a member such as `float64[36] covariance`."""
+    store = get_typestore(Stores.ROS2_JAZZY if with_variance else Stores.ROS2_HUMBLE)
     types: Any = importlib.import_module("cyclonedds.idl.types")
-    kind, name = text.split(" ")
-    kind, bracket, length = kind.rstrip("]").partition("[")
-    plain = {"string": str, "bool": bool}
-    single = classes.get(kind) or plain.get(kind) or getattr(types, kind)
-    if not bracket:
-        return name, single
-    return name, types.array[single, int(length)] if length else types.sequence[single]
+    plain = {"string": str, "bool": bool, "byte": types.uint8}
+
+    @functools.cache
+    def struct(name: str) -> Any:
+        package, kind, short = name.split("/")
+        members = {field: member(*node) for field, node in store.fielddefs[name][1]}
+        return make_idl_struct(f"{short}_", f"{package}.{kind}.dds_.{short}_", members)
+
+    def member(kind: Nodetype, what: Any) -> Any:
+        if kind is Nodetype.NAME:
+            return struct(what)
+        if kind is Nodetype.BASE:
+            return plain.get(what[0]) or getattr(types, what[0])
+        one, length = member(*what[0]), what[1]
+        return types.array[one, length] if kind is Nodetype.ARRAY else types.sequence[one]
+
+    published = {name: struct(name) for name in TYPE_NAMES.values()}
+    for name, made in published.items():
+        made.serialize = _serializer(store, name)
+    return Ros2Types(
+        classes={**store.types, **published},
+        range_has_variance=with_variance,
+        octet=int,
+        octets=functools.partial(np.frombuffer, dtype=np.uint8),
+    )
 
 
-def _serialize_cloud(
-    cloud: Any, buffer: Any = None, endianness: Any = None, use_version_2: bool | None = None
-) -> bytes:
-    """Serialise a cloud without packing `data` number by number, which takes milliseconds.
-
-    `data` is the last member but one, and one octet follows: the rest is serialised without data,
-    and the data put in where its length, nought, stands.
-    """
-    data, cloud.data = cloud.data, b""
-    try:
-        rest = cloud.__idl__.serialize(
-            cloud, buffer=buffer, endianness=endianness, use_version_2=use_version_2
-        )
-    finally:
-        cloud.data = data
-    length = struct.pack("<I" if rest[1] & 1 else ">I", len(data))
-    return b"".join((rest[:-5], length, data, rest[-1:]))
+def _serializer(store: "Typestore", name: str) -> Callable[..., bytes]:
+    """Return a method in place of Cyclone DDS's own, which packs clouds number by number."""
+    return lambda message, **_: bytes(store.serialize_cdr(message, name))
 
 
 # Longest time that a slow reader blocks a reliable writer.
@@ -177,7 +140,7 @@ class DdsOutput:
     Raises
     ------
     OptionError
-        If cyclonedds is not installed, or the domain is none.
+        If cyclonedds or rosbags is not installed, or the domain is none.
     """
 
     name = "ros2"
