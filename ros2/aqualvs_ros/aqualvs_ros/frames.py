@@ -18,8 +18,7 @@ import numpy as np
 from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.transforms import quaternion_from_rotation
-from aqualvs.live.outputs.ros2_messages import Ros2Types
-from aqualvs.live.outputs.ros_messages import FLU_FROM_DOME, flu_from_dome, plane_pose
+from aqualvs.live.outputs.ros_messages import FLU_FROM_DOME, RosTypes, flu_from_dome, plane_pose
 from aqualvs.optics.rig import Rig
 from aqualvs.scanning.posture import Posture
 
@@ -85,9 +84,8 @@ def target_transform(posture: Posture, names: FrameNames) -> FrameTransform:
     return FrameTransform(names.dome, names.target, pose.position, pose.quaternion.tolist())
 
 
-def tf_message(types: Ros2Types, stamp_ns: int, transforms: Sequence[FrameTransform]) -> Any:
+def tf_message(types: RosTypes, stamp_ns: int, transforms: Sequence[FrameTransform]) -> Any:
     """Return transforms as `tf2_msgs/TFMessage`."""
-    sec, nanosec = divmod(stamp_ns, 10**9)
 
     def stamped(one: FrameTransform) -> Any:
         make = types.make
@@ -95,11 +93,7 @@ def tf_message(types: Ros2Types, stamp_ns: int, transforms: Sequence[FrameTransf
         qx, qy, qz, qw = one.quaternion
         return make(
             "geometry_msgs/msg/TransformStamped",
-            header=make(
-                "std_msgs/msg/Header",
-                stamp=make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec),
-                frame_id=one.parent,
-            ),
+            header=types.header(stamp_ns, one.parent),
             child_frame_id=one.child,
             transform=make(
                 "geometry_msgs/msg/Transform",

@@ -4,8 +4,13 @@ import array
 import importlib
 from typing import Any
 
-from aqualvs.live.outputs.ros2_messages import TYPE_NAMES, Ros2Types, to_ros2
-from aqualvs.live.outputs.ros_messages import MessageMaker, PublishedTopic, RosOptions
+from aqualvs.live.outputs.ros_messages import (
+    TYPE_NAMES,
+    MessageMaker,
+    PublishedTopic,
+    RosOptions,
+    RosTypes,
+)
 from aqualvs.recording.sample import LiveSample
 from aqualvs.scanning.posture import Posture
 from aqualvs.sources.base import PartHealth, State
@@ -52,13 +57,13 @@ class RclpyOutput:
         self, node: Any, options: RosOptions | None = None, stamp_of: StampOf | None = None
     ) -> None:
         self._stamp_of = stamp_of
-        self._maker = MessageMaker(options or RosOptions())
-        self._types = installed_types()
+        types = installed_types()
+        self._maker = MessageMaker(options or RosOptions(), types)
         self._node, self._closed = node, False
         reliable = options is None or options.reliable
         self._publishers = {
             topic: node.create_publisher(
-                self._types.classes[TYPE_NAMES[topic]],
+                types.classes[TYPE_NAMES[topic]],
                 "/diagnostics" if topic is PublishedTopic.DIAGNOSTICS else f"~/{topic}",
                 quality(reliable or topic is PublishedTopic.DIAGNOSTICS),
             )
@@ -73,7 +78,7 @@ class RclpyOutput:
         sample, publishers = stamped(sample, self._stamp_of), self._publishers
         wanted = {topic for topic, one in publishers.items() if one.get_subscription_count()}
         for topic, message in self._maker.messages(sample, wanted):
-            publishers[topic].publish(to_ros2(self._types, message))
+            publishers[topic].publish(message)
         self._n_topics = len(wanted)
 
     def health(self) -> PartHealth:
@@ -142,19 +147,19 @@ class FramesOutput:
             self._node.destroy_publisher(self._moving)
 
 
-def installed_types() -> Ros2Types:
+def installed_types() -> RosTypes:
     """Return the message classes of the ROS 2 that is installed."""
     classes = {}
     for name in {*_PARTS, *TYPE_NAMES.values()}:
         package, _, short = name.split("/")
         classes[name] = getattr(importlib.import_module(f"{package}.msg"), short)
     fields = classes[TYPE_NAMES[PublishedTopic.RANGE]].get_fields_and_field_types()
-    return Ros2Types(
+    return RosTypes(
         classes=classes,
         range_has_variance="variance" in fields,
         octet=lambda value: bytes((value,)),
         # Of anything but an array each value would be looked at.
-        octets=lambda data: array.array("B", data),
+        octets=lambda data: array.array("B", data.tobytes()),
     )
 
 

@@ -18,8 +18,7 @@ from aqualvs.live.outputs.dds import (
     stays_on_this_machine,
     type_hash,
 )
-from aqualvs.live.outputs.ros2_messages import TYPE_NAMES
-from aqualvs.live.outputs.ros_messages import PublishedTopic, RosOptions, plane_pose
+from aqualvs.live.outputs.ros_messages import TYPE_NAMES, PublishedTopic, RosOptions, plane_pose
 from aqualvs.recording.sample import LiveSample
 from aqualvs.scanning.posture import Reason, Refusal
 from aqualvs.sources.base import State

@@ -1,4 +1,4 @@
-"""What ROS is told, and the bytes it takes."""
+"""What ROS is told, in the message classes of rosbags, and the bytes it takes."""
 
 import dataclasses
 import functools
@@ -14,17 +14,17 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from aqualvs.control.time_filter import FilteredPosture
 from aqualvs.errors import OptionError
-from aqualvs.live.outputs.dds import dds_types, type_hash
+from aqualvs.live.outputs.dds import dds_types, range_has_variance, type_hash
 from aqualvs.live.outputs.ros1 import ros1_store, ros1_type, ros1_types
-from aqualvs.live.outputs.ros2_messages import TYPE_NAMES, range_has_variance, to_ros2
 from aqualvs.live.outputs.ros_messages import (
     FLU_FROM_DOME,
-    POINT_FIELDS,
     POINT_TYPE,
+    TYPE_NAMES,
     Level,
     MessageMaker,
     PublishedTopic,
     RosOptions,
+    RosTypes,
     plane_pose,
 )
 from aqualvs.recording.sample import LiveSample
@@ -37,7 +37,7 @@ from live_cases import demo_samples
 STORES = {
     store.value.removeprefix("ros2_"): store for store in Stores if store.value.startswith("ros2_")
 }
-# As Noetic's roscore and subscribers know the types.
+# As roscore and subscribers of Noetic, and those of ROS 2 since Iron know the types.
 MD5_SUMS = {
     PublishedTopic.POSTURE: "953b798c0f514ff060a53a3498ce6246",
     PublishedTopic.FILTERED: "953b798c0f514ff060a53a3498ce6246",
@@ -45,8 +45,6 @@ MD5_SUMS = {
     PublishedTopic.CLOUD: "1158d486dd51d683ce2f1be655c3c181",
     PublishedTopic.DIAGNOSTICS: "60810da900de1dd6ddd437c3503511da",
 }
-
-# As subscribers of ROS 2 know the types since Iron.
 HASHES = {
     PublishedTopic.POSTURE: "26432f9803e43727d3c8f668d1fdb3c630f548af631e2f4e31382371bfea3b6e",
     PublishedTopic.FILTERED: "26432f9803e43727d3c8f668d1fdb3c630f548af631e2f4e31382371bfea3b6e",
@@ -76,8 +74,17 @@ def shifted(found: LiveSample, forward: float) -> LiveSample:
     return replace(found, scan=scan)
 
 
-def told(found: LiveSample, options: RosOptions | None = None) -> dict[PublishedTopic, Any]:
-    return dict(MessageMaker(options or RosOptions()).messages(found, set(PublishedTopic)))
+@functools.cache
+def types() -> RosTypes:
+    classes = get_typestore(Stores.ROS2_JAZZY).types
+    return RosTypes(classes=classes, range_has_variance=True)
+
+
+def told(
+    found: LiveSample, options: RosOptions | None = None, kinds: RosTypes | None = None
+) -> dict[PublishedTopic, Any]:
+    maker = MessageMaker(options or RosOptions(), kinds or types())
+    return dict(maker.messages(found, set(PublishedTopic)))
 
 
 def smooth_sample() -> LiveSample:
@@ -90,11 +97,10 @@ def smooth_sample() -> LiveSample:
 
 @pytest.mark.parametrize("distro", ["humble", "jazzy"])
 def test_cyclone_dds_reads_the_messages(distro: str) -> None:
-    types = dds_types(distro)
     for found in (smooth_sample(), refused(Reason.NO_STRIPES), shifted(sample(), math.nan)):
-        for topic, message in told(found).items():
-            data = to_ros2(types, message).serialize(use_version_2=False)
-            kind = types.classes[TYPE_NAMES[topic]]
+        for topic, message in told(found, kinds=dds_types(distro)).items():
+            data = message.serialize(use_version_2=False)
+            kind = type(message)
             # Its own serialiser, which takes numbers one by one.
             again = kind.__idl__.serialize(kind.deserialize(data), use_version_2=False)
             assert again == data, topic
@@ -102,12 +108,11 @@ def test_cyclone_dds_reads_the_messages(distro: str) -> None:
 
 def test_bytes_of_ros1() -> None:
     store = ros1_store()
-    found = told(sample())[PublishedTopic.RANGE]
-    message = to_ros2(ros1_types(store), found)
+    message = told(sample(), kinds=ros1_types(store))[PublishedTopic.RANGE]
     message.header.seq = 7
     frame = b"aqualvs_dome"
     head = struct.pack("<4I", 7, *divmod(sample().utc_ns, 10**9), len(frame)) + frame
-    ranges = found.field_of_view, found.min_range, found.max_range, found.range
+    ranges = message.field_of_view, message.min_range, message.max_range, message.range
     data = store.serialize_ros1(message, TYPE_NAMES[PublishedTopic.RANGE])
     assert bytes(data) == head + struct.pack("<B4f", 1, *ranges)
 
@@ -139,24 +144,31 @@ def test_releases_differ_in_the_variance_of_range_only(distro: str) -> None:
             assert store.hash_rihs01(name) == f"RIHS01_{HASHES[topic]}"
 
 
+def numbers(part: Any, names: str = "xyz") -> list[float]:
+    return [getattr(part, name) for name in names]
+
+
 def test_posture_is_told_as_pose() -> None:
     found = sample()
     posture = found.scan.posture
     assert posture
     pose = told(found)[PublishedTopic.POSTURE]
     expected = plane_pose(posture.range, posture.pitch, posture.yaw, posture.total_covariance)
-    assert pose.stamp_ns == found.utc_ns
-    assert pose.frame_id == "aqualvs_dome"
+    stamp = pose.header.stamp
+    assert stamp.sec * 10**9 + stamp.nanosec == found.utc_ns
+    assert pose.header.frame_id == "aqualvs_dome"
     np.testing.assert_allclose(
-        pose.position, posture.range * FLU_FROM_DOME @ posture.normal_in_dome, atol=1e-12
+        numbers(pose.pose.pose.position),
+        posture.range * FLU_FROM_DOME @ posture.normal_in_dome,
+        atol=1e-12,
     )
-    assert pose.quaternion.tolist() == expected.quaternion.tolist()
-    assert pose.covariance.tolist() == expected.covariance.ravel().tolist()
+    assert numbers(pose.pose.pose.orientation, "xyzw") == expected.quaternion.tolist()
+    assert pose.pose.covariance.tolist() == expected.covariance.ravel().tolist()
 
 
 def test_filtered_posture_has_its_own_topic() -> None:
-    pose = told(smooth_sample())[PublishedTopic.FILTERED]
-    assert pose.position.tolist() == pytest.approx([0.8, 0.0, 0.0])
+    pose = told(smooth_sample())[PublishedTopic.FILTERED].pose
+    assert numbers(pose.pose.position) == pytest.approx([0.8, 0.0, 0.0])
     assert pose.covariance.reshape(6, 6)[5, 5] == pytest.approx(4e-4)
     assert PublishedTopic.FILTERED not in told(sample())
 
@@ -175,14 +187,19 @@ def test_cloud_holds_every_point() -> None:
 
 
 def test_fields_describe_the_points() -> None:
+    cloud = told(sample())[PublishedTopic.CLOUD]
     datatypes = {1: np.int8, 2: np.uint8, 7: np.float32}
     layout = {
-        "names": [field.name for field in POINT_FIELDS],
-        "formats": [datatypes[field.datatype] for field in POINT_FIELDS],
-        "offsets": [field.offset for field in POINT_FIELDS],
-        "itemsize": 24,
+        "names": [field.name for field in cloud.fields],
+        "formats": [datatypes[field.datatype] for field in cloud.fields],
+        "offsets": [field.offset for field in cloud.fields],
+        "itemsize": cloud.point_step,
     }
     assert np.dtype(layout) == POINT_TYPE
+    assert {field.count for field in cloud.fields} == {1}
+    assert cloud.point_step == 24
+    assert cloud.row_step == len(cloud.data) == 24 * cloud.width
+    assert (cloud.height, cloud.is_bigendian) == (1, False)
 
 
 def test_cloud_says_that_a_point_is_missing() -> None:
@@ -193,7 +210,7 @@ def test_no_points() -> None:
     found = sample()
     empty = replace(found, scan=replace(found.scan, points=ScanPoints.none()))
     cloud = told(empty)[PublishedTopic.CLOUD]
-    assert (cloud.width, cloud.data, cloud.is_dense) == (0, b"", True)
+    assert (cloud.width, len(cloud.data), cloud.is_dense) == (0, 0, True)
 
 
 def test_range() -> None:
@@ -243,14 +260,14 @@ def test_out_of_range_without_points_is_unknown() -> None:
 
 
 def test_only_what_is_wanted_is_made() -> None:
-    maker = MessageMaker(RosOptions())
+    maker = MessageMaker(RosOptions(), types())
     assert [topic for topic, _ in maker.messages(sample(), {PublishedTopic.RANGE})] == [
         PublishedTopic.RANGE
     ]
 
 
 def test_diagnostics_come_once_a_second() -> None:
-    maker, found = MessageMaker(RosOptions()), sample()
+    maker, found = MessageMaker(RosOptions(), types()), sample()
     count: Counter[PublishedTopic] = Counter()
     for i in range(101):
         at = replace(found.instants, scanned_ns=40_000_000 * i)
@@ -259,6 +276,10 @@ def test_diagnostics_come_once_a_second() -> None:
         count.update(topic for topic, _ in maker.messages(jumping, set(PublishedTopic)))
     assert count[PublishedTopic.RANGE] == 101
     assert count[PublishedTopic.DIAGNOSTICS] == 5
+
+
+def figures(status: Any) -> dict[str, str]:
+    return {pair.key: pair.value for pair in status.values}
 
 
 def test_diagnostics() -> None:
@@ -276,7 +297,7 @@ def test_diagnostics() -> None:
         n_water=1.339,
     )
     found = told(replace(sample(), health=health))[PublishedTopic.DIAGNOSTICS]
-    by_name = {status.name: status for status in found.statuses}
+    by_name = {status.name: status for status in found.status}
     assert list(by_name) == [
         "aqualvs: posture",
         "aqualvs: pipeline",
@@ -285,24 +306,24 @@ def test_diagnostics() -> None:
         "aqualvs: laser right",
         "aqualvs: output mavlink",
     ]
-    assert {status.hardware_id for status in found.statuses} == {sample().rig.name}
+    assert {status.hardware_id for status in found.status} == {sample().rig.name}
     pipeline = by_name["aqualvs: pipeline"]
     assert pipeline.message == "24.9 frames/s, 97% with a posture"
-    values = dict(pipeline.values)
+    values = figures(pipeline)
     assert values["rate_hz"] == "24.9"
     assert values["n_dropped"] == "3"
     assert values["n_water"] == "1.339"
     assert values["sigma_n_water"] == "nan"
     assert values["total_median_ms"] == "3.1"
     assert values["total_p99_ms"] == "7.2"
-    assert by_name["aqualvs: source"].level is Level.WARN
-    assert dict(by_name["aqualvs: source"].values)["n_dropped"] == "4"
+    assert by_name["aqualvs: source"].level == Level.WARN
+    assert figures(by_name["aqualvs: source"])["n_dropped"] == "4"
     assert by_name["aqualvs: laser right"].message == "not in use: not seen yet"
-    assert by_name["aqualvs: laser right"].level is Level.OK
-    assert by_name["aqualvs: output mavlink"].level is Level.ERROR
+    assert by_name["aqualvs: laser right"].level == Level.OK
+    assert by_name["aqualvs: output mavlink"].level == Level.ERROR
     posture = by_name["aqualvs: posture"]
-    assert posture.level is Level.OK
-    assert float(dict(posture.values)["range_m"]) == pytest.approx(
+    assert posture.level == Level.OK
+    assert float(figures(posture)["range_m"]) == pytest.approx(
         sample().scan.posture.range,  # type: ignore[union-attr]
         rel=1e-5,
     )
@@ -310,7 +331,7 @@ def test_diagnostics() -> None:
 
 def test_diagnostics_without_posture() -> None:
     found = replace(refused(Reason.NO_STRIPES), health=Health())
-    posture, pipeline, *_ = told(found)[PublishedTopic.DIAGNOSTICS].statuses
+    posture, pipeline, *_ = told(found)[PublishedTopic.DIAGNOSTICS].status
     assert (posture.level, posture.message) == (Level.WARN, "no_stripes: because")
     assert (pipeline.level, pipeline.message) == (Level.WARN, "0.0 frames/s")
 
@@ -319,7 +340,7 @@ def test_names() -> None:
     options = RosOptions(namespace="rov1/aqualvs", frame_id="rov1/dome")
     assert options.topic_name(PublishedTopic.CLOUD) == "/rov1/aqualvs/cloud"
     assert options.topic_name(PublishedTopic.DIAGNOSTICS) == "/diagnostics"
-    assert told(sample(), options)[PublishedTopic.RANGE].frame_id == "rov1/dome"
+    assert told(sample(), options)[PublishedTopic.RANGE].header.frame_id == "rov1/dome"
 
 
 @pytest.mark.parametrize(

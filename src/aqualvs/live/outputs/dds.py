@@ -12,22 +12,34 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from aqualvs.errors import OptionError
-from aqualvs.live.outputs.ros2_messages import (
+from aqualvs.live.outputs.ros_messages import (
     TYPE_NAMES,
-    Ros2Types,
-    distro_of_this_machine,
-    range_has_variance,
-    to_ros2,
+    MessageMaker,
+    PublishedTopic,
+    RosOptions,
+    RosTypes,
 )
-from aqualvs.live.outputs.ros_messages import MessageMaker, PublishedTopic, RosOptions
 from aqualvs.recording.sample import LiveSample
 from aqualvs.sources.base import PartHealth, State
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
+
+DEFAULT_DISTRO = "jazzy"
+_BEFORE_IRON = frozenset(
+    {"ardent", "bouncy", "crystal", "dashing", "eloquent", "foxy", "galactic", "humble"}
+)
+
+
+def distro_of_this_machine() -> str:
+    """Return the release of ROS 2 that the environment names, or the default."""
+    return os.environ.get("ROS_DISTRO", "") or DEFAULT_DISTRO
+
+
+def range_has_variance(distro: str) -> bool:
+    """Return whether a release of ROS 2 has `Range.variance`, as all since Iron have."""
+    return distro.lower() not in _BEFORE_IRON
 
 
 def type_hash(topic: PublishedTopic) -> bytes:
@@ -41,7 +53,7 @@ def type_hash(topic: PublishedTopic) -> bytes:
 
 
 @functools.cache
-def dds_types(distro: str) -> Ros2Types:
+def dds_types(distro: str) -> RosTypes:
     """Return the types as a release of ROS 2 has them: published ones of DDS, parts of rosbags.
 
     Raises `OptionError` if cyclonedds or rosbags is not installed.
@@ -77,12 +89,7 @@ def dds_types(distro: str) -> Ros2Types:
     published = {name: struct(name) for name in TYPE_NAMES.values()}
     for name, made in published.items():
         made.serialize = _serializer(store, name)
-    return Ros2Types(
-        classes={**store.types, **published},
-        range_has_variance=with_variance,
-        octet=int,
-        octets=functools.partial(np.frombuffer, dtype=np.uint8),
-    )
+    return RosTypes(classes={**store.types, **published}, range_has_variance=with_variance)
 
 
 def _serializer(store: "Typestore", name: str) -> Callable[..., bytes]:
@@ -159,7 +166,7 @@ class DdsOutput:
         if not 0 <= self._domain_id <= _MAX_DOMAIN:
             raise OptionError(f"ROS domain {self._domain_id}: must be 0 to {_MAX_DOMAIN}")
         self._types = dds_types(distro or distro_of_this_machine())
-        self._maker = MessageMaker(self._options)
+        self._maker = MessageMaker(self._options, self._types)
         self._link: _Link | None = None
         self._closed = False
         self._wait_s, self._retry_s = _FIRST_WAIT_S, 0.0
@@ -182,7 +189,7 @@ class DdsOutput:
                 return
             wanted = link.wanted()
             for topic, message in self._maker.messages(sample, wanted):
-                self._write(link.writers[topic], to_ros2(self._types, message))
+                self._write(link.writers[topic], message)
         except DDSException as fault:
             self._give_up(fault)
         else:
@@ -262,7 +269,7 @@ def stays_on_this_machine(environment: Mapping[str, str] = os.environ) -> bool:
     return local and not environment.get("CYCLONEDDS_URI")
 
 
-def _join(domain_id: int, options: RosOptions, types: Ros2Types) -> _Link:
+def _join(domain_id: int, options: RosOptions, types: RosTypes) -> _Link:
     """Enter the domain and offer all topics."""
     from cyclonedds.domain import DomainParticipant
     from cyclonedds.pub import DataWriter
@@ -292,7 +299,7 @@ def _domain(domain_id: int) -> Any:
         raise
 
 
-def _quality(topic: PublishedTopic, options: RosOptions, types: Ros2Types) -> Any:
+def _quality(topic: PublishedTopic, options: RosOptions, types: RosTypes) -> Any:
     depth = 5
     from cyclonedds.qos import Policy, Qos
 

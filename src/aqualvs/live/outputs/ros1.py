@@ -21,12 +21,15 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
-import numpy as np
-
 from aqualvs.errors import OptionError
 from aqualvs.live.outputs.ros1_links import Ros1Links, Ros1Type
-from aqualvs.live.outputs.ros2_messages import TYPE_NAMES, Ros2Types, to_ros2
-from aqualvs.live.outputs.ros_messages import MessageMaker, PublishedTopic, RosOptions
+from aqualvs.live.outputs.ros_messages import (
+    TYPE_NAMES,
+    MessageMaker,
+    PublishedTopic,
+    RosOptions,
+    RosTypes,
+)
 from aqualvs.recording.sample import LiveSample
 from aqualvs.sources.base import PartHealth, State
 
@@ -327,8 +330,7 @@ class Ros1Output:
         self._names = {topic: options.topic_name(topic) for topic in PublishedTopic}
         self._topics = {name: topic for topic, name in self._names.items()}
         self._store = ros1_store()
-        self._types = ros1_types(self._store)
-        self._maker = MessageMaker(options)
+        self._maker = MessageMaker(options, ros1_types(self._store))
         self._n_sent: Counter[PublishedTopic] = Counter()
         self._closed = False
         types = {name: ros1_type(self._store, topic) for topic, name in self._names.items()}
@@ -343,9 +345,8 @@ class Ros1Output:
         """Hand a sample's messages to the subscribers that are connected; returns at once."""
         wanted = {self._topics[name] for name in self._node.links.listeners()}
         for topic, message in self._maker.messages(sample, wanted):
-            made = to_ros2(self._types, message)
-            made.header.seq = self._n_sent[topic] % 2**32
-            body = self._store.serialize_ros1(made, TYPE_NAMES[topic])
+            message.header.seq = self._n_sent[topic] % 2**32
+            body = self._store.serialize_ros1(message, TYPE_NAMES[topic])
             self._node.links.publish(self._names[topic], body)
             self._n_sent[topic] += 1
 
@@ -382,14 +383,11 @@ def ros1_store() -> "Typestore":
     return get_typestore(Stores.ROS1_NOETIC)
 
 
-def ros1_types(store: "Typestore") -> Ros2Types:
+def ros1_types(store: "Typestore") -> RosTypes:
     """Return the message classes; headers get the number of their message when it is sent."""
     header = functools.partial(store.types["std_msgs/msg/Header"], seq=0)
-    return Ros2Types(
-        classes={**store.types, "std_msgs/msg/Header": header},
-        range_has_variance=False,
-        octet=int,
-        octets=functools.partial(np.frombuffer, dtype=np.uint8),
+    return RosTypes(
+        classes={**store.types, "std_msgs/msg/Header": header}, range_has_variance=False
     )
 
 

@@ -1,4 +1,4 @@
-"""ROS messages before encoding for ROS 1, ROS 2 or DDS: pose, range, cloud and diagnostics.
+"""ROS messages: pose, range, cloud and diagnostics, in the classes of rclpy, rosbags or DDS.
 
 Vectors of the dome are converted to the axes of ROS and MAVLink, all at the dome's centre:
 
@@ -16,10 +16,10 @@ diagnostics, one status with figures for each part of the run.
 
 import math
 import re
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from enum import IntEnum, StrEnum
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -29,7 +29,7 @@ from aqualvs.geometry.arrays import FloatArray, as_vectors
 from aqualvs.optics.rig import Rig
 from aqualvs.recording.sample import LiveSample
 from aqualvs.scanning.posture import Posture, Reason, deviations
-from aqualvs.scanning.scan import Label, ScanPoints
+from aqualvs.scanning.scan import Label
 from aqualvs.sources.base import Health, PartHealth, State
 
 FLU_FROM_DOME: FloatArray = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -132,163 +132,19 @@ def _quaternion(pitch: float, yaw: float) -> FloatArray:
     return np.array([-sy * sp, cy * sp, sy * cp, cy * cp])
 
 
-_PREFIX = "aqualvs: "
-
-
-class Level(IntEnum):
-    """As in diagnostic_msgs/DiagnosticStatus."""
-
-    OK = 0
-    WARN = 1
-    ERROR = 2
-
-
-_LEVELS = {State.OK: Level.OK, State.WARN: Level.WARN, State.FAULT: Level.ERROR}
-
-
-@dataclass(frozen=True, slots=True)
-class DiagnosticStatus:
-    """As diagnostic_msgs/DiagnosticStatus; `values` are pairs of key and value."""
-
-    level: Level
-    name: str
-    message: str
-    hardware_id: str
-    values: tuple[tuple[str, str], ...] = ()
-
-
-@dataclass(frozen=True, slots=True)
-class DiagnosticsMessage:
-    """As diagnostic_msgs/DiagnosticArray; its header names no frame."""
-
-    stamp_ns: int
-    statuses: tuple[DiagnosticStatus, ...]
-
-
-def diagnostics_message(sample: LiveSample) -> DiagnosticsMessage:
-    """Return how the run is: posture, pipeline, source, lasers, outputs."""
-    health, rig = sample.health, sample.rig.name
-    parts = [
-        ("source", health.source),
-        *((f"laser {part.name}", part) for part in health.lasers),
-        *((f"output {part.name}", part) for part in health.outputs),
-    ]
-    return DiagnosticsMessage(
-        sample.utc_ns,
-        (
-            _posture_status(sample),
-            _pipeline_status(health, rig),
-            *(_part_status(name, part, rig) for name, part in parts),
-        ),
-    )
-
-
-def _posture_status(sample: LiveSample) -> DiagnosticStatus:
-    name, rig, posture = f"{_PREFIX}posture", sample.rig.name, sample.scan.posture
-    if not posture:
-        told = f"{posture.reason}: {posture.detail}" if posture.detail else str(posture.reason)
-        return DiagnosticStatus(Level.WARN, name, told, rig, (("reason", str(posture.reason)),))
-    pitch, yaw = math.degrees(posture.pitch), math.degrees(posture.yaw)
-    frame, whole = deviations(posture.covariance), deviations(posture.total_covariance)
-    return DiagnosticStatus(
-        Level.OK,
-        name,
-        f"{posture.range:.3f} m, pitch {pitch:+.1f} deg, yaw {yaw:+.1f} deg",
-        rig,
-        _texts(
-            range_m=posture.range,
-            pitch_deg=pitch,
-            yaw_deg=yaw,
-            sigma_range_m=frame[0],
-            sigma_pitch_deg=frame[1],
-            sigma_yaw_deg=frame[2],
-            sigma_range_total_m=whole[0],
-            sigma_pitch_total_deg=whole[1],
-            sigma_yaw_total_deg=whole[2],
-            slant_range_m=posture.slant_range,
-            nearest_m=posture.nearest,
-            n_points=posture.n_points,
-        ),
-    )
-
-
-def _pipeline_status(health: Health, rig: str) -> DiagnosticStatus:
-    share = "" if math.isnan(health.valid_share) else f", {health.valid_share:.0%} with a posture"
-    delays = {
-        f"{stage.name}_{which}_ms": 1e3 * delay_s
-        for stage in health.delays
-        for which, delay_s in (("median", stage.median_s), ("p99", stage.p99_s))
-    }
-    return DiagnosticStatus(
-        Level.OK if health.rate_hz > 0.0 else Level.WARN,
-        f"{_PREFIX}pipeline",
-        f"{health.rate_hz:.1f} frames/s{share}",
-        rig,
-        _texts(
-            rate_hz=health.rate_hz,
-            valid_share=health.valid_share,
-            n_frames=health.n_frames,
-            n_dropped=health.n_dropped,
-            n_lost=health.n_lost,
-            quality=health.quality,
-            n_water=health.n_water,
-            sigma_n_water=health.sigma_n_water,
-            **delays,
-        ),
-    )
-
-
-def _part_status(name: str, part: PartHealth, rig: str) -> DiagnosticStatus:
-    idle = part.state is State.OFF
-    return DiagnosticStatus(
-        Level.OK if idle else _LEVELS[part.state],
-        f"{_PREFIX}{name}",
-        (f"not in use: {part.detail}" if part.detail else "not in use") if idle else part.detail,
-        rig,
-        (("state", str(part.state)), ("n_dropped", str(part.n_dropped))),
-    )
-
-
-def _texts(**figures: float) -> tuple[tuple[str, str], ...]:
-    return tuple((key, f"{value:.6g}") for key, value in figures.items())
-
-
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
 
 
-@dataclass(frozen=True, slots=True)
-class PointField:
-    """As sensor_msgs/PointField, one value in each; `format` is NumPy's name of `datatype`."""
-
-    name: str
-    offset: int
-    datatype: int
-    format: str
-
-
-_INT8, _UINT8, _FLOAT32 = 1, 2, 7
-
-POINT_FIELDS = (
-    PointField("x", 0, _FLOAT32, "<f4"),
-    PointField("y", 4, _FLOAT32, "<f4"),
-    PointField("z", 8, _FLOAT32, "<f4"),
-    PointField("intensity", 12, _FLOAT32, "<f4"),
-    PointField("sigma", 16, _FLOAT32, "<f4"),
-    PointField("laser", 20, _INT8, "i1"),
-    PointField("label", 21, _UINT8, "u1"),
-    PointField("used", 22, _UINT8, "u1"),
-)
-"""Fields of a point of the cloud: metres, grey levels, indices, `Label` and 0 or 1."""
-
 POINT_TYPE = np.dtype(
-    {
-        "names": [field.name for field in POINT_FIELDS],
-        "formats": [field.format for field in POINT_FIELDS],
-        "offsets": [field.offset for field in POINT_FIELDS],
-        "itemsize": 24,
-    }
+    [
+        *((name, "<f4") for name in ("x", "y", "z", "intensity", "sigma")),
+        ("laser", "i1"),
+        ("label", "u1"),
+        ("used", "u1"),
+    ],
+    align=True,
 )
-"""One point of the cloud as it lies in `CloudMessage.data`."""
+"""One point of the cloud, 24 bytes: metres, grey levels, indices, `Label` and 0 or 1."""
 
 
 class PublishedTopic(StrEnum):
@@ -299,6 +155,38 @@ class PublishedTopic(StrEnum):
     RANGE = "range"
     CLOUD = "cloud"
     DIAGNOSTICS = "diagnostics"
+
+
+TYPE_NAMES = {
+    PublishedTopic.POSTURE: "geometry_msgs/msg/PoseWithCovarianceStamped",
+    PublishedTopic.FILTERED: "geometry_msgs/msg/PoseWithCovarianceStamped",
+    PublishedTopic.RANGE: "sensor_msgs/msg/Range",
+    PublishedTopic.CLOUD: "sensor_msgs/msg/PointCloud2",
+    PublishedTopic.DIAGNOSTICS: "diagnostic_msgs/msg/DiagnosticArray",
+}
+"""Type of each topic."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RosTypes:
+    """Message classes to use; each is called with its fields by name."""
+
+    classes: Mapping[str, Any]  # By name, such as `sensor_msgs/msg/Range`.
+    range_has_variance: bool  # False before ROS 2 Iron.
+    # Makes a value of the type `byte`, which rclpy wants as one byte and others as a number.
+    octet: Callable[[int], Any] = int
+    # Makes a sequence of `uint8` of an array; rclpy copies an `array` without looking at each.
+    octets: Callable[[np.ndarray], Any] = np.asarray
+
+    def make(self, name: str, /, **fields: Any) -> Any:
+        """Return a message."""
+        return self.classes[name](**fields)
+
+    def header(self, stamp_ns: int, frame_id: str) -> Any:
+        """Return a header."""
+        sec, nanosec = divmod(stamp_ns, 10**9)
+        stamp = self.make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
+        return self.make("std_msgs/msg/Header", stamp=stamp, frame_id=frame_id)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -335,88 +223,62 @@ class RosOptions:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class PoseMessage:
-    """As geometry_msgs/PoseWithCovarianceStamped; see `PlanePose`."""
-
-    stamp_ns: int
-    frame_id: str
-    position: FloatArray
-    quaternion: FloatArray
-    covariance: FloatArray
-
-
-@dataclass(frozen=True, slots=True)
-class RangeMessage:
-    """As sensor_msgs/Range: metres, radians; `variance` (m²) exists from ROS 2 Iron on."""
-
-    stamp_ns: int
-    frame_id: str
-    field_of_view: float
-    min_range: float
-    max_range: float
-    range: float
-    variance: float
-
-
-@dataclass(frozen=True, slots=True)
-class CloudMessage:
-    """As sensor_msgs/PointCloud2: `width` points of `POINT_TYPE` in one row."""
-
-    stamp_ns: int
-    frame_id: str
-    width: int
-    data: bytes
-    is_dense: bool
-
-
-Message: TypeAlias = PoseMessage | RangeMessage | CloudMessage | DiagnosticsMessage
-
-
 class MessageMaker:
-    """Converter of samples to messages; diagnostics once per period."""
+    """Converter of samples to messages of some types; diagnostics once per period."""
 
-    def __init__(self, options: RosOptions) -> None:
-        self._options = options
+    def __init__(self, options: RosOptions, types: RosTypes) -> None:
+        self._options, self._types = options, types
         self._rig: Rig | None = None
         self._field_of_view = 0.0
         self._next_diagnostics_ns: int | None = None
 
     def messages(
         self, sample: LiveSample, wanted: Collection[PublishedTopic]
-    ) -> Iterator[tuple[PublishedTopic, Message]]:
+    ) -> Iterator[tuple[PublishedTopic, Any]]:
         """Yield the messages of a sample, on the topics that have subscribers.
 
         Without a posture there is no pose, and the range is not a number.
         """
-        stamp, frame = sample.utc_ns, self._options.frame_id
         posture, filtered = sample.scan.posture, sample.filtered
         if PublishedTopic.POSTURE in wanted and posture:
-            yield (
-                PublishedTopic.POSTURE,
-                _pose_message(
-                    stamp,
-                    frame,
-                    posture.range,
-                    posture.pitch,
-                    posture.yaw,
-                    posture.total_covariance,
-                ),
-            )
+            pose = plane_pose(posture.range, posture.pitch, posture.yaw, posture.total_covariance)
+            yield PublishedTopic.POSTURE, self._pose(sample, pose)
         if PublishedTopic.FILTERED in wanted and filtered is not None:
             cov = filtered.total_covariance
-            yield (
-                PublishedTopic.FILTERED,
-                _pose_message(stamp, frame, filtered.range, filtered.pitch, filtered.yaw, cov),
-            )
+            pose = plane_pose(filtered.range, filtered.pitch, filtered.yaw, cov)
+            yield PublishedTopic.FILTERED, self._pose(sample, pose)
         if PublishedTopic.RANGE in wanted:
-            yield PublishedTopic.RANGE, self._range_message(sample)
+            yield PublishedTopic.RANGE, self._range(sample)
         if PublishedTopic.CLOUD in wanted:
-            yield PublishedTopic.CLOUD, cloud_message(stamp, frame, sample.scan.points)
+            yield PublishedTopic.CLOUD, self._cloud(sample)
         if PublishedTopic.DIAGNOSTICS in wanted and self._diagnostics_are_due(sample):
-            yield PublishedTopic.DIAGNOSTICS, diagnostics_message(sample)
+            yield PublishedTopic.DIAGNOSTICS, _diagnostics(self._types, sample)
 
-    def _range_message(self, sample: LiveSample) -> RangeMessage:
+    def _header(self, sample: LiveSample) -> Any:
+        return self._types.header(sample.utc_ns, self._options.frame_id)
+
+    def _pose(self, sample: LiveSample, pose: PlanePose) -> Any:
+        make = self._types.make
+        x, y, z = pose.position.tolist()
+        qx, qy, qz, qw = pose.quaternion.tolist()
+        place = make(
+            "geometry_msgs/msg/Pose",
+            position=make("geometry_msgs/msg/Point", x=x, y=y, z=z),
+            orientation=make("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw),
+        )
+        return make(
+            TYPE_NAMES[PublishedTopic.POSTURE],
+            header=self._header(sample),
+            pose=make(
+                "geometry_msgs/msg/PoseWithCovariance",
+                pose=place,
+                covariance=pose.covariance.ravel(),
+            ),
+        )
+
+    def _range(self, sample: LiveSample) -> Any:
+        # The message knows sound and light only.
+        infrared = 1
         rig, posture = sample.rig, sample.scan.posture
         if rig is not self._rig:
             self._rig, self._field_of_view = rig, field_of_view(rig)
@@ -425,14 +287,37 @@ class MessageMaker:
         if posture:
             # Ranges that the scanner accepts just outside must not be discarded by the receiver.
             near, far = min(near, value), max(far, value)
-        return RangeMessage(
-            stamp_ns=sample.utc_ns,
-            frame_id=self._options.frame_id,
+        variance = float(posture.total_covariance[0, 0]) if posture else 0.0
+        return self._types.make(
+            TYPE_NAMES[PublishedTopic.RANGE],
+            header=self._header(sample),
+            radiation_type=infrared,
             field_of_view=self._field_of_view,
             min_range=near,
             max_range=far,
             range=value,
-            variance=float(posture.total_covariance[0, 0]) if posture else 0.0,
+            **({"variance": variance} if self._types.range_has_variance else {}),
+        )
+
+    def _cloud(self, sample: LiveSample) -> Any:
+        """Return all stripe points of a frame in one row, in forward, left, up."""
+        types, points = self._types, sample.scan.points
+        packed = np.zeros(len(points), POINT_TYPE)
+        xyz = flu_from_dome(points.points_in_dome)
+        packed["x"], packed["y"], packed["z"] = xyz.T
+        for name in ("intensity", "sigma", "laser", "label", "used"):
+            packed[name] = getattr(points, name)
+        return types.make(
+            TYPE_NAMES[PublishedTopic.CLOUD],
+            header=self._header(sample),
+            height=1,
+            width=len(packed),
+            fields=_point_fields(types),
+            is_bigendian=False,
+            point_step=packed.itemsize,
+            row_step=packed.nbytes,
+            data=types.octets(packed.view(np.uint8)),
+            is_dense=bool(np.isfinite(xyz).all()),
         )
 
     def _diagnostics_are_due(self, sample: LiveSample) -> bool:
@@ -443,15 +328,14 @@ class MessageMaker:
         return True
 
 
-def cloud_message(stamp_ns: int, frame_id: str, points: ScanPoints) -> CloudMessage:
-    """Return all stripe points of a frame, in forward, left, up."""
-    packed = np.zeros(len(points), POINT_TYPE)
-    xyz = flu_from_dome(points.points_in_dome)
-    packed["x"], packed["y"], packed["z"] = xyz.T
-    packed["intensity"], packed["sigma"] = points.intensity, points.sigma
-    packed["laser"], packed["label"], packed["used"] = points.laser, points.label, points.used
-    dense = bool(np.isfinite(xyz).all())
-    return CloudMessage(stamp_ns, frame_id, len(points), packed.tobytes(), dense)
+def _point_fields(types: RosTypes) -> list[Any]:
+    """Return the description of `POINT_TYPE`."""
+    kind: Any = types.classes["sensor_msgs/msg/PointField"]
+    return [
+        # The numbers of the datatypes are constants such as FLOAT32.
+        kind(name=name, offset=offset, datatype=getattr(kind, dtype.name.upper()), count=1)
+        for name, (dtype, offset, *_) in (POINT_TYPE.fields or {}).items()
+    ]
 
 
 def field_of_view(rig: Rig) -> float:
@@ -463,15 +347,6 @@ def field_of_view(rig: Rig) -> float:
         return float(2.0 * np.arctan(0.5 * width / rig.focal_px))
     left, right = rays.directions
     return float(np.arctan2(np.linalg.norm(np.cross(left, right)), left @ right))
-
-
-def _pose_message(
-    stamp_ns: int, frame_id: str, distance: float, pitch: float, yaw: float, cov: FloatArray
-) -> PoseMessage:
-    pose = plane_pose(distance, pitch, yaw, cov)
-    return PoseMessage(
-        stamp_ns, frame_id, pose.position, pose.quaternion, pose.covariance.reshape(36)
-    )
 
 
 def _no_range(sample: LiveSample) -> float:
@@ -489,3 +364,111 @@ def _no_range(sample: LiveSample) -> float:
     near, far = sample.rig.working_range
     ahead = float(np.median(points.points_in_dome[to_target, 1]))
     return float("-inf") if ahead < 0.5 * (near + far) else float("inf")
+
+
+class Level(IntEnum):
+    """As in diagnostic_msgs/DiagnosticStatus."""
+
+    OK = 0
+    WARN = 1
+    ERROR = 2
+
+
+_LEVELS = {
+    State.OK: Level.OK,
+    State.OFF: Level.OK,
+    State.WARN: Level.WARN,
+    State.FAULT: Level.ERROR,
+}
+
+
+def _diagnostics(types: RosTypes, sample: LiveSample) -> Any:
+    """Return how the run is: posture, pipeline, source, lasers, outputs."""
+    health, make = sample.health, types.make
+    parts = [
+        ("posture", _posture_status(sample)),
+        ("pipeline", _pipeline_status(health)),
+        ("source", _part_status(health.source)),
+        *((f"laser {part.name}", _part_status(part)) for part in health.lasers),
+        *((f"output {part.name}", _part_status(part)) for part in health.outputs),
+    ]
+    return make(
+        TYPE_NAMES[PublishedTopic.DIAGNOSTICS],
+        header=types.header(sample.utc_ns, ""),
+        status=[
+            make(
+                "diagnostic_msgs/msg/DiagnosticStatus",
+                level=types.octet(level),
+                name=f"aqualvs: {name}",
+                message=message,
+                hardware_id=sample.rig.name,
+                values=[
+                    make("diagnostic_msgs/msg/KeyValue", key=key, value=value)
+                    for key, value in figures.items()
+                ],
+            )
+            for name, (level, message, figures) in parts
+        ],
+    )
+
+
+_Status: TypeAlias = tuple[Level, str, dict[str, str]]
+"""Level, message and figures."""
+
+
+def _posture_status(sample: LiveSample) -> _Status:
+    posture = sample.scan.posture
+    if not posture:
+        told = f"{posture.reason}: {posture.detail}" if posture.detail else str(posture.reason)
+        return Level.WARN, told, {"reason": str(posture.reason)}
+    pitch, yaw = math.degrees(posture.pitch), math.degrees(posture.yaw)
+    frame, whole = deviations(posture.covariance), deviations(posture.total_covariance)
+    figures = _texts(
+        range_m=posture.range,
+        pitch_deg=pitch,
+        yaw_deg=yaw,
+        sigma_range_m=frame[0],
+        sigma_pitch_deg=frame[1],
+        sigma_yaw_deg=frame[2],
+        sigma_range_total_m=whole[0],
+        sigma_pitch_total_deg=whole[1],
+        sigma_yaw_total_deg=whole[2],
+        slant_range_m=posture.slant_range,
+        nearest_m=posture.nearest,
+        n_points=posture.n_points,
+    )
+    return Level.OK, f"{posture.range:.3f} m, pitch {pitch:+.1f} deg, yaw {yaw:+.1f} deg", figures
+
+
+def _pipeline_status(health: Health) -> _Status:
+    share = "" if math.isnan(health.valid_share) else f", {health.valid_share:.0%} with a posture"
+    delays = {
+        f"{stage.name}_{which}_ms": 1e3 * delay_s
+        for stage in health.delays
+        for which, delay_s in (("median", stage.median_s), ("p99", stage.p99_s))
+    }
+    figures = _texts(
+        rate_hz=health.rate_hz,
+        valid_share=health.valid_share,
+        n_frames=health.n_frames,
+        n_dropped=health.n_dropped,
+        n_lost=health.n_lost,
+        quality=health.quality,
+        n_water=health.n_water,
+        sigma_n_water=health.sigma_n_water,
+        **delays,
+    )
+    level = Level.OK if health.rate_hz > 0.0 else Level.WARN
+    return level, f"{health.rate_hz:.1f} frames/s{share}", figures
+
+
+def _part_status(part: PartHealth) -> _Status:
+    told = part.detail
+    if part.state is State.OFF:
+        told = f"not in use: {told}" if told else "not in use"
+    figures = {"state": str(part.state), "n_dropped": str(part.n_dropped)}
+    return _LEVELS[part.state], told, figures
+
+
+def _texts(**figures: float) -> dict[str, str]:
+    return {key: f"{value:.6g}" for key, value in figures.items()}
