@@ -10,7 +10,11 @@
       CalibrationError          pictures, targets or poses from which nothing can be solved
 
 A refused posture is not an exception but a value, `aqualvs.scanning.posture.Refusal`.
+
+`check_positive` and `check_not_negative` refuse numbers in option classes, in the same words.
 """
+
+import math
 
 
 class AqualvsError(Exception):
@@ -38,3 +42,19 @@ class OptionError(AqualvsError):
 
 class CalibrationError(AqualvsError):
     """Pictures, targets or poses from which nothing can be solved."""
+
+
+def check_positive(what: str, owner: object, *names: str) -> None:
+    """Raise `OptionError` unless these fields of `owner` are finite and above 0."""
+    for name in names:
+        value = getattr(owner, name)
+        if not 0.0 < value < math.inf:
+            raise OptionError(f"{what}, {name} {value:g}: must be positive")
+
+
+def check_not_negative(what: str, owner: object, *names: str) -> None:
+    """Raise `OptionError` unless these fields of `owner` are finite and 0 or more."""
+    for name in names:
+        value = getattr(owner, name)
+        if not 0.0 <= value < math.inf:
+            raise OptionError(f"{what}, {name} {value:g}: must be 0 or more")

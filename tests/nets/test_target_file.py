@@ -35,7 +35,7 @@ def test_file(tmp_path: Path) -> None:
             "mesh_filter.rd_mm is not a key of a net.yaml; did you mean",
         ),
         ("kind: net\nmesh_filter: {dd_mm: wide}", "mesh_filter.dd_mm is 'wide'"),
-        ("kind: net\nmesh_filter: {dd_mm: -1}", "dd is -1 mm"),
+        ("kind: net\nmesh_filter: {dd_mm: -1}", "mesh_filter.dd_mm is -1; it must be greater"),
         ("- net", "holds no keys"),
         ("kind: [", "is not YAML"),
     ],

@@ -5,10 +5,10 @@ the response, and `DeadBandCrossing` crosses the dead band with hysteresis.
 """
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from enum import StrEnum
 
-from aqualvs.errors import OptionError
+from aqualvs.errors import OptionError, check_not_negative, check_positive
 
 
 class Layout(StrEnum):
@@ -219,9 +219,9 @@ class VehicleFacts:
 
         Raises `OptionError` if a number is not positive.
         """
-        _check_positive(self, f"vehicle {self.name}", ("mass", "turning_rate", "climb_rate"))
+        check_positive(f"vehicle {self.name}", self, "mass", "turning_rate", "climb_rate")
         for drag in (self.forward_drag, self.right_drag):
-            if not (drag.linear >= 0.0 and drag.quadratic >= 0.0 and sum(_pair(drag)) > 0.0):
+            if not (min(drag.linear, drag.quadratic) >= 0.0 < drag.linear + drag.quadratic):
                 raise OptionError(
                     f"vehicle {self.name}: drag {drag.linear:g} and {drag.quadratic:g}; 0 or "
                     "more, and one of them positive"
@@ -272,8 +272,8 @@ class RangeGains:
         Raises `OptionError` naming the first.
         """
         free = ("integral", "lag", "swell", "crossing_impulse", "crossing_share")
-        _check_positive(self, "range", [f.name for f in fields(self) if f.name not in free])
-        _check_not_negative(self, "range", free)
+        check_positive("range", self, *(name for name in self.__slots__ if name not in free))
+        check_not_negative("range", self, *free)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -303,8 +303,8 @@ class YawGains:
         Raises `OptionError` naming the first.
         """
         free = ("integral", "derivative", "lag", "quiet_rate")
-        _check_positive(self, "yaw", [f.name for f in fields(self) if f.name not in free])
-        _check_not_negative(self, "yaw", free)
+        check_positive("yaw", self, *(name for name in self.__slots__ if name not in free))
+        check_not_negative("yaw", self, *free)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -324,7 +324,7 @@ class ControlGains:
 
         Raises `OptionError` naming the first.
         """
-        _check_positive(self, "controller", ("rate_time", "memory"))
+        check_positive("controller", self, "rate_time", "memory")
 
 
 def gain_schedule(gains: RangeGains, damping: float) -> tuple[float, float]:
@@ -346,21 +346,3 @@ def gain_schedule(gains: RangeGains, damping: float) -> tuple[float, float]:
 # Drag makes the loop stiff in position; without a greater gain, the integral takes 10 s to find the
 # force of a strong current.
 _INTEGRAL_SHARE, _MAX_INTEGRAL = 1.2, 6.0
-
-
-def _check_positive(owner: object, what: str, names: tuple[str, ...] | list[str]) -> None:
-    for name in names:
-        value = getattr(owner, name)
-        if not (value > 0.0 and math.isfinite(value)):
-            raise OptionError(f"{what}, {name} {value:g}: must be positive")
-
-
-def _check_not_negative(owner: object, what: str, names: tuple[str, ...]) -> None:
-    for name in names:
-        value = getattr(owner, name)
-        if not (value >= 0.0 and math.isfinite(value)):
-            raise OptionError(f"{what}, {name} {value:g}: must be 0 or more")
-
-
-def _pair(drag: Drag) -> tuple[float, float]:
-    return drag.linear, drag.quadratic

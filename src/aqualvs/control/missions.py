@@ -11,7 +11,7 @@ from enum import StrEnum
 from typing import Protocol
 
 from aqualvs.control.vehicle import Setpoint, VehicleState
-from aqualvs.errors import OptionError
+from aqualvs.errors import OptionError, check_positive
 from aqualvs.scanning.posture import Posture
 
 
@@ -363,11 +363,7 @@ class SurveyOptions:
             raise OptionError(f"survey: speed {self.sway:g} m/s; choose one, or hold instead")
         if not self.leg.ends:
             raise OptionError("survey: legs have no end; give a time, a distance or bearings")
-        if not (self.descent > 0.0 and self.patience > 0.0):
-            raise OptionError(
-                f"survey: descent {self.descent:g} m/s, patience {self.patience:g} s; must be "
-                "positive"
-            )
+        check_positive("survey", self, "descent", "patience")
 
 
 class SurveyMission:

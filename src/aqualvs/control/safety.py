@@ -7,12 +7,12 @@ rules as a table.
 
 import math
 from collections import deque
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import NamedTuple
 
 from aqualvs.control.vehicle import NEUTRAL, Effort, Mode, VehicleState
-from aqualvs.errors import OptionError
+from aqualvs.errors import OptionError, check_positive
 from aqualvs.scanning.posture import Posture
 
 
@@ -143,10 +143,7 @@ class SafetyLimits:
 
         Raises `OptionError` if one makes no sense.
         """
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if not (value > 0.0 and math.isfinite(value)):
-                raise OptionError(f"safety, {field.name} {value:g}: must be positive")
+        check_positive("safety", self, *self.__slots__)
         if self.posture_age > 0.2:
             raise OptionError(
                 f"safety, posture_age {self.posture_age:g} s: choose at most 0.2 s; a vehicle "

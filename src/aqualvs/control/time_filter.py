@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from aqualvs.errors import OptionError
+from aqualvs.errors import OptionError, check_positive
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.scanning.posture import Posture, Refusal
 
@@ -67,17 +67,11 @@ class PostureFilterOptions:
 
         Raises `OptionError` if one makes no sense.
         """
-        names = ("range_acceleration", "pitch_acceleration", "yaw_acceleration")
-        for name in (*names, "initial_speed", "initial_turn_rate", "max_coast"):
-            value = getattr(self, name)
-            if not (value > 0.0 and math.isfinite(value)):
-                raise OptionError(f"time filter, {name} {value:g}: must be positive")
-        if not 0.0 < self.gate_probability < 1.0:
+        check_positive("time filter", self, *self.__slots__)
+        if not self.gate_probability < 1.0:
             raise OptionError(
                 f"time filter, gate_probability {self.gate_probability:g}: must lie between 0 and 1"
             )
-        if self.n_rejected < 1:
-            raise OptionError(f"time filter, n_rejected {self.n_rejected}: must be at least 1")
 
 
 class PostureFilter:

@@ -39,7 +39,7 @@ from aqualvs.optics.sheet import sheets_of
 from aqualvs.scanning.posture import Posture
 from aqualvs.scanning.scan import Label, Scan
 from aqualvs.scanning.surfaces import TargetKind
-from aqualvs.schema import Number, Positive, SchemaWords, StrictPart, validated
+from aqualvs.schema import Positive, SchemaWords, StrictPart, validated
 from aqualvs.yamlfile import read_yaml
 
 if TYPE_CHECKING:
@@ -141,10 +141,10 @@ class _NetPart(StrictPart):
 
 
 class _FilterPart(StrictPart):
-    rd_theta_mm: Number | None = None
-    dd_mm: Number | None = None
-    r_min_mm: Number | None = None
-    r_max_mm: Number | None = None
+    rd_theta_mm: Positive | None = None
+    dd_mm: Positive | None = None
+    r_min_mm: Positive | None = None
+    r_max_mm: Positive | None = None
 
 
 class _TargetFile(StrictPart):

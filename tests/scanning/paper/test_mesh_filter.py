@@ -254,8 +254,8 @@ def test_options_of_the_paper() -> None:
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"dd": 0.0}, "dd is 0 mm"),
-        ({"rd_theta": float("nan")}, "rd_theta is nan"),
+        ({"dd": 0.0}, "dd 0: must be positive"),
+        ({"rd_theta": float("nan")}, "rd_theta nan: must be positive"),
         ({"r_max": 0.015}, "r_min is 15 mm and r_max 15 mm"),
         ({"rd_theta": 0.035}, "rd_theta is 35 mm, not below r_max of 35 mm"),
     ],

@@ -29,7 +29,7 @@ import numpy as np
 
 from aqualvs.control.sticks import FULL, MIDDLE, PARAMETERS, Sticks, shaping_of
 from aqualvs.control.vehicle import NEUTRAL, Effort, Mode, VehicleState
-from aqualvs.errors import OptionError
+from aqualvs.errors import OptionError, check_positive
 from aqualvs.live.mavlink.ardusub_commands import (
     Command,
     Commander,
@@ -260,10 +260,8 @@ class ArduSubOptions:
             raise OptionError(
                 f"ArduSub ground_station {self.ground_station}: must lie between 1 and 255"
             )
-        for name in ("station_timeout_s", "speed", "turning_rate"):
-            value = getattr(self, name)
-            if value is not None and not (value > 0.0 and math.isfinite(value)):
-                raise OptionError(f"ArduSub {name} {value:g}: must be positive")
+        timeout = () if self.station_timeout_s is None else ("station_timeout_s",)
+        check_positive("ArduSub", self, *timeout, "speed", "turning_rate")
         if not 0.0 < self.stick_dead_band < 1.0:
             raise OptionError(
                 f"ArduSub stick_dead_band {self.stick_dead_band:g}: must lie between 0 and 1"

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from aqualvs.errors import OptionError
+from aqualvs.errors import OptionError, check_positive
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray, as_vectors
 from aqualvs.geometry.compiled import inline_kernel, kernel
 from aqualvs.geometry.planes import Plane
@@ -199,10 +199,7 @@ class MeshFilterOptions:
     r_max: float = 35e-3
 
     def __post_init__(self) -> None:
-        for name in ("rd_theta", "dd", "r_min", "r_max"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0.0):
-                raise OptionError(f"mesh filter: {name} is {value * 1e3:g} mm; it must be positive")
+        check_positive("mesh filter", self, *self.__slots__)
         if not self.r_min < self.r_max:
             raise OptionError(
                 f"mesh filter: r_min is {self.r_min * 1e3:g} mm and r_max {self.r_max * 1e3:g} mm; "
