@@ -10,7 +10,6 @@ from aqualvs.calibrate.uncalibrated_stripes import (
     UncalibratedStripeOptions,
     find_stripes,
 )
-from aqualvs.errors import OptionError
 from aqualvs.scanning.scan import Frame
 
 SIZE = (360, 240)
@@ -200,18 +199,6 @@ def test_short_dashes_without_a_certain_line_are_left_out() -> None:
     for first in range(0, SIZE[0], 72):
         image[:, first : first + 58] = picture()[:, first : first + 58]
     assert len(find_stripes(image)) == 0
-
-
-@pytest.mark.parametrize("share", [0.0, 1.0, -0.1, float("nan")])
-def test_senseless_options_are_refused(share: float) -> None:
-    with pytest.raises(OptionError, match=f"min_length_share is {share}; use 0 to 1"):
-        UncalibratedStripeOptions(min_length_share=share)
-
-
-@pytest.mark.parametrize("likelihood", [0.0, 1.0, float("nan")])
-def test_senseless_likelihoods_are_refused(likelihood: float) -> None:
-    with pytest.raises(OptionError, match=f"min_likelihood is {likelihood}; use 0 to 1"):
-        UncalibratedStripeOptions(min_likelihood=likelihood)
 
 
 # Channels as OpenCV has them (blue, green, red) of which two change places.

@@ -14,7 +14,6 @@ from aqualvs.control.gains_file import load_gains
 from aqualvs.control.missions import HoldMission
 from aqualvs.control.safety import NO_BRAKE, LimitReason
 from aqualvs.control.vehicle import NEUTRAL, Effort, Setpoint
-from aqualvs.errors import OptionError
 from aqualvs.follow.case import SimCase, sea, vehicle_model
 from aqualvs.follow.loop import SimulatedLoop
 from aqualvs.follow.sensor_model import Blind, LossOfSight, SampledSensor
@@ -315,8 +314,3 @@ def test_a_still_in_swell_is_told_by_the_attitude(name: str) -> None:
     )
     assert neutral_s <= 2.5
     assert decisions[-1].reason is LimitReason.NO_ANSWER
-
-
-def test_limits_that_cannot_work_are_refused() -> None:
-    with pytest.raises(OptionError, match="safety, repeats_s 0"):
-        AnswerLimits(repeats_s=0.0)

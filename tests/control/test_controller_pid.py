@@ -8,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from aqualvs.control.controller import Pid, PidOptions
-from aqualvs.errors import OptionError
 
 STEP = 0.04
 
@@ -160,18 +159,3 @@ def test_schedule_scales_proportional_and_integral() -> None:
     pid = Pid(PidOptions(proportional=2.0, integral=3.0))
     pid.update(0.0, 1.0, 0.0)
     assert pid.update(0.1, 1.0, 0.0, schedule=(2.0, 3.0)) == pytest.approx(4.0 + 0.9)
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"proportional": -1.0},
-        {"proportional": math.nan},
-        {"proportional": 1.0, "integral": -0.1},
-        {"proportional": 1.0, "output_rate": 0.0},
-        {"proportional": 1.0, "low": 1.0, "high": 1.0},
-    ],
-)
-def test_impossible_options_are_refused(wrong: dict[str, float]) -> None:
-    with pytest.raises(OptionError, match="controller"):
-        PidOptions(**wrong)

@@ -181,10 +181,6 @@ def test_csv_has_units_and_empty_cells(tmp_path: Path) -> None:
     assert rows[20]["engaged"] == "1"
 
 
-def test_timing_that_cannot_be_is_refused() -> None:
-    with pytest.raises(OptionError, match="0 frames a second"):
-        Timing(fps=0.0)
-    with pytest.raises(OptionError, match="delay -1 s"):
-        Timing(delay=-1.0)
+def test_a_vehicle_that_is_not_known_is_refused() -> None:
     with pytest.raises(OptionError, match="--vehicle submarine"):
         vehicle_model("submarine")

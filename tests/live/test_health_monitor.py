@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 import pytest
 
-from aqualvs.errors import OptionError
 from aqualvs.live.health_monitor import FrozenOptions, FrozenPicture
 from aqualvs.scanning.scan import ImagePlane
 from live_cases import demo_frames
@@ -180,8 +179,3 @@ def test_another_size_and_a_stream_that_was_away_begin_anew() -> None:
 def test_pictures_smaller_than_a_cell_are_never_frozen() -> None:
     tiny = np.zeros((4, 4), np.uint8)
     assert not any(watched([tiny] * 30))
-
-
-def test_options_that_make_no_sense_are_refused() -> None:
-    with pytest.raises(OptionError, match="span_s 0"):
-        FrozenOptions(span_s=0.0)

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from aqualvs.errors import OptionError
 from aqualvs.nets import condition as net_condition
 from aqualvs.nets.condition import NetCondition, NetConditionOptions
 from aqualvs.nets.lattice import NetLattice, find_lattice
@@ -133,12 +132,3 @@ def test_scans_read_back_in_single_precision_say_the_same() -> None:
     assert b.lattice.bar == pytest.approx(a.lattice.bar, rel=1e-3)
     assert b.solidity == pytest.approx(a.solidity, abs=2e-3)
     np.testing.assert_allclose(b.place, a.place, atol=1e-3)
-
-
-@pytest.mark.parametrize(
-    ("options", "word"),
-    [({"stretch_s": 0.0}, "stretch_s"), ({"stretch": -1.0}, "stretch"), ({"twine": 0.0}, "twine")],
-)
-def test_options_that_cannot_work_are_refused(options: dict[str, float], word: str) -> None:
-    with pytest.raises(OptionError, match=word):
-        NetConditionOptions(**options)

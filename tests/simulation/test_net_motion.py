@@ -227,5 +227,3 @@ def test_faults_are_refused() -> None:
         )
     with pytest.raises(OptionError, match="station"):
         NetWall(curvature=-0.5).station(2.5)
-    with pytest.raises(OptionError, match="periods"):
-        NetWall(sway_period=0.0)

@@ -18,7 +18,6 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import kernel
 from aqualvs.scanning.laser_bands import SLOPE_CELL, LaserBand, SearchAxis, pixels_per_line
@@ -54,13 +53,6 @@ class UncalibratedStripeOptions:
     min_length_share: float = 0.015
     # Of the lasers; green if None.
     wavelength_nm: float | None = None
-
-    def __post_init__(self) -> None:
-        """Refuse values that cannot work."""
-        if not 0.0 < self.min_likelihood < 1.0:
-            raise OptionError(f"min_likelihood is {self.min_likelihood}; use 0 to 1")
-        if not 0.0 < self.min_length_share < 1.0:
-            raise OptionError(f"min_length_share is {self.min_length_share}; use 0 to 1")
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,7 @@ import math
 from bisect import bisect_left
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from statistics import fmean, median
 from typing import NamedTuple
 
@@ -18,7 +18,6 @@ from numpy.lib.stride_tricks import sliding_window_view
 from aqualvs.control.gains import VehicleFacts
 from aqualvs.control.safety import NO_BRAKE, Brake, LimitReason
 from aqualvs.control.vehicle import NEUTRAL, Effort, VehicleState
-from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.scanning.posture import Posture
 
@@ -84,16 +83,6 @@ class AnswerLimits:
     # posture must follow by more than this share.
     swung: float = math.radians(1.0)
     follows: float = 0.35
-
-    def __post_init__(self) -> None:
-        """Refuse limits that cannot work.
-
-        Raises `OptionError` naming the first.
-        """
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if not (value > 0.0 and math.isfinite(value)):
-                raise OptionError(f"safety, {field.name} {value:g}: must be positive")
 
 
 class _Moment(NamedTuple):

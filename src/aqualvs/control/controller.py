@@ -20,7 +20,6 @@ from dataclasses import dataclass
 
 from aqualvs.control.gains import ControlGains, DeadBandCrossing, gain_schedule
 from aqualvs.control.vehicle import Effort, Setpoint
-from aqualvs.errors import OptionError
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,23 +40,6 @@ class PidOptions:
     output_rate: float = math.inf
     # Seconds between two updates beyond which nothing is integrated and the derivative starts anew.
     longest_step: float = 0.5
-
-    def __post_init__(self) -> None:
-        """Refuse impossible values.
-
-        Raises `OptionError` if a gain is negative or a limit is none.
-        """
-        for name in ("proportional", "integral", "derivative", "derivative_time"):
-            value = getattr(self, name)
-            if not (value >= 0.0 and math.isfinite(value)):
-                raise OptionError(f"controller, {name} {value:g}: must be 0 or more")
-        for name in ("output_rate", "longest_step"):
-            if not getattr(self, name) > 0.0:
-                raise OptionError(f"controller, {name} {getattr(self, name):g}: must be positive")
-        if not self.low < self.high:
-            raise OptionError(
-                f"controller, limits {self.low:g} to {self.high:g}: the first must be the lower"
-            )
 
 
 class Pid:

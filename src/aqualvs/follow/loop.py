@@ -102,17 +102,6 @@ class Timing:
     # first field of an interlaced picture does for the second.
     field: float = 0.0
 
-    def __post_init__(self) -> None:
-        """Refuse impossible values.
-
-        Raises `OptionError` if there are no frames, or they come before their time.
-        """
-        if not (self.fps > 0.0 and self.delay >= 0.0 and self.field >= 0.0):
-            raise OptionError(
-                f"simulated loop: {self.fps:g} frames a second, delay {self.delay:g} s; the first "
-                "is positive, the second 0 or more"
-            )
-
 
 class _Arrival(NamedTuple):
     """A measured frame on its way."""

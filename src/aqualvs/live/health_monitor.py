@@ -12,14 +12,14 @@ import threading
 import time
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from aqualvs.errors import OptionError, RigError
+from aqualvs.errors import RigError
 from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.optics.rig import Rig
 from aqualvs.recording.sample import Instants
@@ -72,16 +72,6 @@ class FrozenOptions:
     # Within this time, in seconds, the changes of a stopped picture must fall below the limits
     # above, or it counts as live again.
     confirmed_s: float = 2.0
-
-    def __post_init__(self) -> None:
-        """Refuse impossible values.
-
-        Raises `OptionError` naming the value.
-        """
-        for field in fields(self):
-            name, value = field.name, getattr(self, field.name)
-            if not (value > 0.0 and math.isfinite(value)):
-                raise OptionError(f"frozen pictures, {name} {value:g}: must be positive")
 
 
 class _Patches(NamedTuple):

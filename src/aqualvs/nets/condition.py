@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.nets.coverage import RegisteredView, Twine, dash_kinds, measure_solidity, measure_twine
 from aqualvs.nets.dashes import NetView, crossings_of, find_dashes
@@ -37,15 +36,6 @@ class NetConditionOptions:
     stretch: float = 0.5  # or after the vehicle has moved this far along the net, in metres.
     # Diameter of the bare twine in metres, where it is known: makes solidity more accurate.
     twine: float | None = None
-
-    def __post_init__(self) -> None:
-        """Refuse values that cannot work."""
-        if not self.stretch_s > 0.0:
-            raise OptionError(f"stretch_s is {self.stretch_s:g}; use more than 0 s")
-        if not self.stretch > 0.0:
-            raise OptionError(f"stretch is {self.stretch:g}; use more than 0 m")
-        if self.twine is not None and not self.twine > 0.0:
-            raise OptionError(f"twine is {self.twine:g}; use more than 0 m, or leave it out")
 
 
 @dataclass(frozen=True, slots=True)

@@ -60,13 +60,6 @@ class NetWall:
     rock_period: float = 7.0
     rock_phase: float = 0.0
 
-    def __post_init__(self) -> None:
-        if not min(self.sway_period, self.rock_period) > 0.0:
-            raise OptionError(
-                f"net wall: periods of sway and rock are {self.sway_period:g} and "
-                f"{self.rock_period:g} s; both must be positive"
-            )
-
     def world_from_net(self, time_s: float) -> SE3:
         """Return the pose of the net's frame at a time."""
         north, east = math.cos(self.bearing), math.sin(self.bearing)

@@ -290,16 +290,8 @@ def test_faults_are_refused() -> None:
         vehicle(BLUEROV2, latency=-1.0)
     with pytest.raises(OptionError, match="gain"):
         StickInput(gain=0.0)
-    with pytest.raises(OptionError, match="dead zones"):
-        StickInput(throttle_dead_zone=600)
-    with pytest.raises(OptionError, match="thrust curve"):
-        ThrustCurve(lag=0.0)
     with pytest.raises(OptionError, match="factors"):
         BLUEROV2.scaled(mass=0.0)
-    with pytest.raises(OptionError, match="sensor"):
-        SensorErrors(rate=0.0)
-    with pytest.raises(OptionError, match="masses"):
-        replace(BLUEROV2, mass=-1.0)
 
 
 def test_thrust_curve_is_the_t200s() -> None:

@@ -113,9 +113,3 @@ def test_faults_are_refused() -> None:
         Waves(amplitude=2.0, period=2.0)
     with pytest.raises(OptionError, match="waves"):
         Waves(amplitude=-0.1)
-    with pytest.raises(OptionError, match="spread"):
-        Waves(amplitude=0.1, spread=1.0)
-    with pytest.raises(OptionError, match="tether"):
-        Tether(length=-1.0)
-    with pytest.raises(OptionError, match="water"):
-        WaterMotion(wander=-0.1)

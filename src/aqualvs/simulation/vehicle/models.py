@@ -53,14 +53,6 @@ class ThrustCurve:
     # Time constant in seconds; 0.1 is a round number for a small propeller, not measured.
     lag: float = 0.1
 
-    def __post_init__(self) -> None:
-        if not (min(self.forward, self.reverse, self.lag) > 0.0 and 0.0 <= self.dead_band < 1.0):
-            raise OptionError(
-                f"thrust curve: forward {self.forward:g} N, reverse {self.reverse:g} N, lag "
-                f"{self.lag:g} s, dead band {self.dead_band:g}; the first three are positive, the "
-                "last is 0 or more and less than 1"
-            )
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StickInput:
@@ -86,13 +78,6 @@ class StickInput:
     def __post_init__(self) -> None:
         if not 0.0 < self.gain <= 1.0:
             raise OptionError(f"sticks: gain {self.gain:g}; choose more than 0, at most 1")
-        if not (0 <= self.yaw_dead_zone <= 200 and 0 <= self.throttle_dead_zone <= 300):
-            raise OptionError(
-                f"sticks: dead zones {self.yaw_dead_zone} us and {self.throttle_dead_zone}; choose "
-                "0 to 200 for yaw and 0 to 300 for the throttle"
-            )
-        if not all(1400 <= trim <= 1600 for trim in self.trims):
-            raise OptionError(f"sticks: trims {self.trims} us; choose 1400 to 1600")
 
     def asked(self, x: int, y: int, z: int, r: int) -> tuple[float, float, float, float]:
         """Return the request of stick positions in depth hold.
@@ -204,14 +189,6 @@ class VehicleModel:
     dome_position: Vec = (0.20, 0.0, 0.0)
     # Half length, width and height of the hull, in metres.
     half_size: Vec = (0.2286, 0.169, 0.127)
-
-    def __post_init__(self) -> None:
-        drags = (*self.linear_drag, *self.quadratic_drag, *self.added_mass)
-        if not (self.mass > 0.0 and min(self.inertia) > 0.0 and min(drags) >= 0.0):
-            raise OptionError(
-                f"vehicle {self.name}: mass {self.mass:g} kg, inertia {self.inertia}; masses and "
-                "inertias are positive, drags and added masses 0 or more"
-            )
 
     @property
     def weight(self) -> float:

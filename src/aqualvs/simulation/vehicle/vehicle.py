@@ -45,14 +45,6 @@ class SensorErrors:
     # Readings a second.
     rate: float = 10.0
 
-    def __post_init__(self) -> None:
-        if not (min(self.noise, self.wander) >= 0.0 and min(self.wander_time, self.rate) > 0.0):
-            raise OptionError(
-                f"sensor: noise {self.noise:g}, wander {self.wander:g}, wander time "
-                f"{self.wander_time:g} s, rate {self.rate:g} Hz; the first two are 0 or more, the "
-                "others positive"
-            )
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sensors:

@@ -49,8 +49,6 @@ class Waves:
                 f"waves: amplitude {self.amplitude:g} m, period {self.period:g} s, n {self.n}; "
                 "amplitudes are 0 or more, periods positive, and there is at least one wave"
             )
-        if not 0.0 <= self.spread < 1.0:
-            raise OptionError(f"waves: spread {self.spread:g}; choose 0 or more, less than 1")
         number = (2.0 * math.pi / self.period) ** 2 / GRAVITY
         if self.amplitude * number > steepest:
             raise OptionError(
@@ -90,13 +88,6 @@ class Tether:
     # Steady pull beside the drag, in world axes (north, east, down), in newtons.
     pull: Vec = (0.0, 0.0, 0.0)
 
-    def __post_init__(self) -> None:
-        if not (self.length >= 0.0 and self.diameter > 0.0 and self.drag >= 0.0):
-            raise OptionError(
-                f"tether: length {self.length:g} m, diameter {1e3 * self.diameter:g} mm, drag "
-                f"{self.drag:g}; length and drag are 0 or more, the diameter is positive"
-            )
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WaterMotion:
@@ -116,13 +107,6 @@ class WaterMotion:
     density: float = 1025.0
     # Seed of the phases of waves and wander.
     seed: int = 0
-
-    def __post_init__(self) -> None:
-        if not (self.wander >= 0.0 and self.wander_period > 0.0 and self.density > 0.0):
-            raise OptionError(
-                f"water: wander {self.wander:g} m/s, wander period {self.wander_period:g} s, "
-                f"density {self.density:g} kg/m³; the first is 0 or more, the others are positive"
-            )
 
     def pack(self) -> "Flow":
         """Return the water for kernels; the same seed gives the same water."""
