@@ -230,15 +230,6 @@ def test_swell_term_halves_what_a_swell_does(gains: ControlGains) -> None:
     assert error(gains) < 0.65 * error(calm)
 
 
-def test_first_effort_after_engaging_goes_on_from_what_was(gains: ControlGains) -> None:
-    controller = RangeYawController(gains)
-    held = Effort(forward=0.4, yaw=0.1)
-    controller.engage(10.0, 0.6, 0.0, held)
-    effort = controller.update(10.04, 0.6, 0.0, 0.0, 0.0, HOLD)
-    assert effort.forward == pytest.approx(held.forward, abs=0.02)
-    assert effort.yaw == pytest.approx(held.yaw, abs=0.01)
-
-
 def test_after_a_pause_it_starts_from_neutral_and_knows_the_current(gains: ControlGains) -> None:
     plant, controller = PlanePlant(gains, current=(0.4, 0.0)), RangeYawController(gains)
     run = fly(plant, controller, HOLD, 25.0)

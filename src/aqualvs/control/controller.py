@@ -59,11 +59,6 @@ class Pid:
         self.reset()
 
     @property
-    def output(self) -> float:
-        """The last output."""
-        return self._output
-
-    @property
     def integral(self) -> float:
         """The integral's share of the output."""
         return self._integral
@@ -78,31 +73,6 @@ class Pid:
         """Expect the next update after a stop: output 0 till then, the integral stays."""
         self._output = self._rate = 0.0
         self._time_s = self._measured = math.nan
-
-    def engage(
-        self, time_s: float, setpoint: float, measured: float, output: float, forward: float = 0.0
-    ) -> None:
-        """Start such that the output continues from `output`: the integral takes the difference.
-
-        Parameters
-        ----------
-        time_s : float
-            Now; the next update comes later.
-        setpoint, measured : float
-            As of now, at rest.
-        output : float
-            What the actuator does now.
-        forward : float
-            The feed-forward that the next update will come with.
-        """
-        values = (time_s, setpoint, measured, output, forward)
-        if not all(map(math.isfinite, values)):
-            self.reset()
-            return
-        self._time_s, self._measured, self._rate = time_s, measured, 0.0
-        self._output = self._limited(output)
-        straight = self.options.proportional * (setpoint - measured) + forward
-        self._integral = self._output - straight if self.options.integral > 0.0 else 0.0
 
     def fade(self, kept: float) -> None:
         """Forget all but a share of the integral."""
@@ -293,9 +263,9 @@ class QuietZone:
         self._quiet = quiet
         self.reset()
 
-    def reset(self, rate: float = 0.0) -> None:
-        """Begin at rest, or with a rate that is in force."""
-        self._side = math.copysign(1.0, rate) if rate else 0.0
+    def reset(self) -> None:
+        """Begin at rest."""
+        self._side = 0.0
 
     def rate(self, asked: float) -> float:
         """Return the turning rate to ask of the vehicle."""
@@ -391,29 +361,6 @@ class RangeYawController:
         self._slope.reset()
         self._swell.reset()
         self._let_go()
-
-    def engage(self, time_s: float, range: float, yaw: float, effort: Effort) -> None:
-        """Take over from a human pilot without a jump.
-
-        Parameters
-        ----------
-        time_s : float
-            Of the last frame.
-        range, yaw : float
-            Its posture, in metres and radians.
-        effort : Effort
-            What the vehicle does now.
-        """
-        vehicle = self.gains.vehicle
-        forward, _ = vehicle.thrust.forces(effort.forward, effort.right)
-        self.reset()
-        self._start(time_s, range, yaw)
-        parts = vehicle.thrust.split(effort.forward, effort.right)
-        for pair, part in zip(self._pairs, parts, strict=True):
-            pair.reset(part)
-        self._quiet.reset(effort.yaw)
-        self._speed.engage(time_s, 0.0, 0.0, forward / vehicle.mass)
-        self._turn.engage(time_s, 0.0, 0.0, -effort.yaw * vehicle.turning_rate)
 
     def applied(self, effort: Effort) -> None:
         """Correct the last effort by the one that was sent in its place."""

@@ -95,11 +95,7 @@ class ThrustMap:
 
     def forces(self, forward: float, right: float) -> tuple[float, float]:
         """Return the forces in newtons that two efforts give together."""
-        if self.layout is Layout.STRAIGHT:
-            ahead, aside = self.share(forward), self.share(right)
-        else:
-            one, other = map(self.share, self.split(forward, right))
-            ahead, aside = 0.5 * (one + other), 0.5 * (one - other)
+        ahead, aside = self.joined(*map(self.share, self.split(forward, right)))
         return ahead * (self.forward if ahead > 0.0 else self.backward), aside * self.right
 
     def _past_dead_band(self, size: float) -> float:
@@ -129,10 +125,9 @@ class DeadBandCrossing:
         self._thrust, self._impulse, self._great = thrust, impulse, great
         self.reset()
 
-    def reset(self, effort: float = 0.0) -> None:
-        """Begin with an effort that is in force; in the dead band, on the side asked for next."""
-        beyond = abs(effort) > self._thrust.dead_band
-        self._side, self._owed = math.copysign(1.0, effort) if beyond else 0.0, 0.0
+    def reset(self) -> None:
+        """Begin in the dead band, on the side asked for next."""
+        self._side = self._owed = 0.0
         self._stood_s = math.inf
 
     @property

@@ -31,11 +31,6 @@ class Stage(StrEnum):
     """The target stayed away for too long."""
 
     @property
-    def ended(self) -> bool:
-        """Whether the mission never goes on by itself."""
-        return self in (Stage.OVER, Stage.GAVE_UP)
-
-    @property
     def halts(self) -> bool:
         """Whether there must be no thrust."""
         return self in (Stage.IDLE, Stage.WAITING, Stage.GAVE_UP)
