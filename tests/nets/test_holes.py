@@ -21,17 +21,16 @@ def _dark(view: NetView, strands: Strands, which: BoolArray) -> NetView:
     rows, gaps = [], view.gaps
     for i in range(2):
         mine = gaps.laser == i
-        ends, middles, closed = gaps.ends[mine], gaps.middles[mine], gaps.closed[mine]
+        ends, closed = gaps.ends[mine], gaps.closed[mine]
+        strand = 0.5 * (ends[:-1, 1] + ends[1:, 0])
         gone = strands.along[which & (strands.laser == i)]
-        kept = np.array([np.abs(gone - m).min(initial=1.0) > 2e-3 for m in middles[1:, 0]])
+        kept = np.array([np.abs(gone - m).min(initial=1.0) > 2e-3 for m in strand])
         first, last = np.r_[True, kept], np.r_[kept, True]
         rows.append(
             np.c_[
                 np.full(first.sum(), i),
                 ends[first, 0],
                 ends[last, 1],
-                middles[first, 0],
-                middles[last, 1],
                 closed[first, 0],
                 closed[last, 1],
                 np.zeros(first.sum()),
@@ -41,9 +40,7 @@ def _dark(view: NetView, strands: Strands, which: BoolArray) -> NetView:
 
 
 def _gaps(table: FloatArray) -> Gaps:
-    return Gaps(
-        table[:, 0].astype(int), table[:, 1:3], table[:, 3:5], table[:, 5:7] == 1.0, table[:, 7]
-    )
+    return Gaps(table[:, 0].astype(int), table[:, 1:3], table[:, 3:5] == 1.0, table[:, 5])
 
 
 def view_at(
@@ -73,10 +70,9 @@ def view_at(
             there &= ~lost[20 * i : 20 * i + len(s)]
         low, high = s[there] - 1e-3, s[there] + 1e-3
         edges = np.r_[-HALF, np.stack([low, high], axis=1).ravel(), HALF].reshape(-1, 2)
-        middles = np.r_[-HALF, np.repeat(s[there], 2), HALF].reshape(-1, 2)
         last = len(edges) - 1
-        for k, (ends, middle) in enumerate(zip(edges, middles, strict=True)):
-            rows.append((i, *ends, *middle, k > 0, k < last, beyond))
+        for k, ends in enumerate(edges):
+            rows.append((i, *ends, k > 0, k < last, beyond))
     table = np.array(rows)
     none = np.empty(0)
     return NetView(

@@ -34,8 +34,6 @@ class Stripes:
     lines: FloatArray
     # Shape (K, W): visible length on the wall, metres.
     length: FloatArray
-    # Shape (K, W, 2): pixel of the visible part's middle, in `image`; NaN if there is none.
-    middle: FloatArray
     # Shape (K, W, 3, 3): sum w X X', each point weighted by its inverse variance for an error of 1
     # px.
     matrix: FloatArray
@@ -185,11 +183,9 @@ def _summed(camera: Camera, line: _Lines, ranges: FloatArray, common: FloatArray
     weighted = line_weight[..., None] * np.where(np.isfinite(points), points, 0.0)
     by_error = _own(sensitivity, points, line, per_px, place)
     safe = [np.where(np.isfinite(a), a, 0.0) for a in (points, by_error, sensitivity.by_common)]
-    middle = np.where(seen[..., None], pixels[..., _N_SUM // 2, :], np.nan)
     return Stripes(
         lines=np.where(seen, lines.sum(axis=-1), 0.0),
         length=np.where(seen, 2.0 * half[..., 0], 0.0),
-        middle=middle,
         matrix=np.einsum("kwsi,kwsj->kwij", weighted, safe[0]),
         own=np.einsum("kwsi,kwse->kwei", weighted, safe[1]),
         common=np.einsum("kwsi,kwsg->kwgi", weighted, safe[2]),

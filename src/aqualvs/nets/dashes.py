@@ -60,8 +60,8 @@ def cut_lines(
         L of them.
     dash : array, shape (N, 6)
         Rows laser, whole, middle, length, height, width as in `Dashes`; written.
-    gap : array, shape (K, 8)
-        Rows laser, ends, middles, closed, beyond as in `Gaps`; written.
+    gap : array, shape (K, 6)
+        Rows laser, ends, closed, beyond as in `Gaps`; written.
     span : array, shape (M, 3)
         Rows laser, ends as in `NetView`; written.
     usual : array, shape (L, 2)
@@ -111,7 +111,7 @@ def _cut_span(
     """Append the dashes and gaps of one span; return the new counts."""
     state, height, n_lines = lines.state, lines.height, lines.state.shape[1]
     brightest = height[i].max()
-    j, dark_from, before = begin, begin, -1
+    j, dark_from = begin, begin
     while j < end:
         if state[i, _turned(j, n_lines, back)] != 2:
             j += 1
@@ -143,12 +143,12 @@ def _cut_span(
         dash[n, 2], dash[n, 3] = 0.5 * (low + high), length
         dash[n, 4], dash[n, 5] = peak, wide / n_bright
         if first > dark_from:
-            _put_gap(lines, i, dark_from, first - 1, back, gap, k, dash, before, n)
+            _put_gap(lines, i, dark_from, first - 1, back, gap, k, dark_from > begin, True)
             k += 1
-        dark_from, before = last + 1, n
+        dark_from = last + 1
         n += 1
     if end > dark_from:
-        _put_gap(lines, i, dark_from, end - 1, back, gap, k, dash, before, -1)
+        _put_gap(lines, i, dark_from, end - 1, back, gap, k, dark_from > begin, False)
         k += 1
     return n, k
 
@@ -188,20 +188,17 @@ def _put_gap(
     back: bool,
     gap: FloatArray,
     k: int,
-    dash: FloatArray,
-    before: int,
-    behind: int,
+    before: bool,
+    behind: bool,
 ) -> None:
-    """Write gap k between two dashes by their rows; -1 where the span ends."""
+    """Write gap k, and whether there are dashes before and behind it; else the span ends there."""
     seen = 0
     for a in range(first, last + 1):
         seen += lines.beyond[i, _turned(a, lines.beyond.shape[1], back)]
     gap[k, 0] = i
     gap[k, 1], gap[k, 2] = _ends(lines, i, first, last, back)
-    gap[k, 3] = dash[before, 2] if before >= 0 else gap[k, 1]
-    gap[k, 4] = dash[behind, 2] if behind >= 0 else gap[k, 2]
-    gap[k, 5], gap[k, 6] = 1.0 if before >= 0 else 0.0, 1.0 if behind >= 0 else 0.0
-    gap[k, 7] = seen / (last - first + 1)
+    gap[k, 3], gap[k, 4] = before, behind
+    gap[k, 5] = seen / (last - first + 1)
 
 
 @inner_kernel
@@ -256,8 +253,6 @@ class Gaps:
 
     laser: IntArray  # Shape (K,): index of the laser.
     ends: FloatArray  # Shape (K, 2): on the laser's line, in metres.
-    # Shape (K, 2): middles of the dashes at both ends; as `ends` where there is none.
-    middles: FloatArray
     # Shape (K, 2): whether a dash ends the gap there; otherwise the view ends.
     closed: BoolArray
     # Shape (K,): share of its search lines whose light is seen on something behind the net.
@@ -319,7 +314,7 @@ def find_dashes(signal: NetSignal, usable: BoolArray | None = None) -> NetView:
     state = signal.state if usable is None else np.where(usable, signal.state, LineState.HIDDEN)
     n_lasers, n_lines = state.shape
     most = n_lasers * n_lines
-    dash, gap, span = np.empty((most, 6)), np.empty((2 * most, 8)), np.empty((most, 3))
+    dash, gap, span = np.empty((most, 6)), np.empty((2 * most, 6)), np.empty((most, 3))
     usual = np.empty((n_lasers, 2))
     lines = _LaserLines(
         np.ascontiguousarray(state, np.uint8),
@@ -353,9 +348,8 @@ def find_dashes(signal: NetSignal, usable: BoolArray | None = None) -> NetView:
         gaps=Gaps(
             laser=gap[:k, 0].astype(np.int64),
             ends=gap[:k, 1:3].copy(),
-            middles=gap[:k, 3:5].copy(),
-            closed=gap[:k, 5:7] == 1.0,
-            beyond=gap[:k, 7].copy(),
+            closed=gap[:k, 3:5] == 1.0,
+            beyond=gap[:k, 5].copy(),
         ),
         span_laser=span[:m, 0].astype(np.int64),
         span=span[:m, 1:].copy(),

@@ -81,8 +81,6 @@ def test_lasers_come_out_of_a_box() -> None:
         assert np.abs(view.dome_from_target.translation - true.translation).max() < 5e-4
         # The two poses differ by noise, and are told apart.
         assert 0.0 < view.pose_angle < 1e-3
-        assert 0.0 < view.spatial_rms < 1e-4
-        assert view.spatial_cost == pytest.approx(view.spatial_rms**2 * view.n_corners, rel=1e-9)
 
 
 @pytest.mark.parametrize("thickness", [0.0, 0.006])

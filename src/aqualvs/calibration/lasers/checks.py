@@ -39,9 +39,8 @@ class LaserFigures:
     # stripe, and in metres.
     rms_px: float
     rms: float
-    # Stripe points used, and outliers among them.
+    # Stripe points used.
     n_points: int
-    n_outliers: int
     # Number of independent measurements that the points are worth.
     n_effective: float
     # Surfaces that the laser was seen on.
@@ -68,13 +67,8 @@ class ViewFigures:
     n_corners: int
     n_corners_rejected: int
     n_stripe_points: int
-    # `dome_from_target` by the paper's cost (Eq. 32-33).
-    spatial_pose: SE3
-    # The paper's V at its minimum, in square metres.
-    spatial_cost: float
-    # Root mean square distance of corners from their rays, in metres.
-    spatial_rms: float
-    # Difference of the two poses, in radians, and in metres at the middle of the corners.
+    # Difference from the pose by the paper's cost (Eq. 32-33), in radians, and in metres at the
+    # middle of the corners.
     pose_angle: float
     pose_shift: float
     # Shape (N, 2): measured corners, and their residuals.
@@ -160,7 +154,6 @@ def _laser_figures(
         rms_px=_rms(residuals[inside], weights[inside]),
         rms=_rms(metres[inside], weights[inside]),
         n_points=int(weights.sum()),
-        n_outliers=int(weights[~inside].sum()),
         n_effective=float(np.count_nonzero(inside)) / joint.correlation[i_laser],
         surfaces=tuple(solved.problem.surfaces.names[i] for i in on),
         n_views=len({group.view for group in groups}),
@@ -214,9 +207,6 @@ def _view_figures(solved: SolvedLasers, i_view: int, view: PlacedView) -> ViewFi
         n_corners=len(view.view) + view.n_corners_rejected,
         n_corners_rejected=rejected,
         n_stripe_points=len(view.placed),
-        spatial_pose=view.spatial.dome_from_target,
-        spatial_cost=view.spatial.cost,
-        spatial_rms=view.spatial.rms,
         pose_angle=angle,
         pose_shift=shift,
         corners_px=view.view.pixels,
