@@ -101,9 +101,8 @@ def test_what_is_no_address_is_refused_before_ffmpeg_waits_for_it(where):
     [
         ("udp://:5600", {"transport": "tcp"}, "only RTSP"),
         ("udp://:5600", {"fps": 25.0}, "own clock"),
-        ("rtsp://a/b", {"topic": "/camera"}, "no topics"),
         ("rtsp://a/b", {"size_px": (640, 480)}, "only a camera"),
-        ("camera:0", {"topic": "/camera"}, "neither transport nor topic"),
+        ("camera:0", {"transport": "tcp"}, "no transport"),
         ("camera:0", {"fps": -1.0}, "must be positive"),
     ],
 )

@@ -43,7 +43,7 @@ class RclpyOutput:
     node : rclpy.node.Node
         Topics are private to it, `diagnostics` is not.
     options : RosOptions, optional
-        Defaults if left out; `namespace` is not used, the node has one.
+        Defaults if left out.
     stamp_of : callable, optional
         Takes the number of a frame, gives the time in the header of its picture, or None. The time
         of arrival counts if left out.

@@ -158,7 +158,6 @@ def open_feed(
     size_px: tuple[int, int] | None = None,
     pixel_format: str | None = None,
     transport: "Transport | None" = None,
-    topic: str | None = None,
 ) -> Feed:
     """Open a source for a live run.
 
@@ -187,8 +186,6 @@ def open_feed(
         Asked of a camera: `h264`, `mjpeg`, `yuyv422`.
     transport : {"tcp", "udp"} or None
         How RTSP shall send; TCP if None.
-    topic : str or None
-        Of a bag or MCAP file.
 
     Raises
     ------
@@ -203,14 +200,14 @@ def open_feed(
     if fps is not None and not 0 < fps < math.inf:
         raise OptionError(f"frame rate {fps:g}: must be positive and finite")
     if is_camera(text):
-        _no(transport or topic, text, "a camera has neither transport nor topic; leave it out")
+        _no(transport, text, "a camera has no transport; leave it out")
         return CameraFeed(text, CameraOptions(size_px=size_px, fps=fps, pixel_format=pixel_format))
     _no(size_px or pixel_format, text, "only a camera takes a size or format; leave it out")
     if not text.lower().startswith("rtsp"):
         _no(transport, text, "only RTSP has a choice of transport; leave it out")
     if not _is_stream(text):
-        return PacedFeed(open_source(where, fps=fps, topic=topic), realtime=realtime)
-    _no(fps or topic, text, "a stream has its own clock and no topics; leave that out")
+        return PacedFeed(open_source(where, fps=fps), realtime=realtime)
+    _no(fps, text, "a stream has its own clock; leave the frame rate out")
     return _stream(text, transport or "tcp")
 
 

@@ -137,7 +137,7 @@ def check_offers(listener: Listener, *, hashes: bool) -> None:
     def offers() -> dict[str, Any]:
         return {h["offer"]["topic"]: h["offer"] for h in listener.heard if "offer" in h}
 
-    names = {topic: f"rt{RosOptions().topic_name(topic)}" for topic in PublishedTopic}
+    names = {topic: f"rt{topic.full_name}" for topic in PublishedTopic}
     assert until(lambda: set(names.values()) <= set(offers()))
     for topic, name in names.items():
         offer = offers()[name]

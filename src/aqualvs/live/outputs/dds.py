@@ -280,7 +280,7 @@ def _join(domain_id: int, options: RosOptions, types: RosTypes) -> _Link:
     writers = {}
     for topic in PublishedTopic:
         kind = types.classes[TYPE_NAMES[topic]]
-        offered = DdsTopic(participant, f"rt{options.topic_name(topic)}", kind)
+        offered = DdsTopic(participant, f"rt{topic.full_name}", kind)
         writers[topic] = DataWriter(participant, offered, _quality(topic, options, types))
     return _Link(domain, participant, writers)
 

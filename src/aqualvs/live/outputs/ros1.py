@@ -327,7 +327,7 @@ class Ros1Output:
             raise OptionError(f"ROS node {node_name!r}: use letters, digits and _")
         options = options or RosOptions()
         master = master_uri or environment.get("ROS_MASTER_URI") or DEFAULT_MASTER
-        self._names = {topic: options.topic_name(topic) for topic in PublishedTopic}
+        self._names = {topic: topic.full_name for topic in PublishedTopic}
         self._topics = {name: topic for topic, name in self._names.items()}
         self._store = ros1_store()
         self._maker = MessageMaker(options, ros1_types(self._store))

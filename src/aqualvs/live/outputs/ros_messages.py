@@ -156,6 +156,11 @@ class PublishedTopic(StrEnum):
     CLOUD = "cloud"
     DIAGNOSTICS = "diagnostics"
 
+    @property
+    def full_name(self) -> str:
+        """The whole name; ROS looks for diagnostics at the root."""
+        return f"/{self}" if self is PublishedTopic.DIAGNOSTICS else f"/aqualvs/{self}"
+
 
 TYPE_NAMES = {
     PublishedTopic.POSTURE: "geometry_msgs/msg/PoseWithCovarianceStamped",
@@ -191,40 +196,27 @@ class RosTypes:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RosOptions:
-    """Names, and how hard it is tried to deliver.
+    """Name of the frame, and how hard it is tried to deliver.
 
-    Raises `OptionError` if a name is none that ROS allows, or the period is not positive.
+    Raises `OptionError` if the name is none that ROS allows.
     """
 
-    # What the topics' names start with; `diagnostics` stays at the root, where ROS looks for it.
-    namespace: str = "aqualvs"
     # Name of the frame at the dome's centre, forward, left, up.
     frame_id: str = "aqualvs_dome"
     # ROS 2: offer to repeat what gets lost. Then every subscriber fits, whichever it asks for;
     # without, only those that ask for best effort.
     reliable: bool = True
 
-    diagnostics_period_s: float = 1.0
-
     def __post_init__(self) -> None:
-        for what, name in (("namespace", self.namespace), ("frame", self.frame_id)):
-            if not _NAME.fullmatch(name):
-                raise OptionError(
-                    f"ROS {what} {name!r}: use letters, digits and _, starting with a letter; "
-                    "parts are joined by /, without one in front"
-                )
-        if not self.diagnostics_period_s > 0.0:
-            raise OptionError(f"period of diagnostics {self.diagnostics_period_s:g} s: not above 0")
-
-    def topic_name(self, topic: PublishedTopic) -> str:
-        """Return the full name of a topic."""
-        return (
-            "/diagnostics" if topic is PublishedTopic.DIAGNOSTICS else f"/{self.namespace}/{topic}"
-        )
+        if not _NAME.fullmatch(self.frame_id):
+            raise OptionError(
+                f"ROS frame {self.frame_id!r}: use letters, digits and _, starting with a letter; "
+                "parts are joined by /, without one in front"
+            )
 
 
 class MessageMaker:
-    """Converter of samples to messages of some types; diagnostics once per period."""
+    """Converter of samples to messages of some types; diagnostics once a second."""
 
     def __init__(self, options: RosOptions, types: RosTypes) -> None:
         self._options, self._types = options, types
@@ -324,7 +316,8 @@ class MessageMaker:
         now = sample.instants.scanned_ns
         if self._next_diagnostics_ns is not None and now < self._next_diagnostics_ns:
             return False
-        self._next_diagnostics_ns = now + round(1e9 * self._options.diagnostics_period_s)
+        second_ns = 1_000_000_000
+        self._next_diagnostics_ns = now + second_ns
         return True
 
 
