@@ -55,9 +55,7 @@ def measured(dive: str, camera: str, pixels: float = 1.0) -> FrameResult:
         if not WHOLE:
             # All light as it is; what it does not reach is coarse.
             patch.setattr(dive_of, "Renderer", QuickRenderer)
-        files = simulate_dive(
-            scenario, rig, Path(folder), camera=simulated_camera(camera), threads=2
-        )
+        files = simulate_dive(scenario, rig, Path(folder), camera=simulated_camera(camera))
         with files.truth.open(encoding="utf-8") as file:
             rows = [[float(row[name]) for name in _TRUTH] for row in csv.DictReader(file)]
         scanner = Scanner(rig)

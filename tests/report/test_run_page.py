@@ -195,10 +195,8 @@ def test_residuals_of_exact_points_vanish(dive: Dive) -> None:
     assert summary.labels[:2, Label.CLUTTER].tolist() == [40, 40]
 
 
-def test_truth_gives_the_errors(dive: Dive, tmp_path: Path) -> None:
-    page = write_report(
-        dive.folder, truth=write_truth(dive, bias_mm=2.0), out=tmp_path / "r.html"
-    ).read_text()
+def test_truth_gives_the_errors(dive: Dive) -> None:
+    page = write_report(dive.folder, truth=write_truth(dive, bias_mm=2.0)).read_text()
     text = " ".join(visible(page).split())
     assert "Error against truth, 31 frames" in text
     assert "range, mm 2.00 2.00" in text
@@ -376,12 +374,14 @@ def test_foreign_truth_is_refused(dive: Dive, tmp_path: Path) -> None:
     path = tmp_path / "truth.csv"
     path.write_text("frame,range_mm,pitch_deg,yaw_deg\n999,1,2,3\n")
     with pytest.raises(SourceError, match=r"truth\.csv: no frame in common"):
-        write_report(dive.folder, truth=path, out=tmp_path / "r.html")
+        write_report(dive.folder, truth=path)
 
 
-def test_unwritable_page_names_file_and_remedy(dive: Dive, tmp_path: Path) -> None:
-    with pytest.raises(OutputError, match=r"r\.html: cannot write the report"):
-        write_report(dive.folder, out=tmp_path / "absent" / "r.html")
+def test_unwritable_page_names_file_and_remedy(tmp_path: Path) -> None:
+    folder = make_dive(tmp_path).folder
+    (folder / "report.html").mkdir()
+    with pytest.raises(OutputError, match=r"report\.html: cannot write the report"):
+        write_report(folder)
 
 
 def test_warnings_say_what_is_wrong(tmp_path: Path) -> None:
@@ -548,7 +548,7 @@ def test_page_of_a_long_dive_stays_small(tmp_path: Path) -> None:
     data = data_of(page.read_text())
     assert sum(len(laser["x"]) for laser in data["cloud"]["lasers"]) == 15_000
     assert max(len(strip["x"]) for strip in data["posture"]["strips"]) <= 4000
-    again = data_of(write_report(tmp_path, out=tmp_path / "again.html").read_text())
+    again = data_of(write_report(tmp_path).read_text())
     assert again["cloud"] == data["cloud"]
 
 

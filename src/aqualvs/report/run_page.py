@@ -215,7 +215,7 @@ def _decoded_or_why(
     return images, ""
 
 
-def write_report(run_dir: Path, *, truth: Path | None = None, out: Path | None = None) -> Path:
+def write_report(run_dir: Path, *, truth: Path | None = None) -> Path:
     """Write the report of a finished or interrupted run.
 
     Parameters
@@ -225,13 +225,11 @@ def write_report(run_dir: Path, *, truth: Path | None = None, out: Path | None =
         what belongs to it and the source that `run.yaml` names are used if they are there.
     truth : Path or None
         CSV with columns `frame,range_mm,pitch_deg,yaw_deg`, overlaid with the errors.
-    out : Path or None
-        The file to write; `report.html` in `run_dir` if None.
 
     Returns
     -------
     path : Path
-        The page. It carries all it needs and asks no network.
+        The page, `report.html` in `run_dir`. It carries all it needs and asks no network.
 
     Raises
     ------
@@ -242,7 +240,7 @@ def write_report(run_dir: Path, *, truth: Path | None = None, out: Path | None =
     """
     material = gather(run_dir, truth)
     text = html.page("report.html", _content(material))
-    path = out or run_dir / "report.html"
+    path = run_dir / "report.html"
     try:
         replace_text(path, text)
     except OSError as fault:

@@ -122,8 +122,6 @@ class DiveFiles:
     # `dive.mp4` and `truth.csv`.
     video: Path
     truth: Path
-    # `points_FFFF.npz` of the requested frames.
-    points: tuple[Path, ...]
     # Frames written.
     n_frames: int
 
@@ -137,7 +135,6 @@ def simulate_dive(
     point_frames: Collection[int] = (),
     camera: SimulatedCamera = IDEAL,
     recording: Compression | None = None,
-    threads: int | None = None,
 ) -> DiveFiles:
     """Render a scenario with a rig and write `dive.mp4`, `truth.csv` and, if asked, lit points.
 
@@ -161,8 +158,6 @@ def simulate_dive(
         Sensor and processing; see `aqualvs.simulation.cameras`.
     recording : Compression, optional
         Compression of the video; by default the camera's.
-    threads : int, optional
-        Number of threads; by default one a core. The pictures do not depend on it.
 
     Raises
     ------
@@ -174,8 +169,7 @@ def simulate_dive(
     check_shutter(rig.shutter, scenario.fps)
     _make_folder(out_dir)
     video, truth = out_dir / "dive.mp4", out_dir / "truth.csv"
-    renderer = Renderer(rig, threads=threads or os.cpu_count() or 1, camera=camera)
-    points: list[Path] = []
+    renderer = Renderer(rig, threads=os.cpu_count() or 1, camera=camera)
     with (
         _open_table(truth) as file,
         VideoWriter(
@@ -201,10 +195,10 @@ def simulate_dive(
                 row = truth_row(frame, at, scene, rig, lit)
                 table.writerow([*row, rig.shutter.field_of(frame)] if is_interlaced else row)
                 if frame in point_frames:
-                    points.append(_write_points(out_dir / f"points_{frame:04d}.npz", lit))
+                    _write_points(out_dir / f"points_{frame:04d}.npz", lit)
             if progress is not None:
                 progress(i + 1, scenario.n_frames)
-    return DiveFiles(video, truth, tuple(points), scenario.n_frames)
+    return DiveFiles(video, truth, scenario.n_frames)
 
 
 def frames_of_picture(picture: int, t: float, shutter: Shutter) -> list[tuple[int, float]]:
@@ -288,7 +282,7 @@ def _open_table(path: Path) -> TextIO:
         ) from None
 
 
-def _write_points(path: Path, lit: LitPoints) -> Path:
+def _write_points(path: Path, lit: LitPoints) -> None:
     try:
         np.savez_compressed(
             path,
@@ -302,4 +296,3 @@ def _write_points(path: Path, lit: LitPoints) -> Path:
         raise OutputError(
             f"{path}: {error.strerror}; choose a folder that can be written"
         ) from None
-    return path

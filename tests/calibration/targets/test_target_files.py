@@ -223,7 +223,7 @@ def test_markers_survive_their_file(tmp_path):
         plane_names=("forward",),
         planes={"forward": Plane(np.array([0.0, 1.0, 0.0]), 0.7)},
     )
-    save_markers(markers, tmp_path / "box.yaml", note="colons: too")
+    save_markers(markers, tmp_path / "box.yaml")
     again, n_nominal = load_box(tmp_path / "box.yaml")
     assert n_nominal is None
     assert np.array_equal(again.corners, corners)

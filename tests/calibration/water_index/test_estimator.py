@@ -379,15 +379,13 @@ def test_a_frame_takes_each_corner_once_and_not_too_many() -> None:
 
 
 def test_priors() -> None:
-    prior = IndexPrior.seawater(15.0, 35.0, sigma_wavelength_nm=0.0)
+    prior = IndexPrior.seawater(15.0, 35.0)
     assert prior.n == pytest.approx(float(seawater_index_vacuum(15.0, 35.0)))
     by_temperature = float(seawater_index_vacuum(15.5, 35.0)) - prior.n
     by_salinity = float(seawater_index_vacuum(15.0, 35.5)) - prior.n
-    expected = np.hypot(np.hypot(by_temperature, by_salinity), 1.5e-5)
-    assert prior.sigma == pytest.approx(expected, rel=0.01)
-    by_colour = IndexPrior.seawater(15.0, 35.0)
-    slope = float(seawater_index_vacuum(15.0, 35.0, 537.0)) - prior.n
-    assert by_colour.sigma == pytest.approx(np.hypot(prior.sigma, slope), rel=0.02)
+    by_colour = float(seawater_index_vacuum(15.0, 35.0, 537.0)) - prior.n
+    parts = (by_temperature, by_salinity, by_colour, 1.5e-5)
+    assert prior.sigma == pytest.approx(np.linalg.norm(parts), rel=0.02)
     with pytest.raises(OptionError, match="1 to 2"):
         IndexPrior(0.9, 1e-4)
     with pytest.raises(OptionError, match="positive"):

@@ -37,6 +37,8 @@ class _PoseOptions(NamedTuple):
     """Initial guess of a target's pose."""
 
     min_points: int = 4
+    # Nominal noise of a corner; counts if a view has few points.
+    sigma_px: float = 0.1
     # Extents of a target, relative to its largest, below which it is a line, flat, and nearly flat.
     line: float = 1e-3
     flat: float = 1e-6
@@ -73,12 +75,7 @@ class TargetPose:
 
 
 def target_pose(
-    camera: Camera,
-    view: View,
-    *,
-    start: SE3 | None = None,
-    sigma_px: float = 0.1,
-    max_rms_px: float = MAX_RMS_PX,
+    camera: Camera, view: View, *, start: SE3 | None = None, max_rms_px: float = MAX_RMS_PX
 ) -> TargetPose:
     """Find the pose of a target, by default without an initial guess.
 
@@ -90,8 +87,6 @@ def target_pose(
         At least four points that are not on one line; up to about a third may be wrong.
     start : SE3, optional
         Pose to begin from, where it is known roughly: no other is tried unless it fails.
-    sigma_px : float
-        Nominal noise of a corner; counts if a view has few points.
     max_rms_px : float
         Largest residual of the inliers of a view of this target. Infinite accepts any pose.
 
@@ -103,16 +98,16 @@ def target_pose(
     rays = camera.rays(view.pixels)
     _check(view, rays)
     starts = closed_form_poses(view, rays) if start is None else iter([start])
-    best, rival = _best_two(camera, view, starts, sigma_px)
-    if best is None or _doubtful(best, sigma_px, max_rms_px):
+    best, rival = _best_two(camera, view, starts)
+    if best is None or _doubtful(best, max_rms_px):
         robust = _start_despite_outliers(camera, view, rays)
         if robust is not None:
-            again, second = _best_two(camera, view, iter([robust]), sigma_px)
+            again, second = _best_two(camera, view, iter([robust]))
             if again is not None and (best is None or _better(again, best)):
                 best, rival = again, second
-    if best is None or _rms_px(best, sigma_px) > max_rms_px or _believed(best) < _POSE.min_points:
-        raise CalibrationError(_not_found(view, best, sigma_px))
-    return _result(best, rival, sigma_px)
+    if best is None or _rms_px(best) > max_rms_px or _believed(best) < _POSE.min_points:
+        raise CalibrationError(_not_found(view, best))
+    return _result(best, rival)
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +116,6 @@ class _PoseProblem:
 
     camera: Camera
     view: View
-    sigma_px: float
 
     @property
     def n_parameters(self) -> int:
@@ -135,8 +129,8 @@ class _PoseProblem:
             Block(
                 _CORNERS,
                 np.arange(6),
-                (pixels - self.view.pixels) / self.sigma_px,
-                by_point @ point_by_pose(points, middle) / self.sigma_px,
+                (pixels - self.view.pixels) / _POSE.sigma_px,
+                by_point @ point_by_pose(points, middle) / _POSE.sigma_px,
             )
         ]
 
@@ -167,9 +161,9 @@ def _extents(points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def _best_two(
-    camera: Camera, view: View, starts: Iterator[SE3], sigma_px: float
+    camera: Camera, view: View, starts: Iterator[SE3]
 ) -> tuple[Solution[SE3] | None, Solution[SE3] | None]:
-    problem = _PoseProblem(camera, view, sigma_px)
+    problem = _PoseProblem(camera, view)
     found: list[Solution[SE3]] = []
     for start in starts:
         try:
@@ -190,14 +184,14 @@ def _believed(solution: Solution[SE3]) -> int:
     return int(np.count_nonzero(solution.inliers[0]))
 
 
-def _rms_px(solution: Solution[SE3], sigma_px: float) -> float:
-    residuals = solution.blocks[0].residuals[solution.inliers[0]] * sigma_px
+def _rms_px(solution: Solution[SE3]) -> float:
+    residuals = solution.blocks[0].residuals[solution.inliers[0]] * _POSE.sigma_px
     return float(np.sqrt(np.mean(np.sum(residuals**2, axis=1)))) if len(residuals) else np.inf
 
 
-def _doubtful(solution: Solution[SE3], sigma_px: float, max_rms_px: float) -> bool:
+def _doubtful(solution: Solution[SE3], max_rms_px: float) -> bool:
     share = _believed(solution) / len(solution.inliers[0])
-    return share < _POSE.few_inliers or _rms_px(solution, sigma_px) > min(max_rms_px, MAX_RMS_PX)
+    return share < _POSE.few_inliers or _rms_px(solution) > min(max_rms_px, MAX_RMS_PX)
 
 
 def _better(a: Solution[SE3], b: Solution[SE3]) -> bool:
@@ -294,15 +288,15 @@ def _start_despite_outliers(camera: Camera, view: View, rays: Rays) -> SE3 | Non
     return pinhole.pose(rotvec, translation) if found else None
 
 
-def _result(best: Solution[SE3], rival: Solution[SE3] | None, sigma_px: float) -> TargetPose:
+def _result(best: Solution[SE3], rival: Solution[SE3] | None) -> TargetPose:
     scale = best.scales[_CORNERS]
     freedom = 2.0 * _believed(best) - 6.0
     # Number of observations at the nominal noise that are added to a view's own residuals in the
     # noise estimate: the eight residuals of a single marker leave two degrees of freedom.
     prior_freedom = 8.0
     tempered = (freedom * scale**2 + prior_freedom) / (freedom + prior_freedom)
-    rms = _rms_px(best, sigma_px)
-    ambiguous = rival is not None and _rms_px(rival, sigma_px) < _POSE.rival * rms + 0.1 * sigma_px
+    rms = _rms_px(best)
+    ambiguous = rival is not None and _rms_px(rival) < _POSE.rival * rms + 0.1 * _POSE.sigma_px
     return TargetPose(
         dome_from_target=best.state,
         covariance=best.covariance * (tempered / scale**2),
@@ -312,8 +306,8 @@ def _result(best: Solution[SE3], rival: Solution[SE3] | None, sigma_px: float) -
     )
 
 
-def _not_found(view: View, best: Solution[SE3] | None, sigma_px: float) -> str:
-    fit = "" if best is None else f" (the best leaves {_rms_px(best, sigma_px):.1f} px)"
+def _not_found(view: View, best: Solution[SE3] | None) -> str:
+    fit = "" if best is None else f" (the best leaves {_rms_px(best):.1f} px)"
     return (
         f"{view.name}: no pose of the target explains its {len(view)} points{fit}; check the "
         "target's file against the print, and the rig and medium against the picture"
@@ -353,8 +347,9 @@ def _judged(camera: Camera, view: View, pose: SE3) -> StartPose:
     return StartPose(pose, float(np.median(off)))
 
 
-def thinned(view: View, n_points: int = _POSE.enough_points) -> View:
+def thinned(view: View) -> View:
     """Return a view with a limited number of points, spread over the target."""
+    n_points = _POSE.enough_points
     if len(view) <= n_points:
         return view
     keep = np.zeros(len(view), np.bool_)

@@ -467,14 +467,12 @@ def save_board(board: Board, path: str | Path, *, note: str = "") -> None:
     write_text(Path(path), _yaml(content))
 
 
-def save_markers(markers: MarkerSet, path: str | Path, *, note: str = "") -> None:
+def save_markers(markers: MarkerSet, path: str | Path) -> None:
     """Write a `box.yaml` or `target.yaml` in the form that `load_box` and `load_target` read.
 
     Raises `OutputError` if the file cannot be written.
     """
     content: dict[str, Any] = {"frame": _FRAME_TEXTS.get(markers.frame, markers.frame)}
-    if note:
-        content["note"] = note
     if markers.planes:
         content["planes"] = {
             name: {"normal": _plain(plane.normal), "d": _to_mm(plane.offset)}

@@ -50,27 +50,16 @@ class IndexPrior:
 
     @classmethod
     def seawater(
-        cls,
-        temperature_c: float,
-        salinity_permille: float,
-        *,
-        sigma_temperature_c: float = 0.5,
-        sigma_salinity_permille: float = 0.5,
-        wavelength_nm: float = GREEN_NM,
-        sigma_wavelength_nm: float = 5.0,
-        n_air: float = N_AIR,
+        cls, temperature_c: float, salinity_permille: float, *, n_air: float = N_AIR
     ) -> "IndexPrior":
         """Return the prior from temperature and salinity, by Quan & Fry (1995).
+
+        The target is seen in the colour of the lasers (the green channel).
 
         Parameters
         ----------
         temperature_c, salinity_permille : float
             0 to 30 degrees Celsius and 0 to 40 per mille.
-        sigma_temperature_c, sigma_salinity_permille : float
-            Standard deviations of the two.
-        wavelength_nm, sigma_wavelength_nm : float
-            Of the light in which the target is seen. 5 nm change the index by 2e-4: look at the
-            target in the colour of the lasers (the green channel).
         n_air : float
             Index of air relative to vacuum, a factor on the formula.
 
@@ -79,17 +68,17 @@ class IndexPrior:
         OptionError
             If a value lies outside the formula's range.
         """
-        n = float(seawater_index_vacuum(temperature_c, salinity_permille, wavelength_nm))
-        slopes = seawater_index_slopes(temperature_c, salinity_permille, wavelength_nm)
+        # Standard deviations; 5 nm change the index by 2e-4. The last is of the fit of Quan & Fry
+        # (1995) to its data.
+        sigma_c, sigma_permille, sigma_nm, sigma_formula = 0.5, 0.5, 5.0, 1.5e-5
         step_nm = 1.0
-        side = math.copysign(step_nm, GREEN_NM - wavelength_nm)
-        beside = seawater_index_vacuum(temperature_c, salinity_permille, wavelength_nm + side)
-        # Standard deviation of the fit of Quan & Fry (1995) to its data.
-        sigma_formula = 1.5e-5
+        n = float(seawater_index_vacuum(temperature_c, salinity_permille))
+        slopes = seawater_index_slopes(temperature_c, salinity_permille)
+        beside = seawater_index_vacuum(temperature_c, salinity_permille, GREEN_NM + step_nm)
         parts = (
-            float(slopes.by_temperature) * sigma_temperature_c,
-            float(slopes.by_salinity) * sigma_salinity_permille,
-            (float(beside) - n) / step_nm * sigma_wavelength_nm,
+            float(slopes.by_temperature) * sigma_c,
+            float(slopes.by_salinity) * sigma_permille,
+            (float(beside) - n) / step_nm * sigma_nm,
             sigma_formula,
         )
         source = f"{temperature_c:g} °C, {salinity_permille:g} per mille"
