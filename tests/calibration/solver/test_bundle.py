@@ -125,14 +125,14 @@ def test_considered_numbers_pass_their_errors_on() -> None:
     problem = dome_problem(rig, [shoot.as_set()], INTRINSICS, options)
     bundle = problem.bundle
     # All noise at its nominal size, so that both solves weigh alike.
-    found = solve(bundle, bundle.start, reject=False)
+    found = solve(bundle, bundle.start)
     names, covariance = consider_covariance(bundle, found, problem.considered)
     shift = 0.2 * np.sqrt(INTRINSICS.of(["cx"])[0, 0])
     held = names.index("cx") - len(names)
     gain = covariance[:, held] / INTRINSICS.of(["cx"])[0, 0]
     there = replace(found.state, rig=rig_moved_by(found.state.rig, ["cx"], np.array([shift])))
     start = replace(bundle.start, rig=rig_moved_by(bundle.start.rig, ["cx"], np.array([shift])))
-    moved = solve(replace(bundle, start=start), there, reject=False)
+    moved = solve(replace(bundle, start=start), there)
     off = rig_difference(there.rig, moved.state.rig, bundle.free)
     sigma = np.sqrt(np.diag(found.covariance))[: len(off)]
     # Noise scales, and with them the weights, move a little with the shift.

@@ -67,7 +67,7 @@ def _line(seed: int, noise: float, n: int = N) -> tuple[FloatArray, FloatArray]:
 
 def test_agrees_with_the_closed_form_and_its_covariance() -> None:
     x, y = _line(1, 0.5)
-    found = solve(Linear((x,), (y,), loss=RobustLoss.SQUARE), np.zeros(2), reject=False)
+    found = solve(Linear((x,), (y,), loss=RobustLoss.SQUARE), np.zeros(2))
     design = _by(x).reshape(-1, 2)
     answer, squares, _, _ = np.linalg.lstsq(design, y.reshape(-1), rcond=None)
     np.testing.assert_allclose(found.state, answer, rtol=1e-9)
@@ -100,12 +100,6 @@ def test_outliers_are_left_out(share: float) -> None:
     # Steps below a fiftieth of a sigma are not taken.
     sigma = np.sqrt(np.diag(alone.covariance))
     assert np.all(np.abs(found.state - alone.state) < 0.02 * sigma)
-
-
-def test_nothing_is_rejected_when_not_asked() -> None:
-    x, y = _line(3, 0.1)
-    y[0] += 50.0
-    assert solve(Linear((x,), (y,)), np.zeros(2), reject=False).inliers[0].all()
 
 
 def test_noisy_blocks_weigh_less() -> None:

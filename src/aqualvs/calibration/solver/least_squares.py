@@ -354,20 +354,14 @@ class Solution(Generic[State]):
 
 
 def solve(
-    problem: Problem[State],
-    start: State,
-    *,
-    reject: bool = True,
-    remedy: Callable[[int], str] | None = None,
+    problem: Problem[State], start: State, *, remedy: Callable[[int], str] | None = None
 ) -> Solution[State]:
-    """Minimise the residuals of a problem.
+    """Minimise the residuals of a problem, without observations beyond five scales.
 
     Parameters
     ----------
     start : State
         Initial guess, near enough to the solution for Newton's method.
-    reject : bool
-        Whether to leave out observations beyond five scales.
     remedy : callable, optional
         Gives the message, with the remedy, for a parameter that is not determined.
 
@@ -377,7 +371,7 @@ def solve(
         If a parameter is not determined, or nothing can be seen from the start.
     """
     try:
-        return _solved(_Run(problem, start, reject))
+        return _solved(_Run(problem, start))
     except FreeParameterError as fault:
         if remedy is None:
             raise
@@ -419,7 +413,6 @@ class _Run(Generic[State]):
 
     problem: Problem[State]
     state: State
-    reject: bool
     blocks: tuple[Block, ...] = ()
     inliers: list[BoolArray] = field(default_factory=list)
     scales: list[float] = field(default_factory=list)
@@ -467,8 +460,7 @@ class _Run(Generic[State]):
         equations = self._equations()
         freedom = freedoms(self.blocks, self.inliers, equations, inverse(equations.information))
         largest = largest_scales(self.blocks, freedom)
-        if self.reject:
-            self.inliers = believed(self.blocks, self.scales, largest)
+        self.inliers = believed(self.blocks, self.scales, largest)
         now = self.blocks, self.inliers, self.scales, freedom, largest
         self.typical = group_scales(*now)
         self.scales = block_scales(*now, self.typical)
