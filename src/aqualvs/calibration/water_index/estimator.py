@@ -142,7 +142,7 @@ class IndexEstimator:
     uncertainty: RigUncertainty = field(default_factory=RigUncertainty.none)  # Of the rig.
     # Assumptions about target and medium.
     options: IndexOptions = field(default_factory=IndexOptions)
-    # Prior of the index at the first frame; `set_prior` gives a later one.
+    # Prior of the index at the first frame.
     prior: IndexPrior | None = None
     # All alarms so far.
     steps: list[IndexStep] = field(default_factory=list)
@@ -187,12 +187,6 @@ class IndexEstimator:
             return self._next(view.name, self._state, frame)
         except RigError as error:
             return self._reading(time, view.name, f"no camera sees the target so ({error})")
-
-    def set_prior(self, prior: IndexPrior | None) -> None:
-        """Set a prior of the index at the last frame, for example from a thermometer."""
-        self.prior, self._contradicted, self._since_prior = prior, False, 0.0
-        if self._state is not None:
-            self._state = self._state.anchored()
 
     @property
     def state(self) -> IndexState | None:

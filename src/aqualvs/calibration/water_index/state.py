@@ -86,7 +86,7 @@ class IndexPrior:
 
 
 N, ANCHOR, BEFORE = 0, 1, 2
-"""Present index; index when the prior was given; index before the last step."""
+"""Present index; index at the first frame, of which the prior is; index before the last step."""
 N_INDICES = 3
 POSE = slice(3, 9)
 FIRST_CAMERA = 9
@@ -143,18 +143,15 @@ class IndexState:
             self, time=time, covariance=covariance, random_variance=self.random_variance + grown
         )
 
-    def anchored(self) -> "IndexState":
-        """Return the state with the present index copied to the anchor, for a later prior."""
-        return self._copied(ANCHOR)
-
     def stepped(self, n: float, sigma: float) -> "IndexState":
         """Return the state after the index has jumped to about `n`; the constants stay known."""
-        kept = self._copied(BEFORE)
-        mean, covariance = kept.mean.copy(), kept.covariance
-        mean[N] = n
+        mean, covariance = self.mean.copy(), self.covariance.copy()
+        mean[BEFORE], mean[N] = mean[N], n
+        covariance[BEFORE] = covariance[N]
+        covariance[:, BEFORE] = covariance[:, N]
         covariance[N, N] += sigma**2
         return replace(
-            kept, mean=mean, covariance=covariance, random_variance=self.random_variance + sigma**2
+            self, mean=mean, covariance=covariance, random_variance=self.random_variance + sigma**2
         )
 
     def with_slopes_near(self) -> "IndexState":
@@ -232,14 +229,6 @@ class IndexState:
             mean=self.mean + reach * ((n - self.mean[ANCHOR]) / variance),
             covariance=self.covariance - np.outer(reach, reach) / variance,
         )
-
-    def _copied(self, entry: int) -> "IndexState":
-        mean, covariance = self.mean.copy(), self.covariance.copy()
-        mean[entry] = mean[N]
-        covariance[entry] = covariance[N]
-        covariance[:, entry] = covariance[:, N]
-        covariance[entry, entry] = self.covariance[N, N]
-        return replace(self, mean=mean, covariance=covariance)
 
 
 def first_state(
