@@ -14,9 +14,9 @@ from matplotlib.figure import Figure
 from aqualvs.experiments.experiment import (
     DataColumns,
     Experiment,
-    ExperimentFigure,
     ExperimentResult,
     ExperimentRow,
+    drawn,
 )
 from aqualvs.experiments.growth_and_sun import scene
 from aqualvs.experiments.laboratory import Laboratory, RenderedDive, Variant, compared
@@ -26,7 +26,7 @@ from aqualvs.geometry.planes import Plane
 from aqualvs.geometry.transforms import SE3
 from aqualvs.optics.rig import Laser, Rig, Window
 from aqualvs.optics.sheet import sheets_of
-from aqualvs.report.figure_style import BLUE, GREEN, GREY, ORANGE, new_figure
+from aqualvs.report.figure_style import BLUE, GREEN, GREY, ORANGE
 from aqualvs.simulation.lasers import LaserSource, default_sources
 from aqualvs.simulation.scenario import Scenario, parse_scenario
 from aqualvs.simulation.video import Compression
@@ -204,12 +204,13 @@ def _run_beliefs(laboratory: Laboratory) -> ExperimentResult:
             ),
         ),
         pictures=(
-            ExperimentFigure(
-                name="ablation_beliefs",
-                caption="Largest range error before the wall at the paper's four distances when "
+            drawn(
+                "ablation_beliefs",
+                "Largest range error before the wall at the paper's four distances when "
                 "the scanner believes another index of the water (left) or another place of the "
                 "lens in the dome (right).",
-                figure=_drawn(index, lens),
+                2.7,
+                lambda figure: _draw_beliefs(figure, index, lens),
             ),
         ),
         series=(
@@ -256,19 +257,17 @@ def _slope(steps: Sequence[float], percent: FloatArray) -> float:
     return float(abs(np.polyfit(np.array(steps)[told], percent[told], 1)[0]))
 
 
-def _drawn(index: FloatArray, lens: FloatArray) -> Figure:
-    with new_figure(2.7) as figure:
-        left, right = figure.subplots(1, 2)
-        left.plot(_INDEX_STEPS, index, ".-", color=BLUE)
-        left.set_xlabel("error of the index believed")
-        left.set_ylabel("error of the range (%)")
-        for row, name, colour in zip(lens, _AXES, _COLOURS, strict=True):
-            right.plot(_LENS_STEPS_MM, row, ".-", color=colour, label=name)
-        right.set_xlabel("error of the lens's place believed (mm)")
-        right.legend(loc="best")
-        for axes in (left, right):
-            axes.axhline(0.0, color=GREY, linewidth=0.7)
-    return figure
+def _draw_beliefs(figure: Figure, index: FloatArray, lens: FloatArray) -> None:
+    left, right = figure.subplots(1, 2)
+    left.plot(_INDEX_STEPS, index, ".-", color=BLUE)
+    left.set_xlabel("error of the index believed")
+    left.set_ylabel("error of the range (%)")
+    for row, name, colour in zip(lens, _AXES, _COLOURS, strict=True):
+        right.plot(_LENS_STEPS_MM, row, ".-", color=colour, label=name)
+    right.set_xlabel("error of the lens's place believed (mm)")
+    right.legend(loc="best")
+    for axes in (left, right):
+        axes.axhline(0.0, color=GREY, linewidth=0.7)
 
 
 BELIEFS = Experiment(

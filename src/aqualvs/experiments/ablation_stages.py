@@ -12,15 +12,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from aqualvs.experiments.experiment import (
-    DataColumns,
-    Experiment,
-    ExperimentFigure,
-    ExperimentResult,
-    ExperimentRow,
-)
+from aqualvs.experiments.experiment import DataColumns, Experiment, ExperimentResult, ExperimentRow
 from aqualvs.experiments.growth_and_sun import scene
-from aqualvs.experiments.laboratory import Laboratory, RenderedDive, Variant, compared, drawn, told
+from aqualvs.experiments.laboratory import (
+    Laboratory,
+    RenderedDive,
+    Variant,
+    compared,
+    told,
+    variants_picture,
+)
 from aqualvs.experiments.mesh_filter import (
     Judged,
     LitTruth,
@@ -233,11 +234,11 @@ def _run_filters(laboratory: Laboratory) -> ExperimentResult:
         f"{100 * centres:.0f} %.",
         findings=tuple(finding for row in rows for finding in row.findings()),
         pictures=(
-            ExperimentFigure(
-                name="ablation_filters",
-                caption="Posture on the net of the mesh experiment with the adaptive filter, and "
+            variants_picture(
+                "ablation_filters",
+                "Posture on the net of the mesh experiment with the adaptive filter, and "
                 "with a threshold and the paper's filter before the same search and fit.",
-                figure=drawn(_postures(laboratory, net_dive(laboratory), rows)),
+                _postures(laboratory, net_dive(laboratory), rows),
             ),
         ),
         series=(_series(rows),),

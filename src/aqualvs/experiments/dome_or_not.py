@@ -10,16 +10,16 @@ from matplotlib.figure import Figure
 from aqualvs.experiments.experiment import (
     DataColumns,
     Experiment,
-    ExperimentFigure,
     ExperimentResult,
     ExperimentRow,
+    drawn,
 )
 from aqualvs.experiments.laboratory import Laboratory, MeasuredDive, calibrated_rig
 from aqualvs.experiments.tank import wall_at_places
 from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.planes import Plane, Rays
 from aqualvs.optics.rig import Rig
-from aqualvs.report.figure_style import GREEN, OURS, PAPER, TRUTH, new_figure
+from aqualvs.report.figure_style import GREEN, OURS, PAPER, TRUTH
 from aqualvs.scanning.scan import Label, ScanPoints
 
 PLACES_MM = (*range(300, 1201, 100), 1250, *range(1150, 300, -100))
@@ -107,18 +107,20 @@ def _run(laboratory: Laboratory) -> ExperimentResult:
             *(_row(found, k, name) for k, name in enumerate((*PICKS, "average"))),
         ),
         pictures=(
-            ExperimentFigure(
-                name="figure_19",
-                caption="Distance with and without the dome model from the leftmost point and "
+            drawn(
+                "figure_19",
+                "Distance with and without the dome model from the leftmost point and "
                 "from the average of three, with straight lines through them, beside figure 19.",
-                figure=_distances_drawn(found),
+                3.1,
+                lambda figure: _draw_distances(figure, found),
             ),
-            ExperimentFigure(
-                name="figure_20",
-                caption="Errors of the lines of figure 19 (lines) and of the single distances "
+            drawn(
+                "figure_20",
+                "Errors of the lines of figure 19 (lines) and of the single distances "
                 "(dots), beside figure 20; below at a finer scale those with the dome model and "
                 "those of a laser that was calibrated without it.",
-                figure=_errors_drawn(found),
+                4.2,
+                lambda figure: _draw_errors(figure, found),
             ),
         ),
         series=(_series(found),),
@@ -228,45 +230,41 @@ def _series(found: Distances) -> DataColumns:
     return DataColumns(name="dome_or_not", columns=columns)
 
 
-def _distances_drawn(found: Distances) -> Figure:
-    with new_figure(3.1) as figure:
-        for axes, pick, name in zip(
-            figure.subplots(1, 2, sharey=True), (0, 3), ("leftmost point", "average"), strict=True
+def _draw_distances(figure: Figure, found: Distances) -> None:
+    for axes, pick, name in zip(
+        figure.subplots(1, 2, sharey=True), (0, 3), ("leftmost point", "average"), strict=True
+    ):
+        ends = np.array([min(PLACES_MM), max(PLACES_MM)])
+        axes.plot(ends, ends, color=TRUTH, linewidth=3.0, alpha=0.25, label="true")
+        for which, colour, label in (
+            (found.bare, PAPER, "no dome"),
+            (found.refitted, GREEN, "no dome, laser refitted"),
+            (found.dome, OURS, "dome"),
         ):
-            ends = np.array([min(PLACES_MM), max(PLACES_MM)])
-            axes.plot(ends, ends, color=TRUTH, linewidth=3.0, alpha=0.25, label="true")
-            for which, colour, label in (
-                (found.bare, PAPER, "no dome"),
-                (found.refitted, GREEN, "no dome, laser refitted"),
-                (found.dome, OURS, "dome"),
-            ):
-                fit = np.polyfit(found.true, which[:, pick], 1)
-                axes.plot(ends, 1e3 * np.polyval(fit, ends / 1e3), color=colour, linewidth=0.9)
-                axes.plot(1e3 * found.true, 1e3 * which[:, pick], ".", color=colour, label=label)
-            axes.set_title(name, loc="left")
-            axes.set_xlabel("true distance (mm)")
-            axes.legend(loc="upper left")
-        figure.axes[0].set_ylabel("measured distance (mm)")
-    return figure
+            fit = np.polyfit(found.true, which[:, pick], 1)
+            axes.plot(ends, 1e3 * np.polyval(fit, ends / 1e3), color=colour, linewidth=0.9)
+            axes.plot(1e3 * found.true, 1e3 * which[:, pick], ".", color=colour, label=label)
+        axes.set_title(name, loc="left")
+        axes.set_xlabel("true distance (mm)")
+        axes.legend(loc="upper left")
+    figure.axes[0].set_ylabel("measured distance (mm)")
 
 
-def _errors_drawn(found: Distances) -> Figure:
-    with new_figure(4.2) as figure:
-        grid = figure.subplots(2, 2, sharex=True, sharey="row", height_ratios=(1.4, 1.0))
-        for column, (pick, name) in enumerate(((0, "leftmost point"), (3, "average"))):
-            top, low = grid[0, column], grid[1, column]
-            _errors(top, found, found.bare, pick, PAPER, "no dome")
-            _errors(top, found, found.dome, pick, OURS, "dome")
-            _errors(low, found, found.refitted, pick, GREEN, "no dome, laser refitted")
-            _errors(low, found, found.dome, pick, OURS, "dome")
-            top.set_title(name, loc="left")
-            low.set_xlabel("true distance (mm)")
-        grid[0, 0].legend(loc="upper left")
-        grid[1, 0].legend(loc="best")
-        grid[0, 0].set_ylabel("error (%)")
-        grid[1, 0].set_ylabel("error (%)")
-        figure.align_ylabels(grid[:, 0])
-    return figure
+def _draw_errors(figure: Figure, found: Distances) -> None:
+    grid = figure.subplots(2, 2, sharex=True, sharey="row", height_ratios=(1.4, 1.0))
+    for column, (pick, name) in enumerate(((0, "leftmost point"), (3, "average"))):
+        top, low = grid[0, column], grid[1, column]
+        _errors(top, found, found.bare, pick, PAPER, "no dome")
+        _errors(top, found, found.dome, pick, OURS, "dome")
+        _errors(low, found, found.refitted, pick, GREEN, "no dome, laser refitted")
+        _errors(low, found, found.dome, pick, OURS, "dome")
+        top.set_title(name, loc="left")
+        low.set_xlabel("true distance (mm)")
+    grid[0, 0].legend(loc="upper left")
+    grid[1, 0].legend(loc="best")
+    grid[0, 0].set_ylabel("error (%)")
+    grid[1, 0].set_ylabel("error (%)")
+    figure.align_ylabels(grid[:, 0])
 
 
 def _errors(

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Self, TypeAlias
+from typing import TYPE_CHECKING, Literal, Self, TypeAlias
 
 from matplotlib.figure import Figure
 
@@ -97,20 +97,14 @@ class Experiment:
 
 
 def drawn(
-    name: str, caption: str, height_in: float, draw: Callable[[Figure], None]
+    name: str,
+    caption: str,
+    height_in: float,
+    draw: Callable[[Figure], None],
+    width: Literal["column", "page"] = "page",
 ) -> ExperimentFigure:
-    """Return a picture of a page's width.
-
-    Parameters
-    ----------
-    name, caption : str
-        As in `ExperimentFigure`.
-    height_in : float
-        Height in inches.
-    draw : callable
-        Fills the figure.
-    """
-    with new_figure(height_in) as figure:
+    """Return a picture of a height in inches, whose figure `draw` fills."""
+    with new_figure(height_in, width) as figure:
         draw(figure)
     return ExperimentFigure(name=name, caption=caption, figure=figure)
 

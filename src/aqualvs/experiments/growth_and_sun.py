@@ -15,13 +15,13 @@ from matplotlib.figure import Figure
 from aqualvs.experiments.experiment import (
     DataColumns,
     Experiment,
-    ExperimentFigure,
     ExperimentResult,
     ExperimentRow,
+    drawn,
 )
 from aqualvs.experiments.laboratory import Laboratory, MeasuredDive, RenderedDive, frames_of
 from aqualvs.geometry.arrays import BoolArray, FloatArray
-from aqualvs.report.figure_style import BLUE, GREEN, ORANGE, new_figure
+from aqualvs.report.figure_style import BLUE, GREEN, ORANGE
 from aqualvs.scanner import ScannerOptions
 from aqualvs.scanning.paper.mesh_filter import MeshFilterOptions
 from aqualvs.scanning.posture_estimator import FitMethod
@@ -149,11 +149,12 @@ def _run(laboratory: Laboratory) -> ExperimentResult:
         f"{seen['growth'].rms[0]:.2f} and {seen['sun'].rms[0]:.2f} % root mean square.",
         findings=tuple(row for name in _SCENES for row in _findings(name, seen)),
         pictures=(
-            ExperimentFigure(
-                name="figure_24",
-                caption="A frame of each scene and the errors of every frame, with two stated "
+            drawn(
+                "figure_24",
+                "A frame of each scene and the errors of every frame, with two stated "
                 "standard deviations, beside figure 24.",
-                figure=_drawn(seen),
+                5.6,
+                lambda figure: _draw(figure, seen),
             ),
         ),
         series=tuple(_series(name, one) for name, one in seen.items()),
@@ -219,35 +220,33 @@ def _series(name: str, one: MeasuredScene) -> DataColumns:
     return DataColumns(name=f"failures_{name}", columns=columns)
 
 
-def _drawn(seen: Mapping[str, MeasuredScene]) -> Figure:
-    with new_figure(5.6) as figure:
-        grid = figure.subplots(3, 3, height_ratios=(1.6, 1.0, 1.0), sharey="row")
-        for column, (name, one) in enumerate(seen.items()):
-            picture, *errors = grid[:, column]
-            colours = bgr_of(frames_of(one.dive)[_SHOWN])[..., ::-1]
-            picture.imshow(colours, interpolation="nearest")
-            picture.set_title(name, loc="left")
-            picture.set_axis_off()
-            degrees = np.degrees(one.ours.errors[:, 2])
-            percent_bar = 200.0 * one.ours.sigmas[:, 0] / one.ours.truth[:, 0]
-            bars = (percent_bar, 2.0 * np.degrees(one.ours.sigmas[:, 2]))
-            values = (one.ours.range_percent, degrees)
-            for axes, value, bar in zip(errors, values, bars, strict=True):
-                axes.axhline(0.0, color="#8a8f98", linewidth=0.7)
-                axes.errorbar(
-                    one.ours.time_s,
-                    value,
-                    yerr=bar,
-                    fmt=".",
-                    color=_COLOURS[name],
-                    markersize=3.5,
-                    elinewidth=0.6,
-                )
-            errors[-1].set_xlabel("time (s)")
-        grid[1, 0].set_ylabel("range error (%)")
-        grid[2, 0].set_ylabel("yaw error (degrees)")
-        figure.align_ylabels(grid[1:, 0])
-    return figure
+def _draw(figure: Figure, seen: Mapping[str, MeasuredScene]) -> None:
+    grid = figure.subplots(3, 3, height_ratios=(1.6, 1.0, 1.0), sharey="row")
+    for column, (name, one) in enumerate(seen.items()):
+        picture, *errors = grid[:, column]
+        colours = bgr_of(frames_of(one.dive)[_SHOWN])[..., ::-1]
+        picture.imshow(colours, interpolation="nearest")
+        picture.set_title(name, loc="left")
+        picture.set_axis_off()
+        degrees = np.degrees(one.ours.errors[:, 2])
+        percent_bar = 200.0 * one.ours.sigmas[:, 0] / one.ours.truth[:, 0]
+        bars = (percent_bar, 2.0 * np.degrees(one.ours.sigmas[:, 2]))
+        values = (one.ours.range_percent, degrees)
+        for axes, value, bar in zip(errors, values, bars, strict=True):
+            axes.axhline(0.0, color="#8a8f98", linewidth=0.7)
+            axes.errorbar(
+                one.ours.time_s,
+                value,
+                yerr=bar,
+                fmt=".",
+                color=_COLOURS[name],
+                markersize=3.5,
+                elinewidth=0.6,
+            )
+        errors[-1].set_xlabel("time (s)")
+    grid[1, 0].set_ylabel("range error (%)")
+    grid[2, 0].set_ylabel("yaw error (degrees)")
+    figure.align_ylabels(grid[1:, 0])
 
 
 EXPERIMENT = Experiment(

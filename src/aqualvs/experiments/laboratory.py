@@ -26,11 +26,12 @@ from aqualvs.experiments.experiment import (
     ExperimentFigure,
     ExperimentResult,
     ExperimentRow,
+    drawn,
 )
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.rigfile import load_rig, rig_to_mapping, save_rig
-from aqualvs.report.figure_style import GREY, OURS, new_figure
+from aqualvs.report.figure_style import GREY, OURS
 from aqualvs.results.summary import read_truth
 from aqualvs.scanner import Scanner, ScannerOptions
 from aqualvs.scanning.posture import Posture
@@ -290,7 +291,7 @@ def told(values: Sequence[float] | FloatArray) -> str:
 
 
 def series(name: str, variants: Sequence[Variant]) -> DataColumns:
-    """Return what `drawn` shows as columns."""
+    """Return what `variants_picture` shows as columns."""
     rms = np.array([one.rms for one in variants])
     columns: dict[str, FloatArray | list[str]] = {"variant": [one.name for one in variants]}
     for k, what in enumerate(("rms_range_percent", "rms_pitch_deg", "rms_yaw_deg")):
@@ -299,25 +300,28 @@ def series(name: str, variants: Sequence[Variant]) -> DataColumns:
     return DataColumns(name=name, columns=columns)
 
 
-def drawn(variants: Sequence[Variant]) -> Figure:
+def variants_picture(name: str, caption: str, variants: Sequence[Variant]) -> ExperimentFigure:
     """Draw rms errors as bars on a logarithmic scale, and the share of frames with a posture."""
+    height_in = 0.9 + 0.3 * len(variants)
+    return drawn(name, caption, height_in, lambda figure: _draw_variants(figure, variants))
+
+
+def _draw_variants(figure: Figure, variants: Sequence[Variant]) -> None:
     names = [one.name for one in variants]
     rms = np.array([one.rms for one in variants])
     valid = np.array([one.valid_percent for one in variants])
     least = 1e-3
-    with new_figure(0.9 + 0.3 * len(variants)) as figure:
-        panels = figure.subplots(1, 4, sharey=True)
-        for k, axes in enumerate(panels[:3]):
-            _bars(axes, variants, rms[:, k], QUANTITIES[k])
-            axes.set_xscale("log")
-            low = np.nanmin(np.where(rms > 0.0, rms, np.nan)) if np.isfinite(rms).any() else least
-            axes.set_xlim(0.5 * max(low, least), 4.0 * max(np.nanmax(rms), 2.0 * least))
-        _bars(panels[3], variants, valid, "valid frames (%)")
-        panels[3].set_xlim(0.0, 125.0)
-        panels[0].set_yticks(range(len(names)), names)
-        panels[0].invert_yaxis()
-        panels[0].set_title("rms error", loc="left")
-    return figure
+    panels = figure.subplots(1, 4, sharey=True)
+    for k, axes in enumerate(panels[:3]):
+        _bars(axes, variants, rms[:, k], QUANTITIES[k])
+        axes.set_xscale("log")
+        low = np.nanmin(np.where(rms > 0.0, rms, np.nan)) if np.isfinite(rms).any() else least
+        axes.set_xlim(0.5 * max(low, least), 4.0 * max(np.nanmax(rms), 2.0 * least))
+    _bars(panels[3], variants, valid, "valid frames (%)")
+    panels[3].set_xlim(0.0, 125.0)
+    panels[0].set_yticks(range(len(names)), names)
+    panels[0].invert_yaxis()
+    panels[0].set_title("rms error", loc="left")
 
 
 def compared(
@@ -337,7 +341,7 @@ def compared(
     return ExperimentResult(
         sentence=sentence,
         findings=(*findings(variants), *more_findings),
-        pictures=(ExperimentFigure(name=name, caption=caption, figure=drawn(variants)),),
+        pictures=(variants_picture(name, caption, variants),),
         series=(series(name, variants),),
         notes=notes,
     )

@@ -23,11 +23,12 @@ from aqualvs.experiments.experiment import (
     ExperimentFigure,
     ExperimentResult,
     ExperimentRow,
+    drawn,
 )
 from aqualvs.experiments.laboratory import Laboratory, MeasuredDive, RenderedDive, frames_of, told
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.optics.rig import Rig
-from aqualvs.report.figure_style import OURS, PINK, new_figure
+from aqualvs.report.figure_style import OURS, PINK
 from aqualvs.report.mesh_figures import Reflections, drawn_figures
 from aqualvs.scanner import ScannerOptions
 from aqualvs.scanning.laser_bands import plan_bands
@@ -346,29 +347,30 @@ def _pictures(
 ) -> tuple[ExperimentFigure, ...]:
     laser = level_laser(rig)
     reflections = _reflections(papers, scan, rig, laser)
-    drawn = drawn_figures(reflections, MeshFilterOptions())
+    planes = drawn_figures(reflections, MeshFilterOptions())
     return (
-        ExperimentFigure(
-            name="figure_12",
-            caption="The net as the camera sees it, and the picture above a threshold, beside "
-            "figure 12.",
-            figure=_seen(frame),
+        drawn(
+            "figure_12",
+            "The net as the camera sees it, and the picture above a threshold, beside figure 12.",
+            2.9,
+            lambda figure: _draw_seen(figure, frame),
         ),
         ExperimentFigure(
             name="figure_13",
             caption="All reflections of the level laser in its plane, beside figure 13.",
-            figure=drawn["figure_13"],
+            figure=planes["figure_13"],
         ),
-        ExperimentFigure(
-            name="figure_14",
-            caption="What is taken for net, beside figure 14: sub-pixel returns and the adaptive "
+        drawn(
+            "figure_14",
+            "What is taken for net, beside figure 14: sub-pixel returns and the adaptive "
             "filter (left), a threshold and the paper's filter (right).",
-            figure=_filtered(papers, scan, rig, laser),
+            2.6,
+            lambda figure: _draw_filtered(figure, papers, scan, rig, laser),
         ),
         ExperimentFigure(
             name="laser_plane_image",
             caption="The paper's laser-plane image with its structuring elements, beside figure 9.",
-            figure=drawn["laser_plane_image"],
+            figure=planes["laser_plane_image"],
         ),
     )
 
@@ -395,46 +397,42 @@ def _in_laser(points_in_dome: FloatArray, rig: Rig, laser: int) -> FloatArray:
     return np.ascontiguousarray(frame.apply(points_in_dome)[:, :2])
 
 
-def _seen(frame: Frame) -> Figure:
-    with new_figure(2.9) as figure:
-        left, right = figure.subplots(1, 2)
-        left.imshow(bgr_of(frame)[..., ::-1], interpolation="nearest")
-        level = ThresholdOptions().level
-        right.imshow(frame.luma >= level, cmap="gray", interpolation="nearest")
-        left.set_title("(a) as seen", loc="left")
-        right.set_title(f"(b) above {level} grey levels", loc="left")
-        for axes in (left, right):
-            axes.set_xticks([])
-            axes.set_yticks([])
-            axes.grid(visible=False)
-    return figure
+def _draw_seen(figure: Figure, frame: Frame) -> None:
+    left, right = figure.subplots(1, 2)
+    left.imshow(bgr_of(frame)[..., ::-1], interpolation="nearest")
+    level = ThresholdOptions().level
+    right.imshow(frame.luma >= level, cmap="gray", interpolation="nearest")
+    left.set_title("(a) as seen", loc="left")
+    right.set_title(f"(b) above {level} grey levels", loc="left")
+    for axes in (left, right):
+        axes.set_xticks([])
+        axes.set_yticks([])
+        axes.grid(visible=False)
 
 
-def _filtered(papers: FilteredPeaks, scan: Scan, rig: Rig, laser: int) -> Figure:
+def _draw_filtered(figure: Figure, papers: FilteredPeaks, scan: Scan, rig: Rig, laser: int) -> None:
     own, bright = scan.points.laser == laser, papers.laser == laser
     columns = (
         (scan.points.points_in_dome[own], np.asarray(scan.points.label[own] == Label.NET)),
         (papers.points_in_dome[bright], papers.on_mesh[bright]),
     )
-    with new_figure(2.6) as figure:
-        names = ("(a) sub-pixel, adaptive filter", "(b) threshold, paper's filter")
-        for axes, (points, net), name in zip(
-            figure.subplots(1, 2, sharex=True, sharey=True), columns, names, strict=True
-        ):
-            near, far = rig.working_range
-            distance = np.linalg.norm(points, axis=1)
-            usable = (distance >= near) & (distance <= far)
-            xy, net = 1e3 * _in_laser(points[usable], rig, laser), net[usable]
-            axes.plot(*xy.T, ".", color=PINK, markersize=2.0, label=f"all ({len(xy)})")
-            kept = xy[net]
-            axes.plot(*kept.T, ".", color=OURS, markersize=2.0, label=f"net ({len(kept)})")
-            axes.set_title(name, loc="left")
-            axes.set_xlabel("x in the laser's plane (mm)")
-            axes.set_aspect("equal")
-            axes.legend(loc="upper left", markerscale=3.0)
-            axes.margins(x=0.06, y=0.5)
-        figure.axes[0].set_ylabel("y, forward (mm)")
-    return figure
+    names = ("(a) sub-pixel, adaptive filter", "(b) threshold, paper's filter")
+    for axes, (points, net), name in zip(
+        figure.subplots(1, 2, sharex=True, sharey=True), columns, names, strict=True
+    ):
+        near, far = rig.working_range
+        distance = np.linalg.norm(points, axis=1)
+        usable = (distance >= near) & (distance <= far)
+        xy, net = 1e3 * _in_laser(points[usable], rig, laser), net[usable]
+        axes.plot(*xy.T, ".", color=PINK, markersize=2.0, label=f"all ({len(xy)})")
+        kept = xy[net]
+        axes.plot(*kept.T, ".", color=OURS, markersize=2.0, label=f"net ({len(kept)})")
+        axes.set_title(name, loc="left")
+        axes.set_xlabel("x in the laser's plane (mm)")
+        axes.set_aspect("equal")
+        axes.legend(loc="upper left", markerscale=3.0)
+        axes.margins(x=0.06, y=0.5)
+    figure.axes[0].set_ylabel("y, forward (mm)")
 
 
 EXPERIMENT = Experiment(

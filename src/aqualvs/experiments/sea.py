@@ -20,6 +20,7 @@ from aqualvs.experiments.experiment import (
     ExperimentFigure,
     ExperimentResult,
     ExperimentRow,
+    drawn,
 )
 from aqualvs.experiments.laboratory import Laboratory
 from aqualvs.follow.case import SimCase, Trials, sea, vehicle_model
@@ -28,7 +29,7 @@ from aqualvs.follow.report import drawn_follow_figures
 from aqualvs.follow.sensor_model import RenderedSensor, SampledSensor
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.transforms import SE3
-from aqualvs.report.figure_style import BLUE, DARK, GREY, ORANGE, new_figure
+from aqualvs.report.figure_style import BLUE, DARK, GREY, ORANGE
 from aqualvs.scanning.posture import Posture, Refusal
 from aqualvs.simulation.net_motion import NetPosture, NetWall
 from aqualvs.simulation.scene import Net, Scene
@@ -234,11 +235,12 @@ def _run_sea(laboratory: Laboratory) -> ExperimentResult:
             ),
         ),
         pictures=(
-            ExperimentFigure(
-                name="figure_22",
-                caption="Depth, range, heading and yaw of the net over the dive, beside figure "
+            drawn(
+                "figure_22",
+                "Depth, range, heading and yaw of the net over the dive, beside figure "
                 "22. Dots: measured in rendered pictures; lines: truth.",
-                figure=_drawn(log, time_s, measured),
+                5.0,
+                lambda figure: _draw(figure, log, time_s, measured),
             ),
         ),
         series=(_sea_series(time_s, measured, truth),),
@@ -307,30 +309,28 @@ def _sea_series(time_s: FloatArray, measured: FloatArray, truth: FloatArray) -> 
     return DataColumns(name="sea", columns=columns)
 
 
-def _drawn(log: LoopLog, seen_s: FloatArray, measured: FloatArray) -> Figure:
+def _draw(figure: Figure, log: LoopLog, seen_s: FloatArray, measured: FloatArray) -> None:
     time_s = log.column("time_s")
-    with new_figure(5.0) as figure:
-        depth, ranges, angles = figure.subplots(3, 1, sharex=True)
-        depth.plot(time_s, log.column("depth"), color=BLUE)
-        depth.invert_yaxis()
-        depth.set_ylabel("depth (m)")
-        ranges.plot(time_s, log.column("range"), color=DARK, alpha=0.5, label="true")
-        ranges.plot(seen_s, measured[:, 0], ".", color=BLUE, label="measured")
-        ranges.set_ylabel("range (m)")
-        ranges.legend(loc="upper right", ncols=2)
-        heading = np.degrees(np.unwrap(log.column("heading")))
-        angles.plot(time_s, heading - heading[0], color=ORANGE, label="heading, from its start")
-        angles.plot(time_s, np.degrees(log.column("yaw")), color=DARK, alpha=0.5, label="true yaw")
-        angles.plot(seen_s, measured[:, 2], ".", color=BLUE, label="measured yaw")
-        angles.axhline(0.0, color=GREY, linewidth=0.6)
-        angles.set_ylabel("angle (degrees)")
-        angles.set_xlabel("time (s)")
-        angles.legend(loc="upper right", ncols=3)
-        for axes in (ranges, angles):
-            low, high = axes.get_ylim()
-            axes.set_ylim(low, high + 0.25 * (high - low))
-        figure.align_ylabels((depth, ranges, angles))
-    return figure
+    depth, ranges, angles = figure.subplots(3, 1, sharex=True)
+    depth.plot(time_s, log.column("depth"), color=BLUE)
+    depth.invert_yaxis()
+    depth.set_ylabel("depth (m)")
+    ranges.plot(time_s, log.column("range"), color=DARK, alpha=0.5, label="true")
+    ranges.plot(seen_s, measured[:, 0], ".", color=BLUE, label="measured")
+    ranges.set_ylabel("range (m)")
+    ranges.legend(loc="upper right", ncols=2)
+    heading = np.degrees(np.unwrap(log.column("heading")))
+    angles.plot(time_s, heading - heading[0], color=ORANGE, label="heading, from its start")
+    angles.plot(time_s, np.degrees(log.column("yaw")), color=DARK, alpha=0.5, label="true yaw")
+    angles.plot(seen_s, measured[:, 2], ".", color=BLUE, label="measured yaw")
+    angles.axhline(0.0, color=GREY, linewidth=0.6)
+    angles.set_ylabel("angle (degrees)")
+    angles.set_xlabel("time (s)")
+    angles.legend(loc="upper right", ncols=3)
+    for axes in (ranges, angles):
+        low, high = axes.get_ylim()
+        axes.set_ylim(low, high + 0.25 * (high - low))
+    figure.align_ylabels((depth, ranges, angles))
 
 
 SEA = Experiment(

@@ -4,6 +4,7 @@ Figure 15 is the distance to the wall; figures 16 and 17 are pitch and yaw.
 """
 
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -13,13 +14,13 @@ from matplotlib.figure import Figure
 from aqualvs.experiments.experiment import (
     DataColumns,
     Experiment,
-    ExperimentFigure,
     ExperimentResult,
     ExperimentRow,
+    drawn,
 )
 from aqualvs.experiments.laboratory import Laboratory, MeasuredDive, RenderedDive, calibrated_rig
 from aqualvs.geometry.arrays import FloatArray
-from aqualvs.report.figure_style import DARK, GREY, OURS, PAPER, TRUTH, new_figure
+from aqualvs.report.figure_style import DARK, GREY, OURS, PAPER, TRUTH
 from aqualvs.simulation.scenario import Scenario, parse_scenario
 
 _ANGLES = {"pitch": (1, 16), "yaw": (2, 17)}
@@ -66,12 +67,14 @@ def _run_angles(laboratory: Laboratory) -> ExperimentResult:
         f"paper is within {_SWING.paper_percent} % of its compass.",
         findings=tuple(row for name in _ANGLES for row in _findings(name, seen[name])),
         pictures=tuple(
-            ExperimentFigure(
-                name=f"figure_{number}",
-                caption=f"{name.capitalize()} while it swings, and its error with two stated "
+            drawn(
+                f"figure_{number}",
+                f"{name.capitalize()} while it swings, and its error with two stated "
                 f"standard deviations, beside figure {number}. The truth stands in for the "
                 "paper's compass.",
-                figure=_drawn(seen[name], name),
+                3.4,
+                partial(_draw_angle, measured=seen[name], name=name),
+                "column",
             )
             for name, (_, number) in _ANGLES.items()
         ),
@@ -124,30 +127,28 @@ def _series(name: str, measured: MeasuredDive) -> DataColumns:
     )
 
 
-def _drawn(measured: MeasuredDive, name: str) -> Figure:
+def _draw_angle(figure: Figure, measured: MeasuredDive, name: str) -> None:
     column = _ANGLES[name][0]
     degrees = np.degrees(np.column_stack([a[:, column] for a in (measured.truth, measured.values)]))
-    with new_figure(3.4, "column") as figure:
-        top, low = figure.subplots(2, 1, sharex=True, height_ratios=(2.0, 1.0))
-        top.plot(measured.time_s, degrees[:, 0], color=TRUTH, linewidth=2.2, alpha=0.35)
-        top.plot(measured.time_s, degrees[:, 1], ".", color=OURS)
-        top.set_ylabel(f"{name} (degrees)")
-        top.legend(("truth", "measured"), loc="upper right")
-        low.axhline(0.0, color=GREY, linewidth=0.7)
-        low.errorbar(
-            measured.time_s,
-            _errors_deg(measured, name),
-            yerr=2.0 * np.degrees(measured.sigmas[:, column]),
-            fmt=".",
-            color=OURS,
-            markersize=3.5,
-            elinewidth=0.6,
-        )
-        low.set_ylim(-_SWING.bar_deg, _SWING.bar_deg)
-        low.set_ylabel("error (degrees)")
-        low.set_xlabel("time (s)")
-        figure.align_ylabels((top, low))
-    return figure
+    top, low = figure.subplots(2, 1, sharex=True, height_ratios=(2.0, 1.0))
+    top.plot(measured.time_s, degrees[:, 0], color=TRUTH, linewidth=2.2, alpha=0.35)
+    top.plot(measured.time_s, degrees[:, 1], ".", color=OURS)
+    top.set_ylabel(f"{name} (degrees)")
+    top.legend(("truth", "measured"), loc="upper right")
+    low.axhline(0.0, color=GREY, linewidth=0.7)
+    low.errorbar(
+        measured.time_s,
+        _errors_deg(measured, name),
+        yerr=2.0 * np.degrees(measured.sigmas[:, column]),
+        fmt=".",
+        color=OURS,
+        markersize=3.5,
+        elinewidth=0.6,
+    )
+    low.set_ylim(-_SWING.bar_deg, _SWING.bar_deg)
+    low.set_ylabel("error (degrees)")
+    low.set_xlabel("time (s)")
+    figure.align_ylabels((top, low))
 
 
 ANGLES = Experiment(
@@ -226,12 +227,13 @@ def _run_distance(laboratory: Laboratory) -> ExperimentResult:
             ),
         ),
         pictures=(
-            ExperimentFigure(
-                name="figure_15",
-                caption="Error of the distance at the paper's four places, at the paper's scale "
+            drawn(
+                "figure_15",
+                "Error of the distance at the paper's four places, at the paper's scale "
                 "(left) and at ours (right), beside figure 15. Every dot is a frame, bars are two "
                 "stated standard deviations.",
-                figure=_distance_drawn(calibrated, true),
+                2.7,
+                lambda figure: _draw_distance(figure, calibrated, true),
             ),
         ),
         series=(_distance_series(calibrated, true),),
@@ -258,31 +260,25 @@ def _distance_series(calibrated: MeasuredDive, true: MeasuredDive) -> DataColumn
     )
 
 
-def _distance_drawn(calibrated: MeasuredDive, true: MeasuredDive) -> Figure:
-    with new_figure(2.7) as figure:
-        left, right = figure.subplots(1, 2, width_ratios=(1.0, 1.25))
-        left.axhspan(
-            -_DISTANCES.paper_percent,
-            _DISTANCES.paper_percent,
-            color=PAPER,
-            alpha=0.15,
-            linewidth=0,
-        )
-        left.text(370, 1.95, f"paper: within {_DISTANCES.paper_percent} %", color=PAPER, va="top")
-        left.plot(1e3 * calibrated.truth[:, 0], calibrated.range_percent, ".", color=OURS)
-        left.set_ylim(-2.6, 2.6)
-        left.set_title("at the paper's scale", loc="left")
-        _dots(right, true, GREY, "true rig", -4.0)
-        _dots(right, calibrated, OURS, "calibrated rig", 4.0)
-        right.set_title("at ours", loc="left")
-        right.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
-        for axes in (left, right):
-            axes.axhline(0.0, color=DARK, linewidth=0.7)
-            axes.set_xticks(PLACES_MM)
-            axes.set_xlim(345, 688)
-            axes.set_xlabel("true distance (mm)")
-        left.set_ylabel("error of the distance (%)")
-    return figure
+def _draw_distance(figure: Figure, calibrated: MeasuredDive, true: MeasuredDive) -> None:
+    left, right = figure.subplots(1, 2, width_ratios=(1.0, 1.25))
+    left.axhspan(
+        -_DISTANCES.paper_percent, _DISTANCES.paper_percent, color=PAPER, alpha=0.15, linewidth=0
+    )
+    left.text(370, 1.95, f"paper: within {_DISTANCES.paper_percent} %", color=PAPER, va="top")
+    left.plot(1e3 * calibrated.truth[:, 0], calibrated.range_percent, ".", color=OURS)
+    left.set_ylim(-2.6, 2.6)
+    left.set_title("at the paper's scale", loc="left")
+    _dots(right, true, GREY, "true rig", -4.0)
+    _dots(right, calibrated, OURS, "calibrated rig", 4.0)
+    right.set_title("at ours", loc="left")
+    right.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
+    for axes in (left, right):
+        axes.axhline(0.0, color=DARK, linewidth=0.7)
+        axes.set_xticks(PLACES_MM)
+        axes.set_xlim(345, 688)
+        axes.set_xlabel("true distance (mm)")
+    left.set_ylabel("error of the distance (%)")
 
 
 def _dots(axes: Axes, measured: MeasuredDive, colour: str, label: str, aside_mm: float) -> None:
