@@ -27,6 +27,7 @@ from aqualvs.experiments.experiment import (
     ExperimentResult,
     ExperimentRow,
     drawn,
+    listed,
 )
 from aqualvs.experiments.laboratory import Laboratory, calibration_pictures
 from aqualvs.geometry.arrays import FloatArray
@@ -221,8 +222,7 @@ def _vector(
     true = scale * np.array([rig_numbers(solved.truth)[name] for name in names])
     off = scale * np.array([solved.errors[name] for name in names])
     sigma = scale * np.array([solved.sigmas[name] for name in names])
-    found, right = (", ".join(f"{v:.{digits}f}" for v in vs) for vs in (true + off, true))
-    spread = ", ".join(f"{v:.{digits}f}" for v in sigma)
+    found, right, spread = (listed(values, digits) for values in (true + off, true, sigma))
     return ExperimentRow(what=what, paper=paper, ours=f"{found} ± {spread} (truth {right})")
 
 

@@ -96,6 +96,11 @@ class Experiment:
     run: "Callable[[Laboratory], ExperimentResult]"
 
 
+def listed(values: FloatArray, digits: int) -> str:
+    """Return numbers for a table, with so many digits behind the point."""
+    return ", ".join(f"{value:.{digits}f}" for value in values)
+
+
 def drawn(
     name: str,
     caption: str,

@@ -18,6 +18,7 @@ from aqualvs.experiments.experiment import (
     ExperimentResult,
     ExperimentRow,
     drawn,
+    listed,
 )
 from aqualvs.experiments.laboratory import Laboratory, MeasuredDive, RenderedDive, frames_of
 from aqualvs.geometry.arrays import BoolArray, FloatArray
@@ -88,7 +89,6 @@ _COLOURS = {"clear": BLUE, "growth": GREEN, "sun": ORANGE}
 _SECONDS, _SHOWN = 0.8, 10
 # Of the clear scene: range in percent, pitch and yaw in degrees; twice that for the others.
 _CLEAR_LIMITS = (0.5, 0.5, 0.5)
-_NAMES = ("range", "pitch", "yaw")
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,30 +193,22 @@ def _findings(name: str, seen: Mapping[str, MeasuredScene]) -> list[ExperimentRo
         ),
         ExperimentRow(
             what=f"{name}: largest error of range (%), pitch, yaw (degrees)",
-            ours=_told(one.largest),
+            ours=listed(one.largest, 3),
             bar="<= " + ", ".join(f"{limit:g}" for limit in limits),
             met=bool(np.all(one.largest <= limits)),
         ),
         ExperimentRow(
             what=f"{name}: root mean square error, and as many times the clear scene's",
-            ours=_told(one.rms)
-            + (f"; {', '.join(f'{x:.1f}' for x in one.rms / clear.rms)}" if judged else ""),
+            ours=listed(one.rms, 3) + (f"; {listed(one.rms / clear.rms, 1)}" if judged else ""),
         ),
-        ExperimentRow(what=f"{name}: stated sigma (median)", ours=_told(one.sigmas)),
+        ExperimentRow(what=f"{name}: stated sigma (median)", ours=listed(one.sigmas, 3)),
     ]
 
 
-def _told(values: FloatArray) -> str:
-    return ", ".join(f"{value:.3f}" for value in values)
-
-
 def _series(name: str, one: MeasuredScene) -> DataColumns:
-    columns: dict[str, FloatArray] = {"time_s": one.ours.time_s, "visible_points": one.visible}
-    for k, what in enumerate(_NAMES):
-        unit, scale = ("m", 1.0) if k == 0 else ("deg", 180.0 / np.pi)
-        columns[f"true_{what}_{unit}"] = scale * one.ours.truth[:, k]
-        columns[f"{what}_{unit}"] = scale * one.ours.values[:, k]
-        columns[f"sigma_{what}_{unit}"] = scale * one.ours.sigmas[:, k]
+    columns = {"time_s": one.ours.time_s, "visible_points": one.visible}
+    for k in range(3):
+        columns |= one.ours.columns(k)
     return DataColumns(name=f"failures_{name}", columns=columns)
 
 

@@ -43,6 +43,7 @@ from aqualvs.simulation.scenarios import example_rig
 from aqualvs.simulation.video import Compression
 from aqualvs.sources import open_source
 
+_DEG = 180.0 / np.pi
 _VIDEO, _TRUTH, _RIG, _READY = "dive.mp4", "truth.csv", "rig.yaml", "ready.json"
 
 
@@ -107,6 +108,12 @@ class MeasuredDive:
             np.full(3, np.nan) if p is None else np.diag(p.covariance) for p in self.postures
         ]
         return np.asarray(np.sqrt(np.array(variances).reshape(-1, 3)))
+
+    def columns(self, k: int) -> dict[str, FloatArray]:
+        """Return truth, value and sigma of range (0), pitch (1) or yaw (2) as columns."""
+        name, scale = (("range_m", 1.0), ("pitch_deg", _DEG), ("yaw_deg", _DEG))[k]
+        tables = {"true_": self.truth, "": self.values, "sigma_": self.sigmas}
+        return {f"{what}{name}": scale * table[:, k] for what, table in tables.items()}
 
     @property
     def errors(self) -> FloatArray:

@@ -13,6 +13,7 @@ from aqualvs.experiments.experiment import (
     ExperimentResult,
     ExperimentRow,
     drawn,
+    listed,
 )
 from aqualvs.experiments.laboratory import Laboratory, frames_of
 from aqualvs.geometry.arrays import FloatArray
@@ -146,8 +147,8 @@ def _findings(rig: Rig, bent: float, missed: float) -> tuple[ExperimentRow, ...]
         ("index of air", "1.0003", f"{rig.n_air:.4f}"),
         ("index of the acrylic", "1.4900", f"{shell.n_acrylic:.4f}"),
         ("index of the water", "1.3333", f"{rig.n_water:.4f}"),
-        ("camera's rotation (rad)", "0.0438, 0.0229, 0.1982", _listed(turn, 4)),
-        ("lens in the dome (mm)", "3.0, 41.53, 3.0", _listed(place, 2)),
+        ("camera's rotation (rad)", "0.0438, 0.0229, 0.1982", listed(turn, 4)),
+        ("lens in the dome (mm)", "3.0, 41.53, 3.0", listed(place, 2)),
         ("image plane, turned by (rad)", "-0.0012, -0.0011, -0.0112", "in the camera's rotation"),
         ("green line lasers", "3, planes not printed", f"{len(rig.lasers)}: {names}"),
         ("working range (mm)", "300-1000", f"{1e3 * near:.0f}-{1e3 * far:.0f}"),
@@ -156,10 +157,6 @@ def _findings(rig: Rig, bent: float, missed: float) -> tuple[ExperimentRow, ...]
         ("a point 1 m ahead, off by without refraction (mm)", "", f"{missed:.0f}"),
     )
     return tuple(ExperimentRow(what=what, paper=paper, ours=ours) for what, paper, ours in rows)
-
-
-def _listed(values: FloatArray, digits: int) -> str:
-    return ", ".join(f"{value:.{digits}f}" for value in values)
 
 
 def _series(traced: Bending) -> DataColumns:

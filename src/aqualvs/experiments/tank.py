@@ -78,7 +78,13 @@ def _run_angles(laboratory: Laboratory) -> ExperimentResult:
             )
             for name, (_, number) in _ANGLES.items()
         ),
-        series=tuple(_series(name, seen[name]) for name in _ANGLES),
+        series=tuple(
+            DataColumns(
+                name=f"angles_{name}",
+                columns={"time_s": seen[name].time_s, **seen[name].columns(column)},
+            )
+            for name, (column, _) in _ANGLES.items()
+        ),
         notes=(
             "A calibration on boards whose distances alone are known, as on the paper's rail, "
             "leaves the dome's axes on the vehicle uncertain by some hundredths of a degree; that "
@@ -112,19 +118,6 @@ def _errors_deg(measured: MeasuredDive, name: str) -> FloatArray:
 
 def _largest_deg(measured: MeasuredDive, name: str) -> float:
     return float(np.nanmax(np.abs(_errors_deg(measured, name))))
-
-
-def _series(name: str, measured: MeasuredDive) -> DataColumns:
-    column = _ANGLES[name][0]
-    return DataColumns(
-        name=f"angles_{name}",
-        columns={
-            "time_s": measured.time_s,
-            f"true_{name}_deg": np.degrees(measured.truth[:, column]),
-            f"{name}_deg": np.degrees(measured.values[:, column]),
-            f"sigma_{name}_deg": np.degrees(measured.sigmas[:, column]),
-        },
-    )
 
 
 def _draw_angle(figure: Figure, measured: MeasuredDive, name: str) -> None:
@@ -236,7 +229,12 @@ def _run_distance(laboratory: Laboratory) -> ExperimentResult:
                 lambda figure: _draw_distance(figure, calibrated, true),
             ),
         ),
-        series=(_distance_series(calibrated, true),),
+        series=(
+            DataColumns(
+                name="distance",
+                columns={**calibrated.columns(0), "range_true_rig_m": true.values[:, 0]},
+            ),
+        ),
         notes=(
             "The truth is that of the simulator; the paper's distances were set by hand.",
             "What calibration adds is common to all frames of a place; the bars tell noise only.",
@@ -246,18 +244,6 @@ def _run_distance(laboratory: Laboratory) -> ExperimentResult:
 
 def _largest(measured: MeasuredDive) -> float:
     return float(np.nanmax(np.abs(measured.range_percent)))
-
-
-def _distance_series(calibrated: MeasuredDive, true: MeasuredDive) -> DataColumns:
-    return DataColumns(
-        name="distance",
-        columns={
-            "true_range_m": calibrated.truth[:, 0],
-            "range_m": calibrated.values[:, 0],
-            "sigma_range_m": calibrated.sigmas[:, 0],
-            "range_true_rig_m": true.values[:, 0],
-        },
-    )
 
 
 def _draw_distance(figure: Figure, calibrated: MeasuredDive, true: MeasuredDive) -> None:
