@@ -15,6 +15,7 @@ from aqualvs.demo import bundled_dive
 from aqualvs.errors import OptionError, OutputError
 from aqualvs.follow.command import FOLLOW_CSV, Aim
 from aqualvs.follow.vehicle import FollowLogOutput, FollowRequest, follow_and_tell
+from aqualvs.live.command import LiveRequest
 from aqualvs.live.pilot import PilotReport
 from aqualvs.results.files import Claim
 from aqualvs.sources.base import State
@@ -66,9 +67,8 @@ def demo_request(out: Path, **more: Any) -> FollowRequest:
     """Return a request to follow the net of the bundled dive, with BlueROV2's gains."""
     demo = Path(str(bundled_dive()))
     usual: dict[str, Any] = {"gains": "bluerov2", "aim": Aim(range=0.5)}
-    return FollowRequest(
-        source=str(demo / "dive.mp4"), rig=demo / "rig.yaml", out=out, **(usual | more)
-    )
+    live = LiveRequest(source=str(demo / "dive.mp4"), rig=demo / "rig.yaml")
+    return FollowRequest(live=live, out=out, **(usual | more))
 
 
 def test_a_dive_without_a_vehicle_is_logged_and_never_steered(tmp_path: Path) -> None:

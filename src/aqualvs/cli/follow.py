@@ -175,24 +175,28 @@ def follow(
             "follow: give SOURCE, --rig, --mavlink and --gains for a vehicle, or --sim to try it"
         )
     from aqualvs.follow.vehicle import FollowRequest, follow_and_tell
+    from aqualvs.live.command import LiveRequest
     from aqualvs.live.options import vehicle_setup
     from aqualvs.results.run_request import Water, scanner_options
 
-    dive = FollowRequest(
+    live = LiveRequest(
         source=source,
         rig=rig,
+        dashboard=dashboard_address if dashboard else None,
+        token=token,
+        record=record,
+        record_to=out if record_to is None else record_to,
+        record_video=record_video,
+        water=Water(n_water=water_n, temperature_c=None, salinity=None),
+        scanner=scanner_options(target, "ridge", "none", "robust"),
+    )
+    dive = FollowRequest(
+        live=live,
         mavlink=mavlink,
         vehicle=vehicle_setup(vehicle_file, mavlink_peer, mavlink_key),
         gains=gains,
         out=out,
         aim=aim,
-        dashboard=dashboard_address if dashboard else None,
-        token=token,
-        record=record,
-        record_to=record_to,
-        record_video=record_video,
-        water=Water(n_water=water_n, temperature_c=None, salinity=None),
-        scanner=scanner_options(target, "ridge", "none", "robust"),
         overwrite=overwrite,
     )
     raise typer.Exit(follow_and_tell(dive, typer.echo))

@@ -3,12 +3,11 @@
 A thread of its own writes the log, so that the disk never delays the pilot.
 """
 
-import contextlib
 import sys
 import threading
-from collections.abc import Callable
-from contextlib import ExitStack
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from queue import SimpleQueue
 from typing import TextIO, TypeAlias
@@ -17,27 +16,24 @@ from aqualvs.control.autopilot import Decision, NetPilot
 from aqualvs.control.controller import RangeYawController
 from aqualvs.control.follow_log import FollowLog
 from aqualvs.control.safety import SafetyGate
-from aqualvs.control.time_filter import PostureFilter
 from aqualvs.control.tune import usable_gains
 from aqualvs.control.vehicle import SetpointHolder
 from aqualvs.errors import AqualvsError, OutputError
 from aqualvs.follow.command import FOLLOW_CSV, Aim
-from aqualvs.live.command import SWITCH_S, Console, FeedRequest, recorder_options
+from aqualvs.live.command import LiveRequest, make_runner
 from aqualvs.live.mavlink.ardusub import ArduSubLink
 from aqualvs.live.mavlink.link import MavlinkLink
-from aqualvs.live.options import VehicleSetup, serve_page
+from aqualvs.live.options import VehicleSetup
 from aqualvs.live.outputs.base import Output
 from aqualvs.live.outputs.mavlink import MavlinkOutput
 from aqualvs.live.pilot import Pilot, PilotReport
-from aqualvs.live.runner import LiveRunner, ScannerSupply, warm_up
-from aqualvs.recording import RecorderSwitch
+from aqualvs.live.runner import ScannerSupply, warm_up
 from aqualvs.recording.sample import LiveSample
 from aqualvs.results.files import Claim
-from aqualvs.results.run_request import Water, prepared_rig
-from aqualvs.scanner import Scanner, ScannerOptions
+from aqualvs.results.run_request import prepared_rig
+from aqualvs.scanner import Scanner
 from aqualvs.scanning.posture import Posture, Refusal
 from aqualvs.sources.base import PartHealth, State
-from aqualvs.sources.fields import FrameFeed
 from aqualvs.terminal import StopSignals
 
 _Step: TypeAlias = tuple[PilotReport, float, Posture | Refusal]
@@ -97,26 +93,14 @@ class FollowLogOutput:
 class FollowRequest:
     """Request to steer a vehicle."""
 
-    source: str  # As `open_feed` takes it.
-    rig: Path
+    # Source, rig, page and recordings; postures are smoothed in any case.
+    live: LiveRequest
     mavlink: str  # Address of the vehicle.
     gains: str  # Gains file, or the name of a vehicle whose gains come with the package.
     out: Path  # Folder for the log.
     aim: Aim
     # Who is there, and how it is steered.
     vehicle: VehicleSetup = field(default_factory=VehicleSetup)
-
-    feed: FeedRequest = field(default_factory=FeedRequest)
-    dashboard: str | None = None  # Address HOST:PORT of the pilot's page.
-    token: str | None = None  # Its password.
-    # Whether to record from the start; the page's button begins and ends recordings, too.
-    record: bool = False
-    # Folder of recordings; `out` if left out.
-    record_to: Path | None = None
-
-    record_video: bool = False
-    water: Water = field(default_factory=Water)
-    scanner: ScannerOptions = field(default_factory=ScannerOptions)
     overwrite: bool = False
 
 
@@ -129,18 +113,29 @@ def follow_and_tell(
 
     Raises `AqualvsError` if an input cannot be used, or the source can never work.
     """
-    rig = prepared_rig(request.rig, request.water, no_dome=False)
+    live, log = replace(request.live, smooth=True), request.out / FOLLOW_CSV
+    rig = prepared_rig(live.rig, live.water, no_dome=False)
     mission, limits, setpoint = request.aim.mission(rig.working_range)
     holder = SetpointHolder(rig.working_range)
     holder.put(setpoint)
     gains = usable_gains(request.gains)
     steering = NetPilot(mission, RangeYawController(gains), SafetyGate(limits))
-    scanner = Scanner(rig, request.scanner)
-    with Claim("follow", [request.out / FOLLOW_CSV], overwrite=request.overwrite):
+    scanner = Scanner(rig, live.scanner)
+    with Claim("follow", [log], overwrite=request.overwrite):
         warm_up(scanner)
-        with contextlib.closing(MavlinkLink(request.mavlink, request.vehicle.link)) as link:
-            pilot = Pilot(steering, ArduSubLink(link, request.vehicle.steering), holder)
-            runner = _runner(request, scanner, link, pilot, holder, echo)
+        with (
+            closing(MavlinkLink(request.mavlink, request.vehicle.link)) as link,
+            closing(Pilot(steering, ArduSubLink(link, request.vehicle.steering), holder)) as pilot,
+        ):
+            runner = make_runner(
+                live,
+                rig,
+                lambda: ScannerSupply(scanner),
+                holder,
+                echo,
+                first=_outputs(link, pilot, log),
+                vehicle=lambda: pilot.latest.state if pilot.latest else None,
+            )
             echo("disengaged: Enter engages, Enter again gives the vehicle back; Ctrl-C ends")
             listen(pilot, sys.stdin if keys is None else keys, echo)
             with StopSignals() as stop:
@@ -150,39 +145,11 @@ def follow_and_tell(
     return 0
 
 
-def _runner(
-    request: FollowRequest,
-    scanner: Scanner,
-    link: MavlinkLink,
-    pilot: Pilot,
-    holder: SetpointHolder,
-    echo: Callable[[str], object],
-) -> LiveRunner:
-    """Make the live loop; if a part fails, the parts made before it are closed."""
-    sys.setswitchinterval(SWITCH_S)
-    with ExitStack() as undo:
-        undo.callback(pilot.close)
-        pictures = request.feed.opened(request.source, realtime=True)
-        feed = FrameFeed(pictures, scanner.rig.shutter)
-        undo.callback(feed.close)
-        # The pilot first: other outputs must not delay an effort.
-        outputs: list[Output] = [pilot, MavlinkOutput(link)]
-        outputs.append(FollowLogOutput(request.out / FOLLOW_CSV, pilot))
-        undo.callback(outputs[-1].close)
-        recorder = RecorderSwitch(
-            request.out if request.record_to is None else request.record_to,
-            recorder_options(request.scanner, video=request.record_video),
-        )
-        undo.callback(recorder.close)
-        outputs += [recorder, Console()]
-        if request.record:
-            echo(f"recording: {recorder.start()}")
-        if request.dashboard is not None:
-            page = (request.dashboard, request.token, scanner.rig, holder, recorder, echo)
-            outputs.append(serve_page(*page, lambda: pilot.latest.state if pilot.latest else None))
-        runner = LiveRunner(feed, ScannerSupply(scanner), outputs, posture_filter=PostureFilter())
-        undo.pop_all()
-    return runner
+def _outputs(link: MavlinkLink, pilot: Pilot, log: Path) -> Iterator[Output]:
+    # The pilot first: other outputs must not delay an effort.
+    yield pilot
+    yield MavlinkOutput(link)
+    yield FollowLogOutput(log, pilot)
 
 
 def listen(pilot: Pilot, keys: TextIO, echo: Callable[[str], object]) -> threading.Thread:

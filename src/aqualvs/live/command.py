@@ -9,13 +9,13 @@ import queue
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from aqualvs.control.time_filter import PostureFilter
-from aqualvs.control.vehicle import SetpointHolder
+from aqualvs.control.vehicle import SetpointHolder, VehicleState
 from aqualvs.errors import OptionError
 from aqualvs.live.options import OutputRequest, make_outputs, serve_page, vehicle_reader
 from aqualvs.live.outputs.base import Output
@@ -207,22 +207,8 @@ def live_and_tell(request: LiveRequest, echo: Callable[[str], object]) -> int:
     Raises `AqualvsError` if an input cannot be used, or the source can never work.
     """
     rig = prepared_rig(request.rig, request.water, no_dome=False)
-    pictures = request.feed.opened(request.source, realtime=not request.fast)
-    feed = FrameFeed(pictures, rig.shutter)
-    sys.setswitchinterval(SWITCH_S)
-    with ExitStack() as undo:
-        undo.callback(feed.close)
-        outputs = _outputs(request, rig, echo)
-        for output in outputs:
-            undo.callback(output.close)
-        runner = LiveRunner(
-            feed,
-            _provider(request, rig),
-            outputs,
-            LiveOptions(keep_every=request.fast),
-            PostureFilter() if request.smooth else None,
-        )
-        undo.pop_all()
+    holder = SetpointHolder(rig.working_range, followed=False)
+    runner = make_runner(request, rig, lambda: _provider(request, rig), holder, echo)
     with StopSignals() as stop:
         fault = runner.run(lambda: stop.caught is not None)
     if fault is not None:
@@ -230,29 +216,58 @@ def live_and_tell(request: LiveRequest, echo: Callable[[str], object]) -> int:
     return 0
 
 
-def _outputs(request: LiveRequest, rig: Rig, echo: Callable[[str], object]) -> list[Output]:
-    """Make all outputs; those made before one that fails are closed."""
-    options = recorder_options(request.scanner, video=request.record_video)
-    recorder = RecorderSwitch(request.record_to, options)
-    with ExitStack() as made:
-        outputs: list[Output] = [recorder, Console()]
-        made.callback(recorder.close)
+def make_runner(
+    request: LiveRequest,
+    rig: Rig,
+    provider: Callable[[], ScannerSupply],
+    holder: SetpointHolder,
+    echo: Callable[[str], object],
+    *,
+    first: Iterable[Output] = (),
+    vehicle: Callable[[], VehicleState | None] | None = None,
+) -> LiveRunner:
+    """Make the live loop; if a part fails, the parts made before it are closed.
+
+    Parameters
+    ----------
+    provider : callable
+        Makes the provider of the scanner, after everything else.
+    holder : SetpointHolder
+        Where the page puts what is to be held.
+    first : iterable of Output
+        Outputs before all others; taken once the source is open.
+    vehicle : callable, optional
+        As `serve_page` takes it; by default of the first output that an autopilot answers.
+    """
+    sys.setswitchinterval(SWITCH_S)
+    options = RecorderOptions(
+        pictures=PictureFormat.JPEG if request.record_video else None, scanner=request.scanner
+    )
+    with ExitStack() as undo:
+        outputs: list[Output] = []
+
+        def add(more: Iterable[Output]) -> None:
+            for output in more:
+                outputs.append(output)
+                undo.callback(output.close)
+
+        pictures = request.feed.opened(request.source, realtime=not request.fast)
+        feed = FrameFeed(pictures, rig.shutter)
+        undo.callback(feed.close)
+        add(first)
+        recorder = RecorderSwitch(request.record_to, options)
+        add([recorder, Console()])
         if request.record:
             echo(f"recording: {recorder.start()}")
-        outputs += make_outputs(request.outputs, request.scanner)
-        for output in outputs[2:]:
-            made.callback(output.close)
+        add(make_outputs(request.outputs, request.scanner))
         if request.dashboard is not None:
-            holder = SetpointHolder(rig.working_range, followed=False)
             page = (request.dashboard, request.token, rig, holder, recorder, echo)
-            outputs.append(serve_page(*page, vehicle_reader(outputs), request.embed_from))
-        made.pop_all()
-    return outputs
-
-
-def recorder_options(scanner: ScannerOptions, *, video: bool) -> RecorderOptions:
-    """Return the options of recordings; with `video`, pictures are included."""
-    return RecorderOptions(pictures=PictureFormat.JPEG if video else None, scanner=scanner)
+            add([serve_page(*page, vehicle or vehicle_reader(outputs), request.embed_from)])
+        smoothing = PostureFilter() if request.smooth else None
+        every = LiveOptions(keep_every=request.fast)
+        runner = LiveRunner(feed, provider(), outputs, every, smoothing)
+        undo.pop_all()
+    return runner
 
 
 def _provider(request: LiveRequest, rig: Rig) -> ScannerSupply:
