@@ -5,7 +5,6 @@ beside the Gaussian of their rms. Pictures with detected points drawn over them 
 JPEG, scaled down to a size that suits a page.
 """
 
-import base64
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -18,7 +17,7 @@ import numpy as np
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.report import svg as draw
 from aqualvs.report.calibration_material import MarkKind, Overlay, PictureShot, ResidualMap
-from aqualvs.report.html import Raw
+from aqualvs.report.html import Raw, data_url
 from aqualvs.scanning.scan import ImagePlane
 
 _UNDER = "#10181c"
@@ -43,9 +42,9 @@ def _figure(shot: PictureShot, index: int, count: int) -> str:
     all_bytes = 340_000
     max_bytes = 130_000
     all_marks = 6000
-    jpeg, width, height = _embedded(shot.image, min(max_bytes, all_bytes // count))
+    address, width, height = _embedded(shot.image, min(max_bytes, all_bytes // count))
     scale = width / shot.image.shape[1]
-    body = [f'<image href="data:image/jpeg;base64,{jpeg}" width="{width}" height="{height}"/>']
+    body = [f'<image href="{address}" width="{width}" height="{height}"/>']
     limit = all_marks // count // max(len(shot.points), 1)
     for layer, overlay in enumerate(shot.points):
         name = f"marks-{index}-{layer}"
@@ -60,7 +59,7 @@ def _figure(shot: PictureShot, index: int, count: int) -> str:
 
 
 def _embedded(image: ImagePlane, most_bytes: int) -> tuple[str, int, int]:
-    """Return a picture as JPEG in base64 with its width and height."""
+    """Return a picture as an address with its width and height."""
     if image.dtype != np.uint8 or not image.size or image.ndim not in (2, 3):
         raise ValueError(f"image has shape {image.shape} of {image.dtype}, expected 8-bit pixels")
     if image.ndim == 3 and image.shape[2] != 3:
@@ -72,7 +71,7 @@ def _embedded(image: ImagePlane, most_bytes: int) -> tuple[str, int, int]:
         jpeg, width, height = _jpeg(image, widest, quality)
         if len(jpeg) <= most_bytes:
             break
-    return base64.b64encode(jpeg).decode("ascii"), width, height
+    return data_url(jpeg, "jpeg"), width, height
 
 
 def _jpeg(image: ImagePlane, widest: int, quality: int) -> tuple[bytes, int, int]:

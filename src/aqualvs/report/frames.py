@@ -1,6 +1,5 @@
 """Selection of the frames that a report shows, decoded again from the source."""
 
-import base64
 import contextlib
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -45,7 +44,7 @@ _HOLE_COLOUR = bgr("#ffb347")
 class SampleFrame:
     """A sample frame ready for the page."""
 
-    jpeg_base64: str
+    address: str  # With the picture in it.
     size_px: tuple[int, int]  # Width and height as embedded.
     # Share of the target points that lie on a saturated pixel; NaN without target points.
     saturated: float = float("nan")
@@ -54,8 +53,7 @@ class SampleFrame:
         """Return the picture as HTML, with words for those who cannot see it."""
         width, height = self.size_px
         return html.Raw(
-            f'<img src="data:image/jpeg;base64,{self.jpeg_base64}" width="{width}" '
-            f'height="{height}" alt="{escape(words)}">'
+            f'<img src="{self.address}" width="{width}" height="{height}" alt="{escape(words)}">'
         )
 
 
@@ -153,8 +151,7 @@ def make_crop(image: ImagePlane, middle: tuple[float, float], diameter: float) -
 
 def _embedded(image: ImagePlane) -> SampleFrame:
     _, jpeg = cv2.imencode(".jpg", image, _JPEG)
-    text = base64.b64encode(jpeg.tobytes()).decode("ascii")
-    return SampleFrame(text, (image.shape[1], image.shape[0]))
+    return SampleFrame(html.data_url(jpeg.tobytes(), "jpeg"), (image.shape[1], image.shape[0]))
 
 
 def saturated_share(image: ImagePlane, points: FramePoints | None) -> float:

@@ -1,6 +1,5 @@
 """Condition of the net in a run's report: section, card and warnings, read from its net files."""
 
-import base64
 import csv
 import math
 from collections.abc import Mapping
@@ -10,7 +9,7 @@ from types import MappingProxyType
 from typing import Any, TypeAlias
 
 from aqualvs.report.frames import SampleFrame
-from aqualvs.report.html import Card, Raw, folded, table, text
+from aqualvs.report.html import Card, Raw, data_url, folded, table, text
 from aqualvs.results.files import read_json
 from aqualvs.results.folder import HOLES_CSV, NET_CSV, NET_GEOJSON, NET_MAP_PNG
 from aqualvs.text import clock, signed
@@ -31,8 +30,8 @@ class NetTables:
     holes: list[Row]
     # Member `aqualvs_net` of `net.geojson`; empty where it is missing.
     facts: Mapping[str, Any]
-    # `net_map.png`; "" where it is missing.
-    map_base64: str
+    # `net_map.png` as an address; "" where it is missing.
+    map_address: str
 
     @property
     def summary(self) -> Mapping[str, Any]:
@@ -140,10 +139,10 @@ def _lead(net: NetTables) -> str:
 
 
 def _map(net: NetTables) -> str:
-    if not net.map_base64:
+    if not net.map_address:
         return '<p class="note">net_map.png is missing.</p>'
     return (
-        f'<figure><img class="wide" src="data:image/png;base64,{net.map_base64}" '
+        f'<figure><img class="wide" src="{net.map_address}" '
         'alt="Map of the net wall: fouling, holes and the vehicle’s track"></figure>'
     )
 
@@ -289,6 +288,6 @@ def _facts(path: Path) -> Mapping[str, Any]:
 
 def _picture(run_dir: Path) -> str:
     try:
-        return base64.b64encode((run_dir / NET_MAP_PNG).read_bytes()).decode("ascii")
+        return data_url((run_dir / NET_MAP_PNG).read_bytes(), "png")
     except OSError:
         return ""
