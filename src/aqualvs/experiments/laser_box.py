@@ -2,19 +2,15 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from aqualvs.calibrate.common import picture_paths, read_colour, read_grey
-from aqualvs.calibrate.uncalibrated_stripes import find_stripes
-from aqualvs.calibration.detection.detection import detect_markers
-from aqualvs.calibration.lasers.calibrate import LaserOptions, calibrate_lasers
+from aqualvs.calibrate.common import picture_paths, read_colour
+from aqualvs.calibrate.lasers import LasersResult, calibrate_lasers
 from aqualvs.calibration.lasers.checks import LaserCalibration, LaserFigures, like
-from aqualvs.calibration.lasers.stripes_on_planes import StripePoints, box_surfaces
 from aqualvs.calibration.lasers.views import LaserView
 from aqualvs.calibration.targets.target_files import load_box
 from aqualvs.errors import CalibrationError
@@ -29,8 +25,8 @@ from aqualvs.experiments.laboratory import Laboratory, calibration_pictures, rig
 from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.optics.expected_error import WallView, expected_posture_errors
-from aqualvs.optics.rig import Laser, Rig, merged
-from aqualvs.optics.solved import rig_uncertainty, with_uncertainty
+from aqualvs.optics.rig import Laser, Rig
+from aqualvs.optics.solved import rig_uncertainty
 from aqualvs.report.figure_style import GREEN, GREY, OURS, PAPER, PURPLE, TRUTH
 from aqualvs.text import laser_colour
 
@@ -121,52 +117,33 @@ def remaining(truth: Rig, found: Rig, ranges: Sequence[float] = _SETUP.ranges) -
     return Remaining(far, read - true, np.array([one.sigma_calibration for one in expected]))
 
 
-def _views(folder: Path, box_file: Path) -> list[LaserView]:
-    markers, _ = load_box(box_file)
-    views = []
-    for path in picture_paths((str(folder),)):
-        view = detect_markers(read_grey(path), markers, path.name)
-        if isinstance(view, str):
-            raise CalibrationError(f"{path}: {view}")
-        stripes = find_stripes(read_colour(path))
-        points = StripePoints(
-            path.name, stripes.pixels, stripes.across, stripes.chain, stripes.sigma_px
-        )
-        views.append(LaserView(view, points))
-    return views
-
-
-def _solve(laboratory: Laboratory) -> tuple[LaserCalibration, LaserView]:
-    """Return the calibration, and the first of its pictures."""
+def _solve(laboratory: Laboratory) -> LasersResult:
     files = calibration_pictures(laboratory)
-    rig = rig_without_lasers(laboratory)
-    markers, _ = load_box(files.box_file)
-    views = _views(files.box, files.box_file)
-    result = calibrate_lasers(
-        rig,
-        views,
-        box_surfaces(markers.planes, markers.points()),
-        options=LaserOptions(n_lasers=len(laboratory.rig.lasers), n_medium=rig.n_air),
-        uncertainty=rig_uncertainty(rig),
+    return calibrate_lasers(
+        picture_paths([files.box]),
+        rig_without_lasers(laboratory),
+        box=files.box_file,
+        medium="air",
+        n_lasers=len(laboratory.rig.lasers),
     )
-    return result, views[0]
 
 
 def _run(laboratory: Laboratory) -> ExperimentResult:
     truth = laboratory.rig
-    result, first = _solve(laboratory)
-    figures = matched(result.lasers, truth.lasers)
+    solved = _solve(laboratory)
+    figures = matched(solved.solution.lasers, truth.lasers)
     errors = [plane_error(f, laser.plane) for f, laser in zip(figures, truth.lasers, strict=True)]
-    found = _noted(result, figures, laboratory)
+    lasers = tuple(one.laser for one in figures)
+    found = replace(solved.rig, lasers=lasers).in_water(truth.n_water)
     left = remaining(truth, found)
     angle, offset = max(e.angle for e in errors), max(abs(e.offset) for e in errors)
     return ExperimentResult(
-        sentence=f"{len(result.views)} pictures of the box tell the laser planes to "
+        sentence=f"{len(solved.solution.views)} pictures of the box tell the laser planes to "
         f"{np.rad2deg(angle):.3f}° and {1e3 * offset:.2f} mm; the range error that the whole "
         f"calibration leaves is {np.abs(left.percent).max():.3f} % at most, from 0.3 to 1 m.",
         findings=(*_plane_findings(truth, figures, errors), *_left_findings(left)),
         pictures=(
-            drawn(*_BOX, 2.7, lambda f: _draw_box(f, laboratory, result, first, errors)),
+            drawn(*_BOX, 2.7, lambda f: _draw_box(f, laboratory, solved, errors)),
             drawn(*_LEFT, 2.3, lambda f: _draw_left(f, left)),
         ),
         series=_series(truth, errors, left),
@@ -180,16 +157,6 @@ def _run(laboratory: Laboratory) -> ExperimentResult:
             "read by the calibrated rig. It is the error that no averaging removes.",
         ),
     )
-
-
-def _noted(
-    result: LaserCalibration, figures: Sequence[LaserFigures], laboratory: Laboratory
-) -> Rig:
-    """Return the rig in the tank's water, lasers in the true order, with all its uncertainty."""
-    lasers = tuple(one.laser for one in figures)
-    rig = replace(result.rig, lasers=lasers).in_water(laboratory.rig.n_water)
-    known = merged(rig_uncertainty(result.rig), result.uncertainty)
-    return with_uncertainty(rig, known)
 
 
 def _plane_findings(
@@ -272,18 +239,14 @@ _LEFT = (
 
 
 def _draw_box(
-    figure: Figure,
-    laboratory: Laboratory,
-    result: LaserCalibration,
-    view: LaserView,
-    errors: Sequence[PlaneError],
+    figure: Figure, laboratory: Laboratory, solved: LasersResult, errors: Sequence[PlaneError]
 ) -> None:
-    files = calibration_pictures(laboratory)
+    files, view = calibration_pictures(laboratory), solved.views[0]
     picture, angles, offsets = figure.subplots(1, 3, width_ratios=(2.7, 1.0, 1.0))
     picture.imshow(read_colour(files.box / view.view.name)[..., ::-1])
     picture.plot(*view.view.pixels.T, ".", color="white", markersize=1.0)
-    laser_of = _lasers_of(laboratory, result, view)
-    for i in range(len(result.lasers)):
+    laser_of = _lasers_of(laboratory, solved.solution, view)
+    for i in range(len(solved.rig.lasers)):
         points = view.stripes.pixels[laser_of == i]
         picture.plot(*points.T, ".", color=laser_colour(i), markersize=1.6)
     picture.set(xticks=[], yticks=[])
