@@ -1,7 +1,6 @@
 """Place of the lens in the dome, from boards at known places; the paper's figures 3 and 4."""
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -10,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from aqualvs.calibrate.common import picture_paths, read_grey
+from aqualvs.calibrate.common import detect_targets, picture_paths, read_grey
 from aqualvs.calibration.camera.calibrate import CameraCalibration, camera
 from aqualvs.calibration.detection.detection import detect_board
 from aqualvs.calibration.dome.calibrate import dome
@@ -118,21 +117,17 @@ def board_views(folder: Path, board_file: Path, seed: int) -> tuple[View, ...]:
     Raises `CalibrationError` if one does not show it.
     """
     board = load_board(board_file)
-
-    def look(path: Path) -> View | str:
-        return detect_board(read_grey(path), board, path.name)
-
-    paths = picture_paths((str(folder),))
-    with ThreadPoolExecutor(2) as pool:
-        found = list(pool.map(look, paths))
-    for path, view in zip(paths, found, strict=True):
-        if isinstance(view, str):
-            raise CalibrationError(f"{path}: {view}")
+    found = detect_targets(
+        picture_paths([folder]),
+        lambda name, picture: detect_board(picture, board, name),
+        board_file.name,
+    )
+    for name, why in found.missed.items():
+        raise CalibrationError(f"{folder / name}: {why}")
     rng = np.random.default_rng(seed)
     return tuple(
         replace(view, pixels=view.pixels + rng.normal(0.0, _SETUP.corner_px, view.pixels.shape))
-        for view in found
-        if isinstance(view, View)
+        for view in found.views
     )
 
 
