@@ -187,13 +187,10 @@ def _change_cells(row: ParameterRow) -> list[str]:
 
 def _parts_of(row: ExpectedError) -> dict[str, tuple[float, float, float]]:
     """Return standard deviations of range (mm), pitch and yaw (degrees) by their cause."""
-    system = in_mm_and_degrees(row.sigma_calibration)
-    noise = in_mm_and_degrees(row.sigma_noise)
-    both = [math.hypot(s, n) for s, n in zip(system, noise, strict=True)]
     return {
-        "calibration": system,
-        "noise of one picture": noise,
-        "both": (both[0], both[1], both[2]),
+        "calibration": in_mm_and_degrees(row.sigma_calibration),
+        "noise of one picture": in_mm_and_degrees(row.sigma_noise),
+        "both": in_mm_and_degrees(row.sigma),
     }
 
 
