@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from aqualvs.errors import OptionError, OutputError
+from aqualvs.errors import OptionError
 from aqualvs.geometry.transforms import SE3
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig
 from aqualvs.optics.rigfile import save_rig
@@ -18,7 +18,7 @@ from aqualvs.optics.solved import with_exact_numbers
 from aqualvs.simulation import calibration_targets as targets
 from aqualvs.simulation import calibration_targets as views
 from aqualvs.simulation.cameras import IDEAL, SimulatedCamera
-from aqualvs.simulation.dive import simulate_dive
+from aqualvs.simulation.dive import simulate_dive, writable
 from aqualvs.simulation.panels import PanelRenderer, PanelScene, RoomLight, panel_sheets
 from aqualvs.simulation.scenario import Scenario, parse_scenario
 from aqualvs.simulation.video import jpeg
@@ -193,12 +193,8 @@ def simulate_calibration(
     size = SetSize() if size is None else size
     _check(rig, size)
     job = _Job(rig, out, size, seed, progress, camera)
-    try:
+    with writable(out):
         return _simulate(job)
-    except OSError as error:
-        raise OutputError(
-            f"{error.filename or out}: {error.strerror}; choose a folder that can be written"
-        ) from None
 
 
 def _check(rig: Rig, size: SetSize) -> None:

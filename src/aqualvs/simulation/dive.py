@@ -4,12 +4,12 @@ For the vehicle log and the holes the net hangs plumb and faces `NET_BEARING`, i
 `NET_DEPTH` deep; the attitude of the vehicle follows from the trajectory.
 """
 
+import contextlib
 import csv
 import os
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TextIO
 
 import numpy as np
 
@@ -115,6 +115,18 @@ def _foot(scenario: Scenario, t: float) -> FloatArray:
     return np.asarray(centre[[0, 2]], np.float64)
 
 
+@contextlib.contextmanager
+def writable(path: Path) -> Iterator[None]:
+    """Turn a fault of the operating system into an `OutputError` that names the file."""
+    try:
+        yield
+    except OSError as error:
+        place = error.filename or path
+        raise OutputError(
+            f"{place}: {error.strerror}; choose a folder that can be written"
+        ) from None
+
+
 @dataclass(frozen=True, slots=True)
 class DiveFiles:
     """Files written by `simulate_dive`."""
@@ -167,11 +179,14 @@ def simulate_dive(
         If rig, scenario or options make no sense, or a picture takes longer than a frame.
     """
     check_shutter(rig.shutter, scenario.fps)
-    _make_folder(out_dir)
     video, truth = out_dir / "dive.mp4", out_dir / "truth.csv"
     renderer = Renderer(rig, threads=os.cpu_count() or 1, camera=camera)
+    with writable(out_dir):
+        out_dir.mkdir(parents=True, exist_ok=True)
+    with writable(truth):
+        file = truth.open("w", newline="", encoding="utf-8")
     with (
-        _open_table(truth) as file,
+        file,
         VideoWriter(
             video,
             rig.size_px,
@@ -264,26 +279,8 @@ def check_shutter(shutter: Shutter, fps: float) -> None:
         )
 
 
-def _make_folder(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(
-            f"{folder}: {error.strerror}; choose a folder that can be written"
-        ) from None
-
-
-def _open_table(path: Path) -> TextIO:
-    try:
-        return path.open("w", newline="", encoding="utf-8")
-    except OSError as error:
-        raise OutputError(
-            f"{path}: {error.strerror}; choose a folder that can be written"
-        ) from None
-
-
 def _write_points(path: Path, lit: LitPoints) -> None:
-    try:
+    with writable(path):
         np.savez_compressed(
             path,
             xyz=1e3 * lit.points_in_dome,
@@ -292,7 +289,3 @@ def _write_points(path: Path, lit: LitPoints) -> None:
             label=lit.label,
             labels=np.array([label.name.lower() for label in SurfaceKind]),
         )
-    except OSError as error:
-        raise OutputError(
-            f"{path}: {error.strerror}; choose a folder that can be written"
-        ) from None
