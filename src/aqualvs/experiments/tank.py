@@ -196,6 +196,7 @@ def _run_distance(laboratory: Laboratory) -> ExperimentResult:
     valid = bool(calibrated.valid.all())
     place = np.round(1e3 * calibrated.truth[:, 0])
     spread = max(np.nanstd(calibrated.range_percent[place == p]) for p in np.unique(place))
+    columns = {**calibrated.columns(0), "range_true_rig_m": true.values[:, 0]}
     *most, farthest = PLACES_MM
     return ExperimentResult(
         sentence=f"At {', '.join(map(str, most))} and {farthest} mm every distance is within "
@@ -229,12 +230,7 @@ def _run_distance(laboratory: Laboratory) -> ExperimentResult:
                 lambda figure: _draw_distance(figure, calibrated, true),
             ),
         ),
-        series=(
-            DataColumns(
-                name="distance",
-                columns={**calibrated.columns(0), "range_true_rig_m": true.values[:, 0]},
-            ),
-        ),
+        series=(DataColumns(name="distance", columns=columns),),
         notes=(
             "The truth is that of the simulator; the paper's distances were set by hand.",
             "What calibration adds is common to all frames of a place; the bars tell noise only.",

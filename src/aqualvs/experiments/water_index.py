@@ -22,7 +22,6 @@ from aqualvs.errors import CalibrationError
 from aqualvs.experiments.experiment import (
     DataColumns,
     Experiment,
-    ExperimentFigure,
     ExperimentResult,
     ExperimentRow,
     drawn,
@@ -66,31 +65,6 @@ class Decentred:
     placed: FloatArray
     # Whether the system believes the latter.
     observable: BoolArray
-
-
-def index_picture(wet: Numbers, n_each: int) -> ExperimentFigure:
-    """Return the estimates in the waters, `n_each` frames of each."""
-    return drawn(
-        "index",
-        "The number on the screen, frame by frame, through six waters: the truth, ours with two "
-        "standard deviations, and the paper's way. Below: what both are off. A change is believed "
-        "with its fourth frame; until then ours stays.",
-        2.8,
-        lambda figure: _draw_numbers(figure, wet, n_each),
-    )
-
-
-def target_picture(
-    example: NDArray[np.uint8], spread: Decentred, largest_sigma: float
-) -> ExperimentFigure:
-    """Return the target in view, and the standard deviation by the lens's place."""
-    return drawn(
-        "figure_5",
-        "Beside figure 5: the target in the camera's view, and how well ten frames of it tell the "
-        "index, by how far the lens sits off the dome's centre.",
-        2.7,
-        lambda figure: _draw_target(figure, example, spread, largest_sigma),
-    )
 
 
 def _draw_numbers(figure: Figure, wet: Numbers, n_each: int) -> None:
@@ -302,16 +276,30 @@ def _run(laboratory: Laboratory) -> ExperimentResult:
     taken = cruise(laboratory)
     numbers, alarms = follow(calibrated_rig(laboratory), taken)
     spread = decentred(laboratory.rig)
+    wet = numbers.after(_SETUP.frames)
     last = numbers.after(2 * _SETUP.frames - 1, _SETUP.frames)
     worst, by_paper = (float(np.abs(n - last.truth).max()) for n in (last.ours, last.paper))
     return ExperimentResult(
         sentence=f"From {WATERS[0]} to {WATERS[-1]} the index is told to {worst:.4f} at worst, "
         f"within {_in_sigmas(last).max():.1f} standard deviations everywhere; the paper's way is "
         f"off by up to {by_paper:.4f} on the same frames.",
-        findings=_findings(last, numbers.after(_SETUP.frames), alarms, spread),
+        findings=_findings(last, wet, alarms, spread),
         pictures=(
-            index_picture(numbers.after(_SETUP.frames), _SETUP.frames),
-            target_picture(taken.example, spread, _OPTIONS.largest_sigma),
+            drawn(
+                "index",
+                "The number on the screen, frame by frame, through six waters: the truth, ours "
+                "with two standard deviations, and the paper's way. Below: what both are off. A "
+                "change is believed with its fourth frame; until then ours stays.",
+                2.8,
+                lambda figure: _draw_numbers(figure, wet, _SETUP.frames),
+            ),
+            drawn(
+                "figure_5",
+                "Beside figure 5: the target in the camera's view, and how well ten frames of it "
+                "tell the index, by how far the lens sits off the dome's centre.",
+                2.7,
+                lambda figure: _draw_target(figure, taken.example, spread, _OPTIONS.largest_sigma),
+            ),
         ),
         series=_series(numbers, spread),
         notes=(
