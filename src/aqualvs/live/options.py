@@ -7,7 +7,6 @@ page of `aqualvs live` and `follow`, if its packages are installed.
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -128,23 +127,12 @@ class OutputRequest:
     rerun: str | None = None  # As `RerunOutput` takes it.
 
 
-def make_outputs(request: OutputRequest, scanner: "ScannerOptions") -> list[Output]:
-    """Make the outputs that were asked for.
+def make_outputs(request: OutputRequest, scanner: "ScannerOptions") -> Iterator[Output]:
+    """Make the outputs that were asked for, one by one; only these are imported.
 
     Raises `OptionError` if an address cannot be understood, or the extra that an output needs is
-    not installed; the outputs made before it are closed.
+    not installed.
     """
-    with ExitStack() as made:
-        outputs = []
-        for output in _requested(request, scanner):
-            outputs.append(output)
-            made.callback(output.close)
-        made.pop_all()
-    return outputs
-
-
-def _requested(request: OutputRequest, scanner: "ScannerOptions") -> Iterator[Output]:
-    """Yield the outputs one by one; only what is asked for is imported."""
     for url in request.mavlink:
         from aqualvs.live.outputs.mavlink import MavlinkOutput
 
