@@ -17,7 +17,7 @@ from rich.table import Table
 from scipy.special import chdtri, ndtr
 
 from aqualvs.calibration.solver.bundle import rig_difference as step_between
-from aqualvs.check.finding import escaped
+from aqualvs.check.finding import escaped, number_table
 from aqualvs.errors import RigError
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.geometry.planes import Plane
@@ -504,10 +504,8 @@ def _alike(one: Laser, other: Laser) -> bool:
 
 
 def _table(new: Rig, old: Rig, difference: RigDifference) -> Table:
-    table = Table(box=None)
-    table.add_column("number")
-    for name in ("old", "new", "change", "sigma", "in sigmas"):
-        table.add_column(name, justify="right")
+    names = ("number", "old", "new", "change", "sigma", "in sigmas")
+    table = number_table(None, *names, texts=["number"])
     values, values_before = rig_numbers(new), rig_numbers(old)
     for name in difference.names:
         if ":" not in name:

@@ -37,6 +37,14 @@ def findings_table(findings: Sequence[Finding]) -> Table:
     return table
 
 
+def number_table(title: str | None, *columns: str, texts: Sequence[str] = ()) -> Table:
+    """Return an empty table of these columns: `texts` to the left, numbers to the right."""
+    table = Table(title=title, title_justify="left", box=None)
+    for name in columns:
+        table.add_column(name, justify="left" if name in texts else "right")
+    return table
+
+
 def escaped(text: str) -> str:
     """Return text that a terminal shows as it is, square brackets included."""
     return text.replace("[", r"\[")
@@ -97,10 +105,8 @@ def _calibration_finding(expected: ExpectedError, place: str) -> Finding:
 
 def sensitivity_table(rig: Rig, errors: Sequence[ExpectedError]) -> Table:
     """Return what a pixel across each laser's stripe is worth."""
-    table = Table(title="Range error for a pixel", title_justify="left", box=None)
-    table.add_column("range mm", justify="right")
-    for laser in rig.lasers:
-        table.add_column(f"{escaped(laser.name)} mm/px", justify="right")
+    names = [f"{escaped(laser.name)} mm/px" for laser in rig.lasers]
+    table = number_table("Range error for a pixel", "range mm", *names)
     for expected in errors:
         cells = (_shown(value * 1e3) for value in expected.per_pixel)
         table.add_row(f"{expected.wall_range * 1e3:.0f}", *cells)
@@ -110,11 +116,8 @@ def sensitivity_table(rig: Rig, errors: Sequence[ExpectedError]) -> Table:
 def error_table(errors: Sequence[ExpectedError]) -> Table:
     """Return the standard deviations of posture to a wall ahead, by where they come from."""
     title = f"Expected error, one sigma: a wall ahead, {SIGMA_PX} px on {N_POINTS} points a laser"
-    table = Table(title=title, title_justify="left", box=None)
-    table.add_column("range mm", justify="right")
-    table.add_column("from")
-    for name in ("range mm", "range %", "pitch deg", "yaw deg"):
-        table.add_column(name, justify="right")
+    names = ("range mm", "from", "range mm", "range %", "pitch deg", "yaw deg")
+    table = number_table(title, *names, texts=["from"])
     for expected in errors:
         rows = {
             "rig": expected.sigma_calibration,

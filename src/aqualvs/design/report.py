@@ -14,7 +14,7 @@ import numpy as np
 from rich.table import Table
 from rich.text import Text
 
-from aqualvs.check.finding import escaped, shutter_finding
+from aqualvs.check.finding import escaped, number_table, shutter_finding
 from aqualvs.design.calibrated import INDEX_ERROR, OffsetCost
 from aqualvs.design.changes import Change
 from aqualvs.design.judge import PredictedErrors, predict, together
@@ -93,10 +93,9 @@ def verdict(design: Design, by_camera: Mapping[str, FloatArray]) -> tuple[str, b
 
 def lasers_table(design: Design, told: PredictedErrors) -> Table:
     """Return the table of the lasers' mounts and of the ranges at which they are in the picture."""
-    table = _table("Lasers: where, at what angles, at which ranges in the picture")
     headings = ("x\nmm", "y\nmm", "z\nmm", "baseline\nmm", "stripe\ndeg", "tilt\ndeg")
-    for name in (*headings, "swing\ndeg", "seen\nmm"):
-        table.add_column(name, justify="right")
+    title = "Lasers: where, at what angles, at which ranges in the picture"
+    table = number_table(title, "", *headings, "swing\ndeg", "seen\nmm", texts=[""])
     for mount, visible in zip(design.mounts, told.visible, strict=True):
         place = [f"{value * 1e3 + 0.0:.0f}".replace("-0", "0", 1) for value in mount.position]
         angles = [_angle(mount.stripe), _angle(mount.tilt), _angle(mount.swing)]
@@ -120,13 +119,14 @@ def _interval(ranges: FloatArray, visible: BoolArray) -> str:
     return ", ".join(pieces) or "nowhere"
 
 
+_FROM, _ERRORS = "\nfrom", ("range\nmm", "\n%", "pitch\ndeg", "yaw\ndeg")
+
+
 def error_table(told: PredictedErrors, systematic: FloatArray, title: str) -> Table:
     """Return one sigma of range, pitch and yaw by range; `systematic` (W, 3) is all of it."""
-    table = _table(title, first="range\nmm", right=True)
-    table.add_column("\nfrom")
-    for name in ("range\nmm", "\n%", "pitch\ndeg", "yaw\ndeg"):
-        table.add_column(name, justify="right")
-    table.add_column("points on a wall,\nstrands on a net")
+    points = "points on a wall,\nstrands on a net"
+    names = ("range\nmm", _FROM, *_ERRORS, points)
+    table = number_table(title, *names, texts=[_FROM, points])
     for i, wall in enumerate(told.ranges):
         lines, strands = told.stripes.lines[:, i], told.strands[:, i]
         rows = (
@@ -157,9 +157,8 @@ def _shown(value: float) -> str:
 
 def cause_table(causes: Mapping[str, FloatArray], i: int, wall: float) -> Table:
     """Return the table of posture errors by each tolerance at the i-th range, `wall` in metres."""
-    table = _table(f"Tolerances at {wall * 1e3:.0f} mm, one by one", first="\nfrom")
-    for name in ("range\nmm", "\n%", "pitch\ndeg", "yaw\ndeg"):
-        table.add_column(name, justify="right")
+    title = f"Tolerances at {wall * 1e3:.0f} mm, one by one"
+    table = number_table(title, _FROM, *_ERRORS, texts=[_FROM])
     for cause, sigma in causes.items():
         table.add_row(cause, *_cells(sigma[i], wall))
     return table
@@ -167,17 +166,17 @@ def cause_table(causes: Mapping[str, FloatArray], i: int, wall: float) -> Table:
 
 def offset_table(costs: Sequence[OffsetCost], ranges: Sequence[float]) -> Table:
     """Return the table of errors by offsets of the lens, at the nearest and the farthest range."""
-    table = _table("Lens ahead of the dome's centre: range error", first="offset\nmm", right=True)
     near, far = (f"{value * 1e3:.0f} mm" for value in (ranges[0], ranges[-1]))
-    for name in (
+    table = number_table(
+        "Lens ahead of the dome's centre: range error",
+        "offset\nmm",
         f"neglected\n{near}",
         f"\n{far}",
         f"in calibration too\n{near}",
         f"\n{far}",
         f"n +{INDEX_ERROR:g}\n{far}",
         "n known\nto +-",
-    ):
-        table.add_column(name, justify="right")
+    )
     for cost in costs:
         wide = cost.index_sigma
         table.add_row(
@@ -216,12 +215,9 @@ def _percent(share: float) -> str:
 
 def change_table(found: Sequence[Change]) -> Table:
     """Return the table of changes and their effects, the most helpful first."""
-    table = _table(
-        "Change of the errors in per cent by a change of the rig, lasers tilted anew",
-        first="\nchange",
-    )
-    for name in ("\nall", "noise\nrange", "\nangle", "tolerances\nrange", "\nangle"):
-        table.add_column(name, justify="right")
+    names = ("\nchange", "\nall", "noise\nrange", "\nangle", "tolerances\nrange", "\nangle")
+    title = "Change of the errors in per cent by a change of the rig, lasers tilted anew"
+    table = number_table(title, *names, texts=["\nchange"])
     for one in found:
         values = (
             one.score,
@@ -271,12 +267,6 @@ def _leaves(mount: Mount, ranges: FloatArray, visible: BoolArray) -> str:
     where = _interval(ranges, visible)
     seen = f"is in the picture at {where} mm only" if visible.any() else "is never in the picture"
     return f"Laser '{mount.name}' {seen}; where it is not, its points are missing."
-
-
-def _table(title: str, first: str = "", right: bool = False) -> Table:
-    table = Table(title=title, title_justify="left", box=None)
-    table.add_column(first, justify="right" if right else "left")
-    return table
 
 
 ERRORS_PNG, PICTURE_PNG, DESIGN_HTML = "errors.png", "picture.png", "design.html"
