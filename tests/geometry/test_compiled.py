@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numba
 import numpy as np
@@ -11,7 +12,13 @@ import pytest
 
 import aqualvs
 from aqualvs.demo import bundled_dive
-from aqualvs.geometry.compiled import compiled_at_once, inline_kernel, kernel
+from aqualvs.geometry.compiled import (
+    compiled_at_once,
+    inline_kernel,
+    keeps_code,
+    kernel,
+    lazy_kernel,
+)
 from aqualvs.optics.rigfile import load_rig
 from aqualvs.scanner import Scanner
 from aqualvs.sources import open_source
@@ -125,6 +132,28 @@ def test_code_for_kernels_and_for_python_are_kept_apart_on_disk(
     for path in (tmp_path / "cache").rglob("*summed*"):
         path.unlink()
     assert run_caller(tmp_path, "of_both.py") == [*(said[word] for word in order), "1", "1"]
+
+
+def test_where_no_code_can_be_kept_kernels_are_compiled_for_each_process(monkeypatch) -> None:
+    compile_for_now = numba.njit
+
+    def njit(*arguments, cache=False, **options):
+        if cache:
+            raise RuntimeError("cannot cache function 'later': no locator available for file")
+        return compile_for_now(*arguments, **options)
+
+    monkeypatch.setattr(numba, "njit", njit)
+
+    def later(x):
+        return x + 1.0
+
+    at_once: Any = kernel(later)
+    lazy: Any = lazy_kernel(later)
+    assert at_once(1.0) == lazy(1.0) == 2.0
+    assert len(at_once.signatures) == 1
+    assert not lazy._compiled.signatures
+    assert not keeps_code(at_once)
+    assert keeps_code(_dot)
 
 
 def test_cached_kernels_follow_their_callees(tmp_path: Path) -> None:

@@ -24,6 +24,7 @@ from aqualvs.check.finding import findings_table, shutter_finding
 from aqualvs.control.vehicle import Mode, VehicleState
 from aqualvs.demo import bundled_dive
 from aqualvs.errors import AqualvsError
+from aqualvs.geometry.compiled import keeps_code
 from aqualvs.live.mavlink.ardusub import ArduSubLink, ArduSubOptions
 from aqualvs.live.mavlink.ardusub_parameters import (
     FOR_DISTANCE,
@@ -35,6 +36,7 @@ from aqualvs.live.mavlink.ardusub_parameters import (
 )
 from aqualvs.live.mavlink.link import MavlinkLink
 from aqualvs.live.options import VehicleSetup
+from aqualvs.optics.projection import project_all
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.rigfile import load_rig
 from aqualvs.optics.shutter import AT_ONCE, Shutter
@@ -230,6 +232,11 @@ def _machine() -> Iterator[Finding]:
     min_free_gb = 2.0
     if free_gb < min_free_gb:
         yield Finding.warn(f"only {free_gb:.1f} GB free here; recordings need about 1 GB an hour")
+    if not keeps_code(project_all):
+        yield Finding.warn(
+            "every command compiles anew, because no folder for compiled code can be written; set "
+            "NUMBA_CACHE_DIR to one that can"
+        )
 
 
 def _packages() -> Iterator[Finding]:

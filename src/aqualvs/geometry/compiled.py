@@ -99,6 +99,11 @@ def inline_borrowing_kernel(function: F) -> F:
     return _inner(function, forceinline=True, _nrt=False)
 
 
+def keeps_code(kernel: Callable[..., Any]) -> bool:
+    """Return whether the machine code of a kernel is kept on disk for the next process."""
+    return _cache_file(kernel) is not None
+
+
 def python_of(kernel: Callable[..., Any]) -> Callable[..., Any]:
     """Return the Python function that a kernel is compiled from.
 
@@ -133,7 +138,11 @@ _OPTIONS = {"error_model": "numpy", "nogil": True, "fastmath": False, "no_cfunc_
 
 def _compiled(function: F, **options: object) -> F:
     options = {**_OPTIONS, **options}
-    compiled = numba.njit(cache=True, **options)(function)
+    try:
+        compiled = numba.njit(cache=True, **options)(function)
+    except RuntimeError:
+        # Numba finds no folder for its code: neither the package's nor the user's can be written.
+        return cast(F, numba.njit(**options)(function))
     _depend_on_callees(compiled, repr(sorted(options.items())))
     return cast(F, compiled)
 
@@ -176,7 +185,7 @@ class _LazyKernel:
 
     def _run_first(self, *arguments: Any) -> Any:
         file = _cache_file(self._compiled)
-        if file is None or file._load_index():
+        if file is not None and file._load_index():
             self._run = self._compiled
         else:
             self._left_s = _LAZY_S_PER_BYTE * _n_bytes(self.py_func, set())
