@@ -13,7 +13,7 @@ from aqualvs.design.command import designed_rig
 from aqualvs.design.file import EXAMPLE, design_of_rig
 from aqualvs.design.judge import predict
 from aqualvs.geometry.transforms import SE3
-from aqualvs.optics.rigfile import load_rig
+from aqualvs.optics.rigfile import load_rig, save_rig
 from aqualvs.scanner import Scanner
 from aqualvs.scanning.scan import Frame, planes_of_image
 from aqualvs.simulation.render import Renderer
@@ -118,12 +118,38 @@ def test_a_rig_that_exists_is_judged_as_it_is_and_tilted_best(tmp_path, capsys):
     path = rig_file(tmp_path)
     assert main(["design", "--rig", str(path), "--no-changes"]) == 0
     said = capsys.readouterr().out
+    first, second, *_ = said.splitlines()
+    assert first.startswith("Yes: meets its goals")
+    assert second.startswith("Its lasers tilted best: Yes: meets its goals")
     assert "As it is" in said
     assert "Tilted best, its errors are" in said
     assert main(["design", "--rig", str(path), "--no-changes", "--no-tilt"]) == 0
     said = capsys.readouterr().out
     assert "As it is" not in said
     assert "19.9" in said  # The lower laser's tilt, asin(0.340) = 19.9 degrees.
+
+
+@pytest.mark.parametrize("near", [0.15, 0.2])
+def test_the_verdict_on_a_rig_is_not_that_on_its_lasers_tilted_best(near, tmp_path, capsys):
+    path = tmp_path / "near.yaml"
+    save_rig(replace(example_rig(), working_range=(near, 1.0)), path)
+    assert main(["design", "--rig", str(path), "--no-changes", "-o", str(tmp_path / "out")]) == 0
+    said = capsys.readouterr().out
+    first, second, *_ = said.splitlines()
+    seen = re.search(r"There is (a posture only at [\d-]+ mm) in the working range", said)
+    assert seen
+    assert first == f"No: from {1e3 * near:.0f} to 1000 mm there is {seen[1]}."
+    assert second.startswith("Its lasers tilted best: ")
+    # Stripes that must be seen nearer are worse farther off, by less than a factor of two.
+    gain = re.search(r"Tilted best, its errors are (\d+)% of that, at [\d-]+ mm", said)
+    assert gain
+    assert 60 < int(gain[1]) < 200
+    page = (tmp_path / "out" / "design.html").read_text(encoding="utf-8")
+    assert page.index(first) < page.index("Its lasers tilted best: ")
+    assert 'class="notice warn"' in page
+    assert "all stripes, coloured by range; lasers tilted best.</figcaption>" in page
+    assert main(["design", "--rig", str(path), "--no-changes", "--no-tilt"]) == 0
+    assert capsys.readouterr().out.splitlines()[0] == first
 
 
 def test_the_note_of_the_mounts_is_read_back_by_the_rig_file(tmp_path):

@@ -20,7 +20,7 @@ from aqualvs.design.file import (
     load_design,
     merged_content,
 )
-from aqualvs.design.judge import predict, score, together
+from aqualvs.design.judge import predict, together
 from aqualvs.design.report import (
     DESIGN_HTML,
     ERRORS_PNG,
@@ -31,8 +31,10 @@ from aqualvs.design.report import (
     draw_figures,
     error_table,
     findings,
+    gain_text,
     lasers_table,
     offset_table,
+    predict_closely,
     shown_ranges,
     summary,
     verdict,
@@ -85,18 +87,8 @@ def design_and_tell(request: DesignRequest) -> None:
             turned = [replace(m, free_stripe=m.free_stripe or m.free_tilt) for m in design.mounts]
             design = design.with_mounts(turned)
         best = best_angles(design) if request.tilt else design
-        ranges = shown_ranges(best.rig.working_range)
-        by_camera = camera_errors(best, ranges)
-        first, fine = verdict(best, by_camera)
-        told.console.print(first, style="bold", markup=False, highlight=False, soft_wrap=True)
-        told(*summary(best))
-        if request.rig is not None and request.tilt:
-            title = "As it is: one sigma on a wall or net square ahead"
-            _tell_errors(told, design, camera_errors(design, ranges), title)
-            error, better = score(design).error, score(best).error
-            told(f"Tilted best, its errors are {better / error:.0%} of that.")
-        title = "Expected error: one sigma on a wall or net square ahead"
-        _tell_errors(told, best, by_camera, title)
+        exists = request.rig is not None and request.tilt
+        first, fine, by_camera = _tell_judgement(told, design, best, exists=exists)
         costs = offset_costs(best, best.rig.working_range)
         if costs:
             words = centring_text(best, costs, best.rig.working_range)
@@ -108,9 +100,35 @@ def design_and_tell(request: DesignRequest) -> None:
                 save_rig(designed_rig(best), request.out / RIG_YAML)
                 pictures = draw_figures(best, by_camera, request.out)
                 page = request.out / DESIGN_HTML
-                write_page(page, best.rig.name, first, told.parts, pictures, fine=fine)
+                name = best.rig.name
+                write_page(page, name, first, told.parts, pictures, fine=fine, tilted=exists)
             for path in (request.out / RIG_YAML, *pictures, page):
                 told.say(f"written: {path}")
+
+
+def _tell_judgement(
+    told: "_Telling", design: Design, best: Design, *, exists: bool
+) -> tuple[str, bool, dict[str, FloatArray]]:
+    """Tell the verdict and the expected errors; return the verdict and `best`'s `camera_errors`.
+
+    `exists`: the verdict is on `design` as it is, and what `best` would be follows it.
+    """
+    ranges, square = shown_ranges(best.rig.working_range), "one sigma on a wall or net square ahead"
+    by_camera = camera_errors(best, ranges)
+    first, fine = verdict(best, by_camera)
+    if exists:
+        now, tilted = camera_errors(design, ranges), first
+        first, fine = verdict(design, now)
+        told.headline(first)
+        told(f"Its lasers tilted best: {tilted}", *summary(best))
+        _tell_errors(told, design, now, f"As it is: {square}")
+        told(gain_text(design, best))
+        _tell_errors(told, best, by_camera, f"Tilted best: {square}")
+    else:
+        told.headline(first)
+        told(*summary(best))
+        _tell_errors(told, best, by_camera, f"Expected error: {square}")
+    return first, fine, by_camera
 
 
 @dataclass(slots=True)
@@ -127,6 +145,10 @@ class _Telling:
         self.console.print()
         self.parts += parts
 
+    def headline(self, verdict: str) -> None:
+        """Print the first line, which the page shows by itself."""
+        self.console.print(verdict, style="bold", markup=False, highlight=False, soft_wrap=True)
+
     def say(self, sentence: str) -> None:
         """Print a line that is not for the page."""
         self.console.print(sentence, markup=False, highlight=False, soft_wrap=True)
@@ -136,9 +158,7 @@ def _tell_errors(
     told: _Telling, design: Design, by_camera: Mapping[str, FloatArray], title: str
 ) -> None:
     """Tell the places of the lasers, their errors, and the part of each tolerance."""
-    # Number of ranges at which stripes are checked to be in the picture.
-    n_seen = 181
-    closely = predict(design, np.geomspace(*design.rig.working_range, n_seen))
+    closely = predict_closely(design)
     ranges = shown_ranges(design.rig.working_range)
     found = predict(design, ranges)
     causes = {**by_camera, **found.systematic}

@@ -40,6 +40,12 @@ def shown_ranges(working_range: tuple[float, float]) -> list[float]:
     return [value * 1e-3 for value in (near, *inner, far)]
 
 
+def predict_closely(design: Design) -> PredictedErrors:
+    """Predict a design's errors at ranges close enough to find where its stripes are seen."""
+    n_seen = 181
+    return predict(design, np.geomspace(*design.rig.working_range, n_seen))
+
+
 def summary(design: Design) -> list[str]:
     """Return the design in two or three lines; the third is on a shutter that is stated."""
     rig = design.rig
@@ -75,8 +81,9 @@ def verdict(design: Design, by_camera: Mapping[str, FloatArray]) -> tuple[str, b
     ranges = shown_ranges(design.rig.working_range)
     told, goals = predict(design, ranges), design.goals
     near, far = (f"{1e3 * wall:.0f}" for wall in design.rig.working_range)
-    if not told.valid.all():
-        return f"No: between {near} and {far} mm there are ranges without a posture.", False
+    closely = predict_closely(design)
+    if not closely.valid.all():
+        return f"No: from {near} to {far} mm there is {_posture_words(closely)}.", False
     systematic = np.hypot(told.systematic_total, together(by_camera))
     sigma = np.hypot(told.net, systematic)
     share, angle = sigma[:, 0] / ranges, sigma[:, 1:].max(axis=1)
@@ -89,6 +96,33 @@ def verdict(design: Design, by_camera: Mapping[str, FloatArray]) -> tuple[str, b
         f"{math.degrees(angle[tilted]):.2g} degrees at {1e3 * ranges[tilted]:.0f} mm "
         "(a net, one frame, noise and tolerances)."
     ), fine
+
+
+def _posture_words(closely: PredictedErrors) -> str:
+    """Return at which ranges there is a posture, where it is not all of them."""
+    if not closely.valid.any():
+        return "no posture"
+    return f"a posture only at {_interval(closely.ranges, closely.valid)} mm"
+
+
+def gain_text(design: Design, best: Design) -> str:
+    """Return how large the errors of `best` are beside a design's, where both have a posture.
+
+    Root mean squares in goals, by noise and the tolerances of lasers and water, on walls and nets.
+    """
+    now, tilted = predict_closely(design), predict_closely(best)
+    both = now.valid & tilted.valid
+    if not both.any():
+        return "Tilted best, its errors cannot be compared with that: no range has both."
+    goals = np.full((np.count_nonzero(both), 3), design.goals.angle)
+    goals[:, 0] = design.goals.range_share * now.ranges[both]
+
+    def size(told: PredictedErrors) -> float:
+        squares = told.wall**2 + told.net**2 + 2.0 * told.systematic_total**2
+        return math.sqrt(float(np.mean(squares[both] / goals**2)))
+
+    where = "" if both.all() else f", at {_interval(now.ranges, both)} mm"
+    return f"Tilted best, its errors are {size(tilted) / size(now):.0%} of that{where}."
 
 
 def lasers_table(design: Design, told: PredictedErrors) -> Table:
@@ -243,8 +277,7 @@ def findings(design: Design, told: PredictedErrors) -> list[str]:
     if len(design.mounts) < 2:
         lines.append("One laser draws one line: no posture; add a second.")
     elif not told.valid.all():
-        seen = _interval(told.ranges, told.valid)
-        lines.append(f"There is a posture only at {seen} mm of the working range.")
+        lines.append(f"There is {_posture_words(told)} in the working range.")
     for mount, visible in zip(design.mounts, told.visible, strict=True):
         if not visible.all():
             lines.append(_leaves(mount, told.ranges, visible))
@@ -312,12 +345,13 @@ def write_page(
     pictures: Sequence[Path],
     *,
     fine: bool,
+    tilted: bool = False,
 ) -> None:
     """Write a design's page: the verdict, the figures, and what the terminal shows.
 
     `name` is the rig's, `pictures` are from `draw_figures`, and `fine` is whether the goals are
-    met. Sentences among `parts` belong to the table before them. Raises `OSError` as the system
-    says it.
+    met. `tilted`: the figures are not of the rig that the verdict is on. Sentences among `parts`
+    belong to the table before them. Raises `OSError` as the system says it.
     """
     lead: list[str] = []
     sections: list[tuple[str, html.Raw, list[str]]] = []
@@ -326,6 +360,7 @@ def write_page(
             sections.append((str(part.title or ""), _as_html(part), []))
         else:
             (sections[-1][2] if sections else lead).append(part)
+    of = "; lasers tilted best" if tilted else ""
     content = {
         "title": name,
         "subtitle": "predicted before it is built",
@@ -333,7 +368,7 @@ def write_page(
         "fine": fine,
         "lead": lead,
         "figures": [
-            (html.data_url(one.read_bytes(), "png"), _FIGURES[one.name]) for one in pictures
+            (html.data_url(one.read_bytes(), "png"), _FIGURES[one.name] + of) for one in pictures
         ],
         "tables": sections,
     }
