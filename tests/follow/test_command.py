@@ -45,6 +45,21 @@ def test_simulation_writes_log_figures_and_page(tmp_path: Path) -> None:
         assert (request.out / name).read_bytes().startswith(b"\x89PNG")
 
 
+def test_a_picture_that_stands_still_steers_nobody(tmp_path: Path) -> None:
+    told: list[str] = []
+    request = SimRequest(out=tmp_path / "out", aim=Aim(range=0.6), seconds=4.0, freeze=2.0)
+    assert simulate_and_tell(request, lambda line: told.append(line)) == 0
+    with (request.out / FOLLOW_CSV).open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    share = sum(row["stage"] == "holding" and not row["reason"] for row in rows) / len(rows)
+    assert 0.4 < share < 0.7
+    (line,) = (line for line in told if "share of the frames at which it was steered" in line)
+    # The log of the truth has three more frames, still on their way, and the gate may have braked.
+    assert float(line.split()[-2]) == pytest.approx(100.0 * share, abs=6.0)
+    page = (request.out / "follow.html").read_text(encoding="utf-8")
+    assert "share of the frames at which it was steered" in page
+
+
 def test_simulation_ends_where_the_plan_ends(tmp_path: Path) -> None:
     plan = tmp_path / "plan.yaml"
     plan.write_text(PLAN, encoding="utf-8")

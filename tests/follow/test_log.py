@@ -110,6 +110,25 @@ def test_contact_and_loss_are_told() -> None:
     assert math.isinf(short.lost_s)
 
 
+def test_only_frames_at_which_efforts_pass_are_steered() -> None:
+    """Half of the frames are steered: a gate that brakes steers, one that stops does not."""
+    steered = [
+        ROW,
+        ROW._replace(stage="following"),
+        ROW._replace(reason="too_fast"),
+        ROW._replace(stage="over", reason="mission_over"),
+    ]
+    not_steered = [
+        ROW._replace(engaged=False),
+        ROW._replace(stage=""),
+        ROW._replace(stage="waiting"),
+        ROW._replace(reason="frozen"),
+    ]
+    assert safety_measures(LoopLog(steered)).steered_share == 1.0
+    assert safety_measures(LoopLog(not_steered)).steered_share == 0.0
+    assert safety_measures(LoopLog(steered + not_steered)).steered_share == 0.5
+
+
 def test_late_neutral_is_told() -> None:
     log = log_of(np.full(100, 0.6))
     log.blind_thrust_s = [0.15, 0.21]

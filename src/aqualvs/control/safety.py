@@ -50,6 +50,11 @@ class LimitReason(StrEnum):
         """Whether the pilot must engage again before efforts pass."""
         return self in _TAKES_OVER
 
+    @property
+    def steers(self) -> bool:
+        """Whether an effort still passes, changed or with a warning."""
+        return self in _STEERS
+
 
 _WORDS = {
     LimitReason.NOT_ENGAGED: "not engaged: the pilot steers until told otherwise",
@@ -89,6 +94,9 @@ _TAKES_OVER = frozenset(
         LimitReason.NO_ANSWER,
         LimitReason.GAVE_UP,
     }
+)
+_STEERS = frozenset(
+    {LimitReason.TOO_CLOSE, LimitReason.TOO_FAST, LimitReason.MISSION_OVER, LimitReason.TIPPING}
 )
 
 _REFUSED_MODES = {

@@ -8,6 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from aqualvs.control.missions import Stage
+from aqualvs.control.safety import LimitReason
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.results.files import writing
 
@@ -193,6 +195,9 @@ class SafetyMeasures:
     # Of the vehicle, in radians.
     greatest_tilt: float
 
+    # Share of the frames at which efforts passed: engaged, not waiting, not stopped by the gate.
+    steered_share: float
+
     @property
     def contact(self) -> bool:
         """Whether the hull touched the net."""
@@ -286,7 +291,15 @@ def safety_measures(log: LoopLog) -> SafetyMeasures:
         stable=_is_stable(log),
         lost_s=seen_s if lost else math.inf,
         greatest_tilt=float(log.column("tilt").max()),
+        steered_share=sum(map(_is_steered, log.rows)) / len(log.rows),
     )
+
+
+def _is_steered(row: LoopRow) -> bool:
+    """Return whether an effort of the controllers, or of the gate, reached the vehicle."""
+    if not row.engaged or row.stage == "" or Stage(row.stage).halts:
+        return False
+    return row.reason == "" or LimitReason(row.reason).steers
 
 
 def _last_seen_s(log: LoopLog) -> float:

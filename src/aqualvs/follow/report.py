@@ -168,10 +168,8 @@ class RunFacts:
 
 def summary(log: LoopLog) -> list[tuple[str, str]]:
     """Return the results of a run, as names and values."""
-    rows = log.rows
     start_s = _settled_s(log)
     hold, safety = hold_measures(log, start_s), safety_measures(log)
-    steered = sum(row.engaged for row in rows) / len(rows)
     figures = [
         (
             f"range error, rms from {start_s:.0f} s on",
@@ -185,7 +183,7 @@ def summary(log: LoopLog) -> list[tuple[str, str]]:
             "least distance from hull to net",
             f"{safety.min_clearance:.2f} m" + (" - CONTACT" if safety.contact else ""),
         ),
-        ("share of the time under control", f"{100.0 * steered:.0f} %"),
+        ("share of the frames at which it was steered", f"{100.0 * safety.steered_share:.0f} %"),
     ]
     if safety.n_blind:
         late = f"{safety.neutral_late:.2f} s after the last posture, at most"
