@@ -16,6 +16,7 @@ from pyarrow import parquet
 from aqualvs.errors import AqualvsError, OptionError, OutputError, SourceError
 from aqualvs.optics.water import seawater_index_vacuum
 from aqualvs.pipeline import run, summary_lines
+from aqualvs.report.run_page import write_report
 from aqualvs.results.run_request import (
     FrameWindow,
     RunRequest,
@@ -391,8 +392,28 @@ def test_a_dive_without_any_posture_is_compared_too(tmp_path):
 def test_a_run_compares_with_its_truth(request_for, dive, tmp_path):
     lines = [f"{i},{10 * luma_level(i)},3.0,-7.0" for i in range(8)]
     truth = write_csv(tmp_path / "truth.csv", "frame,range_mm,pitch_deg,yaw_deg", *lines)
-    result = run(request_for(dive, truth=truth), scanner_for=LumaScanner())
+    result = run(request_for(dive, truth=truth, report=True), scanner_for=LumaScanner())
     assert result.comparison.n_compared == 8
     assert result.comparison.yaw_deg.max < 1e-4
     # A grey level that lossy video misses by 2 of at least 30 is 7 percent.
     assert result.comparison.range_percent.max < 10
+    assert "Error against truth" in result.report.read_text(encoding="utf-8")
+    # As a later `aqualvs report` or `net` writes it.
+    assert "Error against truth" in write_report(result.report.parent).read_text(encoding="utf-8")
+
+
+def test_a_truth_of_empty_water_compares_nothing(request_for, dive, tmp_path):
+    truth = write_csv(tmp_path / "truth.csv", "frame,range_mm,pitch_deg,yaw_deg", "0,,,", "1,,,")
+    result = run(request_for(dive, truth=truth, report=True), scanner_for=LumaScanner())
+    assert result.comparison.lines() == [
+        "against the truth: nothing was ahead in any of its frames"
+    ]
+    assert result.report.is_file()
+
+
+def test_the_truth_of_another_dive_does_not_cost_the_report(request_for, dive, tmp_path):
+    truth = write_csv(tmp_path / "truth.csv", "frame,range_mm,pitch_deg,yaw_deg", "99,500,0,0")
+    request = request_for(dive, truth=truth, report=True)
+    with pytest.raises(AqualvsError, match="none of its 1 frames is in"):
+        run(request, scanner_for=LumaScanner())
+    assert "no frame in common" in (request.out / "report.html").read_text(encoding="utf-8")

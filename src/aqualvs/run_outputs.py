@@ -401,7 +401,8 @@ def write_all(
 
 def report(request: RunRequest) -> Path | None:
     """Write the report, if it is wanted."""
-    return write_report(request.out, truth=request.truth) if request.report else None
+    # A truth that is of no use must not cost the report: `run.yaml` names it, `comparison` tells.
+    return write_report(request.out) if request.report else None
 
 
 def comparison(request: RunRequest) -> TruthComparison | None:

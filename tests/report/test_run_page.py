@@ -206,6 +206,35 @@ def test_truth_gives_the_errors(dive: Dive) -> None:
     assert len(data_of(page)["posture"]["strips"][0]["truth"]["x"]) == 40
 
 
+def note_truth(dive: Dive, path: Path) -> None:
+    run_yaml = dive.folder / "run.yaml"
+    content = yaml.safe_load(run_yaml.read_text(encoding="utf-8"))
+    content["options"] = {**content.get("options", {}), "truth": str(path)}
+    run_yaml.write_text(yaml.safe_dump(content), encoding="utf-8")
+
+
+def test_the_truth_of_the_run_is_used_again(tmp_path: Path) -> None:
+    dive = make_dive(tmp_path / "run", video=False)
+    path = write_truth(dive, bias_mm=2.0)
+    note_truth(dive, path)
+    assert "Error against truth, 31 frames" in visible(write_report(dive.folder).read_text())
+    # A page does without a truth that is gone or has become another, and says so.
+    path.write_text("frame,range_mm,pitch_deg,yaw_deg\n999,1,2,3\n")
+    words = visible(write_report(dive.folder).read_text())
+    assert "Error against truth" not in words
+    assert "no frame in common with the run" in words
+    path.unlink()
+    words = visible(write_report(dive.folder).read_text())
+    assert f"{path} is not there any more" in words
+
+
+def test_a_truth_of_empty_water_is_of_all_dives(dive: Dive, tmp_path: Path) -> None:
+    path = tmp_path / "truth.csv"
+    path.write_text("frame,range_mm,pitch_deg,yaw_deg\n0,,,\n1,,,\n")
+    words = visible(write_report(dive.folder, truth=path).read_text())
+    assert "Error against truth" not in words
+
+
 def test_bare_lens_is_compared(tmp_path: Path) -> None:
     dive = make_dive(tmp_path / "run", video=False)
     frames = [i for i in range(40) if i not in dive.refused]

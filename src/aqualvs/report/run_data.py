@@ -125,19 +125,40 @@ def read_truth(path: Path, track: Track) -> FloatArray:
     Returns
     -------
     truth : array, shape (N, 3)
-        As `Track.posture`; NaN where the file has no such frame.
+        As `Track.posture`; NaN where the file has no such frame, or nothing was ahead.
 
     Raises
     ------
     SourceError
-        If the file cannot be read or shares no frame with the track.
+        If the file cannot be read, or has postures of other frames only.
     """
     rows = truth_by_frame(path)
     values = np.array([*rows.values()], dtype=np.float64).reshape(-1, 3)
     truth = _onto(track.frame, np.array([*rows], dtype=np.float64), values)
-    if not np.isfinite(truth).any():
+    if rows and not np.isfinite(truth).any():
         raise SourceError(f"{path}: no frame in common with the run; give the truth of this dive")
     return truth
+
+
+def noted_truth(run: Mapping[str, Any], track: Track) -> tuple[FloatArray | None, str]:
+    """Read the truth that a run was compared with, and return what is wrong with it, in words.
+
+    `run`: content of `run.yaml`. A report does without a truth that is gone, or of another dive.
+    """
+    options = run.get("options")
+    path = options.get("truth") if isinstance(options, dict) else None
+    if not isinstance(path, str):
+        return None, ""
+    without = "the report is without the errors against it."
+    try:
+        if not Path(path).is_file():
+            return None, f"{path} is not there any more: {without}"
+        return read_truth(Path(path), track), ""
+    except OSError:
+        # A name that the file system refuses is no file of it.
+        return None, f"{path} is not there any more: {without}"
+    except SourceError as fault:
+        return None, f"{fault}: {without}"
 
 
 def read_bare(run_dir: Path, track: Track) -> tuple[FloatArray | None, str]:

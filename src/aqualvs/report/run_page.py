@@ -42,6 +42,7 @@ from aqualvs.report.run_data import (
     facts,
     housing_name,
     lasers_of,
+    noted_truth,
     read_bare,
     read_run_file,
     read_track,
@@ -122,12 +123,13 @@ def gather(run_dir: Path, truth: Path | None) -> Material:
     lasers = _lasers(rig, points)
     names = [laser.name for laser in lasers]
     bare, no_bare = read_bare(run_dir, track)
+    true, no_truth = noted_truth(run, track) if truth is None else (read_truth(truth, track), "")
     told = warnings_of(track, points, pictures, run, working_range_m(rig), names)
     return Material(
         title=Path(_source_name(run)).stem or run_dir.resolve().name,
         run=run,
         track=track,
-        truth=None if truth is None else read_truth(truth, track),
+        truth=true if true is not None and np.isfinite(true).any() else None,
         bare=bare,
         points=points,
         lasers=lasers,
@@ -148,6 +150,7 @@ def gather(run_dir: Path, truth: Path | None) -> Material:
                 no_points,
                 no_pictures,
                 no_bare,
+                no_truth,
                 no_net,
                 *told,
                 *net_warnings(net),
@@ -224,7 +227,8 @@ def write_report(run_dir: Path, *, truth: Path | None = None) -> Path:
         Folder with `posture.csv`; `points.parquet`, `run.yaml`, `posture_bare.csv`, `net.csv` with
         what belongs to it and the source that `run.yaml` names are used if they are there.
     truth : Path or None
-        CSV with columns `frame,range_mm,pitch_deg,yaw_deg`, overlaid with the errors.
+        CSV with columns `frame,range_mm,pitch_deg,yaw_deg`, overlaid with the errors. None: the
+        one that `run.yaml` names, where it is there and of this dive.
 
     Returns
     -------

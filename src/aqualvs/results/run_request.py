@@ -252,6 +252,9 @@ class RunRequest:
         found |= asdict(self.water)
         found |= {"first_frame": self.frames.first, "stop_frame": self.frames.stop}
         found["index_target"] = None if self.index_target is None else str(self.index_target)
+        if self.truth is not None:
+            # Whole, as the source's path: other commands read it from elsewhere.
+            found["truth"] = str(self.truth.absolute())
         return found | {"scanner": scanner_dict(self.scanner)}
 
 

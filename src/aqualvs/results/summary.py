@@ -53,6 +53,8 @@ class TruthComparison:
 
     def lines(self) -> list[str]:
         """Return the comparison as lines of text."""
+        if not self.n_compared and not self.n_missed:
+            return ["against the truth: nothing was ahead in any of its frames"]
         if not self.n_compared:
             return [f"against the truth: no posture in its {self.n_missed} frames"]
         return [
@@ -77,7 +79,8 @@ def compare_with_truth(posture_csv: Path, truth_csv: Path) -> TruthComparison:
     Raises
     ------
     SourceError
-        If a file cannot be read, lacks a column, or no frame is in both.
+        If a file cannot be read, lacks a column, or no frame is in both. A truth without any
+        posture, as of empty water, is of all dives.
     """
     measured_rows, true_rows = _rows(posture_csv), _rows(truth_csv)
     in_fields, of_fields = ("field" in rows[0] for rows in (measured_rows, true_rows))
@@ -90,7 +93,7 @@ def compare_with_truth(posture_csv: Path, truth_csv: Path) -> TruthComparison:
     truth = _postures(truth_csv, true_rows)
     frames = {_number(row["frame"]) for row in measured_rows}
     known = {frame for frame in truth if frame in frames}
-    if not known:
+    if truth and not known:
         raise SourceError(
             f"{truth_csv}: none of its {len(truth)} frames is in {posture_csv}; "
             "give the truth of this dive"
