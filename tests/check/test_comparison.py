@@ -11,6 +11,7 @@ from rich.console import Console
 
 from aqualvs.check.comparison import run_compare
 from aqualvs.errors import RigError
+from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig import Rig, RigUncertainty, rig_moved_by, rig_parameter_names
 from aqualvs.optics.rigfile import save_rig
 from aqualvs.optics.solved import with_uncertainty
@@ -96,6 +97,29 @@ def test_what_is_significant_may_not_matter(tmp_path: Path) -> None:
     assert re.search(r"Laser 'left' moved by 0\.0\d+ deg.* sigma\), too little to matter", page)
 
 
+def test_lasers_of_other_names_are_compared_where_they_lie(tmp_path: Path) -> None:
+    old, same = estimated(example_rig(), 2), estimated(turned(example_rig(), 0.42), 1)
+    words = {"lower": "horizontal", "left": "vertical", "right": "diagonal"}
+    # In another order, as a calibration may find them, with normals the other way round.
+    lasers = [
+        replace(
+            laser, name=words[laser.name], plane=Plane(-laser.plane.normal, -laser.plane.offset)
+        )
+        for laser in reversed(same.lasers)
+    ]
+    names = tuple(
+        f"{words[name.partition(':')[0]]}:{name.partition(':')[2]}" if ":" in name else name
+        for name in NAMES
+    )
+    known = RigUncertainty(names, np.diag(SIGMAS**2))
+    other = with_uncertainty(replace(same, lasers=tuple(lasers), solved_from={}), known)
+    page = compared(other, old, tmp_path)
+    assert "'diagonal' as 'right', 'vertical' as 'left', 'horizontal' as 'lower'." in page
+    # All else is as if they had their old names.
+    assert page.splitlines()[1:-1] == compared(same, old, tmp_path).splitlines()[1:]
+    assert "Laser 'left' moved by 0.42 deg" in page
+
+
 @pytest.mark.parametrize(
     ("new", "words"),
     [
@@ -118,7 +142,7 @@ def test_what_is_significant_may_not_matter(tmp_path: Path) -> None:
                 example_rig(),
                 lasers=(replace(example_rig().lasers[0], name="low"), *example_rig().lasers[1:]),
             ),
-            "Laser 'low' lies where 'lower' lay; if it is the same, give it the same name",
+            "Lasers lie where others lay, and are compared as these: 'low' as 'lower'.",
         ),
         (
             replace(example_rig(), lasers=example_rig().lasers[:1], name="one"),

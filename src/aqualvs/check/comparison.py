@@ -274,6 +274,9 @@ def run_compare(new: Path, old: Path, console: Console | None = None) -> int:
     """
     new_rig, new_uncertainty = _loaded(new)
     old_rig, old_uncertainty = _loaded(old)
+    # Names are the user's, or made up by a calibration: the same laser may have two.
+    called = _names_before(new_rig, old_rig)
+    new_rig, new_uncertainty = _with_names(new_rig, new_uncertainty, called)
     difference = rig_difference(new_rig, old_rig, new_uncertainty, old_uncertainty)
     console = console or Console()
     console.print(f"{new} against {old}", style="bold", markup=False, highlight=False)
@@ -284,7 +287,9 @@ def run_compare(new: Path, old: Path, console: Console | None = None) -> int:
             console.print(line, markup=False, highlight=False)
     console.print(_table(new_rig, old_rig, difference))
     known = {new: bool(new_uncertainty.names), old: bool(old_uncertainty.names)}
-    for line in (*_limits(known), *_mismatches(new_rig, old_rig)):
+    same = [f"'{name}' as '{before}'" for name, before in called.items()]
+    renamed = [f"Lasers lie where others lay, and are compared as these: {', '.join(same)}."]
+    for line in (*(renamed if same else []), *_limits(known), *_mismatches(new_rig, old_rig)):
         console.print(line, markup=False, highlight=False)
     return 0
 
@@ -478,21 +483,37 @@ def _mismatches(new: Rig, old: Rig) -> Iterator[str]:
 
 def _laser_mismatches(new: Rig, old: Rig) -> Iterator[str]:
     shared = {laser.name for _, laser in _shared_lasers(new, old)}
+    for what, rig in (("new", new), ("gone", old)):
+        for laser in rig.lasers:
+            if laser.name not in shared:
+                yield f"Laser '{laser.name}' is {what}."
+
+
+def _names_before(new: Rig, old: Rig) -> dict[str, str]:
+    """Return the old name of every new laser that lies where one of another name lay."""
+    shared = {laser.name for _, laser in _shared_lasers(new, old)}
     gone = [laser for laser in old.lasers if laser.name not in shared]
+    called = {}
     for laser in new.lasers:
-        if laser.name in shared:
-            continue
         twin = next((other for other in gone if _alike(laser, other)), None)
-        if twin is None:
-            yield f"Laser '{laser.name}' is new."
-        else:
+        if laser.name not in shared and twin is not None:
             gone.remove(twin)
-            yield (
-                f"Laser '{laser.name}' lies where '{twin.name}' lay; if it is the same, give it "
-                "the same name in both files to compare them."
-            )
-    for laser in gone:
-        yield f"Laser '{laser.name}' is gone."
+            called[laser.name] = twin.name
+    return called
+
+
+def _with_names(
+    rig: Rig, uncertainty: RigUncertainty, called: dict[str, str]
+) -> tuple[Rig, RigUncertainty]:
+    """Return a rig and its uncertainty with other names of its lasers."""
+    lasers = [replace(laser, name=called.get(laser.name, laser.name)) for laser in rig.lasers]
+
+    def renamed(number: str) -> str:
+        laser, colon, parameter = number.rpartition(":")
+        return f"{called.get(laser, laser)}{colon}{parameter}"
+
+    names = tuple(map(renamed, uncertainty.names))
+    return replace(rig, lasers=tuple(lasers)), RigUncertainty(names, uncertainty.covariance)
 
 
 def _alike(one: Laser, other: Laser) -> bool:
