@@ -18,6 +18,7 @@ from aqualvs.scanner import Scanner
 from aqualvs.scanning.scan import Frame, planes_of_image
 from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenarios import example_rig, load_scenario
+from browser import open_page
 from shell_cases import rig_file
 
 SMALL = ["--image", "720x576", "--fov-deg", "48", "--dome-mm", "44.25:5.75"]
@@ -187,6 +188,15 @@ def test_the_page_says_the_verdict_first_and_all_that_was_printed(folder):
     assert page.count('src="data:image/png;base64,') == 2
     assert "http" not in words
     assert page.count("<section") == page.count("</section>")
+
+
+def test_all_columns_of_the_page_are_in_sight(folder, tmp_path):
+    with open_page(tmp_path / "profile") as page:
+        page.size(1300, 900)
+        page.call("Page.navigate", url=(folder / "design.html").as_uri())
+        page.wait_for("document.readyState === 'complete' && !!document.querySelector('footer')")
+        hidden = "[...document.querySelectorAll('.scroll')].map(d => d.scrollWidth - d.clientWidth)"
+        assert page.evaluate(hidden) == [0] * 4
 
 
 def test_a_design_that_misses_its_goals_is_told_so(tmp_path, capsys):
