@@ -46,6 +46,7 @@ def luma_levels(source):
         ("a.mkv", "libx264", "yuv420p", {"bf": "2"}),
         ("a.ts", "libx264", "yuv420p", {"bf": "2"}),
         ("a.avi", "mpeg4", "yuv420p", {"bf": "2", "qscale": "2"}),
+        ("a.webm", "libvpx", "yuv420p", {"b:v": "1M", "cpu-used": "8", "auto-alt-ref": "1"}),
         ("a.nut", "rawvideo", "nv12", {}),
         ("a10.mkv", "ffv1", "yuv420p10le", {}),
         ("a422.mkv", "ffv1", "yuv422p", {}),

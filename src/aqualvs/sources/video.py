@@ -87,7 +87,7 @@ class FrameCounter:
             Greater than that of the picture before.
         """
         if self.first_pts is None and pts is not None:
-            self.first_pts = min(pts, *self._pending[:1])
+            self.first_pts = min([pts, *self._pending[:1]])
         while pts is not None and self._pending and self._pending[0] < pts:
             heapq.heappop(self._pending)
             self._next += 1
