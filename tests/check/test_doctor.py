@@ -16,6 +16,7 @@ from aqualvs.errors import AqualvsError
 from field_cases import interlaced_rig, woven_dive
 from ports import free_port
 from repository import ROOT
+from shell_cases import cut_after, write_video
 
 DEMO = Path(doctor.__file__).parents[1] / "data" / "demo"
 
@@ -68,6 +69,13 @@ def test_silence_is_not_ready_and_the_remedy_is_told(monkeypatch: pytest.MonkeyP
 
 def test_a_missing_file_and_another_size_are_told(tmp_path: Path) -> None:
     assert "none.mp4" in told(DoctorRequest(source=str(tmp_path / "none.mp4")), fault="none.mp4")
+
+
+def test_a_file_that_is_cut_short_is_told(tmp_path: Path) -> None:
+    dive = write_video(tmp_path / "dive.mp4", 10, size=(96, 64), mux={"movflags": "faststart"})
+    cut_after(dive, 5)
+    text = told(DoctorRequest(source=str(dive)), fault="only 5 of 10 frames")
+    assert "96x64 px" in text
 
 
 def test_a_rig_is_read_also_where_nothing_is_to_fit_it(tmp_path: Path) -> None:

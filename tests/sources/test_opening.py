@@ -16,6 +16,7 @@ from aqualvs.sources.datagrams import UdpAddress, parse_udp
 from aqualvs.sources.opening import PacedFeed
 from aqualvs.sources.remote import CameraFeed, CameraOptions, RemoteFeed, camera_device
 from aqualvs.sources.udp import UdpFeed, read_sdp
+from aqualvs.sources.video import FrameCounter
 from shell_cases import cut_after, picture, write_video
 from waiting import TIMEOUT_S, until
 
@@ -247,3 +248,26 @@ def test_pictures_of_a_paced_video_are_those_of_the_source(tmp_path):
         true = [f.luma for f in source]
     found = [f.luma for f in open_feed(str(path), realtime=False)]
     assert all(np.array_equal(a, b) for a, b in zip(found, true, strict=True))
+
+
+def test_a_feed_of_a_file_that_has_ended_or_was_closed_is_not_read_again(tmp_path):
+    path = write_video(tmp_path / "a.mp4", 5, size=(64, 48))
+    feed = open_feed(path, realtime=False)
+    assert len(list(feed)) == 5
+    with pytest.raises(SourceError, match="open it again"):
+        list(feed)
+    feed.close()
+    assert list(feed) == []
+
+
+def test_a_failure_of_reading_a_file_is_one_line(tmp_path, monkeypatch):
+    """A feed that raises anything else is begun again, which no file can be."""
+    write_video(tmp_path / "a.mp4", 5, size=(64, 48))
+
+    def fail(*_):
+        raise TypeError("surprise\nin two lines")
+
+    monkeypatch.setattr(FrameCounter, "number", fail)
+    feed = open_feed(tmp_path / "a.mp4", realtime=False)
+    with pytest.raises(SourceError, match=r"a\.mp4: cannot be read on \(TypeError: surprise\)"):
+        list(feed)

@@ -1,8 +1,11 @@
 """Sources: what arrives is what was encoded, and what is missing is said."""
 
+import contextlib
 import gc
+import itertools
 import os
 import struct
+import threading
 import zlib
 
 import av
@@ -364,7 +367,6 @@ def test_an_address_is_read_like_a_file(tmp_path):
     """An MPEG-TS over HTTP, served here."""
     import functools
     import http.server
-    import threading
 
     write_video(tmp_path / "a.ts", 10, size=SMALL)
 
@@ -387,6 +389,44 @@ def test_decoding_takes_one_pass(tmp_path):
     path = write_video(tmp_path / "a.mp4", 5, size=SMALL)
     with VideoSource(path) as source:
         assert sum(1 for _ in source) == 5
+
+
+def test_a_closed_video_is_refused_and_not_read_from_freed_memory(tmp_path):
+    path = write_video(tmp_path / "a.mp4", 30, size=SMALL)
+    source = VideoSource(path)
+    source.close()
+    with pytest.raises(SourceError, match=r"a\.mp4: has been closed; open it again"):
+        list(source)
+    source = VideoSource(path)
+    frames = iter(source)
+    next(frames)
+    source.close()
+    source.close()
+    with pytest.raises(SourceError, match="has been closed"):
+        next(frames)
+
+
+def test_a_video_may_be_closed_by_another_thread(tmp_path):
+    source = VideoSource(write_video(tmp_path / "a.mp4", 30, size=(320, 240), content=grain))
+    closing = threading.Thread(target=source.close)
+    frames = iter(source)
+    next(frames)
+    closing.start()
+    # It may be closed before any of these.
+    with contextlib.suppress(SourceError):
+        list(itertools.islice(frames, 25))
+    closing.join()
+    with pytest.raises(SourceError, match="has been closed"):
+        list(source)
+
+
+def test_a_video_that_is_iterated_twice_goes_on_or_says_that_it_is_at_its_end(tmp_path):
+    with open_source(write_video(tmp_path / "a.mp4", 10, size=SMALL)) as source:
+        frames = iter(source)
+        assert [next(frames).index for _ in range(10)] == list(range(10))
+        assert list(source) == []
+        with pytest.raises(SourceError, match="read to its end; open it again"):
+            list(source)
 
 
 def huge_png(path, side=60_000):

@@ -304,7 +304,7 @@ def _rig_file(path: Path) -> Iterator[Finding]:
 def _stream(where: str, rig_file: Path | None) -> Iterator[Finding]:
     """Take frames for a few seconds."""
     rig = None if rig_file is None else load_rig(rig_file)
-    frames, span_s, health = _received(where)
+    frames, span_s, health, fault = _received(where)
     if not frames:
         yield Finding.bad(
             f"{where}: no picture in {_STREAM_S:.0f} s ({health}); is the sender on, its address "
@@ -318,6 +318,8 @@ def _stream(where: str, rig_file: Path | None) -> Iterator[Finding]:
     yield Finding(
         severity, f"{where}: {width}x{height} px, {rate:.1f} frames a second, {lost} lost"
     )
+    if fault is not None:
+        yield Finding.bad(str(fault))
     if rig is not None:
         yield _fit(rig, frames)
     yield from _fields(where, AT_ONCE if rig is None else rig.shutter, frames)
@@ -338,8 +340,11 @@ def _fields(where: str, shutter: Shutter, frames: list[Frame]) -> Iterator[Findi
         yield Finding.warn(f"{where}: {wrong}")
 
 
-def _received(where: str) -> tuple[list[Frame], float, str]:
-    """Return the frames of a few seconds, the time between first and last, and the feed's words."""
+def _received(where: str) -> tuple[list[Frame], float, str, AqualvsError | None]:
+    """Return the frames of a few seconds, the time between first and last, and the feed's state.
+
+    That is its words, and what ended it if it did not end by itself.
+    """
     from aqualvs.live.runner import FrameReader, Mailbox
     from aqualvs.sources.opening import open_feed
 
@@ -357,7 +362,7 @@ def _received(where: str) -> tuple[list[Frame], float, str]:
     if reader.fault is not None and not frames:
         raise reader.fault
     span_s = 1e-9 * (arrived_ns[-1] - arrived_ns[0]) if arrived_ns else 0.0
-    return frames, span_s, words
+    return frames, span_s, words, reader.fault
 
 
 def _fit(rig: Rig, frames: list[Frame]) -> Finding:

@@ -15,7 +15,7 @@ from urllib.parse import urlsplit
 import av
 from av.container import InputContainer
 
-from aqualvs.errors import OptionError, SourceError
+from aqualvs.errors import AqualvsError, OptionError, SourceError
 from aqualvs.scanning.scan import Frame
 from aqualvs.sources.base import Feed, FrameSource, PartHealth, State
 from aqualvs.sources.images import IMAGE_SUFFIXES, ImageSource
@@ -54,8 +54,21 @@ class PacedFeed:
     def __iter__(self) -> Iterator[Frame]:
         """Yield frames until the source ends or `close` is called.
 
-        Raises `SourceError` at the end, if the recording is cut short.
+        Raises `SourceError` at the end, if the recording is cut short; and for whatever reading it
+        raises: unlike a stream, a file is no better the next time.
         """
+        if self._closed.is_set():
+            return
+        try:
+            yield from self._frames()
+        except AqualvsError:
+            raise
+        except Exception as fault:
+            told = f"{type(fault).__name__}: {fault}".splitlines()[0]
+            raise SourceError(f"{self.name}: cannot be read on ({told}); check the file") from fault
+        self._state, self._words = State.OFF, "closed" if self._closed.is_set() else "at its end"
+
+    def _frames(self) -> Iterator[Frame]:
         with self._source as source:
             began = time.monotonic()
             for frame in source:
@@ -63,7 +76,6 @@ class PacedFeed:
                     break
                 self._note(frame)
                 yield frame
-        self._state, self._words = State.OFF, "closed" if self._closed.is_set() else "at its end"
 
     def health(self) -> PartHealth:
         """Return how far it is."""

@@ -7,6 +7,7 @@ index.
 import contextlib
 import heapq
 import itertools
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -156,6 +157,11 @@ class VideoSource(Closing):
             counts_packets=self._stream.codec_context.name not in _HIDDEN_PACKETS
         )
         self._frame_counter.begin(self._stream.codec_context)
+        self._tick, self._n_exact = self._stream.time_base, self._stream.frames
+        self._n_delivered, self._last_index, self._last_time_s = 0, -1, 0.0
+        self._is_closed = self._is_at_end = False
+        # FFmpeg reads from memory that closing frees.
+        self._in_ffmpeg = threading.Lock()
         self._packets = self._read_packets()
         if self._packets_are_fields():
             self.fps = None if self.fps is None else 0.5 * self.fps
@@ -165,31 +171,43 @@ class VideoSource(Closing):
         """Yield the sound frames; lost ones leave a gap in the index.
 
         Raises `SourceError` at the end, if frames that the container promised did not come; or when
-        the picture size changes, or a stream stalls.
+        the picture size changes, a stream stalls, or the source is closed or at its end.
         """
-        n_delivered, last = 0, None
+        if self._is_at_end:
+            raise SourceError(f"{self.name}: has been read to its end; open it again")
         for picture in self._pictures():
             index = self._frame_counter.number(picture.pts)
             if picture.is_corrupt:
                 continue
-            last = self._frame(picture, index)
-            n_delivered += 1
-            yield last
-        self._check_complete(n_delivered, last)
+            frame = self._frame(picture, index)
+            self._n_delivered += 1
+            self._last_index, self._last_time_s = index, frame.time_s
+            yield frame
+        self._is_at_end = True
+        self._check_complete()
 
     def _pictures(self) -> Iterator[VideoFrame]:
         """Decode all undamaged pictures, in order of presentation."""
-        for packet in self._packets:
-            self._frame_counter.expect(packet)
-            if packet.is_corrupt and not self._damage_is_partial:
-                continue
-            try:
-                pictures = packet.decode()
-            except av.error.InvalidDataError:
-                continue
-            for picture in pictures:
-                if isinstance(picture, VideoFrame):
-                    yield picture
+        while True:
+            with self._in_ffmpeg:
+                if self._is_closed:
+                    raise SourceError(f"{self.name}: has been closed; open it again")
+                packet = next(self._packets, None)
+                if packet is None:
+                    return
+                pictures = self._decoded(packet)
+            yield from pictures
+
+    def _decoded(self, packet: "Packet[VideoStream]") -> list[VideoFrame]:
+        """Return the pictures that a packet completes; none if it is damaged."""
+        self._frame_counter.expect(packet)
+        if packet.is_corrupt and not self._damage_is_partial:
+            return []
+        try:
+            pictures = packet.decode()
+        except av.error.InvalidDataError:
+            return []
+        return [picture for picture in pictures if isinstance(picture, VideoFrame)]
 
     def _packets_are_fields(self) -> bool:
         """Return whether every packet is one field and has a time, which containers count."""
@@ -224,22 +242,22 @@ class VideoSource(Closing):
 
     def _time_of(self, picture: VideoFrame, index: int) -> float:
         """Return seconds since the start of the stream, by its own clock where it has one."""
-        if picture.pts is None or self._stream.time_base is None:
+        if picture.pts is None or self._tick is None:
             return index / (self.fps or 1.0)
-        return float((picture.pts - (self._frame_counter.first_pts or 0)) * self._stream.time_base)
+        return float((picture.pts - (self._frame_counter.first_pts or 0)) * self._tick)
 
-    def _check_complete(self, n_delivered: int, last: Frame | None) -> None:
+    def _check_complete(self) -> None:
         """Raise if the file ended before its promise, or if its last frames are lost."""
-        index, time_s = (-1, 0.0) if last is None else (last.index, last.time_s)
-        exact = self._stream.frames
+        time_s, exact = self._last_time_s, self._n_exact
         cut = self._frame_counter.n_packets < exact if exact else self._ends_early(time_s)
-        if not cut and index + 1 == self._frame_counter.n_known:
+        if not cut and self._last_index + 1 == self._frame_counter.n_known:
             return
         n_promised = max(self.n_frames or 0, self._frame_counter.n_known)
         promised = f"{self.n_frames}" if exact else f"about {n_promised}"
         raise SourceError(
-            f"{self.name}: only {n_delivered} of {promised} frames could be decoded, the last at "
-            f"{time_s:.2f} s; the file is cut short or damaged, copy it again from the recorder"
+            f"{self.name}: only {self._n_delivered} of {promised} frames could be decoded, the "
+            f"last at {time_s:.2f} s; the file is cut short or damaged, copy it again from the "
+            "recorder"
         )
 
     def _ends_early(self, time_s: float) -> bool:
@@ -264,8 +282,10 @@ class VideoSource(Closing):
         return stream
 
     def close(self) -> None:
-        """Close the file; frames already delivered stay valid."""
-        self._container.close()
+        """Close the file; frames already delivered stay valid. May be called by any thread."""
+        self._is_closed = True
+        with self._in_ffmpeg:
+            self._container.close()
 
 
 # Pictures that are looked at for fields: so many in a row, at so many places of a file.
