@@ -134,6 +134,14 @@ def test_a_file_that_breaks_off_stays_whole(tmp_path):
     assert video_spans(matroska, 10).why_whole == "ends before its promise"
 
 
+def test_avi_whose_times_are_those_of_decoding_stays_whole(tmp_path):
+    path = dive(tmp_path / "dive.avi", options=options(bf="2", preset="fast"))
+    assert video_spans(path, 10).why_whole == "pictures without a time of their own"
+    path = dive(tmp_path / "other.avi", options=options(bf="0", preset="fast"))
+    assert video_spans(path, 10).why_whole == ""
+    assert_same_frames(path, video_spans(path, 10).spans)
+
+
 @pytest.mark.parametrize("damage", [damage_frame, destroy_frame])
 def test_a_damaged_part_is_noticed_and_the_others_are_not_touched(tmp_path, damage):
     path = dive(tmp_path / "dive.mp4")

@@ -48,6 +48,7 @@ def luma_levels(source):
         ("a.mp4", "libx264", "yuv420p", {"bf": "2"}),
         ("a.mkv", "libx264", "yuv420p", {"bf": "2"}),
         ("a.ts", "libx264", "yuv420p", {"bf": "2"}),
+        ("h264.avi", "libx264", "yuv420p", {"bf": "3", "b-pyramid": "normal"}),
         ("a.avi", "mpeg4", "yuv420p", {"bf": "2", "qscale": "2"}),
         ("a.webm", "libvpx", "yuv420p", {"b:v": "1M", "cpu-used": "8", "auto-alt-ref": "1"}),
         ("a.nut", "rawvideo", "nv12", {}),
@@ -136,6 +137,23 @@ def test_a_corrupt_frame_leaves_a_gap_and_the_rest_arrives(tmp_path):
     assert sorted(found) == [0, 1, 2, 3, 5, 6, 7, 8, 9]
     for i, mean in found.items():
         assert mean == pytest.approx(luma_level(i), abs=LEVEL_TOLERANCE)
+
+
+@pytest.mark.parametrize(("lost", "wrong"), [(20, range(18, 31)), (23, range(22, 23))])
+def test_a_lost_picture_shifts_no_time_where_avi_has_those_of_decoding(tmp_path, lost, wrong):
+    """Without a key frame, FFmpeg drops pictures unnoticed until the next one, the thirtieth."""
+    options = {"preset": "veryfast", "bf": "2", "g": "10", "sc_threshold": "0"}
+    path = write_video(tmp_path / "a.avi", 40, size=SMALL, options=options)
+    destroy_frame(path, lost)
+    with open_source(path) as source:
+        frames = list(source)
+    indices = [frame.index for frame in frames]
+    assert indices == sorted(set(indices))
+    assert 1 <= 40 - len(frames) <= 10
+    for frame in frames:
+        assert frame.time_s == pytest.approx(frame.index / 25)
+        if frame.index not in wrong:
+            assert frame.luma.mean() == pytest.approx(luma_level(frame.index), abs=LEVEL_TOLERANCE)
 
 
 def test_a_picture_that_the_decoder_patched_up_is_not_delivered(tmp_path):

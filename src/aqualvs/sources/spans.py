@@ -106,6 +106,8 @@ def video_spans(path: Path, n_min: int, margin: int = 0) -> VideoSpans:
                 packets.add(packet)
         except av.error.FFmpegError as fault:
             packets.doubt(f"the file breaks off ({fault.strerror})")
+        if has_decoding_times(stream):
+            packets.doubt("pictures without a time of their own")
         why = packets.why_whole() or _broken_promise(stream, packets)
         spans = () if why else packets.spans(n_min, margin)
         return VideoSpans(spans, why, packets.checksum, packets.n_bytes)
@@ -293,6 +295,16 @@ def _broken_promise(stream: VideoStream, packets: _Packets) -> str:
         return ""
     timeout_s = max(_EARLY_FRAMES / float(rate), _EARLY_SHARE * promised_s)
     return "" if packets.latest_s() + timeout_s >= promised_s else "ends before its promise"
+
+
+def has_decoding_times(stream: VideoStream) -> bool:
+    """Return whether a packet's time says when it is decoded, not when its picture is shown.
+
+    AVI has no other times; FFmpeg derives them where it knows the order, but for these codecs.
+    """
+    context = stream.codec_context
+    is_avi = cast("InputContainer", stream.container).format.name == "avi"
+    return is_avi and context.name in ("h264", "hevc") and context.has_b_frames
 
 
 def promised_duration(stream: VideoStream) -> float | None:

@@ -24,7 +24,7 @@ from aqualvs.optics.shutter import Field
 from aqualvs.scanning.scan import Frame
 from aqualvs.sources.base import frame_of
 from aqualvs.sources.h264 import FieldPairs, field_pairs
-from aqualvs.sources.spans import promised_duration
+from aqualvs.sources.spans import has_decoding_times, promised_duration
 
 
 class FrameCounter:
@@ -51,6 +51,7 @@ class FrameCounter:
         self._counts_packets = counts_packets
         self._fields: FieldPairs | None = None
         self._pending: list[int] = []
+        self._lost: set[int] = set()
         self._next = 0
 
     @property
@@ -73,6 +74,22 @@ class FrameCounter:
         if packet.pts is None or packet.is_discard or not self._counts_packets:
             return
         heapq.heappush(self._pending, packet.pts)
+
+    def lose(self, packet: "Packet[VideoStream]") -> None:
+        """Note that no picture comes of a packet, so that `time_in_order` leaves its time out."""
+        if packet.pts is not None:
+            self._lost.add(packet.pts)
+
+    def time_in_order(self, picture: VideoFrame) -> int | None:
+        """Return the time of a picture whose own is that of decoding: the earliest left.
+
+        No picture after an instantaneous refresh is shown before it, so that its own time holds
+        even if pictures were lost unnoticed. Before other key frames some are, of later times.
+        """
+        earliest = min((pts for pts in self._pending if pts not in self._lost), default=None)
+        if earliest is None or picture.pts is None:
+            return picture.pts
+        return max(earliest, picture.pts) if picture.key_frame else earliest
 
     def number(self, pts: int | None) -> int:
         """Return the number of a picture, counting those lost before it.
@@ -151,6 +168,7 @@ class VideoSource(Closing):
         rate = self._stream.average_rate or self._stream.guessed_rate
         self.fps = float(rate) if rate else None
         self._damage_is_partial = self._container.format.name in _LOSSY_CONTAINERS
+        self._has_decoding_times = has_decoding_times(self._stream)
         self._promised_s = promised_duration(self._stream)
         self.n_frames = self._stream.frames or self._estimated_frames()
         self._frame_counter = FrameCounter(
@@ -176,6 +194,8 @@ class VideoSource(Closing):
         if self._is_at_end:
             raise SourceError(f"{self.name}: has been read to its end; open it again")
         for picture in self._pictures():
+            if self._has_decoding_times:
+                picture.pts = self._frame_counter.time_in_order(picture)
             index = self._frame_counter.number(picture.pts)
             if picture.is_corrupt:
                 continue
@@ -202,10 +222,12 @@ class VideoSource(Closing):
         """Return the pictures that a packet completes; none if it is damaged."""
         self._frame_counter.expect(packet)
         if packet.is_corrupt and not self._damage_is_partial:
+            self._frame_counter.lose(packet)
             return []
         try:
             pictures = packet.decode()
         except av.error.InvalidDataError:
+            self._frame_counter.lose(packet)
             return []
         return [picture for picture in pictures if isinstance(picture, VideoFrame)]
 
