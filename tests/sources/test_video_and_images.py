@@ -7,6 +7,7 @@ import os
 import struct
 import threading
 import zlib
+from fractions import Fraction
 
 import av
 import cv2
@@ -20,6 +21,7 @@ from aqualvs.scanning.scan import planes_of_image
 from aqualvs.sources import ImageSource, VideoSource, open_source
 from aqualvs.sources.base import planes_of
 from aqualvs.sources.images import read_image
+from aqualvs.sources.spans import video_spans
 from shell_cases import (
     all_key_frames,
     cut_after,
@@ -27,6 +29,7 @@ from shell_cases import (
     destroy_frame,
     grain,
     luma_level,
+    packets,
     picture,
     write_video,
 )
@@ -240,6 +243,67 @@ def test_a_whole_file_raises_nothing_even_if_its_rate_varies(tmp_path):
         frames = list(source)
     assert [f.index for f in frames] == list(range(8))
     assert [f.time_s for f in frames] == pytest.approx([t / 25 for t in ticks], abs=1e-3)
+
+
+def write_slots(path, ticks, tick, codec="mjpeg"):
+    """A video whose pictures are at `ticks` of a clock of `tick` seconds."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=25)
+        stream.width, stream.height = SMALL
+        stream.pix_fmt = "yuvj420p" if codec == "mjpeg" else "yuv420p"
+        stream.codec_context.time_base = tick
+        for i, at in enumerate(ticks):
+            frame = VideoFrame.from_ndarray(picture(i, SMALL), format="bgr24")
+            frame.pts, frame.time_base = at, tick
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("codec", "tick", "ticks"),
+    [
+        ("mjpeg", Fraction(1, 25), [i for i in range(20) if i not in (5, 11, 12)]),
+        ("mpeg4", Fraction(1, 25), [i for i in range(20) if i not in (5, 11, 12)]),
+        ("mjpeg", Fraction(1, 1000), range(0, 800, 40)),
+        ("mjpeg", Fraction(1, 25), [0]),
+    ],
+)
+def test_avi_counts_ticks_of_its_clock_not_pictures(tmp_path, codec, tick, ticks):
+    path = write_slots(tmp_path / "a.avi", ticks, tick, codec)
+    with open_source(path) as source:
+        frames = list(source)
+    assert source.fps == pytest.approx(25.0)
+    assert source.n_frames == (1 if len(ticks) == 1 else 20)
+    assert [f.index for f in frames] == list(range(len(ticks)))
+    assert [f.time_s for f in frames] == pytest.approx([at * float(tick) for at in ticks])
+    spans = video_spans(path, 5)
+    assert spans.why_whole == ("videos in mpeg4 stay whole" if codec == "mpeg4" else "")
+
+
+@pytest.mark.parametrize("tick", [1, 40])
+@pytest.mark.parametrize("n_left", [1, 2, 23, 38, 39])
+def test_avi_that_is_cut_short_is_told(tmp_path, n_left, tick):
+    path = write_slots(tmp_path / "a.avi", range(0, 1600 // tick, 40 // tick), Fraction(tick, 1000))
+    position, _ = packets(path)[n_left]
+    path.write_bytes(path.read_bytes()[: position - 8])
+    delivered = []
+    with open_source(path) as source, pytest.raises(SourceError) as fault:
+        delivered.extend(source)
+    assert len(delivered) == n_left
+    # Few pictures of a fast clock do not tell their rate.
+    assert f"only {n_left} of about {40 if n_left > 2 else ''}" in str(fault.value)
+    assert video_spans(path, 5).why_whole != ""
+
+
+def test_a_rate_that_is_only_the_clock_s_is_not_believed(tmp_path):
+    """Raw DV, whose average rate FFmpeg states as 60000 Hz."""
+    path = write_video(
+        tmp_path / "a.dv", 20, size=(720, 576), codec="dvvideo", options={}, content=grain
+    )
+    with open_source(path) as source:
+        assert (source.fps, source.n_frames) == (25.0, 20)
+        assert len(list(source)) == 20
 
 
 def test_a_change_of_picture_size_is_refused(tmp_path):

@@ -12,6 +12,7 @@ import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -288,9 +289,14 @@ def _broken_promise(stream: VideoStream, packets: _Packets) -> str:
     """Return a note if the file may hold less than its container states; empty if not."""
     if stream.time_base is None:
         return "no clock"
+    slots = time_slots(stream)
+    if slots is not None:
+        passed = packets.latest_s() / float(stream.time_base)
+        filled = slots.are_filled(passed, packets.n_packets)
+        return "" if filled else "ends before its promise"
     if stream.frames:
         return "" if packets.n_packets >= stream.frames else "fewer pictures than promised"
-    promised_s, rate = promised_duration(stream), stream.average_rate
+    promised_s, rate = promised_duration(stream), frame_rate(stream)
     if promised_s is None or not rate:
         return ""
     timeout_s = max(_EARLY_FRAMES / float(rate), _EARLY_SHARE * promised_s)
@@ -303,12 +309,61 @@ def has_decoding_times(stream: VideoStream) -> bool:
     AVI has no other times; FFmpeg derives them where it knows the order, but for these codecs.
     """
     context = stream.codec_context
-    is_avi = cast("InputContainer", stream.container).format.name == "avi"
-    return is_avi and context.name in ("h264", "hevc") and context.has_b_frames
+    return _is_avi(stream) and context.name in ("h264", "hevc") and context.has_b_frames
+
+
+def _is_avi(stream: VideoStream) -> bool:
+    return cast("InputContainer", stream.container).format.name == "avi"
+
+
+def frame_rate(stream: VideoStream) -> Fraction | None:
+    """Return the nominal rate in Hz; where FFmpeg takes the clock's for it, its better guess."""
+    average, guess, tick = stream.average_rate, stream.guessed_rate, stream.time_base
+    if average and guess and tick and average * tick == 1 and guess < average:
+        return guess
+    return average or guess or None
+
+
+@dataclass(frozen=True, slots=True)
+class TimeSlots:
+    """Ticks of the clock that AVI counts instead of pictures.
+
+    It holds nothing where a picture was dropped, and its clock may be faster than the pictures.
+    """
+
+    n: int
+    period: float  # From one picture to the next at the nominal rate, in ticks.
+
+    def are_filled(self, passed: float, n_pictures: int) -> bool:
+        """Return whether pictures reach the end.
+
+        Parameters
+        ----------
+        passed : float
+            From the first picture to the last, in ticks.
+        n_pictures : int
+        """
+        # The last one may be shown for longer than the mean. At a steady rate less than two, so
+        # that one missing picture is noticed.
+        longer = 1.5
+        mean = passed / max(n_pictures - 1, 1)
+        return passed + max(longer * mean, self.period) >= self.n
+
+
+def time_slots(stream: VideoStream) -> TimeSlots | None:
+    """Return the slots that the container counts; None if it counts pictures or nothing."""
+    rate, tick = frame_rate(stream), stream.time_base
+    if not (_is_avi(stream) and stream.frames and rate and tick):
+        return None
+    return TimeSlots(stream.frames, float(1 / (rate * tick)))
 
 
 def promised_duration(stream: VideoStream) -> float | None:
     """Return the duration in seconds that the container states for the video, if it does."""
+    slots = time_slots(stream)
+    if slots is not None and stream.time_base is not None:
+        # FFmpeg shortens the duration of AVI that is cut short.
+        return float(slots.n * stream.time_base)
     if stream.duration is not None and stream.time_base is not None:
         return float(stream.duration * stream.time_base)
     clock = stream.metadata.get("DURATION", "").split(":")

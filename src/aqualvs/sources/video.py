@@ -24,7 +24,7 @@ from aqualvs.optics.shutter import Field
 from aqualvs.scanning.scan import Frame
 from aqualvs.sources.base import frame_of
 from aqualvs.sources.h264 import FieldPairs, field_pairs
-from aqualvs.sources.spans import has_decoding_times, promised_duration
+from aqualvs.sources.spans import frame_rate, has_decoding_times, promised_duration, time_slots
 
 
 class FrameCounter:
@@ -52,12 +52,18 @@ class FrameCounter:
         self._fields: FieldPairs | None = None
         self._pending: list[int] = []
         self._lost: set[int] = set()
-        self._next = 0
+        self._earliest: int | None = None
+        self._latest = self._next = 0
 
     @property
     def n_known(self) -> int:
         """Pictures numbered so far and announced ones that have not come."""
         return self._next + len(self._pending)
+
+    @property
+    def passed(self) -> int:
+        """Ticks from the earliest packet to the latest."""
+        return 0 if self._earliest is None else self._latest - self._earliest
 
     def begin(self, codec: VideoCodecContext) -> None:
         """Count the pictures of a stream from here on."""
@@ -68,6 +74,11 @@ class FrameCounter:
         if packet.size == 0:
             return
         self.n_packets += 1
+        if packet.pts is not None:
+            if self._earliest is None:
+                self._earliest = self._latest = packet.pts
+            self._earliest = min(self._earliest, packet.pts)
+            self._latest = max(self._latest, packet.pts)
         if self._fields is not None and self._fields.is_second(memoryview(packet)):
             self.n_second_fields += 1
             return
@@ -165,17 +176,19 @@ class VideoSource(Closing):
         # patches, so that the following pictures would depend on timing.
         self._stream.codec_context.thread_count = 1
         self.size_px = (self._stream.codec_context.width, self._stream.codec_context.height)
-        rate = self._stream.average_rate or self._stream.guessed_rate
+        rate = frame_rate(self._stream)
         self.fps = float(rate) if rate else None
         self._damage_is_partial = self._container.format.name in _LOSSY_CONTAINERS
         self._has_decoding_times = has_decoding_times(self._stream)
         self._promised_s = promised_duration(self._stream)
-        self.n_frames = self._stream.frames or self._estimated_frames()
+        self._slots = time_slots(self._stream)
+        self._n_exact = 0 if self._slots is not None else self._stream.frames
+        self.n_frames = self._n_exact or self._estimated_frames()
         self._frame_counter = FrameCounter(
             counts_packets=self._stream.codec_context.name not in _HIDDEN_PACKETS
         )
         self._frame_counter.begin(self._stream.codec_context)
-        self._tick, self._n_exact = self._stream.time_base, self._stream.frames
+        self._tick = self._stream.time_base
         self._n_delivered, self._last_index, self._last_time_s = 0, -1, 0.0
         self._is_closed = self._is_at_end = False
         # FFmpeg reads from memory that closing frees.
@@ -270,23 +283,28 @@ class VideoSource(Closing):
 
     def _check_complete(self) -> None:
         """Raise if the file ended before its promise, or if its last frames are lost."""
-        time_s, exact = self._last_time_s, self._n_exact
-        cut = self._frame_counter.n_packets < exact if exact else self._ends_early(time_s)
-        if not cut and self._last_index + 1 == self._frame_counter.n_known:
+        time_s = self._last_time_s
+        if not self._is_cut() and self._last_index + 1 == self._frame_counter.n_known:
             return
         n_promised = max(self.n_frames or 0, self._frame_counter.n_known)
-        promised = f"{self.n_frames}" if exact else f"about {n_promised}"
+        promised = f"{self.n_frames}" if self._n_exact else f"about {n_promised}"
         raise SourceError(
             f"{self.name}: only {self._n_delivered} of {promised} frames could be decoded, the "
             f"last at {time_s:.2f} s; the file is cut short or damaged, copy it again from the "
             "recorder"
         )
 
-    def _ends_early(self, time_s: float) -> bool:
-        """Return whether the last frame lies clearly before the promised end."""
+    def _is_cut(self) -> bool:
+        """Return whether packets are missing, or the last frame is clearly before the end."""
+        counter = self._frame_counter
+        if self._n_exact:
+            return counter.n_packets < self._n_exact
+        if self._slots is not None:
+            n_pictures = counter.n_packets - counter.n_second_fields
+            return not self._slots.are_filled(counter.passed, n_pictures)
         if self._promised_s is None or self.fps is None:
             return False
-        return time_s + max(3 / self.fps, 0.02 * self._promised_s) < self._promised_s
+        return self._last_time_s + max(3 / self.fps, 0.02 * self._promised_s) < self._promised_s
 
     def _estimated_frames(self) -> int | None:
         if self._promised_s is None or self.fps is None:
