@@ -40,6 +40,25 @@ def test_a_folder_is_searched_in_natural_order(season):
     assert {dive.rig for dive in dives} == {season / "north/rig.yaml", season / "south/rig.yaml"}
 
 
+def test_hidden_files_and_folders_of_a_folder_are_no_dives(season):
+    """As macOS leaves them on the disks of other systems."""
+    (season / "north" / "._dive2.mp4").write_bytes(b"\x00\x05\x16\x07")
+    trash = season / ".Trashes" / "501"
+    trash.mkdir(parents=True)
+    (trash / "dive3.mp4").touch()
+    (trash / "rig.yaml").touch()
+    names = [dive.source.name for dive in found(season)]
+    assert names == ["dive2.mp4", "dive10.mp4"] * 2
+    for dive in found(season):
+        dive.source.unlink()
+    (season / "south" / "._a.png").touch()
+    (trash / "a.png").touch()
+    with pytest.raises(SourceError, match="holds no dive"):
+        found(season)
+    (season / "south" / "a.png").touch()
+    assert [dive.source.name for dive in found(season)] == ["south"]
+
+
 def test_a_pattern_and_a_file_name_a_dive_once(season):
     dives = found(season / "*" / "dive2.mp4", season / "north" / "dive2.mp4")
     assert [dive.source.parent.name for dive in dives] == ["north", "south"]

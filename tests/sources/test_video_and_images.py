@@ -369,6 +369,16 @@ def test_images_come_in_natural_order(tmp_path):
         assert frame.luma.mean() == pytest.approx(luma_level(i), abs=LEVEL_TOLERANCE)
 
 
+def test_hidden_files_are_no_images(tmp_path):
+    """macOS puts one beside each file on the disks of other systems."""
+    (tmp_path / "._a.png").write_bytes(b"\x00\x05\x16\x07")
+    with pytest.raises(SourceError, match="no images in this folder"):
+        open_source(tmp_path)
+    write_images(tmp_path, ["a.png"])
+    with open_source(tmp_path) as source:
+        assert [f.index for f in source] == [0]
+
+
 def test_one_image_is_a_source(tmp_path):
     write_images(tmp_path, ["a.png"])
     with open_source(tmp_path / "a.png") as source:

@@ -29,7 +29,7 @@ from aqualvs.errors import OptionError, RigError, SourceError
 from aqualvs.recording import is_recording
 from aqualvs.results.folder import RUN_YAML
 from aqualvs.results.run_request import Water
-from aqualvs.sources.images import IMAGE_SUFFIXES, natural_key
+from aqualvs.sources.images import is_image_name, natural_key
 from aqualvs.text import hole_count
 from aqualvs.yamlfile import parse_yaml, read_text
 
@@ -285,7 +285,7 @@ def _dives_in(folder: Path, out: Path | None) -> list[Path]:
     """Return the dives below a folder; without any video, each folder of images is one."""
     own = out.resolve() if out is not None else None
     found = []
-    for path in sorted(folder.rglob("*"), key=natural_key):
+    for path in _visible(folder):
         if own is not None and path.resolve().is_relative_to(own):
             continue
         # What a run has written about a dive is no other dive.
@@ -297,15 +297,28 @@ def _dives_in(folder: Path, out: Path | None) -> list[Path]:
     raise SourceError(f"{folder}: holds no dive; name videos, recordings or folders of images")
 
 
+def _visible(folder: Path) -> list[Path]:
+    """Return what is below a folder, in natural order, but for hidden names and what they hold.
+
+    macOS puts a `._NAME` beside each file on foreign disks, and deleted ones into `.Trashes`.
+    """
+    found = (
+        path
+        for path in folder.rglob("*")
+        if not any(part.startswith(".") for part in path.relative_to(folder).parts)
+    )
+    return sorted(found, key=natural_key)
+
+
 def _image_folders(folder: Path) -> list[Path]:
-    folders = [folder, *(path for path in folder.rglob("*") if path.is_dir())]
-    return sorted((path for path in folders if _holds_images(path)), key=natural_key)
+    folders = [folder, *(path for path in _visible(folder) if path.is_dir())]
+    return [path for path in folders if _holds_images(path)]
 
 
 def _holds_images(folder: Path) -> bool:
     if (folder / RUN_YAML).exists():
         return False
-    return any(path.suffix.lower() in IMAGE_SUFFIXES for path in folder.iterdir())
+    return any(is_image_name(path) for path in folder.iterdir())
 
 
 def _is_dive(path: Path) -> bool:

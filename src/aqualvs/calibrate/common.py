@@ -41,7 +41,7 @@ from aqualvs.report.calibration_page import write_page
 from aqualvs.results.files import writing
 from aqualvs.results.run_request import checked_index
 from aqualvs.schema import Index, NotNegative, Positive, SchemaWords, StrictPart, validated
-from aqualvs.sources.images import IMAGE_SUFFIXES, natural_key, read_image
+from aqualvs.sources.images import IMAGE_SUFFIXES, is_image_name, natural_key, read_image
 from aqualvs.special_files import refuse_special
 from aqualvs.terminal import progress
 from aqualvs.yamlfile import parse_yaml, read_text
@@ -292,7 +292,7 @@ def picture_paths(arguments: Sequence[str | Path]) -> list[Path]:
 def _meant(argument: str) -> list[Path]:
     path = Path(argument)
     if path.is_dir():
-        found = [p for p in path.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES]
+        found = [one for one in path.iterdir() if is_image_name(one)]
         if not found:
             raise CalibrationError(
                 f"{path}: no pictures in this folder; looked for "

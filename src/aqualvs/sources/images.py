@@ -64,6 +64,14 @@ def _lead_nowhere() -> int:
 IMAGE_SUFFIXES = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"})
 
 
+def is_image_name(path: Path) -> bool:
+    """Return whether a file in a folder counts as an image, by its name.
+
+    Hidden ones do not: macOS puts a `._NAME` beside each file on foreign disks.
+    """
+    return path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".")
+
+
 class ImageSource(Closing):
     """Source of images as frames, in natural order of their names (`img2` before `img10`).
 
@@ -125,7 +133,7 @@ def images_in(folder: Path) -> list[Path]:
     Raises `SourceError` if the folder holds none, or cannot be listed.
     """
     try:
-        found = [p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES]
+        found = [path for path in folder.iterdir() if is_image_name(path)]
     except OSError as fault:
         raise SourceError(f"{folder}: cannot be listed ({fault.strerror})") from fault
     if not found:

@@ -94,6 +94,7 @@ def test_a_picture_without_a_row_is_refused(tmp_path):
 def test_pictures_come_in_natural_order_and_once(tmp_path):
     for name in ("a10.png", "a2.png", "a1.JPG", "notes.txt"):
         (tmp_path / name).write_text("")
+    (tmp_path / "._a2.png").touch()  # As macOS leaves them.
     paths = picture_paths([str(tmp_path), str(tmp_path / "a2.png")])
     assert [path.name for path in paths] == ["a1.JPG", "a2.png", "a10.png"]
     assert picture_paths([str(tmp_path / "a*.png")]) == [tmp_path / "a2.png", tmp_path / "a10.png"]
