@@ -2,6 +2,7 @@
 
 import contextlib
 import gc
+import io
 import itertools
 import os
 import struct
@@ -428,6 +429,26 @@ def test_an_unreadable_image_leaves_a_gap_and_is_named_at_the_end(tmp_path, capf
     assert capfd.readouterr().err == ""
 
 
+@pytest.mark.parametrize("progressive", [False, True])
+def test_a_jpeg_that_is_cut_short_is_no_image(tmp_path, progressive):
+    """Decoders fill what is missing with grey; what follows the end is none of theirs."""
+    thumbnail = io.BytesIO()
+    Image.fromarray(grain(9, (40, 30))).save(thumbnail, "jpeg")
+    for i in range(5):
+        Image.fromarray(grain(i, (320, 240))).save(
+            tmp_path / f"{i}.jpg", progressive=progressive, comment=thumbnail.getvalue()
+        )
+    for i, share in ((1, 0.5), (2, 0.9)):
+        data = (tmp_path / f"{i}.jpg").read_bytes()
+        (tmp_path / f"{i}.jpg").write_bytes(data[: int(share * len(data))])
+    with (tmp_path / "3.jpg").open("ab") as file:
+        file.write(bytes(100_000))
+    with open_source(tmp_path) as source:
+        assert [f.index for f in source] == [0, 3, 4]
+    with pytest.raises(SourceError, match=r"1\.jpg: not a readable image, cut short"):
+        open_source(tmp_path / "1.jpg")
+
+
 def test_images_of_two_sizes_are_refused(tmp_path):
     write_images(tmp_path, ["a1.png"])
     write_images(tmp_path, ["a2.png"], size=(32, 32))
@@ -534,7 +555,7 @@ def huge_png(path, side=60_000):
 
 def test_a_huge_picture_is_refused_and_those_before_it_kept(tmp_path):
     huge_png(tmp_path / "img9.png")
-    with pytest.raises(SourceError, match=r"img9\.png: not a readable image, or too large"):
+    with pytest.raises(SourceError, match=r"img9\.png: .* image, cut short, or too large"):
         open_source(tmp_path)
     for i in range(3):
         cv2.imwrite(str(tmp_path / f"img{i}.png"), picture(i, (64, 48)))

@@ -486,7 +486,7 @@ def _read(path: Path, how: int) -> Image:
     image = read_image(path, how)
     if image is None:
         raise CalibrationError(
-            f"{path}: not a readable picture, or too large; remove or replace it"
+            f"{path}: not a readable picture, cut short, or too large; remove or replace it"
         )
     return image
 

@@ -96,9 +96,7 @@ class ImageSource(Closing):
             raise SourceError(f"{self.name}: no images; name at least one")
         first = read_image(self._paths[0])
         if first is None:
-            raise SourceError(
-                f"{self._paths[0]}: not a readable image, or too large; remove or replace it"
-            )
+            raise SourceError(_unreadable(self._paths[0]))
         self.size_px = (first.shape[1], first.shape[0])
         self.n_frames = len(self._paths)
 
@@ -114,9 +112,7 @@ class ImageSource(Closing):
             yield Frame(index, index / self.fps, luma, chroma)
             last = index
         if last + 1 < self.n_frames:
-            raise SourceError(
-                f"{self._paths[-1]}: not a readable image, or too large; remove or replace it"
-            )
+            raise SourceError(_unreadable(self._paths[-1]))
 
     def _check_size(self, path: Path, image: ImagePlane) -> None:
         size = (image.shape[1], image.shape[0])
@@ -125,6 +121,10 @@ class ImageSource(Closing):
                 f"{path}: {size[0]}x{size[1]} px, but the first image has "
                 f"{self.size_px[0]}x{self.size_px[1]} px; keep one size a folder"
             )
+
+
+def _unreadable(path: Path) -> str:
+    return f"{path}: not a readable image, cut short, or too large; remove or replace it"
 
 
 def images_in(folder: Path) -> list[Path]:
@@ -161,13 +161,35 @@ def read_image(path: Path, how: int = cv2.IMREAD_ANYCOLOR) -> ImagePlane | None:
     Returns
     -------
     image : array or None
-        None for pipes and devices too, and for images of more pixels than OpenCV is told to take
-        (`aqualvs/__init__.py`).
+        None for pipes and devices too, for JPEG files that are cut short, and for images of more
+        pixels than OpenCV is told to take (`aqualvs/__init__.py`).
     """
     try:
+        if not path.is_file() or _is_cut_jpeg(path):
+            return None
         with quiet_decoders():
-            flags = how | cv2.IMREAD_IGNORE_ORIENTATION
-            image = cv2.imread(str(path), flags) if path.is_file() else None
-    except cv2.error:
+            image = cv2.imread(str(path), how | cv2.IMREAD_IGNORE_ORIENTATION)
+    except (cv2.error, OSError):
         return None
     return cast("ImagePlane | None", image)
+
+
+def _is_cut_jpeg(path: Path) -> bool:
+    """Return whether a file is a JPEG whose picture does not end, which OpenCV fills with grey.
+
+    Cameras append anything behind the end, and put a thumbnail with an end of its own before the
+    picture. So the end is looked for from the first scan on (ITU-T T.81, annex B), whose coded data
+    cannot contain it.
+    """
+    start_of_scan, end_of_image, prefix = 0xDA, b"\xff\xd9", 0xFF
+    with path.open("rb") as file:
+        if file.read(2) != b"\xff\xd8":
+            return False
+        data = file.read()
+    at = 0
+    while at + 4 <= len(data) and data[at] == prefix:
+        if data[at + 1] == start_of_scan:
+            return data.find(end_of_image, at) < 0
+        # Bytes of 255 may fill the space before a marker.
+        at += 1 if data[at + 1] == prefix else 2 + int.from_bytes(data[at + 2 : at + 4])
+    return False
