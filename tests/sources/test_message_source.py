@@ -14,10 +14,12 @@ import pyarrow as pa
 import pytest
 
 from aqualvs.errors import OptionError, SourceError
+from aqualvs.recording import PictureFormat, RecorderOptions, Recording
 from aqualvs.sources import bags, image_messages, open_feed, open_source
 from aqualvs.sources.fields import FieldEvidence, first_pairs
 from aqualvs.sources.image_messages import ImageMessage, planes_of_message, protobuf_fields
 from aqualvs.sources.mcap_file import decompressed
+from live_cases import demo_samples
 from shell_cases import luma_level, picture
 
 mcap_writer = pytest.importorskip("mcap.writer")
@@ -315,6 +317,34 @@ def test_a_file_without_images_is_refused(tmp_path):
     topic = "/depth", "foxglove.Log", ("protobuf", b""), "protobuf", [b""]
     with pytest.raises(SourceError, match="holds no images"):
         open_source(write_mcap(tmp_path / "a.mcap", [topic]))
+
+
+@pytest.mark.parametrize("kind", [None, PictureFormat.PNG])
+def test_a_recording_of_aqualvs_without_whole_pictures_says_what_it_is(tmp_path, kind):
+    path = own_recording(tmp_path / "dive.mcap", kind)
+    words = "without pictures" if kind is None else r"in two parts \(PNG\)"
+    with pytest.raises(SourceError, match=f"a recording of aqualvs .*{words}.*aqualvs run") as told:
+        open_feed(path)
+    assert "\n" not in str(told.value)
+    with pytest.raises(OptionError, match="no images on topic /sonar"):
+        open_source(path, topic="/sonar")
+
+
+def test_pictures_of_a_recording_of_aqualvs_are_a_source(tmp_path):
+    """As `aqualvs live --record-video` keeps them; the topic of chroma is known, but empty."""
+    with open_source(own_recording(tmp_path / "dive.mcap", PictureFormat.JPEG)) as source:
+        assert source.name.endswith("#/aqualvs/picture")
+        frames = list(source)
+    assert len(frames) == 3
+    assert all(frame.chroma is not None for frame in frames)
+
+
+def own_recording(path, kind):
+    recording = Recording(path, RecorderOptions(pictures=kind))
+    for sample in demo_samples(3):
+        recording.write(sample)
+    recording.close()
+    return path
 
 
 def test_a_file_cut_short_gives_what_it_has(tmp_path):

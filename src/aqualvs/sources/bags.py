@@ -206,7 +206,33 @@ def open_mcap(path: Path, topic: str | None = None) -> MessageSource:
     missing.
     """
     _require("mcap.reader", path, "MCAP files")
-    return _source(path, topic, _mcap_image_topics(path), functools.partial(_mcap_messages, path))
+    topics = _mcap_image_topics(path)
+    if topic is None:
+        _check_own(path, topics)
+    return _source(path, topic, topics, functools.partial(_mcap_messages, path))
+
+
+# Topics of the recordings that `aqualvs.recording` writes. The second one is of PNG pictures, whose
+# luma the first one has then; a recording of other pictures knows it, but has none there.
+_OWN_PICTURE, _OWN_CHROMA = "/aqualvs/picture", "/aqualvs/picture/chroma"
+
+
+def _check_own(path: Path, topics: list[ImageTopic]) -> None:
+    """Refuse a recording of aqualvs without pictures, or with luma and chroma apart."""
+    counts = {topic.name: topic.n_messages for topic in topics}
+    if not {_OWN_PICTURE, _OWN_CHROMA} <= counts.keys():
+        return
+    again = "aqualvs run measures its stripes again"
+    if not any(n is None or n > 0 for n in counts.values()):
+        raise SourceError(
+            f"{path}: a recording of aqualvs without pictures; {again}, and aqualvs live "
+            "--record-video keeps pictures"
+        )
+    if counts[_OWN_CHROMA] != 0:
+        raise SourceError(
+            f"{path}: a recording of aqualvs that is torn, or whose pictures are in two parts "
+            f"(PNG); {again}, and {path}#{_OWN_PICTURE} is its pictures, of PNG without colour"
+        )
 
 
 def _mcap_image_topics(path: Path) -> list[ImageTopic]:

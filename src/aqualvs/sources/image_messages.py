@@ -328,7 +328,7 @@ class ImageTopic:
 
 
 def choose_topic(where: str, topics: list[ImageTopic], wanted: str | None) -> ImageTopic:
-    """Return the topic wanted, or the only one.
+    """Return the topic wanted, or the only one that is not known to be empty.
 
     Parameters
     ----------
@@ -344,6 +344,8 @@ def choose_topic(where: str, topics: list[ImageTopic], wanted: str | None) -> Im
     OptionError
         If several topics have images and none is named, or the one named has none.
     """
+    if wanted is None:
+        topics = [topic for topic in topics if topic.n_messages != 0]
     listed = ", ".join(sorted(topic.name for topic in topics))
     if not topics:
         raise SourceError(f"{where}: holds no images; record a camera's topic too")
