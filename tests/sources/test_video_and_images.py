@@ -1,7 +1,9 @@
 """Sources: what arrives is what was encoded, and what is missing is said."""
 
 import contextlib
+import functools
 import gc
+import http.server
 import io
 import itertools
 import os
@@ -476,26 +478,42 @@ def test_a_frame_rate_for_a_video_is_refused(tmp_path):
         open_source(tmp_path, fps=0.0)
 
 
-def test_an_address_is_read_like_a_file(tmp_path):
-    """An MPEG-TS over HTTP, served here."""
-    import functools
-    import http.server
-
-    write_video(tmp_path / "a.ts", 10, size=SMALL)
+@contextlib.contextmanager
+def served(folder):
+    """Serve a folder by HTTP, without ranges; yield the address."""
 
     class Quiet(http.server.SimpleHTTPRequestHandler):
         def log_message(self, *arguments):
             pass
 
-    handler = functools.partial(Quiet, directory=str(tmp_path))
+    handler = functools.partial(Quiet, directory=str(folder))
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
-        with open_source(f"http://127.0.0.1:{server.server_port}/a.ts") as source:
+        yield f"http://127.0.0.1:{server.server_port}"
+        server.shutdown()
+
+
+def test_an_address_is_read_like_a_file(tmp_path):
+    """An MPEG-TS over HTTP, served here."""
+    write_video(tmp_path / "a.ts", 10, size=SMALL)
+    with served(tmp_path) as address:
+        with open_source(f"{address}/a.ts") as source:
             assert isinstance(source, VideoSource)
             assert [f.index for f in source] == list(range(10))
         with pytest.raises(SourceError, match="cannot be opened"):
-            open_source(f"http://127.0.0.1:{server.server_port}/missing.ts")
-        server.shutdown()
+            open_source(f"{address}/missing.ts")
+
+
+@pytest.mark.parametrize("codec", ["libx264", "mpeg4"])
+def test_a_server_that_cannot_send_the_pictures_is_blamed_and_not_the_file(tmp_path, codec):
+    """The index is behind the pictures, to which FFmpeg cannot return."""
+    write_video(tmp_path / "a.mp4", 40, size=(320, 240), codec=codec, options={}, content=grain)
+    with (
+        served(tmp_path) as address,
+        pytest.raises(SourceError, match="cannot send parts of a file, download it"),
+        open_source(f"{address}/a.mp4") as source,
+    ):
+        list(source)
 
 
 def test_decoding_takes_one_pass(tmp_path):

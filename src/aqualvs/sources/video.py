@@ -10,6 +10,7 @@ import itertools
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NoReturn
 
 import av
 from av.container import InputContainer
@@ -193,7 +194,7 @@ class VideoSource(Closing):
         self._is_closed = self._is_at_end = False
         # FFmpeg reads from memory that closing frees.
         self._in_ffmpeg = threading.Lock()
-        self._packets = self._read_packets()
+        self._packets: Iterator[Packet[VideoStream]] = self._read_packets()
         if self._packets_are_fields():
             self.fps = None if self.fps is None else 0.5 * self.fps
             self.n_frames = None if self.n_frames is None else self.n_frames // 2
@@ -251,8 +252,11 @@ class VideoSource(Closing):
         if pairs is None:
             return False
         first: list[Packet[VideoStream]] = []
-        with contextlib.suppress(SourceError):
-            first += itertools.islice(self._packets, 2)
+        try:
+            for packet in itertools.islice(self._packets, 2):
+                first.append(packet)
+        except SourceError as fault:
+            self._packets = map(_raise, [fault])
         self._packets = itertools.chain(first, self._packets)
         coded = [packet for packet in first if packet.size]
         seconds = [packet for packet in coded if pairs.is_second(memoryview(packet))]
@@ -265,7 +269,11 @@ class VideoSource(Closing):
         except av.error.InvalidDataError:
             return
         except av.error.FFmpegError as fault:
-            raise SourceError(f"{self.name}: the stream broke off ({fault.strerror})") from fault
+            raise SourceError(self._broke_off(fault.strerror)) from fault
+
+    def _broke_off(self, why: str | None) -> str:
+        words = f"{self.name}: the stream broke off ({why})"
+        return words if self._frame_counter.n_packets else f"{words}{_hint(self.name)}"
 
     def _frame(self, picture: VideoFrame, index: int) -> Frame:
         if (picture.width, picture.height) != self.size_px:
@@ -318,7 +326,8 @@ class VideoSource(Closing):
         stream = self._container.streams.video[0]
         if stream.codec_context is None or not stream.codec_context.width:
             self._container.close()
-            raise SourceError(f"{self.name}: no picture in this video; record it again")
+            remedy = _hint(self.name) or "; record it again"
+            raise SourceError(f"{self.name}: no picture in this video{remedy}")
         return stream
 
     def close(self) -> None:
@@ -326,6 +335,17 @@ class VideoSource(Closing):
         self._is_closed = True
         with self._in_ffmpeg:
             self._container.close()
+
+
+def _hint(where: str) -> str:
+    """Return what to do if nothing can be read from a server; empty for anything else."""
+    if not where.startswith(("http://", "https://")):
+        return ""
+    return "; if the server cannot send parts of a file, download it and give the file"
+
+
+def _raise(fault: SourceError) -> NoReturn:
+    raise fault
 
 
 # Pictures that are looked at for fields: so many in a row, at so many places of a file.
