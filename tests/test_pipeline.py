@@ -7,6 +7,7 @@ import threading
 from dataclasses import replace
 from pathlib import Path
 
+import av
 import cv2
 import numpy as np
 import pytest
@@ -30,6 +31,7 @@ from aqualvs.sources import open_source
 from aqualvs.terminal import StopSignals
 from rerun_stand_in import replace_sdk
 from shell_cases import (
+    SIZE,
     LumaScanner,
     all_key_frames,
     cut_after,
@@ -96,6 +98,25 @@ def test_the_run_file_tells_source_rig_and_options(request_for, dive):
     assert scanner["detector"]["kind"] == "threshold"
     assert scanner["mesh_filter"]["rd_theta"] > 0
     json.dumps(content)
+
+
+def test_a_video_of_two_tracks_says_which_is_measured(request_for, tmp_path):
+    path = tmp_path / "two.mkv"
+    with av.open(str(path), "w") as container:
+        streams = [container.add_stream("ffv1", rate=25) for _ in range(2)]
+        for stream in streams:
+            stream.width, stream.height = SIZE
+        for i in range(3):
+            for stream in streams:
+                frame = av.VideoFrame.from_ndarray(picture(i), format="bgr24")
+                container.mux(stream.encode(frame))
+        for stream in streams:
+            container.mux(stream.encode(None))
+    request = request_for(path)
+    result = run(request, scanner_for=LumaScanner())
+    assert len(rows(request.out)) == 3
+    (told,) = [line for line in summary_lines(request, result) if "warning" in line]
+    assert told.startswith("warning: the video holds 2 tracks, the first is measured")
 
 
 def test_a_lost_frame_has_its_row(request_for, tmp_path):

@@ -220,8 +220,19 @@ def summary_for(dive: OpenDive) -> RunSummary:
     return RunSummary(
         agreement=agreement,
         net_check=net_check(request.target, rig),
-        warnings=_shutter_warnings(dive),
+        warnings=[*_track_warnings(dive), *_shutter_warnings(dive)],
     )
+
+
+def _track_warnings(dive: OpenDive) -> list[str]:
+    """Return a warning if a video holds several tracks."""
+    pictures = source_of_pictures(dive.source)
+    if not isinstance(pictures, VideoSource) or pictures.n_tracks < 2:
+        return []
+    return [
+        f"the video holds {pictures.n_tracks} tracks, the first is measured; for another, copy it "
+        "to a file of its own (ffmpeg -map 0:v:1 -c copy)"
+    ]
 
 
 def _shutter_warnings(dive: OpenDive) -> list[str]:

@@ -15,6 +15,7 @@ from typing import NoReturn
 import av
 from av.container import InputContainer
 from av.packet import Packet
+from av.stream import Disposition
 from av.video.codeccontext import VideoCodecContext
 from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
@@ -156,6 +157,11 @@ class VideoSource(Closing):
     where : str or Path
         Path or address.
 
+    Attributes
+    ----------
+    n_tracks : int
+        Of video in the file, cover pictures left out; the first one is read.
+
     Raises
     ------
     SourceError
@@ -173,6 +179,9 @@ class VideoSource(Closing):
         self.name = str(where)
         self._container = _open(self.name)
         self._stream = self._video_stream()
+        self.n_tracks = sum(
+            not one.disposition & Disposition.attached_pic for one in self._container.streams.video
+        )
         # Slice threads leave patched pictures unmarked; frame threads do not wait for each other's
         # patches, so that the following pictures would depend on timing.
         self._stream.codec_context.thread_count = 1
