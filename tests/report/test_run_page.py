@@ -31,7 +31,7 @@ from aqualvs.scanning.posture import Reason
 from aqualvs.scanning.scan import Label
 from aqualvs.text import LABEL_COLOURS, LABEL_WORDS, REASON_WORDS, reason_text
 from report_cases import COLUMNS, FPS, LASERS, NASTY, NASTY_LASER, Dive, make_dive, write_truth
-from shell_cases import write_video
+from shell_cases import grey, write_video
 
 
 def data_of(page: str) -> dict[str, Any]:
@@ -270,6 +270,18 @@ def test_the_right_pictures_are_decoded(dive: Dive) -> None:
     assert sorted(pictures) == sorted(rows)
     for row, picture in pictures.items():
         assert int(picture.mean(axis=(0, 2)).argmax()) // 8 == row
+
+
+def test_the_right_pictures_of_avi_are_decoded(dive: Dive, tmp_path: Path) -> None:
+    """Its times are those of decoding, which B-frames change."""
+    track = read_track(dive.folder / "posture.csv")
+    path = write_video(tmp_path / "dive.avi", 40, size=(96, 64), options={"bf": "3", "g": "12"})
+    rows = list(range(40))
+    pictures = decode_frames(path, track, rows)
+    assert sorted(pictures) == rows
+    for row, image in pictures.items():
+        # Less than half of the step between two pictures, which lossy encoders miss by a few.
+        assert image.mean() == pytest.approx(grey(row), abs=5.0)
 
 
 def test_pictures_show_refusals_and_the_worst_posture(dive: Dive) -> None:

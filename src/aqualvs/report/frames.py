@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from av.container import InputContainer
 
+from aqualvs.errors import SourceError
 from aqualvs.geometry.arrays import IntArray
 from aqualvs.optics.shutter import FIRST_ROW
 from aqualvs.report import html
@@ -21,7 +22,10 @@ from aqualvs.report.points import FramePoints
 from aqualvs.report.run_data import Track
 from aqualvs.scanning.posture import Reason
 from aqualvs.scanning.scan import ImagePlane
+from aqualvs.sources.base import bgr_of
 from aqualvs.sources.images import IMAGE_SUFFIXES, images_in, read_image
+from aqualvs.sources.spans import has_decoding_times
+from aqualvs.sources.video import VideoSource
 from aqualvs.text import bgr
 
 N_PICTURES = 6
@@ -96,6 +100,8 @@ def decode_frames(source: Path, track: Track, rows: list[int]) -> dict[int, Imag
         return _from_images(images_in(source), track, rows)
     if source.suffix.lower() in IMAGE_SUFFIXES:
         return _from_images([source], track, rows)
+    if _has_decoding_times(source):
+        return _from_beginning(source, track, rows)
     decoders = 2
     with ThreadPoolExecutor(decoders) as pool:
         parts = [rows[i::decoders] for i in range(decoders)]
@@ -225,6 +231,26 @@ def _from_video(source: Path, track: Track, rows: list[int]) -> dict[int, ImageP
             if found is not None and abs((found.time or 0.0) - wanted) <= 2.0 * half:
                 image = np.asarray(found.to_ndarray(format="bgr24"), dtype=np.uint8)
                 pictures[row] = _shown(image, track, row)
+    return pictures
+
+
+def _has_decoding_times(source: Path) -> bool:
+    with contextlib.suppress(*_BROKEN), av.open(str(source)) as container:
+        return has_decoding_times(container.streams.video[0])
+    return False
+
+
+def _from_beginning(source: Path, track: Track, rows: list[int]) -> dict[int, ImagePlane]:
+    """Return pictures by row from a video whose times do not tell which picture is which."""
+    pictures: dict[int, ImagePlane] = {}
+    left = {row: _picture_of(track, row)[0] for row in rows}
+    with contextlib.suppress(SourceError), VideoSource(source) as frames:
+        for frame in frames:
+            for row in [row for row, number in left.items() if number == frame.index]:
+                pictures[row] = _shown(bgr_of(frame), track, row)
+                del left[row]
+            if not left:
+                break
     return pictures
 
 
