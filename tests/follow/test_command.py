@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from aqualvs.cli.follow import follow
+from aqualvs.cli.main import main
 from aqualvs.control.follow_log import FOLLOW_COLUMNS
 from aqualvs.errors import OptionError
 from aqualvs.follow.command import FOLLOW_CSV, TRUTH_CSV, Aim, SimRequest, simulate_and_tell
@@ -102,11 +102,11 @@ def test_what_cannot_be_simulated_is_refused(tmp_path: Path) -> None:
         Aim(range=5.0).mission((0.3, 1.0))
 
 
-def test_command_line_says_what_is_missing() -> None:
-    with pytest.raises(OptionError, match="--rig, --mavlink and --gains"):
-        follow(source="udp://0.0.0.0:5600")
-    with pytest.raises(OptionError, match="has no source"):
-        follow(source="udp://0.0.0.0:5600", sim=True)
+def test_command_line_says_what_is_missing(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["follow", "udp://0.0.0.0:5600"]) == 2
+    assert "--rig, --mavlink and --gains" in capsys.readouterr().err
+    assert main(["follow", "udp://0.0.0.0:5600", "--sim"]) == 2
+    assert "SOURCE udp://0.0.0.0:5600: for a vehicle" in capsys.readouterr().err
 
 
 class Switch:

@@ -4,6 +4,7 @@ A ChArUco board or chessboard for camera and dome, the markers of a box for the 
 plate of markers, fixed to the vehicle, for the water's index.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -72,6 +73,30 @@ class BoardRequest:
     rotation_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
     # Whether to replace files that this command wrote before.
     overwrite: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuse counts and lengths that nothing can be printed with.
+
+        Raises `OptionError` naming the option and its value.
+        """
+        for name in ("squares_x", "squares_y"):
+            count = getattr(self, name)
+            if count is not None and count < 1:
+                raise OptionError(f"{_option(name)} {count}: give 1 or more")
+        # Below a millimetre it is a length in metres.
+        min_mm = 1.0
+        for name in ("square_mm", "marker_mm", "width_mm", "height_mm", "depth_mm"):
+            length = getattr(self, name)
+            if length is not None and not min_mm <= length < math.inf:
+                raise OptionError(
+                    f"{_option(name)} {length:g}: give millimetres, {min_mm:g} or more"
+                )
+        if self.border_mm is not None and not 0.0 <= self.border_mm < math.inf:
+            raise OptionError(f"--border-mm {self.border_mm:g}: give millimetres, 0 or more")
+
+
+def _option(name: str) -> str:
+    return "--" + name.replace("_", "-")
 
 
 def print_board(request: BoardRequest, echo: Echo) -> None:

@@ -8,7 +8,18 @@ from typing import Annotated, Literal
 
 import typer
 
-from aqualvs.cli.command import Celsius, CheckedCommand, Overwrite, Salinity
+from aqualvs.cli.command import Celsius, CheckedCommand, Overwrite, Salinity, refuse_given
+
+_OF_BOARDS = ("squares_x", "squares_y", "square_mm", "border_mm")
+_OF_A_BOX = ("width_mm", "height_mm", "depth_mm")
+_OF_A_PLATE = ("position_mm", "rotation_deg")
+# Options that a kind of target has no use for.
+_IDLE = {
+    "charuco": (*_OF_A_BOX, *_OF_A_PLATE, "first_id"),
+    "chessboard": (*_OF_A_BOX, *_OF_A_PLATE, "first_id", "marker_mm", "dictionary"),
+    "box": (*_OF_BOARDS, *_OF_A_PLATE),
+    "plate": (*_OF_A_BOX, "square_mm"),
+}
 
 calibrate = typer.Typer(
     name="calibrate",
@@ -280,6 +291,7 @@ def shutter(
 
 
 def board(
+    context: typer.Context,
     kind: Annotated[
         Literal["charuco", "chessboard", "box", "plate"],
         typer.Argument(
@@ -320,6 +332,7 @@ def board(
     overwrite: Overwrite = False,
 ) -> None:
     """Print a target."""
+    refuse_given(context, _IDLE[kind], f"not of a {kind}; leave it out")
     from aqualvs.calibrate import board as body
 
     body.print_board(

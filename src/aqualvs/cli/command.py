@@ -1,8 +1,8 @@
 """Base of all commands: a command class that checks values, shared options, and fast imports.
 
 `CheckedCommand` checks the values of every option and argument before the command runs. `given`
-tells which parameters the user set. `importing` switches garbage collection off during large
-imports.
+tells which parameters the user set, and `refuse_given` refuses those that would do nothing.
+`importing` switches garbage collection off during large imports.
 """
 
 import contextlib
@@ -101,6 +101,30 @@ def given(context: typer.Context, names: Sequence[str]) -> frozenset[str]:
     return frozenset(
         name for name, source in sources.items() if source and source.name != "DEFAULT"
     )
+
+
+def typed(context: typer.Context, *names: str) -> tuple[str, ...]:
+    """Return which of these parameters stand on the command line.
+
+    Variables of the environment do not count: they hold for every command.
+    """
+    sources = {name: context.get_parameter_source(name) for name in names}
+    return tuple(
+        name for name, source in sources.items() if source and source.name == "COMMANDLINE"
+    )
+
+
+def refuse_given(context: typer.Context, names: Sequence[str], remedy: str) -> None:
+    """Refuse parameters on the command line that would do nothing.
+
+    Raises `OptionError` with the first of them, its value and the remedy.
+    """
+    parameters = {parameter.name: parameter for parameter in context.command.params}
+    for name in typed(context, *names):
+        values = [str(one) for one in _plain(context.params[name]) if not isinstance(one, bool)]
+        # Passwords do not belong into logs.
+        shown = "" if name == "token" else "".join(f" {one}" for one in values)
+        raise OptionError(f"{_name(parameters[name])}{shown}: {remedy}")
 
 
 class CheckedCommand(TyperCommand):

@@ -6,7 +6,25 @@ from typing import Annotated, Literal
 
 import typer
 
-from aqualvs.cli.command import MavlinkKey, MavlinkPeer, Overwrite, VehicleFileOption
+from aqualvs.cli.command import (
+    MavlinkKey,
+    MavlinkPeer,
+    Overwrite,
+    VehicleFileOption,
+    refuse_given,
+    typed,
+)
+
+OF_A_VEHICLE = (
+    "source", "rig", "mavlink", "vehicle_file", "mavlink_peer", "mavlink_key", "record",
+    "record_to", "record_video", "target", "water_n",
+)  # fmt: skip
+"""Parameters of `aqualvs follow` that mean nothing in simulation."""
+OF_A_SIMULATION = (
+    "vehicle", "seconds", "current", "current_to", "waves", "cage_radius", "net_sway", "pilot_gain",
+    "rendered", "camera", "shutter", "fps", "seed", "freeze",
+)  # fmt: skip
+"""Those that mean nothing with a vehicle."""
 
 
 def tune(
@@ -47,6 +65,7 @@ def tune(
 
 
 def follow(
+    context: typer.Context,
     source: Annotated[
         str | None, typer.Argument(help="Stream or camera of a real vehicle.")
     ] = None,
@@ -143,10 +162,12 @@ def follow(
     from aqualvs.errors import OptionError
     from aqualvs.follow import command as body
 
+    dashboard = dashboard or bool(typed(context, "dashboard_address"))
+    if not dashboard:
+        refuse_given(context, ("token",), "for the pilot's page; add --dashboard")
     aim = body.Aim(plan=plan, range=hold_range, yaw=math.radians(yaw))
     if sim:
-        if source is not None or any((mavlink, vehicle_file, mavlink_peer, mavlink_key)):
-            raise OptionError("--sim: has no source and no --mavlink; leave them out")
+        refuse_given(context, OF_A_VEHICLE, "for a vehicle; leave it out with --sim")
         request = body.SimRequest(
             out=out,
             aim=aim,
@@ -174,6 +195,7 @@ def follow(
         raise OptionError(
             "follow: give SOURCE, --rig, --mavlink and --gains for a vehicle, or --sim to try it"
         )
+    refuse_given(context, OF_A_SIMULATION, "for a simulation; leave it out, or give --sim")
     from aqualvs.follow.vehicle import FollowRequest, follow_and_tell
     from aqualvs.live.command import LiveRequest
     from aqualvs.live.options import vehicle_setup
@@ -184,7 +206,8 @@ def follow(
         rig=rig,
         dashboard=dashboard_address if dashboard else None,
         token=token,
-        record=record,
+        # The page has a button that records; without it nothing else begins a recording.
+        record=record or (not dashboard and (record_video or record_to is not None)),
         record_to=out if record_to is None else record_to,
         record_video=record_video,
         water=Water(n_water=water_n, temperature_c=None, salinity=None),

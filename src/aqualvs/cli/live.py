@@ -14,10 +14,15 @@ from aqualvs.cli.command import (
     Target,
     VehicleFileOption,
     WaterIndex,
+    refuse_given,
+    typed,
 )
+
+_OF_MAVLINK = ("vehicle_file", "mavlink_peer", "mavlink_key")
 
 
 def live(
+    context: typer.Context,
     source: Annotated[
         str, typer.Argument(help="Stream, camera or file; docs/sources.md has a table.")
     ],
@@ -101,6 +106,14 @@ def live(
     index_target: IndexTarget = None,
 ) -> None:
     """Measure live."""
+    foxglove = foxglove or bool(typed(context, "foxglove_address"))
+    dashboard = dashboard or bool(typed(context, "dashboard_address"))
+    # The page has a button that records; without it nothing else begins a recording.
+    record = record or (not dashboard and bool(typed(context, "record_video", "record_to")))
+    if not dashboard:
+        refuse_given(context, ("token", "embed_from"), "for the pilot's page; add --dashboard")
+    if not mavlink:
+        refuse_given(context, _OF_MAVLINK, "for a MAVLink connection; add --mavlink")
     from aqualvs.live import command as body
     from aqualvs.live.options import OutputRequest, vehicle_setup
     from aqualvs.results.run_request import Water, scanner_options
@@ -134,6 +147,7 @@ def live(
 
 
 def doctor(
+    context: typer.Context,
     source: Annotated[str | None, typer.Argument(help="Stream, camera or file to look at.")] = None,
     rig: Annotated[Path | None, typer.Option(help="Rig that the pictures should fit.")] = None,
     mavlink: Annotated[str | None, typer.Option(help="Autopilot to listen for.")] = None,
@@ -142,6 +156,8 @@ def doctor(
     mavlink_key: MavlinkKey = None,
 ) -> None:
     """Look at the machine."""
+    if mavlink is None:
+        refuse_given(context, _OF_MAVLINK, "for a MAVLink connection; add --mavlink")
     from aqualvs.check.doctor import DoctorRequest, run_doctor
     from aqualvs.live.options import vehicle_setup
 
