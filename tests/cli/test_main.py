@@ -65,6 +65,22 @@ def test_every_command_is_in_a_group(capsys):
     assert said.index("  calibrate ") < said.index("Live and control:")
 
 
+def test_calibrate_without_a_step_prints_its_help(capsys):
+    assert main(["calibrate", "--help"]) == 0
+    shown = capsys.readouterr().out
+    assert main(["calibrate"]) == 2
+    assert capsys.readouterr().err == shown
+
+
+def test_the_steps_of_calibrate_are_told_whole(capsys):
+    assert main(["calibrate", "--help"]) == 0
+    steps = capsys.readouterr().out.partition("Commands:")[2]
+    assert "..." not in steps
+    assert [line.split()[0] for line in steps.splitlines() if re.match(r"  \w", line)] == [
+        "camera", "dome", "lasers", "water", "shutter",
+    ]  # fmt: skip
+
+
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish", "powershell"])
 def test_a_shell_can_complete(shell, monkeypatch, capsys):
     monkeypatch.setenv("_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION", "1")

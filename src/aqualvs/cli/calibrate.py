@@ -8,7 +8,14 @@ from typing import Annotated, Literal
 
 import typer
 
-from aqualvs.cli.command import Celsius, CheckedCommand, Overwrite, Salinity, refuse_given
+from aqualvs.cli.command import (
+    Celsius,
+    CheckedCommand,
+    CommandGroups,
+    Overwrite,
+    Salinity,
+    refuse_given,
+)
 
 _OF_BOARDS = ("squares_x", "squares_y", "square_mm", "border_mm")
 _OF_A_BOX = ("width_mm", "height_mm", "depth_mm")
@@ -24,9 +31,18 @@ _IDLE = {
 calibrate = typer.Typer(
     name="calibrate",
     help="Make a rig file from pictures: camera, dome, lasers, water, in this order; shutter last.",
-    no_args_is_help=True,
+    cls=CommandGroups,
     rich_markup_mode=None,
 )
+
+
+@calibrate.callback(invoke_without_command=True)
+def _steps(context: typer.Context) -> None:
+    """Print the help where no step is named."""
+    if context.invoked_subcommand is None:
+        typer.echo(context.get_help(), err=True)
+        raise typer.Exit(2)
+
 
 Pictures = Annotated[
     list[str], typer.Argument(help="Pictures, folders of them, or patterns such as 'air/*.png'.")
