@@ -103,6 +103,36 @@ def test_the_version(capsys):
     assert capsys.readouterr().out == f"aqualvs {__version__}\n"
 
 
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (
+            "run x --water-n 1,33",
+            "--water-n 1,33: write 1.33, with a decimal point; see aqualvs run",
+        ),
+        ("run x --water-n many", "--water-n many: give a number; see aqualvs run"),
+        ("run x --workers 0", "--workers 0: give 1 or more; see aqualvs run"),
+        ("run x --workers 5000", "--workers 5000: give at most 1024; see aqualvs run"),
+        ("run x --workers 1,5", "--workers 1,5: give a whole number; see aqualvs run"),
+        ("run x --detector foo", "--detector foo: give one of ridge, threshold; see aqualvs run"),
+        (
+            "board cube -o x",
+            "KIND cube: give one of charuco, chessboard, box, plate; see aqualvs board",
+        ),
+        (
+            "board plate -o x --position-mm 1 2,5 3",
+            "--position-mm 2,5: write 2.5, with a decimal point; see aqualvs board",
+        ),
+        ("calibrate tank", "No such command 'tank'; see aqualvs calibrate"),
+        ("tank", "No such command 'tank'; see aqualvs"),
+        ("calibrate shutter x --fps a", "--fps a: give a number; see aqualvs calibrate shutter"),
+    ],
+)
+def test_faults_of_the_parser_name_option_value_and_help(arguments, said, capsys):
+    assert main(arguments.split()) == 2
+    assert capsys.readouterr().err == f"aqualvs: error: {said} --help\n"
+
+
 def test_faults_of_the_user_become_one_line(monkeypatch, capsys):
     def fail(**_):
         raise AqualvsError("dive.mp4: odd; mend it")

@@ -2,13 +2,15 @@
 
 `CheckedCommand` checks the values of every option and argument before the command runs. `given`
 tells which parameters the user set, and `refuse_given` refuses those that would do nothing.
+`usage_text` words faults of the parser.
 `importing` switches garbage collection off during large imports.
 """
 
 import contextlib
 import gc
 import math
-from collections.abc import Iterator, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -184,6 +186,37 @@ def _name(parameter: Any) -> str:
     if parameter.param_type_name == "option":
         return str(max(parameter.opts, key=len))
     return str(parameter.name).upper()
+
+
+def usage_text(fault: Exception) -> str:
+    """Return in one line what is wrong with the arguments, and which help has more."""
+    parameter, errors = getattr(fault, "param", None), getattr(fault.__cause__, "errors", None)
+    if parameter is not None and errors is not None:
+        error = errors()[0]
+        said = f"{_name(parameter)} {error['input']}: {_wanted(error)}"
+    else:
+        message = getattr(fault, "format_message", fault.__str__)()
+        said = " ".join(str(message).split()).rstrip(".")
+    context = getattr(fault, "ctx", None)
+    return f"{said}; see {'aqualvs' if context is None else context.command_path} --help"
+
+
+def _wanted(error: Mapping[str, Any]) -> str:
+    """Return what a parameter takes, by what Pydantic says of a value that it refuses."""
+    kind, context = error["type"], error.get("ctx", {})
+    if kind == "float_parsing":
+        number = str(error["input"]).strip().replace(",", ".")
+        is_comma = re.fullmatch(r"[+-]?\d*\.\d+", number)
+        return f"write {number}, with a decimal point" if is_comma else "give a number"
+    if kind.startswith("int_"):
+        return "give a whole number"
+    if kind == "greater_than_equal":
+        return f"give {context['ge']:g} or more"
+    if kind == "less_than_equal":
+        return f"give at most {context['le']:g}"
+    message = str(error["msg"]).removeprefix("Value error, ").rstrip(".")
+    _, is_choice, choices = message.partition(" is not one of ")
+    return f"give one of {choices.replace(chr(39), '')}" if is_choice else message
 
 
 def _check(value: Any, name: str) -> None:

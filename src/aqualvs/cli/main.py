@@ -19,7 +19,7 @@ import typer
 from aqualvs import __version__
 from aqualvs.cli.batch import batch
 from aqualvs.cli.calibrate import board, calibrate, export, import_file, schema
-from aqualvs.cli.command import CheckedCommand, CommandGroups
+from aqualvs.cli.command import CheckedCommand, CommandGroups, usage_text
 from aqualvs.cli.design import design
 from aqualvs.cli.experiments import benchmark, reproduce, score
 from aqualvs.cli.follow import follow, tune
@@ -296,14 +296,8 @@ def _exit_code(arguments: Sequence[str] | None) -> int:
         said = f"{os.fsdecode(fault.filename)}: {fault.strerror}{remedy}"
         return _complain(said, _EXIT_BAD_INPUT)
     except _USAGE_ERROR as fault:
-        return _complain(f"{_usage(fault)}; see aqualvs --help", _EXIT_BAD_INPUT)
+        return _complain(usage_text(fault), _EXIT_BAD_INPUT)
     return int(code or 0)
-
-
-def _usage(fault: Exception) -> str:
-    """Return what is wrong with the arguments, as the parser words it, in one line."""
-    message = getattr(fault, "format_message", fault.__str__)()
-    return " ".join(str(message).split()).rstrip(".")
 
 
 def _complain(message: str, code: int) -> int:
