@@ -148,3 +148,13 @@ def test_yaw_is_held_where_it_is_asked_for(tmp_path: Path) -> None:
         last = list(csv.DictReader(file))[-1]
     # The scanner's noise of 0.4 degrees, smoothed.
     assert float(last["yaw_deg"]) == pytest.approx(15.0, abs=1.0)
+
+
+@pytest.mark.parametrize("name", ["bluerov2_heavy", "bluerov2-heavy"])
+def test_a_vehicle_has_either_spelling(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["tune", name]) == 0
+    assert "name: bluerov2_heavy" in capsys.readouterr().out
+    simulated = ["follow", "--sim", "--seconds", "1", "-o", str(tmp_path / "out")]
+    assert main([*simulated, "--vehicle", name, "--gains", name]) == 0

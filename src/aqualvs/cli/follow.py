@@ -120,7 +120,8 @@ def follow(
         float | None, typer.Option(help="Vehicle: refractive index of the water.")
     ] = None,
     vehicle: Annotated[
-        Literal["bluerov2", "bluerov2-heavy", "videoray"], typer.Option(help="Sim: which one.")
+        Literal["bluerov2", "bluerov2_heavy", "bluerov2-heavy", "videoray"],
+        typer.Option(metavar="bluerov2|bluerov2_heavy|videoray", help="Sim: which one."),
     ] = "bluerov2",
     seconds: Annotated[float, typer.Option(help="Sim: how long.")] = 60.0,
     current: Annotated[float, typer.Option(help="Sim: current in m/s.")] = 0.3,

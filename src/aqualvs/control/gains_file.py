@@ -136,8 +136,9 @@ def load_gains(source: Path | str) -> ControlGains:
 
     Raises `OptionError` with one line: file, place, value, remedy.
     """
-    if str(source) in VEHICLES:
-        text = _packaged(str(source))
+    vehicle = str(source).replace("-", "_")
+    if vehicle in VEHICLES:
+        text = _packaged(vehicle)
         content = parse_yaml(text, str(source), OptionError)
         return _gains(parse_settings(content, GainsFile, _KEY, VERSION, str(source)))
     path = Path(source)

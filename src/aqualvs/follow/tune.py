@@ -115,7 +115,7 @@ def tune_and_tell(request: TuneRequest, echo: Callable[[str], None]) -> None:
     Raises `OptionError` if the model is unknown, or nothing stands what is asked. Raises
     `OutputError` if the file cannot be written.
     """
-    model = VEHICLES.get(request.model)
+    model = VEHICLES.get(request.model.replace("-", "_"))
     if model is None:
         raise OptionError(f"tune {request.model}: no such model; use one of {', '.join(VEHICLES)}")
     files = [] if request.output is None else [request.output]
