@@ -19,6 +19,7 @@ from aqualvs.scanner import Scanner, ScannerOptions
 from aqualvs.scanning.agreement import LaserAgreement
 from aqualvs.sources import FrameSource, VideoSource, open_source
 from aqualvs.sources.fields import FieldEvidence, first_pairs, source_of_frames, source_of_pictures
+from aqualvs.sources.opening import existing_path, is_address
 from aqualvs.sources.video import sampled_pictures
 from aqualvs.terminal import StopSignals, progress
 from aqualvs.workers.frame_results import FrameScanner
@@ -184,6 +185,9 @@ def open_dive(request: RunRequest) -> OpenDive:
     replay = replay_of(request)
     if replay is not None and request.fps is not None:
         raise OptionError(f"--fps: {request.source} has its own clock; leave the frame rate out")
+    if replay is None and request.rig is None and not is_address(request.source):
+        # A mistyped path lacks no rig.
+        existing_path(request.source)
     rig = (
         replay.rig if replay else prepared_rig(request.rig, request.water, no_dome=request.no_dome)
     )

@@ -132,9 +132,24 @@ def refuse_given(context: typer.Context, names: Sequence[str], remedy: str) -> N
 class CheckedCommand(TyperCommand):
     """A command that refuses values that no option and no argument can take.
 
-    Refused are numbers that are not finite, or too large for a 32-bit integer; text that is not
-    UTF-8; and paths of pipes, devices and sockets.
+    Refused are empty values; numbers that are not finite, or too large for a 32-bit integer; text
+    that is not UTF-8; and paths of pipes, devices and sockets.
     """
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse the arguments; refuse empty ones, which `Path` would take for the folder one is in.
+
+        Raises `OptionError` with the option.
+        """
+        if any(word == "" or word.endswith("=") for word in args):
+            found, _, _ = self.make_parser(ctx).parse_args(args=list(args))
+            for parameter in self.params:
+                if any(value == "" for value in _plain(found.get(parameter.name))):
+                    raise OptionError(
+                        f"{_name(parameter)} '': is empty; give a value, or set the variable of "
+                        "the shell that should hold it"
+                    )
+        return super().parse_args(ctx, args)
 
     def invoke(self, ctx: Any) -> Any:
         """Check the values and run the command.
@@ -198,7 +213,11 @@ def usage_text(fault: Exception) -> str:
         message = getattr(fault, "format_message", fault.__str__)()
         said = " ".join(str(message).split()).rstrip(".")
     context = getattr(fault, "ctx", None)
-    return f"{said}; see {'aqualvs' if context is None else context.command_path} --help"
+    command = "aqualvs" if context is None else context.command_path
+    if command == "aqualvs run" and "unexpected extra argument" in said:
+        # A pattern that the shell has expanded.
+        said = f"{said}: it measures one dive; use aqualvs batch for several"
+    return f"{said}; see {command} --help"
 
 
 def _wanted(error: Mapping[str, Any]) -> str:

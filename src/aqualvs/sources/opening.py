@@ -145,9 +145,7 @@ def open_source(
         _check_address(str(where))
         _no(topic, where, "a stream has no topics; leave the topic out")
         return _video(str(where), fps)
-    path, topic = _split_topic(where, topic)
-    if not path.exists():
-        raise SourceError(f"{path}: no such file or folder; check the path")
+    path, topic = existing_path(where, topic)
     refuse_special(path)
     if path.suffix.lower() == ".mcap" or is_bag(path):
         _no(fps, path, "a recording has its own clock; leave the frame rate out")
@@ -226,6 +224,17 @@ def open_feed(
 def is_address(where: str | Path) -> bool:
     """Return whether `where` is the address of a stream rather than a path."""
     return isinstance(where, str) and where.partition("://")[0].lower() in STREAM_SCHEMES
+
+
+def existing_path(where: str | Path, topic: str | None = None) -> tuple[Path, str | None]:
+    """Return path and topic of a source that is no address.
+
+    Raises `SourceError` if nothing is there.
+    """
+    path, topic = _split_topic(where, topic)
+    if not path.exists():
+        raise SourceError(f"{path}: no such file or folder; check the path")
+    return path, topic
 
 
 def is_bag(path: Path) -> bool:
