@@ -1,6 +1,6 @@
 """`aqualvs calibrate dome`: the rig that it begins with."""
 
-from dataclasses import fields, replace
+from dataclasses import MISSING, fields, replace
 
 import pytest
 
@@ -13,7 +13,7 @@ from aqualvs.simulation.scenarios import example_rig, flat_port_rig
 
 
 def request(**given):
-    nothing = dict.fromkeys(field.name for field in fields(DomeRequest))
+    nothing = dict.fromkeys(field.name for field in fields(DomeRequest) if field.default is MISSING)
     return DomeRequest(**nothing | given)
 
 

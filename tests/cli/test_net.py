@@ -226,6 +226,8 @@ def test_faults_are_told_in_one_line(dive, run_folder, tmp_path, refused):
     assert str(missing) in refused("net", video, "--rig", rig, "-o", out, "--log", missing)
     assert "add --log" in refused("net", run_folder, "--log-offset-s", "3")
     assert "--twine-mm -2" in refused("net", run_folder, "--twine-mm=-2")
+    said = refused("net", run_folder, "--twine-mm=45", "--overwrite")
+    assert "--twine-mm 45: not thinner than the mesh's bar, measured as 2" in said
     assert "--stretch-m 0" in refused("net", run_folder, "--stretch-m", "0")
     assert "--log-offset-s nan" in refused("net", run_folder, "--log-offset-s", "nan")
     assert not out.exists()

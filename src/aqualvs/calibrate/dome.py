@@ -1,5 +1,6 @@
 """`aqualvs calibrate dome`: place of the lens in its dome or behind its flat port."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -73,6 +74,21 @@ class DomeRequest:
     acrylic_tolerance: float = 0.003
     distance_sigma_mm: float = 0.2
     refine_intrinsics: bool = True
+
+    def __post_init__(self) -> None:
+        """Refuse negative tolerances.
+
+        Raises `OptionError` naming the option and its value.
+        """
+        for name in (
+            "radius_tolerance_mm",
+            "thickness_tolerance_mm",
+            "acrylic_tolerance",
+            "distance_sigma_mm",
+        ):
+            value = getattr(self, name)
+            if not 0.0 <= value < math.inf:
+                raise OptionError(f"--{name.replace('_', '-')} {value:g}: give 0 or more")
 
 
 def calibrate_dome(

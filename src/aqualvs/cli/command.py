@@ -61,7 +61,19 @@ Fit = Annotated[
 ]
 WaterIndex = Annotated[float | None, typer.Option(help="Refractive index of the water.")]
 Celsius = Annotated[float | None, typer.Option(help="Water temperature, for its index.")]
-Salinity = Annotated[float | None, typer.Option(help="Salinity in per mille, for its index.")]
+
+
+def _per_mille(salinity: float | None) -> float | None:
+    """Remark on a salinity that looks like a share of one; sea water has 0.03 to 0.04 then."""
+    if salinity is not None and 0.0 < salinity < 0.1:
+        said = f"--salinity {salinity:g}: salinity is per mille; sea water has 35"
+        typer.echo(f"aqualvs: remark: {said}", err=True)
+    return salinity
+
+
+Salinity = Annotated[
+    float | None, typer.Option(callback=_per_mille, help="Salinity in per mille, for its index.")
+]
 Refraction = Annotated[
     bool,
     typer.Option("--dome/--no-dome", help="Refract at the dome or the flat port, or ignore it."),

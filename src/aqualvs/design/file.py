@@ -25,7 +25,7 @@ from aqualvs.geometry.transforms import SE3
 from aqualvs.optics.lens import Lens, LensModel
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig
 from aqualvs.optics.rigfile import housing_of, load_rig, shutter_from_part
-from aqualvs.optics.rigschema import ShutterPart, Tilt
+from aqualvs.optics.rigschema import ShutterPart, Tilt, range_fault
 from aqualvs.optics.shutter import AT_ONCE, Shutter
 from aqualvs.optics.water import N_AIR, seawater_index_vacuum
 from aqualvs.schema import (
@@ -275,11 +275,9 @@ def design_of_rig(rig: Rig, fan_deg: float = FAN_DEG) -> Design:
 
 def _design(file: DesignFile, folder: Path) -> Design:
     near, far = (value / _MM for value in file.working_range_mm)
-    if not near < far:
-        raise OptionError(
-            f"working_range_mm is {file.working_range_mm}; write the nearest range first, then a "
-            "larger one"
-        )
+    fault = range_fault(*file.working_range_mm)
+    if fault:
+        raise OptionError(fault)
     lens, size_px, shutter = _camera(file.camera, folder)
     position = np.array(file.lens.position_mm) / _MM
     rig = Rig(

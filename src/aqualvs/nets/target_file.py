@@ -61,6 +61,14 @@ class NetRequest:
         for option, value in (("twine-mm", self.twine_mm), ("stretch-m", self.stretch_m)):
             if value is not None and not 0.0 < value < math.inf:
                 raise OptionError(f"--{option} {value:g}: must be positive; correct it")
+        # Thinner is a length in metres; thicker is the rope at a net's edge.
+        thinnest_mm, thickest_mm = 0.1, 50.0
+        twine = self.twine_mm
+        if twine is not None and not thinnest_mm <= twine <= thickest_mm:
+            raise OptionError(
+                f"--twine-mm {twine:g}: give the diameter of one twine in millimetres, "
+                f"{thinnest_mm:g} to {thickest_mm:g}"
+            )
         if self.log_offset_s is not None and not math.isfinite(self.log_offset_s):
             raise OptionError(f"--log-offset-s {self.log_offset_s:g}: give a number of seconds")
 
@@ -196,6 +204,11 @@ def target_dict(text: str) -> TargetFacts:
     said = None
     if net is not None:
         twine = None if net.twine_mm is None else 1e-3 * net.twine_mm
+        if net.twine_mm is not None and net.twine_mm >= net.bar_mm:
+            raise OptionError(
+                f"{path}: net.twine_mm is {net.twine_mm:g}, not thinner than the bar of "
+                f"{net.bar_mm:g} mm; write the diameter of one twine in millimetres"
+            )
         said = NetFacts(net.mesh, 1e-3 * net.bar_mm, twine)
     lengths = {} if said is None else said.filter_lengths()
     if given is not None:

@@ -34,6 +34,7 @@ from aqualvs.optics.rigschema import (
     ShutterPart,
     missing_text,
     parse_rig,
+    range_fault,
 )
 from aqualvs.optics.shutter import AT_ONCE, Shutter, ShutterKind
 from aqualvs.optics.solved import rig_uncertainty
@@ -435,12 +436,9 @@ def _plane(place: str, normal: Sequence[float], offset_mm: float) -> Plane:
 
 
 def _check_whole(file: RigFile, need_lasers: bool) -> None:
-    near, far = file.working_range_mm
-    if not near < far:
-        raise RigError(
-            f"working_range_mm is [{near:g}, {far:g}]; write the nearest range first, then a "
-            "larger one"
-        )
+    fault = range_fault(*file.working_range_mm)
+    if fault:
+        raise RigError(fault)
     position = _position_mm(file)
     distance = math.hypot(*position)
     if file.dome is not None and distance >= file.dome.inner_radius_mm:

@@ -245,6 +245,21 @@ class RigFile(StrictPart):
     )
 
 
+def range_fault(near_mm: float, far_mm: float) -> str:
+    """Return what is wrong with a working range in millimetres, "" if nothing is."""
+    said = f"working_range_mm is [{near_mm:g}, {far_mm:g}]"
+    if not near_mm < far_mm:
+        return f"{said}; write the nearest range first, then a larger one"
+    # No target is so near to a dome's centre; it is a range in metres.
+    min_far_mm = 10.0
+    if far_mm < min_far_mm:
+        return (
+            f"{said}, but these are millimetres; write [{1e3 * near_mm:g}, {1e3 * far_mm:g}] if "
+            "metres are meant"
+        )
+    return ""
+
+
 def rig_json_schema() -> dict[str, Any]:
     """Return the JSON Schema of the rig file (draft 2020-12), made of the reader's own model.
 

@@ -10,7 +10,7 @@ module and few evaluate a net.
 import csv
 import math
 from array import array
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -21,7 +21,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from aqualvs import __version__
-from aqualvs.errors import SourceError
+from aqualvs.errors import OptionError, SourceError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.nets.target_file import NetRequest
 from aqualvs.optics.rig import Rig
@@ -105,12 +105,15 @@ class NetPass:
         ------
         OutputError
             If a file cannot be written.
+        OptionError
+            If the twine was given thicker than the mesh's bars are long.
         """
         from aqualvs.nets.places import DivePostures, lay_log, place_net
         from aqualvs.nets.tables import net_dict, net_lines, unroll
 
         self._condition.finish()
         stretches, holes = self._condition.stretches, self._condition.holes
+        self._check_twine([one.lattice.bar for one in stretches if one.lattice is not None])
         postures = DivePostures(*(np.array(column) for column in self._postures))
         log = None
         if self._log is not None:
@@ -131,6 +134,17 @@ class NetPass:
         if log is not None:
             lines += [*log.log.notes, log.words()]
         return NetResult(wall, summary, lines, log)
+
+    def _check_twine(self, bars: Sequence[float]) -> None:
+        twine_mm = self._request.twine_mm
+        if twine_mm is None or not bars:
+            return
+        bar_mm = 1e3 * float(np.median(bars))
+        if twine_mm >= bar_mm:
+            raise OptionError(
+                f"--twine-mm {twine_mm:g}: not thinner than the mesh's bar, measured as "
+                f"{bar_mm:.1f} mm; give the diameter of one twine in millimetres"
+            )
 
 
 def write_net_files(folder: Path, wall: "UnrolledNet", facts: dict[str, Any]) -> None:
