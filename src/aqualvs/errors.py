@@ -11,10 +11,12 @@
 
 A refused posture is not an exception but a value, `aqualvs.scanning.posture.Refusal`.
 
-`check_positive` and `check_not_negative` refuse numbers in option classes, in the same words.
+`check_positive` and `check_not_negative` refuse numbers in option classes, in the same words;
+`check_commas` refuses tables that are separated otherwise.
 """
 
 import math
+from collections.abc import Iterable
 
 
 class AqualvsError(Exception):
@@ -58,3 +60,10 @@ def check_not_negative(what: str, owner: object, *names: str) -> None:
         value = getattr(owner, name)
         if not 0.0 <= value < math.inf:
             raise OptionError(f"{what}, {name} {value:g}: must be 0 or more")
+
+
+def check_commas(header: Iterable[str | None], source: object, error: type[AqualvsError]) -> None:
+    """Raise `error` if a table's first line is one name, of columns between semicolons."""
+    names = [name for name in header if name is not None]
+    if len(names) == 1 and ";" in names[0]:
+        raise error(f"{source}: is separated by semicolons; save it with commas")

@@ -71,13 +71,19 @@ class SchemaWords:
     def first_fault(self, error: ValidationError, model: type[BaseModel]) -> str:
         """Return one line on the fault to mend first; a misspelt key explains the missing one."""
         faults = error.errors(include_url=False)
-        unknown = [fault for fault in faults if fault["type"] == "extra_forbidden"]
+        unknown = [fault for fault in faults if fault["type"] in ("extra_forbidden", "invalid_key")]
         return self._sentence((unknown or faults)[0], model)
 
     def _sentence(self, fault: ErrorDetails, model: type[BaseModel]) -> str:
         place, kind = _place(fault["loc"]) or "the file", fault["type"]
         if kind == "extra_forbidden":
             return f"{place} is not a key of {self.file}; {_closest(fault['loc'], model)}"
+        if kind == "invalid_key":
+            parent = _place(fault["loc"][:-1]) or "the file"
+            return (
+                f"{parent} has the key {shown(fault['input'])}, which is no word; write numbers "
+                "with a decimal point, such as 1.5, not 1,5"
+            )
         if kind == "missing":
             return self.missing(place, fault["loc"])
         remedy = self._remedy(fault)

@@ -152,7 +152,7 @@ def read_text(path: Path, what: str, error: type[AqualvsError]) -> str:
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError:
-        raise error(f"{path}: is not text in UTF-8; {remedy}") from None
+        raise error(f"{path}: is not text in UTF-8; save it as UTF-8") from None
 
 
 def parse_yaml(text: str, source: str, error: type[AqualvsError]) -> Any:

@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from aqualvs.batch.dataset import NET_FACTS
-from aqualvs.errors import OptionError, RigError, SourceError
+from aqualvs.errors import OptionError, RigError, SourceError, check_commas
 from aqualvs.recording import is_recording
 from aqualvs.results.folder import RUN_YAML
 from aqualvs.results.run_request import Water
@@ -153,7 +153,9 @@ def read_list(path: Path) -> list[Dive]:
 
 def _csv_rows(text: str, path: Path) -> Iterator[Mapping[str, Any]]:
     try:
-        for row in csv.DictReader(text.splitlines(), skipinitialspace=True):
+        table = csv.DictReader(text.splitlines(), skipinitialspace=True)
+        check_commas(table.fieldnames or (), path, OptionError)
+        for row in table:
             yield {str(key).strip(): value for key, value in row.items() if value not in ("", None)}
     except csv.Error as fault:
         raise OptionError(f"{path}: cannot be read as a list of dives ({fault})") from fault

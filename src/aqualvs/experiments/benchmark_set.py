@@ -17,7 +17,7 @@ import numpy as np
 import yaml
 
 from aqualvs import __version__
-from aqualvs.errors import OptionError, SourceError
+from aqualvs.errors import OptionError, SourceError, check_commas
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.results.files import Claim, writing
 from aqualvs.results.summary import RANGE_UNITS, Row, range_column
@@ -140,6 +140,7 @@ def read_rows(path: Path, needed: tuple[str, ...]) -> list[Row]:
         raise SourceError(f"{path}: cannot be read ({fault.strerror}); check the path") from fault
     except (UnicodeDecodeError, csv.Error) as fault:
         raise SourceError(f"{path}: not a CSV file in UTF-8; save it as one") from fault
+    check_commas(table.fieldnames, path, SourceError)
     for name in needed:
         if name not in table.fieldnames:
             have = ", ".join(table.fieldnames) or "none"

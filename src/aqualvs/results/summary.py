@@ -13,7 +13,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from aqualvs.errors import SourceError
+from aqualvs.errors import SourceError, check_commas
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.nets.target_file import NetCheck
 from aqualvs.scanning.agreement import LaserAgreement
@@ -141,12 +141,15 @@ def _postures(path: Path, rows: list[Row]) -> dict[int, tuple[float, float, floa
 def _rows(path: Path) -> list[Row]:
     """Return the rows of a file that has the columns of `read_truth`, at least one."""
     try:
-        with path.open(newline="", encoding="utf-8") as file:
-            rows = list(csv.DictReader(file))
+        # Excel begins a file in UTF-8 with a byte order mark.
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            table = csv.DictReader(file)
+            check_commas(table.fieldnames or (), path, SourceError)
+            rows = list(table)
     except OSError as fault:
         raise SourceError(f"{path}: cannot be read ({fault.strerror}); check the path") from fault
     except (UnicodeDecodeError, csv.Error) as fault:
-        raise SourceError(f"{path}: not a CSV file; check the path") from fault
+        raise SourceError(f"{path}: not a CSV file in UTF-8; save it as one") from fault
     if not rows:
         raise SourceError(f"{path}: holds no rows; give a CSV with one row for every frame")
     for name in ("frame", *_ANGLES):

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from aqualvs.errors import SourceError
+from aqualvs.errors import SourceError, check_commas
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.special_files import refuse_special
 from aqualvs.vehicle_logs.dataflash import (
@@ -76,8 +76,7 @@ def _rows(text: str, path: Path) -> list[tuple[int, list[str]]]:
 
 
 def _columns(names: list[str], path: Path) -> tuple[list[str], list[str]]:
-    if len(names) == 1 and ";" in names[0]:
-        raise SourceError(f"{path}: is separated by semicolons; save it with commas")
+    check_commas(names, path, SourceError)
     for name in names:
         if name in _COLUMNS and names.count(name) > 1:
             raise SourceError(f"{path}: column {name} appears twice; keep one")

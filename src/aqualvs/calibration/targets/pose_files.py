@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from aqualvs.errors import CalibrationError
+from aqualvs.errors import CalibrationError, check_commas
 from aqualvs.geometry.transforms import SE3
 from aqualvs.yamlfile import read_text
 
@@ -63,8 +63,7 @@ def load_poses(path: str | Path) -> tuple[BoardPose, ...]:
 
 
 def _columns(names: list[str], source: Path) -> list[str]:
-    if len(names) == 1 and ";" in names[0]:
-        raise CalibrationError(f"{source}: is separated by semicolons; save it with commas")
+    check_commas(names, source, CalibrationError)
     for name in names:
         if name not in _COLUMNS:
             close = difflib.get_close_matches(name, _COLUMNS, n=1, cutoff=0.5)

@@ -126,6 +126,10 @@ def _peer_rule(text: str) -> tuple[ipaddress.IPv4Network | ipaddress.IPv6Network
         ) from None
 
 
+PORTS = "with a port from 1 to 65535"
+"""Remedy for addresses that `parse_host_port` refuses."""
+
+
 def parse_host_port(text: str) -> tuple[str, int] | None:
     """Return host and port of `HOST:PORT` or `[IPV6]:PORT`, None if it is neither."""
     match = re.fullmatch(r"(?:\[([0-9A-Fa-f:.%\w]+)\]|([^:\s\[\]/]*)):(\d{1,5})", text)
@@ -137,7 +141,9 @@ def parse_host_port(text: str) -> tuple[str, int] | None:
 def _net_address(kind: NetKind, rest: str, url: str) -> NetAddress:
     found = parse_host_port(rest)
     if found is None:
-        raise OptionError(f"MAVLink connection {url!r}: no HOST:PORT after the scheme; {_FORMS}")
+        raise OptionError(
+            f"MAVLink connection {url!r}: no HOST:PORT after the scheme; {_FORMS}; {PORTS}"
+        )
     host, port = found
     listens = kind == "udpin"
     if not listens and (not host or not port):

@@ -11,7 +11,7 @@ from typing import TypeAlias
 from aqualvs.control.time_filter import FilteredPosture
 from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import FloatArray
-from aqualvs.live.mavlink.ports import UdpPort, find_host, parse_host_port
+from aqualvs.live.mavlink.ports import PORTS, UdpPort, find_host, parse_host_port
 from aqualvs.recording.sample import LiveSample
 from aqualvs.results.folder import POSTURE_COLUMNS, posture_cells
 from aqualvs.scanning.posture import Refusal, deviations
@@ -170,7 +170,7 @@ class _Receiver:
     def __init__(self, address: str) -> None:
         found = parse_host_port(address)
         if found is None or not all(found):
-            raise OptionError(f"JSON over UDP, receiver {address!r}: write HOST:PORT")
+            raise OptionError(f"JSON over UDP, receiver {address!r}: write HOST:PORT, {PORTS}")
         self._address, (self._host, self._number) = address, found
         self.n_dropped = 0
         self._trouble = ""
