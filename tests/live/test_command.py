@@ -328,6 +328,38 @@ def test_what_cannot_work_is_told_in_one_line(
     assert "Traceback" not in said
 
 
+@pytest.mark.parametrize(
+    "options", [["--dashboard", "--token", "abc"], ["--json", "nowhere"], ["--mavlink", "nonsense"]]
+)
+def test_options_are_checked_before_anything_is_opened(
+    options: list[str], rig_file: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    dives = tmp_path / "dives"
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as autopilot:
+        autopilot.bind(("127.0.0.1", 0))
+        autopilot.setblocking(False)
+        sent_to = f"udpout:127.0.0.1:{autopilot.getsockname()[1]}"
+        outputs = ["--mavlink", sent_to, *options, "--record", "--record-to", str(dives)]
+        assert main(["live", "udp://127.0.0.1:1", "--rig", str(rig_file), *outputs]) == 2
+        with pytest.raises(BlockingIOError):
+            autopilot.recv(1000)
+    assert "recording:" not in capfd.readouterr().out
+    assert not dives.exists()
+
+
+def test_a_part_that_cannot_be_made_leaves_no_recording(rig_file: Path, tmp_path: Path) -> None:
+    dives, missing = tmp_path / "dives", tmp_path / "target.yaml"
+    record = ["--record", "--record-to", str(dives)]
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        address = f"127.0.0.1:{taken.getsockname()[1]}"
+        for options in (["--index-target", str(missing)], ["--dashboard-address", address]):
+            command = ["live", "udp://127.0.0.1:1", "--rig", str(rig_file), *options, *record]
+            assert main(command) == 2
+            assert not dives.exists()
+
+
 def test_a_video_that_is_cut_short_is_told_in_one_line(rig_file: Path, tmp_path: Path) -> None:
     """At its end; until then its frames are measured."""
     content = bgr_of(demo_frames(1)[0])

@@ -114,6 +114,7 @@ def follow_and_tell(
     Raises `AqualvsError` if an input cannot be used, or the source can never work.
     """
     live, log = replace(request.live, smooth=True), request.out / FOLLOW_CSV
+    live.check()
     rig = prepared_rig(live.rig, live.water, no_dome=False)
     mission, limits, setpoint = request.aim.mission(rig.working_range)
     holder = SetpointHolder(rig.working_range)

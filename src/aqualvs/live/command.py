@@ -17,7 +17,14 @@ from pathlib import Path
 from aqualvs.control.time_filter import PostureFilter
 from aqualvs.control.vehicle import SetpointHolder, VehicleState
 from aqualvs.errors import OptionError
-from aqualvs.live.options import OutputRequest, make_outputs, serve_page, vehicle_reader
+from aqualvs.live.options import (
+    OutputRequest,
+    check_outputs,
+    check_page,
+    make_outputs,
+    serve_page,
+    vehicle_reader,
+)
 from aqualvs.live.outputs.base import Output
 from aqualvs.live.runner import LiveOptions, LiveRunner, ScannerSupply, warm_up
 from aqualvs.optics.rig import Rig
@@ -200,12 +207,27 @@ class LiveRequest:
     scanner: ScannerOptions = field(default_factory=ScannerOptions)
     index_target: Path | None = None  # Markers on the vehicle that show the water's index.
 
+    def check(self) -> None:
+        """Refuse options that cannot be used, before anything is opened, sent or written.
+
+        Raises `OptionError` naming the option or the address, or `CalibrationError` naming the
+        file of the target.
+        """
+        check_outputs(self.outputs)
+        if self.dashboard is not None:
+            check_page(self.dashboard, self.token, self.embed_from)
+        if self.index_target is not None:
+            from aqualvs.calibration.targets.target_files import load_target
+
+            load_target(self.index_target)
+
 
 def live_and_tell(request: LiveRequest, echo: Callable[[str], object]) -> int:
     """Run until the source ends or the user stops it, the normal end of a live run; return 0.
 
     Raises `AqualvsError` if an input cannot be used, or the source can never work.
     """
+    request.check()
     rig = prepared_rig(request.rig, request.water, no_dome=False)
     holder = SetpointHolder(rig.working_range, followed=False)
     runner = make_runner(request, rig, lambda: _provider(request, rig), holder, echo)
@@ -257,14 +279,15 @@ def make_runner(
         add(first)
         recorder = RecorderSwitch(request.record_to, options)
         add([recorder, Console()])
-        if request.record:
-            echo(f"recording: {recorder.start()}")
         add(make_outputs(request.outputs, request.scanner))
         if request.dashboard is not None:
             page = (request.dashboard, request.token, rig, holder, recorder, echo)
             add([serve_page(*page, vehicle or vehicle_reader(outputs), request.embed_from)])
         smoothing = PostureFilter() if request.smooth else None
         every = LiveOptions(keep_every=request.fast)
+        if request.record:
+            # Where one of the parts above cannot be made, no file is left.
+            echo(f"recording: {recorder.start()}")
         runner = LiveRunner(feed, provider(), outputs, every, smoothing)
         undo.pop_all()
     return runner

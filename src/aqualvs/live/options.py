@@ -19,12 +19,14 @@ from aqualvs.live.mavlink.ardusub import ArduSubOptions
 from aqualvs.live.mavlink.ardusub_commands import Command
 from aqualvs.live.mavlink.link import LinkOptions
 from aqualvs.live.mavlink.peers import load_key
+from aqualvs.live.mavlink.ports import parse_address
 from aqualvs.live.outputs.base import HearsVehicle, Output
 from aqualvs.optics.rig import Rig
 from aqualvs.recording import RecorderSwitch
 from aqualvs.schema import Positive, StrictPart, load_settings
 
 if TYPE_CHECKING:
+    from aqualvs.live.dashboard.access import Access
     from aqualvs.scanner import ScannerOptions
 
 VERSION = 1
@@ -127,6 +129,22 @@ class OutputRequest:
     rerun: str | None = None  # As `RerunOutput` takes it.
 
 
+def check_outputs(request: OutputRequest) -> None:
+    """Refuse addresses that cannot be understood, before anything is opened.
+
+    Raises `OptionError` naming the address.
+    """
+    for url in request.mavlink:
+        parse_address(url)
+    if request.json:
+        from aqualvs.live.outputs.udp_json import receiver_address
+
+        for address in request.json:
+            receiver_address(address)
+    if request.foxglove is not None:
+        host_and_port(request.foxglove, FOXGLOVE_PORT, "--foxglove-address")
+
+
 def make_outputs(request: OutputRequest, scanner: "ScannerOptions") -> Iterator[Output]:
     """Make the outputs that were asked for, one by one; only these are imported.
 
@@ -178,6 +196,29 @@ def vehicle_reader(outputs: Sequence[Output]) -> Callable[[], VehicleState | Non
     )
 
 
+def check_page(
+    address: str, token: str | None, embedders: Sequence[str] = ()
+) -> tuple[str, int, "Access"]:
+    """Return host and port of the page, and who may use it; parameters as `serve_page` takes them.
+
+    Raises `OptionError` if a part is not installed, the token is too short, an embedder is no
+    origin, or the address makes no sense.
+    """
+    try:
+        # The server needs all of the extra.
+        import aqualvs.live.dashboard.server  # noqa: F401
+        from aqualvs.live.dashboard.access import make_access, token_fault
+    except ImportError as lack:
+        raise OptionError(
+            f"--dashboard: {lack.name} is missing; pip install 'aqualvs[dashboard]'"
+        ) from lack
+    host, port = host_and_port(address, DASHBOARD_PORT, "--dashboard-address")
+    fault = token_fault(token)
+    if fault:
+        raise OptionError(fault)
+    return host, port, make_access(host, token, embedders)
+
+
 def serve_page(
     address: str,
     token: str | None,
@@ -208,22 +249,13 @@ def serve_page(
     Raises
     ------
     OptionError
-        If a part is not installed, the token is too short, an embedder is no origin, or the address
-        cannot be used.
+        As `check_page`; or if the address cannot be used.
     """
-    try:
-        from aqualvs.live.dashboard.access import Controls, RecordButton, make_access, token_fault
-        from aqualvs.live.dashboard.output import Dashboard, SwitchButton
-        from aqualvs.live.dashboard.server import DashboardServer
-    except ImportError as lack:
-        raise OptionError(
-            f"--dashboard: {lack.name} is missing; pip install 'aqualvs[dashboard]'"
-        ) from lack
-    host, port = host_and_port(address, DASHBOARD_PORT, "--dashboard-address")
-    fault = token_fault(token)
-    if fault:
-        raise OptionError(fault)
-    access = make_access(host, token, embedders)
+    host, port, access = check_page(address, token, embedders)
+    from aqualvs.live.dashboard.access import Controls, RecordButton
+    from aqualvs.live.dashboard.output import Dashboard, SwitchButton
+    from aqualvs.live.dashboard.server import DashboardServer
+
     controls = Controls(holder, RecordButton() if recorder is None else SwitchButton(recorder))
     server = DashboardServer(host, port, access, rig, controls)
     shown = f"[{host}]" if ":" in host else host

@@ -164,14 +164,22 @@ class UdpJsonOutput:
             receiver.close()
 
 
+def receiver_address(text: str) -> tuple[str, int]:
+    """Return host and port of a receiver.
+
+    Raises `OptionError` if one of them is missing or makes no sense.
+    """
+    found = parse_host_port(text)
+    if found is None or not all(found):
+        raise OptionError(f"JSON over UDP, receiver {text!r}: write HOST:PORT, {PORTS}")
+    return found
+
+
 class _Receiver:
     """One address, found once and then sent to by a socket that never waits."""
 
     def __init__(self, address: str) -> None:
-        found = parse_host_port(address)
-        if found is None or not all(found):
-            raise OptionError(f"JSON over UDP, receiver {address!r}: write HOST:PORT, {PORTS}")
-        self._address, (self._host, self._number) = address, found
+        self._address, (self._host, self._number) = address, receiver_address(address)
         self.n_dropped = 0
         self._trouble = ""
         self._opened_s = -math.inf
