@@ -50,3 +50,36 @@ def test_a_run_is_read_as_it_was_measured(tmp_path) -> None:
         # The table keeps micrometres.
         assert one.posture.range == pytest.approx(other.posture.range, abs=1e-6)
         np.testing.assert_allclose(one.points.pixels, other.points.pixels, rtol=1e-6)
+
+
+def test_words_of_the_scanners_options_are_checked() -> None:
+    options = aqualvs.ScannerOptions(target="net", fit="pseudo_inverse")
+    assert options.target.value == "net"
+    assert options.fit.value == "pseudo_inverse"
+    with pytest.raises(aqualvs.AqualvsError, match="target is 'nets'; give one of auto, net, sol"):
+        aqualvs.ScannerOptions(target="nets")
+    with pytest.raises(aqualvs.AqualvsError, match="fit is 'robst'; give one of robust, pseudo"):
+        aqualvs.ScannerOptions(fit="robst")
+
+
+def test_a_request_takes_paths_as_text(tmp_path) -> None:
+    demo = files("aqualvs") / "data" / "demo"
+    window = importlib.import_module("aqualvs.results.run_request").FrameWindow(0, 2)
+    request = aqualvs.RunRequest(
+        source=demo / "dive.mp4",
+        rig=str(demo / "rig.yaml"),
+        out=str(tmp_path / "run"),
+        frames=window,
+        report=False,
+    )
+    assert aqualvs.run(request).summary.n_frames == 2
+    assert (tmp_path / "run" / "posture.csv").is_file()
+
+
+def test_a_frame_that_does_not_fit_is_a_fault_of_input() -> None:
+    scanner = aqualvs.Scanner(aqualvs.load_rig(files("aqualvs") / "data" / "demo" / "rig.yaml"))
+    for luma in (np.zeros((10, 20), np.uint8), np.zeros((10, 20), np.float32)):
+        frame = aqualvs.Frame(index=0, time_s=0.0, luma=luma)
+        for kind in (aqualvs.AqualvsError, ValueError):
+            with pytest.raises(kind, match=r"^frame 0 "):
+                scanner.process(frame)

@@ -348,7 +348,7 @@ def test_a_frame_is_left_as_it_was() -> None:
 
 @pytest.mark.parametrize("size", [(720, 575), (360, 288), (576, 720)])
 def test_a_frame_of_another_size_is_refused(size: tuple[int, int]) -> None:
-    with pytest.raises(ValueError, match=f"frame is {size[0]} x {size[1]}"):
+    with pytest.raises(ValueError, match=f"is {size[0]} x {size[1]} px but"):
         Scanner(example_rig()).process(Frame(0, 0.0, np.zeros(size[::-1], np.uint8)))
 
 

@@ -5,6 +5,7 @@
     AqualvsError                what a user can mend; the command line prints it and exits with 2
       RigError                  a rig file, or a rig that cannot exist
       SourceError               a video, image folder, recording or log that cannot be read
+        FrameError              a frame that does not fit the rig; a `ValueError`, too
       OutputError               a folder or file that cannot be written
       OptionError               an option, or a combination of them, that makes no sense
       CalibrationError          pictures, targets or poses from which nothing can be solved
@@ -32,6 +33,10 @@ class RigError(AqualvsError):
 
 class SourceError(AqualvsError):
     """A source of frames, or a vehicle's log, that cannot be opened or decoded."""
+
+
+class FrameError(SourceError, ValueError):
+    """A frame of another size, type or field than the rig's."""
 
 
 class OutputError(AqualvsError):

@@ -1,10 +1,12 @@
 """The main path: a frame in, posture and points out."""
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, NamedTuple
+from enum import StrEnum
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import numpy as np
 
+from aqualvs.errors import FrameError, OptionError
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.optics.camera import Camera
@@ -46,6 +48,9 @@ if TYPE_CHECKING:
     from aqualvs.scanning.row_motion import RowMotion
 
 
+AnyWord = TypeVar("AnyWord", bound=StrEnum)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScannerOptions:
     """Options of the scanner; the defaults need no tuning.
@@ -67,6 +72,22 @@ class ScannerOptions:
     mesh_filter: "MeshFilterOptions | None" = None
     target: TargetKind = TargetKind.AUTO
     fit: FitMethod = FitMethod.ROBUST
+
+    def __post_init__(self) -> None:
+        """Take words for their members.
+
+        Raises `OptionError` if a word is none.
+        """
+        object.__setattr__(self, "target", _member(TargetKind, "target", self.target))
+        object.__setattr__(self, "fit", _member(FitMethod, "fit", self.fit))
+
+
+def _member(kind: type[AnyWord], name: str, value: str) -> AnyWord:
+    try:
+        return kind(value)
+    except ValueError:
+        known = ", ".join(kind)
+        raise OptionError(f"ScannerOptions: {name} is {value!r}; give one of {known}") from None
 
 
 # A better plane is tested in its turn, up to so many times.
@@ -149,7 +170,7 @@ class Scanner:
 
         Raises
         ------
-        ValueError
+        FrameError
             If the frame has another size than the rig's image, or is another field.
         """
         return self.measure(frame.index, frame.time_s, self.detect(frame))
@@ -159,13 +180,14 @@ class Scanner:
 
         Raises
         ------
-        ValueError
+        FrameError
             If the frame has another size than the rig's image, or is another field.
         """
         if frame.field != self.rig.shutter.field_of(frame.index):
-            raise ValueError(
+            raise FrameError(
                 f"frame {frame.index} is {frame.field or 'a whole picture'} but expected "
-                f"{self.rig.shutter.field_of(frame.index) or 'a whole picture'}"
+                f"{self.rig.shutter.field_of(frame.index) or 'a whole picture'}; the rig's "
+                "camera.shutter must be that of the source"
             )
         return self._view(frame.index).detector.detect(frame)
 

@@ -245,6 +245,14 @@ class RunRequest:
     target: str = "auto"
     n_processes: int = 1
 
+    def __post_init__(self) -> None:
+        """Take paths in any form that `Path` takes."""
+        object.__setattr__(self, "source", str(self.source))
+        for name in ("rig", "out", "rerun", "truth", "index_target"):
+            value = getattr(self, name)
+            if value is not None:
+                object.__setattr__(self, name, Path(value))
+
     def to_dict(self) -> dict[str, Any]:
         """Return the options as `run.yaml` holds them."""
         rig_file = None if self.rig is None else str(self.rig)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import cv2
 import numpy as np
 
+from aqualvs.errors import FrameError
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import inline_kernel, inner_kernel, kernel, lazy_kernel
 from aqualvs.geometry.linear_algebra import at_rows, element_at, hypot, where
@@ -288,14 +289,19 @@ class FrameDetector:
 
         Raises
         ------
-        ValueError
+        FrameError
             If the frame has another size, or is not of 8 bits.
         """
         if frame.luma.dtype != np.uint8:
-            raise ValueError(f"frame holds {frame.luma.dtype} but expected uint8")
+            raise FrameError(
+                f"frame {frame.index} holds {frame.luma.dtype} but expected uint8; convert it"
+            )
         height, width = frame.luma.shape
         if (width, height) != self._size_px:
-            raise ValueError(f"frame is {width} x {height} but the rig's image is {self._size_px}")
+            raise FrameError(
+                f"frame {frame.index} is {width} x {height} px but the rig's image is "
+                f"{self._size_px[0]} x {self._size_px[1]} px; use the rig of this camera"
+            )
         if not self._bands:
             return {}
         if isinstance(self._options, StripeOptions):
