@@ -382,7 +382,7 @@ def test_the_error_against_the_truth(tmp_path, column, unit):
         ("", "no rows"),
         ("a,b\n1,2\n", "no column frame"),
         ("frame,pitch_deg,yaw_deg\n0,0,0\n", "no column range_m"),
-        ("frame,range_m,pitch_deg,yaw_deg\n77,1,0,0\n", "none of its 1 frames"),
+        ("frame,range_m,pitch_deg,yaw_deg\n77,1,0,0\n", "tells of 1 frame, none of them in"),
         ("frame\0,range_m", "no rows"),
     ],
 )

@@ -22,6 +22,7 @@ from aqualvs.sources.fields import FieldEvidence, first_pairs, source_of_frames,
 from aqualvs.sources.opening import existing_path, is_address
 from aqualvs.sources.video import sampled_pictures
 from aqualvs.terminal import StopSignals, progress
+from aqualvs.text import count_text
 from aqualvs.workers.frame_results import FrameScanner
 from aqualvs.workers.pool import PoolJob, pool_job
 from aqualvs.workers.run_frames import DiveProcessor, Replay, WaterFollowingScanner, replay_of
@@ -133,13 +134,13 @@ def run_and_print(request: RunRequest, echo: Callable[[str], object]) -> int:
 def summary_lines(request: RunRequest, result: RunResult) -> list[str]:
     """Return the lines that the command prints at the end."""
     n_frames = result.summary.n_frames
-    lines = [f"{request.source}: {n_frames} frames in {result.elapsed_s:.1f} s"]
+    lines = [f"{request.source}: {count_text(n_frames, 'frame')} in {result.elapsed_s:.1f} s"]
     lines += [*result.summary.lines(), *result.lines]
     if result.comparison is not None:
         lines += result.comparison.lines()
     if result.stopped_by:
         lines.append(
-            f"stopped by {result.stopped_by} after {n_frames} frames; "
+            f"stopped by {result.stopped_by} after {count_text(n_frames, 'frame')}; "
             f"what was measured is complete in {request.out}"
         )
     lines.append(f"report: {result.report}" if result.report else f"results: {request.out}")

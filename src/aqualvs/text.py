@@ -113,6 +113,12 @@ def clock(seconds: float) -> str:
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
 
 
+def count_text(n: int, word: str, *, commas: bool = False) -> str:
+    """Return a number of things: "1 fault", "2000 faults", or "2,000 faults" with commas."""
+    number = f"{n:,}" if commas else str(n)
+    return f"{number} {word}" if n == 1 else f"{number} {word}s"
+
+
 def hole_count(n_holes: int) -> str:
     """Return the number of holes as text."""
     return "no hole" if not n_holes else "1 hole" if n_holes == 1 else f"{n_holes} holes"

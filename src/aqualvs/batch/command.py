@@ -24,6 +24,7 @@ from aqualvs.results.files import AppendFile, Claim, is_locked, read_json, repla
 from aqualvs.results.run_request import RunRequest, Water
 from aqualvs.scanner import ScannerOptions
 from aqualvs.terminal import StopSignals
+from aqualvs.text import count_text
 
 DIVES, DATASET, HOME = "dives", "dataset", ".batch"
 """Folders of a batch: results by dive, the data set, and what is under way."""
@@ -182,7 +183,10 @@ def _summary_lines(
     request: BatchRequest, found: Mapping[str, DiveRecord], stopped_by: str
 ) -> list[str]:
     counts = Counter(record.state for record in found.values())
-    lines = [f"{len(found)} dives: " + ", ".join(f"{n} {s.value}" for s, n in counts.items())]
+    lines = [
+        f"{count_text(len(found), 'dive')}: "
+        + ", ".join(f"{n} {s.value}" for s, n in counts.items())
+    ]
     if stopped_by:
         lines.append(
             f"stopped by {stopped_by}; what is finished is kept, the same command goes on from here"
@@ -229,7 +233,8 @@ class BatchProgress(Closing):
         self._tell(record.line())
 
     def _words(self) -> str:
-        return f"{self._n_ended} of {self._n_dives} dives, {self._n_frames} frames"
+        dives, frames = count_text(self._n_dives, "dive"), count_text(self._n_frames, "frame")
+        return f"{self._n_ended} of {dives}, {frames}"
 
     def __enter__(self) -> Self:
         """Show the bar."""

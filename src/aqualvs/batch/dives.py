@@ -30,7 +30,7 @@ from aqualvs.recording import is_recording
 from aqualvs.results.folder import RUN_YAML
 from aqualvs.results.run_request import Water
 from aqualvs.sources.images import is_image_name, natural_key
-from aqualvs.text import hole_count
+from aqualvs.text import count_text, hole_count
 from aqualvs.yamlfile import parse_yaml, read_text
 
 _LONGEST = 80
@@ -420,7 +420,7 @@ class DiveRecord:
         if not self.facts:
             return f"{self.name}: {self.state.value}" + (f": {self.words}" if self.words else "")
         n_frames, share = self.facts["n_frames"], 100 * self.summary.get("valid_share", 0.0)
-        said = f"{self.name}: {n_frames} frames, posture in {share:.1f} %"
+        said = f"{self.name}: {count_text(n_frames, 'frame')}, posture in {share:.1f} %"
         if "range_median_m" in self.summary:
             said += f", range {self.summary['range_median_m']:.3f} m"
         if self.net:

@@ -16,7 +16,7 @@ from aqualvs.report import html
 from aqualvs.report.html import Card
 from aqualvs.results.files import replace_text, writing
 from aqualvs.results.run_request import now
-from aqualvs.text import clock
+from aqualvs.text import clock, count_text
 
 
 def range_steps(ranges: ArrayLike) -> list[float | None]:
@@ -135,7 +135,7 @@ def _cards(records: Sequence[DiveRecord]) -> list[Card]:
     share = f"{100 * n_valid / n_frames:.1f} %" if n_frames else "–"
     return [
         Card("Dives", str(len(records)), ", ".join(others)),
-        Card("Recorded", clock(seconds), f"{n_frames:,} frames"),
+        Card("Recorded", clock(seconds), count_text(n_frames, "frame", commas=True)),
         Card("Frames with a posture", share, f"{n_valid:,} of {n_frames:,}"),
     ]
 

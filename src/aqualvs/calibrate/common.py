@@ -44,6 +44,7 @@ from aqualvs.schema import Index, NotNegative, Positive, SchemaWords, StrictPart
 from aqualvs.sources.images import IMAGE_SUFFIXES, is_image_name, natural_key, read_image
 from aqualvs.special_files import refuse_special
 from aqualvs.terminal import progress
+from aqualvs.text import count_text
 from aqualvs.yamlfile import parse_yaml, read_text
 
 WATER_N = 1.3340
@@ -259,9 +260,10 @@ def summary(done: Calibration[CameraCalibration] | Calibration[DomeCalibration])
     result = done.solution
     n_pictures = sum(len(one.views) + len(one.missed) for one in done.found)
     used = len(result.views)
-    of = f" of {n_pictures}" if used < n_pictures else ""
+    pictures = count_text(max(used, n_pictures), "picture")
+    of = f"{used} of " if used < n_pictures else ""
     return [
-        f"{used}{of} pictures, {result.n_points} corners, residual {result.rms_px:.3f} px (rms)",
+        f"{of}{pictures}, {result.n_points} corners, residual {result.rms_px:.3f} px (rms)",
         *(line for one in done.found for line in one.remarks),
         *result.findings,
     ]
@@ -377,7 +379,8 @@ def counting_missed(*sets: DetectedTargets) -> Iterator[None]:
         n_pictures = len(missed) + sum(len(found.views) for found in sets)
         name, why = missed[0]
         raise CalibrationError(
-            f"{fault}; {len(missed)} of {n_pictures} pictures could not be used ({name}: {why})"
+            f"{fault}; {len(missed)} of {count_text(n_pictures, 'picture')} could not be used "
+            f"({name}: {why})"
         ) from fault
 
 

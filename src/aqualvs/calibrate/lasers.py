@@ -67,7 +67,7 @@ from aqualvs.report.calibration_material import (
     residual_map,
 )
 from aqualvs.report.html import Card
-from aqualvs.text import laser_colour
+from aqualvs.text import count_text, laser_colour
 
 _DEG = 180.0 / math.pi
 _SHOTS = 6
@@ -397,7 +397,7 @@ def _page(before: Rig, done: LasersResult, request: LasersRequest) -> Calibratio
         title="Calibration of the lasers",
         subtitle=f"Rig “{rig.name}”, {target.name}, index outside {done.n_medium:.4f}",
         cards=(
-            Card("lasers", str(len(rig.lasers)), f"in {len(result.views)} pictures"),
+            Card("lasers", str(len(rig.lasers)), f"in {count_text(len(result.views), 'picture')}"),
             Card("normals known to", f"{_DEG * worst:.3f}°", "one sigma, the worst laser"),
             Card(
                 "stripes",

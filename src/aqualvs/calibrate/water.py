@@ -39,6 +39,7 @@ from aqualvs.results.run_request import Water, check_fits
 from aqualvs.sources import FrameSource, open_source
 from aqualvs.sources.images import IMAGE_SUFFIXES, ImageSource
 from aqualvs.terminal import progress
+from aqualvs.text import count_text
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -140,7 +141,8 @@ def run_water(request: WaterRequest, echo: Echo) -> None:
             options=IndexOptions.of_target(request.place_sigma_mm, request.turn_sigma_deg),
         )
     result = done.solution
-    echo(f"index {result.n:.5f} ± {result.sigma:.5f} from {len(result.readings)} pictures")
+    pictures = count_text(len(result.readings), "picture")
+    echo(f"index {result.n:.5f} ± {result.sigma:.5f} from {pictures}")
     for line in done.notes:
         echo(line)
     page = _page(done.rig, result, prior, request)

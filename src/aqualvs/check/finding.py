@@ -50,11 +50,6 @@ def escaped(text: str) -> str:
     return text.replace("[", r"\[")
 
 
-def count_text(n: int, word: str) -> str:
-    """Return a number of things: "1 fault", "2 faults"."""
-    return f"{n} {word}" if n == 1 else f"{n} {word}s"
-
-
 def expected_errors(rig: Rig, uncertainty: RigUncertainty) -> tuple[ExpectedError, ...]:
     """Return what to expect at the usual ranges that lie in the working range, if any do."""
     if len(rig.lasers) < 2:

@@ -16,7 +16,6 @@ from rich.console import Console
 
 from aqualvs.check.finding import (
     check_errors,
-    count_text,
     error_table,
     error_words,
     expected_errors,
@@ -41,7 +40,7 @@ from aqualvs.optics.solved import (
     rig_uncertainty,
     solved_steps,
 )
-from aqualvs.text import Finding, Severity
+from aqualvs.text import Finding, Severity, count_text
 
 SURFACES = "surfaces"
 """Extra of the step `lasers`: the surfaces that lasers were seen on, or how many there were."""

@@ -33,6 +33,7 @@ from aqualvs.results.folder import POSTURE_BARE_CSV
 from aqualvs.results.run_request import RunRequest, scanner_options
 from aqualvs.scanning.surfaces import TargetKind
 from aqualvs.simulation.benchmark import VISIBLE_LIMIT
+from aqualvs.text import count_text
 
 WRONG_PERCENT = 5.0
 """An answer whose range is off by more is to something else than the target."""
@@ -391,7 +392,8 @@ def run_own(
                     overwrite,
                 )
             )
-        echo(f"{system.name}: {len(benchmark.dives)} dives measured into {folder / system.name}")
+        dives = count_text(len(benchmark.dives), "dive")
+        echo(f"{system.name}: {dives} measured into {folder / system.name}")
     bare = folder / BARE_LENS
     files = [bare / f"{dive.name}.csv" for dive in benchmark.dives]
     with Claim("score", files, overwrite=overwrite), writing(bare):

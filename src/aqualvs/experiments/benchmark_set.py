@@ -37,6 +37,7 @@ from aqualvs.simulation.dive import shutter_from_words
 from aqualvs.simulation.render import Renderer
 from aqualvs.special_files import refuse_special
 from aqualvs.terminal import progress
+from aqualvs.text import count_text
 from aqualvs.yamlfile import read_yaml
 
 SET_FILE = "benchmark.yaml"
@@ -78,7 +79,7 @@ class BenchmarkSet:
         """Title of the set in scores."""
         frames = sum(len(dive.frames) for dive in self.dives)
         part = "" if self.whole else ", a PART of the set: not to be compared with the whole"
-        size = f"{len(self.dives)} dives, {frames} frames"
+        size = f"{count_text(len(self.dives), 'dive')}, {count_text(frames, 'frame')}"
         return f"{self.name} (checksum {self.checksum}): {size}{part}"
 
     @property
@@ -217,7 +218,7 @@ def make_set(
             facts |= {"whole": False, "shutter": shutter}
         content = yaml.safe_dump(facts, sort_keys=False, width=100)
         (out / SET_FILE).write_text(content, encoding="utf-8")
-    echo(f"{len(dives)} dives, {total} frames: {out}")
+    echo(f"{count_text(len(dives), 'dive')}, {count_text(total, 'frame')}: {out}")
     echo(f"what is in it, and what to write: {out / _README_MD}")
     echo(f"next: aqualvs score mine=RESULTS --truth {out}")
 

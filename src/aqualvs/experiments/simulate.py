@@ -27,6 +27,7 @@ from aqualvs.simulation.dive import (
 )
 from aqualvs.simulation.scenarios import example_rig, list_scenarios, load_scenario
 from aqualvs.terminal import StopSignals, Tick, progress
+from aqualvs.text import count_text
 
 CALIBRATION = "calibration"
 """What is given in a scenario's place to render pictures for a calibration."""
@@ -86,7 +87,7 @@ def simulate(
             simulate_dive(course, rig, out, progress=_stopping(stop, tick), camera=eye)
         except _StoppedError as early:
             stopped = early
-    echo(f"{stopped or f'{course.n_frames} frames'}: {video}, truth: {truth}")
+    echo(f"{stopped or count_text(course.n_frames, 'frame')}: {video}, truth: {truth}")
     echo(f"next: aqualvs run {video} --rig {out / 'rig.yaml'} --truth {truth} -o {out / 'run'}")
     if course.nets:
         echo(

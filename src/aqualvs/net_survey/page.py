@@ -25,6 +25,7 @@ from aqualvs.net_survey.growth import Growth
 from aqualvs.net_survey.tables import (
     bearing_deg,
     by_state,
+    dives_text,
     place_text,
     rate_text,
     size_text,
@@ -285,7 +286,7 @@ def write_page(path: Path, picture: Path, result: Comparison, origins: Mapping[s
     lines = [line for line in summary_lines(result) if not line.startswith("warning: ")]
     content = {
         "title": f"The net from {first} to {last}",
-        "subtitle": f"{len(result.surveys)} dives on {len(result.dates)} dates",
+        "subtitle": dives_text(result),
         "footer": f"Written {html.moment(now())} by aqualvs {__version__}.",
         "cards": html.cards(_cards(result)),
         "warnings": html.notice([sentence(one) for one in result.warnings]),

@@ -10,6 +10,7 @@ from aqualvs.net_survey.comparison import LOOKED, Comparison, HoleState, OnWall,
 from aqualvs.net_survey.frames import WallFrame
 from aqualvs.net_survey.growth import CellChange, Growth
 from aqualvs.nets.tables import Cell, write_table
+from aqualvs.text import count_text
 
 _ORDER = (
     HoleState.NEW,
@@ -31,13 +32,16 @@ _TITLES = {
 }
 
 
+def dives_text(result: Comparison) -> str:
+    """Return how many dives and dates are compared."""
+    dives, dates = len(result.surveys), len(result.dates)
+    return f"{count_text(dives, 'dive')} on {count_text(dates, 'date')}"
+
+
 def summary_lines(result: Comparison) -> list[str]:
     """Return the whole comparison in lines."""
     first, last, wall = result.dates[0], result.dates[-1], result.wall
-    lines = [
-        f"{len(result.surveys)} dives on {len(result.dates)} dates, {first} to {last} "
-        f"({(last - first).days} days)"
-    ]
+    lines = [f"{dives_text(result)}, {first} to {last} ({count_text((last - first).days, 'day')})"]
     if wall is None:
         lines += [_whole_line(result), _hole_counts(result)]
     else:

@@ -24,7 +24,7 @@ from aqualvs.nets.holes import Hole
 from aqualvs.nets.lit_intervals import net_from_dome
 from aqualvs.nets.places import DivePostures, NetPlace, NetPlaces, PlacedBy
 from aqualvs.optics.rig import Rig
-from aqualvs.text import clock, hole_count
+from aqualvs.text import clock, count_text, hole_count
 
 # Bands meet in one edge where the cosine of the turn between them is above this.
 _SHARP = 0.5
@@ -418,7 +418,7 @@ def net_dict(wall: UnrolledNet, area: float, n_frames: int, n_net_frames: int) -
 def net_lines(wall: UnrolledNet, area: float, n_frames: int) -> list[str]:
     """Return the summary in words, line by line."""
     if not wall.stretches:
-        return [f"no net was seen in {n_frames} frames"]
+        return [f"no net was seen in {count_text(n_frames, 'frame')}"]
     facts = net_dict(wall, area, n_frames, n_frames)
     lines = [_mesh_line(facts), *_fouling_lines(wall, facts), *_hole_lines(wall, facts)]
     return lines if not wall.places.slip else [*lines, f"warning: {slip_text(wall.places.slip)}"]

@@ -11,14 +11,14 @@ from aqualvs.report.frames import SampleFrame
 from aqualvs.report.html import Card
 from aqualvs.report.points import PointSummary
 from aqualvs.report.run_data import Track
-from aqualvs.text import clock, sentence, signed
+from aqualvs.text import clock, count_text, sentence, signed
 
 
 def headline(track: Track) -> list[Card]:
     """Return the numbers at the top of the report."""
     share = float(track.valid.mean())
-    valid = f"{int(track.valid.sum())} of {len(track)} frames"
-    seconds, rate = duration_s(track), f"{len(track)} frames"
+    valid = f"{int(track.valid.sum())} of {count_text(len(track), 'frame')}"
+    seconds, rate = duration_s(track), count_text(len(track), "frame")
     if len(track) > 1 and seconds > 0.0:
         rate += f", {(len(track) - 1) / seconds:.3g} per second"
     cards = [
@@ -142,9 +142,10 @@ def _range_warnings(track: Track, working_range: tuple[float, float] | None) -> 
     ranges = track.posture[track.valid, 0]
     outside = int(((ranges < near) | (ranges > far)).sum())
     if outside:
+        frames = f"{count_text(outside, 'frame')} {'lies' if outside == 1 else 'lie'}"
         yield (
-            f"{outside} frames lie outside the rig's working range of "
-            f"{1e3 * near:.0f}–{1e3 * far:.0f} mm; trust them less."
+            f"{frames} outside the rig's working range of {1e3 * near:.0f}–{1e3 * far:.0f} mm; "
+            "trust what is out there less."
         )
 
 

@@ -52,7 +52,7 @@ from aqualvs.report.run_data import (
 from aqualvs.results.files import replace_text
 from aqualvs.results.folder import check_run_files
 from aqualvs.scanning.scan import ImagePlane, Label
-from aqualvs.text import LABEL_COLOURS, LABEL_WORDS, clock, signed
+from aqualvs.text import LABEL_COLOURS, LABEL_WORDS, clock, count_text, signed
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -469,4 +469,5 @@ def _footer(run: Mapping[str, Any], track: Track) -> str:
     """Return when the run took place and what made the page."""
     when = " to ".join(html.moment(run[key]) for key in ("started", "ended") if run.get(key))
     said = f"Run from {when}. " if when else ""
-    return f"{said}{len(track):,} frames over {clock(float(np.ptp(track.time_s)))}."
+    frames = count_text(len(track), "frame", commas=True)
+    return f"{said}{frames} over {clock(float(np.ptp(track.time_s)))}."

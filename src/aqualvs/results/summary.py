@@ -19,6 +19,7 @@ from aqualvs.nets.target_file import NetCheck
 from aqualvs.scanning.agreement import LaserAgreement
 from aqualvs.scanning.posture import Posture
 from aqualvs.scanning.scan import Scan
+from aqualvs.text import count_text
 
 Row: TypeAlias = dict[str, str | None]
 
@@ -56,9 +57,9 @@ class TruthComparison:
         if not self.n_compared and not self.n_missed:
             return ["against the truth: nothing was ahead in any of its frames"]
         if not self.n_compared:
-            return [f"against the truth: no posture in its {self.n_missed} frames"]
+            return [f"against the truth: no posture in its {count_text(self.n_missed, 'frame')}"]
         return [
-            f"against the truth in {self.n_compared} frames "
+            f"against the truth in {count_text(self.n_compared, 'frame')} "
             f"({self.n_missed} with truth but without posture):",
             f"  range  rms {self.range_percent.rms:.3f} %   max {self.range_percent.max:.3f} %",
             f"  pitch  rms {self.pitch_deg.rms:.3f} deg max {self.pitch_deg.max:.3f} deg",
@@ -95,8 +96,8 @@ def compare_with_truth(posture_csv: Path, truth_csv: Path) -> TruthComparison:
     known = {frame for frame in truth if frame in frames}
     if truth and not known:
         raise SourceError(
-            f"{truth_csv}: none of its {len(truth)} frames is in {posture_csv}; "
-            "give the truth of this dive"
+            f"{truth_csv}: tells of {count_text(len(truth), 'frame')}, none of them in "
+            f"{posture_csv}; give the truth of this dive"
         )
     common = sorted(measured.keys() & known)
     got = np.array([measured[frame] for frame in common]).reshape(-1, 3)
@@ -287,7 +288,9 @@ class RunSummary:
         if not self.n_frames:
             return ["no frame was measured"]
         share = 100 * self.n_valid / self.n_frames
-        text = [f"posture in {self.n_valid} of {self.n_frames} frames ({share:.1f} %)"]
+        text = [
+            f"posture in {self.n_valid} of {count_text(self.n_frames, 'frame')} ({share:.1f} %)"
+        ]
         if ranges := self._known_ranges():
             low, high, middle = min(ranges), max(ranges), statistics.median(ranges)
             text.append(f"range {middle:.3f} m (median), from {low:.3f} to {high:.3f} m")

@@ -27,6 +27,7 @@ from aqualvs.scanning.scan import Frame, ImagePlane, Scan, ScanPoints
 from aqualvs.scanning.stripe import StripePeaks
 from aqualvs.sources import FrameSource, ImageSource, VideoSource
 from aqualvs.sources.fields import field_of, source_of_pictures, whole_luma
+from aqualvs.text import count_text
 from aqualvs.workers.frame_results import (
     FrameProcessor,
     FrameResult,
@@ -383,7 +384,9 @@ class WaterFollowingScanner:
                 f"{self._target}: the target was never seen; measured with index "
                 f"{self._rig.n_water:.4f}"
             ]
-        found = [f"water index {last.n:.5f} ± {last.sigma:.5f} from {self._n_read} frames"]
+        found = [
+            f"water index {last.n:.5f} ± {last.sigma:.5f} from {count_text(self._n_read, 'frame')}"
+        ]
         if not last.observable:
             found.append("the pictures alone cannot tell the index; see aqualvs check")
         return found + [step.text() for step in self._estimator.steps]
