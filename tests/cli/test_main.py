@@ -123,6 +123,7 @@ def test_the_version(capsys):
             "board plate -o x --position-mm 1 2,5 3",
             "--position-mm 2,5: write 2.5, with a decimal point; see aqualvs board",
         ),
+        ("simulate wall -o", "Option '-o' requires an argument; see aqualvs simulate"),
         ("calibrate tank", "No such command 'tank'; see aqualvs calibrate"),
         ("tank", "No such command 'tank'; see aqualvs"),
         ("calibrate shutter x --fps a", "--fps a: give a number; see aqualvs calibrate shutter"),

@@ -37,6 +37,9 @@ def importing() -> Iterator[None]:
             gc.enable()
 
 
+# Older versions of Typer keep this class in Click, newer ones in a private module of their own.
+USAGE_ERROR: type[Exception] = typer.BadParameter.__bases__[0]
+
 MAX_WORKERS = 1024
 """Processes on one machine; more are a slip of the finger that would fill its memory."""
 
@@ -153,6 +156,16 @@ class CheckedCommand(TyperCommand):
 
         Raises `OptionError` with the option.
         """
+        try:
+            self._refuse_empty(ctx, args)
+            return super().parse_args(ctx, args)
+        except USAGE_ERROR as fault:
+            # The parser does not know of which command an option lacks its value.
+            if getattr(fault, "ctx", None) is None:
+                vars(fault)["ctx"] = ctx
+            raise
+
+    def _refuse_empty(self, ctx: Any, args: Sequence[str]) -> None:
         if any(word == "" or word.endswith("=") for word in args):
             found, _, _ = self.make_parser(ctx).parse_args(args=list(args))
             for parameter in self.params:
@@ -161,7 +174,6 @@ class CheckedCommand(TyperCommand):
                         f"{_name(parameter)} '': is empty; give a value, or set the variable of "
                         "the shell that should hold it"
                     )
-        return super().parse_args(ctx, args)
 
     def invoke(self, ctx: Any) -> Any:
         """Check the values and run the command.

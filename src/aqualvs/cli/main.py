@@ -19,7 +19,7 @@ import typer
 from aqualvs import __version__
 from aqualvs.cli.batch import batch
 from aqualvs.cli.calibrate import board, calibrate, export, import_file, schema
-from aqualvs.cli.command import CheckedCommand, CommandGroups, usage_text
+from aqualvs.cli.command import USAGE_ERROR, CheckedCommand, CommandGroups, usage_text
 from aqualvs.cli.design import design
 from aqualvs.cli.experiments import benchmark, reproduce, score
 from aqualvs.cli.follow import follow, tune
@@ -232,8 +232,6 @@ _reference(
     epilog="Example: aqualvs score mine=out/mine --truth bench --own out/own -o scores",
 )(score)
 
-# Older versions of Typer keep this class in Click, newer ones in a private module of their own.
-_USAGE_ERROR: type[Exception] = typer.BadParameter.__bases__[0]
 _EXIT_BAD_INPUT = 2
 # Characters of a fault.
 _LONGEST = 2000
@@ -295,7 +293,7 @@ def _exit_code(arguments: Sequence[str] | None) -> int:
         remedy = "; change its rights, or choose another path" if rights else ""
         said = f"{os.fsdecode(fault.filename)}: {fault.strerror}{remedy}"
         return _complain(said, _EXIT_BAD_INPUT)
-    except _USAGE_ERROR as fault:
+    except USAGE_ERROR as fault:
         return _complain(usage_text(fault), _EXIT_BAD_INPUT)
     return int(code or 0)
 
