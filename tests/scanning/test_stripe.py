@@ -11,12 +11,14 @@ from numpy.typing import NDArray
 
 from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import FloatArray
-from aqualvs.scanning.detection import FrameDetector
+from aqualvs.scanning.detection import FrameDetector, are_colourless_dashes
 from aqualvs.scanning.laser_bands import LaserBand, SearchAxis, plan_bands
 from aqualvs.scanning.scan import Frame
 from aqualvs.scanning.stripe import (
     HEIGHT,
     N_MEASURES,
+    POSITION,
+    STEP_U,
     PeakFinder,
     SearchImage,
     StripeOptions,
@@ -457,3 +459,31 @@ def test_the_background_is_the_higher_of_the_least_pixels_on_either_side(reach_p
     ]
     assert line[:n].tolist() == list(range(len(picture)))
     assert table[HEIGHT, :n].tolist() == expected
+
+
+@pytest.mark.parametrize(
+    ("of_dashes", "of_lines", "n_possible", "expected"),
+    [
+        (0.2, 0.5, 400.0, True),
+        # The lines of the wall have their colour: the dashes had theirs, and are something else.
+        (0.2, 1.0, 400.0, False),
+        (0.5, 0.5, 400.0, False),
+        # Far more peaks than the lasers can make; long lines that are few of what they can make.
+        (0.2, 0.5, 140.0, False),
+        (0.2, 0.5, 500.0, False),
+    ],
+)
+def test_dashes_before_a_wall_have_lost_their_colour_if_its_lines_lost_some(
+    of_dashes: float, of_lines: float, n_possible: float, expected: bool
+) -> None:
+    dashes, wall = np.flatnonzero(np.arange(200) % 16 < 8), np.arange(200)
+    line = np.concatenate((dashes, wall))
+    position = np.repeat([80.0, 120.0], (len(dashes), len(wall)))
+    order = np.lexsort((position, line))
+    table = np.zeros((N_MEASURES, len(line)))
+    table[POSITION], table[HEIGHT] = position[order], 60.0
+    for place, share in ((80.0, of_dashes), (120.0, of_lines)):
+        rows = np.flatnonzero(table[POSITION] == place)
+        table[STEP_U, rows[: round(share * len(rows))]] = -60.0
+    ends = np.array([0, len(line)])
+    assert are_colourless_dashes(line[order], table, ends, n_possible) is expected

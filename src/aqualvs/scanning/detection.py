@@ -166,8 +166,10 @@ _SEARCH = _SearchOptions()
 class _DashOptions(NamedTuple):
     """Stripes on thin twine whose chroma the codec dropped.
 
-    Tuned on rendered dives of nets as H.264: at 640x480, and of an interlaced camera. There up to
-    0.18 of the tall peaks are coloured; of nets whose stripes kept their chroma, 0.27 and more.
+    Tuned on rendered dives of nets: as H.264 at 640x480, of an interlaced camera, and as MPEG-4
+    (Part 2) at 0.4 to 2 Mbit/s with a wall behind the net. In the first two up to 0.18 of the tall
+    peaks are coloured; of nets whose stripes kept their chroma, 0.27 and more. In the last, up to
+    0.28 of the dashes and 0.73 of the long lines are; where the chroma is kept, 0.31 and 0.82.
     """
 
     # Least number of tall peaks, those that are always used, and the largest ratio of it to what
@@ -178,6 +180,13 @@ class _DashOptions(NamedTuple):
     crowd: float = 1.5
     max_coloured: float = 0.2
     max_long: float = 0.5
+    # Where more of them are long, as with a wall behind the net: the largest ratio of tall peaks,
+    # and the least of long ones, to what the lasers can make; the largest coloured shares of the
+    # dashes and of the long ones.
+    crowd_before_wall: float = 2.0
+    min_lines: float = 0.5
+    max_coloured_dashes: float = 0.3
+    max_coloured_lines: float = 0.75
 
 
 _DASH = _DashOptions()
@@ -427,10 +436,11 @@ class FrameDetector:
 def are_colourless_dashes(
     line: IntArray, table: FloatArray, ends: IntArray, n_possible: float
 ) -> bool:
-    """Return whether a frame's tall peaks are short stripes, and few have a laser's colour.
+    """Return whether a frame's tall peaks are dashes without colour, or dashes before a wall.
 
     A codec drops the chroma of stripes that are a few pixels long, as on thin twine at low bit
-    rates. Then colour is no evidence, as in a grey picture. Twine in white light makes long peaks.
+    rates, before that of a wall's long lines. Then colour is no evidence, as in a grey picture.
+    Twine in white light makes long peaks without any.
 
     Parameters
     ----------
@@ -439,21 +449,28 @@ def are_colourless_dashes(
     n_possible : float
         Peaks that the lasers can make. Where many more are tall, most are something else.
     """
-    tall, n_coloured = np.empty(line.shape[0], np.bool_), 0
+    tall, coloured = np.empty(line.shape[0], np.bool_), np.empty(line.shape[0], np.bool_)
     for i in range(line.shape[0]):
-        height = table[HEIGHT, i]
-        tall[i] = height >= HIGHEST_USEFUL
+        tall[i] = table[HEIGHT, i] >= HIGHEST_USEFUL
         step = hypot(table[STEP_U, i], table[STEP_V, i])
-        n_coloured += tall[i] and step > RATIO_LEAST * height
-    n_tall, n_long = where(tall).shape[0], 0
-    if not _DASH.min_tall <= n_tall <= _DASH.crowd * n_possible:
-        return False
-    if n_coloured > _DASH.max_coloured * n_tall:
-        return False
+        coloured[i] = step > RATIO_LEAST * table[HEIGHT, i]
+    n_dashes, n_lines, n_coloured_dashes, n_coloured_lines = 0, 0, 0, 0
     for k in range(ends.shape[0] - 1):
         rows = _marked(tall, ends[k], ends[k + 1])
-        n_long += where(_are_long(line, table, rows)).shape[0]
-    return bool(n_long <= _DASH.max_long * n_tall)
+        long = _are_long(line, table, rows)
+        for i in range(rows.shape[0]):
+            n_lines += long[i]
+            n_dashes += not long[i]
+            n_coloured_lines += long[i] and coloured[rows[i]]
+            n_coloured_dashes += not long[i] and coloured[rows[i]]
+    n_tall, n_coloured = n_dashes + n_lines, n_coloured_dashes + n_coloured_lines
+    if n_lines <= _DASH.max_long * n_tall:
+        few = _DASH.min_tall <= n_tall <= _DASH.crowd * n_possible
+        return bool(few and n_coloured <= _DASH.max_coloured * n_tall)
+    few = n_dashes >= _DASH.min_tall and n_tall <= _DASH.crowd_before_wall * n_possible
+    pale = n_coloured_dashes <= _DASH.max_coloured_dashes * n_dashes
+    pale = pale and n_coloured_lines <= _DASH.max_coloured_lines * n_lines
+    return bool(few and pale and n_lines >= _DASH.min_lines * n_possible)
 
 
 @lazy_kernel
