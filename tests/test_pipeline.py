@@ -435,6 +435,6 @@ def test_a_truth_of_empty_water_compares_nothing(request_for, dive, tmp_path):
 def test_the_truth_of_another_dive_does_not_cost_the_report(request_for, dive, tmp_path):
     truth = write_csv(tmp_path / "truth.csv", "frame,range_mm,pitch_deg,yaw_deg", "99,500,0,0")
     request = request_for(dive, truth=truth, report=True)
-    with pytest.raises(AqualvsError, match="none of its 1 frames is in"):
+    with pytest.raises(AqualvsError, match="tells of 1 frame, none of them in"):
         run(request, scanner_for=LumaScanner())
     assert "no frame in common" in (request.out / "report.html").read_text(encoding="utf-8")

@@ -425,7 +425,7 @@ def test_any_picture_gives_orderly_returns(
 @pytest.mark.parametrize("shape", [(0, 0), (200, 0), (0, 160), (160, 200), (200, 161)])
 def test_a_frame_of_another_size_is_refused(shape: tuple[int, int]) -> None:
     detector = detector_for(np.zeros((200, 160), np.uint8))
-    with pytest.raises(ValueError, match="frame is"):
+    with pytest.raises(ValueError, match="px but the rig's image is"):
         detector.detect(Frame(0, 0.0, np.zeros(shape, np.uint8)))
 
 
