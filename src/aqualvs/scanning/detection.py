@@ -450,10 +450,18 @@ def are_colourless_dashes(
         Peaks that the lasers can make. Where many more are tall, most are something else.
     """
     tall, coloured = np.empty(line.shape[0], np.bool_), np.empty(line.shape[0], np.bool_)
+    n_tall, n_coloured = 0, 0
     for i in range(line.shape[0]):
         tall[i] = table[HEIGHT, i] >= HIGHEST_USEFUL
         step = hypot(table[STEP_U, i], table[STEP_V, i])
-        coloured[i] = step > RATIO_LEAST * table[HEIGHT, i]
+        coloured[i] = tall[i] and step > RATIO_LEAST * table[HEIGHT, i]
+        n_tall += tall[i]
+        n_coloured += coloured[i]
+    # Most frames are told by their numbers alone; linking the peaks takes longer.
+    if not _DASH.min_tall <= n_tall <= _DASH.crowd_before_wall * n_possible:
+        return False
+    if n_coloured > _DASH.max_coloured_lines * n_tall:
+        return False
     n_dashes, n_lines, n_coloured_dashes, n_coloured_lines = 0, 0, 0, 0
     for k in range(ends.shape[0] - 1):
         rows = _marked(tall, ends[k], ends[k + 1])
@@ -463,14 +471,12 @@ def are_colourless_dashes(
             n_dashes += not long[i]
             n_coloured_lines += long[i] and coloured[rows[i]]
             n_coloured_dashes += not long[i] and coloured[rows[i]]
-    n_tall, n_coloured = n_dashes + n_lines, n_coloured_dashes + n_coloured_lines
     if n_lines <= _DASH.max_long * n_tall:
-        few = _DASH.min_tall <= n_tall <= _DASH.crowd * n_possible
+        few = n_tall <= _DASH.crowd * n_possible
         return bool(few and n_coloured <= _DASH.max_coloured * n_tall)
-    few = n_dashes >= _DASH.min_tall and n_tall <= _DASH.crowd_before_wall * n_possible
+    enough = n_dashes >= _DASH.min_tall and n_lines >= _DASH.min_lines * n_possible
     pale = n_coloured_dashes <= _DASH.max_coloured_dashes * n_dashes
-    pale = pale and n_coloured_lines <= _DASH.max_coloured_lines * n_lines
-    return bool(few and pale and n_lines >= _DASH.min_lines * n_possible)
+    return bool(enough and pale and n_coloured_lines <= _DASH.max_coloured_lines * n_lines)
 
 
 @lazy_kernel
