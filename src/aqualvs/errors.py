@@ -12,7 +12,8 @@
 
 A refused posture is not an exception but a value, `aqualvs.scanning.posture.Refusal`.
 
-`check_positive` and `check_not_negative` refuse numbers in option classes, in the same words;
+`check_positive` and `check_not_negative` refuse numbers in option classes, in the same words, and
+`check_options` those of a command;
 `check_commas` refuses tables that are separated otherwise.
 """
 
@@ -65,6 +66,17 @@ def check_not_negative(what: str, owner: object, *names: str) -> None:
         value = getattr(owner, name)
         if not 0.0 <= value < math.inf:
             raise OptionError(f"{what}, {name} {value:g}: must be 0 or more")
+
+
+def check_options(request: object, *names: str, least: float, wanted: str) -> None:
+    """Raise `OptionError` for the first of these fields, named as options, below `least`.
+
+    What was not given is None. `wanted`: what to give instead.
+    """
+    for name in names:
+        value = getattr(request, name)
+        if value is not None and not least <= value < math.inf:
+            raise OptionError(f"--{name.replace('_', '-')} {value:g}: give {wanted}")
 
 
 def check_commas(header: Iterable[str | None], source: object, error: type[AqualvsError]) -> None:

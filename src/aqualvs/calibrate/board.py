@@ -4,7 +4,6 @@ A ChArUco board or chessboard for camera and dome, the markers of a box for the 
 plate of markers, fixed to the vehicle, for the water's index.
 """
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,7 +27,7 @@ from aqualvs.calibration.targets.printed import (
 )
 from aqualvs.calibration.targets.target_files import save_board, save_markers
 from aqualvs.calibration.targets.targets import Board, BoardKind, MarkerSet, aruco_dictionary
-from aqualvs.errors import CalibrationError, OptionError
+from aqualvs.errors import CalibrationError, OptionError, check_options
 from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL
@@ -79,24 +78,11 @@ class BoardRequest:
 
         Raises `OptionError` naming the option and its value.
         """
-        for name in ("squares_x", "squares_y"):
-            count = getattr(self, name)
-            if count is not None and count < 1:
-                raise OptionError(f"{_option(name)} {count}: give 1 or more")
+        check_options(self, "squares_x", "squares_y", least=1.0, wanted="1 or more")
         # Below a millimetre it is a length in metres.
-        min_mm = 1.0
-        for name in ("square_mm", "marker_mm", "width_mm", "height_mm", "depth_mm"):
-            length = getattr(self, name)
-            if length is not None and not min_mm <= length < math.inf:
-                raise OptionError(
-                    f"{_option(name)} {length:g}: give millimetres, {min_mm:g} or more"
-                )
-        if self.border_mm is not None and not 0.0 <= self.border_mm < math.inf:
-            raise OptionError(f"--border-mm {self.border_mm:g}: give millimetres, 0 or more")
-
-
-def _option(name: str) -> str:
-    return "--" + name.replace("_", "-")
+        lengths = ("square_mm", "marker_mm", "width_mm", "height_mm", "depth_mm")
+        check_options(self, *lengths, least=1.0, wanted="millimetres, 1 or more")
+        check_options(self, "border_mm", least=0.0, wanted="millimetres, 0 or more")
 
 
 def print_board(request: BoardRequest, echo: Echo) -> None:

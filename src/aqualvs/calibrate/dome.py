@@ -1,6 +1,5 @@
 """`aqualvs calibrate dome`: place of the lens in its dome or behind its flat port."""
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -29,7 +28,7 @@ from aqualvs.calibration.solver.result import DomeCalibration
 from aqualvs.calibration.targets.pose_files import BoardPose, load_poses, match_poses
 from aqualvs.calibration.targets.target_files import load_board
 from aqualvs.calibration.targets.targets import Board
-from aqualvs.errors import OptionError
+from aqualvs.errors import OptionError, check_options
 from aqualvs.optics.camera import POSE_PARAMETERS, parameter_names
 from aqualvs.optics.dome import Dome
 from aqualvs.optics.flat_port import FlatPort
@@ -80,15 +79,8 @@ class DomeRequest:
 
         Raises `OptionError` naming the option and its value.
         """
-        for name in (
-            "radius_tolerance_mm",
-            "thickness_tolerance_mm",
-            "acrylic_tolerance",
-            "distance_sigma_mm",
-        ):
-            value = getattr(self, name)
-            if not 0.0 <= value < math.inf:
-                raise OptionError(f"--{name.replace('_', '-')} {value:g}: give 0 or more")
+        names = ("radius_tolerance_mm", "thickness_tolerance_mm", "acrylic_tolerance")
+        check_options(self, *names, "distance_sigma_mm", least=0.0, wanted="0 or more")
 
 
 def calibrate_dome(
