@@ -330,15 +330,9 @@ def _with_names(rig: Rig, names: Sequence[str]) -> Rig:
             f"--names {','.join(names)}: {len(names)} for {len(lasers)} lasers; give each a name "
             "of its own"
         )
-    uncertainty = rig_uncertainty(rig)
     new = {laser.name: name for laser, name in zip(lasers, names, strict=True)}
     lasers = tuple(replace(laser, name=new[laser.name]) for laser in lasers)
-    called = tuple(
-        f"{new[owner]}:{what}" if colon else name
-        for name in uncertainty.names
-        for owner, colon, what in [name.rpartition(":")]
-    )
-    return with_uncertainty(replace(rig, lasers=lasers), replace(uncertainty, names=called))
+    return with_uncertainty(replace(rig, lasers=lasers), rig_uncertainty(rig).renamed(new))
 
 
 def _words(figures: LaserFigures, laser: Laser) -> str:

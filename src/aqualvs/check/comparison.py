@@ -276,7 +276,9 @@ def run_compare(new: Path, old: Path, console: Console | None = None) -> int:
     old_rig, old_uncertainty = _loaded(old)
     # Names are the user's, or made up by a calibration: the same laser may have two.
     called = _names_before(new_rig, old_rig)
-    new_rig, new_uncertainty = _with_names(new_rig, new_uncertainty, called)
+    lasers = [replace(one, name=called.get(one.name, one.name)) for one in new_rig.lasers]
+    new_rig = replace(new_rig, lasers=tuple(lasers))
+    new_uncertainty = new_uncertainty.renamed(called)
     difference = rig_difference(new_rig, old_rig, new_uncertainty, old_uncertainty)
     console = console or Console()
     console.print(f"{new} against {old}", style="bold", markup=False, highlight=False)
@@ -500,20 +502,6 @@ def _names_before(new: Rig, old: Rig) -> dict[str, str]:
             gone.remove(twin)
             called[laser.name] = twin.name
     return called
-
-
-def _with_names(
-    rig: Rig, uncertainty: RigUncertainty, called: dict[str, str]
-) -> tuple[Rig, RigUncertainty]:
-    """Return a rig and its uncertainty with other names of its lasers."""
-    lasers = [replace(laser, name=called.get(laser.name, laser.name)) for laser in rig.lasers]
-
-    def renamed(number: str) -> str:
-        laser, colon, parameter = number.rpartition(":")
-        return f"{called.get(laser, laser)}{colon}{parameter}"
-
-    names = tuple(map(renamed, uncertainty.names))
-    return replace(rig, lasers=tuple(lasers)), RigUncertainty(names, uncertainty.covariance)
 
 
 def _alike(one: Laser, other: Laser) -> bool:

@@ -200,6 +200,12 @@ class RigUncertainty:
         kept = tuple(name for name in self.names if name in names)
         return RigUncertainty(kept, self.of(kept))
 
+    def renamed(self, lasers: Mapping[str, str]) -> "RigUncertainty":
+        """Return the uncertainty with new names, by old ones, of some lasers."""
+        parts = [name.rpartition(":") for name in self.names]
+        names = tuple(f"{lasers.get(owner, owner)}{colon}{what}" for owner, colon, what in parts)
+        return RigUncertainty(names, self.covariance)
+
 
 def merged(old: RigUncertainty, new: RigUncertainty) -> RigUncertainty:
     """Return the uncertainty of a rig after a calibration has solved some of its numbers anew.
