@@ -114,10 +114,7 @@ MavlinkKey = Annotated[
 
 def given(context: typer.Context, names: Sequence[str]) -> frozenset[str]:
     """Return which of these parameters the user gave."""
-    sources = {name: context.get_parameter_source(name) for name in names}
-    return frozenset(
-        name for name, source in sources.items() if source and source.name != "DEFAULT"
-    )
+    return frozenset(name for name in names if _origin(context, name) not in ("", "DEFAULT"))
 
 
 def typed(context: typer.Context, *names: str) -> tuple[str, ...]:
@@ -125,10 +122,12 @@ def typed(context: typer.Context, *names: str) -> tuple[str, ...]:
 
     Variables of the environment do not count: they hold for every command.
     """
-    sources = {name: context.get_parameter_source(name) for name in names}
-    return tuple(
-        name for name, source in sources.items() if source and source.name == "COMMANDLINE"
-    )
+    return tuple(name for name in names if _origin(context, name) == "COMMANDLINE")
+
+
+def _origin(context: typer.Context, name: str) -> str:
+    source = context.get_parameter_source(name)
+    return source.name if source else ""
 
 
 def refuse_given(context: typer.Context, names: Sequence[str], remedy: str) -> None:
