@@ -167,7 +167,7 @@ def test_errors_on_random_folds_are_as_large_as_stated() -> None:
     # By the planes of flanks alone one in six, some by 30 sigmas. In steep folds all lasers may
     # agree on one row of flanks.
     beyond = np.abs(scores).max(axis=1) > 4.0
-    assert np.count_nonzero(beyond) <= n // 15
+    assert np.count_nonzero(beyond) <= max(1, n // 15)
     # Of a normal distribution: 0.67.
     assert (np.median(np.abs(scores), axis=0) > 0.25).all()
     assert (np.median(np.abs(scores), axis=0) < 1.0).all()
@@ -191,7 +191,7 @@ def test_a_slack_net() -> None:
     wave = Fold(direction=0.5, place=0.1, height=0.008, width=0.15, period=0.3)
     shot = shoot(replace(NET, folds=(wave,)))
     # The mean of the wave stands half its height behind; its flanks lean by 5 degrees.
-    check_posture(shot.posture, share=0.02, degrees=3.0)
+    check_posture(shot.posture, share=0.02, degrees=3.5)
     assert shot.recall() > 0.85
 
 

@@ -7,7 +7,7 @@ from aqualvs.optics.rig import Rig
 from aqualvs.scanning.candidates import Candidates, find_candidates
 from aqualvs.scanning.laser_bands import SearchAxis, plan_bands
 from aqualvs.scanning.observations import average_groups
-from aqualvs.scanning.stripe import StripePeaks
+from aqualvs.scanning.stripe import PULL_OF_STEP, StripePeaks
 from aqualvs.scanning.triangulate import Triangulator
 from aqualvs.simulation.scenarios import bluerov2_rig, example_rig
 from scanning_cases import everywhere, peaks_of, strands
@@ -132,7 +132,7 @@ def test_observations_are_weighed_by_light() -> None:
     light = np.linspace(10.0, 100.0, mine.n)
     shaded = mine._replace(height=light)
     index = np.zeros(mine.n, np.int64)
-    seen = average_groups(shaded, index, 1, WALL.normal)
+    seen = average_groups(shaded, index, 1, WALL.normal, False)
     weight = light * mine.width
     expected = np.average(mine.points, axis=0, weights=weight)
     np.testing.assert_allclose(seen.points[0], expected, atol=1e-12)
@@ -141,6 +141,32 @@ def test_observations_are_weighed_by_light() -> None:
     assert seen.laser[0] == mine.laser[0]
     # Many returns are better than one, but neighbours share errors.
     assert 0.05 < seen.sigma_px[0] < mine.sigma_px.min()
+
+
+def test_dim_ends_of_a_strand_do_not_count() -> None:
+    candidates = read(example_rig(), peaks_of(example_rig(), [(WALL, everywhere)]))
+    strand = candidates.where(candidates.component == candidates.component[0])
+    light = np.full(strand.n, 100.0)
+    light[: strand.n // 2] = 39.0
+    index = np.zeros(strand.n, np.int64)
+    seen = average_groups(strand._replace(height=light), index, 1, WALL.normal, True)
+    bright = light == 100.0
+    expected = np.average(strand.points[bright], axis=0, weights=strand.width[bright])
+    np.testing.assert_allclose(seen.points[0], expected, atol=1e-12)
+
+
+def test_glow_that_ends_at_the_strands_of_a_laser_is_taken_off_all_of_them() -> None:
+    """All of the difference between flanks is measured at one of two strands."""
+    found = read(example_rig(), peaks_of(example_rig(), [(WALL, everywhere)]))
+    found = found.where(found.laser == found.laser[0])
+    strand = np.arange(found.n) * 2 // found.n
+    dark = found._replace(height=np.full(found.n, 100.0), width=np.full(found.n, 5.0))
+    lit = dark._replace(pull=np.where(strand == 0, 0.02, 0.0))
+    clear, moved = (average_groups(one, strand, 2, WALL.normal, True) for one in (dark, lit))
+    glow = np.average(moved.glow, weights=np.bincount(strand))
+    assert moved.glow[1] == 0.0 < glow
+    expected = clear.points - PULL_OF_STEP * 5.0 * glow * clear.sensitivity
+    np.testing.assert_allclose(moved.points, expected, atol=1e-12)
 
 
 def test_nothing_in_nothing_out() -> None:

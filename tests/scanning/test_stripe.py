@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from scipy.special import ndtr
 
 from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import FloatArray
@@ -18,11 +19,13 @@ from aqualvs.scanning.stripe import (
     HEIGHT,
     N_MEASURES,
     POSITION,
+    PULL_OF_STEP,
     STEP_U,
     PeakFinder,
     SearchImage,
     StripeOptions,
     StripePeaks,
+    flank_difference,
 )
 from aqualvs.simulation.scenarios import bluerov2_rig
 
@@ -124,6 +127,24 @@ def test_the_pull_is_what_a_ramp_below_a_stripe_moves_its_centre_by(
     expected = 0.269 * (FWHM * sigma) ** 2 * slope / 120.0
     assert found.pull.mean() == pytest.approx(expected, abs=0.15 * abs(expected) + 4e-3)
     assert abs((moved - found.pull).mean()) < 0.25 * abs(expected) + 3e-3
+
+
+@pytest.mark.parametrize("step", [-9.0, 4.0, 9.0])
+@pytest.mark.parametrize("sigma", [2.0, 3.0])
+def test_a_step_as_wide_as_the_stripe_moves_its_centre_by_a_share_of_its_width(
+    sigma: float, step: float
+) -> None:
+    """Glow of the water, which ends where the laser sheet meets a strand."""
+    place = np.arange(200.0)[:, None] - CENTRES
+    found = detect(as_image(100.0 + step * ndtr(place / sigma) + gaussian(CENTRES, sigma=sigma)))
+    moved = found.position - CENTRES
+    difference = np.array(
+        [flank_difference(*one) for one in zip(found.pull, found.width, strict=True)]
+    )
+    expected = (PULL_OF_STEP * found.width * difference).mean()
+    # Grey levels hide up to a half of one at each flank.
+    assert moved.mean() == pytest.approx(expected, abs=0.15 * abs(expected) + 3e-3)
+    assert abs(expected) > 0.015
 
 
 def test_a_brighter_stripe_beside_a_peak_is_no_pull() -> None:

@@ -66,9 +66,6 @@ def places_along(line: FloatArray, laser: IntArray, n_lines: IntArray, along: Fl
 MIN_LINES = 30
 """Least number of stripe points of a posture."""
 
-# Least search lines of the light on a strand; less is a fragment, off the strand's middle. Rows of
-# a field are two pixels apart: of thin twine across them few show more than two.
-_SHORTEST_STRAND, _SHORTEST_IN_FIELD = 3, 2
 # A net bends out of the plane that touches it by at most this share of the range.
 _DEEPEST_BEND = 0.15
 _FEW_STRANDS, _STRONG_BEND = 36, 0.02
@@ -139,8 +136,6 @@ class PostureEstimator:
         self._n_lasers = len(rig.lasers)
         self._observer = StripeObserver(rig)
         self._focal_px = rig.focal_px
-        in_fields = rig.shutter.is_interlaced
-        self._shortest_strand = _SHORTEST_IN_FIELD if in_fields else _SHORTEST_STRAND
         self._line_px = max((search.line_px for search in laser_bands), default=1)
         self._axis_in_dome = rig.dome_from_cam.rotate([0.0, 0.0, 1.0])
 
@@ -158,16 +153,10 @@ class PostureEstimator:
         target : Surface
             Surface that the posture is measured to.
         """
-        # On a net a component is one strand, whose light has one centre; on a wall a subsegment is
-        # long enough for independent errors.
         mesh = target.is_mesh
-        # The light on a strand has no flanks of its own.
         candidates = candidates if mesh else candidates.without_pull()
-        unit, min_lines = (
-            (candidates.component, self._shortest_strand) if mesh else (candidates.subsegment, 1)
-        )
         on_target = target.members[subsegments.of_candidate]
-        seen = self._observer.observe(candidates, unit, min_lines, on_target, target.plane.normal)
+        seen = self._observer.observe(candidates, on_target, target.plane.normal, on_twine=mesh)
         if seen.n_candidates < MIN_LINES:
             detail = f"only {seen.n_candidates} stripe points outside crossings"
             return _refused(candidates, Refusal(Reason.TOO_FEW_POINTS, detail))
@@ -349,9 +338,7 @@ class PostureEstimator:
         """Average the pieces of stripe of a net, and those near a plane that may be the net's."""
         beside = np.empty(candidates.n, np.bool_)
         mark_beside(candidates.source, net_mask, off, _BESIDE_SHARE, beside)
-        return self._observer.observe(
-            candidates, candidates.component, self._shortest_strand, beside, plane.normal
-        )
+        return self._observer.observe(candidates, beside, plane.normal, on_twine=True)
 
     def _settled(
         self, candidates: Candidates, net_mask: BoolArray, mean: "_MeanPlane | None"
@@ -397,9 +384,7 @@ class PostureEstimator:
         is_curved: bool,
     ) -> Measurement:
         """Return the measurement, widened or replaced by the mean plane if the net is folds."""
-        seen = self._observer.observe(
-            candidates, candidates.component, self._shortest_strand, net_mask, plane.normal
-        )
+        seen = self._observer.observe(candidates, net_mask, plane.normal, on_twine=True)
         share = _share_on(seen, patch, plane)
         if share >= _MAIN_SHARE:
             is_whole = is_curved or share >= _WHOLE_SHARE
@@ -425,9 +410,7 @@ class PostureEstimator:
     ) -> Measurement | None:
         """Measure the posture to a curved net; None where a plane is as good."""
         near = off < _DEEPEST_BEND
-        seen = self._observer.observe(
-            candidates, candidates.component, self._shortest_strand, near, plane.normal
-        )
+        seen = self._observer.observe(candidates, near, plane.normal, on_twine=True)
         if not seen.observations.n:
             return None
         shared = self._shared_error(seen.observations, plane.normal, on_twine=True)

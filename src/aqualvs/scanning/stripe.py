@@ -40,6 +40,9 @@ _OTHER_STRIPE, _FLANK_PX = 0.25, 4
 # Shift of the centroid above half height of a Gaussian of width w on a ramp, over w² times the
 # ramp's slope over the Gaussian's height: (1 / 12) / (0.810 - 1 / 2), the area above half height.
 _PULL_OF_RAMP = 0.269
+PULL_OF_STEP = 0.222
+"""Shift of the centroid above half height of a Gaussian of width w on a step that is blurred as the
+Gaussian is, over w times the step's height over the Gaussian's; integrated numerically."""
 POSITION, HEIGHT, WIDTH, TOP, STEP_U, STEP_V, IMBALANCE, TINT_U, TINT_V, PULL = range(10)
 """Rows of a table of peaks."""
 N_MEASURES = 10
