@@ -29,9 +29,9 @@ _SQUARES = 4.0 ** np.linspace(-3.0, 3.0, 13)
 TWINE_SHARE, TWINE_LEVELS = 0.006, 1.2
 """Shift of the light on twine as a share of the stripe's width, and grey levels that add to it.
 
-Twine is round, so that one side of the stripe is brighter: a length on the target, of which the
-stripe's width is the measure in every picture. On dim strands the light of the water counts, which
-ends at the strand: as a share of the width, about one grey level over the stripe's height.
+Twine is round and brightest in front: a length on the target, of which the stripe's width is the
+measure in every picture. Dim strands show their front alone, and of the glow that ends at a strand
+not all is measured: as a share of the width, about one grey level over the stripe's height.
 """
 GLOW_PX = 0.5
 """Shift of a stripe by a background as much brighter on one side as the stripe is high.
