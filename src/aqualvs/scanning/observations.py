@@ -11,6 +11,7 @@ import numpy as np
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import inline_borrowing_kernel, inner_kernel, kernel
 from aqualvs.geometry.linear_algebra import n_bins, squared
+from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.sheet import COLUMNS, planes_and_bent, sheet_distance, sheets_of
 from aqualvs.scanning.candidates import Candidates
@@ -80,7 +81,13 @@ class StripeObserver:
         self._shortest_strand = _SHORTEST_IN_FIELD if in_fields else _SHORTEST_STRAND
 
     def observe(
-        self, candidates: Candidates, on_target: BoolArray, normal: FloatArray, *, on_twine: bool
+        self,
+        candidates: Candidates,
+        on_target: BoolArray,
+        plane: Plane,
+        *,
+        on_twine: bool,
+        flat: bool = False,
     ) -> Observed:
         """Average the pieces of stripe on a target, those in crossings left out.
 
@@ -93,19 +100,23 @@ class StripeObserver:
             N of them.
         on_target : bool array, shape (N,)
             Candidates on the target.
-        normal : array, shape (3,)
-            Approximate normal of the surface; spread is measured along it.
+        plane : Plane
+            Approximate plane of the surface; spread is measured along its normal.
         on_twine : bool
             Whether the target is a net.
+        flat : bool
+            Whether all of the target lies on the plane.
         """
         unit = candidates.component if on_twine else candidates.subsegment
         min_lines = self._shortest_strand if on_twine else 1
+        m = plane.normal / plane.offset if flat else np.zeros(3)
         return _observe(
             candidates,
             unit,
             min_lines,
             on_target,
-            normal,
+            plane.normal,
+            m,
             self.planes,
             self.bent,
             self._focal_px,
@@ -120,6 +131,7 @@ def _observe(
     min_lines: int,
     on_target: BoolArray,
     normal: FloatArray,
+    m: FloatArray,
     planes: FloatArray,
     bent: FloatArray | None,
     focal_px: float,
@@ -128,7 +140,7 @@ def _observe(
     """Average the pieces of stripe on a target, given the lasers' sheets."""
     group = np.empty(unit.shape[0], np.int64)
     n, n_candidates = _select_units(
-        candidates, unit, min_lines, on_target, planes, bent, focal_px, group
+        candidates, unit, min_lines, on_target, m, planes, bent, focal_px, group
     )
     return Observed(group, n_candidates, average_groups(candidates, group, n, normal, on_twine))
 
@@ -139,6 +151,7 @@ def _select_units(
     unit: IntArray,
     min_lines: int,
     on_target: BoolArray,
+    m: FloatArray,
     planes: FloatArray,
     bent: FloatArray | None,
     focal_px: float,
@@ -146,18 +159,30 @@ def _select_units(
 ) -> tuple[int, int]:
     """Assign numbers to pieces of stripe on the target, -1 to candidates elsewhere or in crossings.
 
-    A piece is used as a whole: the centre of a part of a strand's light would be off the sheet.
+    A piece is used as a whole: the centre of a part of a strand's light would be off the sheet. Of
+    one that reaches into a crossing the rest is used, if it is long enough.
     Return the number of groups, and of candidates in them.
     """
     points, laser = candidates.points, candidates.laser
     number = _units_on(unit, min_lines, on_target)
     mean_width = _mean_widths(laser, candidates.width, unit, number, planes.shape[0])
+    lines = np.zeros(number.shape[0], np.int64)
+    for i in range(unit.shape[0]):
+        p = unit[i]
+        group[i] = -1
+        if number[p] != -1 and not in_crossing(
+            points, i, laser[i], m, planes, bent, mean_width, focal_px
+        ):
+            group[i] = p
+            lines[p] += 1
     n_groups = 0
     n_candidates = 0
     for i in range(unit.shape[0]):
-        group[i] = -1
-        p = unit[i]
-        if number[p] == -1 or in_crossing(points, i, laser[i], planes, bent, mean_width, focal_px):
+        p = group[i]
+        if p == -1:
+            continue
+        if lines[p] < min_lines:
+            group[i] = -1
             continue
         if number[p] == -2:
             number[p] = n_groups
@@ -202,13 +227,22 @@ def in_crossing(
     points: FloatArray,
     i: int,
     own: int,
+    m: FloatArray,
     planes: FloatArray,
     bent: FloatArray | None,
     mean_width: FloatArray,
     focal_px: float,
 ) -> bool:
-    """Return whether another laser's stripe crosses the target here (paper, section 3.1)."""
+    """Return whether another laser's stripe crosses the target here (paper, section 3.1).
+
+    Of a target that is the plane m·X = 1, the place on it along the line of sight counts, nearly
+    through the dome's centre: where two stripes merge, the point is off the plane with either
+    laser. m is zero if the target is no plane.
+    """
     x, y, z = points[i, 0], points[i, 1], points[i, 2]
+    depth = m[0] * x + m[1] * y + m[2] * z
+    if depth > 0.0:
+        x, y, z = x / depth, y / depth, z / depth
     m_per_px = np.sqrt(x * x + y * y + z * z) / focal_px
     # Reach of a crossing: this many full widths of the stripes, and this many pixels more.
     crossing_widths = 1.2

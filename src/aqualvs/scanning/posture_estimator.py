@@ -156,7 +156,7 @@ class PostureEstimator:
         mesh = target.is_mesh
         candidates = candidates if mesh else candidates.without_pull()
         on_target = target.members[subsegments.of_candidate]
-        seen = self._observer.observe(candidates, on_target, target.plane.normal, on_twine=mesh)
+        seen = self._observer.observe(candidates, on_target, target.plane, on_twine=mesh, flat=True)
         if seen.n_candidates < MIN_LINES:
             detail = f"only {seen.n_candidates} stripe points outside crossings"
             return _refused(candidates, Refusal(Reason.TOO_FEW_POINTS, detail))
@@ -338,7 +338,7 @@ class PostureEstimator:
         """Average the pieces of stripe of a net, and those near a plane that may be the net's."""
         beside = np.empty(candidates.n, np.bool_)
         mark_beside(candidates.source, net_mask, off, _BESIDE_SHARE, beside)
-        return self._observer.observe(candidates, beside, plane.normal, on_twine=True)
+        return self._observer.observe(candidates, beside, plane, on_twine=True)
 
     def _settled(
         self, candidates: Candidates, net_mask: BoolArray, mean: "_MeanPlane | None"
@@ -384,7 +384,7 @@ class PostureEstimator:
         is_curved: bool,
     ) -> Measurement:
         """Return the measurement, widened or replaced by the mean plane if the net is folds."""
-        seen = self._observer.observe(candidates, net_mask, plane.normal, on_twine=True)
+        seen = self._observer.observe(candidates, net_mask, plane, on_twine=True)
         share = _share_on(seen, patch, plane)
         if share >= _MAIN_SHARE:
             is_whole = is_curved or share >= _WHOLE_SHARE
@@ -410,7 +410,7 @@ class PostureEstimator:
     ) -> Measurement | None:
         """Measure the posture to a curved net; None where a plane is as good."""
         near = off < _DEEPEST_BEND
-        seen = self._observer.observe(candidates, near, plane.normal, on_twine=True)
+        seen = self._observer.observe(candidates, near, plane, on_twine=True)
         if not seen.observations.n:
             return None
         shared = self._shared_error(seen.observations, plane.normal, on_twine=True)
