@@ -35,6 +35,13 @@ from shell_cases import rig_file
             "--radius-tolerance-mm -1: give 0 or more",
         ),
         (
+            [
+                *("calibrate", "water", "dive.mp4", "--target", "t.yaml", "--rig", "rig.yaml"),
+                *("-o", "r.yaml", "--turn-sigma-deg", "-1"),
+            ],
+            "--turn-sigma-deg -1: give 0 or more",
+        ),
+        (
             ["check", "metres.yaml"],
             "metres.yaml: working_range_mm is [0.3, 1], but these are millimetres; write [300, "
             "1000] if metres are meant",

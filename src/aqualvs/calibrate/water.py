@@ -23,16 +23,16 @@ from aqualvs.calibration.targets.targets import MarkerSet, View
 from aqualvs.calibration.water_index.estimator import WaterCalibration
 from aqualvs.calibration.water_index.estimator import calibrate_water as solve_water
 from aqualvs.calibration.water_index.state import IndexOptions, IndexPrior
-from aqualvs.errors import CalibrationError
+from aqualvs.errors import CalibrationError, check_options
 from aqualvs.optics.rig import Rig, merged
 from aqualvs.optics.rigfile import check_rig_place, load_rig
 from aqualvs.optics.solved import SolvedStep, rig_uncertainty, with_step, with_uncertainty
 from aqualvs.report.calibration_material import (
     CalibrationPage,
     Series,
-    ViewRow,
     expectations,
     facts,
+    missed_rows,
 )
 from aqualvs.report.html import Card
 from aqualvs.results.run_request import Water, check_fits
@@ -55,6 +55,13 @@ class WaterRequest:
     fps: float | None
     place_sigma_mm: float
     turn_sigma_deg: float
+
+    def __post_init__(self) -> None:
+        """Refuse negative deviations.
+
+        Raises `OptionError` naming the option and its value.
+        """
+        check_options(self, "place_sigma_mm", "turn_sigma_deg", least=0.0, wanted="0 or more")
 
 
 def calibrate_water(
@@ -244,16 +251,6 @@ def _page(
                 marks=marks,
             ),
         ),
-        views=tuple(
-            ViewRow(
-                name=reading.name,
-                n_points=0,
-                rms_px=float("nan"),
-                remark=reading.refused,
-                used=False,
-            )
-            for reading in result.readings
-            if not reading
-        ),
+        views=missed_rows({one.name: one.refused for one in result.readings if not one}),
         facts=facts(("rig before", str(request.rig)), ("target", str(request.target))),
     )

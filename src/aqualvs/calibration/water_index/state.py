@@ -11,7 +11,7 @@ from typing import Self
 
 import numpy as np
 
-from aqualvs.errors import OptionError
+from aqualvs.errors import OptionError, check_not_negative
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.optics.water import GREEN_NM, N_AIR, seawater_index_slopes, seawater_index_vacuum
 
@@ -282,19 +282,14 @@ class IndexOptions:
     largest_sigma: float = 2e-3
 
     def __post_init__(self) -> None:
-        for name in self.__slots__:
-            _check_not_negative(name, getattr(self, name))
+        check_not_negative("water index", self, *self.__slots__)
 
     @classmethod
     def of_target(cls, place_sigma_mm: float, turn_sigma_deg: float) -> Self:
         """Return the options for a target with given uncertainties of its place on the vehicle.
 
         An index counts as observable if it separates fresh water from sea water.
-
-        Raises `OptionError` if one of them is negative or no number.
         """
-        _check_not_negative("--place-sigma-mm", place_sigma_mm)
-        _check_not_negative("--turn-sigma-deg", turn_sigma_deg)
         # Fresh water and sea water differ by 0.008: an index known to half of that still separates
         # them.
         largest_sigma = 4e-3
@@ -308,11 +303,6 @@ class IndexOptions:
     def pose_sigmas(self) -> FloatArray:
         """Standard deviations of turn and shift of the target, shape (6,)."""
         return np.array([self.sigma_turn] * 3 + [self.sigma_place] * 3)
-
-
-def _check_not_negative(name: str, value: float) -> None:
-    if not (math.isfinite(value) and value >= 0.0):
-        raise OptionError(f"{name} is {value:g}; give a number that is not negative")
 
 
 @dataclass(frozen=True, slots=True)
