@@ -17,7 +17,6 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import inner_kernel, kernel
@@ -360,65 +359,70 @@ def predicted_strands(lattice: NetLattice, view: NetView, place: FloatArray) -> 
     open_ = gaps.beyond >= let_through * view.beyond[gaps.laser]
     turns = np.abs(lattice.waves).sum(axis=0) @ np.ones(2)
     most = int(np.sum(turns * (view.span[:, 1] - view.span[:, 0]) + len(lattice.waves) + 1.0))
-    row, gap = np.empty((most, 3)), np.empty((most, 3), np.int64)
-    n = _predict(
-        lattice.waves,
-        lattice.basis,
-        lattice.mesh is Mesh.SIX_SIDED,
-        lattice.bar,
-        np.asarray(place, np.float64),
-        view.origin,
-        view.direction,
-        _OFF_STEPS * view.step,
-        view.span_laser,
-        view.span,
-        gaps.laser,
-        gaps.ends,
-        open_,
-        row,
-        gap,
+
+    here, six_sided = np.asarray(place, np.float64), lattice.mesh is Mesh.SIX_SIDED
+    row, gap = _predict(
+        _PlacedLattice(lattice.waves, lattice.basis, lattice.bar, six_sided, here),
+        _Lines(view.origin, view.direction, _OFF_STEPS * view.step, view.span_laser, view.span),
+        _Gaps(gaps.laser, gaps.ends, open_),
+        most,
     )
-    gap = gap[:n]
     missed = gap[:, 2] >= 0
     dark = gap[missed, 2]
-    run, closed = np.zeros(n, np.int64), np.zeros(n, np.bool_)
+    run, closed = np.zeros(len(gap), np.int64), np.zeros(len(gap), np.bool_)
     run[missed] = np.bincount(dark, minlength=len(gaps.laser))[dark]
     closed[missed] = gaps.closed[dark].all(axis=1)
-    return Strands(row[:n, :2].copy(), row[:n, 2].copy(), gap[:, 0], gap[:, 1], missed, run, closed)
+    return Strands(row[:, :2].copy(), row[:, 2].copy(), gap[:, 0], gap[:, 1], missed, run, closed)
+
+
+class _PlacedLattice(NamedTuple):
+    """A lattice at its place in `net`, in metres."""
+
+    waves: FloatArray
+    basis: FloatArray
+    bar: float
+    six_sided: bool
+    place: FloatArray
+
+
+class _Lines(NamedTuple):
+    """Lines of the lasers, and their spans in view."""
+
+    origin: FloatArray
+    direction: FloatArray
+    least_off: FloatArray  # Shape (L,): least tolerance of a strand's place, in metres.
+    span_laser: IntArray
+    span: FloatArray
+
+
+class _Gaps(NamedTuple):
+    """Gaps in the lines, and whether light is seen behind them."""
+
+    laser: IntArray
+    ends: FloatArray
+    is_open: BoolArray
 
 
 @kernel
 def _predict(
-    waves: FloatArray,
-    basis: FloatArray,
-    six_sided: bool,
-    bar: float,
-    place: FloatArray,
-    origin: FloatArray,
-    direction: FloatArray,
-    least_off: FloatArray,
-    span_laser: IntArray,
-    span: FloatArray,
-    gap_laser: IntArray,
-    gap: FloatArray,
-    gap_open: BoolArray,
-    where: FloatArray,
-    row: NDArray[np.int64],
-) -> int:
-    """Write (place, along) and (laser, family, gap or -1) of every crossing; return the number."""
+    strands: _PlacedLattice, lines: _Lines, gaps: _Gaps, most: int
+) -> tuple[FloatArray, IntArray]:
+    """Return (place, along) and (laser, family, gap or -1) of every crossing."""
+    where, row = np.empty((most, 3)), np.empty((most, 3), np.int64)
+    origin, direction, span, place = lines.origin, lines.direction, lines.span, strands.place
     n = 0
     # Least sine of a crossing angle; at smaller ones the place of the crossing is uncertain.
     min_across = 0.3
     for m in range(len(span)):
-        i = span_laser[m]
-        for f in range(len(waves)):
-            qx, qy = waves[f]
+        i = lines.span_laser[m]
+        for f in range(len(strands.waves)):
+            qx, qy = strands.waves[f]
             rate = qx * direction[i, 0] + qy * direction[i, 1]
             size = np.sqrt(qx * qx + qy * qy)
             if not abs(rate) > min_across * size:
                 continue
             start = qx * (origin[i, 0] - place[0]) + qy * (origin[i, 1] - place[1])
-            off = max(_OFF / abs(rate), least_off[i])
+            off = max(_OFF / abs(rate), lines.least_off[i])
             a, b = start + rate * span[m, 0], start + rate * span[m, 1]
             for number in range(int(np.ceil(min(a, b))), int(np.floor(max(a, b))) + 1):
                 s = (number - start) / rate
@@ -426,22 +430,24 @@ def _predict(
                 y = origin[i, 1] + s * direction[i, 1]
                 if s - off < span[m, 0] or s + off > span[m, 1]:
                     continue
-                if six_sided and not _on_bar(x - place[0], y - place[1], basis, bar):
+                if strands.six_sided and not _on_bar(
+                    x - place[0], y - place[1], strands.basis, strands.bar
+                ):
                     continue
-                k = _gap_around(s, off, i, gap_laser, gap)
-                if k >= 0 and not gap_open[k]:
+                k = _gap_around(s, off, i, gaps)
+                if k >= 0 and not gaps.is_open[k]:
                     continue
                 where[n, 0], where[n, 1], where[n, 2] = x, y, s
                 row[n, 0], row[n, 1], row[n, 2] = i, f, k
                 n += 1
-    return n
+    return where[:n], row[:n]
 
 
 @inner_kernel
-def _gap_around(s: float, off: float, i: int, gap_laser: IntArray, gap: FloatArray) -> int:
+def _gap_around(s: float, off: float, i: int, gaps: _Gaps) -> int:
     """Return the row of the gap that reaches farther than `off` to both sides of s, or -1."""
-    for k in range(len(gap)):
-        if gap_laser[k] == i and gap[k, 0] < s - off and gap[k, 1] > s + off:
+    for k in range(len(gaps.laser)):
+        if gaps.laser[k] == i and gaps.ends[k, 0] < s - off and gaps.ends[k, 1] > s + off:
             return k
     return -1
 
