@@ -12,11 +12,12 @@ import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
-from aqualvs.optics.camera import BareCamera, HousedCamera, parameter_names, rays_all
+from aqualvs.optics.camera import Camera, parameter_names, rays_all
 from aqualvs.optics.dome import Dome
 from aqualvs.optics.flat_port import FlatPort
 from aqualvs.optics.lens import Lens
 from aqualvs.optics.projection import project_all
+from optics_cases import moved_by
 
 SIZE_PX = (720, 576)
 LENS = Lens(
@@ -26,10 +27,10 @@ NOMINAL = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 POSE = SE3(rotation_from_rotvec([0.04, 0.029, 0.016]) @ NOMINAL, np.array([3.1, 41.8, 3.0]) * 1e-3)
 DOME = Dome(0.04425, 0.00575, 1.49)
 N_AIR, N_WATER = 1.0003, 1.3333
-CAMERA = HousedCamera(
+CAMERA = Camera(
     size_px=SIZE_PX, lens=LENS, dome_from_cam=POSE, housing=DOME, n_air=N_AIR, n_water=N_WATER
 )
-FLAT = HousedCamera(
+FLAT = Camera(
     size_px=SIZE_PX,
     lens=LENS,
     dome_from_cam=POSE,
@@ -37,7 +38,7 @@ FLAT = HousedCamera(
     n_air=N_AIR,
     n_water=N_WATER,
 )
-BARE = BareCamera(size_px=SIZE_PX, lens=LENS, dome_from_cam=POSE)
+BARE = Camera(size_px=SIZE_PX, lens=LENS, dome_from_cam=POSE)
 DISTANCE = 0.6
 N_JACOBIANS = 40_000
 
@@ -141,7 +142,7 @@ def numeric_parameter_jacobian(points: FloatArray) -> FloatArray:
     """Central differences by the point and by every parameter, as `numeric_jacobian` has them."""
     columns = []
     for step in np.eye(len(parameter_names(CAMERA))) * 1e-6:
-        ahead, behind = CAMERA.moved_by(step), CAMERA.moved_by(-step)
+        ahead, behind = moved_by(CAMERA, step), moved_by(CAMERA, -step)
         columns.append((ahead.project(points)[0] - behind.project(points)[0]) / 2e-6)
     return np.concatenate([numeric_jacobian(points), np.stack(columns, axis=-1)], axis=-1)
 

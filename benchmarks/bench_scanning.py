@@ -20,7 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray
-from aqualvs.optics.camera import HousedCamera
 from aqualvs.optics.dome import Dome
 from aqualvs.optics.rig import Rig
 from aqualvs.scanner import Scanner
@@ -129,7 +128,6 @@ def plain_detect(bgr: U8, areas: list[BoolArray], along_x: list[bool]) -> list[F
 def plain_points(rig: Rig, pixels: list[FloatArray]) -> FloatArray:
     """Points (N, 3) on the laser planes, through the dome."""
     camera = rig.camera()
-    assert isinstance(camera, HousedCamera)
     lens, dome = camera.lens, camera.housing
     assert isinstance(dome, Dome)
     matrix = np.array([[lens.fx, 0.0, lens.cx], [0.0, lens.fy, lens.cy], [0.0, 0.0, 1.0]])

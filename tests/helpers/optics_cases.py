@@ -3,13 +3,15 @@
 from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
-from aqualvs.optics.camera import BareCamera, HousedCamera
+from aqualvs.optics.camera import Camera, parameter_names
 from aqualvs.optics.dome import Dome
 from aqualvs.optics.flat_port import FlatPort
 from aqualvs.optics.lens import Lens, LensModel
+from aqualvs.optics.rig import Rig, rig_moved_by
 
 SIZE_PX = (720, 576)
 NOMINAL = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
@@ -55,8 +57,8 @@ def dome_camera(
     n_air: float = 1.0003,
     n_water: float = 1.3333,
     rotvec: tuple[float, float, float] = (0.04, 0.029, 0.016),
-) -> HousedCamera:
-    return HousedCamera(
+) -> Camera:
+    return Camera(
         size_px=SIZE_PX,
         lens=lens,
         dome_from_cam=pose(lens_mm, rotvec),
@@ -77,8 +79,8 @@ def flat_camera(
     n_air: float = 1.0003,
     n_water: float = 1.3333,
     rotvec: tuple[float, float, float] = (0.04, 0.029, 0.016),
-) -> HousedCamera:
-    return HousedCamera(
+) -> Camera:
+    return Camera(
         size_px=SIZE_PX,
         lens=lens,
         dome_from_cam=pose(lens_mm, rotvec),
@@ -90,8 +92,24 @@ def flat_camera(
 
 def bare_camera(
     lens_mm: tuple[float, float, float] = (3.1, 41.8, 3.0), *, lens: Lens = PAPER_LENS
-) -> BareCamera:
-    return BareCamera(size_px=SIZE_PX, lens=lens, dome_from_cam=pose(lens_mm))
+) -> Camera:
+    return Camera(size_px=SIZE_PX, lens=lens, dome_from_cam=pose(lens_mm))
+
+
+def moved_by(camera: Camera, step: ArrayLike) -> Camera:
+    """The camera with `step` added to its parameters, in the order of `parameter_names`."""
+    rig = Rig(
+        name="moved",
+        size_px=camera.size_px,
+        lens=camera.lens,
+        dome_from_cam=camera.dome_from_cam,
+        housing=camera.housing,
+        n_air=camera.n_air,
+        n_water=camera.n_water,
+        lasers=(),
+        working_range=(0.3, 1.0),
+    )
+    return rig_moved_by(rig, parameter_names(camera), np.asarray(step)).camera()
 
 
 def image_grid(step_px: float = 24.0) -> FloatArray:

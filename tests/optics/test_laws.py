@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
-from aqualvs.optics.camera import HousedCamera
+from aqualvs.optics.camera import Camera
 from aqualvs.optics.dome import Dome
 from aqualvs.optics.refraction import refract
 from optics_cases import (
@@ -38,7 +38,7 @@ def make_camera(
     rotvec: tuple[float, float, float],
     n: tuple[float, float, float],
     relative_thickness: float,
-) -> HousedCamera:
+) -> Camera:
     """A camera with its lens at `share` of the inner radius along `direction`."""
     inner = 0.044
     length = np.linalg.norm(direction)
@@ -54,7 +54,7 @@ def make_camera(
     )
 
 
-def path_of(camera: HousedCamera) -> dict[str, np.ndarray]:
+def path_of(camera: Camera) -> dict[str, np.ndarray]:
     """Corners and directions of the traced rays, those inside from the quadratic formula."""
     rays = camera.rays(PIXELS)
     assert rays.valid.all()
@@ -81,7 +81,7 @@ def angle_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(CAMERAS)
-def test_snell_holds_at_both_surfaces(camera: HousedCamera) -> None:
+def test_snell_holds_at_both_surfaces(camera: Camera) -> None:
     p = path_of(camera)
     n_wall = camera.housing.n_acrylic
     incidence = angle_between(p["in_air"], p["inner"])
@@ -96,7 +96,7 @@ def test_snell_holds_at_both_surfaces(camera: HousedCamera) -> None:
 
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(CAMERAS)
-def test_a_ray_stays_in_the_plane_of_lens_and_centre(camera: HousedCamera) -> None:
+def test_a_ray_stays_in_the_plane_of_lens_and_centre(camera: Camera) -> None:
     p = path_of(camera)
     normal = np.cross(p["lens"], p["in_air"])
     length = np.linalg.norm(normal, axis=-1)
@@ -110,7 +110,7 @@ def test_a_ray_stays_in_the_plane_of_lens_and_centre(camera: HousedCamera) -> No
 
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(CAMERAS)
-def test_bouguers_invariant_is_one_number_along_a_ray(camera: HousedCamera) -> None:
+def test_bouguers_invariant_is_one_number_along_a_ray(camera: Camera) -> None:
     p = path_of(camera)
     at_lens = camera.n_air * np.cross(p["lens"], p["in_air"])
     in_water = camera.n_water * np.cross(p["outer"], p["in_water"])
@@ -183,7 +183,7 @@ def test_an_infinitely_thin_dome_is_one_surface(n_acrylic: float) -> None:
 
 @settings(max_examples=40, deadline=None, derandomize=True)
 @given(CAMERAS)
-def test_light_sent_back_arrives_at_the_lens(camera: HousedCamera) -> None:
+def test_light_sent_back_arrives_at_the_lens(camera: Camera) -> None:
     p = path_of(camera)
     outer_normal = p["outer"] / camera.housing.outer_radius
     in_wall, valid = refract(
@@ -204,7 +204,7 @@ def test_light_sent_back_arrives_at_the_lens(camera: HousedCamera) -> None:
 
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(CAMERAS, st.floats(0.0, 20.0))
-def test_projection_inverts_the_trace(camera: HousedCamera, distance: float) -> None:
+def test_projection_inverts_the_trace(camera: Camera, distance: float) -> None:
     rays = camera.rays(PIXELS)
     assert rays.valid.all()
     found, valid = camera.project(rays.points_at(np.full(len(PIXELS), distance)))
@@ -216,10 +216,10 @@ def test_projection_inverts_the_trace(camera: HousedCamera, distance: float) -> 
 @settings(max_examples=30, deadline=None, derandomize=True)
 @given(CAMERAS, st.tuples(COORDINATE, COORDINATE, COORDINATE))
 def test_turning_everything_about_the_centre_changes_no_pixel(
-    camera: HousedCamera, rotvec: tuple[float, float, float]
+    camera: Camera, rotvec: tuple[float, float, float]
 ) -> None:
     turn = SE3.from_rotvec(rotvec, np.zeros(3))
-    turned = HousedCamera(
+    turned = Camera(
         size_px=SIZE_PX,
         lens=camera.lens,
         dome_from_cam=turn @ camera.dome_from_cam,

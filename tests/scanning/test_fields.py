@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from aqualvs.live.runner import wall_frame
-from aqualvs.optics.camera import BareCamera
+from aqualvs.optics.camera import Camera
 from aqualvs.optics.lens import Lens
 from aqualvs.optics.shutter import FIRST_ROW, Shutter, ShutterKind
 from aqualvs.scanner import Scanner, ScannerOptions
@@ -28,7 +28,7 @@ def test_rows_of_a_field_are_those_of_a_camera_of_half_the_height(rig, field):
     """The bands' lines and the peaks' positions are where that camera's own model puts them."""
     row = FIRST_ROW[field]
     whole, lens = rig.bare_camera(), rig.lens
-    half = BareCamera(
+    half = Camera(
         size_px=(rig.size_px[0], rig.size_px[1] // 2),
         lens=Lens(
             model=lens.model,

@@ -1,6 +1,6 @@
 """Refraction, the camera behind a dome, water, and the rig file."""
 
-from aqualvs.optics.camera import BareCamera, Camera, HousedCamera, parameter_names
+from aqualvs.optics.camera import Camera, parameter_names
 from aqualvs.optics.dome import Dome
 from aqualvs.optics.flat_port import FlatPort
 from aqualvs.optics.lens import Lens, LensModel
@@ -8,11 +8,9 @@ from aqualvs.optics.refraction import refract
 from aqualvs.optics.water import seawater_index, seawater_index_vacuum
 
 __all__ = [
-    "BareCamera",
     "Camera",
     "Dome",
     "FlatPort",
-    "HousedCamera",
     "Lens",
     "LensModel",
     "parameter_names",

@@ -1,15 +1,14 @@
 """The camera: pixels to rays in the outer medium, points to pixels with derivatives.
 
-The cameras share one set of numbers: `parameter_names` gives their order in every parameter
-Jacobian, `moved_by` adds a small step to them, and `camera_params` checks them and packs them for
-kernels. `rays_all` traces pixels, in blocks as `aqualvs.optics.lens` lays them out, and is compiled
-for the class of port that it is called with. A scan projects no points, so the kernels of
-`aqualvs.optics.projection` are imported when they are used.
+`parameter_names` gives the order of a camera's numbers in every parameter Jacobian, and
+`Camera.params` packs them for kernels. `rays_all` traces pixels, in blocks as
+`aqualvs.optics.lens` lays them out, and is compiled for the class of port that it is called with.
+A scan projects no points, so the kernels of `aqualvs.optics.projection` are imported when they are
+used.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple, Self
+from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,7 +17,7 @@ from aqualvs.errors import RigError
 from aqualvs.geometry.arrays import BoolArray, FloatArray, as_vectors
 from aqualvs.geometry.compiled import chosen_by_class, inline_kernel, kernel
 from aqualvs.geometry.planes import Rays
-from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
+from aqualvs.geometry.transforms import SE3
 from aqualvs.optics.dome import Dome, DomeParams, trace_direction
 from aqualvs.optics.flat_port import FlatParams, FlatPort, trace_flat
 from aqualvs.optics.lens import (
@@ -165,33 +164,6 @@ def parameter_names(camera: "Camera") -> tuple[str, ...]:
     return POSE_PARAMETERS + camera.params.port.names + camera.lens.parameter_names
 
 
-def named_step(camera: "Camera", step: ArrayLike) -> dict[str, float]:
-    """Return `step` (P,) by parameter name."""
-    names = parameter_names(camera)
-    values: Sequence[float] = as_vectors(step, len(names), "step").tolist()
-    return dict(zip(names, values, strict=True))
-
-
-def moved_pose(pose: SE3, step: dict[str, float]) -> SE3:
-    """Return the pose with the lens shifted and the camera turned by `step`."""
-    rotvec = [step["rotation_x"], step["rotation_y"], step["rotation_z"]]
-    shift = [step["lens_x"], step["lens_y"], step["lens_z"]]
-    return SE3(rotation_from_rotvec(rotvec) @ pose.rotation, pose.translation + np.array(shift))
-
-
-def moved_lens(lens: Lens, step: dict[str, float]) -> Lens:
-    """Return the lens with `step` added to its intrinsics."""
-    coefficients = zip(lens.parameter_names[4:], lens.distortion, strict=True)
-    return Lens(
-        model=lens.model,
-        fx=lens.fx + step["fx"],
-        fy=lens.fy + step["fy"],
-        cx=lens.cx + step["cx"],
-        cy=lens.cy + step["cy"],
-        distortion=tuple(value + step[name] for name, value in coefficients),
-    )
-
-
 def _check_size(size_px: tuple[int, int]) -> None:
     if len(size_px) != 2 or not all(side > 0 for side in size_px):
         raise RigError(f"camera has size {size_px} px; width and height must be positive")
@@ -218,29 +190,36 @@ def _checked_pose(pose: SE3) -> tuple[FloatArray, FloatArray]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Camera:
-    """Any camera, computed by compiled kernels from the numbers in `params`.
+    """A camera behind a dome or a flat port, or a bare lens in the outer medium itself.
 
-    Frames: `image` and `dome`.
+    Computed by compiled kernels from the numbers in `params`. Frames: `image` and `dome`.
+
+    Raises `RigError` if the lens lies outside the inner sphere of a dome, an index or the size is
+    not valid, or the pose is not one finite rigid transform.
     """
 
     size_px: tuple[int, int]  # Image width and height.
     lens: Lens  # Intrinsics, calibrated in air without the housing.
     dome_from_cam: SE3  # Camera pose in `dome`; the translation is the lens position L in metres.
+    # Sizes and material; a flat port is fixed to the camera. None for a bare lens.
+    housing: Housing | None = None
+    # Refractive indices (vacuum = 1) inside and outside the housing.
+    n_air: float = 1.0
+    n_water: float = 1.0
     params: CameraParams = field(init=False, repr=False, compare=False)
     """Packed numbers for compiled kernels."""
 
-    def _pack(self, housing: Housing | None, n_air: float, n_water: float) -> None:
-        """Check the camera and set `params`."""
+    def __post_init__(self) -> None:
         _check_size(self.size_px)
-        check_index("camera", "n_air", n_air)
-        check_index("camera", "n_water", n_water)
+        check_index("camera", "n_air", self.n_air)
+        check_index("camera", "n_water", self.n_water)
         rotation, centre = _checked_pose(self.dome_from_cam)
         params = CameraParams(
             lens=self.lens.params,
             rotation=(*as_triple(rotation[0]), *as_triple(rotation[1]), *as_triple(rotation[2])),
             port=BareParams(as_triple(centre))
-            if housing is None
-            else housing.params(self.dome_from_cam, n_air, n_water),
+            if self.housing is None
+            else self.housing.params(self.dome_from_cam, self.n_air, self.n_water),
         )
         object.__setattr__(self, "params", params)
 
@@ -347,20 +326,6 @@ class Camera:
         )
         return pixels, valid, by_point
 
-    def moved_by(self, step: ArrayLike) -> Self:
-        """Return the camera with `step` (P,) added to its parameters, see `parameter_names`."""
-        values = named_step(self, step)
-        return replace(
-            self,
-            lens=moved_lens(self.lens, values),
-            dome_from_cam=moved_pose(self.dome_from_cam, values),
-            **self._moved_medium(values),
-        )
-
-    def _moved_medium(self, _values: dict[str, float]) -> dict[str, Any]:
-        """Return the changed fields of housing and media."""
-        return {}
-
     def inside_image(self, pixels: ArrayLike) -> BoolArray:
         """Return which pixels (..., 2) lie in the picture; NaN does not.
 
@@ -369,38 +334,3 @@ class Camera:
         p = as_vectors(pixels, 2, "pixels") + 0.5
         inside: BoolArray = np.all((p >= 0.0) & (p < np.asarray(self.size_px)), axis=-1)
         return inside
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class BareCamera(Camera):
-    """A camera without a dome: the lens itself in the outer medium.
-
-    Raises `RigError` if the size is not positive or the pose is not one finite rigid transform.
-    """
-
-    def __post_init__(self) -> None:
-        self._pack(None, 1.0, 1.0)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class HousedCamera(Camera):
-    """A camera behind a dome or a flat port.
-
-    Raises `RigError` if the lens lies outside the inner sphere of a dome, an index or the size is
-    not valid, or the pose is not one finite rigid transform.
-    """
-
-    housing: Housing  # Sizes and material; a flat port is fixed to the camera.
-    # Refractive indices (vacuum = 1) inside and outside the housing.
-    n_air: float
-    n_water: float
-
-    def __post_init__(self) -> None:
-        self._pack(self.housing, self.n_air, self.n_water)
-
-    def _moved_medium(self, values: dict[str, float]) -> dict[str, Any]:
-        return {
-            "housing": self.housing.moved_by(values),
-            "n_air": self.n_air + values["n_air"],
-            "n_water": self.n_water + values["n_water"],
-        }

@@ -9,7 +9,8 @@ branch are done lane by lane in between.
 """
 
 import math
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 import numpy as np
@@ -121,7 +122,8 @@ class LensModel(StrEnum):
     """Equidistant with an odd polynomial in the angle, as `cv2.fisheye` (Kannala-Brandt)."""
 
 
-_COEFFICIENTS = {LensModel.OPENCV: (0, 4, 5, 8), LensModel.FISHEYE: (0, 4)}
+COEFFICIENT_COUNTS = {LensModel.OPENCV: (0, 4, 5, 8), LensModel.FISHEYE: (0, 4)}
+"""Numbers of distortion coefficients that a model takes."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -163,6 +165,17 @@ class Lens:
         """Names of the intrinsics, in the order of every intrinsics Jacobian."""
         names = _FISHEYE_NAMES if self.model is LensModel.FISHEYE else _OPENCV_NAMES
         return ("fx", "fy", "cx", "cy", *names[: len(self.distortion)])
+
+    def numbers(self) -> dict[str, float]:
+        """Return the intrinsics by their names."""
+        values = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
+        return dict(zip(self.parameter_names, values, strict=True))
+
+    def moved_by(self, step: Mapping[str, float]) -> "Lens":
+        """Return the lens with steps added to the intrinsics that are named."""
+        numbers = [value + step.get(name, 0.0) for name, value in self.numbers().items()]
+        fx, fy, cx, cy, *distortion = numbers
+        return replace(self, fx=fx, fy=fy, cx=cx, cy=cy, distortion=tuple(distortion))
 
     @property
     def max_angle(self) -> float:
@@ -273,7 +286,7 @@ def _check(lens: Lens) -> None:
         raise RigError(
             f"lens has focal lengths fx = {lens.fx}, fy = {lens.fy} px; both must be positive"
         )
-    allowed = _COEFFICIENTS[LensModel(lens.model)]
+    allowed = COEFFICIENT_COUNTS[LensModel(lens.model)]
     if len(lens.distortion) not in allowed:
         raise RigError(
             f"lens has {len(lens.distortion)} distortion coefficients; the {lens.model} model "

@@ -12,16 +12,8 @@ import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.planes import Plane
-from aqualvs.geometry.transforms import SE3
-from aqualvs.optics.camera import (
-    POSE_PARAMETERS,
-    BareCamera,
-    Camera,
-    HousedCamera,
-    Housing,
-    moved_lens,
-    moved_pose,
-)
+from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
+from aqualvs.optics.camera import POSE_PARAMETERS, Camera, Housing
 from aqualvs.optics.dome import DOME_PARAMETERS, Dome
 from aqualvs.optics.flat_port import FLAT_PARAMETERS, FlatPort
 from aqualvs.optics.lens import Lens
@@ -105,9 +97,7 @@ class Rig:
 
     def camera(self) -> Camera:
         """Return the camera as it looks into the outer medium."""
-        if self.housing is None:
-            return self.bare_camera()
-        return HousedCamera(
+        return Camera(
             size_px=self.size_px,
             lens=self.lens,
             dome_from_cam=self.dome_from_cam,
@@ -116,9 +106,9 @@ class Rig:
             n_water=self.n_water,
         )
 
-    def bare_camera(self) -> BareCamera:
+    def bare_camera(self) -> Camera:
         """Return the same camera without the housing, which ignores refraction."""
-        return BareCamera(size_px=self.size_px, lens=self.lens, dome_from_cam=self.dome_from_cam)
+        return Camera(size_px=self.size_px, lens=self.lens, dome_from_cam=self.dome_from_cam)
 
     @property
     def dome(self) -> Dome | None:
@@ -295,12 +285,12 @@ def rig_moved_by(rig: Rig, names: Sequence[str], step: FloatArray) -> Rig:
     Raises `RigError` if the moved rig is not valid.
     """
     values = dict(zip(names, np.asarray(step, np.float64).tolist(), strict=True))
-    pose = {name: values.get(name, 0.0) for name in POSE_PARAMETERS}
-    lens = {name: values.get(name, 0.0) for name in rig.lens.parameter_names}
+    *shift, wx, wy, wz = (values.get(name, 0.0) for name in POSE_PARAMETERS)
+    rotation = rotation_from_rotvec([wx, wy, wz]) @ rig.dome_from_cam.rotation
     return replace(
         rig,
-        dome_from_cam=moved_pose(rig.dome_from_cam, pose),
-        lens=moved_lens(rig.lens, lens),
+        dome_from_cam=SE3(rotation, rig.dome_from_cam.translation + np.array(shift)),
+        lens=rig.lens.moved_by(values),
         housing=None if rig.housing is None else rig.housing.moved_by(values),
         n_air=rig.n_air + values.get("n_air", 0.0),
         n_water=rig.n_water + values.get("n_water", 0.0),

@@ -14,6 +14,7 @@ of pixels, and a few pixels represent each stripe.
 """
 
 import math
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -22,7 +23,7 @@ from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.compiled import inner_kernel, lazy_kernel
 from aqualvs.geometry.linear_algebra import factorise, solve_factorised
 from aqualvs.optics.camera import Camera, parameter_names
-from aqualvs.optics.rig import Rig, RigUncertainty
+from aqualvs.optics.rig import Rig, RigUncertainty, rig_moved_by
 from aqualvs.optics.sheet import packed_sheets, sheet_distance, sheet_tangent, sheets_of
 
 # Segments of stripe that represent all of it: in total, and per laser at least.
@@ -122,13 +123,12 @@ class PostureErrors:
         self.names = tuple(name for name in uncertainty.names if sigmas[name] > 0.0)
         self.covariance = uncertainty.of(self.names)  # Shape (P, P): theirs.
         steps = {name: min(step_share * sigmas[name], largest_step) for name in self.names}
-        self._camera = camera
         self._n_lasers = len(rig.lasers)
         own = parameter_names(camera)
         columns = np.array([i for i, name in enumerate(self.names) if name in own], np.int64)
-        self._camera_steps = [(own.index(name), steps[name]) for name in self.names if name in own]
+        of_camera = {name: steps[name] for name in self.names if name in own}
         self._rig_errors = _RigErrors(
-            self._derivatives_on_lattice(),
+            _derivatives_on_lattice(replace(rig, housing=camera.housing), of_camera),
             _sheet_moves(rig, camera, steps),
             columns,
             self.covariance,
@@ -179,27 +179,27 @@ class PostureErrors:
             )
         return jacobian, covariance
 
-    def _derivatives_on_lattice(self) -> "_Lattice":
-        # Nodes of the lattice: bilinear interpolation of r^6 over it is good to 2 % in the corners.
-        lattice = (33, 25)
-        width, height = self._camera.size_px
-        n_x, n_y = lattice
-        x, y = np.meshgrid(np.linspace(0, width - 1, n_x), np.linspace(0, height - 1, n_y))
-        pixels = np.stack([x, y], axis=-1).reshape(-1, 2)
-        rays = self._camera.rays(pixels)
-        rows = [np.concatenate([rays.origins, rays.directions], axis=-1)]
-        n_parameters = len(parameter_names(self._camera))
-        for place, h in self._camera_steps:
-            step = np.zeros(n_parameters)
-            step[place] = h
-            ahead, behind = (self._camera.moved_by(s).rays(pixels) for s in (step, -step))
-            by_origin = (ahead.origins - behind.origins) / (2.0 * h)
-            by_direction = (ahead.directions - behind.directions) / (2.0 * h)
-            rows.append(np.concatenate([by_origin, by_direction], axis=-1))
-        table = np.stack(rows, axis=1)
-        _fill_blind(table, pixels)
-        scale = np.array([(n_x - 1) / (width - 1), (n_y - 1) / (height - 1)])
-        return _Lattice(np.ascontiguousarray(table.reshape(n_y, n_x, -1, 6)), scale)
+
+def _derivatives_on_lattice(rig: Rig, steps: dict[str, float]) -> _Lattice:
+    """Return the rays of a rig's camera, and their derivatives by the numbers that have steps."""
+    # Nodes of the lattice: bilinear interpolation of r^6 over it is good to 2 % in the corners.
+    lattice = (33, 25)
+    width, height = rig.size_px
+    n_x, n_y = lattice
+    x, y = np.meshgrid(np.linspace(0, width - 1, n_x), np.linspace(0, height - 1, n_y))
+    pixels = np.stack([x, y], axis=-1).reshape(-1, 2)
+    rays = rig.camera().rays(pixels)
+    rows = [np.concatenate([rays.origins, rays.directions], axis=-1)]
+    for name, h in steps.items():
+        moved = (rig_moved_by(rig, [name], np.array([step])) for step in (h, -h))
+        ahead, behind = (one.camera().rays(pixels) for one in moved)
+        by_origin = (ahead.origins - behind.origins) / (2.0 * h)
+        by_direction = (ahead.directions - behind.directions) / (2.0 * h)
+        rows.append(np.concatenate([by_origin, by_direction], axis=-1))
+    table = np.stack(rows, axis=1)
+    _fill_blind(table, pixels)
+    scale = np.array([(n_x - 1) / (width - 1), (n_y - 1) / (height - 1)])
+    return _Lattice(np.ascontiguousarray(table.reshape(n_y, n_x, -1, 6)), scale)
 
 
 def _fill_blind(table: FloatArray, pixels: FloatArray) -> None:

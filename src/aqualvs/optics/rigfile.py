@@ -24,10 +24,9 @@ from aqualvs.geometry.transforms import SE3, rotation_from_rotvec, rotvec_from_r
 from aqualvs.optics.camera import Housing
 from aqualvs.optics.dome import Dome
 from aqualvs.optics.flat_port import FlatPort
-from aqualvs.optics.lens import Lens, LensModel
+from aqualvs.optics.lens import COEFFICIENT_COUNTS, Lens, LensModel
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Laser, Rig, Window
 from aqualvs.optics.rigschema import (
-    COEFFICIENT_COUNTS,
     VERSION,
     LaserPart,
     RigFile,
@@ -324,7 +323,7 @@ def shutter_from_part(part: ShutterPart) -> Shutter:
 
 def _distortion(file: RigFile) -> tuple[float, ...]:
     values, model = file.camera.distortion, file.camera.model
-    allowed = COEFFICIENT_COUNTS[model]
+    allowed = COEFFICIENT_COUNTS[LensModel(model)]
     if len(values) not in allowed:
         raise RigError(
             f"camera.distortion has {len(values)} values; the {model} model takes "

@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 from pydantic import ConfigDict, Field
 
 from aqualvs.errors import RigError
+from aqualvs.optics.lens import COEFFICIENT_COUNTS
 from aqualvs.optics.water import N_AIR
 from aqualvs.schema import (
     Index,
@@ -48,10 +49,6 @@ class ImagePart(StrictPart):
 
     width_px: Annotated[Pixels, _said("Width of the pictures the camera was calibrated at.")]
     height_px: Annotated[Pixels, _said("Height of the pictures the camera was calibrated at.")]
-
-
-COEFFICIENT_COUNTS = {"opencv": (0, 4, 5, 8), "fisheye": (0, 4)}
-"""Numbers of distortion coefficients that a model takes."""
 
 
 def _camera_conditions(schema: dict[str, Any]) -> None:

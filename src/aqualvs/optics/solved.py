@@ -187,11 +187,10 @@ def rig_numbers(rig: Rig) -> dict[str, float]:
 
     The rotation is the rig file's: a vector that is applied after the nominal mounting.
     """
-    lens, turn = rig.lens, rig.dome_from_cam.rotation @ DOME_FROM_CAM_NOMINAL.T
+    turn = rig.dome_from_cam.rotation @ DOME_FROM_CAM_NOMINAL.T
     pose = [*rig.dome_from_cam.translation.tolist(), *rotvec_from_rotation(turn).tolist()]
-    intrinsics = (lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion)
     return {
-        **dict(zip(lens.parameter_names, intrinsics, strict=True)),
+        **rig.lens.numbers(),
         **dict(zip(POSE_PARAMETERS, pose, strict=True)),
         **({} if rig.housing is None else rig.housing.numbers()),
         "n_air": rig.n_air,

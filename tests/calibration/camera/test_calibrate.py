@@ -11,7 +11,7 @@ from aqualvs.calibration.camera.problem import fitted_camera, gain_of_coefficien
 from aqualvs.calibration.targets.targets import View
 from aqualvs.errors import CalibrationError
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
-from aqualvs.optics.camera import BareCamera
+from aqualvs.optics.camera import Camera
 from aqualvs.optics.lens import Lens, LensModel
 from dome_cases import board_points, see
 from whole import WHOLE
@@ -51,8 +51,8 @@ def _shots(
     return views
 
 
-def _camera(lens: Lens) -> BareCamera:
-    return BareCamera(size_px=SIZE, lens=lens, dome_from_cam=SE3.identity())
+def _camera(lens: Lens) -> Camera:
+    return Camera(size_px=SIZE, lens=lens, dome_from_cam=SE3.identity())
 
 
 def _numbers(lens: Lens, n: int) -> np.ndarray:

@@ -12,7 +12,7 @@ from aqualvs.calibration.solver.covariance import shared_covariance
 from aqualvs.calibration.targets.targets import View
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
-from aqualvs.optics.camera import BareCamera
+from aqualvs.optics.camera import Camera
 from aqualvs.optics.lens import Lens, LensModel
 from dome_cases import board_points, see
 from whole import WHOLE
@@ -38,7 +38,7 @@ def _bent(bend: FloatArray) -> FloatArray:
 def _views(seed: int, bend: Callable[[], FloatArray], n: int = N_VIEWS) -> list[View]:
     """Views of a board all over the picture; `bend` is asked for each."""
     rng = np.random.default_rng(seed)
-    seer = BareCamera(size_px=SIZE, lens=LENS, dome_from_cam=SE3.identity())
+    seer = Camera(size_px=SIZE, lens=LENS, dome_from_cam=SE3.identity())
     views = []
     for i in range(n):
         turn = rotation_from_rotvec(rng.normal(0.0, 0.4, 3))
