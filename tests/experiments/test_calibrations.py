@@ -30,9 +30,7 @@ def figures(plane, name="left", paper=None):
         rms_px=0.1,
         rms=1e-4,
         n_points=100,
-        n_effective=50.0,
         surfaces=("left",),
-        n_views=1,
         paper_plane=paper or plane,
         sheet="plane",
     )

@@ -65,7 +65,6 @@ class SolvedDome:
     start_poses: tuple[SE3, ...]  # Of the boards, as they best fit `start`.
     lens: CameraCalibration
     dome: DomeCalibration
-    poses: tuple[BoardPose, ...]  # What was measured of the boards.
     folder: Path  # Of the boards' pictures.
 
     @property
@@ -106,7 +105,6 @@ def solve_from_pictures(laboratory: Laboratory) -> SolvedDome:
         start_poses=problem.bundle.start.poses,
         lens=lens,
         dome=dome(start, sets, options, lens.uncertainty),
-        poses=rows,
         folder=files.dome,
     )
 

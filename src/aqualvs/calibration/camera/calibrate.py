@@ -163,8 +163,6 @@ class CameraCalibration(FittedViews):
     # Remarks for the user, in plain words.
     findings: tuple[str, ...]
 
-    n_iterations: int
-
 
 def camera(
     views: Sequence[View],
@@ -276,7 +274,6 @@ def _result(
         cross_validation_rms_px=_cross_validation(bundle, solution),
         bend_height=0.0,
         findings=(),
-        n_iterations=solution.n_iterations,
     )
 
 

@@ -349,8 +349,6 @@ class SaddleFit:
     pixels: FloatArray  # Shape (N, 2): in `image`; the starting place where not valid.
     # Shape (N,): standard deviation of a coordinate from the fit's own residual, in pixels.
     sigma: FloatArray
-    # Shape (N,): standard deviation of the blur across the edges, in pixels.
-    blur: FloatArray
     # Shape (N,): False where the pixels do not fit the model, or the corner moved too far.
     valid: BoolArray
 
@@ -399,7 +397,7 @@ def refine_saddles(
         pixels,
         quality,
     )
-    sigma, residual_share, turn, blur = quality.T
+    sigma, residual_share, turn, _ = quality.T
     side = np.sqrt(np.min(np.sum(np.square(axes), axis=1), axis=-1, initial=np.inf))
     wander = np.linalg.norm(pixels - starts, axis=1)
     # Limits of an accepted fit: move from the start in sides of a square, residual as a share of
@@ -410,4 +408,4 @@ def refine_saddles(
     max_sigma_px = 0.3
     valid = (sigma > 0.0) & (sigma < max_sigma_px) & (wander <= max_wander * side)
     valid &= (residual_share < max_residual_share) & (turn < max_turn)
-    return SaddleFit(np.where(valid[:, None], pixels, starts), sigma, blur, valid)
+    return SaddleFit(np.where(valid[:, None], pixels, starts), sigma, valid)

@@ -417,7 +417,6 @@ def _result(
         rotation_is_solved=problem.rotation_is_solved,
         cross_validation=None,
         findings=(),
-        n_iterations=solution.n_iterations,
     )
 
 

@@ -41,12 +41,8 @@ class LaserFigures:
     rms: float
     # Stripe points used.
     n_points: int
-    # Number of independent measurements that the points are worth.
-    n_effective: float
     # Surfaces that the laser was seen on.
     surfaces: tuple[str, ...]
-    # Number of pictures that it was seen in.
-    n_views: int
     # By the paper's method (Eq. 33-36), for comparison: poses by distances in space, then the
     # pseudo-inverse.
     paper_plane: Plane
@@ -63,9 +59,8 @@ class ViewFigures:
     # Of the inliers; NaN if there are none.
     rms_corners_px: float
     rms_stripes_px: float
-    # Corners found, outliers among them, and stripe points on surfaces.
+    # Corners found, and stripe points on surfaces.
     n_corners: int
-    n_corners_rejected: int
     n_stripe_points: int
     # Difference from the pose by the paper's cost (Eq. 32-33), in radians, and in metres at the
     # middle of the corners.
@@ -154,9 +149,7 @@ def _laser_figures(
         rms_px=_rms(residuals[inside], weights[inside]),
         rms=_rms(metres[inside], weights[inside]),
         n_points=int(weights.sum()),
-        n_effective=float(np.count_nonzero(inside)) / joint.correlation[i_laser],
         surfaces=tuple(solved.problem.surfaces.names[i] for i in on),
-        n_views=len({group.view for group in groups}),
         paper_plane=paper,
         sheet=words,
     )
@@ -198,14 +191,12 @@ def _view_figures(solved: SolvedLasers, i_view: int, view: PlacedView) -> ViewFi
         pose, view.spatial.dome_from_target, view.view.points.mean(axis=0)
     )
     squares = np.sum(corners[inside] ** 2, axis=1)
-    rejected = view.n_corners_rejected + int(np.count_nonzero(~inside))
     return ViewFigures(
         name=view.view.name,
         dome_from_target=pose,
         rms_corners_px=float(np.sqrt(np.mean(squares))) if len(squares) else float("nan"),
         rms_stripes_px=_rms(residuals[believed], weights[believed]),
         n_corners=len(view.view) + view.n_corners_rejected,
-        n_corners_rejected=rejected,
         n_stripe_points=len(view.placed),
         pose_angle=angle,
         pose_shift=shift,

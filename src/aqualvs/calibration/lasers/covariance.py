@@ -94,8 +94,6 @@ class JointResult:
     uncertainty: RigUncertainty
     # Shape (3 L, 3 L): covariance of the lasers' planes.
     lasers: FloatArray
-    # For every laser, the number of binned residuals that are worth one independent one.
-    correlation: tuple[float, ...]
 
 
 def joint_uncertainty(
@@ -137,7 +135,6 @@ def joint_uncertainty(
     return JointResult(
         RigUncertainty((*camera_covariance.given.names, *names), joint),
         covariance[np.ix_(mine, mine)],
-        correlation,
     )
 
 

@@ -348,7 +348,6 @@ class Solution(Generic[State]):
     scales: dict[str, float]  # The typical noise of every group whose noise was estimated.
     information: FloatArray  # Shape (P, P): of data and priors together, at the estimated noise.
     covariance: FloatArray  # Shape (P, P): inverse of `information`.
-    cost: float  # Minimum of the cost, at the estimated noise.
     converged: bool
     n_iterations: int
 
@@ -480,7 +479,6 @@ class _Run(Generic[State]):
             scales=self.typical,
             information=information,
             covariance=inverse(information),
-            cost=self._cost(self.blocks),
             converged=self.converged,
             n_iterations=self.n_iterations,
         )

@@ -30,8 +30,6 @@ class ViewFit:
     residuals: FloatArray
     # Shape (N,): mask of points that were used.
     inliers: BoolArray
-    # Estimated standard deviation of a coordinate.
-    noise_px: float
 
     @property
     def rms_px(self) -> float:
@@ -143,8 +141,6 @@ class DomeCalibration(FittedViews):
     # In plain words: what the data determined, and what not.
     findings: tuple[str, ...]
 
-    n_iterations: int
-
 
 def rms_px(residuals: FloatArray) -> float:
     """Return the root mean square length of residuals (N, 2)."""
@@ -162,7 +158,6 @@ def view_fits(
         columns = bundle.pose_columns(i)
         of_pose = covariance[np.ix_(columns, columns)] if len(columns) else np.zeros((6, 6))
         residuals = -CORNER_SIGMA_PX * solution.blocks[i].residuals
-        noise_px = CORNER_SIGMA_PX * solution.block_scales[i]
         pose, inliers = solution.state.poses[i], solution.inliers[i]
-        fits.append(ViewFit(label, target.view, pose, of_pose, residuals, inliers, noise_px))
+        fits.append(ViewFit(label, target.view, pose, of_pose, residuals, inliers))
     return tuple(fits)
