@@ -3,10 +3,6 @@
 Section 2.2 of the paper solves for the index alone. Here the uncertainty of the target's place and
 of the camera's numbers counts too; see `water_index.filter`.
 
-A jump of the index is detected by a two-sided cumulative sum over the normalised innovations of the
-frames (`CusumTest`; Page 1954, Continuous inspection schemes, Biometrika 41, 100,
-doi:10.1093/biomet/41.1-2.100).
-
 `calibrate_water` applies the estimator to a set of pictures, as `aqualvs calibrate water` reports
 it.
 """
@@ -31,82 +27,21 @@ from aqualvs.calibration.water_index.filter import (
     compare,
 )
 from aqualvs.calibration.water_index.state import (
+    ANCHOR,
     FIRST_CAMERA,
+    POSE,
+    CusumTest,
     IndexOptions,
     IndexPrior,
     IndexReading,
     IndexState,
     IndexStep,
-    Knowledge,
     N,
     contradicts,
 )
 from aqualvs.errors import CalibrationError, RigError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.optics.rig import Rig, RigUncertainty
-
-
-@dataclass(slots=True)
-class CusumTest:
-    """Two-sided cumulative sum (CUSUM) test of the innovations of frames."""
-
-    # Standard deviation of the innovations over blocks of frames, at least 1: factor on the noise
-    # of corners, because the errors of neighbouring corners and frames are correlated.
-    inflation: float = 1.0
-
-    _sums: list[float] = field(default_factory=lambda: [0.0, 0.0])
-    _lengths: list[int] = field(default_factory=lambda: [0, 0])
-    _block: list[float] = field(default_factory=list)
-    _n_blocks: int = 0
-
-    def add(self, standardised: float) -> int:
-        """Add the innovation of a frame, in standard deviations.
-
-        Returns the number of frames since the start of the change, this one included, if it raises
-        the alarm; else 0.
-        """
-        # Change to be detected: one standard deviation of a frame.
-        allowance = 0.5
-        # Independent normal innovations give a false alarm every exp(2 * 0.5 * 21) frames: years at
-        # 25 fps.
-        limit = 20.0
-        # Limit of a single frame, so that one wrong picture raises no alarm; four in a row do.
-        largest = 7.0
-        for side, sign in enumerate((1.0, -1.0)):
-            bounded = min(max(sign * standardised, -largest), largest)
-            total = max(self._sums[side] + bounded - allowance, 0.0)
-            self._sums[side] = total
-            self._lengths[side] = self._lengths[side] + 1 if total > 0.0 else 0
-            if total > limit:
-                began = self._lengths[side]
-                self.forget()
-                return began
-        self._spread(standardised)
-        return 0
-
-    @property
-    def quiet(self) -> bool:
-        """True while both sums are zero."""
-        return not any(self._lengths)
-
-    def forget(self) -> None:
-        """Reset the sums, as after a jump; keep the inflation."""
-        self._sums, self._lengths, self._block = [0.0, 0.0], [0, 0], []
-
-    def _spread(self, standardised: float) -> None:
-        self._block.append(standardised)
-        # Compression repeats its errors over a group of pictures: frames are correlated that long.
-        block = 12
-        memory = 100
-        if len(self._block) < block:
-            return
-        self._n_blocks += 1
-        square = min(float(np.sum(self._block)) ** 2 / block, 9.0)
-        share = 1.0 / min(self._n_blocks + 8, memory)
-        # Innovations are in units of the inflated noise: a spread above 1 raises the inflation.
-        squared = self.inflation**2 * (1.0 + share * (square - 1.0))
-        self.inflation = float(np.sqrt(min(max(squared, 1.0), 100.0)))
-        self._block = []
 
 
 class _FilterOptions(NamedTuple):
@@ -126,6 +61,9 @@ class _FilterOptions(NamedTuple):
 
 
 _FILTER = _FilterOptions()
+# Number of standard deviations beyond which the target counts as moved.
+_MOVED = 4.0
+_LOST_FRAMES = 10
 
 
 @dataclass(slots=True)
@@ -334,7 +272,15 @@ class IndexEstimator:
         if own is not None and prior is not None:
             self._contradicted = contradicts(own, prior, self._contradicted)
         sigma_frame = self._sigma_frame * self._test.inflation
-        joint, known = self.state, self._knowledge(sigma_frame)
+        joint = self.state
+        observable = self._is_observable(own, joint)
+        about_sight = "" if observable or own is None else self._about_sight(own, sigma_frame)
+        remarks = (
+            about_sight,
+            self._about_prior(own),
+            self._about_place(joint),
+            self._about_lost(),
+        )
         unknown = (math.nan, math.inf) if prior is None else (prior.n, prior.sigma)
         n, sigma = unknown if joint is None else (joint.n, joint.sigma)
         return IndexReading(
@@ -350,27 +296,91 @@ class IndexEstimator:
             sigma_frame=math.inf if update is None else sigma_frame,
             n_points=0 if update is None else update.used,
             rms_px=math.nan if update is None else update.rms,
-            observable=known.observable,
+            observable=observable,
             prior_used=prior is not None and not self._contradicted,
             step=step,
-            remarks=known.remarks(),
+            remarks=tuple(remark for remark in remarks if remark),
         )
 
-    def _knowledge(self, sigma_frame: float) -> Knowledge:
-        return Knowledge(
-            own=self._own,
-            joint=self.state,
-            prior=self.prior,
-            contradicted=self._contradicted,
-            since_prior=self._since_prior,
-            sigma_frame=sigma_frame,
-            decentring=None
-            if self.rig.flat_port is not None
-            else float(np.linalg.norm(self.rig.dome_from_cam.translation)),
-            n_lost=self._n_lost,
-            moved=self._moved,
-            n_camera=len(self._model.camera_names),
-            options=self.options,
+    def _is_observable(self, own: IndexState | None, joint: IndexState | None) -> bool:
+        """Return whether the pictures determine the index, by the states without and with prior."""
+        if own is None or joint is None or self._moved or self._n_lost >= _LOST_FRAMES:
+            return False
+        largest = self.options.largest_sigma
+        if self.prior is None or self._contradicted:
+            return own.sigma < largest
+        alone = math.sqrt(self.prior.sigma**2 + self._since_prior)
+        # After a step the prior is of another medium; its information on the target stays valid.
+        sigma = joint.sigma if alone > largest else own.sigma
+        return sigma < min(alone, largest)
+
+    def _about_sight(self, own: IndexState, sigma_frame: float) -> str:
+        """Return why the index is not observable; `sigma_frame` is its noise from one frame."""
+        if self._moved or self._n_lost >= _LOST_FRAMES:
+            return ""
+        if sigma_frame > self.options.largest_sigma:
+            lens = "the target is small, "
+            if self.rig.flat_port is None:
+                decentring = float(np.linalg.norm(self.rig.dome_from_cam.translation))
+                lens = f"the lens is {decentring * 1e3:.1f} mm from the dome's centre, "
+            return (
+                f"unobservable: {lens}so the picture of the target hardly moves with the index; "
+                "give temperature and salinity"
+            )
+        if self.prior is not None and not self._contradicted:
+            return (
+                f"unobservable: the pictures alone know the index to {own.sigma:.1e}, the "
+                f"prior ({self.prior.source}) to {self.prior.sigma:.1e}; changes are still seen"
+            )
+        return (
+            f"unobservable: what is not known of the target's place and of the camera leaves the "
+            f"index open by {own.sigma:.1e}; measure them better, begin with pictures in "
+            "air, or give temperature and salinity; changes are still seen"
+        )
+
+    def _about_prior(self, own: IndexState | None) -> str:
+        if self.prior is None or own is None or not self._contradicted:
+            return ""
+        n, sigma = float(own.mean[ANCHOR]), math.sqrt(own.covariance[ANCHOR, ANCHOR])
+        return (
+            f"the pictures give {n:.4f} +- {sigma:.4f}, the prior ({self.prior.source}) "
+            f"{self.prior.n:.4f} +- {self.prior.sigma:.4f}: a leak, a pollutant, another medium "
+            "than the prior's, or a target that is not where target.yaml has it; the prior is "
+            "left out"
+        )
+
+    def _about_place(self, joint: IndexState | None) -> str:
+        if self._moved:
+            return (
+                "the target or the lens has moved: the index cannot be trusted until the target "
+                "is measured anew"
+            )
+        if joint is None:
+            return ""
+        moved = np.abs(joint.mean[POSE])
+        if np.any(moved > _MOVED * self.options.pose_sigmas):
+            turn, shift = np.rad2deg(np.linalg.norm(moved[:3])), 1e3 * np.linalg.norm(moved[3:])
+            return (
+                f"the target seems {shift:.2f} mm and {turn:.2f}° from where target.yaml has it, "
+                "more than its place is said to be uncertain"
+            )
+        corners = joint.mean[FIRST_CAMERA + len(self.camera_names) :]
+        off = float(np.sqrt(np.mean(corners**2))) if len(corners) else 0.0
+        # Ratio of the corners' errors to the expected ones that is reported.
+        crooked = 2.0
+        if off > crooked * self.options.sigma_corner_px:
+            return (
+                f"corners are always off by {off:.2f} px, more than was assumed; check the "
+                "target's print and the camera's calibration"
+            )
+        return ""
+
+    def _about_lost(self) -> str:
+        if self._n_lost < _LOST_FRAMES:
+            return ""
+        return (
+            f"the target has not been where it should be for {self._n_lost} frames: it is "
+            "hidden or has moved, and the index is that from before"
         )
 
 

@@ -1,12 +1,15 @@
 """State of the index estimate: index and constants of rig and target, jointly Gaussian.
 
 With it: the prior of a medium's index, before a camera has looked at it (`IndexPrior`, from air or
-from temperature and salinity), and the options, readings, alarms and remarks that an estimate
-reports.
+from temperature and salinity), and the options, readings and alarms that an estimate reports.
+
+A jump of the index is detected by a two-sided cumulative sum over the normalised innovations of the
+frames (`CusumTest`; Page 1954, Continuous inspection schemes, Biometrika 41, 100,
+doi:10.1093/biomet/41.1-2.100).
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Self
 
 import numpy as np
@@ -256,11 +259,6 @@ def first_state(
     return IndexState(time, mean, covariance, (), sigma**2, n, np.zeros((0, 2)))
 
 
-# Number of standard deviations beyond which the target counts as moved.
-_MOVED = 4.0
-_LOST_FRAMES = 10
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class IndexOptions:
     """Options: assumptions about target and medium.
@@ -367,115 +365,67 @@ class IndexReading:
         return not self.refused
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Knowledge:
-    """Data that decide whether an index is observable, and its remarks."""
+@dataclass(slots=True)
+class CusumTest:
+    """Two-sided cumulative sum (CUSUM) test of the innovations of frames."""
 
-    # Without and with the prior; None before the first used frame.
-    own: IndexState | None
-    joint: IndexState | None
-    # As given.
-    prior: IndexPrior | None
-    # Whether the prior disagrees with the pictures.
-    contradicted: bool
-    # Variance of the index added by drift and steps since the prior was given.
-    since_prior: float
-    # Noise of the index from one frame.
-    sigma_frame: float
-    # Distance of the lens from the dome's centre, metres; None behind a flat port.
-    decentring: float | None
-    # Number of frames since the target was last at its place.
-    n_lost: int
-    # Whether a step was not caused by the medium.
-    moved: bool
-    # Number of the camera's uncertain numbers in the states.
-    n_camera: int
-    # As given.
-    options: IndexOptions
+    # Standard deviation of the innovations over blocks of frames, at least 1: factor on the noise
+    # of corners, because the errors of neighbouring corners and frames are correlated.
+    inflation: float = 1.0
+
+    _sums: list[float] = field(default_factory=lambda: [0.0, 0.0])
+    _lengths: list[int] = field(default_factory=lambda: [0, 0])
+    _block: list[float] = field(default_factory=list)
+    _n_blocks: int = 0
+
+    def add(self, standardised: float) -> int:
+        """Add the innovation of a frame, in standard deviations.
+
+        Returns the number of frames since the start of the change, this one included, if it raises
+        the alarm; else 0.
+        """
+        # Change to be detected: one standard deviation of a frame.
+        allowance = 0.5
+        # Independent normal innovations give a false alarm every exp(2 * 0.5 * 21) frames: years at
+        # 25 fps.
+        limit = 20.0
+        # Limit of a single frame, so that one wrong picture raises no alarm; four in a row do.
+        largest = 7.0
+        for side, sign in enumerate((1.0, -1.0)):
+            bounded = min(max(sign * standardised, -largest), largest)
+            total = max(self._sums[side] + bounded - allowance, 0.0)
+            self._sums[side] = total
+            self._lengths[side] = self._lengths[side] + 1 if total > 0.0 else 0
+            if total > limit:
+                began = self._lengths[side]
+                self.forget()
+                return began
+        self._spread(standardised)
+        return 0
 
     @property
-    def observable(self) -> bool:
-        """True if the pictures determine the index."""
-        if self.own is None or self.joint is None or self.moved or self.n_lost >= _LOST_FRAMES:
-            return False
-        if self.prior is None or self.contradicted:
-            return self.own.sigma < self.options.largest_sigma
-        alone = math.sqrt(self.prior.sigma**2 + self.since_prior)
-        # After a step the prior is of another medium; its information on the target stays valid.
-        stepped = alone > self.options.largest_sigma
-        sigma = self.joint.sigma if stepped else self.own.sigma
-        return sigma < min(alone, self.options.largest_sigma)
+    def quiet(self) -> bool:
+        """True while both sums are zero."""
+        return not any(self._lengths)
 
-    def remarks(self) -> tuple[str, ...]:
-        """Return remarks for the user, one sentence each."""
-        found = [self._about_sight(), self._about_prior(), self._about_place()]
-        if self.n_lost >= _LOST_FRAMES:
-            found.append(
-                f"the target has not been where it should be for {self.n_lost} frames: it is "
-                "hidden or has moved, and the index is that from before"
-            )
-        return tuple(remark for remark in found if remark)
+    def forget(self) -> None:
+        """Reset the sums, as after a jump; keep the inflation."""
+        self._sums, self._lengths, self._block = [0.0, 0.0], [0, 0], []
 
-    def _about_sight(self) -> str:
-        if self.observable or self.own is None or self.moved or self.n_lost >= _LOST_FRAMES:
-            return ""
-        if self.sigma_frame > self.options.largest_sigma:
-            lens = "the target is small, "
-            if self.decentring is not None:
-                lens = f"the lens is {self.decentring * 1e3:.1f} mm from the dome's centre, "
-            return (
-                f"unobservable: {lens}so the picture of the target hardly moves with the index; "
-                "give temperature and salinity"
-            )
-        if self.prior is not None and not self.contradicted:
-            return (
-                f"unobservable: the pictures alone know the index to {self.own.sigma:.1e}, the "
-                f"prior ({self.prior.source}) to {self.prior.sigma:.1e}; changes are still seen"
-            )
-        return (
-            f"unobservable: what is not known of the target's place and of the camera leaves the "
-            f"index open by {self.own.sigma:.1e}; measure them better, begin with pictures in "
-            "air, or give temperature and salinity; changes are still seen"
-        )
-
-    def _about_prior(self) -> str:
-        if self.prior is None or self.own is None or not self.contradicted:
-            return ""
-        n = float(self.own.mean[ANCHOR])
-        sigma = math.sqrt(self.own.covariance[ANCHOR, ANCHOR])
-        return (
-            f"the pictures give {n:.4f} +- {sigma:.4f}, the prior ({self.prior.source}) "
-            f"{self.prior.n:.4f} +- {self.prior.sigma:.4f}: a leak, a pollutant, another medium "
-            "than the prior's, or a target that is not where target.yaml has it; the prior is "
-            "left out"
-        )
-
-    def _about_place(self) -> str:
-        if self.moved:
-            return (
-                "the target or the lens has moved: the index cannot be trusted until the target "
-                "is measured anew"
-            )
-        if self.joint is None:
-            return ""
-        moved = np.abs(self.joint.mean[POSE])
-        sigmas = self.options.pose_sigmas
-        if np.any(moved > _MOVED * sigmas):
-            turn, shift = np.rad2deg(np.linalg.norm(moved[:3])), 1e3 * np.linalg.norm(moved[3:])
-            return (
-                f"the target seems {shift:.2f} mm and {turn:.2f}° from where target.yaml has it, "
-                "more than its place is said to be uncertain"
-            )
-        corners = self.joint.mean[POSE.stop + self.n_camera :]
-        off = float(np.sqrt(np.mean(corners**2))) if len(corners) else 0.0
-        # Ratio of the corners' errors to the expected ones that is reported.
-        crooked = 2.0
-        if off > crooked * self.options.sigma_corner_px:
-            return (
-                f"corners are always off by {off:.2f} px, more than was assumed; check the "
-                "target's print and the camera's calibration"
-            )
-        return ""
+    def _spread(self, standardised: float) -> None:
+        self._block.append(standardised)
+        # Compression repeats its errors over a group of pictures: frames are correlated that long.
+        block = 12
+        memory = 100
+        if len(self._block) < block:
+            return
+        self._n_blocks += 1
+        square = min(float(np.sum(self._block)) ** 2 / block, 9.0)
+        share = 1.0 / min(self._n_blocks + 8, memory)
+        # Innovations are in units of the inflated noise: a spread above 1 raises the inflation.
+        squared = self.inflation**2 * (1.0 + share * (square - 1.0))
+        self.inflation = float(np.sqrt(min(max(squared, 1.0), 100.0)))
+        self._block = []
 
 
 def contradicts(own: IndexState, prior: IndexPrior, before: bool) -> bool:
