@@ -24,10 +24,10 @@ from aqualvs.errors import OptionError, RigError
 from aqualvs.geometry.transforms import SE3
 from aqualvs.optics.lens import Lens, LensModel
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig
-from aqualvs.optics.rigfile import housing_of, load_rig, shutter_from_part
-from aqualvs.optics.rigschema import ShutterPart, Tilt, range_fault
+from aqualvs.optics.rigfile import housing_of, load_rig, shutter_from_part, water_index
+from aqualvs.optics.rigschema import ShutterPart, Tilt, WaterPart, range_fault
 from aqualvs.optics.shutter import AT_ONCE, Shutter
-from aqualvs.optics.water import N_AIR, seawater_index_vacuum
+from aqualvs.optics.water import N_AIR
 from aqualvs.schema import (
     Index,
     NotNegative,
@@ -110,14 +110,6 @@ class LensDesign(StrictPart):
     centring_mm: NotNegative = 1.0
 
 
-class WaterDesign(StrictPart):
-    """Schema of `water`: its index, or the values to compute it from."""
-
-    n: Index | None = None
-    temperature_c: Number | None = None
-    salinity_permille: Number | None = None
-
-
 class LasersDesign(StrictPart):
     """Schema of `lasers`, evenly round the dome."""
 
@@ -183,7 +175,7 @@ class DesignFile(StrictPart):
     dome: DomeDesign | None = None
     flat: FlatDesign | None = None
     lens: LensDesign = LensDesign()
-    water: WaterDesign = WaterDesign(n=1.3345)
+    water: WaterPart = WaterPart(n=1.3345)
     lasers: LasersDesign | None = None
     mounts: Annotated[list[MountPart], Field(min_length=1)] | None = None
     working_range_mm: Annotated[list[_Length], Field(min_length=2, max_length=2)]
@@ -287,7 +279,7 @@ def _design(file: DesignFile, folder: Path) -> Design:
         dome_from_cam=SE3(DOME_FROM_CAM_NOMINAL, position),
         housing=housing_of(file.dome, file.flat),
         n_air=N_AIR,
-        n_water=_water_index(file.water),
+        n_water=water_index(file.water, N_AIR),
         lasers=(),
         working_range=(near, far),
         shutter=shutter,
@@ -334,16 +326,6 @@ def _camera(camera: CameraDesign, folder: Path) -> tuple[Lens, tuple[int, int], 
     model = LensModel(camera.model)
     lens = Lens(model=model, fx=focal, fy=focal, cx=middle[0], cy=middle[1])
     return lens, (width, height), given
-
-
-def _water_index(water: WaterDesign) -> float:
-    if water.n is not None:
-        if water.temperature_c is not None or water.salinity_permille is not None:
-            raise OptionError("water gives n and what it would follow from; keep one of them")
-        return water.n
-    if water.temperature_c is None or water.salinity_permille is None:
-        raise OptionError("water has no index; write n, or temperature_c and salinity_permille")
-    return float(seawater_index_vacuum(water.temperature_c, water.salinity_permille, n_air=N_AIR))
 
 
 def _mounts(file: DesignFile) -> tuple[Mount, ...]:

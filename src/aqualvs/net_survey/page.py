@@ -23,13 +23,13 @@ from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.net_survey.comparison import Comparison, HoleState, OnWall, Site
 from aqualvs.net_survey.growth import Growth
 from aqualvs.net_survey.tables import (
+    STATE_TITLES,
     bearing_deg,
     by_state,
     dives_text,
     place_text,
     rate_text,
     size_text,
-    state_title,
     summary_lines,
     verdict,
 )
@@ -54,15 +54,6 @@ _MARKS: dict[HoleState, dict[str, Any]] = {
     HoleState.GONE: {"marker": "X", "markerfacecolor": "#ffffff", "markersize": 10},
     HoleState.FIRST_LOOK: {"marker": "D", "markerfacecolor": "#f7c6c7", "markersize": 8},
     HoleState.NOT_PASSED: {"marker": "s", "markerfacecolor": "#c9ced3", "markersize": 8},
-}
-_NAMES = {
-    HoleState.NEW: "new hole",
-    HoleState.GROWN: "grown",
-    HoleState.SMALLER: "smaller",
-    HoleState.SAME: "same",
-    HoleState.GONE: "gone",
-    HoleState.FIRST_LOOK: "not looked at before",
-    HoleState.NOT_PASSED: "not looked at now",
 }
 _STYLE: dict[Any, Any] = {**STYLE, "axes.grid": False, "hatch.linewidth": 0.5}
 
@@ -223,7 +214,7 @@ def _title(wall: OnWall) -> str:
 def _legend(figure: Figure, wall: OnWall) -> None:
     states = {one.state for one in wall.sites}
     shown: dict[str, Line2D | Patch] = {
-        _NAMES[state]: Line2D(
+        "new hole" if state is HoleState.NEW else state.value: Line2D(
             [], [], linestyle="", markeredgecolor=DARK, markeredgewidth=0.9, **style
         )
         for state, style in _MARKS.items()
@@ -346,7 +337,7 @@ def _hole_row(one: Site, wall: OnWall) -> tuple[str, ...]:
     dates = wall.history.dates
     seen = np.flatnonzero(np.isfinite(one.sizes))
     return (
-        state_title(one.state),
+        STATE_TITLES[one.state],
         place_text(one.place, wall.frame),
         size_text(one).replace("->", "\u2192"),
         dates[seen[0]].isoformat(),

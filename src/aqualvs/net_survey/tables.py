@@ -12,16 +12,7 @@ from aqualvs.net_survey.growth import CellChange, Growth
 from aqualvs.nets.tables import Cell, write_table
 from aqualvs.text import count_text
 
-_ORDER = (
-    HoleState.NEW,
-    HoleState.GROWN,
-    HoleState.GONE,
-    HoleState.FIRST_LOOK,
-    HoleState.NOT_PASSED,
-    HoleState.SMALLER,
-    HoleState.SAME,
-)
-_TITLES = {
+STATE_TITLES = {
     HoleState.NEW: "new",
     HoleState.GROWN: "grown",
     HoleState.GONE: "gone, mended or missed this time",
@@ -30,6 +21,7 @@ _TITLES = {
     HoleState.SMALLER: "smaller, mended in part or seen in part",
     HoleState.SAME: "the same",
 }
+"""How sentences call what became of a hole; what matters most comes first."""
 
 
 def dives_text(result: Comparison) -> str:
@@ -48,11 +40,6 @@ def summary_lines(result: Comparison) -> list[str]:
         lines += [*_shift_lines(wall), _growth_line(wall), *_where_lines(wall)]
         lines += [*_mean_lines(wall), *_hole_lines(wall), *_not_looked(wall)]
     return lines + [f"warning: {one}" for one in result.warnings]
-
-
-def state_title(state: HoleState) -> str:
-    """Return how sentences call what became of a hole."""
-    return _TITLES[state]
 
 
 def place_text(place: FloatArray, frame: WallFrame) -> str:
@@ -85,7 +72,7 @@ def verdict(growth: Growth) -> str:
 
 def by_state(sites: Sequence[Site]) -> dict[HoleState, list[Site]]:
     """Return the holes by what became of them, what matters most first."""
-    found = {state: [one for one in sites if one.state is state] for state in _ORDER}
+    found = {state: [one for one in sites if one.state is state] for state in STATE_TITLES}
     return {state: some for state, some in found.items() if some}
 
 
@@ -189,7 +176,7 @@ def _hole_lines(wall: OnWall) -> Iterator[str]:
         return
     max_listed = 20
     for state, sites in by_state(wall.sites).items():
-        yield f"holes {_TITLES[state]}: {len(sites)}"
+        yield f"holes {STATE_TITLES[state]}: {len(sites)}"
         if state is HoleState.SAME:
             yield from _since(wall, sites)
             continue

@@ -31,6 +31,7 @@ from aqualvs.optics.rigschema import (
     LaserPart,
     RigFile,
     ShutterPart,
+    WaterPart,
     missing_text,
     parse_rig,
     range_fault,
@@ -343,16 +344,20 @@ def _position_mm(file: RigFile) -> list[float]:
 
 
 def _water_index(file: RigFile) -> float:
-    """Return the index outside relative to vacuum: given, from Quan & Fry (1995), or that of air.
-
-    Where nothing refracts it is of no consequence and need not be said.
-    """
-    water, n_air = file.water, file.n_air
-    if water is None:
+    """Return the index outside; where nothing refracts it need not be said, and is that of air."""
+    if file.water is None:
         housed = file.dome is not None or file.flat is not None
         if housed or any(laser.window is not None for laser in file.lasers):
             raise RigError(missing_text("water"))
-        return n_air
+        return file.n_air
+    return water_index(file.water, file.n_air)
+
+
+def water_index(water: WaterPart, n_air: float) -> float:
+    """Return the index relative to vacuum that a file's `water` gives, or Quan & Fry (1995) do.
+
+    Raises `RigError` if it gives none, or more than one.
+    """
     measured = (water.temperature_c, water.salinity_permille, water.wavelength_nm)
     if water.n is not None:
         if any(value is not None for value in measured):

@@ -8,14 +8,9 @@ import pytest
 
 from aqualvs.calibration.solver.bundle import moved_target
 from aqualvs.calibration.targets.targets import View
-from aqualvs.calibration.water_index.estimator import (
-    N_WATER,
-    CusumTest,
-    IndexEstimator,
-    calibrate_water,
-)
+from aqualvs.calibration.water_index.estimator import N_WATER, IndexEstimator, calibrate_water
 from aqualvs.calibration.water_index.filter import MAX_POINTS, FrameCorners
-from aqualvs.calibration.water_index.state import IndexOptions, IndexPrior, IndexReading
+from aqualvs.calibration.water_index.state import CusumTest, IndexOptions, IndexPrior, IndexReading
 from aqualvs.errors import CalibrationError, OptionError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.transforms import SE3

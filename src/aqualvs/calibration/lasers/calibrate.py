@@ -35,7 +35,7 @@ from aqualvs.calibration.lasers.laser_assignment import (
 from aqualvs.calibration.lasers.solve import InitialGuess, paper_planes, solve_lasers, tolerance_px
 from aqualvs.calibration.lasers.stripes_on_planes import TargetSurfaces
 from aqualvs.calibration.lasers.views import LaserView, PlacedView, place_views, pooled
-from aqualvs.errors import CalibrationError, OptionError
+from aqualvs.errors import CalibrationError, OptionError, check_not_negative
 from aqualvs.geometry.arrays import IntArray
 from aqualvs.optics.rig import Laser, Rig, RigUncertainty
 
@@ -65,10 +65,7 @@ class LaserOptions:
         """Refuse values that make no sense."""
         if self.n_lasers is not None and self.n_lasers < 1:
             raise OptionError(f"n_lasers is {self.n_lasers}; use 1 or more")
-        if not self.sigma_n_medium >= 0.0:
-            raise OptionError(f"sigma_n_medium is {self.sigma_n_medium}; use 0 or more")
-        if not self.stripe_bias_px >= 0.0:
-            raise OptionError(f"stripe_bias_px is {self.stripe_bias_px}; use 0 or more")
+        check_not_negative("lasers", self, "sigma_n_medium", "stripe_bias_px")
 
 
 def calibrate_lasers(

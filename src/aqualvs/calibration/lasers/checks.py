@@ -15,7 +15,7 @@ from scipy.optimize import linear_sum_assignment
 from aqualvs.calibration.lasers.covariance import JointResult
 from aqualvs.calibration.lasers.laser_assignment import JudgedPlane, LaserAssignment, PlaneVerdict
 from aqualvs.calibration.lasers.problem import LaserProblem, LaserState, distances_of
-from aqualvs.calibration.lasers.stripes_on_planes import TargetSurfaces
+from aqualvs.calibration.lasers.stripes_on_planes import TargetSurfaces, way_along
 from aqualvs.calibration.lasers.views import LaserView, PlacedView, pose_difference
 from aqualvs.calibration.solver.bundle import CORNER_SIGMA_PX
 from aqualvs.calibration.solver.least_squares import Solution
@@ -444,8 +444,7 @@ def _stripes_misfit(solved: SolvedLasers) -> float:
         if np.count_nonzero(seen) < _MIN_BINS:
             continue
         weights = 1.0 / group.sigma_px[seen]
-        along = group.pixels[seen] - group.pixels[seen].mean(axis=0)
-        way = along @ np.linalg.svd(along, full_matrices=False)[2][0]
+        way = way_along(group.pixels[seen])
         basis = np.stack([np.ones(len(way)), way], axis=-1) * weights[:, None]
         values = residuals[seen] * weights
         left = values - basis @ np.linalg.lstsq(basis, values, rcond=None)[0]

@@ -359,6 +359,13 @@ def binned(i_view: int, i_laser: int, points: StripePoints, surface: IntArray) -
     )
 
 
+def way_along(points: FloatArray) -> FloatArray:
+    """Return how far along their line points (N, K) lie from their middle, shape (N,)."""
+    offsets = points - points.mean(axis=0)
+    way: FloatArray = offsets @ np.linalg.svd(offsets, full_matrices=False)[2][0]
+    return way
+
+
 def _ordered(pixels: FloatArray, surface: IntArray) -> tuple[IntArray, IntArray]:
     """Return the order of points along their stripe, by surface, and each bin's first index."""
     order, starts, n = [], [], 0
@@ -366,8 +373,7 @@ def _ordered(pixels: FloatArray, surface: IntArray) -> tuple[IntArray, IntArray]
     gap_px = 10.0
     for i in np.unique(surface):
         mine = np.flatnonzero(surface == i)
-        offsets = pixels[mine] - pixels[mine].mean(axis=0)
-        way = offsets @ np.linalg.svd(offsets, full_matrices=False)[2][0]
+        way = way_along(pixels[mine])
         along = np.argsort(way, kind="stable")
         order.append(mine[along])
         first = last = -np.inf

@@ -25,7 +25,7 @@ from aqualvs.calibration.targets.targets import View
 from aqualvs.errors import CalibrationError
 from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.planes import Plane
-from aqualvs.geometry.transforms import SE3
+from aqualvs.geometry.transforms import SE3, rotvec_from_rotation
 from aqualvs.optics.camera import Camera
 
 # A corner belongs to a plane of the box within this distance, in metres.
@@ -89,13 +89,9 @@ def planes_with_points(view: View, planes: Sequence[Plane]) -> tuple[int, ...]:
 
 def pose_difference(a: SE3, b: SE3, middle: FloatArray) -> tuple[float, float]:
     """Return the difference of two poses: angle (radians), and shift of a point `middle` (m)."""
-    turn = a.rotation @ b.rotation.T
-    # Accurate near zero, unlike the arc cosine of the trace.
-    sine = 0.5 * np.linalg.norm(
-        [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
-    )
-    angle = float(np.arctan2(sine, 0.5 * (np.trace(turn) - 1.0)))
-    return angle, float(np.linalg.norm(a.apply(middle) - b.apply(middle)))
+    turn = rotvec_from_rotation(a.rotation @ b.rotation.T)
+    shift = a.apply(middle) - b.apply(middle)
+    return float(np.linalg.norm(turn)), float(np.linalg.norm(shift))
 
 
 @dataclass(frozen=True, slots=True)
