@@ -57,7 +57,7 @@ def _camera_conditions(schema: dict[str, Any]) -> None:
         {
             # A model that is left out is opencv.
             "if": {
-                "properties": {"model": {"const": model}},
+                "properties": {"model": {"const": model.value}},
                 **({} if model == "opencv" else {"required": ["model"]}),
             },
             "then": {
