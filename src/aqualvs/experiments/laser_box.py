@@ -249,9 +249,7 @@ def _draw_box(
     for i in range(len(solved.rig.lasers)):
         points = view.stripes.pixels[laser_of == i]
         picture.plot(*points.T, ".", color=laser_colour(i), markersize=1.6)
-    picture.set(xticks=[], yticks=[])
-    picture.grid(visible=False)
-    picture.spines[:].set_visible(False)
+    picture.set_axis_off()
     names = [laser.name for laser in laboratory.rig.lasers]
     _draw_errors(
         angles,

@@ -405,9 +405,7 @@ def _draw_seen(figure: Figure, frame: Frame) -> None:
     left.set_title("(a) as seen", loc="left")
     right.set_title(f"(b) above {level} grey levels", loc="left")
     for axes in (left, right):
-        axes.set_xticks([])
-        axes.set_yticks([])
-        axes.grid(visible=False)
+        axes.set_axis_off()
 
 
 def _draw_filtered(figure: Figure, papers: FilteredPeaks, scan: Scan, rig: Rig, laser: int) -> None:

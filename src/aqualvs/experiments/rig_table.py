@@ -179,9 +179,8 @@ def _draw(figure: Figure, laboratory: Laboratory, traced: Bending) -> None:
     for i, sheet in enumerate(sheets_of(rig)):
         _draw_stripes(view, rig, sheet, i)
     width, height = rig.size_px
-    view.set(xlim=(0, width), ylim=(height, 0), xticks=[], yticks=[])
-    view.grid(visible=False)
-    view.spines[:].set_visible(False)
+    view.set(xlim=(0, width), ylim=(height, 0))
+    view.set_axis_off()
     view.legend(loc="upper center", bbox_to_anchor=(0.5, -0.02), ncols=3)
     _draw_section(section, rig, traced)
 

@@ -30,12 +30,11 @@ from aqualvs.experiments.laboratory import Laboratory, calibrated_rig
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
-from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig
+from aqualvs.optics.rig import Rig
 from aqualvs.optics.solved import rig_uncertainty
 from aqualvs.report.figure_style import BLUE, GREY, OURS, PAPER, TRUTH
 from aqualvs.simulation import calibration_targets as targets
-from aqualvs.simulation.calibration_targets import plate_in_view
-from aqualvs.simulation.panels import PanelRenderer, PanelScene, RoomLight
+from aqualvs.simulation.panels import PanelRenderer, RoomLight
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,9 +90,7 @@ def _draw_target(
 ) -> None:
     picture, chart = figure.subplots(1, 2, width_ratios=(1.0, 1.25))
     picture.imshow(example)
-    picture.set(xticks=[], yticks=[])
-    picture.grid(visible=False)
-    picture.spines[:].set_visible(False)
+    picture.set_axis_off()
     off = spread.lens_mm > 0.0
     lens = spread.lens_mm[off]
     for sigma, colour, name in (
@@ -159,7 +156,9 @@ def cruise(laboratory: Laboratory, waters: Sequence[float] = WATERS) -> Cruise:
     views: list[View] = []
     picture = np.zeros((1, 1, 3), np.uint8)
     for i, n in enumerate(media):
-        picture = PanelRenderer(rig.in_water(n).camera()).render(_scene(truly, i), rng)
+        picture = PanelRenderer(rig.in_water(n).camera()).render(
+            targets.plate_scene(truly, i, _ROOM), rng
+        )
         laboratory.rendered(i, len(media))
         found = _found(picture, markers, f"picture_{i}")
         for _ in range(_SETUP.frames):
@@ -170,8 +169,7 @@ def cruise(laboratory: Laboratory, waters: Sequence[float] = WATERS) -> Cruise:
 
 def _plate(laboratory: Laboratory, rig: Rig) -> tuple[targets.Marked, MarkerSet]:
     """Return the plate where it is meant to be, and its markers as the file says."""
-    plate = targets.marker_plate()
-    plate = targets.moved(plate, plate_in_view(rig, plate.panel.texture.size, _SETUP.plate_far))
+    plate = targets.plate_before(rig, _SETUP.plate_far)
     path = laboratory.folder("index") / "target.yaml"
     targets.write_yaml(path, targets.target_mapping(plate))
     return plate, load_target(path)
@@ -182,12 +180,6 @@ def _out_of_place(plate: targets.Marked) -> SE3:
     middle = plate.corners().reshape(-1, 3).mean(axis=0)
     turn = rotation_from_rotvec(np.deg2rad(_SETUP.turn_deg))
     return SE3(turn, middle - turn @ middle + 1e-3 * np.array(_SETUP.shift_mm))
-
-
-def _scene(plate: targets.Marked, i: int) -> PanelScene:
-    wall = SE3.from_rotvec([0.02, 0.0, 0.05], [0.01 * i, 0.80 + 0.004 * i, 0.0])
-    behind = targets.ground(wall @ SE3(DOME_FROM_CAM_NOMINAL, np.zeros(3)), cell=2e-3, shift=40)
-    return PanelScene(panels=[plate.panel, behind], light=_ROOM)
 
 
 def _found(picture: NDArray[np.uint8], markers: MarkerSet, name: str) -> View:
@@ -260,9 +252,7 @@ def decentred(rig: Rig, lens_mm: Sequence[float] = _SETUP.decentred_mm) -> Decen
 
 
 def _projected(rig: Rig) -> list[View]:
-    plate = targets.marker_plate()
-    plate = targets.moved(plate, plate_in_view(rig, plate.panel.texture.size, _SETUP.plate_far))
-    points = plate.corners().reshape(-1, 3)
+    points = targets.plate_before(rig, _SETUP.plate_far).corners().reshape(-1, 3)
     pixels, _ = rig.camera().project(points)
     rng = np.random.default_rng(_SETUP.seed)
     ids: IntArray = np.arange(len(points))

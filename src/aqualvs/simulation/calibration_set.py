@@ -12,15 +12,16 @@ from numpy.typing import NDArray
 
 from aqualvs.errors import OptionError
 from aqualvs.geometry.transforms import SE3
+from aqualvs.optics.camera import Camera
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig
 from aqualvs.optics.rigfile import save_rig
 from aqualvs.optics.solved import with_exact_numbers
 from aqualvs.simulation import calibration_targets as targets
-from aqualvs.simulation import calibration_targets as views
 from aqualvs.simulation.cameras import IDEAL, SimulatedCamera
 from aqualvs.simulation.dive import simulate_dive, writable
 from aqualvs.simulation.panels import PanelRenderer, PanelScene, RoomLight, panel_sheets
 from aqualvs.simulation.scenario import Scenario, parse_scenario
+from aqualvs.simulation.textures import CharucoPrint
 from aqualvs.simulation.video import jpeg
 
 _ROOM = RoomLight(level=0.72)
@@ -37,21 +38,13 @@ _MATRIX = tuple(f"T{row}{column}" for row in range(3) for column in range(4))
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SetSize:
-    """Numbers of pictures of each kind.
-
-    Attributes
-    ----------
-    camera, dome, box, index : int
-        Pictures; at least one of each.
-    dive : int
-        Frames of a dive before a wall; 0 leaves it out.
-    """
+    """Numbers of pictures of each kind, at least one of each."""
 
     camera: int = 12
     dome: int = 10
     box: int = 4
     index: int = 5
-    dive: int = 12
+    dive: int = 12  # Frames of a dive before a wall; 0 leaves it out.
 
     @property
     def total(self) -> int:
@@ -61,39 +54,26 @@ class SetSize:
 
 @dataclass(frozen=True, slots=True)
 class CalibrationFiles:
-    """Files and folders written by `simulate_calibration`.
+    """Files and folders written by `simulate_calibration`."""
 
-    Attributes
-    ----------
-    nominal : Path
-        Nominal rig: name, size of the pictures, dome, number of lasers.
-    camera, dome, box, index : Path
-        Folders of pictures.
-    board, rail_board, poses, box_file, target : Path
-        Files of their targets: two `board.yaml`, `poses.csv`, `box.yaml`, `target.yaml`. No
-        `poses.csv` (None) for a flat port.
-    dive, dive_truth : Path or None
-        Video of a wall and its truth.
-    rig : Path
-        The true rig.
-    n_pictures : int
-        Pictures and frames.
-    """
-
-    nominal: Path
+    nominal: Path  # Nominal rig: name, size of the pictures, dome, number of lasers.
+    # Folders of pictures.
     camera: Path
     dome: Path
     box: Path
     index: Path
+    # Files of their targets: two `board.yaml`, `poses.csv` (None for a flat port), `box.yaml`,
+    # `target.yaml`.
     board: Path
     rail_board: Path
     poses: Path | None
     box_file: Path
     target: Path
+    # Video of a wall and its truth.
     dive: Path | None
     dive_truth: Path | None
-    rig: Path
-    n_pictures: int
+    rig: Path  # The true rig.
+    n_pictures: int  # Pictures and frames.
 
 
 @dataclass(slots=True)
@@ -140,6 +120,25 @@ class _Job:
             (folder / file).with_suffix(".png" if quality else ".jpg").unlink(missing_ok=True)
             self.did_one()
         return names
+
+    def shoot_board(
+        self,
+        camera: Camera,
+        around: PanelScene,
+        board: CharucoPrint,
+        poses: Sequence[SE3],
+        folder: Path,
+        rng: np.random.Generator,
+    ) -> tuple[list[str], Path]:
+        """Render a board at some poses in a scene; return the pictures' names and its file."""
+        scenes = [
+            replace(around, panels=[targets.board_panel(board, pose), *around.panels])
+            for pose in poses
+        ]
+        names = self.shoot(PanelRenderer(camera, eye=self.camera), scenes, folder, rng)
+        _write_poses(self.folder("truth") / f"{folder.name}_poses.csv", names, poses)
+        targets.write_yaml(folder / "board.yaml", targets.board_mapping(board))
+        return names, folder / "board.yaml"
 
     def with_lasers(self, rig: Rig) -> PanelRenderer:
         """Return the renderer of panels for a rig with all lasers on."""
@@ -248,15 +247,11 @@ def _simulate(job: _Job) -> CalibrationFiles:
 def _camera_air(job: _Job) -> tuple[Path, Path]:
     rig, rng, folder = job.rig, job.rng(0), job.folder("camera_air")
     board = targets.hand_board(rig.size_px[0])
-    poses = views.board_across(rig, targets.squares_size(board), job.size.camera, rng)
+    poses = targets.board_across(rig, targets.squares_size(board), job.size.camera, rng)
     behind = targets.ground(rig.dome_from_cam @ SE3(np.eye(3), np.array([0.0, 0.0, 2.2])))
-    scenes = [
-        PanelScene(panels=[targets.board_panel(board, pose), behind], light=_ROOM) for pose in poses
-    ]
-    names = job.shoot(PanelRenderer(rig.bare_camera(), eye=job.camera), scenes, folder, rng)
-    _write_poses(job.folder("truth") / "camera_air_poses.csv", names, poses)
-    targets.write_yaml(folder / "board.yaml", targets.board_mapping(board))
-    return folder, folder / "board.yaml"
+    around = PanelScene(panels=[behind], light=_ROOM)
+    _, file = job.shoot_board(rig.bare_camera(), around, board, poses, folder, rng)
+    return folder, file
 
 
 def port_folder(rig: Rig) -> str:
@@ -270,17 +265,13 @@ def _port_water(job: _Job) -> tuple[Path, Path, None]:
     # Water magnifies what a flat port shows.
     longer = replace(lens, fx=rig.n_water * lens.fx, fy=rig.n_water * lens.fy)
     boards = replace(rig, lens=longer, housing=None)
-    poses = views.board_across(boards, targets.squares_size(board), job.size.dome, rng)
+    poses = targets.board_across(boards, targets.squares_size(board), job.size.dome, rng)
     behind = targets.ground(
         rig.dome_from_cam @ SE3(np.eye(3), np.array([0.0, 0.0, 2.2])), shift=150
     )
-    scenes = [
-        PanelScene(panels=[targets.board_panel(board, pose), behind], light=_POOL) for pose in poses
-    ]
-    names = job.shoot(PanelRenderer(rig.camera(), eye=job.camera), scenes, folder, rng)
-    _write_poses(job.folder("truth") / "port_water_poses.csv", names, poses)
-    targets.write_yaml(folder / "board.yaml", targets.board_mapping(board))
-    return folder, folder / "board.yaml", None
+    around = PanelScene(panels=[behind], light=_POOL)
+    _, file = job.shoot_board(rig.camera(), around, board, poses, folder, rng)
+    return folder, file, None
 
 
 def _dome_air(job: _Job) -> tuple[Path, Path, Path]:
@@ -291,24 +282,20 @@ def _dome_air(job: _Job) -> tuple[Path, Path, Path]:
     far_square_px, farthest = 19.0, 1.2
     far = max(1.5 * near, min(farthest, board.square * rig.focal_px / far_square_px))
     distances = np.linspace(near, far, job.size.dome)
-    poses, measured = views.board_on_rail(targets.squares_size(board), distances, rng)
+    poses, measured = targets.board_on_rail(targets.squares_size(board), distances, rng)
     behind = targets.ground(SE3(DOME_FROM_CAM_NOMINAL, np.array([0.0, 2.2, 0.0])), shift=150)
-    scenes = [
-        PanelScene(panels=[targets.board_panel(board, pose), behind], light=_ROOM) for pose in poses
-    ]
-    names = job.shoot(PanelRenderer(rig.camera(), eye=job.camera), scenes, folder, rng)
-    _write_poses(job.folder("truth") / "dome_air_poses.csv", names, poses)
+    around = PanelScene(panels=[behind], light=_ROOM)
+    names, file = job.shoot_board(rig.camera(), around, board, poses, folder, rng)
     rows = [(name, targets.to_mm(far)) for name, far in zip(names, measured, strict=True)]
     _write_table(folder / "poses.csv", ("file", "distance_mm"), rows)
-    targets.write_yaml(folder / "board.yaml", targets.board_mapping(board))
-    return folder, folder / "board.yaml", folder / "poses.csv"
+    return folder, file, folder / "poses.csv"
 
 
 def _box(job: _Job) -> tuple[Path, Path]:
     rig, rng, folder = job.rig.in_water(job.rig.n_air), job.rng(2), job.folder("box")
     walls = targets.marker_box(rig.size_px[0])
     behind = targets.ground(SE3(DOME_FROM_CAM_NOMINAL, np.array([0.0, 1.9, 0.0])), shift=300)
-    poses = views.vehicle_in_box(job.size.box, rng)
+    poses = targets.vehicle_in_box(job.size.box, rng)
     scenes = []
     for pose in poses:
         inside = [targets.moved(wall, pose.inverse()).panel for wall in walls]
@@ -321,14 +308,8 @@ def _box(job: _Job) -> tuple[Path, Path]:
 
 def _index(job: _Job) -> tuple[Path, Path]:
     rig, rng, folder = job.rig, job.rng(3), job.folder("index", "clip_0")
-    plate = targets.marker_plate()
-    size = plate.panel.texture.size
-    plate = targets.moved(plate, views.plate_in_view(rig, size, _PLATE_FAR))
-    scenes = []
-    for i in range(job.size.index):
-        wall = SE3.from_rotvec([0.02, 0.0, 0.05], [0.01 * i, 0.80 + 0.004 * i, 0.0])
-        behind = targets.ground(wall @ SE3(DOME_FROM_CAM_NOMINAL, np.zeros(3)), cell=2e-3, shift=40)
-        scenes.append(PanelScene(panels=[plate.panel, behind], light=_WATER))
+    plate = targets.plate_before(rig, _PLATE_FAR)
+    scenes = [targets.plate_scene(plate, i, _WATER) for i in range(job.size.index)]
     job.shoot(job.with_lasers(rig), scenes, folder, rng, "frame_{:03d}")
     target = folder.parent / "target.yaml"
     targets.write_yaml(target, targets.target_mapping(plate))

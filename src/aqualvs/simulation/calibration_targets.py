@@ -15,7 +15,7 @@ from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig
 from aqualvs.optics.sheet import sheets_of
-from aqualvs.simulation.panels import Panel
+from aqualvs.simulation.panels import Panel, PanelScene, RoomLight
 from aqualvs.simulation.textures import (
     PAPER,
     CharucoPrint,
@@ -282,6 +282,19 @@ def marker_plate() -> Marked:
     paper = np.full((2 * side + 3 * gap, 3 * side + 4 * gap), PAPER)
     panel = Panel(SE3.identity(), marker_texture(paper, _PRINTS.plate_cell, prints))
     return Marked("plate", panel, prints)
+
+
+def plate_before(rig: Rig, far: float) -> Marked:
+    """Return the plate as it is fixed before a rig, see `plate_in_view`."""
+    plate = marker_plate()
+    return moved(plate, plate_in_view(rig, plate.panel.texture.size, far))
+
+
+def plate_scene(plate: Marked, i: int, light: RoomLight) -> PanelScene:
+    """Return the scene of picture `i` of a plate, before a ground that moves meanwhile."""
+    wall = SE3.from_rotvec([0.02, 0.0, 0.05], [0.01 * i, 0.80 + 0.004 * i, 0.0])
+    behind = ground(wall @ SE3(DOME_FROM_CAM_NOMINAL, np.zeros(3)), cell=2e-3, shift=40)
+    return PanelScene(panels=[plate.panel, behind], light=light)
 
 
 def _prints(first: int, places: IntArray, side: int, ring: int) -> MarkerPrint:

@@ -234,11 +234,8 @@ class Scenario:
 
     def scene_at(self, t: float) -> Scene:
         """Return the scene before the vehicle at time `t`; render it at the same `t`."""
-        return self._scene(self.trajectory.pose_at(t, self.duration))
-
-    def _scene(self, pose: SE3) -> Scene:
         return Scene(
-            dome_from_scene=pose,
+            dome_from_scene=self.trajectory.pose_at(t, self.duration),
             walls=self.walls,
             nets=self.nets,
             fish=self.fish,
