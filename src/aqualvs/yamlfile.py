@@ -1,4 +1,4 @@
-"""YAML files: the only reader of the package, the writer of rig files, and their comments.
+"""YAML files: the only reader and writer of the package, and the comments of rig files.
 
 Values are plain: None, bool, int, float, str, lists and dicts of them. Numbers are decimal, as
 PyYAML writes them; text that looks like a date, an octal or a sexagesimal number stays text.
@@ -35,7 +35,7 @@ def write_text(path: Path, text: str) -> None:
         ) from None
 
 
-class TidyDumper(yaml.SafeDumper):
+class _TidyDumper(yaml.SafeDumper):
     """YAML dumper with mappings in the requested style and lists of plain values on one line."""
 
 
@@ -46,7 +46,25 @@ def _tidy_list(dumper: yaml.SafeDumper, values: Sequence[Any]) -> yaml.SequenceN
     return dumper.represent_sequence("tag:yaml.org,2002:seq", values, flow_style=flow)
 
 
-TidyDumper.add_representer(list, _tidy_list)
+_TidyDumper.add_representer(list, _tidy_list)
+
+
+def yaml_text(content: Mapping[str, Any], *, flow: bool | None = False) -> str:
+    """Return keys and values as YAML in their own order, each list of plain values on one line.
+
+    With `flow` None a mapping of plain values is on one line too.
+    """
+    # Lists stay on one line, regardless of their digits.
+    width = 1000
+    text: str = yaml.dump(
+        dict(content),
+        Dumper=_TidyDumper,
+        sort_keys=False,
+        allow_unicode=True,
+        width=width,
+        default_flow_style=flow,
+    )
+    return text
 
 
 def rig_text(content: Mapping[str, Any]) -> str:
@@ -58,17 +76,7 @@ def _block(key: str, value: object) -> str:
     # YAML wraps a lone scalar in braces unless told to use the block style; records of calibrations
     # read better in block style.
     flow = None if isinstance(value, list | dict) and key != "solved_from" else False
-    # Lists stay on one line, regardless of their digits.
-    width = 1000
-    text: str = yaml.dump(
-        {key: value},
-        Dumper=TidyDumper,
-        sort_keys=False,
-        allow_unicode=True,
-        width=width,
-        default_flow_style=flow,
-    )
-    return text
+    return yaml_text({key: value}, flow=flow)
 
 
 MAX_BYTES = 8_000_000

@@ -7,10 +7,10 @@ from collections.abc import Mapping
 
 from aqualvs.calibration.targets.targets import Board, BoardKind
 from aqualvs.calibration_files.camera import Entries, ForeignCamera, opencv_lens, padded, shown
-from aqualvs.calibration_files.opencv import plain_name, yaml_text
+from aqualvs.calibration_files.opencv import plain_name
 from aqualvs.errors import CalibrationError, RigError
 from aqualvs.optics.lens import LensModel
-from aqualvs.yamlfile import parse_yaml
+from aqualvs.yamlfile import parse_yaml, yaml_text
 
 # Whether a distortion model is a fisheye's, and its number of coefficients.
 _DISTORTIONS = {

@@ -10,19 +10,17 @@ is (0, 0).
 import ast
 import re
 import warnings
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
 import cv2
 import numpy as np
-import yaml
 
 from aqualvs.calibration_files.camera import Entries, ForeignCamera, opencv_lens, padded, shown
 from aqualvs.errors import RigError
 from aqualvs.optics.lens import Lens, LensModel
-from aqualvs.yamlfile import TidyDumper, parse_yaml
+from aqualvs.yamlfile import parse_yaml, yaml_text
 
 # Coefficients that each of ROS's models takes; image_geometry ignores none of them.
 _ROS_MODELS = {"plumb_bob": (0, 4, 5), "rational_polynomial": (8, 12, 14), "equidistant": (0, 4)}
@@ -99,15 +97,6 @@ def ros_text(camera: ForeignCamera) -> str:
         },
     }
     return yaml_text(content)
-
-
-def yaml_text(content: Mapping[str, Any]) -> str:
-    """Return keys and values as YAML, each list on one line."""
-    width = 1000
-    text: str = yaml.dump(
-        content, Dumper=TidyDumper, sort_keys=False, width=width, default_flow_style=False
-    )
-    return text
 
 
 def plain_name(name: str) -> str:

@@ -14,8 +14,6 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from aqualvs import __version__
 from aqualvs.errors import OptionError, SourceError
 from aqualvs.nets.target_file import NetRequest, target_dict
@@ -27,10 +25,8 @@ from aqualvs.scanner import ScannerOptions
 from aqualvs.scanning.detection import DETECTORS, detector_word
 from aqualvs.scanning.posture_estimator import FitMethod
 from aqualvs.sources import FrameSource
-from aqualvs.yamlfile import TidyDumper, read_yaml
+from aqualvs.yamlfile import read_yaml, yaml_text
 
-# A list stays on one line, however many digits it has.
-_WIDTH = 1000
 _LIBRARIES = ("numpy", "numba", "opencv-python-headless", "av")
 
 
@@ -80,10 +76,7 @@ class RunFile:
 
 def write_yaml(path: Path, content: Mapping[str, Any]) -> None:
     """Write a mapping as YAML in its own order; the old file stays until the new one is whole."""
-    text = yaml.dump(
-        dict(content), Dumper=TidyDumper, sort_keys=False, allow_unicode=True, width=_WIDTH
-    )
-    replace_text(path, text)
+    replace_text(path, yaml_text(content))
 
 
 def read_run_yaml(folder: Path) -> dict[str, Any]:

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import yaml
 
 from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
@@ -26,7 +25,7 @@ from aqualvs.simulation.textures import (
     marker_texture,
     mottled,
 )
-from aqualvs.yamlfile import TidyDumper
+from aqualvs.yamlfile import write_text, yaml_text
 
 Size = tuple[float, float]
 
@@ -365,8 +364,7 @@ def _marker_mappings(marked: Marked, more: dict[str, str]) -> list[dict[str, Any
 
 def write_yaml(path: Path, content: dict[str, Any]) -> None:
     """Write a mapping, lists of numbers on one line each."""
-    text = yaml.dump(content, Dumper=TidyDumper, sort_keys=False, width=1000)
-    path.write_text(text, encoding="utf-8")
+    write_text(path, yaml_text(content))
 
 
 def to_mm(metres: float) -> float:

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
-import yaml
 from pydantic import Field
 
 from aqualvs.calibration.targets.targets import (
@@ -37,7 +36,7 @@ from aqualvs.schema import (
     Triple,
     validated,
 )
-from aqualvs.yamlfile import TidyDumper, parse_yaml, read_text, write_text
+from aqualvs.yamlfile import parse_yaml, read_text, write_text, yaml_text
 
 # Keys of free text, often written without quotes but with colons, which YAML would reject.
 _FREE_TEXT = re.compile(
@@ -464,7 +463,7 @@ def save_board(board: Board, path: str | Path, *, note: str = "") -> None:
         content["legacy_pattern"] = True
     if note:
         content["note"] = note
-    write_text(Path(path), _yaml(content))
+    write_text(Path(path), yaml_text(content))
 
 
 def save_markers(markers: MarkerSet, path: str | Path) -> None:
@@ -480,7 +479,7 @@ def save_markers(markers: MarkerSet, path: str | Path) -> None:
         }
     content |= {"family": markers.family, "corner_order": _CORNER_ORDER_TEXT}
     lines = [_marker_text(markers, i) for i in range(len(markers))]
-    write_text(Path(path), _yaml(content) + "markers:\n" + "".join(lines))
+    write_text(Path(path), yaml_text(content) + "markers:\n" + "".join(lines))
 
 
 def _marker_text(markers: MarkerSet, i: int) -> str:
@@ -490,18 +489,6 @@ def _marker_text(markers: MarkerSet, i: int) -> str:
     plane = markers.plane_names[i]
     on_plane = "" if plane is None else f"    plane: {plane}\n"
     return f"  - id: {int(markers.ids[i])}\n{on_plane}    size_mm: {size}\n    corners: {corners}\n"
-
-
-def _yaml(content: dict[str, Any]) -> str:
-    text: str = yaml.dump(
-        content,
-        Dumper=TidyDumper,
-        sort_keys=False,
-        allow_unicode=True,
-        width=1000,
-        default_flow_style=False,
-    )
-    return text
 
 
 def _to_mm(length: float) -> float:
