@@ -150,18 +150,19 @@ def test_power_of_a_rest_is_that_of_its_pieces_one_by_one() -> None:
     frames = [frame(rng, "square", 0.02, 0.3, np.pi / 4.0, 1e-3) for _ in range(3)]
     one, other = families("square", 0.02, 0.3, np.pi / 4.0)
     rest = Spectrum.of(frames).without(one)
-    assert len(rest.begin) > 60
+    seen = rest.crossings
+    assert len(seen.begin) > 60
     power = np.zeros(3)
     for h in range(3):
         wave = (h + 1) * other
         for k in range(3):
             swing = np.sum(
-                np.exp(2j * np.pi * rest.place[rest.start[k] : rest.start[k + 1]] @ wave)
+                np.exp(2j * np.pi * seen.place[seen.start[k] : seen.start[k + 1]] @ wave)
             )
-            mine = slice(rest.span_start[k], rest.span_start[k + 1])
-            turns = (rest.end[mine] - rest.begin[mine]) @ wave
-            middle = 0.5 * (rest.begin[mine] + rest.end[mine]) @ wave
-            swing -= np.sum(rest.expected[mine] * np.sinc(turns) * np.exp(2j * np.pi * middle))
+            mine = slice(seen.span_start[k], seen.span_start[k + 1])
+            turns = (seen.end[mine] - seen.begin[mine]) @ wave
+            middle = 0.5 * (seen.begin[mine] + seen.end[mine]) @ wave
+            swing -= np.sum(seen.expected[mine] * np.sinc(turns) * np.exp(2j * np.pi * middle))
             power[h] += abs(swing) ** 2
     np.testing.assert_allclose(rest.at(other, 3), power / rest.n_crossings, rtol=1e-9)
 

@@ -29,8 +29,8 @@ from aqualvs.nets.spectrum_kernels import (
     REGULAR,
     SHARE_OF_REST,
     SHELL_1,
+    AllCrossings,
     comb_power,
-    crest_phases,
     expected_on,
     families_gain,
     free_gains,
@@ -81,13 +81,10 @@ class Spectrum:
 
     Parameters
     ----------
-    place, line, start : array, int array, int array
-        Crossings (N, 2), the number of the line that each lies on (N,), counted through all
-        frames, and where each frame's begin (F + 1,).
-    begin, end, span_line, span_start : array, array, int array, int array
-        The same for the visible pieces of line.
+    crossings : AllCrossings
+        Of F frames.
     lines : array, shape (n, 3)
-        Direction and seen length of every line; zero where there is none.
+        Direction and seen length of every line of all frames; zero where there is none.
     laser : int array, shape (n,)
         Its laser.
     lit : float
@@ -95,10 +92,8 @@ class Spectrum:
 
     Attributes
     ----------
-    place, line, start, begin, end, span_line, span_start, lines, laser, lit
+    crossings, lines, laser, lit
         As given.
-    expected : array, shape (M,)
-        Crossings on every piece if those of its line were spread evenly.
     n_frames, n_crossings : int
         Frames and all crossings.
     per_frame : float
@@ -108,74 +103,51 @@ class Spectrum:
     """
 
     def __init__(
-        self,
-        place: FloatArray,
-        line: IntArray,
-        start: IntArray,
-        begin: FloatArray,
-        end: FloatArray,
-        span_line: IntArray,
-        span_start: IntArray,
-        lines: FloatArray,
-        laser: IntArray,
-        lit: float,
+        self, crossings: AllCrossings, lines: FloatArray, laser: IntArray, lit: float
     ) -> None:
-        self.place, self.line, self.start = place, line, start
-        self.begin, self.end = begin, end
-        self.span_line, self.span_start = span_line, span_start
-        self.lines, self.laser, self.lit = lines, laser, lit
-        self.n_frames = len(start) - 1
-        self.n_crossings = len(place)
+        self.crossings, self.lines, self.laser, self.lit = crossings, lines, laser, lit
+        self.n_frames, self.n_crossings = len(crossings.start) - 1, len(crossings.place)
         self.per_frame = self.n_crossings / self.n_frames
-        seen = np.bincount(line, minlength=len(lines))
-        self.expected = expected_on(line, begin, end, span_line, len(lines))
+        seen = np.bincount(crossings.line, minlength=len(lines))
         self.seen = np.bincount(laser, seen, minlength=laser.max(initial=0) + 1)
 
     @classmethod
     def of(cls, frames: Sequence[Crossings]) -> "Spectrum":
         """Join frames."""
-        n_lasers = len(frames[0].length)
-        return cls(
-            np.concatenate([f.place for f in frames]),
-            np.concatenate([f.laser + i * n_lasers for i, f in enumerate(frames)]),
-            np.cumsum([0, *(len(f.place) for f in frames)]),
-            np.concatenate([f.begin for f in frames]),
-            np.concatenate([f.end for f in frames]),
-            np.concatenate([f.span_laser + i * n_lasers for i, f in enumerate(frames)]),
-            np.cumsum([0, *(len(f.begin) for f in frames)]),
-            np.nan_to_num(np.concatenate([np.c_[f.direction, f.length] for f in frames])),
-            np.tile(np.arange(n_lasers), len(frames)),
-            float(np.mean([f.lit for f in frames])),
+        n_lasers, n_frames = len(frames[0].length), len(frames)
+        line = np.concatenate([f.laser + i * n_lasers for i, f in enumerate(frames)])
+        begin = np.concatenate([f.begin for f in frames])
+        end = np.concatenate([f.end for f in frames])
+        span_line = np.concatenate([f.span_laser + i * n_lasers for i, f in enumerate(frames)])
+        crossings = AllCrossings(
+            place=np.concatenate([f.place for f in frames]),
+            line=line,
+            start=np.cumsum([0, *(len(f.place) for f in frames)]),
+            begin=begin,
+            end=end,
+            span_line=span_line,
+            span_start=np.cumsum([0, *(len(f.begin) for f in frames)]),
+            expected=expected_on(line, begin, end, span_line, n_frames * n_lasers),
         )
+        lines = np.nan_to_num(np.concatenate([np.c_[f.direction, f.length] for f in frames]))
+        laser = np.tile(np.arange(n_lasers), n_frames)
+        return cls(crossings, lines, laser, float(np.mean([f.lit for f in frames])))
 
     def without(self, wave: FloatArray) -> "Spectrum":
         """Return the spectrum of the crossings that do not lie on the crests of a wave."""
-        phase = crest_phases(self.place, self.start, wave[0], wave[1])
-        kept, start, begin, end, origin, span_start = off_crests(
-            self.place, self.start, self.begin, self.end, self.span_start, phase, wave[0], wave[1]
-        )
-        return Spectrum(
-            self.place[kept],
-            self.line[kept],
-            start,
-            begin,
-            end,
-            self.span_line[origin],
-            span_start,
-            self.lines,
-            self.laser,
-            self.lit,
-        )
+        rest = off_crests(self.crossings, wave[0], wave[1], len(self.lines))
+        return Spectrum(rest, self.lines, self.laser, self.lit)
 
     def _on_grid(self, most: int) -> FloatArray:
         """Return the power over the upper half plane and some rows more; the rest mirrors it."""
         power = np.zeros((len(_ALONG), len(_UPWARD)), np.float32)
         count = 0
         every = max(1, -(-self.n_frames // most))
-        frames = list(zip(pairwise(self.start), pairwise(self.span_start), strict=True))
+        seen = self.crossings
+        frames = list(zip(pairwise(seen.start), pairwise(seen.span_start), strict=True))
         for (first, last), (from_, to) in frames[::every]:
             even, weight = self._evenly_spread(from_, to)
-            place = np.concatenate([self.place[first:last], even])
+            place = np.concatenate([seen.place[first:last], even])
             x = _swings(place[:, 0], _ALONG[0], len(_ALONG))
             x *= np.r_[np.ones(last - first), -weight].astype(np.float32)[:, None]
             amplitude = x.T @ _swings(place[:, 1], _UPWARD[0], len(_UPWARD))
@@ -185,30 +157,18 @@ class Spectrum:
 
     def _evenly_spread(self, first: int, last: int) -> tuple[FloatArray, FloatArray]:
         """Return places spread over some spans, and the crossings that each stands for."""
-        begin, end = self.begin[first:last], self.end[first:last]
+        begin, end = self.crossings.begin[first:last], self.crossings.end[first:last]
         length = np.hypot(*(end - begin).T)
         pieces = np.maximum(np.ceil(length / _APART), 1.0).astype(np.int64)
         number = np.repeat(np.arange(len(pieces)), pieces)
         share = np.arange(len(number)) - np.repeat(np.cumsum(pieces) - pieces, pieces) + 0.5
         share /= pieces[number]
         place = begin[number] + share[:, None] * (end - begin)[number]
-        return place, (self.expected[first:last] / pieces)[number]
+        return place, (self.crossings.expected[first:last] / pieces)[number]
 
     def at(self, wave: FloatArray, n_harmonics: int = 1) -> FloatArray:
         """Return the power at the first harmonics of a wave, shape (n_harmonics,), exactly."""
-        power = np.zeros(n_harmonics)
-        comb_power(
-            self.place,
-            self.start,
-            self.begin,
-            self.end,
-            self.expected,
-            self.span_start,
-            wave[0],
-            wave[1],
-            power,
-        )
-        return power / max(self.n_crossings, 1)
+        return comb_power(self.crossings, wave[0], wave[1], n_harmonics)
 
     def polar(self, most: int = _MAX_ON_GRID) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the local maximum power at sizes (K,) and directions (A,) of waves, shape (K, A).
@@ -297,29 +257,9 @@ class Hypothesis:
 def score(spectrum: Spectrum, hypothesis: Hypothesis) -> float:
     """Return the log-likelihood per frame over random crossings, including the prior."""
     families = np.ascontiguousarray(hypothesis.families())
-    gain = families_gain(
-        spectrum.place,
-        spectrum.line,
-        spectrum.start,
-        spectrum.begin,
-        spectrum.end,
-        spectrum.expected,
-        spectrum.span_line,
-        spectrum.span_start,
-        len(spectrum.lines),
-        families,
-    )
+    gain = families_gain(spectrum.crossings, families, len(spectrum.lines))
     if hypothesis.mesh is Mesh.SIX_SIDED:
-        basis = np.ascontiguousarray(hypothesis.basis)
-        gain += shell_gain(
-            spectrum.place,
-            spectrum.start,
-            spectrum.begin,
-            spectrum.end,
-            spectrum.expected,
-            spectrum.span_start,
-            basis,
-        )
+        gain += shell_gain(spectrum.crossings, np.ascontiguousarray(hypothesis.basis))
     off = miscount(
         spectrum.lines,
         spectrum.laser,

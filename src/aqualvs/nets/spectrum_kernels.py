@@ -8,9 +8,11 @@ waves that a lattice is made of. The gain is the log-likelihood of the crossings
 over that of random ones.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
-from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.compiled import inline_kernel, inner_kernel, kernel
 
 # Largest distance of a crossing of the wave's family from a crest, in periods.
@@ -18,33 +20,26 @@ _ON_CREST = 0.12
 _TURN = 2.0 * np.pi
 
 
-@kernel
-def comb_power(
-    place: FloatArray,
-    start: IntArray,
-    begin: FloatArray,
-    end: FloatArray,
-    expected: FloatArray,
-    span_start: IntArray,
-    qx: float,
-    qy: float,
-    power: FloatArray,
-) -> None:
-    """Add up the power of a wave's harmonics over frames.
+class AllCrossings(NamedTuple):
+    """Crossings of F frames, N of them, and the visible pieces of their lines: M spans."""
 
-    Parameters
-    ----------
-    place, start
-        As `Spectrum`.
-    begin, end, expected, span_start
-        As `Spectrum`, with the crossings expected on each span, shape (M,).
-    qx, qy : float
-        The wave, in periods a metre.
-    power : array, shape (n,)
-        Of n harmonics; added to in place.
-    """
-    n = power.shape[0]
-    real, imaginary, share = np.zeros(n), np.zeros(n), np.zeros(n)
+    place: FloatArray  # Shape (N, 2): in `net`, metres.
+    line: IntArray  # Shape (N,): number of the line of each, counted through all frames.
+    start: IntArray  # Shape (F + 1,): where each frame's begin.
+    # The same for the spans; shape (M, 2), (M,) and (F + 1,).
+    begin: FloatArray
+    end: FloatArray
+    span_line: IntArray
+    span_start: IntArray
+    # Shape (M,): crossings on every span if those of its line were spread evenly.
+    expected: FloatArray
+
+
+@kernel
+def comb_power(crossings: AllCrossings, qx: float, qy: float, n: int) -> FloatArray:
+    """Return the power at n harmonics of the wave (qx, qy); 1 is what random crossings have."""
+    place, start, span_start = crossings.place, crossings.start, crossings.span_start
+    power, real, imaginary, share = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
     for g in range(start.shape[0] - 1):
         real[:] = 0.0
         imaginary[:] = 0.0
@@ -56,18 +51,15 @@ def comb_power(
                 x, y = x * c - y * s, x * s + y * c
                 real[h] += x
                 imaginary[h] += y
-        _add_spans(
-            begin, end, expected, span_start[g], span_start[g + 1], qx, qy, real, imaginary, share
-        )
+        _add_spans(crossings, span_start[g], span_start[g + 1], qx, qy, real, imaginary, share)
         for h in range(n):
             power[h] += real[h] ** 2 + imaginary[h] ** 2
+    return power / max(len(place), 1)
 
 
 @inline_kernel
 def _add_spans(
-    begin: FloatArray,
-    end: FloatArray,
-    expected: FloatArray,
+    crossings: AllCrossings,
     from_: int,
     to: int,
     qx: float,
@@ -80,7 +72,7 @@ def _add_spans(
 
     Evenly spaced pieces of one line turn by the same angle, which saves most of the sines.
     """
-    n = real.shape[0]
+    begin, end, expected, n = crossings.begin, crossings.end, crossings.expected, real.shape[0]
     c, s, turn_c, turn_s, ch, sh = 1.0, 0.0, 1.0, 0.0, 1.0, 0.0
     middle_x, middle_y, step_x, step_y, half_x, half_y = 0.0, 0.0, np.inf, 0.0, np.inf, 0.0
     # Difference of lengths that count as equal, in metres, and half a span's phase that counts as
@@ -113,8 +105,8 @@ def _add_spans(
             imaginary[h] -= expected[i] * share[h] * b
 
 
-@kernel
-def crest_phases(place: FloatArray, start: IntArray, qx: float, qy: float) -> FloatArray:
+@inner_kernel
+def _crest_phases(place: FloatArray, start: IntArray, qx: float, qy: float) -> FloatArray:
     """Return the phase of the crests in each frame's crossings, in periods, shape (F,)."""
     phase = np.zeros(start.shape[0] - 1)
     for g in range(len(phase)):
@@ -134,41 +126,14 @@ def _off(turns: float) -> float:
 
 
 @kernel
-def off_crests(
-    place: FloatArray,
-    start: IntArray,
-    begin: FloatArray,
-    end: FloatArray,
-    span_start: IntArray,
-    phase: FloatArray,
-    qx: float,
-    qy: float,
-) -> tuple[BoolArray, IntArray, FloatArray, FloatArray, IntArray, IntArray]:
-    """Remove the crossings and the pieces of spans on the crests of a wave.
+def off_crests(crossings: AllCrossings, qx: float, qy: float, n_lines: int) -> AllCrossings:
+    """Remove the crossings and the pieces of spans on the crests of the wave (qx, qy).
 
-    Parameters
-    ----------
-    place, start, begin, end, span_start
-        As `Spectrum`.
-    phase : array, shape (F,)
-        Of the crests in each frame.
-    qx, qy : float
-        The wave.
-
-    Returns
-    -------
-    kept : bool array, shape (N,)
-        Crossings between crests.
-    start : int array, shape (F + 1,)
-        Where each frame's begin among those.
-    begin, end : array, shape (m, 2)
-        Pieces of spans between crests.
-    origin : int array, shape (m,)
-        Spans that they are pieces of.
-    span_start : int array, shape (F + 1,)
-        Where each frame's pieces begin.
+    `n_lines` is the number of the lines of all frames.
     """
-    n_frames = start.shape[0] - 1
+    place, start, begin, end = crossings.place, crossings.start, crossings.begin, crossings.end
+    span_start, n_frames = crossings.span_start, len(crossings.start) - 1
+    phase = _crest_phases(place, start, qx, qy)
     kept = np.zeros(place.shape[0], np.bool_)
     new_start, new_span_start = np.zeros_like(start), np.zeros_like(span_start)
     most = 0
@@ -188,7 +153,18 @@ def off_crests(
             b = qx * end[i, 0] + qy * end[i, 1] - phase[g]
             m = _between(i, a, b, begin, end, low, high, origin, m)
         new_span_start[g + 1] = m
-    return kept, new_start, low[:m].copy(), high[:m].copy(), origin[:m].copy(), new_span_start
+    low, high = low[:m].copy(), high[:m].copy()
+    line, span_line = crossings.line[kept], crossings.span_line[origin[:m]]
+    return AllCrossings(
+        place[kept],
+        line,
+        new_start,
+        low,
+        high,
+        span_line,
+        new_span_start,
+        expected_on(line, low, high, span_line, n_lines),
+    )
 
 
 @inner_kernel
@@ -317,111 +293,58 @@ def free_gains(power: FloatArray, per_frame: float) -> FloatArray:
 
 
 @kernel
-def shell_gain(
-    place: FloatArray,
-    start: IntArray,
-    begin: FloatArray,
-    end: FloatArray,
-    expected: FloatArray,
-    span_start: IntArray,
-    basis: FloatArray,
-) -> float:
+def shell_gain(crossings: AllCrossings, basis: FloatArray) -> float:
     """Return the gain from the waves of a honeycomb that are longer than those of its bars' lines.
 
-    Parameters
-    ----------
-    place, start, begin, end, expected, span_start
-        As for `comb_power`.
-    basis : array, shape (2, 2)
-        Two waves of the first shell.
+    `basis`, shape (2, 2): two waves of the first shell.
     """
-    per_frame = place.shape[0] / (start.shape[0] - 1)
-    gain, power = 0.0, np.empty(2)
+    per_frame = len(crossings.place) / (len(crossings.start) - 1)
+    gain = 0.0
     for k in range(3):
         qx = basis[k, 0] if k < 2 else basis[1, 0] - basis[0, 0]
         qy = basis[k, 1] if k < 2 else basis[1, 1] - basis[0, 1]
-        power[:] = 0.0
-        comb_power(place, start, begin, end, expected, span_start, qx, qy, power)
-        power /= max(place.shape[0], 1)
+        power = comb_power(crossings, qx, qy, 2)
         gain += gain_of(power[0], 1.0 + per_frame * SHELL_1**2)
         gain += free_gain_of(power[1], per_frame)
     return gain
 
 
 @kernel
-def families_gain(
-    place: FloatArray,
-    line: IntArray,
-    start: IntArray,
-    begin: FloatArray,
-    end: FloatArray,
-    expected: FloatArray,
-    span_line: IntArray,
-    span_start: IntArray,
-    n_lines: int,
-    families: FloatArray,
-) -> float:
+def families_gain(crossings: AllCrossings, families: FloatArray, n_lines: int) -> float:
     """Return the gain from the strongest family, the next in the remainder, and so on.
 
-    Parameters
-    ----------
-    place, start, begin, end, expected, span_start
-        As for `comb_power`.
-    line, span_line : int array, shape (N,) and (M,)
-        Lines that crossings and spans lie on.
-    n_lines : int
-        Of all frames.
-    families : array, shape (F, 2)
-        Their waves.
+    `families`, shape (F, 2): their waves; `n_lines`: number of the lines of all frames.
     """
     n = families.shape[0]
     strength = np.empty(n)
     for k in range(n):
-        strength[k] = _comb_gain(
-            place, start, begin, end, expected, span_start, families[k], 1.0 / n
-        )
+        strength[k] = _comb_gain(crossings, families[k], 1.0 / n)
     order = np.argsort(strength)[::-1]
     gain = strength[order[0]]
     for k in range(1, n):
         before = families[order[k - 1]]
-        phase = crest_phases(place, start, before[0], before[1])
-        kept, start, begin, end, origin, span_start = off_crests(
-            place, start, begin, end, span_start, phase, before[0], before[1]
-        )
-        place, line, span_line = place[kept], line[kept], span_line[origin]
-        expected = expected_on(line, begin, end, span_line, n_lines)
+        crossings = off_crests(crossings, before[0], before[1], n_lines)
         # Crossings of the remaining families, less those on a crest by chance.
         share = SHARE_OF_REST / (n - k)
-        gain += _comb_gain(
-            place, start, begin, end, expected, span_start, families[order[k]], share
-        )
+        gain += _comb_gain(crossings, families[order[k]], share)
     return float(gain)
 
 
 @inner_kernel
-def _comb_gain(
-    place: FloatArray,
-    start: IntArray,
-    begin: FloatArray,
-    end: FloatArray,
-    expected: FloatArray,
-    span_start: IntArray,
-    wave: FloatArray,
-    share: float,
-) -> float:
+def _comb_gain(crossings: AllCrossings, wave: FloatArray, share: float) -> float:
     """Return the gain from a family's harmonics that holds a share of the crossings."""
     # Gain if no crossings are left.
     nothing_left = 5.0
-    if place.shape[0] == 0:
+    if len(crossings.place) == 0:
         return -nothing_left
-    per_frame = place.shape[0] / (start.shape[0] - 1)
+    per_frame = len(crossings.place) / (len(crossings.start) - 1)
     size = np.hypot(wave[0], wave[1])
-    power = np.zeros(int(max(1.0, min(HIGHEST // size, MAX_HARMONICS))))
-    comb_power(place, start, begin, end, expected, span_start, wave[0], wave[1], power)
+    n_harmonics = int(max(1.0, min(HIGHEST // size, MAX_HARMONICS)))
+    power = comb_power(crossings, wave[0], wave[1], n_harmonics)
     gain = 0.0
     for h in range(len(power)):
         mean = 1.0 + per_frame * (share * REGULAR ** (h + 1.0)) ** 2
-        gain += gain_of(power[h] / place.shape[0], mean)
+        gain += gain_of(power[h], mean)
     return gain
 
 
