@@ -89,6 +89,15 @@ def upright_axes(normal: FloatArray) -> FloatArray:
     normal : array, shape (3,)
         Unit normal that points away from the vehicle; not vertical.
     """
-    right = np.cross(normal, (0.0, 0.0, 1.0))
-    right /= max(float(np.linalg.norm(right)), 1e-9)
-    return np.stack([right, normal, np.cross(right, normal)], axis=1)
+    up = np.array([0.0, 0.0, 1.0]) - normal[2] * normal
+    up /= max(float(np.linalg.norm(up)), 1e-9)
+    return np.stack([np.cross(normal, up), normal, up], axis=1)
+
+
+def normals_of(pitch: FloatArray, yaw: FloatArray) -> FloatArray:
+    """Return the unit normals (..., 3) of target planes, away from the vehicle.
+
+    Inverse of the paper's Eq. 25-26: they are along (tan yaw, 1, tan pitch).
+    """
+    along = np.stack([np.tan(yaw), np.ones_like(yaw), np.tan(pitch)], axis=-1)
+    return np.asarray(along / np.linalg.norm(along, axis=-1, keepdims=True), np.float64)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.geometry.compiled import kernel
-from aqualvs.geometry.planes import Plane
+from aqualvs.geometry.planes import Plane, upright_axes
 from aqualvs.geometry.transforms import SE3
 from aqualvs.nets.occlusion import LaserLines, hidden_lines, light_beyond
 from aqualvs.optics.rig import Rig
@@ -79,11 +79,8 @@ def net_from_dome(normal_in_dome: FloatArray, distance: float) -> SE3:
     distance : float
         Of the dome's centre from the plane, in metres.
     """
-    n = np.asarray(normal_in_dome, np.float64)
-    up = np.array([0.0, 0.0, 1.0]) - n[2] * n
-    up /= np.linalg.norm(up)
-    right = np.cross(n, up)
-    return SE3(np.stack([right, up, -n]), np.array([0.0, 0.0, distance]))
+    right, away, up = upright_axes(normal_in_dome).T
+    return SE3(np.stack([right, up, -away]), np.array([0.0, 0.0, distance]))
 
 
 class NetReader:

@@ -19,6 +19,7 @@ import numpy as np
 
 from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.geometry.planes import normals_of
 from aqualvs.nets.condition import NetStretch
 from aqualvs.nets.holes import Hole
 from aqualvs.vehicle_logs import (
@@ -50,9 +51,7 @@ class DivePostures:
 
     def normals(self) -> FloatArray:
         """Return the net's far unit normals in `dome`, shape (N, 3)."""
-        along = np.stack([np.tan(self.yaw), np.ones(len(self.yaw)), np.tan(self.pitch)], axis=-1)
-        normals: FloatArray = along / np.linalg.norm(along, axis=-1, keepdims=True)
-        return normals
+        return normals_of(self.pitch, self.yaw)
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,6 +14,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.geometry.planes import normals_of
 from aqualvs.report.run_data import Track
 from aqualvs.results.points import plain_column, points_file, stored_batches
 from aqualvs.scanning.scan import Label
@@ -106,13 +107,8 @@ def summarize_points(
 
 
 def plane_of_posture(posture: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return unit normals (N, 3) and distances (N,) in metres of postures (N, 3) in m and degrees.
-
-    Inverse of the paper's Eq. 23-26: n is along (tan yaw, 1, tan pitch).
-    """
-    pitch, yaw = np.deg2rad(posture[:, 1]), np.deg2rad(posture[:, 2])
-    normal = np.stack([np.tan(yaw), np.ones_like(yaw), np.tan(pitch)], axis=-1)
-    return normal / np.linalg.norm(normal, axis=1, keepdims=True), posture[:, 0]
+    """Return unit normals (N, 3) and distances (N,), in m, of postures (N, 3) in m and degrees."""
+    return normals_of(np.deg2rad(posture[:, 1]), np.deg2rad(posture[:, 2])), posture[:, 0]
 
 
 def _planes(track: Track) -> FloatArray:

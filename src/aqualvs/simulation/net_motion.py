@@ -9,7 +9,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -22,6 +22,9 @@ from aqualvs.simulation.scene import Box, Bubble, Fish, Fold, Net, Scene, Wall
 _CORNERS = np.array(list(product((-1.0, 1.0), repeat=3)))
 # Pairs of corners that differ in one coordinate.
 _EDGES = np.array([(i, i + step) for step in (1, 2, 4) for i in range(8) if not i & step])
+
+
+Swimmer = TypeVar("Swimmer", Fish, Bubble)
 
 
 class NetPosture(NamedTuple):
@@ -160,8 +163,8 @@ class NetWall:
             dome_from_scene=dome_from_net @ net_from_patch,
             nets=tuple(_slid(net, along, up, self.curvature) for net in base.nets),
             walls=tuple(_turned_wall(wall, patch_from_net) for wall in base.walls),
-            fish=tuple(_moved_fish(fish, patch_from_net) for fish in base.fish),
-            bubbles=tuple(_moved_bubble(bubble, patch_from_net) for bubble in base.bubbles),
+            fish=tuple(_moved(fish, patch_from_net) for fish in base.fish),
+            bubbles=tuple(_moved(bubble, patch_from_net) for bubble in base.bubbles),
             boxes=tuple(_turned_box(box, patch_from_net, angle) for box in base.boxes),
         )
 
@@ -268,18 +271,9 @@ def _turned_wall(wall: Wall, patch_from_net: SE3) -> Wall:
     return replace(wall, depth=depth, yaw=math.atan2(x, y), pitch=math.atan2(z, y))
 
 
-def _moved_fish(fish: Fish, patch_from_net: SE3) -> Fish:
-    position, velocity = _moved(fish.position, fish.velocity, patch_from_net)
-    return replace(fish, position=position, velocity=velocity)
-
-
-def _moved_bubble(bubble: Bubble, patch_from_net: SE3) -> Bubble:
-    position, velocity = _moved(bubble.position, bubble.velocity, patch_from_net)
-    return replace(bubble, position=position, velocity=velocity)
-
-
-def _moved(position: Vec, velocity: Vec, patch_from_net: SE3) -> tuple[Vec, Vec]:
-    return _vec(patch_from_net.apply(position)), _vec(patch_from_net.rotate(velocity))
+def _moved(one: Swimmer, patch_from_net: SE3) -> Swimmer:
+    position, velocity = patch_from_net.apply(one.position), patch_from_net.rotate(one.velocity)
+    return replace(one, position=_vec(position), velocity=_vec(velocity))
 
 
 def _turned_box(box: Box, patch_from_net: SE3, angle: float) -> Box:

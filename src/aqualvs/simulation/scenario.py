@@ -31,6 +31,7 @@ from aqualvs.simulation.scene import (
     Target,
     Wall,
     WaterOptics,
+    target_axes,
 )
 from aqualvs.yamlfile import parse_yaml, read_yaml
 
@@ -130,13 +131,9 @@ def dome_from_target(
             f"pitch {np.rad2deg(pitch):g} and yaw {np.rad2deg(yaw):g} deg: the target would be "
             "seen edge on; keep both below 85 deg"
         )
-    normal = np.array([np.tan(yaw), 1.0, np.tan(pitch)])
-    normal /= np.linalg.norm(normal)
-    up = np.array([0.0, 0.0, 1.0]) - normal[2] * normal
-    up /= np.linalg.norm(up)
-    right = np.cross(normal, up)
-    origin = distance * normal + slide[0] * right + slide[1] * up
-    return SE3(np.column_stack([right, normal, up]), origin)
+    axes = target_axes(pitch, yaw)
+    right, normal, up = axes.T
+    return SE3(axes, distance * normal + slide[0] * right + slide[1] * up)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -12,7 +12,8 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from aqualvs.geometry.planes import Plane
+from aqualvs.geometry.arrays import FloatArray
+from aqualvs.geometry.planes import Plane, upright_axes
 from aqualvs.geometry.transforms import SE3
 
 Vector: TypeAlias = tuple[float, float, float]
@@ -224,6 +225,12 @@ class Scene:
         normal = self.dome_from_scene.rotation[:, 1]
         offset = float(normal @ self.dome_from_scene.translation)
         return Plane(normal, offset).facing_origin()
+
+
+def target_axes(pitch: float, yaw: float) -> FloatArray:
+    """Return axes (columns) of a plane whose far normal points right by yaw and up by pitch."""
+    normal = np.array([np.tan(yaw), 1.0, np.tan(pitch)])
+    return upright_axes(normal / np.linalg.norm(normal))
 
 
 def _moved(position: Vector, velocity: Vector, t: float) -> Vector:

@@ -18,7 +18,7 @@ from aqualvs.simulation.net import (
     pack_net,
     strand_albedo,
 )
-from aqualvs.simulation.scene import Box, Fish, Scene, Wall
+from aqualvs.simulation.scene import Box, Fish, Scene, Wall, target_axes
 from aqualvs.simulation.textures import Tiles, noise_tiles, sample
 
 # Columns of the tables. A wall: origin on the plane, axes, albedo, contrast, pitch of its tiles.
@@ -89,17 +89,8 @@ def _table(rows: list[FloatArray], columns: int) -> FloatArray:
     return np.ascontiguousarray(np.reshape(rows, (len(rows), columns)), dtype=np.float64)
 
 
-def _turned(yaw: float, pitch: float) -> FloatArray:
-    """Return axes (columns) of a plane whose far normal points right by yaw and up by pitch."""
-    normal = np.array([np.tan(yaw), 1.0, np.tan(pitch)])
-    normal /= np.linalg.norm(normal)
-    up = np.array([0.0, 0.0, 1.0]) - normal[2] * normal
-    up /= np.linalg.norm(up)
-    return np.column_stack([np.cross(normal, up), normal, up])
-
-
 def _pack_wall(wall: Wall, pose: SE3) -> FloatArray:
-    axes = pose.rotation @ _turned(wall.yaw, wall.pitch)
+    axes = pose.rotation @ target_axes(wall.pitch, wall.yaw)
     origin = pose.apply([0.0, wall.depth, 0.0])
     last = [*wall.albedo, wall.contrast, wall.tile_pitch]
     return np.concatenate([origin, axes[:, 0], axes[:, 2], axes[:, 1], last])
