@@ -4,10 +4,9 @@ One pass gathers counts, histograms and random samples of fixed size, so that me
 with the dive.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -42,6 +41,10 @@ class FramePoints:
     pixels: FloatArray
     # Shape (M, 3): metres.
     points_in_dome: FloatArray
+
+
+def _counts(bins: int) -> IntArray:
+    return np.zeros((MAX_LASERS, bins), dtype=np.int64)
 
 
 @dataclass(slots=True)
@@ -90,52 +93,22 @@ def summarize_points(
     Returns None where there are no points that can be read; and what is wrong, in words, "" if
     nothing.
     """
-    summary = _empty(track)
-    rng = np.random.default_rng(20210126)
-    keys = np.zeros(0)
-    planes = _planes(track)
+    gathered = _Gathered(track, sample_frames)
     try:
-        for batch in _batches(run_dir):
-            keys = _add(summary, batch, track, planes, sample_frames, keys, rng)
+        for batch in stored_batches(points_file(run_dir), _BATCH, (*_NEEDED, *_OPTIONAL)):
+            gathered.add(_columns(batch))
     except FileNotFoundError:
         return None, "points.parquet is missing: no points are shown."
     except KeyError as absent:
         return None, f"points.parquet has no column {absent}: no points are shown."
     except (pa.ArrowInvalid, OSError):
         return None, "points.parquet cannot be read to its end: no points are shown."
-    return summary, ""
+    return gathered.summary, ""
 
 
 def plane_of_posture(posture: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return unit normals (N, 3) and distances (N,), in m, of postures (N, 3) in m and degrees."""
     return normals_of(np.deg2rad(posture[:, 1]), np.deg2rad(posture[:, 2])), posture[:, 0]
-
-
-def _planes(track: Track) -> FloatArray:
-    """Return normal and distance of the target in every frame, shape (N, 4), NaN where refused."""
-    normal, distance = plane_of_posture(track.posture)
-    planes = np.column_stack([normal, distance])
-    planes[~track.valid] = np.nan
-    return planes
-
-
-def _counts(bins: int) -> IntArray:
-    return np.zeros((MAX_LASERS, bins), dtype=np.int64)
-
-
-def _empty(track: Track) -> PointSummary:
-    n = len(track)
-    return PointSummary(
-        on_target=np.zeros((n, MAX_LASERS), dtype=np.int64),
-        squares_mm2=np.zeros(n),
-        n_squares=np.zeros(n, dtype=np.int64),
-    )
-
-
-def _batches(run_dir: Path) -> Iterator[dict[str, NDArray[Any]]]:
-    """Yield batches as arrays by column, labels as numbers."""
-    path = points_file(run_dir)
-    yield from map(_columns, stored_batches(path, _BATCH, (*_NEEDED, *_OPTIONAL)))
 
 
 def _columns(batch: Any) -> dict[str, NDArray[Any]]:
@@ -150,107 +123,140 @@ def _columns(batch: Any) -> dict[str, NDArray[Any]]:
     }
 
 
-def _add(
-    summary: PointSummary,
-    batch: dict[str, NDArray[Any]],
-    track: Track,
-    planes: FloatArray,
-    sample_frames: list[int],
-    keys: FloatArray,
-    rng: np.random.Generator,
-) -> FloatArray:
-    """Add one batch; returns the sampling keys of the cloud as it now is."""
-    frame, laser, label = (batch[name].astype(np.int64) for name in ("frame", "laser", "label"))
-    xyz = [batch[f"{axis}_m"].astype(np.float64) for axis in "xyz"]
-    target, row = _add_counts(summary, batch["used"], frame, laser, label, xyz, track)
-    _add_residuals(summary, laser[target], row, [axis[target] for axis in xyz], planes[row])
-    if "quality" in batch:
-        quality = batch["quality"][target].astype(np.float64)
-        _count(summary.quality, QUALITY_EDGES, laser[target], quality)
-    _keep_samples(summary, batch, frame, laser, label, xyz, sample_frames)
-    # Points of a frame without a posture have no place in the target's frame.
-    of_frames = planes[row]
-    known = np.isfinite(of_frames[:, 3])
-    return _grow_cloud(summary, xyz, laser, target[known], of_frames[known], keys, rng)
+class _Points(NamedTuple):
+    """Points of one batch, N of them."""
+
+    # Shape (N,).
+    frame: IntArray
+    laser: IntArray
+    label: IntArray
+    used: NDArray[Any]
+    # x, y and z in `dome`, shape (N,) each, in metres.
+    xyz: list[FloatArray]
 
 
-def _add_counts(
-    summary: PointSummary,
-    used: NDArray[Any],
-    frame: IntArray,
-    laser: IntArray,
-    label: IntArray,
-    xyz: list[FloatArray],
-    track: Track,
-) -> tuple[IntArray, IntArray]:
-    """Count points by label and by frame.
+class _Gathered:
+    """Points of a dive, batch by batch.
 
-    Return the numbers of target points, and the rows of their frames in the track. Points of
-    frames that the track has not, or of lasers beyond `MAX_LASERS`, are passed over.
+    `sample_frames`: numbers of frames whose points are kept.
     """
-    row = np.minimum(np.searchsorted(track.frame, frame), len(track) - 1)
-    known = (track.frame[row] == frame) & (laser >= 0) & (laser < MAX_LASERS)
-    n_labels = summary.labels.shape[1]
-    _count_cells(summary.labels, laser[known], np.clip(label[known], 0, n_labels - 1))
-    target = np.flatnonzero(known & used.astype(np.bool_) & np.isfinite(xyz).all(axis=0))
-    # A batch holds some frames of many.
-    row = row[target]
-    rows = slice(row.min(initial=len(track)), row.max(initial=0) + 1)
-    _count_cells(summary.on_target[rows], row - rows.start, laser[target])
-    return target, row
 
+    def __init__(self, track: Track, sample_frames: list[int]) -> None:
+        n = len(track)
+        self.summary = PointSummary(
+            on_target=np.zeros((n, MAX_LASERS), np.int64),
+            squares_mm2=np.zeros(n),
+            n_squares=np.zeros(n, np.int64),
+        )
+        self._track, self._sample_frames = track, sample_frames
+        # Normal and distance of the target in every frame, shape (N, 4), NaN where refused.
+        self._planes = np.column_stack(plane_of_posture(track.posture))
+        self._planes[~track.valid] = np.nan
+        # The points with the smallest of all random keys: a uniform sample of any stream.
+        self._keys, self._rng = np.zeros(0), np.random.default_rng(20210126)
 
-def _add_residuals(
-    summary: PointSummary, laser: IntArray, row: IntArray, xyz: list[FloatArray], plane: FloatArray
-) -> None:
-    """Add the distances of target points from their frames' planes."""
-    off_mm = 1e3 * (sum(plane[:, k] * xyz[k] for k in range(3)) - plane[:, 3])
-    known = np.isfinite(off_mm)
-    off_mm, row = off_mm[known], row[known]
-    first = row.min(initial=len(summary.n_squares))
-    squares = np.bincount(row - first, off_mm**2)
-    rows = slice(first, first + len(squares))
-    summary.squares_mm2[rows] += squares
-    summary.n_squares[rows] += np.bincount(row - first)
-    _count(summary.residual, RESIDUAL_EDGES_MM, laser[known], off_mm)
+    def add(self, batch: dict[str, NDArray[Any]]) -> None:
+        """Add one batch, as `_columns` gives it."""
+        frame, laser, label = (batch[name].astype(np.int64) for name in ("frame", "laser", "label"))
+        points = _Points(
+            frame,
+            laser,
+            label,
+            batch["used"],
+            [batch[f"{axis}_m"].astype(np.float64) for axis in "xyz"],
+        )
+        target, row = self._add_counts(points)
+        planes = self._planes[row]
+        self._add_residuals(points, target, row, planes)
+        if "quality" in batch:
+            quality = batch["quality"][target].astype(np.float64)
+            _count(self.summary.quality, QUALITY_EDGES, laser[target], quality)
+        self._keep_samples(points, batch)
+        # Points of a frame without a posture have no place in the target's frame.
+        known = np.isfinite(planes[:, 3])
+        self._grow_cloud(points, target[known], planes[known])
+
+    def _add_counts(self, points: _Points) -> tuple[IntArray, IntArray]:
+        """Count points by label and by frame.
+
+        Return the numbers of target points, and the rows of their frames in the track. Points of
+        frames that the track has not, or of lasers beyond `MAX_LASERS`, are passed over.
+        """
+        track, laser = self._track, points.laser
+        row = np.minimum(np.searchsorted(track.frame, points.frame), len(track) - 1)
+        known = (track.frame[row] == points.frame) & (laser >= 0) & (laser < MAX_LASERS)
+        labels = self.summary.labels
+        _count_cells(labels, laser[known], np.clip(points.label[known], 0, labels.shape[1] - 1))
+        used = points.used.astype(np.bool_)
+        target = np.flatnonzero(known & used & np.isfinite(points.xyz).all(axis=0))
+        # A batch holds some frames of many.
+        row = row[target]
+        rows = slice(row.min(initial=len(track)), row.max(initial=0) + 1)
+        _count_cells(self.summary.on_target[rows], row - rows.start, laser[target])
+        return target, row
+
+    def _add_residuals(
+        self, points: _Points, target: IntArray, row: IntArray, plane: FloatArray
+    ) -> None:
+        """Add the distances of target points from their frames' planes."""
+        summary = self.summary
+        off_mm = 1e3 * (sum(plane[:, k] * points.xyz[k][target] for k in range(3)) - plane[:, 3])
+        known = np.isfinite(off_mm)
+        off_mm, row = off_mm[known], row[known]
+        first = row.min(initial=len(summary.n_squares))
+        squares = np.bincount(row - first, off_mm**2)
+        rows = slice(first, first + len(squares))
+        summary.squares_mm2[rows] += squares
+        summary.n_squares[rows] += np.bincount(row - first)
+        _count(summary.residual, RESIDUAL_EDGES_MM, points.laser[target][known], off_mm)
+
+    def _keep_samples(self, points: _Points, batch: dict[str, NDArray[Any]]) -> None:
+        """Keep the points of sample frames; a frame may go on in the next batch."""
+        frame, laser, samples = points.frame, points.laser, self.summary.samples
+        if not len(frame):
+            return
+        first, last = int(frame.min()), int(frame.max())
+        for sample in self._sample_frames:
+            mine = np.flatnonzero(frame == sample) if first <= sample <= last else _NONE
+            mine = mine[(laser[mine] >= 0) & (laser[mine] < MAX_LASERS)]
+            if not len(mine):
+                continue
+            new = FramePoints(
+                laser[mine],
+                points.label[mine].clip(0, len(Label) - 1),
+                points.used[mine],
+                np.stack([batch["u_px"][mine], batch["v_px"][mine]], axis=-1).astype(np.float64),
+                np.stack([axis[mine] for axis in points.xyz], axis=-1),
+            )
+            old = samples.get(sample)
+            if old is not None:
+                names = new.__dataclass_fields__
+                new = FramePoints(
+                    *(np.concatenate([getattr(p, n) for p in (old, new)]) for n in names)
+                )
+            samples[sample] = new
+
+    def _grow_cloud(self, points: _Points, target: IntArray, planes: FloatArray) -> None:
+        drawn = self._rng.random(len(target))
+        cloud = 15_000
+        if len(self._keys) == cloud:
+            # Of many points only the few whose key is small enough are looked at again.
+            small = np.flatnonzero(drawn < self._keys.max())
+            drawn, target, planes = drawn[small], target[small], planes[small]
+        summary, keys = self.summary, np.concatenate([self._keys, drawn])
+        places = _in_target(np.stack([axis[target] for axis in points.xyz], axis=-1), planes)
+        places = np.concatenate([summary.cloud_in_target, places])
+        laser = np.concatenate([summary.cloud_laser, points.laser[target]])
+        if len(keys) > cloud:
+            kept = np.argpartition(keys, cloud)[:cloud]
+            keys, places, laser = keys[kept], places[kept], laser[kept]
+        self._keys, summary.cloud_in_target, summary.cloud_laser = keys, places, laser
 
 
 def _count_cells(counts: IntArray, i: IntArray, j: IntArray) -> None:
     """Add 1 to the cell (i, j) of a table for each of N points."""
     cells = np.bincount(i * counts.shape[1] + j, minlength=counts.size)
     counts += cells.reshape(counts.shape)
-
-
-def _keep_samples(
-    summary: PointSummary,
-    batch: dict[str, NDArray[Any]],
-    frame: IntArray,
-    laser: IntArray,
-    label: IntArray,
-    xyz: list[FloatArray],
-    sample_frames: list[int],
-) -> None:
-    """Keep the points of sample frames; a frame may go on in the next batch."""
-    if not len(frame):
-        return
-    first, last = int(frame.min()), int(frame.max())
-    for sample in sample_frames:
-        mine = np.flatnonzero(frame == sample) if first <= sample <= last else _NONE
-        mine = mine[(laser[mine] >= 0) & (laser[mine] < MAX_LASERS)]
-        if not len(mine):
-            continue
-        new = FramePoints(
-            laser[mine],
-            label[mine].clip(0, len(Label) - 1),
-            batch["used"][mine],
-            np.stack([batch["u_px"][mine], batch["v_px"][mine]], axis=-1).astype(np.float64),
-            np.stack([axis[mine] for axis in xyz], axis=-1),
-        )
-        old = summary.samples.get(sample)
-        if old is not None:
-            names = new.__dataclass_fields__
-            new = FramePoints(*(np.concatenate([getattr(p, n) for p in (old, new)]) for n in names))
-        summary.samples[sample] = new
 
 
 def _count(histogram: IntArray, edges: FloatArray, laser: IntArray, values: FloatArray) -> None:
@@ -260,33 +266,6 @@ def _count(histogram: IntArray, edges: FloatArray, laser: IntArray, values: Floa
         laser, values = laser[finite], values[finite]
     bins = ((values - edges[0]) / (edges[1] - edges[0])).clip(0, histogram.shape[1] - 1)
     _count_cells(histogram, laser, bins.astype(np.int64))
-
-
-def _grow_cloud(
-    summary: PointSummary,
-    xyz: list[FloatArray],
-    laser: IntArray,
-    target: IntArray,
-    planes: FloatArray,
-    keys: FloatArray,
-    rng: np.random.Generator,
-) -> FloatArray:
-    """Keep the points with the smallest of all random keys: a uniform sample of any stream."""
-    drawn = rng.random(len(target))
-    cloud = 15_000
-    if len(keys) == cloud:
-        # Of many points only the few whose key is small enough are looked at again.
-        small = np.flatnonzero(drawn < keys.max())
-        drawn, target, planes = drawn[small], target[small], planes[small]
-    keys = np.concatenate([keys, drawn])
-    points = _in_target(np.stack([axis[target] for axis in xyz], axis=-1), planes)
-    points = np.concatenate([summary.cloud_in_target, points])
-    laser = np.concatenate([summary.cloud_laser, laser[target]])
-    if len(keys) > cloud:
-        kept = np.argpartition(keys, cloud)[:cloud]
-        keys, points, laser = keys[kept], points[kept], laser[kept]
-    summary.cloud_in_target, summary.cloud_laser = points, laser
-    return keys
 
 
 def _in_target(points: FloatArray, planes: FloatArray) -> FloatArray:
