@@ -19,9 +19,8 @@ import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.net_survey.surveys import Survey
+from aqualvs.nets.places import metres_per_radian
 
-# A round net shows in how its bearing grows along the way (as in `nets.places`).
-_MIN_TURN, _MIN_AGREEMENT = np.deg2rad(5.0), 0.9
 _MIN_KNOWN = 3
 # Flat nets are the same side of a pen if they face the same way up to a compass's error.
 _FLAT_SPREAD, _SAME_SIDE = np.deg2rad(10.0), np.deg2rad(25.0)
@@ -118,11 +117,7 @@ def _radius(survey: Survey) -> float | None:
     if len(known) < _MIN_KNOWN or survey.by_bearing:
         return None
     turn, along = np.unwrap(one.bearing[known]), one.along[known]
-    turn, along = turn - turn.mean(), along - along.mean()
-    spread = float(np.sqrt(turn @ turn * (along @ along)))
-    if np.std(turn) < _MIN_TURN or abs(turn @ along) < _MIN_AGREEMENT * spread:
-        return None
-    return float(turn @ along) / float(turn @ turn)
+    return metres_per_radian(turn - turn.mean(), along - along.mean())
 
 
 def _facing(survey: Survey) -> float:

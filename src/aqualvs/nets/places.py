@@ -447,17 +447,28 @@ def _along_a_cage(along: FloatArray, run: IntArray, bearing: FloatArray) -> Floa
     within = [known & (run == r) for r in np.unique(run[known])]
     off_turn = np.concatenate([turn[mine] - turn[mine].mean() for mine in within])
     off_along = np.concatenate([along[mine] - along[mine].mean() for mine in within])
-    spread = float(np.sqrt(off_turn @ off_turn * (off_along @ off_along)))
-    # A round cage is detected by the growth of its bearing along the track: least change (standard
-    # deviation), and least coefficient of correlation of the two.
-    min_turn, min_agreement = np.deg2rad(5.0), 0.9
-    if np.std(off_turn) < min_turn or abs(off_turn @ off_along) < min_agreement * spread:
+    radius = metres_per_radian(off_turn, off_along)
+    if radius is None:
         return None
-    radius = float(off_turn @ off_along) / float(off_turn @ off_turn)
     lag = np.array([np.mean((radius * turn - along)[mine]) for mine in within])
     numbers = np.array([run[mine][0] for mine in within])
     # A run without bearings is placed with its neighbours.
     return np.asarray(along + np.interp(run, numbers, lag) - np.interp(0, numbers, lag))
+
+
+def metres_per_radian(turn: FloatArray, along: FloatArray) -> float | None:
+    """Return how far along a net its bearing turns by a radian; None where it shows no roundness.
+
+    `turn`, `along`, shape (n,): bearings and places along the net, less their means; negative
+    where bearings fall to the right.
+    """
+    # A round cage is detected by the growth of its bearing along the track: least change (standard
+    # deviation), and least coefficient of correlation of the two.
+    min_turn, min_agreement = np.deg2rad(5.0), 0.9
+    spread = float(np.sqrt(turn @ turn * (along @ along)))
+    if np.std(turn) < min_turn or abs(turn @ along) < min_agreement * spread:
+        return None
+    return float(turn @ along) / float(turn @ turn)
 
 
 def _pinned(time_s: FloatArray, up: FloatArray, run: IntArray, depth: FloatArray) -> FloatArray:
