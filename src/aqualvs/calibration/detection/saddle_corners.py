@@ -89,7 +89,7 @@ def fit_saddles(
     pixels: FloatArray,
     quality: FloatArray,
 ) -> None:
-    """Move `pixels` (N, 2) onto the crossings; write sigma, residual share, turn, blur (N, 4).
+    """Move `pixels` (N, 2) onto the crossings; write sigma, residual share, turn (N, 3).
 
     Sigma stays 0 where nothing could be fitted; arguments as in `refine_saddles`.
     """
@@ -108,7 +108,6 @@ def fit_saddles(
         pixels[i, 0], pixels[i, 1] = best[0], best[1]
         quality[i, 0], quality[i, 1] = sigma, share
         quality[i, 2] = max(abs(best[2] - turn_1), abs(best[3] - turn_2))
-        quality[i, 3] = math.exp(best[4])
 
 
 @inline_borrowing_kernel
@@ -387,7 +386,7 @@ def refine_saddles(
         Refined corners; those that the picture does not confirm are not valid.
     """
     pixels = np.array(starts, dtype=np.float64, order="C")
-    quality = np.zeros((len(pixels), 4))
+    quality = np.zeros((len(pixels), 3))
     fit_saddles(
         np.ascontiguousarray(image),
         np.ascontiguousarray(axes, dtype=np.float64),
@@ -397,7 +396,7 @@ def refine_saddles(
         pixels,
         quality,
     )
-    sigma, residual_share, turn, _ = quality.T
+    sigma, residual_share, turn = quality.T
     side = np.sqrt(np.min(np.sum(np.square(axes), axis=1), axis=-1, initial=np.inf))
     wander = np.linalg.norm(pixels - starts, axis=1)
     # Limits of an accepted fit: move from the start in sides of a square, residual as a share of
