@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
-from aqualvs.simulation.vehicle.dynamics import N_STATE, Body, coast, make_work
+from aqualvs.simulation.vehicle.dynamics import N_STATE, Body
 from aqualvs.simulation.vehicle.models import (
     BLUEROV2,
     BLUEROV2_HEAVY,
@@ -20,6 +20,7 @@ from aqualvs.simulation.vehicle.models import (
 )
 from aqualvs.simulation.vehicle.vehicle import pack_body, pose_of, state_at
 from aqualvs.simulation.vehicle.water_motion import Flow, Tether, WaterMotion, Waves
+from water_cases import coast, water_at
 
 MODELS = pytest.mark.parametrize("model", VEHICLES.values(), ids=VEHICLES)
 STEP = 1.0 / 400.0
@@ -46,7 +47,7 @@ def carried_on(
     """State after n steps under thrusts that change to `wanted`, if that is given."""
     y, forces = state.copy(), np.array(thrusts, dtype=np.float64)
     aim = forces.copy() if wanted is None else np.array(wanted, dtype=np.float64)
-    coast(y, forces, aim, 0.0, h, n, body, flow, make_work())
+    coast(y, forces, aim, h, n, body, flow)
     return y
 
 
@@ -174,7 +175,7 @@ def test_small_body_rides_a_wave() -> None:
     # Froude-Krylov and added mass together: a neutral body that goes with the water stays with it.
     water = WaterMotion(waves=Waves(amplitude=0.3, period=4.0, direction=0.4), seed=3)
     place = np.array([1.0, 2.0, 1.5])
-    velocity, acceleration = water.motion(0.0, place)
+    velocity, acceleration = water_at(water, 0.0, place)
     state = state_at(SE3(np.eye(3), place))
     state[7:10] = velocity
     model = neutral(BLUEROV2_HEAVY, *BLUEROV2_HEAVY.thrusters)
@@ -213,7 +214,7 @@ def test_step_size_converges_with_the_fourth_order() -> None:
 def test_thrust_approaches_with_its_lag() -> None:
     body, flow = pack_body(BLUEROV2), CALM.pack()
     y, thrusts = state_at(SE3.identity()), np.zeros(6)
-    coast(y, thrusts, np.full(6, 10.0), 0.0, STEP, 40, body, flow, make_work())
+    coast(y, thrusts, np.full(6, 10.0), STEP, 40, body, flow)
     assert thrusts == pytest.approx(10.0 * (1.0 - np.exp(-1.0)), rel=1e-9)
 
 

@@ -22,11 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray
-from aqualvs.geometry.compiled import (
-    borrowing_kernel,
-    inline_borrowing_kernel,
-    inner_borrowing_kernel,
-)
+from aqualvs.geometry.compiled import borrowing_kernel, inline_borrowing_kernel
 from aqualvs.geometry.linear_algebra import Vec, cross, minus
 from aqualvs.simulation.vehicle.models import DOWN, FORWARD, PITCH, RIGHT, ROLL, YAW, VehicleModel
 from aqualvs.simulation.vehicle.water_motion import Flow, orbit_at, stream_at, tether_force
@@ -218,23 +214,6 @@ def advance(
         y[ATTITUDE + i] /= length
     for k in range(thrusts.shape[0]):
         thrusts[k] = wanted[k] + (thrusts[k] - wanted[k]) * half * half
-
-
-@inner_borrowing_kernel
-def coast(
-    y: FloatArray,
-    thrusts: FloatArray,
-    wanted: FloatArray,
-    t: float,
-    h: float,
-    n: int,
-    body: Body,
-    flow: Flow,
-    work: Work,
-) -> None:
-    """Advance state (13,) and thrusts (n_thrusters,) by `n` steps without an autopilot."""
-    for i in range(n):
-        advance(y, thrusts, wanted, t + i * h, h, body, flow, work)
 
 
 # Memory of the autopilot.

@@ -13,6 +13,7 @@ import numpy as np
 
 from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import FloatArray
+from aqualvs.geometry.compiled import python_of
 from aqualvs.geometry.transforms import SE3, rotvec_from_rotation
 from aqualvs.simulation.vehicle.dynamics import (
     DEPTH,
@@ -28,6 +29,7 @@ from aqualvs.simulation.vehicle.dynamics import (
     fly,
     make_work,
     pack_pilot,
+    turn_of,
 )
 from aqualvs.simulation.vehicle.models import VehicleModel
 from aqualvs.simulation.vehicle.water_motion import GRAVITY, WaterMotion
@@ -354,15 +356,8 @@ def state_at(world_from_body: SE3) -> FloatArray:
 
 def pose_of(state: FloatArray) -> SE3:
     """Return world_from_body of a state, shape (13,)."""
-    w, x, y, z = state[3:7].tolist()
-    turn = np.array(
-        [
-            [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
-            [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
-            [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
-        ]
-    )
-    return SE3(turn, state[:3].copy())
+    turn = python_of(turn_of)(state.tolist())
+    return SE3(np.array(turn), state[:3].copy())
 
 
 def _quaternion(rotation: FloatArray) -> FloatArray:

@@ -14,8 +14,8 @@ import numpy as np
 
 from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import FloatArray
-from aqualvs.geometry.compiled import inline_borrowing_kernel, kernel
-from aqualvs.geometry.linear_algebra import Vec, row3
+from aqualvs.geometry.compiled import inline_borrowing_kernel
+from aqualvs.geometry.linear_algebra import Vec
 
 GRAVITY = 9.81
 """In m/s²."""
@@ -114,18 +114,8 @@ class WaterMotion:
         waves = self.waves.table(rng) if self.waves else np.zeros((0, _WAVE_COLUMNS))
         tether = self.tether
         thickness = 0.5 * self.density * tether.drag * tether.diameter
-        line = [thickness * tether.length, *tether.attached_at, *tether.pull]
-        return Flow(np.array(self.current, dtype=np.float64), self._drift(rng), waves, _row(line))
-
-    def velocity(self, time_s: float, position: FloatArray) -> FloatArray:
-        """Return the velocity of the water at a place, shape (3,) each, in the world, in m/s."""
-        return self.motion(time_s, position)[0]
-
-    def motion(self, time_s: float, position: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return velocity (m/s) and acceleration (m/s²) of the water at a place, shape (3,)."""
-        place = np.ascontiguousarray(position, dtype=np.float64)
-        both = _motion(float(time_s), place, self.pack())
-        return np.array(both[0]), np.array(both[1])
+        line = np.array([thickness * tether.length, *tether.attached_at, *tether.pull], np.float64)
+        return Flow(np.array(self.current, dtype=np.float64), self._drift(rng), waves, line)
 
     def _drift(self, rng: np.random.Generator) -> FloatArray:
         """Return a few slow sine waves along north and along east, shape (2 * _DRIFT_TERMS, 4)."""
@@ -149,10 +139,6 @@ class Flow(NamedTuple):
     waves: FloatArray
     # Shape (7,): of the tether: half density times drag times area; where it is attached; its pull.
     line: FloatArray
-
-
-def _row(values: list[float]) -> FloatArray:
-    return np.array(values, dtype=np.float64)
 
 
 @inline_borrowing_kernel
@@ -212,12 +198,3 @@ def tether_force(stream: Vec, velocity: Vec, flow: Flow) -> Vec:
         weight = _GAUSS_WEIGHT[i] * s * flow.line[0] * np.sqrt(u * u + v * v)
         north, east = north + weight * u, east + weight * v
     return north + flow.line[4], east + flow.line[5], flow.line[6]
-
-
-@kernel
-def _motion(t: float, place: FloatArray, flow: Flow) -> tuple[Vec, Vec]:
-    """Return velocity and acceleration of the water at a place."""
-    at = row3(place.reshape(1, 3), 0, 0)
-    stream, orbit = stream_at(t, flow), orbit_at(t, at, flow)
-    v, w, a, b = stream[0], orbit[0], stream[1], orbit[1]
-    return (v[0] + w[0], v[1] + w[1], v[2] + w[2]), (a[0] + b[0], a[1] + b[1], a[2] + b[2])
