@@ -21,7 +21,7 @@ import numpy as np
 import yaml
 
 from aqualvs.geometry.arrays import FloatArray
-from aqualvs.simulation.cameras import list_cameras
+from aqualvs.simulation.cameras import CAMERAS
 
 _NET: dict[str, Any] = {
     "range_mm": {"values": [350, 520, 430], "sway": 4, "period_s": 2.3},
@@ -171,7 +171,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("-o", "--out", type=Path, required=True)
     parser.add_argument("--frames", type=int, default=12)
-    parser.add_argument("--cameras", nargs="+", default=[c for c in list_cameras() if c != "ideal"])
+    parser.add_argument("--cameras", nargs="+", default=[c for c in CAMERAS if c != "ideal"])
     parser.add_argument("--dives", nargs="+", default=list(DIVES), choices=list(DIVES))
     options = parser.parse_args()
     print("| dive | camera | valid % | wrong | range % | pitch deg | yaw deg | z | reasons | |")

@@ -9,12 +9,12 @@ import pytest
 from aqualvs.errors import OptionError
 from aqualvs.optics.water import GREEN_NM
 from aqualvs.simulation.cameras import (
+    CAMERAS,
     IDEAL,
     Development,
     Drift,
     SimulatedCamera,
     expose,
-    list_cameras,
     simulated_camera,
     spread,
 )
@@ -38,7 +38,6 @@ def _flat(colour, size=(32, 48)):
 def _shoot(radiance, t=0.0, rng=None, filters=None, **options):
     camera = SimulatedCamera(
         name="test",
-        about="",
         filters=ColourFilters() if filters is None else filters,
         development=replace(_PLAIN, **options),
     )
@@ -237,4 +236,4 @@ def test_water_dims_a_wavelength_as_its_band():
 def test_an_unknown_camera_is_refused_with_the_known_ones():
     with pytest.raises(OptionError, match="ideal, webcam, action, pal"):
         simulated_camera("gopro")
-    assert list(list_cameras()) == ["ideal", *REAL]
+    assert list(CAMERAS) == ["ideal", *REAL]

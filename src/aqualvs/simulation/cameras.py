@@ -214,7 +214,6 @@ class SimulatedCamera:
     """Camera for simulated pictures."""
 
     name: str  # Name for `aqualvs simulate --camera`.
-    about: str  # One line for lists.
     filters: ColourFilters = COLOUR_BALANCED  # Response of its sensor to daylight and lasers.
     development: Development | None = None  # None uses the scene's own `CameraSensor` only.
     recording: Compression = field(default_factory=Compression)  # Compression of its videos.
@@ -287,13 +286,12 @@ def _through_mosaic(raw: Rgb) -> Rgb:
     return np.asarray(colours.astype(np.float32) / np.float32(full_scale))
 
 
-IDEAL = SimulatedCamera(
-    name="ideal", about="no faults but blur, noise and a full scale; H.264 at high quality"
-)
+IDEAL = SimulatedCamera(name="ideal")
+"""No faults but blur, noise and a full scale; H.264 at high quality."""
 
-WEBCAM = SimulatedCamera(
+# Cheap USB camera: crosstalk, sharpening, drifting white balance and exposure, MJPEG.
+_WEBCAM = SimulatedCamera(
     name="webcam",
-    about="cheap USB camera: crosstalk, sharpening, drifting white balance and exposure, MJPEG",
     filters=ColourFilters(at_green=(0.02, 1.0, 0.63), saturation=0.5),
     development=Development(
         defocus_px=0.7,
@@ -315,9 +313,9 @@ WEBCAM = SimulatedCamera(
     still_quality=80,
 )
 
-ACTION = SimulatedCamera(
+# Action camera with lamps: strong tone curve, white cores in a halo, H.264 at a low rate.
+_ACTION = SimulatedCamera(
     name="action",
-    about="action camera with lamps: strong tone curve, white cores in a halo, H.264 at a low rate",
     filters=ColourFilters(at_green=(0.37, 1.0, 0.76), saturation=0.6),
     development=Development(
         lamp=(0.30, 0.30, 0.28),
@@ -341,9 +339,9 @@ ACTION = SimulatedCamera(
     still_quality=85,
 )
 
-PAL = SimulatedCamera(
+# Analogue video, captured: soft, narrow chroma, noise, edges overshoot sideways, H.264.
+_PAL = SimulatedCamera(
     name="pal",
-    about="analogue video, captured: soft, narrow chroma, noise, edges overshoot sideways, H.264",
     filters=ColourFilters(at_green=(0.34, 1.0, 0.55), saturation=0.2),
     development=Development(
         defocus_px=0.9,
@@ -367,14 +365,10 @@ PAL = SimulatedCamera(
     still_quality=92,
 )
 
-_CAMERAS: Mapping[str, SimulatedCamera] = MappingProxyType(
-    {camera.name: camera for camera in (IDEAL, WEBCAM, ACTION, PAL)}
+CAMERAS: Mapping[str, SimulatedCamera] = MappingProxyType(
+    {camera.name: camera for camera in (IDEAL, _WEBCAM, _ACTION, _PAL)}
 )
-
-
-def list_cameras() -> dict[str, str]:
-    """Return the names of the cameras, each with one line about it."""
-    return {name: camera.about for name, camera in _CAMERAS.items()}
+"""All cameras by name."""
 
 
 def simulated_camera(name: str) -> SimulatedCamera:
@@ -382,9 +376,9 @@ def simulated_camera(name: str) -> SimulatedCamera:
 
     Raises `OptionError` if there is none of that name.
     """
-    if name not in _CAMERAS:
-        raise OptionError(f"--camera {name}: no such camera; choose one of {', '.join(_CAMERAS)}")
-    return _CAMERAS[name]
+    if name not in CAMERAS:
+        raise OptionError(f"--camera {name}: no such camera; choose one of {', '.join(CAMERAS)}")
+    return CAMERAS[name]
 
 
 class CornerRays(NamedTuple):
