@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -118,8 +118,9 @@ class StoredDive:
 
     def __init__(self, run_folder: Path) -> None:
         check_stored(run_folder)
-        self._folder = run_folder
-        self._content = _run_file(run_folder)
+        self._folder, self._content = run_folder, read_run_yaml(run_folder)
+        if not isinstance(self._content.get("rig"), dict):
+            raise SourceError(f"{run_folder / RUN_YAML}: holds no rig; run the dive again")
 
     @property
     def n_frames(self) -> int | None:
@@ -142,13 +143,6 @@ class StoredDive:
         """
         rig = rig_from_mapping(self._content["rig"], source_name=str(self._folder / RUN_YAML))
         return NetPass(rig, request)
-
-
-def _run_file(run_folder: Path) -> dict[str, Any]:
-    content = read_run_yaml(run_folder)
-    if not isinstance(content.get("rig"), dict):
-        raise SourceError(f"{run_folder / RUN_YAML}: holds no rig; run the dive again")
-    return content
 
 
 NET_CHANGE_CSV, HOLES_CHANGE_CSV = "net_change.csv", "holes_change.csv"
