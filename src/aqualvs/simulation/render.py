@@ -355,11 +355,10 @@ class Renderer:
     ) -> None:
         """Write the light of some rows, from the first to before the last, into a picture."""
         members = tile_members(self.rig.camera(), self.rig.size_px, surfaces)
-        everything = np.arange(len(surfaces.ellipsoids), dtype=np.int64)
         light = pack_light(self.camera.light(scene), t)
 
         def render_band(band: tuple[int, int]) -> None:
-            _render(band, rays, self.samples, surfaces, members, everything, sheets, light, out)
+            _render(band, rays, self.samples, surfaces, members, sheets, light, out)
 
         if self.threads == 1:
             # Of a picture that rolls this is called for every few rows.
@@ -390,7 +389,6 @@ def _render(
     samples: int,
     s: Surfaces,
     members: TileMembers,
-    everything: IntArray,
     sheets: Sheets,
     light: Light,
     out: NDArray[np.float32],
@@ -408,7 +406,7 @@ def _render(
                 x, y = (k % samples + 0.5) / samples, (k // samples + 0.5) / samples
                 o = between_corners(origins, row, column, x, y)
                 d = unit(between_corners(directions, row, column, x, y))
-                seen = radiance(o, d, s, near, everything, sheets, light)
+                seen = radiance(o, d, s, near, sheets, light)
                 red, green, blue = red + seen[0], green + seen[1], blue + seen[2]
             out[row, column, 0] = red * weight
             out[row, column, 1] = green * weight

@@ -66,9 +66,7 @@ class Members(NamedTuple):
 
 
 @inline_borrowing_kernel
-def radiance(
-    o: Vec, d: Vec, s: Surfaces, near: Members, everything: IntArray, sheets: Sheets, light: Light
-) -> Vec:
+def radiance(o: Vec, d: Vec, s: Surfaces, near: Members, sheets: Sheets, light: Light) -> Vec:
     """Return the radiance (red, green, blue) that arrives along a ray."""
     hit = first_hit(o, d, s, near.ellipsoids, near.first, near.last)
     red, green, blue = 0.0, 0.0, 0.0
@@ -76,7 +74,7 @@ def radiance(
         normal, albedo = normal_and_albedo(o, d, hit, s)
         p = along(o, d, hit.t)
         sun = _daylight(p, normal, light, s.tiles)
-        laser = _laser_light(p, normal, s, everything, sheets, light)
+        laser = _laser_light(p, normal, s, sheets, light)
         red = albedo[0] * (light.colours[2, 0] * sun + laser[0])
         green = albedo[1] * (light.colours[2, 1] * sun + laser[1])
         blue = albedo[2] * (light.colours[2, 2] * sun + laser[2])
@@ -92,7 +90,7 @@ def radiance(
         _through(blue, 2, path, veil, light) + glow[2],
     )
     if t < hit.t:
-        seen = _over_bubble(seen, o, d, t, row, s, everything, sheets, light)
+        seen = _over_bubble(seen, o, d, t, row, s, sheets, light)
     return seen
 
 
@@ -128,9 +126,7 @@ def _daylight(p: Vec, normal: Vec, light: Light, tiles: Tiles) -> float:
 
 
 @inline_borrowing_kernel
-def _laser_light(
-    p: Vec, normal: Vec, s: Surfaces, everything: IntArray, sheets: Sheets, light: Light
-) -> Vec:
+def _laser_light(p: Vec, normal: Vec, s: Surfaces, sheets: Sheets, light: Light) -> Vec:
     """Return the laser light that a surface receives, all sheets together."""
     total = _DARK
     for i in range(sheets.table.shape[0]):
@@ -139,7 +135,7 @@ def _laser_light(
             continue
         from_source, slant = _from_source(p, off, sigma, sheets, i)
         facing = -dot(from_source, normal)
-        if facing <= 0.0 or _shadowed(p, from_source, slant, s, everything):
+        if facing <= 0.0 or _shadowed(p, from_source, slant, s):
             continue
         dimmed = laser_attenuation(row3(light.colours, 0, 0), sheets, i)
         peak = peak_irradiance(distance, sigma, place, dimmed, sheets, i)
@@ -163,9 +159,9 @@ def _from_source(p: Vec, off: float, sigma: float, sheets: Sheets, i: int) -> tu
 
 
 @inline_borrowing_kernel
-def _shadowed(p: Vec, from_source: Vec, length: float, s: Surfaces, everything: IntArray) -> bool:
+def _shadowed(p: Vec, from_source: Vec, length: float, s: Surfaces) -> bool:
     start = along(p, from_source, -length)
-    blocker = first_hit(start, from_source, s, everything, 0, everything.shape[0])
+    blocker = first_hit(start, from_source, s, s.all_ellipsoids, 0, s.all_ellipsoids.shape[0])
     return blocker.t < length - _SHADOW_MARGIN
 
 
@@ -208,15 +204,7 @@ def crossing_sheet(o: Vec, d: Vec, sheets: Sheets, i: int) -> tuple[float, float
 
 @inline_borrowing_kernel
 def _over_bubble(
-    behind: Vec,
-    o: Vec,
-    d: Vec,
-    t: float,
-    row: int,
-    s: Surfaces,
-    everything: IntArray,
-    sheets: Sheets,
-    light: Light,
+    behind: Vec, o: Vec, d: Vec, t: float, row: int, s: Surfaces, sheets: Sheets, light: Light
 ) -> Vec:
     """Return the light with a bubble in front: totally reflecting rim, glints of sun and lasers."""
     p = along(o, d, t)
@@ -226,7 +214,7 @@ def _over_bubble(
     cover = min(0.18 + 1.1 * rim, 0.95)
     mirrored = unit(along(d, normal, 2.0 * facing))
     sky = 0.35 + 0.55 * max(mirrored[2], 0.0) + 2.2 * max(dot(mirrored, _UP), 0.0) ** 60
-    laser = scaled(_laser_light(p, normal, s, everything, sheets, light), 0.35 + 0.5 * rim)
+    laser = scaled(_laser_light(p, normal, s, sheets, light), 0.35 + 0.5 * rim)
     veil = _veil(d, light)
     return (
         _layer(behind[0], 0, cover, sky, laser[0], t, veil, light),

@@ -43,6 +43,7 @@ class Surfaces(NamedTuple):
     folds: FloatArray
     # As `walls`.
     ellipsoids: FloatArray
+    all_ellipsoids: IntArray  # Shape (n,): all of their rows.
     # As `walls`.
     boxes: FloatArray
     # As `walls`.
@@ -79,6 +80,7 @@ def pack_surfaces(scene: Scene, t: float) -> Surfaces:
         holes=_table([np.array(hole) for hole in holes], 4),
         folds=_table(folds, FOLD_COLUMNS),
         ellipsoids=_table(ellipsoids, 16),
+        all_ellipsoids=np.arange(len(ellipsoids), dtype=np.int64),
         boxes=_table([_pack_box(box, pose) for box in scene.boxes], 18),
         bubbles=_table(bubbles, 4),
         tiles=noise_tiles(),

@@ -123,22 +123,18 @@ def cast(origins: FloatArray, directions: FloatArray, surfaces: Surfaces) -> Rea
     """Return first intersections of rays, origins and unit directions (n, 3) in `dome`."""
     n = len(origins)
     reach = Reach(np.empty(n), np.empty(n, dtype=np.int64), np.empty(n))
-    everything = (np.arange(len(surfaces.ellipsoids)), np.arange(len(surfaces.bubbles)))
+    bubbles = np.arange(len(surfaces.bubbles))
     _cast_all(
-        np.ascontiguousarray(origins), np.ascontiguousarray(directions), surfaces, everything, reach
+        np.ascontiguousarray(origins), np.ascontiguousarray(directions), surfaces, bubbles, reach
     )
     return reach
 
 
 @borrowing_kernel
 def _cast_all(
-    origins: FloatArray,
-    directions: FloatArray,
-    s: Surfaces,
-    everything: tuple[IntArray, IntArray],
-    out: Reach,
+    origins: FloatArray, directions: FloatArray, s: Surfaces, bubbles: IntArray, out: Reach
 ) -> None:
-    ellipsoids, bubbles = everything
+    ellipsoids = s.all_ellipsoids
     for k in range(origins.shape[0]):
         o, d = row3(origins, k, 0), row3(directions, k, 0)
         hit = first_hit(o, d, s, ellipsoids, 0, ellipsoids.shape[0])
