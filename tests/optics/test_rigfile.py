@@ -147,6 +147,21 @@ def test_water_from_temperature_and_salinity() -> None:
     assert default.n_water == seawater_index_vacuum(15.0, 38.0, 532.0)
 
 
+@pytest.mark.parametrize(
+    ("wavelengths", "light_nm"),
+    [((650, 650), 650.0), ((450, 650), 532.0), ((None, 650), 532.0), ((780, 780), 700.0)],
+)
+def test_water_has_the_index_of_the_lasers_light(
+    wavelengths: tuple[int | None, int | None], light_nm: float
+) -> None:
+    content = hand_written(water={"temperature_c": 15, "salinity_permille": 38})
+    for laser, nm in zip(content["lasers"], wavelengths, strict=True):
+        if nm is not None:
+            laser["wavelength_nm"] = nm
+    expected = seawater_index_vacuum(15.0, 38.0, light_nm)
+    assert rig_from_mapping(content, source_name="x").n_water == expected
+
+
 def test_bare_lens_and_fisheye() -> None:
     content = hand_written(
         dome=..., camera__model="fisheye", camera__distortion=[0.1, 0.0, 0.0, 0.0]

@@ -25,7 +25,7 @@ from aqualvs.calibration_formats import refuse_foreign
 from aqualvs.errors import CalibrationError, OptionError, RigError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.optics.camera import Housing
-from aqualvs.optics.rig import Laser, Rig, RigUncertainty
+from aqualvs.optics.rig import Rig, RigUncertainty, common_wavelength
 from aqualvs.optics.rigfile import housing_of, keep_dated, load_rig, save_rig
 from aqualvs.optics.rigschema import LaserWavelength
 from aqualvs.optics.shutter import AT_ONCE, Shutter
@@ -121,12 +121,6 @@ def load_nominal(path: Path) -> Nominal:
     if not isinstance(content, Mapping):
         raise RigError(f"{path}: is not a nominal rig; write keys such as 'dome: ...'")
     return _of_rig_file(path) if "aqualvs_rig" in content else _of_mapping(content, path)
-
-
-def common_wavelength(lasers: Sequence[Laser]) -> float | None:
-    """Return the common wavelength of lasers (nm); None if they differ or it is unknown."""
-    found = {laser.wavelength_nm for laser in lasers}
-    return found.pop() if len(found) == 1 else None
 
 
 def _of_rig_file(path: Path) -> Nominal:

@@ -16,7 +16,6 @@ from aqualvs.calibrate.common import (
     Echo,
     Picture,
     check_same_size,
-    common_wavelength,
     counting_missed,
     detect_targets,
     finish,
@@ -41,7 +40,7 @@ from aqualvs.calibration.targets.target_files import load_board, load_box
 from aqualvs.calibration.targets.targets import Board, MarkerSet, View
 from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import FloatArray
-from aqualvs.optics.rig import Laser, Rig, RigUncertainty, merged
+from aqualvs.optics.rig import Laser, Rig, RigUncertainty, common_wavelength, merged
 from aqualvs.optics.rigfile import check_rig_place, load_rig
 from aqualvs.optics.rigschema import LASER_NM, LASER_NM_REMEDY
 from aqualvs.optics.solved import (

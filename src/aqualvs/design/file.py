@@ -279,7 +279,7 @@ def _design(file: DesignFile, folder: Path) -> Design:
         dome_from_cam=SE3(DOME_FROM_CAM_NOMINAL, position),
         housing=housing_of(file.dome, file.flat),
         n_air=N_AIR,
-        n_water=water_index(file.water, N_AIR),
+        n_water=water_index(file.water, N_AIR, ()),
         lasers=(),
         working_range=(near, far),
         shutter=shutter,

@@ -25,7 +25,7 @@ from aqualvs.optics.camera import Housing
 from aqualvs.optics.dome import Dome
 from aqualvs.optics.flat_port import FlatPort
 from aqualvs.optics.lens import COEFFICIENT_COUNTS, Lens, LensModel
-from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Laser, Rig, Window
+from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Laser, Rig, Window, index_in_seawater
 from aqualvs.optics.rigschema import (
     VERSION,
     LaserPart,
@@ -38,7 +38,7 @@ from aqualvs.optics.rigschema import (
 )
 from aqualvs.optics.shutter import AT_ONCE, Shutter, ShutterKind
 from aqualvs.optics.solved import rig_uncertainty
-from aqualvs.optics.water import GREEN_NM, seawater_index_vacuum
+from aqualvs.optics.water import seawater_index_vacuum
 from aqualvs.schema import StrictPart, si_values
 from aqualvs.yamlfile import carry_comments, parse_yaml, read_text, rig_text
 
@@ -259,6 +259,7 @@ def rig_from_mapping(
 def _rig(file: RigFile) -> Rig:
     camera = file.camera
     turn = rotation_from_rotvec(np.deg2rad(camera.rotation_deg))
+    lasers = tuple(_laser(f"lasers[{i}]", part) for i, part in enumerate(file.lasers))
     return Rig(
         name=file.name,
         size_px=(file.image.width_px, file.image.height_px),
@@ -273,8 +274,8 @@ def _rig(file: RigFile) -> Rig:
         dome_from_cam=SE3(turn @ DOME_FROM_CAM_NOMINAL, np.array(_position_mm(file)) / _MILLI),
         housing=_housing(file),
         n_air=file.n_air,
-        n_water=_water_index(file),
-        lasers=tuple(_laser(f"lasers[{i}]", part) for i, part in enumerate(file.lasers)),
+        n_water=_water_index(file, lasers),
+        lasers=lasers,
         working_range=(file.working_range_mm[0] / _MILLI, file.working_range_mm[1] / _MILLI),
         solved_from=dict(file.solved_from),
         shutter=shutter_from_part(camera.shutter),
@@ -343,18 +344,20 @@ def _position_mm(file: RigFile) -> list[float]:
     return [0.0, 0.0, 0.0]
 
 
-def _water_index(file: RigFile) -> float:
+def _water_index(file: RigFile, lasers: Sequence[Laser]) -> float:
     """Return the index outside; where nothing refracts it need not be said, and is that of air."""
     if file.water is None:
         housed = file.dome is not None or file.flat is not None
         if housed or any(laser.window is not None for laser in file.lasers):
             raise RigError(missing_text("water"))
         return file.n_air
-    return water_index(file.water, file.n_air)
+    return water_index(file.water, file.n_air, lasers)
 
 
-def water_index(water: WaterPart, n_air: float) -> float:
+def water_index(water: WaterPart, n_air: float, lasers: Sequence[Laser]) -> float:
     """Return the index relative to vacuum that a file's `water` gives, or Quan & Fry (1995) do.
+
+    They do for the light that `water` names, or else for that of the lasers.
 
     Raises `RigError` if it gives none, or more than one.
     """
@@ -371,14 +374,16 @@ def water_index(water: WaterPart, n_air: float) -> float:
             "water has no index; write 'water: {n: 1.3333}', or both temperature_c and "
             "salinity_permille"
         )
-    wavelength = GREEN_NM if water.wavelength_nm is None else water.wavelength_nm
     try:
-        n = seawater_index_vacuum(
-            water.temperature_c, water.salinity_permille, wavelength, n_air=n_air
+        if water.wavelength_nm is None:
+            return index_in_seawater(water.temperature_c, water.salinity_permille, lasers, n_air)
+        return float(
+            seawater_index_vacuum(
+                water.temperature_c, water.salinity_permille, water.wavelength_nm, n_air=n_air
+            )
         )
     except OptionError as error:
         raise RigError(f"water: {error}") from None
-    return float(n)
 
 
 def _laser(place: str, part: LaserPart) -> Laser:

@@ -163,7 +163,9 @@ class WaterPart(StrictPart):
     n: Annotated[Index | None, _said("Index outside, relative to vacuum.")] = None
     temperature_c: Annotated[Number | None, _said("0 to 30; in place of n.")] = None
     salinity_permille: Annotated[Number | None, _said("0 to 40; in place of n.")] = None
-    wavelength_nm: Annotated[Number | None, _said("Of the light, for the index; 532.")] = None
+    wavelength_nm: Annotated[
+        Number | None, _said("Of the light, for the index; that of the lasers, or 532.")
+    ] = None
 
 
 class WindowPart(StrictPart):

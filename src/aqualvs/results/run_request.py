@@ -17,9 +17,8 @@ from typing import Any
 from aqualvs import __version__
 from aqualvs.errors import OptionError, SourceError
 from aqualvs.nets.target_file import NetRequest, target_dict
-from aqualvs.optics.rig import Rig
+from aqualvs.optics.rig import Rig, index_in_seawater
 from aqualvs.optics.rigfile import load_rig
-from aqualvs.optics.water import seawater_index_vacuum
 from aqualvs.results.files import replace_text
 from aqualvs.scanner import ScannerOptions
 from aqualvs.scanning.detection import DETECTORS, detector_word
@@ -144,7 +143,7 @@ class Water:
             return rig.in_water(checked_index(self.n_water, "--water-n"))
         if self.seawater is None:
             return rig
-        return rig.in_water(float(seawater_index_vacuum(*self.seawater, n_air=rig.n_air)))
+        return rig.in_water(index_in_seawater(*self.seawater, rig.lasers, rig.n_air))
 
 
 @dataclass(frozen=True, slots=True)
