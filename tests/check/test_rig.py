@@ -174,6 +174,10 @@ def test_index_sigma_is_that_of_a_monte_carlo() -> None:
             pinhole(upright(), Laser("twin", Plane.from_normal([-1, 0, 0], -0.1))),
             "lie in one plane",
         ),
+        (
+            pinhole(upright(1.4e-4), level(-0.1)),
+            "'upright' passes the lens at 0.14 mm, so that its stripe does not move with range",
+        ),
         (replace(example_rig(), n_water=1.5), "index 1.5000 is not that of water"),
         (
             replace(
@@ -185,7 +189,7 @@ def test_index_sigma_is_that_of_a_monte_carlo() -> None:
             "looks 180 degrees away",
         ),
     ],
-    ids=["no lasers", "laser unseen", "coplanar", "no water", "backwards"],
+    ids=["no lasers", "laser unseen", "coplanar", "metres", "no water", "backwards"],
 )
 def test_what_makes_a_rig_useless(rig: Rig, words: str) -> None:
     assert words in sentences(check_rig(rig), Severity.BAD)

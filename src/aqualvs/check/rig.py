@@ -413,6 +413,14 @@ def _check_lasers(rig: Rig, camera: Camera) -> Iterator[Finding]:
 
 def _check_laser(rig: Rig, camera: Camera, laser: Laser) -> Finding:
     near, far = rig.working_range
+    # Beside the lens; nearer, a pixel is hundreds of millimetres of range at 0.6 m.
+    least_baseline = 1e-3
+    baseline = abs(float(laser.plane.normal @ rig.dome_from_cam.translation) - laser.plane.offset)
+    if baseline < least_baseline:
+        return Finding.bad(
+            f"Laser '{laser.name}' passes the lens at {baseline * 1e3:.2g} mm, so that its stripe "
+            "does not move with range; offset_mm is in millimetres."
+        )
     n_ranges = 43
     walls = np.geomspace(near, far, n_ranges)
     sheet = sheet_in(laser, rig.n_air, rig.n_water)

@@ -212,7 +212,8 @@ class WallView:
     @property
     def per_pixel(self) -> tuple[float, ...]:
         """As in `ExpectedError`."""
-        return tuple(float(np.nanmedian(np.abs(s))) if len(s) else np.nan for s in self.slopes)
+        known = (np.abs(s[~np.isnan(s)]) for s in self.slopes)
+        return tuple(float(np.median(s)) if len(s) else np.nan for s in known)
 
     def read_by(self, rig: Rig) -> FloatArray:
         """Return range, pitch and yaw (3,) that a rig computes from the same pixels; NaN if none.
