@@ -35,8 +35,10 @@ def made(tmp_path_factory):
 
 
 def test_boards_before_a_flat_port_are_in_water_at_their_true_poses(tmp_path):
+    rig = small_rig()
     rig = replace(
-        small_rig(),
+        rig,
+        lasers=tuple(replace(laser, wavelength_nm=650.0) for laser in rig.lasers),
         housing=FlatPort(0.012, 0.005, 1.49, 0.01, -0.01),
         dome_from_cam=SE3(DOME_FROM_CAM_NOMINAL, np.zeros(3)),
     )
@@ -44,7 +46,9 @@ def test_boards_before_a_flat_port_are_in_water_at_their_true_poses(tmp_path):
     files = simulate_calibration(rig, tmp_path, size=size)
     assert files.dome == tmp_path / "port_water"
     assert files.poses is None
-    port = load_nominal(files.nominal).housing
+    nominal = load_nominal(files.nominal)
+    assert nominal.wavelength_nm == 650.0
+    port = nominal.housing
     assert port == replace(rig.flat_port, tilt_x=0.0, tilt_y=0.0)
     board = load_board(files.rail_board)
     for name, pose in true_poses(files, "port_water").items():

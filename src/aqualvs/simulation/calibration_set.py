@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from aqualvs.errors import OptionError
 from aqualvs.geometry.transforms import SE3
 from aqualvs.optics.camera import Camera
-from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig
+from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig, common_wavelength
 from aqualvs.optics.rigfile import save_rig
 from aqualvs.optics.solved import with_exact_numbers
 from aqualvs.simulation import calibration_targets as targets
@@ -357,7 +357,10 @@ def _nominal_mapping(rig: Rig) -> dict[str, Any]:
             "thickness_mm": targets.to_mm(rig.flat_port.thickness),
             "n_port": float(rig.flat_port.n_port),
         }
-    return {**content, "n_air": float(rig.n_air), "lasers": {"count": len(rig.lasers)}}
+    lasers: dict[str, Any] = {"count": len(rig.lasers)}
+    if (light_nm := common_wavelength(rig.lasers)) is not None:
+        lasers["wavelength_nm"] = float(light_nm)
+    return {**content, "n_air": float(rig.n_air), "lasers": lasers}
 
 
 def _write_picture(path: Path, image: NDArray[np.uint8], jpeg_quality: int | None) -> None:

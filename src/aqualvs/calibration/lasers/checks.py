@@ -335,7 +335,7 @@ def check_distances(views: Sequence[PlacedView], rig: Rig) -> None:
     if not any(len(view.placed) for view in views):
         raise CalibrationError(
             f"{views[0].view.name}: no stripe lies on the target's surfaces; switch the lasers on, "
-            "and let them shine on it"
+            "let them shine on it, and name their --wavelength-nm if they are red or blue"
         )
     points = np.concatenate([view.placed.points_in_dome for view in views])
     distance = float(np.median(np.linalg.norm(points, axis=1)))
