@@ -1,11 +1,14 @@
-"""What is known of a rig before any calibration."""
+"""What is known of a rig before any calibration, and the pictures of one."""
 
 from dataclasses import replace
 
+import cv2
+import numpy as np
 import pytest
 
-from aqualvs.calibrate.common import load_nominal
-from aqualvs.errors import RigError
+from aqualvs.calibrate.common import detect_targets, load_nominal
+from aqualvs.calibration.targets.targets import View
+from aqualvs.errors import CalibrationError, RigError
 from aqualvs.optics.dome import Dome
 from aqualvs.optics.rigfile import save_rig
 from aqualvs.simulation.scenarios import example_rig
@@ -66,3 +69,29 @@ def test_faults_name_file_place_and_value(tmp_path, text, words):
         load_nominal(path)
     assert words in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def seen(name, image):
+    """Find a target in every picture, at its middle."""
+    return View(name, np.arange(1), np.zeros((1, 3)), np.array([[image.shape[1] / 2, 0.0]]))
+
+
+def test_a_folder_a_pattern_and_an_iterable_are_pictures(tmp_path):
+    for i in range(3):
+        cv2.imwrite(str(tmp_path / f"view_{i}.png"), np.zeros((8, 10), np.uint8))
+    for pictures in (str(tmp_path), tmp_path, f"{tmp_path}/*.png", tmp_path.glob("*.png")):
+        assert len(detect_targets(pictures, seen, "board").views) == 3
+
+
+@pytest.mark.parametrize(
+    ("picture", "words"),
+    [
+        (np.zeros((8, 10), np.uint16), "picture 1: uint16 of shape"),
+        (np.zeros((8, 10, 3), np.float32), "picture 1: float32 of shape"),
+        (np.zeros((8, 10, 4), np.uint8), r"picture 1: uint8 of shape \(8, 10, 4\)"),
+    ],
+    ids=["deep", "float", "transparent"],
+)
+def test_an_array_that_is_no_picture_of_8_bits_is_refused(picture, words):
+    with pytest.raises(CalibrationError, match=words):
+        detect_targets([np.zeros((8, 10), np.uint8), picture], seen, "board")

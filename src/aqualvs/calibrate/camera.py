@@ -1,6 +1,5 @@
 """`aqualvs calibrate camera`: intrinsics in air, without the dome."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,7 +12,7 @@ from aqualvs.calibrate.common import (
     DetectedTargets,
     Echo,
     Nominal,
-    Picture,
+    Pictures,
     corner_residuals,
     corner_rows,
     counting_missed,
@@ -52,7 +51,7 @@ class CameraRequest:
 
 
 def calibrate_camera(
-    pictures: Sequence[Picture],
+    pictures: Pictures,
     board: Board | str | Path,
     *,
     nominal: Nominal | str | Path | None = None,
@@ -63,9 +62,9 @@ def calibrate_camera(
 
     Parameters
     ----------
-    pictures : sequence of str, Path or array
-        Files, or pixels (grey, or blue, green, red), all of one size; the board tilted by 20 to 40
-        degrees in most of them.
+    pictures : iterable of str, Path or array, or a str or Path
+        Files or pixels (grey, or blue, green, red), or one folder or pattern; all of one size, the
+        board tilted by 20 to 40 degrees in most of them.
     board : Board, str or Path
         The board or its file.
     nominal : Nominal, str or Path, optional

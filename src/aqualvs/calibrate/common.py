@@ -7,7 +7,7 @@ The nominal rig (`load_nominal`) is known before any calibration: name, picture 
 
 import contextlib
 import glob
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -158,6 +158,8 @@ Echo: TypeAlias = Callable[[str], object]
 Image: TypeAlias = NDArray[np.uint8]
 Picture: TypeAlias = str | Path | Image
 """A picture's file, or its pixels: grey, or blue, green, red."""
+Pictures: TypeAlias = Iterable[Picture] | str | Path
+"""Several pictures, or a folder or pattern of them."""
 Detect: TypeAlias = Callable[[str, Image], View | str]
 """Finder of a target in a named grey picture; returns a clause if there is none."""
 
@@ -307,13 +309,32 @@ def _meant(argument: str) -> list[Path]:
     raise CalibrationError(f"{path}: no such picture or folder; check the path")
 
 
-def detect_targets(pictures: Sequence[Picture], detect: Detect, target: str) -> DetectedTargets:
+def _each_picture(pictures: Pictures) -> list[Picture]:
+    """Return the pictures; of text, those of the folder or pattern, as a command takes it.
+
+    Raises `CalibrationError` if an array is no picture of 8 bits.
+    """
+    if isinstance(pictures, str | Path):
+        return list(picture_paths([pictures]))
+    each = list(pictures)
+    for i, one in enumerate(each):
+        if not isinstance(one, str | Path) and (
+            one.dtype != np.uint8 or (one.ndim != 2 and (one.ndim != 3 or one.shape[2] != 3))
+        ):
+            raise CalibrationError(
+                f"picture {i}: {one.dtype} of shape {one.shape}; give 8 bits (numpy.uint8), grey "
+                "(height, width) or blue, green, red (height, width, 3)"
+            )
+    return each
+
+
+def detect_targets(pictures: Pictures, detect: Detect, target: str) -> DetectedTargets:
     """Find a target in every picture.
 
     Parameters
     ----------
-    pictures : sequence of Picture
-        Files or pixels; pixels are named by their number.
+    pictures : iterable of Picture, str or Path
+        Files or pixels; pixels are named by their number. A folder or a pattern for all of it.
     target : str
         Name of the target in messages, such as "board.yaml".
 
@@ -324,6 +345,7 @@ def detect_targets(pictures: Sequence[Picture], detect: Detect, target: str) -> 
     """
     # Greatest useful number of threads on small pictures.
     threads = 4
+    pictures = _each_picture(pictures)
     with (
         progress(f"looking for {target}", len(pictures), unit="pictures") as tick,
         ThreadPoolExecutor(threads) as pool,

@@ -1,6 +1,6 @@
 """`aqualvs calibrate dome`: place of the lens in its dome or behind its flat port."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -9,7 +9,7 @@ from aqualvs.calibrate.common import (
     Calibration,
     DetectedTargets,
     Echo,
-    Picture,
+    Pictures,
     check_same_size,
     corner_residuals,
     corner_rows,
@@ -84,13 +84,13 @@ class DomeRequest:
 
 
 def calibrate_dome(
-    pictures: Sequence[Picture],
+    pictures: Pictures,
     board: Board | str | Path,
     rig: Rig | str | Path,
     *,
     poses: str | Path | None = None,
     medium: str | float = "air",
-    water_pictures: Sequence[Picture] = (),
+    water_pictures: Pictures = (),
     water_board: Board | str | Path | None = None,
     water_poses: str | Path | None = None,
     options: DomeOptions | None = None,
@@ -101,8 +101,9 @@ def calibrate_dome(
 
     Parameters
     ----------
-    pictures : sequence of str, Path or array
-        Files, or pixels (grey, or blue, green, red), of the size that the rig's camera has.
+    pictures : iterable of str, Path or array, or a str or Path
+        Files or pixels (grey, or blue, green, red), or one folder or pattern; of the size that the
+        rig's camera has.
     board : Board, str or Path
         The board or its file.
     rig : Rig, str or Path
@@ -213,7 +214,7 @@ def _with_housing(rig: Rig, request: DomeRequest) -> Rig:
 
 
 def _board_set(
-    pictures: Sequence[Picture],
+    pictures: Pictures,
     board: Board | str | Path,
     poses: str | Path | None,
     rig: Rig,

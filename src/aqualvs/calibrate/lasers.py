@@ -15,6 +15,7 @@ from aqualvs.calibrate.common import (
     DetectedTargets,
     Echo,
     Picture,
+    Pictures,
     check_same_size,
     counting_missed,
     detect_targets,
@@ -109,7 +110,7 @@ class LasersResult(Calibration[LaserCalibration]):
 
 
 def calibrate_lasers(
-    pictures: Sequence[Picture],
+    pictures: Pictures,
     rig: Rig | str | Path,
     *,
     box: MarkerSet | str | Path | None = None,
@@ -125,8 +126,9 @@ def calibrate_lasers(
 
     Parameters
     ----------
-    pictures : sequence of str, Path or array
-        Files, or pixels (blue, green, red), of the size that the rig's camera has.
+    pictures : iterable of str, Path or array, or a str or Path
+        Files or pixels (blue, green, red), or one folder or pattern; of the size that the rig's
+        camera has.
     rig : Rig, str or Path
         Rig with camera and dome, or its file; its lasers, if any, give names and order.
     box : MarkerSet, str or Path, optional
@@ -265,7 +267,7 @@ def _noted_count(rig: Rig) -> int | None:
 
 
 def _target(
-    pictures: Sequence[Picture],
+    pictures: Pictures,
     rig: Rig,
     box: MarkerSet | str | Path | None,
     board: Board | str | Path | None,

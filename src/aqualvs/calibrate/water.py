@@ -65,7 +65,7 @@ class WaterRequest:
 
 
 def calibrate_water(
-    pictures: Sequence[Picture] | FrameSource,
+    pictures: Sequence[Picture] | str | Path | FrameSource,
     target: MarkerSet | str | Path,
     rig: Rig | str | Path,
     *,
@@ -76,9 +76,10 @@ def calibrate_water(
 
     Parameters
     ----------
-    pictures : sequence of str, Path or array, or FrameSource
-        Files, pixels (grey, or blue, green, red), or an opened video, of the size that the rig's
-        camera has. A source's frames have times, so that changes of the index are followed.
+    pictures : sequence of str, Path or array, a str or Path, or FrameSource
+        Files or pixels (grey, or blue, green, red), one folder or pattern, or an opened video; of
+        the size that the rig's camera has. A source's frames have times, so that changes of the
+        index are followed.
     target : MarkerSet, str or Path
         Markers in the dome's frame, or their file.
     rig : Rig, str or Path
@@ -100,7 +101,7 @@ def calibrate_water(
     """
     before = rig if isinstance(rig, Rig) else load_rig(rig, need_lasers=False)
     markers = target if isinstance(target, MarkerSet) else load_target(target)
-    if isinstance(pictures, Sequence):
+    if isinstance(pictures, Sequence | Path):
         found = detect_targets(
             pictures,
             lambda name, image: detect_markers(image, markers, name),
