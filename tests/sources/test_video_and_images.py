@@ -19,7 +19,8 @@ import pytest
 from av.video.frame import VideoFrame
 from PIL import Image
 
-from aqualvs.errors import OptionError, SourceError
+from aqualvs.calibrate.common import read_grey
+from aqualvs.errors import CalibrationError, OptionError, SourceError
 from aqualvs.scanning.scan import planes_of_image
 from aqualvs.sources import ImageSource, VideoSource, open_source
 from aqualvs.sources.base import planes_of
@@ -456,6 +457,28 @@ def test_images_of_two_sizes_are_refused(tmp_path):
     write_images(tmp_path, ["a2.png"], size=(32, 32))
     with open_source(tmp_path) as source, pytest.raises(SourceError, match="32x32 px"):
         list(source)
+
+
+def write_stack(path, *sizes):
+    first, *others = [Image.fromarray(np.zeros((h, w, 3), np.uint8)) for w, h in sizes]
+    first.save(path, save_all=True, append_images=others)
+
+
+def test_several_pictures_in_a_tiff_file_are_refused(tmp_path):
+    write_stack(tmp_path / "2.tif", (40, 30), (40, 30), (40, 30))
+    with pytest.raises(SourceError, match=r"2\.tif: holds 3 pictures, of which only the first"):
+        open_source(tmp_path / "2.tif")
+    write_stack(tmp_path / "1.tif", (40, 30))
+    with open_source(tmp_path) as source, pytest.raises(SourceError, match="holds 3 pictures"):
+        list(source)
+    with pytest.raises(CalibrationError, match=r"2\.tif: holds 3 pictures"):
+        read_grey(tmp_path / "2.tif")
+
+
+def test_a_thumbnail_in_a_tiff_file_is_no_picture(tmp_path):
+    write_stack(tmp_path / "a.tif", (40, 30), (8, 6))
+    with open_source(tmp_path / "a.tif") as source:
+        assert len(list(source)) == 1
 
 
 def test_a_folder_without_images_is_refused(tmp_path):

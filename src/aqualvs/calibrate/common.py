@@ -41,7 +41,13 @@ from aqualvs.report.calibration_page import write_page
 from aqualvs.results.files import writing
 from aqualvs.results.run_request import checked_index
 from aqualvs.schema import Index, NotNegative, Positive, SchemaWords, StrictPart, validated
-from aqualvs.sources.images import IMAGE_SUFFIXES, is_image_name, natural_key, read_image
+from aqualvs.sources.images import (
+    IMAGE_SUFFIXES,
+    is_image_name,
+    natural_key,
+    read_image,
+    refuse_stack,
+)
 from aqualvs.special_files import refuse_special
 from aqualvs.terminal import progress
 from aqualvs.text import count_text
@@ -507,6 +513,7 @@ def _read(path: Path, how: int) -> Image:
         raise CalibrationError(
             f"{path}: not a readable picture, cut short, or too large; remove or replace it"
         )
+    refuse_stack(path, image, CalibrationError)
     return image
 
 

@@ -15,7 +15,7 @@ from typing import cast
 import cv2
 
 from aqualvs.closing import Closing
-from aqualvs.errors import SourceError
+from aqualvs.errors import AqualvsError, SourceError
 from aqualvs.scanning.scan import Frame, ImagePlane, planes_of_image
 
 _lock = threading.Lock()
@@ -97,6 +97,7 @@ class ImageSource(Closing):
         first = read_image(self._paths[0])
         if first is None:
             raise SourceError(_unreadable(self._paths[0]))
+        refuse_stack(self._paths[0], first, SourceError)
         self.size_px = (first.shape[1], first.shape[0])
         self.n_frames = len(self._paths)
 
@@ -108,6 +109,7 @@ class ImageSource(Closing):
             if image is None:
                 continue
             self._check_size(path, image)
+            refuse_stack(path, image, SourceError)
             luma, chroma = planes_of_image(image)
             yield Frame(index, index / self.fps, luma, chroma)
             last = index
@@ -172,6 +174,23 @@ def read_image(path: Path, how: int = cv2.IMREAD_ANYCOLOR) -> ImagePlane | None:
     except (cv2.error, OSError):
         return None
     return cast("ImagePlane | None", image)
+
+
+def refuse_stack(path: Path, first: ImagePlane, error: type[AqualvsError]) -> None:
+    """Raise `error` if a TIFF file holds several pictures, of which the first alone would be read.
+
+    Thumbnails, which some cameras add, are of another size.
+    """
+    if path.suffix.lower() not in {".tif", ".tiff"}:
+        return
+    with quiet_decoders():
+        n_pictures = cv2.imcount(str(path))
+        more = cv2.imreadmulti(str(path), 1, 1)[1] if n_pictures > 1 else ()
+    if more and more[0].shape[:2] == first.shape[:2]:
+        raise error(
+            f"{path}: holds {n_pictures} pictures, of which only the first would be read; save "
+            "each in a file of its own"
+        )
 
 
 def _is_cut_jpeg(path: Path) -> bool:
