@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from agreement_cases import Diver, Target
+from aqualvs.optics.lens import Lens, LensModel
 from aqualvs.optics.rig import Rig, RigUncertainty, rig_moved_by
 from aqualvs.optics.solved import with_uncertainty
 from aqualvs.scanning.agreement import (
@@ -118,6 +119,17 @@ def test_a_drift_is_seen_on_a_slightly_bent_target() -> None:
     verdict = verdict_on(RIG, frames)
     assert verdict.suspects == (1,)
     assert np.rad2deg(verdict.angle) == pytest.approx(0.4, abs=0.1)
+
+
+def test_a_fisheye_that_does_not_fill_its_picture_is_no_bent_target() -> None:
+    width, height = RIG.size_px
+    lens = Lens(model=LensModel.FISHEYE, fx=140.0, fy=140.0, cx=0.5 * width, cy=0.5 * height)
+    wide = replace(RIG, lens=lens)
+    assert not wide.camera().rays(np.zeros((1, 2))).valid.any()
+    assert verdict_on(wide, scans(wide, wide)).state is AgreementState.AGREE
+    verdict = verdict_on(wide, scans(turned(wide, 1, 1.0), wide))
+    assert verdict.state is AgreementState.DRIFTED
+    assert verdict.suspects == (1,)
 
 
 def test_of_two_lasers_either_may_have_moved() -> None:

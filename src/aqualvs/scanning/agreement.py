@@ -274,6 +274,10 @@ def _on_sheet(stripes: SeenStripes, laser: int, sheet: Sheet) -> _View:
     reach = np.einsum("fki,fki->fk", normal, points - origin)
     reach /= np.einsum("fki,fki->fk", normal, direction)
     per_px = (origin + reach[..., None] * direction - points) / _STEP_PX
+    # Rays of pixels that the lens does not reach, such as the corners of a fisheye's picture, are
+    # NaN, which a weight of zero would not take out of a sum.
+    unseen = ~seen
+    per_px[unseen], by_step[unseen] = 0.0, 0.0
     return _View(points, per_px, by_step, seen)
 
 
