@@ -235,6 +235,16 @@ def test_what_is_worth_a_warning(rig: Rig, words: str) -> None:
     assert words in sentences(findings, Severity.WARN)
 
 
+def test_of_many_lasers_the_widest_angle_counts() -> None:
+    fan = [Laser(f"{i}", Plane.from_normal([1.0, 0.08 * i, 0.0], 0.05)) for i in range(5)]
+    said = sentences(check_rig(pinhole(*fan)), Severity.OK)
+    assert "Lasers '0' and '4' meet at 18 degrees." in said
+    assert said.count("meet at") == 1
+    assert "meet at" not in sentences(check_rig(pinhole(*fan)), Severity.WARN)
+    twice = sentences(check_rig(pinhole(*fan, replace(fan[1], name="twin"))), Severity.BAD)
+    assert "Lasers '1' and 'twin' lie in one plane" in twice
+
+
 def checked(path: Path) -> tuple[int, str]:
     page = io.StringIO()
     code = run_check(path, Console(file=page, width=120))

@@ -278,7 +278,7 @@ def check_rig(rig: Rig, now: datetime | None = None) -> list[Finding]:
         _check_water(rig),
         _check_index(rig),
         *_check_lasers(rig, camera),
-        *(_check_pair(a, b) for a, b in itertools.combinations(rig.lasers, 2)),
+        *_check_pairs(rig.lasers),
         *([] if shutter is None else [shutter]),
         *check_solved(rig, solved_steps(rig), uncertainty, now or datetime.now(UTC)),
         *check_errors(expected_errors(rig, completed_uncertainty(rig))),
@@ -447,9 +447,23 @@ def _place(wall: float, view: StripeView) -> str:
     return f"at {wall * 1e3:.0f} mm for {view.length_px:.0f} px through ({x:.0f}, {y:.0f})"
 
 
+def _check_pairs(lasers: Sequence[Laser]) -> list[Finding]:
+    """Check the angles between lasers; of more than three lasers, say the widest alone if sound."""
+    pairs = list(itertools.combinations(lasers, 2))
+    found = [_check_pair(*pair) for pair in pairs]
+    if len(lasers) <= 3:
+        return found
+    widest = max(range(len(pairs)), key=lambda i: _angle_deg(*pairs[i]))
+    return [one for i, one in enumerate(found) if i == widest or one.severity is Severity.BAD]
+
+
+def _angle_deg(a: Laser, b: Laser) -> float:
+    return math.degrees(math.acos(min(abs(float(a.plane.normal @ b.plane.normal)), 1.0)))
+
+
 def _check_pair(a: Laser, b: Laser) -> Finding:
     cosine = float(a.plane.normal @ b.plane.normal)
-    angle = math.degrees(math.acos(min(abs(cosine), 1.0)))
+    angle = _angle_deg(a, b)
     pair = f"Lasers '{a.name}' and '{b.name}'"
     apart = abs(a.plane.offset - math.copysign(1.0, cosine) * b.plane.offset)
     if angle < 1.0 and apart < 5e-3:
