@@ -60,6 +60,11 @@ def test_a_good_calibration_is_told_and_not_doubted() -> None:
     assert "At 600 mm the uncertainty of the rig leaves a systematic error of" in told
 
 
+def test_a_board_in_several_pictures_is_more_than_one_surface() -> None:
+    rig = solved_rig(camera=step(9), dome=step(3), lasers=step(0, extras={"surfaces": ["board"]}))
+    assert said(rig, Severity.WARN) == ""
+
+
 @pytest.mark.parametrize(
     ("steps", "words"),
     [
@@ -69,8 +74,11 @@ def test_a_good_calibration_is_told_and_not_doubted() -> None:
         ({"dome": step(-3)}, "The date of solved_from.dome, 2026-05-23, is yet to come"),
         ({"dome": step(pictures=1)}, "rests on 1 picture; take at least 2"),
         ({"camera": step(pictures=3)}, "rests on 3 pictures; take at least 5"),
-        ({"lasers": step(extras={"surfaces": 1})}, "The lasers were seen on one surface only"),
-        ({"lasers": step(extras={"surfaces": ["wall"]})}, "seen on one surface only"),
+        (
+            {"lasers": step(pictures=1, extras={"surfaces": 1})},
+            "The lasers were seen on one surface of one picture only",
+        ),
+        ({"lasers": step(pictures=1, extras={"surfaces": ["wall"]})}, "seen on one surface of one"),
         (
             {"dome": step(1), "lasers": step(5)},
             "The dome was calibrated after the lasers, which were found with the dome as it was",

@@ -126,10 +126,10 @@ def _doubts(name: str, step: SolvedStep, now: datetime) -> Iterator[Finding]:
         )
     surfaces = step.extras.get(SURFACES)
     count = len(surfaces) if isinstance(surfaces, list) else surfaces
-    if isinstance(count, int | float) and count < 2:
+    if isinstance(count, int | float) and count < 2 and step.pictures < 2:
         yield Finding.warn(
-            "The lasers were seen on one surface only, and any plane through such a line fits it; "
-            "show their stripes at two distances at least."
+            "The lasers were seen on one surface of one picture only, and any plane through such a "
+            "line fits it; show their stripes at two distances at least."
         )
 
 
