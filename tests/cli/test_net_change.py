@@ -1,6 +1,7 @@
 """`aqualvs net-change`, from the files of runs, or from two dives along a net, to its own files."""
 
 import csv
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -179,6 +180,10 @@ def test_faults_in_one_line_and_files_of_others_stay(cage, tmp_path, refused):
     write(dive(cage, 1, depths=(3.0,)), tmp_path / "one")
     (b / "net.geojson").write_bytes((tmp_path / "one" / "net.geojson").read_bytes())
     assert "do not belong together" in refused("net-change", a, b, *other, "-o", out)
+    content = json.loads((written(cage, b, 21) / "net.geojson").read_text())
+    content["aqualvs_net"]["summary"]["n_holes"] = 9
+    (b / "net.geojson").write_text(json.dumps(content))
+    assert "of 9 holes" in refused("net-change", a, b, *other, "-o", out)
     out.mkdir()
     (out / "net_change.csv").write_text("precious")
     written(cage, b, 21)

@@ -282,11 +282,26 @@ def test_report_copes_with_what_is_missing_or_broken(wall, tmp_path):
         (tmp_path / name).unlink()
     net, _ = read_net(tmp_path)
     assert "net_map.png is missing" in net_view(net)
-    assert net_cards(net)[0].value == "no holes"
+    assert net_cards(net)[0].value == "holes not known"
     (tmp_path / "net.csv").write_bytes(b"\xff\xfe\x00stretch")
     found, trouble = read_net(tmp_path)
     assert found is None
     assert "not shown" in trouble
+
+
+def test_holes_of_a_table_that_lost_some_are_not_known(wall, tmp_path):
+    """Two holes were found: a table without them is damaged, and says nothing of a sound net."""
+    write_net_files(tmp_path, wall, {"summary": net_dict(wall, 1.5, 200, 190)})
+    table = tmp_path / "holes.csv"
+    assert read_net(tmp_path)[1] == ""
+    table.write_text("".join(table.read_text().splitlines(keepends=True)[:2]))
+    for _ in range(2):
+        net, trouble = read_net(tmp_path)
+        assert trouble.startswith("holes.csv is missing or cut short")
+        assert "None was found" not in net_view(net)
+        assert "Not known" in net_view(net)
+        assert net_cards(net)[0].value == "holes not known"
+        table.unlink(missing_ok=True)
 
 
 def test_report_says_that_no_net_was_seen(tmp_path):

@@ -206,6 +206,9 @@ def read_survey(folder: Path, day: date) -> Survey:
         outline = _outlines(content["features"], len(rows))
         stretches = _stretches(rows, outline)
         found = _holes(holes)
+        n_holes = facts.get("summary", {}).get("n_holes", len(holes))
+        if n_holes != len(holes):
+            raise ValueError(f"{HOLES_CSV} holds {len(holes)} of {n_holes} holes")
         coordinates = facts["coordinates"]
         by_bearing = coordinates["x"].startswith("bearing")
         by_depth = coordinates["y"].startswith("minus")

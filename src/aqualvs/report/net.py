@@ -3,7 +3,7 @@
 import csv
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, TypeAlias
@@ -28,6 +28,8 @@ class NetTables:
     # Rows of `net.csv` and `holes.csv`, column to cell.
     stretches: list[Row]
     holes: list[Row]
+    # Whether `holes.csv` is there and holds as many as `net.geojson` counts.
+    holes_known: bool
     # Member `aqualvs_net` of `net.geojson`; empty where it is missing.
     facts: Mapping[str, Any]
     # `net_map.png` as an address; "" where it is missing.
@@ -49,10 +51,15 @@ def read_net(run_dir: Path) -> tuple[NetTables | None, str]:
         return None, ""
     try:
         stretches = _rows(run_dir / NET_CSV)
-        holes = _rows(run_dir / HOLES_CSV) if (run_dir / HOLES_CSV).is_file() else []
+        there = (run_dir / HOLES_CSV).is_file()
+        holes = _rows(run_dir / HOLES_CSV) if there else []
     except (OSError, UnicodeDecodeError, csv.Error):
         return None, "net.csv or holes.csv cannot be read: the state of the net is not shown."
-    return NetTables(stretches, holes, _facts(run_dir / NET_GEOJSON), _picture(run_dir)), ""
+    net = NetTables(stretches, holes, there, _facts(run_dir / NET_GEOJSON), _picture(run_dir))
+    if there and net.summary.get("n_holes", len(holes)) == len(holes):
+        return net, ""
+    words = "holes.csv is missing or cut short: whether there are holes is not known."
+    return replace(net, holes=[], holes_known=False), words
 
 
 def net_warnings(net: NetTables | None) -> list[str]:
@@ -73,6 +80,8 @@ def net_cards(net: NetTables | None) -> list[Card]:
         return []
     n = len(net.holes)
     value = "no holes" if not n else "1 hole" if n == 1 else f"{n} holes"
+    if not net.holes_known:
+        value = "holes not known"
     words = []
     largest = max((_number(row, "diameter_mm") or 0.0 for row in net.holes), default=0.0)
     if largest:
@@ -149,7 +158,8 @@ def _map(net: NetTables) -> str:
 
 def _holes(net: NetTables, crops: Mapping[str, SampleFrame]) -> str:
     if not net.holes:
-        return "<h3>Holes</h3><p>None was found.</p>"
+        said = "None was found." if net.holes_known else "Not known: holes.csv is damaged."
+        return f"<h3>Holes</h3><p>{said}</p>"
     names = (
         *("hole", "diameter, mm", "width × height, mm", "meshes", *_PLACE_HEAD),
         *("heading, °", "nearest at", "in frame"),
