@@ -2,6 +2,7 @@
 
 import csv
 import json
+from dataclasses import replace
 from xml.etree import ElementTree
 
 import cv2
@@ -260,6 +261,20 @@ def test_a_track_that_slipped_is_told(tmp_path):
     dive = make_dive(tmp_path / "run", video=False)
     write_net_files(dive.folder, wall, {"summary": net_dict(wall, 1.0, 200, 190)})
     assert "part by 1.8 m" in write_report(dive.folder).read_text(encoding="utf-8")
+
+
+def test_a_track_that_always_breaks_is_told(tmp_path):
+    """Frames too far apart: each piece of track finds the same hole again."""
+    apart = [replace(stretch(i, (0.0, 0.0)), piece=10 * i, n_frames=10) for i in range(N)]
+    wall = walled(apart)
+    said = net_lines(wall, 1.0, 70)[-1]
+    assert said.startswith("warning: the track along the net broke 50 times in 60 frames")
+    assert "--fps" in said
+    dive = make_dive(tmp_path / "run", video=False)
+    write_net_files(dive.folder, wall, {"summary": net_dict(wall, 1.0, 70, 60)})
+    assert "broke 50 times in 60 frames" in write_report(dive.folder).read_text(encoding="utf-8")
+    mended = walled([replace(one, piece=i) for i, one in enumerate(apart)])
+    assert not any("warning" in line for line in net_lines(mended, 1.0, 70))
 
 
 def test_report_escapes_what_the_files_say(wall, tmp_path):

@@ -21,6 +21,7 @@ import numpy as np
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.nets.condition import NetStretch
 from aqualvs.nets.holes import Hole
+from aqualvs.nets.lattice import START_FRAMES
 from aqualvs.nets.lit_intervals import net_from_dome
 from aqualvs.nets.places import DivePostures, NetPlace, NetPlaces, PlacedBy
 from aqualvs.optics.rig import Rig
@@ -409,6 +410,7 @@ def net_dict(wall: UnrolledNet, area: float, n_frames: int, n_net_frames: int) -
         "solidity": _rounded_number(solidity, 4),
         "fouling": _rounded_number(fouling, 4),
         "track_slip_m": round(wall.places.slip, 2),
+        "track_breaks": stretches[-1].piece if stretches else 0,
         "largest_hole_mm": _rounded_number(
             max((1e3 * h.diameter for h in wall.holes), default=None), 1
         ),
@@ -419,17 +421,32 @@ def net_lines(wall: UnrolledNet, area: float, n_frames: int) -> list[str]:
     """Return the summary in words, line by line."""
     if not wall.stretches:
         return [f"no net was seen in {count_text(n_frames, 'frame')}"]
-    facts = net_dict(wall, area, n_frames, n_frames)
+    facts = net_dict(wall, area, n_frames, sum(one.n_frames for one in wall.stretches))
     lines = [_mesh_line(facts), *_fouling_lines(wall, facts), *_hole_lines(wall, facts)]
-    return lines if not wall.places.slip else [*lines, f"warning: {slip_text(wall.places.slip)}"]
+    return [*lines, *(f"warning: {words}" for words in track_warnings(facts))]
 
 
-def slip_text(slip: float) -> str:
-    """Return what it means that track and log disagree about the height."""
-    return (
-        f"the track and the log's depth part by {slip:.1f} m: meshes were counted wrongly, so "
-        "places along the net and sizes of holes are not to be trusted"
+def track_warnings(summary: Mapping[str, Any]) -> list[str]:
+    """Return why places and holes are not to be trusted, by a summary as of `net_dict`."""
+    slip, breaks, n_frames = (
+        found if isinstance(found := summary.get(name), int | float) else 0
+        for name in ("track_slip_m", "track_breaks", "n_net_frames")
     )
+    words = []
+    if slip > 0.0:
+        words.append(
+            f"the track and the log's depth part by {slip:.1f} m: meshes were counted wrongly, so "
+            "places along the net and sizes of holes are not to be trusted"
+        )
+    # Pieces that are shorter, in the mean, than the frames to which the start of one is fitted.
+    if breaks * START_FRAMES > n_frames:
+        words.append(
+            f"the track along the net broke {count_text(int(breaks), 'time')} in "
+            f"{count_text(int(n_frames), 'frame')}: a hole may count once for each piece, and "
+            "places are not to be trusted; frames are too far apart, or images lack their rate "
+            "(--fps)"
+        )
+    return words
 
 
 def place_text(place: NetPlace) -> str:

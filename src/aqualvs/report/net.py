@@ -64,14 +64,12 @@ def read_net(run_dir: Path) -> tuple[NetTables | None, str]:
 
 def net_warnings(net: NetTables | None) -> list[str]:
     """Return what the reader of the report should know about the net."""
-    slip = None if net is None else net.summary.get("track_slip_m")
-    if not isinstance(slip, int | float) or not slip > 0.0:
+    if net is None or not any(net.summary.get(f"track_{what}") for what in ("slip_m", "breaks")):
         return []
     # Imported here: it brings the evaluation of nets along, which few reports have.
-    from aqualvs.nets.tables import slip_text
+    from aqualvs.nets.tables import track_warnings
 
-    words = slip_text(slip)
-    return [f"Net: {words}."]
+    return [f"Net: {words}." for words in track_warnings(net.summary)]
 
 
 def net_cards(net: NetTables | None) -> list[Card]:
