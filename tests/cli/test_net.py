@@ -99,6 +99,27 @@ def test_from_a_run_to_the_state_of_its_net(scans, tmp_path, capsys):
     assert (facts["summary"]["n_holes"], facts["summary"]["track_slip_m"]) == (1, 0.0)
 
 
+def test_a_dive_of_which_frames_are_missing_is_told(run_folder, capsys):
+    """No hole in what is left of a dive says nothing of the rest."""
+    path, run_yaml = run_folder / "posture.csv", run_folder / "run.yaml"
+    lines = path.read_text().splitlines(keepends=True)
+    path.write_text("".join(lines[:10]))
+    assert main(["net", str(run_folder)]) == 0
+    said = capsys.readouterr().out
+    assert f"posture.csv holds 9 of the run's {FEW} frames" in said
+    assert main(["report", str(run_folder)]) == 0
+    page = (run_folder / "report.html").read_text(encoding="utf-8")
+    assert f"posture.csv holds 9 of the run&#x27;s {FEW} frames" in page
+    path.write_text("".join(lines))
+    run_yaml.write_text(run_yaml.read_text().replace("finished", "interrupted"))
+    assert main(["net", str(run_folder), "--overwrite"]) == 0
+    said = capsys.readouterr().out
+    assert (
+        f"warning: the run did not finish (status: interrupted): the net is that of its first {FEW}"
+        in said
+    )
+
+
 def test_another_folder_keeps_the_run_as_it_is(run_folder, tmp_path):
     before = sorted(path.name for path in run_folder.iterdir())
     assert main(["net", str(run_folder), "-o", str(tmp_path / "net")]) == 0

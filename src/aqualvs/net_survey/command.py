@@ -32,9 +32,10 @@ from aqualvs.results.folder import (
     recover,
 )
 from aqualvs.results.net_survey import NetPass, check_stored, read_run
-from aqualvs.results.run_request import RunRequest, read_run_yaml, scanner_options
+from aqualvs.results.run_request import RunRequest, Status, read_run_yaml, scanner_options
 from aqualvs.sources.opening import folder_beside
 from aqualvs.terminal import StopSignals, progress
+from aqualvs.text import count_text
 
 if TYPE_CHECKING:
     from aqualvs.net_survey.comparison import Comparison
@@ -103,6 +104,8 @@ def net_of_run(place: NetSource, request: NetRequest, echo: Callable[[str], obje
         echo(line)
     if stop.caught:
         echo(f"stopped by {stop.caught.name}; {folder} tells of the frames before")
+    elif missing := stored.missing(result.summary["n_frames"]):
+        echo(f"warning: {missing}")
     if folder == run_folder and (run_folder / REPORT_HTML).exists():
         # The run's own page, brought up to date.
         with claim_run(folder, [REPORT_HTML], overwrite=True):
@@ -128,6 +131,21 @@ class StoredDive:
         summary = self._content.get("summary")
         count = summary.get("n_frames") if isinstance(summary, dict) else None
         return count if isinstance(count, int) else None
+
+    def missing(self, n_read: int) -> str:
+        """Return what the frames that were read lack of the dive, in words; "" if nothing."""
+        if n_read < (self.n_frames or 0):
+            return (
+                f"{self._folder / POSTURE_CSV} holds {n_read} of the run's {self.n_frames} frames: "
+                "the net is that of these alone; run the dive again"
+            )
+        status = self._content.get("status", Status.FINISHED)
+        if status == Status.FINISHED:
+            return ""
+        return (
+            f"the run did not finish (status: {status}): the net is that of its first "
+            f"{count_text(n_read, 'frame')} alone"
+        )
 
     @property
     def video(self) -> Path | None:

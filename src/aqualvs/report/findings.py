@@ -104,6 +104,10 @@ def _status_warnings(run: Mapping[str, Any], track: Track) -> Iterator[str]:
     if status is not None and status != "finished":
         until = clock(float(track.time_s[-1]))
         yield f"The run did not finish (status: {status}); this page covers it up to {until}."
+    summary = run.get("summary")
+    n_frames = summary.get("n_frames") if isinstance(summary, dict) else None
+    if isinstance(n_frames, int) and n_frames > len(track):
+        yield f"posture.csv holds {len(track)} of the run's {n_frames} frames: it was cut short."
     if run.get("error"):
         yield f"The run ended with: {run['error']}"
     share = float(track.valid.mean())
