@@ -219,7 +219,7 @@ def test_the_truth_of_the_run_is_used_again(tmp_path: Path) -> None:
     note_truth(dive, path)
     assert "Error against truth, 31 frames" in visible(write_report(dive.folder).read_text())
     # A page does without a truth that is gone or has become another, and says so.
-    path.write_text("frame,range_mm,pitch_deg,yaw_deg\n999,1,2,3\n")
+    path.write_text("frame,range_mm,pitch_deg,yaw_deg\n999,500,2,3\n")
     words = visible(write_report(dive.folder).read_text())
     assert "Error against truth" not in words
     assert "no frame in common with the run" in words
@@ -413,7 +413,7 @@ def test_a_run_without_postures_is_refused_in_one_line(
 
 def test_foreign_truth_is_refused(dive: Dive, tmp_path: Path) -> None:
     path = tmp_path / "truth.csv"
-    path.write_text("frame,range_mm,pitch_deg,yaw_deg\n999,1,2,3\n")
+    path.write_text("frame,range_mm,pitch_deg,yaw_deg\n999,500,2,3\n")
     with pytest.raises(SourceError, match=r"truth\.csv: no frame in common"):
         write_report(dive.folder, truth=path)
 

@@ -91,7 +91,7 @@ def compare_with_truth(posture_csv: Path, truth_csv: Path) -> TruthComparison:
             "set camera.shutter in the rig file to kind: interlaced"
         )
     measured = _postures(posture_csv, measured_rows)
-    truth = _postures(truth_csv, true_rows)
+    truth = _truth(truth_csv, true_rows)
     frames = {_number(row["frame"]) for row in measured_rows}
     known = {frame for frame in truth if frame in frames}
     if truth and not known:
@@ -121,11 +121,25 @@ def read_truth(path: Path) -> dict[int, tuple[float, float, float]]:
     before the net's own plane. Other columns are ignored. Raises `SourceError` if the file cannot
     be read or lacks a column.
     """
-    return _postures(path, _rows(path))
+    return _truth(path, _rows(path))
+
+
+def _truth(path: Path, rows: list[Row]) -> dict[int, tuple[float, float, float]]:
+    """Return what `read_truth` reads, from rows of a file."""
+    found = _postures(path, rows)
+    # Metres in millimetres' place, or the other way round: no camera sees as near, or as far.
+    nearest, farthest = 0.02, 50.0
+    if found and not nearest < max(value for value, _, _ in found.values()) < farthest:
+        own_column = range_column(path, rows[0])
+        raise SourceError(
+            f"{path}: {own_column} is {rows[0][own_column]} in the first row, which is another "
+            "unit; name the column range_m for metres, range_mm for millimetres"
+        )
+    return found
 
 
 def _postures(path: Path, rows: list[Row]) -> dict[int, tuple[float, float, float]]:
-    """Return what `read_truth` reads, from rows of a file."""
+    """Return range, pitch and yaw by frame, from rows of a file."""
     own_column = range_column(path, rows[0])
     found = {}
     for row in rows:
@@ -135,6 +149,8 @@ def _postures(path: Path, rows: list[Row]) -> dict[int, tuple[float, float, floa
         if all(map(math.isfinite, lit)):
             values, unit = lit, "range_mm"
         if all(map(math.isfinite, [frame, *values])):
+            if int(frame) in found:
+                raise SourceError(f"{path}: tells of frame {int(frame)} twice; keep one row of it")
             found[int(frame)] = (values[0] * RANGE_UNITS[unit], values[1], values[2])
     return found
 
