@@ -49,6 +49,9 @@ def test_progress_is_a_bar_on_terminals_and_one_line_elsewhere(monkeypatch, caps
     with progress("dive", 2) as tick:
         tick(2)
     assert capsys.readouterr().err == f"aqualvs: dive: 2 frames ({FIRST_RUN})\n"
+    with progress("picture.png", 1):
+        pass
+    assert f"picture.png: 1 frame ({FIRST_RUN})" in capsys.readouterr().err
     with hidden_progress(), progress("dive", 2) as tick:
         tick(2)
     assert capsys.readouterr().err == ""

@@ -88,7 +88,8 @@ def progress(label: str, n_frames: int | None, unit: str = "frames") -> Iterator
         yield _echo_nothing
         return
     if not _may_be_terminal():
-        count = unit if n_frames is None else f"{n_frames} {unit}"
+        units = unit.removesuffix("s") if n_frames == 1 else unit
+        count = unit if n_frames is None else f"{n_frames} {units}"
         print(f"aqualvs: {label}: {count} ({FIRST_RUN})", file=sys.stderr, flush=True)
         yield _echo_nothing
         return

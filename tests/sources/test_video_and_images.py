@@ -373,6 +373,13 @@ def test_images_come_in_natural_order(tmp_path):
         assert frame.luma.mean() == pytest.approx(luma_level(i), abs=LEVEL_TOLERANCE)
 
 
+def test_one_image_is_called_by_its_path(tmp_path):
+    """Reports open the source by its name."""
+    write_images(tmp_path, ["a.png", "b.png"])
+    with open_source(tmp_path / "a.png") as source:
+        assert source.name == str(tmp_path / "a.png")
+
+
 def test_hidden_files_are_no_images(tmp_path):
     """macOS puts one beside each file on the disks of other systems."""
     (tmp_path / "._a.png").write_bytes(b"\x00\x05\x16\x07")

@@ -89,9 +89,10 @@ class ImageSource(Closing):
     """
 
     def __init__(self, paths: Path | Sequence[Path], *, fps: float = 1.0) -> None:
-        self.name = str(paths) if isinstance(paths, Path) else f"{len(paths)} images"
         self.fps = fps
         self._paths = images_in(paths) if isinstance(paths, Path) else list(paths)
+        one = paths if isinstance(paths, Path) else self._paths[0] if len(paths) == 1 else None
+        self.name = f"{len(self._paths)} images" if one is None else str(one)
         if not self._paths:
             raise SourceError(f"{self.name}: no images; name at least one")
         first = read_image(self._paths[0])
