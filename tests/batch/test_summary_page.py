@@ -48,6 +48,16 @@ def test_warnings_of_a_run_are_those_of_the_batch(tmp_path):
     assert "april: no &lt;good&gt; rig" in (tmp_path / "summary.html").read_text()
 
 
+def test_why_a_dive_failed_takes_the_room_of_what_it_lacks(tmp_path):
+    """In the width of its state alone a sentence was twenty lines tall."""
+    write_summary(
+        tmp_path, [record(), record("may", DiveState.FAILED, "may.mp4: the file is empty")]
+    )
+    page = (tmp_path / "summary.html").read_text()
+    columns = page.count("</th>")
+    assert f'<td colspan="{columns - 1}">failed<div class="why">may.mp4' in page
+
+
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
     """Two dives: six frames each, of which one is refused."""
