@@ -96,6 +96,7 @@ def test_from_a_run_to_the_state_of_its_net(scans, tmp_path, capsys):
     assert float(hole["diameter_mm"]) == pytest.approx(2e3 * HOLE[2], abs=30.0)
     facts = json.loads((run_folder / "net.geojson").read_text())["aqualvs_net"]
     assert facts["log"]["used"]
+    assert facts["log"]["covered"] == 1.0
     assert (facts["summary"]["n_holes"], facts["summary"]["track_slip_m"]) == (1, 0.0)
 
 

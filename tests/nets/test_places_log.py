@@ -84,6 +84,16 @@ def test_a_log_that_covers_none_of_the_dive_is_not_used(moving):
     assert "none of the dive" in laid.words()
 
 
+def test_a_log_that_covers_a_part_of_the_dive_says_so(moving):
+    log, dive = moving
+    assert "covers" not in lay_log(log, dive, 3.5, None).words()
+    late = log.span_s[1] - 0.5 * dive.time_s[-1]
+    laid = lay_log(log, dive, late, None)
+    assert laid.places is not None
+    assert laid.words().endswith("(given by the user); it covers 50 % of the dive")
+    assert laid.to_dict()["covered"] == pytest.approx(0.5, abs=0.01)
+
+
 def test_a_dive_without_a_net_needs_no_offset(moving):
     log, _ = moving
     laid = lay_log(log, postures(0.0), None, None)

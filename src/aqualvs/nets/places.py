@@ -134,13 +134,13 @@ class LaidLog:
     log: VehicleLog  # As it was read.
     # Log time minus dive time, or the reason why it is not known.
     offset: TimeOffset | OffsetRefusal
-    # Whether the log covers any of the dive.
-    overlap: bool
+    # Share of the dive that the log covers.
+    covered: float
 
     @property
     def places(self) -> VehiclePlaces | None:
         """The log's values at dive times; None where it cannot be used."""
-        if isinstance(self.offset, OffsetRefusal) or not self.overlap:
+        if isinstance(self.offset, OffsetRefusal) or not self.covered:
             return None
         return VehiclePlaces(self.log, self.offset.offset_s)
 
@@ -150,14 +150,18 @@ class LaidLog:
             return f"log {self.log.name} is not used: {self.offset.reason} (--log-offset-s)"
         begins, ends = self.log.span_s
         offset = f"{self.offset.offset_s:.2f} s"
-        if not self.overlap:
+        if not self.covered:
             return (
                 f"log {self.log.name} is not used: it covers {begins:.1f} to {ends:.1f} s of its "
                 f"own clock, and none of the dive with an offset of {offset}; check --log-offset-s"
             )
         sigma = f" ± {self.offset.sigma_s:.2f} s" if self.offset.sigma_s else ""
         how = self.offset.how
-        return f"log {self.log.name}: its clock minus the dive's is {offset}{sigma} ({how})"
+        said = f"log {self.log.name}: its clock minus the dive's is {offset}{sigma} ({how})"
+        # Less than this is a log of another span, or one with gaps.
+        usual = 0.95
+        part = f"; it covers {100 * self.covered:.0f} % of the dive"
+        return said if self.covered > usual else said + part
 
     def to_dict(self) -> dict[str, Any]:
         """Return the same for `net.geojson`."""
@@ -169,6 +173,7 @@ class LaidLog:
             "offset_s": round(self.offset.offset_s, digits),
             "sigma_offset_s": round(self.offset.sigma_s, digits),
             "offset_from": self.offset.how,
+            "covered": round(self.covered, 4),
         }
 
 
@@ -205,11 +210,11 @@ def lay_log(
     video and log help where that is ambiguous, and replace it where there is no motion.
     """
     offset = _given(offset_s) or _found(log, postures, video)
-    overlap = False
+    covered = 0.0
     if not isinstance(offset, OffsetRefusal) and len(postures.time_s):
         state = log.at(postures.time_s + offset.offset_s)
-        overlap = bool((state.depth_valid | state.heading_valid).any())
-    return LaidLog(log, offset, overlap)
+        covered = float((state.depth_valid | state.heading_valid).mean())
+    return LaidLog(log, offset, covered)
 
 
 def _given(offset_s: float | None) -> TimeOffset | None:

@@ -237,9 +237,11 @@ def _log(net: NetTables) -> str:
         why = text(log.get("refused") or "it covers none of the dive")
         return f'<p class="note">The vehicle’s log {name} is not used: {why}.</p>'
     sigma = f" ± {log.get('sigma_offset_s')}" if log.get("sigma_offset_s") else ""
+    covered = log.get("covered")
+    part = f" It covers {100 * covered:.0f} % of the dive." if isinstance(covered, float) else ""
     return signed(
         f'<p class="note">Depth and bearing are from {name}; its clock minus the dive’s is '
-        f"{text(log.get('offset_s'))}{text(sigma)} s ({text(log.get('offset_from'))}).</p>"
+        f"{text(log.get('offset_s'))}{text(sigma)} s ({text(log.get('offset_from'))}).{part}</p>"
     )
 
 
