@@ -207,7 +207,10 @@ def figures(
 
 def report(
     folder: Annotated[Path, typer.Argument(help="Folder of the run.")],
-    truth: Annotated[Path | None, typer.Option(help="CSV with the truth to show.")] = None,
+    truth: Annotated[
+        Path | None,
+        typer.Option(help="CSV with the truth to show; net writes the page again without it."),
+    ] = None,
 ) -> None:
     """Write a report again."""
     from aqualvs.report.run_page import write_report
