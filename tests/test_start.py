@@ -10,7 +10,7 @@ from rich.progress import Progress
 
 from aqualvs.cli.command import importing
 from aqualvs.demo import bundled_dive
-from aqualvs.terminal import FIRST_RUN, hidden_progress, progress, rate_text
+from aqualvs.terminal import FIRST_RUN, hidden_progress, progress, rate_text, told_if_slow
 
 # SciPy's linear algebra is missing here, because compiling a kernel for the first time imports it.
 NOT_FOR_A_RUN = {
@@ -41,6 +41,17 @@ def test_a_run_imports_only_what_it_needs(tmp_path: Path) -> None:
     assert code == "0"
     assert {"numba", "pyarrow.parquet", "aqualvs.report.run_page"} <= set(modules)
     assert not NOT_FOR_A_RUN & set(modules)
+
+
+def test_what_is_slow_says_what_is_waited_for(capsys) -> None:
+    with told_if_slow("ready", after_s=60.0):
+        pass
+    assert capsys.readouterr().err == ""
+    said = ""
+    with told_if_slow("ready", after_s=0.0):
+        while not said:
+            said = capsys.readouterr().err
+    assert said == f"aqualvs: ready ({FIRST_RUN})\n"
 
 
 def test_progress_is_a_bar_on_terminals_and_one_line_elsewhere(monkeypatch, capsys) -> None:

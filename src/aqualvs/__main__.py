@@ -1,8 +1,10 @@
 """The program `aqualvs`, also as `python -m aqualvs`."""
 
+import _thread
 import os
 import signal
 import sys
+import threading
 from types import FrameType
 
 
@@ -15,8 +17,25 @@ def main() -> int:
     from aqualvs.cli.main import main as run
 
     if interruptible:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGINT, interrupt)
     return run()
+
+
+def interrupt(number: int, frame: FrameType | None) -> None:
+    """Raise `KeyboardInterrupt`; in a callback of LLVM only once that has returned.
+
+    Signals that come while LLVM compiles are seen first in the callback with the result. An
+    exception there is dropped by ctypes, and the compilation fails for want of the result.
+    """
+    while frame is not None:
+        if frame.f_code.co_name.startswith("_raw_object_cache"):
+            soon_s = 0.01
+            again = threading.Timer(soon_s, _thread.interrupt_main, (number,))
+            again.daemon = True
+            again.start()
+            return
+        frame = frame.f_back
+    raise KeyboardInterrupt
 
 
 def _leave(_number: int, _frame: FrameType | None) -> None:

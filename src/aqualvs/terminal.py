@@ -98,6 +98,18 @@ def progress(label: str, n_frames: int | None, unit: str = "frames") -> Iterator
         yield tick
 
 
+@contextlib.contextmanager
+def told_if_slow(label: str, after_s: float = 3.0) -> Iterator[None]:
+    """Say on standard error what is waited for, if it takes longer than `after_s` seconds."""
+    words = f"aqualvs: {label} ({FIRST_RUN})\n"
+    timer = threading.Timer(after_s, lambda: print(words, end="", file=sys.stderr, flush=True))
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
 def _may_be_terminal() -> bool:
     """Return whether standard error may be a terminal; False is certain."""
     if any(os.environ.get(name) for name in _CLAIMS):

@@ -1,5 +1,6 @@
 """The command line as a whole: help, version, and how fast it is there."""
 
+import collections
 import contextlib
 import os
 import re
@@ -13,6 +14,7 @@ import typer
 import yaml
 
 from aqualvs import __version__
+from aqualvs.__main__ import interrupt
 from aqualvs.cli import main as cli
 from aqualvs.cli.command import CheckedCommand
 from aqualvs.cli.main import main
@@ -152,6 +154,31 @@ def test_an_interrupted_command_exits_with_130(monkeypatch, capsys):
     monkeypatch.setattr(cli, "app", interrupt)
     assert main(["simulate"]) == 130
     assert capsys.readouterr().err == "aqualvs: error: interrupted\n"
+
+
+def test_an_interrupt_while_llvm_compiles_is_neither_lost_nor_a_fault_of_the_compilation():
+    import llvmlite.binding as llvm  # type: ignore[import-untyped]
+
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    machine = llvm.Target.from_default_triple().create_target_machine()
+    module = llvm.parse_assembly("define void @f() { ret void }")
+    engine = llvm.create_mcjit_compiler(module, machine)
+    compiled = []
+
+    def interrupted_then_kept(_module, result):
+        signal.raise_signal(signal.SIGINT)
+        compiled.append(result)
+
+    engine.set_object_cache(interrupted_then_kept, None)
+    before = signal.signal(signal.SIGINT, interrupt)
+    try:
+        engine.finalize_object()
+        assert compiled
+        with pytest.raises(KeyboardInterrupt):
+            collections.deque(map(time.sleep, [0.01] * 3000))
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def test_faults_of_the_program_are_not_hidden(monkeypatch):

@@ -44,6 +44,7 @@ from aqualvs.scanning.stripe import StripePeaks
 from aqualvs.sources import open_source
 from aqualvs.sources.base import Feed, Health, PartHealth, State
 from aqualvs.sources.fields import frames_of, size_of_frames
+from aqualvs.terminal import told_if_slow
 
 
 def warm_up(scanner: Scanner) -> Scan:
@@ -54,7 +55,7 @@ def warm_up(scanner: Scanner) -> Scan:
     """
     rounds = 2
     picture = wall_frame(scanner.rig)
-    with compiled_at_once():
+    with told_if_slow("getting ready to measure"), compiled_at_once():
         _measure_net()
         for _ in range(rounds):
             for frame in frames_of([picture], scanner.rig.shutter):
