@@ -1,6 +1,7 @@
 """The live decoder: exact pictures, or none."""
 
 import hashlib
+import time
 from fractions import Fraction
 from itertools import pairwise
 
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 from av.video.frame import VideoFrame
 
-from aqualvs.sources.base import packet_with
+from aqualvs.sources.base import State, packet_with
 from aqualvs.sources.h264 import FrameNumbers
 from aqualvs.sources.live_frames import LiveDecoder, LiveFrames, Reception
 
@@ -179,6 +180,25 @@ def test_what_was_sent_before_the_first_key_frame_is_not_lost():
     found, n_dropped = frames_of(packets)
     assert [f.index for f in found] == list(range(18))
     assert (found[0].time_s, n_dropped) == (0.0, 0)
+
+
+def test_a_stream_joined_before_a_key_frame_is_neither_damaged_nor_running(monkeypatch):
+    """A live run listens for some seconds before it reads."""
+    reception, now = Reception("test"), time.monotonic()
+    for later, waited in ((30.0, "0.0"), (32.4, "2.4")):
+        monkeypatch.setattr(time, "monotonic", lambda later=later: now + later)
+        reception.hear("RTP H.264")
+        reception.hold(1)
+        health = reception.health()
+        assert health.state is State.FAULT
+        assert health.detail == f"RTP H.264: waiting for a whole key frame for {waited} s"
+    for i in range(27):
+        monkeypatch.setattr(time, "monotonic", lambda i=i: now + 33.0 + 0.04 * i)
+        reception.hear()
+        reception.deliver((720, 576), 0)
+        if i == 3:
+            assert reception.health().detail == "RTP H.264 720x576 px"
+    assert reception.health().detail == "RTP H.264 720x576 px, 25.0 frames/s"
 
 
 def test_numbers_rise_over_a_new_connection():

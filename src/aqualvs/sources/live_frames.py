@@ -135,7 +135,7 @@ class Reception:
         self._content = content
         self._trouble = ""
         self._size = (0, 0)
-        self._began = time.monotonic()
+        self._began = time.monotonic()  # From the first packet on: when that came.
         self._heard: float | None = None
         self._frames: deque[float] = deque()
         self._losses: deque[tuple[float, int]] = deque()
@@ -150,7 +150,10 @@ class Reception:
         `content`: what it is; empty if that is known.
         """
         with self._lock:
-            self._heard = time.monotonic()
+            now = time.monotonic()
+            if self._heard is None:
+                self._began = now
+            self._heard = now
             self._content = content or self._content
             self._trouble = ""
 
@@ -218,16 +221,19 @@ class Reception:
             return State.FAULT, f"waiting for the stream for {now - self._began:.0f} s"
         if now - self._heard > self._timeout():
             return State.FAULT, f"silent for {now - self._heard:.1f} s; waiting for its return"
-        since = self._began if self._last_frame is None else self._last_frame
-        if now - since > self._timeout():
+        if self._last_frame is None:
+            waiting = f"waiting for a whole key frame for {now - self._began:.1f} s"
+            return State.FAULT, f"{self._content}: {waiting}"
+        if now - self._last_frame > self._timeout():
             why = "damaged or lost packets, no sound picture" if self._n_held else "no key frame"
-            return State.FAULT, f"{self._content}: {why} for {now - since:.1f} s"
+            return State.FAULT, f"{self._content}: {why} for {now - self._last_frame:.1f} s"
         return self._running()
 
     def _running(self) -> tuple[State, str]:
         span = self._frames[-1] - self._frames[0] if self._frames else 0.0
-        rate = (len(self._frames) - 1) / max(span, 1.0)
-        words = f"{self._content} {self._size[0]}x{self._size[1]} px, {rate:.1f} frames/s"
+        words = f"{self._content} {self._size[0]}x{self._size[1]} px"
+        if span > 1.0:  # No rate can be told before.
+            words += f", {(len(self._frames) - 1) / span:.1f} frames/s"
         n_lost = sum(n for _, n in self._losses)
         if not n_lost:
             return State.OK, words.strip()
