@@ -256,6 +256,38 @@ def test_a_stream_that_stops_is_a_fault_and_goes_on_when_it_returns(clips, monke
     assert heard.times[79] - heard.times[50] == pytest.approx(29 / 25, abs=1e-4)
 
 
+def test_what_came_while_the_process_stood_still_is_late(monkeypatch):
+    """Pictures of then would be measured one after the other as if they were new."""
+    lag_s, goes_on = 1.0, threading.Event()
+
+    class Standing(socket.socket):
+        def recv(self, *arguments):
+            goes_on.wait(TIMEOUT_S)
+            return super().recv(*arguments)
+
+    monkeypatch.setattr(datagrams, "_MAX_LAG_S", lag_s)
+    monkeypatch.setattr(socket, "socket", Standing)
+    heard = datagrams.Datagrams(datagrams.UdpAddress("127.0.0.1", 0))
+    queue = datagrams.DatagramQueue(heard, threading.Event(), live_frames.Reception("test"))
+    try:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as outlet:
+            outlet.connect(("127.0.0.1", heard.port))
+            for content in (b"1", b"2", b"3"):
+                outlet.send(content)
+            time.sleep(1.2 * lag_s)
+            goes_on.set()
+            late = queue.get(TIMEOUT_S)
+            outlet.send(b"4")
+            fresh = queue.get(TIMEOUT_S)
+        assert late
+        assert fresh
+        assert (late.content, queue.is_late(late)) == (b"3", True)
+        assert fresh.content == b"4"
+        assert fresh.arrival - late.arrival > lag_s
+    finally:
+        heard.close()
+
+
 def test_rtsp_connects_again_when_the_server_returns(clips):
     """The first pictures come while the server holds the others back: probing is short."""
     port = free_port()

@@ -4,6 +4,7 @@
 kind (RTP with H.264, MPEG-TS, bare H.264) until the content shows another kind.
 """
 
+import contextlib
 import errno
 import queue
 import socket
@@ -111,16 +112,34 @@ class Datagrams:
         self._socket.settimeout(look_s)
         # Datagrams kept for a late reader; further ones are lost, and counted as such.
         max_waiting = 20_000
+        now = time.monotonic()
         while not self._closed.is_set():
+            content = None
             try:
                 content = self._socket.recv(65536)
             except TimeoutError:
-                continue
+                pass
             except OSError:  # Such as an ICMP error that Windows reports here.
                 time.sleep(0.01)
-                continue
-            if self._waiting.qsize() < max_waiting:
-                self._waiting.put(Datagram(content, time.monotonic()))
+            before, now = now, time.monotonic()
+            if now - before > _MAX_LAG_S:
+                # The process stood still, and what the system has kept meanwhile may be as old:
+                # all but one is dropped, with an arrival that shows the reader that it is late.
+                content, arrival = self._latest(look_s) or content, before
+            else:
+                arrival = now
+            if content is not None and self._waiting.qsize() < max_waiting:
+                self._waiting.put(Datagram(content, arrival))
+
+    def _latest(self, timeout: float) -> bytes | None:
+        """Empty the system's buffer; return the last datagram of it."""
+        content = None
+        self._socket.setblocking(False)
+        with contextlib.suppress(OSError):
+            while True:
+                content = self._socket.recv(65536)
+        self._socket.settimeout(timeout)
+        return content
 
 
 def why_not(address: UdpAddress, fault: OSError) -> str:
