@@ -94,6 +94,8 @@ def test_what_cannot_be_simulated_is_refused(tmp_path: Path) -> None:
         SimRequest(out=tmp_path, aim=Aim(), cage_radius=1.0)
     with pytest.raises(OptionError, match="--current 9"):
         SimRequest(out=tmp_path, aim=Aim(), current=9.0)
+    with pytest.raises(OptionError, match="before the end after 4 s"):
+        SimRequest(out=tmp_path, aim=Aim(), seconds=4.0, freeze=4.0)
     with pytest.raises(OptionError, match="add --rendered"):
         SimRequest(out=tmp_path, aim=Aim(), camera="pal")
     with pytest.raises(OptionError, match="leave --range"):

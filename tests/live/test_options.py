@@ -50,6 +50,7 @@ def test_everything_can_be_set(tmp_path: Path) -> None:
         ("aqualvs_vehicle: 1\nsystem: 0", "system is 0"),
         ("aqualvs_vehicle: 1\nstation_timeout_s: 0", "station_timeout_s is 0"),
         ("aqualvs_vehicle: 1\nmodes: [MANUAL]", "cannot be steered by sticks"),
+        ("aqualvs_vehicle: 1\nmodes: []", "modes is []; name a mode"),
         ("aqualvs_vehicle: 1\npeers: [blueos.local]", "write numbers"),
         ("aqualvs_vehicle: 1\nkey: none.key", "none.key: cannot be read"),
         ("aqualvs_vehicle: 1\ncommand: fly", "command is 'fly'"),

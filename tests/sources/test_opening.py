@@ -105,6 +105,8 @@ def test_what_is_no_address_is_refused_before_ffmpeg_waits_for_it(where):
         ("rtsp://a/b", {"size_px": (640, 480)}, "only a camera"),
         ("camera:0", {"transport": "tcp"}, "no transport"),
         ("camera:0", {"fps": -1.0}, "must be positive"),
+        ("udp://:5600", {"realtime": False}, "only a recording can be read faster"),
+        ("camera:0", {"realtime": False}, "only a recording can be read faster"),
     ],
 )
 def test_options_that_do_not_go_with_a_source_are_refused(where, options, words):

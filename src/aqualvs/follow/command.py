@@ -282,8 +282,11 @@ class SimRequest:
                 f"--current {self.current:g} m/s, --net-sway {self.net_sway:g} m: choose 0 to 2, "
                 "and 0 to 1"
             )
-        if self.freeze is not None and not self.freeze >= 0.0:
-            raise OptionError(f"--freeze {self.freeze:g}: choose 0 s or later")
+        if self.freeze is not None and not 0.0 <= self.freeze < self.seconds:
+            raise OptionError(
+                f"--freeze {self.freeze:g}: choose 0 s or later, but before the end after "
+                f"{self.seconds:g} s (--seconds)"
+            )
 
 
 def simulate_and_tell(request: SimRequest, echo: Callable[[str], object]) -> int:

@@ -45,7 +45,7 @@ class VehicleFile(StrictPart):
     ground_station: SystemId = 255
     station_timeout_s: Positive | None = 3.0
     command: Literal["sticks", "guided"] = "sticks"
-    modes: list[str] = Field(default_factory=list)
+    modes: list[str] | None = None
     stick_dead_band: Positive = 0.1
     speed_m_s: Positive = 0.3
     turning_rate_deg_s: Positive = 30.0
@@ -68,13 +68,15 @@ def load_vehicle(path: Path) -> VehicleSetup:
     """
     content = load_settings(path, VehicleFile, _KEY, VERSION)
     try:
+        if content.modes == []:
+            raise OptionError("modes is []; name a mode, or leave it out")
         key = None if content.key is None else load_key(path.parent / content.key)
         link = LinkOptions(
             system=content.system, component=content.component, peers=tuple(content.peers), key=key
         )
         steering = ArduSubOptions(
             command=Command(content.command),
-            modes=tuple(content.modes),
+            modes=tuple(content.modes or ()),
             ground_station=content.ground_station,
             station_timeout_s=content.station_timeout_s,
             stick_dead_band=content.stick_dead_band,

@@ -187,7 +187,7 @@ def open_feed(
     ----------
     realtime : bool
         Whether a recording is played at its own pace, or as fast as it is taken. Streams and
-        cameras have one pace only.
+        cameras have one pace only: True.
     fps : float or None
         Of images, or asked of a camera.
     size_px : (int, int) or None
@@ -209,6 +209,8 @@ def open_feed(
     text = str(where)
     if fps is not None and not 0 < fps < math.inf:
         raise OptionError(f"frame rate {fps:g}: must be positive and finite")
+    if is_camera(text) or _is_stream(text):
+        _no(not realtime, text, "only a recording can be read faster; leave --fast out")
     if is_camera(text):
         _no(transport, text, "a camera has no transport; leave it out")
         return CameraFeed(text, CameraOptions(size_px=size_px, fps=fps, pixel_format=pixel_format))
