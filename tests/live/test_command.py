@@ -11,7 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,12 +21,13 @@ import pytest
 
 from aqualvs.cli.main import main
 from aqualvs.errors import SourceError
+from aqualvs.live.command import Console, status_line
 from aqualvs.optics.rigfile import load_rig
 from aqualvs.recording import DiveRecording, is_recording
 from aqualvs.results.folder import POSTURE_COLUMNS
-from aqualvs.sources.base import bgr_of
+from aqualvs.sources.base import Health, PartHealth, State, bgr_of
 from complaints import complaints
-from live_cases import demo_frames, demo_rig
+from live_cases import demo_frames, demo_rig, first_sample
 from ports import free_port
 from repository import HELPERS
 from shell_cases import all_key_frames, cut_after
@@ -385,6 +386,21 @@ def test_a_video_that_is_cut_short_is_told_in_one_line(rig_file: Path, tmp_path:
     (line,) = complaints(done.stderr)
     assert line.startswith("aqualvs: error: ")
     assert "cut short" in line
+    assert done.stdout == "4 frames measured, 4 with a posture\n"
+
+
+def test_the_line_of_the_terminal_shows_a_sigma_below_a_millimetre() -> None:
+    line = status_line(first_sample())
+    assert line.startswith("range 0.798 m ± 0.3 mm  yaw +12.0 ± 0.05 deg  pitch -6.1 ± 0.07 deg  |")
+
+
+def test_the_log_tells_a_part_that_is_well_again(capsys: pytest.CaptureFixture[str]) -> None:
+    console, sample = Console(), first_sample()
+    for state, detail in ((State.FAULT, "the disk is full"), (State.OK, "")):
+        health = Health(outputs=(PartHealth("follow log", state, detail),))
+        console.send(replace(sample, health=health))
+    said = capsys.readouterr().err
+    assert said == "follow log: fault: the disk is full\nfollow log: ok\n"
 
 
 def test_memory_and_handles_stay_flat_over_a_long_run(tmp_path: Path) -> None:

@@ -57,7 +57,9 @@ def batch(
     temperature_c: Celsius = None,
     salinity: Salinity = None,
     dome: Refraction = True,
-    fps: Annotated[float | None, typer.Option(help="Frame rate of folders of images.")] = None,
+    fps: Annotated[
+        float | None, typer.Option(help="Frame rate of folders of images; 1 if left out.")
+    ] = None,
     index_target: Annotated[
         Path | None,
         typer.Option(

@@ -86,7 +86,9 @@ def live(
     fast: Annotated[
         bool, typer.Option("--fast", help="Files: every frame, as fast as possible.")
     ] = False,
-    fps: Annotated[float | None, typer.Option(help="Of images, or asked of a camera.")] = None,
+    fps: Annotated[
+        float | None, typer.Option(help="Of images (1 if left out), or asked of a camera.")
+    ] = None,
     size: Annotated[
         str | None, typer.Option(metavar="WxH", help="Picture size asked of a camera.")
     ] = None,

@@ -76,7 +76,9 @@ def run(
     frames: Annotated[
         str, typer.Option(metavar="A:B", help="Only frames A to B-1.", show_default=False)
     ] = ":",
-    fps: Annotated[float | None, typer.Option(help="Frame rate of a folder of images.")] = None,
+    fps: Annotated[
+        float | None, typer.Option(help="Frame rate of a folder of images; 1 if left out.")
+    ] = None,
     overlay: Annotated[bool, typer.Option("--overlay", help="Write overlay.mp4 too.")] = False,
     report: Annotated[bool, typer.Option(help="Write report.html.")] = True,
     truth: Annotated[Path | None, typer.Option(help="CSV with the truth to compare with.")] = None,

@@ -121,7 +121,8 @@ class Console:
             self._parts[part.name] = part.state, part.detail
             alarming = part.state in (State.WARN, State.FAULT)
             if part.state is not before and (alarming or before in (State.WARN, State.FAULT)):
-                self._write(f"{part.name}: {part.state.value}: {part.detail}", stays=True)
+                detail = part.detail and f": {part.detail}"
+                self._write(f"{part.name}: {part.state.value}{detail}", stays=True)
 
     def _write(self, line: str, *, stays: bool) -> None:
         if self._on_screen:
@@ -137,9 +138,9 @@ def status_line(sample: LiveSample) -> str:
     if isinstance(posture, Posture):
         sigma = deviations(posture.total_covariance)
         told = (
-            f"range {posture.range:.3f} ± {sigma[0]:.3f} m  "
-            f"yaw {math.degrees(posture.yaw):+.1f} ± {sigma[2]:.1f} deg  "
-            f"pitch {math.degrees(posture.pitch):+.1f} ± {sigma[1]:.1f} deg"
+            f"range {posture.range:.3f} m ± {1e3 * sigma[0]:.1f} mm  "
+            f"yaw {math.degrees(posture.yaw):+.1f} ± {sigma[2]:.2f} deg  "
+            f"pitch {math.degrees(posture.pitch):+.1f} ± {sigma[1]:.2f} deg"
         )
     else:
         told = f"no posture: {posture.detail or posture.reason.value}"
@@ -233,6 +234,7 @@ def live_and_tell(request: LiveRequest, echo: Callable[[str], object]) -> int:
     runner = make_runner(request, rig, lambda: _provider(request, rig), holder, echo)
     with StopSignals() as stop:
         fault = runner.run(lambda: stop.caught is not None)
+    echo(f"{runner.n_measured} frames measured, {runner.n_postures} with a posture")
     if fault is not None:
         raise fault
     return 0

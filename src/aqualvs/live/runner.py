@@ -351,6 +351,11 @@ class LiveRunner:
     posture_filter : PostureFilter or None
         Smooths over time, in addition to the raw values.
 
+    Attributes
+    ----------
+    n_measured, n_postures : int
+        Frames measured until now; those with a posture.
+
     The first output that an autopilot answers tells how the vehicle turns, for a rolling shutter.
     """
 
@@ -362,6 +367,7 @@ class LiveRunner:
         options: LiveOptions | None = None,
         posture_filter: PostureFilter | None = None,
     ) -> None:
+        self.n_measured = self.n_postures = 0
         self._options = options or LiveOptions()
         self._provider, self._filter = provider, posture_filter
         self._mailbox = Mailbox(keep_every=self._options.keep_every)
@@ -424,6 +430,8 @@ class LiveRunner:
         self._heard_ns = arrival.arrived_ns
         scanner = self._provider.scanner
         peaks, scan = self._scan(scanner, arrival)
+        self.n_measured += 1
+        self.n_postures += bool(scan.posture)
         shutter, age_ns = scanner.rig.shutter, 0
         if frame.field == shutter.first_field:
             # It waited for the second field, with which it came.
