@@ -147,12 +147,15 @@ def test_faults_of_the_user_become_one_line(monkeypatch, capsys):
     assert said.out == ""
 
 
-def test_an_interrupted_command_exits_with_130(monkeypatch, capsys):
-    def interrupt(**_):
+@pytest.mark.parametrize(
+    ("place", "name"), [(CheckedCommand, "invoke"), (cli, "app"), (CheckedCommand, "make_context")]
+)
+def test_an_interrupted_command_exits_with_130_and_says_so(place, name, monkeypatch, capsys):
+    def stop(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(cli, "app", interrupt)
-    assert main(["simulate"]) == 130
+    monkeypatch.setattr(place, name, stop)
+    assert main(["doctor"]) == 130
     assert capsys.readouterr().err == "aqualvs: error: interrupted\n"
 
 

@@ -192,6 +192,13 @@ class CommandGroups(TyperGroup):
     itself draws groups by Rich only, which takes as long to import as all the rest of `--help`.
     """
 
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command; raise `Abort` for Ctrl-C, which Typer returns as a silent exit code."""
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt:
+            raise typer.Abort from None
+
     def format_commands(self, _ctx: Any, formatter: Any) -> None:
         """Write a section for every group, and one for commands without a group."""
         max_summary = 200  # Characters; sentences in `--help` are wrapped, not cut.
