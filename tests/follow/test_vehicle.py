@@ -3,6 +3,7 @@
 import csv
 import io
 import socket
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from aqualvs.follow.vehicle import FollowLogOutput, FollowRequest, follow_and_te
 from aqualvs.live.command import LiveRequest
 from aqualvs.live.pilot import PilotReport
 from aqualvs.results.files import Claim
+from aqualvs.sources import open_feed
 from aqualvs.sources.base import State
 from live_cases import demo_samples
 
@@ -67,7 +69,7 @@ def demo_request(out: Path, **more: Any) -> FollowRequest:
     """Return a request to follow the net of the bundled dive, with BlueROV2's gains."""
     demo = Path(str(bundled_dive()))
     usual: dict[str, Any] = {"gains": "bluerov2", "aim": Aim(range=0.5)}
-    live = LiveRequest(source=str(demo / "dive.mp4"), rig=demo / "rig.yaml")
+    live = LiveRequest(feed=partial(open_feed, demo / "dive.mp4"), rig=demo / "rig.yaml")
     return FollowRequest(live=live, out=out, **(usual | more))
 
 

@@ -1,6 +1,7 @@
 """Signatures of `aqualvs follow` and `aqualvs tune`; bodies are imported when they run."""
 
 import math
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -162,10 +163,12 @@ def follow(
     """Hold a distance to a net, or follow it."""
     from aqualvs.errors import OptionError
     from aqualvs.follow import command as body
+    from aqualvs.live.options import Page
 
     dashboard = dashboard or bool(typed(context, "dashboard_address"))
     if not dashboard:
         refuse_given(context, ("token",), "for the pilot's page; add --dashboard")
+    page = Page.of(dashboard_address, token) if dashboard else None
     aim = body.Aim(plan=plan, range=hold_range, yaw=math.radians(yaw))
     if sim:
         refuse_given(context, OF_A_VEHICLE, "for a vehicle; leave it out with --sim")
@@ -187,8 +190,7 @@ def follow(
             shutter=shutter,
             seed=seed,
             freeze=freeze,
-            dashboard=dashboard_address if dashboard else None,
-            token=token,
+            page=page,
             overwrite=overwrite,
         )
         raise typer.Exit(body.simulate_and_tell(request, typer.echo))
@@ -201,12 +203,12 @@ def follow(
     from aqualvs.live.command import LiveRequest
     from aqualvs.live.options import vehicle_setup
     from aqualvs.results.run_request import Water, scanner_options
+    from aqualvs.sources import open_feed
 
     live = LiveRequest(
-        source=source,
+        feed=partial(open_feed, source),
         rig=rig,
-        dashboard=dashboard_address if dashboard else None,
-        token=token,
+        page=page,
         # The page has a button that records; without it nothing else begins a recording.
         record=record or (not dashboard and (record_video or record_to is not None)),
         record_to=out if record_to is None else record_to,

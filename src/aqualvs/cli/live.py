@@ -1,5 +1,6 @@
 """Signatures of `aqualvs live` and `aqualvs doctor`; bodies are imported when they run."""
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -117,32 +118,41 @@ def live(
     if not mavlink:
         refuse_given(context, _OF_MAVLINK, "for a MAVLink connection; add --mavlink")
     from aqualvs.live import command as body
-    from aqualvs.live.options import OutputRequest, vehicle_setup
+    from aqualvs.live.options import Page, output_makers, vehicle_setup
     from aqualvs.results.run_request import Water, scanner_options
+    from aqualvs.sources import open_feed
 
+    scanner = scanner_options(target, detector, "none", "robust")
+    outputs = output_makers(
+        mavlink=mavlink or (),
+        link=vehicle_setup(vehicle_file, mavlink_peer, mavlink_key).link,
+        json=json or (),
+        ros2=ros2,
+        ros1=ros1,
+        foxglove=foxglove_address if foxglove else None,
+        rerun=rerun,
+        scanner=scanner,
+    )
     request = body.LiveRequest(
-        source=source,
-        rig=rig,
-        feed=body.FeedRequest(fps=fps, size=size, pixel_format=pixel_format, transport=transport),
-        outputs=OutputRequest(
-            mavlink=tuple(mavlink or ()),
-            link=vehicle_setup(vehicle_file, mavlink_peer, mavlink_key).link,
-            json=tuple(json or ()),
-            ros2=ros2,
-            ros1=ros1,
-            foxglove=foxglove_address if foxglove else None,
-            rerun=rerun,
+        feed=partial(
+            open_feed,
+            source,
+            realtime=not fast,
+            fps=fps,
+            size_px=None if size is None else body.camera_size(size),
+            pixel_format=pixel_format,
+            transport=transport,
         ),
-        dashboard=dashboard_address if dashboard else None,
-        token=token,
-        embed_from=tuple(embed_from or ()),
+        rig=rig,
+        outputs=tuple(outputs),
+        page=Page.of(dashboard_address, token, embed_from or ()) if dashboard else None,
         record=record,
         record_to=record_to,
         record_video=record_video,
         smooth=smooth,
         fast=fast,
         water=Water(n_water=water_n, temperature_c=temperature_c, salinity=salinity),
-        scanner=scanner_options(target, detector, "none", "robust"),
+        scanner=scanner,
         index_target=index_target,
     )
     raise typer.Exit(body.live_and_tell(request, typer.echo))

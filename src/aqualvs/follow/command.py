@@ -28,7 +28,7 @@ from aqualvs.follow.log import write_log
 from aqualvs.follow.loop import RangeSensor, SimulatedLoop, Timing
 from aqualvs.follow.report import FIGURE_FILES, PAGE, RunFacts, summary_lines, write_report
 from aqualvs.follow.sensor_model import Blind, LossOfSight, RenderedSensor, SampledSensor
-from aqualvs.live.options import serve_page
+from aqualvs.live.options import Page
 from aqualvs.live.outputs.base import Output
 from aqualvs.live.pilot import PilotReport
 from aqualvs.optics.rig import Rig
@@ -245,10 +245,8 @@ class SimRequest:
     seed: int = 0
     # When the picture begins to stand still, in seconds; never if left out.
     freeze: float | None = None
-    # Address HOST:PORT of the pilot's page; the run then goes no faster than the clock.
-    dashboard: str | None = None
-    # Its password.
-    token: str | None = None
+    # The pilot's page; the run then goes no faster than the clock.
+    page: Page | None = None
     # Whether to replace what this command wrote to `out` before.
     overwrite: bool = False
 
@@ -313,12 +311,10 @@ def simulate_and_tell(request: SimRequest, echo: Callable[[str], object]) -> int
         loop = case.loop(sensor, mission)
         with ExitStack() as undo:
             page = None
-            if request.dashboard is not None:
+            if request.page is not None:
                 holder = SetpointHolder(rig.working_range)
                 holder.put(setpoint)
-                served = serve_page(
-                    request.dashboard, request.token, rig, holder, None, echo, loop.link.state
-                )
+                served = request.page.serve(rig, holder, None, echo, loop.link.state)
                 page = LoopPage(served, rig, loop, holder)
                 undo.callback(page.close)
             _run(loop, request, page, echo)

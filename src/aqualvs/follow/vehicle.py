@@ -39,7 +39,7 @@ from aqualvs.terminal import StopSignals
 _Step: TypeAlias = tuple[PilotReport, float, Posture | Refusal]
 
 
-class FollowLogOutput:
+class FollowLogOutput(Output):
     """Writer of the pilot's steps; comes after the pilot among the outputs.
 
     `path`: created, or overwritten. Raises `OutputError` if it cannot be written.
@@ -47,7 +47,6 @@ class FollowLogOutput:
 
     name = "follow log"
     inline = True
-    keeps_all = False
 
     def __init__(self, path: Path, pilot: Pilot) -> None:
         self._log, self._pilot = FollowLog(path), pilot
@@ -114,7 +113,6 @@ def follow_and_tell(
     Raises `AqualvsError` if an input cannot be used, or the source can never work.
     """
     live, log = replace(request.live, smooth=True), request.out / FOLLOW_CSV
-    live.check()
     rig = prepared_rig(live.rig, live.water, no_dome=False)
     mission, limits, setpoint = request.aim.mission(rig.working_range)
     holder = SetpointHolder(rig.working_range)

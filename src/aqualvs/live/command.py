@@ -17,14 +17,7 @@ from pathlib import Path
 from aqualvs.control.time_filter import PostureFilter
 from aqualvs.control.vehicle import SetpointHolder, VehicleState
 from aqualvs.errors import OptionError
-from aqualvs.live.options import (
-    OutputRequest,
-    check_outputs,
-    check_page,
-    make_outputs,
-    serve_page,
-    vehicle_reader,
-)
+from aqualvs.live.options import Page, vehicle_reader
 from aqualvs.live.outputs.base import Output
 from aqualvs.live.runner import LiveOptions, LiveRunner, ScannerSupply, warm_up
 from aqualvs.optics.rig import Rig
@@ -36,8 +29,6 @@ from aqualvs.scanning.posture import Posture, deviations
 from aqualvs.scanning.scan import Frame
 from aqualvs.sources.base import Feed, PartHealth, State
 from aqualvs.sources.fields import FrameFeed
-from aqualvs.sources.opening import open_feed
-from aqualvs.sources.remote import Transport
 from aqualvs.terminal import StopSignals
 from aqualvs.workers.run_frames import WaterFollowingScanner
 
@@ -81,12 +72,10 @@ class WaterFollower(ScannerSupply):
 _SCREEN_EVERY_S, _LOG_EVERY_S = 0.2, 10.0
 
 
-class Console:
+class Console(Output):
     """Output to the terminal of the user who started the run, by standard error."""
 
     name = "console"
-    inline = False
-    keeps_all = False
 
     def __init__(self) -> None:
         self._stream = sys.stderr
@@ -154,31 +143,11 @@ def status_line(sample: LiveSample) -> str:
 SWITCH_S = 0.0005
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FeedRequest:
-    """Request for the delivery of a source, where it has a choice; see `open_feed`."""
+def camera_size(text: str) -> tuple[int, int]:
+    """Return the size that `WIDTHxHEIGHT` asks of a camera.
 
-    fps: float | None = None  # Of images, or asked of a camera.
-    size: str | None = None  # `WIDTHxHEIGHT`, asked of a camera.
-    pixel_format: str | None = None  # Asked of a camera.
-    transport: Transport | None = None  # How RTSP shall send.
-
-    def opened(self, source: str, *, realtime: bool) -> Feed:
-        """Return the feed of a source.
-
-        Raises `OptionError` or `SourceError` as `open_feed`; also if the size is none.
-        """
-        return open_feed(
-            source,
-            realtime=realtime,
-            fps=self.fps,
-            size_px=None if self.size is None else _size_px(self.size),
-            pixel_format=self.pixel_format,
-            transport=self.transport,
-        )
-
-
-def _size_px(text: str) -> tuple[int, int]:
+    Raises `OptionError` if it is none.
+    """
     width, _, height = text.lower().partition("x")
     if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
         raise OptionError(f"--size {text}: not understood; give WIDTHxHEIGHT, such as 1920x1080")
@@ -189,13 +158,10 @@ def _size_px(text: str) -> tuple[int, int]:
 class LiveRequest:
     """Request for a live run."""
 
-    source: str  # As `open_feed` takes it.
+    feed: Callable[[], Feed]  # Opens the source.
     rig: Path
-    feed: FeedRequest = field(default_factory=FeedRequest)
-    outputs: OutputRequest = field(default_factory=OutputRequest)
-    dashboard: str | None = None  # Address HOST:PORT of the pilot's page.
-    token: str | None = None  # Its password.
-    embed_from: tuple[str, ...] = ()  # Origins of pages that may show it.
+    outputs: tuple[Callable[[], Output], ...] = ()  # From `output_makers`.
+    page: Page | None = None
     # Whether to record from the start; the page's button begins and ends recordings, too.
     record: bool = False
     # Folder of recordings.
@@ -208,27 +174,17 @@ class LiveRequest:
     scanner: ScannerOptions = field(default_factory=ScannerOptions)
     index_target: Path | None = None  # Markers on the vehicle that show the water's index.
 
-    def check(self) -> None:
-        """Refuse options that cannot be used, before anything is opened, sent or written.
-
-        Raises `OptionError` naming the option or the address, or `CalibrationError` naming the
-        file of the target.
-        """
-        check_outputs(self.outputs)
-        if self.dashboard is not None:
-            check_page(self.dashboard, self.token, self.embed_from)
-        if self.index_target is not None:
-            from aqualvs.calibration.targets.target_files import load_target
-
-            load_target(self.index_target)
-
 
 def live_and_tell(request: LiveRequest, echo: Callable[[str], object]) -> int:
     """Run until the source ends or the user stops it, the normal end of a live run; return 0.
 
     Raises `AqualvsError` if an input cannot be used, or the source can never work.
     """
-    request.check()
+    if request.index_target is not None:
+        from aqualvs.calibration.targets.target_files import load_target
+
+        # Refused before anything is opened, sent or written.
+        load_target(request.index_target)
     rig = prepared_rig(request.rig, request.water, no_dome=False)
     holder = SetpointHolder(rig.working_range, followed=False)
     runner = make_runner(request, rig, lambda: _provider(request, rig), holder, echo)
@@ -261,7 +217,7 @@ def make_runner(
     first : iterable of Output
         Outputs before all others; taken once the source is open.
     vehicle : callable, optional
-        As `serve_page` takes it; by default of the first output that an autopilot answers.
+        As `Page.serve` takes it; by default of the first output that an autopilot answers.
     """
     sys.setswitchinterval(SWITCH_S)
     options = RecorderOptions(
@@ -275,16 +231,15 @@ def make_runner(
                 outputs.append(output)
                 undo.callback(output.close)
 
-        pictures = request.feed.opened(request.source, realtime=not request.fast)
-        feed = FrameFeed(pictures, rig.shutter)
+        feed = FrameFeed(request.feed(), rig.shutter)
         undo.callback(feed.close)
         add(first)
         recorder = RecorderSwitch(request.record_to, options)
         add([recorder, Console()])
-        add(make_outputs(request.outputs, request.scanner))
-        if request.dashboard is not None:
-            page = (request.dashboard, request.token, rig, holder, recorder, echo)
-            add([serve_page(*page, vehicle or vehicle_reader(outputs), request.embed_from)])
+        add(make() for make in request.outputs)
+        if request.page is not None:
+            reader = vehicle or vehicle_reader(outputs)
+            add([request.page.serve(rig, holder, recorder, echo, reader)])
         smoothing = PostureFilter() if request.smooth else None
         every = LiveOptions(keep_every=request.fast)
         if request.record:

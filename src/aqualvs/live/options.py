@@ -1,13 +1,14 @@
 """Options of a live run: outputs, the vehicle file, and the pilot's page.
 
 The vehicle file states the vehicle's MAVLink identity, how it is steered, and which ground station
-must be present. `vehicle_setup` combines it with the command line. `serve_page` serves the pilot's
-page of `aqualvs live` and `follow`, if its packages are installed.
+must be present. `vehicle_setup` combines it with the command line. `Page` is the pilot's page of
+`aqualvs live` and `follow`, if its packages are installed.
 """
 
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -115,69 +116,61 @@ def vehicle_setup(file: Path | None, peers: Sequence[str] | None, key: Path | No
 FOXGLOVE_PORT, DASHBOARD_PORT = 8765, 8100
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class OutputRequest:
-    """Request for outputs of a live run; all are off by default."""
+def output_makers(
+    *,
+    mavlink: Sequence[str],
+    link: LinkOptions,
+    json: Sequence[str],
+    ros2: bool,
+    ros1: bool,
+    foxglove: str | None,
+    rerun: str | None,
+    scanner: "ScannerOptions",
+) -> Iterator[Callable[[], Output]]:
+    """Yield what makes the outputs that were asked for; only these are imported.
 
-    # Addresses; one output for each.
-    mavlink: tuple[str, ...] = ()
-    json: tuple[str, ...] = ()
-    # Of every MAVLink connection.
-    link: LinkOptions = field(default_factory=LinkOptions)
+    Parameters
+    ----------
+    mavlink, json : sequence of str
+        Addresses; one connection, and one receiver, for each.
+    link : LinkOptions
+        Of every MAVLink connection.
+    foxglove : str or None
+        Address HOST:PORT to listen on.
+    rerun : str or None
+        As `RerunOutput` takes it.
 
-    ros2: bool = False
-    ros1: bool = False
-    foxglove: str | None = None  # Address HOST:PORT to listen on.
-    rerun: str | None = None  # As `RerunOutput` takes it.
-
-
-def check_outputs(request: OutputRequest) -> None:
-    """Refuse addresses that cannot be understood, before anything is opened.
-
-    Raises `OptionError` naming the address.
+    Raises
+    ------
+    OptionError
+        If an address cannot be understood; and from what makes an output, if the extra that it
+        needs is not installed.
     """
-    for url in request.mavlink:
-        parse_address(url)
-    if request.json:
-        from aqualvs.live.outputs.udp_json import receiver_address
-
-        for address in request.json:
-            receiver_address(address)
-    if request.foxglove is not None:
-        host_and_port(request.foxglove, FOXGLOVE_PORT, "--foxglove-address")
-
-
-def make_outputs(request: OutputRequest, scanner: "ScannerOptions") -> Iterator[Output]:
-    """Make the outputs that were asked for, one by one; only these are imported.
-
-    Raises `OptionError` if an address cannot be understood, or the extra that an output needs is
-    not installed.
-    """
-    for url in request.mavlink:
+    for url in mavlink:
         from aqualvs.live.outputs.mavlink import MavlinkOutput
 
-        yield MavlinkOutput(url, request.link)
-    if request.json:
-        from aqualvs.live.outputs.udp_json import UdpJsonOutput
+        yield partial(MavlinkOutput, parse_address(url), link)
+    if json:
+        from aqualvs.live.outputs.udp_json import UdpJsonOutput, receiver_address
 
-        yield UdpJsonOutput(request.json)
-    if request.ros2:
+        yield partial(UdpJsonOutput, [receiver_address(text) for text in json])
+    if ros2:
         from aqualvs.live.outputs.dds import DdsOutput
 
-        yield DdsOutput()
-    if request.ros1:
+        yield DdsOutput
+    if ros1:
         from aqualvs.live.outputs.ros1 import Ros1Output
 
-        yield Ros1Output()
-    if request.foxglove is not None:
+        yield Ros1Output
+    if foxglove is not None:
         from aqualvs.live.outputs.foxglove import FoxgloveOutput
 
-        host, port = host_and_port(request.foxglove, FOXGLOVE_PORT, "--foxglove-address")
-        yield FoxgloveOutput(host, port, scanner=scanner)
-    if request.rerun is not None:
+        where = host_and_port(foxglove, FOXGLOVE_PORT, "--foxglove-address")
+        yield partial(FoxgloveOutput, *where, scanner=scanner)
+    if rerun is not None:
         from aqualvs.live.outputs.rerun import RerunOutput
 
-        yield RerunOutput(request.rerun)
+        yield partial(RerunOutput, rerun)
 
 
 def host_and_port(text: str, default_port: int, option: str) -> tuple[str, int]:
@@ -198,68 +191,74 @@ def vehicle_reader(outputs: Sequence[Output]) -> Callable[[], VehicleState | Non
     )
 
 
-def check_page(
-    address: str, token: str | None, embedders: Sequence[str] = ()
-) -> tuple[str, int, "Access"]:
-    """Return host and port of the page, and who may use it; parameters as `serve_page` takes them.
+@dataclass(frozen=True, slots=True)
+class Page:
+    """The pilot's page, not yet served."""
 
-    Raises `OptionError` if a part is not installed, the token is too short, an embedder is no
-    origin, or the address makes no sense.
-    """
-    try:
-        # The server needs all of the extra.
-        import aqualvs.live.dashboard.server  # noqa: F401
-        from aqualvs.live.dashboard.access import make_access, token_fault
-    except ImportError as lack:
-        raise OptionError(
-            f"--dashboard: {lack.name} is missing; pip install 'aqualvs[dashboard]'"
-        ) from lack
-    host, port = host_and_port(address, DASHBOARD_PORT, "--dashboard-address")
-    fault = token_fault(token)
-    if fault:
-        raise OptionError(fault)
-    return host, port, make_access(host, token, embedders)
+    host: str
+    port: int
+    access: "Access"  # Who may use it.
 
+    @classmethod
+    def of(cls, address: str, token: str | None, embedders: Sequence[str] = ()) -> "Page":
+        """Return the page that the command line asks for.
 
-def serve_page(
-    address: str,
-    token: str | None,
-    rig: Rig,
-    holder: SetpointHolder,
-    recorder: RecorderSwitch | None,
-    echo: Callable[[str], object],
-    vehicle: Callable[[], VehicleState | None] = lambda: None,
-    embedders: Sequence[str] = (),
-) -> Output:
-    """Serve the page and print its address.
+        Parameters
+        ----------
+        address : str
+            HOST:PORT.
+        token : str or None
+            Its password; a new one if left out.
+        embedders : sequence of str, optional
+            Origins, such as `http://blueos.local`, whose pages may show this one; none if left out.
 
-    Parameters
-    ----------
-    address : str
-        HOST:PORT.
-    token : str or None
-        Its password; a new one if left out.
-    holder : SetpointHolder
-        Where the page puts what is to be held.
-    recorder : RecorderSwitch or None
-        What its record button moves; without one the button refuses.
-    vehicle : callable, optional
-        Returns what the autopilot tells of depth and heading.
-    embedders : sequence of str, optional
-        Origins, such as `http://blueos.local`, whose pages may show this one; none if left out.
+        Raises
+        ------
+        OptionError
+            If a part is not installed, the token is too short, an embedder is no origin, or the
+            address makes no sense.
+        """
+        try:
+            # The server needs all of the extra.
+            import aqualvs.live.dashboard.server  # noqa: F401
+            from aqualvs.live.dashboard.access import make_access
+        except ImportError as lack:
+            raise OptionError(
+                f"--dashboard: {lack.name} is missing; pip install 'aqualvs[dashboard]'"
+            ) from lack
+        host, port = host_and_port(address, DASHBOARD_PORT, "--dashboard-address")
+        return cls(host, port, make_access(host, token, embedders))
 
-    Raises
-    ------
-    OptionError
-        As `check_page`; or if the address cannot be used.
-    """
-    host, port, access = check_page(address, token, embedders)
-    from aqualvs.live.dashboard.access import Controls, RecordButton
-    from aqualvs.live.dashboard.output import Dashboard, SwitchButton
-    from aqualvs.live.dashboard.server import DashboardServer
+    def serve(
+        self,
+        rig: Rig,
+        holder: SetpointHolder,
+        recorder: RecorderSwitch | None,
+        echo: Callable[[str], object],
+        vehicle: Callable[[], VehicleState | None],
+    ) -> Output:
+        """Serve the page and print its address.
 
-    controls = Controls(holder, RecordButton() if recorder is None else SwitchButton(recorder))
-    server = DashboardServer(host, port, access, rig, controls)
-    shown = f"[{host}]" if ":" in host else host
-    echo(f"dashboard: http://{shown}:{server.port}/#token={access.token}")
-    return Dashboard(server, controls, vehicle)
+        Parameters
+        ----------
+        holder : SetpointHolder
+            Where the page puts what is to be held.
+        recorder : RecorderSwitch or None
+            What its record button moves; without one the button refuses.
+        vehicle : callable
+            Returns what the autopilot tells of depth and heading.
+
+        Raises
+        ------
+        OptionError
+            If the address cannot be used.
+        """
+        from aqualvs.live.dashboard.access import Controls, RecordButton
+        from aqualvs.live.dashboard.output import Dashboard
+        from aqualvs.live.dashboard.server import DashboardServer
+
+        controls = Controls(holder, RecordButton(recorder))
+        server = DashboardServer(self.host, self.port, self.access, rig, controls)
+        shown = f"[{self.host}]" if ":" in self.host else self.host
+        echo(f"dashboard: http://{shown}:{server.port}/#token={self.access.token}")
+        return Dashboard(server, controls, vehicle)

@@ -15,6 +15,7 @@ from aqualvs.control.missions import Guidance, HoldMission
 from aqualvs.control.safety import LimitReason
 from aqualvs.control.vehicle import NEUTRAL, Effort, Mode, SetpointHolder, VehicleLink, VehicleState
 from aqualvs.errors import OptionError
+from aqualvs.live.outputs.base import Output
 from aqualvs.recording.sample import LiveSample
 from aqualvs.scanning.posture import Posture, Refusal
 from aqualvs.scanning.posture import Reason as NoPosture
@@ -147,7 +148,7 @@ def _aim(guidance: Guidance) -> str:
 _GOODBYES, _GOODBYES_TO_STICKS = 3, 1
 
 
-class Pilot:
+class Pilot(Output):
     """Output of a live run that steers a vehicle by the measured posture.
 
     It starts disengaged and sends nothing. `engage` lets efforts pass; a mode change, the pilot's
@@ -166,7 +167,6 @@ class Pilot:
 
     name = "pilot"
     inline = True
-    keeps_all = False
 
     def __init__(
         self, steering: NetPilot, vehicle: VehicleLink, holder: SetpointHolder | None = None

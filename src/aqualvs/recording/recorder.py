@@ -157,8 +157,6 @@ class Recorder:
     """
 
     name = "recorder"
-    inline = False
-    keeps_all = True
 
     def __init__(
         self,

@@ -6,15 +6,19 @@ a time.
 """
 
 import asyncio
+import contextlib
 import heapq
 import ipaddress
 import math
 import re
 import secrets
+import shutil
+import time
 from collections import Counter, OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import count
+from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 from urllib.parse import urlsplit
 
@@ -23,6 +27,8 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from aqualvs.control.vehicle import Setpoint, SetpointHolder
 from aqualvs.errors import OptionError
+from aqualvs.recording import RecorderSwitch
+from aqualvs.sources.base import State
 
 MAX_MESSAGE_BYTES = 2048
 """Longer messages close the connection."""
@@ -76,21 +82,48 @@ def parse_message(text: str) -> Message:
 
 
 class RecordButton:
-    """Record button of the page; this one is of a run that can record nothing."""
+    """Record button of the page; without a switch the run can record nothing."""
+
+    def __init__(self, switch: RecorderSwitch | None = None) -> None:
+        self._switch = switch
+        self._path: Path | None = None
+        self._asked_s = -math.inf
+        self._found: dict[str, Any] = {"on": False, "words": ""}
 
     def start(self) -> None:
         """Begin a recording; does nothing while one is under way."""
-        raise OptionError("record: this run records nothing; start it with --record FOLDER")
+        if self._switch is None:
+            raise OptionError("record: this run records nothing; start it with --record FOLDER")
+        self._switch.start()
 
     def stop(self) -> None:
         """End it; does nothing where there is none."""
+        if self._switch is not None:
+            self._switch.stop()
 
     def to_dict(self) -> Mapping[str, Any]:
         """Return `on` (bool) and `words` (a file's name, or why it does not work).
 
         Also, as far as known, `seconds` of the recording, `free_bytes` of the disk and `left_s`.
         """
-        return {"on": False, "words": ""}
+        disk_every_s = 1.0  # Between looks at the size of the recording and at the disk.
+        if self._switch is None:
+            return self._found
+        now_s, path = time.monotonic(), self._switch.path
+        if path is self._path and now_s - self._asked_s < disk_every_s:
+            return self._found
+        self._path, self._asked_s = path, now_s
+        health = self._switch.health()
+        words = health.detail if health.state is State.FAULT else path.name if path else ""
+        self._found = {"on": path is not None, "words": words}
+        if path is not None:
+            # A disk that has been taken away is the recorder's fault to tell.
+            with contextlib.suppress(OSError):
+                free, seconds = shutil.disk_usage(path.parent).free, self._switch.seconds
+                rate = path.stat().st_size / seconds if seconds > disk_every_s else 0.0
+                left_s = free / rate if rate else None
+                self._found |= {"seconds": seconds, "free_bytes": free, "left_s": left_s}
+        return self._found
 
 
 class Controls:
@@ -195,8 +228,13 @@ def _is_origin(text: str) -> bool:
 def make_access(host: str, token: str | None, embedders: Sequence[str] = ()) -> Access:
     """Return the rules for an address; without a token a new one is made.
 
-    Raises `OptionError` if an embedder is no origin of web pages.
+    Raises `OptionError` if a token is too short, or an embedder is no origin of web pages.
     """
+    min_token = 8
+    if token is not None and len(token) < min_token:
+        raise OptionError(
+            f"--token: {len(token)} characters; choose at least {min_token}, or leave it out"
+        )
     for origin in embedders:
         # Anything else, such as a wildcard, would let strangers lay a page over the buttons.
         if not (origin.startswith(("http://", "https://")) and _is_origin(origin)):
@@ -204,15 +242,7 @@ def make_access(host: str, token: str | None, embedders: Sequence[str] = ()) -> 
                 f"--embed-from {origin}: not understood; write the address of the page without a "
                 "path, such as http://blueos.local"
             )
-    return Access(host, token if token else secrets.token_urlsafe(12), tuple(embedders))
-
-
-def token_fault(token: str | None) -> str:
-    """Return the fault of a token that a user chose; "" if there is none."""
-    min_token = 8
-    if token is None or len(token) >= min_token:
-        return ""
-    return f"--token: {len(token)} characters; choose at least {min_token}, or leave it out"
+    return Access(host, token or secrets.token_urlsafe(12), tuple(embedders))
 
 
 Peer = tuple[str, int]

@@ -1,24 +1,19 @@
-"""The pilot's page as an output of a live run, and its record button.
+"""The pilot's page as an output of a live run.
 
 The camera's picture is reduced for the page (`page_picture`), so that it is small and cheap to
 make.
 """
 
-import contextlib
-import math
-import shutil
 import time
-from collections.abc import Callable, Mapping
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable
 
 import cv2
 import numpy as np
 
 from aqualvs.control.vehicle import VehicleState
-from aqualvs.live.dashboard.access import Controls, RecordButton
+from aqualvs.live.dashboard.access import Controls
 from aqualvs.live.dashboard.server import DashboardServer, page_state
-from aqualvs.recording import RecorderSwitch
+from aqualvs.live.outputs.base import Output
 from aqualvs.recording.sample import LiveSample
 from aqualvs.scanning.scan import Frame, ImagePlane
 from aqualvs.sources.base import PartHealth, State
@@ -53,7 +48,7 @@ def _resized(plane: ImagePlane, size: tuple[int, int]) -> ImagePlane:
     return np.asarray(cv2.resize(plane, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
-class Dashboard:
+class Dashboard(Output):
     """Output to the open pages; costs next to nothing while there is none.
 
     Parameters
@@ -65,8 +60,6 @@ class Dashboard:
     """
 
     name = "dashboard"
-    inline = False
-    keeps_all = False
 
     def __init__(
         self,
@@ -101,40 +94,3 @@ class Dashboard:
     def close(self) -> None:
         """End the server."""
         self._server.close()
-
-
-class SwitchButton(RecordButton):
-    """The page's record button on a recorder's switch."""
-
-    def __init__(self, switch: RecorderSwitch) -> None:
-        self._switch = switch
-        self._path: Path | None = None
-        self._asked_s = -math.inf
-        self._found: dict[str, Any] = {}
-
-    def start(self) -> None:
-        """Begin a recording."""
-        self._switch.start()
-
-    def stop(self) -> None:
-        """End it."""
-        self._switch.stop()
-
-    def to_dict(self) -> Mapping[str, Any]:
-        """Return whether a recording is on, its file or its fault, its time and the disk's room."""
-        disk_every_s = 1.0  # Between looks at the size of the recording and at the disk.
-        now_s, path = time.monotonic(), self._switch.path
-        if path is self._path and now_s - self._asked_s < disk_every_s:
-            return self._found
-        self._path, self._asked_s = path, now_s
-        health = self._switch.health()
-        words = health.detail if health.state is State.FAULT else path.name if path else ""
-        self._found = {"on": path is not None, "words": words}
-        if path is not None:
-            # A disk that has been taken away is the recorder's fault to tell.
-            with contextlib.suppress(OSError):
-                free, seconds = shutil.disk_usage(path.parent).free, self._switch.seconds
-                rate = path.stat().st_size / seconds if seconds > disk_every_s else 0.0
-                left_s = free / rate if rate else None
-                self._found |= {"seconds": seconds, "free_bytes": free, "left_s": left_s}
-        return self._found

@@ -13,6 +13,7 @@ from typing import Any
 from aqualvs.errors import OptionError
 from aqualvs.live.mavlink.peers import MOVES_AFTER_S, Peer, PeerTable, Signer
 from aqualvs.live.mavlink.ports import (
+    Address,
     AllowedPeers,
     Port,
     SerialAddress,
@@ -94,8 +95,8 @@ class MavlinkLink:
 
     Parameters
     ----------
-    url : str
-        See `parse_address`.
+    address : Address or str
+        From `parse_address`, or as it takes it.
 
     Raises
     ------
@@ -103,14 +104,14 @@ class MavlinkLink:
         If the address makes no sense, or pymavlink is not installed.
     """
 
-    def __init__(self, url: str, options: LinkOptions | None = None) -> None:
+    def __init__(self, address: Address | str, options: LinkOptions | None = None) -> None:
         options = options or LinkOptions()
-        self.url = url
+        self._address = parse_address(address) if isinstance(address, str) else address
+        self.url = self._address.url
         self.system = system = options.system  # Of the vehicle, and our own.
         self._autopilot_ids = (system, _AUTOPILOT_COMPONENT)
         # Messages and constants of ardupilotmega, which holds all common ones.
         self.dialect: Any = _dialect()
-        self._address = parse_address(url)
         check_address(self._address)
         self._signer = None if options.key is None else Signer(self.dialect, options.key)
         self._packer = self.make_packer(system, options.component)
@@ -135,7 +136,7 @@ class MavlinkLink:
         self._closing = threading.Event()
         self._allowed, self._n_foreign, self._foreign = AllowedPeers(options.peers), 0, ""
         self._peers = PeerTable(self._make_parser, (self.dialect.MAVError,), system)
-        self._thread = threading.Thread(target=self._run, name=f"mavlink {url}", daemon=True)
+        self._thread = threading.Thread(target=self._run, name=f"mavlink {self.url}", daemon=True)
         self._thread.start()
 
     def make_packer(self, system: int, component: int) -> Any:

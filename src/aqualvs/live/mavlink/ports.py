@@ -9,7 +9,7 @@ import re
 import socket
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
 
 from aqualvs.errors import OptionError
@@ -45,6 +45,8 @@ class NetAddress:
     host: str
     # 1 to 65535; 0, any free one, for `udpin`.
     port: int
+    # As the user wrote it.
+    url: str = field(default="", compare=False)
 
     def __str__(self) -> str:
         """Return the address as messages show it."""
@@ -58,6 +60,8 @@ class SerialAddress:
 
     device: str
     baud: int
+    # As the user wrote it.
+    url: str = field(default="", compare=False)
 
     def __str__(self) -> str:
         """Return the device as messages show it."""
@@ -148,14 +152,14 @@ def _net_address(kind: NetKind, rest: str, url: str) -> NetAddress:
     listens = kind == "udpin"
     if not listens and (not host or not port):
         raise OptionError(f"MAVLink connection {url!r}: whom to send to is missing; {_FORMS}")
-    return NetAddress(kind, host or "0.0.0.0", port)
+    return NetAddress(kind, host or "0.0.0.0", port, url)
 
 
 def _serial_address(text: str, url: str) -> SerialAddress:
     match = re.fullmatch(r"([^,]+?)(?:[,:](\d+))?", text)
     if match is None:
         raise OptionError(f"MAVLink connection {url!r}: no serial device; {_FORMS}")
-    return SerialAddress(match[1], int(match[2] or DEFAULT_BAUD))
+    return SerialAddress(match[1], int(match[2] or DEFAULT_BAUD), url)
 
 
 _CHUNK = 4096

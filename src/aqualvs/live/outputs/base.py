@@ -15,23 +15,13 @@ class Output(Protocol):
     reported by `health` and raises no exception.
     """
 
-    @property
-    def name(self) -> str:
-        """Name in health reports and messages."""
-
-    @property
-    def inline(self) -> bool:
-        """Whether `send` never waits (a datagram), so that it may run between two frames.
-
-        Others get a thread of their own.
-        """
-
-    @property
-    def keeps_all(self) -> bool:
-        """Whether samples may wait in a queue for their turn (a recorder).
-
-        For others a newer sample replaces one that is still waiting.
-        """
+    name: str  # In health reports and messages.
+    # Whether `send` never waits (a datagram), so that it may run between two frames; others get a
+    # thread of their own.
+    inline: bool = False
+    # Whether samples may wait in a queue for their turn (a recorder); for others a newer sample
+    # replaces one that is still waiting.
+    keeps_all: bool = False
 
     def send(self, sample: LiveSample) -> None:
         """Send one sample.

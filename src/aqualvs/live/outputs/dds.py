@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from aqualvs.errors import OptionError
+from aqualvs.live.outputs.base import Output
 from aqualvs.live.outputs.ros_messages import (
     TYPE_NAMES,
     MessageMaker,
@@ -133,7 +134,7 @@ class _Link:
         )
 
 
-class DdsOutput:
+class DdsOutput(Output):
     """Publisher of ROS 2 topics, whether ROS 2 is installed or not.
 
     Parameters
@@ -151,8 +152,6 @@ class DdsOutput:
     """
 
     name = "ros2"
-    inline = False
-    keeps_all = False
 
     def __init__(
         self,

@@ -16,6 +16,7 @@ from aqualvs.errors import OptionError, OutputError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.planes import upright_axes
 from aqualvs.geometry.transforms import quaternion_from_rotation
+from aqualvs.live.outputs.base import Output
 from aqualvs.live.outputs.ros_messages import FLU_FROM_DOME
 from aqualvs.optics.rig import Laser, Rig
 from aqualvs.recording import messages
@@ -190,7 +191,7 @@ LAYOUT = Path(__file__).with_name("foxglove_layout.json")
 _TRANSFORMS, _SCENE = "/aqualvs/transforms", "/aqualvs/scene"
 
 
-class FoxgloveOutput:
+class FoxgloveOutput(Output):
     """Server of posture, points, picture, scene and health to any number of viewers.
 
     Parameters
@@ -214,8 +215,6 @@ class FoxgloveOutput:
     """
 
     name = "foxglove"
-    inline = False
-    keeps_all = False
 
     def __init__(
         self,

@@ -7,6 +7,8 @@ from aqualvs.control.time_filter import FilteredPosture
 from aqualvs.control.vehicle import VehicleState
 from aqualvs.live.mavlink.ardusub import FRESH_S, DepthChoice, attitude_of, turning_of
 from aqualvs.live.mavlink.link import LinkOptions, MavlinkLink
+from aqualvs.live.mavlink.ports import Address
+from aqualvs.live.outputs.base import Output
 from aqualvs.recording.sample import LiveSample
 from aqualvs.scanning.posture import Posture, Refusal, deviations
 from aqualvs.scanning.scan import GyroRates, ScanPoints
@@ -42,13 +44,13 @@ FILTERED_NAMES = ("aqf_valid", "aqf_range", "aqf_pitch", "aqf_yaw", "aqf_speed")
 range in mm/s. NaN where the filter has no value."""
 
 
-class MavlinkOutput:
+class MavlinkOutput(Output):
     """Output by `DISTANCE_SENSOR` and `NAMED_VALUE_FLOAT`; the link sends the heartbeat.
 
     Parameters
     ----------
-    link : str or MavlinkLink
-        Address as in `parse_address`, or a link that others use too; such a one is not closed here.
+    link : MavlinkLink, Address or str
+        A link that others use too, which is not closed here, or what `MavlinkLink` takes.
     options : LinkOptions, optional
         Where the link is made here.
 
@@ -59,11 +61,12 @@ class MavlinkOutput:
     """
 
     inline = True
-    keeps_all = False
 
-    def __init__(self, link: str | MavlinkLink, options: LinkOptions | None = None) -> None:
-        self._owns_link = isinstance(link, str)
-        self.link = MavlinkLink(link, options) if isinstance(link, str) else link
+    def __init__(
+        self, link: MavlinkLink | Address | str, options: LinkOptions | None = None
+    ) -> None:
+        self._owns_link = not isinstance(link, MavlinkLink)
+        self.link = link if isinstance(link, MavlinkLink) else MavlinkLink(link, options)
         self.name = f"mavlink {self.link.url}"
         self._n_dropped = 0
         self._depth = DepthChoice(self.link, FRESH_S)

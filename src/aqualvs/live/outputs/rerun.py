@@ -7,6 +7,7 @@ from pathlib import Path
 
 from aqualvs.errors import OptionError, OutputError
 from aqualvs.live.mavlink.ports import parse_host_port
+from aqualvs.live.outputs.base import Output
 from aqualvs.recording.rerun_log import RRD, RerunLog, rerun_sdk
 from aqualvs.recording.sample import LiveSample
 from aqualvs.sources.base import PartHealth, State
@@ -17,7 +18,7 @@ VIEWER = "viewer"
 _CHECK_EVERY_S, _REACH_S = 1.0, 0.3
 
 
-class RerunOutput:
+class RerunOutput(Output):
     """Output to Rerun; a viewer that is absent or leaves is looked for once a second.
 
     Parameters
@@ -34,7 +35,6 @@ class RerunOutput:
     """
 
     name = "rerun"
-    inline = False
 
     def __init__(self, where: str) -> None:
         rerun_sdk()

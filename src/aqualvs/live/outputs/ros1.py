@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 from aqualvs.errors import OptionError
+from aqualvs.live.outputs.base import Output
 from aqualvs.live.outputs.ros1_links import Ros1Links, Ros1Type
 from aqualvs.live.outputs.ros_messages import (
     TYPE_NAMES,
@@ -293,7 +294,7 @@ def _is_loopback(host: str) -> bool:
 _NODE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
 
 
-class Ros1Output:
+class Ros1Output(Output):
     """Publisher of ROS 1 topics, whether ROS is installed on this machine or not.
 
     Parameters
@@ -312,8 +313,6 @@ class Ros1Output:
     """
 
     name = "ros1"
-    inline = False
-    keeps_all = False
 
     def __init__(
         self,

@@ -11,7 +11,8 @@ from typing import TypeAlias
 from aqualvs.control.time_filter import FilteredPosture
 from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import FloatArray
-from aqualvs.live.mavlink.ports import PORTS, UdpPort, find_host, parse_host_port
+from aqualvs.live.mavlink.ports import PORTS, NetAddress, UdpPort, find_host, parse_host_port
+from aqualvs.live.outputs.base import Output
 from aqualvs.recording.sample import LiveSample
 from aqualvs.results.folder import POSTURE_COLUMNS, posture_cells
 from aqualvs.scanning.posture import Refusal, deviations
@@ -119,22 +120,18 @@ def _fixed(value: float, digits: int) -> Value:
     return round(float(value), digits) if math.isfinite(value) else None
 
 
-class UdpJsonOutput:
+class UdpJsonOutput(Output):
     """Output that sends every sample to every receiver.
 
-    `receivers`: `HOST:PORT`, or `[IPV6]:PORT`; a broadcast address reaches all that listen in the
-    network. Raises `OptionError` if there is none, or one that makes no sense.
+    `receivers`: at least one, from `receiver_address`; a broadcast address reaches all that listen
+    in the network.
     """
 
     inline = True
-    keeps_all = False
 
-    def __init__(self, receivers: str | Sequence[str]) -> None:
-        addresses = [receivers] if isinstance(receivers, str) else list(receivers)
-        if not addresses:
-            raise OptionError("JSON over UDP: no receiver; give at least one HOST:PORT")
-        self.name = f"json {','.join(addresses)}"
-        self._receivers = [_Receiver(address) for address in addresses]
+    def __init__(self, receivers: Sequence[NetAddress]) -> None:
+        self.name = f"json {','.join(map(str, receivers))}"
+        self._receivers = [_Receiver(address) for address in receivers]
         self._closed = False
 
     def send(self, sample: LiveSample) -> None:
@@ -164,22 +161,22 @@ class UdpJsonOutput:
             receiver.close()
 
 
-def receiver_address(text: str) -> tuple[str, int]:
-    """Return host and port of a receiver.
+def receiver_address(text: str) -> NetAddress:
+    """Return the address of a receiver, `HOST:PORT` or `[IPV6]:PORT`.
 
     Raises `OptionError` if one of them is missing or makes no sense.
     """
     found = parse_host_port(text)
     if found is None or not all(found):
         raise OptionError(f"JSON over UDP, receiver {text!r}: write HOST:PORT, {PORTS}")
-    return found
+    return NetAddress("udpout", *found, text)
 
 
 class _Receiver:
     """One address, found once and then sent to by a socket that never waits."""
 
-    def __init__(self, address: str) -> None:
-        self._address, (self._host, self._number) = address, receiver_address(address)
+    def __init__(self, address: NetAddress) -> None:
+        self._address = address
         self.n_dropped = 0
         self._trouble = ""
         self._opened_s = -math.inf
@@ -188,7 +185,7 @@ class _Receiver:
         self._where = self._lookup(socket.AI_NUMERICHOST)
         if self._where is None:
             # Looking a name up may take seconds.
-            threading.Thread(target=self._resolve, name=f"find {self._host}", daemon=True).start()
+            threading.Thread(target=self._resolve, name=f"find {address.host}", daemon=True).start()
 
     def fault(self) -> str:
         """Return the fault of this receiver, empty if there is none."""
@@ -246,7 +243,7 @@ class _Receiver:
     def _lookup(self, flags: int) -> tuple[int, tuple[object, ...]] | None:
         """Return family and address of the host, IPv4 first; None if it is not known."""
         try:
-            found = find_host(self._host, self._number, flags)
+            found = find_host(self._address.host, self._address.port, flags)
         except (OSError, UnicodeError) as fault:
             self._trouble = (fault.strerror if isinstance(fault, OSError) else "") or str(fault)
             return None
