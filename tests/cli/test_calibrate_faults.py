@@ -7,10 +7,8 @@ import numpy as np
 import pytest
 
 from aqualvs.calibration.targets.target_files import save_board
-from aqualvs.cli.main import main
 from aqualvs.optics.rigfile import save_rig
 from aqualvs.simulation.scenarios import example_rig
-from complaints import complaints
 from target_cases import board_cells, charuco, homography, picture
 
 SIZE = (440, 340)
@@ -40,90 +38,69 @@ def folder(tmp_path_factory):
     return path
 
 
-def fault(capsys, *arguments):
-    """Run a command that must fail, and return the one line that it says."""
-    assert main(["calibrate", *map(str, arguments)]) == 2
-    said = complaints(capsys.readouterr().err)
-    assert len(said) == 1
-    assert said[0].startswith("aqualvs: error: ")
-    return said[0]
+@pytest.fixture
+def faulty(folder, refused, tmp_path):
+    """Run a step of a calibration with a board, which must refuse; returns its words."""
+
+    def run(step, *more, rig=folder / "rig.yaml"):
+        board, out = folder / "board.yaml", tmp_path / "rig.yaml"
+        return refused("calibrate", step, folder, "--board", board, "--rig", rig, "-o", out, *more)
+
+    return run
 
 
-def test_pictures_that_are_not_there(folder, capsys, tmp_path):
-    said = fault(
-        capsys, "camera", tmp_path / "no*.png", "--board", folder / "board.yaml", "-o", "x.yaml"
-    )
+def test_pictures_that_are_not_there(folder, refused, tmp_path):
+    board = folder / "board.yaml"
+    said = refused("calibrate", "camera", tmp_path / "no*.png", "--board", board, "-o", "x.yaml")
     assert "no*.png: no file matches this pattern" in said
 
 
-def test_a_board_that_all_pictures_show_alike(folder, capsys, tmp_path):
+def test_a_board_that_all_pictures_show_alike(folder, refused, tmp_path):
     out = tmp_path / "rig.yaml"
-    said = fault(capsys, "camera", folder, "--board", folder / "board.yaml", "-o", out)
+    said = refused("calibrate", "camera", folder, "--board", folder / "board.yaml", "-o", out)
     assert "tilt" in said
     assert not out.exists()
 
 
-def test_pictures_without_the_board_are_counted_in_a_refusal(folder, capsys, tmp_path):
+def test_pictures_without_the_board_are_counted_in_a_refusal(folder, refused, tmp_path):
     for path in sorted(folder.glob("view_*.png")):
         (tmp_path / path.name).write_bytes(path.read_bytes())
     cv2.imwrite(str(tmp_path / "blank.png"), np.full(SIZE[::-1], 90, np.uint8))
     board = folder / "board.yaml"
-    said = fault(capsys, "camera", tmp_path, "--board", board, "-o", tmp_path / "rig.yaml")
+    said = refused("calibrate", "camera", tmp_path, "--board", board, "-o", tmp_path / "rig.yaml")
     assert "tilt" in said
     assert "; 1 of 5 pictures could not be used (blank.png: no " in said
 
 
-def test_a_board_of_another_dictionary(folder, capsys, tmp_path):
-    said = fault(
-        capsys, "camera", folder, "--board", folder / "other.yaml", "-o", tmp_path / "rig.yaml"
+def test_a_board_of_another_dictionary(folder, refused, tmp_path):
+    said = refused(
+        "calibrate", "camera", folder, "--board", folder / "other.yaml", "-o", tmp_path / "rig.yaml"
     )
     assert "found in none of 4 pictures" in said
     assert "DICT" in said
 
 
-def test_mixed_sizes_and_what_is_no_picture(folder, capsys, tmp_path):
+def test_mixed_sizes_and_what_is_no_picture(folder, refused, tmp_path):
     for path in sorted(folder.glob("view_*.png")):
         (tmp_path / path.name).write_bytes(path.read_bytes())
     cv2.imwrite(str(tmp_path / "view_3.png"), np.zeros((240, 440), np.uint8))
     board = folder / "board.yaml"
-    said = fault(capsys, "camera", tmp_path, "--board", board, "-o", tmp_path / "rig.yaml")
+    said = refused("calibrate", "camera", tmp_path, "--board", board, "-o", tmp_path / "rig.yaml")
     assert "view_3.png: 440x240 px, but the other pictures have 440x340 px" in said
     (tmp_path / "view_3.png").write_text("no picture")
-    said = fault(capsys, "camera", tmp_path, "--board", board, "-o", tmp_path / "rig.yaml")
+    said = refused("calibrate", "camera", tmp_path, "--board", board, "-o", tmp_path / "rig.yaml")
     assert "view_3.png: not a readable picture" in said
 
 
-def test_a_dome_that_nobody_measured(folder, capsys, tmp_path):
-    said = fault(
-        capsys,
-        "dome",
-        folder,
-        "--board",
-        folder / "board.yaml",
-        "--rig",
-        folder / "bare.yaml",
-        "-o",
-        tmp_path / "rig.yaml",
-    )
+def test_a_dome_that_nobody_measured(folder, faulty, tmp_path):
+    said = faulty("dome", rig=folder / "bare.yaml")
     assert "bare.yaml: has no dome; give --inner-radius-mm" in said
 
 
-def test_poses_without_a_row_for_a_picture(folder, capsys, tmp_path):
+def test_poses_without_a_row_for_a_picture(folder, faulty, tmp_path):
     poses = tmp_path / "poses.csv"
     poses.write_text("file,distance_mm\nview_0.png,300\n")
-    said = fault(
-        capsys,
-        "dome",
-        folder,
-        "--board",
-        folder / "board.yaml",
-        "--rig",
-        folder / "rig.yaml",
-        "--poses",
-        poses,
-        "-o",
-        tmp_path / "rig.yaml",
-    )
+    said = faulty("dome", "--poses", poses)
     assert "poses.csv: has no row for view_1.png" in said
 
 
@@ -136,49 +113,27 @@ def test_poses_without_a_row_for_a_picture(folder, capsys, tmp_path):
         ("file,distance_mm\n", "holds no rows"),
     ],
 )
-def test_poses_that_cannot_be(folder, capsys, tmp_path, poses, words):
+def test_poses_that_cannot_be(folder, faulty, tmp_path, poses, words):
     path = tmp_path / "poses.csv"
     path.write_text(poses)
-    said = fault(
-        capsys,
-        "dome",
-        folder,
-        "--board",
-        folder / "board.yaml",
-        "--rig",
-        folder / "rig.yaml",
-        "--poses",
-        path,
-        "-o",
-        tmp_path / "rig.yaml",
-    )
+    said = faulty("dome", "--poses", path)
     assert "poses.csv" in said
     assert words in said
 
 
-def test_lasers_need_one_target_of_two_planes(folder, capsys, tmp_path):
+def test_lasers_need_one_target_of_two_planes(folder, refused, tmp_path):
     rig, out = folder / "rig.yaml", tmp_path / "rig.yaml"
-    said = fault(capsys, "lasers", folder, "--rig", rig, "-o", out)
+    said = refused("calibrate", "lasers", folder, "--rig", rig, "-o", out)
     assert "--box or --board" in said
-    said = fault(capsys, "lasers", folder, "--box", folder / "box.yaml", "--rig", rig, "-o", out)
+    said = refused(
+        "calibrate", "lasers", folder, "--box", folder / "box.yaml", "--rig", rig, "-o", out
+    )
     assert "the box has 1 plane" in said
 
 
 @pytest.mark.parametrize("wavelength", ["5320", "0.532", "nan"])
-def test_a_wavelength_that_no_camera_sees(folder, capsys, tmp_path, wavelength):
-    said = fault(
-        capsys,
-        "lasers",
-        folder,
-        "--board",
-        folder / "board.yaml",
-        "--rig",
-        folder / "rig.yaml",
-        "--wavelength-nm",
-        wavelength,
-        "-o",
-        tmp_path / "rig.yaml",
-    )
+def test_a_wavelength_that_no_camera_sees(folder, faulty, tmp_path, wavelength):
+    said = faulty("lasers", "--wavelength-nm", wavelength)
     remedy = "give a finite number" if wavelength == "nan" else "write the wavelength in nanometres"
     assert wavelength in said
     assert "--wavelength-nm" in said
@@ -186,35 +141,13 @@ def test_a_wavelength_that_no_camera_sees(folder, capsys, tmp_path, wavelength):
     assert not (tmp_path / "rig.yaml").exists()
 
 
-def test_pictures_of_another_size_than_the_rig(folder, capsys, tmp_path):
+def test_pictures_of_another_size_than_the_rig(folder, faulty, tmp_path):
     rig = replace(example_rig(), lasers=())
     save_rig(rig, tmp_path / "large.yaml")
-    said = fault(
-        capsys,
-        "lasers",
-        folder,
-        "--board",
-        folder / "board.yaml",
-        "--rig",
-        tmp_path / "large.yaml",
-        "-o",
-        tmp_path / "rig.yaml",
-    )
+    said = faulty("lasers", rig=tmp_path / "large.yaml")
     assert "the rig's camera was calibrated at" in said
 
 
-def test_a_medium_that_is_none(folder, capsys, tmp_path):
-    said = fault(
-        capsys,
-        "dome",
-        folder,
-        "--board",
-        folder / "board.yaml",
-        "--rig",
-        folder / "rig.yaml",
-        "--medium",
-        "oil",
-        "-o",
-        tmp_path / "rig.yaml",
-    )
+def test_a_medium_that_is_none(folder, faulty, tmp_path):
+    said = faulty("dome", "--medium", "oil")
     assert "--medium oil: not understood" in said

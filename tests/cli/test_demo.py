@@ -27,9 +27,6 @@ def test_the_demo_measures_and_compares(short_dive, tmp_path, monkeypatch, capsy
     assert (out / "report.html").is_file()
 
 
-def test_a_missing_dive_is_said(tmp_path, monkeypatch, capsys):
+def test_a_missing_dive_is_said(tmp_path, monkeypatch, refused):
     monkeypatch.setattr("aqualvs.demo.bundled_dive", lambda: tmp_path)
-    assert main(["demo", "-o", str(tmp_path / "out")]) == 2
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
-    assert "dive.mp4: missing" in said
+    assert "dive.mp4: missing" in refused("demo", "-o", tmp_path / "out")

@@ -39,11 +39,11 @@ def test_options_of_recordings_record(command, requests):
 def test_an_address_serves(requests):
     addresses = ["--dashboard-address", "127.0.0.1:9000", "--foxglove-address", "127.0.0.1:9001"]
     assert main([*LIVE, *addresses]) == 0
-    assert requests[0].dashboard == "127.0.0.1:9000"
-    assert requests[0].outputs.foxglove == "127.0.0.1:9001"
+    assert (requests[0].page.host, requests[0].page.port) == ("127.0.0.1", 9000)
+    assert requests[0].outputs[0].args == ("127.0.0.1", 9001)
     assert main(LIVE) == 0
-    assert requests[1].dashboard is None
-    assert requests[1].outputs.foxglove is None
+    assert requests[1].page is None
+    assert requests[1].outputs == ()
 
 
 def test_a_token_of_the_environment_is_for_all_commands(requests, monkeypatch):
@@ -96,10 +96,9 @@ def test_a_token_of_the_environment_is_for_all_commands(requests, monkeypatch):
         ),
     ],
 )
-def test_options_that_would_do_nothing_are_refused(arguments, said, capsys, tmp_path, monkeypatch):
+def test_options_that_would_do_nothing_are_refused(arguments, said, refused, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert main(arguments) == 2
-    assert capsys.readouterr().err == f"aqualvs: error: {said}\n"
+    assert refused(*arguments) == said
     assert not list(tmp_path.iterdir())
 
 

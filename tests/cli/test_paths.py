@@ -2,8 +2,6 @@
 
 import pytest
 
-from aqualvs.cli.main import main
-
 EMPTY = "is empty; give a value, or set the variable of the shell that should hold it"
 
 
@@ -22,21 +20,18 @@ EMPTY = "is empty; give a value, or set the variable of the shell that should ho
         (["simulate", "wall", "-o", ""], "--out"),
     ],
 )
-def test_an_empty_path_is_not_the_folder_one_is_in(arguments, name, capsys, tmp_path, monkeypatch):
+def test_an_empty_path_is_not_the_folder_one_is_in(arguments, name, refused, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert main(arguments) == 2
-    assert capsys.readouterr().err == f"aqualvs: error: {name} '': {EMPTY}\n"
+    assert refused(*arguments) == f"{name} '': {EMPTY}"
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("command", ["run", "net"])
-def test_a_mistyped_path_is_missing_before_its_rig(command, capsys, tmp_path):
-    assert main([command, str(tmp_path / "NOPE")]) == 2
-    said = capsys.readouterr().err
-    assert said == f"aqualvs: error: {tmp_path / 'NOPE'}: no such file or folder; check the path\n"
+def test_a_mistyped_path_is_missing_before_its_rig(command, refused, tmp_path):
+    path = tmp_path / "NOPE"
+    assert refused(command, path) == f"{path}: no such file or folder; check the path"
 
 
-def test_several_recordings_are_for_a_batch(capsys):
-    assert main(["run", "a.mcap", "b.mcap", "c.mcap"]) == 2
-    said = capsys.readouterr().err
+def test_several_recordings_are_for_a_batch(refused):
+    said = refused("run", "a.mcap", "b.mcap", "c.mcap")
     assert "(b.mcap c.mcap): it measures one dive; use aqualvs batch for several; see" in said

@@ -3,45 +3,39 @@
 import pytest
 import yaml
 
-from aqualvs.cli.main import main
 from aqualvs.results.summary import read_truth
 from shell_cases import rig_file
 
 
 @pytest.mark.parametrize("encoding", ["utf-16", "latin-1"])
-def test_a_rig_in_another_encoding_is_to_be_saved_as_utf_8(encoding, tmp_path, capsys):
+def test_a_rig_in_another_encoding_is_to_be_saved_as_utf_8(encoding, tmp_path, refused):
     rig = rig_file(tmp_path)
     rig.write_bytes(f"# Größe\n{rig.read_text()}".encode(encoding))
-    assert main(["check", str(rig)]) == 2
-    said = capsys.readouterr().err
-    assert said == f"aqualvs: error: {rig}: is not text in UTF-8; save it as UTF-8\n"
+    assert refused("check", rig) == f"{rig}: is not text in UTF-8; save it as UTF-8"
 
 
-def test_a_decimal_comma_in_a_list_of_keys_is_named(tmp_path, capsys):
+def test_a_decimal_comma_in_a_list_of_keys_is_named(tmp_path, refused):
     rig = rig_file(tmp_path)
     content = yaml.safe_load(rig.read_text())
     del content["water"]
     rig.write_text(f"{yaml.safe_dump(content)}water: {{n: 1,3333}}\n")
-    assert main(["check", str(rig)]) == 2
-    said = capsys.readouterr().err
-    assert said == (
-        f"aqualvs: error: {rig}: water has the key 3333, which is no word; write numbers with a "
-        "decimal point, such as 1.5, not 1,5\n"
+    assert refused("check", rig) == (
+        f"{rig}: water has the key 3333, which is no word; write numbers with a decimal point, "
+        "such as 1.5, not 1,5"
     )
 
 
 SEMICOLONS = "is separated by semicolons; save it with commas"
 
 
-def test_semicolons_are_named(tmp_path, capsys):
+def test_semicolons_are_named(tmp_path, refused):
     rig = rig_file(tmp_path)
     table = tmp_path / "table.csv"
     table.write_text("frame;range_m;pitch_deg;yaw_deg\n0;0,5;1,0;-2,0\n")
-    assert main(["run", str(tmp_path), "--rig", str(rig), "--truth", str(table), "-o", "out"]) == 2
-    assert capsys.readouterr().err == f"aqualvs: error: {table}: {SEMICOLONS}\n"
+    said = refused("run", tmp_path, "--rig", rig, "--truth", table, "-o", "out")
+    assert said == f"{table}: {SEMICOLONS}"
     table.write_text("dive;rig;name\na.mp4;rig.yaml;a\n")
-    assert main(["batch", str(table), "-o", str(tmp_path / "out")]) == 2
-    assert capsys.readouterr().err == f"aqualvs: error: {table}: {SEMICOLONS}\n"
+    assert refused("batch", table, "-o", tmp_path / "out") == f"{table}: {SEMICOLONS}"
 
 
 def test_a_truth_with_a_byte_order_mark_is_read(tmp_path):
@@ -53,9 +47,8 @@ def test_a_truth_with_a_byte_order_mark_is_read(tmp_path):
 @pytest.mark.parametrize(
     ("option", "address"), [("--json", "127.0.0.1:99999"), ("--mavlink", "udpout:127.0.0.1:99999")]
 )
-def test_ports_that_do_not_exist_are_told(option, address, tmp_path, capsys):
+def test_ports_that_do_not_exist_are_told(option, address, tmp_path, refused):
     rig = rig_file(tmp_path)
-    assert main(["live", "udp://127.0.0.1:1", "--rig", str(rig), option, address]) == 2
-    said = capsys.readouterr().err
+    said = refused("live", "udp://127.0.0.1:1", "--rig", rig, option, address)
     assert address in said
     assert "with a port from 1 to 65535" in said
