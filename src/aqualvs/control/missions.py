@@ -375,11 +375,6 @@ class SurveyMission:
         The lawn.
     loss : LossOptions, optional
         What to do without the target.
-
-    Attributes
-    ----------
-    i_leg : int
-        The leg gone now, or whose depth is sought; counts from 0.
     """
 
     def __init__(

@@ -27,13 +27,7 @@ MAX_CHUNK_BYTES = 4 << 20
 
 
 class SampleChunks:
-    """Chunk under construction: gathers the messages of samples until it is due.
-
-    Attributes
-    ----------
-    n_samples : int
-        In the present chunk.
-    """
+    """Chunk under construction: gathers the messages of samples until it is due."""
 
     def __init__(self, options: RecorderOptions) -> None:
         self._encoder, self._clock = SampleEncoder(options), RecordClock()
@@ -45,7 +39,7 @@ class SampleChunks:
         self._builder = ChunkBuilder()
         self._from_ns = 0
         self._holds_rig = False
-        self.n_samples = 0
+        self.n_samples = 0  # In the present chunk.
 
     def add(self, sample: LiveSample) -> bool:
         """Add a sample; returns whether the chunk is due."""

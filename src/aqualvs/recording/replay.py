@@ -47,19 +47,7 @@ class RecordedFrame:
 class DiveRecording:
     """A recording of a dive.
 
-    Attributes
-    ----------
-    rig : Rig or None
-        That the dive was measured with at its beginning; None where it is lost or not understood.
-    options : ScannerOptions or None
-        As the dive was measured; likewise.
-    n_frames : int or None
-        None where a torn file does not say.
-
-    Raises
-    ------
-    SourceError
-        If it cannot be read, or holds no stripes.
+    Raises `SourceError` if it cannot be read, or holds no stripes.
     """
 
     def __init__(self, path: Path) -> None:

@@ -218,35 +218,26 @@ class FrameSource(Protocol):
     `Frame.index` rises strictly. A gap in it says that the frames in between existed but could
     not be decoded. A source that ends before its promise, or whose last frames are lost, delivers
     what it has and then raises `SourceError`.
-
-    Attributes
-    ----------
-    name : str
-        How messages call it: a path or an address.
-    size_px : (int, int)
-        Width and height, the same for every frame.
-    fps : float or None
-        Nominal frame rate; None where there is none.
-    n_frames : int or None
-        Frames that the container promises, perhaps estimated from its duration; None for a live
-        stream.
     """
 
     @property
     def name(self) -> str:
-        """Name of the source in messages."""
+        """Name of the source in messages: a path or an address."""
 
     @property
     def size_px(self) -> tuple[int, int]:
-        """Width and height."""
+        """Width and height, the same for every frame."""
 
     @property
     def fps(self) -> float | None:
-        """Nominal frame rate, if there is one."""
+        """Nominal frame rate; None where there is none."""
 
     @property
     def n_frames(self) -> int | None:
-        """Promised frames, if known."""
+        """Frames that the container promises, perhaps estimated from its duration.
+
+        None for a live stream.
+        """
 
     def __iter__(self) -> Iterator[Frame]: ...
 

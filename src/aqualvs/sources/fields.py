@@ -122,15 +122,6 @@ class FieldSource(Closing):
         Closed with this one.
     shutter : Shutter
         Interlaced.
-
-    Attributes
-    ----------
-    size_px : (int, int)
-        Of the pictures.
-    fps : float or None
-        Fields a second.
-    n_frames : int or None
-        Fields.
     """
 
     def __init__(self, pictures: FrameSource, shutter: Shutter) -> None:

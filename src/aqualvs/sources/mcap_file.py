@@ -219,15 +219,7 @@ class McapFile:
     is read from its beginning as far as it goes, and further contents of the summary are added:
     damage in one place loses the chunk that it is in.
 
-    Attributes
-    ----------
-    n_torn : int
-        Chunks left out so far because they are damaged.
-
-    Raises
-    ------
-    SourceError
-        If the file is missing or no MCAP file.
+    Raises `SourceError` if the file is missing or no MCAP file.
     """
 
     def __init__(self, path: Path) -> None:

@@ -36,15 +36,10 @@ class PacedFeed:
     realtime : bool
         Whether each frame waits for its time. A consumer that is late is not made later: frames
         that are due come at once.
-
-    Attributes
-    ----------
-    name : str
-        Of the source.
     """
 
     def __init__(self, source: FrameSource, *, realtime: bool) -> None:
-        self.name = source.name  # Of the source.
+        self.name = source.name
         self._source = source
         self._realtime = realtime
         self._closed = threading.Event()

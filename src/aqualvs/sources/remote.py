@@ -31,17 +31,7 @@ class Connection:
     FFmpeg waits without end where a network is silent, and can't be woken. So the thread is not
     joined: it ends by itself when FFmpeg's time runs out, and closes what it opened.
 
-    Parameters
-    ----------
-    opener : callable
-        Returns an open container, or raises what PyAV raises; its timeouts must be set.
-
-    Attributes
-    ----------
-    reason : str
-        Why the connection ended, in a few words; empty for a plain end.
-    fault : Exception or None
-        What PyAV raised when opening.
+    `opener`: returns an open container, or raises what PyAV raises; its timeouts must be set.
     """
 
     def __init__(self, opener: Opener) -> None:

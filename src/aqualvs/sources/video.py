@@ -32,23 +32,12 @@ from aqualvs.sources.spans import frame_rate, has_decoding_times, promised_durat
 class FrameCounter:
     """Numbers of pictures by the packets that announced them; lost ones leave a gap.
 
-    Parameters
-    ----------
-    counts_packets : bool
-        Whether each packet shows a picture.
-
-    Attributes
-    ----------
-    first_pts : int or None
-        Time of the first picture, in ticks of its stream.
-    n_packets : int
-        Packets noted.
-    n_second_fields : int
-        Of these, packets that complete the picture of the one before, see `FieldPairs`.
+    `counts_packets`: whether each packet shows a picture.
     """
 
     def __init__(self, *, counts_packets: bool) -> None:
-        self.first_pts: int | None = None
+        self.first_pts: int | None = None  # Of the first picture, in ticks of its stream.
+        # Packets noted; of these, those that complete the picture of the one before (`FieldPairs`).
         self.n_packets = self.n_second_fields = 0
         self._counts_packets = counts_packets
         self._fields: FieldPairs | None = None
@@ -157,11 +146,6 @@ class VideoSource(Closing):
     where : str or Path
         Path or address.
 
-    Attributes
-    ----------
-    n_tracks : int
-        Of video in the file, cover pictures left out; the first one is read.
-
     Raises
     ------
     SourceError
@@ -179,6 +163,7 @@ class VideoSource(Closing):
         self.name = str(where)
         self._container = _open(self.name)
         self._stream = self._video_stream()
+        # Of video in the file, cover pictures left out; the first one is read.
         self.n_tracks = sum(
             not one.disposition & Disposition.attached_pic for one in self._container.streams.video
         )

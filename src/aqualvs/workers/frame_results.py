@@ -219,15 +219,7 @@ class FrameResult:
 class FrameProcessor:
     """Measurement of frames, with the dome and without.
 
-    Parameters
-    ----------
-    scanner : FrameScanner
-        For the same rig.
-
-    Attributes
-    ----------
-    block_length : int
-        How many frames it is best given at a time.
+    `scanner`: for the same rig.
     """
 
     def __init__(self, rig: Rig, scanner: FrameScanner) -> None:

@@ -163,19 +163,8 @@ class SharedMemory:
 
     It lies in no folder: none has to have room for it, and nothing is left behind.
 
-    Parameters
-    ----------
-    file : int
-        Descriptor of a file in memory; stays open until `seal`.
-
-    Attributes
-    ----------
-    slots : uint8 array, shape (n_slots, n_bytes)
-
-    Raises
-    ------
-    OSError
-        If the memory is not available.
+    `file`: descriptor of a file in memory; stays open until `seal`. Raises `OSError` if the memory
+    is not available.
     """
 
     def __init__(self, file: int) -> None:
@@ -402,17 +391,7 @@ class _Worker:
 class WorkerPool(Closing):
     """Pool of processes that measure the parts of a dive; a context manager that ends them.
 
-    Parameters
-    ----------
-    n_processes : int
-        There are no more than parts.
-
-    Attributes
-    ----------
-    next_frame : int
-        The first frame of which nothing has come yet.
-    is_done : bool
-        Whether all has come.
+    `n_processes`: there are no more than parts.
     """
 
     def __init__(self, work: PoolJob, n_processes: int) -> None:
@@ -435,7 +414,7 @@ class WorkerPool(Closing):
                 for block in self._of_part(number):
                     yield block
                     self.next_frame += len(block)
-        except (_UnlikeProbeError, EOFError, OSError):
+        except (UnlikeProbeError, EOFError, OSError):
             return
         self.is_done = self.next_frame == self._work.parts[-1].stop
 
@@ -446,7 +425,7 @@ class WorkerPool(Closing):
                 self._take_in(number)
             message = found.popleft()
             if message is Ended.UNLIKE_PROBE:
-                raise _UnlikeProbeError
+                raise UnlikeProbeError
             if message is Ended.WHOLE:
                 break
             yield message
@@ -511,7 +490,3 @@ class WorkerPool(Closing):
                 worker.process.kill()
                 worker.process.join()
             worker.process.close()
-
-
-class _UnlikeProbeError(Exception):
-    pass

@@ -332,11 +332,6 @@ class WaterFollowingScanner:
     water : Water
         Temperature and salinity, if given, are a prior.
 
-    Attributes
-    ----------
-    scanner : Scanner
-        For the water as it is known.
-
     Raises
     ------
     CalibrationError
