@@ -19,14 +19,14 @@ from aqualvs.scanning.posture import Reason as NoPosture
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """Range and yaw with their rates, as a time filter gives them."""
+    """Range and yaw with their rates, which are None where no time filter knows them."""
 
     # Metres and radians, as in `Posture`.
     range: float
     yaw: float
     # Per second.
-    range_rate: float
-    yaw_rate: float
+    range_rate: float | None
+    yaw_rate: float | None
 
 
 def motion_of(filtered: FilteredPosture | None) -> Motion | None:
@@ -234,23 +234,12 @@ def _mission_says(guidance: Guidance) -> LimitReason | None:
     return LimitReason.MISSION_OVER if guidance.stage is Stage.OVER else None
 
 
-@dataclass(frozen=True, slots=True)
-class _Seen:
-    """Input of the controller; rates are None where no filter knows them."""
-
-    range: float
-    yaw: float
-    range_rate: float | None
-    yaw_rate: float | None
-
-
-def _motion(posture: Posture | None, filtered: Motion | None) -> _Seen | None:
+def _motion(posture: Posture | None, filtered: Motion | None) -> Motion | None:
     """Return the filter's view, else the raw one; None where either is not finite."""
-    if filtered is not None:
-        seen = _Seen(filtered.range, filtered.yaw, filtered.range_rate, filtered.yaw_rate)
-    elif posture is not None:
-        seen = _Seen(posture.range, posture.yaw, None, None)
-    else:
+    seen = filtered
+    if seen is None and posture is not None:
+        seen = Motion(posture.range, posture.yaw, None, None)
+    if seen is None:
         return None
     known = (seen.range, seen.yaw, seen.range_rate or 0.0, seen.yaw_rate or 0.0)
     return seen if all(map(math.isfinite, known)) else None

@@ -49,9 +49,7 @@ class Guidance:
 class Mission(Protocol):
     """Plan that is updated by the states of vehicle and target."""
 
-    @property
-    def sways(self) -> bool:
-        """Whether it needs a vehicle that can move sideways."""
+    sways: bool  # Whether it needs a vehicle that can move sideways.
 
     def update(self, now_s: float, posture: Posture | None, state: VehicleState) -> Guidance:
         """Return the present guidance.
@@ -145,6 +143,8 @@ class HoldMission:
         What to do without the target.
     """
 
+    sways = False
+
     def __init__(
         self,
         setpoint: Setpoint | None,
@@ -158,11 +158,6 @@ class HoldMission:
         self._duration = duration
         self._watch = LossWatch(loss)
         self._spent_s = 0.0
-
-    @property
-    def sways(self) -> bool:
-        """Whether it needs a vehicle that can move sideways: never."""
-        return False
 
     def restart(self) -> None:
         """Go on after a stop."""
@@ -281,6 +276,8 @@ class FollowMission:
         If the speed is 0.
     """
 
+    sways = True
+
     def __init__(
         self,
         setpoint: Setpoint,
@@ -294,11 +291,6 @@ class FollowMission:
         self.setpoint, self._sway = setpoint, sway
         self._leg = Leg(leg or LegOptions())
         self._watch = LossWatch(loss)
-
-    @property
-    def sways(self) -> bool:
-        """Whether it needs a vehicle that can move sideways: always."""
-        return True
 
     def restart(self) -> None:
         """Go on after a stop."""
@@ -377,6 +369,8 @@ class SurveyMission:
         What to do without the target.
     """
 
+    sways = True
+
     def __init__(
         self, setpoint: Setpoint, options: SurveyOptions, *, loss: LossOptions | None = None
     ) -> None:
@@ -386,11 +380,6 @@ class SurveyMission:
         self.i_leg = 0  # The leg gone now, or whose depth is sought; counts from 0.
         self._leg: Leg | None = None
         self._begin_change()
-
-    @property
-    def sways(self) -> bool:
-        """Whether it needs a vehicle that can move sideways: always."""
-        return True
 
     @property
     def depth(self) -> float:

@@ -9,7 +9,7 @@ import math
 from collections import deque
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 from aqualvs.control.vehicle import NEUTRAL, Effort, Mode, VehicleState
 from aqualvs.errors import OptionError, check_positive
@@ -19,31 +19,37 @@ from aqualvs.scanning.posture import Posture
 class LimitReason(StrEnum):
     """Reason why an effort was changed or stopped; the value is what logs write in `reason`."""
 
-    NOT_ENGAGED = "not_engaged"
-    NO_HEARTBEAT = "no_heartbeat"
-    DISARMED = "disarmed"
-    PILOT_MODE = "pilot_mode"
-    NO_STATION = "no_station"
-    IGNORED = "ignored"
-    CONFLICT = "conflict"
-    UNKNOWN_MODE = "unknown_mode"
-    PILOT_STICKS = "pilot_sticks"
-    CLOCK = "clock"
-    FROZEN = "frozen"
-    NO_ANSWER = "no_answer"
-    NO_POSTURE = "no_posture"
-    NOT_FINITE = "not_finite"
-    TOO_CLOSE = "too_close"
-    TOO_FAST = "too_fast"
-    NO_SETPOINT = "no_setpoint"
-    MISSION_OVER = "mission_over"
-    TIPPING = "tipping"
-    GAVE_UP = "gave_up"
+    words: str  # Text for the pilot.
 
-    @property
-    def words(self) -> str:
-        """Text for the pilot."""
-        return _WORDS[self]
+    def __new__(cls, value: str, words: str = "") -> Self:
+        """Return a member that has its words."""
+        one = str.__new__(cls, value)
+        one._value_, one.words = value, words
+        return one
+
+    NOT_ENGAGED = "not_engaged", "not engaged: the pilot steers until told otherwise"
+    NO_HEARTBEAT = "no_heartbeat", "the vehicle is silent; stopped until engaged again"
+    DISARMED = "disarmed", "the vehicle is disarmed; arm it and engage again"
+    PILOT_MODE = "pilot_mode", "the pilot chose another mode; stopped until engaged again"
+    NO_STATION = "no_station", "no ground station heard; stopped until engaged again"
+    IGNORED = "ignored", "the vehicle ignores our sticks; stopped until engaged again"
+    CONFLICT = "conflict", "two speak as the vehicle; stopped until engaged again"
+    UNKNOWN_MODE = "unknown_mode", "not a vehicle that can be steered; stopped until engaged again"
+    PILOT_STICKS = "pilot_sticks", "the pilot took the sticks; stopped until engaged again"
+    CLOCK = "clock", "time ran backwards; stopped for this update"
+    FROZEN = "frozen", "the picture stands still; neutral until it moves"
+    NO_ANSWER = (
+        "no_answer",
+        "the posture does not answer to the efforts; stopped until engaged again",
+    )
+    NO_POSTURE = "no_posture", "no valid posture; neutral until it is back"
+    NOT_FINITE = "not_finite", "a number is not finite; neutral for this update"
+    TOO_CLOSE = "too_close", "closer than the least range; backing away"
+    TOO_FAST = "too_fast", "closing in too fast; braking"
+    NO_SETPOINT = "no_setpoint", "no range is set to hold"
+    MISSION_OVER = "mission_over", "the plan is done; holding until the pilot takes over"
+    TIPPING = "tipping", "the vehicle tips over; take the sticks while the target is in sight"
+    GAVE_UP = "gave_up", "the target was lost for too long; stopped until engaged again"
 
     @property
     def takes_over(self) -> bool:
@@ -56,30 +62,6 @@ class LimitReason(StrEnum):
         return self in _STEERS
 
 
-_WORDS = {
-    LimitReason.NOT_ENGAGED: "not engaged: the pilot steers until told otherwise",
-    LimitReason.NO_HEARTBEAT: "the vehicle is silent; stopped until engaged again",
-    LimitReason.DISARMED: "the vehicle is disarmed; arm it and engage again",
-    LimitReason.PILOT_MODE: "the pilot chose another mode; stopped until engaged again",
-    LimitReason.NO_STATION: "no ground station heard; stopped until engaged again",
-    LimitReason.IGNORED: "the vehicle ignores our sticks; stopped until engaged again",
-    LimitReason.CONFLICT: "two speak as the vehicle; stopped until engaged again",
-    LimitReason.UNKNOWN_MODE: "not a vehicle that can be steered; stopped until engaged again",
-    LimitReason.PILOT_STICKS: "the pilot took the sticks; stopped until engaged again",
-    LimitReason.CLOCK: "time ran backwards; stopped for this update",
-    LimitReason.FROZEN: "the picture stands still; neutral until it moves",
-    LimitReason.NO_ANSWER: (
-        "the posture does not answer to the efforts; stopped until engaged again"
-    ),
-    LimitReason.NO_POSTURE: "no valid posture; neutral until it is back",
-    LimitReason.NOT_FINITE: "a number is not finite; neutral for this update",
-    LimitReason.TOO_CLOSE: "closer than the least range; backing away",
-    LimitReason.TOO_FAST: "closing in too fast; braking",
-    LimitReason.NO_SETPOINT: "no range is set to hold",
-    LimitReason.MISSION_OVER: "the plan is done; holding until the pilot takes over",
-    LimitReason.TIPPING: "the vehicle tips over; take the sticks while the target is in sight",
-    LimitReason.GAVE_UP: "the target was lost for too long; stopped until engaged again",
-}
 _TAKES_OVER = frozenset(
     {
         LimitReason.NOT_ENGAGED,

@@ -122,7 +122,7 @@ class StickShaping:
     def _axis(self, share: float, channel: StickChannel, dead_us: float) -> int:
         """Return the position of x, y or r."""
         unit_us = _LEVEL_US * self.gain
-        share = _limited(-share if channel.reverse else share)
+        share = limited(-share if channel.reverse else share)
         if share == 0.0:
             pulse_us = channel.trim
         elif share > 0.0:
@@ -136,7 +136,7 @@ class StickShaping:
     def _upright(self, up: float) -> int:
         """Return the position of z."""
         unit_us = _UPRIGHT_US * self.gain * self.throttle_gain
-        up, channel = _limited(up), self.throttle
+        up, channel = limited(up), self.throttle
         if up == 0.0:
             return MIDDLE
         middle, dead = self._middle(), self.throttle_dead_zone * self.gain
@@ -228,7 +228,8 @@ def _units(pulse_us: float, unit_us: float) -> int:
     return round((whole + 0.5 - _CENTRE_US) / unit_us)
 
 
-def _limited(share: float) -> float:
+def limited(share: float) -> float:
+    """Return a share of the full deflection, -1 to 1 at most."""
     return min(max(share, -1.0), 1.0)
 
 

@@ -12,7 +12,7 @@ from collections import deque
 from enum import StrEnum
 from typing import Any, Protocol
 
-from aqualvs.control.sticks import FULL, MIDDLE, Sticks, StickShaping
+from aqualvs.control.sticks import FULL, MIDDLE, Sticks, StickShaping, limited
 from aqualvs.control.vehicle import Effort
 from aqualvs.live.mavlink.link import MavlinkLink
 
@@ -229,10 +229,10 @@ class GuidedCommander:
         """Return the message."""
         told = self._message
         told.time_boot_ms = (time.monotonic_ns() // 1_000_000) & 0xFFFF_FFFF
-        told.vx = self._speed * _limited(effort.forward)
-        told.vy = self._speed * _limited(effort.right)
-        told.vz = self._speed * _limited(effort.down)
-        told.yaw_rate = self._turning_rate * _limited(effort.yaw)
+        told.vx = self._speed * limited(effort.forward)
+        told.vy = self._speed * limited(effort.right)
+        told.vz = self._speed * limited(effort.down)
+        told.yaw_rate = self._turning_rate * limited(effort.yaw)
         packable: Packable = told
         return packable
 
@@ -248,7 +248,3 @@ class _OnBehalf:
         frame: bytes = self._message.pack(self._packer)
         self._packer.seq = (self._packer.seq + 1) % max_seq
         return frame
-
-
-def _limited(share: float) -> float:
-    return min(max(share, -1.0), 1.0)
