@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from aqualvs.control.autopilot import Decision
 from aqualvs.control.missions import Guidance, Stage
 from aqualvs.control.safety import LimitReason
 from aqualvs.control.vehicle import Effort, Setpoint, VehicleState
@@ -36,10 +37,12 @@ class Reports:
         self.latest = PilotReport(
             at_ns=40_000_000 * frame,
             frame=frame,
-            engaged=True,
-            effort=Effort(forward=forward),
-            reason=LimitReason.TOO_FAST if frame == 2 else None,
-            guidance=Guidance(setpoint=Setpoint(0.6), stage=Stage.HOLDING),
+            decision=Decision(
+                Effort(forward=forward),
+                LimitReason.TOO_FAST if frame == 2 else None,
+                Guidance(setpoint=Setpoint(0.6), stage=Stage.HOLDING),
+                engaged=True,
+            ),
             state=VehicleState(armed=True, depth=4.0),
         )
 

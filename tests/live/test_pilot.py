@@ -99,8 +99,8 @@ def test_silent_until_engaged_then_one_effort_a_sample(pilot: Pilot, vehicle: Ve
     assert vehicle.sent == [Effort(forward=pytest.approx(0.36), yaw=pytest.approx(0.2))]
     latest = pilot.latest
     assert latest is not None
-    assert (latest.frame, latest.engaged, latest.reason) == (1, True, None)
-    assert latest.effort == vehicle.sent[0]
+    assert (latest.frame, latest.decision.engaged, latest.decision.reason) == (1, True, None)
+    assert latest.decision.effort == vehicle.sent[0]
     assert latest.state.mode_name == "ALT_HOLD"
     assert pilot.health().detail == "holding: 0.60 m, yaw 0 deg"
 
@@ -115,7 +115,7 @@ def test_follows_the_setpoint_as_it_is_changed(pilot: Pilot, vehicle: Vehicle) -
     pilot.send(sample(2, posture(0.7)))
     assert vehicle.sent[-1] == NEUTRAL
     assert pilot.latest is not None
-    assert pilot.latest.reason is LimitReason.NO_SETPOINT
+    assert pilot.latest.decision.reason is LimitReason.NO_SETPOINT
 
 
 def test_not_engaged_without_a_setpoint(vehicle: Vehicle) -> None:
@@ -156,7 +156,7 @@ def test_old_postures_are_none(pilot: Pilot, vehicle: Vehicle) -> None:
     pilot.send(sample(0, posture(0.9), arrived_s=vehicle.clock.now_s - 0.3))
     assert vehicle.sent == [NEUTRAL]
     assert pilot.latest is not None
-    assert pilot.latest.reason is LimitReason.NO_POSTURE
+    assert pilot.latest.decision.reason is LimitReason.NO_POSTURE
 
 
 def test_filter_is_handed_on(vehicle: Vehicle) -> None:
@@ -186,7 +186,7 @@ def test_what_cannot_be_sent_is_told(pilot: Pilot, vehicle: Vehicle) -> None:
     health = worker.health()
     assert (health.state, health.detail, health.n_dropped) == (State.FAULT, "no connection", 1)
     assert pilot.latest is not None
-    assert pilot.latest.effort == NEUTRAL
+    assert pilot.latest.decision.effort == NEUTRAL
     vehicle.fault = None
     worker.offer(sample(1, posture(0.9)))
     assert worker.health().state is State.OK
@@ -206,7 +206,7 @@ def test_fault_stops_until_engaged_again(
     assert "division" in pilot.health().detail
     assert sum("stopped by a fault" in told for told in caplog.messages) == 1
     assert pilot.latest is not None
-    assert not pilot.latest.engaged
+    assert not pilot.latest.decision.engaged
     vehicle.state = good
     pilot.send(sample(8, posture(0.9)))
     assert not pilot.engaged

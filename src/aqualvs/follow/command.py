@@ -86,15 +86,7 @@ class LoopPage:
         frame, scan = self._seen(frame_s, posture)
         self._valid.append(bool(posture))
         now_ns = time.monotonic_ns()
-        report = PilotReport(
-            at_ns=now_ns,
-            frame=scan.index,
-            engaged=decision.engaged,
-            effort=decision.effort,
-            reason=decision.reason,
-            guidance=decision.guidance,
-            state=state,
-        )
+        report = PilotReport(at_ns=now_ns, frame=scan.index, decision=decision, state=state)
         sample = LiveSample(
             rig=self._rig,
             scan=scan,
@@ -126,7 +118,7 @@ class LoopPage:
         sensor = (
             "rendered pictures" if isinstance(self._loop.eye, RenderedSensor) else "no pictures"
         )
-        vehicle = f"{report.state.mode_name}, effort forward {report.effort.forward:+.2f}"
+        vehicle = f"{report.state.mode_name}, effort forward {report.decision.effort.forward:+.2f}"
         return Health(
             rate_hz=self._loop.timing.fps,
             valid_share=sum(self._valid) / len(self._valid),

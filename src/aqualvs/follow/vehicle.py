@@ -12,7 +12,7 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import TextIO, TypeAlias
 
-from aqualvs.control.autopilot import Decision, NetPilot
+from aqualvs.control.autopilot import NetPilot
 from aqualvs.control.controller import RangeYawController
 from aqualvs.control.follow_log import FollowLog
 from aqualvs.control.safety import SafetyGate
@@ -80,9 +80,9 @@ class FollowLogOutput(Output):
     def _write(self) -> None:
         while (step := self._waiting.get()) is not None:
             report, frame_s, posture = step
-            decision = Decision(report.effort, report.reason, report.guidance, report.engaged)
+            at_s = 1e-9 * report.at_ns
             try:
-                self._log.write(1e-9 * report.at_ns, frame_s, posture, decision, report.state)
+                self._log.write(at_s, frame_s, posture, report.decision, report.state)
                 self._trouble = ""
             except (OutputError, ValueError) as fault:
                 self._trouble = str(fault)

@@ -106,24 +106,22 @@ class PilotReport:
 
     at_ns: int  # By `time.monotonic_ns`.
     frame: int  # Number of the frame that it rests on; the last one's where the stream is silent.
-    engaged: bool  # Whether efforts go out.
-    effort: Effort  # What was sent; neutral where nothing was.
-    reason: LimitReason | None  # Why it is not what the controller asked for.
-    guidance: Guidance  # What the mission wants.
+    decision: Decision  # With the effort that was sent; neutral where nothing was.
     state: VehicleState  # As the vehicle reported it.
 
     @property
     def words(self) -> str:
         """Action of the pilot, or the reason for none, in one line."""
-        told = words_of(self.reason, self.state) if self.reason else _aim(self.guidance)
-        return f"{told}; {self.state.doubt}" if self.engaged and self.state.doubt else told
+        reason, doubt = self.decision.reason, self.state.doubt
+        told = words_of(reason, self.state) if reason else _aim(self.decision.guidance)
+        return f"{told}; {doubt}" if self.decision.engaged and doubt else told
 
     @property
     def colour(self) -> State:
         """State for the health list."""
-        if not self.engaged:
+        if not self.decision.engaged:
             return State.OFF
-        return State.WARN if self.reason or self.state.doubt else State.OK
+        return State.WARN if self.decision.reason or self.state.doubt else State.OK
 
 
 def words_of(reason: LimitReason, state: VehicleState) -> str:
@@ -233,16 +231,9 @@ class Pilot(Output):
             except Exception as fault:
                 self._give_up(fault)
                 return
-            sent = self._obey(decision)
-            self._latest = PilotReport(
-                at_ns=round(1e9 * now_s),
-                frame=sample.scan.index,
-                engaged=decision.engaged,
-                effort=sent,
-                reason=decision.reason,
-                guidance=decision.guidance,
-                state=state,
-            )
+            sent = replace(decision, effort=self._obey(decision))
+            at_ns, frame = round(1e9 * now_s), sample.scan.index
+            self._latest = PilotReport(at_ns=at_ns, frame=frame, decision=sent, state=state)
         self._tell(self._latest)
 
     def health(self) -> PartHealth:
@@ -251,7 +242,7 @@ class Pilot(Output):
         if trouble:
             return PartHealth(self.name, State.FAULT, trouble, self._n_unsent)
         latest = self._latest
-        if latest is None or latest.engaged is not self.engaged:
+        if latest is None or latest.decision.engaged is not self.engaged:
             words = "engaged" if self.engaged else LimitReason.NOT_ENGAGED.words
             return PartHealth(
                 self.name, State.OK if self.engaged else State.OFF, words, self._n_unsent
@@ -328,9 +319,9 @@ class Pilot(Output):
         self._steering.disengage()
         self._told = (False, LimitReason.NOT_ENGAGED, "")
         if self._latest is not None:
-            self._latest = replace(
-                self._latest, engaged=False, effort=NEUTRAL, reason=LimitReason.NOT_ENGAGED
-            )
+            guidance = self._latest.decision.guidance
+            stopped = Decision(NEUTRAL, LimitReason.NOT_ENGAGED, guidance, engaged=False)
+            self._latest = replace(self._latest, decision=stopped)
         if self._goodbyes < 0:
             self._goodbyes = _GOODBYES
         if self._goodbyes > 0:
@@ -339,7 +330,7 @@ class Pilot(Output):
 
     def _tell(self, report: PilotReport) -> None:
         """Log changes."""
-        told = (report.engaged, report.reason, report.state.doubt)
+        told = (report.decision.engaged, report.decision.reason, report.state.doubt)
         if told == self._told:
             return
         self._told = told
