@@ -87,8 +87,8 @@ def look(work: DiveWork) -> tuple[DiveProbe, dict[str, Any] | None]:
     return probe, None
 
 
-def measure(_work: DiveWork, _probe: DiveProbe, number: int) -> PieceResult:
-    return PieceResult(number=number, n_frames=1, n_valid=1, duration_s=0.0, fault="")
+def measure(_work: DiveWork, _probe: DiveProbe) -> PieceResult:
+    return PieceResult(n_frames=1, n_valid=1, duration_s=0.0, fault="")
 
 
 def join(_work: DiveWork, _probe: DiveProbe, results: Sequence[PieceResult]) -> dict[str, Any]:
@@ -134,7 +134,7 @@ def costs_of(folder: Path, n_frames: int) -> tuple[float, float, float]:
     work = work_in(folder, dive, Path(str(bundled_dive() / "rig.yaml")), name)
     seen, (probe, _) = timed(lambda: real.look(work))
     pieces = range(len(probe.spans))
-    measured, results = timed(lambda: [real.measure(work, probe.only(i), 0) for i in pieces])
+    measured, results = timed(lambda: [real.measure(work, probe.only(i)) for i in pieces])
     joined, _ = timed(lambda: real.join(work, probe, results))
     return seen, measured, joined
 

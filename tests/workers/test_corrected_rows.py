@@ -112,7 +112,7 @@ def test_runs_and_batches_of_a_rolling_shutter_are_the_same(tmp_path, monkeypatc
         (0, 6, 6),
         (6, 6, 0),
     ]
-    results = [measure_piece(work, found, number) for number in range(3)]
+    results = [measure_piece(work, found.only(number)) for number in range(3)]
     assert [one.n_frames for one in results] == [6, 6, 6]
     join_dive(work, found, results)
     assert [without_times(work.request.out / file) for file in RESULTS[:-1]] == alone

@@ -16,7 +16,7 @@ from aqualvs.batch.dives import Dive, DiveRecord, DiveState, find_dives, name_di
 from aqualvs.batch.parts import JOINED
 from aqualvs.batch.scheduler import DaskWorkers, Scheduler, known_net
 from aqualvs.batch.summary_page import SUMMARY_HTML, write_summary
-from aqualvs.batch.work import PIECE_FRAMES, DiveWork, size_of
+from aqualvs.batch.work import DiveWork, size_of
 from aqualvs.closing import Closing
 from aqualvs.errors import OptionError, OutputError
 from aqualvs.nets.target_file import NetRequest
@@ -51,8 +51,6 @@ class BatchRequest:
     report: bool = True  # Whether each dive gets its report.
     # What to find out about the net of each dive, if anything; logs are those of the dives.
     net: NetRequest | None = None
-    # Frames that a piece of a dive has at least.
-    piece_frames: int = PIECE_FRAMES
 
 
 def batch(request: BatchRequest, echo: Callable[[str], object]) -> int:
@@ -142,13 +140,7 @@ def _work(request: BatchRequest, dive: Dive, name: str, out: Path) -> DiveWork:
         target=request.target,
         net=request.net and replace(request.net, log=dive.log, log_offset_s=dive.log_offset_s),
     )
-    return DiveWork(
-        name=name,
-        request=run,
-        home=out / HOME / DIVES / name,
-        dataset=out / DATASET,
-        piece_frames=request.piece_frames,
-    )
+    return DiveWork(name=name, request=run, home=out / HOME / DIVES / name, dataset=out / DATASET)
 
 
 def _known_names(out: Path) -> dict[str, str]:

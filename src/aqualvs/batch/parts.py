@@ -73,7 +73,6 @@ SUMMARY = "summary.npz"
 class PieceResult:
     """Outcome of measuring one piece."""
 
-    number: int  # Of the piece in its dive.
     # Frames, and those with a posture.
     n_frames: int
     n_valid: int
@@ -103,27 +102,25 @@ def piece_key(probe: DiveProbe, number: int) -> str:
     return digest({"dive": probe.key, **of_span})
 
 
-def measure_piece(work: DiveWork, probe: DiveProbe, number: int) -> PieceResult:
-    """Measure one piece of a dive, or take what an earlier batch has finished.
+def measure_piece(work: DiveWork, probe: DiveProbe) -> PieceResult:
+    """Measure the only piece of a probe, or take what an earlier batch has finished.
 
     Raises `UnlikeProbeError` if the piece does not hold what the survey promised. Raises
     `AqualvsError` if the dive cannot be read any more, or the piece not be written.
     """
-    folder, span = piece_folder(work, probe, number), probe.spans[number]
-    key = piece_key(probe, number)
+    folder, key = piece_folder(work, probe, 0), piece_key(probe, 0)
     known = read_valid_manifest(folder, key)
     if known is not None:
-        return PieceResult(number=number, reused=True, **known)
+        return PieceResult(reused=True, **known)
     began_s = time.process_time()
     # The process has one core to itself.
     cv2.setNumThreads(1)
     with writing(folder), drafted(folder) as draft:
         with open_dive(work.request) as dive:
-            facts, names = _write_piece(dive, span, draft, _scanner(dive, probe))
+            facts, names = _write_piece(dive, probe.spans[0], draft, _scanner(dive, probe))
         write_manifest(draft, key, facts, names)
-    return PieceResult(
-        number=number, cpu_s=time.process_time() - began_s, peak_bytes=peak_bytes(), **facts
-    )
+    cpu_s = time.process_time() - began_s
+    return PieceResult(cpu_s=cpu_s, peak_bytes=peak_bytes(), **facts)
 
 
 def peak_bytes() -> int:

@@ -15,7 +15,7 @@ import queue
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -372,7 +372,7 @@ class Steps:
 
     # As `look`, `measure_piece` and `join`.
     look: Callable[[DiveWork], tuple[DiveProbe, dict[str, Any] | None]] = look
-    measure: Callable[[DiveWork, DiveProbe, int], PieceResult] = measure_piece
+    measure: Callable[[DiveWork, DiveProbe], PieceResult] = measure_piece
     join: Callable[[DiveWork, DiveProbe, Sequence[PieceResult]], dict[str, Any]] = join
 
 
@@ -448,7 +448,7 @@ class Scheduler:
         dive.probe = found
         for piece in range(len(found.spans)):
             task = _Task(dive, dive.n_beginnings, piece)
-            self._ready.append((task, self._steps.measure, (dive.work, found.only(piece), 0)))
+            self._ready.append((task, self._steps.measure, (dive.work, found.only(piece))))
 
     def _take(self, outcome: FinishedTask) -> None:
         task: _Task = outcome.token
@@ -474,7 +474,7 @@ class Scheduler:
         found = dive.probe
         if found is None:
             return
-        dive.results[piece] = replace(result, number=piece)
+        dive.results[piece] = result
         n_bytes = found.spans[piece].n_bytes
         if result.reused:
             self._expect(dive, dive.n_bytes - n_bytes)

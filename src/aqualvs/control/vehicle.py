@@ -131,9 +131,7 @@ class VehicleState:
 class VehicleLink(Protocol):
     """Interface to command a vehicle and read its state; never arms it or changes its mode."""
 
-    @property
-    def name(self) -> str:
-        """Name of the vehicle in messages."""
+    name: str  # In messages.
 
     def state(self) -> VehicleState:
         """Return the latest state; returns at once."""

@@ -33,15 +33,11 @@ class SimulatedLink:
 
     def __init__(self, vehicle: SimulatedVehicle) -> None:
         self.vehicle = vehicle
+        self.name = f"simulated {vehicle.model.name}"
         self.effort = NEUTRAL  # The last that was sent.
         self._shaping = shaping_of_model(vehicle.model)
         self._unsent: Effort | None = None
         self._closed = False
-
-    @property
-    def name(self) -> str:
-        """Name of the vehicle in messages."""
-        return f"simulated {self.vehicle.model.name}"
 
     def state(self) -> VehicleState:
         """Return the vehicle's reported state, by the vehicle's clock."""

@@ -191,9 +191,7 @@ def packet_with(data: bytes) -> "Packet[VideoStream]":
 class Feed(Protocol):
     """Frames of a live stream, which may stall, change its size, break off and return."""
 
-    @property
-    def name(self) -> str:
-        """Name of the source in health reports and messages."""
+    name: str  # In health reports and messages.
 
     def __iter__(self) -> Iterator[Frame]:
         """Yield frames until the source ends (a file) or `close` is called (a stream).
@@ -220,13 +218,8 @@ class FrameSource(Protocol):
     what it has and then raises `SourceError`.
     """
 
-    @property
-    def name(self) -> str:
-        """Name of the source in messages: a path or an address."""
-
-    @property
-    def size_px(self) -> tuple[int, int]:
-        """Width and height, the same for every frame."""
+    name: str  # How messages call it: a path or an address.
+    size_px: tuple[int, int]  # Width and height, the same for every frame.
 
     @property
     def fps(self) -> float | None:
@@ -234,10 +227,7 @@ class FrameSource(Protocol):
 
     @property
     def n_frames(self) -> int | None:
-        """Frames that the container promises, perhaps estimated from its duration.
-
-        None for a live stream.
-        """
+        """Frames that the container promises, perhaps estimated; None for a live stream."""
 
     def __iter__(self) -> Iterator[Frame]: ...
 

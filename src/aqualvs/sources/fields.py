@@ -148,13 +148,9 @@ class FrameFeed:
     """
 
     def __init__(self, pictures: Feed, shutter: Shutter) -> None:
+        self.name = pictures.name
         self._pictures, self._shutter = pictures, shutter
         self._watch = FieldWatch(shutter)
-
-    @property
-    def name(self) -> str:
-        """Name of the feed of the pictures."""
-        return self._pictures.name
 
     def __iter__(self) -> Iterator[Frame]:
         """Yield the frames, both fields of a picture as soon as it comes."""
