@@ -267,8 +267,8 @@ def test_what_came_while_the_process_stood_still_is_late(monkeypatch):
 
     monkeypatch.setattr(datagrams, "_MAX_LAG_S", lag_s)
     monkeypatch.setattr(socket, "socket", Standing)
-    heard = datagrams.Datagrams(datagrams.UdpAddress("127.0.0.1", 0))
-    queue = datagrams.DatagramQueue(heard, threading.Event(), live_frames.Reception("test"))
+    address, reception = datagrams.UdpAddress("127.0.0.1", 0), live_frames.Reception("test")
+    heard = datagrams.Datagrams(address, threading.Event(), reception)
     try:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as outlet:
             outlet.connect(("127.0.0.1", heard.port))
@@ -276,12 +276,12 @@ def test_what_came_while_the_process_stood_still_is_late(monkeypatch):
                 outlet.send(content)
             time.sleep(1.2 * lag_s)
             goes_on.set()
-            late = queue.get(TIMEOUT_S)
+            late = heard.get(TIMEOUT_S)
             outlet.send(b"4")
-            fresh = queue.get(TIMEOUT_S)
+            fresh = heard.get(TIMEOUT_S)
         assert late
         assert fresh
-        assert (late.content, queue.is_late(late)) == (b"3", True)
+        assert (late.content, heard.is_late(late)) == (b"3", True)
         assert fresh.content == b"4"
         assert fresh.arrival - late.arrival > lag_s
     finally:

@@ -1,7 +1,7 @@
 """UDP datagrams: addresses, a receiver with its own thread, and detection of their content.
 
-`Datagrams` takes datagrams from the system as they arrive. `DatagramQueue` hands out those of one
-kind (RTP with H.264, MPEG-TS, bare H.264) until the content shows another kind.
+`Datagrams` takes datagrams from the system as they arrive, and tells when their kind (RTP with
+H.264, MPEG-TS, bare H.264) changes.
 """
 
 import contextlib
@@ -63,83 +63,6 @@ class Datagram(NamedTuple):
 
     content: bytes
     arrival: float
-
-
-class Datagrams:
-    """Receiver on a UDP port; a thread of its own empties the system's buffer.
-
-    Raises `OSError` if the system refuses: the port is taken, the address is none of this machine.
-    """
-
-    def __init__(self, address: UdpAddress) -> None:
-        self._socket = _listen(address)
-        self.port: int = self._socket.getsockname()[1]
-        self._waiting: queue.SimpleQueue[Datagram | None] = queue.SimpleQueue()
-        self._closed = threading.Event()
-        self._thread = threading.Thread(target=self._receive, name="datagrams", daemon=True)
-        self._thread.start()
-
-    def get(self, timeout: float) -> Datagram | None:
-        """Return the oldest datagram, or None if there is none in time, or after `close`.
-
-        `timeout`: seconds.
-        """
-        try:
-            return self._waiting.get(timeout=timeout)
-        except queue.Empty:
-            return None
-
-    def forget(self) -> int:
-        """Drop all waiting datagrams; return their number."""
-        n = self._waiting.qsize()
-        for _ in range(n):
-            self.get(0.0)
-        return n
-
-    def wake(self) -> None:
-        """End a `get` that waits; called from any thread."""
-        self._waiting.put(None)
-
-    def close(self) -> None:
-        """Stop listening."""
-        self._closed.set()
-        self._thread.join()
-        self._socket.close()
-
-    def _receive(self) -> None:
-        # Period in which the receiver checks whether to end.
-        look_s = 0.2
-        self._socket.settimeout(look_s)
-        # Datagrams kept for a late reader; further ones are lost, and counted as such.
-        max_waiting = 20_000
-        now = time.monotonic()
-        while not self._closed.is_set():
-            content = None
-            try:
-                content = self._socket.recv(65536)
-            except TimeoutError:
-                pass
-            except OSError:  # Such as an ICMP error that Windows reports here.
-                time.sleep(0.01)
-            before, now = now, time.monotonic()
-            if now - before > _MAX_LAG_S:
-                # The process stood still, and what the system has kept meanwhile may be as old:
-                # all but one is dropped, with an arrival that shows the reader that it is late.
-                content, arrival = self._latest(look_s) or content, before
-            else:
-                arrival = now
-            if content is not None and self._waiting.qsize() < max_waiting:
-                self._waiting.put(Datagram(content, arrival))
-
-    def _latest(self, timeout: float) -> bytes | None:
-        """Empty the system's buffer; return the last datagram of it."""
-        content = None
-        self._socket.setblocking(False)
-        with contextlib.suppress(OSError):
-            while True:
-                content = self._socket.recv(65536)
-        self._socket.settimeout(timeout)
-        return content
 
 
 def why_not(address: UdpAddress, fault: OSError) -> str:
@@ -219,32 +142,38 @@ def transport_content(datagram: bytes) -> bytes | None:
     return datagram if whole and set(datagram[::PACKET_BYTES]) == {SYNC} else None
 
 
-class DatagramQueue:
-    """Queue of datagrams of one kind, until another kind arrives.
+class Datagrams:
+    """Receiver on a UDP port, and queue of what comes; its thread empties the system's buffer.
 
     Parameters
     ----------
-    closed : Event
+    address : UdpAddress
+        Where to listen.
+    ended : Event
         Set when the feed ends.
     reception : Reception
         Told of what cannot be used.
+
+    Raises
+    ------
+    OSError
+        If the system refuses: the port is taken, the address is none of this machine.
     """
 
-    def __init__(self, datagrams: Datagrams, closed: threading.Event, reception: Reception) -> None:
-        self.reception = reception
-        self._datagrams = datagrams
-        self._closed = closed
+    def __init__(self, address: UdpAddress, ended: threading.Event, reception: Reception) -> None:
+        self.ended, self.reception = ended, reception
+        self._socket = _listen(address)
+        self.port: int = self._socket.getsockname()[1]
+        self._waiting: queue.SimpleQueue[Datagram | None] = queue.SimpleQueue()
         self._peeked: Datagram | None = None
         self._n_foreign = 0
-
-    @property
-    def is_closed(self) -> bool:
-        """Whether the feed ends."""
-        return self._closed.is_set()
+        self._closed = threading.Event()
+        self._thread = threading.Thread(target=self._receive, name="datagrams", daemon=True)
+        self._thread.start()
 
     def peek_kind(self) -> str | None:
         """Look at the next datagram; None if none comes, or one of no known kind."""
-        datagram = self._datagrams.get(WAIT_S)
+        datagram = self.get()
         if datagram is None:
             return None
         kind = kind_of(datagram.content)
@@ -254,12 +183,14 @@ class DatagramQueue:
         return kind
 
     def get(self, timeout: float = WAIT_S) -> Datagram | None:
-        """Return the next datagram, or None if none comes in time.
+        """Return the oldest datagram, or None if there is none in time, or after `wake`.
 
         `timeout`: seconds.
         """
         peeked, self._peeked = self._peeked, None
-        return peeked or self._datagrams.get(timeout)
+        with contextlib.suppress(queue.Empty):
+            return peeked or self._waiting.get(timeout=timeout)
+        return None
 
     def is_late(self, datagram: Datagram) -> bool:
         """Return whether decoding lags too far behind; if so, drop the waiting datagrams.
@@ -268,7 +199,8 @@ class DatagramQueue:
         """
         if time.monotonic() - datagram.arrival < _MAX_LAG_S:
             return False
-        self._datagrams.forget()
+        for _ in range(self._waiting.qsize()):
+            self._waiting.get()
         return True
 
     def is_foreign(self, datagram: Datagram, *, fits: bool) -> bool:
@@ -281,3 +213,48 @@ class DatagramQueue:
             return False
         self._n_foreign = 0
         return kind_of(datagram.content) is not None
+
+    def wake(self) -> None:
+        """End a `get` that waits; called from any thread."""
+        self._waiting.put(None)
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._closed.set()
+        self._thread.join()
+        self._socket.close()
+
+    def _receive(self) -> None:
+        # Period in which the receiver checks whether to end.
+        look_s = 0.2
+        self._socket.settimeout(look_s)
+        # Datagrams kept for a late reader; further ones are lost, and counted as such.
+        max_waiting = 20_000
+        now = time.monotonic()
+        while not self._closed.is_set():
+            content = None
+            try:
+                content = self._socket.recv(65536)
+            except TimeoutError:
+                pass
+            except OSError:  # Such as an ICMP error that Windows reports here.
+                time.sleep(0.01)
+            before, now = now, time.monotonic()
+            if now - before > _MAX_LAG_S:
+                # The process stood still, and what the system has kept meanwhile may be as old:
+                # all but one is dropped, with an arrival that shows the reader that it is late.
+                content, arrival = self._latest(look_s) or content, before
+            else:
+                arrival = now
+            if content is not None and self._waiting.qsize() < max_waiting:
+                self._waiting.put(Datagram(content, arrival))
+
+    def _latest(self, timeout: float) -> bytes | None:
+        """Empty the system's buffer; return the last datagram of it."""
+        content = None
+        self._socket.setblocking(False)
+        with contextlib.suppress(OSError):
+            while True:
+                content = self._socket.recv(65536)
+        self._socket.settimeout(timeout)
+        return content

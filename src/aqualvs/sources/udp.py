@@ -31,7 +31,6 @@ from aqualvs.sources.datagrams import (
     TS,
     WAIT_S,
     Datagram,
-    DatagramQueue,
     Datagrams,
     UdpAddress,
     kind_of,
@@ -118,33 +117,30 @@ def _parameter_sets(part: str, payload_type: int) -> bytes:
 
 
 def rtp_frames(
-    frames: LiveFrames,
-    datagram_queue: DatagramQueue,
-    parameter_sets: bytes,
-    payload_type: int | None,
+    frames: LiveFrames, datagrams: Datagrams, parameter_sets: bytes, payload_type: int | None
 ) -> Iterator[Frame]:
     """Yield the frames of RTP with H.264 until the feed ends or another kind comes."""
     order, pictures = RtpOrder(), H264Depacketizer()
     frames.connect(decoder_of("h264", parameter_sets), 1 / TICKS_HZ, hears_losses=True)
-    while not datagram_queue.is_closed:
-        datagram = datagram_queue.get(order.wait or WAIT_S)
+    while not datagrams.ended.is_set():
+        datagram = datagrams.get(order.wait or WAIT_S)
         if datagram is None:
             due = order.overdue(time.monotonic())
-        elif datagram_queue.is_late(datagram):
+        elif datagrams.is_late(datagram):
             frames.lose()
             continue
         else:
             packet = parse_rtp(datagram.content)
-            if datagram_queue.is_foreign(datagram, fits=packet is not None):
+            if datagrams.is_foreign(datagram, fits=packet is not None):
                 return
             if packet is None or not _is_video(packet, payload_type):
                 continue
             due = order.push(packet, datagram.arrival)
             if pictures.n_foreign > MAX_FOREIGN:
                 fault = "RTP comes, but not of H.264; set the camera to H.264"
-                datagram_queue.reception.complain(fault)
+                datagrams.reception.complain(fault)
             else:
-                datagram_queue.reception.hear(RTP)
+                datagrams.reception.hear(RTP)
         for ordered in due:
             for picture in pictures.push(ordered):
                 yield from decoded(frames, picture)
@@ -157,26 +153,26 @@ def _is_video(packet: RtpPacket, payload_type: int | None) -> bool:
     )
 
 
-def _in_time(frames: LiveFrames, datagram_queue: DatagramQueue) -> Iterator[Datagram]:
+def _in_time(frames: LiveFrames, datagrams: Datagrams) -> Iterator[Datagram]:
     """Yield datagrams as they come, until the feed ends; late ones are lost."""
-    while not datagram_queue.is_closed:
-        datagram = datagram_queue.get()
+    while not datagrams.ended.is_set():
+        datagram = datagrams.get()
         if datagram is None:
             continue
-        if datagram_queue.is_late(datagram):
+        if datagrams.is_late(datagram):
             frames.lose()
         else:
             yield datagram
 
 
-def transport_frames(frames: LiveFrames, datagram_queue: DatagramQueue) -> Iterator[Frame]:
+def transport_frames(frames: LiveFrames, datagrams: Datagrams) -> Iterator[Frame]:
     """Yield the frames of MPEG-TS until the feed ends or another kind comes."""
     stream, codec = TransportStream(), None
-    for datagram in _in_time(frames, datagram_queue):
+    for datagram in _in_time(frames, datagrams):
         content = transport_content(datagram.content)
-        if datagram_queue.is_foreign(datagram, fits=content is not None):
+        if datagrams.is_foreign(datagram, fits=content is not None):
             return
-        datagram_queue.reception.hear(TS)
+        datagrams.reception.hear(TS)
         for picture in stream.push(content or b""):
             if codec != stream.codec:
                 codec = stream.codec or ""
@@ -185,18 +181,18 @@ def transport_frames(frames: LiveFrames, datagram_queue: DatagramQueue) -> Itera
             yield from decoded(frames, picture)
 
 
-def bare_frames(frames: LiveFrames, datagram_queue: DatagramQueue) -> Iterator[Frame]:
+def bare_frames(frames: LiveFrames, datagrams: Datagrams) -> Iterator[Frame]:
     """Yield the frames of H.264 without a container, cut into datagrams anywhere.
 
     Ends with the feed, or when another kind comes.
     """
     codec = decoder_of("h264")
     frames.connect(codec, 1e-6, hears_losses=False)
-    for datagram in _in_time(frames, datagram_queue):
+    for datagram in _in_time(frames, datagrams):
         other = kind_of(datagram.content) in (RTP, TS)
-        if datagram_queue.is_foreign(datagram, fits=not other):
+        if datagrams.is_foreign(datagram, fits=not other):
             return
-        datagram_queue.reception.hear(BARE)
+        datagrams.reception.hear(BARE)
         for unit in codec.parse(datagram.content):
             unit.pts, unit.time_base = int(1e6 * datagram.arrival), Fraction(1, 1_000_000)
             yield from frames.feed(unit)
@@ -313,7 +309,7 @@ class UdpFeed:
 
     def _listen(self, address: UdpAddress) -> Datagrams | None:
         try:
-            found = Datagrams(address)
+            found = Datagrams(address, self._closed, self._reception)
         except OSError as fault:
             self._reception.complain(why_not(address, fault))
             return None
@@ -322,14 +318,13 @@ class UdpFeed:
 
     def _receive(self, datagrams: Datagrams) -> Iterator[Frame]:
         """Yield frames of any kind of content, which may change."""
-        datagram_queue = DatagramQueue(datagrams, self._closed, self._reception)
         frames = self._frames
         while not self._closed.is_set():
-            kind = datagram_queue.peek_kind()
+            kind = datagrams.peek_kind()
             if kind == RTP:
                 rtp = self._parameter_sets, self._payload_type
-                yield from rtp_frames(frames, datagram_queue, *rtp)
+                yield from rtp_frames(frames, datagrams, *rtp)
             elif kind == TS:
-                yield from transport_frames(frames, datagram_queue)
+                yield from transport_frames(frames, datagrams)
             elif kind == BARE:
-                yield from bare_frames(frames, datagram_queue)
+                yield from bare_frames(frames, datagrams)
