@@ -12,8 +12,6 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import TypeAlias
 
-_START_CODE = b"\x00\x00\x01"
-
 
 @dataclass(frozen=True, slots=True)
 class Units:
@@ -61,10 +59,9 @@ def unit_reader(codec: str, extradata: bytes) -> UnitReader | None:
     found = _CODECS.get(codec)
     if found is None:
         return None
-    if extradata[:1] == b"\x01" and len(extradata) > found.length_at:
-        n_length = (extradata[found.length_at] & 3) + 1
-        return lambda packet: _units(found, (packet[i] for i in _after_lengths(packet, n_length)))
-    return lambda packet: _units(found, _by_start_code(bytes(packet)))
+    has_lengths = extradata[:1] == b"\x01" and len(extradata) > found.length_at
+    n_length = (extradata[found.length_at] & 3) + 1 if has_lengths else 0
+    return lambda packet: _units(found, (packet[at] for at in _begins(packet, n_length)))
 
 
 def _units(codec: _Codec, heads: Iterator[int]) -> Units:
@@ -78,20 +75,23 @@ def _units(codec: _Codec, heads: Iterator[int]) -> Units:
     return Units(False, bool(sets), False)
 
 
-def _after_lengths(packet: bytes | memoryview, n_length: int) -> Iterator[int]:
-    """Yield where each unit begins, behind its length."""
+def _begins(packet: bytes | memoryview, n_length: int) -> Iterator[int]:
+    """Yield where each unit that is not empty begins, behind its length or, without, a start code.
+
+    Found as they are asked for: most of a packet is behind its first slice.
+    """
+    if not n_length:
+        yield from (m.end() for m in _START.finditer(packet) if m.end() < len(packet))
+        return
     at = 0
     while at + n_length < len(packet):
         yield at + n_length
         at += n_length + int.from_bytes(packet[at : at + n_length], "big")
 
 
-def _by_start_code(packet: bytes) -> Iterator[int]:
-    at = packet.find(_START_CODE)
-    while 0 <= at < len(packet) - len(_START_CODE):
-        at += len(_START_CODE)
-        yield packet[at]
-        at = packet.find(_START_CODE, at)
+def _heads(packet: bytes | memoryview, n_length: int = 0) -> Iterator[bytes]:
+    """Yield the first bytes of each unit, as many as hold all fields read here."""
+    return (bytes(packet[at : at + _HEAD]) for at in _begins(packet, n_length))
 
 
 class NalType(IntEnum):
@@ -113,14 +113,6 @@ _START = re.compile(b"\x00\x00\x01")
 _HEAD = 64
 
 _CHROMA_PROFILES = frozenset({100, 110, 122, 244, 44, 83, 86, 118, 128, 138, 139, 134, 135})
-
-
-def nal_units(data: bytes) -> list[bytes]:
-    """Return the first 64 bytes, at most, of the NAL units of a byte stream (annex B).
-
-    Start codes are left out.
-    """
-    return [data[m.end() : m.end() + _HEAD] for m in _START.finditer(data)]
 
 
 class FrameNumbers:
@@ -152,7 +144,7 @@ class FrameNumbers:
             False also where that is unknown: before a parameter set, in streams that leave
             numbers out on purpose.
         """
-        for unit in nal_units(data):
+        for unit in _heads(data):
             if len(unit) < 4:
                 continue
             kind = unit[0] & 31
@@ -202,7 +194,7 @@ class FieldPairs:
 
         `packet`: the next one of the stream, in the order of decoding.
         """
-        for unit in self._units(packet):
+        for unit in _heads(packet, self._n_length):
             kind = unit[0] & 31
             if kind == NalType.SPS:
                 self._form = _slice_form(unit)
@@ -221,15 +213,6 @@ class FieldPairs:
             return True
         self._first = field
         return False
-
-    def _units(self, packet: bytes | memoryview) -> Iterator[bytes]:
-        """Yield the beginnings of the units that are not empty."""
-        if self._n_length:
-            starts = _after_lengths(packet, self._n_length)
-        else:
-            starts = (m.end() for m in _START.finditer(packet))
-        # None is looked for behind the first slice, where most of a packet is.
-        return (bytes(packet[at : at + _HEAD]) for at in starts if at < len(packet))
 
 
 def field_pairs(codec: str, extradata: bytes | None) -> FieldPairs | None:
