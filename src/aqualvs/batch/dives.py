@@ -293,7 +293,12 @@ def _dives_in(folder: Path, out: Path | None) -> list[Path]:
         # What a run has written about a dive is no other dive.
         if _is_dive(path) and not (path.parent / RUN_YAML).exists():
             found.append(path)
-    found = found or _image_folders(folder)
+    folders = [folder, *(path for path in _visible(folder) if path.is_dir())]
+    found = found or [
+        one
+        for one in folders
+        if not (one / RUN_YAML).exists() and any(map(is_image_name, one.iterdir()))
+    ]
     if found:
         return found
     raise SourceError(f"{folder}: holds no dive; name videos, recordings or folders of images")
@@ -310,17 +315,6 @@ def _visible(folder: Path) -> list[Path]:
         if not any(part.startswith(".") for part in path.relative_to(folder).parts)
     )
     return sorted(found, key=natural_key)
-
-
-def _image_folders(folder: Path) -> list[Path]:
-    folders = [folder, *(path for path in _visible(folder) if path.is_dir())]
-    return [path for path in folders if _holds_images(path)]
-
-
-def _holds_images(folder: Path) -> bool:
-    if (folder / RUN_YAML).exists():
-        return False
-    return any(is_image_name(path) for path in folder.iterdir())
 
 
 def _is_dive(path: Path) -> bool:

@@ -138,8 +138,8 @@ def load_gains(source: Path | str) -> ControlGains:
     """
     vehicle = str(source).replace("-", "_")
     if vehicle in VEHICLES:
-        text = _packaged(vehicle)
-        content = parse_yaml(text, str(source), OptionError)
+        packaged = files("aqualvs") / "data" / "gains" / f"{vehicle}.yaml"
+        content = parse_yaml(packaged.read_text(encoding="utf-8"), str(source), OptionError)
         return _gains(parse_settings(content, GainsFile, _KEY, VERSION, str(source)))
     path = Path(source)
     if path.suffix == "" and not path.exists():
@@ -167,10 +167,6 @@ def gains_text(gains: ControlGains) -> str:
     content = _content(gains).model_dump()
     text: str = yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
     return _HEADER + text
-
-
-def _packaged(name: str) -> str:
-    return (files("aqualvs") / "data" / "gains" / f"{name}.yaml").read_text(encoding="utf-8")
 
 
 def _gains(content: GainsFile) -> ControlGains:

@@ -235,7 +235,9 @@ class _Motion:
         move[0, 3] = move[1, 4] = move[2, 5] = dt
         cov = move @ track.cov @ move.T
         noise = self._noise.copy()
-        noise[0, 0] *= _manoeuvre_factor(track.surprise)
+        # Twice the expected square is no manoeuvre: noise alone exceeds it in one frame of eleven,
+        # by little.
+        noise[0, 0] *= max(1.0, track.surprise / 2.0) ** 2
         cov[:3, :3] += noise * (dt**3 / 3.0)
         cov[:3, 3:] += noise * (dt**2 / 2.0)
         cov[3:, :3] += noise * (dt**2 / 2.0)
@@ -297,15 +299,6 @@ class _Motion:
                 after[at, at] = variance
         pitch, yaw = (n if n < self._n_rejected else 0 for n in track.n_left_out)
         return replace(track, state=state, cov=after, n_left_out=(pitch, yaw))
-
-
-def _manoeuvre_factor(surprise: float) -> float:
-    """Return the factor on the variance of the range's acceleration.
-
-    Twice the expected square is no manoeuvre: noise alone exceeds it in one frame of eleven,
-    by little.
-    """
-    return max(1.0, surprise / 2.0) ** 2
 
 
 def _measurement(posture: Posture | Refusal) -> tuple[FloatArray, FloatArray] | None:

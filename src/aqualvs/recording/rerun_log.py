@@ -33,7 +33,7 @@ from aqualvs.recording.encoding import jpeg_of
 from aqualvs.recording.messages import RateLimit
 from aqualvs.recording.sample import LiveSample
 from aqualvs.scanning.posture import Posture, Reason, Refusal
-from aqualvs.scanning.scan import Label, ScanPoints
+from aqualvs.scanning.scan import Label
 from aqualvs.text import LABEL_COLOURS, LABEL_WORDS, reason_text
 
 RRD = ".rrd"
@@ -99,7 +99,9 @@ class RerunLog(Closing):
             self._log_refusal(posture)
         stamp_ns = sample.instants.arrived_ns
         if self._points_due.at(stamp_ns):
-            self._log_points(scan.points)
+            points = scan.points
+            cloud = self._rr.Points3D(points.points_in_dome, class_ids=points.label, radii=-2.0)
+            self._stream.log(f"{_VEHICLE}/points", cloud)
         jpeg_quality = 75
         if sample.frame is not None and self._picture_due.at(stamp_ns):
             jpeg = jpeg_of(sample.frame, jpeg_quality)
@@ -193,10 +195,6 @@ class RerunLog(Closing):
             for path in _SERIES:
                 self._stream.log(path, self._rr.Clear(recursive=False))
         self._silent = is_silence
-
-    def _log_points(self, points: ScanPoints) -> None:
-        cloud = self._rr.Points3D(points.points_in_dome, class_ids=points.label, radii=-2.0)
-        self._stream.log(f"{_VEHICLE}/points", cloud)
 
 
 def plane_sigma(posture: Posture, places: FloatArray) -> FloatArray:

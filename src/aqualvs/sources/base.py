@@ -143,7 +143,9 @@ def planes_of(picture: VideoFrame) -> Planes:
         return _view(y), (_view(uv, first=0, step=2), _view(uv, first=1, step=2))
     if kind in _GREY:
         return _view(picture.planes[0]), None
-    return planes_of(_as_420(picture))
+    # In the same range, so that luma keeps its values.
+    full = picture.format.name.startswith("yuvj") or picture.color_range == _FULL_RANGE
+    return planes_of(picture.reformat(format="yuvj420p" if full else "yuv420p"))
 
 
 def _view(plane: VideoPlane, *, first: int = 0, step: int = 1) -> ImagePlane:
@@ -151,18 +153,8 @@ def _view(plane: VideoPlane, *, first: int = 0, step: int = 1) -> ImagePlane:
     strides = (plane.line_size, step)
     shape = (plane.height, plane.width)
     view: ImagePlane = np.ndarray(shape, np.uint8, memoryview(plane), first, strides)
-    return _read_only(view)
-
-
-def _read_only(array: ImagePlane) -> ImagePlane:
-    array.flags.writeable = False
-    return array
-
-
-def _as_420(picture: VideoFrame) -> VideoFrame:
-    """Convert to 8-bit 4:2:0 in the same range, so that luma keeps its values."""
-    full = picture.format.name.startswith("yuvj") or picture.color_range == _FULL_RANGE
-    return picture.reformat(format="yuvj420p" if full else "yuv420p")
+    view.flags.writeable = False
+    return view
 
 
 def frame_of(index: int, time_s: float, picture: VideoFrame) -> Frame:

@@ -212,7 +212,7 @@ def open_feed(
     _no(size_px or pixel_format, text, "only a camera takes a size or format; leave it out")
     if not text.lower().startswith("rtsp"):
         _no(transport, text, "only RTSP has a choice of transport; leave it out")
-    if not _is_stream(text):
+    if not (text == "bluerov" or is_address(text) or text.lower().endswith(".sdp")):
         return PacedFeed(open_source(where, fps=fps), realtime=realtime)
     _no(fps, text, "a stream has its own clock; leave the frame rate out")
     return _stream(text, transport or "tcp")
@@ -255,10 +255,6 @@ def _check_address(where: str) -> None:
     # Listening at UDP port 0 takes a free port; sending to port 0 is impossible.
     if port == 0 and parts.scheme.lower() not in ("udp", "rtp"):
         raise SourceError(f"{shown}: port 0 cannot be reached; {remedy}")
-
-
-def _is_stream(where: str) -> bool:
-    return where == "bluerov" or is_address(where) or where.lower().endswith(".sdp")
 
 
 def _recording(path: Path, topic: str | None) -> FrameSource:

@@ -424,7 +424,9 @@ class VideoParts(Closing):
             self.close()
         if self._container is None:
             self._container = av.open(str(self._path), timeout=_TIMEOUT_S)
-            _prepare(self._container.streams.video[0])
+            context = self._container.streams.video[0].codec_context
+            # Stop at any damage instead of patching it up.
+            context.thread_count, context.options = 1, {"err_detect": "explode"}
         return self._container.streams.video[0]
 
 
@@ -445,13 +447,6 @@ def image_frames(folder: Path, span: Span, fps: float) -> Iterator[Frame]:
         raise UnlikeProbeError(str(fault)) from fault
     if index != span.stop:
         raise UnlikeProbeError(f"{index - span.first} images of {span.stop - span.first}")
-
-
-def _prepare(stream: VideoStream) -> None:
-    """Decode on one thread, and stop at any damage instead of patching it up."""
-    context = stream.codec_context
-    context.thread_count = 1
-    context.options = {"err_detect": "explode"}
 
 
 def _pictures(stream: VideoStream, span: Span) -> Iterator[VideoFrame]:
