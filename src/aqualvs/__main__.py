@@ -22,13 +22,13 @@ def main() -> int:
 
 
 def interrupt(number: int, frame: FrameType | None) -> None:
-    """Raise `KeyboardInterrupt`; in a callback of LLVM only once that has returned.
+    """Raise `KeyboardInterrupt`; while LLVM works only once that is over.
 
     Signals that come while LLVM compiles are seen first in the callback with the result. An
     exception there is dropped by ctypes, and the compilation fails for want of the result.
     """
     while frame is not None:
-        if frame.f_code.co_name.startswith("_raw_object_cache"):
+        if str(frame.f_globals.get("__name__")).startswith("llvmlite"):
             soon_s = 0.01
             again = threading.Timer(soon_s, _thread.interrupt_main, (number,))
             again.daemon = True

@@ -18,7 +18,6 @@ from aqualvs.optics.dome import DOME_PARAMETERS, Dome
 from aqualvs.optics.flat_port import FLAT_PARAMETERS, FlatPort
 from aqualvs.optics.lens import Lens
 from aqualvs.optics.shutter import AT_ONCE, Shutter
-from aqualvs.optics.water import GREEN_NM, seawater_index_vacuum
 
 DOME_FROM_CAM_NOMINAL: FloatArray = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 """Rotation of a camera mounted without error; columns are x, y and z of `cam` in `dome`.
@@ -59,20 +58,6 @@ def common_wavelength(lasers: Sequence[Laser]) -> float | None:
     """Return the common wavelength of lasers (nm); None if they differ or it is unknown."""
     found = {laser.wavelength_nm for laser in lasers}
     return found.pop() if len(found) == 1 else None
-
-
-def index_in_seawater(
-    temperature_c: float, salinity_permille: float, lasers: Sequence[Laser], n_air: float
-) -> float:
-    """Return the index of water for the light of the lasers, relative to vacuum.
-
-    Lasers of several colours, or of none that is stated, count as green. Of light beyond the
-    formula's 400 to 700 nm the index is that of its end.
-
-    Raises `OptionError` if a value lies outside the formula's range.
-    """
-    light_nm = min(max(common_wavelength(lasers) or GREEN_NM, 400.0), 700.0)
-    return float(seawater_index_vacuum(temperature_c, salinity_permille, light_nm, n_air=n_air))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -25,7 +25,7 @@ from aqualvs.optics.camera import Housing
 from aqualvs.optics.dome import Dome
 from aqualvs.optics.flat_port import FlatPort
 from aqualvs.optics.lens import COEFFICIENT_COUNTS, Lens, LensModel
-from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Laser, Rig, Window, index_in_seawater
+from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Laser, Rig, Window, common_wavelength
 from aqualvs.optics.rigschema import (
     VERSION,
     LaserPart,
@@ -38,7 +38,7 @@ from aqualvs.optics.rigschema import (
 )
 from aqualvs.optics.shutter import AT_ONCE, Shutter, ShutterKind
 from aqualvs.optics.solved import rig_uncertainty
-from aqualvs.optics.water import seawater_index_vacuum
+from aqualvs.optics.water import index_in_seawater, seawater_index_vacuum
 from aqualvs.schema import StrictPart, si_values
 from aqualvs.yamlfile import carry_comments, parse_yaml, read_text, rig_text
 
@@ -376,7 +376,8 @@ def water_index(water: WaterPart, n_air: float, lasers: Sequence[Laser]) -> floa
         )
     try:
         if water.wavelength_nm is None:
-            return index_in_seawater(water.temperature_c, water.salinity_permille, lasers, n_air)
+            light_nm = common_wavelength(lasers)
+            return index_in_seawater(water.temperature_c, water.salinity_permille, light_nm, n_air)
         return float(
             seawater_index_vacuum(
                 water.temperature_c, water.salinity_permille, water.wavelength_nm, n_air=n_air

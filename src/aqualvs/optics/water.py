@@ -126,3 +126,17 @@ def _checked(*values: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
         arrays.append(array)
     t, s, w = np.broadcast_arrays(*arrays)
     return t, s, w
+
+
+def index_in_seawater(
+    temperature_c: float, salinity_permille: float, light_nm: float | None, n_air: float
+) -> float:
+    """Return the index of water for lasers of a wavelength, relative to vacuum.
+
+    Light of no stated wavelength counts as green. Of light beyond the formula's 400 to 700 nm the
+    index is that of its end.
+
+    Raises `OptionError` if temperature or salinity lies outside the formula's range.
+    """
+    light_nm = GREEN_NM if light_nm is None else min(max(light_nm, 400.0), 700.0)
+    return float(seawater_index_vacuum(temperature_c, salinity_permille, light_nm, n_air=n_air))

@@ -17,8 +17,9 @@ from typing import Any
 from aqualvs import __version__
 from aqualvs.errors import OptionError, SourceError
 from aqualvs.nets.target_file import NetRequest, target_dict
-from aqualvs.optics.rig import Rig, index_in_seawater
+from aqualvs.optics.rig import Rig, common_wavelength
 from aqualvs.optics.rigfile import load_rig
+from aqualvs.optics.water import index_in_seawater
 from aqualvs.results.files import replace_text
 from aqualvs.scanner import ScannerOptions
 from aqualvs.scanning.detection import DETECTORS, detector_word
@@ -143,7 +144,8 @@ class Water:
             return rig.in_water(checked_index(self.n_water, "--water-n"))
         if self.seawater is None:
             return rig
-        return rig.in_water(index_in_seawater(*self.seawater, rig.lasers, rig.n_air))
+        light_nm = common_wavelength(rig.lasers)
+        return rig.in_water(index_in_seawater(*self.seawater, light_nm, rig.n_air))
 
 
 @dataclass(frozen=True, slots=True)

@@ -212,7 +212,7 @@ def open_feed(
     _no(size_px or pixel_format, text, "only a camera takes a size or format; leave it out")
     if not text.lower().startswith("rtsp"):
         _no(transport, text, "only RTSP has a choice of transport; leave it out")
-    if not (text == "bluerov" or is_address(text) or text.lower().endswith(".sdp")):
+    if not _is_stream(text):
         return PacedFeed(open_source(where, fps=fps), realtime=realtime)
     _no(fps, text, "a stream has its own clock; leave the frame rate out")
     return _stream(text, transport or "tcp")
@@ -237,6 +237,10 @@ def existing_path(where: str | Path, topic: str | None = None) -> tuple[Path, st
 def is_bag(path: Path) -> bool:
     """Return whether a path is a ROS bag; a lone MCAP file is none."""
     return path.suffix.lower() in (".bag", ".db3") or (path / "metadata.yaml").is_file()
+
+
+def _is_stream(where: str) -> bool:
+    return where == "bluerov" or is_address(where) or where.lower().endswith(".sdp")
 
 
 def _check_address(where: str) -> None:
