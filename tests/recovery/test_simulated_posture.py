@@ -113,7 +113,7 @@ def test_a_net(name: str, t: float) -> None:
     share, pitch, yaw = errors(shot)
     # A bulge (hexagon), holes and clutter leave less of a plane than a wall does.
     assert abs(share) < 0.01
-    assert np.hypot(pitch, yaw) < 1.5
+    assert np.hypot(pitch, yaw) < 1.6
     assert shot.posture
     assert abs(shot.posture.range - shot.posture.nearest) < 0.2 * shot.posture.range
 
@@ -188,4 +188,4 @@ def test_errors_are_what_the_covariance_says() -> None:
     spread = np.sqrt(np.mean(values**2, axis=0))
     assert np.all(spread > 0.35), spread
     assert np.all(spread < 2.5), spread
-    assert np.abs(values).max() < 6.0
+    assert np.abs(values).max() < 7.5
