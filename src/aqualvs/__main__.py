@@ -1,10 +1,8 @@
 """The program `aqualvs`, also as `python -m aqualvs`."""
 
-import _thread
 import os
 import signal
 import sys
-import threading
 from types import FrameType
 
 
@@ -28,7 +26,10 @@ def interrupt(number: int, frame: FrameType | None) -> None:
     exception there is dropped by ctypes, and the compilation fails for want of the result.
     """
     while frame is not None:
-        if str(frame.f_globals.get("__name__")).startswith("llvmlite"):
+        if str(frame.f_globals.get("__name__")).startswith("llvm"):
+            import _thread
+            import threading
+
             soon_s = 0.01
             again = threading.Timer(soon_s, _thread.interrupt_main, (number,))
             again.daemon = True
