@@ -15,11 +15,11 @@ from aqualvs.optics.sheet import sheets_of
 from aqualvs.scanner import Scanner, ScannerOptions
 from aqualvs.scanning.laser_bands import SearchAxis
 from aqualvs.scanning.paper.mesh_filter import MeshFilterOptions
-from aqualvs.scanning.plane_fit import twine_share
+from aqualvs.scanning.plane_fit import GLOW_SHARE, TWINE_SHARE
 from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.posture_estimator import FitMethod
 from aqualvs.scanning.scan import Frame, Label, Scan, planes_of_image
-from aqualvs.scanning.stripe import ThresholdOptions
+from aqualvs.scanning.stripe import ThresholdOptions, flank_difference
 from aqualvs.scanning.surfaces import Surface, TargetKind, find_surfaces
 from aqualvs.simulation.scenarios import bluerov2_rig, example_rig
 from scanning_cases import peaks_of
@@ -414,21 +414,37 @@ def test_without_its_dome_the_camera_reads_another_posture() -> None:
     assert not found or abs(found.range / 0.9 - 1.0) > 0.03 or abs(np.rad2deg(found.pitch)) > 3.0
 
 
-def test_a_shift_of_the_light_on_twine_is_in_the_sigma_of_the_range() -> None:
-    rig = example_rig()
-    peaks = peaks_of(rig, [(plane(0.5), broken)], 0.05)
-    variances = []
-    for width in (5.0, 1e-3):
-        wide = {a: part._replace(width=np.full(part.n, width)) for a, part in peaks.items()}
-        found = Scanner(rig).measure(0, 0.0, wide).posture
-        assert isinstance(found, Posture)
-        variances.append(found.covariance[0, 0])
-    # How far the stripes move in the picture as the target moves away.
-    near, far = (peaks_of(rig, [(plane(one), everywhere)]) for one in (0.5, 0.501))
+def range_variance_of_net(width: float, pull: float = 0.0) -> float:
+    """Return the variance of the range to a net at 0.5 m, pulled to the near side of stripes."""
+    peaks = peaks_of(example_rig(), [(plane(0.5), broken)], 0.05)
+    alike = {
+        a: part._replace(
+            width=np.full(part.n, width),
+            pull=np.full(part.n, pull if a is SearchAxis.ALONG_Y else -pull),
+        )
+        for a, part in peaks.items()
+    }
+    found = Scanner(example_rig()).measure(0, 0.0, alike).posture
+    assert isinstance(found, Posture)
+    return float(found.covariance[0, 0])
+
+
+def px_per_m() -> float:
+    """Return how far stripes move in the picture as a target at 0.5 m moves away."""
+    near, far = (peaks_of(example_rig(), [(plane(one), everywhere)]) for one in (0.5, 0.501))
     one, other = (part[SearchAxis.ALONG_Y] for part in (near, far))
     moved = np.interp(other.line, one.line, one.position) - other.position
-    px_per_m = float(np.median(np.abs(moved))) / 0.001
-    shift_px = 5.0 * float(twine_share(np.array(80.0)))
+    return float(np.median(np.abs(moved))) / 0.001
+
+
+def test_a_shift_of_the_light_on_twine_is_in_the_sigma_of_the_range() -> None:
     # Narrow stripes weigh more, and each laser's strands share as much again.
-    shared = np.sqrt(variances[0] - variances[1])
-    assert 0.8 * shift_px / px_per_m < shared < 1.6 * shift_px / px_per_m
+    shared = np.sqrt(range_variance_of_net(5.0) - range_variance_of_net(1e-3))
+    shift = 5.0 * TWINE_SHARE / px_per_m()
+    assert 0.8 * shift < shared < 1.6 * shift
+
+
+def test_glow_at_the_strands_of_a_net_is_in_the_sigma_of_the_range() -> None:
+    shared = np.sqrt(range_variance_of_net(5.0, 0.01) - range_variance_of_net(5.0))
+    shift = 5.0 * GLOW_SHARE * flank_difference(0.01, 5.0) / px_per_m()
+    assert 0.9 * shift < shared < 1.1 * shift

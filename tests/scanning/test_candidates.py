@@ -163,8 +163,10 @@ def test_glow_that_ends_at_the_strands_of_a_laser_is_taken_off_all_of_them() -> 
     dark = found._replace(height=np.full(found.n, 100.0), width=np.full(found.n, 5.0))
     lit = dark._replace(pull=np.where(strand == 0, 0.02, 0.0))
     clear, moved = (average_groups(one, strand, 2, WALL.normal, True) for one in (dark, lit))
-    glow = np.average(moved.glow, weights=np.bincount(strand))
-    assert moved.glow[1] == 0.0 < glow
+    alone = average_groups(lit, np.where(strand == 0, 0, -1), 1, WALL.normal, True)
+    glow = float(alone.glow[0]) * np.mean(strand == 0)
+    np.testing.assert_allclose(moved.glow, [glow, glow], rtol=1e-12)
+    assert glow > 0.0
     expected = clear.points - PULL_OF_STEP * 5.0 * glow * clear.sensitivity
     np.testing.assert_allclose(moved.points, expected, atol=1e-12)
 

@@ -39,7 +39,8 @@ class Observations(NamedTuple):
     # Shape (M,): standard deviation of that position.
     sigma_px: FloatArray
     # Shape (M,): mean difference between the flanks of its peaks, as a share of their height,
-    # positive where the background is brighter at greater positions.
+    # positive where the background is brighter at greater positions; on a net, of the laser's
+    # strands together.
     glow: FloatArray
     # Shape (M,): of its peaks, means: full width at half height along the search line, in pixels;
     # height above the background, in grey levels.
@@ -355,7 +356,7 @@ def _take_glow_off(seen: Observations, intensity: FloatArray) -> None:
     """Move the light on strands back by the pull of the glow that ends there, given its intensity.
 
     The glow of a sheet is the same beside all of its strands; beside one alone, the light on the
-    net's other twine counts as much.
+    net's other twine counts as much. The strands' `glow` becomes that of all.
     """
     n_lasers = n_bins(seen.laser)
     levels, total = np.zeros(n_lasers), np.zeros(n_lasers)
@@ -363,6 +364,7 @@ def _take_glow_off(seen: Observations, intensity: FloatArray) -> None:
         levels[seen.laser[c]] += intensity[c] * seen.glow[c] * seen.height[c]
         total[seen.laser[c]] += intensity[c]
     for c in range(seen.laser.shape[0]):
-        glow = levels[seen.laser[c]] / (total[seen.laser[c]] * seen.height[c])
+        seen.glow[c] = levels[seen.laser[c]] / (total[seen.laser[c]] * seen.height[c])
         for k in range(3):
-            seen.points[c, k] -= PULL_OF_STEP * seen.width[c] * glow * seen.sensitivity[c, k]
+            moved = PULL_OF_STEP * seen.width[c] * seen.glow[c] * seen.sensitivity[c, k]
+            seen.points[c, k] -= moved

@@ -39,13 +39,15 @@ from aqualvs.scanning.patch import (
     tangent_covariance,
 )
 from aqualvs.scanning.plane_fit import (
+    GLOW_PX,
+    GLOW_SHARE,
+    TWINE_SHARE,
     PlaneFit,
     SharedError,
     fit_pseudo_inverse,
     fit_robust,
     mark_inliers,
     shared_error,
-    twine_share,
     weigh_candidates,
 )
 from aqualvs.scanning.posture import MAX_RMS_SHARE, Posture, Reason, Refusal, posture_of, validate
@@ -452,10 +454,10 @@ class PostureEstimator:
         """Return the errors that observations of a surface share, given its approximate normal."""
         position_px = self._position_px[seen.laser]
         if not on_twine:
-            return shared_error(seen.glow, position_px=position_px)
+            return shared_error(GLOW_PX * seen.glow, position_px=position_px)
         nearer = -np.sign(seen.sensitivity @ normal)
-        twine = nearer * twine_share(seen.height) * seen.width
-        return shared_error(seen.glow, twine, position_px)
+        glow, twine = GLOW_SHARE * seen.glow, TWINE_SHARE * nearer
+        return shared_error(glow * seen.width, twine * seen.width, position_px)
 
     def _posture_of_fit(
         self, candidates: Candidates, seen: Observed, fit: PlaneFit, *, of_all: bool = False
