@@ -16,8 +16,8 @@ from aqualvs.scanning.scan import Frame, planes_of_image
 from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenario import dome_from_target
 from aqualvs.simulation.scenarios import bluerov2_rig, example_rig, flat_port_rig, load_scenario
-from aqualvs.simulation.scene import Scene, SurfaceKind, Wall, WaterOptics
-from aqualvs.simulation.truth import visible_fit
+from aqualvs.simulation.scene import Net, Scene, SurfaceKind, Wall, WaterOptics
+from aqualvs.simulation.truth import target_fit, visible_fit
 from quick_pictures import QuickRenderer
 
 SMALL, WIDE, FLAT = "example", "bluerov2", "flat port"
@@ -66,7 +66,7 @@ def shoot(scenario_name: str, t: float, rig_name: str = SMALL) -> Shot:
     truth = scene.target_plane()
     if scene.target == "net":
         # Lit twine stands a twine radius in front of the net plane.
-        seen = visible_fit(picture.lit, SurfaceKind.NET)
+        seen = target_fit(scene, picture.lit)
         assert seen is not None
         truth = seen[0]
     behind = min((wall.depth for wall in scene.walls), default=np.inf)
@@ -111,11 +111,45 @@ def test_the_glow_of_the_sheets_in_turbid_water_moves_no_wall() -> None:
 def test_a_net(name: str, t: float) -> None:
     shot = shoot(name, t)
     share, pitch, yaw = errors(shot)
-    # A bulge (hexagon), holes and clutter leave less of a plane than a wall does.
-    assert abs(share) < 0.01
-    assert np.hypot(pitch, yaw) < 1.6
+    # Measured: 0.02 % and 0.14 degrees, the latter of the net that bulges (hexagon).
+    assert abs(share) < 0.001
+    assert np.hypot(pitch, yaw) < 0.25
     assert shot.posture
     assert abs(shot.posture.range - shot.posture.nearest) < 0.2 * shot.posture.range
+
+
+def test_a_bulging_net_is_touched_where_it_is_nearest() -> None:
+    """Some bends are too weak to be measured, and are taken for planes."""
+    normalised, is_curved = [], []
+    for i in range(12):
+        rng = np.random.default_rng([77, i])
+        kx, kz = rng.uniform(-0.15, 0.5, 2)
+        net = Net(
+            mesh=("diamond", "square", "hexagon")[i % 3],
+            bar=rng.uniform(0.015, 0.03),
+            roll=rng.uniform(-0.4, 0.4),
+            curvature=(kx, kz),
+        )
+        pose = dome_from_target(rng.uniform(0.35, 0.7), *np.deg2rad(rng.uniform(-8.0, 8.0, 2)))
+        scene = Scene(dome_from_scene=pose, nets=(net,), target="net")
+        renderer, scanner = equipment(SMALL)
+        picture = renderer.render(scene, 0.0, np.random.default_rng(i))
+        luma, chroma = planes_of_image(cv2.cvtColor(picture.image, cv2.COLOR_RGB2BGR))
+        posture = scanner.process(Frame(0, 0.0, luma, chroma)).posture
+        truth = target_fit(scene, picture.lit)
+        assert posture
+        assert truth is not None
+        share, pitch, yaw = errors(Shot(posture, truth[0], np.inf))
+        assert abs(share) < 0.003
+        error = np.array([share * posture.range, *np.deg2rad([pitch, yaw])])
+        normalised.append(error / np.sqrt(np.diag(posture.covariance)))
+        is_curved.append(posture.curvature is not None)
+    assert sum(is_curved) >= 7
+    spread = np.sqrt(np.mean(np.square(normalised)[is_curved], axis=0))
+    assert np.all(spread > 0.35), spread
+    assert np.all(spread < 1.8), spread
+    # Of such nets seen as planes, with few strands or weak bends, one in seven is beyond it.
+    assert np.sum(np.abs(normalised).max(axis=1) > 4.0) <= 1
 
 
 @pytest.mark.parametrize("rig_name", [WIDE, FLAT])
@@ -184,8 +218,8 @@ def test_errors_are_what_the_covariance_says() -> None:
         normalised.append(error / np.sqrt(np.diag(shot.posture.covariance)))
     values = np.array(normalised)
     assert np.all(np.isfinite(values))
-    # One is ideal; 13 frames of three kinds know it to 20 %, and a bulging net is no plane.
+    # One is ideal; 13 frames of three kinds know it to 20 %.
     spread = np.sqrt(np.mean(values**2, axis=0))
     assert np.all(spread > 0.35), spread
-    assert np.all(spread < 2.6), spread
-    assert np.abs(values).max() < 7.5
+    assert np.all(spread < 1.6), spread
+    assert np.abs(values).max() < 3.5

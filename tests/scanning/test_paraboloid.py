@@ -71,8 +71,10 @@ def test_a_flat_patch_measures_heights_as_its_plane_does() -> None:
 def test_curvature_is_found_with_its_sigma(bend: tuple[float, float, float]) -> None:
     true = patch_of(0.002, 0.01, -0.02, *bend)
     seen = observed(true, wrong=12)
-    fit = fit_patch(seen, BASE, shared(seen))
-    assert fit is not None
+    found = fit_patch(seen, BASE, shared(seen))
+    assert found is not None
+    assert found.asked_for
+    fit = found.fit
     sigma = np.sqrt(np.diag(fit.covariance))
     # Five standard deviations: 18 comparisons in all must hold.
     assert np.all(np.abs(fit.patch.coefficients - true.coefficients) < 5.0 * sigma)
@@ -82,7 +84,9 @@ def test_curvature_is_found_with_its_sigma(bend: tuple[float, float, float]) -> 
 
 def test_a_plane_is_left_a_plane() -> None:
     seen = observed(patch_of(*FLAT))
-    assert fit_patch(seen, BASE, shared(seen)) is None
+    found = fit_patch(seen, BASE, shared(seen))
+    assert found is not None
+    assert not found.asked_for
     assert not shows_curvature(seen, np.ones(len(seen.laser)), BASE)
 
 
@@ -112,8 +116,9 @@ def test_a_net_that_curls_around_the_vehicle_has_no_nearest_point() -> None:
 
 def test_the_covariance_of_the_tangent_follows_the_scatter() -> None:
     true = patch_of(0.0, 0.01, 0.0, 0.8, 0.0, 0.2)
-    fit = fit_patch(observed(true), BASE, shared(observed(true)))
-    assert fit is not None
+    found = fit_patch(observed(true), BASE, shared(observed(true)))
+    assert found is not None
+    fit = found.fit
     m = nearest_tangent(fit.patch)
     expected = nearest_tangent(true)
     assert m is not None

@@ -12,6 +12,7 @@ from aqualvs.simulation.render import Renderer
 from aqualvs.simulation.scenario import dome_from_target
 from aqualvs.simulation.scenarios import bluerov2_rig, example_rig, load_scenario
 from aqualvs.simulation.scene import Net, Scene, SurfaceKind, Wall, WaterOptics
+from aqualvs.simulation.truth import LitPoints, target_fit, visible_fit
 from windowed_cases import windowed
 
 # Laser light alone: nothing else can pull a stripe's centre.
@@ -182,3 +183,27 @@ def test_hidden_points_are_no_truth():
         gap = np.abs(across - pitch * np.rint(across / pitch))
         # The thinnest clean radius, seen up to 35 degrees off the strand's cross-section.
         assert np.all(gap[~hole] > 0.8 * 0.86 * net.twine / 2)
+
+
+@pytest.mark.parametrize("curvature", [(0.0, 0.0), (0.5, 0.1), (-0.4, 0.3)])
+def test_the_plane_of_a_net_touches_it_where_it_is_nearest(curvature):
+    pose = dome_from_target(0.5, np.deg2rad(5.0), np.deg2rad(-8.0))
+    scene = Scene(dome_from_scene=pose, nets=(Net(curvature=curvature),), target="net")
+    x, z = (one.ravel() for one in np.meshgrid(*[np.linspace(-0.3, 0.3, 1201)] * 2))
+    y = 0.5 * (curvature[0] * x**2 + curvature[1] * z**2)
+    points = pose.apply(np.column_stack([x, y, z]))
+    on_net = np.full(len(x), SurfaceKind.NET, np.int32)
+    lit = LitPoints(points, np.zeros((len(x), 2)), np.zeros(len(x), np.int32), on_net)
+    found = target_fit(scene, lit)
+    assert found is not None
+    plane, residual = found
+    away = np.linalg.norm(points, axis=1)
+    nearest = points[np.argmin(away)] / away.min()
+    assert plane.offset == pytest.approx(away.min(), abs=1e-6)
+    # The grid's nearest point is within half a millimetre of the net's.
+    np.testing.assert_allclose(plane.normal, nearest, atol=2e-3)
+    assert residual < 1e-12
+    if not any(curvature):
+        flat = visible_fit(lit, SurfaceKind.NET)
+        assert flat is not None
+        np.testing.assert_allclose(plane.normal, flat[0].normal, atol=1e-12)

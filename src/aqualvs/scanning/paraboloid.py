@@ -9,7 +9,6 @@ starts there and grows outward, because the fitted band predicts the net beside 
 weighted least-squares fit of the six coefficients.
 """
 
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -417,10 +416,17 @@ def shows_curvature(seen: Observations, weights: FloatArray, plane: Plane) -> bo
     return bool(curvature_hint(seen, weights, flat) > _HINT)
 
 
+class PatchAttempt(NamedTuple):
+    """A patch over one base plane, and whether the residuals of the plane ask for it."""
+
+    fit: PatchFit
+    asked_for: bool
+
+
 def fit_patch(
     seen: Observations, plane: Plane, shared: SharedError, min_bend: float = MIN_BEND
-) -> PatchFit | None:
-    """Fit a patch to M observations, if they are not fitted as well by a plane.
+) -> PatchAttempt | None:
+    """Fit a patch to M observations, and tell whether a plane fits them as well.
 
     Parameters
     ----------
@@ -435,20 +441,19 @@ def fit_patch(
 
     Returns
     -------
-    PatchFit or None
-        None where a plane is as good, or the curvature is not determined.
+    PatchAttempt or None
+        None where the curvature is not determined.
     """
     # Few strands of a coarse net are on the plane, and the others not far from it.
     first = _fit_over(seen, plane, shared, 1.0, min_bend)
     wide_gate = 3.0
-    first = first or _fit_over(seen, plane, shared, wide_gate, min_bend)
-    return first.fit if first is not None and first.asked_for else None
+    return first or _fit_over(seen, plane, shared, wide_gate, min_bend)
 
 
 def refit_at_nearest(fit: PatchFit, seen: Observations, shared: SharedError) -> PatchFit | None:
     """Fit a patch once more, over the plane that touches it at its point nearest to the vehicle.
 
-    p and r are then the curvatures of the net at that point. The covariance is widened.
+    p and r are then the curvatures of the net at that point.
 
     Parameters
     ----------
@@ -468,17 +473,7 @@ def refit_at_nearest(fit: PatchFit, seen: Observations, shared: SharedError) -> 
     inside = fit.weights > 0.0
     length = float(np.linalg.norm(m))
     again = _fit_over(seen, Plane(m / length, 1.0 / length), shared, inside)
-    best = fit if again is None else again.fit
-    # Errors of strands on a bend are more correlated than on a plane: found on simulated nets.
-    loosened = 1.5
-    return replace(best, covariance=loosened**2 * best.covariance)
-
-
-class _Attempt(NamedTuple):
-    """A patch over one base plane, and whether the residuals of the plane ask for it."""
-
-    fit: PatchFit
-    asked_for: bool
+    return fit if again is None else again.fit
 
 
 def _fit_over(
@@ -487,7 +482,7 @@ def _fit_over(
     shared: SharedError,
     start: BoolArray | float,
     min_bend: float = MIN_BEND,
-) -> _Attempt | None:
+) -> PatchAttempt | None:
     """Fit a patch over a plane, grown from given observations or from those within some gates."""
     n = seen.n
     inside = np.empty(n, np.bool_) if isinstance(start, float) else start.copy()
@@ -499,4 +494,4 @@ def _fit_over(
     if not found:
         return None
     bent = Patch(plane, patch[RIGHT:UP], patch[UP:COEFFICIENTS], patch[COEFFICIENTS:])
-    return _Attempt(PatchFit(bent, covariance, weights, rms), asked_for)
+    return PatchAttempt(PatchFit(bent, covariance, weights, rms), asked_for)

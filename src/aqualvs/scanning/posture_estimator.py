@@ -204,11 +204,16 @@ class PostureEstimator:
         bends = target.n_planes > 1 or has_much_beside(off)
         bends = bends or shows_curvature(seen.observations, fit.weights, plane)
         least = MIN_BEND if bends else few * _STRONG_BEND
-        curved = None if least == 0.0 else self._measure_curved(candidates, plane, off, least)
-        best = flat if curved is None else curved
-        if curved is not None and not self._is_observable(candidates, curved):
-            # The net bends, but its posture at the nearest point is not observable.
-            best = _inflate_covariance(flat, curved, 1.0)
+        curved, is_clear = None, False
+        if least > 0.0:
+            curved, is_clear = self._measure_curved(candidates, plane, off, least)
+        best = flat
+        if curved is not None:
+            is_observable = self._is_observable(candidates, curved)
+            if is_clear and is_observable:
+                best = curved
+            elif is_clear or (is_observable and _may_bend(curved.posture, seen)):
+                best = _inflate_covariance(flat, curved, 1.0)
         patch = packed_plane(plane) if best.patch is None else best.patch.packed()
         net_mask = self._grow_net_mask(candidates, best.inliers, plane, patch)
         seen = self._beside(candidates, net_mask, off, plane)
@@ -409,26 +414,26 @@ class PostureEstimator:
 
     def _measure_curved(
         self, candidates: Candidates, plane: Plane, off: FloatArray, min_bend: float
-    ) -> Measurement | None:
-        """Measure the posture to a curved net; None where a plane is as good."""
+    ) -> tuple[Measurement | None, bool]:
+        """Measure the posture to a curved net, and return whether the residuals ask for it."""
         near = off < _DEEPEST_BEND
         seen = self._observer.observe(candidates, near, plane, on_twine=True)
         if not seen.observations.n:
-            return None
+            return None, False
         shared = self._shared_error(seen.observations, plane.normal, on_twine=True)
-        fit = fit_patch(seen.observations, plane, shared, min_bend)
-        fit = fit and refit_at_nearest(fit, seen.observations, shared)
+        first = fit_patch(seen.observations, plane, shared, min_bend)
+        fit = first and refit_at_nearest(first.fit, seen.observations, shared)
         m = None if fit is None else nearest_tangent(fit.patch)
-        if fit is None or m is None:
-            return None
+        if first is None or fit is None or m is None:
+            return None, False
         tangent = PlaneFit(m, tangent_covariance(fit, m), fit.weights, fit.rms)
         found = self._posture_of_fit(candidates, seen, tangent)
         if found is None or isinstance(found.posture, Refusal):
-            return None
+            return None, False
         along = fit.patch.coefficients[[3, 5]].tolist()
         sigma = np.sqrt(np.diag(fit.covariance))[[3, 5]].tolist()
         bent = replace(found.posture, curvature=tuple(along), sigma_curvature=tuple(sigma))
-        return replace(found, posture=bent, patch=fit.patch)
+        return replace(found, posture=bent, patch=fit.patch), first.asked_for
 
     def _fit(self, candidates: Candidates, seen: Observed, target: Surface) -> PlaneFit | None:
         observations = seen.observations
@@ -509,6 +514,16 @@ def _share_on(seen: Observed, patch: FloatArray, plane: Plane) -> float:
 def _plane_of(fit: PlaneFit) -> Plane:
     distance = 1.0 / math.hypot(*fit.m.tolist())
     return Plane(fit.m * distance, distance)
+
+
+def _may_bend(curved: Posture | Refusal, seen: Observed) -> bool:
+    """Return whether a net's curvature is more than chance would make of a flat net's strands."""
+    if not isinstance(curved, Posture) or not (curved.curvature and curved.sigma_curvature):
+        return False
+    # In sigmas; of fewer strands chance makes more. Flat nets keep their covariance with these.
+    by_chance, fewest = 3.0, 24
+    beyond = np.abs(curved.curvature) > by_chance * np.array(curved.sigma_curvature)
+    return seen.observations.n >= fewest and bool(beyond.any())
 
 
 def _inflate_covariance(found: Measurement, other: Measurement, share: float) -> Measurement:

@@ -33,7 +33,7 @@ from aqualvs.simulation.render import Renderer, SceneAt
 from aqualvs.simulation.scenario import Scenario, packaged, parse_scenario
 from aqualvs.simulation.scenarios import example_rig
 from aqualvs.simulation.scene import Scene, SurfaceKind
-from aqualvs.simulation.truth import LitPoints, visible_fit
+from aqualvs.simulation.truth import LitPoints, target_fit
 from aqualvs.simulation.video import VideoWriter
 
 CONTRAST_LIMIT = 10.0
@@ -357,7 +357,7 @@ def truth_cells(scene: Scene, visible: LitPoints) -> list[Cell]:
     if scene.target == "none":
         return ["", "", "", *counts, "", "", "", ""]
     plane = scene.target_plane()
-    fit = visible_fit(visible, _LABELS[scene.target])
+    fit = target_fit(scene, visible)
     if fit is None:
         return [*_posture(plane), *counts, "", *_posture(plane)]
     return [*_posture(fit[0]), *counts, f"{1e3 * fit[1]:.3f}", *_posture(plane)]

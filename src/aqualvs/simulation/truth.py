@@ -154,13 +154,16 @@ TRUTH_COLUMNS = (
 
 Range, pitch, yaw, normal and d are those of the target plane; empty without a target. The
 `visible_fit` columns hold the plane through all visible lit points of the target (for a net they
-lie on the front of the twine, up to a twine radius before the net plane); empty where the points
-do not span a plane. The `pts` columns count visible lit points by what they lie on.
+lie on the front of the twine, up to a twine radius before the net plane), or of a net that bulges
+the plane that touches it where it is nearest to the dome; empty where the points do not span a
+plane. The `pts` columns count visible lit points by what they lie on.
 """
 
 # Ratio of the second to the first spread of lit points below which they lie on one line.
 _FLAT = 0.02
 _AIR = 1.1
+# Each step divides what is left by the radius over the range; nets bend less than 1 / m.
+_STEPS_TO_NEAREST = 40
 _LABELS: dict[Target, SurfaceKind] = {"net": SurfaceKind.NET, "wall": SurfaceKind.WALL}
 
 
@@ -173,7 +176,7 @@ def truth_row(frame: int, t: float, scene: Scene, rig: Rig, lit: LitPoints) -> l
     if scene.target == "none":
         return [*head, "", "", "", *middle, *([""] * 8), *counts]
     plane = scene.target_plane()
-    fit = visible_fit(lit, _LABELS[scene.target])
+    fit = target_fit(scene, lit)
     seen: list[Cell] = [""] * 4
     if fit is not None:
         seen = [*_posture(fit[0]), 1e3 * fit[1]]
@@ -202,3 +205,32 @@ def visible_fit(lit: LitPoints, label: SurfaceKind) -> tuple[Plane, float] | Non
         return None
     plane = Plane(axes[2], float(axes[2] @ centre)).facing_origin()
     return plane, float(np.abs(plane.signed_distance(points)).max())
+
+
+def target_fit(scene: Scene, lit: LitPoints) -> tuple[Plane, float] | None:
+    """Return the target's plane by its lit points, and their largest residual in metres.
+
+    It is what a posture states: of a net that bulges, the plane that touches it at the point
+    nearest to the dome's centre, moved to where the lit points are; else `visible_fit`.
+    """
+    if scene.target == "none":
+        return None
+    label = _LABELS[scene.target]
+    fit = visible_fit(lit, label)
+    net = scene.nets[0] if scene.nets else None
+    if fit is None or net is None or not any(net.curvature) or net.folds:
+        return fit
+    scene_from_dome = scene.dome_from_scene.inverse()
+    points = scene_from_dome.apply(lit.points_in_dome[lit.label == label])
+    bend = np.array(net.curvature)
+    off = points[:, 1] - 0.5 * points[:, [0, 2]] ** 2 @ bend
+    dome = scene_from_dome.translation
+    place, height = dome[[0, 2]], 0.0
+    for _ in range(_STEPS_TO_NEAREST):
+        place = dome[[0, 2]] / (1.0 + (height - dome[1]) * bend)
+        height = float(0.5 * place**2 @ bend)
+    slope = bend * place
+    normal = np.array([-slope[0], 1.0, -slope[1]]) / np.sqrt(1.0 + slope @ slope)
+    offset = normal @ (np.array([place[0], height, place[1]]) - dome) + off.mean()
+    plane = Plane(scene.dome_from_scene.rotation @ normal, float(offset))
+    return plane, float(np.abs(off).max())
