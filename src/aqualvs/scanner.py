@@ -341,6 +341,13 @@ class Scanner:
             return Refusal(Reason.NOT_A_PLANE, detail)
         if choice.tested.verdict is Verdict.AMBIGUOUS and choice.tested.other is not None:
             return _ambiguous(target.plane, choice.tested.other)
+        others = assignment.other_lines(candidates, subsegments, stripes.shapes, target)
+        if others is not None:
+            detail = (
+                f"beside the stripes on the surface at {target.plane.offset:.3f} m there is "
+                f"{others:.1f} times their light in other lines; does the rig name all lasers?"
+            )
+            return Refusal(Reason.AMBIGUOUS, detail)
         if self.options.target is TargetKind.AUTO and assignment.may_hide_net(
             candidates, subsegments, stripes.shapes, choice.surfaces, target
         ):

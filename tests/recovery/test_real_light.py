@@ -7,6 +7,7 @@ than those of rendered pictures: the board itself may be a millimetre or a degre
 import hashlib
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,8 @@ from aqualvs.calibration.detection.detection import detect_board
 from aqualvs.calibration.targets.target_files import load_board
 from aqualvs.calibration.targets.targets import View
 from aqualvs.optics.rigfile import load_rig
+from aqualvs.scanner import Scanner
+from aqualvs.scanning.scan import Frame, planes_of_image
 from aqualvs.sources.images import read_image
 from laser_cases import laser_error
 from repository import ROOT
@@ -181,6 +184,16 @@ def test_the_board_is_found_in_uneven_light(picture: str, light) -> None:
     assert len(found) >= 0.8 * len(expected)
     index = [expected.ids.tolist().index(number) for number in found.ids]
     assert np.median(np.abs(found.pixels - expected.pixels[index])) < 0.05
+
+
+@pytest.mark.parametrize("picture", PICTURES)
+def test_a_rig_that_names_few_of_the_lasers_reads_no_posture(picture: str) -> None:
+    """Three lines of fifteen, read as any three lasers, often share a plane by chance."""
+    rig = load_rig(PHOTOGRAPHS / "rig.yaml")
+    luma, chroma = planes_of_image(photograph(picture))
+    for named in ((0, 7, 14), (3, 5, 11), (1, 7, 9), (2, 5, 6), (5, 6, 7)):
+        few = replace(rig, lasers=tuple(rig.lasers[i] for i in named), solved_from={})
+        assert not Scanner(few).process(Frame(0, 0.0, luma, chroma)).posture
 
 
 @pytest.mark.parametrize("picture", PICTURES)

@@ -39,6 +39,7 @@ from aqualvs.scanning.assignment_kernels import (
     find_rivals,
     judge_planes,
     loose_share_before,
+    other_lines_share,
     seen_of,
 )
 from aqualvs.scanning.candidates import Candidates, Subsegments
@@ -80,6 +81,14 @@ class _AssignmentOptions(NamedTuple):
     # moved, the other two have more of the light.
     most_share: float = 0.3
     along_way: float = 0.24
+    # On a search line a laser lights something solid once, and through a net perhaps what is behind
+    # it as well. With more light in other lines than these shares of the surface's, the rig does
+    # not name all lasers, and up to this many of them make planes by chance. Complete rigs have
+    # 0.05 at most (before nets 0.95), three of 15 real lasers 0.5 to 4; of 41 pictures with four or
+    # five of 15 on the surface, five were read as other lasers, with six or more none.
+    max_other_lines: float = 0.5
+    max_other_lines_of_net: float = 1.25
+    may_be_chance: int = 4
 
 
 _ODDS = _AssignmentOptions()
@@ -243,6 +252,35 @@ class AssignmentTest:
         # before them have 0.21 to 0.83, half of them 0.32 and more.
         max_loose_share = 0.25
         return bool(share > max_loose_share)
+
+    def other_lines(
+        self,
+        candidates: Candidates,
+        subsegments: Subsegments,
+        shapes: ComponentShapes,
+        target: Surface,
+    ) -> float | None:
+        """Return the light in other lines beside a target's stripes, if it makes them doubtful.
+
+        A rig that names three lasers of 15 finds planes by chance among the stripes of all.
+
+        Parameters
+        ----------
+        candidates, subsegments, shapes, target
+            As in `may_hide_net`.
+
+        Returns
+        -------
+        float or None
+            As a share of the target's own light. None where the target is not in doubt.
+        """
+        n_lasers = len(self._along_x)
+        if len(np.unique(subsegments.laser[target.members])) > _ODDS.may_be_chance:
+            return None
+        on_target = target.members[subsegments.of_candidate]
+        share: float = other_lines_share(candidates, on_target, shapes, n_lasers)
+        most = _ODDS.max_other_lines_of_net if target.is_mesh else _ODDS.max_other_lines
+        return share if share > most else None
 
     def _light_share(
         self,
