@@ -382,7 +382,7 @@ def test_the_error_against_the_truth(tmp_path, column, unit):
         ("", "no rows"),
         ("a,b\n1,2\n", "no column frame"),
         ("frame,pitch_deg,yaw_deg\n0,0,0\n", "no column range_m"),
-        ("frame,range_m,pitch_deg,yaw_deg\n77,1,0,0\n", "tells of 1 frame, none of them in"),
+        ("frame,range_m,pitch_deg,yaw_deg\n77,1,0,0\n", "covers 1 frame, none of them in"),
         ("frame\0,range_m", "no rows"),
     ],
 )
@@ -435,6 +435,6 @@ def test_a_truth_of_empty_water_compares_nothing(request_for, dive, tmp_path):
 def test_the_truth_of_another_dive_does_not_cost_the_report(request_for, dive, tmp_path):
     truth = write_csv(tmp_path / "truth.csv", "frame,range_mm,pitch_deg,yaw_deg", "99,500,0,0")
     request = request_for(dive, truth=truth, report=True)
-    with pytest.raises(AqualvsError, match="tells of 1 frame, none of them in"):
+    with pytest.raises(AqualvsError, match="covers 1 frame, none of them in"):
         run(request, scanner_for=LumaScanner())
     assert "no frame in common" in (request.out / "report.html").read_text(encoding="utf-8")

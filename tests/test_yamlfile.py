@@ -166,12 +166,12 @@ def test_what_is_no_plain_yaml_is_refused_in_one_line(name: str) -> None:
     ("name", "words"),
     [
         ("two keys", "key 'a' appears twice in line 2; keep one of them"),
-        ("unclosed", "in line 2; mend that line"),
+        ("unclosed", "in line 2; fix that line"),
         ("brackets", f"nested deeper than {MAX_DEPTH} levels in line 1"),
         ("alias ladder", f"nested deeper than {MAX_DEPTH} levels in line {MAX_DEPTH}"),
         ("alias bomb", f"more than {MAX_VALUES:,} values in line"),
         ("digits", "whole number of 5000 digits in line 1; shorten it"),
-        ("tag of a float", "'abc' is no float in line 1"),
+        ("tag of a float", "'abc' is not a float in line 1"),
         ("tag of Python", "in line 1; leave the tag out"),
         ("control character", "control character U+0000 in line 2"),
         ("two documents", "a second document begins in line"),
@@ -239,7 +239,7 @@ def test_files_that_are_no_text(tmp_path: Path) -> None:
     with large.open("wb") as file:
         file.truncate(MAX_BYTES + 1)
     assert "is larger than 8 MB" in said(large)
-    assert "is no path" in said(Path("a\0b"))
+    assert "is not a path" in said(Path("a\0b"))
     assert "cannot be read" in said(tmp_path / ("n" * 300))
     assert "\n" not in said(tmp_path / "a\0\nb")
 

@@ -218,7 +218,7 @@ def _measured(scanner: FrameScanner, frame: Frame) -> FrameOutput:
             scanner.look(frame)
         scanner = scanner.scanner
     if not isinstance(scanner, Scanner):
-        raise TypeError(f"{type(scanner).__name__} does not tell its stripes")
+        raise TypeError(f"{type(scanner).__name__} does not return its stripes")
     peaks = scanner.detect(frame)
     return scanner.rig, scanner.measure(frame.index, frame.time_s, peaks), peaks
 

@@ -352,8 +352,8 @@ class Scanner:
             candidates, subsegments, stripes.shapes, choice.surfaces, target
         ):
             detail = (
-                f"much light before the surface at {target.plane.offset:.3f} m shares no plane, "
-                "such as that on a net in folds"
+                f"much light in front of the surface at {target.plane.offset:.3f} m lies in no "
+                "common plane, as on a net in folds"
             )
             return Refusal(Reason.AMBIGUOUS, detail)
         return None

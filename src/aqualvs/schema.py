@@ -81,7 +81,7 @@ class SchemaWords:
         if kind == "invalid_key":
             parent = _place(fault["loc"][:-1]) or "the file"
             return (
-                f"{parent} has the key {shown(fault['input'])}, which is no word; write numbers "
+                f"{parent} has the key {shown(fault['input'])}, which is not a word; write numbers "
                 "with a decimal point, such as 1.5, not 1,5"
             )
         if kind == "missing":

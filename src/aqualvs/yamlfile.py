@@ -112,7 +112,7 @@ _MERGE: Final = object()
 class _TextError(Exception):
     """A fault of a text, its line (from 1; 0 if unknown), and the remedy."""
 
-    def __init__(self, problem: str, line: int, remedy: str = "mend that line") -> None:
+    def __init__(self, problem: str, line: int, remedy: str = "fix that line") -> None:
         super().__init__(problem)
         place = f" in line {line}" if line else ""
         self.text = f"{problem}{place}; {remedy}"
@@ -154,7 +154,7 @@ def read_text(path: Path, what: str, error: type[AqualvsError]) -> str:
     except OSError as fault:
         raise error(f"{path}: cannot be read ({fault.strerror}); {remedy}") from None
     except ValueError:
-        raise error(f"{str(path)!r}: is no path; {remedy}") from None
+        raise error(f"{str(path)!r}: is not a path; {remedy}") from None
     if len(content) > MAX_BYTES:
         raise error(f"{path}: is larger than {MAX_BYTES / 1e6:g} MB; {remedy}")
     try:
@@ -205,7 +205,7 @@ def _parse(text: str) -> Any:
         raise _TextError(f"is not YAML: {problem}", line) from None
     except (yaml.YAMLError, ValueError):
         # The parser in Python leaks a ValueError for an escape that is no character.
-        raise _TextError("is not YAML", 0, "mend it") from None
+        raise _TextError("is not YAML", 0, "fix it") from None
     return builder.content
 
 
@@ -325,7 +325,7 @@ class _Builder:
             return
         merged = node.value if isinstance(node.value, list) else [node.value]
         if parent.merged or not all(isinstance(one, dict) for one in merged):
-            raise _TextError("<< that is no mapping, or appears twice", line)
+            raise _TextError("<< that is not a mapping, or appears twice", line)
         parent.merged = merged
 
 
@@ -345,7 +345,7 @@ def _scalar(event: yaml.ScalarEvent, line: int) -> Any:
     if name == "float" and type(value) is int:
         value = float(value)
     if type(value) is not kinds[name]:
-        raise _TextError(f"{_shown(text)} is no {name}", line)
+        raise _TextError(f"{_shown(text)} is not a {name}", line)
     return value
 
 

@@ -149,7 +149,7 @@ def test_a_log_that_cannot_be_used_leaves_the_dive_measured(finished, tmp_path):
     record, done, _ = season(replace(finished, request=request))
     assert done == ["look"]
     assert record.state is DiveState.INCOMPLETE
-    assert record.words.startswith("state of the net: ")
+    assert record.words.startswith("condition of the net: ")
     assert str(log) in record.words
     assert (finished.request.out / "points.parquet").is_file()
     os.unlink(log)

@@ -210,8 +210,8 @@ REFUSED = [
         ("LENSMODEL_SPLINED", "mrcal-convert-lensmodel"),
     ),
     (MRCAL, "LENSMODEL_OPENCV4", "LENSMODEL_OPENCV5", ("8 values; write 9",)),
-    (MRCAL, "[720, 576]", "(", ("no Python literal",)),
-    (MRCAL, "[720, 576]", "open('x')", ("no Python literal",)),
+    (MRCAL, "[720, 576]", "(", ("not a Python literal",)),
+    (MRCAL, "[720, 576]", "open('x')", ("not a Python literal",)),
     (COLMAP, " OPENCV ", " THIN_PRISM_FISHEYE ", ("'THIN_PRISM_FISHEYE'", "FULL_OPENCV")),
     (COLMAP, " OPENCV ", " FULL_OPENCV ", ("8 values; write 12: fx, fy, cx, cy, k1",)),
     (COLMAP, "1 OPENCV", "1 PINHOLE 1 1 1 1 1 1\n2 OPENCV", ("cameras 1, 2", "--camera 1")),
@@ -252,7 +252,7 @@ def test_thin_prism_terms_of_mrcal_are_refused(tmp_path):
 def test_nothing_in_a_cameramodel_is_run(tmp_path):
     path = tmp_path / "cam.cameramodel"
     path.write_text(f"{{'lensmodel': 'LENSMODEL_X', 'a': open({str(tmp_path / 'made')!r}, 'w')}}")
-    with pytest.raises(RigError, match="no Python literal"):
+    with pytest.raises(RigError, match="not a Python literal"):
         read_camera(path)
     assert not (tmp_path / "made").exists()
 
@@ -364,7 +364,7 @@ def test_files_of_aqualvs_are_not_taken_for_others():
 def test_what_is_no_calibration_is_told_what_there_is(tmp_path):
     path = tmp_path / "x.yaml"
     path.write_text("a: 1\n")
-    with pytest.raises(RigError, match="no calibration that is known; give a camera_info"):
+    with pytest.raises(RigError, match="not a calibration in a known format; give a camera_info"):
         read_camera(path)
     with pytest.raises(RigError, match="is a rig file already"):
         read_camera(DEMO / "rig.yaml")

@@ -77,7 +77,7 @@ def test_the_consequence_is_what_the_old_rig_reads(tmp_path: Path) -> None:
 
 def test_without_sigmas_only_what_matters_counts(tmp_path: Path) -> None:
     page = compared(turned(example_rig(), 0.3), example_rig(), tmp_path)
-    assert "Neither rig says how well it is known" in page
+    assert "Neither rig states its uncertainty" in page
     assert "Laser 'left' moved by 0.3 deg" in page
     assert "not changed at all: the lens" in page
     page = compared(turned(example_rig(), 0.01), example_rig(), tmp_path)
@@ -86,7 +86,7 @@ def test_without_sigmas_only_what_matters_counts(tmp_path: Path) -> None:
 
 def test_one_rig_alone_may_know_its_sigmas(tmp_path: Path) -> None:
     page = compared(estimated(turned(example_rig(), 0.42), 1), example_rig(), tmp_path)
-    assert "old.yaml does not say how well it is known; sigmas are those of the other rig." in page
+    assert "old.yaml does not state its uncertainty; sigmas are those of the other rig." in page
     assert "Laser 'left' moved by 0.42 deg" in page
 
 
@@ -142,7 +142,7 @@ def test_lasers_of_other_names_are_compared_where_they_lie(tmp_path: Path) -> No
                 example_rig(),
                 lasers=(replace(example_rig().lasers[0], name="low"), *example_rig().lasers[1:]),
             ),
-            "Lasers lie where others lay, and are compared as these: 'low' as 'lower'.",
+            "Lasers with new names are matched by their planes: 'low' as 'lower'.",
         ),
         (
             replace(example_rig(), lasers=example_rig().lasers[:1], name="one"),

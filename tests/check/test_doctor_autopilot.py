@@ -65,10 +65,10 @@ def test_a_vehicle_that_is_ready(vehicle: Fake) -> None:
     assert told(findings, "FS_PILOT_INPUT 1 (warn)") is OK
     assert told(findings, "FS_PILOT_TIMEOUT 1 s") is OK
     # What the vehicle holds is shown, not what it makes of a 0.
-    said = "PILOT_SPEED_UP 50 (PILOT_SPEED_DN 0: as much downwards): a full stick asks for 0.5 m/s"
+    said = "PILOT_SPEED_UP 50 (PILOT_SPEED_DN 0: the same downwards): a full stick asks for 0.5 m/s"
     assert told(findings, said) is OK
     assert told(findings, "RNGFND1_TYPE 10, RNGFND1_ORIENT 0") is OK
-    assert told(findings, "RNGFND1_MIN, RNGFND1_MAX: 0.2 to 7 m count") is OK
+    assert told(findings, "RNGFND1_MIN, RNGFND1_MAX: 0.2 to 7 m are valid") is OK
 
 
 def test_a_vehicle_as_it_comes(vehicle: Fake) -> None:
@@ -105,7 +105,7 @@ def test_a_vehicle_that_does_not_obey_us(vehicle: Fake) -> None:
 
 def test_a_vehicle_that_does_not_answer(vehicle: Fake) -> None:
     findings = found(vehicle, parameters={}, station=False)
-    assert told(findings, "no parameter is told", "docs/ardusub.md") is WARN
+    assert told(findings, "no parameters received", "docs/ardusub.md") is WARN
     assert told(findings, "ground station 255 is not heard") is WARN
 
 
@@ -119,4 +119,6 @@ def test_a_rangefinder_of_before_4_7_that_is_too_short(vehicle: Fake) -> None:
         for one in autopilot(vehicle.url, VehicleSetup(), Path(str(bundled_dive() / "rig.yaml")))
     }
     least, most = rig.working_range
-    assert told(findings, "0.5 to 7 m count", f"the rig measures {least:g} to {most:g} m") is WARN
+    assert (
+        told(findings, "0.5 to 7 m are valid", f"the rig measures {least:g} to {most:g} m") is WARN
+    )

@@ -76,7 +76,7 @@ def test_a_flat_port_is_described() -> None:
     assert sentences(findings, Severity.BAD) == ""
     said = sentences(findings, Severity.OK)
     assert "a flat port, 12 mm ahead, 5 mm thick and tilted by 0.7 degrees" in said
-    assert "A flat port shows the water's index" in said
+    assert "Through a flat port the index is observable" in said
     steep = replace(
         flat_port_rig(),
         housing=FlatPort(0.012, 0.005, 1.49, 0.7),
@@ -203,7 +203,7 @@ def test_what_makes_a_rig_useless(rig: Rig, words: str) -> None:
         (replace(example_rig(), n_water=1.0003), "that of air"),
         (
             pinhole(upright(0.05), Laser("b", Plane.from_normal([1, 0, 0.1], -0.05))),
-            "6 degrees only",
+            "at only 6 degrees",
         ),
         (
             replace(
@@ -259,7 +259,7 @@ def test_command_on_a_sane_rig(tmp_path: Path) -> None:
     assert "rig 'example'" in page
     assert "lower mm/px" in page
     assert "pixel noise" in page
-    assert "How well the set of intrinsics is known is not written down" in " ".join(page.split())
+    assert "No uncertainty is given for the set of intrinsics" in " ".join(page.split())
     assert "This rig is sane" in page
     # The verdict first, then what needs a hand, then what is well.
     assert page.index("This rig is sane") < page.index(" ok ")
@@ -272,7 +272,7 @@ def test_command_on_a_bad_rig(tmp_path: Path) -> None:
     code, page = checked(path)
     assert code == 2
     assert "rig '[bold]odd'" in page
-    assert "cannot measure as it is: mend 1 fault." in page
+    assert "cannot measure as it is: correct 1 fault." in page
 
 
 def test_command_on_no_rig(tmp_path: Path) -> None:

@@ -71,9 +71,9 @@ def test_a_board_in_several_pictures_is_more_than_one_surface() -> None:
         ({"dome": step(rms_px=2.3)}, "to 2.3 px rms: good pictures leave 0.3 px or less"),
         ({"dome": step(rms_px=0.0)}, "no real picture fits that well"),
         ({"dome": step(400)}, "The calibration of the dome is more than a year old"),
-        ({"dome": step(-3)}, "The date of solved_from.dome, 2026-05-23, is yet to come"),
-        ({"dome": step(pictures=1)}, "rests on 1 picture; take at least 2"),
-        ({"camera": step(pictures=3)}, "rests on 3 pictures; take at least 5"),
+        ({"dome": step(-3)}, "The date of solved_from.dome, 2026-05-23, is in the future"),
+        ({"dome": step(pictures=1)}, "used 1 picture; take at least 2"),
+        ({"camera": step(pictures=3)}, "used 3 pictures; take at least 5"),
         (
             {"lasers": step(pictures=1, extras={"surfaces": 1})},
             "The lasers were seen on one surface of one picture only",
@@ -93,7 +93,7 @@ def test_confident_nonsense_is_doubted(steps: dict[str, SolvedStep], words: str)
 @pytest.mark.parametrize(
     ("sigmas", "words"),
     [
-        ({"lens_y": 3e-3}, "lens's place in the dome is known only to 3.0 mm"),
+        ({"lens_y": 3e-3}, "position of the lens in the dome is known only to 3.0 mm"),
         ({"rotation_z": np.deg2rad(1.0)}, "rotation in the dome is known only to 1.0 degrees"),
         ({"fx": 9.0}, "The focal length is known only to 1.0%"),
         ({"n_water": 5e-3}, "The water's index is known only to 0.005"),
@@ -119,10 +119,8 @@ def test_a_spread_that_no_single_number_shows_is_found() -> None:
 def test_what_is_not_written_down_is_named() -> None:
     rig = with_uncertainty(example_rig(), RigUncertainty.independent({"fx": 0.5, "left:offset": 0}))
     told = said(rig, Severity.OK)
-    assert (
-        "How well the lens's place is known is not written down; assumed (one sigma): 1 mm" in told
-    )
-    assert "How well the laser 'lower', the laser 'right' are known is not written down" in told
+    assert "No uncertainty is given for the lens's place; assumed (one sigma): 1 mm" in told
+    assert "No uncertainty is given for the laser 'lower', the laser 'right'" in told
     assert "laser 'left'," not in told
     assert "intrinsics" not in told
 

@@ -62,7 +62,7 @@ def test_an_interrupted_batch_whose_workers_are_killed_gives_what_runs_give(tmp_
         os.killpg(first.pid, signal.SIGINT)
         rest, errors = first.communicate(timeout=TIMEOUT_S)
     assert first.returncode == 130, errors
-    assert "the same command goes on from here" in rest
+    assert "run the same command to resume" in rest
     assert "Traceback" not in errors
     assert (out / "summary.html").exists()
 

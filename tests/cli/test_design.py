@@ -122,7 +122,7 @@ def test_a_rig_that_exists_is_judged_as_it_is_and_tilted_best(tmp_path, capsys):
     assert first.startswith("Yes: meets its goals")
     assert second.startswith("Its lasers tilted best: Yes: meets its goals")
     assert "As it is" in said
-    assert "Tilted best, its errors are" in said
+    assert "With its lasers tilted best, its errors are" in said
     assert main(["design", "--rig", str(path), "--no-changes", "--no-tilt"]) == 0
     said = capsys.readouterr().out
     assert "As it is" not in said
@@ -141,7 +141,9 @@ def test_the_verdict_on_a_rig_is_not_that_on_its_lasers_tilted_best(near, tmp_pa
     assert first == f"No: from {1e3 * near:.0f} to 1000 mm there is {seen[1]}."
     assert second.startswith("Its lasers tilted best: ")
     # Stripes that must be seen nearer are worse farther off, by less than a factor of two.
-    gain = re.search(r"Tilted best, its errors are (\d+)% of that, at [\d-]+ mm", said)
+    gain = re.search(
+        r"With its lasers tilted best, its errors are (\d+)% of that, at [\d-]+ mm", said
+    )
     assert gain
     assert 60 < int(gain[1]) < 200
     page = (tmp_path / "out" / "design.html").read_text(encoding="utf-8")

@@ -110,7 +110,7 @@ def test_the_size_of_the_pictures_can_be_told(here, capfd, refused):
     other = refused("import", "ros.yaml", "-o", "rig.yaml", "--image", "64x48")
     assert "says 640x480" in other
     # Without a sign of its program a file is not guessed at.
-    assert "no calibration that is known" in refused("import", "camera.json", "-o", "r.yaml")
+    assert "not a calibration in a known format" in refused("import", "camera.json", "-o", "r.yaml")
 
 
 def test_rig_and_nominal_name_the_command(here, capfd, refused):

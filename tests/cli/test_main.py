@@ -137,10 +137,10 @@ def test_faults_of_the_parser_name_option_value_and_help(arguments, said, refuse
 
 def test_faults_of_the_user_become_one_line(monkeypatch, refused):
     def fail(**_):
-        raise AqualvsError("dive.mp4: odd; mend it")
+        raise AqualvsError("dive.mp4: odd; fix it")
 
     monkeypatch.setattr(cli, "app", fail)
-    assert refused("run") == "dive.mp4: odd; mend it"
+    assert refused("run") == "dive.mp4: odd; fix it"
 
 
 @pytest.mark.parametrize(

@@ -121,7 +121,7 @@ def test_a_season_in_the_folder_of_a_batch(cage, tmp_path, capsys):
     said = capsys.readouterr().out
     assert "3 dives on 3 dates, 2026-05-01 to 2026-06-10 (40 days)" in said
     assert "holes the same: 4" in said
-    assert "1 dive without the state of its net is left out: d_20260620" in said
+    assert "1 dive whose net has not been evaluated is left out: d_20260620" in said
     assert all(row["n_dates"] in {"2", "3"} for row in rows(tmp_path / "out" / "net_change.csv"))
 
 
@@ -137,7 +137,9 @@ def test_without_a_log_whole_dives_are_compared_and_it_says_so(cage, tmp_path, c
     (row,) = rows(out / "net_change.csv")
     assert (row["cell"], row["depth_from_m"]) == ("all", "")
     assert {row["state"] for row in rows(out / "holes_change.csv")} == {"not compared"}
-    assert "cannot be told without places" in (out / "net_change.html").read_text(encoding="utf-8")
+    assert "without positions it is unknown" in (out / "net_change.html").read_text(
+        encoding="utf-8"
+    )
 
 
 def test_the_date_is_told_by_the_user_the_names_or_the_video(cage, tmp_path, capsys):
@@ -161,14 +163,14 @@ def test_faults_in_one_line_and_files_of_others_stay(cage, tmp_path, refused):
     (run / "posture.csv").write_text("frame\n")
     (empty / "dives").mkdir(parents=True)
     assert f"run: aqualvs net {run} --log" in refused("net-change", a, run, "-o", out)
-    assert "of which no dive has the state of its net" in refused("net-change", a, empty, "-o", out)
+    assert "in which no net has been evaluated" in refused("net-change", a, empty, "-o", out)
     assert "no run is there" in refused("net-change", a, tmp_path / "nowhere", "-o", out)
     assert "add --date" in refused("net-change", a, b, "-o", out)
     assert "once for every RUN" in refused("net-change", a, b, "--date", "2026-05-01", "-o", out)
-    assert "--date May: is no date" in refused(
+    assert "--date May: is not a date" in refused(
         "net-change", a, b, "--date", "May", "--date", "auto", "-o", out
     )
-    assert "one run is no comparison" in refused("net-change", a, "-o", out)
+    assert "one run cannot be compared" in refused("net-change", a, "-o", out)
     assert "is named twice" in refused("net-change", a, a, "-o", out)
     both = ["--date", "2026-05-01", "--date", "2026-05-01"]
     assert "name runs of another date too" in refused("net-change", a, b, *both, "-o", out)

@@ -20,7 +20,7 @@ def test_a_decimal_comma_in_a_list_of_keys_is_named(tmp_path, refused):
     del content["water"]
     rig.write_text(f"{yaml.safe_dump(content)}water: {{n: 1,3333}}\n")
     assert refused("check", rig) == (
-        f"{rig}: water has the key 3333, which is no word; write numbers with a decimal point, "
+        f"{rig}: water has the key 3333, which is not a word; write numbers with a decimal point, "
         "such as 1.5, not 1,5"
     )
 

@@ -136,5 +136,5 @@ def test_faults_name_file_value_and_remedy(parts, words):
 def test_what_is_no_mapping_is_no_design(tmp_path):
     path = tmp_path / "list.yaml"
     path.write_text("- 1\n")
-    with pytest.raises(AqualvsError, match="is no design"):
+    with pytest.raises(AqualvsError, match="is not a design"):
         load_design(path)

@@ -75,7 +75,7 @@ def test_run_writes_all_files_and_says_each_result(tmp_path):
     assert code == 0
     assert lines[0].startswith("[1/2] rig: Found 1. (")
     assert lines[1].startswith("[2/2] box: Found 1. (")
-    assert lines[2].startswith("2 of 2 bars met")
+    assert lines[2].startswith("2 of 2 criteria met")
     assert named(tmp_path) == ["rig", "box"]
     for suffix in ("png", "pdf", "svg"):
         assert (tmp_path / "figures" / f"box_chart.{suffix}").stat().st_size > 500
@@ -98,7 +98,8 @@ def test_failure_is_one_line_and_does_not_stop_the_rest(tmp_path):
     code, lines = run(tmp_path, "rig", "dome", "box", dome=fault)
     assert code == 1
     assert lines[1] == (
-        "[2/3] dome: failed: ValueError: no stripes at all; the whole story is in failures/dome.txt"
+        "[2/3] dome: failed: ValueError: no stripes at all; the full traceback is in "
+        "failures/dome.txt"
     )
     assert "1 of 3 experiments failed: dome" in lines
     assert "Traceback" in (tmp_path / "failures" / "dome.txt").read_text()
@@ -156,7 +157,7 @@ def test_missed_bar_is_said_and_counted(tmp_path):
     code, lines = run(tmp_path, "rig", "dome", dome={"met": False})
     assert code == 0
     assert "MISSED: range error, %." in lines[1]
-    assert lines[2].startswith("1 of 2 bars met")
+    assert lines[2].startswith("1 of 2 criteria met")
 
 
 def test_unknown_name_is_refused_before_anything_is_written(tmp_path):

@@ -67,7 +67,7 @@ def test_a_flat_net_without_a_common_pattern_is_not_laid_at_random(cage):
     second = flat(dive(other, 21, bearings=(0.0, 60.0), depths=LANES))
     result = compare([first, second], 1.0)
     assert result.wall is None
-    assert any("do not tell how it lies along the net" in one for one in result.warnings)
+    assert any("do not determine its position along the net" in one for one in result.warnings)
 
 
 def test_a_round_net_without_a_common_pattern_keeps_its_places_and_their_doubt(cage):
@@ -107,9 +107,9 @@ def test_another_net_and_other_options_are_warned_of(cage):
     facts = {**other.facts, "options": {"twine_mm": 2.5}}
     facts["summary"] = {**other.facts["summary"], "bar_mm": 30.0, "track_slip_m": 1.2}
     warnings = "\n".join(compare([one, replace(other, facts=facts)], 1.0).warnings)
-    assert "is it the same net?" in warnings
+    assert "is this the same net?" in warnings
     assert "--twine-mm" in warnings
-    assert "part by 1.2 m" in warnings
+    assert "differ by 1.2 m" in warnings
 
 
 def test_a_raster_goes_round():

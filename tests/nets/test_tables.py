@@ -236,7 +236,7 @@ def test_summary_in_words(wall):
 
 def test_summary_of_a_net_whose_mesh_nobody_could_make_out():
     said = net_lines(walled([stretch(0, (0.0, 0.0), seen=False)]), 0.0, 30)
-    assert said[0] == "net: its mesh could not be made out"
+    assert said[0] == "net: its mesh could not be determined"
     assert said[1] == "solidity: not measured in any stretch"
 
 
@@ -257,10 +257,10 @@ def test_a_track_that_slipped_is_told(tmp_path):
     climbing = [stretch(i, (STEP * (i + 1), 0.3 * (i + 1))) for i in range(N)]
     wall = walled(climbing, vehicle=log())
     said = net_lines(wall, 1.0, 200)[-1]
-    assert said.startswith("warning: the track and the log's depth part by 1.8 m")
+    assert said.startswith("warning: the track and the log's depth differ by 1.8 m")
     dive = make_dive(tmp_path / "run", video=False)
     write_net_files(dive.folder, wall, {"summary": net_dict(wall, 1.0, 200, 190)})
-    assert "part by 1.8 m" in write_report(dive.folder).read_text(encoding="utf-8")
+    assert "differ by 1.8 m" in write_report(dive.folder).read_text(encoding="utf-8")
 
 
 def test_a_track_that_always_breaks_is_told(tmp_path):

@@ -166,7 +166,7 @@ def noted(**changes: Any) -> dict[str, Any]:
         ("good", "does not have the keys parameters, sigma, correlation"),
         ({"sigma": [1.0]}, "does not have the keys"),
         (noted(extra=1), "does not have the keys"),
-        (noted(parameters="fx_px"), "parameters is no list"),
+        (noted(parameters="fx_px"), "parameters is not a list"),
         (noted(parameters=["fx_px", "fy", "k1"]), r"\[1\] is 'fy'.*did you mean 'fy_px'"),
         (noted(parameters=["fx_px", ["fy_px"], "k1"]), r"\[1\] is \['fy_px'\]"),
         (noted(parameters=["fx_px", "fy_px", "up:offset_mm"]), "which this rig does not have"),

@@ -258,7 +258,7 @@ def test_a_file_that_is_no_rig_is_not_replaced_by_one(tmp_path: Path) -> None:
     for text in (PRECIOUS, "squares_x: 11\n", "a: [", ""):
         path = tmp_path / "board.yaml"
         path.write_text(text)
-        with pytest.raises(OutputError, match="exists and is no rig file"):
+        with pytest.raises(OutputError, match="exists and is not a rig file"):
             save_rig(example_rig(), path)
         assert path.read_text() == text
 

@@ -150,7 +150,9 @@ def test_a_word_where_a_number_belongs_is_told(tmp_path):
     folder = written(tmp_path / "run", dive())
     path = folder / "posture.csv"
     path.write_text(path.read_text().replace("0.510000", "much", 1))
-    with pytest.raises(SourceError, match=r"posture\.csv: frame 1 holds what is no number"):
+    with pytest.raises(
+        SourceError, match=r"posture\.csv: frame 1 holds a value that is not a number"
+    ):
         list(read_run(folder))
 
 

@@ -33,7 +33,7 @@ def test_the_lit_plane_is_in_millimetres_whatever_the_range_column(tmp_path: Pat
     [
         ("frame,range_mm,pitch_deg,yaw_deg\n0,0.6,1,2\n", "range_mm is 0.6 in the first row"),
         ("frame,range_m,pitch_deg,yaw_deg\n0,600,1,2\n", "range_m is 600 in the first row"),
-        ("frame,range_m,pitch_deg,yaw_deg\n3,0.6,1,2\n3,0.7,1,2\n", "tells of frame 3 twice"),
+        ("frame,range_m,pitch_deg,yaw_deg\n3,0.6,1,2\n3,0.7,1,2\n", "has frame 3 twice"),
     ],
 )
 def test_a_truth_that_cannot_be_meant_is_refused(table: str, words: str, tmp_path: Path) -> None:

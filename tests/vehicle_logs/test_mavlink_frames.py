@@ -235,7 +235,7 @@ def test_a_log_without_autopilot_is_refused(tmp_path: Path) -> None:
     records = [
         record(float(i), 0, heartbeat(0, False, (6, 8)), sender=(255, 190)) for i in range(9)
     ]
-    with pytest.raises(SourceError, match="no autopilot tells depth or attitude in 9 messages"):
+    with pytest.raises(SourceError, match="no depth or attitude from an autopilot in 9 messages"):
         logged(tmp_path, b"".join(records))
 
 

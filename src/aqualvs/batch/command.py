@@ -71,7 +71,7 @@ def batch(request: BatchRequest, echo: Callable[[str], object]) -> int:
         (request.out / HOME).mkdir(parents=True, exist_ok=True)
     lock = request.out / HOME / _LOCK
     if is_locked(lock):
-        raise OutputError(f"{request.out}: another batch is under way here; wait for its end")
+        raise OutputError(f"{request.out}: another batch is running here; wait for it to end")
     with writing(lock):
         held = AppendFile(lock)
         held.lock()
@@ -181,7 +181,7 @@ def _summary_lines(
     ]
     if stopped_by:
         lines.append(
-            f"stopped by {stopped_by}; what is finished is kept, the same command goes on from here"
+            f"stopped by {stopped_by}; finished work is kept; run the same command to resume"
         )
     return [*lines, f"data set: {request.out / DATASET}"]
 

@@ -147,7 +147,7 @@ def read_list(path: Path) -> list[Dive]:
     text = read_text(path, "a list of dives", OptionError)
     rows = list(_csv_rows(text, path) if path.suffix.lower() == ".csv" else _yaml_rows(text, path))
     if not rows:
-        raise OptionError(f"{path}: lists no dive; give at least one row")
+        raise OptionError(f"{path}: lists no dives; give at least one row")
     return [_listed(row, path, number) for number, row in enumerate(rows, 1)]
 
 
@@ -167,7 +167,7 @@ def _yaml_rows(text: str, path: Path) -> Iterable[Mapping[str, Any]]:
         content = content["dives"]
     if not isinstance(content, list) or not all(isinstance(row, dict) for row in content):
         raise OptionError(
-            f"{path}: no list of dives; give mappings with the keys {', '.join(_KEYS)}"
+            f"{path}: not a list of dives; give mappings with the keys {', '.join(_KEYS)}"
         )
     return content
 
@@ -256,7 +256,7 @@ def find_dives(
             log=_log_of(source, listed.log),
         )
         if found.setdefault(source, dive) != dive:
-            raise OptionError(f"{source}: given twice, with different words; name it once")
+            raise OptionError(f"{source}: given twice with different settings; name it once")
     return list(found.values())
 
 
@@ -377,7 +377,7 @@ class DiveRecord:
         """Return the record of a dive with a result."""
         faults = [str(facts["fault"])]
         if "net_fault" in facts:
-            faults.append(f"state of the net: {facts['net_fault']}")
+            faults.append(f"condition of the net: {facts['net_fault']}")
         fault = "; ".join(filter(None, faults))
         state = DiveState.INCOMPLETE if fault else DiveState.FINISHED
         return cls(name=name, source=source, state=state, words=fault, facts=facts, reused=reused)

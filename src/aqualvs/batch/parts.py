@@ -284,7 +284,7 @@ def join_dive(work: DiveWork, probe: DiveProbe, results: Sequence[PieceResult]) 
     pieces = [piece_folder(work, probe, number) for number in range(len(probe.spans))]
     for number, piece in enumerate(pieces):
         if read_valid_manifest(piece, piece_key(probe, number)) is None:
-            raise PieceLostError(f"{piece}: is not intact")
+            raise PieceLostError(f"{piece}: is damaged")
     began_s = time.process_time()
     out, home = work.request.out, work.home
     with writing(out), scratch(home, "joining") as draft:

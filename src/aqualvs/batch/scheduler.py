@@ -128,8 +128,8 @@ class DaskWorkers(Closing):
                 self._seen_s = now_s
             elif now_s > self._seen_s + no_worker_s:
                 raise WorkersGoneError(
-                    f"no worker has been there for {no_worker_s:.0f} s; what is finished is kept, "
-                    "see to the workers and run the same command again"
+                    f"no worker for {no_worker_s:.0f} s; finished work is kept: check the workers "
+                    "and run the same command again"
                 )
             self._n_slots = max(1, n_slots)
             self._count_again_s = now_s + count_every_s
@@ -150,7 +150,7 @@ class DaskWorkers(Closing):
             return FinishedTask(token, value=future.result())
         error = future.exception() if future.status == "error" else None
         if error is None or isinstance(error, self._killed):
-            error = WorkersLostError("the processes that worked on it died, again and again")
+            error = WorkersLostError("its worker processes died repeatedly")
         return FinishedTask(token, error=error)
 
     def check_sight(self, path: Path) -> None:

@@ -152,7 +152,7 @@ def probe(work: DiveWork) -> DiveProbe:
         )
     why = found.why_whole
     if work.request.index_target is not None:
-        why = "the water is followed from frame to frame"
+        why = "the water's index is tracked from frame to frame"
     return found.in_one_piece(why) if why or not spans else found
 
 
@@ -163,7 +163,7 @@ def _content(dive: OpenDive, piece_frames: int, margin: int) -> dict[str, Any]:
         try:
             video = video_spans(path, piece_frames, margin)
         except (av.error.FFmpegError, OSError) as fault:
-            return _uncut(path, f"cannot be looked through ({fault})")
+            return _uncut(path, f"cannot be scanned ({fault})")
         return {
             "source_key": digest({"packets": video.checksum, "n_bytes": video.n_bytes}),
             "spans": [asdict(span) for span in video.spans],
@@ -172,7 +172,7 @@ def _content(dive: OpenDive, piece_frames: int, margin: int) -> dict[str, Any]:
         }
     if isinstance(pictures, ImageSource) and path.is_dir():
         return _images(path, piece_frames, margin)
-    return _uncut(path, "recordings and bags are not cut")
+    return _uncut(path, "recordings and bags are not split")
 
 
 def _images(folder: Path, piece_frames: int, margin: int) -> dict[str, Any]:

@@ -135,7 +135,7 @@ def rig_of_camera(
     except AqualvsError:
         raise
     except (ArithmeticError, ValueError):
-        raise RigError(f"{source}: holds numbers that are no camera's; correct them") from None
+        raise RigError(f"{source}: its numbers do not describe a camera; correct them") from None
 
 
 def camera_of_rig(rig: Rig) -> ForeignCamera:
@@ -269,7 +269,7 @@ class Entries:
         if skew != 0.0:
             raise RigError(f"{key} has a skew of {skew:g}, which the lens of aqualvs lacks")
         if (zero, *last) != (0.0, 0.0, 0.0, 1.0):
-            raise RigError(f"{key} is no camera matrix; write [fx, 0, cx, 0, fy, cy, 0, 0, 1]")
+            raise RigError(f"{key} is not a camera matrix; write [fx, 0, cx, 0, fy, cy, 0, 0, 1]")
         return fx, fy, cx, cy
 
 

@@ -51,7 +51,7 @@ def format_of(path: Path) -> tuple[CalibrationFormat, str]:
             raise RigError(f"{path}: is a rig file already; give it to --rig")
         *most, last = FORMAT_TEXTS.values()
         known = f"{', '.join(most)}, or {last}"
-        raise RigError(f"{path}: is no calibration that is known; give {known}")
+        raise RigError(f"{path}: is not a calibration in a known format; give {known}")
     return found, text
 
 
@@ -121,7 +121,7 @@ def camera_text(camera: ForeignCamera, to: str, *, suffix: str = "") -> str:
         return opencv_text(camera, suffix)
     if to in EXPORTS:
         return colmap_text(camera, refractive=to == "colmap-underwater")
-    raise RigError(f"{to!r} is no format; use one of {', '.join(EXPORTS)}")
+    raise RigError(f"{to!r} is not a format; use one of {', '.join(EXPORTS)}")
 
 
 @contextlib.contextmanager

@@ -160,7 +160,7 @@ def _xml(text: str) -> dict[str, Any]:
     try:
         root = ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError, LookupError) as fault:
-        raise RigError(f"is not XML: {fault}; mend it") from None
+        raise RigError(f"is not XML: {fault}; fix it") from None
     xml_depth = 3
     return {node.tag: _xml_value(node, xml_depth) for node in root}
 
@@ -201,7 +201,7 @@ def read_mrcal(text: str, source: str) -> ForeignCamera:
             warnings.simplefilter("ignore")
             content = ast.literal_eval(text.strip())
     except (ValueError, SyntaxError, TypeError, MemoryError, RecursionError):
-        raise RigError("is no Python literal, as a cameramodel is; mend it") from None
+        raise RigError("is not a Python literal, as a cameramodel is; fix it") from None
     entries = Entries.top(content)
     model = entries.word("lensmodel", "lens_model")
     if model not in _COUNTS:

@@ -290,7 +290,7 @@ def run_compare(new: Path, old: Path, console: Console | None = None) -> int:
     console.print(_table(new_rig, old_rig, difference))
     known = {new: bool(new_uncertainty.names), old: bool(old_uncertainty.names)}
     same = [f"'{name}' as '{before}'" for name, before in called.items()]
-    renamed = [f"Lasers lie where others lay, and are compared as these: {', '.join(same)}."]
+    renamed = [f"Lasers with new names are matched by their planes: {', '.join(same)}."]
     for line in (*(renamed if same else []), *_limits(known), *_mismatches(new_rig, old_rig)):
         console.print(line, markup=False, highlight=False)
     return 0
@@ -364,7 +364,7 @@ def _turn_part(difference: RigDifference) -> ComparedPart:
 def _intrinsics_part(new: Rig, old: Rig, difference: RigDifference) -> ComparedPart:
     share = max(abs(new.lens.fx / old.lens.fx - 1.0), abs(new.lens.fy / old.lens.fy - 1.0))
     centre = math.hypot(difference.of("cx"), difference.of("cy"))
-    did = f"changed by {share:.2%} in focal length and {centre:.2g} px in the image centre"
+    did = f"changed by {share:.2%} in focal length and {centre:.2g} px in the principal point"
     matters = share > _FOCAL_SHARE or centre > _CENTRE_PX
     names = old.lens.parameter_names
     return _part(difference, "the intrinsics", names, did, matters)
@@ -457,11 +457,11 @@ def _limits(known: dict[Path, bool]) -> Iterator[str]:
     without = [str(path) for path, is_known in known.items() if not is_known]
     if len(without) == len(known):
         yield (
-            "Neither rig says how well it is known, so whatever is too little to matter counts as "
+            "Neither rig states its uncertainty, so changes that are too little to matter count as "
             "chance."
         )
     elif without:
-        yield f"{without[0]} does not say how well it is known; sigmas are those of the other rig."
+        yield f"{without[0]} does not state its uncertainty; sigmas are those of the other rig."
 
 
 def _mismatches(new: Rig, old: Rig) -> Iterator[str]:

@@ -111,7 +111,7 @@ def _ardusub(
     yield _channels(channels_hz)
     if not told:
         yield Finding.warn(
-            "no parameter is told: the vehicle does not answer us; look its settings up in the "
+            "no parameters received: the vehicle does not answer; check its settings in the "
             "ground station (docs/ardusub.md lists them)"
         )
         return
@@ -150,7 +150,7 @@ def _attitude(rate_hz: float) -> Finding:
     if rate_hz >= enough_hz:
         return Finding.ok(f"{words}: follow hears the vehicle between its heartbeats")
     return Finding.warn(
-        f"{words}: follow takes the vehicle for silent between its heartbeats; set MAV1_EXTRA1 "
+        f"{words}: follow regards the vehicle as silent between its heartbeats; set MAV1_EXTRA1 "
         f"{enough_hz:.0f} (before 4.7: SR0_EXTRA1; the number is that of the autopilot's port)"
     )
 
@@ -234,8 +234,8 @@ def _machine() -> Iterator[Finding]:
         yield Finding.warn(f"only {free_gb:.1f} GB free here; recordings need about 1 GB an hour")
     if not keeps_code(project_all):
         yield Finding.warn(
-            "every command compiles anew, because no folder for compiled code can be written; set "
-            "NUMBA_CACHE_DIR to one that can"
+            "every command recompiles its kernels, because no cache folder is writable; set "
+            "NUMBA_CACHE_DIR to a writable folder"
         )
 
 

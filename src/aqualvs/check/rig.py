@@ -107,8 +107,8 @@ def _doubts(name: str, step: SolvedStep, now: datetime) -> Iterator[Finding]:
     days, old_days = (now - step.date).days, 365
     if days < -1:
         yield Finding.warn(
-            f"The date of solved_from.{name}, {step.date:%Y-%m-%d}, is yet to come; set the clock "
-            "of the computer that calibrates."
+            f"The date of solved_from.{name}, {step.date:%Y-%m-%d}, is in the future; set the "
+            "clock of the computer that calibrates."
         )
     if days > old_days:
         yield Finding.warn(
@@ -121,7 +121,7 @@ def _doubts(name: str, step: SolvedStep, now: datetime) -> Iterator[Finding]:
         )
     if step.pictures < _FEW_PICTURES.get(name, 1):
         yield Finding.warn(
-            f"The calibration of the {name} rests on {count_text(step.pictures, 'picture')}; take "
+            f"The calibration of the {name} used {count_text(step.pictures, 'picture')}; take "
             f"at least {_FEW_PICTURES.get(name, 1)}, at different tilts and distances."
         )
     surfaces = step.extras.get(SURFACES)
@@ -149,24 +149,23 @@ def _assumed(rig: Rig, steps: dict[str, SolvedStep]) -> Iterator[Finding]:
     """Yield findings on numbers without a stated uncertainty, and on what is assumed for them."""
     if is_exact(rig):
         yield Finding.ok(
-            "The rig's numbers count as exact (solved_from.uncertainty), as those of a simulated "
-            "dive are; take that out for a rig that was built."
+            "The rig's numbers count as exact (solved_from.uncertainty), as for a simulated dive; "
+            "remove that key for a real rig."
         )
     alike: dict[str, list[str]] = {}
     for one in assumptions(rig):
         alike.setdefault(one.words, []).append(f"the {one.what}")
     for words, what in alike.items():
-        verb = "is" if len(what) == 1 else "are"
         yield Finding.ok(
-            f"How well {', '.join(what)} {verb} known is not written down; assumed (one sigma): "
-            f"{words}. 'aqualvs calibrate' finds it out."
+            f"No uncertainty is given for {', '.join(what)}; assumed (one sigma): {words}. "
+            "'aqualvs calibrate' determines it."
         )
     for name, step in steps.items():
         numbers = step.extras.get(ASSUMED)
         if isinstance(numbers, list) and numbers:
             yield Finding.ok(
-                f"The calibration of the {name} assumed how well {', '.join(map(str, numbers))} "
-                "are known: they were written by hand."
+                f"The calibration of the {name} assumed an uncertainty for "
+                f"{', '.join(map(str, numbers))}, which were written by hand."
             )
 
 
@@ -175,7 +174,7 @@ def _loose(rig: Rig, uncertainty: RigUncertainty) -> Iterator[Finding]:
     lens = _largest(uncertainty, POSE_PARAMETERS[:3])
     if lens > _LENS_M:
         yield _warning(
-            f"The lens's place in the dome is known only to {lens * 1e3:.1f} mm",
+            f"The position of the lens in the dome is known only to {lens * 1e3:.1f} mm",
             "show the board nearer and in water, or at known distances",
         )
     turn = _largest(uncertainty, POSE_PARAMETERS[3:])
@@ -313,8 +312,8 @@ def _check_lens(rig: Rig) -> Iterator[Finding]:
     across, down = (rig.lens.cx + 0.5) / width, (rig.lens.cy + 0.5) / height
     if not (0.25 < across < 0.75 and 0.25 < down < 0.75):
         yield Finding.warn(
-            f"The image centre ({rig.lens.cx:.0f}, {rig.lens.cy:.0f}) px is far from the middle of "
-            f"a {width}x{height} picture; was the camera calibrated at this size?"
+            f"The principal point ({rig.lens.cx:.0f}, {rig.lens.cy:.0f}) px is far from the middle "
+            f"of a {width}x{height} picture; was the camera calibrated at this size?"
         )
     ratio = rig.lens.fx / rig.lens.fy
     if not 0.8 < ratio < 1.25:
@@ -376,27 +375,27 @@ def _water_name(n: float) -> str:
     # Quan & Fry at 532 nm: fresh 1.334 to 1.336, sea (35 per mille) 1.340 to 1.343.
     if 1.330 <= n < 1.3375:
         return "fresh water"
-    return "sea water" if 1.3375 <= n <= 1.345 else "no usual water, but possible"
+    return "sea water" if 1.3375 <= n <= 1.345 else "unusual, but possible, water"
 
 
 def _check_index(rig: Rig) -> Finding:
     sigma = index_sigma(rig)
     if rig.flat_port is not None:
         return Finding.ok(
-            f"A flat port shows the water's index: one picture of a known target gives it to "
-            f"{sigma:.1g}."
+            f"Through a flat port the index is observable: one picture of a known target gives it "
+            f"to {sigma:.1g}."
         )
     if sigma < 5e-4:
         return Finding.ok(
-            f"The lens is far enough from the dome's centre to see the water's index: one picture "
-            f"of a known target gives it to {sigma:.1g}."
+            f"The lens is far enough from the dome's centre to determine the water's index: one "
+            f"picture of a known target gives it to {sigma:.1g}."
         )
     if rig.dome is None:
         return Finding.ok("Without a dome the water's index does not enter.")
     seen = "not at all" if sigma > 0.1 else f"only to {sigma:.1g}"
     return Finding.ok(
-        f"This lens, so near the dome's centre, can see the water's index {seen}; give it by "
-        "temperature and salinity. It matters as little to the range."
+        f"The lens is near the dome's centre, where the water's index can be determined {seen} and "
+        "hardly affects the range; give temperature and salinity."
     )
 
 
@@ -472,8 +471,8 @@ def _check_pair(a: Laser, b: Laser) -> Finding:
         )
     if angle < 15.0:
         return Finding.warn(
-            f"{pair} meet at {angle:.0f} degrees only: tilt across their stripes is told by the "
-            "distance between them alone."
+            f"{pair} meet at only {angle:.0f} degrees: only the distance between their stripes "
+            "determines the tilt across them."
         )
     return Finding.ok(f"{pair} meet at {angle:.0f} degrees.")
 
@@ -482,7 +481,7 @@ def _verdict(findings: Sequence[Finding]) -> str:
     count = {s: sum(finding.severity is s for finding in findings) for s in Severity}
     if count[Severity.BAD]:
         faults = count_text(count[Severity.BAD], "fault")
-        return f"This rig cannot measure as it is: mend {faults}."
+        return f"This rig cannot measure as it is: correct {faults}."
     if count[Severity.WARN]:
         return f"This rig is sane, with {count_text(count[Severity.WARN], 'warning')}."
     return "This rig is sane."

@@ -31,11 +31,11 @@ def batch(
             "log_offset_s.",
         ),
     ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write, or to go on with.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write or to resume.")],
     rig: Annotated[
         Path | None,
         typer.Option(
-            help="Rig file of all dives; if left out, NAME.rig.yaml or rig.yaml beside each dive."
+            help="Rig file for all dives; by default NAME.rig.yaml or rig.yaml beside each dive."
         ),
     ] = None,
     workers: Annotated[
@@ -46,7 +46,7 @@ def batch(
         str | None,
         typer.Option(
             metavar="URL",
-            help="Dask scheduler whose workers do it, such as tcp://192.168.1.10:8786.",
+            help="Dask scheduler whose workers to use, such as tcp://192.168.1.10:8786.",
         ),
     ] = None,
     target: Target = "auto",
@@ -58,13 +58,13 @@ def batch(
     salinity: Salinity = None,
     dome: Refraction = True,
     fps: Annotated[
-        float | None, typer.Option(help="Frame rate of folders of images; 1 if left out.")
+        float | None, typer.Option(help="Frame rate of folders of images; 1 by default.")
     ] = None,
     index_target: Annotated[
         Path | None,
         typer.Option(
-            help="Target on the vehicle (target.yaml) that tells the water's index on the way; "
-            "dives are then not cut."
+            help="Target on the vehicle (target.yaml) from which to track the water's index; dives "
+            "are then not split."
         ),
     ] = None,
     report: Annotated[bool, typer.Option(help="Write report.html for each dive.")] = True,
@@ -72,13 +72,12 @@ def batch(
         bool,
         typer.Option(
             "--net",
-            help="Echo the state of each dive's net too, as aqualvs net does; a list may name the "
-            "vehicles' logs.",
+            help="Also report the condition of each dive's net, as aqualvs net does; a list may "
+            "name the vehicles' logs.",
         ),
     ] = False,
     twine_mm: Annotated[
-        float | None,
-        typer.Option(help="With --net: diameter of the bare twine, where it is known."),
+        float | None, typer.Option(help="With --net: diameter of the bare twine, if known.")
     ] = None,
     stretch_m: Annotated[
         float | None, typer.Option(help="With --net: length of a stretch of net, 0.5 by default.")

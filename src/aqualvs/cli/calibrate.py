@@ -48,18 +48,18 @@ Pictures = Annotated[
     list[str], typer.Argument(help="Pictures, folders of them, or patterns such as 'air/*.png'.")
 ]
 BoardFile = Annotated[Path, typer.Option("--board", help="Board in the pictures (board.yaml).")]
-RigIn = Annotated[Path, typer.Option("--rig", help="Rig file of the step before.")]
+RigIn = Annotated[Path, typer.Option("--rig", help="Rig file of the previous step.")]
 RigOut = Annotated[
     Path,
     typer.Option(
-        "--out", "-o", help="Rig file to write; one that is there is kept under a dated name."
+        "--out", "-o", help="Rig file to write; an existing one is kept under a dated name."
     ),
 ]
 Medium = Annotated[
     str | None,
     typer.Option(
         metavar="air|water|N",
-        help="What was outside the dome: air, the rig's water, or an index.",
+        help="Medium outside the dome: air, the rig's water, or an index.",
         show_default=False,
     ),
 ]
@@ -76,16 +76,16 @@ def camera(
     out: RigOut,
     nominal: Annotated[
         Path | None,
-        typer.Option(
-            help="What is known of the rig beforehand: a rig file, or name, dome and lasers."
-        ),
+        typer.Option(help="Nominal values: a rig file, or a file with name, dome and lasers."),
     ] = None,
     model: Annotated[
         Literal["opencv", "fisheye"], typer.Option(help="Distortion model.")
     ] = "opencv",
     coefficients: Annotated[
         Literal["auto", "0", "4", "5", "8"],
-        typer.Option(help="Distortion coefficients; auto takes as many as the data support."),
+        typer.Option(
+            help="Number of distortion coefficients; auto takes as many as the data support."
+        ),
     ] = "auto",
 ) -> None:
     """Calibrate the camera."""
@@ -106,8 +106,8 @@ def camera(
 
 @calibrate.command(
     cls=CheckedCommand,
-    help="Place of the lens in the dome, from a board outside it, in air, in water, or both. "
-    "With poses (distance only, or full) the camera's rotation is found too. Of a flat port: its "
+    help="Position of the lens in the dome, from a board outside it, in air, in water, or both. "
+    "With poses (distance only, or full) the camera's rotation is found too. For a flat port: its "
     "distance and tilt, from a board in water, without poses.",
     epilog="Example: aqualvs calibrate dome rail/*.png --board board.yaml --poses poses.csv "
     "--rig rig.yaml -o rig.yaml",
@@ -119,46 +119,46 @@ def dome(
     out: RigOut,
     poses: Annotated[
         Path | None,
-        typer.Option(
-            help="What is known of the boards' poses (poses.csv): distances, or full poses."
-        ),
+        typer.Option(help="Known poses of the boards (poses.csv): distances, or full poses."),
     ] = None,
     medium: Medium = "air",
     water_images: Annotated[
-        list[str] | None, typer.Option(help="Further pictures, taken in water; repeatable.")
+        list[str] | None, typer.Option(help="Additional pictures, taken in water; repeatable.")
     ] = None,
     water_board: Annotated[
-        Path | None, typer.Option(help="Board of those, if it is another one.")
+        Path | None, typer.Option(help="Board in --water-images, if it is a different one.")
     ] = None,
-    water_poses: Annotated[Path | None, typer.Option(help="Poses of those.")] = None,
+    water_poses: Annotated[
+        Path | None, typer.Option(help="Poses of the boards in --water-images.")
+    ] = None,
     inner_radius_mm: Annotated[float | None, typer.Option(help="Inner radius of the dome.")] = None,
     thickness_mm: Annotated[float | None, typer.Option(help="Thickness of the housing.")] = None,
     n_acrylic: Annotated[
-        float | None, typer.Option(help="Index of the housing's material.")
+        float | None, typer.Option(help="Refractive index of the housing.")
     ] = None,
     port_distance_mm: Annotated[
         float | None,
         typer.Option(
-            help="Distance of a flat port from the lens, in place of a dome: an initial guess."
+            help="Initial guess of a flat port's distance from the lens, instead of a dome."
         ),
     ] = None,
     radius_tolerance_mm: Annotated[
-        float, typer.Option(help="How well the radius is known (one sigma).")
+        float, typer.Option(help="Uncertainty of the radius (one sigma).")
     ] = 0.1,
     thickness_tolerance_mm: Annotated[
-        float, typer.Option(help="How well the thickness is known (one sigma).")
+        float, typer.Option(help="Uncertainty of the thickness (one sigma).")
     ] = 0.1,
     acrylic_tolerance: Annotated[
-        float, typer.Option(help="How well the material's index is known (one sigma).")
+        float, typer.Option(help="Uncertainty of the housing's index (one sigma).")
     ] = 0.003,
     distance_sigma_mm: Annotated[
-        float, typer.Option(help="How well the poses' distances are known (one sigma).")
+        float, typer.Option(help="Uncertainty of the poses' distances (one sigma).")
     ] = 0.2,
     refine_intrinsics: Annotated[
         bool,
         typer.Option(
             "--refine-intrinsics/--keep-intrinsics",
-            help="Let the intrinsics move within what the camera's calibration says of them.",
+            help="Refine the intrinsics within the uncertainty of the camera's calibration.",
         ),
     ] = True,
 ) -> None:
@@ -201,25 +201,24 @@ def lasers(
     rig: RigIn,
     out: RigOut,
     box: Annotated[Path | None, typer.Option(help="Box of markers (box.yaml).")] = None,
-    board: Annotated[
-        Path | None, typer.Option(help="Board on the plane that the stripes lie on.")
-    ] = None,
+    board: Annotated[Path | None, typer.Option(help="Board on the plane of the stripes.")] = None,
     medium: Medium = None,
     n_lasers: Annotated[
-        int | None, typer.Option("--lasers", help="How many there are, if known.")
+        int | None, typer.Option("--lasers", help="Number of lasers, if known.")
     ] = None,
     names: Annotated[
-        str | None, typer.Option(metavar="A,B,C", help="Names, left to right by image.")
+        str | None,
+        typer.Option(metavar="A,B,C", help="Names of the lasers, left to right in the picture."),
     ] = None,
     wavelength_nm: Annotated[
         float | None,
         typer.Option(
-            help="Wavelength of the lasers, for example 650 for red ones; without it that of the "
-            "rig's lasers, or else green."
+            help="Wavelength of the lasers, for example 650 for red; by default that of the rig's "
+            "lasers, else green."
         ),
     ] = None,
     board_offset_mm: Annotated[
-        float, typer.Option(help="How far the board stands before the stripes' plane.")
+        float, typer.Option(help="Distance of the board in front of the plane of the stripes.")
     ] = 0.0,
     refine: Annotated[
         bool,
@@ -249,7 +248,7 @@ def lasers(
 
 @calibrate.command(
     cls=CheckedCommand,
-    help="Refractive index of the water, from a target fixed on the vehicle. SOURCE is a video, "
+    help="Refractive index of the water, from a target fixed to the vehicle. SOURCE is a video, "
     "pictures, or a folder of them.",
     epilog="Example: aqualvs calibrate water dive.mp4 --target target.yaml --rig rig.yaml "
     "-o rig.yaml",
@@ -263,10 +262,10 @@ def water(
     salinity: Salinity = None,
     fps: Annotated[float | None, typer.Option(help="Frame rate of pictures.")] = None,
     place_sigma_mm: Annotated[
-        float, typer.Option(help="How well the target's place is known (one sigma).")
+        float, typer.Option(help="Uncertainty of the target's position (one sigma).")
     ] = 0.2,
     turn_sigma_deg: Annotated[
-        float, typer.Option(help="How well the target's turn is known (one sigma).")
+        float, typer.Option(help="Uncertainty of the target's rotation (one sigma).")
     ] = 0.1,
 ) -> None:
     """Calibrate the water."""
@@ -290,8 +289,8 @@ def water(
 
 @calibrate.command(
     cls=CheckedCommand,
-    help="Readout of a rolling shutter, from a dive of 20 s in which the vehicle swings before a "
-    "wall.",
+    help="Readout time of a rolling shutter, from a 20 s dive in which the vehicle swings in front "
+    "of a wall.",
     epilog="Example: aqualvs calibrate shutter dive.mp4 --rig rig.yaml -o rig.yaml",
 )
 def shutter(
@@ -312,7 +311,7 @@ def board(
         Literal["charuco", "chessboard", "box", "plate"],
         typer.Argument(
             help="A board for camera and dome, the markers of a box for the lasers, or a plate "
-            "of markers, fixed on the vehicle, for the water."
+            "of markers, fixed to the vehicle, for the water."
         ),
     ],
     out: Annotated[Path, typer.Option("--out", "-o", help="OUT.pdf and OUT.yaml are written.")],
@@ -320,16 +319,18 @@ def board(
         str, typer.Option(metavar="a4..a0|letter|WxH|fit", help="Paper; WxH in millimetres.")
     ] = "a4",
     squares_x: Annotated[
-        int | None, typer.Option(help="Squares, or markers of a plate, across.")
+        int | None, typer.Option(help="Number of squares, or markers of a plate, across.")
     ] = None,
     squares_y: Annotated[
-        int | None, typer.Option(help="Squares, or markers of a plate, down.")
+        int | None, typer.Option(help="Number of squares, or markers of a plate, down.")
     ] = None,
     square_mm: Annotated[
-        float | None, typer.Option(help="Side of a square; as large as fits if left out.")
+        float | None, typer.Option(help="Side of a square; by default as large as fits.")
     ] = None,
     marker_mm: Annotated[float | None, typer.Option(help="Side of a marker.")] = None,
-    dictionary: Annotated[str | None, typer.Option(help="OpenCV's name of the markers.")] = None,
+    dictionary: Annotated[
+        str | None, typer.Option(help="OpenCV's name of the marker dictionary.")
+    ] = None,
     border_mm: Annotated[float | None, typer.Option(help="Light border of a board.")] = None,
     width_mm: Annotated[float, typer.Option(help="Width of the box, inside.")] = 400.0,
     height_mm: Annotated[float, typer.Option(help="Height of the box, inside.")] = 380.0,
@@ -338,7 +339,7 @@ def board(
     position_mm: Annotated[
         tuple[float, float, float] | None,
         typer.Option(
-            metavar="X Y Z", help="Where the plate's first corner is in the dome's frame."
+            metavar="X Y Z", help="Position of the plate's first corner in the dome's frame."
         ),
     ] = None,
     rotation_deg: Annotated[
@@ -387,7 +388,7 @@ def import_file(
         typer.Option(
             "--out",
             "-o",
-            help="Rig file to write, or board.yaml; a rig that is there is kept under a dated "
+            help="Rig file to write, or board.yaml; an existing rig file is kept under a dated "
             "name.",
         ),
     ],
@@ -395,8 +396,8 @@ def import_file(
         Literal["camera", "rig", "board"] | None,
         typer.Option(
             "--as",
-            help="camera: the intrinsics alone; rig: the dome too, if the file has one; board: a "
-            "target of Kalibr. Without it, all that the file holds.",
+            help="camera: the intrinsics only; rig: also the dome, if the file has one; board: a "
+            "Kalibr target. By default everything in the file.",
         ),
     ] = None,
     camera: Annotated[
@@ -404,7 +405,7 @@ def import_file(
     ] = None,
     model: Annotated[
         Literal["opencv", "fisheye"] | None,
-        typer.Option(help="Distortion model, where a FileStorage of OpenCV does not say it."),
+        typer.Option(help="Distortion model, if an OpenCV FileStorage does not state it."),
     ] = None,
     image: Annotated[
         str | None, typer.Option(metavar="WxH", help="Size of the pictures, if the file lacks it.")

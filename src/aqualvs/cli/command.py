@@ -44,11 +44,10 @@ MAX_WORKERS = 1024
 """Processes on one machine; more are a slip of the finger that would fill its memory."""
 
 Overwrite = Annotated[
-    bool, typer.Option("--overwrite", help="Replace what this command wrote there before.")
+    bool, typer.Option("--overwrite", help="Replace files that this command wrote there before.")
 ]
 Target = Annotated[
-    str,
-    typer.Option(metavar="auto|net|solid|FILE", help="What the lasers hit: a word, or a net.yaml."),
+    str, typer.Option(metavar="auto|net|solid|FILE", help="Kind of target: a word, or a net.yaml.")
 ]
 Detector = Annotated[
     Literal["ridge", "threshold"],
@@ -63,7 +62,7 @@ Fit = Annotated[
     typer.Option(help="Plane fit; pseudo_inverse is the paper's, for comparison."),
 ]
 WaterIndex = Annotated[float | None, typer.Option(help="Refractive index of the water.")]
-Celsius = Annotated[float | None, typer.Option(help="Water temperature, for its index.")]
+Celsius = Annotated[float | None, typer.Option(help="Water temperature, to compute its index.")]
 
 
 def _per_mille(salinity: float | None) -> float | None:
@@ -75,17 +74,18 @@ def _per_mille(salinity: float | None) -> float | None:
 
 
 Salinity = Annotated[
-    float | None, typer.Option(callback=_per_mille, help="Salinity in per mille, for its index.")
+    float | None,
+    typer.Option(callback=_per_mille, help="Salinity in per mille, to compute the water's index."),
 ]
 Refraction = Annotated[
     bool,
-    typer.Option("--dome/--no-dome", help="Refract at the dome or the flat port, or ignore it."),
+    typer.Option(
+        "--dome/--no-dome", help="Model the refraction at the dome or flat port, or ignore it."
+    ),
 ]
 IndexTarget = Annotated[
     Path | None,
-    typer.Option(
-        help="Target on the vehicle (target.yaml) that tells the water's index on the way."
-    ),
+    typer.Option(help="Target on the vehicle (target.yaml) from which to track the water's index."),
 ]
 VehicleFileOption = Annotated[
     Path | None,
@@ -99,7 +99,7 @@ MavlinkPeer = Annotated[
     list[str] | None,
     typer.Option(
         metavar="ADDRESS",
-        help="MAVLink, listening: hear nobody else, such as 192.168.2.2 or 192.168.2.0/24; "
+        help="MAVLink, listening: accept only this peer, such as 192.168.2.2 or 192.168.2.0/24; "
         "repeatable.",
     ),
 ]
@@ -107,7 +107,7 @@ MavlinkKey = Annotated[
     Path | None,
     typer.Option(
         metavar="FILE",
-        help="MAVLink: sign, and hear nobody without this key; a passphrase or 64 hex digits.",
+        help="MAVLink: sign, and accept only this key; a passphrase or 64 hex digits.",
     ),
 ]
 

@@ -14,45 +14,50 @@ def design(
         Path | None, typer.Argument(metavar="[DESIGN]", help="Design file (YAML).")
     ] = None,
     example: Annotated[
-        bool, typer.Option("--example", help="Print a design file to begin with, and end.")
+        bool, typer.Option("--example", help="Print an example design file and exit.")
     ] = False,
     rig: Annotated[
-        Path | None, typer.Option(help="Rig file of a rig that exists, in a design's place.")
+        Path | None, typer.Option(help="Rig file of an existing rig, instead of a design.")
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", help="Folder for rig.yaml, design.html and its pictures."),
+        typer.Option("--out", "-o", help="Folder to write: rig.yaml, design.html and pictures."),
     ] = None,
     image: Annotated[
         str | None, typer.Option(metavar="WIDTHxHEIGHT", help="Size of the picture.")
     ] = None,
-    fov_deg: Annotated[float | None, typer.Option(help="Field of view across, in air.")] = None,
+    fov_deg: Annotated[float | None, typer.Option(help="Horizontal field of view in air.")] = None,
     dome_mm: Annotated[
-        str | None, typer.Option(metavar="RADIUS:THICKNESS", help="Inner radius and thickness.")
+        str | None,
+        typer.Option(metavar="RADIUS:THICKNESS", help="Dome: inner radius and thickness."),
     ] = None,
     flat_mm: Annotated[
         str | None,
         typer.Option(
-            metavar="DISTANCE:THICKNESS", help="A flat port in the dome's place: ahead of the lens."
+            metavar="DISTANCE:THICKNESS",
+            help="Flat port instead of a dome: distance from the lens, and thickness.",
         ),
     ] = None,
     lens_mm: Annotated[
         str | None,
-        typer.Option(metavar="X,Y,Z", help="Lens from the dome's centre: right, ahead, up."),
+        typer.Option(
+            metavar="X,Y,Z",
+            help="Position of the lens relative to the dome's centre: right, forward, up.",
+        ),
     ] = None,
     baseline_mm: Annotated[
-        float | None, typer.Option(help="Lasers from the dome's centre.")
+        float | None, typer.Option(help="Distance of the lasers from the dome's centre.")
     ] = None,
-    lasers: Annotated[int | None, typer.Option(help="How many.")] = None,
-    fan_deg: Annotated[float | None, typer.Option(help="Opening of a laser's fan.")] = None,
+    lasers: Annotated[int | None, typer.Option(help="Number of lasers.")] = None,
+    fan_deg: Annotated[float | None, typer.Option(help="Fan angle of a laser.")] = None,
     range_mm: Annotated[str | None, typer.Option(metavar="NEAR:FAR", help="Working range.")] = None,
     turn: Annotated[
-        bool, typer.Option("--turn", help="Look for the stripes' best directions, too.")
+        bool, typer.Option("--turn", help="Also optimise the stripes' directions.")
     ] = False,
     tilt: Annotated[
-        bool, typer.Option("--tilt/--no-tilt", help="Look for the lasers' best angles.")
+        bool, typer.Option("--tilt/--no-tilt", help="Optimise the lasers' angles.")
     ] = True,
-    changes: Annotated[bool, typer.Option(help="Say which changes would help most.")] = True,
+    changes: Annotated[bool, typer.Option(help="Report which changes would help most.")] = True,
     overwrite: Overwrite = False,
 ) -> None:
     """Predict what a design measures."""

@@ -11,18 +11,18 @@ from aqualvs.cli.command import Overwrite
 def benchmark(
     names: Annotated[
         list[str] | None,
-        typer.Argument(metavar="[LEVEL|DIVE]...", help="Which levels or dives; all if left out."),
+        typer.Argument(metavar="[LEVEL|DIVE]...", help="Levels or dives; all by default."),
     ] = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder to write.")] = None,
     frames: Annotated[
-        int | None, typer.Option(help="Frames of every dive, for a quick look.")
+        int | None, typer.Option(help="Number of frames per dive, for a quick look.")
     ] = None,
     shutter: Annotated[
         str | None,
         typer.Option(
             metavar="KIND[:MS]",
-            help="rolling:READOUT:EXPOSURE, interlaced:EXPOSURE or global:EXPOSURE; all rows at "
-            "once if left out.",
+            help="rolling:READOUT:EXPOSURE, interlaced:EXPOSURE or global:EXPOSURE; global by "
+            "default.",
         ),
     ] = None,
     overwrite: Overwrite = False,
@@ -48,14 +48,14 @@ def score(
         list[str] | None,
         typer.Argument(
             metavar="[NAME=PATH]...",
-            help="What a system answered: a folder with DIVE.csv or DIVE/posture.csv, or one CSV "
+            help="Results of a system: a folder with DIVE.csv or DIVE/posture.csv, or one CSV "
             "with a column dive.",
         ),
     ] = None,
     own: Annotated[
         Path | None,
         typer.Option(
-            help="Run aqualvs and its baselines over the set into this folder, and score them too."
+            help="Also run aqualvs and its baselines on the set into this folder, and score them."
         ),
     ] = None,
     out: Annotated[
@@ -75,7 +75,7 @@ def score(
 def reproduce(
     experiments: Annotated[
         list[str] | None,
-        typer.Argument(metavar="EXPERIMENT", help="Names from --list; all of them if left out."),
+        typer.Argument(metavar="EXPERIMENT", help="Names from --list; all by default."),
     ] = None,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")] = Path(
         "out/reproduce"

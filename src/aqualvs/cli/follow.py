@@ -33,18 +33,23 @@ def tune(
         str, typer.Argument(help="Vehicle model: bluerov2_heavy, bluerov2 or videoray.")
     ],
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="Gains file; printed if left out.")
+        Path | None,
+        typer.Option(
+            "-o", "--output", help="Gains file to write; by default the gains are printed."
+        ),
     ] = None,
     overwrite: Overwrite = False,
     delay_ms: Annotated[
         float,
-        typer.Option(help="Usual delay from the exposure to the vehicle. Less makes it faster."),
+        typer.Option(
+            help="Usual delay from exposure to vehicle; a shorter delay allows higher gains."
+        ),
     ] = 120.0,
     greatest_delay_ms: Annotated[
-        float, typer.Option(help="Delay at which it must still be stable.")
+        float, typer.Option(help="Maximum delay at which the loop must still be stable.")
     ] = 200.0,
-    rate_hz: Annotated[float, typer.Option(help="Frames a second.")] = 25.0,
-    current: Annotated[float, typer.Option(help="Greatest current in m/s.")] = 0.5,
+    rate_hz: Annotated[float, typer.Option(help="Frames per second.")] = 25.0,
+    current: Annotated[float, typer.Option(help="Maximum current in m/s.")] = 0.5,
 ) -> None:
     """Make gains for a vehicle, and say what margins they leave."""
     from aqualvs.control.tune import TuneOptions
@@ -74,14 +79,14 @@ def follow(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")] = Path("follow"),
     plan: Annotated[Path | None, typer.Option(help="Plan file (YAML; docs/missions.md).")] = None,
     hold_range: Annotated[
-        float | None, typer.Option("--range", help="Range to hold in metres; 0.6 if left out.")
+        float | None, typer.Option("--range", help="Range to hold in metres; 0.6 by default.")
     ] = None,
     yaw: Annotated[float, typer.Option(help="Yaw to hold, in degrees; 0 is square.")] = 0.0,
     gains: Annotated[
         str | None,
         typer.Option(
             metavar="FILE|NAME",
-            help="Gains: a file of 'aqualvs tune', or bluerov2, bluerov2_heavy, videoray.",
+            help="Gains: a file from 'aqualvs tune', or bluerov2, bluerov2_heavy, videoray.",
         ),
     ] = None,
     rig: Annotated[Path | None, typer.Option(help="Vehicle: rig file (YAML).")] = None,
@@ -96,7 +101,7 @@ def follow(
         typer.Option("--dashboard", help="Serve the pilot's page; --sim then runs in real time."),
     ] = False,
     dashboard_address: Annotated[
-        str, typer.Option(metavar="HOST:PORT", help="Where to serve it.")
+        str, typer.Option(metavar="HOST:PORT", help="Address of the pilot's page.")
     ] = "127.0.0.1:8100",
     token: Annotated[
         str | None, typer.Option(envvar="AQUALVS_TOKEN", help="Password of the page.")
@@ -105,16 +110,15 @@ def follow(
         bool, typer.Option("--record", help="Vehicle: record from the start.")
     ] = False,
     record_to: Annotated[
-        Path | None, typer.Option(help="Vehicle: folder of recordings; that of -o if left out.")
+        Path | None, typer.Option(help="Vehicle: folder of recordings; by default that of -o.")
     ] = None,
     record_video: Annotated[
-        bool, typer.Option("--record-video", help="Vehicle: record the pictures too.")
+        bool, typer.Option("--record-video", help="Vehicle: also record the pictures.")
     ] = False,
     target: Annotated[
         str,
         typer.Option(
-            metavar="auto|net|solid|FILE",
-            help="Vehicle: what the lasers hit: a word, or a net.yaml.",
+            metavar="auto|net|solid|FILE", help="Vehicle: kind of target: a word, or a net.yaml."
         ),
     ] = "auto",
     water_n: Annotated[
@@ -122,23 +126,26 @@ def follow(
     ] = None,
     vehicle: Annotated[
         Literal["bluerov2", "bluerov2_heavy", "bluerov2-heavy", "videoray"],
-        typer.Option(metavar="bluerov2|bluerov2_heavy|videoray", help="Sim: which one."),
+        typer.Option(metavar="bluerov2|bluerov2_heavy|videoray", help="Sim: vehicle model."),
     ] = "bluerov2",
-    seconds: Annotated[float, typer.Option(help="Sim: how long.")] = 60.0,
+    seconds: Annotated[float, typer.Option(help="Sim: duration in seconds.")] = 60.0,
     current: Annotated[float, typer.Option(help="Sim: current in m/s.")] = 0.3,
     current_to: Annotated[
-        float, typer.Option(help="Sim: where it flows, in degrees to the right; 0: onto the net.")
+        float,
+        typer.Option(
+            help="Sim: direction of the current, in degrees to the right; 0: onto the net."
+        ),
     ] = 60.0,
     waves: Annotated[float, typer.Option(help="Sim: amplitude of the waves in metres.")] = 0.1,
     cage_radius: Annotated[
-        float, typer.Option(help="Sim: of a round net seen from inside, in metres; 0: flat.")
+        float, typer.Option(help="Sim: radius of a round net seen from inside, in metres; 0: flat.")
     ] = 0.0,
     net_sway: Annotated[
-        float, typer.Option(help="Sim: the net moves to and fro by so many metres.")
+        float, typer.Option(help="Sim: amplitude of the net's motion in metres.")
     ] = 0.0,
     pilot_gain: Annotated[float, typer.Option(help="Sim: ArduSub's pilot gain.")] = 0.5,
     rendered: Annotated[
-        bool, typer.Option("--rendered", help="Sim: render every frame and measure in it.")
+        bool, typer.Option("--rendered", help="Sim: render every frame and measure it.")
     ] = False,
     camera: Annotated[
         str | None,
@@ -153,10 +160,10 @@ def follow(
             help="Sim, rendered: rolling:READOUT:EXPOSURE, interlaced:EXPOSURE, global:EXPOSURE.",
         ),
     ] = None,
-    fps: Annotated[float, typer.Option(help="Sim: frames a second.")] = 25.0,
-    seed: Annotated[int, typer.Option(min=0, help="Sim: of waves and noise.")] = 0,
+    fps: Annotated[float, typer.Option(help="Sim: frames per second.")] = 25.0,
+    seed: Annotated[int, typer.Option(min=0, help="Sim: random seed of waves and noise.")] = 0,
     freeze: Annotated[
-        float | None, typer.Option(help="Sim: the picture stands still from this second on.")
+        float | None, typer.Option(help="Sim: freeze the picture from this time on, in seconds.")
     ] = None,
     overwrite: Overwrite = False,
 ) -> None:

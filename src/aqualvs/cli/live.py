@@ -44,13 +44,13 @@ def live(
         bool, typer.Option("--foxglove", help="Serve Foxglove at ws://127.0.0.1:8765.")
     ] = False,
     foxglove_address: Annotated[
-        str, typer.Option(metavar="HOST:PORT", help="Where to serve Foxglove.")
+        str, typer.Option(metavar="HOST:PORT", help="Address of the Foxglove server.")
     ] = "127.0.0.1:8765",
     rerun: Annotated[
         str | None,
         typer.Option(
             metavar="viewer|HOST:PORT|FILE.rrd",
-            help="Show in Rerun: open a viewer, use one that is open, or write a file.",
+            help="Show in Rerun: open a viewer, connect to an open one, or write a file.",
         ),
     ] = None,
     dashboard: Annotated[
@@ -59,13 +59,15 @@ def live(
     dashboard_address: Annotated[
         str,
         typer.Option(
-            metavar="HOST:PORT", help="Where to serve it; other than 127.0.0.1 needs a token."
+            metavar="HOST:PORT",
+            help="Address of the pilot's page; any other than 127.0.0.1 needs a token.",
         ),
     ] = "127.0.0.1:8100",
     token: Annotated[
         str | None,
         typer.Option(
-            envvar="AQUALVS_TOKEN", help="Password of the page; made and printed if one is needed."
+            envvar="AQUALVS_TOKEN",
+            help="Password of the page; generated and printed if one is needed.",
         ),
     ] = None,
     embed_from: Annotated[
@@ -73,31 +75,33 @@ def live(
         typer.Option(
             envvar="AQUALVS_EMBED_FROM",
             metavar="ORIGIN",
-            help="Let pages of this origin show the page, such as http://blueos.local; repeatable.",
+            help="Let pages of this origin embed the page, such as http://blueos.local; "
+            "repeatable.",
         ),
     ] = None,
     record: Annotated[bool, typer.Option("--record", help="Record from the start.")] = False,
     record_to: Annotated[Path, typer.Option(help="Folder of recordings.")] = Path("dives"),
     record_video: Annotated[
-        bool, typer.Option("--record-video", help="Record the pictures too.")
+        bool, typer.Option("--record-video", help="Also record the pictures.")
     ] = False,
     smooth: Annotated[
-        bool, typer.Option("--filter", help="Smooth over time; raw values stay available.")
+        bool, typer.Option("--filter", help="Add time-filtered values; raw values stay available.")
     ] = False,
     fast: Annotated[
-        bool, typer.Option("--fast", help="Files: every frame, as fast as possible.")
+        bool, typer.Option("--fast", help="For files: measure every frame, as fast as possible.")
     ] = False,
     fps: Annotated[
-        float | None, typer.Option(help="Of images (1 if left out), or asked of a camera.")
+        float | None,
+        typer.Option(help="Frame rate of images (1 by default), or to request from a camera."),
     ] = None,
     size: Annotated[
-        str | None, typer.Option(metavar="WxH", help="Picture size asked of a camera.")
+        str | None, typer.Option(metavar="WxH", help="Picture size to request from a camera.")
     ] = None,
     pixel_format: Annotated[
-        str | None, typer.Option(help="Asked of a camera: h264, mjpeg, yuyv422.")
+        str | None, typer.Option(help="Format to request from a camera: h264, mjpeg, yuyv422.")
     ] = None,
     transport: Annotated[
-        Literal["tcp", "udp"] | None, typer.Option(help="How RTSP shall send; tcp if left out.")
+        Literal["tcp", "udp"] | None, typer.Option(help="Transport of RTSP; tcp by default.")
     ] = None,
     target: Target = "auto",
     detector: Annotated[Literal["ridge", "threshold"], typer.Option(help="Stripe detector.")] = (
@@ -160,8 +164,10 @@ def live(
 
 def doctor(
     context: typer.Context,
-    source: Annotated[str | None, typer.Argument(help="Stream, camera or file to look at.")] = None,
-    rig: Annotated[Path | None, typer.Option(help="Rig that the pictures should fit.")] = None,
+    source: Annotated[str | None, typer.Argument(help="Stream, camera or file to check.")] = None,
+    rig: Annotated[
+        Path | None, typer.Option(help="Rig file that the pictures should match.")
+    ] = None,
     mavlink: Annotated[str | None, typer.Option(help="Autopilot to listen for.")] = None,
     vehicle_file: VehicleFileOption = None,
     mavlink_peer: MavlinkPeer = None,

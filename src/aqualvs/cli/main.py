@@ -138,61 +138,60 @@ _measure(
     epilog="Example: aqualvs run dive.mp4 --rig rig.yaml -o out/dive",
 )(run)
 _measure(
-    help="Measure many dives, on this machine or on many, each as aqualvs run does it; writes a "
-    "summary and one Parquet data set. Run it again to go on after an interruption: what is "
-    "finished is kept. Exit code 1 if a dive could not be finished.",
+    help="Measure many dives, on one machine or several, each as by aqualvs run; write a summary "
+    "and one Parquet data set. To resume after an interruption, run it again: finished work is "
+    "kept. Exit code 1 if a dive could not be finished.",
     epilog="Example: aqualvs batch season/2026 --rig rig.yaml -o out/2026",
 )(batch)
 _measure(
-    help="Write the report of a run again. After a run that was killed, its points are completed "
-    "first.",
+    help="Rewrite the report of a run. If the run was killed, complete its points first.",
     epilog="Example: aqualvs report out/dive --truth truth.csv",
 )(report)
 _measure(
-    help="Draw a run's reflections in a laser's plane, with what the filters take for net: "
-    "pictures after figures 13 and 14 of the paper, and the filter's binary image.",
+    help="Draw a run's reflections in a laser's plane, with those that the filters take for net, "
+    "as in figures 13 and 14 of the paper, and the filter's binary image.",
     epilog="Example: aqualvs figures out/dive -o out/figures",
 )(figures)
 _calibrate(
-    help="Print a calibration target, true to scale, with its yaml: OUT.pdf and OUT.yaml.",
+    help="Make a printable calibration target, true to scale, and its file: OUT.pdf and OUT.yaml.",
     epilog="Example: aqualvs board charuco --paper a3 -o board",
 )(board)
 _calibrate(
     "import",
-    help="Make a rig file of the calibration that another program made: ROS, OpenCV, Kalibr, "
-    "mrcal, COLMAP, Refractive COLMAP.",
+    help="Make a rig file from the calibration of another program: ROS, OpenCV, Kalibr, mrcal, "
+    "COLMAP, Refractive COLMAP.",
     epilog="Example: aqualvs import camera_info.yaml --as camera -o rig.yaml",
 )(import_file)
 _calibrate(
-    help="Write a rig's camera as a calibration file of another program.",
+    help="Write a rig's camera as a calibration file for another program.",
     epilog="Example: aqualvs export rig.yaml --to colmap-underwater -o cameras.txt",
 )(export)
 app.add_typer(calibrate, rich_help_panel="Calibrate")
 _calibrate(
-    help="Say in words whether a rig is sane and what it can measure.",
+    help="Report whether a rig is plausible and what it can measure.",
     epilog="Example: aqualvs check rig.yaml --against last",
 )(check)
 _calibrate(
-    help="Print the JSON Schema of rig files, with which editors complete and check them; put it "
-    "in a file with > rig.schema.json.",
+    help="Print the JSON Schema of rig files, with which editors complete and check them; write it "
+    "to a file with > rig.schema.json.",
     epilog="Example: aqualvs schema",
 )(schema)
 _live(
-    help="Say whether this machine is ready, the stream arrives and the autopilot answers.",
+    help="Check whether this machine is ready, the stream arrives and the autopilot answers.",
     epilog="Example: aqualvs doctor udp://0.0.0.0:5600 --rig rig.yaml",
 )(doctor)
 _live(
-    help="Measure live: a stream, a camera or a file in real time, to pilot, autopilot, ROS, "
-    "Foxglove and recording. Ctrl-C ends it.",
+    help="Measure a stream, a camera or a file in real time; send the posture to pilot, autopilot, "
+    "ROS, Foxglove and a recording. Ctrl-C ends it.",
     epilog="Example: aqualvs live udp://0.0.0.0:5600 --rig rig.yaml --dashboard "
     "--mavlink udpout:192.168.2.2:14550",
 )(live)
 _live(
-    help="Hold a distance to a net, or follow it: in simulation, or with a vehicle.",
+    help="Hold a distance to a net, or follow it, in simulation or with a vehicle.",
     epilog="Example: aqualvs follow --sim -o out/follow",
 )(follow)
 _live(
-    help="Make gains for a vehicle model, and say what margins they leave.",
+    help="Compute controller gains for a vehicle model and report their stability margins.",
     epilog="Example: aqualvs tune bluerov2_heavy -o gains.yaml",
 )(tune)
 _nets(
@@ -203,32 +202,33 @@ _nets(
 _nets(
     "net-change",
     help="Compare a net between dates: how fouling grew and where, which holes are new, grown, "
-    "gone, or were not passed. RUN is the folder of a run with the state of its net, or of a "
-    "batch.",
+    "gone, or were not passed. RUN is the folder of a run that aqualvs net has evaluated, or of "
+    "a batch.",
     epilog="Example: aqualvs net-change out/2026-05-01 out/2026-05-22 -o out/change",
 )(net_change)
 _simulate(
-    help="Render a dive with known truth: dive.mp4, truth.csv and rig.yaml. "
+    help="Render a dive with ground truth: dive.mp4, truth.csv and rig.yaml. "
     "SCENARIO is a name from --list or a YAML file.",
     epilog="Example: aqualvs simulate net_diamond --camera webcam -o out/net",
 )(simulate)
 _simulate(
-    help="Predict what a camera, a dome and lasers would measure, and tilt the lasers best. "
-    "DESIGN is a file; options take the place of what it says, or of the example's numbers.",
+    help="Predict the accuracy of a camera, a dome and lasers, and optimise the lasers' tilt. "
+    "DESIGN is a file; options override its values, or those of the example.",
     epilog="Example: aqualvs design --image 1920x1080 --fov-deg 69 --dome-mm 51:6 "
     "--baseline-mm 150 --lasers 3 --range-mm 300:1200 -o out/design",
 )(design)
 _reference(
-    help="Repeat the paper's experiments in a simulated tank, each beside what the paper prints: "
-    "figures, tables and one page, reproduce.html. Without a name, all of them.",
+    help="Repeat the paper's experiments in a simulated tank and compare each with the paper: "
+    "figures, tables and one page, reproduce.html.",
     epilog="Example: aqualvs reproduce distance angles -o out/reproduce",
 )(reproduce)
 _reference(
-    help="Render the public benchmark set: dives by difficulty, each with its truth and its rig.",
+    help="Render the public benchmark set: dives by difficulty, each with its ground truth and "
+    "rig.",
     epilog="Example: aqualvs benchmark sun fouled -o bench",
 )(benchmark)
 _reference(
-    help="Score what systems answered on a benchmark set, side by side: plain CSV in, scores out.",
+    help="Score the results of one or more systems on a benchmark set: plain CSV in, scores out.",
     epilog="Example: aqualvs score mine=out/mine --truth bench --own out/own -o scores",
 )(score)
 

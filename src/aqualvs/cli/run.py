@@ -29,8 +29,7 @@ def net_change(
     runs: Annotated[
         list[Path],
         typer.Argument(
-            metavar="RUN...",
-            help="Folders of runs with the state of their net (aqualvs net), or of batches.",
+            metavar="RUN...", help="Folders of runs that aqualvs net has evaluated, or of batches."
         ),
     ],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")],
@@ -38,11 +37,11 @@ def net_change(
         list[str] | None,
         typer.Option(
             metavar="YYYY-MM-DD|auto",
-            help="Day of the dive, once for every RUN in their order; else from the names or the "
-            "video's clock.",
+            help="Date of each dive, in the order of the RUNs; by default from the folder's or "
+            "video's name, or the video's clock.",
         ),
     ] = None,
-    cell_m: Annotated[float, typer.Option(help="Side of the map's cells.")] = 1.0,
+    cell_m: Annotated[float, typer.Option(help="Side length of the map's cells.")] = 1.0,
     overwrite: Overwrite = False,
 ) -> None:
     """Compare a net between dates."""
@@ -59,7 +58,7 @@ def run(
     source: Annotated[str, typer.Argument(help="Video, folder of images, address, or recording.")],
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", help="Folder to write; NAME_run beside the dive if left out."),
+        typer.Option("--out", "-o", help="Folder to write; by default NAME_run beside the dive."),
     ] = None,
     rig: Annotated[
         Path | None, typer.Option("--rig", help="Rig file; a recording has its own.")
@@ -77,25 +76,27 @@ def run(
         str, typer.Option(metavar="A:B", help="Only frames A to B-1.", show_default=False)
     ] = ":",
     fps: Annotated[
-        float | None, typer.Option(help="Frame rate of a folder of images; 1 if left out.")
+        float | None, typer.Option(help="Frame rate of a folder of images; 1 by default.")
     ] = None,
-    overlay: Annotated[bool, typer.Option("--overlay", help="Write overlay.mp4 too.")] = False,
+    overlay: Annotated[bool, typer.Option("--overlay", help="Also write overlay.mp4.")] = False,
     report: Annotated[bool, typer.Option(help="Write report.html.")] = True,
-    truth: Annotated[Path | None, typer.Option(help="CSV with the truth to compare with.")] = None,
+    truth: Annotated[
+        Path | None, typer.Option(help="CSV with the ground truth, to compare with.")
+    ] = None,
     index_target: IndexTarget = None,
     net: Annotated[
-        bool, typer.Option("--net", help="Echo the state of the net too, see aqualvs net.")
+        bool, typer.Option("--net", help="Also report the condition of the net, see aqualvs net.")
     ] = False,
     mcap: Annotated[
-        bool, typer.Option("--mcap", help="Write dive.mcap too, for Foxglove and for replays.")
+        bool, typer.Option("--mcap", help="Also write dive.mcap, for Foxglove and for replays.")
     ] = False,
     rerun: Annotated[
-        Path | None, typer.Option(metavar="FILE.rrd", help="Write a file of Rerun too.")
+        Path | None, typer.Option(metavar="FILE.rrd", help="Also write a file for Rerun.")
     ] = None,
     workers: Annotated[
         int | None,
         typer.Option(
-            min=1, max=MAX_WORKERS, help="Processes that measure; one per core by default."
+            min=1, max=MAX_WORKERS, help="Number of worker processes; one per core by default."
         ),
     ] = None,
 ) -> None:
@@ -132,22 +133,22 @@ def run(
 
 
 def net(
-    source: Annotated[str, typer.Argument(help="Folder of a run, or video, folder of images.")],
+    source: Annotated[str, typer.Argument(help="Folder of a run, a video, or a folder of images.")],
     out: Annotated[
         Path | None,
         typer.Option(
             "--out",
             "-o",
-            help="Folder to write; if left out a run's own, or NAME_run beside a dive.",
+            help="Folder to write; by default the run's own, or NAME_run beside a dive.",
         ),
     ] = None,
     rig: Annotated[
-        Path | None, typer.Option(help="Rig file, for a dive; a run has its own.")
+        Path | None, typer.Option(help="Rig file, if SOURCE is a dive; a run has its own.")
     ] = None,
     target: Annotated[
         str,
         typer.Option(
-            metavar="auto|net|solid|FILE", help="As for aqualvs run, which a dive needs first."
+            metavar="auto|net|solid|FILE", help="As for aqualvs run; only if SOURCE is a dive."
         ),
     ] = "auto",
     log: Annotated[
@@ -156,10 +157,10 @@ def net(
     ] = None,
     log_offset_s: Annotated[
         float | None,
-        typer.Option(help="Log's clock minus the dive's; found from the motion if left out."),
+        typer.Option(help="The log's clock minus the dive's; by default found from the motion."),
     ] = None,
     twine_mm: Annotated[
-        float | None, typer.Option(help="Diameter of the bare twine, where it is known.")
+        float | None, typer.Option(help="Diameter of the bare twine, if known.")
     ] = None,
     stretch_m: Annotated[float, typer.Option(help="Length of a stretch of net.")] = 0.5,
     overwrite: Overwrite = False,
@@ -178,14 +179,14 @@ def figures(
     out: Annotated[
         Path | None,
         typer.Option(
-            "--out", "-o", help="Folder to write; figures in the run's folder if left out."
+            "--out", "-o", help="Folder to write; by default figures in the run's folder."
         ),
     ] = None,
     frame: Annotated[
-        int | None, typer.Option(help="Frame; the one that shows most if left out.")
+        int | None, typer.Option(help="Frame; by default the one that shows most.")
     ] = None,
     laser: Annotated[
-        str | None, typer.Option(help="Laser's name; the one that shows most if left out.")
+        str | None, typer.Option(help="Name of the laser; by default the one that shows most.")
     ] = None,
     target: Annotated[
         Path | None,
@@ -211,7 +212,9 @@ def report(
     folder: Annotated[Path, typer.Argument(help="Folder of the run.")],
     truth: Annotated[
         Path | None,
-        typer.Option(help="CSV with the truth to show; net writes the page again without it."),
+        typer.Option(
+            help="CSV with the ground truth to show; aqualvs net rewrites the page without it."
+        ),
     ] = None,
 ) -> None:
     """Write a report again."""
@@ -228,7 +231,7 @@ def report(
 def simulate(
     scenario: Annotated[str | None, typer.Argument(help="Scenario name or YAML file.")] = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder to write.")] = None,
-    rig: Annotated[Path | None, typer.Option(help="Rig file; the example rig if left out.")] = None,
+    rig: Annotated[Path | None, typer.Option(help="Rig file; by default the example rig.")] = None,
     camera: Annotated[
         str, typer.Option(help="Camera that takes the pictures: ideal, webcam, action or pal.")
     ] = "ideal",
@@ -237,7 +240,7 @@ def simulate(
         typer.Option(
             metavar="KIND:MS",
             help="How the camera exposes a picture, in milliseconds: rolling:READOUT:EXPOSURE, "
-            "interlaced:EXPOSURE or global:EXPOSURE; the rig's if left out.",
+            "interlaced:EXPOSURE or global:EXPOSURE; by default the rig's.",
         ),
     ] = None,
     overwrite: Overwrite = False,
@@ -271,7 +274,7 @@ def check(
         Path | None,
         typer.Option(
             metavar="last|FILE",
-            help="Say what has moved since the last calibration, or an older rig file.",
+            help="Report what has moved since the last calibration, or since an older rig file.",
         ),
     ] = None,
 ) -> None:

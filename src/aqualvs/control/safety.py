@@ -33,22 +33,25 @@ class LimitReason(StrEnum):
     PILOT_MODE = "pilot_mode", "the pilot chose another mode; stopped until engaged again"
     NO_STATION = "no_station", "no ground station heard; stopped until engaged again"
     IGNORED = "ignored", "the vehicle ignores our sticks; stopped until engaged again"
-    CONFLICT = "conflict", "two speak as the vehicle; stopped until engaged again"
-    UNKNOWN_MODE = "unknown_mode", "not a vehicle that can be steered; stopped until engaged again"
+    CONFLICT = "conflict", "two senders claim to be the vehicle; stopped until engaged again"
+    UNKNOWN_MODE = (
+        "unknown_mode",
+        "this kind of vehicle cannot be steered; stopped until engaged again",
+    )
     PILOT_STICKS = "pilot_sticks", "the pilot took the sticks; stopped until engaged again"
     CLOCK = "clock", "time ran backwards; stopped for this update"
     FROZEN = "frozen", "the picture stands still; neutral until it moves"
     NO_ANSWER = (
         "no_answer",
-        "the posture does not answer to the efforts; stopped until engaged again",
+        "the posture does not respond to the efforts; stopped until engaged again",
     )
     NO_POSTURE = "no_posture", "no valid posture; neutral until it is back"
-    NOT_FINITE = "not_finite", "a number is not finite; neutral for this update"
+    NOT_FINITE = "not_finite", "a value is not finite; neutral for this update"
     TOO_CLOSE = "too_close", "closer than the least range; backing away"
     TOO_FAST = "too_fast", "closing in too fast; braking"
     NO_SETPOINT = "no_setpoint", "no range is set to hold"
     MISSION_OVER = "mission_over", "the plan is done; holding until the pilot takes over"
-    TIPPING = "tipping", "the vehicle tips over; take the sticks while the target is in sight"
+    TIPPING = "tipping", "the vehicle is tipping over; take the sticks while the target is in sight"
     GAVE_UP = "gave_up", "the target was lost for too long; stopped until engaged again"
 
     @property

@@ -194,7 +194,7 @@ def load_design(path: Path, given: Mapping[str, Any] | None = None) -> Design:
     """
     content = read_yaml(path, "a design file", OptionError)
     if not isinstance(content, Mapping):
-        raise OptionError(f"{path}: is no design; such a file begins with '{KEY}: {VERSION}'")
+        raise OptionError(f"{path}: is not a design file, which begins with '{KEY}: {VERSION}'")
     merged = merged_content(content, given or {})
     return design_from(merged, name=str(path), folder=path.parent)
 

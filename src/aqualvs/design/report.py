@@ -113,7 +113,7 @@ def gain_text(design: Design, best: Design) -> str:
     now, tilted = predict_closely(design), predict_closely(best)
     both = now.valid & tilted.valid
     if not both.any():
-        return "Tilted best, its errors cannot be compared with that: no range has both."
+        return "With its lasers tilted best, its errors cannot be compared: no range has both."
     goals = np.full((np.count_nonzero(both), 3), design.goals.angle)
     goals[:, 0] = design.goals.range_share * now.ranges[both]
 
@@ -122,7 +122,8 @@ def gain_text(design: Design, best: Design) -> str:
         return math.sqrt(float(np.mean(squares[both] / goals**2)))
 
     where = "" if both.all() else f", at {_interval(now.ranges, both)} mm"
-    return f"Tilted best, its errors are {size(tilted) / size(now):.0%} of that{where}."
+    share = size(tilted) / size(now)
+    return f"With its lasers tilted best, its errors are {share:.0%} of that{where}."
 
 
 def lasers_table(design: Design, told: PredictedErrors) -> Table:

@@ -201,7 +201,7 @@ def print_experiments(echo: Echo) -> None:
     width = max(map(len, catalogue.MODULES))
     for name in catalogue.MODULES:
         found = catalogue.experiment(name)
-        echo(f"{name:<{width}}  {found.title} ({found.paper or 'an ablation of ours'})")
+        echo(f"{name:<{width}}  {found.title} ({found.paper or 'an ablation'})")
 
 
 def reproduce(request: ReproduceRequest, echo: Echo, load: Load = catalogue.experiment) -> int:
@@ -287,7 +287,7 @@ def _failed(name: str, found: Experiment | None, fault: Exception) -> Record:
 def _line(record: Record, seconds: float) -> str:
     if record.failure:
         return (
-            f"{record.name}: failed: {record.failure}; the whole story is in "
+            f"{record.name}: failed: {record.failure}; the full traceback is in "
             f"{_FAILURES}/{record.name}.txt"
         )
     missed = [finding.what for finding in record.findings if finding.met is False]
@@ -304,7 +304,7 @@ def _closing(book: _Book, names: Sequence[str], out: Path) -> list[str]:
     ]
     took = sum(book.seconds[name] for name in names)
     failed = [name for name in names if book.records[name].failure]
-    lines = [f"{sum(bars)} of {len(bars)} bars met, {took:.0f} s", f"page: {out / PAGE}"]
+    lines = [f"{sum(bars)} of {len(bars)} criteria met, {took:.0f} s", f"page: {out / PAGE}"]
     if failed:
         lines.insert(0, f"{len(failed)} of {len(names)} experiments failed: {', '.join(failed)}")
     return lines

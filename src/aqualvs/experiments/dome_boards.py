@@ -169,7 +169,7 @@ def _run(laboratory: Laboratory) -> ExperimentResult:
             "The pictures are rendered through the dome, in air, with defocus and sensor noise, "
             "and the corners are found in them. As in the paper only the distance of a board from "
             "the dome's centre is given, here with 0.2 mm of error on each reading and 0.2 mm on "
-            "all; every second board stands up to 1.5° askew, which nobody tells the solver.",
+            "all; every second board stands up to 1.5° askew, of which the solver knows nothing.",
             "The paper prints one set of parameters (Table 1) and neither an uncertainty nor a "
             "residual. Radius, thickness and index of the dome are given, as there: pictures "
             "cannot tell them apart.",
@@ -348,7 +348,7 @@ EXPERIMENT = Experiment(
     name="dome",
     title="Calibrating the dome from boards",
     paper="section 2.2, table 1, figures 3 and 4",
-    about="Boards at measured distances in air, seen through the dome, tell where the lens sits in "
-    "it and how the camera is turned; intrinsics come from boards without the dome.",
+    about="Boards at measured distances in air, seen through the dome, give the position of the "
+    "lens in it and the rotation of the camera; intrinsics come from boards without the dome.",
     run=_run,
 )

@@ -138,7 +138,7 @@ def _run(laboratory: Laboratory) -> ExperimentResult:
     left = remaining(truth, found)
     angle, offset = max(e.angle for e in errors), max(abs(e.offset) for e in errors)
     return ExperimentResult(
-        sentence=f"{len(solved.solution.views)} pictures of the box tell the laser planes to "
+        sentence=f"{len(solved.solution.views)} pictures of the box give the laser planes to "
         f"{np.rad2deg(angle):.3f}° and {1e3 * offset:.2f} mm; the range error that the whole "
         f"calibration leaves is {np.abs(left.percent).max():.3f} % at most, from 0.3 to 1 m.",
         findings=(*_plane_findings(truth, figures, errors), *_left_findings(left)),
@@ -153,8 +153,8 @@ def _run(laboratory: Laboratory) -> ExperimentResult:
             "picture. The paper has one view of its box and prints no accuracy.",
             "The paper's way (pose by distances in space, Eq. 32-33, then the pseudo-inverse, "
             "Eq. 36) is computed from the same pictures and stands beside ours.",
-            "What remains is told without any noise: the true rig's pixels on walls square ahead, "
-            "read by the calibrated rig. It is the error that no averaging removes.",
+            "The remaining error is computed without noise: the true rig's pixels on walls square "
+            "ahead, read by the calibrated rig. It is the error that no averaging removes.",
         ),
     )
 
@@ -234,7 +234,7 @@ _BOX = (
 _LEFT = (
     "remaining",
     "Error that the calibration leaves on walls square ahead, with the two standard deviations "
-    "that it states; dashed: what we hold ourselves to.",
+    "that it states; dashed: our criterion.",
 )
 
 
@@ -330,6 +330,6 @@ EXPERIMENT = Experiment(
     title="Calibrating the lasers in a box",
     paper="section 3.3, figure 7",
     about="An open box with markers on four planes, the vehicle somewhere before it: the markers "
-    "tell its pose, and the stripes on known planes tell the planes of the lasers.",
+    "give its pose, and the stripes on known planes give the planes of the lasers.",
     run=_run,
 )

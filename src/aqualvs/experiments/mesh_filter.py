@@ -297,7 +297,7 @@ def _run(laboratory: Laboratory) -> ExperimentResult:
             "Truth: the points that the simulator lit, every fourth pixel of stripe. A reflection "
             "is a group of connected bright pixels of one laser, and kept if more than half of "
             "them are.",
-            "The paper's text leaves choices open; docs/mesh-filter.md tells which were made, and "
+            "The paper's text leaves choices open; docs/mesh-filter.md lists those made, and "
             "why so little of a diamond net passes.",
         ),
     )

@@ -257,7 +257,7 @@ def page_html(records: Sequence[Record], seconds: Mapping[str, float], folder: P
     Raises `OSError` if a figure cannot be read.
     """
     content = {
-        "title": "The paper’s experiments, beside ours",
+        "title": "The paper’s experiments and ours",
         "version": __version__,
         "doi": DOI,
         "results": RESULTS,
@@ -276,7 +276,7 @@ def _cards(records: Sequence[Record], seconds: Mapping[str, float]) -> Iterator[
     bars = [finding.met for _, finding in _with_bar(records)]
     done = sum(not record.failure for record in records)
     took = sum(seconds.get(record.name, 0.0) for record in records)
-    yield Card("bars met", f"{sum(map(bool, bars))} of {len(bars)}", "what we hold ourselves to")
+    yield Card("bars met", f"{sum(map(bool, bars))} of {len(bars)}", "our criterion")
     yield Card("experiments", f"{done} of {len(records)}", "done; each can be run alone")
     yield Card("time", duration(took), f"on {os.cpu_count() or 1} cores")
     papers_fps = 25

@@ -210,8 +210,8 @@ def _run_sea(laboratory: Laboratory) -> ExperimentResult:
     depth, heading = log.column("depth"), np.unwrap(log.column("heading"))
     return ExperimentResult(
         sentence=f"Sinking from {depth[0]:.1f} to {depth[-1]:.1f} m along a net that moves, range "
-        f"is told within {rms[0]:.2f} % and yaw within {rms[2]:.2f} degrees (rms) in {share:.0f} % "
-        "of the pictures.",
+        f"is measured within {rms[0]:.2f} % and yaw within {rms[2]:.2f} degrees (rms) in "
+        f"{share:.0f} % of the pictures.",
         findings=(
             ExperimentRow(
                 what="pictures with a posture (%)",

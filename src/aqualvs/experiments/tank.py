@@ -233,7 +233,7 @@ def _run_distance(laboratory: Laboratory) -> ExperimentResult:
         series=(DataColumns(name="distance", columns=columns),),
         notes=(
             "The truth is that of the simulator; the paper's distances were set by hand.",
-            "What calibration adds is common to all frames of a place; the bars tell noise only.",
+            "What calibration adds is common to all frames of a place; the bars are noise only.",
         ),
     )
 

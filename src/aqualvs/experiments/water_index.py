@@ -270,7 +270,7 @@ def _run(laboratory: Laboratory) -> ExperimentResult:
     last = numbers.after(2 * _SETUP.frames - 1, _SETUP.frames)
     worst, by_paper = (float(np.abs(n - last.truth).max()) for n in (last.ours, last.paper))
     return ExperimentResult(
-        sentence=f"From {WATERS[0]} to {WATERS[-1]} the index is told to {worst:.4f} at worst, "
+        sentence=f"From {WATERS[0]} to {WATERS[-1]} the index is found to {worst:.4f} at worst, "
         f"within {_in_sigmas(last).max():.1f} standard deviations everywhere; the paper's way is "
         f"off by up to {by_paper:.4f} on the same frames.",
         findings=_findings(last, wet, alarms, spread),
@@ -343,7 +343,7 @@ def _findings(
         ),
         ExperimentRow(
             what="index with the lens at the dome's centre",
-            ours="told" if spread.observable[0] else "refused as unobservable",
+            ours="found" if spread.observable[0] else "refused as unobservable",
             bar="refused",
             met=not spread.observable[0],
         ),

@@ -103,7 +103,7 @@ def net_of_run(place: NetSource, request: NetRequest, echo: Callable[[str], obje
     for line in [*result.lines, f"map of the net: {folder / NET_MAP_PNG}"]:
         echo(line)
     if stop.caught:
-        echo(f"stopped by {stop.caught.name}; {folder} tells of the frames before")
+        echo(f"stopped by {stop.caught.name}; {folder} covers the frames before")
     elif missing := stored.missing(result.summary["n_frames"]):
         echo(f"warning: {missing}")
     if folder == run_folder and (run_folder / REPORT_HTML).exists():

@@ -357,8 +357,8 @@ def _on_wall(
         shift = align(one, placed, frame) if placed else SurveyShift.first()
         if not frame.round and not shift.told[0]:
             warnings.append(
-                f"{survey.folder}: growth and holes do not tell how it lies along the net beside "
-                "earlier dives, and it is left out of the map"
+                f"{survey.folder}: growth and holes do not determine its position along the net "
+                "relative to earlier dives; it is left out of the map"
             )
             continue
         if not shift.told.all():
@@ -388,8 +388,8 @@ def _not_aligned(survey: Survey, shift: SurveyShift, frame: WallFrame) -> str:
     if not shift.told[1]:
         parts.append(f"depth (± {shift.sigma[1]:.1f} m)")
     return (
-        f"{survey.folder}: growth and holes do not tell how its {' and '.join(parts)} "
-        f"lie{'s' if len(parts) == 1 else ''} beside earlier dives; taken as logged"
+        f"{survey.folder}: growth and holes do not determine the offset of its "
+        f"{' and '.join(parts)} from earlier dives; taken as logged"
     )
 
 
@@ -427,19 +427,20 @@ def _warnings(surveys: Sequence[Survey]) -> list[str]:
     other_net = 0.1
     if known and max(known) > (1.0 + other_net) * min(known):
         found.append(
-            f"meshes differ, from {min(known):.1f} to {max(known):.1f} mm bar: is it the same net?"
+            f"meshes differ, from {min(known):.1f} to {max(known):.1f} mm bar: is this the "
+            "same net?"
         )
     twines = {one.facts.get("options", {}).get("twine_mm") for one in surveys}
     if len(twines) > 1:
         found.append(
-            "the twine was given (--twine-mm) for some runs and not, or differently, for others: "
-            "solidity may differ for that alone"
+            "--twine-mm differs between runs, or was given for some only: solidity may differ for "
+            "that reason alone"
         )
     for one in surveys:
         slip = one.facts.get("summary", {}).get("track_slip_m")
         if isinstance(slip, int | float) and slip > 0.0:
             found.append(
-                f"{one.folder}: its track and its log part by {slip:.1f} m in height; its places "
-                "and the sizes of its holes are not to be trusted"
+                f"{one.folder}: its track and its log differ by {slip:.1f} m in depth; its places "
+                "and the sizes of its holes are unreliable"
             )
     return found

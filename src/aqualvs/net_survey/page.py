@@ -394,5 +394,5 @@ def _dives(result: Comparison, origins: Mapping[str, str]) -> html.Raw:
                 *words,
             )
         )
-    head = ("dive", "date", "told by", "stretches", "holes", "shifted along", "shifted down")
+    head = ("dive", "date", "date from", "stretches", "holes", "shifted along", "shifted down")
     return html.table(head, rows, texts=3)

@@ -56,7 +56,7 @@ def date_of_run(folder: Path) -> tuple[date, str]:
     if start is not None:
         return datetime.fromtimestamp(start, UTC).date(), "the video's clock"
     raise OptionError(
-        f"{folder}: neither its name nor its video tells the date of the dive; add --date "
+        f"{folder}: neither its name nor its video gives the date of the dive; add --date "
         f"YYYY-MM-DD, once for every RUN in their order ({AUTO} where it is to be found)"
     )
 
@@ -77,7 +77,7 @@ def _given(text: str) -> date | None:
     try:
         return datetime.fromisoformat(text).date()
     except ValueError as fault:
-        raise OptionError(f"--date {text}: is no date; write it as 2026-05-01") from fault
+        raise OptionError(f"--date {text}: is not a date; write it as 2026-05-01") from fault
 
 
 def _source(folder: Path) -> Path:
@@ -166,7 +166,7 @@ def find_runs(folder: Path) -> list[Path]:
         return [folder]
     if (folder / POSTURE_CSV).is_file():
         raise SourceError(
-            f"{folder}: is a run without the state of its net ({NET_CSV}); "
+            f"{folder}: is a run whose net has not been evaluated ({NET_CSV}); "
             f"run: aqualvs net {folder} --log LOG"
         )
     found = sorted(path.parent for path in folder.glob(f"{_DIVES}/*/{NET_CSV}"))
@@ -174,7 +174,7 @@ def find_runs(folder: Path) -> list[Path]:
         return found
     if (folder / _DIVES).is_dir():
         raise SourceError(
-            f"{folder}: is a batch of which no dive has the state of its net ({NET_CSV}); "
+            f"{folder}: is a batch in which no net has been evaluated ({NET_CSV}); "
             f"run: aqualvs net {folder / _DIVES}/NAME --log LOG, for each"
         )
     raise SourceError(f"{folder}: no run is there ({NET_CSV} is missing); name folders of runs")
@@ -189,7 +189,11 @@ def left_out(folder: Path) -> list[str]:
     if not missing:
         return []
     n = len(missing)
-    words = "dive without the state of its net is" if n == 1 else "dives without their net's are"
+    words = (
+        "dive whose net has not been evaluated is"
+        if n == 1
+        else "dives whose nets have not been evaluated are"
+    )
     return [f"{folder}: {n} {words} left out: {', '.join(missing)} (aqualvs net)"]
 
 
@@ -231,7 +235,7 @@ def check_surveys(surveys: Sequence[Survey]) -> None:
         if folders.count(folder) > 1:
             raise OptionError(f"{one.folder}: is named twice; name every run once")
     if len(surveys) < 2:
-        raise OptionError("one run is no comparison; name the runs of two dates or more")
+        raise OptionError("one run cannot be compared; name runs of at least two dates")
     if len({one.date for one in surveys}) < 2:
         raise OptionError(
             f"all {len(surveys)} runs are of {surveys[0].date}; name runs of another date too, or "

@@ -15,10 +15,10 @@ from aqualvs.text import count_text
 STATE_TITLES = {
     HoleState.NEW: "new",
     HoleState.GROWN: "grown",
-    HoleState.GONE: "gone, mended or missed this time",
+    HoleState.GONE: "gone, repaired or missed this time",
     HoleState.FIRST_LOOK: "seen now, where no earlier dive looked",
     HoleState.NOT_PASSED: "seen before, where no dive looked now",
-    HoleState.SMALLER: "smaller, mended in part or seen in part",
+    HoleState.SMALLER: "smaller, partly repaired or partly seen",
     HoleState.SAME: "the same",
 }
 """How sentences call what became of a hole; what matters most comes first."""
@@ -100,7 +100,7 @@ def _hole_counts(result: Comparison) -> str:
         f"{day}: {sum(len(s.holes.number) for s in result.surveys if s.date == day)}"
         for day in result.dates
     ]
-    return f"holes: {', '.join(counts)}; which are the same cannot be told without places"
+    return f"holes: {', '.join(counts)}; without positions it is unknown which are the same"
 
 
 def _shift_lines(wall: OnWall) -> Iterator[str]:
@@ -118,12 +118,12 @@ def _shift_lines(wall: OnWall) -> Iterator[str]:
         how = " and ".join(
             name for name, told in (("growth", shift.by_pattern), ("holes", shift.by_holes)) if told
         )
-        yield f"{one.survey.name}: laid on earlier dives by {how}: {', '.join(parts)}"
+        yield f"{one.survey.name}: aligned with earlier dives by {how}: {', '.join(parts)}"
 
 
 def _growth_line(wall: OnWall) -> str:
     if wall.growth is None:
-        return "no part of the net was seen on two dates: growth is not told"
+        return "no part of the net was seen on two dates: growth is unknown"
     area = len(wall.cells) * float(np.prod(wall.history.raster.size))
     return (
         f"fouling: {rate_text(wall.growth)}, on {area:.0f} m² seen on two dates or more: "

@@ -435,16 +435,15 @@ def track_warnings(summary: Mapping[str, Any]) -> list[str]:
     words = []
     if slip > 0.0:
         words.append(
-            f"the track and the log's depth part by {slip:.1f} m: meshes were counted wrongly, so "
-            "places along the net and sizes of holes are not to be trusted"
+            f"the track and the log's depth differ by {slip:.1f} m: meshes were miscounted, so "
+            "places along the net and sizes of holes are unreliable"
         )
     # Pieces that are shorter, in the mean, than the frames to which the start of one is fitted.
     if breaks * START_FRAMES > n_frames:
         words.append(
             f"the track along the net broke {count_text(int(breaks), 'time')} in "
             f"{count_text(int(n_frames), 'frame')}: a hole may count once for each piece, and "
-            "places are not to be trusted; frames are too far apart, or images lack their rate "
-            "(--fps)"
+            "places are unreliable; frames are too far apart, or images lack their rate (--fps)"
         )
     return words
 
@@ -468,7 +467,7 @@ def size_text(hole: Hole) -> str:
 
 def _mesh_line(facts: dict[str, Any]) -> str:
     if facts["bar_mm"] is None:
-        return "net: its mesh could not be made out"
+        return "net: its mesh could not be determined"
     bar = facts["bar_mm"]
     words = f"net: {facts['mesh']} meshes of {bar:.1f} mm bar ({2.0 * bar:.0f} mm stretched)"
     return words if facts["twine_mm"] is None else f"{words}, twine {facts['twine_mm']:.1f} mm"

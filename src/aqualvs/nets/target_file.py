@@ -98,7 +98,7 @@ def net_request(
         return NetRequest(**known)
     if known:
         option = next(iter(known)).replace("_", "-")
-        raise OptionError(f"--{option}: is about the state of the net; add --net")
+        raise OptionError(f"--{option}: is for the condition of the net; add --net")
     return None
 
 

@@ -182,7 +182,7 @@ def _checked_pose(pose: SE3) -> tuple[FloatArray, FloatArray]:
     error = np.abs(rotation @ rotation.T - np.eye(3)).max()
     if not (error < 1e-6 and np.linalg.det(rotation) > 0.0):
         raise RigError(
-            f"camera rotation {rotation.tolist()} is no rotation matrix; give an orthogonal "
+            f"camera rotation {rotation.tolist()} is not a rotation matrix; give an orthogonal "
             "matrix with determinant 1"
         )
     return rotation, centre

@@ -189,7 +189,7 @@ def _old_rig(path: Path) -> str:
     except OutputError:
         content = None
     if not isinstance(content, Mapping) or "aqualvs_rig" not in content:
-        raise OutputError(f"{path}: exists and is no rig file; choose another place for the rig")
+        raise OutputError(f"{path}: exists and is not a rig file; choose another place for the rig")
     return text
 
 

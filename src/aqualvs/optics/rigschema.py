@@ -71,7 +71,7 @@ def _camera_conditions(schema: dict[str, Any]) -> None:
 
 
 class ShutterPart(StrictPart):
-    """`shutter` of the camera; all at once if left out."""
+    """`shutter` of the camera; global by default."""
 
     kind: Annotated[
         Literal["global", "rolling", "interlaced"], _said("Order in which rows are exposed.")
@@ -83,7 +83,7 @@ class ShutterPart(StrictPart):
             "field to the second."
         ),
     ] = 0.0
-    exposure_ms: Annotated[NotNegative, _said("Time that a row gathers light; 0 if unknown.")] = 0.0
+    exposure_ms: Annotated[NotNegative, _said("Exposure time of a row; 0 if unknown.")] = 0.0
     first_field: Annotated[
         Literal["top", "bottom"], _said("Of interlaced video; top holds rows 0, 2, 4.")
     ] = "top"
@@ -99,8 +99,8 @@ class CameraPart(StrictPart):
     ] = "opencv"
     fx_px: Annotated[FocalLength, _said("Focal length along x, in air without the dome.")]
     fy_px: Annotated[FocalLength, _said("Focal length along y, in air without the dome.")]
-    cx_px: Annotated[Number, _said("Image centre; the centre of the top-left pixel is (0, 0).")]
-    cy_px: Annotated[Number, _said("Image centre; the centre of the top-left pixel is (0, 0).")]
+    cx_px: Annotated[Number, _said("Principal point; the centre of the top-left pixel is (0, 0).")]
+    cy_px: Annotated[Number, _said("Principal point; the centre of the top-left pixel is (0, 0).")]
     distortion: Annotated[
         list[Number],
         _said("opencv: none, or k1 k2 p1 p2 [k3 [k4 k5 k6]]; fisheye: none, or k1 k2 k3 k4."),
@@ -112,7 +112,7 @@ class CameraPart(StrictPart):
     rotation_deg: Annotated[
         Triple, _said("Rotation vector in `dome`, applied after the nominal mounting.")
     ] = Field(default=[0.0, 0.0, 0.0])
-    shutter: Annotated[ShutterPart, _said("When rows are exposed; all at once if left out.")] = (
+    shutter: Annotated[ShutterPart, _said("When rows are exposed; global by default.")] = (
         ShutterPart()
     )
 
@@ -134,7 +134,7 @@ class FlatPart(StrictPart):
     tilt_deg: Annotated[
         list[Tilt],
         Field(min_length=2, max_length=2),
-        _said("Of its normal from the optical axis, about the camera's x and y axes."),
+        _said("Tilt of its normal from the optical axis, about the camera's x and y axes."),
     ] = Field(default=[0.0, 0.0])
 
 
@@ -164,7 +164,7 @@ class WaterPart(StrictPart):
     temperature_c: Annotated[Number | None, _said("0 to 30; in place of n.")] = None
     salinity_permille: Annotated[Number | None, _said("0 to 40; in place of n.")] = None
     wavelength_nm: Annotated[
-        Number | None, _said("Of the light, for the index; that of the lasers, or 532.")
+        Number | None, _said("Wavelength for the index; by default that of the lasers, or 532.")
     ] = None
 
 
@@ -172,18 +172,20 @@ class WindowPart(StrictPart):
     """`window` of a laser: its outer face in `dome`, and the light source."""
 
     normal: Annotated[Triple, _said("Normal of the window's outer face.")]
-    offset_mm: Annotated[Number, _said("Of the outer face, along the unit normal.")]
-    source_mm: Annotated[Triple, _said("Point that the light fans out from.")]
+    offset_mm: Annotated[
+        Number, _said("Distance of the outer face from the dome's centre along the unit normal.")
+    ]
+    source_mm: Annotated[Triple, _said("Point from which the light fans out.")]
 
 
 class LaserPart(StrictPart):
     """One of `lasers`: a plane in `dome`; `offset_mm` belongs to the unit normal."""
 
-    name: Annotated[Name, _said("A name of its own.")]
+    name: Annotated[Name, _said("Unique name.")]
     normal: Annotated[Triple, _said("Normal of the laser's plane in `dome`, of any length.")]
     offset_mm: Annotated[Number, _said("Distance from the dome's centre along the unit normal.")]
     wavelength_nm: Annotated[
-        LaserWavelength | None, _said("Of this laser's light; green if it is left out.")
+        LaserWavelength | None, _said("Wavelength of this laser; green by default.")
     ] = None
     window: WindowPart | None = None
 
@@ -220,7 +222,7 @@ class RigFile(StrictPart):
     aqualvs_rig: Annotated[
         int, Field(description="Version of the format.", json_schema_extra={"const": VERSION})
     ]
-    name: Annotated[Name, _said("How reports call the rig.")] = "rig"
+    name: Annotated[Name, _said("Name of the rig in reports.")] = "rig"
     image: ImagePart
     camera: CameraPart
     housing: Annotated[
@@ -231,15 +233,15 @@ class RigFile(StrictPart):
     flat: Annotated[FlatPart | None, _said("Leave it out without a flat port.")] = None
     n_air: Annotated[Index, _said("Index inside the housing, relative to vacuum.")] = N_AIR
     water: Annotated[
-        WaterPart | None, _said("What is outside; needed behind a housing, else air.")
+        WaterPart | None, _said("Water outside; required behind a housing, else air.")
     ] = None
-    lasers: Annotated[list[LaserPart], _said("One to measure points, two for a posture.")] = Field(
+    lasers: Annotated[list[LaserPart], _said("One laser for points, two for a posture.")] = Field(
         default=[]
     )
     working_range_mm: Annotated[
-        Pair, _said("Nearest and farthest target at which stripes are believed.")
+        Pair, _said("Nearest and farthest target at which stripes are accepted.")
     ] = Field(default=[250.0, 1300.0])
-    solved_from: Annotated[dict[str, Any], _said("What calibrations note down; kept.")] = Field(
+    solved_from: Annotated[dict[str, Any], _said("Written by calibrations; preserved.")] = Field(
         default={}
     )
 

@@ -248,7 +248,7 @@ def _shortened(sigma: FloatArray, correlation: FloatArray) -> tuple[FloatArray, 
 def _names(values: object, rig: Rig) -> tuple[str, ...]:
     known = {file_parameter_name(name): name for name in rig_parameter_names(rig)}
     if not isinstance(values, list):
-        raise RigError(f"{_PLACE}.parameters is no list; take {_PLACE} out, or calibrate again")
+        raise RigError(f"{_PLACE}.parameters is not a list; take {_PLACE} out, or calibrate again")
     for i, value in enumerate(values):
         place = f"{_PLACE}.parameters[{i}] is {value!r}"
         if not isinstance(value, str) or value not in known:
@@ -451,7 +451,7 @@ def _intrinsics(rig: Rig) -> Assumption:
     }
     words = (
         f"{SIGMAS.focal_share:.1%} in focal length, "
-        f"{SIGMAS.centre_share:.1%} of the width in image centre"
+        f"{SIGMAS.centre_share:.1%} of the width in principal point"
     )
     if "k1" in lens.parameter_names:
         sigmas["k1"] = SIGMAS.distortion_k1

@@ -107,7 +107,7 @@ def _status_warnings(run: Mapping[str, Any], track: Track) -> Iterator[str]:
     summary = run.get("summary")
     n_frames = summary.get("n_frames") if isinstance(summary, dict) else None
     if isinstance(n_frames, int) and n_frames > len(track):
-        yield f"posture.csv holds {len(track)} of the run's {n_frames} frames: it was cut short."
+        yield f"posture.csv holds {len(track)} of the run's {n_frames} frames: it is truncated."
     if run.get("error"):
         yield f"The run ended with: {run['error']}"
     share = float(track.valid.mean())
@@ -149,7 +149,7 @@ def _range_warnings(track: Track, working_range: tuple[float, float] | None) -> 
         frames = f"{count_text(outside, 'frame')} {'lies' if outside == 1 else 'lie'}"
         yield (
             f"{frames} outside the rig's working range of {1e3 * near:.0f}–{1e3 * far:.0f} mm; "
-            "trust what is out there less."
+            "values out there are less accurate."
         )
 
 
@@ -158,7 +158,7 @@ def _precision_warnings(track: Track) -> Iterator[str]:
     loose_share = 0.02
     loose = float((relative > loose_share).mean()) if len(relative) else 0.0
     if loose > 0.05:
-        yield f"{100 * loose:.0f} % of the ranges are looser than {100 * loose_share:g} % (1 σ)."
+        yield f"{100 * loose:.0f} % of the ranges have a sigma above {100 * loose_share:g} %."
     n_points = track.n_points[track.valid & np.isfinite(track.n_points)]
     few_points = 60
     if len(n_points) and np.median(n_points) < few_points:

@@ -54,7 +54,7 @@ def read_net(run_dir: Path) -> tuple[NetTables | None, str]:
         there = (run_dir / HOLES_CSV).is_file()
         holes = _rows(run_dir / HOLES_CSV) if there else []
     except (OSError, UnicodeDecodeError, csv.Error):
-        return None, "net.csv or holes.csv cannot be read: the state of the net is not shown."
+        return None, "net.csv or holes.csv cannot be read: the condition of the net is not shown."
     net = NetTables(stretches, holes, there, _facts(run_dir / NET_GEOJSON), _picture(run_dir))
     if there and net.summary.get("n_holes", len(holes)) == len(holes):
         return net, ""

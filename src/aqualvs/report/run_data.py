@@ -219,9 +219,7 @@ def _read_columns(
     # With NumPy: filtering an Arrow table imports all of its functions first.
     whole = np.isfinite(_numbers(table["frame"])) & np.isfinite(_numbers(table["time_s"]))
     if not whole.any():
-        raise NoFrameError(
-            f"{path}: holds no frame; there is nothing to report, run the dive again"
-        )
+        raise NoFrameError(f"{path}: holds no frame; run the dive again")
     words = table.unify_dictionaries()
     return (
         {name: _numbers(table[name])[whole] for name in numbers},
@@ -246,7 +244,7 @@ def _read_table(path: Path, numbers: tuple[str, ...], texts: tuple[str, ...]) ->
         raise SourceError(f"{path}: no such file; name the folder of a run, or run it") from None
     except (pa.ArrowInvalid, OSError) as fault:
         first_line = str(fault).splitlines()[0]
-        raise SourceError(f"{path}: cannot be read ({first_line}); mend or remove it") from fault
+        raise SourceError(f"{path}: cannot be read ({first_line}); fix or remove it") from fault
 
 
 def _words(column: Any, rows: BoolArray) -> _Words:

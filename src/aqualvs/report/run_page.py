@@ -360,7 +360,7 @@ def _errors_table(track: Track, truth: FloatArray) -> tuple[int, str]:
 def _why_no_planes(points: PointSummary | None, known: list[int]) -> str:
     if points is None:
         return "The run left no points."
-    return "" if known else "The laser planes are unknown, so there is no such view."
+    return "" if known else "The laser planes are unknown, so this view is left out."
 
 
 def _cloud_amount(points: PointSummary | None) -> str:

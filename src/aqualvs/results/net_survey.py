@@ -217,7 +217,8 @@ def read_run(run_folder: str | Path) -> Iterator[Scan]:
             time_s, n_water = float(row["time_s"]), _number(row["n_water"])
         except ValueError as fault:
             raise SourceError(
-                f"{path}: frame {row['frame']} holds what is no number ({fault}); mend the row"
+                f"{path}: frame {row['frame']} holds a value that is not a number "
+                f"({fault}); fix the row"
             ) from fault
         yield Scan(index, time_s, posture, points.of(index), n_water)
 

@@ -96,7 +96,7 @@ def compare_with_truth(posture_csv: Path, truth_csv: Path) -> TruthComparison:
     known = {frame for frame in truth if frame in frames}
     if truth and not known:
         raise SourceError(
-            f"{truth_csv}: tells of {count_text(len(truth), 'frame')}, none of them in "
+            f"{truth_csv}: covers {count_text(len(truth), 'frame')}, none of them in "
             f"{posture_csv}; give the truth of this dive"
         )
     common = sorted(measured.keys() & known)
@@ -150,7 +150,7 @@ def _postures(path: Path, rows: list[Row]) -> dict[int, tuple[float, float, floa
             values, unit = lit, "range_mm"
         if all(map(math.isfinite, [frame, *values])):
             if int(frame) in found:
-                raise SourceError(f"{path}: tells of frame {int(frame)} twice; keep one row of it")
+                raise SourceError(f"{path}: has frame {int(frame)} twice; keep one row of it")
             found[int(frame)] = (values[0] * RANGE_UNITS[unit], values[1], values[2])
     return found
 

@@ -209,7 +209,7 @@ def _check(rig: Rig, size: SetSize) -> None:
         and not pose.translation.any()
     ):
         raise OptionError(
-            f"rig {rig.name}: behind a flat port no picture tells where the camera is on the "
+            f"rig {rig.name}: behind a flat port no picture determines where the camera is on the "
             "vehicle; leave camera.position_mm and camera.rotation_deg at zero"
         )
     if min(size.camera, size.dome, size.box, size.index) < 1 or size.dive < 0:

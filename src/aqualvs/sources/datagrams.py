@@ -71,7 +71,7 @@ def why_not(address: UdpAddress, fault: OSError) -> str:
         return f"port {address.port} is taken by another program, such as QGroundControl"
     if fault.errno == errno.EADDRNOTAVAIL:
         return (
-            f"{address.host} is no address of this machine; connect the tether, "
+            f"{address.host} is not an address of this machine; connect the tether, "
             f"or listen on all with udp://:{address.port}"
         )
     return f"cannot listen on {address} ({fault.strerror})"

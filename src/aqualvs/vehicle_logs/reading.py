@@ -72,7 +72,7 @@ def _rows(text: str, path: Path) -> list[tuple[int, list[str]]]:
     try:
         return [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
     except csv.Error as fault:
-        raise SourceError(f"{path}: line {reader.line_num}: {fault}; mend the line") from None
+        raise SourceError(f"{path}: line {reader.line_num}: {fault}; fix the line") from None
 
 
 def _columns(names: list[str], path: Path) -> tuple[list[str], list[str]]:
@@ -119,7 +119,7 @@ def _table(
     for line, row in rows:
         if len(row) != len(names):
             raise SourceError(
-                f"{path}: line {line} has {len(row)} values for {len(names)} columns; mend the line"
+                f"{path}: line {line} has {len(row)} values for {len(names)} columns; fix the line"
             )
         for i, name in wanted:
             filled[name].append(_number(name, row[i].strip(), path, line))

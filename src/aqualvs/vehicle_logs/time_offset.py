@@ -178,8 +178,8 @@ def _clear_peak(
         return best
     if rival is None:
         return OffsetRefusal(
-            f"the motion common to posture and log is too small to tell the offset{where} (best "
-            f"{best:.2f} s, {margin:.1f} sigma from chance); give the offset yourself"
+            f"the motion common to posture and log is too small to determine the offset{where} "
+            f"(best {best:.2f} s, {margin:.1f} sigma from chance); give the offset yourself"
         )
     return OffsetRefusal(
         f"offsets of {best:.2f} s and {rival:.2f} s explain the motion almost equally well{where} "

@@ -248,7 +248,7 @@ def _autopilot(frames: SelectedMessages, path: Path) -> tuple[int, str | None]:
     counts = {int(source): int(np.count_nonzero(said == source)) for source in speakers}
     if not counts or not max(counts.values()):
         raise SourceError(
-            f"{path}: no autopilot tells depth or attitude in {frames.n_frames} messages; "
+            f"{path}: no depth or attitude from an autopilot in {frames.n_frames} messages; "
             "give the log of the vehicle's own connection"
         )
     best = max(counts, key=lambda source: counts[source])

@@ -383,7 +383,7 @@ class WaterFollowingScanner:
             f"water index {last.n:.5f} ± {last.sigma:.5f} from {count_text(self._n_read, 'frame')}"
         ]
         if not last.observable:
-            found.append("the pictures alone cannot tell the index; see aqualvs check")
+            found.append("the pictures alone do not determine the index; see aqualvs check")
         return found + [step.text() for step in self._estimator.steps]
 
     def is_due(self, frame: Frame) -> bool:

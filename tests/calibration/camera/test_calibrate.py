@@ -211,7 +211,7 @@ def _few_corners(views: list[View]) -> list[View]:
         (_fewer, "2 pictures show the board; the camera needs 3"),
         (_few_corners, "30 board corners in 5 pictures"),
         (_parallel, "focal length .* parallel within .* tilt the board by 20 to 40"),
-        (_same, "do not determine the (focal length|image centre)"),
+        (_same, "do not determine the (focal length|principal point)"),
         (_other_board, "no camera (explains|can have taken)"),
         (_in_metres, "would stand 0.* mm away; is square_mm in its file in millimetres"),
         (_in_micrometres, "would stand .*e\\+05 mm away; is square_mm"),

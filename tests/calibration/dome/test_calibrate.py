@@ -221,7 +221,7 @@ def test_tolerances_stay_what_pictures_cannot_tell() -> None:
     text = "\n".join(found.findings)
     assert "acrylic index" in text
     assert "not determined by the pictures, taken as given" in text
-    assert "camera rotation: taken from the rig; boards at unknown poses say nothing" in text
+    assert "camera rotation: taken from the rig; boards at unknown poses do not" in text
     exact = replace(QUICK, inner_radius_sigma=0.0)
     without = _solve([_rail("unknown").as_set()], options=exact, rotation_known=True)
     assert "inner_radius" not in without.uncertainty.names
@@ -269,7 +269,7 @@ def test_says_that_pictures_show_no_dome() -> None:
     found = _solve([_rail("exact", centred).as_set()], centred, DomeOptions())
     assert any("do not show that there is a dome" in line for line in found.findings)
     unknown = _solve([_rail("unknown", centred, WATER).as_set(WATER)], centred, rotation_known=True)
-    assert any("do not tell n = 1.3333 from 1.0003" in line for line in unknown.findings)
+    assert any("do not distinguish n = 1.3333 from 1.0003" in line for line in unknown.findings)
 
 
 def test_outliers_do_not_matter() -> None:

@@ -112,5 +112,5 @@ def test_poses_are_refused() -> None:
 def test_too_little_in_the_pictures_is_refused() -> None:
     boards = shoot(flat_port_rig(), WATER, np.random.default_rng(1), 3, nearest=0.7, at_most=25)
     vague = RigUncertainty.independent(dict.fromkeys(("fx", "fy", "cx", "cy"), 10.0))
-    with pytest.raises(CalibrationError, match="do not tell how far the port is"):
+    with pytest.raises(CalibrationError, match="do not determine the port's distance"):
         dome(START, [boards.as_set(WATER)], QUICK, vague)

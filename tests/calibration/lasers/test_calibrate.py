@@ -292,7 +292,9 @@ def test_one_laser_among_glints_is_found_where_it_is_told(laser: int) -> None:
 def test_a_plane_that_may_be_print_is_asked_about() -> None:
     made = scene(3, 1, 8, clutter=Clutter(edges=0.6), noise_px=0.1, rail=True)
     views = [LaserView(v.view, v.stripes) for v in made.views]
-    with pytest.raises(CalibrationError, match=r"1 laser is certain.*give --lasers N"):
+    with pytest.raises(
+        CalibrationError, match=r"1 laser is certain.*give their number \(--lasers N\)"
+    ):
         calibrate_lasers(without_lasers(made.rig), views, board_surface())
     told = calibrate_lasers(
         without_lasers(made.rig), views, board_surface(), options=LaserOptions(n_lasers=1)

@@ -60,11 +60,11 @@ def test_cut_digits_still_give_a_rotation(tmp_path):
         ("file,distance_mm\na.png,near\n", "distance_mm is 'near'; write a plain number"),
         ("file,distance_mm\na.png\n", "line 2 has 1 values for 2 columns"),
         ("file,distance_mm\n,200\n", "file is empty"),
-        (_FULL.replace("1,0,0,-551.4", "1.1,0,0,-551.4"), "no rotation (off by 0.21)"),
-        (_FULL.replace("0,-1,0,413.4", "0,1,0,413.4"), "no rotation (a mirror image)"),
+        (_FULL.replace("1,0,0,-551.4", "1.1,0,0,-551.4"), "not a rotation (off by 0.21)"),
+        (_FULL.replace("0,-1,0,413.4", "0,1,0,413.4"), "not a rotation (a mirror image)"),
         (_FULL.replace("1,0,0,-551.4", ",0,0,-551.4"), "T00 is empty"),
         (_FULL.replace("1,200,0", "1,0.2,0"), "T03, T13 and T23 look like metres"),
-        (_FULL.replace("1,200,0", "1,230,0"), "plane at 230 mm on the y axis; mend one"),
+        (_FULL.replace("1,200,0", "1,230,0"), "plane at 230 mm on the y axis; correct one"),
     ],
 )
 def test_faults_of_poses_name_the_remedy(tmp_path, text, words):

@@ -188,7 +188,7 @@ def test_a_mirrored_marker_is_refused(tmp_path):
 def test_a_leaning_rhombus_is_refused(tmp_path):
     rhombus = "[[-24, 700, 24], [24, 700, 24], [34, 700, -22.9], [-14, 700, -22.9]]"
     text = _BOX.replace("[[-24, 700, 24], [24, 700, 24], [24, 700, -24], [-24, 700, -24]]", rhombus)
-    with pytest.raises(CalibrationError, match="so it is no square"):
+    with pytest.raises(CalibrationError, match="so it is not a square"):
         load_box(_written(tmp_path, text))
 
 

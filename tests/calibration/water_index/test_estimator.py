@@ -276,7 +276,7 @@ def test_what_is_unobservable_for_the_plates_sake_is_said_otherwise() -> None:
     last = vehicle.film(vehicle.estimator(IndexPrior(1.34, 2e-4)), [1.34] * 3)[-1]
     assert not last.observable
     assert last.prior_used
-    assert "changes are still seen" in last.remarks[0]
+    assert "changes are still detected" in last.remarks[0]
 
 
 def test_a_prior_that_contradicts_is_left_out() -> None:

@@ -333,7 +333,7 @@ def responding(
         (lambda _: 0, "does not follow"),
         (lambda s: 1500 + round(40 * s), ""),
         (lambda s: 1500 + round(400 * s), ""),
-        (lambda _: None, "is not told"),
+        (lambda _: None, "is not received"),
     ],
 )
 def test_sticks_that_are_not_obeyed_are_doubted(

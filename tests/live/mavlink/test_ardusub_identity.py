@@ -80,7 +80,7 @@ def test_channels_that_are_not_told_are_missed(fake: Fake) -> None:
     fake.play(channels_told=False)
     with contextlib.closing(Dive(fake, setpoint=FAR)) as one:
         pushed(one)
-        until(lambda: "RC_CHANNELS is not told" in one.pilot.health().detail, "a warning", 20.0)
+        until(lambda: "RC_CHANNELS is not received" in one.pilot.health().detail, "a warning", 20.0)
 
 
 def test_a_ground_station_that_is_missing_is_named(fake: Fake) -> None:

@@ -353,7 +353,7 @@ def test_a_connection_that_takes_nothing_for_long_is_made_anew(
     becomes(output, State.OK, "ArduSub")
     os.kill(peer.process.pid, signal.SIGSTOP)
     end = time.monotonic() + TIMEOUT_S
-    while "takes nothing any more" not in (found := output.health()).detail:
+    while "does not accept data any more" not in (found := output.health()).detail:
         # At full speed, to fill the buffers of both systems.
         output.send(first_sample())
         assert time.monotonic() < end, found

@@ -184,7 +184,7 @@ def test_spoofed_modes_that_contradict_the_vehicles_stop_us(dive: Dive) -> None:
     at = time.monotonic()
     with Strangers(PORT, [beat(19)], count=1) as strangers:
         assert_released(dive, at, NOTICED_S)
-        assert "two speak as the vehicle" in dive.pilot.health().detail
+        assert "two senders claim to be the vehicle" in dive.pilot.health().detail
         assert "contradict each other" in dive.pilot.health().detail
     assert not strangers.were_steered
     # What was said counts for a while; then the pilot may engage again.
@@ -194,7 +194,9 @@ def test_spoofed_modes_that_contradict_the_vehicles_stop_us(dive: Dive) -> None:
 def test_nobody_is_steered_while_two_are_the_vehicle_from_the_start(dive: Dive) -> None:
     with Strangers(PORT, [beat(2), attitude()], count=1) as strangers:
         until(lambda: dive.vehicle.state().rival, "a rival")
-        with pytest.raises(OptionError, match=r"two speak as the vehicle.*both speak as sysid 1"):
+        with pytest.raises(
+            OptionError, match=r"two senders claim to be the vehicle.*both speak as sysid 1"
+        ):
             dive.pilot.engage()
         assert not dive.fake.steered(dive.began)
     assert not strangers.were_steered
@@ -257,7 +259,7 @@ def test_a_vehicle_that_may_not_speak_is_named(vehicle: Fake) -> None:
     vehicle.play(**AT_START)
     link = MavlinkLink(f"udpin:127.0.0.1:{PORT}", LinkOptions(peers=("192.0.2.1",)))
     with contextlib.closing(link):
-        until(lambda: "127.0.0.1 is none of the peers" in link.health().detail, "a word on it")
+        until(lambda: "127.0.0.1 is not an allowed peer" in link.health().detail, "a word on it")
         assert link.autopilot() is None
 
 

@@ -78,7 +78,7 @@ def test_a_device_that_goes_is_an_error_and_closes_at_once(line: tuple[int, str]
 
 def test_what_is_no_serial_port_is_said_in_a_few_words(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(OSError, match="this is no serial port"):
+    with pytest.raises(OSError, match="this is not a serial port"):
         open_port(parse_address(f"serial:{tmp_path / 'file'}"))
     with pytest.raises(FileNotFoundError, match=r"No such file or directory$"):
         open_port(parse_address(f"serial:{tmp_path / 'missing'}"))

@@ -252,7 +252,7 @@ def test_close_leaves_nothing_behind(publish: Publish, sample: LiveSample) -> No
 def test_domain(monkeypatch: pytest.MonkeyPatch) -> None:
     assert domain_of_this_machine({}) == 0
     assert domain_of_this_machine({"ROS_DOMAIN_ID": " 42 "}) == 42
-    with pytest.raises(OptionError, match="'abc' is no number"):
+    with pytest.raises(OptionError, match="'abc' is not a number"):
         domain_of_this_machine({"ROS_DOMAIN_ID": "abc"})
     monkeypatch.setenv("ROS_DOMAIN_ID", "233")
     with pytest.raises(OptionError, match="domain 233: must be 0 to 232"):

@@ -106,7 +106,7 @@ def _check_determined(solution: Solution[BundleState], covariance: FloatArray) -
         )
     if not centre < max_centre_sigma:
         raise CalibrationError(
-            f"the views do not determine the image centre ({float(sigma[2:].max()):.2g} px "
+            f"the views do not determine the principal point ({float(sigma[2:].max()):.2g} px "
             f"uncertain); {remedy}"
         )
     if not solution.converged:
@@ -304,7 +304,7 @@ def _findings(result: CameraCalibration) -> list[str]:
     n = len(lens.distortion)
     lines = [
         f"focal lengths: {lens.fx:.2f} ± {sigmas['fx']:.2f} and {lens.fy:.2f} ± "
-        f"{sigmas['fy']:.2f} px; image centre {lens.cx:.2f} ± {sigmas['cx']:.2f}, "
+        f"{sigmas['fy']:.2f} px; principal point {lens.cx:.2f} ± {sigmas['cx']:.2f}, "
         f"{lens.cy:.2f} ± {sigmas['cy']:.2f} px",
         f"distortion: {n} coefficients of the {lens.model} model",
     ]
@@ -326,7 +326,7 @@ def _shared_errors(result: CameraCalibration) -> list[str]:
     if result.bend_height > 0.0:
         lines.append(
             f"the board is not flat: {1e3 * result.bend_height:.2g} mm between its highest and its "
-            "lowest corner, the same in all views; this bend is solved for. Glue the board to "
+            "lowest corner, the same in all views; this bend is estimated too. Glue the board to "
             "something stiff before the next step"
         )
     # Ratio of the variance by views to that by corners that is reported: sigmas 1.5 times as large.

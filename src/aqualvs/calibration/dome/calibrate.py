@@ -116,7 +116,7 @@ def _port(result: DomeCalibration) -> str:
 def _rotation(problem: DomeProblem, result: DomeCalibration) -> str:
     if not result.rotation_is_solved:
         return (
-            "camera rotation: taken from the rig; boards at unknown poses say nothing about it"
+            "camera rotation: taken from the rig; boards at unknown poses do not determine it"
             + (
                 ", and the lens position is given in axes turned by it"
                 if result.rig.flat_port is None
@@ -165,14 +165,14 @@ def _intrinsics(problem: DomeProblem, result: DomeCalibration, seen: Observabili
         share = np.median([seen.shrinkage[name] for name in refined])
         focal = result.uncertainty.sigmas["fx"] if "fx" in refined else float("nan")
         return [
-            f"intrinsics: refined within what the camera's calibration says of them; their "
-            f"uncertainty is {100.0 * share:.0f} % of what it was, that of fx {focal:.2f} px"
+            f"intrinsics: refined within the uncertainty of the camera's calibration, to "
+            f"{100.0 * share:.0f} % of it; that of fx is now {focal:.2f} px"
         ]
     if problem.considered.names:
-        return ["intrinsics: held as they were; their uncertainty is passed on to the result"]
+        return ["intrinsics: held fixed; their uncertainty is propagated to the result"]
     return [
-        "intrinsics: taken as exact, as the rig does not say how well they are known; "
-        "calibrate the camera with this version to mend that"
+        "intrinsics: taken as exact, because the rig file does not state their uncertainty; "
+        "calibrate the camera with this version to add it"
     ]
 
 
@@ -204,8 +204,8 @@ def _entangled(result: DomeCalibration) -> list[str]:
         return []
     one, other = (_WORDS.get(name, name) for name in pair)
     return [
-        f"{one} and {other}: known together only (correlation {worst:.3f}); an error of one is "
-        "made up for by the other"
+        f"{one} and {other}: only their combination is known (correlation {worst:.3f}); an error "
+        "of one compensates that of the other"
     ]
 
 
@@ -226,8 +226,8 @@ def _against_priors(problem: DomeProblem, solution: Solution[BundleState]) -> li
     sigmas = bundle.priors.sigmas
     off = {n: float(m) / sigmas[n] for n, m in zip(names, moved, strict=True)}
     return [
-        f"{_WORDS.get(name, name)}: moved by {abs(value):.1f} sigma of what was known of it; check "
-        "that figure"
+        f"{_WORDS.get(name, name)}: moved by {abs(value):.1f} sigma from its given value; check "
+        "that value"
         for name, value in off.items()
         if abs(value) > far_from_prior
     ]

@@ -222,8 +222,8 @@ def _weighed_against_other(
         raise wrong_medium(one, n)
     if gain > -0.5 * _MEDIUM.sure**2:
         return [
-            f"{one.name}: the pictures do not tell n = {one.n_medium:.4f} from {n:.4f}; the lens "
-            "position rests on the medium being the stated one"
+            f"{one.name}: the pictures do not distinguish n = {one.n_medium:.4f} from {n:.4f}; "
+            "the lens position relies on the stated medium"
         ]
     return []
 
@@ -474,8 +474,9 @@ def _check_lens(
         sigma = uncertainty.sigmas["port_distance"]
         if sigma > max_lens_sigma:
             raise CalibrationError(
-                f"the pictures do not tell how far the port is from the lens: {1e3 * sigma:.1f} mm "
-                "uncertain; show more views in water, some near, with corners all over the picture"
+                f"the pictures do not determine the port's distance from the lens: "
+                f"{1e3 * sigma:.1f} mm uncertain; show more views in water, some near, with "
+                "corners all over the picture"
             )
         return
     lens = rig.dome_from_cam.translation
@@ -490,8 +491,8 @@ def _check_lens(
     sigma, axis = float(np.sqrt(values[-1])), vectors[:, -1] * np.sign(vectors[:, -1].sum())
     if sigma > max_lens_sigma:
         raise CalibrationError(
-            f"the pictures do not tell where the lens is: {1e3 * sigma:.1f} mm uncertain along "
-            f"{np.round(axis, 1).tolist()}; {_remedy(problem)}"
+            f"the pictures do not determine the lens position: {1e3 * sigma:.1f} mm uncertain "
+            f"along {np.round(axis, 1).tolist()}; {_remedy(problem)}"
         )
 
 

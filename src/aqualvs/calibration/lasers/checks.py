@@ -373,8 +373,8 @@ def check_count(
         several = "another plane" if len(split.undecided) == 1 else "further planes"
         raise CalibrationError(
             f"{found} {'laser is' if found == 1 else 'lasers are'} certain, but {several} of light "
-            "may be of lasers as well: "
-            f"{_planes(split.undecided, views, surfaces)}; give --lasers N, how many there are, or "
+            "may also be from lasers: "
+            f"{_planes(split.undecided, views, surfaces)}; give their number (--lasers N), or "
             f"{_remedy(surfaces)}"
         )
     words = [
@@ -400,7 +400,7 @@ def check_count(
         words.append(
             f"a stripe of {len(longest.members)} points "
             f"({_where(longest.patch, views, surfaces)}) {rest} to no laser; "
-            f"{'a reflection' if alone else 'reflections'}, perhaps"
+            f"perhaps {'a reflection' if alone else 'reflections'}"
         )
     return words
 

@@ -101,7 +101,7 @@ def judged(
         if abs(float(candidate.plane.signed_distance(lens_in_dome))) < min_baseline:
             fault = PlaneVerdict.OTHER, "it stays in one place of the picture, near or far"
         if fault is None and i >= n_sure:
-            fault = PlaneVerdict.WEAK, "too few stripes lie in it to tell it from an accident"
+            fault = PlaneVerdict.WEAK, "too few stripes lie in it to distinguish it from chance"
         verdict, why = fault or (PlaneVerdict.LASER, "")
         patches = tuple(np.unique(pooled.patch[members]).tolist())
         seen.append(JudgedPlane(candidate, members, patches, verdict, why))

@@ -308,11 +308,11 @@ def free_text(
     for i, view in enumerate(views):
         if parameter in problem.bundle.pose_columns(i):
             return (
-                f"{view.view.name}: its {len(view.view)} corners do not tell where the target is; "
-                "leave this picture out, or show more of the target in it"
+                f"{view.view.name}: its {len(view.view)} corners do not determine the pose of the "
+                "target; leave this picture out, or show more of the target in it"
             )
     return (
-        "the pictures do not tell the camera's numbers that are to be refined; leave --refine "
+        "the pictures do not determine the camera's parameters to refine; leave --refine "
         "out, or add pictures with the target nearer, farther and tilted"
     )
 

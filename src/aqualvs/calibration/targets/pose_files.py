@@ -44,7 +44,7 @@ def load_poses(path: str | Path) -> tuple[BoardPose, ...]:
         rows = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
     except csv.Error as fault:
         raise CalibrationError(
-            f"{source}: line {reader.line_num} cannot be read ({fault}); mend that line"
+            f"{source}: line {reader.line_num} cannot be read ({fault}); fix that line"
         ) from None
     if len(rows) < 2:
         raise CalibrationError(
@@ -89,7 +89,7 @@ def _columns(names: list[str], source: Path) -> list[str]:
 def _pose(columns: list[str], row: list[str], place: str) -> BoardPose:
     if len(row) != len(columns):
         raise CalibrationError(
-            f"{place} has {len(row)} values for {len(columns)} columns; mend the line"
+            f"{place} has {len(row)} values for {len(columns)} columns; fix the line"
         )
     cells = dict(zip(columns, (cell.strip() for cell in row), strict=True))
     name = Path(cells["file"]).name
@@ -148,7 +148,7 @@ def _matrix_pose(matrix: list[float | None], place: str) -> SE3 | None:
     if off > rotation_tolerance or np.linalg.det(rotation) < 0.0:
         what = "a mirror image" if off <= rotation_tolerance else f"off by {off:.2g}"
         raise CalibrationError(
-            f"{place}: T00 to T22 are no rotation ({what}); give the columns of dome_from_board "
+            f"{place}: T00 to T22 are not a rotation ({what}); give the columns of dome_from_board "
             "with at least four decimals"
         )
     # The nearest rotation, because digits were rounded.
@@ -167,7 +167,7 @@ def _check_agreement(pose: SE3, distance_mm: float, place: str) -> None:
     distance_tolerance_mm = 1.0
     if abs(by_matrix_mm - distance_mm) > distance_tolerance_mm:
         units = abs(_MM * by_matrix_mm - distance_mm) <= 0.01 * distance_mm
-        hint = "T03, T13 and T23 look like metres, write millimetres" if units else "mend one"
+        hint = "T03, T13 and T23 look like metres, write millimetres" if units else "correct one"
         raise CalibrationError(
             f"{place}: distance_mm is {distance_mm:g}, but T00 to T23 put the board's plane at "
             f"{by_matrix_mm:.4g} mm on the y axis; {hint}"

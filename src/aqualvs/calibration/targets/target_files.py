@@ -231,12 +231,12 @@ def _check_shape(part: MarkerPart) -> None:
     if abs(sides[worst] - part.size_mm) > tolerance:
         raise CalibrationError(
             f"marker {part.id}: corners {worst} and {(worst + 1) % 4} are {sides[worst]:.2f} mm "
-            f"apart, but size_mm is {part.size_mm:g}; mend the corners or the size"
+            f"apart, but size_mm is {part.size_mm:g}; correct the corners or the size"
         )
     if np.any(np.abs(diagonals - np.sqrt(2.0) * part.size_mm) > 2.0 * tolerance):
         raise CalibrationError(
             f"marker {part.id}: its diagonals are {diagonals[0]:.2f} and {diagonals[1]:.2f} mm, "
-            "so it is no square; mend the corners"
+            "so it is not a square; correct the corners"
         )
 
 
@@ -252,7 +252,7 @@ def _check_plane(part: MarkerPart, planes: dict[str, Plane]) -> None:
     if abs(off[worst]) > _TOLERANCES.plane_mm:
         raise CalibrationError(
             f"marker {part.id}: corner {worst} lies {abs(off[worst]):.1f} mm off plane "
-            f"{part.plane!r}; mend the corner, the plane's d, or the plane's name"
+            f"{part.plane!r}; correct the corner, the plane's d, or the plane's name"
         )
 
 

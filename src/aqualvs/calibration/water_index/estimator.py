@@ -329,13 +329,13 @@ class IndexEstimator:
             )
         if self.prior is not None and not self._contradicted:
             return (
-                f"unobservable: the pictures alone know the index to {own.sigma:.1e}, the "
-                f"prior ({self.prior.source}) to {self.prior.sigma:.1e}; changes are still seen"
+                f"unobservable: the pictures alone give the index to {own.sigma:.1e}, the "
+                f"prior ({self.prior.source}) to {self.prior.sigma:.1e}; changes are still detected"
             )
         return (
-            f"unobservable: what is not known of the target's place and of the camera leaves the "
-            f"index open by {own.sigma:.1e}; measure them better, begin with pictures in "
-            "air, or give temperature and salinity; changes are still seen"
+            f"unobservable: the uncertainty of the target's position and of the camera leaves the "
+            f"index uncertain by {own.sigma:.1e}; measure them better, begin with pictures in "
+            "air, or give temperature and salinity; changes are still detected"
         )
 
     def _about_prior(self, own: IndexState | None) -> str:
@@ -352,8 +352,8 @@ class IndexEstimator:
     def _about_place(self, joint: IndexState | None) -> str:
         if self._moved:
             return (
-                "the target or the lens has moved: the index cannot be trusted until the target "
-                "is measured anew"
+                "the target or the lens has moved: the index is unreliable until the target is "
+                "measured again"
             )
         if joint is None:
             return ""
@@ -362,7 +362,7 @@ class IndexEstimator:
             turn, shift = np.rad2deg(np.linalg.norm(moved[:3])), 1e3 * np.linalg.norm(moved[3:])
             return (
                 f"the target seems {shift:.2f} mm and {turn:.2f}° from where target.yaml has it, "
-                "more than its place is said to be uncertain"
+                "more than the stated uncertainty of its position"
             )
         corners = joint.mean[FIRST_CAMERA + len(self.camera_names) :]
         off = float(np.sqrt(np.mean(corners**2))) if len(corners) else 0.0
@@ -380,7 +380,7 @@ class IndexEstimator:
             return ""
         return (
             f"the target has not been where it should be for {self._n_lost} frames: it is "
-            "hidden or has moved, and the index is that from before"
+            "hidden or has moved; the last index is kept"
         )
 
 

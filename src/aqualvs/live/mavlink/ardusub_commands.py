@@ -67,7 +67,7 @@ class StickResponse:
             return ""
         if _slope(self._turns.since(now_s)) < _MIN_TURN:
             return "the vehicle does not turn as our yaw stick says"
-        return "RC_CHANNELS is not told: whether our sticks are obeyed is not seen"
+        return "RC_CHANNELS is not received: cannot check whether our sticks are obeyed"
 
     def _take(self, now_s: float, sticks: Sticks) -> None:
         """Pair the messages since the last call with our stick."""

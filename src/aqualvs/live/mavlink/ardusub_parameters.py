@@ -94,8 +94,8 @@ def advise_on_station(parameters: Mapping[str, float], station: int) -> Finding:
     obeyed = StationRange(parameters)
     if not obeyed.known:
         return Finding.warn(
-            f"{' or '.join(STATION)} is not told: whether the vehicle obeys sticks of ground "
-            f"station {station} is unknown; look it up in the ground station"
+            f"{' or '.join(STATION)} is unknown, and so is whether the vehicle obeys sticks of "
+            f"ground station {station}; look it up in the ground station"
         )
     if station in obeyed:
         return Finding.ok(
@@ -115,10 +115,10 @@ def advise_on_fail_safe(parameters: Mapping[str, float]) -> Iterator[Finding]:
     disabled, disarm = 0, 2
     action, timeout_s = parameters.get(PILOT_INPUT), parameters.get(PILOT_TIMEOUT)
     if action is None:
-        yield Finding.warn(f"{PILOT_INPUT} is not told; see that it is 1 or 2")
+        yield Finding.warn(f"{PILOT_INPUT} is unknown; make sure that it is 1 or 2")
     elif round(action) == disabled:
         yield Finding.bad(
-            f"{PILOT_INPUT} 0 (off): if follow is killed its last effort stands for ever; set "
+            f"{PILOT_INPUT} 0 (off): if follow is killed, its last effort stands for ever; set "
             f"{PILOT_INPUT} 1"
         )
     elif round(action) == disarm:
@@ -130,15 +130,15 @@ def advise_on_fail_safe(parameters: Mapping[str, float]) -> Iterator[Finding]:
     else:
         yield Finding.ok(f"{PILOT_INPUT} 1 (warn): sticks go neutral, armed")
     if timeout_s is None:
-        yield Finding.warn(f"{PILOT_TIMEOUT} is not told; see that it is 0.5 to 1")
+        yield Finding.warn(f"{PILOT_TIMEOUT} is unknown; make sure that it is 0.5 to 1")
     elif timeout_s > longest_timeout_s:
         yield Finding.warn(
-            f"{PILOT_TIMEOUT} {timeout_s:g} s: if follow is killed its last effort stands for "
-            f"so long; set {PILOT_TIMEOUT} 1"
+            f"{PILOT_TIMEOUT} {timeout_s:g} s: if follow is killed, its last effort stands that "
+            f"long; set {PILOT_TIMEOUT} 1"
         )
     else:
         yield Finding.ok(
-            f"{PILOT_TIMEOUT} {timeout_s:g} s: so long a last effort stands if follow is killed"
+            f"{PILOT_TIMEOUT} {timeout_s:g} s: the last effort stands that long if follow is killed"
         )
 
 
@@ -146,11 +146,13 @@ def advise_on_speed(parameters: Mapping[str, float]) -> Iterator[Finding]:
     """Advise on the climb rate of a full vertical stick, compared with the gains' assumption."""
     up, down = parameters.get(SPEED_UP), parameters.get(SPEED_DOWN, 0.0)
     if up is None:
-        yield Finding.warn(f"{SPEED_UP} is not told: plans that change the depth are off")
+        yield Finding.warn(
+            f"{SPEED_UP} is unknown: depth changes may be faster or slower than planned"
+        )
     elif down == 0.0:
         # ArduSub takes 0 for the speed upwards (get_pilot_speed_dn).
-        same = "0" if SPEED_DOWN in parameters else "is not told"
-        yield _climb_advice(f"{SPEED_UP} {up:.0f} ({SPEED_DOWN} {same}: as much downwards)", up)
+        same = "0" if SPEED_DOWN in parameters else "unknown"
+        yield _climb_advice(f"{SPEED_UP} {up:.0f} ({SPEED_DOWN} {same}: the same downwards)", up)
     else:
         yield _climb_advice(f"{SPEED_UP} {up:.0f}", up)
         yield _climb_advice(f"{SPEED_DOWN} {down:.0f}", down)
@@ -165,20 +167,20 @@ def advise_on_distance(
     """
     kind, orient = parameters.get(RANGE_TYPE), parameters.get(RANGE_ORIENT)
     if kind is None:
-        yield Finding.warn(f"{RANGE_TYPE} is not told; set 10 (MAVLink) for the distance")
+        yield Finding.warn(f"{RANGE_TYPE} is unknown; set 10 (MAVLink) to use the distance")
     elif round(kind) != _MAVLINK_RANGEFINDER:
         yield Finding.warn(
-            f"{RANGE_TYPE} {kind:.0f}: the distance to the net is not taken in; set "
-            f"{RANGE_TYPE} 10 (MAVLink) and {RANGE_ORIENT} 0, and start the autopilot anew"
+            f"{RANGE_TYPE} {kind:.0f}: the autopilot does not use the distance to the net; set "
+            f"{RANGE_TYPE} 10 (MAVLink) and {RANGE_ORIENT} 0, and restart the autopilot"
         )
     elif orient is None or round(orient) != _FORWARD:
-        told = "is not told" if orient is None else f"{orient:.0f}"
+        told = "is unknown" if orient is None else f"{orient:.0f}"
         yield Finding.warn(
-            f"{RANGE_ORIENT} {told}: ours looks forward, and others are left out; set "
-            f"{RANGE_ORIENT} 0"
+            f"{RANGE_ORIENT} {told}: our sensor looks forward, and the autopilot ignores other "
+            f"orientations; set {RANGE_ORIENT} 0"
         )
     else:
-        text = f"{RANGE_TYPE} 10, {RANGE_ORIENT} 0: the distance to the net is taken in"
+        text = f"{RANGE_TYPE} 10, {RANGE_ORIENT} 0: the autopilot uses the distance to the net"
         yield Finding.ok(text)
         yield from _limits_advice(parameters, working_range)
 
@@ -189,8 +191,9 @@ def _climb_advice(setting: str, told: float) -> Finding:
     if FULL_CLIMB_RATE / _CLIMB_RATE_RATIO <= speed <= FULL_CLIMB_RATE * _CLIMB_RATE_RATIO:
         return Finding.ok(means)
     return Finding.warn(
-        f"{means}, but gains take {FULL_CLIMB_RATE:g} m/s: follow changes the depth at another "
-        f"speed than planned; set {SPEED_UP} and {SPEED_DOWN} {100.0 * FULL_CLIMB_RATE:.0f}"
+        f"{means}, but the gains assume {FULL_CLIMB_RATE:g} m/s: follow changes the depth at a "
+        f"different speed than planned; set {SPEED_UP} and {SPEED_DOWN} "
+        f"{100.0 * FULL_CLIMB_RATE:.0f}"
     )
 
 
@@ -201,7 +204,7 @@ def _limits_advice(
     if near is None or far is None:
         return
     (near_name, least), (far_name, most) = near, far
-    means = f"{near_name}, {far_name}: {least:g} to {most:g} m count"
+    means = f"{near_name}, {far_name}: {least:g} to {most:g} m are valid"
     if working_range is None:
         yield Finding.ok(f"{means}; the rig's working range must lie within")
     elif least <= working_range[0] and most >= working_range[1]:

@@ -298,7 +298,7 @@ class MavlinkLink:
         if self._signer is not None and self._signer.n_refused:
             told += f"; {self._signer.n_refused} messages are not signed with our key, or are old"
         if self._n_foreign:
-            told += f"; {self._foreign} is none of the peers that may speak"
+            told += f"; {self._foreign} is not an allowed peer"
         return told
 
     def _autopilots(self) -> list[Received]:

@@ -363,7 +363,7 @@ class _UdpListener(UdpPort):
             if fault.errno == errno.EADDRNOTAVAIL:
                 raise OSError(
                     fault.errno,
-                    f"{address.host} is no address of this computer; to send there use udpout:",
+                    f"{address.host} is not an address of this computer; to send there use udpout:",
                 ) from fault
             raise
 
@@ -398,7 +398,7 @@ class StreamPort(Port):
         except BlockingIOError:
             return b"", ()
         if not data:
-            raise ConnectionResetError(errno.ECONNRESET, "the peer has gone")
+            raise ConnectionResetError(errno.ECONNRESET, "the peer has closed the connection")
         return data, ()
 
     def write_all(self, frames: bytes, _heard: Sequence[Peer], /) -> bool:
@@ -427,7 +427,7 @@ class StreamPort(Port):
             self._rest = self._rest[n_sent:]
             self._moved_s = time.monotonic()
         elif time.monotonic() - self._moved_s > _STALLED_S:
-            raise TimeoutError(errno.ETIMEDOUT, "the peer takes nothing any more")
+            raise TimeoutError(errno.ETIMEDOUT, "the peer does not accept data any more")
 
     def _take(self) -> bytes:
         raise NotImplementedError

@@ -109,5 +109,5 @@ def _as_os_error(fault: Exception) -> OSError:
     """Return why a port cannot be opened; pyserial's own text names the device three times."""
     number = fault.args[0] if fault.args and isinstance(fault.args[0], int) else None
     if number is None:
-        return OSError(0, "this is no serial port")
+        return OSError(0, "this is not a serial port")
     return OSError(number, os.strerror(number))

@@ -255,7 +255,7 @@ def domain_of_this_machine(environment: Mapping[str, str] = os.environ) -> int:
         return int(text or "0")
     except ValueError:
         raise OptionError(
-            f"ROS_DOMAIN_ID {text!r} is no number; unset it or use 0 to {_MAX_DOMAIN}"
+            f"ROS_DOMAIN_ID {text!r} is not a number; unset it or use 0 to {_MAX_DOMAIN}"
         ) from None
 
 
