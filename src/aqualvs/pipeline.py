@@ -14,7 +14,7 @@ from aqualvs.errors import AqualvsError, OptionError, RigError, SourceError
 from aqualvs.nets.target_file import net_check
 from aqualvs.optics.rig import Rig
 from aqualvs.results.run_request import RunRequest, check_fits, prepared_rig
-from aqualvs.results.summary import RunSummary, TruthComparison, read_truth
+from aqualvs.results.summary import RunSummary, TruthComparison, compare_with_truth, read_truth
 from aqualvs.scanner import Scanner, ScannerOptions
 from aqualvs.scanning.agreement import LaserAgreement
 from aqualvs.sources import FrameSource, VideoSource, open_source
@@ -76,45 +76,48 @@ def run(request: RunRequest, *, scanner_for: ScannerFor = Scanner) -> RunResult:
     with (
         open_dive(request) as dive,
         DiveProcessor(
-            dive.source,
-            dive.rig,
-            request.frames,
-            _shared_work(dive, scanner_for),
-            request.n_processes,
+            dive.source, dive.rig, request.frames, _pool_job(dive, scanner_for), request.n_processes
         ) as processor,
     ):
         # While other processes measure the first frames, this one gets ready to write.
         from aqualvs import run_outputs as outputs
+        from aqualvs.report.run_page import write_report
+        from aqualvs.results.folder import POSTURE_CSV
+        from aqualvs.results.net_survey import NetPass
 
         scanner, summary = dive.scanner(scanner_for), summary_for(dive)
-        net = outputs.RunNet(dive.rig, request.net)
+        net = None if request.net is None else NetPass(dive.rig, request.net)
         processor.wait_for_first()
-        claim = outputs.prepare(request)
+        claims = outputs.claim_outputs(request)
         started, fault = time.perf_counter(), None
         try:
             with (
-                outputs.writers(dive.request, dive.rig, dive.source, net, summary) as writers,
+                outputs.open_writers(dive.request, dive.rig, dive.source, net, summary) as writers,
                 StopSignals() as stop,
                 progress(dive.source.name, request.frames.n_frames(dive.source.n_frames)) as tick,
-                closing(
-                    processor.blocks(writers.recorded(scanner), one_by_one=request.mcap)
-                ) as blocks,
+                closing(processor.blocks(scanner)) as blocks,
             ):
                 outputs.write_all(blocks, writers, stop, tick)
         except SourceError as broken_off:
             fault = broken_off
-    water = scanner.lines() if isinstance(scanner, WaterFollowingScanner) else []
+    lines = scanner.lines() if isinstance(scanner, WaterFollowingScanner) else []
+    lines += writers.bare_lens.lines()
+    if net is not None:
+        lines += outputs.write_net(net, request)
     result = RunResult(
         exit_code=stop.exit_code,
         stopped_by=stop.caught.name if stop.caught else "",
         summary=summary,
-        lines=[*water, *writers.dome_lines(), *net.write(request.out, request.source)],
+        lines=lines,
         elapsed_s=time.perf_counter() - started,
-        report=outputs.report(request),
-        comparison=outputs.comparison(request),
+        # Before the comparison: a truth that cannot be used must not cost the report.
+        report=write_report(request.out) if request.report else None,
+        comparison=compare_with_truth(request.out / POSTURE_CSV, request.truth)
+        if request.truth
+        else None,
         fault=fault,
     )
-    claim.close()
+    claims.close()
     return result
 
 
@@ -256,7 +259,7 @@ def _shutter_warnings(dive: OpenDive) -> list[str]:
     return [wrong] if wrong else []
 
 
-def _shared_work(dive: OpenDive, scanner_for: ScannerFor) -> PoolJob | None:
+def _pool_job(dive: OpenDive, scanner_for: ScannerFor) -> PoolJob | None:
     """Return the job for a pool of processes; None if one process must measure the whole dive."""
     request = dive.request
     shows_pictures = request.overlay or request.rerun is not None

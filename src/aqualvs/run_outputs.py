@@ -6,16 +6,15 @@
 - `RunOverlay`: `overlay.mp4`, the video of what the scanner detected.
 - `RunMcap`: `dive.mcap`, the recording, on request.
 - `RunRerun`: a file of Rerun, on request.
-- `RunNet`: the state of the net, on request.
+- `NetPass`: the state of the net, on request.
 """
 
 import statistics
 import time
 from array import array
-from collections import deque
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager, nullcontext
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,18 +22,15 @@ import numpy as np
 
 from aqualvs.closing import Closing
 from aqualvs.errors import OptionError, OutputError
-from aqualvs.nets.target_file import NetRequest
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.rigfile import rig_to_mapping
 from aqualvs.report.overlay import OverlayWriter, draw_overlay
-from aqualvs.report.run_page import write_report
 from aqualvs.results.files import Claim, writing
 from aqualvs.results.folder import (
     DIVE_MCAP,
     NET_MAP_PNG,
     OVERLAY_MP4,
     POSTURE_BARE_CSV,
-    POSTURE_CSV,
     RUN_FILES,
     PostureCsv,
     RunOutputs,
@@ -42,52 +38,18 @@ from aqualvs.results.folder import (
 )
 from aqualvs.results.net_survey import NetPass
 from aqualvs.results.run_request import RunRequest, Status, source_dict
-from aqualvs.results.summary import RunSummary, TruthComparison, compare_with_truth
-from aqualvs.scanner import Scanner, ScannerOptions
-from aqualvs.scanning.laser_bands import SearchAxis
+from aqualvs.results.summary import RunSummary
+from aqualvs.scanner import ScannerOptions
 from aqualvs.scanning.posture import Posture
 from aqualvs.scanning.scan import Frame, Scan
-from aqualvs.scanning.stripe import StripePeaks
 from aqualvs.sources import FrameSource
 from aqualvs.sources.base import bgr_of
 from aqualvs.special_files import refuse_special
 from aqualvs.terminal import StopSignals, Tick
-from aqualvs.workers.frame_results import FrameResult, FrameScanner
-from aqualvs.workers.run_frames import Replay, WaterFollowingScanner
+from aqualvs.workers.frame_results import FrameResult, ScanInputs
 
 if TYPE_CHECKING:
     from aqualvs.recording.sample import LiveSample
-
-
-class RunNet:
-    """Evaluation of the net as the frames come; does nothing if not requested.
-
-    `request`: what to find out, if anything. Raises `AqualvsError` if the log that the request
-    names cannot be read.
-    """
-
-    def __init__(self, rig: Rig, request: NetRequest | None) -> None:
-        self._net = None if request is None else NetPass(rig, request)
-
-    def add(self, scan: Scan) -> None:
-        """Take the next scan."""
-        if self._net is not None:
-            self._net.add(scan)
-
-    def write(self, folder: Path, source: str) -> list[str]:
-        """Finish, write the net's files and return the summary as lines.
-
-        `source`: of the frames; the clock of a video may help to lay a log on it. Raises
-        `OutputError` if a file cannot be written.
-        """
-        if self._net is None:
-            return []
-        video = Path(source) if Path(source).is_file() else None
-        result = self._net.write(folder, video)
-        return [*result.lines, f"map of the net: {folder / NET_MAP_PNG}"]
-
-
-FrameOutput = tuple[Rig, Scan, dict[SearchAxis, StripePeaks]]
 
 
 class RunMcap(Closing):
@@ -112,23 +74,17 @@ class RunMcap(Closing):
 
         self._path, self._rig = folder / DIVE_MCAP, rig
         self._began_ns = time.time_ns()
-        # A rolling shutter's scans are written a few frames after their stripes are measured.
-        self._waiting: deque[tuple[Rig, dict[SearchAxis, StripePeaks]]] = deque()
         with writing(self._path):
             self._recording = Recording(self._path, RecorderOptions(scanner=options))
 
-    def recorded(self, scanner: FrameScanner) -> FrameScanner:
-        """Return a scanner that measures as this one does, and keeps the stripes for `write`."""
-        return _RecordedScanner(scanner, self._waiting)
+    def write(self, result: FrameResult) -> None:
+        """Record the next scan, with the rig and the stripes that it was computed from.
 
-    def write(self, scan: Scan, *, is_lost: bool) -> None:
-        """Record the next scan, with the rig and the stripes that it was made from.
-
-        A frame that was lost has none.
+        A frame that was lost has no stripes.
         """
-        rig, peaks = (self._rig, {}) if is_lost else self._waiting.popleft()
+        inputs = result.inputs or ScanInputs(self._rig, {})
         with writing(self._path):
-            self._recording.write(_sample(self._began_ns, rig, scan, peaks))
+            self._recording.write(_sample(self._began_ns, result.scan, inputs))
 
     def close(self) -> None:
         """Close the file; readable in any case."""
@@ -136,26 +92,8 @@ class RunMcap(Closing):
             self._recording.close()
 
 
-class _RecordedScanner:
-    """Scanner that measures as another one does, and keeps the stripes of its scans."""
-
-    def __init__(
-        self, scanner: FrameScanner, stripes: deque[tuple[Rig, dict[SearchAxis, StripePeaks]]]
-    ) -> None:
-        self._scanner, self._stripes = scanner, stripes
-
-    def process(self, frame: Frame) -> Scan:
-        rig, scan, peaks = _measured(self._scanner, frame)
-        self._stripes.append((rig, peaks))
-        return scan
-
-
 def _sample(
-    began_ns: int,
-    rig: Rig,
-    scan: Scan,
-    peaks: dict[SearchAxis, StripePeaks],
-    frame: Frame | None = None,
+    began_ns: int, scan: Scan, inputs: ScanInputs, frame: Frame | None = None
 ) -> "LiveSample":
     """Return the sample of a frame, with times as if the dive had started with the run."""
     from aqualvs.recording.sample import Instants, LiveSample
@@ -163,9 +101,9 @@ def _sample(
 
     at_ns = round(1e9 * scan.time_s)
     return LiveSample(
-        rig=rig,
+        rig=inputs.rig,
         scan=scan,
-        peaks=peaks,
+        peaks=inputs.peaks,
         frame=frame,
         utc_ns=began_ns + at_ns,
         instants=Instants(at_ns, at_ns, at_ns),
@@ -191,7 +129,7 @@ class RunRerun(Closing):
 
     def write(self, frame: Frame | None, scan: Scan) -> None:
         """Log the result of a frame."""
-        self._log.write(_sample(0, self._rig, scan, {}, frame))
+        self._log.write(_sample(0, scan, ScanInputs(self._rig, {}), frame))
 
     def close(self) -> None:
         """Finish the file."""
@@ -207,20 +145,6 @@ def check_source_stays(folder: Path, source: str) -> None:
     is_ours = path.is_file() and path.name in RUN_FILES
     if is_ours and path.resolve().parent == folder.resolve():
         raise OptionError(f"{path}: is what the run reads; write to another folder")
-
-
-def _measured(scanner: FrameScanner, frame: Frame) -> FrameOutput:
-    """Return the scan of a frame, with its rig and stripes."""
-    if isinstance(scanner, Replay):
-        return scanner.measured(frame)
-    if isinstance(scanner, WaterFollowingScanner):
-        if scanner.is_due(frame):
-            scanner.look(frame)
-        scanner = scanner.scanner
-    if not isinstance(scanner, Scanner):
-        raise TypeError(f"{type(scanner).__name__} does not return its stripes")
-    peaks = scanner.detect(frame)
-    return scanner.rig, scanner.measure(frame.index, frame.time_s, peaks), peaks
 
 
 class RunOverlay(Closing):
@@ -268,13 +192,13 @@ class RunBareLens(Closing):
             with writing(self._path):
                 self._file = PostureCsv(self._path, rig.shutter)
 
-    def write(self, *found: FrameResult) -> None:
+    def write(self, *results: FrameResult) -> None:
         """Append the rows of frames."""
         if self._file is None:
             return
         rows = []
-        for measured in found:
-            scan, posture = measured.scan, measured.bare
+        for result in results:
+            scan, posture = result.scan, result.bare
             if isinstance(posture, Posture) and isinstance(scan.posture, Posture):
                 self._ratios.append(posture.range / scan.posture.range)
             if posture is not None:
@@ -295,53 +219,34 @@ class RunBareLens(Closing):
             self._file.close()
 
 
+@dataclass(frozen=True, slots=True)
 class RunWriters:
-    """The folder's files, the overlay, the recording and the state of the net, as one.
+    """Everything that a run writes frame by frame; None for what was not requested."""
 
-    `outputs` and `bare_lens` are written in any case, the others where they are wanted.
-    """
+    folder: RunOutputs
+    bare_lens: RunBareLens
+    overlay: RunOverlay | None
+    mcap: RunMcap | None
+    rerun: RunRerun | None
+    net: NetPass | None
 
-    def __init__(
-        self,
-        outputs: RunOutputs,
-        overlay: RunOverlay | None,
-        bare_lens: RunBareLens,
-        mcap: RunMcap | None,
-        rerun: RunRerun | None,
-        net: RunNet,
-    ) -> None:
-        self._outputs, self._overlay, self._bare_lens = outputs, overlay, bare_lens
-        self._mcap, self._rerun, self._net = mcap, rerun, net
-
-    def recorded(self, scanner: FrameScanner) -> FrameScanner:
-        """Return the scanner to measure with, which records its results if requested."""
-        return scanner if self._mcap is None else self._mcap.recorded(scanner)
-
-    def write(self, *found: FrameResult) -> None:
+    def write(self, *results: FrameResult) -> None:
         """Write the results of frames, and scans of lost ones, in their order."""
-        self._outputs.write(*(measured.scan for measured in found))
-        self._bare_lens.write(*found)
-        for measured in found:
-            if self._overlay is not None:
-                self._overlay.write(measured.frame, measured.scan)
-            if self._rerun is not None:
-                self._rerun.write(measured.frame, measured.scan)
-            if self._mcap is not None:
-                self._mcap.write(measured.scan, is_lost=measured.is_lost)
-            if not measured.is_lost:
-                self._net.add(measured.scan)
-
-    def interrupt(self) -> None:
-        """Note that the run ends before its source does."""
-        self._outputs.status = Status.INTERRUPTED
-
-    def dome_lines(self) -> list[str]:
-        """Return the effect of the dome model as lines of text."""
-        return self._bare_lens.lines()
+        self.folder.write(*(result.scan for result in results))
+        self.bare_lens.write(*results)
+        for result in results:
+            if self.overlay is not None:
+                self.overlay.write(result.frame, result.scan)
+            if self.rerun is not None:
+                self.rerun.write(result.frame, result.scan)
+            if self.mcap is not None:
+                self.mcap.write(result)
+            if self.net is not None and not result.is_lost:
+                self.net.add(result.scan)
 
 
-def prepare(request: RunRequest) -> ExitStack:
-    """Make sure that the run can be written; returns the claims to be closed at its end.
+def claim_outputs(request: RunRequest) -> ExitStack:
+    """Make sure that the run can be written, and return its claims, to be closed at its end.
 
     Raises `OutputError` if it cannot, or its folder holds another that may not be replaced. Raises
     `OptionError` if a file of Rerun is requested but cannot be.
@@ -365,11 +270,11 @@ def _claim_rerun(path: Path, *, overwrite: bool) -> Claim:
 
 
 @contextmanager
-def writers(
-    request: RunRequest, rig: Rig, source: FrameSource, net: RunNet, summary: RunSummary
+def open_writers(
+    request: RunRequest, rig: Rig, source: FrameSource, net: NetPass | None, summary: RunSummary
 ) -> Iterator[RunWriters]:
     """Open everything that the run writes; it is completed however the run ends."""
-    outputs = RunOutputs(
+    folder = RunOutputs(
         request.out,
         source=source_dict(source),
         rig=rig_to_mapping(rig),
@@ -378,13 +283,13 @@ def writers(
         shutter=rig.shutter,
     )
     with (
-        outputs,
+        folder,
         RunOverlay(request.out, rig, source) if request.overlay else nullcontext() as overlay,
         RunBareLens(request.out, rig) as bare_lens,
         RunMcap(request.out, rig, request.scanner) if request.mcap else nullcontext() as mcap,
         RunRerun(request.rerun, rig) if request.rerun else nullcontext() as rerun,
     ):
-        yield RunWriters(outputs, overlay, bare_lens, mcap, rerun, net)
+        yield RunWriters(folder, bare_lens, overlay, mcap, rerun, net)
 
 
 def write_all(
@@ -395,18 +300,16 @@ def write_all(
         writers.write(*block)
         tick(len(block))
         if stop.caught:
-            writers.interrupt()
+            writers.folder.status = Status.INTERRUPTED
             return
 
 
-def report(request: RunRequest) -> Path | None:
-    """Write the report, if it is wanted."""
-    # A truth that is of no use must not cost the report: `run.yaml` names it, `comparison` tells.
-    return write_report(request.out) if request.report else None
+def write_net(net: NetPass, request: RunRequest) -> list[str]:
+    """Write the files on the state of the net, and return its summary as lines of text.
 
-
-def comparison(request: RunRequest) -> TruthComparison | None:
-    """Compare the postures with the truth, where there is one."""
-    if request.truth is None:
-        return None
-    return compare_with_truth(request.out / POSTURE_CSV, request.truth)
+    Raises `OutputError` if a file cannot be written.
+    """
+    # The clock of a video may help to align the vehicle's log with it.
+    video = Path(request.source) if Path(request.source).is_file() else None
+    result = net.write(request.out, video)
+    return [*result.lines, f"map of the net: {request.out / NET_MAP_PNG}"]

@@ -13,7 +13,7 @@ import threading
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Protocol, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,10 +23,11 @@ from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import lazy_borrowing_kernel
 from aqualvs.optics.rig import Rig
 from aqualvs.scanner import Scanner
-from aqualvs.scanning.laser_bands import plan_bands
+from aqualvs.scanning.laser_bands import SearchAxis, plan_bands
 from aqualvs.scanning.plane_fit import PlaneFit, fit_robust, plane_of_all, shared_error
 from aqualvs.scanning.posture import Posture, Reason, Refusal, count_inliers, posture_of
 from aqualvs.scanning.scan import Frame, Scan
+from aqualvs.scanning.stripe import StripePeaks
 from aqualvs.scanning.triangulate import Triangulator
 
 if TYPE_CHECKING:
@@ -196,11 +197,26 @@ class _End:
         self.fault = fault
 
 
+class ScanInputs(NamedTuple):
+    """Rig and stripe peaks that a scan was computed from, for recordings."""
+
+    rig: Rig  # In the water as known at the time of the frame.
+    peaks: dict[SearchAxis, StripePeaks]
+
+
 class FrameScanner(Protocol):
     """Interface of a scanner for a run."""
 
     def process(self, frame: Frame) -> Scan:
         """Return the scan of one frame."""
+
+
+@runtime_checkable
+class RecordableScanner(FrameScanner, Protocol):
+    """Interface of a scanner that also returns what it computes its scans from."""
+
+    def process_with_inputs(self, frame: Frame) -> tuple[Scan, ScanInputs]:
+        """Return the scan of one frame, and its inputs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,6 +228,8 @@ class FrameResult:
     bare: Posture | Refusal | None
     # None for a frame that was lost, or that another process has measured.
     frame: Frame | None = None
+    # Rig and stripes that the scan was computed from; None where the scanner does not return them.
+    inputs: "ScanInputs | None" = None
     # Whether the scan is that of a frame that could not be decoded.
     is_lost: bool = False
 
@@ -231,8 +249,8 @@ class FrameProcessor:
     def measure(self, frames: Sequence[Frame]) -> list[FrameResult]:
         """Measure frames, in their order."""
         return [
-            FrameResult(scan, self._bare(scan), frame)
-            for scan, frame in zip(self._scans(frames), frames, strict=True)
+            FrameResult(scan, self._bare(scan), frame, inputs)
+            for (scan, inputs), frame in zip(self._scans(frames), frames, strict=True)
         ]
 
     def lost(self, scan: Scan) -> FrameResult:
@@ -242,15 +260,17 @@ class FrameProcessor:
     def _bare(self, scan: Scan) -> Posture | Refusal | None:
         return None if self._bare_lens is None else self._bare_lens.measure(scan)
 
-    def _scans(self, frames: Sequence[Frame]) -> list[Scan]:
+    def _scans(self, frames: Sequence[Frame]) -> list[tuple[Scan, ScanInputs | None]]:
         scanner = self._scanner
+        if isinstance(scanner, RecordableScanner):
+            return [scanner.process_with_inputs(frame) for frame in frames]
         if not isinstance(scanner, Scanner):
-            return [scanner.process(frame) for frame in frames]
+            return [(scanner.process(frame), None) for frame in frames]
         # Step by step for all frames: code that has just run is still in the caches, from which
         # decoding and the other step would displace it.
         peaks = [scanner.detect(frame) for frame in frames]
         return [
-            scanner.measure(frame.index, frame.time_s, found)
+            (scanner.measure(frame.index, frame.time_s, found), ScanInputs(scanner.rig, found))
             for frame, found in zip(frames, peaks, strict=True)
         ]
 
@@ -308,26 +328,13 @@ def _corrected(
 def result_blocks(
     blocks: Iterator[list[tuple[list[Scan], Frame]]], processor: FrameProcessor
 ) -> Generator[list[FrameResult], None, None]:
-    """Yield the results of frames, and scans of lost ones, in the order of the dive.
+    """Yield the results of blocks of frames, and of lost frames, in the order of the dive.
 
-    Parameters
-    ----------
-    blocks : iterator of list
-        Of frames with the scans of the lost ones right before, see `with_losses`.
-
-    Yields
-    ------
-    found : list of FrameResult
-        Of one block; scans of lost frames before it come by themselves.
+    `blocks`: frames, each with the scans of the lost frames right before it, see `with_losses`.
     """
     for block in blocks:
-        (before, _), *others = block
-        if before:
-            # Before any result of the block's own frames is recorded.
-            yield [processor.lost(scan) for scan in before]
-        first, *more = processor.measure([frame for _, frame in block])
-        found = [first]
-        for (lost, _), measured in zip(others, more, strict=True):
-            found += [processor.lost(scan) for scan in lost]
-            found.append(measured)
-        yield found
+        results = list[FrameResult]()
+        measured = processor.measure([frame for _, frame in block])
+        for (lost, _), result in zip(block, measured, strict=True):
+            results += [*map(processor.lost, lost), result]
+        yield results

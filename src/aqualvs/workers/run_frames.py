@@ -21,10 +21,8 @@ from aqualvs.optics.rig import Rig
 from aqualvs.optics.solved import rig_uncertainty
 from aqualvs.results.run_request import FrameWindow, RunRequest, Water, in_water, prepared_rig
 from aqualvs.scanner import Scanner, ScannerOptions
-from aqualvs.scanning.laser_bands import SearchAxis
 from aqualvs.scanning.posture import Reason, Refusal
 from aqualvs.scanning.scan import Frame, ImagePlane, Scan, ScanPoints
-from aqualvs.scanning.stripe import StripePeaks
 from aqualvs.sources import FrameSource, ImageSource, VideoSource
 from aqualvs.sources.fields import field_of, source_of_pictures, whole_luma
 from aqualvs.text import count_text
@@ -32,6 +30,7 @@ from aqualvs.workers.frame_results import (
     FrameProcessor,
     FrameResult,
     FrameScanner,
+    ScanInputs,
     corrected_rows,
     in_blocks,
     read_ahead,
@@ -111,9 +110,9 @@ class Replay(Closing):
 
     def process(self, frame: Frame) -> Scan:
         """Return the scan of a frame of this source."""
-        return self.measured(frame)[1]
+        return self.process_with_inputs(frame)[0]
 
-    def measured(self, frame: Frame) -> tuple[Rig, Scan, dict[SearchAxis, StripePeaks]]:
+    def process_with_inputs(self, frame: Frame) -> tuple[Scan, ScanInputs]:
         """Return the scan of a frame of this source, with its rig and stripes."""
         recorded = frame.recorded if isinstance(frame, ReplayedFrame) else None
         if recorded is None:
@@ -121,11 +120,11 @@ class Replay(Closing):
         if recorded.refusal is not None:
             nothing = ScanPoints.none()
             scan = Scan(frame.index, frame.time_s, recorded.refusal, nothing, recorded.n_water)
-            return self.rig, scan, {}
+            return scan, ScanInputs(self.rig, {})
         scanner = self._scanner_in(recorded.n_water)
         peaks = scanner.detect(frame) if self._detects else recorded.peaks
         scan = scanner.measure(frame.index, frame.time_s, peaks)
-        return scanner.rig, replace(scan, turning=recorded.turning), peaks
+        return replace(scan, turning=recorded.turning), ScanInputs(scanner.rig, peaks)
 
     def _scanner_in(self, n_water: float) -> Scanner:
         """Return the scanner for the water of a frame, as the dive's run knew it."""
@@ -244,38 +243,25 @@ class DiveProcessor(Closing):
     ) -> None:
         self._source, self._rig, self._window = source, rig, window
         self._pool = None if work is None else WorkerPool(work, n_processes)
-        self._head: list[FrameResult] | None = None
-        self._shared: Iterator[list[FrameResult]] = iter(())
+        self._first_block: list[FrameResult] | None = None
+        self._pool_blocks: Iterator[list[FrameResult]] = iter(())
         self._frames: Iterator[Frame] = iter(())
         self._stack = ExitStack()
 
-    def blocks(
-        self, scanner: FrameScanner, *, one_by_one: bool
-    ) -> Generator[list[FrameResult], None, None]:
+    def blocks(self, scanner: FrameScanner) -> Generator[list[FrameResult], None, None]:
         """Yield the results, in the order of the dive; to be closed before the source is.
 
         Those of a rolling shutter are corrected.
 
-        Parameters
-        ----------
-        scanner : FrameScanner
-            For what this process measures.
-        one_by_one : bool
-            Whether nothing may be measured before what was found in the frame before is yielded.
-
-        Raises
-        ------
-        SourceError
-            From the source, at the end of what it has.
+        `scanner`: measures what the pool does not. Raises `SourceError` from the source, after the
+        results of all frames before the fault.
         """
-        return corrected_rows(self._measured(scanner, one_by_one=one_by_one), self._rig)
+        return corrected_rows(self._measured(scanner), self._rig)
 
-    def _measured(
-        self, scanner: FrameScanner, *, one_by_one: bool
-    ) -> Generator[list[FrameResult], None, None]:
-        if self._head is not None and self._pool is not None:
-            yield self._head
-            yield from self._shared
+    def _measured(self, scanner: FrameScanner) -> Generator[list[FrameResult], None, None]:
+        if self._first_block is not None and self._pool is not None:
+            yield self._first_block
+            yield from self._pool_blocks
             if self._pool.is_done:
                 return
             # The effect of damage depends on the whole video; earlier results stay valid.
@@ -284,7 +270,7 @@ class DiveProcessor(Closing):
         # A recording contains its lost frames; frames that it lacks were skipped on purpose.
         first = None if isinstance(self._source, Replay) else self._window.first
         pairs = with_losses(self._frames, first, self._rig.n_water)
-        ahead = _is_at_hand(self._source) and not one_by_one
+        ahead = _is_at_hand(self._source)
         processor = FrameProcessor(self._rig, scanner)
         frames = in_blocks(pairs, processor.block_length if ahead else 1)
         yield from result_blocks(read_ahead(frames) if ahead else frames, processor)
@@ -294,15 +280,15 @@ class DiveProcessor(Closing):
 
         Raises `SourceError` or `OptionError` if there is none.
         """
-        self._head = next(self._shared, None)
-        if self._head is None:
+        self._first_block = next(self._pool_blocks, None)
+        if self._first_block is None:
             frames = window_of(self._source, self._window)
             self._frames = ready(frames, self._source, self._window)
 
     def __enter__(self) -> Self:
         """Start the processes."""
         if self._pool is not None:
-            self._shared = self._stack.enter_context(self._pool).blocks()
+            self._pool_blocks = self._stack.enter_context(self._pool).blocks()
         return self
 
     def close(self) -> None:
@@ -362,9 +348,14 @@ class WaterFollowingScanner:
 
     def process(self, frame: Frame) -> Scan:
         """Measure a frame in the water as presently known."""
+        return self.process_with_inputs(frame)[0]
+
+    def process_with_inputs(self, frame: Frame) -> tuple[Scan, ScanInputs]:
+        """Measure a frame, and return the rig and the stripes that it was measured with."""
         if self.is_due(frame):
             self.look(frame)
-        return self.scanner.process(frame)
+        scanner, peaks = self.scanner, self.scanner.detect(frame)
+        return scanner.measure(frame.index, frame.time_s, peaks), ScanInputs(scanner.rig, peaks)
 
     @property
     def sigma_n_water(self) -> float:
