@@ -18,7 +18,7 @@ from aqualvs.optics.expected_error import (
     ExpectedError,
     expected_posture_errors,
     point_per_pixel,
-    see_stripe,
+    visible_stripe,
 )
 from aqualvs.optics.flat_port import FlatPort
 from aqualvs.optics.lens import Lens, LensModel
@@ -93,7 +93,7 @@ def test_field_of_view_of_a_pinhole() -> None:
 
 
 def test_stripe_of_a_pinhole() -> None:
-    stripe = see_stripe(pinhole().camera(), sheet(upright()), 0.5)
+    stripe = visible_stripe(pinhole().camera(), sheet(upright()), 0.5)
     # x = 320 + 800 · 0.1 / 0.5, the whole height of the picture but for one angular step.
     np.testing.assert_allclose(stripe.pixels[:, 0], 480.0, atol=1e-9)
     assert stripe.length_px == pytest.approx(481.0, abs=4.0)
@@ -105,7 +105,7 @@ def test_stripe_lies_on_wall_and_laser_behind_a_dome() -> None:
     window = Window(Plane.from_normal([-0.3, 0.95, 0.1], 0.05), np.array([-0.15, 0.0, 0.0]))
     rig = replace(rig, lasers=(*rig.lasers, replace(rig.lasers[1], name="bent", window=window)))
     for one in sheets_of(rig):
-        stripe = see_stripe(rig.camera(), one, 0.6)
+        stripe = visible_stripe(rig.camera(), one, 0.6)
         assert len(stripe.pixels) > 100
         np.testing.assert_allclose(stripe.points_in_dome[:, 1], 0.6, rtol=1e-12)
         np.testing.assert_allclose(one.signed_distance(stripe.points_in_dome), 0.0, atol=1e-14)
@@ -113,7 +113,7 @@ def test_stripe_lies_on_wall_and_laser_behind_a_dome() -> None:
 
 def test_laser_parallel_to_the_wall_is_not_seen() -> None:
     across = Plane.from_normal([0.0, 1.0, 0.0], 0.5)
-    assert not see_stripe(pinhole().camera(), Sheet(plane=across), 0.5).visible
+    assert not visible_stripe(pinhole().camera(), Sheet(plane=across), 0.5).visible
 
 
 @pytest.mark.parametrize("wall", [0.3, 0.6, 1.0])
@@ -124,7 +124,7 @@ def test_range_per_pixel_of_a_pinhole(wall: float) -> None:
     per_pixel = expect(rig, wall).per_pixel
     # Second order of the central difference over one pixel: (h/u)² with u = f b / r >= 64 px.
     np.testing.assert_allclose(per_pixel, expected, rtol=1e-4)
-    stripe = see_stripe(rig.camera(), sheet(upright()), wall)
+    stripe = visible_stripe(rig.camera(), sheet(upright()), wall)
     slope = point_per_pixel(rig.camera(), stripe)
     np.testing.assert_allclose(slope[:, 0], 0.0, atol=1e-12)
 

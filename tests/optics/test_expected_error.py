@@ -15,7 +15,7 @@ from aqualvs.optics.expected_error import (
     WallView,
     expected_posture_errors,
     point_per_pixel,
-    see_stripe,
+    visible_stripe,
 )
 from aqualvs.optics.rig import Rig, RigUncertainty, Window, rig_moved_by, rig_parameter_names
 from aqualvs.optics.sheet import sheets_of
@@ -66,7 +66,7 @@ def posture_by_points(
 
 def test_a_stripe_that_is_hardly_in_the_picture_has_a_direction_at_every_point() -> None:
     rig = example_rig()
-    whole = see_stripe(rig.camera(), sheets_of(rig)[0], 0.6)
+    whole = visible_stripe(rig.camera(), sheets_of(rig)[0], 0.6)
     few = StripeView(whole.sheet, whole.points_in_dome[:5], whole.pixels[:5], 7.0).thinned(N_POINTS)
     assert len(few.pixels) == 5
     assert np.isfinite(point_per_pixel(rig.camera(), few)).all()
@@ -84,7 +84,7 @@ def test_calibration_errors_are_those_of_a_monte_carlo(rig: Rig) -> None:
     ]
     for expected in told:
         views = [
-            see_stripe(rig.camera(), sheet, expected.wall_range).thinned(N_POINTS)
+            visible_stripe(rig.camera(), sheet, expected.wall_range).thinned(N_POINTS)
             for sheet in sheets_of(rig)
         ]
         weights = [1.0 / np.abs(point_per_pixel(rig.camera(), view)[:, 1]) for view in views]
@@ -99,7 +99,7 @@ def test_calibration_errors_are_those_of_a_monte_carlo(rig: Rig) -> None:
 
 def test_noise_is_that_of_a_monte_carlo() -> None:
     rig, rng = example_rig(), np.random.default_rng(11)
-    views = [see_stripe(rig.camera(), s, 0.6).thinned(N_POINTS) for s in sheets_of(rig)]
+    views = [visible_stripe(rig.camera(), s, 0.6).thinned(N_POINTS) for s in sheets_of(rig)]
     slopes = [point_per_pixel(rig.camera(), view) for view in views]
     true, slope = np.concatenate([v.points_in_dome for v in views]), np.concatenate(slopes)
     weight = 1.0 / np.abs(slope[:, 1])
@@ -144,11 +144,11 @@ def test_a_wall_reads_right_with_the_rig_that_saw_it() -> None:
     window = Window(Plane.from_normal([-0.3, 0.95, 0.1], 0.05), np.array([-0.15, 0.0, 0.0]))
     bent = replace(rig, lasers=(rig.lasers[0], replace(rig.lasers[1], window=window)))
     for one in (rig, bent):
-        read = WallView.ahead(one, 0.6).read_by(one)
+        read = WallView.ahead(one, 0.6).measured_by(one)
         # Projection and its inverse agree to 1e-11 px; a bent sheet is met to 1e-12 m.
         np.testing.assert_allclose(read, [0.6, 0.0, 0.0], atol=1e-9)
     # The window matters, so that the test above has tested it: millimetres at this tilt.
-    flat = WallView.ahead(bent, 0.6).read_by(replace(rig, lasers=rig.lasers[:2]))
+    flat = WallView.ahead(bent, 0.6).measured_by(replace(rig, lasers=rig.lasers[:2]))
     assert abs(flat[0] - 0.6) > 1e-3
 
 

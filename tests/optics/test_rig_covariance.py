@@ -9,7 +9,7 @@ import pytest
 
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.planes import Plane
-from aqualvs.optics.expected_error import see_stripe
+from aqualvs.optics.expected_error import visible_stripe
 from aqualvs.optics.rig import Rig, RigUncertainty, Window, rig_moved_by, rig_parameter_names
 from aqualvs.optics.rig_covariance import PostureErrors, fitted_plane
 from aqualvs.optics.sheet import sheets_of
@@ -154,7 +154,7 @@ def test_windows_and_the_water_in_front_of_them_count() -> None:
     sigmas = {name: 1e-2 if name in ("fx", "fy", "cx", "cy") else 1e-5 for name in names}
     uncertainty = RigUncertainty.independent(sigmas)
     errors = PostureErrors(rig, rig.camera(), uncertainty)
-    views = [see_stripe(rig.camera(), sheet, 0.6).thinned(50) for sheet in sheets_of(rig)]
+    views = [visible_stripe(rig.camera(), sheet, 0.6).thinned(50) for sheet in sheets_of(rig)]
     points = np.concatenate([view.points_in_dome for view in views])
     pixels = np.concatenate([view.pixels for view in views])
     laser, ones = np.repeat([0, 1], 50), np.ones(100)
@@ -188,7 +188,7 @@ def test_a_curved_net_answers_with_its_own_coefficients() -> None:
     assert m is not None
     points, pixels, laser = [], [], []
     for i, sheet in enumerate(sheets_of(rig)):
-        view = see_stripe(rig.camera(), sheet, 0.6).thinned(60)
+        view = visible_stripe(rig.camera(), sheet, 0.6).thinned(60)
         points.append(view.points_in_dome)
         pixels.append(view.pixels)
         laser.append(np.full(60, i))

@@ -327,7 +327,7 @@ def consequence(new: Rig, old: Rig) -> Iterator[str]:
         return
     pairs = _shared_lasers(new, old)
     wall = WallView.ahead(replace(new, lasers=tuple(a for a, _ in pairs)), _WALL_M)
-    read = wall.read_by(replace(old, lasers=tuple(b for _, b in pairs)))
+    read = wall.measured_by(replace(old, lasers=tuple(b for _, b in pairs)))
     place = f"If the new rig is right, a wall {_WALL_M * 1e3:.0f} mm ahead"
     if not np.isfinite(read).all():
         yield f"{place} cannot be measured with the lasers that both rigs have."

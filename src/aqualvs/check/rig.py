@@ -27,7 +27,7 @@ from aqualvs.check.finding import (
 from aqualvs.errors import RigError
 from aqualvs.geometry.planes import Rays
 from aqualvs.optics.camera import POSE_PARAMETERS, Camera
-from aqualvs.optics.expected_error import StripeView, see_stripe
+from aqualvs.optics.expected_error import StripeView, visible_stripe
 from aqualvs.optics.rig import Laser, Rig, RigUncertainty, laser_parameter_names
 from aqualvs.optics.rigfile import load_rig
 from aqualvs.optics.sheet import sheet_in
@@ -423,7 +423,7 @@ def _check_laser(rig: Rig, camera: Camera, laser: Laser) -> Finding:
     n_ranges = 43
     walls = np.geomspace(near, far, n_ranges)
     sheet = sheet_in(laser, rig.n_air, rig.n_water)
-    views = [see_stripe(camera, sheet, float(wall)) for wall in walls]
+    views = [visible_stripe(camera, sheet, float(wall)) for wall in walls]
     seen = np.array([view.visible for view in views])
     if not seen.any():
         return Finding.bad(

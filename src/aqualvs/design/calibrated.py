@@ -64,7 +64,7 @@ def camera_errors(design: Design, ranges: Sequence[float]) -> dict[str, FloatArr
             if believed is None:
                 squares += np.nan
                 continue
-            read = np.array([wall.read_by(believed) for wall in walls])
+            read = np.array([wall.measured_by(believed) for wall in walls])
             squares += (read - truth) ** 2
         found[cause] = np.sqrt(squares)
     return found
@@ -242,5 +242,5 @@ def _errors(true: Rig, believed: Rig | None, ranges: Sequence[float]) -> FloatAr
     """Return the posture errors (W, 3) of `believed` on pictures of `true`; NaN without posture."""
     if believed is None:
         return np.full((len(ranges), 3), np.nan)
-    read = [WallView.ahead(true, wall).read_by(believed) - [wall, 0.0, 0.0] for wall in ranges]
+    read = [WallView.ahead(true, wall).measured_by(believed) - [wall, 0.0, 0.0] for wall in ranges]
     return np.array(read)

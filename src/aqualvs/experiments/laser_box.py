@@ -110,7 +110,7 @@ def matched(found: Sequence[LaserFigures], lasers: Sequence[Laser]) -> list[Lase
 
 def remaining(truth: Rig, found: Rig, ranges: Sequence[float] = _SETUP.ranges) -> Remaining:
     """Return what a found rig makes of the pixels that the true one sees."""
-    read = np.array([WallView.ahead(truth, far).read_by(found) for far in ranges])
+    read = np.array([WallView.ahead(truth, far).measured_by(found) for far in ranges])
     expected = expected_posture_errors(found, rig_uncertainty(found), ranges)
     far = np.array(ranges)
     true = np.column_stack([far, np.zeros_like(far), np.zeros_like(far)])

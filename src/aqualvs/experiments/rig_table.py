@@ -18,7 +18,7 @@ from aqualvs.experiments.experiment import (
 from aqualvs.experiments.laboratory import Laboratory, frames_of
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.transforms import rotvec_from_rotation
-from aqualvs.optics.expected_error import see_stripe
+from aqualvs.optics.expected_error import visible_stripe
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig
 from aqualvs.optics.sheet import Sheet, sheets_of
 from aqualvs.report.figure_style import BLUE, DARK, GREY, OURS, PAPER
@@ -190,7 +190,7 @@ def _draw_stripes(axes: Axes, rig: Rig, sheet: Sheet, i: int) -> None:
     # Walls whose stripes are drawn, metres.
     walls = (0.3, 0.52, 1.0)
     for far in walls:
-        pixels = see_stripe(rig.camera(), sheet, far).pixels
+        pixels = visible_stripe(rig.camera(), sheet, far).pixels
         full = far == walls[1]
         axes.plot(
             *pixels.T,

@@ -20,6 +20,7 @@ from aqualvs.geometry.compiled import (
 )
 
 Vec: TypeAlias = tuple[float, float, float]
+"""A vector as scalar kernels take and return it."""
 
 
 @inline_borrowing_kernel

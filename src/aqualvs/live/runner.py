@@ -29,7 +29,7 @@ from aqualvs.errors import AqualvsError
 from aqualvs.geometry.compiled import compiled_at_once
 from aqualvs.live.health_monitor import FrozenOptions, FrozenPicture, HealthMonitor
 from aqualvs.live.outputs.base import HearsVehicle, Output
-from aqualvs.optics.expected_error import see_stripe
+from aqualvs.optics.expected_error import visible_stripe
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.rigfile import load_rig
 from aqualvs.optics.sheet import sheets_of
@@ -84,7 +84,7 @@ def wall_frame(rig: Rig) -> Frame:
     width, height = rig.size_px
     luma = np.full((height, width), grey, np.uint8)
     for sheet in sheets_of(rig):
-        stripe = see_stripe(camera, sheet, 0.5 * sum(rig.working_range))
+        stripe = visible_stripe(camera, sheet, 0.5 * sum(rig.working_range))
         # OpenCV takes fixed-point coordinates, here in 1/16 px.
         pixels = np.rint(16.0 * stripe.pixels).astype(np.int32)
         cv2.polylines(luma, [pixels], False, light, thick_px, cv2.LINE_AA, shift=4)

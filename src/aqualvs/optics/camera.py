@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from aqualvs.errors import RigError
 from aqualvs.geometry.arrays import BoolArray, FloatArray, as_vectors
 from aqualvs.geometry.compiled import chosen_by_class, inline_kernel, kernel
+from aqualvs.geometry.linear_algebra import Vec
 from aqualvs.geometry.planes import Rays
 from aqualvs.geometry.transforms import SE3
 from aqualvs.optics.dome import Dome, DomeParams, trace_direction
@@ -31,7 +32,7 @@ from aqualvs.optics.lens import (
     directions_block,
     load_pixels,
 )
-from aqualvs.optics.lens_kernels import LensParams, Vector
+from aqualvs.optics.lens_kernels import LensParams
 from aqualvs.optics.refraction import as_triple, check_index
 
 POSE_PARAMETERS = ("lens_x", "lens_y", "lens_z", "rotation_x", "rotation_y", "rotation_z")
@@ -47,7 +48,7 @@ Housing = Dome | FlatPort
 class BareParams(NamedTuple):
     """A lens in the outer medium itself, as kernels take it."""
 
-    centre: Vector  # The lens position L in `dome`, metres.
+    centre: Vec  # The lens position L in `dome`, metres.
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -81,7 +82,7 @@ class CameraParams(NamedTuple):
 
 
 @inline_kernel
-def dome_from_cam(camera: CameraParams, x: float, y: float, z: float) -> Vector:
+def rotate_to_dome(camera: CameraParams, x: float, y: float, z: float) -> Vec:
     """Rotate a direction from `cam` to `dome`."""
     r = camera.rotation
     return (
@@ -110,7 +111,7 @@ def trace_block(camera: CameraParams, w: FloatArray) -> None:
 def rotate_block(camera: CameraParams, w: FloatArray) -> None:
     """Rotate directions from `cam` to `dome`, all lanes of a block."""
     for j in range(BLOCK):
-        x, y, z = dome_from_cam(camera, w[DX + j], w[DY + j], w[DZ + j])
+        x, y, z = rotate_to_dome(camera, w[DX + j], w[DY + j], w[DZ + j])
         w[DX + j], w[DY + j], w[DZ + j] = x, y, z
 
 

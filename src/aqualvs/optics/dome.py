@@ -13,8 +13,8 @@ import numpy as np
 
 from aqualvs.errors import RigError
 from aqualvs.geometry.compiled import inline_kernel
+from aqualvs.geometry.linear_algebra import Vec
 from aqualvs.geometry.transforms import SE3
-from aqualvs.optics.lens_kernels import Vector
 from aqualvs.optics.refraction import as_triple, check_index, leave_sphere
 
 DOME_PARAMETERS = ("inner_radius", "thickness", "n_air", "n_acrylic", "n_water")
@@ -25,7 +25,7 @@ sphere along."""
 class DomeParams(NamedTuple):
     """A dome as kernels take it; `Dome.params` makes it."""
 
-    centre: Vector  # The lens position L in `dome`, metres.
+    centre: Vec  # The lens position L in `dome`, metres.
     # Metres.
     inner_radius: float
     outer_radius: float
@@ -36,7 +36,7 @@ class DomeParams(NamedTuple):
     # |L| in metres.
     decentring: float
     # L/|L| in `dome`; any unit vector when L is zero.
-    axis: Vector
+    axis: Vec
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -46,7 +46,7 @@ class StripeView:
         return StripeView(self.sheet, self.points_in_dome[pick], self.pixels[pick], self.length_px)
 
 
-def see_stripe(camera: Camera, sheet: Sheet, wall_range: float) -> StripeView:
+def visible_stripe(camera: Camera, sheet: Sheet, wall_range: float) -> StripeView:
     """Return what a camera sees of a laser's stripe on the wall y = `wall_range` (metres)."""
     points = _stripe_on_wall(sheet, wall_range)
     pixels, valid = camera.project(points)
@@ -191,7 +191,7 @@ class WallView:
     """Whether the stripes determine a plane."""
 
     def __post_init__(self) -> None:
-        points, _ = self._weighed(self._points())
+        points, _ = self._weighted(self._points())
         singular = np.linalg.svd(points, compute_uv=False)
         # Points on one line leave one direction of m·X = 1 to rounding.
         rounding = 1e-10
@@ -202,7 +202,7 @@ class WallView:
     def ahead(cls, rig: Rig, wall_range: float) -> "WallView":
         """Return what a rig sees on the wall y = `wall_range` (metres)."""
         camera = rig.camera()
-        seen = (see_stripe(camera, sheet, wall_range) for sheet in sheets_of(rig))
+        seen = (visible_stripe(camera, sheet, wall_range) for sheet in sheets_of(rig))
         stripes = tuple(one.thinned(N_POINTS) if one.visible else one for one in seen)
         slopes = tuple(
             point_per_pixel(camera, one)[:, 1] if one.visible else np.empty(0) for one in stripes
@@ -215,7 +215,7 @@ class WallView:
         known = (np.abs(s[~np.isnan(s)]) for s in self.slopes)
         return tuple(float(np.median(s)) if len(s) else np.nan for s in known)
 
-    def read_by(self, rig: Rig) -> FloatArray:
+    def measured_by(self, rig: Rig) -> FloatArray:
         """Return range, pitch and yaw (3,) that a rig computes from the same pixels; NaN if none.
 
         The rig has the same lasers in the same order.
@@ -228,7 +228,7 @@ class WallView:
             for sheet, stripe in zip(sheets, self.stripes, strict=True)
             if stripe.visible
         ]
-        points, weights = self._weighed(np.concatenate(read))
+        points, weights = self._weighted(np.concatenate(read))
         if len(points) < 3:
             return np.full(3, np.nan)
         x, y, z = np.linalg.lstsq(points, weights)[0].tolist()
@@ -238,7 +238,7 @@ class WallView:
         """Return the covariance (3, 3) of range, pitch and yaw by `SIGMA_PX`; NaN where none."""
         if not self.determined:
             return np.full((3, 3), np.nan)
-        points, _ = self._weighed(self._points())
+        points, _ = self._weighted(self._points())
         by_m = self._by_m()
         return by_m @ np.linalg.inv(points.T @ points) @ by_m.T
 
@@ -255,8 +255,8 @@ class WallView:
         # At its time t a point lies on the plane m + t * rate, so m is off by what explains
         # t * rate·X, of which the wall's rate is one column for each part of m.
         points = self._points()
-        moved, _ = self._weighed(points * row_times(rows)[:, None])
-        by_rate = np.linalg.lstsq(self._weighed(points)[0], moved)[0]
+        moved, _ = self._weighted(points * row_times(rows)[:, None])
+        by_rate = np.linalg.lstsq(self._weighted(points)[0], moved)[0]
         errors: FloatArray = self._by_m() @ by_rate @ np.linalg.inv(self._by_m())
         return errors
 
@@ -284,7 +284,7 @@ class WallView:
         seen = [stripe.points_in_dome for stripe in self.stripes if stripe.visible]
         return np.concatenate([np.empty((0, 3)), *seen])
 
-    def _weighed(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _weighted(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the points (N, 3) that are seen, times their weights (N,), and the weights."""
         sigma = self._sigma()
         good = np.isfinite(sigma) & (sigma > 0.0) & np.isfinite(points).all(axis=-1)

@@ -14,8 +14,8 @@ import numpy as np
 
 from aqualvs.errors import RigError
 from aqualvs.geometry.compiled import inline_kernel
+from aqualvs.geometry.linear_algebra import Vec
 from aqualvs.geometry.transforms import SE3
-from aqualvs.optics.lens_kernels import Vector
 from aqualvs.optics.refraction import as_triple, check_index, leave_plane
 
 FLAT_PARAMETERS = (
@@ -36,12 +36,12 @@ MAX_TILT = math.radians(45.0)
 class FlatParams(NamedTuple):
     """A flat port as kernels take it; `FlatPort.params` makes it."""
 
-    centre: Vector  # The lens position L in `dome`, metres.
+    centre: Vec  # The lens position L in `dome`, metres.
     # The port's normal away from the camera, and the axes about which its tilts turn it; unit
     # vectors in `dome`.
-    normal: Vector
-    turn_x: Vector
-    turn_y: Vector
+    normal: Vec
+    turn_x: Vec
+    turn_y: Vec
     # Metres.
     distance: float
     thickness: float
@@ -126,7 +126,7 @@ class FlatPort:
         return FlatPort(*(value + step.get(name, 0.0) for name, value in self.numbers().items()))
 
     @property
-    def normal_in_cam(self) -> Vector:
+    def normal_in_cam(self) -> Vec:
         """Unit normal in `cam`, away from the camera."""
         across = math.cos(self.tilt_y)
         return (

@@ -7,15 +7,12 @@ direction in `cam`, "distorted" ones are those after the distortion: (u - cx)/fx
 
 import functools
 import math
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.geometry.compiled import inline_kernel, inner_kernel, python_of
-
-Vector: TypeAlias = tuple[float, float, float]
-"""A vector as scalar kernels take and return it."""
 
 
 class LensParams(NamedTuple):

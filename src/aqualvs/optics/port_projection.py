@@ -13,7 +13,7 @@ asin is the unit complex number (sqrt(1 - s^2), s), sums are products, and the r
 of theta - target. Sines are carried divided by b, so that nothing breaks when the lens is in the
 centre, where b vanishes.
 
-The derivatives of the projection follow from the implicit function theorem (`back_derivative`).
+The derivatives of the projection follow from the implicit function theorem (`dome_derivative`).
 With u the unit vector along which the direction turns as alpha grows, m the normal of the plane of
 refraction, and D = theta - alpha, the derivative of the direction is
 
@@ -50,15 +50,14 @@ import math
 from typing import NamedTuple
 
 from aqualvs.geometry.compiled import inline_kernel, inner_kernel
-from aqualvs.geometry.linear_algebra import cross, dot
+from aqualvs.geometry.linear_algebra import Vec, cross, dot
 from aqualvs.optics.dome import DomeParams
 from aqualvs.optics.flat_port import FlatParams
-from aqualvs.optics.lens_kernels import Vector
 
 # A last Newton step below this leaves an error of its square times a factor of order one.
 STEP_SOLVED = 3e-8
 # Rounds of three steps: one is enough for a lens that looks outwards, two for one at 95 % of the
-# inner radius that looks sideways; the remaining cases are searched (`solve_guarded`).
+# inner radius that looks sideways; the remaining cases are searched (`bisect_dome`).
 ROUNDS = 3
 # Points this much (relative) inside the outer surface are still on it: rounding, not geometry.
 SURFACE_SLACK = 1e-9
@@ -66,7 +65,7 @@ _TINY = 1e-300
 
 
 @inline_kernel
-def perpendicular(a: Vector) -> Vector:
+def perpendicular(a: Vec) -> Vec:
     """Return a unit vector perpendicular to the unit vector a."""
     if abs(a[0]) < 0.6:
         length = math.sqrt(a[1] * a[1] + a[2] * a[2])
@@ -76,13 +75,13 @@ def perpendicular(a: Vector) -> Vector:
 
 
 @inline_kernel
-def blend(p: float, a: Vector, q: float, b: Vector) -> Vector:
+def blend(p: float, a: Vec, q: float, b: Vec) -> Vec:
     """Return p a + q b."""
     return p * a[0] + q * b[0], p * a[1] + q * b[1], p * a[2] + q * b[2]
 
 
 @inline_kernel
-def across_axis(axis: Vector, e: Vector, spare: Vector) -> Vector:
+def across_axis(axis: Vec, e: Vec, spare: Vec) -> Vec:
     """Return e made exactly perpendicular to the axis, or `spare` where e is parallel to it.
 
     Near the axis e is the quotient of two rounding errors. Any perpendicular vector serves there:
@@ -111,7 +110,7 @@ class AngleSines(NamedTuple):
 
 
 @inline_kernel
-def surfaces_at(port: DomeParams, inverse_rho: float) -> AngleSines:
+def angle_sines(port: DomeParams, inverse_rho: float) -> AngleSines:
     """Return the sines per unit of b for a point at distance 1 / inverse_rho from the centre."""
     return AngleSines(
         1.0 / (port.n_air * port.inner_radius),
@@ -183,7 +182,7 @@ def newton_step(
 
 
 @inline_kernel
-def paraxial_start(
+def newton_start(
     s: AngleSines, n_l: float, cos_target: float, sin_target: float
 ) -> tuple[float, float]:
     """Return (cos, sin) of alpha for the straight line from the lens's image to the point.
@@ -198,18 +197,18 @@ def paraxial_start(
 
 
 @inline_kernel
-def three_steps(
+def three_newton_steps(
     s: AngleSines, n_l: float, cos_target: float, sin_target: float, c: float, k: float
 ) -> tuple[float, float, bool]:
     """Return (cos alpha, sin alpha, solved) after three steps from (c, k), without branches."""
     c, k, _ = newton_step(s, n_l, cos_target, sin_target, c, k)
     c, k, _ = newton_step(s, n_l, cos_target, sin_target, c, k)
     c, k, solved = newton_step(s, n_l, cos_target, sin_target, c, k)
-    return c, k, solved & (n_l * abs(k) * steepest(s) < 1.0)
+    return c, k, solved & (n_l * abs(k) * largest_sine(s) < 1.0)
 
 
 @inner_kernel
-def solve_guarded(
+def bisect_dome(
     s: AngleSines, n_l: float, cos_target: float, sin_target: float
 ) -> tuple[bool, float, float]:
     """Solve theta(alpha) = target by bracketing; return (found, cos alpha, sin alpha).
@@ -219,7 +218,7 @@ def solve_guarded(
     close to the caustic, where two of them merge, may be refused.
     """
     target = math.atan2(sin_target, cos_target)
-    sine = min(1.0 / max(n_l * steepest(s), _TINY), 1.0)
+    sine = min(1.0 / max(n_l * largest_sine(s), _TINY), 1.0)
     bound = math.asin(sine)
     # Parts of each branch of theta(alpha) that the slow search looks at for a crossing.
     slices = 32
@@ -241,7 +240,7 @@ def solve_guarded(
 
 
 @inline_kernel
-def steepest(s: AngleSines) -> float:
+def largest_sine(s: AngleSines) -> float:
     """Return the largest sine per unit of b: the surface that reflects totally first."""
     return max(max(s.q1, s.q2), max(max(s.q3, s.q4), s.q5))
 
@@ -253,9 +252,7 @@ def _theta(s: AngleSines, n_l: float, alpha: float) -> float:
 
 
 @inline_kernel
-def polar_angle(
-    port: DomeParams, x: float, y: float, z: float
-) -> tuple[float, float, float, Vector]:
+def polar_angle(port: DomeParams, x: float, y: float, z: float) -> tuple[float, float, float, Vec]:
     """Return (1/rho, cos, sin, e) of a point: cos a + sin e is its direction, a the lens axis.
 
     e is a unit vector, or zero for a point exactly on the axis.
@@ -276,14 +273,14 @@ def is_outside(port: DomeParams, inverse_rho: float) -> bool:
     return (inverse_rho > 0.0) & (inverse_rho * port.outer_radius <= 1.0 + SURFACE_SLACK)
 
 
-class BackDerivative(NamedTuple):
+class DomeDerivative(NamedTuple):
     """Terms of the derivatives of a solved projection."""
 
     # u and m of the module's docstring.
-    turn: Vector
-    normal: Vector
+    turn: Vec
+    normal: Vec
     # d alpha / d point, 1/m.
-    along_point: Vector
+    along_point: Vec
     # Factor of m m^T for the point, 1/m.
     across_point: float
     # Factors of u u^T and m m^T for the lens position, 1/m.
@@ -299,13 +296,13 @@ class BackDerivative(NamedTuple):
 
 
 @inline_kernel
-def back_derivative(
+def dome_derivative(
     port: DomeParams,
     s: AngleSines,
     target: tuple[float, float, float],
-    e: Vector,
+    e: Vec,
     solution: tuple[float, float],
-) -> BackDerivative:
+) -> DomeDerivative:
     """Return the derivatives at a solution, without branches.
 
     Parameters
@@ -335,7 +332,7 @@ def back_derivative(
     t5 = b * s.q5 / cosine_of(s.q5, b)
     by_outer = (t4 - t3) / port.outer_radius * inverse
     axis = port.axis
-    return BackDerivative(
+    return DomeDerivative(
         turn=blend(-k, axis, c, e),
         normal=cross(axis, e),
         along_point=blend((-sin_t - t5 * cos_t) * by_rho, axis, (cos_t - t5 * sin_t) * by_rho, e),
@@ -351,7 +348,7 @@ def back_derivative(
 
 
 @inline_kernel
-def height_and_reach(port: FlatParams, x: float, y: float, z: float) -> tuple[float, float, Vector]:
+def height_and_radius(port: FlatParams, x: float, y: float, z: float) -> tuple[float, float, Vec]:
     """Return (h, rho, e) of a point: its height above the outer face, and where it is beside m.
 
     e is a unit vector, or zero for a point exactly on the axis.
@@ -379,7 +376,7 @@ def layer(k: float, t: float) -> tuple[float, float]:
 
 
 @inline_kernel
-def tangent_start(port: FlatParams, height: float, rho: float) -> float:
+def halley_start(port: FlatParams, height: float, rho: float) -> float:
     """Return t of the straight line from the lens's image to the point, exact near the axis.
 
     Or, far from the axis, the least t with which the air alone can bridge what glass and water
@@ -387,28 +384,26 @@ def tangent_start(port: FlatParams, height: float, rho: float) -> float:
     """
     glass, water = port.n_air / port.n_port, port.n_air / port.n_water
     start = rho / (port.distance + port.thickness * glass + height * water)
-    rest = rho - port.thickness * _widest(glass) - height * _widest(water)
+    rest = rho - port.thickness * _critical_tangent(glass) - height * _critical_tangent(water)
     return max(start, rest / port.distance)
 
 
 @inline_kernel
-def _widest(k: float) -> float:
+def _critical_tangent(k: float) -> float:
     """Return the tangent of the critical angle, 1e30 where there is none."""
     return k / math.sqrt(max(1.0 - k * k, 1e-60))
 
 
 @inline_kernel
-def three_tangent_steps(
-    port: FlatParams, height: float, rho: float, t: float
-) -> tuple[float, bool]:
+def three_halley_steps(port: FlatParams, height: float, rho: float, t: float) -> tuple[float, bool]:
     """Return (t, solved) after three of Halley's steps towards rho(t) = rho, without branches."""
-    t, _ = tangent_step(port, height, rho, t)
-    t, _ = tangent_step(port, height, rho, t)
-    return tangent_step(port, height, rho, t)
+    t, _ = halley_step(port, height, rho, t)
+    t, _ = halley_step(port, height, rho, t)
+    return halley_step(port, height, rho, t)
 
 
 @inline_kernel
-def tangent_step(port: FlatParams, height: float, rho: float, t: float) -> tuple[float, bool]:
+def halley_step(port: FlatParams, height: float, rho: float, t: float) -> tuple[float, bool]:
     """Return t after one of Halley's steps, and whether that step was the last needed."""
     glass, water = port.n_air / port.n_port, port.n_air / port.n_water
     square_g, inverse_g = layer(glass, t)
@@ -429,7 +424,7 @@ def tangent_step(port: FlatParams, height: float, rho: float, t: float) -> tuple
 
 
 @inner_kernel
-def tangent_guarded(port: FlatParams, height: float, rho: float) -> tuple[bool, float]:
+def bisect_flat(port: FlatParams, height: float, rho: float) -> tuple[bool, float]:
     """Solve rho(t) = rho by bisection over alpha; return (found, t). Slow, but safe."""
     low, high = 0.0, math.asin(min(1.0, min(port.n_port, port.n_water) / port.n_air))
     glass, water = port.n_air / port.n_port, port.n_air / port.n_water
@@ -448,7 +443,7 @@ def tangent_guarded(port: FlatParams, height: float, rho: float) -> tuple[bool, 
 class FlatDerivative(NamedTuple):
     """Terms of the derivatives of a solved projection behind a flat port."""
 
-    turn: Vector  # u of the module's docstring.
+    turn: Vec  # u of the module's docstring.
     by_reach: float  # d alpha / d rho, 1/m.
     across_point: float  # sin alpha / rho, 1/m.
     water_tangent: float  # w, the tangent of the angle in the water.
@@ -462,7 +457,7 @@ class FlatDerivative(NamedTuple):
 
 @inline_kernel
 def flat_derivative(
-    port: FlatParams, height: float, e: Vector, solution: tuple[float, float]
+    port: FlatParams, height: float, e: Vec, solution: tuple[float, float]
 ) -> FlatDerivative:
     """Return the derivatives at a solution (cos alpha, sin alpha), without branches."""
     c, s = solution

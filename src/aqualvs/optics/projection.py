@@ -12,30 +12,30 @@ import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.geometry.compiled import chosen_by_class, inline_kernel, kernel
-from aqualvs.geometry.linear_algebra import cross, dot
-from aqualvs.optics.camera import BareParams, CameraParams, dome_from_cam
+from aqualvs.geometry.linear_algebra import Vec, cross, dot
+from aqualvs.optics.camera import BareParams, CameraParams, rotate_to_dome
 from aqualvs.optics.dome import DomeParams
 from aqualvs.optics.flat_port import FLAT_PARAMETERS, FlatParams
 from aqualvs.optics.lens import BLOCK
-from aqualvs.optics.lens_kernels import LensParams, Vector, fisheye_distort, opencv_distort
+from aqualvs.optics.lens_kernels import LensParams, fisheye_distort, opencv_distort
 from aqualvs.optics.port_projection import (
     ROUNDS,
     across_axis,
-    back_derivative,
+    angle_sines,
+    bisect_dome,
+    bisect_flat,
     blend,
+    dome_derivative,
     flat_derivative,
-    height_and_reach,
+    halley_start,
+    height_and_radius,
     is_in_front,
     is_outside,
-    paraxial_start,
+    newton_start,
     perpendicular,
     polar_angle,
-    solve_guarded,
-    surfaces_at,
-    tangent_guarded,
-    tangent_start,
-    three_steps,
-    three_tangent_steps,
+    three_halley_steps,
+    three_newton_steps,
 )
 
 
@@ -71,7 +71,7 @@ def lens_pixel(lens: LensParams, x: float, y: float, z: float) -> tuple[bool, fl
 @inline_kernel
 def opencv_pixel_jacobian(
     lens: LensParams, x: float, y: float, z: float
-) -> tuple[bool, float, float, Vector, Vector]:
+) -> tuple[bool, float, float, Vec, Vec]:
     """Return `lens_pixel_jacobian` of the opencv model, without branches."""
     inverse = 1.0 / z
     xn, yn = x * inverse, y * inverse
@@ -89,7 +89,7 @@ def opencv_pixel_jacobian(
 @inline_kernel
 def fisheye_pixel_jacobian(
     lens: LensParams, x: float, y: float, z: float
-) -> tuple[bool, float, float, Vector, Vector]:
+) -> tuple[bool, float, float, Vec, Vec]:
     """Return `lens_pixel_jacobian` of the fisheye model."""
     radius = math.sqrt(x * x + y * y)
     theta = math.atan2(radius, z)
@@ -115,7 +115,7 @@ def fisheye_pixel_jacobian(
 @inline_kernel
 def lens_pixel_jacobian(
     lens: LensParams, x: float, y: float, z: float
-) -> tuple[bool, float, float, Vector, Vector]:
+) -> tuple[bool, float, float, Vec, Vec]:
     """Return (valid, u, v, gradient of u, gradient of v) with respect to the direction."""
     if lens.fisheye:
         return fisheye_pixel_jacobian(lens, x, y, z)
@@ -231,7 +231,7 @@ N_POINT_ROWS = 12
 
 
 @inline_kernel
-def aim_bare_block(port: BareParams, _count: int, w: FloatArray) -> None:
+def bare_directions_block(port: BareParams, _count: int, w: FloatArray) -> None:
     """Turn points into directions from the lens, all lanes of a block."""
     cx, cy, cz = port.centre
     for j in range(BLOCK):
@@ -248,8 +248,8 @@ def polar_block(port: DomeParams, w: FloatArray) -> None:
         w[FAR + j], w[COS_T + j], w[SIN_T + j] = far, cos_t, sin_t
         w[EX + j], w[EY + j], w[EZ + j] = e
         w[OK + j] = 0.0 if is_outside(port, far) else -1.0
-        s = surfaces_at(port, far)
-        w[COS_A + j], w[SIN_A + j] = paraxial_start(s, n_l, cos_t, sin_t)
+        s = angle_sines(port, far)
+        w[COS_A + j], w[SIN_A + j] = newton_start(s, n_l, cos_t, sin_t)
 
 
 @inline_kernel
@@ -264,8 +264,8 @@ def solve_block(port: DomeParams, count: int, w: FloatArray) -> None:
         if n_open == 0:
             return
         for j in range(BLOCK):
-            s = surfaces_at(port, w[FAR + j])
-            c, k, solved = three_steps(
+            s = angle_sines(port, w[FAR + j])
+            c, k, solved = three_newton_steps(
                 s, n_l, w[COS_T + j], w[SIN_T + j], w[COS_A + j], w[SIN_A + j]
             )
             w[COS_A + j], w[SIN_A + j] = c, k
@@ -275,13 +275,13 @@ def solve_block(port: DomeParams, count: int, w: FloatArray) -> None:
             n_open += w[OK + j] == 0.0
     for j in range(count):
         if w[OK + j] == 0.0:
-            s = surfaces_at(port, w[FAR + j])
-            found, w[COS_A + j], w[SIN_A + j] = solve_guarded(s, n_l, w[COS_T + j], w[SIN_T + j])
+            s = angle_sines(port, w[FAR + j])
+            found, w[COS_A + j], w[SIN_A + j] = bisect_dome(s, n_l, w[COS_T + j], w[SIN_T + j])
             w[OK + j] = 1.0 if found else -1.0
 
 
 @inline_kernel
-def turn_block(port: DomeParams, w: FloatArray) -> None:
+def angles_to_directions_block(port: DomeParams, w: FloatArray) -> None:
     """Turn solved angles into directions at the lens, in `dome`, all lanes of a block."""
     ax, ay, az = port.axis
     for j in range(BLOCK):
@@ -292,27 +292,27 @@ def turn_block(port: DomeParams, w: FloatArray) -> None:
 
 
 @inline_kernel
-def aim_dome_block(port: DomeParams, count: int, w: FloatArray) -> None:
+def dome_directions_block(port: DomeParams, count: int, w: FloatArray) -> None:
     """Turn points into directions at the lens, in `dome`, all lanes of a block."""
     polar_block(port, w)
     solve_block(port, count, w)
-    turn_block(port, w)
+    angles_to_directions_block(port, w)
 
 
 @inline_kernel
-def aim_flat_block(port: FlatParams, count: int, w: FloatArray) -> None:
+def flat_directions_block(port: FlatParams, count: int, w: FloatArray) -> None:
     """Turn points into directions at the lens, in `dome`, all lanes of a block."""
     for j in range(BLOCK):
-        height, rho, e = height_and_reach(port, w[PX + j], w[PY + j], w[PZ + j])
+        height, rho, e = height_and_radius(port, w[PX + j], w[PY + j], w[PZ + j])
         w[FAR + j], w[SIN_T + j] = height, rho
         w[EX + j], w[EY + j], w[EZ + j] = e
-        t, solved = three_tangent_steps(port, height, rho, tangent_start(port, height, rho))
+        t, solved = three_halley_steps(port, height, rho, halley_start(port, height, rho))
         w[SIN_A + j] = t
         in_front = is_in_front(port, height)
         w[OK + j] = (1.0 if solved else 0.0) if in_front else -1.0
     for j in range(count):
         if w[OK + j] == 0.0:
-            found, w[SIN_A + j] = tangent_guarded(port, w[FAR + j], w[SIN_T + j])
+            found, w[SIN_A + j] = bisect_flat(port, w[FAR + j], w[SIN_T + j])
             w[OK + j] = 1.0 if found else -1.0
     mx, my, mz = port.normal
     for j in range(BLOCK):
@@ -325,10 +325,14 @@ def aim_flat_block(port: FlatParams, count: int, w: FloatArray) -> None:
         w[PZ + j] = c * mz + s * w[EZ + j]
 
 
-aim_block = chosen_by_class(
-    {BareParams: aim_bare_block, DomeParams: aim_dome_block, FlatParams: aim_flat_block}
+port_directions_block = chosen_by_class(
+    {
+        BareParams: bare_directions_block,
+        DomeParams: dome_directions_block,
+        FlatParams: flat_directions_block,
+    }
 )
-"""`aim_block(port, count, w)`: `aim` for all lanes of a block."""
+"""`port_directions_block(port, count, w)`: points to directions at the lens, in `dome`."""
 
 
 # Columns of the parameter Jacobian before the intrinsics: lens position 3, rotation 3, and those of
@@ -351,9 +355,9 @@ def dome_gradients_block(port: DomeParams, w: FloatArray) -> None:
     """Write the gradients of u and v by point, lens position and dome, all lanes of a block."""
     spare = perpendicular(port.axis)
     for j in range(BLOCK):
-        back = back_derivative(
+        back = dome_derivative(
             port,
-            surfaces_at(port, w[FAR + j]),
+            angle_sines(port, w[FAR + j]),
             (w[FAR + j], w[COS_T + j], w[SIN_T + j]),
             across_axis(port.axis, (w[EX + j], w[EY + j], w[EZ + j]), spare),
             (w[COS_A + j], w[SIN_A + j]),
@@ -442,7 +446,7 @@ the rotation, all lanes of a block."""
 
 
 @inline_kernel
-def _turn_gradients_block(_port: BareParams | DomeParams, w: FloatArray) -> None:
+def _rotation_gradients_block(_port: BareParams | DomeParams, w: FloatArray) -> None:
     """Write the gradients of u and v by the camera's rotation, all lanes of a block.
 
     exp(w) R seen from `cam` turns the direction d by -w: g . (d x w) = w . (g x d).
@@ -459,22 +463,22 @@ def _turn_gradients_block(_port: BareParams | DomeParams, w: FloatArray) -> None
 
 
 @inline_kernel
-def _turned_with_port(_port: FlatParams, _w: FloatArray) -> None:
+def _flat_rotation_gradients_block(_port: FlatParams, _w: FloatArray) -> None:
     """Leave the gradients by the rotation as `flat_gradients_block` wrote them."""
 
 
-turn_gradients_block = chosen_by_class(
+rotation_gradients_block = chosen_by_class(
     {
-        BareParams: _turn_gradients_block,
-        DomeParams: _turn_gradients_block,
-        FlatParams: _turned_with_port,
+        BareParams: _rotation_gradients_block,
+        DomeParams: _rotation_gradients_block,
+        FlatParams: _flat_rotation_gradients_block,
     }
 )
-"""`turn_gradients_block(port, w)`: the gradients by the camera's rotation, all lanes of a block."""
+"""`rotation_gradients_block(port, w)`: gradients by the camera's rotation, all lanes of a block."""
 
 
 @inline_kernel
-def cam_from_dome(camera: CameraParams, x: float, y: float, z: float) -> Vector:
+def rotate_to_cam(camera: CameraParams, x: float, y: float, z: float) -> Vec:
     """Rotate a direction from `dome` to `cam`."""
     r = camera.rotation
     return (
@@ -494,10 +498,10 @@ def load_points(points: FloatArray, start: int, count: int, w: FloatArray) -> No
 
 
 @inline_kernel
-def see_block(camera: CameraParams, count: int, w: FloatArray) -> None:
+def pixels_block(camera: CameraParams, count: int, w: FloatArray) -> None:
     """Turn directions in `dome` into pixels, all lanes of a block."""
     for j in range(BLOCK):
-        x, y, z = cam_from_dome(camera, w[PX + j], w[PY + j], w[PZ + j])
+        x, y, z = rotate_to_cam(camera, w[PX + j], w[PY + j], w[PZ + j])
         w[PX + j], w[PY + j], w[PZ + j] = x, y, z
     if camera.lens.fisheye:
         for j in range(count):
@@ -520,8 +524,8 @@ def project_all(
     for start in range(0, points.shape[0], BLOCK):
         count = min(BLOCK, points.shape[0] - start)
         load_points(points, start, count, w)
-        aim_block(camera.port, count, w)
-        see_block(camera, count, w)
+        port_directions_block(camera.port, count, w)
+        pixels_block(camera, count, w)
         for j in range(count):
             ok = w[OK + j] > 0.0
             valid[start + j] = ok
@@ -530,31 +534,31 @@ def project_all(
 
 
 @inline_kernel
-def _see_lane(
-    camera: CameraParams, w: FloatArray, j: int, seen: tuple[bool, float, float, Vector, Vector]
+def _store_pixel_jacobian(
+    camera: CameraParams, w: FloatArray, j: int, seen: tuple[bool, float, float, Vec, Vec]
 ) -> None:
     """Write the pixel and its gradients into lane j."""
     ok, w[U + j], w[V + j], u_d, v_d = seen
-    w[GUX + j], w[GUY + j], w[GUZ + j] = dome_from_cam(camera, u_d[0], u_d[1], u_d[2])
-    w[GVX + j], w[GVY + j], w[GVZ + j] = dome_from_cam(camera, v_d[0], v_d[1], v_d[2])
+    w[GUX + j], w[GUY + j], w[GUZ + j] = rotate_to_dome(camera, u_d[0], u_d[1], u_d[2])
+    w[GVX + j], w[GVY + j], w[GVZ + j] = rotate_to_dome(camera, v_d[0], v_d[1], v_d[2])
     w[OK + j] = w[OK + j] if ok else -1.0
 
 
 @inline_kernel
-def see_jacobian_block(camera: CameraParams, count: int, w: FloatArray) -> None:
+def pixels_jacobian_block(camera: CameraParams, count: int, w: FloatArray) -> None:
     """Turn directions in `dome` into pixels and their gradients, all lanes of a block."""
     lens = camera.lens
     for j in range(BLOCK):
-        x, y, z = cam_from_dome(camera, w[PX + j], w[PY + j], w[PZ + j])
+        x, y, z = rotate_to_cam(camera, w[PX + j], w[PY + j], w[PZ + j])
         w[CX + j], w[CY + j], w[CZ + j] = x, y, z
     if lens.fisheye:
         for j in range(count):
             seen = fisheye_pixel_jacobian(lens, w[CX + j], w[CY + j], w[CZ + j])
-            _see_lane(camera, w, j, seen)
+            _store_pixel_jacobian(camera, w, j, seen)
         return
     for j in range(BLOCK):
         seen = opencv_pixel_jacobian(lens, w[CX + j], w[CY + j], w[CZ + j])
-        _see_lane(camera, w, j, seen)
+        _store_pixel_jacobian(camera, w, j, seen)
 
 
 @inline_kernel
@@ -593,8 +597,8 @@ def project_jacobian_all(
     for start in range(0, points.shape[0], BLOCK):
         count = min(BLOCK, points.shape[0] - start)
         load_points(points, start, count, w)
-        aim_block(camera.port, count, w)
-        see_jacobian_block(camera, count, w)
+        port_directions_block(camera.port, count, w)
+        pixels_jacobian_block(camera, count, w)
         gradients_block(camera.port, w)
         for j in range(count):
             ok = w[OK + j] > 0.0
@@ -605,5 +609,5 @@ def project_jacobian_all(
                 point_jacobian[start + j, 0, k] = w[JU + k * BLOCK + j] if ok else np.nan
                 point_jacobian[start + j, 1, k] = w[JV + k * BLOCK + j] if ok else np.nan
         if parameter_jacobian.shape[0] > 0:
-            turn_gradients_block(camera.port, w)
+            rotation_gradients_block(camera.port, w)
             store_parameters(camera, n_before, start, count, w, parameter_jacobian)

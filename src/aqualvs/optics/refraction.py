@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike
 from aqualvs.errors import RigError
 from aqualvs.geometry.arrays import BoolArray, FloatArray, as_vectors
 from aqualvs.geometry.compiled import inline_kernel, kernel
+from aqualvs.geometry.linear_algebra import Vec
 
 
 def check_index(owner: str, name: str, value: float) -> None:
@@ -19,7 +20,7 @@ def check_index(owner: str, name: str, value: float) -> None:
         )
 
 
-def as_triple(vector: FloatArray) -> tuple[float, float, float]:
+def as_triple(vector: FloatArray) -> Vec:
     """Return a vector (3,) as kernels take it."""
     return float(vector[0]), float(vector[1]), float(vector[2])
 
@@ -72,13 +73,7 @@ def leave_sphere(
 
 
 @inline_kernel
-def leave_plane(
-    p: tuple[float, float, float],
-    d: tuple[float, float, float],
-    normal: tuple[float, float, float],
-    height: float,
-    ratio: float,
-) -> tuple[float, tuple[float, float, float], tuple[float, float, float]]:
+def leave_plane(p: Vec, d: Vec, normal: Vec, height: float, ratio: float) -> tuple[float, Vec, Vec]:
     """Carry a ray from `height` behind a plane to it and refract it there.
 
     Parameters

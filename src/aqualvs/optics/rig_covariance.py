@@ -119,18 +119,17 @@ class PostureErrors:
         # Central differences: this share of a sigma, and no more than this in any unit.
         step_share, largest_step = 0.1, 1e-4
         sigmas = uncertainty.sigmas
-        # Numbers of the rig that have an uncertainty, P of them.
         self.names = tuple(name for name in uncertainty.names if sigmas[name] > 0.0)
-        self.covariance = uncertainty.of(self.names)  # Shape (P, P): theirs.
+        self.covariance = uncertainty.of(self.names)
         steps = {name: min(step_share * sigmas[name], largest_step) for name in self.names}
         self._n_lasers = len(rig.lasers)
         own = parameter_names(camera)
-        columns = np.array([i for i, name in enumerate(self.names) if name in own], np.int64)
-        of_camera = {name: steps[name] for name in self.names if name in own}
+        camera_columns = [i for i, name in enumerate(self.names) if name in own]
+        camera_steps = {name: steps[name] for name in self.names if name in own}
         self._rig_errors = _RigErrors(
-            _derivatives_on_lattice(replace(rig, housing=camera.housing), of_camera),
+            _derivatives_on_lattice(replace(rig, housing=camera.housing), camera_steps),
             _sheet_moves(rig, camera, steps),
-            columns,
+            np.array(camera_columns, np.int64),
             self.covariance,
         )
 

@@ -39,7 +39,7 @@ LASER_NM_REMEDY = "write the wavelength in nanometres, 380 to 780, for example 5
 LaserWavelength = Annotated[float, Field(ge=LASER_NM[0], le=LASER_NM[1], allow_inf_nan=False)]
 
 
-def _said(text: str) -> Any:
+def _doc(text: str) -> Any:
     """Return the description of a key, for editors that complete rig files."""
     return Field(description=text)
 
@@ -47,8 +47,8 @@ def _said(text: str) -> Any:
 class ImagePart(StrictPart):
     """`image`: size of the pictures."""
 
-    width_px: Annotated[Pixels, _said("Width of the pictures the camera was calibrated at.")]
-    height_px: Annotated[Pixels, _said("Height of the pictures the camera was calibrated at.")]
+    width_px: Annotated[Pixels, _doc("Width of the pictures the camera was calibrated at.")]
+    height_px: Annotated[Pixels, _doc("Height of the pictures the camera was calibrated at.")]
 
 
 def _camera_conditions(schema: dict[str, Any]) -> None:
@@ -74,18 +74,18 @@ class ShutterPart(StrictPart):
     """`shutter` of the camera; global by default."""
 
     kind: Annotated[
-        Literal["global", "rolling", "interlaced"], _said("Order in which rows are exposed.")
+        Literal["global", "rolling", "interlaced"], _doc("Order in which rows are exposed.")
     ] = "global"
     readout_ms: Annotated[
         Number,
-        _said(
+        _doc(
             "From the first row to the last, negative if the last comes first, or from the first "
             "field to the second."
         ),
     ] = 0.0
-    exposure_ms: Annotated[NotNegative, _said("Exposure time of a row; 0 if unknown.")] = 0.0
+    exposure_ms: Annotated[NotNegative, _doc("Exposure time of a row; 0 if unknown.")] = 0.0
     first_field: Annotated[
-        Literal["top", "bottom"], _said("Of interlaced video; top holds rows 0, 2, 4.")
+        Literal["top", "bottom"], _doc("Of interlaced video; top holds rows 0, 2, 4.")
     ] = "top"
 
 
@@ -95,24 +95,24 @@ class CameraPart(StrictPart):
     model_config = ConfigDict(json_schema_extra=_camera_conditions)
 
     model: Annotated[
-        Literal["opencv", "fisheye"], _said("As cv2.projectPoints, or as cv2.fisheye.")
+        Literal["opencv", "fisheye"], _doc("As cv2.projectPoints, or as cv2.fisheye.")
     ] = "opencv"
-    fx_px: Annotated[FocalLength, _said("Focal length along x, in air without the dome.")]
-    fy_px: Annotated[FocalLength, _said("Focal length along y, in air without the dome.")]
-    cx_px: Annotated[Number, _said("Principal point; the centre of the top-left pixel is (0, 0).")]
-    cy_px: Annotated[Number, _said("Principal point; the centre of the top-left pixel is (0, 0).")]
+    fx_px: Annotated[FocalLength, _doc("Focal length along x, in air without the dome.")]
+    fy_px: Annotated[FocalLength, _doc("Focal length along y, in air without the dome.")]
+    cx_px: Annotated[Number, _doc("Principal point; the centre of the top-left pixel is (0, 0).")]
+    cy_px: Annotated[Number, _doc("Principal point; the centre of the top-left pixel is (0, 0).")]
     distortion: Annotated[
         list[Number],
-        _said("opencv: none, or k1 k2 p1 p2 [k3 [k4 k5 k6]]; fisheye: none, or k1 k2 k3 k4."),
+        _doc("opencv: none, or k1 k2 p1 p2 [k3 [k4 k5 k6]]; fisheye: none, or k1 k2 k3 k4."),
     ] = Field(default=[])
     position_mm: Annotated[
         Triple | None,
-        _said("Projection centre of the lens in the frame `dome`; needed behind a dome."),
+        _doc("Projection centre of the lens in the frame `dome`; needed behind a dome."),
     ] = None
     rotation_deg: Annotated[
-        Triple, _said("Rotation vector in `dome`, applied after the nominal mounting.")
+        Triple, _doc("Rotation vector in `dome`, applied after the nominal mounting.")
     ] = Field(default=[0.0, 0.0, 0.0])
-    shutter: Annotated[ShutterPart, _said("When rows are exposed; global by default.")] = (
+    shutter: Annotated[ShutterPart, _doc("When rows are exposed; global by default.")] = (
         ShutterPart()
     )
 
@@ -120,21 +120,21 @@ class CameraPart(StrictPart):
 class DomePart(StrictPart):
     """`dome`: two concentric spheres and the material between them."""
 
-    inner_radius_mm: Annotated[Positive, _said("Inner radius.")]
-    thickness_mm: Annotated[NotNegative, _said("Thickness of the wall.")]
-    n_acrylic: Annotated[Index, _said("Refractive index of the wall.")]
+    inner_radius_mm: Annotated[Positive, _doc("Inner radius.")]
+    thickness_mm: Annotated[NotNegative, _doc("Thickness of the wall.")]
+    n_acrylic: Annotated[Index, _doc("Refractive index of the wall.")]
 
 
 class FlatPart(StrictPart):
     """`flat`: a plane window, fixed to the camera."""
 
-    distance_mm: Annotated[Positive, _said("From the lens's projection centre to the inner face.")]
-    thickness_mm: Annotated[NotNegative, _said("Thickness of the window.")]
-    n_port: Annotated[Index, _said("Refractive index of the window.")]
+    distance_mm: Annotated[Positive, _doc("From the lens's projection centre to the inner face.")]
+    thickness_mm: Annotated[NotNegative, _doc("Thickness of the window.")]
+    n_port: Annotated[Index, _doc("Refractive index of the window.")]
     tilt_deg: Annotated[
         list[Tilt],
         Field(min_length=2, max_length=2),
-        _said("Tilt of its normal from the optical axis, about the camera's x and y axes."),
+        _doc("Tilt of its normal from the optical axis, about the camera's x and y axes."),
     ] = Field(default=[0.0, 0.0])
 
 
@@ -160,32 +160,32 @@ class WaterPart(StrictPart):
         }
     )
 
-    n: Annotated[Index | None, _said("Index outside, relative to vacuum.")] = None
-    temperature_c: Annotated[Number | None, _said("0 to 30; in place of n.")] = None
-    salinity_permille: Annotated[Number | None, _said("0 to 40; in place of n.")] = None
+    n: Annotated[Index | None, _doc("Index outside, relative to vacuum.")] = None
+    temperature_c: Annotated[Number | None, _doc("0 to 30; in place of n.")] = None
+    salinity_permille: Annotated[Number | None, _doc("0 to 40; in place of n.")] = None
     wavelength_nm: Annotated[
-        Number | None, _said("Wavelength for the index; by default that of the lasers, or 532.")
+        Number | None, _doc("Wavelength for the index; by default that of the lasers, or 532.")
     ] = None
 
 
 class WindowPart(StrictPart):
     """`window` of a laser: its outer face in `dome`, and the light source."""
 
-    normal: Annotated[Triple, _said("Normal of the window's outer face.")]
+    normal: Annotated[Triple, _doc("Normal of the window's outer face.")]
     offset_mm: Annotated[
-        Number, _said("Distance of the outer face from the dome's centre along the unit normal.")
+        Number, _doc("Distance of the outer face from the dome's centre along the unit normal.")
     ]
-    source_mm: Annotated[Triple, _said("Point from which the light fans out.")]
+    source_mm: Annotated[Triple, _doc("Point from which the light fans out.")]
 
 
 class LaserPart(StrictPart):
     """One of `lasers`: a plane in `dome`; `offset_mm` belongs to the unit normal."""
 
-    name: Annotated[Name, _said("Unique name.")]
-    normal: Annotated[Triple, _said("Normal of the laser's plane in `dome`, of any length.")]
-    offset_mm: Annotated[Number, _said("Distance from the dome's centre along the unit normal.")]
+    name: Annotated[Name, _doc("Unique name.")]
+    normal: Annotated[Triple, _doc("Normal of the laser's plane in `dome`, of any length.")]
+    offset_mm: Annotated[Number, _doc("Distance from the dome's centre along the unit normal.")]
     wavelength_nm: Annotated[
-        LaserWavelength | None, _said("Wavelength of this laser; green by default.")
+        LaserWavelength | None, _doc("Wavelength of this laser; green by default.")
     ] = None
     window: WindowPart | None = None
 
@@ -222,26 +222,26 @@ class RigFile(StrictPart):
     aqualvs_rig: Annotated[
         int, Field(description="Version of the format.", json_schema_extra={"const": VERSION})
     ]
-    name: Annotated[Name, _said("Name of the rig in reports.")] = "rig"
+    name: Annotated[Name, _doc("Name of the rig in reports.")] = "rig"
     image: ImagePart
     camera: CameraPart
     housing: Annotated[
         Literal["dome", "flat", "none"] | None,
-        _said("Follows from the sections `dome` and `flat`, and must agree with them."),
+        _doc("Follows from the sections `dome` and `flat`, and must agree with them."),
     ] = None
-    dome: Annotated[DomePart | None, _said("Leave it out without a dome.")] = None
-    flat: Annotated[FlatPart | None, _said("Leave it out without a flat port.")] = None
-    n_air: Annotated[Index, _said("Index inside the housing, relative to vacuum.")] = N_AIR
+    dome: Annotated[DomePart | None, _doc("Leave it out without a dome.")] = None
+    flat: Annotated[FlatPart | None, _doc("Leave it out without a flat port.")] = None
+    n_air: Annotated[Index, _doc("Index inside the housing, relative to vacuum.")] = N_AIR
     water: Annotated[
-        WaterPart | None, _said("Water outside; required behind a housing, else air.")
+        WaterPart | None, _doc("Water outside; required behind a housing, else air.")
     ] = None
-    lasers: Annotated[list[LaserPart], _said("One laser for points, two for a posture.")] = Field(
+    lasers: Annotated[list[LaserPart], _doc("One laser for points, two for a posture.")] = Field(
         default=[]
     )
     working_range_mm: Annotated[
-        Pair, _said("Nearest and farthest target at which stripes are accepted.")
+        Pair, _doc("Nearest and farthest target at which stripes are accepted.")
     ] = Field(default=[250.0, 1300.0])
-    solved_from: Annotated[dict[str, Any], _said("Written by calibrations; preserved.")] = Field(
+    solved_from: Annotated[dict[str, Any], _doc("Written by calibrations; preserved.")] = Field(
         default={}
     )
 

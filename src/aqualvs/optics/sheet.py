@@ -169,7 +169,7 @@ def sheet_tangent(
 
 
 @inline_borrowing_kernel
-def meet_sheet(
+def intersect_ray(
     row: FloatArray, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, near: float
 ) -> tuple[float, float, float, float]:
     """Return the distance along a ray to a windowed sheet in the water, and f's gradient there.
@@ -229,7 +229,7 @@ def differentials(row: FloatArray, points: FloatArray, out: FloatArray) -> None:
 
 
 @borrowing_kernel
-def meet_rays(
+def intersect_rays(
     row: FloatArray,
     origins: FloatArray,
     directions: FloatArray,
@@ -245,7 +245,7 @@ def meet_rays(
         dx, dy, dz = directions[i, 0], directions[i, 1], directions[i, 2]
         approach = row[0] * dx + row[1] * dy + row[2] * dz
         near = (row[3] - row[0] * ox - row[1] * oy - row[2] * oz) / approach
-        distance[i] = meet_sheet(row, ox, oy, oz, dx, dy, dz, near)[0]
+        distance[i] = intersect_ray(row, ox, oy, oz, dx, dy, dz, near)[0]
 
 
 WINDOW_PARAMETERS = (*LASER_WINDOW_PARAMETERS, "n_water")
@@ -344,7 +344,7 @@ class Sheet:
         if self.window is None:
             return self.plane.intersect(rays)
         distance = np.empty(rays.valid.shape)
-        meet_rays(
+        intersect_rays(
             self._row,
             np.ascontiguousarray(rays.origins).reshape(-1, 3),
             np.ascontiguousarray(rays.directions).reshape(-1, 3),

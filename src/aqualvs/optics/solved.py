@@ -19,7 +19,7 @@ Numbers that were never calibrated, such as those written by hand, get stated de
 
 import difflib
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from typing import Any, NamedTuple, Self
@@ -387,60 +387,49 @@ def _settled_by(one: Assumption) -> tuple[str, ...]:
 
 
 def _defaults(rig: Rig) -> Iterator[Assumption]:
+    """Yield the default uncertainty of every group of numbers that a rig has."""
     yield _intrinsics(rig)
+    lens, thickness = f"{SIGMAS.lens_m * 1e3:g} mm", f"{SIGMAS.thickness_m * 1e3:g} mm"
     if rig.dome is not None:
-        yield Assumption(
-            "lens's place",
-            f"{SIGMAS.lens_m * 1e3:g} mm",
-            RigUncertainty.independent(dict.fromkeys(_LENS, SIGMAS.lens_m)),
-        )
-        sizes = dict(
-            zip(_SHELL, (SIGMAS.radius_m, SIGMAS.thickness_m, SIGMAS.n_acrylic), strict=True)
-        )
-        yield Assumption(
+        yield _independent("lens's place", lens, _LENS, [SIGMAS.lens_m] * 3)
+        yield _independent(
             "dome",
             f"{SIGMAS.radius_m * 1e3:g} mm in radius and thickness, {SIGMAS.n_acrylic:g} in index",
-            RigUncertainty.independent(sizes),
+            _SHELL,
+            (SIGMAS.radius_m, SIGMAS.thickness_m, SIGMAS.n_acrylic),
         )
     if rig.flat_port is not None:
-        tolerances = (
-            SIGMAS.lens_m,
-            SIGMAS.thickness_m,
-            SIGMAS.n_acrylic,
-            SIGMAS.port_tilt,
-            SIGMAS.port_tilt,
-        )
-        yield Assumption(
+        tilt = SIGMAS.port_tilt
+        yield _independent(
             "flat port",
-            f"{SIGMAS.lens_m * 1e3:g} mm in distance, "
-            f"{SIGMAS.thickness_m * 1e3:g} mm in thickness, "
-            f"{SIGMAS.n_acrylic:g} in index, {math.degrees(SIGMAS.port_tilt):g} degrees in tilt",
-            RigUncertainty.independent(dict(zip(_FLAT, tolerances, strict=True))),
+            f"{lens} in distance, {thickness} in thickness, {SIGMAS.n_acrylic:g} in index, "
+            f"{math.degrees(tilt):g} degrees in tilt",
+            _FLAT,
+            (SIGMAS.lens_m, SIGMAS.thickness_m, SIGMAS.n_acrylic, tilt, tilt),
         )
-    bends = rig.housing is not None or any(laser.window is not None for laser in rig.lasers)
+    refracts = rig.housing is not None or any(laser.window is not None for laser in rig.lasers)
     # An index outside that is the one inside is air, which is known.
     air = 1e-3
-    if bends and abs(rig.n_water - rig.n_air) > air:
-        yield Assumption(
-            "water's index",
-            f"{SIGMAS.n_water:g}",
-            RigUncertainty.independent({"n_water": SIGMAS.n_water}),
-        )
+    if refracts and abs(rig.n_water - rig.n_air) > air:
+        yield _independent("water's index", f"{SIGMAS.n_water:g}", ["n_water"], [SIGMAS.n_water])
     for laser in rig.lasers:
-        sigmas = zip(
-            LASER_PARAMETERS,
-            (SIGMAS.laser_tilt, SIGMAS.laser_tilt, SIGMAS.laser_offset_m),
-            strict=True,
-        )
-        yield Assumption(
+        yield _independent(
             f"laser '{laser.name}'",
             f"{math.degrees(SIGMAS.laser_tilt):g} degrees and {SIGMAS.laser_offset_m * 1e3:g} mm",
-            RigUncertainty.independent({f"{laser.name}:{name}": s for name, s in sigmas}),
+            [f"{laser.name}:{name}" for name in LASER_PARAMETERS],
+            (SIGMAS.laser_tilt, SIGMAS.laser_tilt, SIGMAS.laser_offset_m),
         )
+
+
+def _independent(
+    group: str, words: str, names: Sequence[str], sigmas: Sequence[float]
+) -> Assumption:
+    sigma_of = dict(zip(names, sigmas, strict=True))
+    return Assumption(group, words, RigUncertainty.independent(sigma_of))
 
 
 def _intrinsics(rig: Rig) -> Assumption:
-    """Return that of the lens: the errors of fx and fy are equal but for the pixels' aspect."""
+    """Return the assumption on the lens: fx and fy share one error but for the pixels' aspect."""
     lens = rig.lens
     centre = SIGMAS.centre_share * rig.size_px[0]
     sigmas = {

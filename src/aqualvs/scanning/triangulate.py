@@ -13,7 +13,7 @@ from aqualvs.geometry.compiled import (
 )
 from aqualvs.optics.camera import Camera, rays_all
 from aqualvs.optics.rig import Rig
-from aqualvs.optics.sheet import WINDOWED, meet_sheet, packed_sheets, planes_and_bent
+from aqualvs.optics.sheet import WINDOWED, intersect_ray, packed_sheets, planes_and_bent
 
 # Step of the one-sided difference, in pixels; the second derivative of a point by the pixel is
 # about 1e-2 of the first, so the error stays below 1 % of a sensitivity.
@@ -227,7 +227,7 @@ def _intersect_bent_sheets(
         if first or near != near:
             nx, ny, nz, offset = sheet[0], sheet[1], sheet[2], sheet[3]
         near = (offset - nx * ox - ny * oy - nz * oz) / (nx * dx + ny * dy + nz * dz)
-        near, nx, ny, nz = meet_sheet(sheet, ox, oy, oz, dx, dy, dz, near)
+        near, nx, ny, nz = intersect_ray(sheet, ox, oy, oz, dx, dy, dz, near)
         x, y, z = ox + near * dx, oy + near * dy, oz + near * dz
         offset = nx * x + ny * y + nz * z
         if first:
