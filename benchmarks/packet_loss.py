@@ -184,7 +184,7 @@ def delivered(
 ) -> list[tuple[int, ImagePlane]]:
     """Return number and luma of what a live feed delivers."""
     frames = LiveFrames(Reception("stream"))
-    frames.connect(decoder_of("h264"), 1 / TICKS_HZ, hears_losses=True)
+    frames.connect(decoder_of("h264"), 1 / TICKS_HZ, reports_losses=True)
     order, units, found = RtpOrder(), H264Depacketizer(), []
     for sequence, (part, is_lost) in enumerate(zip(parts, lost, strict=True)):
         if is_lost:

@@ -52,10 +52,10 @@ def test_a_file_of_single_fields_is_not_cut(tmp_path, images):
     assert found.why_whole == "fields in packets of their own"
 
 
-@pytest.mark.parametrize("hears_losses", [True, False])
-def test_live_pictures_of_two_packets_leave_no_gap(images, hears_losses):
+@pytest.mark.parametrize("reports_losses", [True, False])
+def test_live_pictures_of_two_packets_leave_no_gap(images, reports_losses):
     live = LiveFrames(Reception("camera", "camera"))
-    live.connect(av.CodecContext.create("h264", "r"), 0.02, hears_losses=hears_losses)
+    live.connect(av.CodecContext.create("h264", "r"), 0.02, reports_losses=reports_losses)
     frames = []
     for i, data in enumerate(field_packets(images)):
         packet = packet_with(data)

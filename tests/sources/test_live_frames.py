@@ -67,24 +67,24 @@ def exact(packets, codec="h264"):
     return found
 
 
-def delivered(packets, *, hears_losses, lost=(), codec="h264"):
-    decoder = LiveDecoder(av.CodecContext.create(codec, "r"), hears_losses=hears_losses)
+def delivered(packets, *, reports_losses, lost=(), codec="h264"):
+    decoder = LiveDecoder(av.CodecContext.create(codec, "r"), reports_losses=reports_losses)
     found = {}
     for i, (data, pts) in enumerate(packets):
         if i in lost:
-            if hears_losses:
-                decoder.distrust()
+            if reports_losses:
+                decoder.reset()
             continue
         found |= {f.pts: digest(f) for f in decoder.decode(packet(data, pts))}
     return found
 
 
-@pytest.mark.parametrize("hears_losses", [True, False])
+@pytest.mark.parametrize("reports_losses", [True, False])
 @pytest.mark.parametrize("kind", KINDS)
-def test_after_a_loss_only_exact_pictures_come(kind, hears_losses):
+def test_after_a_loss_only_exact_pictures_come(kind, reports_losses):
     packets = encoded(70, KINDS[kind])
     true = exact(packets)
-    found = delivered(packets, hears_losses=hears_losses, lost=(17, 30))
+    found = delivered(packets, reports_losses=reports_losses, lost=(17, 30))
     assert all(true[pts] == content for pts, content in found.items())
     assert len(found) >= 25
     assert max(found) >= 65
@@ -93,7 +93,7 @@ def test_after_a_loss_only_exact_pictures_come(kind, hears_losses):
 @pytest.mark.parametrize("kind", KINDS)
 def test_without_loss_every_picture_comes_at_once(kind):
     packets = encoded(40, KINDS[kind])
-    decoder = LiveDecoder(av.CodecContext.create("h264", "r"), hears_losses=False)
+    decoder = LiveDecoder(av.CodecContext.create("h264", "r"), reports_losses=False)
     held = [i + 1 for i in range(40)]
     n = 0
     for i, (data, pts) in enumerate(packets):
@@ -125,7 +125,7 @@ def test_a_damaged_picture_and_its_followers_are_not_delivered():
     data = bytearray(packets[15][0])
     data[len(data) // 2 : len(data) // 2 + 30] = bytes(range(30, 60))
     packets[15] = bytes(data), packets[15][1]
-    found = delivered(packets, hears_losses=True)
+    found = delivered(packets, reports_losses=True)
     assert all(true[pts] == content for pts, content in found.items())
     assert sorted(found) == [*range(15), *range(24, 40)]
 
@@ -133,7 +133,7 @@ def test_a_damaged_picture_and_its_followers_are_not_delivered():
 def test_other_codecs_wait_for_a_key_frame_too():
     packets = encoded(40, {"qscale": "3"}, codec="mpeg4", gop=10)
     true = exact(packets, "mpeg4")
-    found = delivered(packets[5:], hears_losses=True, lost=(18,), codec="mpeg4")
+    found = delivered(packets[5:], reports_losses=True, lost=(18,), codec="mpeg4")
     assert all(true[pts] == content for pts, content in found.items())
     # Packets are counted from the fifth picture.
     assert sorted(found) == [*range(10, 23), *range(30, 40)]
@@ -143,7 +143,7 @@ def test_motion_jpeg_loses_only_what_is_damaged():
     packets = encoded(12, {}, codec="mjpeg")
     true = exact(packets, "mjpeg")
     packets[5] = b"no picture at all" * 9, packets[5][1]
-    found = delivered(packets, hears_losses=False, codec="mjpeg")
+    found = delivered(packets, reports_losses=False, codec="mjpeg")
     assert found == {pts: true[pts] for pts in range(12) if pts != 5}
 
 
@@ -151,7 +151,7 @@ def frames_of(packets, *, lost=(), announced=()):
     """Frames of a stream whose lost pictures are noticed, some of them by a damaged packet."""
     reception = Reception("test")
     frames = LiveFrames(reception)
-    frames.connect(av.CodecContext.create("h264", "r"), 1 / 25, hears_losses=True)
+    frames.connect(av.CodecContext.create("h264", "r"), 1 / 25, reports_losses=True)
     found = []
     for i, (data, pts) in enumerate(packets):
         if i in announced:
@@ -187,15 +187,15 @@ def test_a_stream_joined_before_a_key_frame_is_neither_damaged_nor_running(monke
     reception, now = Reception("test"), time.monotonic()
     for later, waited in ((30.0, "0.0"), (32.4, "2.4")):
         monkeypatch.setattr(time, "monotonic", lambda later=later: now + later)
-        reception.hear("RTP H.264")
-        reception.hold(1)
+        reception.note_arrival("RTP H.264")
+        reception.note_held(1)
         health = reception.health()
         assert health.state is State.FAULT
         assert health.detail == f"RTP H.264: waiting for a whole key frame for {waited} s"
     for i in range(27):
         monkeypatch.setattr(time, "monotonic", lambda i=i: now + 33.0 + 0.04 * i)
-        reception.hear()
-        reception.deliver((720, 576), 0)
+        reception.note_arrival()
+        reception.note_frame((720, 576), 0)
         if i == 3:
             assert reception.health().detail == "RTP H.264 720x576 px"
     assert reception.health().detail == "RTP H.264 720x576 px, 25.0 frames/s"
@@ -206,7 +206,7 @@ def test_numbers_rise_over_a_new_connection():
     frames = LiveFrames(Reception("test"))
     found = []
     for _ in range(3):
-        frames.connect(av.CodecContext.create("h264", "r"), 1 / 25, hears_losses=False)
+        frames.connect(av.CodecContext.create("h264", "r"), 1 / 25, reports_losses=False)
         for data, pts in packets:
             found += frames.feed(packet(data, pts))
     assert [f.index for f in found] == list(range(72))

@@ -9,8 +9,8 @@ from aqualvs.sources.h264 import unit_reader
 from aqualvs.sources.spans import (
     Span,
     SpanKind,
-    UnlikeProbeError,
-    VideoParts,
+    SpanMismatchError,
+    SpanReader,
     image_frames,
     image_spans,
     video_spans,
@@ -31,7 +31,7 @@ def dive(path, n=N, content=grain, **more):
 
 
 def frames_of(path, spans):
-    with VideoParts(path, SIZE) as parts:
+    with SpanReader(path, SIZE) as parts:
         for span in spans:
             yield from parts.frames(span)
 
@@ -148,10 +148,10 @@ def test_a_damaged_part_is_noticed_and_the_others_are_not_touched(tmp_path, dama
     damage(path, 14)
     spans = video_spans(path, 10).spans
     assert len(spans) == 4
-    with pytest.raises(UnlikeProbeError):
-        list(VideoParts(path, SIZE).frames(spans[1]))
+    with pytest.raises(SpanMismatchError):
+        list(SpanReader(path, SIZE).frames(spans[1]))
     for span in (spans[0], spans[2], spans[3]):
-        assert len(list(VideoParts(path, SIZE).frames(span))) == 10
+        assert len(list(SpanReader(path, SIZE).frames(span))) == 10
 
 
 @pytest.mark.parametrize("seed", range(12))
@@ -166,8 +166,8 @@ def test_no_damage_goes_unnoticed_that_the_whole_video_shows(tmp_path, seed):
     path.write_bytes(data)
     spans = video_spans(path, 10).spans
     try:
-        list(VideoParts(path, SIZE).frames(spans[1]))
-    except UnlikeProbeError:
+        list(SpanReader(path, SIZE).frames(spans[1]))
+    except SpanMismatchError:
         return
     assert_same_frames(path, spans)
 
@@ -176,14 +176,14 @@ def test_a_file_that_was_changed_since_is_noticed(tmp_path):
     path = dive(tmp_path / "dive.mp4")
     spans = video_spans(path, 10).spans
     dive(path, content=lambda i, size: grain(i + 1, size))
-    with pytest.raises(UnlikeProbeError):
+    with pytest.raises(SpanMismatchError):
         list(frames_of(path, spans[2:3]))
 
 
 def test_pictures_of_another_size_are_noticed(tmp_path):
     path = dive(tmp_path / "dive.mp4")
-    with pytest.raises(UnlikeProbeError, match="another size"):
-        list(VideoParts(path, (64, 96)).frames(video_spans(path, 10).spans[1]))
+    with pytest.raises(SpanMismatchError, match="another size"):
+        list(SpanReader(path, (64, 96)).frames(video_spans(path, 10).spans[1]))
 
 
 def test_the_parts_of_a_folder_of_images_are_the_whole(tmp_path):
@@ -199,7 +199,7 @@ def test_the_parts_of_a_folder_of_images_are_the_whole(tmp_path):
     for part, one in zip(parts, whole, strict=True):
         assert np.array_equal(part.luma, one.luma)
     (tmp_path / "4.png").write_bytes(b"torn")
-    with pytest.raises(UnlikeProbeError):
+    with pytest.raises(SpanMismatchError):
         list(image_frames(tmp_path, spans[1], 5.0))
 
 

@@ -54,7 +54,7 @@ from aqualvs.run_outputs import RunBareLens
 from aqualvs.scanning.row_motion import REACH
 from aqualvs.scanning.scan import Frame
 from aqualvs.sources.fields import frames_in, frames_of
-from aqualvs.sources.spans import Span, SpanKind, VideoParts, image_frames
+from aqualvs.sources.spans import Span, SpanKind, SpanReader, image_frames
 from aqualvs.workers.frame_results import (
     FrameProcessor,
     FrameResult,
@@ -105,7 +105,7 @@ def piece_key(probe: DiveProbe, number: int) -> str:
 def measure_piece(work: DiveWork, probe: DiveProbe) -> PieceResult:
     """Measure the only piece of a probe, or take what an earlier batch has finished.
 
-    Raises `UnlikeProbeError` if the piece does not hold what the survey promised. Raises
+    Raises `SpanMismatchError` if the piece does not hold what the survey promised. Raises
     `AqualvsError` if the dive cannot be read any more, or the piece not be written.
     """
     folder, key = piece_folder(work, probe, 0), piece_key(probe, 0)
@@ -185,7 +185,7 @@ def _frames(dive: OpenDive, span: Span) -> Iterator[Frame]:
 
 
 def _video_frames(path: Path, span: Span, size_px: tuple[int, int]) -> Iterator[Frame]:
-    with VideoParts(path, size_px) as video:
+    with SpanReader(path, size_px) as video:
         yield from video.frames(span)
 
 

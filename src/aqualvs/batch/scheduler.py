@@ -42,7 +42,7 @@ from aqualvs.results.files import writing
 from aqualvs.results.folder import NET_FILES
 from aqualvs.results.net_survey import read_run
 from aqualvs.results.run_request import versions
-from aqualvs.sources.spans import UnlikeProbeError
+from aqualvs.sources.spans import SpanMismatchError
 from aqualvs.workers import start_method
 
 _MAX_DEATHS = 20
@@ -492,7 +492,7 @@ class Scheduler:
         # Beginnings of a dive; each costs only what is not finished.
         max_beginnings = 3
         again = dive.n_beginnings < max_beginnings
-        if isinstance(error, UnlikeProbeError) and dive.probe is not None:
+        if isinstance(error, SpanMismatchError) and dive.probe is not None:
             if not dive.probe.is_whole:
                 return self._as_whole(dive, str(error))
         elif isinstance(error, PieceLostError | WorkersLostError) and again:

@@ -108,7 +108,7 @@ def _bag_messages(path: Path, topic: str) -> Iterator[Logged]:
         try:
             for connection, log_ns, content in reader.messages(connections=wanted):
                 read = functools.partial(_ros_image, reader, connection.msgtype)
-                yield log_ns, _image(read, content)
+                yield log_ns, _image_or_none(read, content)
         # Damaged files raise anything in the package, from AssertionError to ZstdError.
         except Exception as fault:
             raise SourceError(f"{path}: the bag breaks off ({_words(fault)})") from fault
@@ -118,7 +118,7 @@ def _ros_image(reader: Any, kind: str, content: bytes) -> ImageMessage:
     return image_of_ros(reader.deserialize(content, kind))
 
 
-def _image(read: _Reader, content: bytes) -> ImageMessage | None:
+def _image_or_none(read: _Reader, content: bytes) -> ImageMessage | None:
     """Return the image in a message; None for a damaged one, whatever the packages raise for it."""
     try:
         return read(content)
@@ -208,7 +208,7 @@ def open_mcap(path: Path, topic: str | None = None) -> MessageSource:
     _require("mcap.reader", path, "MCAP files")
     topics = _mcap_image_topics(path)
     if topic is None:
-        _check_own(path, topics)
+        _check_own_recording(path, topics)
     return _source(path, topic, topics, functools.partial(_mcap_messages, path))
 
 
@@ -217,7 +217,7 @@ def open_mcap(path: Path, topic: str | None = None) -> MessageSource:
 _OWN_PICTURE, _OWN_CHROMA = "/aqualvs/picture", "/aqualvs/picture/chroma"
 
 
-def _check_own(path: Path, topics: list[ImageTopic]) -> None:
+def _check_own_recording(path: Path, topics: list[ImageTopic]) -> None:
     """Refuse a recording of aqualvs without pictures, or with luma and chroma apart."""
     counts = {topic.name: topic.n_messages for topic in topics}
     if not {_OWN_PICTURE, _OWN_CHROMA} <= counts.keys():
@@ -239,7 +239,7 @@ def _mcap_image_topics(path: Path) -> list[ImageTopic]:
     with _opened_mcap(path) as stream:
         summary = _summary(stream)
         if summary is None:
-            return _listed(path, stream)
+            return _topics_by_reading(path, stream)
         counts = summary.statistics.channel_message_counts if summary.statistics else {}
         return [
             ImageTopic(channel.topic, counts.get(channel.id))
@@ -249,12 +249,12 @@ def _mcap_image_topics(path: Path) -> list[ImageTopic]:
         ]
 
 
-def _listed(path: Path, stream: "_Bounded") -> list[ImageTopic]:
+def _topics_by_reading(path: Path, stream: "_Bounded") -> list[ImageTopic]:
     """Find the topics of a file without index by reading it to its end, or as far as it goes."""
     found: dict[str, ImageTopic] = {}
     try:
-        with _told(path):
-            for schema, channel, _ in _by_order(stream, None, only_channels=True):
+        with _faults_in_one_line(path):
+            for schema, channel, _ in _messages_in_order(stream, None, only_channels=True):
                 if schema is not None and kind_of_schema(schema.name):
                     found[channel.topic] = ImageTopic(channel.topic, None)
     except SourceError:
@@ -271,22 +271,22 @@ def _mcap_messages(path: Path, topic: str) -> Iterator[Logged]:
                 continue
             if schema.id not in readers:
                 readers[schema.id] = _reader(path, schema, channel.message_encoding)
-            yield message.log_time, _image(readers[schema.id], message.data)
+            yield message.log_time, _image_or_none(readers[schema.id], message.data)
 
 
 def _read(path: Path, stream: "_Bounded", topic: str) -> Iterator[tuple[Any, Any, Any]]:
     """Yield schemas, channels and messages of a topic."""
     summary = _summary(stream)
-    with _told(path):
+    with _faults_in_one_line(path):
         if summary is not None and summary.chunk_indexes:
-            yield from _by_index(stream, summary, topic)
+            yield from _messages_by_index(stream, summary, topic)
         else:
-            yield from _by_order(stream, topic)
+            yield from _messages_in_order(stream, topic)
 
 
 @contextlib.contextmanager
-def _told(path: Path) -> Iterator[None]:
-    """Say in one line where a file breaks off."""
+def _faults_in_one_line(path: Path) -> Iterator[None]:
+    """Turn the faults of a damaged file into one line."""
     try:
         yield
     except _mcap_faults() as fault:
@@ -296,7 +296,7 @@ def _told(path: Path) -> Iterator[None]:
         ) from fault
 
 
-def _by_index(stream: "_Bounded", summary: Any, topic: str) -> Iterator[tuple[Any, ...]]:
+def _messages_by_index(stream: "_Bounded", summary: Any, topic: str) -> Iterator[tuple[Any, ...]]:
     """Yield the messages in the chunks of a topic, in the order of their times."""
     from mcap.data_stream import ReadDataStream
     from mcap.records import Chunk, Message
@@ -314,7 +314,7 @@ def _by_index(stream: "_Bounded", summary: Any, topic: str) -> Iterator[tuple[An
             yield summary.schemas.get(channel.schema_id), channel, message
 
 
-def _by_order(
+def _messages_in_order(
     stream: "_Bounded", topic: str | None, *, only_channels: bool = False
 ) -> Iterator[tuple[Any, Any, Any]]:
     """Yield the messages of a file without index, from its beginning on, or its channels only."""

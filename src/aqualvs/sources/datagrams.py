@@ -65,8 +65,8 @@ class Datagram(NamedTuple):
     arrival: float
 
 
-def why_not(address: UdpAddress, fault: OSError) -> str:
-    """Return in a few words why listening is impossible."""
+def listening_fault(address: UdpAddress, fault: OSError) -> str:
+    """Return in a few words why the system refuses to listen."""
     if fault.errno == errno.EADDRINUSE:
         return f"port {address.port} is taken by another program, such as QGroundControl"
     if fault.errno == errno.EADDRNOTAVAIL:
@@ -178,7 +178,9 @@ class Datagrams:
             return None
         kind = kind_of(datagram.content)
         if kind is None:
-            self.reception.complain("something comes, but neither RTP H.264 nor MPEG-TS nor H.264")
+            self.reception.note_fault(
+                "something comes, but neither RTP H.264 nor MPEG-TS nor H.264"
+            )
         self._peeked = None if kind is None else datagram
         return kind
 

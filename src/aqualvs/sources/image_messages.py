@@ -493,7 +493,7 @@ class _Decoder:
             return
         if self._video is None:
             context = cast("VideoCodecContext", av.CodecContext.create(message.codec, "r"))
-            self._video = LiveDecoder(context, hears_losses=False)
+            self._video = LiveDecoder(context, reports_losses=False)
         packet = packet_with(message.data)
         packet.pts = index
         for picture in self._video.decode(packet):

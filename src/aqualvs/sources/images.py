@@ -34,7 +34,7 @@ def quiet_decoders() -> Iterator[None]:
     with _lock:
         if _n_inside == 0:
             level = cv2.utils.logging.setLogLevel(0)
-            _before = _lead_nowhere(), level
+            _before = _discard_stderr(), level
         _n_inside += 1
     try:
         yield
@@ -49,7 +49,7 @@ def quiet_decoders() -> Iterator[None]:
                     os.close(kept)
 
 
-def _lead_nowhere() -> int:
+def _discard_stderr() -> int:
     """Discard standard error; return a copy of its descriptor, -1 where it is closed."""
     try:
         kept = os.dup(2)

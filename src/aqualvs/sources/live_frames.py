@@ -133,39 +133,39 @@ class Reception:
         self.name = name
         self._lock = threading.Lock()
         self._content = content
-        self._trouble = ""
+        self._fault = ""
         self._size = (0, 0)
         self._began = time.monotonic()  # From the first packet on: when that came.
-        self._heard: float | None = None
+        self._last_arrival: float | None = None
         self._frames: deque[float] = deque()
         self._losses: deque[tuple[float, int]] = deque()
         self._last_frame: float | None = None
         self._n_lost = 0
         self._n_held = 0
-        self._over = ""
+        self._end = ""
 
-    def hear(self, content: str = "") -> None:
-        """Note that something came; ends a trouble.
+    def note_arrival(self, content: str = "") -> None:
+        """Note that data came, which ends a fault.
 
-        `content`: what it is; empty if that is known.
+        `content`: kind of the data; empty if it is known.
         """
         with self._lock:
             now = time.monotonic()
-            if self._heard is None:
+            if self._last_arrival is None:
                 self._began = now
-            self._heard = now
+            self._last_arrival = now
             self._content = content or self._content
-            self._trouble = ""
+            self._fault = ""
 
-    def complain(self, words: str) -> None:
-        """Note why nothing of use comes, until something does.
+    def note_fault(self, words: str) -> None:
+        """Note why no usable data come, until some do.
 
         `words`: empty if the reason is gone.
         """
         with self._lock:
-            self._trouble = words
+            self._fault = words
 
-    def deliver(self, size_px: tuple[int, int], n_lost: int) -> None:
+    def note_frame(self, size_px: tuple[int, int], n_lost: int) -> None:
         """Note a frame that goes out.
 
         Parameters
@@ -186,7 +186,7 @@ class Reception:
                 self._n_lost += n_lost
             self._forget(now)
 
-    def hold(self, n: int) -> None:
+    def note_held(self, n: int) -> None:
         """Note how many pictures are not delivered, since the last one that was, after a loss."""
         with self._lock:
             self._n_held = n
@@ -194,7 +194,7 @@ class Reception:
     def end(self, words: str) -> None:
         """Note that nothing more will come."""
         with self._lock:
-            self._over = words
+            self._end = words
 
     def health(self) -> PartHealth:
         """Return the state of the reception."""
@@ -213,14 +213,15 @@ class Reception:
             self._losses.popleft()
 
     def _state(self, now: float) -> tuple[State, str]:
-        if self._over:
-            return State.OFF, self._over
-        if self._trouble:
-            return State.FAULT, self._trouble
-        if self._heard is None:
+        if self._end:
+            return State.OFF, self._end
+        if self._fault:
+            return State.FAULT, self._fault
+        if self._last_arrival is None:
             return State.FAULT, f"waiting for the stream for {now - self._began:.0f} s"
-        if now - self._heard > self._timeout():
-            return State.FAULT, f"silent for {now - self._heard:.1f} s; waiting for its return"
+        silent_s = now - self._last_arrival
+        if silent_s > self._timeout():
+            return State.FAULT, f"silent for {silent_s:.1f} s; waiting for its return"
         if self._last_frame is None:
             waiting = f"waiting for a whole key frame for {now - self._began:.1f} s"
             return State.FAULT, f"{self._content}: {waiting}"
@@ -259,7 +260,7 @@ class LiveDecoder:
     ----------
     codec : VideoCodecContext
         Not yet opened; taken over.
-    hears_losses : bool
+    reports_losses : bool
         Whether the caller learns of every loss from the transport. If not, the numbers of H.264's
         pictures are watched.
 
@@ -274,12 +275,12 @@ class LiveDecoder:
     Python's bytes deadlock when a decoder with threads is closed (PyAV 18).
     """
 
-    def __init__(self, codec: VideoCodecContext, *, hears_losses: bool) -> None:
-        self.is_waiting = False  # Since damage no sound picture has come.
+    def __init__(self, codec: VideoCodecContext, *, reports_losses: bool) -> None:
+        self.is_waiting = False  # No sound picture has come since a loss.
         self._codec = codec
         codec.thread_count = 1
         codec.flags |= int(Flags.low_delay)
-        self._numbers = FrameNumbers() if codec.name == "h264" and not hears_losses else None
+        self._numbers = FrameNumbers() if codec.name == "h264" and not reports_losses else None
         if self._numbers is not None and codec.extradata:
             self._learn(codec.extradata)
         self._waits_for_key = codec.name not in _KNOWS_SOUND
@@ -291,7 +292,7 @@ class LiveDecoder:
         else:
             self._numbers.is_gap_before(extradata)
 
-    def distrust(self) -> None:
+    def reset(self) -> None:
         """Wait for a picture that needs no other: something was lost."""
         self.is_waiting = True
         self._codec.flush_buffers()
@@ -313,14 +314,14 @@ class LiveDecoder:
             In order of presentation; empty while waiting.
         """
         if packet.is_corrupt:
-            self.distrust()
+            self.reset()
             return []
         if self._numbers is not None and self._numbers.is_gap_before(bytes(packet)):
-            self.distrust()
+            self.reset()
         try:
             pictures = self._codec.decode(packet)
         except (av.error.FFmpegError, ValueError):
-            self.distrust()
+            self.reset()
             return []
         return self._sound(pictures)
 
@@ -328,7 +329,7 @@ class LiveDecoder:
         sound = []
         for picture in pictures:
             if picture.is_corrupt:
-                self.distrust()
+                self.reset()
                 continue
             self._waits_for_key = self._waits_for_key and not picture.key_frame
             if not self._waits_for_key:
@@ -355,7 +356,7 @@ class LiveFrames:
         self._lossy = False
         self._n_held = 0
 
-    def connect(self, codec: VideoCodecContext, tick: float, *, hears_losses: bool) -> None:
+    def connect(self, codec: VideoCodecContext, tick: float, *, reports_losses: bool) -> None:
         """Begin with a new decoder; pictures in the old one are lost.
 
         Parameters
@@ -364,10 +365,10 @@ class LiveFrames:
             Not yet opened.
         tick : float
             Unit of the packets' time, in seconds.
-        hears_losses : bool
+        reports_losses : bool
             As for `LiveDecoder`.
         """
-        self._decoder = LiveDecoder(codec, hears_losses=hears_losses)
+        self._decoder = LiveDecoder(codec, reports_losses=reports_losses)
         self._frame_counter.restart()
         self._frame_counter.begin(codec)
         self._lossy = False
@@ -383,7 +384,7 @@ class LiveFrames:
         """Note that packets were lost: wait for sound pictures."""
         self._lossy = True
         if self._decoder is not None:
-            self._decoder.distrust()
+            self._decoder.reset()
 
     def announce(self, packet: "Packet[VideoStream]") -> None:
         """Count a picture that is too damaged to be decoded."""
@@ -415,7 +416,7 @@ class LiveFrames:
 
     def _hold(self) -> None:
         self._n_held += 1
-        self._reception.hold(self._n_held)
+        self._reception.note_held(self._n_held)
 
     def _frame(self, picture: VideoFrame, arrival: float) -> Frame:
         at = self._clock.time_of(picture.pts, arrival)
@@ -423,7 +424,7 @@ class LiveFrames:
         n_lost = index - self._last_index - 1
         self._last_index, self._last_time = index, at
         self._lossy, self._n_held = False, 0
-        self._reception.deliver((picture.width, picture.height), n_lost)
+        self._reception.note_frame((picture.width, picture.height), n_lost)
         return frame_of(index, at, picture)
 
     def _number(self, picture: VideoFrame, at: float) -> int:

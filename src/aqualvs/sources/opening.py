@@ -43,7 +43,7 @@ class PacedFeed:
         self._source = source
         self._realtime = realtime
         self._closed = threading.Event()
-        self._state, self._words = State.OK, "not begun"
+        self._state, self._progress = State.OK, "not begun"
         self._n_lost, self._last_index = 0, -1
 
     def __iter__(self) -> Iterator[Frame]:
@@ -61,36 +61,36 @@ class PacedFeed:
         except Exception as fault:
             told = f"{type(fault).__name__}: {fault}".splitlines()[0]
             raise SourceError(f"{self.name}: cannot be read on ({told}); check the file") from fault
-        self._state, self._words = State.OFF, "closed" if self._closed.is_set() else "at its end"
+        self._state, self._progress = State.OFF, "closed" if self._closed.is_set() else "at its end"
 
     def _frames(self) -> Iterator[Frame]:
         with self._source as source:
             began = time.monotonic()
             for frame in source:
-                if not self._is_due(began + frame.time_s):
+                if not self._wait_until(began + frame.time_s):
                     break
-                self._note(frame)
+                self._update_progress(frame)
                 yield frame
 
     def health(self) -> PartHealth:
         """Return how far it is."""
-        return PartHealth(self.name, self._state, self._words, self._n_lost)
+        return PartHealth(self.name, self._state, self._progress, self._n_lost)
 
     def close(self) -> None:
         """End the iteration."""
         self._closed.set()
 
-    def _is_due(self, when: float) -> bool:
-        """Wait for a frame's time; False if closed meanwhile."""
+    def _wait_until(self, when: float) -> bool:
+        """Wait for the time of a frame; return False if closed meanwhile."""
         if self._realtime:
             return not self._closed.wait(max(0.0, when - time.monotonic()))
         return not self._closed.is_set()
 
-    def _note(self, frame: Frame) -> None:
+    def _update_progress(self, frame: Frame) -> None:
         self._n_lost += frame.index - self._last_index - 1
         self._last_index = frame.index
         total = f" of {self._source.n_frames}" if self._source.n_frames else ""
-        self._words = f"frame {frame.index + 1}{total}, {frame.time_s:.1f} s"
+        self._progress = f"frame {frame.index + 1}{total}, {frame.time_s:.1f} s"
 
 
 STREAM_SCHEMES = ("http", "https", "rtmp", "rtp", "rtsp", "rtsps", "srt", "tcp", "udp")
@@ -138,14 +138,14 @@ def open_source(
         raise OptionError(f"frame rate {fps:g}: must be positive and finite")
     if is_address(where):
         _check_address(str(where))
-        _no(topic, where, "a stream has no topics; leave the topic out")
+        _refuse(topic, where, "a stream has no topics; leave the topic out")
         return _video(str(where), fps)
     path, topic = existing_path(where, topic)
     refuse_special(path)
     if path.suffix.lower() == ".mcap" or is_bag(path):
-        _no(fps, path, "a recording has its own clock; leave the frame rate out")
-        return _recording(path, topic)
-    _no(topic, path, "only bags and MCAP files have topics; leave the topic out")
+        _refuse(fps, path, "a recording has its own clock; leave the frame rate out")
+        return _message_source(path, topic)
+    _refuse(topic, path, "only bags and MCAP files have topics; leave the topic out")
     if path.is_dir():
         return ImageSource(path, fps=fps or 1.0)
     if path.suffix.lower() in IMAGE_SUFFIXES:
@@ -205,17 +205,17 @@ def open_feed(
     if fps is not None and not 0 < fps < math.inf:
         raise OptionError(f"frame rate {fps:g}: must be positive and finite")
     if is_camera(text) or _is_stream(text):
-        _no(not realtime, text, "only a recording can be read faster; leave --fast out")
+        _refuse(not realtime, text, "only a recording can be read faster; leave --fast out")
     if is_camera(text):
-        _no(transport, text, "a camera has no transport; leave it out")
+        _refuse(transport, text, "a camera has no transport; leave it out")
         return CameraFeed(text, CameraOptions(size_px=size_px, fps=fps, pixel_format=pixel_format))
-    _no(size_px or pixel_format, text, "only a camera takes a size or format; leave it out")
+    _refuse(size_px or pixel_format, text, "only a camera takes a size or format; leave it out")
     if not text.lower().startswith("rtsp"):
-        _no(transport, text, "only RTSP has a choice of transport; leave it out")
+        _refuse(transport, text, "only RTSP has a choice of transport; leave it out")
     if not _is_stream(text):
         return PacedFeed(open_source(where, fps=fps), realtime=realtime)
-    _no(fps, text, "a stream has its own clock; leave the frame rate out")
-    return _stream(text, transport or "tcp")
+    _refuse(fps, text, "a stream has its own clock; leave the frame rate out")
+    return _stream_feed(text, transport or "tcp")
 
 
 def is_address(where: str | Path) -> bool:
@@ -261,13 +261,13 @@ def _check_address(where: str) -> None:
         raise SourceError(f"{shown}: port 0 cannot be reached; {remedy}")
 
 
-def _recording(path: Path, topic: str | None) -> FrameSource:
+def _message_source(path: Path, topic: str | None) -> FrameSource:
     from aqualvs.sources.bags import open_bag, open_mcap
 
     return open_bag(path, topic) if is_bag(path) else open_mcap(path, topic)
 
 
-def _stream(where: str, transport: "Transport") -> Feed:
+def _stream_feed(where: str, transport: "Transport") -> Feed:
     from aqualvs.sources.datagrams import UdpAddress, parse_udp
     from aqualvs.sources.remote import remote_feed
     from aqualvs.sources.udp import UdpFeed
@@ -275,14 +275,14 @@ def _stream(where: str, transport: "Transport") -> Feed:
     if where == "bluerov":
         return UdpFeed(where, UdpAddress("", BLUEROV_PORT))
     if where.lower().endswith(".sdp"):
-        return _described(Path(where))
+        return _sdp_feed(Path(where))
     _check_address(where)
     if where.lower().startswith(("udp://", "rtp://")):
         return UdpFeed(where, parse_udp(where))
     return remote_feed(where, transport=transport)
 
 
-def _described(path: Path) -> Feed:
+def _sdp_feed(path: Path) -> Feed:
     from aqualvs.sources.remote import RemoteFeed
     from aqualvs.sources.udp import UdpFeed, read_sdp
 
@@ -323,12 +323,12 @@ def _split_topic(where: str | Path, topic: str | None) -> tuple[Path, str | None
     return Path(path), name
 
 
-def _no(value: object, where: str | Path, words: str) -> None:
+def _refuse(value: object, where: str | Path, words: str) -> None:
     """Refuse an option that does not go with a source."""
     if value:
         raise OptionError(f"{where}: {words}")
 
 
 def _video(where: str, fps: float | None) -> VideoSource:
-    _no(fps, where, "a video has its own clock; leave the frame rate out")
+    _refuse(fps, where, "a video has its own clock; leave the frame rate out")
     return VideoSource(where)

@@ -133,14 +133,14 @@ class RemoteFeed:
                 while (packet := connection.get()) is not None and not self._closed.is_set():
                     if n_packets == 0:
                         codec, tick = packet.stream.codec_context, float(packet.time_base)
-                        self._frames.connect(codec, tick, hears_losses=False)
+                        self._frames.connect(codec, tick, reports_losses=False)
                     n_packets += 1
-                    self._reception.hear()
+                    self._reception.note_arrival()
                     yield from self._frames.feed(packet)
             finally:
                 connection.abandon()
             n_failed = 0 if n_packets else n_failed + 1
-            self._rest(connection, n_failed)
+            self._wait_before_retry(connection, n_failed)
 
     def health(self) -> PartHealth:
         """Return how the stream is."""
@@ -153,11 +153,11 @@ class RemoteFeed:
         if self._connection is not None:
             self._connection.abandon()
 
-    def _rest(self, connection: Connection, n_failed: int) -> None:
-        """Say why there is no connection, and wait a little."""
+    def _wait_before_retry(self, connection: Connection, n_failed: int) -> None:
+        """Report why there is no connection, and wait a little."""
         if self._closed.is_set():
             return
-        self._reception.complain(f"no connection ({connection.reason}); trying again")
+        self._reception.note_fault(f"no connection ({connection.reason}); trying again")
         # Pauses before retries, the last one repeated: the vehicle may return at any time.
         retry_s = (0.1, 0.2, 0.5)
         self._closed.wait(retry_s[min(n_failed, len(retry_s) - 1)])
@@ -236,7 +236,7 @@ class CameraFeed(RemoteFeed):
                 f"{self._device}: cameras are read on Linux only; send the picture by RTSP"
             )
         if not Path(self._device).exists():
-            raise SourceError(f"{self._device}: no such camera; {_what_there_is()}")
+            raise SourceError(f"{self._device}: no such camera; {_present_cameras()}")
         return super().__iter__()
 
 
@@ -256,6 +256,6 @@ def is_camera(where: str) -> bool:
     return where.startswith(("camera:", f"{_DEVICES}/video", f"{_DEVICES}/v4l/"))
 
 
-def _what_there_is() -> str:
+def _present_cameras() -> str:
     found = sorted(str(path) for path in _DEVICES.glob("video*"))
     return f"there is {', '.join(found)}" if found else "no camera is plugged in"

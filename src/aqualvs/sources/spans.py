@@ -101,7 +101,7 @@ def video_spans(path: Path, n_min: int, margin: int = 0) -> VideoSpans:
     """
     with av.open(str(path), timeout=_TIMEOUT_S) as container:
         stream = container.streams.video[0]
-        packets = _Packets(stream)
+        packets = _PacketIndex(stream)
         try:
             for packet in container.demux(stream):
                 packets.add(packet)
@@ -109,7 +109,7 @@ def video_spans(path: Path, n_min: int, margin: int = 0) -> VideoSpans:
             packets.doubt(f"the file breaks off ({fault.strerror})")
         if has_decoding_times(stream):
             packets.doubt("pictures without a time of their own")
-        why = packets.why_whole() or _broken_promise(stream, packets)
+        why = packets.why_whole() or _missing_end(stream, packets)
         spans = () if why else packets.spans(n_min, margin)
         return VideoSpans(spans, why, packets.checksum, packets.n_bytes)
 
@@ -153,7 +153,7 @@ def joint_checksum(checksums: Sequence[int]) -> int:
     return zlib.crc32(np.asarray(checksums, "<u4").tobytes())
 
 
-class _Packets:
+class _PacketIndex:
     """Packets read so far, and the first reason found not to cut the video."""
 
     def __init__(self, stream: VideoStream) -> None:
@@ -197,7 +197,7 @@ class _Packets:
             self.doubt("damaged or hidden pictures")
         if self._fields is not None and self._fields.is_second(memoryview(packet)):
             self.doubt("fields in packets of their own")
-        if self._may_begin_here(packet):
+        if self._can_start_at(packet):
             self._cuts.append(len(self._pts))
         self._pts.append(packet.pts or 0)
         self._sizes.append(packet.size)
@@ -215,9 +215,9 @@ class _Packets:
 
     def spans(self, n_min: int, margin: int) -> tuple[Span, ...]:
         """Return the spans, each of which begins at a picture that needs none before it."""
-        cuts, n = self._sound_cuts(), len(self._pts)
+        cuts, n = self._usable_cuts(), len(self._pts)
         origin, found = min(self._pts), []
-        for first, stop in itertools.pairwise([*_far_enough(cuts, n_min), n]):
+        for first, stop in itertools.pairwise([*_spaced(cuts, n_min), n]):
             begin = max(cut for cut in cuts if cut <= max(first - margin, 0))
             end = min(cut for cut in (*cuts, n) if cut >= min(stop + margin, n))
             found.append(
@@ -240,7 +240,7 @@ class _Packets:
         base = self._stream.time_base
         return float((max(self._pts) - min(self._pts)) * base) if base and self._pts else 0.0
 
-    def _sound_cuts(self) -> list[int]:
+    def _usable_cuts(self) -> list[int]:
         """Return the cuts at which the order of the file is that of the pictures."""
         pts = np.asarray(self._pts, np.int64)
         latest = np.maximum.accumulate(pts)
@@ -267,7 +267,7 @@ class _Packets:
         context = self._stream.codec_context
         return field_pairs(context.name, context.extradata)
 
-    def _may_begin_here(self, packet: "Packet[VideoStream]") -> bool:
+    def _can_start_at(self, packet: "Packet[VideoStream]") -> bool:
         if self._units is None:
             return packet.is_keyframe
         found = self._units(memoryview(packet))
@@ -276,8 +276,8 @@ class _Packets:
         return found.is_refresh and (found.has_all_parameter_sets or not self._sets_in_band)
 
 
-def _far_enough(cuts: Sequence[int], n_min: int) -> list[int]:
-    """Return the first cut and those that leave enough frames since the one before."""
+def _spaced(cuts: Sequence[int], n_min: int) -> list[int]:
+    """Return the first cut, and those at least `n_min` frames after the one chosen before."""
     chosen = [cuts[0]]
     for cut in cuts:
         if cut - chosen[-1] >= n_min:
@@ -285,8 +285,8 @@ def _far_enough(cuts: Sequence[int], n_min: int) -> list[int]:
     return chosen
 
 
-def _broken_promise(stream: VideoStream, packets: _Packets) -> str:
-    """Return a note if the file may hold less than its container states; empty if not."""
+def _missing_end(stream: VideoStream, packets: _PacketIndex) -> str:
+    """Return why the file may hold less than its container states; empty if it does not."""
     if stream.time_base is None:
         return "no clock"
     slots = time_slots(stream)
@@ -296,7 +296,7 @@ def _broken_promise(stream: VideoStream, packets: _Packets) -> str:
         return "" if filled else "ends before its promise"
     if stream.frames:
         return "" if packets.n_packets >= stream.frames else "fewer pictures than promised"
-    promised_s, rate = promised_duration(stream), frame_rate(stream)
+    promised_s, rate = stated_duration(stream), frame_rate(stream)
     if promised_s is None or not rate:
         return ""
     timeout_s = max(_EARLY_FRAMES / float(rate), _EARLY_SHARE * promised_s)
@@ -358,7 +358,7 @@ def time_slots(stream: VideoStream) -> TimeSlots | None:
     return TimeSlots(stream.frames, float(1 / (rate * tick)))
 
 
-def promised_duration(stream: VideoStream) -> float | None:
+def stated_duration(stream: VideoStream) -> float | None:
     """Return the duration in seconds that the container states for the video, if it does."""
     slots = time_slots(stream)
     if slots is not None and stream.time_base is not None:
@@ -373,11 +373,11 @@ def promised_duration(stream: VideoStream) -> float | None:
     return 3600 * hours + 60 * minutes + seconds
 
 
-class UnlikeProbeError(Exception):
+class SpanMismatchError(Exception):
     """Difference between a span and its description; the dive must be measured in one piece."""
 
 
-class VideoParts(Closing):
+class SpanReader(Closing):
     """Reader of spans of a video, opened once for all of them; a context manager.
 
     `size_px`: width and height of every picture.
@@ -390,7 +390,7 @@ class VideoParts(Closing):
     def frames(self, span: Span) -> Iterator[Frame]:
         """Decode a part; frames have the index and the time that the whole video gives them.
 
-        `span`: from `video_spans` of the same file. Raises `UnlikeProbeError` if any picture is
+        `span`: from `video_spans` of the same file. Raises `SpanMismatchError` if any picture is
         damaged or missing: the whole video decides what becomes of those that follow.
         """
         index, latest = span.first, span.origin_pts - 1
@@ -398,19 +398,19 @@ class VideoParts(Closing):
             stream = self._stream(span)
             for picture in _pictures(stream, span):
                 if picture.is_corrupt or picture.pts is None or picture.pts <= latest:
-                    raise UnlikeProbeError(f"picture {index} is damaged")
+                    raise SpanMismatchError(f"picture {index} is damaged")
                 if (picture.width, picture.height) != self._size_px:
-                    raise UnlikeProbeError(f"picture {index} has another size")
+                    raise SpanMismatchError(f"picture {index} has another size")
                 latest = picture.pts
                 ticks = picture.pts - span.origin_pts
                 yield frame_of(index, float(ticks * (stream.time_base or 0)), picture)
                 index += 1
         except (av.error.FFmpegError, OSError) as fault:
-            raise UnlikeProbeError(
+            raise SpanMismatchError(
                 f"picture {index} or a later one is damaged ({fault})"
             ) from fault
         if index != span.stop:
-            raise UnlikeProbeError(f"{index - span.first} pictures of {span.stop - span.first}")
+            raise SpanMismatchError(f"{index - span.first} pictures of {span.stop - span.first}")
 
     def close(self) -> None:
         """Close the file; frames already delivered stay valid."""
@@ -433,20 +433,20 @@ class VideoParts(Closing):
 def image_frames(folder: Path, span: Span, fps: float) -> Iterator[Frame]:
     """Read a part of a folder of images, as `ImageSource` reads all of it.
 
-    Raises `UnlikeProbeError` if an image cannot be read, or there are others than there were.
+    Raises `SpanMismatchError` if an image cannot be read, or there are others than there were.
     """
     try:
         source = ImageSource(images_in(folder)[span.first : span.stop], fps=fps)
         index = span.first
         for frame in source:
             if frame.index + span.first != index:
-                raise UnlikeProbeError(f"image {index} cannot be read")
+                raise SpanMismatchError(f"image {index} cannot be read")
             yield Frame(index, index / fps, frame.luma, frame.chroma)
             index += 1
     except SourceError as fault:
-        raise UnlikeProbeError(str(fault)) from fault
+        raise SpanMismatchError(str(fault)) from fault
     if index != span.stop:
-        raise UnlikeProbeError(f"{index - span.first} images of {span.stop - span.first}")
+        raise SpanMismatchError(f"{index - span.first} images of {span.stop - span.first}")
 
 
 def _pictures(stream: VideoStream, span: Span) -> Iterator[VideoFrame]:
@@ -456,7 +456,7 @@ def _pictures(stream: VideoStream, span: Span) -> Iterator[VideoFrame]:
         checksums.append(packet_checksum(packet))
         yield from packet.decode()
     if joint_checksum(checksums) != span.checksum:
-        raise UnlikeProbeError("the file has changed since it was looked through")
+        raise SpanMismatchError("the file has changed since it was looked through")
     yield from stream.codec_context.decode(None)
 
 
@@ -479,4 +479,4 @@ def _packets_from(stream: VideoStream, span: Span) -> "Iterator[Packet[VideoStre
                 return itertools.chain([packet], packets)
             if packet.is_keyframe and (packet.pts is None or packet.pts > span.start_pts):
                 break
-    raise UnlikeProbeError(f"picture {span.first} is not found")
+    raise SpanMismatchError(f"picture {span.first} is not found")

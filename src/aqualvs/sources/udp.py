@@ -34,8 +34,8 @@ from aqualvs.sources.datagrams import (
     Datagrams,
     UdpAddress,
     kind_of,
+    listening_fault,
     transport_content,
-    why_not,
 )
 from aqualvs.sources.h264 import START_CODE
 from aqualvs.sources.live_frames import LiveFrames, Reception
@@ -121,7 +121,7 @@ def rtp_frames(
 ) -> Iterator[Frame]:
     """Yield the frames of RTP with H.264 until the feed ends or another kind comes."""
     order, pictures = RtpOrder(), H264Depacketizer()
-    frames.connect(decoder_of("h264", parameter_sets), 1 / TICKS_HZ, hears_losses=True)
+    frames.connect(decoder_of("h264", parameter_sets), 1 / TICKS_HZ, reports_losses=True)
     while not datagrams.ended.is_set():
         datagram = datagrams.get(order.wait or WAIT_S)
         if datagram is None:
@@ -138,9 +138,9 @@ def rtp_frames(
             due = order.push(packet, datagram.arrival)
             if pictures.n_foreign > MAX_FOREIGN:
                 fault = "RTP comes, but not of H.264; set the camera to H.264"
-                datagrams.reception.complain(fault)
+                datagrams.reception.note_fault(fault)
             else:
-                datagrams.reception.hear(RTP)
+                datagrams.reception.note_arrival(RTP)
         for ordered in due:
             for picture in pictures.push(ordered):
                 yield from decoded(frames, picture)
@@ -172,12 +172,12 @@ def transport_frames(frames: LiveFrames, datagrams: Datagrams) -> Iterator[Frame
         content = transport_content(datagram.content)
         if datagrams.is_foreign(datagram, fits=content is not None):
             return
-        datagrams.reception.hear(TS)
+        datagrams.reception.note_arrival(TS)
         for picture in stream.push(content or b""):
             if codec != stream.codec:
                 codec = stream.codec or ""
                 # A loss of 16 packets, or a multiple of that, shows in no counter.
-                frames.connect(decoder_of(codec), 1 / TICKS_HZ, hears_losses=False)
+                frames.connect(decoder_of(codec), 1 / TICKS_HZ, reports_losses=False)
             yield from decoded(frames, picture)
 
 
@@ -187,12 +187,12 @@ def bare_frames(frames: LiveFrames, datagrams: Datagrams) -> Iterator[Frame]:
     Ends with the feed, or when another kind comes.
     """
     codec = decoder_of("h264")
-    frames.connect(codec, 1e-6, hears_losses=False)
+    frames.connect(codec, 1e-6, reports_losses=False)
     for datagram in _in_time(frames, datagrams):
         other = kind_of(datagram.content) in (RTP, TS)
         if datagrams.is_foreign(datagram, fits=not other):
             return
-        datagrams.reception.hear(BARE)
+        datagrams.reception.note_arrival(BARE)
         for unit in codec.parse(datagram.content):
             unit.pts, unit.time_base = int(1e6 * datagram.arrival), Fraction(1, 1_000_000)
             yield from frames.feed(unit)
@@ -311,9 +311,9 @@ class UdpFeed:
         try:
             found = Datagrams(address, self._closed, self._reception)
         except OSError as fault:
-            self._reception.complain(why_not(address, fault))
+            self._reception.note_fault(listening_fault(address, fault))
             return None
-        self._reception.complain("")
+        self._reception.note_fault("")
         return found
 
     def _receive(self, datagrams: Datagrams) -> Iterator[Frame]:

@@ -26,7 +26,7 @@ from aqualvs.optics.shutter import Field
 from aqualvs.scanning.scan import Frame
 from aqualvs.sources.base import frame_of
 from aqualvs.sources.h264 import FieldPairs, field_pairs
-from aqualvs.sources.spans import frame_rate, has_decoding_times, promised_duration, time_slots
+from aqualvs.sources.spans import frame_rate, has_decoding_times, stated_duration, time_slots
 
 
 class FrameCounter:
@@ -175,7 +175,7 @@ class VideoSource(Closing):
         self.fps = float(rate) if rate else None
         self._damage_is_partial = self._container.format.name in _LOSSY_CONTAINERS
         self._has_decoding_times = has_decoding_times(self._stream)
-        self._promised_s = promised_duration(self._stream)
+        self._promised_s = stated_duration(self._stream)
         self._slots = time_slots(self._stream)
         self._n_exact = 0 if self._slots is not None else self._stream.frames
         self.n_frames = self._n_exact or self._estimated_frames()

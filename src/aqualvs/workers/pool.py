@@ -43,8 +43,8 @@ from aqualvs.sources.images import images_in
 from aqualvs.sources.spans import (
     Span,
     SpanKind,
-    UnlikeProbeError,
-    VideoParts,
+    SpanMismatchError,
+    SpanReader,
     image_frames,
     image_spans,
     video_spans,
@@ -57,7 +57,7 @@ class Ended(Enum):
     """Message that a part has ended, and its outcome."""
 
     WHOLE = auto()
-    UNLIKE_PROBE = auto()
+    MISMATCH = auto()
     """It does not hold what it should; what was sent before is sound."""
 
 
@@ -296,7 +296,7 @@ def serve(
     sender = Sender(pipe, memory)
     try:
         processor = FrameProcessor(work.rig, Scanner(work.rig, work.options))
-        with VideoParts(work.path, work.rig.size_px) as video:
+        with SpanReader(work.path, work.rig.size_px) as video:
             while True:
                 part = work.parts[sender.next_part()]
                 frames = frames_of(_pictures(work, part, video), work.rig.shutter)
@@ -318,15 +318,15 @@ def _messages(
         None if part.stop == stop else part.stop - first,
     )
     try:
-        for block in in_blocks(wanted, processor.block_length, UnlikeProbeError):
+        for block in in_blocks(wanted, processor.block_length, SpanMismatchError):
             yield processor.measure(block)
-    except UnlikeProbeError:
-        yield Ended.UNLIKE_PROBE
+    except SpanMismatchError:
+        yield Ended.MISMATCH
     else:
         yield Ended.WHOLE
 
 
-def _pictures(work: PoolJob, part: SpanPart, video: VideoParts) -> Iterator[Frame]:
+def _pictures(work: PoolJob, part: SpanPart, video: SpanReader) -> Iterator[Frame]:
     if part.span.kind is SpanKind.VIDEO:
         return video.frames(part.span)
     return image_frames(work.path, part.span, work.fps)
@@ -414,7 +414,7 @@ class WorkerPool(Closing):
                 for block in self._of_part(number):
                     yield block
                     self.next_frame += len(block)
-        except (UnlikeProbeError, EOFError, OSError):
+        except (SpanMismatchError, EOFError, OSError):
             return
         self.is_done = self.next_frame == self._work.parts[-1].stop
 
@@ -424,8 +424,8 @@ class WorkerPool(Closing):
             while not found:
                 self._take_in(number)
             message = found.popleft()
-            if message is Ended.UNLIKE_PROBE:
-                raise UnlikeProbeError
+            if message is Ended.MISMATCH:
+                raise SpanMismatchError
             if message is Ended.WHOLE:
                 break
             yield message
