@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from aqualvs.scanning.row_motion import RowMotion
 
 
-AnyWord = TypeVar("AnyWord", bound=StrEnum)
+AnyEnum = TypeVar("AnyEnum", bound=StrEnum)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,15 +74,15 @@ class ScannerOptions:
     fit: FitMethod = FitMethod.ROBUST
 
     def __post_init__(self) -> None:
-        """Take words for their members.
+        """Convert strings to members of their enumerations.
 
-        Raises `OptionError` if a word is none.
+        Raises `OptionError` if there is no such member.
         """
-        object.__setattr__(self, "target", _member(TargetKind, "target", self.target))
-        object.__setattr__(self, "fit", _member(FitMethod, "fit", self.fit))
+        object.__setattr__(self, "target", _enum_member(TargetKind, "target", self.target))
+        object.__setattr__(self, "fit", _enum_member(FitMethod, "fit", self.fit))
 
 
-def _member(kind: type[AnyWord], name: str, value: str) -> AnyWord:
+def _enum_member(kind: type[AnyEnum], name: str, value: str) -> AnyEnum:
     try:
         return kind(value)
     except ValueError:
@@ -90,12 +90,12 @@ def _member(kind: type[AnyWord], name: str, value: str) -> AnyWord:
         raise OptionError(f"ScannerOptions: {name} is {value!r}; give one of {known}") from None
 
 
-# A better plane is tested in its turn, up to so many times.
+# Number of times that a rival replaces the target, and is tested in its turn.
 _MAX_RIVALS = 3
 
 
 class _Stripes(NamedTuple):
-    """What a frame shows of the lasers, and the test of how its peaks are assigned to them."""
+    """Stripes of a frame, and the test of how its peaks are assigned to lasers."""
 
     candidates: Candidates
     subsegments: Subsegments
@@ -104,16 +104,17 @@ class _Stripes(NamedTuple):
 
 
 class _Choice(NamedTuple):
-    """The target among the surfaces of a frame, and what speaks against it."""
+    """The target among the surfaces of a frame, and evidence against it."""
 
     surfaces: list[Surface]  # Of the requested kind.
     target: Surface | None = None
-    before: Surface | None = None  # A surface before the target that may be the net instead.
-    tested: AssignmentOutcome = NOT_TESTED  # Of the target's peaks, read as other lasers'.
+    overlooked: Surface | None = None  # Nearer than the target; may be the net instead.
+    # Test of the target's peaks against their assignment to other lasers.
+    tested: AssignmentOutcome = NOT_TESTED
 
 
 @dataclass(frozen=True, slots=True)
-class _View:
+class _StripeSearch:
     """Search for stripes in whole pictures, or in one field of them."""
 
     laser_bands: tuple[LaserBand, ...]
@@ -148,8 +149,8 @@ class Scanner:
         camera = camera or rig.camera()
         self._triangulator = Triangulator(rig, camera)
         fields = {rig.shutter.field_of(index) for index in range(2)}
-        self._views = {field: self._make_view(camera, field) for field in fields}
-        laser_bands = self._view(0).laser_bands
+        self._searches = {field: self._make_search(camera, field) for field in fields}
+        laser_bands = self._search(0).laser_bands
         self._posture_estimator = PostureEstimator(rig, laser_bands, self.options.fit)
         self._paper_filter = self._make_paper_filter(camera, laser_bands)
         self._row_motion = self._make_row_motion()
@@ -189,7 +190,7 @@ class Scanner:
                 f"{self.rig.shutter.field_of(frame.index) or 'a whole picture'}; the rig's "
                 "camera.shutter must be that of the source"
             )
-        return self._view(frame.index).detector.detect(frame)
+        return self._search(frame.index).detector.detect(frame)
 
     def measure(self, index: int, time_s: float, peaks: dict[SearchAxis, StripePeaks]) -> Scan:
         """Measure the posture from the peaks of one frame.
@@ -204,29 +205,29 @@ class Scanner:
             From `detect`; recorded peaks give the same result as their frame.
         """
         # Candidates: each peak as a point of every laser that could have made it.
-        view = self._view(index)
-        candidates = find_candidates(peaks, view.laser_bands, self._triangulator)
-        found, points, listed = self._estimate(candidates, view.assignment)
+        search = self._search(index)
+        candidates = find_candidates(peaks, search.laser_bands, self._triangulator)
+        measurement, points, rows = self._estimate(candidates, search.assignment)
         if self._paper_filter is not None:
             # The paper's filter needs the laser of each peak, which is known by now.
             kept = np.zeros(candidates.n, np.bool_)
-            kept[listed] = _on_mesh(self._paper_filter, points)
+            kept[rows] = _on_mesh(self._paper_filter, points)
             candidates = candidates.where(kept)
-            found, points, _ = self._estimate(candidates, view.assignment)
-        posture = self._with_rig_covariance(found, candidates)
+            measurement, points, _ = self._estimate(candidates, search.assignment)
+        posture = self._with_rig_covariance(measurement, candidates)
         return Scan(index, time_s, posture, points, self.rig.n_water)
 
-    def _make_view(self, camera: Camera, field: Field | None) -> _View:
+    def _make_search(self, camera: Camera, field: Field | None) -> _StripeSearch:
         laser_bands = plan_bands(self.rig, camera, field)
         limits = search_range(self.rig.working_range)
-        return _View(
+        return _StripeSearch(
             laser_bands,
             FrameDetector(self.rig.size_px, laser_bands, self.options.detector, field),
             AssignmentTest(laser_bands, self._triangulator, limits),
         )
 
-    def _view(self, index: int) -> _View:
-        return self._views[self.rig.shutter.field_of(index)]
+    def _search(self, index: int) -> _StripeSearch:
+        return self._searches[self.rig.shutter.field_of(index)]
 
     def _make_paper_filter(
         self, camera: Camera, laser_bands: tuple[LaserBand, ...]
@@ -261,81 +262,82 @@ class Scanner:
             search_range(self.rig.working_range),
             self.rig.focal_px,
         )
-        # The one that is the target, and the posture from its points outside crossing zones.
+        # The target among them, and the posture from its points outside crossing zones.
         stripes = _Stripes(candidates, subsegments, shapes, assignment)
-        choice = self._choose(stripes, surfaces)
-        found = self._measured(stripes, choice)
-        solid = _as_solid(choice.target, found)
+        choice = self._choose_target(stripes, surfaces)
+        measurement = self._measure_target(stripes, choice)
+        solid = _as_solid(choice.target, measurement)
         if self.options.target is TargetKind.AUTO and solid is not None:
-            surfaces = _with_changed(choice.surfaces, solid)
+            surfaces = _with_replaced(choice.surfaces, solid)
             choice = choice._replace(surfaces=surfaces, target=solid)
-            found = self._measured(stripes, choice)
-        # What every point lies on.
-        points, listed = label_candidates(
+            measurement = self._measure_target(stripes, choice)
+        # The kind of surface that every point lies on.
+        points, rows = label_candidates(
             candidates,
             subsegments,
             shapes,
             choice.surfaces,
             choice.target,
-            found,
+            measurement,
             self.rig.working_range,
         )
-        return found, points, listed
+        return measurement, points, rows
 
-    def _choose(self, stripes: _Stripes, surfaces: list[Surface]) -> _Choice:
+    def _choose_target(self, stripes: _Stripes, surfaces: list[Surface]) -> _Choice:
         """Choose the target among the surfaces of the requested kind."""
-        choice = self._tested(stripes, as_requested_kind(surfaces, self.options.target))
+        choice = self._choose_and_test(stripes, as_requested_kind(surfaces, self.options.target))
         for _ in range(_MAX_RIVALS):
             surfaces, target, _, (verdict, other, _) = choice
             if target is None or verdict is not Verdict.RIVAL or other is None:
                 break
             surfaces = self._with_rival(surfaces, target, other, stripes.subsegments)
-            choice = self._tested(stripes, surfaces)
+            choice = self._choose_and_test(stripes, surfaces)
         return choice
 
-    def _tested(self, stripes: _Stripes, surfaces: list[Surface]) -> _Choice:
-        """Choose the target, and test whether its peaks are as well read as other lasers'."""
-        surfaces, target, before = self._preferred(stripes, surfaces)
+    def _choose_and_test(self, stripes: _Stripes, surfaces: list[Surface]) -> _Choice:
+        """Choose the target, and test whether other lasers explain its peaks as well."""
+        surfaces, target, overlooked = self._best_target(stripes, surfaces)
         if target is None:
             return _Choice(surfaces)
         candidates, subsegments, _, assignment = stripes
-        return _Choice(surfaces, target, before, assignment.test(candidates, subsegments, target))
+        outcome = assignment.test(candidates, subsegments, target)
+        return _Choice(surfaces, target, overlooked, outcome)
 
-    def _preferred(
+    def _best_target(
         self, stripes: _Stripes, surfaces: list[Surface]
     ) -> tuple[list[Surface], Surface | None, Surface | None]:
-        """Return the surfaces, the target, and a surface before it that may be the net instead."""
+        """Return the surfaces, the target, and a nearer surface that may be the net instead."""
         kind = self.options.target
         target = choose_target(surfaces, kind, self.rig.working_range)
         if target is None or kind is not TargetKind.AUTO:
             return surfaces, target, None
         candidates, subsegments, _, assignment = stripes
-        before = assignment.overlooked(candidates, subsegments, surfaces, target)
-        if before is None or not before.is_mesh:
-            return surfaces, target, before
-        return _with_changed(surfaces, before), before, None
+        nearer = assignment.overlooked(candidates, subsegments, surfaces, target)
+        if nearer is None or not nearer.is_mesh:
+            return surfaces, target, nearer
+        return _with_replaced(surfaces, nearer), nearer, None
 
-    def _measured(self, stripes: _Stripes, choice: _Choice) -> Measurement:
-        """Return the posture to the target, or why there is none."""
+    def _measure_target(self, stripes: _Stripes, choice: _Choice) -> Measurement:
+        """Return the posture to the target, or the refusal."""
         candidates, subsegments, _, assignment = stripes
         surfaces, target, _, tested = choice
         if target is None:
             return _refused(candidates, _no_target(candidates, surfaces, self.options.target))
-        doubt = self._doubt(stripes, choice, target)
-        if doubt is not None:
-            return _refused(candidates, doubt)
-        found = inflate_for_rival(self._posture(candidates, subsegments, target), tested)
+        refusal = self._refusal(stripes, choice, target)
+        if refusal is not None:
+            return _refused(candidates, refusal)
+        found = inflate_for_rival(self._fit_posture(candidates, subsegments, target), tested)
         # The mean plane of folds covers all of a net's light, nearer parts included.
         nearer = None if found.folded else assignment.nearer_net(subsegments, surfaces, target)
         if nearer is None or not found.posture:
             return found
         return _refused(candidates, _ambiguous(target.plane, nearer.plane))
 
-    def _doubt(self, stripes: _Stripes, choice: _Choice, target: Surface) -> Refusal | None:
-        """Return why a target is not to be trusted, None if it is."""
+    def _refusal(self, stripes: _Stripes, choice: _Choice, target: Surface) -> Refusal | None:
+        """Return the refusal of a target that is ambiguous or found by chance; else None."""
         candidates, subsegments, _, assignment = stripes
-        if choice.before is not None:
-            return _ambiguous(target.plane, choice.before.plane)
+        if choice.overlooked is not None:
+            return _ambiguous(target.plane, choice.overlooked.plane)
         if assignment.is_by_chance(candidates, subsegments, choice.surfaces, target):
             detail = "the best plane is small, and lasers that should be seen on it are not"
             return Refusal(Reason.NOT_A_PLANE, detail)
@@ -358,7 +360,7 @@ class Scanner:
             return Refusal(Reason.AMBIGUOUS, detail)
         return None
 
-    def _posture(
+    def _fit_posture(
         self, candidates: Candidates, subsegments: Subsegments, target: Surface
     ) -> Measurement:
         """Return the posture to the target, as the rows of the picture show it."""
@@ -370,7 +372,7 @@ class Scanner:
         posture = found.posture
         if not isinstance(posture, Posture) or found.weights is None:
             return found
-        surface, weights = _fitted(posture, found.patch, candidates.points, found.weights)
+        surface, weights = _fitted_surface(posture, found.patch, candidates.points, found.weights)
         exposed = self._row_motion.as_exposed(posture, surface, still, candidates, weights)
         return replace(found, posture=exposed)
 
@@ -379,7 +381,7 @@ class Scanner:
         posture = found.posture
         if not isinstance(posture, Posture) or found.weights is None:
             return posture
-        surface, weights = _fitted(posture, found.patch, candidates.points, found.weights)
+        surface, weights = _fitted_surface(posture, found.patch, candidates.points, found.weights)
         _, covariance = self._rig_errors.propagate(
             surface, candidates.pixels, candidates.laser, candidates.points, weights
         )
@@ -398,7 +400,7 @@ class Scanner:
         return as_requested_kind([rival, *kept], self.options.target)
 
 
-def _fitted(
+def _fitted_surface(
     posture: Posture, patch: Patch | None, points: FloatArray, weights: FloatArray
 ) -> tuple[FittedSurface, FloatArray]:
     """Return the surface of a posture as fitted to points, and their weights for its residuals."""
@@ -409,7 +411,7 @@ def _fitted(
     return fitted_patch(patch, m, points), weights / posture.range**2
 
 
-def _with_changed(surfaces: list[Surface], changed: Surface) -> list[Surface]:
+def _with_replaced(surfaces: list[Surface], changed: Surface) -> list[Surface]:
     """Return the surfaces with one of them replaced by its changed copy."""
     return [changed if one.members is changed.members else one for one in surfaces]
 

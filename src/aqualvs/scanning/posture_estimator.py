@@ -213,7 +213,7 @@ class PostureEstimator:
             if is_clear and is_observable:
                 best = curved
             elif is_clear or (is_observable and _may_bend(curved.posture, seen)):
-                best = _inflate_covariance(flat, curved, 1.0)
+                best = _inflate_covariance(flat, curved)
         patch = packed_plane(plane) if best.patch is None else best.patch.packed()
         net_mask = self._grow_net_mask(candidates, best.inliers, plane, patch)
         seen = self._beside(candidates, net_mask, off, plane)
@@ -526,10 +526,10 @@ def _may_bend(curved: Posture | Refusal, seen: Observed) -> bool:
     return seen.observations.n >= fewest and bool(beyond.any())
 
 
-def _inflate_covariance(found: Measurement, other: Measurement, share: float) -> Measurement:
-    """Inflate a posture's covariance by its difference from another one with a share of light."""
+def _inflate_covariance(found: Measurement, other: Measurement) -> Measurement:
+    """Inflate a posture's covariance by its difference from another one."""
     one, two = found.posture, other.posture
-    return replace(found, posture=inflate_covariance(one, two, share)) if one and two else found
+    return replace(found, posture=inflate_covariance(one, two, 1.0)) if one and two else found
 
 
 def _refused(candidates: Candidates, refusal: Refusal) -> Measurement:

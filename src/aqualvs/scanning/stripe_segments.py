@@ -545,9 +545,7 @@ def _density(table: FloatArray, of: IntArray, width_px: int) -> FloatArray:
     return density
 
 
-def line_log_odds(
-    table: FloatArray, width_px: int, *, has_colour: bool, weights: Weights = WEIGHTS
-) -> FloatArray:
+def line_log_odds(table: FloatArray, width_px: int, *, has_colour: bool) -> FloatArray:
     """Return the log odds that each piece is a laser's line.
 
     Parameters
@@ -558,24 +556,22 @@ def line_log_odds(
         Of the picture.
     has_colour : bool
         Whether the picture has chroma.
-    weights : Weights, optional
-        Of the evidence.
 
     Returns
     -------
     array, shape (P,)
         Minus infinity for all where none is certain.
     """
-    log_odds = general_evidence(table, width_px, has_colour=has_colour) @ weights.general
+    log_odds = general_evidence(table, width_px, has_colour=has_colour) @ WEIGHTS.general
     # Dashes in a row are as long as all of them together.
     likely = np.flatnonzero(log_odds > 0.0)
     in_a_row = table.copy()
     in_a_row[LENGTH, likely] = _length_in_a_row(table[:, likely], width_px)
-    log_odds = general_evidence(in_a_row, width_px, has_colour=has_colour) @ weights.general
+    log_odds = general_evidence(in_a_row, width_px, has_colour=has_colour) @ WEIGHTS.general
     lines = learn_lines(in_a_row, log_odds, width_px, has_colour=has_colour)
     if lines is None:
         return np.full(table.shape[1], -np.inf)
-    found: FloatArray = own_evidence(table, lines, width_px, has_colour=has_colour) @ weights.own
+    found: FloatArray = own_evidence(table, lines, width_px, has_colour=has_colour) @ WEIGHTS.own
     return found + place_evidence(table, found, width_px)
 
 
