@@ -11,7 +11,7 @@ from aqualvs.batch.dataset import OF_DIVE, drop, holds, put_dive, write_dives
 from aqualvs.batch.dives import DiveRecord, DiveState
 from aqualvs.batch.summary_page import range_steps, range_svg, write_summary
 from aqualvs.results.folder import PostureCsv
-from aqualvs.results.points import PointsStream, export_points
+from aqualvs.results.points import PointsStream, export_points, read_points_stream
 from aqualvs.scanning.posture import Reason
 from shell_cases import scan
 
@@ -71,7 +71,7 @@ def dataset(tmp_path_factory):
                 one = scan(i, 20 + k, reason=Reason.ONE_LASER if i == 3 else None)
                 rows.write(one)
                 points.write(one)
-        export_points(points_stream, run / "points.parquet", run / "points.ply")
+        export_points(read_points_stream(points_stream), run / "points.parquet", run / "points.ply")
         put_dive(folder / "dataset", name, run)
     return folder / "dataset"
 

@@ -241,7 +241,9 @@ def test_export_keeps_every_point_and_colours_the_targets(tmp_path, monkeypatch)
     with PointsStream(points_stream) as writer:
         for made in scans:
             writer.write(made)
-    n_points = export_points(points_stream, tmp_path / "p.parquet", tmp_path / "p.ply")
+    n_points = export_points(
+        read_points_stream(points_stream), tmp_path / "p.parquet", tmp_path / "p.ply"
+    )
     assert n_points == 300
     file = parquet.ParquetFile(tmp_path / "p.parquet")
     assert file.num_row_groups == 3
@@ -268,7 +270,10 @@ def test_export_keeps_every_point_and_colours_the_targets(tmp_path, monkeypatch)
 def test_an_empty_journal_gives_empty_files(tmp_path):
     points_stream = tmp_path / "points.arrows"
     points_stream.write_bytes(b"")
-    assert export_points(points_stream, tmp_path / "p.parquet", tmp_path / "p.ply") == 0
+    assert (
+        export_points(read_points_stream(points_stream), tmp_path / "p.parquet", tmp_path / "p.ply")
+        == 0
+    )
     assert parquet.read_table(tmp_path / "p.parquet").schema == POINTS_SCHEMA
     assert len(read_ply(tmp_path / "p.ply")) == 0
 
@@ -283,7 +288,9 @@ def test_a_failed_export_leaves_no_half_files(tmp_path, monkeypatch):
 
     monkeypatch.setattr("aqualvs.results.points._vertices", fail)
     with pytest.raises(OSError, match="No space"):
-        export_points(points_stream, tmp_path / "points.parquet", tmp_path / "points.ply")
+        export_points(
+            read_points_stream(points_stream), tmp_path / "points.parquet", tmp_path / "points.ply"
+        )
     assert [p.name for p in tmp_path.iterdir()] == ["points.arrows"]
 
 

@@ -11,7 +11,7 @@ from aqualvs.errors import SourceError
 from aqualvs.results import net_survey as module
 from aqualvs.results.folder import RunOutputs
 from aqualvs.results.net_survey import check_stored, read_run
-from aqualvs.results.points import PointsStream, export_points
+from aqualvs.results.points import PointsStream, export_points, read_points_stream
 from aqualvs.scanning.posture import Reason
 from shell_cases import scan
 
@@ -124,7 +124,7 @@ def test_an_older_journal_still_becomes_parquet(tmp_path):
         table = stream.read_all().drop_columns(["intensity", "width_px"])
     with pa.ipc.new_stream(old, table.schema) as stream:
         stream.write_table(table)
-    assert export_points(old, tmp_path / "p.parquet", tmp_path / "p.ply") == 60
+    assert export_points(read_points_stream(old), tmp_path / "p.parquet", tmp_path / "p.ply") == 60
     assert parquet.read_table(tmp_path / "p.parquet").schema == table.schema
 
 

@@ -47,7 +47,7 @@ from aqualvs.results.folder import (
     RUN_YAML,
     PostureCsv,
 )
-from aqualvs.results.points import PointsStream, export_batches, read_points_stream
+from aqualvs.results.points import PointsStream, export_points, read_points_stream
 from aqualvs.results.run_request import FrameWindow, RunFile, Status
 from aqualvs.results.summary import RunSummary
 from aqualvs.run_outputs import RunBareLens
@@ -341,7 +341,7 @@ def _join_files(pieces: Sequence[Path], folder: Path) -> None:
         parts = [piece / name for piece in pieces if (piece / name).exists()]
         if parts:
             _join_rows(parts, folder / name)
-    export_batches(
+    export_points(
         (batch for piece in pieces for batch in read_points_stream(piece / POINTS_STREAM)),
         folder / POINTS_PARQUET,
         folder / POINTS_PLY,

@@ -221,36 +221,38 @@ class Claim(Closing):
         for folder, names in self._names.items():
             with writing(folder):
                 folder.mkdir(parents=True, exist_ok=True)
-                _note(folder, {name: {_WRITER: writer, _MARK: None} for name in names})
+                _update_record(folder, {name: {_WRITER: writer, _MARK: None} for name in names})
 
     def close(self) -> None:
         """Note size and checksum of the files; call it when they are complete."""
         for folder, names in self._names.items():
             written = {
-                name: {_WRITER: self._writer, _MARK: _mark(folder / name)}
+                name: {_WRITER: self._writer, _MARK: _fingerprint(folder / name)}
                 if os.path.lexists(folder / name)
                 else None
                 for name in names
             }
             # The files matter more than the note; without it they stay noted as incomplete.
             with contextlib.suppress(OSError):
-                _note(folder, written)
+                _update_record(folder, written)
 
     def _adopt(self, known: Sequence[Path]) -> None:
         if known and not os.path.lexists(known[0].parent / RECORD):
             with writing(known[0].parent):
-                entries = {path.name: {_WRITER: self._writer, _MARK: _mark(path)} for path in known}
-                _note(known[0].parent, entries)
+                entries = {
+                    path.name: {_WRITER: self._writer, _MARK: _fingerprint(path)} for path in known
+                }
+                _update_record(known[0].parent, entries)
 
     def _check(self, path: Path, *, overwrite: bool) -> None:
-        noted = _noted(path.parent).get(path.name)
+        noted = _read_record(path.parent).get(path.name)
         if not isinstance(noted, dict) or noted.get(_WRITER) != self._writer:
             raise OutputError(
                 f"{path}: exists, and 'aqualvs {self._writer}' did not write it; move it away, or "
                 "choose another place with -o"
             )
         mark = noted.get(_MARK)
-        if mark is not None and mark != _mark(path):
+        if mark is not None and mark != _fingerprint(path):
             raise OutputError(
                 f"{path}: has changed since 'aqualvs {self._writer}' wrote it; move it away, or "
                 "choose another place with -o"
@@ -259,7 +261,7 @@ class Claim(Closing):
             raise OutputError(f"{path}: exists; choose another place with -o, or add --overwrite")
 
 
-def _noted(folder: Path) -> dict[str, Any]:
+def _read_record(folder: Path) -> dict[str, Any]:
     """Return the record of a folder; empty where there is none that can be read."""
     try:
         content = json.loads(read_text(folder / RECORD, "a record", OutputError))
@@ -268,14 +270,14 @@ def _noted(folder: Path) -> dict[str, Any]:
     return content if isinstance(content, dict) else {}
 
 
-def _note(folder: Path, entries: Mapping[str, dict[str, Any] | None]) -> None:
+def _update_record(folder: Path, entries: Mapping[str, dict[str, Any] | None]) -> None:
     """Write entries into the record of a folder; those of None are taken out."""
-    merged = {**_noted(folder), **entries}
+    merged = {**_read_record(folder), **entries}
     content = {name: one for name, one in merged.items() if one is not None}
     replace_text(folder / RECORD, json.dumps(content, indent=1, sort_keys=True))
 
 
-def _mark(path: Path) -> list[int] | None:
+def _fingerprint(path: Path) -> list[int] | None:
     """Return size and checksum of a file's two ends; None for a folder or an unreadable file."""
     # A video has gigabytes: its beginning and end, with the size, identify it.
     ends = 1 << 16

@@ -23,7 +23,14 @@ from aqualvs.errors import OutputError, SourceError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.optics.shutter import AT_ONCE, Shutter
 from aqualvs.results.files import AppendFile, Claim, explain, locked_folder, writing
-from aqualvs.results.points import DRAFT, PointsExport, PointsStream, check_idle, export_points
+from aqualvs.results.points import (
+    DRAFT,
+    PointsExport,
+    PointsStream,
+    check_idle,
+    export_points,
+    read_points_stream,
+)
 from aqualvs.results.run_request import RunFile, Status, now, read_run_yaml, write_yaml
 from aqualvs.results.summary import RunSummary, summary_of
 from aqualvs.scanning.posture import Posture, deviations
@@ -236,7 +243,7 @@ class RunOutputs:
     def __exit__(self, _kind: object, fault: BaseException | None, _trace: object) -> None:
         """Complete the folder: `points.parquet` and `points.ply` replace the journal."""
         if isinstance(fault, OutputError):
-            self._leave_as_it_is(fault)
+            self._abandon(fault)
             return
         try:
             self._open_files.close()
@@ -246,14 +253,14 @@ class RunOutputs:
                 self._export.finish()
             (self.folder / POINTS_STREAM).unlink()
             self._run_file.write(
-                self._final(fault), error=_words(fault), summary=self.summary.to_dict()
+                self._final_status(fault), error=_error_text(fault), summary=self.summary.to_dict()
             )
         except OSError as full:
             refusal = OutputError(explain(self.folder, full))
-            self._leave_as_it_is(refusal)
+            self._abandon(refusal)
             raise refusal from full
 
-    def _leave_as_it_is(self, fault: OutputError) -> None:
+    def _abandon(self, fault: OutputError) -> None:
         """Close open files, writing no more than a full disk can take."""
         self._discard_export()
         self._points.abandon()
@@ -266,7 +273,7 @@ class RunOutputs:
             self._export.discard()
             self._export = None
 
-    def _final(self, fault: BaseException | None) -> Status:
+    def _final_status(self, fault: BaseException | None) -> Status:
         if fault is None:
             return self.status
         return Status.INTERRUPTED if isinstance(fault, KeyboardInterrupt) else Status.FAILED
@@ -345,7 +352,7 @@ def recover(folder: Path) -> bool:
     with writing(folder):
         _export_points_stream(folder)
         points_stream.unlink()
-        _mend_run_file(folder)
+        _complete_run_file(folder)
     return True
 
 
@@ -364,10 +371,11 @@ def _new_points_stream(folder: Path) -> PointsStream:
 
 
 def _export_points_stream(folder: Path) -> None:
-    export_points(folder / POINTS_STREAM, folder / POINTS_PARQUET, folder / POINTS_PLY)
+    batches = read_points_stream(folder / POINTS_STREAM)
+    export_points(batches, folder / POINTS_PARQUET, folder / POINTS_PLY)
 
 
-def _mend_run_file(folder: Path) -> None:
+def _complete_run_file(folder: Path) -> None:
     """Replace the status of a run that could not say how it ended."""
     path = folder / RUN_YAML
     try:
@@ -387,5 +395,5 @@ def _mend_run_file(folder: Path) -> None:
     write_yaml(path, head | {key: value for key, value in content.items() if key not in known})
 
 
-def _words(fault: BaseException | None) -> str:
+def _error_text(fault: BaseException | None) -> str:
     return "" if fault is None else f"{fault}" or type(fault).__name__

@@ -122,14 +122,14 @@ class NetPass:
         wall = unroll(stretches, holes, places, self._rig, postures)
         area = self._condition.area
         summary = net_dict(wall, area, self._n_frames, len(postures.time_s))
-        facts = {
+        metadata = {
             "version": __version__,
             "options": self._request.to_dict(),
             "log": None if log is None else log.to_dict(),
             "summary": summary,
         }
         with writing(folder):
-            write_net_files(folder, wall, facts)
+            write_net_files(folder, wall, metadata)
         lines = net_lines(wall, area, self._n_frames)
         if log is not None:
             lines += [*log.log.notes, log.words()]
@@ -147,7 +147,7 @@ class NetPass:
             )
 
 
-def write_net_files(folder: Path, wall: "UnrolledNet", facts: dict[str, Any]) -> None:
+def write_net_files(folder: Path, wall: "UnrolledNet", metadata: dict[str, Any]) -> None:
     """Write tables first, pictures last.
 
     Raises `OSError` as the system says it.
@@ -164,7 +164,7 @@ def write_net_files(folder: Path, wall: "UnrolledNet", facts: dict[str, Any]) ->
 
     write_table(folder / NET_CSV, NET_COLUMNS, stretch_rows(wall))
     write_table(folder / HOLES_CSV, HOLE_COLUMNS, hole_rows(wall))
-    write_geojson(folder / NET_GEOJSON, wall, facts)
+    write_geojson(folder / NET_GEOJSON, wall, metadata)
     draw_map(wall, [folder / NET_MAP_PNG, folder / NET_MAP_SVG])
 
 
@@ -210,7 +210,7 @@ def read_run(run_folder: str | Path) -> Iterator[Scan]:
     Memory holds one batch of points, however long the dive.
     """
     folder = Path(run_folder)
-    points, path = _Points(folder), folder / POSTURE_CSV
+    points, path = _StoredPoints(folder), folder / POSTURE_CSV
     for row in _posture_rows(path):
         try:
             index, posture = int(row["frame"]), _posture(row)
@@ -271,8 +271,8 @@ def _posture(row: dict[str, str]) -> Posture | Refusal:
         nearest=float(row["nearest_m"]),
         n_points=int(row["n_points"]),
         rms=math.nan,
-        curvature=_pair(row, "curvature_{}_per_m"),
-        sigma_curvature=_pair(row, "sigma_curvature_{}_per_m"),
+        curvature=_pair_along_axes(row, "curvature_{}_per_m"),
+        sigma_curvature=_pair_along_axes(row, "sigma_curvature_{}_per_m"),
         rig_covariance=_variances(row, _RIG_SIGMAS),
     )
 
@@ -284,7 +284,7 @@ def _variances(row: dict[str, str], names: tuple[str, ...]) -> FloatArray:
     return np.diag(sigma**2)
 
 
-def _pair(row: dict[str, str], name: str) -> tuple[float, float] | None:
+def _pair_along_axes(row: dict[str, str], name: str) -> tuple[float, float] | None:
     """Return a pair along x and z, None where it is empty or the run older than its columns."""
     words = [row.get(name.format(axis)) for axis in "xz"]
     if not all(words):
@@ -296,17 +296,17 @@ def _number(text: str | None) -> float:
     return float(text) if text else math.nan
 
 
-class _Points:
+class _StoredPoints:
     """The points of a run, asked for frame by frame in ascending order."""
 
     def __init__(self, run_folder: Path) -> None:
-        self._pieces = _pieces(run_folder)
+        self._parts = _points_by_frame(run_folder)
         self._waiting: tuple[int, Columns] | None = None
 
     def of(self, frame: int) -> ScanPoints:
         """Return the points of a frame; none where it has none."""
         found: list[Columns] = []
-        while (piece := self._waiting or next(self._pieces, None)) is not None:
+        while (piece := self._waiting or next(self._parts, None)) is not None:
             self._waiting = piece
             if piece[0] > frame:
                 break
@@ -316,7 +316,7 @@ class _Points:
         return _scan_points(found)
 
 
-def _pieces(run_folder: Path) -> Iterator[tuple[int, Columns]]:
+def _points_by_frame(run_folder: Path) -> Iterator[tuple[int, Columns]]:
     """Yield each frame's points, in parts where the file's batches split them."""
     for columns in _batches(run_folder):
         frame = columns["frame"]

@@ -314,13 +314,13 @@ class PointsExport:
         self._n_vertices += len(vertices)
 
 
-def export_points(points_stream: Path, points_parquet: Path, points_ply: Path) -> int:
-    """Write the points of a journal as `PointsExport` does it.
+def export_points(batches: Iterator[Any], points_parquet: Path, points_ply: Path) -> int:
+    """Write record batches to the files of `PointsExport`, with the columns of the first batch.
 
     Parameters
     ----------
-    points_stream : Path
-        May lack its end; what follows the last whole batch is left out.
+    batches : iterator of pyarrow.RecordBatch
+        As `read_points_stream` yields them.
 
     Returns
     -------
@@ -330,13 +330,8 @@ def export_points(points_stream: Path, points_parquet: Path, points_ply: Path) -
     Raises
     ------
     OSError
-        As the system says it, a full disk for example; the journal is left as it is.
+        As the system says it, a full disk for example; nothing is left of the files.
     """
-    return export_batches(read_points_stream(points_stream), points_parquet, points_ply)
-
-
-def export_batches(batches: Iterator[Any], points_parquet: Path, points_ply: Path) -> int:
-    """Write record batches with the columns of the first, as `export_points` does it."""
     first = next(batches, None)
     schema = POINTS_SCHEMA if first is None else first.schema
     export = PointsExport(points_parquet, points_ply, schema)
