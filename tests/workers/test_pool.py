@@ -56,7 +56,7 @@ def short_dives_are_shared(monkeypatch):
 
 @pytest.fixture
 def worker_pools(monkeypatch):
-    """The crews that runs have had."""
+    """The pools that runs have had."""
     seen = []
     entered = WorkerPool.__enter__
     monkeypatch.setattr(
@@ -127,7 +127,7 @@ def test_from_damage_on_one_process_goes_on(tmp_path, dive, worker_pools):
 def test_from_the_death_of_a_process_on_one_goes_on(tmp_path, dive, worker_pools, monkeypatch):
     """Nothing is lost, and nothing is there twice."""
     whole, _ = results(dive, tmp_path / "alone", 1)
-    of_part = WorkerPool._of_part
+    of_part = WorkerPool._results_of
 
     def one_dies(worker_pool, number):
         if number == 1:
@@ -136,7 +136,7 @@ def test_from_the_death_of_a_process_on_one_goes_on(tmp_path, dive, worker_pools
                     os.kill(worker.process.pid, signal.SIGKILL)
         return of_part(worker_pool, number)
 
-    monkeypatch.setattr(WorkerPool, "_of_part", one_dies)
+    monkeypatch.setattr(WorkerPool, "_results_of", one_dies)
     shared, result = results(dive, tmp_path / "shared", 2)
     assert result.summary.n_frames == N
     assert whole == shared
@@ -296,7 +296,7 @@ def test_a_sender_waits_until_there_is_a_place(block, ends):
     for message in messages:
         assert_like(message, receiver.receive())
     assert receiver.receive() is Ended.WHOLE
-    receiver.give_part(5)
+    receiver.assign(5)
     assert sent.result(timeout=60) == 5
 
 

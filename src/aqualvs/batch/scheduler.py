@@ -206,7 +206,7 @@ def _local_cluster(distributed: Any, n_workers: int | None) -> Any:
 
     n_workers = n_workers or CPU_COUNT
     settings = dict(_SETTINGS)
-    if start_method.has_server():
+    if start_method.can_fork():
         start_method.prepare(start_method.FOR_BATCHES)
         settings["distributed.worker.multiprocessing-method"] = "forkserver"
         # It would import whatever it can find, to have it in the server, which is there already.
@@ -215,7 +215,7 @@ def _local_cluster(distributed: Any, n_workers: int | None) -> Any:
     memory_bytes = 2_000_000_000
     starts = 3
     # What Dask says of dying processes helps nobody: the task is done by another.
-    with dask.config.set(settings), start_method.deaf_to_interrupts():
+    with dask.config.set(settings), start_method.ignored_interrupts():
         for _ in range(starts):
             try:
                 return distributed.LocalCluster(

@@ -190,11 +190,10 @@ def read_ahead(items: Iterator[T]) -> Iterator[T]:
         thread.join()
 
 
-class _End:
-    """Mark of the end of the items, with the exception that caused it."""
+class _End(NamedTuple):
+    """Mark of the end of the items."""
 
-    def __init__(self, fault: BaseException | None = None) -> None:
-        self.fault = fault
+    fault: BaseException | None = None  # Exception that ended them.
 
 
 class ScanInputs(NamedTuple):

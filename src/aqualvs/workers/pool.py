@@ -50,7 +50,7 @@ from aqualvs.sources.spans import (
     video_spans,
 )
 from aqualvs.workers.frame_results import FrameProcessor, FrameResult, in_blocks
-from aqualvs.workers.start_method import context, deaf_to_interrupts, interrupts_blocked
+from aqualvs.workers.start_method import blocked_interrupts, context, ignored_interrupts
 
 
 class Ended(Enum):
@@ -69,14 +69,14 @@ _ARRAYS = ("covariance", "normal_in_dome", "rig_covariance")
 _NUMBERS = tuple(field.name for field in fields(Posture) if field.name not in _ARRAYS)
 
 
-def room_for(message: Message) -> int:
-    """Return how many bytes of memory `packed` needs."""
+def packed_size(message: Message) -> int:
+    """Return how many bytes of memory `pack` writes."""
     if isinstance(message, Ended):
         return 0
-    return _places(sum(len(measured.scan.points) for measured in message))[-1][1]
+    return _column_ranges(sum(len(result.scan.points) for result in message))[-1][1]
 
 
-def packed(message: Message, memory: NDArray[np.uint8]) -> bytes:
+def pack(message: Message, memory: NDArray[np.uint8]) -> bytes:
     """Return a message as bytes, but for the points of frames, which are written to memory.
 
     Pictures stay behind. The points of all frames travel together: a dozen arrays for each frame,
@@ -84,15 +84,25 @@ def packed(message: Message, memory: NDArray[np.uint8]) -> bytes:
     """
     if isinstance(message, Ended):
         return pickle.dumps(message)
-    points = [measured.scan.points for measured in message]
+    points = [result.scan.points for result in message]
     stops = np.cumsum([len(one) for one in points]).tolist()
     for name, column in zip(_COLUMNS, _columns(memory, stops[-1]), strict=True):
         np.concatenate([getattr(one, name) for one in points], out=column, casting="no")
-    return pickle.dumps((_heads(message), stops), pickle.HIGHEST_PROTOCOL)
+    heads = [
+        (
+            result.scan.index,
+            result.scan.time_s,
+            _to_plain(result.scan.posture),
+            result.scan.n_water,
+            _to_plain(result.bare),
+        )
+        for result in message
+    ]
+    return pickle.dumps((heads, stops), pickle.HIGHEST_PROTOCOL)
 
 
-def unpacked(parcel: bytes, memory: NDArray[np.uint8]) -> Message:
-    """Return the message of `packed`, which a process of this program has sent.
+def unpack(parcel: bytes, memory: NDArray[np.uint8]) -> Message:
+    """Return the message of `pack`, which a process of this program has sent.
 
     The points stay in `memory`.
     """
@@ -104,28 +114,21 @@ def unpacked(parcel: bytes, memory: NDArray[np.uint8]) -> Message:
     found, first = [], 0
     for (index, time_s, posture, n_water, bare), stop in zip(heads, stops, strict=True):
         points = ScanPoints(*[column[first:stop] for column in columns])
-        scan = Scan(index, time_s, _answer(posture), points, n_water)
-        found.append(FrameResult(scan, _answer(bare)))
+        scan = Scan(index, time_s, _from_plain(posture), points, n_water)
+        found.append(FrameResult(scan, _from_plain(bare)))
         first = stop
     return found
 
 
-def _heads(block: Sequence[FrameResult]) -> list[tuple[Any, ...]]:
-    return [
-        (m.scan.index, m.scan.time_s, _plain(m.scan.posture), m.scan.n_water, _plain(m.bare))
-        for m in block
-    ]
+def _to_plain(posture: Posture | Refusal | None) -> Any:
+    """Return a posture as plain numbers, which are pickled several times as fast."""
+    if not isinstance(posture, Posture):
+        return posture
+    numbers = [getattr(posture, name) for name in _NUMBERS]
+    return numbers, [getattr(posture, name).tolist() for name in _ARRAYS]
 
 
-def _plain(answer: Posture | Refusal | None) -> Any:
-    """Return a posture as plain numbers, which are packed several times as fast."""
-    if not isinstance(answer, Posture):
-        return answer
-    numbers = [getattr(answer, name) for name in _NUMBERS]
-    return numbers, [getattr(answer, name).tolist() for name in _ARRAYS]
-
-
-def _answer(plain: Any) -> Any:
+def _from_plain(plain: Any) -> Any:
     if not isinstance(plain, tuple):
         return plain
     numbers, arrays = plain
@@ -135,21 +138,21 @@ def _answer(plain: Any) -> Any:
 
 
 def _columns(memory: NDArray[np.uint8], n_points: int) -> Iterator[NDArray[Any]]:
-    """Yield where the columns of points lie in memory."""
-    for like, (first, stop) in zip(_COLUMNS.values(), _places(n_points), strict=True):
+    """Yield views on the columns of points in memory."""
+    for like, (first, stop) in zip(_COLUMNS.values(), _column_ranges(n_points), strict=True):
         yield memory[first:stop].view(like.dtype).reshape(n_points, *like.shape[1:])
 
 
-def _places(n_points: int) -> list[tuple[int, int]]:
-    """Return where the bytes of each column begin and end."""
-    places, first = [], 0
+def _column_ranges(n_points: int) -> list[tuple[int, int]]:
+    """Return the range of bytes of each column."""
+    ranges, first = [], 0
     # Size of a cache line: no two columns share one.
     aligned = 64
     for n_bytes in _BYTES:
         stop = first + n_points * n_bytes
-        places.append((first, stop))
+        ranges.append((first, stop))
         first = -(-stop // aligned) * aligned
-    return places
+    return ranges
 
 
 _N_SLOTS = 3
@@ -190,15 +193,15 @@ class SharedMemory:
             return None
 
     def seal(self) -> None:
-        """Stop giving it to further processes."""
+        """Close the descriptor: no further process can attach to the memory."""
         os.close(self._file)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Give it to a process that is being started."""
-        return _received, (reduction.DupFd(self._file),)
+        """Pass the memory to a process that is being started."""
+        return _attached, (reduction.DupFd(self._file),)
 
 
-def _received(file: Any) -> SharedMemory:
+def _attached(file: Any) -> SharedMemory:
     memory = SharedMemory(file.detach())
     memory.seal()
     return memory
@@ -223,16 +226,16 @@ class Sender:
 
     def send(self, message: Message) -> None:
         """Send a message; waits while all slots are full."""
-        n_bytes = room_for(message)
+        n_bytes = packed_size(message)
         if self._memory is None or n_bytes == 0 or n_bytes > _SLOT_BYTES:
             own = np.empty(n_bytes, np.uint8)
-            self._pipe.send((packed(message, own), own, n_bytes))
+            self._pipe.send((pack(message, own), own, n_bytes))
             return
         while self._n_free == 0:
             # A part is given only to a process without one, so this is always `_TAKEN`.
             self._pipe.recv()
             self._n_free += 1
-        parcel = packed(message, self._memory.slots[self._next])
+        parcel = pack(message, self._memory.slots[self._next])
         self._pipe.send((parcel, self._next, n_bytes))
         self._next, self._n_free = (self._next + 1) % _N_SLOTS, self._n_free - 1
 
@@ -243,18 +246,18 @@ class Receiver:
     def __init__(self, pipe: Connection, memory: SharedMemory | None) -> None:
         self._pipe, self._memory = pipe, memory
 
-    def give_part(self, number: int) -> None:
-        """Have a part measured; the one before must have ended."""
+    def assign(self, number: int) -> None:
+        """Have a part measured, after the one before has ended."""
         self._pipe.send(number)
 
     def receive(self) -> Message:
         """Wait for a message."""
         parcel, place, n_bytes = self._pipe.recv()
         if self._memory is None or not isinstance(place, int):
-            return unpacked(parcel, place)
+            return unpack(parcel, place)
         points = self._memory.slots[place, :n_bytes].copy()
         self._pipe.send(_TAKEN)
-        return unpacked(parcel, points)
+        return unpack(parcel, points)
 
 
 @dataclass(frozen=True, slots=True)
@@ -280,7 +283,7 @@ class PoolJob:
 
 
 def serve(
-    work: PoolJob, pipe: Connection, memory: SharedMemory | None, others: Sequence[Connection]
+    job: PoolJob, pipe: Connection, memory: SharedMemory | None, others: Sequence[Connection]
 ) -> None:
     """Measure the parts whose numbers come through a pipe, until its other end is closed.
 
@@ -295,12 +298,12 @@ def serve(
     cv2.setNumThreads(1)
     sender = Sender(pipe, memory)
     try:
-        processor = FrameProcessor(work.rig, Scanner(work.rig, work.options))
-        with SpanReader(work.path, work.rig.size_px) as video:
+        processor = FrameProcessor(job.rig, Scanner(job.rig, job.options))
+        with SpanReader(job.path, job.rig.size_px) as video:
             while True:
-                part = work.parts[sender.next_part()]
-                frames = frames_of(_pictures(work, part, video), work.rig.shutter)
-                for message in _messages(part, work.rig.shutter, frames, processor):
+                part = job.parts[sender.next_part()]
+                frames = frames_of(_pictures(job, part, video), job.rig.shutter)
+                for message in _messages(part, job.rig.shutter, frames, processor):
                     sender.send(message)
     except (EOFError, ConnectionError):
         # The other end is closed; buffered data are discarded.
@@ -326,10 +329,10 @@ def _messages(
         yield Ended.WHOLE
 
 
-def _pictures(work: PoolJob, part: SpanPart, video: SpanReader) -> Iterator[Frame]:
+def _pictures(job: PoolJob, part: SpanPart, video: SpanReader) -> Iterator[Frame]:
     if part.span.kind is SpanKind.VIDEO:
         return video.frames(part.span)
-    return image_frames(work.path, part.span, work.fps)
+    return image_frames(job.path, part.span, job.fps)
 
 
 _MIN_FRAMES = 100
@@ -342,7 +345,7 @@ _PART_FRAMES = 32
 def pool_job(
     source: FrameSource, window: FrameWindow, rig: Rig, options: ScannerOptions
 ) -> PoolJob | None:
-    """Return how a dive can be shared, or None where it cannot, or is too short.
+    """Return the job of measuring a dive in parts; None if it cannot be cut, or is too short.
 
     Reads a video once without decoding it: 25 ms for 1000 frames of standard definition.
 
@@ -380,7 +383,7 @@ def _earlier(stop: int, wanted: int | None) -> int:
 
 @dataclass(slots=True)
 class _Worker:
-    """A process, and the number of the part that it works on; -1 if there is none left for it."""
+    """A process, and the number of the part that it measures; -1 if none is left for it."""
 
     process: BaseProcess
     pipe: Connection
@@ -394,14 +397,14 @@ class WorkerPool(Closing):
     `n_processes`: there are no more than parts.
     """
 
-    def __init__(self, work: PoolJob, n_processes: int) -> None:
-        self._work = work
-        self.next_frame = work.parts[0].first  # The first frame of which nothing has come yet.
+    def __init__(self, job: PoolJob, n_processes: int) -> None:
+        self._job = job
+        self.next_frame = job.parts[0].first  # The first frame of which nothing has come yet.
         self.is_done = False  # Whether all has come.
         self._n_given = 0
         self._workers: list[_Worker] = []
         self._found: defaultdict[int, deque[Message]] = defaultdict(deque)
-        self._n_processes = min(n_processes, len(work.parts))
+        self._n_processes = min(n_processes, len(job.parts))
 
     def blocks(self) -> Iterator[list[FrameResult]]:
         """Yield the results, in the order of the dive.
@@ -410,19 +413,19 @@ class WorkerPool(Closing):
         `is_done` is False then, and the rest is to be measured by other means, from `next_frame`.
         """
         try:
-            for number in range(len(self._work.parts)):
-                for block in self._of_part(number):
+            for number in range(len(self._job.parts)):
+                for block in self._results_of(number):
                     yield block
                     self.next_frame += len(block)
         except (SpanMismatchError, EOFError, OSError):
             return
-        self.is_done = self.next_frame == self._work.parts[-1].stop
+        self.is_done = self.next_frame == self._job.parts[-1].stop
 
-    def _of_part(self, number: int) -> Iterator[list[FrameResult]]:
+    def _results_of(self, number: int) -> Iterator[list[FrameResult]]:
         found = self._found[number]
         while True:
             while not found:
-                self._take_in(number)
+                self._receive(number)
             message = found.popleft()
             if message is Ended.MISMATCH:
                 raise SpanMismatchError
@@ -431,8 +434,8 @@ class WorkerPool(Closing):
             yield message
         del self._found[number]
 
-    def _take_in(self, number: int) -> None:
-        """Wait for messages about a part, and take in others unless too many wait."""
+    def _receive(self, number: int) -> None:
+        """Wait for a message about a part; receive others too unless too many are waiting."""
         # Blocks for each process that may wait for earlier parts; beyond it, only those are read.
         max_waiting = 100
         crowded = sum(map(len, self._found.values())) > max_waiting * len(self._workers)
@@ -446,21 +449,21 @@ class WorkerPool(Closing):
             message = worker.receiver.receive()
             self._found[worker.number].append(message)
             if isinstance(message, Ended):
-                self._give(worker)
+                self._assign_next(worker)
 
-    def _give(self, worker: _Worker) -> None:
+    def _assign_next(self, worker: _Worker) -> None:
         """Give a process its next part, if there is one."""
-        worker.number = self._n_given if self._n_given < len(self._work.parts) else -1
+        worker.number = self._n_given if self._n_given < len(self._job.parts) else -1
         if worker.number >= 0:
             self._n_given += 1
-            worker.receiver.give_part(worker.number)
+            worker.receiver.assign(worker.number)
 
     def __enter__(self) -> Self:
         """Start the processes."""
         for _ in range(self._n_processes):
             worker = self._start()
             self._workers.append(worker)
-            self._give(worker)
+            self._assign_next(worker)
         return self
 
     def _start(self) -> _Worker:
@@ -469,8 +472,8 @@ class WorkerPool(Closing):
         is_copy = how.get_start_method() == "fork"
         # Copies of this process inherit these; a pipe is closed when no process has it open.
         mines = [*(worker.pipe for worker in self._workers), mine] if is_copy else []
-        process = how.Process(target=serve, args=(self._work, theirs, memory, mines), daemon=True)
-        with interrupts_blocked() if is_copy else deaf_to_interrupts():
+        process = how.Process(target=serve, args=(self._job, theirs, memory, mines), daemon=True)
+        with blocked_interrupts() if is_copy else ignored_interrupts():
             process.start()
         theirs.close()
         if memory is not None:

@@ -221,7 +221,7 @@ def _lost(index: int, time_s: float, n_water: float) -> Scan:
 
 
 class DiveProcessor(Closing):
-    """Measurement of a dive's frames; a context manager, within which processes are at work.
+    """Measurement of a dive's frames; a context manager, within which processes measure.
 
     Parameters
     ----------
@@ -229,7 +229,7 @@ class DiveProcessor(Closing):
         Open, and not yet read from.
     window : FrameWindow
         Of the frames to measure.
-    work : PoolJob or None
+    job : PoolJob or None
         How processes may share the dive; None has this process measure it.
     """
 
@@ -238,11 +238,11 @@ class DiveProcessor(Closing):
         source: FrameSource,
         rig: Rig,
         window: FrameWindow,
-        work: PoolJob | None,
+        job: PoolJob | None,
         n_processes: int,
     ) -> None:
         self._source, self._rig, self._window = source, rig, window
-        self._pool = None if work is None else WorkerPool(work, n_processes)
+        self._pool = None if job is None else WorkerPool(job, n_processes)
         self._first_block: list[FrameResult] | None = None
         self._pool_blocks: Iterator[list[FrameResult]] = iter(())
         self._frames: Iterator[Frame] = iter(())

@@ -17,15 +17,15 @@ FOR_BATCHES = ("distributed.nanny", "aqualvs.batch.scheduler")
 
 
 def prepare(modules: tuple[str, ...]) -> None:
-    """Begin the process that others are copied from, where the system has such a thing.
+    """Start the server that worker processes are forked from, on systems that have one.
 
-    It imports what they need while this process imports what it needs itself.
+    It imports `modules` while this process goes on with its own imports.
     """
-    if has_server():
+    if can_fork():
         from multiprocessing import forkserver
 
         multiprocessing.get_context("forkserver").set_forkserver_preload(list(modules))
-        with deaf_to_interrupts():
+        with ignored_interrupts():
             forkserver.ensure_running()
 
 
@@ -35,7 +35,7 @@ def context() -> "ForkContext | ForkServerContext | SpawnContext":
     Copies are impossible where this process has threads, those of libraries included: a copy would
     have their locks, but not the threads that release them.
     """
-    if not has_server():
+    if not can_fork():
         return multiprocessing.get_context("spawn")
     if n_threads() == 1:
         return multiprocessing.get_context("fork")
@@ -57,17 +57,17 @@ def n_cores() -> int:
     return os.cpu_count() or 1
 
 
-def has_server() -> bool:
-    """Return whether the system copies a process that has imported much.
+def can_fork() -> bool:
+    """Return whether the system can fork a process that has loaded many libraries.
 
-    Libraries of macOS do not bear it once they are loaded, and Windows cannot.
+    Libraries of macOS fail in a fork once they are loaded, and Windows has no fork.
     """
     return sys.platform == "linux"
 
 
 @contextlib.contextmanager
-def deaf_to_interrupts() -> Iterator[None]:
-    """Ignore Ctrl-C in all threads and processes started here, and in theirs.
+def ignored_interrupts() -> Iterator[None]:
+    """Ignore Ctrl-C in all threads and processes started here, and in their own.
 
     A terminal sends it to all processes; this one decides what becomes of the others.
     """
@@ -78,12 +78,12 @@ def deaf_to_interrupts() -> Iterator[None]:
 
     # Started later, it would unblock the signal in the starting thread.
     resource_tracker.ensure_running()
-    with interrupts_blocked():
+    with blocked_interrupts():
         yield
 
 
 @contextlib.contextmanager
-def interrupts_blocked() -> Iterator[None]:
+def blocked_interrupts() -> Iterator[None]:
     """Block Ctrl-C; copies of this process that are started here never receive it."""
     heard = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
