@@ -31,6 +31,7 @@ from aqualvs.scanning.observations import Observations, Observed, StripeObserver
 from aqualvs.scanning.paraboloid import MIN_BEND, fit_patch, refit_at_nearest, shows_curvature
 from aqualvs.scanning.patch import (
     Patch,
+    PatchFit,
     heights_over,
     intensity_share_near,
     nearest_in_view,
@@ -212,7 +213,7 @@ class PostureEstimator:
             is_observable = self._is_observable(candidates, curved)
             if is_clear and is_observable:
                 best = curved
-            elif is_clear or (is_observable and _may_bend(curved.posture, seen)):
+            elif is_clear or is_observable:
                 best = _inflate_covariance(flat, curved)
         patch = packed_plane(plane) if best.patch is None else best.patch.packed()
         net_mask = self._grow_net_mask(candidates, best.inliers, plane, patch)
@@ -415,16 +416,21 @@ class PostureEstimator:
     def _measure_curved(
         self, candidates: Candidates, plane: Plane, off: FloatArray, min_bend: float
     ) -> tuple[Measurement | None, bool]:
-        """Measure the posture to a curved net, and return whether the residuals ask for it."""
+        """Measure the posture to a net that may bend, and return whether it clearly does.
+
+        None where chance makes as much of a flat net's strands.
+        """
         near = off < _DEEPEST_BEND
         seen = self._observer.observe(candidates, near, plane, on_twine=True)
         if not seen.observations.n:
             return None, False
         shared = self._shared_error(seen.observations, plane.normal, on_twine=True)
         first = fit_patch(seen.observations, plane, shared, min_bend)
-        fit = first and refit_at_nearest(first.fit, seen.observations, shared)
+        if first is None or not (first.asked_for or _may_bend(first.fit)):
+            return None, False
+        fit = refit_at_nearest(first.fit, seen.observations, shared)
         m = None if fit is None else nearest_tangent(fit.patch)
-        if first is None or fit is None or m is None:
+        if fit is None or m is None:
             return None, False
         tangent = PlaneFit(m, tangent_covariance(fit, m), fit.weights, fit.rms)
         found = self._posture_of_fit(candidates, seen, tangent)
@@ -516,14 +522,13 @@ def _plane_of(fit: PlaneFit) -> Plane:
     return Plane(fit.m * distance, distance)
 
 
-def _may_bend(curved: Posture | Refusal, seen: Observed) -> bool:
+def _may_bend(fit: PatchFit) -> bool:
     """Return whether a net's curvature is more than chance would make of a flat net's strands."""
-    if not isinstance(curved, Posture) or not (curved.curvature and curved.sigma_curvature):
-        return False
     # In sigmas; of fewer strands chance makes more. Flat nets keep their covariance with these.
     by_chance, fewest = 3.0, 24
-    beyond = np.abs(curved.curvature) > by_chance * np.array(curved.sigma_curvature)
-    return seen.observations.n >= fewest and bool(beyond.any())
+    curvature, variance = fit.patch.coefficients[3:], np.diag(fit.covariance)[3:]
+    beyond = curvature**2 > by_chance**2 * variance
+    return bool(beyond.any() and np.count_nonzero(fit.weights) >= fewest)
 
 
 def _inflate_covariance(found: Measurement, other: Measurement) -> Measurement:
