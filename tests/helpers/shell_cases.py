@@ -89,9 +89,9 @@ def destroy_frame(path, i):
 
 
 def damage_frame(path, i):
-    """Overwrite 40 bytes near the end of packet `i`, which the decoder patches up."""
+    """Overwrite 40 bytes in the middle of packet `i`, which the decoder patches up."""
     position, size = packets(path)[i]
-    start = position + int(0.9 * size)
+    start = position + size // 2
     data = bytearray(path.read_bytes())
     data[start : start + 40] = np.random.default_rng(0).integers(1, 256, 40, np.uint8).tobytes()
     path.write_bytes(data)

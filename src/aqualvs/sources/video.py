@@ -8,6 +8,7 @@ import contextlib
 import heapq
 import itertools
 import threading
+from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NoReturn
@@ -17,7 +18,7 @@ from av.container import InputContainer
 from av.packet import Packet
 from av.stream import Disposition
 from av.video.codeccontext import VideoCodecContext
-from av.video.frame import VideoFrame
+from av.video.frame import PictureType, VideoFrame
 from av.video.stream import VideoStream
 
 from aqualvs.closing import Closing
@@ -138,6 +139,10 @@ predict the next ones. Elsewhere it is the torn end of a file; its error would d
 pictures that the decoder still holds."""
 
 
+_MAX_HELD = 16
+"""Pictures that H.264 and HEVC can reorder. Encoders without delay may call all pictures B."""
+
+
 class VideoSource(Closing):
     """A video file, or a stream that FFmpeg can open.
 
@@ -153,9 +158,9 @@ class VideoSource(Closing):
 
     Notes
     -----
-    Pictures that the decoder had to patch up are dropped, not delivered: a stripe copied from the
-    picture before would give a posture that looks sound. Pictures predicted from a lost one are
-    delivered; they mend themselves at the next key frame. Damage that happens to be valid code goes
+    Pictures that the decoder had to patch up are dropped, not delivered, and all that may be
+    predicted from them, up to the next picture that needs no other: a stripe copied from the
+    picture before would give a posture that looks sound. Damage that happens to be valid code goes
     unseen.
     """
 
@@ -185,6 +190,11 @@ class VideoSource(Closing):
         self._frame_counter.begin(self._stream.codec_context)
         self._tick = self._stream.time_base
         self._n_delivered, self._last_index, self._last_time_s = 0, -1, 0.0
+        # Time of the latest damage, None while pictures are sound; of the key packets since then.
+        self._damage: int | None = None
+        self._refreshes: list[int] = []
+        # Pictures predicted from both sides, until the later side proves sound.
+        self._held: deque[Frame] = deque()
         self._is_closed = self._is_at_end = False
         # FFmpeg reads from memory that closing frees.
         self._in_ffmpeg = threading.Lock()
@@ -205,14 +215,38 @@ class VideoSource(Closing):
             if self._has_decoding_times:
                 picture.pts = self._frame_counter.time_in_order(picture)
             index = self._frame_counter.number(picture.pts)
-            if picture.is_corrupt:
-                continue
-            frame = self._frame(picture, index)
-            self._n_delivered += 1
-            self._last_index, self._last_time_s = index, frame.time_s
-            yield frame
+            if self._is_sound(picture):
+                self._held.append(self._frame(picture, index))
+                if picture.pict_type != PictureType.B or len(self._held) > _MAX_HELD:
+                    yield from self._released()
+        yield from self._released()
         self._is_at_end = True
         self._check_complete()
+
+    def _is_sound(self, picture: VideoFrame) -> bool:
+        """Return whether neither a picture nor one that it is predicted from is damaged."""
+        time = picture.pts or 0
+        if picture.is_corrupt:
+            self._distrust(time)
+        # Pictures of before the damage may be shown after it was found. A gradual refresh is
+        # complete where the next one begins.
+        elif self._damage is not None and time >= self._damage:
+            needs_no_other = picture.key_frame or picture.pict_type == PictureType.I
+            if needs_no_other or sum(pts <= time for pts in self._refreshes) > 1:
+                self._damage = None
+        return self._damage is None
+
+    def _distrust(self, time: int) -> None:
+        """Wait for a picture that needs no other: something was lost."""
+        self._damage, self._refreshes = time, []
+        self._held.clear()
+
+    def _released(self) -> Iterator[Frame]:
+        while self._held:
+            frame = self._held.popleft()
+            self._n_delivered += 1
+            self._last_index, self._last_time_s = frame.index, frame.time_s
+            yield frame
 
     def _pictures(self) -> Iterator[VideoFrame]:
         """Decode all undamaged pictures, in order of presentation."""
@@ -232,10 +266,13 @@ class VideoSource(Closing):
         if packet.is_corrupt and not self._damage_is_partial:
             self._frame_counter.lose(packet)
             return []
+        if packet.is_keyframe and self._damage is not None:
+            self._refreshes.append(packet.pts or 0)
         try:
             pictures = packet.decode()
         except av.error.InvalidDataError:
             self._frame_counter.lose(packet)
+            self._distrust(packet.pts or 0)
             return []
         return [picture for picture in pictures if isinstance(picture, VideoFrame)]
 
