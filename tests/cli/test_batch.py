@@ -107,6 +107,25 @@ def test_an_interrupted_batch_whose_workers_are_killed_gives_what_runs_give(tmp_
     assert yaml.safe_load((result / "run.yaml").read_text())["status"] == "finished"
 
 
+def test_a_folder_that_is_renamed_is_not_another_season(tmp_path, capfd):
+    source = tmp_path / "may" / "dive.mp4"
+    source.parent.mkdir()
+    demo_dive(source, 6)
+    out, rig = tmp_path / "out", str(DEMO / "rig.yaml")
+    words = ["batch", str(tmp_path), "-o", str(out), "--rig", rig, "--workers", "1", "--no-report"]
+    assert main(words) == 0
+    source.parent.rename(tmp_path / "2026-05")
+    assert main(words) == 0
+    assert "was finished" in capfd.readouterr().out
+    assert [path.name for path in (out / "dataset" / "posture").iterdir()] == ["dive=dive"]
+    # A dive of the same name and another content is another dive.
+    (tmp_path / "2026-05" / "dive.mp4").unlink()
+    source.parent.mkdir()
+    demo_dive(source, 7)
+    assert main(words) == 0
+    assert len(list((out / "dataset" / "posture").iterdir())) == 2
+
+
 def test_bad_input_is_refused_in_one_line(tmp_path, season, refused):
     out = tmp_path / "out"
     assert "no such file" in refused("batch", tmp_path / "none.mp4", "-o", out)

@@ -117,7 +117,7 @@ def _check(request: BatchRequest) -> None:
 def _works(request: BatchRequest, dives: Sequence[Dive]) -> list[DiveWork]:
     """Return the work for each dive, under the name that it has in the folder for good."""
     out = request.out.resolve()
-    known = _known_names(out)
+    known = _with_moved(_known_names(out), dives, out)
     names = name_dives([(dive.source, dive.name) for dive in dives], known)
     known |= {str(dive.source): name for dive, name in zip(dives, names, strict=True)}
     replace_text(out / HOME / _NAMES, json.dumps(known, indent=1, ensure_ascii=False))
@@ -150,6 +150,26 @@ def _known_names(out: Path) -> dict[str, str]:
     except (OSError, ValueError):
         return {}
     return {str(key): str(value) for key, value in found.items()}
+
+
+def _with_moved(known: dict[str, str], dives: Sequence[Dive], out: Path) -> dict[str, str]:
+    """Return the names with those of files that were moved under their new places.
+
+    A file was moved if one of its name and size is missing at its old place. Counted as another
+    dive, it would be in the data set twice.
+    """
+    gone = {source: name for source, name in known.items() if not Path(source).exists()}
+    for dive in dives:
+        if str(dive.source) in known or dive.name:
+            continue
+        for source, name in gone.items():
+            manifest = read_manifest(out / HOME / DIVES / name / JOINED)
+            size = manifest and manifest["facts"]["source"].get("size_bytes")
+            same_name = Path(source).name == dive.source.name
+            if source in known and same_name and size == size_of(dive.source):
+                known[str(dive.source)] = known.pop(source)
+                break
+    return known
 
 
 def _tidy(home: Path) -> None:
