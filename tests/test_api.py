@@ -4,6 +4,7 @@ import importlib
 import subprocess
 import sys
 from importlib.resources import files
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -52,6 +53,39 @@ def test_a_run_is_read_as_it_was_measured(tmp_path) -> None:
         np.testing.assert_allclose(one.points.pixels, other.points.pixels, rtol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("image", "said"),
+    [
+        (np.zeros((576, 720, 3)), "float64 of shape (576, 720, 3)"),
+        (np.zeros((576, 720, 3), np.uint16), "uint16 of shape"),
+        (np.zeros((3, 576, 720), np.uint8), "uint8 of shape (3, 576, 720)"),
+        (np.zeros((576, 720, 1), np.uint8), "(576, 720, 1)"),
+        (np.zeros((0, 0, 3), np.uint8), "(0, 0, 3)"),
+        ([[0]], "list"),
+    ],
+)
+def test_an_array_that_is_no_image_is_refused(image, said) -> None:
+    with pytest.raises(aqualvs.AqualvsError) as fault:
+        aqualvs.planes_of_image(image)
+    assert said in str(fault.value)
+    assert "expected uint8" in str(fault.value)
+
+
+@pytest.mark.parametrize("image", [np.zeros((576, 720, 3), np.uint8), None])
+def test_what_is_no_frame_is_refused_by_the_scanner(image) -> None:
+    scanner = aqualvs.Scanner(aqualvs.load_rig(files("aqualvs") / "data" / "demo" / "rig.yaml"))
+    with pytest.raises(aqualvs.AqualvsError, match="make one of an image"):
+        scanner.process(image)
+    with pytest.raises(aqualvs.AqualvsError, match="planes_of_image"):
+        scanner.process(aqualvs.Frame(0, 0.0, np.zeros((576, 720, 3), np.uint8)))
+
+
+@pytest.mark.parametrize("words", [{"detector": "threshold"}, {"mesh_filter": "paper"}])
+def test_a_word_in_place_of_options_is_refused(words) -> None:
+    with pytest.raises(aqualvs.AqualvsError, match="give its options"):
+        aqualvs.ScannerOptions(**words)
+
+
 def test_words_of_the_scanners_options_are_checked() -> None:
     options = aqualvs.ScannerOptions(target="net", fit="pseudo_inverse")
     assert options.target.value == "net"
@@ -83,3 +117,9 @@ def test_a_frame_that_does_not_fit_is_a_fault_of_input() -> None:
         for kind in (aqualvs.AqualvsError, ValueError):
             with pytest.raises(kind, match=r"^frame 0 "):
                 scanner.process(frame)
+
+
+def test_a_picture_that_opencv_could_not_read_is_named() -> None:
+    board = Path(__file__).parent / "data" / "real-wall" / "board.yaml"
+    with pytest.raises(aqualvs.AqualvsError, match="picture 1: None; cv2"):
+        aqualvs.calibrate_camera([np.zeros((576, 720), np.uint8), None], board)

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from aqualvs.scanning.scan import Label as Label
     from aqualvs.scanning.scan import Scan as Scan
     from aqualvs.scanning.scan import ScanPoints as ScanPoints
+    from aqualvs.scanning.scan import planes_of_image as planes_of_image
     from aqualvs.simulation.calibration_set import CalibrationFiles as CalibrationFiles
     from aqualvs.simulation.calibration_set import SetSize as SetSize
     from aqualvs.simulation.calibration_set import simulate_calibration as simulate_calibration
@@ -62,6 +63,7 @@ _MODULES = {
     "calibrate_water": "aqualvs.calibrate.water",
     "load_rig": "aqualvs.optics.rigfile",
     "open_source": "aqualvs.sources",
+    "planes_of_image": "aqualvs.scanning.scan",
     "read_run": "aqualvs.results.net_survey",
     "run": "aqualvs.pipeline",
     "save_rig": "aqualvs.optics.rigfile",

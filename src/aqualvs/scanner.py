@@ -76,8 +76,15 @@ class ScannerOptions:
     def __post_init__(self) -> None:
         """Convert strings to members of their enumerations.
 
-        Raises `OptionError` if there is no such member.
+        Raises `OptionError` if there is no such member, or a string stands for options.
         """
+        for name in ("detector", "mesh_filter"):
+            if isinstance(getattr(self, name), str):
+                raise OptionError(
+                    f"ScannerOptions: {name} is {getattr(self, name)!r}; give its options, such as "
+                    "ThresholdOptions() of aqualvs.scanning.stripe, or MeshFilterOptions() of "
+                    "aqualvs.scanning.paper.mesh_filter"
+                )
         object.__setattr__(self, "target", _enum_member(TargetKind, "target", self.target))
         object.__setattr__(self, "fit", _enum_member(FitMethod, "fit", self.fit))
 
@@ -172,8 +179,13 @@ class Scanner:
         Raises
         ------
         FrameError
-            If the frame has another size than the rig's image, or is another field.
+            If it is no frame, has another size than the rig's image, or is another field.
         """
+        if not isinstance(frame, Frame):
+            raise FrameError(
+                f"expected a Frame but got {type(frame).__name__}; make one of an image by "
+                "aqualvs.Frame(index, time_s, *aqualvs.planes_of_image(image))"
+            )
         return self.measure(frame.index, frame.time_s, self.detect(frame))
 
     def detect(self, frame: Frame) -> dict[SearchAxis, StripePeaks]:

@@ -322,8 +322,11 @@ def _each_picture(pictures: Pictures) -> list[Picture]:
     """
     if isinstance(pictures, str | Path):
         return list(picture_paths([pictures]))
-    each = list(pictures)
+    each: list[Any] = list(pictures)
     for i, one in enumerate(each):
+        if one is None:
+            remedy = "cv2.imread returns it for a file that it cannot read; check the path"
+            raise CalibrationError(f"picture {i}: None; {remedy}")
         if not isinstance(one, str | Path) and (
             one.dtype != np.uint8 or (one.ndim != 2 and (one.ndim != 3 or one.shape[2] != 3))
         ):

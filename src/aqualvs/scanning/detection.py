@@ -301,9 +301,10 @@ class FrameDetector:
         FrameError
             If the frame has another size, or is not of 8 bits.
         """
-        if frame.luma.dtype != np.uint8:
+        if frame.luma.dtype != np.uint8 or frame.luma.ndim != 2:
             raise FrameError(
-                f"frame {frame.index} holds {frame.luma.dtype} but expected uint8; convert it"
+                f"frame {frame.index} holds {frame.luma.dtype} of {frame.luma.ndim} dimensions but "
+                "expected uint8 of 2; convert it, colours by aqualvs.planes_of_image"
             )
         height, width = frame.luma.shape
         if (width, height) != self._size_px:

@@ -8,12 +8,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from aqualvs.errors import FrameError
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.optics.shutter import Field
 from aqualvs.scanning.posture import Posture, Refusal
 
 ImagePlane: TypeAlias = NDArray[np.uint8]
 Planes: TypeAlias = tuple[ImagePlane, tuple[ImagePlane, ImagePlane] | None]
+
+# Of grey images; of colours, which may have transparency.
+_CHANNELS = ((), (3,), (4,))
 
 # U and V by blue, green, red and 1 (BT.601, limited range).
 _UV_OF_BGR = np.array([[0.4392, -0.2910, -0.1482, 128.0], [-0.0714, -0.3678, 0.4392, 128.0]])
@@ -77,7 +81,19 @@ def planes_of_image(image: ImagePlane) -> Planes:
     luma, chroma
         As in `Frame`; BT.601 limited range, as videos have it. Chroma is the mean over its four
         pixels: OpenCV's conversion takes that of one of them, which moves it by half a pixel.
+
+    Raises
+    ------
+    FrameError
+        If the image has another type or shape.
     """
+    shape, dtype = getattr(image, "shape", ()), getattr(image, "dtype", None)
+    if dtype != np.uint8 or 0 in shape or len(shape) not in (2, 3) or shape[2:] not in _CHANNELS:
+        given = type(image).__name__ if dtype is None else f"{dtype} of shape {shape}"
+        raise FrameError(
+            f"image: is {given} but expected uint8 of shape (height, width), or (height, width, 3) "
+            "in blue, green, red; scale it to 0 to 255 and convert it"
+        )
     if image.ndim == 2:
         return image, None
     height, width = image.shape[:2]

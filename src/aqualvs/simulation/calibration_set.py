@@ -149,7 +149,7 @@ class _Job:
 
 def simulate_calibration(
     rig: Rig,
-    out: Path,
+    out: Path | str,
     *,
     size: SetSize | None = None,
     progress: Callable[[int, int], None] | None = None,
@@ -170,7 +170,7 @@ def simulate_calibration(
     ----------
     rig : Rig
         The truth; with a housing and at least one laser.
-    out : Path
+    out : Path or str
         Made if it is missing; files of an earlier set in it are overwritten.
     size : SetSize, optional
         Numbers of pictures.
@@ -189,7 +189,7 @@ def simulate_calibration(
     OutputError
         If the folder or a file cannot be written.
     """
-    size = SetSize() if size is None else size
+    size, out = SetSize() if size is None else size, Path(out)
     _check(rig, size)
     job = _Job(rig, out, size, seed, progress, camera)
     with writable(out):
