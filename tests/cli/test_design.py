@@ -164,6 +164,7 @@ def test_the_note_of_the_mounts_is_read_back_by_the_rig_file(tmp_path):
     ("arguments", "words"),
     [
         (["--image", "1920"], "--image 1920: write 2 numbers as NxN"),
+        (["--range-mm", "300,5:1200"], "write 2 numbers as N:N, decimals with a point"),
         (["--lens-mm", "0,a,0"], "--lens-mm 0,a,0: write 3 numbers"),
         (["--range-mm", "900:300"], "nearest range first"),
         (["--lasers", "0"], "lasers.count is 0"),

@@ -132,7 +132,10 @@ def test_without_a_log_whole_dives_are_compared_and_it_says_so(cage, tmp_path, c
     out = tmp_path / "out"
     assert main(["net-change", str(before), str(after), *dates, "-o", str(out)]) == 0
     said = capsys.readouterr().out
-    assert "only whole dives: depth and bearing are known on fewer than two dates" in said
+    assert (
+        "only whole dives: depth and bearing are known on fewer than two dates, of 3 stretches"
+        in said
+    )
     assert "--log" in said
     (row,) = rows(out / "net_change.csv")
     assert (row["cell"], row["depth_from_m"]) == ("all", "")

@@ -5,9 +5,11 @@ from pathlib import Path
 
 import pytest
 
+from aqualvs.control.vehicle import SetpointHolder
 from aqualvs.errors import OptionError
 from aqualvs.live.mavlink.ardusub_commands import Command
-from aqualvs.live.options import VehicleSetup, load_vehicle
+from aqualvs.live.options import Page, VehicleSetup, load_vehicle
+from live_cases import demo_rig
 
 
 def write(folder: Path, text: str) -> Path:
@@ -63,3 +65,15 @@ def test_faults_are_one_line(tmp_path: Path, text: str, words: str) -> None:
     assert str(caught.value).startswith(f"{path}: ")
     assert words in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("host", "shown"), [("0.0.0.0", "127.0.0.1"), ("127.0.0.1", "127.0.0.1")])
+def test_the_address_that_is_printed_can_be_opened(host: str, shown: str) -> None:
+    pytest.importorskip("starlette")
+    said: list[str] = []
+    holder = SetpointHolder((0.3, 2.0))
+    page = Page.of(f"{host}:0", "a-token-of-the-test")
+    page.serve(demo_rig(), holder, None, said.append, lambda: None).close()
+    (line,) = said
+    assert line.startswith(f"dashboard: http://{shown}:")
+    assert ("on other machines" in line) == (host != shown)

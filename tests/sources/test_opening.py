@@ -239,6 +239,25 @@ def test_lost_frames_of_a_recording_are_counted_and_its_faults_told(tmp_path):
         list(open_feed(path, realtime=False))
 
 
+@pytest.mark.parametrize(
+    ("typed", "hint"),
+    [
+        ("5600", "udp://:5600"),
+        ("udp:5600", "udp://:5600"),
+        ("0.0.0.0:5602", "udp://:5602"),
+        ("camera", "camera:0"),
+        ("1", "camera:1"),
+        ("dive5600", ""),
+    ],
+)
+def test_a_mistyped_port_or_camera_is_told_what_to_type(typed, hint, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SourceError, match="no such file or folder; check the path") as fault:
+        open_feed(typed)
+    assert hint in str(fault.value)
+    assert ("or type" in str(fault.value)) == bool(hint)
+
+
 def test_a_missing_file_is_refused_at_once(tmp_path):
     with pytest.raises(SourceError, match="no such file"):
         open_feed(tmp_path / "missing.mp4")

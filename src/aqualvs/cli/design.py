@@ -131,4 +131,5 @@ def _split(text: str | None, between: str, count: int, option: str) -> list[floa
         return [int(p) if re.fullmatch(r"[+-]?\d+", p.strip()) else float(p) for p in pieces]
     except ValueError:
         shown = between.join("N" * count)
-        raise OptionError(f"{option} {text}: write {count} numbers as {shown}") from None
+        point = ", decimals with a point" if "," in text else ""
+        raise OptionError(f"{option} {text}: write {count} numbers as {shown}{point}") from None

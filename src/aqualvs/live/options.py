@@ -259,6 +259,9 @@ class Page:
 
         controls = Controls(holder, RecordButton(recorder))
         server = DashboardServer(self.host, self.port, self.access, rig, controls)
-        shown = f"[{self.host}]" if ":" in self.host else self.host
-        echo(f"dashboard: http://{shown}:{server.port}/#token={self.access.token}")
+        # No browser opens the address that stands for all of this machine's.
+        is_any = self.host in ("0.0.0.0", "::")
+        shown = "127.0.0.1" if is_any else f"[{self.host}]" if ":" in self.host else self.host
+        elsewhere = "  (on other machines: this one's address for 127.0.0.1)" if is_any else ""
+        echo(f"dashboard: http://{shown}:{server.port}/#token={self.access.token}{elsewhere}")
         return Dashboard(server, controls, vehicle)

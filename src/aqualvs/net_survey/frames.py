@@ -64,8 +64,8 @@ def common_frame(surveys: Sequence[Survey]) -> tuple[WallFrame | None, str]:
     known = [one for one in surveys if has_places(one)]
     if len({one.date for one in known}) < 2:
         return None, (
-            "depth and bearing are known on fewer than two dates; add the vehicles' logs: "
-            "aqualvs net RUN --log LOG --overwrite"
+            f"depth and bearing are known on fewer than two dates, of {_MIN_KNOWN} stretches or "
+            "more; add the vehicles' logs: aqualvs net RUN --log LOG --overwrite"
         )
     radii = [radius for radius in map(_radius, known) if radius is not None]
     if radii:

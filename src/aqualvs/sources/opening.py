@@ -5,6 +5,7 @@ dives are videos.
 """
 
 import math
+import re
 import threading
 import time
 from collections.abc import Iterator
@@ -230,8 +231,17 @@ def existing_path(where: str | Path, topic: str | None = None) -> tuple[Path, st
     """
     path, topic = _split_topic(where, topic)
     if not path.exists():
-        raise SourceError(f"{path}: no such file or folder; check the path")
+        raise SourceError(f"{path}: no such file or folder; check the path{_hint(str(path))}")
     return path, topic
+
+
+def _hint(where: str) -> str:
+    """Return what to type instead of a port or a camera's number; empty for anything else."""
+    if port := re.fullmatch(r"(?:(?:udp|rtp):)?(?:[\d.]*:)?(\d{4,5})", where.lower()):
+        return f", or type udp://:{port[1]} for the stream at this port"
+    if camera := re.fullmatch(r"(?:camera)?(\d?)", where.lower()):
+        return f", or type camera:{camera[1] or 0} for a camera"
+    return ""
 
 
 def is_bag(path: Path) -> bool:
