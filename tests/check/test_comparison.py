@@ -12,6 +12,7 @@ from rich.console import Console
 from aqualvs.check.comparison import run_compare
 from aqualvs.errors import RigError
 from aqualvs.geometry.planes import Plane
+from aqualvs.optics.lens import LensModel
 from aqualvs.optics.rig import Rig, RigUncertainty, rig_moved_by, rig_parameter_names
 from aqualvs.optics.rigfile import save_rig
 from aqualvs.optics.solved import with_uncertainty
@@ -126,8 +127,8 @@ def test_lasers_of_other_names_are_compared_where_they_lie(tmp_path: Path) -> No
         (bluerov2_rig(), "The pictures are 1920x1080 px and were 720x576 px"),
         (replace(example_rig(), housing=None), "Only the old rig has a dome."),
         (
-            replace(example_rig(), lens=replace(example_rig().lens, distortion=())),
-            "The lens models differ",
+            replace(example_rig(), lens=replace(example_rig().lens, model=LensModel.FISHEYE)),
+            "The intrinsics cannot be compared",
         ),
         (replace(example_rig(), lasers=example_rig().lasers[:2]), "Laser 'right' is gone."),
         (
@@ -156,6 +157,24 @@ def test_what_cannot_be_compared_is_said(tmp_path: Path, new: Rig, words: str) -
     if new.name == "one":
         new = rig_moved_by(new, ("lens_y",), np.array([1e-3]))
     assert words in compared(new, old, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("distortion", "words"),
+    [
+        ((0.0,), "Nothing has changed: the lens, the camera, the intrinsics"),
+        ((0.0, 0.0, 0.0, 0.0), "Nothing has changed: the lens, the camera, the intrinsics"),
+        ((3.0,), "by distortion (no sigma is known); not changed at all: the lens, the camera"),
+    ],
+)
+def test_coefficients_that_are_left_out_are_zero(
+    tmp_path: Path, distortion: tuple[float, ...], words: str
+) -> None:
+    old = example_rig()
+    lens = replace(old.lens, distortion=(*old.lens.distortion, *distortion))
+    new = replace(old, lens=lens)
+    assert words in " ".join(compared(new, old, tmp_path).split())
+    assert words in " ".join(compared(old, new, tmp_path).split())
 
 
 def test_malformed_notes_name_the_file(tmp_path: Path) -> None:

@@ -137,6 +137,15 @@ def _camera_changes(new: Rig, old: Rig) -> dict[str, float]:
     return changes | small
 
 
+def _with_all_coefficients(rig: Rig, other: Rig) -> Rig:
+    """Return a rig with as many distortion coefficients as another; those left out are 0."""
+    n_more = len(other.lens.distortion) - len(rig.lens.distortion)
+    if n_more <= 0 or rig.lens.model != other.lens.model:
+        return rig
+    distortion = (*rig.lens.distortion, *[0.0] * n_more)
+    return replace(rig, lens=replace(rig.lens, distortion=distortion))
+
+
 def same_lens_model(new: Rig, old: Rig) -> bool:
     """Return whether the intrinsics of two rigs mean the same."""
     return (
@@ -274,6 +283,8 @@ def run_compare(new: Path, old: Path, console: Console | None = None) -> int:
     """
     new_rig, new_uncertainty = _loaded(new)
     old_rig, old_uncertainty = _loaded(old)
+    new_rig = _with_all_coefficients(new_rig, old_rig)
+    old_rig = _with_all_coefficients(old_rig, new_rig)
     # Names are the user's, or made up by a calibration: the same laser may have two.
     called = _names_before(new_rig, old_rig)
     lasers = [replace(one, name=called.get(one.name, one.name)) for one in new_rig.lasers]
@@ -301,6 +312,10 @@ def compared_parts(new: Rig, old: Rig, difference: RigDifference) -> list[Compar
     parts = [_lens_part(difference), _turn_part(difference)]
     if same_lens_model(new, old):
         parts.append(_intrinsics_part(new, old, difference))
+    else:
+        parts.append(
+            ComparedPart("the intrinsics", "cannot be compared", "", None, moved=True, matters=True)
+        )
     if new.dome is not None and old.dome is not None:
         parts += [_shell_part(difference), _water_part(difference)]
     if new.flat_port is not None and old.flat_port is not None:
@@ -364,10 +379,23 @@ def _turn_part(difference: RigDifference) -> ComparedPart:
 def _intrinsics_part(new: Rig, old: Rig, difference: RigDifference) -> ComparedPart:
     share = max(abs(new.lens.fx / old.lens.fx - 1.0), abs(new.lens.fy / old.lens.fy - 1.0))
     centre = math.hypot(difference.of("cx"), difference.of("cy"))
-    did = f"changed by {share:.2%} in focal length and {centre:.2g} px in the principal point"
-    matters = share > _FOCAL_SHARE or centre > _CENTRE_PX
+    bent = _bent_px(new, old)
+    did = f"changed by {share:.2%} in focal length, {centre:.2g} px in the principal point"
+    did += f" and {bent:.2g} px (rms) by distortion"
+    matters = share > _FOCAL_SHARE or max(centre, bent) > _CENTRE_PX
     names = old.lens.parameter_names
     return _part(difference, "the intrinsics", names, did, matters)
+
+
+def _bent_px(new: Rig, old: Rig) -> float:
+    """Return how far the new distortion moves the old pixels, rms over the picture."""
+    width, height = old.size_px
+    across = np.meshgrid(np.linspace(0.0, width - 1.0, 17), np.linspace(0.0, height - 1.0, 17))
+    pixels = np.stack(across, axis=-1).reshape(-1, 2)
+    directions, seen = old.lens.directions(pixels)
+    moved, valid = replace(old.lens, distortion=new.lens.distortion).pixels(directions)
+    way = np.sum((moved - pixels)[seen & valid] ** 2, axis=-1)
+    return float(np.sqrt(way.mean())) if way.size else math.inf
 
 
 def _shell_part(difference: RigDifference) -> ComparedPart:
