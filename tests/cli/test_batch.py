@@ -138,6 +138,9 @@ def test_bad_input_is_refused_in_one_line(tmp_path, season, refused):
     (tmp_path / "file").touch()
     rig = ("--rig", season / "rig.yaml")
     assert "choose another folder" in refused("batch", season, "-o", tmp_path / "file", *rig)
+    assert "another folder for the results" in refused("batch", season, "-o", season, *rig)
+    assert "no such file" in refused("batch", season, "-o", out, "--rig", tmp_path / "no.yaml")
+    assert not out.exists()
 
 
 def test_help_shows_an_example(capsys):

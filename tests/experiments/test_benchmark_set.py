@@ -74,6 +74,7 @@ HEAD = "frame,range_m,pitch_deg,yaw_deg\n"
 FAULTS = {
     "no column yaw_deg": "frame,range_m,pitch_deg\n0,0.4,1\n",
     "no column range_m or range_mm": "frame,distance,pitch_deg,yaw_deg\n0,0.4,1,2\n",
+    "range_m is 400 in the first row, which is another unit": f"{HEAD}0,400,1,2\n",
     "holds no rows": HEAD,
     "line 3: range_m is '0,4 m'": f'{HEAD}0,0.4,1,2\n1,"0,4 m",1,2\n',
     "frame '7' is not in clear_near; its frames are 0 to 2": f"{HEAD}7,0.4,1,2\n",

@@ -20,6 +20,7 @@ from aqualvs.batch.work import DiveWork, size_of
 from aqualvs.closing import Closing
 from aqualvs.errors import OptionError, OutputError
 from aqualvs.nets.target_file import NetRequest
+from aqualvs.optics.rigfile import load_rig
 from aqualvs.results.files import AppendFile, Claim, is_locked, read_json, replace_text, writing
 from aqualvs.results.run_request import RunRequest, Water
 from aqualvs.scanner import ScannerOptions
@@ -108,6 +109,8 @@ def batch(request: BatchRequest, echo: Callable[[str], object]) -> int:
 def _check(request: BatchRequest) -> None:
     if not request.dives:
         raise OptionError("DIVES: missing; name videos, folders, patterns or a list of dives")
+    if request.rig is not None:
+        load_rig(request.rig)
     if request.scheduler is not None and request.n_workers is not None:
         raise OptionError("--workers: the scheduler has its own workers; leave one of them out")
     if request.n_workers is not None and request.n_workers < 1:

@@ -243,7 +243,8 @@ def find_dives(
     RigError
         If a dive has no rig.
     OptionError
-        If a dive is given twice with different rigs, water or names, or a list cannot be read.
+        If a dive is given twice with different rigs, water or names, a folder of dives is `out` or
+        in it, or a list cannot be read.
     """
     found: dict[Path, Dive] = {}
     for listed in _found_dives(wanted, out):
@@ -286,6 +287,8 @@ def _expanded(text: str) -> list[Path]:
 def _dives_in(folder: Path, out: Path | None) -> list[Path]:
     """Return the dives below a folder; without any video, each folder of images is one."""
     own = out.resolve() if out is not None else None
+    if own is not None and folder.resolve().is_relative_to(own):
+        raise OptionError(f"-o {out}: is where {folder} is; choose another folder for the results")
     found = []
     for path in _visible(folder):
         if own is not None and path.resolve().is_relative_to(own):

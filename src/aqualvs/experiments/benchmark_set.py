@@ -20,7 +20,7 @@ from aqualvs import __version__
 from aqualvs.errors import OptionError, SourceError, check_commas
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.results.files import Claim, writing
-from aqualvs.results.summary import RANGE_UNITS, Row, range_column
+from aqualvs.results.summary import RANGE_UNITS, Row, check_range_unit, range_column
 from aqualvs.simulation.benchmark import (
     BENCHMARK_NAME,
     CONTRAST_LIMIT,
@@ -390,6 +390,8 @@ def _answers(path: Path, rows: list[tuple[int, Row]], dive: DiveTruth) -> Answer
         found.valid[place] = _valid(path, i, row, numbers[0])
         found.posture[place] = [numbers[0] * unit, *numbers[1:]]
         found.sigma[place] = [sigmas[0] * unit, *sigmas[1:]]
+    if found.valid.any():
+        check_range_unit(path, rows[0][1], float(np.median(found.posture[found.valid, 0])))
     return found
 
 

@@ -127,15 +127,24 @@ def read_truth(path: Path) -> dict[int, tuple[float, float, float]]:
 def _truth(path: Path, rows: list[Row]) -> dict[int, tuple[float, float, float]]:
     """Return what `read_truth` reads, from rows of a file."""
     found = _postures(path, rows)
-    # Metres in millimetres' place, or the other way round: no camera sees as near, or as far.
+    if found:
+        check_range_unit(path, rows[0], max(value for value, _, _ in found.values()))
+    return found
+
+
+def check_range_unit(path: Path, first: Row, range_m: float) -> None:
+    """Raise `SourceError` where metres are in millimetres' place, or the other way round.
+
+    `first`: row to show. `range_m`: a typical range by the name of its column.
+    """
+    # No camera sees as near, or as far.
     nearest, farthest = 0.02, 50.0
-    if found and not nearest < max(value for value, _, _ in found.values()) < farthest:
-        own_column = range_column(path, rows[0])
+    if not nearest < range_m < farthest:
+        own_column = range_column(path, first)
         raise SourceError(
-            f"{path}: {own_column} is {rows[0][own_column]} in the first row, which is another "
+            f"{path}: {own_column} is {first[own_column]} in the first row, which is another "
             "unit; name the column range_m for metres, range_mm for millimetres"
         )
-    return found
 
 
 def _postures(path: Path, rows: list[Row]) -> dict[int, tuple[float, float, float]]:
