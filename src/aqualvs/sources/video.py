@@ -140,7 +140,7 @@ pictures that the decoder still holds."""
 
 
 _MAX_HELD = 16
-"""Pictures that H.264 and HEVC can reorder. Encoders without delay may call all pictures B."""
+"""Pictures that H.264 and HEVC can reorder."""
 
 
 class VideoSource(Closing):
@@ -211,13 +211,15 @@ class VideoSource(Closing):
         """
         if self._is_at_end:
             raise SourceError(f"{self.name}: has been read to its end; open it again")
+        codec = self._stream.codec_context
         for picture in self._pictures():
             if self._has_decoding_times:
                 picture.pts = self._frame_counter.time_in_order(picture)
             index = self._frame_counter.number(picture.pts)
             if self._is_sound(picture):
                 self._held.append(self._frame(picture, index))
-                if picture.pict_type != PictureType.B or len(self._held) > _MAX_HELD:
+                is_last = picture.pict_type != PictureType.B or not codec.has_b_frames
+                if is_last or len(self._held) > _MAX_HELD:
                     yield from self._released()
         yield from self._released()
         self._is_at_end = True
