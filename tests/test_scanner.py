@@ -414,6 +414,20 @@ def test_without_its_dome_the_camera_reads_another_posture() -> None:
     assert not found or abs(found.range / 0.9 - 1.0) > 0.03 or abs(np.rad2deg(found.pitch)) > 3.0
 
 
+@pytest.mark.parametrize("rough_px", [0.1, 1.2])
+def test_small_gaps_without_long_lines_are_a_nets_if_the_surface_is_rough(rough_px: float) -> None:
+    """Growth leaves small gaps, as the joints of a mosaic, which is smooth."""
+
+    def lit(points: FloatArray) -> BoolArray:
+        return np.hypot(points[:, 0], points[:, 2]) % 0.034 < 0.03
+
+    peaks = peaks_of(example_rig(), [(plane(0.5), lit)], rough_px)
+    scan = Scanner(example_rig()).measure(0, 0.0, peaks)
+    assert isinstance(scan.posture, Posture)
+    expected = Label.SOLID if rough_px < 0.5 else Label.NET
+    assert np.mean(scan.points.label == expected) > 0.9
+
+
 def range_variance_of_net(width: float, pull: float = 0.0) -> float:
     """Return the variance of the range to a net at 0.5 m, pulled to the near side of stripes."""
     peaks = peaks_of(example_rig(), [(plane(0.5), broken)], 0.05)

@@ -278,11 +278,13 @@ class Scanner:
         stripes = _Stripes(candidates, subsegments, shapes, assignment)
         choice = self._choose_target(stripes, surfaces)
         measurement = self._measure_target(stripes, choice)
-        solid = _as_solid(choice.target, measurement)
-        if self.options.target is TargetKind.AUTO and solid is not None:
-            surfaces = _with_replaced(choice.surfaces, solid)
-            choice = choice._replace(surfaces=surfaces, target=solid)
-            measurement = self._measure_target(stripes, choice)
+        other = _as_other_kind(choice.target, measurement, self.rig.focal_px)
+        if self.options.target is TargetKind.AUTO and other is not None:
+            surfaces = _with_replaced(choice.surfaces, other)
+            changed = choice._replace(surfaces=surfaces, target=other)
+            again = self._measure_target(stripes, changed)
+            if again.posture or not measurement.posture:
+                choice, measurement = changed, again
         # The kind of surface that every point lies on.
         points, rows = label_candidates(
             candidates,
@@ -428,16 +430,29 @@ def _with_replaced(surfaces: list[Surface], changed: Surface) -> list[Surface]:
     return [changed if one.members is changed.members else one for one in surfaces]
 
 
-def _as_solid(target: Surface | None, found: Measurement) -> Surface | None:
-    """Return a net as solid if its strands are too few for a posture and its lines are a wall's.
+def _as_other_kind(
+    target: Surface | None, measurement: Measurement, focal_px: float
+) -> Surface | None:
+    """Return a target as solid, or as a net, if it is likely to be that.
 
-    Noise breaks the lines of a dim picture as twine does.
+    Noise breaks the lines of a dim picture as twine does: a net whose strands are too few for a
+    posture is solid if its lines are a wall's. Growth fills the gaps of a net: what has small gaps
+    only, but no long lines either, and is rough, is a net.
     """
-    too_little = (Reason.ONE_LASER, Reason.COLLINEAR, Reason.TOO_FEW_POINTS)
-    if target is None or found.posture or found.posture.reason not in too_little:
+    if target is None:
         return None
-    (solid,) = as_requested_kind([target], TargetKind.SOLID)
-    return solid if target.is_mesh and not solid.is_mesh else None
+    too_little = (Reason.ONE_LASER, Reason.COLLINEAR, Reason.TOO_FEW_POINTS)
+    posture = measurement.posture
+    if target.is_mesh and isinstance(posture, Refusal) and posture.reason in too_little:
+        (solid,) = as_requested_kind([target], TargetKind.SOLID)
+        return None if solid.is_mesh else solid
+    # Points scatter about walls by 0.15 to 0.5 px, in strong sun by 0.8, about grown nets that pass
+    # as solid by 0.5 to 1.6.
+    rough_px = 0.7
+    if posture and posture.rms * focal_px > rough_px * posture.range:
+        is_net = not target.is_mesh and not target.is_unbroken
+        return replace(target, is_mesh=True) if is_net else None
+    return None
 
 
 def _on_mesh(paper_filter: "PaperFilter", points: ScanPoints) -> BoolArray:
