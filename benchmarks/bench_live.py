@@ -27,7 +27,7 @@ from aqualvs.live.dashboard.output import Dashboard
 from aqualvs.live.dashboard.server import DashboardServer
 from aqualvs.live.outputs.base import Output
 from aqualvs.live.outputs.mavlink import MavlinkOutput
-from aqualvs.live.runner import LiveRunner, ScannerSupply, warm_up
+from aqualvs.live.runner import LiveRunner, ScannerProvider, warm_up
 from aqualvs.optics.rig import Rig
 from aqualvs.recording.sample import LiveSample
 from aqualvs.scanner import Scanner
@@ -136,18 +136,18 @@ def measure(rig: Rig, dive: Path) -> tuple[Clock, list[float]]:
     """Play the dive; returns the clock and the packets' delays in ms."""
     scanner = Scanner(rig)
     warm_up(scanner)
-    controls = Controls(SetpointHolder(rig.working_range), RecordButton())
+    controls = Controls(SetpointHolder(rig.working_range), RecordButton(None))
     server = DashboardServer("127.0.0.1", 0, Access("127.0.0.1", "unused"), rig, controls)
     clock = Clock()
     with script(_PEER) as peer, script(_WATCHER, str(server.port)) as viewer:
         outputs: list[Output] = [
             MavlinkOutput(f"udpout:127.0.0.1:{line_of(peer)}"),
             clock,
-            Dashboard(server, controls),
+            Dashboard(server, controls, lambda: None),
         ]
         line_of(viewer)
         feed = open_feed(dive, realtime=True)
-        LiveRunner(feed, ScannerSupply(scanner), outputs, posture_filter=PostureFilter()).run(
+        LiveRunner(feed, ScannerProvider(scanner), outputs, posture_filter=PostureFilter()).run(
             lambda: False
         )
         arrived = json.loads(line_of(peer))

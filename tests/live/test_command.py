@@ -413,7 +413,7 @@ def test_memory_and_handles_stay_flat_over_a_long_run(tmp_path: Path) -> None:
     n_frames = int(os.environ.get("AQUALVS_SOAK_FRAMES", "600"))
     from aqualvs.control.time_filter import PostureFilter
     from aqualvs.live.outputs.udp_json import UdpJsonOutput, receiver_address
-    from aqualvs.live.runner import LiveOptions, LiveRunner, ScannerSupply
+    from aqualvs.live.runner import LiveOptions, LiveRunner, ScannerProvider
     from aqualvs.recording import RecorderSwitch
     from live_cases import Collector, ScriptedFeed, demo_scanner, renumbered
 
@@ -442,7 +442,11 @@ def test_memory_and_handles_stay_flat_over_a_long_run(tmp_path: Path) -> None:
     switch.start()
     outputs = [Looks(), UdpJsonOutput([receiver_address("127.0.0.1:9")]), switch]
     LiveRunner(
-        feed, ScannerSupply(demo_scanner()), outputs, LiveOptions(keep_every=True), PostureFilter()
+        feed,
+        ScannerProvider(demo_scanner()),
+        outputs,
+        LiveOptions(keep_every=True),
+        PostureFilter(),
     ).run(lambda: False)
     memory, handles = np.array(sizes).T
     assert len(memory) == 8

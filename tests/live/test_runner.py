@@ -15,7 +15,7 @@ from aqualvs.control.vehicle import VehicleState
 from aqualvs.errors import SourceError
 from aqualvs.live import runner as live_runner
 from aqualvs.live.health_monitor import FrozenOptions
-from aqualvs.live.runner import Arrival, LiveOptions, LiveRunner, Mailbox, ScannerSupply
+from aqualvs.live.runner import Arrival, LiveOptions, LiveRunner, Mailbox, ScannerProvider
 from aqualvs.optics.shutter import AT_ONCE, Shutter, ShutterKind
 from aqualvs.scanner import Scanner
 from aqualvs.scanning.posture import Posture, Reason, Refusal
@@ -59,7 +59,7 @@ def runner(
 ) -> LiveRunner:
     return LiveRunner(
         ScriptedFeed(steps, endless=endless),
-        ScannerSupply(scanner or demo_scanner()),  # type: ignore[arg-type]
+        ScannerProvider(scanner or demo_scanner()),  # type: ignore[arg-type]
         outputs,
         # Most of these steps show one picture again and again.
         LiveOptions(keep_every=keep_every, frozen=FrozenOptions() if watches else None),
@@ -216,7 +216,7 @@ def test_a_source_faster_than_the_pipeline_costs_frames_but_no_delay(
             scanner.let_go.set()
 
     output = Collector()
-    LiveRunner(Fast([]), ScannerSupply(scanner), [output]).run(never)  # type: ignore[arg-type]
+    LiveRunner(Fast([]), ScannerProvider(scanner), [output]).run(never)  # type: ignore[arg-type]
     measured = [s for s in output.samples if s.frame is not None]
     assert [s.scan.index for s in measured] == [0, 399]
     assert (measured[-1].health.n_dropped, measured[-1].health.n_lost) == (398, 0)
@@ -344,7 +344,10 @@ def test_a_slow_output_gets_the_latest_and_delays_nobody(monkeypatch: pytest.Mon
             yield from super().__iter__()
 
     LiveRunner(
-        Late(steps[1:]), ScannerSupply(demo_scanner()), [slow, quick], LiveOptions(keep_every=True)
+        Late(steps[1:]),
+        ScannerProvider(demo_scanner()),
+        [slow, quick],
+        LiveOptions(keep_every=True),
     ).run(never)
     measured = [s for s in quick.samples if s.frame is not None]
     assert [s.scan.index for s in measured] == list(range(20))
@@ -360,7 +363,7 @@ def test_an_output_that_keeps_all_loses_nothing_at_the_end() -> None:
 
 
 def test_a_feed_that_can_never_work_ends_the_run_with_its_reason() -> None:
-    fault = LiveRunner(broken_feed(), ScannerSupply(demo_scanner()), []).run(never)
+    fault = LiveRunner(broken_feed(), ScannerProvider(demo_scanner()), []).run(never)
     assert isinstance(fault, SourceError)
     assert "no such camera" in str(fault)
 
@@ -447,7 +450,7 @@ def test_both_fields_of_a_picture_are_measured_with_their_own_times() -> None:
     steps: list[Step] = list(woven_pictures(4))
     feed, output = FrameFeed(ScriptedFeed(steps), FIELDS), Collector()
     options = LiveOptions(keep_every=True)
-    assert LiveRunner(feed, ScannerSupply(scanner), [output], options).run(never) is None
+    assert LiveRunner(feed, ScannerProvider(scanner), [output], options).run(never) is None
     assert [sample.scan.index for sample in output.samples] == list(range(8))
     assert sum(bool(sample.scan.posture) for sample in output.samples) >= 7
     for sample, frame in zip(output.samples, demo_frames(8), strict=True):
@@ -494,7 +497,7 @@ def test_a_still_interlaced_picture_is_noticed_though_its_fields_differ() -> Non
     pictures = woven_pictures(12)
     steps: list[Step] = [*pictures, *(_again(pictures[-1], i) for i in range(12, 32))]
     feed, output = FrameFeed(ScriptedFeed(steps), FIELDS), Collector()
-    scanner = ScannerSupply(Scanner(replace(demo_rig(), shutter=FIELDS)))
+    scanner = ScannerProvider(Scanner(replace(demo_rig(), shutter=FIELDS)))
     LiveRunner(feed, scanner, [output], LiveOptions(keep_every=True)).run(never)
     found = reasons(output)
     assert Reason.FROZEN not in found[:24]

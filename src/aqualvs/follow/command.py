@@ -125,7 +125,7 @@ class LoopPage:
             n_frames=report.frame + 1,
             source=PartHealth("simulation", State.OK, sensor),
             outputs=(
-                PartHealth("pilot", report.colour, report.words),
+                PartHealth("pilot", report.health_state, report.words),
                 PartHealth(link.name, State.OK, vehicle),
             ),
         )

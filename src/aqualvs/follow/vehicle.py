@@ -27,7 +27,7 @@ from aqualvs.live.options import VehicleSetup
 from aqualvs.live.outputs.base import Output
 from aqualvs.live.outputs.mavlink import MavlinkOutput
 from aqualvs.live.pilot import Pilot, PilotReport
-from aqualvs.live.runner import ScannerSupply, warm_up
+from aqualvs.live.runner import ScannerProvider, warm_up
 from aqualvs.recording.sample import LiveSample
 from aqualvs.results.files import Claim
 from aqualvs.results.run_request import prepared_rig
@@ -129,7 +129,7 @@ def follow_and_tell(
             runner = make_runner(
                 live,
                 rig,
-                lambda: ScannerSupply(scanner),
+                lambda: ScannerProvider(scanner),
                 holder,
                 echo,
                 first=_outputs(link, pilot, log),

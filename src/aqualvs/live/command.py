@@ -19,7 +19,7 @@ from aqualvs.control.vehicle import SetpointHolder, VehicleState
 from aqualvs.errors import OptionError
 from aqualvs.live.options import Page, vehicle_reader
 from aqualvs.live.outputs.base import Output
-from aqualvs.live.runner import LiveOptions, LiveRunner, ScannerSupply, warm_up
+from aqualvs.live.runner import LiveOptions, LiveRunner, ScannerProvider, warm_up
 from aqualvs.optics.rig import Rig
 from aqualvs.recording import PictureFormat, RecorderOptions, RecorderSwitch
 from aqualvs.recording.sample import LiveSample
@@ -35,7 +35,7 @@ from aqualvs.workers.run_frames import WaterFollowingScanner
 _TIMEOUT_S = 3.0
 
 
-class WaterFollower(ScannerSupply):
+class WaterFollower(ScannerProvider):
     """Provider of the scanner for the present water; a thread reads the target.
 
     `following`: looks at the target; used by the thread alone from here on.
@@ -45,7 +45,7 @@ class WaterFollower(ScannerSupply):
         self._following = following
         self._frames: queue.Queue[Frame | None] = queue.Queue(1)
         super().__init__(following.scanner, following.sigma_n_water)
-        self._thread = threading.Thread(target=self._look, name="water", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="water", daemon=True)
         self._thread.start()
 
     def offer(self, frame: Frame) -> None:
@@ -62,7 +62,7 @@ class WaterFollower(ScannerSupply):
         self._frames.put(None)
         self._thread.join(_TIMEOUT_S)
 
-    def _look(self) -> None:
+    def _run(self) -> None:
         while (frame := self._frames.get()) is not None:
             self._following.look(frame)
             self.scanner = self._following.scanner
@@ -126,17 +126,17 @@ def status_line(sample: LiveSample) -> str:
     posture, health = sample.scan.posture, sample.health
     if isinstance(posture, Posture):
         sigma = deviations(posture.total_covariance)
-        told = (
+        text = (
             f"range {posture.range:.3f} m ± {1e3 * sigma[0]:.1f} mm  "
             f"yaw {math.degrees(posture.yaw):+.1f} ± {sigma[2]:.2f} deg  "
             f"pitch {math.degrees(posture.pitch):+.1f} ± {sigma[1]:.2f} deg"
         )
     else:
-        told = f"no posture: {posture.detail or posture.reason.value}"
+        text = f"no posture: {posture.detail or posture.reason.value}"
     total = health.delays[-1] if health.delays else None
     delay = "" if total is None else f"  {1e3 * total.median_s:.1f} ms"
     dropped = f"  {health.n_dropped} dropped" if health.n_dropped else ""
-    return f"{told}  | {health.rate_hz:.0f} Hz{delay}{dropped}"
+    return f"{text}  | {health.rate_hz:.0f} Hz{delay}{dropped}"
 
 
 # Longest wait of a thread for the interpreter; Python's default of 5 ms would show in the delays.
@@ -199,7 +199,7 @@ def live_and_tell(request: LiveRequest, echo: Callable[[str], object]) -> int:
 def make_runner(
     request: LiveRequest,
     rig: Rig,
-    provider: Callable[[], ScannerSupply],
+    provider: Callable[[], ScannerProvider],
     holder: SetpointHolder,
     echo: Callable[[str], object],
     *,
@@ -223,16 +223,16 @@ def make_runner(
     options = RecorderOptions(
         pictures=PictureFormat.JPEG if request.record_video else None, scanner=request.scanner
     )
-    with ExitStack() as undo:
+    with ExitStack() as closing:
         outputs: list[Output] = []
 
         def add(more: Iterable[Output]) -> None:
             for output in more:
                 outputs.append(output)
-                undo.callback(output.close)
+                closing.callback(output.close)
 
         feed = FrameFeed(request.feed(), rig.shutter)
-        undo.callback(feed.close)
+        closing.callback(feed.close)
         add(first)
         recorder = RecorderSwitch(request.record_to, options)
         add([recorder, Console()])
@@ -246,15 +246,15 @@ def make_runner(
             # Where one of the parts above cannot be made, no file is left.
             echo(f"recording: {recorder.start()}")
         runner = LiveRunner(feed, provider(), outputs, every, smoothing)
-        undo.pop_all()
+        closing.pop_all()
     return runner
 
 
-def _provider(request: LiveRequest, rig: Rig) -> ScannerSupply:
+def _provider(request: LiveRequest, rig: Rig) -> ScannerProvider:
     if request.index_target is None:
         scanner = Scanner(rig, request.scanner)
         warm_up(scanner)
-        return ScannerSupply(scanner)
+        return ScannerProvider(scanner)
     following = WaterFollowingScanner(rig, request.scanner, request.index_target, request.water)
     warm_up(following.scanner)
     return WaterFollower(following)

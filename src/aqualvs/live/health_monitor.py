@@ -34,7 +34,7 @@ _ONES = np.ones(_CELL, np.float32)
 # Number of stored changes of a live picture, and the least number for their quantile: a vehicle in
 # swell has turned round by then, so that its slowest moments are known.
 _N_KEPT, _N_KNOWN = 250, 50
-_USUAL = 0.05
+_QUIET_QUANTILE = 0.05
 # Width to which a picture is reduced for its motion, and the side of a patch there, in pixels.
 _REDUCED_PX, _PATCH = 360, 16
 # Share of the patches that are compared: those with the strongest edges. The quantile of their
@@ -109,8 +109,8 @@ class FrozenPicture:
 
     def __init__(self, options: FrozenOptions | None = None) -> None:
         self.options = options or FrozenOptions()
-        self._usual: deque[float] = deque(maxlen=_N_KEPT)
-        self._begin()
+        self._changes: deque[float] = deque(maxlen=_N_KEPT)
+        self._restart()
 
     def update(self, time_s: float, luma: ImagePlane) -> float:
         """Return for how long the picture has stood still at most, in seconds; 0 for a live one.
@@ -124,24 +124,24 @@ class FrozenPicture:
         cells, reduced = _cell_means(luma), _reduced(luma)
         height, width = luma.shape
         if self._kept and not self._continues(time_s, (height, width)):
-            self._begin()
+            self._restart()
         while len(self._kept) > 1 and time_s - self._kept[1].time_s >= self._span_s:
             self._kept.popleft()
         self._compare(time_s, cells, reduced)
         self._kept.append(_Kept(time_s, (height, width), cells, _strong_patches(reduced)))
-        self._judge(time_s)
+        self._update_state(time_s)
         return 0.0 if math.isnan(self._since_s) else time_s - self._since_s
 
-    def _begin(self) -> None:
+    def _restart(self) -> None:
         self._kept: deque[_Kept] = deque()
         self._span_s = self.options.span_s - _EPS_S
         self._motions: deque[tuple[float, float]] = deque()
         # Of the last picture, in grey levels, and in pixels of the reduced one; NaN where there was
         # nothing to compare.
         self.change = self.motion = math.nan
-        self._go_on()
+        self._assume_live()
 
-    def _go_on(self) -> None:
+    def _assume_live(self) -> None:
         """Take the picture for a live one."""
         self._since_s = self._moved_s = self._doubted_s = self._pace = self._moving_s = math.nan
 
@@ -166,9 +166,9 @@ class FrozenPicture:
     def _limit(self) -> float:
         """Return the change below which a picture stands still."""
         options = self.options
-        if len(self._usual) < _N_KNOWN:
+        if len(self._changes) < _N_KNOWN:
             return options.least
-        quiet = float(np.quantile(np.array(self._usual), _USUAL))
+        quiet = float(np.quantile(np.array(self._changes), _QUIET_QUANTILE))
         return min(max(options.share * quiet, options.least), options.greatest)
 
     def _has_stopped(self, time_s: float) -> bool:
@@ -185,20 +185,20 @@ class FrozenPicture:
         lately = max(motion for at_s, motion in self._motions if at_s >= stop_s)
         return self._pace >= options.motion and lately < options.stop * self._pace
 
-    def _judge(self, time_s: float) -> None:
+    def _update_state(self, time_s: float) -> None:
         if math.isnan(self.change):
             return
         still = self.change < self._limit()
         if not math.isnan(self._since_s):
-            self._doubt(time_s, still=still)
+            self._check_for_motion(time_s, still=still)
         elif still | self._has_stopped(time_s):
             # The picture before the stop was compared with one so old: all until that may be live.
             self._since_s = self._kept[0].time_s if still else self._moving_s - self._span_s
             self._doubted_s = math.nan if still else time_s
         else:
-            self._usual.append(self.change)
+            self._changes.append(self.change)
 
-    def _doubt(self, time_s: float, *, still: bool) -> None:
+    def _check_for_motion(self, time_s: float, *, still: bool) -> None:
         """Look for signs of life in a frozen picture."""
         if still:
             self._doubted_s = math.nan
@@ -210,7 +210,7 @@ class FrozenPicture:
         # A key frame changes a still once, so it affects the comparison for one span.
         moves = time_s - self._moved_s > self.options.span_s
         if moves or time_s - self._doubted_s > self.options.confirmed_s:
-            self._go_on()
+            self._assume_live()
 
 
 def _upper(values: FloatArray | NDArray[np.float32], quantile: float) -> float:
@@ -324,7 +324,7 @@ class DriftWatch:
         while (scan := self._scans.get()) is not None:
             agreement.add(scan)
             if time.monotonic() - judged_s > _VERDICT_EVERY_S:
-                self.off = _off(agreement)
+                self.off = _suspects_of(agreement)
                 judged_s = time.monotonic()
 
 
@@ -338,7 +338,7 @@ def _agreement_of(rig: Rig) -> LaserAgreement | None:
         return None
 
 
-def _off(agreement: LaserAgreement) -> dict[int, str]:
+def _suspects_of(agreement: LaserAgreement) -> dict[int, str]:
     verdict = agreement.verdict()
     if verdict.state not in (AgreementState.DRIFTED, AgreementState.DISAGREE):
         return {}
@@ -357,7 +357,7 @@ _DARK_S = 2.0
 
 
 @dataclass(frozen=True, slots=True)
-class _Passed:
+class _FrameFigures:
     """Figures kept of one frame."""
 
     at_ns: int
@@ -375,7 +375,7 @@ class HealthMonitor:
     def __init__(self, rig: Rig) -> None:
         self._names = [laser.name for laser in rig.lasers]
         self._drift = DriftWatch(rig)
-        self._passed: deque[_Passed] = deque()
+        self._frames: deque[_FrameFigures] = deque()
         self._lit_ns = [0] * len(self._names)
         self._valid_ns = 0
         self._n_frames = 0
@@ -390,8 +390,8 @@ class HealthMonitor:
         times = (instants.arrived_ns, instants.taken_ns, instants.scanned_ns, sent_ns)
         wait, measure, send = (1e-9 * (b - a) for a, b in itertools.pairwise(times))
         total = wait + measure + send
-        self._passed.append(
-            _Passed(sent_ns, bool(scan.posture), quality, (wait, measure, send, total))
+        self._frames.append(
+            _FrameFigures(sent_ns, bool(scan.posture), quality, (wait, measure, send, total))
         )
         if scan.posture:
             self._valid_ns = sent_ns
@@ -415,9 +415,9 @@ class HealthMonitor:
         sigma_n_water: float,
     ) -> Health:
         """Return the state of things."""
-        while self._passed and now_ns - self._passed[0].at_ns > 1e9 * WINDOW_S:
-            self._passed.popleft()
-        recent = self._passed
+        while self._frames and now_ns - self._frames[0].at_ns > 1e9 * WINDOW_S:
+            self._frames.popleft()
+        recent = self._frames
         return Health(
             rate_hz=self._rate_hz(now_ns),
             valid_share=sum(p.valid for p in recent) / len(recent) if recent else float("nan"),
@@ -434,18 +434,18 @@ class HealthMonitor:
         )
 
     def _rate_hz(self, now_ns: int) -> float:
-        if len(self._passed) < 2:
+        if len(self._frames) < 2:
             return 0.0
         # While frames come the span ends with the last one; in silence the rate falls.
-        period_ns = (self._passed[-1].at_ns - self._passed[0].at_ns) / (len(self._passed) - 1)
-        silent_ns = now_ns - self._passed[-1].at_ns
-        span_ns = self._passed[-1].at_ns - self._passed[0].at_ns + max(0.0, silent_ns - period_ns)
-        return (len(self._passed) - 1) / max(1e-9 * span_ns, 1e-9)
+        period_ns = (self._frames[-1].at_ns - self._frames[0].at_ns) / (len(self._frames) - 1)
+        silent_ns = now_ns - self._frames[-1].at_ns
+        span_ns = self._frames[-1].at_ns - self._frames[0].at_ns + max(0.0, silent_ns - period_ns)
+        return (len(self._frames) - 1) / max(1e-9 * span_ns, 1e-9)
 
     def _delays(self) -> tuple[StageDelay, ...]:
-        if not self._passed:
+        if not self._frames:
             return ()
-        delays = np.array([p.delays_s for p in self._passed])
+        delays = np.array([p.delays_s for p in self._frames])
         middle, worst = np.quantile(delays, [0.5, 0.99], axis=0)
         return tuple(
             StageDelay(name, float(m), float(w))

@@ -91,7 +91,7 @@ class Watchdog:
         _log.warning("no new posture for %.2f s: neutral", late_s)
 
 
-_TELL_MODE = (
+_MODE_REASONS = (
     LimitReason.PILOT_MODE,
     LimitReason.NO_STATION,
     LimitReason.IGNORED,
@@ -113,11 +113,11 @@ class PilotReport:
     def words(self) -> str:
         """Action of the pilot, or the reason for none, in one line."""
         reason, doubt = self.decision.reason, self.state.doubt
-        told = words_of(reason, self.state) if reason else _aim(self.decision.guidance)
-        return f"{told}; {doubt}" if self.decision.engaged and doubt else told
+        text = words_of(reason, self.state) if reason else _aim_text(self.decision.guidance)
+        return f"{text}; {doubt}" if self.decision.engaged and doubt else text
 
     @property
-    def colour(self) -> State:
+    def health_state(self) -> State:
         """State for the health list."""
         if not self.decision.engaged:
             return State.OFF
@@ -126,13 +126,13 @@ class PilotReport:
 
 def words_of(reason: LimitReason, state: VehicleState) -> str:
     """Return the reason why efforts do not pass, with the vehicle's report of it."""
-    told = state.mode_name if reason in _TELL_MODE else ""
+    text = state.mode_name if reason in _MODE_REASONS else ""
     if reason is LimitReason.CONFLICT and state.mode is not Mode.CONFLICT:
-        told = state.rival
-    return f"{reason.words} ({told})" if told else reason.words
+        text = state.rival
+    return f"{reason.words} ({text})" if text else reason.words
 
 
-def _aim(guidance: Guidance) -> str:
+def _aim_text(guidance: Guidance) -> str:
     """Return the aim of a mission."""
     setpoint = guidance.setpoint
     if setpoint is None:
@@ -143,7 +143,7 @@ def _aim(guidance: Guidance) -> str:
 
 
 # Several, as datagrams may be lost; only one while the pilot moves his sticks, not to disturb him.
-_GOODBYES, _GOODBYES_TO_STICKS = 3, 1
+_NEUTRALS, _NEUTRALS_TO_STICKS = 3, 1
 
 
 class Pilot(Output):
@@ -175,13 +175,13 @@ class Pilot(Output):
         # Samples come from one thread, engaging from another.
         self._stepping = threading.Lock()
         # Neutrals still to be sent; negative while engaged.
-        self._goodbyes = 0
+        self._neutrals_left = 0
         self._seen_s = float("-inf")
         self._latest: PilotReport | None = None
         self._fault = ""
         self._unsent = ""
         self._n_unsent = 0
-        self._told: tuple[bool, LimitReason | None, str] = (False, LimitReason.NOT_ENGAGED, "")
+        self._logged: tuple[bool, LimitReason | None, str] = (False, LimitReason.NOT_ENGAGED, "")
 
     @property
     def engaged(self) -> bool:
@@ -203,11 +203,11 @@ class Pilot(Output):
             holds = isinstance(self._steering.mission, HoldMission)
             if holds and self._holder is not None and self._holder.setpoint is None:
                 raise OptionError(f"pilot: {LimitReason.NO_SETPOINT.words}; choose one first")
-            refused, state = self._begin()
+            refused, state = self._engage()
             if refused is not None:
                 raise OptionError(f"pilot: not engaged: {words_of(refused, state)}")
-            self._fault, self._goodbyes = "", 0
-            self._told = (True, None, "")
+            self._fault, self._neutrals_left = "", 0
+            self._logged = (True, None, "")
         _log.info("pilot: engaged")
 
     def disengage(self) -> None:
@@ -216,8 +216,8 @@ class Pilot(Output):
             if not self._steering.engaged:
                 return
             self._steering.disengage()
-            self._told = (False, LimitReason.NOT_ENGAGED, "")
-            self._goodbyes = _GOODBYES
+            self._logged = (False, LimitReason.NOT_ENGAGED, "")
+            self._neutrals_left = _NEUTRALS
             self._send(NEUTRAL)
         _log.info("pilot: disengaged")
 
@@ -229,25 +229,25 @@ class Pilot(Output):
                 state = self._vehicle.state()
                 decision = self._decide(sample, now_s, state)
             except Exception as fault:
-                self._give_up(fault)
+                self._stop_after(fault)
                 return
-            sent = replace(decision, effort=self._obey(decision))
+            sent = replace(decision, effort=self._execute(decision))
             at_ns, frame = round(1e9 * now_s), sample.scan.index
             self._latest = PilotReport(at_ns=at_ns, frame=frame, decision=sent, state=state)
-        self._tell(self._latest)
+        self._log_changes(self._latest)
 
     def health(self) -> PartHealth:
         """Return the pilot's action, or the reason for none."""
-        trouble = self._fault or self._unsent
-        if trouble:
-            return PartHealth(self.name, State.FAULT, trouble, self._n_unsent)
-        latest = self._latest
-        if latest is None or latest.decision.engaged is not self.engaged:
-            words = "engaged" if self.engaged else LimitReason.NOT_ENGAGED.words
-            return PartHealth(
-                self.name, State.OK if self.engaged else State.OFF, words, self._n_unsent
-            )
-        return PartHealth(self.name, latest.colour, latest.words, self._n_unsent)
+        latest, engaged = self._latest, self.engaged
+        if fault := self._fault or self._unsent:
+            state, words = State.FAULT, fault
+        elif latest is not None and latest.decision.engaged is engaged:
+            state, words = latest.health_state, latest.words
+        elif engaged:
+            state, words = State.OK, "engaged"
+        else:
+            state, words = State.OFF, LimitReason.NOT_ENGAGED.words
+        return PartHealth(self.name, state, words, self._n_unsent)
 
     def close(self) -> None:
         """Stop, send neutral and free the vehicle; further calls do nothing."""
@@ -255,7 +255,7 @@ class Pilot(Output):
         self._watchdog.close()
         self._vehicle.close()
 
-    def _begin(self) -> tuple[LimitReason | None, VehicleState]:
+    def _engage(self) -> tuple[LimitReason | None, VehicleState]:
         """Start control; return the reason if it cannot start, and the vehicle's state."""
         try:
             state = self._vehicle.state()
@@ -271,12 +271,12 @@ class Pilot(Output):
         return self._steering.step(
             now_s,
             sample.scan.time_s,
-            self._present(sample, now_s),
+            self._current_posture(sample, now_s),
             motion_of(sample.filtered),
             state,
         )
 
-    def _present(self, sample: LiveSample, now_s: float) -> Posture | Refusal:
+    def _current_posture(self, sample: LiveSample, now_s: float) -> Posture | Refusal:
         """Return the posture, unless measuring took so long that it is outdated."""
         posture, arrived_s = sample.scan.posture, 1e-9 * sample.instants.arrived_ns
         if not posture:
@@ -286,18 +286,22 @@ class Pilot(Output):
         self._seen_s = arrived_s
         return posture
 
-    def _obey(self, decision: Decision) -> Effort:
+    def _execute(self, decision: Decision) -> Effort:
         """Send the decided effort; return the sent one."""
         if decision.engaged:
-            self._goodbyes = -1
+            self._neutrals_left = -1
             return self._send(decision.effort)
-        if self._goodbyes < 0:
-            by_sticks = decision.reason is LimitReason.PILOT_STICKS
-            self._goodbyes = _GOODBYES_TO_STICKS if by_sticks else _GOODBYES
-        if self._goodbyes > 0:
-            self._goodbyes -= 1
-            self._send(NEUTRAL)
+        by_sticks = decision.reason is LimitReason.PILOT_STICKS
+        self._send_neutral(_NEUTRALS_TO_STICKS if by_sticks else _NEUTRALS)
         return NEUTRAL
+
+    def _send_neutral(self, n_after_effort: int) -> None:
+        """Send neutral, a limited number of times after an effort."""
+        if self._neutrals_left < 0:
+            self._neutrals_left = n_after_effort
+        if self._neutrals_left > 0:
+            self._neutrals_left -= 1
+            self._send(NEUTRAL)
 
     def _send(self, effort: Effort) -> Effort:
         """Send an effort that rests on the last posture; return the sent one."""
@@ -310,29 +314,25 @@ class Pilot(Output):
         self._unsent = ""
         return sent
 
-    def _give_up(self, fault: Exception) -> None:
+    def _stop_after(self, fault: Exception) -> None:
         """Stop after an exception of control, until engaged again."""
         words = f"stopped by a fault: {fault}"
         if words != self._fault:
             _log.exception("pilot: %s", words)
         self._fault = words
         self._steering.disengage()
-        self._told = (False, LimitReason.NOT_ENGAGED, "")
+        self._logged = (False, LimitReason.NOT_ENGAGED, "")
         if self._latest is not None:
             guidance = self._latest.decision.guidance
             stopped = Decision(NEUTRAL, LimitReason.NOT_ENGAGED, guidance, engaged=False)
             self._latest = replace(self._latest, decision=stopped)
-        if self._goodbyes < 0:
-            self._goodbyes = _GOODBYES
-        if self._goodbyes > 0:
-            self._goodbyes -= 1
-            self._send(NEUTRAL)
+        self._send_neutral(_NEUTRALS)
 
-    def _tell(self, report: PilotReport) -> None:
+    def _log_changes(self, report: PilotReport) -> None:
         """Log changes."""
-        told = (report.decision.engaged, report.decision.reason, report.state.doubt)
-        if told == self._told:
+        state = (report.decision.engaged, report.decision.reason, report.state.doubt)
+        if state == self._logged:
             return
-        self._told = told
-        level = logging.INFO if report.colour is State.OK else logging.WARNING
+        self._logged = state
+        level = logging.INFO if report.health_state is State.OK else logging.WARNING
         _log.log(level, "pilot, frame %d: %s", report.frame, report.words)

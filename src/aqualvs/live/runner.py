@@ -109,7 +109,7 @@ class OutputWorker:
 
     def __init__(self, output: Output) -> None:
         self._output = output
-        self._trouble = ""
+        self._fault = ""
         self._n_dropped = 0
         self._waiting: deque[LiveSample] = deque()
         self._room = _QUEUE if output.keeps_all else 1
@@ -117,7 +117,7 @@ class OutputWorker:
         self._closing = False
         self._thread: threading.Thread | None = None
         if not output.inline:
-            self._thread = threading.Thread(target=self._work, name=output.name, daemon=True)
+            self._thread = threading.Thread(target=self._run, name=output.name, daemon=True)
             self._thread.start()
 
     @property
@@ -143,9 +143,8 @@ class OutputWorker:
             found = self._output.health()
         except Exception as fault:
             return PartHealth(self.name, State.FAULT, f"{fault}", self._n_dropped)
-        trouble = self._trouble
-        if trouble:
-            found = PartHealth(found.name, State.FAULT, trouble, found.n_dropped)
+        if self._fault:
+            found = PartHealth(found.name, State.FAULT, self._fault, found.n_dropped)
         elif self._output.keeps_all and self._n_dropped and found.state is State.OK:
             found = replace(found, state=State.WARN)
         return replace(found, n_dropped=found.n_dropped + self._n_dropped)
@@ -164,11 +163,11 @@ class OutputWorker:
         except Exception:
             _log.exception("%s: closing failed", self.name)
 
-    def _work(self) -> None:
-        while (sample := self._next()) is not None:
+    def _run(self) -> None:
+        while (sample := self._next_sample()) is not None:
             self._send(sample)
 
-    def _next(self) -> LiveSample | None:
+    def _next_sample(self) -> LiveSample | None:
         with self._changed:
             self._changed.wait_for(lambda: self._waiting or self._closing)
             return self._waiting.popleft() if self._waiting else None
@@ -177,12 +176,12 @@ class OutputWorker:
         try:
             self._output.send(sample)
         except Exception as fault:
-            told = f"{fault}" or type(fault).__name__
-            if told != self._trouble:
-                _log.warning("%s: %s", self.name, told)
-            self._trouble = told
+            text = f"{fault}" or type(fault).__name__
+            if text != self._fault:
+                _log.warning("%s: %s", self.name, text)
+            self._fault = text
         else:
-            self._trouble = ""
+            self._fault = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -258,14 +257,14 @@ class FrameReader:
         self.n_lost = 0  # Frames that the feed could not decode, by the gaps in their numbers.
         self.fault: AqualvsError | None = None  # What ended the feed, if it did not end by itself.
         self._feed, self._mailbox = feed, mailbox
-        self._trouble = ""
+        self._read_error = ""
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._read, name="frames", daemon=True)
 
     def health(self) -> PartHealth:
         """Return how the feed is; what ends it is the owner's to tell, once."""
-        if self._trouble:
-            return PartHealth(self._feed.name, State.FAULT, self._trouble)
+        if self._read_error:
+            return PartHealth(self._feed.name, State.FAULT, self._read_error)
         return self._feed.health()
 
     def __enter__(self) -> Self:
@@ -288,25 +287,25 @@ class FrameReader:
         try:
             while not self._closing.is_set():
                 try:
-                    return self._move()
+                    return self._read_feed()
                 except AqualvsError as fault:
                     self.fault = fault
                     return None
                 except Exception as fault:
                     # The thread must not die silently: the pilot would see an old picture.
                     _log.exception("%s: reading failed; trying again", self._feed.name)
-                    self._trouble = f"{type(fault).__name__}: {fault}"
+                    self._read_error = f"{type(fault).__name__}: {fault}"
                     self._closing.wait(again_s)
         finally:
             self._mailbox.close()
 
-    def _move(self) -> None:
+    def _read_feed(self) -> None:
         expected = None
         for frame in self._feed:
             if expected is not None:
                 self.n_lost += max(0, frame.index - expected)
             expected = frame.index + 1
-            self._trouble = ""
+            self._read_error = ""
             self._mailbox.put(frame)
 
 
@@ -314,7 +313,7 @@ class FrameReader:
 _SILENT_EVERY_S, _LOOK_EVERY_S, _HEALTH_EVERY_S = 0.1, 0.05, 0.1
 
 
-class ScannerSupply:
+class ScannerProvider:
     """Provider of the scanner for the next frame: always the same, but for subclasses."""
 
     def __init__(self, scanner: Scanner, sigma_n_water: float = math.nan) -> None:
@@ -344,7 +343,7 @@ class LiveRunner:
     Parameters
     ----------
     feed : Feed
-    provider : ScannerSupply
+    provider : ScannerProvider
         Closed at the end.
     outputs : sequence of Output
         Closed at the end.
@@ -362,7 +361,7 @@ class LiveRunner:
     def __init__(
         self,
         feed: Feed,
-        provider: ScannerSupply,
+        provider: ScannerProvider,
         outputs: Sequence[Output],
         options: LiveOptions | None = None,
         posture_filter: PostureFilter | None = None,
@@ -382,8 +381,8 @@ class LiveRunner:
         self._gyros = next((one for one in outputs if isinstance(one, HearsVehicle)), None)
         self._before: deque[Scan] = deque(maxlen=REACH)
         self._last: Frame | None = None
-        self._heard_ns = self._told_ns = 0
-        self._trouble = ""
+        self._heard_ns = self._silence_sent_ns = 0
+        self._fault = ""
         self._health, self._health_ns = Health(), 0
 
     def run(self, stop: Callable[[], bool]) -> AqualvsError | None:
@@ -397,9 +396,9 @@ class LiveRunner:
                 while not stop() and not self._mailbox.exhausted:
                     arrival = self._mailbox.take(_LOOK_EVERY_S)
                     if arrival is not None:
-                        self._pass_on(self._measured(arrival))
+                        self._distribute(self._measure(arrival))
                     elif self._is_silent():
-                        self._pass_on(self._silence())
+                        self._distribute(self._silent_sample())
         finally:
             self._provider.close()
             self._monitor.close()
@@ -423,7 +422,7 @@ class LiveRunner:
             )
         return self._health
 
-    def _measured(self, arrival: Arrival) -> LiveSample:
+    def _measure(self, arrival: Arrival) -> LiveSample:
         """Return the sample of a frame that came."""
         taken_ns = time.monotonic_ns()
         frame = self._last = arrival.frame
@@ -461,9 +460,9 @@ class LiveRunner:
                 return peaks, self._at_middle(scan, rig, arrival.arrived_ns)
             except Exception as fault:
                 # One bad frame must not end a dive.
-                if str(fault) != self._trouble:
+                if str(fault) != self._fault:
                     _log.exception("frame %d could not be measured", frame.index)
-                    self._trouble = str(fault)
+                    self._fault = str(fault)
                 refusal = Refusal(Reason.CORRUPT_FRAME, f"could not be measured: {fault}")
         return {}, Scan(frame.index, frame.time_s, refusal, ScanPoints.none(), rig.n_water)
 
@@ -489,14 +488,14 @@ class LiveRunner:
         now_ns = time.monotonic_ns()
         return (
             now_ns - self._heard_ns > 1e9 * self._options.stale_after_s
-            and now_ns - self._told_ns > 1e9 * _SILENT_EVERY_S
+            and now_ns - self._silence_sent_ns > 1e9 * _SILENT_EVERY_S
             and not self._mailbox.exhausted
         )
 
-    def _silence(self) -> LiveSample:
+    def _silent_sample(self) -> LiveSample:
         """Return the sample that says that no frames come."""
         now_ns = time.monotonic_ns()
-        self._told_ns = now_ns
+        self._silence_sent_ns = now_ns
         silent_s = 1e-9 * (now_ns - self._heard_ns)
         index, time_s = (-1, 0.0) if self._last is None else (self._last.index, self._last.time_s)
         refusal = Refusal(Reason.NO_FRAMES, f"no picture for {silent_s:.1f} s")
@@ -527,7 +526,7 @@ class LiveRunner:
             health=self.health(),
         )
 
-    def _pass_on(self, sample: LiveSample) -> None:
+    def _distribute(self, sample: LiveSample) -> None:
         for worker in self._workers:
             worker.offer(sample)
         if sample.frame is not None:

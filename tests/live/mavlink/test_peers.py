@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from aqualvs.live.mavlink.peers import MOVES_AFTER_S, PeerTable
+from aqualvs.live.mavlink.peers import SILENT_AFTER_S, PeerTable
 
 pytest.importorskip("pymavlink")
 
@@ -65,7 +65,7 @@ def test_the_vehicles_name_belongs_to_where_it_was_heard_first(
     assert table.vehicle == VEHICLE
     assert "10.0.0.1:14550 and 10.0.0.2:14550 both speak as sysid 1" in table.rival
     assert not table.conflict
-    clock.now_s += MOVES_AFTER_S + 0.1
+    clock.now_s += SILENT_AFTER_S + 0.1
     assert heard(table, OTHER, beat(), ATTITUDE) == ["HEARTBEAT", "ATTITUDE"]
     assert table.vehicle == OTHER
 

@@ -124,7 +124,7 @@ def samples():
 
 def is_watched(output, n):
     """Whether so many viewers have subscribed, each to every topic."""
-    n_subscriptions = sum(output._viewers._watched.values())
+    n_subscriptions = sum(output._viewers._n_topics.values())
     return f"{n} watching" in output.health().detail and n_subscriptions == n * len(TOPICS)
 
 

@@ -84,7 +84,7 @@ def parse_message(text: str) -> Message:
 class RecordButton:
     """Record button of the page; without a switch the run can record nothing."""
 
-    def __init__(self, switch: RecorderSwitch | None = None) -> None:
+    def __init__(self, switch: RecorderSwitch | None) -> None:
         self._switch = switch
         self._path: Path | None = None
         self._asked_s = -math.inf
@@ -282,7 +282,7 @@ class ConnectionLimits:
         transport = self._waiting.get(peer)
         return transport is not None and not transport.is_closing()
 
-    def welcome(self, peer: Peer) -> None:
+    def release(self, peer: Peer) -> None:
         """Note that a page has greeted: its connection may stay."""
         self._waiting.pop(peer, None)
 
@@ -328,18 +328,18 @@ class TokenGate:
 
     async def check(self, address: str, token: str) -> bool:
         """Return whether a token is right, when its turn has come."""
-        await self._turn(address)
+        await self._await_turn(address)
         right = self._access.may_command(token)
         self._remember(address, right)
         if right:
-            self._next()
+            self._start_next()
         else:
             # The next turn waits even if this caller is cancelled: disconnecting saves no time.
-            asyncio.get_running_loop().call_later(self.WRONG_S, self._next)
+            asyncio.get_running_loop().call_later(self.WRONG_S, self._start_next)
             await asyncio.sleep(self.WRONG_S)
         return right
 
-    async def _turn(self, address: str) -> None:
+    async def _await_turn(self, address: str) -> None:
         if not self._busy:
             self._busy = True
             return
@@ -350,10 +350,10 @@ class TokenGate:
             await turn
         except asyncio.CancelledError:
             if turn.done() and not turn.cancelled():
-                self._next()
+                self._start_next()
             raise
 
-    def _next(self) -> None:
+    def _start_next(self) -> None:
         while self._queue:
             turn = heapq.heappop(self._queue)[2]
             if not turn.done():

@@ -55,7 +55,7 @@ class Dashboard(Output):
     ----------
     server : DashboardServer
         Owned from here on.
-    vehicle : callable or None
+    vehicle : callable
         Returns what the autopilot tells of depth and heading.
     """
 
@@ -65,7 +65,7 @@ class Dashboard(Output):
         self,
         server: DashboardServer,
         controls: Controls,
-        vehicle: Callable[[], VehicleState | None] = lambda: None,
+        vehicle: Callable[[], VehicleState | None],
     ) -> None:
         self._server, self._controls, self._vehicle = server, controls, vehicle
         self._state_s = self._picture_s = 0.0

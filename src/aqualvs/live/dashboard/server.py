@@ -56,7 +56,7 @@ def page_state(
     sample: LiveSample,
     setpoint: Setpoint | None,
     recording: Mapping[str, Any],
-    vehicle: VehicleState | None = None,
+    vehicle: VehicleState | None,
 ) -> str:
     """Return the message for the page about one sample.
 
@@ -274,14 +274,14 @@ class DashboardServer:
     def __init__(self, host: str, port: int, access: Access, rig: Rig, controls: Controls) -> None:
         self.hub = Hub()
         self._access, self._rig, self._controls = access, rig, controls
-        self._policy = _policy(access)
+        self._content_policy = _content_policy(access)
         self._limits, self._gate = ConnectionLimits(), TokenGate(access)
-        self._socket = _listening(host, port)
+        self._socket = _listen(host, port)
         self.port: int = self._socket.getsockname()[1]  # Where it listens.
         self._loop: asyncio.AbstractEventLoop | None = None
         self._server = uvicorn.Server(
             uvicorn.Config(
-                _refusing_malformed(self._app()),
+                _checked_addresses(self._app()),
                 http=self._limits.protocol(),
                 log_level="warning",
                 access_log=False,
@@ -326,7 +326,7 @@ class DashboardServer:
             routes=[
                 Route("/register_service", _blueos, methods=["GET"]),
                 Route("/{name:path}", self._asset, methods=["GET"]),
-                WebSocketRoute("/live", self._talk),
+                WebSocketRoute("/live", self._serve_page),
             ]
         )
 
@@ -335,10 +335,10 @@ class DashboardServer:
         if found is None:
             return PlainTextResponse("no such page\n", 404, headers=_HEADERS)
         content = (importlib.resources.files(found[2]) / "assets" / found[0]).read_bytes()
-        headers = {**_HEADERS, "Content-Security-Policy": self._policy}
+        headers = {**_HEADERS, "Content-Security-Policy": self._content_policy}
         return Response(content, media_type=f"{found[1]}; charset=utf-8", headers=headers)
 
-    async def _talk(self, socket: WebSocket) -> None:
+    async def _serve_page(self, socket: WebSocket) -> None:
         peer = socket.client.host if socket.client else "unknown"
         headers = socket.headers
         if not self._access.is_own_page(headers.get("origin"), headers.get("host", "")):
@@ -347,14 +347,14 @@ class DashboardServer:
             return
         await socket.accept()
         try:
-            viewer = await self._welcome(socket, peer)
+            viewer = await self._admit(socket, peer)
             if viewer is not None:
-                await self._attend(socket, viewer, peer)
+                await self._exchange(socket, viewer, peer)
         except (WebSocketDisconnect, RuntimeError, OSError):
             # The page has closed, which is normal.
             return
 
-    async def _welcome(self, socket: WebSocket, peer: str) -> PageClient | None:
+    async def _admit(self, socket: WebSocket, peer: str) -> PageClient | None:
         """Read the greeting; None if the page may not stay."""
         try:
             hello = parse_message(await asyncio.wait_for(socket.receive_text(), _HELLO_S))
@@ -364,11 +364,11 @@ class DashboardServer:
         token = hello.token if isinstance(hello, Hello) else ""
         known = bool(token) and await self._is_right(socket, token)
         viewer = PageClient(may_command=known)
-        why = self._why_not(token, viewer)
+        why = self._refusal(token, viewer)
         if why:
             await _refuse(socket, peer, why)
             return None
-        self._limits.welcome(_end(socket))
+        self._limits.release(_peer_of(socket))
         await socket.send_text(
             rig_state(self._rig, may_command=known, holds=self._controls.setpoint.followed)
         )
@@ -376,7 +376,7 @@ class DashboardServer:
 
     async def _is_right(self, socket: WebSocket, token: str) -> bool:
         """Return whether a token is right, when its turn has come; a page that goes loses it."""
-        end = _end(socket)
+        end = _peer_of(socket)
         asking = asyncio.create_task(self._gate.check(end[0], token))
         while self._limits.holds(end):
             done, _ = await asyncio.wait({asking}, timeout=_ALIVE_S)
@@ -385,7 +385,7 @@ class DashboardServer:
         asking.cancel()
         raise WebSocketDisconnect
 
-    def _why_not(self, token: str, viewer: PageClient) -> str:
+    def _refusal(self, token: str, viewer: PageClient) -> str:
         """Let a page in, or return why not."""
         if token and not viewer.may_command:
             return "wrong token"
@@ -393,23 +393,23 @@ class DashboardServer:
             return "no token"
         return "" if self.hub.join(viewer) else "too many pages are open"
 
-    async def _attend(self, socket: WebSocket, viewer: PageClient, peer: str) -> None:
+    async def _exchange(self, socket: WebSocket, viewer: PageClient, peer: str) -> None:
         """Send news and receive messages until the page closes."""
-        beside = [
+        tasks = [
             asyncio.create_task(_send_news(socket, viewer)),
-            asyncio.create_task(_make_room(socket, viewer, peer)),
+            asyncio.create_task(_close_when_replaced(socket, viewer, peer)),
         ]
         try:
             while True:
-                await self._hear(socket, viewer, peer, await socket.receive_text())
+                await self._handle(socket, viewer, peer, await socket.receive_text())
         except (ValidationError, KeyError):
             await _refuse(socket, peer, "message not understood")
         finally:
             self.hub.leave(viewer)
-            for task in beside:
+            for task in tasks:
                 task.cancel()
 
-    async def _hear(self, socket: WebSocket, viewer: PageClient, peer: str, text: str) -> None:
+    async def _handle(self, socket: WebSocket, viewer: PageClient, peer: str, text: str) -> None:
         message = parse_message(text)
         if isinstance(message, PictureShown):
             viewer.shown()
@@ -426,7 +426,7 @@ class DashboardServer:
                 await socket.send_json({"kind": "refused", "why": str(fault)})
 
 
-def _policy(access: Access) -> str:
+def _content_policy(access: Access) -> str:
     """Return what the page may load, and who may show it inside a page of theirs."""
     embedders = " ".join(access.embedders) or "'none'"
     return f"default-src 'self'; img-src 'self' blob: data:; frame-ancestors {embedders}"
@@ -441,7 +441,7 @@ async def _send_news(socket: WebSocket, viewer: PageClient) -> None:
             await socket.send_bytes(picture)
 
 
-async def _make_room(socket: WebSocket, viewer: PageClient, peer: str) -> None:
+async def _close_when_replaced(socket: WebSocket, viewer: PageClient, peer: str) -> None:
     await viewer.gone.wait()
     await _refuse(socket, peer, "a page with the token took this place")
 
@@ -451,12 +451,12 @@ async def _refuse(socket: WebSocket, peer: str, why: str) -> None:
     await socket.close(_REFUSED, why)
 
 
-def _end(socket: WebSocket) -> Peer:
+def _peer_of(socket: WebSocket) -> Peer:
     """Return address and port of a page."""
     return (socket.client.host, socket.client.port) if socket.client else ("unknown", 0)
 
 
-def _refusing_malformed(app: ASGIApp) -> ASGIApp:
+def _checked_addresses(app: ASGIApp) -> ASGIApp:
     """Return an application that answers 400 where a request's addresses are malformed."""
 
     async def checked(scope: Scope, receive: Receive, send: Send) -> None:
@@ -490,7 +490,7 @@ async def _blueos(_request: Request) -> Response:
     )
 
 
-def _listening(host: str, port: int) -> socket.socket:
+def _listen(host: str, port: int) -> socket.socket:
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     listener = socket.socket(family, socket.SOCK_STREAM)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

@@ -101,17 +101,17 @@ class PilotSticks:
         since = found.received_ns - round(1e9 * FRESH_S)
         # The thread that sends may add while this one reads.
         ours = [s for at, s in self._sent.copy() if since <= at <= found.received_ns]
-        told = found.message
+        message = found.message
         for channel, axis in ((_FORWARD, "x"), (_LATERAL, "y"), (_YAW, "r")):
-            if self._beyond(told, channel, [getattr(sticks, axis) for sticks in ours]):
+            if self._exceeds(message, channel, [getattr(sticks, axis) for sticks in ours]):
                 return True
         # JS_THR_GAIN scales the vertical by up to 4: while we use that axis, it shows nothing.
         vertical_is_ours = any(s.z != MIDDLE for s in ours)
-        return not vertical_is_ours and self._beyond(told, _VERTICAL, [])
+        return not vertical_is_ours and self._exceeds(message, _VERTICAL, [])
 
-    def _beyond(self, told: Any, channel: str, ours: list[int]) -> bool:
+    def _exceeds(self, message: Any, channel: str, ours: list[int]) -> bool:
         """Return whether a channel is outside of the range that our own sticks explain."""
-        pulse_us = getattr(told, channel)
+        pulse_us = getattr(message, channel)
         if not _MIN_US <= pulse_us <= _MAX_US:
             return False
         swing = (pulse_us - _CENTRE_US) / _FULL_US
@@ -135,13 +135,10 @@ _PRESSURE: Final = ("SCALED_PRESSURE2", "press_abs", 100.0 / (1025.0 * 9.80665))
 
 
 class DepthChoice:
-    """Reader of the depth; remembers which estimates stood still.
+    """Reader of the depth; remembers which estimates stood still."""
 
-    `fresh_s`: older messages do not count.
-    """
-
-    def __init__(self, link: MavlinkLink, fresh_s: float) -> None:
-        self._link, self._fresh_s = link, fresh_s
+    def __init__(self, link: MavlinkLink) -> None:
+        self._link = link
         self._spans: dict[str, tuple[float, float]] = {}
 
     def read(self) -> float | None:
@@ -156,7 +153,7 @@ class DepthChoice:
 
     def _value(self, kind: str, field: str, scale: float) -> float | None:
         received = self._link.latest(kind, system=self._link.system)
-        if received is None or received.age_s > self._fresh_s:
+        if received is None or received.age_s > FRESH_S:
             return None
         value = scale * float(getattr(received.message, field))
         low, high = self._spans.get(kind, (value, value))
@@ -176,9 +173,6 @@ class DepthChoice:
 
 
 _AUTOPILOT = 1
-# Not a ground station's own component (190 as a rule): a router would take the two for one, and
-# keep its messages from us.
-_SENDER = MAV_COMP_ID_ONBOARD_COMPUTER
 _ARDUPILOT, _SUBMARINE, _GROUND_STATION = 3, 12, 6
 _ARMED = 128
 # Two and a half of ArduSub's heartbeats.
@@ -196,21 +190,21 @@ def attitude_of(link: MavlinkLink) -> tuple[float | None, float | None, float | 
     found = link.latest("ATTITUDE", system=link.system, component=_AUTOPILOT)
     if found is None or found.age_s > FRESH_S:
         return None, None, None
-    told = found.message
-    return told.roll, told.pitch, told.yaw % (2.0 * math.pi)
+    message = found.message
+    return message.roll, message.pitch, message.yaw % (2.0 * math.pi)
 
 
-def turning_of(link: MavlinkLink, at_ns: int) -> GyroRates | None:
-    """Return the turning of an autopilot's vehicle; None if it has told none of use.
+def gyro_rates_of(link: MavlinkLink, at_ns: int) -> GyroRates | None:
+    """Return the turning of an autopilot's vehicle; None if it is unknown.
 
     `at_ns`: time of a picture, by `time.monotonic_ns`.
     """
     found = link.latest("ATTITUDE", system=link.system, component=_AUTOPILOT)
     if found is None or found.age_s > FRESH_S:
         return None
-    told = found.message
+    message = found.message
     # Forward, right, down to the dome's right, forward, up.
-    rates = np.array([told.pitchspeed, told.rollspeed, -told.yawspeed])
+    rates = np.array([message.pitchspeed, message.rollspeed, -message.yawspeed])
     # A vehicle changes its rates by so much (rad/s², as in `row_motion`) in the time between the
     # message and the picture. Of that, the delay of camera and network is not known; this (s) is
     # that of a usual stream.
@@ -300,16 +294,17 @@ class ArduSubLink:
         self._owns_link = isinstance(link, str)
         self.link = MavlinkLink(link) if isinstance(link, str) else link
         self.name = f"ArduSub {self.link.url}"
-        station = self.options.ground_station
+        # Not a ground station's own component (190 as a rule): a router would take the two for one,
+        # and keep its messages from us.
+        self._sender = (self.options.ground_station, MAV_COMP_ID_ONBOARD_COMPUTER)
         self._commander = self._make_commander()
-        self._sticks = PilotSticks(
-            self.link, own=(station, _SENDER), dead_band=self.options.stick_dead_band
-        )
-        self._depth = DepthChoice(self.link, FRESH_S)
+        dead_band = self.options.stick_dead_band
+        self._sticks = PilotSticks(self.link, own=self._sender, dead_band=dead_band)
+        self._depth = DepthChoice(self.link)
         self._response = StickResponse(self.link)
         self._watch = ParameterWatch(self.link, FOR_STICKS)
         # The autopilot takes ten requests at once.
-        self._shapes = [
+        self._shaping_watches = [
             ParameterWatch(self.link, PARAMETERS[k : k + 10]) for k in range(0, len(PARAMETERS), 10)
         ]
         self._advised = not advises
@@ -326,10 +321,10 @@ class ArduSubLink:
         parameters = self._watch.read()
         self._advise(parameters)
         mode, mode_name = self._mode(beat, parameters)
-        self._shape(beat)
+        self._update_shaping(beat)
         roll, pitch, heading = attitude_of(self.link)
         return VehicleState(
-            heard_s=self._heard_s(beat),
+            heard_s=self._last_heard_s(beat),
             armed=bool(beat.message.base_mode & _ARMED),
             mode=mode,
             mode_name=mode_name,
@@ -383,8 +378,7 @@ class ArduSubLink:
                 speed=options.speed,
                 turning_rate=options.turning_rate,
             )
-        packer = link.make_packer(options.ground_station, _SENDER)
-        return StickCommander(link.dialect, packer, target=link.system)
+        return StickCommander(link.dialect, link.make_packer(*self._sender), target=link.system)
 
     def _send(self, effort: Effort) -> bool:
         with self._sending:
@@ -397,12 +391,12 @@ class ArduSubLink:
             self._sent_s = time.monotonic() if sent else self._sent_s
         return sent
 
-    def _shape(self, beat: Received) -> None:
+    def _update_shaping(self, beat: Received) -> None:
         """Compensate the vehicle's reported conversion of the sticks."""
         if not isinstance(self._commander, StickCommander):
             return
         known: dict[str, float] = {}
-        for watch in self._shapes:
+        for watch in self._shaping_watches:
             known = watch.read()
         keeps_place = SUB_MODES.get(beat.message.custom_mode) == "POSHOLD"
         with self._sending:
@@ -413,9 +407,9 @@ class ArduSubLink:
         """Log advice on the vehicle's settings once, when they are known or stay unanswered."""
         if self._advised or self.options.command is not Command.STICKS:
             return
-        if not (StationRange(parameters).known or self._watch.was_patient):
+        if not (StationRange(parameters).known or self._watch.has_waited):
             return
-        if PILOT_TIMEOUT not in parameters and not self._watch.was_patient:
+        if PILOT_TIMEOUT not in parameters and not self._watch.has_waited:
             return
         self._advised = True
         advice = advise_on_station(parameters, self.options.ground_station)
@@ -465,7 +459,7 @@ class ArduSubLink:
         } - {self.options.ground_station}
         return f"{wanted}, but of {', '.join(map(str, sorted(others)))}" if others else wanted
 
-    def _heard_s(self, beat: Received) -> float:
+    def _last_heard_s(self, beat: Received) -> float:
         """Return when the vehicle was heard last.
 
         Heartbeats come once a second, attitude ten times and more: between two heartbeats attitude

@@ -58,7 +58,7 @@ class StickResponse:
             for pairs in (*self._channels.values(), self._turns):
                 pairs.clear()
             return ""
-        self._take(now_s, stick[1])
+        self._add_pairs(now_s, stick[1])
         channels = [pair for pairs in self._channels.values() for pair in pairs.since(now_s)]
         still = all(pairs.swing <= still_us for pairs in self._channels.values())
         if still and _slope(channels) < min_slope_us:
@@ -69,21 +69,21 @@ class StickResponse:
             return "the vehicle does not turn as our yaw stick says"
         return "RC_CHANNELS is not received: cannot check whether our sticks are obeyed"
 
-    def _take(self, now_s: float, sticks: Sticks) -> None:
+    def _add_pairs(self, now_s: float, sticks: Sticks) -> None:
         """Pair the messages since the last call with our stick."""
-        told = self._new("RC_CHANNELS")
-        if told is not None:
+        message = self._new_message("RC_CHANNELS")
+        if message is not None:
             for channel, axis in _AXES:
-                share, pulse_us = getattr(sticks, axis) / FULL, getattr(told, channel)
+                share, pulse_us = getattr(sticks, axis) / FULL, getattr(message, channel)
                 # 0 and 65535 mean an unused channel.
                 off_us = pulse_us - _CENTRE_US if _MIN_US < pulse_us < _MAX_US else 0
                 self._channels[channel].add(now_s, share, float(off_us))
-        told = self._new("ATTITUDE")
+        message = self._new_message("ATTITUDE")
         turn = sticks.r / FULL
-        if told is not None and abs(turn) >= _TURNING_STICK:
-            self._turns.add(now_s, turn, float(told.yawspeed))
+        if message is not None and abs(turn) >= _TURNING_STICK:
+            self._turns.add(now_s, turn, float(message.yawspeed))
 
-    def _new(self, kind: str) -> Any:
+    def _new_message(self, kind: str) -> Any:
         found = self._link.latest(kind, system=self._link.system)
         if found is None or found.received_ns <= self._seen_ns[kind]:
             return None
@@ -185,9 +185,9 @@ class StickCommander:
 
     def message(self, effort: Effort) -> Packable:
         """Return the message; no button is ever pressed."""
-        sticks, told = self.sticks(effort), self._message
-        told.x, told.y, told.z, told.r = sticks.x, sticks.y, sticks.z, sticks.r
-        return _OnBehalf(told, self._packer)
+        sticks, message = self.sticks(effort), self._message
+        message.x, message.y, message.z, message.r = sticks.x, sticks.y, sticks.z, sticks.r
+        return _OnBehalf(message, self._packer)
 
 
 class GuidedCommander:
@@ -227,13 +227,13 @@ class GuidedCommander:
 
     def message(self, effort: Effort) -> Packable:
         """Return the message."""
-        told = self._message
-        told.time_boot_ms = (time.monotonic_ns() // 1_000_000) & 0xFFFF_FFFF
-        told.vx = self._speed * limited(effort.forward)
-        told.vy = self._speed * limited(effort.right)
-        told.vz = self._speed * limited(effort.down)
-        told.yaw_rate = self._turning_rate * limited(effort.yaw)
-        packable: Packable = told
+        message = self._message
+        message.time_boot_ms = (time.monotonic_ns() // 1_000_000) & 0xFFFF_FFFF
+        message.vx = self._speed * limited(effort.forward)
+        message.vy = self._speed * limited(effort.right)
+        message.vz = self._speed * limited(effort.down)
+        message.yaw_rate = self._turning_rate * limited(effort.yaw)
+        packable: Packable = message
         return packable
 
 

@@ -38,9 +38,8 @@ class StationRange:
     """
 
     def __init__(self, parameters: Mapping[str, float]) -> None:
-        told = [name for name in STATION if name in parameters]
-        self.name = told[0] if told else STATION[0]
-        self._least = round(parameters[self.name]) if told else None
+        self.name = next((name for name in STATION if name in parameters), STATION[0])
+        self._least = round(parameters[self.name]) if self.name in parameters else None
         self._most = round(parameters.get(STATION_HIGH, 0))
 
     @property
@@ -84,7 +83,7 @@ class ParameterWatch:
         return known
 
     @property
-    def was_patient(self) -> bool:
+    def has_waited(self) -> bool:
         """Whether the vehicle had time enough to answer."""
         return self._n_asked >= _ROUNDS
 
@@ -174,9 +173,9 @@ def advise_on_distance(
             f"{RANGE_TYPE} 10 (MAVLink) and {RANGE_ORIENT} 0, and restart the autopilot"
         )
     elif orient is None or round(orient) != _FORWARD:
-        told = "is unknown" if orient is None else f"{orient:.0f}"
+        value = "is unknown" if orient is None else f"{orient:.0f}"
         yield Finding.warn(
-            f"{RANGE_ORIENT} {told}: our sensor looks forward, and the autopilot ignores other "
+            f"{RANGE_ORIENT} {value}: our sensor looks forward, and the autopilot ignores other "
             f"orientations; set {RANGE_ORIENT} 0"
         )
     else:
@@ -185,8 +184,8 @@ def advise_on_distance(
         yield from _limits_advice(parameters, working_range)
 
 
-def _climb_advice(setting: str, told: float) -> Finding:
-    speed = 0.01 * told
+def _climb_advice(setting: str, speed_cm_s: float) -> Finding:
+    speed = 0.01 * speed_cm_s
     means = f"{setting}: a full stick asks for {speed:.2g} m/s times the pilot gain"
     if FULL_CLIMB_RATE / _CLIMB_RATE_RATIO <= speed <= FULL_CLIMB_RATE * _CLIMB_RATE_RATIO:
         return Finding.ok(means)
@@ -218,9 +217,9 @@ def _first(
     parameters: Mapping[str, float], names: tuple[tuple[str, float], ...]
 ) -> tuple[str, float] | None:
     """Return the first name with a reported value, and the value in metres."""
-    told = [(name, unit * parameters[name]) for name, unit in names if name in parameters]
-    return told[0] if told else None
+    known = ((name, unit * parameters[name]) for name, unit in names if name in parameters)
+    return next(known, None)
 
 
 def _seconds(timeout_s: float | None) -> str:
-    return f"{PILOT_TIMEOUT}" if timeout_s is None else f"{timeout_s:g} s"
+    return PILOT_TIMEOUT if timeout_s is None else f"{timeout_s:g} s"

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from aqualvs.errors import OptionError
-from aqualvs.live.mavlink.peers import MOVES_AFTER_S, Peer, PeerTable, Signer
+from aqualvs.live.mavlink.peers import SILENT_AFTER_S, Peer, PeerTable, Signer
 from aqualvs.live.mavlink.ports import (
     Address,
     AllowedPeers,
@@ -26,8 +26,6 @@ from aqualvs.sources.base import PartHealth, State
 
 MAV_COMP_ID_ONBOARD_COMPUTER = 191
 HEARTBEAT_EVERY_S = 1.0
-SILENT_AFTER_S = MOVES_AFTER_S
-"""A vehicle without a heartbeat for this time counts as gone."""
 
 _LOOK_EVERY_S = 0.1
 _FIRST_WAIT_S, _LONGEST_WAIT_S = 0.25, 4.0
@@ -294,20 +292,18 @@ class MavlinkLink:
         others = [beat for beat in self._autopilots() if beat.age_s < SILENT_AFTER_S]
         if others:
             return f"no heartbeat of sysid {self.system}, but of {_name(others[-1])}"
-        told = f"no heartbeat of sysid {self.system} yet"
+        text = f"no heartbeat of sysid {self.system} yet"
         if self._signer is not None and self._signer.n_refused:
-            told += f"; {self._signer.n_refused} messages are not signed with our key, or are old"
+            text += f"; {self._signer.n_refused} messages are not signed with our key, or are old"
         if self._n_foreign:
-            told += f"; {self._foreign} is not an allowed peer"
-        return told
+            text += f"; {self._foreign} is not an allowed peer"
+        return text
 
     def _autopilots(self) -> list[Received]:
         beats = self.every("HEARTBEAT")
         return [beat for beat in beats if beat.message.autopilot != _NO_AUTOPILOT]
 
-    def _send(
-        self, messages: tuple[Any, ...], timeout_s: float, *, to_vehicle: bool = False
-    ) -> bool:
+    def _send(self, messages: tuple[Any, ...], timeout_s: float, *, to_vehicle: bool) -> bool:
         port = self._port
         if port is None or self._broken is not None:
             return False
@@ -367,7 +363,7 @@ class MavlinkLink:
             if now_s >= beat_s:
                 beat_s = now_s + HEARTBEAT_EVERY_S
                 with self._sending:
-                    self._send((self._heartbeat,), _URGENT_TIMEOUT_S)
+                    self._send((self._heartbeat,), _URGENT_TIMEOUT_S, to_vehicle=False)
             events = selectors.EVENT_READ | (selectors.EVENT_WRITE if port.unsent else 0)
             selector.modify(port, events)
             for _, ready in selector.select(min(_LOOK_EVERY_S, max(0.0, beat_s - now_s))):

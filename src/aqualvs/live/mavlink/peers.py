@@ -118,14 +118,14 @@ def _now() -> int:
 Peer: TypeAlias = tuple[object, ...]
 """Address of a sender, as the system writes it; empty where a connection has only one."""
 
-MOVES_AFTER_S = 5.0
-"""A system id that was silent for this time may be heard from another address."""
+SILENT_AFTER_S = 5.0
+"""A system id silent for this time counts as gone, and may be heard from another address."""
 
 # Messages are sent to the vehicle and at most so many others, heard within so many seconds.
 _HEARD_S, _MAX_OTHERS = 10.0, 8
 # Lifetime of a statement about the vehicle's mode: two and a half heartbeats, and the delay of a
 # busy machine.
-_SAYS_FOR_S = 3.0
+_CLAIM_LIFETIME_S = 3.0
 _MAX_CLAIMS = 32
 _NO_AUTOPILOT = 8
 _ARMED = 128
@@ -164,7 +164,7 @@ class _Contest:
     """Recent statements of the vehicle's heartbeats, and the end of their contradiction."""
 
     now: dict[int, _Claim] = field(default_factory=dict)
-    given_up_s: dict[_Claim, float] = field(default_factory=dict)
+    left_s: dict[_Claim, float] = field(default_factory=dict)
     rivals: dict[Peer, tuple[_Claim, float]] = field(default_factory=dict)
     until_s: float = float("-inf")
     words: str = ""
@@ -211,7 +211,7 @@ class PeerTable:
     @property
     def rival(self) -> str:
         """Other address that speaks as the vehicle; empty if there is none."""
-        since_s = time.monotonic() - _SAYS_FOR_S
+        since_s = time.monotonic() - _CLAIM_LIFETIME_S
         with self._lock:
             rivals = self._contest.rivals
             found = [peer for peer, (_, at_s) in rivals.items() if at_s > since_s]
@@ -278,7 +278,7 @@ class PeerTable:
     def _bind(self, peer: Peer, system: int, message: Any) -> None:
         now_s = time.monotonic()
         home = self._homes.get(system)
-        if home is None or now_s - home.heard_s > MOVES_AFTER_S:
+        if home is None or now_s - home.heard_s > SILENT_AFTER_S:
             home = self._homes[system] = _Home(peer, now_s)
         if home.peer == peer:
             home.heard_s = now_s
@@ -294,18 +294,18 @@ class PeerTable:
             contest.now[claim.component] = claim
             if before is not None and before != claim:
                 # A mode that returns so soon was not left: two systems speak from one address.
-                if now_s - contest.given_up_s.pop(claim, float("-inf")) < _SAYS_FOR_S:
-                    self._contradicted(now_s, f"from {_shown(peer)}")
-                _put(contest.given_up_s, before, now_s)
+                if now_s - contest.left_s.pop(claim, float("-inf")) < _CLAIM_LIFETIME_S:
+                    self._note_conflict(now_s, f"from {_shown(peer)}")
+                _put_last(contest.left_s, before, now_s)
         else:
-            _put(contest.rivals, peer, (claim, now_s))
+            _put_last(contest.rivals, peer, (claim, now_s))
         for rival, (said, at_s) in contest.rivals.items():
             ours = contest.now.get(said.component)
-            if now_s - at_s < _SAYS_FOR_S and ours is not None and said != ours:
-                self._contradicted(at_s, f"from {_shown(home)} and {_shown(rival)}")
+            if now_s - at_s < _CLAIM_LIFETIME_S and ours is not None and said != ours:
+                self._note_conflict(at_s, f"from {_shown(home)} and {_shown(rival)}")
 
-    def _contradicted(self, at_s: float, where: str) -> None:
-        self._contest.until_s = max(self._contest.until_s, at_s + _SAYS_FOR_S)
+    def _note_conflict(self, at_s: float, where: str) -> None:
+        self._contest.until_s = max(self._contest.until_s, at_s + _CLAIM_LIFETIME_S)
         self._contest.words = f"heartbeats of sysid {self._system} {where} contradict each other"
 
     def _remember(self, peer: Peer, parser: Any) -> None:
@@ -340,7 +340,7 @@ def _claim(message: Any) -> _Claim:
     )
 
 
-def _put(kept: dict[Any, Any], key: object, value: object) -> None:
+def _put_last(kept: dict[Any, Any], key: object, value: object) -> None:
     """Put a value last into a dictionary that stays small."""
     kept.pop(key, None)
     kept[key] = value

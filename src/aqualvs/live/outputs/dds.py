@@ -111,7 +111,7 @@ _LOCALHOST = (
     '<Peers><Peer address="localhost"/></Peers></Discovery></Domain></CycloneDDS>'
 )
 # By default every topic waits a second for dead subscribers when it is closed.
-_SHORT_FAREWELL = (
+_SHORT_LINGER = (
     "<CycloneDDS><Domain><Internal><WriterLingerDuration>100 ms</WriterLingerDuration>"
     "</Internal></Domain></CycloneDDS>"
 )
@@ -190,9 +190,9 @@ class DdsOutput(Output):
             for topic, message in self._maker.messages(sample, wanted):
                 self._write(link.writers[topic], message)
         except DDSException as fault:
-            self._give_up(fault)
+            self._disconnect_after(fault)
         else:
-            self._health = self._well(len(wanted))
+            self._health = self._connected_health(len(wanted))
 
     def health(self) -> PartHealth:
         """Return how the link is."""
@@ -223,21 +223,21 @@ class DdsOutput(Output):
             self._n_dropped += 1
             self._slow_until_s = time.monotonic() + _SLOW_FOR_S
 
-    def _well(self, n_topics: int) -> PartHealth:
+    def _connected_health(self, n_topics: int) -> PartHealth:
         where = f"domain {self._domain_id}"
         if time.monotonic() < self._slow_until_s:
-            told = f"{where}: a reliable subscriber is too slow"
-            return PartHealth(self.name, State.WARN, told, self._n_dropped)
-        told = f"{where}: {n_topics or 'no'} topic{'s' * (n_topics != 1)} listened to"
-        return PartHealth(self.name, State.OK, told, self._n_dropped)
+            text = f"{where}: a reliable subscriber is too slow"
+            return PartHealth(self.name, State.WARN, text, self._n_dropped)
+        text = f"{where}: {n_topics or 'no'} topic{'s' * (n_topics != 1)} listened to"
+        return PartHealth(self.name, State.OK, text, self._n_dropped)
 
-    def _give_up(self, fault: Exception) -> None:
+    def _disconnect_after(self, fault: Exception) -> None:
         self._drop_link()
         self._n_dropped += 1
         self._retry_s = time.monotonic() + self._wait_s
-        told = f"domain {self._domain_id}: {fault}; tried again in {self._wait_s:g} s"
+        text = f"domain {self._domain_id}: {fault}; tried again in {self._wait_s:g} s"
         self._wait_s = min(2.0 * self._wait_s, _LONGEST_WAIT_S)
-        self._health = PartHealth(self.name, State.FAULT, told, self._n_dropped)
+        self._health = PartHealth(self.name, State.FAULT, text, self._n_dropped)
 
     def _drop_link(self) -> None:
         link, self._link = self._link, None
@@ -280,7 +280,7 @@ def _join(domain_id: int, options: RosOptions, types: RosTypes) -> _Link:
     for topic in PublishedTopic:
         kind = types.classes[TYPE_NAMES[topic]]
         offered = DdsTopic(participant, f"rt{topic.full_name}", kind)
-        writers[topic] = DataWriter(participant, offered, _quality(topic, options, types))
+        writers[topic] = DataWriter(participant, offered, _qos(topic, options, types))
     return _Link(domain, participant, writers)
 
 
@@ -289,16 +289,16 @@ def _domain(domain_id: int) -> Any:
     from cyclonedds.core import DDSException
     from cyclonedds.domain import Domain
 
-    wishes = _LOCALHOST if stays_on_this_machine() else os.environ.get("CYCLONEDDS_URI", "")
+    config = _LOCALHOST if stays_on_this_machine() else os.environ.get("CYCLONEDDS_URI", "")
     try:
-        return Domain(domain_id, ",".join(filter(None, (wishes, _SHORT_FAREWELL))))
+        return Domain(domain_id, ",".join(filter(None, (config, _SHORT_LINGER))))
     except DDSException as fault:
         if fault.code == DDSException.DDS_RETCODE_PRECONDITION_NOT_MET:
             return None
         raise
 
 
-def _quality(topic: PublishedTopic, options: RosOptions, types: RosTypes) -> Any:
+def _qos(topic: PublishedTopic, options: RosOptions, types: RosTypes) -> Any:
     depth = 5
     from cyclonedds.qos import Policy, Qos
 

@@ -39,7 +39,8 @@ VEHICLE = "vehicle"
 
 # Side of the square that represents the target, as a share of its range.
 _SIDE_SHARE = 1.0
-_GREEN, _BLUE = (0.1, 1.0, 0.3, 1.0), (0.2, 0.6, 1.0, 0.25)
+_GREEN = {"r": 0.1, "g": 1.0, "b": 0.3, "a": 1.0}
+_BLUE = {"r": 0.2, "g": 0.6, "b": 1.0, "a": 0.25}
 _LINE_PX = 2.0
 
 
@@ -72,7 +73,7 @@ def scene(rig: Rig, scan: Scan, stamp_ns: int) -> "sdk.SceneUpdate":
         frame_id=FRAME_ID,
         id="target",
         lifetime=Duration.from_secs(lifetime_s),
-        cubes=[_plate(posture)],
+        cubes=[_target_square(posture)],
         lines=[
             _line(ends) for ends in laser_lines(rig.lasers, posture.normal_in_dome, scan.points)
         ],
@@ -103,7 +104,7 @@ def laser_lines(
     return found
 
 
-def _plate(posture: Posture) -> "sdk.CubePrimitive":
+def _target_square(posture: Posture) -> "sdk.CubePrimitive":
     """Return the target as a thin square about the foot of the perpendicular."""
     from foxglove.messages import Color, CubePrimitive, Vector3
 
@@ -111,7 +112,7 @@ def _plate(posture: Posture) -> "sdk.CubePrimitive":
     foot = posture.range * posture.normal_in_dome
     axes = upright_axes(posture.normal_in_dome)
     return CubePrimitive(
-        pose=_pose(axes, foot), size=Vector3(x=side, y=1e-3, z=side), color=Color(**_rgba(_BLUE))
+        pose=_pose(axes, foot), size=Vector3(x=side, y=1e-3, z=side), color=Color(**_BLUE)
     )
 
 
@@ -137,7 +138,7 @@ def _line(ends: FloatArray) -> "sdk.LinePrimitive":
         thickness=_LINE_PX,
         scale_invariant=True,
         points=[Point3(x=float(x), y=float(y), z=float(z)) for x, y, z in ends],
-        color=Color(**_rgba(_GREEN)),
+        color=Color(**_GREEN),
     )
 
 
@@ -151,14 +152,14 @@ def _transform(
         parent_frame_id=parent,
         child_frame_id=child,
         translation=_vector(origin),
-        rotation=_turn(rotation),
+        rotation=_quaternion(rotation),
     )
 
 
 def _pose(rotation: FloatArray, origin: FloatArray) -> "sdk.Pose":
     from foxglove.messages import Pose
 
-    return Pose(position=_vector(origin), orientation=_turn(rotation))
+    return Pose(position=_vector(origin), orientation=_quaternion(rotation))
 
 
 def _vector(values: FloatArray) -> "sdk.Vector3":
@@ -168,7 +169,7 @@ def _vector(values: FloatArray) -> "sdk.Vector3":
     return Vector3(x=x, y=y, z=z)
 
 
-def _turn(rotation: FloatArray) -> "sdk.Quaternion":
+def _quaternion(rotation: FloatArray) -> "sdk.Quaternion":
     from foxglove.messages import Quaternion
 
     x, y, z, w = quaternion_from_rotation(rotation)
@@ -179,10 +180,6 @@ def _stamp(stamp_ns: int) -> "sdk.Timestamp":
     from foxglove.messages import Timestamp
 
     return Timestamp(sec=stamp_ns // 10**9, nsec=stamp_ns % 10**9)
-
-
-def _rgba(color: tuple[float, float, float, float]) -> dict[str, float]:
-    return dict(zip("rgba", color, strict=True))
 
 
 LAYOUT = Path(__file__).with_name("foxglove_layout.json")
@@ -272,8 +269,8 @@ class FoxgloveOutput(Output):
                 lambda: messages.image_message("jpeg", jpeg_of(frame, jpeg_quality), at_ns),
                 self._picture_due,
             )
-        if self._seldom_due.at(at_ns) or self._viewers.take_news():
-            self._log_seldom(sample, at_ns)
+        if self._seldom_due.at(at_ns) or self._viewers.take_subscribed():
+            self._log_rarely_changing(sample, at_ns)
 
     def health(self) -> PartHealth:
         """Return how many watch."""
@@ -289,7 +286,7 @@ class FoxgloveOutput(Output):
             self._closed = True
             self._server.stop()
 
-    def _log_seldom(self, sample: LiveSample, at_ns: int) -> None:
+    def _log_rarely_changing(self, sample: LiveSample, at_ns: int) -> None:
         """Send data that rarely change, also to new viewers."""
         rig, health, options = sample.rig, sample.health, self._options
         if self._transforms.has_sinks():
@@ -315,33 +312,33 @@ class _Viewers:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._watched: dict[int, int] = {}
-        self._news = False
+        self._n_topics: dict[int, int] = {}
+        self._subscribed = False
 
     @property
     def n_watching(self) -> int:
         """Viewers with at least one topic."""
         with self._lock:
-            return len(self._watched)
+            return len(self._n_topics)
 
-    def take_news(self) -> bool:
+    def take_subscribed(self) -> bool:
         """Return whether a viewer has subscribed to a topic since the last call."""
         with self._lock:
-            news, self._news = self._news, False
-            return news
+            subscribed, self._subscribed = self._subscribed, False
+            return subscribed
 
     def on_subscribe(self, client: "Client", _channel: "ChannelView") -> None:
         """Note a viewer's interest in a topic."""
         with self._lock:
-            self._watched[client.id] = self._watched.get(client.id, 0) + 1
-            self._news = True
+            self._n_topics[client.id] = self._n_topics.get(client.id, 0) + 1
+            self._subscribed = True
 
     def on_unsubscribe(self, client: "Client", _channel: "ChannelView") -> None:
         """Note that it has gone."""
         with self._lock:
-            left = self._watched.pop(client.id, 1) - 1
+            left = self._n_topics.pop(client.id, 1) - 1
             if left > 0:
-                self._watched[client.id] = left
+                self._n_topics[client.id] = left
 
 
 def _sdk() -> Any:

@@ -5,7 +5,7 @@ from typing import Any
 
 from aqualvs.control.time_filter import FilteredPosture
 from aqualvs.control.vehicle import VehicleState
-from aqualvs.live.mavlink.ardusub import FRESH_S, DepthChoice, attitude_of, turning_of
+from aqualvs.live.mavlink.ardusub import DepthChoice, attitude_of, gyro_rates_of
 from aqualvs.live.mavlink.link import LinkOptions, MavlinkLink
 from aqualvs.live.mavlink.ports import Address
 from aqualvs.live.outputs.base import Output
@@ -69,7 +69,7 @@ class MavlinkOutput(Output):
         self.link = link if isinstance(link, MavlinkLink) else MavlinkLink(link, options)
         self.name = f"mavlink {self.link.url}"
         self._n_dropped = 0
-        self._depth = DepthChoice(self.link, FRESH_S)
+        self._depth = DepthChoice(self.link)
         self._distance = _distance_message(self.link.dialect)
         self._values = _value_messages(self.link.dialect, NAMES)
         self._filtered_values = _value_messages(self.link.dialect, FILTERED_NAMES)
@@ -101,7 +101,7 @@ class MavlinkOutput(Output):
 
     def turning(self, at_ns: int) -> GyroRates | None:
         """Return the vehicle's turning at a time, as far as the autopilot tells it."""
-        return turning_of(self.link, at_ns)
+        return gyro_rates_of(self.link, at_ns)
 
     def close(self) -> None:
         """Close the link if it was made here; further calls do nothing."""

@@ -63,7 +63,7 @@ class RerunOutput(Output):
             return
         now_s = time.monotonic()
         if now_s >= self._next_s:
-            self._look()
+            self._check_viewer()
             # It may have taken seconds.
             self._next_s = time.monotonic() + _CHECK_EVERY_S
         if self._log is not None:
@@ -83,32 +83,32 @@ class RerunOutput(Output):
         if self._log is not None:
             self._log.close()
 
-    def _look(self) -> None:
+    def _check_viewer(self) -> None:
         """Find the viewer, or see whether it is still there."""
         if self.keeps_all:
             return
         if self._log is None:
-            self._log = self._connected()
+            self._log = self._connect()
         elif self._address is not None:
             # The SDK waits seconds for a viewer that has gone; a knock tells at once.
             try:
-                self._knock(self._address)
+                self._check_reachable(self._address)
             except OSError:
                 left, self._log = self._log, None
                 left.close()
                 raise
 
-    def _connected(self) -> RerunLog:
+    def _connect(self) -> RerunLog:
         log = RerunLog()
         if self._address is None:
             log.spawn()
         else:
-            self._knock(self._address)
+            self._check_reachable(self._address)
             host, port = self._address
             log.connect(f"rerun+http://{f'[{host}]' if ':' in host else host}:{port}/proxy")
         return log
 
-    def _knock(self, address: tuple[str, int]) -> None:
+    def _check_reachable(self, address: tuple[str, int]) -> None:
         try:
             socket.create_connection(address, _REACH_S).close()
         except OSError as fault:

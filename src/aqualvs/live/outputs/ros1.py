@@ -40,8 +40,8 @@ if TYPE_CHECKING:
 DEFAULT_MASTER = "http://localhost:11311"
 _TIMEOUT_S = 3.0
 # No packet is ever sent there; the system is only asked for the route.
-_FAR_AWAY = "198.51.100.1"
-_TROUBLE = (OSError, xmlrpc.client.Error, http.client.HTTPException, ValueError)
+_REMOTE_ADDRESS = "198.51.100.1"
+_MASTER_ERRORS = (OSError, xmlrpc.client.Error, http.client.HTTPException, ValueError)
 _log = logging.getLogger(__name__)
 
 
@@ -70,23 +70,18 @@ class Ros1Node:
         name: str,
         topics: Mapping[str, Ros1Type],
         master_uri: str,
-        environment: Mapping[str, str] = os.environ,
+        environment: Mapping[str, str],
     ) -> None:
-        self.name, self._topics, self.master_uri = name, dict(topics), master_uri
+        self.name, self.topics, self.master_uri = name, dict(topics), master_uri
         self._host = advertised_host(master_host(master_uri), environment)
         self._stop = threading.Event()
-        self._trouble, self._ended = "not registered yet", ""
+        self._fault, self._ended = "not registered yet", ""
         at = "127.0.0.1" if _is_loopback(self._host) else "0.0.0.0"
         self.links = Ros1Links(at, name, topics)
         self._server = _Server(at, _SlaveApi(self))
         self.uri = f"http://{self._host}:{self._server.port}/"
-        self._keeper = threading.Thread(target=self._keep, name="ros1 node", daemon=True)
-        self._keeper.start()
-
-    @property
-    def topics(self) -> dict[str, Ros1Type]:
-        """Types by topic."""
-        return self._topics
+        self._thread = threading.Thread(target=self._stay_registered, name="ros1 node", daemon=True)
+        self._thread.start()
 
     @property
     def tcpros(self) -> list[Any]:
@@ -94,9 +89,9 @@ class Ros1Node:
         return ["TCPROS", self._host, self.links.port]
 
     @property
-    def trouble(self) -> str:
+    def fault(self) -> str:
         """Reason why roscore does not know the node; empty if it does."""
-        return self._ended or self._trouble
+        return self._ended or self._fault
 
     def leave(self, reason: str) -> None:
         """End as ROS demands it: another node has taken the name, or `rosnode kill`."""
@@ -108,11 +103,11 @@ class Ros1Node:
     def close(self) -> None:
         """Say good-bye to roscore and subscribers, within some seconds; once is enough."""
         self._stop.set()
-        self._keeper.join(_TIMEOUT_S)
+        self._thread.join(_TIMEOUT_S)
         self._server.close()
         self.links.close()
 
-    def _keep(self) -> None:
+    def _stay_registered(self) -> None:
         """See to it that roscore knows the node, also one that was restarted."""
         first_wait_s, longest_wait_s = 0.5, 8.0
         ask_every_s = 2.0
@@ -122,12 +117,12 @@ class Ros1Node:
                 with _master(self.master_uri) as master:
                     if not (registered and self._is_known(master)):
                         self._register(master)
-            except _TROUBLE as fault:
+            except _MASTER_ERRORS as fault:
                 registered = False
-                self._trouble = f"no roscore at {self.master_uri} ({fault})"
+                self._fault = f"no roscore at {self.master_uri} ({fault})"
                 wait_s, next_wait_s = next_wait_s, min(2.0 * next_wait_s, longest_wait_s)
             else:
-                registered, self._trouble = True, ""
+                registered, self._fault = True, ""
                 wait_s, next_wait_s = ask_every_s, first_wait_s
         if registered:
             self._unregister()
@@ -137,17 +132,17 @@ class Ros1Node:
         return code == 1 and uri == self.uri
 
     def _register(self, master: xmlrpc.client.ServerProxy) -> None:
-        for topic, kind in self._topics.items():
-            code, told, _ = _answer(master.registerPublisher(self.name, topic, kind.name, self.uri))
+        for topic, kind in self.topics.items():
+            code, text, _ = _answer(master.registerPublisher(self.name, topic, kind.name, self.uri))
             if code != 1:
-                raise ValueError(f"{topic} refused: {told}")
+                raise ValueError(f"{topic} refused: {text}")
 
     def _unregister(self) -> None:
         try:
             with _master(self.master_uri) as master:
-                for topic in self._topics:
+                for topic in self.topics:
                     master.unregisterPublisher(self.name, topic, self.uri)
-        except _TROUBLE as fault:
+        except _MASTER_ERRORS as fault:
             _log.info("roscore went before %s: %s", self.name, fault)
 
 
@@ -274,7 +269,7 @@ def advertised_host(roscore: str, environment: Mapping[str, str]) -> str:
         return named
     own = _address_towards(roscore)
     if own is None or _is_loopback(own):
-        own = _address_towards(_FAR_AWAY)
+        own = _address_towards(_REMOTE_ADDRESS)
     return own or "127.0.0.1"
 
 
@@ -353,13 +348,13 @@ class Ros1Output(Output):
         """Return how the link to roscore and the subscribers is."""
         links = self._node.links
         n = sum(links.listeners().values())
-        told = f"{n or 'no'} subscriber{'s' * (n != 1)}"
+        text = f"{n or 'no'} subscriber{'s' * (n != 1)}"
         state = State.OK
         if self._closed:
-            state, told = State.OFF, "closed"
-        elif self._node.trouble:
-            state, told = State.WARN if n else State.FAULT, f"{self._node.trouble}; {told}"
-        return PartHealth(self.name, state, told, links.n_dropped)
+            state, text = State.OFF, "closed"
+        elif self._node.fault:
+            state, text = State.WARN if n else State.FAULT, f"{self._node.fault}; {text}"
+        return PartHealth(self.name, state, text, links.n_dropped)
 
     def close(self) -> None:
         """Say good-bye to roscore and the subscribers."""

@@ -49,7 +49,7 @@ class _Link:
         self.since_s = time.monotonic()
         self.topic = ""
         self.caller = ""
-        self.asked = bytearray()
+        self.received = bytearray()
         self.waiting: deque[bytes] = deque()
         self.rest = memoryview(b"")
 
@@ -89,7 +89,7 @@ class Ros1Links:
         self._links: set[_Link] = set()
         self._lock = threading.Lock()
         self._closing = False
-        self._n_dropped = 0
+        self.n_dropped = 0  # Messages that slow subscribers have missed.
         self._server = socket.create_server((host, 0), backlog=16)
         self._server.setblocking(False)
         self._wake, self._woken = socket.socketpair()
@@ -98,18 +98,13 @@ class Ros1Links:
         self._selector = selectors.DefaultSelector()
         self._selector.register(self._server, selectors.EVENT_READ)
         self._selector.register(self._woken, selectors.EVENT_READ)
-        self._thread = threading.Thread(target=self._work, name="ros1 links", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="ros1 links", daemon=True)
         self._thread.start()
 
     @property
     def port(self) -> int:
         """Port that subscribers connect to."""
         return int(self._server.getsockname()[1])
-
-    @property
-    def n_dropped(self) -> int:
-        """Messages that a slow subscriber has missed."""
-        return self._n_dropped
 
     def listeners(self) -> Counter[str]:
         """Return the number of subscribers of each topic."""
@@ -130,48 +125,48 @@ class Ros1Links:
                     continue
                 if len(link.waiting) >= _WAITING:
                     link.waiting.popleft()
-                    self._n_dropped += 1
+                    self.n_dropped += 1
                 link.waiting.append(packet)
-        self._rouse()
+        self._wake_thread()
 
     def close(self) -> None:
         """Close all connections and the port."""
         self._closing = True
-        self._rouse()
+        self._wake_thread()
         self._thread.join(_TIMEOUT_S)
 
-    def _rouse(self) -> None:
+    def _wake_thread(self) -> None:
         # If the pipe is full, the thread will wake anyway.
         with contextlib.suppress(OSError):
             self._wake.send(b"!")
 
-    def _work(self) -> None:
+    def _run(self) -> None:
         try:
             while not self._closing:
-                self._attend()
+                self._poll()
         finally:
             with self._lock:
                 for link in list(self._links):
-                    self._part(link)
+                    self._disconnect(link)
             for one in (self._server, self._wake, self._woken):
                 one.close()
             self._selector.close()
 
-    def _attend(self) -> None:
+    def _poll(self) -> None:
         """Wait for something to happen, and deal with it."""
         ready = self._selector.select(_LOOK_EVERY_S)
         with self._lock:
             for key, _ in ready:
                 if key.fileobj is self._server:
-                    self._greet()
+                    self._accept()
                 elif key.fileobj is self._woken:
                     self._woken.recv(4096)
                 else:
-                    self._hear(key.data)
+                    self._receive(key.data)
             for link in list(self._links):
-                self._serve(link)
+                self._send(link)
 
-    def _greet(self) -> None:
+    def _accept(self) -> None:
         try:
             connection, address = self._server.accept()
         except OSError:
@@ -185,39 +180,39 @@ class Ros1Links:
         self._links.add(link)
         self._selector.register(connection, selectors.EVENT_READ, link)
 
-    def _hear(self, link: _Link) -> None:
+    def _receive(self, link: _Link) -> None:
         """Read from a subscriber; after the handshake only the end of the connection comes."""
         if link not in self._links:
             return
         try:
-            told = link.connection.recv(4096)
+            data = link.connection.recv(4096)
         except BlockingIOError:
             return
         except OSError:
-            told = b""
-        if not told:
-            self._part(link)
+            data = b""
+        if not data:
+            self._disconnect(link)
         elif not link.topic:
-            link.asked += told
+            link.received += data
             self._shake_hands(link)
 
     def _shake_hands(self, link: _Link) -> None:
         try:
-            fields = _whole_header(link.asked)
+            fields = _whole_header(link.received)
             if fields is None:
                 return
-            reply = self._accepted(fields)
+            reply = self._reply(fields)
         except _RefusedError as refusal:
             _log.warning("subscriber at %s refused: %s", link.peer, refusal)
             link.waiting.append(_tcpros_header({"error": str(refusal)}))
             # A few octets always fit; the peer may ignore them.
-            self._serve(link)
-            self._part(link)
+            self._send(link)
+            self._disconnect(link)
             return
         link.topic, link.caller = fields["topic"], fields.get("callerid", "")
         link.waiting.append(reply)
 
-    def _accepted(self, fields: Mapping[str, str]) -> bytes:
+    def _reply(self, fields: Mapping[str, str]) -> bytes:
         """Return the answer to a subscriber's header."""
         topic = fields.get("topic", "")
         offered = self._topics.get(topic)
@@ -237,7 +232,7 @@ class Ros1Links:
             }
         )
 
-    def _serve(self, link: _Link) -> None:
+    def _send(self, link: _Link) -> None:
         if link not in self._links:
             return
         idle = not link.topic and time.monotonic() - link.since_s > _HANDSHAKE_S
@@ -246,7 +241,7 @@ class Ros1Links:
         except OSError:
             idle = True
         if idle:
-            self._part(link)
+            self._disconnect(link)
             return
         events = selectors.EVENT_READ
         if link.wants_to_write():
@@ -254,7 +249,7 @@ class Ros1Links:
         if self._selector.get_key(link.connection).events != events:
             self._selector.modify(link.connection, events, link)
 
-    def _part(self, link: _Link) -> None:
+    def _disconnect(self, link: _Link) -> None:
         if link in self._links:
             self._links.discard(link)
             self._selector.unregister(link.connection)

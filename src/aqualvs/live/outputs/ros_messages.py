@@ -412,11 +412,11 @@ _Status: TypeAlias = tuple[Level, str, dict[str, str]]
 def _posture_status(sample: LiveSample) -> _Status:
     posture = sample.scan.posture
     if not posture:
-        told = f"{posture.reason}: {posture.detail}" if posture.detail else str(posture.reason)
-        return Level.WARN, told, {"reason": str(posture.reason)}
+        text = f"{posture.reason}: {posture.detail}" if posture.detail else str(posture.reason)
+        return Level.WARN, text, {"reason": str(posture.reason)}
     pitch, yaw = math.degrees(posture.pitch), math.degrees(posture.yaw)
     frame, whole = deviations(posture.covariance), deviations(posture.total_covariance)
-    figures = _texts(
+    figures = _figure_texts(
         range_m=posture.range,
         pitch_deg=pitch,
         yaw_deg=yaw,
@@ -440,7 +440,7 @@ def _pipeline_status(health: Health) -> _Status:
         for stage in health.delays
         for which, delay_s in (("median", stage.median_s), ("p99", stage.p99_s))
     }
-    figures = _texts(
+    figures = _figure_texts(
         rate_hz=health.rate_hz,
         valid_share=health.valid_share,
         n_frames=health.n_frames,
@@ -456,12 +456,12 @@ def _pipeline_status(health: Health) -> _Status:
 
 
 def _part_status(part: PartHealth) -> _Status:
-    told = part.detail
+    text = part.detail
     if part.state is State.OFF:
-        told = f"not in use: {told}" if told else "not in use"
+        text = f"not in use: {text}" if text else "not in use"
     figures = {"state": str(part.state), "n_dropped": str(part.n_dropped)}
-    return _LEVELS[part.state], told, figures
+    return _LEVELS[part.state], text, figures
 
 
-def _texts(**figures: float) -> dict[str, str]:
+def _figure_texts(**figures: float) -> dict[str, str]:
     return {key: f"{value:.6g}" for key, value in figures.items()}

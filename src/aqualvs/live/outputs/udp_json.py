@@ -178,7 +178,7 @@ class _Receiver:
     def __init__(self, address: NetAddress) -> None:
         self._address = address
         self.n_dropped = 0
-        self._trouble = ""
+        self._fault = ""
         self._opened_s = -math.inf
         self._port: UdpPort | None = None
         self._closing = threading.Event()
@@ -193,7 +193,7 @@ class _Receiver:
         refused_s = None if self._port is None else self._port.refused_s
         if refused_s is not None and time.monotonic() - refused_s < refused_for_s:
             return f"nobody listens at {self._address}"
-        return f"{self._address}: {self._trouble}" if self._trouble else ""
+        return f"{self._address}: {self._fault}" if self._fault else ""
 
     def send(self, line: bytes) -> None:
         """Send a line or drop it."""
@@ -201,11 +201,11 @@ class _Receiver:
             port = self._opened()
             sent = port is not None and port.write(line, ())
         except OSError as fault:
-            self._trouble = fault.strerror or str(fault)
+            self._fault = fault.strerror or str(fault)
             self._drop_port()
             sent = False
         if sent:
-            self._trouble = ""
+            self._fault = ""
         self.n_dropped += not sent
 
     def close(self) -> None:
@@ -245,7 +245,7 @@ class _Receiver:
         try:
             found = find_host(self._address.host, self._address.port, flags)
         except (OSError, UnicodeError) as fault:
-            self._trouble = (fault.strerror if isinstance(fault, OSError) else "") or str(fault)
+            self._fault = (fault.strerror if isinstance(fault, OSError) else "") or str(fault)
             return None
-        self._trouble = ""
+        self._fault = ""
         return found
