@@ -13,6 +13,7 @@ from aqualvs.errors import OptionError, OutputError, SourceError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rigfile import rig_to_mapping
+from aqualvs.report.figure_style import save_figures
 from aqualvs.report.mesh_figures import Reflections, draw_figures, figures
 from aqualvs.scanning.paper.mesh_filter import MeshFilterOptions, laser_frame
 from aqualvs.simulation.scenarios import example_rig
@@ -172,7 +173,9 @@ def reflections(in_laser: FloatArray, net: bool) -> Reflections:
 
 @pytest.mark.parametrize("points", [np.empty((0, 2)), strands(1)[:1], box(50)])
 def test_little_to_see_is_drawn_too(tmp_path: Path, points: FloatArray) -> None:
-    written = draw_figures(reflections(points, False), MeshFilterOptions(), tmp_path)
+    written = save_figures(
+        draw_figures(reflections(points, False), MeshFilterOptions()), tmp_path, dpi=220
+    )
     assert all(path.stat().st_size > 5000 for path in written)
 
 

@@ -29,7 +29,7 @@ from aqualvs.experiments.laboratory import Laboratory, MeasuredDive, RenderedDiv
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.optics.rig import Rig
 from aqualvs.report.figure_style import OURS, PINK
-from aqualvs.report.mesh_figures import Reflections, drawn_figures
+from aqualvs.report.mesh_figures import Reflections, draw_figures
 from aqualvs.scanner import ScannerOptions
 from aqualvs.scanning.laser_bands import plan_bands
 from aqualvs.scanning.paper.detector import FilteredPeaks, PaperFilter
@@ -347,7 +347,7 @@ def _pictures(
 ) -> tuple[ExperimentFigure, ...]:
     laser = level_laser(rig)
     reflections = _reflections(papers, scan, rig, laser)
-    planes = drawn_figures(reflections, MeshFilterOptions())
+    planes = draw_figures(reflections, MeshFilterOptions())
     return (
         drawn(
             "figure_12",

@@ -20,6 +20,7 @@ from aqualvs.net_survey.surveys import (
 from aqualvs.nets.target_file import NetRequest
 from aqualvs.optics.rigfile import rig_from_mapping
 from aqualvs.pipeline import run_and_print
+from aqualvs.report.run_data import mapping
 from aqualvs.report.run_page import write_report
 from aqualvs.results.files import Claim, writing
 from aqualvs.results.folder import (
@@ -128,8 +129,7 @@ class StoredDive:
     @property
     def n_frames(self) -> int | None:
         """Number of frames that the run has measured, if known."""
-        summary = self._content.get("summary")
-        count = summary.get("n_frames") if isinstance(summary, dict) else None
+        count = mapping(self._content, "summary").get("n_frames")
         return count if isinstance(count, int) else None
 
     def missing(self, n_read: int) -> str:
@@ -150,8 +150,7 @@ class StoredDive:
     @property
     def video(self) -> Path | None:
         """The dive's video, if it is still there."""
-        source = self._content.get("source")
-        path = source.get("path") if isinstance(source, dict) else None
+        path = mapping(self._content, "source").get("path")
         return Path(path) if isinstance(path, str) and Path(path).is_file() else None
 
     def net_pass(self, request: NetRequest) -> NetPass:

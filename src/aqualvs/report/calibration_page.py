@@ -46,20 +46,20 @@ def number(value: float | None, digits: int, *, plus: bool = False) -> str:
 
 def view_table(views: Sequence[ViewRow]) -> Raw:
     """Return the views with a bar for the rms of each; in two columns if they are many."""
-    usual = _usual_rms(views)
+    median = _median_rms(views)
     remarks = any(view.remark or not view.used for view in views)
     rows_per_column = 18
     halves = 2 if len(views) > rows_per_column else 1
     length = -(-len(views) // halves)
     parts = [
-        _view_part(views[start : start + length], usual, remarks)
+        _view_part(views[start : start + length], median, remarks)
         for start in range(0, len(views), length)
     ]
     lead = ""
-    if math.isfinite(usual):
+    if math.isfinite(median):
         lead = (
             '<p class="lead">Distance between measured and predicted points, rms. The dashed line '
-            f"is the median of the views used, {usual:.3f} px; orange views are left out, or more "
+            f"is the median of the views used, {median:.3f} px; orange views are left out, or more "
             f"than {_HIGH_RMS:g} times as far off.</p>"
         )
     return Raw(f'{lead}<div class="halves">{"".join(parts)}</div>')
@@ -75,7 +75,7 @@ def parameter_table(rows: Sequence[ParameterRow]) -> Raw:
         line = [row.name, number(row.value, row.digits), _sigma_text(row), row.unit or DASH]
         line += _change_cells(row) if changed else []
         cells.append(line)
-    return Raw(table(head, cells))
+    return table(head, cells)
 
 
 def expectation_view(rows: Sequence[ExpectedError]) -> Raw:
@@ -118,21 +118,21 @@ def _marked(text: str, wrong: bool) -> str:
     return Raw(f'<span class="refused">{escape(text)}</span>') if wrong else text
 
 
-def _usual_rms(views: Sequence[ViewRow]) -> float:
+def _median_rms(views: Sequence[ViewRow]) -> float:
     values = [view.rms_px for view in views if view.used and math.isfinite(view.rms_px)]
     return float(np.median(values)) if values else math.nan
 
 
-def _view_part(views: Sequence[ViewRow], usual: float, remarks: bool) -> str:
+def _view_part(views: Sequence[ViewRow], median: float, remarks: bool) -> str:
     head = ["view", "", "rms, px", "points", *(["remark"] if remarks else [])]
     cells = []
     for view in views:
-        wrong = not view.used or view.rms_px > _HIGH_RMS * usual
+        wrong = not view.used or view.rms_px > _HIGH_RMS * median
         words = "; ".join(filter(None, ("" if view.used else "left out", view.remark)))
         remark = [_marked(words, wrong)] if remarks else []
         line = [
             _marked(view.name, wrong),
-            _bar(view, usual, wrong),
+            _rms_bar(view, median, wrong),
             _marked(number(view.rms_px, 3), wrong),
             f"{view.n_points:,}",
             *remark,
@@ -141,19 +141,19 @@ def _view_part(views: Sequence[ViewRow], usual: float, remarks: bool) -> str:
     return table(head, cells, tail=int(remarks))
 
 
-def _bar(view: ViewRow, usual: float, wrong: bool) -> Raw:
+def _rms_bar(view: ViewRow, median: float, wrong: bool) -> Raw:
     """Return the rms as a bar; one that would be too long is cut open at its end."""
     if not math.isfinite(view.rms_px):
         return Raw("")
     bar, bar_height, bar_reach = 180.0, 14.0, 4.0
-    reach = bar_reach * usual if usual > 0.0 else max(view.rms_px, 1e-9)
+    reach = bar_reach * median if median > 0.0 else max(view.rms_px, 1e-9)
     length = bar * min(view.rms_px / reach, 1.0)
     colour = draw.OUTLIER if wrong else draw.ACCENT
     body = [draw.box(0.0, 2.0, length, bar_height - 4.0, fill=colour, stroke="none")]
     if view.rms_px > reach:
         gap = ' stroke-width="3"'
         body.append(draw.line(bar - 16, bar_height, bar - 10, 0, colour=draw.PAPER, more=gap))
-    if usual > 0.0:
+    if median > 0.0:
         x = bar / bar_reach
         dashed = ' stroke-width="1.2" stroke-dasharray="3 2"'
         body.append(draw.line(x, 0.0, x, bar_height, colour="var(--ink)", more=dashed))
@@ -214,12 +214,12 @@ def _expectation_lines(row: ExpectedError) -> Iterator[list[str]]:
 
 def _excess(row: ExpectedError) -> float:
     """Return the worst of range, pitch and yaw, relative to what it should stay within."""
-    range_mm, pitch, yaw = _seen(row)
+    range_mm, pitch, yaw = _expected(row)
     parts = (_percent(row, range_mm) / LIMIT_PERCENT, pitch / LIMIT_DEG, yaw / LIMIT_DEG)
     return math.nan if any(math.isnan(part) for part in parts) else max(parts)
 
 
-def _seen(row: ExpectedError) -> tuple[float, float, float]:
+def _expected(row: ExpectedError) -> tuple[float, float, float]:
     """Return both causes together; the calibration's alone where the noise is not known."""
     parts = _parts_of(row)
     both = parts["both"]
@@ -231,7 +231,7 @@ def _expectation_text(rows: Sequence[ExpectedError]) -> str:
     if not known:
         return '<p class="verdict bad">What to expect on a target is not known.</p>'
     worst = max(known, key=_excess)
-    range_mm, pitch, yaw = _seen(worst)
+    range_mm, pitch, yaw = _expected(worst)
     fine = _excess(worst) <= 1.0 and len(known) == len(rows)
     limits = f"{LIMIT_PERCENT:g} % of range and {LIMIT_DEG:g}°"
     where = " at every distance" if len(rows) > 1 else ""

@@ -94,7 +94,7 @@ def stretches(track: Track) -> list[Stretch]:
     return [Stretch(first, last) for first, last in runs_of(~track.valid).tolist()]
 
 
-def merged(found: list[Stretch], track: Track, columns: int) -> list[Stretch]:
+def merge_stretches(found: list[Stretch], track: Track, columns: int) -> list[Stretch]:
     """Return stretches joined across gaps too narrow to see, so that about `columns` remain.
 
     Parameters
@@ -108,7 +108,7 @@ def merged(found: list[Stretch], track: Track, columns: int) -> list[Stretch]:
     joined: list[Stretch] = []
     for stretch in found:
         gap_ends = float(track.time_s[stretch.first])
-        if joined and gap_ends - stretch_end_s(joined[-1], track)[1] < least:
+        if joined and gap_ends - stretch_span_s(joined[-1], track)[1] < least:
             joined[-1] = Stretch(joined[-1].first, stretch.last)
         else:
             joined.append(stretch)
@@ -133,7 +133,7 @@ def reason_counts(track: Track) -> list[tuple[str, int]]:
     return counted.most_common()
 
 
-def stretch_end_s(stretch: Stretch, track: Track) -> tuple[float, float]:
+def stretch_span_s(stretch: Stretch, track: Track) -> tuple[float, float]:
     """Return when a stretch starts and when the next posture, if any, ends it, in seconds."""
     after = min(stretch.last + 1, len(track) - 1)
     return float(track.time_s[stretch.first]), float(track.time_s[after])
@@ -160,7 +160,7 @@ def posture_chart(track: Track, truth: FloatArray | None) -> Json:
     """Return range, pitch and yaw over time with their sigma, truth and the gaps."""
     scale, unit = time_unit(track)
     columns = 1000
-    found = merged(stretches(track), track, columns)
+    found = merge_stretches(stretches(track), track, columns)
     return {
         "time_unit": unit,
         "measured": "measured",
@@ -320,8 +320,8 @@ def _line(time: FloatArray, values: FloatArray, rows: IntArray, digits: int) -> 
     }
 
 
-def _stretch(stretch: Any, track: Track, scale: float) -> Json:
-    start, end = stretch_end_s(stretch, track)
+def _stretch(stretch: Stretch, track: Track, scale: float) -> Json:
+    start, end = stretch_span_s(stretch, track)
     rows = slice(stretch.first, stretch.last + 1)
     refused = int((~track.valid[rows]).sum())
     count = f"{refused} frame{'s' if refused > 1 else ''}"

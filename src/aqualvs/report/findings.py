@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray
-from aqualvs.report.charts import stretch_end_s, stretch_text, stretches
+from aqualvs.report.charts import stretch_span_s, stretch_text, stretches
 from aqualvs.report.frames import SampleFrame
 from aqualvs.report.html import Card
 from aqualvs.report.points import PointSummary
-from aqualvs.report.run_data import Track
+from aqualvs.report.run_data import Track, mapping
 from aqualvs.text import clock, count_text, sentence, signed
 
 
@@ -18,7 +18,7 @@ def headline(track: Track) -> list[Card]:
     """Return the numbers at the top of the report."""
     share = float(track.valid.mean())
     valid = f"{int(track.valid.sum())} of {count_text(len(track), 'frame')}"
-    seconds, rate = duration_s(track), count_text(len(track), "frame")
+    seconds, rate = float(track.time_s[-1] - track.time_s[0]), count_text(len(track), "frame")
     if len(track) > 1 and seconds > 0.0:
         rate += f", {(len(track) - 1) / seconds:.3g} per second"
     cards = [
@@ -35,11 +35,6 @@ def headline(track: Track) -> list[Card]:
             note = f"{water.min():.4f} to {water.max():.4f} over the dive"
         cards.append(Card("Water's refractive index", f"{np.median(water):.4f}", note))
     return cards
-
-
-def duration_s(track: Track) -> float:
-    """Return the time from the first frame to the last, in seconds."""
-    return float(track.time_s[-1] - track.time_s[0])
 
 
 def warnings_of(
@@ -104,8 +99,7 @@ def _status_warnings(run: Mapping[str, Any], track: Track) -> Iterator[str]:
     if status is not None and status != "finished":
         until = clock(float(track.time_s[-1]))
         yield f"The run did not finish (status: {status}); this page covers it up to {until}."
-    summary = run.get("summary")
-    n_frames = summary.get("n_frames") if isinstance(summary, dict) else None
+    n_frames = mapping(run, "summary").get("n_frames")
     if isinstance(n_frames, int) and n_frames > len(track):
         yield f"posture.csv holds {len(track)} of the run's {n_frames} frames: it is truncated."
     if run.get("error"):
@@ -117,15 +111,13 @@ def _status_warnings(run: Mapping[str, Any], track: Track) -> Iterator[str]:
 
 def _summary_text(run: Mapping[str, Any], name: str) -> Iterator[str]:
     """Yield what a part of the run's summary has to say, as a sentence."""
-    summary = run.get("summary")
-    found = summary.get(name) if isinstance(summary, dict) else None
-    words = found.get("words") if isinstance(found, dict) else None
+    words = mapping(mapping(run, "summary"), name).get("words")
     if isinstance(words, str) and words:
         yield sentence(words)
 
 
 def _gap_warnings(track: Track) -> Iterator[str]:
-    spans = [(stretch_end_s(found, track), found) for found in stretches(track)]
+    spans = [(stretch_span_s(found, track), found) for found in stretches(track)]
     long_gap_s = 2.0
     long = [
         (end - start, start, found) for (start, end), found in spans if end - start > long_gap_s
@@ -199,8 +191,7 @@ def _water_warnings(track: Track) -> Iterator[str]:
 
 def _own_warnings(run: Mapping[str, Any]) -> Iterator[str]:
     """Yield what the run itself put on record."""
-    summary = run.get("summary")
-    for place in (run, summary if isinstance(summary, dict) else {}):
+    for place in (run, mapping(run, "summary")):
         found = place.get("warnings")
         if isinstance(found, list):
             yield from (sentence(str(words)) for words in found)

@@ -25,7 +25,7 @@ from aqualvs.geometry.planes import Plane
 from aqualvs.nets.target_file import target_dict
 from aqualvs.optics.rigfile import rig_from_mapping
 from aqualvs.report.figure_style import BLUE, DARK, GREY, PINK, STYLE, new_canvas, save_figures
-from aqualvs.report.run_data import LaserFacts, lasers_of, read_run_file, working_range_m
+from aqualvs.report.run_data import LaserFacts, lasers_of, mapping, read_run_file, working_range_m
 from aqualvs.results.files import Claim, writing
 from aqualvs.results.folder import POINTS_PARQUET, check_run_files
 from aqualvs.scanning.laser_bands import plan_bands
@@ -91,25 +91,7 @@ FIGURES = ("figure_13", "figure_14", "laser_plane_image")
 """Names of the pictures."""
 
 
-def draw_figures(reflections: Reflections, options: MeshFilterOptions, out: Path) -> list[Path]:
-    """Write `figure_13.png`, `figure_14.png` and `laser_plane_image.png`.
-
-    Parameters
-    ----------
-    options : MeshFilterOptions
-        Of the paper's filter.
-    out : Path
-        Folder that exists.
-
-    Raises
-    ------
-    OSError
-        If a picture cannot be written.
-    """
-    return save_figures(drawn_figures(reflections, options), out, dpi=220)
-
-
-def drawn_figures(reflections: Reflections, options: MeshFilterOptions) -> dict[str, Figure]:
+def draw_figures(reflections: Reflections, options: MeshFilterOptions) -> dict[str, Figure]:
     """Return the same pictures by name, not yet written."""
     with rc_context(STYLE):
         return {
@@ -352,9 +334,9 @@ def figures(
     `OutputError` if the pictures cannot be written.
     """
     check_run_files(folder)
-    run, trouble = read_run_file(folder)
-    if trouble:
-        raise SourceError(f"{folder}: {trouble} Give the folder of a run that has one.")
+    run, fault = read_run_file(folder)
+    if fault:
+        raise SourceError(f"{folder}: {fault} Give the folder of a run that has one.")
     facts = _lasers(folder, run)
     options = _paper_options(folder, run, target)
     points = folder / POINTS_PARQUET
@@ -373,7 +355,7 @@ def figures(
         raise SourceError(f"{points}: cannot be read ({why}); run again") from fault
     files = [out / f"{name}.png" for name in FIGURES]
     with Claim("figures", files, overwrite=overwrite), writing(out):
-        written = draw_figures(reflections, options, out)
+        written = save_figures(draw_figures(reflections, options), out, dpi=220)
     for line in _summary(reflections):
         echo(line)
     for path in written:
@@ -382,16 +364,14 @@ def figures(
 
 
 def _lasers(folder: Path, run: Mapping[str, Any]) -> list[LaserFacts]:
-    rig = run.get("rig")
-    known = lasers_of(rig) if isinstance(rig, dict) else []
+    known = lasers_of(mapping(run, "rig"))
     if not known or not all(np.isfinite(one.offset) for one in known):
         raise SourceError(f"{folder / 'run.yaml'}: holds no lasers; run again with a whole rig")
     return known
 
 
 def _paper_options(folder: Path, run: Mapping[str, Any], target: Path | None) -> MeshFilterOptions:
-    scanner = (run.get("options") or {}).get("scanner") or {}
-    if scanner.get("mesh_filter"):
+    if mapping(mapping(run, "options"), "scanner").get("mesh_filter"):
         raise OptionError(
             f"{folder}: the run used --mesh-filter paper, which drops what it rejects; run once "
             "more without it (the figures apply the filter themselves)"
@@ -459,7 +439,7 @@ def _worth(r: Reflections) -> float:
     return float(pieces * np.sqrt(1.0 + np.count_nonzero(r.usable & ~r.adaptive)))
 
 
-class _Judged(NamedTuple):
+class _FilteredPoints(NamedTuple):
     """Points of one laser in `dome`, shape (N, 3), and which of them each filter takes for net."""
 
     in_dome: FloatArray
@@ -476,7 +456,7 @@ def _read(
 ) -> Reflections:
     plane = Plane(laser.normal, laser.offset)
     near, far = working_range_m(run["rig"]) or (0.0, np.inf)
-    detector = ((run.get("options") or {}).get("scanner") or {}).get("detector") or {}
+    detector = mapping(mapping(mapping(run, "options"), "scanner"), "detector")
     every_pixel = detector.get("kind") == "threshold"
     table = parquet.read_table(
         points.absolute(),
@@ -484,33 +464,37 @@ def _read(
         filters=[("frame", "==", chosen[0]), ("laser", "==", chosen[1])],
     )
     if every_pixel:
-        judged = _pixels(table, chosen[1], run, options)
+        filtered = _pixels(table, chosen[1], run, options)
     else:
         in_dome = _columns(table, "x_m", "y_m", "z_m")
         kept = mesh_filter(in_dome, plane, options, working_range=(near, far))
-        judged = _Judged(in_dome, _is_net(table["label"]), kept)
-    distance = np.linalg.norm(judged.in_dome, axis=1)
+        filtered = _FilteredPoints(in_dome, _is_net(table["label"]), kept)
+    distance = np.linalg.norm(filtered.in_dome, axis=1)
     return Reflections(
         frame=chosen[0],
         laser=laser.name,
-        in_laser=np.ascontiguousarray(laser_frame(plane).apply(judged.in_dome)[:, :2]),
+        in_laser=np.ascontiguousarray(laser_frame(plane).apply(filtered.in_dome)[:, :2]),
         offset=laser.offset,
         working_range=(near, far),
         usable=(distance >= near) & (distance <= far),
-        adaptive=judged.adaptive,
-        paper=judged.paper,
+        adaptive=filtered.adaptive,
+        paper=filtered.paper,
         every_pixel=every_pixel,
     )
 
 
-def _pixels(table: Any, laser: int, run: Mapping[str, Any], options: MeshFilterOptions) -> _Judged:
+def _pixels(
+    table: Any, laser: int, run: Mapping[str, Any], options: MeshFilterOptions
+) -> _FilteredPoints:
     """Return every bright pixel of a run with the threshold detector."""
     rig = rig_from_mapping(run["rig"], source_name="run.yaml")
     camera = rig.camera()
     papers = PaperFilter(rig, camera, plan_bands(rig, camera), options, every_pixel=True)
     centres, width = _columns(table, "u_px", "v_px"), _columns(table, "width_px")[:, 0]
     found = papers.apply(centres, width, np.full(len(width), laser))
-    return _Judged(found.points_in_dome, _is_net(table["label"])[found.source], found.on_mesh)
+    return _FilteredPoints(
+        found.points_in_dome, _is_net(table["label"])[found.source], found.on_mesh
+    )
 
 
 def _columns(table: Any, *names: str) -> FloatArray:

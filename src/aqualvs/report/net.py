@@ -10,6 +10,7 @@ from typing import Any, TypeAlias
 
 from aqualvs.report.frames import SampleFrame
 from aqualvs.report.html import Card, Raw, data_url, folded, table, text
+from aqualvs.report.run_data import mapping
 from aqualvs.results.files import read_json
 from aqualvs.results.folder import HOLES_CSV, NET_CSV, NET_GEOJSON, NET_MAP_PNG
 from aqualvs.text import clock, signed
@@ -38,8 +39,7 @@ class NetTables:
     @property
     def summary(self) -> Mapping[str, Any]:
         """The dive in a few numbers; empty where `net.geojson` is missing."""
-        found = self.facts.get("summary")
-        return found if isinstance(found, dict) else {}
+        return mapping(self.facts, "summary")
 
 
 def read_net(run_dir: Path) -> tuple[NetTables | None, str]:
@@ -292,8 +292,7 @@ def _facts(path: Path) -> Mapping[str, Any]:
         content = read_json(path)
     except (OSError, ValueError):
         return {}
-    found = content.get("aqualvs_net") if isinstance(content, dict) else None
-    return found if isinstance(found, dict) else {}
+    return mapping(content, "aqualvs_net") if isinstance(content, dict) else {}
 
 
 def _picture(run_dir: Path) -> str:

@@ -91,7 +91,7 @@ def posture_lines(posture: Posture | Refusal) -> list[str]:
     ]
 
 
-def draw_caption(image: ImagePlane, lines: list[str], *, warn: bool = False) -> None:
+def draw_caption(image: ImagePlane, lines: list[str], *, warn: bool) -> None:
     """Write lines into the top left corner, on a darkened ground; changes `image`."""
     size = _font_size(image)
     step = round(34 * size)

@@ -28,6 +28,7 @@ POSTURE = ("range_m", "pitch_deg", "yaw_deg")
 _SIGMAS = tuple(f"sigma_{name}" for name in POSTURE)
 _TOTALS = ("sigma_range_total_m", "sigma_pitch_total_deg", "sigma_yaw_total_deg")
 _NUMBERS = ("frame", "time_s", *POSTURE, *_SIGMAS, *_TOTALS, "n_points", "n_water")
+_TEXTS = ("valid", "reason", "field")
 _TRUE = ("true", "1", "yes")
 
 
@@ -53,8 +54,7 @@ class Track:
     # Shape (N,): NaN where the file has none.
     n_points: FloatArray
     n_water: FloatArray
-    # Field of even frames of an interlaced camera; None where frames are whole
-    # pictures.
+    # Field of even frames of an interlaced camera; None where frames are whole pictures.
     first_field: Field | None = None
 
     def __len__(self) -> int:
@@ -81,7 +81,7 @@ def read_track(path: Path) -> Track:
     Raises `SourceError` if the file is missing, holds no frame, or holds something that is no
     number.
     """
-    columns, texts = _read_columns(path, _NUMBERS, ("valid", "reason", "field"))
+    columns, texts = _read_columns(path)
     order = np.argsort(columns["frame"], kind="stable")
     posture = np.stack([columns[name] for name in POSTURE], axis=-1)[order]
     sigma = np.stack([columns[name] for name in _SIGMAS], axis=-1)[order]
@@ -107,11 +107,8 @@ def read_track(path: Path) -> Track:
 
 def _first_field(frame: FloatArray, field: "_Words") -> Field | None:
     """Return the field of even frames, as the first even row names it."""
-    for row in np.flatnonzero(frame % 2 == 0)[:1].tolist():
-        for name in FIRST_ROW:
-            if field.names[field.codes[row]] == name:
-                return name
-    return None
+    named = {field.names[code] for code in field.codes[frame % 2 == 0][:1].tolist()}
+    return next((name for name in FIRST_ROW if name in named), None)
 
 
 def read_truth(path: Path, track: Track) -> FloatArray:
@@ -145,8 +142,7 @@ def noted_truth(run: Mapping[str, Any], track: Track) -> tuple[FloatArray | None
 
     `run`: content of `run.yaml`. A report does without a truth that is gone, or of another dive.
     """
-    options = run.get("options")
-    path = options.get("truth") if isinstance(options, dict) else None
+    path = mapping(run, "options").get("truth")
     if not isinstance(path, str):
         return None, ""
     without = "the report is without the errors against it."
@@ -179,6 +175,12 @@ def read_bare(run_dir: Path, track: Track) -> tuple[FloatArray | None, str]:
     return _onto(track.frame, bare.frame.astype(np.float64), bare.posture), ""
 
 
+def mapping(content: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+    """Return the mapping below a key, empty if there is none."""
+    found = content.get(key)
+    return found if isinstance(found, dict) else {}
+
+
 def number(value: object) -> float:
     """Return a file's value as a finite float, NaN where it is none."""
     if isinstance(value, bool) or not isinstance(value, int | float):
@@ -208,28 +210,26 @@ class _Words(NamedTuple):
     codes: IntArray
 
 
-def _read_columns(
-    path: Path, numbers: tuple[str, ...], texts: tuple[str, ...]
-) -> tuple[dict[str, FloatArray], dict[str, _Words]]:
-    """Read the named columns of a CSV, of the rows that have a frame and its time.
+def _read_columns(path: Path) -> tuple[dict[str, FloatArray], dict[str, _Words]]:
+    """Read numbers and texts of a `posture.csv`, of the rows that have a frame and its time.
 
     A missing column becomes NaN or "None".
     """
-    table = _read_table(path, numbers, texts)
+    table = _read_table(path)
     # With NumPy: filtering an Arrow table imports all of its functions first.
     whole = np.isfinite(_numbers(table["frame"])) & np.isfinite(_numbers(table["time_s"]))
     if not whole.any():
         raise NoFrameError(f"{path}: holds no frame; run the dive again")
     words = table.unify_dictionaries()
     return (
-        {name: _numbers(table[name])[whole] for name in numbers},
-        {name: _words(words[name], whole) for name in texts},
+        {name: _numbers(table[name])[whole] for name in _NUMBERS},
+        {name: _words(words[name], whole) for name in _TEXTS},
     )
 
 
-def _read_table(path: Path, numbers: tuple[str, ...], texts: tuple[str, ...]) -> Any:
+def _read_table(path: Path) -> Any:
     word = pa.dictionary(pa.int32(), pa.string())
-    types = dict.fromkeys(numbers, pa.float64()) | dict.fromkeys(texts, word)
+    types = dict.fromkeys(_NUMBERS, pa.float64()) | dict.fromkeys(_TEXTS, word)
     convert = csv.ConvertOptions(
         column_types=types, include_columns=list(types), include_missing_columns=True
     )
@@ -344,9 +344,7 @@ def housing_name(rig: Mapping[str, Any]) -> str:
 
 def dome_radius_mm(rig: Mapping[str, Any]) -> float:
     """Return the dome's outer radius in millimetres, NaN where the rig has no dome."""
-    dome = rig.get("dome")
-    if not isinstance(dome, dict):
-        return float("nan")
+    dome = mapping(rig, "dome")
     return number(dome.get("inner_radius_mm")) + number(dome.get("thickness_mm"))
 
 

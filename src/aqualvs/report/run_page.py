@@ -42,6 +42,7 @@ from aqualvs.report.run_data import (
     facts,
     housing_name,
     lasers_of,
+    mapping,
     noted_truth,
     read_bare,
     read_run_file,
@@ -99,7 +100,7 @@ def gather(run_dir: Path, truth: Path | None) -> Material:
     Raises `SourceError` if `posture.csv`, or the truth, cannot be read or holds no frame.
     """
     check_run_files(run_dir)
-    run, trouble = read_run_file(run_dir)
+    run, fault = read_run_file(run_dir)
     track = read_track(run_dir / "posture.csv")
     source = _source(run_dir, run)
     picture_rows = choose_pictures(track, None if isinstance(source, str) else source)
@@ -124,7 +125,7 @@ def gather(run_dir: Path, truth: Path | None) -> Material:
     names = [laser.name for laser in lasers]
     bare, no_bare = read_bare(run_dir, track)
     true, no_truth = noted_truth(run, track) if truth is None else (read_truth(truth, track), "")
-    told = warnings_of(track, points, pictures, run, working_range_m(rig), names)
+    warnings = warnings_of(track, points, pictures, run, working_range_m(rig), names)
     return Material(
         title=Path(_source_name(run)).stem or run_dir.resolve().name,
         run=run,
@@ -146,24 +147,18 @@ def gather(run_dir: Path, truth: Path | None) -> Material:
         warnings=[
             text
             for text in (
-                trouble,
+                fault,
                 no_points,
                 no_pictures,
                 no_bare,
                 no_truth,
                 no_net,
-                *told,
+                *warnings,
                 *net_warnings(net),
             )
             if text
         ],
     )
-
-
-def mapping(content: Mapping[str, Any], key: str) -> Mapping[str, Any]:
-    """Return the mapping below a key, empty if there is none."""
-    found = content.get(key)
-    return found if isinstance(found, dict) else {}
 
 
 def _lasers(rig: Mapping[str, Any], points: PointSummary | None) -> list[LaserFacts]:
@@ -316,9 +311,9 @@ _MARKS = ("●", "■", "▲", "★", "□", "✕", "◆", "○")
 
 def _subtitle(run: Mapping[str, Any]) -> str:
     """Return the rig's name, the source and its picture size, as far as they are known."""
-    rig, source = run.get("rig"), run.get("source")
+    rig, source = mapping(run, "rig"), run.get("source")
     said = []
-    if isinstance(rig, dict) and rig.get("name"):
+    if rig.get("name"):
         said.append(f"Rig “{rig['name']}”")
     if isinstance(source, dict):
         said.append(f"source {source.get('path') or source.get('name') or 'unknown'}")
@@ -439,8 +434,7 @@ def _fact_blocks(run: Mapping[str, Any]) -> list[tuple[str, html.Raw]]:
         ("Versions", "versions", ()),
         ("Summary", "summary", ("warnings",)),
     ):
-        content = run.get(key)
-        if isinstance(content, dict) and content:
+        if content := mapping(run, key):
             blocks.append((title, html.fact_table(facts(content, skip))))
     return blocks
 
