@@ -35,7 +35,7 @@ def view_of(
         for k in range(2):
             across = abs(t[k])
             slant = abs(search[i, k]) / (across * square)
-            usual = TWINE.usual(*(np.array(v) for v in (across, slant, STEP, HEIGHT)))
+            usual = TWINE.dash_length(*(np.array(v) for v in (across, slant, STEP, HEIGHT)))
             for s in (np.arange(-15, 16) - shift) * BAR / t[k]:
                 n += 2
                 length = float(usual) + (4e-3 if n % 5 < 5.0 * grown else 0.0)
@@ -76,7 +76,7 @@ def test_dashes_are_sorted_by_laser_and_family() -> None:
     assert slanted.across == pytest.approx(np.sin(TURN))
     assert slanted.slant == pytest.approx(1.0 / (np.sin(TURN) * np.cos(TURN)))
     for kind in (level, slanted):
-        usual = TWINE.usual(*(np.array(v) for v in (kind.across, kind.slant, STEP, HEIGHT)))
+        usual = TWINE.dash_length(*(np.array(v) for v in (kind.across, kind.slant, STEP, HEIGHT)))
         assert kind.length == pytest.approx(float(usual), abs=STEP)
         # Pixels are as large as search lines are apart; width square to the line: that leans.
         assert kind.pixel == pytest.approx(STEP * np.cos(TURN))

@@ -92,7 +92,7 @@ def test_known_twine_measures_the_halo() -> None:
     assert found is not None
     assert found.thickness == pytest.approx(1.6e-3)
     # What is lit is as before: what was twine is halo now.
-    lit = found.usual(np.ones(1), np.zeros(1), np.full(1, STEP), np.full(1, 100.0))
+    lit = found.dash_length(np.ones(1), np.zeros(1), np.full(1, STEP), np.full(1, 100.0))
     assert lit[0] == pytest.approx(SEEN * BODY * 2.0e-3 + HALO, rel=0.05)
     assert found.halo == pytest.approx(lit[0] - BODY * 1.6e-3 - 0.44 * STEP)
 

@@ -8,7 +8,7 @@ import pytest
 
 from aqualvs.errors import OptionError, SourceError
 from aqualvs.nets import places as net_log
-from aqualvs.nets.places import DivePostures, lay_log, open_log
+from aqualvs.nets.places import DivePostures, align_log, open_log
 from aqualvs.vehicle_logs.vehicle_log import VehicleLog
 from net_app_cases import postures, vehicle_log
 
@@ -45,7 +45,7 @@ def still() -> tuple[VehicleLog, DivePostures]:
 
 def test_motion_tells_the_offset(moving):
     log, dive = moving
-    laid = lay_log(log, dive, None, None)
+    laid = align_log(log, dive, None, None)
     assert laid.offset.offset_s == pytest.approx(TRUE_S, abs=0.1)
     assert laid.places is not None
     assert laid.to_dict()["offset_s"] == pytest.approx(TRUE_S, abs=0.1)
@@ -54,7 +54,7 @@ def test_motion_tells_the_offset(moving):
 
 def test_what_the_user_says_counts(moving):
     log, dive = moving
-    laid = lay_log(log, dive, 3.5, None)
+    laid = align_log(log, dive, 3.5, None)
     assert laid.places.offset_s == 3.5
     assert laid.to_dict()["offset_from"] == "given by the user"
 
@@ -62,7 +62,7 @@ def test_what_the_user_says_counts(moving):
 def test_clocks_stand_in_where_motion_says_nothing(still, monkeypatch):
     monkeypatch.setattr(net_log, "dive_start_utc", lambda _: 1002.0)
     log, dive = still
-    laid = lay_log(log, dive, None, VIDEO)
+    laid = align_log(log, dive, None, VIDEO)
     assert laid.places.offset_s == pytest.approx(2.0)
     assert laid.offset.sigma_s > 1.0
     assert "clocks" in laid.words()
@@ -71,7 +71,7 @@ def test_clocks_stand_in_where_motion_says_nothing(still, monkeypatch):
 def test_without_motion_and_clocks_the_log_is_not_used(still, monkeypatch):
     monkeypatch.setattr(net_log, "dive_start_utc", lambda _: None)
     log, dive = still
-    laid = lay_log(log, dive, None, VIDEO)
+    laid = align_log(log, dive, None, VIDEO)
     assert laid.places is None
     assert "is not used" in laid.words()
     assert laid.to_dict() == {"file": "vehicle.csv", "used": False, "refused": laid.offset.reason}
@@ -79,16 +79,16 @@ def test_without_motion_and_clocks_the_log_is_not_used(still, monkeypatch):
 
 def test_a_log_that_covers_none_of_the_dive_is_not_used(moving):
     log, dive = moving
-    laid = lay_log(log, dive, 500.0, None)
+    laid = align_log(log, dive, 500.0, None)
     assert laid.places is None
     assert "none of the dive" in laid.words()
 
 
 def test_a_log_that_covers_a_part_of_the_dive_says_so(moving):
     log, dive = moving
-    assert "covers" not in lay_log(log, dive, 3.5, None).words()
+    assert "covers" not in align_log(log, dive, 3.5, None).words()
     late = log.span_s[1] - 0.5 * dive.time_s[-1]
-    laid = lay_log(log, dive, late, None)
+    laid = align_log(log, dive, late, None)
     assert laid.places is not None
     assert laid.words().endswith("(given by the user); it covers 50 % of the dive")
     assert laid.to_dict()["covered"] == pytest.approx(0.5, abs=0.01)
@@ -96,7 +96,7 @@ def test_a_log_that_covers_a_part_of_the_dive_says_so(moving):
 
 def test_a_dive_without_a_net_needs_no_offset(moving):
     log, _ = moving
-    laid = lay_log(log, postures(0.0), None, None)
+    laid = align_log(log, postures(0.0), None, None)
     assert laid.places is None
     assert "\n" not in laid.words()
 

@@ -19,7 +19,7 @@ from pyarrow import parquet
 
 from aqualvs.errors import OutputError, SourceError
 from aqualvs.report import html
-from aqualvs.report.charts import breaks, merged, stretches, thin
+from aqualvs.report.charts import breaks, merge_stretches, stretches, thin
 from aqualvs.report.frames import choose_pictures, choose_samples, decode_frames
 from aqualvs.report.html import Raw, embedded_json
 from aqualvs.report.html import page as filled_page
@@ -543,7 +543,7 @@ def test_merged_stretches_are_bounded_and_shade_no_visible_gap() -> None:
     track = long_track(50_000)
     found = stretches(track)
     assert sum(s.last - s.first + 1 for s in found) == int((~track.valid).sum())
-    joined = merged(found, track, 1000)
+    joined = merge_stretches(found, track, 1000)
     assert len(found) > 5000 >= 2 * len(joined)
     covered = np.zeros(len(track), np.bool_)
     for stretch in joined:

@@ -84,7 +84,7 @@ class NetStretch:
 
 
 @dataclass(frozen=True, slots=True)
-class _Seen:
+class _Observations:
     """Observations of the n frames of a stretch."""
 
     views: list[NetView]
@@ -109,19 +109,17 @@ class NetCondition:
 
     def __init__(self, rig: Rig, options: NetConditionOptions | None = None) -> None:
         self.options = options or NetConditionOptions()
-        # Completed stretches. Where the net's lattice is found only later, the places of earlier
-        # stretches and the holes in them are filled in then.
         self.stretches: list[NetStretch] = []
         self._reader = NetReader(rig)
         self._signals: list[NetSignal] = []
         self._velocities: list[FloatArray | None] = []
         # Stretches before the first lattice, by their number.
-        self._waiting: dict[int, _Seen] = {}
+        self._waiting: dict[int, _Observations] = {}
         self._track = NetTrack()
         self._map = HoleMap()
         self._lattice: NetLattice | None = None
         shape = (len(rig.lasers), self._reader.n_lines)
-        self._lit, self._looked = np.zeros(shape), np.zeros(shape)
+        self._lit, self._observed = np.zeros(shape), np.zeros(shape)
 
     @property
     def holes(self) -> list[Hole]:
@@ -144,7 +142,7 @@ class NetCondition:
             Of the vehicle along the net, right and up in m/s, if another sensor measures it.
         """
         finished = None
-        if self._signals and scan.time_s - self._signals[0].time_s >= self._length_s():
+        if self._signals and scan.time_s - self._signals[0].time_s >= self._duration_s():
             finished = self.finish()
         signal = self._reader.read(scan)
         if signal is not None and np.any(signal.state == LineState.LIT):
@@ -163,10 +161,10 @@ class NetCondition:
         """Complete the current stretch, even if it is short; None where nothing was seen."""
         if not self._signals:
             return None
-        seen = self._take()
+        seen = self._end_observations()
         lattice = find_lattice(seen.crossings, self._lattice)
         if lattice is not None:
-            self._look_back(lattice)
+            self._track_waiting(lattice)
             self._lattice = lattice
         stretch = self._evaluate(seen, lattice)
         self.stretches.append(stretch)
@@ -179,22 +177,22 @@ class NetCondition:
                 del self._waiting[min(self._waiting)]
         return stretch
 
-    def _take(self) -> _Seen:
+    def _end_observations(self) -> _Observations:
         """Cut the signals of the current stretch into dashes."""
         for signal in self._signals:
             self._lit += signal.state == LineState.LIT
-            self._looked += signal.state != LineState.HIDDEN
-        usable = self._usable()
+            self._observed += signal.state != LineState.HIDDEN
+        usable = self._lines_in_fan()
         views = [find_dashes(signal, usable) for signal in self._signals]
-        seen = _Seen(views, [crossings_of(view) for view in views], self._velocities)
+        seen = _Observations(views, [crossings_of(view) for view in views], self._velocities)
         self._signals, self._velocities = [], []
         return seen
 
-    def _look_back(self, lattice: NetLattice) -> None:
+    def _track_waiting(self, lattice: NetLattice) -> None:
         """Track the net through the stretches in which its lattice was not known yet."""
         for i, seen in self._waiting.items():
             begin = self._track.place
-            self._follow(lattice, seen)
+            self._register(lattice, seen)
             self.stretches[i] = replace(
                 self.stretches[i],
                 begin_place=begin,
@@ -203,22 +201,22 @@ class NetCondition:
             )
         self._waiting.clear()
 
-    def _length_s(self) -> float:
+    def _duration_s(self) -> float:
         """Return the duration of the current stretch at the speed of the last one."""
         speed = float(np.hypot(*self._track.velocity))
         return min(self.options.stretch_s, max(self.options.stretch / max(speed, 1e-6), 1.0))
 
-    def _evaluate(self, seen: _Seen, lattice: NetLattice | None) -> NetStretch:
+    def _evaluate(self, seen: _Observations, lattice: NetLattice | None) -> NetStretch:
         views, begin = seen.views, self._track.place
         twine, solidity, sigma, strands = None, None, None, 0.0
         if self._lattice is not None:
             # Without a lattice most of it may be a hole: the net beside it is as before.
-            laid = self._follow(self._lattice, seen)
-            if lattice is not None and laid:
-                strands = float(np.mean([one.fit.n_strands for one in laid]))
-                twine = measure_twine(dash_kinds(lattice, laid), self.options.twine)
+            registered = self._register(self._lattice, seen)
+            if lattice is not None and registered:
+                strands = float(np.mean([one.fit.n_strands for one in registered]))
+                twine = measure_twine(dash_kinds(lattice, registered), self.options.twine)
                 if twine is not None:
-                    solidity, sigma = measure_solidity(lattice, twine, laid) or (None, None)
+                    solidity, sigma = measure_solidity(lattice, twine, registered) or (None, None)
         return NetStretch(
             first_frame=views[0].index,
             last_frame=views[-1].index,
@@ -237,9 +235,9 @@ class NetCondition:
             seen_length=sum(view.seen_length for view in views),
         )
 
-    def _follow(self, lattice: NetLattice, seen: _Seen) -> list[RegisteredView]:
+    def _register(self, lattice: NetLattice, seen: _Observations) -> list[RegisteredView]:
         """Fit the lattice's place in every frame, update the track, and search for holes."""
-        fitter, laid = LatticeFitter(lattice), []
+        fitter, registered = LatticeFitter(lattice), []
         for i, view in enumerate(seen.views):
             start = self._start(fitter, seen, i) if self._track.begins(view.time_s) else None
             shift = self._track.step(
@@ -248,12 +246,12 @@ class NetCondition:
             if shift is None:
                 continue
             place = self._track.place
-            laid.append(RegisteredView(view, fitter.assign(view.dashes, shift.place), place))
+            registered.append(RegisteredView(view, fitter.assign(view.dashes, shift.place), place))
             self._map.add(lattice, view, shift.place, place, self._track.piece)
         self._map.update(lattice)
-        return laid
+        return registered
 
-    def _start(self, fitter: LatticeFitter, seen: _Seen, first: int) -> TrackStart | None:
+    def _start(self, fitter: LatticeFitter, seen: _Observations, first: int) -> TrackStart | None:
         """Fit the start of a track to the next frames, unless a sensor gives the velocity."""
         if seen.velocities[first] is not None:
             return None
@@ -261,7 +259,7 @@ class NetCondition:
         times = times[times - times[0] < START_S]
         return fitter.start(seen.crossings[first : first + len(times)], times)
 
-    def _usable(self) -> BoolArray:
+    def _lines_in_fan(self) -> BoolArray:
         """Return the search lines (L, J) that each laser's fan reaches, from the dive so far."""
         usable = np.ones(self._lit.shape, np.bool_)
         # Ends of a laser's line that are darker than the rest by this factor are beyond the laser's
@@ -270,12 +268,12 @@ class NetCondition:
         min_looked_at = 600
         edges = np.arange(0, self._lit.shape[1], bin_lines)
         lit = np.add.reduceat(self._lit, edges, axis=1)
-        looked = np.add.reduceat(self._looked, edges, axis=1)
+        observed = np.add.reduceat(self._observed, edges, axis=1)
         for i in range(len(lit)):
-            known = looked[i] > min_looked_at
+            known = observed[i] > min_looked_at
             if not known.any():
                 continue
-            share = lit[i] / np.maximum(looked[i], 1.0)
+            share = lit[i] / np.maximum(observed[i], 1.0)
             bright = known & (share > dim * np.median(share[known]))
             bright |= ~known
             inside = np.flatnonzero(bright)

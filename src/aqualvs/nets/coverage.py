@@ -109,22 +109,23 @@ class Twine:
     halo: float
     sigma_halo: float
 
-    def usual(
+    def dash_length(
         self, across: FloatArray, slant: FloatArray, step: FloatArray, height: FloatArray
     ) -> FloatArray:
         """Return the length of dashes (m) by crossing angle, slant, step, height (`DashKind`)."""
-        return np.asarray(_bright(height) * np.hypot(self._lit(step) / across, self.sheet * slant))
+        straight = self._lit(step) / across
+        return np.asarray(_length_factor(height) * np.hypot(straight, self.sheet * slant))
 
     def excess(
         self, across: FloatArray, slant: FloatArray, step: FloatArray, height: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the part of `usual` that is not twine, in metres, and its standard deviation."""
-        usual = self.usual(across, slant, step, height)
-        straight = _bright(height) * self._lit(step) / across
+        """Return the part of `dash_length` not due to twine (m), and its standard deviation."""
+        length = self.dash_length(across, slant, step, height)
+        straight = _length_factor(height) * self._lit(step) / across
         # Relative uncertainty of the length that slant adds to a dash.
-        slant_told = 0.1
-        sigma = np.hypot(self.sigma_halo / across, slant_told * (usual - straight))
-        return usual - self.body / across, np.asarray(sigma)
+        slant_error_share = 0.1
+        sigma = np.hypot(self.sigma_halo / across, slant_error_share * (length - straight))
+        return length - self.body / across, np.asarray(sigma)
 
     def _lit(self, step: FloatArray) -> FloatArray:
         """Return the lit width at the usual height, in metres."""
@@ -170,7 +171,7 @@ def measure_twine(kinds: Sequence[DashKind], known: float | None = None) -> Twin
     )
 
 
-def _bright(height: FloatArray) -> FloatArray:
+def _length_factor(height: FloatArray) -> FloatArray:
     """Return the ratio of the length of dashes to that of dashes of the usual height."""
     return np.asarray((np.maximum(height, _TWINE.min_height) / USUAL_HEIGHT) ** _TWINE.brighter)
 
@@ -185,7 +186,7 @@ def _fit(kinds: Sequence[DashKind]) -> tuple[FloatArray, FloatArray]:
         np.float64,
     ).T
     blur = _TWINE.halo + _TWINE.halo_steps * step, _TWINE.strand_more * pixel
-    seen = np.log(np.r_[length / _bright(height), width])
+    seen = np.log(np.r_[length / _length_factor(height), width])
     # Error of bare twine's length for the spread of all lengths: growth may be taken for twine.
     spread_error = 0.15
     grown = spread_error * np.array([k.spread for k in kinds])
@@ -405,7 +406,7 @@ def measure_solidity(
         at = angles.across, angles.slant, one.view.step[dashes.laser], dashes.height
         excess, sigma = twine.excess(*at)
         # A dash that is cut off, or lies along the edge of the light, has a share of the halo only.
-        share = np.minimum(dashes.length / twine.usual(*at), 1.0)
+        share = np.minimum(dashes.length / twine.dash_length(*at), 1.0)
         share = np.where(dashes.whole, share, 0.5 * share)
         mine = dashes.length - excess * share
         rows.append(np.c_[family, mine, dashes.place + one.place][counts[dashes.laser, family]])
@@ -488,7 +489,7 @@ def _reliable(lattice: NetLattice, twine: Twine, view: NetView) -> BoolArray:
     line, search = np.nan_to_num(view.direction), np.nan_to_num(view.search)
     angles = _Angles.of(line[:, None], search[:, None], lattice.normals[None])
     step = view.step[:, None]
-    lines = twine.usual(angles.across, angles.slant, step, USUAL_HEIGHT) / step
+    lines = twine.dash_length(angles.across, angles.slant, step, USUAL_HEIGHT) / step
     good: BoolArray = lines < _KIND.max_lines
     best = lines.argmin(axis=0)
     good[best, np.arange(len(best))] = True

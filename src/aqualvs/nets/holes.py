@@ -120,7 +120,7 @@ class HoleMap:
         if piece != self._piece:
             # The area in which the track was lost may be a hole.
             self.update(lattice)
-            self._start_over(piece)
+            self._start_piece(piece)
         self._last = place.copy()
         strands = predicted_strands(lattice, view, knot)
         self._waiting.append((strands, place.copy(), HERE * view.range, view.index))
@@ -133,23 +133,23 @@ class HoleMap:
         """Find the holes in the looks so far; earlier holes are corrected."""
         if not self._waiting:
             return
-        self._merge()
+        self._merge_waiting()
         fresh = self._find(lattice)
         live = [hole for hole in self.holes if hole.piece == self._piece and self._near(hole)]
         settled = [hole for hole in self.holes if not any(hole is one for one in live)]
         # A hole to which the vehicle comes back is the same one.
-        self.holes = [one for one in settled if not any(_same(one, hole) for hole in fresh)] + fresh
-        self._settle()
+        self.holes = [
+            one for one in settled if not any(_overlap(one, hole) for hole in fresh)
+        ] + fresh
+        self._drop_settled()
 
-    def _start_over(self, piece: int) -> None:
+    def _start_piece(self, piece: int) -> None:
         self._settled_meshes += len(self._meshes)
         self._meshes = np.empty(0, np.int64)
         self._looks, self._feet = Looks(), {}
         self._piece, self._last = piece, None
 
-    def _merge(self) -> None:
-        if not self._waiting:
-            return
+    def _merge_waiting(self) -> None:
         strands = [one for one, _, _, _ in self._waiting]
         place = np.concatenate([one.place + foot for one, foot, _, _ in self._waiting])
         here = np.concatenate([np.floor(one.along / part) for one, _, part, _ in self._waiting])
@@ -197,14 +197,14 @@ class HoleMap:
             around = np.all((places > low) & (places < high), axis=1)
             discs = find_discs(places[around], left[around], bar)
             # Only a part of a hole of another group may lie in these surroundings.
-            discs = [one for one in discs if _holds_any(one, seeds)]
+            discs = [one for one in discs if _contains_any(one, seeds)]
             for disc in discs:
                 # Another group also has this hole in its surroundings.
                 left[np.hypot(*(places - disc.middle).T) < disc.radius + RIM * bar] = 0.0
             discs = [disc for disc in discs if self._looks.stays_dark(disc.middle, disc.radius)]
             found += [
                 self._hole(lattice, some, places[around], weights[around])
-                for some in _touching(discs, touch * bar)
+                for some in _group_touching(discs, touch * bar)
             ]
         return found
 
@@ -234,7 +234,7 @@ class HoleMap:
             feet=tuple(self._feet.values()),
         )
 
-    def _settle(self) -> None:
+    def _drop_settled(self) -> None:
         """Drop cells far behind the vehicle."""
         if self._last is None or not len(self._looks.keys):
             return
@@ -277,12 +277,12 @@ def _groups(places: FloatArray, reach: float) -> list[IntArray]:
     return groups
 
 
-def _holds_any(disc: Disc, places: FloatArray) -> bool:
+def _contains_any(disc: Disc, places: FloatArray) -> bool:
     """Return whether some of the places (n, 2) are in a disc."""
     return bool(np.any(np.hypot(*(places - disc.middle).T) < disc.radius))
 
 
-def _touching(discs: Sequence[Disc], apart: float) -> list[list[Disc]]:
+def _group_touching(discs: Sequence[Disc], apart: float) -> list[list[Disc]]:
     """Group discs that touch."""
     groups: list[list[Disc]] = []
     for disc in discs:
@@ -316,7 +316,7 @@ def _outline(discs: Sequence[Disc]) -> tuple[FloatArray, tuple[float, float], fl
     return at[inside].mean(axis=0), (float(size[0]), float(size[1])), area
 
 
-def _same(one: Hole, other: Hole) -> bool:
+def _overlap(one: Hole, other: Hole) -> bool:
     """Return whether two holes on one map overlap by half."""
     apart = float(np.hypot(*(one.place - other.place)))
     return one.piece == other.piece and apart < 0.25 * (one.diameter + other.diameter)

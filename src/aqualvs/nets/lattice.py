@@ -102,9 +102,9 @@ def find_lattice(
     if not chosen:
         return None
     spectrum = Spectrum.of(chosen)
-    best = _known(before, spectrum) if before is not None else None
+    best = _refine_known(before, spectrum) if before is not None else None
     if best is None:
-        best = _searched(Spectrum.of(_spread(chosen, _FIT.searched_frames)))
+        best = _search(Spectrum.of(_spread(chosen, _FIT.searched_frames)))
         best = best and refine(best, spectrum, _FIT.last_rounds)
     # A chance result of a few frames is not confirmed by all of them.
     if best is None or best.score < _FIT.min_score:
@@ -112,7 +112,7 @@ def find_lattice(
     return _lattice(best, _sigma(best, chosen))
 
 
-def _searched(spectrum: Spectrum) -> Hypothesis | None:
+def _search(spectrum: Spectrum) -> Hypothesis | None:
     rough = [one.scored(score(spectrum, one)) for one in hypotheses(spectrum)]
     rough.sort(key=lambda one: -one.score)
     tried = [refine(one, spectrum, _FIT.first_rounds) for one in rough[: _FIT.followed]]
@@ -127,7 +127,7 @@ def _searched(spectrum: Spectrum) -> Hypothesis | None:
     return best
 
 
-def _known(before: NetLattice, spectrum: Spectrum) -> Hypothesis | None:
+def _refine_known(before: NetLattice, spectrum: Spectrum) -> Hypothesis | None:
     """Return the previous lattice, if it explains these frames nearly as well."""
     # The previous lattice is kept with this share of its score, turned by up to this many degrees.
     as_before, turns = 0.6, (0.0, -4.0, 4.0)
@@ -414,7 +414,7 @@ def _inverse(matrix: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.inv(matrix), np.float64)
 
 
-def _at_first() -> FloatArray:
+def _initial_covariance() -> FloatArray:
     """Return the covariance of place and velocity where a piece of track begins."""
     return np.diag([_TRACK.foot**2, _TRACK.foot**2, _TRACK.velocity**2, _TRACK.velocity**2])
 
@@ -438,7 +438,7 @@ class NetTrack:
     path: float = 0.0
     piece: int = 0
     _state: FloatArray = field(default_factory=lambda: np.zeros(4))
-    _covariance: FloatArray = field(default_factory=_at_first)
+    _covariance: FloatArray = field(default_factory=_initial_covariance)
     _time_s: float = 0.0
     _origin: FloatArray | None = None
     _lattice: NetLattice | None = None
@@ -476,29 +476,29 @@ class NetTrack:
         start : TrackStart, optional
             Place and velocity common to this frame and the next, where the track begins.
         """
-        state, covariance = self._ahead(time_s, velocity)
+        state, covariance = self._predict(time_s, velocity)
         if self._origin is None or covariance[:2, :2].trace() > _TRACK.lost**2:
-            return self._begin(fitter, crossings, time_s, state, start)
+            return self._begin_piece(fitter, crossings, time_s, state, start)
         if self._lattice is not fitter.lattice:
             shift = fitter.shift(crossings)
             if shift is not None:
                 # The same net with a new estimate of its lattice: it lies at the expected place.
                 self._lattice, self._origin = fitter.lattice, state[:2] + shift.place
-                self._take(state, covariance, time_s)
+                self._update(state, covariance, time_s)
             return shift
         precision = _inverse(covariance[:2, :2] + _TRACK.foot**2 * np.eye(2))
         shift = fitter.shift(crossings, self._origin - state[:2], precision)
         if shift is not None:
-            told = np.zeros((4, 4))
-            told[:2, :2] = shift.information @ _inverse(
+            information = np.zeros((4, 4))
+            information[:2, :2] = shift.information @ _inverse(
                 np.eye(2) + _TRACK.foot**2 * shift.information
             )
-            covariance = _inverse(_inverse(covariance) + told)
+            covariance = _inverse(_inverse(covariance) + information)
             miss = np.r_[self._origin - shift.place - state[:2], 0.0, 0.0]
-            self._take(state + covariance @ told @ miss, covariance, time_s)
+            self._update(state + covariance @ information @ miss, covariance, time_s)
         return shift
 
-    def _ahead(self, time_s: float, velocity: FloatArray | None) -> tuple[FloatArray, FloatArray]:
+    def _predict(self, time_s: float, velocity: FloatArray | None) -> tuple[FloatArray, FloatArray]:
         """Return the state and covariance at a later time."""
         dt = time_s - self._time_s
         state, covariance = self._state.copy(), self._covariance.copy()
@@ -511,7 +511,7 @@ class NetTrack:
         noise = np.outer([0.5 * dt**2, dt], [0.5 * dt**2, dt]) * _TRACK.acceleration**2
         return move @ state, move @ covariance @ move.T + np.kron(noise, np.eye(2))
 
-    def _begin(
+    def _begin_piece(
         self,
         fitter: LatticeFitter,
         crossings: Crossings,
@@ -528,7 +528,7 @@ class NetTrack:
             shift = fitter.shift(crossings, start.place, np.eye(2) / place**2)
         if shift is None:
             return None
-        covariance = _at_first()
+        covariance = _initial_covariance()
         if self.begins(time_s):
             state = np.r_[self.place, 0.0, 0.0]
             if start is not None:
@@ -536,9 +536,9 @@ class NetTrack:
                 covariance[2:, 2:] = _TRACK.found**2 * np.eye(2)
         self.piece += self._origin is not None
         self._lattice, self._origin = fitter.lattice, state[:2] + shift.place
-        self._take(state, covariance, time_s)
+        self._update(state, covariance, time_s)
         return shift
 
-    def _take(self, state: FloatArray, covariance: FloatArray, time_s: float) -> None:
+    def _update(self, state: FloatArray, covariance: FloatArray, time_s: float) -> None:
         self.path += float(np.hypot(*(state - self._state)[:2]))
         self._state, self._covariance, self._time_s = state, covariance, time_s

@@ -5,12 +5,12 @@ breaks, its pieces have nothing in common. The log has depth and heading all the
 So the track gives the places within a piece, and the log positions the pieces: depth fixes their
 height, the bearing of the net their place along a round cage (`place_net`).
 
-`open_log` and `lay_log` read the log beside a dive and align it with the dive's clock;
+`open_log` and `align_log` read the log beside a dive and align it with the dive's clock;
 `ViewedPlaces` gives depth, bearing and heading at the moments of the dive's postures.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
@@ -97,11 +97,11 @@ class ViewedPlaces:
 
     def bearing(self, begin_s: float, end_s: float | None = None) -> float | None:
         """Return the net's mean bearing around a moment, or over a time; None if not known."""
-        return _or_none(_direction(self._at(self.net, begin_s, end_s)))
+        return _known(_direction(self._at(self.net, begin_s, end_s)))
 
     def heading(self, begin_s: float, end_s: float | None = None) -> float | None:
         """Return the vehicle's mean heading around a moment, or over a time; None if not known."""
-        return _or_none(_direction(self._at(self.nose, begin_s, end_s)))
+        return _known(_direction(self._at(self.nose, begin_s, end_s)))
 
     def _at(self, values: FloatArray, begin_s: float, end_s: float | None) -> FloatArray:
         """Return the known values between two times, or around the first."""
@@ -123,12 +123,12 @@ def _direction(angles: FloatArray) -> float:
     return float(np.arctan2(np.sin(angles).mean(), np.cos(angles).mean())) % (2.0 * np.pi)
 
 
-def _or_none(value: float) -> float | None:
-    return value if np.isfinite(value) else None
+def _known(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
 
 
 @dataclass(frozen=True, slots=True)
-class LaidLog:
+class AlignedLog:
     """A log and its alignment with the dive's clock."""
 
     log: VehicleLog  # As it was read.
@@ -190,9 +190,9 @@ def open_log(path: Path | None, offset_s: float | None) -> VehicleLog | None:
     return None
 
 
-def lay_log(
+def align_log(
     log: VehicleLog, postures: DivePostures, offset_s: float | None, video: Path | None
-) -> LaidLog:
+) -> AlignedLog:
     """Align a log with a dive's clock.
 
     Parameters
@@ -209,19 +209,16 @@ def lay_log(
     Without an offset from the user it is estimated from the motion common to both; the clocks of
     video and log help where that is ambiguous, and replace it where there is no motion.
     """
-    offset = _given(offset_s) or _found(log, postures, video)
+    given = offset_s is not None and TimeOffset(offset_s, 0.0, None, "given by the user")
+    offset = given or _estimate_offset(log, postures, video)
     covered = 0.0
     if not isinstance(offset, OffsetRefusal) and len(postures.time_s):
         state = log.at(postures.time_s + offset.offset_s)
         covered = float((state.depth_valid | state.heading_valid).mean())
-    return LaidLog(log, offset, covered)
+    return AlignedLog(log, offset, covered)
 
 
-def _given(offset_s: float | None) -> TimeOffset | None:
-    return None if offset_s is None else TimeOffset(offset_s, 0.0, None, "given by the user")
-
-
-def _found(
+def _estimate_offset(
     log: VehicleLog, postures: DivePostures, video: Path | None
 ) -> TimeOffset | OffsetRefusal:
     clocks = offset_from_clocks(log, None if video is None else dive_start_utc(video))
@@ -304,26 +301,19 @@ def place_net(
     seen = ViewedPlaces.of(postures, vehicle)
     nodes = _Nodes.of(stretches, seen)
     ends = [nodes.place(i, seen) for i in range(len(nodes.time_s))]
-    middles = [
-        replace(
-            _middle(ends[i], ends[i + 1]),
-            bearing=seen.bearing(one.begin_s, one.end_s),
-            heading=seen.heading(one.begin_s, one.end_s),
-        )
-        for i, one in enumerate(stretches)
-    ]
+    middles = [_middle(ends[i], ends[i + 1], one, seen) for i, one in enumerate(stretches)]
     of_holes = [nodes.place_hole(hole, seen) for hole in holes]
     return NetPlaces(ends[:-1], middles, ends[1:], of_holes, nodes.slip(seen))
 
 
-def _middle(begin: NetPlace, end: NetPlace) -> NetPlace:
+def _middle(begin: NetPlace, end: NetPlace, stretch: NetStretch, seen: ViewedPlaces) -> NetPlace:
     depths = [one.depth for one in (begin, end) if one.depth is not None]
     return NetPlace(
         along=0.5 * (begin.along + end.along),
         up=0.5 * (begin.up + end.up),
         depth=sum(depths) / len(depths) if depths else None,
-        bearing=None,
-        heading=None,
+        bearing=seen.bearing(stretch.begin_s, stretch.end_s),
+        heading=seen.heading(stretch.begin_s, stretch.end_s),
         placed_by=end.placed_by,
     )
 
@@ -362,11 +352,11 @@ class _Nodes:
         placed_by = [PlacedBy.TRACK if r == 0 else PlacedBy.SPEED for r in run]
         if not tracked.any():
             placed_by = [PlacedBy.NOTHING] * len(run)
-        turned = _along_a_cage(along, run, seen.bearings(time_s))
+        turned = _place_round_cage(along, run, seen.bearings(time_s))
         if turned is not None:
             along = turned
             placed_by = [PlacedBy.TRACK if r == 0 else PlacedBy.BEARING for r in run]
-        depth = _pinned(time_s, up, run, seen.depths(time_s))
+        depth = _log_corrected_depths(time_s, up, run, seen.depths(time_s))
         return cls(time_s, along, up, raw, piece, run, upright, depth, placed_by)
 
     def slip(self, seen: ViewedPlaces) -> float:
@@ -396,32 +386,25 @@ class _Nodes:
         A piece that was lost before its first stretch ended has no node; then the hole is placed
         relative to the vehicle at the time of the look.
         """
-        bearing, heading = seen.bearing(hole.time_s), seen.heading(hole.time_s)
         mine = np.flatnonzero(self.piece == hole.piece)
-        if not len(mine):
-            right, up = hole.from_foot * [1.0, self.upright]
-            return NetPlace(
-                along=float(np.interp(hole.time_s, self.time_s, self.along) + right),
-                up=float(np.interp(hole.time_s, self.time_s, self.up) + up),
-                depth=_known(seen.depths(np.array([hole.time_s]))[0] - up),
-                bearing=bearing,
-                heading=heading,
-                placed_by=PlacedBy.SPEED,
-            )
-        i = int(mine[np.argmin(np.abs(self.time_s[mine] - hole.time_s))])
-        right, up = (hole.place - self.raw[i]) * [1.0, self.upright]
+        if len(mine):
+            i = int(mine[np.argmin(np.abs(self.time_s[mine] - hole.time_s))])
+            off, placed_by = hole.place - self.raw[i], self.placed_by[i]
+            along, height, depth = self.along[i], self.up[i], self.depth[i]
+        else:
+            off, placed_by = hole.from_foot, PlacedBy.SPEED
+            along = np.interp(hole.time_s, self.time_s, self.along)
+            height = np.interp(hole.time_s, self.time_s, self.up)
+            depth = seen.depths(np.array([hole.time_s]))[0]
+        right, up = off * [1.0, self.upright]
         return NetPlace(
-            along=float(self.along[i] + right),
-            up=float(self.up[i] + up),
-            depth=_known(self.depth[i] - up),
-            bearing=bearing,
-            heading=heading,
-            placed_by=self.placed_by[i],
+            along=float(along + right),
+            up=float(height + up),
+            depth=_known(depth - up),
+            bearing=seen.bearing(hole.time_s),
+            heading=seen.heading(hole.time_s),
+            placed_by=placed_by,
         )
-
-
-def _known(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
 
 
 def _tracked(stretches: Sequence[NetStretch], raw: FloatArray, piece: IntArray) -> BoolArray:
@@ -442,7 +425,7 @@ def _steps(steps: FloatArray, elapsed: FloatArray, tracked: BoolArray) -> FloatA
     return found
 
 
-def _along_a_cage(along: FloatArray, run: IntArray, bearing: FloatArray) -> FloatArray | None:
+def _place_round_cage(along: FloatArray, run: IntArray, bearing: FloatArray) -> FloatArray | None:
     """Place the runs by the bearing of a round cage; None where it shows no roundness."""
     known = np.isfinite(bearing)
     if not run.any() or np.count_nonzero(known) < 3:
@@ -476,14 +459,16 @@ def metres_per_radian(turn: FloatArray, along: FloatArray) -> float | None:
     return float(turn @ along) / float(turn @ turn)
 
 
-def _pinned(time_s: FloatArray, up: FloatArray, run: IntArray, depth: FloatArray) -> FloatArray:
+def _log_corrected_depths(
+    time_s: FloatArray, up: FloatArray, run: IntArray, depth: FloatArray
+) -> FloatArray:
     """Return depths that follow the track in the short term, and the log in the long term."""
     found = np.full(len(time_s), np.nan)
     # Time before and after over which depth is averaged to correct the track's height, in seconds:
     # it averages out waves and the sensor's noise, and the track hardly drifts in it.
-    pin_s = 15.0
+    half_window_s = 15.0
     for i in range(len(time_s)):
-        near = (run == run[i]) & (np.abs(time_s - time_s[i]) <= pin_s) & np.isfinite(depth)
+        near = (run == run[i]) & (np.abs(time_s - time_s[i]) <= half_window_s) & np.isfinite(depth)
         if near.any():
             found[i] = float(np.mean(depth[near] + up[near])) - up[i]
     return found

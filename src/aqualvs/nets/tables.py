@@ -394,8 +394,7 @@ def net_dict(wall: UnrolledNet, area: float, n_frames: int, n_net_frames: int) -
         Frames of the dive, and those with a posture to a net.
     """
     stretches = wall.stretches
-    solidity = _mean(stretches, lambda one: one.solidity)
-    fouling = _mean(stretches, fouling_of)
+    largest = max((hole.diameter for hole in wall.holes), default=None)
     shapes = Counter(one.lattice.mesh.value for one in stretches if one.lattice is not None)
     return {
         "n_frames": n_frames,
@@ -405,15 +404,15 @@ def net_dict(wall: UnrolledNet, area: float, n_frames: int, n_net_frames: int) -
         "area_m2": round(area, 3),
         "way_m": round(_way(wall), 3),
         "mesh": shapes.most_common(1)[0][0] if shapes else None,
-        "bar_mm": _rounded_number(_mean(stretches, _bar_mm), 2),
-        "twine_mm": _rounded_number(_mean(stretches, _twine_mm), 2),
-        "solidity": _rounded_number(solidity, 4),
-        "fouling": _rounded_number(fouling, 4),
+        "bar_mm": _mean(stretches, lambda one: 1e3 * one.lattice.bar if one.lattice else None, 2),
+        "twine_mm": _mean(
+            stretches, lambda one: 1e3 * one.twine.thickness if one.twine else None, 2
+        ),
+        "solidity": _mean(stretches, lambda one: one.solidity, 4),
+        "fouling": _mean(stretches, fouling_of, 4),
         "track_slip_m": round(wall.places.slip, 2),
         "track_breaks": stretches[-1].piece if stretches else 0,
-        "largest_hole_mm": _rounded_number(
-            max((1e3 * h.diameter for h in wall.holes), default=None), 1
-        ),
+        "largest_hole_mm": None if largest is None else round(1e3 * float(largest), 1),
     }
 
 
@@ -510,22 +509,12 @@ def _way(wall: UnrolledNet) -> float:
 
 
 def _mean(
-    stretches: Sequence[NetStretch], value: Callable[[NetStretch], float | None]
+    stretches: Sequence[NetStretch], value: Callable[[NetStretch], float | None], digits: int
 ) -> float | None:
-    """Return the mean over stretches, weighed by how much of them was seen."""
+    """Return the rounded mean over stretches, weighed by how much of them was seen."""
     pairs = [(value(one), one.seen_length) for one in stretches]
     known = [(float(found), weight) for found, weight in pairs if found is not None]
     total = sum(weight for _, weight in known)
-    return sum(found * weight for found, weight in known) / total if total > 0.0 else None
-
-
-def _bar_mm(stretch: NetStretch) -> float | None:
-    return None if stretch.lattice is None else 1e3 * stretch.lattice.bar
-
-
-def _twine_mm(stretch: NetStretch) -> float | None:
-    return None if stretch.twine is None else 1e3 * stretch.twine.thickness
-
-
-def _rounded_number(value: float | None, digits: int) -> float | None:
-    return None if value is None else round(float(value), digits)
+    if not total > 0.0:
+        return None
+    return round(sum(found * weight for found, weight in known) / total, digits)

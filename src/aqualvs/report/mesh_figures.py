@@ -334,9 +334,9 @@ def figures(
     `OutputError` if the pictures cannot be written.
     """
     check_run_files(folder)
-    run, fault = read_run_file(folder)
-    if fault:
-        raise SourceError(f"{folder}: {fault} Give the folder of a run that has one.")
+    run, problem = read_run_file(folder)
+    if problem:
+        raise SourceError(f"{folder}: {problem} Give the folder of a run that has one.")
     facts = _lasers(folder, run)
     options = _paper_options(folder, run, target)
     points = folder / POINTS_PARQUET

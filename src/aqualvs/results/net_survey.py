@@ -40,7 +40,7 @@ from aqualvs.scanning.posture import Posture, Reason, Refusal
 from aqualvs.scanning.scan import Label, Scan, ScanPoints
 
 if TYPE_CHECKING:
-    from aqualvs.nets.places import LaidLog
+    from aqualvs.nets.places import AlignedLog
     from aqualvs.nets.tables import UnrolledNet
 
 
@@ -51,7 +51,7 @@ class NetResult:
     wall: "UnrolledNet"  # Stretches and holes on the unrolled net.
     summary: dict[str, Any]  # The same in numbers, as `net.geojson` has it.
     lines: list[str]  # The summary in words.
-    log: "LaidLog | None"  # The vehicle's log.
+    log: "AlignedLog | None"  # The vehicle's log.
 
 
 class NetPass:
@@ -108,7 +108,7 @@ class NetPass:
         OptionError
             If the twine was given thicker than the mesh's bars are long.
         """
-        from aqualvs.nets.places import DivePostures, lay_log, place_net
+        from aqualvs.nets.places import DivePostures, align_log, place_net
         from aqualvs.nets.tables import net_dict, net_lines, unroll
 
         self._condition.finish()
@@ -117,7 +117,7 @@ class NetPass:
         postures = DivePostures(*(np.array(column) for column in self._postures))
         log = None
         if self._log is not None:
-            log = lay_log(self._log, postures, self._request.log_offset_s, video)
+            log = align_log(self._log, postures, self._request.log_offset_s, video)
         places = place_net(stretches, holes, postures, log.places if log else None)
         wall = unroll(stretches, holes, places, self._rig, postures)
         area = self._condition.area
