@@ -54,7 +54,7 @@ def test_along_a_flat_net_the_pattern_tells_where_a_dive_began(cage):
     assert not wall.frame.round
     shift = wall.shifts[1]
     true = np.array([RADIUS * np.deg2rad(8.0), 0.2])
-    assert shift.told.all()
+    assert shift.determined.all()
     assert np.all(np.abs(shift.value - true) < 4.0 * shift.sigma)
     states = sorted(one.state for one in wall.sites)
     assert states.count(HoleState.NEW) == 1
@@ -78,7 +78,7 @@ def test_a_round_net_without_a_common_pattern_keeps_its_places_and_their_doubt(c
     ]
     result = compare(dives, 1.0)
     shift = result.wall.shifts[1]
-    assert not shift.told.any()
+    assert not shift.determined.any()
     assert not shift.by_pattern
     assert not shift.value.any()
     assert shift.sigma == pytest.approx([result.wall.frame.radius * np.deg2rad(5.0), 0.5])

@@ -107,7 +107,7 @@ def test_the_instruments_shift_is_found_within_its_sigma(pairs):
     z = []
     for _, off, result in pairs:
         wall, shift = result.wall, result.wall.shifts[1]
-        assert shift.told.all()
+        assert shift.determined.all()
         assert np.all(shift.sigma < [0.25, 0.15])
         true = -np.array([wall.frame.radius * np.deg2rad(off[0]), off[1]])
         z.append((shift.value - true) / shift.sigma)

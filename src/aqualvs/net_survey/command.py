@@ -193,9 +193,10 @@ def net_change(request: NetChangeRequest, echo: Callable[[str], object]) -> "Com
     compare.
     """
     # `aqualvs net` and the processes of a batch need neither SciPy nor charts.
+    from aqualvs.net_survey import tables
     from aqualvs.net_survey.comparison import compare
     from aqualvs.net_survey.page import draw_change, write_page
-    from aqualvs.net_survey.tables import summary_lines, write_tables
+    from aqualvs.nets.tables import write_table
 
     surveys, origins = _surveys(request)
     check_surveys(surveys)
@@ -208,10 +209,12 @@ def net_change(request: NetChangeRequest, echo: Callable[[str], object]) -> "Com
             echo(f"{one.folder}: {one.date} ({origins[str(one.folder)]})")
         result = compare(surveys, request.cell_m)
         with writing(request.out):
-            write_tables(request.out, result, (NET_CHANGE_CSV, HOLES_CHANGE_CSV))
+            cells, holes = tables.cell_rows(result), tables.hole_rows(result)
+            write_table(request.out / NET_CHANGE_CSV, tables.NET_CHANGE_COLUMNS, cells)
+            write_table(request.out / HOLES_CHANGE_CSV, tables.HOLES_CHANGE_COLUMNS, holes)
             draw_change(result, request.out / NET_CHANGE_PNG)
             write_page(request.out / NET_CHANGE_HTML, request.out / NET_CHANGE_PNG, result, origins)
-    for line in summary_lines(result):
+    for line in tables.summary_lines(result):
         echo(line)
     echo(f"page: {request.out / NET_CHANGE_HTML}")
     return result

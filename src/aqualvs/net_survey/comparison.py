@@ -138,7 +138,7 @@ def _groups(
                 # A piece of a hole that another dive saw whole.
                 found[k] = group[known[np.argmin(np.where(inside[k], distance[k], np.inf))]]
             group[hole] = found[k] if found[k] >= 0 else group.max() + 1
-    return _joined(group, _touching(place, size, of_run, frame), of_run)
+    return _join_touching(group, _touching(place, size, of_run, frame), of_run)
 
 
 def _touching(place: FloatArray, size: FloatArray, of_run: IntArray, frame: WallFrame) -> BoolArray:
@@ -150,7 +150,7 @@ def _touching(place: FloatArray, size: FloatArray, of_run: IntArray, frame: Wall
     return np.asarray(near & (of_run[:, None] == of_run[None]))
 
 
-def _joined(group: IntArray, touching: BoolArray, of_run: IntArray) -> IntArray:
+def _join_touching(group: IntArray, touching: BoolArray, of_run: IntArray) -> IntArray:
     """Join groups whose holes touch in the one dive that saw both."""
     n = int(group.max()) + 1
     seen = np.zeros((n, int(of_run.max()) + 1), np.bool_)
@@ -225,14 +225,14 @@ class _Visits:
         """Return with what chance (V,) a place was looked at on each date."""
         found = np.zeros(n_dates)
         for seen, own, visit in zip(self.seen, self.sigma, self.visit, strict=True):
-            at = place + _normal() * np.hypot(sigma, own)
+            at = place + _normal_samples() * np.hypot(sigma, own)
             index = self.raster.index(at)
             share = float(np.mean(np.where(index >= 0, seen[index], False)))
             found[visit] = max(found[visit], share)
         return found
 
 
-def _normal() -> FloatArray:
+def _normal_samples() -> FloatArray:
     """Return places (n, 2) spread like a normal distribution, always the same ones."""
     draws = 256
     n = int(np.sqrt(draws))
@@ -331,7 +331,7 @@ def compare(surveys: Sequence[Survey], cell: float) -> Comparison:
     """
     ordered = sorted(surveys, key=lambda one: (one.date, one.name))
     dates = sorted({one.date for one in ordered})
-    whole = [_whole(one for one in ordered if one.date == day) for day in dates]
+    whole = [_mean_solidity(one for one in ordered if one.date == day) for day in dates]
     warnings = _warnings(ordered)
     frame, why = common_frame(ordered)
     wall = None
@@ -355,14 +355,14 @@ def _on_wall(
             warnings.append(f"{survey.folder}: has no places on the net and is left out of the map")
             continue
         shift = align(one, placed, frame) if placed else SurveyShift.first()
-        if not frame.round and not shift.told[0]:
+        if not frame.round and not shift.determined[0]:
             warnings.append(
                 f"{survey.folder}: growth and holes do not determine its position along the net "
                 "relative to earlier dives; it is left out of the map"
             )
             continue
-        if not shift.told.all():
-            warnings.append(_not_aligned(survey, shift, frame))
+        if not shift.determined.all():
+            warnings.append(_alignment_warning(survey, shift, frame))
         placed.append(shifted(one, shift))
         shifts.append(shift)
     if len({one.survey.date for one in placed}) < 2:
@@ -381,11 +381,11 @@ def _on_wall(
     ), warnings
 
 
-def _not_aligned(survey: Survey, shift: SurveyShift, frame: WallFrame) -> str:
+def _alignment_warning(survey: Survey, shift: SurveyShift, frame: WallFrame) -> str:
     parts = []
-    if not shift.told[0]:
+    if not shift.determined[0]:
         parts.append(f"bearing (± {np.rad2deg(shift.sigma[0] / frame.radius):.0f}°)")
-    if not shift.told[1]:
+    if not shift.determined[1]:
         parts.append(f"depth (± {shift.sigma[1]:.1f} m)")
     return (
         f"{survey.folder}: growth and holes do not determine the offset of its "
@@ -393,7 +393,7 @@ def _not_aligned(survey: Survey, shift: SurveyShift, frame: WallFrame) -> str:
     )
 
 
-def _whole(surveys: Iterable[Survey]) -> Growth | None:
+def _mean_solidity(surveys: Iterable[Survey]) -> Growth | None:
     """Return the mean solidity of a date's dives, weighed by what was seen."""
     value = seen = own = common = 0.0
     for survey in surveys:

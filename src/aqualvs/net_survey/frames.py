@@ -249,7 +249,7 @@ class _AlignmentOptions(NamedTuple):
     """Alignment of a dive with earlier ones: shifts that are tried, and evidence for one."""
 
     reach: float = 3.0
-    # A shift is told if so much of the chance lies so near (in prior deviations, and in metres).
+    # A shift is determined if so much of the chance lies so near (prior deviations, and metres).
     mass: float = 0.95
     near: float = 0.5
     min_near: float = 0.3
@@ -278,12 +278,12 @@ STEP = 0.1
 class SurveyShift:
     """Offset added to a dive's places to align them with those of the first dive."""
 
-    # Shape (2,): metres in u and d; the value is 0 where it is not told.
+    # Shape (2,): metres in u and d; the value is 0 where it is not determined.
     value: FloatArray
     sigma: FloatArray
-    # Shape (2,): whether what stayed tells it.
-    told: BoolArray
-    # What told it: agreement of the growth's pattern beyond chance; holes found again.
+    # Shape (2,): whether what stayed determines it.
+    determined: BoolArray
+    # By what: agreement of the growth's pattern beyond chance; holes found again.
     by_pattern: bool = False
     by_holes: bool = False
 
@@ -316,7 +316,7 @@ def align(later: PlacedSurvey, earlier: Sequence[PlacedSurvey], frame: WallFrame
     log_chance = grid.log_prior + pattern + holes
     chance = np.exp(log_chance - log_chance.max())
     chance /= chance.sum()
-    value, spread, told = np.zeros(2), sigma.copy(), np.zeros(2, np.bool_)
+    value, spread, determined = np.zeros(2), sigma.copy(), np.zeros(2, np.bool_)
     for axis in range(2):
         near = (
             max(_ALIGNMENT.near * sigma[axis], _ALIGNMENT.min_near)
@@ -329,11 +329,13 @@ def align(later: PlacedSurvey, earlier: Sequence[PlacedSurvey], frame: WallFrame
         mass = float(marginal[inside].sum())
         if mass < _ALIGNMENT.mass:
             continue
-        told[axis] = True
+        determined[axis] = True
         value[axis] = marginal[inside] @ shifts[inside] / mass
         variance = marginal[inside] @ (shifts[inside] - value[axis]) ** 2 / mass
         spread[axis] = np.sqrt(variance + STEP**2 / 4.0)
-    return SurveyShift(value, spread, told, bool(pattern.max() > 0.0), bool(holes.max() > 0.0))
+    return SurveyShift(
+        value, spread, determined, bool(pattern.max() > 0.0), bool(holes.max() > 0.0)
+    )
 
 
 def shifted(one: PlacedSurvey, shift: SurveyShift) -> PlacedSurvey:
@@ -371,23 +373,23 @@ def _pattern_gain(
     places = spread_over(later.outline, 1e9)
     mine = _clipped(later.solidity)
     count, agreement = nothing.copy(), nothing.copy()
-    best, best_told = -np.inf, None
+    best, best_theirs = -np.inf, None
     for i, du in enumerate(STEP * grid.steps[0]):
         for j, dd in enumerate(STEP * grid.steps[1]):
-            told = _mean_over(known, raster.index(places + np.array([du, dd])))
-            good = np.isfinite(told)
+            theirs = _mean_over(known, raster.index(places + np.array([du, dd])))
+            good = np.isfinite(theirs)
             count[i, j] = np.count_nonzero(good)
             if count[i, j] < _ALIGNMENT.min_stretches:
                 continue
-            agreement[i, j] = _correlation(mine[good], _clipped(told[good]))
+            agreement[i, j] = _correlation(mine[good], _clipped(theirs[good]))
             value = -count[i, j] * np.log1p(-(agreement[i, j] ** 2)) * (agreement[i, j] > 0.0)
             if value > best:
-                best, best_told = value, told
-    if best_told is None:
+                best, best_theirs = value, theirs
+    if best_theirs is None:
         return nothing
     agreement[(agreement < 0.0) | (count < _ALIGNMENT.min_overlap * count.max())] = 0.0
     gain = -0.5 * count * np.log1p(-(np.minimum(agreement, 0.9999) ** 2))
-    alike, rest = _independent(mine, best_told, later.outline.mean(axis=1))
+    alike, rest = _independent_shares(mine, best_theirs, later.outline.mean(axis=1))
     n_shifts = max(grid.log_prior.size * (STEP / _ALIGNMENT.pattern) ** 2, 1.0)
     # Agreement of patterns that chance alone would show in one of so many cases does not count.
     chance = 0.01
@@ -437,26 +439,28 @@ def _correlation(a: FloatArray, b: FloatArray) -> float:
     return float(a @ b) / spread if spread > 0.0 else 0.0
 
 
-def _independent(mine: FloatArray, told: FloatArray, middle: FloatArray) -> tuple[float, float]:
+def _independent_shares(
+    mine: FloatArray, theirs: FloatArray, middle: FloatArray
+) -> tuple[float, float]:
     """Return the share of stretches that count as independent: of patterns, and of what is left.
 
     Neighbours are alike, along the way and across lanes: by Bartlett's formula for series with a
     memory of one step, in both directions.
     """
-    good = np.isfinite(told)
-    a, b = mine[good] - mine[good].mean(), told[good] - told[good].mean()
+    good = np.isfinite(theirs)
+    a, b = mine[good] - mine[good].mean(), theirs[good] - theirs[good].mean()
     left = a - b * float(a @ b) / max(float(b @ b), 1e-12)
-    beside = _beside(middle[good])
+    beside = _nearest_pairs(middle[good])
     alike = rest = 1.0
     for pairs in (np.stack([np.arange(len(a) - 1), np.arange(1, len(a))]), beside):
-        both = _memory(a, pairs) * _memory(b, pairs)
-        own = _memory(left, pairs)
+        both = _autocorrelation(a, pairs) * _autocorrelation(b, pairs)
+        own = _autocorrelation(left, pairs)
         alike *= (1.0 - both) / (1.0 + both)
         rest *= (1.0 - own) / (1.0 + own)
     return alike, rest
 
 
-def _beside(middle: FloatArray) -> IntArray:
+def _nearest_pairs(middle: FloatArray) -> IntArray:
     """Return pairs (2, n): stretches, and the nearest of another time, where one is near."""
     # All pairs of so many stretches fit into memory, and tell how alike neighbours are.
     max_beside = 2000
@@ -472,7 +476,7 @@ def _beside(middle: FloatArray) -> IntArray:
     return np.stack([rows[near], nearest[near]])
 
 
-def _memory(values: FloatArray, pairs: IntArray) -> float:
+def _autocorrelation(values: FloatArray, pairs: IntArray) -> float:
     if pairs.shape[1] < _ALIGNMENT.min_stretches:
         return 0.0
     return float(np.clip(_correlation(values[pairs[0]], values[pairs[1]]), 0.0, 0.95))

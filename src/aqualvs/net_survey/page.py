@@ -121,7 +121,7 @@ def _shades(wall: OnWall) -> ScalarMappable:
 
 
 def _cells(axes: Axes, wall: OnWall, columns: IntArray, shades: ScalarMappable) -> None:
-    raster, told = wall.history.raster, {one.cell: one for one in wall.cells}
+    raster, changes = wall.history.raster, {one.cell: one for one in wall.cells}
     known = np.asarray(wall.history.known.any(axis=1))
     axes.set_facecolor(_SEA)
     width, height = map(float, raster.size)
@@ -131,7 +131,7 @@ def _cells(axes: Axes, wall: OnWall, columns: IntArray, shades: ScalarMappable) 
             if not known[cell]:
                 continue
             corner = (x * width, float(raster.low[1]) + row * height)
-            one = told.get(cell)
+            one = changes.get(cell)
             if one is None:
                 style: dict[str, Any] = {"facecolor": _GREY, "hatch": "////", "edgecolor": "white"}
             else:

@@ -36,7 +36,7 @@ def given_dates(texts: Sequence[str], n: int) -> list[date | None]:
             f"--date is given {len(texts)} times for {n} folders; give it once for every RUN, in "
             f"their order ({AUTO} where it is to be found)"
         )
-    return [_given(text) for text in texts] or [None] * n
+    return [_parse_date(text) for text in texts] or [None] * n
 
 
 def date_of_run(folder: Path) -> tuple[date, str]:
@@ -72,7 +72,7 @@ def named_date(name: str) -> date | None:
     return None
 
 
-def _given(text: str) -> date | None:
+def _parse_date(text: str) -> date | None:
     if text == AUTO:
         return None
     try:

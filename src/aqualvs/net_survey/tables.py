@@ -1,7 +1,6 @@
 """Tables and sentences of a comparison: `net_change.csv`, `holes_change.csv`, and the summary."""
 
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 
 import numpy as np
 
@@ -9,7 +8,7 @@ from aqualvs.geometry.arrays import FloatArray
 from aqualvs.net_survey.comparison import LOOKED, Comparison, HoleState, OnWall, Site
 from aqualvs.net_survey.frames import WallFrame
 from aqualvs.net_survey.growth import CellChange, Growth
-from aqualvs.nets.tables import Cell, write_table
+from aqualvs.nets.tables import Cell
 from aqualvs.text import count_text
 
 STATE_TITLES = {
@@ -64,8 +63,8 @@ def rate_text(growth: Growth) -> str:
 def verdict(growth: Growth) -> str:
     """Return whether a growth is beyond its uncertainty."""
     # Beyond this many standard deviations a change is called one.
-    told = 2.0
-    if abs(growth.z) < told:
+    min_z = 2.0
+    if abs(growth.z) < min_z:
         return "no change beyond the uncertainty"
     return "fouling has grown" if growth.value > 0.0 else "fouling has become less"
 
@@ -105,18 +104,20 @@ def _hole_counts(result: Comparison) -> str:
 
 def _shift_lines(wall: OnWall) -> Iterator[str]:
     for one, shift in zip(wall.placed[1:], wall.shifts[1:], strict=True):
-        if not shift.told.any():
+        if not shift.determined.any():
             continue
         parts = []
-        if shift.told[0] and wall.frame.round:
+        if shift.determined[0] and wall.frame.round:
             degrees, sigma = np.rad2deg([shift.value[0], shift.sigma[0]]) / wall.frame.radius
             parts.append(f"bearing {degrees:+.1f} ± {sigma:.1f}°")
-        elif shift.told[0]:
+        elif shift.determined[0]:
             parts.append(f"along {shift.value[0]:+.2f} ± {shift.sigma[0]:.2f} m")
-        if shift.told[1]:
+        if shift.determined[1]:
             parts.append(f"depth {shift.value[1]:+.2f} ± {shift.sigma[1]:.2f} m")
         how = " and ".join(
-            name for name, told in (("growth", shift.by_pattern), ("holes", shift.by_holes)) if told
+            name
+            for name, found in (("growth", shift.by_pattern), ("holes", shift.by_holes))
+            if found
         )
         yield f"{one.survey.name}: aligned with earlier dives by {how}: {', '.join(parts)}"
 
@@ -272,15 +273,6 @@ def hole_rows(result: Comparison) -> list[dict[str, Cell]]:
             row |= {f"diameter_{when}_mm": _mm(diameter), f"sigma_{when}_mm": _mm(sigma)}
             rows.append(row)
     return rows
-
-
-def write_tables(folder: Path, result: Comparison, names: tuple[str, str]) -> None:
-    """Write both tables.
-
-    Raises `OSError` as the system says it.
-    """
-    write_table(folder / names[0], NET_CHANGE_COLUMNS, cell_rows(result))
-    write_table(folder / names[1], HOLES_CHANGE_COLUMNS, hole_rows(result))
 
 
 def _whole_rows(result: Comparison) -> list[dict[str, Cell]]:
