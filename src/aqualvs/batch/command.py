@@ -85,7 +85,7 @@ def batch(request: BatchRequest, echo: Callable[[str], object]) -> int:
             BatchProgress(len(works), echo) as progress,
         ):
             if request.scheduler is not None:
-                workers.check_sight(lock)
+                workers.check_access(lock)
             sized = [(work, size_of(Path(work.request.source))) for work in works]
             found = Scheduler(sized, workers, progress).run(lambda: stop.caught is not None)
         records = _all_records(request.out, found)
@@ -101,9 +101,7 @@ def batch(request: BatchRequest, echo: Callable[[str], object]) -> int:
     claim.close()
     if stop.caught:
         return stop.exit_code
-    unfinished = [r for r in found.values() if r.state is not DiveState.FINISHED]
-    exit_incomplete = 1
-    return exit_incomplete if unfinished else 0
+    return int(any(record.state is not DiveState.FINISHED for record in found.values()))
 
 
 def _check(request: BatchRequest) -> None:
@@ -215,7 +213,7 @@ class BatchProgress(Closing):
     def __init__(self, n_dives: int, echo: Callable[[str], object]) -> None:
         self._n_dives, self._n_ended, self._n_frames = n_dives, 0, 0
         self._total = 0
-        self._tell = echo
+        self._echo = echo
         console = Console(stderr=True)
         columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn())
         # Pieces take seconds, so that the last half minute says little of the speed.
@@ -245,7 +243,7 @@ class BatchProgress(Closing):
         """Note that a dive is done, or given up."""
         self._n_ended += 1
         self._bar.update(self._task, description=self._words())
-        self._tell(record.line())
+        self._echo(record.line())
 
     def _words(self) -> str:
         dives, frames = count_text(self._n_dives, "dive"), count_text(self._n_frames, "frame")

@@ -58,7 +58,9 @@ def name_dives(sources: Sequence[tuple[Path, str]], known: Mapping[str, str]) ->
     OptionError
         If the user gives one name to two dives.
     """
-    names = {str(path): known[str(path)] for path, given in sources if _keeps(path, given, known)}
+    names = {
+        str(path): known[str(path)] for path, given in sources if _keeps_name(path, given, known)
+    }
     for path, given in sources:
         if given:
             # Another dive's name for good: what the earlier batch wrote under it would be lost.
@@ -68,7 +70,9 @@ def name_dives(sources: Sequence[tuple[Path, str]], known: Mapping[str, str]) ->
             names[str(path)] = safe_name(given)
     unnamed = [path for path, _ in sources if str(path) not in names]
     taken = {_folded(name) for name in (*known.values(), *names.values())}
-    names |= {str(path): name for path, name in zip(unnamed, _own(unnamed, taken), strict=True)}
+    names |= {
+        str(path): name for path, name in zip(unnamed, _unique_names(unnamed, taken), strict=True)
+    }
     return [names[str(path)] for path, _ in sources]
 
 
@@ -80,17 +84,17 @@ def safe_name(text: str) -> str:
     return text if text[:1].isalpha() else f"dive_{text}".rstrip("_")
 
 
-def _keeps(path: Path, given: str, known: Mapping[str, str]) -> bool:
+def _keeps_name(path: Path, given: str, known: Mapping[str, str]) -> bool:
     return str(path) in known and (not given or safe_name(given) == known[str(path)])
 
 
-def _own(paths: Sequence[Path], taken: Collection[str]) -> list[str]:
+def _unique_names(paths: Sequence[Path], taken: Collection[str]) -> list[str]:
     """Return names after the files; those that clash all get more of their path."""
     used, names = set(taken), dict.fromkeys(paths, "")
     waiting = list(names)
     deepest = 4
     for depth in range(1, deepest + 1):
-        called = {path: _called(path, depth) for path in waiting}
+        called = {path: _name_with_folders(path, depth) for path in waiting}
         counted = [_folded(name) for name in called.values()]
         for path, name in called.items():
             if counted.count(_folded(name)) == 1 and _folded(name) not in used:
@@ -98,12 +102,12 @@ def _own(paths: Sequence[Path], taken: Collection[str]) -> list[str]:
         used |= {_folded(name) for name in names.values() if name}
         waiting = [path for path in waiting if not names[path]]
     for path in waiting:
-        names[path] = _numbered(_called(path, deepest), used)
+        names[path] = _numbered(_name_with_folders(path, deepest), used)
         used.add(_folded(names[path]))
     return [names[path] for path in paths]
 
 
-def _called(path: Path, depth: int) -> str:
+def _name_with_folders(path: Path, depth: int) -> str:
     folders = [part for part in path.parent.parts if part.strip("/\\")]
     own = path.name if path.is_dir() else path.stem
     # The file's own end must outlive the cut.
@@ -148,7 +152,7 @@ def read_list(path: Path) -> list[Dive]:
     rows = list(_csv_rows(text, path) if path.suffix.lower() == ".csv" else _yaml_rows(text, path))
     if not rows:
         raise OptionError(f"{path}: lists no dives; give at least one row")
-    return [_listed(row, path, number) for number, row in enumerate(rows, 1)]
+    return [_dive_of_row(row, path, number) for number, row in enumerate(rows, 1)]
 
 
 def _csv_rows(text: str, path: Path) -> Iterator[Mapping[str, Any]]:
@@ -172,7 +176,7 @@ def _yaml_rows(text: str, path: Path) -> Iterable[Mapping[str, Any]]:
     return content
 
 
-def _listed(row: Mapping[str, Any], path: Path, number: int) -> Dive:
+def _dive_of_row(row: Mapping[str, Any], path: Path, number: int) -> Dive:
     unknown = sorted(str(key) for key in set(row) - set(_KEYS))
     if unknown:
         raise OptionError(f"{path}: unknown key {unknown[0]!r}; known are {', '.join(_KEYS)}")

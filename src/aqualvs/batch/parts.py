@@ -145,7 +145,7 @@ def _write_piece(
         bare = files.enter_context(RunBareLens(folder, dive.rig))
         try:
             for block in _blocks(dive, span, frames, processor):
-                scans = [measured.scan for measured in block]
+                scans = [result.scan for result in block]
                 points.write(*scans)
                 posture.write(*scans)
                 bare.write(*block)
@@ -204,27 +204,27 @@ def _blocks(
         yield from blocks
         return
     for block in blocks:
-        own = [measured for measured in block if first <= measured.scan.index < stop]
+        own = [result for result in block if first <= result.scan.index < stop]
         if own:
             yield own
 
 
-class _Kept(threading.local):
+class _LastScanner(threading.local):
     """The scanner of the last piece, which the next one mostly needs again."""
 
     key: str = ""
     scanner: FrameScanner | None = None
 
 
-_KEPT = _Kept()
+_LAST = _LastScanner()
 
 
 def _scanner(dive: OpenDive, probe: DiveProbe) -> FrameScanner:
     if dive.is_replay or dive.request.index_target is not None:
         return dive.scanner()
-    if _KEPT.key != probe.result_key or _KEPT.scanner is None:
-        _KEPT.key, _KEPT.scanner = probe.result_key, dive.scanner()
-    return _KEPT.scanner
+    if _LAST.key != probe.result_key or _LAST.scanner is None:
+        _LAST.key, _LAST.scanner = probe.result_key, dive.scanner()
+    return _LAST.scanner
 
 
 def joined_summary(dive: OpenDive, pieces: Sequence[Path]) -> RunSummary:

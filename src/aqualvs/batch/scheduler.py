@@ -153,14 +153,14 @@ class DaskWorkers(Closing):
             error = WorkersLostError("its worker processes died repeatedly")
         return FinishedTask(token, error=error)
 
-    def check_sight(self, path: Path) -> None:
+    def check_access(self, path: Path) -> None:
         """Raise unless every worker sees a file and has the same versions as this process.
 
         Raises `OptionError` if one does not.
         """
         mine, option = versions(), f"--scheduler {self._client.scheduler.address}"
         try:
-            found: Mapping[str, Any] = self._client.run(_sight, str(path))
+            found: Mapping[str, Any] = self._client.run(_access, str(path))
         except Exception as fault:  # Dask words what workers raise in an exception of its own
             raise OptionError(
                 f"{option}: a worker cannot take part ({fault}); install aqualvs[batch] of this "
@@ -229,14 +229,14 @@ def _local_cluster(distributed: Any, n_workers: int | None) -> Any:
                 )
             except RuntimeError as fault:
                 # A process died before it was there; on a busy machine that may happen once.
-                trouble = fault
+                cause = fault
         raise OptionError(
-            f"--workers {n_workers}: the processes do not start ({trouble}); "
+            f"--workers {n_workers}: the processes do not start ({cause}); "
             "take fewer, and see whether there is memory left"
-        ) from trouble
+        ) from cause
 
 
-def _sight(path: str) -> tuple[bool, dict[str, str]]:
+def _access(path: str) -> tuple[bool, dict[str, str]]:
     return Path(path).exists(), versions()
 
 
@@ -332,20 +332,20 @@ class _Dive:
     """A dive under way."""
 
     work: DiveWork
-    # What the watcher was told to expect of it, and not yet that it is done.
+    # What the observer expects of it, and has not yet been reported as done.
     n_bytes: int
     probe: DiveProbe | None = None
     results: dict[int, PieceResult] = field(default_factory=dict)
-    n_beginnings: int = 0
+    n_attempts: int = 0
     is_done: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class _Task:
-    """A task under way; those of a beginning that was given up count no more."""
+    """A task under way; those of an attempt that was given up count no more."""
 
     dive: _Dive
-    beginning: int
+    attempt: int
     piece: int | None = None
 
 
@@ -417,49 +417,49 @@ class Scheduler:
         for dive in self._dives:
             self._observer.expect(dive.n_bytes)
         while len(self.records) < len(self._dives) and not is_stopped():
-            self._hand_over()
+            self._submit_ready()
             outcome = self._workers.next_done(_WAIT_S)
             if outcome is not None:
                 self._n_under_way -= 1
-                self._take(outcome)
+                self._receive(outcome)
         for dive in self._dives:
             if not dive.is_done:
                 name = dive.work.name
                 self.records[name] = _record(dive, DiveState.UNFINISHED, "")
         return self.records
 
-    def _hand_over(self) -> None:
+    def _submit_ready(self) -> None:
         """Keep the processes busy: dives that were begun come before new ones."""
         most = _AHEAD * self._workers.n_slots
         while self._n_under_way < most and (self._ready or self._new):
             if not self._ready:
-                self._begin(self._new.popleft())
+                self._start(self._new.popleft())
             task, function, arguments = self._ready.popleft()
             if not self._is_stale(task):
                 self._workers.submit(task, function, *arguments)
                 self._n_under_way += 1
 
-    def _begin(self, dive: _Dive) -> None:
-        dive.n_beginnings += 1
+    def _start(self, dive: _Dive) -> None:
+        dive.n_attempts += 1
         dive.results.clear()
-        self._ready.append((_Task(dive, dive.n_beginnings), self._steps.look, (dive.work,)))
+        self._ready.append((_Task(dive, dive.n_attempts), self._steps.look, (dive.work,)))
 
     def _measure(self, dive: _Dive, found: DiveProbe) -> None:
         dive.probe = found
         for piece in range(len(found.spans)):
-            task = _Task(dive, dive.n_beginnings, piece)
+            task = _Task(dive, dive.n_attempts, piece)
             self._ready.append((task, self._steps.measure, (dive.work, found.only(piece))))
 
-    def _take(self, outcome: FinishedTask) -> None:
+    def _receive(self, outcome: FinishedTask) -> None:
         task: _Task = outcome.token
         if self._is_stale(task):
             return
         if outcome.error is not None:
-            self._mend(task.dive, outcome.error)
-        elif task.dive.probe is None:
+            self._handle_error(task.dive, outcome.error)
+        elif (found := task.dive.probe) is None:
             self._probed(task.dive, *outcome.value)
         elif task.piece is not None:
-            self._measured(task.dive, task.piece, outcome.value)
+            self._measured(task.dive, found, task.piece, outcome.value)
         else:
             self._finish(task.dive, outcome.value, reused=False)
 
@@ -470,10 +470,7 @@ class Scheduler:
         else:
             self._finish(dive, facts, reused=True)
 
-    def _measured(self, dive: _Dive, piece: int, result: PieceResult) -> None:
-        found = dive.probe
-        if found is None:
-            return
+    def _measured(self, dive: _Dive, found: DiveProbe, piece: int, result: PieceResult) -> None:
         dive.results[piece] = result
         n_bytes = found.spans[piece].n_bytes
         if result.reused:
@@ -484,33 +481,31 @@ class Scheduler:
         if len(dive.results) == len(found.spans):
             results = [dive.results[i] for i in range(len(found.spans))]
             # A dive that is nearly done comes first: its pieces can go.
-            task = _Task(dive, dive.n_beginnings)
+            task = _Task(dive, dive.n_attempts)
             self._ready.appendleft((task, self._steps.join, (dive.work, found, results)))
 
-    def _mend(self, dive: _Dive, error: BaseException) -> None:
+    def _handle_error(self, dive: _Dive, error: BaseException) -> None:
         """Retry the tasks that may succeed, and give up the others."""
-        # Beginnings of a dive; each costs only what is not finished.
-        max_beginnings = 3
-        again = dive.n_beginnings < max_beginnings
+        # Attempts at a dive; each costs only what is not finished.
+        max_attempts = 3
+        again = dive.n_attempts < max_attempts
         if isinstance(error, SpanMismatchError) and dive.probe is not None:
             if not dive.probe.is_whole:
-                return self._as_whole(dive, str(error))
+                return self._measure_whole(dive, dive.probe, str(error))
         elif isinstance(error, PieceLostError | WorkersLostError) and again:
             dive.probe = None
-            return self._begin(dive)
+            return self._start(dive)
         foreseen = isinstance(error, AqualvsError | WorkersLostError)
         words = str(error) if foreseen else f"{type(error).__name__}: {error}"
         drop(dive.work.dataset, dive.work.name, (*OF_DIVE, *OF_NET))
         return self._end(dive, _record(dive, DiveState.FAILED, words))
 
-    def _as_whole(self, dive: _Dive, why: str) -> None:
+    def _measure_whole(self, dive: _Dive, found: DiveProbe, why: str) -> None:
         """Measure a dive in one piece after its pieces turned out to be unusable."""
-        if dive.probe is None:
-            return
-        dive.n_beginnings += 1
+        dive.n_attempts += 1
         dive.results.clear()
-        self._expect(dive, dive.probe.n_bytes)
-        self._measure(dive, dive.probe.in_one_piece(why))
+        self._expect(dive, found.n_bytes)
+        self._measure(dive, found.in_one_piece(why))
 
     def _finish(self, dive: _Dive, facts: Mapping[str, Any], *, reused: bool) -> None:
         work = dive.work
@@ -528,7 +523,7 @@ class Scheduler:
 
     @staticmethod
     def _is_stale(task: _Task) -> bool:
-        return task.dive.is_done or task.beginning != task.dive.n_beginnings
+        return task.dive.is_done or task.attempt != task.dive.n_attempts
 
 
 def _record(dive: _Dive, state: DiveState, words: str) -> DiveRecord:

@@ -52,8 +52,8 @@ def result_key(dive: OpenDive) -> str:
     request = dive.request
     target_content = content_digest(request.index_target)
     facts = request.to_dict() | {"rig_file": None, "index_target": target_content}
-    told = target_dict(request.target)
-    target = asdict(told) | {"mesh_filter": asdict(told.mesh_filter)}
+    facts_of_target = target_dict(request.target)
+    target = asdict(facts_of_target) | {"mesh_filter": asdict(facts_of_target.mesh_filter)}
     del target["filter_lengths"]
     found = {
         "format": _FORMAT,
@@ -86,7 +86,7 @@ def content_digest(path: Path | None) -> str | None:
         raise OptionError(f"{path}: cannot be read ({fault.strerror}); check the path") from fault
 
 
-_MEMORY = "survey"
+_PROBE = "survey"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -137,7 +137,7 @@ def probe(work: DiveWork) -> DiveProbe:
         margin = REACH if dive.rig.shutter.needs_neighbours else 0
         stat = _stat_key(Path(work.request.source))
         stat |= {"frames": work.piece_frames, "margin": margin}
-        content = read_valid_manifest(work.home / _MEMORY, digest(stat)) or _remember(
+        content = read_valid_manifest(work.home / _PROBE, digest(stat)) or _store_content(
             work, stat, _content(dive, work.piece_frames, margin)
         )
         spans = [Span(**{**span, "kind": SpanKind(span["kind"])}) for span in content["spans"]]
@@ -208,8 +208,10 @@ def _stat_key(path: Path) -> dict[str, Any]:
     return {"path": str(path), "size": size_of(path), "n_files": len(found), "mtime_ns": latest}
 
 
-def _remember(work: DiveWork, stat: Mapping[str, Any], content: dict[str, Any]) -> dict[str, Any]:
-    folder = work.home / _MEMORY
+def _store_content(
+    work: DiveWork, stat: Mapping[str, Any], content: dict[str, Any]
+) -> dict[str, Any]:
+    folder = work.home / _PROBE
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
         write_manifest(folder, digest(stat), content, [])
