@@ -18,6 +18,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from aqualvs.control.time_filter import FilteredPosture
 from aqualvs.errors import OptionError, OutputError
 from aqualvs.live.outputs.base import Output
+from aqualvs.optics.rigfile import rig_to_mapping
 from aqualvs.recording import (
     DiveRecording,
     PictureFormat,
@@ -40,13 +41,13 @@ from aqualvs.recording.encoding import (
     CdrWriter,
     rig_exact,
     rig_from_record,
-    rig_yaml,
 )
 from aqualvs.scanning.posture import Reason, Refusal
 from aqualvs.scanning.scan import ScanPoints
 from aqualvs.simulation.scenarios import flat_port_rig
 from aqualvs.sources.base import Health, PartHealth, StageDelay, State
 from aqualvs.sources.mcap_file import McapFile
+from aqualvs.yamlfile import rig_text
 from live_cases import demo_frames, demo_rig, demo_samples
 from recorder_cases import counted, read_by_mcap, read_by_rosbags
 from waiting import TIMEOUT_S, until
@@ -547,5 +548,5 @@ def test_cdr_is_that_of_rosbags():
 @pytest.mark.parametrize("rig", [flat_port_rig(), replace(flat_port_rig(), housing=None)])
 def test_a_recorded_rig_comes_back_to_the_last_bit_whatever_its_housing(rig):
     exact = replace(rig, housing=rig.housing and rig.housing.moved_by({"port_tilt_x": 1e-15}))
-    back = rig_from_record(rig_yaml(exact), rig_exact(exact), "dive.mcap")
+    back = rig_from_record(rig_text(rig_to_mapping(exact)), rig_exact(exact), "dive.mcap")
     assert back.housing == exact.housing

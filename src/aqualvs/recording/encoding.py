@@ -27,7 +27,7 @@ from aqualvs.optics.camera import Housing
 from aqualvs.optics.dome import Dome
 from aqualvs.optics.flat_port import FlatPort
 from aqualvs.optics.rig import Laser, Rig, Window
-from aqualvs.optics.rigfile import rig_from_mapping, rig_to_mapping
+from aqualvs.optics.rigfile import rig_from_mapping
 from aqualvs.scanner import ScannerOptions
 from aqualvs.scanning.detection import DETECTORS, detector_word
 from aqualvs.scanning.paper.mesh_filter import MeshFilterOptions
@@ -35,7 +35,7 @@ from aqualvs.scanning.posture_estimator import FitMethod
 from aqualvs.scanning.scan import Frame, ImagePlane, planes_of_image
 from aqualvs.scanning.surfaces import TargetKind
 from aqualvs.sources.base import bgr_of
-from aqualvs.yamlfile import parse_yaml, rig_text
+from aqualvs.yamlfile import parse_yaml
 
 # In noise a search for repetitions finds little: run-length coding is smaller and no slower.
 _PNG = [
@@ -60,15 +60,15 @@ def jpeg_of(frame: Frame, quality: int) -> bytes:
     image = bgr_of(frame)
     if frame.chroma is None:
         image = np.ascontiguousarray(image[..., 0])
-    return _encoded(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return _encode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
 
 
 def png_of(frame: Frame) -> tuple[bytes, bytes | None]:
     """Return luma and, where the frame has it, chroma as PNG."""
-    luma = _encoded(".png", np.ascontiguousarray(frame.luma), _PNG)
+    luma = _encode(".png", np.ascontiguousarray(frame.luma), _PNG)
     if frame.chroma is None:
         return luma, None
-    return luma, _encoded(".png", np.concatenate(frame.chroma), _PNG)
+    return luma, _encode(".png", np.concatenate(frame.chroma), _PNG)
 
 
 def frame_of(index: int, time_s: float, kind: str, picture: bytes, chroma: bytes | None) -> Frame:
@@ -76,31 +76,26 @@ def frame_of(index: int, time_s: float, kind: str, picture: bytes, chroma: bytes
 
     Raises `ValueError` if they cannot be decoded.
     """
-    image = _decoded(picture)
+    image = _decode(picture)
     if kind == PictureFormat.JPEG:
         return Frame(index, time_s, *planes_of_image(image))
     if chroma is None:
         return Frame(index, time_s, image)
-    both = _decoded(chroma)
+    both = _decode(chroma)
     rows = len(both) // 2
     return Frame(index, time_s, image, (both[:rows], both[rows:]))
 
 
-def _encoded(suffix: str, image: ImagePlane, options: list[int]) -> bytes:
+def _encode(suffix: str, image: ImagePlane, options: list[int]) -> bytes:
     _, found = cv2.imencode(suffix, image, options)
     return found.tobytes()
 
 
-def _decoded(data: bytes) -> ImagePlane:
+def _decode(data: bytes) -> ImagePlane:
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_ANYCOLOR)
     if image is None:
         raise ValueError("a picture that cannot be decoded")
     return cast(ImagePlane, image)
-
-
-def rig_yaml(rig: Rig) -> str:
-    """Return the text of a rig file."""
-    return rig_text(rig_to_mapping(rig))
 
 
 def rig_exact(rig: Rig) -> str:
@@ -126,7 +121,7 @@ def rig_from_record(text: str, exact: str, source_name: str) -> Rig:
     Parameters
     ----------
     text, exact : str
-        From `rig_yaml` and `rig_exact`.
+        Rig file, and `rig_exact`.
     source_name : str
         How messages call the recording.
 

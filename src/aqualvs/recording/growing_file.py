@@ -168,7 +168,7 @@ class GrowingFile:
         self._index_bytes = 0
         self._unlisted: list[bytes] = []
         self._frontier = self._limit = self._summary_at = self._tail = self._size = 0
-        self._settled = True
+        self._summary_placed = True
         draft = path.with_name(path.name + ".part")
         self._file = (open_file or _open)(draft)
         try:
@@ -190,7 +190,7 @@ class GrowingFile:
         index = chunk.index_at(self._frontier)
         self._make_room(len(chunk.content), len(index))
         self._frontier = self._insert(self._frontier, chunk.content, self._limit)
-        self._note(chunk, index)
+        self._count(chunk, index)
         # The chunk is in the file; the next call lists records that cannot be listed now.
         with contextlib.suppress(OSError):
             self._list_pending()
@@ -227,7 +227,7 @@ class GrowingFile:
         self._frontier += len(fill)
         self._write(0, front + fill)
         self._size = self._size_for(self._frontier, 0)
-        self._settle()
+        self._place_summary()
 
     def _insert(self, at: int, content: bytes, limit: int) -> int:
         """Replace the beginning of the padding at `at`, which ends at `limit`, by whole records.
@@ -240,7 +240,7 @@ class GrowingFile:
         self._write(at, content[:HEAD_BYTES])
         return end
 
-    def _note(self, chunk: Chunk, index: bytes) -> None:
+    def _count(self, chunk: Chunk, index: bytes) -> None:
         start_ns, end_ns = chunk.times_ns
         first_ns, last_ns = self._times_ns if self._n_chunks else chunk.times_ns
         self._times_ns = (min(first_ns, start_ns), max(last_ns, end_ns))
@@ -261,37 +261,37 @@ class GrowingFile:
 
     def _make_room(self, n_data: int, n_index: int) -> None:
         """Make the file longer where a chunk or its index, and the end that follows, do not fit."""
-        if not self._settled:
-            self._settle()
+        if not self._summary_placed:
+            self._place_summary()
         data_end = self._frontier + n_data + self._summary_bytes() + _SPARE_BYTES
         index_end = self._tail + n_index + _SPARE_BYTES
         if data_end > self._limit or index_end > self._size - FOOTER_BYTES:
             self._grow(n_data)
-            self._settle()
+            self._place_summary()
 
     def _grow(self, n_data: int) -> None:
         """Make the file longer, with a copy of the summary where the data ended."""
         size = self._size_for(self._size, n_data)
-        at = _down(self._limit - self._summary_bytes() - PAGE)
+        at = _page_down(self._limit - self._summary_bytes() - PAGE)
         tail = self._write_summary(at, size)
         self._write(size - FOOTER_BYTES, mcap_file.footer(at))
-        self._summary_at, self._tail, self._size, self._settled = at, tail, size, False
+        self._summary_at, self._tail, self._size, self._summary_placed = at, tail, size, False
 
     def _size_for(self, size: int, n_data: int) -> int:
         """Return a file size with room for more data and their summary."""
         summary_bytes = self._summary_bytes()
         data_bytes = max(_DATA_BYTES, _DATA_PER_SUMMARY * summary_bytes) + n_data
-        return _up(size + data_bytes + summary_bytes + self._summary_room() + 2 * _SPARE_BYTES)
+        return _page_up(size + data_bytes + summary_bytes + self._summary_room() + 2 * _SPARE_BYTES)
 
-    def _settle(self) -> None:
+    def _place_summary(self) -> None:
         """Move the summary near the end of the file and free the space before it."""
-        at = _down(self._size - FOOTER_BYTES - self._summary_room())
+        at = _page_down(self._size - FOOTER_BYTES - self._summary_room())
         limit = at - DATA_END_BYTES
         # Zeros, not a hole: adding to the summary then needs no new place on the disk.
         tail = self._write_summary(at, self._size, zeros=_INDEX_BYTES // 2)
         self._write(self._frontier, mcap_file.padding_head(limit - self._frontier))
         self._write(self._size - FOOTER_BYTES, mcap_file.footer(at))
-        self._summary_at, self._tail, self._limit, self._settled = at, tail, limit, True
+        self._summary_at, self._tail, self._limit, self._summary_placed = at, tail, limit, True
 
     def _write_summary(self, at: int, size: int, zeros: int = 0) -> int:
         """Write the end of the data and a summary, padded to the footer; returns its tail."""
@@ -331,11 +331,11 @@ class GrowingFile:
             rest = rest[self._file.write(rest) :]
 
 
-def _up(n: int) -> int:
+def _page_up(n: int) -> int:
     return -(-n // PAGE) * PAGE
 
 
-def _down(n: int) -> int:
+def _page_down(n: int) -> int:
     return n // PAGE * PAGE
 
 

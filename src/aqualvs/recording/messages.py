@@ -14,6 +14,7 @@ import numpy as np
 from aqualvs.control.time_filter import FilteredPosture
 from aqualvs.errors import OptionError
 from aqualvs.optics.rig import Rig
+from aqualvs.optics.rigfile import rig_to_mapping
 from aqualvs.recording.encoding import (
     CHROMA,
     HEALTH,
@@ -30,7 +31,6 @@ from aqualvs.recording.encoding import (
     options_text,
     png_of,
     rig_exact,
-    rig_yaml,
 )
 from aqualvs.recording.sample import LiveSample
 from aqualvs.scanner import ScannerOptions
@@ -39,9 +39,9 @@ from aqualvs.scanning.posture import Posture, Reason, Refusal, deviations
 from aqualvs.scanning.scan import Frame, GyroRates, ScanPoints
 from aqualvs.scanning.stripe import StripePeaks
 from aqualvs.sources.base import Health, PartHealth, State
+from aqualvs.yamlfile import rig_text
 
 FRAME_ID = "dome"
-_NAN = math.nan
 _STATES = {State.OFF: 0, State.OK: 1, State.WARN: 2, State.FAULT: 3}
 _FLOATS = ("x", "y", "z", "quality")
 _BYTES = ("intensity", "laser", "label", "used")
@@ -171,7 +171,7 @@ def health_message(health: Health, stamp_ns: int) -> bytes:
 
 def rig_texts(rig: Rig, options: ScannerOptions) -> tuple[str, str, str]:
     """Return the rig file, its exact numbers and the scanner's options as a message has them."""
-    return rig_yaml(rig), rig_exact(rig), options_text(options)
+    return rig_text(rig_to_mapping(rig)), rig_exact(rig), options_text(options)
 
 
 def rig_message(texts: tuple[str, str, str], stamp_ns: int) -> bytes:
@@ -215,9 +215,9 @@ def image_of(message: bytes) -> tuple[str, bytes]:
 def _posture_values(posture: Posture | Refusal) -> list[float]:
     """Return nine scalars, normal, covariance and curvatures."""
     if not isinstance(posture, Posture):
-        return [_NAN] * 25
-    curvature = posture.curvature or (_NAN, _NAN)
-    sigma_curvature = posture.sigma_curvature or (_NAN, _NAN)
+        return [math.nan] * 25
+    curvature = posture.curvature or (math.nan, math.nan)
+    sigma_curvature = posture.sigma_curvature or (math.nan, math.nan)
     return [
         *(posture.range, math.degrees(posture.pitch), math.degrees(posture.yaw)),
         *deviations(posture.covariance),
@@ -232,7 +232,7 @@ def _posture_values(posture: Posture | Refusal) -> list[float]:
 def _rig_values(posture: Posture | Refusal) -> list[float]:
     """Return standard deviations by the rig and by both, and the covariance by the rig."""
     if not isinstance(posture, Posture):
-        return [_NAN] * 15
+        return [math.nan] * 15
     return [
         *deviations(posture.rig_covariance),
         *deviations(posture.total_covariance),
@@ -242,7 +242,7 @@ def _rig_values(posture: Posture | Refusal) -> list[float]:
 
 def _filtered_values(filtered: FilteredPosture | None) -> list[float]:
     if filtered is None:
-        return [_NAN] * 7
+        return [math.nan] * 7
     rates: Any = filtered.rates
     return [
         *(filtered.range, math.degrees(filtered.pitch), math.degrees(filtered.yaw)),

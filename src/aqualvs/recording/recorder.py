@@ -161,7 +161,7 @@ class Recorder:
         self.path = path
         self._options = options or RecorderOptions()
         self._chunks = SampleChunks(self._options)
-        self._file = _begun(path, open_file)
+        self._file = _create_file(path, open_file)
         self._changed = threading.Condition()
         self._waiting: deque[tuple[ChunkBuilder, int]] = deque()
         self._waiting_bytes = 0
@@ -169,7 +169,7 @@ class Recorder:
         self._fault = ""
         self._closing = False
         self._began_s = self._chunk_s = self._synced_s = time.monotonic()
-        self._thread = threading.Thread(target=self._work, name=self.name, daemon=True)
+        self._thread = threading.Thread(target=self._run, name=self.name, daemon=True)
         self._thread.start()
 
     def send(self, sample: LiveSample) -> None:
@@ -179,7 +179,7 @@ class Recorder:
                 return
             self._n_samples += 1
             if self._chunks.add(sample):
-                self._hand_over()
+                self._enqueue_chunk()
 
     def health(self) -> PartHealth:
         """Return how much was recorded, or why no more is."""
@@ -200,12 +200,12 @@ class Recorder:
         with self._changed:
             if not self._closing:
                 self._chunks.finish()
-                self._hand_over()
+                self._enqueue_chunk()
                 self._closing = True
                 self._changed.notify()
         self._thread.join(_TIMEOUT_S)
 
-    def _hand_over(self) -> None:
+    def _enqueue_chunk(self) -> None:
         """Leave the present chunk to the thread, or drop it where too much waits already."""
         n_samples, messages = self._chunks.n_samples, self._chunks.take()
         self._chunk_s = time.monotonic()
@@ -218,17 +218,20 @@ class Recorder:
         self._waiting_bytes += messages.n_bytes
         self._changed.notify()
 
-    def _work(self) -> None:
-        while (messages := self._next()) is not None:
+    def _run(self) -> None:
+        while (messages := self._next_chunk()) is not None:
             written = self._write(messages.seal())
             with self._changed:
                 _, n_samples = self._waiting.popleft()
                 self._waiting_bytes -= messages.n_bytes
                 if not written:
                     self._n_dropped += n_samples
-        self._end()
+        try:
+            self._file.close()
+        except OSError as fault:
+            self._fault = _fault_text(fault)
 
-    def _next(self) -> ChunkBuilder | None:
+    def _next_chunk(self) -> ChunkBuilder | None:
         """Return the oldest chunk, which waits until it is written; None at the end."""
         with self._changed:
             while not self._waiting:
@@ -236,7 +239,7 @@ class Recorder:
                     return None
                 self._changed.wait(_LOOK_S)
                 if time.monotonic() - self._chunk_s > self._options.chunk_s + _LOOK_S:
-                    self._hand_over()
+                    self._enqueue_chunk()
             return self._waiting[0][0]
 
     def _write(self, chunk: Chunk) -> bool:
@@ -245,7 +248,7 @@ class Recorder:
             try:
                 self._file.append(chunk)
             except OSError as fault:
-                self._fault = _words(fault)
+                self._fault = _fault_text(fault)
             else:
                 self._fault = ""
                 self._sync_if_due()
@@ -261,30 +264,24 @@ class Recorder:
         try:
             self._file.sync()
         except OSError as fault:
-            self._fault = _words(fault)
+            self._fault = _fault_text(fault)
 
     def _must_end(self) -> bool:
         """Wait before the disk is tried again; returns whether there is no time left for it."""
         with self._changed:
             return self._closing or self._changed.wait_for(lambda: self._closing, _RETRY_S)
 
-    def _end(self) -> None:
-        try:
-            self._file.close()
-        except OSError as fault:
-            self._fault = _words(fault)
 
-
-def _begun(path: Path, open_file: Callable[[Path], BinaryIO] | None) -> GrowingFile:
+def _create_file(path: Path, open_file: Callable[[Path], BinaryIO] | None) -> GrowingFile:
     try:
         return recording_file(path, open_file)
     except FileExistsError:
         raise OutputError(f"{path}: exists; give the recording another name") from None
     except OSError as fault:
-        raise OutputError(f"{path}: {_words(fault)}; choose another place") from fault
+        raise OutputError(f"{path}: {_fault_text(fault)}; choose another place") from fault
 
 
-def _words(fault: OSError) -> str:
+def _fault_text(fault: OSError) -> str:
     if fault.errno in _FULL:
         return "the disk is full"
     return f"cannot be written ({fault.strerror or fault})"

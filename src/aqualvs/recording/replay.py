@@ -38,7 +38,7 @@ class RecordedFrame:
     peaks: dict[SearchAxis, StripePeaks]
     # Why it was not measured at all.
     refusal: Refusal | None
-    # As the vehicle's gyros told.
+    # By the vehicle's gyros.
     turning: GyroRates | None
     # None where there is none, or it was not asked for.
     picture: Frame | None

@@ -187,9 +187,9 @@ class RerunLog(Closing):
         is_silence = refusal.reason is Reason.NO_FRAMES
         # A silent stream repeats itself ten times a second.
         if not (is_silence and self._silent):
-            told = refusal.detail or reason_text(refusal.reason)
+            detail = refusal.detail or reason_text(refusal.reason)
             level = "WARN" if is_silence else "INFO"
-            text = self._rr.TextLog(f"{refusal.reason.value}: {told}", level=level)
+            text = self._rr.TextLog(f"{refusal.reason.value}: {detail}", level=level)
             self._stream.log(_REFUSALS, text)
             self._stream.log(_PLANE, self._rr.Clear(recursive=True))
             for path in _SERIES:
