@@ -84,6 +84,11 @@ class Effort:
     # heading at 0.
     yaw: float = 0.0
 
+    @property
+    def is_finite(self) -> bool:
+        """Whether every part is a number."""
+        return all(map(math.isfinite, (self.forward, self.right, self.down, self.yaw)))
+
 
 NEUTRAL = Effort()
 """No thrust in any direction."""

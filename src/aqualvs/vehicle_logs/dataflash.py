@@ -17,7 +17,7 @@ Records read for each signal, with reasons:
 """
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -95,22 +95,21 @@ class Records:
     n_bogus: int
 
 
-def read_binary(data: bytes, wanted: Iterable[str]) -> Records:
+def read_binary(data: bytes) -> Records:
     """Read wanted kinds of records out of a binary dataflash log."""
-    names = frozenset(wanted)
-    places: dict[str, list[int]] = {name: [] for name in names}
+    places: dict[str, list[int]] = {name: [] for name in _WANTED}
     formats: dict[str, Format] = {}
-    n_records, skipped = _scan(data, names, places, formats)
+    n_records, skipped = _scan(data, places, formats)
     octets = np.frombuffer(data, np.uint8)
     tables: dict[str, dict[str, FloatArray]] = {}
     for name, starts in places.items():
         if starts:
             tables[name] = _decode(octets, np.array(starts, np.int64), formats[name])
-    return _sound(tables, n_records, skipped)
+    return _timed_records(tables, n_records, skipped)
 
 
 def _scan(
-    data: bytes, names: frozenset[str], places: dict[str, list[int]], formats: dict[str, Format]
+    data: bytes, places: dict[str, list[int]], formats: dict[str, Format]
 ) -> tuple[int, list[tuple[int, int]]]:
     """Walk over the records; note the places and formats of the wanted ones."""
     fmt = 0x80
@@ -141,7 +140,7 @@ def _scan(
             number, described = _format(data, at)
             if described.dtype is not None:
                 lengths[number] = described.length
-                if described.name in names:
+                if described.name in _WANTED:
                     formats[described.name] = described
                     lists[number] = places[described.name]
             elif described.length > 3 and number != fmt:
@@ -189,9 +188,8 @@ def _decode(octets: np.ndarray, at: np.ndarray, form: Format) -> dict[str, Float
     }
 
 
-def read_text(text: str, wanted: Iterable[str]) -> Records:
+def read_text(text: str) -> Records:
     """Read wanted kinds of records out of the text form of a dataflash log."""
-    names = frozenset(wanted)
     columns: dict[str, tuple[str, ...]] = {}
     rows: dict[str, list[list[float]]] = {}
     skipped: list[tuple[int, int]] = []
@@ -201,7 +199,7 @@ def read_text(text: str, wanted: Iterable[str]) -> Records:
         name = cells[0]
         if name == "FMT" and len(cells) > 5:
             columns[cells[3]] = tuple(cells[5:])
-        elif name in names:
+        elif name in _WANTED:
             if name not in columns or len(cells) != len(columns[name]) + 1:
                 skipped.append((number, 1))
                 continue
@@ -210,7 +208,7 @@ def read_text(text: str, wanted: Iterable[str]) -> Records:
         name: dict(zip(columns[name], np.array(found).T, strict=True))
         for name, found in rows.items()
     }
-    return _sound(tables, len(lines), skipped)
+    return _timed_records(tables, len(lines), skipped)
 
 
 def _number(cell: str) -> float:
@@ -220,7 +218,7 @@ def _number(cell: str) -> float:
         return float("nan")
 
 
-def _sound(
+def _timed_records(
     tables: Mapping[str, dict[str, FloatArray]], n_records: int, skipped: list[tuple[int, int]]
 ) -> Records:
     """Give each table its times and leave out records whose time is impossible."""
@@ -270,7 +268,7 @@ def read_dataflash(path: Path) -> VehicleLog:
 
     Raises `SourceError` if nothing that is wanted is in it.
     """
-    records = read_binary(path.read_bytes(), _WANTED)
+    records = read_binary(path.read_bytes())
     return _log(path, records, "dataflash", "bytes")
 
 
@@ -280,7 +278,7 @@ def read_dataflash_text(path: Path) -> VehicleLog:
     Raises `SourceError` if nothing that is wanted is in it.
     """
     text = path.read_text(encoding="utf-8", errors="replace")
-    return _log(path, read_text(text, _WANTED), "dataflash text", "lines")
+    return _log(path, read_text(text), "dataflash text", "lines")
 
 
 def _log(path: Path, records: Records, kind: str, unit: str) -> VehicleLog:
@@ -416,9 +414,9 @@ def _armed(tables: _Tables, begin: float) -> tuple[Signal | None, str]:
         table = tables.get("EV")
         if table is None or "Id" not in table:
             return None, ""
-        told = (table["Id"] == armed_event) | (table["Id"] == disarmed_event)
-        times, where = table["time_s"][told], "EV.Id"
-        state = (table["Id"][told] == armed_event).astype(float)
+        is_event = (table["Id"] == armed_event) | (table["Id"] == disarmed_event)
+        times, where = table["time_s"][is_event], "EV.Id"
+        state = (table["Id"][is_event] == armed_event).astype(float)
     signal = Signal.from_samples(times - begin, (state > 0.0).astype(float), Interpolation.HELD)
     if signal is None:
         return None, ""

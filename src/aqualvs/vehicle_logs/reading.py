@@ -26,6 +26,7 @@ from aqualvs.vehicle_logs.dataflash import (
 from aqualvs.vehicle_logs.mavlink_frames import looks_like_frames
 from aqualvs.vehicle_logs.tlog import read_tlog
 from aqualvs.vehicle_logs.vehicle_log import (
+    NETWORK_UTC_SIGMA_S,
     Interpolation,
     Signal,
     VehicleLog,
@@ -201,8 +202,6 @@ def _log(
         turned = bearing_of(turned) if interpolation is Interpolation.BEARING else wrap(turned)
         return Signal.from_samples(time_s, turned, interpolation)
 
-    # Clocks set by the network are more accurate than this.
-    utc_sigma_s = 2.0
     return VehicleLog(
         name=str(path),
         kind="csv",
@@ -211,7 +210,7 @@ def _log(
         roll=angle("roll_deg", Interpolation.ANGLE),
         pitch=angle("pitch_deg", Interpolation.ANGLE),
         start_utc_s=start_utc_s,
-        start_utc_sigma_s=None if start_utc_s is None else utc_sigma_s,
+        start_utc_sigma_s=None if start_utc_s is None else NETWORK_UTC_SIGMA_S,
         sources={n.rsplit("_", 1)[0]: f"column {n}" for n in VALUE_COLUMNS if n in table},
         notes=notes,
     )

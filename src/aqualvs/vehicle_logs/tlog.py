@@ -25,6 +25,7 @@ from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.vehicle_logs.mavlink_frames import SelectedMessages, Table, read_frames
 from aqualvs.vehicle_logs.vehicle_log import (
     FIRST_BELIEVED_UTC_S,
+    NETWORK_UTC_SIGMA_S,
     Interpolation,
     Signal,
     VehicleLog,
@@ -149,9 +150,7 @@ def _with_utc(
     block_s = 30.0
     firsts = np.flatnonzero(np.diff(np.floor(log_s / block_s), prepend=-np.inf))
     least = np.minimum.reduceat(behind, firsts)
-    # Clocks set by the network are more accurate than this.
-    utc_sigma_s = 2.0
-    start, sigma = float(np.median(least)), utc_sigma_s
+    start, sigma = float(np.median(least)), NETWORK_UTC_SIGMA_S
     if start < FIRST_BELIEVED_UTC_S:
         return TelemetryClock(table.at, log_s, boot_at, boot_s, None, None, notes)
     steps = np.diff(least)
@@ -182,6 +181,15 @@ SUB_MODES = {
     21: "SURFTRAK",
 }
 """ArduSub's flight modes (ArduSub/mode.h)."""
+
+DEPTH_FIELDS = (
+    ("GLOBAL_POSITION_INT", "relative_alt", -1e-3),
+    ("VFR_HUD", "alt", -1.0),
+    ("AHRS2", "altitude", -1.0),
+)
+"""Messages, fields and scales of the depth in metres, the best first."""
+PRESSURE_FIELD = ("SCALED_PRESSURE2", "press_abs", 100.0 / (1025.0 * 9.80665))
+"""The same of the outer pressure, which gives changes of the depth."""
 
 _Tables = Mapping[str, Table]
 _Found = tuple[Signal | None, str]
@@ -279,15 +287,9 @@ def _signal(
 def _depth(tables: _Tables, clock: TelemetryClock) -> tuple[Candidate | None, str | None]:
     candidates = [
         Candidate(f"{message}.{field}", _signal(tables, clock, message, field, scale))
-        for message, field, scale in (
-            ("GLOBAL_POSITION_INT", "relative_alt", -1e-3),
-            ("VFR_HUD", "alt", -1.0),
-            ("AHRS2", "altitude", -1.0),
-        )
+        for message, field, scale in DEPTH_FIELDS
     ]
-    metres_per_hpa = 100.0 / (1025.0 * 9.80665)
-    pressure = _signal(tables, clock, "SCALED_PRESSURE2", "press_abs", metres_per_hpa)
-    return choose_depth(candidates, pressure)
+    return choose_depth(candidates, _signal(tables, clock, *PRESSURE_FIELD))
 
 
 def _heading(tables: _Tables, clock: TelemetryClock) -> _Found:

@@ -150,6 +150,8 @@ def utc_seconds(text: str) -> float:
     return moment.timestamp()
 
 
+NETWORK_UTC_SIGMA_S = 2.0
+"""Clocks set by the network are more accurate than this."""
 FIRST_BELIEVED_UTC_S = utc_seconds("1990-01-01")
 """Clocks that were never set begin before: in 1904, 1970 or 1980."""
 

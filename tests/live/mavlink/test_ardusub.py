@@ -16,7 +16,7 @@ from aqualvs.control.vehicle import NEUTRAL, Effort, Mode
 from aqualvs.errors import OptionError
 from aqualvs.geometry.transforms import SE3
 from aqualvs.live.mavlink.ardusub import ArduSubLink, ArduSubOptions, gyro_rates_of
-from aqualvs.live.mavlink.ardusub_commands import Command, is_finite
+from aqualvs.live.mavlink.ardusub_commands import Command
 from aqualvs.live.mavlink.link import Received
 from aqualvs.simulation.dive import vehicle_attitude
 from aqualvs.simulation.scenario import dome_from_target
@@ -436,7 +436,7 @@ def test_what_is_no_number_becomes_neutral(
     wire: Wire, vehicle: ArduSubLink, name: str, value: float
 ) -> None:
     effort = Effort(**{"forward": 0.5, name: value})
-    assert not is_finite(effort)
+    assert not effort.is_finite
     with pytest.raises(ValueError, match="not finite"):
         vehicle.send(effort)
     (told,) = wire.sent

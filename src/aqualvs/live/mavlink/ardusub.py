@@ -36,7 +36,6 @@ from aqualvs.live.mavlink.ardusub_commands import (
     GuidedCommander,
     StickCommander,
     StickResponse,
-    is_finite,
 )
 from aqualvs.live.mavlink.ardusub_parameters import (
     FOR_STICKS,
@@ -49,7 +48,7 @@ from aqualvs.live.mavlink.ardusub_parameters import (
 from aqualvs.live.mavlink.link import MAV_COMP_ID_ONBOARD_COMPUTER, MavlinkLink, Received
 from aqualvs.scanning.scan import GyroRates
 from aqualvs.text import Severity
-from aqualvs.vehicle_logs.tlog import SUB_MODES
+from aqualvs.vehicle_logs.tlog import DEPTH_FIELDS, PRESSURE_FIELD, SUB_MODES
 
 FRESH_S = 1.0
 """Older messages are ignored; ground stations send sticks 5 to 50 times a second."""
@@ -124,16 +123,6 @@ def _swing_of_z(z: int) -> int:
     return z if z == _INVALID else 2 * (z - MIDDLE)
 
 
-# As in logs: height above home, which ArduSub puts at the surface; then above mean sea level; then
-# that of the spare estimator.
-_CANDIDATES: Final = (
-    ("GLOBAL_POSITION_INT", "relative_alt", -1e-3),
-    ("VFR_HUD", "alt", -1.0),
-    ("AHRS2", "altitude", -1.0),
-)
-_PRESSURE: Final = ("SCALED_PRESSURE2", "press_abs", 100.0 / (1025.0 * 9.80665))
-
-
 class DepthChoice:
     """Reader of the depth; remembers which estimates stood still."""
 
@@ -144,8 +133,8 @@ class DepthChoice:
     def read(self) -> float | None:
         """Return the depth in metres, positive down; None if none is known."""
         # Only its span counts: the pressure at the surface is unknown.
-        self._value(*_PRESSURE)
-        found = {kind: self._value(kind, field, scale) for kind, field, scale in _CANDIDATES}
+        self._value(*PRESSURE_FIELD)
+        found = {kind: self._value(kind, field, scale) for kind, field, scale in DEPTH_FIELDS}
         for kind, depth in found.items():
             if depth is not None and not self._stands_still(kind):
                 return depth
@@ -164,7 +153,7 @@ class DepthChoice:
         # An estimate that stands still while the outer pressure changes is that of a filter without
         # origin, not a depth.
         stuck_share, dived_m = 0.1, 0.5
-        dived = self._span(_PRESSURE[0])
+        dived = self._span(PRESSURE_FIELD[0])
         return dived > dived_m and self._span(kind) < stuck_share * dived
 
     def _span(self, kind: str) -> float:
@@ -346,9 +335,8 @@ class ArduSubLink:
         Raises `OSError` if it could not be sent. Raises `ValueError` if a part of it is not finite;
         neutral is sent then.
         """
-        finite = is_finite(effort)
-        sent = self._send(effort if finite else NEUTRAL)
-        if not finite:
+        sent = self._send(effort if effort.is_finite else NEUTRAL)
+        if not effort.is_finite:
             raise ValueError(f"effort is not finite: {effort}")
         if not sent:
             raise OSError(f"{self.name}: not sent; {self.link.health().detail}")

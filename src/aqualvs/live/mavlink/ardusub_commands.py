@@ -152,11 +152,6 @@ class Commander(Protocol):
         """Return the message for an effort of finite parts."""
 
 
-def is_finite(effort: Effort) -> bool:
-    """Return whether every part of an effort is a number."""
-    return all(map(math.isfinite, (effort.forward, effort.right, effort.down, effort.yaw)))
-
-
 class StickCommander:
     """Converter to `MANUAL_CONTROL`, in the name of the ground station that ArduSub obeys.
 
