@@ -9,6 +9,7 @@ from bisect import bisect_left
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from statistics import fmean, median
 from typing import NamedTuple
 
@@ -147,7 +148,7 @@ class AnswerWatch:
         self._effort = NEUTRAL
         self._balance, self._thrust_s = 0.0, 0.0
         self._speed = self._way = 0.0
-        self._heading, self._told = 0.0, math.nan
+        self._heading, self._last_heading = 0.0, math.nan
         # For how long the posture has stood still, and the age from which on it is live.
         self._still_s, self._blind_s = 0.0, _TRUSTED_S
 
@@ -169,7 +170,7 @@ class AnswerWatch:
         """
         if not all(map(math.isfinite, (now_s, posture.range, posture.pitch, posture.yaw))):
             return None
-        push = self._go_on(now_s, posture.yaw, state)
+        push = self._advance(now_s, posture.yaw, state)
         vanished = self._noise.vanished(posture)
         if self._repeats(now_s, posture) or vanished:
             self._blind_s = _TRUSTED_S
@@ -247,13 +248,13 @@ class AnswerWatch:
         now_s = self._now_s
         return bisect_left(self._moments, True, key=lambda m: now_s - m.time_s <= period_s)
 
-    def _go_on(self, now_s: float, yaw: float, state: VehicleState) -> float:
+    def _advance(self, now_s: float, yaw: float, state: VehicleState) -> float:
         """Let the efforts act until now; return their acceleration towards the target."""
         step = now_s - self._now_s
         self._now_s = now_s
         if not 0.0 < step < _GAP_S:
             self._moments.clear()
-            self._told = math.nan
+            self._last_heading = math.nan
             # It has drifted: other efforts may be needed to hold it.
             step = self._thrust_s = 0.0
         # Sideways thrust balances the drag of a way along the target; it predicts no approach.
@@ -267,10 +268,10 @@ class AnswerWatch:
         kept = math.exp(-self._damping(self._balance) * step)
         self._speed = kept * self._speed + step * (push - self._balance)
         if state.heading is not None:
-            turn = math.remainder(state.heading - self._told, 2.0 * math.pi)
+            turn = math.remainder(state.heading - self._last_heading, 2.0 * math.pi)
             if abs(turn) < _MAX_TURN:
                 self._heading += turn
-            self._told = state.heading
+            self._last_heading = state.heading
         return push
 
     def _damping(self, balance: float) -> float:
@@ -374,8 +375,8 @@ class AnswerWatch:
         # A posture that follows one of them is live, however the net moves the other.
         follows = [
             _share(_about_lines(seen[-n:], n)[0], about) >= limits.follows
-            for seen, told in ((pitch, attitude), (yaw, heading))
-            if _least_swing(about := _about_lines(told, n)) > limits.swung
+            for seen, reported in ((pitch, attitude), (yaw, heading))
+            if min((about := _about_lines(reported, n)).std(axis=1).tolist()) > limits.swung
         ]
         if not follows or any(follows):
             return False
@@ -406,11 +407,6 @@ def _swing(values: list[float], moments: Sequence[_Moment]) -> float:
     return max(means) - min(means)
 
 
-def _time_of(moment: _Moment) -> float:
-    """Return the time of a moment."""
-    return moment.time_s
-
-
 def _about_lines(values: list[float], n: int) -> FloatArray:
     """Return each `n` values in a row, without their mean and even change."""
     ramp = np.linspace(-1.0, 1.0, n)
@@ -421,15 +417,12 @@ def _about_lines(values: list[float], n: int) -> FloatArray:
     return rest
 
 
-def _least_swing(told: FloatArray) -> float:
-    """Return the least standard deviation over the delays; NaN where it told nothing."""
-    least: float = min(told.std(axis=1).tolist())
-    return least
+def _share(seen: FloatArray, reported: FloatArray) -> float:
+    """Return the greatest share of what the autopilot reports that is seen, over the delays."""
+    return max(abs(float(seen @ one)) / float(one @ one) for one in reported)
 
 
-def _share(seen: FloatArray, told: FloatArray) -> float:
-    """Return the greatest share of what the autopilot told that is seen, over the delays."""
-    return max(abs(float(seen @ one)) / float(one @ one) for one in told)
+_time_of = attrgetter("time_s")
 
 
 class _Noise:

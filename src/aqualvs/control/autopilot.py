@@ -126,13 +126,13 @@ class NetPilot:
         state : VehicleState
             As the vehicle reports it.
         """
-        if self._other_stream(time_s):
+        if self._stream_restarted(time_s):
             _, reason = self.gate.check(now_s, math.inf, None, state, NEUTRAL)
             stopped = reason if reason is not None and reason.takes_over else LimitReason.CLOCK
             return Decision(NEUTRAL, stopped, _IDLE, self.engaged)
-        present = self._present(now_s, time_s, posture, state)
-        guidance = self._guide(now_s, present, state)
-        asked = self._ask(time_s, present, filtered, guidance)
+        present = self._new_posture(now_s, time_s, posture, state)
+        guidance = self.mission.update(now_s, present, state) if self.engaged else _IDLE
+        asked = self._request_effort(time_s, present, filtered, guidance)
         effort, reason = self.gate.check(
             now_s,
             now_s - self._seen_s,
@@ -144,20 +144,20 @@ class NetPilot:
             brake=NO_BRAKE if self._doubt is None else self._watch.brake(now_s, self._still_s),
         )
         self._watch.done(now_s, effort)
-        self._settle(asked, effort, reason)
-        reason = self._end(guidance) or reason or _mission_says(guidance)
+        self._report_sent(asked, effort, reason)
+        reason = self._stop_if_lost(guidance) or reason or _mission_reason(guidance)
         if reason is None and self.gate.tips(state):
             reason = LimitReason.TIPPING
         return Decision(effort, reason, guidance, self.engaged)
 
-    def _end(self, guidance: Guidance) -> LimitReason | None:
+    def _stop_if_lost(self, guidance: Guidance) -> LimitReason | None:
         """Give the vehicle back where the target stayed away; return why."""
         if guidance.stage is not Stage.GAVE_UP:
             return None
         self.gate.stop(LimitReason.GAVE_UP)
         return LimitReason.GAVE_UP
 
-    def _other_stream(self, time_s: float) -> bool:
+    def _stream_restarted(self, time_s: float) -> bool:
         """Return whether frame times have jumped back; then all that was seen is forgotten."""
         if not time_s < self._frame_s - _LATE_S:
             return False
@@ -167,7 +167,7 @@ class NetPilot:
         self._watch.reset()
         return True
 
-    def _present(
+    def _new_posture(
         self, now_s: float, time_s: float, posture: Posture | Refusal | None, state: VehicleState
     ) -> Posture | None:
         """Return the posture of a new frame; a picture that stands still is none."""
@@ -183,13 +183,7 @@ class NetPilot:
         self._posture, self._seen_s = posture, now_s
         return posture
 
-    def _guide(self, now_s: float, posture: Posture | None, state: VehicleState) -> Guidance:
-        """Update the mission; it pauses while disengaged."""
-        if not self.engaged:
-            return _IDLE
-        return self.mission.update(now_s, posture, state)
-
-    def _ask(
+    def _request_effort(
         self, time_s: float, posture: Posture | None, filtered: Motion | None, guidance: Guidance
     ) -> Effort | None:
         """Return the controller's effort; None, and the controller at rest, if it must not act."""
@@ -210,7 +204,9 @@ class NetPilot:
             guidance.down,
         )
 
-    def _settle(self, asked: Effort | None, effort: Effort, reason: LimitReason | None) -> None:
+    def _report_sent(
+        self, asked: Effort | None, effort: Effort, reason: LimitReason | None
+    ) -> None:
         """Report the sent effort to the controller."""
         self._asked = asked
         if asked is None or (reason is not None and effort == NEUTRAL):
@@ -225,7 +221,7 @@ _LATE_S = 0.5
 _IDLE = Guidance(setpoint=None, stage=Stage.IDLE)
 
 
-def _mission_says(guidance: Guidance) -> LimitReason | None:
+def _mission_reason(guidance: Guidance) -> LimitReason | None:
     """Return why a mission asks for nothing, or for no more than to stay."""
     if guidance.stage is Stage.WAITING:
         return LimitReason.NO_POSTURE

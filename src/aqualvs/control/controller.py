@@ -19,7 +19,7 @@ import math
 from dataclasses import dataclass
 
 from aqualvs.control.gains import ControlGains, DeadBandCrossing, gain_schedule
-from aqualvs.control.vehicle import Effort, Setpoint
+from aqualvs.control.vehicle import Effort, Setpoint, clipped
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -442,7 +442,7 @@ class RangeYawController:
     ) -> tuple[float, float]:
         """Return the forces forward and right, in newtons."""
         vehicle, ramp = self.gains.vehicle, self._range_ramp
-        psi = min(max(yaw, -_MAX_YAW), _MAX_YAW)
+        psi = clipped(yaw, _MAX_YAW)
         c, s = math.cos(psi), math.sin(psi)
         side = sway * c if vehicle.can_sway else 0.0
         aside = (side + vehicle.dome_forward * turn) * s
@@ -481,7 +481,7 @@ class RangeYawController:
         """Return the closing speed that corrects the range's error."""
         gains = self.gains.range
         wanted = gains.position * (range - self._range_ramp.seen)
-        return min(max(wanted, -gains.greatest_speed), gains.greatest_speed)
+        return clipped(wanted, gains.greatest_speed)
 
     def _against_drag(self, ahead: float) -> tuple[float, tuple[float, float]]:
         """Return the acceleration that keeps a speed, in addition to the integral.
@@ -511,8 +511,8 @@ class RangeYawController:
         return Effort(
             forward=ahead,
             right=aside,
-            down=min(max(down / vehicle.climb_rate, -1.0), 1.0),
-            yaw=min(max(turn / vehicle.turning_rate, -1.0), 1.0),
+            down=clipped(down / vehicle.climb_rate),
+            yaw=clipped(turn / vehicle.turning_rate),
         )
 
 

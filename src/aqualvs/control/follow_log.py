@@ -55,7 +55,7 @@ class FollowLog(Closing):
             # Unbuffered, so that rows survive the death of the process.
             self._file = path.open("wb", buffering=0)
         except OSError as fault:
-            raise self._trouble(fault) from None
+            raise self._output_error(fault) from None
         self._append(FOLLOW_COLUMNS)
 
     def write(
@@ -83,9 +83,9 @@ class FollowLog(Closing):
         try:
             self._file.write(text.getvalue().encode("utf-8"))
         except OSError as fault:
-            raise self._trouble(fault) from None
+            raise self._output_error(fault) from None
 
-    def _trouble(self, fault: OSError) -> OutputError:
+    def _output_error(self, fault: OSError) -> OutputError:
         return OutputError(
             f"{self._path}: cannot be written ({fault.strerror}); make room, or "
             "choose another place"

@@ -8,6 +8,7 @@ import math
 from dataclasses import dataclass
 from enum import StrEnum
 
+from aqualvs.control.vehicle import clipped
 from aqualvs.errors import OptionError, check_not_negative, check_positive
 
 
@@ -74,11 +75,11 @@ class ThrustMap:
         What is beyond the thrusters is cut: sideways first, for distance matters more.
         """
         full = self.forward if forward > 0.0 else self.backward
-        ahead = _clipped(forward / full, 1.0)
-        aside = 0.0 if self.right == 0.0 else _clipped(right / self.right, 1.0)
+        ahead = clipped(forward / full)
+        aside = 0.0 if self.right == 0.0 else clipped(right / self.right)
         if self.layout is Layout.STRAIGHT:
             return ahead, aside
-        aside = _clipped(aside, 1.0 - abs(ahead))
+        aside = clipped(aside, 1.0 - abs(ahead))
         return ahead + aside, ahead - aside
 
     def split(self, forward: float, right: float) -> tuple[float, float]:
@@ -159,10 +160,6 @@ class DeadBandCrossing:
 
     def _edge(self) -> float:
         return self._side * self._thrust.dead_band
-
-
-def _clipped(value: float, most: float) -> float:
-    return min(max(value, -most), most)
 
 
 @dataclass(frozen=True, slots=True)

@@ -35,14 +35,14 @@ from aqualvs.yamlfile import parse_yaml, write_text
 def _in_file_units(kind: type[AnyPart], gains: object) -> AnyPart:
     """Return the part whose values `si_values` gives back, but for rounding."""
 
-    def told(key: str) -> Any:
+    def value_of(key: str) -> Any:
         value, part = getattr(gains, without_unit(key)), kind.model_fields[key].annotation
         if isinstance(part, type) and issubclass(part, StrictPart):
             return _in_file_units(part, value)
         # More digits than users set, fewer than rounding errors leave.
         return float(f"{math.degrees(value):.10g}") if "_deg" in key else value
 
-    return kind(**{key: told(key) for key in kind.model_fields})
+    return kind(**{key: value_of(key) for key in kind.model_fields})
 
 
 VERSION = 1

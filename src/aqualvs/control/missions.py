@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Protocol
 
-from aqualvs.control.vehicle import Setpoint, VehicleState
+from aqualvs.control.vehicle import Setpoint, VehicleState, clipped
 from aqualvs.errors import OptionError, check_positive
 from aqualvs.scanning.posture import Posture
 
@@ -235,24 +235,19 @@ class Leg:
         self._options = options
         self._time = self._distance = 0.0
         self._inside = False
-        self._done = False
-
-    @property
-    def done(self) -> bool:
-        """Whether it has come to its end."""
-        return self._done
+        self.done = False  # Whether it has come to its end.
 
     def go(self, spent_s: float, speed: float, bearing: float | None) -> None:
         """Count seconds at a speed, and look where the net faces."""
         self._time += spent_s
         self._distance += spent_s * abs(speed)
-        self._done |= self._time >= self._options.time
-        self._done |= self._distance >= self._options.distance
+        self.done |= self._time >= self._options.time
+        self.done |= self._distance >= self._options.distance
         sector = self._options.sector
         if sector is None or bearing is None:
             return
         inside = sector.holds(bearing)
-        self._done |= self._inside and not inside
+        self.done |= self._inside and not inside
         self._inside |= inside
 
 
@@ -301,10 +296,10 @@ class FollowMission:
         lost = self._watch.update(now_s, posture is not None)
         bearing = None if posture is None else bearing_of(posture, state)
         self._leg.go(self._watch.spent_s, self._sway, bearing)
-        return paced(self.setpoint, self._sway, lost, self._leg.done)
+        return guidance_along(self.setpoint, self._sway, lost, self._leg.done)
 
 
-def paced(setpoint: Setpoint, sway: float, lost: Stage | None, done: bool) -> Guidance:
+def guidance_along(setpoint: Setpoint, sway: float, lost: Stage | None, done: bool) -> Guidance:
     """Return the guidance along the net, or at its end, or without the target."""
     if lost is Stage.GAVE_UP:
         return Guidance(setpoint=None, stage=lost)
@@ -393,9 +388,9 @@ class SurveyMission:
     def update(self, now_s: float, posture: Posture | None, state: VehicleState) -> Guidance:
         """Return the guidance of the leg or the change of depth."""
         lost = self._watch.update(now_s, posture is not None)
-        if self.i_leg >= len(self._options.depths) or lost is not None:
-            over = self.i_leg >= len(self._options.depths)
-            return paced(self.setpoint, 0.0, lost, over)
+        over = self.i_leg >= len(self._options.depths)
+        if over or lost is not None:
+            return guidance_along(self.setpoint, 0.0, lost, over)
         if self._leg is None and not self._depth_reached(state):
             return Guidance(
                 setpoint=self.setpoint, down=self._descent(state), stage=Stage.CHANGING_DEPTH
@@ -409,10 +404,10 @@ class SurveyMission:
         sway = -self._options.sway if back else self._options.sway
         leg.go(self._watch.spent_s, sway, None if posture is None else bearing_of(posture, state))
         if not leg.done:
-            return paced(self.setpoint, sway, None, False)
+            return guidance_along(self.setpoint, sway, None, False)
         self.i_leg += 1
         self._begin_change()
-        return paced(self.setpoint, 0.0, None, self.i_leg >= len(self._options.depths))
+        return guidance_along(self.setpoint, 0.0, None, self.i_leg >= len(self._options.depths))
 
     def _begin_change(self) -> None:
         self._leg = None
@@ -423,8 +418,7 @@ class SurveyMission:
         """Return the speed of descent towards the leg's depth."""
         if state.depth is None or not math.isfinite(state.depth):
             return 0.0
-        wanted = _DESCENT_GAIN * (self.depth - state.depth)
-        return min(max(wanted, -self._options.descent), self._options.descent)
+        return clipped(_DESCENT_GAIN * (self.depth - state.depth), self._options.descent)
 
     def _depth_reached(self, state: VehicleState) -> bool:
         # Seconds that a depth must be kept before the next leg, longer than a wave.

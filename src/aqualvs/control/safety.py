@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import NamedTuple, Self
 
-from aqualvs.control.vehicle import NEUTRAL, Effort, Mode, VehicleState
+from aqualvs.control.vehicle import NEUTRAL, Effort, Mode, VehicleState, clipped
 from aqualvs.errors import OptionError, check_positive
 from aqualvs.scanning.posture import Posture
 
@@ -219,7 +219,9 @@ class SafetyGate:
         refused = self._clock_refuses(now_s) or self._vehicle_stops(now_s, state)
         if refused is None and self._doubts(doubt, brake) is not None:
             return self._effort_in_doubt(now_s), self._doubt
-        refused = refused or self._sight_refuses(posture_age_s, posture) or _refused_effort(effort)
+        refused = refused or self._sight_refuses(posture_age_s, posture)
+        if refused is None and not effort.is_finite:
+            refused = LimitReason.NOT_FINITE
         if refused is not None or posture is None:
             return NEUTRAL, refused or LimitReason.NO_POSTURE
         near = min(posture.range, posture.nearest)
@@ -320,11 +322,6 @@ _SPEED_WINDOW_S = 0.4
 _MIN_WINDOW_S = 0.15
 
 
-def _refused_effort(effort: Effort) -> LimitReason | None:
-    parts = (effort.forward, effort.right, effort.down, effort.yaw)
-    return None if all(map(math.isfinite, parts)) else LimitReason.NOT_FINITE
-
-
 def _backing(effort: Effort, least: float) -> Effort:
     """Return a push back, the controller's where it is stronger; turning stays allowed."""
     back = min(effort.forward, -least)
@@ -332,12 +329,9 @@ def _backing(effort: Effort, least: float) -> Effort:
 
 
 def _clipped(effort: Effort) -> Effort:
-    def clip(value: float) -> float:
-        return min(max(value, -1.0), 1.0)
-
     return Effort(
-        forward=clip(effort.forward),
-        right=clip(effort.right),
-        down=clip(effort.down),
-        yaw=clip(effort.yaw),
+        forward=clipped(effort.forward),
+        right=clipped(effort.right),
+        down=clipped(effort.down),
+        yaw=clipped(effort.yaw),
     )

@@ -18,7 +18,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
-from aqualvs.control.vehicle import Effort
+from aqualvs.control.vehicle import Effort, clipped
 
 FULL, MIDDLE = 1000, 500
 """Full deflection of x, y and r; z runs from 0 (down) over 500 (neutral) to 1000 (up)."""
@@ -122,7 +122,7 @@ class StickShaping:
     def _axis(self, share: float, channel: StickChannel, dead_us: float) -> int:
         """Return the position of x, y or r."""
         unit_us = _LEVEL_US * self.gain
-        share = limited(-share if channel.reverse else share)
+        share = clipped(-share if channel.reverse else share)
         if share == 0.0:
             pulse_us = channel.trim
         elif share > 0.0:
@@ -136,7 +136,7 @@ class StickShaping:
     def _upright(self, up: float) -> int:
         """Return the position of z."""
         unit_us = _UPRIGHT_US * self.gain * self.throttle_gain
-        up, channel = limited(up), self.throttle
+        up, channel = clipped(up), self.throttle
         if up == 0.0:
             return MIDDLE
         middle, dead = self._middle(), self.throttle_dead_zone * self.gain
@@ -226,11 +226,6 @@ def _units(pulse_us: float, unit_us: float) -> int:
     if whole == _CENTRE_US:
         return 0
     return round((whole + 0.5 - _CENTRE_US) / unit_us)
-
-
-def limited(share: float) -> float:
-    """Return a share of the full deflection, -1 to 1 at most."""
-    return min(max(share, -1.0), 1.0)
 
 
 def _within(value: float | None, least: float, most: float, default: float) -> float:

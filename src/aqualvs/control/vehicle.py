@@ -71,6 +71,11 @@ class SetpointHolder:
             )
 
 
+def clipped(value: float, most: float = 1.0) -> float:
+    """Return a value within `most` of 0."""
+    return min(max(value, -most), most)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Effort:
     """Effort as by a pilot's sticks, -1 to 1, as ArduSub's depth hold takes it."""

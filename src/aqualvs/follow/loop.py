@@ -41,17 +41,17 @@ class SimulatedLink:
 
     def state(self) -> VehicleState:
         """Return the vehicle's reported state, by the vehicle's clock."""
-        tells_hz = 10.0  # A vehicle reports its attitude ten times a second.
-        told = self.vehicle.telemetry()
+        report_hz = 10.0  # A vehicle reports its attitude ten times a second.
+        report = self.vehicle.telemetry()
         return VehicleState(
-            heard_s=math.floor(told.time_s * tells_hz) / tells_hz,
-            armed=told.armed,
-            mode=Mode.OURS if told.obeys else Mode.PILOT,
-            mode_name="ALT_HOLD" if told.obeys else "MANUAL",
-            depth=told.depth,
-            heading=told.heading,
-            roll=told.roll,
-            pitch=told.pitch,
+            heard_s=math.floor(report.time_s * report_hz) / report_hz,
+            armed=report.armed,
+            mode=Mode.OURS if report.obeys else Mode.PILOT,
+            mode_name="ALT_HOLD" if report.obeys else "MANUAL",
+            depth=report.depth,
+            heading=report.heading,
+            roll=report.roll,
+            pitch=report.pitch,
         )
 
     def send(self, effort: Effort) -> None:
@@ -75,7 +75,7 @@ class SimulatedLink:
 
 # Time after which the live run reports a silent stream, the period of further reports, and that of
 # the watchdog's checks.
-_SILENT_AFTER_S, _SILENT_EVERY_S, _DOG_LOOKS_S = 0.20, 0.10, 0.02
+_SILENT_AFTER_S, _SILENT_EVERY_S, _WATCHDOG_EVERY_S = 0.20, 0.10, 0.02
 
 
 OnStep: TypeAlias = Callable[[float, float, Posture | Refusal, Decision, VehicleState], object]
@@ -115,7 +115,7 @@ class _Sight:
     coming: deque[_Arrival] = field(default_factory=deque)
     # Times of the last frame and of the last report of a silent stream.
     heard_s: float = 0.0
-    told_s: float = -math.inf
+    reported_s: float = -math.inf
     # Exposure of that frame.
     exposed_s: float = 0.0
     # Time of the last valid posture.
@@ -123,11 +123,11 @@ class _Sight:
 
     def silence_s(self) -> float:
         """Return when a silent stream is reported next."""
-        return max(self.heard_s + _SILENT_AFTER_S, self.told_s + _SILENT_EVERY_S)
+        return max(self.heard_s + _SILENT_AFTER_S, self.reported_s + _SILENT_EVERY_S)
 
-    def bark_s(self, thrusts: bool) -> float:
+    def stop_s(self, thrusts: bool) -> float:
         """Return when the watchdog stops the thrusters."""
-        return self.seen_s + self.timeout_s + _DOG_LOOKS_S if thrusts else math.inf
+        return self.seen_s + self.timeout_s + _WATCHDOG_EVERY_S if thrusts else math.inf
 
 
 class SimulatedLoop:
@@ -144,7 +144,7 @@ class SimulatedLoop:
         steering: NetPilot,
         timing: Timing | None = None,
     ) -> None:
-        self.link, self.net, self.eye, self.steering = link, net, sensor, steering
+        self.link, self.net, self.sensor, self.steering = link, net, sensor, steering
         self.timing = timing or Timing()
         self._filter = PostureFilter()
         # Called after every step of the pilot with the time, the frame's time, what was measured,
@@ -152,18 +152,14 @@ class SimulatedLoop:
         self.on_step: OnStep | None = None
         self._sight = _Sight(steering.gate.limits.posture_age)
         self._decision: Decision | None = None
-        self._filtered: FilteredPosture | None = None
+        # State of the time filter at the last step; None where it does not run.
+        self.filtered: FilteredPosture | None = None
         self.log = LoopLog()
 
     @property
     def seen_s(self) -> float:
         """Time of the last valid posture; -inf before the first."""
         return self._sight.seen_s
-
-    @property
-    def filtered(self) -> FilteredPosture | None:
-        """State of the time filter at the last step; None where it does not run."""
-        return self._filtered
 
     def run(self, seconds: float, every_frame: Callable[[float], object] | None = None) -> LoopLog:
         """Let simulated time pass and return the log; may be called again to go on.
@@ -200,22 +196,22 @@ class SimulatedLoop:
         sight = self._sight
         while True:
             arrives_s = sight.coming[0].at_s if sight.coming else math.inf
-            silence_s, bark_s = sight.silence_s(), sight.bark_s(self.link.effort != NEUTRAL)
-            next_s = min(arrives_s, silence_s, bark_s)
+            silence_s, stop_s = sight.silence_s(), sight.stop_s(self.link.effort != NEUTRAL)
+            next_s = min(arrives_s, silence_s, stop_s)
             if next_s > until_s:
                 break
             self.link.pass_time(next_s)
             if arrives_s == next_s:
-                self._arrive(sight.coming.popleft())
-            elif bark_s == next_s:
+                self._receive(sight.coming.popleft())
+            elif stop_s == next_s:
                 self._send(NEUTRAL, next_s)
             else:
-                self._be_silent(next_s)
+                self._report_silence(next_s)
         self.link.pass_time(until_s)
 
     def _expose(self, now_s: float) -> None:
         """Take a frame, and write down how things stand."""
-        posture = self.eye.look(self.link.vehicle.dome_pose, now_s)
+        posture = self.sensor.look(self.link.vehicle.dome_pose, now_s)
         if posture is not None:
             coming = self._sight.coming
             wait_s = 0.0 if len(self.log.rows) % 2 else self.timing.field
@@ -225,7 +221,7 @@ class SimulatedLoop:
             coming.append(_Arrival(at_s, now_s, posture))
         self.log.rows.append(self._row(now_s, posture))
 
-    def _arrive(self, arrival: _Arrival) -> None:
+    def _receive(self, arrival: _Arrival) -> None:
         """Take a step by a frame's posture."""
         sight = self._sight
         sight.heard_s, sight.exposed_s = arrival.at_s, arrival.exposed_s
@@ -234,10 +230,10 @@ class SimulatedLoop:
             sight.seen_s = arrival.at_s
         self._step(arrival.at_s, arrival.exposed_s, arrival.exposed_s, arrival.posture)
 
-    def _be_silent(self, now_s: float) -> None:
+    def _report_silence(self, now_s: float) -> None:
         """Take a step without a frame."""
         sight = self._sight
-        sight.told_s = now_s
+        sight.reported_s = now_s
         silent_s = now_s - sight.heard_s
         refusal = Refusal(Reason.NO_FRAMES, f"no picture for {silent_s:.1f} s")
         self._step(now_s, sight.exposed_s, sight.exposed_s + silent_s, refusal)
@@ -245,10 +241,10 @@ class SimulatedLoop:
     def _step(
         self, now_s: float, frame_s: float, filter_s: float, posture: Posture | Refusal
     ) -> None:
-        self._filtered = self._filter.update(filter_s, posture)
+        self.filtered = self._filter.update(filter_s, posture)
         state = self.link.state()
         decision = self._decision = self.steering.step(
-            now_s, frame_s, posture, motion_of(self._filtered), state
+            now_s, frame_s, posture, motion_of(self.filtered), state
         )
         if self.on_step is not None:
             self.on_step(now_s, frame_s, posture, decision, state)
@@ -264,7 +260,7 @@ class SimulatedLoop:
         self.link.send(effort)
 
     def _row(self, now_s: float, posture: Posture | Refusal | None) -> LoopRow:
-        vehicle, decision, seen = self.link.vehicle, self._decision, self._filtered
+        vehicle, decision, seen = self.link.vehicle, self._decision, self.filtered
         truth = self.net.posture_at(vehicle.dome_pose, now_s)
         state = self.link.state()
         guidance = decision.guidance if decision else None
@@ -297,11 +293,11 @@ class SimulatedLoop:
             engaged=decision.engaged if decision else True,
             stage=guidance.stage.value if guidance else "",
             reason=decision.reason.value if decision and decision.reason else "",
-            refusal=_why_not(posture),
+            refusal=_refusal_of(posture),
         )
 
 
-def _why_not(posture: Posture | Refusal | None) -> str:
+def _refusal_of(posture: Posture | Refusal | None) -> str:
     if posture is None:
         return Reason.NO_FRAMES.value
     return posture.reason.value if isinstance(posture, Refusal) else ""

@@ -80,7 +80,7 @@ class RenderedSensor:
         self._poses.append((time_s, world_from_dome))
         field = self._scanner.rig.shutter.field_of(self._n_frames)
         if field not in self._planes or time_s < self._freeze_s:
-            self._planes[field] = self._rendered(time_s, field)
+            self._planes[field] = self._render(time_s, field)
         frame = Frame(self._n_frames, time_s, *self._planes[field], field=field)
         self._n_frames += 1
         # As the live run does.
@@ -91,7 +91,7 @@ class RenderedSensor:
         self.shots.append((frame, scan))
         return scan.posture
 
-    def _rendered(self, time_s: float, field: Field | None) -> Planes:
+    def _render(self, time_s: float, field: Field | None) -> Planes:
         shutter = self._scanner.rig.shutter
         middle_s = time_s - 0.5 * shutter.exposure
         if field is not None:
@@ -211,9 +211,9 @@ class SampledSensor:
             return Refusal(Reason.OUT_OF_RANGE, f"{truth.range:.2f} m")
         if max(abs(truth.yaw), abs(truth.pitch)) > _MAX_ANGLE:
             return Refusal(Reason.COLLINEAR, "the lasers leave the net")
-        return self._measured(truth, (10.0 if wild else 1.0) * draws)
+        return self._sample(truth, (10.0 if wild else 1.0) * draws)
 
-    def _measured(self, truth: NetPosture, draws: FloatArray) -> Posture:
+    def _sample(self, truth: NetPosture, draws: FloatArray) -> Posture:
         noise = self._noise
         sigma = np.array([noise.range_share * truth.range, noise.pitch, noise.yaw])
         distance, pitch, yaw = (np.array(truth[:3]) + sigma * draws).tolist()

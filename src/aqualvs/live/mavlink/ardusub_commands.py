@@ -12,8 +12,8 @@ from collections import deque
 from enum import StrEnum
 from typing import Any, Protocol
 
-from aqualvs.control.sticks import FULL, MIDDLE, Sticks, StickShaping, limited
-from aqualvs.control.vehicle import Effort
+from aqualvs.control.sticks import FULL, MIDDLE, Sticks, StickShaping
+from aqualvs.control.vehicle import Effort, clipped
 from aqualvs.live.mavlink.link import MavlinkLink
 
 # Length of the window of sticks and responses, and their least number: six messages of three
@@ -224,10 +224,10 @@ class GuidedCommander:
         """Return the message."""
         message = self._message
         message.time_boot_ms = (time.monotonic_ns() // 1_000_000) & 0xFFFF_FFFF
-        message.vx = self._speed * limited(effort.forward)
-        message.vy = self._speed * limited(effort.right)
-        message.vz = self._speed * limited(effort.down)
-        message.yaw_rate = self._turning_rate * limited(effort.yaw)
+        message.vx = self._speed * clipped(effort.forward)
+        message.vy = self._speed * clipped(effort.right)
+        message.vz = self._speed * clipped(effort.down)
+        message.yaw_rate = self._turning_rate * clipped(effort.yaw)
         packable: Packable = message
         return packable
 
