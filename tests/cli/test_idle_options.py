@@ -21,8 +21,8 @@ def requests(monkeypatch):
         made.append(getattr(request, "live", request))
         return 0
 
-    monkeypatch.setattr(live_command, "live_and_tell", note)
-    monkeypatch.setattr(vehicle, "follow_and_tell", note)
+    monkeypatch.setattr(live_command, "run_live", note)
+    monkeypatch.setattr(vehicle, "run_follow", note)
     return made
 
 

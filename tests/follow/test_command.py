@@ -10,7 +10,7 @@ import pytest
 from aqualvs.cli.main import main
 from aqualvs.control.follow_log import FOLLOW_COLUMNS
 from aqualvs.errors import OptionError
-from aqualvs.follow.command import FOLLOW_CSV, TRUTH_CSV, Aim, SimRequest, simulate_and_tell
+from aqualvs.follow.command import FOLLOW_CSV, TRUTH_CSV, Aim, SimRequest, run_simulation
 from aqualvs.follow.vehicle import listen
 from aqualvs.results.files import RECORD
 
@@ -26,7 +26,7 @@ leg:
 def test_simulation_writes_log_figures_and_page(tmp_path: Path) -> None:
     told: list[str] = []
     request = SimRequest(out=tmp_path / "out", aim=Aim(range=0.7), seconds=3.0)
-    assert simulate_and_tell(request, lambda line: told.append(line)) == 0
+    assert run_simulation(request, lambda line: told.append(line)) == 0
     made = {path.name for path in request.out.iterdir()} - {RECORD}
     assert made == {FOLLOW_CSV, TRUTH_CSV, "figure_22.png", "figure_23.png", "follow.html"}
     with (request.out / FOLLOW_CSV).open(encoding="utf-8") as file:
@@ -48,7 +48,7 @@ def test_simulation_writes_log_figures_and_page(tmp_path: Path) -> None:
 def test_a_picture_that_stands_still_steers_nobody(tmp_path: Path) -> None:
     told: list[str] = []
     request = SimRequest(out=tmp_path / "out", aim=Aim(range=0.6), seconds=4.0, freeze=2.0)
-    assert simulate_and_tell(request, lambda line: told.append(line)) == 0
+    assert run_simulation(request, lambda line: told.append(line)) == 0
     with (request.out / FOLLOW_CSV).open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     share = sum(row["stage"] == "holding" and not row["reason"] for row in rows) / len(rows)
@@ -65,7 +65,7 @@ def test_simulation_ends_where_the_plan_ends(tmp_path: Path) -> None:
     plan.write_text(PLAN, encoding="utf-8")
     told: list[str] = []
     request = SimRequest(out=tmp_path / "out", aim=Aim(plan=plan), seconds=20.0, cage_radius=10.0)
-    simulate_and_tell(request, lambda line: told.append(line))
+    run_simulation(request, lambda line: told.append(line))
     assert any("the plan is done; holding" in line for line in told)
     with (request.out / TRUTH_CSV).open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
@@ -84,7 +84,7 @@ def test_a_vehicle_that_cannot_sway_refuses_to_follow(tmp_path: Path) -> None:
     plan.write_text(PLAN, encoding="utf-8")
     request = SimRequest(out=tmp_path, aim=Aim(plan=plan), vehicle="videoray", seconds=2.0)
     with pytest.raises(OptionError, match="cannot move sideways"):
-        simulate_and_tell(request, print)
+        run_simulation(request, print)
 
 
 def test_what_cannot_be_simulated_is_refused(tmp_path: Path) -> None:
@@ -145,7 +145,7 @@ def test_yaw_is_held_where_it_is_asked_for(tmp_path: Path) -> None:
         current=0.0,
         waves=0.0,
     )
-    simulate_and_tell(request, lambda _: None)
+    run_simulation(request, lambda _: None)
     with (tmp_path / TRUTH_CSV).open(encoding="utf-8") as file:
         last = list(csv.DictReader(file))[-1]
     # The scanner's noise of 0.4 degrees, smoothed.

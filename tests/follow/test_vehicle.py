@@ -16,7 +16,7 @@ from aqualvs.control.vehicle import Effort, Setpoint, VehicleState
 from aqualvs.demo import bundled_dive
 from aqualvs.errors import OptionError, OutputError
 from aqualvs.follow.command import FOLLOW_CSV, Aim
-from aqualvs.follow.vehicle import FollowLogOutput, FollowRequest, follow_and_tell
+from aqualvs.follow.vehicle import FollowLogOutput, FollowRequest, run_follow
 from aqualvs.live.command import LiveRequest
 from aqualvs.live.pilot import PilotReport
 from aqualvs.results.files import Claim
@@ -84,7 +84,7 @@ def test_a_dive_without_a_vehicle_is_logged_and_never_steered(tmp_path: Path) ->
         request = demo_request(tmp_path, mavlink=f"udpout:127.0.0.1:{port}")
         # Two lines: both times there is no vehicle that could be steered.
         keys = io.StringIO("\n\n")
-        assert follow_and_tell(request, lambda line: told.append(line), keys) == 0
+        assert run_follow(request, lambda line: told.append(line), keys) == 0
     assert sum("not engaged" in line and "silent" in line for line in told) == 2
     with (tmp_path / FOLLOW_CSV).open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
@@ -114,11 +114,11 @@ def test_the_log_of_an_earlier_dive_stays(
         log.write_text(earlier, encoding="utf-8")
     request = demo_request(tmp_path, mavlink="udpout:127.0.0.1:9", overwrite=overwrite)
     with pytest.raises(OutputError, match=words):
-        follow_and_tell(request, lambda _: None, io.StringIO())
+        run_follow(request, lambda _: None, io.StringIO())
     assert log.read_text(encoding="utf-8") == earlier
 
 
 def test_gains_that_are_not_there_are_told(tmp_path: Path) -> None:
     request = demo_request(tmp_path, mavlink="udpout:127.0.0.1:14550", gains="submarine", aim=Aim())
     with pytest.raises(OptionError, match="submarine"):
-        follow_and_tell(request, print, io.StringIO())
+        run_follow(request, print, io.StringIO())

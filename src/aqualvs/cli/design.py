@@ -93,7 +93,7 @@ def design(
         try_changes=changes,
         overwrite=overwrite,
     )
-    command.design_and_tell(request)
+    command.run_design(request)
 
 
 def _without_none(given: dict[str, Any]) -> dict[str, Any]:

@@ -67,7 +67,7 @@ def score(
     """Score systems."""
     from aqualvs.experiments import benchmark_score as body
 
-    body.score_and_tell(
+    body.run_score(
         results or [], truth, typer.echo, own=own, out=out, dives=dives, overwrite=overwrite
     )
 

@@ -64,7 +64,7 @@ def tune(
         frame=1.0 / rate_hz,
         current=current,
     )
-    body.tune_and_tell(
+    body.run_tune(
         body.TuneRequest(model=model, output=output, overwrite=overwrite, options=options),
         typer.echo,
     )
@@ -200,13 +200,13 @@ def follow(
             page=page,
             overwrite=overwrite,
         )
-        raise typer.Exit(body.simulate_and_tell(request, typer.echo))
+        raise typer.Exit(body.run_simulation(request, typer.echo))
     if source is None or rig is None or mavlink is None or gains is None:
         raise OptionError(
             "follow: give SOURCE, --rig, --mavlink and --gains for a vehicle, or --sim to try it"
         )
     refuse_given(context, OF_A_SIMULATION, "for a simulation; leave it out, or give --sim")
-    from aqualvs.follow.vehicle import FollowRequest, follow_and_tell
+    from aqualvs.follow.vehicle import FollowRequest, run_follow
     from aqualvs.live.command import LiveRequest
     from aqualvs.live.options import vehicle_setup
     from aqualvs.results.run_request import Water, scanner_options
@@ -232,4 +232,4 @@ def follow(
         aim=aim,
         overwrite=overwrite,
     )
-    raise typer.Exit(follow_and_tell(dive, typer.echo))
+    raise typer.Exit(run_follow(dive, typer.echo))

@@ -159,7 +159,7 @@ def live(
         scanner=scanner,
         index_target=index_target,
     )
-    raise typer.Exit(body.live_and_tell(request, typer.echo))
+    raise typer.Exit(body.run_live(request, typer.echo))
 
 
 def doctor(

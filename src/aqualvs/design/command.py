@@ -73,7 +73,7 @@ class DesignRequest:
     overwrite: bool = False
 
 
-def design_and_tell(request: DesignRequest) -> None:
+def run_design(request: DesignRequest) -> None:
     """Evaluate a design and print its predicted errors.
 
     Raises `AqualvsError` if a file or an option cannot be used, or the folder cannot be written.

@@ -422,7 +422,7 @@ def _request(system: OwnSystem, source: Path, out: Path, overwrite: bool) -> Run
     )
 
 
-def score_and_tell(
+def run_score(
     results: Sequence[str],
     truth: Path,
     echo: Callable[[str], object],

@@ -105,7 +105,7 @@ class LoopPage:
 
     def _seen(self, frame_s: float, posture: Posture | Refusal) -> tuple[Frame | None, Scan]:
         """Return the picture of a step with its points, where pictures are rendered."""
-        sensor = self._loop.eye
+        sensor = self._loop.sensor
         if isinstance(sensor, RenderedSensor):
             for frame, scan in sensor.shots:
                 if scan.posture is posture:
@@ -116,7 +116,7 @@ class LoopPage:
     def _health(self, report: PilotReport) -> Health:
         link = self._loop.link
         sensor = (
-            "rendered pictures" if isinstance(self._loop.eye, RenderedSensor) else "no pictures"
+            "rendered pictures" if isinstance(self._loop.sensor, RenderedSensor) else "no pictures"
         )
         vehicle = f"{report.state.mode_name}, effort forward {report.decision.effort.forward:+.2f}"
         return Health(
@@ -151,27 +151,27 @@ class RunWatch:
         *,
         slow: bool,
     ) -> None:
-        self._loop, self._seconds, self._tell, self._stop = loop, seconds, echo, stop
-        self._told_s = 0.0 if slow else math.inf
+        self._loop, self._seconds, self._echo, self._stop = loop, seconds, echo, stop
+        self._reported_s = 0.0 if slow else math.inf
         self._over_s = math.inf
 
     def __call__(self, now_s: float) -> bool:
         """Report changes; return False to end the run."""
         min_s = 1.0  # Least length of a run: a report needs some rows.
         holds_on_s = 5.0  # A plan that is over continues to hold: time to show that it does.
-        tell_every_s = 10.0
-        if now_s - self._told_s >= tell_every_s:
-            self._told_s = now_s
-            self._tell(f"simulated {now_s:.0f} of {self._seconds:g} s")
+        report_every_s = 10.0
+        if now_s - self._reported_s >= report_every_s:
+            self._reported_s = now_s
+            self._echo(f"simulated {now_s:.0f} of {self._seconds:g} s")
         steering, rows = self._loop.steering, self._loop.log.rows
         if not steering.engaged:
             reason = steering.gate.latched
             words = "disengaged" if reason is None else reason.words
-            self._tell(f"at {now_s:.1f} s: {words}; here a pilot takes over")
+            self._echo(f"at {now_s:.1f} s: {words}; here a pilot takes over")
             return False
         if self._over_s == math.inf and rows and rows[-1].stage == Stage.OVER.value:
             self._over_s = now_s
-            self._tell(f"at {now_s:.1f} s: {LimitReason.MISSION_OVER.words}")
+            self._echo(f"at {now_s:.1f} s: {LimitReason.MISSION_OVER.words}")
         stopped = self._stop.caught is not None and now_s >= min_s
         return not stopped and now_s < self._over_s + holds_on_s
 
@@ -279,7 +279,7 @@ class SimRequest:
             )
 
 
-def simulate_and_tell(request: SimRequest, echo: Callable[[str], object]) -> int:
+def run_simulation(request: SimRequest, echo: Callable[[str], object]) -> int:
     """Run the loop, write log, figures and page, and print the summary; return 0.
 
     Raises `AqualvsError` if an input cannot be used, or the folder cannot be written.
@@ -301,14 +301,14 @@ def simulate_and_tell(request: SimRequest, echo: Callable[[str], object]) -> int
             camera = simulated_camera(request.camera or "ideal")
             sensor = RenderedSensor(case.net, rig, rng, camera=camera, freeze_s=freeze_s)
         loop = case.loop(sensor, mission)
-        with ExitStack() as undo:
+        with ExitStack() as stack:
             page = None
             if request.page is not None:
                 holder = SetpointHolder(rig.working_range)
                 holder.put(setpoint)
                 served = request.page.serve(rig, holder, None, echo, loop.link.state)
                 page = LoopPage(served, rig, loop, holder)
-                undo.callback(page.close)
+                stack.callback(page.close)
             _run(loop, request, page, echo)
         write_log(loop.log, request.out / TRUTH_CSV)
         facts = RunFacts(

@@ -109,7 +109,7 @@ class TuneRequest:
     options: TuneOptions = field(default_factory=TuneOptions)  # What the loops must stand.
 
 
-def tune_and_tell(request: TuneRequest, echo: Callable[[str], None]) -> None:
+def run_tune(request: TuneRequest, echo: Callable[[str], None]) -> None:
     """Tune, try a step, write or print the gains.
 
     Raises `OptionError` if the model is unknown, or nothing stands what is asked. Raises

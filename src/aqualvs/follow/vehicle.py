@@ -50,24 +50,24 @@ class FollowLogOutput(Output):
 
     def __init__(self, path: Path, pilot: Pilot) -> None:
         self._log, self._pilot = FollowLog(path), pilot
-        self._told: PilotReport | None = None
+        self._last: PilotReport | None = None
         self._waiting: SimpleQueue[_Step | None] = SimpleQueue()
-        self._trouble = ""
+        self._fault = ""
         self._thread = threading.Thread(target=self._write, name=self.name, daemon=True)
         self._thread.start()
 
     def send(self, sample: LiveSample) -> None:
         """Take the pilot's last step; return at once."""
         report = self._pilot.latest
-        if report is None or report is self._told:
+        if report is None or report is self._last:
             return
-        self._told = report
+        self._last = report
         self._waiting.put((report, sample.scan.time_s, sample.scan.posture))
 
     def health(self) -> PartHealth:
         """Return whether the log can be written."""
-        if self._trouble:
-            return PartHealth(self.name, State.FAULT, self._trouble)
+        if self._fault:
+            return PartHealth(self.name, State.FAULT, self._fault)
         return PartHealth(self.name, State.OK)
 
     def close(self) -> None:
@@ -83,9 +83,9 @@ class FollowLogOutput(Output):
             at_s = 1e-9 * report.at_ns
             try:
                 self._log.write(at_s, frame_s, posture, report.decision, report.state)
-                self._trouble = ""
+                self._fault = ""
             except (OutputError, ValueError) as fault:
-                self._trouble = str(fault)
+                self._fault = str(fault)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -103,7 +103,7 @@ class FollowRequest:
     overwrite: bool = False
 
 
-def follow_and_tell(
+def run_follow(
     request: FollowRequest, echo: Callable[[str], object], keys: TextIO | None = None
 ) -> int:
     """Run until the source ends or the user stops it; return 0.

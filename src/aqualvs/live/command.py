@@ -175,7 +175,7 @@ class LiveRequest:
     index_target: Path | None = None  # Markers on the vehicle that show the water's index.
 
 
-def live_and_tell(request: LiveRequest, echo: Callable[[str], object]) -> int:
+def run_live(request: LiveRequest, echo: Callable[[str], object]) -> int:
     """Run until the source ends or the user stops it, the normal end of a live run; return 0.
 
     Raises `AqualvsError` if an input cannot be used, or the source can never work.
