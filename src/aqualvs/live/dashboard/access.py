@@ -1,6 +1,6 @@
 """Access to the pilot's page: rules for viewing and commanding, limits, and checked commands.
 
-Messages of a page are checked by type and size (`parse_message`) and carried out (`Controls`).
+Messages of a page are checked by type and size (`MESSAGES`) and carried out (`Controls`).
 `ConnectionLimits` bounds the connections that wait for a greeting; `TokenGate` checks one token at
 a time.
 """
@@ -70,15 +70,8 @@ Message = Annotated[
     Hello | PictureShown | RecordCommand | SetpointCommand, Field(discriminator="kind")
 ]
 Command = RecordCommand | SetpointCommand
-_ADAPTER: TypeAdapter[Message] = TypeAdapter(Message)
-
-
-def parse_message(text: str) -> Message:
-    """Return a page's message.
-
-    Raises `ValueError` if it is none.
-    """
-    return _ADAPTER.validate_json(text)
+MESSAGES: TypeAdapter[Message] = TypeAdapter(Message)
+"""Parser of a page's messages."""
 
 
 class RecordButton:

@@ -32,6 +32,7 @@ from aqualvs.control.vehicle import Setpoint, VehicleState
 from aqualvs.errors import AqualvsError, OptionError
 from aqualvs.live.dashboard.access import (
     MAX_MESSAGE_BYTES,
+    MESSAGES,
     Access,
     ConnectionLimits,
     Controls,
@@ -40,7 +41,6 @@ from aqualvs.live.dashboard.access import (
     PictureShown,
     TokenGate,
     are_addresses,
-    parse_message,
 )
 from aqualvs.optics.rig import Rig
 from aqualvs.recording.sample import LiveSample
@@ -357,7 +357,8 @@ class DashboardServer:
     async def _admit(self, socket: WebSocket, peer: str) -> PageClient | None:
         """Read the greeting; None if the page may not stay."""
         try:
-            hello = parse_message(await asyncio.wait_for(socket.receive_text(), _HELLO_S))
+            text = await asyncio.wait_for(socket.receive_text(), _HELLO_S)
+            hello = MESSAGES.validate_json(text)
         except (TimeoutError, ValidationError, KeyError) as fault:
             await _refuse(socket, peer, f"no greeting: {type(fault).__name__}")
             return None
@@ -410,7 +411,7 @@ class DashboardServer:
                 task.cancel()
 
     async def _handle(self, socket: WebSocket, viewer: PageClient, peer: str, text: str) -> None:
-        message = parse_message(text)
+        message = MESSAGES.validate_json(text)
         if isinstance(message, PictureShown):
             viewer.shown()
         elif isinstance(message, Hello):

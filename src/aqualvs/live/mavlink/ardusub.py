@@ -90,7 +90,9 @@ class PilotSticks:
         if found.age_s > FRESH_S or (found.system, found.component) == self._own:
             return False
         sticks = found.message
-        swings = (sticks.x, sticks.y, sticks.r, _swing_of_z(sticks.z))
+        # The vertical counts from 0 to 1000, the others from -1000 to 1000.
+        z = sticks.z if sticks.z == _INVALID else 2 * (sticks.z - MIDDLE)
+        swings = (sticks.x, sticks.y, sticks.r, z)
         return any(abs(s) > FULL * self._dead_band for s in swings if s != _INVALID)
 
     def _channels_moved(self) -> bool:
@@ -116,11 +118,6 @@ class PilotSticks:
         swing = (pulse_us - _CENTRE_US) / _FULL_US
         least, most = min((0, *ours)) / FULL, max((0, *ours)) / FULL
         return not least - self._dead_band <= swing <= most + self._dead_band
-
-
-def _swing_of_z(z: int) -> int:
-    """Return the vertical stick as the others count, -1000 to 1000."""
-    return z if z == _INVALID else 2 * (z - MIDDLE)
 
 
 class DepthChoice:

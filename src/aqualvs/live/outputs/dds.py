@@ -33,11 +33,6 @@ _BEFORE_IRON = frozenset(
 )
 
 
-def distro_of_this_machine() -> str:
-    """Return the release of ROS 2 that the environment names, or the default."""
-    return os.environ.get("ROS_DISTRO", "") or DEFAULT_DISTRO
-
-
 def range_has_variance(distro: str) -> bool:
     """Return whether a release of ROS 2 has `Range.variance`, as all since Iron have."""
     return distro.lower() not in _BEFORE_IRON
@@ -164,7 +159,7 @@ class DdsOutput(Output):
         self._domain_id = domain_of_this_machine() if domain_id is None else domain_id
         if not 0 <= self._domain_id <= _MAX_DOMAIN:
             raise OptionError(f"ROS domain {self._domain_id}: must be 0 to {_MAX_DOMAIN}")
-        self._types = dds_types(distro or distro_of_this_machine())
+        self._types = dds_types(distro or os.environ.get("ROS_DISTRO") or DEFAULT_DISTRO)
         self._maker = MessageMaker(self._options, self._types)
         self._link: _Link | None = None
         self._closed = False
