@@ -128,7 +128,7 @@ def _stripe(
     rng: np.random.Generator,
 ) -> tuple[FloatArray, FloatArray]:
     """Pixels and directions across of one laser's stripe on one surface."""
-    points, up = _lit(pose, surfaces.placed(i_surface, pose), sheet, spacing)
+    points, up = _lit(pose, surfaces.placed(pose)[i_surface], sheet, spacing)
     in_target = pose.inverse().apply(points)
     on = np.all((in_target >= surfaces.lowest) & (in_target <= surfaces.highest), axis=1)
     for i, plane in enumerate(surfaces.planes):

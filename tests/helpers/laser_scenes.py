@@ -128,7 +128,7 @@ def _view(
 ) -> PlacedView:
     size = SQUARE * np.array(SQUARES)
     low, high = np.full(2, -margin), size + margin
-    surface = board_surface().placed(0, pose)
+    surface = board_surface().placed(pose)[0]
     chains: list[FloatArray] = []
     for laser in rig.lasers:
         lit = _cut(laser.plane, surface)

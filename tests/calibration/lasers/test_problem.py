@@ -44,7 +44,7 @@ def made(
     bundle = Bundle(shots, free, state, RigUncertainty.none(), np.array([medium]))
     camera, sheets, groups, n = rig.camera(), sheets_of(rig), [], len(surfaces.planes)
     for i, view in enumerate(views):
-        planes = [surfaces.placed(k, poses[i]) for k in range(n)]
+        planes = surfaces.placed(poses[i])
         for i_laser, sheet in enumerate(sheets):
             mine = np.flatnonzero(view.stripes.chain // n == i_laser)
             group = binned(i, i_laser, view.stripes.at(mine), view.stripes.chain[mine] % n)

@@ -173,7 +173,7 @@ def test_observability_tells_data_from_priors() -> None:
     assert "lens_x" not in seen.shrinkage
     assert seen.shrinkage["fx"] == pytest.approx(1.0, abs=1e-6)
     assert seen.shrinkage["fy"] < 0.02
-    assert "fx" in seen.undetermined(["fx", "fy"])
+    assert "fx" in seen.undetermined(["fx", "fy"], 0.9)
     best, worst = seen.directions[0], seen.directions[-1]
     assert best.gain > 1e3
     assert list(best.main) == ["fy"]

@@ -26,6 +26,7 @@ from aqualvs.calibration.solver.bundle import CORNER_SIGMA_PX, CORNERS, Bundle, 
 from aqualvs.calibration.solver.covariance import (
     ViewCovariance,
     implausible_distance,
+    largest_angle,
     shared_covariance,
 )
 from aqualvs.calibration.solver.least_squares import Solution, solve
@@ -86,7 +87,7 @@ def _check_determined(solution: Solution[BundleState], covariance: FloatArray) -
     focal = max(sigma[0] / rig.lens.fx, sigma[1] / rig.lens.fy)
     centre = float(sigma[2:].max()) / rig.size_px[0]
     normals = np.array([pose.rotation[:, 2] for pose in solution.state.poses])
-    lean = float(np.arccos(np.clip(np.abs(normals @ normals.T), 0.0, 1.0).min()))
+    lean = largest_angle(normals)
     # Angle between boards below which they count as parallel.
     parallel = np.deg2rad(5.0)
     remedy = (

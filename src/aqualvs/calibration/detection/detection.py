@@ -10,7 +10,6 @@ from dataclasses import replace
 import numpy as np
 
 from aqualvs.calibration.detection.boards import (
-    CornerGrid,
     Markers,
     agreed_corners,
     find_charuco,
@@ -134,10 +133,6 @@ def detect_board(
     n = int(np.count_nonzero(grid.known))
     if n < min_corners:
         return why_no_board(image, board, n, min_corners)
-    return _view(grid, board, name)
-
-
-def _view(grid: CornerGrid, board: Board, name: str) -> View:
     ids = np.flatnonzero(grid.known).astype(np.int64)
     return View(name, ids, board.corner_points()[ids], grid.pixels.reshape(-1, 2)[ids], grid.notes)
 

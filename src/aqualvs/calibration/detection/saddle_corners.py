@@ -47,7 +47,8 @@ def blurred_edge(distance: float, blur: float) -> tuple[float, float]:
     return 0.5 + 0.5 * math.erf(_SQRT_HALF * t), _DENSITY_AT_ZERO * math.exp(-0.5 * t * t) / blur
 
 
-U8Array = NDArray[np.uint8]
+GreyImage = NDArray[np.uint8]
+"""A grey picture, shape (height, width)."""
 
 # Unknowns: centre x, y; angles of the edges' normals; log of the blur; level, contrast, slopes.
 _N = 9
@@ -81,7 +82,7 @@ _X, _Y, _RADIUS, _REACH_1, _REACH_2, _SIGN, _MARGIN, _BITS_FROM = range(8)
 
 @kernel
 def fit_saddles(
-    image: U8Array,
+    image: GreyImage,
     axes: FloatArray,
     light_first: BoolArray,
     margin: float,
@@ -133,7 +134,7 @@ def _start(axes: FloatArray, pixel: FloatArray, window: FloatArray, unknowns: Fl
 
 @borrowing_kernel
 def _fit(
-    image: U8Array, window: FloatArray, matrices: FloatArray, vectors: FloatArray
+    image: GreyImage, window: FloatArray, matrices: FloatArray, vectors: FloatArray
 ) -> tuple[float, float]:
     """Fit one corner in vectors[0]; return sigma of a coordinate and the residual's share."""
     best, unit, column = vectors[0], vectors[1], vectors[2]
@@ -159,7 +160,7 @@ def _fit(
 
 
 @inline_borrowing_kernel
-def _place_window(image: U8Array, unknowns: FloatArray, window: FloatArray) -> bool:
+def _place_window(image: GreyImage, unknowns: FloatArray, window: FloatArray) -> bool:
     """Centre the window on the corner; return False if it is too small at the border.
 
     The window stays symmetric about the corner, so that effects outside the model cancel.
@@ -177,7 +178,7 @@ def _place_window(image: U8Array, unknowns: FloatArray, window: FloatArray) -> b
 
 @inner_borrowing_kernel
 def _descend(
-    image: U8Array, window: FloatArray, matrices: FloatArray, vectors: FloatArray
+    image: GreyImage, window: FloatArray, matrices: FloatArray, vectors: FloatArray
 ) -> tuple[float, int]:
     """Run Levenberg-Marquardt in one window; return the sum of squares and number of pixels.
 
@@ -227,7 +228,7 @@ def _advance(best: FloatArray, step: FloatArray, tried: FloatArray) -> None:
 
 
 @inner_borrowing_kernel
-def _first_tones(image: U8Array, window: FloatArray, unknowns: FloatArray) -> None:
+def _first_tones(image: GreyImage, window: FloatArray, unknowns: FloatArray) -> None:
     """Write level and contrast from the means of the two kinds of quadrants."""
     radius = window[_RADIUS]
     light, n_light, dark, n_dark = 0.0, 1e-9, 0.0, 1e-9
@@ -250,7 +251,7 @@ def _first_tones(image: U8Array, window: FloatArray, unknowns: FloatArray) -> No
 
 @inner_borrowing_kernel
 def _sums(
-    image: U8Array,
+    image: GreyImage,
     window: FloatArray,
     unknowns: FloatArray,
     normal: FloatArray,
@@ -335,10 +336,6 @@ def _lightness(
         by_blur += (d_1 - m_1) * t_1 * f_2 + (d_2 - m_2) * f_1 * t_2
         by_blur += (-d_1 - m_1) * q_1 * g_2 + (-d_2 - m_2) * g_1 * q_2
     return value, by_1, sign * by_2, by_blur
-
-
-GreyImage = NDArray[np.uint8]
-"""A grey picture, shape (height, width)."""
 
 
 @dataclass(frozen=True, slots=True)

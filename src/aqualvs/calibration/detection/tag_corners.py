@@ -21,7 +21,6 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from aqualvs.calibration.detection.saddle_corners import MIN_PIVOT, GreyImage, blurred_edge
 from aqualvs.calibration.targets.targets import aruco_dictionary
@@ -33,8 +32,6 @@ from aqualvs.geometry.compiled import (
     kernel,
 )
 from aqualvs.geometry.linear_algebra import factorise, inverse_of, solve_factorised
-
-U8Array = NDArray[np.uint8]
 
 # Unknowns: centre 0-1; linear part 2-5, row by row; perspective 6-7; bend of x and of y 8-13, in
 # pixels per q0 q0, q0 q1, q1 q1; log of the blur 14; log of gamma 15; level 16, contrast 17; slopes
@@ -214,7 +211,7 @@ def _pixel_to_marker(unknowns: FloatArray, x: float, y: float) -> tuple[float, f
 class TagWindow(NamedTuple):
     """Pixels around a marker, and what the marker looks like."""
 
-    image: U8Array  # Shape (height, width): grey picture.
+    image: GreyImage  # Shape (height, width): grey picture.
     corner: FloatArray  # Shape (2,): column and row of the window's first pixel.
     weights: FloatArray  # Shape (rows, columns): of each pixel of the window; 0 leaves it out.
     # Shape (n + 2, n + 2): the marker's cells, 1 where light, and a light ring around them.

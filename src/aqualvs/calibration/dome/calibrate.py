@@ -294,7 +294,9 @@ def dome(
     n_solved = len(solution.covariance)
     doubts = check_shared_errors(problem, solution, covariance[:n_solved, :n_solved])
     doubts += check_media(problem, solution, sets)
-    covariance[:n_solved, :n_solved] += _of_rail(problem, solution, options)
+    # All given distances share an error.
+    by_offset = options.distance_offset_sigma * solved_by_offset(problem, solution)
+    covariance[:n_solved, :n_solved] += np.outer(by_offset, by_offset)
     result = _result(problem, solution, sets, names, covariance)
     check_solution(problem, solution, result.uncertainty)
     if options.check_cross_validation:
@@ -381,14 +383,6 @@ def _wrong_distances(problem: DomeProblem, solution: Solution[BundleState]) -> l
     # A given distance with an error of this many sigmas is a mistake.
     wrong_distance = 5.0
     return [i for i, block in off.items() if block.lengths[0] > wrong_distance]
-
-
-def _of_rail(
-    problem: DomeProblem, solution: Solution[BundleState], options: DomeOptions
-) -> FloatArray:
-    """Return the covariance added by an error that all given distances share."""
-    by_offset = options.distance_offset_sigma * solved_by_offset(problem, solution)
-    return np.outer(by_offset, by_offset)
 
 
 def _result(

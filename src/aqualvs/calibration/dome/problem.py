@@ -15,7 +15,7 @@ Cross-validation: the dome's prediction of unused corners against that of a bare
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
@@ -57,15 +57,6 @@ class PoseKind(StrEnum):
     UNKNOWN = "unknown"
 
 
-def kind_of(given: BoardPose | None) -> PoseKind:
-    """Return the kind of knowledge of a pose."""
-    if given is None:
-        return PoseKind.UNKNOWN
-    if given.dome_from_board is not None:
-        return PoseKind.EXACT
-    return PoseKind.UNKNOWN if given.distance is None else PoseKind.DISTANCE
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BoardSet:
     """Views taken in one medium."""
@@ -103,7 +94,7 @@ class DomeOptions:
     distance_offset_sigma: float = 2e-4
     # Standard deviation, about each axis, of well set up boards at known distances from square to
     # the dome. A minority of boards may be off by any amount.
-    tilt_sigma: float = field(default=float(np.deg2rad(0.2)))
+    tilt_sigma: float = float(np.deg2rad(0.2))
     # Whether intrinsics are solved too, with the camera's calibration as their prior. If not, they
     # are held, and their uncertainty is propagated to the result.
     refine_intrinsics: bool = True
@@ -131,9 +122,7 @@ def check_sets(rig: Rig, sets: Sequence[BoardSet]) -> None:
     if rig.flat_port is not None:
         _check_flat(rig, sets)
     views = [view for one in sets for view in one.views]
-    exact = any(
-        kind_of(one.given(i)) is PoseKind.EXACT for one in sets for i in range(len(one.views))
-    )
+    exact = any(shot.kind is PoseKind.EXACT for shot in shots_of(sets))
     good = "10 to 15 at distances all over the working range"
     check_enough(views, 1 if exact else 3, "dome", good)
 
@@ -175,7 +164,11 @@ class Shot:
     @property
     def kind(self) -> PoseKind:
         """Kind of knowledge of the board's pose."""
-        return kind_of(self.given)
+        if self.given is None:
+            return PoseKind.UNKNOWN
+        if self.given.dome_from_board is not None:
+            return PoseKind.EXACT
+        return PoseKind.UNKNOWN if self.given.distance is None else PoseKind.DISTANCE
 
 
 @dataclass(frozen=True, slots=True)

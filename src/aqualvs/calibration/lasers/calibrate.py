@@ -98,7 +98,14 @@ def calibrate_lasers(
         If refinement is requested and nothing is uncertain.
     """
     options = options or LaserOptions()
-    camera_covariance = _camera_covariance(rig, options, uncertainty or RigUncertainty.none())
+    camera_covariance = CameraCovariance.of(
+        rig, uncertainty or RigUncertainty.none(), options.n_medium, options.sigma_n_medium
+    )
+    if options.refine and not camera_covariance.n_columns:
+        raise OptionError(
+            "refinement is asked for, but the rig says of none of its camera's numbers how well "
+            "it is known; calibrate the camera and dome first, or leave refinement out"
+        )
     check_size(views)
     seen_rig = rig if options.n_medium is None else rig.in_water(options.n_medium)
     placed, left_out = place_views(seen_rig.camera(), views, surfaces)
@@ -118,8 +125,9 @@ def calibrate_lasers(
         refined=options.refine,
         stripe_bias_px=options.stripe_bias_px,
     )
-    figures = laser_figures(solved, joint, result.lasers, paper_planes(solved), words)
-    pictures = view_figures(solved)
+    each = zip(result.lasers, paper_planes(solved), words, strict=True)
+    figures = [laser_figures(solved, joint, i, *one) for i, one in enumerate(each)]
+    pictures = [view_figures(solved, i, view) for i, view in enumerate(solved.views)]
     return LaserCalibration(
         rig=result,
         uncertainty=joint.uncertainty,
@@ -129,20 +137,6 @@ def calibrate_lasers(
         warnings=(*warnings, *_warnings(solved, figures, pictures)),
         refined=options.refine,
     )
-
-
-def _camera_covariance(
-    rig: Rig, options: LaserOptions, uncertainty: RigUncertainty
-) -> CameraCovariance:
-    camera_covariance = CameraCovariance.of(
-        rig, uncertainty, options.n_medium, options.sigma_n_medium
-    )
-    if options.refine and not camera_covariance.n_columns:
-        raise OptionError(
-            "refinement is asked for, but the rig says of none of its camera's numbers how well "
-            "it is known; calibrate the camera and dome first, or leave refinement out"
-        )
-    return camera_covariance
 
 
 def _sorted_stripes(

@@ -19,6 +19,7 @@ from aqualvs.calibration.lasers.stripes_on_planes import TargetSurfaces, way_alo
 from aqualvs.calibration.lasers.views import LaserView, PlacedView, pose_difference
 from aqualvs.calibration.solver.bundle import CORNER_SIGMA_PX
 from aqualvs.calibration.solver.least_squares import Solution
+from aqualvs.calibration.solver.result import rms_px
 from aqualvs.errors import CalibrationError
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.planes import Plane
@@ -121,22 +122,9 @@ class SolvedLasers:
 
 
 def laser_figures(
-    solved: SolvedLasers,
-    joint: JointResult,
-    lasers: Sequence[Laser],
-    papers: Sequence[Plane],
-    words: Sequence[str],
-) -> list[LaserFigures]:
-    """Return the figures of every laser."""
-    return [
-        _laser_figures(solved, joint, i, laser, papers[i], words[i])
-        for i, laser in enumerate(lasers)
-    ]
-
-
-def _laser_figures(
     solved: SolvedLasers, joint: JointResult, i_laser: int, laser: Laser, paper: Plane, words: str
 ) -> LaserFigures:
+    """Return the figures of a laser; `paper` and `words` become its `paper_plane` and `sheet`."""
     mine = solved.groups_of(laser=i_laser)
     groups = [solved.problem.groups[i] for i in mine]
     residuals, inside, weights, metres = _stripes(solved, mine)
@@ -175,12 +163,8 @@ def _rms(values: FloatArray, weights: IntArray) -> float:
     return float(np.sqrt(np.average(values**2, weights=weights)))
 
 
-def view_figures(solved: SolvedLasers) -> list[ViewFigures]:
-    """Return the figures of every picture."""
-    return [_view_figures(solved, i, view) for i, view in enumerate(solved.views)]
-
-
-def _view_figures(solved: SolvedLasers, i_view: int, view: PlacedView) -> ViewFigures:
+def view_figures(solved: SolvedLasers, i_view: int, view: PlacedView) -> ViewFigures:
+    """Return the figures of a picture."""
     n_groups = len(solved.problem.groups)
     block = solved.solution.blocks[n_groups + i_view]
     inside = solved.solution.inliers[n_groups + i_view]
@@ -190,11 +174,10 @@ def _view_figures(solved: SolvedLasers, i_view: int, view: PlacedView) -> ViewFi
     angle, shift = pose_difference(
         pose, view.spatial.dome_from_target, view.view.points.mean(axis=0)
     )
-    squares = np.sum(corners[inside] ** 2, axis=1)
     return ViewFigures(
         name=view.view.name,
         dome_from_target=pose,
-        rms_corners_px=float(np.sqrt(np.mean(squares))) if len(squares) else float("nan"),
+        rms_corners_px=rms_px(corners[inside]),
         rms_stripes_px=_rms(residuals[believed], weights[believed]),
         n_corners=len(view.view) + view.n_corners_rejected,
         n_stripe_points=len(view.placed),
@@ -431,8 +414,11 @@ def contradicts(solved: SolvedLasers) -> bool:
     Then stripes shift the board from its pose by corners alone, or stripes do not fit one plane
     although each is straight.
     """
-    corners = _corners_px(solved) / _alone_px(solved)
-    return corners > _CORNERS_CONTRADICT or _stripes_misfit(solved) > _STRIPES_CONTRADICT
+    alone_px = float(np.sqrt(np.mean([view.rms_px**2 for view in solved.views])))
+    return (
+        _corners_px(solved) / alone_px > _CORNERS_CONTRADICT
+        or _stripes_misfit(solved) > _STRIPES_CONTRADICT
+    )
 
 
 def _stripes_misfit(solved: SolvedLasers) -> float:
@@ -470,10 +456,6 @@ def _corners_px(solved: SolvedLasers) -> float:
     blocks = solved.solution.blocks[n_groups : n_groups + len(solved.views)]
     squares = [np.nanmean(np.sum(block.residuals**2, axis=1)) for block in blocks]
     return float(np.sqrt(np.mean(squares))) * CORNER_SIGMA_PX
-
-
-def _alone_px(solved: SolvedLasers) -> float:
-    return float(np.sqrt(np.mean([view.rms_px**2 for view in solved.views])))
 
 
 def _too_few(

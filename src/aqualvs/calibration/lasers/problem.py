@@ -144,7 +144,7 @@ class LaserProblem:
     def surface_planes(self, state: LaserState, i_view: int) -> list[Plane]:
         """Return the surfaces of the stripes in a view, in `dome`."""
         pose, board_pose = state.bundle.poses[i_view], state.board_poses[i_view]
-        planes = [self.surfaces.placed(i, pose) for i in range(len(self.surfaces.planes))]
+        planes = self.surfaces.placed(pose)
         if self.board_pose_prior is None:
             return planes
         middle = pose.apply(self.bundle.views[i_view].view.points.mean(axis=0))

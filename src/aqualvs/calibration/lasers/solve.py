@@ -60,11 +60,12 @@ def start_sheets(rig: Rig, lasers: Sequence[Laser], *, bent: bool) -> tuple[Shee
     bent : bool
         Whether sheets behind windows are bent.
     """
-    sheets = []
-    for laser in lasers:
-        flat = Sheet(plane=laser.plane, window=None, n_air=rig.n_air, n_water=rig.n_water)
-        sheets.append(_bent(rig, laser) if bent and laser.window is not None else flat)
-    return tuple(sheets)
+    return tuple(
+        _bent(rig, laser)
+        if bent and laser.window is not None
+        else Sheet(plane=laser.plane, window=None, n_air=rig.n_air, n_water=rig.n_water)
+        for laser in lasers
+    )
 
 
 def _bent(rig: Rig, laser: Laser) -> Sheet:
@@ -171,11 +172,6 @@ class InitialGuess:
     # Error that shifts or turns a whole stripe in its picture.
     shared_error_px: float = 0.0
 
-    def planes(self, view: PlacedView) -> list[Plane]:
-        """Return the surfaces in `dome`."""
-        n = len(self.surfaces.planes)
-        return [self.surfaces.placed(i, view.dome_from_target) for i in range(n)]
-
     def bundle(self) -> Bundle:
         """Return the bundle of the corners alone."""
         camera_covariance = self.camera_covariance
@@ -265,7 +261,7 @@ def _solve_from(
     camera, groups = start.rig.camera(), []
     for i_view, mine in enumerate(split_by_view(laser_of, start.views)):
         view = start.views[i_view]
-        planes = start.planes(view)
+        planes = start.surfaces.placed(view.dome_from_target)
         for i_laser, sheet in enumerate(sheets):
             members = np.flatnonzero(mine == i_laser)
             if len(members) >= _MIN_POINTS:
@@ -321,10 +317,7 @@ def paper_planes(solved: SolvedLasers) -> list[Plane]:
     """Return the planes of all lasers by the paper's method (Eq. 33-36)."""
     camera = solved.problem.bundle.start.camera(0)
     surfaces, planes = solved.problem.surfaces, []
-    spatial = [
-        [surfaces.placed(i, view.spatial.dome_from_target) for i in range(len(surfaces.planes))]
-        for view in solved.views
-    ]
+    spatial = [surfaces.placed(view.spatial.dome_from_target) for view in solved.views]
     for i, sheet in enumerate(solved.state.sheets):
         groups = [solved.problem.groups[k] for k in solved.groups_of(laser=i)]
         points = [

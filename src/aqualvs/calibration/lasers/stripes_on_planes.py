@@ -41,7 +41,7 @@ class StripePoints:
     def thinned(self, n_points: int) -> "StripePoints":
         """Return every k-th point, so that hardly more than `n_points` are left."""
         every = -(-len(self) // n_points) if len(self) else 1
-        return self if every == 1 else self.where(np.arange(len(self)) % every == 0)
+        return self if every == 1 else self.at(np.arange(0, len(self), every))
 
     def where(self, keep: BoolArray) -> "StripePoints":
         """Return the points that `keep` (N,) marks."""
@@ -93,11 +93,13 @@ class TargetSurfaces:
             points[valid], surface[valid] = there[valid], i
         return points, surface
 
-    def placed(self, i_surface: int, dome_from_target: SE3) -> Plane:
-        """Return the plane of a surface in `dome`."""
-        plane = self.planes[i_surface]
-        normal = dome_from_target.rotate(plane.normal)
-        return Plane(normal, plane.offset + float(normal @ dome_from_target.translation))
+    def placed(self, dome_from_target: SE3) -> list[Plane]:
+        """Return the planes of the surfaces in `dome`."""
+        normals = [dome_from_target.rotate(plane.normal) for plane in self.planes]
+        return [
+            Plane(normal, plane.offset + float(normal @ dome_from_target.translation))
+            for plane, normal in zip(self.planes, normals, strict=True)
+        ]
 
     def _inside(self, points: FloatArray, i_own: int) -> BoolArray:
         # Points this near to the edge of two surfaces may be light of the other one, or of both.

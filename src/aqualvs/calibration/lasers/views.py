@@ -176,19 +176,15 @@ def _placed_view(camera: Camera, laser_view: LaserView, surfaces: TargetSurfaces
         )
     # Neighbouring points of a stripe are nearly redundant.
     enough_points = 2000
-    return replaced(
-        camera,
-        PlacedView(
-            believed,
-            laser_view.stripes.thinned(enough_points),
-            pose.dome_from_target,
-            spatial_pose(camera, believed, pose.dome_from_target),
-            _none(),
-            len(view) - len(believed),
-            pose.rms_px,
-        ),
+    stripes = laser_view.stripes.thinned(enough_points)
+    return PlacedView(
+        believed,
+        stripes,
         pose.dome_from_target,
-        surfaces,
+        spatial_pose(camera, believed, pose.dome_from_target),
+        place_stripes(camera, stripes, pose.dome_from_target, surfaces),
+        len(view) - len(believed),
+        pose.rms_px,
     )
 
 
@@ -208,32 +204,16 @@ def _check_surfaces(view: View, surfaces: TargetSurfaces) -> None:
         )
 
 
-def _none() -> PlacedStripes:
-    return PlacedStripes(
-        np.zeros(0, np.int64),
-        np.zeros(0, np.int64),
-        np.zeros((0, 3)),
-        np.zeros((0, 3, 2)),
-        np.zeros((0, 2)),
-    )
-
-
 def pooled(views: Sequence[PlacedView], surfaces: TargetSurfaces) -> PooledStripes:
     """Return the stripe points of all pictures joined."""
     n_surfaces = len(surfaces.planes)
     parts = [view.placed for view in views]
-    placed = PlacedStripes(
-        np.concatenate([p.index for p in parts]),
-        np.concatenate([p.surface for p in parts]),
-        np.concatenate([p.points_in_dome for p in parts]),
-        np.concatenate([p.by_pixel for p in parts]),
-        np.concatenate([p.across for p in parts]),
-    )
+    joined = [np.concatenate([getattr(p, name) for p in parts]) for name in PlacedStripes.__slots__]
     patch = [p.surface + n_surfaces * i for i, p in enumerate(parts)]
     planes: list[Plane] = []
     chain, first = [], 0
     for view in views:
-        planes += [surfaces.placed(i, view.dome_from_target) for i in range(n_surfaces)]
+        planes += surfaces.placed(view.dome_from_target)
         chain.append(view.stripes.chain[view.placed.index] + first)
         first += int(view.stripes.chain.max(initial=-1)) + 1
     in_target = np.concatenate(
@@ -244,7 +224,7 @@ def pooled(views: Sequence[PlacedView], surfaces: TargetSurfaces) -> PooledStrip
     # A flat target has bounds along its face only.
     inside = np.all((in_target >= low) & (in_target <= high) | (high <= low), axis=1)
     return PooledStripes(
-        placed,
+        PlacedStripes(*joined),
         np.concatenate(patch),
         tuple(planes),
         np.repeat(np.arange(len(views)), [len(p) for p in parts]),

@@ -176,22 +176,9 @@ def moved_target(pose: SE3, middle: FloatArray, step: FloatArray) -> SE3:
     step : array, shape (6,)
         Rotation vector (radians) and shift (metres), both in `dome`.
     """
-    return _moved(pose, middle, rotation_from_rotvec(step[:3]), step[3:])
-
-
-def moved_targets(
-    poses: Sequence[SE3], middles: Sequence[FloatArray], steps: FloatArray
-) -> list[SE3]:
-    """Return several poses, each moved by its row of the steps (N, 6), as by `moved_target`."""
-    turns = rotation_from_rotvec(steps[:, :3])
-    moves = zip(poses, middles, turns, steps[:, 3:], strict=True)
-    return [_moved(pose, middle, turn, shift) for pose, middle, turn, shift in moves]
-
-
-def _moved(pose: SE3, middle: FloatArray, turn: FloatArray, shift: FloatArray) -> SE3:
-    arm = pose.rotation @ middle
+    turn, arm = rotation_from_rotvec(step[:3]), pose.rotation @ middle
     # The middle lies at arm + translation, and stays there under the turn.
-    return SE3(turn @ pose.rotation, arm - turn @ arm + pose.translation + shift)
+    return SE3(turn @ pose.rotation, arm - turn @ arm + pose.translation + step[3:])
 
 
 def point_by_pose(points_in_dome: FloatArray, centre: FloatArray) -> FloatArray:
@@ -213,61 +200,6 @@ def point_by_pose(points_in_dome: FloatArray, centre: FloatArray) -> FloatArray:
 CORNERS = "corners"
 CORNER_SIGMA_PX = 0.1
 """Nominal noise of a corner; solves estimate the real one."""
-
-
-@dataclass(frozen=True, slots=True)
-class PosedView:
-    """A view with the pose of its target and the columns of its derivatives."""
-
-    view: View
-    dome_from_target: SE3
-    # Shape (S,): of the camera's numbers, in the order of `shared` in `corner_blocks`.
-    shared_columns: IntArray
-    # Shape (6,) or (0,): of the pose; none if it is exact.
-    pose_columns: IntArray
-
-
-def corner_blocks(camera: Camera, shared: Sequence[str], views: Sequence[PosedView]) -> list[Block]:
-    """Return one block a view, for views of one medium.
-
-    Parameters
-    ----------
-    camera : Camera
-        Looking into that medium.
-    shared : sequence of str
-        The camera's numbers that are solved for, named as by `parameter_names`.
-    """
-    if not views:
-        return []
-    counts = [len(v.view) for v in views]
-    points = np.concatenate([_in_dome(v) for v in views])
-    centres = np.repeat([v.dome_from_target.apply(v.view.middle) for v in views], counts, axis=0)
-    pixels, _, by_point, by_number = camera.project_with_parameter_jacobian(points)
-    found = np.concatenate([v.view.pixels for v in views])
-    residuals = (pixels - found) / CORNER_SIGMA_PX
-    names = parameter_names(camera)
-    jacobian = np.empty((len(points), 2, len(shared) + 6))
-    jacobian[:, :, : len(shared)] = by_number[:, :, [names.index(name) for name in shared]]
-    jacobian[:, :, len(shared) : -3] = _cross(points - centres, by_point)
-    jacobian[:, :, -3:] = by_point
-    jacobian /= CORNER_SIGMA_PX
-    ends = np.cumsum(counts)
-    return [
-        _block(v, len(shared), residuals[end - n : end], jacobian[end - n : end])
-        for v, n, end in zip(views, counts, ends, strict=True)
-    ]
-
-
-def _block(posed: PosedView, n_shared: int, residuals: FloatArray, jacobian: FloatArray) -> Block:
-    columns = np.concatenate([posed.shared_columns, posed.pose_columns])
-    if not len(posed.pose_columns):
-        jacobian = jacobian[:, :, :n_shared]
-    return Block(CORNERS, columns, residuals, jacobian)
-
-
-def _in_dome(posed: PosedView) -> FloatArray:
-    pose = posed.dome_from_target
-    return posed.view.points @ pose.rotation.T + pose.translation
 
 
 def _cross(arms: FloatArray, by_point: FloatArray) -> FloatArray:
@@ -374,31 +306,41 @@ class Bundle:
         """Return the state moved by a step (P,)."""
         media = state.media.copy()
         media[self.free_media] += step[len(self.free) : self.n_shared]
-        free = [i for i, target in enumerate(self.views) if not target.fixed]
         poses = list(state.poses)
-        moved = moved_targets(
-            [poses[i] for i in free],
-            [self.views[i].view.middle for i in free],
-            step[self.n_shared :].reshape(-1, 6),
-        )
-        for i, pose in zip(free, moved, strict=True):
-            poses[i] = pose
+        for i, target in enumerate(self.views):
+            if not target.fixed:
+                poses[i] = moved_target(poses[i], target.view.middle, step[self.pose_columns(i)])
         rig = rig_moved_by(state.rig, self.free, step[: len(self.free)])
         return BundleState(rig, media, tuple(poses))
 
     def _corner_blocks(self, state: BundleState) -> list[Block]:
+        """Return the corners' residuals; views of one medium are projected together."""
         by_view: dict[int, Block] = {}
         for medium in range(len(state.media)):
-            mine = [i for i, v in enumerate(self.views) if v.medium == medium]
-            column = self.medium_columns(medium)
-            shared = np.concatenate([np.arange(len(self.free)), column])
-            views = [
-                PosedView(self.views[i].view, state.poses[i], shared, self.pose_columns(i))
-                for i in mine
-            ]
-            names = (*self.free, *([_N_WATER] if len(column) else []))
-            blocks = corner_blocks(state.camera(medium), names, views)
-            by_view.update(zip(mine, blocks, strict=True))
+            mine = [i for i, target in enumerate(self.views) if target.medium == medium]
+            if not mine:
+                continue
+            camera, column = state.camera(medium), self.medium_columns(medium)
+            shared = (*self.free, *([_N_WATER] if len(column) else []))
+            views, poses = [self.views[i].view for i in mine], [state.poses[i] for i in mine]
+            seen = list(zip(views, poses, strict=True))
+            counts = [len(view) for view in views]
+            points = np.concatenate([v.points @ p.rotation.T + p.translation for v, p in seen])
+            centres = np.repeat([p.apply(v.middle) for v, p in seen], counts, axis=0)
+            pixels, _, by_point, by_number = camera.project_with_parameter_jacobian(points)
+            residuals = (pixels - np.concatenate([v.pixels for v in views])) / CORNER_SIGMA_PX
+            names = parameter_names(camera)
+            jacobian = np.empty((len(points), 2, len(shared) + 6))
+            jacobian[:, :, : len(shared)] = by_number[:, :, [names.index(name) for name in shared]]
+            jacobian[:, :, len(shared) : -3] = _cross(points - centres, by_point)
+            jacobian[:, :, -3:] = by_point
+            jacobian /= CORNER_SIGMA_PX
+            for i, n, end in zip(mine, counts, np.cumsum(counts), strict=True):
+                columns = [np.arange(len(self.free)), column, self.pose_columns(i)]
+                joined, rows = np.concatenate(columns), slice(end - n, end)
+                by_view[i] = Block(
+                    CORNERS, joined, residuals[rows], jacobian[rows, :, : len(joined)]
+                )
         return [by_view[i] for i in range(len(self.views))]
 
     def _known(self, state: BundleState) -> list[Block]:

@@ -41,25 +41,17 @@ _UNITS = {
 }
 
 
-def spread_of(normals: FloatArray, distances: FloatArray) -> tuple[float, float]:
-    """Return the spread of boards in direction (radians, largest) and distance (share).
-
-    Parameters
-    ----------
-    normals : array, shape (V, 3)
-        Unit normals of the boards, in any common frame.
-    distances : array, shape (V,)
-    """
-    cosines = np.clip(np.abs(normals @ normals.T), 0.0, 1.0)
-    return float(np.arccos(cosines.min())), float(np.ptp(distances) / np.median(distances))
+def largest_angle(normals: FloatArray) -> float:
+    """Return the largest angle between boards, in radians, by their unit normals (V, 3)."""
+    return float(np.arccos(np.clip(np.abs(normals @ normals.T), 0.0, 1.0).min()))
 
 
 def all_alike(normals: FloatArray, distances: FloatArray) -> bool:
     """Return whether all boards are parallel and at one distance."""
-    direction, distance = spread_of(normals, distances)
+    distance = float(np.ptp(distances) / np.median(distances))
     # Boards less than this apart in direction (radians) and in distance (share) are all alike.
     same_direction, same_distance = np.deg2rad(3.0), 0.05
-    return direction < same_direction and distance < same_distance
+    return largest_angle(normals) < same_direction and distance < same_distance
 
 
 def length_ratio(given: FloatArray, found: FloatArray) -> float:
@@ -138,7 +130,7 @@ class Observability:
         least_gain = 0.1
         return [direction for direction in self.directions if direction.gain < least_gain]
 
-    def undetermined(self, names: Sequence[str], limit: float = 0.9) -> list[str]:
+    def undetermined(self, names: Sequence[str], limit: float) -> list[str]:
         """Return those of the names that the data hardly determine."""
         return [name for name in names if self.shrinkage.get(name, 0.0) > limit]
 

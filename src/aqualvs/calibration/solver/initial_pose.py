@@ -18,7 +18,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from aqualvs.calibration.solver.bundle import moved_target, point_by_pose
+from aqualvs.calibration.solver.bundle import CORNER_SIGMA_PX, CORNERS, moved_target, point_by_pose
 from aqualvs.calibration.solver.least_squares import Block, Solution, solve
 from aqualvs.calibration.targets.targets import View
 from aqualvs.errors import CalibrationError
@@ -30,15 +30,12 @@ from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL, Rig
 
 MAX_RMS_PX = 5.0
 """Largest residual of corners of the right target."""
-_CORNERS = "corners"
 
 
 class _PoseOptions(NamedTuple):
     """Initial guess of a target's pose."""
 
     min_points: int = 4
-    # Nominal noise of a corner; counts if a view has few points.
-    sigma_px: float = 0.1
     # Extents of a target, relative to its largest, below which it is a line, flat, and nearly flat.
     line: float = 1e-3
     flat: float = 1e-6
@@ -127,10 +124,10 @@ class _PoseProblem:
         middle = state.apply(self.view.middle)
         return [
             Block(
-                _CORNERS,
+                CORNERS,
                 np.arange(6),
-                (pixels - self.view.pixels) / _POSE.sigma_px,
-                by_point @ point_by_pose(points, middle) / _POSE.sigma_px,
+                (pixels - self.view.pixels) / CORNER_SIGMA_PX,
+                by_point @ point_by_pose(points, middle) / CORNER_SIGMA_PX,
             )
         ]
 
@@ -172,7 +169,7 @@ def _best_two(
             continue
         if not any(_same(solution.state, other.state) for other in found):
             found.append(solution)
-    found.sort(key=lambda s: (-round(4.0 * _believed(s) / len(view)), s.scales[_CORNERS]))
+    found.sort(key=lambda s: (-round(4.0 * _believed(s) / len(view)), s.scales[CORNERS]))
     return (found[0] if found else None), (found[1] if len(found) > 1 else None)
 
 
@@ -185,7 +182,7 @@ def _believed(solution: Solution[SE3]) -> int:
 
 
 def _rms_px(solution: Solution[SE3]) -> float:
-    residuals = solution.blocks[0].residuals[solution.inliers[0]] * _POSE.sigma_px
+    residuals = solution.blocks[0].residuals[solution.inliers[0]] * CORNER_SIGMA_PX
     return float(np.sqrt(np.mean(np.sum(residuals**2, axis=1)))) if len(residuals) else np.inf
 
 
@@ -289,14 +286,14 @@ def _start_despite_outliers(camera: Camera, view: View, rays: Rays) -> SE3 | Non
 
 
 def _result(best: Solution[SE3], rival: Solution[SE3] | None) -> TargetPose:
-    scale = best.scales[_CORNERS]
+    scale = best.scales[CORNERS]
     freedom = 2.0 * _believed(best) - 6.0
     # Number of observations at the nominal noise that are added to a view's own residuals in the
     # noise estimate: the eight residuals of a single marker leave two degrees of freedom.
     prior_freedom = 8.0
     tempered = (freedom * scale**2 + prior_freedom) / (freedom + prior_freedom)
     rms = _rms_px(best)
-    ambiguous = rival is not None and _rms_px(rival) < _POSE.rival * rms + 0.1 * _POSE.sigma_px
+    ambiguous = rival is not None and _rms_px(rival) < _POSE.rival * rms + 0.1 * CORNER_SIGMA_PX
     return TargetPose(
         dome_from_target=best.state,
         covariance=best.covariance * (tempered / scale**2),

@@ -369,23 +369,20 @@ def solve(
     CalibrationError
         If a parameter is not determined, or nothing can be seen from the start.
     """
+    max_rounds = 20
     try:
-        return _solved(_Run(problem, start))
+        run = _Run(problem, start)
+        run.descend(_DESCENT.near)
+        for _ in range(max_rounds):
+            if not run.rescale():
+                break
+            run.descend(_DESCENT.near)
+        run.descend(_DESCENT.small_step)
+        return run.solution()
     except FreeParameterError as fault:
         if remedy is None:
             raise
         raise CalibrationError(remedy(fault.parameter)) from fault
-
-
-def _solved(run: "_Run[State]") -> Solution[State]:
-    run.descend(_DESCENT.near)
-    max_rounds = 20
-    for _ in range(max_rounds):
-        if not run.rescale():
-            break
-        run.descend(_DESCENT.near)
-    run.descend(_DESCENT.small_step)
-    return run.solution()
 
 
 def inverse(information: FloatArray) -> FloatArray:

@@ -12,7 +12,7 @@
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -256,8 +256,7 @@ class PdfPage:
     height: float
     # Shape (N, 4): x, y, width, height of black rectangles, in millimetres.
     rectangles: FloatArray
-
-    texts: tuple[Text, ...] = field(default=())
+    texts: tuple[Text, ...] = ()
 
 
 def pdf_bytes(pages: Sequence[PdfPage], title: str) -> bytes:

@@ -129,10 +129,6 @@ class Board:
                 f"markers of {_mm(self.marker)} on squares of {_mm(self.square)}; a marker is "
                 "smaller than its square"
             )
-        if dictionary_id(self.dictionary) is None:
-            raise CalibrationError(
-                f"dictionary {self.dictionary!r} is unknown; use one of {', '.join(DICTIONARIES)}"
-            )
         held = len(aruco_dictionary(self.dictionary).bytesList)
         if self.n_markers > held:
             raise CalibrationError(

@@ -18,7 +18,6 @@ import numpy as np
 from aqualvs.calibration.targets.targets import View
 from aqualvs.calibration.water_index.filter import (
     MIN_POINTS,
-    WIDE,
     FrameCorners,
     IndexModel,
     Innovation,
@@ -30,6 +29,7 @@ from aqualvs.calibration.water_index.state import (
     ANCHOR,
     FIRST_CAMERA,
     POSE,
+    WIDE,
     CusumTest,
     IndexOptions,
     IndexPrior,

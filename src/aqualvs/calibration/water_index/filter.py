@@ -71,8 +71,6 @@ class FrameCorners:
         return replace(self, ids=ids, points=self.points[keep], pixels=self.pixels[keep])
 
 
-WIDE = 0.2
-"""Standard deviation of an unknown index, or of one that has just jumped."""
 BLIND = 1e-6
 """Motion of the picture, in pixels per unit of index, below which the index is unobservable."""
 LINEAR = 1e-4
@@ -126,16 +124,15 @@ class IndexModel:
     def first(self, frame: FrameCorners, n: float) -> IndexState:
         """Return the state before a first frame, with the index searched from `n`."""
         camera = self.uncertainty.of(self.camera_names)
-        blank = first_state(frame.time, n, WIDE, self.pose_sigmas, camera)
-        return first_state(
-            frame.time, self.nearest(blank, frame), WIDE, self.pose_sigmas, camera
-        ).with_corners(frame.ids, self.sigma_corner)
+        blank = first_state(frame.time, n, self.pose_sigmas, camera)
+        state = first_state(frame.time, self.nearest(blank, frame), self.pose_sigmas, camera)
+        return state.with_corners(frame.ids, self.sigma_corner)
 
     def jumped(self, state: IndexState, frame: FrameCorners) -> IndexState:
         """Return the state after a jump of the index to the value by a frame."""
         n = self.nearest(state, frame)
         line = self.line(at_index(state, n, slopes_too=True), frame)
-        return self.settled(state, line, frame).stepped(n, WIDE)
+        return self.settled(state, line, frame).stepped(n)
 
     def settled(self, state: IndexState, line: Line, frame: FrameCorners) -> IndexState:
         """Return a state with corner errors for the picture that `line` predicts."""

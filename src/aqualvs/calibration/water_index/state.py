@@ -93,6 +93,8 @@ N, ANCHOR, BEFORE = 0, 1, 2
 N_INDICES = 3
 POSE = slice(3, 9)
 FIRST_CAMERA = 9
+WIDE = 0.2
+"""Standard deviation of an unknown index, or of one that has just jumped."""
 FAR = 0.02
 """Change of the index from which derivatives are taken anew."""
 
@@ -146,15 +148,15 @@ class IndexState:
             self, time=time, covariance=covariance, random_variance=self.random_variance + grown
         )
 
-    def stepped(self, n: float, sigma: float) -> "IndexState":
+    def stepped(self, n: float) -> "IndexState":
         """Return the state after the index has jumped to about `n`; the constants stay known."""
         mean, covariance = self.mean.copy(), self.covariance.copy()
         mean[BEFORE], mean[N] = mean[N], n
         covariance[BEFORE] = covariance[N]
         covariance[:, BEFORE] = covariance[:, N]
-        covariance[N, N] += sigma**2
+        covariance[N, N] += WIDE**2
         return replace(
-            self, mean=mean, covariance=covariance, random_variance=self.random_variance + sigma**2
+            self, mean=mean, covariance=covariance, random_variance=self.random_variance + WIDE**2
         )
 
     def with_slopes_near(self) -> "IndexState":
@@ -234,17 +236,15 @@ class IndexState:
         )
 
 
-def first_state(
-    time: float, n: float, sigma: float, pose_sigmas: FloatArray, camera: FloatArray
-) -> IndexState:
+def first_state(time: float, n: float, pose_sigmas: FloatArray, camera: FloatArray) -> IndexState:
     """Return the state before any frame.
 
     Parameters
     ----------
     time : float
         In seconds.
-    n, sigma : float
-        Initial guess of the index, and its standard deviation.
+    n : float
+        Initial guess of the index.
     pose_sigmas : array, shape (6,)
         Of the target's place: turn (radians) and shift (metres).
     camera : array, shape (C, C)
@@ -253,10 +253,10 @@ def first_state(
     size = FIRST_CAMERA + len(camera)
     mean, covariance = np.zeros(size), np.zeros((size, size))
     mean[:N_INDICES] = n
-    covariance[:N_INDICES, :N_INDICES] = sigma**2
+    covariance[:N_INDICES, :N_INDICES] = WIDE**2
     covariance[POSE, POSE] = np.diag(np.asarray(pose_sigmas) ** 2)
     covariance[FIRST_CAMERA:, FIRST_CAMERA:] = camera
-    return IndexState(time, mean, covariance, (), sigma**2, n, np.zeros((0, 2)))
+    return IndexState(time, mean, covariance, (), WIDE**2, n, np.zeros((0, 2)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -402,11 +402,6 @@ class CusumTest:
                 return began
         self._spread(standardised)
         return 0
-
-    @property
-    def quiet(self) -> bool:
-        """True while both sums are zero."""
-        return not any(self._lengths)
 
     def forget(self) -> None:
         """Reset the sums, as after a jump; keep the inflation."""
