@@ -16,17 +16,14 @@ from aqualvs.calibrate.common import (
     corner_residuals,
     corner_rows,
     counting_missed,
-    detect_targets,
+    detect_boards,
     finish,
     load_nominal,
-    named,
     picture_paths,
     summary,
 )
 from aqualvs.calibration.camera.calibrate import CameraCalibration
 from aqualvs.calibration.camera.calibrate import camera as solve_camera
-from aqualvs.calibration.detection.detection import detect_board
-from aqualvs.calibration.targets.target_files import load_board
 from aqualvs.calibration.targets.targets import Board
 from aqualvs.errors import CalibrationError
 from aqualvs.geometry.transforms import SE3
@@ -85,10 +82,7 @@ def calibrate_camera(
         If a file, a picture or its content cannot be used.
     """
     known = load_nominal(Path(nominal)) if isinstance(nominal, str | Path) else nominal or Nominal()
-    pattern = board if isinstance(board, Board) else load_board(board)
-    found = detect_targets(
-        pictures, lambda name, image: detect_board(image, pattern, name), named(board, "the board")
-    )
+    found = detect_boards(pictures, board)
     _check_size(found, known, nominal)
     with counting_missed(found):
         result = solve_camera(

@@ -19,8 +19,10 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 
 from aqualvs.calibration.camera.calibrate import CameraCalibration
+from aqualvs.calibration.detection.detection import detect_board
 from aqualvs.calibration.solver.result import DomeCalibration, ViewFit
-from aqualvs.calibration.targets.targets import View
+from aqualvs.calibration.targets.target_files import load_board
+from aqualvs.calibration.targets.targets import Board, View
 from aqualvs.calibration_formats import refuse_foreign
 from aqualvs.errors import CalibrationError, OptionError, RigError
 from aqualvs.geometry.arrays import FloatArray
@@ -389,6 +391,14 @@ def detect_targets(pictures: Pictures, detect: Detect, target: str) -> DetectedT
         )
     return DetectedTargets(
         tuple(view for _, view in found), tuple(one for one, _ in found), size_px, missed
+    )
+
+
+def detect_boards(pictures: Pictures, board: Board | str | Path) -> DetectedTargets:
+    """Find a board, or that of a file, in every picture; see `detect_targets`."""
+    pattern = board if isinstance(board, Board) else load_board(board)
+    return detect_targets(
+        pictures, lambda name, image: detect_board(image, pattern, name), named(board, "the board")
     )
 
 

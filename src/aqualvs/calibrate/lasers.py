@@ -18,6 +18,7 @@ from aqualvs.calibrate.common import (
     Pictures,
     check_same_size,
     counting_missed,
+    detect_boards,
     detect_targets,
     finish,
     medium_index,
@@ -26,7 +27,7 @@ from aqualvs.calibrate.common import (
     read_colour,
 )
 from aqualvs.calibrate.uncalibrated_stripes import UncalibratedStripeOptions, find_stripes
-from aqualvs.calibration.detection.detection import detect_board, detect_markers
+from aqualvs.calibration.detection.detection import detect_markers
 from aqualvs.calibration.lasers.calibrate import LaserOptions
 from aqualvs.calibration.lasers.calibrate import calibrate_lasers as solve_lasers
 from aqualvs.calibration.lasers.checks import LaserCalibration, LaserFigures
@@ -37,7 +38,7 @@ from aqualvs.calibration.lasers.stripes_on_planes import (
     box_surfaces,
 )
 from aqualvs.calibration.lasers.views import LaserView
-from aqualvs.calibration.targets.target_files import load_board, load_box
+from aqualvs.calibration.targets.target_files import load_box
 from aqualvs.calibration.targets.targets import Board, MarkerSet, View
 from aqualvs.errors import OptionError
 from aqualvs.geometry.arrays import FloatArray
@@ -289,11 +290,10 @@ def _target(
         )
         return _Target(name, surfaces, found, medium_index(medium, rig, default))
     assert board is not None
-    pattern = board if isinstance(board, Board) else load_board(board)
-    name = named(board, "the board")
-    found = detect_targets(pictures, lambda one, image: detect_board(image, pattern, one), name)
+    found = detect_boards(pictures, board)
     n_medium = medium_index(medium, rig, rig.n_water)
-    return _Target(name, board_surface(thickness=board_offset), found, n_medium)
+    surface = board_surface(thickness=board_offset)
+    return _Target(named(board, "the board"), surface, found, n_medium)
 
 
 def _stripes(picture: Picture, name: str, wavelength_nm: float | None) -> StripePoints:

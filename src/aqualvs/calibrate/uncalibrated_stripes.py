@@ -244,23 +244,16 @@ def _unless_blob(line: list[StripePixels]) -> list[StripePixels]:
 
 def _joined(parts: list[StripePixels]) -> StripePixels:
     """Return all parts as one, with chains numbered through."""
-    if not parts:
-        none = np.zeros(0)
-        return StripePixels(
-            np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, np.int64), none, none, none
-        )
-    chains, first = [], 0
+    none = np.zeros(0)
+    whole = [
+        StripePixels(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, np.int64), none, none, none)
+    ]
+    first = 0
     for part in parts:
-        chains.append(part.chain + first)
+        whole.append(replace(part, chain=part.chain + first))
         first += int(part.chain.max(initial=-1)) + 1
-    return StripePixels(
-        np.concatenate([part.pixels for part in parts]),
-        np.concatenate([part.across for part in parts]),
-        np.concatenate(chains),
-        np.concatenate([part.height for part in parts]),
-        np.concatenate([part.width for part in parts]),
-        np.concatenate([part.sigma_px for part in parts]),
-    )
+    names = StripePixels.__slots__
+    return StripePixels(*(np.concatenate([getattr(one, name) for one in whole]) for name in names))
 
 
 class _Window(NamedTuple):

@@ -9,15 +9,13 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from aqualvs.calibrate.common import detect_targets, picture_paths, read_grey
+from aqualvs.calibrate.common import detect_boards, picture_paths, read_grey
 from aqualvs.calibration.camera.calibrate import CameraCalibration, camera
-from aqualvs.calibration.detection.detection import detect_board
 from aqualvs.calibration.dome.calibrate import dome
 from aqualvs.calibration.dome.problem import BoardSet, DomeOptions, dome_problem
 from aqualvs.calibration.solver.bundle import rig_difference
 from aqualvs.calibration.solver.result import DomeCalibration, rms_px
 from aqualvs.calibration.targets.pose_files import BoardPose, load_poses, match_poses
-from aqualvs.calibration.targets.target_files import load_board
 from aqualvs.calibration.targets.targets import View
 from aqualvs.errors import CalibrationError
 from aqualvs.experiments.experiment import (
@@ -114,12 +112,7 @@ def board_views(folder: Path, board_file: Path, seed: int) -> tuple[View, ...]:
 
     Raises `CalibrationError` if one does not show it.
     """
-    board = load_board(board_file)
-    found = detect_targets(
-        picture_paths([folder]),
-        lambda name, picture: detect_board(picture, board, name),
-        board_file.name,
-    )
+    found = detect_boards(picture_paths([folder]), board_file)
     for name, why in found.missed.items():
         raise CalibrationError(f"{folder / name}: {why}")
     rng = np.random.default_rng(seed)
