@@ -419,18 +419,14 @@ def _fitted_candidate(
     tolerance_px: float,
 ) -> PlaneCandidate | None:
     """Fit a plane to the points of the free lines near it, and evaluate its evidence anew."""
-    worst, mine = np.zeros((1, len(lines))), np.zeros(0, np.int64)
-    for _ in range(_N_PLANE_FITS):
+    for fits_left in range(_N_PLANE_FITS, -1, -1):
         worst = table.worst_px(plane.normal[None], np.array([plane.offset]))
         mine = np.flatnonzero(free & (worst[0] <= tolerance_px))
         if not _on_two_surfaces(pooled, table.patch[mine]):
             return None
-        members = np.concatenate([lines[int(i)].members for i in mine])
-        plane = fitted_plane(pooled.placed, members, plane)
-    worst = table.worst_px(plane.normal[None], np.array([plane.offset]))
-    mine = np.flatnonzero(free & (worst[0] <= tolerance_px))
-    if not _on_two_surfaces(pooled, table.patch[mine]):
-        return None
+        if fits_left:
+            members = np.concatenate([lines[int(i)].members for i in mine])
+            plane = fitted_plane(pooled.placed, members, plane)
     nearness = np.where(free, _nearness(worst, tolerance_px), np.inf)
     alarms = _log_false_alarms(table, nearness, accidents)
     residual = float(np.sqrt(np.mean(worst[0, mine] ** 2)))
