@@ -171,8 +171,8 @@ def test_culling_changes_nothing(renderer, monkeypatch):
     scene = load_scenario("net_clutter").scene_at(1.5)
     culled = renderer.radiance(scene, 1.5)
 
-    def everywhere(camera, size_px, surfaces):
-        real = tile_members(camera, size_px, surfaces)
+    def everywhere(camera, surfaces):
+        real = tile_members(camera, surfaces)
         n, e, b = len(real.ellipsoid_start) - 1, len(surfaces.ellipsoids), len(surfaces.bubbles)
         assert len(real.bubbles) < 0.2 * n * b
         return TileMembers(

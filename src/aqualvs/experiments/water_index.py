@@ -35,6 +35,7 @@ from aqualvs.optics.solved import rig_uncertainty
 from aqualvs.report.figure_style import BLUE, GREY, OURS, PAPER, TRUTH
 from aqualvs.simulation import calibration_targets as targets
 from aqualvs.simulation.panels import PanelRenderer, RoomLight
+from aqualvs.yamlfile import write_text, yaml_text
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,7 +172,7 @@ def _plate(laboratory: Laboratory, rig: Rig) -> tuple[targets.Marked, MarkerSet]
     """Return the plate where it is meant to be, and its markers as the file says."""
     plate = targets.plate_before(rig, _SETUP.plate_far)
     path = laboratory.folder("index") / "target.yaml"
-    targets.write_yaml(path, targets.target_mapping(plate))
+    write_text(path, yaml_text(targets.target_mapping(plate)))
     return plate, load_target(path)
 
 

@@ -16,7 +16,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, TypeAlias
+from typing import Any
 
 import cv2
 import numpy as np
@@ -33,7 +33,7 @@ from aqualvs.simulation.render import Renderer, SceneAt
 from aqualvs.simulation.scenario import Scenario, packaged, parse_scenario
 from aqualvs.simulation.scenarios import example_rig
 from aqualvs.simulation.scene import Scene, SurfaceKind
-from aqualvs.simulation.truth import LitPoints, target_fit
+from aqualvs.simulation.truth import Cell, LitPoints, target_fit
 from aqualvs.simulation.video import VideoWriter
 
 CONTRAST_LIMIT = 10.0
@@ -84,12 +84,9 @@ def stripe_contrast(
     )
     bright_luma, dark_luma = (image.astype(np.float32) @ _LUMA for image in images)
     lift = bright_luma - dark_luma
-    across = [_above_flanks(lift, around, window) for window in _windows(size)]
+    windows = np.ones((1, size), np.uint8), np.ones((size, 1), np.uint8)
+    across = [_above_flanks(lift, around, window) for window in windows]
     return np.where(around, np.maximum(*across), 0.0).astype(np.float32)
-
-
-def _windows(size: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    return np.ones((1, size), np.uint8), np.ones((size, 1), np.uint8)
 
 
 def _above_flanks(
@@ -260,8 +257,6 @@ always hold the latter: the axes of a net's twine, without folds. All are empty 
 """
 
 _LABELS = {"net": SurfaceKind.NET, "wall": SurfaceKind.WALL, "none": SurfaceKind.NONE}
-
-Cell: TypeAlias = int | float | str
 
 
 def render_benchmark_dive(

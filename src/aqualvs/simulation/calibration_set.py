@@ -23,6 +23,7 @@ from aqualvs.simulation.panels import PanelRenderer, PanelScene, RoomLight, pane
 from aqualvs.simulation.scenario import Scenario, parse_scenario
 from aqualvs.simulation.textures import CharucoPrint
 from aqualvs.simulation.video import jpeg
+from aqualvs.yamlfile import write_text, yaml_text
 
 _ROOM = RoomLight(level=0.72)
 _DIM = RoomLight(level=0.32)
@@ -137,13 +138,12 @@ class _Job:
         ]
         names = self.shoot(PanelRenderer(camera, eye=self.camera), scenes, folder, rng)
         _write_poses(self.folder("truth") / f"{folder.name}_poses.csv", names, poses)
-        targets.write_yaml(folder / "board.yaml", targets.board_mapping(board))
+        write_text(folder / "board.yaml", yaml_text(targets.board_mapping(board)))
         return names, folder / "board.yaml"
 
     def with_lasers(self, rig: Rig) -> PanelRenderer:
         """Return the renderer of panels for a rig with all lasers on."""
-        laser_power = 8.0
-        sheets = panel_sheets(rig, power=laser_power, filters=self.camera.filters)
+        sheets = panel_sheets(rig, filters=self.camera.filters)
         return PanelRenderer(rig.camera(), sheets, eye=self.camera)
 
 
@@ -219,7 +219,7 @@ def _check(rig: Rig, size: SetSize) -> None:
 def _simulate(job: _Job) -> CalibrationFiles:
     # First, so that a set that is interrupted has them.
     nominal, rig = job.out / "nominal.yaml", job.folder("truth") / "rig.yaml"
-    targets.write_yaml(nominal, _nominal_mapping(job.rig))
+    write_text(nominal, yaml_text(_nominal_mapping(job.rig)))
     save_rig(with_exact_numbers(job.rig), rig)
     camera, board = _camera_air(job)
     dome, rail_board, poses = (_dome_air if job.rig.flat_port is None else _port_water)(job)
@@ -302,7 +302,7 @@ def _box(job: _Job) -> tuple[Path, Path]:
         scenes.append(PanelScene(panels=[*inside, behind], light=_DIM))
     names = job.shoot(job.with_lasers(rig), scenes, folder, rng)
     _write_poses(job.folder("truth") / "box_poses.csv", names, poses)
-    targets.write_yaml(folder / "box.yaml", targets.box_mapping(walls, rig.n_water))
+    write_text(folder / "box.yaml", yaml_text(targets.box_mapping(walls, rig.n_water)))
     return folder, folder / "box.yaml"
 
 
@@ -312,7 +312,7 @@ def _index(job: _Job) -> tuple[Path, Path]:
     scenes = [targets.plate_scene(plate, i, _WATER) for i in range(job.size.index)]
     job.shoot(job.with_lasers(rig), scenes, folder, rng, "frame_{:03d}")
     target = folder.parent / "target.yaml"
-    targets.write_yaml(target, targets.target_mapping(plate))
+    write_text(target, yaml_text(targets.target_mapping(plate)))
     return folder, target
 
 

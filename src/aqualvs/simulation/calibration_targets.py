@@ -5,7 +5,6 @@ a box of markers, and of a plate in the view.
 """
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,7 +24,6 @@ from aqualvs.simulation.textures import (
     marker_texture,
     mottled,
 )
-from aqualvs.yamlfile import write_text, yaml_text
 
 Size = tuple[float, float]
 
@@ -360,11 +358,6 @@ def _marker_mappings(marked: Marked, more: dict[str, str]) -> list[dict[str, Any
         }
         for number, corners in zip(marked.prints.ids, marked.corners(), strict=True)
     ]
-
-
-def write_yaml(path: Path, content: dict[str, Any]) -> None:
-    """Write a mapping, lists of numbers on one line each."""
-    write_text(path, yaml_text(content))
 
 
 def to_mm(metres: float) -> float:

@@ -129,13 +129,13 @@ class TileMembers(NamedTuple):
     bubble_start: IntArray  # As `ellipsoid_start`.
 
 
-def tile_members(camera: Camera, size_px: tuple[int, int], surfaces: Surfaces) -> TileMembers:
+def tile_members(camera: Camera, surfaces: Surfaces) -> TileMembers:
     """Return for every tile the ellipsoids and bubbles whose outline can reach it.
 
     A body that can be projected in part only (near the dome, or at the edge of the lens model) is
     listed everywhere: slower, but never wrong.
     """
-    columns, rows = (-(-side // TILE) for side in size_px)
+    columns, rows = (-(-side // TILE) for side in camera.size_px)
     e, b = surfaces.ellipsoids, surfaces.bubbles
     reach = [1.0 / np.linalg.norm(row[3:12].reshape(3, 3), axis=1).min() for row in e]
     ellipsoids = _lists(camera, e[:, :3], np.array(reach), columns, rows)
@@ -354,7 +354,7 @@ class Renderer:
         rays: CornerRays,
     ) -> None:
         """Write the light of some rows, from the first to before the last, into a picture."""
-        members = tile_members(self.rig.camera(), self.rig.size_px, surfaces)
+        members = tile_members(self.rig.camera(), surfaces)
         light = pack_light(self.camera.light(scene), t)
 
         def render_band(band: tuple[int, int]) -> None:

@@ -1,6 +1,7 @@
 """Video files, as an ROV's recorder would write them or without any loss."""
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -94,14 +95,12 @@ class VideoWriter(Closing):
         _check(size_px, fps, self._recording.codec, first_field)
         self._path, self._n_frames, self._first_field = path, 0, first_field
         codec = _CODECS.get(self._recording.codec) or _lossy_codec()
-        try:
+        with _writing_video(path, ValueError):
             self._container = av.open(str(path), "w")
             self._stream = _add_stream(self._container, codec, fps)
             self._stream.width, self._stream.height = size_px
             self._set_quality(codec)
             self._container.start_encoding()
-        except (OSError, ValueError, av.error.FFmpegError) as error:
-            raise OutputError(f"{path}: cannot write video ({error}); {_REMEDY}") from None
 
     def _set_quality(self, codec: str) -> None:
         stream, recording = self._stream, self._recording
@@ -136,7 +135,9 @@ class VideoWriter(Closing):
         Raises `OutputError` if it cannot be written.
         """
         if self._recording.codec == "mjpeg":
-            self._mux([self._jpeg_packet(image)])
+            packet = self._jpeg_packet(image)
+            with _writing_video(self._path):
+                self._container.mux(packet)
         else:
             self._encode(self._picture(np.ascontiguousarray(image)))
         self._n_frames += 1
@@ -173,21 +174,21 @@ class VideoWriter(Closing):
         return packet
 
     def _encode(self, frame: av.VideoFrame | None) -> None:
-        try:
-            packets = self._stream.encode(frame)
-        except (OSError, av.error.FFmpegError) as error:
-            raise OutputError(f"{self._path}: cannot write video ({error}); {_REMEDY}") from None
-        self._mux(packets)
-
-    def _mux(self, packets: "Sequence[av.Packet[Any]]") -> None:
-        try:
-            for packet in packets:
-                self._container.mux(packet)
-        except (OSError, av.error.FFmpegError) as error:
-            raise OutputError(f"{self._path}: cannot write video ({error}); {_REMEDY}") from None
+        with _writing_video(self._path):
+            self._container.mux(self._stream.encode(frame))
 
 
-_REMEDY = "choose a folder that can be written, with space left"
+@contextlib.contextmanager
+def _writing_video(path: Path, *more: type[Exception]) -> Iterator[None]:
+    """Turn faults of the encoder and the disk, and `more`, into an `OutputError`."""
+    faults: tuple[type[Exception], ...] = (OSError, av.error.FFmpegError, *more)
+    try:
+        yield
+    except faults as error:
+        raise OutputError(
+            f"{path}: cannot write video ({error}); choose a folder that can be written, with "
+            "space left"
+        ) from None
 
 
 def _add_stream(container: OutputContainer, codec: str, fps: float) -> VideoStream:
