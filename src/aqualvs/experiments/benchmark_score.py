@@ -271,9 +271,9 @@ def lines(scores: Scores, *, dives: bool) -> list[str]:
     return [*text, *(_bar_line(bar) for bar in scores.bars)]
 
 
-def markdown(scores: Scores, *, dives: bool) -> str:
-    """Return the same table in Markdown."""
-    rows = [_HEADER, tuple("---" for _ in _HEADER), *_rows(scores, dives=dives)]
+def markdown(scores: Scores) -> str:
+    """Return the same table in Markdown, with every dive."""
+    rows = [_HEADER, tuple("---" for _ in _HEADER), *_rows(scores, dives=True)]
     table = "\n".join(f"| {' | '.join(row)} |" for row in rows)
     bars = "".join(f"- {_bar_line(bar)}\n" for bar in scores.bars)
     return f"{scores.title}\n\n{table}\n\n{bars}"
@@ -298,7 +298,7 @@ def write_scores(scores: Scores, folder: Path) -> list[Path]:
     bars = [without_nan(asdict(bar)) for bar in scores.bars]
     content = {"set": scores.title, "scores": records, "error_bars_against_clear": bars}
     data.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-    text.write_text(markdown(scores, dives=True), encoding="utf-8")
+    text.write_text(markdown(scores), encoding="utf-8")
     return [table, data, text]
 
 
@@ -384,14 +384,8 @@ def run_own(
     """
     for system in OWN_SYSTEMS:
         for dive in benchmark.dives:
-            run(
-                _request(
-                    system,
-                    benchmark.folder / dive.name,
-                    folder / system.name / dive.name,
-                    overwrite,
-                )
-            )
+            out = folder / system.name / dive.name
+            run(_request(system, benchmark.folder / dive.name, out, overwrite))
         dives = count_text(len(benchmark.dives), "dive")
         echo(f"{system.name}: {dives} measured into {folder / system.name}")
     bare = folder / BARE_LENS
@@ -444,8 +438,7 @@ def run_score(
     benchmark = load_set(truth)
     files = [] if out is None else [out / name for name in SCORE_FILES]
     with Claim("score", files, overwrite=overwrite):
-        arguments = list(results)
-        systems = [read_system(argument, benchmark) for argument in arguments]
+        systems = [read_system(argument, benchmark) for argument in results]
         if own is not None:
             mine = run_own(benchmark, own, echo, overwrite=overwrite)
             systems += [read_system(argument, benchmark) for argument in mine]

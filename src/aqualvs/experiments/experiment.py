@@ -5,7 +5,7 @@ style. The catalogue has the paper's order; each experiment is imported when it 
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib import import_module
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Literal, Self, TypeAlias
@@ -80,7 +80,7 @@ class ExperimentResult:
     pictures: tuple[ExperimentFigure, ...] = ()
     series: tuple[DataColumns, ...] = ()
     # What a reader must know to judge it: where it differs from the paper's setting, and why.
-    notes: tuple[str, ...] = field(default=())
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

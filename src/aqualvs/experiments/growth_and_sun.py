@@ -33,8 +33,6 @@ from aqualvs.simulation.scenario import Scenario, parse_scenario
 from aqualvs.sources.base import bgr_of
 
 _FILE = "visible.csv"
-ENOUGH = VISIBLE_LIMIT
-"""Visible stripe points from which on a posture can be asked for."""
 
 
 def visible_points(laboratory: Laboratory, dive: RenderedDive) -> FloatArray:
@@ -103,7 +101,7 @@ class MeasuredScene:
     @property
     def asked(self) -> BoolArray:
         """Frames in which stripe enough can be seen, shape (N,)."""
-        return np.asarray(self.visible >= ENOUGH)
+        return np.asarray(self.visible >= VISIBLE_LIMIT)
 
     def valid_percent(self, measured: MeasuredDive) -> float:
         """Return the share of those frames that have a posture."""
@@ -159,8 +157,8 @@ def _run(laboratory: Laboratory) -> ExperimentResult:
         ),
         series=tuple(_series(name, one) for name, one in seen.items()),
         notes=(
-            f"Counted are frames in which {ENOUGH} stripe points or more of the net stand out by "
-            f"{CONTRAST_LIMIT:g} grey levels in the picture before noise and coding.",
+            f"Counted are frames in which {VISIBLE_LIMIT} stripe points or more of the net stand "
+            f"out by {CONTRAST_LIMIT:g} grey levels in the picture before noise and coding.",
             "Errors count against the plane through the lit points: growth stands out of the "
             "net, and the lasers measure to it.",
         ),

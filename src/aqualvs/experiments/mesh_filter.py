@@ -283,7 +283,8 @@ def _run(laboratory: Laboratory) -> ExperimentResult:
     adaptive = adaptive_pixels(measured.scans, dive.rig)
     mine = mean_judged([judge(measured.scans[i].points, lit) for i, lit in truth])
     whole = mean_judged([judge_reflections(adaptive[i], lit) for i, lit in truth])
-    theirs = mean_judged([_judge_each(papers[i], lit) for i, lit in truth])
+    kept = [(papers[i], papers[i].on_mesh, lit) for i, lit in truth]
+    theirs = mean_judged([judge_pixels(p.pixels[on], p.laser[on], lit) for p, on, lit in kept])
     their_whole = mean_judged([judge_reflections(papers[i], lit) for i, lit in truth])
     shown = 8
     return ExperimentResult(
@@ -301,10 +302,6 @@ def _run(laboratory: Laboratory) -> ExperimentResult:
             "why so little of a diamond net passes.",
         ),
     )
-
-
-def _judge_each(found: FilteredPeaks, lit: LitTruth) -> Judged:
-    return judge_pixels(found.pixels[found.on_mesh], found.laser[found.on_mesh], lit)
 
 
 def _findings(
