@@ -424,7 +424,7 @@ def _water_part(difference: RigDifference) -> ComparedPart:
 
 
 def _laser_part(new_rig: Rig, new: Laser, old: Laser, difference: RigDifference) -> ComparedPart:
-    names = _names(old)
+    names = laser_parameter_names(old)[:3]
     angle, shift, _ = _laser_move(new_rig, new, old, difference)
     did = f"moved by {math.degrees(angle):.2g} deg, {abs(shift) * 1e3:.2g} mm at 0.6 m"
     matters = angle > _TILT or abs(shift) > _SHIFT_M
@@ -457,7 +457,7 @@ def _laser_move(
 
     The stripe is that on a wall `_WALL_M` ahead; NaN where the camera does not see it.
     """
-    names = _names(old)
+    names = laser_parameter_names(old)[:3]
     angle = math.atan(math.hypot(*(difference.of(name) for name in names[:2])))
     points = WallView.ahead(replace(rig, lasers=(new,)), _WALL_M).stripes[0].points_in_dome
     if not len(points):
@@ -468,10 +468,6 @@ def _laser_move(
     rows = [difference.names.index(name) for name in names]
     variance = float(slope @ difference.covariance[np.ix_(rows, rows)] @ slope)
     return angle, shift, math.sqrt(max(variance, 0.0))
-
-
-def _names(laser: Laser) -> tuple[str, ...]:
-    return tuple(f"{laser.name}:{name}" for name in LASER_PARAMETERS)
 
 
 def _shared_lasers(new: Rig, old: Rig) -> list[tuple[Laser, Laser]]:
@@ -508,10 +504,6 @@ def _mismatches(new: Rig, old: Rig) -> Iterator[str]:
     ):
         if (ours is None) != (theirs is None):
             yield f"Only the {'old' if ours is None else 'new'} rig has a {what}."
-    yield from _laser_mismatches(new, old)
-
-
-def _laser_mismatches(new: Rig, old: Rig) -> Iterator[str]:
     shared = {laser.name for _, laser in _shared_lasers(new, old)}
     for what, rig in (("new", new), ("gone", old)):
         for laser in rig.lasers:
@@ -585,7 +577,7 @@ def _laser_rows(rig: Rig, new: Laser, old: Laser, difference: RigDifference) -> 
 
 def _tilt_sigma(laser: Laser, difference: RigDifference) -> float:
     """Return the sigma of a laser's rotation in the direction in which it has turned."""
-    rows = [difference.names.index(name) for name in _names(laser)[:2]]
+    rows = [difference.names.index(name) for name in laser_parameter_names(laser)[:2]]
     tilt = difference.change[rows]
     length = float(np.linalg.norm(tilt))
     if length == 0.0:
