@@ -45,16 +45,13 @@ class StopSignals(Closing):
 
     def close(self) -> None:
         """Put the previous handlers back."""
-        self._restore()
-
-    def _note(self, number: int, _frame: FrameType | None) -> None:
-        self.caught = signal.Signals(number)
-        self._restore()
-
-    def _restore(self) -> None:
         for number, handler in self._previous.items():
             signal.signal(number, handler)
         self._previous = {}
+
+    def _note(self, number: int, _frame: FrameType | None) -> None:
+        self.caught = signal.Signals(number)
+        self.close()
 
 
 Tick: TypeAlias = Callable[[int], None]
