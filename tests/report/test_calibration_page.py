@@ -203,7 +203,7 @@ def test_parts_that_are_empty_leave_no_heading() -> None:
         ("residual_maps", "Residuals"),
         ("views", "Views"),
         ("parameters", "Parameters"),
-        ("expectations", "What it means on a target"),
+        ("expectations", "Accuracy on a target"),
         ("lasers", "Lasers"),
         ("series", "Charts"),
         ("pictures", "Pictures"),

@@ -452,7 +452,7 @@ def test_warnings_say_what_is_wrong(tmp_path: Path) -> None:
         "No posture for 3.5 s from 6.0 s on: only one laser on the target.",
         "outside the rig's working range of 300–650 mm",
         "Laser “third” gave only 0.0 % of the target points.",
-        "The water's index moved by 0.0050",
+        "The water's index changed by 0.0050",
         "The disk was <i>slow</i>.",
     ):
         assert words in text

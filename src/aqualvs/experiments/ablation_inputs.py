@@ -46,8 +46,8 @@ def _run_video(laboratory: Laboratory) -> ExperimentResult:
     at_last = f"it is {last.rms[0]:.3f} %" if last.valid_percent else "no frame has a posture"
     return compared(
         "ablation_video",
-        "Root mean square errors on a clear net from the same pictures, uncompressed and coded "
-        "ever more coarsely.",
+        "Root mean square errors on a clear net from the same pictures, uncompressed and at four "
+        "qualities of H.264.",
         variants,
         sentence=f"Against uncompressed pictures H.264 of good quality changes the range error "
         f"from {variants[0].rms[0]:.3f} to {first.rms[0]:.3f} %; at {last.name} {at_last}.",
@@ -98,11 +98,11 @@ def _run_sheets(laboratory: Laboratory) -> ExperimentResult:
     off = _off_plane_mm(bent)
     return compared(
         "ablation_sheets",
-        "Root mean square errors before a wall with lasers behind tilted windows.",
+        "Root mean square errors on a wall with lasers behind tilted windows.",
         variants,
-        sentence=f"Behind windows tilted by 12 to 25 degrees the light leaves its best plane by up "
-        f"to {max(off):.1f} mm; taking it for planes costs {variants[1].rms[0]:.2f} % of the "
-        f"range instead of {variants[0].rms[0]:.3f} %.",
+        sentence=f"Behind windows tilted by 12 to 25 degrees the light deviates from its best "
+        f"plane by up to {max(off):.1f} mm; with planes the range error is "
+        f"{variants[1].rms[0]:.2f} % instead of {variants[0].rms[0]:.3f} %.",
         more_findings=[
             ExperimentRow(
                 what=f"laser behind a window tilted by {tilt:g} degrees: farthest from its best "
@@ -111,7 +111,7 @@ def _run_sheets(laboratory: Laboratory) -> ExperimentResult:
             )
             for tilt, mm in zip(_TILTS_DEG, off, strict=True)
         ],
-        notes=("The planes are the best that any calibration could find for such sheets.",),
+        notes=("The planes are the best that a calibration could find for such sheets.",),
     )
 
 
@@ -161,7 +161,7 @@ def _off_plane_mm(rig: Rig) -> list[float]:
 SHEETS = Experiment(
     name="sheets",
     title="Why refracted laser sheets",
-    about="The rig with each laser behind a flat window that is tilted against its beam; the wall "
+    about="Each laser of the rig is behind a flat window tilted relative to its beam; the wall is "
     "measured with the refracted-sheet model and with the planes of the paper's Eq. 19.",
     run=_run_sheets,
 )
@@ -189,15 +189,15 @@ def _run_beliefs(laboratory: Laboratory) -> ExperimentResult:
     per_index = _slope(_INDEX_STEPS, index) * _WATERS
     per_mm = np.array([_slope(_LENS_STEPS_MM, row) for row in lens])
     return ExperimentResult(
-        sentence=f"Sea water taken for fresh costs {per_index:.2f} % of the range through this "
-        f"dome; a lens believed 1 mm from its place costs up to {per_mm.max():.1f} %.",
+        sentence=f"With sea water assumed to be fresh the range error through this dome is "
+        f"{per_index:.2f} %; with the lens assumed 1 mm off it is up to {per_mm.max():.1f} %.",
         findings=(
             ExperimentRow(
                 what=f"range error for an index wrong by {_WATERS} (%)", ours=f"{per_index:.2f}"
             ),
             *(
                 ExperimentRow(
-                    what=f"range error for each mm that the lens is believed too far {name} (%)",
+                    what=f"range error for each mm that the lens is assumed too far {name} (%)",
                     ours=f"{cost:.2f}",
                 )
                 for name, cost in zip(_AXES, per_mm, strict=True)
@@ -206,9 +206,9 @@ def _run_beliefs(laboratory: Laboratory) -> ExperimentResult:
         pictures=(
             drawn(
                 "ablation_beliefs",
-                "Largest range error before the wall at the paper's four distances when "
-                "the scanner believes another index of the water (left) or another place of the "
-                "lens in the dome (right).",
+                "Largest range error before the wall at the paper's four distances if the scanner "
+                "assumes another index of the water (left) or another position of the lens in the "
+                "dome (right).",
                 2.7,
                 lambda figure: _draw_beliefs(figure, index, lens),
             ),
@@ -230,9 +230,9 @@ def _run_beliefs(laboratory: Laboratory) -> ExperimentResult:
             ),
         ),
         notes=(
-            "The laser planes stay those of the true rig. Lasers that were calibrated with the "
-            "wrong belief would take up a part of the error near the places of calibration.",
-            "Where a point is missing, the lasers' points no longer shared a plane: the posture "
+            "The laser planes are those of the true rig. Lasers calibrated with the wrong "
+            "assumption would absorb a part of the error near the ranges of calibration.",
+            "Where a point is missing, the lasers' points shared no plane, and the posture "
             "was refused.",
         ),
     )
@@ -260,11 +260,11 @@ def _slope(steps: Sequence[float], percent: FloatArray) -> float:
 def _draw_beliefs(figure: Figure, index: FloatArray, lens: FloatArray) -> None:
     left, right = figure.subplots(1, 2)
     left.plot(_INDEX_STEPS, index, ".-", color=BLUE)
-    left.set_xlabel("error of the index believed")
+    left.set_xlabel("error of the assumed index")
     left.set_ylabel("error of the range (%)")
     for row, name, colour in zip(lens, _AXES, _COLOURS, strict=True):
         right.plot(_LENS_STEPS_MM, row, ".-", color=colour, label=name)
-    right.set_xlabel("error of the lens's place believed (mm)")
+    right.set_xlabel("error of the assumed lens position (mm)")
     right.legend(loc="best")
     for axes in (left, right):
         axes.axhline(0.0, color=GREY, linewidth=0.7)
@@ -272,8 +272,8 @@ def _draw_beliefs(figure: Figure, index: FloatArray, lens: FloatArray) -> None:
 
 BELIEFS = Experiment(
     name="beliefs",
-    title="What wrong beliefs cost",
-    about="The wall at the paper's four distances, measured with the true rig but for one "
-    "parameter: the index of the water, or the place of the lens in the dome.",
+    title="What wrong assumptions cost",
+    about="The wall at the paper's four distances, measured with the true rig except for one "
+    "parameter: the index of the water, or the position of the lens in the dome.",
     run=_run_beliefs,
 )

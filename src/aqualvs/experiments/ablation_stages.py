@@ -55,10 +55,9 @@ def _run_stripes(laboratory: Laboratory) -> ExperimentResult:
         variants,
         sentence=_sentence(variants, list(dives)),
         notes=(
-            "Everything behind the detector is the same: filter, target and robust fit. Where a "
-            "threshold suits a scene it is as exact as the sub-pixel detector: a stripe has many "
-            "points, and their half pixels cancel. What it lacks is a level that suits every "
-            "scene.",
+            "Everything after the detector is the same: filter, target and robust fit. If its "
+            "level suits a scene, a threshold is as accurate as the sub-pixel detector: a stripe "
+            "has many points, and their rounding errors cancel. But no level suits every scene.",
         ),
     )
 
@@ -79,7 +78,7 @@ def _sentence(variants: list[Variant], places: list[str]) -> str:
         if what != "sub-pixel"
     )
     return (
-        f"In the scene that suits it least ({', '.join(places)}) the sub-pixel detector has a "
+        f"In its worst scene ({', '.join(places)}) the sub-pixel detector has a "
         f"range error of {ours}; {others}."
     )
 
@@ -130,8 +129,8 @@ def _run_fits(laboratory: Laboratory) -> ExperimentResult:
         sentence="Fitted by the paper's pseudo-inverse to the same target points, the range error "
         f"is {told(times)} times that of the robust fit on {', '.join(dives)}.",
         notes=(
-            "The points are those that our own search has assigned to the target; it has removed "
-            "what the pseudo-inverse would suffer from most.",
+            "The points are those that our own search has assigned to the target; it has already "
+            "removed most of the outliers that affect the pseudo-inverse.",
         ),
     )
 
@@ -140,7 +139,7 @@ FITS = Experiment(
     name="fits",
     title="Why a robust fit",
     about="The points of the target in three dives, fitted robustly with their covariances, and "
-    "all alike by pseudo-inverse.",
+    "with equal weights by pseudo-inverse.",
     run=_run_fits,
 )
 
@@ -192,7 +191,7 @@ _GRID = tuple(_Set(level, lengths) for level in _FILTERS_LEVELS for lengths in _
 _KINDS = {
     "section 5.2": tuple(_Set(level, (10.0, 1.0, 15.0, 35.0)) for level in _FILTERS_LEVELS),
     "best of the grid": _GRID,
-    "best of the grid, one centre a return": tuple(_Set(None, one) for one in _LENGTHS_MM),
+    "best of the grid, one centre per peak": tuple(_Set(None, one) for one in _LENGTHS_MM),
 }
 
 
@@ -227,10 +226,10 @@ def _run_filters(laboratory: Laboratory) -> ExperimentResult:
     ours = [mean_judged(one.adaptive).recall for one in seen]
     named, best, centres = (max(row.paper[kind][1].recall for row in rows) for kind in _KINDS)
     return ExperimentResult(
-        sentence=f"The adaptive filter keeps {100 * min(ours):.0f} % of a net's reflections or "
-        "more without a parameter. The paper's, given every bright pixel, keeps "
+        sentence=f"The adaptive filter keeps at least {100 * min(ours):.0f} % of a net's "
+        "reflections without a parameter. The paper's, given every bright pixel, keeps "
         f"{100 * named:.0f} % at best with section 5.2's parameters, and {100 * best:.0f} % with "
-        f"the best of {len(_GRID)} sets for that net and range; given one centre a return "
+        f"the best of {len(_GRID)} sets for that net and range; given one centre per peak "
         f"{100 * centres:.0f} %.",
         findings=tuple(finding for row in rows for finding in row.findings()),
         pictures=(
@@ -246,8 +245,8 @@ def _run_filters(laboratory: Laboratory) -> ExperimentResult:
             "Reflections are groups of connected bright pixels of one laser. Each net and range "
             "has its own best set, of those whose precision is "
             f"{_MIN_PRECISION:g} or more: level of the threshold, rd_theta/dd/r_min/r_max. The "
-            "level of section 5.2's row is the best of the same three. One centre a return is "
-            "what the sub-pixel detector finds on each search line, and not the paper's way.",
+            "level of section 5.2's row is the best of the same three. One centre per peak is the "
+            "output of the sub-pixel detector on each search line, and not the paper's method.",
         ),
     )
 
@@ -338,7 +337,7 @@ FILTERS = Experiment(
     name="filters",
     title="Why an adaptive mesh filter",
     about="Two nets at three ranges, and the net of the mesh experiment; a threshold and the "
-    "paper's filter on every bright pixel, with its own and with other parameters, against the "
-    "adaptive filter.",
+    "paper's filter on every bright pixel, with its own and with other parameters, compared "
+    "with the adaptive filter.",
     run=_run_filters,
 )

@@ -87,8 +87,8 @@ class Score:
     # Frames without any visible point, and those of them that were answered all the same.
     n_empty: int
     n_false: int
-    # Rms of error over claimed sigma in measurable frames: 1 is honest, more is too sure; NaN where
-    # no sigma is claimed.
+    # Rms of error over claimed sigma in measurable frames: 1 is consistent, more is
+    # overconfident; NaN where no sigma is claimed.
     z_range: float
     z_pitch: float
     z_yaw: float

@@ -150,8 +150,8 @@ def _run(laboratory: Laboratory) -> ExperimentResult:
     turned = float(np.linalg.norm([solved.errors[name] for name in _TURN]))
     return ExperimentResult(
         sentence=f"From {len(after)} boards in air the lens is found to {1e3 * off:.2f} mm and "
-        f"the camera's rotation to {np.rad2deg(turned):.3f}°; corners are then "
-        f"{solved.dome.rms_px:.2f} px from where they should be, {before_px:.1f} px before.",
+        f"the camera's rotation to {np.rad2deg(turned):.3f}°; the residual of "
+        f"corners is then {solved.dome.rms_px:.2f} px, {before_px:.1f} px before.",
         findings=_findings(solved, before_px),
         pictures=(
             drawn("figure_3_4", _BOARDS_CAPTION, 2.9, lambda f: _draw_boards(f, solved)),
@@ -162,13 +162,13 @@ def _run(laboratory: Laboratory) -> ExperimentResult:
             "The pictures are rendered through the dome, in air, with defocus and sensor noise, "
             "and the corners are found in them. As in the paper only the distance of a board from "
             "the dome's centre is given, here with 0.2 mm of error on each reading and 0.2 mm on "
-            "all; every second board stands up to 1.5° askew, of which the solver knows nothing.",
-            "The paper prints one set of parameters (Table 1) and neither an uncertainty nor a "
-            "residual. Radius, thickness and index of the dome are given, as there: pictures "
-            "cannot tell them apart.",
-            "The paper turns the camera and, by a second set of angles, its image plane; these "
-            "two are one rotation for the pictures, which we state as one, with focal lengths "
-            "and centre of the image plane instead of the second.",
+            "all; every second board is tilted by up to 1.5°, which the solver does not know.",
+            "The paper gives one set of parameters (Table 1) without uncertainties or residuals. "
+            "As in the paper, radius, thickness and index of the dome are known in advance: "
+            "pictures do not determine them separately.",
+            "The paper turns the camera and, by a second set of angles, its image plane; these two "
+            "are equivalent to a single rotation, which is given here, with focal lengths and "
+            "centre of the image plane instead of the second.",
         ),
     )
 
@@ -249,13 +249,13 @@ def _series(
 
 
 _BOARDS_CAPTION = (
-    "Beside figures 3 and 4: the boards before the dome, seen from the right as far as they are in "
-    "view, and one through the dome, with the corners that were found and where the solved rig "
-    "puts them."
+    "Compare figures 3 and 4: the visible parts of the boards in front of the dome, seen from the "
+    "right, and one board through the dome, with the detected corners and those predicted by the "
+    "solved rig."
 )
 _RESIDUALS_CAPTION = (
     "Corners of all boards, measured minus predicted: with the lens at the dome's centre, and as "
-    "solved. Mind the two scales."
+    "solved. The scales differ."
 )
 
 
@@ -285,7 +285,7 @@ def _draw_side(axes: Axes, solved: SolvedDome) -> None:
         "lens", (lens[1], lens[2]), (110, -230), arrowprops={"arrowstyle": "-", "color": ORANGE}
     )
     axes.set(aspect="equal", xlabel="y, forward of the dome's centre (mm)", ylabel="z, up (mm)")
-    axes.set_title("boards carried away from the dome")
+    axes.set_title("boards moved away from the dome")
 
 
 def _draw_picture(axes: Axes, solved: SolvedDome) -> None:

@@ -109,29 +109,29 @@ def _run(laboratory: Laboratory) -> ExperimentResult:
         pictures=(
             drawn(
                 "figure_19",
-                "Distance with and without the dome model from the leftmost point and "
-                "from the average of three, with straight lines through them, beside figure 19.",
+                "Distance with and without the dome model from the leftmost point and from the "
+                "average of three, with straight lines fitted to them; compare figure 19.",
                 3.1,
                 lambda figure: _draw_distances(figure, found),
             ),
             drawn(
                 "figure_20",
-                "Errors of the lines of figure 19 (lines) and of the single distances "
-                "(dots), beside figure 20; below at a finer scale those with the dome model and "
-                "those of a laser that was calibrated without it.",
+                "Errors of the lines of figure 19 (lines) and of the single distances (dots); "
+                "below, at a finer scale, errors with the dome model and errors of a laser "
+                "calibrated without it; compare figure 20.",
                 4.2,
                 lambda figure: _draw_errors(figure, found),
             ),
         ),
         series=(_series(found),),
         notes=(
-            "Without the dome model means what `aqualvs run --no-dome` does: the same lens in the "
-            "same place, the same laser planes, and rays that go straight.",
-            "A laser that was itself calibrated with straight rays, before walls at known "
-            "distances up to 650 mm, takes up most of what the model explains: errors of "
+            "Without the dome model means as with `aqualvs run --no-dome`: the same lens in the "
+            "same position, the same laser planes, and straight rays.",
+            "A laser that was itself calibrated with straight rays, on walls at known distances "
+            "up to 650 mm, absorbs most of what the model explains: errors of "
             f"{min(refitted):.1f} to {max(refitted):.1f} % remain, {min(gains):.0f} to "
-            f"{max(gains):.0f} times those with the model. How the paper calibrated its lasers "
-            "without the model it does not say; its figure lies between the two.",
+            f"{max(gains):.0f} times those with the model. The paper does not state how it "
+            "calibrated its lasers without the model; its figure lies between the two.",
             "Beyond the rig's working range no posture is given; single points still are.",
         ),
     )
@@ -282,6 +282,6 @@ EXPERIMENT = Experiment(
     title="With and without the dome model",
     paper="section 5.4, figures 19 and 20",
     about="A wall moves from 300 to 1250 mm and back. Three points of the level laser's stripe "
-    "give its distance, through the dome model and as if the rays went straight.",
+    "give its distance, with the dome model and with straight rays.",
     run=_run,
 )

@@ -149,8 +149,8 @@ def _run(laboratory: Laboratory) -> ExperimentResult:
         pictures=(
             drawn(
                 "figure_24",
-                "A frame of each scene and the errors of every frame, with two stated "
-                "standard deviations, beside figure 24.",
+                "A frame of each scene and the errors of every frame, with two stated standard "
+                "deviations; compare figure 24.",
                 5.6,
                 lambda figure: _draw(figure, seen),
             ),
@@ -159,7 +159,7 @@ def _run(laboratory: Laboratory) -> ExperimentResult:
         notes=(
             f"Counted are frames in which {VISIBLE_LIMIT} stripe points or more of the net stand "
             f"out by {CONTRAST_LIMIT:g} grey levels in the picture before noise and coding.",
-            "Errors count against the plane through the lit points: growth stands out of the "
+            "Errors are relative to the plane through the lit points: growth stands out from the "
             "net, and the lasers measure to it.",
         ),
     )
@@ -243,7 +243,8 @@ EXPERIMENT = Experiment(
     name="failures",
     title="Growth and sunlight",
     paper="section 5.5, figure 24",
-    about="The same way along a clear net, a net with growth on most of it in turbid water, and a "
-    "net close below the surface in the sun: the two cases in which the paper's system failed.",
+    about="The same course along a clear net, a net with growth on most of it in turbid water, and "
+    "a net close below the surface in the sun: the two cases in which the paper's system "
+    "failed.",
     run=_run,
 )

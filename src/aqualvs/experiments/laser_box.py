@@ -139,8 +139,8 @@ def _run(laboratory: Laboratory) -> ExperimentResult:
     angle, offset = max(e.angle for e in errors), max(abs(e.offset) for e in errors)
     return ExperimentResult(
         sentence=f"{len(solved.solution.views)} pictures of the box give the laser planes to "
-        f"{np.rad2deg(angle):.3f}° and {1e3 * offset:.2f} mm; the range error that the whole "
-        f"calibration leaves is {np.abs(left.percent).max():.3f} % at most, from 0.3 to 1 m.",
+        f"{np.rad2deg(angle):.3f}° and {1e3 * offset:.2f} mm; the remaining range error of "
+        f"the whole calibration is {np.abs(left.percent).max():.3f} % at most, from 0.3 to 1 m.",
         findings=(*_plane_findings(truth, figures, errors), *_left_findings(left)),
         pictures=(
             drawn(*_BOX, 2.7, lambda f: _draw_box(f, laboratory, solved, errors)),
@@ -150,11 +150,11 @@ def _run(laboratory: Laboratory) -> ExperimentResult:
         notes=(
             "Camera and dome are those solved from boards in air; the box is seen in air too, as "
             "in the paper, with all lasers on at once, the vehicle's pose unknown in every "
-            "picture. The paper has one view of its box and prints no accuracy.",
-            "The paper's way (pose by distances in space, Eq. 32-33, then the pseudo-inverse, "
-            "Eq. 36) is computed from the same pictures and stands beside ours.",
+            "picture. The paper has one view of its box and states no accuracy.",
+            "The paper's way (pose by distances in space, Eq. 32-33, then the pseudo-inverse, Eq. "
+            "36) is computed from the same pictures for comparison.",
             "The remaining error is computed without noise: the true rig's pixels on walls square "
-            "ahead, read by the calibrated rig. It is the error that no averaging removes.",
+            "ahead, read by the calibrated rig. Averaging does not remove it.",
         ),
     )
 
@@ -227,14 +227,14 @@ def _series(truth: Rig, errors: Sequence[PlaneError], left: Remaining) -> tuple[
 
 _BOX = (
     "figure_7",
-    "Beside figure 7: the box as the camera sees it, with the stripe points that were found, "
-    "coloured by laser, and the corners of its markers; and how far the planes found are from the "
-    "true ones, ours with one standard deviation.",
+    "Compare figure 7: the box as the camera sees it, with the detected stripe points, coloured by "
+    "laser, and the corners of its markers; and the errors of the estimated planes, ours with one "
+    "standard deviation.",
 )
 _LEFT = (
     "remaining",
-    "Error that the calibration leaves on walls square ahead, with the two standard deviations "
-    "that it states; dashed: our criterion.",
+    "Remaining error of the calibration on walls square ahead, with two stated standard "
+    "deviations; dashed: our criterion.",
 )
 
 
@@ -329,7 +329,7 @@ EXPERIMENT = Experiment(
     name="box",
     title="Calibrating the lasers in a box",
     paper="section 3.3, figure 7",
-    about="An open box with markers on four planes, the vehicle somewhere before it: the markers "
-    "give its pose, and the stripes on known planes give the planes of the lasers.",
+    about="An open box with markers on four planes, the vehicle in front of it: the markers give "
+    "its pose, and the stripes on known planes give the planes of the lasers.",
     run=_run,
 )

@@ -288,18 +288,18 @@ def _run(laboratory: Laboratory) -> ExperimentResult:
     their_whole = mean_judged([judge_reflections(papers[i], lit) for i, lit in truth])
     shown = 8
     return ExperimentResult(
-        sentence=f"Of what the adaptive filter calls net {100 * mine.precision:.1f} % is net, and "
-        f"it keeps {100 * whole.recall:.0f} % of the net's reflections, with no parameter given; "
-        "a threshold and the paper's filter with its own parameters, given every bright pixel, "
-        f"keep {100 * their_whole.recall:.0f} %.",
+        sentence=f"Of the points that the adaptive filter labels net, {100 * mine.precision:.1f} % "
+        f"are, and it keeps {100 * whole.recall:.0f} % of the net's reflections without "
+        "parameters; a threshold and the paper's filter with its own parameters, given every "
+        f"bright pixel, keep {100 * their_whole.recall:.0f} %.",
         findings=_findings(mine, whole, theirs, their_whole, measured),
         pictures=_pictures(frames[shown], measured.scans[shown], papers[shown], dive.rig),
         notes=(
-            "Truth: the points that the simulator lit, every fourth pixel of stripe. A reflection "
-            "is a group of connected bright pixels of one laser, and kept if more than half of "
-            "them are.",
-            "The paper's text leaves choices open; docs/mesh-filter.md lists those made, and "
-            "why so little of a diamond net passes.",
+            "The ground truth is the points that the simulator lit, every fourth pixel of stripe. "
+            "A reflection is a group of connected bright pixels of one laser; it is kept if more "
+            "than half of its pixels are.",
+            "The paper's text is ambiguous in places; docs/mesh-filter.md lists the choices made, "
+            "and explains why so little of a diamond net is kept.",
         ),
     )
 
@@ -348,25 +348,26 @@ def _pictures(
     return (
         drawn(
             "figure_12",
-            "The net as the camera sees it, and the picture above a threshold, beside figure 12.",
+            "The net as the camera sees it, and the picture above a threshold; compare figure 12.",
             2.9,
             lambda figure: _draw_seen(figure, frame),
         ),
         ExperimentFigure(
             name="figure_13",
-            caption="All reflections of the level laser in its plane, beside figure 13.",
+            caption="All reflections of the level laser in its plane; compare figure 13.",
             figure=planes["figure_13"],
         ),
         drawn(
             "figure_14",
-            "What is taken for net, beside figure 14: sub-pixel returns and the adaptive "
-            "filter (left), a threshold and the paper's filter (right).",
+            "Points classified as net: sub-pixel peaks and the adaptive filter (left), a threshold "
+            "and the paper's filter (right); compare figure 14.",
             2.6,
             lambda figure: _draw_filtered(figure, papers, scan, rig, laser),
         ),
         ExperimentFigure(
             name="laser_plane_image",
-            caption="The paper's laser-plane image with its structuring elements, beside figure 9.",
+            caption="The paper's laser-plane image with its structuring elements; compare figure "
+            "9.",
             figure=planes["laser_plane_image"],
         ),
     )
@@ -435,6 +436,6 @@ EXPERIMENT = Experiment(
     title="The mesh filter",
     paper="section 5.2, figures 12 to 14",
     about="A net with a box beside it and the wall of the tank behind. The paper's filter has its "
-    "parameters from section 5.2; the adaptive one finds the net by itself.",
+    "parameters from section 5.2; the adaptive filter has none.",
     run=_run,
 )

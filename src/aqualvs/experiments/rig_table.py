@@ -30,9 +30,9 @@ from aqualvs.text import laser_colour
 _FAR = 1.0
 
 _CAPTION = (
-    "In place of figures 1 and 2: a frame of a net at 0.52 m, with the stripe of each laser on "
+    "Instead of figures 1 and 2: a frame of a net at 0.52 m, with the stripe of each laser on "
     "walls at 0.52 m (full), 0.3 and 1 m (dashed); and a section through the dome, true to scale, "
-    "with rays from the lens as they bend (blue) and as they would go on (orange)."
+    "with refracted rays from the lens (blue) and straight ones (orange)."
 )
 
 
@@ -115,18 +115,18 @@ def _run(laboratory: Laboratory) -> ExperimentResult:
         sentence=f"The rig stands in for the paper's: its lens sits "
         f"{1e3 * float(np.linalg.norm(traced.lens)):.1f} mm off the dome's centre, so that rays "
         f"bend by up to {bent:.1f}° on their way into the water, and a point 1 m ahead would be "
-        f"{missed:.0f} mm off if that were left out.",
+        f"{missed:.0f} mm off without refraction.",
         findings=_findings(rig, bent, missed),
         pictures=(drawn("figure_1_2", _CAPTION, 3.0, lambda f: _draw(f, laboratory, traced)),),
         series=(_series(traced),),
         notes=(
-            "The paper gives the focal length in millimetres and no planes of its lasers; a rig "
-            "in round numbers near table 1 takes its place, and its truth is known.",
+            "The paper gives the focal length in millimetres and no planes of its lasers; it is "
+            "replaced by a rig in round numbers near table 1, whose ground truth is known.",
             "The paper turns the camera and, by a second set of angles, its image plane; here "
             "both are one rotation. Its axes are those of the dome: x right, y forward, z up.",
-            "Where each laser can be seen at all, in the range that it works in, follows from the "
-            "rig; these bands take the place of the areas that the paper draws by hand. They "
-            "overlap: what is a stripe of which laser is then told by direction and continuity.",
+            "The band of the picture in which each laser is visible within the working range "
+            "follows from the rig; these bands replace the areas that the paper draws by hand. "
+            "They overlap: stripes are then assigned to lasers by direction and continuity.",
         ),
     )
 
@@ -246,7 +246,7 @@ EXPERIMENT = Experiment(
     name="rig",
     title="The rig",
     paper="table 1, figures 1 and 2",
-    about="The simulated rig that all experiments share unless they say otherwise: camera, dome "
-    "and lasers after the paper's.",
+    about="The simulated rig of all experiments, unless stated otherwise: camera, dome and lasers "
+    "like the paper's.",
     run=_run,
 )

@@ -59,16 +59,16 @@ def _run_control(laboratory: Laboratory) -> ExperimentResult:  # noqa: ARG001
             ExperimentFigure(
                 name="figure_23",
                 caption="Setpoint, measurement and command of both controllers (BlueROV2): hold, "
-                "then a step of the range, beside figure 23.",
+                "then a step of the range; compare figure 23.",
                 figure=drawn_follow_figures(held["bluerov2"][0])["figure_23"],
             ),
         ),
         series=tuple(_series(name, log) for name, (log, _, _) in held.items()),
         notes=(
             "Simulated vehicles (Fossen's model with the published parameters of both) with the "
-            "packaged gains, steered by postures with sampled noise and a delay of 60 ms. "
+            "packaged gains, controlled with postures with sampled noise and a delay of 60 ms. "
             "`aqualvs follow --sim --rendered` closes the loop through rendered pictures.",
-            "The paper prints curves without figures for this experiment.",
+            "The paper shows curves without numbers for this experiment.",
         ),
     )
 
@@ -129,7 +129,7 @@ CONTROL = Experiment(
     title="Distance and yaw under control",
     paper="section 5.5, figure 23",
     about="The vehicle holds 0.6 m and stays square to a net in a current of 0.3 m/s and waves, "
-    "then goes 0.2 m back; after that it follows a curved, moving net for a minute.",
+    "then moves back 0.2 m; after that it follows a curved, moving net for a minute.",
     run=_run_control,
 )
 
@@ -237,22 +237,22 @@ def _run_sea(laboratory: Laboratory) -> ExperimentResult:
         pictures=(
             drawn(
                 "figure_22",
-                "Depth, range, heading and yaw of the net over the dive, beside figure "
-                "22. Dots: measured in rendered pictures; lines: truth.",
+                "Depth, range, heading and yaw of the net over the dive; compare figure 22. Dots: "
+                "measured in rendered pictures; lines: truth.",
                 5.0,
                 lambda figure: _draw(figure, log, time_s, measured),
             ),
         ),
         series=(_sea_series(time_s, measured, truth),),
         notes=(
-            "A simulated BlueROV2 in a current of 0.15 m/s and waves of 0.1 m before a net of a "
-            "cage of 20 m radius that sways and rocks. It is steered by postures with sampled "
-            "noise at 25 Hz, and every tenth picture is rendered and measured; `aqualvs follow "
-            "--sim --rendered` renders all of them.",
+            "A simulated BlueROV2 in a current of 0.15 m/s and waves of 0.1 m in front of the net "
+            "of a cage of 20 m radius that sways and rocks. It is controlled with postures with "
+            "sampled noise at 25 Hz, and every tenth picture is rendered and measured; `aqualvs "
+            "follow --sim --rendered` renders all of them.",
             "A vehicle that turns to the right sees a net that turns to the left: heading and yaw "
-            "go against each other here, where yaw is positive to the right. What the net itself "
-            "does weakens that, at sea as here.",
-            "Range and angles count against the tangent plane of the net at the nearest point, a "
+            "have opposite signs here, where yaw is positive to the right. Motion of the net "
+            "itself weakens this correlation, at sea and in the simulation.",
+            "Range and angles are relative to the tangent plane of the net at the nearest point, a "
             "twine's radius behind the light.",
         ),
     )

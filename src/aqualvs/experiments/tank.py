@@ -70,8 +70,8 @@ def _run_angles(laboratory: Laboratory) -> ExperimentResult:
             drawn(
                 f"figure_{number}",
                 f"{name.capitalize()} while it swings, and its error with two stated "
-                f"standard deviations, beside figure {number}. The truth stands in for the "
-                "paper's compass.",
+                f"standard deviations; compare figure {number}. The truth replaces the paper's "
+                "compass.",
                 3.4,
                 partial(_draw_angle, measured=seen[name], name=name),
                 "column",
@@ -86,9 +86,9 @@ def _run_angles(laboratory: Laboratory) -> ExperimentResult:
             for name, (column, _) in _ANGLES.items()
         ),
         notes=(
-            "A calibration on boards whose distances alone are known, as on the paper's rail, "
-            "leaves the dome's axes on the vehicle uncertain by some hundredths of a degree; that "
-            "shows as an offset that is common to all frames.",
+            "A calibration on boards of which only the distances are known, as on the paper's "
+            "rail, determines the dome's axes on the vehicle only to some hundredths of a degree; "
+            "this is an offset common to all frames.",
         ),
     )
 
@@ -148,8 +148,8 @@ ANGLES = Experiment(
     name="angles",
     title="Pitch and yaw to a wall",
     paper="section 5.3, figures 16 and 17",
-    about="At 600 mm before a wall first the pitch, then the yaw swings to either side. In the "
-    "paper a tilt-compensated compass gives the comparison, here the truth does.",
+    about="At 600 mm in front of a wall first the pitch, then the yaw swings to either side. The "
+    "reference is a tilt-compensated compass in the paper, and the ground truth here.",
     run=_run_angles,
 )
 
@@ -214,7 +214,7 @@ def _run_distance(laboratory: Laboratory) -> ExperimentResult:
             ExperimentRow(
                 what="largest error of the distance, true rig (%)", ours=f"{worst_true:.3f}"
             ),
-            ExperimentRow(what="spread between frames at one place (%)", ours=f"{spread:.4f}"),
+            ExperimentRow(what="spread between frames at one distance (%)", ours=f"{spread:.4f}"),
             ExperimentRow(
                 what="frames with a posture",
                 ours=f"{np.count_nonzero(calibrated.valid)} of {len(calibrated.scans)}",
@@ -223,17 +223,19 @@ def _run_distance(laboratory: Laboratory) -> ExperimentResult:
         pictures=(
             drawn(
                 "figure_15",
-                "Error of the distance at the paper's four places, at the paper's scale "
-                "(left) and at ours (right), beside figure 15. Every dot is a frame, bars are two "
-                "stated standard deviations.",
+                "Error of the distance at the paper's four distances, at the paper's scale (left) "
+                "and at ours (right); compare figure 15. Every dot is a frame, bars are two stated "
+                "standard deviations.",
                 2.7,
                 lambda figure: _draw_distance(figure, calibrated, true),
             ),
         ),
         series=(DataColumns(name="distance", columns=columns),),
         notes=(
-            "The truth is that of the simulator; the paper's distances were set by hand.",
-            "What calibration adds is common to all frames of a place; the bars are noise only.",
+            "The reference is the simulator's ground truth; the paper's distances were set by "
+            "hand.",
+            "The error of calibration is common to all frames at a distance; the bars are noise "
+            "only.",
         ),
     )
 
@@ -293,7 +295,7 @@ DISTANCE = Experiment(
     name="distance",
     title="Distance to a wall",
     paper="section 5.3, figure 15",
-    about="The vehicle stands square to the wall of a tank, at four distances. A rig that was "
-    "calibrated from pictures alone measures them; the truth is known.",
+    about="The vehicle stands square to the wall of a tank, at four distances. A rig calibrated "
+    "from pictures only measures them; the ground truth is known.",
     run=_run_distance,
 )

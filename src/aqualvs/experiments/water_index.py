@@ -95,8 +95,8 @@ def _draw_target(
     off = spread.lens_mm > 0.0
     lens = spread.lens_mm[off]
     for sigma, colour, name in (
-        (spread.placed[off], GREY, "target's place known to 0.2 mm and 0.1°"),
-        (spread.noise[off], BLUE, "target's place known exactly"),
+        (spread.placed[off], GREY, "target's position known to 0.2 mm and 0.1°"),
+        (spread.noise[off], BLUE, "target's position known exactly"),
     ):
         chart.loglog(lens, sigma, "o-", color=colour, markersize=3, label=name)
     chart.axhspan(largest_sigma, 1.0, color=PAPER, alpha=0.12, linewidth=0.0)
@@ -272,36 +272,37 @@ def _run(laboratory: Laboratory) -> ExperimentResult:
     worst, by_paper = (float(np.abs(n - last.truth).max()) for n in (last.ours, last.paper))
     return ExperimentResult(
         sentence=f"From {WATERS[0]} to {WATERS[-1]} the index is found to {worst:.4f} at worst, "
-        f"within {_in_sigmas(last).max():.1f} standard deviations everywhere; the paper's way is "
-        f"off by up to {by_paper:.4f} on the same frames.",
+        f"within {_in_sigmas(last).max():.1f} standard deviations everywhere; the error of the "
+        f"paper's method is up to {by_paper:.4f} on the same frames.",
         findings=_findings(last, wet, alarms, spread),
         pictures=(
             drawn(
                 "index",
-                "The number on the screen, frame by frame, through six waters: the truth, ours "
-                "with two standard deviations, and the paper's way. Below: what both are off. A "
-                "change is believed with its fourth frame; until then ours stays.",
+                "The index, frame by frame, through six waters: the truth, our estimate with two "
+                "standard deviations, and the paper's method. Below: errors of both. A change is "
+                "accepted at its fourth frame; until then our estimate does not change.",
                 2.8,
                 lambda figure: _draw_numbers(figure, wet, _SETUP.frames),
             ),
             drawn(
                 "figure_5",
-                "Beside figure 5: the target in the camera's view, and how well ten frames of it "
-                "tell the index, by how far the lens sits off the dome's centre.",
+                "Compare figure 5: the target in the camera's view, and the sigma of the index "
+                "from ten frames of it, against the distance of the lens from the dome's centre.",
                 2.7,
                 lambda figure: _draw_target(figure, taken.example, spread, _OPTIONS.largest_sigma),
             ),
         ),
         series=_series(numbers, spread),
         notes=(
-            "The rig is the one calibrated from pictures. The target truly sits 0.3 mm and 0.15° "
-            "from where its file says, of which the estimators know nothing. Its corners are found "
-            "in one rendered picture of each medium, and seen in ten frames with 0.1 px of noise.",
-            "Ours begins with ten frames in air, whose index is known: they tell what is off in "
-            "target and lens, which would otherwise look like another index. The paper's number is "
-            "its method, repeated here: one frame, one unknown.",
-            "The paper shows the estimate on the screen (figure 5) and does not print how good it "
-            "is. A lens at the dome's centre sees the same picture in every water: there the "
+            "The rig is the one calibrated from pictures. The true position of the target differs "
+            "from its file by 0.3 mm and 0.15°, which the estimators do not know. Its corners are "
+            "detected in one rendered picture of each medium, and repeated in ten frames with 0.1 "
+            "px of noise.",
+            "Our method begins with ten frames in air, whose index is known: they determine the "
+            "errors of target and lens, which would otherwise bias the index. The paper's values "
+            "are from its method, repeated here: one frame, one unknown.",
+            "The paper shows the estimate on the screen (figure 5) and does not state its "
+            "accuracy. A lens at the dome's centre sees the same picture in every water: there the "
             "estimate must be, and is, refused.",
         ),
     )
@@ -333,11 +334,11 @@ def _findings(
             "largest error, in standard deviations", worst, _SETUP.bar_sigmas, digits=1
         ),
         ExperimentRow(
-            what="scatter from frame to frame, the paper's way",
+            what="scatter from frame to frame, the paper's method",
             ours=f"{float(np.sqrt(in_each.var(axis=1).mean())):.5f}",
         ),
         ExperimentRow(
-            what="changes of the medium noticed as such, the dive into the water among them",
+            what="changes of the medium detected, including the entry into the water",
             ours=f"{noticed} of {n_waters}, {len(alarms) - noticed} false",
             bar="all, none false",
             met=noticed == len(alarms) == n_waters,
@@ -378,7 +379,7 @@ EXPERIMENT = Experiment(
     name="index",
     title="The water's index, fresh to sea",
     paper="section 2.2, figure 5",
-    about="A target fixed on the vehicle, in view of the camera, tells the index of the water that "
-    "the dome is in; from fresh water to sea water in six steps.",
+    about="A target fixed to the vehicle, in view of the camera, determines the index of the "
+    "water, from fresh water to sea water in six steps.",
     run=_run,
 )

@@ -248,7 +248,7 @@ def _coverage_chart(points: ResidualMap) -> tuple[Raw, str]:
     for (row, column), count in np.ndenumerate(counts):
         x, y = 1.0 + dx * column, 1.0 + dy * row
         body += _cell(x, y, dx, dy, int(count), int(counts.max()))
-    words = f"Coverage: {covered:.0f} % of the picture’s cells hold points, as many as they say"
+    words = f"Coverage: {covered:.0f} % of the picture’s cells hold points (see the counts)"
     words += "." if counts.all() else "; hatched cells hold none."
     alt = f"{points.title}: coverage of the picture, {covered:.0f} % of its cells hold points"
     return draw.svg(_BESIDE.width, tall + 2.0, body, alt=alt, kind="coverage"), words
@@ -467,7 +467,7 @@ def _histogram_text(values: FloatArray, rms: float) -> str:
     within = 100.0 * float((np.abs(values) <= rms).mean())
     beyond = int((np.abs(values) > _BESIDE.reach * rms).sum())
     said = (
-        f"Bars: residuals, x and y apart. Line: the Gaussian of their rms, {rms:.3f} px. "
+        f"Bars: residuals, x and y separately. Line: the Gaussian of their rms, {rms:.3f} px. "
         f"{within:.0f} % lie within one rms (Gaussian: {100 * _GAUSS_WITHIN_ONE:.0f} %)"
     )
     return said + (f"; {beyond:,} beyond the chart." if beyond else ".")

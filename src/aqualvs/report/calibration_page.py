@@ -229,7 +229,7 @@ def _expected(row: ExpectedError) -> tuple[float, float, float]:
 def _expectation_text(rows: Sequence[ExpectedError]) -> str:
     known = [row for row in rows if math.isfinite(_excess(row))]
     if not known:
-        return '<p class="verdict bad">What to expect on a target is not known.</p>'
+        return '<p class="verdict bad">The accuracy on a target is not known.</p>'
     worst = max(known, key=_excess)
     range_mm, pitch, yaw = _expected(worst)
     fine = _excess(worst) <= 1.0 and len(known) == len(rows)
@@ -238,7 +238,7 @@ def _expectation_text(rows: Sequence[ExpectedError]) -> str:
     start = f"Good to {limits}{where}." if fine else f"Not good to {limits}."
     cause, end = "one picture gives", "averaging pictures does not remove it."
     if not all(map(math.isfinite, _parts_of(worst)["both"])):
-        cause, end = "the calibration alone gives", "the noise of the picture comes on top."
+        cause, end = "the calibration alone gives", "the noise of the picture is additional."
     means = (
         f" On a target at {number(worst.wall_range, 2)} m {cause} the range to "
         f"{number(range_mm, 1)} mm ({number(_percent(worst, range_mm), 2)} %), pitch to "
@@ -278,7 +278,7 @@ def page_html(page: CalibrationPage) -> str:
     """Return the report of a calibration as HTML."""
     names = [view.name for view in page.views]
     sections: list[tuple[str, str, Callable[[Any], str], Any]] = [
-        ("expectations", "What it means on a target", expectation_view, page.expectations),
+        ("expectations", "Accuracy on a target", expectation_view, page.expectations),
         ("parameters", "Parameters", parameter_table, page.parameters),
         ("lasers", "Lasers", laser_tables, page.lasers),
         ("series", "Charts", _charts, page.series),

@@ -141,7 +141,7 @@ def _range_warnings(track: Track, working_range: tuple[float, float] | None) -> 
         frames = f"{count_text(outside, 'frame')} {'lies' if outside == 1 else 'lie'}"
         yield (
             f"{frames} outside the rig's working range of {1e3 * near:.0f}–{1e3 * far:.0f} mm; "
-            "values out there are less accurate."
+            "values outside are less accurate."
         )
 
 
@@ -184,7 +184,7 @@ def _water_warnings(track: Track) -> Iterator[str]:
     water_step = 5e-4
     if len(water) and np.ptp(water) > water_step:
         yield (
-            f"The water's index moved by {np.ptp(water):.4f} during the dive: a change of "
+            f"The water's index changed by {np.ptp(water):.4f} during the dive: a change of "
             "medium, a leak, or a target that moved."
         )
 

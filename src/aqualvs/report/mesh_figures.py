@@ -373,7 +373,7 @@ def _lasers(folder: Path, run: Mapping[str, Any]) -> list[LaserFacts]:
 def _paper_options(folder: Path, run: Mapping[str, Any], target: Path | None) -> MeshFilterOptions:
     if mapping(mapping(run, "options"), "scanner").get("mesh_filter"):
         raise OptionError(
-            f"{folder}: the run used --mesh-filter paper, which drops what it rejects; run once "
+            f"{folder}: the run used --mesh-filter paper, which drops rejected points; run once "
             "more without it (the figures apply the filter themselves)"
         )
     return MeshFilterOptions() if target is None else target_dict(str(target)).mesh_filter

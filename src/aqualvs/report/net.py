@@ -137,11 +137,11 @@ def _lead(net: NetTables) -> str:
     if isinstance(facts.get("twine_mm"), int | float):
         words.append(f"twine {facts['twine_mm']:.1f} mm")
     if isinstance(facts.get("area_m2"), int | float):
-        words.append(f"{facts['area_m2']:.2f} m² looked at for holes")
+        words.append(f"{facts['area_m2']:.2f} m² searched for holes")
     said = f"{text(', '.join(words))}. " if words else ""
     return (
-        f'<p class="lead">{said}Solidity is the share of the net’s area that strands and growth '
-        "cover; fouling is what it has beyond the bare twine.</p>"
+        f'<p class="lead">{said}Solidity is the share of the net’s area covered by strands and '
+        "growth; fouling is the solidity beyond that of bare twine.</p>"
     )
 
 
