@@ -392,7 +392,9 @@ def test_a_video_that_is_cut_short_is_told_in_one_line(rig_file: Path, tmp_path:
 
 def test_the_line_of_the_terminal_shows_a_sigma_below_a_millimetre() -> None:
     line = status_line(first_sample())
-    said = r"range 0\.\d{3} m ± 0\.\d mm  yaw \+1\d\.\d ± 0\.\d\d deg  pitch -6\.\d ± 0\.\d\d deg  \|"
+    said = (
+        r"range 0\.\d{3} m ± 0\.\d mm  yaw \+1\d\.\d ± 0\.\d\d deg  pitch -6\.\d ± 0\.\d\d deg  \|"
+    )
     assert re.match(said, line)
 
 

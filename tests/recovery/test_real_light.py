@@ -275,8 +275,8 @@ def work(tmp_path_factory) -> Iterator[Path]:
     """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(common, "read_image", cache(read_image))
-        for function in (detect_board, find_stripes):
-            patch.setattr(lasers, function.__name__, once_for_each_picture(function))
+        patch.setattr(common, "detect_board", once_for_each_picture(detect_board))
+        patch.setattr(lasers, "find_stripes", once_for_each_picture(find_stripes))
         yield tmp_path_factory.mktemp("real")
 
 

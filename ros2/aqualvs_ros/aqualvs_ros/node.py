@@ -13,7 +13,7 @@ from aqualvs.control.time_filter import PostureFilter
 from aqualvs.errors import AqualvsError, OptionError
 from aqualvs.live.outputs.base import Output
 from aqualvs.live.outputs.ros_messages import RosOptions
-from aqualvs.live.runner import LiveRunner, ScannerSupply
+from aqualvs.live.runner import LiveRunner, ScannerProvider
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.rigfile import load_rig
 from aqualvs.scanner import Scanner
@@ -91,7 +91,7 @@ def make_runner(node: Node) -> LiveRunner:
         subscribe(node, topics, rig, asked["image_transport"], asked["camera_info_topic"])
     return LiveRunner(
         feed,
-        ScannerSupply(Scanner(rig)),
+        ScannerProvider(Scanner(rig)),
         outputs,
         posture_filter=PostureFilter() if asked["filter"] else None,
     )
