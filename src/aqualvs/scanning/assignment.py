@@ -275,7 +275,8 @@ class AssignmentTest:
             As a share of the target's own light. None where the target is not in doubt.
         """
         n_lasers = len(self._along_x)
-        if len(np.unique(subsegments.laser[target.members])) > _ODDS.may_be_chance:
+        n_on_target = np.count_nonzero(np.bincount(subsegments.laser[target.members]))
+        if n_on_target > _ODDS.may_be_chance:
             return None
         on_target = target.members[subsegments.of_candidate]
         share: float = other_lines_share(candidates, on_target, shapes, n_lasers)
