@@ -214,6 +214,7 @@ class PostureEstimator:
             if is_clear and is_observable:
                 best = curved
             elif is_clear or is_observable:
+                # Its nearest point is out of view, or the bend is too weak to be relied on.
                 best = _inflate_covariance(flat, curved)
         patch = packed_plane(plane) if best.patch is None else best.patch.packed()
         net_mask = self._grow_net_mask(candidates, best.inliers, plane, patch)
