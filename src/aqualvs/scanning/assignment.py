@@ -23,7 +23,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from aqualvs.geometry.arrays import FloatArray
+from aqualvs.geometry.arrays import BoolArray, FloatArray
+from aqualvs.geometry.compiled import lazy_kernel
+from aqualvs.geometry.linear_algebra import n_bins
 from aqualvs.geometry.planes import Plane
 from aqualvs.scanning.assignment_kernels import (
     CELL_LINES,
@@ -39,7 +41,6 @@ from aqualvs.scanning.assignment_kernels import (
     find_rivals,
     judge_planes,
     loose_share_before,
-    other_lines_share,
     seen_of,
 )
 from aqualvs.scanning.candidates import Candidates, Subsegments
@@ -48,7 +49,7 @@ from aqualvs.scanning.net_surfaces import inflate_covariance, seen_through
 from aqualvs.scanning.plane_search import WEIGHT, X, Z
 from aqualvs.scanning.posture import Refusal, range_pitch_yaw
 from aqualvs.scanning.posture_estimator import Measurement
-from aqualvs.scanning.segments import ComponentShapes
+from aqualvs.scanning.segments import ComponentShapes, is_straight
 from aqualvs.scanning.surfaces import Surface
 from aqualvs.scanning.triangulate import Triangulator
 
@@ -396,6 +397,41 @@ def _is_nearer(one: Surface, target: Surface, subsegments: Subsegments) -> bool:
     return bool(
         sampling_weight[one.members & near].sum() > 0.5 * sampling_weight[one.members].sum()
     )
+
+
+@lazy_kernel
+def other_lines_share(
+    candidates: Candidates, on_target: BoolArray, shapes: ComponentShapes, n_lasers: int
+) -> float:
+    """Return the light in other long lines on the search lines of a surface, over the surface's.
+
+    Straight lines that no laser makes on the surface are counted where a laser's stripe is on it.
+
+    Parameters
+    ----------
+    candidates : Candidates
+        N of them.
+    on_target : bool array, shape (N,)
+        Candidates on the surface.
+    shapes : ComponentShapes
+        Of the candidates' components.
+    n_lasers : int
+        Lasers of the rig.
+    """
+    source, laser, line = candidates.source, candidates.laser, candidates.line
+    own = np.zeros(n_bins(source), np.bool_)
+    lit = np.zeros((n_lasers, n_bins(line)), np.bool_)
+    of_surface, others = 0.0, 0.0
+    for i in range(source.shape[0]):
+        if on_target[i]:
+            own[source[i]] = True
+            lit[laser[i], line[i]] = True
+            of_surface += candidates.confidence[i]
+    for i in range(source.shape[0]):
+        is_other = lit[laser[i], line[i]] and not own[source[i]]
+        if is_other and is_straight(shapes, candidates.component[i]):
+            others += candidates.confidence[i]
+    return others / max(of_surface, 1e-12)
 
 
 def inflate_for_rival(found: Measurement, outcome: AssignmentOutcome) -> Measurement:

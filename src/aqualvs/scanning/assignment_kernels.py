@@ -26,7 +26,6 @@ from aqualvs.scanning.plane_search import (
     refine_plane,
     squared_gate,
 )
-from aqualvs.scanning.segments import ComponentShapes, is_straight
 
 INTENSITY_WEIGHT, PER_LASER, DARK, VARIANCE, FREEDOM = range(5)
 """Measures of a hypothesis: light that it explains, the same for each laser, dark lasers, variance
@@ -550,41 +549,6 @@ def loose_share_before(
         of_surface += intensity_weight[r] if own[r] else 0.0
         loose += 0.0 if bound[r] else intensity_weight[r]
     return loose / max(of_surface, 1e-12)
-
-
-@lazy_kernel
-def other_lines_share(
-    candidates: Candidates, on_target: BoolArray, shapes: ComponentShapes, n_lasers: int
-) -> float:
-    """Return the light in other long lines on the search lines of a surface, over the surface's.
-
-    Straight lines that no laser makes on the surface are counted where a laser's stripe is on it.
-
-    Parameters
-    ----------
-    candidates : Candidates
-        N of them.
-    on_target : bool array, shape (N,)
-        Candidates on the surface.
-    shapes : ComponentShapes
-        Of the candidates' components.
-    n_lasers : int
-        Lasers of the rig.
-    """
-    source, laser, line = candidates.source, candidates.laser, candidates.line
-    own = np.zeros(n_bins(source), np.bool_)
-    lit = np.zeros((n_lasers, n_bins(line)), np.bool_)
-    of_surface, others = 0.0, 0.0
-    for i in range(source.shape[0]):
-        if on_target[i]:
-            own[source[i]] = True
-            lit[laser[i], line[i]] = True
-            of_surface += candidates.confidence[i]
-    for i in range(source.shape[0]):
-        is_other = lit[laser[i], line[i]] and not own[source[i]]
-        if is_other and is_straight(shapes, candidates.component[i]):
-            others += candidates.confidence[i]
-    return others / max(of_surface, 1e-12)
 
 
 @lazy_kernel
