@@ -32,8 +32,8 @@ from aqualvs.simulation.dive import frames_of_picture
 from aqualvs.simulation.render import Renderer, SceneAt
 from aqualvs.simulation.scenario import Scenario, packaged, parse_scenario
 from aqualvs.simulation.scenarios import example_rig
-from aqualvs.simulation.scene import Scene, SurfaceKind
-from aqualvs.simulation.truth import Cell, LitPoints, target_fit
+from aqualvs.simulation.scene import Scene
+from aqualvs.simulation.truth import LABELS, Cell, LitPoints, target_fit
 from aqualvs.simulation.video import VideoWriter
 
 CONTRAST_LIMIT = 10.0
@@ -256,8 +256,6 @@ no plane, they are those of the target's own plane, and the residual is empty. T
 always hold the latter: the axes of a net's twine, without folds. All are empty without a target.
 """
 
-_LABELS = {"net": SurfaceKind.NET, "wall": SurfaceKind.WALL, "none": SurfaceKind.NONE}
-
 
 def render_benchmark_dive(
     dive: BenchmarkDive, renderer: Renderer, folder: Path, *, tick: Callable[[int], None]
@@ -335,7 +333,7 @@ def visible_lit(
     `radiance` is that of the scene, if it is known.
     """
     lit = renderer.lit_points(scene, t)
-    label = _LABELS[scene.target]
+    label = LABELS[scene.target]
     if not np.any(lit.label == label):
         return _part(lit, np.empty(0, np.int64))
     seen = renderer.radiance(scene, t) if radiance is None else radiance

@@ -164,7 +164,13 @@ _FLAT = 0.02
 _AIR = 1.1
 # Each step divides what is left by the radius over the range; nets bend less than 1 / m.
 _STEPS_TO_NEAREST = 40
-_LABELS: dict[Target, SurfaceKind] = {"net": SurfaceKind.NET, "wall": SurfaceKind.WALL}
+
+LABELS: dict[Target, SurfaceKind] = {
+    "net": SurfaceKind.NET,
+    "wall": SurfaceKind.WALL,
+    "none": SurfaceKind.NONE,
+}
+"""Kind of surface that a scene's target is."""
 
 
 def truth_row(frame: int, t: float, scene: Scene, rig: Rig, lit: LitPoints) -> list[Cell]:
@@ -213,9 +219,7 @@ def target_fit(scene: Scene, lit: LitPoints) -> tuple[Plane, float] | None:
     It is what a posture states: of a net that bulges, the plane that touches it at the point
     nearest to the dome's centre, moved to where the lit points are; else `visible_fit`.
     """
-    if scene.target == "none":
-        return None
-    label = _LABELS[scene.target]
+    label = LABELS[scene.target]
     fit = visible_fit(lit, label)
     net = scene.nets[0] if scene.nets else None
     if fit is None or net is None or not any(net.curvature) or net.folds:
