@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
@@ -164,13 +164,18 @@ def _with_moved(known: dict[str, str], dives: Sequence[Dive], out: Path) -> dict
         if str(dive.source) in known or dive.name:
             continue
         for source, name in gone.items():
-            manifest = read_manifest(out / HOME / DIVES / name / JOINED)
-            size = manifest and manifest["facts"]["source"].get("size_bytes")
-            same_name = Path(source).name == dive.source.name
-            if source in known and same_name and size == size_of(dive.source):
+            if Path(source).name != dive.source.name or source not in known:
+                continue
+            manifest = _finished(out, name)
+            if manifest and manifest["facts"]["source"].get("size_bytes") == size_of(dive.source):
                 known[str(dive.source)] = known.pop(source)
                 break
     return known
+
+
+def _finished(out: Path, name: str) -> dict[str, Any] | None:
+    """Return the manifest of a dive whose pieces are joined; None of any other."""
+    return read_manifest(out / HOME / DIVES / name / JOINED)
 
 
 def _tidy(home: Path) -> None:
@@ -185,7 +190,7 @@ def _all_records(out: Path, found: Mapping[str, DiveRecord]) -> list[DiveRecord]
     """Return how all dives of the folder stand, those of earlier batches too, by name."""
     records = dict(found)
     for source, name in _known_names(out).items():
-        manifest = read_manifest(out / HOME / DIVES / name / JOINED)
+        manifest = _finished(out, name)
         if name not in records and manifest is not None:
             facts = manifest["facts"] | known_net(out / HOME / DIVES / name, manifest["key"])
             records[name] = DiveRecord.of(name, source, facts, reused=True)
