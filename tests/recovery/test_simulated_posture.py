@@ -85,6 +85,14 @@ def errors(shot: Shot) -> tuple[float, float, float]:
     )
 
 
+def in_sigmas(shot: Shot) -> FloatArray:
+    """Errors of range, pitch and yaw over their sigmas."""
+    share, pitch, yaw = errors(shot)
+    assert shot.posture
+    error: FloatArray = np.array([share * shot.posture.range, *np.deg2rad([pitch, yaw])])
+    return error / np.sqrt(np.diag(shot.posture.covariance))
+
+
 @pytest.mark.parametrize(("name", "t"), WALLS)
 def test_a_wall(name: str, t: float) -> None:
     share, pitch, yaw = errors(shoot(name, t))
@@ -139,10 +147,9 @@ def test_a_bulging_net_is_touched_where_it_is_nearest() -> None:
         truth = target_fit(scene, picture.lit)
         assert posture
         assert truth is not None
-        share, pitch, yaw = errors(Shot(posture, truth[0], np.inf))
-        assert abs(share) < 0.003
-        error = np.array([share * posture.range, *np.deg2rad([pitch, yaw])])
-        normalised.append(error / np.sqrt(np.diag(posture.covariance)))
+        shot = Shot(posture, truth[0], np.inf)
+        assert abs(errors(shot)[0]) < 0.003
+        normalised.append(in_sigmas(shot))
         is_curved.append(posture.curvature is not None)
     assert sum(is_curved) >= 7
     spread = np.sqrt(np.mean(np.square(normalised)[is_curved], axis=0))
@@ -211,11 +218,7 @@ def test_a_wall_beyond_the_range_gives_no_posture_but_a_reason() -> None:
 def test_errors_are_what_the_covariance_says() -> None:
     normalised: list[FloatArray] = []
     for name, t in WALLS + NETS:
-        shot = shoot(name, t)
-        assert shot.posture
-        share, pitch, yaw = errors(shot)
-        error = np.array([share * shot.posture.range, *np.deg2rad([pitch, yaw])])
-        normalised.append(error / np.sqrt(np.diag(shot.posture.covariance)))
+        normalised.append(in_sigmas(shoot(name, t)))
     values = np.array(normalised)
     assert np.all(np.isfinite(values))
     # One is ideal; 13 frames of three kinds know it to 20 %.
