@@ -85,11 +85,11 @@ def test_every_look_that_found_nothing_makes_it_surer():
     hole = [(20.0, 3.4, 0.12)]
     (once,) = sites(seen(0, []), seen(21, hole))
     (twice,) = sites(seen(0, []), seen(9, []), seen(21, hole))
-    assert once.missed == pytest.approx(0.3)
-    assert twice.missed == pytest.approx(0.09)
+    assert once.missed == pytest.approx(0.2)
+    assert twice.missed == pytest.approx(0.04)
     (gone,) = sites(seen(0, []), seen(9, hole), seen(21, []))
     assert gone.state is HoleState.GONE
-    assert gone.missed == pytest.approx(0.3)
+    assert gone.missed == pytest.approx(0.2)
 
 
 def test_a_new_hole_beside_an_old_one_is_new():
