@@ -155,8 +155,8 @@ def test_a_bulging_net_is_touched_where_it_is_nearest() -> None:
     spread = np.sqrt(np.mean(np.square(normalised)[is_curved], axis=0))
     assert np.all(spread > 0.35), spread
     assert np.all(spread < 1.8), spread
-    # Of such nets seen as planes, with few strands or weak bends, one in seven is beyond it.
-    assert np.sum(np.abs(normalised).max(axis=1) > 4.0) <= 1
+    # Of 42 such nets seen as planes, with few strands or weak bends, 2 are beyond it.
+    assert np.abs(normalised).max() < 4.0
 
 
 @pytest.mark.parametrize("rig_name", [WIDE, FLAT])

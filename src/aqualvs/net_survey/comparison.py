@@ -47,8 +47,8 @@ LOOKED = 0.8
 _GROWN = float(-ndtri(0.005))
 _SIDE = 0.1
 MISSED = 0.2
-"""Share of the holes that lasers swept over and that one dive does not find: of short rendered dives,
-which are harder than long ones, 6 of 34 (docs/net-condition.md)."""
+"""Share of the holes that lasers swept over and that one dive does not find: 6 of 34 in short
+rendered dives, which are harder than long ones (docs/net-condition.md)."""
 
 
 class HoleState(StrEnum):

@@ -525,11 +525,9 @@ def _plane_of(fit: PlaneFit) -> Plane:
 
 def _may_bend(fit: PatchFit) -> bool:
     """Return whether a net's curvature is more than chance would make of a flat net's strands."""
-    # In sigmas; of fewer strands chance makes more. Flat nets keep their covariance with these.
-    by_chance, fewest = 3.0, 20
+    by_chance = 3.0  # In sigmas.
     curvature, variance = fit.patch.coefficients[3:], np.diag(fit.covariance)[3:]
-    beyond = curvature**2 > by_chance**2 * variance
-    return bool(beyond.any() and np.count_nonzero(fit.weights) >= fewest)
+    return bool((curvature**2 > by_chance**2 * variance).any())
 
 
 def _inflate_covariance(found: Measurement, other: Measurement) -> Measurement:
