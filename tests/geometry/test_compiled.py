@@ -15,7 +15,7 @@ from aqualvs.demo import bundled_dive
 from aqualvs.geometry.compiled import (
     compiled_at_once,
     inline_kernel,
-    keeps_code,
+    is_cached_on_disk,
     kernel,
     lazy_kernel,
 )
@@ -152,8 +152,8 @@ def test_where_no_code_can_be_kept_kernels_are_compiled_for_each_process(monkeyp
     assert at_once(1.0) == lazy(1.0) == 2.0
     assert len(at_once.signatures) == 1
     assert not lazy._compiled.signatures
-    assert not keeps_code(at_once)
-    assert keeps_code(_dot)
+    assert not is_cached_on_disk(at_once)
+    assert is_cached_on_disk(_dot)
 
 
 def test_cached_kernels_follow_their_callees(tmp_path: Path) -> None:

@@ -4,17 +4,17 @@ import numpy as np
 import pytest
 
 from aqualvs.geometry.linear_algebra import (
-    at_rows,
-    factorise,
-    inverse_of,
+    argsort,
+    cholesky,
+    cholesky_inverse,
+    cholesky_solve,
+    flatnonzero,
     median_of,
-    order_of,
     select_nth,
-    solve_factorised,
-    where,
+    take,
 )
 
-LEAST = 1e-13
+MIN_PIVOT = 1e-13
 
 
 def positive(n: int) -> np.ndarray:
@@ -29,13 +29,15 @@ def test_solutions_and_inverse(n: int) -> None:
     # Only the lower half is read.
     factor = np.tril(matrix)
     apart = np.zeros((n, n))
-    assert factorise(factor.copy(), 0.0, LEAST, apart)
-    assert factorise(factor, 0.0, LEAST, factor)
+    assert cholesky(factor.copy(), 0.0, MIN_PIVOT, apart)
+    assert cholesky(factor, 0.0, MIN_PIVOT, factor)
     np.testing.assert_array_equal(np.tril(factor), apart)
     np.testing.assert_allclose(np.tril(factor), np.linalg.cholesky(matrix), rtol=1e-10)
-    np.testing.assert_allclose(inverse_of(factor), np.linalg.inv(matrix), rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(
+        cholesky_inverse(factor), np.linalg.inv(matrix), rtol=1e-9, atol=1e-9
+    )
     solution = right.copy()
-    solve_factorised(factor, solution, solution)
+    cholesky_solve(factor, solution, solution)
     np.testing.assert_allclose(matrix @ solution, right, rtol=1e-9, atol=1e-9)
 
 
@@ -49,13 +51,13 @@ def test_solutions_and_inverse(n: int) -> None:
     ],
     ids=["nothing", "one direction", "negative", "nan"],
 )
-def test_no_factor_where_nothing_is_determined(matrix: np.ndarray) -> None:
-    assert not factorise(matrix, 0.0, LEAST, np.zeros_like(matrix))
+def test_a_matrix_that_is_not_positive_definite_has_no_factor(matrix: np.ndarray) -> None:
+    assert not cholesky(matrix, 0.0, MIN_PIVOT, np.zeros_like(matrix))
 
 
 def test_damping_adds_to_the_diagonal() -> None:
     matrix, factor = positive(4), np.zeros((4, 4))
-    assert factorise(matrix, 0.5, LEAST, factor)
+    assert cholesky(matrix, 0.5, MIN_PIVOT, factor)
     damped = matrix + 0.5 * np.diag(np.diag(matrix))
     np.testing.assert_allclose(factor, np.linalg.cholesky(damped), rtol=1e-10)
 
@@ -65,13 +67,13 @@ def test_damping_adds_to_the_diagonal() -> None:
 def test_order_and_choice_are_those_of_numpy(n: int, with_ties: bool) -> None:
     random = np.random.default_rng(n)
     values = random.integers(0, 5, n).astype(float) if with_ties else random.normal(size=n)
-    np.testing.assert_array_equal(order_of(values), np.argsort(values, kind="stable"))
+    np.testing.assert_array_equal(argsort(values), np.argsort(values, kind="stable"))
     for k in {0, n // 3, n // 2, n - 1} if n else ():
         assert select_nth(values.copy(), k) == np.sort(values)[k]
     np.testing.assert_equal(median_of(values.copy()), np.median(values) if n else np.nan)
-    rows = where(values > 0.5)
+    rows = flatnonzero(values > 0.5)
     np.testing.assert_array_equal(rows, np.flatnonzero(values > 0.5))
-    np.testing.assert_array_equal(at_rows(values, rows), values[values > 0.5])
+    np.testing.assert_array_equal(take(values, rows), values[values > 0.5])
 
 
 def test_nan_counts_as_highest() -> None:

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from aqualvs.geometry.arrays import FloatArray
-from aqualvs.geometry.linear_algebra import element_at
+from aqualvs.geometry.linear_algebra import lower_quantile
 from aqualvs.scanning.plane_search import _guide, _median_weight, _pick
 from aqualvs.scanning.surfaces import lit_cells, number_cells
 
@@ -24,7 +24,7 @@ SAMPLING_WEIGHTS = arrays(np.float64, st.integers(1, 60), elements=st.integers(1
 def test_a_quantile_is_the_value_that_sorting_gives(values: FloatArray, share: float) -> None:
     expected = np.sort(values)[int(share * (len(values) - 1))] if len(values) else 0.0
     # Zeros of both signs are equal, and sorted in any order.
-    np.testing.assert_equal(element_at(values, share) + 0.0, expected + 0.0)
+    np.testing.assert_equal(lower_quantile(values, share) + 0.0, expected + 0.0)
 
 
 @settings(deadline=None, max_examples=200)

@@ -24,7 +24,7 @@ from aqualvs.check.finding import findings_table, shutter_finding
 from aqualvs.control.vehicle import Mode, VehicleState
 from aqualvs.demo import bundled_dive
 from aqualvs.errors import AqualvsError
-from aqualvs.geometry.compiled import keeps_code
+from aqualvs.geometry.compiled import is_cached_on_disk
 from aqualvs.live.mavlink.ardusub import ArduSubLink, ArduSubOptions
 from aqualvs.live.mavlink.ardusub_parameters import (
     FOR_DISTANCE,
@@ -232,7 +232,7 @@ def _machine() -> Iterator[Finding]:
     min_free_gb = 2.0
     if free_gb < min_free_gb:
         yield Finding.warn(f"only {free_gb:.1f} GB free here; recordings need about 1 GB an hour")
-    if not keeps_code(project_all):
+    if not is_cached_on_disk(project_all):
         yield Finding.warn(
             "every command recompiles its kernels, because no cache folder is writable; set "
             "NUMBA_CACHE_DIR to a writable folder"

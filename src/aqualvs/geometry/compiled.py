@@ -1,9 +1,9 @@
-"""A typed door to Numba: every compiled kernel of the project goes through `kernel`.
+"""Typed decorators for Numba: every compiled kernel of the project uses one of them.
 
-Kernels round after every operation, in the order in which it is written, as Python does. Were LLVM
-free to fuse and to reorder, the last bits of a result would depend on the processor, on where
-arrays lie in memory, and on which of its callers a kernel was compiled for: a dive measured on
-several machines, or by several processes, would not equal the same dive measured by one.
+Kernels round after every operation, in the order in which it is written, as Python does. If LLVM
+fused or reordered operations, the last bits of a result would depend on the processor, on the
+alignment of arrays, and on the caller for which a kernel was compiled: a dive measured on several
+machines, or by several processes, would differ from the same dive measured by one.
 """
 
 import contextlib
@@ -16,8 +16,8 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
-# Numba prepares colours for every error that it might report: where colorama is installed, as on
-# Windows, that is a twentieth of its compiling.
+# Numba colours every message that it might report: with colorama installed, as on Windows, that
+# takes a twentieth of the compile time.
 os.environ.setdefault("NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING", "1")
 
 import numba
@@ -26,8 +26,8 @@ from numba.extending import overload, typeof_impl
 from numpy.typing import NDArray
 
 ZERO = cast(int, np.int64(0))
-"""Initial value of a count that kernels pass on and get back; they would be compiled once more for
-a literal 0."""
+"""Initial value of a count that kernels pass to others; for a literal 0 Numba would compile these
+once more."""
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -38,34 +38,33 @@ def kernel(function: F) -> F:
 
 
 def borrowing_kernel(function: F) -> F:
-    """Compile a batch kernel that only borrows its arrays and creates none.
+    """Compile a batch kernel that creates no arrays, without reference counting.
 
-    Counting references to arrays at every call of a small function, or for every row that is
-    looked at, can take longer than the work itself. Compilation fails where an array is created.
+    Counting references to arrays at every call of a small function, or for every row of an array,
+    can take longer than the work itself. Compilation fails where an array is created.
     """
     return _compiled(function, _nrt=False)
 
 
 def lazy_kernel(function: F) -> F:
-    """Compile a batch kernel once Python has run it for a while; most first runs need no more.
+    """Compile a batch kernel only after Python has run it for a while; short runs never compile it.
 
-    Compiling what measures a few hundred candidates takes as long as Python needs for a hundred
-    frames of them. Both give the same bits for kernels that keep to loops, to arithmetic of 64-bit
-    numbers (NumPy's narrower integers wrap around where compiled code widens them), and to
-    functions that round alike (`squared` and `hypot` of `linear_algebra`, not `x**2` and
-    `math.hypot`).
+    Compiling a kernel for a few hundred candidates takes as long as Python needs for a hundred
+    frames of them. Both give the same bits if the kernel uses only loops, arithmetic of 64-bit
+    numbers (NumPy's narrower integers wrap around where compiled code widens them), and functions
+    that round alike (`squared` and `hypot` of `linear_algebra`, not `x**2` and `math.hypot`).
     """
     return cast(F, _LazyKernel(function, {}))
 
 
 def lazy_borrowing_kernel(function: F) -> F:
-    """Compile a `borrowing_kernel` when its calls have taken a while, as a `lazy_kernel`."""
+    """Compile a `borrowing_kernel` as late as a `lazy_kernel`."""
     return cast(F, _LazyKernel(function, {"_nrt": False}))
 
 
 @contextlib.contextmanager
 def compiled_at_once() -> Iterator[None]:
-    """Have this thread compile lazy kernels when first called, before work that must not wait."""
+    """Make this thread compile lazy kernels at their first call, before work that must not wait."""
     before = _interpreter.is_allowed
     _interpreter.is_allowed = False
     try:
@@ -75,17 +74,17 @@ def compiled_at_once() -> Iterator[None]:
 
 
 def inner_kernel(function: F) -> F:
-    """Compile a function that kernels call, and Python hardly ever.
+    """Compile a function that is called by kernels, and hardly ever by Python.
 
-    Within kernels it is compiled without what calls from Python need: the conversion of every
-    argument and of the result, which makes a third of the code of a small function. The machine
-    code is part of the kernels that call it. From Python it is compiled once more.
+    For kernels it is compiled without the wrapper for calls from Python, which converts arguments
+    and result and is a third of the code of a small function. The machine code becomes part of the
+    kernels that call it. The first call from Python compiles it once more.
     """
     return _inner(function)
 
 
 def inner_borrowing_kernel(function: F) -> F:
-    """Compile an `inner_kernel` that only borrows its arrays, as a `borrowing_kernel` does."""
+    """Compile an `inner_kernel` without reference counting, as a `borrowing_kernel`."""
     return _inner(function, _nrt=False)
 
 
@@ -95,33 +94,33 @@ def inline_kernel(function: F) -> F:
 
 
 def inline_borrowing_kernel(function: F) -> F:
-    """Compile an `inline_kernel` that borrowing kernels call."""
+    """Compile an `inline_kernel` without reference counting, which borrowing kernels may call."""
     return _inner(function, forceinline=True, _nrt=False)
 
 
-def keeps_code(kernel: Callable[..., Any]) -> bool:
-    """Return whether the machine code of a kernel is kept on disk for the next process."""
+def is_cached_on_disk(kernel: Callable[..., Any]) -> bool:
+    """Return whether the machine code of a kernel is cached on disk for the next process."""
     return _cache_file(kernel) is not None
 
 
 def python_of(kernel: Callable[..., Any]) -> Callable[..., Any]:
-    """Return the Python function that a kernel is compiled from.
+    """Return the uncompiled Python function of a kernel.
 
-    It takes numbers of NumPy, and arrays where it has no branches, and need not be compiled.
+    A scalar kernel without branches works on arrays, too, in this form.
     """
     function: Callable[..., Any] = cast(Any, kernel).py_func
     return function
 
 
-def chosen_by_class(kernels: Mapping[type, Callable[..., Any]]) -> Callable[..., Any]:
-    """Return a function for kernels to call that stands for one of several inline kernels.
+def dispatch_by_class(kernels: Mapping[type, Callable[..., Any]]) -> Callable[..., Any]:
+    """Return a function that kernels call in place of one of several inline kernels.
 
-    The class of the first argument, a named tuple, chooses among them when the caller is compiled:
-    nothing is decided, and nothing of the others is compiled, at run time.
+    The class of the first argument, a named tuple, selects the kernel when the caller is compiled:
+    there is no branch at run time, and the other kernels are not compiled.
     """
 
     def stand_in(*arguments: Any) -> Any:
-        raise TypeError(f"only kernels can call what is chosen by class, not {arguments!r}")
+        raise TypeError(f"only kernels can call what is dispatched by class, not {arguments!r}")
 
     def choose(*arguments: Any) -> Any:
         chosen: Any = kernels.get(getattr(arguments[0], "instance_class", type(None)))
@@ -132,7 +131,7 @@ def chosen_by_class(kernels: Mapping[type, Callable[..., Any]]) -> Callable[...,
     return stand_in
 
 
-# C code, which the wrapper left out would serve, calls no kernel.
+# Without the wrapper for calls from C, which nothing here makes.
 _OPTIONS = {"error_model": "numpy", "nogil": True, "fastmath": False, "no_cfunc_wrapper": True}
 
 
@@ -141,16 +140,16 @@ def _compiled(function: F, **options: object) -> F:
     try:
         compiled = numba.njit(cache=True, **options)(function)
     except RuntimeError:
-        # Numba finds no folder for its code: neither the package's nor the user's can be written.
+        # Numba has no cache folder: neither the package's nor the user's is writable.
         return cast(F, numba.njit(**options)(function))
     _depend_on_callees(compiled, repr(sorted(options.items())))
     return cast(F, compiled)
 
 
 class _Interpreter(threading.local):
-    """State of a thread: whether Python may run lazy kernels, and whether it runs one now.
+    """State of a thread: whether Python may run lazy kernels, and whether it is running one now.
 
-    All that a kernel calls is run by the same means.
+    The kernels that an interpreted kernel calls are interpreted as well.
     """
 
     is_allowed = True
@@ -160,8 +159,8 @@ class _Interpreter(threading.local):
 _interpreter = _Interpreter()
 
 _LAZY_S_PER_BYTE = 1e-4
-"""CPU time for which Python runs a lazy kernel in a process, for each byte of Python's code for it
-and its callees: a quarter of what compiling takes (3 kB and 1.2 s in the median of 22 kernels)."""
+"""CPU time for which Python runs a lazy kernel in a process, for each byte of bytecode of it and
+its callees: a quarter of the compile time (3 kB and 1.2 s in the median of 22 kernels)."""
 
 
 class _LazyKernel:
@@ -178,7 +177,7 @@ class _LazyKernel:
     def __call__(self, *arguments: Any) -> Any:
         return self._run(*arguments)
 
-    # Most programs call few of the kernels that they import.
+    # Made on demand: most programs call few of the kernels that they import.
     @functools.cached_property
     def _compiled(self) -> Callable[..., Any]:
         return _compiled(self.py_func, **self._options)
@@ -211,8 +210,8 @@ class _LazyKernel:
             with np.errstate(all="ignore"):
                 return _native(self.py_func(*arguments))
         except Exception:
-            # Compiled code goes on where Python raises, as in dividing one of its own numbers by
-            # zero.
+            # Python raises where compiled code goes on, as in division of a Python number by zero:
+            # undo what was written, and run the compiled kernel.
             for array, before in written:
                 array[...] = before
         finally:
@@ -225,8 +224,8 @@ class _LazyKernel:
 def _turn_to_compile(function: Callable[..., Any]) -> Iterator[bool]:
     """Yield whether no other process is compiling a kernel of the same module.
 
-    The processes that share a dive want the same kernels at the same time. So each compiles others,
-    and finds the rest on disk later.
+    Processes that share a dive need the same kernels at the same time: each compiles those of
+    another module, and loads the rest from disk later.
     """
     has_turn = True
     with contextlib.ExitStack() as stack:
@@ -244,7 +243,7 @@ def _turn_to_compile(function: Callable[..., Any]) -> Iterator[bool]:
 
 
 def _n_bytes(function: Callable[..., Any], counted: set[Callable[..., Any]]) -> int:
-    """Return the length of Python's code for a kernel and for the kernels that it calls."""
+    """Return the size of the bytecode of a kernel and of the kernels that it calls."""
     if function in counted:
         return 0
     counted.add(function)
@@ -264,7 +263,7 @@ def _arrays(arguments: tuple[Any, ...]) -> Iterator[NDArray[Any]]:
 
 
 def _native(result: Any) -> Any:
-    """Return what a kernel returned with Python's numbers, as compiled code gives them."""
+    """Return the result of a kernel with NumPy's scalars as Python's, as compiled code returns."""
     if isinstance(result, np.generic):
         return result.item()
     if isinstance(result, tuple):
@@ -286,15 +285,15 @@ class _InnerKernel:
         run = self.py_func if _interpreter.runs else self._for_python
         return run(*arguments)
 
-    # Kernels that are on disk contain it.
+    # Made on demand: kernels that are loaded from disk already contain its code.
     @functools.cached_property
     def _for_kernels(self) -> Callable[..., Any]:
         return _compiled(self.py_func, no_cpython_wrapper=True, **self._options)
 
     @functools.cached_property
     def _for_python(self) -> Callable[..., Any]:
-        # Numba names files on disk by functions: under one name, a process could load the code
-        # without an entry for Python, and jump nowhere.
+        # Numba names cache files by qualified name: under the same one, a process could load the
+        # code without a wrapper for Python, and crash.
         function = self.py_func
         own = types.FunctionType(
             function.__code__,
@@ -325,22 +324,22 @@ def _inner(function: F, **options: object) -> F:
 
 
 def _depend_on_callees(compiled: Any, options: str) -> None:
-    """Make machine code on disk depend on its options and the files of kernels that it may call.
+    """Invalidate cached machine code if its options or the files of kernels it may call change.
 
     Numba compares only the stamp of the function's own file, so a change in an inlined kernel of
-    another module would leave stale machine code in use. Counted are all kernels that the module
-    has imported, whether this function calls them or not.
+    another module would leave stale machine code in use. All kernels that the module imports
+    count, whether this function calls them or not.
     """
     own = _cache_file(compiled)
     if own is None:
         return
     files = sorted(_files_of_kernels(compiled.py_func))
     own._source_stamp = (options, *map(_stamp_of, files))
-    own._load_index = _forgiving(own._load_index)
+    own._load_index = _without_stale_classes(own._load_index)
 
 
 def _files_of_kernels(function: Callable[..., Any]) -> frozenset[str]:
-    """Return the files of the kernels that a kernel's module has or has imported, and of theirs."""
+    """Return the files of the kernels that a kernel's module defines or imports, recursively."""
     path = function.__code__.co_filename
     if path not in _files:
         named = list(function.__globals__.values())
@@ -360,19 +359,19 @@ _files: dict[str, frozenset[str]] = {}
 
 @functools.cache
 def _stamp_of(path: str) -> tuple[int, int]:
-    """Return the stamp of a file as it was when its first kernel was imported.
+    """Return modification time (ns) and size of a file when its first kernel was imported.
 
-    It may be edited before a kernel is compiled, from the code of before.
+    The file may be edited after that, before the imported code is compiled.
     """
     status = os.stat(path)
     return status.st_mtime_ns, status.st_size
 
 
-def _forgiving(load_index: Callable[[], Any]) -> Callable[[], Any]:
-    """Have an index of machine code be empty if it names classes that are gone.
+def _without_stale_classes(load_index: Callable[[], Any]) -> Callable[[], Any]:
+    """Return a loader of a cache index that is empty if it names classes that no longer exist.
 
-    Numba reads the index before it compares stamps, and the index holds the types of arguments: one
-    from before an upgrade that renamed such a class would end every run with a traceback.
+    Numba unpickles the index, with the types of arguments, before it compares stamps: after an
+    upgrade that renames such a class, every run would end with a traceback.
     """
 
     def load() -> Any:

@@ -2,7 +2,8 @@
 
 For small systems, calling LAPACK costs more than the solution. Three-vectors are tuples, so that
 they stay in registers. Symmetric 3 x 3 systems are solved by cofactors, positive definite systems
-of a few unknowns by their Cholesky factor.
+of a few unknowns by their Cholesky factor. Functions named as NumPy's do the same for 1-D arrays,
+and take less time to compile.
 """
 
 import math
@@ -71,7 +72,7 @@ def scaled(a: Vec, factor: float) -> Vec:
 
 @inline_borrowing_kernel
 def unit(a: Vec) -> Vec:
-    """Return a with length 1."""
+    """Return a / |a|."""
     inverse = 1.0 / np.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2])
     return a[0] * inverse, a[1] * inverse, a[2] * inverse
 
@@ -94,15 +95,15 @@ def row3(values: FloatArray, i: int, j: int) -> Vec:
 
 @inline_kernel
 def invert_symmetric(matrix: FloatArray, inverse: FloatArray) -> bool:
-    """Invert a positive definite 3 x 3 matrix by its cofactors; only its lower half is read.
+    """Invert a positive definite 3 x 3 matrix by its cofactors; only its lower triangle is read.
 
-    Return False, and write nothing, where the matrix is singular to rounding or not positive.
+    Return False, and write nothing, if the matrix is singular to rounding or not positive definite.
     """
     a, b, c = matrix[0, 0], matrix[1, 0], matrix[2, 0]
     d, e, f = matrix[1, 1], matrix[2, 1], matrix[2, 2]
     c00, c01, c02 = d * f - e * e, c * e - b * f, b * e - c * d
     determinant = a * c00 + b * c01 + c * c02
-    # Relative to the product of the diagonal: a smaller determinant is rounding, not information.
+    # A determinant that is smaller relative to the product of the diagonal is rounding error.
     singular = 1e-13
     if not determinant > singular * a * d * f:
         return False
@@ -119,7 +120,10 @@ def invert_symmetric(matrix: FloatArray, inverse: FloatArray) -> bool:
 def solve_symmetric(
     matrix: FloatArray, right: FloatArray, scratch: FloatArray, solution: FloatArray
 ) -> bool:
-    """Solve a positive definite 3 x 3 system; False, and nothing written, where it is singular."""
+    """Solve a positive definite 3 x 3 system; return False, and write nothing, if singular.
+
+    `scratch` (3, 3) is overwritten by the inverse of the matrix.
+    """
     if not invert_symmetric(matrix, scratch):
         return False
     for i in range(3):
@@ -128,11 +132,24 @@ def solve_symmetric(
 
 
 @inner_borrowing_kernel
-def factorise(matrix: FloatArray, damping: float, least: float, factor: FloatArray) -> bool:
-    """Write the lower factor of a matrix (N, N), its diagonal times 1 + damping, to `factor`.
+def cholesky(matrix: FloatArray, damping: float, min_pivot: float, factor: FloatArray) -> bool:
+    """Write the lower Cholesky factor of a positive definite matrix.
 
-    Only the lower half of the matrix is read; `factor` may be the matrix itself. Return False where
-    a pivot is not above `least` of its diagonal element: it is rounding, not information.
+    Parameters
+    ----------
+    matrix : array, shape (N, N)
+        Only its lower triangle is read.
+    damping : float
+        The diagonal is multiplied by 1 + damping first (Levenberg-Marquardt).
+    min_pivot : float
+        Least pivot, as a share of its diagonal element; a smaller one is rounding error.
+    factor : array, shape (N, N)
+        Written in its lower triangle; may be `matrix`.
+
+    Returns
+    -------
+    bool
+        False if a pivot is too small: the factor is incomplete then.
     """
     n = len(matrix)
     for i in range(n):
@@ -145,7 +162,7 @@ def factorise(matrix: FloatArray, damping: float, least: float, factor: FloatArr
                 rest -= factor[i, k] * factor[j, k]
             if i != j:
                 factor[i, j] = rest / factor[j, j]
-            elif rest > least * own:
+            elif rest > min_pivot * own:
                 factor[i, i] = math.sqrt(rest)
             else:
                 return False
@@ -153,8 +170,8 @@ def factorise(matrix: FloatArray, damping: float, least: float, factor: FloatArr
 
 
 @inner_borrowing_kernel
-def solve_factorised(factor: FloatArray, right: FloatArray, out: FloatArray) -> None:
-    """Write the solution (N,) of factor factor' x = right to `out`, which may be `right` itself."""
+def cholesky_solve(factor: FloatArray, right: FloatArray, out: FloatArray) -> None:
+    """Write the solution (N,) of factor factorᵀ x = right to `out`, which may be `right` itself."""
     n = len(right)
     for i in range(n):
         rest = right[i]
@@ -169,12 +186,12 @@ def solve_factorised(factor: FloatArray, right: FloatArray, out: FloatArray) -> 
 
 
 @inner_kernel
-def inverse_of(factor: FloatArray) -> FloatArray:
-    """Return the inverse (N, N) of the matrix that a factor was made from."""
+def cholesky_inverse(factor: FloatArray) -> FloatArray:
+    """Return the inverse (N, N) of the matrix with this Cholesky factor."""
     inverse = np.zeros(factor.shape)
     for k in range(factor.shape[0]):
         inverse[k, k] = 1.0
-        solve_factorised(factor, inverse[k], inverse[k])
+        cholesky_solve(factor, inverse[k], inverse[k])
     return inverse
 
 
@@ -182,11 +199,11 @@ _N_BINS = 256
 
 
 @lazy_kernel
-def element_at(values: FloatArray, share: float) -> float:
-    """Return the element below which a share of the values lie; 0 if there are no values.
+def lower_quantile(values: FloatArray, q: float) -> float:
+    """Return the quantile `q`, 0 to 1, of values (N,), as `numpy.quantile(method="lower")`.
 
-    NaN counts as highest. The values are counted in bins, and only one bin is sorted; a partition
-    takes longer, because its branches cannot be predicted.
+    0 if there are no values; NaN counts as highest. The values are counted in bins, and only one
+    bin is searched: a partition of all takes longer, because its branches cannot be predicted.
     """
     n = values.shape[0]
     if n == 0:
@@ -196,7 +213,7 @@ def element_at(values: FloatArray, share: float) -> float:
         low = values[i] if values[i] < low else low
         high = values[i] if values[i] > high else high
     per_level = _N_BINS / (high - low) if low < high else 0.0
-    count, rank = np.zeros(_N_BINS + 1, np.int64), int(share * (n - 1))
+    count, rank = np.zeros(_N_BINS + 1, np.int64), int(q * (n - 1))
     for i in range(n):
         count[_bin_of(values[i], low, per_level)] += 1
     # The bin that holds the element, and the number of values in lower bins.
@@ -214,9 +231,10 @@ def element_at(values: FloatArray, share: float) -> float:
 
 @inner_borrowing_kernel
 def select_nth(values: FloatArray, n: int) -> float:
-    """Return the element that sorted values have at position `n`, NaN as highest; reorders them.
+    """Return the element that sorted values (N,) have at index `n`; reorder them in place.
 
-    Hoare's algorithm (1961); takes a tenth of the time to compile of `numpy.partition`.
+    NaN counts as highest. Hoare's algorithm (1961); compiles in a tenth of the time of
+    `numpy.partition`.
     """
     low, high, i = 0, values.shape[0] - 1, 0
     while i <= high:
@@ -250,14 +268,14 @@ def select_nth(values: FloatArray, n: int) -> float:
 
 @inner_borrowing_kernel
 def median_of(values: FloatArray) -> float:
-    """Return the median of values, which it reorders; NaN for none."""
+    """Return the median of values (N,), NaN if there are none; reorder them in place."""
     n = values.shape[0]
     if n == 0:
         return math.nan
     upper = select_nth(values, n // 2)
     if n % 2 == 1:
         return upper
-    # What is not above it stands before it.
+    # `select_nth` has moved all smaller values before index n // 2.
     lower = values[0]
     for i in range(1, n // 2):
         lower = values[i] if values[i] > lower else lower
@@ -265,8 +283,8 @@ def median_of(values: FloatArray) -> float:
 
 
 @inner_kernel
-def order_of(values: FloatArray) -> IntArray:
-    """Return the indices that sort values, equal ones in their order: Shell's sort (1959)."""
+def argsort(values: FloatArray) -> IntArray:
+    """Return the indices (N,) that sort values (N,) stably; Shell's sort (1959)."""
     n = values.shape[0]
     order = np.empty(n, np.int64)
     for i in range(n):
@@ -289,14 +307,14 @@ def order_of(values: FloatArray) -> IntArray:
 
 
 @inner_kernel
-def where(chosen: BoolArray) -> IntArray:
-    """Return the indices of what is chosen; takes less time to compile than `numpy.flatnonzero`."""
+def flatnonzero(mask: BoolArray) -> IntArray:
+    """Return the indices at which a mask (N,) is True."""
     n = 0
-    for i in range(chosen.shape[0]):
-        n += chosen[i]
+    for i in range(mask.shape[0]):
+        n += mask[i]
     rows, n = np.empty(n, np.int64), 0
-    for i in range(chosen.shape[0]):
-        if chosen[i]:
+    for i in range(mask.shape[0]):
+        if mask[i]:
             rows[n] = i
             n += 1
     return rows
@@ -304,7 +322,7 @@ def where(chosen: BoolArray) -> IntArray:
 
 @inner_borrowing_kernel
 def n_bins(numbers: IntArray) -> int:
-    """Return how many bins `numpy.bincount` has: one more than the highest of some numbers."""
+    """Return the number of bins of `numpy.bincount`: the highest number plus 1, or 0 for none."""
     n = 0
     for i in range(numbers.shape[0]):
         n = max(n, numbers[i] + 1)
@@ -312,8 +330,8 @@ def n_bins(numbers: IntArray) -> int:
 
 
 @inner_kernel
-def at_rows(values: FloatArray, rows: IntArray) -> FloatArray:
-    """Return the values of some rows; takes less time to compile than an array of indices."""
+def take(values: FloatArray, rows: IntArray) -> FloatArray:
+    """Return values[rows]."""
     some = np.empty(rows.shape[0])
     for k in range(rows.shape[0]):
         some[k] = values[rows[k]]
@@ -322,7 +340,7 @@ def at_rows(values: FloatArray, rows: IntArray) -> FloatArray:
 
 @inline_kernel
 def sum_of(values: FloatArray | IntArray) -> float:
-    """Return the sum of values; takes less time to compile than `numpy.sum`."""
+    """Return the sum of values (N,), added in their order."""
     found = 0.0
     for i in range(values.shape[0]):
         found += values[i]

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from aqualvs.errors import RigError
 from aqualvs.geometry.arrays import BoolArray, FloatArray, as_vectors
-from aqualvs.geometry.compiled import chosen_by_class, inline_kernel, kernel
+from aqualvs.geometry.compiled import dispatch_by_class, inline_kernel, kernel
 from aqualvs.geometry.linear_algebra import Vec
 from aqualvs.geometry.planes import Rays
 from aqualvs.geometry.transforms import SE3
@@ -64,7 +64,7 @@ def _trace_bare(
     return True, ox, oy, oz, dx, dy, dz
 
 
-trace_port = chosen_by_class(
+trace_port = dispatch_by_class(
     {BareParams: _trace_bare, DomeParams: trace_direction, FlatParams: trace_flat}
 )
 """`trace_port(port, dx, dy, dz)`: a unit direction at the lens as the ray in the outer medium, see

@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray
-from aqualvs.geometry.compiled import chosen_by_class, inline_kernel, kernel
+from aqualvs.geometry.compiled import dispatch_by_class, inline_kernel, kernel
 from aqualvs.geometry.linear_algebra import Vec, cross, dot
 from aqualvs.optics.camera import BareParams, CameraParams, rotate_to_dome
 from aqualvs.optics.dome import DomeParams
@@ -325,7 +325,7 @@ def flat_directions_block(port: FlatParams, count: int, w: FloatArray) -> None:
         w[PZ + j] = c * mz + s * w[EZ + j]
 
 
-port_directions_block = chosen_by_class(
+port_directions_block = dispatch_by_class(
     {
         BareParams: bare_directions_block,
         DomeParams: dome_directions_block,
@@ -434,7 +434,7 @@ def flat_gradients_block(port: FlatParams, w: FloatArray) -> None:
             w[row + 15 * BLOCK + j] = dot(by_normal, port.turn_y)
 
 
-gradients_block = chosen_by_class(
+gradients_block = dispatch_by_class(
     {
         BareParams: bare_gradients_block,
         DomeParams: dome_gradients_block,
@@ -467,7 +467,7 @@ def _flat_rotation_gradients_block(_port: FlatParams, _w: FloatArray) -> None:
     """Leave the gradients by the rotation as `flat_gradients_block` wrote them."""
 
 
-rotation_gradients_block = chosen_by_class(
+rotation_gradients_block = dispatch_by_class(
     {
         BareParams: _rotation_gradients_block,
         DomeParams: _rotation_gradients_block,

@@ -21,7 +21,7 @@ import numpy as np
 
 from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.compiled import inner_kernel, lazy_kernel
-from aqualvs.geometry.linear_algebra import factorise, solve_factorised
+from aqualvs.geometry.linear_algebra import cholesky, cholesky_solve
 from aqualvs.optics.camera import Camera, parameter_names
 from aqualvs.optics.rig import Rig, RigUncertainty, rig_moved_by
 from aqualvs.optics.sheet import packed_sheets, sheet_distance, sheet_tangent, sheets_of
@@ -331,13 +331,13 @@ def _propagate(
     n, n_terms = jacobian.shape[1], surface.terms.shape[1]
     factor, gain, slopes = np.empty((n_terms, n_terms)), surface.posture.copy(), np.empty(n)
     scratch = np.empty(15)
-    if not factorise(sums.matrix, 0.0, _MIN_PIVOT, factor):
+    if not cholesky(sums.matrix, 0.0, _MIN_PIVOT, factor):
         jacobian[:] = np.nan
         covariance[:] = np.nan
         return
     jacobian[:] = 0.0
     for i in range(3):
-        solve_factorised(factor, gain[i], gain[i])
+        cholesky_solve(factor, gain[i], gain[i])
     for b in range(sums.laser.shape[0]):
         _write_slopes(surface, sums, b, rig_errors, scratch, slopes)
         for i in range(3):

@@ -13,7 +13,7 @@ from aqualvs.geometry.compiled import (
     inner_kernel,
     lazy_kernel,
 )
-from aqualvs.geometry.linear_algebra import n_bins, solve_symmetric, squared, where
+from aqualvs.geometry.linear_algebra import flatnonzero, n_bins, solve_symmetric, squared
 from aqualvs.scanning.candidates import Candidates, Subsegments
 from aqualvs.scanning.plane_search import (
     JX,
@@ -577,7 +577,7 @@ def seen_of(
             way[laser[c]] += subsegments.n_lines[c]
     most, asked, faint, dark = 0.0, 0, 0, 0
     for i in range(n_lasers):
-        cells = where(expected[i]).shape[0]
+        cells = flatnonzero(expected[i]).shape[0]
         way[i] = way[i] / (CELL_LINES * cells) if cells >= _EVIDENCE.min_cells else np.nan
         if way[i] > most:
             most = way[i]

@@ -18,7 +18,7 @@ from aqualvs.geometry.compiled import (
     lazy_borrowing_kernel,
     lazy_kernel,
 )
-from aqualvs.geometry.linear_algebra import element_at, median_of
+from aqualvs.geometry.linear_algebra import lower_quantile, median_of
 from aqualvs.scanning.laser_bands import BandLines, LaserBand, SearchAxis
 from aqualvs.scanning.segments import (
     ComponentShapes,
@@ -345,7 +345,7 @@ def find_candidates(
         np.empty((N_MEASURES, capacity)),
         np.empty((capacity, 2)),
     )
-    best_height = element_at(np.concatenate((along_x.height, along_y.height)), _BEST_SHARE)
+    best_height = lower_quantile(np.concatenate((along_x.height, along_y.height)), _BEST_SHARE)
     n = 0
     for i, (search, found) in enumerate(zip(laser_bands, by_search, strict=True)):
         n = append_candidates(found, search.lines, i, found is along_x, best_height, n, tables)

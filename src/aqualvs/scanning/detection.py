@@ -13,7 +13,7 @@ import numpy as np
 from aqualvs.errors import FrameError
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import inline_kernel, inner_kernel, kernel, lazy_kernel
-from aqualvs.geometry.linear_algebra import at_rows, element_at, hypot, where
+from aqualvs.geometry.linear_algebra import flatnonzero, hypot, lower_quantile, take
 from aqualvs.optics.shutter import FIRST_ROW, Field
 from aqualvs.scanning.laser_bands import LaserBand, SearchAxis
 from aqualvs.scanning.laser_colour import (
@@ -507,19 +507,21 @@ def select_peaks(
     keep = np.empty(likelihood.shape[0], np.bool_)
     for i in range(keep.shape[0]):
         keep[i] = likelihood[i] >= min_likelihood
-    bright = min_share * element_at(at_rows(table[HEIGHT], where(keep)), _SEARCH.bright_quantile)
+    bright = min_share * lower_quantile(
+        take(table[HEIGHT], flatnonzero(keep)), _SEARCH.bright_quantile
+    )
     for k in range(ends.shape[0] - 1):
         rows = _marked(keep, ends[k], ends[k + 1])
         long = _are_long(line, table, rows)
         for i in range(rows.shape[0]):
             keep[rows[i]] = long[i] or table[HEIGHT, rows[i]] >= bright
-    return where(keep)
+    return flatnonzero(keep)
 
 
 @inner_kernel
 def _marked(marks: BoolArray, start: int, end: int) -> IntArray:
     """Return the rows from `start` to before `end` that are marked."""
-    rows = where(marks[start:end])
+    rows = flatnonzero(marks[start:end])
     for i in range(rows.shape[0]):
         rows[i] += start
     return rows
@@ -531,7 +533,7 @@ def _are_long(line: IntArray, table: FloatArray, rows: IntArray) -> BoolArray:
     its_line = np.empty(rows.shape[0], np.int64)
     for i in range(rows.shape[0]):
         its_line[i] = line[rows[i]]
-    return in_a_row(its_line, at_rows(table[POSITION], rows))
+    return in_a_row(its_line, take(table[POSITION], rows))
 
 
 def _in_picture(peaks: StripePeaks, field: Field) -> StripePeaks:

@@ -17,7 +17,7 @@ from aqualvs.geometry.compiled import (
     lazy_borrowing_kernel,
     lazy_kernel,
 )
-from aqualvs.geometry.linear_algebra import element_at, n_bins
+from aqualvs.geometry.linear_algebra import lower_quantile, n_bins
 from aqualvs.geometry.planes import Plane
 from aqualvs.scanning.candidates import Candidates, Subsegments
 from aqualvs.scanning.patch import height_over, packed_plane
@@ -211,7 +211,7 @@ def label_loose(
             straight = is_straight(shapes, s)
             label[i] = _kind_of(candidates.points, i, straight, target, working_range)
         if is_round(shapes, s, 0.0) and bright != bright:
-            bright = element_at(candidates.height, bright_share)
+            bright = lower_quantile(candidates.height, bright_share)
         if is_round(shapes, s, bright):
             label[i] = _BUBBLE
         elif is_bent(shapes, s):

@@ -20,7 +20,14 @@ from numpy.typing import NDArray
 
 from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.compiled import inline_kernel, inner_kernel, kernel, lazy_kernel
-from aqualvs.geometry.linear_algebra import at_rows, element_at, hypot, squared, sum_of, where
+from aqualvs.geometry.linear_algebra import (
+    flatnonzero,
+    hypot,
+    lower_quantile,
+    squared,
+    sum_of,
+    take,
+)
 from aqualvs.scanning.scan import Frame, ImagePlane
 from aqualvs.scanning.stripe import HEIGHT, IMBALANCE, STEP_U, STEP_V, TINT_U, TINT_V, TOP, WIDTH
 
@@ -312,7 +319,7 @@ def _noise(table: FloatArray) -> float:
     off = np.empty(table.shape[1])
     for i in range(table.shape[1]):
         off[i] = abs(table[IMBALANCE, i])
-    noise = element_at(off, 0.25) / quarter_of_normal
+    noise = lower_quantile(off, 0.25) / quarter_of_normal
     # Least chroma noise after rounding and subsampling, in levels.
     min_sigma = 0.7
     return max(noise / math.sqrt(2.0), min_sigma)
@@ -354,7 +361,7 @@ def _learn(table: FloatArray, u: float, v: float) -> tuple[float, float, float, 
             line_u, line_v = line_u / size, line_v / size
             for k in range(best.shape[0]):
                 of_u[k] = line_u * of_u[k] + line_v * of_v[k]
-            ratio = element_at(of_u, learned_quantile)
+            ratio = lower_quantile(of_u, learned_quantile)
             return line_u, line_v, max(ratio, RATIO_LEAST), sigma
     return u, v, 0.0, sigma
 
@@ -373,11 +380,11 @@ def _shown(table: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
 @inner_kernel
 def _middle(of_u: FloatArray, of_v: FloatArray) -> tuple[float, float, bool]:
     """Return the median of steps, and whether at least half of them are near it."""
-    u, v = element_at(of_u, 0.5), element_at(of_v, 0.5)
+    u, v = lower_quantile(of_u, 0.5), lower_quantile(of_v, 0.5)
     apart = np.empty(of_u.shape[0])
     for k in range(of_u.shape[0]):
         apart[k] = squared(of_u[k] - u) + squared(of_v[k] - v)
-    usual = element_at(apart, 0.5)
+    usual = lower_quantile(apart, 0.5)
     return u, v, usual <= squared(_LEARN.max_scatter) * (squared(u) + squared(v))
 
 
@@ -401,17 +408,17 @@ def _learn_paint(table: FloatArray, n_min: float) -> tuple[float, float, float, 
         height[k] = table[HEIGHT, i]
         of_u[k], of_v[k] = table[STEP_U, i] / height[k], table[STEP_V, i] / height[k]
         tint_of_u[k], tint_of_v[k] = table[TINT_U, i], table[TINT_V, i]
-    noise = _noise(table) / element_at(height, 0.5)
+    noise = _noise(table) / lower_quantile(height, 0.5)
     u, v, spread_u, spread_v = 0.0, 0.0, 0.0, 0.0
     near_u, near_v, n_near = np.empty(n), np.empty(n), n
     for k in range(n):
         near_u[k], near_v[k] = of_u[k], of_v[k]
     for _ in range(_ROUNDS):
-        u, v = element_at(near_u[:n_near], 0.5), element_at(near_v[:n_near], 0.5)
+        u, v = lower_quantile(near_u[:n_near], 0.5), lower_quantile(near_v[:n_near], 0.5)
         for k in range(n_near):
             near_u[k], near_v[k] = abs(near_u[k] - u), abs(near_v[k] - v)
-        seen_u = _PAINT.mad_to_sigma * element_at(near_u[:n_near], 0.5)
-        seen_v = _PAINT.mad_to_sigma * element_at(near_v[:n_near], 0.5)
+        seen_u = _PAINT.mad_to_sigma * lower_quantile(near_u[:n_near], 0.5)
+        seen_v = _PAINT.mad_to_sigma * lower_quantile(near_v[:n_near], 0.5)
         spread_u = math.sqrt(max(squared(seen_u) - squared(noise), squared(_PAINT.min_spread)))
         spread_v = math.sqrt(max(squared(seen_v) - squared(noise), squared(_PAINT.min_spread)))
         var_u, var_v = squared(spread_u) + squared(noise), squared(spread_v) + squared(noise)
@@ -421,7 +428,7 @@ def _learn_paint(table: FloatArray, n_min: float) -> tuple[float, float, float, 
             if off < squared(_PAINT.of_crowd):
                 near_u[n_near], near_v[n_near] = of_u[k], of_v[k]
                 n_near += 1
-    tint_u, tint_v = element_at(tint_of_u, 0.5), element_at(tint_of_v, 0.5)
+    tint_u, tint_v = lower_quantile(tint_of_u, 0.5), lower_quantile(tint_of_v, 0.5)
     size = hypot(tint_u, tint_v)
     across = hypot(spread_u, spread_v)
     if size > _PAINT.min_spread:
@@ -445,7 +452,7 @@ def _learn_beside_paint(
             var_v = squared(spread_v * height) + squared(sigma)
             off = squared(off_u) / var_u + squared(off_v) / var_v
             is_clear[i] = off > squared(_PAINT.clear_of_paint)
-    best = where(is_clear)
+    best = flatnonzero(is_clear)
     if best.shape[0] < _LEARN.min_learned:
         return u, v, 0.0, sigma, 1.0, 1.0
     of_u, of_v = _shown(table, best)
@@ -458,8 +465,8 @@ def _learn_beside_paint(
     for k in range(best.shape[0]):
         off_along[k] = abs(line_u * of_u[k] + line_v * of_v[k] - size)
         off_across[k] = abs(line_v * of_u[k] - line_u * of_v[k])
-    along = max(_PAINT.mad_to_sigma * element_at(off_along, 0.5) / size, _LEARN.min_scatter)
-    across = max(_PAINT.mad_to_sigma * element_at(off_across, 0.5) / size, _LEARN.min_scatter)
+    along = max(_PAINT.mad_to_sigma * lower_quantile(off_along, 0.5) / size, _LEARN.min_scatter)
+    across = max(_PAINT.mad_to_sigma * lower_quantile(off_across, 0.5) / size, _LEARN.min_scatter)
     return line_u, line_v, max(size, RATIO_LEAST), sigma, along, across
 
 
@@ -498,10 +505,10 @@ def _best_stripes(
     chosen = np.empty(table.shape[1], np.bool_)
     for i in range(table.shape[1]):
         chosen[i] = share[i] > 0.0
-    lowest = _LEARN.best_share * element_at(at_rows(share, where(chosen)), 0.95)
+    lowest = _LEARN.best_share * lower_quantile(take(share, flatnonzero(chosen)), 0.95)
     for i in range(table.shape[1]):
         chosen[i] = share[i] > lowest
-    return where(chosen)
+    return flatnonzero(chosen)
 
 
 @lazy_kernel

@@ -16,11 +16,11 @@ import numpy as np
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import ZERO, inner_borrowing_kernel, inner_kernel, lazy_kernel
 from aqualvs.geometry.linear_algebra import (
-    factorise,
-    inverse_of,
+    cholesky,
+    cholesky_inverse,
+    cholesky_solve,
     median_of,
     n_bins,
-    solve_factorised,
     squared,
 )
 from aqualvs.geometry.planes import Plane
@@ -224,9 +224,9 @@ def _solve(
                 factor[j, k] += part * terms[i, k]
     # A pivot below this share of its diagonal is rounding, not information.
     min_pivot = 1e-13
-    if not factorise(factor, 0.0, min_pivot, factor):
+    if not cholesky(factor, 0.0, min_pivot, factor):
         return False
-    solve_factorised(factor, right, coefficients)
+    cholesky_solve(factor, right, coefficients)
     return True
 
 
@@ -248,7 +248,7 @@ def curvature_in_sigmas(
             off -= terms[i, k] * coefficients[k]
         square += weight[i] * off * off
     scale = max(np.sqrt(square / (n - N)), 1.0)
-    inverse = inverse_of(factor)
+    inverse = cholesky_inverse(factor)
     most = 0.0
     for k in range(3, N):
         most = max(most, abs(coefficients[k]) / (np.sqrt(inverse[k, k]) * scale))
@@ -341,7 +341,7 @@ def reweight(
             off -= terms[i, k] * coefficients[k]
         square += weights[i] * off * off
         total += weights[i]
-    return scale, np.sqrt(square / total), inverse_of(known)
+    return scale, np.sqrt(square / total), cholesky_inverse(known)
 
 
 @inner_kernel

@@ -9,11 +9,11 @@ import numpy as np
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import inner_kernel, lazy_kernel
 from aqualvs.geometry.linear_algebra import (
-    factorise,
+    cholesky,
+    cholesky_solve,
     invert_symmetric,
     median_of,
     n_bins,
-    solve_factorised,
     solve_symmetric,
     squared,
 )
@@ -376,9 +376,9 @@ def _expected_square(matrix: FloatArray, residual: FloatArray) -> float:
             for b in range(a):
                 lower[a, b] = matrix[a, b]
             lower[a, a] = max(matrix[a, a], 0.0) + 1.0 / t
-        if not factorise(lower, 0.0, 0.0, lower):
+        if not cholesky(lower, 0.0, 0.0, lower):
             continue
-        solve_factorised(lower, residual, solved)
+        cholesky_solve(lower, residual, solved)
         total = -squared(math.log(t) / spread) - n_modes * math.log(t)
         for a in range(n_modes):
             total += residual[a] * solved[a] - 2.0 * math.log(lower[a, a])

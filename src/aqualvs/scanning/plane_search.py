@@ -20,7 +20,7 @@ from aqualvs.geometry.compiled import (
     inner_borrowing_kernel,
     inner_kernel,
 )
-from aqualvs.geometry.linear_algebra import at_rows, solve_symmetric, sum_of
+from aqualvs.geometry.linear_algebra import solve_symmetric, sum_of, take
 
 X, Y, Z, JX, JY, JZ, WEIGHT = range(7)
 """Rows of the table: centroid (m), sensitivity (m/px), sampling weight (search lines)."""
@@ -305,7 +305,7 @@ def search_plane(
         for c in range(n):
             heavy[c] = c
     n_heavy = heavy.shape[0]
-    cumulative_weight = at_rows(table[WEIGHT], heavy)
+    cumulative_weight = take(table[WEIGHT], heavy)
     for k in range(1, n_heavy):
         cumulative_weight[k] += cumulative_weight[k - 1]
     guide = np.empty(n_heavy, np.int64)

@@ -15,7 +15,7 @@ import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.compiled import inner_kernel, lazy_kernel
-from aqualvs.geometry.linear_algebra import median_of, n_bins, order_of, squared
+from aqualvs.geometry.linear_algebra import argsort, median_of, n_bins, squared
 from aqualvs.scanning.candidates import Candidates
 from aqualvs.scanning.net_surfaces import LONGEST_INTERVAL
 
@@ -215,7 +215,7 @@ def _listed(facts: FloatArray, distance: float) -> tuple[IntArray, float]:
         if seed or (short and near and loose):
             key[s] = facts[LASER, s] * 1e6 + facts[LINE, s]
             n_listed += 1
-    return order_of(key)[:n_listed], dimmest * total / max(n_seeds, 1)
+    return argsort(key)[:n_listed], dimmest * total / max(n_seeds, 1)
 
 
 @inner_kernel

@@ -22,7 +22,12 @@ import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.geometry.compiled import borrowing_kernel, kernel
-from aqualvs.geometry.linear_algebra import element_at, factorise, inverse_of, solve_factorised
+from aqualvs.geometry.linear_algebra import (
+    cholesky,
+    cholesky_inverse,
+    cholesky_solve,
+    lower_quantile,
+)
 from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig import Rig
 from aqualvs.optics.rig_covariance import FittedSurface, posture_by_plane
@@ -259,7 +264,7 @@ def _reweight(
             for k in range(3):
                 off += points[i, k] * (both[k] + times[i] * both[3 + k])
             z[i] = abs(off / sigma[i])
-        scale = max(1.4826 * element_at(z, 0.5), 0.1)
+        scale = max(1.4826 * lower_quantile(z, 0.5), 0.1)
         matrix[:], right[:] = prior, 0.0
         for i in range(n):
             far = z[i] / (TUKEY * scale)
@@ -272,9 +277,9 @@ def _reweight(
                 right[a] += weight * term[a]
                 for b in range(a + 1):
                     matrix[a, b] += weight * term[a] * term[b]
-        if not factorise(matrix, 0.0, 0.0, matrix):
+        if not cholesky(matrix, 0.0, 0.0, matrix):
             return False
-        solve_factorised(matrix, right, both)
+        cholesky_solve(matrix, right, both)
     return True
 
 
@@ -396,9 +401,9 @@ def _weigh_motions(
         _fill_terms(t[f], by_motion[f], by)
         both = covariances[f] + covariances[0]
         agrees = f == 0 or _agree(off, by, by_motion[0], variances, both)
-        if not agrees or not factorise(covariances[f], 0.0, 0.0, weighed):
+        if not agrees or not cholesky(covariances[f], 0.0, 0.0, weighed):
             continue
-        weighed[:] = inverse_of(weighed)
+        weighed[:] = cholesky_inverse(weighed)
         for a in range(12):
             for i in range(3):
                 term = 0.0
@@ -407,9 +412,9 @@ def _weigh_motions(
                 right[a] += term * off[i]
                 for b in range(12):
                     matrix[a, b] += term * by[i, b]
-    factorise(matrix, 0.0, 0.0, matrix)
-    covariance[:] = inverse_of(matrix)
-    solve_factorised(matrix, right, motion)
+    cholesky(matrix, 0.0, 0.0, matrix)
+    covariance[:] = cholesky_inverse(matrix)
+    cholesky_solve(matrix, right, motion)
 
 
 @borrowing_kernel
@@ -445,9 +450,9 @@ def _agree(
         for j in range(3):
             for k in range(9):
                 expected[i, j] += of_both[i, k] * variances[k] * of_both[j, k]
-    if not factorise(expected, 0.0, 0.0, expected):
+    if not cholesky(expected, 0.0, 0.0, expected):
         return False
-    solve_factorised(expected, off, told)
+    cholesky_solve(expected, off, told)
     return bool(off[0] * told[0] + off[1] * told[1] + off[2] * told[2] <= gate)
 
 

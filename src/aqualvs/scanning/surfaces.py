@@ -27,7 +27,7 @@ from aqualvs.geometry.compiled import (
     lazy_borrowing_kernel,
     lazy_kernel,
 )
-from aqualvs.geometry.linear_algebra import sum_of, where
+from aqualvs.geometry.linear_algebra import flatnonzero, sum_of
 from aqualvs.geometry.planes import Plane
 from aqualvs.scanning.candidates import Subsegments
 from aqualvs.scanning.net_surfaces import (
@@ -179,7 +179,7 @@ def search_surfaces(
     min_share = 0.03
     weight, found = table[WEIGHT], ZERO
     while found < MAX_SURFACES:
-        rows, left = where(free), 0
+        rows, left = flatnonzero(free), 0
         for k in range(rows.shape[0]):
             left += subsegments.n_lines[rows[k]]
         if left < enough or rows.shape[0] < min_subsegments:

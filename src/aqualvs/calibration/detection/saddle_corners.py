@@ -25,7 +25,7 @@ from aqualvs.geometry.compiled import (
     inner_borrowing_kernel,
     kernel,
 )
-from aqualvs.geometry.linear_algebra import factorise, solve_factorised
+from aqualvs.geometry.linear_algebra import cholesky, cholesky_solve
 
 MIN_PIVOT = 1e-12
 """Ratio of a pivot of the normal matrix to its diagonal below which there is no information."""
@@ -147,14 +147,14 @@ def _fit(
             return 0.0, 1.0
         if max(abs(best[0] - window[_X]), abs(best[1] - window[_Y])) < _FIT.recentre_px:
             break
-    if not best[6] > 0.0 or not factorise(matrices[0], 0.0, MIN_PIVOT, matrices[2]):
+    if not best[6] > 0.0 or not cholesky(matrices[0], 0.0, MIN_PIVOT, matrices[2]):
         return 0.0, 1.0
     variance = rss / (count - _N)
     spread = 0.0
     for i in range(2):
         unit[:] = 0.0
         unit[i] = 1.0
-        solve_factorised(matrices[2], unit, column)
+        cholesky_solve(matrices[2], unit, column)
         spread += 0.5 * variance * column[i]
     return math.sqrt(spread), math.sqrt(variance) / best[6]
 
@@ -189,9 +189,9 @@ def _descend(
     rss, count = _sums(image, window, best, matrices[0], gradient, vectors[5])
     damping = 1e-3
     for _ in range(_FIT.max_iterations):
-        if count < 2 * _N or not factorise(matrices[0], damping, MIN_PIVOT, matrices[2]):
+        if count < 2 * _N or not cholesky(matrices[0], damping, MIN_PIVOT, matrices[2]):
             return np.inf, 0
-        solve_factorised(matrices[2], gradient, step)
+        cholesky_solve(matrices[2], gradient, step)
         _advance(best, step, tried)
         new_rss, _ = _sums(image, window, tried, matrices[1], vectors[3], vectors[5])
         if new_rss <= rss:

@@ -31,7 +31,7 @@ from aqualvs.geometry.compiled import (
     inner_kernel,
     kernel,
 )
-from aqualvs.geometry.linear_algebra import factorise, inverse_of, solve_factorised
+from aqualvs.geometry.linear_algebra import cholesky, cholesky_inverse, cholesky_solve
 
 # Unknowns: centre 0-1; linear part 2-5, row by row; perspective 6-7; bend of x and of y 8-13, in
 # pixels per q0 q0, q0 q1, q1 q1; log of the blur 14; log of gamma 15; level 16, contrast 17; slopes
@@ -337,9 +337,9 @@ def descend(
     squares += _add_prior(prior, unknowns, normal, gradient)
     damping = 1e-3
     for _ in range(n_steps):
-        if not factorise(normal, damping, MIN_PIVOT, lower):
+        if not cholesky(normal, damping, MIN_PIVOT, lower):
             return False
-        solve_factorised(lower, gradient, step)
+        cholesky_solve(lower, gradient, step)
         _shorten(step, unknowns)
         tried = unknowns + step
         tried[BLUR] = min(max(tried[BLUR], _LOG_BLUR[0]), _LOG_BLUR[1])
@@ -359,9 +359,9 @@ def descend(
             and abs(step[BLUR]) < _DESCENT.settled_log_blur
         ):
             break
-    if not factorise(normal, 0.0, MIN_PIVOT, lower):
+    if not cholesky(normal, 0.0, MIN_PIVOT, lower):
         return False
-    covariance[:, :] = inverse_of(lower)
+    covariance[:, :] = cholesky_inverse(lower)
     return True
 
 
