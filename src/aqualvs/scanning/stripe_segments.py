@@ -1,13 +1,13 @@
-"""Pieces of stripes in a whole picture, and the likelihood that each is a laser's line.
+"""Segments of stripes in a whole picture, and the log odds that each is a laser's line.
 
-A piece is a smooth chain of peaks of neighbouring search lines. One peak carries little evidence:
-noise, texture and printed edges make thousands, some of them of the laser's colour. Pooled along a
-piece, the evidence is strong: a laser's line is long for its width, thin, higher than either side,
-and moves the chroma along the wavelength's direction and not across it. Where a camera or codec has
-blurred the chroma, a line shows it only beside itself, as a halo. The evidence is weighted by
-logistic regression, twice: first with general statistics of lines, then with those of the picture's
-own lines, which are learned from the pieces that are certain. Where these lie and how they run is
-evidence too. Where no piece is certain, there is no line.
+For pictures without a rig. A segment is a smooth chain of peaks of neighbouring search lines. One
+peak carries little evidence: noise, texture and printed edges make thousands, some of them of the
+laser's colour. Pooled along a segment, the evidence is strong: a laser's line is long for its
+width, thin, brighter than both sides, and moves the chroma along the wavelength's direction and not
+across it. If a camera or codec has blurred the chroma, a line shows it only in a halo beside
+itself. Logistic regression weights the evidence twice: first with general statistics of lines, then
+with those of the picture's own lines, which are learned from the segments that are certain. Their
+positions and directions are evidence, too. If no segment is certain, the picture has no line.
 """
 
 import math
@@ -40,41 +40,45 @@ Rows = NDArray[np.float32]
 
 LENGTH, HEIGHT, WIDTH, TOP, ONE_SIDED, ALONG, ACROSS, HALO = range(8)
 FIRST_X, FIRST_Y, LAST_X, LAST_Y = range(8, 12)
-"""Rows of a table of pieces: lengths and places in pixels, heights in grey levels."""
+"""Rows of a table of segments: lengths and places in pixels, heights in grey levels."""
 
-# Least height of peaks in grey levels, in a picture smoothed along the stripes by this many search
-# lines, so that noise of one pixel does not break a faint line. Number of peaks per search line.
+# Least height of peaks in grey levels; standard deviation in search lines of the Gaussian that
+# smooths the picture along the stripes, so that noise of one pixel does not break a faint line;
+# largest number of peaks per search line.
 _MIN_CONTRAST, SMOOTHING, _PEAKS_PER_LINE = 3, 1.0, 120
-# Ends of a piece: distance to the next return in search lines and in pixels; bend within three
-# peaks in pixels and as a share of the width. Least number of peaks.
+# A segment ends where the next peak is farther away, in search lines or in pixels, or where three
+# peaks bend by more than this, in pixels and as a share of the width. Least number of peaks.
 _MAX_LINE_STEP, _MAX_STEP_PX = 2, 4.0
 _KINK_PX, _KINK_IN_WIDTHS, MIN_PEAKS = 1.0, 0.25, 5
-# Light and chroma of a stripe are summed up to its flanks, this many pixels beyond half height.
+# Intensity and chroma of a stripe are summed up to its flanks, this many pixels beyond half height.
 _FLANK_PX = 2
 
 
 class _EvidenceOptions(NamedTuple):
-    """Evidence that pieces of a picture are laser light, where no rig is known."""
+    """Bounds of the evidence, and segments that are certainly lines.
 
-    # Ratios of chroma to light, and differences in height of the flanks for each level, are clipped
-    # to these bounds. Every red line of the photographs has at least the expected halo, however
-    # coded.
+    Tuned on the photographs of docs/real-light.md and on rendered caustics.
+    """
+
+    # Bounds of the chroma for each grey level of intensity, along and across the laser's colour,
+    # and of the difference between the flanks as a share of the height. Every red line of the
+    # photographs has at least the expected halo, in every coding.
     max_ratio: float = 1.0
     min_ratio: float = -0.5
     max_across: float = 0.6
     max_one_sided: float = 3.0
     halo_expected: float = 0.3
-    # Pieces of more than these log odds, by the general statistics of lines, and of this share of
-    # the picture's width are certain. Without laser, long pieces of its colour are rare: those of
-    # rendered caustics have up to 3.0, longer gaps between lines of another colour up to 1.3.
-    # Pieces with less chroma for each level than any camera's lines, on themselves or beside them,
+    # Segments above these log odds, by the general statistics of lines, are certain if they are
+    # longer than this share of the picture's width. Without laser, long segments of its colour are
+    # rare: those of rendered caustics have up to 3.0, longer gaps between lines of another colour
+    # up to 1.3. Segments with less chroma than any camera's lines, on themselves or beside them,
     # are not certain: a highlight on steel, for example.
     certain: float = 3.2
     certain_share: float = 0.08
     certain_if_long: float = 1.4
     long_share: float = 0.2
-    # Dashes in a row: largest gap as a share of the picture's width; largest deviation from the
-    # direction of a piece in pixels, and as a share of the gap.
+    # Segments that continue one another: largest gap as a share of the picture's width; largest
+    # distance from the straight continuation in pixels, and as a share of the gap.
     max_gap: float = 0.1
     off_px: float = 1.5
     off_share: float = 0.05
@@ -108,20 +112,20 @@ WEIGHTS = Weights(
 
 
 class StripeSegments(NamedTuple):
-    """Pieces of stripes, P of them, along one search direction."""
+    """Segments of stripes, P of them, along one search direction."""
 
     search: LaserBand  # Of the whole picture.
     peaks: StripePeaks  # All peaks of the search direction.
-    order: IntArray  # Shape (N,): indices into the peaks, piece by piece, along each piece.
-    start: IntArray  # Shape (P + 1,): where each piece begins in `order`, and N.
-    table: FloatArray  # Shape (12, P): measures of the pieces, rows as named above.
+    order: IntArray  # Shape (N,): indices into the peaks, segment by segment, along each segment.
+    start: IntArray  # Shape (P + 1,): where each segment begins in `order`, and N.
+    table: FloatArray  # Shape (12, P): measures of the segments, rows as named above.
 
 
 class PictureRows(NamedTuple):
     """A picture laid out for one search direction, with search lines as rows."""
 
-    # Shape (n_lines, length): grey levels of the channel in which the laser is brightest.
-    intensity_weight: Rows
+    # Shape (n_lines, length): grey levels of the picture in which the laser has the most contrast.
+    intensity: Rows
     # Shape (n_lines, length): chroma along the direction of the laser's colour and at right angles
     # to it; of shape (0, 0) for a grey picture.
     along: Rows
@@ -129,7 +133,7 @@ class PictureRows(NamedTuple):
 
 
 def picture_rows(frame: Frame, search: LaserBand, colour: LaserColour) -> PictureRows:
-    """Return a picture as the rows of a search, light smoothed along the stripes.
+    """Return a picture as the rows of a search, its intensity smoothed along the stripes.
 
     Parameters
     ----------
@@ -155,6 +159,7 @@ def picture_rows(frame: Frame, search: LaserBand, colour: LaserColour) -> Pictur
 
 
 def _rows(image: ImagePlane | Rows, search: LaserBand) -> Rows:
+    """Return the search lines (n_lines, length) of an image, means of several pixels if need be."""
     lines = image.T if search.axis is SearchAxis.ALONG_Y else image
     step = search.line_px
     n = len(lines) // step
@@ -165,7 +170,7 @@ def _rows(image: ImagePlane | Rows, search: LaserBand) -> Rows:
 
 
 def find_segments(frame: Frame, search: LaserBand) -> StripeSegments:
-    """Find and measure all pieces, of whatever colour, along one search direction.
+    """Find and measure all segments, of whatever colour, along one search direction.
 
     Parameters
     ----------
@@ -174,7 +179,7 @@ def find_segments(frame: Frame, search: LaserBand) -> StripeSegments:
         Of the whole picture, with the colour of the laser.
     """
     rows = picture_rows(frame, search, search.colour)
-    peaks = _peaks(rows.intensity_weight, search, frame.luma.shape[1])
+    peaks = _peaks(rows.intensity, search, frame.luma.shape[1])
     order, start = _smooth_chains(peaks, search)
     n_measures = 12
     table = np.empty((n_measures, len(start) - 1))
@@ -184,6 +189,7 @@ def find_segments(frame: Frame, search: LaserBand) -> StripeSegments:
 
 
 def _peaks(light: Rows, search: LaserBand, width_px: int) -> StripePeaks:
+    """Return the peaks of a picture of this width whose flanks lie in the picture."""
     n_lines, length = light.shape
     # Reach of the search for the background: a share of the picture's width, or this many pixels.
     reach_share, min_reach = 0.045, 8
@@ -197,7 +203,6 @@ def _peaks(light: Rows, search: LaserBand, width_px: int) -> StripePeaks:
     n = finder.find(image, _MIN_CONTRAST, 1, line, table)
     line, table = line[:n], table[:, :n]
     position, height, width = table[POSITION], table[PEAK_HEIGHT], table[PEAK_WIDTH]
-    # Flanks must lie in the picture.
     margin = np.ceil(0.5 * width) + _FLANK_PX + 2.0
     inside = (position >= margin) & (position < length - 1 - margin)
     position, height, width = (column[inside] for column in (position, height, width))
@@ -206,7 +211,10 @@ def _peaks(light: Rows, search: LaserBand, width_px: int) -> StripePeaks:
 
 
 def _smooth_chains(peaks: StripePeaks, search: LaserBand) -> tuple[IntArray, IntArray]:
-    """Return chains of peaks without gaps, kinks and steps: order, and where each begins."""
+    """Return chains of peaks without gaps, kinks and steps: `order`, `start` of `StripeSegments`.
+
+    Chains shorter than MIN_PEAKS are dropped.
+    """
     segments = link_segments(peaks, search)
     order = segments.order
     if len(order) == 0:
@@ -226,7 +234,7 @@ def _smooth_chains(peaks: StripePeaks, search: LaserBand) -> tuple[IntArray, Int
 
 
 def _height_steps(height: FloatArray, ends: BoolArray) -> IntArray:
-    """Return after which peaks (of N) the height changes for good, but not beside an end."""
+    """Return the peaks (of N) after which the height changes lastingly, but not beside an end."""
     n, half = len(height), MIN_PEAKS
     if n < 2 * half:
         return np.zeros(0, np.int64)
@@ -235,10 +243,10 @@ def _height_steps(height: FloatArray, ends: BoolArray) -> IntArray:
     change[half - 1 : n - half] = np.abs(median[half:] - median[:-half])
     chain = np.concatenate([[0], np.cumsum(ends)])
     change[half - 1 : n - half][chain[: n - 2 * half + 1] != chain[2 * half - 1 :]] = 0.0
-    # One end for each step: where the medians differ most.
+    # A step is one end only: at the largest difference of the medians.
     largest = np.lib.stride_tricks.sliding_window_view(np.pad(change, half), 2 * half + 1).max(1)
-    # Where the median height of MIN_PEAKS changes by this factor, another thing begins: noise and
-    # the ringing of a codec continue many a line.
+    # If the median height of MIN_PEAKS peaks changes by this factor, another object begins: noise
+    # and the ringing of a codec continue many lines.
     height_step = 3.0
     return np.flatnonzero((change > math.log(height_step)) & (change >= largest))
 
@@ -253,15 +261,15 @@ def _measure(
     along_x: bool,
     table: FloatArray,
 ) -> None:
-    """Write the measures of all pieces."""
+    """Write the measures of all segments; fields and shapes as in `StripeSegments`."""
     light, along, across = rows
     line, position, width = peaks.line, peaks.position, peaks.width
     has_colour = along.shape[0] > 0
-    # The halo is summed up to so many pixels beyond them: codecs keep chroma in blocks of 16
-    # pixels.
+    # The halo is summed up to this many pixels beyond the flanks: codecs keep chroma in blocks of
+    # 16 pixels.
     halo_px = 6
-    # Another stripe beside a peak ends its halo: a piece over this share of the search lines, which
-    # noise and a line in pieces do not reach.
+    # The halo ends at another stripe: a segment over this share of the search lines, which noise
+    # and broken lines do not reach.
     long_share = 0.1
     is_long = np.zeros(line.shape[0], np.bool_)
     for k in range(start.shape[0] - 1):
@@ -306,7 +314,10 @@ def _measure(
 
 @inner_kernel
 def _middles(peaks: StripePeaks, is_long: BoolArray, i: int) -> tuple[float, float]:
-    """Return the middles between a peak and the next long pieces before and after it."""
+    """Return the midpoints between peak i and the next long segments before and after it.
+
+    Positions along the search line in pixels; infinite where there is no such segment.
+    """
     line, position = peaks.line, peaks.position
     before, after = -np.inf, np.inf
     k = i - 1
@@ -326,7 +337,7 @@ def _middles(peaks: StripePeaks, is_long: BoolArray, i: int) -> tuple[float, flo
 
 @inner_kernel
 def _sum_above_flanks(row: Rows, low: int, high: int) -> float:
-    """Return the sum between two flanks above the straight line from one to the other."""
+    """Return the sum of a row between two flanks, above the straight line that joins them."""
     left, right = 0.5 * (row[low] + row[low - 1]), 0.5 * (row[high] + row[high + 1])
     total = 0.0
     for k in range(low + 1, high):
@@ -336,20 +347,21 @@ def _sum_above_flanks(row: Rows, low: int, high: int) -> float:
 
 
 def general_evidence(table: FloatArray, width_px: int, *, has_colour: bool) -> FloatArray:
-    """Return the evidence that separates lines from other things in any picture, one row a piece.
+    """Return the evidence that separates lines from other objects in any picture.
 
     Parameters
     ----------
     table : array, shape (12, P)
-        Measures of pieces.
+        Measures of segments.
     width_px : int
-        Of the picture: stripes are about as thin for it in every camera.
+        Of the picture: the width of stripes is about the same share of it in every camera.
     has_colour : bool
-        Whether the picture has chroma; else every piece counts as of the laser's colour.
+        Whether the picture has chroma; else every segment counts as of the laser's colour.
 
     Returns
     -------
     array, shape (P, 15)
+        A row for each segment.
     """
     length = np.log(32.0 * table[LENGTH] / width_px + 0.1)
     slimness = np.log(table[LENGTH] / table[WIDTH] + 0.5)
@@ -360,16 +372,16 @@ def general_evidence(table: FloatArray, width_px: int, *, has_colour: bool) -> F
     most, across = halo, np.zeros(n)
     if has_colour:
         along, halo = (
-            _believed(table, ALONG, RATIO_LEAST),
-            _believed(table, HALO, _EVIDENCE.halo_expected),
+            _clip_ratio(table, ALONG, RATIO_LEAST),
+            _clip_ratio(table, HALO, _EVIDENCE.halo_expected),
         )
         most, across = np.maximum(table[ALONG], table[HALO]), table[ACROSS]
     levels = np.maximum(np.maximum(along, halo), 0.0) * table[HEIGHT]
     as_expected = np.clip(halo, 0.0, _EVIDENCE.halo_expected)
-    # More chroma for each level than this is coloured paint, or the halo of another thing; and the
-    # logarithm of that excess is clipped.
+    # More chroma for each level than this is coloured paint, or the halo of another object; the
+    # logarithm of the excess is clipped.
     painted_ratio, max_excess = 1.5, 3.0
-    # Noise of chroma, in levels.
+    # Chroma that counts as noise, in levels.
     chroma_noise = 2.0
     return np.stack(
         [
@@ -382,7 +394,7 @@ def general_evidence(table: FloatArray, width_px: int, *, has_colour: bool) -> F
             width,
             np.minimum(table[ONE_SIDED], _EVIDENCE.max_one_sided),
             as_expected,
-            # Noise hides the colour of a short piece, not that of a long one.
+            # Noise hides the colour of a short segment, not that of a long one.
             as_expected * length,
             np.clip(halo, _EVIDENCE.min_ratio, 0.0),
             np.clip(along, _EVIDENCE.min_ratio, 0.0),
@@ -394,15 +406,15 @@ def general_evidence(table: FloatArray, width_px: int, *, has_colour: bool) -> F
     )
 
 
-def _believed(table: FloatArray, row: int, in_white: float) -> FloatArray:
-    """Return chroma for each level (P,) of a row; a white core says nothing."""
+def _clip_ratio(table: FloatArray, row: int, in_white: float) -> FloatArray:
+    """Return a clipped ratio of chroma to intensity (P,); at least `in_white` in a white core."""
     ratio = np.minimum(table[row], _EVIDENCE.max_ratio)
     believed: FloatArray = np.where(table[TOP] >= WHITE, np.maximum(ratio, in_white), ratio)
     return believed
 
 
 class OwnLines(NamedTuple):
-    """Statistics of the lines of a picture: colour, and logarithms of width and height."""
+    """Medians over a picture's lines: chroma for each level, logarithms of width and height."""
 
     along: float
     across: float
@@ -413,12 +425,12 @@ class OwnLines(NamedTuple):
 def learn_lines(
     table: FloatArray, log_odds: FloatArray, width_px: int, *, has_colour: bool
 ) -> OwnLines | None:
-    """Learn the statistics of the picture's lines from the pieces that are certain.
+    """Learn the statistics of the picture's lines from the segments that are certain.
 
     Parameters
     ----------
     table : array, shape (12, P)
-        Measures of pieces, lengths together with the pieces that continue them.
+        Measures of segments; lengths include the segments that continue them.
     log_odds : array, shape (P,)
         By the general evidence.
     width_px : int
@@ -429,7 +441,7 @@ def learn_lines(
     Returns
     -------
     OwnLines or None
-        None where no piece is certain.
+        None where no segment is certain.
     """
     share = table[LENGTH] / width_px
     is_certain = (log_odds > _EVIDENCE.certain) & (share >= _EVIDENCE.certain_share)
@@ -455,7 +467,14 @@ def learn_lines(
 def own_evidence(
     table: FloatArray, lines: OwnLines, width_px: int, *, has_colour: bool
 ) -> FloatArray:
-    """Return the general evidence, and the differences of pieces from the picture's own lines.
+    """Return the general evidence, and the differences of segments from the picture's own lines.
+
+    Parameters
+    ----------
+    table, width_px, has_colour
+        As in `general_evidence`.
+    lines : OwnLines
+        From `learn_lines`.
 
     Returns
     -------
@@ -463,8 +482,9 @@ def own_evidence(
     """
     general = general_evidence(table, width_px, has_colour=has_colour)
     off_across = np.zeros(table.shape[1])
-    # Spread of the colour of a picture's lines: chroma for each level, and as a share of theirs.
+    # Spread of the colour of a picture's lines: chroma for each level, and a share of their chroma.
     across_spread, share_spread = 0.08, 0.3
+    # Largest evidence from one difference: three standard deviations, squared.
     max_own = 9.0
     if has_colour:
         spread = across_spread + share_spread * np.hypot(lines.along, lines.across)
@@ -479,17 +499,18 @@ def own_evidence(
 
 
 def place_evidence(table: FloatArray, log_odds: FloatArray, width_px: int) -> FloatArray:
-    """Return how much likelier lines than other things lie and run as pieces do, as log odds.
+    """Return the evidence, as log odds, from the position and direction of segments.
 
     Lines of one laser pass through a part of the picture only, in about one direction, or in a few
-    on bent surfaces. Both densities are those of the picture's other pieces. Lines may lie where
-    none is known: each piece that is certain makes that less likely, as in a Dirichlet process.
-    Where few are certain, or where lines and other things lie alike, this tells little.
+    on bent surfaces. The densities of lines and of other objects are estimated from the picture's
+    other segments. Lines may lie where none is known: each segment that is certain makes that less
+    likely, as in a Dirichlet process. If few are certain, or if lines and other objects lie alike,
+    this evidence is weak.
 
     Parameters
     ----------
     table : array, shape (12, P)
-        Measures of all pieces of one picture.
+        Measures of all segments of one picture.
     log_odds : array, shape (P,)
         That each is a line, by its shape and colour.
     width_px : int
@@ -499,15 +520,15 @@ def place_evidence(table: FloatArray, log_odds: FloatArray, width_px: int) -> Fl
     -------
     array, shape (P,)
     """
-    # Pieces of more than these log odds tell where lines are, pieces below zero where others are.
+    # Segments above these log odds give the density of lines, those below zero that of others.
     certain = 2.0
-    # What is not known counts as this many pieces: a picture has but a few lasers, and each of its
-    # lines breaks into a few pieces. With 3 or 8 as many red lines are found in the photographs of
-    # docs/real-light.md, and with more, more of a second laser that was not seen well.
+    # Weight of the uniform prior density, in segments: a picture has few lasers, and each of their
+    # lines breaks into a few segments. With 3 or 8, as many red lines are found in the photographs
+    # of docs/real-light.md; with more, more of a second, poorly visible laser.
     n_unknown = 5.0
-    # In the second round, pieces count that their places made certain in the first.
+    # The second round includes segments that the first one has made certain.
     n_rounds = 2
-    # Of many other things, this many or more tell as much.
+    # Enough segments of other objects for their density; more are thinned, to save time.
     n_enough = 500
     evidence = np.zeros(len(log_odds))
     for _ in range(n_rounds):
@@ -522,9 +543,12 @@ def place_evidence(table: FloatArray, log_odds: FloatArray, width_px: int) -> Fl
 
 
 def _density(table: FloatArray, of: IntArray, width_px: int) -> FloatArray:
-    """Return how densely pieces `of` lie along each piece (P,), itself left out; 1 if evenly."""
-    # Spread of the directions of one laser's lines on bent surfaces, and of short pieces; spread of
-    # places across lines by the depth of the scene, as a share of the picture's width.
+    """Return the density (P,) of segments `of` along each segment, itself left out; 1 if uniform.
+
+    A kernel density estimate over the direction and the position across the lines.
+    """
+    # Kernel width in direction: that of one laser's lines on bent surfaces, and of short segments.
+    # Kernel width in position, due to the depth of the scene, as a share of the picture's width.
     spread_rad, spread_share = 0.2, 0.04
     x, y = 0.5 * (table[FIRST_X] + table[LAST_X]), 0.5 * (table[FIRST_Y] + table[LAST_Y])
     angle = np.arctan2(table[LAST_Y] - table[FIRST_Y], table[LAST_X] - table[FIRST_X])
@@ -546,12 +570,12 @@ def _density(table: FloatArray, of: IntArray, width_px: int) -> FloatArray:
 
 
 def line_log_odds(table: FloatArray, width_px: int, *, has_colour: bool) -> FloatArray:
-    """Return the log odds that each piece is a laser's line.
+    """Return the log odds that each segment is a laser's line.
 
     Parameters
     ----------
     table : array, shape (12, P)
-        Measures of all pieces of one picture.
+        Measures of all segments of one picture.
     width_px : int
         Of the picture.
     has_colour : bool
@@ -563,48 +587,40 @@ def line_log_odds(table: FloatArray, width_px: int, *, has_colour: bool) -> Floa
         Minus infinity for all where none is certain.
     """
     log_odds = general_evidence(table, width_px, has_colour=has_colour) @ WEIGHTS.general
-    # Dashes in a row are as long as all of them together.
+    # Segments that continue one another count with their total length.
     likely = np.flatnonzero(log_odds > 0.0)
-    in_a_row = table.copy()
-    in_a_row[LENGTH, likely] = _length_in_a_row(table[:, likely], width_px)
-    log_odds = general_evidence(in_a_row, width_px, has_colour=has_colour) @ WEIGHTS.general
-    lines = learn_lines(in_a_row, log_odds, width_px, has_colour=has_colour)
+    joined = table.copy()
+    joined[LENGTH, likely] = _length_with_continuations(table[:, likely], width_px)
+    log_odds = general_evidence(joined, width_px, has_colour=has_colour) @ WEIGHTS.general
+    lines = learn_lines(joined, log_odds, width_px, has_colour=has_colour)
     if lines is None:
         return np.full(table.shape[1], -np.inf)
     found: FloatArray = own_evidence(table, lines, width_px, has_colour=has_colour) @ WEIGHTS.own
     return found + place_evidence(table, found, width_px)
 
 
-def _length_in_a_row(table: FloatArray, width_px: int) -> FloatArray:
-    """Return the length (P,) of each piece together with the pieces that continue it."""
+def _length_with_continuations(table: FloatArray, width_px: int) -> FloatArray:
+    """Return the length (P,) of each segment together with the segments that continue it."""
     if table.shape[1] == 0:
         return np.zeros(0)
-    ends = _ends(table)
-    linked = np.zeros((len(ends), len(ends)), bool)
-    for k, one in enumerate(ends):
-        linked[k] = _goes_on(one, ends, width_px)
+    # First and last point of each segment.
+    ends = table[[FIRST_X, FIRST_Y, LAST_X, LAST_Y]].T.reshape(-1, 2, 2)
+    linked = np.array([_continuations(one, ends, width_px) for one in ends])
     linked |= linked.T | np.eye(len(ends), dtype=bool)
-    _, row = connected_components(csr_array(linked), directed=False)
-    return np.asarray(np.bincount(row, table[LENGTH])[row], np.float64)
+    _, line = connected_components(csr_array(linked), directed=False)
+    return np.asarray(np.bincount(line, table[LENGTH])[line], np.float64)
 
 
-def _ends(table: FloatArray) -> FloatArray:
-    """Return the first and the last point (P, 2, 2) of pieces."""
-    return table[[FIRST_X, FIRST_Y, LAST_X, LAST_Y]].T.reshape(-1, 2, 2)
-
-
-def _goes_on(segment: FloatArray, others: FloatArray, width_px: int) -> BoolArray:
-    """Mark which other pieces (N, 2, 2) lie on the straight continuation of a piece (2, 2)."""
-    way = segment[1] - segment[0]
-    length = float(np.hypot(*way))
-    way = way / max(length, 1e-9)
-    middle = segment.mean(axis=0)
-    off = others - middle
-    along, across = off @ way, off @ np.array([-way[1], way[0]])
-    # The gap is at most the length of the piece, because of the uncertainty of its direction.
+def _continuations(segment: FloatArray, others: FloatArray, width_px: int) -> BoolArray:
+    """Mark the segments (N, 2, 2) that lie on the straight continuation of a segment (2, 2)."""
+    direction = segment[1] - segment[0]
+    length = float(np.hypot(*direction))
+    direction = direction / max(length, 1e-9)
+    off = others - segment.mean(axis=0)
+    along, across = off @ direction, off @ np.array([-direction[1], direction[0]])
+    # The gap is at most the length of the segment, because its direction is uncertain.
     gap = np.abs(along).min(axis=1) - 0.5 * length
     reach = min(length, _EVIDENCE.max_gap * width_px)
     allowed = _EVIDENCE.off_px + _EVIDENCE.off_share * np.maximum(gap, 0.0)
-    goes_on: BoolArray = np.abs(across).max(axis=1) <= allowed
-    goes_on &= (gap > -0.5 * length) & (gap <= reach)
-    return goes_on
+    continues: BoolArray = np.abs(across).max(axis=1) <= allowed
+    return continues & (gap > -0.5 * length) & (gap <= reach)
