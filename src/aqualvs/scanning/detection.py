@@ -1,4 +1,4 @@
-"""Stripe detection in a whole frame: one search for each direction that the lasers need.
+"""Stripe detection in a whole frame: one search for each direction of the lasers' stripes.
 
 `SearchLines` makes the search images, in which search lines are rows; `FrameDetector` finds the
 peaks in them within the lasers' bands.
@@ -52,9 +52,8 @@ class SearchLines:
     """Search lines of pictures of one size, as rows; buffers are allocated once.
 
     In wide pictures a search line is the mean of two rows or columns, smoothed along itself by
-    (1, 2, 1) / 4: a stripe can be only a pixel or two wide there, which would lock its centre to
-    the pixel grid. All means are of two bytes and rounded up, for which processors have an
-    instruction.
+    (1, 2, 1) / 4: a stripe may be only a pixel or two wide there, and its centre would be biased to
+    the pixel grid. All means are of two bytes, rounded up: processors have an instruction for that.
 
     Parameters
     ----------
@@ -85,7 +84,7 @@ class SearchLines:
         Returns
         -------
         uint8 array, shape (n_lines, length)
-            Overwritten by the next call; the picture itself where that is the same.
+            Overwritten by the next call; `luma` itself if its rows are the search lines.
         """
         lines = luma
         if self._paired:
@@ -96,6 +95,7 @@ class SearchLines:
 
 @inline_kernel
 def _mean(one: np.uint8, other: np.uint8) -> np.uint8:
+    """Return the mean, rounded up; compiled to one vector instruction."""
     return np.uint8((np.uint16(one) + np.uint16(other) + np.uint16(1)) >> np.uint16(1))
 
 
@@ -132,6 +132,7 @@ def _pair_columns(luma: U8Array, means: U8Array, columns: U8Array) -> None:
 
 @inner_kernel
 def _pair_pixels(row: U8Array, mean: U8Array) -> None:
+    """Write the means of two neighbours each."""
     for x in range(mean.shape[0]):
         mean[x] = _mean(row[2 * x], row[2 * x + 1])
 
@@ -141,48 +142,50 @@ DETECTORS: dict[str, type[DetectorOptions]] = {
     "ridge": StripeOptions,
     "threshold": ThresholdOptions,
 }
-"""Options of every detector, by its word on the command line and in files."""
+"""Options of every detector, by its name on the command line and in files."""
 
 
-class _SearchOptions(NamedTuple):
-    """Sample of a frame that tells how high its stripes are."""
+class _SampleOptions(NamedTuple):
+    """Sample of a frame's search lines, from which the contrast threshold follows."""
 
-    # One search line of this many is sampled first. Low peaks are used up to this many times the
-    # number that the lasers can make.
+    # One search line in this many is sampled first. The threshold is raised until there are at most
+    # this many times as many peaks as the lasers can make.
     sample_every: int = 48
     max_peaks: float = 2.0
-    # A picture is quiet if its peaks are fewer than this many times that number.
+    # A picture with fewer peaks than this many times that number is quiet.
     quiet: float = 0.25
     # Quantile of the height of a frame's bright peaks.
     bright_quantile: float = 0.9
+    # Float64 numbers in a cache line of 64 bytes.
     cache_line: int = 8
-    # An overexposed line is no wider than this share of the picture.
+    # Largest width of an overexposed line, as a share of the picture's width.
     widest_white: float = 0.02
 
 
-_SEARCH = _SearchOptions()
+_SAMPLE = _SampleOptions()
 
 
 class _DashOptions(NamedTuple):
-    """Stripes on thin twine whose chroma the codec dropped.
+    """Limits for stripes on thin twine whose chroma the codec dropped.
+
+    Tall peaks are those that are always used (`HIGHEST_USEFUL`); coloured ones show as much of the
+    lasers' colour as the weakest line; long ones lie in a segment that is longer than a dash.
 
     Tuned on rendered dives of nets: as H.264 at 640x480, of an interlaced camera, and as MPEG-4
-    (Part 2) at 0.4 to 2 Mbit/s with a wall behind the net. In the first two up to 0.18 of the tall
-    peaks are coloured; of nets whose stripes kept their chroma, 0.27 and more. In the last, up to
-    0.28 of the dashes and 0.73 of the long lines are; where the chroma is kept, 0.31 and 0.82.
+    (Part 2) at 0.4 to 2 Mbit/s with a wall behind the net. In the first two, up to 0.18 of the tall
+    peaks are coloured; if the stripes keep their chroma, 0.27 and more. In the last, up to 0.28 of
+    the dashes and 0.73 of the long lines are; if the chroma is kept, 0.31 and 0.82.
     """
 
-    # Least number of tall peaks, those that are always used, and the largest ratio of it to what
-    # the lasers can make; the largest share of them that shows as much of the lasers' colour as the
-    # weakest line; and the largest share that is longer than a dash: of such stripes codecs keep
-    # the chroma.
+    # Least number of tall peaks; the largest ratio of it to the number that the lasers can make;
+    # the largest shares of coloured and of long peaks: codecs keep the chroma of long ones.
     min_tall: int = 48
     crowd: float = 1.5
     max_coloured: float = 0.2
     max_long: float = 0.5
-    # Where more of them are long, as with a wall behind the net: the largest ratio of tall peaks,
-    # and the least of long ones, to what the lasers can make; the largest coloured shares of the
-    # dashes and of the long ones.
+    # If more are long, as with a wall behind the net: the largest ratio of tall peaks, and the
+    # least of long ones, to what the lasers can make; the largest coloured shares of the dashes
+    # and of the long ones.
     crowd_before_wall: float = 2.0
     min_lines: float = 0.5
     max_coloured_dashes: float = 0.3
@@ -195,7 +198,7 @@ _NO_CHROMA = np.empty((0, 0), np.uint8)
 
 
 def detector_word(options: DetectorOptions) -> str:
-    """Return the word for the detector with these options."""
+    """Return the name of the detector with these options."""
     return next(word for word, kind in DETECTORS.items() if isinstance(options, kind))
 
 
@@ -211,8 +214,8 @@ class FrameDetector:
     options : StripeOptions or ThresholdOptions
         Kind of detector, and its options.
     field : {"top", "bottom"} or None
-        Field that the frames hold: rows of the bands' pictures, and of peaks, that they have not.
-        An odd last row of the picture belongs to none. None for whole pictures.
+        Field that the frames hold; bands and peaks are in pixels of the whole picture. An odd last
+        row of the picture belongs to no field. None for whole pictures.
     """
 
     def __init__(
@@ -226,11 +229,13 @@ class FrameDetector:
         self._field = field
         self._size_px = size_px if field is None else (width, height // 2)
         self._options = options
-        seen = [search for search in laser_bands if search.visible]
-        self._colours = sorted({one.colour for one in seen}, key=lambda colour: colour.name)
-        # Each laser shows about once on a search line.
-        self._n_possible = float(sum(np.count_nonzero(one.lowest <= one.highest) for one in seen))
-        by_axis = {axis: [one for one in seen if one.axis is axis] for axis in SearchAxis}
+        visible = [band for band in laser_bands if band.visible]
+        self._colours = sorted({one.colour for one in visible}, key=lambda colour: colour.name)
+        # Each laser makes about one peak on a search line.
+        self._n_possible = float(
+            sum(np.count_nonzero(one.lowest <= one.highest) for one in visible)
+        )
+        by_axis = {axis: [one for one in visible if one.axis is axis] for axis in SearchAxis}
         self._bands = {axis: _band(ones) for axis, ones in by_axis.items() if ones}
         # A search line along x of a field is one of its rows.
         self._line_px = {
@@ -247,9 +252,9 @@ class FrameDetector:
         )
         self._room = options.max_returns
         # Peaks of all directions, one after the other. Rows whose length is a power of two would
-        # all map to the same few lines of the processor's cache.
+        # map to the same few lines of the processor's cache: they are one cache line longer.
         self._line = np.empty(len(self._finders) * self._room, np.int64)
-        self._table = np.empty((N_MEASURES, len(self._line) + _SEARCH.cache_line))
+        self._table = np.empty((N_MEASURES, len(self._line) + _SAMPLE.cache_line))
         self._threshold = (
             {} if isinstance(options, StripeOptions) else self._threshold_detectors(options)
         )
@@ -264,7 +269,7 @@ class FrameDetector:
     def _threshold_detectors(
         self, options: ThresholdOptions
     ) -> Mapping[SearchAxis, "ThresholdDetector"]:
-        # Only for comparisons with the paper.
+        # Imported only for comparisons with the paper.
         from aqualvs.scanning.paper.detector import ThresholdDetector
 
         return {
@@ -293,7 +298,7 @@ class FrameDetector:
 
         Returns
         -------
-        dict of SearchAxis to Returns
+        dict of SearchAxis to StripePeaks
             Copies: they stay valid after the next call.
 
         Raises
@@ -328,15 +333,14 @@ class FrameDetector:
 
     def _find_stripes(self, frame: Frame, options: StripeOptions) -> dict[SearchAxis, StripePeaks]:
         frame = without_neutral_chroma(frame)
-        luma, has_colour = self._brightest(frame), frame.chroma is not None
+        luma, has_colour = self._contrast_image(frame), frame.chroma is not None
         planes = frame.chroma or (_NO_CHROMA, _NO_CHROMA)
-        u, v = (_plain(plane, out) for plane, out in zip(planes, self._chroma, strict=True))
+        u, v = (_contiguous(plane, out) for plane, out in zip(planes, self._chroma, strict=True))
         images = {
             axis: SearchImage(lines.of(luma), u, v, self._line_px[axis], axis is SearchAxis.ALONG_X)
             for axis, lines in self._lines.items()
         }
-        # A sample of the search lines gives the least useful height of peaks.
-        contrast, paint = self._survey(images, options.min_contrast, has_colour)
+        contrast, paint = self._measure_sample(images, options.min_contrast, has_colour)
         line, table, ends = self._find(images, contrast)
         if not has_colour or are_colourless_dashes(line, table, ends, self._n_possible):
             likelihood = np.ones(len(line))
@@ -361,14 +365,14 @@ class FrameDetector:
             for axis, start, end in zip(images, bounds[:-1], bounds[1:], strict=True)
         }
 
-    def _brightest(self, frame: Frame) -> U8Array:
-        """Return the picture in which the lasers stand out best.
+    def _contrast_image(self, frame: Frame) -> U8Array:
+        """Return the picture in which the lasers have the most contrast.
 
-        Overwritten by the next call; the frame's luma itself where that is the same.
+        Overwritten by the next call; may be the frame's luma itself.
         """
         first, *others = (channel_image(frame, colour) for colour in self._colours)
         if not others:
-            return _plain(first, self._luma)
+            return _contiguous(first, self._luma)
         np.copyto(self._luma, first)
         for image in others:
             np.maximum(self._luma, image, out=self._luma)
@@ -377,9 +381,10 @@ class FrameDetector:
     def _find(
         self, images: Mapping[SearchAxis, SearchImage], contrast: int, every: int = 1
     ) -> tuple[IntArray, FloatArray, IntArray]:
-        """Return search line and measures of the peaks, and where those of each direction end.
+        """Find the peaks of all directions on one search line in `every`.
 
-        Views: the next call overwrites them.
+        Returns search lines (N,), measures (10, N), and where the peaks of each direction end
+        (n_directions + 1,), from 0 on. The next call overwrites the first two.
         """
         ends = [0]
         for axis, image in images.items():
@@ -390,26 +395,26 @@ class FrameDetector:
             ends.append(ends[-1] + n)
         return self._line[: ends[-1]], self._table[:, : ends[-1]], np.array(ends)
 
-    def _survey(
+    def _measure_sample(
         self, images: Mapping[SearchAxis, SearchImage], least: int, has_colour: bool
     ) -> tuple[int, Paint | None]:
-        """Return the least useful height of peaks, and the paint.
+        """Return the contrast threshold and the paint's colour, from a sample of the search lines.
 
-        In a quiet picture `least` is halved: lines far off or out of focus stand out there, too,
-        and only colour tells them from its faint texture. Above the returned height there are not
-        many more peaks than the lasers can make.
+        In a quiet picture `least` is halved: lines far away or out of focus are visible there, too,
+        and only colour separates them from faint texture. Above the threshold there are not many
+        more peaks than the lasers can make.
         """
-        n_possible = self._n_possible / _SEARCH.sample_every
-        _, sample, _ = self._find(images, least, _SEARCH.sample_every)
-        if has_colour and sample.shape[1] < _SEARCH.quiet * n_possible:
+        n_possible = self._n_possible / _SAMPLE.sample_every
+        _, sample, _ = self._find(images, least, _SAMPLE.sample_every)
+        if has_colour and sample.shape[1] < _SAMPLE.quiet * n_possible:
             least = (least + 1) // 2
-            _, sample, _ = self._find(images, least, _SEARCH.sample_every)
-        most = _SEARCH.max_peaks * n_possible
+            _, sample, _ = self._find(images, least, _SAMPLE.sample_every)
+        most = _SAMPLE.max_peaks * n_possible
         heights = np.sort(sample[HEIGHT])
         n = len(heights)
         if n > most:
             least = max(least, round(min(float(heights[n - 1 - int(most)]), HIGHEST_USEFUL)))
-        # Few peaks need no colour to be told apart; codecs drop that of thin lines.
+        # Few peaks are used whatever their colour: codecs drop that of thin lines.
         if not has_colour or n <= n_possible:
             return least, None
         paint = learn_paint(sample, n_possible)
@@ -425,7 +430,7 @@ class FrameDetector:
             laser_likelihood(
                 table,
                 learn_colour(table, colour, paint) or expected_colour(table, colour, paint),
-                _SEARCH.widest_white * self._size_px[0],
+                _SAMPLE.widest_white * self._size_px[0],
                 n_possible,
             )
             for colour in self._colours
@@ -437,18 +442,18 @@ class FrameDetector:
 def are_colourless_dashes(
     line: IntArray, table: FloatArray, ends: IntArray, n_possible: float
 ) -> bool:
-    """Return whether a frame's tall peaks are dashes without colour, or dashes before a wall.
+    """Return whether most tall peaks are short dashes without colour, perhaps before a wall.
 
-    A codec drops the chroma of stripes that are a few pixels long, as on thin twine at low bit
-    rates, before that of a wall's long lines. Then colour is no evidence, as in a grey picture.
-    Twine in white light makes long peaks without any.
+    At low bit rates a codec drops the chroma of stripes that are a few pixels long, as on thin
+    twine, but keeps that of a wall's long lines. Then colour is no evidence, as in a grey picture.
+    Twine in white light is different: it makes long segments without colour.
 
     Parameters
     ----------
     line, table, ends
         As in `select_peaks`.
     n_possible : float
-        Peaks that the lasers can make. Where many more are tall, most are something else.
+        Number of peaks that the lasers can make; if many more are tall, most are other objects.
     """
     tall, coloured = np.empty(line.shape[0], np.bool_), np.empty(line.shape[0], np.bool_)
     n_tall, n_coloured = 0, 0
@@ -458,15 +463,15 @@ def are_colourless_dashes(
         coloured[i] = tall[i] and step > RATIO_LEAST * table[HEIGHT, i]
         n_tall += tall[i]
         n_coloured += coloured[i]
-    # Most frames are told by their numbers alone; linking the peaks takes longer.
+    # These counts decide most frames; linking the peaks takes longer.
     if not _DASH.min_tall <= n_tall <= _DASH.crowd_before_wall * n_possible:
         return False
     if n_coloured > _DASH.max_coloured_lines * n_tall:
         return False
     n_dashes, n_lines, n_coloured_dashes, n_coloured_lines = 0, 0, 0, 0
     for k in range(ends.shape[0] - 1):
-        rows = _marked(tall, ends[k], ends[k + 1])
-        long = _are_long(line, table, rows)
+        rows = _marked_rows(tall, ends[k], ends[k + 1])
+        long = _are_in_a_row(line, table, rows)
         for i in range(rows.shape[0]):
             n_lines += long[i]
             n_dashes += not long[i]
@@ -489,38 +494,43 @@ def select_peaks(
     min_likelihood: float,
     min_share: float,
 ) -> IntArray:
-    """Return the peaks that are likely laser light, and bright or one of many in a row.
+    """Return the peaks that are likely laser light, and bright or in a long segment.
 
     Parameters
     ----------
     line : int array, shape (N,)
         Search line of each peak, direction after direction.
     table : array, shape (10, N)
-        Measures of the peaks.
+        Measures of the peaks, rows as `stripe` names them.
     likelihood : array, shape (N,)
-        Of each peak.
+        Of being laser light, 0 to 1.
     ends : int array, shape (n_directions + 1,)
         0, and where the peaks of each direction end.
     min_likelihood, min_share : float
         As in `StripeOptions`.
+
+    Returns
+    -------
+    int array, shape (K,)
+        Their indices, ascending.
     """
     keep = np.empty(likelihood.shape[0], np.bool_)
     for i in range(keep.shape[0]):
         keep[i] = likelihood[i] >= min_likelihood
     bright = min_share * lower_quantile(
-        take(table[HEIGHT], flatnonzero(keep)), _SEARCH.bright_quantile
+        take(table[HEIGHT], flatnonzero(keep)), _SAMPLE.bright_quantile
     )
     for k in range(ends.shape[0] - 1):
-        rows = _marked(keep, ends[k], ends[k + 1])
-        long = _are_long(line, table, rows)
+        rows = _marked_rows(keep, ends[k], ends[k + 1])
+        long = _are_in_a_row(line, table, rows)
         for i in range(rows.shape[0]):
             keep[rows[i]] = long[i] or table[HEIGHT, rows[i]] >= bright
     return flatnonzero(keep)
 
 
 @inner_kernel
-def _marked(marks: BoolArray, start: int, end: int) -> IntArray:
-    """Return the rows from `start` to before `end` that are marked."""
+def _marked_rows(marks: BoolArray, start: int, end: int) -> IntArray:
+    """Return the indices in [start, end) that are marked."""
     rows = flatnonzero(marks[start:end])
     for i in range(rows.shape[0]):
         rows[i] += start
@@ -528,8 +538,8 @@ def _marked(marks: BoolArray, start: int, end: int) -> IntArray:
 
 
 @inner_kernel
-def _are_long(line: IntArray, table: FloatArray, rows: IntArray) -> BoolArray:
-    """Mark those of some peaks of one direction that are of many in a row."""
+def _are_in_a_row(line: IntArray, table: FloatArray, rows: IntArray) -> BoolArray:
+    """Mark which of the peaks `rows`, of one direction, lie in a long segment."""
     its_line = np.empty(rows.shape[0], np.int64)
     for i in range(rows.shape[0]):
         its_line[i] = line[rows[i]]
@@ -537,13 +547,13 @@ def _are_long(line: IntArray, table: FloatArray, rows: IntArray) -> BoolArray:
 
 
 def _in_picture(peaks: StripePeaks, field: Field) -> StripePeaks:
-    """Return peaks of columns of a field with positions and widths in pixels of the picture."""
+    """Convert peaks on columns of a field: positions and widths in pixels of the picture."""
     position = 2.0 * peaks.position + FIRST_ROW[field]
     return peaks._replace(position=position, width=2.0 * peaks.width)
 
 
-def _plain(plane: U8Array, copy: U8Array) -> U8Array:
-    """Return a plane in the layout in memory that kernels are compiled for, or a copy in it."""
+def _contiguous(plane: U8Array, copy: U8Array) -> U8Array:
+    """Return a plane if it is contiguous, as kernels are compiled for, else a copy in `copy`."""
     if plane.flags.carray:
         return plane
     np.copyto(copy, plane)
@@ -551,7 +561,7 @@ def _plain(plane: U8Array, copy: U8Array) -> U8Array:
 
 
 def _band(laser_bands: Sequence[LaserBand]) -> tuple[IntArray, IntArray]:
-    """Return the first and the last position (n_lines,) of any of the lasers."""
-    lowest: IntArray = np.min([search.lowest for search in laser_bands], axis=0)
-    highest: IntArray = np.max([search.highest for search in laser_bands], axis=0)
+    """Return the first and last position (n_lines,) of the union of the bands."""
+    lowest: IntArray = np.min([band.lowest for band in laser_bands], axis=0)
+    highest: IntArray = np.max([band.highest for band in laser_bands], axis=0)
     return lowest, highest

@@ -1,10 +1,10 @@
 """Stripe peaks: sub-pixel detection along search lines.
 
-A peak ("return") is a run of pixels above the local background with one maximum. The background on
-one side is the least pixel within reach; the higher of the two sides counts, so that a step edge (a
-box before a dark wall) has no contrast, and a stripe that runs along the search line has none
-either. The centre is the centroid of the profile above half height, which keeps its place when the
-top saturates; of a stripe narrower than two pixels, the peak of a Gaussian through three pixels.
+A peak is a run of pixels above the local background with one maximum. The background on one side is
+the minimum within reach; the higher of the two sides counts, so that neither a step edge (a box
+before a dark wall) nor a stripe that runs along the search line has contrast. The centre is the
+centroid of the profile above half height, which does not move when the top saturates; for a stripe
+narrower than two pixels, the peak of a Gaussian through three pixels.
 """
 
 import math
@@ -25,17 +25,18 @@ _WORD = 8
 _NOTHING, _ALL_BITS = np.uint64(0), np.uint64(0xFFFFFFFFFFFFFFFF)
 _BYTE_NUMBERS = np.uint64(0x0001020304050607)
 _BRIGHT = np.uint8(255)
-# The profile of a stripe narrower than this is not straight between pixels: straight lines draw its
-# centroid to the grid by up to 0.05 px, at half of this width by 0.15 px. Noise moves both centres
-# alike at this width. A saturated pixel, at least this bright, has not a Gaussian's height.
+# The profile of a stripe narrower than this is not linear between pixels: linear interpolation
+# pulls its centroid to the pixel grid by up to 0.05 px, at half of this width by 0.15 px. At this
+# width noise moves centroid and Gaussian peak alike. A pixel at least as bright as `_WHITE` (grey
+# levels) is saturated: a Gaussian does not fit it.
 _NARROW_PX, _WHITE = 2.0, 250
-# Bytes that compiled loops work on at a time, or a multiple of them.
+# Bytes that compiled loops process at a time, or a multiple of them.
 _VECTOR = 128
-# Luma of flanks that are dark; black is 16.
+# Luma up to which flanks are dark, in grey levels; black is 16.
 _DARK = 36.0
 _THIRD = 1.0 / 3.0
-# Flanks that differ by more than this share of a peak's height are not both background; they are
-# read this many pixels beyond the peak's width.
+# If the flanks differ by more than this share of a peak's height, one of them is another stripe.
+# They are read this many pixels beyond the peak's width.
 _OTHER_STRIPE, _FLANK_PX = 0.25, 4
 # Shift of the centroid above half height of a Gaussian of width w on a ramp, over w² times the
 # ramp's slope over the Gaussian's height: (1 / 12) / (0.810 - 1 / 2), the area above half height.
@@ -44,7 +45,11 @@ PULL_OF_STEP = 0.222
 """Shift of the centroid above half height of a Gaussian of width w on a step that is blurred as the
 Gaussian is, over w times the step's height over the Gaussian's; integrated numerically."""
 POSITION, HEIGHT, WIDTH, TOP, STEP_U, STEP_V, IMBALANCE, TINT_U, TINT_V, PULL = range(10)
-"""Rows of a table of peaks."""
+"""Rows of a table of peaks: position and full width at half height along the search line (px);
+height above the background and luma of the highest pixel (grey levels); chroma of the peak less
+that of its flanks; difference of chroma between the flanks, along the laser's colour; chroma of the
+flanks for each level of their luma, 0 if dark; shift of the position by an uneven background (px).
+"""
 N_MEASURES = 10
 
 
@@ -52,8 +57,8 @@ N_MEASURES = 10
 class StripeOptions:
     """Options of the sub-pixel detector."""
 
-    # Smallest height of a peak above its background, in grey levels; raised where hardly any return
-    # of that height is laser light, halved where hardly anything in a colour picture is as high.
+    # Smallest height of a peak above its background, in grey levels; raised if hardly any peak of
+    # that height is laser light, halved if hardly anything in a colour picture is as high.
     min_contrast: int = 6
     # Reach of the search for the background on each side, as a share of the image width; must
     # exceed the width of the widest stripe.
@@ -62,11 +67,11 @@ class StripeOptions:
     # has colour.
     min_likelihood: float = 0.1
     # Peaks lower than this share of the frame's bright peaks (their 90 % quantile) are kept only
-    # where many follow one another, as on a distant wall or of a weak laser; others are noise, or
+    # if many follow one another, as on a distant wall or of a weak laser; others are noise, or
     # the glow beside a strand.
     min_share: float = 0.25
-    # Returns kept per frame and search direction; where there are more, the contrast threshold is
-    # doubled until there are not.
+    # Largest number of peaks per frame and search direction; if there are more, the contrast
+    # threshold is doubled until there are not.
     max_returns: int = 16384
 
     def __post_init__(self) -> None:
@@ -87,9 +92,9 @@ class ThresholdOptions:
 
     # Pixels at least this bright are laser light, in grey levels.
     level: int = 140
-    # Runs of bright pixels, and bright pixels, allowed per frame and search direction. Where there
-    # are more, the lowest higher level is used at which there are not; if even white is too much,
-    # the frame has no peaks.
+    # Largest number of runs of bright pixels, and of bright pixels, per frame and search direction.
+    # If there are more, the level is raised until there are not; a frame with too much white has no
+    # peaks.
     max_returns: int = 16384
     max_pixels: int = 131072
 
@@ -139,20 +144,22 @@ class SearchImage(NamedTuple):
 
 
 class _Workspace(NamedTuple):
-    """Buffers of one search line, by pairs of pixels: extremes, minima, marks above background."""
+    """Buffers of one search line; an element stands for a pair of pixels."""
 
-    # With margins.
+    # Minimum and maximum of each pair, with a margin of the reach at both ends.
     least: U8Array
     most: U8Array
+    # Minima over windows, and a second buffer for them.
     minima: U8Array
     spare: U8Array
     background: U8Array
+    # 1 if a pixel of the pair is above the background, else 0; and the same bytes, eight at a time.
     above: U8Array
     words: NDArray[np.uint64]
 
 
 class PeakFinder:
-    """Finder of peaks along every search line of one direction; several per line.
+    """Detector of peaks along the search lines of one direction.
 
     Parameters
     ----------
@@ -176,10 +183,10 @@ class PeakFinder:
     ) -> None:
         self._lowest, self._highest = lowest, highest
         self._reach_px, self._directions = reach_px, directions
-        # Lines are worked on in whole vectors, whatever stands after their last pixel.
+        # Lines are processed in whole vectors, beyond their last pixel.
         pairs = (length + 1) // 2
         least, most, minima, spare = np.full((4, pairs + 2 * reach_px + _VECTOR), 255, np.uint8)
-        # There is room for a mark after the last pair, in whole words.
+        # With room for a mark after the last pair, in whole words.
         background, above = np.zeros((2, (pairs + _VECTOR) // _WORD * _WORD + _WORD), np.uint8)
         words = above.view(np.uint64)
         self._scratch = _Workspace(least, most, minima, spare, background, above, words)
@@ -194,8 +201,8 @@ class PeakFinder:
         image : SearchImage
             Of the shape that the finder was made for.
         min_contrast : int
-            Least height above the background, in grey levels; doubled where noise makes N peaks
-            or more.
+            Least height above the background, in grey levels; doubled while there are N peaks or
+            more.
         every : int
             Use one search line of this many.
         line : int array, shape (N,)
@@ -203,7 +210,7 @@ class PeakFinder:
         table : array, shape (10, N)
             Written: measures of each peak, rows as named above.
         """
-        # Limit of the doubled contrast threshold.
+        # Contrast threshold above which it is not doubled, in grey levels: twice this is 240.
         max_contrast = 120
         while True:
             n = _find_peaks(
@@ -242,7 +249,7 @@ def _find_peaks(
         if lowest[x] > highest[x]:
             continue
         row = image.lines[x]
-        # Runs reach over the band's limits.
+        # Runs may extend beyond the band.
         first = max(lowest[x] - reach_px, 0) >> 1
         end = (min(highest[x] + reach_px, row.shape[0] - 1) >> 1) + 1
         _mark_above(row, first, end, min_contrast, max((reach_px - 1) >> 1, 1), scratch)
@@ -282,13 +289,14 @@ def _mark_above(
 ) -> None:
     """Mark the pairs of pixels [first, end) that stand above the background; index 0 is `first`.
 
-    The background of a pair is the higher of the least values of `reach` pairs to either side. The
-    pair itself does not count: of its pixels only one may belong to a step edge's bright side.
+    The background of a pair is the higher of the two minima over `reach` pairs on either side. The
+    pair itself does not count: one of its pixels may lie on the dark side of a step edge.
     """
     n = end - first
-    # Slices from 0 on: LLVM sees that no index is negative, and uses vector instructions.
+    # With slices that start at 0 LLVM knows that no index is negative, and uses vector
+    # instructions.
     least, most = scratch.least[: n + 2 * reach], scratch.most[: n + 2 * reach]
-    # Pixels beyond the border count as bright: one flank is not visible there, so no peak is found.
+    # Pixels beyond the border count as white: a peak with one invisible flank is not found.
     seen, ahead = min(reach, first), min(reach, ((row.shape[0] + 1) >> 1) - end)
     least[: reach - seen] = _BRIGHT
     _pair(
@@ -297,7 +305,7 @@ def _mark_above(
         most[reach - seen : reach + n + ahead],
     )
     least[reach + n + ahead :] = _BRIGHT
-    # Minima over windows that grow towards `reach`: four times as wide each time.
+    # Minima over windows that grow to `reach` pairs, four times as wide at each step.
     here, there = scratch.least, scratch.minima
     span = 1
     while 2 * span < reach:
@@ -313,7 +321,7 @@ def _mark_above(
         )
         here, there = there, here if span > 1 else scratch.spare
         span = grown
-    # The last step is taken here, for the windows before and behind a pair.
+    # The last step joins two windows of `span` pairs, before a pair and behind it.
     near_before, near_behind = here, here[reach + 1 :]
     far_before, far_behind = here[reach - span :], here[2 * reach + 1 - span :]
     pairs, background, above = scratch.most[reach:], scratch.background, scratch.above
@@ -325,13 +333,13 @@ def _mark_above(
         background[i] = base
         base = base if base < pairs[i] else pairs[i]
         above[i] = np.uint8(np.uint8(pairs[i] - base) >= enough)
-    # A mark that ends the search for the next run.
+    # Sentinel for `_next_marked`.
     above[n] = np.uint8(1)
 
 
 @inline_borrowing_kernel
 def _pair(row: U8Array, least: U8Array, most: U8Array) -> None:
-    """Write the lesser and the greater of each pair of pixels; an odd last one is both."""
+    """Write minimum and maximum of each pair of pixels; an odd last pixel is both."""
     for i in range(row.shape[0] >> 1):
         one, other = row[2 * i], row[2 * i + 1]
         least[i] = one if one < other else other
@@ -342,7 +350,7 @@ def _pair(row: U8Array, least: U8Array, most: U8Array) -> None:
 
 @inline_borrowing_kernel
 def _whole_vectors(n: int) -> int:
-    """Round a number of pairs up: what remains after the last vector is slow, one by one."""
+    """Round a number of pairs up to whole vectors: compiled loops handle a remainder one by one."""
     return (n + _VECTOR - 1) // _VECTOR * _VECTOR
 
 
@@ -350,6 +358,7 @@ def _whole_vectors(n: int) -> int:
 def _least_of_four(
     one: U8Array, two: U8Array, three: U8Array, four: U8Array, n: int, least: U8Array
 ) -> None:
+    """Write the elementwise minimum of four arrays (n,)."""
     for i in range(n):
         first = one[i] if one[i] < two[i] else two[i]
         second = three[i] if three[i] < four[i] else four[i]
@@ -358,13 +367,14 @@ def _least_of_four(
 
 @inline_borrowing_kernel
 def _next_marked(words: NDArray[np.uint64], at: int) -> int:
-    """Return the first mark from `at` on; there must be one."""
+    """Return the index of the first mark from `at` on; there must be one."""
     index = at >> 3
     found = words[index] & (_ALL_BITS << np.uint64(8 * (at & 7)))
     while found == _NOTHING:
         index += 1
         found = words[index]
-    # A product with the lowest of these bits shifts the number of its byte to the top.
+    # The lowest set bit is 1 << 8 k; multiplying by it shifts byte 7 - k of the constant, which is
+    # k, to the top.
     lowest = found & (~found + np.uint64(1))
     return (index << 3) + int((lowest * _BYTE_NUMBERS) >> np.uint64(56))
 
@@ -382,9 +392,9 @@ def _measure_run(
     table: FloatArray,
     n: int,
 ) -> int:
-    """Append the peaks of a run [start, end) of search line `x`; return their new number.
+    """Append the peaks of a run [start, end) of search line `x`; return the new number of peaks.
 
-    The background counts pairs from position `first` on.
+    Element 0 of the background is the pair at position `first`.
     """
     row, background = image.lines[x], scratch.background
     start, end = run
@@ -422,7 +432,7 @@ def _measure_run(
 
 @inline_borrowing_kernel
 def _next_peak(row: U8Array, start: int, end: int, base: np.int64) -> tuple[int, int]:
-    """Return (peak, end) of the first peak in [start, end); the next one begins at its end."""
+    """Return maximum and end of the first peak in [start, end); the next peak begins at its end."""
     peak, valley_at = start, start
     top = np.int64(row[start])
     valley = top
@@ -442,17 +452,18 @@ def _next_peak(row: U8Array, start: int, end: int, base: np.int64) -> tuple[int,
 
 @inline_borrowing_kernel
 def _separates(valley: np.int64, lower_peak: np.int64, base: np.int64) -> bool:
-    # A valley below this many tenths of the lower of two peaks separates two peaks.
+    """Return whether a valley separates two peaks, of which the lower one is given."""
+    # It does below this many tenths of the height of the lower peak.
     valley_tenths = 6
     return bool(10 * (valley - base) < valley_tenths * (lower_peak - base))
 
 
 @inline_borrowing_kernel
 def _feet(row: U8Array, peak: int, low: int, high: int, level: np.int64) -> tuple[int, int]:
-    """Return the nearest positions in [low, high] around the peak that are below half height.
+    """Return the nearest positions in [low, high] before and after the peak below half height.
 
-    Return -1 for both where one is missing, or where a pixel higher than the peak lies nearer: the
-    foot is then that of another stripe.
+    -1 for both if one is missing, or if a pixel higher than the peak lies nearer: the foot is then
+    that of another stripe. `level` is twice the half height, as in `_measure_run`.
     """
     top = row[peak]
     a = peak - 1
@@ -481,15 +492,15 @@ def _centroid(
 ) -> float:
     """Return the centroid of the profile above half height, between its `crossings`.
 
-    The profile is a straight line from pixel to pixel. Sums over whole pixels alone would draw the
-    centroid of a stripe that is two pixels wide by up to 0.09 px to the grid; this one, by 0.01 px.
+    The profile is linear between pixels. Sums over whole pixels would pull the centroid of a stripe
+    that is two pixels wide to the pixel grid by up to 0.09 px; this one does by 0.01 px.
     """
     total, moment = np.int64(0), np.int64(0)
     for k in range(1, b - a):
         value = 2 * np.int64(row[a + k]) - level
         total += value
         moment += value * k
-    # Half of the first and of the last pixel lies beyond the polygon; triangles take their place.
+    # Half of the first and of the last pixel lies outside the polygon; triangles replace them.
     first, last = 2 * np.int64(row[a + 1]) - level, 2 * np.int64(row[b - 1]) - level
     rise, fall = 1.0 - crossings[0], 1.0 - crossings[1]
     end = b - a - 1
@@ -505,7 +516,7 @@ def _gaussian_peak(row: U8Array, peak: int, base: np.int64) -> float:
 
     Source: Fisher and Naidu, "A comparison of algorithms for subpixel peak detection", 1996.
     """
-    # Rounding hides half a grey level.
+    # A pixel at the background may be half a grey level above it, before rounding.
     before = math.log(max(float(np.int64(row[peak - 1]) - base), 0.5))
     top = math.log(np.int64(row[peak]) - base)
     after = math.log(max(float(np.int64(row[peak + 1]) - base), 0.5))
@@ -514,7 +525,7 @@ def _gaussian_peak(row: U8Array, peak: int, base: np.int64) -> float:
 
 @inline_borrowing_kernel
 def _pull(row: U8Array, peak: int, width: float, height: float) -> float:
-    """Return the shift of the centroid by the difference between the flanks, were it a ramp."""
+    """Return the shift (px) of the centroid if the flanks differ because of a linear ramp."""
     flank = int(width) + _FLANK_PX
     before, after = max(peak - flank, 0), min(peak + flank, row.shape[0] - 1)
     difference = np.int64(row[after]) - np.int64(row[before])
@@ -548,7 +559,7 @@ def _measure_chroma(
     before, after = max(peak - flank, 0), min(peak + flank, row.shape[0] - 1)
     u_before, v_before = _chroma(image, chroma_line, before)
     u_after, v_after = _chroma(image, chroma_line, after)
-    # Where one flank is much brighter, another stripe lies there.
+    # If one flank is much brighter, another stripe lies there, and only the darker one counts.
     difference = np.int64(row[before]) - np.int64(row[after])
     weight = 0.5
     if abs(difference) > _OTHER_STRIPE * measures[HEIGHT]:
@@ -569,7 +580,7 @@ def _measure_chroma(
                 measures[IMBALANCE] = along_u * (u_after - u_before) + along_v * (
                     v_after - v_before
                 )
-    # In the dark paint has no light to reflect; there is only the line's own glow.
+    # Dark flanks have no tint of paint in ambient light, only the line's own glow.
     per_level = 1.0 / luma if luma > _DARK else 0.0
     measures[TINT_U], measures[TINT_V] = (
         (u_flank - 128.0) * per_level,
@@ -579,7 +590,7 @@ def _measure_chroma(
 
 @inline_borrowing_kernel
 def _chroma(image: SearchImage, chroma_line: int, position: int) -> tuple[float, float]:
-    """Return U and V at a position of a search line, the mean over neighbours along the stripe."""
+    """Return U and V at a position of a search line, means over three neighbours along stripes."""
     u, v = image.u, image.v
     n_lines, length = u.shape if image.along_x else (u.shape[1], u.shape[0])
     p = min(max(position >> 1, 0), length - 1)
