@@ -18,7 +18,7 @@ from aqualvs.optics.shutter import FIRST_ROW, Field
 from aqualvs.scanning.laser_bands import LaserBand, SearchAxis
 from aqualvs.scanning.laser_colour import (
     HIGHEST_USEFUL,
-    RATIO_LEAST,
+    RATIO_MIN,
     Paint,
     channel_image,
     expected_colour,
@@ -460,7 +460,7 @@ def are_colourless_dashes(
     for i in range(line.shape[0]):
         tall[i] = table[HEIGHT, i] >= HIGHEST_USEFUL
         step = hypot(table[STEP_U, i], table[STEP_V, i])
-        coloured[i] = tall[i] and step > RATIO_LEAST * table[HEIGHT, i]
+        coloured[i] = tall[i] and step > RATIO_MIN * table[HEIGHT, i]
         n_tall += tall[i]
         n_coloured += coloured[i]
     # These counts decide most frames; linking the peaks takes longer.

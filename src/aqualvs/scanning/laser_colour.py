@@ -4,10 +4,10 @@ A camera sees a 532 nm line neither as pure green nor always as green: its colou
 white balance scales the channels, and an overexposed core is white inside a green halo. On nine
 cameras, in air and under water, green lines lower V in 94 to 100 % of their pixels, but U in 0 to
 100 %; red lines raise V. So colour is evidence, not a gate: the wavelength gives the half of the
-chroma plane to look in; the frame's own best stripes give the direction in which its lines move the
+(U, V) plane to look in; the frame's own best stripes give the direction in which its lines move the
 chroma, and the amount for each grey level of height; and every peak gets the likelihood that it is
-such a line and not paint, twine or glare. The colour is learned from each frame alone: a white
-balance that drifts needs no tracking, and a frame's result depends on nothing but the frame.
+such a line and not paint, twine or glare. The colour is learned from each frame alone: a drifting
+white balance needs no tracking, and the result for a frame depends on that frame only.
 """
 
 import math
@@ -33,22 +33,20 @@ from aqualvs.scanning.stripe import HEIGHT, IMBALANCE, STEP_U, STEP_V, TINT_U, T
 
 
 class _LearnOptions(NamedTuple):
-    """Stripes to learn the colour of the lines from.
+    """Peaks from which the colour of the lines is learned.
 
-    Tuned on the rendered sample and benchmark dives, the photographs of the sample folders and
-    dives of the simulated cameras.
+    A step is the chroma of a peak less that of its flanks, in levels. Tuned on the rendered sample
+    and benchmark dives, the photographs of the sample folders and dives of the simulated cameras.
     """
 
-    # Least height of the peaks in grey levels; least chroma step beyond that of paint, in standard
-    # deviations and in levels; least cosine of its angle to the wavelength's direction; least share
-    # of the largest step for their height; least number of such peaks; and the largest and the
-    # smallest scatter of half of them, as shares of their mean step.
-    min_height: float = 12.0
+    min_height: float = 12.0  # Least height of the peaks, in grey levels.
+    # Least chroma step beyond that of paint, in standard deviations and in levels.
     clear_sigmas: float = 3.0
     clear_levels: float = 3.0
-    min_cosine: float = 0.2
-    best_share: float = 0.6
-    min_learned: int = 16
+    min_cosine: float = 0.2  # Least cosine of its angle to the wavelength's direction.
+    best_share: float = 0.6  # Least share of the largest step relative to the height.
+    min_learned: int = 16  # Least number of such peaks.
+    # Largest and smallest scatter of half of them, as shares of their median step.
     max_scatter: float = 0.4
     min_scatter: float = 0.22
 
@@ -57,42 +55,49 @@ _LEARN = _LearnOptions()
 
 
 class _PaintOptions(NamedTuple):
-    """Paint: things that have the colour of the lines."""
+    """Paint: objects of one colour that make most of the tall peaks, such as twine in the sun.
 
-    # Paint: least height of the peaks near one colour, and least ratio of their number to what the
-    # lasers can make; its least spread, as chroma for each level, and its largest spread across the
-    # tint of its light; and the distances from its middle, in standard deviations, of other things
-    # and of lines.
-    tall: float = 20.0
-    crowd: float = 1.5
+    Tuned on the same pictures as `_LearnOptions`.
+    """
+
+    tall: float = 20.0  # Least height of its peaks, in grey levels.
+    crowd: float = 1.5  # Least ratio of their number to the number that the lasers can make.
+    # Least spread of its chroma for each level of height, and largest spread across the tint of its
+    # light.
     min_spread: float = 0.02
     max_across: float = 0.045
+    # Peaks within the first distance from its median colour are paint, those beyond the second may
+    # be lines; in standard deviations.
     of_crowd: float = 2.5
     clear_of_paint: float = 4.0
+    # Standard deviation of a normal distribution, in median absolute deviations.
     mad_to_sigma: float = 1.4826
 
 
 _PAINT = _PaintOptions()
 
-# Chroma levels for each grey level of height: the expected value of a line where none is clear
-# enough to learn from, the least and the most that is accepted of a learned one, and the spread of
-# paint and glare about zero. Lines of nine cameras show 0.15 to 0.7.
-RATIO_EXPECTED, RATIO_LEAST, _RATIO_MOST, _RATIO_OF_PAINT = 0.25, 0.1, 0.75, 0.05
+# Chroma levels for each grey level of height: expected of a line if none is clear enough to learn
+# from, least and largest learned value that is accepted, and standard deviation of paint and glare
+# about zero. Lines of nine cameras have 0.15 to 0.7.
+RATIO_EXPECTED, RATIO_MIN, _RATIO_MAX, _RATIO_OF_PAINT = 0.25, 0.1, 0.75, 0.05
 
 
 class _LikelihoodOptions(NamedTuple):
-    """Likelihood that a peak is a laser line, by its colour."""
+    """Likelihood that a peak is a laser line, by its colour.
 
-    # One frame's lines spread about their ratio by this share, and by the second one across their
-    # direction: overexposed ones show less and differ in hue, faint ones more.
+    Tuned on the same pictures as `_LearnOptions`.
+    """
+
+    # Standard deviations of one frame's lines about their mean step, as shares of it: along its
+    # direction and across. Overexposed lines show less chroma and differ in hue, faint ones more.
     ratio_spread: float = 0.35
     across_spread: float = 0.5
     # Paint shows up to this share of the tint of its flanks, and at most the second share of the
     # chroma of a line, however green the scene is.
     tint_share: float = 0.5
     paint_share: float = 0.5
-    # The largest of three normal numbers is this many standard deviations above their mean; up to
-    # this many levels of noise the lines' own differences are larger.
+    # Expected maximum of three normal numbers, in standard deviations; up to this noise, in levels,
+    # the lines' own differences are larger.
     largest_of_three: float = 0.85
     quiet: float = 1.4
     # Limit of the log-likelihood ratio.
@@ -101,14 +106,13 @@ class _LikelihoodOptions(NamedTuple):
 
 _LIKELIHOOD = _LikelihoodOptions()
 
-# Width of the bins of height, and number of refinements of the shares of lines in them.
-_KINDS_PER_OCTAVE, _N_KINDS, _ROUNDS = 2.0, 16, 3
-_KIND_OF_HEIGHT = np.minimum(_KINDS_PER_OCTAVE * np.log2(np.arange(256).clip(1)), _N_KINDS - 1)
-_KIND_OF_HEIGHT = _KIND_OF_HEIGHT.astype(np.int64)
-# The colour of a core this bright, in limited-range luma, is ignored: every light is white there.
+# Bins of height (grey levels): their number for each doubling, and in total; refinements of the
+# share of lines in them, and of the paint.
+_BINS_PER_OCTAVE, _N_BINS, _ROUNDS = 2.0, 16, 3
+_BIN_OF_HEIGHT = np.minimum(_BINS_PER_OCTAVE * np.log2(np.arange(256).clip(1)), _N_BINS - 1)
+_BIN_OF_HEIGHT = _BIN_OF_HEIGHT.astype(np.int64)
 WHITE = 225.0
-
-
+"""Luma from which on the colour of a peak's core is ignored: every overexposed light is white."""
 HIGHEST_USEFUL = 32
 """Height in grey levels from which on peaks are always used."""
 
@@ -139,8 +143,9 @@ class LaserColour(Enum):
 def channel_image(frame: Frame, colour: LaserColour) -> ImagePlane:
     """Return the picture in which a laser's light has the most contrast.
 
-    This is luma for green, of which luma mostly consists. A blue line raises luma by a ninth of
-    what it raises blue, a red one by a third, so blue and red are made of luma and chroma.
+    For green this is luma, most of which is green. A blue line raises luma by a ninth of what it
+    raises the blue channel, a red one by a third of the red: these channels are computed from luma
+    and chroma.
 
     Parameters
     ----------
@@ -154,7 +159,7 @@ def channel_image(frame: Frame, colour: LaserColour) -> ImagePlane:
     """
     if colour is LaserColour.GREEN or frame.chroma is None:
         return frame.luma
-    # R and B by V and U, in the scale of limited-range luma (BT.601).
+    # Factors of V in R and of U in B, in the scale of limited-range luma (BT.601).
     red_of_v, blue_of_u = 1.596 / 1.164, 2.018 / 1.164
     chroma, weight = (
         (frame.chroma[1], red_of_v) if colour is LaserColour.RED else (frame.chroma[0], blue_of_u)
@@ -174,10 +179,10 @@ def full_size(half: NDArray[np.float32], frame: Frame) -> NDArray[np.float32]:
 class Paint(NamedTuple):
     """Colour of the paint in one frame, in levels of chroma for each grey level of height."""
 
-    # Its middle.
+    # Median.
     u: float
     v: float
-    # Standard deviations, without noise.
+    # Standard deviations, those of noise taken off.
     spread_u: float
     spread_v: float
 
@@ -217,7 +222,7 @@ def learn_paint(table: FloatArray, n_possible: float) -> Paint | None:
         None where there are few tall peaks, or they are not of one colour.
     """
     *paint, across_tint, n_near = _learn_paint(table, _PAINT.crowd * n_possible)
-    # The share of the light's tint in paint varies; other differences are a mixture with lines.
+    # Paint varies along the tint of its light; a spread across it is due to lines among the peaks.
     return (
         Paint(*paint)
         if across_tint < _PAINT.max_across and n_near > _PAINT.crowd * n_possible
@@ -241,7 +246,7 @@ def learn_colour(table: FloatArray, colour: LaserColour, paint: Paint | None) ->
     LineColour or None
         None where too few peaks are clearly of the laser's colour.
     """
-    # Number of peaks that is enough to learn from.
+    # Enough peaks to learn from; more are thinned, to save time.
     enough = 2500
     sample = table[:, :: 1 + table.shape[1] // enough]
     found = (
@@ -260,7 +265,7 @@ def expected_colour(table: FloatArray, colour: LaserColour, paint: Paint | None)
 def laser_likelihood(
     table: FloatArray, line: LineColour, widest_white_px: float, n_possible: float = np.inf
 ) -> FloatArray:
-    """Return the likelihood that each peak of a frame is laser light, not another bright thing.
+    """Return the likelihood that each peak of a frame is laser light, not another bright object.
 
     Two explanations of a chroma step are compared: a line moves the chroma in proportion to its
     height, as the frame's best stripes do; noise does not move it, and brighter paint under the
@@ -286,14 +291,16 @@ def laser_likelihood(
         0 to 1; 0.5 where colour gives no evidence.
     """
     likelihood = np.empty(table.shape[1])
-    # Spreads of 0: unknown.
+    # Spreads of 0 mean no paint.
     no_paint = Paint(0.0, 0.0, 0.0, 0.0)
-    _weigh(table, line[:6], line.paint or no_paint, widest_white_px, n_possible, likelihood)
+    _write_likelihood(
+        table, line[:6], line.paint or no_paint, widest_white_px, n_possible, likelihood
+    )
     return likelihood
 
 
 def useful_height(height: FloatArray, likelihood: FloatArray) -> int:
-    """Return the height up to which hardly any peak is clearly laser light, in grey levels.
+    """Return the height in grey levels below which hardly any peak is clearly laser light.
 
     Parameters
     ----------
@@ -304,17 +311,18 @@ def useful_height(height: FloatArray, likelihood: FloatArray) -> int:
 
 
 @inline_kernel
-def _kind_of(height: float) -> int:
-    return int(_KIND_OF_HEIGHT[min(int(height), 255)])
+def _height_bin(height: float) -> int:
+    return int(_BIN_OF_HEIGHT[min(int(height), 255)])
 
 
 @lazy_kernel
 def _noise(table: FloatArray) -> float:
-    """Return the standard deviation of a step, from how the two flanks of peaks differ.
+    """Return the standard deviation of a step in levels, from the difference of the two flanks.
 
-    A low quantile: beside other stripes and edges the flanks differ by more than noise.
+    From a low quantile, because beside other stripes and edges the flanks differ by more than
+    noise.
     """
-    # A quarter of a normal distribution lies within this many standard deviations.
+    # A quarter of a normal distribution lies within this many standard deviations of its mean.
     quarter_of_normal = 0.3186
     off = np.empty(table.shape[1])
     for i in range(table.shape[1]):
@@ -326,12 +334,12 @@ def _noise(table: FloatArray) -> float:
 
 
 @inline_kernel
-def _beyond_paint(
+def _chroma_beyond_paint(
     table: FloatArray, i: int, left: float, tint_share: float, most: float
 ) -> tuple[float, float]:
-    """Return the part (U, V) of a share `left` of a peak's chroma step that is not due to paint.
+    """Return the part (U, V) of a peak's chroma step, times `left`, that is not due to paint.
 
-    Brighter paint shows up to `tint_share` of the tint that its flanks have, and at most `most`.
+    Brighter paint shows up to `tint_share` of the tint of its flanks, and at most `most` levels.
     """
     u, v, height = left * table[STEP_U, i], left * table[STEP_V, i], table[HEIGHT, i]
     tint_u, tint_v = height * table[TINT_U, i], height * table[TINT_V, i]
@@ -347,39 +355,40 @@ def _beyond_paint(
 def _learn(table: FloatArray, u: float, v: float) -> tuple[float, float, float, float]:
     """Return direction, ratio and noise of the frame's best stripes; a ratio of 0 if unknown."""
     sigma = _noise(table)
-    # The learned ratio is the one that this share of the best stripes exceeds.
+    # Quantile of the best stripes' ratios that is the learned one.
     learned_quantile = 0.35
-    # Steps that differ from any paint are the most certain; a line as green as the water is not.
+    # First only steps that differ from any paint, which are the most certain; lines as green as the
+    # water are found in the second pass.
     for tint_share in (1.0, _LIKELIHOOD.tint_share):
         best = _best_stripes(table, u, v, sigma, tint_share)
         if best.shape[0] < _LEARN.min_learned:
             continue
-        of_u, of_v = _shown(table, best)
-        line_u, line_v, is_one_colour = _middle(of_u, of_v)
+        of_u, of_v = _chroma_per_level(table, best)
+        line_u, line_v, is_one_colour = _median_step(of_u, of_v)
         if is_one_colour:
             size = hypot(line_u, line_v)
             line_u, line_v = line_u / size, line_v / size
             for k in range(best.shape[0]):
                 of_u[k] = line_u * of_u[k] + line_v * of_v[k]
             ratio = lower_quantile(of_u, learned_quantile)
-            return line_u, line_v, max(ratio, RATIO_LEAST), sigma
+            return line_u, line_v, max(ratio, RATIO_MIN), sigma
     return u, v, 0.0, sigma
 
 
 @inner_kernel
-def _shown(table: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Return the steps of peaks in U and V, for each level of height that shows its colour."""
+def _chroma_per_level(table: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Return the steps of peaks in U and V for each level of height, corrected for overexposure."""
     of_u, of_v = np.empty(rows.shape[0]), np.empty(rows.shape[0])
     for k in range(rows.shape[0]):
         i = rows[k]
-        height = table[HEIGHT, i] * _colour_left(table[TOP, i])
+        height = table[HEIGHT, i] * _chroma_left(table[TOP, i])
         of_u[k], of_v[k] = table[STEP_U, i] / height, table[STEP_V, i] / height
     return of_u, of_v
 
 
 @inner_kernel
-def _middle(of_u: FloatArray, of_v: FloatArray) -> tuple[float, float, bool]:
-    """Return the median of steps, and whether at least half of them are near it."""
+def _median_step(of_u: FloatArray, of_v: FloatArray) -> tuple[float, float, bool]:
+    """Return the median (U, V) of steps, and whether at least half of them are near it."""
     u, v = lower_quantile(of_u, 0.5), lower_quantile(of_v, 0.5)
     apart = np.empty(of_u.shape[0])
     for k in range(of_u.shape[0]):
@@ -440,13 +449,13 @@ def _learn_paint(table: FloatArray, n_min: float) -> tuple[float, float, float, 
 def _learn_beside_paint(
     table: FloatArray, u: float, v: float, paint: Paint
 ) -> tuple[float, float, float, float, float, float]:
-    """Return direction, ratio, noise and spreads of non-paint peaks; a ratio of 0 if unknown."""
+    """Return the fields of a `LineColour` of peaks that are not paint; a ratio of 0 if unknown."""
     paint_u, paint_v, spread_u, spread_v = paint
     sigma = _noise(table)
     is_clear = np.zeros(table.shape[1], np.bool_)
     for i in range(table.shape[1]):
         height, step_u, step_v = table[HEIGHT, i], table[STEP_U, i], table[STEP_V, i]
-        if height >= _PAINT.tall and _is_near(step_u, step_v, u, v):
+        if height >= _PAINT.tall and _is_towards(step_u, step_v, u, v):
             off_u, off_v = step_u - paint_u * height, step_v - paint_v * height
             var_u = squared(spread_u * height) + squared(sigma)
             var_v = squared(spread_v * height) + squared(sigma)
@@ -455,10 +464,10 @@ def _learn_beside_paint(
     best = flatnonzero(is_clear)
     if best.shape[0] < _LEARN.min_learned:
         return u, v, 0.0, sigma, 1.0, 1.0
-    of_u, of_v = _shown(table, best)
-    line_u, line_v, is_one_colour = _middle(of_u, of_v)
+    of_u, of_v = _chroma_per_level(table, best)
+    line_u, line_v, is_one_colour = _median_step(of_u, of_v)
     size = hypot(line_u, line_v)
-    if size > _RATIO_MOST or not is_one_colour:
+    if size > _RATIO_MAX or not is_one_colour:
         return u, v, 0.0, sigma, 1.0, 1.0
     line_u, line_v = line_u / size, line_v / size
     off_along, off_across = np.empty(best.shape[0]), np.empty(best.shape[0])
@@ -467,22 +476,22 @@ def _learn_beside_paint(
         off_across[k] = abs(line_v * of_u[k] - line_u * of_v[k])
     along = max(_PAINT.mad_to_sigma * lower_quantile(off_along, 0.5) / size, _LEARN.min_scatter)
     across = max(_PAINT.mad_to_sigma * lower_quantile(off_across, 0.5) / size, _LEARN.min_scatter)
-    return line_u, line_v, max(size, RATIO_LEAST), sigma, along, across
+    return line_u, line_v, max(size, RATIO_MIN), sigma, along, across
 
 
 @inline_kernel
-def _is_near(step_u: float, step_v: float, u: float, v: float) -> bool:
-    """Return whether a chroma step is within the widest angle of a direction."""
+def _is_towards(step_u: float, step_v: float, u: float, v: float) -> bool:
+    """Return whether the angle of a chroma step to a direction is small enough for a line."""
     along = u * step_u + v * step_v
     size = squared(step_u) + squared(step_v)
     return along > 0.0 and squared(along) > squared(_LEARN.min_cosine) * size
 
 
 @inline_kernel
-def _colour_left(top: float) -> float:
-    """Return the share of its chroma that an overexposed line of this luma shows."""
-    # Luma from which on a channel may be clipped; full scale; and the share of its chroma that a
-    # line shows there: measured on rendered stripes, at the middle or an edge.
+def _chroma_left(top: float) -> float:
+    """Return the share of its chroma that a line of this luma shows: 1, less if overexposed."""
+    # Luma from which on a channel may be clipped, luma at full scale, and the share of the chroma
+    # that remains there; measured on rendered stripes, at the middle or an edge.
     clipped, full, left_at_full = 185.0, 235.0, 0.33
     return 1.0 - (1.0 - left_at_full) * min(max((top - clipped) / (full - clipped), 0.0), 1.0)
 
@@ -491,17 +500,17 @@ def _colour_left(top: float) -> float:
 def _best_stripes(
     table: FloatArray, u: float, v: float, sigma: float, tint_share: float
 ) -> IntArray:
-    """Return the peaks with the most chroma beyond that of paint, relative to their height.
+    """Return the indices of the peaks with the most chroma beyond paint, relative to their height.
 
-    The highest peaks are not taken instead, because they may be white paper.
+    Height alone would select white paper.
     """
     share, least = np.zeros(table.shape[1]), max(_LEARN.clear_sigmas * sigma, _LEARN.clear_levels)
     for i in range(table.shape[1]):
         height = table[HEIGHT, i]
-        if height >= _LEARN.min_height and _is_near(table[STEP_U, i], table[STEP_V, i], u, v):
-            beyond_u, beyond_v = _beyond_paint(table, i, 1.0, tint_share, np.inf)
+        if height >= _LEARN.min_height and _is_towards(table[STEP_U, i], table[STEP_V, i], u, v):
+            beyond_u, beyond_v = _chroma_beyond_paint(table, i, 1.0, tint_share, np.inf)
             size = hypot(beyond_u, beyond_v)
-            share[i] = size / (height * _colour_left(table[TOP, i])) if size > least else 0.0
+            share[i] = size / (height * _chroma_left(table[TOP, i])) if size > least else 0.0
     chosen = np.empty(table.shape[1], np.bool_)
     for i in range(table.shape[1]):
         chosen[i] = share[i] > 0.0
@@ -513,31 +522,33 @@ def _best_stripes(
 
 @lazy_kernel
 def _useful_height(height: FloatArray, likelihood: FloatArray) -> float:
-    lines, peaks = np.zeros(_N_KINDS), np.zeros(_N_KINDS)
-    clearly = 0.8
+    """Return the height (grey levels) from which on a useful number of peaks are clearly lines."""
+    lines, peaks = np.zeros(_N_BINS), np.zeros(_N_BINS)
+    clearly = 0.8  # Likelihood of a clear line.
     for i in range(height.shape[0]):
-        kind = _kind_of(height[i])
-        peaks[kind] += 1.0
-        lines[kind] += likelihood[i] > clearly
+        b = _height_bin(height[i])
+        peaks[b] += 1.0
+        lines[b] += likelihood[i] > clearly
     useful = HIGHEST_USEFUL
-    # Of all peaks from a height on, and of those of about that height.
+    # Both the peaks of a bin and all peaks from its height on must be useful.
     all_lines, all_peaks = 0.0, 0.0
-    for kind in range(_kind_of(HIGHEST_USEFUL) - 1, -1, -1):
-        all_lines, all_peaks = all_lines + lines[kind], all_peaks + peaks[kind]
-        if _are_useful(lines[kind], peaks[kind]) and _are_useful(all_lines, all_peaks):
-            useful = math.ceil(2.0 ** (kind / _KINDS_PER_OCTAVE))
+    for b in range(_height_bin(HIGHEST_USEFUL) - 1, -1, -1):
+        all_lines, all_peaks = all_lines + lines[b], all_peaks + peaks[b]
+        if _are_useful(lines[b], peaks[b]) and _are_useful(all_lines, all_peaks):
+            useful = math.ceil(2.0 ** (b / _BINS_PER_OCTAVE))
     return float(useful)
 
 
 @inline_kernel
 def _are_useful(lines: float, peaks: float) -> bool:
-    # Peaks of a sample of which so few, or at most this share, are clearly lines are skipped.
+    """Return whether enough of a sample's peaks are clearly lines."""
+    # Least number of lines, and least share of the peaks.
     few_lines, useful_share = 4.0, 0.05
     return bool(lines >= few_lines and lines > useful_share * peaks)
 
 
 @kernel
-def _weigh(
+def _write_likelihood(
     table: FloatArray,
     line_colour: tuple[float, float, float, float, float, float],
     paint: Paint,
@@ -545,18 +556,18 @@ def _weigh(
     n_possible: float,
     likelihood: FloatArray,
 ) -> None:
-    """Write the likelihood of each peak, given the first fields of a `LineColour`."""
+    """Write the likelihood (N,) of each peak, given the first six fields of a `LineColour`."""
     u, v, ratio, sigma, along_spread, across_spread = line_colour
     paint_u, paint_v, spread_u, spread_v = paint
     n = table.shape[1]
-    odds, kind = np.empty(n), np.empty(n, np.int64)
+    odds, bin_of = np.empty(n), np.empty(n, np.int64)
     for i in range(n):
         height = table[HEIGHT, i]
         full = ratio * height
-        line = full * _colour_left(table[TOP, i])
+        line = full * _chroma_left(table[TOP, i])
         step_u, step_v = table[STEP_U, i], table[STEP_V, i]
         size = hypot(step_u, step_v)
-        # A step is the largest of three, so its mean is not zero for noise alone.
+        # A step is the largest of three, so its mean is not zero for pure noise: shrink it.
         left = (
             max(
                 1.0 - _LIKELIHOOD.largest_of_three * max(sigma - _LIKELIHOOD.quiet, 0.0) / size, 0.0
@@ -566,7 +577,7 @@ def _weigh(
         )
         step_u, step_v = left * step_u, left * step_v
         along, across = u * step_u + v * step_v, v * step_u - u * step_v
-        # More of the colour than expected is no evidence against a line.
+        # More chroma than expected is no evidence against a line.
         off_line = min(along - line, 0.0)
         var_along = squared(sigma) + squared(along_spread * full)
         var_across = squared(sigma) + squared(across_spread * full)
@@ -574,11 +585,11 @@ def _weigh(
             off_u, off_v = step_u - paint_u * height, step_v - paint_v * height
             var_u = squared(sigma) + squared(spread_u * height)
             var_v = squared(sigma) + squared(spread_v * height)
-            # Where both explanations hold, the narrower one has the higher density.
+            # Normalisation of the two densities: the narrower one is higher.
             off_paint = squared(off_u) / var_u + squared(off_v) / var_v
             off_paint -= math.log(var_along * var_across / (var_u * var_v))
         else:
-            beyond_u, beyond_v = _beyond_paint(
+            beyond_u, beyond_v = _chroma_beyond_paint(
                 table, i, left, _LIKELIHOOD.tint_share, _LIKELIHOOD.paint_share * line
             )
             off_paint = (squared(beyond_u) + squared(beyond_v)) / (
@@ -589,21 +600,21 @@ def _weigh(
             # Light of another colour.
             log_odds = -_LIKELIHOOD.max_log_odds
         odds[i] = math.exp(min(max(log_odds, -_LIKELIHOOD.max_log_odds), _LIKELIHOOD.max_log_odds))
-        kind[i] = _kind_of(height)
-    share, lines, peaks = np.empty(_N_KINDS), np.empty(_N_KINDS), np.empty(_N_KINDS)
-    for k in range(_N_KINDS):
+        bin_of[i] = _height_bin(height)
+    share, lines, peaks = (np.empty(_N_BINS), np.empty(_N_BINS), np.empty(_N_BINS))
+    for k in range(_N_BINS):
         share[k] = 0.5
     for _ in range(_ROUNDS):
-        for k in range(_N_KINDS):
+        for k in range(_N_BINS):
             lines[k], peaks[k] = 1.0, 2.0
         for i in range(n):
-            prior = share[kind[i]]
+            prior = share[bin_of[i]]
             likelihood[i] = prior * odds[i] / (prior * odds[i] + 1.0 - prior)
-            lines[kind[i]] += likelihood[i]
-            peaks[kind[i]] += 1.0
-        # The number of lines is limited to the number that the lasers can make.
+            lines[bin_of[i]] += likelihood[i]
+            peaks[bin_of[i]] += 1.0
+        # The lasers cannot make more lines than `n_possible`.
         most = min(n_possible / sum_of(lines), 1.0)
-        for k in range(_N_KINDS):
+        for k in range(_N_BINS):
             share[k] = lines[k] / peaks[k] * most
     for i in range(n):
         if table[TOP, i] >= WHITE and table[WIDTH, i] <= widest_white_px:

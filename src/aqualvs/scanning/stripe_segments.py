@@ -24,7 +24,7 @@ from aqualvs.geometry.compiled import inner_kernel, kernel
 from aqualvs.scanning.laser_bands import LaserBand, SearchAxis
 from aqualvs.scanning.laser_colour import (
     RATIO_EXPECTED,
-    RATIO_LEAST,
+    RATIO_MIN,
     WHITE,
     LaserColour,
     channel_image,
@@ -372,7 +372,7 @@ def general_evidence(table: FloatArray, width_px: int, *, has_colour: bool) -> F
     most, across = halo, np.zeros(n)
     if has_colour:
         along, halo = (
-            _clip_ratio(table, ALONG, RATIO_LEAST),
+            _clip_ratio(table, ALONG, RATIO_MIN),
             _clip_ratio(table, HALO, _EVIDENCE.halo_expected),
         )
         most, across = np.maximum(table[ALONG], table[HALO]), table[ACROSS]
@@ -447,7 +447,7 @@ def learn_lines(
     is_certain = (log_odds > _EVIDENCE.certain) & (share >= _EVIDENCE.certain_share)
     is_certain |= (log_odds > _EVIDENCE.certain_if_long) & (share >= _EVIDENCE.long_share)
     if has_colour:
-        is_certain &= np.minimum(table[ALONG], table[HALO]) >= RATIO_LEAST
+        is_certain &= np.minimum(table[ALONG], table[HALO]) >= RATIO_MIN
     certain = np.flatnonzero(is_certain)
     if len(certain) == 0:
         return None
