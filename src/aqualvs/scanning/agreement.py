@@ -440,7 +440,7 @@ class LaserAgreement:
         self._rig = rig
         self._camera = rig.camera()
         self._known = rig_uncertainty(rig)
-        axes = [search.axis for search in plan_bands(rig, self._camera)]
+        axes = [band.axis for band in plan_bands(rig, self._camera)]
         self._along_x = np.array([axis is SearchAxis.ALONG_X for axis in axes], np.int64)
         self._middles: dict[int, FloatArray] = {}
         # At first one frame in this many is used: neighbouring frames show the same.

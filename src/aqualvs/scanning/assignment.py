@@ -515,15 +515,15 @@ def _sample_bands(laser_bands: Sequence[LaserBand], triangulator: Triangulator) 
     # Samples across a laser's band, in which its stripe on a plane is looked up.
     n_samples = 16
     bands = np.full((len(laser_bands), n_cells, n_samples, 4), np.nan)
-    for i, search in enumerate(laser_bands):
-        lines = np.arange(CELL_LINES // 2, len(search.lowest), CELL_LINES)
-        lines = lines[search.lowest[lines] <= search.highest[lines]]
+    for i, band in enumerate(laser_bands):
+        lines = np.arange(CELL_LINES // 2, len(band.lowest), CELL_LINES)
+        lines = lines[band.lowest[lines] <= band.highest[lines]]
         if not len(lines):
             continue
-        places = np.linspace(search.lowest[lines], search.highest[lines], n_samples, axis=1)
-        middle = (lines + 0.5)[:, None] * search.line_px - 0.5 + search.shift_px
+        places = np.linspace(band.lowest[lines], band.highest[lines], n_samples, axis=1)
+        middle = (lines + 0.5)[:, None] * band.line_px - 0.5 + band.shift_px
         across = np.broadcast_to(middle, places.shape)
-        along_x = search.axis is SearchAxis.ALONG_X
+        along_x = band.axis is SearchAxis.ALONG_X
         pixels = np.stack([places, across] if along_x else [across, places], axis=-1)
         n = places.size
         found = triangulator.triangulate(

@@ -1,7 +1,7 @@
 """Laser bands: the part of the image where each laser can appear, and its possible slopes there.
 
-A laser sheet, limited to the working range, is seen only in a band of the image that follows from
-the rig. The band replaces the hand-drawn areas of the paper (section 3.1).
+A laser sheet, limited to the working range, is visible only in a band of the image, which follows
+from the rig. The band replaces the hand-drawn areas of the paper (section 3.1).
 """
 
 import functools
@@ -22,7 +22,7 @@ from aqualvs.optics.shutter import FIRST_ROW, Field
 from aqualvs.scanning.laser_colour import LaserColour
 
 SLOPE_CELL = 8
-"""Positions, and search lines, per cell of the slope tables and of the grid bands come from."""
+"""Positions, and search lines, per cell of the slope tables and of the grid that is intersected."""
 
 
 class SearchAxis(Enum):
@@ -50,8 +50,8 @@ class LaserBand:
     """The search band of one laser in the image."""
 
     axis: SearchAxis  # Direction of the search lines.
-    # Pixels across one search line, 1 or 2: the mean of so many rows or columns of pixels, or one
-    # row of every two in a field.
+    # Pixels across one search line, 1 or 2: it is the mean of that many rows or columns of pixels,
+    # or in a field one row of two.
     line_px: int
     # Shape (n_lines,): first and last position of the band on each search line; lowest > highest
     # where the laser cannot be seen.
@@ -61,17 +61,16 @@ class LaserBand:
     # within 45 degrees of square allows, by cell of 8 positions by 8 lines.
     slope_low: FloatArray
     slope_high: FloatArray
-    # Of the laser's light.
-    colour: LaserColour = LaserColour.GREEN
-    # Of the lines from the middle of the pixels that each stands for; 0 but for the rows of a
-    # field.
+    colour: LaserColour = LaserColour.GREEN  # Of the laser's light.
+    # Shift of each search line from the middle of its `line_px` pixels; nonzero for rows of a field
+    # only.
     shift_px: float = 0.0
-    # Pixels from one position to the next; 2 along the columns of a field.
+    # Pixels from one position to the next; 2 along the columns of a field, else 1.
     position_px: float = 1.0
 
     @property
     def lines(self) -> BandLines:
-        """What kernels use of the band."""
+        """Arguments of kernels: the band without its axis and colour."""
         return BandLines(
             self.lowest, self.highest, self.slope_low, self.slope_high, self.line_px, self.shift_px
         )
@@ -83,16 +82,18 @@ class LaserBand:
 
 
 def search_range(working_range: tuple[float, float]) -> tuple[float, float]:
-    """Return the working range widened, so that a target beyond it is detected and reported."""
+    """Return the working range (m) widened, so that a target beyond it is detected and reported."""
     near, far = working_range
     return 0.8 * near, 1.2 * far
 
 
 def pixels_per_line(size_px: tuple[int, int]) -> int:
-    """Return how many rows or columns of pixels make a search line: 2 in wide pictures, or 1."""
-    # Wider pictures have finer pixels than stripes need; lines are binned to about this many.
-    pixels_per_line_from = 1280
-    return 2 if size_px[0] >= pixels_per_line_from else 1
+    """Return the number of rows or columns of pixels in a search line: 2 in wide pictures, else 1.
+
+    Wide pictures have finer pixels than stripes need.
+    """
+    wide_px = 1280
+    return 2 if size_px[0] >= wide_px else 1
 
 
 def plan_bands(rig: Rig, camera: Camera, field: Field | None = None) -> tuple[LaserBand, ...]:
@@ -112,7 +113,7 @@ def plan_bands(rig: Rig, camera: Camera, field: Field | None = None) -> tuple[La
     tuple of LaserBand
         In the order of `rig.lasers`.
     """
-    # All lasers are seen along the rays of the same pixels.
+    # The rays of the grid are the same for all lasers.
     rays = functools.cache(functools.partial(_rays_on_grid, camera))
     return tuple(
         _plan_band(
@@ -130,6 +131,7 @@ def _plan_band(
     field: Field | None,
     rays: Callable[[tuple[int, int]], Rays],
 ) -> LaserBand:
+    """Compute the band of one laser; `rays` gives those of a grid with steps along x and y (px)."""
     fine = (SLOPE_CELL, SLOPE_CELL)
     points, in_band = _points_on_grid(sheet, working_range, rays(fine))
     rise, run = _stripe_directions(points, _target_normals()[:1])
@@ -144,7 +146,7 @@ def _plan_band(
         points, in_band = _points_on_grid(sheet, working_range, rays(steps))
     if along_x:
         points, in_band = points.swapaxes(0, 1), in_band.T
-    # Seen with search lines as columns, the change along a line is the rise.
+    # The grid now has search lines as columns: the slope d(position)/d(line) is rise over run.
     rise, run = _stripe_directions(points, _target_normals())
     length, n_pixels = camera.size_px if along_x else camera.size_px[::-1]
     lowest, highest = _band_limits(in_band, n_pixels // line_px, length)
@@ -164,14 +166,16 @@ def _rays_on_grid(camera: Camera, steps: tuple[int, int]) -> Rays:
 def _points_on_grid(
     sheet: Sheet, working_range: tuple[float, float], rays: Rays
 ) -> tuple[FloatArray, BoolArray]:
-    """Return points on the sheet that a grid of rays meets, and a mask of those in range."""
+    """Return the points (..., 3) where rays meet the sheet, and a mask of those in range.
+
+    In `dome`, metres.
+    """
     points, valid = sheet.intersect(rays)
     distance = np.linalg.norm(points, axis=-1)
     near, far = search_range(working_range)
-    # Factor on the far range: off the axis, points of a target there are farther by up to this
-    # much.
+    # Points of a target at the far range are farther away by up to this factor, off the axis. At
+    # the near range no point is nearer than the target's plane, so that bound is exact.
     off_axis_stretch = 1.5
-    # A plane at range d has no point nearer than d, so the near bound is exact.
     with np.errstate(invalid="ignore"):
         in_band = valid & (distance >= near) & (distance <= far * off_axis_stretch)
     return points, in_band
@@ -179,9 +183,11 @@ def _points_on_grid(
 
 @functools.cache
 def _target_normals() -> FloatArray:
-    """Return the normals (5, 3) of targets that bound a stripe's direction; square first."""
+    """Return the normals (5, 3) of a target square to the vehicle, and of the most tilted ones.
+
+    They bound the direction of a stripe.
+    """
     tilts = [np.zeros(3)]
-    # Largest angle of a target from square to the vehicle; it bounds the stripe's direction.
     max_target_tilt = np.deg2rad(45.0)
     for sign in (-1.0, 1.0):
         tilts += [np.array([sign * max_target_tilt, 0.0, 0.0])]
@@ -190,9 +196,11 @@ def _target_normals() -> FloatArray:
 
 
 def _stripe_directions(points: FloatArray, normals: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the stripe direction (rise along the rows, run along the columns) for several targets.
+    """Return the direction of the stripe at points (V, U, 3) for targets with normals (N, 3).
 
-    The stripe of a target n·X = d is the contour line of n·X over the image.
+    The stripe of a target n·X = d is the contour line of n·X over the image: its direction is the
+    gradient, turned by a right angle. Rise and run (N, V, U) are its components along the first and
+    the second axis of the grid.
     """
     with np.errstate(invalid="ignore"):
         height = np.einsum("nk,vuk->nvu", normals, points)
@@ -201,19 +209,21 @@ def _stripe_directions(points: FloatArray, normals: FloatArray) -> tuple[FloatAr
 
 
 def _search_axis(rise: FloatArray, run: FloatArray, in_band: BoolArray) -> SearchAxis:
+    """Return the image axis that crosses most of the stripe nearer to a right angle."""
     steep = np.abs(rise) > np.abs(run)
     share = np.mean(steep[in_band]) if np.any(in_band) else 0.0
     return SearchAxis.ALONG_X if share > 0.5 else SearchAxis.ALONG_Y
 
 
 def _slope_bounds(rise: FloatArray, run: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the lowest and highest slope of each cell over all targets; all slopes if unknown."""
     with np.errstate(invalid="ignore", divide="ignore"):
         slopes = rise / run
     slopes = np.where(np.isfinite(slopes), slopes, np.nan)
     known = np.isfinite(slopes).any(axis=0)
     low = np.min(np.where(np.isfinite(slopes), slopes, np.inf), axis=0)
     high = np.max(np.where(np.isfinite(slopes), slopes, -np.inf), axis=0)
-    # Slopes beyond this count as parallel to the search line.
+    # Steeper stripes count as parallel to the search line.
     steepest = 5.0
     low = np.where(known, np.clip(low, -steepest, steepest), -steepest)
     high = np.where(known, np.clip(high, -steepest, steepest), steepest)
@@ -221,7 +231,7 @@ def _slope_bounds(rise: FloatArray, run: FloatArray) -> tuple[FloatArray, FloatA
 
 
 def _band_limits(in_band: BoolArray, n_lines: int, length: int) -> tuple[IntArray, IntArray]:
-    """Return the first and last position on each line, one cell wider than the grid says."""
+    """Return first and last position (n_lines,) of the band, widened by one cell of the grid."""
     any_in = in_band.any(axis=0)
     first = np.argmax(in_band, axis=0)
     last = in_band.shape[0] - 1 - np.argmax(in_band[::-1], axis=0)

@@ -601,7 +601,7 @@ def _write_likelihood(
             log_odds = -_LIKELIHOOD.max_log_odds
         odds[i] = math.exp(min(max(log_odds, -_LIKELIHOOD.max_log_odds), _LIKELIHOOD.max_log_odds))
         bin_of[i] = _height_bin(height)
-    share, lines, peaks = (np.empty(_N_BINS), np.empty(_N_BINS), np.empty(_N_BINS))
+    share, lines, peaks = np.empty(_N_BINS), np.empty(_N_BINS), np.empty(_N_BINS)
     for k in range(_N_BINS):
         share[k] = 0.5
     for _ in range(_ROUNDS):

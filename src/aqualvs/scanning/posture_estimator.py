@@ -133,13 +133,13 @@ class PostureEstimator:
 
     def __init__(self, rig: Rig, laser_bands: Sequence[LaserBand], fit: FitMethod) -> None:
         self._fit_method = fit
-        self._n_lines = np.array([len(search.lowest) for search in laser_bands])
-        self._position_px = np.array([search.position_px for search in laser_bands])
+        self._n_lines = np.array([len(band.lowest) for band in laser_bands])
+        self._position_px = np.array([band.position_px for band in laser_bands])
         self._working_range = rig.working_range
         self._n_lasers = len(rig.lasers)
         self._observer = StripeObserver(rig)
         self._focal_px = rig.focal_px
-        self._line_px = max((search.line_px for search in laser_bands), default=1)
+        self._line_px = max((band.line_px for band in laser_bands), default=1)
         self._axis_in_dome = rig.dome_from_cam.rotate([0.0, 0.0, 1.0])
 
     def measure(

@@ -1,13 +1,12 @@
-"""Segments: stripe peaks on neighbouring search lines that follow one another, and their shape.
+"""Segments: linked stripe peaks on neighbouring search lines, and the shapes of their components.
 
 A stripe on a wall makes segments of hundreds of peaks, a strand of a net one of a few. A long
-segment that runs in a direction in which its laser's stripe cannot run belongs to another laser;
-the direction of a short one carries no information, because it follows the strand, not the stripe.
-Segments that continue where another ends, or meet there, form a connected component:
-one strand with its knots.
+segment whose direction is impossible for its laser's stripe belongs to another laser; the direction
+of a short one carries no information, because it follows the strand, not the stripe. Segments whose
+ends meet form a connected component, such as a strand with its knots.
 
-`ComponentShapes` describes single components: straight, bent smoothly, or as high as they are wide.
-The flank of a fish bends the stripe in one smooth sweep; a face of a box keeps it straight, and its
+`ComponentShapes` describes components: straight, bent smoothly, or as high as they are wide. The
+flank of a fish bends the stripe in one smooth sweep; a face of a box keeps it straight, and its
 edge breaks it; a bubble is a spot.
 """
 
@@ -29,17 +28,19 @@ from aqualvs.geometry.linear_algebra import n_bins, solve_symmetric
 from aqualvs.scanning.laser_bands import SLOPE_CELL, BandLines, LaserBand
 from aqualvs.scanning.stripe import StripePeaks
 
-# Least height of a bend over its chord, beyond errors of the lens.
+# Least sagitta of a bend, in pixels; errors of the lens are smaller.
 _MIN_SAGITTA_PX = 1.0
-# Shorter pieces are as short as the light on a strand and have no distinctive shape.
+# Least number of search lines of a component with a distinctive shape; the light on a strand is
+# shorter.
 _MIN_LINES = 16
-# A spot is as long as it is wide within these factors, and no larger than that.
+# A spot: limits of length over width, least number of search lines, largest length in metres, and
+# least height as a share of that of the frame's bright peaks, because bubbles glint.
 _ROUND_FROM, _ROUND_TO = 0.5, 2.6
 _SPOT_LINES = 4
 _LARGEST_SPOT = 0.012
-# And it glints: its brightness as a share of that of the frame's bright peaks.
 _GLINT_SHARE = 0.75
-# What is summed over a component: powers 0 to 4 of the place, its moments, and squares.
+# Columns of the sums over a component: powers 0 to 4 of the place along its chord (0 to 4), three
+# moments of the offset beside it (5 to 7), and the offset squared.
 _MOMENTS, _SQUARES, _N_SUMS = 5, 8, 9
 
 
@@ -47,14 +48,14 @@ class ComponentShapes(NamedTuple):
     """Shapes of components (connected segments), one row for each component number."""
 
     n_lines: FloatArray  # Shape (S,): search lines in it.
-    # Shape (S,): height of its bend over its chord, as a shift of the stripe; 0 where it is too
-    # short to have a shape.
+    # Shape (S,): height of a parabola over the component's chord, as a shift of the stripe; 0 if
+    # the component is too short to have a shape.
     sagitta_px: FloatArray
-    # Shape (S,): root mean square of what a parabola leaves, likewise.
+    # Shape (S,): root mean square of the residuals of the parabola, likewise.
     rough_px: FloatArray
-    # Shape (S,): chord in metres.
+    # Shape (S,): length of the chord in metres.
     size: FloatArray
-    # Shape (S,): mean width of its peaks in search lines.
+    # Shape (S,): mean width of its peaks in pixels.
     thickness: FloatArray
     # Shape (S,): mean height of its peaks in grey levels.
     height: FloatArray
@@ -72,7 +73,7 @@ class ComponentShapes(NamedTuple):
         return self._those(is_straight)
 
     def round(self, bright: float) -> BoolArray:
-        """Mark the components that are spots of at least nearly the height `bright`."""
+        """Mark the components that are spots about as high as `bright` (grey levels) or higher."""
         return self._those(lambda shapes, s: is_round(shapes, s, bright))
 
     def _those(self, asked: Callable[["ComponentShapes", int], bool]) -> BoolArray:
@@ -83,7 +84,7 @@ class ComponentShapes(NamedTuple):
 def is_bent(shapes: ComponentShapes, s: int) -> bool:
     """Return whether component s is bent smoothly, as the flank of a fish."""
     sagitta_px = shapes.sagitta_px[s]
-    # Largest residual of a smooth bend: a floor, and a share of its height. A corner leaves more.
+    # Largest residual of a smooth bend: a floor, and a share of its sagitta. A corner leaves more.
     rough_px = 0.3
     rough_share = 0.05
     smooth = shapes.rough_px[s] < rough_px + rough_share * sagitta_px
@@ -108,7 +109,7 @@ def is_straight(shapes: ComponentShapes, s: int) -> bool:
 
 @inline_borrowing_kernel
 def is_round(shapes: ComponentShapes, s: int, bright: float) -> bool:
-    """Return whether component s is a spot of at least nearly the height `bright`."""
+    """Return whether component s is a spot about as high as `bright` (grey levels) or higher."""
     n_lines = shapes.n_lines[s]
     ratio = n_lines / max(shapes.thickness[s], 1.0)
     spot = _ROUND_FROM <= ratio <= _ROUND_TO and n_lines >= _SPOT_LINES
@@ -176,7 +177,7 @@ def _measure_components(
     first: IntArray,
     last: IntArray,
 ) -> None:
-    """Sum lines, widths and heights, and find the candidates at the ends."""
+    """Sum lines, widths and heights of each component, and find the candidates at its ends."""
     begin = ZERO
     while begin < component.shape[0]:
         s, end = component[begin], run_end(component, begin)
@@ -245,9 +246,9 @@ def _add_powers(
     length: float,
     sums: FloatArray,
 ) -> None:
-    """Add the powers of the places along a chord, 0 to 1, and their products with those beside it.
+    """Add the powers of the place t along a chord, 0 to 1, and the moments of the offset beside it.
 
-    Places beside the chord are in pixels.
+    The offset is the shift of the stripe, in pixels, that moves the point off the chord.
     """
     scale = 1.0 / length
     ex, ey, ez = chord[0] * scale, chord[1] * scale, chord[2] * scale
@@ -290,7 +291,7 @@ _LINK_GATE_PX = 2.0
 
 @dataclass(frozen=True, slots=True)
 class Segments:
-    """Peaks of one laser's search, grouped by segment, component and subsegment."""
+    """Peaks in one laser's band, grouped by segment, component and subsegment."""
 
     # Shape (N,): indices into the `StripePeaks`, segment by segment, along each segment.
     order: IntArray
@@ -302,14 +303,14 @@ class Segments:
     subsegment: IntArray
 
 
-def link_segments(peaks: StripePeaks, search: LaserBand) -> Segments:
-    """Group the peaks inside a laser's band; segments of another laser's direction are dropped.
+def link_segments(peaks: StripePeaks, band: LaserBand) -> Segments:
+    """Group the peaks inside a laser's band; drop segments that only another laser can make.
 
     Parameters
     ----------
     peaks : StripePeaks
-        Of the search direction of `search`.
-    search : LaserBand
+        Of the search direction of `band`.
+    band : LaserBand
         Band and slopes of the laser.
 
     Returns
@@ -317,14 +318,14 @@ def link_segments(peaks: StripePeaks, search: LaserBand) -> Segments:
     Segments
     """
     numbers = np.empty((3, peaks.n), np.int64)
-    n = segment_peaks(peaks, search.lines, numbers)
+    n = segment_peaks(peaks, band.lines, numbers)
     order, component, subsegment = numbers[:, :n]
     return Segments(order, component, subsegment)
 
 
 @inner_kernel
 def in_a_row(line: IntArray, position: FloatArray) -> BoolArray:
-    """Mark the peaks (N,) of segments of at least `SUBSEGMENT_LINES`, of any direction.
+    """Mark the peaks (N,) in segments of at least `SUBSEGMENT_LINES` peaks, in any direction.
 
     Parameters
     ----------
@@ -335,7 +336,7 @@ def in_a_row(line: IntArray, position: FloatArray) -> BoolArray:
     n_lines = line[n - 1] + 1 if n else 0
     segment_of = np.empty(n, np.int64)
     first, last, count = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, np.int64)
-    # Beyond any position on a search line.
+    # No band: limits beyond any position on a search line.
     anywhere = 1 << 40
     lowest, highest = np.full(n_lines, -anywhere), np.full(n_lines, anywhere)
     _link(line, position, lowest, highest, segment_of, first, last, count)
@@ -347,15 +348,18 @@ def in_a_row(line: IntArray, position: FloatArray) -> BoolArray:
 
 @lazy_kernel
 def segment_peaks(peaks: StripePeaks, band: BandLines, numbers: IntArray) -> int:
-    """Write the rows of `Segments`, shape (3, N); return the number kept."""
+    """Write the fields of `Segments` as rows (3, N); return the number of peaks kept.
+
+    Peaks outside the band, and of segments of another laser's direction, are left out.
+    """
     line, position, n = peaks.line, peaks.position, peaks.line.shape[0]
     segment_of = np.empty(n, np.int64)
-    # First and last return of each segment, and their number.
+    # First and last peak of each segment, and the number of its peaks.
     first, last, count = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, np.int64)
     n_segments = _link(line, position, band.lowest, band.highest, segment_of, first, last, count)
-    start = _sort(segment_of, count[:n_segments], numbers)
+    start = _sort_by_segment(segment_of, count[:n_segments], numbers)
     n_kept = _drop_foreign(peaks, band, start, first, last, numbers)
-    root = _join(line, position, first[:n_kept], last[:n_kept])
+    root = _join_components(line, position, first[:n_kept], last[:n_kept])
     order, component = numbers[0], numbers[1]
     n = 0
     for s in range(n_kept):
@@ -369,7 +373,7 @@ def segment_peaks(peaks: StripePeaks, band: BandLines, numbers: IntArray) -> int
 
 
 @inline_borrowing_kernel
-def _still_due(x: int, n_alive: int, alive: IntArray, track: FloatArray, due: FloatArray) -> int:
+def _predict(x: int, n_alive: int, alive: IntArray, track: FloatArray, due: FloatArray) -> int:
     """Predict the segments' positions on search line x; drop ended ones, return the number left."""
     kept = 0
     for k in range(n_alive):
@@ -396,10 +400,14 @@ def _link(
     last: IntArray,
     count: IntArray,
 ) -> int:
-    """Give each peak the segment that it continues, or a new one; -1 outside the band."""
+    """Assign each peak to the segment that it continues, or to a new one; -1 outside the band.
+
+    Write `segment_of` (N,), and first peak, last peak and count of each segment; return the number
+    of segments. A segment predicts its next peak by its last position and an averaged slope.
+    """
     n = line.shape[0]
-    # Active segments: number and last line; last position, slope and the largest change of it by
-    # the next return; and the predicted position on this search line.
+    # Active segments: number and last search line; last position, slope, and weight of the next
+    # peak in the slope; and the predicted position on this search line.
     alive, track, due = np.empty((2, n), np.int64), np.empty((3, n)), np.empty(n)
     n_alive = ZERO
     n_segments = 0
@@ -410,7 +418,7 @@ def _link(
         if place < lowest[x] or place > highest[x]:
             continue
         if x != here:
-            n_alive = _still_due(x, n_alive, alive, track, due)
+            n_alive = _predict(x, n_alive, alive, track, due)
             here = x
         best = -1
         best_miss = _LINK_GATE_PX
@@ -426,19 +434,19 @@ def _link(
             n_alive += 1
         else:
             s = alive[0, best]
-            # The last return is one or two search lines away.
-            seen = (place - track[0, best]) * (1.0 if x - alive[1, best] == 1 else 0.5)
-            track[1, best] += track[2, best] * (seen - track[1, best])
+            # The last peak is one or two search lines away.
+            slope = (place - track[0, best]) * (1.0 if x - alive[1, best] == 1 else 0.5)
+            track[1, best] += track[2, best] * (slope - track[1, best])
             count[s] += 1
             track[2, best] = max(1.0 / count[s], 0.15)
-        # A segment has one peak on a search line.
+        # A segment has one peak on a search line: no other one is near the prediction.
         alive[1, best], track[0, best], due[best] = x, place, np.inf
         segment_of[i], last[s] = s, i
     return n_segments
 
 
 @inner_kernel
-def _sort(segment_of: IntArray, count: IntArray, numbers: IntArray) -> IntArray:
+def _sort_by_segment(segment_of: IntArray, count: IntArray, numbers: IntArray) -> IntArray:
     """Sort the peaks by segment into the first row of `numbers`; return the segments' starts."""
     n_segments = count.shape[0]
     start, fill = np.empty(n_segments + 1, np.int64), np.empty(n_segments, np.int64)
@@ -463,10 +471,13 @@ def _drop_foreign(
     last: IntArray,
     numbers: IntArray,
 ) -> int:
-    """Keep the segments whose direction is possible, and count them; number their subsegments."""
+    """Keep the segments whose direction is possible; number their subsegments.
+
+    Return the number of segments kept. `numbers`, `first` and `last` are compacted in place.
+    """
     order, subsegment = numbers[0], numbers[2]
     n, n_subsegments, n_kept = 0, 0, 0
-    # Segments shorter than this follow the strand; longer ones must follow the stripe.
+    # Least number of peaks of a segment that must follow the stripe; shorter ones follow strands.
     long_segment = 24
     for s in range(start.shape[0] - 1):
         begin, size = start[s], start[s + 1] - start[s]
@@ -474,10 +485,10 @@ def _drop_foreign(
             members = order[begin : begin + size]
             if not _direction_possible(peaks, members, band):
                 continue
-            n_planes = (size + SUBSEGMENT_LINES - 1) // SUBSEGMENT_LINES
+            n_parts = (size + SUBSEGMENT_LINES - 1) // SUBSEGMENT_LINES
             for k in range(size):
-                subsegment[n + k] = n_subsegments + k * n_planes // size
-            n_subsegments += n_planes
+                subsegment[n + k] = n_subsegments + k * n_parts // size
+            n_subsegments += n_parts
         else:
             for k in range(size):
                 subsegment[n + k] = n_subsegments
@@ -493,7 +504,10 @@ def _drop_foreign(
 
 @inner_kernel
 def _direction_possible(peaks: StripePeaks, members: IntArray, band: BandLines) -> bool:
-    """Return whether the direction of a long segment is possible for its laser's stripe."""
+    """Return whether the slope of a long segment is possible for its laser's stripe.
+
+    The slope is that of a straight line through its peaks, by least squares.
+    """
     line, position, n = peaks.line, peaks.position, members.shape[0]
     mean_line = 0.0
     mean_position = 0.0
@@ -511,7 +525,7 @@ def _direction_possible(peaks: StripePeaks, members: IntArray, band: BandLines) 
     slope = product / spread
     row = int(mean_position) // SLOPE_CELL
     column = int(mean_line) // SLOPE_CELL
-    # Tolerance of a segment's direction beyond the bounds for a plane target; covers curvature.
+    # Tolerance of a slope beyond the bounds for a plane target; covers curvature.
     slope_margin = 0.15
     low = band.slope_low[row, column] - slope_margin
     high = band.slope_high[row, column] + slope_margin
@@ -519,8 +533,10 @@ def _direction_possible(peaks: StripePeaks, members: IntArray, band: BandLines) 
 
 
 @inner_kernel
-def _join(line: IntArray, position: FloatArray, first: IntArray, last: IntArray) -> IntArray:
-    """Assign each connected component of segments whose ends meet the number of its first segment.
+def _join_components(
+    line: IntArray, position: FloatArray, first: IntArray, last: IntArray
+) -> IntArray:
+    """Return for each segment the number of the first segment of its connected component.
 
     `first` and `last` are the peaks at the segments' ends; segments are ordered by the first.
     """
@@ -528,7 +544,8 @@ def _join(line: IntArray, position: FloatArray, first: IntArray, last: IntArray)
     root = np.empty(n, np.int64)
     for s in range(n):
         root[s] = s
-    # A segment that begins this near to another one's end belongs to the same component.
+    # A segment that begins within this distance of another one's end belongs to the same component:
+    # in search lines, and in pixels.
     join_lines = 4
     join_px = 4.0
     for a in range(n):
@@ -560,6 +577,7 @@ def _first_from(line: IntArray, first: IntArray, wanted: int) -> int:
 
 @inline_borrowing_kernel
 def _root_of(root: IntArray, a: int) -> int:
+    """Return the root of a segment in the union-find forest."""
     while root[a] != a:
         a = root[a]
     return a

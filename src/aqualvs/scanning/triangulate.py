@@ -62,8 +62,8 @@ class Triangulator:
         laser : int array, shape (N,)
             Index into the rig's lasers.
         group : int array, shape (N,), optional
-            Neighbours with equal numbers, which stand together, share the sensitivity of the first
-            of them; over a few pixels of one stripe it hardly changes.
+            Successive pixels with equal numbers share the sensitivity of the first of them; over a
+            few pixels of one stripe it hardly changes.
         """
         n = len(pixels)
         points, sensitivity, valid = np.empty((n, 3)), np.empty((n, 3)), np.empty(n, np.bool_)
@@ -82,7 +82,10 @@ class Triangulator:
         out_sensitivity: FloatArray,
         out_valid: BoolArray,
     ) -> bool:
-        """Triangulate into arrays (N, 3), (N, 3) and (N); return whether all points are valid."""
+        """Write the fields of a `Triangulation`; return whether all points are valid.
+
+        Arguments as of `triangulate`.
+        """
         n = len(pixels)
         rays_px, owner = np.empty((2 * n, 2)), np.empty(n, np.int64)
         n_rays = _place_rays(pixels, along_x, group, rays_px, owner)
@@ -133,9 +136,10 @@ def _intersect(
 def _place_rays(
     pixels: FloatArray, along_x: IntArray, group: IntArray, rays_px: FloatArray, owner: IntArray
 ) -> int:
-    """Write the pixels, and after them the first of each group moved along the search line.
+    """Write the pixels to trace: all N, then the first of each group moved along the search line.
 
-    The row of the moved pixel that gives each pixel's sensitivity is written to `owner`.
+    `owner` (N,) gets the row of the moved pixel that gives each pixel's sensitivity. Return the
+    number of pixels to trace.
     """
     n = pixels.shape[0]
     n_rays = n
@@ -162,7 +166,7 @@ def _intersect_planes(
     sensitivity: FloatArray,
     valid: BoolArray,
 ) -> None:
-    """Intersect the rays with n·X = d (Eq. 20); the first of a group has a moved ray as well."""
+    """Intersect the rays with n·X = d (Eq. 20), and those moved of the first of each group."""
     sx, sy, sz = np.nan, np.nan, np.nan
     for i in range(points.shape[0]):
         plane = laser[i]
@@ -190,7 +194,7 @@ def _intersect_planes(
 def _distance_to_sheet(
     origins: FloatArray, directions: FloatArray, i: int, planes: FloatArray, plane: int
 ) -> float:
-    """Return the distance along ray i to the plane."""
+    """Return the distance along ray i to a plane, in metres; negative behind its origin."""
     nx, ny, nz = planes[plane, 0], planes[plane, 1], planes[plane, 2]
     approach = nx * directions[i, 0] + ny * directions[i, 1] + nz * directions[i, 2]
     behind = nx * origins[i, 0] + ny * origins[i, 1] + nz * origins[i, 2] - planes[plane, 3]
@@ -209,10 +213,10 @@ def _intersect_bent_sheets(
     sensitivity: FloatArray,
     valid: BoolArray,
 ) -> None:
-    """Move the points of bent sheets from the planes near them onto them.
+    """Replace the points on the planes of bent sheets by points on the sheets themselves.
 
-    A sheet's tangent plane at a point approximates it along the moved ray, and nearly so along the
-    next ray of the group.
+    The tangent plane at a point approximates the sheet along the moved ray; along the next ray of
+    the group it gives the first guess.
     """
     sx, sy, sz = np.nan, np.nan, np.nan
     near = np.nan
