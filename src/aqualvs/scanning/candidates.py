@@ -2,7 +2,7 @@
 
 `find_candidates` links each laser's peaks (`StripePeaks`) to segments and triangulates them; the
 result, `Candidates`, holds the candidate correspondences of peaks and lasers. `Subsegments`
-summarises them by subsegments, the units that agree with a surface or do not.
+summarises them: a subsegment as a whole lies on a surface or does not.
 """
 
 from collections.abc import Mapping, Sequence
@@ -31,16 +31,17 @@ from aqualvs.scanning.stripe import StripePeaks
 from aqualvs.scanning.triangulate import Triangulator
 
 SOURCE, LASER, LINE, COMPONENT, SUBSEGMENT, ALONG_X = range(6)
-"""Rows of a table of candidates' whole numbers, the last 1 where the search runs along x."""
+"""Rows of a table of candidates' integers, as in `Candidates`; ALONG_X is 1 if the search lines run
+along x."""
 N_NUMBERS = 6
 HEIGHT, WIDTH, SIGMA_PX, CONFIDENCE, PULL = range(5)
-"""Rows of a table of candidates' measures."""
+"""Rows of a table of candidates' measures, as in `Candidates`."""
 N_MEASURES = 5
 
-# Position noise of a peak: a floor (texture, compression), and the effect of grey-level noise on
-# the two flanks of a stripe of given width and height.
+# Standard deviation of a peak's position: a floor in pixels (texture, compression), and this factor
+# on width over height: 0.45 (geometry of two flanks) times noise of 3 grey levels.
 _FLOOR_PX = 0.1
-_FLANK_NOISE = 1.35  # 0.45 (geometry of two flanks) times 3 grey levels
+_FLANK_NOISE = 1.35
 
 
 FORWARD: FloatArray = np.array([0.0, 1.0, 0.0])
@@ -53,15 +54,15 @@ class Subsegments(NamedTuple):
     # Shape (N,): row of the subsegment that each candidate belongs to; ascending.
     of_candidate: IntArray
     # Shape (7, C): rows as `plane_search` names them: centroid in `dome` (m), mean derivative of
-    # the points by the stripe's position (m/px), and sampling weight: its light, but a long
-    # component weighs no more than a few strands, because it may follow one strand off the sheet's
-    # middle.
+    # the points by the stripe's position (m/px), and sampling weight: the intensity weight, but a
+    # long component weighs no more than a few strands, because it may follow one strand off the
+    # sheet's middle.
     table: FloatArray
-    # Shape (C,): search lines in it, each weighted by the confidence that its peak is laser light.
+    # Shape (C,): sum of its candidates' confidences: search lines of certain laser light.
     intensity_weight: FloatArray
     # Shape (C,): search lines in it.
     n_lines: IntArray
-    # Shape (C,): its extent in search lines; separates lit from dark intervals.
+    # Shape (C,): its first and last search line.
     first_line: IntArray
     last_line: IntArray
     # Shape (C,): index of the laser; ascending.
@@ -77,7 +78,7 @@ class Candidates(NamedTuple):
     """Triangulated candidates, N of them, ordered by laser, segment and subsegment."""
 
     source: IntArray  # Shape (N,): number of the peak; equal for all candidates of one peak.
-    laser: IntArray  # Shape (N,): index of the laser that the peak is read as.
+    laser: IntArray  # Shape (N,): index of the laser that the peak is assigned to.
     line: IntArray  # Shape (N,): search line.
     # Shape (N,): numbers of the component (connected segments) and the subsegment; those of the
     # subsegments ascend.
@@ -85,13 +86,13 @@ class Candidates(NamedTuple):
     subsegment: IntArray
     # Shape (N, 2): in `image`.
     pixels: FloatArray
-    # Shape (N,): of the peak: grey levels, pixels.
+    # Shape (N,): height and width of the peak: grey levels, pixels.
     height: FloatArray
     width: FloatArray
     # Shape (N,): standard deviation of the position along the search line.
     sigma_px: FloatArray
-    # Shape (N,): confidence that the peak is laser light, from its height as a share of the frame's
-    # best and its likelihood; 0 to 1.
+    # Shape (N,): confidence that the peak is laser light, 0 to 1: geometric mean of its height, as
+    # a share of that of the frame's best peaks, and its likelihood.
     confidence: FloatArray
     # Shape (N,): shift of the position by an uneven background, in pixels, as in `StripePeaks`.
     pull: FloatArray
@@ -110,16 +111,16 @@ class Candidates(NamedTuple):
         return Candidates._make(column[mask] for column in self)
 
     def without_pull(self) -> "Candidates":
-        """Return the candidates with their points moved back by `pull`."""
+        """Return the candidates with `pull` subtracted from their positions on the stripe."""
         return self._replace(points=self.points - self.pull[:, None] * self.sensitivity)
 
     def subsegments(self) -> tuple[Subsegments, ComponentShapes]:
         """Summarise the subsegments by their centroids; describe the components by their shapes."""
         n = count_subsegments(self.subsegment)
-        of_candidate, facts = np.empty(self.n, np.int64), np.empty((4, n), np.int64)
+        of_candidate, numbers = np.empty(self.n, np.int64), np.empty((4, n), np.int64)
         table, intensity_weight = np.empty((7, n)), np.empty(n)
-        shapes = summarise_subsegments(self, of_candidate, table, intensity_weight, facts)
-        found = Subsegments(of_candidate, table, intensity_weight, *facts)
+        shapes = summarise_subsegments(self, of_candidate, table, intensity_weight, numbers)
+        found = Subsegments(of_candidate, table, intensity_weight, *numbers)
         return found, ComponentShapes(*shapes)
 
 
@@ -141,22 +142,22 @@ def append_candidates(
     begin: int,
     tables: CandidateTables,
 ) -> int:
-    """Append one laser's candidates to the tables from column `begin` on; return their end.
+    """Append one laser's candidates to the tables from column `begin` on; return the end column.
 
     Parameters
     ----------
     peaks : StripePeaks
         Of the laser's search direction.
     band : BandLines
-        The laser's.
+        Of the laser.
     laser : int
         Its index.
     along_x : int
-        1 where its search lines run along x.
+        1 if its search lines run along x, else 0.
     best_height : float
-        Of the frame's best peaks.
+        Height of the frame's best peaks, in grey levels.
     begin : int
-        Number of candidates of other lasers.
+        Number of candidates of the lasers before.
     tables : CandidateTables
         Written.
     """
@@ -174,7 +175,7 @@ def append_candidates(
     height_share = 1.0 / best_height
     for k in range(n):
         i, r = begin + k, found[0, k]
-        # Returns of the two search directions get odd and even numbers.
+        # Peaks of the two search directions get odd and even numbers.
         numbers[SOURCE, i] = 2 * r + along_x
         numbers[LASER, i] = laser
         numbers[LINE, i] = line[r]
@@ -187,7 +188,7 @@ def append_candidates(
         measures[SIGMA_PX, i] = np.sqrt(_FLOOR_PX * _FLOOR_PX + flank * flank)
         measures[PULL, i] = peaks.pull[r]
         measures[CONFIDENCE, i] = np.sqrt(min(height[r] * height_share, 1.0) * peaks.likelihood[r])
-        # The middle of a search line that is several pixels wide.
+        # Middle of the pixels that make the search line.
         pixels[i, across] = (line[r] + 0.5) * band.line_px - 0.5 + band.shift_px
         pixels[i, along] = peaks.position[r]
     return begin + n
@@ -195,7 +196,7 @@ def append_candidates(
 
 @lazy_borrowing_kernel
 def count_subsegments(subsegment: IntArray) -> int:
-    """Count subsegments whose numbers ascend."""
+    """Return the number of different values in ascending subsegment numbers (N,)."""
     n = 0
     for i in range(subsegment.shape[0]):
         n += i == 0 or subsegment[i] != subsegment[i - 1]
@@ -208,7 +209,7 @@ def summarise_subsegments(
     of_candidate: IntArray,
     table: FloatArray,
     intensity_weight: FloatArray,
-    facts: IntArray,
+    numbers: IntArray,
 ) -> FloatArray:
     """Summarise N candidates in C subsegments.
 
@@ -220,21 +221,21 @@ def summarise_subsegments(
     table : array, shape (7, C)
     intensity_weight : array, shape (C,)
         Written, as in `Subsegments`.
-    facts : int array, shape (4, C)
-        Written: (n_lines, first_line, last_line, laser).
+    numbers : int array, shape (4, C)
+        Written: n_lines, first_line, last_line and laser of `Subsegments`.
 
     Returns
     -------
     array, shape (6, S)
-        The components as described by `describe_components`.
+        From `describe_components`.
     """
     line, begin = candidates.line, ZERO
     for c in range(intensity_weight.shape[0]):
         end = run_end(candidates.subsegment, begin)
         for i in range(begin, end):
             of_candidate[i] = c
-        facts[0, c], facts[1, c], facts[2, c] = end - begin, line[begin], line[end - 1]
-        facts[3, c] = candidates.laser[begin]
+        numbers[0, c], numbers[1, c], numbers[2, c] = end - begin, line[begin], line[end - 1]
+        numbers[3, c] = candidates.laser[begin]
         total = 0.0
         for i in range(begin, end):
             total += candidates.confidence[i]
@@ -249,7 +250,7 @@ def summarise_subsegments(
         candidates.width,
         candidates.height,
     )
-    _write_sampling_weights(facts[0], candidates.component, intensity_weight, shapes, table[6])
+    _write_sampling_weights(numbers[0], candidates.component, intensity_weight, shapes, table[6])
     return shapes
 
 
@@ -257,7 +258,7 @@ def summarise_subsegments(
 def _write_centroid(
     candidates: Candidates, begin: int, end: int, table: FloatArray, c: int
 ) -> None:
-    """Write the mean point and sensitivity of a subsegment, weighted by the light in each peak."""
+    """Write mean point and sensitivity of subsegment c, weighted by each peak's height x width."""
     points, sensitivity = candidates.points, candidates.sensitivity
     total, x, y, z, jx, jy, jz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(begin, end):
@@ -282,9 +283,9 @@ def _write_sampling_weights(
     table: FloatArray,
     sampling_weight: FloatArray,
 ) -> None:
-    """Write each subsegment's sampling weight: its light, less in long or curved components."""
+    """Write each subsegment's sampling weight (C,), reduced in long or curved components."""
     shapes = ComponentShapes(table[0], table[1], table[2], table[3], table[4], table[5])
-    # Shorter components are specks, and are left out of the typical weight.
+    # Components with fewer search lines are specks, and do not count for the typical length.
     speck_lines = 3.0
     strands, n = np.empty(shapes.n_lines.shape[0]), 0
     for s in range(shapes.n_lines.shape[0]):
@@ -292,14 +293,13 @@ def _write_sampling_weights(
             strands[n] = shapes.n_lines[s]
             n += 1
     typical = median_of(strands[:n]) if n else 0.0
-    # Limit of a component's sampling weight in the search for surfaces: this many times the
-    # typical one, but at least that of this many search lines.
+    # A component counts with at most this many times the typical number of search lines, but with
+    # this many at least.
     weight_limit_share = 2.0
     min_weight_limit = 16.0
     most_lines = max(weight_limit_share * typical, min_weight_limit)
     begin = 0
-    # Factor on the sampling weight of a curved component: a fish has tangent planes, but is not a
-    # plane.
+    # Factor on the sampling weight of a curved component: any tangent plane fits a part of a fish.
     curved_weight = 0.2
     for c in range(n_lines.shape[0]):
         s = component[begin]
@@ -309,8 +309,8 @@ def _write_sampling_weights(
         begin += n_lines[c]
 
 
-# The best peaks of a frame are those from this quantile on.
-_BEST_SHARE = 0.95
+# Quantile of the heights of a frame's peaks that is the height of the best ones.
+_BEST_QUANTILE = 0.95
 _AXES = (SearchAxis.ALONG_X, SearchAxis.ALONG_Y)
 _NOTHING = np.empty(0)
 _NO_PEAKS = StripePeaks(np.empty(0, np.int64), _NOTHING, _NOTHING, _NOTHING, _NOTHING, _NOTHING)
@@ -345,10 +345,10 @@ def find_candidates(
         np.empty((N_MEASURES, capacity)),
         np.empty((capacity, 2)),
     )
-    best_height = lower_quantile(np.concatenate((along_x.height, along_y.height)), _BEST_SHARE)
+    best_height = lower_quantile(np.concatenate((along_x.height, along_y.height)), _BEST_QUANTILE)
     n = 0
-    for i, (search, found) in enumerate(zip(laser_bands, by_search, strict=True)):
-        n = append_candidates(found, search.lines, i, found is along_x, best_height, n, tables)
+    for i, (band, found) in enumerate(zip(laser_bands, by_search, strict=True)):
+        n = append_candidates(found, band.lines, i, found is along_x, best_height, n, tables)
     points, sensitivity, valid = np.empty((n, 3)), np.empty((n, 3)), np.empty(n, np.bool_)
     source, laser, line, component, subsegment, along = tables.numbers[:, :n]
     height, width, sigma_px, confidence, pull = tables.measures[:, :n]

@@ -1,8 +1,8 @@
-"""Labels of stripe points: the kind of object that each was found on.
+"""Labels of stripe points: the kind of object that each lies on.
 
-`label_candidates` labels light on the other surfaces first, then light on the target (on a net also
-nearby light that the search left out). What lies on no surface is labelled by the shape of its
-segment.
+`label_candidates` labels candidates on the other surfaces first, then those on the target (on a net
+also nearby ones that the search left out). Candidates on no surface are labelled by the shape of
+their component.
 """
 
 from collections.abc import Sequence
@@ -28,7 +28,7 @@ from aqualvs.scanning.scan import Label, ScanPoints
 from aqualvs.scanning.segments import ComponentShapes, is_bent, is_round, is_straight
 from aqualvs.scanning.surfaces import Surface, lit_cells, number_cells
 
-# Compiled code takes numbers more easily than members of an enumeration.
+# Numba compiles plain numbers faster than members of an enumeration.
 _NET, _SOLID, _FISH = np.uint8(Label.NET), np.uint8(Label.SOLID), np.uint8(Label.FISH)
 _BUBBLE, _BACKGROUND = np.uint8(Label.BUBBLE), np.uint8(Label.BACKGROUND)
 _CLUTTER, _AMBIGUOUS = np.uint8(Label.CLUTTER), np.uint8(Label.AMBIGUOUS)
@@ -46,7 +46,7 @@ def label_other(
     explained: BoolArray,
     label: NDArray[np.uint8],
 ) -> None:
-    """Label the light on a surface that is not the target, and mark it as explained.
+    """Label the candidates on a surface that is not the target, and mark them as explained.
 
     Parameters
     ----------
@@ -67,7 +67,8 @@ def label_other(
     """
     points = candidates.points
     n, n_bent, n_behind = 0, 0, 0
-    # Distances nearest to the target on either side: they decide if half of them lie behind it.
+    # A surface is behind the target if most candidates are. Of an even number, exactly half may be:
+    # then the nearest to the target on either side decide, as in a median.
     nearest_before, nearest_behind = -np.inf, np.inf
     for i in range(points.shape[0]):
         if not members[of_candidate[i]]:
@@ -85,7 +86,7 @@ def label_other(
     if n > 0 and 2 * n_behind == n:
         is_behind = nearest_before + nearest_behind > 0.0
     kind = _BACKGROUND
-    # A surface is a fish if this share of its light lies in bent components.
+    # A surface is a fish if more than this share of its candidates lie in bent components.
     mostly = 0.5
     if not is_behind:
         kind = _NET if is_mesh else _FISH if n_bent > mostly * n else _SOLID
@@ -107,7 +108,7 @@ def label_target(
     explained: BoolArray,
     label: NDArray[np.uint8],
 ) -> None:
-    """Label the light on the target, on a net also nearby light; mark it as explained.
+    """Label the candidates on the target, on a net also nearby ones; mark them as explained.
 
     Parameters
     ----------
@@ -153,7 +154,7 @@ def label_target(
 
 @inner_kernel
 def _of_same_peak(source: IntArray, one: BoolArray, other: BoolArray) -> BoolArray:
-    """Mark every candidate of the peaks that have a candidate marked in one of two ways."""
+    """Mark every candidate of those peaks of which a candidate is marked in `one` or `other`."""
     known = np.zeros(n_bins(source), np.bool_)
     for i in range(source.shape[0]):
         if one[i] or other[i]:
@@ -174,7 +175,7 @@ def label_loose(
     label: NDArray[np.uint8],
     rows: IntArray,
 ) -> int:
-    """Label points on no surface by their shape; write the rows to list, and return their number.
+    """Label candidates on no surface by their shape; select the candidates to list as points.
 
     Parameters
     ----------
@@ -187,20 +188,24 @@ def label_loose(
     working_range : (float, float)
         Distances from the dome's centre beyond which clutter is out of range, in metres.
     explained : bool array, shape (N,)
-        Candidates on surfaces. Others of the same light are not listed.
+        Candidates on surfaces. Others in the same cells of the image are not listed.
     label : uint8 array, shape (N,)
-        Completed in place, for what is listed.
+        Completed in place, for listed candidates.
     rows : int array, shape (N,)
-        Written.
+        Written: indices of the listed candidates.
+
+    Returns
+    -------
+    int
+        Number of listed candidates.
     """
     source = candidates.source
     n = _list_kept(source, candidates.pixels, explained, rows)
     candidates_of = np.zeros(n_bins(source), np.int64)
     for k in range(n):
         candidates_of[source[rows[k]]] += 1
-    bright = np.nan
-    # Quantile of the height of a frame's bright peaks.
-    bright_share = 0.9
+    # Height of the frame's bright peaks; NaN until it is needed.
+    bright, bright_quantile = np.nan, 0.9
     for k in range(n):
         i = rows[k]
         if explained[i]:
@@ -209,9 +214,9 @@ def label_loose(
         label[i] = _AMBIGUOUS
         if candidates_of[source[i]] == 1:
             straight = is_straight(shapes, s)
-            label[i] = _kind_of(candidates.points, i, straight, target, working_range)
+            label[i] = _single_label(candidates.points, i, straight, target, working_range)
         if is_round(shapes, s, 0.0) and bright != bright:
-            bright = lower_quantile(candidates.height, bright_share)
+            bright = lower_quantile(candidates.height, bright_quantile)
         if is_round(shapes, s, bright):
             label[i] = _BUBBLE
         elif is_bent(shapes, s):
@@ -221,7 +226,7 @@ def label_loose(
 
 @inner_kernel
 def _list_kept(source: IntArray, pixels: FloatArray, explained: BoolArray, rows: IntArray) -> int:
-    """List the explained candidates, and those whose light no surface explains."""
+    """Write the explained candidates and those in no cell of one; return their number."""
     cell = np.empty(source.shape[0], np.int64)
     n_cells, n_columns = number_cells(pixels, cell)
     lit = lit_cells(cell, explained, n_cells, n_columns)
@@ -233,7 +238,7 @@ def _list_kept(source: IntArray, pixels: FloatArray, explained: BoolArray, rows:
 
 
 @inner_borrowing_kernel
-def _kind_of(
+def _single_label(
     points: FloatArray,
     i: int,
     straight: bool,
@@ -268,7 +273,7 @@ def copy_points(
 
     `out_measures`, shape (4, len(rows)), gets sigma, intensity, width and quality.
     """
-    # Position error of the best peaks: quality 1.
+    # Position error of the best peaks, which have quality 1: the floor of `Candidates.sigma_px`.
     best_sigma_px = 0.1
     pixels, sensitivity, sigma_px = candidates.pixels, candidates.sensitivity, candidates.sigma_px
     for k in range(rows.shape[0]):
@@ -284,7 +289,7 @@ def copy_points(
         out_measures[3, k] = min(best_sigma_px / sigma_px[i], 1.0)
 
 
-# Arguments of kernels where there is no target, and no net.
+# Arguments of kernels if there is no target, and no net.
 _NOTHING, _NOWHERE = np.empty(0), np.empty(0, np.bool_)
 
 
@@ -327,7 +332,7 @@ def label_candidates(
     """
     n, of_candidate = candidates.n, subsegments.of_candidate
     label, explained = np.empty(n, np.uint8), np.zeros(n, np.bool_)
-    facing = _facing(target, found)
+    patch = _target_surface(target, found)
     for surface in surfaces:
         if surface is not target:
             label_other(
@@ -336,7 +341,7 @@ def label_candidates(
                 shapes,
                 surface.members,
                 surface.is_mesh,
-                facing,
+                patch,
                 explained,
                 label,
             )
@@ -346,20 +351,20 @@ def label_candidates(
             of_candidate,
             target.members,
             target.is_mesh,
-            facing,
+            patch,
             found.inliers,
             _NOWHERE if found.net_mask is None else found.net_mask,
             explained,
             label,
         )
     rows = np.empty(n, np.int64)
-    n_listed = label_loose(candidates, shapes, facing, working_range, explained, label, rows)
+    n_listed = label_loose(candidates, shapes, patch, working_range, explained, label, rows)
     listed = rows[:n_listed]
     return _scan_points(candidates, label, found.inliers, listed), listed
 
 
-def _facing(target: Surface | None, found: Measurement) -> FloatArray:
-    """Return the best estimate of the target's surface, as `Patch.packed` gives it."""
+def _target_surface(target: Surface | None, found: Measurement) -> FloatArray:
+    """Return the best estimate of the target's surface (16,), as `Patch.packed`; empty if none."""
     if target is None:
         return _NOTHING
     if found.patch is not None:
@@ -373,6 +378,7 @@ def _facing(target: Surface | None, found: Measurement) -> FloatArray:
 def _scan_points(
     candidates: Candidates, label: NDArray[np.uint8], used: BoolArray, rows: IntArray
 ) -> ScanPoints:
+    """Return the candidates of some rows as points."""
     n = len(rows)
     measures = np.empty((4, n))
     sigma, intensity, width, quality = measures
