@@ -1,7 +1,8 @@
-"""Observations: the pieces of stripe on a surface, averaged outside crossings.
+"""Observations: the light of stripe units on a surface, averaged outside crossings.
 
-`observe` selects the pieces of stripe on a target, components or subsegments, leaves out where the
-stripe of another laser crosses them, and averages the rest of each, weighted by intensity.
+A unit of stripe has one independent error: on a net a component, which is the light on one strand;
+on a wall a subsegment. `observe` selects the units on a target, leaves out candidates where the
+stripe of another laser crosses them, and averages the rest of each unit, weighted by intensity.
 """
 
 from typing import NamedTuple
@@ -17,32 +18,33 @@ from aqualvs.optics.sheet import COLUMNS, planes_and_bent, sheet_distance, sheet
 from aqualvs.scanning.candidates import Candidates
 from aqualvs.scanning.stripe import PULL_OF_STEP, flank_difference
 
-# Position noise of a piece's centroid beyond that of its peaks: a floor that neighbouring peaks
+# Position noise of a unit's centroid beyond that of its peaks: a floor that neighbouring peaks
 # share, and a share of the spread, because a strand's light may be cut off on one side by a knot or
 # the border.
 _SUBSEGMENT_FLOOR_PX = 0.08
 _SPREAD_SHARE = 0.12
-# Least search lines of the light on a strand; less is a fragment, off the strand's middle. Rows of
-# a field are two pixels apart: of thin twine across them few show more than two.
+# Least number of search lines of the light on a strand; less is a fragment, off the strand's
+# middle. Rows of a field are two pixels apart, and thin twine across them is rarely seen in more
+# than two.
 _SHORTEST_STRAND, _SHORTEST_IN_FIELD = 3, 2
-# Share of a strand's greatest height below which its light does not count. On rendered nets, clear
-# and turbid, strands scatter by 10 to 20 % less with it, and little more or less with 0.3 or 0.5.
+# Share of a strand's maximum height below which a peak does not count. On rendered nets, in clear
+# and turbid water, it reduces the scatter of strands by 10 to 20 %; 0.3 and 0.5 do about the same.
 _DIM_SHARE = 0.4
 
 
 class Observations(NamedTuple):
-    """Independent observations of a surface: centroids of M pieces of stripe."""
+    """Independent observations of a surface: centroids of M units of stripe."""
 
     # Shape (M, 3): centroid in `dome` (m) and its derivative by the stripe's position (m/px).
     points: FloatArray
     sensitivity: FloatArray
-    # Shape (M,): standard deviation of that position.
+    # Shape (M,): standard deviation of the stripe's position.
     sigma_px: FloatArray
     # Shape (M,): mean difference between the flanks of its peaks, as a share of their height,
-    # positive where the background is brighter at greater positions; on a net, of the laser's
-    # strands together.
+    # positive if the background is brighter at larger positions; on a net, the mean over all
+    # strands of the laser.
     glow: FloatArray
-    # Shape (M,): of its peaks, means: full width at half height along the search line, in pixels;
+    # Shape (M,): means over its peaks: full width at half height along the search line, in pixels;
     # height above the background, in grey levels.
     width: FloatArray
     height: FloatArray
@@ -58,15 +60,15 @@ class Observations(NamedTuple):
 
 
 class Observed(NamedTuple):
-    """What a frame shows of one surface."""
+    """Observations of one surface in a frame, and the candidates that they average."""
 
-    group: IntArray  # Shape (N,): each candidate's piece of stripe; -1 for those in none.
-    n_candidates: int  # In pieces.
-    observations: Observations  # Of the pieces.
+    group: IntArray  # Shape (N,): each candidate's observation; -1 for those in none.
+    n_candidates: int  # Number of candidates in observations.
+    observations: Observations
 
 
 class StripeObserver:
-    """Selection and averaging of the pieces of stripe on surfaces before one rig.
+    """Selection and averaging of the units of stripe on surfaces in front of one rig.
 
     Parameters
     ----------
@@ -90,10 +92,7 @@ class StripeObserver:
         on_twine: bool,
         flat: bool = False,
     ) -> Observed:
-        """Average the pieces of stripe on a target, those in crossings left out.
-
-        On a net a piece is a component, the light on one strand, which has one centre. On a wall it
-        is a subsegment, long enough for independent errors.
+        """Average the units of stripe on a target, without candidates in crossings.
 
         Parameters
         ----------
@@ -106,7 +105,7 @@ class StripeObserver:
         on_twine : bool
             Whether the target is a net.
         flat : bool
-            Whether all of the target lies on the plane.
+            Whether the whole target lies on the plane.
         """
         unit = candidates.component if on_twine else candidates.subsegment
         min_lines = self._shortest_strand if on_twine else 1
@@ -138,7 +137,7 @@ def _observe(
     focal_px: float,
     on_twine: bool,
 ) -> Observed:
-    """Average the pieces of stripe on a target, given the lasers' sheets."""
+    """Average the units of stripe on a target, given the lasers' sheets."""
     group = np.empty(unit.shape[0], np.int64)
     n, n_candidates = _select_units(
         candidates, unit, min_lines, on_target, m, planes, bent, focal_px, group
@@ -158,11 +157,11 @@ def _select_units(
     focal_px: float,
     group: IntArray,
 ) -> tuple[int, int]:
-    """Assign numbers to pieces of stripe on the target, -1 to candidates elsewhere or in crossings.
+    """Write the numbers of units on the target to `group` (N,), -1 elsewhere and in crossings.
 
-    A piece is used as a whole: the centre of a part of a strand's light would be off the sheet. Of
-    one that reaches into a crossing the rest is used, if it is long enough.
-    Return the number of groups, and of candidates in them.
+    A unit counts as a whole if one of its candidates is on the target: the centroid of a part of a
+    strand's light would be off the sheet. Outside a crossing it must still be long enough. Return
+    the number of units and of candidates in them.
     """
     points, laser = candidates.points, candidates.laser
     number = _units_on(unit, min_lines, on_target)
@@ -195,14 +194,14 @@ def _select_units(
 
 @inner_kernel
 def _units_on(unit: IntArray, min_lines: int, on_target: BoolArray) -> IntArray:
-    """Return -2 for each piece on the target that is long enough, -1 for others."""
-    n_planes = n_bins(unit)
-    number, lines = np.full(n_planes, -1), np.zeros(n_planes, np.int64)
+    """Return -2 for each unit on the target that is long enough, -1 for others."""
+    n_units = n_bins(unit)
+    number, lines = np.full(n_units, -1), np.zeros(n_units, np.int64)
     for i in range(unit.shape[0]):
         lines[unit[i]] += 1
         if on_target[i]:
             number[unit[i]] = -2
-    for p in range(n_planes):
+    for p in range(n_units):
         if lines[p] < min_lines:
             number[p] = -1
     return number
@@ -212,7 +211,10 @@ def _units_on(unit: IntArray, min_lines: int, on_target: BoolArray) -> IntArray:
 def _mean_widths(
     laser: IntArray, width: FloatArray, unit: IntArray, number: IntArray, n_lasers: int
 ) -> FloatArray:
-    """Return each laser's mean stripe width; single widths are inflated by the crossing itself."""
+    """Return each laser's mean stripe width in pixels, -1 without a stripe.
+
+    Means, because a crossing inflates the widths of the peaks in it.
+    """
     total, count = np.zeros(n_lasers), np.zeros(n_lasers)
     for i in range(unit.shape[0]):
         if number[unit[i]] != -1:
@@ -236,8 +238,8 @@ def in_crossing(
 ) -> bool:
     """Return whether another laser's stripe crosses the target here (paper, section 3.1).
 
-    Of a target that is the plane m·X = 1, the place on it along the line of sight counts, nearly
-    through the dome's centre: where two stripes merge, the point is off the plane with either
+    If the target is the plane m·X = 1, the point is projected to it along the line of sight, which
+    passes near the dome's centre: where two stripes merge, the point is off the plane with either
     laser. m is zero if the target is no plane.
     """
     x, y, z = points[i, 0], points[i, 1], points[i, 2]
@@ -245,7 +247,7 @@ def in_crossing(
     if depth > 0.0:
         x, y, z = x / depth, y / depth, z / depth
     m_per_px = np.sqrt(x * x + y * y + z * z) / focal_px
-    # Reach of a crossing: this many full widths of the stripes, and this many pixels more.
+    # Half size of a crossing: this many full widths of the wider stripe, plus this many pixels.
     crossing_widths = 1.2
     crossing_px = 2.0
     for b in range(planes.shape[0]):
@@ -267,10 +269,10 @@ def average_groups(
     """Average groups of candidates, weighted by intensity.
 
     A strand is lit where it crosses the laser sheet, brightest in the sheet's middle; the centroid
-    of that light lies on the sheet, regardless of the strand's direction. Its dim ends are mostly
-    noise, and on the near side glow of the water that looks like more of it: only light above a
-    share of the strand's brightest counts. The glow ends at the strand, where the sheet does: like
-    a step as wide as the stripe, whose pull is taken off.
+    of that light lies on the sheet, whatever the strand's direction. The dim ends are mostly noise,
+    and on the near side glow of the water: only intensity above a share of the strand's maximum
+    counts. The glow ends with the sheet, at the strand: a step of background, blurred as the
+    stripe, whose pull is subtracted.
 
     Parameters
     ----------
@@ -311,7 +313,7 @@ def average_groups(
         for k in range(3):
             seen.points[c, k] += intensity_weight * points[i, k]
             seen.sensitivity[c, k] += intensity_weight * candidates.sensitivity[i, k]
-        # Error of a weighted mean of independent positions.
+        # Variance of a weighted mean of independent positions.
         seen.sigma_px[c] += squared(intensity_weight * candidates.sigma_px[i])
         seen.glow[c] += intensity_weight * flank_difference(candidates.pull[i], width[i])
         seen.width[c] += intensity_weight * width[i]
@@ -347,16 +349,16 @@ def average_groups(
         variance = seen.sigma_px[c] + squared(_SPREAD_SHARE) * scatter
         seen.sigma_px[c] = np.sqrt(variance + squared(_SUBSEGMENT_FLOOR_PX))
     if on_twine:
-        _take_glow_off(seen, total)
+        _subtract_glow(seen, total)
     return seen
 
 
 @inner_kernel
-def _take_glow_off(seen: Observations, intensity: FloatArray) -> None:
-    """Move the light on strands back by the pull of the glow that ends there, given its intensity.
+def _subtract_glow(seen: Observations, intensity: FloatArray) -> None:
+    """Subtract the pull of the glow from the points on strands, given their total intensity (M,).
 
-    The glow of a sheet is the same beside all of its strands; beside one alone, the light on the
-    net's other twine counts as much. The strands' `glow` becomes that of all.
+    The glow of a sheet is the same beside all of its strands, while light on other twine disturbs
+    the measured glow of a single strand: `glow` is replaced by the mean over the laser's strands.
     """
     n_lasers = n_bins(seen.laser)
     levels, total = np.zeros(n_lasers), np.zeros(n_lasers)
