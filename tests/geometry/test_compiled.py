@@ -291,7 +291,7 @@ def test_no_kernel_of_a_scan_is_compiled_for_one_number() -> None:
     with open_source(str(bundled_dive() / "dive.mp4")) as source, compiled_at_once():
         assert scanner.process(next(iter(source))).posture
     kernels = {
-        name: value._for_kernels._cache._cache_file
+        f"{module}.{name}": value._for_kernels._cache._cache_file
         for module, content in list(sys.modules.items())
         if module.startswith("aqualvs.scanning.")
         for name, value in vars(content).items()

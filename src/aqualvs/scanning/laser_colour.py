@@ -115,6 +115,7 @@ WHITE = 225.0
 """Luma from which on the colour of a peak's core is ignored: every overexposed light is white."""
 HIGHEST_USEFUL = 32
 """Height in grey levels from which on peaks are always used."""
+_N_LOW_BINS = int(_BIN_OF_HEIGHT[HIGHEST_USEFUL])
 
 
 class LaserColour(Enum):
@@ -532,7 +533,7 @@ def _useful_height(height: FloatArray, likelihood: FloatArray) -> float:
     useful = HIGHEST_USEFUL
     # Both the peaks of a bin and all peaks from its height on must be useful.
     all_lines, all_peaks = 0.0, 0.0
-    for b in range(_height_bin(HIGHEST_USEFUL) - 1, -1, -1):
+    for b in range(_N_LOW_BINS - 1, -1, -1):
         all_lines, all_peaks = all_lines + lines[b], all_peaks + peaks[b]
         if _are_useful(lines[b], peaks[b]) and _are_useful(all_lines, all_peaks):
             useful = math.ceil(2.0 ** (b / _BINS_PER_OCTAVE))
