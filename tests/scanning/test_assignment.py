@@ -14,7 +14,7 @@ from aqualvs.scanning.assignment import NOT_TESTED, AssignmentOutcome, Verdict, 
 from aqualvs.scanning.assignment_kernels import (
     FREEDOM,
     INTENSITY_WEIGHT,
-    N_FACTS,
+    N_MEASURES,
     PER_LASER,
     VARIANCE,
 )
@@ -134,15 +134,15 @@ def posture(distance: float, yaw: float) -> Posture:
 
 def test_two_bright_stripes_do_not_outweigh_three_that_are_left_over() -> None:
     """A plane of two lasers leaves over 1.6 stripes of five lasers, not one of its brighter two."""
-    five = facts(light=277.0, n_lasers=5, freedom=7.0)
-    two = facts(light=189.0, n_lasers=2, freedom=1.0)
+    five = measures(light=277.0, n_lasers=5, freedom=7.0)
+    two = measures(light=189.0, n_lasers=2, freedom=1.0)
     planes = np.array([[0.0, 1.0, 0.0, 0.67], [0.0, 0.94, -0.34, 0.37]])
     assert assignment._verdict(planes, np.array([five, two])) == NOT_TESTED
     assert assignment._log_odds(five, two) == -assignment._log_odds(two, five)
 
 
-def facts(*, light: float, n_lasers: int, freedom: float) -> FloatArray:
-    found = np.zeros(N_FACTS)
+def measures(*, light: float, n_lasers: int, freedom: float) -> FloatArray:
+    found = np.zeros(N_MEASURES)
     found[[INTENSITY_WEIGHT, PER_LASER]] = light, light / n_lasers
     found[[VARIANCE, FREEDOM]] = 0.08, freedom
     return found

@@ -52,6 +52,10 @@ class Plane:
         normal = np.linalg.svd(points - middle, full_matrices=False)[2][-1]
         return cls(normal, float(normal @ middle))
 
+    def packed(self) -> FloatArray:
+        """Return normal and offset as one array (4,), for kernels."""
+        return np.append(self.normal, self.offset)
+
     def signed_distance(self, points: FloatArray) -> FloatArray:
         """Return normal·X - offset for points of shape (..., 3)."""
         return points @ self.normal - self.offset

@@ -1,18 +1,18 @@
 """Laser assignment test: a surface against rival assignments of the same peaks to lasers.
 
-Where lasers are nearly parallel, a picture in which every stripe is read as its neighbour's may
-show a plane as well: shifted and tilted, with small residuals. The rivals of a surface are found by
-reading the peaks of two of its stripes as other lasers', which gives a plane, and refining that
-plane on all peaks. Each hypothesis is then judged by
+If lasers are nearly parallel, a picture in which every stripe is assigned to the neighbouring laser
+may show a plane as well: shifted and tilted, with small residuals. The rivals of a surface are
+found by assigning the peaks of two of its stripes to other lasers, which gives a plane, and
+refining that plane on all peaks. Each hypothesis is then judged by
 
-- the light that it explains: peaks of the same appearance that are left over count against it;
-- the light that it lacks: a laser whose stripe would lie in the picture, beside others that are
-  seen, and shows nothing. It may be switched off or hidden, so this is a cost, not a gate;
+- the peaks that it explains: peaks of the same appearance that are left over count against it;
+- the lasers that are dark: a laser whose stripe would lie in the picture, beside visible ones, and
+  shows nothing. It may be switched off or hidden, so this is a cost, not a gate;
 - the residuals of each laser's stripe as a whole: the log-likelihood ratio of two fits with unknown
   noise is half the degrees of freedom times the logarithm of the ratio of the variances.
 
-The order of the stripes needs no rule of its own: on a plane in front of camera and emitter a fan's
-stripes appear in the order of its lasers, and only such planes are considered.
+The order of the stripes needs no test: on a plane in front of camera and emitter the stripes of a
+fan appear in the order of its lasers, and only such planes are considered.
 """
 
 import math
@@ -32,7 +32,7 @@ from aqualvs.scanning.assignment_kernels import (
     DARK,
     FREEDOM,
     INTENSITY_WEIGHT,
-    N_FACTS,
+    N_MEASURES,
     PER_LASER,
     SAME_ANGLE,
     SAME_RANGE,
@@ -41,7 +41,7 @@ from aqualvs.scanning.assignment_kernels import (
     find_rivals,
     judge_planes,
     loose_share_before,
-    seen_of,
+    stripe_visibility,
 )
 from aqualvs.scanning.candidates import Candidates, Subsegments
 from aqualvs.scanning.laser_bands import LaserBand, SearchAxis
@@ -55,36 +55,40 @@ from aqualvs.scanning.triangulate import Triangulator
 
 
 class _AssignmentOptions(NamedTuple):
-    """Evidence for and against an assignment."""
+    """Evidence for and against an assignment, and surfaces that may be there by chance.
 
-    # Log-odds of a laser that shows nothing though it should (7 %), and of a false stripe as good
-    # as the others (5 %); odds of 20 to 1 decide.
+    The light of a surface is the confidence of its peaks, as a share of that of all peaks that no
+    other surface explains. A stripe's visible share is that of its search lines in the picture that
+    show it.
+    """
+
+    # Log-odds of a laser that is dark though it should be visible (7 %), and of a false stripe as
+    # good as the others (5 %); odds of 20 to 1 decide.
     dark_laser: float = 2.6
     foreign_stripe: float = 3.0
     decided: float = 3.0
     # Residuals of half stripes count as at most this many independent ones, because errors of the
-    # rig are not noise. Then the limit of the evidence from residuals.
+    # rig are not noise. Then the limit of the evidence from residuals, in log-odds.
     max_freedom: float = 10.0
     max_by_residuals: float = 12.0
-    # A surface with less than this share of the light that no other explains, or a solid one whose
-    # stripes are nowhere seen over this share of their way through the picture, must be seen
-    # evenly: caustics and fish are not. This share of the lasers may be faint. Found on rendered
-    # dives: planes through caustics have up to 0.14 of the light, most below 0.1; nets come down to
-    # 0.15, folded ones to 0.14.
+    # A surface with less than this share of the light, or a solid one whose best stripe has a
+    # smaller visible share, must show its lasers evenly, as caustics and fish do not: at most this
+    # share of the lasers may be faint. Tuned on rendered dives: planes through caustics have up to
+    # 0.14 of the light, most below 0.1; nets come down to 0.15, folded ones to 0.14.
     small_share: float = 0.12
-    short_way: float = 0.15
+    short_visible: float = 0.15
     may_be_faint: float = 0.25
-    # With so little light, stripes must be seen over this share of their way at least: 0.12 to 0.25
-    # on nets, 0.05 to 0.09 where strands in daylight make a plane by chance.
-    least_way: float = 0.1
-    # A net with less than this share of the light, on which a laser is dark, may not show another
-    # one over more than this share of its way: that is a strand along its sheet. Where a laser has
+    # Least visible share of the best stripe of a surface with so little light: 0.12 to 0.25 on
+    # nets, 0.05 to 0.09 where strands in daylight make a plane by chance.
+    min_visible: float = 0.1
+    # A net on which a laser is dark, with less than this share of the light, may be a single strand
+    # along another laser's sheet, which then has more than this visible share. If a laser has
     # moved, the other two have more of the light.
-    most_share: float = 0.3
-    along_way: float = 0.24
+    max_share_along: float = 0.3
+    max_visible_along: float = 0.24
     # On a search line a laser lights something solid once, and through a net perhaps what is behind
-    # it as well. With more light in other lines than these shares of the surface's, the rig does
-    # not name all lasers, and up to this many of them make planes by chance. Complete rigs have
+    # it as well. With more light in other lines, as a share of the surface's own, the rig does not
+    # name all lasers; up to `may_be_chance` lasers then make planes by chance. Complete rigs have
     # 0.05 at most (before nets 0.95), three of 15 real lasers 0.5 to 4. Of 87 postures by rigs that
     # name four or five of the 15, five were those of other lasers, all with four on the surface.
     max_other_lines: float = 0.5
@@ -99,13 +103,13 @@ class Verdict(Enum):
     """Result of the test of a surface."""
 
     CLEAR = "clear"
-    """No rival comes near it."""
+    """No rival is about as good."""
     RIVAL = "rival"
     """Another plane explains the picture better."""
     NEAR = "near"
-    """Another plane is as good, and near: the posture's sigma must cover both."""
+    """Another plane is about as good, and near: the posture's sigma must cover both."""
     AMBIGUOUS = "ambiguous"
-    """Another plane is as good, and far off."""
+    """Another plane is about as good, and far away."""
 
 
 class AssignmentOutcome(NamedTuple):
@@ -150,31 +154,31 @@ class AssignmentTest:
         surfaces: Sequence[Surface],
         target: Surface,
     ) -> bool:
-        """Return whether a surface is so small, and seen so unevenly, that it may be chance.
+        """Return whether a surface may be there by chance: it is small, or shows lasers unevenly.
 
         Parameters
         ----------
         candidates, subsegments
             As in `test`.
         surfaces : sequence of Surface
-            All that were found: light on the others does not speak against this one.
+            All that were found: light on the others is no evidence against this one.
         target : Surface
             The one to judge.
         """
         share = self._light_share(candidates, subsegments, surfaces, target)
-        way, faint, dark = self._seen_of(target, subsegments)
-        if target.is_mesh and dark > _ODDS.may_be_faint and way > _ODDS.along_way:
-            return share < _ODDS.most_share
-        # Planes by chance are steep, because there are more of those: the ones that caustics make
+        visible, faint, dark = self._visibility(target, subsegments)
+        if target.is_mesh and dark > _ODDS.may_be_faint and visible > _ODDS.max_visible_along:
+            return share < _ODDS.max_share_along
+        # Planes by chance are steep, because there are more steep planes: those that caustics make
         # of this much light are tilted by 39 to 58 degrees, nets of random scenes by 26 at most.
         share *= float(target.plane.normal[1]) ** 2
-        if share < _ODDS.small_share and way < _ODDS.least_way:
+        if share < _ODDS.small_share and visible < _ODDS.min_visible:
             return True
-        # A fish before a wall that is out of range: the wall is no target, and the fish is none.
+        # A fish in front of a wall that is out of range: neither is a target.
         outweighed = not target.is_mesh and any(
             one.inlier_weight > target.inlier_weight for one in surfaces
         )
-        return (outweighed or _is_small(target, share, way)) and faint > _ODDS.may_be_faint
+        return (outweighed or _is_small(target, share, visible)) and faint > _ODDS.may_be_faint
 
     def overlooked(
         self,
@@ -185,9 +189,8 @@ class AssignmentTest:
     ) -> Surface | None:
         """Return a surface before something solid that may be a net, if there is one.
 
-        It has light that no other surface explains, all lasers show it, and its stripes are broken:
-        a fish shows few lasers and long stripes, and specks that share a plane by chance have
-        little light.
+        It has light that no other surface explains, all lasers show it, and its stripes are broken;
+        a fish shows few lasers and long stripes, and specks on a plane by chance have little light.
 
         Parameters
         ----------
@@ -199,18 +202,18 @@ class AssignmentTest:
         Returns
         -------
         Surface or None
-            A net if it has the pattern of one, or if the target alternates with it along the
-            stripes. A surface that is no mesh may be one all the same.
+            `is_mesh` is set if it has the pattern of a net, or if the target alternates with it
+            along the stripes; otherwise it may still be a net.
         """
         if target.is_mesh and not target.is_unbroken:
             return None
         for one in surfaces:
-            # Only broken stripes have an extent.
+            # Only gappy stripes have an extent.
             if one is target or one.extent <= 0.0 or not _is_nearer(one, target, subsegments):
                 continue
             share = self._light_share(candidates, subsegments, surfaces, one)
-            way, faint, _ = self._seen_of(one, subsegments)
-            if _is_small(one, share, way) or faint > _ODDS.may_be_faint:
+            visible, faint, _ = self._visibility(one, subsegments)
+            if _is_small(one, share, visible) or faint > _ODDS.may_be_faint:
                 continue
             is_net = one.is_mesh or seen_through(one.members, target.members, subsegments)
             return replace(one, is_mesh=is_net)
@@ -224,10 +227,10 @@ class AssignmentTest:
         surfaces: Sequence[Surface],
         target: Surface,
     ) -> bool:
-        """Return whether a net that makes no plane, all folds, may hang before something solid.
+        """Return whether a net without a plane, all folds, may hang in front of a solid target.
 
-        Its light lies loose before the target, in short pieces. Where something is seen behind the
-        target, that is no wall behind a net.
+        Its light is on no surface, in front of the target, and in short components. If another
+        surface lies behind the target, the target is not a wall behind a net.
 
         Parameters
         ----------
@@ -244,13 +247,12 @@ class AssignmentTest:
             shapes.n_lines,
             target.members,
             np.any([one.members for one in surfaces], axis=0),
-            np.append(target.plane.normal, target.plane.offset),
+            target.plane.packed(),
             self._searched[0],
         )
-        # With more loose light before it, over its own, something solid may be seen through a net
-        # that makes no plane. On rendered walls this share is 0.01 at most, on real ones with 15
-        # lasers, whose lines noise nearly hides, 0.09; walls that were taken for the folded net
-        # before them have 0.21 to 0.83, half of them 0.32 and more.
+        # Loose light in front of something solid, over its own light. Rendered walls have 0.01 at
+        # most, real ones with 15 lasers, whose lines are nearly hidden by noise, 0.09; walls behind
+        # a folded net have 0.21 to 0.83, half of them 0.32 and more.
         max_loose_share = 0.25
         return bool(share > max_loose_share)
 
@@ -261,9 +263,9 @@ class AssignmentTest:
         shapes: ComponentShapes,
         target: Surface,
     ) -> float | None:
-        """Return the light in other lines beside a target's stripes, if it makes them doubtful.
+        """Return the light in other lines beside a target's stripes, if it is too much.
 
-        A rig that names three lasers of 15 finds planes by chance among the stripes of all.
+        A rig that names only three lasers of 15 finds planes by chance among the stripes of all.
 
         Parameters
         ----------
@@ -273,7 +275,7 @@ class AssignmentTest:
         Returns
         -------
         float or None
-            As a share of the target's own light. None where the target is not in doubt.
+            As a share of the target's own light. None if it is no evidence against the target.
         """
         n_lasers = len(self._along_x)
         n_on_target = np.count_nonzero(np.bincount(subsegments.laser[target.members]))
@@ -296,7 +298,6 @@ class AssignmentTest:
         for one in surfaces:
             if one is not surface:
                 others |= one.members
-        # A plane needs two lasers: the surplus of one is no evidence for it.
         share: float = exclusive_share(
             candidates.source,
             candidates.confidence,
@@ -307,27 +308,21 @@ class AssignmentTest:
         )
         return share
 
-    def _is_faint(self, surface: Surface, subsegments: Subsegments) -> bool:
-        """Return whether a laser that should be seen on a surface is faint there, or missing."""
-        return self._seen_of(surface, subsegments)[1] > _ODDS.may_be_faint
-
-    def _seen_of(self, surface: Surface, subsegments: Subsegments) -> tuple[float, float, float]:
-        """Return the share of its best stripe that a surface shows, and of faint, dark lasers."""
-        packed = np.empty(4)
-        packed[:3], packed[3] = surface.plane.normal, surface.plane.offset
-        seen: tuple[float, float, float] = seen_of(
-            packed, surface.members, subsegments, self._bands
+    def _visibility(self, surface: Surface, subsegments: Subsegments) -> tuple[float, float, float]:
+        """Return visible share of a surface's best stripe; shares of faint and of dark lasers."""
+        found: tuple[float, float, float] = stripe_visibility(
+            surface.plane.packed(), surface.members, subsegments, self._bands
         )
-        return seen
+        return found
 
     def nearer_net(
         self, subsegments: Subsegments, surfaces: Sequence[Surface], target: Surface
     ) -> Surface | None:
         """Return a nearer net with as much light as a net that lacks a laser, if there is one.
 
-        Two stripes test a plane by one number. Of the many pieces of a folded net two may pass that
-        test without being a plane, while the third laser, which should be seen there, lights the
-        net elsewhere. Other light behind a net is normal; light nearer than the net is not.
+        Two stripes determine a plane with one redundant number only. Two parts of a folded net may
+        fit that by chance, while the third laser, which should be visible there, lights the net
+        elsewhere. Other light behind a net is normal; light in front of it is not.
 
         Parameters
         ----------
@@ -345,13 +340,14 @@ class AssignmentTest:
                 one is not target and one.is_mesh and one.sampling_weight >= target.sampling_weight
             )
             if rivals and _is_nearer(one, target, subsegments):
-                return one if self._is_faint(target, subsegments) else None
+                _, faint, _ = self._visibility(target, subsegments)
+                return one if faint > _ODDS.may_be_faint else None
         return None
 
     def test(
         self, candidates: Candidates, subsegments: Subsegments, surface: Surface
     ) -> AssignmentOutcome:
-        """Test a surface.
+        """Test a surface against rival assignments of its peaks.
 
         Parameters
         ----------
@@ -368,8 +364,8 @@ class AssignmentTest:
         # Number of rivals that are refined.
         n_rivals = 6
         planes = np.empty((n_rivals + 1, 4))
-        facts = np.empty((n_rivals + 1, N_FACTS))
-        planes[0, :3], planes[0, 3] = surface.plane.normal, surface.plane.offset
+        measures = np.empty((n_rivals + 1, N_MEASURES))
+        planes[0] = surface.plane.packed()
         n = find_rivals(
             candidates,
             subsegments.of_candidate,
@@ -381,17 +377,17 @@ class AssignmentTest:
         )
         if n == 0:
             return NOT_TESTED
-        judge_planes(planes[: n + 1], candidates, subsegments, self._along_x, self._bands, facts)
-        return _verdict(planes[: n + 1], facts[: n + 1])
+        judge_planes(planes[: n + 1], candidates, subsegments, self._along_x, self._bands, measures)
+        return _verdict(planes[: n + 1], measures[: n + 1])
 
 
-def _is_small(surface: Surface, share: float, way: float) -> bool:
-    """Return whether a surface has little light of its own, or, if no mesh, short stripes."""
-    return share < _ODDS.small_share or (not surface.is_mesh and way < _ODDS.short_way)
+def _is_small(surface: Surface, share: float, visible: float) -> bool:
+    """Return whether a surface has a small share of the light, or, if no mesh, short stripes."""
+    return share < _ODDS.small_share or (not surface.is_mesh and visible < _ODDS.short_visible)
 
 
 def _is_nearer(one: Surface, target: Surface, subsegments: Subsegments) -> bool:
-    """Return whether most of a surface's light lies before another surface's plane."""
+    """Return whether most of a surface's light lies in front of another surface's plane."""
     sampling_weight, plane = subsegments.table[WEIGHT], target.plane
     near = plane.normal @ subsegments.table[X : Z + 1] < plane.offset
     return bool(
@@ -403,9 +399,10 @@ def _is_nearer(one: Surface, target: Surface, subsegments: Subsegments) -> bool:
 def other_lines_share(
     candidates: Candidates, on_target: BoolArray, shapes: ComponentShapes, n_lasers: int
 ) -> float:
-    """Return the light in other long lines on the search lines of a surface, over the surface's.
+    """Return the light in other lines on the search lines of a surface, over the surface's light.
 
-    Straight lines that no laser makes on the surface are counted where a laser's stripe is on it.
+    Other lines are long straight components of a laser, on the search lines where the surface has a
+    stripe of that laser, of peaks that are not on the surface.
 
     Parameters
     ----------
@@ -435,7 +432,7 @@ def other_lines_share(
 
 
 def inflate_for_rival(found: Measurement, outcome: AssignmentOutcome) -> Measurement:
-    """Return a measurement with its covariance widened by a near rival.
+    """Return a measurement with its covariance inflated by a near rival.
 
     Parameters
     ----------
@@ -453,20 +450,25 @@ def inflate_for_rival(found: Measurement, outcome: AssignmentOutcome) -> Measure
     return replace(found, posture=inflate_covariance(posture, rival, share))
 
 
-def _verdict(planes: FloatArray, facts: FloatArray) -> AssignmentOutcome:
-    """Compare the surface, the first plane, with its rivals, and those with each other."""
+def _verdict(planes: FloatArray, measures: FloatArray) -> AssignmentOutcome:
+    """Compare the surface, the first plane, with its rivals, and these with each other."""
     best = 0
     for k in range(1, len(planes)):
-        if _log_odds(facts[best], facts[k]) < 0.0:
+        if _log_odds(measures[best], measures[k]) < 0.0:
             best = k
     # The nearest rival of the best one.
     second, odds = -1, math.inf
     for k in range(len(planes)):
-        one = _log_odds(facts[best], facts[k]) if not _alike(planes[best], planes[k]) else math.inf
+        one = (
+            _log_odds(measures[best], measures[k])
+            if not _alike(planes[best], planes[k])
+            else math.inf
+        )
         if one < odds:
             second, odds = k, one
     kept = _alike(planes[best], planes[0])
-    # Hypotheses nearer to each other than this are covered by a larger sigma instead of a refusal.
+    # Limits of range (as a share) and angle within which a larger sigma covers both hypotheses;
+    # farther apart, the posture is refused.
     near_range, near_angle = 0.02, math.radians(2.0)
     if odds < _ODDS.decided:
         other = _plane(planes[second] if kept else planes[best])
@@ -483,7 +485,7 @@ def _plane(packed: FloatArray) -> Plane:
 
 def _log_odds(one: FloatArray, other: FloatArray) -> float:
     """Return the log-odds of one hypothesis against another."""
-    # What the other leaves over are stripes of the one that explains more light.
+    # The difference in light, in stripes of the hypothesis that explains more.
     more = one if one[INTENSITY_WEIGHT] > other[INTENSITY_WEIGHT] else other
     foreign = (one[INTENSITY_WEIGHT] - other[INTENSITY_WEIGHT]) / max(more[PER_LASER], 1e-9)
     dark = _ODDS.dark_laser * (other[DARK] - one[DARK])
@@ -506,13 +508,13 @@ def _alike(
 
 
 def _sample_bands(laser_bands: Sequence[LaserBand], triangulator: Triangulator) -> FloatArray:
-    """Sample the points that each laser's band sees: (n_lasers, cells, samples, 4).
+    """Sample points of each laser's sheet across its band: (n_lasers, cells, samples, 4).
 
-    A point P is kept as (P, 1) / |P|: with it (m·X - 1) / |X| changes nearly evenly across a band.
-    NaN where nothing is seen.
+    A point P is stored as (P, 1) / |P|, because (m·P - 1) / |P| is nearly linear across a band. NaN
+    where the laser cannot be seen.
     """
     n_cells = max((len(one.lowest) for one in laser_bands), default=0) // CELL_LINES + 1
-    # Samples across a laser's band, in which its stripe on a plane is looked up.
+    # Samples across a laser's band, between which its stripe on a plane is located.
     n_samples = 16
     bands = np.full((len(laser_bands), n_cells, n_samples, 4), np.nan)
     for i, band in enumerate(laser_bands):

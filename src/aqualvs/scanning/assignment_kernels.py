@@ -28,36 +28,39 @@ from aqualvs.scanning.plane_search import (
 )
 
 INTENSITY_WEIGHT, PER_LASER, DARK, VARIANCE, FREEDOM = range(5)
-"""Measures of a hypothesis: light that it explains, the same for each laser, dark lasers, variance
-of half stripes (px²) and its degrees of freedom."""
-N_FACTS = 5
+"""Measures of a hypothesis: intensity weight that it explains, the same divided by the number of
+lasers, number of dark lasers, variance of half stripes (px²) and its degrees of freedom."""
+N_MEASURES = 5
 CELL_LINES = 16
 """Search lines per cell along a stripe."""
 SAME_RANGE, SAME_ANGLE = 0.004, math.radians(0.4)
-"""Largest difference of equal hypotheses (share of the range, radians)."""
+"""Largest differences of hypotheses that count as the same (share of the range, radians)."""
 
 
-class _EvidenceOptions(NamedTuple):
+class _LightOptions(NamedTuple):
     """Light of the lasers on a plane, and what counts as dark or faint."""
 
-    rival_share: float = 0.5  # Least light that a rival must explain, as a share of the surface's.
-    # Light within this many gates of a plane is on it: lasers whose calibration is less accurate
-    # than the peaks must not count as dark, nor their light as foreign.
+    # Least intensity weight that a rival must explain, as a share of the surface's.
+    rival_share: float = 0.5
+    # Subsegments within this many gates of a plane are on it: lasers whose calibration is less
+    # accurate than the peaks must not count as dark, nor their light as foreign.
     wide: float = 2.5
-    # Least number of cells to judge a laser; with a smaller share of the typical light it is dark.
+    # Least number of cells to judge a laser; with a smaller share of lit cells than this, relative
+    # to that of the other lasers, it is dark.
     min_cells: int = 3
     dark_share: float = 0.25
-    # A laser is faint with this share of the best one's way through the picture.
+    # A laser is faint with a visible share below this share of the best laser's.
     faint: float = 0.4
-    # Light is before a plane from this share of its distance on; pieces of stripe this long are
-    # those of walls and fish, not the light on strands.
+    # Light is in front of a plane beyond this share of its distance; components of this many search
+    # lines are those of walls and fish, not the light on strands.
     before: float = 0.03
-    long_piece: float = 24.0
+    long_component: float = 24.0
 
 
-_EVIDENCE = _EvidenceOptions()
+_LIGHT = _LightOptions()
 
-# Columns of sums over the peaks of one laser's stripe, read as some laser's.
+# Columns of sums over the peaks of one laser's stripe, assigned to some laser: second moments and
+# first moments of the points, sum of the confidences, sums of the sensitivities.
 _XX, _XY, _XZ, _YY, _YZ, _ZZ, _SX, _SY, _SZ, _N, _SJX, _SJY, _SJZ, _N_SUMS = range(14)
 
 
@@ -72,7 +75,7 @@ def find_rivals(
     n_lasers: int,
     planes: FloatArray,
 ) -> int:
-    """Write planes on which a surface's peaks are other lasers'; return their number.
+    """Write planes that explain a surface's peaks as those of other lasers; return their number.
 
     Parameters
     ----------
@@ -88,7 +91,8 @@ def find_rivals(
     n_lasers : int
         Lasers of the rig.
     planes : array, shape (1 + n, 4)
-        Normals and offsets: that of the surface, which is refined, then written.
+        Normals and offsets. The first is that of the surface, and is refined; the others are
+        written.
     """
     sums = np.zeros((n_lasers, n_lasers, _N_SUMS))
     place = np.zeros((n_lasers, 3))
@@ -105,7 +109,7 @@ def find_rivals(
         if own > 0.0:
             for k in range(3):
                 place[i, k] = sums[i, i, _SX + k] / own
-    if other < _EVIDENCE.rival_share * total:
+    if other < _LIGHT.rival_share * total:
         return 0
     seeds = _choose_seeds(sums, place)
     score = np.zeros(planes.shape[0])
@@ -120,7 +124,7 @@ def find_rivals(
 def _sum_candidates(
     candidates: Candidates, of_candidate: IntArray, members: BoolArray, sums: FloatArray
 ) -> None:
-    """Sum the moments of each laser's peaks on the surface, read as each laser's."""
+    """Sum the moments of each laser's peaks on the surface, assigned to every laser (L, L, 13)."""
     source, laser, points = candidates.source, candidates.laser, candidates.points
     sensitivity = candidates.sensitivity
     owner = np.full(n_bins(source), -1)
@@ -150,7 +154,7 @@ def _sum_candidates(
 
 @inner_kernel
 def _choose_seeds(sums: FloatArray, place: FloatArray) -> IntArray:
-    """Choose lasers whose stripes are bright and far from each other."""
+    """Return lasers whose stripes on the surface are bright and far from each other."""
     n_lasers = place.shape[0]
     # Number of lasers whose stripes start rivals.
     n_seeds = 4
@@ -187,7 +191,10 @@ def _try_pair(
     score: FloatArray,
     n: int,
 ) -> int:
-    """Read two stripes as those of any two lasers; keep the planes that explain most light."""
+    """Assign the stripes i and k to any two lasers; keep the best planes, and return their number.
+
+    `total` is the intensity weight of the surface; `planes` and `score` are as in `_keep_best`.
+    """
     n_lasers = sums.shape[0]
     plane = np.empty(4)
     normal, scratch, right, m = np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3)
@@ -196,16 +203,16 @@ def _try_pair(
             if a == b or (a == i and b == k):
                 continue
             first, second = sums[i, a], sums[k, b]
-            if first[_N] < _EVIDENCE.rival_share * sums[i, i, _N]:
+            if first[_N] < _LIGHT.rival_share * sums[i, i, _N]:
                 continue
-            if second[_N] < _EVIDENCE.rival_share * sums[k, k, _N]:
+            if second[_N] < _LIGHT.rival_share * sums[k, k, _N]:
                 continue
             if not _fit_two(first, second, normal, scratch, right, m, plane):
                 continue
             if plane[3] < nearest or plane[3] > farthest or plane[1] < MIN_FACING:
                 continue
             value = _explained(sums, plane)
-            if value >= _EVIDENCE.rival_share * total:
+            if value >= _LIGHT.rival_share * total:
                 n = _keep_best(plane, value, planes, score, n)
     return n
 
@@ -220,7 +227,10 @@ def _fit_two(
     m: FloatArray,
     plane: FloatArray,
 ) -> bool:
-    """Fit X·m = 1 to the peaks of two stripes, each with the same weight."""
+    """Fit X·m = 1 to the peaks of two stripes with equal weights, given their sums.
+
+    Write normal and offset to `plane`; return False if the fit is singular.
+    """
     u, v = 1.0 / first[_N], 1.0 / second[_N]
     normal[0, 0] = u * first[_XX] + v * second[_XX]
     normal[1, 0] = u * first[_XY] + v * second[_XY]
@@ -243,9 +253,9 @@ def _fit_two(
 
 @inner_borrowing_kernel
 def _explained(sums: FloatArray, plane: FloatArray) -> float:
-    """Return the light of the stripes on a plane, each read as the laser that fits best.
+    """Return the weight of the stripes on a plane, each assigned to the laser that fits best.
 
-    A stripe counts less the farther it is off the plane, by the root mean square over its length.
+    A stripe counts less, the larger its mean square distance from the plane is.
     """
     x, y, z, d = plane[0], plane[1], plane[2], plane[3]
     total = 0.0
@@ -260,7 +270,7 @@ def _explained(sums: FloatArray, plane: FloatArray) -> float:
             square += y * (y * row[_YY] + 2.0 * z * row[_YZ]) + z * z * row[_ZZ]
             square += -2.0 * d * (x * row[_SX] + y * row[_SY] + z * row[_SZ]) + n * d * d
             per_px = (x * row[_SJX] + y * row[_SJY] + z * row[_SJZ]) / n
-            gate = _EVIDENCE.wide * _EVIDENCE.wide * squared_gate(per_px, d)
+            gate = _LIGHT.wide * _LIGHT.wide * squared_gate(per_px, d)
             best = max(best, n * (1.0 - square / (n * gate)))
         total += best
     return total
@@ -270,7 +280,11 @@ def _explained(sums: FloatArray, plane: FloatArray) -> float:
 def _keep_best(
     plane: FloatArray, value: float, planes: FloatArray, score: FloatArray, n: int
 ) -> int:
-    """Insert a plane from the second row on, unless a similar one is better; best first."""
+    """Put a plane with the score `value` among the n best rivals, in rows 1 to n of `planes`.
+
+    It replaces a similar one if it is better, else the worst one if all rows are filled; planes
+    similar to that of the surface, in row 0, are dropped. Return the new n.
+    """
     if _same(plane, planes[0], 2.0):
         return n
     at = 1
@@ -290,13 +304,14 @@ def _keep_best(
 
 @inline_borrowing_kernel
 def _copy_plane(plane: FloatArray, out: FloatArray) -> None:
-    """Copy without the messages about shapes that Numba compiles for an assigned slice."""
+    """Copy a plane (4,): an assigned slice would compile error messages about shapes as well."""
     for k in range(4):
         out[k] = plane[k]
 
 
 @inline_borrowing_kernel
 def _same(one: FloatArray, other: FloatArray, times: float) -> bool:
+    """Return whether planes differ by less than `times` the limits of equal hypotheses."""
     cosine = one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
     angle = times * SAME_ANGLE
     near = abs(one[3] - other[3]) < times * SAME_RANGE * other[3]
@@ -307,16 +322,16 @@ def _same(one: FloatArray, other: FloatArray, times: float) -> bool:
 def _refine_rivals(
     table: FloatArray, nearest: float, farthest: float, planes: FloatArray, n: int
 ) -> int:
-    """Refine the planes from the second row on; drop duplicates; return the number left."""
+    """Refine the surface's plane and n rivals in place; drop duplicates, return the number left."""
     normal, scratch, lanes = np.empty((3, 3)), np.empty((5, 3)), np.empty(table.shape[1])
     kept = 0
     for _ in range(2):
-        refine_plane(table, planes[0], _EVIDENCE.wide, normal, scratch, lanes)
+        refine_plane(table, planes[0], _LIGHT.wide, normal, scratch, lanes)
     for k in range(1, n + 1):
         plane = planes[k]
         good = True
-        for component in (_EVIDENCE.wide, 1.0, 1.0, _EVIDENCE.wide, _EVIDENCE.wide):
-            good = good and refine_plane(table, plane, component, normal, scratch, lanes)
+        for gate_scale in (_LIGHT.wide, 1.0, 1.0, _LIGHT.wide, _LIGHT.wide):
+            good = good and refine_plane(table, plane, gate_scale, normal, scratch, lanes)
         good = good and nearest <= plane[3] <= farthest and plane[1] >= MIN_FACING
         for j in range(kept + 1):
             good = good and not _same(plane, planes[j], 1.0)
@@ -333,7 +348,7 @@ def judge_planes(
     subsegments: Subsegments,
     along_x: BoolArray,
     bands: FloatArray,
-    facts: FloatArray,
+    measures: FloatArray,
 ) -> None:
     """Write the evidence for every plane.
 
@@ -349,7 +364,7 @@ def judge_planes(
         Whether each laser's search lines run along x.
     bands : array, shape (n_lasers, cells, samples, 4)
         Points P that each laser's band sees, as (P, 1) / |P|; NaN where nothing is seen.
-    facts : array, shape (P, 5)
+    measures : array, shape (P, 5)
         Written, see `INTENSITY_WEIGHT`.
     """
     n_lasers, n_cells = bands.shape[0], bands.shape[1]
@@ -357,9 +372,11 @@ def judge_planes(
     near = np.empty(subsegments.laser.shape[0])
     lit, expected = np.empty((n_lasers, n_cells), np.bool_), np.empty((n_lasers, n_cells), np.bool_)
     for k in range(planes.shape[0]):
-        plane, found = planes[k], facts[k]
+        plane, found = planes[k], measures[k]
         _mark_lit_cells(plane, subsegments, near, lit)
-        found[INTENSITY_WEIGHT] = _intensity_on(k, near, candidates, subsegments.of_candidate, seen)
+        found[INTENSITY_WEIGHT] = _intensity_weight_on(
+            k, near, candidates, subsegments.of_candidate, seen
+        )
         found[VARIANCE], found[FREEDOM], n_lit = _variance(plane, subsegments, near, n_lasers)
         found[PER_LASER] = found[INTENSITY_WEIGHT] / max(n_lit, 1)
         _mark_expected(plane, bands, expected)
@@ -370,14 +387,17 @@ def judge_planes(
 def _mark_lit_cells(
     plane: FloatArray, subsegments: Subsegments, near: FloatArray, lit: BoolArray
 ) -> None:
-    """Write how near each subsegment is to a plane, 0 to 1; mark the cells with light near it."""
+    """Write how near each subsegment is to a plane, 0 to 1; mark the cells with light near it.
+
+    `lit` has the shape (n_lasers, cells).
+    """
     table, laser = subsegments.table, subsegments.laser
     lit[:] = False
     x, y, z, offset = plane[0], plane[1], plane[2], plane[3]
     for c in range(laser.shape[0]):
         residual = x * table[X, c] + y * table[Y, c] + z * table[Z, c] - offset
         per_px = x * table[JX, c] + y * table[JY, c] + z * table[JZ, c]
-        gate = _EVIDENCE.wide * _EVIDENCE.wide * squared_gate(per_px, offset)
+        gate = _LIGHT.wide * _LIGHT.wide * squared_gate(per_px, offset)
         near[c] = max(1.0 - residual * residual / gate, 0.0)
         if near[c] > 0.0:
             first, last = subsegments.first_line[c], subsegments.last_line[c]
@@ -386,10 +406,13 @@ def _mark_lit_cells(
 
 
 @inner_borrowing_kernel
-def _intensity_on(
+def _intensity_weight_on(
     number: int, near: FloatArray, candidates: Candidates, of_candidate: IntArray, seen: IntArray
 ) -> float:
-    """Sum the confidence of the peaks on a plane, each counted once, weighted by its distance."""
+    """Return the sum over the peaks on plane `number` of their confidence times nearness.
+
+    Each peak counts once, whatever the number of its candidates on the plane.
+    """
     source, total = candidates.source, 0.0
     for i in range(source.shape[0]):
         share = near[of_candidate[i]]
@@ -403,7 +426,7 @@ def _intensity_on(
 def _variance(
     plane: FloatArray, subsegments: Subsegments, near: FloatArray, n_lasers: int
 ) -> tuple[float, float, int]:
-    """Return variance (px²) of half stripes about a plane, degrees of freedom, lasers seen."""
+    """Return variance (px²) of half stripes about a plane, degrees of freedom, visible lasers."""
     table, n_lines, laser = subsegments.table, subsegments.n_lines, subsegments.laser
     first_line = subsegments.first_line
     x, y, z, offset = plane[0], plane[1], plane[2], plane[3]
@@ -436,14 +459,17 @@ def _variance(
     freedom = n - 3.0
     if freedom <= 0.0:
         return 1.0, 0.0, n_lit
-    # The noise (px) that half a stripe has at least.
+    # Least noise (px) of half a stripe.
     half_stripe_px = 0.1
     return square / freedom + half_stripe_px * half_stripe_px, freedom, n_lit
 
 
 @inner_borrowing_kernel
 def _mark_expected(plane: FloatArray, bands: FloatArray, expected: BoolArray) -> None:
-    """Mark the cells in which each laser's stripe on a plane lies in its band in the picture."""
+    """Mark the cells (n_lasers, cells) where each laser's stripe on a plane lies in its band.
+
+    There m·P - 1 changes its sign between two samples.
+    """
     x, y, z, offset = plane[0], plane[1], plane[2], plane[3]
     for i in range(bands.shape[0]):
         for cell in range(bands.shape[1]):
@@ -468,7 +494,7 @@ def exclusive_share(
     others: BoolArray,
     inlier_weight: float,
 ) -> float:
-    """Return the share of the light on a surface, without light on other surfaces.
+    """Return the light on a surface, as a share of all light that is not on other surfaces.
 
     Parameters
     ----------
@@ -479,18 +505,20 @@ def exclusive_share(
     members, others : bool array, shape (C,)
         Subsegments on the surface, and on other surfaces.
     inlier_weight : float
-        The part of the surface's light that counts.
+        Of the surface: less than its intensity weight if one laser dominates, because the surplus
+        of one laser is no evidence for a plane.
     """
     n = n_bins(source)
-    intensity_weight, owner = np.zeros(n), np.zeros(n, np.int64)
+    # For each peak: its confidence, and 2 if it is on the surface, 1 if only on others, else 0.
+    light, owner = np.zeros(n), np.zeros(n, np.int64)
     for i in range(source.shape[0]):
         c, r = subsegments.of_candidate[i], source[i]
-        intensity_weight[r] = confidence[i]
+        light[r] = confidence[i]
         owner[r] = max(owner[r], 2 if members[c] else int(others[c]))
     total, on = 0.0, 0.0
     for r in range(n):
-        total += intensity_weight[r] if owner[r] != 1 else 0.0
-        on += intensity_weight[r] if owner[r] == 2 else 0.0
+        total += light[r] if owner[r] != 1 else 0.0
+        on += light[r] if owner[r] == 2 else 0.0
     of_members = 0.0
     for c in range(members.shape[0]):
         of_members += subsegments.intensity_weight[c] if members[c] else 0.0
@@ -507,10 +535,10 @@ def loose_share_before(
     plane: FloatArray,
     nearest: float,
 ) -> float:
-    """Return the light in short pieces before a surface that none explains, over its own light.
+    """Return the loose light in front of a surface, over the surface's own light.
 
-    Light that another laser may have made at or behind the surface is not counted: with many lasers
-    that is nearly all noise.
+    Loose light is that of peaks in short components on no surface. Peaks that some laser may have
+    made at or behind the surface are not counted: with many lasers, these are nearly all noise.
 
     Parameters
     ----------
@@ -528,34 +556,37 @@ def loose_share_before(
         Least distance along the forward axis, in metres.
     """
     source, points, n = candidates.source, candidates.points, n_bins(candidates.source)
-    intensity_weight = np.zeros(n)
+    light = np.zeros(n)
     own, bound = np.zeros((2, n), np.bool_)
     for i in range(source.shape[0]):
         c, r = of_candidate[i], source[i]
         off = -plane[3]
         for k in range(3):
             off += plane[k] * points[i, k]
-        intensity_weight[r] = candidates.confidence[i]
+        light[r] = candidates.confidence[i]
         own[r] |= members[c]
-        # However it is read: one peak has a candidate for each laser.
+        # A peak is bound if any of its candidates is, whatever the laser.
         bound[r] |= (
             explained[c]
-            or n_lines[candidates.component[i]] >= _EVIDENCE.long_piece
-            or off > -_EVIDENCE.before * plane[3]
+            or n_lines[candidates.component[i]] >= _LIGHT.long_component
+            or off > -_LIGHT.before * plane[3]
             or points[i, 1] <= nearest
         )
     of_surface, loose = 0.0, 0.0
     for r in range(n):
-        of_surface += intensity_weight[r] if own[r] else 0.0
-        loose += 0.0 if bound[r] else intensity_weight[r]
+        of_surface += light[r] if own[r] else 0.0
+        loose += 0.0 if bound[r] else light[r]
     return loose / max(of_surface, 1e-12)
 
 
 @lazy_kernel
-def seen_of(
+def stripe_visibility(
     plane: FloatArray, members: BoolArray, subsegments: Subsegments, bands: FloatArray
 ) -> tuple[float, float, float]:
-    """Return the share of its best stripe that a surface shows; shares of faint and dark lasers.
+    """Return the visible share of a surface's best stripe; shares of faint and of dark lasers.
+
+    The visible share of a stripe is the number of its search lines on the surface, over that of the
+    cells in which the stripe lies in the picture. Lasers in few cells are not judged.
 
     Parameters
     ----------
@@ -570,31 +601,34 @@ def seen_of(
     """
     laser = subsegments.laser
     n_lasers, n_cells = bands.shape[0], bands.shape[1]
-    expected, way = np.empty((n_lasers, n_cells), np.bool_), np.zeros(n_lasers)
+    expected, visible = np.empty((n_lasers, n_cells), np.bool_), np.zeros(n_lasers)
     _mark_expected(plane, bands, expected)
     for c in range(laser.shape[0]):
         if members[c]:
-            way[laser[c]] += subsegments.n_lines[c]
+            visible[laser[c]] += subsegments.n_lines[c]
     most, asked, faint, dark = 0.0, 0, 0, 0
     for i in range(n_lasers):
         cells = flatnonzero(expected[i]).shape[0]
-        way[i] = way[i] / (CELL_LINES * cells) if cells >= _EVIDENCE.min_cells else np.nan
-        if way[i] > most:
-            most = way[i]
+        visible[i] = visible[i] / (CELL_LINES * cells) if cells >= _LIGHT.min_cells else np.nan
+        if visible[i] > most:
+            most = visible[i]
     for i in range(n_lasers):
-        if way[i] == way[i]:
+        if visible[i] == visible[i]:
             asked += 1
-            faint += way[i] < _EVIDENCE.faint * most
-            dark += way[i] == 0.0
+            faint += visible[i] < _LIGHT.faint * most
+            dark += visible[i] == 0.0
     return most, faint / max(asked, 1), dark / max(asked, 1)
 
 
 @inner_borrowing_kernel
 def _dark_lasers(lit: BoolArray, expected: BoolArray, along_x: BoolArray) -> float:
-    """Count the lasers that show nothing where others do; a dim one counts in part."""
+    """Return the number of lasers that are dark where others are visible; dim ones count in part.
+
+    `lit` and `expected` have the shape (n_lasers, cells).
+    """
     n_lasers, n_cells = lit.shape
     dark = 0.0
-    # A cell is lit if this share of the other lasers that can be there is seen there.
+    # A cell counts if this share of the other lasers that can be visible there is.
     lit_share = 0.15
     for i in range(n_lasers):
         asked, seen, of_others, by_others = 0, 0, 0.0, 0.0
@@ -612,9 +646,9 @@ def _dark_lasers(lit: BoolArray, expected: BoolArray, along_x: BoolArray) -> flo
             seen += lit[i, cell]
             of_others += there
             by_others += shown
-        if asked < _EVIDENCE.min_cells:
+        if asked < _LIGHT.min_cells:
             continue
-        typical = _EVIDENCE.dark_share * by_others / of_others
+        typical = _LIGHT.dark_share * by_others / of_others
         share = seen / asked
         if share < typical:
             dark += 1.0 - share / typical

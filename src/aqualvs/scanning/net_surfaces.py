@@ -52,7 +52,7 @@ def is_continuation(
     subsegments : Subsegments
         C of them.
     """
-    packed = np.append(plane.normal, plane.offset)
+    packed = plane.packed()
     turns, at_random, met = _turns(subsegments, first, second, packed)
     # Share of the transitions at which the one surface must begin where the other ends.
     most = 0.5

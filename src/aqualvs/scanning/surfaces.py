@@ -405,7 +405,7 @@ def surface_on(plane: Plane, subsegments: Subsegments, n_lasers: int, focal_px: 
     subsegments, n_lasers, focal_px
         As in `find_surfaces`.
     """
-    packed, members = np.append(plane.normal, plane.offset), np.zeros(subsegments.n, np.bool_)
+    packed, members = plane.packed(), np.zeros(subsegments.n, np.bool_)
     sums = np.empty(3)
     collect_surface(subsegments, n_lasers, packed, members, sums)
     return _describe(subsegments, packed, members, sums, n_lasers, focal_px)
