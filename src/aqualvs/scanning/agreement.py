@@ -1,15 +1,15 @@
 """Agreement of the lasers over a dive: detection of a laser whose sheet has moved.
 
-Two lines on a flat target share a plane, and so do three: a laser whose sheet is no longer where
-the rig says leaves it. One frame shows little of that (of three lines, each with a shift and a
-turn, the target's own plane takes three numbers), but a sheet that has moved has done so by the
-same three numbers in all frames, at every range and angle of the target; no bulge of a net or fish
-in front of it follows that pattern. So each laser in turn is assumed to have moved, and it is named
-if that explains all frames and no other laser does.
+The stripes of all lasers on a flat target lie in one plane; the stripe of a laser whose sheet is
+not where the rig says lies beside it. One frame is weak evidence (three lines, each with a shift
+and a turn, have six parameters, of which the target's own plane takes three), but a sheet that has
+moved has done so by the same three parameters in all frames, at every range and angle of the
+target; a bulge of a net or a fish in front of it does not. So each laser in turn is assumed to have
+moved; it is named if that explains all frames and no other laser does.
 
-`bin_stripes` summarises each stripe of a frame by the middle of its light in a few bins, whatever
-its label: the points of a laser that has drifted are labelled as clutter or as another surface.
-`explain` fits a plane m·X = 1 to each frame and one step of three numbers (turns and shift) to one
+`bin_stripes` summarises each stripe of a frame by its centroid in a few bins, whatever the labels:
+the points of a laser that has drifted are labelled as clutter or as another surface. `fit_drift`
+fits a plane m·X = 1 to each frame and one step of three parameters (two tilts and a shift) to one
 laser's sheet in all frames; the planes are eliminated from the normal equations (Schur complement),
 and weights are Tukey's. `LaserAgreement` collects the frames and gives the verdict.
 """
@@ -36,10 +36,12 @@ from aqualvs.scanning.scan import Scan, ScanPoints
 N_BINS = 12
 """Bins of a stripe, from one border of the picture to the other."""
 
-# In a bin, points within three times the typical scatter of the median are the stripe; the limit is
-# at least the first of these shares of the range and at most the second.
-_NEAR, _FAR = 0.003, 0.02
-_SCATTER = 4.4  # three sigmas in median absolute deviations
+# In a bin, points within three standard deviations of the median are the stripe; the limit is at
+# least the first of these shares of the range and at most the second. Three standard deviations are
+# 4.4 median absolute deviations.
+_MIN_NEAR, _MAX_NEAR = 0.003, 0.02
+_SCATTER = 4.4
+# Least number of these points in a bin, and least share of all points in it.
 _MIN_POINTS = 4
 _MIN_SHARE = 0.6
 
@@ -47,40 +49,39 @@ _MIN_SHARE = 0.6
 def bin_stripes(
     points: ScanPoints, m: FloatArray, along_x: IntArray, size_px: tuple[int, int]
 ) -> FloatArray:
-    """Return the middle of the light in each bin of each laser's stripe.
+    """Return the centroid of the light in each bin of each laser's stripe.
 
     Parameters
     ----------
     points : ScanPoints
         Of one frame.
     m : array, shape (3,)
-        The target's plane m·X = 1 in `dome`, roughly.
+        Approximate plane m·X = 1 of the target, in `dome`.
     along_x : int array, shape (L,)
-        1 for lasers whose stripe is searched along x, and so runs along y.
+        1 for lasers whose search lines run along x, so that the stripe runs along y; else 0.
     size_px : (int, int)
         Image width and height.
 
     Returns
     -------
     array, shape (L, N_BINS, 2)
-        In `image`; NaN where a bin shows no stripe, or too much beside it.
+        In `image`; NaN if a bin has no stripe, or too many other points.
     """
     laser, n_cells = points.laser.astype(np.int64), len(along_x) * N_BINS
     x, y, place = points.pixels[:, 0], points.pixels[:, 1], points.points_in_dome
     share = np.where(along_x[laser] == 1, y / size_px[1], x / size_px[0])
-    piece = np.clip((share * N_BINS).astype(np.int64), 0, N_BINS - 1)
+    i_bin = np.clip((share * N_BINS).astype(np.int64), 0, N_BINS - 1)
     off = m[0] * place[:, 0] + m[1] * place[:, 1] + m[2] * place[:, 2] - 1.0
-    # Points farther from the target's plane than this share of the range belong to something else:
-    # two degrees of a laser are a quarter of the range at worst.
+    # Points farther from the target's plane than this share of the range are on other objects: a
+    # laser that is off by two degrees moves them by a quarter of the range at most.
     gate = 0.4
     rows = np.flatnonzero(np.abs(off) < gate)
-    cell, off = (laser * N_BINS + piece)[rows], off[rows]
+    cell, off = (laser * N_BINS + i_bin)[rows], off[rows]
     n = np.bincount(cell, minlength=n_cells)
     apart = np.abs(off - _medians(off, cell, n)[cell])
-    near = apart < np.clip(_SCATTER * _medians(apart, cell, n), _NEAR, _FAR)[cell]
+    near = apart < np.clip(_SCATTER * _medians(apart, cell, n), _MIN_NEAR, _MAX_NEAR)[cell]
     rows, cell = rows[near], cell[near]
     n_near = np.bincount(cell, minlength=n_cells)
-    # The middle of the light of the points that lie together.
     brightness = points.intensity[rows] * points.width[rows]
     sums = [np.bincount(cell, brightness * at, n_cells) for at in (1.0, x[rows], y[rows])]
     seen = (n_near >= _MIN_POINTS) & (n_near >= _MIN_SHARE * n)
@@ -91,7 +92,7 @@ def bin_stripes(
 
 
 def _medians(values: FloatArray, group: IntArray, n: IntArray) -> FloatArray:
-    """Return the median of each group, NaN for none; `n` are the numbers of its values."""
+    """Return the median of each group, NaN without values; `n` are the numbers of its values."""
     found = np.full(len(n), np.nan)
     ordered, filled = values[np.lexsort((values, group))], n > 0
     first, n_filled = (np.cumsum(n) - n)[filled], n[filled]
@@ -100,34 +101,39 @@ def _medians(values: FloatArray, group: IntArray, n: IntArray) -> FloatArray:
 
 
 CUT = 4.0
-"""Cost limit of residuals, in sigmas: larger residuals count as this."""
+"""Limit of a residual in the cost, in sigmas."""
 
-# Prior of a step: a laser that was knocked has turned rather than shifted, and hardly by more.
+# Prior standard deviations of a step (rad, rad, m): a laser that was knocked has turned rather than
+# shifted, and hardly by more.
 _PRIOR = np.array([np.deg2rad(1.5), np.deg2rad(1.5), 0.005])
-# Limit of the steps; a laser so far off would not be seen at all.
-_FARTHEST = np.array([0.2, 0.2, 0.05])
+# Largest step (rad, rad, m): a laser that is farther off would not be visible.
+_MAX_STEP = np.array([0.2, 0.2, 0.05])
+# Step of the numerical derivative across a stripe, in pixels.
 _STEP_PX = 0.25
+# Iterations at most, the first ones without weights; the fit has converged if no parameter changes
+# by more than the first limit (rad, m), and the weights by less than the second on average.
 _ITERATIONS, _UNWEIGHTED = 12, 2
-_SMALL, _SETTLED = 1e-5, 1e-3
-_LEAST, _RIDGE = 1e-6, 1e-12
+_SMALL_STEP, _SMALL_CHANGE = 1e-5, 1e-3
+# Least weight of a point that is seen, and ridge as a share of the trace of the normal matrix.
+_MIN_WEIGHT, _RIDGE = 1e-6, 1e-12
 
 
 @dataclass(frozen=True, slots=True)
 class SeenStripes:
-    """Stripes on flat-looking targets, as rays; F frames, L lasers, K bins."""
+    """Stripes of the frames as rays: L lasers, F frames, K bins."""
 
-    # Shape (L, F, K, 3): of the rays, in `dome`.
+    # Shape (L, F, K, 3): origins (m) and unit directions of the rays, in `dome`.
     origins: FloatArray
     directions: FloatArray
-    # Shape (L, F, K, 3, 2): origins and directions of the rays that pass `_STEP_PX` beside, across
-    # the stripe.
+    # Shape (L, F, K, 3, 2): origins and directions of the rays of pixels that are moved across the
+    # stripe by `_STEP_PX`.
     beside: FloatArray
-    # Shape (L, F, K).
+    # Shape (L, F, K): whether the bin has a stripe, and both rays exist.
     seen: BoolArray
 
     @classmethod
     def of(cls, middles: Sequence[FloatArray], camera: Camera, along_x: IntArray) -> "SeenStripes":
-        """Trace the pieces of stripes (L, K, 2) of several frames, NaN where unseen."""
+        """Trace the bins (L, K, 2) of several frames from `bin_stripes`, NaN where unseen."""
         pixels = np.stack(middles, axis=1)
         step = np.where(along_x[:, None] == 1, [_STEP_PX, 0.0], [0.0, _STEP_PX])
         rays = camera.rays(np.nan_to_num(pixels))
@@ -141,36 +147,36 @@ class SeenStripes:
 
 
 @dataclass(frozen=True, slots=True)
-class Explanation:
+class DriftFit:
     """Fit of the frames under the hypothesis that one laser, or none, has moved."""
 
-    laser: int | None  # The one that may have moved.
-    step: FloatArray  # Shape (3,): its step as `moved_plane` takes it: tilts (rad) and offset (m).
+    laser: int | None  # Index of the laser that has moved; None for none.
+    step: FloatArray  # Shape (3,): its step: two tilts (rad) and a shift (m), as `Sheet.moved_by`.
     cost: float  # Mean square residual in sigmas, none counted beyond `CUT`.
     inliers: float  # Share of residuals below `CUT`.
     # Root mean square distance of that laser's stripe from the targets, as a share of range.
     effect: float
-    # Shape (3 L, 3 L): of the steps of all lasers, from a typical frame: errors of a stripe are the
-    # same in all frames, so more frames add no information.
+    # Shape (3 L, 3 L): information of a typical frame on the steps of all lasers: errors of a
+    # stripe are the same in all frames, so that more frames add no information.
     information: FloatArray
 
     def covariance(self) -> FloatArray:
         """Return the covariance (3, 3) of `step`, including its prior."""
-        own = self._own()
+        own = self._own_rows()
         total = self.information[own, own] + np.diag(_PRIOR**-2.0)
         return np.asarray(np.linalg.inv(total), dtype=np.float64)
 
-    def spill(self) -> FloatArray:
-        """Return the derivative (3, 3 L) of `step` by the steps of all lasers (3 L)."""
-        return self.covariance() @ self.information[self._own()]
+    def by_steps_of_all(self) -> FloatArray:
+        """Return the derivative (3, 3 L) of `step` by errors of the sheets of all lasers (3 L)."""
+        return self.covariance() @ self.information[self._own_rows()]
 
-    def _own(self) -> slice:
+    def _own_rows(self) -> slice:
         if self.laser is None:
             raise ValueError("no laser has moved, so there is no step")
         return slice(3 * self.laser, 3 * self.laser + 3)
 
 
-def explain(stripes: SeenStripes, sheets: Sequence[Sheet], laser: int | None) -> Explanation:
+def fit_drift(stripes: SeenStripes, sheets: Sequence[Sheet], laser: int | None) -> DriftFit:
     """Fit a plane to every frame, and a step of one laser, or of none, to all of them.
 
     Parameters
@@ -179,65 +185,72 @@ def explain(stripes: SeenStripes, sheets: Sequence[Sheet], laser: int | None) ->
     sheets : sequence of Sheet
         One for each laser, as the rig has them.
     laser : int or None
-        The one that may have moved.
+        The one that is assumed to have moved.
     """
     step = np.zeros(3)
-    view = _View.of(stripes, sheets)
-    weight = view.seen.astype(np.float64)
+    on_sheets = _SheetPoints.of(stripes, sheets)
+    weight = on_sheets.seen.astype(np.float64)
     for i in range(_ITERATIONS):
-        fit, last = _Fit.of(view, weight), step
+        fit, last = _Fit.of(on_sheets, weight), step
         if laser is not None:
-            step = np.clip(step - _toward(fit, view, laser, step), -_FARTHEST, _FARTHEST)
-            view = view.with_laser(stripes, laser, _moved(sheets[laser], step))
+            step = np.clip(step - _newton_step(fit, on_sheets, laser, step), -_MAX_STEP, _MAX_STEP)
+            on_sheets = on_sheets.with_laser(stripes, laser, _moved(sheets[laser], step))
         if i >= _UNWEIGHTED:
-            before, weight = weight, fit.tukey(view.seen)
-            if np.abs(step - last).max() < _SMALL and np.abs(weight - before).mean() < _SETTLED:
+            before, weight = weight, fit.tukey(on_sheets.seen)
+            if (
+                np.abs(step - last).max() < _SMALL_STEP
+                and np.abs(weight - before).mean() < _SMALL_CHANGE
+            ):
                 break
-    fit = _Fit.of(view, weight)
-    z = np.abs(fit.z[view.seen])
-    return Explanation(
+    fit = _Fit.of(on_sheets, weight)
+    z = np.abs(fit.z[on_sheets.seen])
+    return DriftFit(
         laser=laser,
         step=step,
         cost=float(np.mean(np.minimum(z, CUT) ** 2)),
         inliers=float(np.mean(z < CUT)),
-        effect=0.0 if laser is None else fit.effect(view, laser, step),
-        information=fit.normal_equations(view, _spread(fit.slopes(view)))[0],
+        effect=0.0 if laser is None else fit.effect(on_sheets, laser, step),
+        information=fit.normal_equations(on_sheets, _columns_by_laser(fit.slopes(on_sheets)))[0],
     )
 
 
-def _toward(fit: "_Fit", view: "_View", laser: int, step: FloatArray) -> FloatArray:
-    """Return Newton's correction, to be subtracted, of the step of one laser."""
-    slope = np.zeros((*view.seen.shape, 3))
-    mine = _pieces(laser)
-    slope[:, mine] = fit.slopes(view)[:, mine]
-    information, right = fit.normal_equations(view, slope)
+def _newton_step(
+    fit: "_Fit", on_sheets: "_SheetPoints", laser: int, step: FloatArray
+) -> FloatArray:
+    """Return the Gauss-Newton correction (3,) of the step of one laser, to be subtracted."""
+    slope = np.zeros((*on_sheets.seen.shape, 3))
+    mine = _bins_of(laser)
+    slope[:, mine] = fit.slopes(on_sheets)[:, mine]
+    information, right = fit.normal_equations(on_sheets, slope)
     prior = _PRIOR**-2.0
     toward = np.linalg.solve(information + np.diag(prior), right + prior * step)
     return np.asarray(toward, dtype=np.float64)
 
 
-def _pieces(laser: int) -> slice:
+def _bins_of(laser: int) -> slice:
+    """Return the columns of one laser on the axis of the bins of all lasers."""
     return slice(N_BINS * laser, N_BINS * (laser + 1))
 
 
 def _moved(sheet: Sheet, step: FloatArray) -> Sheet:
+    """Return a sheet moved by two tilts and a shift; its other parameters stay."""
     rest = np.zeros(len(sheet.parameter_names) - len(step))
     return sheet.moved_by(np.concatenate([step, rest]))
 
 
 @dataclass(frozen=True, slots=True)
-class _View:
-    """Points of stripes on the assumed sheets; frames first, the bins of all lasers in one axis."""
+class _SheetPoints:
+    """Points of the bins on the assumed sheets, in `dome`; the bins of all lasers on one axis."""
 
-    points: FloatArray  # Shape (F, L K, 3).
+    points: FloatArray  # Shape (F, L K, 3): metres; 0 where unseen.
     per_px: FloatArray  # Shape (F, L K, 3): derivative of the points by a pixel across the stripe.
     # Shape (F, L K, 3, 3): derivative of the points by a step of their own laser.
     by_step: FloatArray
-    # Shape (F, L K).
+    # Shape (F, L K): whether the ray meets the sheet.
     seen: BoolArray
 
     @classmethod
-    def of(cls, stripes: SeenStripes, sheets: Sequence[Sheet]) -> "_View":
+    def of(cls, stripes: SeenStripes, sheets: Sequence[Sheet]) -> "_SheetPoints":
         """Return the points on all sheets."""
         parts = [_on_sheet(stripes, i, sheet) for i, sheet in enumerate(sheets)]
         return cls(
@@ -247,19 +260,19 @@ class _View:
             np.concatenate([part.seen for part in parts], axis=1),
         )
 
-    def with_laser(self, stripes: SeenStripes, laser: int, sheet: Sheet) -> "_View":
-        """Return the same view with another sheet of one laser."""
-        changed = _View(
+    def with_laser(self, stripes: SeenStripes, laser: int, sheet: Sheet) -> "_SheetPoints":
+        """Return a copy with the points of one laser on another sheet."""
+        changed = _SheetPoints(
             self.points.copy(), self.per_px.copy(), self.by_step.copy(), self.seen.copy()
         )
-        mine, part = _pieces(laser), _on_sheet(stripes, laser, sheet)
+        mine, part = _bins_of(laser), _on_sheet(stripes, laser, sheet)
         changed.points[:, mine], changed.per_px[:, mine] = part.points, part.per_px
         changed.by_step[:, mine], changed.seen[:, mine] = part.by_step, part.seen
         return changed
 
 
-def _on_sheet(stripes: SeenStripes, laser: int, sheet: Sheet) -> _View:
-    """Return the points of one laser, K pieces of it."""
+def _on_sheet(stripes: SeenStripes, laser: int, sheet: Sheet) -> _SheetPoints:
+    """Return the points of one laser's K bins on a sheet."""
     shape = stripes.seen.shape[1:]
     origins, directions = stripes.origins[laser], stripes.directions[laser]
     rays = Rays(origins, directions, stripes.seen[laser])
@@ -274,84 +287,91 @@ def _on_sheet(stripes: SeenStripes, laser: int, sheet: Sheet) -> _View:
     reach = np.einsum("fki,fki->fk", normal, points - origin)
     reach /= np.einsum("fki,fki->fk", normal, direction)
     per_px = (origin + reach[..., None] * direction - points) / _STEP_PX
-    # Rays of pixels that the lens does not reach, such as the corners of a fisheye's picture, are
-    # NaN, which a weight of zero would not take out of a sum.
+    # Rays of pixels outside the lens model, such as the corners of a fisheye's picture, are NaN,
+    # which a weight of zero would not remove from a sum.
     unseen = ~seen
     per_px[unseen], by_step[unseen] = 0.0, 0.0
-    return _View(points, per_px, by_step, seen)
+    return _SheetPoints(points, per_px, by_step, seen)
 
 
 @dataclass(frozen=True, slots=True)
 class _Fit:
     """Planes fitted to all frames, and their residuals."""
 
-    m: FloatArray  # Shape (F, 3).
-    # Shape (F, L K): weights by errors and outliers; residuals of m·X = 1, and the same in sigmas.
+    m: FloatArray  # Shape (F, 3): planes m·X = 1 in `dome`, in 1/m.
+    # Shape (F, L K): weights, 1 over the variance and less for outliers; residuals of m·X = 1, and
+    # the same in sigmas.
     weight: FloatArray
     residual: FloatArray
     z: FloatArray
-    # Shape (F, 3, 3): of the planes' normal equations.
+    # Shape (F, 3, 3): inverse of the planes' normal matrices.
     inverse: FloatArray
 
     @classmethod
-    def of(cls, view: _View, weight: FloatArray) -> "_Fit":
-        """Fit a plane to each frame; `weight` tells outliers from the rest."""
-        x = view.points
-        # A frame with outliers only keeps some plane, which has no influence.
-        least = _LEAST * view.seen
+    def of(cls, on_sheets: _SheetPoints, weight: FloatArray) -> "_Fit":
+        """Fit a plane to each frame; `weight` (F, L K) is the robust weight, 0 for outliers."""
+        x = on_sheets.points
+        # So that a frame with outliers only still has a plane, which has no influence.
+        least = _MIN_WEIGHT * on_sheets.seen
         m, _ = _planes(x, weight + least)
-        per_px = np.abs(np.einsum("fbi,fi->fb", view.per_px, m))
-        # Error of a bin of stripe that stays from frame to frame: texture, strands, the glow beside
-        # the sheet, in pixels; and the unevenness that a target may have, as a share of the range.
+        per_px = np.abs(np.einsum("fbi,fi->fb", on_sheets.per_px, m))
+        # Standard deviation of a bin in pixels: texture, strands, and the glow beside the sheet do
+        # not average out; and unevenness of the target, as a share of the range.
         sigma_px, uneven = 0.25, 7e-4
         sigma = np.hypot(sigma_px * per_px, uneven)
         w = (weight + least) / sigma**2
         m, inverse = _planes(x, w)
-        residual = np.where(view.seen, np.einsum("fbi,fi->fb", x, m) - 1.0, 0.0)
+        residual = np.where(on_sheets.seen, np.einsum("fbi,fi->fb", x, m) - 1.0, 0.0)
         return cls(m, w, residual, residual / sigma, inverse)
 
-    def slopes(self, view: _View) -> FloatArray:
+    def slopes(self, on_sheets: _SheetPoints) -> FloatArray:
         """Return the derivative (F, L K, 3) of the residuals by their own laser's step."""
-        slopes: FloatArray = np.einsum("fbij,fi->fbj", view.by_step, self.m)
+        slopes: FloatArray = np.einsum("fbij,fi->fbj", on_sheets.by_step, self.m)
         return slopes
 
-    def normal_equations(self, view: _View, slope: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return matrix (C, C) and right side (C,) of parameters with derivatives (F, L K, C).
+    def normal_equations(
+        self, on_sheets: _SheetPoints, slope: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return normal matrix (C, C) and right side (C,) of C parameters besides the planes.
 
-        Means over the frames, with the planes eliminated.
+        `slope`, shape (F, L K, C), are the derivatives of the residuals by the parameters. Means
+        over the frames, with the planes eliminated.
         """
         weighed = self.weight[..., None] * slope
-        across = np.swapaxes(view.points, 1, 2) @ weighed
+        across = np.swapaxes(on_sheets.points, 1, 2) @ weighed
         eliminated = self.inverse @ across
         matrix = np.swapaxes(slope, 1, 2) @ weighed - np.swapaxes(across, 1, 2) @ eliminated
         right = np.einsum("fbc,fb->fc", weighed, self.residual)
-        # The planes are at their minimum, so that the residuals' pull on them is zero.
+        # The planes are at their minimum: their part of the right side is zero.
         return matrix.mean(axis=0), right.mean(axis=0)
 
     def tukey(self, seen: BoolArray) -> FloatArray:
-        """Return Tukey's weights of the residuals."""
+        """Return Tukey's weights of the residuals (F, L K); 0 where unseen."""
         scale = max(1.0, 1.4826 * float(np.median(np.abs(self.z[seen]))))
         return np.maximum(1.0 - (self.z / (TUKEY * scale)) ** 2, 0.0) ** 2 * seen
 
-    def effect(self, view: _View, laser: int, step: FloatArray) -> float:
-        """Return the shift of its laser's stripe off the targets by a step, over the range."""
-        mine = _pieces(laser)
-        off = self.slopes(view)[:, mine] @ step
-        return float(np.sqrt(np.mean(off[view.seen[:, mine]] ** 2)))
+    def effect(self, on_sheets: _SheetPoints, laser: int, step: FloatArray) -> float:
+        """Return the rms shift of a laser's stripe off the targets by a step, over the range."""
+        mine = _bins_of(laser)
+        off = self.slopes(on_sheets)[:, mine] @ step
+        return float(np.sqrt(np.mean(off[on_sheets.seen[:, mine]] ** 2)))
 
 
 def _planes(x: FloatArray, w: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Fit m·X = 1, shape (F, 3), to weighted points; return the inverse normal matrices too."""
+    """Fit m (F, 3) of m·X = 1 to points (F, N, 3) with weights (F, N).
+
+    Return also the inverse of the normal matrices (F, 3, 3).
+    """
     weighed = w[..., None] * x
     normal = np.swapaxes(x, 1, 2) @ weighed
-    # Points of one laser alone would leave the plane to turn about their line.
+    # Points of one laser alone leave the rotation of the plane about their line undetermined.
     ridge = _RIDGE * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(3)
     inverse = np.asarray(np.linalg.inv(normal + ridge), dtype=np.float64)
     return (inverse @ weighed.sum(axis=1)[..., None])[..., 0], inverse
 
 
-def _spread(slope: FloatArray) -> FloatArray:
-    """Give every laser columns of its own: (F, L K, 3) to (F, L K, 3 L)."""
+def _columns_by_laser(slope: FloatArray) -> FloatArray:
+    """Expand derivatives by the own laser's step (F, L K, 3) to all steps (F, L K, 3 L)."""
     n_frames, n, _ = slope.shape
     n_lasers = n // N_BINS
     spread = np.zeros((n_frames, n_lasers, N_BINS, n_lasers, 3))
@@ -363,11 +383,12 @@ def _spread(slope: FloatArray) -> FloatArray:
 # Frames in the fit; when there are twice as many, every other one is dropped.
 _MAX_FRAMES = 24
 _MIN_FRAMES = 5
-# Least share of the stripes that must be explained: by a flat target, or by the laser that moved.
+# Least share of inliers of a hypothesis: flat targets, or a laser that has moved.
 _EXPLAINED = 0.6
-# Another laser is excluded if its mean square is worse by this value and by the first share; a
-# laser has moved at all if the hypothesis of none is worse by this value and by the second share.
-_WORSE, _WORSE_SHARE, _WORSE_SHARE_OF_NONE = 0.1, 0.1, 0.3
+# Another laser is excluded if its cost (mean square in sigmas) is higher by this value plus the
+# first share; no laser has moved unless the cost without a move is higher by this value plus the
+# second share.
+_WORSE_COST, _WORSE_SHARE, _WORSE_SHARE_OF_NONE = 0.1, 0.1, 0.3
 
 
 class AgreementState(StrEnum):
@@ -390,14 +411,14 @@ class AgreementVerdict:
 
     state: AgreementState
     n_frames: int  # Frames that the verdict is based on.
-    # Lasers of which one has moved, numbered from 0, the likeliest first.
+    # Indices of the lasers one of which has moved, the likeliest first.
     suspects: tuple[int, ...] = ()
-    # Of the suspects.
+    # Names of the suspects.
     names: tuple[str, ...] = ()
-    # By how much the first of them has turned (rad) if it is the one; NaN without suspects.
+    # Turn of the first suspect and its standard deviation, in radians; NaN without suspects.
     angle: float = math.nan
     sigma_angle: float = math.nan
-    # How far its stripe lies off the plane of the others, as a share of the range; NaN likewise.
+    # Rms distance of its stripe from the targets, as a share of the range; NaN without suspects.
     effect: float = math.nan
 
     def to_dict(self) -> dict[str, Any]:
@@ -443,7 +464,7 @@ class LaserAgreement:
         axes = [band.axis for band in plan_bands(rig, self._camera)]
         self._along_x = np.array([axis is SearchAxis.ALONG_X for axis in axes], np.int64)
         self._middles: dict[int, FloatArray] = {}
-        # At first one frame in this many is used: neighbouring frames show the same.
+        # One frame in this many is sampled at first: neighbouring frames are about the same.
         every = 3
         self._every = every
         self._verdict: AgreementVerdict | None = None
@@ -451,20 +472,20 @@ class LaserAgreement:
     def add(self, scan: Scan) -> None:
         """Add a frame; frames without a posture, and all but a sample of the others, are skipped.
 
-        A frame is sampled by its number, so that parts of a dive, added by themselves, take the
+        Frames are sampled by their index, so that the parts of a dive, added separately, sample the
         same frames as the whole dive.
         """
         if not scan.posture or scan.index % self._every or len(self._along_x) < 2:
             return
         m = scan.posture.normal_in_dome / scan.posture.range
         middles = bin_stripes(scan.points, m, self._along_x, self._rig.size_px)
-        # Bins of stripe that every laser must show for a frame to count.
-        min_pieces = 4
-        if np.isfinite(middles[..., 0]).sum(axis=1).min() >= min_pieces:
+        # Least number of bins with a stripe that every laser must have for a frame to count.
+        min_bins = 4
+        if np.isfinite(middles[..., 0]).sum(axis=1).min() >= min_bins:
             self._sample({scan.index: middles})
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Return the sampled frames, to be stored and given to `extend`."""
+        """Return the sampled frames as arrays, for `extend`."""
         shape = (len(self._middles), len(self._along_x), N_BINS, 2)
         return {
             "every": np.array(self._every),
@@ -473,13 +494,13 @@ class LaserAgreement:
         }
 
     def extend(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Add frames that another monitor of the same rig has sampled, as from `arrays`."""
+        """Add the frames that another monitor of the same rig has sampled, from `arrays`."""
         self._every = max(self._every, int(arrays["every"]))
         frames = arrays["frames"].tolist()
         self._sample(dict(zip(frames, arrays["middles"], strict=True)))
 
     def _sample(self, middles: Mapping[int, FloatArray]) -> None:
-        """Take frames into the sample; where it grows too large, every other one is dropped."""
+        """Add frames to the sample; while it is too large, drop every other one."""
         self._verdict = None
         self._middles |= middles
         while True:
@@ -492,10 +513,11 @@ class LaserAgreement:
     def verdict(self) -> AgreementVerdict:
         """Return the verdict on the frames so far."""
         if self._verdict is None:
-            self._verdict = self._judged()
+            self._verdict = self._compute_verdict()
         return self._verdict
 
-    def _judged(self) -> AgreementVerdict:
+    def _compute_verdict(self) -> AgreementVerdict:
+        """Compare the fits without a move and with a move of each laser."""
         thinning = max(1, math.ceil(len(self._middles) / _MAX_FRAMES))
         middles = list(self._middles.values())[::thinning]
         n_frames = len(middles)
@@ -503,27 +525,28 @@ class LaserAgreement:
             return AgreementVerdict(AgreementState.NOT_CHECKED, n_frames)
         stripes = SeenStripes.of(middles, self._camera, self._along_x)
         sheets = sheets_of(self._rig)
-        none = explain(stripes, sheets, None)
+        none = fit_drift(stripes, sheets, None)
         found = sorted(
-            (explain(stripes, sheets, laser) for laser in range(len(sheets))),
+            (fit_drift(stripes, sheets, laser) for laser in range(len(sheets))),
             key=lambda one: one.cost,
         )
         best = found[0]
-        if not self._is_off(best):
+        if not self._is_significant(best):
             return _no_alarm(best, n_frames)
         if not _is_worse(none, best, _WORSE_SHARE_OF_NONE):
             return _no_alarm(none, n_frames)
-        # Beyond this the target is bent: a laser so far off shows next to nothing.
+        # A larger turn means a bent target: a laser so far off would show next to nothing.
         unlikely = math.radians(5.0)
         if best.inliers < _EXPLAINED or float(np.linalg.norm(best.step[:2])) > unlikely:
             return AgreementVerdict(AgreementState.NOT_FLAT, n_frames)
         suspects = [one for one in found if one is best or not _is_worse(one, best)]
         if len(suspects) == len(found) > 2:
-            # If any of three lasers could explain it, none has moved: the target is no plane.
+            # If each of three lasers or more could have moved, none has: the target is no plane.
             return AgreementVerdict(AgreementState.NOT_FLAT, n_frames)
-        return self._told(suspects, n_frames)
+        return self._drift_verdict(suspects, n_frames)
 
-    def _told(self, suspects: list[Explanation], n_frames: int) -> AgreementVerdict:
+    def _drift_verdict(self, suspects: list[DriftFit], n_frames: int) -> AgreementVerdict:
+        """Return the verdict that one of the suspects has moved, the likeliest first."""
         best = suspects[0]
         numbers = tuple(one.laser for one in suspects if one.laser is not None)
         tilt = best.step[:2]
@@ -540,28 +563,29 @@ class LaserAgreement:
             effect=best.effect,
         )
 
-    def _is_off(self, found: Explanation) -> bool:
+    def _is_significant(self, found: DriftFit) -> bool:
         """Return whether the step of a laser is significant, and large enough to matter."""
         step = found.step
         sigmas = math.sqrt(float(step @ np.linalg.solve(self._covariance(found), step)))
-        # An alarm needs a step of this significance, and of this size in angle or range.
+        # Least significance in sigmas; least turn in radians, or least effect.
         significant = 5.0
         angle, effect = math.radians(0.15), 0.005
         matters = found.effect > effect or float(np.linalg.norm(step[:2])) > angle
         return sigmas > significant and matters
 
-    def _covariance(self, found: Explanation) -> FloatArray:
-        """Return the covariance of a step, by errors of the stripes and of the calibration."""
+    def _covariance(self, found: DriftFit) -> FloatArray:
+        """Return the covariance (3, 3) of a step by errors of stripes and calibration."""
         names = [f"{laser.name}:{name}" for laser in self._rig.lasers for name in LASER_PARAMETERS]
-        spill = found.spill()
-        return found.covariance() + spill @ self._known.of(names) @ spill.T
+        by_steps_of_all = found.by_steps_of_all()
+        return found.covariance() + by_steps_of_all @ self._known.of(names) @ by_steps_of_all.T
 
 
-def _no_alarm(found: Explanation, n_frames: int) -> AgreementVerdict:
-    """Return that the lasers agree, if flat targets without a relevant step explain the frames."""
+def _no_alarm(found: DriftFit, n_frames: int) -> AgreementVerdict:
+    """Return the verdict without suspects: the lasers agree, or the targets are not flat."""
     flat = found.inliers >= _EXPLAINED
     return AgreementVerdict(AgreementState.AGREE if flat else AgreementState.NOT_FLAT, n_frames)
 
 
-def _is_worse(one: Explanation, best: Explanation, share: float = _WORSE_SHARE) -> bool:
-    return one.cost - best.cost > _WORSE + share * best.cost
+def _is_worse(one: DriftFit, best: DriftFit, share: float = _WORSE_SHARE) -> bool:
+    """Return whether a hypothesis costs clearly more than the best one."""
+    return one.cost - best.cost > _WORSE_COST + share * best.cost

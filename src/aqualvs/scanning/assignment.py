@@ -456,14 +456,12 @@ def _verdict(planes: FloatArray, measures: FloatArray) -> AssignmentOutcome:
     for k in range(1, len(planes)):
         if _log_odds(measures[best], measures[k]) < 0.0:
             best = k
-    # The nearest rival of the best one.
+    # The best one of those that differ from it.
     second, odds = -1, math.inf
     for k in range(len(planes)):
-        one = (
-            _log_odds(measures[best], measures[k])
-            if not _alike(planes[best], planes[k])
-            else math.inf
-        )
+        if _alike(planes[best], planes[k]):
+            continue
+        one = _log_odds(measures[best], measures[k])
         if one < odds:
             second, odds = k, one
     kept = _alike(planes[best], planes[0])
