@@ -1,13 +1,13 @@
-"""Surfaces of a frame, planes that the stripes of several lasers agree on; the target among them.
+"""Surfaces of a frame, which are planes that several lasers agree on, and the target among them.
 
-One pixel may belong to the bands of several lasers. Every candidate of it is triangulated; wrong
-candidates scatter in space, right ones share a plane. Planes are found one after another; light
-that one explains is not available to the next, whichever laser it was read as. The target is the
-surface that the posture is measured to (`choose_target`).
+A peak may lie in the bands of several lasers, and has a candidate for each: wrong candidates
+scatter in space, right ones share a plane. Planes are found one after another; peaks that one
+explains are not available to the next, whichever laser they were assigned to. The target is the
+surface to which the posture is measured (`choose_target`).
 
-Light is identified by cells of the image: one peak yields candidates of several lasers, and one
-stripe may be found by two search directions, so candidates in or beside a cell in which a surface
-has light count as the same light.
+Cells of the image identify light: one peak yields candidates of several lasers, and one stripe may
+be found by two search directions, so candidates in or next to a cell in which a surface has
+candidates count as the same light.
 """
 
 from collections.abc import Sequence
@@ -52,17 +52,17 @@ from aqualvs.scanning.plane_search import (
 
 U8Array: TypeAlias = NDArray[np.uint8]
 
-# Marks of a cell: light beside it at least, or light in it.
+# Marks of a cell: light in a neighbouring cell, or in the cell itself.
 _BESIDE, _MIDDLE = np.uint8(1), np.uint8(2)
-# Light within cells of six pixels is the same, whichever laser or search it was read by.
+# Cells have six pixels. Division by six is a multiplication and a shift, exact for integers below
+# 100,000.
 _SIXTH_BITS = 18
 _SIXTH = (1 << _SIXTH_BITS) // 6 + 1
 
 
 @inline_borrowing_kernel
 def _cell(coordinate: float) -> int:
-    """Return the row or column of the cell of a coordinate, from 1; there is a margin of one."""
-    # Division by six by multiplication, for whole numbers below a hundred thousand.
+    """Return the row or column of the cell of a coordinate (px), from 1: cell 0 is a margin."""
     return (int(max(coordinate, 0.0)) * _SIXTH >> _SIXTH_BITS) + 1
 
 
@@ -80,7 +80,7 @@ def number_cells(pixels: FloatArray, cell: IntArray) -> tuple[int, int]:
     Returns
     -------
     n_cells, n_columns : int
-        Cells in total, and in a row; cells are numbered row by row, as the pixels of a picture.
+        Cells in total, and in a row; cells are numbered row by row.
     """
     right, low = 0.0, 0.0
     for i in range(pixels.shape[0]):
@@ -93,7 +93,7 @@ def number_cells(pixels: FloatArray, cell: IntArray) -> tuple[int, int]:
 
 @inline_borrowing_kernel
 def mark_cells(middle: int, n_columns: int, lit: U8Array) -> None:
-    """Mark a cell and those around it, as far as they lie in `lit`, with nonzero values."""
+    """Mark a cell and the eight around it with nonzero values in `lit`, shape (n_cells,)."""
     if lit[middle] == _MIDDLE:
         return
     for row in (middle - n_columns, middle, middle + n_columns):
@@ -104,7 +104,7 @@ def mark_cells(middle: int, n_columns: int, lit: U8Array) -> None:
 
 @inner_kernel
 def lit_cells(cell: IntArray, explained: BoolArray, n_cells: int, n_columns: int) -> U8Array:
-    """Mark the cells in and around which explained candidates lie, with nonzero values.
+    """Mark the cells with explained candidates, and those around them.
 
     Parameters
     ----------
@@ -112,6 +112,11 @@ def lit_cells(cell: IntArray, explained: BoolArray, n_cells: int, n_columns: int
         From `number_cells`.
     explained : bool array, shape (N,)
         Candidates that lie on a surface.
+
+    Returns
+    -------
+    uint8 array, shape (n_cells,)
+        Nonzero in marked cells.
     """
     lit = np.zeros(n_cells, np.uint8)
     for i in range(cell.shape[0]):
@@ -125,13 +130,14 @@ MAX_SURFACES = 5
 MIN_LINES_PER_LASER = 8
 """Least number of search lines with which a laser supports a surface."""
 WORTH_SHARE = 0.08
-"""Least support of a surface, as a share of the best one's; less is left-over light."""
-# Share of the light in the frame, all candidates counted, of a surface that stands out. In a
-# photograph with 15 lasers, five candidates a peak, the wall has 0.18; with this share, none of 775
-# rendered nets without lasers has a posture that it would not have had.
+"""Least search lines and sampling weight of a surface, as a share of the best one's; less is what
+other surfaces have left over."""
+# Least intensity weight of a surface that stands out, as a share of that of all candidates. In a
+# photograph with 15 lasers and five candidates a peak, the wall has 0.18; this limit adds no
+# posture to 775 rendered nets without lasers.
 _CLEAR_SHARE = 0.1
 LINES, INLIER_WEIGHT, SAMPLING_WEIGHT = range(3)
-"""Sums over a surface: search lines on it, light, and sampling weight."""
+"""Sums over a surface: search lines on it, intensity weight, and sampling weight."""
 
 
 @lazy_kernel
@@ -162,8 +168,8 @@ def search_surfaces(
     members : bool array, shape (5, C)
         Written: subsegments on each; False at first.
     sums : array, shape (5, 3)
-        Written: search lines, light and sampling weight of each. Light and weight of the best laser
-        count up to three times those of the second.
+        Written: search lines, intensity weight and sampling weight of each; those weights of the
+        best laser count up to three times those of the second.
     """
     table, laser = subsegments.table, subsegments.laser
     intensity_weight = subsegments.intensity_weight
@@ -175,7 +181,8 @@ def search_surfaces(
     min_lines = 30
     enough = float(min_lines)
     min_subsegments = 6
-    # Planes through noise hold up to a hundredth of the light in the frame, all candidates counted.
+    # Least intensity weight, as a share of that of all candidates; planes through noise have up to
+    # 0.01.
     min_share = 0.03
     weight, found = table[WEIGHT], ZERO
     while found < MAX_SURFACES:
@@ -188,7 +195,7 @@ def search_surfaces(
         if not _find_plane(table, weight, laser, rows, n_lasers, nearest, farthest, found, plane):
             return found
         by_laser, supporting = np.zeros((3, n_lasers)), 0
-        n = _collect(subsegments, rows, plane, mine, by_laser)
+        n = _collect_inliers(subsegments, rows, plane, mine, by_laser)
         for i in range(n_lasers):
             supporting += by_laser[LINES, i] >= MIN_LINES_PER_LASER
         sums[found, LINES] = sum_of(by_laser[LINES])
@@ -197,13 +204,14 @@ def search_surfaces(
         if sum_of(by_laser[INLIER_WEIGHT]) < min_share * sum_of(intensity_weight):
             if found > 0 or min_share == _CLEAR_SHARE:
                 return found
-            # Many specks, as between lines that a camera has sharpened, make long stripes weigh
-            # little. By their light alone, only a surface that stands out counts.
+            # Many specks, as between lines that a camera has sharpened, limit the sampling weights
+            # of long stripes too much: search again by intensity weight, but only for a surface
+            # that stands out.
             weight, min_share = intensity_weight, _CLEAR_SHARE
             mine[:] = False
             continue
-        sums[found, INLIER_WEIGHT] = on_two(by_laser[INLIER_WEIGHT])
-        sums[found, SAMPLING_WEIGHT] = on_two(by_laser[SAMPLING_WEIGHT])
+        sums[found, INLIER_WEIGHT] = limited_sum(by_laser[INLIER_WEIGHT])
+        sums[found, SAMPLING_WEIGHT] = limited_sum(by_laser[SAMPLING_WEIGHT])
         enough = max(enough, WORTH_SHARE * sums[found, LINES])
         if n_cells == 0:
             n_cells, n_columns = number_cells(pixels, cell)
@@ -224,7 +232,7 @@ def _find_plane(
     seed: int,
     plane: FloatArray,
 ) -> bool:
-    """Search the subsegments of some rows for a plane, by these weights."""
+    """Search a plane among the subsegments of some rows, with these weights (C,)."""
     n = rows.shape[0]
     some, its_laser = np.empty((N_ROWS, n)), np.empty(n, np.int64)
     start = np.zeros(n_lasers + 1, np.int64)
@@ -241,14 +249,17 @@ def _find_plane(
 
 
 @inner_borrowing_kernel
-def _collect(
+def _collect_inliers(
     subsegments: Subsegments,
     rows: IntArray,
     plane: FloatArray,
     members: BoolArray,
     by_laser: FloatArray,
 ) -> int:
-    """Mark the subsegments on the plane; return their number, and sums for each laser."""
+    """Mark the subsegments of some rows on the plane, and return their number.
+
+    `by_laser`, shape (3, n_lasers), gets their sums for each laser, rows as `LINES` and the others.
+    """
     table, laser, n = subsegments.table, subsegments.laser, 0
     nx, ny, nz, offset = plane[0], plane[1], plane[2], plane[3]
     for k in range(rows.shape[0]):
@@ -281,19 +292,22 @@ def collect_surface(
     members : bool array, shape (C,)
         Written where True; False at first.
     sums : array, shape (3,)
-        Written: search lines, light and sampling weight.
+        Written: search lines, intensity weight and sampling weight.
     """
     by_laser = np.zeros((3, n_lasers))
     rows = np.arange(subsegments.laser.shape[0])
-    _collect(subsegments, rows, plane, members, by_laser)
+    _collect_inliers(subsegments, rows, plane, members, by_laser)
     sums[LINES] = sum_of(by_laser[LINES])
-    sums[INLIER_WEIGHT] = on_two(by_laser[INLIER_WEIGHT])
-    sums[SAMPLING_WEIGHT] = on_two(by_laser[SAMPLING_WEIGHT])
+    sums[INLIER_WEIGHT] = limited_sum(by_laser[INLIER_WEIGHT])
+    sums[SAMPLING_WEIGHT] = limited_sum(by_laser[SAMPLING_WEIGHT])
 
 
 @lazy_borrowing_kernel
-def on_two(weight: FloatArray) -> float:
-    """Sum over the lasers, the first of them with at most three times the second's share."""
+def limited_sum(weight: FloatArray) -> float:
+    """Return the sum over lasers (n_lasers,), the largest limited to three times the second.
+
+    A plane needs two lasers: the surplus of one is no evidence for it.
+    """
     total, first, second = 0.0, 0.0, 0.0
     for i in range(weight.shape[0]):
         total += weight[i]
@@ -311,7 +325,7 @@ def _claim_peaks(
     members: BoolArray,
     free: BoolArray,
 ) -> None:
-    """Remove the members, and all other candidates of that light, from the free subsegments."""
+    """Remove the members, and subsegments mostly of the same light, from the free ones (C,)."""
     lit = np.zeros(n_cells, np.uint8)
     for i in range(subsegment_index.shape[0]):
         if members[subsegment_index[i]]:
@@ -324,8 +338,8 @@ def _claim_peaks(
             free[c] = False
 
 
-# With more of its search lines on another surface it is a part of that one.
-_SHARED = 0.5
+# A surface with a larger share of its search lines on another surface is a part of that one.
+_MAX_SHARED = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -335,21 +349,19 @@ class Surface:
     plane: Plane  # In `dome`, offset > 0.
     members: BoolArray  # Shape (C,): subsegments on it.
     n_lines: int  # Search lines on it.
-    # Inlier weight: light on it, that of the best laser up to three times the second's, because a
-    # plane needs two lasers.
+    # Intensity weight on it, that of the best laser up to three times the second's.
     inlier_weight: float
-    # Sampling weight: the same, but a long component counts as a few strands.
+    # Sampling weight on it, limited likewise.
     sampling_weight: float
-    # Search lines over which its broken stripes reach, summed over the lasers, stragglers left out.
+    # Search lines from end to end of its gappy stripes, summed over the lasers, without stragglers.
     extent: float
-    # Whether its stripes are broken as those on a net are.
+    # Pattern of its stripes, as in `StripePattern`: as on a net; with gaps at least, as on a dense
+    # net or in a net's shadows; and with long lit intervals, as on a table with gaps.
     is_mesh: bool
-    # Whether they are broken at least, as on a dense net or in a net's shadows.
     is_gappy: bool = False
-    # Whether much of the light is in long components all the same, as on a table with gaps.
     is_unbroken: bool = False
-    # Planes that were joined, because a folded or bent net goes on from one to the next. `plane` is
-    # then that of the largest, or their mean where none of them has half of the light.
+    # Number of planes that were joined, because a folded or bent net continues from one to the
+    # next. `plane` is then that of the largest, or their mean if none has half of the weight.
     n_planes: int = 1
 
 
@@ -371,7 +383,7 @@ def find_surfaces(
     n_lasers : int
         Lasers of the rig.
     working_range : (float, float)
-        Hypotheses nearer or farther are not considered, in metres.
+        Limits of the planes that are considered, in metres.
     focal_px : float
         Pixels per radian, roughly: turns search lines into lengths on the surface.
 
@@ -412,9 +424,9 @@ def surface_on(plane: Plane, subsegments: Subsegments, n_lasers: int, focal_px: 
 
 
 def shares_peaks(one: Surface, other: Surface, subsegments: Subsegments) -> bool:
-    """Return whether half of a surface's subsegments are on another one as well."""
+    """Return whether most search lines of a surface are on another one as well."""
     shared = subsegments.n_lines[one.members & other.members].sum()
-    return bool(shared > _SHARED * subsegments.n_lines[one.members].sum())
+    return bool(shared > _MAX_SHARED * subsegments.n_lines[one.members].sum())
 
 
 def _describe(
@@ -425,19 +437,21 @@ def _describe(
     n_lasers: int,
     focal_px: float,
 ) -> Surface:
-    """Make a surface from a plane and its subsegments."""
+    """Make a surface from a plane (4,), its subsegments and their sums."""
     lines, inlier_weight, sampling_weight = sums.tolist()
     pattern = describe_pattern(subsegments, members, n_lasers, MIN_LINES_PER_LASER, focal_px)
-    # Least share of a net's light on strands; that of a fish lies in long or bent components.
+    # Least share of a net's light on strands; a fish has more in long or bent components.
     strands_share = 0.4
     light = np.zeros(n_lasers)
     np.add.at(light, subsegments.laser[members], subsegments.intensity_weight[members])
     brightest = light.argmax()
     if pattern.is_mesh and pattern.on_strands[brightest] == 0.0:
-        # It runs along a strand.
+        # This laser lights a strand along its sheet.
         light[brightest] = 0.0
-    # Strands near the vehicle are long in search lines, and still short.
-    on_strands = max(sampling_weight, on_two(pattern.on_strands)) > strands_share * on_two(light)
+    # Near the vehicle, strands are long in search lines, and limited in sampling weight.
+    on_strands = max(
+        sampling_weight, limited_sum(pattern.on_strands)
+    ) > strands_share * limited_sum(light)
     return Surface(
         plane=Plane(plane[:3], float(plane[3])),
         members=members,
@@ -452,7 +466,7 @@ def _describe(
 
 
 def _merge_coplanar(surfaces: list[Surface], subsegments: Subsegments) -> list[Surface]:
-    """Join planes that are pieces of one net; the others stay as they are."""
+    """Join the planes that are parts of one net."""
     rest, done = list(surfaces), []
     while rest:
         net = rest.pop(0)
@@ -470,11 +484,12 @@ def _merge_coplanar(surfaces: list[Surface], subsegments: Subsegments) -> list[S
                 break
             parts += more
             rest = [one for one in rest if all(one is not part for part in more)]
-        done.append(_merged(parts, subsegments) if len(parts) > 1 else net)
+        done.append(_merge(parts, subsegments) if len(parts) > 1 else net)
     return done
 
 
-def _merged(parts: list[Surface], subsegments: Subsegments) -> Surface:
+def _merge(parts: list[Surface], subsegments: Subsegments) -> Surface:
+    """Return the net that consists of several planes."""
     members = [part.members for part in parts]
     return Surface(
         plane=merged_plane([part.plane for part in parts], members, subsegments),
@@ -490,11 +505,11 @@ def _merged(parts: list[Surface], subsegments: Subsegments) -> Surface:
 
 
 def _is_dense_net(surface: Surface, surfaces: list[Surface], subsegments: Subsegments) -> bool:
-    """Return whether another surface, broken by shadows, is seen through the gaps of this one.
+    """Return whether a surface, broken by this one's shadows, is seen through its gaps.
 
-    A net that is near may fill most of the stripes; it then has more light than what it shadows.
+    A near net may fill most of the stripes; it then has more light than the surface behind it.
     """
-    # A wall's shadows reach nearly as far as the net that casts them.
+    # Least extent of the surface behind, as a share of the net's: shadows are where the net is.
     extent_share = 0.6
     return not surface.is_mesh and any(
         other.is_gappy
@@ -514,11 +529,11 @@ class TargetKind(StrEnum):
     NET = "net"
     """Only a mesh-like surface."""
     SOLID = "solid"
-    """Only a surface with unbroken stripes, or with long stretches between gaps."""
+    """Only a surface with unbroken stripes, or with long lit intervals between gaps."""
 
 
 def as_requested_kind(surfaces: list[Surface], kind: TargetKind) -> list[Surface]:
-    """Return the surfaces, classified as solid where possible if a solid target is wanted.
+    """Return the surfaces; if a solid target is wanted, those with long lit intervals as solid.
 
     A table with gaps, or a wall whose texture breaks the stripes, may look like a net.
     """
@@ -530,15 +545,23 @@ def as_requested_kind(surfaces: list[Surface], kind: TargetKind) -> list[Surface
 def choose_target(
     surfaces: Sequence[Surface], kind: TargetKind, working_range: tuple[float, float]
 ) -> Surface | None:
-    """Choose the surface that the posture is measured to, or None where the kind is absent.
+    """Choose the surface to which the posture is measured; None if there is none of the kind.
 
-    Surfaces in the working range come before those outside.
+    Surfaces in the working range are preferred to those outside, and nets to solid surfaces: an
+    object in front of the net (a fish, a box) or behind it (a tank wall) may have more stripe
+    points, but is not the target that the vehicle follows. Of several meshes, the nearest one with
+    a large extent is the net: a fish is smaller, and a wall behind the net, lit through its
+    openings, may look like a mesh as well. A few points left over from a wall that fills the
+    picture are no net.
 
-    A net is preferred to anything solid: an object in front of it (a fish, a box) or behind it (a
-    tank wall) may have more stripe points, but is not the target that the vehicle follows. Of
-    several meshes the nearest that reaches far across the picture is the net: a fish is smaller,
-    and a wall behind the net, lit through its openings, may look broken as well. A few left-over
-    points that look like a mesh are no net beside a wall that fills the picture.
+    Parameters
+    ----------
+    surfaces : sequence of Surface
+        From `find_surfaces`.
+    kind : TargetKind
+        Kind of the target.
+    working_range : (float, float)
+        In metres.
     """
     if len(surfaces) == 1:
         only = surfaces[0]
@@ -548,11 +571,11 @@ def choose_target(
     surfaces = [one for one in surfaces if near <= one.plane.offset <= far] or surfaces
     most = max((surface.sampling_weight for surface in surfaces), default=0.0)
     lines = max((surface.n_lines for surface in surfaces), default=0)
-    reach = max((_reach(surface) for surface in surfaces), default=0.0)
-    # Specks that share a plane by chance have less than these shares of the search lines of the
-    # surface that has most, and of the extent of the one that reaches farthest; a sparse net
-    # reaches far. Stripes without extent have too few intervals to be seen as broken.
-    lines_share, reach_share = 0.1, 0.5
+    extent = max((_extent(surface) for surface in surfaces), default=0.0)
+    # Specks on a plane by chance have less than both shares: of the search lines of the surface
+    # with most of them, and of the largest extent; a sparse net has a large extent. Stripes without
+    # extent have too few intervals for a pattern.
+    lines_share, extent_share = 0.1, 0.5
     meshes = [
         one
         for one in surfaces
@@ -560,33 +583,34 @@ def choose_target(
         and one.sampling_weight >= WORTH_SHARE * most
         and (
             (one.extent > 0.0 and one.n_lines >= lines_share * lines)
-            or _reach(one) >= reach_share * reach
+            or _extent(one) >= extent_share * extent
         )
     ]
     solids = [one for one in surfaces if not one.is_mesh]
     solid = max(solids, key=lambda surface: surface.inlier_weight, default=None)
-    net = _nearest_far_reaching(meshes)
+    net = _nearest_wide(meshes)
     if kind is TargetKind.NET:
         return net
     return solid if kind is TargetKind.SOLID or net is None else net
 
 
-def _reach(surface: Surface) -> float:
-    """Return the extent of a surface; unbroken stripes have none, so their search lines serve."""
+def _extent(surface: Surface) -> float:
+    """Return the extent of a surface; its number of search lines if its stripes have no gaps."""
     return max(surface.extent, surface.n_lines)
 
 
-def _nearest_far_reaching(meshes: Sequence[Surface]) -> Surface | None:
-    wide_share = 0.75  # A mesh reaches far with this share of the widest mesh's extent.
-    inlier_share = 0.35  # And it is well supported with this share of the best one's support.
-    farthest = max((surface.extent for surface in meshes), default=0.0)
-    # What has long intervals as well may be a wall in a net's shadows: no measure of a net's light.
+def _nearest_wide(meshes: Sequence[Surface]) -> Surface | None:
+    """Return the nearest mesh with a large extent and weight, else the one with most weight."""
+    wide_share = 0.75  # Least extent, as a share of the largest one.
+    weight_share = 0.35  # Least sampling weight, as a share of the largest one.
+    widest = max((surface.extent for surface in meshes), default=0.0)
+    # A mesh with long lit intervals may be a wall in a net's shadows: its weight does not count.
     broken = [surface for surface in meshes if not surface.is_unbroken] or meshes
     most = max((surface.sampling_weight for surface in broken), default=0.0)
     wide = [
         one
         for one in meshes
-        if one.extent >= wide_share * farthest and one.sampling_weight >= inlier_share * most
+        if one.extent >= wide_share * widest and one.sampling_weight >= weight_share * most
     ]
     best = max(meshes, key=lambda surface: surface.sampling_weight, default=None)
     return min(wide, key=lambda surface: surface.plane.offset, default=best)
