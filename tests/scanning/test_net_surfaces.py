@@ -7,7 +7,7 @@ from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.geometry.planes import Plane
 from aqualvs.scanning.candidates import Candidates, Subsegments
 from aqualvs.scanning.net_surfaces import (
-    fit_mean,
+    fit_mean_plane,
     inflate_covariance,
     is_continuation,
     merged_plane,
@@ -185,8 +185,8 @@ def in_turn(n: int) -> IntArray:
 
 
 def test_the_mean_plane_of_folds_is_as_uncertain_as_they_are_few() -> None:
-    few = fit_mean(wavy(60), in_turn(60), FLAT)
-    many = fit_mean(wavy(240), in_turn(240), FLAT)
+    few = fit_mean_plane(wavy(60), in_turn(60), FLAT)
+    many = fit_mean_plane(wavy(240), in_turn(240), FLAT)
     assert few is not None
     assert many is not None
     assert 1.0 / np.linalg.norm(few.m) == pytest.approx(RANGE, abs=4e-3)
@@ -202,7 +202,7 @@ def test_errors_of_the_plane_of_all_strands_are_as_large_as_its_covariance_says(
     for i in range(n):
         x, z = rng.uniform(-0.2, 0.2, (2, 30))
         points = np.stack([x, RANGE + rng.normal(0.0, 0.005, 30), z], axis=-1)
-        found = fit_mean(points, in_turn(30), FLAT, reject=False)
+        found = fit_mean_plane(points, in_turn(30), FLAT, reject=False)
         assert found is not None
         error = found.m - FLAT.normal / RANGE
         scores[i] = error / np.sqrt(np.diag(found.covariance))
@@ -213,9 +213,9 @@ def test_errors_of_the_plane_of_all_strands_are_as_large_as_its_covariance_says(
 
 def test_a_few_strands_elsewhere_do_not_move_the_mean_plane() -> None:
     points = wavy()
-    clean = fit_mean(points, in_turn(60), FLAT)
+    clean = fit_mean_plane(points, in_turn(60), FLAT)
     elsewhere = points[:4] + np.array([0.0, 0.2, 0.0])
-    spoilt = fit_mean(np.vstack([points, elsewhere]), in_turn(64), FLAT)
+    spoilt = fit_mean_plane(np.vstack([points, elsewhere]), in_turn(64), FLAT)
     assert clean is not None
     assert spoilt is not None
     np.testing.assert_allclose(spoilt.m, clean.m, atol=2e-3)
@@ -246,7 +246,7 @@ def test_a_plane_through_one_laser_s_strands_is_not_the_mean_plane() -> None:
     points, laser, steep = steep_plane_through_one_laser()
     assert np.mean(np.abs(points @ steep.normal - steep.offset) < 3e-3) > 0.6
     assert share_near(points, laser, packed_plane(steep), 3e-3) < 0.3
-    mean = fit_mean(points, laser, steep)
+    mean = fit_mean_plane(points, laser, steep)
     assert mean is not None
     np.testing.assert_allclose(mean.m * RANGE, [0.0, 1.0, 0.0], atol=0.02)
 
@@ -254,8 +254,8 @@ def test_a_plane_through_one_laser_s_strands_is_not_the_mean_plane() -> None:
 def test_points_on_a_line_have_no_mean_plane() -> None:
     s = np.linspace(-0.2, 0.2, 20)
     line = np.stack([s, np.full(20, RANGE), np.zeros(20)], axis=-1)
-    assert fit_mean(line, in_turn(20), FLAT) is None
-    assert fit_mean(line, in_turn(20), FLAT, reject=False) is None
+    assert fit_mean_plane(line, in_turn(20), FLAT) is None
+    assert fit_mean_plane(line, in_turn(20), FLAT, reject=False) is None
 
 
 def posture(distance: float, yaw: float) -> Posture:

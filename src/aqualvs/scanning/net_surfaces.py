@@ -1,12 +1,11 @@
-"""Net surfaces: classification of stripes as a net's, joining of coplanar pieces, and mean plane.
+"""Net surfaces: classification of stripes as a net's, joining of its planes, and its mean plane.
 
-`describe_pattern` classifies the stripes on a surface by their lit lengths and gaps. A net is the
-only surface through which another one is seen: along a stripe, light on it alternates with light
-behind it (`seen_through`). The flanks of a fold, which are found as planes of their own, lie side
-by side, and the one begins where the other ends (`is_continuation`); `merged_plane` gives their
-plane. For a net that is mostly folds `fit_mean` fits the mean plane, and `inflate_covariance`
-widens the covariance of a posture that disagrees with another one, such as that to the plane of all
-strands.
+`describe_pattern` classifies the stripes on a surface by their lit intervals and gaps. A net is the
+only surface through which another one is visible: along a stripe, light on it alternates with light
+behind it (`seen_through`). The flanks of a fold are found as separate planes, which lie side by
+side, and one begins where the other ends (`is_continuation`); `merged_plane` gives their plane.
+`fit_mean_plane` fits the mean plane of a net that is mostly folds, and `inflate_covariance` adds
+the difference from another posture to the covariance of a posture.
 """
 
 from collections.abc import Sequence
@@ -31,17 +30,18 @@ from aqualvs.scanning.plane_fit import TUKEY, PlaneFit, normal_equations
 from aqualvs.scanning.plane_search import WEIGHT, X, Z
 from aqualvs.scanning.posture import Posture
 
-# Transitions along the stripes, as a share of those in random order: with fewer, surfaces are side
-# by side; with more, one is seen through the other, if there are enough transitions.
-_MAX_TURNS = 0.5
-_MIN_TURNS = 0.6
-_ENOUGH_TURNS = 8
+# Transitions between two surfaces along the stripes, as a share of their expected number in random
+# order: with fewer than the first, the surfaces are side by side; with more than the second, one is
+# seen through the other, if there are enough transitions.
+_MAX_TRANSITIONS = 0.5
+_MIN_TRANSITIONS = 0.6
+_ENOUGH_TRANSITIONS = 8
 
 
 def is_continuation(
     plane: Plane, first: BoolArray, second: BoolArray, subsegments: Subsegments
 ) -> bool:
-    """Return whether one surface continues, side by side, as another one.
+    """Return whether one surface continues beside another one.
 
     Parameters
     ----------
@@ -53,10 +53,11 @@ def is_continuation(
         C of them.
     """
     packed = plane.packed()
-    turns, at_random, met = _turns(subsegments, first, second, packed)
-    # Share of the transitions at which the one surface must begin where the other ends.
-    most = 0.5
-    return bool(0 < turns <= max(_MAX_TURNS * at_random, 1.0) and met >= most * turns)
+    transitions, at_random, met = _count_transitions(subsegments, first, second, packed)
+    # Share of the transitions at which one surface must begin where the other ends.
+    min_share = 0.5
+    side_by_side = 0 < transitions <= max(_MAX_TRANSITIONS * at_random, 1.0)
+    return side_by_side and met >= min_share * transitions
 
 
 def seen_through(first: BoolArray, second: BoolArray, subsegments: Subsegments) -> bool:
@@ -69,17 +70,17 @@ def seen_through(first: BoolArray, second: BoolArray, subsegments: Subsegments) 
     subsegments : Subsegments
         C of them.
     """
-    turns, at_random, _ = _turns(subsegments, first, second, np.zeros(4))
-    return bool(turns >= _ENOUGH_TURNS and turns >= _MIN_TURNS * at_random)
+    transitions, at_random, _ = _count_transitions(subsegments, first, second, np.zeros(4))
+    return bool(transitions >= _ENOUGH_TRANSITIONS and transitions >= _MIN_TRANSITIONS * at_random)
 
 
-def _turns(
+def _count_transitions(
     subsegments: Subsegments, first: BoolArray, second: BoolArray, plane: FloatArray
 ) -> tuple[int, float, int]:
-    """Count the transitions from one surface to the other along the stripes.
+    """Return the number of transitions between two surfaces along the stripes.
 
-    Also return their expected number in random order, and the number at which the step off the
-    plane is one that a fold makes.
+    Return also the number that is expected in random order, and the number of transitions whose
+    step off the plane (4,) a fold can make.
     """
     rows = np.flatnonzero(first | second)
     rows = rows[np.lexsort((subsegments.first_line[rows], subsegments.laser[rows]))]
@@ -88,29 +89,30 @@ def _turns(
     seen = total > 0
     total, n_second = total[seen], n_second[seen]
     at_random = float(np.sum(2.0 * n_second * (total - n_second) / total))
-    turns = np.flatnonzero((laser[1:] == laser[:-1]) & (on_second[1:] != on_second[:-1]))
-    apart = (
-        subsegments.table[X : Z + 1, rows[turns + 1]] - subsegments.table[X : Z + 1, rows[turns]]
+    transitions = np.flatnonzero((laser[1:] == laser[:-1]) & (on_second[1:] != on_second[:-1]))
+    difference = (
+        subsegments.table[X : Z + 1, rows[transitions + 1]]
+        - subsegments.table[X : Z + 1, rows[transitions]]
     )
-    step = plane[:3] @ apart
-    beside = np.sqrt(np.maximum((apart * apart).sum(axis=0) - step * step, 0.0))
-    # The steepest flank of a fold, and what noise adds to the step from one piece to the next, as a
+    step = plane[:3] @ difference
+    beside = np.sqrt(np.maximum((difference * difference).sum(axis=0) - step * step, 0.0))
+    # Slope of the steepest flank of a fold, and noise of the step between two subsegments, as a
     # share of the range.
     steepest = 2.0
-    loose_share = 0.01
-    met = np.abs(step) <= steepest * beside + loose_share * plane[3]
-    return len(turns), at_random, int(np.count_nonzero(met))
+    noise_share = 0.01
+    met = np.abs(step) <= steepest * beside + noise_share * plane[3]
+    return len(transitions), at_random, int(np.count_nonzero(met))
 
 
 def merged_plane(
     planes: Sequence[Plane], members: Sequence[BoolArray], subsegments: Subsegments
 ) -> Plane:
-    """Return the plane of a net in several pieces: that of the main one, else the mean.
+    """Return the plane of a net that consists of several: the main one, or the mean if none is.
 
     Parameters
     ----------
     planes : sequence of Plane
-        Of the pieces.
+        Of its parts.
     members : sequence of bool array, shape (C,)
         Subsegments on them.
     subsegments : Subsegments
@@ -118,7 +120,7 @@ def merged_plane(
     """
     sampling_weight = np.array([subsegments.table[WEIGHT] @ mine for mine in members])
     main = int(np.argmax(sampling_weight))
-    # With this share of a net's light a plane is the net's plane, and the rest is folds in it.
+    # A plane with more than this share of the sampling weight is the main one; the rest is folds.
     main_share = 0.5
     if sampling_weight[main] > main_share * sampling_weight.sum():
         return planes[main]
@@ -132,10 +134,10 @@ def merged_plane(
 
 @lazy_borrowing_kernel
 def share_near(points: FloatArray, laser: IntArray, patch: FloatArray, near: float) -> float:
-    """Return the share of a laser's strands that are nearer to a surface than `near`, in metres.
+    """Return the share of strands that are nearer to a surface than `near`, in metres.
 
-    It is that of the second best laser: a line and one point share a plane, so that a plane may
-    hold all strands of one laser by chance, and those of the others beside them.
+    It is that of the second best laser: a line and a point share a plane, so that a plane may hold
+    all strands of one laser by chance.
 
     Parameters
     ----------
@@ -157,7 +159,7 @@ def share_near(points: FloatArray, laser: IntArray, patch: FloatArray, near: flo
     return second
 
 
-def fit_mean(
+def fit_mean_plane(
     points: FloatArray, laser: IntArray, start: Plane, *, reject: bool = True
 ) -> PlaneFit | None:
     """Fit m·X = 1 to the strands of a folded net, with equal weights.
@@ -169,9 +171,9 @@ def fit_mean(
     points : array, shape (N, 3), laser : int array, shape (N,)
         Of the strands, in `dome`, metres.
     start : Plane
-        A first guess: tells outliers.
+        Initial guess, from which outliers are judged.
     reject : bool
-        Whether strands count less the farther they lie off; else all count alike.
+        Whether strands have Tukey's weights; else all have the weight 1.
 
     Returns
     -------
@@ -181,12 +183,12 @@ def fit_mean(
     if len(points) <= 3:
         return None
     m, weights, covariance = start.normal / start.offset, np.empty(len(points)), np.empty((3, 3))
-    rms = _fit_mean(points, laser, reject, m, weights, covariance)
+    rms = _fit_mean_plane(points, laser, reject, m, weights, covariance)
     return PlaneFit(m, covariance, weights, rms) if np.isfinite(rms) else None
 
 
 @lazy_kernel
-def _fit_mean(
+def _fit_mean_plane(
     points: FloatArray,
     laser: IntArray,
     reject: bool,
@@ -194,17 +196,20 @@ def _fit_mean(
     weights: FloatArray,
     covariance: FloatArray,
 ) -> float:
-    """Refine m in place, write weights and covariance; return the rms, NaN if undetermined."""
+    """Refine m (3,) in place, write weights (N,) and covariance (3, 3).
+
+    Return the rms in metres, NaN if the points do not determine m.
+    """
     n, one = points.shape[0], np.empty(points.shape[0])
     for i in range(n):
         one[i] = 1.0
     off, normal, right, inverse = np.empty(n), np.empty((3, 3)), np.empty(3), np.empty((3, 3))
     iterations = 5
-    exact = 1e-9
+    exact = 1e-9  # Least typical distance, as a share of the range.
     for _ in range(iterations):
         _distances(points, m, off)
-        usual = max(_usual_distance(off, laser), exact) if reject else np.inf
-        cut = TUKEY * 1.4826 * usual
+        typical = max(_typical_distance(off, laser), exact) if reject else np.inf
+        cut = TUKEY * 1.4826 * typical
         for i in range(n):
             weights[i] = squared(max(1.0 - squared(off[i] / cut), 0.0))
         normal_equations(points, one, weights, normal, right)
@@ -225,8 +230,8 @@ def _fit_mean(
 
 
 @inner_kernel
-def _usual_distance(off: FloatArray, laser: IntArray) -> float:
-    """Return the median distance of the second best laser's strands, as `share_near` explains."""
+def _typical_distance(off: FloatArray, laser: IntArray) -> float:
+    """Return the median |m·X - 1| of the second best laser's strands, as in `share_near`."""
     best, second, mine = np.inf, np.inf, np.empty(off.shape[0])
     for k in range(n_bins(laser)):
         n = 0
@@ -242,7 +247,7 @@ def _usual_distance(off: FloatArray, laser: IntArray) -> float:
 
 @inner_kernel
 def _distances(points: FloatArray, m: FloatArray, off: FloatArray) -> None:
-    """Write m·X - 1 of each point."""
+    """Write m·X - 1 of each point (N,)."""
     for i in range(points.shape[0]):
         off[i] = m[0] * points[i, 0] + m[1] * points[i, 1] + m[2] * points[i, 2] - 1.0
 
@@ -253,63 +258,69 @@ def inflate_covariance(posture: Posture, other: Posture, share: float) -> Postur
     Parameters
     ----------
     posture, other : Posture
-        Both estimates.
+        Two estimates of the same posture.
     share : float
-        Share of the light that supports the other one.
+        Weight of the squared difference: the share of the light that supports the other one.
     """
-    apart = _apart(posture, other)
-    return replace(posture, covariance=posture.covariance + share * np.outer(apart, apart))
+    difference = _difference(posture, other)
+    return replace(
+        posture, covariance=posture.covariance + share * np.outer(difference, difference)
+    )
 
 
 def disagreement(posture: Posture, other: Posture) -> float:
     """Return the squared Mahalanobis distance of a posture from another, by the other's sigmas."""
-    return _squared_distance(_apart(posture, other), other.covariance)
+    return _squared_distance(_difference(posture, other), other.covariance)
 
 
 @lazy_kernel
-def _squared_distance(apart: FloatArray, covariance: FloatArray) -> float:
-    """Return the square of a difference over a covariance; infinite if that is singular."""
+def _squared_distance(difference: FloatArray, covariance: FloatArray) -> float:
+    """Return the squared Mahalanobis distance; infinite if the covariance is singular."""
     solved = np.empty(3)
-    if not solve_symmetric(covariance, apart, np.empty((3, 3)), solved):
+    if not solve_symmetric(covariance, difference, np.empty((3, 3)), solved):
         return np.inf
-    return float(apart[0] * solved[0] + apart[1] * solved[1] + apart[2] * solved[2])
+    return float(difference[0] * solved[0] + difference[1] * solved[1] + difference[2] * solved[2])
 
 
-def _apart(posture: Posture, other: Posture) -> FloatArray:
+def _difference(posture: Posture, other: Posture) -> FloatArray:
+    """Return the difference (3,) of range, pitch and yaw, in m and rad."""
     return np.array(
         [other.range - posture.range, other.pitch - posture.pitch, other.yaw - posture.yaw]
     )
 
 
-# Below this duty the gaps are real, not specks: a dense net, or a wall in a net's shadows.
+# Largest duty of gappy stripes, as on a dense net or a wall in a net's shadows; above it the gaps
+# are specks. The duty is a typical lit interval over the sum of it and a typical gap.
 _GAPPY_DUTY = 0.9
 # Lit intervals with fewer dark search lines between them are one.
 _MIN_GAP_LINES = 3
+# Least number of lit intervals of a gappy stripe.
 _MIN_INTERVALS = 3
-# This many short intervals on all lasers, and none longer, are a net of which little is seen.
+# This many short intervals on all lasers, and no long ones, are a net of which little is visible.
 _FEW_INTERVALS = 5
 LONGEST_INTERVAL = 0.03
-"""The light on one strand is typically shorter than this, in metres."""
-# A stripe with this share of its light in intervals so much longer lies on something solid that is
-# partly hidden or broken by its texture; growth and strands along a laser make few of them.
+"""Largest length of the light on one strand, typically, in metres."""
+# A stripe with this share of its lit search lines in intervals of more than twice that length lies
+# on something solid, partly hidden or broken by its texture; growth and strands along a laser make
+# few of them.
 _UNBROKEN_SHARE, _UNBROKEN_LENGTHS = 0.4, 2.0
 
 
 class StripePattern(NamedTuple):
     """Pattern of lit intervals and gaps of the stripes on a surface."""
 
-    # As on a net: two lasers (or the only one asked) show short lit intervals between longer gaps.
-    # One laser may run along a strand and look unbroken even on a net. Where little is seen, a few
-    # short intervals and nothing longer are enough.
+    # As on a net: two lasers (or the only one with enough lines) have short lit intervals between
+    # longer gaps. One laser may run along a strand and be unbroken even on a net. If little is
+    # visible, a few short intervals and no long ones are enough.
     is_mesh: bool
-    # As on a dense net, or as on a wall in the shadows of a net: short intervals at any gaps.
+    # As on a dense net, or on a wall in the shadows of a net: short intervals between any gaps.
     is_gappy: bool
-    # As on something solid, if need be with gaps: on two lasers (or the only one asked) much of the
-    # light is in intervals longer than those on strands.
+    # As on something solid, perhaps with gaps: on two lasers (or the only one with enough lines)
+    # many search lines are in intervals longer than those on strands.
     is_unbroken: bool
-    # Search lines over which the gappy stripes reach, summed over the lasers.
+    # Search lines from end to end of the gappy stripes, summed over the lasers.
     extent: float
-    # Shape (n_lasers,): light in intervals as short as those on a strand, and not curved.
+    # Shape (n_lasers,): intensity weight in intervals as short as those on strands, not curved.
     on_strands: FloatArray
 
 
@@ -327,7 +338,7 @@ def describe_pattern(
     n_lasers : int
         Lasers of the rig.
     min_lines : int
-        Lasers with fewer search lines on the surface are not asked.
+        Lasers with fewer search lines on the surface do not count.
     focal_px : float
         Pixels per radian, roughly.
 
@@ -350,11 +361,11 @@ def _describe(
     focal_px: float,
     on_strands: FloatArray,
 ) -> tuple[bool, bool, bool, float]:
-    """Write the light on strands; returns the rest of a `StripePattern`."""
+    """Write the intensity weight on strands (n_lasers,); return the rest of a `StripePattern`."""
     asked, broken, gappy, long, unbroken, n_intervals = 0, 0, 0, 0, 0, 0
     total = 0.0
-    # Duty of a mesh at most: a typical lit interval over the sum of it and a typical gap. The gaps
-    # of a net are longer than the lit strands; a wall behind a net is lit between short shadows.
+    # Largest duty of a mesh. The gaps of a net are longer than the lit strands; a wall behind a net
+    # is lit between short shadows.
     mesh_duty = 0.6
     for index in range(on_strands.shape[0]):
         order, n_mine = _in_order(subsegments, members, index)
@@ -379,13 +390,15 @@ def _describe(
 
 @inner_kernel
 def _in_order(subsegments: Subsegments, members: BoolArray, index: int) -> tuple[IntArray, int]:
-    """Return a laser's subsegments on a surface, in order along the stripe, and their lines."""
+    """Return a laser's subsegments on a surface, ordered along the stripe, and their search lines.
+
+    By insertion, because subsegments are almost in order.
+    """
     first_line = subsegments.first_line
     order, n, total = np.empty(members.shape[0], np.int64), 0, 0
     for c in range(members.shape[0]):
         if not members[c] or subsegments.laser[c] != index:
             continue
-        # Subsegments come almost in order.
         at = n
         while at > 0 and first_line[order[at - 1]] > first_line[c]:
             order[at] = order[at - 1]
@@ -400,10 +413,10 @@ def _in_order(subsegments: Subsegments, members: BoolArray, index: int) -> tuple
 def _describe_stripe(
     subsegments: Subsegments, order: IntArray, focal_px: float
 ) -> tuple[int, float, float, float, float, float]:
-    """Return number, duty, typical length (m), extent and light on strands of a laser's intervals.
+    """Return number, duty, typical length (m), extent and weight on strands of a laser's intervals.
 
     The last value is the share of the lit search lines in intervals much longer than a strand's
-    light. Medians are used, so that parts hidden by a fish or a box do not count.
+    light. Typical values are medians, so that parts hidden by a fish or a box do not count.
     """
     table, intensity_weight = subsegments.table, subsegments.intensity_weight
     first_line, last_line = subsegments.first_line, subsegments.last_line
@@ -412,7 +425,8 @@ def _describe_stripe(
     n_intervals = 0
     begin = first_line[order[0]]
     end = last_line[order[0]] + 1
-    # A subsegment whose sampling weight is a smaller share of its light lies in a curved component.
+    # A subsegment whose sampling weight is a smaller share of its intensity weight lies in a curved
+    # component.
     curved_weight = 0.21
     for k in range(n):
         c = order[k]
@@ -433,7 +447,7 @@ def _describe_stripe(
     m_per_line = median_of(distance) / focal_px
     for k in range(n_intervals):
         dark[k] = lit[k]
-    component = median_of(dark[:n_intervals])
+    length = median_of(dark[:n_intervals])
     on_strands, all_lines, unbroken = 0.0, 0.0, 0.0
     for k in range(n_intervals):
         all_lines += lit[k]
@@ -442,20 +456,20 @@ def _describe_stripe(
         elif lit[k] * m_per_line > _UNBROKEN_LENGTHS * LONGEST_INTERVAL:
             unbroken += lit[k]
     share = float(unbroken / all_lines)
-    duty = float(component / (component + gap))
-    return n_intervals, duty, float(component * m_per_line), extent, on_strands, share
+    duty = float(length / (length + gap))
+    return n_intervals, duty, float(length * m_per_line), extent, on_strands, share
 
 
 @inner_kernel
 def _extent(subsegments: Subsegments, order: IntArray) -> float:
-    """Return the search lines between the 10 % and the 90 % point of one laser's light."""
+    """Return the search lines between the 10 % and the 90 % quantile of one laser's light."""
     n_lines, total = subsegments.n_lines, 0
     for k in range(order.shape[0]):
         total += n_lines[order[k]]
     seen = 0
     begin = 0
     end = 0
-    # Share of the lines at each end of a stripe that may be stragglers.
+    # Share of the lit search lines at each end of a stripe that may be stragglers.
     stragglers = 0.1
     for k in range(order.shape[0]):
         c = order[k]
@@ -469,7 +483,7 @@ def _extent(subsegments: Subsegments, order: IntArray) -> float:
 
 @lazy_borrowing_kernel
 def distances_off(points: FloatArray, normal: FloatArray, offset: float, off: FloatArray) -> None:
-    """Write the distances of points (N, 3) from a plane, as shares of its own."""
+    """Write the distances (N,) of points (N, 3) from a plane, as shares of its offset."""
     nx, ny, nz = normal[0] / offset, normal[1] / offset, normal[2] / offset
     for i in range(points.shape[0]):
         off[i] = abs(nx * points[i, 0] + ny * points[i, 1] + nz * points[i, 2] - 1.0)
@@ -479,7 +493,7 @@ def distances_off(points: FloatArray, normal: FloatArray, offset: float, off: Fl
 def mark_beside(
     source: IntArray, net_mask: BoolArray, off: FloatArray, most: float, beside: BoolArray
 ) -> None:
-    """Mark the candidates of a net, and those near its plane whose light the net does not explain.
+    """Mark the candidates of a net, and those near its plane whose peak is not on the net.
 
     Parameters
     ----------
@@ -490,7 +504,7 @@ def mark_beside(
     off : array, shape (N,)
         From `distances_off`.
     most : float
-        Largest distance that is near.
+        Largest distance from the plane, as a share of its offset.
     beside : bool array, shape (N,)
         Written.
     """

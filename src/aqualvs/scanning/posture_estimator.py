@@ -22,7 +22,7 @@ from aqualvs.scanning.laser_bands import LaserBand
 from aqualvs.scanning.net_surfaces import (
     disagreement,
     distances_off,
-    fit_mean,
+    fit_mean_plane,
     inflate_covariance,
     mark_beside,
     share_near,
@@ -52,7 +52,7 @@ from aqualvs.scanning.plane_fit import (
     weigh_candidates,
 )
 from aqualvs.scanning.posture import MAX_RMS_SHARE, Posture, Reason, Refusal, posture_of, validate
-from aqualvs.scanning.region_growing import SOME, grow_region, has_much_beside
+from aqualvs.scanning.region_growing import MODERATELY_BESIDE, grow_region, has_much_beside
 from aqualvs.scanning.surfaces import Surface
 
 
@@ -201,7 +201,7 @@ class PostureEstimator:
         off = np.empty(candidates.n)
         distances_off(candidates.points, plane.normal, plane.offset, off)
         # With few strands only a strong bend is accepted.
-        few = seen.observations.n < _FEW_STRANDS and has_much_beside(off, SOME)
+        few = seen.observations.n < _FEW_STRANDS and has_much_beside(off, MODERATELY_BESIDE)
         bends = target.n_planes > 1 or has_much_beside(off)
         bends = bends or shows_curvature(seen.observations, fit.weights, plane)
         least = MIN_BEND if bends else few * _STRONG_BEND
@@ -312,7 +312,7 @@ class PostureEstimator:
         self, best: Measurement, seen: Observed, plane: Plane, intensity_share: float
     ) -> Measurement:
         """Widen a posture by the mean plane of the light near it; `intensity_share` is its own."""
-        fit = fit_mean(seen.observations.points, seen.observations.laser, plane)
+        fit = fit_mean_plane(seen.observations.points, seen.observations.laser, plane)
         if fit is None or not isinstance(best.posture, Posture):
             return best
         mean = posture_of(fit, 0.0, 0, self._axis_in_dome)
@@ -331,7 +331,7 @@ class PostureEstimator:
         if not isinstance(found.posture, Posture):
             return found
         plane = Plane(found.posture.normal_in_dome, found.posture.range)
-        fit = fit_mean(seen.observations.points, seen.observations.laser, plane, reject=False)
+        fit = fit_mean_plane(seen.observations.points, seen.observations.laser, plane, reject=False)
         if fit is None:
             return found
         other = posture_of(fit, 0.0, 0, self._axis_in_dome)
@@ -375,7 +375,7 @@ class PostureEstimator:
         self, candidates: Candidates, seen: Observed, plane: Plane
     ) -> "_MeanPlane | None":
         """Measure the posture to the mean plane of a folded net."""
-        fit = fit_mean(seen.observations.points, seen.observations.laser, plane)
+        fit = fit_mean_plane(seen.observations.points, seen.observations.laser, plane)
         if fit is None:
             return None
         found = self._posture_of_fit(candidates, seen, fit, of_all=True)
