@@ -73,7 +73,7 @@ def test_curvature_is_found_with_its_sigma(bend: tuple[float, float, float]) -> 
     seen = observed(true, wrong=12)
     found = fit_patch(seen, BASE, shared(seen))
     assert found is not None
-    assert found.asked_for
+    assert found.is_clear
     fit = found.fit
     sigma = np.sqrt(np.diag(fit.covariance))
     # Five standard deviations: 18 comparisons in all must hold.
@@ -86,7 +86,7 @@ def test_a_plane_is_left_a_plane() -> None:
     seen = observed(patch_of(*FLAT))
     found = fit_patch(seen, BASE, shared(seen))
     assert found is not None
-    assert not found.asked_for
+    assert not found.is_clear
 
 
 @pytest.mark.parametrize("bend", [0.0, 0.2])

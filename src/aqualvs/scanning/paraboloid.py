@@ -1,12 +1,12 @@
-"""Curved nets: fit of a paraboloid where the residuals of a plane ask for it.
+"""Curved nets: fit of a paraboloid, if the residuals of a plane show curvature.
 
-Over the plane that the search found, the net is a height
+Over the plane that the search found, the net has the height
 
     h(u, v) = a + b u + c v + (p u² + 2 q u v + r v²) / 2
 
-with u to the right and v upward in that plane. The plane touches the net along a band only; the fit
-starts there and grows outward, because the fitted band predicts the net beside it. Each step is a
-weighted least-squares fit of the six coefficients.
+with u to the right and v upward in that plane, in metres. The plane touches the net along a band
+only; the fit starts there and grows outward, because the fitted band predicts the net beside it.
+Each step is a weighted least-squares fit of the six coefficients.
 """
 
 from typing import NamedTuple
@@ -41,10 +41,10 @@ from aqualvs.scanning.patch import (
 from aqualvs.scanning.plane_fit import TUKEY, SharedError, add_error
 
 N = 6
-"""Coefficients a, b, c, p, q, r."""
+"""Number of the coefficients a, b, c, p, q, r."""
 GATE_SHARE, GATE_PX = 0.004, 1.2
-"""Gate of a patch: as a share of the range, and in pixels."""
-MIN_PIECES = 12
+"""Largest distance of observations from a patch: as a share of the range, and in pixels."""
+MIN_OBSERVATIONS = 12
 """Least number of observations of a patch."""
 
 
@@ -59,18 +59,18 @@ def fit_over(
     covariance: FloatArray,
     weights: FloatArray,
 ) -> tuple[bool, bool, float]:
-    """Fit a patch over its base plane, grown from what lies near the plane, or from `inside`.
+    """Fit a patch over its base plane, grown from observations near the plane, or from `inside`.
 
     Parameters
     ----------
     seen : Observations
         M of them.
     gates : float
-        The fit begins with observations within this many gates of the base; 0: with `inside`.
+        The fit begins with observations within this many gates of the base; if 0, with `inside`.
     shared : SharedError
         Errors that they share.
     min_bend : float
-        Share of the range by which the net must bend where it is seen.
+        Least bend of the net between its visible points, as a share of the range.
     inside : bool array, shape (M,)
         Initial observations, unless `gates` selects them; then those of the grown fit.
     patch : array, shape (16,)
@@ -80,8 +80,8 @@ def fit_over(
 
     Returns
     -------
-    found, asked_for : bool
-        Whether there is a fit, and whether the residuals of the plane ask for it.
+    found, is_clear : bool
+        Whether there is a fit, and whether it is clearly better than the plane.
     rms : float
         Weighted root mean square distance from the patch, in metres.
     """
@@ -107,12 +107,12 @@ def fit_over(
         pull[i] = weights[i] * per_px[i] / (sigma[i] * sigma[i])
     add_shared(terms, pull, seen.line, seen.laser, shared, inverse, covariance)
     enough = min_bend * patch[OFFSET]
-    asked = _asked_for(terms, height, inside, coefficients, covariance, n_on_plane, enough, rms)
-    return True, asked, rms
+    is_clear = _is_clear(terms, height, inside, coefficients, covariance, n_on_plane, enough, rms)
+    return True, is_clear, rms
 
 
 @inner_borrowing_kernel
-def _asked_for(
+def _is_clear(
     terms: FloatArray,
     height: FloatArray,
     inside: BoolArray,
@@ -122,37 +122,38 @@ def _asked_for(
     min_bend: float,
     rms: float,
 ) -> bool:
-    """Return whether the residual of the base plane asks for curvature."""
+    """Return whether a patch bends significantly, and fits clearly better than its base plane."""
     n_inside, square = 0, 0.0
-    least, most = np.inf, -np.inf
+    lowest, highest = np.inf, -np.inf
     for i in range(height.shape[0]):
         if inside[i]:
             bend = 0.0
             for k in range(3, N):
                 bend += terms[i, k] * coefficients[k]
-            least, most = min(least, bend), max(most, bend)
+            lowest, highest = min(lowest, bend), max(highest, bend)
             square += height[i] * height[i]
             n_inside += 1
-    if most - least < min_bend:
+    if highest - lowest < min_bend:
         return False
     sigmas = 0.0
     for k in range(3, N):
         sigmas = max(sigmas, abs(coefficients[k]) / np.sqrt(covariance[k, k]))
-    significant = 6.0
+    significant = 6.0  # In standard deviations.
     if sigmas < significant:
         return False
-    # Significant curvature is fitted when it gains this share of the light or of the scatter.
-    more_intensity = 1.10
+    # Least ratio of the observations on the patch to those on the plane, or largest ratio of their
+    # scatter.
+    more_observations = 1.10
     less_scatter = 0.6
     less = rms < less_scatter * np.sqrt(square / n_inside)
-    return bool(n_inside >= more_intensity * n_on_plane or less)
+    return bool(n_inside >= more_observations * n_on_plane or less)
 
 
 @lazy_kernel
 def curvature_hint(seen: Observations, weights: FloatArray, patch: FloatArray) -> float:
-    """Return the strongest curvature that M observations show over a patch's base, over its sigma.
+    """Return `curvature_in_sigmas` of M observations over a patch's base plane.
 
-    0 for too few.
+    `weights` (M,) are those of the plane fit.
     """
     n = weights.shape[0]
     terms, height, per_px = np.empty((n, N)), np.empty(n), np.empty(n)
@@ -204,9 +205,9 @@ def _solve(
     factor: FloatArray,
     coefficients: FloatArray,
 ) -> bool:
-    """Fit the coefficients; write the Cholesky factor of the normal matrix to `factor`.
+    """Fit the coefficients (6,); write the Cholesky factor (6, 6) of the normal matrix to `factor`.
 
-    Return False where the observations do not determine them.
+    The prior of the curvatures is included. Return False if the observations do not determine them.
     """
     right = np.zeros(N)
     factor[:] = 0.0
@@ -222,7 +223,7 @@ def _solve(
             right[j] += part * height[i]
             for k in range(j + 1):
                 factor[j, k] += part * terms[i, k]
-    # A pivot below this share of its diagonal is rounding, not information.
+    # Least pivot as a share of its diagonal element; a smaller one is rounding error.
     min_pivot = 1e-13
     if not cholesky(factor, 0.0, min_pivot, factor):
         return False
@@ -234,7 +235,7 @@ def _solve(
 def curvature_in_sigmas(
     terms: FloatArray, height: FloatArray, sigma: FloatArray, weights: FloatArray
 ) -> float:
-    """Return the strongest curvature that M observations show, over its sigma; 0 for too few."""
+    """Return the most significant of p, q, r of M observations, in sigmas; 0 for too few."""
     n = height.shape[0]
     weight, factor, coefficients = np.empty(n), np.empty((N, N)), np.empty(N)
     for i in range(n):
@@ -249,10 +250,10 @@ def curvature_in_sigmas(
         square += weight[i] * off * off
     scale = max(np.sqrt(square / (n - N)), 1.0)
     inverse = cholesky_inverse(factor)
-    most = 0.0
+    strongest = 0.0
     for k in range(3, N):
-        most = max(most, abs(coefficients[k]) / (np.sqrt(inverse[k, k]) * scale))
-    return most
+        strongest = max(strongest, abs(coefficients[k]) / (np.sqrt(inverse[k, k]) * scale))
+    return strongest
 
 
 @inner_kernel
@@ -263,21 +264,22 @@ def grow(
     inside: BoolArray,
     coefficients: FloatArray,
 ) -> bool:
-    """Refit and add the predicted observations until nothing changes; return False on failure.
+    """Fit the observations `inside`, and select those near the fit anew, until nothing changes.
 
-    `inside` holds the initial observations, and then those of the grown fit.
+    `inside` (M,) holds the initial observations, and is overwritten. Return False if too few
+    observations are left, or if the fit is implausible.
     """
     n = height.shape[0]
     weight, factor = np.empty(n), np.empty((N, N))
     steps = 16
-    # Largest curvature: a net does not bend with a radius below half a metre.
+    # Largest curvature in 1/m: a net does not bend with a radius below half a metre.
     strongest = 2.0
     for _ in range(steps):
         n_inside = 0
         for i in range(n):
             weight[i] = 1.0 / (gate[i] * gate[i]) if inside[i] else 0.0
             n_inside += inside[i]
-        if n_inside < MIN_PIECES or not _solve(terms, height, weight, factor, coefficients):
+        if n_inside < MIN_OBSERVATIONS or not _solve(terms, height, weight, factor, coefficients):
             return False
         for k in range(3, N):
             if abs(coefficients[k]) > strongest:
@@ -293,7 +295,7 @@ def grow(
             n_inside += now
         if not changed:
             break
-    return n_inside >= MIN_PIECES
+    return n_inside >= MIN_OBSERVATIONS
 
 
 @inner_kernel
@@ -305,9 +307,10 @@ def reweight(
     coefficients: FloatArray,
     weights: FloatArray,
 ) -> tuple[float, float, FloatArray]:
-    """Refine a grown fit with Tukey's biweight, in place.
+    """Refine the coefficients of a grown fit with Tukey's biweight, in place; write `weights` (M,).
 
-    Return the scale, the rms in metres, and the inverse (6, 6) of the normal matrix.
+    Return the scale of the residuals in sigmas, the weighted rms in metres, and the inverse (6, 6)
+    of the normal matrix.
     """
     n = height.shape[0]
     z, weight = np.empty(n), np.empty(n)
@@ -354,13 +357,14 @@ def add_shared(
     inverse: FloatArray,
     covariance: FloatArray,
 ) -> None:
-    """Add the covariance of the errors that a laser's stripe and all stripes share.
+    """Add the covariance of the errors that one laser's stripe shares, and those that all share.
 
     Parameters
     ----------
     terms : array, shape (M, 6)
+        From `over_plane`.
     pull : array, shape (M,)
-        Weight of each observation times its height by the stripe's position.
+        Weight of each observation times the derivative of its height by the stripe's position.
     line : array, shape (M,)
         Search lines.
     laser : int array, shape (M,)
@@ -395,15 +399,16 @@ def add_shared(
 
 
 MIN_BEND = 0.003
-"""Least bend of a curved net where it is seen, as a share of the range."""
+"""Least bend of a curved net between its visible points, as a share of the range."""
 
-# Curvature over its sigma from which a patch is fitted. A robust fit of a plane drops the strands
-# that bend away from it: of 150 simulated nets that bulge, clearly bent ones show 1.0 and more.
+# Least significance of the curvature in a plane fit, in sigmas, for which a patch is fitted. A robust
+# plane fit drops the strands that bend away from it: of 150 simulated nets that bulge, clearly bent
+# ones have 1.0 and more.
 _HINT = 1.0
 
 
 def shows_curvature(seen: Observations, weights: FloatArray, plane: Plane) -> bool:
-    """Return whether the residuals of a plane fit look bent: a cheap test before a patch fit.
+    """Return whether the residuals of a plane fit may be curved: a cheap test before a patch fit.
 
     Parameters
     ----------
@@ -419,16 +424,16 @@ def shows_curvature(seen: Observations, weights: FloatArray, plane: Plane) -> bo
 
 
 class PatchAttempt(NamedTuple):
-    """A patch over one base plane, and whether the residuals of the plane ask for it."""
+    """A patch over a base plane, and whether it is clearly better than the plane."""
 
     fit: PatchFit
-    asked_for: bool
+    is_clear: bool
 
 
 def fit_patch(
     seen: Observations, plane: Plane, shared: SharedError, min_bend: float = MIN_BEND
 ) -> PatchAttempt | None:
-    """Fit a patch to M observations, and tell whether a plane fits them as well.
+    """Fit a patch to M observations, and compare it with the plane.
 
     Parameters
     ----------
@@ -439,15 +444,15 @@ def fit_patch(
     shared : SharedError
         Errors that they share.
     min_bend : float
-        Share of the range by which the net must bend where it is seen.
+        Least bend of the net between its visible points, as a share of the range.
 
     Returns
     -------
     PatchAttempt or None
-        None where the curvature is not determined.
+        None if the curvature is not determined.
     """
-    # Few strands of a coarse net are on the plane, and the others not far from it.
     first = _fit_over(seen, plane, shared, 1.0, min_bend)
+    # In gates. Few strands of a coarse net are on the plane, but the others not far from it.
     wide_gate = 3.0
     return first or _fit_over(seen, plane, shared, wide_gate, min_bend)
 
@@ -467,7 +472,7 @@ def refit_at_nearest(fit: PatchFit, seen: Observations, shared: SharedError) -> 
     Returns
     -------
     PatchFit or None
-        None where there is no such point.
+        None if there is no such point.
     """
     m = nearest_tangent(fit.patch)
     if m is None:
@@ -485,15 +490,15 @@ def _fit_over(
     start: BoolArray | float,
     min_bend: float = MIN_BEND,
 ) -> PatchAttempt | None:
-    """Fit a patch over a plane, grown from given observations or from those within some gates."""
+    """Fit a patch over a plane, grown from a mask of observations or from those in `start` gates."""
     n = seen.n
     inside = np.empty(n, np.bool_) if isinstance(start, float) else start.copy()
     patch, covariance, weights = packed_plane(plane), np.empty((N, N)), np.empty(n)
     gates = start if isinstance(start, float) else 0.0
-    found, asked_for, rms = fit_over(
+    found, is_clear, rms = fit_over(
         seen, gates, shared, min_bend, inside, patch, covariance, weights
     )
     if not found:
         return None
     bent = Patch(plane, patch[RIGHT:UP], patch[UP:COEFFICIENTS], patch[COEFFICIENTS:])
-    return PatchAttempt(PatchFit(bent, covariance, weights, rms), asked_for)
+    return PatchAttempt(PatchFit(bent, covariance, weights, rms), is_clear)

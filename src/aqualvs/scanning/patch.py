@@ -1,7 +1,7 @@
-"""Patches: pieces of paraboloids over a plane, and their point nearest to the vehicle.
+"""Patches: parts of paraboloids over a base plane, and their point nearest to the vehicle.
 
-For kernels a patch is 16 numbers: normal and offset of its base, the two unit vectors along u and
-v, and the coefficients a, b, c, p, q, r of the height.
+For kernels a patch is packed into 16 numbers: normal and offset of its base plane, the two unit
+vectors along u and v, and the coefficients a, b, c, p, q, r of its height (see `paraboloid`).
 """
 
 import math
@@ -15,15 +15,15 @@ from aqualvs.geometry.planes import Plane
 from aqualvs.optics.rig_covariance import FittedSurface, posture_by_plane
 
 NORMAL, OFFSET, RIGHT, UP, COEFFICIENTS, PACKED = 0, 3, 4, 7, 10, 16
-"""Offsets of the parts of a packed patch, and its length."""
+"""Indices of the parts of a packed patch, and its length."""
 
 SIGMA_CURVATURE, SIGMA_TWIST = 2.0, 0.5
-"""Prior standard deviations of the curvatures of nets, in 1/m: radius of a metre, little twist."""
+"""Prior standard deviations of the curvatures p, r and of the twist q of nets, in 1/m."""
 
 
 @inline_borrowing_kernel
 def height_over(patch: FloatArray, x: float, y: float, z: float) -> float:
-    """Return the distance of a point behind a patch (16,), along its base's normal, in metres."""
+    """Return the distance of a point behind a patch (16,), along the base normal, in metres."""
     u = patch[4] * x + patch[5] * y + patch[6] * z
     v = patch[7] * x + patch[8] * y + patch[9] * z
     height = patch[10] + patch[11] * u + patch[12] * v
@@ -33,17 +33,18 @@ def height_over(patch: FloatArray, x: float, y: float, z: float) -> float:
 
 @lazy_borrowing_kernel
 def heights_over(points: FloatArray, patch: FloatArray, off: FloatArray) -> None:
-    """Write the distances of points (N, 3) behind a patch (16,)."""
+    """Write the distances (N,) of points (N, 3) behind a patch (16,), in metres."""
     for i in range(points.shape[0]):
         off[i] = height_over(patch, points[i, 0], points[i, 1], points[i, 2])
 
 
 @lazy_borrowing_kernel
 def write_tangent(patch: FloatArray, m: FloatArray) -> bool:
-    """Write m = n/d of the tangent plane at the point nearest to the origin; False without one."""
+    """Write m = n/d of the tangent plane at the point nearest to the origin; False if none exists."""
     a, b, c, p, q, r = patch[10], patch[11], patch[12], patch[13], patch[14], patch[15]
     u, v, h, slope_u, slope_v = 0.0, 0.0, 0.0, 0.0, 0.0
-    # Newton steps of the search for the nearest point, which must go downhill.
+    # Newton steps to the nearest point; the Hessian of half the squared distance, and its first
+    # element, must be clearly positive.
     foot_steps = 12
     min_curved = 0.05
     for _ in range(foot_steps):
@@ -71,9 +72,9 @@ def write_tangent(patch: FloatArray, m: FloatArray) -> bool:
 
 @lazy_kernel
 def tangent_jacobian(patch: FloatArray, sigma: FloatArray, m: FloatArray, out: FloatArray) -> bool:
-    """Write the derivatives (3, 6) of m by the coefficients, by differences; False if undefined.
+    """Write the derivatives (3, 6) of m by the coefficients; False if undefined.
 
-    `sigma`, shape (6,), are the coefficients' standard deviations.
+    By one-sided differences, of 1e-4 times the coefficients' standard deviations `sigma` (6,).
     """
     moved, other = patch.copy(), np.empty(3)
     for k in range(6):
@@ -91,9 +92,9 @@ def tangent_jacobian(patch: FloatArray, sigma: FloatArray, m: FloatArray, out: F
 def carry_to_tangent(
     patch: FloatArray, covariance: FloatArray, m: FloatArray, out: FloatArray
 ) -> None:
-    """Write the covariance (3, 3) of m by differences of the coefficients; infinite if undefined.
+    """Propagate the covariance (6, 6) of the coefficients to m; write (3, 3), infinite if undefined.
 
-    `covariance`, shape (6, 6), is that of the coefficients.
+    To first order, by `tangent_jacobian`.
     """
     jacobian = np.empty((3, 6))
     if not tangent_jacobian(patch, np.sqrt(np.diag(covariance)), m, jacobian):
@@ -110,7 +111,7 @@ def carry_to_tangent(
 
 @lazy_borrowing_kernel
 def write_terms(points: FloatArray, patch: FloatArray, terms: FloatArray) -> None:
-    """Write the factors (N, 6) of a patch's coefficients at points (N, 3)."""
+    """Write the derivatives (N, 6) of a patch's height at points (N, 3) by its coefficients."""
     for i in range(points.shape[0]):
         u, v = 0.0, 0.0
         for k in range(3):
@@ -127,17 +128,17 @@ CURVATURE_PRIOR: FloatArray = np.array(
 )
 """Information on the coefficients that fits add to that of the observations."""
 
-# Steps of the coefficients in numerical derivatives: metres, shares, 1/m.
-_ALIKE = np.full(6, 0.1)
-# Largest distance of the nearest point from the visible area, in shares of its width and height;
-# its normal lies within 55 degrees of the vehicle's forward axis.
+# Scale of the coefficients for `tangent_jacobian`, if they have no covariance: m, 1, 1/m.
+_SCALES = np.full(6, 0.1)
+# Largest distance of the nearest point from the visible area, as a share of its width and height;
+# least cosine of its normal to the vehicle's forward axis, that of 55 degrees.
 _BESIDE_VIEW = 0.6
 _FACING = 0.57
 
 
 @dataclass(frozen=True, slots=True)
 class Patch:
-    """A curved piece of net over a base plane."""
+    """A curved part of a net over a base plane."""
 
     base: Plane  # In `dome`; heights are measured along its normal.
     # Shape (3,): unit vectors in the base plane along which u and v run, in `dome`.
@@ -147,13 +148,13 @@ class Patch:
     coefficients: FloatArray
 
     def height(self, points: FloatArray) -> FloatArray:
-        """Return by how much points (N, 3) lie behind the patch, along the base's normal, in m."""
+        """Return the distances (N,) of points (N, 3) behind the patch, in metres."""
         off = np.empty(len(points))
         heights_over(points, self.packed(), off)
         return off
 
     def packed(self) -> FloatArray:
-        """Return the patch as 16 numbers for kernels: normal, offset, right, up, coefficients."""
+        """Return normal, offset, right, up and coefficients as one array (16,), for kernels."""
         packed = np.empty(PACKED)
         packed[:3], packed[3] = self.base.normal, self.base.offset
         packed[RIGHT:UP], packed[UP:COEFFICIENTS] = self.right, self.up
@@ -178,7 +179,7 @@ def flat_patch(plane: Plane) -> Patch:
 
 
 def packed_plane(plane: Plane) -> FloatArray:
-    """Return `flat_patch(plane).packed()`."""
+    """Return a plane as a packed patch (16,), as `flat_patch(plane).packed()`."""
     a, b, c = plane.normal.tolist()
     level = math.sqrt(a * a + b * b)
     right, ahead = b / level, -a / level
@@ -190,9 +191,9 @@ def packed_plane(plane: Plane) -> FloatArray:
 
 
 def nearest_in_view(m: FloatArray, points: FloatArray) -> bool:
-    """Return whether a tangent touches near the visible part of a net.
+    """Return whether a tangent plane touches a net near its visible part.
 
-    Farther out a paraboloid does not describe the net.
+    Farther away a paraboloid does not describe the net.
 
     Parameters
     ----------
@@ -211,26 +212,26 @@ def nearest_in_view(m: FloatArray, points: FloatArray) -> bool:
 def nearest_tangent(patch: Patch) -> FloatArray | None:
     """Return m = n/d of the tangent plane at the point nearest to the dome's centre.
 
-    Range and angles of a plane are those at the foot of the perpendicular; so are a curved net's.
+    The posture to a plane is that at the foot of the perpendicular; so is that to a curved net.
 
     Returns
     -------
     array, shape (3,), or None
-        None where there is no such point: the net curls around the vehicle.
+        In 1/m. None if there is no such point: the net curls around the vehicle.
     """
     m = np.empty(3)
     return m if write_tangent(patch.packed(), m) else None
 
 
 def tangent_covariance(fit: PatchFit, m: FloatArray) -> FloatArray:
-    """Return the covariance (3, 3) of `nearest_tangent`, by differences of the coefficients."""
+    """Return the covariance (3, 3) of `nearest_tangent` by that of the coefficients, in 1/m²."""
     covariance = np.empty((3, 3))
     carry_to_tangent(fit.patch.packed(), fit.covariance, m, covariance)
     return covariance
 
 
 def fitted_patch(patch: Patch, m: FloatArray, points: FloatArray) -> FittedSurface:
-    """Return a patch as fitted to points (N, 3); the posture is that of its tangent.
+    """Return a patch as a surface fitted to points (N, 3), with the posture to its tangent plane.
 
     Parameters
     ----------
@@ -243,7 +244,7 @@ def fitted_patch(patch: Patch, m: FloatArray, points: FloatArray) -> FittedSurfa
     packed, terms = patch.packed(), np.empty((len(points), len(FLAT)))
     by_terms = np.empty((3, len(FLAT)))
     write_terms(points, packed, terms)
-    if not tangent_jacobian(packed, _ALIKE, m, by_terms):
+    if not tangent_jacobian(packed, _SCALES, m, by_terms):
         by_terms[:] = np.nan
     _, b, c, p, q, r = patch.coefficients.tolist()
     right, up = patch.right, patch.up
@@ -257,7 +258,7 @@ def fitted_patch(patch: Patch, m: FloatArray, points: FloatArray) -> FittedSurfa
 def intensity_share_near(
     group: IntArray, confidence: FloatArray, points: FloatArray, patch: FloatArray, near: float
 ) -> float:
-    """Return the share of the light in pieces nearer to a patch than `near`, in metres.
+    """Return the share of the light in observations nearer to a patch than `near`, in metres.
 
     Parameters
     ----------
@@ -266,7 +267,7 @@ def intensity_share_near(
     confidence : array, shape (N,)
         Of the candidates.
     points : array, shape (M, 3)
-        Of the pieces.
+        Of the observations, in `dome`.
     patch : array, shape (16,)
         As `Patch.packed` gives it.
     """

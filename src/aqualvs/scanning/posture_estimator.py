@@ -427,7 +427,7 @@ class PostureEstimator:
             return None, False
         shared = self._shared_error(seen.observations, plane.normal, on_twine=True)
         first = fit_patch(seen.observations, plane, shared, min_bend)
-        if first is None or not (first.asked_for or _may_bend(first.fit)):
+        if first is None or not (first.is_clear or _may_bend(first.fit)):
             return None, False
         fit = refit_at_nearest(first.fit, seen.observations, shared)
         m = None if fit is None else nearest_tangent(fit.patch)
@@ -440,7 +440,7 @@ class PostureEstimator:
         along = fit.patch.coefficients[[3, 5]].tolist()
         sigma = np.sqrt(np.diag(fit.covariance))[[3, 5]].tolist()
         bent = replace(found.posture, curvature=tuple(along), sigma_curvature=tuple(sigma))
-        return replace(found, posture=bent, patch=fit.patch), first.asked_for
+        return replace(found, posture=bent, patch=fit.patch), first.is_clear
 
     def _fit(self, candidates: Candidates, seen: Observed, target: Surface) -> PlaneFit | None:
         observations = seen.observations
