@@ -490,7 +490,7 @@ def _fit_over(
     start: BoolArray | float,
     min_bend: float = MIN_BEND,
 ) -> PatchAttempt | None:
-    """Fit a patch over a plane, grown from a mask of observations or from those in `start` gates."""
+    """Fit a patch over a plane, grown from a mask of observations or those in `start` gates."""
     n = seen.n
     inside = np.empty(n, np.bool_) if isinstance(start, float) else start.copy()
     patch, covariance, weights = packed_plane(plane), np.empty((N, N)), np.empty(n)

@@ -40,7 +40,7 @@ def heights_over(points: FloatArray, patch: FloatArray, off: FloatArray) -> None
 
 @lazy_borrowing_kernel
 def write_tangent(patch: FloatArray, m: FloatArray) -> bool:
-    """Write m = n/d of the tangent plane at the point nearest to the origin; False if none exists."""
+    """Write m = n/d of the tangent plane at the point nearest to the origin, if any."""
     a, b, c, p, q, r = patch[10], patch[11], patch[12], patch[13], patch[14], patch[15]
     u, v, h, slope_u, slope_v = 0.0, 0.0, 0.0, 0.0, 0.0
     # Newton steps to the nearest point; the Hessian of half the squared distance, and its first
@@ -92,7 +92,7 @@ def tangent_jacobian(patch: FloatArray, sigma: FloatArray, m: FloatArray, out: F
 def carry_to_tangent(
     patch: FloatArray, covariance: FloatArray, m: FloatArray, out: FloatArray
 ) -> None:
-    """Propagate the covariance (6, 6) of the coefficients to m; write (3, 3), infinite if undefined.
+    """Write the covariance (3, 3) of m by that of the coefficients (6, 6); infinite if undefined.
 
     To first order, by `tangent_jacobian`.
     """

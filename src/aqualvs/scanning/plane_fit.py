@@ -19,47 +19,49 @@ from aqualvs.geometry.linear_algebra import (
 )
 
 SHARED_ERROR_PX = 0.015
-"""Shift of one laser's stripe in one frame, and its tilt at the image border: standard deviations.
+"""Standard deviations of the shift of one laser's stripe in one frame, and of its tilt at the image
+border, in pixels.
 
 Optics, sampling and compression move a whole stripe by about this much in a good picture. Residuals
-of single points do not show it, but how well the stripes of one frame make a plane does.
+of single points do not show it, but the common plane of the stripes of one frame does.
 """
-# Squares of the factors that are weighed against each other.
+# Squared factors on the standard deviations of shared errors, among which a frame's is estimated.
 _SQUARES = 4.0 ** np.linspace(-3.0, 3.0, 13)
 TWINE_SHARE = 0.006
-"""Shift of the light on twine as a share of the stripe's width.
+"""Standard deviation of the shift of the light on twine, as a share of the stripe's width.
 
-Twine is round and brightest in front: a length on the target, of which the stripe's width is the
-measure in every picture.
+Twine is round and brightest in front. The shift is a length on the target, and so is proportional
+to the stripe's width in every picture.
 """
 GLOW_PX = 0.5
-"""Shift of a stripe by a background as much brighter on one side as the stripe is high.
+"""Standard deviation of the shift of a stripe, in pixels, for a background that is as much brighter
+on one side as the stripe is high.
 
-Glow in the water ends at the stripe, where exactly is blurred by the camera. This error is left
-after the pull of a ramp is taken off.
+Glow in the water ends at the stripe, at a position that the camera blurs. This error remains after
+the pull of a ramp is subtracted.
 """
 GLOW_SHARE = 1.0
-"""The same of the light on twine, as a share of the stripe's width.
+"""The same for the light on twine, as a share of the stripe's width.
 
-Beside strands that run across the search line the glow on both flanks is the same, so what is
-measured and taken off is the lesser part. On rendered nets, clear and turbid, the shift that is
-left is 0.4 to 1.4 of what this gives.
+Beside strands that run across the search line the glow on both flanks is the same, so that the
+smaller part is measured and subtracted. On rendered nets, in clear and turbid water, the remaining
+shift is 0.4 to 1.4 of this.
 """
 
 
 class SharedError(NamedTuple):
     """Errors that points share, as standard deviations at each of N points in pixels."""
 
-    # Shape (N,): of the stripe of one laser: of its shift, and of its tilt at the image border.
+    # Shape (N,): shift of the stripe of one laser, and equally its tilt at the image border.
     own: FloatArray
-    # Shape (K, N): of all stripes together, one row for each cause, with its sign.
+    # Shape (K, N): shift of all stripes together, one row for each cause, with its sign.
     common: FloatArray
 
 
 def shared_error(
     glow_px: FloatArray, twine_px: FloatArray | None = None, position_px: FloatArray | float = 1.0
 ) -> SharedError:
-    """Return the errors that points on a solid surface or on a net share.
+    """Return the errors that N points on a solid surface or on a net share.
 
     Parameters
     ----------
@@ -67,7 +69,7 @@ def shared_error(
         Shift by glow in the water, with its sign. All stripes share it.
     twine_px : array, shape (N,), optional
         Shift of the light on twine, with the sign that brings the point nearer. All stripes share
-        it, and as much again those of one laser. None on something solid.
+        it, and those of one laser a second error of the same size. None on something solid.
     position_px : float or array, shape (N,)
         Pixels from one position of the search line to the next; 2 along the columns of a field.
     """
@@ -80,7 +82,7 @@ def shared_error(
 TUKEY = 4.685
 """Cut of Tukey's biweight, in standard deviations: 95 % efficiency for normal errors."""
 _ITERATIONS = 6
-# The stated errors count as much as the scatter of this many observations.
+# Weight of the stated errors relative to the scatter of the residuals, in observations.
 _STATED_COUNT = 10.0
 
 
@@ -95,7 +97,7 @@ class PlaneFit:
 
 
 def fit_pseudo_inverse(points: FloatArray, n_groups: int, covariance: FloatArray) -> PlaneFit:
-    """Fit m·X = 1 by the left pseudo-inverse (paper, Eq. 24): equal weights, outliers included.
+    """Fit m·X = 1 by the left pseudo-inverse (paper, Eq. 24), with equal weights for all points.
 
     Parameters
     ----------
@@ -133,22 +135,23 @@ def fit_robust(
         different points should be independent: take centroids of subsegments rather than single
         peaks, which share the errors of their neighbours.
     sigma_px : array, shape (N,)
-        Least standard deviation of the stripe's position; greater scatter is recognised.
+        Standard deviation of the stripe's position. If the residuals scatter more, the covariance
+        increases accordingly; if they scatter less, only in part.
     laser : int array, shape (N,)
         Index of the laser.
     along : array, shape (N,)
         Place along the stripe, from -1 at one image border to 1 at the other.
     start : array, shape (3,)
-        A first m, such as RANSAC gives.
+        Initial m, as from RANSAC.
     shared : SharedError
-        Errors that the points share. How large those of single lasers are in this frame is judged
-        from how well the stripes of all lasers make a plane, beginning with `own`.
+        Errors that the points share. The size of `own` in this frame is estimated from the distance
+        of the lasers' stripes from their common plane.
 
     Returns
     -------
     PlaneFit or None
-        None where the points do not determine a plane. The covariance follows from the actual
-        residuals (Huber 1981, section 7.6), widened by the errors that stripes share.
+        None if the points do not determine a plane. The covariance follows from the actual
+        residuals (Huber 1981, section 7.6), inflated by the errors that stripes share.
     """
     m = np.array(start, dtype=np.float64)
     covariance = np.empty((3, 3))
@@ -161,7 +164,7 @@ def fit_robust(
 
 @lazy_kernel
 def plane_of_all(points: FloatArray, m: FloatArray) -> bool:
-    """Write the m of m·X = 1 that best fits points (N, 3), unweighted; False if undetermined."""
+    """Write m of the least-squares plane m·X = 1 of points (N, 3); False if undetermined."""
     normal, right, inverse = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
     one = np.empty(points.shape[0])
     for i in range(points.shape[0]):
@@ -179,7 +182,7 @@ def _normalised_residuals(
     sigma: FloatArray,
     z: FloatArray,
 ) -> None:
-    """Return the residuals of m·X = 1 over their sigma by pixel error (written to `sigma`)."""
+    """Write the residuals z (N,) of m·X = 1 in sigmas, and these sigmas (N,)."""
     for i in range(points.shape[0]):
         per_px = m[0] * sensitivity[i, 0] + m[1] * sensitivity[i, 1] + m[2] * sensitivity[i, 2]
         sigma[i] = abs(per_px) * sigma_px[i] + 1e-12
@@ -195,7 +198,7 @@ def normal_equations(
     normal: FloatArray,
     right: FloatArray,
 ) -> None:
-    """Write the weighted normal equations of X·m = 1; the lower half of the matrix suffices."""
+    """Write the weighted normal equations of X·m = 1: lower triangle (3, 3) and right side (3,)."""
     normal[:] = 0.0
     right[:] = 0.0
     for i in range(points.shape[0]):
@@ -218,6 +221,10 @@ def _fit(
     covariance: FloatArray,
     weights: FloatArray,
 ) -> float:
+    """Refine m (3,) in place, write covariance (3, 3) and weights (N,); return the rms in metres.
+
+    NaN if the points do not determine a plane. Arguments as of `fit_robust`.
+    """
     n = points.shape[0]
     z = np.empty(n)
     sigma = np.empty(n)
@@ -240,7 +247,7 @@ def _fit(
     _normalised_residuals(points, sensitivity, sigma_px, m, sigma, z)
     factor = _huber_factor(z, TUKEY * scale)
     if factor < 1.0:
-        # With few observations, a scatter below the stated errors is chance.
+        # With few observations, a scatter below the stated errors may be chance.
         factor = (_STATED_COUNT + n * factor) / (_STATED_COUNT + n)
     weight, per_px = np.empty(n), np.empty(n)
     for i in range(n):
@@ -275,9 +282,9 @@ def _fit(
 
 @inner_kernel
 def _huber_factor(z: FloatArray, cut: float) -> float:
-    """Return the factor on the unweighted inverse of the normal matrix (Huber 1981, section 7.6).
+    """Return the factor on the inverse of the unweighted normal matrix (Huber 1981, section 7.6).
 
-    Accounts for outliers: they add no information, and the fit ignores them.
+    With it, outliers add no information. Infinite if undetermined.
     """
     n = z.shape[0]
     if n <= 3:
@@ -309,9 +316,10 @@ def _add_own_errors(
     inverse: FloatArray,
     covariance: FloatArray,
 ) -> None:
-    """Widen by one shift and one tilt for each laser, as large as this frame's residuals ask for.
+    """Inflate the covariance by a shift and a tilt of each laser, as large as the frame shows.
 
-    `off` is m·X - 1; `factor` is that of the points' variances.
+    `off` (N,) is m·X - 1, `per_px` (N,) its derivative by the stripe's position; `factor` is the
+    factor on the points' variances, `inverse` (3, 3) that of the weighted normal matrix.
     """
     n_modes = 2 * n_bins(laser)
     pull, residual = np.zeros((n_modes, 3)), np.zeros(n_modes)
@@ -333,7 +341,7 @@ def _add_own_errors(
         for j in range(3):
             for k in range(3):
                 moved[a, j] += inverse[j, k] * pull[a, k]
-    # What a plane can follow does not show.
+    # The part of the errors that a plane can follow does not show in the residuals.
     for a in range(n_modes):
         for b in range(a + 1):
             for k in range(3):
@@ -351,20 +359,20 @@ def _add_own_errors(
 
 @inner_kernel
 def _expected_square(matrix: FloatArray, residual: FloatArray) -> float:
-    """Return the expected square of the factor on shared errors, given what a frame shows.
+    """Return the expected squared factor t on shared errors, given the residuals of a frame.
 
-    Errors that are normal with variance t have a marginal likelihood (Rasmussen and Williams 2006,
-    Eq. 2.30); it is weighed with the prior of t.
+    The mean over `_SQUARES`, weighted by the marginal likelihood of normal errors with variance t
+    (Rasmussen and Williams 2006, Eq. 2.30) times the prior of t.
 
     Parameters
     ----------
     matrix : array, shape (K, K)
-        Information of the frame on the K errors; lower half.
+        Information of the frame on the K errors; lower triangle.
     residual : array, shape (K,)
         The same times their estimate.
     """
-    # By this factor pictures differ in that: standard deviation of its logarithm. Rendered walls
-    # have 0.01 to 0.06 px, most where compression is strong.
+    # Prior: the logarithm of the standard deviation has that of this factor as its own. Rendered
+    # walls have 0.01 to 0.06 px, the most with strong compression.
     pictures_differ = 4.0
     n_modes, spread = residual.shape[0], 2.0 * math.log(pictures_differ)
     lower, solved = np.empty((n_modes, n_modes)), np.empty(n_modes)
@@ -398,9 +406,10 @@ def _expected_square(matrix: FloatArray, residual: FloatArray) -> float:
 
 @inner_kernel
 def add_error(pull: FloatArray, inverse: FloatArray, covariance: FloatArray) -> None:
-    """Widen a covariance (K, K) by an error of all observations together.
+    """Inflate a covariance (K, K) by an error that all observations share.
 
-    `pull` (K,) is what its standard deviation adds to the right side of the normal equations.
+    `pull` (K,) is the change of the right side of the normal equations by one standard deviation,
+    `inverse` (K, K) the inverse of their matrix.
     """
     moved = np.zeros(pull.shape[0])
     for j in range(pull.shape[0]):
@@ -413,6 +422,7 @@ def add_error(pull: FloatArray, inverse: FloatArray, covariance: FloatArray) -> 
 
 @inner_kernel
 def _weighted_rms(off: FloatArray, weights: FloatArray, m: FloatArray) -> float:
+    """Return the weighted rms distance in metres, given m·X - 1."""
     total, weight = 0.0, 0.0
     for i in range(off.shape[0]):
         total += weights[i] * off[i] * off[i]
@@ -430,7 +440,7 @@ def mark_inliers(
     points: FloatArray,
     inliers: BoolArray,
 ) -> tuple[int, float, int]:
-    """Mark the inliers of a fit.
+    """Mark the inliers of a fit to M observations among N candidates.
 
     Parameters
     ----------
@@ -439,7 +449,7 @@ def mark_inliers(
     laser : int array, shape (M,), weights : array, shape (M,)
         Of the observations.
     of_all : bool
-        Whether observations without weight are counted in `second`.
+        Whether `second` counts observations without weight, too.
     points : array, shape (N, 3)
         Of the candidates.
     inliers : bool array, shape (N,)
@@ -450,7 +460,7 @@ def mark_inliers(
     n_points : int
         Number of inliers.
     nearest : float
-        Distance of the nearest of them from the origin.
+        Distance of the nearest of them from the origin, in metres.
     second : int
         Number of observations of the second best laser.
     """
@@ -482,7 +492,7 @@ def weigh_candidates(
     alike: bool,
     weights: FloatArray,
 ) -> None:
-    """Write the weight of each candidate in a fit of m·X = 1: an equal share of its piece's.
+    """Write the weight of each candidate in a fit: an equal share of its observation's.
 
     Parameters
     ----------

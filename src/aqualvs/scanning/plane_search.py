@@ -1,14 +1,14 @@
 """Search for one plane among subsegments: a deterministic, locally optimised RANSAC.
 
 Samples are taken among neighbours (after NAPSAC, Myatt et al. 2002, doi:10.5244/C.16.44):
-subsegments next to each other on a stripe more likely share a surface than distant ones,
-and those with a larger sampling weight more likely lie on any surface than specks.
+subsegments next to each other on a stripe more likely share a surface than distant ones, and those
+with a larger sampling weight more likely lie on any surface than specks.
 Hypotheses are scored by MSAC (Torr & Zisserman 2000, doi:10.1006/cviu.1999.0832), and the promising
 ones are refined.
 
-Subsegments come as a table, one column a subsegment and one row a quantity, so that scoring a
-hypothesis runs along memory and is vectorised; the scores are then summed subsegment by subsegment,
-in a fixed order.
+Subsegments are the columns of a table, quantities its rows, so that scoring a hypothesis reads
+memory in order and is vectorised; the scores are then summed subsegment by subsegment, in a fixed
+order.
 """
 
 import numpy as np
@@ -27,22 +27,24 @@ X, Y, Z, JX, JY, JZ, WEIGHT = range(7)
 N_ROWS = 7
 
 _MAX_HYPOTHESES = 6000
-# Trials for a plane, times the square of its share of the sampling weight; beyond the second number
-# in total, only this part of them.
+# Trials for a plane: the first number over the square of the plane's share of the sampling weight.
+# If that is more than the second number, the third one is a factor on it.
 _TRIALS, _MANY, _SOME = 45.0, 2500.0, 0.55
-# Limit of the subsegments of all hypotheses, most of which are scored in part only: a frame full of
-# noise must not delay a live run. A sixth of it was too few for a photograph with 15 lasers, of
-# whose 10,000 subsegments JPEG had made most: every other search missed the board.
+# Largest number of hypotheses times subsegments: a frame full of noise must not delay a live run.
+# With a sixth of it, every second search missed the board in a photograph with 15 lasers, where
+# most of 10,000 subsegments were JPEG artefacts.
 _MAX_WORK = 60_000_000
 # Subsegments scored between checks whether the rest can change the result.
 _STEP = 32
-# A neighbour for sampling lies at most this many subsegments away in the same laser's list.
+# The second subsegment of a sample is at most this many places after the first one, on the same
+# laser.
 _NEIGHBOURHOOD = 8
-# Subsegments with a smaller share of the typical sampling weight are not sampled.
+# Subsegments with a smaller share of the weighted median of the sampling weights are not sampled.
 _LIGHTEST_SHARE = 0.5
 MIN_FACING = float(np.cos(np.deg2rad(55.0)))
-"""Limit of a normal's deviation from the forward axis: others are no target ahead."""
-# Gate of a hypothesis before it is refined, and how near the best one it must come for that.
+"""Least cosine of a target's normal to the forward axis: others are not ahead of the vehicle."""
+# Factor on the gate of a hypothesis before it is refined, and least score, as a share of the best
+# one, for which it is refined.
 _WIDE_GATE = 3.0
 _WORTH_REFINING = 0.8
 # Largest weight of the best laser relative to the second: a plane needs two lasers.
@@ -52,9 +54,9 @@ MAX_TO_SECOND = 3.0
 @inline_kernel
 def squared_gate(per_px: float, offset: float) -> float:
     """Return the square of the largest distance (m) at which a subsegment belongs to a plane."""
-    # Distance of a subsegment from a plane: this share of the range, and this shift of the stripe,
-    # up to the second share. Where the line of sight is nearly parallel to the sheet, light read as
-    # the wrong laser's lies far away, and a pixel moves it so far that it would be on any plane.
+    # Root sum of squares of a share of the range and of the distance for a shift of the stripe,
+    # which is limited to the second share: where the line of sight is nearly parallel to the sheet,
+    # a pixel moves a wrong candidate so far that it would be on any plane.
     gate_range_share, max_range_share = 0.003, 0.25
     gate_px = 1.0
     by_range = gate_range_share * offset
@@ -104,7 +106,10 @@ def _near(
     squared_gate_scale: float,
     lanes: FloatArray,
 ) -> float:
-    """Sum the sampling weights of some subsegments, scaled by their closeness to a plane."""
+    """Return the sum over subsegments [at, stop) of their sampling weight times their nearness.
+
+    The nearness to the plane is 1 on it and 0 beyond the gate; `lanes` is overwritten.
+    """
     x, y, z, weight = table[X], table[Y], table[Z], table[WEIGHT]
     jx, jy, jz = table[JX], table[JY], table[JZ]
     nx, ny, nz, offset = plane[0], plane[1], plane[2], plane[3]
@@ -128,7 +133,11 @@ def refine_plane(
     scratch: FloatArray,
     lanes: FloatArray,
 ) -> bool:
-    """Refit the plane X·m = 1 (paper, Eq. 24) to the subsegments in the widened gate, in place."""
+    """Refit the plane X·m = 1 (paper, Eq. 24) to the subsegments in its gate times `gate_scale`.
+
+    `plane` (4,) is overwritten; `normal` (3, 3), `scratch` (5, 3) and `lanes` (C,) are buffers.
+    Return False, and leave the plane, if the subsegments do not determine it.
+    """
     x, y, z, weight = table[X], table[Y], table[Z], table[WEIGHT]
     jx, jy, jz = table[JX], table[JY], table[JZ]
     nx, ny, nz, offset = plane[0], plane[1], plane[2], plane[3]
@@ -168,7 +177,7 @@ def refine_plane(
 
 @inline_kernel
 def _plane_through(table: FloatArray, i: int, j: int, k: int, plane: FloatArray) -> bool:
-    """Write the plane through three subsegments, normal outward; return False if collinear."""
+    """Write the plane (4,) through three subsegments, its offset positive; False if collinear."""
     ax, ay, az = table[X, i], table[Y, i], table[Z, i]
     ux, uy, uz = table[X, j] - ax, table[Y, j] - ay, table[Z, j] - az
     vx, vy, vz = table[X, k] - ax, table[Y, k] - ay, table[Z, k] - az
@@ -192,7 +201,7 @@ def _next_random(state: np.uint64) -> tuple[np.uint64, float]:
 
 @inline_borrowing_kernel
 def _pick(cumulative_weight: FloatArray, guide: IntArray, draw: float) -> int:
-    """Draw a subsegment with a probability proportional to its sampling weight."""
+    """Return the subsegment for a uniform `draw` in [0, 1): probability as its sampling weight."""
     wanted = draw * cumulative_weight[cumulative_weight.shape[0] - 1]
     at = guide[int(draw * guide.shape[0])]
     while at > 0 and cumulative_weight[at - 1] > wanted:
@@ -204,7 +213,7 @@ def _pick(cumulative_weight: FloatArray, guide: IntArray, draw: float) -> int:
 
 @inner_borrowing_kernel
 def _guide(cumulative_weight: FloatArray, guide: IntArray) -> None:
-    """Write the start of the search in `_pick`, for as many draws as there are subsegments."""
+    """Write the start of the search in `_pick` for equally spaced draws, as many as subsegments."""
     n = guide.shape[0]
     step = cumulative_weight[n - 1] / n
     at = 0
@@ -288,10 +297,15 @@ def search_plane(
     nearest, farthest : float
         Limits of the hypotheses, in metres.
     seed : int
-        The same seed and subsegments give the same plane; 0 for the first plane of a frame, which
-        is searched in all light if the heavy light is one laser's.
+        The same seed and subsegments give the same plane. With 0, for the first plane of a frame,
+        all subsegments are sampled if the heavy ones are of one laser.
     best_plane : array, shape (4,)
         Written: unit normal, pointing outward, and offset.
+
+    Returns
+    -------
+    bool
+        Whether there is a plane.
     """
     n = table.shape[1]
     state = np.uint64(seed + 1)
@@ -300,7 +314,7 @@ def search_plane(
     best_rough = 0.0
     heavy = _heavy(table[WEIGHT])
     if seed == 0 and laser[heavy[0]] == laser[heavy[heavy.shape[0] - 1]]:
-        # A sample needs two lasers. Later, such light is what a surface has left over.
+        # A sample needs two lasers. Later in a frame, such subsegments are left over of a surface.
         heavy = np.empty(n, np.int64)
         for c in range(n):
             heavy[c] = c
@@ -334,7 +348,8 @@ def search_plane(
             continue
         if plane[3] < nearest or plane[3] > farthest or plane[1] < MIN_FACING:
             continue
-        # A plane through neighbours is rough: scored with a wide gate, refined with narrower ones.
+        # A plane through neighbours is inaccurate: score it with a wide gate, refine it with
+        # narrower ones.
         score = _score(
             table, laser_start, plane, _WIDE_GATE, weight_after, _WORTH_REFINING * best_rough, lanes
         )
@@ -350,9 +365,9 @@ def search_plane(
         for k in range(4):
             best_plane[k] = plane[k]
         # With a share s of the weight on the plane a trial succeeds with a probability of s^2 / 12
-        # to s^2 / 5: half of the neighbours fit or fewer, and a third of the draws are of one
-        # laser. Where two thirds of a net's light make a plane of their own, its trials leave one
-        # search in 1000 without the whole net. Planes through noise do not deserve as many.
+        # to s^2 / 5: at most half of the neighbours fit, and a third of the draws are of one laser.
+        # If two thirds of a net's weight make a plane of their own, one search in 1000 misses the
+        # whole net with these trials. Planes through noise get fewer.
         share = min(best / total, 1.0)
         trials = _TRIALS / (share * share)
         needed = min(most, int(max(min(trials, _MANY), _SOME * trials)) + 20)
