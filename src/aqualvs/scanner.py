@@ -336,16 +336,17 @@ class Scanner:
         candidates, subsegments, _, assignment = stripes
         surfaces, target, _, tested = choice
         if target is None:
-            return _refused(candidates, _no_target(candidates, surfaces, self.options.target))
+            missing = _no_target(candidates, surfaces, self.options.target)
+            return Measurement.refused(missing, candidates.n)
         refusal = self._refusal(stripes, choice, target)
         if refusal is not None:
-            return _refused(candidates, refusal)
+            return Measurement.refused(refusal, candidates.n)
         found = inflate_for_rival(self._fit_posture(candidates, subsegments, target), tested)
         # The mean plane of folds covers all of a net's light, nearer parts included.
         nearer = None if found.folded else assignment.nearer_net(subsegments, surfaces, target)
         if nearer is None or not found.posture:
             return found
-        return _refused(candidates, _ambiguous(target.plane, nearer.plane))
+        return Measurement.refused(_ambiguous(target.plane, nearer.plane), candidates.n)
 
     def _refusal(self, stripes: _Stripes, choice: _Choice, target: Surface) -> Refusal | None:
         """Return the refusal of a target that is ambiguous or found by chance; else None."""
@@ -458,10 +459,6 @@ def _as_other_kind(
 def _on_mesh(paper_filter: "PaperFilter", points: ScanPoints) -> BoolArray:
     laser = points.laser.astype(np.int64)
     return paper_filter.apply(points.pixels, points.width, laser).peaks_on_mesh(len(points))
-
-
-def _refused(candidates: Candidates, refusal: Refusal) -> Measurement:
-    return Measurement(refusal, np.zeros(candidates.n, np.bool_))
 
 
 def _ambiguous(one: Plane, other: Plane) -> Refusal:

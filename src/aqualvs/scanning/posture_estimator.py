@@ -1,8 +1,8 @@
-"""The posture to one surface: its inliers, the fit to them, and the checks of the result.
+"""Estimation of the posture to one surface: inliers, fit, and checks of the result.
 
-`PostureEstimator.measure` selects the pieces of stripe on the surface, fits a plane or a paraboloid
-to them, follows a net where it leaves the surface, and replaces or widens the posture where a net
-is mostly folds.
+`PostureEstimator.measure` averages the stripes on the surface to observations, fits a plane or a
+paraboloid to them, follows a net where it leaves the surface, and replaces the posture by that to
+the mean plane, or inflates its covariance, if a net is mostly folds.
 """
 
 import math
@@ -58,9 +58,9 @@ from aqualvs.scanning.surfaces import Surface
 
 @lazy_borrowing_kernel
 def places_along(line: FloatArray, laser: IntArray, n_lines: IntArray, along: FloatArray) -> None:
-    """Write places along the stripes, from -1 at one image border to 1 at the other.
+    """Write the places (N,) along the stripes, from -1 at one image border to 1 at the other.
 
-    `n_lines`, shape (n_lasers,), are the search lines in the picture.
+    `n_lines`, shape (n_lasers,), is the number of search lines in the picture.
     """
     for k in range(line.shape[0]):
         along[k] = 2.0 * line[k] / n_lines[laser[k]] - 1.0
@@ -69,26 +69,28 @@ def places_along(line: FloatArray, laser: IntArray, n_lines: IntArray, along: Fl
 MIN_LINES = 30
 """Least number of stripe points of a posture."""
 
-# A net bends out of the plane that touches it by at most this share of the range.
+# Largest distance of a net from the plane that touches it, as a share of the range.
 _DEEPEST_BEND = 0.15
+# With fewer strands, only a bend of at least the second number, as a share of the range, counts.
 _FEW_STRANDS, _STRONG_BEND = 36, 0.02
-# With less than this share of a net's light on the surface, the net's mean plane replaces it. Up to
-# the greater share, the plane of all its strands inflates the covariance.
+# With a smaller share of a net's strands on the surface than the first, the net's mean plane
+# replaces it; with a smaller one than the second, the plane of all strands inflates the covariance.
 _MAIN_SHARE, _WHOLE_SHARE = 0.4, 0.9
-# Fewer strands do not show that a net is folded.
+# Least number of strands that show whether a net is folded.
 _MIN_FOLDED = 12
 # Largest scatter of strands about the mean plane of a folded net, as a share of the range.
 _FOLDED_RMS_SHARE = 0.04
+# Largest distance of strands on the surface, as a share of the range.
 _NEAR_SHARE = 0.005
-# Light this near the plane (share of the range) may be the net's if nothing else explains it. A net
-# is mostly folds if at most the second share of its strands, and less than the third of its light,
-# lie on the surface. Flat nets in strong sun and those with growth come down to 0.36 of the strands
-# and to 0.31 of the light; folded ones reach 0.5 and 0.62.
+# Candidates within the first share of the range of the plane may be on the net if no other surface
+# explains them. A net is mostly folds if at most the second share of its strands, and less than the
+# third of its light, lie on the surface. Flat nets in strong sun and with growth have at least 0.36
+# of the strands and 0.31 of the light there, folded ones at most 0.5 and 0.62.
 _BESIDE_SHARE, _FOLDED_STRANDS, _FOLDED_INTENSITY = 0.06, 0.5, 0.47
-# Square of the distance between two postures, over the covariance of the one: its expected value if
-# only chance parts them, and what chance exceeds once in 1000 times (chi-squared, 3 values).
+# Squared Mahalanobis distance between two postures: its expected value if they differ by chance,
+# and the quantile 0.999 (chi-squared, 3 degrees of freedom).
 _EXPECTED, _CONTRADICTS = 3.0, 16.27
-# Independent pieces of stripe that the second best laser must show.
+# Least number of observations of the second best laser.
 _MIN_OBSERVATIONS = 3
 
 
@@ -105,17 +107,24 @@ class FitMethod(StrEnum):
 class Measurement:
     """A posture or its refusal, with the inliers and their weights."""
 
-    posture: Posture | Refusal  # The result.
-    inliers: BoolArray  # Shape (N,): inliers: candidates in the posture; none where it is refused.
-    patch: Patch | None = None  # The curved surface, where a plane does not describe the net.
-    # Shape (N,): mask of the net: candidates on it, also where its folds leave the surface; None if
-    # the target is no net.
+    posture: Posture | Refusal
+    inliers: BoolArray  # Shape (N,): candidates in the posture; none if it is refused.
+    patch: Patch | None = None  # The curved surface, if a plane does not describe the net.
+    # Shape (N,): candidates on the net, also where its folds leave the surface; None if the target
+    # is no net.
     net_mask: BoolArray | None = None
     # Shape (N,): weight of each candidate in the fit, 1 over the variance of m·X; None without a
     # posture.
     weights: FloatArray | None = None
-    # Whether the posture is that of a folded net's mean plane.
+    # Whether the posture is that to a folded net's mean plane.
     folded: bool = False
+
+    @classmethod
+    def refused(
+        cls, refusal: Refusal, n_candidates: int, net_mask: BoolArray | None = None
+    ) -> "Measurement":
+        """Return a refusal, without inliers among the candidates."""
+        return cls(refusal, np.zeros(n_candidates, np.bool_), net_mask=net_mask)
 
 
 class PostureEstimator:
@@ -162,30 +171,27 @@ class PostureEstimator:
         seen = self._observer.observe(candidates, on_target, target.plane, on_twine=mesh, flat=True)
         if seen.n_candidates < MIN_LINES:
             detail = f"only {seen.n_candidates} stripe points outside crossings"
-            return _refused(candidates, Refusal(Reason.TOO_FEW_POINTS, detail))
+            return Measurement.refused(Refusal(Reason.TOO_FEW_POINTS, detail), candidates.n)
         fit = self._fit(candidates, seen, target)
         if fit is None:
-            return _refused(candidates, Refusal(Reason.COLLINEAR, "the points do not fix a plane"))
+            refusal = Refusal(Reason.COLLINEAR, "the points do not fix a plane")
+            return Measurement.refused(refusal, candidates.n)
         flat = self._posture_of_fit(candidates, seen, fit)
         found = flat
         if mesh and self._fit_method is FitMethod.ROBUST:
             if flat is not None:
                 found = self._measure_net(candidates, seen, fit, flat, target)
             else:
-                found = self._measure_folds(candidates, seen, fit)
+                found = self._measure_folded(candidates, seen, fit)
         if found is None:
             detail = "all lasers but one show too little of the target"
-            return _refused(candidates, Refusal(Reason.ONE_LASER, detail))
-        return self._validated(candidates, found)
-
-    def _validated(self, candidates: Candidates, found: Measurement) -> Measurement:
-        """Return the measurement if a pilot may rely on it, else a refusal."""
+            return Measurement.refused(Refusal(Reason.ONE_LASER, detail), candidates.n)
         if isinstance(found.posture, Refusal):
             return found
         max_rms_share = _FOLDED_RMS_SHARE if found.folded else MAX_RMS_SHARE
         posture = validate(found.posture, self._working_range, max_rms_share)
         if isinstance(posture, Refusal):
-            return Measurement(posture, np.zeros(candidates.n, np.bool_), net_mask=found.net_mask)
+            return Measurement.refused(posture, candidates.n, found.net_mask)
         return found
 
     def _measure_net(
@@ -196,11 +202,13 @@ class PostureEstimator:
         flat: Measurement,
         target: Surface,
     ) -> Measurement:
-        """Measure the posture to a net, which may bend or fold, and find its visible part."""
+        """Measure the posture to a net, which may bend or fold, and mark its candidates.
+
+        `flat` is the posture to the plane that was fitted to the target.
+        """
         plane = _plane_of(fit)
         off = np.empty(candidates.n)
         distances_off(candidates.points, plane.normal, plane.offset, off)
-        # With few strands only a strong bend is accepted.
         few = seen.observations.n < _FEW_STRANDS and has_much_beside(off, MODERATELY_BESIDE)
         bends = target.n_planes > 1 or has_much_beside(off)
         bends = bends or shows_curvature(seen.observations, fit.weights, plane)
@@ -214,11 +222,11 @@ class PostureEstimator:
             if is_clear and is_observable:
                 best = curved
             elif is_clear or is_observable:
-                # Its nearest point is out of view, or the bend is too weak to be relied on.
-                best = _inflate_covariance(flat, curved)
+                # The nearest point is out of view, or the bend may be due to chance.
+                best = _inflated_by(flat, curved)
         patch = packed_plane(plane) if best.patch is None else best.patch.packed()
         net_mask = self._grow_net_mask(candidates, best.inliers, plane, patch)
-        seen = self._beside(candidates, net_mask, off, plane)
+        seen = self._observe_near(candidates, net_mask, off, plane)
         share = _share_on(seen, patch, plane)
         if share < _WHOLE_SHARE:
             is_curved = best is curved
@@ -227,15 +235,15 @@ class PostureEstimator:
             )
             best = folded or best
             if not best.folded:
-                best = self._or_mean_plane(candidates, net_mask, plane, patch, best, is_curved)
+                best = self._checked_for_folds(candidates, net_mask, plane, patch, best, is_curved)
         return replace(best, net_mask=net_mask)
 
-    def _measure_folds(
+    def _measure_folded(
         self, candidates: Candidates, seen: Observed, fit: PlaneFit
     ) -> Measurement | None:
-        """Measure the posture to the mean plane of a net of which one laser alone fits a plane.
+        """Measure the posture to the mean plane of a net on whose plane only one laser lies.
 
-        Such a plane may stand anywhere: its mean plane counts if every laser confirms it.
+        Such a plane has no fixed angles: the mean plane counts only if every laser confirms it.
         """
         plane = _plane_of(fit)
         off = np.empty(candidates.n)
@@ -243,7 +251,7 @@ class PostureEstimator:
         inliers = (seen.group >= 0) & (fit.weights[seen.group] > 0.0)
         patch = packed_plane(plane)
         net_mask = self._grow_net_mask(candidates, inliers, plane, patch)
-        seen = self._beside(candidates, net_mask, off, plane)
+        seen = self._observe_near(candidates, net_mask, off, plane)
         share = _share_on(seen, patch, plane)
         if share >= _FOLDED_STRANDS:
             return None
@@ -259,7 +267,7 @@ class PostureEstimator:
     def _grow_net_mask(
         self, candidates: Candidates, inliers: BoolArray, plane: Plane, patch: FloatArray
     ) -> BoolArray:
-        """Mark the visible part of a net, also where its folds leave the surface."""
+        """Mark the candidates on a net (N,), also where its folds leave the surface."""
         net_mask, height = inliers.copy(), np.empty(candidates.n)
         heights_over(candidates.points, patch, height)
         grow_region(
@@ -281,12 +289,12 @@ class PostureEstimator:
         patch: FloatArray,
         best: Measurement | None,
     ) -> Measurement | None:
-        """Return the posture to the mean plane of a net most of whose light is off the surface.
+        """Return the posture to the mean plane if the surface is only one flank of a fold.
 
-        A surface on one flank of a fold explains little of the light that lies about it, or the
-        mean plane of all that light contradicts it. `seen` are the strands about the surface,
-        `share` is that of those on it. `best` is the posture to the surface, if any: where it is
-        the main part of the net it is returned, widened as far as the two disagree.
+        Such a surface holds little of the light around it, or the mean plane of all that light
+        contradicts it. `seen` are the strands around the surface, `share` is the share of strands
+        on it. `best` is the posture to the surface, if any: if the surface is the main part of the
+        net, it is returned, with its covariance inflated by the disagreement with the mean plane.
         """
         intensity_share = intensity_share_near(
             seen.group,
@@ -296,8 +304,8 @@ class PostureEstimator:
             _NEAR_SHARE * plane.offset,
         )
         if best and share > _FOLDED_STRANDS:
-            return self._widened(best, seen, plane, intensity_share)
-        mean = self._settled(candidates, net_mask, self._mean_plane(candidates, seen, plane))
+            return self._inflated_by_mean(best, seen, plane, intensity_share)
+        mean = self._reselected(candidates, net_mask, self._mean_plane(candidates, seen, plane))
         if mean is None:
             return None
         if best and intensity_share >= _FOLDED_INTENSITY:
@@ -305,28 +313,32 @@ class PostureEstimator:
             if not (one and other):
                 return None
             if disagreement(one, other) <= _CONTRADICTS:
-                return self._widened_by_all(best, seen, intensity_share, folded=True)
-        return self._widened_by_all(mean.found, mean.seen, mean.share, folded=True)
+                return self._inflated_by_all(best, seen, intensity_share, folded=True)
+        return self._inflated_by_all(mean.found, mean.seen, mean.share, folded=True)
 
-    def _widened(
+    def _inflated_by_mean(
         self, best: Measurement, seen: Observed, plane: Plane, intensity_share: float
     ) -> Measurement:
-        """Widen a posture by the mean plane of the light near it; `intensity_share` is its own."""
+        """Inflate the covariance of a posture by the mean plane of the strands around it.
+
+        `intensity_share` is the share of their light on the surface.
+        """
         fit = fit_mean_plane(seen.observations.points, seen.observations.laser, plane)
         if fit is None or not isinstance(best.posture, Posture):
             return best
         mean = posture_of(fit, 0.0, 0, self._axis_in_dome)
-        # Of the difference, what the scatter of the strands does not explain.
+        # Share of the squared difference that the scatter of the strands does not explain.
         excess = 1.0 - _EXPECTED / max(disagreement(best.posture, mean), _EXPECTED)
         share = (1.0 - intensity_share) * excess
         return replace(best, posture=inflate_covariance(best.posture, mean, share))
 
-    def _widened_by_all(
+    def _inflated_by_all(
         self, found: Measurement, seen: Observed, share: float, *, folded: bool = False
     ) -> Measurement:
-        """Widen a posture, which a share of a net's light supports, by the plane of all strands.
+        """Inflate the covariance of a posture by the plane of all strands, outliers included.
 
-        The plane of all strands of a folded net is uncertain itself, and adds its own covariance.
+        `share` is the share of the net's light that supports the posture. The plane of all strands
+        of a folded net is uncertain itself, and adds its own covariance.
         """
         if not isinstance(found.posture, Posture):
             return found
@@ -341,31 +353,29 @@ class PostureEstimator:
             posture = replace(posture, covariance=covariance)
         return replace(found, posture=posture)
 
-    def _beside(
+    def _observe_near(
         self, candidates: Candidates, net_mask: BoolArray, off: FloatArray, plane: Plane
     ) -> Observed:
-        """Average the pieces of stripe of a net, and those near a plane that may be the net's."""
+        """Return the observations of a net, and of candidates near a plane that may be on it."""
         beside = np.empty(candidates.n, np.bool_)
         mark_beside(candidates.source, net_mask, off, _BESIDE_SHARE, beside)
         return self._observer.observe(candidates, beside, plane, on_twine=True)
 
-    def _settled(
+    def _reselected(
         self, candidates: Candidates, net_mask: BoolArray, mean: "_MeanPlane | None"
     ) -> "_MeanPlane | None":
-        """Measure a mean plane again from the light about it.
+        """Fit a mean plane again to the strands around it, until the selection is stable.
 
-        The light near one flank is more of that side than of the other: the selection is repeated
-        about the mean plane until it holds the same pieces.
+        The first selection is that around one flank, and holds more strands of that side.
         """
         off = np.empty(candidates.n)
-        # The light about a mean plane is selected at most this many times more.
         max_selections = 5
         for _ in range(max_selections):
             if mean is None or not isinstance(mean.found.posture, Posture):
                 break
             plane = Plane(mean.found.posture.normal_in_dome, mean.found.posture.range)
             distances_off(candidates.points, plane.normal, plane.offset, off)
-            seen = self._beside(candidates, net_mask, off, plane)
+            seen = self._observe_near(candidates, net_mask, off, plane)
             if np.array_equal(seen.group >= 0, mean.seen.group >= 0):
                 break
             mean = self._mean_plane(candidates, seen, plane)
@@ -383,7 +393,7 @@ class PostureEstimator:
             return None
         return _MeanPlane(replace(found, folded=True), seen, float(np.mean(fit.weights)))
 
-    def _or_mean_plane(
+    def _checked_for_folds(
         self,
         candidates: Candidates,
         net_mask: BoolArray,
@@ -392,19 +402,22 @@ class PostureEstimator:
         best: Measurement,
         is_curved: bool,
     ) -> Measurement:
-        """Return the measurement, widened or replaced by the mean plane if the net is folds."""
+        """Return the measurement, or that to the mean plane if the net is mostly folds.
+
+        In between, the covariance of the measurement is inflated.
+        """
         seen = self._observer.observe(candidates, net_mask, plane, on_twine=True)
         share = _share_on(seen, patch, plane)
         if share >= _MAIN_SHARE:
             is_whole = is_curved or share >= _WHOLE_SHARE
-            return best if is_whole else self._widened_by_all(best, seen, share)
+            return best if is_whole else self._inflated_by_all(best, seen, share)
         mean = self._mean_plane(candidates, seen, plane)
         if mean is None:
             return best
-        return self._widened_by_all(mean.found, seen, mean.share, folded=True)
+        return self._inflated_by_all(mean.found, seen, mean.share, folded=True)
 
     def _is_observable(self, candidates: Candidates, curved: Measurement) -> bool:
-        """Return whether the posture to a curved net may be relied on."""
+        """Return whether the posture to a curved net is accurate, and its nearest point visible."""
         posture = curved.posture
         return (
             isinstance(posture, Posture)
@@ -419,7 +432,7 @@ class PostureEstimator:
     ) -> tuple[Measurement | None, bool]:
         """Measure the posture to a net that may bend, and return whether it clearly does.
 
-        None where chance makes as much of a flat net's strands.
+        None if the strands of a flat net may look so by chance.
         """
         near = off < _DEEPEST_BEND
         seen = self._observer.observe(candidates, near, plane, on_twine=True)
@@ -443,6 +456,7 @@ class PostureEstimator:
         return replace(found, posture=bent, patch=fit.patch), first.is_clear
 
     def _fit(self, candidates: Candidates, seen: Observed, target: Surface) -> PlaneFit | None:
+        """Fit a plane to the observations of a target by the chosen method."""
         observations = seen.observations
         along = np.empty(observations.n)
         places_along(observations.line, observations.laser, self._n_lines, along)
@@ -476,8 +490,8 @@ class PostureEstimator:
     ) -> Measurement | None:
         """Return the posture of a fit; None unless a second laser determines the plane's angles.
 
-        A line and one point always share a plane: an error of a single piece would not show.
-        With `of_all`, pieces that the fit has rejected count too.
+        A line and one point always share a plane: an error of a single observation would not show.
+        With `of_all`, observations that the fit has rejected count, too.
         """
         inliers = np.empty(candidates.n, np.bool_)
         laser = seen.observations.laser
@@ -487,7 +501,7 @@ class PostureEstimator:
         if second < _MIN_OBSERVATIONS:
             return None
         weights, observations = np.empty(candidates.n), seen.observations
-        # The mean plane of folds and the pseudo-inverse do not use the errors.
+        # The mean plane of folds and the pseudo-inverse do not weight by the errors.
         alike = of_all or self._fit_method is FitMethod.PSEUDO_INVERSE
         weigh_candidates(
             seen.group,
@@ -511,7 +525,7 @@ class _MeanPlane(NamedTuple):
 
 
 def _share_on(seen: Observed, patch: FloatArray, plane: Plane) -> float:
-    """Return the share of a net's strands on its surface; 1 where few strands show no folds."""
+    """Return the share of a net's strands on its surface; 1 if they are too few to show folds."""
     if seen.observations.n < _MIN_FOLDED:
         return 1.0
     strands = seen.observations
@@ -519,22 +533,19 @@ def _share_on(seen: Observed, patch: FloatArray, plane: Plane) -> float:
 
 
 def _plane_of(fit: PlaneFit) -> Plane:
+    """Return the plane of a fit, in `dome`."""
     distance = 1.0 / math.hypot(*fit.m.tolist())
     return Plane(fit.m * distance, distance)
 
 
 def _may_bend(fit: PatchFit) -> bool:
     """Return whether a net's curvature is more than chance would make of a flat net's strands."""
-    by_chance = 3.0  # In sigmas.
+    min_sigmas = 3.0  # Least significance of a curvature.
     curvature, variance = fit.patch.coefficients[3:], np.diag(fit.covariance)[3:]
-    return bool((curvature**2 > by_chance**2 * variance).any())
+    return bool((curvature**2 > min_sigmas**2 * variance).any())
 
 
-def _inflate_covariance(found: Measurement, other: Measurement) -> Measurement:
+def _inflated_by(found: Measurement, other: Measurement) -> Measurement:
     """Inflate a posture's covariance by its difference from another one."""
     one, two = found.posture, other.posture
     return replace(found, posture=inflate_covariance(one, two, 1.0)) if one and two else found
-
-
-def _refused(candidates: Candidates, refusal: Refusal) -> Measurement:
-    return Measurement(refusal, np.zeros(candidates.n, np.bool_))
