@@ -12,28 +12,29 @@ from aqualvs.geometry.compiled import lazy_borrowing_kernel
 from aqualvs.optics.rig_covariance import posture_by_plane
 from aqualvs.scanning.plane_fit import PlaneFit
 
-# Limits of the standard deviations of a posture that a pilot can use.
+# Largest standard deviations of a posture that is accepted: of the range, as a share of it, and of
+# the angles.
 _MAX_SIGMA_RANGE_SHARE = 0.05
 _MAX_SIGMA_ANGLE = np.deg2rad(5.0)
 MAX_RMS_SHARE = 0.02
-"""A plane fits a net or a wall within this share of the range, or it is not a plane."""
+"""Largest scatter of the points of a net or a wall about its plane, as a share of the range."""
 
 
 class Reason(StrEnum):
     """Reason for a refusal; the value is that of `reason` in `posture.csv`."""
 
     NO_STRIPES = "no_stripes"
-    """Nothing in the lasers' bands stands out."""
+    """No peaks in the lasers' bands."""
     TOO_FEW_POINTS = "too_few_points"
-    """Less stripe than a posture needs."""
+    """Fewer stripe points than a posture needs."""
     ONE_LASER = "one_laser"
-    """Stripes of one laser only: a line does not fix a plane."""
+    """Stripes of one laser only: a line does not determine a plane."""
     COLLINEAR = "collinear"
     """The points are almost on a line; the plane could turn about it."""
     NOT_A_PLANE = "not_a_plane"
     """Stripes that share no plane."""
     AMBIGUOUS = "ambiguous"
-    """The stripes fit two planes about as well, read as different lasers'."""
+    """Two planes, with different assignments to lasers, explain the stripes about as well."""
     NO_TARGET = "no_target"
     """Surfaces, but none of the kind that was asked for."""
     BLURRED = "blurred"
@@ -45,9 +46,9 @@ class Reason(StrEnum):
     WRONG_SIZE = "wrong_size"
     """The picture has another size than the rig's."""
     NO_FRAMES = "no_frames"
-    """A live stream is silent: there is no picture to measure in."""
+    """A live stream delivers no pictures."""
     FROZEN = "frozen"
-    """A live stream repeats its last picture; its time stamps run on."""
+    """A live stream repeats its last picture, with new time stamps."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,9 +59,9 @@ class Refusal:
     ----------
     reason : Reason
     detail : str
-        In words.
+        Description with the values that led to it.
     still_s : float
-        For how long a frozen picture has stood still at most, in seconds.
+        Upper limit of the time since the last new picture, if the picture is frozen, in seconds.
     """
 
     reason: Reason
@@ -85,7 +86,7 @@ class Posture:
         from frame to frame and that averaging reduces. A time filter needs this one.
     rig_covariance : array, shape (3, 3)
         Of the same by the uncertainty of the rig (intrinsics, dome, water, lasers): nearly the same
-        error in all frames of a dive. Zero where the rig is exact or its uncertainty was not used.
+        error in all frames of a dive. Zero if the rig is exact or its uncertainty is not used.
     normal_in_dome : array, shape (3,)
         Unit normal of the target plane, pointing away from the vehicle.
     slant_range : float
@@ -99,12 +100,12 @@ class Posture:
         surface where there is one.
     curvature, sigma_curvature : (float, float) or None
         Of a curved net along the horizontal and along the vertical, in 1/m, and their standard
-        deviations; positive where the net recedes beside the point nearest to the vehicle. Range,
-        pitch and yaw are then those of the tangent plane at that point. None for a plane.
+        deviations; positive if the net recedes from the point nearest to the vehicle. Range, pitch
+        and yaw are then those of the tangent plane at that point. None for a plane.
     by_motion : array, shape (3, 6), or None
-        Error of (range, pitch, yaw) by their rates and accelerations, in s and s², m and rad, where
-        the rows of a rolling shutter show the target at different times; `row_motion` corrects it.
-        None where it has been corrected, and where all rows are exposed at once.
+        Derivative of (range, pitch, yaw) by their rates and accelerations (s, s², m, rad): the rows of
+        a rolling shutter show the target at different times. `row_motion` corrects this error. None
+        if it has been corrected, or if all rows are exposed at once.
     """
 
     range: float
@@ -127,14 +128,14 @@ class Posture:
 
     @property
     def numbers(self) -> FloatArray:
-        """Range, pitch and yaw (3,), in m and rad."""
+        """Range, pitch and yaw as an array (3,), in m and rad."""
         return np.array([self.range, self.pitch, self.yaw])
 
     @property
     def total_covariance(self) -> FloatArray:
         """Covariance (3, 3) of (range, pitch, yaw) by frame and rig together, in m and rad.
 
-        The expected error of the posture, for use outside of the package.
+        That of the whole error of the posture, for uses that do not average frames.
         """
         return self.covariance + self.rig_covariance
 
@@ -142,7 +143,19 @@ class Posture:
 def posture_of(
     fit: PlaneFit, nearest: float, n_points: int, camera_axis_in_dome: FloatArray
 ) -> Posture:
-    """Convert a plane fit to a posture, given the number of points and the nearest distance."""
+    """Convert a plane fit to a posture.
+
+    Parameters
+    ----------
+    fit : PlaneFit
+        To the target's points in `dome`.
+    nearest : float
+        Distance of the nearest inlier, in metres.
+    n_points : int
+        Number of inliers.
+    camera_axis_in_dome : array, shape (3,)
+        Unit vector along which the slant range is measured.
+    """
     jacobian = posture_by_plane(fit.m)
     x, y, z = fit.m.tolist()
     along_x, along_y, along_z = camera_axis_in_dome.tolist()
@@ -185,7 +198,7 @@ def validate(
             f"points do not fix the plane: sigma {1e3 * sigma_range:.0f} mm, "
             f"{np.rad2deg(worst):.1f} deg",
         )
-    # Tolerance at the edge of the working range for detection noise.
+    # Tolerance at the limits of the working range for detection noise, as a share.
     range_tolerance = 0.01
     if not (1.0 - range_tolerance) * near <= distance <= (1.0 + range_tolerance) * far:
         return Refusal(
@@ -200,7 +213,7 @@ def validate(
 
 
 def deviations(covariance: FloatArray) -> tuple[float, float, float]:
-    """Return standard deviations of range (m), pitch and yaw (degrees); NaN where unknown."""
+    """Return the standard deviations of range (m), pitch and yaw (degrees); NaN if unknown."""
     variances = covariance.diagonal()[:3]
     sigma_range, pitch, yaw = np.sqrt(np.where(variances >= 0.0, variances, np.nan)).tolist()
     return sigma_range, math.degrees(pitch), math.degrees(yaw)
@@ -214,7 +227,7 @@ def range_pitch_yaw(m: FloatArray) -> tuple[float, float, float]:
 
 @lazy_borrowing_kernel
 def count_inliers(points: FloatArray, weights: FloatArray) -> tuple[int, float]:
-    """Return the number of points (N, 3) with a weight, and the least distance from the origin."""
+    """Return the number of points (N, 3) with a weight, and the distance of the nearest (m)."""
     n, square = 0, np.inf
     for i in range(points.shape[0]):
         if weights[i] > 0.0:

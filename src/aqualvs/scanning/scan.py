@@ -16,7 +16,7 @@ from aqualvs.scanning.posture import Posture, Refusal
 ImagePlane: TypeAlias = NDArray[np.uint8]
 Planes: TypeAlias = tuple[ImagePlane, tuple[ImagePlane, ImagePlane] | None]
 
-# Of grey images; of colours, which may have transparency.
+# Shapes after height and width: of grey images, of BGR, and of BGR with transparency.
 _CHANNELS = ((), (3,), (4,))
 
 # U and V by blue, green, red and 1 (BT.601, limited range).
@@ -38,10 +38,10 @@ class Frame:
     chroma : (uint8 array, uint8 array) or None
         U and V planes, shape (ceil(height/2), ceil(width/2)); None for a grey source.
     field : {"top", "bottom"} or None
-        Field that the rows are, every other one of the picture's; None for a whole picture.
+        The field whose rows these are, every other one of the picture; None for a whole picture.
     is_interlaced : bool
-        Whether the stream says that a whole picture is two fields. Its rows of chroma alternate
-        between them then, as those of luma do.
+        Whether the stream declares that a whole picture consists of two fields. Rows of chroma then
+        alternate between the fields, as rows of luma do.
     """
 
     index: int
@@ -53,13 +53,13 @@ class Frame:
 
 
 def without_neutral_chroma(frame: Frame) -> Frame:
-    """Return a frame without its chroma if that is neutral all over the picture.
+    """Return a frame without its chroma if that is neutral in the whole picture.
 
-    The pictures of a monochrome camera are often coded as colour, and say as little about colour as
-    those of a grey source. The noise of a colour camera is more than rounding.
+    Pictures of a monochrome camera are often coded as colour. The chroma of a colour camera differs
+    from neutral by more than rounding, at least by noise.
     """
     neutral, rounding = 128, 1
-    # A few rows tell of nearly every colour camera.
+    # Checking a few rows first is enough for nearly every colour camera.
     row_step = 16
     for rows in (slice(None, None, row_step), slice(None)):
         for plane in frame.chroma or ():
@@ -79,8 +79,8 @@ def planes_of_image(image: ImagePlane) -> Planes:
     Returns
     -------
     luma, chroma
-        As in `Frame`; BT.601 limited range, as videos have it. Chroma is the mean over its four
-        pixels: OpenCV's conversion takes that of one of them, which moves it by half a pixel.
+        As in `Frame`; BT.601 limited range, as in videos. Chroma is the mean over four pixels:
+        OpenCV's conversion takes that of one of them, which shifts it by half a pixel.
 
     Raises
     ------
@@ -109,17 +109,17 @@ class Label(IntEnum):
     """Label of a stripe point; `points.parquet` holds the lower-case name."""
 
     NET = 0
-    """On a surface whose stripes are broken as those on a net are."""
+    """On a surface with the stripe pattern of a net."""
     SOLID = 1
     """On a surface with unbroken stripes: the wall that is the target, a box before the net."""
     FISH = 2
-    """On something smooth and short that no two lasers see as one plane."""
+    """On a smoothly bent stripe, as on the flank of a fish."""
     BUBBLE = 3
-    """An isolated return, as high as it is wide."""
+    """An isolated bright spot, about as long as it is wide."""
     BACKGROUND = 4
     """On a surface behind the target: the tank's wall behind the net."""
     CLUTTER = 5
-    """On nothing that can be identified: marine snow, glare, fragments."""
+    """On no surface, and of no distinctive shape: marine snow, glare, fragments."""
     AMBIGUOUS = 6
     """Clutter that several lasers could have made; listed once for each of them."""
     OUT_OF_RANGE = 7
@@ -147,7 +147,7 @@ class ScanPoints:
         `Label` values.
     used : bool array, shape (N,)
         Inliers of the posture. Other points on the target lie where stripes cross, are fragments
-        of a strand, or stand out of the plane.
+        of a strand, or lie off the plane.
     """
 
     laser: NDArray[np.int8]
@@ -183,10 +183,10 @@ class ScanPoints:
 
 @dataclass(frozen=True, slots=True)
 class GyroRates:
-    """Angular velocity of the vehicle at a picture's middle, from its gyros."""
+    """Angular velocity of the vehicle at the middle of a picture's exposure, from its gyros."""
 
     rates: FloatArray  # Shape (3,): angular velocity about the axes of `dome`, in rad/s.
-    # Standard deviation of each, in rad/s, as the turning before a target that stands still.
+    # Standard deviation of each in rad/s, as rotation relative to a target at rest.
     sigma: float
 
 
@@ -205,7 +205,7 @@ class Scan:
     n_water : float
         Refractive index used.
     turning : GyroRates or None
-        None where no gyros are known.
+        None without gyros.
     """
 
     index: int
