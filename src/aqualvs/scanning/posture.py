@@ -103,9 +103,9 @@ class Posture:
         deviations; positive if the net recedes from the point nearest to the vehicle. Range, pitch
         and yaw are then those of the tangent plane at that point. None for a plane.
     by_motion : array, shape (3, 6), or None
-        Derivative of (range, pitch, yaw) by their rates and accelerations (s, s², m, rad): the rows of
-        a rolling shutter show the target at different times. `row_motion` corrects this error. None
-        if it has been corrected, or if all rows are exposed at once.
+        Derivative of (range, pitch, yaw) by their rates and accelerations (s, s², m, rad): the rows
+        of a rolling shutter show the target at different times. `row_motion` corrects this error.
+        None if it has been corrected, or if all rows are exposed at once.
     """
 
     range: float

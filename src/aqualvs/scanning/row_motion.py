@@ -1,17 +1,20 @@
-"""Correction of postures for the motion from row to row of a rolling shutter, and blur named.
+"""Correction of postures for motion during the readout of a rolling shutter; detection of blur.
 
-Every stripe point is seen at the time of its row, so that a posture is off by its `by_motion` times
-the rates and accelerations of range, pitch and yaw. These come from the frames beside it, with the
-frames' own errors by them: in frame j, at time t from the frame that is corrected,
+Every stripe point is exposed at the time of its row, so that the error of a posture is its
+`by_motion` times the rates and accelerations of range, pitch and yaw. These are estimated from the
+neighbouring frames, including their own errors by motion: in frame j, at time t from the frame that
+is corrected,
 
     measured_j = posture + t rates + t²/2 acceleration
                  + by_motion_j (rates + t acceleration, acceleration) + e_j.
 
-Frames beside it never smooth a posture: it is moved by its `by_motion` times both, no more.
-Gyros, where they are known, tell the rates of pitch and yaw too: most of all of a lone frame.
+Neighbouring frames do not smooth a posture: it is only corrected by its `by_motion` times both.
+Gyros, if there are any, measure the rates of pitch and yaw, too, which matters most for a single
+frame.
 
-The points of one frame alone tell the rates too, but worse: they bend and twist a plane. That is
-enough to take the motion out of the scatter, before surfaces are fitted and sigmas are found.
+The points of a single frame also show the rates, but less accurately: motion bends and twists a
+plane. That is enough to remove the motion from the scatter of the points, before surfaces are
+fitted and sigmas are estimated.
 """
 
 import math
@@ -37,29 +40,28 @@ from aqualvs.scanning.posture import Posture, Reason, Refusal, range_pitch_yaw
 from aqualvs.scanning.scan import GyroRates, Scan
 
 REACH = 2
-"""Frames to each side that tell the rates of a frame."""
+"""Frames on each side from which the rates of a frame are estimated."""
 
-# Frames further away tell little of the rates now.
+# Largest time between such frames, in seconds: rates change in longer times.
 _REACH_S = 0.25
-# Standard deviations of a small vehicle's motion near a net, before anything is measured: of the
-# rates of range, pitch and yaw (m/s, rad/s), of their changes (m/s², rad/s²), and of the changes of
-# these (m/s³, rad/s³): swings of 2 s.
+# Prior standard deviations of a small vehicle's motion near a net, swinging with a period of 2 s:
+# rates of range, pitch and yaw (m/s, rad/s), accelerations (m/s², rad/s²), jerks (m/s³, rad/s³).
 _RATES = np.array([0.3, np.deg2rad(20.0), np.deg2rad(20.0)])
 _ACCELERATIONS = np.array([0.5, np.deg2rad(40.0), np.deg2rad(40.0)])
 _JERKS = np.array([1.5, np.deg2rad(120.0), np.deg2rad(120.0)])
-# Some of the points are enough for it. They share the errors of their stripe: all together they
-# count as fewer still, so that a rate of which one frame tells little, such as that of the range,
-# stays near zero.
-_ENOUGH, _INDEPENDENT = 200, 30.0
+# Points of one frame that are used for its rates, at most; and their weight in independent points,
+# because they share the errors of their stripe: a rate that one frame hardly determines, such as
+# that of the range, stays near zero.
+_MAX_POINTS, _N_INDEPENDENT = 200, 30.0
 _REWEIGHTS = 3
-# Blur explains these reasons where the vehicle turns by more during an exposure: rendered nets at
-# 480 mm, meshes of 25 mm, were refused from 2.7 degrees on, and none up to 1.9.
-_BLURRED = np.deg2rad(2.5)
+# Least turn of the vehicle during an exposure by which blur explains one of these reasons. Postures
+# to rendered nets with meshes of 25 mm at 480 mm were refused from 2.7 degrees on, none up to 1.9.
+_BLUR_ANGLE = np.deg2rad(2.5)
 _BY_BLUR = (Reason.NO_STRIPES, Reason.TOO_FEW_POINTS, Reason.ONE_LASER, Reason.NOT_A_PLANE)
 
 
 class RowMotion:
-    """Motion during the pictures of one rig, from row to row and during the exposure.
+    """Correction of motion during the pictures of one rig, from row to row and in the exposure.
 
     Parameters
     ----------
@@ -72,7 +74,7 @@ class RowMotion:
         self._axis_in_dome = rig.dome_from_cam.rotate([0.0, 0.0, 1.0])
 
     def stilled(self, candidates: Candidates, on_target: BoolArray, plane: Plane) -> Candidates:
-        """Return candidates without the motion that one frame shows.
+        """Return candidates with their points at the picture's middle, by the frame's own rates.
 
         Parameters
         ----------
@@ -81,10 +83,10 @@ class RowMotion:
         on_target : bool array, shape (N,)
             Candidates on the target.
         plane : Plane
-            Of the target, roughly.
+            Approximate plane of the target.
         """
         seen = np.flatnonzero(on_target)
-        seen = seen[:: -(-len(seen) // _ENOUGH)]
+        seen = seen[:: -(-len(seen) // _MAX_POINTS)]
         times, m = self._times(candidates.pixels), plane.normal / plane.offset
         sigma = np.abs(candidates.sensitivity[seen] @ m) * candidates.sigma_px[seen] + 1e-12
         m, m_rate = _fit_rates(candidates.points[seen], sigma, times[seen], m)
@@ -98,9 +100,9 @@ class RowMotion:
         seen: Candidates,
         weights: FloatArray,
     ) -> Posture:
-        """Return the posture to `stilled` candidates as that to the candidates themselves.
+        """Convert a posture to `stilled` candidates to that to the candidates themselves.
 
-        It has `by_motion`, and how `stilled` moved the points is no longer in it.
+        The shift of the points by `stilled` is undone to first order, and `by_motion` is added.
 
         Parameters
         ----------
@@ -108,13 +110,13 @@ class RowMotion:
         surface : FittedSurface
             Surface of the posture.
         still, seen : Candidates
-            N of them, to which it was fitted, and as they were before.
+            N of them: after `stilled`, to which the surface was fitted, and before.
         weights : array, shape (N,)
-            1 over the variance of the residual, or 0.
+            1 over the variance of the residual; 0 for candidates that were not used.
         """
         m = posture.normal_in_dome / posture.range
         matrix, moved = np.diag(surface.prior), np.zeros((len(surface.prior), 7))
-        # An exposure shows the mean of its own times.
+        # Variance of the times within an exposure.
         spread = self._shutter.exposure**2 / 12.0
         times, terms = self._times(seen.pixels), np.ascontiguousarray(surface.terms)
         _sum_up(terms, weights, seen.points, still.points, times, spread, m, matrix, moved)
@@ -127,33 +129,33 @@ class RowMotion:
         by_motion = np.empty((3, 6))
         by_motion[:, :3] = by_m @ m_moved[:, :3] @ to_m
         by_motion[:, 3:] = by_m @ m_moved[:, 3:6] @ to_m
-        return replace(self._on(posture, m), by_motion=by_motion)
+        return replace(self._with_plane(posture, m), by_motion=by_motion)
 
     def correct(self, scan: Scan, beside: Sequence[Scan]) -> Scan:
-        """Return a scan with posture and points as they are at the picture's middle.
+        """Return a scan with posture and points at the middle of the picture's readout.
 
-        Points move as the target does if it turns about the dome's centre: how it slides along
-        itself, or rolls, no posture tells. Their pixels stay as seen.
+        Points move as if the target turned about the dome's centre: postures do not show a motion
+        along the target, nor roll. Their pixels stay as measured.
 
         Parameters
         ----------
         scan : Scan
-            As the scanner measured it; without a posture, its reason is `BLURRED` where the frames
-            beside it say so.
+            As the scanner measured it. A refusal gets the reason `BLURRED` if the neighbouring
+            frames show that the vehicle turned too fast.
         beside : sequence of Scan
-            Scans just before and after, as measured; in a live run, those before alone.
+            Neighbouring scans before and after, as measured; in a live run, only those before.
         """
         posture = scan.posture
         if isinstance(posture, Refusal):
-            return replace(scan, posture=self._with_blur_named(scan, posture, beside))
+            return replace(scan, posture=self._named_blurred(scan, posture, beside))
         by_motion = posture.by_motion
         if by_motion is None:
             return scan
         motion, covariance = motion_beside(scan, beside)
         m, m_rate = _at_middle(posture, by_motion, motion)
-        off = self._off_by_light(motion[:3], posture.range)
+        off = self._error_of_brightness(motion[:3], posture.range)
         corrected = replace(
-            self._on(posture, m),
+            self._with_plane(posture, m),
             covariance=posture.covariance
             + by_motion @ covariance @ by_motion.T
             + np.outer(off, off),
@@ -166,7 +168,7 @@ class RowMotion:
             corrected = replace(corrected, nearest=nearest)
         return replace(scan, posture=corrected, points=replace(points, points_in_dome=moved))
 
-    def _with_blur_named(self, scan: Scan, refusal: Refusal, beside: Sequence[Scan]) -> Refusal:
+    def _named_blurred(self, scan: Scan, refusal: Refusal, beside: Sequence[Scan]) -> Refusal:
         """Return a refusal with the reason `BLURRED` if the vehicle turned too fast."""
         near = [one for one in beside if one.posture and abs(one.time_s - scan.time_s) < _REACH_S]
         near.sort(key=lambda one: abs(one.time_s - scan.time_s))
@@ -177,7 +179,7 @@ class RowMotion:
             return refusal
         exposure = self._shutter.exposure
         turned = float(np.hypot(*(other.numbers - one.numbers)[1:])) / abs(u - t) * exposure
-        if turned < _BLURRED:
+        if turned < _BLUR_ANGLE:
             return refusal
         return Refusal(
             Reason.BLURRED,
@@ -201,43 +203,49 @@ class RowMotion:
             by_motion=None,
         )
 
-    def _off_by_light(self, rates: FloatArray, distance: float) -> FloatArray:
-        """Return the error (3,) of a posture by light that changes during the exposure.
+    def _error_of_brightness(self, rates: FloatArray, distance: float) -> FloatArray:
+        """Return the error (3,) of a posture by stripes whose brightness changes in the exposure.
 
-        Stripes are brighter while the target is near, and so their mean is of another time than the
-        exposure's middle.
+        Stripes are brighter while the target is near, so that their mean position is that at
+        another time than the exposure's middle.
         """
-        # Of the distance, by which light falls: a sheet spreads, its stripe is seen smaller, and
-        # water dims it to and fro.
+        # Brightness falls with this power of the distance: the sheet spreads, the stripe appears
+        # smaller, and water absorbs light on both ways.
         power = 3.0
         late = power * rates[0] / distance * self._shutter.exposure**2 / 12.0
         error: FloatArray = late * rates
         return error
 
-    def _on(self, posture: Posture, m: FloatArray) -> Posture:
+    def _with_plane(self, posture: Posture, m: FloatArray) -> Posture:
         """Return a posture as that to the plane m·X = 1."""
         return self.moved(posture, np.array(range_pitch_yaw(m)) - posture.numbers)
 
     def _times(self, pixels: FloatArray) -> FloatArray:
+        """Return the time (N,) of each pixel's row from the picture's middle, in seconds."""
         return self._shutter.row_times(pixels[:, 1], self._height)
 
 
 def _fit_rates(
     points: FloatArray, sigma: FloatArray, times: FloatArray, m: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the plane m·X = 1 at time 0 and the rate of m, from points (N, 3) at their times.
+    """Fit the plane m·X = 1 at time 0 and the rate of m to points at different times.
 
     Parameters
     ----------
     points, sigma, times : array, shape (N, 3), (N,), (N,)
         In `dome` (m); standard deviations of m·X; seconds.
     m : array, shape (3,)
-        A first m.
+        Initial m.
+
+    Returns
+    -------
+    m, m_rate : array, shape (3,)
+        In 1/m and 1/(m s); the initial m and zero if the points do not determine them.
     """
     prior, both = np.zeros((6, 6)), np.concatenate([m, np.zeros(3)])
     scaled = posture_by_plane(m) / _RATES[:, None]
     prior[3:, 3:] = scaled.T @ scaled
-    share = min(_INDEPENDENT / max(len(points), 1), 1.0)
+    share = min(_N_INDEPENDENT / max(len(points), 1), 1.0)
     if not _reweight(points, sigma, times, prior, share, both):
         return m, np.zeros(3)
     return both[:3], both[3:]
@@ -252,9 +260,9 @@ def _reweight(
     share: float,
     both: FloatArray,
 ) -> bool:
-    """Fit m and its rate, one after the other in `both` (6,), with Tukey's weights times a share.
+    """Fit m and its rate, concatenated in `both` (6,), with Tukey's weights times `share`.
 
-    Return False where neither points nor prior tell one of them.
+    `prior` (6, 6) is the prior information. Return False if the fit is singular.
     """
     n = len(points)
     z, matrix, right, term = np.empty(n), np.empty((6, 6)), np.empty(6), np.empty(6)
@@ -295,11 +303,11 @@ def _sum_up(
     matrix: FloatArray,
     moved: FloatArray,
 ) -> None:
-    """Add the normal matrix (K, K) of N points, and what motion adds to its right side (K, 7).
+    """Add the normal matrix (K, K) of N points, and the change of its right side by motion (K, 7).
 
-    At its time t a point lies on the plane m + t rate + t²/2 acceleration, and so off m by the rest
-    times X: columns for the rate, for the acceleration, and for what took points from where they
-    were `seen`.
+    At time t a point lies on the plane m + t rate + t²/2 acceleration, and so off the plane m by
+    the difference times X. The columns are for the rates, the accelerations, and the shift from
+    `seen` to `still`.
 
     Parameters
     ----------
@@ -331,9 +339,9 @@ def _sum_up(
 
 
 def motion_beside(scan: Scan, beside: Sequence[Scan]) -> tuple[FloatArray, FloatArray]:
-    """Return the motion (6,) at a scan, and its covariance (6, 6).
+    """Estimate the motion (6,) at a scan, and its covariance (6, 6).
 
-    It is the rates of range, pitch and yaw, then their accelerations.
+    The motion is the rates of range, pitch and yaw, then their accelerations.
 
     Parameters
     ----------
@@ -352,7 +360,7 @@ def motion_beside(scan: Scan, beside: Sequence[Scan]) -> tuple[FloatArray, Float
         if is_near and isinstance(found, Posture) and found.by_motion is not None:
             known.append((after, found, found.by_motion))
     motion, covariance = np.empty(12), np.empty((12, 12))
-    _weigh_motions(
+    _estimate_motion(
         np.array([after for after, _, _ in known]),
         np.array([found.numbers for _, found, _ in known]),
         np.array([found.covariance for _, found, _ in known]),
@@ -368,7 +376,7 @@ def motion_beside(scan: Scan, beside: Sequence[Scan]) -> tuple[FloatArray, Float
 
 
 @kernel
-def _weigh_motions(
+def _estimate_motion(
     t: FloatArray,
     numbers: FloatArray,
     covariances: FloatArray,
@@ -377,38 +385,39 @@ def _weigh_motions(
     motion: FloatArray,
     covariance: FloatArray,
 ) -> None:
-    """Write posture and motion (12,) at the first of some frames, and their covariance (12, 12).
+    """Estimate posture and motion (12,) at the first of F frames, with their covariance (12, 12).
 
-    Unknowns are the posture, relative to what the first frame measured, its rates, its
-    accelerations, and how these change, of which the error during a picture is nothing.
+    Unknowns are the posture, relative to that measured in the first frame, its rates,
+    accelerations and jerks. Jerks during a picture are neglected.
 
     Parameters
     ----------
     t : array, shape (F,)
-        Times from the first frame.
+        Times from the first frame, in seconds.
     numbers, covariances, by_motion : array, shape (F, 3), (F, 3, 3), (F, 3, 6)
-        Range, pitch and yaw, and what belongs to them.
+        Range, pitch and yaw, in m and rad; their covariance and derivative as in `Posture`.
     variances : array, shape (9,)
-        Of the motion, before anything is measured.
-    motion, covariance : array
+        Prior variances of rates, accelerations and jerks.
+    motion, covariance : array, shape (12,), (12, 12)
+        Written.
     """
     matrix, right = np.zeros((12, 12)), np.zeros(12)
     for k in range(9):
         matrix[3 + k, 3 + k] = 1.0 / variances[k]
-    by, off, weighed = np.empty((3, 12)), np.empty(3), np.empty((3, 3))
+    by, off, information = np.empty((3, 12)), np.empty(3), np.empty((3, 3))
     for f in range(len(t)):
         off[:] = numbers[f] - numbers[0]
         _fill_terms(t[f], by_motion[f], by)
         both = covariances[f] + covariances[0]
-        agrees = f == 0 or _agree(off, by, by_motion[0], variances, both)
-        if not agrees or not cholesky(covariances[f], 0.0, 0.0, weighed):
+        agrees = f == 0 or _is_consistent(off, by, by_motion[0], variances, both)
+        if not agrees or not cholesky(covariances[f], 0.0, 0.0, information):
             continue
-        weighed[:] = cholesky_inverse(weighed)
+        information[:] = cholesky_inverse(information)
         for a in range(12):
             for i in range(3):
                 term = 0.0
                 for j in range(3):
-                    term += by[j, a] * weighed[j, i]
+                    term += by[j, a] * information[j, i]
                 right[a] += term * off[i]
                 for b in range(12):
                     matrix[a, b] += term * by[i, b]
@@ -419,7 +428,7 @@ def _weigh_motions(
 
 @borrowing_kernel
 def _fill_terms(t: float, by_motion: FloatArray, by: FloatArray) -> None:
-    """Write the derivatives (3, 12) of what a frame measures at a time, by all unknowns."""
+    """Write the derivatives (3, 12) of the posture measured at time t by all unknowns."""
     for i in range(3):
         for k in range(3):
             same = 1.0 if i == k else 0.0
@@ -430,21 +439,21 @@ def _fill_terms(t: float, by_motion: FloatArray, by: FloatArray) -> None:
 
 
 @kernel
-def _agree(
+def _is_consistent(
     off: FloatArray,
     by: FloatArray,
     by_motion_of_first: FloatArray,
     variances: FloatArray,
     expected: FloatArray,
 ) -> bool:
-    """Return whether two frames show one surface, from their difference (3,).
+    """Return whether two frames may show the same surface, given their difference (3,).
 
-    `expected` (3, 3), the sum of their covariances, is used up.
+    `expected` (3, 3), the sum of their covariances, is overwritten.
     """
-    # A squared Mahalanobis distance that is larger once in 1000 times by chance, of 3 values.
+    # Quantile 0.999 of the squared Mahalanobis distance (chi-squared, 3 degrees of freedom).
     gate = 16.27
-    # Of the difference, in which what both have in common is not.
-    of_both, told = by[:, 3:].copy(), np.empty(3)
+    # Derivative of the difference by the motion; the posture itself cancels.
+    of_both, solved = by[:, 3:].copy(), np.empty(3)
     of_both[:, :6] -= by_motion_of_first
     for i in range(3):
         for j in range(3):
@@ -452,22 +461,22 @@ def _agree(
                 expected[i, j] += of_both[i, k] * variances[k] * of_both[j, k]
     if not cholesky(expected, 0.0, 0.0, expected):
         return False
-    cholesky_solve(expected, off, told)
-    return bool(off[0] * told[0] + off[1] * told[1] + off[2] * told[2] <= gate)
+    cholesky_solve(expected, off, solved)
+    return bool(off[0] * solved[0] + off[1] * solved[1] + off[2] * solved[2] <= gate)
 
 
 def _with_gyros(
     motion: FloatArray, covariance: FloatArray, posture: Posture, turning: GyroRates
 ) -> tuple[FloatArray, FloatArray]:
-    """Return a motion and its covariance as gyros change them."""
+    """Update a motion (6,) and its covariance (6, 6) by gyros, as a Kalman filter does."""
     m = posture.normal_in_dome / posture.range
-    # A target that stands still turns against the vehicle; its distance does not change by that.
+    # Pitch and yaw rates of a target at rest, by the vehicle's rotation; its range does not change.
     by_turning = (posture_by_plane(m) @ np.cross(m, np.eye(3)).T)[1:]
     angles = slice(1, 3)
     off = by_turning @ turning.rates - motion[angles]
     expected = covariance[angles, angles] + turning.sigma**2 * by_turning @ by_turning.T
-    # A squared Mahalanobis distance that is larger once in 1000 times by chance, of 2 values: the
-    # target moves by itself, or the gyros are not the vehicle's.
+    # Quantile 0.999 of the squared Mahalanobis distance (chi-squared, 2 degrees of freedom). Beyond
+    # it the target moves itself, or the gyros are not the vehicle's.
     gate = 13.82
     if not off @ np.linalg.solve(expected, off) <= gate:
         return motion, covariance
@@ -478,11 +487,10 @@ def _with_gyros(
 def _at_middle(
     posture: Posture, by_motion: FloatArray, motion: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the plane m·X = 1 at the picture's middle, and the rate of m.
+    """Return m (3,) of the plane m·X = 1 at the picture's middle, and its rate (3,).
 
-    Rows that show it moving give a plane that is off by constants times rate and acceleration of m.
-    Range, pitch and yaw are not so simple: a plane that leans by 1.3 degrees, as by 0.3 m/s, is
-    nearer by 0.03 %.
+    The error of m by motion is linear in its rate and acceleration. That of range, pitch and yaw is
+    not: a plane that is tilted by 1.3 degrees, as at 0.3 m/s, is nearer by 0.03 %.
     """
     exposed = posture.normal_in_dome / posture.range
     by_m = posture_by_plane(exposed)
@@ -504,9 +512,12 @@ def _go_to_middle(
     m: FloatArray,
     m_rate: FloatArray,
 ) -> None:
-    """Write m at the picture's middle over a first guess, and its rate."""
+    """Replace an initial m by that at the picture's middle; write its rate.
+
+    Rate and acceleration of m are central differences over 0.01 s.
+    """
     step, before, after = 0.01, np.empty(3), np.empty(3)
-    # The motion of m depends on m itself; each round leaves 2 % of the error.
+    # The motion of m depends on m itself; each round reduces the error to 2 %.
     rounds = 2
     for _ in range(rounds):
         distance = 1.0 / math.sqrt(m[0] * m[0] + m[1] * m[1] + m[2] * m[2])
@@ -528,7 +539,7 @@ def _go_to_middle(
 
 
 def _plane_of(numbers: FloatArray) -> FloatArray:
-    """Return m of range, pitch and yaw, in m and rad."""
+    """Return m (3,) of the plane m·X = 1 with a range (m), pitch and yaw (rad)."""
     distance, pitch, yaw = numbers.tolist()
     x, z = math.tan(yaw), math.tan(pitch)
     scale = 1.0 / (distance * math.sqrt(x * x + 1.0 + z * z))
@@ -538,9 +549,9 @@ def _plane_of(numbers: FloatArray) -> FloatArray:
 def _moved_back(
     points: FloatArray, times: FloatArray, m: FloatArray, m_rate: FloatArray
 ) -> FloatArray:
-    """Return points (N, 3) where they are at time 0.
+    """Return the positions at time 0 of points (N, 3) that were seen at different times (N,).
 
-    Each was seen at its time (N,), and turns and moves with the plane m·X = 1.
+    They turn and move with the plane m·X = 1.
     """
     distance = float(1.0 / np.linalg.norm(m))
     normal = m * distance
@@ -560,7 +571,7 @@ def _move_back(
     approach: float,
     moved: FloatArray,
 ) -> None:
-    """Write points (N, 3) less their times times their velocities.
+    """Write points (N, 3) minus their times (N,) times their velocities.
 
     The velocity at X is (n·X) turned - (turned·X + approach) n, with the unit normal n.
     """
