@@ -1,8 +1,8 @@
 """The paper's stripe detection (section 3.1), and its mesh filter behind either detector.
 
-For comparison: every pixel above one threshold is detected. Bright pixels that follow one another
-on a search line are one peak; its position and width determine them exactly, and
-`pixels_of_peaks` gives them back one by one.
+For comparison: every pixel above one threshold is detected. Consecutive bright pixels on a search
+line are one peak; its position and width determine them exactly, and `pixels_of_peaks` returns them
+one by one.
 
 The paper treats every bright pixel as a point of its own, so that its regions count the lit cells
 of whole reflections. `PaperFilter` passes peaks of the threshold detector to the mesh filter in
@@ -24,11 +24,12 @@ from aqualvs.scanning.paper.mesh_filter import MeshFilterOptions, mesh_filter
 from aqualvs.scanning.stripe import StripePeaks, ThresholdOptions
 from aqualvs.scanning.triangulate import Triangulator
 
+# Grey levels of 8-bit images.
 _LEVELS = 256
 
 
 class ThresholdDetector:
-    """Detector of the bright pixels on every search line of one direction, inside its band.
+    """Detector of the bright pixels on every search line of one direction, inside the band.
 
     Parameters
     ----------
@@ -39,7 +40,6 @@ class ThresholdDetector:
     lowest, highest : int array, shape (n_lines,)
         First and last position of interest on each line (an empty interval skips the line).
     options : ThresholdOptions
-        Options.
     """
 
     def __init__(
@@ -54,11 +54,11 @@ class ThresholdDetector:
         length = size_px[0] if axis is SearchAxis.ALONG_X else size_px[1]
         along = np.arange(length)
         self._in_band: BoolArray = (lowest[:, None] <= along) & (along <= highest[:, None])
-        # Zero outside the band; the zeros of one more column end the runs of every line.
+        # Zero outside the band; an additional column of zeros ends the runs of every line.
         self._lines: NDArray[np.uint8] = np.zeros((len(lowest), length + 1), np.uint8)
 
     def detect(self, lines: NDArray[np.uint8]) -> StripePeaks:
-        """Find the runs of bright pixels of one frame; colour is ignored.
+        """Find the runs of bright pixels of one frame; ignore colour.
 
         Parameters
         ----------
@@ -67,9 +67,9 @@ class ThresholdDetector:
 
         Returns
         -------
-        found : Returns
-            Position is the middle of a run, width the number of its pixels, height its brightest
-            value.
+        StripePeaks
+            Position is the middle of a run, width the number of its pixels, height its largest grey
+            level.
         """
         np.multiply(lines, self._in_band, out=self._lines[:, :-1])
         flat = self._lines.ravel()
@@ -88,7 +88,7 @@ class ThresholdDetector:
         )
 
     def _raised_level(self, flat: NDArray[np.uint8]) -> int:
-        """Return the lowest level at which both limits hold; 256 where none is."""
+        """Return the lowest level at which both limits hold; 256 if there is none."""
         # A run begins where a pixel reaches a level and the one before it does not.
         inside = np.minimum(flat[1:], flat[:-1])
         n_pixels, n_inside = _counts_from(flat), _counts_from(inside)
@@ -99,10 +99,10 @@ class ThresholdDetector:
 
 
 def pixels_of_peaks(position: FloatArray, width: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Return the pixels of peaks, along their search lines.
+    """Return the pixels of N peaks, along their search lines.
 
-    A peak of the threshold detector gives its bright pixels, each once; a sub-pixel one those
-    above half its height, at least one.
+    These are the bright pixels of a peak of the threshold detector, each once; of a sub-pixel peak,
+    those above half its height, at least one.
 
     Parameters
     ----------
@@ -114,7 +114,7 @@ def pixels_of_peaks(position: FloatArray, width: FloatArray) -> tuple[IntArray, 
     source : int array, shape (M,)
         Row of the peak that each pixel belongs to, ascending.
     place : array, shape (M,)
-        Whole position of each pixel.
+        Integer position of each pixel.
     """
     first, last = np.ceil(position - 0.5 * width), np.floor(position + 0.5 * width)
     none = last < first
@@ -137,11 +137,12 @@ def _runs(flat: NDArray[np.uint8], level: int) -> tuple[IntArray, IntArray]:
 
 
 def _counts_from(values: NDArray[np.uint8]) -> IntArray:
-    """Return how many values are at least 0, 1, ... 255."""
+    """Return the number of values (256,) that are at least 0, 1, ... 255."""
     return np.cumsum(np.bincount(values, minlength=_LEVELS)[::-1])[::-1]
 
 
 def _brightest(flat: NDArray[np.uint8], first: IntArray, end: IntArray) -> FloatArray:
+    """Return the largest grey level of each run."""
     if not len(first):
         return np.empty(0)
     bounds = np.column_stack([first, end]).ravel()
@@ -150,18 +151,18 @@ def _brightest(flat: NDArray[np.uint8], first: IntArray, end: IntArray) -> Float
 
 @dataclass(frozen=True, slots=True)
 class FilteredPeaks:
-    """Points of N peaks as the paper's filter takes them, M of them, and its answer."""
+    """M points of N peaks, in the form of the paper's filter, and its result."""
 
     source: IntArray  # Shape (M,): row of the peak that each point belongs to, ascending.
     laser: IntArray  # Shape (M,): index of its laser.
     pixels: FloatArray  # Shape (M, 2): in `image`.
-    # Shape (M, 3): metres. A pixel whose ray misses the laser's sheet is no point.
+    # Shape (M, 3): metres. Pixels whose ray misses the laser's sheet are left out.
     points_in_dome: FloatArray
     # Shape (M,): points that the filter keeps.
     on_mesh: BoolArray
 
     def peaks_on_mesh(self, n: int) -> BoolArray:
-        """Return which of the N peaks have more than half of their points on the mesh."""
+        """Mark the peaks (N,) that have more than half of their points on the mesh."""
         n_points = np.bincount(self.source, minlength=n)
         n_on_mesh = np.bincount(self.source[self.on_mesh], minlength=n)
         return np.asarray(2 * n_on_mesh > n_points)
@@ -200,7 +201,7 @@ class PaperFilter:
         self._along_x = np.array([one.axis is SearchAxis.ALONG_X for one in laser_bands], np.int64)
 
     def apply(self, pixels: FloatArray, width: FloatArray, laser: IntArray) -> FilteredPeaks:
-        """Triangulate the peaks, and filter the points of each laser.
+        """Triangulate N peaks, and filter the points of each laser.
 
         Parameters
         ----------
@@ -209,8 +210,8 @@ class PaperFilter:
         width : array, shape (N,)
             As in `StripePeaks`.
         laser : int array, shape (N,)
-            Index of the laser that made each peak. The paper divides its picture by hand into
-            one area for each laser.
+            Index of the laser of each peak. In the paper, its picture is divided by hand into one
+            area for each laser.
         """
         source, each = self._places(pixels, width, laser)
         of_laser = laser[source]

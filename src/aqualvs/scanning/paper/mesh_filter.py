@@ -26,7 +26,7 @@ from aqualvs.geometry.transforms import SE3
 class Limits(NamedTuple):
     """Limits by which a cell belongs to the mesh (paper, Algorithm 1)."""
 
-    # Greatest squared distance, in cells, of the cells of the regions A, B and C.
+    # Largest squared distance, in cells, of the cells of the regions A, B and C.
     a: int
     b: int
     c: int
@@ -53,19 +53,19 @@ class _Numbering(NamedTuple):
 class _Blocks(NamedTuple):
     """Cells sorted by the block that they lie in."""
 
-    # Shape (n_cells,): the cells, block by block. Whole numbers kept as floats, which processors
-    # square faster.
+    # Shape (n_cells,): the cells (m, n), block by block. Floats, because processors square
+    # them faster.
     m: FloatArray
     n: FloatArray
     # Shape (n_blocks + 1,): where every block begins.
     start: IntArray
-    # Shape (n_cells,): where every cell went.
+    # Shape (n_cells,): index of every cell in `m` and `n`.
     place: IntArray
 
 
 @kernel
 def keep_points(columns: IntArray, rows: IntArray, limits: Limits, out: BoolArray) -> None:
-    """Decide Algorithm 1 of the paper for points in cells (columns, rows), each of shape (N,)."""
+    """Run Algorithm 1 of the paper for points in cells (columns, rows), each of shape (N,)."""
     cells = _number_pairs(columns, rows)
     m, n = columns[cells.first], rows[cells.first]
     block_m, block_n = m // limits.reach, n // limits.reach
@@ -143,7 +143,7 @@ def _sort_by_block(m: IntArray, n: IntArray, known: _Numbering) -> _Blocks:
 def _neighbours(
     block_m: IntArray, block_n: IntArray, home: int, known: _Numbering, near: IntArray
 ) -> int:
-    """Write the numbers of the blocks around a cell's block, and itself; return how many."""
+    """Write the numbers of a cell's block and of the blocks around it; return how many exist."""
     count = 0
     for bm in range(block_m[home] - 1, block_m[home] + 2):
         for bn in range(block_n[home] - 1, block_n[home] + 2):
@@ -166,7 +166,7 @@ def _belongs(blocks: _Blocks, place: int, near: IntArray, n_near: int, limits: L
             in_a += distance <= limits.a
             in_ab += distance <= limits.b
             in_abc += distance <= limits.c
-        # Counts only grow: a cell amid a wall or a fish needs no further counting.
+        # Counts only grow: most cells on a wall or a fish need no further counting.
         if in_abc > limits.max_in_ab + limits.max_in_c:
             return False
     in_c = in_abc - in_ab
@@ -178,7 +178,7 @@ def _belongs(blocks: _Blocks, place: int, near: IntArray, n_near: int, limits: L
 
 
 _FORWARD, _UP = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])
-# Lengths that are whole numbers of cells must not fall beside them by a rounding.
+# Tolerance of rounding for lengths that are integer multiples of a cell, as a share.
 _ROUNDING = 1e-9
 
 
@@ -194,7 +194,7 @@ class MeshFilterOptions:
 
     rd_theta: float = 10e-3  # Size of a thread's reflection along the stripe.
     dd: float = 1e-3  # Side of a cell of the laser-plane image.
-    # Least and greatest distance between consecutive threads, centre to centre, in the laser plane.
+    # Smallest and largest distance of consecutive threads, centre to centre, in the laser plane.
     r_min: float = 15e-3
     r_max: float = 35e-3
 
@@ -231,12 +231,12 @@ class MeshFilterOptions:
 
     @property
     def dg_theta(self) -> int:
-        """Most cells that a thread's reflection can light, dg_theta = ceil(rd_theta / dd) + 1."""
+        """Largest number of cells of a thread's reflection, dg_theta = ceil(rd_theta / dd) + 1."""
         return math.ceil(self.rd_theta / self.dd - _ROUNDING) + 1
 
     @property
     def squared_radii(self) -> tuple[int, int, int]:
-        """Greatest squared distance, in cells, of cells in the regions A, B and C.
+        """Largest squared distance, in cells, of cells in the regions A, B and C.
 
         B and C begin where the region before them ends; B is empty when r_min <= rd_theta.
         """
@@ -247,7 +247,7 @@ class MeshFilterOptions:
 
     @property
     def padding(self) -> int:
-        """rho_pad, in cells: how far the regions reach, ceil((r_max + rd_theta / 2) / dd)."""
+        """Reach of the regions in cells, rho_pad = ceil((r_max + rd_theta / 2) / dd)."""
         return math.ceil((self.r_max + self.rd_theta / 2.0) / self.dd - _ROUNDING)
 
 
@@ -279,8 +279,7 @@ def laser_frame(plane: Plane) -> SE3:
         have z = 0 in `laser`.
     """
     e_z = plane.normal
-    # A forward axis whose projection into the laser plane is shorter has no direction worth
-    # following.
+    # Least length of the forward axis projected into the laser plane; rounding dominates below.
     degenerate = 1e-6
     square_to_forward = math.hypot(e_z[0], e_z[2]) < degenerate
     e_y = _in_plane(_UP if square_to_forward else _FORWARD, e_z)
@@ -289,10 +288,10 @@ def laser_frame(plane: Plane) -> SE3:
 
 
 def _in_plane(axis: FloatArray, normal: FloatArray) -> FloatArray:
-    """Return the direction of an axis projected into a plane to which it is not square."""
+    """Return the unit vector of an axis projected into a plane to which it is not normal."""
     direction = axis - normal * (normal @ axis)
     direction /= np.linalg.norm(direction)
-    # What the first projection left along the normal grew when a short result became a unit.
+    # Again, because normalising a short projection magnifies its rounding error along the normal.
     direction -= normal * (normal @ direction)
     return direction / np.linalg.norm(direction)
 
