@@ -6,7 +6,13 @@ import pytest
 from aqualvs.geometry.planes import Plane
 from aqualvs.scanning.observations import Observations
 from aqualvs.scanning.paraboloid import fit_patch, shows_curvature
-from aqualvs.scanning.patch import FLAT, Patch, flat_patch, nearest_tangent, tangent_covariance
+from aqualvs.scanning.patch import (
+    Patch,
+    heights_over,
+    nearest_tangent,
+    packed_plane,
+    tangent_covariance,
+)
 from aqualvs.scanning.plane_fit import SharedError
 
 BASE = Plane.from_normal([0.1, 1.0, -0.05], 0.6)
@@ -52,14 +58,15 @@ def shared(seen: Observations) -> SharedError:
 
 
 def patch_of(*coefficients: float) -> Patch:
-    flat = flat_patch(BASE)
+    flat = Patch.unpacked(BASE, packed_plane(BASE))
     return Patch(BASE, flat.right, flat.up, np.array(coefficients))
 
 
 def test_a_flat_patch_measures_heights_as_its_plane_does() -> None:
     points = np.random.default_rng(0).normal(0.0, 0.3, (50, 3))
-    patch = flat_patch(BASE)
-    np.testing.assert_allclose(patch.height(points), BASE.signed_distance(points), atol=1e-15)
+    patch, height = Patch.unpacked(BASE, packed_plane(BASE)), np.empty(50)
+    heights_over(points, patch.packed(), height)
+    np.testing.assert_allclose(height, BASE.signed_distance(points), atol=1e-15)
     assert abs(patch.right @ BASE.normal) < 1e-15
     # u to the right, v upward.
     assert patch.right[0] > 0.9
@@ -83,7 +90,7 @@ def test_curvature_is_found_with_its_sigma(bend: tuple[float, float, float]) -> 
 
 
 def test_a_plane_is_left_a_plane() -> None:
-    seen = observed(patch_of(*FLAT))
+    seen = observed(patch_of(*np.zeros(6)))
     found = fit_patch(seen, BASE, shared(seen))
     assert found is not None
     assert not found.is_clear

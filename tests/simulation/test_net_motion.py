@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from aqualvs.errors import OptionError
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
-from aqualvs.scanning.patch import Patch, flat_patch, nearest_tangent
+from aqualvs.scanning.patch import Patch, nearest_tangent, packed_plane
 from aqualvs.scanning.posture import range_pitch_yaw
 from aqualvs.simulation.net_motion import NetWall
 from aqualvs.simulation.render import Renderer
@@ -88,7 +88,8 @@ def lit_points(wall: NetWall, pose: SE3, twine: float) -> tuple[np.ndarray, Scen
 def lit_posture(wall: NetWall, pose: SE3, twine: float) -> np.ndarray:
     """Posture from the lit points of a fine net: a paraboloid by least squares."""
     points, scene = lit_points(wall, pose, twine)
-    flat = flat_patch(scene.target_plane())
+    plane = scene.target_plane()
+    flat = Patch.unpacked(plane, packed_plane(plane))
     u, v = points @ flat.right, points @ flat.up
     terms = np.stack([np.ones_like(u), u, v, 0.5 * u * u, u * v, 0.5 * v * v], axis=-1)
     fit = np.linalg.lstsq(terms, flat.base.signed_distance(points), rcond=None)[0]

@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 FloatArray: TypeAlias = NDArray[np.float64]
 BoolArray: TypeAlias = NDArray[np.bool_]
 IntArray: TypeAlias = NDArray[np.int64]
+U8Array: TypeAlias = NDArray[np.uint8]
 
 
 def as_vectors(values: ArrayLike, size: int, name: str) -> FloatArray:

@@ -350,25 +350,11 @@ def find_candidates(
     for i, (band, found) in enumerate(zip(laser_bands, by_search, strict=True)):
         n = append_candidates(found, band.lines, i, found is along_x, best_height, n, tables)
     points, sensitivity, valid = np.empty((n, 3)), np.empty((n, 3)), np.empty(n, np.bool_)
-    source, laser, line, component, subsegment, along = tables.numbers[:, :n]
-    height, width, sigma_px, confidence, pull = tables.measures[:, :n]
-    pixels = tables.pixels[:n]
+    pixels, numbers = tables.pixels[:n], tables.numbers[:, :n]
     all_valid = triangulator.triangulate_into(
-        pixels, along, laser, subsegment, points, sensitivity, valid
+        pixels, numbers[ALONG_X], numbers[LASER], numbers[SUBSEGMENT], points, sensitivity, valid
     )
-    candidates = Candidates(
-        source,
-        laser,
-        line,
-        component,
-        subsegment,
-        pixels,
-        height,
-        width,
-        sigma_px,
-        confidence,
-        pull,
-        points,
-        sensitivity,
-    )
+    # The rows of the tables are in the order of the fields.
+    measures = tables.measures[:, :n]
+    candidates = Candidates(*numbers[:ALONG_X], pixels, *measures, points, sensitivity)
     return candidates if all_valid else candidates.where(valid)

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from aqualvs.errors import FrameError
-from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray, U8Array
 from aqualvs.geometry.compiled import inline_kernel, inner_kernel, kernel, lazy_kernel
 from aqualvs.geometry.linear_algebra import flatnonzero, hypot, lower_quantile, take
 from aqualvs.optics.shutter import FIRST_ROW, Field
@@ -41,7 +41,6 @@ from aqualvs.scanning.stripe import (
     StripeOptions,
     StripePeaks,
     ThresholdOptions,
-    U8Array,
 )
 
 if TYPE_CHECKING:

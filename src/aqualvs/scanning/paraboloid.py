@@ -38,10 +38,9 @@ from aqualvs.scanning.patch import (
     nearest_tangent,
     packed_plane,
 )
+from aqualvs.scanning.patch import N_COEFFICIENTS as N
 from aqualvs.scanning.plane_fit import TUKEY, SharedError, add_error
 
-N = 6
-"""Number of the coefficients a, b, c, p, q, r."""
 GATE_SHARE, GATE_PX = 0.004, 1.2
 """Largest distance of observations from a patch: as a share of the range, and in pixels."""
 MIN_OBSERVATIONS = 12
@@ -500,5 +499,5 @@ def _fit_over(
     )
     if not found:
         return None
-    bent = Patch(plane, patch[RIGHT:UP], patch[UP:COEFFICIENTS], patch[COEFFICIENTS:])
+    bent = Patch.unpacked(plane, patch)
     return PatchAttempt(PatchFit(bent, covariance, weights, rms), is_clear)

@@ -16,6 +16,7 @@ from aqualvs.optics.rig_covariance import FittedSurface, posture_by_plane
 
 NORMAL, OFFSET, RIGHT, UP, COEFFICIENTS, PACKED = 0, 3, 4, 7, 10, 16
 """Indices of the parts of a packed patch, and its length."""
+N_COEFFICIENTS = 6
 
 SIGMA_CURVATURE, SIGMA_TWIST = 2.0, 0.5
 """Prior standard deviations of the curvatures p, r and of the twist q of nets, in 1/m."""
@@ -121,8 +122,6 @@ def write_terms(points: FloatArray, patch: FloatArray, terms: FloatArray) -> Non
         terms[i, 3], terms[i, 4], terms[i, 5] = 0.5 * u * u, u * v, 0.5 * v * v
 
 
-FLAT = np.zeros(6)
-"""Coefficients (a, b, c, p, q, r) of a plane."""
 CURVATURE_PRIOR: FloatArray = np.array(
     [0.0, 0.0, 0.0, SIGMA_CURVATURE**-2, SIGMA_TWIST**-2, SIGMA_CURVATURE**-2]
 )
@@ -147,11 +146,11 @@ class Patch:
     # Shape (6,): a (m), b, c, p, q, r (1/m) of the height.
     coefficients: FloatArray
 
-    def height(self, points: FloatArray) -> FloatArray:
-        """Return the distances (N,) of points (N, 3) behind the patch, in metres."""
-        off = np.empty(len(points))
-        heights_over(points, self.packed(), off)
-        return off
+    @classmethod
+    def unpacked(cls, base: Plane, packed: FloatArray) -> "Patch":
+        """Make a patch over a base plane from its packed form (16,)."""
+        right, up = packed[RIGHT:UP], packed[UP:COEFFICIENTS]
+        return cls(base, right, up, packed[COEFFICIENTS:])
 
     def packed(self) -> FloatArray:
         """Return normal, offset, right, up and coefficients as one array (16,), for kernels."""
@@ -172,14 +171,8 @@ class PatchFit:
     rms: float  # Weighted root mean square distance from the patch, in metres.
 
 
-def flat_patch(plane: Plane) -> Patch:
-    """Return a plane as a patch: u to the right, v upward."""
-    packed = packed_plane(plane)
-    return Patch(plane, packed[RIGHT:UP], packed[UP:COEFFICIENTS], FLAT)
-
-
 def packed_plane(plane: Plane) -> FloatArray:
-    """Return a plane as a packed patch (16,), as `flat_patch(plane).packed()`."""
+    """Return a plane as a packed patch (16,): u to the right, v upward, no curvature."""
     a, b, c = plane.normal.tolist()
     level = math.sqrt(a * a + b * b)
     right, ahead = b / level, -a / level
@@ -241,8 +234,8 @@ def fitted_patch(patch: Patch, m: FloatArray, points: FloatArray) -> FittedSurfa
     points : array, shape (N, 3)
         In `dome`, metres.
     """
-    packed, terms = patch.packed(), np.empty((len(points), len(FLAT)))
-    by_terms = np.empty((3, len(FLAT)))
+    packed, terms = patch.packed(), np.empty((len(points), N_COEFFICIENTS))
+    by_terms = np.empty((3, N_COEFFICIENTS))
     write_terms(points, packed, terms)
     if not tangent_jacobian(packed, _SCALES, m, by_terms):
         by_terms[:] = np.nan

@@ -10,7 +10,6 @@ flank of a fish bends the stripe in one smooth sweep; a face of a box keeps it s
 edge breaks it; a bubble is a spot.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -59,25 +58,6 @@ class ComponentShapes(NamedTuple):
     thickness: FloatArray
     # Shape (S,): mean height of its peaks in grey levels.
     height: FloatArray
-
-    def bent(self) -> BoolArray:
-        """Mark the components that are bent smoothly, as the flank of a fish."""
-        return self._those(is_bent)
-
-    def curved(self) -> BoolArray:
-        """Mark the components that are not straight for any reason, so not on a plane."""
-        return self._those(is_curved)
-
-    def straight(self) -> BoolArray:
-        """Mark the components that are long and straight, as on a plane."""
-        return self._those(is_straight)
-
-    def round(self, bright: float) -> BoolArray:
-        """Mark the components that are spots about as high as `bright` (grey levels) or higher."""
-        return self._those(lambda shapes, s: is_round(shapes, s, bright))
-
-    def _those(self, asked: Callable[["ComponentShapes", int], bool]) -> BoolArray:
-        return np.array([asked(self, s) for s in range(len(self.n_lines))], np.bool_)
 
 
 @inline_borrowing_kernel

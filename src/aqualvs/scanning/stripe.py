@@ -9,16 +9,14 @@ narrower than two pixels, the peak of a Gaussian through three pixels.
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from aqualvs.errors import OptionError
-from aqualvs.geometry.arrays import FloatArray, IntArray
+from aqualvs.geometry.arrays import FloatArray, IntArray, U8Array
 from aqualvs.geometry.compiled import ZERO, borrowing_kernel, inline_borrowing_kernel
-
-U8Array: TypeAlias = NDArray[np.uint8]
 
 # Marks, bytes of 0 or 1, are read eight at a time.
 _WORD = 8

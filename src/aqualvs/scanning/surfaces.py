@@ -13,12 +13,10 @@ candidates count as the same light.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
-from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
+from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray, U8Array
 from aqualvs.geometry.compiled import (
     ZERO,
     inline_borrowing_kernel,
@@ -49,8 +47,6 @@ from aqualvs.scanning.plane_search import (
     search_plane,
     squared_gate,
 )
-
-U8Array: TypeAlias = NDArray[np.uint8]
 
 # Marks of a cell: light in a neighbouring cell, or in the cell itself.
 _BESIDE, _MIDDLE = np.uint8(1), np.uint8(2)
