@@ -58,7 +58,7 @@ class Subsegments(NamedTuple):
     # long component weighs no more than a few strands, because it may follow one strand off the
     # sheet's middle.
     table: FloatArray
-    # Shape (C,): sum of its candidates' confidences: search lines of certain laser light.
+    # Shape (C,): sum of its candidates' confidences, in search lines.
     intensity_weight: FloatArray
     # Shape (C,): search lines in it.
     n_lines: IntArray
@@ -356,5 +356,5 @@ def find_candidates(
     )
     # The rows of the tables are in the order of the fields.
     measures = tables.measures[:, :n]
-    candidates = Candidates(*numbers[:ALONG_X], pixels, *measures, points, sensitivity)
+    candidates = Candidates._make([*numbers[:ALONG_X], pixels, *measures, points, sensitivity])
     return candidates if all_valid else candidates.where(valid)

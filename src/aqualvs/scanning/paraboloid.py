@@ -400,9 +400,9 @@ def add_shared(
 MIN_BEND = 0.003
 """Least bend of a curved net between its visible points, as a share of the range."""
 
-# Least significance of the curvature in a plane fit, in sigmas, for which a patch is fitted. A robust
-# plane fit drops the strands that bend away from it: of 150 simulated nets that bulge, clearly bent
-# ones have 1.0 and more.
+# Least significance of the curvature in a plane fit, in sigmas, for which a patch is fitted. A
+# robust plane fit drops the strands that bend away from it: of 150 simulated nets that bulge,
+# clearly bent ones have 1.0 and more.
 _HINT = 1.0
 
 

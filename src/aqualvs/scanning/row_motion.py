@@ -42,7 +42,7 @@ from aqualvs.scanning.scan import GyroRates, Scan
 REACH = 2
 """Frames on each side from which the rates of a frame are estimated."""
 
-# Largest time between such frames, in seconds: rates change in longer times.
+# Largest time to such a frame, in seconds: over longer times the rates change too much.
 _REACH_S = 0.25
 # Prior standard deviations of a small vehicle's motion near a net, swinging with a period of 2 s:
 # rates of range, pitch and yaw (m/s, rad/s), accelerations (m/s², rad/s²), jerks (m/s³, rad/s³).

@@ -623,4 +623,5 @@ def _continuations(segment: FloatArray, others: FloatArray, width_px: int) -> Bo
     reach = min(length, _EVIDENCE.max_gap * width_px)
     allowed = _EVIDENCE.off_px + _EVIDENCE.off_share * np.maximum(gap, 0.0)
     continues: BoolArray = np.abs(across).max(axis=1) <= allowed
-    return continues & (gap > -0.5 * length) & (gap <= reach)
+    continues &= (gap > -0.5 * length) & (gap <= reach)
+    return continues
