@@ -358,6 +358,12 @@ class Scanner:
             return Refusal(Reason.NOT_A_PLANE, detail)
         if choice.tested.verdict is Verdict.AMBIGUOUS and choice.tested.other is not None:
             return _ambiguous(target.plane, choice.tested.other)
+        if assignment.may_be_exchanged(subsegments, target):
+            detail = (
+                f"two lasers alone show a steep surface at {target.plane.offset:.3f} m, and would "
+                "show another if each stripe were the other laser's"
+            )
+            return Refusal(Reason.AMBIGUOUS, detail)
         others = assignment.other_lines(candidates, subsegments, stripes.shapes, target)
         if others is not None:
             detail = (

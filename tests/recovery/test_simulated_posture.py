@@ -100,6 +100,25 @@ def test_a_wall(name: str, t: float) -> None:
     assert np.hypot(pitch, yaw) < 0.2
 
 
+@pytest.mark.parametrize(("pitch_deg", "is_clear"), [(75.0, False), (-75.0, True)])
+def test_two_stripes_on_a_near_ceiling_are_not_read_as_each_others(
+    pitch_deg: float, is_clear: bool
+) -> None:
+    """Beside a floor, too, two lasers alone show the wall, but it is not steep."""
+    walls = (Wall(), Wall(pitch=np.deg2rad(pitch_deg)))
+    scene = Scene(dome_from_scene=dome_from_target(0.5, 0.0, 0.0), walls=walls, target="wall")
+    picture = quick(SMALL).render(scene, 0.0, np.random.default_rng(1))
+    luma, chroma = planes_of_image(cv2.cvtColor(picture.image, cv2.COLOR_RGB2BGR))
+    posture = equipment(SMALL)[1].process(Frame(0, 0.0, luma, chroma)).posture
+    if is_clear:
+        assert posture
+        assert posture.range == pytest.approx(0.5, rel=1e-3)
+    else:
+        assert isinstance(posture, Refusal)
+        assert posture.reason is Reason.AMBIGUOUS
+        assert "two lasers alone" in posture.detail
+
+
 def test_the_glow_of_the_sheets_in_turbid_water_moves_no_wall() -> None:
     water = WaterOptics(attenuation=(1.5, 0.6, 0.84), sheet_scatter=1.0, forward_scatter=0.08)
     renderer, scanner = equipment(SMALL)

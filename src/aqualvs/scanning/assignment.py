@@ -94,6 +94,11 @@ class _AssignmentOptions(NamedTuple):
     max_other_lines: float = 0.5
     max_other_lines_of_net: float = 1.25
     may_be_chance: int = 4
+    # Two lasers are alone on a solid target if the others have less than this share of the search
+    # lines; a target is steep below this cosine of its tilt. Planes by exchanged lasers, as of a
+    # floor close below the vehicle, are tilted by 44 to 61 degrees.
+    two_alone: float = 0.1
+    steep: float = 0.8
 
 
 _ODDS = _AssignmentOptions()
@@ -285,6 +290,28 @@ class AssignmentTest:
         share: float = other_lines_share(candidates, on_target, shapes, n_lasers)
         most = _ODDS.max_other_lines_of_net if target.is_mesh else _ODDS.max_other_lines
         return share if share > most else None
+
+    def may_be_exchanged(self, subsegments: Subsegments, target: Surface) -> bool:
+        """Return whether a solid target may be two lasers' stripes, each read as the other's.
+
+        Two straight stripes on a plane share one with their lasers exchanged, too: both pass the
+        point in which the line of sight to their crossing meets the line in which the sheets meet.
+        Only a third laser decides, and if it should be visible on a steep target and is not, the
+        stripes may be those of a floor or a side wall nearer than the working range.
+
+        Parameters
+        ----------
+        subsegments, target
+            As in `is_by_chance`.
+        """
+        if target.is_mesh or target.plane.normal[1] > _ODDS.steep:
+            return False
+        on_target = target.members
+        n_lines = np.bincount(subsegments.laser[on_target], subsegments.n_lines[on_target])
+        if np.sort(n_lines)[:-2].sum() >= _ODDS.two_alone * n_lines.sum():
+            return False
+        _, faint, _ = self._visibility(target, subsegments)
+        return faint > _ODDS.may_be_faint
 
     def _light_share(
         self,
