@@ -1,7 +1,7 @@
-"""`aqualvs board`: print a target, true to scale, with the file that describes it.
+"""`aqualvs board`: write a target as a PDF, true to scale, and the file that describes it.
 
-A ChArUco board or chessboard for camera and dome, the markers of a box for the lasers, or a small
-plate of markers, fixed to the vehicle, for the water's index.
+The target is a ChArUco board or chessboard for camera and dome, the markers of a box for the
+lasers, or a small plate of markers, fixed to the vehicle, for the water's refractive index.
 """
 
 from collections.abc import Callable
@@ -32,14 +32,18 @@ from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL
 from aqualvs.results.files import Claim, writing
+from aqualvs.text import count_text
 
 Echo: TypeAlias = Callable[[str], object]
 
 _MM = 1e3
-# A light border that keeps the outer squares readable on any background, as a share of a square.
+# Width of the light border around a board, as a share of a square; keeps the outer squares
+# detectable on any background.
 _BORDER_SHARE = 0.25
+# Gap between the markers of a plate and width of its border, as a share of a marker.
 _PLATE_GAP_SHARE = 0.25
-_COUNT_SUFFIXES = (50, 100, 250, 1000)
+# Numbers of markers of OpenCV's dictionaries DICT_4X4_50 to DICT_4X4_1000.
+_DICTIONARY_SIZES = (50, 100, 250, 1000)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,10 +53,10 @@ class BoardRequest:
     kind: Literal["charuco", "chessboard", "box", "plate"]  # Kind of target.
     out: Path  # `OUT.pdf` and `OUT.yaml` are written.
     paper: str = "a4"  # A4 to A0, letter, WIDTHxHEIGHT, or "fit".
-    # Of a board, or columns and rows of markers on a plate.
+    # Columns and rows of squares on a board, or of markers on a plate.
     squares_x: int | None = None
     squares_y: int | None = None
-    # Side of a square; None takes the largest whole one that the paper holds.
+    # Side of a square; None takes the largest whole number of millimetres that fits the paper.
     square_mm: float | None = None
     # Side of a marker; None takes 3/4 of the square on a board, 48 in a box, 12 on a plate.
     marker_mm: float | None = None
@@ -60,13 +64,13 @@ class BoardRequest:
     dictionary: str | None = None
     # Light border; None takes a quarter of a square.
     border_mm: float | None = None
-    # Of the box, inside.
+    # Inner sizes of the box.
     width_mm: float = 400.0
     height_mm: float = 380.0
     depth_mm: float = 700.0
-    # Number of the first marker of a box or plate.
+    # Id of the first marker of a box or plate.
     first_id: int = 0
-    # Place of the plate's first corner (top left of its first marker) in `dome`.
+    # Position of the plate's first corner (top left of its first marker) in `dome`.
     position_mm: tuple[float, float, float] | None = None
     # Rotation vector in `dome`, applied to a plate that faces the camera upright.
     rotation_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -74,12 +78,12 @@ class BoardRequest:
     overwrite: bool = False
 
     def __post_init__(self) -> None:
-        """Refuse counts and lengths that nothing can be printed with.
+        """Refuse counts and lengths that cannot be printed.
 
         Raises `OptionError` naming the option and its value.
         """
         check_options(self, "squares_x", "squares_y", least=1.0, wanted="1 or more")
-        # Below a millimetre it is a length in metres.
+        # A length below a millimetre was most likely given in metres.
         lengths = ("square_mm", "marker_mm", "width_mm", "height_mm", "depth_mm")
         check_options(self, *lengths, least=1.0, wanted="millimetres, 1 or more")
         check_options(self, "border_mm", least=0.0, wanted="millimetres, 0 or more")
@@ -88,7 +92,7 @@ class BoardRequest:
 def print_board(request: BoardRequest, echo: Echo) -> None:
     """Write the PDF and the yaml of a target.
 
-    Raises `OptionError` if the target is impossible or does not fit the paper, or the files have no
+    Raises `OptionError` if the target is impossible or does not fit the paper, or `out` has no file
     name. Raises `OutputError` if a file cannot be written.
     """
     out = request.out.with_suffix("") if request.out.suffix == ".pdf" else request.out
@@ -98,20 +102,20 @@ def print_board(request: BoardRequest, echo: Echo) -> None:
     with Claim("board", [pdf, yaml], overwrite=request.overwrite):
         try:
             if request.kind == "box":
-                pages, words = _print_box(request, yaml)
+                pages, notes = _print_box(request, yaml)
             elif request.kind == "plate":
-                pages, words = _print_plate(request, yaml)
+                pages, notes = _print_plate(request, yaml)
             else:
-                pages, words = _print_squares(request, yaml)
+                pages, notes = _print_squares(request, yaml)
         except CalibrationError as fault:
             raise OptionError(str(fault)) from None
         with writing(pdf):
             pdf.write_bytes(pdf_bytes(pages, f"aqualvs {request.kind}"))
-    n = len(pages)
-    echo(f"pages: {pdf} ({n} page{'s' if n > 1 else ''}; print at 100 %, then measure the ruler)")
+    n_pages = count_text(len(pages), "page")
+    echo(f"pages: {pdf} ({n_pages}; print at 100 %, then measure the ruler)")
     echo(f"file: {yaml}")
-    for word in words:
-        echo(f"note: {word}")
+    for note in notes:
+        echo(f"note: {note}")
 
 
 def _print_squares(request: BoardRequest, yaml: Path) -> tuple[list[PdfPage], list[str]]:
@@ -149,7 +153,7 @@ def _board(request: BoardRequest) -> Board:
 
 
 def _largest_square(request: BoardRequest, squares: tuple[int, int]) -> float:
-    """Return the largest whole number of millimetres that the paper has room for."""
+    """Return the side of the largest square, in whole millimetres, that fits the paper."""
     border = request.border_mm
     shares = np.array(squares) + (2.0 * _BORDER_SHARE if border is None else 0.0)
     sides = []
@@ -167,10 +171,10 @@ def _largest_square(request: BoardRequest, squares: tuple[int, int]) -> float:
 
 
 def _smallest_dictionary(n_markers: int) -> str:
-    fitting = [n for n in _COUNT_SUFFIXES if n >= n_markers]
+    fitting = [n for n in _DICTIONARY_SIZES if n >= n_markers]
     if not fitting:
         raise OptionError(
-            f"{n_markers} markers: no dictionary has more than {_COUNT_SUFFIXES[-1]}; take fewer "
+            f"{n_markers} markers: no dictionary has more than {_DICTIONARY_SIZES[-1]}; take fewer "
             "squares"
         )
     return f"DICT_4X4_{fitting[0]}"
@@ -190,8 +194,8 @@ def _print_box(request: BoardRequest, yaml: Path) -> tuple[list[PdfPage], list[s
     pages = [_patch_page(request, plan, patch) for patch in patches]
     save_markers(markers, yaml)
     return pages, [
-        "cut along the lines and glue each sheet where its words say, upright as seen from inside; "
-        "the box needs no other pattern",
+        "cut along the lines and glue each sheet where its caption says, upright as seen from "
+        "inside; the box needs no other pattern",
         "measure the box: where a sheet lies elsewhere, correct the corners and planes in the file",
     ]
 
@@ -204,13 +208,13 @@ def _patch_page(request: BoardRequest, plan: BoxPlan, patch: SheetPatch) -> PdfP
         for number, corner in zip(patch.ids, patch.corners, strict=True)
     ]
     left, top = _MM * patch.offset[0], _MM * patch.offset[1]
-    words = (
+    caption = (
         f"aqualvs box: plane {patch.plane}; top-left corner {left:.1f} mm from its left edge and "
         f"{top:.1f} mm from its top edge; markers of {_MM * plan.marker:g} mm, "
         f"ids {min(patch.ids)}-{max(patch.ids)}"
     )
     black = np.concatenate([*rectangles, outline(0.0, 0.0, width, height)])
-    return sheet(paper, black, (width, height), words)
+    return sheet(paper, black, (width, height), caption)
 
 
 def _print_plate(request: BoardRequest, yaml: Path) -> tuple[list[PdfPage], list[str]]:
@@ -236,7 +240,10 @@ def _print_plate(request: BoardRequest, yaml: Path) -> tuple[list[PdfPage], list
 
 
 def _plate_corners(columns: int, rows: int, size: float) -> FloatArray:
-    """Return the markers' corners (M, 4, 2) from the first one's top left, row by row."""
+    """Return the corners (M, 4, 2) of the markers, row by row, from the first one's top left.
+
+    `size` and corners are in millimetres, x to the right and y down.
+    """
     pitch = (1.0 + _PLATE_GAP_SHARE) * size
     column, row = np.meshgrid(np.arange(columns), np.arange(rows))
     first = pitch * np.stack([column.ravel(), row.ravel()], axis=-1)
@@ -246,11 +253,12 @@ def _plate_corners(columns: int, rows: int, size: float) -> FloatArray:
 def _plate_markers(
     request: BoardRequest, family: str, ids: IntArray, flat: FloatArray
 ) -> MarkerSet:
+    """Return the markers with flat corners (M, 4, 2), in metres, in the plate's or dome's frame."""
     corners: FloatArray = np.concatenate([flat, np.zeros((*flat.shape[:2], 1))], axis=-1)
     frame = "plate"
     if request.position_mm is not None:
-        turn = rotation_from_rotvec(np.deg2rad(request.rotation_deg)) @ DOME_FROM_CAM_NOMINAL
-        corners = SE3(turn, np.array(request.position_mm) / _MM).apply(corners)
+        rotation = rotation_from_rotvec(np.deg2rad(request.rotation_deg)) @ DOME_FROM_CAM_NOMINAL
+        corners = SE3(rotation, np.array(request.position_mm) / _MM).apply(corners)
         frame = "dome"
     return MarkerSet(
         frame=frame, family=family, ids=ids, corners=corners, plane_names=(None,) * len(ids)
@@ -260,19 +268,19 @@ def _plate_markers(
 def _plate_notes(request: BoardRequest, yaml: Path) -> list[str]:
     fix = "fix the plate where the camera sees it sharp, off the middle, beside the lasers"
     if request.position_mm is not None:
-        return [fix, f"{yaml} holds the corners in the dome's frame, for the place that was given"]
+        return [fix, f"{yaml} has the corners in the dome's frame, at the position given"]
     return [
         fix,
-        f"{yaml} does not know the plate's place yet; measure where the top-left corner of marker "
-        f"{request.first_id} is in the dome's frame, and print again with --position-mm X Y Z "
-        "(and --rotation-deg where the plate does not face straight back)",
+        f"{yaml} does not have the plate's position yet; measure where the top-left corner of "
+        f"marker {request.first_id} is in the dome's frame, and print again with --position-mm "
+        "X Y Z (and --rotation-deg if the plate does not face straight back)",
     ]
 
 
 def _check_ids(family: str, first_id: int, count: int) -> None:
-    held = len(aruco_dictionary(family).bytesList)
-    if first_id < 0 or first_id + count > held:
+    n_ids = len(aruco_dictionary(family).bytesList)
+    if first_id < 0 or first_id + count > n_ids:
         raise OptionError(
             f"--first-id {first_id}: {count} markers from there, but {family} has ids 0 to "
-            f"{held - 1}; begin lower or print fewer"
+            f"{n_ids - 1}; begin lower or print fewer"
         )

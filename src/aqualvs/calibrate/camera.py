@@ -55,13 +55,13 @@ def calibrate_camera(
     model: LensModel | str = LensModel.OPENCV,
     n_coefficients: int | None = None,
 ) -> Calibration[CameraCalibration]:
-    """Solve the intrinsics from pictures of a board in air, without the dome.
+    """Solve the intrinsics from pictures of a board in air, taken without the dome.
 
     Parameters
     ----------
     pictures : iterable of str, Path or array, or a str or Path
-        Files or pixels (grey, or blue, green, red), or one folder or pattern; all of one size, the
-        board tilted by 20 to 40 degrees in most of them.
+        Files or pixels (grey, or blue, green, red), or one folder or pattern; all of one size, with
+        the board tilted by 20 to 40 degrees in most of them.
     board : Board, str or Path
         The board or its file.
     nominal : Nominal, str or Path, optional
@@ -89,7 +89,7 @@ def calibrate_camera(
             found.views, found.size_px, model=LensModel(model), n_coefficients=n_coefficients
         )
     return Calibration(
-        rig=_rig(result, known),
+        rig=_solved_rig(result, known),
         uncertainty=result.uncertainty,
         residuals_px={view.label: view.residuals for view in result.views},
         left_out={**found.missed, **result.left_out},
@@ -121,14 +121,15 @@ def run_camera(request: CameraRequest, echo: Echo) -> None:
 def _check_size(found: DetectedTargets, nominal: Nominal, source: object) -> None:
     if nominal.size_px is not None and nominal.size_px != found.size_px:
         (w, h), (nw, nh) = found.size_px, nominal.size_px
-        said_by = source if isinstance(source, str | Path) else "the nominal rig"
+        where = source if isinstance(source, str | Path) else "the nominal rig"
         raise CalibrationError(
-            f"{found.first}: {w}x{h} px, but {said_by} says {nw}x{nh} px; calibrate at "
+            f"{found.first}: {w}x{h} px, but {where} says {nw}x{nh} px; calibrate at "
             "the size that the camera is used at, or correct that file"
         )
 
 
-def _rig(result: CameraCalibration, nominal: Nominal) -> Rig:
+def _solved_rig(result: CameraCalibration, nominal: Nominal) -> Rig:
+    """Return the nominal rig with the solved intrinsics and a note of this step."""
     rig = Rig(
         name=nominal.name,
         size_px=result.size_px,
@@ -145,8 +146,8 @@ def _rig(result: CameraCalibration, nominal: Nominal) -> Rig:
         pictures=len(result.views), points=result.n_points, rms_px=result.rms_px, extras={}
     )
     # The calibration of the lasers searches for this number and colour.
-    said = {N_LASERS: nominal.n_lasers, WAVELENGTH_NM: nominal.wavelength_nm}
-    rig = replace(rig, solved_from={key: value for key, value in said.items() if value is not None})
+    planned = {N_LASERS: nominal.n_lasers, WAVELENGTH_NM: nominal.wavelength_nm}
+    rig = replace(rig, solved_from={k: value for k, value in planned.items() if value is not None})
     return with_uncertainty(with_step(rig, "camera", step), result.uncertainty)
 
 

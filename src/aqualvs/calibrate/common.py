@@ -1,8 +1,8 @@
 """Common parts of all calibrations: nominal rig, target detection in pictures, result, output.
 
 The nominal rig (`load_nominal`) is known before any calibration: name, picture size, dome, lasers.
-`Calibration` is what the functions `calibrate_camera`, `calibrate_dome`, `calibrate_lasers` and
-`calibrate_water` return; the commands of `aqualvs calibrate` write it down.
+`calibrate_camera`, `calibrate_dome`, `calibrate_lasers` and `calibrate_water` return a
+`Calibration`; the commands of `aqualvs calibrate` write it to a rig file and a page.
 """
 
 import contextlib
@@ -58,9 +58,9 @@ from aqualvs.yamlfile import parse_yaml, read_text
 WATER_N = 1.3340
 """Default index: fresh water of 15 °C in green light."""
 N_LASERS = "n_lasers"
-"""Key of `Rig.solved_from` for the planned number of lasers of a rig without any."""
+"""Key of `Rig.solved_from`: planned number of lasers of a rig that has none yet."""
 WAVELENGTH_NM = "wavelength_nm"
-"""The same for their wavelength, in nanometres."""
+"""Key of `Rig.solved_from`: wavelength of these lasers, in nanometres."""
 
 _Count = Annotated[int, Field(gt=0)]
 
@@ -75,38 +75,38 @@ class Nominal:
     n_air: float = N_AIR
     n_water: float = WATER_N
     n_lasers: int | None = None
-    wavelength_nm: float | None = None  # Of the lasers; None if unknown, or if they differ.
+    wavelength_nm: float | None = None  # Of all lasers; None if unknown or not the same for all.
     working_range: tuple[float, float] = (0.25, 1.3)  # Metres.
     shutter: Shutter = AT_ONCE  # Of the camera.
 
 
-class _Part(StrictPart):
+class _Section(StrictPart):
     model_config = ConfigDict(strict=False)
 
 
-class _Image(_Part):
+class _Image(_Section):
     width: _Count
     height: _Count
 
 
-class _Dome(_Part):
+class _Dome(_Section):
     inner_radius_mm: Positive
     thickness_mm: NotNegative
     n_acrylic: Index = 1.49
 
 
-class _Flat(_Part):
+class _Flat(_Section):
     distance_mm: Positive
     thickness_mm: NotNegative
     n_port: Index = 1.49
 
 
-class _Lasers(_Part):
+class _Lasers(_Section):
     count: _Count
     wavelength_nm: LaserWavelength | None = None
 
 
-class _File(_Part):
+class _NominalFile(_Section):
     name: str = "rig"
     image: _Image | None = None
     dome: _Dome | None = None
@@ -117,7 +117,7 @@ class _File(_Part):
 
 
 def load_nominal(path: Path) -> Nominal:
-    """Read a nominal rig, or take over what a rig file knows.
+    """Read a nominal rig, or take the same values from a rig file.
 
     Raises `RigError` with one line that names the file, the place in it, the value and the remedy.
     """
@@ -128,10 +128,10 @@ def load_nominal(path: Path) -> Nominal:
     content = parse_yaml(text, str(path), RigError)
     if not isinstance(content, Mapping):
         raise RigError(f"{path}: is not a nominal rig; write keys such as 'dome: ...'")
-    return _of_rig_file(path) if "aqualvs_rig" in content else _of_mapping(content, path)
+    return _from_rig_file(path) if "aqualvs_rig" in content else _from_mapping(content, path)
 
 
-def _of_rig_file(path: Path) -> Nominal:
+def _from_rig_file(path: Path) -> Nominal:
     rig = load_rig(path, need_lasers=False)
     return Nominal(
         name=rig.name,
@@ -146,8 +146,8 @@ def _of_rig_file(path: Path) -> Nominal:
     )
 
 
-def _of_mapping(content: Mapping[str, Any], path: Path) -> Nominal:
-    file = validated(_File, dict(content), path, RigError, SchemaWords(file="a nominal rig"))
+def _from_mapping(content: Mapping[str, Any], path: Path) -> Nominal:
+    file = validated(_NominalFile, dict(content), path, RigError, SchemaWords(file="a nominal rig"))
     try:
         housing = housing_of(file.dome, file.flat)
     except RigError as fault:
@@ -169,7 +169,7 @@ Picture: TypeAlias = str | Path | Image
 Pictures: TypeAlias = Iterable[Picture] | str | Path
 """Several pictures, or a folder or pattern of them."""
 Detect: TypeAlias = Callable[[str, Image], View | str]
-"""Finder of a target in a named grey picture; returns a clause if there is none."""
+"""Detector: name and grey picture to the target's view, or a clause that says why there is none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,8 +179,8 @@ class DetectedTargets:
     views: tuple[View, ...]  # Of the pictures in which the target was found.
     pictures: tuple[Picture, ...]  # Those pictures.
     size_px: tuple[int, int]  # Width and height of every picture.
-    missed: dict[str, str]  # Names of pictures in which it was not found, with the reason.
-    pose_notes: tuple[str, ...] = ()  # Remarks on the poses that were given for them.
+    missed: dict[str, str]  # By name of each picture in which it was not found: the reason.
+    pose_notes: tuple[str, ...] = ()  # Remarks on poses that the user gave for the pictures.
 
     @property
     def first(self) -> str:
@@ -190,7 +190,7 @@ class DetectedTargets:
 
     @property
     def remarks(self) -> list[str]:
-        """Warnings."""
+        """Notes on the detection, pictures without a target, and notes on the poses."""
         return [
             *self._detection_notes(),
             *(f"{name}: left out, {why}" for name, why in self.missed.items()),
@@ -199,7 +199,7 @@ class DetectedTargets:
 
     @property
     def notes(self) -> list[str]:
-        """Notes on the detection, each with its pictures, and on the poses."""
+        """Notes on the detection, each with its pictures, and notes on the poses."""
         return [*self._detection_notes(), *self.pose_notes]
 
     def _detection_notes(self) -> list[str]:
@@ -207,14 +207,14 @@ class DetectedTargets:
         for view in self.views:
             for note in view.notes:
                 names.setdefault(note, []).append(view.name)
-        return [f"{_listed(where)}: {note}" for note, where in names.items()]
+        return [f"{_abridged(where)}: {note}" for note, where in names.items()]
 
 
-def _listed(names: Sequence[str]) -> str:
-    # Names of pictures that a note lists.
-    names_shown = 3
-    more = len(names) - names_shown
-    return ", ".join(names[:names_shown]) + (f" and {more} more" if more > 0 else "")
+def _abridged(names: Sequence[str]) -> str:
+    """Return the first three names, and the number of further ones."""
+    n_shown = 3
+    more = len(names) - n_shown
+    return ", ".join(names[:n_shown]) + (f" and {more} more" if more > 0 else "")
 
 
 SolutionT = TypeVar("SolutionT")
@@ -227,10 +227,11 @@ class Calibration(Generic[SolutionT]):
     Attributes
     ----------
     rig : Rig
-        The rig with the solved numbers, their covariance and a note of the step. `save_rig` writes
-        it; the next calibration takes it.
+        The rig with the solved parameters, their covariance and a note of this step. `save_rig`
+        writes it; the next calibration takes it.
     uncertainty : RigUncertainty
-        Names of the numbers that the calibration solved or relied on, and their joint covariance.
+        Names of the parameters that the calibration solved or relied on, and their joint
+        covariance.
     residuals_px : dict
         By the name of each used picture: measured minus predicted pixels, shape (N, 2), of its
         corners.
@@ -260,7 +261,7 @@ class Calibration(Generic[SolutionT]):
 
 
 def summary(done: Calibration[CameraCalibration] | Calibration[DomeCalibration]) -> list[str]:
-    """Return the numbers of pictures used and left out, the residual and the reasons."""
+    """Return lines with the pictures used, the residual, remarks on pictures, and findings."""
     result = done.solution
     n_pictures = sum(len(one.views) + len(one.missed) for one in done.found)
     used = len(result.views)
@@ -274,14 +275,14 @@ def summary(done: Calibration[CameraCalibration] | Calibration[DomeCalibration])
 
 
 def picture_paths(arguments: Sequence[str | Path]) -> list[Path]:
-    """Return the pictures given by files, folders and patterns, each once.
+    """Return the paths of the pictures given by files, folders and patterns, without repetition.
 
-    `arguments`: pictures, folders of them, or patterns such as 'air/*.png'. The pictures of one
+    `arguments`: pictures, folders of pictures, or patterns such as 'air/*.png'. The pictures of one
     argument are sorted naturally (`img2` before `img10`). Raises `CalibrationError` if an argument
-    matches no picture, or two of the pictures have the same file name: poses and reports identify
-    pictures by their names.
+    matches no picture, or two pictures have the same file name: poses and reports identify pictures
+    by their names.
     """
-    paths = [path for argument in arguments for path in _meant(str(argument))]
+    paths = [path for argument in arguments for path in _matching_paths(str(argument))]
     if not paths:
         raise CalibrationError("no pictures given; name pictures, a folder, or a pattern")
     unique = list(dict.fromkeys(paths))
@@ -295,7 +296,7 @@ def picture_paths(arguments: Sequence[str | Path]) -> list[Path]:
     return unique
 
 
-def _meant(argument: str) -> list[Path]:
+def _matching_paths(argument: str) -> list[Path]:
     path = Path(argument)
     if path.is_dir():
         found = [one for one in path.iterdir() if is_image_name(one)]
@@ -317,8 +318,8 @@ def _meant(argument: str) -> list[Path]:
     raise CalibrationError(f"{path}: no such picture or folder; check the path")
 
 
-def _each_picture(pictures: Pictures) -> list[Picture]:
-    """Return the pictures; of text, those of the folder or pattern, as a command takes it.
+def _picture_list(pictures: Pictures) -> list[Picture]:
+    """Return the pictures as a list; a single str or Path is one folder, pattern or file.
 
     Raises `CalibrationError` if an array is no picture of 8 bits.
     """
@@ -345,31 +346,34 @@ def detect_targets(pictures: Pictures, detect: Detect, target: str) -> DetectedT
     Parameters
     ----------
     pictures : iterable of Picture, str or Path
-        Files or pixels; pixels are named by their number. A folder or a pattern for all of it.
+        Files or pixels (then named "picture 0", "picture 1", ...), or one folder or pattern.
+    detect : callable
+        Detector that is called with the name and the grey pixels of each picture, in several
+        threads.
     target : str
         Name of the target in messages, such as "board.yaml".
 
     Raises
     ------
     CalibrationError
-        If the target is in none of the pictures, or they differ in size.
+        If a picture cannot be read, the target is in none of them, or they differ in size.
     """
-    # Greatest useful number of threads on small pictures.
+    # More threads do not detect faster in small pictures.
     threads = 4
-    pictures = _each_picture(pictures)
+    pictures = _picture_list(pictures)
     with (
         progress(f"looking for {target}", len(pictures), unit="pictures") as tick,
         ThreadPoolExecutor(threads) as pool,
     ):
 
-        def look(name: str, picture: Picture) -> tuple[View | str, tuple[int, int]]:
+        def detect_in(name: str, picture: Picture) -> tuple[View | str, tuple[int, int]]:
             image = read_grey(picture)
             found = detect(name, image)
             tick(1)
             return found, (image.shape[1], image.shape[0])
 
         names = [named(picture, f"picture {i}") for i, picture in enumerate(pictures)]
-        results = list(pool.map(look, names, pictures))
+        results = list(pool.map(detect_in, names, pictures))
     if not results:
         raise CalibrationError("no pictures given; name pictures, a folder, or a pattern")
     size_px = _common_size(
@@ -395,7 +399,7 @@ def detect_targets(pictures: Pictures, detect: Detect, target: str) -> DetectedT
 
 
 def detect_boards(pictures: Pictures, board: Board | str | Path) -> DetectedTargets:
-    """Find a board, or that of a file, in every picture; see `detect_targets`."""
+    """Find a board, given itself or by its file, in every picture; see `detect_targets`."""
     pattern = board if isinstance(board, Board) else load_board(board)
     return detect_targets(
         pictures, lambda name, image: detect_board(image, pattern, name), named(board, "the board")
@@ -404,7 +408,7 @@ def detect_boards(pictures: Pictures, board: Board | str | Path) -> DetectedTarg
 
 @contextlib.contextmanager
 def counting_missed(*sets: DetectedTargets) -> Iterator[None]:
-    """Add to a refusal how many pictures the solve did without, with the reason for one of them."""
+    """Add to a refusal the number of pictures without a target, and the reason for the first."""
     try:
         yield
     except CalibrationError as fault:
@@ -420,7 +424,7 @@ def counting_missed(*sets: DetectedTargets) -> Iterator[None]:
 
 
 def named(target: object, what: str) -> str:
-    """Return the name of a file for messages; `what` it is if its content was given itself."""
+    """Return a file's name for messages, or `what` if its content was given instead of a path."""
     return Path(target).name if isinstance(target, str | Path) else what
 
 
@@ -445,9 +449,9 @@ def read_colour(picture: Picture) -> Image:
 
 
 def medium_index(word: str | float | None, rig: Rig, default: float) -> float:
-    """Return the index of `--medium`: "air", "water" (the rig's), or a number.
+    """Return the refractive index of `--medium`: "air", "water" (the rig's), or a number.
 
-    Raises `OptionError` if it is none of these.
+    Returns `default` for None. Raises `OptionError` for any other word.
     """
     if word is None:
         return default
@@ -464,7 +468,7 @@ def medium_index(word: str | float | None, rig: Rig, default: float) -> float:
 
 
 def corner_residuals(views: Sequence[ViewFit], size_px: tuple[int, int]) -> ResidualMap:
-    """Return the residuals of a target's corners over the picture."""
+    """Return the map of the residuals of all views' corners over the picture."""
     return residual_map(
         "Corners of all views",
         size_px,
@@ -475,7 +479,7 @@ def corner_residuals(views: Sequence[ViewFit], size_px: tuple[int, int]) -> Resi
 
 
 def corner_rows(views: Sequence[ViewFit], missed: Mapping[str, str]) -> tuple[ViewRow, ...]:
-    """Return the rows of the views that were used, and of those that were not, with the reason."""
+    """Return a row for each view that was used, and for each `missed` one with its reason."""
     used = (ViewRow(name=fit.label, n_points=len(fit.view), rms_px=fit.rms_px) for fit in views)
     return (*used, *missed_rows(missed))
 
@@ -491,9 +495,10 @@ def finish(
 ) -> None:
     """Write the rig and the page of a calibration, and print their paths.
 
-    A rig and a page that are there already are kept under dated names.
+    Existing files of these names are kept under dated names. `comments_of` is the rig file whose
+    comments are copied.
 
-    Raises `OutputError` if one cannot be written, or `out` is a file but no rig.
+    Raises `OutputError` if a file cannot be written, or `out` exists and is no rig.
     """
     with writing(out):
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -508,10 +513,7 @@ def finish(
 
 
 def check_same_size(rig: Rig, found: DetectedTargets) -> None:
-    """Refuse pictures of another size than the rig's.
-
-    Raises `CalibrationError` with both sizes.
-    """
+    """Raise `CalibrationError` with both sizes if the pictures' size is not the rig's."""
     if found.size_px != rig.size_px:
         (w, h), (rw, rh) = found.size_px, rig.size_px
         raise CalibrationError(
@@ -520,8 +522,8 @@ def check_same_size(rig: Rig, found: DetectedTargets) -> None:
         )
 
 
-def _read(path: Path, how: int) -> Image:
-    image = read_image(path, how)
+def _read(path: Path, flags: int) -> Image:
+    image = read_image(path, flags)
     if image is None:
         raise CalibrationError(
             f"{path}: not a readable picture, cut short, or too large; remove or replace it"

@@ -1,4 +1,4 @@
-"""`aqualvs calibrate dome`: place of the lens in its dome or behind its flat port."""
+"""`aqualvs calibrate dome`: position of the lens in its dome or behind its flat port."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -14,19 +14,16 @@ from aqualvs.calibrate.common import (
     corner_residuals,
     corner_rows,
     counting_missed,
-    detect_targets,
+    detect_boards,
     finish,
     medium_index,
-    named,
     picture_paths,
     summary,
 )
-from aqualvs.calibration.detection.detection import detect_board
 from aqualvs.calibration.dome.calibrate import dome as solve_dome
 from aqualvs.calibration.dome.problem import BoardSet, DomeOptions
 from aqualvs.calibration.solver.result import DomeCalibration
 from aqualvs.calibration.targets.pose_files import BoardPose, load_poses, match_poses
-from aqualvs.calibration.targets.target_files import load_board
 from aqualvs.calibration.targets.targets import Board
 from aqualvs.errors import OptionError, check_options
 from aqualvs.optics.camera import POSE_PARAMETERS, parameter_names
@@ -46,9 +43,6 @@ from aqualvs.optics.solved import (
 )
 from aqualvs.report.calibration_material import CalibrationPage, expectations, facts, parameter_rows
 from aqualvs.report.html import Card
-
-# Difference of indices below which a medium is the air inside.
-_AIR = 1e-3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -97,7 +91,7 @@ def calibrate_dome(
 ) -> Calibration[DomeCalibration]:
     """Solve the lens's position in the dome and the camera's rotation, from boards outside it.
 
-    Of a flat port its distance and its tilt are solved, from boards in water at unknown poses.
+    For a flat port, solve its distance and tilt from boards in water at unknown poses.
 
     Parameters
     ----------
@@ -109,9 +103,9 @@ def calibrate_dome(
     rig : Rig, str or Path
         Rig with intrinsics and a nominal dome or flat port, or its file.
     poses : str or Path, optional
-        File of what is known of the boards' poses: distances, or full poses.
+        File with known distances or full poses of the boards.
     medium : str or float
-        Outside of the housing: "air", "water" (the rig's), or an index.
+        Medium outside the housing: "air", "water" (the rig's), or a refractive index.
     water_pictures, water_board, water_poses : optional
         Further pictures, taken in the rig's water; their board, if it is another one; their poses.
     options : DomeOptions, optional
@@ -137,7 +131,7 @@ def calibrate_dome(
         raise OptionError("--water-images: missing; --water-board and --water-poses need them")
     known = rig_uncertainty(before)
     if not set(known.names) & set(before.lens.parameter_names):
-        # Intrinsics that were written by hand are not exact either.
+        # Intrinsics that a user wrote by hand are not exact either.
         given = completed_uncertainty(before).only(before.lens.parameter_names)
         known = merged(known, given)
     found = tuple(one for one, _ in sets)
@@ -145,7 +139,7 @@ def calibrate_dome(
         result = solve_dome(before, [one for _, one in sets], options or DomeOptions(), known)
     missed = {name: why for one in found for name, why in one.missed.items()}
     return Calibration(
-        rig=_noted(before, result),
+        rig=_solved_rig(before, result),
         uncertainty=result.uncertainty,
         residuals_px={view.label: view.residuals for view in result.views},
         left_out=missed | result.left_out,
@@ -185,32 +179,37 @@ def run_dome(request: DomeRequest, echo: Echo) -> None:
 
 
 def _with_housing(rig: Rig, request: DomeRequest) -> Rig:
-    """Return the rig with the sizes that options give; they may add a dome or a flat port."""
+    """Return the rig with the housing's sizes from the options, which may add a dome or port."""
     radius, distance = request.inner_radius_mm, request.port_distance_mm
     if radius is not None and (distance is not None or rig.flat_port is not None):
         raise OptionError("--inner-radius-mm: of a dome, but the housing is a flat port")
     if distance is not None and rig.dome is not None:
         raise OptionError("--port-distance-mm: of a flat port, but the housing is a dome")
-    first, thickness = radius if distance is None else distance, request.thickness_mm
-    if rig.housing is None and (first is None or thickness is None):
+    size, thickness = radius if distance is None else distance, request.thickness_mm
+    if rig.housing is None and (size is None or thickness is None):
         raise OptionError(
             f"{request.rig}: has no dome; give --inner-radius-mm (of a flat port "
             "--port-distance-mm) and --thickness-mm, or write 'dome: {inner_radius_mm: ..., "
             "thickness_mm: ..., n_acrylic: 1.49}' in it"
         )
-    old = rig.housing
-    if old is None:
-        old = Dome(1.0, 1.0, 1.49) if distance is None else FlatPort(1.0, 1.0, 1.49)
-        if abs(rig.n_water - rig.n_air) < _AIR:
-            # A camera that was bare in air goes into the water with its housing.
+    housing = rig.housing
+    if housing is None:
+        # Options give both sizes, see above; the index has a default.
+        housing = Dome(1.0, 1.0, 1.49) if distance is None else FlatPort(1.0, 1.0, 1.49)
+        if rig.is_air(rig.n_water):
+            # A camera calibrated bare in air goes into the water with its housing.
             rig = rig.in_water(WATER_N)
-    size, _, index = list(old.numbers())[:3]
-    given = zip((size, "thickness", index), (first, thickness, request.n_acrylic), strict=True)
-    wanted = {name: value for name, value in given if value is not None}
-    now = old.numbers()
-    for name, value in wanted.items():
-        now[name] = value if name == index else value / 1e3
-    return replace(rig, housing=type(old)(*now.values()))
+    numbers = housing.numbers()
+    given = (
+        size if size is None else size / 1e3,
+        thickness if thickness is None else thickness / 1e3,
+        request.n_acrylic,
+    )
+    # Radius or distance, thickness and index come first.
+    for name, value in zip(numbers, given, strict=False):
+        if value is not None:
+            numbers[name] = value
+    return replace(rig, housing=type(housing)(*numbers.values()))
 
 
 def _board_set(
@@ -220,18 +219,15 @@ def _board_set(
     rig: Rig,
     n_medium: float,
 ) -> tuple[DetectedTargets, BoardSet]:
-    """Return the boards found in one set of pictures, as found and as the solver takes them."""
-    pattern = board if isinstance(board, Board) else load_board(board)
+    """Return the boards found in one set of pictures, and the same as input of the solver."""
     rows = None if poses is None else load_poses(Path(poses))
-    found = detect_targets(
-        pictures, lambda name, image: detect_board(image, pattern, name), named(board, "the board")
-    )
+    found = detect_boards(pictures, board)
     check_same_size(rig, found)
     given: tuple[BoardPose | None, ...] = ()
     if rows is not None and poses is not None:
         given, notes = match_poses(rows, [view.name for view in found.views], Path(poses))
         found = replace(found, pose_notes=notes)
-    in_air = abs(n_medium - rig.n_air) < _AIR
+    in_air = rig.is_air(n_medium)
     board_set = BoardSet(
         name="air" if in_air else "water",
         views=found.views,
@@ -242,7 +238,8 @@ def _board_set(
     return found, board_set
 
 
-def _noted(rig: Rig, result: DomeCalibration) -> Rig:
+def _solved_rig(rig: Rig, result: DomeCalibration) -> Rig:
+    """Return the solved rig with its covariance and a note of this step."""
     uncertainty = merged(rig_uncertainty(rig), result.uncertainty)
     names = set(rig_uncertainty(rig).names)
     solved = set(parameter_names(rig.camera())) - set(rig.lens.parameter_names)

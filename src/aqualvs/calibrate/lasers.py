@@ -70,8 +70,8 @@ from aqualvs.report.calibration_material import (
 from aqualvs.report.html import Card
 from aqualvs.text import count_text, laser_colour
 
-_DEG = 180.0 / math.pi
-_SHOTS = 6
+# Pictures on the page, each with its corners and stripes drawn over it.
+_N_SHOTS = 6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -95,17 +95,17 @@ class LasersRequest:
 class _Target:
     """Target that the lasers shine on."""
 
-    name: str
+    name: str  # In messages.
     surfaces: TargetSurfaces
     found: DetectedTargets
-    n_medium: float
+    n_medium: float  # Refractive index outside the dome.
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LasersResult(Calibration[LaserCalibration]):
     """Result of `calibrate_lasers`."""
 
-    n_medium: float  # Index outside of the dome in the pictures.
+    n_medium: float  # Refractive index outside the dome in the pictures.
     # Corners and stripes of every picture in which the target was found.
     views: tuple[LaserView, ...]
 
@@ -137,18 +137,18 @@ def calibrate_lasers(
     board : Board, str or Path, optional
         Instead of a box: the board on the surface that the stripes are on, or its file.
     medium : str, float or None
-        Outside of the dome: "air", "water" (the rig's), or an index; None for what the box's file
-        says, else the rig's water.
+        Medium outside the dome: "air", "water" (the rig's), or a refractive index; None for the
+        one in the box's file, else the rig's water.
     n_lasers : int, optional
-        Number of lasers that shine; by default the rig's.
+        Number of lasers switched on; by default the rig's.
     names : sequence of str, optional
         Names of the lasers.
     board_offset : float
         Thickness of the board above the surface, in metres.
     refine : bool
-        Whether the camera's uncertain numbers are solved too.
+        Whether to solve the camera's uncertain parameters too.
     wavelength_nm : float, optional
-        Of the lasers; by default what the rig says.
+        Wavelength of the lasers; by default the rig's.
 
     Returns
     -------
@@ -161,41 +161,40 @@ def calibrate_lasers(
         If a file, a picture or its content cannot be used.
     """
     before = rig if isinstance(rig, Rig) else load_rig(rig, need_lasers=False)
-    before = _coloured(before, wavelength_nm)
-    colour_nm = _wavelength(wavelength_nm, before)
-    seen = _target(pictures, before, box, board, medium, board_offset)
-    check_same_size(before, seen.found)
+    before = _with_wavelength(before, wavelength_nm)
+    wavelength_nm = _wavelength(wavelength_nm, before)
+    target = _detected(pictures, before, box, board, medium, board_offset)
+    check_same_size(before, target.found)
     views = tuple(
-        LaserView(view, _stripes(picture, view.name, colour_nm))
-        for view, picture in zip(seen.found.views, seen.found.pictures, strict=True)
+        LaserView(view, _stripes(picture, view.name, wavelength_nm))
+        for view, picture in zip(target.found.views, target.found.pictures, strict=True)
     )
-    in_air = abs(seen.n_medium - before.n_air) < 1e-3
-    elsewhere = in_air or medium is not None
+    elsewhere = medium is not None or before.is_air(target.n_medium)
     expected = len(names) if n_lasers is None and names is not None else n_lasers
-    with counting_missed(seen.found):
+    with counting_missed(target.found):
         result = solve_lasers(
             before,
             views,
-            seen.surfaces,
+            target.surfaces,
             options=LaserOptions(
-                n_lasers=_noted_count(before) if expected is None else expected,
-                n_medium=seen.n_medium if elsewhere else None,
+                n_lasers=_planned_count(before) if expected is None else expected,
+                n_medium=target.n_medium if elsewhere else None,
                 refine=refine,
             ),
-            uncertainty=_known(before, refine=refine, elsewhere=elsewhere),
+            uncertainty=_camera_uncertainty(before, refine=refine, elsewhere=elsewhere),
         )
     if len(result.lasers) != len(before.lasers):
-        result = replace(result, rig=_coloured(result.rig, colour_nm))
-    solved = _noted(before, result, seen)
+        result = replace(result, rig=_with_wavelength(result.rig, wavelength_nm))
+    solved = _solved_rig(before, result, target)
     return LasersResult(
         rig=solved if names is None else _with_names(solved, names),
         uncertainty=result.uncertainty,
         residuals_px={one.name: one.corner_residuals_px for one in result.views},
-        left_out={**seen.found.missed, **result.left_out},
-        notes=(*seen.found.notes, *result.warnings),
+        left_out={**target.found.missed, **result.left_out},
+        notes=(*target.found.notes, *result.warnings),
         solution=result,
-        found=(seen.found,),
-        n_medium=seen.n_medium,
+        found=(target.found,),
+        n_medium=target.n_medium,
         views=views,
     )
 
@@ -206,8 +205,7 @@ def run_lasers(request: LasersRequest, echo: Echo) -> None:
     Raises `AqualvsError` as `calibrate_lasers`, or if an output cannot be written.
     """
     check_rig_place(request.out)
-    before = _coloured(load_rig(request.rig, need_lasers=False), request.wavelength_nm)
-    _wavelength(request.wavelength_nm, before)
+    before = _with_wavelength(load_rig(request.rig, need_lasers=False), request.wavelength_nm)
     done = calibrate_lasers(
         picture_paths(request.images),
         before,
@@ -223,16 +221,17 @@ def run_lasers(request: LasersRequest, echo: Echo) -> None:
     for warning in done.solution.warnings:
         echo(f"note: {warning}")
     for figures, laser in zip(done.solution.lasers, done.rig.lasers, strict=True):
-        echo(_words(figures, laser))
+        echo(_laser_text(figures, laser))
     page = _page(before, done, request)
     finish(done.rig, page, request.out, "lasers", echo, comments_of=request.rig)
 
 
-def _known(rig: Rig, *, refine: bool, elsewhere: bool) -> RigUncertainty:
-    """Return the camera's uncertainty, with defaults for numbers that were written by hand.
+def _camera_uncertainty(rig: Rig, *, refine: bool, elsewhere: bool) -> RigUncertainty:
+    """Return the camera's uncertainty, with default sigmas for parameters without their own.
 
-    This makes lasers and camera correlated, as they are found together. Priors of a refinement are
-    the rig's own only, and an index that is only assumed is left to the water of the dive.
+    The solver propagates it to the lasers, which correlates lasers and camera. A refinement takes
+    only the rig's own covariance as its prior. If the pictures were taken `elsewhere`, not in the
+    rig's water, the default sigma of the water's index does not concern them.
     """
     own = rig_uncertainty(rig)
     if refine:
@@ -242,8 +241,8 @@ def _known(rig: Rig, *, refine: bool, elsewhere: bool) -> RigUncertainty:
     return known.only([name for name in known.names if name not in left_out])
 
 
-def _coloured(rig: Rig, wavelength_nm: float | None) -> Rig:
-    """Return the rig with lasers of this wavelength; unchanged if none is given."""
+def _with_wavelength(rig: Rig, wavelength_nm: float | None) -> Rig:
+    """Return the rig with this wavelength for all lasers; unchanged if None."""
     if wavelength_nm is None:
         return rig
     return replace(
@@ -252,22 +251,24 @@ def _coloured(rig: Rig, wavelength_nm: float | None) -> Rig:
 
 
 def _wavelength(given: float | None, rig: Rig) -> float | None:
-    """Return the lasers' wavelength in nanometres from the first source that gives it."""
-    if given is not None and not LASER_NM[0] <= given <= LASER_NM[1]:
-        raise OptionError(f"--wavelength-nm is {given:g}; {LASER_NM_REMEDY}")
-    noted = rig.solved_from.get(WAVELENGTH_NM)
-    if given is None and not rig.lasers and isinstance(noted, int | float):
-        return float(noted)
-    return common_wavelength(rig.lasers) if given is None else given
+    """Return the wavelength in nanometres: as given, else the lasers', else the planned one."""
+    if given is not None:
+        if not LASER_NM[0] <= given <= LASER_NM[1]:
+            raise OptionError(f"--wavelength-nm is {given:g}; {LASER_NM_REMEDY}")
+        return given
+    planned = rig.solved_from.get(WAVELENGTH_NM)
+    if not rig.lasers and isinstance(planned, int | float):
+        return float(planned)
+    return common_wavelength(rig.lasers)
 
 
-def _noted_count(rig: Rig) -> int | None:
-    """Return the number of lasers by the rig's notes; None for the rig's own."""
-    noted = rig.solved_from.get(N_LASERS)
-    return noted if isinstance(noted, int) and not rig.lasers else None
+def _planned_count(rig: Rig) -> int | None:
+    """Return the planned number of lasers of a rig without lasers; None otherwise."""
+    planned = rig.solved_from.get(N_LASERS)
+    return planned if isinstance(planned, int) and not rig.lasers else None
 
 
-def _target(
+def _detected(
     pictures: Pictures,
     rig: Rig,
     box: MarkerSet | str | Path | None,
@@ -275,6 +276,7 @@ def _target(
     medium: str | float | None,
     board_offset: float,
 ) -> _Target:
+    """Find the box or board in the pictures; return it with its surfaces and the medium."""
     if (box is None) == (board is None):
         raise OptionError("--box or --board: give one of them, the file of what the lasers hit")
     if box is not None:
@@ -283,7 +285,7 @@ def _target(
         surfaces = box_surfaces(markers.planes, markers.points())
         default = rig.n_water
         if n_nominal is not None:
-            # Air or the rig's own water, whichever is nearer to what the box's file says.
+            # Air or the rig's own water, whichever is nearer to the index in the box's file.
             default = min((rig.n_air, rig.n_water), key=lambda n: abs(n - n_nominal))
         found = detect_targets(
             pictures, lambda one, image: detect_markers(image, markers, one), name
@@ -303,7 +305,8 @@ def _stripes(picture: Picture, name: str, wavelength_nm: float | None) -> Stripe
     return StripePoints(name, found.pixels, found.across, found.chain, found.sigma_px)
 
 
-def _noted(before: Rig, result: LaserCalibration, target: _Target) -> Rig:
+def _solved_rig(before: Rig, result: LaserCalibration, target: _Target) -> Rig:
+    """Return the solved rig with its covariance and a note of this step."""
     old = rig_uncertainty(before)
     assumed = [name for name in result.uncertainty.names if ":" not in name]
     assumed = [file_parameter_name(name) for name in assumed if name not in old.names]
@@ -324,7 +327,7 @@ def _noted(before: Rig, result: LaserCalibration, target: _Target) -> Rig:
 
 
 def _with_names(rig: Rig, names: Sequence[str]) -> Rig:
-    """Return the rig with its lasers renamed, in its uncertainty too."""
+    """Return the rig with its lasers renamed, also in the names of its covariance."""
     lasers = rig.lasers
     if len(names) != len(lasers) or len(set(names)) != len(names):
         raise OptionError(
@@ -336,9 +339,9 @@ def _with_names(rig: Rig, names: Sequence[str]) -> Rig:
     return with_uncertainty(replace(rig, lasers=lasers), rig_uncertainty(rig).renamed(new))
 
 
-def _words(figures: LaserFigures, laser: Laser) -> str:
+def _laser_text(figures: LaserFigures, laser: Laser) -> str:
     return (
-        f"laser '{laser.name}': normal ± {_DEG * figures.sigma_normal:.3f} deg, offset "
+        f"laser '{laser.name}': normal ± {math.degrees(figures.sigma_normal):.3f} deg, offset "
         f"{1e3 * laser.plane.offset:.2f} ± {1e3 * figures.sigma_offset:.2f} mm, residual "
         f"{figures.rms_px:.2f} px, {figures.n_points} points; seen on {', '.join(figures.surfaces)}"
     )
@@ -349,7 +352,7 @@ def _laser_row(figures: LaserFigures, laser: Laser, before: Rig) -> LaserRow:
         name=laser.name,
         normal=laser.plane.normal,
         offset_mm=1e3 * laser.plane.offset,
-        sigma_normal_deg=_DEG * figures.sigma_normal,
+        sigma_normal_deg=math.degrees(figures.sigma_normal),
         sigma_offset_mm=1e3 * figures.sigma_offset,
         rms_px=figures.rms_px,
         rms_mm=1e3 * figures.rms,
@@ -366,7 +369,7 @@ def _moved(laser: Laser, before: Rig) -> str:
         return ""
     cosine = abs(float(old.plane.normal @ laser.plane.normal))
     shift = 1e3 * (abs(laser.plane.offset) - abs(old.plane.offset))
-    return f"{_DEG * math.acos(min(cosine, 1.0)):.3f}°, {shift:+.2f} mm"
+    return f"{math.degrees(math.acos(min(cosine, 1.0))):.3f}°, {shift:+.2f} mm"
 
 
 def _page(before: Rig, done: LasersResult, request: LasersRequest) -> CalibrationPage:
@@ -382,7 +385,7 @@ def _page(before: Rig, done: LasersResult, request: LasersRequest) -> Calibratio
             n_points=one.n_corners,
             rms_px=one.rms_corners_px,
             remark=f"stripes: {one.n_stripe_points} points, {one.rms_stripes_px:.2f} px; pose by "
-            f"the paper's cost differs by {_DEG * one.pose_angle:.3f}°, "
+            f"the paper's cost differs by {math.degrees(one.pose_angle):.3f}°, "
             f"{1e3 * one.pose_shift:.2f} mm",
         )
         for one in result.views
@@ -393,7 +396,7 @@ def _page(before: Rig, done: LasersResult, request: LasersRequest) -> Calibratio
         subtitle=f"Rig “{rig.name}”, {target.name}, index outside {done.n_medium:.4f}",
         cards=(
             Card("lasers", str(len(rig.lasers)), f"in {count_text(len(result.views), 'picture')}"),
-            Card("normals known to", f"{_DEG * worst:.3f}°", "one sigma, the worst laser"),
+            Card("normals known to", f"{math.degrees(worst):.3f}°", "one sigma, the worst laser"),
             Card(
                 "stripes",
                 f"{max(f.rms_px for f in result.lasers):.2f} px",
@@ -406,7 +409,8 @@ def _page(before: Rig, done: LasersResult, request: LasersRequest) -> Calibratio
             *found.remarks,
         ),
         words=tuple(
-            _words(figures, laser) for figures, laser in zip(result.lasers, rig.lasers, strict=True)
+            _laser_text(figures, laser)
+            for figures, laser in zip(result.lasers, rig.lasers, strict=True)
         ),
         expectations=expectations(rig),
         lasers=tuple(
@@ -424,8 +428,8 @@ def _page(before: Rig, done: LasersResult, request: LasersRequest) -> Calibratio
             ),
         ),
         views=(*rows, *missed_rows(found.missed)),
-        # Only these are read again.
-        pictures=tuple(_shot(view, picture) for view, picture in islice(shown, _SHOTS)),
+        # Pictures are not kept in memory: those on the page are read again.
+        pictures=tuple(_shot(view, picture) for view, picture in islice(shown, _N_SHOTS)),
         facts=facts(("rig before", str(request.rig)), ("target", str(target))),
     )
 

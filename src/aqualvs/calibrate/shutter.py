@@ -1,10 +1,10 @@
 """`aqualvs calibrate shutter`: the readout of a rolling shutter, from a dive before a flat target.
 
-Points that are read as if all rows had been exposed at once lie on no plane while the vehicle
-turns: a pitch that changes bends it, a yaw that changes twists it, in proportion to the readout.
-The rates come from the frames beside each, as in a run. What does not change with them, such as
-errors of the rig, is fitted beside the readout, and so is the warp by the change of range: it is so
-slight that errors of the picture outweigh it.
+Points that are computed as if all rows had been exposed at once do not lie on a plane while the
+vehicle turns: a pitch rate bends the plane and a yaw rate twists it, in proportion to the readout.
+The rates come from the neighbouring frames, as in a run. Two further warps are fitted with the
+readout: the static one, such as errors of the rig, and the one by the change of range, which is
+too slight to tell the readout by.
 """
 
 from collections.abc import Iterator, Sequence
@@ -32,15 +32,18 @@ from aqualvs.scanning.scan import Scan, ScanPoints
 from aqualvs.sources import FrameSource, open_source
 from aqualvs.terminal import progress
 
-# Errors by the rates are proportional to the readout: any will do to find them.
+# Readout for which the scanner computes the influence of motion, in seconds. The influence is
+# proportional to the readout and scaled afterwards, so any value will do.
 _NOMINAL = 0.02
-# Parts of the dive whose disagreement gives sigma, in seconds: longer than errors of the picture
-# stay alike while a vehicle swings, and rates are told by the same frames. Their least number, and
-# the least frames in all.
-_PART_S, _MIN_PARTS, _MIN_FRAMES = 0.5, 4, 50
+# Length in seconds of the parts of the dive whose scatter gives sigma: longer than errors of the
+# picture are correlated while a vehicle swings, and than the window of frames that gives a rate.
+_PART_S = 0.5
+_MIN_PARTS = 4
+# Fewest frames with a posture.
+_MIN_FRAMES = 50
 # The lasers move with the camera: a stripe moves by the change of range and tilt alone, 50 px/s and
 # less, and its width changes more by distance and brightness than by blur.
-_EXPOSURE = "The exposure is not observable from stripes: what the rig file says of it stays."
+_EXPOSURE = "The exposure is not observable from stripes: the value in the rig file stays."
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,29 +58,32 @@ class ShutterRequest:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ShutterCalibration:
-    """Readout of a shutter, as a dive shows it."""
+    """Readout of a shutter, estimated from a dive."""
 
     # As in `Shutter`, and its standard deviation, in seconds.
     readout: float
     sigma: float
     # Frames with a posture.
     n_frames: int
-    # Shape (N,): middles of the parts of the dive, and the readout of each, in seconds.
+    # Shape (N,): mean time of each part of the dive, and its readout, in seconds.
     times: FloatArray
     parts: FloatArray
 
     @property
     def rolls(self) -> bool:
-        """Whether the readout is not zero by chance."""
+        """Whether the readout differs from zero by more than three sigmas."""
         return abs(self.readout) > 3.0 * self.sigma
 
 
 class _Warp(NamedTuple):
-    """What one frame tells: b = matrix @ (static - readout * rates), in units of its own noise."""
+    """Normal equations of one frame: right = matrix @ (static - readout * rates).
+
+    The three components are range, pitch and yaw; residuals are divided by their noise.
+    """
 
     scan: Scan
-    matrix: FloatArray
-    right: FloatArray
+    matrix: FloatArray  # Shape (3, 3).
+    right: FloatArray  # Shape (3,).
 
 
 def calibrate_shutter(source: FrameSource, rig: Rig) -> ShutterCalibration:
@@ -88,12 +94,12 @@ def calibrate_shutter(source: FrameSource, rig: Rig) -> ShutterCalibration:
     source : FrameSource
         A dive in which the vehicle turns before a flat target.
     rig : Rig
-        With lasers; its own readout is not used.
+        Rig with lasers; its own readout is not used.
 
     Raises
     ------
     CalibrationError
-        If the dive shows too few postures, or too little motion.
+        If the dive has too few postures, or too little motion.
     SourceError
         If the pictures do not fit the rig, or cannot be read.
     """
@@ -117,7 +123,7 @@ def calibrate_shutter(source: FrameSource, rig: Rig) -> ShutterCalibration:
             f"wall, at least {_MIN_FRAMES} frames"
         )
     found = _solve(scans, warps)
-    # A sigma beyond this, in seconds, is no result: 5 % of a usual readout.
+    # Largest useful sigma, in seconds: 5 % of a usual readout.
     max_sigma = 1e-3
     if not found.sigma <= max_sigma:
         raise CalibrationError(
@@ -131,15 +137,15 @@ def calibrate_shutter(source: FrameSource, rig: Rig) -> ShutterCalibration:
 def run_shutter(request: ShutterRequest, echo: Echo) -> None:
     """Calibrate the shutter and write the rig with it, and its report.
 
-    Raises `AqualvsError` as `calibrate_shutter`, or if the rig cannot be used or an output not be
-    written.
+    Raises `AqualvsError` as `calibrate_shutter`, or if the rig cannot be used or an output cannot
+    be written.
     """
     check_rig_place(request.out)
     rig = load_rig(request.rig)
     if rig.shutter.is_interlaced:
         raise RigError(
-            f"{request.rig}: camera.shutter.kind is interlaced, whose fields are as far apart as "
-            "the video's standard says; leave the shutter out to calibrate a rolling one"
+            f"{request.rig}: camera.shutter.kind is interlaced, and the video standard fixes the "
+            "time between its fields; leave the shutter out to calibrate a rolling one"
         )
     with open_source(request.source, fps=request.fps) as source:
         found = calibrate_shutter(source, rig)
@@ -185,19 +191,24 @@ def _text(found: ShutterCalibration) -> str:
 
 
 def _warp(scan: Scan, height: int) -> _Warp | None:
-    """Return how the points of a posture are bent by rates that last from row to row."""
+    """Return the normal equations of a frame's warp; None without a posture or noise.
+
+    `height` is the number of rows of the picture.
+    """
     posture, points = scan.posture, scan.points
     if not isinstance(posture, Posture) or posture.by_motion is None or not points.used.any():
         return None
     seen = points.points_in_dome[points.used]
+    # The plane is m·X = 1.
     m = posture.normal_in_dome / posture.range
     by_m = posture_by_plane(m)
     sigma = points.sigma[points.used] * np.linalg.norm(m)
+    # Time of each row from the middle of the readout, as a share of the readout.
     shares = (points.pixels[points.used, 1] + 0.5) / height - 0.5
     # Residuals of m·X, and their derivatives by the rates, for a readout of one second.
     both = np.column_stack([seen @ m - 1.0, (seen * shares[:, None]) @ np.linalg.inv(by_m)])
     both, seen = both / sigma[:, None], seen / sigma[:, None]
-    # What a plane explains tells nothing.
+    # Remove the component that another plane explains: it does not depend on the readout.
     both -= seen @ np.linalg.lstsq(seen, both)[0]
     noise = 1.4826 * float(np.median(np.abs(both[:, 0])))
     if not noise > 0.0:
@@ -207,9 +218,9 @@ def _warp(scan: Scan, height: int) -> _Warp | None:
 
 
 def _solve(scans: Sequence[Scan], warps: Sequence[tuple[int, _Warp]]) -> ShutterCalibration:
-    """Return the readout that explains the warps, and its sigma by the parts of the dive."""
+    """Return the readout that explains the warps, with a sigma from the parts of the dive."""
     readout = 0.0
-    # The rates are corrected by the readout, which converges by a factor of ten or more a round.
+    # Rates depend on the readout; each iteration reduces the error by a factor of ten or more.
     rounds = 6
     for _ in range(rounds):
         equations = list(_equations(scans, warps, readout))
@@ -225,11 +236,12 @@ def _solve(scans: Sequence[Scan], warps: Sequence[tuple[int, _Warp]]) -> Shutter
     without = np.array(
         [np.linalg.pinv(matrices[one].sum(axis=0))[0] @ rights[one].sum(axis=0) for one in left]
     )
-    # Few parts tell their scatter badly: the variance is that of Student's distribution.
+    # The variance of Student's distribution: the scatter of few parts is itself uncertain.
     variance = float((n_parts - 1) * np.var(without)) * (n_parts - 1) / (n_parts - 3)
     return ShutterCalibration(
         readout=readout,
-        # Without motion the noise of the rates is taken for some, and chance may agree with it.
+        # Without motion, the noise of the rates passes for motion, and parts may agree by chance:
+        # sigma is at least that of the least squares.
         sigma=float(np.sqrt(max(variance, inverse[0, 0]))),
         n_frames=len(warps),
         times=np.array([times[share == part].mean() for part in range(n_parts)]),
@@ -240,9 +252,9 @@ def _solve(scans: Sequence[Scan], warps: Sequence[tuple[int, _Warp]]) -> Shutter
 def _equations(
     scans: Sequence[Scan], warps: Sequence[tuple[int, _Warp]], readout: float
 ) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Yield the normal equations of each frame, with rates for a readout.
+    """Yield the normal equations (5, 5) and (5,) of each frame, with rates for a readout.
 
-    Unknowns (5): the readout, the warp by the change of range, and the static one.
+    The unknowns are the readout, the warp by the change of range, and the static warp (3).
     """
     scaled = [_with_readout(scan, readout) for scan in scans]
     for i, warp in warps:
@@ -255,6 +267,7 @@ def _equations(
 
 
 def _with_readout(scan: Scan, readout: float) -> Scan:
+    """Return the scan with the influence of motion scaled from `_NOMINAL` to a readout."""
     posture = scan.posture
     if not isinstance(posture, Posture) or posture.by_motion is None:
         return scan

@@ -1,13 +1,13 @@
 """Stripes in a whole picture, for lasers whose planes are not known yet.
 
-Compression takes the colour of a thin line piece by piece, and print or a dark surface its height,
-so that what is left of it, taken alone, may as well be another thing. A line's own direction at its
-end leads to a window that widens with the way, as the direction is uncertain and the surface may
-bend. How many other pieces are at least as likely to be a line, and run the same way, is counted in
-the picture itself. A piece continues the line if a hundredth of such a piece, or less, is expected
-by chance in the window up to it (the number of false alarms of Desolneux, Moisan and Morel 2000,
-"Meaningful Alignments"). Only peaks that were found are added, and nothing where no piece is
-certain.
+Compression removes the colour of parts of a thin line, and print or a dark surface their height, so
+that the segments left over are not certain to be laser light when judged alone. They are therefore
+linked to certain ones. From the end of a line, along its direction there, a window opens that
+widens with distance, as the direction is uncertain and the surface may bend. The density of other
+segments that are at least as likely to be a line, and run the same way, is counted in the picture
+itself. A segment continues the line if at most a hundredth of such a segment is expected by chance
+in the window up to it (the number of false alarms of Desolneux, Moisan and Morel 2000, "Meaningful
+Alignments"). Only detected peaks are added, and no line begins without a certain segment.
 """
 
 import math
@@ -32,36 +32,37 @@ from aqualvs.scanning.stripe_segments import (
     line_log_odds,
 )
 
-# A stripe at less than 45 degrees to a search line is left to the other axis.
-_STEEPEST = 1.0
+# Largest slope, in pixels across search lines per pixel: steeper stripes, at less than 45 degrees
+# to their search lines, are left to the other axis.
+_MAX_SLOPE = 1.0
 # Full width at half height of a normal distribution, in standard deviations.
 _WIDTH_OF_SIGMA = 2.355
+# Longest side of a map of `cv2.remap`, which must stay below 32768.
 _MAP_LENGTH = 30000
-# Pieces that are less likely than needed by more than these log odds continue nothing.
-_HELP = 2.0
+# A segment whose log odds are below the threshold by more than this continues no line.
+_MAX_SHORTFALL = 2.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class UncalibratedStripeOptions:
     """Options of `find_stripes`."""
 
-    # Least likelihood, 0 to 1, that a piece of stripe is a laser's line, by its shape and colour
-    # and by the picture's other lines.
+    # Least probability that a segment is a laser's line, by its shape and colour and by the
+    # picture's other lines.
     min_likelihood: float = 0.5
-    # Shortest unbroken piece of a stripe that continues no other, as a share of the picture's
-    # width.
+    # Shortest segment that may begin a line, as a share of the picture's width.
     min_length_share: float = 0.015
-    # Of the lasers; green if None.
+    # Wavelength of the lasers; green if None.
     wavelength_nm: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class StripePixels:
-    """Points on stripes of a picture, N of them, chain by chain along each stripe."""
+    """Points on stripes of a picture, N of them, ordered along each unbroken chain."""
 
     pixels: FloatArray  # Shape (N, 2): sub-pixel centres, in `image`.
-    across: FloatArray  # Shape (N, 2): unit vectors at right angles to the stripe.
-    chain: IntArray  # Shape (N,): number of the unbroken piece of a stripe that a point belongs to.
+    across: FloatArray  # Shape (N, 2): unit vectors perpendicular to the stripe, in `image`.
+    chain: IntArray  # Shape (N,): number of the unbroken chain that a point belongs to.
     height: FloatArray  # Shape (N,): peak above background, in grey levels.
     width: FloatArray  # Shape (N,): full width at half height across the stripe, in pixels.
     sigma_px: FloatArray  # Shape (N,): nominal standard deviation of the centre across the stripe.
@@ -74,7 +75,7 @@ class StripePixels:
 def find_stripes(
     image: ImagePlane | Frame, options: UncalibratedStripeOptions | None = None
 ) -> StripePixels:
-    """Find the lines of lasers: thin, long, of the lasers' colour, and similar to each other.
+    """Find laser lines: thin, long, of the lasers' colour, and similar to each other.
 
     Parameters
     ----------
@@ -85,8 +86,8 @@ def find_stripes(
     Returns
     -------
     StripePixels
-        Each piece of a stripe is searched along the axis that crosses it nearer to a right angle.
-        Empty if no piece is certain.
+        Each segment is searched along the axis that crosses it at the larger angle. Empty if no
+        segment is certain.
     """
     options = options or UncalibratedStripeOptions()
     frame = image if isinstance(image, Frame) else Frame(0, 0.0, *planes_of_image(image))
@@ -104,20 +105,20 @@ def find_stripes(
         here = slice(first, first + len(segments.start) - 1)
         keep = line[here] >= 0
         for of, chain in zip(line[here][keep], extended(segments, keep), strict=True):
-            parts.setdefault(int(of), []).append(_piece(segments.search, segments.peaks, chain))
+            parts.setdefault(int(of), []).append(_pixels_of(segments.search, segments.peaks, chain))
         first = here.stop
-    stripes = _joined([piece for of in parts.values() for piece in _unless_blob(of)])
+    stripes = _concatenated([chain for of in parts.values() for chain in _unless_blob(of)])
     return replace(stripes, sigma_px=_sigma_px(frame.luma, stripes))
 
 
 def find_all_segments(frame: Frame, options: UncalibratedStripeOptions) -> list[StripeSegments]:
-    """Find pieces of stripes along both search directions, lines of lasers and others.
+    """Find the segments of all lines, laser light or not, one set for each search axis.
 
     Parameters
     ----------
     frame : Frame
     options : UncalibratedStripeOptions
-        The wavelength says in which channel lines are brightest.
+        Of these, the wavelength selects the channel in which lines are brightest.
     """
     size_px = frame.luma.shape[1], frame.luma.shape[0]
     colour = LaserColour.of(options.wavelength_nm)
@@ -125,22 +126,24 @@ def find_all_segments(frame: Frame, options: UncalibratedStripeOptions) -> list[
 
 
 def _whole_band(size_px: tuple[int, int], axis: SearchAxis, colour: LaserColour) -> LaserBand:
+    """Return a band that covers the whole picture, for slopes up to `_MAX_SLOPE`."""
     line_px = pixels_per_line(size_px)
     n_pixels, length = size_px if axis is SearchAxis.ALONG_Y else size_px[::-1]
     n_lines = n_pixels // line_px
-    slopes = np.full((-(-length // SLOPE_CELL), -(-n_lines // SLOPE_CELL)), _STEEPEST * line_px)
+    slopes = np.full((-(-length // SLOPE_CELL), -(-n_lines // SLOPE_CELL)), _MAX_SLOPE * line_px)
     lowest, highest = np.zeros(n_lines, np.int64), np.full(n_lines, length - 1)
     return LaserBand(axis, line_px, lowest, highest, -slopes, slopes, colour)
 
 
-def _piece(search: LaserBand, peaks: StripePeaks, chain: IntArray) -> StripePixels:
+def _pixels_of(search: LaserBand, peaks: StripePeaks, chain: IntArray) -> StripePixels:
+    """Return the points of one chain of peaks, without dots and parts that are too steep."""
     axis = search.axis
     line = search.line_px * (peaks.line[chain].astype(np.float64) + 0.5) - 0.5
     slope = _slopes(line, peaks.position[chain])
     width = peaks.width[chain]
-    # At just 45 degrees one of the axes must have it.
-    steep_enough = np.abs(slope) <= _STEEPEST * (1.0 if axis is SearchAxis.ALONG_Y else 0.999999)
-    keep = steep_enough & ~_in_dot(width, search.line_px)
+    # A stripe at exactly 45 degrees belongs to one axis only.
+    not_steep = np.abs(slope) <= _MAX_SLOPE * (1.0 if axis is SearchAxis.ALONG_Y else 0.999999)
+    keep = not_steep & ~_in_dot(width, search.line_px)
     chain, line, slope = chain[keep], line[keep], slope[keep]
     along_x = axis is SearchAxis.ALONG_X
     cosine = 1.0 / np.hypot(1.0, slope)
@@ -159,10 +162,10 @@ def _piece(search: LaserBand, peaks: StripePeaks, chain: IntArray) -> StripePixe
 
 def _in_dot(width: FloatArray, line_px: int) -> BoolArray:
     """Mark the peaks (N,) of a chain that lie on a dot, by their widths in pixels."""
-    # Returns wider than this many median widths of their chain are a dot on the stripe, unless they
-    # go on for longer than this many of their own widths: then a pale surface saturates the camera.
+    # Peaks wider than `max_width` medians of their chain are a dot on the stripe, unless the wide
+    # part is longer than `longest_dot` of its own widths: then a pale surface saturates the camera.
     max_width, longest_dot = 1.8, 1.5
-    # The measured width of a thinner line tells where it lies between two pixels.
+    # The measured width of thinner lines varies with their position between two pixels.
     thinnest_px = 2.0
     wide = width > max_width * max(float(np.median(width)), thinnest_px)
     bounds = np.flatnonzero(np.diff(wide, prepend=False, append=False))
@@ -173,35 +176,35 @@ def _in_dot(width: FloatArray, line_px: int) -> BoolArray:
 
 
 def _unsmoothed(width: FloatArray, slope: FloatArray) -> FloatArray:
-    """Return widths (N,) without what smoothing along slanted stripes adds to them."""
+    """Return widths (N,), in pixels, without the broadening by smoothing along slanted stripes."""
     added = _WIDTH_OF_SIGMA * SMOOTHING * slope
     squared: FloatArray = np.maximum(width**2 - added**2, (0.5 * width) ** 2)
     return np.sqrt(squared)
 
 
 def _sigma_px(luma: ImagePlane, stripes: StripePixels) -> FloatArray:
-    """Return the nominal noise (N,) of points across their stripes."""
+    """Return the nominal noise (N,) of points across their stripes, in pixels."""
 
-    def lopsided(at: float) -> FloatArray:
+    def asymmetry(at: float) -> FloatArray:
+        """Return the brightness of one side minus the other, `at` widths away, by peak height."""
         arms = at * stripes.width[:, None] * stripes.across
         sides = [_bilinear(luma, stripes.pixels + sign * arms) for sign in (-1.0, 1.0)]
         return (sides[1] - sides[0]) / stripes.height
 
-    # Where one side is lighter than the other, beyond the stripe or on its slopes, paint shifts the
-    # centre by about this many widths, relative to the height of the stripe.
-    flank_at, flank_pull = 1.3, 0.2
-    slope_at, slope_pull = 0.5, 0.35
-    pull = np.hypot(flank_pull * lopsided(flank_at), slope_pull * lopsided(slope_at))
-    # Noise of the centre of a stripe by speckle, as a share of its width; the least noise is that
-    # of 8 bits and a Bayer pattern.
+    # A painted surface that is lighter on one side, beyond the stripe or on its slopes, shifts the
+    # centre by about this many widths per unit of asymmetry.
+    flank_at, flank_shift = 1.3, 0.2
+    slope_at, slope_shift = 0.5, 0.35
+    shift = np.hypot(flank_shift * asymmetry(flank_at), slope_shift * asymmetry(slope_at))
+    # Noise of the centre by speckle, as a share of the width; and the least noise, by 8 bits and a
+    # Bayer pattern.
     sigma_in_widths, min_sigma_px = 0.01, 0.05
-    in_widths = np.hypot(sigma_in_widths, pull)
+    in_widths = np.hypot(sigma_in_widths, shift)
     return np.hypot(min_sigma_px, in_widths * stripes.width)
 
 
 def _bilinear(luma: ImagePlane, pixels: FloatArray) -> FloatArray:
     x, y = np.ascontiguousarray(pixels.T, np.float32)
-    # OpenCV's maps are pictures, of which the sides have a limit.
     rows = [slice(i, i + _MAP_LENGTH) for i in range(0, len(x), _MAP_LENGTH)]
     values = [
         cv2.remap(luma, x[r], y[r], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).ravel()
@@ -213,7 +216,7 @@ def _bilinear(luma: ImagePlane, pixels: FloatArray) -> FloatArray:
 def _slopes(line: FloatArray, position: FloatArray) -> FloatArray:
     """Return d position / d line (N,), by a straight fit to the neighbours along the chain."""
     index = np.arange(len(line))
-    # Slopes are computed from this many peaks on either side.
+    # Peaks on either side that a slope is fitted to.
     slope_reach = 6
     first = np.maximum(index - slope_reach, 0)
     last = np.minimum(index + slope_reach + 1, len(line))
@@ -230,42 +233,42 @@ def _slopes(line: FloatArray, position: FloatArray) -> FloatArray:
 
 
 def _unless_blob(line: list[StripePixels]) -> list[StripePixels]:
-    """Return the pieces of a line that have at least three points; none if they are a blob."""
-    pieces = [piece for piece in line if len(piece) >= 3]
-    if not pieces:
+    """Return the chains of a line that have at least three points; none if they are a blob."""
+    chains = [chain for chain in line if len(chain) >= 3]
+    if not chains:
         return []
-    length = sum(float(np.hypot(*(piece.pixels[-1] - piece.pixels[0]))) for piece in pieces)
+    length = sum(float(np.hypot(*(chain.pixels[-1] - chain.pixels[0]))) for chain in chains)
     # A line shorter than this many of its own widths is a blob: the beam's own dot, a glint, a
     # mark.
     min_length_in_widths = 2.5
-    width = np.median(np.concatenate([piece.width for piece in pieces]))
-    return pieces if length >= min_length_in_widths * float(width) else []
+    width = np.median(np.concatenate([chain.width for chain in chains]))
+    return chains if length >= min_length_in_widths * float(width) else []
 
 
-def _joined(parts: list[StripePixels]) -> StripePixels:
-    """Return all parts as one, with chains numbered through."""
+def _concatenated(chains: list[StripePixels]) -> StripePixels:
+    """Return the points of all chains, with the chains numbered consecutively."""
     none = np.zeros(0)
-    whole = [
-        StripePixels(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, np.int64), none, none, none)
-    ]
-    first = 0
-    for part in parts:
-        whole.append(replace(part, chain=part.chain + first))
-        first += int(part.chain.max(initial=-1)) + 1
+    empty = StripePixels(
+        none.reshape(0, 2), none.reshape(0, 2), none.astype(np.int64), none, none, none
+    )
+    numbered = [replace(one, chain=np.full(len(one), i)) for i, one in enumerate(chains)]
     names = StripePixels.__slots__
-    return StripePixels(*(np.concatenate([getattr(one, name) for one in whole]) for name in names))
+    return StripePixels(
+        *(np.concatenate([getattr(one, name) for one in (empty, *numbered)]) for name in names)
+    )
 
 
 class _Window(NamedTuple):
-    """Where a line may go on beyond its end."""
+    """Window beyond the end of a line in which the line may continue."""
 
-    # Half width in pixels, and its growth for each pixel of the way on bent surfaces; largest
-    # change of direction in radians there; standard deviations of what noise adds to both. Pieces
-    # may overlap by some pixels.
+    # Half width at the end of the line, and its growth per pixel of distance, for bent surfaces.
     half_px: float = 0.75
     widening: float = 0.04
+    # Largest change of direction.
     turn_rad: float = 0.15
+    # Standard deviations of noise by which half width and change of direction may be larger.
     n_sigmas: float = 2.0
+    # Largest overlap of two segments along the line.
     overlap_px: float = 2.5
 
 
@@ -273,17 +276,17 @@ _WINDOW = _Window()
 
 
 class _Ends(NamedTuple):
-    """Both ends of pieces, P of them."""
+    """First and last end of segments, P of them, by a straight fit to the peaks at each end."""
 
-    # Shape (P, 2, 2): first and last point of a straight fit to the peaks at that end.
+    # Shape (P, 2, 2): position of each end.
     at: FloatArray
-    # Shape (P, 2, 2): unit vectors along it, away from the piece.
+    # Shape (P, 2, 2): unit vectors along the fit, away from the segment.
     outward: FloatArray
-    # Shape (P, 2): standard deviations of its place across the piece and of its direction.
+    # Shape (P, 2): standard deviations of position across the segment, and of direction.
     sigma_px: FloatArray
     sigma_rad: FloatArray
-    # Shape (P,): whether the piece is nearer to its search lines than to a right angle with them;
-    # then the other search direction has it.
+    # Shape (P,): whether the segment makes less than 45 degrees with its search lines; the other
+    # search axis finds it then, too.
     is_steep: BoolArray
 
 
@@ -294,29 +297,27 @@ def continued(
     min_length_px: float,
     size_px: tuple[int, int],
 ) -> IntArray:
-    """Find the pieces that are lines: likely long ones, and others that continue these.
+    """Find the segments of lines: long and likely ones, and others that continue these.
 
     Parameters
     ----------
     found : list of StripeSegments
-        All pieces of one picture, P in all.
+        All segments of one picture, by search axis; P in all.
     log_odds : array, shape (P,)
-        That each is a line.
-    least : float
-        Log odds from which on a piece needs no other.
-    min_length_px : float
-        Length from which on it needs no other.
+        Log odds that each segment is a line.
+    least, min_length_px : float
+        Log odds and length from which on a segment is a line by itself.
     size_px : tuple of int
         Width and height of the picture.
 
     Returns
     -------
     line : int array, shape (P,)
-        Number of the line that a piece belongs to, -1 if to none. Its other pieces may be of the
-        other search direction.
+        Number of the line that a segment belongs to, or -1. A line may have segments of both search
+        axes.
     """
     length = np.concatenate([segments.table[LENGTH] for segments in found])
-    pool = np.flatnonzero(log_odds >= least - _HELP)
+    pool = np.flatnonzero(log_odds >= least - _MAX_SHORTFALL)
     ends, log_odds = _ends(found, pool), log_odds[pool]
     in_line = (log_odds >= least) & (length[pool] >= min_length_px)
     by_chance = np.flatnonzero(~in_line & ~ends.is_steep)
@@ -326,7 +327,7 @@ def continued(
     while waiting:
         a = waiting.popleft()
         for end in (0, 1):
-            b = _next_piece(ends, a, end, log_odds, in_line, by_chance, area_px)
+            b = _next_segment(ends, a, end, log_odds, in_line, by_chance, area_px)
             if b < 0:
                 continue
             root[root == root[b]] = root[a]
@@ -338,7 +339,7 @@ def continued(
     return line
 
 
-def _next_piece(
+def _next_segment(
     ends: _Ends,
     a: int,
     end: int,
@@ -347,10 +348,13 @@ def _next_piece(
     by_chance: IntArray,
     area_px: float,
 ) -> int:
-    """Return the piece that continues piece `a` beyond one of its ends, or -1."""
-    # Pieces expected by chance in the window up to one that continues a line. Of the pieces of a
-    # class the k-th likeliest is met with this chance over k, so that some hundredths of all ends
-    # are continued by another thing.
+    """Return the segment that continues segment `a` beyond one of its ends, or -1.
+
+    `by_chance` are the segments that serve to count how many are met by chance.
+    """
+    # Largest number of segments expected by chance in the window up to one that continues a line.
+    # The k-th likeliest segment is met by chance with this probability divided by k, so that some
+    # hundredths of all ends are continued wrongly.
     max_false_alarms = 0.01
     ahead, way_px, near = _ahead(ends, a, end)
     turn = _turn(ends.outward[a, end], ends.outward[by_chance, 1])
@@ -367,7 +371,7 @@ def _next_piece(
 
 
 def _ahead(ends: _Ends, a: int, end: int) -> tuple[IntArray, FloatArray, IntArray]:
-    """Return the pieces in the window of an end; of all pieces, the way there and the near end."""
+    """Return the segments in the window of an end; of all, the distance along it and near end."""
     along = ends.outward[a, end]
     off = ends.at - ends.at[a, end]
     way, across = off @ along, off @ np.array([-along[1], along[0]])
@@ -387,7 +391,7 @@ def _ahead(ends: _Ends, a: int, end: int) -> tuple[IntArray, FloatArray, IntArra
 
 
 def _turn(along: FloatArray, others: FloatArray) -> FloatArray:
-    """Return the angles (N,) between a direction and others (N, 2), whichever way these point."""
+    """Return the angles (N,) between a direction and others (N, 2), regardless of their sign."""
     return np.arccos(np.minimum(np.abs(others @ along), 1.0))
 
 
@@ -396,7 +400,7 @@ def _turn_limit(one_rad: FloatArray, other_rad: FloatArray) -> FloatArray:
 
 
 def _window_px(ends: _Ends, a: int, end: int, way_px: float) -> float:
-    """Return the area of the window of an end up to a way."""
+    """Return the area of the window of an end up to a distance, in square pixels."""
     way_px = max(way_px, 1.0)
     half_px = _WINDOW.half_px + _WINDOW.n_sigmas * float(ends.sigma_px[a, end])
     widening = _WINDOW.widening + _WINDOW.n_sigmas * float(ends.sigma_rad[a, end])
@@ -404,7 +408,7 @@ def _window_px(ends: _Ends, a: int, end: int, way_px: float) -> float:
 
 
 def _ends(found: list[StripeSegments], pool: IntArray) -> _Ends:
-    """Fit straight lines to both ends of the pieces `pool`."""
+    """Fit straight lines to both ends of the segments with the numbers `pool`."""
     n = len(pool)
     points, sigmas = np.zeros((2, n, 2, 2)), np.zeros((2, n, 2))
     ends = _Ends(points[0], points[1], sigmas[0], sigmas[1], np.zeros(n, bool))
@@ -427,17 +431,17 @@ def _ends(found: list[StripeSegments], pool: IntArray) -> _Ends:
 
 
 def _fit_ends(line: FloatArray, position: FloatArray, ends: _Ends, i: int) -> None:
-    """Write the ends of piece i, with search lines as x."""
-    # Peaks to fit, and least noise of a peak in pixels: neighbours share the noise that smoothing
-    # along the stripe leaves.
+    """Write the ends of segment i to `ends`, with search lines as x."""
+    # Peaks to fit, and least noise of a peak in pixels: smoothing along the stripe correlates the
+    # noise of neighbours, so that residuals show too little of it.
     n_fit, min_sigma_px = 16, 0.3
     for end, peaks in ((0, slice(None, n_fit)), (1, slice(-n_fit, None))):
         x, y = line[peaks], position[peaks]
         n, middle = len(x), x.mean()
         spread = float(((x - middle) ** 2).sum())
         slope = float(((x - middle) * y).sum()) / spread
-        left = y - y.mean() - slope * (x - middle)
-        sigma = max(math.sqrt(float((left**2).sum()) / max(n - 2, 1)), min_sigma_px)
+        residuals = y - y.mean() - slope * (x - middle)
+        sigma = max(math.sqrt(float((residuals**2).sum()) / max(n - 2, 1)), min_sigma_px)
         cosine = 1.0 / math.hypot(1.0, slope)
         at = x[-end]
         ends.at[i, end] = at, y.mean() + slope * (at - middle)
@@ -448,15 +452,20 @@ def _fit_ends(line: FloatArray, position: FloatArray, ends: _Ends, i: int) -> No
 
 
 def extended(segments: StripeSegments, keep: BoolArray) -> list[IntArray]:
-    """Return the chains of peaks of kept pieces, each with the peaks that follow at its ends.
+    """Return the chains of peaks of some segments, extended by the peaks beyond their ends.
 
-    A piece ends at a kink or a gap; a few peaks beyond may still belong to the line.
+    A segment ends at a kink or a gap; a few peaks beyond may still belong to the line.
 
     Parameters
     ----------
     segments : StripeSegments
     keep : bool array, shape (P,)
-        Which pieces are lines.
+        True for the segments that are lines.
+
+    Returns
+    -------
+    chains : list of int array
+        Indices of peaks along each segment.
     """
     peaks = segments.peaks
     first_of = np.searchsorted(peaks.line, np.arange(len(segments.search.lowest) + 1))
@@ -486,11 +495,14 @@ def _following(
     first_of: IntArray,
     used: BoolArray,
 ) -> IntArray:
-    """Return and mark the peaks that follow the last one of a chain, one a search line."""
+    """Return the peaks that follow the last one of a chain, one a search line; mark them as used.
+
+    `step` is 1 or -1, the direction in search lines.
+    """
     n = chain.shape[0]
-    # Extension of a line at its end: most peaks; largest distance in pixels from the extrapolation
-    # by its slope over this many peaks; least height as a share of the line's; and limit of the
-    # search lines missed.
+    # Most peaks that extend a line; largest distance in pixels from the extrapolation by the slope
+    # over `slope_peaks`; least height as a share of the chain's median; search lines without a peak
+    # at which to stop.
     max_following, follow_px, slope_peaks, min_height_share, max_missed = 8, 1.2, 6, 0.3, 4
     last, back = chain[n - 1], chain[max(n - 1 - slope_peaks, 0)]
     slope = (position[last] - position[back]) / max(abs(line[last] - line[back]), 1)

@@ -1,5 +1,6 @@
 """`aqualvs calibrate water`: the index of the water, from a target fixed on the vehicle."""
 
+import glob
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -78,16 +79,16 @@ def calibrate_water(
     ----------
     pictures : sequence of str, Path or array, a str or Path, or FrameSource
         Files or pixels (grey, or blue, green, red), one folder or pattern, or an opened video; of
-        the size that the rig's camera has. A source's frames have times, so that changes of the
-        index are followed.
+        the size that the rig's camera has. Frames of a source have times, by which changes of the
+        index are tracked.
     target : MarkerSet, str or Path
         Markers in the dome's frame, or their file.
     rig : Rig, str or Path
         Rig with camera and dome, or its file.
     prior : IndexPrior, optional
-        What is known of the index beforehand, such as `IndexPrior.seawater`.
+        Prior of the index, such as `IndexPrior.seawater`.
     options : IndexOptions, optional
-        Assumptions about the target's fixing and the water.
+        Assumptions on how firmly the target is mounted, and on the water.
 
     Returns
     -------
@@ -119,9 +120,9 @@ def calibrate_water(
         prior=prior,
         options=options or IndexOptions(),
     )
-    _check(result)
+    _check_observable(result)
     return Calibration(
-        rig=_noted(before, result),
+        rig=_solved_rig(before, result),
         uncertainty=result.uncertainty,
         residuals_px=result.residuals,
         left_out={**found.missed, **{one.name: one.refused for one in result.readings if not one}},
@@ -182,7 +183,8 @@ def _found_in(
     return DetectedTargets(tuple(views), (), rig.size_px, missed), times
 
 
-def _check(result: WaterCalibration) -> None:
+def _check_observable(result: WaterCalibration) -> None:
+    """Raise `CalibrationError` if neither the pictures nor a prior determine the index."""
     if not result.observable and not any(reading.prior_used for reading in result.readings):
         raise CalibrationError(
             f"the index is known to {result.sigma:.2g} only: "
@@ -192,16 +194,18 @@ def _check(result: WaterCalibration) -> None:
 
 
 def _source(request: WaterRequest) -> FrameSource:
-    only = request.source[0]
-    pictures = len(request.source) > 1 or Path(only).suffix.lower() in IMAGE_SUFFIXES
-    usual_fps = 25.0
-    if pictures or any(sign in only for sign in "*?["):
-        return ImageSource(picture_paths(request.source), fps=request.fps or usual_fps)
-    fps = request.fps or (usual_fps if Path(only).is_dir() else None)
-    return open_source(only, fps=fps)
+    """Open the pictures, the folder or the video of a request."""
+    first = request.source[0]
+    several = len(request.source) > 1 or glob.has_magic(first)
+    # Pictures carry no times.
+    default_fps = 25.0
+    if several or Path(first).suffix.lower() in IMAGE_SUFFIXES:
+        return ImageSource(picture_paths(request.source), fps=request.fps or default_fps)
+    fps = request.fps or (default_fps if Path(first).is_dir() else None)
+    return open_source(first, fps=fps)
 
 
-def _noted(rig: Rig, result: WaterCalibration) -> Rig:
+def _solved_rig(rig: Rig, result: WaterCalibration) -> Rig:
     counted = [reading for reading in result.readings if reading]
     step = SolvedStep(
         pictures=len(counted),
@@ -225,7 +229,11 @@ def _page(
         subtitle=f"Rig “{rig.name}”, {' '.join(request.source[:3])}",
         cards=(
             Card("index", f"{result.n:.5f}", f"± {result.sigma:.5f}"),
-            Card("changes seen", f"{result.sigma_random:.1e}", "what more pictures would lessen"),
+            Card(
+                "random part",
+                f"{result.sigma_random:.1e}",
+                "of this sigma; less with more pictures",
+            ),
             Card("pictures", str(len(counted)), f"{result.rms_px:.3f} px rms"),
         ),
         warnings=tuple(step.text() for step in result.steps),
@@ -243,7 +251,7 @@ def _page(
                 marks=marks,
             ),
             Series(
-                title="Index of each picture, with its noise alone",
+                title="Index of each picture, with its own noise",
                 x_label="time, s",
                 y_label="index",
                 x=times,

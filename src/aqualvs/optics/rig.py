@@ -135,6 +135,11 @@ class Rig:
         """Return the same rig in a medium of another index."""
         return replace(self, n_water=n_water)
 
+    def is_air(self, index: float) -> bool:
+        """Return whether a medium of this refractive index is the air inside the housing."""
+        tolerance = 1e-3
+        return abs(index - self.n_air) < tolerance
+
 
 LASER_PARAMETERS = ("tilt_1", "tilt_2", "offset")
 """Small changes of a laser plane: rotations of its normal towards `tangent_basis` (radians), and

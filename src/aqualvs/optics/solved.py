@@ -408,9 +408,8 @@ def _defaults(rig: Rig) -> Iterator[Assumption]:
             (SIGMAS.lens_m, SIGMAS.thickness_m, SIGMAS.n_acrylic, tilt, tilt),
         )
     refracts = rig.housing is not None or any(laser.window is not None for laser in rig.lasers)
-    # An index outside that is the one inside is air, which is known.
-    air = 1e-3
-    if refracts and abs(rig.n_water - rig.n_air) > air:
+    # The index of air is known.
+    if refracts and not rig.is_air(rig.n_water):
         yield _independent("water's index", f"{SIGMAS.n_water:g}", ["n_water"], [SIGMAS.n_water])
     for laser in rig.lasers:
         yield _independent(
