@@ -1,8 +1,8 @@
 """`aqualvs check new.yaml --against old.yaml`: changes between two rigs, and their consequence.
 
 Two rigs are compared number by number, for example before and after maintenance. Each difference
-has a sigma from the covariances of both rigs, so that a move can be told from chance. The
-consequence is what the old rig would read of a wall where the new one is right.
+has a sigma from the covariances of both rigs, which separates changes from chance. The consequence
+is the posture to a wall that the old rig would measure if the new one is right.
 """
 
 import math
@@ -37,9 +37,9 @@ from aqualvs.optics.solved import file_parameter_name, rig_numbers, rig_uncertai
 from aqualvs.text import sentence
 
 SIGNIFICANT = 5.0
-"""Sigmas from which on a change is no chance."""
+"""Sigmas above which a change is significant."""
 
-# Rotations (rad) come back from files with this much rounding, and then some.
+# Rotations, in radians, below this are rounding: files keep fewer digits.
 _ROUNDING = 1e-12
 
 
@@ -47,26 +47,26 @@ _ROUNDING = 1e-12
 class RigDifference:
     """Changes of the numbers that two rigs share."""
 
-    names: tuple[str, ...]  # As `RigUncertainty.names` has them; lasers are those of the old rig.
+    names: tuple[str, ...]  # As in `RigUncertainty.names`; lasers by their names in the old rig.
     change: FloatArray  # Shape (P,): new minus old, SI units and radians.
-    # Shape (P, P): of `change`; zero where neither rig says how well it is known.
+    # Shape (P, P): of `change`; zero where neither rig states an uncertainty.
     covariance: FloatArray
 
     def of(self, name: str) -> float:
-        """Return the change of one number; 0 for those that the rigs do not share."""
+        """Return the change of one number; 0 if the rigs do not share it."""
         return float(self.change[self.names.index(name)]) if name in self.names else 0.0
 
     def sigma(self, name: str) -> float:
-        """Return the standard deviation of one change; 0 where it is not known."""
+        """Return the standard deviation of one change; 0 if unknown."""
         if name not in self.names:
             return 0.0
         i = self.names.index(name)
         return float(np.sqrt(max(self.covariance[i, i], 0.0)))
 
     def sigmas(self, names: Sequence[str]) -> float | None:
-        """Return how many sigmas some numbers have moved together, in the direction that shows it.
+        """Return the Mahalanobis distance by which some numbers have changed together.
 
-        None where it is not known, though something has moved.
+        None if a number has changed whose sigma is not known.
         """
         rows = [self.names.index(name) for name in names if name in self.names]
         change, covariance = self.change[rows], self.covariance[np.ix_(rows, rows)]
@@ -79,15 +79,16 @@ class RigDifference:
         scaled, size = change[known] / size[known], size[known]
         correlation = covariance[np.ix_(known, known)] / np.outer(size, size)
         values, vectors = np.linalg.eigh(correlation)
-        # No combination of numbers is believed to be known better than this share of their
-        # variances.
-        not_better = 1e-4
-        return float(np.linalg.norm(scaled @ vectors / np.sqrt(np.maximum(values, not_better))))
+        # Least variance of a combination of numbers, as a share of their own variances: files round
+        # the covariance.
+        min_value = 1e-4
+        return float(np.linalg.norm(scaled @ vectors / np.sqrt(np.maximum(values, min_value))))
 
     def has_moved(self, names: Sequence[str]) -> bool | None:
-        """Return whether some numbers have moved by more than chance, None where unknown.
+        """Return whether some numbers have changed significantly; None if not known.
 
-        The chance is that of `SIGNIFICANT` sigmas of one number, however many there are.
+        The probability of a false alarm is that of `SIGNIFICANT` sigmas of a single number,
+        regardless of how many numbers there are.
         """
         distance = self.sigmas(names)
         if distance is None:
@@ -104,25 +105,23 @@ def rig_difference(
     Parameters
     ----------
     new, old : Rig
-        Intrinsics are compared where both have the same lens model and number of coefficients,
-        lasers where both have one of that name.
+        Intrinsics are compared if both have the same lens model and number of coefficients, lasers
+        if both have one of that name.
     new_uncertainty, old_uncertainty : RigUncertainty
-        Of either. Numbers that are equal to the last bit come from the same calibration, so that
-        their errors are common to both and take part in no difference; all others are independent.
+        Of each rig. Numbers that are equal to the last bit come from the same calibration, so that
+        their errors are common to both and cancel; all others are taken as independent.
     """
     changes = _camera_changes(new, old)
-    turns: dict[str, FloatArray] = {}
-    for laser in old.lasers:
-        twin = next((other for other in new.lasers if other.name == laser.name), None)
-        if twin is not None:
-            change, turns[laser.name] = _laser_change(twin, laser)
-            changes |= dict(zip(laser_parameter_names(laser), change.tolist(), strict=False))
+    bases: dict[str, FloatArray] = {}
+    for theirs, ours in _shared_lasers(new, old):
+        change, bases[ours.name] = _laser_change(theirs, ours)
+        changes |= dict(zip(laser_parameter_names(ours), change.tolist(), strict=False))
     names = tuple(changes)
     change = np.array([*changes.values()])
     same = change == 0.0
-    covariance = _given(old_uncertainty.of(names), same)
-    turn = _turned(names, turns)
-    covariance += _given(turn @ new_uncertainty.of(names) @ turn.T, same)
+    covariance = _conditional(old_uncertainty.of(names), same)
+    basis = _basis_change(names, bases)
+    covariance += _conditional(basis @ new_uncertainty.of(names) @ basis.T, same)
     return RigDifference(names, change, covariance)
 
 
@@ -147,7 +146,7 @@ def _with_all_coefficients(rig: Rig, other: Rig) -> Rig:
 
 
 def same_lens_model(new: Rig, old: Rig) -> bool:
-    """Return whether the intrinsics of two rigs mean the same."""
+    """Return whether the intrinsics of two rigs can be compared number by number."""
     return (
         new.lens.model == old.lens.model
         and new.size_px == old.size_px
@@ -156,7 +155,7 @@ def same_lens_model(new: Rig, old: Rig) -> bool:
 
 
 def _laser_change(new: Laser, old: Laser) -> tuple[FloatArray, FloatArray]:
-    """Return the step that leads from the old plane to the new one, and what turns new steps.
+    """Return the step from the old plane to the new one, and the change of basis of small steps.
 
     The step is (tilt_1, tilt_2, offset) as `moved_plane` takes it. The matrix (3, 3) expresses a
     small step from the new plane, in its own `tangent_basis`, as one from the old plane.
@@ -168,22 +167,23 @@ def _laser_change(new: Laser, old: Laser) -> tuple[FloatArray, FloatArray]:
     # `moved_plane` adds tangents to the normal: a step is the tangent of the angle.
     tilt = basis @ plane.normal / max(float(plane.normal @ old.plane.normal), 1e-6)
     tilt[np.abs(tilt) < _ROUNDING] = 0.0
-    turn = np.zeros((3, 3))
-    turn[:2, :2] = sign * basis @ tangent_basis(new.plane.normal).T
-    turn[2, 2] = sign
-    return np.array([*tilt, plane.offset - old.plane.offset]), turn
+    old_from_new = np.zeros((3, 3))
+    old_from_new[:2, :2] = sign * basis @ tangent_basis(new.plane.normal).T
+    old_from_new[2, 2] = sign
+    return np.array([*tilt, plane.offset - old.plane.offset]), old_from_new
 
 
-def _turned(names: tuple[str, ...], turns: dict[str, FloatArray]) -> FloatArray:
+def _basis_change(names: tuple[str, ...], bases: dict[str, FloatArray]) -> FloatArray:
+    """Return the matrix (P, P) that applies the change of basis of each laser, by its name."""
     matrix = np.eye(len(names))
-    for laser, turn in turns.items():
+    for laser, basis in bases.items():
         rows = [names.index(f"{laser}:{name}") for name in LASER_PARAMETERS]
-        matrix[np.ix_(rows, rows)] = turn
+        matrix[np.ix_(rows, rows)] = basis
     return matrix
 
 
-def _given(covariance: FloatArray, same: BoolArray) -> FloatArray:
-    """Return the covariance where the numbers marked by `same` are known to have no error."""
+def _conditional(covariance: FloatArray, same: BoolArray) -> FloatArray:
+    """Return the covariance given that the numbers marked by `same` have no error."""
     if not same.any():
         return covariance
     size = np.sqrt(np.diag(covariance))
@@ -191,38 +191,44 @@ def _given(covariance: FloatArray, same: BoolArray) -> FloatArray:
     scaled = covariance / np.outer(size, size)
     across = scaled[np.ix_(~same, same)]
     common = np.linalg.pinv(scaled[np.ix_(same, same)], hermitian=True)
-    left: FloatArray = np.zeros_like(covariance)
-    left[np.ix_(~same, ~same)] = scaled[np.ix_(~same, ~same)] - across @ common @ across.T
-    left *= np.outer(size, size)
-    return left
+    rest: FloatArray = np.zeros_like(covariance)
+    rest[np.ix_(~same, ~same)] = scaled[np.ix_(~same, ~same)] - across @ common @ across.T
+    rest *= np.outer(size, size)
+    return rest
 
 
-# The steps of one calibration are done in a day's work, two calibrations days or months apart.
+# Longest time between the steps of one calibration, which take a day's work; two calibrations are
+# days or months apart.
 _PAUSE = timedelta(hours=12)
+# Range of the wall by which consequences are stated.
 _WALL_M = 0.6
-# Changes that matter to a dive: about 0.1 % of range or 0.1 degrees.
+# Changes that matter to a dive, by about 0.1 % of range or 0.1 degrees: position of the lens,
+# rotation of the camera (rad), focal length and principal point;
 _LENS_M, _TURN, _FOCAL_SHARE, _CENTRE_PX = 5e-4, math.radians(0.1), 0.002, 2.0
+# sizes and index of the housing, and index of the water;
 _SHELL_M, _ACRYLIC, _INDEX = 2e-4, 5e-3, 1e-3
-# Of a flat port. It bends a ray by about a quarter of it.
+# tilt of a flat port, which bends a ray by about a quarter of it;
 _PORT_TILT = math.radians(0.2)
+# tilt of a laser plane, and its distance at the wall.
 _TILT, _SHIFT_M = math.radians(0.05), 3e-4
 
+# Factors from SI units to the unit at the end of a name in a rig file.
 _SCALES = {"mm": 1e3, "deg": math.degrees(1.0)}
 
 
 @dataclass(frozen=True, slots=True)
 class ComparedPart:
-    """A part of a rig and how it has changed."""
+    """A part of a rig and its change."""
 
-    name: str  # As the verdict calls it.
-    # What it did or did not, in words: "moved by 0.4 mm", "stayed".
-    did: str
-    stayed: str
-    # How many sigmas that is; None where no sigma is known.
+    name: str  # In the verdict.
+    # The change in words, "moved by 0.4 mm", and its absence, "stayed".
+    change: str
+    unchanged: str
+    # Size of the change in sigmas; None if no sigma is known.
     sigmas: float | None
-    # Whether that is more than chance, or, without sigmas, more than what matters.
+    # Whether the change is significant, or, without sigmas, large enough to matter.
     moved: bool
-    # Whether it is enough to be seen in a dive.
+    # Whether the change is large enough to show in a dive.
     matters: bool
 
     @property
@@ -234,22 +240,21 @@ class ComparedPart:
     def sentence(self) -> str:
         """Return the change in one sentence."""
         if self.sigmas is None:
-            told = "no sigma is known"
+            in_sigmas = "no sigma is known"
         else:
-            told = f"{self.sigmas:{'.2g' if self.sigmas < 10.0 else '.0f'}} sigma"
+            in_sigmas = f"{self.sigmas:{'.2g' if self.sigmas < 10.0 else '.0f'}} sigma"
         if not self.moved and self.sigmas is not None:
-            return f"{self.name} {self.stayed} ({told})"
+            return f"{self.name} {self.unchanged} ({in_sigmas})"
         hardly = "" if self.matters else ", too little to matter"
-        return f"{self.name} {self.did} ({told}){hardly}"
+        return f"{self.name} {self.change} ({in_sigmas}){hardly}"
 
 
 def last_calibration(path: Path) -> Path:
-    """Return the dated copy of a rig file as it was before its latest calibration.
+    """Return the dated copy of a rig file from before its latest calibration.
 
-    Steps that follow one another within half a day are one calibration, of which every step leaves
-    a copy.
+    Steps that follow one another within half a day are one calibration; each step leaves a copy.
 
-    Raises `RigError` if the rig notes no calibration, or no copy of an earlier one is kept beside
+    Raises `RigError` if the rig has no dated calibration, or no copy of an earlier one is beside
     it.
     """
     dates = {
@@ -258,11 +263,11 @@ def last_calibration(path: Path) -> Path:
     if not dates:
         raise RigError(f"{path}: notes no date of a calibration; name an older rig file instead")
     latest = set()
-    begun = max(dates.values())
+    started = max(dates.values())
     for name, date in sorted(dates.items(), key=lambda one: one[1], reverse=True):
-        if begun - date <= _PAUSE:
+        if started - date <= _PAUSE:
             latest.add((name, date))
-            begun = date
+            started = date
     for copy in dated_copies(path):
         try:
             found = solved_steps(load_rig(copy, need_lasers=False))
@@ -285,11 +290,11 @@ def run_compare(new: Path, old: Path, console: Console | None = None) -> int:
     old_rig, old_uncertainty = _loaded(old)
     new_rig = _with_all_coefficients(new_rig, old_rig)
     old_rig = _with_all_coefficients(old_rig, new_rig)
-    # Names are the user's, or made up by a calibration: the same laser may have two.
-    called = _names_before(new_rig, old_rig)
-    lasers = [replace(one, name=called.get(one.name, one.name)) for one in new_rig.lasers]
+    # The user or a calibration names the lasers: the same laser may have two names.
+    old_names = _old_names(new_rig, old_rig)
+    lasers = [replace(one, name=old_names.get(one.name, one.name)) for one in new_rig.lasers]
     new_rig = replace(new_rig, lasers=tuple(lasers))
-    new_uncertainty = new_uncertainty.renamed(called)
+    new_uncertainty = new_uncertainty.renamed(old_names)
     difference = rig_difference(new_rig, old_rig, new_uncertainty, old_uncertainty)
     console = console or Console()
     console.print(f"{new} against {old}", style="bold", markup=False, highlight=False)
@@ -300,16 +305,19 @@ def run_compare(new: Path, old: Path, console: Console | None = None) -> int:
             console.print(line, markup=False, highlight=False)
     console.print(_table(new_rig, old_rig, difference))
     known = {new: bool(new_uncertainty.names), old: bool(old_uncertainty.names)}
-    same = [f"'{name}' as '{before}'" for name, before in called.items()]
-    renamed = [f"Lasers with new names are matched by their planes: {', '.join(same)}."]
-    for line in (*(renamed if same else []), *_limits(known), *_mismatches(new_rig, old_rig)):
+    if old_names:
+        same = ", ".join(f"'{name}' as '{before}'" for name, before in old_names.items())
+        notes = [f"Lasers with new names are matched by their planes: {same}."]
+    else:
+        notes = []
+    for line in (*notes, *_missing_sigmas(known), *_mismatches(new_rig, old_rig)):
         console.print(line, markup=False, highlight=False)
     return 0
 
 
 def compared_parts(new: Rig, old: Rig, difference: RigDifference) -> list[ComparedPart]:
-    """Return the parts that both rigs have, and how each has changed."""
-    parts = [_lens_part(difference), _turn_part(difference)]
+    """Return the parts that both rigs have, with their changes."""
+    parts = [_lens_part(difference), _rotation_part(difference)]
     if same_lens_model(new, old):
         parts.append(_intrinsics_part(new, old, difference))
     else:
@@ -328,16 +336,17 @@ def verdict(parts: list[ComparedPart]) -> str:
     moved = [part.sentence for part in parts if part.moved]
     stayed = [part.sentence for part in parts if not part.moved and not part.is_same]
     same = [part.name for part in parts if part.is_same]
-    told = moved + stayed
+    clauses = moved + stayed
     if same:
-        told.append(f"{'not changed at all' if told else 'nothing has changed'}: {', '.join(same)}")
+        none = "not changed at all" if clauses else "nothing has changed"
+        clauses.append(f"{none}: {', '.join(same)}")
     if not moved and stayed:
-        told.insert(0, "nothing has moved that matters")
-    return sentence("; ".join(told))
+        clauses.insert(0, "nothing has moved that matters")
+    return sentence("; ".join(clauses))
 
 
 def consequence(new: Rig, old: Rig) -> Iterator[str]:
-    """Say what the old rig would read where the new one is right."""
+    """Yield what the old rig would measure of a wall if the new one is right, in one sentence."""
     if new.size_px != old.size_px:
         return
     pairs = _shared_lasers(new, old)
@@ -365,85 +374,87 @@ def _loaded(path: Path) -> tuple[Rig, RigUncertainty]:
 
 def _lens_part(difference: RigDifference) -> ComparedPart:
     names = POSE_PARAMETERS[:3]
-    way = float(np.linalg.norm([difference.of(name) for name in names]))
-    return _part(difference, "the lens", names, f"moved by {way * 1e3:.2g} mm", way > _LENS_M)
+    shift = float(np.linalg.norm([difference.of(name) for name in names]))
+    return _part(difference, "the lens", names, f"moved by {shift * 1e3:.2g} mm", shift > _LENS_M)
 
 
-def _turn_part(difference: RigDifference) -> ComparedPart:
+def _rotation_part(difference: RigDifference) -> ComparedPart:
     names = POSE_PARAMETERS[3:]
     angle = float(np.linalg.norm([difference.of(name) for name in names]))
-    did = f"turned by {math.degrees(angle):.2g} deg"
-    return _part(difference, "the camera", names, did, angle > _TURN, "did not turn")
+    change = f"turned by {math.degrees(angle):.2g} deg"
+    return _part(difference, "the camera", names, change, angle > _TURN, "did not turn")
 
 
 def _intrinsics_part(new: Rig, old: Rig, difference: RigDifference) -> ComparedPart:
     share = max(abs(new.lens.fx / old.lens.fx - 1.0), abs(new.lens.fy / old.lens.fy - 1.0))
     centre = math.hypot(difference.of("cx"), difference.of("cy"))
-    bent = _bent_px(new, old)
-    did = f"changed by {share:.2%} in focal length, {centre:.2g} px in the principal point"
-    did += f" and {bent:.2g} px (rms) by distortion"
-    matters = share > _FOCAL_SHARE or max(centre, bent) > _CENTRE_PX
+    moved_px = _distortion_change_px(new, old)
+    change = f"changed by {share:.2%} in focal length, {centre:.2g} px in the principal point"
+    change += f" and {moved_px:.2g} px (rms) by distortion"
+    matters = share > _FOCAL_SHARE or max(centre, moved_px) > _CENTRE_PX
     names = old.lens.parameter_names
-    return _part(difference, "the intrinsics", names, did, matters)
+    return _part(difference, "the intrinsics", names, change, matters)
 
 
-def _bent_px(new: Rig, old: Rig) -> float:
-    """Return how far the new distortion moves the old pixels, rms over the picture."""
+def _distortion_change_px(new: Rig, old: Rig) -> float:
+    """Return the shift of the old pixels by the new distortion, rms over the picture."""
     width, height = old.size_px
-    across = np.meshgrid(np.linspace(0.0, width - 1.0, 17), np.linspace(0.0, height - 1.0, 17))
-    pixels = np.stack(across, axis=-1).reshape(-1, 2)
+    grid = np.meshgrid(np.linspace(0.0, width - 1.0, 17), np.linspace(0.0, height - 1.0, 17))
+    pixels = np.stack(grid, axis=-1).reshape(-1, 2)
     directions, seen = old.lens.directions(pixels)
     moved, valid = replace(old.lens, distortion=new.lens.distortion).pixels(directions)
-    way = np.sum((moved - pixels)[seen & valid] ** 2, axis=-1)
-    return float(np.sqrt(way.mean())) if way.size else math.inf
+    squared = np.sum((moved - pixels)[seen & valid] ** 2, axis=-1)
+    return float(np.sqrt(squared.mean())) if squared.size else math.inf
 
 
 def _shell_part(difference: RigDifference) -> ComparedPart:
     names = ("inner_radius", "thickness", "n_acrylic")
     radius, thickness, index = (difference.of(name) for name in names)
-    did = f"changed by {radius * 1e3:+.2g} mm in radius, {thickness * 1e3:+.2g} mm in thickness"
-    did += f" and {index:+.2g} in index"
+    change = f"changed by {radius * 1e3:+.2g} mm in radius, {thickness * 1e3:+.2g} mm in thickness"
+    change += f" and {index:+.2g} in index"
     matters = max(abs(radius), abs(thickness)) > _SHELL_M or abs(index) > _ACRYLIC
-    return _part(difference, "the dome", names, did, matters)
+    return _part(difference, "the dome", names, change, matters)
 
 
 def _flat_part(difference: RigDifference) -> ComparedPart:
     names = ("port_distance", "thickness", "n_port", "port_tilt_x", "port_tilt_y")
     distance, thickness, index, *tilts = (difference.of(name) for name in names)
     tilt = math.hypot(*tilts)
-    did = f"changed by {distance * 1e3:+.2g} mm in distance, {thickness * 1e3:+.2g} mm in thickness"
-    did += f", {index:+.2g} in index and {math.degrees(tilt):.2g} degrees in tilt"
+    change = (
+        f"changed by {distance * 1e3:+.2g} mm in distance, {thickness * 1e3:+.2g} mm in thickness"
+    )
+    change += f", {index:+.2g} in index and {math.degrees(tilt):.2g} degrees in tilt"
     matters = max(abs(distance), abs(thickness)) > _SHELL_M or abs(index) > _ACRYLIC
-    return _part(difference, "the flat port", names, did, matters or tilt > _PORT_TILT)
+    return _part(difference, "the flat port", names, change, matters or tilt > _PORT_TILT)
 
 
 def _water_part(difference: RigDifference) -> ComparedPart:
-    change = difference.of("n_water")
-    did = f"changed its index by {change:+.4f}"
-    return _part(difference, "the water", ("n_water",), did, abs(change) > _INDEX)
+    step = difference.of("n_water")
+    change = f"changed its index by {step:+.4f}"
+    return _part(difference, "the water", ("n_water",), change, abs(step) > _INDEX)
 
 
 def _laser_part(new_rig: Rig, new: Laser, old: Laser, difference: RigDifference) -> ComparedPart:
     names = laser_parameter_names(old)[:3]
     angle, shift, _ = _laser_move(new_rig, new, old, difference)
-    did = f"moved by {math.degrees(angle):.2g} deg, {abs(shift) * 1e3:.2g} mm at 0.6 m"
+    change = f"moved by {math.degrees(angle):.2g} deg, {abs(shift) * 1e3:.2g} mm at {_WALL_M:g} m"
     matters = angle > _TILT or abs(shift) > _SHIFT_M
-    return _part(difference, f"laser '{old.name}'", names, did, matters)
+    return _part(difference, f"laser '{old.name}'", names, change, matters)
 
 
 def _part(
     difference: RigDifference,
     name: str,
     names: tuple[str, ...],
-    did: str,
+    change: str,
     matters: bool,
-    stayed: str = "stayed",
+    unchanged: str = "stayed",
 ) -> ComparedPart:
     moved = difference.has_moved(names)
     return ComparedPart(
         name=name,
-        did=did,
-        stayed=stayed,
+        change=change,
+        unchanged=unchanged,
         sigmas=difference.sigmas(names),
         moved=matters if moved is None else moved,
         matters=matters,
@@ -453,9 +464,10 @@ def _part(
 def _laser_move(
     rig: Rig, new: Laser, old: Laser, difference: RigDifference
 ) -> tuple[float, float, float]:
-    """Return the angle between two planes, the stripe's distance from the old sheet, its sigma.
+    """Return the angle between two planes, the shift of the stripe, and the sigma of the shift.
 
-    The stripe is that on a wall `_WALL_M` ahead; NaN where the camera does not see it.
+    The shift, in metres, is the distance of the new stripe on a wall `_WALL_M` ahead from the old
+    sheet; NaN if the camera does not see it.
     """
     names = laser_parameter_names(old)[:3]
     angle = math.atan(math.hypot(*(difference.of(name) for name in names[:2])))
@@ -476,8 +488,8 @@ def _shared_lasers(new: Rig, old: Rig) -> list[tuple[Laser, Laser]]:
     return [(by_name[laser.name], laser) for laser in old.lasers if laser.name in by_name]
 
 
-def _limits(known: dict[Path, bool]) -> Iterator[str]:
-    """Say what the sigmas do not count."""
+def _missing_sigmas(known: dict[Path, bool]) -> Iterator[str]:
+    """Yield a sentence if a rig does not state its uncertainty; `known`: by file, if it does."""
     without = [str(path) for path, is_known in known.items() if not is_known]
     if len(without) == len(known):
         yield (
@@ -489,7 +501,7 @@ def _limits(known: dict[Path, bool]) -> Iterator[str]:
 
 
 def _mismatches(new: Rig, old: Rig) -> Iterator[str]:
-    """Say what cannot be compared."""
+    """Yield sentences on parts that cannot be compared."""
     if new.size_px != old.size_px:
         have, had = ("x".join(map(str, rig.size_px)) for rig in (new, old))
         yield (
@@ -511,25 +523,25 @@ def _mismatches(new: Rig, old: Rig) -> Iterator[str]:
                 yield f"Laser '{laser.name}' is {what}."
 
 
-def _names_before(new: Rig, old: Rig) -> dict[str, str]:
-    """Return the old name of every new laser that lies where one of another name lay."""
+def _old_names(new: Rig, old: Rig) -> dict[str, str]:
+    """Return the old name of each new laser whose plane is that of an old one of another name."""
     shared = {laser.name for _, laser in _shared_lasers(new, old)}
     gone = [laser for laser in old.lasers if laser.name not in shared]
-    called = {}
+    old_names = {}
     for laser in new.lasers:
-        twin = next((other for other in gone if _alike(laser, other)), None)
+        twin = next((other for other in gone if _is_same_plane(laser, other)), None)
         if laser.name not in shared and twin is not None:
             gone.remove(twin)
-            called[laser.name] = twin.name
-    return called
+            old_names[laser.name] = twin.name
+    return old_names
 
 
-def _alike(one: Laser, other: Laser) -> bool:
+def _is_same_plane(one: Laser, other: Laser) -> bool:
+    """Return whether two planes are so near that most likely both are of the same laser."""
     cosine = float(one.plane.normal @ other.plane.normal)
     shift = one.plane.offset - math.copysign(1.0, cosine) * other.plane.offset
-    # A laser whose plane is as near as this to one of another name is likely the same.
-    alike_tilt, alike_shift_m = math.radians(1.0), 5e-3
-    return abs(cosine) > math.cos(alike_tilt) and abs(shift) < alike_shift_m
+    max_tilt, max_shift_m = math.radians(1.0), 5e-3
+    return abs(cosine) > math.cos(max_tilt) and abs(shift) < max_shift_m
 
 
 def _table(new: Rig, old: Rig, difference: RigDifference) -> Table:
@@ -549,7 +561,7 @@ def _row(name: str, new: float, old: float, difference: RigDifference) -> list[s
     label = file_parameter_name(name)
     scale = _SCALES.get(label.rpartition("_")[2], 1.0)
     change, sigma = scale * difference.of(name), scale * difference.sigma(name)
-    # Rotations are given by their change.
+    # Of rotations, only the change has a meaning.
     is_rotation = name in POSE_PARAMETERS[3:]
     values = ["", ""] if is_rotation else [f"{scale * old:.6g}", f"{scale * new:.6g}"]
     return [label, *values, *_change_cells(change, sigma)]
@@ -570,7 +582,7 @@ def _laser_rows(rig: Rig, new: Laser, old: Laser, difference: RigDifference) -> 
     yield turn + _change_cells(math.degrees(angle), math.degrees(_tilt_sigma(old, difference)))
     if math.isfinite(shift):
         moved = [f"{label} off at {_WALL_M:g} m by mm", "", ""]
-        # Rounding of points that have not moved.
+        # Points that have not moved differ by rounding.
         shift = 0.0 if abs(shift) < 1e-12 else shift
         yield moved + _change_cells(shift * 1e3, sigma * 1e3)
 

@@ -1,7 +1,7 @@
-"""`aqualvs doctor`: readiness of machine, stream and autopilot, in words.
+"""`aqualvs doctor`: readiness of machine, stream and autopilot, in sentences.
 
-With `--mavlink` it waits for the autopilot's heartbeat, reads its parameters, and says what they
-mean for us.
+With `--mavlink` it waits for the autopilot's heartbeat, reads its parameters, and explains their
+effect on `aqualvs live` and `aqualvs follow`.
 """
 
 import contextlib
@@ -15,6 +15,7 @@ import statistics
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 from rich.console import Console
@@ -49,8 +50,11 @@ from aqualvs.sources.opening import is_address
 from aqualvs.sources.video import sampled_pictures
 from aqualvs.text import Finding, Severity
 
+# Longest wait for the first heartbeat, which is sent every second; then time to count messages.
 _HEARTBEAT_S, _LISTEN_S = 6.0, 3.0
+# MAV_TYPE_SUBMARINE.
 _SUBMARINE = 12
+# Meaning of the vehicle's mode for `aqualvs follow`; `{own}` are the modes in which it engages.
 _MODES = {
     Mode.OURS: "follow engages in it",
     Mode.PILOT: "follow does not engage in it; choose {own}",
@@ -69,7 +73,7 @@ def autopilot(address: str, vehicle: VehicleSetup, rig: Path | None = None) -> I
     address : str
         As in `parse_address`.
     rig : Path or None
-        Whose working range the autopilot's rangefinder should take.
+        Rig file whose working range the autopilot's rangefinder should accept.
     """
     working_range = None if rig is None else load_rig(rig).working_range
     with contextlib.closing(MavlinkLink(address, vehicle.link)) as link:
@@ -97,8 +101,8 @@ def _ardusub(
 ) -> Iterator[Finding]:
     began_s = time.monotonic()
     before = [link.n_received(kind) for kind in ("ATTITUDE", "RC_CHANNELS")]
-    told = link.read_parameters((*FOR_STICKS, *FOR_DISTANCE), timeout_s=_LISTEN_S)
-    # The ground station is to be heard, and rates are to be counted, for some seconds.
+    parameters = link.read_parameters((*FOR_STICKS, *FOR_DISTANCE), timeout_s=_LISTEN_S)
+    # Counting messages, and hearing the ground station, takes some seconds.
     time.sleep(max(0.0, began_s + _LISTEN_S - time.monotonic()))
     span_s = time.monotonic() - began_s
     after = [link.n_received(kind) for kind in ("ATTITUDE", "RC_CHANNELS")]
@@ -109,23 +113,23 @@ def _ardusub(
     yield _station(link, steering)
     yield _attitude(attitude_hz)
     yield _channels(channels_hz)
-    if not told:
+    if not parameters:
         yield Finding.warn(
             "no parameters received: the vehicle does not answer; check its settings in the "
             "ground station (docs/ardusub.md lists them)"
         )
         return
-    yield advise_on_station(told, steering.ground_station)
-    yield from advise_on_fail_safe(told)
-    yield from advise_on_speed(told)
-    yield from advise_on_distance(told, working_range)
+    yield advise_on_station(parameters, steering.ground_station)
+    yield from advise_on_fail_safe(parameters)
+    yield from advise_on_speed(parameters)
+    yield from advise_on_distance(parameters, working_range)
 
 
 def _mode(state: VehicleState, own_modes: tuple[str, ...]) -> Finding:
     means = _MODES[state.mode].format(own=" or ".join(own_modes))
     armed = "armed" if state.armed else "disarmed: follow engages once it is armed"
     fits = state.mode in (Mode.OURS, Mode.PILOT)
-    # The rest of it is told with the station's own line.
+    # The part after a semicolon repeats the finding on the station.
     name = state.mode_name.partition(";")[0]
     return Finding(Severity.OK if fits else Severity.WARN, f"mode {name}: {means}; {armed}")
 
@@ -144,25 +148,25 @@ def _station(link: MavlinkLink, steering: ArduSubOptions) -> Finding:
 
 
 def _attitude(rate_hz: float) -> Finding:
-    # Between heartbeats it tells that the vehicle is there.
+    # Between heartbeats, this message shows that the vehicle is alive.
     enough_hz = 10.0
-    words = f"ATTITUDE {rate_hz:.0f} Hz"
+    text = f"ATTITUDE {rate_hz:.0f} Hz"
     if rate_hz >= enough_hz:
-        return Finding.ok(f"{words}: follow hears the vehicle between its heartbeats")
+        return Finding.ok(f"{text}: follow hears the vehicle between its heartbeats")
     return Finding.warn(
-        f"{words}: follow regards the vehicle as silent between its heartbeats; set MAV1_EXTRA1 "
+        f"{text}: follow regards the vehicle as silent between its heartbeats; set MAV1_EXTRA1 "
         f"{enough_hz:.0f} (before 4.7: SR0_EXTRA1; the number is that of the autopilot's port)"
     )
 
 
 def _channels(rate_hz: float) -> Finding:
-    # Channels show the pilot's sticks.
+    # This message shows the positions of the pilot's sticks.
     enough_hz = 5.0
-    words = f"RC_CHANNELS {rate_hz:.0f} Hz"
+    text = f"RC_CHANNELS {rate_hz:.0f} Hz"
     if rate_hz >= enough_hz:
-        return Finding.ok(f"{words}: follow sees the pilot's sticks, and whether ours are obeyed")
+        return Finding.ok(f"{text}: follow sees the pilot's sticks, and whether ours are obeyed")
     return Finding.warn(
-        f"{words}: follow sees the pilot's sticks late or not at all, and not whether ours are "
+        f"{text}: follow sees the pilot's sticks late or not at all, and not whether ours are "
         "obeyed; set MAV1_RC_CHAN 10 (before 4.7: SR0_RC_CHAN; the number is that of the "
         "autopilot's port)"
     )
@@ -177,9 +181,11 @@ _EXTRAS = {
     "dds": (("cyclonedds", "rosbags"), "ROS 2 without ROS"),
     "batch": (("distributed",), "aqualvs batch"),
 }
-"""Extra, the packages it brings, what they are for."""
+"""By extra of the package: the packages that it installs, and their purpose."""
 
+# Frames of the bundled dive that are measured, and the rate, in hertz, to keep up with.
 _N_FRAMES, _FRAME_RATE = 40, 25.0
+# Longest time to receive a stream.
 _STREAM_S = 8.0
 
 
@@ -190,44 +196,45 @@ class DoctorRequest:
     source: str | None = None  # Stream, camera or file.
     rig: Path | None = None  # Rig that the pictures should fit.
     mavlink: str | None = None  # Address of an autopilot.
-    # Who is to be there, and how it is to be steered.
+    # Expected systems, and options of steering.
     vehicle: VehicleSetup = field(default_factory=VehicleSetup)
 
 
 def run_doctor(request: DoctorRequest, console: Console | None = None) -> None:
-    """Look at everything and print what was found.
+    """Run all checks and print their findings.
 
-    Raises `AqualvsError` at the end, if something does not work: the first such finding.
+    Raises `AqualvsError` with the first bad finding, after all checks.
     """
     console = console or Console()
     console.print(f"aqualvs {__version__}", style="bold", highlight=False)
-    looks: list[Callable[[], Iterator[Finding]]] = [_machine, _packages, _pipeline]
+    checks: list[Callable[[], Iterator[Finding]]] = [_machine, _packages, _pipeline]
     if request.rig is not None:
-        looks.append(lambda: _rig_file(Path(str(request.rig))))
+        checks.append(partial(_rig_file, request.rig))
     if request.source is not None:
-        looks.append(lambda: _stream(str(request.source), request.rig))
+        checks.append(partial(_stream, request.source, request.rig))
     if request.mavlink is not None:
-        looks.append(lambda: autopilot(str(request.mavlink), request.vehicle, request.rig))
-    broken: list[str] = []
-    for look in looks:
-        found = list(_guarded(look))
+        checks.append(partial(autopilot, request.mavlink, request.vehicle, request.rig))
+    bad: list[str] = []
+    for check in checks:
+        found = list(_with_fault(check))
         console.print(findings_table(found))
-        broken += [finding.sentence for finding in found if finding.severity is Severity.BAD]
-    if broken:
-        raise AqualvsError(f"not ready: {broken[0]}")
+        bad += [finding.sentence for finding in found if finding.severity is Severity.BAD]
+    if bad:
+        raise AqualvsError(f"not ready: {bad[0]}")
 
 
-def _guarded(look: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:
+def _with_fault(check: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:
+    """Yield the findings of a check; an `AqualvsError` that ends it is a bad finding."""
     try:
-        yield from look()
+        yield from check()
     except AqualvsError as fault:
         yield Finding.bad(str(fault))
 
 
 def _machine() -> Iterator[Finding]:
     cores = os.cpu_count() or 1
-    words = f"Python {platform.python_version()}, {platform.machine()}, {cores} cores"
-    yield Finding(Severity.OK if cores > 1 else Severity.WARN, words)
+    text = f"Python {platform.python_version()}, {platform.machine()}, {cores} cores"
+    yield Finding(Severity.OK if cores > 1 else Severity.WARN, text)
     free_gb = shutil.disk_usage(Path.cwd()).free / 1e9
     min_free_gb = 2.0
     if free_gb < min_free_gb:
@@ -247,8 +254,8 @@ def _packages() -> Iterator[Finding]:
                 f"{purpose}: {', '.join(missing)} missing; pip install 'aqualvs[{extra}]'"
             )
         else:
-            told = ", ".join(f"{name} {importlib.metadata.version(name)}" for name in packages)
-            yield Finding.ok(f"{purpose}: {told}")
+            found = ", ".join(f"{name} {importlib.metadata.version(name)}" for name in packages)
+            yield Finding.ok(f"{purpose}: {found}")
 
 
 def _installed(package: str) -> bool:
@@ -260,7 +267,7 @@ def _installed(package: str) -> bool:
 
 
 def _pipeline() -> Iterator[Finding]:
-    """Decode and measure the bundled dive."""
+    """Decode the bundled dive and measure its postures."""
     with importlib.resources.as_file(bundled_dive()) as folder:
         rig = load_rig(folder / "rig.yaml")
         with open_source(folder / "dive.mp4") as source:
@@ -279,17 +286,17 @@ def _speed(rig: Rig, frames: list[Frame]) -> Finding:
         began = time.perf_counter()
         n_valid += bool(scanner.process(frame).posture)
         times.append(time.perf_counter() - began)
-    middle = statistics.median(times)
+    median = statistics.median(times)
     width, height = rig.size_px
-    words = (
-        f"posture in {n_valid} of {len(frames)} frames; {1e3 * middle:.1f} ms a frame of "
+    text = (
+        f"posture in {n_valid} of {len(frames)} frames; {1e3 * median:.1f} ms a frame of "
         f"{width}x{height} px, first after {ready_s:.1f} s"
     )
     if n_valid < 0.9 * len(frames):
-        return Finding.bad(f"{words}; the installation is broken, install aqualvs again")
-    if middle > 0.5 / _FRAME_RATE:
-        return Finding.warn(f"{words}; too slow for {_FRAME_RATE:.0f} frames a second")
-    return Finding.ok(words)
+        return Finding.bad(f"{text}; the installation is broken, install aqualvs again")
+    if median > 0.5 / _FRAME_RATE:
+        return Finding.warn(f"{text}; too slow for {_FRAME_RATE:.0f} frames a second")
+    return Finding.ok(text)
 
 
 def _rig_file(path: Path) -> Iterator[Finding]:
@@ -302,7 +309,7 @@ def _rig_file(path: Path) -> Iterator[Finding]:
 
 
 def _stream(where: str, rig_file: Path | None) -> Iterator[Finding]:
-    """Take frames for a few seconds."""
+    """Receive frames for a few seconds; report size, rate, losses and the fit to the rig."""
     rig = None if rig_file is None else load_rig(rig_file)
     frames, span_s, health, fault = _received(where)
     if not frames:
@@ -326,7 +333,7 @@ def _stream(where: str, rig_file: Path | None) -> Iterator[Finding]:
 
 
 def _fields(where: str, shutter: Shutter, frames: list[Frame]) -> Iterator[Finding]:
-    """Say whether the pictures are interlaced, if the rig does not say so too, or the reverse."""
+    """Yield a finding if the pictures are interlaced and the rig's shutter is not, or reversely."""
     successive = [
         list(pair) for pair in itertools.pairwise(frames) if pair[1].index == pair[0].index + 1
     ]
@@ -341,9 +348,10 @@ def _fields(where: str, shutter: Shutter, frames: list[Frame]) -> Iterator[Findi
 
 
 def _received(where: str) -> tuple[list[Frame], float, str, AqualvsError | None]:
-    """Return the frames of a few seconds, the time between first and last, and the feed's state.
+    """Receive frames for a few seconds.
 
-    That is its words, and what ended it if it did not end by itself.
+    Returns the frames, the time between the first and the last arrival in seconds, the detail of
+    the feed's health, and the error that ended the feed, if any. Raises it if no frame arrived.
     """
     from aqualvs.live.runner import FrameReader, Mailbox
     from aqualvs.sources.opening import open_feed
@@ -358,11 +366,11 @@ def _received(where: str) -> tuple[list[Frame], float, str, AqualvsError | None]
             if arrival is not None:
                 frames.append(arrival.frame)
                 arrived_ns.append(arrival.arrived_ns)
-        words = reader.health().detail
+        text = reader.health().detail
     if reader.fault is not None and not frames:
         raise reader.fault
     span_s = 1e-9 * (arrived_ns[-1] - arrived_ns[0]) if arrived_ns else 0.0
-    return frames, span_s, words, reader.fault
+    return frames, span_s, text, reader.fault
 
 
 def _fit(rig: Rig, frames: list[Frame]) -> Finding:
@@ -376,8 +384,8 @@ def _fit(rig: Rig, frames: list[Frame]) -> Finding:
     scanner = Scanner(rig)
     frames = list(frames_of(frames, rig.shutter))
     n_valid = sum(bool(scanner.process(frame).posture) for frame in frames)
-    words = f"posture in {n_valid} of {len(frames)} frames with the rig {rig.name!r}"
+    text = f"posture in {n_valid} of {len(frames)} frames with the rig {rig.name!r}"
     if not n_valid:
         reason = scanner.process(frames[-1]).posture
-        return Finding.warn(f"{words}: {getattr(reason, 'detail', '')}")
-    return Finding.ok(words)
+        return Finding.warn(f"{text}: {getattr(reason, 'detail', '')}")
+    return Finding.ok(text)

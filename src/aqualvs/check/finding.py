@@ -1,8 +1,7 @@
-"""Findings of `aqualvs check`, one sentence each, and the errors to expect of a rig.
+"""Findings of `aqualvs check`, one sentence each, and the expected errors of a rig.
 
-The accuracy part predicts what a rig can measure, in sentences and tables: standard deviations of
-the posture to a wall ahead, from noise and from the uncertainty of the rig, and of the water's
-index.
+The accuracy part predicts, in sentences and tables, the standard deviations of the posture to a
+wall ahead, from noise and from the uncertainty of the rig, and that of the water's index.
 """
 
 import math
@@ -26,7 +25,7 @@ from aqualvs.text import Finding, Severity
 
 
 def findings_table(findings: Sequence[Finding]) -> Table:
-    """Return the findings for a terminal, a line each."""
+    """Return the findings as a table for a terminal, one row each."""
     style = {Severity.OK: "green", Severity.WARN: "yellow", Severity.BAD: "bold red"}
     table = Table(box=None, show_header=False, padding=(0, 1))
     table.add_column(no_wrap=True)
@@ -38,7 +37,7 @@ def findings_table(findings: Sequence[Finding]) -> Table:
 
 
 def number_table(title: str | None, *columns: str, texts: Sequence[str] = ()) -> Table:
-    """Return an empty table of these columns: `texts` to the left, numbers to the right."""
+    """Return an empty table; columns in `texts` are left-justified, others right-justified."""
     table = Table(title=title, title_justify="left", box=None)
     for name in columns:
         table.add_column(name, justify="left" if name in texts else "right")
@@ -46,12 +45,15 @@ def number_table(title: str | None, *columns: str, texts: Sequence[str] = ()) ->
 
 
 def escaped(text: str) -> str:
-    """Return text that a terminal shows as it is, square brackets included."""
+    """Return text in which Rich does not take square brackets for markup."""
     return text.replace("[", r"\[")
 
 
 def expected_errors(rig: Rig, uncertainty: RigUncertainty) -> tuple[ExpectedError, ...]:
-    """Return what to expect at the usual ranges that lie in the working range, if any do."""
+    """Return the expected errors at the usual ranges within the working range, else at its ends.
+
+    Empty for a rig with fewer than two lasers, which measures no posture.
+    """
     if len(rig.lasers) < 2:
         return ()
     near, far = rig.working_range
@@ -60,7 +62,7 @@ def expected_errors(rig: Rig, uncertainty: RigUncertainty) -> tuple[ExpectedErro
 
 
 def check_errors(errors: Sequence[ExpectedError]) -> Iterator[Finding]:
-    """Say what to expect at each range, from noise and from the uncertainty of the rig."""
+    """Yield findings on the errors at each range, from noise and from the rig's uncertainty."""
     for expected in errors:
         place = f"At {expected.wall_range * 1e3:.0f} mm"
         if not expected.valid:
@@ -99,17 +101,17 @@ def _calibration_finding(expected: ExpectedError, place: str) -> Finding:
 
 
 def sensitivity_table(rig: Rig, errors: Sequence[ExpectedError]) -> Table:
-    """Return what a pixel across each laser's stripe is worth."""
+    """Return the table of the range error for one pixel across each laser's stripe."""
     names = [f"{escaped(laser.name)} mm/px" for laser in rig.lasers]
     table = number_table("Range error for a pixel", "range mm", *names)
     for expected in errors:
-        cells = (_shown(value * 1e3) for value in expected.per_pixel)
+        cells = (_cell(value * 1e3) for value in expected.per_pixel)
         table.add_row(f"{expected.wall_range * 1e3:.0f}", *cells)
     return table
 
 
 def error_table(errors: Sequence[ExpectedError]) -> Table:
-    """Return the standard deviations of posture to a wall ahead, by where they come from."""
+    """Return the table of the standard deviations of the posture to a wall ahead, by cause."""
     title = f"Expected error, one sigma: a wall ahead, {SIGMA_PX} px on {N_POINTS} points a laser"
     names = ("range mm", "from", "range mm", "range %", "pitch deg", "yaw deg")
     table = number_table(title, *names, texts=["from"])
@@ -123,12 +125,12 @@ def error_table(errors: Sequence[ExpectedError]) -> Table:
             range_mm, pitch, yaw = in_mm_and_degrees(sigmas)
             share = 0.1 * range_mm / expected.wall_range
             place = "" if i else f"{expected.wall_range * 1e3:.0f}"
-            table.add_row(place, name, *map(_shown, (range_mm, share, pitch, yaw)))
+            table.add_row(place, name, *map(_cell, (range_mm, share, pitch, yaw)))
     return table
 
 
-def error_words(errors: Sequence[ExpectedError]) -> Iterator[str]:
-    """Say in one line what the rig measures at the middle one of the ranges."""
+def error_text(errors: Sequence[ExpectedError]) -> Iterator[str]:
+    """Yield one sentence on the errors at the middle one of the ranges, if it is valid."""
     if not errors or not errors[len(errors) // 2].valid:
         return
     middle = errors[len(errors) // 2]
@@ -143,31 +145,32 @@ def error_words(errors: Sequence[ExpectedError]) -> Iterator[str]:
 def index_sigma(rig: Rig) -> float:
     """Return the sigma of the water's index from a known target, infinite if not observable.
 
-    The target is a plate of 10 by 6 corners, 180 by 100 mm, held 0.4 m ahead at a known place,
-    each corner found to 0.1 px: what an index target on the vehicle gives in one picture.
+    The target is a plate of 10 by 6 corners, 180 by 100 mm, at a known position 0.4 m ahead, with
+    each corner detected to `SIGMA_PX`: like an index target on the vehicle in one picture.
     """
     if rig.housing is None:
         return np.inf
     x, z = np.meshgrid(np.linspace(-0.09, 0.09, 10), np.linspace(-0.05, 0.05, 6))
     corners = np.stack([x, np.full_like(x, 0.4), z], axis=-1).reshape(-1, 3)
     index_step = 1e-4
-    more, seen_more = rig.in_water(rig.n_water + index_step).camera().project(corners)
+    stepped, seen_stepped = rig.in_water(rig.n_water + index_step).camera().project(corners)
     here, seen = rig.camera().project(corners)
-    slope = (more - here)[seen & seen_more] / index_step
+    slope = (stepped - here)[seen & seen_stepped] / index_step
     information = float(np.sum(slope**2)) / SIGMA_PX**2
     return 1.0 / np.sqrt(information) if information > 0.0 else np.inf
 
 
-def _shown(value: float) -> str:
+def _cell(value: float) -> str:
     return "-" if math.isnan(value) else f"{value:.3g}"
 
 
-# A small vehicle near a net in waves; what a shutter costs is stated at these rates.
+# Speed (m/s) and rate of turn (rad/s) at which errors by the shutter are stated: those of a small
+# vehicle near a net in waves.
 _SPEED, _TURN = 0.2, math.radians(15.0)
 
 
 def shutter_finding(rig: Rig) -> Finding | None:
-    """Return what a rig's shutter means for a vehicle that moves; None if it states none."""
+    """Return the effect of a rig's shutter on a moving vehicle; None if the rig states none."""
     shutter = rig.shutter
     if shutter.instant:
         return None
@@ -195,7 +198,7 @@ def shutter_finding(rig: Rig) -> Finding | None:
 
 
 def _rolling_error(rig: Rig) -> str:
-    """Return the largest errors on a wall in the middle of the working range, as words."""
+    """Return a clause on the largest errors on a wall in the middle of the working range."""
     wall = WallView.ahead(rig, math.sqrt(math.prod(rig.working_range)))
     by_rates = wall.by_rates(lambda rows: rig.shutter.row_times(rows, rig.size_px[1]))
     if not np.isfinite(by_rates).all():

@@ -1,8 +1,8 @@
-"""`aqualvs check rig.yaml`: plausibility of a rig and its expected accuracy, in words.
+"""`aqualvs check rig.yaml`: plausibility of a rig and its expected accuracy, in sentences.
 
-The findings follow the light through the rig. They include the age, order and quality of its
-calibrations, numbers that were assumed or that the calibration did not determine, and the part of
-the picture that sees nothing of the outer medium.
+The findings are in the order in which light passes the rig. They include the age, order and quality
+of its calibrations, numbers that were assumed or that the calibration did not determine, and the
+part of the picture that sees nothing of the outer medium.
 """
 
 import itertools
@@ -17,7 +17,7 @@ from rich.console import Console
 from aqualvs.check.finding import (
     check_errors,
     error_table,
-    error_words,
+    error_text,
     expected_errors,
     findings_table,
     index_sigma,
@@ -43,40 +43,41 @@ from aqualvs.optics.solved import (
 from aqualvs.text import Finding, Severity, count_text
 
 SURFACES = "surfaces"
-"""Extra of the step `lasers`: the surfaces that lasers were seen on, or how many there were."""
+"""Extra of the step `lasers`: the surfaces that the lasers were seen on, or their number."""
 
-_FEW_PICTURES = {"camera": 5, "dome": 2}
-# Beyond these a calibration has not found what it was for.
+# Fewest pictures of a calibration step; 1 for others.
+_MIN_PICTURES = {"camera": 5, "dome": 2}
+# Sigmas above which a calibration has not determined a parameter: position of the lens, rotation of
+# the camera (rad), focal length, index of the water; tilt (rad) and offset of a laser plane.
 _LENS_M, _TURN, _FOCAL_SHARE, _INDEX = 2e-3, math.radians(0.5), 0.005, 2e-3
 _TILT, _OFFSET_M = math.radians(0.25), 2e-3
-# Difference of indices below which the medium outside is air.
-_AIR = 1e-3
 
 
 def check_solved(
     rig: Rig, steps: dict[str, SolvedStep], uncertainty: RigUncertainty, now: datetime
 ) -> Iterator[Finding]:
-    """Return what is worth saying about how a rig was calibrated.
+    """Yield findings on the calibration of a rig.
 
     Parameters
     ----------
+    rig : Rig
     steps : dict of SolvedStep
-        As `solved_steps` gives them.
+        Calibration steps of the rig, from `solved_steps`.
     uncertainty : RigUncertainty
         Of the rig.
     now : datetime
-        With a time zone.
+        Current time, with a time zone.
     """
     for name, step in steps.items():
-        yield _told(name, step, now)
-        yield from _doubts(name, step, now)
+        yield _step_summary(name, step, now)
+        yield from _step_warnings(name, step, now)
     yield from _out_of_order(steps)
     yield from _assumed(rig, steps)
-    yield from _loose(rig, uncertainty)
+    yield from _undetermined(rig, uncertainty)
 
 
 def age_text(date: datetime, now: datetime) -> str:
-    """Return how long ago a date is: "today", "3 days ago", "5 months ago"."""
+    """Return the age of a date as text: "today", "3 days ago", "5 months ago"."""
     days = (now - date).days
     if days < 1:
         return "today"
@@ -86,7 +87,7 @@ def age_text(date: datetime, now: datetime) -> str:
     return f"{count_text(round(days / 365.25), 'year')} ago"
 
 
-def _told(name: str, step: SolvedStep, now: datetime) -> Finding:
+def _step_summary(name: str, step: SolvedStep, now: datetime) -> Finding:
     verb = "were" if name == "lasers" else "was"
     sentence = (
         f"The {name} {verb} calibrated {age_text(step.date, now)} from "
@@ -103,7 +104,7 @@ def _told(name: str, step: SolvedStep, now: datetime) -> Finding:
     return Finding.ok(f"{sentence}.")
 
 
-def _doubts(name: str, step: SolvedStep, now: datetime) -> Iterator[Finding]:
+def _step_warnings(name: str, step: SolvedStep, now: datetime) -> Iterator[Finding]:
     days, old_days = (now - step.date).days, 365
     if days < -1:
         yield Finding.warn(
@@ -119,10 +120,10 @@ def _doubts(name: str, step: SolvedStep, now: datetime) -> Iterator[Finding]:
         yield Finding.warn(
             f"solved_from.{name}.rms_px is {step.rms_px:g}: no real picture fits that well."
         )
-    if step.pictures < _FEW_PICTURES.get(name, 1):
+    if step.pictures < _MIN_PICTURES.get(name, 1):
         yield Finding.warn(
             f"The calibration of the {name} used {count_text(step.pictures, 'picture')}; take "
-            f"at least {_FEW_PICTURES.get(name, 1)}, at different tilts and distances."
+            f"at least {_MIN_PICTURES.get(name, 1)}, at different tilts and distances."
         )
     surfaces = step.extras.get(SURFACES)
     count = len(surfaces) if isinstance(surfaces, list) else surfaces
@@ -146,7 +147,7 @@ def _out_of_order(steps: dict[str, SolvedStep]) -> Iterator[Finding]:
 
 
 def _assumed(rig: Rig, steps: dict[str, SolvedStep]) -> Iterator[Finding]:
-    """Yield findings on numbers without a stated uncertainty, and on what is assumed for them."""
+    """Yield findings on parameters without a stated uncertainty, with the assumed sigmas."""
     if is_exact(rig):
         yield Finding.ok(
             "The rig's numbers count as exact (solved_from.uncertainty), as for a simulated dive; "
@@ -169,8 +170,8 @@ def _assumed(rig: Rig, steps: dict[str, SolvedStep]) -> Iterator[Finding]:
             )
 
 
-def _loose(rig: Rig, uncertainty: RigUncertainty) -> Iterator[Finding]:
-    """Yield findings on numbers that the calibration did not determine."""
+def _undetermined(rig: Rig, uncertainty: RigUncertainty) -> Iterator[Finding]:
+    """Yield warnings on parameters that the calibration did not determine."""
     lens = _largest(uncertainty, POSE_PARAMETERS[:3])
     if lens > _LENS_M:
         yield _warning(
@@ -206,7 +207,7 @@ def _loose(rig: Rig, uncertainty: RigUncertainty) -> Iterator[Finding]:
 
 
 def _largest(uncertainty: RigUncertainty, names: tuple[str, ...]) -> float:
-    """Return the largest sigma of any combination of some numbers; 0 where none is known."""
+    """Return the largest sigma of some parameters in any direction; 0 if none is known."""
     return math.sqrt(max(float(np.linalg.eigvalsh(uncertainty.of(names))[-1]), 0.0))
 
 
@@ -215,7 +216,10 @@ def _warning(fact: str, remedy: str) -> Finding:
 
 
 def field_of_view(camera: Camera) -> tuple[float, float]:
-    """Return the horizontal and vertical field of view in the outer medium, rad; NaN if none."""
+    """Return the horizontal and vertical field of view in the outer medium, in radians.
+
+    NaN if the middle of an edge of the picture sees nothing of it.
+    """
     width, height = camera.size_px
     middle_x, middle_y = (width - 1) / 2.0, (height - 1) / 2.0
     ends = [[-0.5, middle_y], [width - 0.5, middle_y], [middle_x, -0.5], [middle_x, height - 0.5]]
@@ -224,7 +228,7 @@ def field_of_view(camera: Camera) -> tuple[float, float]:
 
 
 def blind_fraction(camera: Camera) -> float:
-    """Return the fraction of the pixels, on a grid, that see nothing of the outer medium."""
+    """Return the fraction of pixels, on a grid, that see nothing of the outer medium."""
     width, height = camera.size_px
     x, y = np.meshgrid(np.linspace(0, width - 1, 33), np.linspace(0, height - 1, 33))
     rays = camera.rays(np.stack([x, y], axis=-1))
@@ -237,10 +241,10 @@ def _angle(rays: Rays, first: int, second: int) -> float:
 
 
 def run_check(path: Path, console: Console | None = None) -> int:
-    """Check a rig file, print what was found, and return the exit code.
+    """Check a rig file, print the findings, and return the exit code.
 
-    It is 0 where the rig is sane, warnings allowed, and 2 where something is bad. Raises `RigError`
-    if the file is not a rig file.
+    The code is 2 if a finding is bad, else 0, also with warnings. Raises `RigError` if the file is
+    not a rig file.
     """
     rig = load_rig(path, need_lasers=False)
     console = console or Console()
@@ -251,10 +255,9 @@ def run_check(path: Path, console: Console | None = None) -> int:
     console.print(f"{path}: rig '{rig.name}'", style="bold", markup=False, highlight=False)
     errors = expected_errors(rig, completed_uncertainty(rig))
     bad = any(finding.severity is Severity.BAD for finding in findings)
-    words = [_verdict(findings), *error_words(errors)]
-    for line in words:
+    for line in (_verdict(findings), *error_text(errors)):
         console.print(line, style="bold red" if bad else "bold", highlight=False, soft_wrap=True)
-    # What needs a hand first; else in the order in which light passes the rig.
+    # The worst first; else in the order in which light passes the rig.
     order = (Severity.BAD, Severity.WARN, Severity.OK)
     console.print(findings_table(sorted(findings, key=lambda one: order.index(one.severity))))
     if errors:
@@ -264,10 +267,10 @@ def run_check(path: Path, console: Console | None = None) -> int:
 
 
 def check_rig(rig: Rig, now: datetime | None = None) -> list[Finding]:
-    """Return everything worth saying about a rig, in the order in which light passes it.
+    """Return the findings on a rig, in the order in which light passes it.
 
-    `now`: with a time zone; calibrations are as old as it makes them. The computer's clock if left
-    out. Raises `RigError` if what calibrations have noted down in the rig cannot be understood.
+    `now` is the time, with a time zone, that the age of calibrations refers to; by default the
+    computer's clock. Raises `RigError` if the notes of calibrations in the rig are malformed.
     """
     camera, uncertainty = rig.camera(), rig_uncertainty(rig)
     shutter = shutter_finding(rig)
@@ -292,7 +295,7 @@ def _check_lens(rig: Rig) -> Iterator[Finding]:
             f"The lens looks through a flat port, {port.distance * 1e3:g} mm ahead, "
             f"{port.thickness * 1e3:g} mm thick and tilted by {tilt:.1f} degrees."
         )
-    elif rig.dome is None and _in_air(rig):
+    elif rig.dome is None and rig.is_air(rig.n_water):
         yield Finding.ok("There is no dome and no water: rays start at the lens, in air.")
     elif rig.dome is None:
         yield Finding.warn("There is no dome: rays start at the lens, in the water.")
@@ -345,22 +348,15 @@ def _check_view(rig: Rig, camera: Camera) -> Iterator[Finding]:
             + f"there; check camera.distortion and the {'port' if rig.flat_port else 'dome'}."
         )
     else:
-        yield Finding.ok(
-            f"The field of view in {'air' if _in_air(rig) else 'the water'} is {across:.0f} by "
-            f"{down:.0f} degrees."
-        )
-
-
-def _in_air(rig: Rig) -> bool:
-    """Return whether the medium outside is the air inside."""
-    return abs(rig.n_water - rig.n_air) < _AIR
+        medium = "air" if rig.is_air(rig.n_water) else "the water"
+        yield Finding.ok(f"The field of view in {medium} is {across:.0f} by {down:.0f} degrees.")
 
 
 def _check_water(rig: Rig) -> Finding:
     n = rig.n_water
     if 1.32 <= n <= 1.36:
         return Finding.ok(f"The water's index {n:.4f} is that of {_water_name(n)}.")
-    if _in_air(rig):
+    if rig.is_air(rig.n_water):
         return Finding(
             Severity.OK if rig.housing is None else Severity.WARN,
             f"The water's index {n:.4f} is that of air: this rig is for the bench.",
@@ -412,7 +408,8 @@ def _check_lasers(rig: Rig, camera: Camera) -> Iterator[Finding]:
 
 def _check_laser(rig: Rig, camera: Camera, laser: Laser) -> Finding:
     near, far = rig.working_range
-    # Beside the lens; nearer, a pixel is hundreds of millimetres of range at 0.6 m.
+    # Least distance of the plane from the lens, in metres: nearer, one pixel is hundreds of
+    # millimetres of range at 0.6 m.
     least_baseline = 1e-3
     baseline = abs(float(laser.plane.normal @ rig.dome_from_cam.translation) - laser.plane.offset)
     if baseline < least_baseline:
@@ -447,7 +444,7 @@ def _place(wall: float, view: StripeView) -> str:
 
 
 def _check_pairs(lasers: Sequence[Laser]) -> list[Finding]:
-    """Check the angles between lasers; of more than three lasers, say the widest alone if sound."""
+    """Check the angles between lasers; of more than three, report the widest and bad ones only."""
     pairs = list(itertools.combinations(lasers, 2))
     found = [_check_pair(*pair) for pair in pairs]
     if len(lasers) <= 3:
