@@ -1,4 +1,4 @@
-"""The command line: one module a command, with its signature and a thin body.
+"""The command line: signatures of the commands, grouped in modules, with thin bodies.
 
 Modules here import nothing heavy at the top, so that `--help` answers at once.
 """

@@ -1,6 +1,6 @@
 """Signatures and help of `aqualvs calibrate`, `board`, `import`, `export` and `schema`.
 
-The bodies are elsewhere.
+Bodies are imported when they run.
 """
 
 from pathlib import Path
@@ -20,8 +20,8 @@ from aqualvs.cli.command import (
 _OF_BOARDS = ("squares_x", "squares_y", "square_mm", "border_mm")
 _OF_A_BOX = ("width_mm", "height_mm", "depth_mm")
 _OF_A_PLATE = ("position_mm", "rotation_deg")
-# Options that a kind of target has no use for.
-_IDLE = {
+# By kind of target: options that do not apply to it.
+_NOT_OF = {
     "charuco": (*_OF_A_BOX, *_OF_A_PLATE, "first_id"),
     "chessboard": (*_OF_A_BOX, *_OF_A_PLATE, "first_id", "marker_mm", "dictionary"),
     "box": (*_OF_BOARDS, *_OF_A_PLATE),
@@ -38,7 +38,7 @@ calibrate = typer.Typer(
 
 @calibrate.callback(invoke_without_command=True)
 def _steps(context: typer.Context) -> None:
-    """Print the help where no step is named."""
+    """Print the help if no step is given."""
     if context.invoked_subcommand is None:
         typer.echo(context.get_help(), err=True)
         raise typer.Exit(2)
@@ -349,7 +349,7 @@ def board(
     overwrite: Overwrite = False,
 ) -> None:
     """Print a target."""
-    refuse_given(context, _IDLE[kind], f"not of a {kind}; leave it out")
+    refuse_given(context, _NOT_OF[kind], f"not of a {kind}; leave it out")
     from aqualvs.calibrate import board as body
 
     body.print_board(

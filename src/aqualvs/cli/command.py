@@ -1,9 +1,9 @@
 """Base of all commands: a command class that checks values, shared options, and fast imports.
 
 `CheckedCommand` checks the values of every option and argument before the command runs. `given`
-tells which parameters the user set, and `refuse_given` refuses those that would do nothing.
-`usage_text` words faults of the parser.
-`importing` switches garbage collection off during large imports.
+returns the parameters that the user set, and `refuse_given` refuses those that have no effect.
+`usage_text` describes errors of the parser in one line. `importing` switches garbage collection off
+during large imports.
 """
 
 import contextlib
@@ -23,7 +23,7 @@ from aqualvs.special_files import refuse_special
 
 @contextlib.contextmanager
 def importing() -> Iterator[None]:
-    """Exclude what is imported inside from garbage collection, during the import and after it.
+    """Exclude the objects of imported modules from garbage collection, during and after the import.
 
     Modules never become garbage; searching them takes a sixth of the time of importing them.
     """
@@ -37,11 +37,11 @@ def importing() -> Iterator[None]:
             gc.enable()
 
 
-# Older versions of Typer keep this class in Click, newer ones in a private module of their own.
+# Older versions of Typer import this class from Click, newer ones have it in a private module.
 USAGE_ERROR: type[Exception] = typer.BadParameter.__bases__[0]
 
 MAX_WORKERS = 1024
-"""Processes on one machine; more are a slip of the finger that would fill its memory."""
+"""Most processes on one machine; a larger number is a typing error that would fill its memory."""
 
 Overwrite = Annotated[
     bool, typer.Option("--overwrite", help="Replace files that this command wrote there before.")
@@ -66,10 +66,10 @@ Celsius = Annotated[float | None, typer.Option(help="Water temperature, to compu
 
 
 def _per_mille(salinity: float | None) -> float | None:
-    """Remark on a salinity that looks like a share of one; sea water has 0.03 to 0.04 then."""
+    """Print a remark if a salinity looks like a fraction (0.035) instead of per mille (35)."""
     if salinity is not None and 0.0 < salinity < 0.1:
-        said = f"--salinity {salinity:g}: salinity is per mille; sea water has 35"
-        typer.echo(f"aqualvs: remark: {said}", err=True)
+        remark = f"--salinity {salinity:g}: salinity is per mille; sea water has 35"
+        typer.echo(f"aqualvs: remark: {remark}", err=True)
     return salinity
 
 
@@ -113,14 +113,14 @@ MavlinkKey = Annotated[
 
 
 def given(context: typer.Context, names: Sequence[str]) -> frozenset[str]:
-    """Return which of these parameters the user gave."""
+    """Return those of these parameters that the user set, on the command line or by environment."""
     return frozenset(name for name in names if _origin(context, name) not in ("", "DEFAULT"))
 
 
 def typed(context: typer.Context, *names: str) -> tuple[str, ...]:
-    """Return which of these parameters stand on the command line.
+    """Return those of these parameters that are on the command line.
 
-    Variables of the environment do not count: they hold for every command.
+    Environment variables do not count: they apply to every command.
     """
     return tuple(name for name in names if _origin(context, name) == "COMMANDLINE")
 
@@ -131,27 +131,27 @@ def _origin(context: typer.Context, name: str) -> str:
 
 
 def refuse_given(context: typer.Context, names: Sequence[str], remedy: str) -> None:
-    """Refuse parameters on the command line that would do nothing.
+    """Refuse parameters on the command line that would have no effect.
 
     Raises `OptionError` with the first of them, its value and the remedy.
     """
     parameters = {parameter.name: parameter for parameter in context.command.params}
     for name in typed(context, *names):
-        values = [str(one) for one in _plain(context.params[name]) if not isinstance(one, bool)]
-        # Passwords do not belong into logs.
+        values = [str(one) for one in _flattened(context.params[name]) if not isinstance(one, bool)]
+        # Passwords must not appear in logs.
         shown = "" if name == "token" else "".join(f" {one}" for one in values)
         raise OptionError(f"{_name(parameters[name])}{shown}: {remedy}")
 
 
 class CheckedCommand(TyperCommand):
-    """A command that refuses values that no option and no argument can take.
+    """Command that refuses values that are wrong for any option or argument.
 
     Refused are empty values; numbers that are not finite, or too large for a 32-bit integer; text
     that is not UTF-8; and paths of pipes, devices and sockets.
     """
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the arguments; refuse empty ones, which `Path` would take for the folder one is in.
+        """Parse the arguments; refuse empty ones, which `Path` takes for the current folder.
 
         Raises `OptionError` with the option.
         """
@@ -159,7 +159,7 @@ class CheckedCommand(TyperCommand):
             self._refuse_empty(ctx, args)
             return super().parse_args(ctx, args)
         except USAGE_ERROR as fault:
-            # The parser does not know of which command an option lacks its value.
+            # The parser leaves out the command if the value of an option is missing.
             if getattr(fault, "ctx", None) is None:
                 vars(fault)["ctx"] = ctx
             raise
@@ -168,7 +168,7 @@ class CheckedCommand(TyperCommand):
         if any(word == "" or word.endswith("=") for word in args):
             found, _, _ = self.make_parser(ctx).parse_args(args=list(args))
             for parameter in self.params:
-                if any(value == "" for value in _plain(found.get(parameter.name))):
+                if any(value == "" for value in _flattened(found.get(parameter.name))):
                     raise OptionError(
                         f"{_name(parameter)} '': is empty; give a value, or set the variable of "
                         "the shell that should hold it"
@@ -180,16 +180,16 @@ class CheckedCommand(TyperCommand):
         Raises `OptionError` with the option and its value.
         """
         for parameter in self.params:
-            for value in _plain(ctx.params.get(parameter.name)):
+            for value in _flattened(ctx.params.get(parameter.name)):
                 _check(value, _name(parameter))
         return super().invoke(ctx)
 
 
 class CommandGroups(TyperGroup):
-    """A program whose help lists its commands by group, each with the first sentence of its help.
+    """Program whose help lists its commands by group, each with the first sentence of its help.
 
-    A command's group is its `rich_help_panel`; groups are listed as their first commands are. Typer
-    itself draws groups by Rich only, which takes as long to import as all the rest of `--help`.
+    A command's group is its `rich_help_panel`; groups are in the order of their first commands.
+    Typer itself shows groups only with Rich, which takes as long to import as the rest of `--help`.
     """
 
     def invoke(self, ctx: Any) -> Any:
@@ -200,7 +200,7 @@ class CommandGroups(TyperGroup):
             raise typer.Abort from None
 
     def format_commands(self, _ctx: Any, formatter: Any) -> None:
-        """Write a section for every group, and one for commands without a group."""
+        """Write a section for each group, and one for commands without a group."""
         max_summary = 200  # Characters; sentences in `--help` are wrapped, not cut.
         groups: dict[str, list[tuple[str, str]]] = {}
         for name, command in self.commands.items():
@@ -217,41 +217,41 @@ class CommandGroups(TyperGroup):
                 formatter.write_dl([(f"{name:{widest}}", summary) for name, summary in rows])
 
 
-def _plain(value: Any) -> Iterator[Any]:
-    """Yield the values of a parameter that may take several."""
+def _flattened(value: Any) -> Iterator[Any]:
+    """Yield the single values of a parameter, from nested lists and tuples."""
     if isinstance(value, list | tuple):
         for one in value:
-            yield from _plain(one)
+            yield from _flattened(one)
     else:
         yield value
 
 
 def _name(parameter: Any) -> str:
-    """Return a parameter as the user writes it."""
+    """Return a parameter's name as the user types it: --option or ARGUMENT."""
     if parameter.param_type_name == "option":
         return str(max(parameter.opts, key=len))
     return str(parameter.name).upper()
 
 
 def usage_text(fault: Exception) -> str:
-    """Return in one line what is wrong with the arguments, and which help has more."""
+    """Return the parser's error in one line, with the command whose `--help` to read."""
     parameter, errors = getattr(fault, "param", None), getattr(fault.__cause__, "errors", None)
     if parameter is not None and errors is not None:
         error = errors()[0]
-        said = f"{_name(parameter)} {error['input']}: {_wanted(error)}"
+        text = f"{_name(parameter)} {error['input']}: {_remedy(error)}"
     else:
         message = getattr(fault, "format_message", fault.__str__)()
-        said = " ".join(str(message).split()).rstrip(".")
+        text = " ".join(str(message).split()).rstrip(".")
     context = getattr(fault, "ctx", None)
     command = "aqualvs" if context is None else context.command_path
-    if command == "aqualvs run" and "unexpected extra argument" in said:
+    if command == "aqualvs run" and "unexpected extra argument" in text:
         # A pattern that the shell has expanded.
-        said = f"{said}: it measures one dive; use aqualvs batch for several"
-    return f"{said}; see {command} --help"
+        text = f"{text}: it measures one dive; use aqualvs batch for several"
+    return f"{text}; see {command} --help"
 
 
-def _wanted(error: Mapping[str, Any]) -> str:
-    """Return what a parameter takes, by what Pydantic says of a value that it refuses."""
+def _remedy(error: Mapping[str, Any]) -> str:
+    """Return which values a parameter takes, from Pydantic's error on a refused one."""
     kind, context = error["type"], error.get("ctx", {})
     if kind == "float_parsing":
         number = str(error["input"]).strip().replace(",", ".")
@@ -281,7 +281,7 @@ def _check(value: Any, name: str) -> None:
 
 
 def _is_text(value: str) -> bool:
-    """Return whether a text can be written as UTF-8; bytes that cannot come in as surrogates."""
+    """Return whether a text can be encoded as UTF-8; Python decodes other bytes as surrogates."""
     try:
         value.encode()
     except UnicodeEncodeError:

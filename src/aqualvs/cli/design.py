@@ -97,7 +97,7 @@ def design(
 
 
 def _without_none(given: dict[str, Any]) -> dict[str, Any]:
-    """Return what the user gave: empty parts and keys without a value are left out."""
+    """Return the values that the user gave, without None and empty parts."""
     kept: dict[str, Any] = {}
     for key, value in given.items():
         if isinstance(value, dict):
@@ -108,13 +108,13 @@ def _without_none(given: dict[str, Any]) -> dict[str, Any]:
 
 
 def _numbers(text: str | None, between: str, names: tuple[str, ...], option: str) -> dict[str, Any]:
-    """Return named numbers of an option such as 1920x1080."""
+    """Return the numbers of an option such as 1920x1080 by their names; empty if not given."""
     found = _split(text, between, len(names), option)
     return dict(zip(names, found, strict=False))
 
 
 def _listed(text: str | None, between: str, name: str, count: int, option: str) -> dict[str, Any]:
-    """Return one named list of numbers, or nothing."""
+    """Return the numbers of an option such as 300:1200 as one named list; empty if not given."""
     found = _split(text, between, count, option)
     return {name: found} if found else {}
 

@@ -20,12 +20,12 @@ OF_A_VEHICLE = (
     "source", "rig", "mavlink", "vehicle_file", "mavlink_peer", "mavlink_key", "record",
     "record_to", "record_video", "target", "water_n",
 )  # fmt: skip
-"""Parameters of `aqualvs follow` that mean nothing in simulation."""
+"""Parameters of `aqualvs follow` that have no effect in a simulation."""
 OF_A_SIMULATION = (
     "vehicle", "seconds", "current", "current_to", "waves", "cage_radius", "net_sway", "pilot_gain",
     "rendered", "camera", "shutter", "fps", "seed", "freeze",
 )  # fmt: skip
-"""Those that mean nothing with a vehicle."""
+"""Parameters of `aqualvs follow` that have no effect with a vehicle."""
 
 
 def tune(
@@ -51,7 +51,7 @@ def tune(
     rate_hz: Annotated[float, typer.Option(help="Frames per second.")] = 25.0,
     current: Annotated[float, typer.Option(help="Maximum current in m/s.")] = 0.5,
 ) -> None:
-    """Make gains for a vehicle, and say what margins they leave."""
+    """Compute gains for a vehicle."""
     from aqualvs.control.tune import TuneOptions
     from aqualvs.errors import OptionError
     from aqualvs.follow import tune as body
@@ -216,7 +216,7 @@ def follow(
         feed=partial(open_feed, source),
         rig=rig,
         page=page,
-        # The page has a button that records; without it nothing else begins a recording.
+        # The page has a button for recording; without the page, nothing else starts one.
         record=record or (not dashboard and (record_video or record_to is not None)),
         record_to=out if record_to is None else record_to,
         record_video=record_video,

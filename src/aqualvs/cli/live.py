@@ -115,7 +115,7 @@ def live(
     """Measure live."""
     foxglove = foxglove or bool(typed(context, "foxglove_address"))
     dashboard = dashboard or bool(typed(context, "dashboard_address"))
-    # The page has a button that records; without it nothing else begins a recording.
+    # The page has a button for recording; without the page, nothing else starts one.
     record = record or (not dashboard and bool(typed(context, "record_video", "record_to")))
     if not dashboard:
         refuse_given(context, ("token", "embed_from"), "for the pilot's page; add --dashboard")
@@ -173,7 +173,7 @@ def doctor(
     mavlink_peer: MavlinkPeer = None,
     mavlink_key: MavlinkKey = None,
 ) -> None:
-    """Look at the machine."""
+    """Check the machine."""
     if mavlink is None:
         refuse_given(context, _OF_MAVLINK, "for a MAVLink connection; add --mavlink")
     from aqualvs.check.doctor import DoctorRequest, run_doctor

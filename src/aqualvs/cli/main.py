@@ -29,35 +29,35 @@ from aqualvs.errors import AqualvsError
 
 
 class LenientStream:
-    """A text stream that remembers a fault instead of raising it.
+    """Text stream that keeps a fault instead of raising it.
 
-    Whoever reads the output may go before the end, as `head` does, and a terminal may be closed. A
-    dive under way is measured to its end all the same.
+    The reader of a pipe may end early, as `head` does, and a terminal may be closed. A run that has
+    begun is finished all the same.
     """
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
-        self.fault: OSError | None = None  # Why nothing is written any more.
+        self.fault: OSError | None = None  # First fault; afterwards text is dropped.
 
     def write(self, text: str) -> int:
         """Write a text, or drop it after a fault."""
         if self.fault is None:
-            with self._noting():
+            with self._keeping_fault():
                 return self._stream.write(text)
         return len(text)
 
     def flush(self) -> None:
-        """Hand over what was written."""
+        """Flush the stream."""
         if self.fault is None:
-            with self._noting():
+            with self._keeping_fault():
                 self._stream.flush()
 
     def __getattr__(self, name: str) -> Any:
-        """Return whatever else the stream has."""
+        """Return any other attribute of the stream."""
         return getattr(self._stream, name)
 
     @contextlib.contextmanager
-    def _noting(self) -> Iterator[None]:
+    def _keeping_fault(self) -> Iterator[None]:
         try:
             yield
         except OSError as fault:
@@ -66,12 +66,12 @@ class LenientStream:
 
 @contextlib.contextmanager
 def lenient_output() -> Iterator[LenientStream | None]:
-    """Make standard output and error lenient inside, and let them take every character.
+    """Make standard output and error lenient, and able to write every character.
 
     Yields
     ------
     output : LenientStream or None
-        Standard output; None where it is closed.
+        Standard output; None if it is closed.
     """
     before = sys.stdout, sys.stderr
     output = None if sys.stdout is None else _lenient(sys.stdout)
@@ -87,7 +87,7 @@ def lenient_output() -> Iterator[LenientStream | None]:
 
 
 def drop_output() -> None:
-    """Lead standard output nowhere, so that the interpreter's last flush does not fail."""
+    """Redirect standard output to the null device, so that the last flush at exit succeeds."""
     with contextlib.suppress(OSError, ValueError):
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, sys.stdout.fileno())
@@ -95,18 +95,17 @@ def drop_output() -> None:
 
 
 def _lenient(stream: TextIO) -> LenientStream:
-    # A name that the terminal's encoding lacks is no reason to fail.
+    # Characters that the terminal's encoding lacks must not raise.
     reconfigure = getattr(stream, "reconfigure", None)
     if reconfigure is not None:
         reconfigure(errors="backslashreplace")
     return LenientStream(stream)
 
 
-# Matrices here are small: threads of the linear algebra gain nothing, and where another process
-# keeps the cores busy they wait for each other twenty times as long. Before NumPy is imported.
+# Before NumPy is imported: matrices here are too small for threads of the linear algebra, which
+# slow down twenty-fold if other processes keep the cores busy.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-# No plugin of Pydantic has anything to do here, and to look for one reads what every package that
-# is installed says of itself.
+# The search for plugins reads the metadata of every installed package.
 os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
 
 app = typer.Typer(
@@ -119,7 +118,7 @@ app = typer.Typer(
 
 
 def _group(title: str) -> Callable[..., Any]:
-    """Return what registers a command in a group of `--help`."""
+    """Return the decorator that registers a command in a group of `--help`."""
     return functools.partial(app.command, cls=CheckedCommand, rich_help_panel=title)
 
 
@@ -232,11 +231,10 @@ _reference(
     epilog="Example: aqualvs score mine=out/mine --truth bench --own out/own -o scores",
 )(score)
 
-_EXIT_BAD_INPUT = 2
-# Characters of a fault.
-_LONGEST = 2000
-_EXIT_INTERRUPTED = 130
-_EXIT_BROKEN_PIPE = 141
+# 128 + signal as in a shell: SIGINT and SIGPIPE.
+_EXIT_BAD_INPUT, _EXIT_INTERRUPTED, _EXIT_BROKEN_PIPE = 2, 130, 141
+# Longest error message, in characters.
+_MAX_MESSAGE = 2000
 
 
 @app.callback(invoke_without_command=True)
@@ -261,19 +259,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns
     -------
     exit_code : int
-        0, or 2 for bad input, or 128 + signal for a run that was stopped; 141 where all went well
-        but nobody read the output to its end.
+        0 for success; 2 for bad input; 128 + signal for a run that was stopped; 141 for success
+        whose output was not read to its end.
     """
     if arguments is None:
-        # To compile a kernel makes many objects and little garbage. With Python's thresholds, the
-        # search for it takes a tenth of a first run.
+        # Compiling a kernel makes many objects and little garbage. With Python's thresholds,
+        # garbage collection takes a tenth of a first run.
         gc.set_threshold(50_000, 20, 50)
     with lenient_output() as output:
         code = _exit_code(arguments)
     code = _complete(code, output, ends=arguments is None)
     if arguments is None:
-        # The process ends here. To look once more through all that was imported for what refers to
-        # itself would take a third of a second.
+        # The process ends here. A last garbage collection of all imported modules would take a
+        # third of a second.
         gc.freeze()
     return code
 
@@ -289,27 +287,31 @@ def _exit_code(arguments: Sequence[str] | None) -> int:
     except OSError as fault:
         if fault.filename is None:
             raise
-        rights = isinstance(fault, PermissionError)
-        remedy = "; change its rights, or choose another path" if rights else ""
-        said = f"{os.fsdecode(fault.filename)}: {fault.strerror}{remedy}"
-        return _complain(said, _EXIT_BAD_INPUT)
+        denied = isinstance(fault, PermissionError)
+        remedy = "; change its rights, or choose another path" if denied else ""
+        message = f"{os.fsdecode(fault.filename)}: {fault.strerror}{remedy}"
+        return _complain(message, _EXIT_BAD_INPUT)
     except USAGE_ERROR as fault:
         return _complain(usage_text(fault), _EXIT_BAD_INPUT)
     return int(code or 0)
 
 
 def _complain(message: str, code: int) -> int:
-    # Names of files, and values in them, may hold line feeds and other control characters.
+    """Print an error message in one line and return the exit code."""
+    # Names of files, and values in them, may contain line feeds and other control characters.
     line = "".join(sign if sign.isprintable() else repr(sign)[1:-1] for sign in message)
-    if len(line) > _LONGEST:
-        # A value of a megabyte in a file; the name of the file is at the front, the remedy behind.
-        line = f"{line[: _LONGEST // 2]} ... {line[-_LONGEST // 2 :]}"
+    if len(line) > _MAX_MESSAGE:
+        # A value may be a megabyte long; the file's name is in front of it, the remedy behind.
+        line = f"{line[: _MAX_MESSAGE // 2]} ... {line[-_MAX_MESSAGE // 2 :]}"
     print(f"aqualvs: error: {line}", file=sys.stderr)
     return code
 
 
 def _complete(code: int, output: LenientStream | None, *, ends: bool) -> int:
-    """Return the exit code with regard to whether the output was read."""
+    """Return the exit code after a possible fault of standard output.
+
+    `ends`: the process ends now, so that its output may be redirected.
+    """
     fault = None if output is None else output.fault
     if fault is None:
         return code

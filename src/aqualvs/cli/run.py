@@ -217,13 +217,13 @@ def report(
         ),
     ] = None,
 ) -> None:
-    """Write a report again."""
+    """Rewrite a report."""
     from aqualvs.report.run_page import write_report
     from aqualvs.results.folder import REPORT_HTML, claim_run, recover
 
     if recover(folder):
         typer.echo(f"{folder}: points completed from the journal of a run that was killed")
-    # To write it again is what the command is for.
+    # Rewriting the report is the purpose of the command.
     with claim_run(folder, [REPORT_HTML], overwrite=True):
         typer.echo(f"report: {write_report(folder, truth=truth)}")
 
@@ -239,7 +239,7 @@ def simulate(
         str | None,
         typer.Option(
             metavar="KIND:MS",
-            help="How the camera exposes a picture, in milliseconds: rolling:READOUT:EXPOSURE, "
+            help="Shutter of the camera, in milliseconds: rolling:READOUT:EXPOSURE, "
             "interlaced:EXPOSURE or global:EXPOSURE; by default the rig's.",
         ),
     ] = None,
