@@ -1,9 +1,9 @@
-"""Posture errors of a wrong camera whose lasers are calibrated with it, and of an off-centre lens.
+"""Posture errors by errors of the camera and by an off-centre lens, after a laser calibration.
 
-Lasers are calibrated on boards that the same camera sees. An error of the camera moves the boards,
-and the lasers with them: stripes on a wall are then found where a board would be found
-(`camera_errors`). `offset_costs` gives the errors for a lens that is not in the dome's centre, if
-its offset is neglected or known.
+Lasers are calibrated on boards that the same camera sees. An error of the camera model displaces
+the boards, and the lasers with them, so that it partly cancels in the posture (`camera_errors`).
+`offset_costs` gives the errors for a lens off the dome's centre, if its offset is neglected or
+known.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -27,9 +27,12 @@ from aqualvs.optics.rig import Laser, Rig, rig_moved_by
 class _BoardOptions(NamedTuple):
     """Boards for the calibration of lasers, and points on their stripes."""
 
+    # Ranges of the boards, as exponents between the ends of the working range.
     places: tuple[float, float] = (0.15, 0.85)
+    # Corners to a side, and half a side as a share of the range, such that boards fill the picture.
     n_corners: int = 11
     half_board: float = 0.8
+    # Points along a stripe, and fewest visible points of a laser on all boards.
     n_points: int = 161
     min_points: int = 40
 
@@ -60,18 +63,18 @@ def camera_errors(design: Design, ranges: Sequence[float]) -> dict[str, FloatArr
         squares = np.zeros((len(walls), 3))
         for step in steps:
             moved = rig_moved_by(rig, list(step), np.array([*step.values()]))
-            believed = lasers_by(moved, rig)
-            if believed is None:
+            assumed = lasers_by(moved, rig)
+            if assumed is None:
                 squares += np.nan
                 continue
-            read = np.array([wall.measured_by(believed) for wall in walls])
+            read = np.array([wall.measured_by(assumed) for wall in walls])
             squares += (read - truth) ** 2
         found[cause] = np.sqrt(squares)
     return found
 
 
 def _steps(rig: Rig, tolerances: Tolerances) -> dict[str, list[Mapping[str, float]]]:
-    """Return one-sigma steps of the camera's numbers, by cause."""
+    """Return one-sigma steps of the camera's parameters, by cause."""
     lens, turn, dome = tolerances.lens, tolerances.rotation, tolerances.dome
     focal = {"fx": tolerances.focal * rig.lens.fx, "fy": tolerances.focal * rig.lens.fy}
     steps: dict[str, list[Mapping[str, float]]] = {
@@ -82,22 +85,24 @@ def _steps(rig: Rig, tolerances: Tolerances) -> dict[str, list[Mapping[str, floa
     if rig.dome is not None:
         steps["dome"] = [{"inner_radius": dome}, {"thickness": dome}]
     if rig.flat_port is not None:
-        # The place of the lens is that of the whole camera; the port's is what tolerances change.
+        # A shift of the lens shifts the whole camera; what matters is the distance of the port.
         tilts = [{"port_tilt_x": turn}, {"port_tilt_y": turn}]
         steps["flat port"] = [{"port_distance": lens}, {"thickness": dome}, *tilts]
     return steps
 
 
-def lasers_by(believed: Rig, true: Rig) -> Rig | None:
+def lasers_by(assumed: Rig, true: Rig) -> Rig | None:
     """Return a rig with lasers calibrated by its own camera in the pictures of another rig.
 
-    A calibration without noise: the assumed camera gives the poses of boards in the working range,
-    and the stripes on them the lasers.
+    The calibration is without noise: the assumed camera gives the poses of boards in the working
+    range, and the stripes on the boards give the lasers.
 
     Parameters
     ----------
-    believed : Rig
-        Rig whose camera is assumed.
+    assumed : Rig
+        Rig whose camera the calibration assumes.
+    true : Rig
+        Rig that takes the pictures.
 
     Returns
     -------
@@ -106,35 +111,33 @@ def lasers_by(believed: Rig, true: Rig) -> Rig | None:
     """
     lit: list[list[FloatArray]] = [[] for _ in true.lasers]
     for board in _boards(true.working_range):
-        found = _found(believed, true, board)
+        found = _estimated_pose(assumed, true, board)
         if found is None:
             continue
         for points, laser in zip(lit, true.lasers, strict=True):
-            points.append(_stripe_on(board, found, laser, believed, true))
+            points.append(_stripe_on(board, found, laser, assumed, true))
     if any(sum(map(len, points)) < _BOARD.min_points for points in lit):
         return None
     lasers = (
         replace(laser, plane=Plane.fitted(np.concatenate(points)), window=None)
         for laser, points in zip(true.lasers, lit, strict=True)
     )
-    return replace(believed, lasers=tuple(lasers))
+    return replace(assumed, lasers=tuple(lasers))
 
 
 def _boards(working_range: tuple[float, float]) -> Iterator[SE3]:
-    """Return poses `dome_from_board`; boards lie in their x-z plane."""
+    """Yield poses `dome_from_board`; boards lie in their x-z plane."""
     near, far = working_range
-    # Boards for the calibration of lasers: tilts (radians), places in the working range (as
-    # powers), corners to a side, and half a side as a share of the range, such that they fill the
-    # picture.
-    leans = (np.deg2rad((25.0, 0.0, 10.0)), np.deg2rad((-15.0, 0.0, -25.0)))
+    # Rotation vectors.
+    tilts = (np.deg2rad((25.0, 0.0, 10.0)), np.deg2rad((-15.0, 0.0, -25.0)))
     for share in _BOARD.places:
         middle = np.array([0.0, near * (far / near) ** share, 0.0])
-        for lean in leans:
-            yield SE3(rotation_from_rotvec(lean), middle)
+        for tilt in tilts:
+            yield SE3(rotation_from_rotvec(tilt), middle)
 
 
-def _found(believed: Rig, true: Rig, board: SE3) -> SE3 | None:
-    """Return the pose of a board as the assumed camera finds it."""
+def _estimated_pose(assumed: Rig, true: Rig, board: SE3) -> SE3 | None:
+    """Return the pose of a board that the assumed camera estimates; None if it fails."""
     half = _BOARD.half_board * float(board.translation[1])
     x, z = np.meshgrid(*(np.linspace(-half, half, _BOARD.n_corners),) * 2)
     corners = np.stack([x, np.zeros_like(x), z], axis=-1).reshape(-1, 3)
@@ -143,14 +146,17 @@ def _found(believed: Rig, true: Rig, board: SE3) -> SE3 | None:
     seen = valid & camera.inside_image(pixels)
     view = View("board", np.flatnonzero(seen), corners[seen], pixels[seen])
     try:
-        pose = target_pose(believed.camera(), view, start=board, max_rms_px=np.inf)
+        pose = target_pose(assumed.camera(), view, start=board, max_rms_px=np.inf)
     except CalibrationError:
         return None
     return pose.dome_from_target
 
 
-def _stripe_on(board: SE3, found: SE3, laser: Laser, believed: Rig, true: Rig) -> FloatArray:
-    """Return points (N, 3) of a laser's stripe on a board as placed by the assumed camera."""
+def _stripe_on(board: SE3, found: SE3, laser: Laser, assumed: Rig, true: Rig) -> FloatArray:
+    """Return points (N, 3) of a laser's stripe on a board, located by the assumed camera.
+
+    `board` is the true pose, `found` the pose by the assumed camera.
+    """
     face = board.rotate([0.0, 1.0, 0.0])
     along = np.cross(laser.plane.normal, face)
     length = float(np.linalg.norm(along))
@@ -167,7 +173,7 @@ def _stripe_on(board: SE3, found: SE3, laser: Laser, believed: Rig, true: Rig) -
     seen = valid & camera.inside_image(pixels) & on_board.all(axis=-1)
     normal = found.rotate([0.0, 1.0, 0.0])
     surface = Plane(normal, float(normal @ found.translation))
-    placed, met = surface.intersect(believed.camera().rays(pixels[seen]))
+    placed, met = surface.intersect(assumed.camera().rays(pixels[seen]))
     return placed[met]
 
 
@@ -177,14 +183,14 @@ INDEX_ERROR = 0.005
 
 @dataclass(frozen=True, slots=True)
 class OffsetCost:
-    """Errors by an offset of the lens ahead of the dome's centre."""
+    """Errors by an offset of the lens forward of the dome's centre."""
 
     offset: float  # Metres.
-    # Shape (W, 3): errors of (range, pitch, yaw), in m and rad, if the lens is taken to be in the
+    # Shape (W, 3): errors of (range, pitch, yaw), in m and rad, if the lens is assumed to be in the
     # centre and all else is right.
     neglected: FloatArray
-    # Shape (W, 3): the same if the lasers, too, were calibrated with the lens taken to be in the
-    # centre, on boards whose places are then wrong as well. NaN if no board's place can be found.
+    # Shape (W, 3): the same if the lasers, too, were calibrated with the lens assumed to be in the
+    # centre, on boards whose poses are then wrong as well. NaN if no board's pose can be estimated.
     calibrated: FloatArray
     # Shape (W, 3): as `neglected`, for an equal offset to the right.
     aside: FloatArray
@@ -197,9 +203,9 @@ class OffsetCost:
 
 
 def offset_costs(design: Design, ranges: Sequence[float]) -> tuple[OffsetCost, ...]:
-    """Return the errors by offsets from none to the largest that the dome has room for.
+    """Return the errors by offsets of the lens, from zero to the largest possible in the dome.
 
-    Among them are the design's own offset and its centring tolerance. None without a dome.
+    Among them are the design's own offset and its centring tolerance. Empty without a dome.
 
     Parameters
     ----------
@@ -215,10 +221,10 @@ def offset_costs(design: Design, ranges: Sequence[float]) -> tuple[OffsetCost, .
     usual = (0.0, 0.5e-3, 1e-3, 2e-3, 5e-3, 10e-3, 20e-3, 40e-3)
     offsets = {round(value, 5) for value in (*usual, own, design.centring)}
     rig = design.nominal_rig()
-    # Greatest offset of a lens, as a share of the inner radius.
-    room_share = 0.9
-    room = room_share * dome.inner_radius
-    return tuple(_cost(rig, offset, ranges) for offset in sorted(offsets) if offset <= room)
+    # Largest offset of a lens, as a share of the inner radius.
+    max_share = 0.9
+    largest = max_share * dome.inner_radius
+    return tuple(_cost(rig, offset, ranges) for offset in sorted(offsets) if offset <= largest)
 
 
 def _cost(rig: Rig, offset: float, ranges: Sequence[float]) -> OffsetCost:
@@ -238,9 +244,9 @@ def _with_lens(rig: Rig, position: tuple[float, float, float]) -> Rig:
     return replace(rig, dome_from_cam=SE3(rig.dome_from_cam.rotation, np.array(position)))
 
 
-def _errors(true: Rig, believed: Rig | None, ranges: Sequence[float]) -> FloatArray:
-    """Return the posture errors (W, 3) of `believed` on pictures of `true`; NaN without posture."""
-    if believed is None:
+def _errors(true: Rig, assumed: Rig | None, ranges: Sequence[float]) -> FloatArray:
+    """Return the posture errors (W, 3) of `assumed` on pictures of `true`; NaN without posture."""
+    if assumed is None:
         return np.full((len(ranges), 3), np.nan)
-    read = [WallView.ahead(true, wall).measured_by(believed) - [wall, 0.0, 0.0] for wall in ranges]
+    read = [WallView.ahead(true, wall).measured_by(assumed) - [wall, 0.0, 0.0] for wall in ranges]
     return np.array(read)

@@ -1,11 +1,11 @@
 """Optimisation of a design: best angles of its lasers, and the changes that help most.
 
-Angles: coordinate exchange (Meyer & Nachtsheim 1995, Technometrics 37, 60-69). One laser after the
-other takes the best of its candidates, the others being as they are, until none changes. The
-information of stripes adds up over the lasers (`stripes`), so the candidates are traced once for
-each grid; grids become finer about the best.
+Angles: coordinate exchange (Meyer & Nachtsheim 1995, Technometrics 37, 60-69). Each laser in turn
+takes the best of its candidate angles while the others are held, until none changes. The
+information of stripes is additive over lasers (`stripes`), so that candidates are evaluated once
+for each grid; grids become finer around the best.
 
-Changes: each one is tried with the lasers tilted anew (`changes`).
+Changes: each one is tried with the lasers' angles optimised again (`changes`).
 """
 
 import math
@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from aqualvs.design.judge import Judge, Lot, predict, score
+from aqualvs.design.judge import Judge, StripeSet, predict, score
 from aqualvs.design.settings import Design, Mount, tangential
 from aqualvs.geometry.transforms import SE3
 
@@ -22,22 +22,24 @@ TILT_LIMITS = (math.radians(-40.0), math.radians(60.0))
 """Limits of the search for the best tilt."""
 
 _DEG = math.pi / 180.0
-# Steps of tilt and stripe from grid to grid, and number of steps to each side after the first.
+# Steps of tilt and stripe in each grid, and their number to each side in all but the first grid,
+# which covers all angles.
 _TILT_STEPS = (2.5 * _DEG, 0.5 * _DEG, 0.1 * _DEG)
 _STRIPE_STEPS = (15.0 * _DEG, 5.0 * _DEG, 1.0 * _DEG)
 _HALF_TILTS, _HALF_STRIPES = 6, 3
-# Number of initial choices of each kind.
+# Number of initial choices of each kind, see `_starts`.
 _N_STARTS = 8
+# Limit of exchanges, in case two choices alternate.
 _MAX_ROUNDS = 20
 
 
 def best_angles(design: Design, *, quick: bool = False) -> Design:
-    """Return the design with the best angles of the mounts that are free to turn.
+    """Return the design with the best angles of the mounts whose angles are free.
 
-    The fans of these mounts are swung so that their middles are abreast of the forward axis halfway
-    through the working range.
+    The fans of these mounts are swung so that their middles are beside the forward axis at the
+    middle of the working range.
 
-    `quick`: start from the mounts' own angles only: sufficient after small changes of a design.
+    `quick`: start from the mounts' own angles only, which is sufficient after small changes.
     """
     if not any(mount.free_tilt or mount.free_stripe for mount in design.mounts):
         return design
@@ -55,8 +57,13 @@ def best_angles(design: Design, *, quick: bool = False) -> Design:
     return design.with_mounts(mounts)
 
 
-def _exchange(judge: Judge, lots: Sequence[Lot], start: Sequence[int]) -> tuple[float, list[int]]:
-    """Exchange every laser for its best candidate until none changes."""
+def _exchange(
+    judge: Judge, lots: Sequence[StripeSet], start: Sequence[int]
+) -> tuple[float, list[int]]:
+    """Exchange each laser for its best candidate until none changes.
+
+    Returns the score of the choice, and the index of the candidate of each laser.
+    """
     picked, least = list(start), math.inf
     for _ in range(_MAX_ROUNDS):
         before = list(picked)
@@ -74,7 +81,7 @@ def _exchange(judge: Judge, lots: Sequence[Lot], start: Sequence[int]) -> tuple[
 
 
 def _candidates(mount: Mount, i_grid: int, halfway: float) -> list[Mount]:
-    """Return a mount at all angles of a grid; the middle of later grids is the mount itself."""
+    """Return a mount at all angles of a grid; all but the first grid are centred on the mount."""
     if not (mount.free_tilt or mount.free_stripe):
         return [mount]
     tilts, stripes = [mount.tilt], [mount.stripe]
@@ -110,7 +117,7 @@ def _around(middle: float, step: float, half: int) -> list[float]:
 
 
 def _starts(lots: Sequence[Sequence[Mount]]) -> list[list[int]]:
-    """Return initial choices: alike for all lasers, and mixed (the same at every call)."""
+    """Return initial choices: the same for all lasers, and random ones with a fixed seed."""
     shares = (np.arange(_N_STARTS) + 0.5) / _N_STARTS
     alike = [[share] * len(lots) for share in shares.tolist()]
     mixed = np.random.default_rng(0).uniform(size=(_N_STARTS, len(lots))).tolist()
@@ -122,7 +129,7 @@ def _starts(lots: Sequence[Sequence[Mount]]) -> list[list[int]]:
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """Effect of a change; all numbers are ratios to the present values, 1 is no effect."""
+    """Effect of a change of a design; all numbers are ratios of errors, after to before."""
 
     words: str  # Description of the change.
     score: float  # Root mean square of all errors, in goals, on walls and nets.
@@ -135,9 +142,9 @@ class Change:
 
 
 def changes(design: Design) -> list[Change]:
-    """Try every change and return them, the most helpful first.
+    """Evaluate every change and return them, the most helpful first.
 
-    `design`: with the final tilts of its lasers. Those that are free to turn are turned again.
+    `design`: with the final tilts of its lasers. Free angles are optimised again for each change.
     """
     now = _measures(design)
     tried = ((words, change(design)) for words, change in _CHANGES.items())
@@ -151,10 +158,10 @@ def changes(design: Design) -> list[Change]:
 
 def _measures(design: Design) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
     """Return the score, then noise and tolerances for range (as a share) and angles."""
-    told = predict(design)
+    errors = predict(design)
     parts = [score(design).error]
-    for sigma in (told.wall, told.systematic_total):
-        parts.append(_rms(sigma[:, 0] / told.ranges))
+    for sigma in (errors.wall, errors.systematic_total):
+        parts.append(_rms(sigma[:, 0] / errors.ranges))
         parts.append(_rms(np.hypot(sigma[:, 1], sigma[:, 2])))
     return np.array(parts)
 
@@ -163,8 +170,8 @@ def _rms(values: np.ndarray[tuple[int], np.dtype[np.float64]]) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def _moved(design: Design, move: Callable[[Mount], Mount]) -> Design:
-    return design.with_mounts([move(mount) for mount in design.mounts])
+def _for_mounts(design: Design, change: Callable[[Mount], Mount]) -> Design:
+    return design.with_mounts([change(mount) for mount in design.mounts])
 
 
 def _wider_baseline(design: Design) -> Design:
@@ -172,7 +179,7 @@ def _wider_baseline(design: Design) -> Design:
         x, y, z = mount.position
         return replace(mount, position=(1.2 * x, y, 1.2 * z))
 
-    return _moved(design, move)
+    return _for_mounts(design, move)
 
 
 def _finer(design: Design) -> Design:
@@ -222,7 +229,7 @@ def _free_places(design: Design) -> Iterator[tuple[float, float, float]]:
 def _turned(design: Design) -> Design | None:
     if all(mount.free_stripe for mount in design.mounts):
         return None
-    return _moved(design, lambda mount: replace(mount, free_stripe=True))
+    return _for_mounts(design, lambda mount: replace(mount, free_stripe=True))
 
 
 def _centred(design: Design) -> Design | None:
@@ -234,9 +241,9 @@ def _centred(design: Design) -> Design | None:
 
 
 def _averaged(design: Design) -> Design:
-    """Average four frames with stripes at different places of the target: all noise halves.
+    """Average four frames with stripes at different places of the target: the noise halves.
 
-    But for the shift of the light on twine, which follows from twine and water, not from the place.
+    The shift of the light on twine does not: it depends on twine and water, not on the place.
     """
     noise = design.noise
     halved = {name: 0.5 * getattr(noise, name) for name in ("point", "strand", "shared")}
@@ -268,7 +275,7 @@ _CHANGES: dict[str, Callable[[Design], Design | None]] = {
     "stripes may cross": lambda design: (
         replace(design, avoid_crossings=False) if design.avoid_crossings else None
     ),
-    "fan of 90 degrees": lambda design: _moved(
+    "fan of 90 degrees": lambda design: _for_mounts(
         design, lambda mount: replace(mount, fan=math.radians(90.0))
     ),
     "lens in the dome's centre": _centred,

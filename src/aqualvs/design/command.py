@@ -54,14 +54,14 @@ RIG_YAML = "rig.yaml"
 class DesignRequest:
     """Request of `aqualvs design`, see its `--help`."""
 
-    # A design file, or a rig file that exists; the example if neither is given.
+    # A design file, or the file of an existing rig; the example design if neither is given.
     design: Path | None = None
     rig: Path | None = None
     # Output folder.
     out: Path | None = None
     # Replacements of the file's values, see `merged_content`.
     given: Mapping[str, Any] = field(default_factory=dict)
-    # Opening of the fans of a rig's lasers.
+    # Fan angle of an existing rig's lasers.
     fan_deg: float | None = None
     # Whether to optimise the stripes' directions of the tilted lasers, too.
     turn: bool = False
@@ -78,8 +78,8 @@ def run_design(request: DesignRequest) -> None:
 
     Raises `AqualvsError` if a file or an option cannot be used, or the folder cannot be written.
     """
-    told = _Telling()
-    design = _asked_for(request)
+    output = _Output()
+    design = _requested_design(request)
     names = () if request.out is None else (RIG_YAML, ERRORS_PNG, PICTURE_PNG, DESIGN_HTML)
     files = [(request.out or Path()) / name for name in names]
     with Claim("design", files, overwrite=request.overwrite):
@@ -88,30 +88,31 @@ def run_design(request: DesignRequest) -> None:
             design = design.with_mounts(turned)
         best = best_angles(design) if request.tilt else design
         exists = request.rig is not None and request.tilt
-        first, fine, by_camera = _tell_judgement(told, design, best, exists=exists)
+        first, fine, by_camera = _print_verdict(output, design, best, exists=exists)
         costs = offset_costs(best, best.rig.working_range)
         if costs:
             words = centring_text(best, costs, best.rig.working_range)
-            told(offset_table(costs, best.rig.working_range), words)
+            output(offset_table(costs, best.rig.working_range), words)
         if request.try_changes:
-            told(change_table(changes(best)))
+            output(change_table(changes(best)))
         if request.out is not None:
             with writing(request.out):
                 save_rig(designed_rig(best), request.out / RIG_YAML)
                 pictures = draw_figures(best, by_camera, request.out)
                 page = request.out / DESIGN_HTML
                 name = best.rig.name
-                write_page(page, name, first, told.parts, pictures, fine=fine, tilted=exists)
+                write_page(page, name, first, output.parts, pictures, fine=fine, tilted=exists)
             for path in (request.out / RIG_YAML, *pictures, page):
-                told.say(f"written: {path}")
+                output.say(f"written: {path}")
 
 
-def _tell_judgement(
-    told: "_Telling", design: Design, best: Design, *, exists: bool
+def _print_verdict(
+    output: "_Output", design: Design, best: Design, *, exists: bool
 ) -> tuple[str, bool, dict[str, FloatArray]]:
-    """Tell the verdict and the expected errors; return the verdict and `best`'s `camera_errors`.
+    """Print the verdict and the expected errors.
 
-    `exists`: the verdict is on `design` as it is, and what `best` would be follows it.
+    Returns the verdict, whether the goals are met, and the `camera_errors` of `best`. `exists`: the
+    verdict is on `design`, an existing rig, and is followed by that on `best`.
     """
     ranges, square = shown_ranges(best.rig.working_range), "one sigma on a wall or net square ahead"
     by_camera = camera_errors(best, ranges)
@@ -119,56 +120,56 @@ def _tell_judgement(
     if exists:
         now, tilted = camera_errors(design, ranges), first
         first, fine = verdict(design, now)
-        told.headline(first)
-        told(f"Its lasers tilted best: {tilted}", *summary(best))
-        _tell_errors(told, design, now, f"As it is: {square}")
-        told(gain_text(design, best))
-        _tell_errors(told, best, by_camera, f"Tilted best: {square}")
+        output.headline(first)
+        output(f"Its lasers tilted best: {tilted}", *summary(best))
+        _print_errors(output, design, now, f"As it is: {square}")
+        output(gain_text(design, best))
+        _print_errors(output, best, by_camera, f"Tilted best: {square}")
     else:
-        told.headline(first)
-        told(*summary(best))
-        _tell_errors(told, best, by_camera, f"Expected error: {square}")
+        output.headline(first)
+        output(*summary(best))
+        _print_errors(output, best, by_camera, f"Expected error: {square}")
     return first, fine, by_camera
 
 
 @dataclass(slots=True)
-class _Telling:
-    """Printer of a design's parts, which the page repeats."""
+class _Output:
+    """Output to the terminal; `parts` collects what the page repeats."""
 
     console: Console = field(default_factory=Console)
     parts: list[str | Table] = field(default_factory=list)
 
     def __call__(self, *parts: str | Table) -> None:
-        """Print parts that belong together."""
+        """Print parts that belong together, and keep them for the page."""
         for part in parts:
             self.console.print(part) if isinstance(part, Table) else self.say(part)
         self.console.print()
         self.parts += parts
 
     def headline(self, verdict: str) -> None:
-        """Print the first line, which the page shows by itself."""
+        """Print the first line, which the page shows separately."""
         self.console.print(verdict, style="bold", markup=False, highlight=False, soft_wrap=True)
 
     def say(self, sentence: str) -> None:
-        """Print a line that is not for the page."""
+        """Print a line that the page does not repeat."""
         self.console.print(sentence, markup=False, highlight=False, soft_wrap=True)
 
 
-def _tell_errors(
-    told: _Telling, design: Design, by_camera: Mapping[str, FloatArray], title: str
+def _print_errors(
+    output: _Output, design: Design, by_camera: Mapping[str, FloatArray], title: str
 ) -> None:
-    """Tell the places of the lasers, their errors, and the part of each tolerance."""
+    """Print the mounts of the lasers, the errors, and the part of each tolerance."""
     closely = predict_closely(design)
     ranges = shown_ranges(design.rig.working_range)
     found = predict(design, ranges)
     causes = {**by_camera, **found.systematic}
-    told(lasers_table(design, closely), *findings(design, closely))
-    told(error_table(found, together(causes), title))
+    output(lasers_table(design, closely), *findings(design, closely))
+    output(error_table(found, together(causes), title))
     middle = int(np.argmin(np.abs(found.ranges - math.sqrt(math.prod(design.rig.working_range)))))
-    told(cause_table(causes, middle, ranges[middle]))
+    output(cause_table(causes, middle, ranges[middle]))
 
 
-def _asked_for(request: DesignRequest) -> Design:
+def _requested_design(request: DesignRequest) -> Design:
     if request.rig is not None:
         if request.design is not None:
             raise OptionError("give either a design file or --rig, not both")

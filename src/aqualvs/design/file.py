@@ -1,4 +1,4 @@
-"""`design.yaml`: the numbers of a design known before purchase, in millimetres and degrees."""
+"""`design.yaml`: values of a design known before purchase, in millimetres and degrees."""
 
 import math
 from collections.abc import Mapping
@@ -53,7 +53,7 @@ dome: {inner_radius_mm: 51, thickness_mm: 6, n_acrylic: 1.49}  # leave out for a
 lens: {position_mm: [0, 6, 0], centring_mm: 1}
 water: {temperature_c: 12, salinity_permille: 35}  # or {n: 1.3400}
 lasers: {count: 3, baseline_mm: 150, back_mm: 0, fan_deg: 68}
-# or, in place of lasers, one by one; tilts and stripes that are left out are looked for:
+# or, in place of lasers, one by one; tilts that are left out are optimised:
 # mounts:
 # - {name: lower, position_mm: [0, 0, -150], stripe_deg: 0}
 # - {name: left, position_mm: [-160, 0, 0], stripe_deg: 90, tilt_deg: 12, fan_deg: 60}
@@ -65,7 +65,7 @@ avoid_crossings: true
 
 _MM = 1e3
 
-# Limits beyond which numbers are mistakes: 100 m, and the pictures of the largest cameras.
+# Larger numbers are mistakes: 100 m, and the pictures of the largest cameras.
 _MAX_MM, _MAX_PX = 1e5, 32_768
 _Place = Annotated[float, Field(ge=-_MAX_MM, le=_MAX_MM, allow_inf_nan=False)]
 _Length = Annotated[float, Field(gt=0.0, le=_MAX_MM, allow_inf_nan=False)]
@@ -111,7 +111,7 @@ class LensDesign(StrictPart):
 
 
 class LasersDesign(StrictPart):
-    """Schema of `lasers`, evenly round the dome."""
+    """Schema of `lasers`: evenly spaced around the dome."""
 
     count: Annotated[int, Field(ge=1, le=8)] = 3
     baseline_mm: _Length
@@ -206,9 +206,9 @@ def example_content() -> dict[str, Any]:
 
 
 def merged_content(content: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the content of a file with some values replaced; `given` maps part to its keys.
+    """Return the content of a file with some values replaced; `given` maps a part to its keys.
 
-    A flat port replaces the dome, and the place of the lens in it; a dome replaces a flat port.
+    A flat port replaces the dome and the lens's position in it; a dome replaces a flat port.
     """
     merged = dict(content)
     if "flat" in given and "dome" not in given and "dome" in merged:
@@ -239,7 +239,7 @@ def design_from(content: object, *, name: str, folder: Path) -> Design:
     name : str
         Name in messages.
     folder : Path
-        Folder of a rig file that it names.
+        Folder that the path of a rig file in it is relative to.
 
     Raises
     ------
@@ -256,9 +256,9 @@ def design_from(content: object, *, name: str, folder: Path) -> Design:
 
 
 def design_of_rig(rig: Rig, fan_deg: float = FAN_DEG) -> Design:
-    """Return the design of an existing rig: its lasers may be tilted, but keep their places.
+    """Return the design of an existing rig: its lasers keep their positions, but may be tilted.
 
-    Raises `RigError` if a laser can draw no stripe.
+    `fan_deg`: full fan angle of the lasers. Raises `RigError` if a laser draws no stripe.
     """
     fan = math.radians(fan_deg)
     mounts = tuple(mount_of_laser(laser, rig, fan) for laser in rig.lasers)

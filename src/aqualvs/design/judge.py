@@ -10,14 +10,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from aqualvs.design.settings import Design, Mount, Noise, Tolerances, index_step
-from aqualvs.design.stripes import OWN_ERRORS, Stripes, line_pixels, see_stripes
+from aqualvs.design.stripes import OWN_ERRORS, Stripes, see_stripes
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.geometry.compiled import kernel
 from aqualvs.geometry.linear_algebra import invert_symmetric
+from aqualvs.scanning.laser_bands import pixels_per_line
 
-# Least number of search lines of a stripe for the scanner; least number of lasers for a posture.
 MIN_LINES = 16
-"""Least number of points of a visible stripe."""
+"""Least number of search lines, with one point each, of a stripe that counts as visible."""
 _SHIFT, _OFFSET = OWN_ERRORS.index("shift"), OWN_ERRORS.index("laser_offset")
 
 
@@ -31,10 +31,10 @@ class PredictedErrors:
     # wall and on the design's net, in m and rad; NaN without a posture.
     wall: FloatArray
     net: FloatArray
-    # Shape (W, 3): standard deviations by the tolerances of lasers and water, each alone; the same
-    # in all frames. `calibrated.camera_errors` gives those by the camera's.
+    # By cause, shape (W, 3): standard deviations by each tolerance of lasers and water, the same in
+    # all frames. `calibrated.camera_errors` gives those by the camera's tolerances.
     systematic: dict[str, FloatArray]
-    # Shape (L, W): number of strands of the net that each stripe meets.
+    # Shape (L, W): number of strands of the net that each stripe crosses.
     strands: FloatArray
     # Shape (L, L, W): True if two stripes cross in the picture.
     crossing: BoolArray
@@ -76,7 +76,7 @@ def predict(design: Design, ranges: Sequence[float] | FloatArray | None = None) 
 
 
 def together(causes: Mapping[str, FloatArray]) -> FloatArray:
-    """Return the standard deviation (W, 3) of independent causes together."""
+    """Return the joint standard deviation (W, 3) of independent causes."""
     total: FloatArray = np.sqrt(np.sum([sigma**2 for sigma in causes.values()], axis=0))
     return total
 
@@ -116,7 +116,7 @@ def twine_shift(stripes: Stripes, noise: Noise) -> FloatArray:
 
 
 def net_share(stripes: Stripes, design: Design) -> FloatArray:
-    """Return the strands of the design's net for every point on a wall, (K, W)."""
+    """Return the number of strands of the design's net per point on a wall, (K, W), at most 1."""
     strands = stripes.length * design.net.strands_per_metre
     return np.minimum(strands / np.maximum(stripes.lines, 1.0), 1.0)
 
@@ -129,10 +129,10 @@ def net_sums(stripes: Stripes, design: Design) -> Sums:
 
 
 def twine_pulls(stripes: Stripes, design: Design) -> FloatArray:
-    """Return the pull (K, W, 3) of each stripe by the shift that all strands of the net share.
+    """Return the effect (K, W, 3) on each stripe's sums of the shift that all strands share.
 
-    Light on twine appears nearer than the net on every stripe; which way that is in the picture
-    depends on the side of the lens that the laser is on.
+    Light on twine appears nearer than the net on every stripe; the direction in the picture depends
+    on the side of the lens on which the laser is.
     """
     shift = stripes.own[..., 0, :]
     nearer = np.sign(shift[..., 1:2]) * net_share(stripes, design)[..., None]
@@ -150,7 +150,7 @@ def _parts(stripes: Stripes, share: FloatArray, point: float, shared: FloatArray
 
 
 def outer(pulls: FloatArray) -> FloatArray:
-    """Return the sum of q q' over pulls (..., M, 3), shape (..., 3, 3)."""
+    """Return the sum of q q' over vectors (..., M, 3), shape (..., 3, 3)."""
     summed: FloatArray = np.einsum("...mi,...mj->...ij", pulls, pulls)
     return summed
 
@@ -194,18 +194,19 @@ def crossings(stripes: Stripes) -> BoolArray:
 
 
 def cross(one: Stripes, other: Stripes) -> BoolArray:
-    """Return the mask (K, L, W) of stripes of two lots that cross within their visible parts."""
+    """Return the mask (K, L, W) of stripes of two sets that cross within their visible parts."""
     e, f = one.along[:, None, None], other.along[None, :, None]
     apart = other.centre[None] - one.centre[:, None]
-    turn = _turn(e, f)
+    sine = _cross_xz(e, f)
     with np.errstate(divide="ignore", invalid="ignore"):
-        s, t = _turn(apart, f) / turn, _turn(apart, e) / turn
+        s, t = _cross_xz(apart, f) / sine, _cross_xz(apart, e) / sine
         here = (s >= one.ends[:, None, :, 0]) & (s <= one.ends[:, None, :, 1])
         there = (t >= other.ends[None, ..., 0]) & (t <= other.ends[None, ..., 1])
-    return here & there & (np.abs(turn) > 1e-9)
+    return here & there & (np.abs(sine) > 1e-9)
 
 
-def _turn(a: FloatArray, b: FloatArray) -> FloatArray:
+def _cross_xz(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Return the cross product of vectors (..., 3) in the x-z plane, the plane of the wall."""
     return a[..., 0] * b[..., 2] - a[..., 2] * b[..., 0]
 
 
@@ -240,35 +241,35 @@ _MARGIN_SHARE, _LENGTH_SHARE = 0.05, 0.3
 class AngleScore:
     """Score of a choice of angles; less is better."""
 
-    # Root mean square of the errors of range, pitch and yaw over the working range, from noise and
-    # the tolerances of lasers and water, on walls and nets alike, in goals.
+    # Root mean square of the errors of range, pitch and yaw over the working range, in multiples of
+    # the goals, from noise and the tolerances of lasers and water, on walls and nets.
     error: float
     # The same with the penalties of missing and crossing stripes.
     total: float
 
 
 @dataclass(frozen=True, slots=True)
-class Lot:
-    """K candidates for one laser, or the chosen stripes of several."""
+class StripeSet:
+    """K stripes with their sums: candidates for one laser, or the chosen ones of several."""
 
     stripes: Stripes
-    # Tuple of (matrix, scatter, common): on a wall and on the net: arrays (K, W, 3, 3), (K, W, 3,
-    # 3) and (K, W, G, 3).
+    # (matrix, scatter, common) on a wall, and the same on the net: arrays (K, W, 3, 3),
+    # (K, W, 3, 3) and (K, W, G, 3).
     parts: tuple[tuple[FloatArray, FloatArray, FloatArray], ...]
 
-    def take(self, rows: Sequence[int]) -> "Lot":
-        """Return the named rows of K."""
+    def take(self, rows: Sequence[int]) -> "StripeSet":
+        """Return the stripes of these indices."""
         picked = list(rows)
         parts = tuple((m[picked], s[picked], c[picked]) for m, s, c in self.parts)
-        return Lot(self.stripes.take(picked), parts)
+        return StripeSet(self.stripes.take(picked), parts)
 
-    def joined(self, other: "Lot") -> "Lot":
-        """Return these rows followed by another's."""
+    def joined(self, other: "StripeSet") -> "StripeSet":
+        """Return these stripes followed by others."""
         parts = tuple(
             (np.concatenate([a, x]), np.concatenate([b, y]), np.concatenate([c, z]))
             for (a, b, c), (x, y, z) in zip(self.parts, other.parts, strict=True)
         )
-        return Lot(self.stripes.joined(other.stripes), parts)
+        return StripeSet(self.stripes.joined(other.stripes), parts)
 
     def __len__(self) -> int:
         """Return K."""
@@ -285,8 +286,8 @@ class Judge:
         self._steps = index_step(self._camera, design.tolerances)
         self._height = min(design.rig.size_px)
 
-    def trace(self, mounts: Sequence[Mount]) -> Lot:
-        """Return the stripes of mounts in the picture, with a margin for turned targets."""
+    def trace(self, mounts: Sequence[Mount]) -> StripeSet:
+        """Return the stripes of mounts in the picture, with a margin for oblique targets."""
         design, margin = self._design, _MARGIN_SHARE * self._height
         stripes = see_stripes(self._camera, mounts, self._ranges, self._steps, margin)
         scatter = laser_scatter(stripes, design.tolerances)
@@ -298,26 +299,27 @@ class Judge:
             [share * stripes.common, twine_pulls(stripes, design)[..., None, :]], axis=-2
         )
         on_net = net.matrix, net.scatter + share**2 * scatter, pulls
-        return Lot(stripes, (on_wall, on_net))
+        return StripeSet(stripes, (on_wall, on_net))
 
-    def judge(self, lot: Lot, others: Lot) -> tuple[FloatArray, FloatArray]:
+    def judge(self, candidates: StripeSet, others: StripeSet) -> tuple[FloatArray, FloatArray]:
         """Return error and total (see `AngleScore`) of every candidate (K,) beside other lasers."""
         goals = self._design.goals
         wanted = np.array([goals.range_share, goals.angle, goals.angle])
-        squares = np.zeros((len(lot), len(self._ranges)))
-        for candidates, rest in zip(lot.parts, others.parts, strict=True):
+        squares = np.zeros((len(candidates), len(self._ranges)))
+        for own, rest in zip(candidates.parts, others.parts, strict=True):
             matrix, scatter, common = (part.sum(axis=0) for part in rest)
-            _add_squares(*candidates, matrix, scatter, common, self._ranges, wanted, squares)
-        error = np.sqrt(squares.mean(axis=-1) / len(lot.parts))
-        short = self._shortfall(lot.stripes) + self._shortfall(others.stripes).sum()
-        # Penalty of a stripe out of the picture, in goals; greatest penalty of crossings.
+            _add_squares(*own, matrix, scatter, common, self._ranges, wanted, squares)
+        error = np.sqrt(squares.mean(axis=-1) / len(candidates.parts))
+        short = self._shortfall(candidates.stripes) + self._shortfall(others.stripes).sum()
+        # Penalty of a stripe out of the picture, in goals; largest penalty of crossings, as a share
+        # of the error.
         out_cost, crossing_share = 20.0, 0.3
-        total = error * (1.0 + crossing_share * self._crossings(lot.stripes, others.stripes))
+        total = error * (1.0 + crossing_share * self._crossings(candidates.stripes, others.stripes))
         return error, total + out_cost * short / (1 + len(others))
 
     def _shortfall(self, stripes: Stripes) -> FloatArray:
-        """Return the missing share (K,) of each stripe's least length, mean over the ranges."""
-        least = _LENGTH_SHARE * self._height / line_pixels(self._camera)
+        """Return the share (K,) by which each stripe is too short, mean over the ranges."""
+        least = _LENGTH_SHARE * self._height / pixels_per_line(self._camera.size_px)
         missing: FloatArray = np.maximum(1.0 - stripes.lines / least, 0.0).mean(axis=-1)
         return missing
 
@@ -335,8 +337,8 @@ class Judge:
 def score(design: Design) -> AngleScore:
     """Return the score of the angles of a design's mounts."""
     judge = Judge(design)
-    lot = judge.trace(design.mounts)
-    errors, totals = judge.judge(lot.take([0]), lot.take(range(1, len(lot))))
+    candidates = judge.trace(design.mounts)
+    errors, totals = judge.judge(candidates.take([0]), candidates.take(range(1, len(candidates))))
     return AngleScore(float(errors[0]), float(totals[0]))
 
 
@@ -352,10 +354,13 @@ def _add_squares(
     wanted: FloatArray,
     squares: FloatArray,
 ) -> None:
-    """Add the mean square error in goals of every candidate and range to `squares` (K, W)."""
+    """Add the mean square error, in goals squared, of each candidate and range to `squares` (K, W).
+
+    Arrays as in `StripeSet.parts`; those of the other lasers are summed over these.
+    """
     whole, inverse, middle = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     scale = np.empty(3)
-    # Square error of no posture, in goals squared.
+    # Square error without a posture, in goals squared.
     no_posture = 1e4
     for k in range(matrix.shape[0]):
         for w in range(matrix.shape[1]):

@@ -1,7 +1,7 @@
 """Report of a design: tables, and two figures.
 
 The figures show the errors over range and the stripes in the picture. Matplotlib is imported when a
-figure is drawn, and only its Agg canvas: no display is needed.
+figure is drawn, and only its Agg canvas, which needs no display.
 """
 
 import math
@@ -41,13 +41,13 @@ def shown_ranges(working_range: tuple[float, float]) -> list[float]:
 
 
 def predict_closely(design: Design) -> PredictedErrors:
-    """Predict a design's errors at ranges close enough to find where its stripes are seen."""
-    n_seen = 181
-    return predict(design, np.geomspace(*design.rig.working_range, n_seen))
+    """Predict a design's errors at ranges close enough to show where its stripes are visible."""
+    n_ranges = 181
+    return predict(design, np.geomspace(*design.rig.working_range, n_ranges))
 
 
 def summary(design: Design) -> list[str]:
-    """Return the design in two or three lines; the third is on a shutter that is stated."""
+    """Return the design in two or three lines; the third is on the shutter, if the rig has one."""
     rig = design.rig
     width, height = rig.size_px
     fov = 2.0 * math.degrees(math.atan(0.5 * width / rig.lens.fx))
@@ -73,19 +73,19 @@ def summary(design: Design) -> list[str]:
 
 
 def verdict(design: Design, by_camera: Mapping[str, FloatArray]) -> tuple[str, bool]:
-    """Return in one line whether a design meets its goals, and whether it does.
+    """Return a sentence on whether a design meets its goals, and whether it does.
 
-    Of a single frame on the net, noise and tolerances together, at the worst range. `by_camera` is
-    from `camera_errors`, at `shown_ranges`.
+    The errors are those of a single frame on the net at the worst range, by noise and tolerances.
+    `by_camera` is from `camera_errors`, at `shown_ranges`.
     """
     ranges = shown_ranges(design.rig.working_range)
-    told, goals = predict(design, ranges), design.goals
+    errors, goals = predict(design, ranges), design.goals
     near, far = (f"{1e3 * wall:.0f}" for wall in design.rig.working_range)
     closely = predict_closely(design)
     if not closely.valid.all():
-        return f"No: from {near} to {far} mm there is {_posture_words(closely)}.", False
-    systematic = np.hypot(told.systematic_total, together(by_camera))
-    sigma = np.hypot(told.net, systematic)
+        return f"No: from {near} to {far} mm there is {_posture_text(closely)}.", False
+    systematic = np.hypot(errors.systematic_total, together(by_camera))
+    sigma = np.hypot(errors.net, systematic)
     share, angle = sigma[:, 0] / ranges, sigma[:, 1:].max(axis=1)
     worst, tilted = int(share.argmax()), int(angle.argmax())
     fine = bool(share[worst] <= goals.range_share and angle[tilted] <= goals.angle)
@@ -98,17 +98,18 @@ def verdict(design: Design, by_camera: Mapping[str, FloatArray]) -> tuple[str, b
     ), fine
 
 
-def _posture_words(closely: PredictedErrors) -> str:
-    """Return at which ranges there is a posture, where it is not all of them."""
+def _posture_text(closely: PredictedErrors) -> str:
+    """Return the ranges with a posture as text, for a design that lacks it at some."""
     if not closely.valid.any():
         return "no posture"
     return f"a posture only at {_interval(closely.ranges, closely.valid)} mm"
 
 
 def gain_text(design: Design, best: Design) -> str:
-    """Return how large the errors of `best` are beside a design's, where both have a posture.
+    """Return a sentence on the errors of `best` relative to a design's, where both have a posture.
 
-    Root mean squares in goals, by noise and the tolerances of lasers and water, on walls and nets.
+    Errors are root mean squares in multiples of the goals, by noise and the tolerances of lasers
+    and water, on walls and nets.
     """
     now, tilted = predict_closely(design), predict_closely(best)
     both = now.valid & tilted.valid
@@ -117,8 +118,8 @@ def gain_text(design: Design, best: Design) -> str:
     goals = np.full((np.count_nonzero(both), 3), design.goals.angle)
     goals[:, 0] = design.goals.range_share * now.ranges[both]
 
-    def size(told: PredictedErrors) -> float:
-        squares = told.wall**2 + told.net**2 + 2.0 * told.systematic_total**2
+    def size(errors: PredictedErrors) -> float:
+        squares = errors.wall**2 + errors.net**2 + 2.0 * errors.systematic_total**2
         return math.sqrt(float(np.mean(squares[both] / goals**2)))
 
     where = "" if both.all() else f", at {_interval(now.ranges, both)} mm"
@@ -126,12 +127,12 @@ def gain_text(design: Design, best: Design) -> str:
     return f"With its lasers tilted best, its errors are {share:.0%} of that{where}."
 
 
-def lasers_table(design: Design, told: PredictedErrors) -> Table:
+def lasers_table(design: Design, errors: PredictedErrors) -> Table:
     """Return the table of the lasers' mounts and of the ranges at which they are in the picture."""
     headings = ("x\nmm", "y\nmm", "z\nmm", "baseline\nmm", "stripe\ndeg", "tilt\ndeg")
     title = "Lasers: where, at what angles, at which ranges in the picture"
     table = number_table(title, "", *headings, "swing\ndeg", "seen\nmm", texts=[""])
-    for mount, visible in zip(design.mounts, told.visible, strict=True):
+    for mount, visible in zip(design.mounts, errors.visible, strict=True):
         place = [f"{value * 1e3 + 0.0:.0f}".replace("-0", "0", 1) for value in mount.position]
         angles = [_angle(mount.stripe), _angle(mount.tilt), _angle(mount.swing)]
         table.add_row(
@@ -139,7 +140,7 @@ def lasers_table(design: Design, told: PredictedErrors) -> Table:
             *place,
             f"{mount.baseline * 1e3:.0f}",
             *angles,
-            _interval(told.ranges, visible),
+            _interval(errors.ranges, visible),
         )
     return table
 
@@ -157,16 +158,19 @@ def _interval(ranges: FloatArray, visible: BoolArray) -> str:
 _FROM, _ERRORS = "\nfrom", ("range\nmm", "\n%", "pitch\ndeg", "yaw\ndeg")
 
 
-def error_table(told: PredictedErrors, systematic: FloatArray, title: str) -> Table:
-    """Return one sigma of range, pitch and yaw by range; `systematic` (W, 3) is all of it."""
+def error_table(errors: PredictedErrors, systematic: FloatArray, title: str) -> Table:
+    """Return the table of one sigma of range, pitch and yaw by range.
+
+    `systematic`, shape (W, 3): of all tolerances together, of camera, lasers and water.
+    """
     points = "points on a wall,\nstrands on a net"
     names = ("range\nmm", _FROM, *_ERRORS, points)
     table = number_table(title, *names, texts=[_FROM, points])
-    for i, wall in enumerate(told.ranges):
-        lines, strands = told.stripes.lines[:, i], told.strands[:, i]
+    for i, wall in enumerate(errors.ranges):
+        lines, strands = errors.stripes.lines[:, i], errors.strands[:, i]
         rows = (
-            ("wall", told.wall[i], _counts(lines)),
-            ("net", told.net[i], _counts(strands)),
+            ("wall", errors.wall[i], _counts(lines)),
+            ("net", errors.net[i], _counts(strands)),
             ("tolerances", systematic[i], ""),
         )
         for j, (name, sigma, points) in enumerate(rows):
@@ -272,22 +276,22 @@ def _change(share: float) -> str:
     return f"{percent:+d}" if percent else "0"
 
 
-def findings(design: Design, told: PredictedErrors) -> list[str]:
+def findings(design: Design, errors: PredictedErrors) -> list[str]:
     """Return findings: missing postures, stripes out of the picture, crossings."""
     lines = []
     if len(design.mounts) < 2:
         lines.append("One laser draws one line: no posture; add a second.")
-    elif not told.valid.all():
-        lines.append(f"There is {_posture_words(told)} in the working range.")
-    for mount, visible in zip(design.mounts, told.visible, strict=True):
+    elif not errors.valid.all():
+        lines.append(f"There is {_posture_text(errors)} in the working range.")
+    for mount, visible in zip(design.mounts, errors.visible, strict=True):
         if not visible.all():
-            lines.append(_leaves(mount, told.ranges, visible))
+            lines.append(_visibility_text(mount, errors.ranges, visible))
     names = [mount.name for mount in design.mounts]
     pairs = [
-        f"{names[i]} and {names[j]} at {_interval(told.ranges, told.crossing[i, j])} mm"
+        f"{names[i]} and {names[j]} at {_interval(errors.ranges, errors.crossing[i, j])} mm"
         for i in range(len(names))
         for j in range(i + 1, len(names))
-        if told.crossing[i, j].any()
+        if errors.crossing[i, j].any()
     ]
     if pairs:
         lines.append(
@@ -297,7 +301,7 @@ def findings(design: Design, told: PredictedErrors) -> list[str]:
     return lines
 
 
-def _leaves(mount: Mount, ranges: FloatArray, visible: BoolArray) -> str:
+def _visibility_text(mount: Mount, ranges: FloatArray, visible: BoolArray) -> str:
     where = _interval(ranges, visible)
     seen = f"is in the picture at {where} mm only" if visible.any() else "is never in the picture"
     return f"Laser '{mount.name}' {seen}; where it is not, its points are missing."
@@ -305,6 +309,7 @@ def _leaves(mount: Mount, ranges: FloatArray, visible: BoolArray) -> str:
 
 ERRORS_PNG, PICTURE_PNG, DESIGN_HTML = "errors.png", "picture.png", "design.html"
 
+# Ranges of the plotted errors; points along a drawn stripe.
 _N_RANGES, _N_ALONG = 60, 40
 
 
@@ -351,8 +356,9 @@ def write_page(
     """Write a design's page: the verdict, the figures, and what the terminal shows.
 
     `name` is the rig's, `pictures` are from `draw_figures`, and `fine` is whether the goals are
-    met. `tilted`: the figures are not of the rig that the verdict is on. Sentences among `parts`
-    belong to the table before them. Raises `OSError` as the system says it.
+    met. `tilted`: the figures show the rig with its lasers tilted best, unlike the verdict.
+    Sentences among `parts` belong to the table before them. Raises `OSError` if it cannot be
+    written.
     """
     lead: list[str] = []
     sections: list[tuple[str, html.Raw, list[str]]] = []
@@ -388,7 +394,7 @@ def _as_html(table: Table) -> html.Raw:
     head, group = [], ""
     for column in table.columns:
         first, _, second = str(column.header).rpartition("\n")
-        # A column of numbers without a heading of its own shares that of the one before it.
+        # A column of numbers without its own heading shares that of the previous one.
         group = first if first or column.justify != "right" else group
         unit = ", " if group and second in ("mm", "%", "deg") else " "
         head.append(plain(f"{group}{unit}{second}").replace(", deg", ", °"))
@@ -402,15 +408,15 @@ def _as_html(table: Table) -> html.Raw:
 def _errors(design: Design, by_camera: Mapping[str, FloatArray]) -> "Figure":
     """Draw the range error in per cent, and pitch and yaw errors in degrees, over range."""
     ranges = np.geomspace(*design.rig.working_range, _N_RANGES)
-    told = predict(design, ranges)
+    errors = predict(design, ranges)
     few = shown_ranges(design.rig.working_range)
     camera = np.stack([np.interp(ranges, few, by) for by in together(by_camera).T], axis=-1)
-    systematic = np.hypot(told.systematic_total, camera)
+    systematic = np.hypot(errors.systematic_total, camera)
     figure = new_canvas(7.2, 2.9)
     panels = figure.subplots(1, 3, sharex=True)
     kinds = (
-        ("net, one frame", told.net, ORANGE, "-"),
-        ("wall, one frame", told.wall, BLUE, "-"),
+        ("net, one frame", errors.net, ORANGE, "-"),
+        ("wall, one frame", errors.wall, BLUE, "-"),
         ("tolerances", systematic, DARK, "--"),
     )
     percent, degrees = 100.0 / ranges, np.full_like(ranges, 180.0 / np.pi)
@@ -472,7 +478,7 @@ def _stripe_pixels(design: Design, ranges: FloatArray) -> FloatArray:
 
 
 def _label_lasers(axes: "Axes", design: Design, ranges: FloatArray) -> None:
-    """Label every laser at a place of its nearest stripe that is far from the others' labels."""
+    """Label each laser at a point of its nearest stripe that is far from the other labels."""
     taken: list[FloatArray] = []
     for mount, lines in zip(design.mounts, _stripe_pixels(design, ranges), strict=True):
         seen = [line for line in lines if np.isfinite(line).all()]

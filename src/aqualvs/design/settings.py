@@ -1,6 +1,6 @@
 """Settings of a design in SI units: nominal rig, mounts of the lasers, noise, tolerances and goals.
 
-A `Mount` is the place of a line laser on the vehicle and the sheet of light that leaves it.
+A `Mount` is the position of a line laser on the vehicle and the sheet of light that leaves it.
 """
 
 import math
@@ -30,11 +30,11 @@ class Mount:
     # Tilt of the sheet towards the forward axis through the dome's centre, in radians; negative is
     # away from it.
     tilt: float
-    # Full opening of the fan, in radians.
+    # Full fan angle, in radians.
     fan: float
-    # Turn of the fan's middle within its sheet, along the stripe's direction, in radians.
+    # Rotation of the fan's middle within its sheet, along the stripe's direction, in radians.
     swing: float = 0.0
-    # Whether to optimise these angles, or keep them.
+    # Whether to optimise tilt and stripe.
     free_tilt: bool = True
     free_stripe: bool = False
     # As `Laser.wavelength_nm`.
@@ -44,8 +44,7 @@ class Mount:
     def axes(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Unit vectors in `dome`: along the stripe, across it away from the axis, along the beam.
 
-        For a laser whose stripe would run through the axis, upwards, or else to the left, counts as
-        away.
+        If the stripe runs through the axis, the vector across points upwards, or else to the left.
         """
         along = np.array([math.cos(self.stripe), 0.0, math.sin(self.stripe)])
         across = np.array([-along[2], 0.0, along[0]])
@@ -73,14 +72,17 @@ class Mount:
         return Laser(self.name, self.plane, wavelength_nm=self.wavelength_nm)
 
     def aimed_at(self, wall_range: float) -> "Mount":
-        """Return the mount with its fan swung so that its middle is abreast of the forward axis."""
+        """Return the mount with its fan swung so that its middle is beside the forward axis.
+
+        `wall_range`: range, in metres, at which it is.
+        """
         along, _, beam = self.axes
-        way = (wall_range - self.position[1]) / float(beam[1])
-        return replace(self, swing=math.atan2(-float(along @ self.position), way))
+        distance = (wall_range - self.position[1]) / float(beam[1])
+        return replace(self, swing=math.atan2(-float(along @ self.position), distance))
 
 
 def ring(count: int, baseline: float, back: float, fan: float) -> tuple[Mount, ...]:
-    """Return mounts evenly round the forward axis, their stripes square to the way to it.
+    """Return mounts evenly spaced around the forward axis, their stripes tangential to the circle.
 
     The first is below. Two are put below and beside, because opposite ones draw parallel stripes.
 
@@ -93,18 +95,17 @@ def ring(count: int, baseline: float, back: float, fan: float) -> tuple[Mount, .
     back : float
         Distance behind the dome's centre, metres.
     fan : float
-        Full opening, radians.
+        Full fan angle, radians.
     """
     step = math.tau / count if count > 2 else math.pi / 2
     mounts = []
     for i in range(count):
-        round_axis = -math.pi / 2 - i * step
-        place = (baseline * math.cos(round_axis), -back, baseline * math.sin(round_axis))
+        polar = -math.pi / 2 - i * step
         mounts.append(
             Mount(
-                name=_place_name(round_axis, i),
-                position=place,
-                stripe=_half_turn(round_axis + math.pi / 2),
+                name=_place_name(polar, i),
+                position=(baseline * math.cos(polar), -back, baseline * math.sin(polar)),
+                stripe=_line_direction(polar + math.pi / 2),
                 tilt=0.0,
                 fan=fan,
             )
@@ -113,21 +114,23 @@ def ring(count: int, baseline: float, back: float, fan: float) -> tuple[Mount, .
 
 
 def tangential(position: Sequence[float]) -> float:
-    """Return the direction of a stripe that is square to the way from the axis to a mount."""
+    """Return the direction of a stripe that is tangential to the circle of a mount, in radians."""
     if math.hypot(position[0], position[2]) == 0.0:
         return 0.0
-    return _half_turn(math.atan2(position[2], position[0]) + math.pi / 2)
+    return _line_direction(math.atan2(position[2], position[0]) + math.pi / 2)
 
 
 def mount_of_laser(laser: Laser, rig: Rig, fan: float) -> Mount:
-    """Return a mount for a laser of a rig, with default values of what its plane leaves open.
+    """Return a mount for a laser of a rig, with defaults for values that its plane does not give.
 
     Parameters
     ----------
     laser : Laser
         Behind a window the plane that fits its light best is used.
+    rig : Rig
+        The laser's rig.
     fan : float
-        Full opening, radians.
+        Full fan angle, radians.
 
     Raises
     ------
@@ -139,7 +142,7 @@ def mount_of_laser(laser: Laser, rig: Rig, fan: float) -> Mount:
     normal = plane.normal
     side = np.array([normal[0], 0.0, normal[2]])
     length = float(np.linalg.norm(side))
-    # Limit of a sheet square to the forward axis, which draws no stripe on a wall ahead.
+    # Below this, the sheet is perpendicular to the forward axis.
     min_across = 1e-3
     if length < min_across:
         raise RigError(
@@ -147,16 +150,16 @@ def mount_of_laser(laser: Laser, rig: Rig, fan: float) -> Mount:
             "on a wall ahead; check its normal"
         )
     side /= length
-    # Assumed distance before the dome's centre of a rig's laser without a source of its own.
-    beside_dome = 0.01
-    # Beside the dome: the plane's point at this height ahead that is nearest to the axis.
     if laser.window is None:
-        position = side * (plane.offset - normal[1] * beside_dome) / length
-        position[1] = beside_dome
+        # Without a known source: the plane's point nearest to the forward axis, this far forward of
+        # the dome's centre, in metres.
+        forward = 0.01
+        position = side * (plane.offset - normal[1] * forward) / length
+        position[1] = forward
     else:
         source = np.array(sheet.source)
         position = source - float(plane.signed_distance(source)) * normal
-    stripe = _half_turn(math.atan2(-side[0], side[2]))
+    stripe = _line_direction(math.atan2(-side[0], side[2]))
     mount = Mount(
         name=laser.name,
         position=(float(position[0]), float(position[1]), float(position[2])),
@@ -170,15 +173,15 @@ def mount_of_laser(laser: Laser, rig: Rig, fan: float) -> Mount:
     return replace(mount, tilt=math.atan2(lean, float(beam[1])))
 
 
-def _half_turn(angle: float) -> float:
-    """Return the same line's direction between 0 and pi; a rounding below pi is 0."""
+def _line_direction(angle: float) -> float:
+    """Return the direction of a line between 0 and pi; just below pi, by rounding, is 0."""
     turned = angle % math.pi
     return 0.0 if math.pi - turned < 1e-12 else turned
 
 
-def _place_name(round_axis: float, i: int) -> str:
-    """Return a word for a place round the axis."""
-    x, z = math.cos(round_axis), math.sin(round_axis)
+def _place_name(polar: float, i: int) -> str:
+    """Return a name for a position around the axis, such as "lower_left"; `polar` in radians."""
+    x, z = math.cos(polar), math.sin(polar)
     upright = "lower" if z < -0.4 else "upper" if z > 0.4 else ""
     level = "left" if x < -0.4 else "right" if x > 0.4 else ""
     return "_".join(word for word in (upright, level) if word) or f"laser_{i + 1}"
@@ -198,9 +201,9 @@ class Noise:
     shared: float = SHARED_ERROR_PX
     # Width of a stripe on the target, in metres.
     stripe: float = 3e-3
-    # Of the shift of the light on twine, as a share of the width of the stripe: all strands of a
-    # net share it, towards the near side or the far one, and as much again those of one laser.
-    # The twine's roundness makes 0.006 of it, glow in the water the rest.
+    # Of the shift of the light on twine, as a share of the width of the stripe: one that all
+    # strands of a net share, towards the camera or away from it, and another of the same size that
+    # those of one laser share. Roundness of the twine causes 0.006, glow in the water the rest.
     twine: float = 0.0146
 
 
@@ -208,7 +211,7 @@ class Noise:
 class Tolerances:
     """Tolerances: one sigma of the errors after calibration, in metres, radians and shares."""
 
-    lens: float = 0.03e-3  # Of the lens's place, along each axis.
+    lens: float = 0.03e-3  # Of the lens's position, along each axis.
     rotation: float = math.radians(0.01)  # Of the camera's rotation, about each axis.
     focal: float = 1e-4  # Of the focal length, as a share of it.
     dome: float = 0.05e-3  # Of the dome's inner radius and of its thickness.
@@ -251,7 +254,7 @@ class Design:
 
     rig: Rig  # Nominal camera, dome, water and working range. Its lasers are ignored.
     mounts: tuple[Mount, ...]
-    centring: float = 1e-3  # Standard deviation of the lens's place before a calibration, metres.
+    centring: float = 1e-3  # Standard deviation of the lens's position before calibration, metres.
     noise: Noise = field(default_factory=Noise)
     tolerances: Tolerances = field(default_factory=Tolerances)
     net: NominalNet = field(default_factory=lambda: NominalNet(bar=15e-3, twine=2.5e-3))
@@ -274,9 +277,9 @@ class Design:
 
 
 def index_step(camera: Camera, tolerances: Tolerances) -> FloatArray:
-    """Return a step of one sigma of the water's index, in the camera's parameters (P, G).
+    """Return a step of one sigma of the water's index, as steps (P, G) of the camera's parameters.
 
-    Of all that stripes share only the water changes after the calibration of the lasers. G is 1,
+    Of all that stripes share, only the water changes after the calibration of the lasers. G is 1,
     or 0 for a bare lens, which does not depend on the water.
     """
     names = parameter_names(camera)

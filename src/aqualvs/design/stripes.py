@@ -1,4 +1,4 @@
-"""Information of a stripe on a wall ahead about the wall's plane, for many sheets and ranges.
+"""Information that a stripe gives on the plane of a wall ahead, for many sheets and ranges.
 
 A wall square ahead is m·X = 1 with m = (0, 1/range, 0). The scanner fits m by least squares, each
 point weighted by the effect of a pixel's error on m·X. A stripe contributes one matrix,
@@ -14,6 +14,7 @@ import numpy as np
 from aqualvs.design.settings import Mount
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.optics.camera import Camera
+from aqualvs.scanning.laser_bands import pixels_per_line
 
 OWN_ERRORS = ("shift", "tilt", "laser_tilt_1", "laser_tilt_2", "laser_offset")
 """Errors that all points of one stripe share: in pixels, radians, metres.
@@ -21,7 +22,7 @@ OWN_ERRORS = ("shift", "tilt", "laser_tilt_1", "laser_tilt_2", "laser_offset")
 The laser's tilts turn the sheet's normal towards the stripe and towards the beam.
 """
 
-# Numbers of points in the search for the ends of a stripe, and in the sums over it (Gauss).
+# Points and passes of the search for the ends of a stripe; nodes of the Gauss quadrature over it.
 _N_SEARCH, _N_PASSES, _N_SUM = 33, 2, 24
 
 
@@ -48,12 +49,12 @@ class Stripes:
     ends: FloatArray
 
     def take(self, rows: Sequence[int]) -> "Stripes":
-        """Return the named rows of K."""
+        """Return the stripes of these indices."""
         picked = list(rows)
         return Stripes(*(getattr(self, name)[picked] for name in self.__dataclass_fields__))
 
     def joined(self, other: "Stripes") -> "Stripes":
-        """Return these rows followed by another's."""
+        """Return these stripes followed by others."""
         names = self.__dataclass_fields__
         return Stripes(*(np.concatenate([getattr(s, n) for s in (self, other)]) for n in names))
 
@@ -79,10 +80,10 @@ def see_stripes(
     axes = [mount.axes for mount in mounts]
     along, beam = (np.array([one[i] for one in axes]).reshape(-1, 3) for i in (0, 2))
     position = np.array([mount.position for mount in mounts]).reshape(-1, 3)
-    way = (ranges[None, :] - position[:, 1, None]) / beam[:, 1, None]
-    centre = position[:, None] + way[..., None] * beam[:, None]
+    distance = (ranges[None, :] - position[:, 1, None]) / beam[:, 1, None]
+    centre = position[:, None] + distance[..., None] * beam[:, None]
     reach = np.array([_reach(mount) for mount in mounts]).reshape(-1, 2)
-    fan = np.where((way > 0.0)[..., None], way[..., None] * reach[:, None], np.nan)
+    fan = np.where((distance > 0.0)[..., None], distance[..., None] * reach[:, None], np.nan)
     ends = _visible_ends(camera, centre, along, fan, margin)
     return _summed(camera, _Lines(centre, along, beam, ends), ranges, common)
 
@@ -97,16 +98,10 @@ class _Lines:
     ends: FloatArray
 
 
-def line_pixels(camera: Camera) -> int:
-    """Return the width of the scanner's search lines in pixels."""
-    # As in the scanner: wider pictures are read in lines of two pixels.
-    pixels_per_line_from = 1280
-    return 2 if camera.size_px[0] >= pixels_per_line_from else 1
-
-
 def _reach(mount: Mount) -> tuple[float, float]:
+    """Return the ends of the fan along the stripe, at a distance of 1."""
     low, high = mount.swing - 0.5 * mount.fan, mount.swing + 0.5 * mount.fan
-    # Limit of the fan to either side of the beam: beyond, it meets no wall nearby.
+    # Limit of the fan to either side of the beam: light beyond it hits no wall nearby.
     widest = np.deg2rad(80.0)
     return float(np.tan(max(low, -widest))), float(np.tan(min(high, widest)))
 
@@ -114,9 +109,9 @@ def _reach(mount: Mount) -> tuple[float, float]:
 def _visible_ends(
     camera: Camera, centre: FloatArray, along: FloatArray, fan: FloatArray, margin: float
 ) -> FloatArray:
-    """Return begin and end (K, W, 2) of the visible part along the stripe; NaN if none."""
+    """Return the ends (K, W, 2) of the visible part along the stripe, in metres; NaN if none."""
     share = np.linspace(0.0, 1.0, _N_SEARCH)
-    # First over the whole fan, which may be much wider than the picture; then finer.
+    # The first pass covers the whole fan, which may be much wider than the picture.
     for _ in range(_N_PASSES):
         place = fan[..., :1] + share * (fan[..., 1:] - fan[..., :1])
         inside = _depth_in_picture(camera, _points(centre, along, place), margin)
@@ -146,13 +141,13 @@ def _depth_in_picture(camera: Camera, points: FloatArray, margin: float) -> Floa
 
 
 def _at(values: FloatArray, i: IntArray) -> FloatArray:
-    """Return values (K, W, S) at places (K, W), clipped to the ends."""
+    """Return values (K, W, S) at indices (K, W), clipped to the ends."""
     row = np.clip(i, 0, values.shape[-1] - 1)[..., None]
     return np.take_along_axis(values, row, -1)[..., 0]
 
 
 def _edge(place: FloatArray, inside: FloatArray, i: IntArray, step: int) -> FloatArray:
-    """Return the crossing of the border between the outermost point inside and the next."""
+    """Interpolate the border of the picture between the outermost point inside and the next."""
     here, there = _at(inside, i), _at(inside, i + step)
     at, to = _at(place, i), _at(place, i + step)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -163,6 +158,7 @@ def _edge(place: FloatArray, inside: FloatArray, i: IntArray, step: int) -> Floa
 
 
 def _summed(camera: Camera, line: _Lines, ranges: FloatArray, common: FloatArray) -> Stripes:
+    """Integrate the sums over the visible parts of stripes; see `Stripes`."""
     centre, along, ends = line.centre, line.along, line.ends
     node, weight = np.polynomial.legendre.leggauss(_N_SUM)
     half = 0.5 * (ends[..., 1:] - ends[..., :1])
@@ -172,7 +168,7 @@ def _summed(camera: Camera, line: _Lines, ranges: FloatArray, common: FloatArray
     path = np.einsum("kwsij,kj->kwsi", by_point, along)
     is_row = _along_x(path)
     lines = np.abs(np.where(is_row, path[..., 1], path[..., 0])) * (weight * half)
-    lines = lines / line_pixels(camera)
+    lines = lines / pixels_per_line(camera.size_px)
     normal = np.cross(along, line.beam)
     sensitivity = _Sensitivity.of(normal, ranges, by_point, by_parameter @ common)
     per_px = np.where(is_row, sensitivity.by_x, sensitivity.by_y)
@@ -196,14 +192,14 @@ def _summed(camera: Camera, line: _Lines, ranges: FloatArray, common: FloatArray
 
 
 def _along_x(path: FloatArray) -> BoolArray:
-    """Return the mask (K, W, 1) of rather upright stripes, which the scanner reads by rows."""
+    """Return the mask (K, W, 1) of upright stripes, which the scanner searches by rows."""
     x, y = np.abs(path[..., 0]).mean(axis=-1), np.abs(path[..., 1]).mean(axis=-1)
     upright: BoolArray = (y > x)[..., None]
     return upright
 
 
 def _place(camera: Camera, pixels: FloatArray, is_row: BoolArray) -> FloatArray:
-    """Return places along the stripe, from -1 at one border of the picture to 1 at the other."""
+    """Return positions along the stripe, from -1 at one border of the picture to 1 at the other."""
     width, height = camera.size_px
     x, y = 2.0 * pixels[..., 0] / (width - 1) - 1.0, 2.0 * pixels[..., 1] / (height - 1) - 1.0
     return np.where(is_row, y, x)
@@ -225,7 +221,7 @@ class _Sensitivity:
     def of(
         cls, normals: FloatArray, ranges: FloatArray, by_point: FloatArray, steps: FloatArray
     ) -> "_Sensitivity":
-        """Solve [J; n] dX = (du, dv, dn) for m·dX, the rows of the inverse by cross products."""
+        """Solve [J; n] dX = (du, dv, dn) for m·dX, with the inverse by cross products."""
         row_x, row_y = by_point[..., 0, :], by_point[..., 1, :]
         normal = normals[:, None, None, :]
         # Only the forward part of dX changes m·X = y / range.
