@@ -1,6 +1,6 @@
-"""Setup of a simulated run (vehicle, sea, net, delays), and the three trials that judge a loop.
+"""Setup of a simulated run (vehicle, sea, net, delays), and the trials that evaluate a loop.
 
-The trials are hold, step and follow, all in the same sea and before the same net.
+The trials are: hold a range, make a step of the range, and follow a curved, moving net.
 """
 
 import math
@@ -34,8 +34,8 @@ _MODELS = dict(zip(VEHICLE_NAMES, (BLUEROV2, BLUEROV2_HEAVY, VIDEORAY), strict=T
 class SimCase:
     """One simulated run."""
 
-    model: VehicleModel  # The true vehicle.
-    gains: ControlGains  # Of the controller, for its model of the vehicle.
+    model: VehicleModel  # The simulated vehicle.
+    gains: ControlGains  # Of the controller, possibly tuned for another model.
     water: WaterMotion = field(default_factory=WaterMotion)
     net: NetWall = field(default_factory=NetWall)
     # Posture at the start, at rest, in metres and radians.
@@ -43,11 +43,11 @@ class SimCase:
     start_yaw: float = 0.0
     # Of the frames.
     timing: Timing = field(default_factory=Timing)
-    # Time from an effort to its arrival at the vehicle, in seconds.
+    # Latency from sending an effort to its arrival at the vehicle, in seconds.
     wire: float = 0.02
     # Of the safety gate.
     limits: SafetyLimits = field(default_factory=SafetyLimits)
-    # Of the noise of sensors and pictures.
+    # Random seed of the noise of the vehicle's sensors.
     seed: int = 0
 
     def loop(self, sensor: RangeSensor, mission: Mission) -> SimulatedLoop:
@@ -66,10 +66,10 @@ class SimCase:
 
 
 def vehicle_model(name: str, pilot_gain: float = 0.5) -> VehicleModel:
-    """Return a vehicle by the name that the command line knows.
+    """Return a vehicle by its name on the command line.
 
-    `pilot_gain`: ArduSub's: the share of the thrust that a full effort asks for. Raises
-    `OptionError` if there is no such vehicle, or the gain is none.
+    `pilot_gain`: ArduSub's pilot gain, the share of the thrust that a full effort demands. Raises
+    `OptionError` if there is no such vehicle, or the gain is out of range.
     """
     model = _MODELS.get(name.replace("_", "-"))
     if model is None:
@@ -100,20 +100,20 @@ def sea(
     current : float
         Speed in m/s.
     current_to : float
-        Direction it flows to, in radians clockwise from the direction in which one looks at the
-        net (north): 0 presses the vehicle against the net.
+        Direction of flow, in radians clockwise from the direction of view onto the net (north):
+        0 pushes the vehicle towards the net.
     wander : float
         Standard deviation of slow changes of the current, in m/s.
     waves : float
-        Amplitude in metres at the surface; 0 is a calm. The net hangs 5 m deep.
+        Amplitude at the surface, in metres; 0 for none. The vehicle is 5 m deep.
     period : float
-        Of the waves, in seconds.
+        Period of the waves, in seconds.
     waves_to : float
-        Direction they go, as of the current.
+        Direction in which the waves travel, as `current_to`.
     tether : float
-        Its length in the water, in metres.
+        Length of the tether in the water, in metres.
     seed : int
-        Of the phases.
+        Random seed of the waves' phases and of the wander.
     """
     flow = (current * math.cos(current_to), current * math.sin(current_to), 0.0)
     swell = Waves(amplitude=waves, period=period, direction=waves_to, n=6) if waves else None
@@ -125,11 +125,11 @@ def sea(
 RANGE, STEP, SWAY = 0.6, 0.2, 0.2
 """Range to hold and its step, in metres; speed along the net, in m/s."""
 FROM_REST_S = 10.0
-"""Time to settle in a run, which begins at rest in the current."""
+"""Time to settle, in seconds, in a run that begins at rest in the current."""
 STEP_S, HOLD_END_S, FOLLOW_END_S = 40.0, 52.0, 70.0
 """Times of the step and of the ends of the two runs, in seconds."""
 CURVED = NetWall(curvature=-0.1, sway=0.05, sway_period=8.0, rock=math.radians(1.0))
-"""The inside of a cage of 10 m radius, that sways and rocks."""
+"""Inside of a cage of 10 m radius that sways and rocks."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,18 +138,18 @@ class Trials:
 
     model: VehicleModel
     gains: ControlGains
-    rendered: bool = False  # Pictures through the scanner, else postures with its noise.
+    rendered: bool = False  # Render and scan pictures; otherwise, sample postures with noise.
     fps: float = 25.0  # Frames a second.
-    seed: int = 0  # Of waves and noise.
+    seed: int = 0  # Random seed of waves and noise.
     waves: float = 0.1  # Amplitude in metres.
 
     def begin(self, seconds: float) -> LoopLog:
-        """Take hold before a flat net, from rest in the current."""
+        """Hold the range to a flat net, from rest in the current."""
         case = self._case(NetWall())
         return case.loop(self._sensor(case), HoldMission(Setpoint(RANGE))).run(seconds)
 
     def hold_and_step(self) -> tuple[LoopLog, HoldMeasures, StepMeasures]:
-        """Hold before a flat net, then step away from it."""
+        """Hold the range to a flat net, then increase it by a step."""
         case = self._case(NetWall())
         mission = HoldMission(Setpoint(RANGE))
 
@@ -167,7 +167,7 @@ class Trials:
     def follow(
         self, seconds: float = FOLLOW_END_S, every_frame: Callable[[float], object] | None = None
     ) -> tuple[LoopLog, HoldMeasures]:
-        """Go along a curved net that moves."""
+        """Follow a curved net that moves."""
         case = self._case(CURVED)
         mission = FollowMission(Setpoint(RANGE), SWAY)
         log = case.loop(self._sensor(case), mission).run(seconds, every_frame)

@@ -46,33 +46,36 @@ from aqualvs.terminal import StopSignals
 
 
 class LoopPage:
-    """Page that shows a loop step by step, in real time at most.
+    """Page that shows a loop step by step, not faster than real time.
 
     Parameters
     ----------
     page : Output
-        Closed with this.
+        The page's server, which `close` closes.
+    rig : Rig
+        Rig of the samples that the page shows.
+    loop : SimulatedLoop
     holder : SetpointHolder
-        Where the page puts the setpoint; a mission that holds follows it.
+        Holder of the setpoint chosen on the page; a hold mission takes it over.
     """
 
     def __init__(self, page: Output, rig: Rig, loop: SimulatedLoop, holder: SetpointHolder) -> None:
-        n_share = 50  # Number of frames over which the share of valid ones is taken.
+        n_share = 50  # Number of frames over which the share of valid ones is computed.
         self._page, self._rig, self._loop, self._holder = page, rig, loop, holder
-        self._began_s = time.monotonic()
+        self._start_s = time.monotonic()
         self._valid: deque[bool] = deque(maxlen=n_share)
 
     def keep_pace(self, now_s: float) -> None:
-        """Take over the page's setpoint, and wait for the clock to reach a simulated time."""
-        late_s = 0.2  # Lag behind the clock beyond which a run does not catch up.
+        """Take over the page's setpoint, and wait until the clock reaches a simulated time."""
+        late_s = 0.2  # A larger lag behind the clock is not caught up.
         mission = self._loop.steering.mission
         if isinstance(mission, HoldMission):
             mission.setpoint = self._holder.setpoint
-        ahead_s = self._began_s + now_s - time.monotonic()
+        ahead_s = self._start_s + now_s - time.monotonic()
         if ahead_s > 0.0:
             time.sleep(ahead_s)
         elif ahead_s < -late_s:
-            self._began_s -= ahead_s
+            self._start_s -= ahead_s
 
     def take(
         self,
@@ -100,11 +103,11 @@ class LoopPage:
         self._page.send(sample)
 
     def close(self) -> None:
-        """End the page."""
+        """Close the page."""
         self._page.close()
 
     def _seen(self, frame_s: float, posture: Posture | Refusal) -> tuple[Frame | None, Scan]:
-        """Return the picture of a step with its points, where pictures are rendered."""
+        """Return the picture and the scan of a step; without rendering, None and an empty scan."""
         sensor = self._loop.sensor
         if isinstance(sensor, RenderedSensor):
             for frame, scan in sensor.shots:
@@ -132,14 +135,19 @@ class LoopPage:
 
 
 class RunWatch:
-    """Called before each frame; returns whether to go on.
+    """Callback before each frame that prints events and decides whether to continue.
 
     Parameters
     ----------
+    loop : SimulatedLoop
     seconds : float
-        Of the whole run.
+        Duration of the whole run.
+    echo : callable
+        Printer of a line.
+    stop : StopSignals
+        A signal ends the run.
     slow : bool
-        Whether a simulated second takes seconds, so that progress is printed.
+        Whether the run is slow, as with rendering, so that progress is printed.
     """
 
     def __init__(
@@ -157,9 +165,9 @@ class RunWatch:
 
     def __call__(self, now_s: float) -> bool:
         """Report changes; return False to end the run."""
-        min_s = 1.0  # Least length of a run: a report needs some rows.
-        holds_on_s = 5.0  # A plan that is over continues to hold: time to show that it does.
-        report_every_s = 10.0
+        min_s = 1.0  # Shortest run: the report needs some rows.
+        holds_on_s = 5.0  # Time to show that the vehicle keeps holding after the plan's end.
+        report_every_s = 10.0  # Simulated time between reports of progress.
         if now_s - self._reported_s >= report_every_s:
             self._reported_s = now_s
             self._echo(f"simulated {now_s:.0f} of {self._seconds:g} s")
@@ -184,7 +192,7 @@ class Aim:
     """Aim of the loop: a plan file, or a range and yaw to hold."""
 
     plan: Path | None = None
-    range: float | None = None  # Metres; 0.6 if neither it nor a plan is given.
+    range: float | None = None  # Metres; 0.6 if neither range nor plan is given.
     yaw: float = 0.0  # Radians.
 
     def mission(self, working_range: tuple[float, float]) -> tuple[Mission, SafetyLimits, Setpoint]:
@@ -208,21 +216,21 @@ class Aim:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SimRequest:
-    """Request for a simulation."""
+    """Request of `aqualvs follow --sim`, see its `--help`."""
 
     out: Path  # Folder to write.
     aim: Aim
     vehicle: str = "bluerov2"  # A name of `VEHICLE_NAMES`.
     gains: str | None = None  # Gains file, or a vehicle's name; tuned for the vehicle if left out.
-    pilot_gain: float = 0.5  # ArduSub's.
-    # Speed in m/s, and where it flows, in radians clockwise from the way one looks at the net.
+    pilot_gain: float = 0.5  # ArduSub's pilot gain.
+    # Speed in m/s, and direction of flow, in radians clockwise from the direction of view.
     current: float = 0.3
     current_to: float = math.radians(60.0)
     # Amplitude in metres.
     waves: float = 0.1
-    # Of a round net seen from inside, in metres; 0 is a flat one.
+    # Radius of a round net seen from inside, in metres; 0 for a flat net.
     cage_radius: float = 0.0
-    # Amplitude of the net's own motion to and fro, in metres.
+    # Amplitude of the net's own motion, in metres.
     net_sway: float = 0.0
 
     seconds: float = 60.0
@@ -231,15 +239,15 @@ class SimRequest:
     rendered: bool = False
     # Simulated camera that takes the rendered frames; the ideal one if left out.
     camera: str | None = None
-    # Of that camera, as `shutter_from_words` reads it; all rows at once if left out.
+    # Shutter of that camera, for `shutter_from_words`; all rows at once if left out.
     shutter: str | None = None
 
     seed: int = 0
-    # When the picture begins to stand still, in seconds; never if left out.
+    # Time from which on the picture is frozen, in seconds; never if left out.
     freeze: float | None = None
-    # The pilot's page; the run then goes no faster than the clock.
+    # The pilot's page; with it, the run is in real time.
     page: Page | None = None
-    # Whether to replace what this command wrote to `out` before.
+    # Whether to replace earlier output of this command in `out`.
     overwrite: bool = False
 
     def __post_init__(self) -> None:
@@ -247,12 +255,13 @@ class SimRequest:
 
         Raises `OptionError` naming the value.
         """
-        # A day; frame rates of the slowest and the fastest cameras.
-        max_s, min_fps, max_fps = 86_400.0, 1.0, 1000.0
-        follow_least_s, min_radius = 1.0, 2.0
-        if not follow_least_s <= self.seconds <= max_s:
+        # A second to a day; frame rates of the slowest and the fastest cameras.
+        min_s, max_s, min_fps, max_fps = 1.0, 86_400.0, 1.0, 1000.0
+        # Metres.
+        min_radius = 2.0
+        if not min_s <= self.seconds <= max_s:
             raise OptionError(
-                f"--seconds {self.seconds:g}: choose at least {follow_least_s:g}, at most {max_s:g}"
+                f"--seconds {self.seconds:g}: choose at least {min_s:g}, at most {max_s:g}"
             )
         if not min_fps <= self.fps <= max_fps:
             raise OptionError(f"--fps {self.fps:g}: choose {min_fps:g} to {max_fps:g}")
@@ -357,7 +366,7 @@ def _case(
 def _run(
     loop: SimulatedLoop, request: SimRequest, page: LoopPage | None, echo: Callable[[str], object]
 ) -> None:
-    """Run with the log beside it; Ctrl-C ends it early."""
+    """Run the loop and write its log; Ctrl-C ends it early."""
     with StopSignals() as stop, FollowLog(request.out / FOLLOW_CSV) as follow_log:
         watch = RunWatch(loop, request.seconds, echo, stop, slow=request.rendered)
         if page is None:

@@ -14,14 +14,14 @@ from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.results.files import writing
 
 NEUTRAL_WITHIN_S = 0.2
-"""Without a valid posture for this time there must be no thrust."""
+"""Longest time, in seconds, with thrust but without a valid posture."""
 
 
 class LoopRow(NamedTuple):
-    """The state at one frame's exposure; SI units and radians, NaN where nothing is known."""
+    """State at the exposure of one frame; SI units and radians, NaN for unknown values."""
 
     time_s: float
-    # In truth, as `NetPosture`.
+    # True values, as in `NetPosture`.
     range: float
     pitch: float
     yaw: float
@@ -29,16 +29,16 @@ class LoopRow(NamedTuple):
     up: float
     # Least distance between hull and net.
     clearance: float
-    # Angle between the vehicle's upright and the plumb line.
+    # Angle between the vehicle's vertical axis and the plumb line.
     tilt: float
-    # By the lasers in this frame.
+    # Measured by the lasers in this frame.
     measured_range: float
     measured_pitch: float
     measured_yaw: float
-    # From the time filter, as known by now.
+    # Of the time filter at its last update.
     filtered_range: float
     filtered_yaw: float
-    # What the mission asks for.
+    # Setpoint of the mission.
     wanted_range: float
     wanted_yaw: float
     sway: float
@@ -52,23 +52,23 @@ class LoopRow(NamedTuple):
     heading: float
 
     engaged: bool
-    # Of the mission; why the effort was changed; why there is no posture.
-    stage: str
-    reason: str
-    refusal: str
+    stage: str  # Of the mission.
+    reason: str  # Of the safety gate for changing the effort; empty if it did not.
+    refusal: str  # Reason for a missing posture; empty if there is one.
 
 
 @dataclass(slots=True)
 class LoopLog:
-    """All rows, and how long thrust outlived the sight of the net."""
+    """Rows of all frames, and durations of thrust without sight of the net."""
 
     rows: list[LoopRow] = field(default_factory=list)
-    # For each period of more than `NEUTRAL_WITHIN_S` without a valid posture into which thrust
-    # reached: time from the last valid posture to neutral.
+    # For each period of more than `NEUTRAL_WITHIN_S` without a valid posture that began with
+    # thrust: time from the last valid posture to neutral.
     blind_thrust_s: list[float] = field(default_factory=list)
-    # Such periods, with or without thrust.
+    # Number of such periods, with or without thrust.
     n_blind: int = 0
 
+    # Time from the last valid posture to neutral in the present period; infinite if not reached.
     _neutral_s: float = math.inf
 
     def column(self, name: str) -> FloatArray:
@@ -76,11 +76,14 @@ class LoopLog:
         return np.array([getattr(row, name) for row in self.rows], dtype=np.float64)
 
     def note_neutral(self, seen_s: float, now_s: float) -> None:
-        """Note that thrust ended, at a time after the last valid posture."""
+        """Note that thrust ended now; `seen_s` is the time of the last valid posture."""
         self._neutral_s = now_s - seen_s
 
     def note_sight(self, seen_s: float, now_s: float, thrusts: bool) -> None:
-        """Note a valid posture, with the one before and the effort until now."""
+        """Note a valid posture now.
+
+        `seen_s` is the time of the previous one; `thrusts`: whether there was thrust until now.
+        """
         gap = now_s - seen_s
         if NEUTRAL_WITHIN_S < gap < math.inf:
             self.n_blind += 1
@@ -89,6 +92,7 @@ class LoopLog:
         self._neutral_s = math.inf
 
 
+# Heading with unit, factor and decimals of columns that `_column` has no rule for.
 _UNITS = {
     "time_s": ("time_s", 1.0, 3),
     "along": ("along_m", 1.0, 4),
@@ -100,7 +104,7 @@ _UNITS = {
 
 
 def write_log(log: LoopLog, path: Path) -> None:
-    """Write the rows as CSV; units are in the names, cells of unknown values are empty.
+    """Write the rows as CSV, with units in the column names and empty cells for unknown values.
 
     Raises `OutputError` if the file cannot be written.
     """
@@ -136,21 +140,21 @@ def _cell(value: object, factor: float, digits: int) -> str:
 
 
 SETTLED_SHARE = 0.1
-"""A step has settled once the range stays within this share of it."""
+"""A step has settled when the error of the range stays below this share of the step."""
 LOST_AFTER_S = 2.5
-"""Without sight for longer, in seconds, a human has to take over."""
+"""Time without sight, in seconds, after which a human has to take over."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HoldMeasures:
     """Measures of a period with a constant setpoint."""
 
-    # Of the true posture about the setpoint, in metres and radians.
+    # Rms deviation of the true posture from the setpoint, in metres and radians.
     range_rms: float
     yaw_rms: float
-    # Greatest error of the range, in metres.
+    # Largest deviation of the range, in metres.
     range_worst: float
-    # Between hull and net, in metres; negative is contact.
+    # Least distance between hull and net, in metres; negative for contact.
     min_clearance: float
     # Frames without a posture.
     n_lost: int
@@ -160,7 +164,7 @@ class HoldMeasures:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StepMeasures:
-    """Answer to a step of the range."""
+    """Response to a step of the range."""
 
     # Seconds until the range stays within `SETTLED_SHARE` of the step; infinite if it never does.
     settling: float
@@ -170,32 +174,32 @@ class StepMeasures:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EffortMeasures:
-    """Rate of an effort's reversals, which wear thrusters and shake the camera."""
+    """Rates of an effort's reversals and jumps, which wear thrusters and shake the camera."""
 
-    reversals: float  # Changes of the sign a minute; neutral between two of one sign is none.
-    jumps: float  # Changes by more than `JUMP` from one frame to the next, a minute.
+    reversals: float  # Changes of sign per minute, not counting neutral in between.
+    jumps: float  # Changes by more than `JUMP` from one frame to the next, per minute.
 
 
 JUMP = 0.25
-"""Least jump of an effort that counts: about the width of a dead band."""
+"""Least change of an effort that counts as a jump: about the width of a dead band."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SafetyMeasures:
     """Safety measures of a whole run."""
 
-    min_clearance: float  # In metres; negative is contact.
-    n_blind: int  # Periods of more than 0.2 s without a valid posture.
-    # Longest time from a last valid posture to neutral, in seconds; 0 where there was no thrust.
+    min_clearance: float  # In metres; negative for contact.
+    n_blind: int  # Periods of more than `NEUTRAL_WITHIN_S` without a valid posture.
+    # Longest time from a last valid posture to neutral, in seconds; 0 without such thrust.
     neutral_late: float
-    # Whether swings of the range do not grow while the net is in sight.
+    # True if oscillations of the range do not grow while the net is in sight.
     stable: bool
-    # When sight was lost for good; infinite if it was not.
+    # Time at which sight was lost for good; infinite if it was not.
     lost_s: float
-    # Of the vehicle, in radians.
+    # Largest tilt of the vehicle, in radians.
     greatest_tilt: float
 
-    # Share of the frames at which efforts passed: engaged, not waiting, not stopped by the gate.
+    # Share of frames at which efforts reached the vehicle: engaged and not stopped by the gate.
     steered_share: float
 
     @property
@@ -205,15 +209,15 @@ class SafetyMeasures:
 
 
 def hold_measures(log: LoopLog, start_s: float, end_s: float = math.inf) -> HoldMeasures:
-    """Return the measures of a period; frames without a setpoint count against the last one."""
+    """Return the measures of a period; frames without a setpoint are compared with the last one."""
     here = _between(log, start_s, end_s)
-    off = log.column("range")[here] - _filled(log.column("wanted_range"))[here]
-    turned = log.column("yaw")[here] - _filled(log.column("wanted_yaw"))[here]
+    range_error = log.column("range")[here] - _filled(log.column("wanted_range"))[here]
+    yaw_error = log.column("yaw")[here] - _filled(log.column("wanted_yaw"))[here]
     rows = [row for row, kept in zip(log.rows, here, strict=True) if kept]
     return HoldMeasures(
-        range_rms=_rms(off),
-        yaw_rms=_rms(turned),
-        range_worst=float(np.abs(off).max()),
+        range_rms=_rms(range_error),
+        yaw_rms=_rms(yaw_error),
+        range_worst=float(np.abs(range_error).max()),
         min_clearance=float(log.column("clearance")[here].min()),
         n_lost=sum(row.refusal != "" for row in rows),
         n_guarded=sum(row.reason != "" for row in rows),
@@ -223,19 +227,19 @@ def hold_measures(log: LoopLog, start_s: float, end_s: float = math.inf) -> Hold
 def effort_measures(
     log: LoopLog, name: str, start_s: float = 0.0, end_s: float = math.inf
 ) -> EffortMeasures:
-    """Return how often an effort turned round between two times.
+    """Return the rates of reversals and jumps of an effort between two times.
 
-    `name`, one of {"forward", "right", "down", "turn"}: of the effort.
+    `name`: "forward", "right", "down" or "turn".
     """
     return _measured(log, log.column(name), start_s, end_s)
 
 
 def thruster_measures(log: LoopLog, start_s: float = 0.0) -> EffortMeasures:
-    """Return how often horizontal thrusters turned round from a time on, the worse of two pairs.
+    """Return the rates of reversals and jumps of the horizontal thrusters, the worse of two pairs.
 
     Efforts forward and to the right add up in one pair of vectored thrusters and cancel in the
-    other. Along a target the pairs push against each other: the sign of the forward effort, which
-    is small then, changes with the noise, and no thruster turns round.
+    other. While the vehicle moves along a target, the pairs push against each other: the small
+    forward effort changes sign with the noise, but no thruster reverses.
     """
     forward, right = log.column("forward"), log.column("right")
     pairs = [
@@ -264,9 +268,9 @@ def step_measures(
     Parameters
     ----------
     time_s, ranges : array, shape (n,)
-        True ranges, or their mean over several runs.
+        Times in seconds, and true ranges in metres or their mean over several runs.
     step_s : float
-        When the setpoint changed.
+        Time at which the setpoint changed.
     before, after : float
         Setpoints in metres.
     """
@@ -303,23 +307,25 @@ def _is_steered(row: LoopRow) -> bool:
 
 
 def _last_seen_s(log: LoopLog) -> float:
-    """Return when the last valid posture was exposed."""
+    """Return the exposure time of the last valid posture; 0 if there is none."""
     seen = np.flatnonzero(np.isfinite(log.column("measured_range")))
     return float(log.column("time_s")[seen[-1]]) if len(seen) else 0.0
 
 
 def _is_stable(log: LoopLog) -> bool:
-    """Return whether the last third swings no more than the second, both about their setpoints."""
-    # Greater increase of the swings from the middle to the end of a run counts as growth, in
-    # metres.
-    grows, grows_by = 2.0, 0.05
-    off = log.column("range") - _filled(log.column("wanted_range"))
-    off = off[log.column("time_s") <= _last_seen_s(log)]
-    third = len(off) // 3
-    if third == 0 or not np.isfinite(off[-1]):
+    """Return whether the deviations in the last third of a run do not exceed those in the second.
+
+    Only the time with sight of the net counts.
+    """
+    # Factor and margin, in metres, by which the rms may increase.
+    max_factor, margin = 2.0, 0.05
+    error = log.column("range") - _filled(log.column("wanted_range"))
+    error = error[log.column("time_s") <= _last_seen_s(log)]
+    third = len(error) // 3
+    if third == 0 or not np.isfinite(error[-1]):
         return third == 0
-    middle, last = _rms(off[third : 2 * third]), _rms(off[2 * third :])
-    return last <= grows * middle + grows_by
+    middle, last = _rms(error[third : 2 * third]), _rms(error[2 * third :])
+    return last <= max_factor * middle + margin
 
 
 def _between(log: LoopLog, start_s: float, end_s: float) -> BoolArray:
@@ -328,7 +334,7 @@ def _between(log: LoopLog, start_s: float, end_s: float) -> BoolArray:
 
 
 def _filled(values: FloatArray) -> FloatArray:
-    """Return values with the last known one where there is none."""
+    """Return values in which NaN is replaced by the last finite value, or else by the first."""
     known = np.isfinite(values)
     if not known.any():
         return values

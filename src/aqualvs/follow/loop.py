@@ -1,8 +1,8 @@
 """The closed loop in simulated time: frames, time filter, pilot, vehicle, water and net.
 
-Decisions are made by the code of a live run: the time filter, `NetPilot` with mission, controller
-and safety gate, and the rules of the live pilot's watchdog. Delays are those of events: a frame is
-exposed, arrives later, and its effort reaches the vehicle after the latency of the wire.
+The time filter and `NetPilot` with mission, controller and safety gate are those of a live run; the
+rules of the live pilot's watchdog are repeated here. Delays are simulated event by event: a frame
+is exposed, arrives later, and its effort reaches the vehicle after the latency of the link.
 
 `SimulatedLink` gives the simulated vehicle the interface that the controllers use.
 """
@@ -26,22 +26,22 @@ from aqualvs.simulation.vehicle.vehicle import SimulatedVehicle
 
 
 class SimulatedLink:
-    """Link to a simulated vehicle, in its own time.
+    """Link to a simulated vehicle, in simulated time.
 
-    `vehicle`: its latency is that of the wire.
+    `vehicle`: its latency is that of the link.
     """
 
     def __init__(self, vehicle: SimulatedVehicle) -> None:
         self.vehicle = vehicle
         self.name = f"simulated {vehicle.model.name}"
-        self.effort = NEUTRAL  # The last that was sent.
+        self.effort = NEUTRAL  # Last effort sent.
         self._shaping = shaping_of_model(vehicle.model)
         self._unsent: Effort | None = None
         self._closed = False
 
     def state(self) -> VehicleState:
         """Return the vehicle's reported state, by the vehicle's clock."""
-        report_hz = 10.0  # A vehicle reports its attitude ten times a second.
+        report_hz = 10.0  # Rate at which a vehicle reports its attitude.
         report = self.vehicle.telemetry()
         return VehicleState(
             heard_s=math.floor(report.time_s * report_hz) / report_hz,
@@ -55,13 +55,13 @@ class SimulatedLink:
         )
 
     def send(self, effort: Effort) -> None:
-        """Ask for an effort."""
+        """Send an effort to the vehicle."""
         if not self._closed:
             self.effort = effort
             self._unsent = self._shaping.position(effort)
 
     def pass_time(self, until_s: float) -> None:
-        """Let the vehicle move until a time; nothing if that is not ahead."""
+        """Simulate the vehicle until a time; do nothing if that has passed."""
         step = until_s - self.vehicle.time_s
         if step > 1e-9:
             self.vehicle.step(self._unsent, step)
@@ -73,8 +73,8 @@ class SimulatedLink:
         self._closed = True
 
 
-# Time after which the live run reports a silent stream, the period of further reports, and that of
-# the watchdog's checks.
+# As in the live run: time after which a silent stream is reported, and periods of further reports
+# and of the watchdog's checks.
 _SILENT_AFTER_S, _SILENT_EVERY_S, _WATCHDOG_EVERY_S = 0.20, 0.10, 0.02
 
 
@@ -94,13 +94,13 @@ class Timing:
 
     fps: float = 25.0  # Frames a second.
     delay: float = 0.06  # From the exposure to the measured posture, in seconds.
-    # Time that every other frame, from the first on, waits for the next besides, in seconds: as the
-    # first field of an interlaced picture does for the second.
+    # Additional delay of every other frame, from the first on, in seconds: the first field of an
+    # interlaced picture arrives with the second.
     field: float = 0.0
 
 
 class _Arrival(NamedTuple):
-    """A measured frame on its way."""
+    """Result of a frame that has not reached the pilot yet."""
 
     at_s: float
     exposed_s: float
@@ -109,31 +109,38 @@ class _Arrival(NamedTuple):
 
 @dataclass(slots=True)
 class _Sight:
-    """State of the stream, as the live run and the pilot's watchdog know it."""
+    """State of the stream in the live run and in the pilot's watchdog."""
 
-    timeout_s: float
+    timeout_s: float  # Longest age of a posture for thrust.
     coming: deque[_Arrival] = field(default_factory=deque)
-    # Times of the last frame and of the last report of a silent stream.
+    # Arrival of the last frame; last report of a silent stream.
     heard_s: float = 0.0
     reported_s: float = -math.inf
-    # Exposure of that frame.
+    # Exposure of the last frame.
     exposed_s: float = 0.0
-    # Time of the last valid posture.
+    # Arrival of the last valid posture.
     seen_s: float = -math.inf
 
     def silence_s(self) -> float:
-        """Return when a silent stream is reported next."""
+        """Return the time of the next report of a silent stream."""
         return max(self.heard_s + _SILENT_AFTER_S, self.reported_s + _SILENT_EVERY_S)
 
     def stop_s(self, thrusts: bool) -> float:
-        """Return when the watchdog stops the thrusters."""
+        """Return the time at which the watchdog stops the thrusters; infinite without thrust."""
         return self.seen_s + self.timeout_s + _WATCHDOG_EVERY_S if thrusts else math.inf
 
 
 class SimulatedLoop:
-    """A vehicle before a net that it sees with lasers and steers by.
+    """Simulation of a vehicle in front of a net, steered by what its lasers measure.
 
-    `steering`: engaged at the start.
+    Parameters
+    ----------
+    link : SimulatedLink
+    net : NetWall
+    sensor : RangeSensor
+    steering : NetPilot
+        Pilot; it is engaged at the start.
+    timing : Timing, optional
     """
 
     def __init__(
@@ -147,12 +154,12 @@ class SimulatedLoop:
         self.link, self.net, self.sensor, self.steering = link, net, sensor, steering
         self.timing = timing or Timing()
         self._filter = PostureFilter()
-        # Called after every step of the pilot with the time, the frame's time, what was measured,
-        # the decision and the vehicle's state.
+        # Called after every step of the pilot with the time, the frame's time, the posture or
+        # refusal, the decision and the vehicle's state.
         self.on_step: OnStep | None = None
         self._sight = _Sight(steering.gate.limits.posture_age)
         self._decision: Decision | None = None
-        # State of the time filter at the last step; None where it does not run.
+        # State of the time filter at the last step; None while it has none.
         self.filtered: FilteredPosture | None = None
         self.log = LoopLog()
 
@@ -162,20 +169,20 @@ class SimulatedLoop:
         return self._sight.seen_s
 
     def run(self, seconds: float, every_frame: Callable[[float], object] | None = None) -> LoopLog:
-        """Let simulated time pass and return the log; may be called again to go on.
+        """Simulate and return the log; a further call continues the run.
 
         Parameters
         ----------
         seconds : float
-            Until this simulated time.
+            Simulated time at which to end.
         every_frame : callable, optional
-            Called with the time before each frame: changes setpoints, shows the way, ends the run
-            by returning False.
+            Called with the time before each frame; may change the setpoint, and ends the run by
+            returning False.
 
         Raises
         ------
         OptionError
-            If the pilot may not begin.
+            If the pilot refuses to engage.
         """
         if not self.log.rows:
             refused = self.steering.engage(0.0, self.link.state())
@@ -192,7 +199,7 @@ class SimulatedLoop:
         return self.log
 
     def _pass_time(self, until_s: float) -> None:
-        """Let everything happen that happens until then."""
+        """Process all events until a time, in their order."""
         sight = self._sight
         while True:
             arrives_s = sight.coming[0].at_s if sight.coming else math.inf
@@ -210,19 +217,19 @@ class SimulatedLoop:
         self.link.pass_time(until_s)
 
     def _expose(self, now_s: float) -> None:
-        """Take a frame, and write down how things stand."""
+        """Expose a frame, and log the state."""
         posture = self.sensor.look(self.link.vehicle.dome_pose, now_s)
         if posture is not None:
             coming = self._sight.coming
             wait_s = 0.0 if len(self.log.rows) % 2 else self.timing.field
             at_s = now_s + self.timing.delay + wait_s
-            # The fields of a picture arrive at one moment, but for rounding.
+            # Both fields of a picture arrive at the same time, up to rounding.
             at_s = max(at_s, coming[-1].at_s) if coming else at_s
             coming.append(_Arrival(at_s, now_s, posture))
         self.log.rows.append(self._row(now_s, posture))
 
     def _receive(self, arrival: _Arrival) -> None:
-        """Take a step by a frame's posture."""
+        """Step the pilot with the posture of a frame."""
         sight = self._sight
         sight.heard_s, sight.exposed_s = arrival.at_s, arrival.exposed_s
         if arrival.posture:
@@ -231,7 +238,7 @@ class SimulatedLoop:
         self._step(arrival.at_s, arrival.exposed_s, arrival.exposed_s, arrival.posture)
 
     def _report_silence(self, now_s: float) -> None:
-        """Take a step without a frame."""
+        """Step the pilot without a frame."""
         sight = self._sight
         sight.reported_s = now_s
         silent_s = now_s - sight.heard_s
@@ -251,7 +258,7 @@ class SimulatedLoop:
         self._send(decision.effort if decision.engaged else NEUTRAL, now_s)
 
     def _send(self, effort: Effort, now_s: float) -> None:
-        """Send an effort, or neutral for one that rests on too old a posture."""
+        """Send an effort, or neutral if the last valid posture is too old."""
         seen_s = self._sight.seen_s
         if now_s - seen_s > self._sight.timeout_s:
             effort = NEUTRAL

@@ -1,8 +1,8 @@
 """Page, summary and figures of a simulated run.
 
 The figures follow figures 22 and 23 of the paper (Constantinou, Georgiades and Loizou, Robotics
-2021, 10, 126). Matplotlib is imported when a figure is drawn, and only its Agg canvas: no display
-is needed.
+2021, 10, 126). Matplotlib is imported when a figure is drawn, and only its Agg canvas, which needs
+no display.
 """
 
 import math
@@ -31,8 +31,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+# Shades of frames without a posture, and of those at which the safety gate changed the effort.
 _LOST, _GUARDED = "#f3c9bd", "#f6e3a8"
-# Least span of an axis, so that noise does not fill it: metres, degrees.
+_COLOURS = {_LOST: "red", _GUARDED: "yellow"}
+# Least span of an axis, in metres and degrees, so that noise does not fill it.
 _MIN_DEPTH, _MIN_RANGE, _MIN_ANGLE = 0.2, 0.1, 6.0
 
 
@@ -40,7 +42,7 @@ FIGURE_FILES = ("figure_22.png", "figure_23.png")
 
 
 def drawn_follow_figures(log: LoopLog) -> "dict[str, Figure]":
-    """Return the same pictures by name, not yet written."""
+    """Return the figures by their names without ending, not yet written."""
     from matplotlib import rc_context
 
     with rc_context(STYLE):
@@ -107,7 +109,7 @@ def _panels(n: int, height_in: float) -> "tuple[Figure, list[Axes]]":
 
 
 def _name(axes: "Axes", label: str, least: float) -> None:
-    """Name an axis, and let it show at least so much."""
+    """Label an axis, and extend it to a span of at least `least`."""
     axes.set_ylabel(label)
     low, high = axes.get_ylim()
     short = least - abs(high - low)
@@ -116,12 +118,12 @@ def _name(axes: "Axes", label: str, least: float) -> None:
 
 
 def _legend(axes: "Axes") -> None:
-    """Put the legend above, out of the curves' way."""
+    """Put the legend above the axes, off the curves."""
     axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4, borderaxespad=0.1)
 
 
 def _finish(axes: "list[Axes]", log: LoopLog, time_s: FloatArray) -> None:
-    """Shade where there was no posture, and where the gate stepped in."""
+    """Shade frames without a posture and those at which the safety gate stepped in; name both."""
     lost = np.array([row.refusal != "" for row in log.rows])
     guarded = np.array([row.reason != "" for row in log.rows]) & ~lost
     step_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
@@ -138,17 +140,14 @@ def _finish(axes: "list[Axes]", log: LoopLog, time_s: FloatArray) -> None:
     axes[-1].set_xlabel("time (s)" + (f"   ({words})" if words else ""))
 
 
-_COLOURS = {_LOST: "red", _GUARDED: "yellow"}
-
-
 PAGE = "follow.html"
 SETTLED_S = 10.0
-"""A run begins at rest in moving water; errors count from then on, in seconds."""
+"""Time, in seconds, from which on errors count: a run begins at rest in moving water."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunFacts:
-    """Setup of the simulation, as text of the page."""
+    """Setup of the simulation for page and summary; SI units."""
 
     vehicle: str
     current: float
@@ -158,7 +157,7 @@ class RunFacts:
 
     @property
     def words(self) -> str:
-        """One line."""
+        """The setup in one line."""
         sensor = "rendered pictures, measured" if self.rendered else "sampled postures"
         return (
             f"{self.vehicle}, current {self.current:g} m/s, waves of {self.waves:g} m amplitude, "
@@ -167,7 +166,7 @@ class RunFacts:
 
 
 def summary(log: LoopLog) -> list[tuple[str, str]]:
-    """Return the results of a run, as names and values."""
+    """Return the results of a run as pairs of name and value."""
     start_s = _settled_s(log)
     hold, safety = hold_measures(log, start_s), safety_measures(log)
     figures = [
@@ -221,7 +220,7 @@ def _headline(log: LoopLog) -> tuple[list[html.Card], list[str]]:
 
 
 def _efforts(log: LoopLog, start_s: float) -> list[tuple[str, str]]:
-    """Return how often the thrusters turned round."""
+    """Return rows on reversals and jumps of the thrusters."""
     found = {
         "horizontal": thruster_measures(log, start_s),
         "yaw": effort_measures(log, "turn", start_s),
@@ -242,9 +241,9 @@ def summary_lines(log: LoopLog, facts: RunFacts) -> list[str]:
 
 
 def write_report(log: LoopLog, facts: RunFacts, out: Path) -> Path:
-    """Draw the figures and write the page beside them; returns the page.
+    """Draw the figures, write the page beside them, and return its path.
 
-    Raises `OutputError` if something cannot be written.
+    Raises `OutputError` if a file cannot be written.
     """
     with writing(out):
         figures = save_figures(drawn_follow_figures(log), out, dpi=160)

@@ -1,7 +1,7 @@
 """Models of the scanner for simulated loops: sampled postures, or the scanner on rendered pictures.
 
-`SampledSensor` gives the true posture with noise and losses. `RenderedSensor` renders every frame
-and measures in it by the real pipeline.
+`SampledSensor` returns the true posture with noise and losses. `RenderedSensor` renders every frame
+and runs the scanner on it.
 """
 
 import math
@@ -33,24 +33,25 @@ def net_scene() -> Scene:
 
 
 class RenderedSensor:
-    """Sensor that renders the camera's picture from a vehicle, and measures in it.
+    """Sensor that renders the camera's picture from a vehicle, and runs the scanner on it.
 
-    A picture is what the rig's shutter saw until it was read out: rows show where the vehicle was
-    when they were exposed, between its poses at this frame and at the one before. Frames of an
-    interlaced camera are its fields, one by one.
+    Each row of a picture is rendered from the vehicle's pose during its exposure, interpolated
+    between this frame and the previous one; the frame's time is the end of the readout. Frames of
+    an interlaced camera are its single fields.
 
     Parameters
     ----------
+    net : NetWall
     rig : Rig
-        That the pictures are taken with, and measured with.
+        Rig that takes and measures the pictures.
     rng : Generator
         Source of the sensor's noise.
     scene : Scene, optional
-        In the frame of the net at rest; `net_scene` if left out.
+        Scene in the frame of the net at rest; `net_scene` if left out.
     camera : SimulatedCamera
-        Takes the pictures; they are measured before it compresses them.
+        Camera that takes the pictures; its compression is left out.
     freeze_s : float
-        From then on the last picture comes again and again, with time stamps that run on.
+        Time from which on the last picture is repeated, with time stamps that advance.
     """
 
     def __init__(
@@ -62,7 +63,7 @@ class RenderedSensor:
         camera: SimulatedCamera = IDEAL,
         freeze_s: float = math.inf,
     ) -> None:
-        n_kept = 8  # More pictures than are in transit from the exposure to the pilot.
+        n_kept = 8  # More than the pictures between exposure and pilot.
         self._net, self._rng = net, rng
         self._scene = net_scene() if scene is None else scene
         self._renderer = Renderer(rig, camera=camera)
@@ -72,11 +73,11 @@ class RenderedSensor:
         self._frozen: dict[Field | None, FrozenPicture] = {}
         self._planes: dict[Field | None, Planes] = {}
         self._poses: deque[tuple[float, SE3]] = deque(maxlen=2)
-        # The last pictures, and what was measured in them.
+        # The last pictures and their scans.
         self.shots: deque[tuple[Frame, Scan]] = deque(maxlen=n_kept)
 
     def look(self, world_from_dome: SE3, time_s: float) -> Posture | Refusal:
-        """Return the result for the frame whose exposure ends now; None for a lost frame."""
+        """Return the result for the frame whose readout ends now."""
         self._poses.append((time_s, world_from_dome))
         field = self._scanner.rig.shutter.field_of(self._n_frames)
         if field not in self._planes or time_s < self._freeze_s:
@@ -107,18 +108,19 @@ class RenderedSensor:
         return self._net.scene_at(self._pose_at(time_s), time_s, self._scene)
 
     def _pose_at(self, time_s: float) -> SE3:
-        """Return the vehicle's pose between the last two frames."""
+        """Return the vehicle's pose at a time, interpolated between the last two frames."""
         (early_s, early), (late_s, late) = self._poses[0], self._poses[-1]
         if time_s >= late_s or late_s == early_s:
             return late
         share = (time_s - early_s) / (late_s - early_s)
         turn = rotation_from_rotvec(share * rotvec_from_rotation(early.rotation.T @ late.rotation))
-        way = late.translation - early.translation
-        return SE3(early.rotation @ turn, early.translation + share * way)
+        shift = late.translation - early.translation
+        return SE3(early.rotation @ turn, early.translation + share * shift)
 
 
-# Approximate number of inliers of a posture by the example rig.
+# Typical number of inliers of a posture of the example rig.
 _N_POINTS = 400
+# Largest yaw or pitch of the net at which a posture is measured.
 _MAX_ANGLE = math.radians(60.0)
 
 
@@ -126,20 +128,20 @@ class LossOfSight(StrEnum):
     """Kind of loss of sight."""
 
     TARGET = "target"
-    """Frames come, but nothing is measured in them."""
+    """Frames arrive, but without a posture."""
     STREAM = "stream"
-    """No frames come."""
+    """No frames arrive."""
     FROZEN = "frozen"
-    """The last picture comes again and again: its posture repeats to the bit."""
+    """The last picture is repeated: its posture is the same to the last bit."""
     STUCK = "stuck"
-    """Frames come with noise of their own, but show what was there at the start."""
+    """Frames have new noise, but show the scene at the start of the period."""
 
 
 @dataclass(frozen=True, slots=True)
 class Blind:
     """Period without a valid posture."""
 
-    # Of the exposures, in seconds.
+    # Times of exposure, in seconds.
     start_s: float
     end_s: float
 
@@ -148,7 +150,7 @@ class Blind:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PostureNoise:
-    """Standard deviations, of each frame by itself."""
+    """Standard deviations of the noise, independent from frame to frame."""
 
     range_share: float = 0.003  # Of the range.
     # In radians.
@@ -159,16 +161,18 @@ class PostureNoise:
 
 
 class SampledSensor:
-    """Sensor that gives the true posture with noise.
+    """Sensor that returns the true posture with noise.
 
     Parameters
     ----------
+    net : NetWall
     rng : Generator
         Source of the noise.
+    noise : PostureNoise, optional
     blind : sequence of Blind
         Periods without sight.
     working_range : (float, float)
-        Outside of it nothing is measured, in metres.
+        Range in metres outside which there is no posture.
     """
 
     def __init__(

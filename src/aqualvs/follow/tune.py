@@ -1,6 +1,6 @@
 """The command `aqualvs tune`: gains for a vehicle, their margins, and a step of the range.
 
-The step is simulated with the whole vehicle, to test what the linear model of tuning promises.
+The step is simulated with the nonlinear vehicle, to verify the linear model that tuning uses.
 """
 
 import math
@@ -24,7 +24,9 @@ from aqualvs.simulation.vehicle.water_motion import WaterMotion
 
 # Distance of the wall north of the origin, and depth of the vehicle, in metres.
 _WALL, _DEPTH = 5.0, 5.0
+# Time before the step, to settle, and after it.
 _REST_S, _AFTER_S = 6.0, 12.0
+# The step has settled when the error stays below this share of it.
 _BAND = 0.05
 
 
@@ -35,7 +37,7 @@ class StepOptions:
     # Ranges before and after, in metres.
     begin: float = 0.8
     end: float = 0.6
-    # From a frame to its effort at the vehicle, in seconds.
+    # Delay from a frame to its effort at the vehicle, in seconds.
     delay: float = 0.1
     # Seconds between frames.
     frame: float = 0.04
@@ -48,7 +50,7 @@ class StepAnswer:
     # Shape (N,): seconds since the step, from before it on; metres.
     time: FloatArray
     range: FloatArray
-    # Share of the step.
+    # As a share of the step.
     overshoot: float
     # Seconds after which the range stays within 5 % of the step; infinite if it does not.
     settling: float
@@ -57,9 +59,9 @@ class StepAnswer:
 def simulate_step(
     model: VehicleModel, gains: ControlGains, options: StepOptions | None = None
 ) -> StepAnswer:
-    """Hold a range before a wall in still water, then another one; postures are exact.
+    """Simulate a step of the range to a wall in still water, with exact postures.
 
-    `model`: need not be the one that the gains are for.
+    `model` may differ from the one that the gains are tuned for.
     """
     options = options or StepOptions()
     ahead = _WALL - options.begin - model.dome_position[0]
@@ -101,18 +103,18 @@ def _answer(time: FloatArray, ranges: FloatArray, options: StepOptions) -> StepA
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TuneRequest:
-    """Request of the command line."""
+    """Request of `aqualvs tune`, see its `--help`."""
 
     model: str  # Name of a vehicle model.
     output: Path | None = None  # Gains file; None prints the gains.
     overwrite: bool = False  # Whether to replace a file that this command wrote before.
-    options: TuneOptions = field(default_factory=TuneOptions)  # What the loops must stand.
+    options: TuneOptions = field(default_factory=TuneOptions)  # Requirements on the loops.
 
 
 def run_tune(request: TuneRequest, echo: Callable[[str], None]) -> None:
-    """Tune, try a step, write or print the gains.
+    """Tune, simulate a step, and write or print the gains.
 
-    Raises `OptionError` if the model is unknown, or nothing stands what is asked. Raises
+    Raises `OptionError` if the model is unknown, or no gains meet the requirements. Raises
     `OutputError` if the file cannot be written.
     """
     model = VEHICLES.get(request.model.replace("-", "_"))
@@ -131,7 +133,7 @@ def run_tune(request: TuneRequest, echo: Callable[[str], None]) -> None:
 
 
 def report(model: VehicleModel, tuned: Tuned, options: TuneOptions) -> list[str]:
-    """Return the report on gains: margins at both delays, nominal and worst case; steps."""
+    """Return the report on gains: margins at both delays, nominal and worst case, and steps."""
     usual, most = options.delay, options.greatest_delay
     lines = [
         f"{model.name}: margins with the model as it is, and in the worst corner (mass "

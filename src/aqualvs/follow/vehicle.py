@@ -1,6 +1,6 @@
 """The command `aqualvs follow SOURCE`: hold and follow with a real vehicle, with a log.
 
-A thread of its own writes the log, so that the disk never delays the pilot.
+A separate thread writes the log, so that the disk never delays the pilot.
 """
 
 import sys
@@ -40,9 +40,9 @@ _Step: TypeAlias = tuple[PilotReport, float, Posture | Refusal]
 
 
 class FollowLogOutput(Output):
-    """Writer of the pilot's steps; comes after the pilot among the outputs.
+    """Output that logs the pilot's steps; it must follow the pilot in the list of outputs.
 
-    `path`: created, or overwritten. Raises `OutputError` if it cannot be written.
+    `path` is created, or overwritten. Raises `OutputError` if it cannot be written.
     """
 
     name = "follow log"
@@ -57,7 +57,7 @@ class FollowLogOutput(Output):
         self._thread.start()
 
     def send(self, sample: LiveSample) -> None:
-        """Take the pilot's last step; return at once."""
+        """Queue the pilot's last step, without waiting for the disk."""
         report = self._pilot.latest
         if report is None or report is self._last:
             return
@@ -98,7 +98,7 @@ class FollowRequest:
     gains: str  # Gains file, or the name of a vehicle whose gains come with the package.
     out: Path  # Folder for the log.
     aim: Aim
-    # Who is there, and how it is steered.
+    # Expected systems, and options of steering.
     vehicle: VehicleSetup = field(default_factory=VehicleSetup)
     overwrite: bool = False
 
@@ -106,11 +106,12 @@ class FollowRequest:
 def run_follow(
     request: FollowRequest, echo: Callable[[str], object], keys: TextIO | None = None
 ) -> int:
-    """Run until the source ends or the user stops it; return 0.
+    """Steer until the source ends or the user stops it; return 0.
 
-    It starts disengaged: a line on `keys` (the terminal) engages or disengages.
+    The pilot starts disengaged: a line on `keys` (by default the terminal) engages or disengages
+    it.
 
-    Raises `AqualvsError` if an input cannot be used, or the source can never work.
+    Raises `AqualvsError` if an input cannot be used, or the source fails for good.
     """
     live, log = replace(request.live, smooth=True), request.out / FOLLOW_CSV
     rig = prepared_rig(live.rig, live.water, no_dome=False)
@@ -152,7 +153,7 @@ def _outputs(link: MavlinkLink, pilot: Pilot, log: Path) -> Iterator[Output]:
 
 
 def listen(pilot: Pilot, keys: TextIO, echo: Callable[[str], object]) -> threading.Thread:
-    """Engage and disengage by lines of a terminal, in a thread of its own."""
+    """Engage and disengage by lines of a terminal, in a separate thread; return the thread."""
 
     def toggle() -> None:
         for _ in keys:
