@@ -1,17 +1,17 @@
 """ArduPilot's dataflash logs, binary (`.BIN`) and text (`.log`): their records and their signals.
 
-A dataflash log describes itself: `FMT` records give the number, length, NumPy-like format and
+A dataflash log describes itself: `FMT` records give the number, length, `struct`-like format and
 columns of every other kind. Binary records start with 0xA3 0x95 and the number of their kind; they
-carry no checksum (https://ardupilot.org/dev/docs/code-overview-adding-a-new-log-message.html). Only
+have no checksum (https://ardupilot.org/dev/docs/code-overview-adding-a-new-log-message.html). Only
 the wanted kinds are decoded.
 
 Records read for each signal, with reasons:
 
-- attitude and heading: `ATT`, the attitude that the autopilot flies by.
-- depth: `CTUN.Alt`, the filtered height that ArduSub flies by, 0 at the surface. `POS` follows home
-  when someone moves it; the filter's own `XKF1.PD` counts from where it started. `CTUN.BAlt` and
-  `BARO.Alt` are the pressure sensor without filter; of several `BARO`, the one in the water is not
-  the first, which sits in the hull.
+- attitude and heading: `ATT`, the attitude that the autopilot controls.
+- depth: `CTUN.Alt`, the filtered height that ArduSub controls, 0 at the surface. `POS` is relative
+  to home, which may be moved; the filter's own `XKF1.PD` is relative to where it started.
+  `CTUN.BAlt` and `BARO.Alt` are the unfiltered pressure sensor; of several `BARO`, the first is
+  inside the hull, and another one in the water.
 - velocity: `XKF1` (`NKF1` of older firmware), of the first core.
 - UTC: `GPS` (leap seconds of 2017 subtracted), else `RTC`.
 """
@@ -53,7 +53,7 @@ _TYPES = {
     "Z": ("S64", 0.0),
     "a": ("S64", 0.0),
 }
-"""Format characters: type, and the factor on numbers (0 for what is no number)."""
+"""By format character: NumPy type, and factor on numbers (0 for text and arrays)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,13 +61,13 @@ class Format:
     """Format of one kind of record, as its `FMT` record describes it."""
 
     name: str  # Kind, such as 'ATT'.
-    length: int  # Bytes of a record, its head of three included.
-    codes: str  # One format character a column.
+    length: int  # Bytes of a record, including its head of three.
+    codes: str  # One format character for each column.
     columns: tuple[str, ...]  # Names of the columns.
 
     @property
     def dtype(self) -> np.dtype[np.void] | None:
-        """A record without its head as a NumPy type; None where the description makes no sense."""
+        """NumPy type of a record without its head; None if the description is inconsistent."""
         if len(self.codes) != len(self.columns) or any(c not in _TYPES for c in self.codes):
             return None
         named = all(self.columns) and len(set(self.columns)) == len(self.columns)
@@ -81,22 +81,21 @@ class Format:
 
 @dataclass(frozen=True, slots=True)
 class Records:
-    """The wanted records of a dataflash log."""
+    """Wanted records of a dataflash log."""
 
-    # Kind to columns; numbers as float64 in the units that the log's text form has. A table without
-    # records is missing. `time_s`, seconds since the autopilot started, is in each.
+    # By kind, the columns; numbers as float64 in the units of the log's text form. Kinds without
+    # records are missing. Each has `time_s`, seconds since the autopilot started.
     tables: Mapping[str, Mapping[str, FloatArray]]
-    # Records of any kind.
+    # Number of records of any kind.
     n_records: int
-    # Stretches without records: place in the file (or line, of text), and length in bytes (or
-    # lines).
+    # Sections without records: offset in the file and length in bytes (for text, line and lines).
     skipped: tuple[tuple[int, int], ...]
-    # Wanted records with an impossible time; they are left out.
+    # Number of wanted records with an impossible time, which are left out.
     n_bogus: int
 
 
 def read_binary(data: bytes) -> Records:
-    """Read wanted kinds of records out of a binary dataflash log."""
+    """Read the wanted kinds of records from a binary dataflash log."""
     places: dict[str, list[int]] = {name: [] for name in _WANTED}
     formats: dict[str, Format] = {}
     n_records, skipped = _scan(data, places, formats)
@@ -111,9 +110,12 @@ def read_binary(data: bytes) -> Records:
 def _scan(
     data: bytes, places: dict[str, list[int]], formats: dict[str, Format]
 ) -> tuple[int, list[tuple[int, int]]]:
-    """Walk over the records; note the places and formats of the wanted ones."""
-    fmt = 0x80
-    fmt_length = 89
+    """Walk over the records; fill in offsets and formats of the wanted ones.
+
+    Returns the number of records, and the sections without records.
+    """
+    # Number and length of the `FMT` record itself.
+    fmt, fmt_length = 0x80, 89
     lengths: dict[int, int] = {fmt: fmt_length}
     lists: dict[int, list[int]] = {}
     skipped: list[tuple[int, int]] = []
@@ -122,12 +124,13 @@ def _scan(
         kind = data[at + 2]
         length = lengths.get(kind, 0) if data[at] == 0xA3 and data[at + 1] == 0x95 else 0
         if not length:
-            # A record that lost bytes overlaps the next ones, so the search begins within it.
+            # A record that lost bytes overlaps the next ones, so the search begins within it. If it
+            # succeeds there, that record is damaged and dropped.
             found = _next_record(data, last + 1 if n_records else 0, lengths)
             begin = at if found is None or found >= at else last
-            swallower = lists.get(data[last + 2]) if begin == last < at else None
-            if swallower and swallower[-1] == last:
-                swallower.pop()
+            damaged = lists.get(data[last + 2]) if begin == last < at else None
+            if damaged and damaged[-1] == last:
+                damaged.pop()
             skipped.append((begin, (size if found is None else found) - begin))
             if found is None:
                 return n_records, skipped
@@ -164,7 +167,7 @@ def _format(data: bytes, at: int) -> tuple[int, Format]:
 
 
 def _next_record(data: bytes, start: int, lengths: Mapping[int, int]) -> int | None:
-    """Return where the first record starts that another, or the end of the file, follows."""
+    """Return the offset of the next record that another, or the end of the file, follows."""
     at = data.find(HEAD, start)
     while at >= 0 and at + 3 <= len(data):
         length = lengths.get(data[at + 2], 0)
@@ -189,7 +192,7 @@ def _decode(octets: np.ndarray, at: np.ndarray, form: Format) -> dict[str, Float
 
 
 def read_text(text: str) -> Records:
-    """Read wanted kinds of records out of the text form of a dataflash log."""
+    """Read the wanted kinds of records from the text form of a dataflash log."""
     columns: dict[str, tuple[str, ...]] = {}
     rows: dict[str, list[list[float]]] = {}
     skipped: list[tuple[int, int]] = []
@@ -221,31 +224,33 @@ def _number(cell: str) -> float:
 def _timed_records(
     tables: Mapping[str, dict[str, FloatArray]], n_records: int, skipped: list[tuple[int, int]]
 ) -> Records:
-    """Give each table its times and leave out records whose time is impossible."""
+    """Add `time_s` to each table and leave out records whose time is impossible."""
     kept: dict[str, dict[str, FloatArray]] = {}
     n_bogus = 0
+    # ArduSub before 3.4 wrote milliseconds.
+    units = {"TimeUS": 1e-6, "TimeMS": 1e-3}
     for name, table in tables.items():
-        # ArduSub before 3.4 wrote milliseconds.
-        units = {"TimeUS": 1e-6, "TimeMS": 1e-3}
-        unit = next((name for name in units if name in table), None)
-        if unit is None:
+        column = next((one for one in units if one in table), None)
+        if column is None:
             continue
-        times = table[unit] * units[unit]
-        sound = _believable(times)
-        n_bogus += int(np.count_nonzero(~sound))
-        if sound.any():
-            kept[name] = {column: values[sound] for column, values in table.items()}
-            kept[name]["time_s"] = times[sound]
+        times = table[column] * units[column]
+        valid = _plausible(times)
+        n_bogus += int(np.count_nonzero(~valid))
+        if valid.any():
+            kept[name] = {one: values[valid] for one, values in table.items()}
+            kept[name]["time_s"] = times[valid]
     return Records(kept, n_records, tuple(skipped), n_bogus)
 
 
-def _believable(times: FloatArray) -> BoolArray:
-    """Return which times are near those of their neighbours in the file."""
-    neighbours = 9
-    usual = ndimage.median_filter(times, min(neighbours, len(times)), mode="nearest")
-    bogus_time_s = 10.0
-    near: BoolArray = np.isfinite(times) & (np.abs(times - usual) <= bogus_time_s)
-    return near if len(times) > 2 else np.isfinite(times)
+def _plausible(times: FloatArray) -> BoolArray:
+    """Return the mask of times near those of their neighbours in the file."""
+    if len(times) <= 2:
+        return np.isfinite(times)
+    # Records have no checksum: damaged ones may have any time. Logging may pause for a while.
+    n_neighbours, max_deviation_s = 9, 10.0
+    median = ndimage.median_filter(times, min(n_neighbours, len(times)), mode="nearest")
+    near: BoolArray = np.isfinite(times) & (np.abs(times - median) <= max_deviation_s)
+    return near
 
 
 _WANTED = ("ATT", "CTUN", "POS", "XKF1", "NKF1", "BARO", "GPS", "RTC", "MODE", "ARM", "EV")
@@ -254,19 +259,19 @@ _Tables = Mapping[str, Mapping[str, FloatArray]]
 
 
 def looks_like_dataflash(head: bytes) -> bool:
-    """Return whether a file begins as a binary dataflash log; a damaged begin is forgiven."""
+    """Return whether a file begins like a binary dataflash log, possibly damaged."""
     return head.startswith(HEAD) or head.count(HEAD + b"\x80") >= 3
 
 
 def looks_like_dataflash_text(head: bytes) -> bool:
-    """Return whether a file begins as a dataflash log in text."""
+    """Return whether a file begins like a dataflash log in text."""
     return head.startswith(b"FMT,") or b"\nFMT," in head
 
 
 def read_dataflash(path: Path) -> VehicleLog:
     """Read a binary dataflash log.
 
-    Raises `SourceError` if nothing that is wanted is in it.
+    Raises `SourceError` if it contains neither attitude nor depth.
     """
     records = read_binary(path.read_bytes())
     return _log(path, records, "dataflash", "bytes")
@@ -275,7 +280,7 @@ def read_dataflash(path: Path) -> VehicleLog:
 def read_dataflash_text(path: Path) -> VehicleLog:
     """Read a dataflash log in text.
 
-    Raises `SourceError` if nothing that is wanted is in it.
+    Raises `SourceError` if it contains neither attitude nor depth.
     """
     text = path.read_text(encoding="utf-8", errors="replace")
     return _log(path, read_text(text), "dataflash text", "lines")
@@ -307,7 +312,7 @@ def _log(path: Path, records: Records, kind: str, unit: str) -> VehicleLog:
         "armed": armed_from,
         "start_utc_s": utc_from,
     }
-    # A vehicle's clock is set once, to about the second.
+    # The vehicle's clock is set once, to about a second.
     utc_sigma_s = 1.0
     damage = damage_notes(records.skipped, unit, "records")
     if records.n_bogus:
@@ -330,7 +335,7 @@ def _log(path: Path, records: Records, kind: str, unit: str) -> VehicleLog:
 
 
 def _first_core(tables: _Tables) -> _Tables:
-    """Keep the first core of each filter, where a log has several."""
+    """Return the tables with records of the first core only, where a filter has several."""
     kept = dict(tables)
     for name in ("XKF1", "NKF1"):
         table = tables.get(name)
@@ -347,8 +352,9 @@ def _signal(
     if table is None or column not in table:
         return None
     values = scale * table[column]
-    deepest_m = 12000.0
-    values = np.where(np.abs(values) <= deepest_m, values, np.nan)
+    # Records have no checksum: damaged ones may contain any number. No sea is deeper.
+    max_depth_m = 12000.0
+    values = np.where(np.abs(values) <= max_depth_m, values, np.nan)
     return Signal.from_samples(table["time_s"] - begin, values)
 
 
@@ -358,7 +364,7 @@ def _angle(
     table = tables.get("ATT")
     if table is None or column not in table:
         return None
-    # Records have no checksum: damaged ones may hold any number.
+    # Records have no checksum: damaged ones may contain any number.
     largest_deg = 720.0
     angle = np.deg2rad(np.where(np.abs(table[column]) <= largest_deg, table[column], np.nan))
     angle = bearing_of(angle) if interpolation is Interpolation.BEARING else wrap(angle)
@@ -405,8 +411,12 @@ def _velocity(tables: _Tables, begin: float) -> tuple[Signal | None, str]:
 
 
 def _armed(tables: _Tables, begin: float) -> tuple[Signal | None, str]:
-    """Return the arming; it is logged at changes only, so a signal without gaps is made of it."""
+    """Return whether the vehicle is armed, and the source.
+
+    It is logged at changes only, so that the signal has no gaps.
+    """
     table = tables.get("ARM")
+    # DATA_ARMED and DATA_DISARMED of ArduPilot's log events.
     armed_event, disarmed_event = 10, 11
     if table is not None and "ArmState" in table:
         times, state, where = table["time_s"], table["ArmState"], "ARM.ArmState"
@@ -442,11 +452,10 @@ def _modes(tables: _Tables, begin: float) -> tuple[tuple[float, str], ...]:
 
 
 def _start_utc(tables: _Tables, begin: float) -> tuple[float | None, str]:
+    """Return the UTC of log time 0, and its source."""
     gps = tables.get("GPS")
-    gps_epoch_s = 315964800.0
-    leap_s = 18.0
-    week_s = 604800.0
-    gps_fix = 3
+    # 1980-01-06, leap seconds between GPS time and UTC since 2017, and least status of a 3D fix.
+    gps_epoch_s, leap_s, week_s, gps_fix = 315964800.0, 18.0, 604800.0, 3
     if gps is not None and {"GWk", "GMS", "Status"} <= set(gps):
         fixed = (gps["Status"] >= gps_fix) & (gps["GWk"] > 0)
         if fixed.any():

@@ -1,8 +1,8 @@
 """MAVLink frames from a telemetry log; only frames of the wanted messages are decoded.
 
-A telemetry log is a chain of records: the time of receipt (UTC, microseconds, big-endian, 8 bytes)
-and a MAVLink 1 or 2 frame (https://mavlink.io/en/guide/serialization.html). The reader follows the
-chain from header to header, and checks and decodes wanted frames only, all of one kind at once.
+A telemetry log is a sequence of records: the time of receipt (UTC, microseconds, big-endian, 8
+bytes) and a MAVLink 1 or 2 frame (https://mavlink.io/en/guide/serialization.html). The reader goes
+from header to header, and checks and decodes only wanted frames, all of one kind at once.
 """
 
 import re
@@ -14,11 +14,14 @@ import numpy as np
 
 from aqualvs.geometry.arrays import BoolArray, IntArray
 
+# First byte of a frame of MAVLink 1 and 2.
 MAGIC_1, MAGIC_2 = 0xFE, 0xFD
+# Bytes of the time of receipt, of a frame's header and of its checksum.
 _STAMP = 8
 _HEADER = {MAGIC_1: 6, MAGIC_2: 10}
 _CHECKSUM = 2
-_SHORTEST = _STAMP + 6 + _CHECKSUM
+_SHORTEST = _STAMP + _HEADER[MAGIC_1] + _CHECKSUM
+# Time of receipt up to the year 2100, and the first byte of a frame.
 _RECORD = re.compile(rb"\x00[\x00-\x0e].{6}[\xfd\xfe]", re.DOTALL)
 
 
@@ -28,11 +31,11 @@ class Message:
 
     name: str  # As in MAVLink's definitions.
     fields: tuple[tuple[str, str], ...]  # Name and NumPy type; extensions are left out.
-    crc_extra: int  # Seed that guards against other definitions of the message.
+    crc_extra: int  # Seed of the checksum, which depends on the definition of the message.
 
     @property
     def dtype(self) -> np.dtype[np.void]:
-        """The payload as a NumPy type."""
+        """NumPy type of the payload."""
         return np.dtype(list(self.fields))
 
 
@@ -77,38 +80,36 @@ MESSAGES: Mapping[int, Message] = {
         "AHRS2", (*_floats("roll pitch yaw altitude"), ("lat", "<i4"), ("lng", "<i4")), 47
     ),
 }
-"""The messages that are read (message_definitions: common.xml, ardupilotmega.xml)."""
+"""By message id: the messages that are read (definitions: common.xml, ardupilotmega.xml)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """All sound frames of one message, in the order of the file."""
+    """All valid frames of one message, in the order of the file."""
 
-    at: IntArray  # Shape (n,): places in the file.
+    at: IntArray  # Shape (n,): offsets in the file.
     received_us: IntArray  # Shape (n,): time of receipt, UTC, in microseconds.
-    source: IntArray  # Shape (n,): sender: 256 times the system's number plus the component's.
+    source: IntArray  # Shape (n,): sender: 256 times the system id plus the component id.
     payload: np.ndarray  # Shape (n,): fields as in `MESSAGES`.
 
-    def __getitem__(self, chosen: BoolArray) -> "Table":
-        """Return the chosen frames."""
-        return Table(
-            self.at[chosen], self.received_us[chosen], self.source[chosen], self.payload[chosen]
-        )
+    def __getitem__(self, mask: BoolArray) -> "Table":
+        """Return the frames marked by a mask (n,)."""
+        return Table(self.at[mask], self.received_us[mask], self.source[mask], self.payload[mask])
 
 
 @dataclass(frozen=True, slots=True)
 class SelectedMessages:
     """Wanted messages of a telemetry log."""
 
-    tables: Mapping[str, Table]  # By message name; messages that did not come are missing.
-    n_frames: int  # Frames of any kind.
-    n_failed: int  # Wanted frames whose checksum is wrong; they are left out.
-    # Stretches that hold no frames: place in the file, and length in bytes.
+    tables: Mapping[str, Table]  # By message name; messages without a frame are missing.
+    n_frames: int  # Number of frames of any kind.
+    n_failed: int  # Number of wanted frames with a wrong checksum, which are left out.
+    # Sections without frames: offset in the file, and length in bytes.
     skipped: tuple[tuple[int, int], ...]
 
 
 def looks_like_frames(head: bytes) -> bool:
-    """Return whether the begin of a file holds two records in a row."""
+    """Return whether the beginning of a file contains two consecutive records."""
     return _next_record(head, 0) is not None
 
 
@@ -130,7 +131,11 @@ def read_frames(data: bytes) -> SelectedMessages:
 
 
 def _scan(data: bytes) -> tuple[dict[tuple[int, int], list[int]], int, list[tuple[int, int]]]:
-    """Follow the chain; return the places of wanted frames by message and version of MAVLink."""
+    """Walk over the records.
+
+    Returns the offsets of wanted frames by message id and first byte, the number of frames, and the
+    sections without frames.
+    """
     places: dict[tuple[int, int], list[int]] = defaultdict(list)
     skipped: list[tuple[int, int]] = []
     size, n_frames, last, at = len(data), 0, 0, 0
@@ -161,24 +166,22 @@ def _scan(data: bytes) -> tuple[dict[tuple[int, int], list[int]], int, list[tupl
 
 
 def _record_end(data: bytes, start: int) -> int | None:
-    """Return where the record that starts here ends; None if none starts here."""
+    """Return the end of the record that starts at `start`; None if there is no record."""
     magic = data[start + _STAMP]
     # Second byte of the microseconds since 1970 in the year 2100; the first is 0.
     latest = 0x0E
     if (magic != MAGIC_2 and magic != MAGIC_1) or data[start] or data[start + 1] > latest:
         return None
+    end = start + _STAMP + _HEADER[magic] + data[start + 9] + _CHECKSUM
     if magic == MAGIC_1:
-        return start + _STAMP + 6 + _CHECKSUM + data[start + 9]
-    flags = data[start + 10]
-    signed = 0x01
-    if flags > signed:
-        return None
-    signature = 13
-    return start + _STAMP + 10 + _CHECKSUM + data[start + 9] + flags * signature
+        return end
+    # Flags are 0, or 1 for a frame with a signature.
+    flags, signature = data[start + 10], 13
+    return end + flags * signature if flags <= 1 else None
 
 
 def _next_record(data: bytes, start: int) -> int | None:
-    """Return where the first record starts that another, or the end of the file, follows."""
+    """Return the offset of the next record that another, or the end of the file, follows."""
     for match in _RECORD.finditer(data, start):
         at = match.start()
         if at + _SHORTEST > len(data):
@@ -194,7 +197,7 @@ def _next_record(data: bytes, start: int) -> int | None:
 def _decode(
     octets: np.ndarray, at: IntArray, message: Message, magic: int
 ) -> tuple[Table, BoolArray]:
-    """Decode frames of one message and version; return them, and which have a right checksum."""
+    """Decode frames of one message and version; return them, and the mask of valid ones."""
     header = _HEADER[magic]
     frame = at + _STAMP
     length = octets[frame + 1].astype(np.int64)
@@ -222,16 +225,16 @@ def _checksums_agree(
     crc = np.full(len(frame), 0xFFFF, np.uint16)
     for i in range(int(length.max(initial=0))):
         going = i < length
-        crc[going] = _fed(crc[going], octets[frame[going] + 1 + i])
-    crc = _fed(crc, np.full(len(frame), crc_extra, np.uint8))
+        crc[going] = _updated(crc[going], octets[frame[going] + 1 + i])
+    crc = _updated(crc, np.full(len(frame), crc_extra, np.uint8))
     end = frame + 1 + length
     agree: BoolArray = (crc & 0xFF == octets[end]) & (crc >> 8 == octets[end + 1])
     return agree
 
 
-def _fed(crc: np.ndarray, octet: np.ndarray) -> np.ndarray:
-    fed: np.ndarray = _CRC[(crc ^ octet) & 0xFF] ^ (crc >> 8)
-    return fed
+def _updated(crc: np.ndarray, octet: np.ndarray) -> np.ndarray:
+    updated: np.ndarray = _CRC[(crc ^ octet) & 0xFF] ^ (crc >> 8)
+    return updated
 
 
 def _crc_table() -> np.ndarray:

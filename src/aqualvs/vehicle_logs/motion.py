@@ -1,7 +1,7 @@
-"""Angular motion as band-passed rates on an even grid, and the correlation of two such motions.
+"""Angular motion as band-passed rates on a uniform grid, and the correlation of two motions.
 
-`rates_of` computes the rates; `scores_of` scores the agreement at every time offset, `match_at`
-that at one offset, sample by sample.
+`rates_of` computes the rates; `scores_of` scores the agreement at every time offset, `match_at` at
+one offset, sample by sample.
 """
 
 import math
@@ -15,21 +15,22 @@ from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.vehicle_logs.vehicle_log import Interpolation, Signal
 
 STEP_S = 0.05
-"""Step of the grid. Motion faster than the smoothing below is noise: a finer step adds nothing."""
+"""Step of the grid: a finer one would resolve only what the smoothing below removes."""
 SMOOTHING_S = 0.4
-"""Standard deviation of the window over which a rate is taken. Posture's noise of 0.4 degrees at
-25 Hz leaves a rate of 0.1 degrees a second; a vehicle's own motion is slower than this window."""
+"""Standard deviation of the Gaussian window of a rate. Noise of the posture of 0.4 degrees at 25 Hz
+leaves 0.1 degrees/s; a vehicle's own motion is slower than this window."""
 _TREND_S = 5.0
-"""Slower changes are left out: the net's own bearing along a cage, drift of a compass."""
+"""Standard deviation of the window whose mean is subtracted, which removes slower changes: the
+net's own bearing along a cage, the drift of a compass."""
 
 
 @dataclass(frozen=True, slots=True)
 class Rates:
     """Band-passed rates of one angle."""
 
-    start_s: float  # Time of the first; they are `STEP_S` apart.
-    rate: FloatArray  # Shape (n,): radians a second, extreme ones cut down; 0 where not valid.
-    valid: BoolArray  # Shape (n,): where there are enough values.
+    start_s: float  # Time of the first rate; the step is `STEP_S`.
+    rate: FloatArray  # Shape (n,): rad/s, with outliers clipped; 0 where not valid.
+    valid: BoolArray  # Shape (n,): False where there are too few values.
 
     @property
     def time_s(self) -> FloatArray:
@@ -44,59 +45,56 @@ def rates_of(angle: Signal, start_s: float, end_s: float) -> Rates:
     values, valid = unwrapped.at(times)
     rate, known = _slopes(np.where(valid, values, 0.0), valid)
     rate = rate - _smooth(np.where(known, rate, 0.0), known)
-    clip_sigmas = 4.0
-    # Rates beyond both are clipped to the larger one, so that no single false reading decides.
-    clip_rate = math.radians(5.0)
+    # Rates are clipped to the larger of these limits, so that no single false reading decides.
+    clip_sigmas, clip_rate = 4.0, math.radians(5.0)
     limit = max(clip_sigmas * robust_sigma(rate[known]), clip_rate)
     return Rates(float(times[0]), np.where(known, np.clip(rate, -limit, limit), 0.0), known)
 
 
 def without_outliers(angle: ArrayLike, valid: ArrayLike) -> BoolArray:
-    """Return which valid samples are not far from their neighbours.
+    """Return the mask of valid samples near their neighbours (a Hampel filter).
 
     Parameters
     ----------
     angle : array, shape (n,)
         Radians, in the order of time.
     valid : bool array, shape (n,)
-        Samples that count at all.
+        Samples to consider.
     """
     values, kept = np.asarray(angle, float), np.array(valid, bool)
     kept &= np.isfinite(values)
-    hampel_samples = 11
-    if np.count_nonzero(kept) < hampel_samples:
+    # Samples of the running median; deviations up to the larger of both limits are kept.
+    n_samples, max_sigmas, max_angle = 11, 5.0, math.radians(2.0)
+    if np.count_nonzero(kept) < n_samples:
         return kept
     chosen = values[kept]
-    off = np.abs(chosen - ndimage.median_filter(chosen, hampel_samples, mode="nearest"))
-    hampel_sigmas = 5.0
-    hampel_angle = math.radians(2.0)
-    limit = max(hampel_sigmas * 1.4826 * float(np.median(off)), hampel_angle)
-    kept[kept] = off <= limit
+    deviation = np.abs(chosen - ndimage.median_filter(chosen, n_samples, mode="nearest"))
+    kept[kept] = deviation <= max(max_sigmas * robust_sigma(deviation), max_angle)
     return kept
 
 
 def robust_sigma(values: FloatArray) -> float:
-    """Return the standard deviation by the median of the magnitudes; 0 for none."""
+    """Return the standard deviation by the median of the magnitudes; 0 for no values."""
     return 1.4826 * float(np.median(np.abs(values))) if len(values) else 0.0
 
 
 def _slopes(values: FloatArray, valid: BoolArray) -> tuple[FloatArray, BoolArray]:
-    """Return the slope of the line that fits best within a Gaussian window about each sample.
+    """Return the slope of the best line in a Gaussian window around each sample, and where valid.
 
-    Unlike a difference, it copes with missing samples and averages the others.
+    Unlike differences, this tolerates missing samples and averages over the others.
     """
     reach = math.ceil(3.0 * SMOOTHING_S / STEP_S)
     lag = STEP_S * np.arange(-reach, reach + 1)
     window = np.exp(-0.5 * (lag / SMOOTHING_S) ** 2)
     centred = np.where(valid, values - values[valid].mean(), 0.0) if valid.any() else values
     count = valid.astype(float)
-    # Reversed kernels, because convolution reverses them.
+    # Odd kernels are negated, because convolution reverses them.
     s0, s2 = _convolve(count, window), _convolve(count, window * lag**2)
     s1, sx = _convolve(count, -window * lag), _convolve(centred, window)
     stx = _convolve(centred, -window * lag)
     spread = s0 * s2 - s1**2
     whole = window.sum()
-    # Share of the window that must hold values.
+    # Least share of the window's weight with values.
     min_cover = 0.5
     known = (s0 >= min_cover * whole) & (spread >= min_cover**2 * whole * window @ lag**2)
     slope = (s0 * stx - s1 * sx) / np.where(known, spread, 1.0)
@@ -124,7 +122,7 @@ def _convolve(values: FloatArray, window: FloatArray) -> FloatArray:
 
 
 def correlation_time(first: Rates, second: Rates) -> float:
-    """Return how much time one independent pair of values takes, in seconds (Bartlett, 1946).
+    """Return the time per independent pair of values, in seconds (Bartlett, 1946).
 
     It is the integral over lag of the product of both autocorrelations.
     """
@@ -146,11 +144,11 @@ def _autocorrelation(rates: Rates, reach: int) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class Channel:
-    """One angle, seen from the net and logged by the vehicle."""
+    """Rates of one angle, measured relative to the net and logged by the vehicle."""
 
     name: str  # 'yaw' or 'pitch'.
     seen: Rates  # Of the posture, in dive time.
-    logged: Rates  # Of the vehicle, in log time. Posture's angles change opposite to the vehicle's.
+    logged: Rates  # Of the vehicle, in log time; of opposite sign.
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,7 +158,7 @@ class OffsetScores:
     offset_s: FloatArray  # Shape (k,): log time minus dive time, rising by `STEP_S`.
     # Shape (k,): logarithm of the likelihood ratio between "the motions agree" and "they do not".
     score: FloatArray
-    # Shape (k,): time for which both are known, of the channel that has most.
+    # Shape (k,): duration for which both rates are valid, of the channel with the longest.
     overlap_s: FloatArray
 
 
@@ -186,7 +184,7 @@ def scores_of(channels: tuple[Channel, ...]) -> OffsetScores:
 
 
 def _correlations(seen: Rates, logged: Rates) -> tuple[FloatArray, FloatArray]:
-    """Return the correlation coefficient, and the pairs it rests on, for every lag."""
+    """Return the correlation coefficient and the number of valid pairs for every lag."""
     a, b = seen.rate, logged.rate
     size = fft.next_fast_len(len(a) + len(b) - 1, real=True)
     fa, fa2, fma = (fft.rfft(x, size) for x in (a, a**2, seen.valid.astype(float)))
@@ -211,21 +209,21 @@ def _correlations(seen: Rates, logged: Rates) -> tuple[FloatArray, FloatArray]:
 class Match:
     """Seen and logged rates of a channel at one offset, sample by sample of the seen ones."""
 
-    # Shape (n,): seen rate less what the logged one predicts; less the mean only, where it is not
-    # known.
+    # Shape (n,): seen rate minus its prediction from the logged one; the seen rate itself where the
+    # logged one is not valid.
     residual: FloatArray
-    # Shape (n,): where both rates are known.
+    # Shape (n,): where both rates are valid.
     predicted: BoolArray
-    # Share of the vehicle's motion that the net shows: 1 for a plane, still net.
+    # Ratio of the seen to the (opposite) logged motion: 1 for a plane, still net.
     gain: float
-    # Shape (n,): change of the logged rate with time, 0 where not known.
+    # Shape (n,): derivative of the logged rate, 0 where not valid.
     slope: FloatArray
-    # Between seen and opposite logged rates.
+    # Of seen and opposite logged rates.
     correlation: float
 
 
 def match_at(channel: Channel, offset_s: float) -> Match:
-    """Return how a channel agrees at one offset, not bound to the grid."""
+    """Return the agreement of a channel at one offset, which need not be on the grid."""
     seen, logged = channel.seen, channel.logged
     where = (seen.time_s + offset_s - logged.start_s) / STEP_S
     below = np.floor(where).astype(np.int64)
@@ -251,7 +249,7 @@ def match_at(channel: Channel, offset_s: float) -> Match:
 def _between(
     values: FloatArray, below: IntArray, share: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return values between grid points, and their slopes (central differences)."""
+    """Interpolate values and their slopes (central differences) between grid points."""
     last = len(values) - 1
     before, first, second, after = (
         values[np.clip(below + step, 0, last)] for step in (-1, 0, 1, 2)

@@ -2,8 +2,8 @@
 
 Columns of a table, in any order: `time_s` (seconds on any clock) or `time` (UTC, ISO 8601);
 `depth_m`, positive down; `heading_deg`, clockwise from north; and optionally `roll_deg` and
-`pitch_deg`. At least one of depth and heading is required. An empty cell is a value that was not
-logged. Other columns are ignored, unless they look like one of these in another unit.
+`pitch_deg`. At least one of depth and heading is required. An empty cell is a missing value. Other
+columns are ignored, but names that resemble these, or have another unit, are refused.
 """
 
 import csv
@@ -38,8 +38,10 @@ from aqualvs.vehicle_logs.vehicle_log import (
 TIME_COLUMNS = ("time_s", "time")
 VALUE_COLUMNS = ("depth_m", "heading_deg", "roll_deg", "pitch_deg")
 _COLUMNS = TIME_COLUMNS + VALUE_COLUMNS
+# Quantities by their names without unit, and units that other programs use.
 _STEMS = {name.rsplit("_", 1)[0]: name for name in VALUE_COLUMNS} | {"yaw": "heading_deg"}
 _UNITS = frozenset({"", "m", "cm", "mm", "ft", "deg", "rad", "degrees", "radians", "cdeg"})
+# Largest plausible magnitudes, in these units.
 _LARGEST = {"depth_m": 12000.0, "heading_deg": 720.0, "roll_deg": 360.0, "pitch_deg": 180.0}
 
 
@@ -68,7 +70,7 @@ def read_csv_log(path: Path) -> VehicleLog:
 
 
 def _rows(text: str, path: Path) -> list[tuple[int, list[str]]]:
-    """Return the lines that hold anything, with their numbers."""
+    """Return the lines that are not empty, with their numbers."""
     reader = csv.reader(text.splitlines())
     try:
         return [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
@@ -96,7 +98,7 @@ def _columns(names: list[str], path: Path) -> tuple[list[str], list[str]]:
 
 
 def _refuse_near_misses(names: list[str], wanted: tuple[str, ...] | list[str], path: Path) -> None:
-    """Refuse a column that means a missing one but writes it otherwise, or in another unit."""
+    """Refuse a column that resembles a missing one, or has another unit."""
     for name in names:
         if name in _COLUMNS:
             continue
@@ -177,9 +179,9 @@ def _check_times(time_s: FloatArray, lines: list[int], path: Path) -> None:
 
 def _check_depths(depth_m: FloatArray, lines: list[int], path: Path) -> None:
     known = depth_m[np.isfinite(depth_m)]
-    # Greatest height above the surface, from waves and the sensor's zero.
-    above_surface_m = -2.0
-    if len(known) and np.median(known) < above_surface_m:
+    # Waves and the zero of the sensor explain smaller heights above the surface.
+    min_depth_m = -2.0
+    if len(known) and np.median(known) < min_depth_m:
         i = int(np.nanargmin(depth_m))
         raise SourceError(
             f"{path}: line {lines[i]}: depth_m is {depth_m[i]:g}, above the surface; write depths "
@@ -198,9 +200,9 @@ def _log(
     def angle(name: str, interpolation: Interpolation) -> Signal | None:
         if name not in table:
             return None
-        turned = np.deg2rad(table[name])
-        turned = bearing_of(turned) if interpolation is Interpolation.BEARING else wrap(turned)
-        return Signal.from_samples(time_s, turned, interpolation)
+        values = np.deg2rad(table[name])
+        values = bearing_of(values) if interpolation is Interpolation.BEARING else wrap(values)
+        return Signal.from_samples(time_s, values, interpolation)
 
     return VehicleLog(
         name=str(path),
@@ -236,8 +238,7 @@ def read_vehicle_log(path: str | Path) -> VehicleLog:
     Returns
     -------
     log : VehicleLog
-        Of a file that is cut short or damaged in places, what is readable; `log.notes` says what is
-        not.
+        Of a truncated or damaged file, the readable part; `log.notes` describes the rest.
 
     Raises
     ------
@@ -257,7 +258,7 @@ def read_vehicle_log(path: str | Path) -> VehicleLog:
 
 
 def _reader(head: bytes, path: Path) -> Callable[[Path], VehicleLog]:
-    """Return the function that reads a file with such content."""
+    """Return the function that reads a file with this beginning."""
     if looks_like_dataflash(head):
         return read_dataflash
     if looks_like_dataflash_text(head):

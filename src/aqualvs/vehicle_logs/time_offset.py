@@ -1,12 +1,12 @@
-"""Time offset between a dive's clock and the vehicle's, from the motion seen by both, or from UTC.
+"""Time offset between the clocks of dive and vehicle, from common motion or from UTC.
 
-The net stands still: when the vehicle turns right, the net's far normal turns left in the dome's
-frame, and when its nose rises, the normal falls. So posture yaw changes opposite to heading, and
-posture pitch opposite to the vehicle's pitch. `find_time_offset` compares rates between about 0.03
-and 0.5 Hz: the bearing of the net itself, which changes as the vehicle moves along a cage, and the
-compass's drift are slower.
+The net is taken as still: when the vehicle turns right, the net's far normal turns left in the
+dome's frame, and when its nose rises, the normal falls. So posture yaw changes opposite to heading,
+and posture pitch opposite to the vehicle's pitch. `find_time_offset` compares rates between about
+0.03 and 0.5 Hz: the bearing of the net itself, which changes as the vehicle moves along a cage, and
+the compass's drift are slower.
 
-`offset_from_clocks` compares the log's UTC with the time that a video's container states.
+`offset_from_clocks` compares the log's UTC with the creation time in a video's container.
 """
 
 import contextlib
@@ -32,8 +32,9 @@ from aqualvs.vehicle_logs.motion import (
 from aqualvs.vehicle_logs.vehicle_log import FIRST_BELIEVED_UTC_S, Signal, VehicleLog, utc_seconds
 
 _LOBE_S = 1.0
-"""Offsets within this of the best one belong to the same peak and are no rivals."""
+"""Offsets within this distance of the best one belong to the same peak."""
 _START_SIGMAS = 4.0
+"""Sigmas of the clocks' offset within which the true one is expected."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +42,7 @@ class PostureTrack:
     """Posture over a dive."""
 
     time_s: FloatArray  # Shape (n,): dive time, increasing.
-    # Shape (n,): posture to the net in radians (paper, Eq. 24-26); anything where not valid.
+    # Shape (n,): posture to the net in radians (paper, Eq. 24-26); undefined where not valid.
     yaw: FloatArray
     pitch: FloatArray
     # Shape (n,): where the posture is valid.
@@ -59,16 +60,16 @@ class TimeOffset:
 
     offset_s: float  # Seconds.
     sigma_s: float  # Its standard deviation.
-    # Between the vehicle's and the net's motion at this offset, 1 for full agreement; None where
-    # the offset does not come from motion.
+    # Of the vehicle's and the net's motion at this offset, 1 for full agreement; None if the offset
+    # does not come from motion.
     correlation: float | None
-    # In words, where it comes from.
+    # Description of the source.
     how: str
 
 
 @dataclass(frozen=True, slots=True)
 class OffsetRefusal:
-    """No offset, and why; falsy."""
+    """Refusal of an offset, with the reason; falsy."""
 
     reason: str  # One line, with the remedy.
 
@@ -85,16 +86,18 @@ def find_time_offset(
     Parameters
     ----------
     log : VehicleLog
-        With heading, pitch or both.
+        Log with heading, pitch or both.
+    posture_track : PostureTrack
+        Posture of the dive.
     start : TimeOffset, optional
-        What clocks say. Where motion alone leaves a doubt, only offsets within four of its sigmas
+        Offset by the clocks. If motion alone is ambiguous, only offsets within four of its sigmas
         are considered.
 
     Returns
     -------
     offset : TimeOffset or OffsetRefusal
-        Refused, where no offset clearly explains the motion best: too little motion or overlap,
-        or motion that repeats itself.
+        A refusal if no offset is clearly the best: too little motion or overlap, or motion that
+        repeats itself.
 
     Notes
     -----
@@ -102,9 +105,9 @@ def find_time_offset(
     every offset; the score is the sum of -n/2 log(1 - rho²) over channels with the right sign, n
     the number of independent pairs (Bartlett 1946). The best offset must explain blocks of three
     seconds better than every rival and than no motion at all, by 2.5 standard deviations of the
-    blocks' votes (Vuong 1989). It is then refined by weighted least squares; its sigma
-    comes from the scatter of the blocks' scores (sandwich estimate), so that it holds for residuals
-    of any colour.
+    blocks' differences (Vuong 1989). It is then refined by weighted least squares; its sigma comes
+    from the scatter of the blocks' scores (sandwich estimate), so that it holds for correlated
+    residuals.
     """
     channels = _channels(log, posture_track)
     if isinstance(channels, OffsetRefusal):
@@ -123,7 +126,7 @@ def find_time_offset(
 
 
 def _channels(log: VehicleLog, track: PostureTrack) -> tuple[Channel, ...] | OffsetRefusal:
-    """Pair the angles that both sides have, on one grid each."""
+    """Return the rates of the angles that both dive and log have, each on one grid."""
     pairs = [("yaw", track.yaw, log.heading), ("pitch", track.pitch, log.pitch)]
     logged = [(name, seen, angle) for name, seen, angle in pairs if angle is not None]
     if not logged:
@@ -190,10 +193,10 @@ def _clear_peak(
 def _peaks(scores: OffsetScores, allowed: BoolArray) -> list[float]:
     """Return the offsets of the best peaks, the highest first."""
     height = np.where(allowed, scores.score, 0.0)
-    # Padded, since a peak may be the first or the last.
     # Imported here: it takes a second, and only this function needs it.
     from scipy.signal import find_peaks
 
+    # Padded, since a peak may be the first or the last.
     tops, _ = find_peaks(np.pad(height, 1), height=1e-9, distance=round(_LOBE_S / STEP_S))
     ranked = tops[np.argsort(height[tops - 1])[::-1]] - 1
     n_rivals = 30
@@ -203,21 +206,21 @@ def _peaks(scores: OffsetScores, allowed: BoolArray) -> list[float]:
 def _margin(
     channels: tuple[Channel, ...], best: float, rivals: list[float]
 ) -> tuple[float, float | None]:
-    """Return by how many sigmas the best explains the blocks better, and than which rival.
+    """Return the margin of the best offset over the strongest rival, in sigmas, and that rival.
 
-    The rival is None where it is the absence of common motion.
+    The rival is None if it is the hypothesis that there is no common motion.
     """
     at_best = [match_at(channel, best) for channel in channels]
     scales = [_scale(match) for match in at_best]
-    still = [c.seen.rate for c in channels]
+    without_motion = [c.seen.rate for c in channels]
     chosen = [match.residual for match in at_best]
-    worst, which = _vote(still, chosen, scales), None
+    least, strongest = _advantage(without_motion, chosen, scales), None
     for rival in rivals:
         others = [match_at(channel, rival).residual for channel in channels]
-        votes = _vote(others, chosen, scales)
-        if votes < worst:
-            worst, which = votes, rival
-    return worst, which
+        advantage = _advantage(others, chosen, scales)
+        if advantage < least:
+            least, strongest = advantage, rival
+    return least, strongest
 
 
 def _scale(match: Match) -> float:
@@ -225,8 +228,8 @@ def _scale(match: Match) -> float:
     return spread if spread > 0.0 else 1.0
 
 
-def _vote(others: list[FloatArray], chosen: list[FloatArray], scales: list[float]) -> float:
-    """Return by how many sigmas the chosen residuals are smaller, block by block."""
+def _advantage(others: list[FloatArray], chosen: list[FloatArray], scales: list[float]) -> float:
+    """Return by how many sigmas the chosen residuals are smaller, from sums over blocks."""
     gain = np.zeros(len(chosen[0]))
     for other, residual, scale in zip(others, chosen, scales, strict=True):
         gain += (other / scale) ** 2 - (residual / scale) ** 2
@@ -237,7 +240,7 @@ def _vote(others: list[FloatArray], chosen: list[FloatArray], scales: list[float
 
 def _blocks(values: FloatArray) -> FloatArray:
     """Return the sums over blocks."""
-    # Longer than a motion lasts, so that blocks are independent.
+    # Longer than a single motion, so that blocks are independent.
     block_s = 3.0
     return np.add.reduceat(values, np.arange(0, len(values), round(block_s / STEP_S)))
 
@@ -245,11 +248,10 @@ def _blocks(values: FloatArray) -> FloatArray:
 def _refine(channels: tuple[Channel, ...], start_s: float) -> TimeOffset:
     """Return the offset that fits best by weighted least squares, with its sandwich sigma."""
     offset = start_s
-    iterations = 8
-    converged_s = 1e-5
-    for _ in range(iterations):
-        pull, stiffness = _normal_equation(channels, offset, _weights(channels, offset))
-        step = float(np.clip(pull.sum() / stiffness.sum(), -_LOBE_S / 4, _LOBE_S / 4))
+    max_iterations, converged_s = 8, 1e-5
+    for _ in range(max_iterations):
+        gradient, curvature = _normal_equation(channels, offset, _weights(channels, offset))
+        step = float(np.clip(gradient.sum() / curvature.sum(), -_LOBE_S / 4, _LOBE_S / 4))
         offset += step
         if abs(step) < converged_s:
             break
@@ -260,12 +262,12 @@ def _refine(channels: tuple[Channel, ...], start_s: float) -> TimeOffset:
         f"{channel.name} (correlation {match.correlation:.2f}, share {match.gain:.2f})"
         for channel, match in zip(channels, matches, strict=True)
     ]
-    words = f"motion over {shared_s:.0f} s: {' and '.join(parts)}"
-    return TimeOffset(offset, _sigma(channels, offset), best, words)
+    how = f"motion over {shared_s:.0f} s: {' and '.join(parts)}"
+    return TimeOffset(offset, _sigma(channels, offset), best, how)
 
 
 def _weights(channels: tuple[Channel, ...], offset_s: float) -> list[FloatArray]:
-    """Return Huber's weights of every channel's samples, over the residuals' variance."""
+    """Return Huber's weights of each channel's samples, divided by the residuals' variance."""
     weights = []
     huber = 1.5
     for channel in channels:
@@ -279,57 +281,56 @@ def _weights(channels: tuple[Channel, ...], offset_s: float) -> list[FloatArray]
 def _normal_equation(
     channels: tuple[Channel, ...], offset_s: float, weights: list[FloatArray]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return every sample's pull on the offset, and its stiffness.
+    """Return the terms (n,) of each sample in the gradient and the curvature of the cost.
 
-    A later offset changes the residual by the gain times the slope of the logged rate.
+    The derivative of a residual by the offset is the gain times the slope of the logged rate.
     """
     n = len(channels[0].seen.rate)
-    pull, stiffness = np.zeros(n), np.full(n, 1e-300)
+    gradient, curvature = np.zeros(n), np.full(n, 1e-300)
     for channel, weight in zip(channels, weights, strict=True):
         match = match_at(channel, offset_s)
         change = match.gain * match.slope
-        pull -= np.where(match.predicted, weight * change * match.residual, 0.0)
-        stiffness += np.where(match.predicted, weight * change**2, 0.0)
-    return pull, stiffness
+        gradient -= np.where(match.predicted, weight * change * match.residual, 0.0)
+        curvature += np.where(match.predicted, weight * change**2, 0.0)
+    return gradient, curvature
 
 
 def _sigma(channels: tuple[Channel, ...], offset_s: float) -> float:
-    """Return the standard deviation of the offset from the scatter of the blocks' pulls.
+    """Return the standard deviation of the offset from the scatter of the blocks' gradients.
 
-    The pull's derivative is taken by differences: noise in the log makes its slopes, and with them
-    the stiffness, too large. Each block's pull is raised by its own share in finding the offset
-    (MacKinnon & White 1985, HC3), which matters when few turns carry it.
+    The derivative of the gradient is taken by differences: noise in the log makes its slopes, and
+    with them the curvature, too large. Each block's gradient is increased according to its leverage
+    (MacKinnon & White 1985, HC3), which matters if the offset depends on a few turns.
     """
     weights = _weights(channels, offset_s)
-    pull, stiffness = _normal_equation(channels, offset_s, weights)
-    shares = _blocks(stiffness) / stiffness.sum()
-    sums = _blocks(pull) / np.maximum(1.0 - shares, 0.1)
+    gradient, curvature = _normal_equation(channels, offset_s, weights)
+    shares = _blocks(curvature) / curvature.sum()
+    sums = _blocks(gradient) / np.maximum(1.0 - shares, 0.1)
     probe_s = 0.1
     later, _ = _normal_equation(channels, offset_s + probe_s, weights)
     earlier, _ = _normal_equation(channels, offset_s - probe_s, weights)
-    fall = float(earlier.sum() - later.sum()) / (2.0 * probe_s)
-    slope = fall if fall > 0.0 else float(stiffness.sum())
+    derivative = float(earlier.sum() - later.sum()) / (2.0 * probe_s)
+    slope = derivative if derivative > 0.0 else float(curvature.sum())
     return math.sqrt(float(sums @ sums)) / slope
 
 
 def _compared(found: TimeOffset, start: TimeOffset) -> TimeOffset:
-    """Add a comparison with the offset by the clocks."""
-    off = start.offset_s - found.offset_s
-    doubt = math.hypot(found.sigma_s, start.sigma_s)
-    verdict = "agree" if abs(off) <= _START_SIGMAS * doubt else "are not to be trusted"
-    how = f"{found.how}; the clocks {verdict} ({off:+.1f} s off)"
-    return TimeOffset(found.offset_s, found.sigma_s, found.correlation, how)
+    """Return the offset with a comparison with that of the clocks in its description."""
+    difference = start.offset_s - found.offset_s
+    sigma = math.hypot(found.sigma_s, start.sigma_s)
+    verdict = "agree" if abs(difference) <= _START_SIGMAS * sigma else "are not to be trusted"
+    return replace(found, how=f"{found.how}; the clocks {verdict} ({difference:+.1f} s off)")
 
 
 VIDEO_UTC_SIGMA_S = 5.0
-"""Containers state whole seconds, some write them when recording ends or the file is copied, and
-few cameras' clocks are set to better than this."""
+"""Standard deviation of a video's creation time: containers state whole seconds, some the end of
+recording or the time of copying, and few cameras' clocks are set more accurately."""
 
 
 def dive_start_utc(video: str | Path) -> float | None:
-    """Return the UTC at which a video says that it was created, in seconds since 1970.
+    """Return the UTC of a video's creation according to its container, in seconds since 1970.
 
-    Only the container's `creation_time` counts; times of the file change when it is copied.
+    Only the container's `creation_time` is used; times of the file change when it is copied.
 
     Parameters
     ----------
@@ -339,7 +340,7 @@ def dive_start_utc(video: str | Path) -> float | None:
     Returns
     -------
     start_utc_s : float or None
-        None where the container does not state it, or states the zero of its calendar.
+        None if the container does not state it, or states the zero of its calendar.
     """
     import av
 
@@ -359,16 +360,16 @@ def dive_start_utc(video: str | Path) -> float | None:
 def offset_from_clocks(
     log: VehicleLog, dive_start_utc_s: float | None, sigma_s: float = VIDEO_UTC_SIGMA_S
 ) -> TimeOffset | OffsetRefusal:
-    """Return the offset that the clocks of dive and log give.
+    """Return the offset by the clocks of dive and log.
 
     Parameters
     ----------
     log : VehicleLog
-        With `start_utc_s`.
+        Log with `start_utc_s`.
     dive_start_utc_s : float or None
         UTC of dive time 0.
     sigma_s : float
-        How far to trust it.
+        Standard deviation of `dive_start_utc_s`.
     """
     if log.start_utc_s is None or log.start_utc_sigma_s is None:
         return OffsetRefusal(f"{log.name} does not know the time of day")

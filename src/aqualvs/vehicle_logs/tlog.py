@@ -2,16 +2,16 @@
 
 Messages read for each signal, with reasons:
 
-- attitude and heading: `ATTITUDE`, which carries the autopilot's time and comes at the highest
-  rate. Where it is missing, heading from `GLOBAL_POSITION_INT` (hundredths of a degree), then
-  `VFR_HUD` (whole degrees).
-- depth: `GLOBAL_POSITION_INT.relative_alt`, height above home, which ArduSub puts at the surface.
-  `VFR_HUD.alt` is above mean sea level and 0 without a home; `AHRS2.altitude` comes from the spare
-  estimator, in centimetres. `SCALED_PRESSURE2`, the outer sensor, shows changes only, because the
-  log does not contain the pressure at the surface. `choose_depth` takes the first that moves.
+- attitude and heading: `ATTITUDE`, which has the autopilot's time and the highest rate. If it is
+  missing, heading from `GLOBAL_POSITION_INT` (hundredths of a degree), then `VFR_HUD` (whole
+  degrees).
+- depth: `GLOBAL_POSITION_INT.relative_alt`, height above home, which ArduSub sets at the surface.
+  `VFR_HUD.alt` is above mean sea level and 0 without a home; `AHRS2.altitude` is that of the backup
+  estimator, in centimetres. `SCALED_PRESSURE2`, the outer sensor, gives changes only, because the
+  log does not contain the pressure at the surface. `choose_depth` takes the first that changes.
 - velocity: `LOCAL_POSITION_NED`, then `GLOBAL_POSITION_INT` in cm/s.
 
-`TelemetryClock` puts all messages on the autopilot's clock, through reboots, and places it in UTC.
+`TelemetryClock` gives all messages times of the autopilot's clock, across reboots, and its UTC.
 """
 
 from collections.abc import Mapping, Sequence
@@ -35,14 +35,14 @@ from aqualvs.vehicle_logs.vehicle_log import (
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """A depth that a log holds."""
+    """Candidate for the depth in a log."""
 
-    label: str  # Where it stands in the log.
-    depth: Signal | None  # Metres, positive down; None where the log does not have it.
+    label: str  # Message or record, and field.
+    depth: Signal | None  # Metres, positive down; None if the log does not have it.
 
 
 def damage_notes(skipped: Sequence[tuple[int, int]], unit: str, what: str) -> list[str]:
-    """Return a note on the stretches of a file that hold none of what it should, if any."""
+    """Return a note on unreadable sections of a file, if any; `skipped`: offsets and lengths."""
     if not skipped:
         return []
     lost = sum(length for _, length in skipped)
@@ -55,24 +55,24 @@ def damage_notes(skipped: Sequence[tuple[int, int]], unit: str, what: str) -> li
 def choose_depth(
     candidates: Sequence[Candidate], pressure_depth: Signal | None
 ) -> tuple[Candidate | None, str | None]:
-    """Return the first candidate that is there and moves, and a note where one does not.
+    """Return the first candidate with a changing depth, and a note on one that is stuck.
 
     Parameters
     ----------
     candidates : sequence of Candidate
-        The best first.
+        In the order of preference.
     pressure_depth : Signal or None
-        Depth by the outer pressure alone, up to a constant. An estimate that stands still
-        while the pressure changes is the estimate of a filter without origin, not a depth.
+        Depth by the outer pressure, up to a constant. A filter without an origin reports a constant
+        instead of the depth, although the pressure changes.
     """
     dived = 0.0 if pressure_depth is None else _span(pressure_depth)
     note = None
-    stuck_share = 0.1
-    dived_m = 0.5
+    # Shortest dive, in metres, that shows it, and share of it below which a candidate is stuck.
+    min_dive_m, stuck_share = 0.5, 0.1
     for candidate in candidates:
         if candidate.depth is None:
             continue
-        if dived > dived_m and _span(candidate.depth) < stuck_share * dived:
+        if dived > min_dive_m and _span(candidate.depth) < stuck_share * dived:
             note = note or (
                 f"{candidate.label} stands still while the pressure changes by {dived:.1f} m of "
                 "water; not used"
@@ -92,22 +92,22 @@ _BOOT = "time_boot_ms"
 
 @dataclass(frozen=True, slots=True)
 class TelemetryClock:
-    """Log time of every message."""
+    """Clock of a telemetry log, which gives the log time of every message."""
 
-    at: IntArray  # Shape (n,): places in the file of the messages that define the clock.
+    at: IntArray  # Shape (n,): offsets in the file of the messages that define the clock.
     log_s: FloatArray  # Shape (n,): their log time.
-    boot_at: IntArray  # Shape (k,): place in the file from which each run of the autopilot counts.
+    boot_at: IntArray  # Shape (k,): offset in the file at which each run of the autopilot begins.
     boot_s: FloatArray  # Shape (k,): log time at which each run began.
-    # UTC of log time 0, and how far to trust it.
+    # UTC of log time 0, and its standard deviation; None if unknown.
     start_utc_s: float | None
     start_utc_sigma_s: float | None
-    # Reboots, and steps of the computer's clock.
+    # On reboots, and steps of the computer's clock.
     notes: tuple[str, ...]
 
     def of(self, table: Table) -> FloatArray:
         """Return the log time of a table's messages.
 
-        A message without time of its own takes it from its neighbours in the file.
+        That of messages without a time stamp is interpolated between their neighbours in the file.
         """
         if _BOOT not in (table.payload.dtype.names or ()) or not len(self.boot_at):
             return np.interp(table.at, self.at, self.log_s)
@@ -125,15 +125,16 @@ def telemetry_clock(tables: Mapping[str, Table]) -> TelemetryClock:
         return _with_utc(table, received - received[0], none.astype(np.int64), none, ())
     table = max(timed, key=lambda t: len(t.at))
     boot, received = table.payload[_BOOT] / 1e3, table.received_us / 1e6
+    # A larger step back, in seconds, is a reboot.
     reboot_s = 2.0
     firsts = np.concatenate([[0], 1 + np.flatnonzero(np.diff(boot) < -reboot_s)])
     starts = [-float(boot[0])]
     for before, first, end in zip(firsts, firsts[1:], [*firsts[2:], len(boot)], strict=False):
-        # The fastest messages to either side tell how much time passed in between.
+        # The messages with the least delay on either side give the time in between.
         old = slice(max(before, first - 100), first)
         new = slice(first, min(end, first + 100))
-        gone = np.min(received[new] - boot[new]) - np.min(received[old] - boot[old])
-        starts.append(starts[-1] + float(gone))
+        elapsed = np.min(received[new] - boot[new]) - np.min(received[old] - boot[old])
+        starts.append(starts[-1] + float(elapsed))
     notes = (f"the autopilot restarted {len(firsts) - 1} times",) if len(firsts) > 1 else ()
     boot_at, boot_s = table.at[firsts].copy(), np.array(starts)
     boot_at[0] = 0
@@ -144,16 +145,17 @@ def telemetry_clock(tables: Mapping[str, Table]) -> TelemetryClock:
 def _with_utc(
     table: Table, log_s: FloatArray, boot_at: IntArray, boot_s: FloatArray, notes: tuple[str, ...]
 ) -> TelemetryClock:
-    """Place log time 0 in UTC by the messages that were received with the least delay."""
-    behind = table.received_us / 1e6 - log_s
-    # In this time, a tether delays at least one message by almost nothing.
+    """Return the clock with the UTC of log time 0, by the messages with the least delay."""
+    delayed = table.received_us / 1e6 - log_s
+    # Long enough that at least one message has almost no delay.
     block_s = 30.0
     firsts = np.flatnonzero(np.diff(np.floor(log_s / block_s), prepend=-np.inf))
-    least = np.minimum.reduceat(behind, firsts)
+    least = np.minimum.reduceat(delayed, firsts)
     start, sigma = float(np.median(least)), NETWORK_UTC_SIGMA_S
     if start < FIRST_BELIEVED_UTC_S:
         return TelemetryClock(table.at, log_s, boot_at, boot_s, None, None, notes)
     steps = np.diff(least)
+    # Larger changes are no delays: the computer's clock was set.
     clock_step_s = 1.0
     large = np.flatnonzero(np.abs(steps) > clock_step_s)
     if len(large):
@@ -198,12 +200,12 @@ _Found = tuple[Signal | None, str]
 def read_tlog(path: Path) -> VehicleLog:
     """Read a telemetry log.
 
-    Raises `SourceError` if no autopilot speaks in it.
+    Raises `SourceError` if it has no depth or attitude from an autopilot.
     """
     frames = read_frames(path.read_bytes())
     source, others = _autopilot(frames, path)
-    spoken = {name: table[table.source == source] for name, table in frames.tables.items()}
-    tables = {name: table for name, table in spoken.items() if len(table.at)}
+    own = {name: table[table.source == source] for name, table in frames.tables.items()}
+    tables = {name: table for name, table in own.items() if len(table.at)}
     clock = telemetry_clock(tables)
     depth, stuck = _depth(tables, clock)
     heading, heading_from = _heading(tables, clock)
@@ -240,20 +242,20 @@ def read_tlog(path: Path) -> VehicleLog:
 
 
 def _autopilot(frames: SelectedMessages, path: Path) -> tuple[int, str | None]:
-    """Return whose messages to read, and a note where several vehicles speak."""
+    """Return the sender whose messages to read, and a note if there are several vehicles."""
     beats = frames.tables.get("HEARTBEAT")
-    speakers: set[int] = set()
-    no_autopilot = 8
-    ground_station = 6
+    senders: set[int] = set()
+    # MAV_AUTOPILOT_INVALID and MAV_TYPE_GCS.
+    no_autopilot, ground_station = 8, 6
     if beats is not None:
         kind, autopilot = beats.payload["type"], beats.payload["autopilot"]
-        speakers = set(beats.source[(kind != ground_station) & (autopilot != no_autopilot)])
-    telling = [t.source for name, t in frames.tables.items() if name not in ("HEARTBEAT",)]
-    said = np.concatenate(telling) if telling else np.zeros(0, np.int64)
-    if not speakers:
-        # A log cut out of a longer one may lack heartbeats; autopilots are component 1.
-        speakers = {int(source) for source in np.unique(said) if source % 256 == 1}
-    counts = {int(source): int(np.count_nonzero(said == source)) for source in speakers}
+        senders = set(beats.source[(kind != ground_station) & (autopilot != no_autopilot)])
+    others = [table.source for name, table in frames.tables.items() if name != "HEARTBEAT"]
+    sources = np.concatenate(others) if others else np.zeros(0, np.int64)
+    if not senders:
+        # A part of a longer log may lack heartbeats; autopilots are component 1.
+        senders = {int(source) for source in np.unique(sources) if source % 256 == 1}
+    counts = {int(source): int(np.count_nonzero(sources == source)) for source in senders}
     if not counts or not max(counts.values()):
         raise SourceError(
             f"{path}: no depth or attitude from an autopilot in {frames.n_frames} messages; "
@@ -329,10 +331,12 @@ def _armed_and_modes(
     if table is None:
         return None, ()
     times, beat = clock.of(table), table.payload
+    # MAV_MODE_FLAG_SAFETY_ARMED.
     armed_flag = 128
     armed = (beat["base_mode"] & armed_flag > 0).astype(float)
     number = beat["custom_mode"].astype(np.int64)
     changed = np.flatnonzero(np.diff(number, prepend=-1))
+    # MAV_AUTOPILOT_ARDUPILOTMEGA and MAV_TYPE_SUBMARINE.
     ardupilot, submarine = 3, 12
     is_sub = (beat["autopilot"] == ardupilot) & (beat["type"] == submarine)
     modes = []

@@ -1,6 +1,6 @@
-"""A vehicle's log of its own motion: signals over time, and places on the net that were seen.
+"""A vehicle's log of its own motion: signals over time, and position and bearing at dive times.
 
-- `VehicleLog`: all signals on one clock, and what is wrong with the file.
+- `VehicleLog`: all signals on one clock, and faults of the file.
 - `Signal`: one quantity with its own time stamps, interpolated except across gaps.
 - `Places`: depth, heading and the net's bearing at dive times.
 """
@@ -27,13 +27,13 @@ class Interpolation(StrEnum):
     """Interpolation of a signal between its samples."""
 
     LINEAR = "linear"
-    """Changes evenly."""
+    """Linear."""
     ANGLE = "angle"
-    """Changes evenly along the shorter way round; answers lie in (-pi, pi]."""
+    """Linear along the shorter arc; results are in (-pi, pi]."""
     BEARING = "bearing"
-    """As ANGLE, but answers lie in [0, 2 pi)."""
+    """As ANGLE, but results are in [0, 2 pi)."""
     HELD = "held"
-    """Keeps the value of the last sample."""
+    """Value of the last sample."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,8 +42,8 @@ class Signal:
 
     time_s: FloatArray  # Shape (n,): log time, strictly increasing; n is at least 1.
     values: FloatArray  # Shape (n,) or (n, k): finite; SI units and radians.
-    interpolation: Interpolation  # How values between samples are found.
-    max_gap_s: float  # Values between samples that are further apart than this are not valid.
+    interpolation: Interpolation  # Between samples.
+    max_gap_s: float  # Values between samples further apart than this are not valid.
 
     @classmethod
     def from_samples(
@@ -52,10 +52,10 @@ class Signal:
         values: ArrayLike,
         interpolation: Interpolation = Interpolation.LINEAR,
     ) -> Self | None:
-        """Make a signal from samples in the order of the file; None where none is usable.
+        """Make a signal from samples in the order of the file; None if no sample is usable.
 
         Samples that are not finite are left out, and so are those whose time is not later than
-        that of all samples before them: such a value has no place on the time axis.
+        that of all samples before them.
         """
         times, found = np.asarray(time_s, float), np.asarray(values, float)
         if not len(times):
@@ -132,17 +132,17 @@ def usual_gap(time_s: FloatArray) -> float:
     """Return the longest step between increasing times that is not a gap, in seconds."""
     steps = np.diff(time_s)
     usual = float(np.median(steps)) if len(steps) else 0.0
-    # A step this many times the usual one is a gap: single messages get lost all the time.
+    # Single lost messages are common: a gap is longer than this many usual steps.
     gap_steps = 4.0
-    # Within half a second a vehicle under water hardly changes what it does, so no step is a gap.
+    # The motion of a vehicle under water hardly changes in half a second.
     shortest_gap_s = 0.5
     return max(gap_steps * usual, shortest_gap_s)
 
 
 def utc_seconds(text: str) -> float:
-    """Return a time in ISO 8601 as seconds since 1970; UTC where it has no zone.
+    """Return a time in ISO 8601 as seconds since 1970; UTC if it has no time zone.
 
-    Raises `ValueError` if it is none.
+    Raises `ValueError` for any other text.
     """
     moment = datetime.datetime.fromisoformat(text)
     if moment.tzinfo is None:
@@ -151,18 +151,18 @@ def utc_seconds(text: str) -> float:
 
 
 NETWORK_UTC_SIGMA_S = 2.0
-"""Clocks set by the network are more accurate than this."""
+"""Standard deviation of clocks that are set by the network; an upper limit."""
 FIRST_BELIEVED_UTC_S = utc_seconds("1990-01-01")
-"""Clocks that were never set begin before: in 1904, 1970 or 1980."""
+"""Earliest plausible UTC: clocks that were never set begin in 1904, 1970 or 1980."""
 
 
 def wrap(angle: FloatArray) -> FloatArray:
-    """Return angles as their equals in (-pi, pi]."""
+    """Return the equivalent angles in (-pi, pi]."""
     return math.pi - np.mod(math.pi - angle, _TURN)
 
 
 def bearing_of(angle: FloatArray) -> FloatArray:
-    """Return angles as their equals in [0, 2 pi)."""
+    """Return the equivalent angles in [0, 2 pi)."""
     turned = np.mod(angle, _TURN)
     # A tiny negative angle rounds up to a full turn.
     return np.where(turned >= _TURN, 0.0, turned)
@@ -170,7 +170,7 @@ def bearing_of(angle: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoggedStates:
-    """The vehicle at some times; NaN and False where the log has no value."""
+    """State of the vehicle at some times; NaN and False where the log has no value."""
 
     time_s: FloatArray  # Shape (n,): log time.
     # Shape (n,): metres, positive down; radians, heading in [0, 2 pi).
@@ -189,10 +189,10 @@ class LoggedStates:
 class VehicleLog:
     """A vehicle's log: signals on one clock, each with its own time stamps."""
 
-    name: str  # How messages call it: the file's path.
+    name: str  # In messages: the file's path.
     kind: str  # 'csv', 'tlog' (MAVLink telemetry), 'dataflash' or 'dataflash text'.
     depth: Signal | None = None  # Metres below the surface, positive down.
-    # Radians clockwise from north as the vehicle knows it, in [0, 2 pi).
+    # Radians clockwise from the vehicle's north, in [0, 2 pi).
     heading: Signal | None = None
     # Radians, MAVLink's axes (forward, right, down): roll is positive with the right side down,
     # pitch with the nose up.
@@ -200,17 +200,16 @@ class VehicleLog:
     pitch: Signal | None = None
     # North, east and down, in m/s.
     velocity_ned: Signal | None = None
-    # 1 while the thrusters could turn, else 0.
+    # 1 while the thrusters can turn, else 0.
     armed: Signal | None = None
     # Log time of each change of the flight mode, and the new mode.
     modes: tuple[tuple[float, str], ...] = ()
-    # UTC (seconds since 1970) of log time 0, where the log knows it.
+    # UTC (seconds since 1970) of log time 0, and its standard deviation; None if unknown.
     start_utc_s: float | None = None
-    # How far to trust it.
     start_utc_sigma_s: float | None = None
-    # Signal to what in the file it was read from, and why where there was a choice.
+    # By signal: message or record, and field, that it was read from.
     sources: Mapping[str, str] = field(default_factory=dict)
-    # What is wrong with the file, one line each: cut short, corrupt sections, clock steps.
+    # Faults of the file, one line each: truncation, corrupt sections, clock steps.
     notes: tuple[str, ...] = ()
 
     @property
@@ -251,33 +250,31 @@ class Places:
 
     time_s: FloatArray  # Shape (n,): dive time.
     depth: FloatArray  # Shape (n,): of the vehicle's depth sensor, in metres, positive down.
-    # Shape (n,): of the vehicle's nose (the dome's y axis), radians clockwise from north, in [0, 2
-    # pi).
+    # Shape (n,): of the dome's y axis, radians clockwise from north, in [0, 2 pi).
     heading: FloatArray
-    # Shape (n,): of the net's far normal: the compass direction in which one looks when square to
-    # the net, radians in [0, 2 pi). From inside a round cage it says where on the wall the vehicle
-    # is.
+    # Shape (n,): compass direction of the net's far normal, the direction of view square to the
+    # net, radians in [0, 2 pi). Inside a round cage it gives the position along the wall.
     bearing: FloatArray
-    # Shape (n,): elevation of the far normal: 0 for a net that hangs plumb, positive where the
-    # net's top leans towards the vehicle, radians. Needs the vehicle's roll and pitch.
+    # Shape (n,): elevation of the far normal, radians: 0 for a vertical net, positive if the net's
+    # top leans towards the vehicle. Needs the vehicle's roll and pitch.
     lean: FloatArray
-    # Shape (n,): where they are known.
+    # Shape (n,): where the values are known.
     depth_valid: BoolArray
     heading_valid: BoolArray
     bearing_valid: BoolArray
     lean_valid: BoolArray
     # Shape (n, 3, 3): rotations from `dome` to `world` (north, east, down). The depth of a point in
-    # `dome` is `depth + (ned_from_dome @ p_in_dome)[2]`, but for the lever arm between the depth
-    # sensor and the dome. NaN where the heading is not known.
+    # `dome` is `depth + (ned_from_dome @ p_in_dome)[2]`, if the lever arm between the depth sensor
+    # and the dome is neglected. NaN where the heading is not known.
     ned_from_dome: FloatArray
-    # Shape (n,): where roll or pitch is not known and the vehicle was taken as level in
+    # Shape (n,): where roll or pitch is not known, so that the vehicle is assumed level in
     # `ned_from_dome` and `bearing`.
     level: BoolArray
 
 
 @dataclass(frozen=True, slots=True)
 class VehiclePlaces:
-    """A log next to a dive: answers for dive times."""
+    """Log of a dive with the offset of their clocks, evaluated at dive times."""
 
     log: VehicleLog  # The vehicle's log.
     offset_s: float = 0.0  # Log time = dive time + offset_s.
@@ -295,7 +292,7 @@ class VehiclePlaces:
         pitch: ArrayLike | None = None,
         valid: ArrayLike | None = None,
     ) -> Places:
-        """Return where the vehicle and the net were.
+        """Return depth, heading and orientation of vehicle and net at dive times.
 
         Parameters
         ----------
@@ -303,9 +300,9 @@ class VehiclePlaces:
             Dive time.
         yaw, pitch : array, shape (n,), optional
             Posture to the net (paper, Eq. 24-26) at those times. Without yaw there is no bearing;
-            without pitch the net counts as square to the dome's y axis in elevation.
+            without pitch, a pitch of 0 is assumed.
         valid : bool array, shape (n,), optional
-            Where the posture is valid; everywhere that it is finite, if left out.
+            Where the posture is valid; wherever it is finite, if left out.
 
         Notes
         -----
@@ -369,7 +366,7 @@ def ned_from_dome_of(heading: ArrayLike, pitch: ArrayLike, roll: ArrayLike) -> F
 def _far_normals(
     n: int, yaw: ArrayLike | None, pitch: ArrayLike | None, valid: ArrayLike | None
 ) -> tuple[FloatArray, BoolArray]:
-    """Return unit far normals in `dome`, shape (n, 3), and where they are known."""
+    """Return unit far normals in `dome`, shape (n, 3), and the mask of known ones."""
     if yaw is None:
         return np.full((n, 3), np.nan), np.zeros(n, bool)
     across = np.broadcast_to(np.asarray(yaw, float), n)
