@@ -5,8 +5,8 @@ implemented as far as these messages need it: primitives are aligned to multiple
 counted from the end of the four bytes at the start of every message. A sequence is its length as
 uint32, then its elements; an empty one has no gap after its length.
 
-Pictures are JPEG (small) or PNG of the planes as they are (lossless). The rig is recorded as the
-text of its file and its exact numbers; the scanner's options as JSON.
+Pictures are JPEG (small) or PNG of the unchanged planes (lossless). The rig is recorded as the text
+of its file and its exact numbers; the scanner's options as JSON.
 """
 
 import json
@@ -37,7 +37,7 @@ from aqualvs.scanning.surfaces import TargetKind
 from aqualvs.sources.base import bgr_of
 from aqualvs.yamlfile import parse_yaml
 
-# In noise a search for repetitions finds little: run-length coding is smaller and no slower.
+# Noise contains few repetitions: run-length coding is smaller than a search for them, and as fast.
 _PNG = [
     *(cv2.IMWRITE_PNG_COMPRESSION, 1),
     *(cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE),
@@ -49,11 +49,11 @@ class PictureFormat(StrEnum):
 
     JPEG = "jpeg"
     PNG = "png"
-    """Luma as one grey picture, U above V as another: bit for bit, and large."""
+    """Luma as one grey picture, and U above V as another: lossless and large."""
 
 
 def jpeg_of(frame: Frame, quality: int) -> bytes:
-    """Return a frame as JPEG, in colour where it has any.
+    """Return a frame as JPEG, in colour if it has chroma.
 
     `quality`: 1 to 100.
     """
@@ -64,7 +64,7 @@ def jpeg_of(frame: Frame, quality: int) -> bytes:
 
 
 def png_of(frame: Frame) -> tuple[bytes, bytes | None]:
-    """Return luma and, where the frame has it, chroma as PNG."""
+    """Return luma and chroma (None for a grey frame) as PNG."""
     luma = _encode(".png", np.ascontiguousarray(frame.luma), _PNG)
     if frame.chroma is None:
         return luma, None
@@ -72,9 +72,10 @@ def png_of(frame: Frame) -> tuple[bytes, bytes | None]:
 
 
 def frame_of(index: int, time_s: float, kind: str, picture: bytes, chroma: bytes | None) -> Frame:
-    """Return the frame that a recording's pictures show.
+    """Return the frame of recorded pictures.
 
-    Raises `ValueError` if they cannot be decoded.
+    `kind`: a `PictureFormat`; `chroma`: the second picture of PNG, None for a grey frame. Raises
+    `ValueError` if a picture cannot be decoded.
     """
     image = _decode(picture)
     if kind == PictureFormat.JPEG:
@@ -121,16 +122,16 @@ def rig_from_record(text: str, exact: str, source_name: str) -> Rig:
     Parameters
     ----------
     text, exact : str
-        Rig file, and `rig_exact`.
+        Text of the rig file, and that of `rig_exact`.
     source_name : str
-        How messages call the recording.
+        Name of the recording in messages.
 
     Raises
     ------
     RigError
-        If the text holds no rig.
+        If the text is no rig file.
     ValueError
-        If the numbers do not belong to it.
+        If the numbers do not match it.
     """
     content = parse_yaml(text, source_name, RigError)
     rig = rig_from_mapping(content, source_name=source_name, need_lasers=False)
@@ -165,7 +166,7 @@ def options_text(options: ScannerOptions) -> str:
 def options_from_text(text: str) -> ScannerOptions:
     """Return the scanner's options that `options_text` wrote.
 
-    Raises `ValueError`, `KeyError` or `TypeError` if the text is none that this version knows.
+    Raises `ValueError`, `KeyError` or `TypeError` if this version does not know the text's content.
     """
     found = json.loads(text)
     detector = dict(found["detector"])
@@ -204,13 +205,13 @@ _NS = 1_000_000_000
 
 
 class CdrWriter:
-    """Writer of a CDR message, field by field in their order."""
+    """Writer of a CDR message, field by field in the order of its definition."""
 
     def __init__(self) -> None:
         self._content = bytearray(_HEAD)
 
     def numbers(self, kind: str, *values: float) -> None:
-        """Append numbers of one kind (of `struct`), such as the fields of a fixed array."""
+        """Append numbers of one `struct` format, such as the elements of a fixed array."""
         size = struct.calcsize("=" + kind)
         self._align(size)
         self._content += struct.pack(f"<{len(values)}{kind}", *values)
@@ -222,7 +223,7 @@ class CdrWriter:
         self._content += content
 
     def array(self, values: NDArray[Any]) -> None:
-        """Append a sequence of numbers, as the array holds them."""
+        """Append a sequence of numbers of the array's type."""
         self.numbers("I", values.size)
         if values.size:
             self._align(values.itemsize)
@@ -249,9 +250,9 @@ class CdrWriter:
 
 
 class CdrReader:
-    """Reader of a CDR message, field by field in their order.
+    """Reader of a CDR message, field by field in the order of its definition.
 
-    Raises `ValueError` from every method, if the message is cut short or not little-endian CDR.
+    All methods raise `ValueError` if the message is truncated or not little-endian CDR.
     """
 
     def __init__(self, content: bytes) -> None:
@@ -260,21 +261,21 @@ class CdrReader:
         self._content, self._at = content, len(_HEAD)
 
     def number(self, kind: str) -> Any:
-        """Take one number of a kind (of `struct`)."""
+        """Read one number of a `struct` format."""
         return self.numbers(kind, 1)[0]
 
     def numbers(self, kind: str, n: int) -> tuple[Any, ...]:
-        """Take numbers of one kind."""
+        """Read n numbers of one `struct` format."""
         size = struct.calcsize("=" + kind)
         self._align(size)
         return struct.unpack(f"<{n}{kind}", self._take(n * size))
 
     def text(self) -> str:
-        """Take a string."""
+        """Read a string."""
         return self._take(self.number("I"))[:-1].decode("utf-8")
 
     def array(self, kind: str) -> NDArray[Any]:
-        """Take a sequence of numbers of a NumPy kind; a copy."""
+        """Read a sequence of numbers of a NumPy type, as a copy."""
         n, dtype = self.number("I"), np.dtype(kind).newbyteorder("<")
         if n:
             self._align(dtype.itemsize)
@@ -283,15 +284,15 @@ class CdrReader:
 
     @property
     def at_end(self) -> bool:
-        """Whether nothing is left to take."""
+        """Whether the whole message has been read."""
         return self._at >= len(self._content)
 
     def blob(self) -> bytes:
-        """Take a sequence of bytes."""
+        """Read a sequence of bytes."""
         return self._take(self.number("I"))
 
     def header(self) -> tuple[int, str]:
-        """Take a `std_msgs/Header`: nanoseconds and the frame's name."""
+        """Read a `std_msgs/Header`: time in nanoseconds and frame id."""
         seconds, nanoseconds = self.number("i"), self.number("I")
         return seconds * _NS + nanoseconds, self.text()
 
@@ -313,16 +314,16 @@ _HEADER = "std_msgs/Header", "builtin_interfaces/Time stamp\nstring frame_id\n"
 
 @dataclass(frozen=True, slots=True)
 class RecordedTopic:
-    """A topic."""
+    """Topic of a recording."""
 
-    number: int  # Of its channel and its schema in the file; from 1.
+    number: int  # Id of its channel and its schema in the file, from 1.
     name: str
-    kind: str  # Full name of its messages.
-    definition: str  # Of its messages and of all that they hold.
+    kind: str  # Full name of its message type.
+    definition: str  # Of the message type and of all types in it.
 
 
 def _definition(own: str, *parts: tuple[str, str]) -> str:
-    """Return a definition with those of its parts, in the form of ROS 2's recordings."""
+    """Return a definition with those of its parts, in the format of ROS 2's recordings."""
     line = 80 * "=" + "\n"
     return "".join([own, *(f"{line}MSG: {name}\n{text}" for name, text in parts)])
 
@@ -511,4 +512,4 @@ CHROMA = RecordedTopic(
     _definition(_IMAGE, _HEADER, _TIME),
 )
 TOPICS = (POSTURE, STRIPES, POINTS, HEALTH, RIG, PICTURE, CHROMA)
-"""All of them; a recording without pictures has no messages on the last two."""
+"""All topics of a recording; the last two have no messages without pictures."""

@@ -1,23 +1,23 @@
 """An MCAP file that is valid after every single write, and the compressed chunks appended to it.
 
-The format ends in a summary and a footer, so a file that is merely appended to cannot be read until
-it has been closed. This file always has both. Its size runs ahead of the data:
+The format ends in a summary and a footer, so a file to which data are only appended cannot be read
+until it has been closed. This file always has both. Its size is ahead of the data:
 
 ::
 
     header, schemas, chunks | padding ........ | data end, summary | padding ..... | footer
                             ^ frontier                             ^ tail
 
-New data, except for its first nine bytes, is written into a padding, where no reader looks,
-together with the smaller padding behind it. Then the nine bytes that were the old padding's head
-are replaced. They never straddle a page, and a system copies within a page in one go: every reader,
-and every end of the process, finds the record whole or not at all. The summary's records are added
-in the same way. When one of the paddings is used up, the file is made longer by its new footer
-alone, in one write behind a hole; that footer belongs to a second copy of the summary, because a
-footer in the middle of a summary is no valid file. Holes take no space on the disk.
+New data, except for the first nine bytes, are written into the padding, which readers skip, with
+the head of the smaller padding after them. Then the nine bytes of the old padding's head are
+replaced. They never cross a page boundary, and the system copies within a page at once: a reader,
+or the end of the process, finds the record complete or not at all. Records of the summary are added
+in the same way. When a padding is used up, the file is extended by a new footer alone, in one write
+after a hole; that footer refers to a second copy of the summary, because a footer in the middle of
+a summary is no valid file. Holes take no space on the disk.
 
-After a loss of power the order in which pages reached the disk counts, and data written since the
-last `sync` may be torn; `McapFile` leaves out chunks whose checksum is wrong.
+After a loss of power, pages may have reached the disk in any order, so that data written since the
+last `sync` may be torn; `McapFile` leaves out chunks with a wrong checksum.
 
 A `Chunk` holds the messages of about half a second, compressed together.
 """
@@ -43,21 +43,21 @@ _COMPRESSION = "zstd"
 
 @dataclass(frozen=True, slots=True)
 class Chunk:
-    """A chunk ready for the file."""
+    """Chunk of compressed messages with its indexes."""
 
     content: bytes  # The chunk's record and its message indexes.
-    length: int  # Of the record alone.
-    # Where each channel's message index begins, from the chunk's start.
+    length: int  # Of the record alone, in bytes.
+    # By channel: offset of its message index from the chunk's start.
     index_offsets: dict[int, int]
     # Log times of the first and the last message.
     times_ns: tuple[int, int]
-    # Compressed and raw.
+    # Compressed and uncompressed size, in bytes.
     sizes: tuple[int, int]
-    # Messages by channel.
+    # By channel: number of messages.
     counts: dict[int, int]
 
     def index_at(self, at: int) -> bytes:
-        """Return the record for the summary, with the chunk at a place in the file."""
+        """Return the index record for the summary, for the chunk at an offset in the file."""
         return mcap_file.chunk_index(
             self.times_ns,
             at,
@@ -70,7 +70,7 @@ class Chunk:
 
 
 class ChunkBuilder:
-    """Builder of a chunk: gathers messages; `seal` compresses them."""
+    """Builder of a chunk: collects messages; `seal` compresses them."""
 
     def __init__(self) -> None:
         self._parts: list[bytes] = []
@@ -82,14 +82,14 @@ class ChunkBuilder:
         return len(self._parts) // 2
 
     def add(self, channel: int, sequence: int, log_ns: int, publish_ns: int, data: bytes) -> None:
-        """Append a message; log times never fall."""
+        """Append a message; log times must not decrease."""
         parts = mcap_file.message(channel, sequence, log_ns, publish_ns, data)
         self._entries.setdefault(channel, []).append((log_ns, self.n_bytes))
         self._parts += parts
         self.n_bytes += len(parts[0]) + len(parts[1])
 
     def seal(self) -> Chunk:
-        """Return the chunk of the gathered messages, at least one."""
+        """Return the chunk of the collected messages, of which there must be one at least."""
         raw = b"".join(self._parts)
         packed = _codec().compress(raw, asbytes=True)
         times = [entries[end][0] for entries in self._entries.values() for end in (0, -1)]
@@ -112,18 +112,18 @@ class ChunkBuilder:
 
 @cache
 def _codec() -> Any:
-    # The fastest level: higher ones gain 3 % on sub-pixel positions, for twice the time.
+    # The fastest level: higher ones save 3 % of the size, for twice the time.
     level = 1
     return pa.Codec(_COMPRESSION, compression_level=level)
 
 
 PAGE = 4096
-# Least room for chunks, and for their index records, added when the file is made longer.
+# Least space for chunks, and for their index records, by which the file is extended.
 _DATA_BYTES = 8 << 20
 _INDEX_BYTES = 1 << 16
 # Margin for rounding to pages.
 _SPARE_BYTES = 3 * PAGE
-# Copying the summary costs at most this share of what is written.
+# Least ratio of new data to the summary that is copied when the file is extended.
 _DATA_PER_SUMMARY = 8
 
 
@@ -133,21 +133,23 @@ class GrowingFile:
     Parameters
     ----------
     path : Path
-        Must not exist; it appears once the file is readable.
+        Must not exist; the file appears as soon as it is readable.
     front : bytes
-        What the file begins with: magic, header, schemas and channels.
+        Beginning of the file: magic, header, schemas and channels.
     repeated : bytes
-        Schemas and channels once more, for the summary.
+        Schemas and channels again, for the summary.
+    n_schemas : int
+        Number of schemas.
     channels : sequence of int
-        Their numbers.
+        Ids of the channels.
     open_file : callable, optional
         Opens a path for unbuffered reading and writing; for tests.
 
     Raises
     ------
     OSError
-        From every method, as the system says it. After it the file is as it was before the call,
-        and the call may be repeated. `FileExistsError` if the path is taken.
+        From every method, if the system refuses a write. The file is then as before the call, which
+        may be repeated. `FileExistsError` if the path exists.
     """
 
     def __init__(
@@ -181,17 +183,17 @@ class GrowingFile:
 
     @property
     def n_bytes(self) -> int:
-        """Bytes of data so far, without the summary."""
+        """Size of the data so far, in bytes, without the summary."""
         return self._frontier
 
     def append(self, chunk: Chunk) -> None:
-        """Write one chunk; when this returns it outlives the process."""
+        """Write one chunk, which then survives the end of the process."""
         self._list_pending()
         index = chunk.index_at(self._frontier)
         self._make_room(len(chunk.content), len(index))
         self._frontier = self._insert(self._frontier, chunk.content, self._limit)
         self._count(chunk, index)
-        # The chunk is in the file; the next call lists records that cannot be listed now.
+        # The chunk is in the file; the next call adds index records that fail now.
         with contextlib.suppress(OSError):
             self._list_pending()
 
@@ -200,9 +202,9 @@ class GrowingFile:
         os.fsync(self._file.fileno())
 
     def close(self) -> None:
-        """Cut off the unused end of the file and close it; further calls do nothing.
+        """Truncate the unused end of the file and close it; further calls do nothing.
 
-        It is closed and readable in any case.
+        Even after an error the file is closed and readable.
         """
         if self._file.closed:
             return
@@ -232,7 +234,7 @@ class GrowingFile:
     def _insert(self, at: int, content: bytes, limit: int) -> int:
         """Replace the beginning of the padding at `at`, which ends at `limit`, by whole records.
 
-        Returns where the padding begins now.
+        Returns the offset at which the padding begins now.
         """
         content += self._fill(at + len(content))
         end = at + len(content)
@@ -252,7 +254,7 @@ class GrowingFile:
         self._unlisted.append(index)
 
     def _list_pending(self) -> None:
-        """Add missing records to the summary."""
+        """Add missing index records to the summary."""
         while self._unlisted:
             limit = self._size - FOOTER_BYTES
             self._tail = self._insert(self._tail, self._unlisted[0], limit)
@@ -260,7 +262,7 @@ class GrowingFile:
             self._write(self._summary_at, self._statistics())
 
     def _make_room(self, n_data: int, n_index: int) -> None:
-        """Make the file longer where a chunk or its index, and the end that follows, do not fit."""
+        """Extend the file if a chunk or its index, and the end of the file after it, do not fit."""
         if not self._summary_placed:
             self._place_summary()
         data_end = self._frontier + n_data + self._summary_bytes() + _SPARE_BYTES
@@ -270,7 +272,7 @@ class GrowingFile:
             self._place_summary()
 
     def _grow(self, n_data: int) -> None:
-        """Make the file longer, with a copy of the summary where the data ended."""
+        """Extend the file, with a copy of the summary at the end of the old space for data."""
         size = self._size_for(self._size, n_data)
         at = _page_down(self._limit - self._summary_bytes() - PAGE)
         tail = self._write_summary(at, size)
@@ -278,7 +280,7 @@ class GrowingFile:
         self._summary_at, self._tail, self._size, self._summary_placed = at, tail, size, False
 
     def _size_for(self, size: int, n_data: int) -> int:
-        """Return a file size with room for more data and their summary."""
+        """Return a file size with space for more data and their summary."""
         summary_bytes = self._summary_bytes()
         data_bytes = max(_DATA_BYTES, _DATA_PER_SUMMARY * summary_bytes) + n_data
         return _page_up(size + data_bytes + summary_bytes + self._summary_room() + 2 * _SPARE_BYTES)
@@ -287,14 +289,17 @@ class GrowingFile:
         """Move the summary near the end of the file and free the space before it."""
         at = _page_down(self._size - FOOTER_BYTES - self._summary_room())
         limit = at - DATA_END_BYTES
-        # Zeros, not a hole: adding to the summary then needs no new place on the disk.
+        # Zeros instead of a hole: the disk space for additions to the summary is allocated now.
         tail = self._write_summary(at, self._size, zeros=_INDEX_BYTES // 2)
         self._write(self._frontier, mcap_file.padding_head(limit - self._frontier))
         self._write(self._size - FOOTER_BYTES, mcap_file.footer(at))
         self._summary_at, self._tail, self._limit, self._summary_placed = at, tail, limit, True
 
     def _write_summary(self, at: int, size: int, zeros: int = 0) -> int:
-        """Write the end of the data and a summary, padded to the footer; returns its tail."""
+        """Write the end of the data and a summary, padded to the footer.
+
+        Returns the offset of the padding.
+        """
         summary = self._summary()
         summary += self._fill(at + len(summary))
         tail = at + len(summary)
@@ -310,14 +315,14 @@ class GrowingFile:
         return len(self._statistics()) + len(self._repeated) + self._index_bytes
 
     def _summary_room(self) -> int:
-        """Return how much the summary may take before the file must be made longer."""
+        """Return the space that is reserved for the summary."""
         return self._summary_bytes() * 5 // 4 + _INDEX_BYTES + 2 * _SPARE_BYTES
 
     def _statistics(self) -> bytes:
         return mcap_file.statistics(self._n_schemas, self._n_chunks, self._times_ns, self._counts)
 
     def _fill(self, at: int) -> bytes:
-        """Return a record of no meaning if a record's head at `at` would straddle two pages."""
+        """Return a padding record if a record's head at `at` would cross a page boundary."""
         left = PAGE - at % PAGE
         if left >= HEAD_BYTES:
             return b""
@@ -327,7 +332,7 @@ class GrowingFile:
         self._file.seek(at)
         rest = memoryview(content)
         while len(rest):
-            # A disk that fills up takes a part; the next attempt raises the reason.
+            # A full disk accepts a part; the next write raises the error.
             rest = rest[self._file.write(rest) :]
 
 
@@ -344,7 +349,7 @@ def _open(path: Path) -> BinaryIO:
 
 
 def _publish(draft: Path, path: Path) -> None:
-    """Give a draft its name, never that of another file."""
+    """Rename a draft; raise `FileExistsError` instead of replacing a file."""
     try:
         os.link(draft, path)
     except FileExistsError:

@@ -1,7 +1,7 @@
 """Messages of a recording and of Foxglove, and their creation from samples.
 
 Their definitions are in `encoding.py`. All are in the frame `dome`, with angles in degrees, as
-everywhere outside the library. Numbers that do not exist are NaN.
+everywhere outside the library. Missing numbers are NaN.
 """
 
 import math
@@ -49,7 +49,7 @@ _POINT = np.dtype([*((name, "<f4") for name in _FLOATS), *((name, "u1") for name
 
 
 def posture_message(sample: LiveSample, stamp_ns: int) -> bytes:
-    """Return range, pitch and yaw, raw and filtered."""
+    """Return the message with range, pitch and yaw, raw and filtered."""
     scan, posture, to = sample.scan, sample.scan.posture, CdrWriter()
     to.header(stamp_ns, FRAME_ID)
     to.numbers("q", scan.index)
@@ -70,7 +70,7 @@ def posture_message(sample: LiveSample, stamp_ns: int) -> bytes:
 
 
 def stripes_message(sample: LiveSample, stamp_ns: int) -> bytes:
-    """Return the detected stripes, bit for bit, or the reason of a refusal."""
+    """Return the message with the exact detected stripes, or the reason of a refusal."""
     scan, to = sample.scan, CdrWriter()
     refusal = scan.posture if not sample.peaks and not scan.posture else None
     to.header(stamp_ns, FRAME_ID)
@@ -84,7 +84,7 @@ def stripes_message(sample: LiveSample, stamp_ns: int) -> bytes:
         to.array(found.line.astype(np.uint32))
         for column in (found.position, found.height, found.width, found.likelihood):
             to.array(column)
-    # Behind all that older recordings hold, so that both are read alike.
+    # New fields follow those of older recordings, so that one reader reads both.
     to.array(np.concatenate([np.empty(0), *(found.pull for found in sample.peaks.values())]))
     turning = scan.turning
     to.array(np.empty(0) if turning is None else np.append(turning.rates, turning.sigma))
@@ -94,9 +94,9 @@ def stripes_message(sample: LiveSample, stamp_ns: int) -> bytes:
 def stripes_of(
     message: bytes,
 ) -> tuple[int, float, float, dict[SearchAxis, StripePeaks], Refusal | None, GyroRates | None]:
-    """Return frame, time, index of the water, stripes, refusal and turning of a message.
+    """Return frame number, time, index of the water, stripes, refusal and gyro rates of a message.
 
-    Raises `ValueError` if it is none of `stripes_message`.
+    Raises `ValueError` if the message is not from `stripes_message`.
     """
     of = CdrReader(message)
     of.header()
@@ -108,7 +108,7 @@ def stripes_of(
         axis = SearchAxis(of.text())
         line = of.array("u4").astype(np.int64)
         position, height, width, likelihood = (of.array("f8") for _ in range(4))
-        # Recordings of 0.1.0 hold levels here, of peaks that passed a colour gate; NaN if grey.
+        # Recordings of 0.1.0 have grey levels here, of peaks that passed a colour gate, or NaN.
         likelihood = np.where(np.isnan(likelihood), 1.0, np.minimum(likelihood, 1.0))
         peaks[axis] = StripePeaks(line, position, height, width, likelihood, np.zeros(len(line)))
     if not of.at_end:
@@ -125,7 +125,7 @@ def stripes_of(
 
 
 def points_message(points: ScanPoints, stamp_ns: int) -> bytes:
-    """Return a point cloud; `label` is a number of `Label`, `laser` that of the rig."""
+    """Return the point cloud message; `label` is a number of `Label`, `laser` a laser's index."""
     cloud = np.empty(len(points), _POINT)
     cloud["x"], cloud["y"], cloud["z"] = points.points_in_dome.T
     cloud["quality"] = points.quality
@@ -149,7 +149,7 @@ def points_message(points: ScanPoints, stamp_ns: int) -> bytes:
 
 
 def health_message(health: Health, stamp_ns: int) -> bytes:
-    """Return how the run goes."""
+    """Return the message with the health of the run and its parts."""
     to = CdrWriter()
     to.header(stamp_ns, "")
     to.numbers("B", _STATES[health.state])
@@ -170,23 +170,23 @@ def health_message(health: Health, stamp_ns: int) -> bytes:
 
 
 def rig_texts(rig: Rig, options: ScannerOptions) -> tuple[str, str, str]:
-    """Return the rig file, its exact numbers and the scanner's options as a message has them."""
+    """Return the texts of a rig message: rig file, exact numbers and scanner's options."""
     return rig_text(rig_to_mapping(rig)), rig_exact(rig), options_text(options)
 
 
 def rig_message(texts: tuple[str, str, str], stamp_ns: int) -> bytes:
-    """Return the message of rig and options, from `rig_texts`."""
+    """Return the message with rig and options, from `rig_texts`."""
     to = CdrWriter()
     to.header(stamp_ns, FRAME_ID)
-    for words in texts:
-        to.text(words)
+    for text in texts:
+        to.text(text)
     return to.finish()
 
 
 def rig_texts_of(message: bytes) -> tuple[str, str, str]:
     """Return the rig file, its exact numbers and the scanner's options of a message.
 
-    Raises `ValueError` if it is none of `rig_message`.
+    Raises `ValueError` if the message is not from `rig_message`.
     """
     of = CdrReader(message)
     of.header()
@@ -194,7 +194,7 @@ def rig_texts_of(message: bytes) -> tuple[str, str, str]:
 
 
 def image_message(kind: str, data: bytes, stamp_ns: int) -> bytes:
-    """Return a picture; `kind` is jpeg or png."""
+    """Return the message with a picture; `kind` is jpeg or png."""
     to = CdrWriter()
     to.header(stamp_ns, "cam")
     to.text(kind)
@@ -203,9 +203,9 @@ def image_message(kind: str, data: bytes, stamp_ns: int) -> bytes:
 
 
 def image_of(message: bytes) -> tuple[str, bytes]:
-    """Return kind and bytes of a picture's message.
+    """Return kind and content of a picture's message.
 
-    Raises `ValueError` if it is none of `image_message`.
+    Raises `ValueError` if the message is not from `image_message`.
     """
     of = CdrReader(message)
     of.header()
@@ -213,7 +213,7 @@ def image_of(message: bytes) -> tuple[str, bytes]:
 
 
 def _posture_values(posture: Posture | Refusal) -> list[float]:
-    """Return nine scalars, normal, covariance and curvatures."""
+    """Return nine scalars, normal (3), covariance (9) and curvatures (4)."""
     if not isinstance(posture, Posture):
         return [math.nan] * 25
     curvature = posture.curvature or (math.nan, math.nan)
@@ -230,7 +230,7 @@ def _posture_values(posture: Posture | Refusal) -> list[float]:
 
 
 def _rig_values(posture: Posture | Refusal) -> list[float]:
-    """Return standard deviations by the rig and by both, and the covariance by the rig."""
+    """Return standard deviations by the rig (3), total ones (3), and the rig's covariance (9)."""
     if not isinstance(posture, Posture):
         return [math.nan] * 15
     return [
@@ -261,25 +261,25 @@ def _put_part(to: CdrWriter, kind: str, part: PartHealth) -> None:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RecorderOptions:
-    """Options of a recording: its contents, and how often it is written."""
+    """Options of a recording: its content, and how often it is written."""
 
-    pictures: PictureFormat | None = None  # Every frame's picture, or none of them.
+    pictures: PictureFormat | None = None  # Format of all pictures; None leaves them out.
     jpeg_quality: int = 90  # 1 to 100.
-    # Point clouds per second, for the eye: stripes, from which every point can be had again bit for
-    # bit, are always kept. 0 for none, None for those of every frame.
+    # Point clouds per second, for viewers only: stripes, from which all points can be computed
+    # exactly, are always recorded. 0 for none, None for every frame.
     points_hz: float | None = 5.0
-    # That the run measures with; a replay uses them.
+    # Options of the run, for replays.
     scanner: ScannerOptions = field(default_factory=ScannerOptions)
-    # Time after which what was gathered is written: what the death of the process costs.
+    # Interval of writing: data lost if the process is killed.
     chunk_s: float = 0.5
-    # Time after which it is also on the disk: what a loss of power costs. None leaves it to the
+    # Interval of flushing to the disk: data lost after a loss of power. None leaves it to the
     # system.
     sync_s: float | None = 5.0
-    # Memory for what the disk has not taken yet.
+    # Limit of the memory for data that wait for the disk.
     max_waiting_bytes: int = 64 << 20
 
     def __post_init__(self) -> None:
-        """Refuse values that cannot work."""
+        """Raise `OptionError` for values out of range."""
         if not 1 <= self.jpeg_quality <= 100:
             raise OptionError(f"jpeg quality {self.jpeg_quality}: use 1 to 100")
         if self.points_hz is not None and not self.points_hz >= 0.0:
@@ -300,7 +300,7 @@ class SampleEncoder:
         self._points_due = RateLimit(math.inf if hz is None else hz)
 
     def messages(self, sample: LiveSample, stamp_ns: int) -> Iterator[tuple[RecordedTopic, bytes]]:
-        """Yield topic and content; pictures come before the stripes that belong to them."""
+        """Yield topic and content of each message; pictures precede the stripes of their frame."""
         yield from self.rig_messages(sample.rig, stamp_ns)
         if sample.frame is not None:
             yield from self._pictures(sample.frame, stamp_ns)
@@ -315,9 +315,12 @@ class SampleEncoder:
             yield HEALTH, health_message(sample.health, stamp_ns)
 
     def rig_messages(self, rig: Rig, stamp_ns: int) -> Iterator[tuple[RecordedTopic, bytes]]:
-        """Yield the rig if it is not the one before, or due again; its water is in every frame."""
+        """Yield the rig's message if the rig has changed or is due again.
+
+        A change of the water alone does not count: its index is in every frame.
+        """
         # The rig is recorded again after a second, then at intervals that double up to a minute,
-        # and at the end: so no damage, not even of the first part, loses the rig.
+        # and at the end, so that damage of a part of the file does not lose it.
         rig_again_ns, rig_every_ns = 1_000_000_000, 60_000_000_000
         if self._is_new(rig):
             self._rig, self._exact = rig, rig_exact(rig)
@@ -331,7 +334,7 @@ class SampleEncoder:
         yield from self.rig_again(stamp_ns)
 
     def rig_again(self, stamp_ns: int) -> Iterator[tuple[RecordedTopic, bytes]]:
-        """Yield the last recorded rig once more, bit for bit."""
+        """Yield the message of the last recorded rig again."""
         if self._rig_texts is not None:
             yield RIG, rig_message(self._rig_texts, stamp_ns)
 
@@ -355,9 +358,9 @@ class SampleEncoder:
 
 
 class RecordClock:
-    """Clock of a recording: its times rise, whatever the system's clock does.
+    """Clock of a recording, whose times always increase.
 
-    That of the first sample is the system's; from there on the monotonic clock counts.
+    It starts with the system's clock at the first sample, and continues with the monotonic clock.
     """
 
     def __init__(self) -> None:
@@ -376,11 +379,11 @@ class RecordClock:
 class RateLimit:
     """Rate limit of a message.
 
-    `hz`: 0 for none at all, infinite for every one.
+    `hz`: 0 for no message, infinite for all.
     """
 
     def __init__(self, hz: float) -> None:
-        # A tenth of a period early rather than a whole frame late.
+        # A tenth of a period of tolerance: otherwise jitter would delay a message by a frame.
         self._every_ns = round(0.9e9 / hz) if hz else None
         self._from_ns = -math.inf
 

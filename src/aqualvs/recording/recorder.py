@@ -1,8 +1,8 @@
 """Recorders of dives: for `aqualvs run`, for a live run, and switchable during a live run.
 
-`Recording` writes in the caller's own time. `Recorder` is an output of a live run with a thread of
-its own: it loses nothing and blocks nobody. `RecorderSwitch` starts and stops such recorders while
-the run goes on.
+`Recording` writes in the calling thread. `Recorder` is an output of a live run with its own thread,
+which records every sample without blocking the run. `RecorderSwitch` starts and stops recorders
+during the run.
 """
 
 import errno
@@ -27,7 +27,7 @@ MAX_CHUNK_BYTES = 4 << 20
 
 
 class SampleChunks:
-    """Chunk under construction: gathers the messages of samples until it is due."""
+    """Chunk under construction, with the messages of samples until it is due."""
 
     def __init__(self, options: RecorderOptions) -> None:
         self._encoder, self._clock = SampleEncoder(options), RecordClock()
@@ -42,7 +42,7 @@ class SampleChunks:
         self.n_samples = 0  # In the present chunk.
 
     def add(self, sample: LiveSample) -> bool:
-        """Add a sample; returns whether the chunk is due."""
+        """Add a sample; return whether the chunk is due."""
         stamp_ns = self._clock.stamp_ns(sample)
         self._from_ns = self._from_ns or stamp_ns
         self._publish_ns = max(sample.utc_ns, 0)
@@ -53,7 +53,7 @@ class SampleChunks:
         return long or self._builder.n_bytes >= MAX_CHUNK_BYTES
 
     def finish(self) -> None:
-        """Add the rig once more, unless the present chunk holds it already."""
+        """Add the rig again, unless the present chunk contains it already."""
         if not self._holds_rig:
             stamp_ns = self._clock.last_ns
             self._add(self._encoder.rig_again(stamp_ns), stamp_ns)
@@ -64,7 +64,7 @@ class SampleChunks:
             self._builder.add(topic.number, self._sequence, stamp_ns, self._publish_ns, data)
 
     def take(self) -> ChunkBuilder:
-        """Return the messages so far, perhaps none, and begin anew."""
+        """Return the messages so far, possibly none, and begin a new chunk."""
         found = self._builder
         self._begin()
         return found
@@ -73,8 +73,7 @@ class SampleChunks:
 class Recording:
     """Writer of samples to a file that is readable at any time.
 
-    `path`: must not exist. Raises `OSError` from every method, as the system says it; what was
-    written stays readable.
+    `path`: must not exist. All methods raise `OSError` if a write fails; the file stays readable.
     """
 
     def __init__(self, path: Path, options: RecorderOptions) -> None:
@@ -107,7 +106,7 @@ class Recording:
 
 
 def recording_file(path: Path, open_file: Callable[[Path], BinaryIO] | None = None) -> GrowingFile:
-    """Begin a file with the topics of a recording.
+    """Create a file with the topics of a recording.
 
     Raises `OSError` as `GrowingFile` does.
     """
@@ -128,13 +127,14 @@ def recording_file(path: Path, open_file: Callable[[Path], BinaryIO] | None = No
 
 
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
-# Period of retries on a full disk, and of checks for a chunk that is due.
-_RETRY_S, _LOOK_S = 2.0, 0.25
+# Period of retries after a failed write, and of checks for a chunk that is due.
+_RETRY_S, _CHECK_S = 2.0, 0.25
+# Longest wait for the thread when a recorder is closed.
 _TIMEOUT_S = 4.0
 
 
 class Recorder:
-    """Writer of samples by a thread of its own, to a file that is readable at any time.
+    """Writer of samples in its own thread, to a file that is readable at any time.
 
     Parameters
     ----------
@@ -146,8 +146,8 @@ class Recorder:
     Raises
     ------
     OutputError
-        If the file exists or cannot be begun. `health` reports later faults: what does not fit
-        on the disk waits, as far as memory is granted, and is tried again.
+        If the file exists or cannot be created. `health` reports later faults: data that cannot be
+        written wait in memory, up to the limit of the options, and are tried again.
     """
 
     name = "recorder"
@@ -173,7 +173,7 @@ class Recorder:
         self._thread.start()
 
     def send(self, sample: LiveSample) -> None:
-        """Take a sample; returns without waiting for the disk."""
+        """Record a sample, without waiting for the disk."""
         with self._changed:
             if self._closing:
                 return
@@ -182,7 +182,7 @@ class Recorder:
                 self._enqueue_chunk()
 
     def health(self) -> PartHealth:
-        """Return how much was recorded, or why no more is."""
+        """Return size and duration of the recording, or the fault that stops it."""
         n_dropped = self._n_dropped
         size = f"{1e-6 * self._file.n_bytes:.1f} MB"
         if self._fault:
@@ -206,7 +206,7 @@ class Recorder:
         self._thread.join(_TIMEOUT_S)
 
     def _enqueue_chunk(self) -> None:
-        """Leave the present chunk to the thread, or drop it where too much waits already."""
+        """Pass the present chunk to the thread, or drop it if too much waits already."""
         n_samples, messages = self._chunks.n_samples, self._chunks.take()
         self._chunk_s = time.monotonic()
         if not len(messages):
@@ -232,18 +232,18 @@ class Recorder:
             self._fault = _fault_text(fault)
 
     def _next_chunk(self) -> ChunkBuilder | None:
-        """Return the oldest chunk, which waits until it is written; None at the end."""
+        """Return the oldest chunk, which stays in the queue; None at the end."""
         with self._changed:
             while not self._waiting:
                 if self._closing:
                     return None
-                self._changed.wait(_LOOK_S)
-                if time.monotonic() - self._chunk_s > self._options.chunk_s + _LOOK_S:
+                self._changed.wait(_CHECK_S)
+                if time.monotonic() - self._chunk_s > self._options.chunk_s + _CHECK_S:
                     self._enqueue_chunk()
             return self._waiting[0][0]
 
     def _write(self, chunk: Chunk) -> bool:
-        """Write a chunk, however often it takes; False if the recording ends before it worked."""
+        """Write a chunk, with retries; return False if the recording ends before it succeeds."""
         while True:
             try:
                 self._file.append(chunk)
@@ -267,7 +267,7 @@ class Recorder:
             self._fault = _fault_text(fault)
 
     def _must_end(self) -> bool:
-        """Wait before the disk is tried again; returns whether there is no time left for it."""
+        """Wait before a retry; return whether the recording is being closed."""
         with self._changed:
             return self._closing or self._changed.wait_for(lambda: self._closing, _RETRY_S)
 
@@ -288,9 +288,9 @@ def _fault_text(fault: OSError) -> str:
 
 
 class RecorderSwitch:
-    """Output whose recording is switched on and off; every start makes a file of its own.
+    """Output whose recording can be switched on and off; each start creates a new file.
 
-    `folder`: made when it is needed.
+    `folder`: created when needed.
     """
 
     name = "recorder"
@@ -306,17 +306,17 @@ class RecorderSwitch:
 
     @property
     def path(self) -> Path | None:
-        """File that is being written, None where none is."""
+        """File that is being written; None if there is none."""
         recorder = self._recorder
         return None if recorder is None else recorder.path
 
     @property
     def seconds(self) -> float:
-        """Since the last recording was begun."""
+        """Time since the last recording was started."""
         return time.monotonic() - self._began_s
 
     def start(self, path: Path | None = None) -> Path:
-        """Begin to record, if that is not yet so.
+        """Start a recording, unless one is running.
 
         Parameters
         ----------
@@ -331,7 +331,7 @@ class RecorderSwitch:
         Raises
         ------
         OutputError
-            If it cannot be begun.
+            If the file cannot be created.
         """
         with self._lock:
             if self._recorder is None:
@@ -340,7 +340,7 @@ class RecorderSwitch:
             return self._recorder.path
 
     def stop(self) -> Path | None:
-        """Close the file; returns it, or None if nothing was being recorded."""
+        """Close the file and return its path; None if there is no recording."""
         with self._lock:
             recorder, self._recorder = self._recorder, None
         if recorder is None:
@@ -367,7 +367,7 @@ class RecorderSwitch:
         self.stop()
 
     def _free_path(self) -> Path:
-        """Return a name by the time that no file has."""
+        """Return a path, named by the time, that does not exist yet."""
         stem = f"dive_{datetime.now(UTC):%Y%m%dT%H%M%SZ}"
         try:
             self._folder.mkdir(parents=True, exist_ok=True)

@@ -1,6 +1,7 @@
 """A recorded dive, frame by frame, with the stripes that the scanner detected."""
 
 import functools
+import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,27 +28,27 @@ from aqualvs.sources.mcap_file import McapFile, StoredMessage
 
 @dataclass(frozen=True, slots=True)
 class RecordedFrame:
-    """Frame as a recording holds it."""
+    """Frame of a recording."""
 
-    # As in the `Frame`.
+    # As in `Frame`.
     index: int
     time_s: float
-    # Index that it was measured with.
+    # Refractive index of the water used for this frame.
     n_water: float
-    # Stripes as detected.
+    # Detected stripes.
     peaks: dict[SearchAxis, StripePeaks]
-    # Why it was not measured at all.
+    # Reason if the frame was not measured; None if it was.
     refusal: Refusal | None
-    # By the vehicle's gyros.
+    # Rates by the vehicle's gyros, if known.
     turning: GyroRates | None
-    # None where there is none, or it was not asked for.
+    # None if there is none, or pictures are not decoded.
     picture: Frame | None
 
 
 class DiveRecording:
-    """A recording of a dive.
+    """Recording of a dive.
 
-    Raises `SourceError` if it cannot be read, or holds no stripes.
+    Raises `SourceError` if it cannot be read, or contains no stripes.
     """
 
     def __init__(self, path: Path) -> None:
@@ -55,38 +56,35 @@ class DiveRecording:
         self._file = McapFile(path)
         if STRIPES.name not in self._file.topics:
             raise SourceError(f"{path}: holds no stripes; give a recording of aqualvs, or a video")
-        # That the dive was measured with at its beginning; None where it is lost or not understood.
+        # Rig and options at the beginning of the dive; None if lost or of a later version.
         self.rig: Rig | None = None
-        self.options: ScannerOptions | None = None  # As the dive was measured; likewise.
+        self.options: ScannerOptions | None = None
         self._no_rig = "its rig is in none of its undamaged parts; add --rig"
-        # The rig is recorded every minute, so it survives the loss of the first part.
+        # The rig is recorded every minute, so that it survives the loss of the first part.
         stored = next(self._file.messages([RIG.name]), None)
         if stored is not None:
             self._read_rig(stored.data)
         elif next(self._file.messages([STRIPES.name]), None) is None:
             raise SourceError(f"{path}: holds no stripes; give a recording of aqualvs, or a video")
-        self.n_frames = self._file.count(STRIPES.name)  # None where a torn file does not say.
+        self.n_frames = self._file.count(STRIPES.name)  # None if unknown, in a torn file.
         self.has_pictures = next(self._file.messages([PICTURE.name]), None) is not None
 
     @functools.cached_property
     def fps(self) -> float | None:
-        """Frames per second over the first few of them, which are read when it is asked for.
+        """Frames per second over the first frames, which are read on first access; None if unknown.
 
-        Raises `SourceError` if a message cannot be understood.
+        Raises `SourceError` if a message cannot be decoded.
         """
-        first = last = None
-        for n, frame in enumerate(self.frames(with_pictures=False)):
-            first, last = first or frame, frame
-            if n == 50:
-                break
-        if first is None or last is None or last.time_s <= first.time_s:
+        n_frames = 51
+        frames = list(itertools.islice(self.frames(with_pictures=False), n_frames))
+        if not frames or frames[-1].time_s <= frames[0].time_s:
             return None
-        return (last.index - first.index) / (last.time_s - first.time_s)
+        return (frames[-1].index - frames[0].index) / (frames[-1].time_s - frames[0].time_s)
 
     def need_rig(self) -> Rig:
         """Return the rig.
 
-        Raises `SourceError` if it is lost or not understood.
+        Raises `SourceError` if it is lost or cannot be decoded.
         """
         if self.rig is None:
             raise SourceError(f"{self.path}: {self._no_rig}")
@@ -106,14 +104,14 @@ class DiveRecording:
 
     @property
     def n_torn(self) -> int:
-        """Chunks of about half a second that were torn and left out so far."""
+        """Number of torn chunks, of about half a second each, left out so far."""
         return self._file.n_torn
 
     def frames(self, *, with_pictures: bool) -> Iterator[RecordedFrame]:
         """Yield the frames in the order of their recording.
 
-        `with_pictures`: whether to decode pictures, where there are any. Raises `SourceError` if a
-        message cannot be understood.
+        `with_pictures`: whether to decode pictures, if there are any. Raises `SourceError` if a
+        message cannot be decoded.
         """
         wanted = [STRIPES.name]
         if with_pictures:
@@ -149,7 +147,7 @@ def is_recording(path: Path) -> bool:
 
 
 def _picture(index: int, time_s: float, parts: dict[str, StoredMessage]) -> Frame | None:
-    """Return the picture that came with the stripes."""
+    """Return the picture of the same frame as the stripes; None if there is none."""
     picture, chroma = parts.get(PICTURE.name), parts.get(CHROMA.name)
     stamp_ns = parts[STRIPES.name].log_ns
     if picture is None or picture.log_ns != stamp_ns:

@@ -1,21 +1,21 @@
 """Samples for Rerun (https://rerun.io; extra `rerun`): to a file `.rrd` or to a viewer.
 
 Entities: `target` is the frame of the target, with the foot of the perpendicular from the dome's
-centre as origin and axes as `dome` has them before a target that is squarely ahead: x right, y away
-along the normal, z up. The vehicle moves in it, the target stands still.
+centre as origin, and x right, y away along the normal, z up: parallel to `dome` for a target square
+ahead. The vehicle moves in this frame, and the target is at rest.
 
 ==========================================  ======================================================
-`target/plane`, `target/plane/sigma`        the target, and where it may lie by one sigma of the
-                                            total: the farther it turns, the more at the edges
+`target/plane`, `target/plane/sigma`        the target, and one total sigma of its position, which
+                                            at the edges includes that of its rotation
 `target/vehicle`                            transform of `dome`
 `target/vehicle/points`                     stripe points by label
 `target/vehicle/camera`                     transform and pinhole; `picture` and its `points`
 `posture/range_m`, `pitch_deg`, `yaw_deg`   value, value - sigma, value + sigma
-`refusals`                                  why there is no posture, as text
+`refusals`                                  reason for a missing posture, as text
 ==========================================  ======================================================
 
-Timelines: `frame`, its number, and `dive`, the time since the start of the source. What a refusal
-leaves without a value is cleared, so that nothing old stays in sight.
+Timelines: `frame`, its number, and `dive`, the time since the start of the source. After a refusal,
+entities without a value are cleared, so that viewers do not show old ones.
 """
 
 import math
@@ -48,10 +48,10 @@ _BLUE, _PALE, _AMBER = (51, 153, 255, 90), (51, 153, 255, 255), (240, 228, 66, 2
 
 
 class RerunLog(Closing):
-    """Writer of samples to one place, chosen by `save`, `connect` or `spawn`; a context manager.
+    """Writer of samples to one destination: `save`, `connect` or `spawn`; a context manager.
 
-    `picture_hz`, `points_hz`: most pictures, with the points in them, and point clouds per second;
-    0 for none. Raises `OptionError` if rerun-sdk is not installed.
+    `picture_hz`, `points_hz`: largest rates of pictures, with the points in them, and of point
+    clouds; 0 for none. Raises `OptionError` if rerun-sdk is not installed.
     """
 
     def __init__(self, *, picture_hz: float = 5.0, points_hz: float = 10.0) -> None:
@@ -66,14 +66,14 @@ class RerunLog(Closing):
 
         Raises `OSError` if it cannot be written.
         """
-        # The SDK words such faults in its own way.
+        # Raises OSError; the SDK has errors of its own.
         path.open("wb").close()
         self._stream.save(path, default_blueprint=_blueprint())
 
     def connect(self, url: str) -> None:
-        """Send to a viewer; may wait for it for seconds.
+        """Send to a viewer; may wait for seconds until it answers.
 
-        Raises `RuntimeError` if the address is none.
+        Raises `RuntimeError` if the address is malformed.
         """
         self._stream.connect_grpc(url, default_blueprint=_blueprint())
 
@@ -111,14 +111,14 @@ class RerunLog(Closing):
             self._stream.log(f"{_PICTURE}/points", marks)
 
     def flush(self, timeout_s: float) -> None:
-        """Wait until everything has gone out.
+        """Wait until everything has been sent.
 
-        Raises `RuntimeError` if it does not within the time.
+        Raises `RuntimeError` after the timeout.
         """
         self._stream.flush(timeout_sec=timeout_s)
 
     def close(self) -> None:
-        """Finish the file, or leave the viewer; further calls do nothing."""
+        """Finish the file, or disconnect from the viewer; further calls do nothing."""
         if not self._closed:
             self._closed = True
             self._stream.disconnect()
@@ -130,7 +130,7 @@ class RerunLog(Closing):
         self._log_static(
             _CAMERA, rr.Transform3D(translation=camera.translation, mat3x3=camera.rotation)
         )
-        # Of the lens in air: neither its distortion nor the dome is in it.
+        # The lens in air, without its distortion and the dome.
         pinhole = rr.Pinhole(
             focal_length=(lens.fx, lens.fy),
             principal_point=(lens.cx + 0.5, lens.cy + 0.5),
@@ -185,7 +185,7 @@ class RerunLog(Closing):
 
     def _log_refusal(self, refusal: Refusal) -> None:
         is_silence = refusal.reason is Reason.NO_FRAMES
-        # A silent stream repeats itself ten times a second.
+        # A silent stream is reported ten times a second.
         if not (is_silence and self._silent):
             detail = refusal.detail or reason_text(refusal.reason)
             level = "WARN" if is_silence else "INFO"
@@ -198,14 +198,14 @@ class RerunLog(Closing):
 
 
 def plane_sigma(posture: Posture, places: FloatArray) -> FloatArray:
-    """Return the standard deviation of the target's place along its normal, in metres.
+    """Return the standard deviation (N,) of points of the target along its normal, in metres.
 
     Parameters
     ----------
     posture : Posture
-        Its total covariance counts.
+        Posture with its total covariance.
     places : array, shape (N, 2)
-        On the target, in metres from the foot of the perpendicular: to the right and up.
+        Points on the target, in metres to the right and up from the foot of the perpendicular.
     """
     normal, axes = posture.normal_in_dome, upright_axes(posture.normal_in_dome)
     steep = np.array([math.tan(posture.yaw), 1.0, math.tan(posture.pitch)])
@@ -236,7 +236,7 @@ def rerun_sdk() -> Any:
 
 
 def _blueprint() -> Any:
-    """Return the layout that a viewer begins with."""
+    """Return the initial layout of a viewer."""
     rrb = rerun_sdk().blueprint
     picture = rrb.Spatial2DView(origin=_PICTURE, name="picture")
     series = [rrb.TimeSeriesView(origin=path, name=path.rpartition("/")[2]) for path in _SERIES]

@@ -12,22 +12,22 @@ from aqualvs.sources.base import Health
 
 @dataclass(frozen=True, slots=True)
 class Instants:
-    """Times at which a frame passed the stages, by `time.monotonic_ns`."""
+    """Times at which a frame passed the stages of a live run, by `time.monotonic_ns`."""
 
-    arrived_ns: int  # Decoded, or in the hands of the source.
+    arrived_ns: int  # Arrival: decoded, or received from the source.
     taken_ns: int  # Taken from the mailbox.
     scanned_ns: int  # Measured.
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LiveSample:
-    """One frame's answer on its way to pilot, autopilot and log."""
+    """Result of one frame for the outputs: pilot, autopilot, recording and others."""
 
-    rig: Rig  # That it was measured with, in the water as it is known.
-    # Raw posture or refusal, and the points. Where the stream is silent there is no frame: the scan
-    # then has the refusal `no_frames` and the number and time of the last frame.
+    rig: Rig  # Rig of the measurement, in water of the index known then.
+    # Raw posture or refusal, and the points. For a silent stream there is no frame: the scan then
+    # has the refusal `no_frames` and the number and time of the last frame.
     scan: Scan
-    # Stripes by search direction, as detected; empty where there is no frame.
+    # Detected stripes by search axis; empty without a frame.
     peaks: dict[SearchAxis, StripePeaks]
     # The picture.
     frame: Frame | None
@@ -35,14 +35,14 @@ class LiveSample:
     utc_ns: int
 
     instants: Instants
-    filtered: FilteredPosture | None  # From the time filter, where it is switched on and running.
-    health: Health  # As of this frame.
+    filtered: FilteredPosture | None  # Of the time filter; None while it is off or has no state.
+    health: Health  # At the time of this frame.
 
     @property
     def posture_ns(self) -> int:
-        """Time of the posture by `time.monotonic_ns`: that of the picture's middle.
+        """Time of the posture by `time.monotonic_ns`: that of the middle of the picture.
 
-        As if the picture had come at the end of its last row: delays of camera and network are not
-        known here.
+        The picture is assumed to arrive when its last row ends: delays of camera and network are
+        not known here.
         """
         return self.instants.arrived_ns - round(1e9 * self.rig.shutter.middle_to_end)
