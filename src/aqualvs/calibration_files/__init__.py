@@ -1,7 +1,7 @@
-"""Calibration files of other programs, read into rigs and written from them.
+"""Calibration files of other programs, converted to rigs and from rigs.
 
-ROS, OpenCV, Kalibr, mrcal, COLMAP and Refractive COLMAP; docs/formats.md has the conventions. One
-module for each program; imports `optics` and `calibration.targets`.
+ROS, OpenCV, Kalibr, mrcal, COLMAP and Refractive COLMAP; docs/formats.md has the conventions.
+Imports `optics` and `calibration.targets`.
 """
 
 from aqualvs.calibration_files.camera import ForeignCamera, camera_of_rig, rig_of_camera

@@ -1,6 +1,6 @@
-"""A camera as other programs describe it, the rig that it makes, and the values of their files.
+"""Cameras of other programs, their conversion to rigs, and strict access to values of their files.
 
-Keys and values are read strictly; every fault names its place (`Entries`).
+`Entries` reads keys and values; its errors name the place in the file.
 """
 
 import math
@@ -24,29 +24,29 @@ from aqualvs.optics.water import N_AIR
 
 @dataclass(frozen=True, slots=True)
 class ForeignHousing:
-    """A housing and the media inside and outside of it, in the frame of the camera."""
+    """Housing in the frame of the camera, with the media inside and outside."""
 
     housing: Dome | FlatPort
-    # Refractive indices.
+    # Refractive indices inside and outside.
     n_air: float
     n_water: float
-    # Shape (3,): centre of the dome in `cam`, in metres; zero for a flat port, whose origin is the
-    # lens.
+    # Shape (3,): centre of the dome in `cam`, in metres; zero for a flat port, whose distance is
+    # measured from the lens.
     centre: FloatArray = field(default_factory=lambda: np.zeros(3))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ForeignCamera:
-    """What the file of another program says of one camera."""
+    """Camera from the file of another program."""
 
     name: str
-    size_px: tuple[int, int] | None  # Image width and height; None where the file does not say it.
+    size_px: tuple[int, int] | None  # Image width and height; None if the file does not state it.
     lens: Lens  # The centre of the top-left pixel is (0, 0).
     port: ForeignHousing | None = None  # None for a camera without a housing.
 
 
 def opencv_lens(core: Sequence[float], distortion: Sequence[float], *, fisheye: bool) -> Lens:
-    """Return the lens of OpenCV's coefficients, if aqualvs has all of them.
+    """Return the lens with OpenCV's coefficients.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ def opencv_lens(core: Sequence[float], distortion: Sequence[float], *, fisheye: 
     Raises
     ------
     RigError
-        If there are others, or a value is impossible.
+        If there are coefficients that the lens model lacks, or a value is impossible.
     """
     values = tuple(map(float, distortion))
     n_opencv = 8
@@ -77,9 +77,9 @@ def opencv_lens(core: Sequence[float], distortion: Sequence[float], *, fisheye: 
 
 
 def padded(lens: Lens, n: int) -> tuple[float, ...]:
-    """Return n distortion coefficients of a lens, zeros for those that it lacks.
+    """Return the first n distortion coefficients of a lens, padded with zeros.
 
-    Raises `RigError` if one that is not zero would be lost.
+    Raises `RigError` if a further one is not zero.
     """
     values = (*lens.distortion, *(0.0,) * n)
     if any(values[n:]):
@@ -93,12 +93,12 @@ def rig_of_camera(
 ) -> Rig:
     """Return the rig of a camera, without lasers: behind its housing, or bare in air.
 
-    The camera looks along the dome's y axis: other programs do not know a frame of the vehicle.
+    The camera looks along the dome's y axis: other programs have no frame of the vehicle.
 
     Parameters
     ----------
     camera : ForeignCamera
-        With the size of its pictures.
+        Camera with the size of its pictures.
     source : str
         Name of the file in messages.
     solved_from : dict, optional
@@ -107,21 +107,22 @@ def rig_of_camera(
     Raises
     ------
     RigError
-        If such a rig is impossible.
+        If the size is missing, or values do not fulfil the conditions on rig files.
     """
     if camera.size_px is None:
         raise RigError(
             f"{source}: does not say the size of the pictures; add --image, such as "
             "--image 1920x1080"
         )
-    port, turn = camera.port, DOME_FROM_CAM_NOMINAL
-    lens_in_dome = np.zeros(3) if port is None else -(turn @ port.centre) + 0.0
+    port, rotation = camera.port, DOME_FROM_CAM_NOMINAL
+    lens_in_dome = np.zeros(3) if port is None else -(rotation @ port.centre) + 0.0
+    # As of a nominal rig.
     working_range_m = (0.25, 1.3)
     rig = Rig(
         name=camera.name,
         size_px=camera.size_px,
         lens=camera.lens,
-        dome_from_cam=SE3(turn.copy(), lens_in_dome),
+        dome_from_cam=SE3(rotation.copy(), lens_in_dome),
         housing=None if port is None else port.housing,
         n_air=N_AIR if port is None else port.n_air,
         n_water=N_AIR if port is None else port.n_water,
@@ -130,7 +131,7 @@ def rig_of_camera(
         solved_from=solved_from or {},
     )
     try:
-        # The conditions on rig files hold for this one, too.
+        # Apply the conditions on rig files.
         return rig_from_mapping(rig_to_mapping(rig), source_name=source, need_lasers=False)
     except AqualvsError:
         raise
@@ -139,7 +140,7 @@ def rig_of_camera(
 
 
 def camera_of_rig(rig: Rig) -> ForeignCamera:
-    """Return the camera of a rig, with its housing, as seen from the camera."""
+    """Return the camera of a rig, with its housing in the frame of the camera."""
     port = None
     if rig.housing is not None:
         port = ForeignHousing(rig.housing, rig.n_air, rig.n_water)
@@ -149,31 +150,31 @@ def camera_of_rig(rig: Rig) -> ForeignCamera:
     return ForeignCamera(name=rig.name, size_px=rig.size_px, lens=rig.lens, port=port)
 
 
-# YAML of C++ programs has numbers such as 1e-05, which YAML 1.1 reads as text; XML has text only.
+# C++ programs write numbers such as 1e-05, which YAML 1.1 reads as text; XML has text only.
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 
 
 @dataclass(frozen=True, slots=True)
 class Entries:
-    """A mapping of a file."""
+    """Mapping in a file, with access to checked values."""
 
     content: Mapping[Any, Any]
-    place: str = ""  # Where it is in the file, such as "cam0."; empty at the top.
+    place: str = ""  # Prefix of keys in messages, such as "cam0."; empty at the top.
 
     @classmethod
     def top(cls, content: object) -> "Entries":
-        """Return the mapping that a whole file holds.
+        """Return the top-level mapping of a file.
 
-        Raises `RigError` if it holds none.
+        Raises `RigError` if the content is no mapping.
         """
         if not isinstance(content, Mapping):
             raise RigError("holds no keys and values; give the whole file")
         return cls(content)
 
     def first(self, keys: Sequence[str]) -> str:
-        """Return the first of some keys that there is.
+        """Return the first of some keys that has a value.
 
-        Raises `RigError` if there is none.
+        Raises `RigError` if none has.
         """
         for key in keys:
             if self.content.get(key) is not None:
@@ -187,7 +188,7 @@ class Entries:
     def part(self, key: str) -> "Entries":
         """Return the mapping at a key.
 
-        Raises `RigError` if there is none.
+        Raises `RigError` if there is no mapping.
         """
         value = self.content.get(key)
         if not isinstance(value, Mapping):
@@ -195,7 +196,7 @@ class Entries:
         return Entries(value, f"{self.place}{key}.")
 
     def word(self, *keys: str) -> str:
-        """Return the text at the first of some keys that there is."""
+        """Return the text at the first key with a value."""
         key = self.first(keys)
         value = self.content[key]
         if not isinstance(value, str):
@@ -209,19 +210,20 @@ class Entries:
         return (str(value).strip() if named else "") or default
 
     def number(self, *keys: str) -> float:
-        """Return the number at the first of some keys that there is."""
+        """Return the number at the first key with a value."""
         key = self.first(keys)
         return number(self.content[key], self.place + key)
 
     def whole(self, *keys: str) -> int:
-        """Return the whole number at the first of some keys that there is."""
+        """Return the whole number at the first key with a value."""
         key = self.first(keys)
         return whole(self.number(key), self.place + key)
 
     def numbers(self, *keys: str) -> list[float]:
-        """Return the numbers of a list, matrix or vector at the first of some keys that there is.
+        """Return the numbers of a list, matrix or vector at the first key with a value.
 
-        Raises `RigError` if it holds anything else, or not as many numbers as it says.
+        Raises `RigError` for anything else, or if the number of values is not that of `rows` times
+        `cols`.
         """
         key = self.first(keys)
         value, place = self.content[key], self.place + key
@@ -243,9 +245,9 @@ class Entries:
         return [number(one, f"{place}[{i}]") for i, one in enumerate(flat)]
 
     def listed(self, n: int, *keys: str) -> list[float]:
-        """Return the numbers at the first of some keys that there is, which must be n.
+        """Return the numbers at the first key with a value, which must be n.
 
-        Raises `RigError` if it holds anything else.
+        Raises `RigError` for anything else.
         """
         values = self.numbers(*keys)
         if len(values) != n:
@@ -254,15 +256,15 @@ class Entries:
         return values
 
     def size(self, *keys: str) -> tuple[int, int]:
-        """Return the width and height in a list at the first of some keys that there is."""
+        """Return the width and height in a list at the first key with a value."""
         key = self.place + self.first(keys)
         width, height = self.listed(2, *keys)
         return whole(width, key), whole(height, key)
 
     def core(self, *keys: str) -> tuple[float, float, float, float]:
-        """Return fx, fy, cx, cy of the camera matrix at the first of some keys that there is.
+        """Return fx, fy, cx, cy of the camera matrix at the first key with a value.
 
-        Raises `RigError` if it is no camera matrix, or has skew.
+        Raises `RigError` if it is no camera matrix, or has a skew.
         """
         key = self.place + self.first(keys)
         fx, skew, cx, zero, fy, cy, *last = self.listed(9, *keys)
@@ -276,10 +278,11 @@ class Entries:
 def number(value: object, place: str) -> float:
     """Return a value as a finite number.
 
-    Raises `RigError` if it is none.
+    Raises `RigError` for any other value.
     """
-    longest_number = 40
-    if isinstance(value, str) and len(value) < longest_number and _NUMBER.fullmatch(value.strip()):
+    # A longer text is no number.
+    max_length = 40
+    if isinstance(value, str) and len(value) < max_length and _NUMBER.fullmatch(value.strip()):
         value = float(value)
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise RigError(f"{place} is {shown(value)}; write a finite number")
@@ -287,9 +290,9 @@ def number(value: object, place: str) -> float:
 
 
 def whole(value: float, place: str) -> int:
-    """Return a number as a whole one.
+    """Return a number as an integer.
 
-    Raises `RigError` if it is none, or larger than any size of a picture.
+    Raises `RigError` if it is not a whole number between 0 and 1e9, beyond any size of a picture.
     """
     largest = 1e9
     if value != math.floor(value) or not 0 <= value <= largest:
@@ -298,7 +301,7 @@ def whole(value: float, place: str) -> int:
 
 
 def shown(value: object) -> str:
-    """Return a value in a few characters."""
+    """Return a value as text of at most 60 characters."""
     if isinstance(value, Mapping):
         return "a mapping"
     text = "empty" if value is None else repr(value)[:200]

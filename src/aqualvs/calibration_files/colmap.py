@@ -7,8 +7,8 @@ Refractive COLMAP (colmap_underwater, arXiv:2403.08640) appends `DOMEPORT Cx Cy 
 int_thick na ng nw` or `FLATPORT Nx Ny Nz int_dist int_thick na ng nw`
 (src/colmap/sensor/models_refrac.h, WriteCamerasText in reconstruction.cc): the dome's centre or the
 port's unit normal in `cam`, inner radius or distance of the inner face from the lens, and
-thickness, all in metres, and the indices of air, wall and water. A later port writes the word
-REFRAC before; it is read as well.
+thickness, all in metres, and the refractive indices of air, housing and water. A later version
+writes the word REFRAC before these; it is read as well.
 """
 
 import math
@@ -33,7 +33,7 @@ from aqualvs.optics.dome import Dome
 from aqualvs.optics.flat_port import FlatPort
 from aqualvs.optics.lens import Lens, LensModel
 
-# Pixel centres are at halves.
+# Position of the centre of the top-left pixel.
 _HALF = 0.5
 _MODELS = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
@@ -66,8 +66,8 @@ class _Row(NamedTuple):
 def read_colmap(text: str, source: str, *, name: str | None = None) -> ForeignCamera:
     """Return one camera of a `cameras.txt`.
 
-    `name`: CAMERA_ID; needed where there are several. Raises `RigError` with one line without the
-    file's name.
+    `name`: CAMERA_ID; required if there are several cameras. Raises `RigError` with one line,
+    without the file's name.
     """
     rows: dict[str, _Row] = {}
     for n_line, line in enumerate(text.splitlines(), 1):
@@ -128,9 +128,9 @@ def _port(words: Sequence[str], place: str) -> ForeignHousing:
     if model == _DOME:
         return ForeignHousing(Dome(size, thickness, n_port), n_air, n_water, np.array([x, y, z]))
     length = math.hypot(x, y, z)
-    # Of a normal that is written with few digits.
-    not_unit = 1e-3
-    if not abs(length - 1.0) <= not_unit:
+    # The normal may be written with few digits.
+    tolerance = 1e-3
+    if not abs(length - 1.0) <= tolerance:
         raise RigError(
             f"{place}: {model}: the normal Nx Ny Nz has the length {length:g}; write a unit vector"
         )

@@ -1,7 +1,6 @@
 """`aqualvs import` and `aqualvs export`: calibrations of other programs into rigs, and back.
 
-`read_camera`, `read_board` and `camera_text` read and write any of the formats; faults name the
-file.
+`read_camera`, `read_board` and `camera_text` read and write all formats; errors name the file.
 """
 
 import contextlib
@@ -31,6 +30,7 @@ from aqualvs.optics.rigfile import check_rig_place, load_rig, save_rig
 from aqualvs.optics.shutter import AT_ONCE
 from aqualvs.optics.solved import assumptions, rig_uncertainty
 from aqualvs.results.files import Claim, replace_text, writing
+from aqualvs.text import count_text
 from aqualvs.yamlfile import read_text
 
 EXPORTS: Final = ("ros", "opencv", "kalibr", "mrcal", "colmap", "colmap-underwater")
@@ -42,7 +42,7 @@ _WHAT = "a calibration file of another program"
 def format_of(path: Path) -> tuple[CalibrationFormat, str]:
     """Return the format of a file, and its text.
 
-    Raises `RigError` if the file cannot be read, or is of none of the formats.
+    Raises `RigError` if the file cannot be read, or its format is not known.
     """
     text = read_text(path, _WHAT, RigError)
     found = recognised(text)
@@ -63,9 +63,9 @@ def read_camera(
     Parameters
     ----------
     camera : str, optional
-        Name of the camera, where a file of Kalibr or COLMAP holds several.
+        Name of the camera, if a file of Kalibr or COLMAP has several.
     model : str, optional
-        "opencv" or "fisheye", where a FileStorage of OpenCV does not say it.
+        "opencv" or "fisheye", if a FileStorage of OpenCV does not state it.
 
     Raises
     ------
@@ -107,12 +107,12 @@ def camera_text(camera: ForeignCamera, to: str, *, suffix: str = "") -> str:
     to : str
         One of `EXPORTS`.
     suffix : str
-        Of the file; .xml and .json choose the form of a FileStorage.
+        Suffix of the file; .xml and .json choose the form of a FileStorage.
 
     Raises
     ------
     RigError
-        If the format cannot hold the camera.
+        If the format cannot represent the camera.
     """
     writers = {"ros": ros_text, "kalibr": kalibr_text, "mrcal": mrcal_text}
     if to in writers:
@@ -126,7 +126,7 @@ def camera_text(camera: ForeignCamera, to: str, *, suffix: str = "") -> str:
 
 @contextlib.contextmanager
 def _naming(path: str | Path) -> Iterator[None]:
-    """Put the file's name before a fault that lacks it."""
+    """Prefix errors with the file's name, unless they have it."""
     try:
         yield
     except RigError as fault:
@@ -139,7 +139,7 @@ def _naming(path: str | Path) -> Iterator[None]:
 Echo: TypeAlias = Callable[[str], object]
 
 IMPORTED = "imported"
-"""Key of `Rig.solved_from`: the file that the camera was taken from."""
+"""Key of `Rig.solved_from`: the file from which the camera was imported."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -168,8 +168,7 @@ class ExportRequest:
 def run_import(request: ImportRequest, echo: Echo) -> None:
     """Write the rig or the board of a calibration file.
 
-    Raises `AqualvsError` if the file cannot be read, holds what aqualvs lacks, or the output cannot
-    be written.
+    Raises `AqualvsError` if the file cannot be read or converted, or the output cannot be written.
     """
     found, _ = format_of(request.source)
     what = request.what or ("board" if found is CalibrationFormat.KALIBR_TARGET else "rig")
@@ -181,7 +180,7 @@ def run_import(request: ImportRequest, echo: Echo) -> None:
         return
     check_rig_place(request.out)
     camera = read_camera(request.source, camera=request.camera, model=request.model)
-    camera = _of_size(camera, request)
+    camera = _with_size(camera, request)
     dropped = what == "camera" and camera.port is not None
     if dropped:
         camera = replace(camera, port=None)
@@ -194,8 +193,8 @@ def run_import(request: ImportRequest, echo: Echo) -> None:
         echo(line)
 
 
-def _of_size(camera: ForeignCamera, request: ImportRequest) -> ForeignCamera:
-    """Return the camera with the size of its pictures, which a file may leave out."""
+def _with_size(camera: ForeignCamera, request: ImportRequest) -> ForeignCamera:
+    """Return the camera with the picture size of `--image`, for files that do not state it."""
     if request.image is None:
         return camera
     match = re.fullmatch(r"(\d{1,6})x(\d{1,6})", request.image)
@@ -230,8 +229,8 @@ def _remarks(rig: Rig, *, dropped: bool) -> list[str]:
             f"dome: inner radius {rig.dome.inner_radius * 1e3:g} mm; the camera counts as looking "
             "along the dome's y axis"
         )
-    words = "; ".join(f"{one.words} ({one.what})" for one in assumptions(rig))
-    lines.append(f"uncertainty: the file has none; one sigma that is assumed: {words}")
+    sigmas = "; ".join(f"{one.words} ({one.what})" for one in assumptions(rig))
+    lines.append(f"uncertainty: the file has none; assumed (one sigma): {sigmas}")
     lines.append("next: lasers, by 'aqualvs calibrate lasers' or by hand (docs/rig.md)")
     return lines
 
@@ -239,8 +238,8 @@ def _remarks(rig: Rig, *, dropped: bool) -> list[str]:
 def run_export(request: ExportRequest, echo: Echo) -> None:
     """Write the camera of a rig in the format of another program.
 
-    Raises `AqualvsError` if the rig cannot be read, the format cannot hold it, or the file cannot
-    be written.
+    Raises `AqualvsError` if the rig cannot be read, the format cannot represent it, or the file
+    cannot be written.
     """
     rig = load_rig(request.rig, need_lasers=False)
     try:
@@ -261,7 +260,7 @@ def _left_out(rig: Rig, to: str) -> list[str]:
     names = []
     if housing and not refractive:
         names.append(f"the {housing} (the intrinsics are those in air)")
-    names += [f"{len(rig.lasers)} laser{'s' if len(rig.lasers) > 1 else ''}"] if rig.lasers else []
+    names += [count_text(len(rig.lasers), "laser")] if rig.lasers else []
     if housing and refractive:
         names.append("the camera's rotation" + (" in the dome" if rig.dome else " and place"))
     names += ["the shutter"] if rig.shutter != AT_ONCE else []

@@ -12,7 +12,7 @@ from aqualvs.errors import CalibrationError, RigError
 from aqualvs.optics.lens import LensModel
 from aqualvs.yamlfile import parse_yaml, yaml_text
 
-# Whether a distortion model is a fisheye's, and its number of coefficients.
+# By distortion model: whether it is a fisheye, and its number of coefficients.
 _DISTORTIONS = {
     "radtan": (False, 4),
     "equi": (True, 4),
@@ -24,8 +24,8 @@ _DISTORTIONS = {
 def read_kalibr(text: str, source: str, *, name: str | None = None) -> ForeignCamera:
     """Return one camera of a `camchain.yaml`.
 
-    `name`: key of the camera, such as "cam0"; needed where there are several. Raises `RigError`
-    with one line without the file's name, but for faults of the YAML.
+    `name`: key of the camera, such as "cam0"; required if there are several. Raises `RigError` with
+    one line, without the file's name except for errors of the YAML.
     """
     top = Entries.top(parse_yaml(text, source, RigError))
     cameras = [
@@ -60,9 +60,9 @@ def read_kalibr(text: str, source: str, *, name: str | None = None) -> ForeignCa
 
 
 def one_of(cameras: list[str], name: str | None) -> str:
-    """Return the name of the camera that is meant.
+    """Return the name of the requested camera, or of the only one.
 
-    Raises `RigError` if there is none, or which one is not said.
+    Raises `RigError` if there is no camera of that name, or several and no name.
     """
     listed = ", ".join(cameras[:20])
     if not cameras:
@@ -101,8 +101,8 @@ def kalibr_text(camera: ForeignCamera) -> str:
 def read_kalibr_target(text: str, source: str) -> Board:
     """Return the board of a target file.
 
-    Raises `RigError` with one line without the file's name, but for faults of the YAML; also for
-    targets that aqualvs does not find in pictures.
+    Raises `RigError` with one line, without the file's name except for errors of the YAML; also for
+    targets that aqualvs cannot detect.
     """
     target = Entries.top(parse_yaml(text, source, RigError))
     kind = target.word("target_type")

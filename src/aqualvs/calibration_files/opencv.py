@@ -1,6 +1,6 @@
 """Camera files in OpenCV's model: ROS (`camera_info.yaml`), OpenCV (FileStorage), mrcal.
 
-Those of ROS and OpenCV hold OpenCV's camera matrix and distortion coefficients. The names of ROS's
+Those of ROS and OpenCV have OpenCV's camera matrix and distortion coefficients. The names of ROS's
 distortion models are those of sensor_msgs/distortion_models.hpp: plumb_bob, rational_polynomial,
 equidistant. A `.cameramodel` of mrcal is a Python literal; its models LENSMODEL_PINHOLE and
 LENSMODEL_OPENCV4, 5, 8 and 12 are OpenCV's (mrcal, "Lens models"); the centre of the top-left pixel
@@ -22,7 +22,7 @@ from aqualvs.errors import RigError
 from aqualvs.optics.lens import Lens, LensModel
 from aqualvs.yamlfile import parse_yaml, yaml_text
 
-# Coefficients that each of ROS's models takes; image_geometry ignores none of them.
+# By distortion model of ROS: possible numbers of coefficients; image_geometry uses all of them.
 _ROS_MODELS = {"plumb_bob": (0, 4, 5), "rational_polynomial": (8, 12, 14), "equidistant": (0, 4)}
 _FISHEYE = "equidistant"
 
@@ -30,7 +30,7 @@ _FISHEYE = "equidistant"
 def read_ros(text: str, source: str) -> ForeignCamera:
     """Return the camera of a `camera_info.yaml`, or of a printed sensor_msgs/CameraInfo.
 
-    Raises `RigError` with one line without the file's name, but for faults of the YAML.
+    Raises `RigError` with one line, without the file's name except for errors of the YAML.
     """
     # `ros2 topic echo` ends each message with this line.
     content = parse_yaml(re.sub(r"(?:^---\s*)+\Z", "", text, flags=re.MULTILINE), source, RigError)
@@ -59,7 +59,7 @@ def read_ros(text: str, source: str) -> ForeignCamera:
 
 
 def _check_whole_picture(entries: Entries) -> None:
-    """Refuse a message of binned or cut pictures, which its intrinsics are not for."""
+    """Refuse a message of binned or cropped pictures, to which its intrinsics do not apply."""
     for key in ("binning_x", "binning_y"):
         if entries.has(key) and entries.whole(key) > 1:
             raise RigError(f"{key} is {entries.whole(key)}; calibrate the pictures that are used")
@@ -100,7 +100,7 @@ def ros_text(camera: ForeignCamera) -> str:
 
 
 def plain_name(name: str) -> str:
-    """Return a name of letters, digits and underscores, as ROS takes it."""
+    """Return a name of letters, digits and underscores only, as ROS requires."""
     return re.sub(r"[^A-Za-z0-9_]+", "_", name) or "camera"
 
 
@@ -108,7 +108,7 @@ def _matrix(lens: Lens) -> Any:
     return np.array([[lens.fx, 0.0, lens.cx], [0.0, lens.fy, lens.cy], [0.0, 0.0, 1.0]])
 
 
-# Names that OpenCV's own samples and applications, and users of FileStorage, give.
+# Keys that OpenCV's samples and applications, and users of FileStorage, use.
 _MATRIX = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "mtx", "intrinsic_matrix")
 _DISTORTION = (
     *("distortion_coefficients", "Distortion_Coefficients", "distCoeffs", "dist_coeffs"),
@@ -120,8 +120,8 @@ _SIZES = ("image_size", "imageSize", "cameraResolution", "resolution")
 def read_opencv(text: str, source: str, *, model: str | None = None) -> ForeignCamera:
     """Return the camera of a FileStorage in YAML, XML or JSON.
 
-    `model`: "opencv" or "fisheye" where the file does not say it (`fisheye_model`). Raises
-    `RigError` with one line without the file's name, but for faults of the YAML.
+    `model`: "opencv" or "fisheye", if the file does not state it (`fisheye_model`). Raises
+    `RigError` with one line, without the file's name except for errors of the YAML.
     """
     entries = _storage(text, source)
     core = entries.core(*_MATRIX)
@@ -149,7 +149,7 @@ def _storage(text: str, source: str) -> Entries:
     """Return the content of a FileStorage as plain values; matrices have rows, cols and data."""
     if "<opencv_storage>" in text:
         return Entries.top(_xml(text))
-    # YAML 1.0 has a header that newer YAML does not know, and matrices have a tag of OpenCV.
+    # YAML 1.0 has a header that parsers of later versions refuse, and matrices have OpenCV's tag.
     plain = re.sub(r"\A%YAML[: ]1\.\d[^\n]*\n", "", text)
     return Entries.top(parse_yaml(plain.replace("!!opencv-matrix", ""), source, RigError))
 
@@ -161,8 +161,9 @@ def _xml(text: str) -> dict[str, Any]:
         root = ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError, LookupError) as fault:
         raise RigError(f"is not XML: {fault}; fix it") from None
-    xml_depth = 3
-    return {node.tag: _xml_value(node, xml_depth) for node in root}
+    # Levels that are read; a FileStorage of a camera has two.
+    max_depth = 3
+    return {node.tag: _xml_value(node, max_depth) for node in root}
 
 
 def _xml_value(node: ElementTree.Element, depth: int) -> Any:
@@ -181,7 +182,7 @@ def opencv_text(camera: ForeignCamera, suffix: str) -> str:
     storage.write("image_height", height)
     storage.write("fisheye_model", int(camera.lens.model is LensModel.FISHEYE))
     storage.write("camera_matrix", _matrix(camera.lens))
-    # Both models of OpenCV take four coefficients at least.
+    # Both models of OpenCV need at least four coefficients.
     n = max(4, len(camera.lens.distortion))
     storage.write("distortion_coefficients", np.array([padded(camera.lens, n)]))
     return storage.releaseAndGetString()
@@ -193,11 +194,11 @@ _COUNTS = {"LENSMODEL_PINHOLE": 0} | {f"LENSMODEL_OPENCV{n}": n for n in (4, 5, 
 def read_mrcal(text: str, source: str) -> ForeignCamera:
     """Return the camera of a `.cameramodel`.
 
-    Raises `RigError` with one line without the file's name.
+    Raises `RigError` with one line, without the file's name.
     """
     try:
         with warnings.catch_warnings():
-            # Of odd literals the parser warns on standard error.
+            # The parser prints warnings on odd literals.
             warnings.simplefilter("ignore")
             content = ast.literal_eval(text.strip())
     except (ValueError, SyntaxError, TypeError, MemoryError, RecursionError):
