@@ -12,8 +12,8 @@ from aqualvs.experiments.command import (
     TYPICAL_S,
     ReproduceRequest,
     TimeLeft,
-    left_in_words,
     reproduce,
+    time_left_text,
 )
 from aqualvs.experiments.experiment import (
     DataColumns,
@@ -209,8 +209,8 @@ def test_time_left_follows_the_pace_of_this_machine():
 
 
 def test_time_left_in_words():
-    assert left_in_words(12.0) == "about 10 s left"
-    assert left_in_words(200.0) == "about 3 min left"
+    assert time_left_text(12.0) == "about 10 s left"
+    assert time_left_text(200.0) == "about 3 min left"
 
 
 def test_bars_of_what_runs_inside_are_hidden(monkeypatch, capsys):

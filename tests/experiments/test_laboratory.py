@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from aqualvs.experiments.dome_or_not import Distances, _calibrated_without, distances, level_laser
-from aqualvs.experiments.laboratory import Laboratory, MeasuredDive, Variant, told
-from aqualvs.experiments.mesh_filter import LitTruth, judge_pixels, judge_reflections, mean_judged
+from aqualvs.experiments.laboratory import Laboratory, MeasuredDive, Variant, numbers_text
+from aqualvs.experiments.mesh_filter import LitTruth, mean_score, score_pixels, score_reflections
 from aqualvs.scanning.paper.detector import FilteredPeaks
 from aqualvs.scanning.posture import Reason, Refusal
 from aqualvs.scanning.scan import Scan, ScanPoints
@@ -22,13 +22,13 @@ def stripe(n=20, laser=0, v=100.0):
 def test_points_are_judged_by_the_nearest_true_one():
     truth = stripe()
     lasers = np.zeros(20, np.int64)
-    assert judge_pixels(truth.pixels, lasers, truth) == (0.5, 1.0)
+    assert score_pixels(truth.pixels, lasers, truth) == (0.5, 1.0)
     net = truth.pixels[:10]
-    assert judge_pixels(net, lasers[:10], truth) == (1.0, 1.0)
+    assert score_pixels(net, lasers[:10], truth) == (1.0, 1.0)
     # Every other one: the true ones between lie 4 px off, beyond the 3 that count as found.
-    assert judge_pixels(net[::2], lasers[:5], truth) == (1.0, 0.5)
+    assert score_pixels(net[::2], lasers[:5], truth) == (1.0, 0.5)
     # Of another laser they are not found, and nothing can be judged.
-    precision, recall = judge_pixels(net, lasers[:10] + 1, truth)
+    precision, recall = score_pixels(net, lasers[:10] + 1, truth)
     assert np.isnan(precision)
     assert recall == 0.0
 
@@ -48,21 +48,21 @@ def test_reflections_count_as_most_of_their_pixels_do():
     # Two true points 4 px apart in each blob; three on the net, one on a wall.
     u = np.repeat(50.0 + 20.0 * np.arange(4), 2) + np.tile([-2.0, 2.0], 4)
     truth = LitTruth(np.column_stack([u, np.full(8, 100.0)]), np.zeros(8, np.int64), u < 100.0)
-    assert judge_reflections(blobs([9, 9, 9, 0]), truth) == (1.0, 1.0)
-    assert judge_reflections(blobs([5, 4, 0, 5]), truth) == (0.5, 1 / 3)
-    precision, recall = judge_reflections(blobs([4, 4, 4, 4]), truth)
+    assert score_reflections(blobs([9, 9, 9, 0]), truth) == (1.0, 1.0)
+    assert score_reflections(blobs([5, 4, 0, 5]), truth) == (0.5, 1 / 3)
+    precision, recall = score_reflections(blobs([4, 4, 4, 4]), truth)
     assert np.isnan(precision)
     assert recall == 0.0
     # One blob of two touching ones is one reflection, though the true points are two.
     joined = blobs([9, 0, 0, 0])
     joined.pixels[9:18] = joined.pixels[:9] + np.array([3.0, 0.0])
-    assert judge_reflections(joined, truth) == pytest.approx((np.nan, 0.0), nan_ok=True)
+    assert score_reflections(joined, truth) == pytest.approx((np.nan, 0.0), nan_ok=True)
 
 
 def test_the_mean_leaves_out_what_nothing_is_said_of():
-    from aqualvs.experiments.mesh_filter import Judged
+    from aqualvs.experiments.mesh_filter import PrecisionRecall
 
-    found = mean_judged([Judged(1.0, 0.4), Judged(np.nan, 0.0)])
+    found = mean_score([PrecisionRecall(1.0, 0.4), PrecisionRecall(np.nan, 0.0)])
     assert found == (1.0, 0.2)
 
 
@@ -76,7 +76,7 @@ def test_frames_without_a_posture_have_no_error():
     one = Variant("dark", (refused(),))
     assert one.valid_percent == 0.0
     assert np.isnan(one.rms).all()
-    assert told(one.rms) == "-, -, -"
+    assert numbers_text(one.rms) == "-, -, -"
 
 
 def test_lines_through_distances():

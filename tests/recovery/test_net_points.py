@@ -11,8 +11,8 @@ import pytest
 from benchmarks.random_scenes import Difficulty, random_scene
 from scipy.spatial import cKDTree
 
-from aqualvs.experiments.mesh_filter import Judged as Reflections
-from aqualvs.experiments.mesh_filter import LitTruth, judge_reflections, mean_judged
+from aqualvs.experiments.mesh_filter import LitTruth, mean_score, score_reflections
+from aqualvs.experiments.mesh_filter import PrecisionRecall as Reflections
 from aqualvs.geometry.arrays import BoolArray, FloatArray
 from aqualvs.scanner import Scanner, ScannerOptions
 from aqualvs.scanning.laser_bands import plan_bands
@@ -117,8 +117,8 @@ def paper_judged(samples: Path, dive: str, options: MeshFilterOptions) -> Reflec
     for frame, path in sample_frames(samples, dive):
         points = scanner.process(frame).points
         kept = papers.apply(points.pixels, points.width, points.laser.astype(np.int64))
-        found.append(judge_reflections(kept, LitTruth.read(path)))
-    return mean_judged(found)
+        found.append(score_reflections(kept, LitTruth.read(path)))
+    return mean_score(found)
 
 
 @pytest.mark.parametrize("dive", ["net_clutter", "net_diamond"])

@@ -1,7 +1,7 @@
-"""Ablations of the inputs: wrong rig numbers, the refracted sheet, and video coding.
+"""Ablations of the inputs: wrong rig parameters, the refracted sheet, and video coding.
 
-They measure the cost of a wrong refractive index and of a wrong place of the lens; the gain of the
-refracted-sheet model where a laser sits behind a tilted window; and the cost of H.264 at several
+They measure the errors by a wrong refractive index and by a wrong position of the lens; the gain of
+the refracted-sheet model for lasers behind tilted windows; and the errors by H.264 at several
 qualities against uncompressed pictures.
 """
 
@@ -33,7 +33,7 @@ from aqualvs.simulation.video import Compression
 
 
 def _run_video(laboratory: Laboratory) -> ExperimentResult:
-    # The clear net of the growth experiment, whose H.264 at the default quality is there already.
+    # The growth experiment has rendered its clear net at the default quality already.
     course = scene("clear")
     raw = laboratory.dive(course, recording=Compression(codec="lossless"))
     variants = [_variant(laboratory, raw, "uncompressed")]
@@ -70,11 +70,11 @@ VIDEO = Experiment(
 
 
 _TILTS_DEG = (-20.0, 12.0, 25.0)
-"""Of the windows of the three lasers, against square to the beam, across the sheet."""
+"""Tilts of the windows of the three lasers from perpendicular to the beam, across the sheet."""
 
 
 def before_wall() -> Scenario:
-    """Return the dive: a wall from near to far, turned a little to and fro."""
+    """Return the dive: a wall from near to far, whose yaw swings by 8 degrees."""
     facts = {
         "duration_s": 0.8,
         "motion": {
@@ -127,8 +127,9 @@ def _behind_windows(rig: Rig) -> Rig:
 def _behind_window(laser: Laser, source: LaserSource, tilt: float) -> Laser:
     normal = source.direction + np.tan(tilt) * laser.plane.normal
     normal /= np.linalg.norm(normal)
-    before_source = 0.02
-    face = Plane(normal, float(normal @ source.position) + before_source)
+    # Distance of the window from the source, in metres.
+    distance = 0.02
+    face = Plane(normal, float(normal @ source.position) + distance)
     return replace(laser, window=Window(face, source.position))
 
 
@@ -142,7 +143,7 @@ def _with_best_planes(rig: Rig) -> Rig:
 
 
 def _off_plane_mm(rig: Rig) -> list[float]:
-    """Return for each laser how far what the camera sees of its sheet leaves its best plane."""
+    """Return the largest distance of the visible part of each laser's sheet from its best plane."""
     camera, (near, far) = rig.camera(), rig.working_range
     width, height = rig.size_px
     grid_px = 24
@@ -173,7 +174,7 @@ _LENS_STEPS_MM = (-0.5, -0.25, 0.0, 0.25, 0.5)
 _AXES = ("right", "forward", "up")
 _COLOURS = (ORANGE, BLUE, GREEN)
 _WATERS = 0.007
-"""From fresh to sea water (S = 35): what one who never measures the index may be off by."""
+"""Difference of the index between fresh and sea water (S = 35): the error without a measurement."""
 
 
 def _run_beliefs(laboratory: Laboratory) -> ExperimentResult:
@@ -239,22 +240,22 @@ def _run_beliefs(laboratory: Laboratory) -> ExperimentResult:
 
 
 def _with_lens(rig: Rig, axis: int, step_mm: float) -> Rig:
-    place = rig.dome_from_cam.translation.copy()
-    place[axis] += 1e-3 * step_mm
-    return replace(rig, dome_from_cam=SE3(rig.dome_from_cam.rotation, place))
+    position = rig.dome_from_cam.translation.copy()
+    position[axis] += 1e-3 * step_mm
+    return replace(rig, dome_from_cam=SE3(rig.dome_from_cam.rotation, position))
 
 
 def _worst(laboratory: Laboratory, dive: RenderedDive, rig: Rig) -> float:
-    """Return the range error of the place where it is largest, in percent, with its sign."""
+    """Return the range error of largest magnitude, in percent, with its sign; NaN if none."""
     percent = laboratory.measure(dive, rig=rig).range_percent
     found = percent[np.isfinite(percent)]
     return float(found[np.argmax(np.abs(found))]) if len(found) else np.nan
 
 
 def _slope(steps: Sequence[float], percent: FloatArray) -> float:
-    """Return the cost per step; none where no plane was found any more."""
-    told = np.isfinite(percent)
-    return float(abs(np.polyfit(np.array(steps)[told], percent[told], 1)[0]))
+    """Return the magnitude of the slope of the errors, without those that are NaN."""
+    valid = np.isfinite(percent)
+    return float(abs(np.polyfit(np.array(steps)[valid], percent[valid], 1)[0]))
 
 
 def _draw_beliefs(figure: Figure, index: FloatArray, lens: FloatArray) -> None:

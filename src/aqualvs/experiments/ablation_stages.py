@@ -19,18 +19,18 @@ from aqualvs.experiments.laboratory import (
     RenderedDive,
     Variant,
     compared,
-    told,
+    numbers_text,
     variants_picture,
 )
 from aqualvs.experiments.mesh_filter import (
-    Judged,
     LitTruth,
+    PrecisionRecall,
     adaptive_pixels,
-    judge_reflections,
-    mean_judged,
+    mean_score,
     net_dive,
     papers_centres,
     papers_pixels,
+    score_reflections,
 )
 from aqualvs.experiments.tank import wall_dive
 from aqualvs.scanner import ScannerOptions
@@ -63,7 +63,7 @@ def _run_stripes(laboratory: Laboratory) -> ExperimentResult:
 
 
 def _sentence(variants: list[Variant], places: list[str]) -> str:
-    """Say what each way is worth in the scene that suits it least."""
+    """Return a sentence on each detector's result in its worst scene."""
     shares = {
         what: min(v.valid_percent for v in variants if v.name.startswith(what))
         for what in ("sub-pixel", *(f"threshold {level}" for level in _LEVELS))
@@ -73,7 +73,7 @@ def _sentence(variants: list[Variant], places: list[str]) -> str:
     }
     ours = f"{worst['sub-pixel']:.2f} % in {shares['sub-pixel']:.0f} % of the frames"
     others = "; ".join(
-        f"{what} has {told([worst[what]])} % in {shares[what]:.0f} %"
+        f"{what} has {numbers_text([worst[what]])} % in {shares[what]:.0f} %"
         for what in shares
         if what != "sub-pixel"
     )
@@ -127,7 +127,7 @@ def _run_fits(laboratory: Laboratory) -> ExperimentResult:
         "same points of the target.",
         variants,
         sentence="Fitted by the paper's pseudo-inverse to the same target points, the range error "
-        f"is {told(times)} times that of the robust fit on {', '.join(dives)}.",
+        f"is {numbers_text(times)} times that of the robust fit on {', '.join(dives)}.",
         notes=(
             "The points are those that our own search has assigned to the target; it has already "
             "removed most of the outliers that affect the pseudo-inverse.",
@@ -146,36 +146,41 @@ FITS = Experiment(
 
 # Two frames at about each of three ranges, in mm.
 _RANGES = {"0.4 m": (400, 450), "0.6 m": (600, 650), "0.8 m": (800, 850)}
-# The diamond has the r_min and r_max of section 5.2. A laser square to the strands of the square
-# net meets one every 25 mm: region C then holds two neighbours.
+# The diamond has the r_min and r_max of section 5.2. A laser perpendicular to the strands of the
+# square net crosses one every 25 mm: region C then contains two neighbours.
 _FILTERS_NETS = ("diamond", "square")
-# The paper names no level; nobody would take a filter that calls much else a net.
-_FILTERS_LEVELS, _MIN_PRECISION = (140, 180, 220), 0.9
+# The paper does not state its threshold, so several are tried, in grey levels.
+_FILTERS_LEVELS = (140, 180, 220)
+# Filters of lower precision are of no use, however much of the net they keep.
+_MIN_PRECISION = 0.9
 
 
 class _Set(NamedTuple):
-    """Level in grey levels, None for sub-pixel centres; rd_theta, dd, r_min and r_max in mm."""
+    """Parameters of threshold and filter.
+
+    Threshold in grey levels, None for sub-pixel centres; rd_theta, dd, r_min and r_max in mm.
+    """
 
     level: int | None
     lengths_mm: tuple[float, float, float, float]
 
     @property
     def options(self) -> MeshFilterOptions:
-        """The filter's part of it."""
+        """Options of the filter."""
         rd_theta, dd, r_min, r_max = (1e-3 * length for length in self.lengths_mm)
         return MeshFilterOptions(rd_theta=rd_theta, dd=dd, r_min=r_min, r_max=r_max)
 
     @property
     def scanner(self) -> ScannerOptions:
-        """The whole chain."""
+        """Options of the scanner with this detector and filter."""
         if self.level is None:
             return ScannerOptions(mesh_filter=self.options)
         detector = ThresholdOptions(level=self.level)
         return ScannerOptions(detector=detector, mesh_filter=self.options)
 
     @property
-    def told(self) -> str:
-        """The set in words."""
+    def text(self) -> str:
+        """The parameters as text."""
         lengths = "/".join(f"{length:g}" for length in self.lengths_mm)
         return f"{lengths} mm" if self.level is None else f"level {self.level}, {lengths} mm"
 
@@ -197,15 +202,15 @@ _KINDS = {
 
 @dataclass(frozen=True, slots=True)
 class _Seen:
-    """A net at the ranges: how the adaptive filter and every set do, frame by frame."""
+    """Results of the adaptive filter and of each set on one net, frame by frame."""
 
     net: str
-    adaptive: list[Judged]
-    papers: dict[_Set, list[Judged]] = field(default_factory=dict)
+    adaptive: list[PrecisionRecall]
+    papers: dict[_Set, list[PrecisionRecall]] = field(default_factory=dict)
 
 
 def nets_at_ranges(net: str) -> Scenario:
-    """Return a dive before a net of 25 mm and a wall, which steps through the ranges."""
+    """Return a dive before a net with bars of 25 mm and a wall, in steps through the ranges."""
     values = [one for pair in _RANGES.values() for one in pair]
     facts = {
         "duration_s": 0.04 * len(values),
@@ -223,7 +228,7 @@ def nets_at_ranges(net: str) -> Scenario:
 def _run_filters(laboratory: Laboratory) -> ExperimentResult:
     seen = [_see(laboratory, net) for net in _FILTERS_NETS]
     rows = [_row(one, k, where) for one in seen for k, where in enumerate(_RANGES)]
-    ours = [mean_judged(one.adaptive).recall for one in seen]
+    ours = [mean_score(one.adaptive).recall for one in seen]
     named, best, centres = (max(row.paper[kind][1].recall for row in rows) for kind in _KINDS)
     return ExperimentResult(
         sentence=f"The adaptive filter keeps at least {100 * min(ours):.0f} % of a net's "
@@ -267,59 +272,59 @@ def _see(laboratory: Laboratory, net: str) -> _Seen:
     return seen
 
 
-def _judged(found: Sequence[FilteredPeaks], truth: Sequence[LitTruth]) -> list[Judged]:
-    return [judge_reflections(one, lit) for one, lit in zip(found, truth, strict=True)]
+def _judged(found: Sequence[FilteredPeaks], truth: Sequence[LitTruth]) -> list[PrecisionRecall]:
+    return [score_reflections(one, lit) for one, lit in zip(found, truth, strict=True)]
 
 
 @dataclass(frozen=True, slots=True)
 class _Row:
-    """A net at one range: the adaptive filter, and the paper's best sets."""
+    """Results on one net at one range: of the adaptive filter, and of the paper's best sets."""
 
     where: str
-    adaptive: Judged
-    paper: Mapping[str, tuple[_Set, Judged]]
+    adaptive: PrecisionRecall
+    paper: Mapping[str, tuple[_Set, PrecisionRecall]]
 
     def findings(self) -> list[ExperimentRow]:
         """Return the rows of the table."""
         what = f"{self.where}: precision, recall of net reflections"
-        return [ExperimentRow(what=f"{what}, adaptive", ours=told(self.adaptive))] + [
-            ExperimentRow(what=f"{what}, {kind}", ours=f"{told(judged)} ({one.told})")
+        return [ExperimentRow(what=f"{what}, adaptive", ours=numbers_text(self.adaptive))] + [
+            ExperimentRow(what=f"{what}, {kind}", ours=f"{numbers_text(judged)} ({one.text})")
             for kind, (one, judged) in self.paper.items()
         ]
 
 
 def _row(seen: _Seen, k: int, where: str) -> _Row:
     here = slice(2 * k, 2 * k + 2)
-    judged = {one: mean_judged(found[here]) for one, found in seen.papers.items()}
+    judged = {one: mean_score(found[here]) for one, found in seen.papers.items()}
     return _Row(
         f"{seen.net}, {where}",
-        mean_judged(seen.adaptive[here]),
+        mean_score(seen.adaptive[here]),
         {kind: _best({one: judged[one] for one in sets}) for kind, sets in _KINDS.items()},
     )
 
 
-def _best(judged: Mapping[_Set, Judged]) -> tuple[_Set, Judged]:
-    """Return the set that keeps most, among those that keep little else."""
+def _best(judged: Mapping[_Set, PrecisionRecall]) -> tuple[_Set, PrecisionRecall]:
+    """Return the set with the largest recall among those of sufficient precision."""
 
-    def worth(item: tuple[_Set, Judged]) -> float:
+    def value(item: tuple[_Set, PrecisionRecall]) -> float:
         precise = not item[1].precision < _MIN_PRECISION
         return item[1].recall if precise else -1.0
 
-    return max(judged.items(), key=worth)
+    return max(judged.items(), key=value)
 
 
 def _postures(laboratory: Laboratory, dive: RenderedDive, rows: Sequence[_Row]) -> list[Variant]:
     variants = [Variant("adaptive", (laboratory.measure(dive),), ours=True)]
     sets = [one for row in rows for one, _ in row.paper.values() if row.where.startswith("diamond")]
     for one in dict.fromkeys(sets):
-        variants.append(Variant(f"paper, {one.told}", (laboratory.measure(dive, one.scanner),)))
+        variants.append(Variant(f"paper, {one.text}", (laboratory.measure(dive, one.scanner),)))
     return variants
 
 
 def _series(rows: Sequence[_Row]) -> DataColumns:
     judged = {f"{row.where}, adaptive": row.adaptive for row in rows}
     judged |= {
-        f"{row.where}, {kind}, {one.told}": found
+        f"{row.where}, {kind}, {one.text}": found
         for row in rows
         for kind, (one, found) in row.paper.items()
     }

@@ -1,7 +1,7 @@
 """`aqualvs score`: answers in plain CSV compared with the truth of a benchmark set.
 
-Systems that come with aqualvs can be run over the set as well: aqualvs itself, and what it is
-compared with (`OWN_SYSTEMS`).
+Systems that come with aqualvs can be run on the set as well: aqualvs itself, and its baselines
+(`OWN_SYSTEMS`).
 """
 
 import csv
@@ -36,30 +36,30 @@ from aqualvs.simulation.benchmark import VISIBLE_LIMIT
 from aqualvs.text import count_text
 
 WRONG_PERCENT = 5.0
-"""An answer whose range is off by more is to something else than the target."""
+"""Range error above which an answer counts as wrong: it is not that of the target."""
 
 
 @dataclass(frozen=True, slots=True)
 class FrameAnswers:
-    """Answers against the truth of N frames, of one dive or of many."""
+    """Comparison of answers with the truth of N frames, of one dive or several."""
 
     valid: BoolArray  # Shape (N,): frames with an answer.
     n_visible: FloatArray  # Shape (N,): visible stripe points.
-    # Shape (N, 3): range in percent of the true one, pitch and yaw in degrees; NaN without answer
-    # or target.
+    # Shape (N, 3): errors of range in percent of the true one, of pitch and yaw in degrees; NaN
+    # without answer or target.
     error: FloatArray
-    # Shape (N, 3): what the system claims for them, same units.
+    # Shape (N, 3): standard deviations that the system states, same units.
     sigma: FloatArray
 
     @property
     def measurable(self) -> BoolArray:
-        """Frames that show enough to be measured, and must be."""
+        """Mask (N,) of frames with enough visible points, in which an answer is required."""
         return self.n_visible >= VISIBLE_LIMIT
 
 
 @dataclass(frozen=True, slots=True)
 class ErrorSpread:
-    """Absolute errors in few numbers; NaN without any."""
+    """Statistics of absolute errors; NaN without errors."""
 
     rms: float
     median: float
@@ -71,35 +71,33 @@ class ErrorSpread:
 class Score:
     """Score of a system on some frames."""
 
-    # Frames; those with at least `VISIBLE_LIMIT` visible stripe points; those of them with an
-    # answer.
     n_frames: int
-    n_measurable: int
-    n_available: int
-    # Share of the last two; NaN where nothing is measurable.
+    n_measurable: int  # Frames with at least `VISIBLE_LIMIT` visible stripe points.
+    n_available: int  # Measurable frames with an answer.
+    # Share of measurable frames with an answer; NaN if no frame is measurable.
     available_percent: float
     # Errors of the answers in measurable frames.
     range_percent: ErrorSpread
     pitch_deg: ErrorSpread
     yaw_deg: ErrorSpread
-    # Answers off by more than `WRONG_PERCENT` of the range in frames with any visible point.
+    # Answers off by more than `WRONG_PERCENT` of the range, in frames with a visible point.
     n_wrong: int
-    # Frames without any visible point, and those of them that were answered all the same.
+    # Frames without a visible point, and those of them with an answer.
     n_empty: int
     n_false: int
-    # Rms of error over claimed sigma in measurable frames: 1 is consistent, more is
-    # overconfident; NaN where no sigma is claimed.
+    # Rms of error over stated sigma in measurable frames: 1 is consistent, more is overconfident;
+    # NaN if no sigma is stated.
     z_range: float
     z_pitch: float
     z_yaw: float
-    # Medians of the claimed sigmas in measurable frames.
+    # Medians of the stated sigmas in measurable frames.
     sigma_range_percent: float
     sigma_pitch_deg: float
     sigma_yaw_deg: float
 
 
 def compare(truth: DiveTruth, answers: Answers) -> FrameAnswers:
-    """Hold the answers to a dive against its truth."""
+    """Compare the answers to a dive with its truth."""
     shown = np.where(answers.valid[:, None], answers.posture, np.nan)
     error = shown - truth.posture
     scale = 100.0 / truth.posture[:, 0]
@@ -144,18 +142,18 @@ def score(frames: FrameAnswers) -> Score:
 
 
 def bars_against(frames: FrameAnswers, clear: FrameAnswers) -> FloatArray:
-    """Return how much longer error bars are than those of the same frames in clear water.
+    """Return the ratio of error bars to those of the same frames in clear water.
 
     Parameters
     ----------
     frames, clear : FrameAnswers
-        Frame by frame the same course before the same target.
+        Of the same motion before the same target, frame by frame.
 
     Returns
     -------
     ratios : array, shape (N, 3)
         Sigma of range (in percent), pitch and yaw over that in clear water; NaN where a frame is
-        not measurable or lacks one.
+        not measurable or lacks a sigma.
     """
     both = frames.measurable & clear.measurable
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -194,11 +192,11 @@ _HEADER = (
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """A score and what it is of."""
+    """Score of a system on a dive, a level or the whole set."""
 
     system: str
     scope: str  # "dive", "level" or "total".
-    name: str  # Of the dive or level; "total" for all.
+    name: str  # Name of the dive or level; "total" for all.
     score: Score
 
 
@@ -208,7 +206,7 @@ class Bars:
 
     system: str
     level: str
-    # NaN where the system claims none.
+    # NaN if the system states no sigma.
     range: float
     pitch: float
     yaw: float
@@ -216,7 +214,7 @@ class Bars:
 
 @dataclass(frozen=True, slots=True)
 class Scores:
-    """Everything that was found of some systems."""
+    """Scores of some systems on a set."""
 
     title: str  # The set's.
     entries: tuple[Entry, ...]  # By system: dives, levels, total.
@@ -255,9 +253,9 @@ def _bars(system: str, level: str, names: list[str], frames: dict[str, FrameAnsw
 
 
 def lines(scores: Scores, *, dives: bool) -> list[str]:
-    """Return the table to read: level after level, the systems below each other.
+    """Return the lines of the table: all systems of a level, then those of the next.
 
-    `dives`: whether to show every dive before its level.
+    `dives`: whether to include every dive.
     """
     rows = _rows(scores, dives=dives)
     widths = [max(len(row[k]) for row in (_HEADER, *rows)) for k in range(len(_HEADER))]
@@ -280,7 +278,7 @@ def markdown(scores: Scores) -> str:
 
 
 SCORE_FILES = ("scores.csv", "scores.json", "scores.md")
-"""What `write_scores` writes."""
+"""Files that `write_scores` writes."""
 
 
 def write_scores(scores: Scores, folder: Path) -> list[Path]:
@@ -303,7 +301,7 @@ def write_scores(scores: Scores, folder: Path) -> list[Path]:
 
 
 def _record(entry: Entry) -> dict[str, Any]:
-    """Return an entry as one flat mapping; None where a number does not exist."""
+    """Return an entry as one flat mapping, with None for missing numbers."""
     flat: dict[str, Any] = {"system": entry.system, "scope": entry.scope, "name": entry.name}
     for key, value in asdict(entry.score).items():
         if isinstance(value, dict):
@@ -351,7 +349,7 @@ def _bar_line(bar: Bars) -> str:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OwnSystem:
-    """Options of `aqualvs run`."""
+    """System that comes with aqualvs: options of `aqualvs run`."""
 
     name: str
     detector: str = "ridge"  # "ridge" or "threshold".
@@ -367,11 +365,12 @@ OWN_SYSTEMS = (
     OwnSystem(name="paper-filter", mesh_filter="paper"),
     OwnSystem(name="paper", detector="threshold", mesh_filter="paper", fit="pseudo_inverse"),
 )
-"""aqualvs as it is; without its dome model; with the paper's detector; with the paper's filter for
-nets, which is told the net; and with the paper's detector, filter and fit, dome modelled."""
+"""aqualvs with default options; without its dome model; with the paper's detector; with the paper's
+filter for nets, which gets the net's parameters; and with the paper's detector, filter and fit, and
+the dome model."""
 
 BARE_LENS = "bare-lens"
-"""What aqualvs found, triangulated again without the dome: the stripes are told apart with it."""
+"""Points of aqualvs triangulated again without the dome, which is used to detect the stripes."""
 
 
 def run_own(
@@ -379,8 +378,8 @@ def run_own(
 ) -> list[str]:
     """Measure every dive of a set with every system of `OWN_SYSTEMS`, into SYSTEM/DIVE of a folder.
 
-    Returns NAME=PATH of every system, to be scored. Raises `AqualvsError` if a dive cannot be read
-    or the folder not be written.
+    Returns NAME=PATH of every system, for `read_system`. Raises `AqualvsError` if a dive cannot be
+    read or the folder cannot be written.
     """
     for system in OWN_SYSTEMS:
         for dive in benchmark.dives:
@@ -399,12 +398,12 @@ def run_own(
 
 
 def _request(system: OwnSystem, source: Path, out: Path, overwrite: bool) -> RunRequest:
-    """Return what to run; a wall is no net, so no filter for nets is laid over it."""
+    """Return the run of a system on a dive; filters for nets are not applied to walls."""
     target, mesh_filter = "auto", "none"
     if system.mesh_filter == "paper":
-        told = str(source / TARGET_FILE)
-        if target_dict(told).kind is not TargetKind.SOLID:
-            target, mesh_filter = told, system.mesh_filter
+        file = str(source / TARGET_FILE)
+        if target_dict(file).kind is not TargetKind.SOLID:
+            target, mesh_filter = file, system.mesh_filter
     return RunRequest(
         source=str(source / "dive.mp4"),
         rig=source / "rig.yaml",
@@ -426,7 +425,7 @@ def run_score(
     dives: bool,
     overwrite: bool = False,
 ) -> None:
-    """Score systems side by side and print the table.
+    """Score systems and print the table.
 
     Options are those of `aqualvs score`, see its `--help`. Raises `AqualvsError` if truth or
     results cannot be used, or a folder cannot be written.

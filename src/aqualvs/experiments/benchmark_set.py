@@ -1,7 +1,7 @@
 """The public benchmark set on disk, and the answers of a system to it.
 
-`aqualvs benchmark` renders the set or a part of it: dives, the truth of their frames, and a README
-for whoever opens its folder. The answers of a system are plain CSV, frame by frame.
+`aqualvs benchmark` renders the set or a part of it: dives, the truth of their frames, and a README.
+The answers of a system are plain CSV, frame by frame.
 """
 
 import csv
@@ -54,21 +54,20 @@ class DiveTruth:
 
     name: str
     level: str
-    frames: IntArray  # Shape (N,): numbers from 0.
-    # Shape (N, 3): range (m), pitch and yaw (deg); NaN where there is no target.
+    frames: IntArray  # Shape (N,): frame numbers, from 0.
+    # Shape (N, 3): range (m), pitch and yaw (deg); NaN without a target.
     posture: FloatArray
-    # Shape (N,): stripe points on the target that the picture truly shows.
+    # Shape (N,): number of stripe points on the target that are visible in the picture.
     n_visible: IntArray
 
 
 @dataclass(frozen=True, slots=True)
 class BenchmarkSet:
-    """A set of dives with truth."""
+    """Set of dives with truth."""
 
-    # Of the set's definition.
     name: str
-    checksum: str
-    # False for a part of the set, or one in fewer frames: its scores stand for themselves.
+    checksum: str  # Of the set's definition.
+    # False for a part of the set, or fewer frames: scores cannot be compared with the whole set's.
     whole: bool
 
     folder: Path
@@ -91,7 +90,7 @@ class BenchmarkSet:
 def load_set(folder: Path) -> BenchmarkSet:
     """Read a set that `aqualvs benchmark` wrote.
 
-    Raises `SourceError` if the folder holds none, or a file of it cannot be read.
+    Raises `SourceError` if the folder contains no set, or a file of it cannot be read.
     """
     path = folder / SET_FILE
     content = _read_yaml(path)
@@ -112,7 +111,8 @@ def load_set(folder: Path) -> BenchmarkSet:
 def read_dive(path: Path, name: str, level: str) -> DiveTruth:
     """Read the truth of one dive.
 
-    Raises `SourceError` if the file cannot be read, lacks a column, or holds what is no number.
+    Raises `SourceError` if the file cannot be read, lacks a column, or has a value that is no
+    number.
     """
     rows = read_rows(path, _COLUMNS)
     cells = [[cell(path, i, row, column) for column in _COLUMNS] for i, row in enumerate(rows)]
@@ -127,9 +127,9 @@ def read_dive(path: Path, name: str, level: str) -> DiveTruth:
 
 
 def read_rows(path: Path, needed: tuple[str, ...]) -> list[Row]:
-    """Return the rows of a CSV file with a header, its names without space around them.
+    """Return the rows of a CSV file with a header, whose names are stripped.
 
-    Raises `SourceError` if it cannot be read, holds no row, or lacks a column.
+    Raises `SourceError` if it cannot be read, has no rows, or lacks a column.
     """
     refuse_special(path)
     try:
@@ -155,9 +155,9 @@ def read_rows(path: Path, needed: tuple[str, ...]) -> list[Row]:
 
 
 def cell(path: Path, i_row: int, row: dict[str, str | None], column: str) -> float:
-    """Return the number in a cell; NaN where it is empty.
+    """Return the number in a cell; NaN if it is empty.
 
-    Raises `SourceError` if it holds something else.
+    Raises `SourceError` for any other text.
     """
     text = (row.get(column) or "").strip()
     try:
@@ -189,24 +189,24 @@ def make_set(
 ) -> None:
     """Render dives of the set, with truth and a README, into a folder.
 
-    Options are those of `aqualvs benchmark`, see its `--help`. A shutter is read for 25 pictures a
-    second, which the set's few are some of; a set with one is a part: its scores stand for
-    themselves.
+    Options are those of `aqualvs benchmark`, see its `--help`. The shutter is that of a camera of
+    25 frames a second, from which the set's frames are taken; a set with a shutter counts as a part
+    of the set.
 
     Raises `OptionError` if a name is not known or the number of frames makes no sense,
-    `OutputError` if the folder holds a set already or cannot be written.
+    `OutputError` if the folder contains a set already or cannot be written.
     """
     dives = chosen_dives(names, n_frames)
     written = [out / name for name in (SET_FILE, _README_MD, *(dive.name for dive in dives))]
     claim = Claim("benchmark", written, overwrite=overwrite)
     rig = benchmark_rig()
-    pictures_a_second = 25.0
     if shutter is not None:
-        rig = replace(rig, shutter=shutter_from_words(shutter, pictures_a_second))
+        camera_fps = 25.0
+        rig = replace(rig, shutter=shutter_from_words(shutter, camera_fps))
     renderer = Renderer(rig, threads=os.cpu_count() or 1)
     total = sum(dive.scenario.n_frames for dive in dives)
     with claim, writing(out), progress(BENCHMARK_NAME, total) as tick:
-        # Written last: a set that was interrupted is none.
+        # Written last, so that an interrupted set is not complete.
         (out / SET_FILE).unlink(missing_ok=True)
         for dive in dives:
             render_benchmark_dive(dive, renderer, out / dive.name, tick=tick)
@@ -224,7 +224,9 @@ def make_set(
 
 
 def chosen_dives(names: Sequence[str], n_frames: int | None) -> list[BenchmarkDive]:
-    """Return the dives of some levels or names, in the set's order, shortened if wished.
+    """Return the dives of some levels or names, in the set's order.
+
+    `n_frames`: number of frames to shorten them to; None for all.
 
     Raises `OptionError` if a name is not known or the number of frames makes no sense.
     """
@@ -242,7 +244,7 @@ def chosen_dives(names: Sequence[str], n_frames: int | None) -> list[BenchmarkDi
 
 
 def target_text(dive: BenchmarkDive) -> str:
-    """Return what may be known of a target beforehand, as `aqualvs run --target` takes it."""
+    """Return the target file of a dive, with what a user may know beforehand."""
     if dive.level == "empty":
         return "kind: auto\n"
     if not dive.scenario.nets:
@@ -286,7 +288,7 @@ def print_dives(echo: Callable[[str], object]) -> None:
 
 _ANSWER = ("pitch_deg", "yaw_deg")
 _SIGMAS = ("sigma_pitch_deg", "sigma_yaw_deg")
-# What our own runs claim in all, next to what a frame's noise makes of it.
+# Total sigmas of our own runs, which include the rig's uncertainty.
 _TOTALS = ("sigma_range_total_m", "sigma_pitch_total_deg", "sigma_yaw_total_deg")
 _YES, _NO = {"1", "true", "yes"}, {"0", "false", "no"}
 _RUN_FILE = "posture.csv"
@@ -297,29 +299,28 @@ class Answers:
     """Answers of a system to the N frames of one dive, in the order of the truth."""
 
     valid: BoolArray  # Shape (N,).
-    posture: FloatArray  # Shape (N, 3): range (m), pitch and yaw (deg); NaN where a frame has none.
-    # Shape (N, 3): standard deviations that the system claims, same units; NaN where it claims
-    # none.
+    posture: FloatArray  # Shape (N, 3): range (m), pitch and yaw (deg); NaN if missing.
+    # Shape (N, 3): standard deviations that the system states, same units; NaN if missing.
     sigma: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
 class System:
-    """A system under test."""
+    """System under test."""
 
     name: str
-    answers: dict[str, Answers]  # By dive; every dive of the set is there.
-    missing: tuple[str, ...]  # Dives for which it brought no file; it has no valid answer in them.
+    answers: dict[str, Answers]  # By dive, for every dive of the set.
+    missing: tuple[str, ...]  # Dives without a file, which have no valid answers.
 
 
 def read_system(argument: str, benchmark: BenchmarkSet) -> System:
     """Read the results of a system for the dives of a set.
 
-    `argument`: NAME=PATH, or a path, which is then called as its last part. The path is a folder
-    with DIVE.csv or DIVE/posture.csv for every dive, or one CSV with a column `dive`.
+    `argument`: NAME=PATH, or a path whose last part is the name. The path is a folder with DIVE.csv
+    or DIVE/posture.csv for every dive, or one CSV with a column `dive`.
 
-    Raises `SourceError` if a file cannot be read or makes no sense, `OptionError` if there is
-    nothing for any dive.
+    Raises `SourceError` if a file cannot be read or is malformed, `OptionError` if there are no
+    results for any dive.
     """
     given, equals, rest = argument.partition("=")
     path = Path(rest if equals else argument)
@@ -370,7 +371,7 @@ def _from_file(path: Path, benchmark: BenchmarkSet) -> dict[str, Answers]:
 
 
 def _answers(path: Path, rows: list[tuple[int, Row]], dive: DiveTruth) -> Answers:
-    """Put the rows of a dive into the order of its truth; frames without a row have no answer."""
+    """Return the rows of a dive in the order of its truth; frames without a row have no answer."""
     own_range = range_column(path, rows[0][1])
     places = {int(frame): k for k, frame in enumerate(dive.frames)}
     found = _nothing(len(places))
@@ -406,15 +407,15 @@ def _place(path: Path, i: int, row: Row, places: dict[int, int], dive: str) -> i
 
 
 def _valid(path: Path, i: int, row: Row, distance: float) -> bool:
-    """Return whether a row holds an answer: as it says, or else if it has a range."""
-    said = (row.get("valid") or "").strip().lower()
-    if said in _NO:
+    """Return whether a row has an answer: by its column `valid`, or else if it has a range."""
+    valid = (row.get("valid") or "").strip().lower()
+    if valid in _NO:
         return False
-    if said and said not in _YES:
-        raise SourceError(f"{path}: line {i + 2}: valid is {said!r}; write 1 or 0")
+    if valid and valid not in _YES:
+        raise SourceError(f"{path}: line {i + 2}: valid is {valid!r}; write 1 or 0")
     if math.isfinite(distance) and distance > 0.0:
         return True
-    if said or not math.isnan(distance):
+    if valid or not math.isnan(distance):
         raise SourceError(
             f"{path}: line {i + 2}: a valid row with the range {distance:g}; give a positive range "
             "or valid 0"

@@ -1,6 +1,6 @@
-"""`aqualvs reproduce`: the experiments, run one after the other and shown on one page.
+"""`aqualvs reproduce`: runs the experiments one after the other and shows them on one page.
 
-Standard error shows the experiment, its frames and the time left.
+Progress on standard error names the experiment, the frames rendered and the time left.
 """
 
 import contextlib
@@ -58,64 +58,67 @@ TYPICAL_S: Mapping[str, float] = {
     "beliefs": 2.0,
     "video": 17.0,
 }
-"""Seconds, to guess what is left; only their ratios matter once some are done."""
+"""Typical seconds of each experiment; only their ratios matter once some are done."""
 
 
 class TimeLeft:
-    """Guess of the time that is left, from what the experiments so far took.
+    """Estimate of the time left, from the durations of the experiments so far.
 
     Parameters
     ----------
     names : sequence of str
-        Experiments to come.
+        Experiments to run.
     now : callable
         Clock in seconds.
     """
 
     def __init__(self, names: Sequence[str], now: Callable[[], float] = time.monotonic) -> None:
-        unknown_s = 25.0
-        self._to_come = {name: TYPICAL_S.get(name, unknown_s) for name in names}
+        # Of an experiment that is not in the table.
+        default_s = 25.0
+        self._to_come = {name: TYPICAL_S.get(name, default_s) for name in names}
         self._now = now
+        # Typical seconds of the running experiment, and of those done.
         self._running = 0.0
         self._done = 0.0
+        # Clock at the start of all, and of the running experiment.
         self._started = self._began = now()
 
     def start(self, name: str) -> None:
-        """Note that an experiment begins."""
+        """Note the start of an experiment."""
         self._running = self._to_come.pop(name)
         self._began = self._now()
 
     def end(self) -> None:
-        """Note that the running experiment is done."""
+        """Note the end of the running experiment."""
         self._done += self._running
         self._running = 0.0
         self._began = self._now()
 
     @property
     def seconds(self) -> float:
-        """Seconds left."""
+        """Estimated seconds left."""
         return self._ahead() * self._pace()
 
     @property
     def share(self) -> float:
-        """Share of the work that is behind, 0 to 1."""
+        """Share of the work that is done, 0 to 1."""
         total = self._done + self._running + sum(self._to_come.values())
         return 1.0 - self._ahead() / total if total > 0.0 else 1.0
 
     def _pace(self) -> float:
-        """Return seconds per typical second."""
-        # As if so many typical seconds had gone by before: the first, short experiments say little.
-        trust_s = 20.0
-        return (trust_s + self._began - self._started) / (trust_s + self._done)
+        """Return the ratio of actual to typical seconds so far."""
+        # Prior weight of a ratio of 1, as the first experiments are short.
+        prior_s = 20.0
+        return (prior_s + self._began - self._started) / (prior_s + self._done)
 
     def _ahead(self) -> float:
-        """Return typical seconds ahead; one that takes too long is held at nine tenths."""
+        """Return the typical seconds left; at least a tenth of the running experiment."""
         within = (self._now() - self._began) / self._pace()
         return sum(self._to_come.values()) + max(self._running - within, 0.1 * self._running)
 
 
 class ExperimentBar:
-    """A progress bar over experiments."""
+    """Progress bar over experiments."""
 
     def __init__(self, bar: Progress, names: Sequence[str]) -> None:
         self._bar = bar
@@ -125,7 +128,7 @@ class ExperimentBar:
         self._task = bar.add_task("", total=1.0, left=self._left, frames="")
 
     def start(self, name: str) -> None:
-        """Show that an experiment begins."""
+        """Show the start of an experiment."""
         self._i += 1
         self._left.start(name)
         self._bar.update(
@@ -140,16 +143,16 @@ class ExperimentBar:
         )
 
     def end(self) -> None:
-        """Show that the running experiment is done."""
+        """Show the end of the running experiment."""
         self._left.end()
         self._bar.update(self._task, completed=self._left.share)
 
 
 @contextlib.contextmanager
 def experiment_bar(names: Sequence[str]) -> Iterator[ExperimentBar]:
-    """Show how far the experiments are; nothing where standard error is not a terminal.
+    """Show the progress of the experiments, if standard error is a terminal.
 
-    `names`: experiments to come, in their order.
+    `names`: experiments to run, in their order.
     """
     console = Console(stderr=True)
     columns = (
@@ -167,16 +170,16 @@ def experiment_bar(names: Sequence[str]) -> Iterator[ExperimentBar]:
 
 
 class _LeftColumn(ProgressColumn):
-    """The time left in words."""
+    """Column of the progress bar with the time left."""
 
     def render(self, task: Task) -> Text:
         """Return the time left as text."""
         left: TimeLeft = task.fields["left"]
-        return Text(left_in_words(left.seconds))
+        return Text(time_left_text(left.seconds))
 
 
-def left_in_words(seconds: float) -> str:
-    """Return a guessed time as one would say it."""
+def time_left_text(seconds: float) -> str:
+    """Return an estimated time as text, rounded to 5 s or to minutes."""
     if seconds < 60.0:
         return f"about {max(5, 5 * round(seconds / 5.0))} s left"
     return f"about {round(seconds / 60.0)} min left"
@@ -190,14 +193,14 @@ _FAILURES = "failures"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReproduceRequest:
-    """Request for `aqualvs reproduce`; see its `--help`."""
+    """Request of `aqualvs reproduce`, see its `--help`."""
 
     names: tuple[str, ...]  # Experiments; all of them if empty.
     out: Path  # Folder to write.
 
 
 def print_experiments(echo: Echo) -> None:
-    """Print the name, title and place in the paper of every experiment."""
+    """Print the name, title and section of the paper of every experiment."""
     width = max(map(len, catalogue.MODULES))
     for name in catalogue.MODULES:
         found = catalogue.experiment(name)
@@ -207,41 +210,39 @@ def print_experiments(echo: Echo) -> None:
 def reproduce(request: ReproduceRequest, echo: Echo, load: Load = catalogue.experiment) -> int:
     """Run experiments, write the page after each of them, and return 0, or 1 if one failed.
 
-    Results of other experiments that the same version left in the folder stay on the page. Raises
-    `OptionError` if there is no experiment of some name, `OutputError` if the folder cannot be
-    written.
+    Results of other experiments by the same version in the folder stay on the page. Raises
+    `OptionError` if a name is not known, `OutputError` if the folder cannot be written.
     """
     names = catalogue.ordered(request.names)
-    # Results of other experiments in the folder stay; those of the same are brought up to date.
     written = (PAGE, RESULTS, TIMES, FIGURES, SERIES, WORK, _FAILURES)
     files = [request.out / name for name in written]
     known = files if is_reproduced(request.out) else []
     claim = Claim("reproduce", files, overwrite=True, known=known)
     with experiment_bar(names) as bar:
         laboratory = Laboratory(work_folder(request.out), bar.tick)
-        book = _Book(request.out)
+        results = _Records(request.out)
         for number, name in enumerate(names, 1):
             bar.start(name)
-            book.run(name, load, laboratory)
-            echo(f"[{number}/{len(names)}] {_line(book.records[name], book.seconds[name])}")
+            results.run(name, load, laboratory)
+            echo(f"[{number}/{len(names)}] {_line(results.records[name], results.seconds[name])}")
             bar.end()
-            write_page(book.in_order(), book.seconds, request.out)
+            write_page(results.in_order(), results.seconds, request.out)
     claim.close()
-    for line in _closing(book, names, request.out):
+    for line in _closing(results, names, request.out):
         echo(line)
     exit_failed = 1
-    return exit_failed if any(book.records[name].failure for name in names) else 0
+    return exit_failed if any(results.records[name].failure for name in names) else 0
 
 
-class _Book:
-    """The records of a folder, on disk after every experiment."""
+class _Records:
+    """Records of the experiments in a folder, written after each experiment."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.records, self.seconds = read_results(folder)
 
     def run(self, name: str, load: Load, laboratory: Laboratory) -> None:
-        """Run one experiment and store its outcome or its fault."""
+        """Run one experiment and store its outcome or its failure."""
         started = time.perf_counter()
         self.records[name] = self._record(name, load, laboratory)
         self.seconds[name] = time.perf_counter() - started
@@ -260,7 +261,7 @@ class _Book:
         except OutputError:
             raise
         except Exception as fault:
-            # Sixteen other experiments are still worth having.
+            # The failure of one experiment must not end the others.
             self._keep_traceback(name, fault)
             return _failed(name, found, fault)
         (self.folder / _FAILURES / f"{name}.txt").unlink(missing_ok=True)
@@ -274,13 +275,13 @@ class _Book:
 
 
 def _failed(name: str, found: Experiment | None, fault: Exception) -> Record:
-    said = " ".join(str(fault).split())
+    message = " ".join(str(fault).split())
     return Record(
         name=name,
         title=found.title if found else name,
         paper=found.paper if found else "",
         about=found.about if found else "",
-        failure=f"{type(fault).__name__}: {said}" if said else type(fault).__name__,
+        failure=f"{type(fault).__name__}: {message}" if message else type(fault).__name__,
     )
 
 
@@ -295,15 +296,15 @@ def _line(record: Record, seconds: float) -> str:
     return f"{record.name}: {record.sentence}{more} ({seconds:.0f} s)"
 
 
-def _closing(book: _Book, names: Sequence[str], out: Path) -> list[str]:
+def _closing(results: _Records, names: Sequence[str], out: Path) -> list[str]:
     bars = [
         finding.met
         for name in names
-        for finding in book.records[name].findings
+        for finding in results.records[name].findings
         if finding.met is not None
     ]
-    took = sum(book.seconds[name] for name in names)
-    failed = [name for name in names if book.records[name].failure]
+    took = sum(results.seconds[name] for name in names)
+    failed = [name for name in names if results.records[name].failure]
     lines = [f"{sum(bars)} of {len(bars)} criteria met, {took:.0f} s", f"page: {out / PAGE}"]
     if failed:
         lines.insert(0, f"{len(failed)} of {len(names)} experiments failed: {', '.join(failed)}")

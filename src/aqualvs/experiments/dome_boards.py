@@ -1,4 +1,4 @@
-"""Place of the lens in the dome, from boards at known places; the paper's figures 3 and 4."""
+"""Position of the lens in the dome, from boards at known distances; the paper's figures 3 and 4."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -42,10 +42,10 @@ _PAPER_PLANE = "turned by -0.07°, -0.06°, -0.64°"
 
 
 class _Setup(NamedTuple):
-    """Noise of the boards' poses and corners, and the bar."""
+    """Noise of the boards' poses and corners, and the criterion."""
 
-    reading_sigma: float = 0.2e-3  # How well a place on a rail is read off, each by itself.
-    # Paper that is not flat and print that is not true, as corners of real boards show them.
+    reading_sigma: float = 0.2e-3  # Of a position read off the rail, in metres.
+    # Noise of corners of real boards, by paper that is not flat and distortion of the print.
     corner_px: float = 0.1
     seed: int = 3
     bar_sigmas: float = 3.0
@@ -56,7 +56,7 @@ _SETUP = _Setup()
 
 @dataclass(frozen=True, slots=True)
 class SolvedDome:
-    """The two steps of a calibration, with what they were given."""
+    """Results of the two calibration steps, with their inputs."""
 
     truth: Rig
     start: Rig  # Before the second step: lens at the dome's centre, camera straight ahead.
@@ -67,7 +67,7 @@ class SolvedDome:
 
     @property
     def errors(self) -> dict[str, float]:
-        """Found minus true, by the names of a rig's numbers, SI units."""
+        """Estimate minus truth, by parameter of the rig, SI units."""
         names = (*_LENS, *_TURN, *_PLANE)
         off = rig_difference(self.truth, self.dome.rig, names)
         return dict(zip(names, off.tolist(), strict=True))
@@ -79,7 +79,7 @@ class SolvedDome:
 
 
 def solve_from_pictures(laboratory: Laboratory) -> SolvedDome:
-    """Solve lens and dome from rendered pictures, distances read off with 0.2 mm of error.
+    """Solve lens and dome from rendered pictures, with errors of 0.2 mm in the boards' distances.
 
     Raises `CalibrationError` if a picture does not show its board.
     """
@@ -108,9 +108,9 @@ def solve_from_pictures(laboratory: Laboratory) -> SolvedDome:
 
 
 def board_views(folder: Path, board_file: Path, seed: int) -> tuple[View, ...]:
-    """Find a board in all pictures of a folder, and blur what was found as real boards would.
+    """Detect a board in all pictures of a folder, and add the noise of real boards to its corners.
 
-    Raises `CalibrationError` if one does not show it.
+    Raises `CalibrationError` if a picture does not show it.
     """
     found = detect_boards(picture_paths([folder]), board_file)
     for name, why in found.missed.items():
@@ -123,7 +123,7 @@ def board_views(folder: Path, board_file: Path, seed: int) -> tuple[View, ...]:
 
 
 def read_with_errors(rows: Sequence[BoardPose], seed: int = _SETUP.seed) -> tuple[BoardPose, ...]:
-    """Return true distances as they are read off a rail: each 0.2 mm off, and all together too."""
+    """Return distances with the errors of a rail: 0.2 mm each, and 0.2 mm common to all."""
     rng = np.random.default_rng(seed)
     zero = rng.normal(0.0, _SETUP.reading_sigma)
     off = zero + rng.normal(0.0, _SETUP.reading_sigma, len(rows))
@@ -134,7 +134,7 @@ def read_with_errors(rows: Sequence[BoardPose], seed: int = _SETUP.seed) -> tupl
 
 
 def start_residuals(solved: SolvedDome) -> list[FloatArray]:
-    """Return measured minus predicted pixels (N, 2) of every view, before the dome was solved."""
+    """Return measured minus predicted pixels (N, 2) of every view, before solving the dome."""
     seen = solved.start.in_water(solved.start.n_air).camera()
     return [
         fit.view.pixels - seen.project(pose.apply(fit.view.points))[0]
@@ -316,7 +316,7 @@ def _draw_residuals(figure: Figure, solved: SolvedDome) -> None:
 def _draw_arrows(
     axes: Axes, pixels: FloatArray, residuals: FloatArray, size_px: tuple[int, int]
 ) -> None:
-    """Draw a share of the residuals, all from corners, so long that they can be seen."""
+    """Draw about 700 of the residuals as arrows, enlarged so that they can be seen."""
     fine = np.flatnonzero(np.isfinite(residuals).all(axis=1))
     fine = fine[:: max(1, len(fine) // 700)]
     typical = rms_px(residuals[fine])

@@ -1,4 +1,4 @@
-"""Gain of the dome model from 300 to 1250 mm, where the paper has figures 19 and 20."""
+"""Gain of the dome model from 300 to 1250 mm; the paper's figures 19 and 20."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -30,7 +30,7 @@ PICKS = ("left", "central", "right")
 
 
 class _Setup(NamedTuple):
-    """Frames at each distance, the paper's figures, and the bars."""
+    """Frames at each distance, the paper's numbers, and the criteria."""
 
     frames: int = 2
     paper_factor: int = 5
@@ -44,21 +44,20 @@ _SETUP = _Setup()
 
 @dataclass(frozen=True, slots=True)
 class Distances:
-    """Distances of the wall from three points of a stripe, N frames."""
+    """Distances of the wall from three points of a stripe, N frames, in metres."""
 
     true: FloatArray  # Shape (N,).
-    # Shape (N, 4): in metres: left, central, right, and their average. With the dome model; without
-    # it; and without it, but with a laser that was calibrated without it too.
-    dome: FloatArray
-    bare: FloatArray
-    refitted: FloatArray
+    # Shape (N, 4): left, central, right, and their average.
+    dome: FloatArray  # With the dome model.
+    bare: FloatArray  # Without it.
+    refitted: FloatArray  # Without it, and with a laser calibrated without it.
 
     def percent(self, found: FloatArray) -> FloatArray:
         """Return errors of distances in percent of the true ones, shape (N, 4)."""
         return np.asarray(100.0 * (found / self.true[:, None] - 1.0))
 
     def line_percent(self, found: FloatArray, pick: int) -> FloatArray:
-        """Return the same of a straight line through one column, as the paper has it."""
+        """Return the same for a straight line fitted to one column, as in the paper."""
         slope, start = np.polyfit(self.true, found[:, pick], 1)
         return np.asarray(100.0 * ((slope * self.true + start) / self.true - 1.0))
 
@@ -138,7 +137,7 @@ def _run(laboratory: Laboratory) -> ExperimentResult:
 
 
 def level_laser(rig: Rig) -> int:
-    """Return the index of the laser whose plane is nearest to level: the paper's horizontal."""
+    """Return the index of the laser whose plane is nearest to horizontal."""
     return int(np.argmax([abs(laser.plane.normal[2]) for laser in rig.lasers]))
 
 
@@ -148,9 +147,9 @@ def distances(measured: MeasuredDive, rig: Rig, laser: int) -> Distances:
     Parameters
     ----------
     measured : MeasuredDive
-        With the dome model.
+        Measured with the dome model.
     rig : Rig
-        As the scanner believed it.
+        Rig of the measurement.
     laser : int
         Index of the laser.
     """
@@ -172,23 +171,23 @@ def distances(measured: MeasuredDive, rig: Rig, laser: int) -> Distances:
 
 
 def _calibrated_without(rays: Rays, true: FloatArray) -> Plane:
-    """Return the laser plane that suits straight rays best where lasers are calibrated: near.
+    """Return the laser plane that a calibration with straight rays would find.
 
-    The rays are cut off at the wall's true distance; the plane goes through these ends.
+    The plane is fitted to the points of the rays at the wall's true distance.
     """
-    # As far as a box or a board stands when lasers are calibrated, in metres.
-    calibrated_to = 0.65
-    near = true <= calibrated_to
+    # Largest distance of a box or board when lasers are calibrated, in metres.
+    max_distance = 0.65
+    near = true <= max_distance
     origins, directions = rays.origins[near], rays.directions[near]
-    way = (true[near, None] - origins[..., 1]) / directions[..., 1]
-    ends = (origins + way[..., None] * directions).reshape(-1, 3)
+    reach = (true[near, None] - origins[..., 1]) / directions[..., 1]
+    ends = (origins + reach[..., None] * directions).reshape(-1, 3)
     normal = np.linalg.lstsq(ends, np.ones(len(ends)))[0]
     return Plane.from_normal(normal, 1.0)
 
 
 def _picked(points: ScanPoints, laser: int) -> IntArray | None:
-    """Return the rows of the leftmost, the central and the rightmost point on the wall."""
-    # Beyond the working range the wall's points bear another name.
+    """Return the indices of the leftmost, the central and the rightmost point on the wall."""
+    # Beyond the working range the wall's points have another label.
     wanted = (points.label == Label.SOLID) | (points.label == Label.OUT_OF_RANGE)
     mine = np.flatnonzero((points.laser == laser) & wanted & (points.quality > 0.0))
     if len(mine) < len(PICKS):

@@ -1,7 +1,7 @@
-"""Experiments and their outcomes, and the catalogue of experiments by name.
+"""Experiments and their results, and the catalogue of experiments by name.
 
-An experiment is a function that returns findings, figures and series. All figures are drawn in one
-style. The catalogue has the paper's order; each experiment is imported when it is run.
+An experiment is a function that returns findings, figures and series. All figures have one style.
+The catalogue has the paper's order; each experiment is imported when it is run.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -28,10 +28,10 @@ class ExperimentRow:
     """One row of an experiment's table."""
 
     what: str  # The quantity, with its unit.
-    paper: str = ""  # As the paper prints it; empty where it says nothing.
-    ours: str  # As measured here.
-    bar: str = ""  # What we hold ourselves to; empty where there is no such thing.
-    met: bool | None = None  # Whether it is reached; None without a bar.
+    paper: str = ""  # Value in the paper; empty if it has none.
+    ours: str  # Value measured here.
+    bar: str = ""  # Criterion; empty if there is none.
+    met: bool | None = None  # Whether the criterion is met; None without one.
 
     @classmethod
     def at_most(
@@ -44,7 +44,7 @@ class ExperimentRow:
         paper: str = "",
         valid: bool = True,
     ) -> Self:
-        """Return the row of a value that must not exceed a limit; it misses where not `valid`."""
+        """Return the row of a value that must not exceed a limit; not met if not `valid`."""
         return cls(
             what=what,
             paper=paper,
@@ -56,16 +56,16 @@ class ExperimentRow:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ExperimentFigure:
-    """A figure to print."""
+    """Figure of an experiment."""
 
     name: str  # Stem of its files, such as `figure_15`.
-    caption: str  # What it shows and which figure of the paper it stands beside.
+    caption: str  # With the figure of the paper to compare it with.
     figure: Figure  # From `figure_style.new_figure`.
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DataColumns:
-    """The numbers behind a picture, for a CSV: columns of one length with units in their names."""
+    """Data of a figure, for a CSV file: columns of one length with units in their names."""
 
     name: str
     columns: Mapping[str, Column]
@@ -79,25 +79,25 @@ class ExperimentResult:
     findings: tuple[ExperimentRow, ...]
     pictures: tuple[ExperimentFigure, ...] = ()
     series: tuple[DataColumns, ...] = ()
-    # What a reader must know to judge it: where it differs from the paper's setting, and why.
+    # Differences from the paper's setting and their reasons, and other limits of the result.
     notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Experiment:
-    """One experiment of the paper, or one that explains a choice of ours."""
+    """Experiment of the paper, or an ablation."""
 
-    name: str  # What is typed to run it alone.
+    name: str  # On the command line.
     title: str
-    paper: str = ""  # Where the paper has it, such as "section 5.3, figure 15"; empty for our own.
+    paper: str = ""  # Section and figure of the paper; empty for an ablation.
     about: str  # The setting, in one or two sentences.
-    # Takes the laboratory, gives the outcome. It must depend on nothing else, so that the same
-    # version gives the same numbers on every machine.
+    # It must depend on nothing but the laboratory, so that a version gives the same numbers on
+    # every machine.
     run: "Callable[[Laboratory], ExperimentResult]"
 
 
 def listed(values: FloatArray, digits: int) -> str:
-    """Return numbers for a table, with so many digits behind the point."""
+    """Return numbers for a table, with a number of decimals."""
     return ", ".join(f"{value:.{digits}f}" for value in values)
 
 
@@ -108,7 +108,7 @@ def drawn(
     draw: Callable[[Figure], None],
     width: Literal["column", "page"] = "page",
 ) -> ExperimentFigure:
-    """Return a picture of a height in inches, whose figure `draw` fills."""
+    """Return a figure of a height in inches, which `draw` fills."""
     with new_figure(height_in, width) as figure:
         draw(figure)
     return ExperimentFigure(name=name, caption=caption, figure=figure)
@@ -137,11 +137,11 @@ MODULES: Mapping[str, str] = MappingProxyType(
         "video": "ablation_inputs:VIDEO",
     }
 )
-"""Module and constant of each; `beliefs` are a wrong index and a wrong place of the lens."""
+"""By name: module and constant of each experiment."""
 
 
 def ordered(names: Sequence[str]) -> list[str]:
-    """Return these names in the catalogue's order, each once; all of them for none.
+    """Return these names in the catalogue's order, without repetition; all names for none.
 
     Raises `OptionError` if a name is not in the catalogue.
     """

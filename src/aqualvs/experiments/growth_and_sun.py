@@ -1,7 +1,7 @@
 """Growth on the net and sunlight, on which the paper's system failed (figure 24).
 
-Each frame's stripe points that stand out of the picture are counted by rendering the dive once
-more, so that the frames from which a posture can be asked for are known.
+The visible stripe points of each frame are counted by rendering the dive again, to know the frames
+in which a posture can be required.
 """
 
 import os
@@ -36,11 +36,10 @@ _FILE = "visible.csv"
 
 
 def visible_points(laboratory: Laboratory, dive: RenderedDive) -> FloatArray:
-    """Return the number of stripe points on the target that stand out, for each frame.
+    """Return the number of visible stripe points on the target, for each frame.
 
-    See `aqualvs.simulation.benchmark` for what stands out. The numbers are kept beside the dive.
-
-    `laboratory`: counts the frames, which are rendered once more for this.
+    `aqualvs.simulation.benchmark` defines when a point is visible. The frames are rendered again
+    for this, with progress to `laboratory`; the numbers are kept beside the dive.
     """
     path = dive.folder / _FILE
     if not path.exists():
@@ -58,7 +57,7 @@ def visible_points(laboratory: Laboratory, dive: RenderedDive) -> FloatArray:
 PAPERS_WAY = ScannerOptions(
     detector=ThresholdOptions(), mesh_filter=MeshFilterOptions(), fit=FitMethod.PSEUDO_INVERSE
 )
-"""Threshold, mesh filter with the parameters of section 5.2, and pseudo-inverse."""
+"""The paper's method: threshold, mesh filter with the parameters of section 5.2, pseudo-inverse."""
 
 _MOTION: Mapping[str, Any] = {
     "range_mm": {"values": [450, 620, 520], "sway": 4, "period_s": 0.7},
@@ -84,14 +83,16 @@ _SCENES: Mapping[str, Mapping[str, Any]] = {
     },
 }
 _COLOURS = {"clear": BLUE, "growth": GREEN, "sun": ORANGE}
+# Duration of a dive, and the frame that the figure shows.
 _SECONDS, _SHOWN = 0.8, 10
-# Of the clear scene: range in percent, pitch and yaw in degrees; twice that for the others.
+# Largest errors in the clear scene: range in percent, pitch and yaw in degrees; twice that in the
+# others.
 _CLEAR_LIMITS = (0.5, 0.5, 0.5)
 
 
 @dataclass(frozen=True, slots=True)
 class MeasuredScene:
-    """One scene: its dive, what we and the paper's way made of it, and who could have."""
+    """Scene: its dive, measured by our and by the paper's method, and the visible points."""
 
     dive: RenderedDive
     ours: MeasuredDive
@@ -100,7 +101,7 @@ class MeasuredScene:
 
     @property
     def asked(self) -> BoolArray:
-        """Frames in which stripe enough can be seen, shape (N,)."""
+        """Mask (N,) of frames with enough visible points, in which a posture is required."""
         return np.asarray(self.visible >= VISIBLE_LIMIT)
 
     def valid_percent(self, measured: MeasuredDive) -> float:
@@ -110,7 +111,7 @@ class MeasuredScene:
     @property
     def errors(self) -> FloatArray:
         """Errors of each frame, shape (N, 3): range in percent, pitch and yaw in degrees."""
-        return self.ours.errors_told
+        return self.ours.errors_in_units
 
     @property
     def rms(self) -> FloatArray:
@@ -119,12 +120,12 @@ class MeasuredScene:
 
     @property
     def largest(self) -> FloatArray:
-        """Largest errors by amount, shape (3,)."""
+        """Largest magnitudes of the errors, shape (3,)."""
         return np.asarray(np.nanmax(np.abs(self.errors), axis=0))
 
     @property
     def sigmas(self) -> FloatArray:
-        """Median stated sigmas in the same units."""
+        """Median stated sigmas in the same units, shape (3,)."""
         percent = 100.0 * self.ours.sigmas[:, 0] / self.ours.truth[:, 0]
         degrees = np.degrees(self.ours.sigmas[:, 1:])
         return np.asarray(np.nanmedian(np.column_stack([percent, degrees]), axis=0))

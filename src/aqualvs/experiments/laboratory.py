@@ -1,8 +1,7 @@
 """Simulated water tank of the experiments: rendered dives with truth, and measurements of them.
 
-A dive is rendered once and measured as often as wanted; `Variant` compares several ways to measure
-the same dive. `calibrated_rig` is the rig as a user gets it: calibrated from pictures, as the
-commands do it.
+A dive is rendered once and can be measured several times; `Variant` compares several methods on the
+same dives. `calibrated_rig` is calibrated from pictures by the commands that a user would run.
 """
 
 import hashlib
@@ -49,33 +48,33 @@ _VIDEO, _TRUTH, _RIG, _READY = "dive.mp4", "truth.csv", "rig.yaml", "ready.json"
 
 @dataclass(frozen=True, slots=True)
 class RenderedDive:
-    """A rendered dive on disk."""
+    """Rendered dive on disk."""
 
     name: str
-    # Holds `dive.mp4`, `truth.csv` and `rig.yaml`, and `points_FFFF.npz` of the frames asked for.
+    # With `dive.mp4`, `truth.csv` and `rig.yaml`, and `points_FFFF.npz` of the requested frames.
     folder: Path
-    # The true one.
+    # True rig.
     rig: Rig
 
     scenario: Scenario
 
     @property
     def video(self) -> Path:
-        """The video."""
+        """Path of the video."""
         return self.folder / _VIDEO
 
     @property
     def truth(self) -> Path:
-        """The truth, as `read_truth` takes it."""
+        """Path of the truth, for `read_truth`."""
         return self.folder / _TRUTH
 
 
 @dataclass(frozen=True, slots=True)
 class MeasuredDive:
-    """Dive as one scanner measured it, frame by frame, N of them, beside the truth."""
+    """Dive measured by one scanner, N frames, with the truth."""
 
     scans: list[Scan]
-    # Shape (N, 3): range in m, pitch and yaw in radians; NaN where there is none.
+    # Shape (N, 3): range in m, pitch and yaw in radians; NaN if unknown.
     truth: FloatArray
 
     @property
@@ -126,8 +125,8 @@ class MeasuredDive:
         return np.asarray(100.0 * self.errors[:, 0] / self.truth[:, 0])
 
     @property
-    def errors_told(self) -> FloatArray:
-        """Errors for people, shape (N, 3): range in percent, pitch and yaw in degrees."""
+    def errors_in_units(self) -> FloatArray:
+        """Errors, shape (N, 3): range in percent, pitch and yaw in degrees."""
         return np.column_stack([self.range_percent, np.degrees(self.errors[:, 1:])])
 
 
@@ -137,22 +136,20 @@ class Laboratory:
     Parameters
     ----------
     work : Path
-        Folder for the dives; kept, so that another run finds them.
+        Folder for the dives, which later runs reuse.
     tick : callable, optional
         Called with the number of frames rendered since the last call.
 
     Attributes
     ----------
     frame_s : list of float
-        Seconds that the scanner took for each frame that it measured with its default options.
+        Seconds of the scanner for each frame measured with its default options.
     """
 
     def __init__(self, work: Path, tick: Callable[[int], None] | None = None) -> None:
         self._work = work
         self._tick = tick or (lambda _n: None)
         self._measured: dict[tuple[str, str], MeasuredDive] = {}
-        # How long the scanner took for each frame that it measured with its own options, in
-        # seconds.
         self.frame_s: list[float] = []
 
     @cached_property
@@ -161,11 +158,11 @@ class Laboratory:
         return example_rig()
 
     def rendered(self, _done: int, _all: int) -> None:
-        """Count a rendered picture; what renderers take as `progress`."""
+        """Count a rendered picture; the `progress` callback of renderers."""
         self._tick(1)
 
     def folder(self, name: str) -> Path:
-        """Return a folder for the files of an experiment, made if it is not there."""
+        """Return a folder for the files of an experiment; create it if needed."""
         folder = self._work / name
         folder.mkdir(parents=True, exist_ok=True)
         return folder
@@ -178,12 +175,12 @@ class Laboratory:
         recording: Compression | None = None,
         point_frames: tuple[int, ...] = (),
     ) -> RenderedDive:
-        """Return a dive with its truth, rendered where it has not been yet.
+        """Return a dive with its truth; render it on the first call.
 
         Parameters
         ----------
         scenario : Scenario
-            Its name, with a digest of everything that shapes the pictures, names the folder.
+            The folder is named by its name and a digest of everything that affects the pictures.
         rig : Rig, optional
             `self.rig` by default.
         recording, point_frames
@@ -215,14 +212,14 @@ class Laboratory:
     ) -> MeasuredDive:
         """Measure every frame of a dive.
 
-        `rig`: what the scanner believes; the true rig by default.
+        `rig`: rig of the scanner; the true rig by default.
         """
-        believed = rig or dive.rig
+        assumed = rig or dive.rig
         options = options or ScannerOptions()
-        key = (dive.name, _digest([repr(options), rig_to_mapping(believed)]))
+        key = (dive.name, _digest([repr(options), rig_to_mapping(assumed)]))
         if key not in self._measured:
             frame_s = self.frame_s if options == ScannerOptions() else []
-            self._measured[key] = _measured(dive, Scanner(believed, options), frame_s)
+            self._measured[key] = _measured(dive, Scanner(assumed, options), frame_s)
         return self._measured[key]
 
 
@@ -258,11 +255,11 @@ QUANTITIES = ("range (%)", "pitch (degrees)", "yaw (degrees)")
 
 @dataclass(frozen=True, slots=True)
 class Variant:
-    """One way to measure, over one dive or several."""
+    """Measurements by one method, of one dive or several."""
 
     name: str
     measured: tuple[MeasuredDive, ...]
-    ours: bool = False  # Whether this is what `aqualvs` does by default.
+    ours: bool = False  # Whether this is the default of `aqualvs`.
 
     @property
     def valid_percent(self) -> float:
@@ -272,11 +269,11 @@ class Variant:
     @property
     def errors(self) -> FloatArray:
         """Errors of each frame, shape (N, 3): range in percent, pitch and yaw in degrees."""
-        return np.concatenate([m.errors_told for m in self.measured])
+        return np.concatenate([m.errors_in_units for m in self.measured])
 
     @property
     def rms(self) -> FloatArray:
-        """Root mean square of the errors, shape (3,); NaN where no frame has a posture."""
+        """Root mean square of the errors, shape (3,); NaN if no frame has a posture."""
         found = self.errors[np.isfinite(self.errors[:, 0])]
         return np.asarray(np.sqrt(np.mean(found**2, axis=0))) if len(found) else np.full(3, np.nan)
 
@@ -286,19 +283,19 @@ def findings(variants: Sequence[Variant]) -> tuple[ExperimentRow, ...]:
     return tuple(
         ExperimentRow(
             what=f"{one.name}: rms error of range (%), pitch, yaw (degrees); frames with a posture",
-            ours=f"{told(one.rms)}; {one.valid_percent:.0f} %",
+            ours=f"{numbers_text(one.rms)}; {one.valid_percent:.0f} %",
         )
         for one in variants
     )
 
 
-def told(values: Sequence[float] | FloatArray) -> str:
-    """Return numbers for a table, a dash for those that are not."""
+def numbers_text(values: Sequence[float] | FloatArray) -> str:
+    """Return numbers for a table, with a dash for those that are not finite."""
     return ", ".join("-" if not np.isfinite(x) else f"{x:.3g}" for x in values)
 
 
 def series(name: str, variants: Sequence[Variant]) -> DataColumns:
-    """Return what `variants_picture` shows as columns."""
+    """Return the data of `variants_picture`."""
     rms = np.array([one.rms for one in variants])
     columns: dict[str, FloatArray | list[str]] = {"variant": [one.name for one in variants]}
     for k, what in enumerate(("rms_range_percent", "rms_pitch_deg", "rms_yaw_deg")):
@@ -340,10 +337,9 @@ def compared(
     more_findings: Sequence[ExperimentRow] = (),
     notes: tuple[str, ...] = (),
 ) -> ExperimentResult:
-    """Return the outcome of a comparison: a row for each variant, a picture of all, its numbers.
+    """Return the result of a comparison: a row for each variant, a figure of all, and its data.
 
-    `name` is that of the picture and of its series, `caption` what the picture shows; the others
-    are as in `ExperimentResult`.
+    `name` and `caption` are those of the figure; the other parameters are as in `ExperimentResult`.
     """
     return ExperimentResult(
         sentence=sentence,
@@ -375,28 +371,28 @@ _CALIBRATED_RIG, _DRAFT, _RIG_READY = "rig.yaml", "draft.yaml", "pictures.json"
 
 
 def calibration_pictures(laboratory: Laboratory) -> CalibrationFiles:
-    """Return rendered pictures for a whole calibration of the laboratory's rig.
+    """Return rendered pictures for a calibration of the laboratory's rig; render them once.
 
-    12 boards in air for the lens, 10 at known places in air for the dome, 4 of the box, in
-    air too, for the lasers. Rendered once.
+    All are in air: 12 of a board for the camera, 10 of a board at known distances for the dome, and
+    4 of the box for the lasers.
     """
     folder = laboratory.folder("calibration")
     if not (folder / _RIG_READY).exists():
         files = simulate_calibration(
             laboratory.rig, folder, size=_SIZE, progress=laboratory.rendered
         )
-        noted = {
+        stored = {
             name: str(value.relative_to(folder)) if isinstance(value, Path) else value
             for name, value in asdict(files).items()
         }
-        (folder / _RIG_READY).write_text(json.dumps(noted), encoding="utf-8")
-    return _noted_files(folder)
+        (folder / _RIG_READY).write_text(json.dumps(stored), encoding="utf-8")
+    return _stored_files(folder)
 
 
 def calibrated_rig(laboratory: Laboratory) -> Rig:
-    """Return the laboratory's rig as calibrated from those pictures, in the tank's own water.
+    """Return the laboratory's rig as calibrated from these pictures, in the tank's water.
 
-    It carries its covariance, and the working range that `aqualvs calibrate` gives.
+    It has its covariance, and the working range of `aqualvs calibrate`.
     """
     folder = laboratory.folder("calibration")
     if not (folder / _CALIBRATED_RIG).exists():
@@ -407,36 +403,36 @@ def calibrated_rig(laboratory: Laboratory) -> Rig:
 
 
 def rig_without_lasers(laboratory: Laboratory) -> Rig:
-    """Return what `calibrated_rig` came from: camera and dome solved, with their covariance."""
+    """Return the rig before the calibration of the lasers: camera and dome, with covariance."""
     calibrated_rig(laboratory)
     draft = laboratory.folder("calibration") / _DRAFT
     return load_rig(draft, need_lasers=False).in_water(laboratory.rig.n_water)
 
 
-def _noted_files(folder: Path) -> CalibrationFiles:
-    noted: dict[str, Any] = json.loads((folder / _RIG_READY).read_text(encoding="utf-8"))
+def _stored_files(folder: Path) -> CalibrationFiles:
+    stored: dict[str, Any] = json.loads((folder / _RIG_READY).read_text(encoding="utf-8"))
     files: dict[str, Any] = {
-        name: folder / value if isinstance(value, str) else value for name, value in noted.items()
+        name: folder / value if isinstance(value, str) else value for name, value in stored.items()
     }
     return CalibrationFiles(**files)
 
 
 def _calibrate(files: CalibrationFiles, rig: Path, n_lasers: int) -> None:
-    # The last step writes the file that tells that all is done.
+    # The last step writes `rig`, which exists only if all steps have succeeded.
     draft = rig.with_name(_DRAFT)
     camera = CameraRequest(
         images=(str(files.camera),), board=files.board, out=draft, nominal=files.nominal
     )
-    run_camera(camera, _say_nothing)
+    run_camera(camera, _discard)
     dome = DomeRequest(
         images=(str(files.dome),), board=files.rail_board, rig=draft, out=draft, poses=files.poses
     )
-    run_dome(dome, _say_nothing)
+    run_dome(dome, _discard)
     lasers = LasersRequest(
         images=(str(files.box),), rig=draft, out=rig, box=files.box_file, n_lasers=n_lasers
     )
-    run_lasers(lasers, _say_nothing)
+    run_lasers(lasers, _discard)
 
 
-def _say_nothing(_line: str) -> None:
+def _discard(_line: str) -> None:
     """Discard a line for the user; the experiment reports its own result."""

@@ -1,4 +1,4 @@
-"""Laser planes from a box of markers, and the range error that remains; the paper's figure 7."""
+"""Laser planes from a box of markers, and the remaining range error; the paper's figure 7."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -32,10 +32,10 @@ from aqualvs.text import laser_colour
 
 
 class _Setup(NamedTuple):
-    """Ranges of the walls in metres, and the bars."""
+    """Ranges of the walls in metres, and the criteria."""
 
     ranges: tuple[float, ...] = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
-    # A stripe point lies this near to the wall that it is on.
+    # Largest distance of a stripe point from the wall that it is on, in metres.
     near_wall: float = 4e-3
     bar_percent: float = 0.5
     bar_deg: float = 0.5
@@ -47,25 +47,25 @@ _SETUP = _Setup()
 
 @dataclass(frozen=True, slots=True)
 class PlaneError:
-    """Error of a found laser plane against the true one."""
+    """Error of an estimated laser plane."""
 
-    # Between the normals, radians.
+    # Angle between the normals, radians.
     angle: float
     sigma_angle: float
-    # Found minus true, metres.
+    # Estimate minus truth, metres.
     offset: float
     sigma_offset: float
-    # The same of the plane by the paper's way.
+    # The same for the plane by the paper's method.
     paper_angle: float
     paper_offset: float
 
 
 @dataclass(frozen=True, slots=True)
 class Remaining:
-    """Range errors that a calibration leaves on walls square ahead, without noise, W of them."""
+    """Remaining errors of a calibration on W walls square ahead, without noise."""
 
-    ranges: FloatArray  # Shape (W,): True ones, metres.
-    # Shape (W, 3): of range, pitch and yaw, m and rad; the sigmas are what the calibration states.
+    ranges: FloatArray  # Shape (W,): true ranges, metres.
+    # Shape (W, 3): of range, pitch and yaw, m and rad; the sigmas are those of the calibration.
     errors: FloatArray
     sigmas: FloatArray
 
@@ -76,7 +76,7 @@ class Remaining:
 
 
 def plane_error(figures: LaserFigures, true: Plane) -> PlaneError:
-    """Compare a laser that was found with the plane it truly lies in."""
+    """Compare an estimated laser with its true plane."""
     found, paper = like(figures.laser.plane, true), like(figures.paper_plane, true)
     return PlaneError(
         angle=angle_between(found.normal, true.normal),
@@ -89,14 +89,14 @@ def plane_error(figures: LaserFigures, true: Plane) -> PlaneError:
 
 
 def angle_between(a: FloatArray, b: FloatArray) -> float:
-    """Return the angle of two unit vectors, exact for small ones too."""
+    """Return the angle between two unit vectors, accurate for small angles, too."""
     return float(2.0 * np.arcsin(min(0.5 * float(np.linalg.norm(a - b)), 1.0)))
 
 
 def matched(found: Sequence[LaserFigures], lasers: Sequence[Laser]) -> list[LaserFigures]:
-    """Return the found lasers in the order of the true ones.
+    """Return the estimated lasers in the order of the true ones.
 
-    Raises `CalibrationError` if two of them are nearest to the same.
+    Raises `CalibrationError` if one of them is nearest to two true ones.
     """
 
     def apart(one: LaserFigures, laser: Laser) -> float:
@@ -109,7 +109,7 @@ def matched(found: Sequence[LaserFigures], lasers: Sequence[Laser]) -> list[Lase
 
 
 def remaining(truth: Rig, found: Rig, ranges: Sequence[float] = _SETUP.ranges) -> Remaining:
-    """Return what a found rig makes of the pixels that the true one sees."""
+    """Return the posture errors of an estimated rig on the pixels of the true one."""
     read = np.array([WallView.ahead(truth, far).measured_by(found) for far in ranges])
     expected = expected_posture_errors(found, rig_uncertainty(found), ranges)
     far = np.array(ranges)
@@ -269,7 +269,7 @@ def _draw_box(
 
 
 def _draw_errors(axes: Axes, names: Sequence[str], table: FloatArray, title: str) -> None:
-    """Draw found, sigma and the paper's (K, 3) for every laser."""
+    """Draw our errors, their sigmas and the paper's errors, the columns of `table` (K, 3)."""
     place = np.arange(len(names))
     axes.errorbar(
         place - 0.12, table[:, 0], table[:, 1], fmt="o", color=OURS, markersize=4, label="ours"
@@ -282,7 +282,7 @@ def _draw_errors(axes: Axes, names: Sequence[str], table: FloatArray, title: str
 
 
 def _lasers_of(laboratory: Laboratory, result: LaserCalibration, view: LaserView) -> IntArray:
-    """Return which laser lit each stripe point, as the solution has it; -1 for none."""
+    """Return the index of the laser of each stripe point by the solution; -1 for none."""
     markers, _ = load_box(calibration_pictures(laboratory).box_file)
     pose = next(v.dome_from_target for v in result.views if v.name == view.view.name)
     rays = result.rig.in_water(result.rig.n_air).camera().rays(view.stripes.pixels)
@@ -317,7 +317,7 @@ def _draw_left(figure: Figure, left: Remaining) -> None:
 
 
 def _draw_band(axes: Axes, ranges: FloatArray, table: FloatArray, colour: str, name: str) -> None:
-    """Draw errors and sigmas (W, 2) over the distance."""
+    """Draw errors and two sigmas, the columns of `table` (W, 2), over the distance."""
     error, sigma = table.T
     axes.fill_between(
         ranges, error - 2.0 * sigma, error + 2.0 * sigma, color=colour, alpha=0.15, linewidth=0.0

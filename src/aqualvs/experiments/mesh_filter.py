@@ -1,8 +1,8 @@
-"""The mesh filters before a net, a box and a wall, where the paper has figures 12 to 14.
+"""The mesh filters on a net, a box and a wall; the paper's figures 12 to 14.
 
-Points and reflections that the adaptive filter or the paper's takes for the net are judged by
-precision and recall against the points that truly lie on it. The paper's filter gets every bright
-pixel, as in the paper.
+Points and reflections that the adaptive or the paper's filter classifies as net are evaluated by
+precision and recall against the true points of the net. The paper's filter gets every bright pixel,
+as in the paper.
 """
 
 from collections.abc import Sequence
@@ -25,7 +25,13 @@ from aqualvs.experiments.experiment import (
     ExperimentRow,
     drawn,
 )
-from aqualvs.experiments.laboratory import Laboratory, MeasuredDive, RenderedDive, frames_of, told
+from aqualvs.experiments.laboratory import (
+    Laboratory,
+    MeasuredDive,
+    RenderedDive,
+    frames_of,
+    numbers_text,
+)
 from aqualvs.geometry.arrays import BoolArray, FloatArray, IntArray
 from aqualvs.optics.rig import Rig
 from aqualvs.report.figure_style import OURS, PINK
@@ -43,17 +49,19 @@ from aqualvs.sources.base import bgr_of
 def papers_pixels(
     laboratory: Laboratory, dive: RenderedDive, options: MeshFilterOptions, level: int | None = None
 ) -> list[FilteredPeaks]:
-    """Return the bright pixels of every frame, and what the paper's filter keeps of them.
+    """Return the bright pixels of every frame, marked where the paper's filter keeps them.
 
-    The paper divides its picture by hand into one area for each laser; here our own classification
-    does it, which is better than such areas.
+    The paper divides its picture by hand into one area for each laser; here our assignment of
+    pixels to lasers is used, which is better than such areas.
 
     Parameters
     ----------
+    laboratory : Laboratory
+    dive : RenderedDive
     options : MeshFilterOptions
-        Of the filter; by default those of section 5.2.
+        Of the filter.
     level : int, optional
-        Of the threshold, in grey levels.
+        Threshold in grey levels.
     """
     detector = ThresholdOptions() if level is None else ThresholdOptions(level=level)
     scans = laboratory.measure(dive, ScannerOptions(detector=detector)).scans
@@ -63,9 +71,9 @@ def papers_pixels(
 def papers_centres(
     laboratory: Laboratory, dive: RenderedDive, options: MeshFilterOptions
 ) -> list[FilteredPeaks]:
-    """Return the pixels of every frame, on the mesh where the paper's filter keeps their return.
+    """Return the pixels of every frame, marked where the paper's filter keeps their peak.
 
-    The filter is given one point for each sub-pixel return, as the paper does not do it.
+    Unlike in the paper, the filter gets one point for each sub-pixel peak.
     """
     scans = laboratory.measure(dive).scans
     centres = filtered_points(scans, dive.rig, options, every_pixel=False)
@@ -73,14 +81,14 @@ def papers_centres(
 
 
 def adaptive_pixels(scans: Sequence[Scan], rig: Rig) -> list[FilteredPeaks]:
-    """Return the pixels of scans, on the mesh where their return is labelled net."""
+    """Return the pixels of scans, marked where their peak is labelled net."""
     return _pixels(scans, rig, [np.asarray(scan.points.label == Label.NET) for scan in scans])
 
 
 def filtered_points(
     scans: Sequence[Scan], rig: Rig, options: MeshFilterOptions, *, every_pixel: bool
 ) -> list[FilteredPeaks]:
-    """Return the points of scans, and what the paper's filter keeps of them."""
+    """Return the points of scans, marked where the paper's filter keeps them."""
     camera = rig.camera()
     laser_bands = plan_bands(rig, camera)
     papers = PaperFilter(rig, camera, laser_bands, options, every_pixel=every_pixel)
@@ -95,12 +103,13 @@ def _pixels(scans: Sequence[Scan], rig: Rig, kept: Sequence[BoolArray]) -> list[
     return [replace(one, on_mesh=mine[one.source]) for one, mine in zip(found, kept, strict=True)]
 
 
-# The true points are a sample along the stripe, some 4 px apart.
+# Largest distances at which a point counts as the nearest true point, and at which a true point
+# counts as found. True points are about 4 px apart along the stripe.
 _SAME_PX, _FOUND_PX = 9.0, 3.0
 
 
-class Judged(NamedTuple):
-    """Shares between 0 and 1: of what was said to be net, and of what is net."""
+class PrecisionRecall(NamedTuple):
+    """Precision and recall of a classification as net, between 0 and 1."""
 
     precision: float
     recall: float
@@ -108,7 +117,7 @@ class Judged(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class LitTruth:
-    """Points that the lasers light and the camera sees, N of them."""
+    """True points that the lasers light and the camera sees, N of them."""
 
     pixels: FloatArray  # Shape (N, 2).
     laser: IntArray  # Shape (N,).
@@ -124,27 +133,28 @@ class LitTruth:
             )
 
 
-def judge(points: ScanPoints, truth: LitTruth) -> Judged:
-    """Compare the points labelled net with the true points; see `judge_pixels`."""
-    said = points.label == Label.NET
-    return judge_pixels(points.pixels[said], points.laser[said].astype(np.int64), truth)
+def score_points(points: ScanPoints, truth: LitTruth) -> PrecisionRecall:
+    """Compare the points labelled net with the true points; see `score_pixels`."""
+    net = points.label == Label.NET
+    return score_pixels(points.pixels[net], points.laser[net].astype(np.int64), truth)
 
 
-def judge_pixels(pixels: FloatArray, laser: IntArray, truth: LitTruth) -> Judged:
-    """Compare points that are said to lie on the net with the true points of the same laser.
+def score_pixels(pixels: FloatArray, laser: IntArray, truth: LitTruth) -> PrecisionRecall:
+    """Compare points classified as net with the true points of the same laser.
 
-    A point counts as what the nearest true point within 9 px is; a true point of the net is found
-    where such a point lies within 3 px.
+    A point has the class of the nearest true point within 9 px; a true point of the net is found if
+    such a point is within 3 px.
 
     Parameters
     ----------
     pixels : array, shape (N, 2)
     laser : int array, shape (N,)
+    truth : LitTruth
 
     Returns
     -------
-    Judged
-        Precision is NaN where nothing can be judged, recall where there is no net.
+    PrecisionRecall
+        Precision is NaN if no true point is near, recall if there is no net.
     """
     right = judged = found = true = 0
     for one in np.unique(truth.laser):
@@ -160,27 +170,28 @@ def judge_pixels(pixels: FloatArray, laser: IntArray, truth: LitTruth) -> Judged
         if len(net):
             gap, _ = cKDTree(said).query(net)
             found += int(np.count_nonzero(gap < _FOUND_PX))
-    return Judged(right / judged if judged else np.nan, found / true if true else np.nan)
+    return PrecisionRecall(right / judged if judged else np.nan, found / true if true else np.nan)
 
 
-def judge_reflections(found: FilteredPeaks, truth: LitTruth) -> Judged:
-    """Compare the reflections that are said to lie on the net with the true ones.
+def score_reflections(found: FilteredPeaks, truth: LitTruth) -> PrecisionRecall:
+    """Compare the reflections classified as net with the true ones.
 
-    A reflection is a group of pixels of one laser that touch by sides or corners, and said to lie
-    on the net if more than half of its pixels are. It counts as what most of its pixels are, each
-    judged by the nearest true point within 9 px. A true reflection is a group of true points of
-    one laser and the net, no more than 6 px from one to the next; it is found if pixels of
-    reflections that are said to lie on the net lie within 3 px of more than half of its points.
+    A reflection is an 8-connected group of pixels of one laser; it is classified as net if more
+    than half of its pixels are. Its true class is that of most of its pixels, each by the nearest
+    true point within 9 px. A true reflection is a group of true points of one laser on the net, at
+    most 6 px from one to the next; it is found if pixels of reflections classified as net are
+    within 3 px of more than half of its points.
 
     Parameters
     ----------
     found : FilteredPeaks
-        All pixels of the frame, and which of them are said to lie on the net.
+        All pixels of the frame, with the mask of those classified as net.
+    truth : LitTruth
 
     Returns
     -------
-    Judged
-        As `judge_pixels`.
+    PrecisionRecall
+        As of `score_pixels`.
     """
     right = judged = n_found = n_true = 0
     for one in np.unique(truth.laser):
@@ -204,11 +215,13 @@ def judge_reflections(found: FilteredPeaks, truth: LitTruth) -> Judged:
         if len(net):
             gap, _ = cKDTree(pixels[said]).query(net)
             n_found += int(np.count_nonzero(_mostly(np.asarray(gap) < _FOUND_PX, group)))
-    return Judged(right / judged if judged else np.nan, n_found / n_true if n_true else np.nan)
+    return PrecisionRecall(
+        right / judged if judged else np.nan, n_found / n_true if n_true else np.nan
+    )
 
 
 def _blobs(pixels: FloatArray) -> IntArray:
-    """Return the group of each pixel; those of one group touch by sides or corners."""
+    """Return the 8-connected group of each pixel."""
     if not len(pixels):
         return np.empty(0, np.int64)
     x, y = (np.floor(pixels) - np.floor(pixels).min(axis=0)).astype(np.int64).T
@@ -218,11 +231,11 @@ def _blobs(pixels: FloatArray) -> IntArray:
 
 
 def _groups(places: FloatArray) -> IntArray:
-    """Return the group of each true point; those of one group follow one another."""
+    """Return the group of each true point, linked by distance."""
     n = len(places)
     if not n:
         return np.empty(0, np.int64)
-    # True points of one reflection lie no farther apart.
+    # Largest distance of neighbouring true points of one reflection.
     next_px = 6.0
     first, second = cKDTree(places).query_pairs(next_px, output_type="ndarray").T
     graph = coo_array((np.ones(len(first), np.bool_), (first, second)), shape=(n, n))
@@ -230,20 +243,20 @@ def _groups(places: FloatArray) -> IntArray:
 
 
 def _mostly(holds: BoolArray, group: IntArray, n: int = 0) -> BoolArray:
-    """Return for each group whether something holds for more than half of its members."""
+    """Return the mask of groups of which more than half of the members are marked by `holds`."""
     total = np.bincount(group, minlength=n)
     return np.asarray(2 * np.bincount(group[holds], minlength=len(total)) > total)
 
 
-def mean_judged(found: Sequence[Judged]) -> Judged:
-    """Return the mean over frames; NaN where no frame says anything."""
+def mean_score(found: Sequence[PrecisionRecall]) -> PrecisionRecall:
+    """Return the mean over frames, without those that are NaN; NaN if all are."""
     columns = np.array(found, np.float64).reshape(-1, 2)
-    said = np.isfinite(columns)
+    valid = np.isfinite(columns)
     means = [
         float(column[here].mean()) if here.any() else np.nan
-        for column, here in zip(columns.T, said.T, strict=True)
+        for column, here in zip(columns.T, valid.T, strict=True)
     ]
-    return Judged(*means)
+    return PrecisionRecall(*means)
 
 
 _JUDGED = (2, 8, 14, 20)
@@ -271,7 +284,7 @@ def net_before_wall() -> Scenario:
 
 
 def net_dive(laboratory: Laboratory) -> RenderedDive:
-    """Return the dive before the net, shared with those who compare filters."""
+    """Return the dive before the net, shared with the comparison of filters."""
     return laboratory.dive(net_before_wall(), point_frames=_JUDGED)
 
 
@@ -281,11 +294,11 @@ def _run(laboratory: Laboratory) -> ExperimentResult:
     truth = [(i, LitTruth.read(dive.folder / f"points_{i:04d}.npz")) for i in _JUDGED]
     papers = papers_pixels(laboratory, dive, MeshFilterOptions())
     adaptive = adaptive_pixels(measured.scans, dive.rig)
-    mine = mean_judged([judge(measured.scans[i].points, lit) for i, lit in truth])
-    whole = mean_judged([judge_reflections(adaptive[i], lit) for i, lit in truth])
+    mine = mean_score([score_points(measured.scans[i].points, lit) for i, lit in truth])
+    whole = mean_score([score_reflections(adaptive[i], lit) for i, lit in truth])
     kept = [(papers[i], papers[i].on_mesh, lit) for i, lit in truth]
-    theirs = mean_judged([judge_pixels(p.pixels[on], p.laser[on], lit) for p, on, lit in kept])
-    their_whole = mean_judged([judge_reflections(papers[i], lit) for i, lit in truth])
+    theirs = mean_score([score_pixels(p.pixels[on], p.laser[on], lit) for p, on, lit in kept])
+    their_whole = mean_score([score_reflections(papers[i], lit) for i, lit in truth])
     shown = 8
     return ExperimentResult(
         sentence=f"Of the points that the adaptive filter labels net, {100 * mine.precision:.1f} % "
@@ -305,7 +318,11 @@ def _run(laboratory: Laboratory) -> ExperimentResult:
 
 
 def _findings(
-    mine: Judged, whole: Judged, theirs: Judged, their_whole: Judged, measured: MeasuredDive
+    mine: PrecisionRecall,
+    whole: PrecisionRecall,
+    theirs: PrecisionRecall,
+    their_whole: PrecisionRecall,
+    measured: MeasuredDive,
 ) -> tuple[ExperimentRow, ...]:
     worst = float(np.nanmax(np.abs(measured.range_percent)))
     bar_precision, bar_recall, bar_range = 0.98, 0.95, 0.5
@@ -323,12 +340,12 @@ def _findings(
             bar=f">= {bar_recall}",
             met=mine.recall >= bar_recall,
         ),
-        ExperimentRow(what="precision and recall of net reflections", ours=told(whole)),
+        ExperimentRow(what="precision and recall of net reflections", ours=numbers_text(whole)),
         ExperimentRow(
             what="threshold and paper's filter, section 5.2's parameters: of net pixels",
-            ours=told(theirs),
+            ours=numbers_text(theirs),
         ),
-        ExperimentRow(what="the same of net reflections", ours=told(their_whole)),
+        ExperimentRow(what="the same of net reflections", ours=numbers_text(their_whole)),
         ExperimentRow.at_most(
             "largest error of the range to the net (%)",
             worst,

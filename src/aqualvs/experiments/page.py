@@ -1,17 +1,17 @@
 """Page and folder of `aqualvs reproduce`: the paper's figures beside ours.
 
 The page is one file that prints well, without scripts or requests to a network; figures are
-embedded, and link to the files beside the page. The folder holds
+embedded, and link to the files beside the page. The folder contains
 
 ==================  ========================================================================
 `reproduce.html`    everything, on one page
 `results.json`      all findings; the same version of aqualvs writes the same file
 `figures/`          every figure as PNG, PDF and SVG
-`series/`           the numbers behind the figures, as CSV
-`times.json`        how long each experiment took
-`failures/`         the traceback of an experiment that failed
-`work/`             rendered dives and what was solved from them, kept so that the same version is
-                    faster the next time; can be deleted
+`series/`           the data of the figures, as CSV
+`times.json`        duration of each experiment
+`failures/`         tracebacks of failed experiments
+`work/`             rendered dives and results of calibrations, which the same version reuses; can
+                    be deleted
 ==================  ========================================================================
 """
 
@@ -67,7 +67,7 @@ class PrintedFigure:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Record:
-    """An experiment that was run, as `results.json` keeps it."""
+    """Result of an experiment in `results.json`."""
 
     # As in `Experiment`.
     name: str
@@ -80,7 +80,7 @@ class Record:
     pictures: tuple[PrintedFigure, ...] = ()
     series: tuple[str, ...] = ()  # Files in `series/`.
     notes: tuple[str, ...] = ()
-    failure: str = ""  # Why there is no outcome; empty if there is one.
+    failure: str = ""  # Error of a failed experiment; empty if it succeeded.
 
 
 def save_outcome(experiment: Experiment, outcome: ExperimentResult, folder: Path) -> Record:
@@ -118,9 +118,9 @@ def write_results(records: Sequence[Record], seconds: Mapping[str, float], folde
 
 
 def read_results(folder: Path) -> tuple[dict[str, Record], dict[str, float]]:
-    """Return what this version left in a folder, and how long it took; nothing of other versions.
+    """Return the records and durations of this version in a folder; empty for other versions.
 
-    Files that cannot be read count as missing: they are about to be written again.
+    Files that cannot be read count as missing: they will be written again.
     """
     try:
         content = json.loads((folder / RESULTS).read_text(encoding="utf-8"))
@@ -134,14 +134,14 @@ def read_results(folder: Path) -> tuple[dict[str, Record], dict[str, float]]:
 
 
 def is_reproduced(folder: Path) -> bool:
-    """Return whether the experiments have been run in a folder before, by whichever version."""
+    """Return whether any version has run the experiments in a folder before."""
     return (folder / WORK / _MADE_BY).is_file()
 
 
 def work_folder(folder: Path) -> Path:
-    """Return the folder for rendered dives, emptied of what another version left in it.
+    """Return the folder for rendered dives; delete its content if it is of another version.
 
-    Raises `OutputError` if it cannot be made.
+    Raises `OutputError` if it cannot be created.
     """
     work = folder / WORK
     mark = work / _MADE_BY
@@ -155,7 +155,7 @@ def work_folder(folder: Path) -> Path:
 
 @cache
 def sources_digest() -> str:
-    """Return a digest of the package's sources: what makes one version differ from another."""
+    """Return a digest of the package's sources, which identifies the version."""
     digest = hashlib.sha256(__version__.encode())
     for name, source in sorted(_sources(files("aqualvs"), ""), key=lambda one: one[0]):
         digest.update(name.encode())
@@ -189,7 +189,7 @@ def _record(content: Mapping[str, Any]) -> Record:
 def _save_picture(name: str, picture: ExperimentFigure, folder: Path) -> PrintedFigure:
     stem = f"{name}_{picture.name}"
     place = folder / FIGURES
-    # The salt keeps the identifiers inside an SVG the same from run to run.
+    # The salt makes the identifiers in an SVG the same in every run.
     with writing(place), rc_context({**STYLE, "svg.hashsalt": stem}):
         place.mkdir(parents=True, exist_ok=True)
         for kind, metadata in _FORMATS.items():
@@ -200,7 +200,7 @@ def _save_picture(name: str, picture: ExperimentFigure, folder: Path) -> Printed
 
 def _save_series(name: str, series: DataColumns, folder: Path) -> str:
     file = f"{name}_{series.name}.csv"
-    # Python's own numbers, which know whole ones from others.
+    # As numbers of Python, so that integers are written without a point.
     plain = (np.asarray(column).tolist() for column in series.columns.values())
     rows = list(zip(*([_cell(value) for value in column] for column in plain), strict=True))
     path = folder / SERIES / file
@@ -214,8 +214,8 @@ def _save_series(name: str, series: DataColumns, folder: Path) -> str:
 
 
 def _cell(value: str | int | float) -> str:
-    """Return a value as text; nothing where there is no number."""
-    # What rounding differs by from run to run stays hidden.
+    """Return a value as text; empty if it is not finite."""
+    # Few enough digits to hide differences by rounding.
     digits = 7
     if isinstance(value, float):
         return f"{value:.{digits}g}" if math.isfinite(value) else ""
@@ -230,19 +230,20 @@ def _write_json(path: Path, content: Mapping[str, Any]) -> None:
 
 PAGE = "reproduce.html"
 FRAME = "a frame"
-"""Among the times: what the scanner takes for one frame (median); no experiment has this name."""
+"""Key of the scanner's median time for one frame among the durations."""
 
 
-# A drawing with more marks than this weighs more than its picture, and opens slower.
+# A larger SVG, in bytes, is larger than its PNG and opens more slowly.
 _LARGEST_SVG = 250_000
+# Size of a figure on the page.
 _PX_PER_INCH = 125
 
 
 def write_page(records: Sequence[Record], seconds: Mapping[str, float], folder: Path) -> Path:
-    """Write the page from records, in their order, and from the figures that are in the folder.
+    """Write the page from records, in their order, and from the figures in the folder.
 
-    `seconds`: how long experiments took, as far as it is known. Returns the page, `reproduce.html`
-    in the folder. Raises `OutputError` if a figure cannot be read or the page cannot be written.
+    `seconds`: durations of experiments, as far as known. Returns the path of the page. Raises
+    `OutputError` if a figure cannot be read or the page cannot be written.
     """
     path = folder / PAGE
     with writing(path):
@@ -286,13 +287,13 @@ def _cards(records: Sequence[Record], seconds: Mapping[str, float]) -> Iterator[
 
 
 def _notice(records: Sequence[Record]) -> str:
-    said = [f"{record.name} failed: {record.failure}" for record in records if record.failure]
-    said += [
+    lines = [f"{record.name} failed: {record.failure}" for record in records if record.failure]
+    lines += [
         f"{record.name}: {finding.what}: {finding.ours}, bar {_bar_text(finding.bar)}"
         for record, finding in _with_bar(records)
         if not finding.met
     ]
-    return html.notice(said) if said else ""
+    return html.notice(lines) if lines else ""
 
 
 def _with_bar(records: Sequence[Record]) -> list[tuple[Record, ExperimentRow]]:
@@ -305,12 +306,12 @@ def _with_bar(records: Sequence[Record]) -> list[tuple[Record, ExperimentRow]]:
 
 
 def _bar_text(bar: str) -> str:
-    # The number stays on the line of its sign.
+    # No line break between sign and number.
     return bar.replace("<= ", "≤\u00a0").replace(">= ", "≥\u00a0")
 
 
 def _picture(printed: PrintedFigure, folder: Path) -> tuple[str, str]:
-    """Return a figure as an address, and the width of its drawing as a style."""
+    """Return a figure as a data URL, and the style with its width."""
     stem = folder / FIGURES / printed.file
     drawing = stem.with_name(f"{stem.name}.svg")
     width = f"max-width: {_PX_PER_INCH * printed.width_in:.0f}px"
@@ -320,7 +321,7 @@ def _picture(printed: PrintedFigure, folder: Path) -> tuple[str, str]:
 
 
 def duration(seconds: float) -> str:
-    """Return a time as one would say it."""
+    """Return a duration as text."""
     if seconds < 10.0:
         return f"{seconds:.1f} s"
     if seconds < 100.0:

@@ -1,4 +1,4 @@
-"""The rig of the experiments beside the paper's; table 1, and in place of figures 1 and 2."""
+"""The rig of the experiments compared with the paper's; table 1, instead of figures 1 and 2."""
 
 from dataclasses import dataclass
 
@@ -38,13 +38,13 @@ _CAPTION = (
 
 @dataclass(frozen=True, slots=True)
 class Bending:
-    """Rays through the dome, from lens to water, R of them, in `dome`."""
+    """R rays through the dome, from lens to water, in `dome`."""
 
-    lens: FloatArray  # Shape (3,).
-    # Shape (R, 3): where they meet the dome's surfaces, metres.
+    lens: FloatArray  # Shape (3,): position, metres.
+    # Shape (R, 3): intersections with the dome's surfaces, metres.
     inner: FloatArray
     outer: FloatArray
-    # Shape (R, 3): unit directions, in the air inside, and in the water.
+    # Shape (R, 3): unit directions in the air inside, and in the water.
     straight: FloatArray
     water: FloatArray
 
@@ -56,7 +56,7 @@ class Bending:
         return angle
 
     def missed_at(self, forward: float) -> FloatArray:
-        """Return how far off a straight ray is in the plane y = `forward`, metres, shape (R,)."""
+        """Return the distance (R,) from straight to refracted ray in the plane y = `forward`."""
         ends = []
         for start, direction in ((self.lens, self.straight), (self.outer, self.water)):
             reach = (forward - start[..., 1]) / direction[..., 1]
@@ -81,7 +81,7 @@ def bending(rig: Rig, pixels: FloatArray) -> Bending:
 
 
 def band_shares(rig: Rig) -> list[float]:
-    """Return the share of the picture in which each laser is looked for."""
+    """Return the share of the picture in each laser's search band."""
     shares = []
     for search in plan_bands(rig, rig.camera()):
         along = rig.size_px[1] if search.axis is SearchAxis.ALONG_Y else rig.size_px[0]
@@ -186,8 +186,8 @@ def _draw(figure: Figure, laboratory: Laboratory, traced: Bending) -> None:
 
 
 def _draw_stripes(axes: Axes, rig: Rig, sheet: Sheet, i: int) -> None:
-    """Draw where a laser's stripe lies on walls square ahead, the middle of them full."""
-    # Walls whose stripes are drawn, metres.
+    """Draw a laser's stripes on walls square ahead, as a full line for the second wall."""
+    # Ranges, metres.
     walls = (0.3, 0.52, 1.0)
     for far in walls:
         pixels = visible_stripe(rig.camera(), sheet, far).pixels

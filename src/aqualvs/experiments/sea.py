@@ -1,7 +1,7 @@
-"""Runs along a net under control, where the paper has figures 22 and 23.
+"""Controlled runs along a net; the paper's figures 22 and 23.
 
-Figure 22 is a descent along a net at sea with distance and heading kept; figure 23 is distance and
-yaw under control before a net.
+Figure 22 is a descent along a net at sea with distance and heading held; figure 23 shows distance
+and yaw control in front of a net.
 """
 
 import math
@@ -135,9 +135,10 @@ CONTROL = Experiment(
 
 
 class _Setup(NamedTuple):
-    """Descent along the net in m and m/s, and the bars."""
+    """Descent along the net in m and m/s, and the criteria."""
 
     seconds: float = 40.0
+    # Frames from one rendered picture to the next.
     every: int = 10
     range: float = 0.6
     descent: float = 0.08
@@ -150,7 +151,7 @@ _SETUP = _Setup()
 
 
 class _Descent:
-    """A mission: sink at a constant speed, holding range and yaw."""
+    """Mission that sinks at a constant speed and holds range and yaw."""
 
     sways = False
 
@@ -163,7 +164,7 @@ class _Descent:
         posture: Posture | None,
         state: VehicleState,  # noqa: ARG002
     ) -> Guidance:
-        """Return range, yaw and descent; nothing without the net."""
+        """Return the setpoint and the descent; wait without a posture."""
         if posture is None:
             return Guidance(setpoint=None, stage=Stage.WAITING)
         return Guidance(setpoint=self._setpoint, down=_SETUP.descent, stage=Stage.CHANGING_DEPTH)
@@ -173,11 +174,11 @@ class _Descent:
 
 
 @dataclass(slots=True)
-class _Watched:
-    """Sensor for control: sampled postures, with a rendered picture measured now and then.
+class _PartlyRendered:
+    """Sensor for control with sampled postures, which renders and scans every tenth picture.
 
-    A picture takes longer to render than all the rest of a second together; what the scanner makes
-    of every tenth of them is written down.
+    Rendering a picture takes longer than the rest of a simulated second. `seen` collects the
+    results of the scanner, with the truth; they do not affect the control.
     """
 
     net: NetWall
@@ -258,7 +259,7 @@ def _run_sea(laboratory: Laboratory) -> ExperimentResult:
     )
 
 
-def _dive(laboratory: Laboratory) -> tuple[_Watched, LoopLog]:
+def _dive(laboratory: Laboratory) -> tuple[_PartlyRendered, LoopLog]:
     net = NetWall(curvature=-1.0 / 20.0, sway=0.04, sway_period=9.0, rock=math.radians(3.0))
     model = vehicle_model("bluerov2")
     sea_seed = 22
@@ -275,7 +276,7 @@ def _dive(laboratory: Laboratory) -> tuple[_Watched, LoopLog]:
         nets=(Net(bar=0.025, twine=0.0022, fouling=0.2, seed=sea_seed),),
         target="net",
     )
-    sensor = _Watched(
+    sensor = _PartlyRendered(
         net,
         SampledSensor(net, np.random.default_rng([sea_seed, 1])),
         RenderedSensor(net, laboratory.rig, np.random.default_rng([sea_seed, 2]), scene),
@@ -285,8 +286,8 @@ def _dive(laboratory: Laboratory) -> tuple[_Watched, LoopLog]:
     return sensor, loop.run(_SETUP.seconds)
 
 
-def _postures(sensor: _Watched) -> tuple[FloatArray, FloatArray]:
-    """Return what was measured, NaN where refused, and the truth; shape (N, 3) each.
+def _postures(sensor: _PartlyRendered) -> tuple[FloatArray, FloatArray]:
+    """Return the measured postures, NaN for refusals, and the true ones; shape (N, 3) each.
 
     Range in metres, pitch and yaw in degrees.
     """

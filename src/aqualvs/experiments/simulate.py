@@ -30,7 +30,7 @@ from aqualvs.terminal import StopSignals, Tick, progress
 from aqualvs.text import count_text
 
 CALIBRATION = "calibration"
-"""What is given in a scenario's place to render pictures for a calibration."""
+"""Argument, instead of a scenario, for pictures for a calibration."""
 
 _ABOUT_CALIBRATION = "no dive: pictures for all four steps of a calibration, with the truth"
 _LOG, _HOLES = "vehicle.csv", "truth_holes.csv"
@@ -50,22 +50,22 @@ def simulate(
     """Render a scenario into a folder and print how to run it.
 
     Options are those of `aqualvs simulate`, see its `--help`; the scenario `CALIBRATION` renders
-    pictures to calibrate from. SIGINT and SIGTERM end it after the frame under way; what was
-    rendered can be used. Returns 0, or 128 + signal if it was stopped. Raises `AqualvsError` if
-    scenario, camera, rig or folder cannot be used.
+    pictures for a calibration. SIGINT and SIGTERM end it after the present frame; the frames so far
+    can be used. Returns 0, or 128 + signal if it was stopped. Raises `AqualvsError` if scenario,
+    camera, rig or folder cannot be used.
     """
     if scenario is None:
         raise OptionError("SCENARIO: missing; choose one from aqualvs simulate --list")
     if out is None:
         raise OptionError("--out: missing; give the folder to write")
-    eye = simulated_camera(camera)
+    model = simulated_camera(camera)
     if scenario == CALIBRATION:
         if shutter is not None:
             raise OptionError(
                 "--shutter: boards stand still, so it would show nothing; leave it out, or choose "
                 "a dive"
             )
-        return _simulate_calibration(rig_file, out, echo, camera=eye, overwrite=overwrite)
+        return _simulate_calibration(rig_file, out, echo, camera=model, overwrite=overwrite)
     course = load_scenario(scenario)
     rig = example_rig() if rig_file is None else load_rig(rig_file)
     if shutter is not None:
@@ -84,7 +84,7 @@ def simulate(
         save_rig(with_exact_numbers(rig), out / "rig.yaml")
         stopped = None
         try:
-            simulate_dive(course, rig, out, progress=_stopping(stop, tick), camera=eye)
+            simulate_dive(course, rig, out, progress=_stopping(stop, tick), camera=model)
         except _StoppedError as early:
             stopped = early
     echo(f"{stopped or count_text(course.n_frames, 'frame')}: {video}, truth: {truth}")
@@ -98,7 +98,7 @@ def simulate(
 
 
 class _StoppedError(Exception):
-    """A signal asked to stop, and everything up to here is written."""
+    """Rendering was stopped by a signal after a complete picture."""
 
     def __init__(self, signal: str, n_done: int, n_all: int, unit: str) -> None:
         super().__init__(f"stopped by {signal} after {n_done} of {n_all} {unit}")
@@ -108,9 +108,9 @@ class _StoppedError(Exception):
 def _stopping(
     stop: StopSignals, tick: Tick, *, unit: str = "frames", not_at: Collection[int] = ()
 ) -> Callable[[int, int], None]:
-    """Return a callback of renderers that shows progress, and ends them when a signal was caught.
+    """Return a `progress` callback of renderers that ends them after a signal.
 
-    It raises `_StoppedError`, but not after the last picture, nor after those in `not_at`.
+    It raises `_StoppedError`, but not after the last picture, nor after the pictures `not_at`.
     """
 
     def after(n_done: int, n_all: int) -> None:
@@ -135,7 +135,7 @@ def _simulate_calibration(
     files_of_set = [out / name for name in (*folders, "truth", "nominal.yaml")]
     claim = Claim("simulate", files_of_set, overwrite=overwrite)
     size = SetSize()
-    # A folder is complete with what is written after its last picture.
+    # A folder is complete when the picture after its last one begins: files follow its pictures.
     ends = dict(zip(folders, itertools.accumulate(astuple(size)), strict=True))
     with (
         claim,
@@ -158,14 +158,16 @@ def _simulate_calibration(
 
 
 def calibration_commands(files: CalibrationFiles, out: Path, n_lasers: int) -> list[list[str]]:
-    """Return the arguments of `aqualvs` that calibrate from a simulated set, in turn.
+    """Return the arguments of the `aqualvs` commands that calibrate from a simulated set.
 
     Parameters
     ----------
+    files : CalibrationFiles
+        Files of the set.
     out : Path
-        Folder in which `rig.yaml` and `run` are to be written.
+        Folder for `rig.yaml` and `run`.
     n_lasers : int
-        Lasers of the rig.
+        Number of lasers of the rig.
     """
     rig = str(out / "rig.yaml")
     update = ["--rig", rig, "-o", rig]

@@ -1,4 +1,4 @@
-"""Runs before the wall of a tank, where the paper has figures 15 to 17.
+"""Runs in front of the wall of a tank; the paper's figures 15 to 17.
 
 Figure 15 is the distance to the wall; figures 16 and 17 are pitch and yaw.
 """
@@ -28,7 +28,7 @@ _ANGLES = {"pitch": (1, 16), "yaw": (2, 17)}
 
 
 class _AngleSetup(NamedTuple):
-    """Swing before the wall, the bar, and the paper's error."""
+    """Swing in front of the wall, the criterion, and the paper's error."""
 
     amplitude_deg: float = 20.0
     period_s: float = 4.0
@@ -41,7 +41,7 @@ _SWING = _AngleSetup()
 
 
 def swing(name: str) -> Scenario:
-    """Return the dive: "pitch" or "yaw" swings to either side before a wall at 600 mm."""
+    """Return the dive: "pitch" or "yaw" swings to both sides in front of a wall at 600 mm."""
     facts = {
         "duration_s": _SWING.period_s,
         "fps": _SWING.fps,
@@ -155,11 +155,11 @@ ANGLES = Experiment(
 
 
 PLACES_MM = (374, 438, 525, 659)
-"""Where the vehicle stood before the wall (paper, section 5.3)."""
+"""Distances of the vehicle from the wall (paper, section 5.3)."""
 
 
 class _DistanceSetup(NamedTuple):
-    """Frames at each place, the paper's error, and the bar."""
+    """Frames at each distance, the paper's error, and the criterion."""
 
     frames: int = 8
     paper_percent: float = 2.3
@@ -170,12 +170,12 @@ _DISTANCES = _DistanceSetup()
 
 
 def wall_at_places(places_mm: Sequence[int], frames: int, name: str) -> Scenario:
-    """Return the dive: so many frames at each of some distances, square to a wall."""
+    """Return the dive: a number of frames at each of some distances, square to a wall."""
     facts = {
         "duration_s": len(places_mm) * frames / 25.0,
         "motion": {
             "range_mm": {"values": list(places_mm), "mode": "steps"},
-            # Along the wall, so that the stripes lie on other stains in every frame.
+            # Along the wall, so that the stripes are on different texture in every frame.
             "slide_x_mm": {"values": [0], "sway": 25, "period_s": 0.5},
         },
         "walls": [{}],
@@ -184,7 +184,7 @@ def wall_at_places(places_mm: Sequence[int], frames: int, name: str) -> Scenario
 
 
 def wall_dive(laboratory: Laboratory) -> RenderedDive:
-    """Return the dive before the wall, shared with those who ask what our choices are worth."""
+    """Return the dive in front of the wall, shared with the ablations."""
     return laboratory.dive(wall_at_places(PLACES_MM, _DISTANCES.frames, "distance"))
 
 
@@ -266,7 +266,7 @@ def _draw_distance(figure: Figure, calibrated: MeasuredDive, true: MeasuredDive)
 
 
 def _dots(axes: Axes, measured: MeasuredDive, colour: str, label: str, aside_mm: float) -> None:
-    """Draw the frames of a place side by side, so that they can be told apart."""
+    """Draw the frames at a distance side by side, so that they can be distinguished."""
     at = 1e3 * measured.truth[:, 0] + aside_mm + _fanned(measured.truth[:, 0])
     bars = 200.0 * measured.sigmas[:, 0] / measured.truth[:, 0]
     axes.errorbar(
@@ -282,7 +282,7 @@ def _dots(axes: Axes, measured: MeasuredDive, colour: str, label: str, aside_mm:
 
 
 def _fanned(truth: FloatArray) -> FloatArray:
-    """Return a small shift in mm for each frame among those of its place."""
+    """Return a small shift in mm for each frame among those at its distance."""
     place = np.round(1e3 * truth)
     shift = np.zeros(len(truth))
     for p in np.unique(place):

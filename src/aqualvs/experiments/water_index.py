@@ -1,7 +1,7 @@
 """Refractive index of the water from a target on the vehicle, fresh to sea; the paper's figure 5.
 
-The figures show the index on the screen frame by frame, and its standard deviation by the place of
-the lens in the dome.
+The figures show the index frame by frame, and its standard deviation against the position of the
+lens in the dome.
 """
 
 from collections.abc import Sequence
@@ -39,35 +39,35 @@ from aqualvs.yamlfile import write_text, yaml_text
 
 
 @dataclass(frozen=True, slots=True)
-class Numbers:
-    """Index and its uncertainty after each frame, F of them, shape (F,) each."""
+class IndexSeries:
+    """Index and its uncertainty after each of F frames, shape (F,) each."""
 
     truth: FloatArray
     # Joint estimate and its standard deviation.
     ours: FloatArray
     sigma: FloatArray
-    # The paper's way: each frame by itself, everything but the index held.
+    # The paper's method: each frame separately, with only the index free.
     paper: FloatArray
 
-    def after(self, start: int, every: int = 1) -> "Numbers":
-        """Return frame `start` and every so-many-th after it."""
+    def after(self, start: int, every: int = 1) -> "IndexSeries":
+        """Return frame `start` and every `every`-th one after it."""
         part = slice(start, None, every)
-        return Numbers(self.truth[part], self.ours[part], self.sigma[part], self.paper[part])
+        return IndexSeries(self.truth[part], self.ours[part], self.sigma[part], self.paper[part])
 
 
 @dataclass(frozen=True, slots=True)
 class Decentred:
-    """Uncertainty of an index by the lens's distance from the dome's centre, shape (L,) each."""
+    """Uncertainty of the index by distance of the lens from the dome's centre, shape (L,) each."""
 
     lens_mm: FloatArray
-    # Standard deviation of the index, target's place known exactly, or as well as one measures.
+    # Standard deviation of the index, for a target position known exactly, and to 0.2 mm and 0.1°.
     noise: FloatArray
     placed: FloatArray
-    # Whether the system believes the latter.
+    # Whether the estimator calls the index observable in the latter case.
     observable: BoolArray
 
 
-def _draw_numbers(figure: Figure, wet: Numbers, n_each: int) -> None:
+def _draw_numbers(figure: Figure, wet: IndexSeries, n_each: int) -> None:
     number = np.arange(1, len(wet.truth) + 1)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(1.5, 1.0))
     upper.step(number, wet.truth, where="mid", color=TRUTH, linewidth=0.9, label="truth")
@@ -108,17 +108,18 @@ def _draw_target(
 
 
 WATERS = (1.333, 1.335, 1.337, 1.339, 1.341, 1.343)
-"""Indices relative to vacuum: fresh and warm, to salt and cold."""
+"""Indices relative to vacuum, from warm fresh water to cold sea water."""
 
 
 class _Setup(NamedTuple):
-    """Target, frames and noise of the experiment, and its bar."""
+    """Target, frames and noise of the experiment, and its criterion."""
 
-    # Frames of each medium; a change is told from a fish before the target by the fourth.
+    # Frames in each medium; a change is accepted at the fourth frame, as a fish may pass.
     frames: int = 10
     fps: float = 5.0
+    # Distance of the target, in metres.
     plate_far: float = 0.35
-    # Where the plate truly is: as far from the file as the options allow for.
+    # True pose of the target relative to its file: as far off as the options allow for.
     turn_deg: tuple[float, float, float] = (0.06, -0.11, 0.08)
     shift_mm: tuple[float, float, float] = (0.15, -0.22, 0.12)
     corner_px: float = 0.1
@@ -135,19 +136,19 @@ _ROOM = RoomLight(level=0.30, tint=(0.75, 1.0, 0.95), veil=(0.012, 0.035, 0.028)
 
 @dataclass(frozen=True, slots=True)
 class Cruise:
-    """Frames of the target, from the deck through all waters, F of them."""
+    """F frames of the target, in air and through all waters."""
 
-    views: list[View]  # Points where the target's file puts them, pixels where they were found.
-    n_true: FloatArray  # Shape (F,): index of the medium in each.
+    views: list[View]  # Points by the target's file, with the detected pixels.
+    n_true: FloatArray  # Shape (F,): index of the medium.
     example: NDArray[np.uint8]  # Shape (height, width, 3): the last picture.
 
 
 def cruise(laboratory: Laboratory, waters: Sequence[float] = WATERS) -> Cruise:
-    """Render the target in air and in all waters, and find it.
+    """Render the target in air and in all waters, and detect it.
 
-    One picture is rendered in each medium; its corners are seen ten times, with new noise.
+    One picture is rendered in each medium; its corners are repeated in ten frames with new noise.
 
-    Raises `CalibrationError` if it cannot be found.
+    Raises `CalibrationError` if the target is not detected.
     """
     rig = laboratory.rig
     plate, markers = _plate(laboratory, rig)
@@ -169,7 +170,7 @@ def cruise(laboratory: Laboratory, waters: Sequence[float] = WATERS) -> Cruise:
 
 
 def _plate(laboratory: Laboratory, rig: Rig) -> tuple[targets.Marked, MarkerSet]:
-    """Return the plate where it is meant to be, and its markers as the file says."""
+    """Return the plate at its nominal pose, and its markers from its file."""
     plate = targets.plate_before(rig, _SETUP.plate_far)
     path = laboratory.folder("index") / "target.yaml"
     write_text(path, yaml_text(targets.target_mapping(plate)))
@@ -177,14 +178,14 @@ def _plate(laboratory: Laboratory, rig: Rig) -> tuple[targets.Marked, MarkerSet]
 
 
 def _out_of_place(plate: targets.Marked) -> SE3:
-    """Return the small move from where the file has the plate to where it is."""
+    """Return the small motion from the pose of the plate in its file to the true one."""
     middle = plate.corners().reshape(-1, 3).mean(axis=0)
-    turn = rotation_from_rotvec(np.deg2rad(_SETUP.turn_deg))
-    return SE3(turn, middle - turn @ middle + 1e-3 * np.array(_SETUP.shift_mm))
+    rotation = rotation_from_rotvec(np.deg2rad(_SETUP.turn_deg))
+    return SE3(rotation, middle - rotation @ middle + 1e-3 * np.array(_SETUP.shift_mm))
 
 
 def _found(picture: NDArray[np.uint8], markers: MarkerSet, name: str) -> View:
-    # Weighted as OpenCV makes grey of colours.
+    # Weights of OpenCV's conversion from RGB to grey.
     grey = np.asarray(np.rint(picture @ np.array([0.299, 0.587, 0.114])), np.uint8)
     view = detect_markers(grey, markers, name)
     if isinstance(view, str):
@@ -192,26 +193,26 @@ def _found(picture: NDArray[np.uint8], markers: MarkerSet, name: str) -> View:
     return view
 
 
-def follow(rig: Rig, taken: Cruise) -> tuple[Numbers, list[IndexStep]]:
-    """Estimate the index frame by frame, ours and the paper's way.
+def follow(rig: Rig, taken: Cruise) -> tuple[IndexSeries, list[IndexStep]]:
+    """Estimate the index frame by frame, by our and by the paper's method.
 
     Parameters
     ----------
     rig : Rig
-        As calibrated, with its covariance.
+        Calibrated rig with its covariance.
     taken : Cruise
-        Begins in air.
+        Frames, beginning in air.
 
     Returns
     -------
-    numbers : Numbers
+    numbers : IndexSeries
     alarms : list of IndexStep
     """
     estimator = IndexEstimator(
         rig, uncertainty=rig_uncertainty(rig), options=_OPTIONS, prior=IndexPrior.air(rig.n_air)
     )
     readings = [estimator.add(i / _SETUP.fps, view) for i, view in enumerate(taken.views)]
-    numbers = Numbers(
+    numbers = IndexSeries(
         truth=taken.n_true,
         ours=np.array([reading.n for reading in readings]),
         sigma=np.array([reading.sigma for reading in readings]),
@@ -221,10 +222,10 @@ def follow(rig: Rig, taken: Cruise) -> tuple[Numbers, list[IndexStep]]:
 
 
 def paper_index(rig: Rig, view: View) -> float:
-    """Return the index by the paper's way: least squares in space, everything else held.
+    """Return the index by the paper's method: least squares in space, with only the index free.
 
-    Corners are traced to the target's plane, and the index is sought that brings them nearest to
-    where they are known to be (paper, section 2.2).
+    The index minimises the distances of the corners, traced to the target's plane, from their known
+    positions (paper, section 2.2).
     """
     plane = Plane.fitted(view.points)
 
@@ -239,7 +240,7 @@ def paper_index(rig: Rig, view: View) -> float:
 
 
 def decentred(rig: Rig, lens_mm: Sequence[float] = _SETUP.decentred_mm) -> Decentred:
-    """Return how well ten pictures determine the index, by the lens's distance from the centre."""
+    """Return the sigma of the index from ten pictures, by distance of the lens from the centre."""
     exact = replace(_OPTIONS, sigma_place=0.0, sigma_turn=0.0)
     rows = []
     for far in lens_mm:
@@ -308,12 +309,12 @@ def _run(laboratory: Laboratory) -> ExperimentResult:
     )
 
 
-def _in_sigmas(last: Numbers) -> FloatArray:
+def _in_sigmas(last: IndexSeries) -> FloatArray:
     return np.abs(last.ours - last.truth) / last.sigma
 
 
 def _findings(
-    last: Numbers, wet: Numbers, alarms: Sequence[IndexStep], spread: Decentred
+    last: IndexSeries, wet: IndexSeries, alarms: Sequence[IndexStep], spread: Decentred
 ) -> tuple[ExperimentRow, ...]:
     rows = [
         ExperimentRow(
@@ -352,7 +353,7 @@ def _findings(
     )
 
 
-def _series(numbers: Numbers, spread: Decentred) -> tuple[DataColumns, ...]:
+def _series(numbers: IndexSeries, spread: Decentred) -> tuple[DataColumns, ...]:
     frames = DataColumns(
         name="frames",
         columns={
