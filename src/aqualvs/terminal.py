@@ -18,6 +18,9 @@ from aqualvs.closing import Closing
 if TYPE_CHECKING:
     from rich.progress import Task
 
+Echo: TypeAlias = Callable[[str], object]
+"""Printer of a line for the user."""
+
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 

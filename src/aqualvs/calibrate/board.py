@@ -4,10 +4,9 @@ The target is a ChArUco board or chessboard for camera and dome, the markers of 
 lasers, or a small plate of markers, fixed to the vehicle, for the water's refractive index.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, TypeAlias
+from typing import Literal
 
 import numpy as np
 
@@ -32,9 +31,8 @@ from aqualvs.geometry.arrays import FloatArray, IntArray
 from aqualvs.geometry.transforms import SE3, rotation_from_rotvec
 from aqualvs.optics.rig import DOME_FROM_CAM_NOMINAL
 from aqualvs.results.files import Claim, writing
+from aqualvs.terminal import Echo
 from aqualvs.text import count_text
-
-Echo: TypeAlias = Callable[[str], object]
 
 _MM = 1e3
 # Width of the light border around a board, as a share of a square; keeps the outer squares

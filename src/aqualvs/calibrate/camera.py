@@ -10,7 +10,6 @@ from aqualvs.calibrate.common import (
     WAVELENGTH_NM,
     Calibration,
     DetectedTargets,
-    Echo,
     Nominal,
     Pictures,
     corner_residuals,
@@ -33,6 +32,7 @@ from aqualvs.optics.rigfile import check_rig_place
 from aqualvs.optics.solved import SolvedStep, with_step, with_uncertainty
 from aqualvs.report.calibration_material import CalibrationPage, facts, parameter_rows
 from aqualvs.report.html import Card
+from aqualvs.terminal import Echo
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

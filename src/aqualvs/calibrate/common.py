@@ -51,7 +51,7 @@ from aqualvs.sources.images import (
     refuse_stack,
 )
 from aqualvs.special_files import refuse_special
-from aqualvs.terminal import progress
+from aqualvs.terminal import Echo, progress
 from aqualvs.text import count_text
 from aqualvs.yamlfile import parse_yaml, read_text
 
@@ -162,7 +162,6 @@ def _from_mapping(content: Mapping[str, Any], path: Path) -> Nominal:
     )
 
 
-Echo: TypeAlias = Callable[[str], object]
 Image: TypeAlias = NDArray[np.uint8]
 Picture: TypeAlias = str | Path | Image
 """A picture's file, or its pixels: grey, or blue, green, red."""

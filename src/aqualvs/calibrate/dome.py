@@ -8,7 +8,6 @@ from aqualvs.calibrate.common import (
     WATER_N,
     Calibration,
     DetectedTargets,
-    Echo,
     Pictures,
     check_same_size,
     corner_residuals,
@@ -43,6 +42,7 @@ from aqualvs.optics.solved import (
 )
 from aqualvs.report.calibration_material import CalibrationPage, expectations, facts, parameter_rows
 from aqualvs.report.html import Card
+from aqualvs.terminal import Echo
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -13,7 +13,6 @@ from aqualvs.calibrate.common import (
     WAVELENGTH_NM,
     Calibration,
     DetectedTargets,
-    Echo,
     Picture,
     Pictures,
     check_same_size,
@@ -68,6 +67,7 @@ from aqualvs.report.calibration_material import (
     residual_map,
 )
 from aqualvs.report.html import Card
+from aqualvs.terminal import Echo
 from aqualvs.text import count_text, laser_colour
 
 # Pictures on the page, each with its corners and stripes drawn over it.

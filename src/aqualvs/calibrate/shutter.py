@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from aqualvs.calibrate.common import Echo, finish
+from aqualvs.calibrate.common import finish
 from aqualvs.errors import CalibrationError, RigError
 from aqualvs.geometry.arrays import FloatArray
 from aqualvs.optics.rig import Rig
@@ -30,7 +30,7 @@ from aqualvs.scanning.posture import Posture
 from aqualvs.scanning.row_motion import REACH, motion_beside
 from aqualvs.scanning.scan import Scan, ScanPoints
 from aqualvs.sources import FrameSource, open_source
-from aqualvs.terminal import progress
+from aqualvs.terminal import Echo, progress
 
 # Readout for which the scanner computes the influence of motion, in seconds. The influence is
 # proportional to the readout and scaled afterwards, so any value will do.

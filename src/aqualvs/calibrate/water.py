@@ -10,7 +10,6 @@ import numpy as np
 from aqualvs.calibrate.common import (
     Calibration,
     DetectedTargets,
-    Echo,
     Picture,
     check_same_size,
     detect_targets,
@@ -39,7 +38,7 @@ from aqualvs.report.html import Card
 from aqualvs.results.run_request import Water, check_fits
 from aqualvs.sources import FrameSource, open_source
 from aqualvs.sources.images import IMAGE_SUFFIXES, ImageSource
-from aqualvs.terminal import progress
+from aqualvs.terminal import Echo, progress
 from aqualvs.text import count_text
 
 

@@ -5,10 +5,10 @@
 
 import contextlib
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final, TypeAlias
+from typing import Final
 
 from aqualvs.calibration.targets.target_files import save_board
 from aqualvs.calibration.targets.targets import Board
@@ -30,6 +30,7 @@ from aqualvs.optics.rigfile import check_rig_place, load_rig, save_rig
 from aqualvs.optics.shutter import AT_ONCE
 from aqualvs.optics.solved import assumptions, rig_uncertainty
 from aqualvs.results.files import Claim, replace_text, writing
+from aqualvs.terminal import Echo
 from aqualvs.text import count_text
 from aqualvs.yamlfile import read_text
 
@@ -135,8 +136,6 @@ def _naming(path: str | Path) -> Iterator[None]:
             raise
         raise RigError(f"{path}: {text}") from None
 
-
-Echo: TypeAlias = Callable[[str], object]
 
 IMPORTED = "imported"
 """Key of `Rig.solved_from`: the file from which the camera was imported."""

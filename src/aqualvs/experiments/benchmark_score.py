@@ -8,7 +8,7 @@ import csv
 import json
 import math
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -33,6 +33,7 @@ from aqualvs.results.folder import POSTURE_BARE_CSV
 from aqualvs.results.run_request import RunRequest, scanner_options
 from aqualvs.scanning.surfaces import TargetKind
 from aqualvs.simulation.benchmark import VISIBLE_LIMIT
+from aqualvs.terminal import Echo
 from aqualvs.text import count_text
 
 WRONG_PERCENT = 5.0
@@ -373,9 +374,7 @@ BARE_LENS = "bare-lens"
 """Points of aqualvs triangulated again without the dome, which is used to detect the stripes."""
 
 
-def run_own(
-    benchmark: BenchmarkSet, folder: Path, echo: Callable[[str], object], *, overwrite: bool
-) -> list[str]:
+def run_own(benchmark: BenchmarkSet, folder: Path, echo: Echo, *, overwrite: bool) -> list[str]:
     """Measure every dive of a set with every system of `OWN_SYSTEMS`, into SYSTEM/DIVE of a folder.
 
     Returns NAME=PATH of every system, for `read_system`. Raises `AqualvsError` if a dive cannot be
@@ -418,7 +417,7 @@ def _request(system: OwnSystem, source: Path, out: Path, overwrite: bool) -> Run
 def run_score(
     results: Sequence[str],
     truth: Path,
-    echo: Callable[[str], object],
+    echo: Echo,
     *,
     own: Path | None,
     out: Path | None,

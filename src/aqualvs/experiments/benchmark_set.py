@@ -7,7 +7,7 @@ The answers of a system are plain CSV, frame by frame.
 import csv
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
@@ -36,7 +36,7 @@ from aqualvs.simulation.benchmark import (
 from aqualvs.simulation.dive import shutter_from_words
 from aqualvs.simulation.render import Renderer
 from aqualvs.special_files import refuse_special
-from aqualvs.terminal import progress
+from aqualvs.terminal import Echo, progress
 from aqualvs.text import count_text
 from aqualvs.yamlfile import read_yaml
 
@@ -181,7 +181,7 @@ _README_MD = "README.md"
 def make_set(
     out: Path,
     names: Sequence[str],
-    echo: Callable[[str], object],
+    echo: Echo,
     *,
     n_frames: int | None,
     shutter: str | None = None,
@@ -279,7 +279,7 @@ def set_facts(dives: Sequence[BenchmarkDive]) -> dict[str, Any]:
     }
 
 
-def print_dives(echo: Callable[[str], object]) -> None:
+def print_dives(echo: Echo) -> None:
     """Print the levels and their dives, one line each."""
     for level, about in LEVELS.items():
         names = (dive.name for dive in benchmark_dives() if dive.level == level)

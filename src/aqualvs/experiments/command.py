@@ -37,7 +37,7 @@ from aqualvs.experiments.page import (
     write_results,
 )
 from aqualvs.results.files import Claim, writing
-from aqualvs.terminal import hidden_progress
+from aqualvs.terminal import Echo, hidden_progress
 
 TYPICAL_S: Mapping[str, float] = {
     "rig": 2.0,
@@ -185,7 +185,6 @@ def time_left_text(seconds: float) -> str:
     return f"about {round(seconds / 60.0)} min left"
 
 
-Echo: TypeAlias = Callable[[str], object]
 Load: TypeAlias = Callable[[str], Experiment]
 
 _FAILURES = "failures"

@@ -26,7 +26,7 @@ from aqualvs.simulation.dive import (
     write_vehicle_log,
 )
 from aqualvs.simulation.scenarios import example_rig, list_scenarios, load_scenario
-from aqualvs.terminal import StopSignals, Tick, progress
+from aqualvs.terminal import Echo, StopSignals, Tick, progress
 from aqualvs.text import count_text
 
 CALIBRATION = "calibration"
@@ -41,7 +41,7 @@ def simulate(
     scenario: str | None,
     rig_file: Path | None,
     out: Path | None,
-    echo: Callable[[str], object],
+    echo: Echo,
     *,
     camera: str,
     shutter: str | None = None,
@@ -122,12 +122,7 @@ def _stopping(
 
 
 def _simulate_calibration(
-    rig_file: Path | None,
-    out: Path,
-    echo: Callable[[str], object],
-    *,
-    camera: SimulatedCamera,
-    overwrite: bool,
+    rig_file: Path | None, out: Path, echo: Echo, *, camera: SimulatedCamera, overwrite: bool
 ) -> int:
     rig = example_rig() if rig_file is None else load_rig(rig_file)
     # In the order in which they are rendered.
@@ -185,7 +180,7 @@ def calibration_commands(files: CalibrationFiles, out: Path, n_lasers: int) -> l
     return commands
 
 
-def print_scenarios(echo: Callable[[str], object]) -> None:
+def print_scenarios(echo: Echo) -> None:
     """Print the built-in scenarios, one line each."""
     scenarios = {**list_scenarios(), CALIBRATION: _ABOUT_CALIBRATION}
     width = max(map(len, scenarios))

@@ -7,7 +7,6 @@ terminal and ends the run.
 import math
 import time
 from collections import deque
-from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -42,7 +41,7 @@ from aqualvs.simulation.dive import check_shutter, shutter_from_words
 from aqualvs.simulation.net_motion import NetWall
 from aqualvs.simulation.scenarios import example_rig
 from aqualvs.sources.base import Health, PartHealth, State
-from aqualvs.terminal import StopSignals
+from aqualvs.terminal import Echo, StopSignals
 
 
 class LoopPage:
@@ -151,13 +150,7 @@ class RunWatch:
     """
 
     def __init__(
-        self,
-        loop: SimulatedLoop,
-        seconds: float,
-        echo: Callable[[str], object],
-        stop: StopSignals,
-        *,
-        slow: bool,
+        self, loop: SimulatedLoop, seconds: float, echo: Echo, stop: StopSignals, *, slow: bool
     ) -> None:
         self._loop, self._seconds, self._echo, self._stop = loop, seconds, echo, stop
         self._reported_s = 0.0 if slow else math.inf
@@ -288,7 +281,7 @@ class SimRequest:
             )
 
 
-def run_simulation(request: SimRequest, echo: Callable[[str], object]) -> int:
+def run_simulation(request: SimRequest, echo: Echo) -> int:
     """Run the loop, write log, figures and page, and print the summary; return 0.
 
     Raises `AqualvsError` if an input cannot be used, or the folder cannot be written.
@@ -363,9 +356,7 @@ def _case(
     )
 
 
-def _run(
-    loop: SimulatedLoop, request: SimRequest, page: LoopPage | None, echo: Callable[[str], object]
-) -> None:
+def _run(loop: SimulatedLoop, request: SimRequest, page: LoopPage | None, echo: Echo) -> None:
     """Run the loop and write its log; Ctrl-C ends it early."""
     with StopSignals() as stop, FollowLog(request.out / FOLLOW_CSV) as follow_log:
         watch = RunWatch(loop, request.seconds, echo, stop, slow=request.rendered)

@@ -4,7 +4,6 @@ The step is simulated with the nonlinear vehicle, to verify the linear model tha
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -21,6 +20,7 @@ from aqualvs.results.files import Claim
 from aqualvs.simulation.vehicle.models import VEHICLES, VehicleModel
 from aqualvs.simulation.vehicle.vehicle import SimulatedVehicle, level_pose
 from aqualvs.simulation.vehicle.water_motion import WaterMotion
+from aqualvs.terminal import Echo
 
 # Distance of the wall north of the origin, and depth of the vehicle, in metres.
 _WALL, _DEPTH = 5.0, 5.0
@@ -111,7 +111,7 @@ class TuneRequest:
     options: TuneOptions = field(default_factory=TuneOptions)  # Requirements on the loops.
 
 
-def run_tune(request: TuneRequest, echo: Callable[[str], None]) -> None:
+def run_tune(request: TuneRequest, echo: Echo) -> None:
     """Tune, simulate a step, and write or print the gains.
 
     Raises `OptionError` if the model is unknown, or no gains meet the requirements. Raises

@@ -5,7 +5,7 @@ A separate thread writes the log, so that the disk never delays the pilot.
 
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -34,7 +34,7 @@ from aqualvs.results.run_request import prepared_rig
 from aqualvs.scanner import Scanner
 from aqualvs.scanning.posture import Posture, Refusal
 from aqualvs.sources.base import PartHealth, State
-from aqualvs.terminal import StopSignals
+from aqualvs.terminal import Echo, StopSignals
 
 _Step: TypeAlias = tuple[PilotReport, float, Posture | Refusal]
 
@@ -103,9 +103,7 @@ class FollowRequest:
     overwrite: bool = False
 
 
-def run_follow(
-    request: FollowRequest, echo: Callable[[str], object], keys: TextIO | None = None
-) -> int:
+def run_follow(request: FollowRequest, echo: Echo, keys: TextIO | None = None) -> int:
     """Steer until the source ends or the user stops it; return 0.
 
     The pilot starts disengaged: a line on `keys` (by default the terminal) engages or disengages
@@ -152,7 +150,7 @@ def _outputs(link: MavlinkLink, pilot: Pilot, log: Path) -> Iterator[Output]:
     yield FollowLogOutput(log, pilot)
 
 
-def listen(pilot: Pilot, keys: TextIO, echo: Callable[[str], object]) -> threading.Thread:
+def listen(pilot: Pilot, keys: TextIO, echo: Echo) -> threading.Thread:
     """Engage and disengage by lines of a terminal, in a separate thread; return the thread."""
 
     def toggle() -> None:
